@@ -1,0 +1,53 @@
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test bench robustness accuracy lint clean
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+BIN := .venv/bin
+STAMP := .venv/.installed
+# True for an interpreter that runs, fits, and can make a virtual environment.
+FITS := -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
+
+help:  ## show this list
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
+
+setup: $(STAMP)  ## install the package with its tools into .venv (PYTHON=… chooses the interpreter)
+
+$(STAMP): pyproject.toml
+	@if ! $(BIN)/python $(FITS); then \
+	  for python in $(PYTHON) python3 python3.13 python3.12 python3.11 none; do \
+	    if $$python $(FITS); then break; fi; \
+	  done; \
+	  if [ $$python = none ]; then \
+	    echo "make setup: no Python 3.11, 3.12 or 3.13 with venv found; name one with PYTHON=/path/to/python" >&2; \
+	    exit 1; \
+	  fi; \
+	  echo "Making .venv with $$($$python --version)" >&2; \
+	  $$python -m venv --clear .venv; \
+	fi
+	@echo "Installing flexneedle and its tools into .venv" >&2
+	@$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@touch $@
+
+demo: setup  ## plan and steer one insertion on the phantom
+	@$(BIN)/flexneedle insert phantom --seed 0
+
+test: setup  ## run the tests
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+bench: setup  ## measure speed
+	$(BIN)/python benchmarks/bench.py
+
+robustness: setup  ## 100,000 random insertions without a failure (long)
+	$(BIN)/python studies/robustness.py
+
+accuracy: setup  ## the 15 targets of the paper, closed loop against open loop (long)
+	$(BIN)/python studies/accuracy.py
+
+lint: setup  ## style, types, layers
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+clean:  ## remove what make and the tools made
+	rm -rf .venv dist build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

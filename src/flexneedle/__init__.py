@@ -1,0 +1,53 @@
+"""Simulate, plan and steer flexible bevel-tip needles in soft tissue.
+
+Names are imported when they are first used: `import flexneedle` alone stays fast and does not load the compiler.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .errors import CommandError, FlexneedleError, InputError, RunError, ScenarioError, StateError
+    from .run import insert, plan
+    from .scenario import Scenario, load_scenario
+    from .simulator import Control, Simulator, State
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "CommandError",
+    "Control",
+    "FlexneedleError",
+    "InputError",
+    "RunError",
+    "Scenario",
+    "ScenarioError",
+    "Simulator",
+    "State",
+    "StateError",
+    "__version__",
+    "insert",
+    "load_scenario",
+    "plan",
+]
+
+_HOMES = {
+    "errors": ("CommandError", "FlexneedleError", "InputError", "RunError", "ScenarioError", "StateError"),
+    "run": ("insert", "plan"),
+    "scenario": ("Scenario", "load_scenario"),
+    "simulator": ("Control", "Simulator", "State"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from its home on first use (PEP 562)."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f".{_HOME_OF[name]}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

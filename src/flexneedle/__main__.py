@@ -1,0 +1,8 @@
+"""`python -m flexneedle` is the command line."""
+
+import sys
+
+from flexneedle.cli.main import main
+
+if __name__ == "__main__":
+    sys.exit(main())

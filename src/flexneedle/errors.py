@@ -1,0 +1,46 @@
+"""The one tree of errors. A message is one line: the value, the rule, the valid choices."""
+
+__all__ = ["CommandError", "FlexneedleError", "InputError", "RunError", "ScenarioError", "StateError"]
+
+
+class FlexneedleError(Exception):
+    """Root of all errors that flexneedle raises on purpose."""
+
+
+class InputError(FlexneedleError):
+    """What the user gave cannot be used (exit status 2)."""
+
+
+class ScenarioError(InputError):
+    """A scenario cannot be read or breaks a rule. Each argument is one problem in one line."""
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """One line for each problem."""
+        return self.args
+
+    def __str__(self) -> str:
+        return "\n".join(self.args)
+
+
+class CommandError(InputError):
+    """A command to the simulator or a device is out of range.
+
+    `name` is the input (`db_x`), `value` what was asked for, `limit` the bound that it passes (in the unit of
+    the input: mm or rad) and `rule` the sentence that names it, such as "must be at most 1 mm a step".
+    """
+
+    def __init__(self, name: str, value: float, limit: float, rule: str) -> None:
+        super().__init__(name, value, limit, rule)
+        self.name, self.value, self.limit, self.rule = name, value, limit, rule
+
+    def __str__(self) -> str:
+        return f"{self.name} = {float(self.value):.12g}: {self.rule}"
+
+
+class StateError(InputError):
+    """A saved state does not belong to this scenario, or its file is damaged."""
+
+
+class RunError(FlexneedleError):
+    """An insertion or a study could not be carried out (exit status 1)."""
