@@ -1,0 +1,73 @@
+"""`flexneedle`: the commands, and what their endings mean for the shell.
+
+Exit status: 0 done, 1 failed, 2 bad input, 130 interrupted.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+
+from flexneedle import __version__
+from flexneedle.errors import FlexneedleError, InputError
+
+from . import scenario
+
+__all__ = ["build_parser", "main"]
+
+_COMMANDS = (scenario,)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser; each command sets `handler`, which takes the arguments and returns the status."""
+    parser = argparse.ArgumentParser(
+        prog="flexneedle",
+        description="Simulate, plan and steer flexible bevel-tip needles in soft tissue. For research only.",
+    )
+    parser.add_argument("--version", action="version", version=f"flexneedle {__version__}")
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for command in _COMMANDS:
+        command.add_parser(subparsers)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status; argparse itself leaves with SystemExit."""
+    return _guarded(lambda: _run(argv))
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    try:
+        args = build_parser().parse_args(argv)
+        status: int = args.handler(args)
+        return status
+    finally:
+        sys.stdout.flush()  # here, where a closed pipe is still handled, --help included
+
+
+def _guarded(command: Callable[[], int]) -> int:
+    """Turn the errors that a user can cause into one line each and an exit status."""
+    try:
+        return command()
+    except FlexneedleError as error:
+        _complain(str(error))
+        return 2 if isinstance(error, InputError) else 1
+    except KeyboardInterrupt:
+        _complain("interrupted")
+        return 130
+    except BrokenPipeError:
+        _drop_stdout()
+        return 1
+    except OSError as error:
+        _complain(str(error))
+        return 1
+
+
+def _complain(message: str) -> None:
+    for line in message.splitlines():
+        print(f"flexneedle: {line}", file=sys.stderr)
+
+
+def _drop_stdout() -> None:
+    """Keep the interpreter from complaining about the closed pipe once more as it exits (Python docs, signal)."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

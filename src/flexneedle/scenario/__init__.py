@@ -1,0 +1,27 @@
+"""Scenarios: what is inserted, into what, towards what, and with which settings."""
+
+from .apparatus import Setup, Tracker
+from .files import dump_scenario, load_scenario, preset_names
+from .model import Scenario, check_target
+from .needle import GAUGES, Bevel, Needle
+from .settings import Control, Phantom, Plan, Target
+from .tissue import Contact, Layer
+
+__all__ = [
+    "GAUGES",
+    "Bevel",
+    "Contact",
+    "Control",
+    "Layer",
+    "Needle",
+    "Phantom",
+    "Plan",
+    "Scenario",
+    "Setup",
+    "Target",
+    "Tracker",
+    "check_target",
+    "dump_scenario",
+    "load_scenario",
+    "preset_names",
+]

@@ -1,0 +1,81 @@
+"""What holds, moves and measures the needle."""
+
+from math import sqrt
+
+from .fields import NonNegative, Positive, Section
+
+__all__ = ["Setup", "Tracker"]
+
+
+class Setup(Section):
+    """Section `setup`: where things stand at the start, and how far and fast the actuators go."""
+
+    guide_to_skin_mm: Positive | None = None
+    """G; left out, there is no guide."""
+    tip_to_skin_mm: Positive
+    """Gap between tip and skin at the start."""
+    stroke_mm: Positive
+    """Greatest travel of the base along the insertion axis."""
+    max_advance_mm: Positive = 1.0
+    """Greatest travel along the insertion axis in a control step, either way."""
+    max_guide_step_mm: Positive = 0.5
+    """Greatest lateral travel of the guide in a control step."""
+    max_guide_travel_mm: Positive = 15.0
+    """Greatest lateral distance of the guide from the axis."""
+    max_base_step_mm: Positive = 0.5
+    """Greatest lateral travel of the base in a control step."""
+    max_base_travel_mm: Positive = 15.0
+    """Greatest lateral distance of the base from the axis."""
+    max_base_turn_step_mrad: Positive = 5.0
+    """Greatest turn of the base in a control step."""
+    insertion_speed_mm_s: Positive = 5.0
+    """Speed along the insertion axis; a step of 1 mm at 5 mm/s lasts 200 ms."""
+
+    @property
+    def has_guide(self) -> bool:
+        """Whether a guide supports the needle before the skin."""
+        return self.guide_to_skin_mm is not None
+
+    @property
+    def guide_x(self) -> float | None:
+        """x of the guide, mm: −G, or None without a guide."""
+        return None if self.guide_to_skin_mm is None else -self.guide_to_skin_mm
+
+    @property
+    def start_tip_x(self) -> float:
+        """x of the tip at the start, mm."""
+        return -self.tip_to_skin_mm
+
+    @property
+    def max_depth(self) -> float:
+        """Depth that a straight needle reaches at full stroke, mm; negative if it stays before the skin."""
+        return self.stroke_mm - self.tip_to_skin_mm
+
+    @property
+    def max_lateral(self) -> float:
+        """How far aside a target may lie, mm: as far as the guide travels, or the base without one."""
+        return self.max_guide_travel_mm if self.has_guide else self.max_base_travel_mm
+
+    @property
+    def max_base_turn_step(self) -> float:
+        """Greatest turn of the base in a control step, rad."""
+        return 1e-3 * self.max_base_turn_step_mrad
+
+
+class Tracker(Section):
+    """Section `tracker`: what measures the tip."""
+
+    rate_hz: Positive = 40.0
+    """Readings a second."""
+    jitter_mm: NonNegative = 0.07
+    """RMS length of the 3D deviation vector."""
+
+    @property
+    def period(self) -> float:
+        """Time between two readings, s."""
+        return 1 / self.rate_hz
+
+    @property
+    def jitter_per_axis(self) -> float:
+        """Standard deviation of one coordinate, mm: a third of the variance of the 3D deviation."""
+        return self.jitter_mm / sqrt(3)

@@ -1,0 +1,53 @@
+"""Values of nested tables by dotted key: `tissue.0.alpha`, or as in messages `tissue[0].alpha`."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from flexneedle.errors import ScenarioError
+
+__all__ = ["flatten", "set_value", "split_key"]
+
+
+def split_key(key: str) -> list[str | int]:
+    """Return the parts of a dotted key, indices as int."""
+    parts = key.replace("[", ".").replace("]", "").split(".")
+    return [int(part) if part.isascii() and part.isdigit() else part for part in parts]
+
+
+def flatten(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the leaves of nested tables by dotted key, in order; a list of numbers is a leaf."""
+    return dict(_leaves("", values))
+
+
+def _leaves(key: str, value: Any) -> list[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        items = list(value.items())
+    elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+        items = [(str(i), item) for i, item in enumerate(value)]
+    else:
+        return [(key, value)]
+    opening = f"{key}." if key else ""
+    return [leaf for name, item in items for leaf in _leaves(opening + name, item)]
+
+
+def set_value(values: dict[str, Any], key: str, value: Any) -> None:
+    """Set a value in nested tables in place; None takes the key out. Missing tables on the way are made."""
+    *way, last = split_key(key)
+    table: Any = values
+    for part in way:
+        table = table.setdefault(part, {}) if isinstance(table, dict) else _item(table, part, key)
+    if isinstance(table, dict):
+        table[last] = value
+        if value is None:
+            del table[last]
+    else:
+        _item(table, last, key)
+        table[last] = value
+
+
+def _item(table: Any, part: str | int, key: str) -> Any:
+    if not isinstance(table, list):
+        raise ScenarioError(f"{key}: no such key, {part} lies in a single value")
+    if not isinstance(part, int) or part >= len(table):
+        raise ScenarioError(f"{key}: no such key, the list has items 0 to {len(table) - 1}")
+    return table[part]

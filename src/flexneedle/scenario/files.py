@@ -1,0 +1,88 @@
+"""Scenario files: presets, reading, writing."""
+
+import tomllib
+from importlib.resources import files
+from os import fspath
+from pathlib import Path
+from typing import IO
+
+import tomli_w
+
+from flexneedle.errors import ScenarioError
+
+from .model import Scenario
+
+__all__ = ["dump_scenario", "load_scenario", "preset_names"]
+
+_PRESETS = files(__package__) / "presets"
+_SUFFIX = ".toml"
+# A scenario has a few kB; the bound keeps an endless file such as /dev/zero from filling the memory.
+_LARGEST_FILE = 1_000_000
+
+
+def preset_names() -> list[str]:
+    """Return the names of the scenarios that come with the package."""
+    return sorted(
+        entry.name.removesuffix(_SUFFIX) for entry in _PRESETS.iterdir() if entry.name.endswith(_SUFFIX)
+    )
+
+
+def load_scenario(source: str | Path | Scenario) -> Scenario:
+    """Return the scenario of a preset name or of a TOML file; a scenario is returned as it is.
+
+    A text that is the name of a preset means the preset, also where a file has that name.
+    Raises ScenarioError with one line for each problem: file, key, value, rule.
+    """
+    if isinstance(source, Scenario):
+        return source
+    if not isinstance(source, str | Path):
+        raise ScenarioError(f"a scenario is a preset name, a path or a Scenario, not {type(source).__name__}")
+    if isinstance(source, str) and source in preset_names():
+        data = (_PRESETS / (source + _SUFFIX)).read_bytes()
+    else:
+        data = _read(source)
+    label = _one_line(fspath(source))
+    return Scenario.from_values(_parse(data, label), label)
+
+
+def dump_scenario(scenario: Scenario) -> str:
+    """Return the scenario, with all defaults, as TOML that loads back equal."""
+    return tomli_w.dumps(scenario.values())
+
+
+def _read(source: str | Path) -> bytes:
+    label = _one_line(fspath(source)) or '""'
+    try:
+        with Path(source).open("rb") as file:
+            return _read_bounded(file, label)
+    except FileNotFoundError:
+        presets = ", ".join(preset_names())
+        raise ScenarioError(f"{label}: no such file, and no such preset (presets: {presets})") from None
+    except IsADirectoryError:
+        raise ScenarioError(f"{label}: is a directory, not a scenario file") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ScenarioError(f"{label}: cannot be read: {reason}") from None
+
+
+def _read_bounded(file: IO[bytes], label: str) -> bytes:
+    data = file.read(_LARGEST_FILE + 1)
+    if len(data) > _LARGEST_FILE:
+        raise ScenarioError(f"{label}: larger than {_LARGEST_FILE} bytes, not a scenario file")
+    return data
+
+
+def _parse(data: bytes, label: str) -> dict[str, object]:
+    try:
+        return tomllib.loads(data.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise ScenarioError(f"{label}: not UTF-8 (at line {line}): save the file as UTF-8") from None
+    except RecursionError:
+        raise ScenarioError(f"{label}: not TOML: nested too deeply") from None
+    except ValueError as error:
+        raise ScenarioError(f"{label}: not TOML: {_one_line(str(error))}") from None
+
+
+def _one_line(text: str) -> str:
+    return text if text.isprintable() else text.encode("unicode_escape").decode()

@@ -1,0 +1,108 @@
+"""The scenario: everything that plan and insertion depend on, but for the seed."""
+
+from collections.abc import Mapping
+from itertools import chain
+from typing import Annotated, Any, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from flexneedle.errors import ScenarioError
+
+from .apparatus import Setup, Tracker
+from .dotted import flatten, set_value, split_key
+from .fields import Section, Title
+from .needle import Needle
+from .problems import describe, key_path, refuse, to_line
+from .rules import geometry_problems, grid_problems, layer_problems, plan_problems, target_problems
+from .settings import Control, Phantom, Plan, Target
+from .tissue import Contact, Layer
+
+__all__ = ["Scenario", "check_target"]
+
+
+class Scenario(Section):
+    """A scenario, frozen. Fields keep the names and units of the file.
+
+    Properties without a unit in their name are in mm, N, MPa, rad, s.
+    """
+
+    name: Title
+    """Title in tables and figures."""
+    needle: Needle
+    setup: Setup
+    tissue: Annotated[tuple[Layer, ...], Field(strict=False, max_length=1_000)]
+    """Layers from the skin down."""
+    contact: Contact = Contact()
+    target: Target = Target()
+    plan: Plan = Plan()
+    control: Control = Control()
+    tracker: Tracker = Tracker()
+    phantom: Phantom = Phantom()
+
+    @model_validator(mode="after")
+    def _check_sections_together(self) -> Self:
+        refuse(
+            chain(
+                geometry_problems(self.needle, self.setup),
+                layer_problems(self.tissue, self.needle.bevel),
+                target_problems(self.setup, self.target),
+                plan_problems(self.plan),
+                grid_problems(self.setup, self.contact, self.phantom, self.tracker),
+            )
+        )
+        return self
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, Any], source: str = "") -> Self:
+        """Return the scenario of nested tables, or raise ScenarioError, whose lines open with `source`."""
+        try:
+            return cls.model_validate(dict(values))
+        except ValidationError as error:
+            opening = f"{source}: " if source else ""
+            raise ScenarioError(*(opening + line for line in describe(error, cls))) from None
+
+    def values(self) -> dict[str, Any]:
+        """Return nested tables, with all defaults, without the keys that are left out."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    def with_values(self, changes: Mapping[str, Any]) -> Self:
+        """Return a copy with values replaced by dotted key (`tissue.0.alpha`); None leaves a key out.
+
+        Raises ScenarioError if a key is unknown or the copy breaks a rule.
+        """
+        values = self.values()
+        for key, value in changes.items():
+            set_value(values, key, value)
+        return self.from_values(values)
+
+    def flat(self) -> dict[str, Any]:
+        """Return all values by dotted key (`tissue.0.alpha`), in the order of the schema."""
+        return flatten(self.values())
+
+    def first_difference(self, other: "Scenario") -> str | None:
+        """Return the first key whose value differs, as `tissue[0].alpha`, or None if all are equal."""
+        mine, theirs = self.flat(), other.flat()
+        return next(
+            (key_path(split_key(key)) for key in mine | theirs if mine.get(key) != theirs.get(key)), None
+        )
+
+    @property
+    def start_base_x(self) -> float:
+        """x of the base clamp at the start, mm."""
+        return self.setup.start_tip_x - self.needle.length_mm
+
+    @property
+    def layer_tops(self) -> tuple[float, ...]:
+        """Depth at which each layer begins, mm; the first is 0, the skin."""
+        tops = [0.0]
+        for layer in self.tissue[:-1]:
+            tops.append(tops[-1] + (layer.thickness_mm or 0.0))
+        return tuple(tops)
+
+
+def check_target(scenario: Scenario, depth: float, lateral: float) -> None:
+    """Raise ScenarioError if a target (x, y), mm, cannot be reached by stroke or sideways travel."""
+    target = Target.model_construct(depth_mm=float(depth), lateral_mm=float(lateral))
+    problems = [to_line(problem) for problem in target_problems(scenario.setup, target)]
+    if problems:
+        raise ScenarioError(*problems)

@@ -1,0 +1,147 @@
+"""From what is wrong with a scenario to one line each: key, value, rule."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any, NamedTuple, get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from .dotted import split_key
+
+__all__ = ["Problem", "describe", "key_path", "refuse", "to_line"]
+
+_BROKEN = "broken_rules"
+_LONGEST_VALUE = 60
+
+
+class Problem(NamedTuple):
+    """A broken rule. `key` is dotted, relative to the section that checks; value None is a key left out."""
+
+    key: str
+    value: object
+    rule: str
+
+
+def refuse(problems: Iterable[Problem]) -> None:
+    """Raise the problems, if any, from within a pydantic validator."""
+    found = list(problems)
+    if found:
+        raise PydanticCustomError(_BROKEN, "rules are broken", {"problems": found})
+
+
+def to_line(problem: Problem, *, above: Sequence[str | int] = ()) -> str:
+    """Return a problem as `key = value: rule`; `above` is the path of the section that found it."""
+    return _line([*above, *split_key(problem.key)], problem.value, problem.rule)
+
+
+def describe(error: ValidationError, model: type[BaseModel]) -> list[str]:
+    """Return one line `key = value: rule` for each problem, in the order of the schema."""
+    details = error.errors(include_url=False)
+    inner = {detail["loc"][:depth] for detail in details for depth in range(len(detail["loc"]))}
+    # pydantic calls a list too short when its items are refused: the items have said enough.
+    told = [d for d in details if not (d["type"] == "too_short" and d["loc"] in inner)]
+    return [line for detail in told for line in _lines(detail, model)]
+
+
+def key_path(loc: Sequence[str | int]) -> str:
+    """Return a path as it is written in messages: `tissue[1].alpha`."""
+    path = ""
+    for part in loc:
+        if isinstance(part, int):
+            path += f"[{part}]"
+        else:
+            path += ("." if path else "") + (part if _is_bare(part) else json.dumps(part))
+    return path
+
+
+def _is_bare(key: str) -> bool:
+    return key.isascii() and key.replace("-", "").isidentifier()
+
+
+def _lines(detail: ErrorDetails, model: type[BaseModel]) -> list[str]:
+    loc = detail["loc"]
+    if detail["type"] == _BROKEN:
+        return [to_line(problem, above=loc) for problem in detail["ctx"]["problems"]]
+    if detail["type"] == "missing":
+        return [_line(loc, None, "missing")]
+    if detail["type"] == "extra_forbidden":
+        return [_line(loc, detail["input"], _unknown(str(loc[-1]), _section_at(loc[:-1], model)))]
+    return [_line(loc, detail["input"], _rule(detail))]
+
+
+def _line(loc: Sequence[str | int], value: object, rule: str) -> str:
+    shown = "" if value is None else f" = {_shown(value)}"
+    return f"{key_path(loc) or 'scenario'}{shown}: {rule}"
+
+
+def _shown(value: object) -> str:
+    """Return a value about as TOML writes it, in one short line."""
+    if isinstance(value, Mapping):
+        text = "{…}"
+    elif isinstance(value, bool | str):
+        text = json.dumps(value, ensure_ascii=False)
+    elif isinstance(value, list | tuple):
+        text = "[" + ", ".join(_shown(item) for item in value[:5]) + (", …]" if len(value) > 5 else "]")
+    elif isinstance(value, int) and value.bit_length() > 200:
+        text = "a very large number"
+    else:
+        text = str(value)
+    return text if len(text) <= _LONGEST_VALUE else text[:_LONGEST_VALUE] + "…"
+
+
+def _rule(detail: ErrorDetails) -> str:
+    kind, context = detail["type"], detail.get("ctx", {})
+    match kind:
+        case "greater_than":
+            return f"must be above {context['gt']:g}"
+        case "greater_than_equal":
+            return f"must be at least {context['ge']:g}"
+        case "less_than":
+            return f"must be below {context['lt']:g}"
+        case "less_than_equal":
+            return f"must be at most {context['le']:g}"
+        case "literal_error":
+            return f"must be one of {context['expected'].replace(' or ', ', ').replace(chr(39), '')}"
+        case "string_too_long":
+            return f"must have at most {context['max_length']} characters"
+        case "too_short" | "too_long":
+            return "must be two numbers, low and high"
+        case "value_error":
+            return str(context["error"])
+    return _TYPE_RULES.get(kind, detail["msg"])
+
+
+_TYPE_RULES = {
+    "float_type": "must be a number",
+    "finite_number": "must be a finite number",
+    "int_type": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "bool_type": "must be true or false",
+    "string_type": "must be text in quotes",
+    "tuple_type": "must be a list",
+    "model_type": "must be a table",
+}
+
+
+def _unknown(key: str, section: type[BaseModel] | None) -> str:
+    valid = list(section.model_fields) if section else []
+    close = get_close_matches(key, valid, n=1)
+    hint = f"did you mean {close[0]}? " if close else ""
+    return f"unknown key; {hint}valid keys: {', '.join(valid)}"
+
+
+def _section_at(loc: Sequence[str | int], model: type[BaseModel]) -> type[BaseModel] | None:
+    """Return the model that describes the table at a path."""
+    section: type[BaseModel] | None = model
+    for part in loc:
+        if section and isinstance(part, str):
+            section = _model_in(section.model_fields[part].annotation)
+    return section
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(_model_in, get_args(annotation))), None)

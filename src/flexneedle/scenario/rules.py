@@ -1,0 +1,97 @@
+"""Rules between sections: geometry, layers, the target, and grids that would never end."""
+
+from collections.abc import Iterator, Sequence
+from math import isfinite
+
+from .apparatus import Setup, Tracker
+from .needle import Bevel, Needle
+from .problems import Problem
+from .settings import Phantom, Plan, Target
+from .tissue import Contact, Layer
+
+__all__ = ["geometry_problems", "grid_problems", "layer_problems", "plan_problems", "target_problems"]
+
+# The stretch 1 − b/h of a bevel that is held sideways stays above the floor stretch 0.3 of the tissue law.
+_GREATEST_OFFSET_SHARE = 0.7
+_MOST_GRID_POINTS = 20_000
+_MOST_READINGS_A_STEP = 10_000
+
+
+def geometry_problems(needle: Needle, setup: Setup) -> Iterator[Problem]:
+    """Tip before the guide at the start, base behind it (or behind the skin) at full stroke."""
+    guide, tip = setup.guide_to_skin_mm, setup.tip_to_skin_mm
+    if needle.bevel.length_mm >= needle.length_mm:
+        rule = f"must be below needle.length_mm ({needle.length_mm:g})"
+        yield Problem("needle.bevel.length_mm", needle.bevel.length_mm, rule)
+    if guide is not None and tip >= guide:
+        rule = f"the tip would start behind the guide: must be below setup.guide_to_skin_mm ({guide:g})"
+        yield Problem("setup.tip_to_skin_mm", tip, rule)
+    room = needle.length_mm + tip - (guide or 0.0)
+    if setup.stroke_mm >= room:
+        stop = "skin" if guide is None else "guide"
+        yield Problem(
+            "setup.stroke_mm",
+            setup.stroke_mm,
+            f"the base would reach the {stop}: must be below {room:g} with this needle length and start",
+        )
+
+
+def layer_problems(tissue: Sequence[Layer], bevel: Bevel) -> Iterator[Problem]:
+    """At least one layer, a thickness for each but the last, a bevel that no layer is too thin for."""
+    if not tissue:
+        yield Problem("tissue", None, "needs at least one layer: add a [[tissue]]")
+    for i, layer in enumerate(tissue):
+        yield from _thickness_problems(i, layer, is_last=i == len(tissue) - 1)
+        limit = _GREATEST_OFFSET_SHARE * layer.compression_length_mm
+        if bevel.offset_mm >= limit:
+            rule = f"must be below {limit:g}, 0.7 times tissue[{i}].compression_length_mm"
+            yield Problem("needle.bevel.offset_mm", bevel.offset_mm, rule)
+
+
+def _thickness_problems(i: int, layer: Layer, *, is_last: bool) -> Iterator[Problem]:
+    key = f"tissue.{i}.thickness_mm"
+    if is_last and layer.thickness_mm is not None:
+        yield Problem(key, layer.thickness_mm, "leave it out: the last layer goes on")
+    if not is_last and layer.thickness_mm is None:
+        yield Problem(key, None, "missing: only the last layer goes on without a thickness")
+
+
+def target_problems(setup: Setup, target: Target) -> Iterator[Problem]:
+    """Return what keeps a target out of reach: not in the tissue, beyond the stroke, or too far aside."""
+    depth, lateral = target.depth_mm, target.lateral_mm
+    if not (isfinite(depth) and depth > 0):
+        yield Problem("target.depth_mm", depth, "must be above 0, the skin")
+    elif depth > setup.max_depth:
+        rule = (
+            f"beyond the stroke: must be at most {setup.max_depth:g} (setup.stroke_mm - setup.tip_to_skin_mm)"
+        )
+        yield Problem("target.depth_mm", depth, rule)
+    if not abs(lateral) <= setup.max_lateral:
+        mover = "guide" if setup.has_guide else "base"
+        rule = f"must be at most {setup.max_lateral:g} in size, as far aside as the {mover} travels"
+        yield Problem("target.lateral_mm", lateral, rule)
+
+
+def plan_problems(plan: Plan) -> Iterator[Problem]:
+    """A covariance needs two elite samples."""
+    if plan.elite_count < 2:
+        rule = f"must leave at least 2 elite samples of plan.samples ({plan.samples})"
+        yield Problem("plan.elite_fraction", plan.elite_fraction, rule)
+
+
+def grid_problems(setup: Setup, contact: Contact, phantom: Phantom, tracker: Tracker) -> Iterator[Problem]:
+    """No spacing or step so small that a run would hang."""
+    smallest = setup.stroke_mm / _MOST_GRID_POINTS
+    grids = {
+        "setup.max_advance_mm": setup.max_advance_mm,
+        "contact.spacing_mm": contact.spacing_mm,
+        "phantom.contact_spacing_mm": phantom.contact_spacing_mm,
+        "phantom.step_mm": phantom.step_mm,
+    }
+    for key, value in grids.items():
+        if value < smallest:
+            yield Problem(key, value, f"must be at least {smallest:g}, setup.stroke_mm / {_MOST_GRID_POINTS}")
+    fastest = _MOST_READINGS_A_STEP * setup.insertion_speed_mm_s / setup.max_advance_mm
+    if tracker.rate_hz > fastest:
+        rule = f"must be at most {fastest:g}, {_MOST_READINGS_A_STEP} readings in a control step"
+        yield Problem("tracker.rate_hz", tracker.rate_hz, rule)

@@ -1,0 +1,122 @@
+"""The task and the settings of planner, controller and virtual phantom."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from .fields import Fraction, NonNegative, NonNegativeRange, Positive, PositiveRange, Section, count
+
+__all__ = ["Control", "Phantom", "Plan", "Target"]
+
+
+class Target(Section):
+    """Section `target`: where the tip is to arrive."""
+
+    depth_mm: float = 40.0
+    """x of the target."""
+    lateral_mm: float = 5.0
+    """y of the target."""
+
+    @property
+    def position(self) -> tuple[float, float]:
+        """(x, y), mm."""
+        return self.depth_mm, self.lateral_mm
+
+
+class Plan(Section):
+    """Section `plan`: the cross-entropy method and the cost of a plan."""
+
+    samples: int = count(128, least=2, most=100_000)
+    """N, control sequences in an iteration."""
+    iterations: int = count(25, least=1, most=10_000)
+    """Greatest number of iterations."""
+    elite_fraction: Annotated[float, Field(gt=0, le=1)] = 0.125
+    """ρ, share of the samples from which mean and covariance are fitted."""
+    smoothing: Annotated[float, Field(ge=0, lt=1)] = 0.3
+    """Share of the old mean and covariance that is kept in an iteration."""
+    primitives: int = count(6, least=1, most=1_000)
+    """Pieces of a control sequence, each constant over several steps."""
+    tolerance: Positive = 1e-3
+    """The search has converged once the cost of the elite spreads less than this, relative to its mean."""
+    advance_sigma_mm: NonNegative = 0.1
+    """First standard deviation of the advance of a step; 0 keeps it fixed."""
+    guide_sigma_mm: NonNegative = 0.25
+    """First standard deviation of the guide's travel in a step; 0 keeps it fixed."""
+    base_sigma_mm: NonNegative = 0.0
+    """First standard deviation of the base's lateral travel in a step; 0 keeps it fixed."""
+    base_turn_sigma_mrad: NonNegative = 0.0
+    """First standard deviation of the base's turn in a step; 0 keeps it fixed."""
+    accuracy_weight_per_mm: NonNegative = 20.0
+    """γ₁, cost of the distance between tip and target."""
+    energy_weight_per_mj: NonNegative = 5.0
+    """γ₂, cost of the strain energy W."""
+    deflection_weight: NonNegative = 0.002
+    """Q, cost of the needle's deflection in a step."""
+    guide_weight: NonNegative = 1.0
+    """R, cost of the guide's travel in a step."""
+    flip_weight: NonNegative = 0.3
+    """R of a turn of the bevel."""
+    steering_stiffness_factor: Annotated[float, Field(gt=0, le=1)] = 0.1
+    """Bending stiffness of the needle in the strategy `steering`, relative to its own."""
+
+    @property
+    def elite_count(self) -> int:
+        """Number of elite samples, rounded to the nearest."""
+        return round(self.samples * self.elite_fraction)
+
+    @property
+    def base_turn_sigma(self) -> float:
+        """First standard deviation of the base's turn in a step, rad."""
+        return 1e-3 * self.base_turn_sigma_mrad
+
+
+class Control(Section):
+    """Section `control`: the closed loop."""
+
+    samples: int = count(64, least=2, most=100_000)
+    """Control sequences in an iteration of a period."""
+    iterations: int = count(4, least=1, most=1_000)
+    """Iterations of a period."""
+    horizon: int = count(8, least=1, most=1_000)
+    """Steps that a period looks ahead."""
+    orientation_weight_mm: NonNegative = 5.0
+    """Cost of an angle off the planned path, as a distance: 1 rad weighs as much as this."""
+    curvature_per_m: NonNegative = 0.5
+    """κ of the two paths of the bang-bang rule."""
+    load_gain: Fraction = 0.3
+    """Share of a new tip load that is learnt in a period."""
+    depth_tolerance_mm: Positive = 0.01
+    """The insertion ends this close to the target depth."""
+    innovation_limit_mm: Positive = 2.0
+    """A measured tip further than this from the predicted one is not believed."""
+    hold_limit_s: Positive = 1.0
+    """The insertion is given up after so long without a measurement to believe."""
+    stale_after_s: Positive = 0.1
+    """A measurement older than this is not believed."""
+
+    @property
+    def curvature(self) -> float:
+        """κ, 1/mm."""
+        return 1e-3 * self.curvature_per_m
+
+
+class Phantom(Section):
+    """Section `phantom`: how the virtual phantom differs from what the controller believes."""
+
+    shear_modulus_factor: PositiveRange = (0.6, 1.6)
+    """Range of the factor on μ, uniform, each layer on its own."""
+    bevel_factor: NonNegativeRange = (0.5, 1.5)
+    """Range of the factor on the bevel offset, uniform."""
+    start_offset_sd_mm: NonNegative = 0.5
+    """Standard deviation of the base clamp's lateral position."""
+    start_angle_sd_mrad: NonNegative = 3.0
+    """Standard deviation of the base clamp's slope."""
+    contact_spacing_mm: Positive = 0.5
+    """Depth between the phantom's contact points."""
+    step_mm: Positive = 0.25
+    """Greatest travel in one step of the phantom's own simulation."""
+
+    @property
+    def start_angle_sd(self) -> float:
+        """Standard deviation of the base clamp's slope, rad."""
+        return 1e-3 * self.start_angle_sd_mrad
