@@ -1,6 +1,6 @@
 """Simulate, plan and steer flexible bevel-tip needles in soft tissue.
 
-Names are imported when they are first used: `import flexneedle` alone stays fast and does not load the compiler.
+Names are imported when they are first used: `import flexneedle` alone stays fast and loads no compiler.
 """
 
 from importlib import import_module

@@ -4,6 +4,7 @@ Exit status: 0 done, 1 failed, 2 bad input, 130 interrupted.
 """
 
 import argparse
+import io
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -37,6 +38,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(
+            errors="backslashreplace"
+        )  # a name that the terminal cannot show is no failure
     try:
         args = build_parser().parse_args(argv)
         status: int = args.handler(args)
@@ -69,5 +74,5 @@ def _complain(message: str) -> None:
 
 
 def _drop_stdout() -> None:
-    """Keep the interpreter from complaining about the closed pipe once more as it exits (Python docs, signal)."""
+    """Keep the interpreter from complaining about the closed pipe again as it exits (Python docs, signal)."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -11,6 +11,7 @@ import tomli_w
 from flexneedle.errors import ScenarioError
 
 from .model import Scenario
+from .problems import printable
 
 __all__ = ["dump_scenario", "load_scenario", "preset_names"]
 
@@ -41,7 +42,7 @@ def load_scenario(source: str | Path | Scenario) -> Scenario:
         data = (_PRESETS / (source + _SUFFIX)).read_bytes()
     else:
         data = _read(source)
-    label = _one_line(fspath(source))
+    label = printable(fspath(source))
     return Scenario.from_values(_parse(data, label), label)
 
 
@@ -51,7 +52,7 @@ def dump_scenario(scenario: Scenario) -> str:
 
 
 def _read(source: str | Path) -> bytes:
-    label = _one_line(fspath(source)) or '""'
+    label = printable(fspath(source)) or '""'
     try:
         with Path(source).open("rb") as file:
             return _read_bounded(file, label)
@@ -81,8 +82,4 @@ def _parse(data: bytes, label: str) -> dict[str, object]:
     except RecursionError:
         raise ScenarioError(f"{label}: not TOML: nested too deeply") from None
     except ValueError as error:
-        raise ScenarioError(f"{label}: not TOML: {_one_line(str(error))}") from None
-
-
-def _one_line(text: str) -> str:
-    return text if text.isprintable() else text.encode("unicode_escape").decode()
+        raise ScenarioError(f"{label}: not TOML: {printable(str(error))}") from None

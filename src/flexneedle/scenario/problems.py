@@ -10,7 +10,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 
 from .dotted import split_key
 
-__all__ = ["Problem", "describe", "key_path", "refuse", "to_line"]
+__all__ = ["Problem", "describe", "key_path", "printable", "refuse", "to_line"]
 
 _BROKEN = "broken_rules"
 _LONGEST_VALUE = 60
@@ -45,6 +45,11 @@ def describe(error: ValidationError, model: type[BaseModel]) -> list[str]:
     return [line for detail in told for line in _lines(detail, model)]
 
 
+def printable(text: str) -> str:
+    """Return the text in one line: line ends and other invisible characters escaped."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 def key_path(loc: Sequence[str | int]) -> str:
     """Return a path as it is written in messages: `tissue[1].alpha`."""
     path = ""
@@ -73,7 +78,7 @@ def _lines(detail: ErrorDetails, model: type[BaseModel]) -> list[str]:
 
 def _line(loc: Sequence[str | int], value: object, rule: str) -> str:
     shown = "" if value is None else f" = {_shown(value)}"
-    return f"{key_path(loc) or 'scenario'}{shown}: {rule}"
+    return printable(f"{key_path(loc) or 'scenario'}{shown}: {rule}")
 
 
 def _shown(value: object) -> str:

@@ -40,12 +40,14 @@ def layer_problems(tissue: Sequence[Layer], bevel: Bevel) -> Iterator[Problem]:
     """At least one layer, a thickness for each but the last, a bevel that no layer is too thin for."""
     if not tissue:
         yield Problem("tissue", None, "needs at least one layer: add a [[tissue]]")
+        return
     for i, layer in enumerate(tissue):
         yield from _thickness_problems(i, layer, is_last=i == len(tissue) - 1)
-        limit = _GREATEST_OFFSET_SHARE * layer.compression_length_mm
-        if bevel.offset_mm >= limit:
-            rule = f"must be below {limit:g}, 0.7 times tissue[{i}].compression_length_mm"
-            yield Problem("needle.bevel.offset_mm", bevel.offset_mm, rule)
+    shortest = min(range(len(tissue)), key=lambda i: tissue[i].compression_length_mm)
+    limit = _GREATEST_OFFSET_SHARE * tissue[shortest].compression_length_mm
+    if bevel.offset_mm >= limit:
+        rule = f"must be below {limit:g}, 0.7 times tissue[{shortest}].compression_length_mm"
+        yield Problem("needle.bevel.offset_mm", bevel.offset_mm, rule)
 
 
 def _thickness_problems(i: int, layer: Layer, *, is_last: bool) -> Iterator[Problem]:

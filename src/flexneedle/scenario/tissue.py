@@ -8,7 +8,7 @@ from .fields import NonNegative, Positive, Section, Title
 
 __all__ = ["Contact", "Layer"]
 
-# Between them the law's 0.3^(−α/2 − 1), at the floor stretch, and 2μ/α² stay far from overflow and cancellation.
+# Between them the law's 0.3^(−α/2 − 1), at the floor stretch, and 2μ/α² stay clear of overflow and rounding.
 _ALPHA_SMALLEST, _ALPHA_LARGEST = 0.01, 100.0
 
 

@@ -1,0 +1,123 @@
+"""`flexneedle scenario …`: what it prints, how it ends."""
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import flexneedle
+from flexneedle.cli import main as cli
+from flexneedle.errors import RunError
+from flexneedle.scenario import Scenario, load_scenario
+
+
+def run(capsys, *argv):
+    """Return exit status, stdout and the lines on stderr."""
+    status = cli.main(argv)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err.splitlines()
+
+
+def run_process(*argv, stdout=subprocess.PIPE):
+    return subprocess.run(
+        [sys.executable, "-m", "flexneedle", *argv],
+        stdout=stdout,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+
+
+def test_list_names_the_presets(capsys):
+    assert run(capsys, "scenario", "list") == (0, "phantom      Two-layer tissue phantom\n", [])
+
+
+def test_show_prints_the_scenario_with_its_defaults(capsys, minimal_text, scenario_file):
+    path = str(scenario_file(minimal_text))
+    status, out, err = run(capsys, "scenario", "show", path)
+    assert (status, err) == (0, [])
+    assert tomllib.loads(out)["plan"]["samples"] == 128
+    assert Scenario.from_values(tomllib.loads(out)) == load_scenario(path)
+
+
+def test_check_says_ok(capsys, minimal_text, scenario_file):
+    path = scenario_file(minimal_text)
+    assert run(capsys, "scenario", "check", str(path)) == (0, f"{path}: ok, Minimal\n", [])
+
+
+def test_check_prints_one_line_a_problem(capsys, minimal_text, scenario_file):
+    path = scenario_file(minimal_text.replace("alpha = 8.0", "alpha = 0").replace("100.0", "-1"))
+    assert run(capsys, "scenario", "check", str(path)) == (
+        2,
+        "",
+        [
+            f"flexneedle: {path}: setup.stroke_mm = -1: must be above 0",
+            f"flexneedle: {path}: tissue[0].alpha = 0: must not be 0",
+        ],
+    )
+
+
+def test_schema_describes_every_key_with_a_unit_or_a_meaning(capsys):
+    status, out, _ = run(capsys, "scenario", "schema")
+    schema = json.loads(out)
+    assert status == 0
+    assert set(schema["required"]) == {"name", "needle", "setup", "tissue"}
+    sections = schema["$defs"].values()
+    described = [
+        ("description" in field or "$ref" in field) for s in sections for field in s["properties"].values()
+    ]
+    assert all(described)
+
+
+@pytest.mark.parametrize("argv", [["scenario"], ["scenario", "show"], ["nonsense"], []])
+def test_wrong_arguments_end_with_2(argv, capsys):
+    with pytest.raises(SystemExit) as caught:
+        cli.main(argv)
+    assert caught.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("raised", "status", "told"),
+    [
+        (RunError("no such luck"), 1, ["flexneedle: no such luck"]),
+        (flexneedle.CommandError("db_x", 2, 1, "too far"), 2, ["flexneedle: db_x = 2: too far"]),
+        (KeyboardInterrupt(), 130, ["flexneedle: interrupted"]),
+        (OSError(28, "No space left on device"), 1, ["flexneedle: [Errno 28] No space left on device"]),
+    ],
+    ids=["run", "command", "interrupt", "disk"],
+)
+def test_errors_become_a_line_and_a_status(raised, status, told, capsys, monkeypatch):
+    def fail(_source):
+        raise raised
+
+    monkeypatch.setattr("flexneedle.scenario.load_scenario", fail)
+    assert run(capsys, "scenario", "show", "phantom") == (status, "", told)
+
+
+def test_a_process_ends_without_a_traceback():
+    done = run_process("scenario", "check", "/nowhere.toml")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == "flexneedle: /nowhere.toml: no such file, and no such preset (presets: phantom)\n"
+
+
+@pytest.mark.parametrize("argv", [["scenario", "schema"], ["--help"]])
+def test_a_closed_pipe_is_no_noise(argv):
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = run_process(*argv, stdout=writing)
+    os.close(writing)
+    assert done.stderr == ""
+
+
+def test_a_name_that_is_no_text_is_no_failure(minimal_text, tmp_path):
+    path = os.fsencode(tmp_path) + b"/\xff.toml"
+    Path(os.fsdecode(path)).write_text(minimal_text)
+    done = run_process("scenario", "check", path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.endswith("\\udcff.toml: ok, Minimal\n")

@@ -1,0 +1,40 @@
+"""What all tests share."""
+
+from pathlib import Path
+
+import pytest
+
+MINIMAL = """\
+name = "Minimal"
+
+[needle]
+gauge = "21G"
+
+[setup]
+tip_to_skin_mm = 10.0
+stroke_mm = 100.0
+
+[[tissue]]
+shear_modulus_kpa = 2.0
+alpha = 8.0
+compression_length_mm = 20.0
+engaged_width_mm = 5.0
+"""
+
+
+@pytest.fixture
+def minimal_text() -> str:
+    """The shortest scenario file: no guide, one layer."""
+    return MINIMAL
+
+
+@pytest.fixture
+def scenario_file(tmp_path):
+    """Return a function that writes a scenario file and returns its path."""
+
+    def write(content: str | bytes) -> Path:
+        path = tmp_path / "case.toml"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write

@@ -1,0 +1,368 @@
+"""Every rule of a scenario file has one line: file, key, value, rule."""
+
+import math
+import tomllib
+from importlib.resources import files
+
+import pytest
+import tomli_w
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flexneedle.errors import ScenarioError
+from flexneedle.scenario import Scenario, load_scenario
+
+PHANTOM = load_scenario("phantom")
+HUGE = 10**400
+ABOVE_ZERO = "must be above 0"
+NUMBER = "must be a number"
+FINITE = "must be a finite number"
+
+POSITIVE = [
+    "needle.outer_diameter_mm",
+    "needle.length_mm",
+    "needle.youngs_modulus_gpa",
+    "needle.bevel.length_mm",
+    "setup.guide_to_skin_mm",
+    "setup.tip_to_skin_mm",
+    "setup.stroke_mm",
+    "setup.max_advance_mm",
+    "setup.max_guide_step_mm",
+    "setup.max_guide_travel_mm",
+    "setup.max_base_step_mm",
+    "setup.max_base_travel_mm",
+    "setup.max_base_turn_step_mrad",
+    "setup.insertion_speed_mm_s",
+    "tissue[0].thickness_mm",
+    "tissue[1].shear_modulus_kpa",
+    "tissue[0].compression_length_mm",
+    "tissue[1].engaged_width_mm",
+    "contact.spacing_mm",
+    "plan.tolerance",
+    "control.depth_tolerance_mm",
+    "control.innovation_limit_mm",
+    "control.hold_limit_s",
+    "control.stale_after_s",
+    "tracker.rate_hz",
+    "phantom.contact_spacing_mm",
+    "phantom.step_mm",
+]
+
+NOT_NEGATIVE = [
+    "needle.inner_diameter_mm",
+    "needle.bevel.offset_mm",
+    "tissue[0].energy_weight",
+    "plan.advance_sigma_mm",
+    "plan.guide_sigma_mm",
+    "plan.base_sigma_mm",
+    "plan.base_turn_sigma_mrad",
+    "plan.accuracy_weight_per_mm",
+    "plan.energy_weight_per_mj",
+    "plan.deflection_weight",
+    "plan.guide_weight",
+    "plan.flip_weight",
+    "plan.smoothing",
+    "control.orientation_weight_mm",
+    "control.curvature_per_m",
+    "control.load_gain",
+    "tracker.jitter_mm",
+    "phantom.start_offset_sd_mm",
+    "phantom.start_angle_sd_mrad",
+]
+
+COUNTS = {
+    "needle.nodes": (2, 10_000),
+    "plan.samples": (2, 100_000),
+    "plan.iterations": (1, 10_000),
+    "plan.primitives": (1, 1_000),
+    "control.samples": (2, 100_000),
+    "control.iterations": (1, 1_000),
+    "control.horizon": (1, 1_000),
+}
+
+RULES = [
+    # types
+    ("needle.length_mm", True, NUMBER),
+    ("needle.length_mm", "150", NUMBER),
+    ("needle.length_mm", HUGE, NUMBER),
+    ("needle.length_mm", [150.0], NUMBER),
+    ("needle.nodes", 61.5, "must be a whole number"),
+    ("needle.nodes", True, "must be a whole number"),
+    ("needle.stylet", 1, "must be true or false"),
+    ("needle.bevel", 4.0, "must be a table"),
+    ("needle", "21G", "must be a table"),
+    ("tissue", {"alpha": 1.0}, "must be a list"),
+    ("tissue", [], "needs at least one layer"),
+    ("tissue[0]", 5, "must be a table"),
+    ("name", 5, "must be text in quotes"),
+    ("name", "", "must be one line of printable text"),
+    ("name", "two\nlines", "must be one line of printable text"),
+    ("name", "x" * 201, "must have at most 200 characters"),
+    ("phantom.bevel_factor", 1.0, "must be a list"),
+    ("phantom.bevel_factor", [1.0, 2.0, 3.0], "must be two numbers"),
+    ("phantom.bevel_factor[1]", True, NUMBER),
+    # not finite
+    ("tissue[0].alpha", math.nan, FINITE),
+    ("tissue[0].alpha", math.inf, FINITE),
+    ("setup.stroke_mm", math.inf, FINITE),
+    ("phantom.bevel_factor[0]", -math.inf, FINITE),
+    ("target.depth_mm", math.nan, FINITE),
+    # bounds
+    ("tissue[0].alpha", 0, "must not be 0"),
+    ("tissue[1].alpha", -1e-3, "must be between 0.01 and 100 in size"),
+    ("tissue[1].alpha", 1e3, "must be between 0.01 and 100 in size"),
+    ("needle.youngs_modulus_gpa", 1e300, "must be at most 1e+06"),
+    ("needle.outer_diameter_mm", 1e-300, "must be at least 1e-06"),
+    ("plan.elite_fraction", 0.0, ABOVE_ZERO),
+    ("plan.elite_fraction", 1.1, "must be at most 1"),
+    ("plan.elite_fraction", 0.01, "must leave at least 2 elite samples of plan.samples (128)"),
+    ("plan.smoothing", 1.0, "must be below 1"),
+    ("plan.steering_stiffness_factor", 0.0, ABOVE_ZERO),
+    ("control.load_gain", 1.1, "must be at most 1"),
+    ("phantom.shear_modulus_factor[0]", 0.0, ABOVE_ZERO),
+    ("phantom.bevel_factor[0]", -0.1, "must be at least 0"),
+    ("phantom.shear_modulus_factor", [1.6, 0.6], "the low end must not be above the high end"),
+    ("phantom.bevel_factor", [1.5, 0.5], "the low end must not be above the high end"),
+    # needle
+    ("needle.inner_diameter_mm", 0.819, "must be below outer_diameter_mm (0.819)"),
+    ("needle.bevel.offset_mm", 14.0, "must be below 14, 0.7 times tissue[0].compression_length_mm"),
+    ("needle.bevel.length_mm", 150.0, "must be below needle.length_mm (150)"),
+    # geometry
+    (
+        "setup.tip_to_skin_mm",
+        41.0,
+        "the tip would start behind the guide: must be below setup.guide_to_skin_mm (41)",
+    ),
+    ("setup.stroke_mm", 137.5, "the base would reach the guide: must be below 137.5"),
+    ("target.depth_mm", 0.0, "must be above 0, the skin"),
+    ("target.depth_mm", 81.6, "beyond the stroke: must be at most 81.5"),
+    ("target.lateral_mm", 15.1, "must be at most 15 in size, as far aside as the guide travels"),
+    ("target.lateral_mm", -15.1, "must be at most 15 in size, as far aside as the guide travels"),
+    # layers
+    ("tissue[1].thickness_mm", 20.0, "leave it out: the last layer goes on"),
+    # grids that would never end
+    ("setup.max_advance_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
+    ("contact.spacing_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
+    ("phantom.contact_spacing_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
+    ("phantom.step_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
+    ("tracker.rate_hz", 1e6, "must be at most 50000, 10000 readings in a control step"),
+    # unknown keys
+    ("needle.lenght_mm", 150.0, "unknown key; did you mean length_mm? valid keys: gauge, stylet,"),
+    ("needle.bevel.b", 4.0, "unknown key; valid keys: offset_mm, length_mm"),
+    ("tissue[1].mu", 4.0, "unknown key; valid keys: name, thickness_mm,"),
+    ("tisue", [], "unknown key; did you mean tissue? valid keys: name, needle,"),
+]
+
+
+def problems(values, source="case.toml"):
+    with pytest.raises(ScenarioError) as caught:
+        Scenario.from_values(values, source)
+    lines = caught.value.problems
+    assert all(line.startswith(f"{source}: ") and line.isprintable() for line in lines)
+    return [line.removeprefix(f"{source}: ") for line in lines]
+
+
+def changed(key, value):
+    """Return the phantom's values with one value set, by the path that messages use; None takes it out."""
+    values = PHANTOM.values()
+    *way, last = [
+        int(part) if part.isdigit() else part for part in key.replace("[", ".").replace("]", "").split(".")
+    ]
+    table = values
+    for part in way:
+        table = table[part]
+    table[last] = value
+    if value is None:
+        del table[last]
+    return values
+
+
+@pytest.mark.parametrize(("key", "value", "rule"), RULES, ids=lambda part: str(part)[:30])
+def test_a_broken_rule_is_told_in_one_line(key, value, rule):
+    (line,) = problems(changed(key, value))
+    told_key, told = line.split(": ", maxsplit=1)
+    assert told_key.split(" = ")[0] == key
+    assert told.startswith(rule)
+
+
+@pytest.mark.parametrize("key", POSITIVE)
+@pytest.mark.parametrize("value", [0, -1.0])
+def test_zero_and_less_is_refused(key, value):
+    assert problems(changed(key, value)) == [f"{key} = {value}: {ABOVE_ZERO}"]
+
+
+@pytest.mark.parametrize("key", NOT_NEGATIVE)
+def test_less_than_zero_is_refused(key):
+    assert problems(changed(key, -0.5)) == [f"{key} = -0.5: must be at least 0"]
+
+
+@pytest.mark.parametrize(("key", "bounds"), COUNTS.items())
+def test_counts_have_bounds(key, bounds):
+    least, most = bounds
+    assert problems(changed(key, least - 1)) == [f"{key} = {least - 1}: must be at least {least}"]
+    assert problems(changed(key, most + 1)) == [f"{key} = {most + 1}: must be at most {most:g}"]
+
+
+def test_every_number_of_the_schema_is_covered_by_a_test_of_its_bounds():
+    tested = {key for key, _, _ in RULES} | set(POSITIVE) | set(NOT_NEGATIVE) | set(COUNTS)
+    names = {key.replace("[0]", "").replace("[1]", "") for key in tested}
+    numbers = {
+        key.replace(".0", "").replace(".1", "") for key, value in PHANTOM.flat().items() if value is not True
+    }
+    assert numbers - names == {"tissue.name"}
+
+
+@pytest.mark.parametrize("key", ["name", "needle", "setup", "tissue", "setup.stroke_mm", "tissue[0].alpha"])
+def test_a_required_key_is_missed(key):
+    assert problems(changed(key, None)) == [f"{key}: missing"]
+
+
+@pytest.mark.parametrize("key", ["shear_modulus_kpa", "alpha", "compression_length_mm", "engaged_width_mm"])
+def test_a_layer_has_no_hidden_mechanics(key):
+    assert problems(changed(f"tissue[1].{key}", None)) == [f"tissue[1].{key}: missing"]
+
+
+def test_a_thickness_is_missing_only_in_the_last_layer():
+    (line,) = problems(changed("tissue[0].thickness_mm", None))
+    assert line == "tissue[0].thickness_mm: missing: only the last layer goes on without a thickness"
+
+
+def test_a_range_misses_its_high_end():
+    assert problems(changed("phantom.bevel_factor", [1.0])) == ["phantom.bevel_factor[1]: missing"]
+
+
+def test_a_gauge_with_diameters_is_refused():
+    assert problems(changed("needle.gauge", "21G")) == [
+        "needle.outer_diameter_mm = 0.819: leave it out: gauge 21G gives it",
+        "needle.inner_diameter_mm = 0.0: leave it out: gauge 21G gives it",
+    ]
+
+
+def test_neither_gauge_nor_diameter_is_refused():
+    values = changed("needle.outer_diameter_mm", None)
+    assert problems(values) == ["needle.outer_diameter_mm: missing: give it, or a gauge such as 21G"]
+
+
+def test_an_unknown_gauge_names_the_gauges():
+    (line,) = problems(changed("needle.gauge", "16G"))
+    assert line.startswith('needle.gauge = "16G": must be one of 17G, 18G, 19G')
+    assert line.endswith("26G, 27G")
+
+
+def test_without_a_guide_the_base_must_not_reach_the_skin():
+    values = changed("setup.guide_to_skin_mm", None)
+    values["setup"]["stroke_mm"] = 178.5
+    (line,) = problems(values)
+    assert line.startswith("setup.stroke_mm = 178.5: the base would reach the skin: must be below 178.5")
+
+
+def test_a_thin_layer_below_is_judged_too():
+    (line,) = problems(changed("tissue[1].compression_length_mm", 5.0))
+    assert (
+        line == "needle.bevel.offset_mm = 4.0: must be below 3.5, 0.7 times tissue[1].compression_length_mm"
+    )
+
+
+def test_all_problems_are_told_at_once():
+    values = changed("tissue[0].alpha", 0)
+    values["needle"]["nodes"] = 1
+    values["plan"]["sample"] = 5
+    assert [line.split(" = ")[0] for line in problems(values)] == [
+        "needle.nodes",
+        "tissue[0].alpha",
+        "plan.sample",
+    ]
+
+
+def test_a_long_or_odd_value_stays_one_short_line():
+    (line,) = problems(changed("needle.length_mm", "a\nb" * 1000))
+    assert len(line) < 120
+    (line,) = problems({**PHANTOM.values(), "odd\nkey": {"x": 1}})
+    assert line.startswith('"odd\\nkey" = {…}: unknown key')
+
+
+json_like = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=5,
+)
+
+
+@given(key=st.sampled_from(sorted(PHANTOM.flat())), value=json_like)
+def test_any_value_gives_a_scenario_or_one_line_each(key, value):
+    try:
+        PHANTOM.with_values({key: value})
+        told = ["fine"]
+    except ScenarioError as error:
+        told = list(error.problems)
+    assert told
+    assert all(line.isprintable() for line in told)
+
+
+# files
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b'name = "\xff"', "not UTF-8 (at line 1)"),
+        ('name = "a"\n'.encode("utf-16"), "not UTF-8 (at line 1)"),
+        (b'name = "a"\nneedle = [\n', "not TOML: Invalid value (at end of document)"),
+        (b'name = "a"\nlength = 1 mm\n', "not TOML: "),
+        (b"a = " + b"[" * 100_000, "not TOML: nested too deeply"),
+        (b"a = " + b"1" * 10_000, "not TOML: "),
+        (b"#" * 1_000_001, "larger than 1000000 bytes, not a scenario file"),
+        (b"", "name: missing"),
+    ],
+    ids=["latin", "utf-16", "end", "syntax", "deep", "digits", "large", "empty"],
+)
+def test_a_file_that_is_no_scenario_is_refused(content, told, scenario_file):
+    path = scenario_file(content)
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(path)
+    assert caught.value.problems[0].startswith(f"{path}: {told}")
+
+
+def test_a_syntax_error_names_its_line(scenario_file):
+    with pytest.raises(ScenarioError, match=r"not TOML: .*\(at line 2, column 12\)"):
+        load_scenario(scenario_file('name = "a"\nlength = 1 mm\n'))
+
+
+def test_a_value_in_a_file_is_told_with_the_file(scenario_file):
+    text = (files("flexneedle.scenario") / "presets" / "phantom.toml").read_text(encoding="utf-8")
+    path = scenario_file(text.replace("offset_mm = 4.0", "offset_mm = inf"))
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(path)
+    assert str(caught.value) == f"{path}: needle.bevel.offset_mm = inf: must be a finite number"
+
+
+def test_a_byte_order_mark_and_windows_line_ends_are_accepted(minimal_text, scenario_file):
+    content = b"\xef\xbb\xbf" + minimal_text.replace("\n", "\r\n").encode()
+    assert load_scenario(scenario_file(content)).name == "Minimal"
+
+
+@pytest.mark.parametrize(
+    ("source", "told"),
+    [
+        ("phantm", "phantm: no such file, and no such preset (presets: phantom)"),
+        ("", '"": is a directory'),
+        ("/", "/: is a directory, not a scenario file"),
+        ("a\0b", "a\\x00b: cannot be read"),
+        ("a\nb", "a\\nb: no such file"),
+        ("a/" * 5000, "a/a/"),
+        ("/dev/zero", "/dev/zero: larger than 1000000 bytes"),
+        (None, "a scenario is a preset name, a path or a Scenario, not NoneType"),
+    ],
+)
+def test_a_source_that_cannot_be_read_is_refused(source, told):
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(source)
+    (line,) = caught.value.problems
+    assert line.startswith(told)
+    assert line.isprintable()
+
+
+def test_the_written_file_loads_by_path_and_by_name(scenario_file):
+    path = scenario_file(tomli_w.dumps(PHANTOM.values()))
+    assert load_scenario(path) == load_scenario(str(path)) == PHANTOM
+    assert Scenario.from_values(tomllib.loads(path.read_text())) == PHANTOM

@@ -1,0 +1,52 @@
+"""The package: what it exports, and that importing it costs nothing."""
+
+import subprocess
+import sys
+from importlib.metadata import version
+
+import pytest
+
+import flexneedle
+
+HEAVY = {"numba", "numpy", "matplotlib", "pydantic", "rosbags", "mcap"}
+
+
+def modules_after(*arguments: str) -> set[str]:
+    """Return the names of the top-level modules that a fresh interpreter has loaded after its work."""
+    script = (
+        "import sys, atexit; atexit.register(lambda: print('\\n' + ' '.join(sys.modules), file=sys.stderr)); "
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script + arguments[0], *arguments[1:]], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return {name.split(".")[0] for name in done.stderr.splitlines()[-1].split()}
+
+
+def test_import_loads_nothing_heavy():
+    assert not modules_after("import flexneedle") & HEAVY
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["scenario", "--help"]])
+def test_help_loads_nothing_heavy(arguments):
+    assert not modules_after("from flexneedle.cli.main import main; sys.exit(main())", *arguments) & HEAVY
+
+
+def test_loading_a_scenario_does_not_load_the_compiler():
+    loaded = modules_after("import flexneedle; flexneedle.load_scenario('phantom')")
+    assert not loaded & {"numba", "numpy", "matplotlib"}
+
+
+def test_public_names_are_listed():
+    assert dir(flexneedle) == sorted(flexneedle.__all__)
+    assert flexneedle.load_scenario("phantom").name
+    assert flexneedle.ScenarioError.__module__ == "flexneedle.errors"
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        flexneedle.nonsense  # noqa: B018
+
+
+def test_the_version_is_that_of_the_distribution():
+    assert flexneedle.__version__ == version("flexneedle")
