@@ -1,0 +1,78 @@
+"""A control period as one row of named scalars: the columns of the CSV, the keys of `/control/status`.
+
+Names end in their unit; numbers are exact (`repr`), so that a period comes back from its row to the last bit.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from flexneedle.ports import Sample
+from flexneedle.trace.records import Floats, Period
+
+__all__ = ["COLUMNS", "from_row", "to_row"]
+
+_Scalar = Callable[[str], Any]
+
+
+def _command(name: str) -> tuple[tuple[str, _Scalar], ...]:
+    moves = ("db_x_mm", "db_y_mm", "db_theta_rad", "dg_y_mm")
+    return (*((f"{name}_{move}", float) for move in moves), (f"{name}_flip", int))
+
+
+def _pose(name: str) -> tuple[tuple[str, _Scalar], ...]:
+    return tuple((f"{name}_{part}", float) for part in ("x_mm", "y_mm", "theta_rad"))
+
+
+# Field of Period: its columns, each with what reads it back. A field of several columns is a tuple.
+_FIELDS: dict[str, tuple[tuple[str, _Scalar], ...]] = {
+    "index": (("index", int),),
+    "time": (("time_s", float),),
+    "command": _command("command"),
+    "applied": _command("applied"),
+    "sample": (("sample_time_s", float), ("sample_x_mm", float), ("sample_y_mm", float)),
+    "verdict": (("verdict", str),),
+    "innovation": (("innovation_x_mm", float), ("innovation_y_mm", float)),
+    "estimate": _pose("estimate"),
+    "base": _pose("base"),
+    "guide": (("guide_y_mm", float),),
+    "bevel": (("bevel", int),),
+    "strain_energy": (("strain_energy_mj", float),),
+    "tip_load": (("tip_load_n", float),),
+    "path": _pose("path"),
+    "cost": (("cost", float),),
+    "spread": (("spread_mm", float),),
+    "decision": (("decision", str),),
+    "true_tip": _pose("true"),
+    "true_strain_energy": (("true_strain_energy_mj", float),),
+}
+
+COLUMNS: tuple[str, ...] = tuple(name for columns in _FIELDS.values() for name, _ in columns)
+"""Names of the columns, in order."""
+
+
+def to_row(period: Period) -> dict[str, str]:
+    """Return the scalars of a period as text by column; what is missing is empty."""
+    return dict(cell for field in _FIELDS for cell in _cells(field, getattr(period, field)))
+
+
+def from_row(row: Mapping[str, str], shape: Floats, durations: dict[str, float]) -> Period:
+    """Return the period of a row; raises KeyError or ValueError where the row is not one of `to_row`."""
+    return Period(shape=shape, durations=durations, **{field: _value(field, row) for field in _FIELDS})
+
+
+def _cells(field: str, value: Any) -> Iterator[tuple[str, str]]:
+    if isinstance(value, Sample):
+        value = (value.time, value.x, value.y)
+    columns = _FIELDS[field]
+    parts = value if isinstance(value, tuple) else (value,) * len(columns)
+    for (name, kind), part in zip(columns, parts, strict=True):
+        yield name, "" if part is None else part if kind is str else repr(kind(part))
+
+
+def _value(field: str, row: Mapping[str, str]) -> Any:
+    parts: Any = tuple(kind(row[name]) if row[name] or kind is str else None for name, kind in _FIELDS[field])
+    if field == "sample":
+        return Sample(*parts)
+    if len(parts) == 1:
+        return parts[0]
+    return parts if parts[0] is not None else None

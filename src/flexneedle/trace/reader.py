@@ -1,0 +1,97 @@
+"""Reading `trace.mcap` back, finished or not."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from struct import error as StructError
+from typing import Any
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Attachment, Channel, McapRecord, Message, Metadata
+from mcap.stream_reader import CRCValidationError, StreamReader
+
+from flexneedle.errors import InputError
+from flexneedle.trace.columns import from_row
+from flexneedle.trace.messages import STORE, DiagnosticArray, points_of
+from flexneedle.trace.messages import Path as PathMessage
+from flexneedle.trace.records import Floats, Period
+from flexneedle.trace.topics import SHAPE, STATUS, TIMING, TOPICS
+
+__all__ = ["Trace", "read_trace"]
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """What a trace holds. `note` is one line about a missing or damaged end, "" for a whole file."""
+
+    periods: tuple[Period, ...]
+    about: dict[str, str]
+    scenario: dict[str, Any]
+    note: str
+
+
+def read_trace(path: Path) -> Trace:
+    """Return what can be read of a trace, up to its last whole period.
+
+    Raises InputError if there is no such file or if it is no trace.
+    """
+    collector = _Collector()
+    try:
+        with path.open("rb") as file:
+            note = _collect(file, collector)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    if collector.about is None:
+        raise InputError(f"{path}: not a trace of flexneedle{': ' + note if note else ''}")
+    return Trace(tuple(collector.periods), collector.about, collector.scenario, note and f"{path}: {note}")
+
+
+def _collect(file: Any, collector: "_Collector") -> str:
+    """Feed all whole records to the collector; return what is wrong with the rest."""
+    try:
+        for record in StreamReader(file, validate_crcs=True).records:
+            collector.take(record)
+    except (McapError, CRCValidationError, StructError, KeyError, ValueError) as error:
+        ending = f"at the end of {len(collector.periods)} whole periods"
+        return f"not finished: reading stopped {ending} ({type(error).__name__})"
+    return ""
+
+
+class _Collector:
+    """Puts the records of a file together to periods."""
+
+    def __init__(self) -> None:
+        self.periods: list[Period] = []
+        self.about: dict[str, str] | None = None
+        self.scenario: dict[str, Any] = {}
+        self._topics: dict[int, str] = {}
+        self._shape: Floats = np.empty((0, 3))
+        self._durations: dict[str, float] = {}
+
+    def take(self, record: McapRecord) -> None:
+        """Take one record of the file."""
+        if isinstance(record, Message):
+            self._hear(self._topics[record.channel_id], record.data)
+        elif isinstance(record, Channel):
+            self._topics[record.id] = record.topic
+        elif isinstance(record, Metadata) and record.name == "flexneedle":
+            self.about = dict(record.metadata)
+        elif isinstance(record, Attachment) and record.name == "scenario.json":
+            self.scenario = json.loads(record.data)
+
+    def _hear(self, topic: str, data: bytes) -> None:
+        if topic not in (SHAPE, TIMING, STATUS):
+            return
+        message = STORE.deserialize_cdr(data, TOPICS[topic])
+        if isinstance(message, PathMessage):
+            self._shape = points_of(message)
+        elif isinstance(message, DiagnosticArray) and topic == TIMING:
+            self._durations = {name[:-2]: float(value) for name, value in _pairs(message)}
+        elif isinstance(message, DiagnosticArray):
+            self.periods.append(from_row(dict(_pairs(message)), self._shape, self._durations))
+
+
+def _pairs(message: DiagnosticArray) -> Iterator[tuple[str, str]]:
+    return ((pair.key, pair.value) for pair in message.status[0].values)

@@ -1,0 +1,112 @@
+"""Which topics a run has, with their types, and what a plan or a period says on each."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from flexneedle.trace.columns import to_row
+from flexneedle.trace.messages import (
+    Message,
+    diagnostics,
+    joints,
+    nanoseconds,
+    number,
+    path,
+    pose,
+    vector,
+)
+from flexneedle.trace.records import Floats, Period
+
+__all__ = [
+    "LATCHED",
+    "PLAN",
+    "SHAPE",
+    "STATUS",
+    "TIMING",
+    "TOPICS",
+    "Spoken",
+    "period_messages",
+    "plan_message",
+]
+
+PLAN, SHAPE, STATUS, TIMING = "/plan/path", "/needle/shape", "/control/status", "/timing"
+
+_POSE, _PATH, _JOINTS = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path", "sensor_msgs/msg/JointState"
+_NUMBER, _STATUS = "std_msgs/msg/Float64", "diagnostic_msgs/msg/DiagnosticArray"
+
+TOPICS: dict[str, str] = {
+    PLAN: _PATH,  # planned poses of the tip; once, at the start
+    SHAPE: _PATH,  # nodes of the needle as estimated
+    "/tip/measured": _POSE,  # the tracker's reading, at the time that it was taken; it sees no angle
+    "/tip/estimate": _POSE,
+    "/tip/path": _POSE,  # planned pose at the estimated depth
+    "/tip/true": _POSE,  # of the virtual phantom; the controller never sees it
+    "/command": _JOINTS,  # what the period moves: increments; bevel +1 turns it over, −1 leaves it
+    "/command/applied": _JOINTS,  # the same as the actuators carried it out
+    "/joint_states": _JOINTS,  # where base and guide stand after it; bevel ±1 is its side
+    "/control/cost": _NUMBER,
+    "/control/spread": _NUMBER,  # m
+    "/control/tip_load": _NUMBER,  # N
+    "/control/innovation": "geometry_msgs/msg/Vector3Stamped",  # m
+    "/tissue/strain_energy": _NUMBER,  # J, of the estimate
+    "/tissue/true_strain_energy": _NUMBER,  # J, of the virtual phantom
+    TIMING: _STATUS,  # wall-clock durations of the period, s
+    STATUS: _STATUS,  # every scalar of the period, exact, in the columns of the CSV; ends the period
+}
+"""Message type by topic. Units are SI, poses are in the frame `skin`."""
+
+LATCHED = (PLAN,)
+"""Topics whose one message later subscribers want, too."""
+
+
+@dataclass(frozen=True)
+class Spoken:
+    """One message on its topic, at a time (ns since the start of the run)."""
+
+    topic: str
+    time: int
+    message: Message
+
+
+def plan_message(tips: Floats) -> Spoken:
+    """Return the planned poses of the tip (m + 1, 3) as said once at time 0."""
+    return Spoken(PLAN, 0, path(0.0, tips))
+
+
+def period_messages(period: Period) -> Iterator[Spoken]:
+    """Yield what a period says; `/control/status` comes last and closes it."""
+    now = nanoseconds(period.time)
+    for topic, message in (*_tip(period), *_control(period), *_tissue(period), *_status(period)):
+        yield Spoken(topic, now, message)
+
+
+def _tip(period: Period) -> Iterator[tuple[str, Message]]:
+    yield SHAPE, path(period.time, period.shape)
+    if period.sample.x is not None and period.sample.y is not None:
+        yield "/tip/measured", pose(period.sample.time, (period.sample.x, period.sample.y, 0.0))
+    yield "/tip/estimate", pose(period.time, period.estimate)
+    yield "/tip/path", pose(period.time, period.path)
+    if period.true_tip is not None:
+        yield "/tip/true", pose(period.time, period.true_tip)
+
+
+def _control(period: Period) -> Iterator[tuple[str, Message]]:
+    yield "/command", joints(period.time, period.command)
+    yield "/command/applied", joints(period.time, period.applied)
+    yield "/joint_states", joints(period.time, (*period.base, period.guide, period.bevel))
+    yield "/control/cost", number(period.cost)
+    yield "/control/spread", number(period.spread * 1e-3)
+    yield "/control/tip_load", number(period.tip_load)
+    yield "/control/innovation", vector(period.time, *period.innovation)
+
+
+def _tissue(period: Period) -> Iterator[tuple[str, Message]]:
+    yield "/tissue/strain_energy", number(period.strain_energy * 1e-3)
+    if period.true_strain_energy is not None:
+        yield "/tissue/true_strain_energy", number(period.true_strain_energy * 1e-3)
+
+
+def _status(period: Period) -> Iterator[tuple[str, Message]]:
+    durations = {f"{name}_s": repr(float(seconds)) for name, seconds in period.durations.items()}
+    yield TIMING, diagnostics(period.time, "timing", durations)
+    good = period.verdict == "ok"
+    yield STATUS, diagnostics(period.time, "control", to_row(period), text=period.decision, good=good)

@@ -1,0 +1,27 @@
+"""Ctrl-C waits until a record is whole."""
+
+import signal
+
+import pytest
+
+from flexneedle.trace.shield import uninterrupted
+
+
+def test_an_interrupt_comes_after_the_block():
+    done = []
+
+    def interrupted_block():
+        with uninterrupted():
+            signal.raise_signal(signal.SIGINT)
+            done.append("block")
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_block()
+    assert done == ["block"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_without_an_interrupt_nothing_happens():
+    with uninterrupted():
+        pass
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -1,0 +1,194 @@
+"""`trace.mcap`: what goes in comes out, for us and for others, and a kill loses nothing."""
+
+import signal
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.exceptions import EndOfFile
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.stream_reader import StreamReader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from flexneedle.errors import InputError
+from flexneedle.trace.columns import COLUMNS, to_row
+from flexneedle.trace.reader import read_trace
+from flexneedle.trace.topics import TOPICS
+from flexneedle.trace.writer import TraceWriter
+from synthetic import blind, make_periods, make_plan
+
+PLAN = make_plan()
+PERIODS = list(make_periods(PLAN))[:12]
+ABOUT = {"seed": "0", "flexneedle": "0.1.0"}
+SCENARIO = {"name": "Größe", "target": {"depth_mm": 40.0}}
+
+WRITE_AND_DIE = """
+import os, signal, sys
+sys.path.insert(0, sys.argv[2])
+from pathlib import Path
+from synthetic import make_periods, make_plan
+from flexneedle.trace.writer import TraceWriter
+
+plan = make_plan()
+writer = TraceWriter(Path(sys.argv[1]), plan, about={"seed": "0"}, scenario={})
+for period in list(make_periods(plan))[:12]:
+    writer.add(period)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def write(path, periods=PERIODS):
+    with TraceWriter(path, PLAN, about=ABOUT, scenario=SCENARIO) as writer:
+        for period in periods:
+            writer.add(period)
+    return path
+
+
+def messages(path):
+    """Return all messages but the wall-clock ones, by the stock reader."""
+    with path.open("rb") as file:
+        found = make_reader(file).iter_messages(log_time_order=False)
+        return [(c.topic, m.log_time, m.data) for _, c, m in found if c.topic != "/timing"]
+
+
+def until_the_end(records):
+    """Yield what comes before the file ends too early."""
+    try:
+        yield from records
+    except EndOfFile:
+        return
+    pytest.fail("the file ends as if it were finished")
+
+
+@pytest.fixture(scope="module")
+def trace_file(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("trace") / "trace.mcap")
+
+
+@pytest.fixture(scope="module")
+def killed_file(tmp_path_factory):
+    """The trace of a process that was killed (SIGKILL) after its 12th period."""
+    path = tmp_path_factory.mktemp("killed") / "trace.mcap"
+    script = [sys.executable, "-c", WRITE_AND_DIE, str(path), str(Path(__file__).parents[1])]
+    assert subprocess.run(script, check=False).returncode == -signal.SIGKILL
+    return path
+
+
+def test_periods_come_back_to_the_last_bit_of_every_scalar(trace_file):
+    trace = read_trace(trace_file)
+    assert [to_row(p) for p in trace.periods] == [to_row(p) for p in PERIODS]
+    assert [p.durations for p in trace.periods] == [p.durations for p in PERIODS]
+    assert (trace.about, trace.scenario, trace.note) == (ABOUT, SCENARIO, "")
+
+
+def test_shapes_come_back(trace_file):
+    for again, period in zip(read_trace(trace_file).periods, PERIODS, strict=True):
+        np.testing.assert_allclose(again.shape, period.shape, rtol=1e-14, atol=1e-14)
+
+
+def test_a_blind_period_comes_back(tmp_path):
+    period = blind(PERIODS[3])
+    (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
+    assert to_row(again) == to_row(period)
+    assert (again.sample.x, again.true_tip, again.true_strain_energy) == (None, None, None)
+    assert (again.verdict, again.sample.time) == ("missing", period.sample.time)
+
+
+def test_columns_carry_units():
+    bare = {"index", "verdict", "bevel", "cost", "decision", "command_flip", "applied_flip"}
+    units = {"mm", "rad", "s", "mj", "n"}
+    assert {name for name in COLUMNS if name.rsplit("_", 1)[-1] not in units} == bare
+
+
+def test_every_topic_is_heard_each_period(trace_file):
+    with trace_file.open("rb") as file:
+        heard = Counter(channel.topic for _, channel, _ in make_reader(file).iter_messages())
+    assert heard == {topic: 1 if topic == "/plan/path" else len(PERIODS) for topic in TOPICS}
+
+
+def test_rosbags_reads_types_units_and_frame(trace_file):
+    with AnyReader([trace_file], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        heard = {
+            c.topic: (time, reader.deserialize(raw, c.msgtype)) for c, time, raw in reader.messages()
+        }  # the last one of each topic
+    last = PERIODS[-1]
+    time, estimate = heard["/tip/estimate"]
+    assert time == round(last.time * 1e9)
+    assert estimate.header.frame_id == "skin"
+    assert estimate.pose.position.y == pytest.approx(last.estimate[1] * 1e-3, rel=1e-15)
+    assert 2 * estimate.pose.orientation.z == pytest.approx(last.estimate[2], rel=1e-3)
+    assert heard["/tissue/true_strain_energy"][1].data == last.true_strain_energy * 1e-3
+    command = heard["/command"][1]
+    assert dict(zip(command.name, command.position, strict=True))["base_x"] == last.command[0] * 1e-3
+    assert len(heard["/needle/shape"][1].poses) == len(last.shape)
+    measured = heard["/tip/measured"][1].header.stamp
+    assert measured.sec + measured.nanosec * 1e-9 == pytest.approx(last.sample.time)
+
+
+def test_the_plan_is_latched(trace_file):
+    with trace_file.open("rb") as file:
+        channels = make_reader(file).get_summary().channels.values()
+    latched = {c.topic for c in channels if "durability: 1" in c.metadata.get("offered_qos_profiles", "")}
+    assert latched == {"/plan/path"}
+
+
+def test_content_but_for_timing_is_the_same_for_the_same_run(trace_file, tmp_path):
+    slower = [p.__class__(**{**vars(p), "durations": {"total": 1.0}}) for p in PERIODS]
+    assert messages(trace_file) == messages(write(tmp_path / "again.mcap", slower))
+
+
+def test_a_killed_writer_leaves_all_its_periods(killed_file):
+    trace = read_trace(killed_file)
+    assert [to_row(p) for p in trace.periods] == [to_row(p) for p in PERIODS]
+    assert "not finished: reading stopped at the end of 12 whole periods" in trace.note
+
+
+def test_a_killed_writer_leaves_a_file_for_the_stock_reader(killed_file):
+    with killed_file.open("rb") as file:
+        found = NonSeekingReader(file).iter_messages(log_time_order=False)
+        topics = [channel.topic for _, channel, _ in until_the_end(found)]
+    assert topics.count("/control/status") == 12
+
+
+def test_a_killed_writer_ends_at_a_record(killed_file):
+    size = killed_file.stat().st_size
+    with killed_file.open("rb") as file:
+        positions = [file.tell() for _ in until_the_end(StreamReader(file, emit_chunks=True).records)]
+    assert positions[-1] == size
+
+
+def test_a_torn_tail_costs_only_the_torn_period(trace_file, tmp_path):
+    torn = tmp_path / "torn.mcap"
+    data = trace_file.read_bytes()
+    counts = []
+    for length in range(len(data) // 2, len(data), 997):
+        torn.write_bytes(data[:length])
+        trace = read_trace(torn)
+        counts.append(len(trace.periods))
+        assert trace.note
+    assert counts == sorted(counts)
+    assert counts[-1] == len(PERIODS)
+
+
+@pytest.mark.parametrize("content", [b"", b"no trace at all", b"\x89MCAP0\r\n"])
+def test_a_file_that_is_no_trace_is_refused(content, tmp_path):
+    path = tmp_path / "trace.mcap"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="not a trace of flexneedle"):
+        read_trace(path)
+
+
+def test_a_missing_trace_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"trace\.mcap: cannot be read: No such file"):
+        read_trace(tmp_path / "trace.mcap")
+
+
+def test_a_trace_is_never_overwritten(trace_file):
+    before = trace_file.read_bytes()
+    with pytest.raises(FileExistsError):
+        TraceWriter(trace_file, PLAN, about=ABOUT, scenario=SCENARIO)
+    assert trace_file.read_bytes() == before
