@@ -1,0 +1,101 @@
+"""Steps of an insertion: move, solve, cut (docs/theory.md section 6), alone and in batches."""
+
+import math
+
+import numpy as np
+
+from flexneedle.mechanics import needle as nd
+from flexneedle.mechanics.compile import inner, kernel
+from flexneedle.mechanics.model import ESSENTIAL
+
+
+@inner
+def _move(model, s, rest, command):
+    """Begin a step: remember where the tip is, apply (db_x, db_y, db_theta, dg_y, flip)."""
+    s[nd.CUT_X], s[nd.CUT_Y], s[nd.CUT_TURN] = s[nd.TIP_X], s[nd.TIP_Y], s[nd.TIP_TURN]
+    s[nd.CUT_FRONT], s[nd.CUT_REST] = s[nd.FRONT], s[nd.REST]
+    s[nd.BASE_X] += command[0]
+    s[nd.BASE_Y] += command[1]
+    s[nd.BASE_TURN] += command[2]
+    s[nd.GUIDE_Y] += command[3]
+    if command[4] > 0.0:
+        s[nd.BEVEL] = -s[nd.BEVEL]
+    if rest.size > 0 and model.nodes.kind[0] == ESSENTIAL:
+        rest[0] = s[nd.GUIDE_Y]
+
+
+@inner
+def _end_cut(model, s, rest, w, count, fresh):
+    """Leave the channel and the tip spring as the step cut them; out of the skin the channel is closed."""
+    for i in range(fresh, count):
+        if model.nodes.kind[i] != ESSENTIAL:
+            rest[i] = w[nd.FIXED, i] + w[nd.SHARE, i] * s[nd.TIP_Y]
+    fixed, slope = nd.spring_rest(model, s, s[nd.TIP_X])
+    s[nd.REST] = fixed + (1.0 - slope) * s[nd.TIP_Y]
+    s[nd.FRONT] = max(s[nd.CUT_FRONT], s[nd.TIP_X]) if s[nd.TIP_X] > 0.0 else 0.0
+
+
+@kernel
+def settle(model, s, rest, u, w, held):
+    """Solve where base and guide are and lay the cut; a `held` tip y (mm) is essential, NaN leaves it free.
+
+    Work arrays in place, as in `needle.solve`; returns the number of nodes behind the tip.
+    """
+    count, fresh = nd.solve(model, s, rest, u, w, held)
+    _end_cut(model, s, rest, w, count, fresh)
+    return count
+
+
+@kernel
+def advance(model, s, rest, u, w, command):
+    """One step (X, C)_{k+1} = f((X, C)_k, U_k) (paper eq. 1); arrays and result as in `settle`."""
+    _move(model, s, rest, command)
+    return settle(model, s, rest, u, w, math.nan)
+
+
+@inner
+def _strain_energy(model, w, count):
+    """Tissue strain energy Σ w_c W (mJ) of the contacts after a solve (paper eq. 12)."""
+    total = 0.0
+    for i in range(count):
+        if model.nodes.kind[i] != ESSENTIAL:
+            total += model.nodes.weight[i] * w[nd.ENERGY, i]
+    return total
+
+
+@inner
+def _mean_square_deflection(model, s, w, count):
+    """∫y² dx over the length of the needle (mm²), exact for cubics (the consistent mass matrix of a beam)."""
+    x, y, turn = s[nd.TIP_X], s[nd.TIP_Y], s[nd.TIP_TURN]
+    total = 0.0
+    for i in range(count - 1, -2, -1):
+        x0, y0, turn0 = s[nd.BASE_X], s[nd.BASE_Y], s[nd.BASE_TURN]
+        if i >= 0:
+            x0, y0, turn0 = model.nodes.x[i], w[nd.Y, i], w[nd.TURN, i]
+        length = x - x0
+        square = (156.0 * (y0 * y0 + y * y) + 108.0 * y0 * y) / 420.0
+        mixed = (44.0 * (y0 * turn0 - y * turn) + 26.0 * (turn0 * y - y0 * turn)) / 420.0
+        turns = (4.0 * (turn0 * turn0 + turn * turn) - 6.0 * turn0 * turn) / 420.0
+        total += length * (square + length * (mixed + length * turns))
+        x, y, turn = x0, y0, turn0
+    return total / model.length
+
+
+@kernel
+def rollout(model, s0, rest0, u0, controls, first, last, tips, energy, converged, deflection):
+    """Run samples first to last − 1 of `controls` (N, m, 5) from one state.
+
+    Fills tips (N, m, 3), energy (N, m), converged (N, m), and deflection (N, m) unless its size is 0.
+    """
+    n = rest0.size
+    w = np.zeros((nd.WORK_ROWS, n))
+    s, rest, u = np.empty(nd.STATE_SIZE), np.empty(n), np.empty(n)
+    for j in range(first, last):
+        s[:], rest[:], u[:] = s0, rest0, u0
+        for k in range(controls.shape[1]):
+            count = advance(model, s, rest, u, w, controls[j, k])
+            tips[j, k, 0], tips[j, k, 1], tips[j, k, 2] = s[nd.TIP_X], s[nd.TIP_Y], s[nd.TIP_TURN]
+            energy[j, k] = _strain_energy(model, w, count)
+            converged[j, k] = s[nd.CONVERGED] > 0.0
+            if deflection.size > 0:
+                deflection[j, k] = _mean_square_deflection(model, s, w, count)

@@ -1,0 +1,89 @@
+"""The constants of a needle in layered tissue, as flat arrays for the kernels (docs/theory.md section 2)."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.mechanics.ogden import law_constants
+
+Floats = NDArray[np.float64]
+
+CONTACT, ESSENTIAL = 0, 1  # kinds of node: a tissue spring, a prescribed lateral position
+
+
+class Nodes(NamedTuple):
+    """What can load the needle, by increasing x: the guide, then the contact points (each array (n,)).
+
+    x: position (mm); kind: CONTACT or ESSENTIAL; reach: length over which a contact grows in behind
+    the tip (mm); alpha, height, force, energy: `ogden.Law` of each contact; weight: layer weight w_c.
+    """
+
+    x: Floats
+    kind: NDArray[np.int8]
+    reach: Floats
+    alpha: Floats
+    height: Floats
+    force: Floats
+    energy: Floats
+    weight: Floats
+
+
+class Layers(NamedTuple):
+    """Tissue layers for the tip spring: depth of each layer's end (mm), its law for 1 mm of needle length."""
+
+    end: Floats
+    alpha: Floats
+    height: Floats
+    force: Floats
+    energy: Floats
+
+
+class Model(NamedTuple):
+    """A needle in layered tissue: bending stiffness (N·mm²), length (mm), bevel offset and length (mm)."""
+
+    bending_stiffness: float
+    length: float
+    bevel_offset: float
+    bevel_length: float
+    nodes: Nodes
+    layers: Layers
+
+
+def tissue_layers(
+    thickness: Floats, shear_modulus: Floats, alpha: Floats, height: Floats, width: Floats
+) -> Layers:
+    """Layers from arrays (k,) in mm and MPa; the last one goes on, so its thickness is ignored."""
+    end = np.append(np.cumsum(thickness[:-1]), np.inf)
+    law = law_constants(shear_modulus, alpha, height, width * height)
+    return Layers(end, alpha, height, np.asarray(law.force), np.asarray(law.energy))
+
+
+def contact_nodes(layers: Layers, weight: Floats, spacing: float, depth: float, guide_x: float | None) -> Nodes:
+    """The guide, if any, and a contact point in the middle of every `spacing` down to `depth` (all mm).
+
+    An interval that a layer's end divides becomes two, so that the stiffness per length is exact at any spacing.
+    """
+    grid = np.arange(int(np.ceil(depth / spacing)) + 2) * spacing
+    ends = layers.end[layers.end < grid[-1]]
+    edges = np.union1d(grid, ends[np.abs(ends[:, None] - grid).min(axis=1, initial=np.inf) > 1e-6 * spacing])
+    x, length = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+    layer = np.searchsorted(layers.end, x, side="right")
+    contacts = Nodes(
+        x,
+        np.full(x.size, CONTACT, dtype=np.int8),
+        0.5 * length,
+        layers.alpha[layer],
+        layers.height[layer],
+        layers.force[layer] * length,
+        layers.energy[layer] * length,
+        weight[layer],
+    )
+    return contacts if guide_x is None else insert_essential(contacts, np.array([guide_x]))
+
+
+def insert_essential(nodes: Nodes, x: Floats) -> Nodes:
+    """`nodes` with essential nodes added at `x` (mm), in order of x."""
+    place = np.searchsorted(nodes.x, x)
+    values = (x, ESSENTIAL, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+    return Nodes(*(np.insert(array, place, value) for array, value in zip(nodes, values, strict=True)))

@@ -1,0 +1,62 @@
+"""One-term Ogden tissue in unconfined compression, per contact point (paper eq. 12, docs/theory.md eq. 1 to 4).
+
+With the stretch λ = 1 − |u|/h and t = λ^(−α/2), so that λ^α = t⁻², everything follows from one power:
+
+    W    = V (2μ/α²) (2t + t⁻² − 3)
+    −W_u = −sign(u) (2μV/αh) (t − t⁻²)/λ          lateral force on the needle
+    W_uu = (2μV/αh²) ((α − 1) t⁻² + (α/2 + 1) t)/λ²
+
+Below `FLOOR_STRETCH` the force goes on linearly: W stays convex and C¹, and no input gives a NaN.
+"""
+
+import math
+from typing import NamedTuple
+
+from flexneedle.mechanics.compile import inner
+import numpy as np
+
+FLOOR_STRETCH = 0.3
+
+
+class Law(NamedTuple):
+    """Constants of one contact: α, h (mm), force scale 2μV/(αh) (N), energy scale 2μV/α² (mJ)."""
+
+    alpha: float
+    height: float
+    force: float
+    energy: float
+
+
+@inner
+def _power_law(alpha, height, force, energy, stretch):
+    """(|force|, stiffness, energy) at a stretch above the floor."""
+    t = math.exp(-0.5 * alpha * math.log(stretch))
+    s = 1.0 / (t * t)
+    r = 1.0 / stretch
+    magnitude = force * (t - s) * r
+    stiffness = force / height * ((alpha - 1.0) * s + (0.5 * alpha + 1.0) * t) * (r * r)
+    return magnitude, stiffness, energy * (2.0 * t + s - 3.0)
+
+
+@inner
+def contact_law(alpha, height, force, energy, u):
+    """Force on the needle (N), stiffness (N/mm) and stored energy (mJ) at the lateral compression u (mm)."""
+    stretch = 1.0 - abs(u) / height
+    beyond = 0.0
+    if stretch < FLOOR_STRETCH:
+        beyond = (FLOOR_STRETCH - stretch) * height
+        stretch = FLOOR_STRETCH
+    magnitude, stiffness, stored = _power_law(alpha, height, force, energy, stretch)
+    stored += (magnitude + 0.5 * stiffness * beyond) * beyond
+    magnitude += stiffness * beyond
+    return (-magnitude if u > 0.0 else magnitude), stiffness, stored
+
+
+def law_constants(shear_modulus, alpha, height, volume):
+    """The scales of `Law` for V = `volume` (mm³), μ in MPa; arrays broadcast."""
+    return Law(
+        alpha,
+        height,
+        np.multiply(2.0 * shear_modulus, volume) / (np.multiply(alpha, height)),
+        np.multiply(2.0 * shear_modulus, volume) / np.square(alpha),
+    )

@@ -1,0 +1,139 @@
+"""The cross-entropy method with a full Gaussian (paper section III; Kobilarov 2012), ask and tell on arrays.
+
+    belief = start(mean, sigma)
+    while not belief.done(settings):
+        samples = ask(belief, settings, rng)
+        belief = tell(belief, settings, samples, cost(samples))
+
+A coordinate whose sigma is 0 stays at its mean: its covariance entries are zero.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+_FLOOR = 1e-3  # standard deviation that regularisation keeps, relative to the initial one
+
+
+@dataclass(frozen=True)
+class Settings:
+    """N samples, the elite ρN of them, most iterations; smoothing β keeps that share of the old moments.
+
+    lower, upper (d,): bounds, enforced on the samples. tolerance: relative spread of the elite costs at which
+    the method has converged.
+    """
+
+    samples: int
+    elite: int
+    iterations: int
+    smoothing: float
+    tolerance: float
+    lower: Floats
+    upper: Floats
+
+
+@dataclass(frozen=True)
+class Belief:
+    """Gaussian over d coordinates after some iterations, the best sample so far, and how it came about.
+
+    history: a dict per iteration with mean (cost of the samples), best (so far), quantiles of the cost
+    (min, ρ, median, max) and spread (d,) of the belief.
+    """
+
+    mean: Floats
+    covariance: Floats
+    initial_sigma: Floats
+    best: Floats
+    best_cost: float = np.inf
+    converged: bool = False
+    history: tuple[dict[str, Any], ...] = ()
+
+    @property
+    def iterations(self) -> int:
+        """Iterations done."""
+        return len(self.history)
+
+    def done(self, settings: Settings) -> bool:
+        """Whether to stop."""
+        return self.converged or self.iterations >= settings.iterations
+
+
+def start(mean: Floats, sigma: Floats, correlation: Floats | None = None) -> Belief:
+    """Begin with standard deviations `sigma` (d,) and a `correlation` (d, d), by default none."""
+    mean, sigma = np.asarray(mean, dtype=float), np.asarray(sigma, dtype=float)
+    correlation = np.eye(mean.size) if correlation is None else correlation
+    return Belief(mean, correlation * np.outer(sigma, sigma), sigma, mean)
+
+
+def ask(belief: Belief, settings: Settings, rng: np.random.Generator) -> Floats:
+    """Draw samples (N, d) within the bounds; the first is the mean, the second the best so far."""
+    noise = rng.standard_normal((settings.samples, belief.mean.size))
+    free = belief.initial_sigma > 0.0
+    factor = np.zeros_like(belief.covariance)
+    factor[np.ix_(free, free)] = np.linalg.cholesky(belief.covariance[np.ix_(free, free)])
+    samples = belief.mean + noise @ factor.T
+    samples[0] = belief.mean
+    if belief.iterations > 0:
+        samples[1] = belief.best
+    return np.clip(samples, settings.lower, settings.upper)
+
+
+def tell(belief: Belief, settings: Settings, samples: Floats, costs: Floats) -> Belief:
+    """Refit to the elite: all samples up to the ρ-quantile γ = J_⌈ρN⌉ of cost (paper eq. 6 and 7).
+
+    A cost of infinity marks a failed sample; with no finite cost at all the belief stays as it is.
+    """
+    costs = np.where(np.isfinite(costs), costs, np.inf)
+    order = np.argsort(costs, kind="stable")
+    elite = order[: settings.elite][np.isfinite(costs[order[: settings.elite]])]
+    if elite.size == 0:
+        return _with(belief, belief.mean, belief.covariance, samples[order[0]], costs, settings)
+    keep = settings.smoothing
+    mean = (1.0 - keep) * samples[elite].mean(axis=0) + keep * belief.mean
+    centred = samples[elite] - samples[elite].mean(axis=0)
+    covariance = (1.0 - keep) * centred.T @ centred / elite.size + keep * belief.covariance
+    covariance += np.diag((_FLOOR * belief.initial_sigma) ** 2)
+    return _with(belief, mean, covariance, samples[order[0]], costs, settings)
+
+
+def minimize(
+    cost: Callable[[Floats], Floats],
+    belief: Belief,
+    settings: Settings,
+    rng: np.random.Generator,
+    progress: Callable[[dict[str, Any]], None] | None = None,
+) -> Belief:
+    """Ask and tell until done. `cost` maps samples (N, d) to costs (N,)."""
+    while not belief.done(settings):
+        samples = ask(belief, settings, rng)
+        belief = tell(belief, settings, samples, cost(samples))
+        if progress is not None:
+            progress({"iteration": belief.iterations, "iterations": settings.iterations, **belief.history[-1]})
+    return belief
+
+
+def _with(
+    belief: Belief, mean: Floats, covariance: Floats, winner: Floats, costs: Floats, settings: Settings
+) -> Belief:
+    """Append an iteration to the history and keep the better of `winner` and the best so far."""
+    ordered = np.sort(costs)
+    better = bool(ordered[0] < belief.best_cost)
+    best_cost = min(float(ordered[0]), belief.best_cost)
+    quantile = float(ordered[settings.elite - 1])
+    entry = {
+        "mean": float(np.mean(costs)),
+        "best": best_cost,
+        "quantile": quantile,
+        "quantiles": tuple(float(ordered[k]) for k in (0, settings.elite - 1, costs.size // 2, -1)),
+        "spread": tuple(np.sqrt(np.diag(covariance)).tolist()),
+    }
+    spread = quantile - float(ordered[0])
+    converged = bool(spread <= settings.tolerance * abs(float(ordered[0])))
+    best = winner if better else belief.best
+    return Belief(
+        mean, covariance, belief.initial_sigma, best, best_cost, converged, (*belief.history, entry)
+    )

@@ -1,0 +1,156 @@
+"""Insertion plans: a few control primitives, their cost, the best of them (paper section III-A).
+
+A primitive covers its share of the travel with equal steps. Its six coordinates are the longest step of base x
+(mm), the step of base y (mm), base θ (rad) and guide (mm), ε, whose sign is the wanted bevel direction, and the
+logarithm of its share, before normalisation. A flip is issued, counted and charged where the wanted direction
+changes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.planning import cross_entropy as ce
+
+Floats = NDArray[np.float64]
+Rollout = Callable[[Floats], tuple[Floats, Floats, NDArray[np.bool_], Floats]]
+"""controls (N, m, 5) → tips (N, m, 3), strain energy (N, m), converged (N, m), mean square deflection (N, m)."""
+
+ADVANCE, BASE_Y, BASE_TURN, GUIDE, BEVEL, SHARE = range(6)
+COORDINATES = 6
+_LEAST_ADVANCE = 0.5  # of the longest step
+_BEVEL_BOUND = 3.0  # ε has standard deviation 1 at first
+_SHARE_BOUND = 1.0  # no primitive is longer than e² times another
+_BEVEL_CORRELATION = 0.8  # of ε of neighbouring primitives at first: few flips are likelier than many
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What to reach and with what: mm, rad.
+
+    travel: insertion from the start to the target depth; step (4,) and reach (4,): largest step of base x, y, θ,
+    guide and largest sum of steps; sigma (6,): first standard deviation of each coordinate, 0 if not free.
+    """
+
+    target: tuple[float, float]
+    travel: float
+    primitives: int
+    step: Floats
+    reach: Floats
+    sigma: Floats
+    accuracy_weight: float  # gamma_1, 1/mm
+    energy_weight: float  # gamma_2, 1/mJ
+    deflection_weight: float  # Q, 1/mm²
+    guide_weight: float  # R, 1/mm²
+    flip_weight: float  # R of a flip
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The best controls (m, 5) and bevel at the start, its cost by term, and the search behind it."""
+
+    controls: Floats
+    bevel: int
+    terms: dict[str, float]
+    belief: ce.Belief
+
+
+def optimise(
+    rollout: Rollout,
+    problem: Problem,
+    settings: dict[str, Any],
+    rng: np.random.Generator,
+    progress: Callable[[dict[str, Any]], None] | None = None,
+) -> Solution:
+    """Search the primitives; `settings` are samples, elite, iterations, smoothing, tolerance of the method.
+
+    `rollout` starts with bevel +1 in air; a sample that wants −1 flips in its first step, which is not charged.
+    """
+    n = problem.primitives
+    lower = np.tile([_LEAST_ADVANCE * problem.step[0], *-problem.step[1:], -_BEVEL_BOUND, -_SHARE_BOUND], n)
+    upper = np.tile([problem.step[0], *problem.step[1:], _BEVEL_BOUND, _SHARE_BOUND], n)
+    mean = np.tile([problem.step[0], 0.0, 0.0, 0.0, 0.0, 0.0], n)
+    searched = ce.minimize(
+        lambda z: sum(_terms(rollout, problem, z).values()),
+        ce.start(mean, np.tile(problem.sigma, n), _correlation(n)),
+        ce.Settings(**settings, lower=lower, upper=upper),
+        rng,
+        progress,
+    )
+    best = searched.best[None]
+    controls, wanted = schedule(problem, best)
+    bevel = int(wanted[0, 0])
+    controls[0, 0, 4] = -1.0
+    moving = controls[0, :, 0] > 0.0
+    terms = {name: float(value[0]) for name, value in _terms(rollout, problem, best).items()}
+    return Solution(controls[0, moving], bevel, terms, searched)
+
+
+def _correlation(primitives: int) -> Floats:
+    """Correlation of the coordinates at first: only that of ε between primitives."""
+    correlation = np.eye(primitives * COORDINATES)
+    index = np.arange(primitives)
+    apart = np.abs(index[:, None] - index)
+    bevel = index * COORDINATES + BEVEL
+    correlation[np.ix_(bevel, bevel)] = _BEVEL_CORRELATION**apart
+    return correlation
+
+
+def schedule(problem: Problem, z: Floats) -> tuple[Floats, Floats]:
+    """Primitives z (N, 6 P) to controls (N, m, 5), padded with zero steps, and bevel directions (N, P).
+
+    The sum of lateral steps is kept within reach here, before any rollout.
+    """
+    primitives = z.reshape(len(z), problem.primitives, COORDINATES)
+    share = np.exp(primitives[:, :, SHARE])
+    share *= problem.travel / share.sum(axis=1, keepdims=True)
+    count = np.ceil(share / primitives[:, :, ADVANCE] - 1e-9).astype(int)  # steps of each primitive
+    steps = np.concatenate([(share / count)[:, :, None], _within_reach(problem, primitives, count)], axis=2)
+    wanted = np.where(primitives[:, :, BEVEL] >= 0.0, 1.0, -1.0)
+    ends = np.cumsum(count, axis=1)
+    index = np.arange(ends[:, -1].max())
+    owner = (index[None, :, None] >= ends[:, None, :]).sum(axis=2)  # primitive of each step; P when it is over
+    rows = np.arange(len(z))[:, None]
+    steps = np.concatenate([steps, np.zeros((len(z), 1, 4))], axis=1)
+    controls = np.full((len(z), index.size, 5), -1.0)
+    controls[:, :, :4] = steps[rows, owner]
+    first = np.concatenate([np.zeros((len(z), 1), dtype=int), ends[:, :-1]], axis=1)
+    turns = wanted != np.concatenate([np.ones((len(z), 1)), wanted[:, :-1]], axis=1)
+    controls[rows, first, 4] = np.where(turns, 1.0, -1.0)
+    return controls, wanted
+
+
+def _within_reach(problem: Problem, primitives: Floats, count: NDArray[np.int64]) -> Floats:
+    """Lateral steps (N, P, 3) whose running sums stay within reach."""
+    lateral = primitives[:, :, BASE_Y : GUIDE + 1].copy()
+    total = np.zeros((len(primitives), 3))
+    for p in range(problem.primitives):
+        n = count[:, p, None]
+        moved = np.clip(total + n * lateral[:, p], -problem.reach[1:], problem.reach[1:])
+        lateral[:, p] = (moved - total) / n
+        total = moved
+    return lateral
+
+
+def _terms(rollout: Rollout, problem: Problem, z: Floats) -> dict[str, Floats]:
+    """Cost terms (N,) of primitives z, an infinite accuracy term where the model failed (paper eq. 9 and 10)."""
+    controls, _ = schedule(problem, z)
+    tips, energy, converged, deflection = rollout(controls)
+    depth, lateral = problem.target
+    end = tips[:, -1]
+    # The last step will be shortened to end at the target depth: follow the tip's own line to it.
+    at_depth = end[:, 1] + np.tan(end[:, 2]) * (depth - end[:, 0])
+    moving = controls[:, :, 0] > 0.0
+    inside = (tips[:, :, 0] > 0.0) & moving
+    flips = (controls[:, 1:, 4] > 0.0).sum(axis=1)
+    miss = np.where(converged.all(axis=1), np.abs(at_depth - lateral), np.inf)
+    return {
+        "accuracy": problem.accuracy_weight * miss,
+        "energy": problem.energy_weight * energy[:, -1],
+        "deflection": problem.deflection_weight * (deflection * inside).sum(axis=1),
+        "guide": problem.guide_weight * ((controls[:, :, 3] ** 2) * inside).sum(axis=1),
+        "flips": problem.flip_weight * flips,
+    }

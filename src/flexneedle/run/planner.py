@@ -1,0 +1,175 @@
+"""Plan an insertion: the cross-entropy method on rollouts of the simulator (paper section III-A)."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.errors import InputError
+from flexneedle.planning import Problem, Solution, optimise
+from flexneedle.scenario import Scenario, check_target
+from flexneedle.simulator import Control, Simulator, State
+from flexneedle.trace import PlanRecord
+
+Floats = NDArray[np.float64]
+STRATEGIES = ("manipulation", "steering")
+_DEPTH_TOLERANCE_MM = 1e-6
+_SHARE_SIGMA = 0.3  # of the logarithm of a primitive's share of the travel
+_AT_LIMIT = 0.999  # share of a limit that counts as reached
+
+
+def plan(
+    scenario: Scenario,
+    target: tuple[float, float] | None = None,
+    strategy: str = "manipulation",
+    seed: int = 0,
+    progress: Callable[[dict[str, Any]], None] | None = None,
+) -> PlanRecord:
+    """Plan an insertion to `target` (x, y) in mm (default: the scenario's), best found by cross-entropy.
+
+    strategy: "manipulation" moves guide and bevel; "steering" lowers the bending stiffness and moves only the
+    bevel (paper section III-A). `progress` gets a dict after each iteration. Same seed, same plan.
+    Raises ScenarioError for a target that the scenario excludes and InputError for an unknown strategy.
+    """
+    if strategy not in STRATEGIES:
+        raise InputError(f"strategy = {strategy!r}: must be one of {', '.join(STRATEGIES)}")
+    goal = scenario.target.position if target is None else (float(target[0]), float(target[1]))
+    check_target(scenario, *goal)
+    begun = time.perf_counter()
+    simulator = Simulator(_strategic(scenario, strategy))
+    solution = _search(simulator, goal, strategy, np.random.default_rng(seed), progress)
+    controls = _end_at_depth(simulator, solution.controls, solution.bevel, goal[0])
+    return _record(simulator, controls, solution, goal, strategy, seed, time.perf_counter() - begun)
+
+
+def _strategic(scenario: Scenario, strategy: str) -> Scenario:
+    """The scenario that the planner simulates: steering makes the needle follow its tip."""
+    if strategy == "manipulation":
+        return scenario
+    factor = scenario.plan.steering_stiffness_factor
+    return scenario.with_values({"needle.youngs_modulus_gpa": factor * scenario.needle.youngs_modulus_gpa})
+
+
+def _search(
+    simulator: Simulator,
+    goal: tuple[float, float],
+    strategy: str,
+    rng: np.random.Generator,
+    progress: Callable[[dict[str, Any]], None] | None,
+) -> Solution:
+    plan = simulator.scenario.plan
+    start = simulator.start()
+
+    def rollout(controls: Floats) -> tuple[Floats, Floats, NDArray[np.bool_], Floats]:
+        result, deflection = simulator.rollout_with_deflection(start, controls)
+        return *result, deflection
+
+    settings = {
+        "samples": plan.samples,
+        "elite": plan.elite_count,
+        "iterations": plan.iterations,
+        "smoothing": plan.smoothing,
+        "tolerance": plan.tolerance,
+    }
+    return optimise(rollout, _problem(simulator.scenario, goal, strategy), settings, rng, progress)
+
+
+def _problem(scenario: Scenario, goal: tuple[float, float], strategy: str) -> Problem:
+    setup, plan = scenario.setup, scenario.plan
+    guide_step = setup.max_guide_step_mm if setup.has_guide else 0.0
+    sigma = np.array(
+        [plan.advance_sigma_mm, plan.base_sigma_mm, plan.base_turn_sigma, plan.guide_sigma_mm, 1.0, _SHARE_SIGMA]
+    )
+    if strategy == "steering":
+        sigma[1:4] = 0.0
+    elif not setup.has_guide:
+        sigma[3] = 0.0
+    return Problem(
+        target=goal,
+        travel=setup.tip_to_skin_mm + goal[0],
+        primitives=plan.primitives,
+        step=np.array([setup.max_advance_mm, setup.max_base_step_mm, setup.max_base_turn_step, guide_step]),
+        reach=np.array([setup.stroke_mm, setup.max_base_travel_mm, np.inf, setup.max_guide_travel_mm]),
+        sigma=sigma,
+        accuracy_weight=plan.accuracy_weight_per_mm,
+        energy_weight=plan.energy_weight_per_mj,
+        deflection_weight=plan.deflection_weight,
+        guide_weight=plan.guide_weight,
+        flip_weight=plan.flip_weight,
+    )
+
+
+def _end_at_depth(simulator: Simulator, controls: Floats, bevel: int, depth: float) -> Floats:
+    """Shorten or add last steps until the tip ends at the target depth."""
+    start, setup = simulator.start(bevel), simulator.scenario.setup
+    for _ in range(8):
+        short = depth - float(simulator.rollout(start, controls[None]).tips[0, -1, 0])
+        if abs(short) < _DEPTH_TOLERANCE_MM:
+            break
+        last = float(controls[-1, 0]) + short
+        left = setup.stroke_mm - float(controls[:-1, 0].sum())
+        if last <= 0.0 and len(controls) > 1:
+            controls = controls[:-1]
+        elif last > setup.max_advance_mm and left > setup.max_advance_mm:
+            # The rest is no more than the shortening, so it takes a single further step.
+            extra = np.array([[min(short, setup.max_advance_mm), 0.0, 0.0, 0.0, -1.0]])
+            controls = np.concatenate([controls, extra])
+        else:
+            controls = controls.copy()
+            controls[-1, 0] = min(last, setup.max_advance_mm, left)
+    return controls
+
+
+def _record(
+    simulator: Simulator,
+    controls: Floats,
+    solution: Solution,
+    goal: tuple[float, float],
+    strategy: str,
+    seed: int,
+    seconds: float,
+) -> PlanRecord:
+    states = [simulator.start(solution.bevel)]
+    for row in controls:
+        states.append(simulator.step(states[-1], Control(*row[:4].tolist(), flip=row[4] > 0.0)))
+    belief = solution.belief
+    return PlanRecord(
+        strategy=strategy,
+        target=goal,
+        seed=seed,
+        bevel=solution.bevel,
+        controls=controls,
+        tips=np.array([state.tip for state in states]),
+        strain_energy=np.array([state.strain_energy for state in states]),
+        guide=np.array([state.guide for state in states]),
+        shapes=np.array([state.nodes for state in states]),
+        cost=belief.best_cost,
+        terms=solution.terms,
+        iterations=belief.iterations,
+        converged=belief.converged,
+        history=belief.history,
+        limit=_binding_limit(simulator.scenario, controls, states, goal, strategy),
+        seconds=seconds,
+    )
+
+
+def _binding_limit(
+    scenario: Scenario, controls: Floats, states: list[State], goal: tuple[float, float], strategy: str
+) -> str:
+    """Name the key that keeps the plan from its target; empty if it gets there."""
+    end = states[-1].tip
+    if np.hypot(end[0] - goal[0], end[1] - goal[1]) <= 1.0:
+        return ""
+    setup = scenario.setup
+    guide = max(abs(state.guide) for state in states)
+    if controls[:, 0].sum() > _AT_LIMIT * setup.stroke_mm and end[0] < goal[0] - 0.5:
+        return f"setup.stroke_mm = {setup.stroke_mm:g}"
+    if strategy == "steering" or not setup.has_guide:
+        return f"needle.bevel.offset_mm = {scenario.needle.bevel.offset_mm:g} (only the bevel steers)"
+    if guide > _AT_LIMIT * setup.max_guide_travel_mm:
+        return f"setup.max_guide_travel_mm = {setup.max_guide_travel_mm:g}"
+    if np.abs(controls[:, 3]).max() > _AT_LIMIT * setup.max_guide_step_mm:
+        return f"setup.max_guide_step_mm = {setup.max_guide_step_mm:g}"
+    return f"plan.accuracy_weight_per_mm = {scenario.plan.accuracy_weight_per_mm:g} (other costs outweigh the miss)"

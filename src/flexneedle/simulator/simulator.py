@@ -1,0 +1,205 @@
+"""Steps, rollouts and assimilation of measurements for one scenario."""
+
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flexneedle.errors import CommandError, StateError
+from flexneedle.mechanics import insertion, model
+from flexneedle.mechanics import needle as nd
+from flexneedle.scenario import Scenario
+from flexneedle.simulator.control import Control, Limits
+from flexneedle.simulator.state import State, load_arrays, mechanics_difference, solved
+
+Floats = NDArray[np.float64]
+_STEPS_WORTH_A_THREAD = 200
+_CHUNKS_A_THREAD = 4
+_CLOSEST_POINTS_MM = 0.1
+
+
+class Rollout(NamedTuple):
+    """Result of N sequences of m steps: tips (N, m, 3) in mm and rad, strain_energy (N, m) in mJ, converged (N, m)."""
+
+    tips: Floats
+    strain_energy: Floats
+    converged: NDArray[np.bool_]
+
+
+class Assimilation(NamedTuple):
+    """The state that meets a measurement, and the axial innovation: measured x less the model's (mm)."""
+
+    state: State
+    innovation: float
+
+
+class Simulator:
+    """The needle of a scenario in its tissue (DESIGN of the model: docs/theory.md).
+
+    `threads` is for rollouts (default: all cores that the process may use); results do not depend on it.
+    """
+
+    def __init__(self, scenario: Scenario, threads: int | None = None) -> None:
+        self.scenario = scenario
+        self.threads = threads or len(os.sched_getaffinity(0))
+        self._model = _build_model(scenario)
+        self._limits = Limits.of(scenario)
+
+    def start(self, bevel: int = 1) -> State:
+        """Return the straight needle in air, `setup.tip_to_skin_mm` before the skin, bevel −1 or +1."""
+        if bevel not in (-1, 1):
+            raise CommandError("bevel", bevel, 1.0, "must be −1 or +1")
+        s = np.zeros(nd.STATE_SIZE)
+        s[nd.BASE_X], s[nd.BEVEL] = self.scenario.start_base_x, bevel
+        s[nd.TIP_X] = self.scenario.setup.start_tip_x
+        n = self._model.nodes.x.size
+        return self._settled(s, np.zeros(n), np.zeros(n), math.nan)
+
+    def step(self, state: State, control: Control) -> State:
+        """Return the state after one control step; CommandError, with the limit, if it is out of range."""
+        self._own(state)
+        row = control.row()
+        self._limits.check(self._moved(state), row[None])
+        s, rest, u, w = self._work(state)
+        count = insertion.advance(self._model, s, rest, u, w, row)
+        return solved(self.scenario, self._model, s, rest, u, w, count)
+
+    def rollout(self, state: State, controls: ArrayLike) -> Rollout:
+        """Run each of N sequences from `state`; controls (N, m, 5): db_x, db_y, db_theta, dg_y, flip (−1 or +1).
+
+        Equal to repeated `step`, bit by bit; CommandError if any value is out of range.
+        """
+        return Rollout(*self._rollout(state, controls, deflection=False)[:3])
+
+    def rollout_with_deflection(self, state: State, controls: ArrayLike) -> tuple[Rollout, Floats]:
+        """`rollout`, and the mean square lateral deflection of the needle (N, m) in mm²."""
+        *arrays, deflection = self._rollout(state, controls, deflection=True)
+        return Rollout(*arrays), deflection
+
+    def assimilate(
+        self, state: State, tip: Sequence[float], points: Sequence[Sequence[float]] = ()
+    ) -> Assimilation:
+        """Hold the tip at its measured y, and the needle at further measured (x, y), as essential conditions.
+
+        The last step is solved again, so a contact that it cut lies on the measured path. Axial motion is
+        rigid: x is not corrected, its innovation is returned. The next step releases the conditions;
+        `state.reactions.tip_force` is what the tip needed beyond `state.tip_load` (N).
+        """
+        self._own(state)
+        measured = np.array([tip, *points], dtype=float).reshape(-1, 2)
+        if not np.isfinite(measured).all():
+            raise CommandError("measured position", float(measured[~np.isfinite(measured)][0]), 0.0, "must be finite")
+        x, y = measured[1:][np.argsort(measured[1:, 0])].T
+        self._check_points(state, x)
+        after = self._assimilated(state, float(measured[0, 1]), x, y)
+        return Assimilation(after, float(measured[0, 0] - after.scalars[nd.TIP_X]))
+
+    def load(self, path: str | Path) -> State:
+        """Read a state that `State.save` wrote; StateError with the differing key under another scenario."""
+        return State(self.scenario, self._model, **load_arrays(path, self.scenario))
+
+    def _assimilated(self, state: State, tip_y: float, x: Floats, y: Floats) -> State:
+        s, rest, u, _ = self._work(state)
+        place = np.searchsorted(self._model.nodes.x, x)
+        merged = self._model._replace(nodes=model.insert_essential(self._model.nodes, x))
+        rest, u = np.insert(rest, place, y), np.insert(u, place, 0.0)
+        w = np.zeros((nd.WORK_ROWS, rest.size))
+        insertion.settle(merged, s, rest, u, w, tip_y)
+        added = place + np.arange(x.size)
+        rest, u, w = np.delete(rest, added), np.delete(u, added), np.delete(w, added, axis=1)
+        count = int(np.searchsorted(self._model.nodes.x, s[nd.TIP_X]))
+        return solved(self.scenario, self._model, s, rest, u, w, count)
+
+    def _check_points(self, state: State, x: Floats) -> None:
+        guide = [self.scenario.setup.guide_x] if self.scenario.setup.guide_x is not None else []
+        low, high = float(state.scalars[nd.BASE_X]), float(state.scalars[nd.TIP_X])
+        fixed = np.array([low, *guide, high])
+        for k, value in enumerate(x):
+            others = np.append(fixed, np.delete(x, k))
+            if not low < value < high or np.abs(others - value).min() < _CLOSEST_POINTS_MM:
+                rule = (
+                    f"must lie between base and tip ({low:g} to {high:g} mm), "
+                    f"{_CLOSEST_POINTS_MM} mm or more from them, the guide and other points"
+                )
+                raise CommandError("measured point x", float(value), high, rule)
+
+    def _settled(self, s: Floats, rest: Floats, u: Floats, held: float) -> State:
+        w = np.zeros((nd.WORK_ROWS, rest.size))
+        s[[nd.CUT_X, nd.CUT_Y, nd.CUT_TURN]] = s[[nd.TIP_X, nd.TIP_Y, nd.TIP_TURN]]
+        count = insertion.settle(self._model, s, rest, u, w, held)
+        return solved(self.scenario, self._model, s, rest, u, w, count)
+
+    def _rollout(self, state: State, controls: ArrayLike, *, deflection: bool) -> tuple[Any, ...]:
+        self._own(state)
+        u = np.ascontiguousarray(controls, dtype=float)
+        if u.ndim != 3 or u.shape[2] != 5:
+            raise CommandError("controls", float(u.ndim), 3.0, f"must have shape (N, m, 5), not {u.shape}")
+        self._limits.check(self._moved(state), u)
+        n, m = u.shape[:2]
+        out = np.zeros((n, m, 3)), np.zeros((n, m)), np.zeros((n, m), dtype=np.bool_)
+        spread = np.zeros((n, m) if deflection else (0, 0))
+        start = state.scalars, state.rest, state.compression
+
+        def run(first: int, last: int) -> None:
+            insertion.rollout(self._model, *start, u, first, last, *out, spread)
+
+        threads = min(self.threads, n * m // _STEPS_WORTH_A_THREAD)
+        if threads <= 1:
+            run(0, n)
+        else:
+            edges = np.unique(np.linspace(0, n, threads * _CHUNKS_A_THREAD + 1).astype(int))
+            list(self._pool.map(run, edges[:-1], edges[1:]))
+        return *out, spread
+
+    def _own(self, state: State) -> None:
+        if state.scenario is self.scenario:
+            return
+        if (key := mechanics_difference(state.scenario, self.scenario)) is not None:
+            theirs, mine = state.scenario.flat().get(key), self.scenario.flat().get(key)
+            raise StateError(f"state of another scenario: {key} was {theirs}, is {mine}")
+
+    def _moved(self, state: State) -> Floats:
+        s = state.scalars
+        moved = s[[nd.BASE_X, nd.BASE_Y, nd.BASE_TURN, nd.GUIDE_Y]].copy()
+        moved[0] -= self.scenario.start_base_x
+        return moved
+
+    def _work(self, state: State) -> tuple[Floats, Floats, Floats, Floats]:
+        w = np.zeros((nd.WORK_ROWS, state.rest.size))
+        return state.scalars.copy(), state.rest.copy(), state.compression.copy(), w
+
+    @cached_property
+    def _pool(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(self.threads, thread_name_prefix="rollout")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"scenario": self.scenario, "threads": self.threads}
+
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        self.__init__(saved["scenario"], saved["threads"])  # type: ignore[misc]
+
+
+def _build_model(scenario: Scenario) -> model.Model:
+    tissue, needle = scenario.tissue, scenario.needle
+    layers = model.tissue_layers(
+        np.array([layer.thickness_mm or np.inf for layer in tissue]),
+        np.array([layer.shear_modulus for layer in tissue]),
+        np.array([layer.alpha for layer in tissue]),
+        np.array([layer.compression_length_mm for layer in tissue]),
+        np.array([layer.engaged_width_mm for layer in tissue]),
+    )
+    weight = np.array([layer.energy_weight for layer in tissue])
+    depth = max(scenario.setup.max_depth, 0.0)
+    nodes = model.contact_nodes(
+        layers, weight, scenario.contact.spacing_mm, depth, scenario.setup.guide_x
+    )
+    bevel = needle.bevel
+    return model.Model(
+        needle.bending_stiffness, needle.length_mm, bevel.offset_mm, bevel.length_mm, nodes, layers
+    )

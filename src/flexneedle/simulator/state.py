@@ -1,0 +1,223 @@
+"""The state (X, C) of an insertion: a frozen value that can be compared, pickled, saved and loaded."""
+
+import json
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.errors import StateError
+from flexneedle.mechanics import needle as nd
+from flexneedle.mechanics.model import CONTACT, Model
+from flexneedle.mechanics.shape import beam_energy, equal_arc_nodes
+from flexneedle.scenario import Scenario
+
+Floats = NDArray[np.float64]
+_MECHANICS = ("needle.", "setup.", "tissue", "contact.")  # the keys that a state depends on
+_MESH_ROWS = (nd.Y, nd.TURN, nd.SHEAR, nd.MOMENT, nd.FORCE, nd.ENERGY)
+
+
+class Contacts(NamedTuple):
+    """Contact points of the cut channel, each (k,), by depth: x, rest_y, y (mm), stretch λ, whether active.
+
+    A point ahead of a tip that was pulled back is not active: it is at rest, y = rest_y and stretch 1.
+    """
+
+    x: Floats
+    rest_y: Floats
+    y: Floats
+    stretch: Floats
+    active: NDArray[np.bool_]
+
+
+class Reactions(NamedTuple):
+    """What holds the needle: lateral forces (N) and the clamp's moment (N·mm) on it, 0 where nothing does."""
+
+    base_force: float
+    base_moment: float
+    guide_force: float
+    tip_force: float
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The insertion at one instant. Arrays are read-only; angles in rad, lengths in mm, energies in mJ.
+
+    `scalars` (STATE_SIZE,), `rest` (k,) and `compression` (k,) are what the next step starts from;
+    `mesh` (6, j) is the solution at the nodes behind the tip: y, θ, shear, moment, force, energy.
+    """
+
+    scenario: Scenario
+    model: Model
+    scalars: Floats
+    rest: Floats
+    compression: Floats
+    mesh: Floats
+
+    @property
+    def tip(self) -> Floats:
+        """Tip pose x, y, θ, shape (3,)."""
+        return self.scalars[[nd.TIP_X, nd.TIP_Y, nd.TIP_TURN]]
+
+    @property
+    def base(self) -> Floats:
+        """Pose of the base clamp x, y, θ, shape (3,)."""
+        return self.scalars[[nd.BASE_X, nd.BASE_Y, nd.BASE_TURN]]
+
+    @property
+    def guide(self) -> float:
+        """Lateral position of the guide (mm); 0 without a guide."""
+        return float(self.scalars[nd.GUIDE_Y])
+
+    @property
+    def bevel(self) -> int:
+        """Bevel direction bvl, −1 or +1; +1 bends the path towards +y."""
+        return int(self.scalars[nd.BEVEL])
+
+    @property
+    def tip_load(self) -> float:
+        """Extra lateral force at the tip (N), what an observer believes the model lacks."""
+        return float(self.scalars[nd.TIP_LOAD])
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last solve reached its tolerance."""
+        return bool(self.scalars[nd.CONVERGED] > 0.0)
+
+    @property
+    def iterations(self) -> int:
+        """Newton iterations of the last solve."""
+        return int(self.scalars[nd.ITERATIONS])
+
+    @property
+    def residual(self) -> float:
+        """Estimated distance of the last solve from equilibrium (mm)."""
+        return float(self.scalars[nd.RESIDUAL])
+
+    @cached_property
+    def nodes(self) -> Floats:
+        """Needle state X: (n, 3) of x, y, θ at n equal arc lengths from base to tip."""
+        return _frozen(equal_arc_nodes(*self._curve(), self.scenario.needle.nodes))
+
+    @cached_property
+    def contacts(self) -> Contacts:
+        """The cut channel."""
+        nodes, count = self.model.nodes, self.mesh.shape[1]
+        formed = (nodes.kind == CONTACT) & (nodes.x < self.scalars[nd.FRONT])
+        active = np.arange(nodes.x.size) < count
+        y = np.where(active, np.append(self.mesh[0], np.zeros(nodes.x.size - count)), self.rest)
+        stretch = np.where(active, 1.0 - np.abs(y - self.rest) / nodes.height, 1.0)
+        return Contacts(*(_frozen(a[formed]) for a in (nodes.x, self.rest, y, stretch, active)))
+
+    @cached_property
+    def strain_energy(self) -> float:
+        """Tissue strain energy Σ w_c W of the contacts (mJ), weighted by layer (paper eq. 12)."""
+        count = self.mesh.shape[1]
+        tissue = self.model.nodes.kind[:count] == CONTACT
+        return float(np.dot(self.model.nodes.weight[:count][tissue], self.mesh[5][tissue]))
+
+    @cached_property
+    def energy(self) -> float:
+        """Stored energy of beam, contacts and tip spring (mJ), unweighted."""
+        tissue = self.model.nodes.kind[: self.mesh.shape[1]] == CONTACT
+        x, _, _ = self._curve()
+        shear = np.append(self.scalars[nd.BASE_SHEAR], self.mesh[2])
+        moment = np.append(self.scalars[nd.BASE_MOMENT], self.mesh[3])
+        beam = beam_energy(x, shear, moment, self.model.bending_stiffness)
+        return float(beam + self.mesh[5][tissue].sum() + self.scalars[nd.SPRING_ENERGY])
+
+    @property
+    def reactions(self) -> Reactions:
+        """Forces of clamp, guide and held tip on the needle."""
+        s = self.scalars
+        guide = self.scenario.setup.has_guide and self.mesh.shape[1] > 0
+        return Reactions(
+            -float(s[nd.BASE_SHEAR]),
+            -float(s[nd.BASE_MOMENT]),
+            float(self.mesh[4, 0]) if guide else 0.0,
+            float(s[nd.TIP_REACTION]),
+        )
+
+    def believing(
+        self, *, base_y: float | None = None, base_turn: float | None = None, tip_load: float | None = None
+    ) -> "State":
+        """Return the state with what an observer corrected (mm, rad, N); the next solve takes it up."""
+        scalars = self.scalars.copy()
+        corrections = ((nd.BASE_Y, base_y), (nd.BASE_TURN, base_turn), (nd.TIP_LOAD, tip_load))
+        for index, value in corrections:
+            if value is not None:
+                scalars[index] = value
+        return replace(self, scalars=_frozen(scalars))
+
+    def save(self, path: str | Path) -> None:
+        """Write the state to `path` (NumPy npz); load it with `Simulator.load`."""
+        with Path(path).open("wb") as file:
+            np.savez(file, scenario=np.array(json.dumps(self.scenario.values())), **self._arrays())
+
+    def _arrays(self) -> dict[str, Any]:
+        return {
+            "scalars": self.scalars,
+            "rest": self.rest,
+            "compression": self.compression,
+            "mesh": self.mesh,
+        }
+
+    def _curve(self) -> tuple[Floats, Floats, Floats]:
+        """x, y, θ of base, nodes and tip."""
+        x = self.model.nodes.x[: self.mesh.shape[1]]
+        rows = zip(self.base, (x, self.mesh[0], self.mesh[1]), self.tip, strict=True)
+        first, second, third = (np.concatenate([[base], inner, [tip]]) for base, inner, tip in rows)
+        return first, second, third
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, State):
+            return NotImplemented
+        mine, theirs = self._arrays(), other._arrays()
+        return self.scenario == other.scenario and all(
+            np.array_equal(mine[name], theirs[name]) for name in mine
+        )
+
+    def __hash__(self) -> int:
+        return hash(self.scalars.tobytes())
+
+
+def mechanics_difference(one: Scenario, other: Scenario) -> str | None:
+    """Return the first key on which the mechanics of two scenarios differ, or None."""
+    mine, theirs = one.flat(), other.flat()
+    for key in [*mine, *(key for key in theirs if key not in mine)]:
+        if key.startswith(_MECHANICS) and mine.get(key) != theirs.get(key):
+            return key
+    return None
+
+
+def load_arrays(path: str | Path, scenario: Scenario) -> dict[str, Floats]:
+    """Read what `State.save` wrote; StateError if it is no state or of another scenario, with the differing key."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        saved = Scenario.from_values(json.loads(str(arrays.pop("scenario"))), source=str(path))
+    except (OSError, ValueError, KeyError) as error:
+        raise StateError(f"{path}: not a saved state ({error})") from error
+    if (key := mechanics_difference(saved, scenario)) is not None:
+        mine, theirs = scenario.flat().get(key), saved.flat().get(key)
+        raise StateError(f"{path}: saved under another scenario: {key} was {theirs}, is {mine}")
+    if set(arrays) != {"scalars", "rest", "compression", "mesh"} or arrays["scalars"].shape != (nd.STATE_SIZE,):
+        raise StateError(f"{path}: saved by another version of flexneedle")
+    return {name: _frozen(array) for name, array in arrays.items()}
+
+
+def solved(
+    scenario: Scenario, model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, count: int
+) -> State:
+    """Freeze the work arrays of a solve into a state."""
+    mesh = w[list(_MESH_ROWS), :count]
+    mesh[5, model.nodes.kind[:count] != CONTACT] = 0.0
+    return State(scenario, model, _frozen(s), _frozen(rest), _frozen(u), _frozen(mesh))
+
+
+def _frozen(array: Any) -> Any:
+    array.flags.writeable = False
+    return array
