@@ -1,7 +1,7 @@
 """The folder of a run: claimed once, `run.json` always whole, read back with clear errors.
 
-`run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing and
-plans. All but `timing`, which holds the date and the wall-clock times, is the same for the same seed.
+`run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing
+and plans. All but `timing`, which holds the date and the wall-clock times, is the same for the same seed.
 """
 
 import json
@@ -16,6 +16,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from flexneedle import __version__
 from flexneedle.errors import InputError, ScenarioError
 from flexneedle.scenario import Scenario
 from flexneedle.trace import PlanRecord
@@ -89,9 +90,11 @@ class Folder:
 
 def versions() -> dict[str, str]:
     """Return the versions on which the numbers of a run depend."""
-    packages = ("flexneedle", "numpy", "numba")
-    return {"flexneedle": version(packages[0]), "python": platform.python_version()} | {
-        name: version(name) for name in packages[1:]
+    return {
+        "flexneedle": __version__,
+        "python": platform.python_version(),
+        "numpy": version("numpy"),
+        "numba": version("numba"),
     }
 
 

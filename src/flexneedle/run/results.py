@@ -7,7 +7,7 @@ import numpy as np
 from flexneedle.trace import Insertion, PlanRecord
 from flexneedle.trace.plain import plain
 
-__all__ = ["insertion_result", "insertion_timing", "plan_result", "plan_timing", "verdict"]
+__all__ = ["insertion_result", "insertion_timing", "plan_result", "plan_timing"]
 
 
 def plan_result(plan: PlanRecord) -> dict[str, Any]:
@@ -68,18 +68,6 @@ def insertion_timing(insertion: Insertion) -> dict[str, Any]:
         **plan_timing(insertion.plan),
         "period_ms": dict(zip(("p50", "p99", "max"), milliseconds, strict=True)),
     }
-
-
-def verdict(insertion: Insertion) -> str:
-    """Say in one line how an insertion ended."""
-    error = insertion.true_error_mm
-    if insertion.outcome != "done":
-        return f"{insertion.outcome} after {len(insertion.periods)} periods: {insertion.reason or 'no reason given'}"
-    if np.isnan(error):
-        return "done: the true tip is not known"
-    if insertion.reached:
-        return f"reached: the tip ended {error:.3f} mm from the target"
-    return f"MISSED: the tip ended {error:.3f} mm from the target, more than 1 mm"
 
 
 def _measured_tip(insertion: Insertion) -> tuple[float | None, float | None] | None:

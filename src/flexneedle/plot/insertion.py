@@ -1,0 +1,219 @@
+"""The figure of an insertion: the scene to scale, below it what happened over depth; the end magnified."""
+
+from textwrap import shorten
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from flexneedle.plot import curves, scene
+from flexneedle.plot.curves import Floats
+from flexneedle.plot.panels import Line, draw_panel
+from flexneedle.plot.style import (
+    BAD,
+    ESTIMATE,
+    INK,
+    MEASURED,
+    NEEDLE,
+    PLAN,
+    QUIET,
+    TARGET,
+    TRUE,
+    WIDTH,
+    axes,
+    new_figure,
+    styled,
+)
+from flexneedle.scenario import Scenario
+from flexneedle.trace import Insertion
+from flexneedle.trace.summary import verdict
+
+__all__ = ["insertion_figure"]
+
+# Places in inches from the top left.
+_LEFT, _RIGHT, _HEAD = 0.62, 0.15, 0.72
+_PANEL_WIDTH, _PANEL_HEIGHT, _PANEL_GAP = 4.55, 0.88, 0.3
+_CLOSE_UP = 2.6
+_FAR = 6.0  # mm; further from the target, the close-up shows the tip instead
+
+
+def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
+    """Return the figure of an insertion that has at least one period, finished or not."""
+    plan = insertion.plan
+    known = [
+        plan.tips,
+        curves.estimated_path(insertion),
+        curves.true_path(insertion),
+        np.array([[*plan.target]]),
+    ]
+    window = scene.view_of(scenario, max(plan.target[0], float(known[1][:, 0].max())), known)
+    width = WIDTH - _LEFT - _RIGHT
+    below = _HEAD + width * window.ratio + 0.98
+    with styled():
+        figure = new_figure(below + 3 * _PANEL_HEIGHT + 2 * _PANEL_GAP + 0.45)
+        _head(figure, scenario, insertion)
+        _scene(axes(figure, _LEFT, _HEAD, width, width * window.ratio), scenario, insertion, window)
+        _legend(figure, below - 0.5, insertion)
+        _panels(figure, scenario, insertion, below)
+        _close_up(axes(figure, WIDTH - _RIGHT - _CLOSE_UP, below, _CLOSE_UP, _CLOSE_UP), scenario, insertion)
+    return figure
+
+
+def _head(figure: Figure, scenario: Scenario, insertion: Insertion) -> None:
+    depth, aside = insertion.target
+    name = shorten(scenario.name, 60, placeholder=" …")
+    title = f"{name}: target {depth:g} mm deep, {aside:g} mm aside (seed {insertion.seed})"
+    height = float(figure.get_figheight())
+    left = 0.12 / WIDTH
+    figure.text(left, 1 - 0.1 / height, title, fontsize=11, weight="bold", va="top")
+    ended = shorten(verdict(insertion), 100, placeholder=" …")
+    color = TARGET if insertion.reached else BAD
+    figure.text(left, 1 - 0.36 / height, ended, fontsize=10, color=color, weight="bold", va="top").set_gid(
+        "verdict"
+    )
+    figure.text(1 - _RIGHT / WIDTH, 1 - 0.37 / height, _counts(insertion), color=INK, va="top", ha="right")
+
+
+def _counts(insertion: Insertion) -> str:
+    plan = insertion.plan
+    return f"bevel turns: {insertion.flips} (planned {plan.flips})"
+
+
+def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, window: scene.View) -> None:
+    plan, last = insertion.plan, insertion.periods[-1]
+    scene.draw_tissue(ax, scenario, window)
+    shapes = [period.shape for period in insertion.periods]
+    before = curves.shapes_on_the_way(curves.estimated_path(insertion), shapes)
+    scene.draw_needle(ax, last.shape, before, scenario.needle.outer_diameter)
+    if scenario.setup.guide_x is not None:
+        travel = np.array([0.0, *(period.guide for period in insertion.periods)])
+        scene.draw_guide(ax, scenario.setup.guide_x, travel, last.guide)
+    _paths(ax, insertion)
+    scene.draw_target(ax, plan.target)
+    scene.name_target(ax, plan.target)
+    scene.name_bevel(ax, plan)
+    scene.draw_turns(ax, curves.planned_turns(plan), PLAN, solid=False, label="bevel turn, planned")
+    scene.draw_turns(ax, curves.applied_turns(insertion), ESTIMATE, solid=True, label="bevel turn, applied")
+
+
+def _paths(ax: Axes, insertion: Insertion, scale: float = 1.0) -> None:
+    plan = insertion.plan
+    samples, refused = curves.good_samples(insertion), curves.refused_samples(insertion)
+    dots: dict[str, Any] = {"color": MEASURED, "markersize": 2.6 * scale**2, "markeredgewidth": 0.0}
+    ax.plot(*samples.T, ".", zorder=3, label="tracker", **dots)
+    ax.plot(*refused.T, "x", color=QUIET, markersize=3.5 * scale, zorder=3, label="tracker, refused")
+    ax.plot(*plan.tips[:, :2].T, "--", color=PLAN, linewidth=1.1 * scale, zorder=5, label="planned")
+    ax.plot(*curves.true_path(insertion).T, color=TRUE, linewidth=1.3 * scale, zorder=4, label="true")
+    estimated = curves.estimated_path(insertion)
+    ax.plot(*estimated.T, ":", color=ESTIMATE, linewidth=1.5 * scale, zorder=4.5, label="estimated")
+
+
+def _legend(figure: Figure, top: float, insertion: Insertion) -> None:
+    """Name the lines and marks of the scene in one row below it."""
+    handles = _handles(len(curves.refused_samples(insertion)) > 0)
+    figure.legend(
+        handles=handles,
+        loc="upper center",
+        bbox_to_anchor=(0.5, 1 - top / float(figure.get_figheight())),
+        ncols=len(handles),
+        columnspacing=1.3,
+        handlelength=1.8,
+        borderaxespad=0,
+    )
+
+
+def _handles(refused: bool) -> list[Line2D]:
+    planned, applied = scene.turn_style(PLAN, solid=False), scene.turn_style(ESTIMATE, solid=True)
+    samples = [Line2D([], [], color=MEASURED, marker=".", linestyle="none", label="tracker")]
+    if refused:
+        samples += [Line2D([], [], color=QUIET, marker="x", markersize=4, linestyle="none", label="refused")]
+    return [
+        Line2D([], [], color=NEEDLE, alpha=0.75, linewidth=4.0, label="needle"),
+        Line2D([], [], color=PLAN, linestyle="--", linewidth=1.1, label="planned path"),
+        Line2D([], [], color=TRUE, linewidth=1.3, label="true path"),
+        Line2D([], [], color=ESTIMATE, linestyle=":", linewidth=1.6, label="estimated path"),
+        *samples,
+        Line2D([], [], marker="^", label="bevel turn, planned", **planned),
+        Line2D([], [], marker="^", label="applied", **applied),
+    ]
+
+
+def _panels(figure: Figure, scenario: Scenario, insertion: Insertion, top: float) -> None:
+    """Draw the three panels over depth, the lowest with the axis."""
+    plan = insertion.plan
+    span = (float(plan.tips[0, 0]), max(float(plan.tips[:, 0].max()), plan.target[0]))
+    contents = (
+        ("Off the planned path (mm)", _error_lines(insertion), 0.4),
+        _motion(scenario, insertion),
+        ("Energy stored in the tissue (mJ)", _energy_lines(insertion), 0.1),
+    )
+    for k, (title, lines, least) in enumerate(contents):
+        ax = axes(figure, _LEFT, top + k * (_PANEL_HEIGHT + _PANEL_GAP), _PANEL_WIDTH, _PANEL_HEIGHT)
+        draw_panel(ax, scenario, title, lines, span, least)
+        ax.tick_params(labelbottom=k == len(contents) - 1)
+    ax.set_xlabel("depth of the tip (mm)", labelpad=1.0)
+
+
+def _error_lines(insertion: Insertion) -> list[Line]:
+    plan = insertion.plan
+    samples, truth = curves.good_samples(insertion), curves.true_path(insertion)
+    return [
+        Line("by tracker", samples[:, 0], curves.lateral_error(plan, samples), MEASURED, marker="o"),
+        Line("true", truth[:, 0], curves.lateral_error(plan, truth), TRUE),
+    ]
+
+
+def _motion(scenario: Scenario, insertion: Insertion) -> tuple[str, list[Line], float]:
+    """Guide over depth, or the base aside where there is no guide."""
+    plan, depth = insertion.plan, curves.estimated_path(insertion)[:, 0]
+    if scenario.setup.has_guide:
+        title, planned = "Guide aside (mm)", plan.guide
+        applied = np.array([period.guide for period in insertion.periods])
+    else:
+        title, planned = "Base aside (mm)", np.cumsum([0.0, *plan.controls[:, 1]])
+        applied = np.array([period.base[1] for period in insertion.periods])
+    lines = [Line("planned", plan.tips[:, 0], planned, PLAN, "--"), Line("applied", depth, applied, ESTIMATE)]
+    return title, lines, 0.4
+
+
+def _energy_lines(insertion: Insertion) -> list[Line]:
+    plan, truth = insertion.plan, curves.true_energy(insertion)
+    return [
+        Line("planned", plan.tips[:, 0], plan.strain_energy, PLAN, "--"),
+        Line("true", truth[:, 0], truth[:, 1], TRUE),
+    ]
+
+
+def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion) -> None:
+    """Magnify the end: around the target, or around the tip where it is still far away."""
+    tip = _last_tip(insertion)
+    distance = float(np.hypot(*(tip - insertion.target)))
+    near = distance <= _FAR
+    centre, half = (insertion.target, max(1.6, 1.15 * distance)) if near else (tip, 3.0)
+    ax.set_xlim(centre[0] - half, centre[0] + half)
+    ax.set_ylim(centre[1] - half, centre[1] + half)
+    ax.set_aspect("equal")
+    ax.set_title("The end, magnified" if near else f"The tip, {distance:.1f} mm from the target")
+    scene.tint_layers(ax, scenario, centre[0] + half)
+    _paths(ax, insertion, scale=1.6)
+    scene.draw_target(ax, insertion.target)
+    if near and not insertion.reached:
+        ax.plot(*np.array([tip, insertion.target]).T, color=BAD, linewidth=1.0, zorder=6, label="miss")
+    ax.plot(*tip, "o", color=TRUE, markersize=6, markeredgecolor="white", zorder=9, label="tip")
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(True)
+    ax.locator_params(nbins=5)
+    ax.set_xlabel(_errors(insertion), labelpad=3.0)
+
+
+def _last_tip(insertion: Insertion) -> Floats:
+    truth = curves.true_path(insertion)
+    end: Floats = (truth if len(truth) else curves.estimated_path(insertion))[-1]
+    return end
+
+
+def _errors(insertion: Insertion) -> str:
+    values = (("true error", insertion.true_error_mm), ("by the tracker", insertion.residual_mm))
+    return "\n".join(f"{name} {value:.2f} mm" for name, value in values if not np.isnan(value))

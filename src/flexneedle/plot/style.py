@@ -1,0 +1,107 @@
+"""How all figures look and are saved: the same bytes for the same data, whatever the user's settings."""
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+__all__ = [
+    "BAD",
+    "ESTIMATE",
+    "GUIDE",
+    "INK",
+    "MEASURED",
+    "NEEDLE",
+    "PLAN",
+    "QUIET",
+    "STRATEGIES",
+    "TARGET",
+    "TRUE",
+    "WIDTH",
+    "axes",
+    "new_figure",
+    "save",
+    "styled",
+]
+
+WIDTH = 9.0  # inches; shown 900 pixels wide, a point is 1.4 pixels
+
+# Okabe and Ito's colours, told apart by the colour-blind, with another line style or marker each.
+INK, QUIET = "#222222", "#6b6b6b"
+PLAN, ESTIMATE, TRUE, MEASURED, TARGET, BAD = "#222222", "#0072B2", "#D55E00", "#A8437F", "#00734f", "#B03A00"
+NEEDLE, GUIDE = "#8a8f98", "#4d535c"
+STRATEGIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+
+_SETTINGS: Any = {
+    "font.size": 8.5,
+    "axes.titlesize": 8.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.titlepad": 4.0,
+    "axes.labelsize": 8.5,
+    "axes.edgecolor": QUIET,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.unicode_minus": True,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "xtick.color": QUIET,
+    "ytick.color": QUIET,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "text.color": INK,
+    "text.parse_math": False,  # a scenario may be called "$5 phantom"
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "lines.linewidth": 1.4,
+    "lines.solid_capstyle": "round",
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "svg.hashsalt": "flexneedle",
+    "svg.fonttype": "path",
+}
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Use the style of the house inside the block, not the user's matplotlibrc."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_SETTINGS)
+        yield
+
+
+def new_figure(height: float) -> Figure:
+    """Return an empty figure of this height (inches)."""
+    figure = Figure(figsize=(WIDTH, height))
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def axes(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
+    """Add axes to a figure, placed in inches from its top left corner."""
+    total = float(figure.get_figheight())
+    added: Axes = figure.add_axes(
+        (left / WIDTH, (total - top - height) / total, width / WIDTH, height / total)
+    )
+    return added
+
+
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write `name`.png and `name`.svg into the folder, without date or version; return the paths."""
+    paths = [folder / f"{name}.png", folder / f"{name}.svg"]
+    plain: tuple[dict[str, Any], ...] = ({"Software": None}, {"Date": None, "Creator": "flexneedle"})
+    with styled(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph")  # a name in a script that the font lacks
+        for path, metadata in zip(paths, plain, strict=True):
+            draft = path.with_name(f".{path.name}")
+            figure.savefig(draft, format=path.suffix[1:], dpi=200, metadata=metadata)
+            draft.replace(path)
+    return paths

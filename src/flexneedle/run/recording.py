@@ -1,0 +1,108 @@
+"""Plan and insert with a record on disk: what the commands `plan` and `insert` do."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+from flexneedle.run.figures import draw_run
+from flexneedle.run.folder import TRACE_FILE, Folder, versions
+from flexneedle.run.results import insertion_result, insertion_timing, plan_result, plan_timing
+from flexneedle.scenario import Scenario
+from flexneedle.trace import Insertion, Period, PlanRecord
+from flexneedle.trace.writer import TraceWriter
+
+__all__ = ["OnIteration", "OnPeriod", "record_insertion", "record_plans"]
+
+OnIteration = Callable[[str, dict[str, Any]], None]
+"""Hears of each iteration of the planner: the strategy, and what `plan` tells."""
+OnPeriod = Callable[[Period], None]
+
+
+def record_plans(
+    folder: Folder, scenario: Scenario, strategies: Sequence[str], seed: int, on_iteration: OnIteration
+) -> dict[str, PlanRecord]:
+    """Plan with each strategy and leave `run.json` and `plan.png`, `.svg` in the folder.
+
+    An error or an interruption is marked in `run.json` and passed on.
+    """
+    with _marked(folder):
+        for strategy in strategies:
+            _plan(folder, scenario, strategy, seed, on_iteration)
+        results = {name: plan_result(plan) for name, plan in folder.plans.items()}
+        folder.values["result"] = results
+        folder.end("done")
+        draw_run(folder.path)
+    return folder.plans
+
+
+def record_insertion(
+    folder: Folder,
+    scenario: Scenario,
+    strategy: str,
+    seed: int,
+    *,
+    force: bool,
+    on_iteration: OnIteration,
+    on_period: OnPeriod,
+) -> Insertion:
+    """Plan, carry out, and leave `run.json`, `trace.mcap` and `insertion.png`, `.svg` in the folder.
+
+    An insertion that is interrupted (Ctrl-C) comes back with its periods and the outcome "interrupted". An
+    error, or an interruption of the planning, is marked in `run.json` and passed on.
+    """
+    with _marked(folder):
+        plan = _plan(folder, scenario, strategy, seed, on_iteration)
+        insertion = _insert(folder, scenario, plan, seed, force, on_period)
+        folder.values["result"] = insertion_result(insertion)
+        folder.timing |= insertion_timing(insertion)
+        folder.end(insertion.outcome, insertion.reason)
+        draw_run(folder.path)
+    return insertion
+
+
+def _plan(
+    folder: Folder, scenario: Scenario, strategy: str, seed: int, on_iteration: OnIteration
+) -> PlanRecord:
+    from flexneedle.run.planner import plan
+
+    made = plan(scenario, strategy=strategy, seed=seed, progress=partial(on_iteration, strategy))
+    folder.plans[strategy] = made
+    folder.timing[strategy] = plan_timing(made)
+    folder.write()
+    return made
+
+
+def _insert(
+    folder: Folder, scenario: Scenario, plan: PlanRecord, seed: int, force: bool, on_period: OnPeriod
+) -> Insertion:
+    from flexneedle.run.insertion import insert
+
+    periods: list[Period] = []
+    about = {"seed": str(seed), "scenario": scenario.name, "strategy": plan.strategy, **versions()}
+    path = folder.path / TRACE_FILE
+    with TraceWriter(path, plan, about=about, scenario=scenario.values()) as trace:
+
+        def keep(period: Period) -> None:
+            trace.add(period)
+            periods.append(period)
+            on_period(period)
+
+        try:
+            return insert(scenario, plan, seed, force=force, on_period=keep)
+        except KeyboardInterrupt:
+            return Insertion(plan, seed, tuple(periods), "interrupted", "stopped by the user")
+
+
+@contextmanager
+def _marked(folder: Folder) -> Iterator[None]:
+    """Mark in the folder how the block ended, if it did not end by itself, and draw what there is."""
+    try:
+        yield
+    except BaseException as error:
+        if folder.values["status"] == "running":
+            interrupted = isinstance(error, KeyboardInterrupt)
+            folder.end("interrupted" if interrupted else "failed", str(error) or type(error).__name__)
+            if folder.plans:
+                draw_run(folder.path)
+        raise

@@ -1,0 +1,75 @@
+"""Records as plain JSON values and back, and JSON as text that a person can read.
+
+Numbers keep all their digits. JSON has no NaN and no infinity: they become null.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from flexneedle.trace.records import PlanRecord
+
+__all__ = ["plain", "plan_from_values", "plan_values", "to_text"]
+
+_ARRAYS = ("controls", "tips", "strain_energy", "guide", "shapes")
+_WALL_CLOCK = "seconds"
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON knows it: dicts, lists, text, numbers, booleans, null."""
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not isfinite(value):
+        return None
+    return value
+
+
+def plan_values(plan: PlanRecord) -> dict[str, Any]:
+    """Return a plan as plain values, without the time that it took; arrays (mm, rad, mJ) come last."""
+    names = [field.name for field in fields(plan) if field.name != _WALL_CLOCK]
+    ordered = [name for name in names if name not in _ARRAYS] + list(_ARRAYS)
+    return {name: plain(getattr(plan, name)) for name in ordered}
+
+
+def plan_from_values(values: Mapping[str, Any]) -> PlanRecord:
+    """Return the plan of `plan_values`; raises KeyError, TypeError or ValueError if it is not one."""
+    given = {**values, **{name: np.array(values[name], dtype=float) for name in _ARRAYS}}
+    given["controls"] = given["controls"].reshape(-1, 5)
+    x, y = values["target"]
+    return PlanRecord(**{**given, "target": (x, y), "history": tuple(values["history"])})
+
+
+def to_text(values: Mapping[str, Any]) -> str:
+    """Return JSON with a line for each key, and for each row of an array."""
+    return "".join(_lines(plain(values), "")) + "\n"
+
+
+def _lines(value: Any, indent: str) -> Iterator[str]:
+    deeper = indent + " "
+    if isinstance(value, dict) and value:
+        opened = [(f"{_dump(key)}: ", item) for key, item in value.items()]
+        yield from _wrapped("{}", opened, indent, deeper)
+    elif isinstance(value, list) and any(isinstance(item, list | dict) for item in value) and len(indent) < 4:
+        yield from _wrapped("[]", [("", item) for item in value], indent, deeper)
+    else:
+        yield _dump(value)
+
+
+def _wrapped(brackets: str, items: list[tuple[str, Any]], indent: str, deeper: str) -> Iterator[str]:
+    yield brackets[0]
+    for number, (opening, item) in enumerate(items):
+        yield f"{',' if number else ''}\n{deeper}{opening}"
+        yield from _lines(item, deeper)
+    yield f"\n{indent}{brackets[1]}"
+
+
+def _dump(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
