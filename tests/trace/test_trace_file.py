@@ -99,7 +99,7 @@ def test_a_blind_period_comes_back(tmp_path):
 
 
 def test_columns_carry_units():
-    bare = {"index", "verdict", "bevel", "cost", "decision", "command_flip", "applied_flip"}
+    bare = {"index", "verdict", "bevel", "cost", "decision", "converged", "command_flip", "applied_flip"}
     units = {"mm", "rad", "s", "mj", "n"}
     assert {name for name in COLUMNS if name.rsplit("_", 1)[-1] not in units} == bare
 

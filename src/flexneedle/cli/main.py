@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 from flexneedle import __version__
 from flexneedle.errors import FlexneedleError, InputError
 
-from . import scenario
+from . import export, insert, plan, scenario, view
 
 __all__ = ["build_parser", "main"]
 
-_COMMANDS = (scenario,)
+_COMMANDS = (plan, insert, view, export, scenario)
 
 
 def build_parser() -> argparse.ArgumentParser:

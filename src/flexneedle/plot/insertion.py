@@ -147,7 +147,7 @@ def _panels(figure: Figure, scenario: Scenario, insertion: Insertion, top: float
     contents = (
         ("Off the planned path (mm)", _error_lines(insertion), 0.4),
         _motion(scenario, insertion),
-        ("Energy stored in the tissue (mJ)", _energy_lines(insertion), 0.1),
+        ("Energy stored in the tissue (mJ)", _energy_lines(insertion), 0.01),
     )
     for k, (title, lines, least) in enumerate(contents):
         ax = axes(figure, _LEFT, top + k * (_PANEL_HEIGHT + _PANEL_GAP), _PANEL_WIDTH, _PANEL_HEIGHT)
@@ -216,4 +216,4 @@ def _last_tip(insertion: Insertion) -> Floats:
 
 def _errors(insertion: Insertion) -> str:
     values = (("true error", insertion.true_error_mm), ("by the tracker", insertion.residual_mm))
-    return "\n".join(f"{name} {value:.2f} mm" for name, value in values if not np.isnan(value))
+    return "\n".join(f"{name} {value:.3f} mm" for name, value in values if not np.isnan(value))

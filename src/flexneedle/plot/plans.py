@@ -101,10 +101,10 @@ def _entry(ax: Axes, plan: PlanRecord) -> None:
 
 def _panels(figure: Figure, scenario: Scenario, plans: Sequence[PlanRecord], top: float) -> None:
     span = (float(plans[0].tips[0, 0]), max(float(plan.tips[:, 0].max()) for plan in plans))
-    contents = (_motion(scenario, plans), ("Energy stored in the tissue (mJ)", _energy(plans)))
-    for k, (title, lines) in enumerate(contents):
+    contents = ((*_motion(scenario, plans), 0.4), ("Energy stored in the tissue (mJ)", _energy(plans), 0.01))
+    for k, (title, lines, least) in enumerate(contents):
         ax = axes(figure, _LEFT, top + k * (_PANEL_HEIGHT + _PANEL_GAP), _PANEL_WIDTH, _PANEL_HEIGHT)
-        draw_panel(ax, scenario, title, lines, span, 0.2)
+        draw_panel(ax, scenario, title, lines, span, least)
         ax.tick_params(labelbottom=k == len(contents) - 1)
     ax.set_xlabel("depth of the tip (mm)", labelpad=1.0)
 

@@ -14,6 +14,10 @@ __all__ = ["COLUMNS", "from_row", "to_row"]
 _Scalar = Callable[[str], Any]
 
 
+def _flag(value: object) -> bool:
+    return str(value) == "True"
+
+
 def _command(name: str) -> tuple[tuple[str, _Scalar], ...]:
     moves = ("db_x_mm", "db_y_mm", "db_theta_rad", "dg_y_mm")
     return (*((f"{name}_{move}", float) for move in moves), (f"{name}_flip", int))
@@ -44,6 +48,7 @@ _FIELDS: dict[str, tuple[tuple[str, _Scalar], ...]] = {
     "decision": (("decision", str),),
     "true_tip": _pose("true"),
     "true_strain_energy": (("true_strain_energy_mj", float),),
+    "converged": (("converged", _flag),),
 }
 
 COLUMNS: tuple[str, ...] = tuple(name for columns in _FIELDS.values() for name, _ in columns)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import isfinite
 
 from flexneedle.trace.columns import to_row
 from flexneedle.trace.messages import (
@@ -81,8 +82,9 @@ def period_messages(period: Period) -> Iterator[Spoken]:
 
 def _tip(period: Period) -> Iterator[tuple[str, Message]]:
     yield SHAPE, path(period.time, period.shape)
-    if period.sample.x is not None and period.sample.y is not None:
-        yield "/tip/measured", pose(period.sample.time, (period.sample.x, period.sample.y, 0.0))
+    x, y = period.sample.x, period.sample.y
+    if x is not None and y is not None and isfinite(x) and isfinite(y):
+        yield "/tip/measured", pose(period.sample.time, (x, y, 0.0))
     yield "/tip/estimate", pose(period.time, period.estimate)
     yield "/tip/path", pose(period.time, period.path)
     if period.true_tip is not None:

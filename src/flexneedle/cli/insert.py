@@ -1,0 +1,119 @@
+"""`flexneedle insert`: plan an insertion and carry it out in closed loop."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import TYPE_CHECKING, Any
+
+from .common import add_run_arguments, chosen_scenario, print_json, print_table, run_name
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from flexneedle.scenario import Scenario
+    from flexneedle.trace import Insertion, Period
+
+    from .progress import Progress
+
+__all__ = ["add_parser"]
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser of `flexneedle`."""
+    parser = subparsers.add_parser(
+        "insert", help="plan an insertion and carry it out in closed loop on the virtual phantom"
+    )
+    add_run_arguments(parser)
+    parser.add_argument(
+        "--strategy",
+        choices=("manipulation", "steering"),
+        default="manipulation",
+        help="how to plan: manipulation moves guide and bevel, steering only the bevel (manipulation)",
+    )
+    parser.add_argument(
+        "--force", action="store_true", help="insert even if the plan misses the target by more than 1 mm"
+    )
+    parser.set_defaults(handler=_insert)
+
+
+def _insert(args: argparse.Namespace) -> int:
+    from flexneedle.run.folder import Folder
+    from flexneedle.run.recording import record_insertion
+
+    from .progress import Progress
+
+    scenario = chosen_scenario(args)
+    folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
+    with Progress() as progress:
+        show = _Show(progress, scenario)
+        insertion = record_insertion(
+            folder,
+            scenario,
+            args.strategy,
+            args.seed,
+            force=args.force,
+            on_iteration=show.iteration,
+            on_period=show.period,
+        )
+    return _report(insertion, args.json, folder.path)
+
+
+class _Show:
+    """Turns what planner and loop tell into progress."""
+
+    def __init__(self, progress: Progress, scenario: Scenario) -> None:
+        self._progress = progress
+        self._start = scenario.setup.start_tip_x
+        self._travel = scenario.target.depth_mm - self._start
+        progress.begin("Planning")
+
+    def iteration(self, _strategy: str, info: dict[str, Any]) -> None:
+        note = f"best cost {info['best']:.4g}"
+        self._progress.show("Planning", info["iteration"], info["iterations"], note)
+
+    def period(self, period: Period) -> None:
+        self._progress.finish("Planning")
+        depth = period.estimate[0]
+        done = min(max(depth - self._start, 0.0), self._travel)
+        self._progress.show("Inserting", done, self._travel, f"tip at {depth:.1f} mm")
+
+
+def _report(insertion: Insertion, as_json: bool, folder: Path) -> int:
+    from flexneedle.run.results import insertion_result, insertion_timing
+
+    if insertion.outcome == "interrupted":
+        print(f"flexneedle: interrupted: the record is in {folder}", file=sys.stderr)
+        return 130
+    if as_json:
+        result, timing = insertion_result(insertion), insertion_timing(insertion)
+        print_json({**result, "run_dir": str(folder), "timing": timing})
+    else:
+        _table(insertion, folder)
+    return 0 if insertion.reached else 1
+
+
+def _table(insertion: Insertion, folder: Path) -> None:
+    from flexneedle.run.results import insertion_result, insertion_timing
+    from flexneedle.trace.summary import verdict
+
+    result, timing = insertion_result(insertion), insertion_timing(insertion)
+    depth, aside = insertion.target
+    rows = [
+        ("target, depth and aside", f"{depth:g}, {aside:g} mm"),
+        ("true distance from the target", _number(result["true_error_mm"], "mm")),
+        ("  by the tracker", _number(result["residual_mm"], "mm")),
+        ("  as planned", _number(result["planned_error_mm"], "mm")),
+        ("energy in the true tissue", _number(result["strain_energy_mj"], "mJ")),
+        ("  as planned", _number(result["planned_strain_energy_mj"], "mJ")),
+        ("bevel turns", str(insertion.flips)),
+        ("  as planned", str(insertion.plan.flips)),
+        ("control periods", str(result["steps"])),
+        ("time of the plan", _number(timing["plan_seconds"], "s")),
+        ("time of a period, median", _number(timing["period_ms"]["p50"], "ms")),
+    ]
+    print_table(verdict(insertion)[:1].upper() + verdict(insertion)[1:], rows, folder)
+
+
+def _number(value: float | None, unit: str) -> str:
+    return "not known" if value is None else f"{value:.3f} {unit}"

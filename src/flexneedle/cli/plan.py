@@ -1,0 +1,84 @@
+"""`flexneedle plan`: plan an insertion and draw the plan."""
+
+from __future__ import annotations
+
+import argparse
+from math import degrees, isnan
+from typing import TYPE_CHECKING, Any
+
+from .common import add_run_arguments, chosen_scenario, print_json, print_table, run_name
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from flexneedle.trace import PlanRecord
+
+__all__ = ["add_parser"]
+
+_STRATEGIES = ("manipulation", "steering")
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser of `flexneedle`."""
+    parser = subparsers.add_parser("plan", help="plan an insertion and draw the plan")
+    add_run_arguments(parser)
+    parser.add_argument(
+        "--strategy",
+        choices=(*_STRATEGIES, "both"),
+        default="manipulation",
+        help="manipulation moves guide and bevel, steering only the bevel (manipulation)",
+    )
+    parser.set_defaults(handler=_plan)
+
+
+def _plan(args: argparse.Namespace) -> int:
+    from flexneedle.run.folder import Folder
+    from flexneedle.run.recording import record_plans
+
+    from .progress import Progress
+
+    scenario = chosen_scenario(args)
+    strategies = _STRATEGIES if args.strategy == "both" else (args.strategy,)
+    folder = Folder.claim(args.out, run_name(args), "plan", scenario, args.seed)
+    with Progress() as progress:
+
+        def show(strategy: str, info: dict[str, Any]) -> None:
+            note = f"best cost {info['best']:.4g}"
+            progress.show(f"Planning ({strategy})", info["iteration"], info["iterations"], note)
+
+        plans = record_plans(folder, scenario, strategies, args.seed, show)
+    _report(plans, args.json, folder.path)
+    return 0 if all(plan.reached for plan in plans.values()) else 1
+
+
+def _report(plans: dict[str, PlanRecord], as_json: bool, folder: Path) -> None:
+    from flexneedle.run.results import plan_result, plan_timing
+    from flexneedle.trace.summary import plan_verdict
+
+    if as_json:
+        results = {name: {**plan_result(plan), "timing": plan_timing(plan)} for name, plan in plans.items()}
+        print_json(results if len(results) > 1 else next(iter(results.values())))
+        return
+    title = "\n".join(f"Plan ({name}) {plan_verdict(plan)}" for name, plan in plans.items())
+    columns = [_rows(plan) for plan in plans.values()]
+    names = dict.fromkeys(name for column in columns for name in column)
+    rows = [(name, *(column.get(name, "") for column in columns)) for name in names]
+    print_table(title, rows, folder, heads=list(plans) if len(plans) > 1 else ())
+
+
+def _rows(plan: PlanRecord) -> dict[str, str]:
+    from flexneedle.trace.summary import entry_angle
+
+    angle = entry_angle(plan)
+    depth, aside = plan.target
+    return {
+        "target, depth and aside": f"{depth:g}, {aside:g} mm",
+        "distance from the target": f"{plan.error:.3f} mm",
+        "angle of entry": "none" if isnan(angle) else f"{degrees(angle):+.2f}°",
+        "bevel turns": str(plan.flips),
+        "energy stored in the tissue": f"{plan.strain_energy[-1]:.3f} mJ",
+        "cost": f"{plan.cost:.3f}",
+        **{f"  {name}": f"{value:.3f}" for name, value in plan.terms.items()},
+        "iterations": f"{plan.iterations}, {'converged' if plan.converged else 'not converged'}",
+        "time": f"{plan.seconds:.2f} s",
+    }

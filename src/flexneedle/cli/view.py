@@ -1,0 +1,23 @@
+"""`flexneedle view`: draw the figures of a run again."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+__all__ = ["add_parser"]
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser of `flexneedle`."""
+    parser = subparsers.add_parser("view", help="draw the figures of a run again, finished or not")
+    parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run")
+    parser.set_defaults(handler=_view)
+
+
+def _view(args: argparse.Namespace) -> int:
+    from flexneedle.run.figures import draw_run
+
+    for path in draw_run(args.run):
+        print(path)
+    return 0
