@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Progress"]
 
-_SHARE = 0.2  # without a terminal, a line each time that this much more is done
+_LINES = 5  # of a stage, without a terminal
 
 
 class Progress:
@@ -21,7 +21,7 @@ class Progress:
     def __init__(self) -> None:
         self._bars = _bars() if sys.stderr.isatty() else None
         self._tasks: dict[str, TaskID] = {}
-        self._told: dict[str, float] = {}
+        self._told: dict[str, int] = {}
 
     def __enter__(self) -> Self:
         if self._bars is not None:
@@ -40,7 +40,7 @@ class Progress:
             _tell(f"{stage} …")
         else:
             self._tasks[stage] = self._bars.add_task(stage, total=None, note="")
-        self._told[stage] = 0.0
+        self._told[stage] = 0
 
     def show(self, stage: str, done: float, total: float, note: str) -> None:
         """Show that `done` of `total` is done, with a short note."""
@@ -48,8 +48,8 @@ class Progress:
             self.begin(stage)
         if self._bars is not None:
             self._bars.update(self._tasks[stage], completed=done, total=total, note=note)
-        elif done >= total or done / total >= self._told[stage] + _SHARE:
-            self._told[stage] = done / total
+        elif (lines := int(_LINES * done / total + 1e-9)) > self._told[stage]:
+            self._told[stage] = lines
             _tell(f"{stage} {done / total:.0%}: {note}")
 
     def finish(self, stage: str) -> None:

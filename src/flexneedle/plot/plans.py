@@ -92,7 +92,7 @@ def _entry(ax: Axes, plan: PlanRecord) -> None:
     ax.annotate(
         text,
         (0.0, y),
-        (-4.0, high - 1.2),
+        (-6.0, high - 1.2),
         ha="right",
         va="top",
         arrowprops={"arrowstyle": "-", "color": QUIET, "linewidth": 0.6},

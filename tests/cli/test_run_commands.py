@@ -1,0 +1,302 @@
+"""`flexneedle plan`, `insert`, `view`, `export`: results, records, endings."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import fake_engine
+from fake_engine import install
+from flexneedle.cli import main as cli
+from flexneedle.errors import RunError
+from flexneedle.trace.columns import COLUMNS
+
+INSERTION_FILES = ["insertion.png", "insertion.svg", "run.json", "trace.mcap"]
+INSERT_KEYS = [
+    *("target_mm", "tip_true_mm", "tip_measured_mm", "true_error_mm", "residual_mm", "planned_error_mm"),
+    *("reached", "flips", "planned_flips", "strain_energy_mj", "planned_strain_energy_mj", "steps"),
+    *("converged", "seed", "run_dir", "timing"),
+]
+PLAN_KEYS = [
+    *("tip_mm", "error_mm", "reached", "cost", "terms", "flips", "strain_energy_mj", "iterations"),
+    *("converged", "seed", "timing"),
+]
+
+
+@pytest.fixture(autouse=True)
+def in_tmp(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def engine(monkeypatch):
+    """Return a function that puts the made-up planner and loop in place."""
+    return lambda **options: install(monkeypatch.setattr, **options)
+
+
+def run(capsys, *argv):
+    """Return exit status, stdout and stderr."""
+    status = cli.main(argv)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def reproducible(folder):
+    """Return what must be the same for the same seed: run.json but for timing, and the figures."""
+    values = json.loads((folder / "run.json").read_text())
+    del values["timing"]
+    figures = {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".png", ".svg")}
+    return json.dumps(values), figures
+
+
+def run_process(signal_name, *argv):
+    """Run a command in a process of its own that is hit by a signal in its 12th period."""
+    command = [sys.executable, fake_engine.__file__, signal_name, *argv]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_insert_leaves_a_record_and_a_table(engine, capsys, in_tmp):
+    engine()
+    status, out, err = run(capsys, "insert", "--out", "here")
+    assert status == 0
+    assert names(in_tmp / "here") == INSERTION_FILES
+    assert out.startswith("Reached: the tip ended 0.070 mm from the target\n")
+    assert "Record and figures: here" in out
+    assert "Planning 100%" in err
+    assert "Inserting" in err
+    assert "\x1b" not in out + err
+
+
+def test_insert_json_is_one_object_with_all_digits(engine, capsys):
+    engine()
+    status, out, _ = run(capsys, "insert", "--json", "--seed", "3")
+    result = json.loads(out)
+    assert status == 0
+    assert list(result) == INSERT_KEYS
+    assert result["target_mm"] == [40.0, 5.0]
+    assert result["reached"] is True
+    assert result["true_error_mm"] == pytest.approx(0.07)
+    assert (result["flips"], result["planned_flips"], result["steps"], result["seed"]) == (3, 1, 69, 3)
+    assert result["strain_energy_mj"] == pytest.approx(1.25 * result["planned_strain_energy_mj"])
+    assert set(result["timing"]) == {"plan_seconds", "period_ms"}
+    assert result["timing"]["period_ms"]["max"] == pytest.approx(5.1 + 0.01 * 68)
+    stored = json.loads((Path(result["run_dir"]) / "run.json").read_text())
+    assert stored["result"] == {key: result[key] for key in INSERT_KEYS if key not in ("run_dir", "timing")}
+    assert stored["status"] == "done"
+
+
+def test_the_target_is_depth_then_aside(engine, capsys):
+    engine()
+    status, out, _ = run(capsys, "insert", "--json", "--target", "30", "-4.5")
+    result = json.loads(out)
+    assert status == 0
+    assert result["target_mm"] == [30.0, -4.5]
+    stored = json.loads((Path(result["run_dir"]) / "run.json").read_text())
+    assert stored["scenario"]["target"] == {"depth_mm": 30.0, "lateral_mm": -4.5}
+
+
+def test_a_miss_is_said_and_fails(engine, capsys):
+    engine(miss=1.4)
+    status, out, _ = run(capsys, "insert")
+    assert status == 1
+    assert out.startswith("MISSED: the tip ended 1.410 mm from the target, more than 1 mm\n")
+
+
+def test_a_held_insertion_fails_with_its_reason(engine, capsys, in_tmp):
+    engine(outcome="held")
+    status, out, _ = run(capsys, "insert", "--out", "here")
+    assert status == 1
+    assert out.startswith("Held after 69 periods: no sample for 1.00 s\n")
+    assert json.loads((in_tmp / "here/run.json").read_text())["status"] == "held"
+
+
+def test_an_unreachable_plan_is_refused_and_recorded(engine, capsys, in_tmp):
+    engine(plan_miss=2.5)
+    status, out, err = run(capsys, "insert", "--json", "--out", "here")
+    assert (status, out) == (1, "")
+    assert err.splitlines()[-1].startswith("flexneedle: plan misses the target by 2.51 mm, bound by setup.")
+    assert names(in_tmp / "here") == ["plan.png", "plan.svg", "run.json", "trace.mcap"]
+    assert json.loads((in_tmp / "here/run.json").read_text())["status"] == "failed"
+
+
+def test_force_inserts_all_the_same(engine, capsys):
+    engine(plan_miss=2.5)
+    status, out, _ = run(capsys, "insert", "--json", "--force")
+    assert status == 1
+    assert json.loads(out)["planned_error_mm"] == pytest.approx(2.51)
+
+
+def test_a_failure_on_the_way_keeps_the_periods(engine, capsys, in_tmp):
+    def fail():
+        raise RunError("the driver is gone")
+
+    engine(stop=(20, fail))
+    status, out, err = run(capsys, "insert", "--out", "here")
+    assert (status, out) == (1, "")
+    assert err.splitlines()[-1] == "flexneedle: the driver is gone"
+    assert names(in_tmp / "here") == INSERTION_FILES
+    stored = json.loads((in_tmp / "here/run.json").read_text())
+    assert (stored["status"], stored["reason"]) == ("failed", "the driver is gone")
+
+
+def test_ctrl_c_keeps_and_marks_the_record(in_tmp):
+    done = run_process("SIGINT", "insert", "--json", "--out", "here")
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr.splitlines()[-1] == "flexneedle: interrupted: the record is in here"
+    stored = json.loads((in_tmp / "here/run.json").read_text())
+    assert (stored["status"], stored["result"]["steps"]) == ("interrupted", 12)
+    assert names(in_tmp / "here") == INSERTION_FILES
+
+
+def test_ctrl_c_while_planning_marks_the_record(engine, capsys, in_tmp, monkeypatch):
+    engine()
+
+    def interrupted(*_args, **_kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("flexneedle.run.planner.plan", interrupted)
+    status, out, err = run(capsys, "insert", "--out", "here")
+    assert (status, out, err.splitlines()[-1]) == (130, "", "flexneedle: interrupted")
+    assert json.loads((in_tmp / "here/run.json").read_text())["status"] == "interrupted"
+    assert run(capsys, "view", "here")[0] == 1
+
+
+def test_a_killed_run_can_be_viewed_and_exported(in_tmp, capsys):
+    assert run_process("SIGKILL", "insert", "--out", "here").returncode == -signal.SIGKILL
+    assert names(in_tmp / "here") == ["run.json", "trace.mcap"]
+    assert run(capsys, "view", "here")[:2] == (0, "here/insertion.png\nhere/insertion.svg\n")
+    status, out, err = run(capsys, "export", "here", "--csv", "-")
+    assert status == 0
+    assert len(list(csv.DictReader(out.splitlines()))) == 12
+    assert "not finished: reading stopped at the end of 12 whole periods" in err
+
+
+def test_view_draws_the_same_figures_again(engine, capsys, in_tmp):
+    engine()
+    run(capsys, "insert", "--out", "here")
+    before = reproducible(in_tmp / "here")
+    (in_tmp / "here/insertion.png").unlink()
+    assert run(capsys, "view", "here")[0] == 0
+    assert reproducible(in_tmp / "here") == before
+
+
+def test_the_same_seed_gives_the_same_bytes(engine, capsys, in_tmp):
+    engine()
+    for folder in ("first", "second"):
+        run(capsys, "insert", "--seed", "5", "--out", folder)
+    assert reproducible(in_tmp / "first") == reproducible(in_tmp / "second")
+    run(capsys, "insert", "--seed", "6", "--out", "third")
+    assert reproducible(in_tmp / "first") != reproducible(in_tmp / "third")
+
+
+@pytest.mark.parametrize("command", ["plan", "insert"])
+def test_a_folder_that_holds_a_run_is_refused(engine, capsys, in_tmp, command):
+    engine()
+    run(capsys, "insert", "--out", "here")
+    before = {path.name: path.read_bytes() for path in (in_tmp / "here").iterdir()}
+    status, out, err = run(capsys, command, "--out", "here")
+    assert (status, out) == (2, "")
+    assert err == "flexneedle: here: holds a run already (run.json): give another folder with --out\n"
+    assert {path.name: path.read_bytes() for path in (in_tmp / "here").iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["insert", "nowhere.toml"],
+        ["insert", "--target", "1000", "0"],
+        ["plan", "--target", "nan", "0"],
+        ["view", "nowhere"],
+        ["export", "nowhere", "--csv"],
+    ],
+)
+def test_bad_input_is_a_line_and_2_and_leaves_nothing(argv, capsys, in_tmp):
+    status, out, err = run(capsys, *argv)
+    assert (status, out) == (2, "")
+    assert err.startswith("flexneedle: ")
+    assert err.count("\n") == 1
+    assert names(in_tmp) == []
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["insert", "--seed", "-1"],
+        ["insert", "--target", "1"],
+        ["insert", "--strategy", "both"],
+        ["export", "x"],
+    ],
+)
+def test_wrong_arguments_end_with_2(argv, capsys):
+    with pytest.raises(SystemExit) as caught:
+        cli.main(argv)
+    assert caught.value.code == 2
+    assert capsys.readouterr().out == ""
+
+
+def test_plan_leaves_a_record_and_a_figure(engine, capsys, in_tmp):
+    engine()
+    status, out, _ = run(capsys, "plan", "--out", "here")
+    assert status == 0
+    assert names(in_tmp / "here") == ["plan.png", "plan.svg", "run.json"]
+    assert out.startswith("Plan (manipulation) reaches the target to 0.010 mm\n")
+    assert run(capsys, "view", "here")[:2] == (0, "here/plan.png\nhere/plan.svg\n")
+
+
+def test_plan_json_is_one_object(engine, capsys):
+    engine()
+    status, out, _ = run(capsys, "plan", "--json")
+    assert status == 0
+    assert list(json.loads(out)) == PLAN_KEYS
+
+
+def test_both_plans_are_one_object_by_strategy(engine, capsys):
+    engine()
+    _, out, _ = run(capsys, "plan", "--strategy", "both", "--json")
+    assert {name: list(result) for name, result in json.loads(out).items()} == {
+        "manipulation": PLAN_KEYS,
+        "steering": PLAN_KEYS,
+    }
+
+
+def test_a_plan_that_misses_says_the_limit_and_fails(engine, capsys):
+    engine(plan_miss=2.5)
+    status, out, _ = run(capsys, "plan")
+    assert status == 1
+    assert (
+        "MISSES the target: best distance 2.510 mm, more than 1 mm, limited by setup.max_guide_travel_mm"
+        in out
+    )
+
+
+def test_export_writes_a_line_a_period_with_units(engine, capsys, in_tmp):
+    engine()
+    run(capsys, "insert", "--out", "here")
+    assert run(capsys, "export", "here", "--csv") == (0, "here/periods.csv\n", "")
+    run(capsys, "export", "here", "--csv", "other.csv")
+    text = (in_tmp / "here/periods.csv").read_text()
+    assert text == (in_tmp / "other.csv").read_text()
+    rows = list(csv.DictReader(text.splitlines()))
+    assert tuple(rows[0]) == COLUMNS
+    assert len(rows) == 69
+    assert float(rows[-1]["true_x_mm"]) == 40.0
+    assert rows[-1]["guide_y_mm"].count(".") == 1
+
+
+def test_a_plan_cannot_be_exported(engine, capsys):
+    engine()
+    run(capsys, "plan", "--out", "here")
+    assert run(capsys, "export", "here", "--csv") == (
+        1,
+        "",
+        "flexneedle: here: holds a plan, not an insertion\n",
+    )

@@ -1,0 +1,237 @@
+"""Figures hold what they must: judged by their artists, not by their pixels."""
+
+from itertools import combinations
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.patches import Circle, Rectangle
+from matplotlib.text import Text
+
+from flexneedle.plot import insertion_figure, plan_figure, save
+from flexneedle.plot.panels import spread_out
+from flexneedle.scenario import Scenario, load_scenario
+from flexneedle.trace import Insertion
+from synthetic import GUIDE_X, blind, make_insertion, make_plan
+
+PHANTOM = load_scenario("phantom")
+
+
+@pytest.fixture(scope="module")
+def insertion():
+    return make_insertion()
+
+
+@pytest.fixture(scope="module")
+def figure(insertion):
+    return insertion_figure(PHANTOM, insertion)
+
+
+def texts(figure):
+    found = (text.get_text().strip() for text in figure.findobj(Text) if text.get_visible())
+    return [text for text in found if text]
+
+
+def lines(ax, label):
+    return [line for line in ax.get_lines() if line.get_label() == label]
+
+
+def unseen_ticks(figure):
+    """Return the labels of ticks beyond the ends of their axes, which are not drawn."""
+    sides = [axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)]
+    ticks = [(tick, sorted(axis.get_view_interval())) for axis in sides for tick in axis.get_major_ticks()]
+    return {tick.label1 for tick, (low, high) in ticks if not low <= tick.get_loc() <= high}
+
+
+def overlapping(figure):
+    """Return pairs of visible texts whose boxes overlap, and texts that leave the figure."""
+    renderer = figure.canvas.get_renderer()
+    figure.draw(renderer)
+    unseen = unseen_ticks(figure)
+    shown = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and t not in unseen]
+    boxes = [(text.get_text(), Text.get_window_extent(text, renderer)) for text in shown]  # without arrows
+    cut = [name for name, box in boxes if not (figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1)]
+    return cut + [(a, b) for (a, one), (b, two) in combinations(boxes, 2) if one.overlaps(two)]
+
+
+def test_the_scene_is_to_scale(figure):
+    scene, *_, close_up = figure.axes
+    for ax in (scene, close_up):
+        box = ax.get_window_extent()
+        (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
+        assert box.width / (right - left) == pytest.approx(box.height / (high - low), rel=1e-6)
+        assert ax.get_aspect() == 1.0
+
+
+def test_layers_are_named_with_their_modulus(figure):
+    assert {"air", "skin", "superficial, μ 1.82 kPa", "deep, μ 3.63 kPa"} <= set(texts(figure))
+
+
+def test_the_target_has_a_circle_of_1_mm(figure):
+    for ax in (figure.axes[0], figure.axes[-1]):
+        (circle,) = (patch for patch in ax.patches if isinstance(patch, Circle))
+        assert (circle.center, circle.radius) == ((40.0, 5.0), 1.0)
+
+
+def test_needle_is_as_thick_as_it_is(figure, insertion):
+    scene = figure.axes[0]
+    (needle,) = lines(scene, "needle")
+    np.testing.assert_array_equal(needle.get_xydata(), insertion.periods[-1].shape[:, :2])
+    left, right = scene.get_xlim()
+    points_per_mm = 72.0 * scene.get_window_extent().width / figure.dpi / (right - left)
+    assert needle.get_linewidth() == pytest.approx(0.819 * points_per_mm)
+    assert len(lines(scene, "needle before")) == 4
+
+
+def test_the_guide_stands_open_where_it_ended(figure, insertion):
+    jaws = [p for p in figure.axes[0].patches if isinstance(p, Rectangle) and p.get_gid() == "guide"]
+    upper, lower = sorted(jaws, key=lambda jaw: -jaw.get_y())
+    assert lower.get_x() < GUIDE_X < lower.get_x() + lower.get_width()
+    assert (upper.get_y() + lower.get_y() + lower.get_height()) / 2 == pytest.approx(
+        insertion.periods[-1].guide
+    )
+    (travel,) = lines(figure.axes[0], "guide travel")
+    assert travel.get_ydata()[0] == min(period.guide for period in insertion.periods)
+
+
+def test_paths_are_those_of_plan_and_record(figure, insertion):
+    scene = figure.axes[0]
+    expected = {
+        "planned": insertion.plan.tips[:, :2],
+        "true": [period.true_tip[:2] for period in insertion.periods],
+        "estimated": [period.estimate[:2] for period in insertion.periods],
+        "tracker": [(period.sample.x, period.sample.y) for period in insertion.periods],
+    }
+    for label, path in expected.items():
+        (line,) = lines(scene, label)
+        np.testing.assert_array_equal(line.get_xydata(), path)
+
+
+def test_turns_of_the_bevel_show_side_and_place(figure, insertion):
+    scene, plan = figure.axes[0], insertion.plan
+    (planned,) = lines(scene, "bevel turn, planned")
+    assert planned.get_marker() == "v"  # from +1, at the start, to −1
+    assert planned.get_markerfacecolor() == "none"
+    assert planned.get_xdata()[0] == plan.tips[45, 0]
+    applied = lines(scene, "bevel turn, applied")
+    assert [line.get_marker() for line in applied] == ["v", "^", "v"]
+    assert applied[0].get_xdata()[0] == insertion.periods[40].estimate[0]
+    assert applied[0].get_ydata()[0] < insertion.periods[40].estimate[1]
+    (start,) = lines(scene, "bevel at the start")
+    assert start.get_marker() == "^"
+
+
+def test_panels_show_error_motion_and_energy_over_depth(figure, insertion):
+    error, motion, energy = figure.axes[1:4]
+    (true,) = lines(error, "true")
+    lateral = [p.true_tip[1] - q[1] for p, q in zip(insertion.periods, insertion.plan.tips[1:], strict=True)]
+    np.testing.assert_allclose(true.get_ydata(), lateral, atol=1e-12)
+    assert lines(error, "by tracker")
+    (applied,) = lines(motion, "applied")
+    np.testing.assert_array_equal(applied.get_ydata(), [period.guide for period in insertion.periods])
+    (planned,) = lines(energy, "planned")
+    np.testing.assert_array_equal(planned.get_ydata(), insertion.plan.strain_energy)
+    (stored,) = lines(energy, "true")
+    assert stored.get_ydata()[-1] == insertion.periods[-1].true_strain_energy
+
+
+def test_a_reached_target_is_said(figure):
+    assert "reached: the tip ended 0.070 mm from the target" in texts(figure)
+
+
+def test_a_miss_is_said_plainly():
+    figure = insertion_figure(PHANTOM, make_insertion(miss=1.4))
+    assert "MISSED: the tip ended 1.410 mm from the target, more than 1 mm" in texts(figure)
+    assert lines(figure.axes[-1], "miss")
+
+
+@pytest.mark.parametrize("periods", [1, 2, 40])
+def test_an_unfinished_insertion_is_drawn_as_far_as_it_went(periods):
+    cut = make_insertion(periods=periods, outcome="interrupted", reason="stopped by the user")
+    figure = insertion_figure(PHANTOM, cut)
+    assert f"interrupted after {periods} periods: stopped by the user" in texts(figure)
+    assert len(lines(figure.axes[0], "true")[0].get_xdata()) == periods
+
+
+def test_an_insertion_without_truth_or_samples_is_drawn(insertion):
+    unseen = Insertion(insertion.plan, 0, tuple(map(blind, insertion.periods)), "held", "held for 1.00 s")
+    figure = insertion_figure(PHANTOM, unseen)
+    figure.canvas.draw()
+    assert "held after 69 periods: held for 1.00 s" in texts(figure)
+
+
+@pytest.mark.parametrize("case", ["reached", "missed", "interrupted"])
+def test_no_labels_overlap(case):
+    options = {
+        "reached": {},
+        "missed": {"miss": 1.4},
+        "interrupted": {"periods": 40, "outcome": "interrupted"},
+    }
+    assert overlapping(insertion_figure(PHANTOM, make_insertion(**options[case]))) == []
+
+
+def test_no_labels_of_plans_overlap():
+    assert overlapping(plan_figure(PHANTOM, [make_plan(), make_plan("steering")])) == []
+
+
+def test_without_a_guide_the_base_is_shown(minimal_text, scenario_file, insertion):
+    scenario = load_scenario(scenario_file(minimal_text))
+    figure = insertion_figure(scenario, insertion)
+    assert "Base aside (mm)" in texts(figure)
+    assert not lines(figure.axes[0], "guide travel")
+    assert "Base aside (mm)" in texts(plan_figure(scenario, [insertion.plan]))
+
+
+def test_names_are_no_mathematics_and_never_too_long(tmp_path, insertion):
+    values = PHANTOM.values() | {"name": "$5_phantom$ 針 " + "long " * 30}
+    values["tissue"][0] |= {"name": "$x_1", "thickness_mm": 1.5}
+    figure = insertion_figure(Scenario.from_values(values), insertion)
+    save(figure, tmp_path, "insertion")
+    assert any(text.startswith("$5_phantom$ 針 long") and "…" in text for text in texts(figure))
+
+
+def test_both_plans_stand_in_one_figure_with_terms_and_angles():
+    plans = [make_plan(), make_plan("steering")]
+    figure = plan_figure(PHANTOM, plans)
+    found = texts(figure)
+    assert "manipulation: reaches the target to 0.010 mm (cost 7.60)" in found
+    assert "steering: reaches the target to 0.010 mm (cost 14.10)" in found
+    assert {"enters at −2.7°", "enters at −0.7°"} <= set(found)
+    assert {"accuracy", "energy", "deflection", "control", "flips", "4.00", "10.50"} <= set(found)
+    bars = figure.axes[-1].containers
+    assert [bar.get_width() for bar in bars[1]] == list(plans[1].terms.values())
+
+
+def test_the_same_data_give_the_same_bytes(tmp_path, insertion):
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        folder.mkdir()
+        save(insertion_figure(PHANTOM, insertion), folder, "insertion")
+        save(plan_figure(PHANTOM, [insertion.plan]), folder, "plan")
+    names = sorted(path.name for path in first.iterdir())
+    assert names == ["insertion.png", "insertion.svg", "plan.png", "plan.svg"]
+    assert all((first / name).read_bytes() == (second / name).read_bytes() for name in names)
+
+
+def test_settings_of_the_user_change_nothing(tmp_path, insertion):
+    save(insertion_figure(PHANTOM, insertion), tmp_path, "plain")
+    with matplotlib.rc_context({"font.size": 20.0, "axes.facecolor": "black", "svg.hashsalt": None}):
+        save(insertion_figure(PHANTOM, insertion), tmp_path, "changed")
+        assert matplotlib.rcParams["font.size"] == 20.0
+    assert (tmp_path / "plain.svg").read_bytes() == (tmp_path / "changed.svg").read_bytes()
+    assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "changed.png").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("levels", "expected"),
+    [
+        ([], []),
+        ([0.5], [0.5]),
+        ([0.1, 0.9], [0.1, 0.9]),
+        ([0.5, 0.5], [0.4, 0.6]),
+        ([0.6, 0.5], [0.65, 0.45]),
+        ([0.0, 0.0, 0.0, 1.0], [-0.2, 0.0, 0.2, 1.0]),
+    ],
+)
+def test_names_keep_their_distance_and_their_order(levels, expected):
+    np.testing.assert_allclose(spread_out(levels, 0.2), expected, atol=1e-12)

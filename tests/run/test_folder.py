@@ -1,0 +1,160 @@
+"""The folder of a run: claimed once, never torn, read back with clear errors."""
+
+import json
+import os
+import re
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from flexneedle.errors import InputError
+from flexneedle.run.folder import Folder, read_run
+from flexneedle.scenario import load_scenario
+from flexneedle.trace.plain import plain, plan_from_values, plan_values, to_text
+from synthetic import make_plan
+
+PHANTOM = load_scenario("phantom")
+
+
+def claim(out=None, name="phantom", kind="insertion"):
+    return Folder.claim(out, name, kind, PHANTOM, 7)
+
+
+@pytest.fixture
+def in_tmp(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_folder_is_named_by_date_scenario_and_seed(in_tmp):
+    assert re.fullmatch(r"runs/\d{8}T\d{6}Z-phantom-7", str(claim().path))
+    assert (in_tmp / claim().path / "run.json").exists()
+
+
+@pytest.mark.usefixtures("in_tmp")
+def test_runs_in_the_same_second_get_their_own_folders():
+    paths = {claim().path for _ in range(5)}
+    assert len(paths) == 5
+    assert {path.parent.name for path in paths} == {"runs"}
+
+
+@pytest.mark.usefixtures("in_tmp")
+@pytest.mark.parametrize(
+    ("name", "expected"), [("my case/../x", "my-case-..-x"), ("…", "scenario"), ("針", "針")]
+)
+def test_a_name_becomes_a_single_folder(name, expected):
+    path = claim(name=name).path
+    assert path.parent == path.parents[-2]
+    assert path.name.endswith(f"Z-{expected}-7")
+
+
+def test_a_claimed_run_is_running_until_it_ends(tmp_path):
+    folder = claim(tmp_path / "a" / "b")
+    assert read_run(folder.path).status == "running"
+    folder.end("held", "no sample")
+    run = read_run(folder.path)
+    assert (run.status, run.reason, run.kind, run.seed) == ("held", "no sample", "insertion", 7)
+    assert run.scenario == PHANTOM
+
+
+@pytest.mark.parametrize("name", ["run.json", "trace.mcap"])
+def test_a_folder_that_holds_a_run_is_refused(tmp_path, name):
+    (tmp_path / name).write_text("precious")
+    with pytest.raises(InputError, match="holds a run already") as caught:
+        claim(tmp_path)
+    assert "\n" not in str(caught.value)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "precious")]
+
+
+def test_a_folder_with_other_files_is_used(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    claim(tmp_path)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file: is there already, and no empty folder"):
+        claim(tmp_path / "file")
+    with pytest.raises(InputError, match="cannot be made: Not a directory"):
+        claim(tmp_path / "file" / "below")
+
+
+def test_without_a_place_for_runs_there_is_a_clear_error(in_tmp):
+    (in_tmp / "runs").write_text("")
+    with pytest.raises(InputError, match="runs"):
+        claim()
+
+
+def test_run_json_is_whole_at_any_time(tmp_path, monkeypatch):
+    folder = claim(tmp_path)
+    before = (tmp_path / "run.json").read_bytes()
+
+    def full(_descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        folder.end("done")
+    assert (tmp_path / "run.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "damaged"),
+        ("{", "damaged"),
+        ("[]", "format must be 1"),
+        ('{"format": 2}', "format must be 1"),
+        ('{"format": 1}', "damaged: KeyError 'plans'"),
+        ('{"format": 1, "plans": {"x": {}}}', "damaged: KeyError"),
+        ('{"format": 1, "plans": 3}', "damaged: AttributeError"),
+    ],
+)
+def test_a_damaged_run_is_one_clear_line(tmp_path, text, told):
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(InputError, match=re.escape(told)) as caught:
+        read_run(tmp_path)
+    assert str(caught.value).startswith(f"{tmp_path}/run.json: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_damaged_scenario_is_named(tmp_path):
+    folder = claim(tmp_path)
+    folder.values["scenario"] |= {"target": {"depth_mm": 1e9}}
+    folder.write()
+    with pytest.raises(InputError, match=r"run\.json: damaged: target\.depth_mm"):
+        read_run(tmp_path)
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"holds no run: there is no run\.json"):
+        read_run(tmp_path)
+
+
+def test_plans_come_back_to_the_last_bit(tmp_path):
+    folder = claim(tmp_path)
+    plan = folder.plans["manipulation"] = make_plan()
+    folder.write()
+    again = read_run(tmp_path).plans["manipulation"]
+    for field in fields(plan):
+        if field.name != "seconds":
+            np.testing.assert_array_equal(getattr(again, field.name), getattr(plan, field.name))
+
+
+def test_a_plan_without_steps_comes_back():
+    values = plan_values(make_plan())
+    again = plan_from_values({**values, "controls": []})
+    assert again.controls.shape == (0, 5)
+    assert again.flips == 0
+
+
+def test_text_is_json_with_a_row_a_line():
+    values = {"a": np.arange(4.0).reshape(2, 2), "b": [], "c": {}, "d": {"e": float("nan"), "f": (1, "µ")}}
+    text = to_text(values)
+    assert json.loads(text) == plain(values)
+    assert text == (
+        '{\n "a": [\n  [0.0, 1.0],\n  [2.0, 3.0]\n ],\n "b": [],\n "c": {},\n'
+        ' "d": {\n  "e": null,\n  "f": [1, "µ"]\n }\n}\n'
+    )
