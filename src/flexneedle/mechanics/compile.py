@@ -6,12 +6,15 @@ silently run the old law. Here the cache folder is named after the sources of al
 
 import hashlib
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numba as nb
+from numba.core import config as _numba_config
 
+_Function = TypeVar("_Function")  # a compiled function is called like the one that it was
+_njit: Any = nb.njit
+_config: Any = _numba_config  # its settings are not declared
 _HERE = Path(__file__).parent
 
 
@@ -23,23 +26,25 @@ def _cache_folder() -> str:
     beside = _HERE / "__pycache__"
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "flexneedle"
     writable = os.access(beside if beside.exists() else _HERE, os.W_OK)
-    base = Path(nb.config.CACHE_DIR) if nb.config.CACHE_DIR else (beside if writable else user)
+    base = Path(_config.CACHE_DIR) if _config.CACHE_DIR else (beside if writable else user)
     return str(base / f"kernels-{digest.hexdigest()[:16]}")
 
 
 _FOLDER = _cache_folder()
 
 
-def inner(function: Callable[..., Any]) -> Any:
+def inner(function: _Function) -> _Function:
     """Compile a function that only other kernels call."""
-    return nb.njit(nogil=True, error_model="numpy")(function)
+    compiled: _Function = _njit(nogil=True, error_model="numpy")(function)
+    return compiled
 
 
-def kernel(function: Callable[..., Any]) -> Any:
+def kernel(function: _Function) -> _Function:
     """Compile an entry point, once for each version of the sources."""
-    before = nb.config.CACHE_DIR
-    nb.config.CACHE_DIR = _FOLDER
+    before = _config.CACHE_DIR
+    _config.CACHE_DIR = _FOLDER
     try:
-        return nb.njit(cache=True, nogil=True, error_model="numpy")(function)
+        compiled: _Function = _njit(cache=True, nogil=True, error_model="numpy")(function)
+        return compiled
     finally:
-        nb.config.CACHE_DIR = before
+        _config.CACHE_DIR = before

@@ -3,14 +3,17 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.compile import inner, kernel
-from flexneedle.mechanics.model import ESSENTIAL
+from flexneedle.mechanics.model import ESSENTIAL, Floats, Model
+
+Bools = NDArray[np.bool_]
 
 
 @inner
-def _move(model, s, rest, command):
+def _move(model: Model, s: Floats, rest: Floats, command: Floats) -> None:
     """Begin a step: remember where the tip is, apply (db_x, db_y, db_theta, dg_y, flip)."""
     s[nd.CUT_X], s[nd.CUT_Y], s[nd.CUT_TURN] = s[nd.TIP_X], s[nd.TIP_Y], s[nd.TIP_TURN]
     s[nd.CUT_FRONT], s[nd.CUT_REST] = s[nd.FRONT], s[nd.REST]
@@ -25,7 +28,7 @@ def _move(model, s, rest, command):
 
 
 @inner
-def _end_cut(model, s, rest, w, count, fresh):
+def _end_cut(model: Model, s: Floats, rest: Floats, w: Floats, count: int, fresh: int) -> None:
     """Leave the channel and the tip spring as the step cut them; out of the skin the channel is closed."""
     for i in range(fresh, count):
         if model.nodes.kind[i] != ESSENTIAL:
@@ -36,7 +39,7 @@ def _end_cut(model, s, rest, w, count, fresh):
 
 
 @kernel
-def settle(model, s, rest, u, w, held):
+def settle(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, held: float) -> int:
     """Solve where base and guide are and lay the cut; a `held` tip y (mm) is essential, NaN leaves it free.
 
     Work arrays in place, as in `needle.solve`; returns the number of nodes behind the tip.
@@ -47,14 +50,14 @@ def settle(model, s, rest, u, w, held):
 
 
 @kernel
-def advance(model, s, rest, u, w, command):
+def advance(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, command: Floats) -> int:
     """One step (X, C)_{k+1} = f((X, C)_k, U_k) (paper eq. 1); arrays and result as in `settle`."""
     _move(model, s, rest, command)
     return settle(model, s, rest, u, w, math.nan)
 
 
 @inner
-def _strain_energy(model, w, count):
+def _strain_energy(model: Model, w: Floats, count: int) -> float:
     """Tissue strain energy Σ w_c W (mJ) of the contacts after a solve (paper eq. 12)."""
     total = 0.0
     for i in range(count):
@@ -64,7 +67,7 @@ def _strain_energy(model, w, count):
 
 
 @inner
-def _mean_square_deflection(model, s, w, count):
+def _mean_square_deflection(model: Model, s: Floats, w: Floats, count: int) -> float:
     """∫y² dx over the length of the needle (mm²), exact for cubics (the consistent mass matrix of a beam)."""
     x, y, turn = s[nd.TIP_X], s[nd.TIP_Y], s[nd.TIP_TURN]
     total = 0.0
@@ -82,7 +85,19 @@ def _mean_square_deflection(model, s, w, count):
 
 
 @kernel
-def rollout(model, s0, rest0, u0, controls, first, last, tips, energy, converged, deflection):
+def rollout(
+    model: Model,
+    s0: Floats,
+    rest0: Floats,
+    u0: Floats,
+    controls: Floats,
+    first: int,
+    last: int,
+    tips: Floats,
+    energy: Floats,
+    converged: Bools,
+    deflection: Floats,
+) -> None:
     """Run samples first to last − 1 of `controls` (N, m, 5) from one state.
 
     Fills tips (N, m, 3), energy (N, m), converged (N, m), and deflection (N, m) unless its size is 0.

@@ -1,11 +1,11 @@
 """The constants of a needle in layered tissue, as flat arrays for the kernels (docs/theory.md section 2)."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.mechanics.ogden import law_constants
+from flexneedle.mechanics.ogden import law_scales
 
 Floats = NDArray[np.float64]
 
@@ -16,7 +16,7 @@ class Nodes(NamedTuple):
     """What can load the needle, by increasing x: the guide, then the contact points (each array (n,)).
 
     x: position (mm); kind: CONTACT or ESSENTIAL; reach: length over which a contact grows in behind
-    the tip (mm); alpha, height, force, energy: `ogden.Law` of each contact; weight: layer weight w_c.
+    the tip (mm); alpha, height, force, energy: its law (`ogden`); weight: layer weight w_c.
     """
 
     x: Floats
@@ -55,11 +55,13 @@ def tissue_layers(
 ) -> Layers:
     """Layers from arrays (k,) in mm and MPa; the last one goes on, so its thickness is ignored."""
     end = np.append(np.cumsum(thickness[:-1]), np.inf)
-    law = law_constants(shear_modulus, alpha, height, width * height)
-    return Layers(end, alpha, height, np.asarray(law.force), np.asarray(law.energy))
+    force, energy = law_scales(shear_modulus, alpha, height, width * height)
+    return Layers(end, alpha, height, force, energy)
 
 
-def contact_nodes(layers: Layers, weight: Floats, spacing: float, depth: float, guide_x: float | None) -> Nodes:
+def contact_nodes(
+    layers: Layers, weight: Floats, spacing: float, depth: float, guide_x: float | None
+) -> Nodes:
     """The guide, if any, and a contact point in the middle of every `spacing` down to `depth` (all mm).
 
     An interval that a layer's end divides becomes two, so that the stiffness per length is exact at any spacing.
@@ -85,5 +87,6 @@ def contact_nodes(layers: Layers, weight: Floats, spacing: float, depth: float, 
 def insert_essential(nodes: Nodes, x: Floats) -> Nodes:
     """`nodes` with essential nodes added at `x` (mm), in order of x."""
     place = np.searchsorted(nodes.x, x)
-    values = (x, ESSENTIAL, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
-    return Nodes(*(np.insert(array, place, value) for array, value in zip(nodes, values, strict=True)))
+    values: tuple[Any, ...] = (x, ESSENTIAL, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+    arrays: tuple[Any, ...] = nodes
+    return Nodes(*(np.insert(array, place, value) for array, value in zip(arrays, values, strict=True)))

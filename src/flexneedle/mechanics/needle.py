@@ -14,10 +14,10 @@ cut_y + share (y_tip − cut_y). So a is carried as a + y_tip g, and y_tip found
 
 import math
 
-from flexneedle.mechanics.compile import inner
 import numpy as np
 
-from flexneedle.mechanics.model import ESSENTIAL
+from flexneedle.mechanics.compile import inner
+from flexneedle.mechanics.model import ESSENTIAL, Floats, Model
 from flexneedle.mechanics.ogden import FLOOR_STRETCH, contact_law
 
 # Scalars of a state (docs/theory.md section 6 lists them): pose of base and guide, tip pose and tip spring now,
@@ -29,7 +29,9 @@ COUPLING, PATH_Y, ITERATIONS, RESIDUAL, CONVERGED = range(23, 28)
 STATE_SIZE = 28
 
 # Rows of the work array, one column a node. A1, G1, B11, B12 are those before an essential node, all else after.
-A1, A2, G1, G2, B11, B12, B22, STIFFNESS, FORCE, ENERGY, SHARE, FIXED, NEW_U, Y, TURN, SHEAR, MOMENT = range(17)
+A1, A2, G1, G2, B11, B12, B22, STIFFNESS, FORCE, ENERGY, SHARE, FIXED, NEW_U, Y, TURN, SHEAR, MOMENT = range(
+    17
+)
 WORK_ROWS = 17
 
 TOLERANCE_MM = 1e-7
@@ -38,10 +40,10 @@ COUPLED_ITERATIONS = 8
 MAX_ITERATIONS = 60
 
 
-
-
 @inner
-def _sweep_out(model, s, rest, u, w, tip_x, count, fresh):
+def _sweep_out(
+    model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, tip_x: float, count: int, fresh: int
+) -> tuple[float, ...]:
     """From the base to the tip: fill `w`, return (a1, a2, g1, g2, b11, b12, b22) just left of the tip spring."""
     nodes = model.nodes
     flexibility = 1.0 / model.bending_stiffness
@@ -96,7 +98,7 @@ def _sweep_out(model, s, rest, u, w, tip_x, count, fresh):
 
 
 @inner
-def spring_rest(model, s, tip_x):
+def spring_rest(model: Model, s: Floats, tip_x: float) -> tuple[float, float]:
     """(fixed, slope): the tip spring rests at fixed + (1 − slope) y_tip; docs/theory.md eq. 9."""
     cut = tip_x - s[CUT_FRONT]
     if cut <= 0.0:
@@ -114,7 +116,7 @@ def spring_rest(model, s, tip_x):
 
 
 @inner
-def _spring_law(model, s, tip_x, u):
+def _spring_law(model: Model, s: Floats, tip_x: float, u: float) -> tuple[float, ...]:
     """Force (N), stiffness (N/mm) and energy (mJ) of the tip spring over its layers; sharpest α/h and least h."""
     layers = model.layers
     front = max(s[CUT_FRONT], tip_x)
@@ -135,7 +137,7 @@ def _spring_law(model, s, tip_x, u):
 
 
 @inner
-def _judge(height, sharpness, u, new_u):
+def _judge(height: float, sharpness: float, u: float, new_u: float) -> tuple[float, float]:
     """(error, fraction): what is left after this Newton step (mm), and how much of the step may be taken.
 
     Newton converges quadratically, so about |Δu|² W_uuu/2W_uu is left; a step may use half the remaining stretch.
@@ -152,7 +154,7 @@ def _judge(height, sharpness, u, new_u):
 
 
 @inner
-def _tip(model, s, tip_x, held, ahead):
+def _tip(model: Model, s: Floats, tip_x: float, held: float, ahead: tuple[float, ...]) -> tuple[float, ...]:
     """Solve the tip: y, turn, total lateral force, spring u and energy, (error, fraction), reaction if held."""
     a1, a2, g1, g2, b11, b12, _ = ahead
     fixed, slope = spring_rest(model, s, tip_x)
@@ -175,7 +177,9 @@ def _tip(model, s, tip_x, held, ahead):
 
 
 @inner
-def _sweep_back(model, s, rest, u, w, tip, count):
+def _sweep_back(
+    model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, tip: tuple[float, ...], count: int
+) -> float:
     """From the tip to the base: positions, loads and new compressions into `w`, the shortening ½∫y'² (mm) returned."""
     nodes = model.nodes
     flexibility = 1.0 / model.bending_stiffness
@@ -213,7 +217,9 @@ def _sweep_back(model, s, rest, u, w, tip, count):
 
 
 @inner
-def _limit(model, u, w, count, error, fraction):
+def _limit(
+    model: Model, u: Floats, w: Floats, count: int, error: float, fraction: float
+) -> tuple[float, float]:
     """(error, fraction) of `_judge`, the worst over all contacts."""
     nodes = model.nodes
     for i in range(count):
@@ -225,7 +231,7 @@ def _limit(model, u, w, count, error, fraction):
 
 
 @inner
-def _move_by(model, u, w, count, fraction):
+def _move_by(model: Model, u: Floats, w: Floats, count: int, fraction: float) -> None:
     """Take `fraction` of the Newton step; the energies follow to third order in the full step."""
     for i in range(count):
         if model.nodes.kind[i] != ESSENTIAL:
@@ -235,7 +241,9 @@ def _move_by(model, u, w, count, fraction):
 
 
 @inner
-def _overshoot(model, s, u, w, count, tip_x, new_u, t):
+def _overshoot(
+    model: Model, s: Floats, u: Floats, w: Floats, count: int, tip_x: float, new_u: float, t: float
+) -> float:
     """Slope of the energy along the Newton step at `t`, less the beam's part (never negative) of 1 − t."""
     nodes = model.nodes
     change = new_u - s[SPRING_U]
@@ -245,15 +253,20 @@ def _overshoot(model, s, u, w, count, tip_x, new_u, t):
         if nodes.kind[i] != ESSENTIAL:
             change = w[NEW_U, i] - u[i]
             ramp = min(1.0, (tip_x - nodes.x[i]) / nodes.reach[i])
-            force = ramp * contact_law(
-                nodes.alpha[i], nodes.height[i], nodes.force[i], nodes.energy[i], u[i] + t * change
-            )[0]
-            slope += (w[FORCE, i] - w[STIFFNESS, i] * change - force) * change
+            force = (
+                ramp
+                * contact_law(
+                    nodes.alpha[i], nodes.height[i], nodes.force[i], nodes.energy[i], u[i] + t * change
+                )[0]
+            )
+            slope += (float(w[FORCE, i]) - w[STIFFNESS, i] * change - force) * change
     return slope
 
 
 @inner
-def _line_search(model, s, u, w, count, tip_x, new_u):
+def _line_search(
+    model: Model, s: Floats, u: Floats, w: Floats, count: int, tip_x: float, new_u: float
+) -> float:
     """The fraction of a Newton step at which the convex energy still falls: no cycle can form."""
     if _overshoot(model, s, u, w, count, tip_x, new_u, 1.0) <= 0.0:
         return 1.0
@@ -268,7 +281,7 @@ def _line_search(model, s, u, w, count, tip_x, new_u):
 
 
 @inner
-def _count_below(x, value):
+def _count_below(x: Floats, value: float) -> int:
     """How many of the sorted `x` are below `value`."""
     low, high = 0, x.size
     while low < high:
@@ -281,7 +294,9 @@ def _count_below(x, value):
 
 
 @inner
-def _iterate(model, s, rest, u, w, held):
+def _iterate(
+    model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, held: float
+) -> tuple[int, int, float, float]:
     """One Newton iteration, in place; returns (nodes behind the tip, first one being cut, error, change of x)."""
     x = model.nodes.x
     coupled = s[COUPLING] > 0.0
@@ -310,7 +325,7 @@ def _iterate(model, s, rest, u, w, held):
 
 
 @inner
-def guess(model, s, u):
+def guess(model: Model, s: Floats, u: Floats) -> None:
     """First guess: contacts to be cut are unstrained, the tip follows its own line."""
     tip_x = s[BASE_X] + model.length - s[SHORTENING]
     s[PATH_Y] = s[CUT_Y] + s[CUT_TURN] * (tip_x - s[CUT_X])
@@ -321,7 +336,7 @@ def guess(model, s, u):
 
 
 @inner
-def solve(model, s, rest, u, w, held):
+def solve(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, held: float) -> tuple[int, int]:
     """Find the equilibrium for the base and guide in `s`; a `held` tip (mm, NaN if free) is an essential condition.
 
     The shortening and the end of the path being cut are found with it. Where that does not converge, both are

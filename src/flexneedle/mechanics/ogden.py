@@ -10,25 +10,20 @@ Below `FLOOR_STRETCH` the force goes on linearly: W stays convex and C¹, and no
 """
 
 import math
-from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from flexneedle.mechanics.compile import inner
-import numpy as np
 
+Floats = NDArray[np.float64]
 FLOOR_STRETCH = 0.3
 
 
-class Law(NamedTuple):
-    """Constants of one contact: α, h (mm), force scale 2μV/(αh) (N), energy scale 2μV/α² (mJ)."""
-
-    alpha: float
-    height: float
-    force: float
-    energy: float
-
-
 @inner
-def _power_law(alpha, height, force, energy, stretch):
+def _power_law(
+    alpha: float, height: float, force: float, energy: float, stretch: float
+) -> tuple[float, float, float]:
     """(|force|, stiffness, energy) at a stretch above the floor."""
     t = math.exp(-0.5 * alpha * math.log(stretch))
     s = 1.0 / (t * t)
@@ -39,7 +34,9 @@ def _power_law(alpha, height, force, energy, stretch):
 
 
 @inner
-def contact_law(alpha, height, force, energy, u):
+def contact_law(
+    alpha: float, height: float, force: float, energy: float, u: float
+) -> tuple[float, float, float]:
     """Force on the needle (N), stiffness (N/mm) and stored energy (mJ) at the lateral compression u (mm)."""
     stretch = 1.0 - abs(u) / height
     beyond = 0.0
@@ -52,11 +49,6 @@ def contact_law(alpha, height, force, energy, u):
     return (-magnitude if u > 0.0 else magnitude), stiffness, stored
 
 
-def law_constants(shear_modulus, alpha, height, volume):
-    """The scales of `Law` for V = `volume` (mm³), μ in MPa; arrays broadcast."""
-    return Law(
-        alpha,
-        height,
-        np.multiply(2.0 * shear_modulus, volume) / (np.multiply(alpha, height)),
-        np.multiply(2.0 * shear_modulus, volume) / np.square(alpha),
-    )
+def law_scales(shear_modulus: Floats, alpha: Floats, height: Floats, volume: Floats) -> tuple[Floats, Floats]:
+    """Force scale 2μV/αh (N) and energy scale 2μV/α² (mJ) for μ in MPa, V in mm³, h in mm."""
+    return 2.0 * shear_modulus * volume / (alpha * height), 2.0 * shear_modulus * volume / alpha**2

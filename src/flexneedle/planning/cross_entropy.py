@@ -112,7 +112,9 @@ def minimize(
         samples = ask(belief, settings, rng)
         belief = tell(belief, settings, samples, cost(samples))
         if progress is not None:
-            progress({"iteration": belief.iterations, "iterations": settings.iterations, **belief.history[-1]})
+            progress(
+                {"iteration": belief.iterations, "iterations": settings.iterations, **belief.history[-1]}
+            )
     return belief
 
 

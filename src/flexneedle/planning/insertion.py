@@ -74,7 +74,7 @@ def optimise(
     upper = np.tile([problem.step[0], *problem.step[1:], _BEVEL_BOUND, _SHARE_BOUND], n)
     mean = np.tile([problem.step[0], 0.0, 0.0, 0.0, 0.0, 0.0], n)
     searched = ce.minimize(
-        lambda z: sum(_terms(rollout, problem, z).values()),
+        lambda z: np.sum(list(_terms(rollout, problem, z).values()), axis=0),
         ce.start(mean, np.tile(problem.sigma, n), _correlation(n)),
         ce.Settings(**settings, lower=lower, upper=upper),
         rng,
@@ -112,7 +112,9 @@ def schedule(problem: Problem, z: Floats) -> tuple[Floats, Floats]:
     wanted = np.where(primitives[:, :, BEVEL] >= 0.0, 1.0, -1.0)
     ends = np.cumsum(count, axis=1)
     index = np.arange(ends[:, -1].max())
-    owner = (index[None, :, None] >= ends[:, None, :]).sum(axis=2)  # primitive of each step; P when it is over
+    owner = (index[None, :, None] >= ends[:, None, :]).sum(
+        axis=2
+    )  # primitive of each step; P when it is over
     rows = np.arange(len(z))[:, None]
     steps = np.concatenate([steps, np.zeros((len(z), 1, 4))], axis=1)
     controls = np.full((len(z), index.size, 5), -1.0)

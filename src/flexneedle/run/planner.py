@@ -80,7 +80,14 @@ def _problem(scenario: Scenario, goal: tuple[float, float], strategy: str) -> Pr
     setup, plan = scenario.setup, scenario.plan
     guide_step = setup.max_guide_step_mm if setup.has_guide else 0.0
     sigma = np.array(
-        [plan.advance_sigma_mm, plan.base_sigma_mm, plan.base_turn_sigma, plan.guide_sigma_mm, 1.0, _SHARE_SIGMA]
+        [
+            plan.advance_sigma_mm,
+            plan.base_sigma_mm,
+            plan.base_turn_sigma,
+            plan.guide_sigma_mm,
+            1.0,
+            _SHARE_SIGMA,
+        ]
     )
     if strategy == "steering":
         sigma[1:4] = 0.0
@@ -133,7 +140,7 @@ def _record(
 ) -> PlanRecord:
     states = [simulator.start(solution.bevel)]
     for row in controls:
-        states.append(simulator.step(states[-1], Control(*row[:4].tolist(), flip=row[4] > 0.0)))
+        states.append(simulator.step(states[-1], Control.from_row(row.tolist())))
     belief = solution.belief
     return PlanRecord(
         strategy=strategy,

@@ -87,6 +87,16 @@ class Control(Section):
     """Share of a new tip load that is learnt in a period."""
     depth_tolerance_mm: Positive = 0.01
     """The insertion ends this close to the target depth."""
+    guide_weight: NonNegative = 0.05
+    """Cost of a squared millimetre that a guide step departs from the plan's."""
+    energy_weight_per_mj: NonNegative = 1.0
+    """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
+    flip_dead_band: Fraction = 0.8
+    """Share of the two paths' separation by which turning the bevel must be nearer to the target."""
+    start_offset_sd_mm: NonNegative = 0.5
+    """What the controller expects of the base clamp's lateral position: its standard deviation."""
+    start_angle_sd_mrad: NonNegative = 3.0
+    """What the controller expects of the base clamp's slope: its standard deviation."""
     innovation_limit_mm: Positive = 2.0
     """A measured tip further than this from the predicted one is not believed."""
     hold_limit_s: Positive = 1.0
@@ -98,6 +108,11 @@ class Control(Section):
     def curvature(self) -> float:
         """κ, 1/mm."""
         return 1e-3 * self.curvature_per_m
+
+    @property
+    def start_angle_sd(self) -> float:
+        """Expected standard deviation of the base clamp's slope, rad."""
+        return 1e-3 * self.start_angle_sd_mrad
 
 
 class Phantom(Section):

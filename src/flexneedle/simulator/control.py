@@ -1,5 +1,6 @@
 """Control inputs U = (δb_x, δb_y, δb_θ, δg_y, flip) and the limits that a command must keep."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,12 @@ class Control:
     dg_y: float = 0.0
     flip: bool = False
 
+    @classmethod
+    def from_row(cls, row: Sequence[float]) -> "Control":
+        """Return the control of five columns, flip as −1 or +1."""
+        db_x, db_y, db_theta, dg_y, flip = row
+        return cls(db_x, db_y, db_theta, dg_y, flip > 0.0)
+
     def row(self) -> Floats:
         """The five columns of `Simulator.rollout`, flip as −1 or +1."""
         return np.array([self.db_x, self.db_y, self.db_theta, self.dg_y, 1.0 if self.flip else -1.0])
@@ -40,9 +47,7 @@ class Limits:
         """Return the limits of a scenario in mm and rad; without a guide it cannot move."""
         setup = scenario.setup
         guide_step = setup.max_guide_step_mm if setup.has_guide else 0.0
-        step = np.array(
-            [setup.max_advance_mm, setup.max_base_step_mm, setup.max_base_turn_step, guide_step]
-        )
+        step = np.array([setup.max_advance_mm, setup.max_base_step_mm, setup.max_base_turn_step, guide_step])
         lateral, guide = setup.max_base_travel_mm, setup.max_guide_travel_mm
         travel = np.array([[0.0, setup.stroke_mm], [-lateral, lateral], [-np.inf, np.inf], [-guide, guide]])
         return cls(step, travel)

@@ -94,7 +94,9 @@ class Simulator:
         self._own(state)
         measured = np.array([tip, *points], dtype=float).reshape(-1, 2)
         if not np.isfinite(measured).all():
-            raise CommandError("measured position", float(measured[~np.isfinite(measured)][0]), 0.0, "must be finite")
+            raise CommandError(
+                "measured position", float(measured[~np.isfinite(measured)][0]), 0.0, "must be finite"
+            )
         x, y = measured[1:][np.argsort(measured[1:, 0])].T
         self._check_points(state, x)
         after = self._assimilated(state, float(measured[0, 1]), x, y)
@@ -196,9 +198,7 @@ def _build_model(scenario: Scenario) -> model.Model:
     )
     weight = np.array([layer.energy_weight for layer in tissue])
     depth = max(scenario.setup.max_depth, 0.0)
-    nodes = model.contact_nodes(
-        layers, weight, scenario.contact.spacing_mm, depth, scenario.setup.guide_x
-    )
+    nodes = model.contact_nodes(layers, weight, scenario.contact.spacing_mm, depth, scenario.setup.guide_x)
     bevel = needle.bevel
     return model.Model(
         needle.bending_stiffness, needle.length_mm, bevel.offset_mm, bevel.length_mm, nodes, layers

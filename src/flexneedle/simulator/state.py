@@ -4,7 +4,7 @@ import json
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from flexneedle.scenario import Scenario
 
 Floats = NDArray[np.float64]
 _MECHANICS = ("needle.", "setup.", "tissue", "contact.")  # the keys that a state depends on
+_Array = TypeVar("_Array", bound=NDArray[Any])
 _MESH_ROWS = (nd.Y, nd.TURN, nd.SHEAR, nd.MOMENT, nd.FORCE, nd.ENERGY)
 
 
@@ -60,12 +61,14 @@ class State:
     @property
     def tip(self) -> Floats:
         """Tip pose x, y, θ, shape (3,)."""
-        return self.scalars[[nd.TIP_X, nd.TIP_Y, nd.TIP_TURN]]
+        tip: Floats = self.scalars[[nd.TIP_X, nd.TIP_Y, nd.TIP_TURN]]
+        return tip
 
     @property
     def base(self) -> Floats:
         """Pose of the base clamp x, y, θ, shape (3,)."""
-        return self.scalars[[nd.BASE_X, nd.BASE_Y, nd.BASE_TURN]]
+        base: Floats = self.scalars[[nd.BASE_X, nd.BASE_Y, nd.BASE_TURN]]
+        return base
 
     @property
     def guide(self) -> float:
@@ -204,7 +207,9 @@ def load_arrays(path: str | Path, scenario: Scenario) -> dict[str, Floats]:
     if (key := mechanics_difference(saved, scenario)) is not None:
         mine, theirs = scenario.flat().get(key), saved.flat().get(key)
         raise StateError(f"{path}: saved under another scenario: {key} was {theirs}, is {mine}")
-    if set(arrays) != {"scalars", "rest", "compression", "mesh"} or arrays["scalars"].shape != (nd.STATE_SIZE,):
+    if set(arrays) != {"scalars", "rest", "compression", "mesh"} or arrays["scalars"].shape != (
+        nd.STATE_SIZE,
+    ):
         raise StateError(f"{path}: saved by another version of flexneedle")
     return {name: _frozen(array) for name, array in arrays.items()}
 
@@ -218,6 +223,6 @@ def solved(
     return State(scenario, model, _frozen(s), _frozen(rest), _frozen(u), _frozen(mesh))
 
 
-def _frozen(array: Any) -> Any:
+def _frozen(array: _Array) -> _Array:
     array.flags.writeable = False
     return array

@@ -85,6 +85,7 @@ class Period:
     true_tip: Pose | None
     true_strain_energy: float | None
     durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
+    converged: bool = True  # the model's solve of this period
 
 
 @dataclass(frozen=True, eq=False)

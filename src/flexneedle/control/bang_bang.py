@@ -1,0 +1,43 @@
+"""The bang-bang rule for the bevel: two kinematic paths, the nearer to the target wins (paper eq. 14 and 15)."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def closest_approach(pose: Floats, curvature: float, target: tuple[float, float]) -> float:
+    """Least distance (mm) to `target` of the path from `pose` (x, y, θ) with signed `curvature` (1/mm), ahead only.
+
+    The path of paper eq. 14 with steps u → 0: a line for curvature 0, else a circle.
+    """
+    x, y, turn = (float(value) for value in pose)
+    ahead = target[0] - x, target[1] - y
+    along = math.cos(turn) * ahead[0] + math.sin(turn) * ahead[1]
+    aside = math.cos(turn) * ahead[1] - math.sin(turn) * ahead[0]
+    if along <= 0.0:
+        return math.hypot(*ahead)
+    # |‖t − c‖ − R| with c at R = 1/κ aside, written so that κ → 0 stays exact.
+    bend = curvature * (along**2 + aside**2) - 2.0 * aside
+    return abs(bend) / (1.0 + math.sqrt(max(0.0, 1.0 + curvature * bend)))
+
+
+def wants_flip(
+    pose: Floats, bevel: int, curvature: float, target: tuple[float, float], dead_band: float, noise: float
+) -> tuple[bool, str]:
+    """Whether to turn the bevel over, and why.
+
+    curvature: κ (1/mm); dead_band: share of the paths' separation at the target, κ s², by which the other path
+    must be nearer, and `noise` (mm) what it must be nearer in any case: closer to the target than that the paths
+    do not part by more than the tracker sees. A wide band in mm would forbid turns that still help.
+    """
+    keep = closest_approach(pose, bevel * curvature, target)
+    turn = closest_approach(pose, -bevel * curvature, target)
+    separation = curvature * float(np.sum(np.square(np.subtract(target, pose[:2]))))
+    flip = keep - turn > dead_band * separation + noise
+    return (
+        flip,
+        f"bevel {'turned' if flip else 'kept'}: keeping misses by {keep:.3f} mm, turning by {turn:.3f} mm",
+    )

@@ -1,0 +1,44 @@
+"""One period of the closed loop: the bevel by the bang-bang rule, advance and guide by cross-entropy MPC."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexneedle.control import bang_bang, mpc
+from flexneedle.control.observer import Estimate
+from flexneedle.ports import Command
+from flexneedle.simulator import Simulator
+from flexneedle.trace import PlanRecord
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A command, why, its predicted cost, and the standard deviation left in the guide step (mm)."""
+
+    command: Command
+    why: str
+    cost: float
+    spread: float
+
+
+def decide(simulator: Simulator, plan: PlanRecord, estimate: Estimate, rng: np.random.Generator) -> Decision:
+    """Choose the next command towards the plan's target. In air the bevel has no effect and stays."""
+    control = simulator.scenario.control
+    flip, why = False, "in air"
+    if estimate.tip[0] > 0.0:
+        flip, why = bang_bang.wants_flip(
+            estimate.tip,
+            estimate.state.bevel,
+            control.curvature,
+            plan.target,
+            control.flip_dead_band,
+            simulator.scenario.tracker.jitter_per_axis,
+        )
+    choice = mpc.choose(simulator, plan, estimate.state, flip=flip, rng=rng)
+    command = (choice.db_x, 0.0, 0.0, choice.dg_y, 1 if flip else -1)
+    return Decision(command, why, choice.cost, choice.spread)
+
+
+def arrived(plan: PlanRecord, estimate: Estimate, tolerance: float) -> bool:
+    """Whether the believed tip is at the target depth, within `tolerance` mm, or past it."""
+    return bool(estimate.tip[0] >= plan.target[0] - tolerance)

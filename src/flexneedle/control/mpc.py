@@ -1,0 +1,105 @@
+"""Cross-entropy model predictive control of advance and guide (paper eq. 13)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.planning import Settings, cross_entropy
+from flexneedle.scenario import Scenario
+from flexneedle.simulator import Simulator, State
+from flexneedle.trace import PlanRecord
+
+Floats = NDArray[np.float64]
+_LEAST_ADVANCE = 0.5  # of the longest step: standing still is no way to reduce the cost
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The command of a period: db_x, dg_y (mm), its cost, and the standard deviation left in dg_y (mm)."""
+
+    db_x: float
+    dg_y: float
+    cost: float
+    spread: float
+
+
+def choose(
+    simulator: Simulator, plan: PlanRecord, state: State, *, flip: bool, rng: np.random.Generator
+) -> Choice:
+    """Search the next steps of advance and guide for the least deviation from the planned tip poses."""
+    scenario = simulator.scenario
+    steps, travel = scenario.control.horizon, max(plan.target[0] - float(state.tip[0]), 0.0)
+    reference, nominal = _window(plan, float(state.tip[0]), steps)
+    lower, upper, sigma = _bounds(scenario, steps)
+    mean = np.clip(np.concatenate([nominal[:, 0], nominal[:, 3]]), lower, upper)
+    settings = Settings(
+        samples=scenario.control.samples,
+        elite=max(2, round(scenario.control.samples * scenario.plan.elite_fraction)),
+        iterations=scenario.control.iterations,
+        smoothing=scenario.plan.smoothing,
+        tolerance=scenario.plan.tolerance,
+        lower=lower,
+        upper=upper,
+    )
+
+    def cost(z: Floats) -> Floats:
+        controls = _controls(scenario, state, z, travel, flip)
+        return _cost(simulator, state, controls, reference, nominal)
+
+    found = cross_entropy.minimize(cost, cross_entropy.start(mean, sigma), settings, rng)
+    first = _controls(scenario, state, found.best[None], travel, flip)[0, 0]
+    spread = float(np.sqrt(found.covariance[steps, steps]))
+    return Choice(float(first[0]), float(first[3]), found.best_cost, spread)
+
+
+def _window(plan: PlanRecord, x: float, steps: int) -> tuple[Floats, Floats]:
+    """Planned tip poses (steps, 3) after each step from where the plan is at x, and its controls (steps, 5)."""
+    last = len(plan.tips) - 1
+    at = float(np.interp(x, plan.tips[:, 0], np.arange(last + 1)))
+    index = np.minimum(at + np.arange(1, steps + 1), last)
+    poses = np.stack([np.interp(index, np.arange(last + 1), plan.tips[:, k]) for k in range(3)], axis=1)
+    rows = np.minimum(np.floor(at + 1e-9).astype(int) + np.arange(steps), last)
+    controls = np.concatenate([plan.controls, [[0.0, 0.0, 0.0, 0.0, -1.0]]])[rows]
+    return poses, controls
+
+
+def _bounds(scenario: Scenario, steps: int) -> tuple[Floats, Floats, Floats]:
+    """Lower, upper bound and first standard deviation of z = (advances, guide steps), each (2 steps,)."""
+    setup, control = scenario.setup, scenario.control
+    advance, guide = setup.max_advance_mm, setup.max_guide_step_mm if setup.has_guide else 0.0
+    # A guide step must undo the start error within half the horizon; jitter asks for a little more.
+    sigma = min(guide, 2.0 * (control.start_offset_sd_mm + scenario.tracker.jitter_per_axis) / steps)
+    ones = np.ones(steps)
+    return (
+        np.concatenate([_LEAST_ADVANCE * advance * ones, -guide * ones]),
+        np.concatenate([advance * ones, guide * ones]),
+        np.concatenate([scenario.plan.advance_sigma_mm * ones, sigma * ones]),
+    )
+
+
+def _controls(scenario: Scenario, state: State, z: Floats, travel: float, flip: bool) -> Floats:
+    """Controls (N, steps, 5) of z: the advance ends with the travel, the guide stays within its own."""
+    n, steps = len(z), z.shape[1] // 2
+    reach = scenario.setup.max_guide_travel_mm
+    moved = np.minimum(np.cumsum(z[:, :steps], axis=1), travel)
+    guide = np.clip(state.guide + np.cumsum(z[:, steps:], axis=1), -reach, reach)
+    controls = np.zeros((n, steps, 5))
+    controls[:, :, 0] = np.diff(moved, axis=1, prepend=0.0)
+    controls[:, :, 3] = np.diff(guide, axis=1, prepend=state.guide)
+    controls[:, :, 3] *= controls[:, :, 0] > 0.0
+    controls[:, :, 4] = -1.0
+    controls[:, 0, 4] = 1.0 if flip else -1.0
+    return controls
+
+
+def _cost(simulator: Simulator, state: State, controls: Floats, reference: Floats, nominal: Floats) -> Floats:
+    """Squared SE(2) deviation of the tip, summed over the steps, and the guide's departure from the plan."""
+    control = simulator.scenario.control
+    tips, energy, converged = simulator.rollout(state, controls)
+    off = tips - reference
+    off[:, :, 2] *= control.orientation_weight_mm
+    guide = controls[:, :, 3] - nominal[:, 3]
+    costs = (off**2).sum(axis=(1, 2)) + control.guide_weight * (guide**2).sum(axis=1)
+    costs += control.energy_weight_per_mj * energy.sum(axis=1)
+    return np.where(converged.all(axis=1), costs, np.inf)
