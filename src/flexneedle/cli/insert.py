@@ -56,6 +56,8 @@ def _insert(args: argparse.Namespace) -> int:
             on_iteration=show.iteration,
             on_period=show.period,
         )
+        if insertion.outcome == "done":
+            progress.finish("Inserting")
     return _report(insertion, args.json, folder.path)
 
 

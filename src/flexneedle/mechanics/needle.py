@@ -253,14 +253,11 @@ def _overshoot(
         if nodes.kind[i] != ESSENTIAL:
             change = w[NEW_U, i] - u[i]
             ramp = min(1.0, (tip_x - nodes.x[i]) / nodes.reach[i])
-            force = (
-                ramp
-                * contact_law(
-                    nodes.alpha[i], nodes.height[i], nodes.force[i], nodes.energy[i], u[i] + t * change
-                )[0]
+            force, _, _ = contact_law(
+                nodes.alpha[i], nodes.height[i], nodes.force[i], nodes.energy[i], u[i] + t * change
             )
-            slope += (float(w[FORCE, i]) - w[STIFFNESS, i] * change - force) * change
-    return slope
+            slope += (w[FORCE, i] - w[STIFFNESS, i] * change - ramp * force) * change
+    return float(slope)
 
 
 @inner

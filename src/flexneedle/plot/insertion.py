@@ -24,6 +24,7 @@ from flexneedle.plot.style import (
     WIDTH,
     axes,
     new_figure,
+    signed,
     styled,
 )
 from flexneedle.scenario import Scenario
@@ -64,7 +65,7 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
 def _head(figure: Figure, scenario: Scenario, insertion: Insertion) -> None:
     depth, aside = insertion.target
     name = shorten(scenario.name, 60, placeholder=" …")
-    title = f"{name}: target {depth:g} mm deep, {aside:g} mm aside (seed {insertion.seed})"
+    title = f"{name}: target {signed(depth)} mm deep, {signed(aside)} mm aside (seed {insertion.seed})"
     height = float(figure.get_figheight())
     left = 0.12 / WIDTH
     figure.text(left, 1 - 0.1 / height, title, fontsize=11, weight="bold", va="top")

@@ -10,7 +10,19 @@ from matplotlib.figure import Figure
 
 from flexneedle.plot import curves, scene
 from flexneedle.plot.panels import Line, draw_panel
-from flexneedle.plot.style import BAD, INK, PLAN, QUIET, STRATEGIES, TARGET, WIDTH, axes, new_figure, styled
+from flexneedle.plot.style import (
+    BAD,
+    INK,
+    PLAN,
+    QUIET,
+    STRATEGIES,
+    TARGET,
+    WIDTH,
+    axes,
+    new_figure,
+    signed,
+    styled,
+)
 from flexneedle.scenario import Scenario
 from flexneedle.trace import PlanRecord
 from flexneedle.trace.summary import entry_angle, plan_verdict
@@ -48,7 +60,7 @@ def plan_figure(scenario: Scenario, plans: Sequence[PlanRecord]) -> Figure:
 def _head(figure: Figure, scenario: Scenario, plan: PlanRecord) -> None:
     depth, aside = plan.target
     name = shorten(scenario.name, 60, placeholder=" …")
-    title = f"{name}: plan to {depth:g} mm deep, {aside:g} mm aside (seed {plan.seed})"
+    title = f"{name}: plan to {signed(depth)} mm deep, {signed(aside)} mm aside (seed {plan.seed})"
     height = float(figure.get_figheight())
     figure.text(0.12 / WIDTH, 1 - 0.1 / height, title, fontsize=11, weight="bold", va="top")
 
@@ -88,7 +100,7 @@ def _entry(ax: Axes, plan: PlanRecord) -> None:
         label="direction of entry",
     )
     high = ax.get_ylim()[1]
-    text = f"enters at {degrees(angle):+.1f}°".replace("-", "−")
+    text = f"enters at {signed(degrees(angle), '+.1f')}°"
     ax.annotate(
         text,
         (0.0, y),

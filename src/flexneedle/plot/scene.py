@@ -147,13 +147,11 @@ def name_target(ax: Axes, target: tuple[float, float]) -> None:
 
 
 def name_bevel(ax: Axes, plan: PlanRecord) -> None:
-    """Write at the start of the tip which side the bevel faces before it turns."""
-    x, where = float(plan.tips[0, 0]), float(plan.tips[0, 1]) + 2.2 * plan.bevel
-    ax.plot(
-        x, where, marker="^" if plan.bevel > 0 else "v", markersize=5, color=QUIET, label="bevel at the start"
-    )
-    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8}
-    ax.text(x + 1.0, where, "bevel at the start", color=QUIET, fontsize=8, va="center", bbox=box, zorder=3)
+    """Write below the start of the tip which side the bevel faces before it turns."""
+    x, foot = float(plan.tips[0, 0]), ax.get_ylim()[0] + 0.5
+    marker = "^" if plan.bevel > 0 else "v"
+    ax.plot(x, foot + 0.6, marker=marker, markersize=5, color=QUIET, label="bevel at the start")
+    ax.text(x + 1.0, foot, "bevel at the start", color=QUIET, fontsize=8)
 
 
 def draw_turns(ax: Axes, turns: Sequence[Turn], color: str, *, solid: bool, label: str) -> None:

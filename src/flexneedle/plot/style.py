@@ -27,6 +27,7 @@ __all__ = [
     "axes",
     "new_figure",
     "save",
+    "signed",
     "styled",
 ]
 
@@ -67,6 +68,11 @@ _SETTINGS: Any = {
     "svg.hashsalt": "flexneedle",
     "svg.fonttype": "path",
 }
+
+
+def signed(value: float, form: str = "g") -> str:
+    """Return a number as text with a true minus sign."""
+    return f"{value:{form}}".replace("-", "−")
 
 
 @contextmanager
