@@ -1,0 +1,264 @@
+"""The cross-entropy method on functions whose minimum is known, and its update against numbers by hand."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from flexneedle.planning import cross_entropy as ce
+
+FREE = ce.Settings(
+    samples=60, elite=10, iterations=60, smoothing=0.2, tolerance=1e-12,
+    lower=np.full(2, -10.0), upper=np.full(2, 10.0),
+)  # fmt: skip
+LEAST = np.array([1.5, -2.0])
+NARROW = np.array([[10.0, 9.0], [9.0, 10.0]])  # a valley along (1, −1)
+
+
+def quadratic(z):
+    return np.einsum("ni,ij,nj->n", z - LEAST, NARROW, z - LEAST)
+
+
+def two_wells(z):
+    """Wells at ±3 on the first axis; the one at +3 is deeper by 1."""
+    well = [np.sum((z - [side, 0.0]) ** 2, axis=1) for side in (3.0, -3.0)]
+    return np.minimum(well[0] - 1.0, well[1])
+
+
+def search(cost, settings=FREE, mean=(0.0, 0.0), sigma=(2.0, 2.0), seed=0, progress=None):
+    return ce.minimize(cost, ce.start(mean, sigma), settings, np.random.default_rng(seed), progress)
+
+
+def after(costs, samples, *, elite=2, smoothing=0.25, belief=None):
+    """The belief after one iteration with these costs and samples (N, 2)."""
+    belief = belief or ce.start(
+        np.array([1.0, -1.0]), np.array([2.0, 3.0]), np.array([[1, 1 / 6], [1 / 6, 1]])
+    )
+    settings = replace(FREE, samples=len(costs), elite=elite, smoothing=smoothing, tolerance=0.0)
+    return ce.tell(belief, settings, np.array(samples, dtype=float), np.array(costs, dtype=float))
+
+
+@pytest.mark.parametrize(("cost", "least"), [(quadratic, LEAST), (two_wells, [3.0, 0.0])])
+@pytest.mark.parametrize("seed", range(5))
+def test_known_minimum_is_found(cost, least, seed):
+    found = search(cost, seed=seed)
+    np.testing.assert_allclose(found.best, least, atol=1e-3)
+    np.testing.assert_allclose(found.best_cost, cost(np.array([least]))[0], atol=1e-5)
+
+
+def test_a_minimum_outside_the_bounds_ends_at_the_bound():
+    box = replace(FREE, upper=np.array([1.0, 10.0]))
+    found = search(lambda z: np.sum((z - 4.0) ** 2, axis=1), box)
+    assert found.best[0] == 1.0
+    assert found.best[1] == pytest.approx(4.0, abs=1e-3)
+
+
+def test_update_against_numbers_by_hand():
+    """Elite (0, 0), (2, 4): mean (1, 2), covariance ½ Σ c cᵀ = ((1, 2), (2, 4)); a quarter of the old is kept."""
+    belief = after([7.0, 1.0, 5.0, 2.0, 6.0], [(9, 9), (0, 0), (8, -8), (2, 4), (-9, 3)])
+    np.testing.assert_allclose(belief.mean, [0.75 * 1 + 0.25 * 1, 0.75 * 2 - 0.25 * 1], rtol=1e-14)
+    floor = [4e-6, 9e-6]  # a thousandth of the first standard deviation, squared
+    expected = [[0.75 * 1 + 0.25 * 4 + floor[0], 0.75 * 2 + 0.25 * 1], [1.75, 0.75 * 4 + 0.25 * 9 + floor[1]]]
+    np.testing.assert_allclose(belief.covariance, expected, rtol=1e-12)
+    np.testing.assert_array_equal(belief.best, [0.0, 0.0])
+    assert belief.best_cost == 1.0
+
+
+def test_smoothing_takes_the_old_moments_of_the_last_iteration():
+    once = after([1.0, 2.0, 3.0], [(0, 0), (2, 4), (9, 9)])
+    twice = after([1.0, 2.0, 3.0], [(0, 0), (2, 4), (9, 9)], belief=once)
+    np.testing.assert_allclose(twice.mean, 0.75 * np.array([1, 2]) + 0.25 * once.mean, rtol=1e-14)
+    floor = np.diag([4e-6, 9e-6])
+    expected = 0.75 * np.array([[1, 2], [2, 4]]) + 0.25 * once.covariance + floor
+    np.testing.assert_allclose(twice.covariance, expected, rtol=1e-12)
+
+
+def test_without_smoothing_the_elite_alone_counts():
+    belief = after([1.0, 2.0, 3.0], [(0, 0), (2, 4), (9, 9)], smoothing=0.0)
+    np.testing.assert_allclose(belief.mean, [1.0, 2.0])
+    np.testing.assert_allclose(belief.covariance, [[1 + 4e-6, 2], [2, 4 + 9e-6]], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("elite", "mean"), [(1, 1.0), (2, 1.5), (3, 2.0), (5, 3.0)])
+def test_elite_are_the_samples_of_least_cost(elite, mean):
+    """Samples 1 to 5 cost as much as they are; handed over in disorder."""
+    values = [4.0, 1.0, 5.0, 3.0, 2.0]
+    belief = after(values, [(v, 0) for v in values], elite=elite, smoothing=0.0)
+    assert belief.mean[0] == pytest.approx(mean)
+    assert belief.history[-1]["quantile"] == float(elite)
+
+
+def test_ties_at_the_quantile_leave_the_size_of_the_elite_the_first_drawn_win():
+    belief = after([2.0, 1.0, 2.0, 2.0], [(10, 0), (0, 0), (20, 0), (30, 0)], elite=2, smoothing=0.0)
+    assert belief.mean[0] == pytest.approx(5.0)
+
+
+def test_full_covariance_learns_the_correlation_of_a_valley():
+    belief = ce.start(np.zeros(2), np.full(2, 2.0))
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        samples = ce.ask(belief, FREE, rng)
+        belief = ce.tell(belief, FREE, samples, quadratic(samples))
+    c = belief.covariance
+    assert c[0, 1] / math.sqrt(c[0, 0] * c[1, 1]) < -0.5
+
+
+def test_samples_have_the_mean_and_covariance_of_the_belief():
+    covariance = np.array([[4.0, 1.5], [1.5, 1.0]])
+    belief = ce.start(np.array([1.0, -1.0]), np.array([2.0, 1.0]), np.array([[1.0, 0.75], [0.75, 1.0]]))
+    wide = replace(FREE, samples=20_000, lower=np.full(2, -1e3), upper=np.full(2, 1e3))
+    samples = ce.ask(belief, wide, np.random.default_rng(0))
+    np.testing.assert_allclose(samples.mean(axis=0), [1.0, -1.0], atol=0.05)
+    np.testing.assert_allclose(np.cov(samples.T), covariance, rtol=0.05)
+
+
+def test_first_sample_is_the_mean_and_later_the_second_the_best_so_far():
+    belief = after([3.0, 1.0, 2.0], [(5, 5), (7, -7), (1, 1)])
+    samples = ce.ask(belief, FREE, np.random.default_rng(0))
+    np.testing.assert_array_equal(samples[0], belief.mean)
+    np.testing.assert_array_equal(samples[1], [7.0, -7.0])
+    fresh = ce.start(np.array([1.0, -1.0]), np.array([2.0, 3.0]))
+    assert (ce.ask(fresh, FREE, np.random.default_rng(0))[1] != fresh.mean).all()
+
+
+def test_every_sample_keeps_its_bounds():
+    tight = replace(FREE, lower=np.array([-0.5, 0.2]), upper=np.array([0.1, 0.3]), iterations=5)
+    seen = []
+
+    def cost(z):
+        seen.append(z.copy())
+        return quadratic(z)
+
+    search(cost, tight, mean=(0.0, 0.9))
+    samples = np.concatenate(seen)
+    assert (samples >= tight.lower).all()
+    assert (samples <= tight.upper).all()
+    assert (samples == tight.lower).any()
+
+
+def test_a_coordinate_without_sigma_stays_at_its_mean():
+    seen = []
+
+    def cost(z):
+        seen.append(z.copy())
+        return quadratic(z)
+
+    found = search(cost, mean=(0.0, 1.0), sigma=(2.0, 0.0))
+    np.testing.assert_allclose(np.concatenate(seen)[:, 1], 1.0, rtol=1e-12)
+    assert not found.covariance[1].any()
+    assert not found.covariance[:, 1].any()
+    assert found.best[0] == pytest.approx(LEAST[0] - 0.9 * (1.0 - LEAST[1]), abs=1e-3)  # least on that line
+
+
+@given(seed=st.integers(0, 2**32), failing=st.floats(0.0, 1.0))
+@hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
+def test_best_so_far_is_never_worse_than_any_sample_seen(seed, failing):
+    """With a share of samples that fail, too."""
+    rng = np.random.default_rng(seed)
+    told: list[float] = []
+    sampled: list[np.ndarray] = []
+
+    def cost(z):
+        value = np.sin(5.0 * z[:, 0]) + 0.1 * np.sum(z**2, axis=1)
+        value[rng.random(len(z)) < failing] = rng.choice([np.nan, np.inf, -np.inf])
+        told.extend(value)
+        sampled.extend(z)
+        return value
+
+    belief = ce.start(np.zeros(2), np.full(2, 2.0))
+    small = replace(FREE, samples=8, elite=2)
+    for _ in range(6):
+        samples = ce.ask(belief, small, rng)
+        belief = ce.tell(belief, small, samples, cost(samples))
+        finite = [value for value in told if np.isfinite(value)]
+        assert belief.best_cost == min(finite, default=np.inf)
+        assert belief.history[-1]["best"] == belief.best_cost
+        assert np.isfinite(belief.mean).all()
+        assert np.isfinite(belief.covariance).all()
+        if finite:
+            assert any(np.array_equal(belief.best, z) for z in sampled)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_failed_samples_are_no_elite(bad):
+    belief = after([bad, 1.0, 2.0, bad], [(9, 9), (0, 0), (2, 4), (9, 9)], elite=3, smoothing=0.0)
+    np.testing.assert_allclose(belief.mean, [1.0, 2.0])
+    np.testing.assert_allclose(belief.covariance, [[1 + 4e-6, 2], [2, 4 + 9e-6]], rtol=1e-12)
+    assert not belief.converged
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_with_only_failed_samples_the_belief_stays(bad):
+    begin = ce.start(np.array([1.0, -1.0]), np.array([2.0, 3.0]))
+    belief = after([bad] * 4, [(9, 9)] * 4, belief=begin)
+    np.testing.assert_array_equal(belief.mean, begin.mean)
+    np.testing.assert_array_equal(belief.covariance, begin.covariance)
+    np.testing.assert_array_equal(belief.best, begin.mean)
+    assert belief.best_cost == np.inf
+    assert not belief.converged
+    assert belief.iterations == 1
+
+
+def test_a_minimum_where_most_samples_fail_is_found():
+    found = search(lambda z: np.where(z[:, 0] > 0.5, quadratic(z), np.nan))
+    np.testing.assert_allclose(found.best, LEAST, atol=1e-3)
+
+
+@pytest.mark.parametrize(("spread", "converged"), [(0.0999, True), (0.1001, False)])
+def test_converged_once_the_elite_costs_spread_less_than_the_tolerance(spread, converged):
+    begin = ce.start(np.zeros(1), np.ones(1))
+    costs = np.array([-2.0 + 2 * spread, 5.0, -2.0])
+    settings = ce.Settings(3, 2, 9, 0.0, 0.1, np.full(1, -9.0), np.full(1, 9.0))
+    belief = ce.tell(begin, settings, np.array([[1.0], [2.0], [3.0]]), costs)
+    assert belief.converged is converged
+    assert belief.done(settings) is converged
+
+
+def test_search_stops_at_convergence_or_at_the_maximum_of_iterations():
+    flat = search(lambda z: np.ones(len(z)))
+    assert flat.converged
+    assert flat.iterations == 1
+    limited = search(quadratic, replace(FREE, iterations=7))
+    assert not limited.converged
+    assert limited.iterations == 7
+
+
+def test_history_has_mean_quantiles_and_spread_of_each_iteration():
+    belief = after([7.0, 1.0, 5.0, 2.0, 6.0], [(9, 9), (0, 0), (8, -8), (2, 4), (-9, 3)])
+    (entry,) = belief.history
+    assert entry["mean"] == pytest.approx(21.0 / 5)
+    assert entry["best"] == 1.0
+    assert entry["quantile"] == 2.0
+    assert entry["quantiles"] == (1.0, 2.0, 5.0, 7.0)  # least, ρ, median, greatest
+    np.testing.assert_allclose(entry["spread"], np.sqrt(np.diag(belief.covariance)))
+    later = after([3.0, 4.0, 5.0], [(0, 0), (1, 1), (2, 2)], belief=belief)
+    assert [e["best"] for e in later.history] == [1.0, 1.0]
+    np.testing.assert_array_equal(later.best, [0.0, 0.0])
+
+
+def test_callback_gets_each_iteration_in_order():
+    calls = []
+    found = search(quadratic, replace(FREE, iterations=4), progress=calls.append)
+    assert [call["iteration"] for call in calls] == [1, 2, 3, 4]
+    assert {call["iterations"] for call in calls} == {4}
+    assert [call["best"] for call in calls] == [entry["best"] for entry in found.history]
+
+
+def test_same_seed_same_bytes_other_seed_others():
+    one, again, other = (search(quadratic, seed=seed) for seed in (3, 3, 4))
+    for name in ("mean", "covariance", "best"):
+        assert getattr(one, name).tobytes() == getattr(again, name).tobytes()
+    assert one.history == again.history
+    assert one.best.tobytes() != other.best.tobytes()
+
+
+def test_tell_leaves_samples_and_costs_as_they_were():
+    samples, costs = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), np.array([np.nan, 1.0, 2.0])
+    kept = samples.copy(), costs.copy()
+    ce.tell(ce.start(np.zeros(2), np.ones(2)), replace(FREE, samples=3, elite=2), samples, costs)
+    np.testing.assert_array_equal(samples, kept[0])
+    np.testing.assert_array_equal(costs, kept[1])

@@ -1,0 +1,256 @@
+"""Primitives to controls, the terms of a plan's cost, and the search on a needle that is made up."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from flexneedle.planning import insertion
+from flexneedle.planning.insertion import Problem, optimise, schedule
+
+PROBLEM = Problem(
+    target=(8.0, 2.0), travel=12.0, primitives=3,
+    step=np.array([1.0, 0.5, 0.005, 0.5]), reach=np.array([20.0, 1.0, np.inf, 2.0]),
+    sigma=np.array([0.1, 0.0, 0.0, 0.25, 1.0, 0.3]),
+    accuracy_weight=20.0, energy_weight=5.0, deflection_weight=0.002, guide_weight=1.0, flip_weight=0.3,
+)  # fmt: skip
+SEARCH = {"samples": 64, "elite": 8, "iterations": 30, "smoothing": 0.2, "tolerance": 1e-6}
+BOUNDS = np.array([0.25, 0.5, 0.005, 0.5, 3.0, 1.0])
+
+
+def primitives(*rows):
+    """Samples z (1, 6 P) of rows (longest advance, base y, base θ, guide, ε, log share)."""
+    return np.array(rows, dtype=float).reshape(1, -1)
+
+
+def sampled():
+    """z (4, 18) within the bounds of the search."""
+    unit = st.floats(-1.0, 1.0, allow_subnormal=False)
+    offset = np.array([0.75, 0, 0, 0, 0, 0])
+    return arrays(float, (4, 3, 6), elements=unit).map(lambda a: (offset + a * BOUNDS).reshape(4, 18))
+
+
+def test_equal_shares_and_full_steps():
+    """12 mm in three primitives of four steps; the direction turns at the second and again at the third."""
+    z = primitives((1, 0, 0, 0.1, 2.0, 0), (1, 0.02, 0, 0, -0.1, 0), (1, 0, 0.001, -0.2, 0.1, 0))
+    controls, wanted = schedule(PROBLEM, z)
+    expected = np.zeros((12, 5))
+    expected[:, 0], expected[:, 4] = 1.0, -1.0
+    expected[:4, 3], expected[4:8, 1], expected[8:, 2], expected[8:, 3] = 0.1, 0.02, 0.001, -0.2
+    expected[[4, 8], 4] = 1.0
+    np.testing.assert_allclose(controls[0], expected, atol=1e-14)
+    np.testing.assert_array_equal(wanted, [[1.0, -1.0, 1.0]])
+
+
+def test_shares_are_the_exponentials_and_steps_no_longer_than_asked():
+    """Shares 2 : 1 : 1 of 12 mm with longest steps of 1, 0.7 and 0.5: 6, 5 and 6 steps."""
+    z = primitives((1, 0, 0, 0, 1, np.log(2)), (0.7, 0, 0, 0, 1, 0), (0.5, 0, 0, 0, 1, 0))
+    controls, _ = schedule(PROBLEM, z)
+    np.testing.assert_allclose(controls[0, :, 0], [*[1.0] * 6, *[0.6] * 5, *[0.5] * 6])
+
+
+def test_wanting_minus_from_the_start_turns_in_the_first_step():
+    controls, wanted = schedule(PROBLEM, primitives(*[(1, 0, 0, 0, -1, 0)] * 3))
+    assert controls[0, :, 4].tolist() == [1.0, *[-1.0] * 11]
+    assert wanted.tolist() == [[-1.0, -1.0, -1.0]]
+
+
+def test_no_direction_at_all_counts_as_plus():
+    controls, wanted = schedule(PROBLEM, primitives(*[(1, 0, 0, 0, 0.0, 0)] * 3))
+    assert (controls[0, :, 4] == -1.0).all()
+    assert (wanted == 1.0).all()
+
+
+def test_guide_stops_at_its_reach_and_comes_back_from_there():
+    """Four steps of 0.5 reach 2.0, the limit; four more stay; four back end at 0."""
+    up = (1, 0, 0, 0.5, 1, 0)
+    controls, _ = schedule(PROBLEM, primitives(up, up, (1, 0, 0, -0.5, 1, 0)))
+    np.testing.assert_allclose(controls[0, :, 3], [*[0.5] * 4, *[0.0] * 4, *[-0.5] * 4], atol=1e-14)
+    halfway, _ = schedule(PROBLEM, primitives((1, 0, 0, 0.4, 1, 0), up, up))
+    np.testing.assert_allclose(halfway[0, :, 3], [*[0.4] * 4, *[0.1] * 4, *[0.0] * 4], atol=1e-14)
+
+
+def test_short_samples_are_padded_with_steps_that_do_nothing():
+    quick, slow = (1, 0, 0, 0.1, -1, 0), (0.5, 0, 0, 0.1, -1, 0)
+    controls, _ = schedule(PROBLEM, np.concatenate([primitives(*[quick] * 3), primitives(*[slow] * 3)]))
+    assert controls.shape == (2, 24, 5)
+    np.testing.assert_array_equal(controls[0, 12:], np.tile([0.0, 0.0, 0.0, 0.0, -1.0], (12, 1)))
+    assert (controls[1, :, 0] > 0.0).all()
+
+
+@given(z=sampled())
+@hypothesis_settings(deadline=None, derandomize=True, max_examples=100)
+def test_any_sample_keeps_travel_limits_and_turns(z):
+    controls, wanted = schedule(PROBLEM, z)
+    np.testing.assert_allclose(controls[:, :, 0].sum(axis=1), PROBLEM.travel, rtol=1e-12)
+    assert (np.abs(controls[:, :, :4]) <= PROBLEM.step + 1e-12).all()
+    travel = np.abs(np.cumsum(controls[:, :, :4], axis=1))
+    assert (travel <= PROBLEM.reach + 1e-12).all()
+    turns = (np.diff(wanted, axis=1, prepend=1.0) != 0.0).sum(axis=1)
+    np.testing.assert_array_equal((controls[:, :, 4] == 1.0).sum(axis=1), turns)
+    assert set(np.unique(controls[:, :, 4])) <= {-1.0, 1.0}
+    facing = np.cumprod(np.where(controls[:, :, 4] > 0.0, -1.0, 1.0), axis=1)
+    np.testing.assert_array_equal(facing[:, 0], wanted[:, 0])
+    np.testing.assert_array_equal(facing[:, -1], wanted[:, -1])
+    for row, sample in zip(controls, z.reshape(4, 3, 6), strict=True):
+        moving = row[row[:, 0] > 0.0]
+        assert (row[len(moving) :, :4] == 0.0).all()
+        assert (moving[:, 0] <= sample[:, 0].max() + 1e-12).all()
+        share = np.exp(sample[:, 5]) / np.exp(sample[:, 5]).sum() * PROBLEM.travel
+        least = np.ceil(share / sample[:, 0] - 1e-9).sum()
+        assert len(moving) == least  # no more steps than needed
+
+
+def made_up(n):
+    """A rollout of n samples, 12 steps: the tip ends at (7.5, 1.5) with slope 0.2, in tissue for the last 8."""
+    x = np.arange(12.0) - 3.0
+    tips = np.zeros((n, 12, 3))
+    tips[:, :, 0] = np.where(x < 1.0, x, x - 0.5)
+    tips[:, -1] = 7.5, 1.5, 0.2
+    energy = np.tile(np.linspace(0.0, 0.4, 12), (n, 1))
+    deflection = np.tile(np.arange(12.0), (n, 1))
+    return tips, energy, np.ones((n, 12), dtype=bool), deflection
+
+
+def terms(z, change=lambda *arrays: arrays, problem=PROBLEM):
+    found = insertion._terms(lambda controls: change(*made_up(len(controls))), problem, z)
+    return {name: float(value[0]) for name, value in found.items()}
+
+
+GUIDED = primitives((1, 0, 0, 0.1, 1, 0), (1, 0, 0, -0.2, -1, 0), (1, 0, 0, 0.05, 1, 0))
+
+
+def test_cost_term_by_term_against_a_computation_by_hand():
+    """x > 0 from the fifth step on: guide 4 × 0.04 + 4 × 0.0025, deflection 4 + 5 + … + 11 = 60."""
+    found = terms(GUIDED)
+    assert found["accuracy"] == pytest.approx(20.0 * abs(1.5 + np.tan(0.2) * 0.5 - 2.0))
+    assert found["energy"] == pytest.approx(5.0 * 0.4)
+    assert found["deflection"] == pytest.approx(0.002 * 60.0)
+    assert found["guide"] == pytest.approx(1.0 * (4 * 0.04 + 4 * 0.0025))
+    assert found["flips"] == pytest.approx(0.3 * 2)
+    assert len(found) == 5
+
+
+def test_each_weight_scales_its_own_term_alone():
+    base = terms(GUIDED)
+    for name in base:
+        changed = terms(GUIDED, problem=replace(PROBLEM, **{f"{name.removesuffix('s')}_weight": 7.0}))
+        assert changed[name] != pytest.approx(base[name])
+        assert {k: v for k, v in changed.items() if k != name} == {k: v for k, v in base.items() if k != name}
+
+
+def test_first_turn_is_free_and_padding_costs_nothing():
+    """A start with −1 isn't charged; nor is what the needle would do in steps that do nothing."""
+    assert terms(primitives(*[(1, 0, 0, 0, -1, 0)] * 3))["flips"] == 0.0
+    shorter = replace(PROBLEM, travel=9.0)
+    found = terms(primitives(*[(1, 0, 0, 0.1, 1, 0)] * 3), padded, problem=shorter)
+    assert found["deflection"] == pytest.approx(0.002 * (4 + 5 + 6 + 7 + 8))
+
+
+def padded(tips, energy, converged, deflection):
+    return tips[:, :9], energy[:, :9], converged[:, :9], deflection[:, :9]
+
+
+def test_padding_of_a_shorter_sample_is_not_charged():
+    """Two samples, 12 and 24 steps: the first one's last twelve steps lie in tissue and count nothing."""
+    z = np.concatenate([primitives(*[(1, 0, 0, 0.1, 1, 0)] * 3), primitives(*[(0.5, 0, 0, 0.1, 1, 0)] * 3)])
+
+    def rollout(controls):
+        n, m = controls.shape[:2]
+        tips = np.ones((n, m, 3))
+        return tips, np.zeros((n, m)), np.ones((n, m), dtype=bool), np.ones((n, m))
+
+    found = insertion._terms(rollout, PROBLEM, z)
+    np.testing.assert_allclose(found["deflection"], [0.002 * 12, 0.002 * 24])
+
+
+def test_a_sample_that_did_not_converge_costs_infinity():
+    def fail(tips, energy, converged, deflection):
+        converged[0, 3] = False
+        return tips, energy, converged, deflection
+
+    assert terms(GUIDED, fail)["accuracy"] == np.inf
+
+
+def rigid(controls, bevel=1.0):
+    """A needle that goes where guide (mm) and bevel (0.1 mm a mm in tissue) push it, without tissue energy."""
+    x = np.cumsum(controls[:, :, 0], axis=1) - 4.0
+    facing = bevel * np.cumprod(np.where(controls[:, :, 4] > 0.0, -1.0, 1.0), axis=1)
+    bent = 0.1 * np.cumsum(facing * controls[:, :, 0] * (x > 0.0), axis=1)
+    tips = np.stack([x, np.cumsum(controls[:, :, 3], axis=1) + bent, np.zeros_like(x)], axis=2)
+    zero = np.zeros_like(x)
+    return tips, zero, np.ones(x.shape, dtype=bool), zero
+
+
+def test_search_meets_the_target_of_a_rigid_needle():
+    found = optimise(rigid, PROBLEM, SEARCH, np.random.default_rng(0))
+    tips, *_ = rigid(found.controls[None], found.bevel)
+    np.testing.assert_allclose(tips[0, -1, :2], [8.0, 2.0], atol=0.01)
+    assert sum(found.terms.values()) == pytest.approx(found.belief.best_cost)
+
+
+def bevel_only(sign):
+    sigma = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.3])
+    return replace(PROBLEM, target=(8.0, 0.8 * sign), sigma=sigma)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_bevel_at_the_start_is_told_and_no_turn_is_left_in_the_first_step(sign):
+    """Straight away to one side: 8 mm at 0.1 a mm, without a turn while inserting."""
+    found = optimise(rigid, bevel_only(sign), SEARCH, np.random.default_rng(0))
+    assert found.bevel == sign
+    assert (found.controls[:, 4] == -1.0).all()
+    assert found.terms["flips"] == 0.0
+    assert found.terms["accuracy"] == pytest.approx(0.0, abs=1e-4)
+    assert (found.controls[:, 1:4] == 0.0).all()
+
+
+def test_inputs_that_are_not_free_stay_still():
+    found = optimise(rigid, PROBLEM, SEARCH, np.random.default_rng(0))
+    assert (found.controls[:, 1:3] == 0.0).all()
+    assert found.controls[:, 3].any()
+
+
+def test_bounds_of_the_search_keep_the_steps():
+    """No step above the longest, none of a primitive below half of it but by rounding up the count."""
+    wild = replace(PROBLEM, sigma=np.array([5.0, 5.0, 1.0, 5.0, 9.0, 9.0]))
+    seen = []
+
+    def rollout(controls):
+        seen.append(controls)
+        return rigid(controls)
+
+    optimise(rollout, wild, SEARCH | {"iterations": 4}, np.random.default_rng(0))
+    for controls in seen:
+        assert (np.abs(controls[:, :, :4]) <= PROBLEM.step + 1e-12).all()
+        assert controls.shape[1] <= 2 * 12 + 3
+    shares = [controls[:, :, 0].sum(axis=1) for controls in seen]
+    np.testing.assert_allclose(np.concatenate(shares), 12.0)
+
+
+def test_neighbouring_primitives_want_the_same_bevel_more_often_than_not():
+    """ε is correlated at first: 0.8 between neighbours, so they differ in 1 of 5, not of 2, and ε are unit."""
+    turned = []
+
+    def rollout(controls):
+        turned.append((controls[:, 1:, 4] > 0.0).sum(axis=1))
+        return rigid(controls)
+
+    many = SEARCH | {"samples": 4000, "iterations": 1, "elite": 100}
+    optimise(rollout, replace(PROBLEM, primitives=6), many, np.random.default_rng(0))
+    expected = 5 * np.arccos(0.8) / np.pi
+    assert turned[0].mean() == pytest.approx(expected, abs=0.06)
+
+
+def test_progress_and_same_seed_same_bytes():
+    calls = []
+    short = SEARCH | {"iterations": 5}
+    one = optimise(rigid, PROBLEM, short, np.random.default_rng(3), calls.append)
+    again = optimise(rigid, PROBLEM, short, np.random.default_rng(3))
+    assert [call["iteration"] for call in calls] == [1, 2, 3, 4, 5]
+    assert one.controls.tobytes() == again.controls.tobytes()
+    assert one.belief.history == again.belief.history
