@@ -16,7 +16,7 @@ from flexneedle.trace import PlanRecord
 Floats = NDArray[np.float64]
 STRATEGIES = ("manipulation", "steering")
 _DEPTH_TOLERANCE_MM = 1e-6
-_SHARE_SIGMA = 0.3  # of the logarithm of a primitive's share of the travel
+_SHARE_SIGMA = 0.1  # of the logarithm of a primitive's share of the travel
 _AT_LIMIT = 0.999  # share of a limit that counts as reached
 
 

@@ -32,15 +32,15 @@ class Plan(Section):
     """Greatest number of iterations."""
     elite_fraction: Annotated[float, Field(gt=0, le=1)] = 0.125
     """ρ, share of the samples from which mean and covariance are fitted."""
-    smoothing: Annotated[float, Field(ge=0, lt=1)] = 0.3
+    smoothing: Annotated[float, Field(ge=0, lt=1)] = 0.4
     """Share of the old mean and covariance that is kept in an iteration."""
     primitives: int = count(6, least=1, most=1_000)
     """Pieces of a control sequence, each constant over several steps."""
     tolerance: Positive = 1e-3
     """The search has converged once the cost of the elite spreads less than this, relative to its mean."""
-    advance_sigma_mm: NonNegative = 0.1
+    advance_sigma_mm: NonNegative = 0.03
     """First standard deviation of the advance of a step; 0 keeps it fixed."""
-    guide_sigma_mm: NonNegative = 0.25
+    guide_sigma_mm: NonNegative = 0.06
     """First standard deviation of the guide's travel in a step; 0 keeps it fixed."""
     base_sigma_mm: NonNegative = 0.0
     """First standard deviation of the base's lateral travel in a step; 0 keeps it fixed."""
@@ -89,7 +89,7 @@ class Control(Section):
     """The insertion ends this close to the target depth."""
     guide_weight: NonNegative = 0.05
     """Cost of a squared millimetre that a guide step departs from the plan's."""
-    energy_weight_per_mj: NonNegative = 1.0
+    energy_weight_per_mj: NonNegative = 2.0
     """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
     flip_dead_band: Fraction = 0.8
     """Share of the two paths' separation by which turning the bevel must be nearer to the target."""
