@@ -1,0 +1,110 @@
+"""The bevel rule against paths that are followed in small steps."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from flexneedle.control.bang_bang import closest_approach, wants_flip
+
+POSES = {
+    "straight ahead": ((0.0, 0.0, 0.0), (40.0, 0.0)),
+    "aside": ((0.0, 0.0, 0.0), (40.0, 5.0)),
+    "on the way": ((12.0, 1.5, 0.1), (40.0, 5.0)),
+    "turned away": ((20.0, -2.0, -0.3), (45.0, 5.0)),
+    "close": ((39.0, 4.8, 0.05), (40.0, 5.0)),
+    "within the circle": ((0.0, 0.0, 0.0), (3.0, 30.0)),
+    "steep": ((0.0, 0.0, 1.2), (5.0, 25.0)),
+}
+
+
+def followed(pose, curvature, target, step=1e-3):
+    """Least distance to the target of paper eq. 14, x += u cos θ, y += u sin θ, θ += κ u, in small steps u."""
+    reach = 2.0 * math.dist(pose[:2], target) + 1.0
+    turn = pose[2] + curvature * step * (np.arange(int(reach / step)) + 0.5)
+    x = pose[0] + step * np.concatenate([[0.0], np.cumsum(np.cos(turn))])
+    y = pose[1] + step * np.concatenate([[0.0], np.cumsum(np.sin(turn))])
+    return float(np.hypot(x - target[0], y - target[1]).min())
+
+
+@pytest.mark.parametrize("curvature", [0.0, 1e-9, 5e-4, -5e-4, 0.01, -0.01, 0.06])
+@pytest.mark.parametrize(("pose", "target"), POSES.values(), ids=POSES)
+def test_closest_approach_is_that_of_the_path_in_small_steps(pose, target, curvature):
+    expected = followed(pose, curvature, target)
+    assert closest_approach(np.array(pose), curvature, target) == pytest.approx(expected, abs=2e-3)
+
+
+def test_closest_approach_to_a_circle_by_hand():
+    """A radius of 100 round (0, 100): the target at (60, 20) lies exactly on it, (60, 30) inside by 100 − √8500."""
+    start = np.zeros(3)
+    assert closest_approach(start, 0.01, (60.0, 20.0)) == pytest.approx(0.0, abs=1e-12)
+    assert closest_approach(start, 0.01, (60.0, 30.0)) == pytest.approx(100.0 - math.sqrt(8500.0))
+
+
+@pytest.mark.parametrize("curvature", [-0.01, 0.0, 0.01])
+def test_a_target_behind_is_as_near_as_it_is_now(curvature):
+    assert closest_approach(np.array([40.0, 5.0, 0.0]), curvature, (37.0, 1.0)) == pytest.approx(5.0)
+    turned = np.array([0.0, 0.0, math.pi])
+    assert closest_approach(turned, curvature, (3.0, 4.0)) == pytest.approx(5.0)
+
+
+@given(
+    x=st.floats(-10, 60), y=st.floats(-10, 10), turn=st.floats(-0.5, 0.5),
+    aside=st.floats(-15, 15), bevel=st.sampled_from([-1, 1]), curvature=st.floats(0, 0.02),
+)  # fmt: skip
+@hypothesis_settings(deadline=None, derandomize=True, max_examples=200)
+def test_mirrored_pose_target_and_bevel_give_the_same_answer(x, y, turn, aside, bevel, curvature):
+    here = wants_flip(np.array([x, y, turn]), bevel, curvature, (40.0, aside), 0.3, 0.01)
+    mirrored = wants_flip(np.array([x, -y, -turn]), -bevel, curvature, (40.0, -aside), 0.3, 0.01)
+    assert here == mirrored
+
+
+def flips(bevel, target, *, band=0.0, noise=0.0, curvature=0.001, pose=(0.0, 0.0, 0.0)):
+    return wants_flip(np.array(pose), bevel, curvature, target, band, noise)[0]
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_bevel_turns_towards_the_target_and_stays_there(side):
+    assert flips(-1, (40.0, 3.0)) is True
+    assert flips(1, (40.0, 3.0)) is False
+    assert flips(1, (40.0, -3.0)) is True
+    assert flips(-1, (40.0, -3.0)) is False
+    # What counts is where the tip's own line meets the target, not the side of the axis.
+    assert flips(1, (40.0, 3.0 * side), pose=(0.0, 0.0, 0.2)) is True
+    assert flips(1, (40.0, 3.0 * side), pose=(0.0, 0.0, -0.2)) is False
+
+
+def test_dead_band_is_a_share_of_the_separation_of_the_paths():
+    """κ = 1/m, 40 mm ahead: the paths pass 0.8 mm aside each, 1.6 mm apart. With the target at −y the other
+    path is nearer by 2y, until it lies beyond it: 1.2 mm of advantage at −0.6 mm are 0.75 of the separation."""
+    assert flips(1, (40.0, -0.6), band=0.70) is True
+    assert flips(1, (40.0, -0.6), band=0.80) is False
+    assert flips(1, (40.0, -5.0), band=0.95) is True
+    # A quarter of the distance: the same share at a sixteenth of the offset.
+    assert flips(1, (10.0, -0.6 / 16), band=0.70) is True
+    assert flips(1, (10.0, -0.6 / 16), band=0.80) is False
+
+
+def test_noise_of_the_tracker_is_needed_in_any_case():
+    assert flips(1, (40.0, -0.6), noise=1.1) is True
+    assert flips(1, (40.0, -0.6), noise=1.3) is False
+    assert flips(1, (40.0, -0.6), band=0.35, noise=0.55) is True  # 0.56 + 0.55 < 1.2
+    assert flips(1, (40.0, -0.6), band=0.45, noise=0.55) is False
+
+
+def test_without_advantage_or_curvature_or_with_the_target_behind_the_bevel_stays():
+    assert flips(1, (40.0, 0.0)) is False
+    assert flips(1, (40.0, -3.0), curvature=0.0) is False
+    assert flips(1, (-1.0, -3.0)) is False
+
+
+def test_reason_gives_both_misses():
+    """±0.8 mm at 40 mm and a target 0.6 mm to the other side."""
+    flip, why = wants_flip(np.zeros(3), 1, 0.001, (40.0, -0.6), 0.0, 0.0)
+    assert flip
+    assert why == "bevel turned: keeping misses by 1.399 mm, turning by 0.200 mm"
+    _, why = wants_flip(np.zeros(3), -1, 0.001, (40.0, -0.6), 0.0, 0.0)
+    assert why == "bevel kept: keeping misses by 0.200 mm, turning by 1.399 mm"

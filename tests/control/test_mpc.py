@@ -1,0 +1,197 @@
+"""Advance and guide of a period: within limits, back to the plan, the same for the same seed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.control import controller, mpc, observer
+from flexneedle.simulator import Control, Simulator
+
+PHANTOM = flexneedle.load_scenario("phantom")
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return flexneedle.plan(PHANTOM, (40.0, 5.0), seed=1)
+
+
+def along(plan, periods, scenario=PHANTOM, **corrections):
+    """The state after so many steps of the plan, then corrected."""
+    simulator = Simulator(scenario)
+    state = simulator.start(plan.bevel)
+    for row in plan.controls[:periods]:
+        state = simulator.step(state, Control.from_row(row.tolist()))
+    if corrections:
+        state = simulator.step(state.believing(**corrections), Control())
+    return state
+
+
+def choose(plan, state, scenario=PHANTOM, seed=0, *, flip=False):
+    return mpc.choose(Simulator(scenario), plan, state, flip=flip, rng=np.random.default_rng(seed))
+
+
+def believed(state):
+    return replace(observer.begin(Simulator(state.scenario), 1), state=state)
+
+
+@pytest.mark.parametrize("periods", [0, 20, 45, 70])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_command_is_within_the_limits(plan, periods, seed):
+    choice = choose(plan, along(plan, periods), seed=seed)
+    assert 0.5 <= choice.db_x <= 1.0
+    assert abs(choice.dg_y) <= 0.5
+    assert np.isfinite(choice.cost)
+    assert choice.spread > 0.0
+
+
+def test_on_the_plan_it_goes_on_with_the_plan(plan):
+    for periods in (10, 40, 60):
+        choice = choose(plan, along(plan, periods))
+        assert choice.dg_y == pytest.approx(plan.controls[periods, 3], abs=0.06)
+        assert choice.db_x == pytest.approx(plan.controls[periods, 0], abs=0.1)
+
+
+@pytest.mark.parametrize("offset", [-1.5, 1.5])
+def test_off_the_plan_the_guide_moves_back_to_it(plan, offset):
+    """A base clamp off to one side moves the tip there; the guide goes the other way, against what was planned."""
+    state = along(plan, 15, base_y=offset)
+    side = np.sign(state.tip[1] - along(plan, 15).tip[1])
+    assert side * (choose(plan, state).dg_y - plan.controls[15, 3]) < -0.05
+
+
+def test_the_deviation_shrinks_over_the_next_periods(plan):
+    simulator, state = Simulator(PHANTOM), along(plan, 10, base_y=1.0)
+    rng = np.random.default_rng(0)
+
+    def deviation():
+        return abs(state.tip[1] - np.interp(state.tip[0], plan.tips[:, 0], plan.tips[:, 1]))
+
+    first = deviation()
+    for _ in range(12):
+        choice = mpc.choose(simulator, plan, state, flip=False, rng=rng)
+        state = simulator.step(state, Control(db_x=choice.db_x, dg_y=choice.dg_y))
+    assert first > 0.1
+    assert deviation() < 0.2 * first
+
+
+def test_guide_stays_within_its_reach(plan):
+    """A plan far aside, and a guide that may hardly move: it goes to its end and no further."""
+    scenario = PHANTOM.with_values({"setup.max_guide_travel_mm": 0.3, "target.lateral_mm": 0.3})
+    away = replace(plan, tips=plan.tips + np.array([0.0, 6.0, 0.0]))
+    simulator, state, rng = Simulator(scenario), Simulator(scenario).start(), np.random.default_rng(0)
+    for _ in range(4):
+        choice = mpc.choose(simulator, away, state, flip=False, rng=rng)
+        state = simulator.step(state, Control(db_x=choice.db_x, dg_y=choice.dg_y))
+        assert abs(state.guide) <= 0.3 + 1e-9
+    assert state.guide == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("left", [0.7, 0.3, 1e-6])
+def test_last_advance_ends_at_the_target_depth(plan, left):
+    state = along(plan, len(plan.controls) - 1)
+    near = replace(plan, target=(float(state.tip[0]) + left, 5.0))
+    choice = choose(near, state)
+    assert choice.db_x == pytest.approx(left, abs=0.21 if left > 0.5 else 1e-12)
+    assert choice.db_x <= left + 1e-12
+
+
+def test_past_the_target_nothing_moves_any_more(plan):
+    state = along(plan, len(plan.controls))
+    past = replace(plan, target=(float(state.tip[0]) - 0.5, 5.0))
+    choice = choose(past, state)
+    assert (choice.db_x, choice.dg_y) == (0.0, 0.0)
+
+
+def test_without_a_guide_none_is_moved(plan):
+    scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
+    assert choose(plan, Simulator(scenario).start(), scenario).dg_y == 0.0
+
+
+def test_same_seed_same_command_other_seed_another(plan):
+    state = along(plan, 30, base_y=0.5)
+    one, again, other = choose(plan, state, seed=5), choose(plan, state, seed=5), choose(plan, state, seed=6)
+    assert (one.db_x, one.dg_y, one.cost, one.spread) == (again.db_x, again.dg_y, again.cost, again.spread)
+    assert one.dg_y != other.dg_y
+
+
+def test_cost_is_that_of_the_chosen_steps(plan):
+    """With a horizon of one step it can be computed again: pose against the planned one, guide, energy."""
+    weights = {
+        "control.horizon": 1, "control.orientation_weight_mm": 40.0, "control.guide_weight": 3.0,
+        "control.energy_weight_per_mj": 2.0,
+    }  # fmt: skip
+    scenario = PHANTOM.with_values(weights)
+    state = along(plan, 40, scenario, base_y=1.0)
+    choice = choose(plan, state, scenario)
+    after = Simulator(scenario).step(state, Control(db_x=choice.db_x, dg_y=choice.dg_y))
+    at = np.interp(state.tip[0], plan.tips[:, 0], np.arange(len(plan.tips)))
+    goal = [np.interp(at + 1, np.arange(len(plan.tips)), plan.tips[:, k]) for k in range(3)]
+    off = (after.tip - goal) * [1.0, 1.0, 40.0]
+    guide = choice.dg_y - plan.controls[int(at + 1e-9), 3]
+    expected = (off**2).sum() + 3.0 * guide**2 + 2.0 * after.strain_energy
+    assert choice.cost == pytest.approx(expected, rel=1e-9)
+
+
+def test_no_random_search_of_many_samples_beats_it_by_much(plan):
+    """One step ahead: the command is near the best of a fine grid."""
+    scenario = PHANTOM.with_values({"control.horizon": 1})
+    state = along(plan, 40, scenario, base_y=1.0)
+    simulator, choice = Simulator(scenario), choose(plan, state, scenario)
+    reference, nominal = mpc._window(plan, float(state.tip[0]), 1)
+    grid = np.stack(np.meshgrid(np.linspace(0.5, 1, 41), np.linspace(-0.5, 0.5, 81)), axis=-1).reshape(-1, 2)
+    controls = mpc._controls(scenario, state, grid, 40.0, flip=False)
+    best = mpc._cost(simulator, state, controls, reference, nominal).min()
+    assert choice.cost <= best + 0.002
+
+
+@pytest.mark.parametrize("flip", [True, False])
+def test_rollouts_turn_the_bevel_only_in_the_first_step_and_if_told(plan, flip):
+    state = along(plan, 40)
+    controls = mpc._controls(PHANTOM, state, np.tile([0.9, 0.1], (3, 8)), 30.0, flip=flip)
+    assert (controls[:, 0, 4] == (1.0 if flip else -1.0)).all()
+    assert (controls[:, 1:, 4] == -1.0).all()
+
+
+def test_in_air_the_bevel_stays(plan):
+    """Even where the rule would turn it."""
+    state = along(plan, 5)
+    away = replace(plan, target=(40.0, -5.0))
+    decision = controller.decide(Simulator(PHANTOM), away, believed(state), np.random.default_rng(0))
+    assert decision.command[4] == -1
+    assert decision.why == "in air"
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_in_tissue_the_bevel_turns_to_the_target(plan, side):
+    """The target lies to one side of the tip's own line, further than either path bends."""
+    state = along(plan, 50)
+    x, y, turn = state.tip
+    away = replace(plan, target=(float(x) + 30.0, float(y + 30.0 * np.tan(turn) + 2.0 * side)))
+    decision = controller.decide(Simulator(PHANTOM), away, believed(state), np.random.default_rng(0))
+    assert decision.command[4] == (-1 if side == state.bevel else 1)
+    assert decision.why.startswith("bevel kept" if side == state.bevel else "bevel turned")
+
+
+def test_the_rollouts_know_of_the_turn(plan):
+    """A predicted cost of its own: the bevel that the rule chose acts on the steps that are searched."""
+    state, scenario = along(plan, 50), PHANTOM.with_values({"control.energy_weight_per_mj": 0.0})
+    kept, turned = (choose(plan, state, scenario, flip=flip) for flip in (False, True))
+    assert kept.cost != turned.cost
+
+
+def test_command_has_the_five_inputs_and_leaves_the_base_alone(plan):
+    decision = controller.decide(
+        Simulator(PHANTOM), plan, believed(along(plan, 30)), np.random.default_rng(0)
+    )
+    assert len(decision.command) == 5
+    assert decision.command[1:3] == (0.0, 0.0)
+    assert decision.command[4] in (-1, 1)
+
+
+@pytest.mark.parametrize(("short", "there"), [(0.02, False), (0.009, True), (-0.5, True)])
+def test_arrived_at_the_depth_within_the_tolerance_or_past_it(plan, short, there):
+    state = along(plan, 60)
+    goal = replace(plan, target=(float(state.tip[0]) + short, 5.0))
+    assert controller.arrived(goal, believed(state), 0.01) is there
