@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .errors import CommandError, FlexneedleError, InputError, RunError, ScenarioError, StateError
-    from .run import insert, plan
+    from .run.insertion import insert
+    from .run.planner import plan
     from .scenario import Scenario, load_scenario
     from .simulator import Control, Simulator, State
 
@@ -33,7 +34,8 @@ __all__ = [
 
 _HOMES = {
     "errors": ("CommandError", "FlexneedleError", "InputError", "RunError", "ScenarioError", "StateError"),
-    "run": ("insert", "plan"),
+    "run.insertion": ("insert",),
+    "run.planner": ("plan",),
     "scenario": ("Scenario", "load_scenario"),
     "simulator": ("Control", "Simulator", "State"),
 }

@@ -10,6 +10,9 @@ from flexneedle.scenario import Scenario
 from flexneedle.simulator import Control, Simulator, State
 
 
+_LARGEST_OFFSET = 0.699  # of the compression length
+
+
 @dataclass(frozen=True)
 class Truth:
     """What really stands in the tank: its scenario, and where the clamp holds the base (mm, rad)."""
@@ -27,14 +30,22 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
         f"tissue.{k}.shear_modulus_kpa": layer.shear_modulus_kpa * float(factor)
         for k, (layer, factor) in enumerate(zip(scenario.tissue, factors, strict=True))
     }
-    bevel = float(rng.uniform(*settings.bevel_factor))
-    values["needle.bevel.offset_mm"] = scenario.needle.bevel.offset_mm * bevel
+    values["needle.bevel.offset_mm"] = scenario.needle.bevel.offset_mm * _bevel_factor(scenario, rng)
     values["contact.spacing_mm"] = settings.contact_spacing_mm
     return Truth(
         scenario.with_values(values),
         float(rng.normal(0.0, settings.start_offset_sd_mm)),
         float(rng.normal(0.0, settings.start_angle_sd)),
     )
+
+
+def _bevel_factor(scenario: Scenario, rng: np.random.Generator) -> float:
+    """Draw the factor on the bevel offset, from the part of its range that keeps the rule b < 0.7 h."""
+    low, high = scenario.phantom.bevel_factor
+    offset = scenario.needle.bevel.offset_mm
+    least = min(layer.compression_length_mm for layer in scenario.tissue)
+    most = min(high, _LARGEST_OFFSET * least / offset) if offset > 0.0 else high
+    return float(rng.uniform(min(low, most), most))
 
 
 class Phantom:

@@ -23,8 +23,8 @@ _FLOOR = 1e-3  # standard deviation that regularisation keeps, relative to the i
 class Settings:
     """N samples, the elite ρN of them, most iterations; smoothing β keeps that share of the old moments.
 
-    lower, upper (d,): bounds, enforced on the samples. tolerance: relative spread of the elite costs at which
-    the method has converged.
+    lower, upper (d,): bounds, enforced on the samples. tolerance: spread of the elite costs, relative to that of
+    the first iteration, at which the method has converged.
     """
 
     samples: int
@@ -133,8 +133,9 @@ def _with(
         "quantiles": tuple(float(ordered[k]) for k in (0, settings.elite - 1, costs.size // 2, -1)),
         "spread": tuple(np.sqrt(np.diag(covariance)).tolist()),
     }
-    spread = quantile - float(ordered[0])
-    converged = bool(spread <= settings.tolerance * abs(float(ordered[0])))
+    first: dict[str, Any] = belief.history[0] if belief.history else entry
+    scale = first["quantile"] - first["quantiles"][0]
+    converged = bool(quantile - float(ordered[0]) <= settings.tolerance * scale)
     best = winner if better else belief.best
     return Belief(
         mean, covariance, belief.initial_sigma, best, best_cost, converged, (*belief.history, entry)

@@ -37,7 +37,7 @@ class Plan(Section):
     primitives: int = count(6, least=1, most=1_000)
     """Pieces of a control sequence, each constant over several steps."""
     tolerance: Positive = 1e-3
-    """The search has converged once the cost of the elite spreads less than this, relative to its mean."""
+    """The search has converged once the costs of the elite spread less than this, relative to the first iteration."""
     advance_sigma_mm: NonNegative = 0.03
     """First standard deviation of the advance of a step; 0 keeps it fixed."""
     guide_sigma_mm: NonNegative = 0.06
@@ -121,7 +121,7 @@ class Phantom(Section):
     shear_modulus_factor: PositiveRange = (0.6, 1.6)
     """Range of the factor on μ, uniform, each layer on its own."""
     bevel_factor: NonNegativeRange = (0.5, 1.5)
-    """Range of the factor on the bevel offset, uniform."""
+    """Range of the factor on the bevel offset, uniform, as far as b stays below 0.7 h."""
     start_offset_sd_mm: NonNegative = 0.5
     """Standard deviation of the base clamp's lateral position."""
     start_angle_sd_mrad: NonNegative = 3.0

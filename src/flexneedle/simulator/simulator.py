@@ -169,7 +169,7 @@ class Simulator:
     def _moved(self, state: State) -> Floats:
         s = state.scalars
         moved = s[[nd.BASE_X, nd.BASE_Y, nd.BASE_TURN, nd.GUIDE_Y]].copy()
-        moved[0] -= self.scenario.start_base_x
+        moved[:3] -= self.scenario.start_base_x, s[nd.CLAMP_Y], s[nd.CLAMP_TURN]
         return moved
 
     def _work(self, state: State) -> tuple[Floats, Floats, Floats, Floats]:

@@ -147,12 +147,19 @@ class State:
     def believing(
         self, *, base_y: float | None = None, base_turn: float | None = None, tip_load: float | None = None
     ) -> "State":
-        """Return the state with what an observer corrected (mm, rad, N); the next solve takes it up."""
+        """Return the state with what an observer corrected (mm, rad, N); the next solve takes it up.
+
+        A base that stands elsewhere than commanded has not used up its travel.
+        """
         scalars = self.scalars.copy()
-        corrections = ((nd.BASE_Y, base_y), (nd.BASE_TURN, base_turn), (nd.TIP_LOAD, tip_load))
-        for index, value in corrections:
-            if value is not None:
-                scalars[index] = value
+        if base_y is not None:
+            scalars[nd.CLAMP_Y] += base_y - scalars[nd.BASE_Y]
+            scalars[nd.BASE_Y] = base_y
+        if base_turn is not None:
+            scalars[nd.CLAMP_TURN] += base_turn - scalars[nd.BASE_TURN]
+            scalars[nd.BASE_TURN] = base_turn
+        if tip_load is not None:
+            scalars[nd.TIP_LOAD] = tip_load
         return replace(self, scalars=_frozen(scalars))
 
     def save(self, path: str | Path) -> None:
