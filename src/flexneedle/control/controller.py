@@ -7,6 +7,7 @@ import numpy as np
 from flexneedle.control import bang_bang, mpc
 from flexneedle.control.observer import Estimate
 from flexneedle.ports import Command
+from flexneedle.scenario import Scenario
 from flexneedle.simulator import Simulator
 from flexneedle.trace import PlanRecord
 
@@ -39,6 +40,6 @@ def decide(simulator: Simulator, plan: PlanRecord, estimate: Estimate, rng: np.r
     return Decision(command, why, choice.cost, choice.spread)
 
 
-def arrived(plan: PlanRecord, estimate: Estimate, tolerance: float) -> bool:
-    """Whether the believed tip is at the target depth, within `tolerance` mm, or past it."""
-    return bool(estimate.tip[0] >= plan.target[0] - tolerance)
+def arrived(scenario: Scenario, plan: PlanRecord, estimate: Estimate) -> bool:
+    """Whether the believed tip is at the target depth, within the tolerance, or past it, or the stroke is used up."""
+    return mpc.travel_left(scenario, plan, estimate.state) <= scenario.control.depth_tolerance_mm

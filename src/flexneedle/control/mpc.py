@@ -29,7 +29,7 @@ def choose(
 ) -> Choice:
     """Search the next steps of advance and guide for the least deviation from the planned tip poses."""
     scenario = simulator.scenario
-    steps, travel = scenario.control.horizon, max(plan.target[0] - float(state.tip[0]), 0.0)
+    steps, travel = scenario.control.horizon, travel_left(scenario, plan, state)
     reference, nominal = _window(plan, float(state.tip[0]), steps)
     lower, upper, sigma = _bounds(scenario, steps)
     mean = np.clip(np.concatenate([nominal[:, 0], nominal[:, 3]]), lower, upper)
@@ -51,6 +51,12 @@ def choose(
     first = _controls(scenario, state, found.best[None], travel, flip)[0, 0]
     spread = float(np.sqrt(found.covariance[steps, steps]))
     return Choice(float(first[0]), float(first[3]), found.best_cost, spread)
+
+
+def travel_left(scenario: Scenario, plan: PlanRecord, state: State) -> float:
+    """Advance (mm) to the target depth, or to the end of the stroke if that comes first."""
+    stroke_left = scenario.start_base_x + scenario.setup.stroke_mm - float(state.base[0])
+    return max(0.0, min(plan.target[0] - float(state.tip[0]), stroke_left))
 
 
 def _window(plan: PlanRecord, x: float, steps: int) -> tuple[Floats, Floats]:

@@ -9,7 +9,6 @@ from flexneedle.ports import Command
 from flexneedle.scenario import Scenario
 from flexneedle.simulator import Control, Simulator, State
 
-
 _LARGEST_OFFSET = 0.699  # of the compression length
 
 

@@ -11,7 +11,6 @@ from flexneedle.control import controller, observer
 from flexneedle.errors import RunError
 from flexneedle.phantom import Phantom, draw
 from flexneedle.ports import Clock, Command, Driver, Sample, Tracker
-from flexneedle.scenario import Control as ControlSettings
 from flexneedle.scenario import Scenario
 from flexneedle.simulator import Simulator, State
 from flexneedle.trace import Insertion, Period, PlanRecord
@@ -93,7 +92,7 @@ def _periods(
     scenario: Scenario, plan: PlanRecord, rig: Rig, rng: np.random.Generator
 ) -> Iterator[tuple[Period, tuple[str, str] | None]]:
     """Yield each period, and how the insertion ended with it: (outcome, reason), None while it goes on."""
-    simulator, control = Simulator(scenario), scenario.control
+    simulator = Simulator(scenario)
     estimate = observer.begin(simulator, plan.bevel)
     held_since: float | None = None
     for index in range(_TOO_MANY * len(plan.controls)):
@@ -108,7 +107,7 @@ def _periods(
         now = rig.clock.now()
         held_since = None if verdict == OK else (now if held_since is None else held_since)
         held = 0.0 if held_since is None else now - held_since
-        ending = _ending(control, plan, estimate, verdict, held)
+        ending = _ending(scenario, plan, estimate, verdict, held)
         yield _record(index, now, plan, rig, decision, applied, sample, verdict, estimate, clocks), ending
         if ending is not None:
             return
@@ -154,16 +153,20 @@ def _see(
 
 
 def _ending(
-    control: ControlSettings, plan: PlanRecord, estimate: observer.Estimate, verdict: str, held: float
+    scenario: Scenario, plan: PlanRecord, estimate: observer.Estimate, verdict: str, held: float
 ) -> tuple[str, str] | None:
     """How the insertion ends after this period, if it does."""
     if not estimate.state.converged:
         return "failed", f"the model did not converge: residual {estimate.state.residual:.3g} mm"
-    if held > control.hold_limit_s - 1e-9:
-        return "held", f"held for {held:.2f} s (limit {control.hold_limit_s:g} s): {verdict}"
-    if verdict == OK and controller.arrived(plan, estimate, control.depth_tolerance_mm):
-        return "done", ""
-    return None
+    limit = scenario.control.hold_limit_s
+    if held > limit - 1e-9:
+        return "held", f"held for {held:.2f} s (limit {limit:g} s): {verdict}"
+    if verdict != OK or not controller.arrived(scenario, plan, estimate):
+        return None
+    short = plan.target[0] - float(estimate.tip[0])
+    if short > scenario.control.depth_tolerance_mm:
+        return "done", f"the stroke ends {short:.2f} mm before the target depth"
+    return "done", ""
 
 
 def _record(
