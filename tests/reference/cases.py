@@ -1,0 +1,57 @@
+"""Scenarios and insertions that several tests use."""
+
+import numpy as np
+
+from flexneedle import Control, Scenario, Simulator
+from flexneedle.simulator import State
+
+EI = 200e3 * np.pi * 0.4**4 / 64  # of `long_beam`, N·mm²
+LENGTH_MM = 10.0  # 1/β of `long_beam`
+FOUNDATION = 4 * EI / LENGTH_MM**4  # its k₀ = 3μw/h, N/mm²
+
+
+def long_beam(depth: float, *, spacing: float, bevel: float = 0.0, bevel_length: float = 1e-6) -> Scenario:
+    """A thin needle in one layer with 1/β = 10 mm; α = 6 makes Ogden's law linear to second order."""
+    height, width = 20.0, 5.0
+    return Scenario.from_values(
+        {
+            "name": "Long beam",
+            "needle": {
+                "outer_diameter_mm": 0.4,
+                "length_mm": depth + 60.0,
+                "bevel": {"offset_mm": bevel, "length_mm": bevel_length},
+            },
+            "setup": {"tip_to_skin_mm": 1.0, "stroke_mm": depth + 1.0, "max_advance_mm": depth + 1.0},
+            "target": {"depth_mm": depth / 2, "lateral_mm": 0.0},
+            "contact": {"spacing_mm": spacing},
+            "tissue": [
+                {
+                    "shear_modulus_kpa": 1e3 * FOUNDATION * height / (3 * width),
+                    "alpha": 6.0,
+                    "compression_length_mm": height,
+                    "engaged_width_mm": width,
+                }
+            ],
+        }
+    )
+
+
+def repeat(simulator: Simulator, state: State, control: Control, times: int) -> list[State]:
+    """The states of `times` equal steps, `state` first."""
+    states = [state]
+    for _ in range(times):
+        states.append(simulator.step(states[-1], control))
+    return states
+
+
+def insert_to(simulator: Simulator, depth: float, *, step: float = 1.0, bevel: int = 1) -> State:
+    """A straight push until an unbent needle would be at `depth`."""
+    way = depth + simulator.scenario.setup.tip_to_skin_mm
+    steps = int(np.ceil(way / step - 1e-9))
+    return repeat(simulator, simulator.start(bevel), Control(db_x=way / steps), steps)[-1]
+
+
+def assert_same_curve(one: State, other: State, tolerance: float) -> None:
+    """Nodes within `tolerance` mm, slopes within as many mm on 10 mm."""
+    gap = np.abs(one.nodes - other.nodes) * [1.0, 1.0, 10.0]
+    assert gap.max() < tolerance
