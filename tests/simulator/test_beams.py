@@ -1,0 +1,128 @@
+"""The needle as a beam: closed forms, with the order in which the contact spacing approaches them."""
+
+import numpy as np
+import pytest
+
+from flexneedle import Control, Simulator, load_scenario
+from reference import closed_forms as exact
+from reference.cases import EI, FOUNDATION, LENGTH_MM, insert_to, long_beam, repeat
+
+PHANTOM = load_scenario("phantom")
+
+
+def orders(errors):
+    """Observed order between halvings."""
+    errors = np.abs(errors)
+    return np.log2(errors[:-1] / errors[1:])
+
+
+def free_needle(**changes):
+    """The phantom's needle without guide, in air."""
+    return Simulator(PHANTOM.with_values({"setup.guide_to_skin_mm": None, **changes}))
+
+
+@pytest.mark.parametrize("load", [1e-6, -0.01, 0.02])
+def test_cantilever_with_an_end_load_is_exact_to_rounding(load):
+    """In every node, over the length that the shortening leaves."""
+    simulator = free_needle()
+    state = simulator.step(simulator.start().believing(tip_load=load), Control())
+    stiffness = simulator.scenario.needle.bending_stiffness
+    x, length = state.nodes[:, 0] - state.base[0], state.tip[0] - state.base[0]
+    np.testing.assert_allclose(
+        state.nodes[:, 1], exact.cantilever(x, load, stiffness, length), rtol=1e-12, atol=1e-15 * length
+    )
+    assert state.tip[1] == pytest.approx(load * length**3 / (3 * stiffness), rel=1e-13)
+    assert state.tip[2] == pytest.approx(load * length**2 / (2 * stiffness), rel=1e-13)
+    assert state.energy == pytest.approx(load * state.tip[1] / 2, rel=1e-12)
+    assert state.reactions.base_force == pytest.approx(-load, rel=1e-12)
+    assert state.reactions.base_moment == pytest.approx(-load * length, rel=1e-12)
+
+
+def test_arc_length_is_kept_to_second_order():
+    """A cantilever shortens by ½∫y'² = P²L⁵/15(EI)² (equation 5)."""
+    simulator = free_needle()
+    load = 0.01
+    state = simulator.step(simulator.start().believing(tip_load=load), Control())
+    length = state.tip[0] - state.base[0]
+    short = load**2 * length**5 / (15 * simulator.scenario.needle.bending_stiffness**2)
+    assert short > 0.02
+    assert simulator.scenario.needle.length_mm - length == pytest.approx(short, abs=1e-6)
+
+
+def test_needle_in_air_follows_base_and_guide():
+    """Clamp, guide and a straight free end."""
+    simulator = Simulator(PHANTOM)
+    control = Control(db_x=0.1, db_y=0.2, db_theta=-2e-3, dg_y=0.4)
+    state = repeat(simulator, simulator.start(), control, 10)[-1]
+    arm, overhang = -41.0 - state.base[0], state.tip[0] + 41.0
+    y, turn, force = exact.guided_tip(2.0, -0.02, 4.0, arm, overhang, PHANTOM.needle.bending_stiffness)
+    np.testing.assert_allclose(state.tip[1:], [y, turn], rtol=1e-12)
+    assert state.reactions.guide_force == pytest.approx(force, rel=1e-12)
+    assert state.contacts.x.size == 0
+    assert state.strain_energy == 0.0
+
+
+def test_without_tissue_effect_the_needle_is_a_free_beam():
+    """Tissue of a millionth of a kPa moves an 8 mm deflection by less than 0.0001 mm."""
+    soft = {f"tissue.{i}.shear_modulus_kpa": 1e-6 for i in (0, 1)}
+    simulator = Simulator(PHANTOM.with_values(soft))
+    state = insert_to(simulator, 30.0)
+    state = repeat(simulator, state, Control(db_y=0.1, db_theta=1e-3, dg_y=-0.3), 10)[-1]
+    arm, overhang = -41.0 - state.base[0], state.tip[0] + 41.0
+    y, turn, _ = exact.guided_tip(1.0, 0.01, -3.0, arm, overhang, PHANTOM.needle.bending_stiffness)
+    np.testing.assert_allclose(state.tip[1:], [y, turn], atol=1e-4)
+    assert state.contacts.active.sum() >= 29
+
+
+def test_endless_beam_on_springs_converges_at_fourth_order():
+    """A needle held aside in the middle of 40/β of tissue: shape, and the load that the springs take."""
+    depth, y0, beta = 400.0, 1e-3, 1 / LENGTH_MM
+    shape, load = [], []
+    for spacing in (8.0, 4.0, 2.0, 1.0):
+        simulator = Simulator(long_beam(depth, spacing=spacing))
+        state = simulator.step(simulator.start(), Control(db_x=depth + 1.0))
+        contacts = simulator.assimilate(state, (depth, 0.0), [(depth / 2, y0)]).state.contacts
+        y = exact.endless_beam(contacts.x - depth / 2, y0, beta)
+        shape.append(np.abs(contacts.y - y).max() / y0)
+        load.append(FOUNDATION * spacing * contacts.y.sum() / (2 * FOUNDATION * y0 / beta) - 1)
+    np.testing.assert_allclose(orders(shape), 4.0, atol=0.1)
+    np.testing.assert_allclose(orders(load), 4.0, atol=0.25)
+    assert shape[-1] < 1.2e-6
+    assert abs(load[-1]) < 1.6e-6
+
+
+def loaded_free_end(depth, spacing):
+    """Relative errors of y, θ and energy at the loaded end of a half-endless needle."""
+    beta, load = 1 / LENGTH_MM, 1e-3 * FOUNDATION * LENGTH_MM / 2
+    simulator = Simulator(long_beam(depth, spacing=spacing))
+    state = simulator.step(simulator.start(), Control(db_x=depth + 1.0))
+    state = simulator.step(state.believing(tip_load=load), Control())
+    y = exact.free_end(0.0, load, FOUNDATION, beta)
+    turn = exact.free_end_slope(load, FOUNDATION, beta)
+    return np.array([state.tip[1] / y, state.tip[2] / turn, state.energy / (load * y / 2)]) - 1
+
+
+def test_loaded_free_end_converges_at_second_order():
+    """The tip at the end of an interval, where all the tissue behind it acts."""
+    errors = np.array([loaded_free_end(160.0, spacing) for spacing in (4.0, 2.0, 1.0, 0.5)])
+    np.testing.assert_allclose(orders(errors), 2.0, atol=0.06)
+    assert np.abs(errors[-1]).max() < 7e-4
+
+
+def test_loaded_free_end_within_an_interval_lacks_half_an_interval_of_tissue_at_most():
+    """The point of an interval grows in over its second half, which is first order: 2β·Δ/2 of the deflection."""
+    spacing = 0.5
+    errors = [loaded_free_end(160.0 + part * spacing, spacing)[0] for part in (0.25, 0.5, 0.75)]
+    assert min(errors) > 0.0
+    assert max(errors) == errors[1]
+    assert errors[1] == pytest.approx(2 / LENGTH_MM * spacing / 2, rel=0.1)
+
+
+def test_long_beam_is_the_one_of_the_closed_forms():
+    """EI and k₀ of the helper are those of the scenario."""
+    scenario = long_beam(20.0, spacing=1.0)
+    layer = scenario.tissue[0]
+    foundation = 3 * layer.shear_modulus * layer.engaged_width_mm / layer.compression_length_mm
+    assert scenario.needle.bending_stiffness == pytest.approx(EI, rel=1e-14)
+    assert foundation == pytest.approx(FOUNDATION, rel=1e-14)
+    assert exact.characteristic(FOUNDATION, EI) == pytest.approx(1 / LENGTH_MM, rel=1e-14)

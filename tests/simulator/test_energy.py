@@ -1,0 +1,143 @@
+"""Work and energy: what base, guide, held tip and the slide along the channel do is what is stored.
+
+The needle slides while it bends (equation 5), through a guide that stands still, and that slide does work on
+whatever the tip leaves or meets: the spring that fades, the points that lose weight, a held tip that is on a
+slope. It is a 200th of the work for a millimetre or two of lateral motion. It vanishes where the tip is out of
+the bevel's spring and past the growth of the last point, and is counted by `axial_force` where it is not.
+"""
+
+import numpy as np
+import pytest
+
+from flexneedle import Control, Simulator, load_scenario
+from flexneedle.mechanics import needle as nd
+from flexneedle.mechanics.model import CONTACT
+from reference.cases import insert_to, repeat
+
+PHANTOM = load_scenario("phantom").with_values({"setup.max_base_turn_step_mrad": 50.0})
+SIMULATOR = Simulator(PHANTOM)
+MOVES = {  # base y, base turn, guide y, held tip y: mm and rad in all
+    "base": (2.0, 0.0, 0.0, 0.0),
+    "turn": (0.0, 0.02, 0.0, 0.0),
+    "guide": (0.0, 0.0, 2.0, 0.0),
+    "tip": (0.0, 0.0, 0.0, 1.5),
+    "all": (2.0, -0.016, -1.4, 1.0),
+}
+
+
+def withdrawn(by):
+    """A bent needle, the bevel turned on the way, then drawn back without cutting by `by` mm."""
+    state = insert_to(SIMULATOR, 17.0)
+    state = SIMULATOR.step(state, Control(db_x=1.0, flip=True))
+    state = repeat(SIMULATOR, state, Control(db_x=1.0, dg_y=0.02), 12)[-1]
+    return repeat(SIMULATOR, state, Control(db_x=-by / 10), 10)[-1]
+
+
+def lateral_forces(state):
+    """Work-conjugates of base y, base turn, guide y, held tip y."""
+    reactions = state.reactions
+    return np.array([reactions.base_force, reactions.base_moment, reactions.guide_force, reactions.tip_force])
+
+
+def axial_force(state):
+    """∂(energy)/∂x_t at a needle whose base and guide stay: growing points, growing spring, a push on a slope."""
+    count, nodes, s = state.mesh.shape[1], state.model.nodes, state.scalars
+    behind = state.tip[0] - nodes.x[:count]
+    growing = (nodes.kind[:count] == CONTACT) & (behind < nodes.reach[:count])
+    length = state.tip[0] - max(0.0, s[nd.FRONT] - PHANTOM.needle.bevel.length_mm)
+    spring = s[nd.SPRING_ENERGY] / length if length > 0.0 else 0.0
+    return (state.mesh[5][growing] / behind[growing]).sum() + spring - s[nd.TIP_FORCE] * state.tip[2]
+
+
+def base_axial_force(state):
+    """∂(energy)/∂b_x: bent needle drawn into the clamp, a lateral force on a slope."""
+    reactions = state.reactions
+    bent = reactions.base_moment**2 / (2 * PHANTOM.needle.bending_stiffness)
+    return bent - reactions.base_force * state.base[2]
+
+
+def travel(state, move, advance=0.0, steps=60):
+    """(lateral work, axial work, change of energy) over a move, by the trapezoid rule."""
+    held = state.tip[1] if move[3] else None
+    energy, lateral, axial = state.energy, 0.0, 0.0
+    db_y, db_theta, dg_y, dtip = np.array(move) / steps
+    for _ in range(steps):
+        after = SIMULATOR.step(state, Control(db_x=advance / steps, db_y=db_y, db_theta=db_theta, dg_y=dg_y))
+        if held is not None:
+            held += dtip
+            after = SIMULATOR.assimilate(after, (after.tip[0], held)).state
+        lateral += (lateral_forces(state) + lateral_forces(after)) @ [db_y, db_theta, dg_y, dtip] / 2
+        slide = after.tip[0] - state.tip[0]
+        axial += (axial_force(state) + axial_force(after)) * slide / 2
+        axial += (base_axial_force(state) + base_axial_force(after)) * advance / steps / 2
+        if not after.tip[0] < after.scalars[nd.FRONT]:
+            raise ValueError("this move cuts")
+        state = after
+    return lateral, axial, state.energy - energy
+
+
+def first_hold(state):
+    """The state with its tip held where it is."""
+    return SIMULATOR.assimilate(state, state.tip[:2]).state
+
+
+@pytest.mark.parametrize("name", ["base", "turn", "guide"])
+def test_work_of_base_and_guide_is_the_energy_stored(name):
+    """With the tip out of the bevel's spring, where its slide costs nothing: to 3 parts in a million."""
+    lateral, axial, stored = travel(withdrawn(3.55), MOVES[name])
+    assert abs(stored) > 0.02
+    assert lateral == pytest.approx(stored, rel=5e-6)
+    assert axial == 0.0
+
+
+@pytest.mark.parametrize("name", ["tip", "all"])
+def test_work_of_a_held_tip_is_the_energy_stored(name):
+    """Within 0.1 % by lateral work alone, to a hundred-thousandth with that of the slide along the hold."""
+    lateral, axial, stored = travel(first_hold(withdrawn(3.55)), MOVES[name])
+    assert abs(stored) > 0.02
+    assert lateral == pytest.approx(stored, rel=2e-3)
+    assert lateral + axial == pytest.approx(stored, rel=2e-5)
+
+
+@pytest.mark.parametrize("name", MOVES)
+def test_work_with_the_bevels_spring_is_the_energy_stored(name):
+    """Tip spring included; its fading with the slide is 0.2 to 1 % of the work here."""
+    lateral, axial, stored = travel(withdrawn(0.4), MOVES[name])
+    assert abs(stored) > 0.01
+    assert lateral == pytest.approx(stored, rel=0.02)
+    assert lateral + axial == pytest.approx(stored, rel=1e-4)
+
+
+def test_work_of_drawing_back_is_the_energy_released():
+    """An axial move, through points that lose weight and a spring that fades, with the base moving aside."""
+    errors = []
+    for steps in (100, 400):
+        lateral, axial, stored = travel(withdrawn(0.4), (2.0, -0.016, -1.4, 0.0), advance=-2.0, steps=steps)
+        errors.append(abs((lateral + axial) / stored - 1))
+    assert abs(axial) > 0.05 * abs(stored)
+    assert errors[1] < 2e-3
+    assert errors[1] < errors[0]
+
+
+@pytest.mark.parametrize("name", ["base", "turn", "guide"])
+def test_energy_gradient_is_the_reaction(name):
+    """Central difference of the energy against the reaction, with the tip out of the bevel's spring."""
+    state = repeat(SIMULATOR, withdrawn(3.55), Control(db_y=0.1, dg_y=-0.2, db_theta=2e-3), 5)[-1]
+    index = ("base", "turn", "guide").index(name)
+    h = (0.01, 1e-4, 0.01)[index]
+    field = ("db_y", "db_theta", "dg_y")[index]
+    up, down = (SIMULATOR.step(state, Control(**{field: side * h})).energy for side in (1.0, -1.0))
+    assert (up - down) / (2 * h) == pytest.approx(lateral_forces(state)[index], rel=1e-4)
+
+
+def test_forces_and_moments_on_the_needle_balance():
+    """Clamp, guide, contacts, tip: the forces add up to nothing where the tip spring is out."""
+    state = repeat(SIMULATOR, withdrawn(3.55), Control(db_y=0.2, dg_y=-0.3), 5)[-1]
+    contacts = state.mesh[4][state.model.nodes.kind[: state.mesh.shape[1]] == CONTACT]
+    reactions, x = state.reactions, state.contacts.x[state.contacts.active]
+    total = reactions.base_force + reactions.guide_force + contacts.sum()
+    base_x = state.base[0]
+    turning = reactions.base_moment + reactions.guide_force * (-41.0 - base_x) + contacts @ (x - base_x)
+    assert np.abs(contacts).max() > 1e-4
+    assert total == pytest.approx(0.0, abs=1e-6)
+    assert turning == pytest.approx(0.0, abs=1e-4)

@@ -1,0 +1,177 @@
+"""Agreement with the independent implementation in tests/reference/insertion.py, in every quantity of a state."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flexneedle import Control, Simulator, load_scenario
+from reference.comparison import gaps, worst_gaps
+from reference.draws import draw_controls, draw_scenario
+from reference.insertion import Reference, Tissue, ogden
+
+PHANTOM = load_scenario("phantom")
+TOLERANCE = 1e-6  # mm, mJ, N
+ANGLE_TOLERANCE_MRAD = 1e-5
+STEPS = 90
+
+
+def too_far(worst, factor=1.0):
+    """The gaps that are too large."""
+    limit = {
+        "slope": ANGLE_TOLERANCE_MRAD,
+        "node slope": ANGLE_TOLERANCE_MRAD,
+        "base moment": 100 * TOLERANCE,
+    }
+    return {name: gap for name, gap in worst.items() if not gap <= factor * limit.get(name, TOLERANCE)}
+
+
+def random_insertion(seed, every):
+    """Gaps of one random insertion."""
+    rng = np.random.default_rng(seed)
+    scenario = draw_scenario(rng)
+    return worst_gaps(scenario, draw_controls(scenario, STEPS, rng), every=every)
+
+
+class Pair:
+    """The simulator and the reference side by side."""
+
+    def __init__(self, scenario=PHANTOM):
+        self.simulator, self.reference = Simulator(scenario), Reference(scenario)
+        self.state, self.pose = self.simulator.start(), self.reference.start()
+
+    def step(self, times=1, **control):
+        """Equal steps of both; fails at the first gap of the tip."""
+        for _ in range(times):
+            self.state = self.simulator.step(self.state, Control(**control))
+            self.pose = self.reference.step(self.pose, Control(**control))
+            np.testing.assert_allclose(self.state.tip, self.pose.tip, rtol=0, atol=5 * TOLERANCE)
+
+    def hold(self, x, y, points=()):
+        """Assimilate in both; returns the innovation."""
+        self.state, innovation = self.simulator.assimilate(self.state, (x, y), points)
+        self.pose = self.reference.hold(self.pose, y, points)
+        return innovation
+
+    def believe(self, **corrections):
+        """Base and load corrected in both."""
+        self.state = self.state.believing(**corrections)
+        base, load = self.pose.base.copy(), corrections.get("tip_load", self.pose.load)
+        base[1:] = corrections.get("base_y", base[1]), corrections.get("base_turn", base[2])
+        self.pose = replace(self.pose, base=base, load=load)
+
+    def too_far(self):
+        """Gaps now, with room for what the steps before left."""
+        return too_far(gaps(self.reference, self.state, self.pose), factor=5.0)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_random_insertions_agree(seed):
+    """90 random steps each: 1e-9 to 1 mm, retractions, all inputs, flips, layers, with and without guide."""
+    assert not too_far(random_insertion(seed, every=15))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hundred", range(10))
+def test_a_thousand_random_insertions_agree(hundred):
+    """Seeds apart from those of the sample."""
+    failures = {}
+    for seed in range(1000 + 100 * hundred, 1100 + 100 * hundred):
+        if found := too_far(random_insertion(seed, every=30)):
+            failures[seed] = found
+    assert not failures
+
+
+def test_straight_insertion_agrees():
+    """To full depth of the phantom, with a turn of the bevel."""
+    pair = Pair()
+    pair.step(48, db_x=1.0)
+    pair.step(flip=True)
+    pair.step(32, db_x=1.0)
+    assert not pair.too_far()
+
+
+def test_exit_from_the_skin_and_new_entry_agree():
+    """Half out, on, all out, aside, in again."""
+    pair = Pair()
+    pair.step(36, db_x=1.0, dg_y=0.05)
+    pair.step(4, db_x=-1.0)
+    pair.step(5, db_x=0.9, flip=True)
+    assert not pair.too_far()
+    pair.step(14, db_x=-0.8, dg_y=0.1)
+    assert pair.state.tip[0] < 0.0
+    assert not pair.too_far()
+    pair.step(6, dg_y=-0.4, flip=True)
+    pair.step(14, db_x=0.83)
+    assert pair.state.contacts.active.sum() > 5
+    assert not pair.too_far()
+
+
+def test_needle_without_guide_agrees():
+    """Steered by base motion alone."""
+    pair = Pair(PHANTOM.with_values({"setup.guide_to_skin_mm": None}))
+    pair.step(40, db_x=1.0, db_y=0.1)
+    pair.step(25, db_x=0.7, db_theta=-1e-3)
+    assert not pair.too_far()
+
+
+def test_step_that_ends_just_past_a_contact_or_an_interval_agrees():
+    """A billionth to a tenth of a millimetre past points, ends of intervals and the layers' boundary."""
+    for past in (1e-9, 1e-6, 1e-3, 0.1):
+        pair = Pair()
+        pair.step(30, db_x=1.0)
+        for place in (2.5, 3.0, 3.5, 19.5, 20.0, 20.5):
+            while pair.state.tip[0] < place - 1.0:
+                pair.step(db_x=0.9)
+            for _ in range(3):  # the step itself bends the needle
+                pair.step(db_x=place + past - pair.state.tip[0])
+            assert not pair.too_far()
+
+
+@pytest.mark.parametrize(
+    "points", [[], [(15.5, 5.4)], [(10.5, 5.0), (0.5, 4.2)]], ids=["tip", "tip and one", "tip and two"]
+)
+def test_held_tip_and_points_agree(points):
+    """Held, cut anew, held on while the base moves, and released; points that coincide with contacts."""
+    pair = Pair()
+    pair.step(55, db_x=1.0, dg_y=0.05)
+    tip = pair.state.tip
+    innovation = pair.hold(tip[0] + 0.3, tip[1] + 0.4, points)
+    assert innovation == pytest.approx(tip[0] + 0.3 - pair.pose.tip[0], abs=5e-6)
+    assert not pair.too_far()
+    pair.hold(tip[0], tip[1] - 0.2, points)
+    assert not pair.too_far()
+    pair.step(3, db_x=0.9, db_y=0.1)
+    assert not pair.too_far()
+
+
+def test_believed_load_and_base_agree():
+    """What an observer corrects acts from the next step on."""
+    pair = Pair()
+    pair.step(20, db_x=1.0)
+    pair.believe(base_y=0.4, base_turn=-3e-3)
+    pair.step(25, db_x=1.0)
+    pair.believe(tip_load=0.004)
+    pair.step(8, db_x=1.0)
+    assert pair.state.tip_load == 0.004
+    assert not pair.too_far()
+    pair.hold(pair.state.tip[0], pair.state.tip[1] - 0.3)
+    assert not pair.too_far()
+
+
+def test_start_held_in_air_agrees():
+    """The start is a solve of its own, cut from nowhere."""
+    pair = Pair()
+    pair.hold(-28.5, 0.3)
+    assert not pair.too_far()
+
+
+def test_the_references_own_law_is_that_of_the_equations():
+    """Stress of layer 1 at λ = 0.7 (kPa), and derivatives, so that the two do not share a slip."""
+    point = Tissue(*(np.array([value]) for value in (1.82e-3, 8.74, 20.0, 5.2 * 20.0)))
+    _, force, stiffness = ogden(point, np.array([6.0]))
+    assert force[0] == pytest.approx(-2.80e-3 * 5.2, rel=2e-3)
+    h = 1e-4
+    (w1, f1, _), (w2, f2, _) = (ogden(point, np.array([6.0 + side * h])) for side in (-1, 1))
+    assert force[0] == pytest.approx(-(w2 - w1)[0] / (2 * h), rel=1e-7)
+    assert stiffness[0] == pytest.approx(-(f2 - f1)[0] / (2 * h), rel=1e-7)

@@ -1,0 +1,88 @@
+"""Batches: the same bits as single steps, whatever the number of threads."""
+
+import numpy as np
+import pytest
+
+from flexneedle import Control, Simulator, load_scenario
+from reference.cases import insert_to
+from reference.draws import draw_controls
+
+PHANTOM = load_scenario("phantom")
+
+
+@pytest.fixture(scope="module")
+def controls():
+    """40 sequences of 60 random steps."""
+    rng = np.random.default_rng(7)
+    scenario = PHANTOM.with_values({"setup.stroke_mm": 69.0})
+    return np.stack([draw_controls(scenario, 60, rng) for _ in range(40)])
+
+
+def test_rollout_equals_repeated_steps_to_the_last_bit(controls):
+    """Tips, strain energy and convergence, from a state in the tissue."""
+    simulator = Simulator(PHANTOM)
+    start = insert_to(simulator, 12.0)
+    result = simulator.rollout(start, controls)
+    assert result.tips.shape == (40, 60, 3)
+    assert result.strain_energy.shape == result.converged.shape == (40, 60)
+    for j in range(0, 40, 7):
+        state = start
+        for k, row in enumerate(controls[j]):
+            state = simulator.step(state, Control.from_row(row))
+            assert state.tip.tobytes() == result.tips[j, k].tobytes()
+            assert state.converged == result.converged[j, k]
+            assert state.strain_energy == pytest.approx(result.strain_energy[j, k], rel=1e-13)
+    assert result.strain_energy[:, -1].min() > 0.0
+
+
+def test_bytes_do_not_depend_on_the_number_of_threads(controls):
+    """1, 2, 3 and 8 threads, and one sequence at a time."""
+    results = []
+    for threads in (1, 2, 3, 8):
+        simulator = Simulator(PHANTOM, threads=threads)
+        results.append(simulator.rollout(insert_to(simulator, 12.0), controls))
+    simulator = Simulator(PHANTOM, threads=1)
+    single = [simulator.rollout(insert_to(simulator, 12.0), row[None]) for row in controls]
+    results.append(tuple(np.concatenate(arrays) for arrays in zip(*single, strict=True)))
+    for result in results[1:]:
+        for array, first in zip(result, results[0], strict=True):
+            assert array.tobytes() == first.tobytes()
+
+
+def test_mean_square_deflection_is_that_of_the_nodes(controls):
+    """∫y² dx/L against Simpson's rule on a fine needle state."""
+    simulator = Simulator(PHANTOM.with_values({"needle.nodes": 2001}))
+    start = insert_to(simulator, 12.0)
+    plain = simulator.rollout(start, controls[:2])
+    result, deflection = simulator.rollout_with_deflection(start, controls[:2])
+    assert plain.tips.tobytes() == result.tips.tobytes()
+    for j in range(2):
+        state = start
+        for row in controls[j]:
+            state = simulator.step(state, Control.from_row(row))
+        x, y, _ = state.nodes.T
+        mean = np.trapezoid(y**2, x) / 150.0
+        assert deflection[j, -1] == pytest.approx(mean, rel=1e-5)
+
+
+def test_empty_and_single_batches():
+    """No sequence, no step, one step."""
+    simulator = Simulator(PHANTOM)
+    state = simulator.start()
+    assert simulator.rollout(state, np.zeros((0, 5, 5))).tips.shape == (0, 5, 3)
+    assert simulator.rollout(state, np.zeros((3, 0, 5))).tips.shape == (3, 0, 3)
+    one = simulator.rollout(state, [[[1.0, 0.0, 0.0, 0.1, -1.0]]])
+    np.testing.assert_array_equal(one.tips[0, 0], simulator.step(state, Control(db_x=1.0, dg_y=0.1)).tip)
+
+
+def test_rollout_leaves_its_inputs_alone(controls):
+    """Neither the state nor the controls change; lists and read-only arrays do."""
+    simulator = Simulator(PHANTOM)
+    state = insert_to(simulator, 12.0)
+    before, kept = (state.scalars.tobytes(), state.rest.tobytes(), state.mesh.tobytes()), controls.copy()
+    frozen = controls[:3].copy()
+    frozen.flags.writeable = False
+    simulator.rollout(state, frozen)
+    simulator.rollout(state, frozen.tolist())
+    assert before == (state.scalars.tobytes(), state.rest.tobytes(), state.mesh.tobytes())
+    np.testing.assert_array_equal(frozen, kept[:3])

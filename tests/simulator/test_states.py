@@ -1,0 +1,240 @@
+"""States as values, and commands that are refused."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+
+from flexneedle import Control, Simulator, load_scenario
+from flexneedle.errors import CommandError, StateError
+from reference.cases import insert_to, repeat
+
+PHANTOM = load_scenario("phantom")
+SIMULATOR = Simulator(PHANTOM)
+ON = Control(db_x=0.7, dg_y=-0.2, flip=True)
+
+
+@pytest.fixture(scope="module")
+def state():
+    """A bent needle, pulled back a little."""
+    deep = repeat(SIMULATOR, insert_to(SIMULATOR, 15.0), Control(db_x=1.0, dg_y=0.2), 10)[-1]
+    return SIMULATOR.step(deep, Control(db_x=-0.6))
+
+
+def same_future(one, other):
+    """Whether both go on to the same bytes."""
+    return SIMULATOR.step(one, ON).nodes.tobytes() == SIMULATOR.step(other, ON).nodes.tobytes()
+
+
+@pytest.mark.parametrize(
+    "duplicate", [copy.copy, copy.deepcopy, lambda state: pickle.loads(pickle.dumps(state))]
+)
+def test_copies_are_equal_and_go_on_the_same(state, duplicate):
+    """Copied, deeply copied, pickled."""
+    twin = duplicate(state)
+    assert twin == state
+    assert hash(twin) == hash(state)
+    assert same_future(twin, state)
+
+
+def test_states_compare_by_value(state):
+    """A step makes a difference, and so does a belief; other things are not states."""
+    assert state != SIMULATOR.step(state, Control(db_x=0.1))
+    assert state != state.believing(tip_load=1e-3)
+    assert SIMULATOR.step(state, ON) == SIMULATOR.step(state, ON)
+    assert state != 3
+    assert state.believing() == state
+
+
+def test_saved_state_loads_equal(state, tmp_path):
+    """From a file, by text or path."""
+    path = tmp_path / "needle.npz"
+    state.save(path)
+    loaded = SIMULATOR.load(str(path))
+    assert loaded == state
+    assert same_future(loaded, state)
+    assert not loaded.rest.flags.writeable
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("tissue.1.alpha", 9.0),
+        ("needle.bevel.offset_mm", 3.5),
+        ("contact.spacing_mm", 0.5),
+        ("setup.guide_to_skin_mm", None),
+    ],
+)
+def test_state_of_other_mechanics_is_refused_with_the_key(state, tmp_path, key, value):
+    """In a step, a rollout, an assimilation and a file, with both values."""
+    other = Simulator(PHANTOM.with_values({key: value}))
+    path = tmp_path / "needle.npz"
+    state.save(path)
+    uses = (
+        lambda: other.step(state, ON),
+        lambda: other.rollout(state, [[ON.row()]]),
+        lambda: other.assimilate(state, state.tip[:2]),
+        lambda: other.load(path),
+    )
+    for use in uses:
+        with pytest.raises(StateError) as caught:
+            use()
+        assert key in str(caught.value)
+        assert str(PHANTOM.flat()[key]) in str(caught.value)
+        assert str(value) in str(caught.value)
+
+
+def test_state_of_a_scenario_with_another_plan_is_welcome(state, tmp_path):
+    """Planner, controller and target are no part of the mechanics."""
+    other = Simulator(PHANTOM.with_values({"plan.samples": 77, "target.depth_mm": 30.0, "name": "Other"}))
+    path = tmp_path / "needle.npz"
+    state.save(path)
+    assert other.step(other.load(path), ON).nodes.tobytes() == SIMULATOR.step(state, ON).nodes.tobytes()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"plain text",
+        pytest.param(b"", marks=pytest.mark.xfail(reason="EOFError gets through", strict=True)),
+        pytest.param(
+            b"PK\x03\x04 no", marks=pytest.mark.xfail(reason="BadZipFile gets through", strict=True)
+        ),
+    ],
+)
+def test_file_that_is_no_state_is_refused(tmp_path, content):
+    """One clear error, whatever the file holds."""
+    path = tmp_path / "needle.npz"
+    path.write_bytes(content)
+    with pytest.raises(StateError, match=r"needle\.npz"):
+        SIMULATOR.load(path)
+    with pytest.raises(StateError, match="absent"):
+        SIMULATOR.load(tmp_path / "absent")
+
+
+def test_file_with_other_arrays_is_refused(tmp_path):
+    """An npz of something else."""
+    path = tmp_path / "needle.npz"
+    np.savez(path, x=np.zeros(3))
+    with pytest.raises(StateError, match="not a saved state"):
+        SIMULATOR.load(path)
+
+
+def test_arrays_of_a_state_are_read_only(state):
+    """What the next step starts from, and what is read from it."""
+    for array in (state.scalars, state.rest, state.compression, state.mesh, state.nodes, *state.contacts):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0
+
+
+def test_reading_a_state_changes_nothing(state):
+    """Properties have no effects, and hand out copies."""
+    before = pickle.dumps((state.scalars, state.rest, state.compression, state.mesh))
+    state.tip[:] = 99.0
+    state.base[:] = 99.0
+    _ = state.nodes, state.contacts, state.energy, state.strain_energy, state.reactions
+    assert pickle.dumps((state.scalars, state.rest, state.compression, state.mesh)) == before
+    assert state.tip[0] != 99.0
+
+
+def test_step_returns_a_new_state(state):
+    """The old one stays as it was, after steps and assimilation."""
+    before = pickle.dumps((state.scalars, state.rest, state.compression, state.mesh))
+    first = SIMULATOR.step(state, ON)
+    SIMULATOR.assimilate(state, np.add(state.tip[:2], [0.0, 0.2]))
+    assert pickle.dumps((state.scalars, state.rest, state.compression, state.mesh)) == before
+    assert first == SIMULATOR.step(state, ON)
+
+
+def test_simulator_pickles(state):
+    """For worker processes."""
+    simulator = pickle.loads(pickle.dumps(Simulator(PHANTOM, threads=3)))
+    assert simulator.threads == 3
+    assert simulator.step(state, ON) == SIMULATOR.step(state, ON)
+
+
+def test_start_is_straight_and_in_air():
+    """Tip before the skin, nothing bent, both bevels."""
+    for bevel in (-1, 1):
+        start = SIMULATOR.start(bevel)
+        np.testing.assert_array_equal(start.tip, [-28.5, 0.0, 0.0])
+        np.testing.assert_array_equal(start.base, [-178.5, 0.0, 0.0])
+        assert (start.bevel, start.guide, start.energy, start.contacts.x.size) == (bevel, 0.0, 0.0, 0)
+    with pytest.raises(CommandError, match="bevel = 0"):
+        SIMULATOR.start(0)
+
+
+@pytest.mark.parametrize(
+    ("control", "name", "value", "limit"),
+    [
+        ({"db_x": 1.001}, "db_x", 1.001, 1.0),
+        ({"db_x": -1.2}, "db_x", -1.2, 1.0),
+        ({"db_y": 0.6}, "db_y", 0.6, 0.5),
+        ({"db_theta": -0.0051}, "db_theta", -0.0051, 0.005),
+        ({"dg_y": 0.5001}, "dg_y", 0.5001, 0.5),
+        ({"db_x": -0.1}, "db_x", -0.1, 0.0),
+    ],
+)
+def test_command_out_of_range_is_refused_with_value_and_limit(control, name, value, limit):
+    """From the start; never clipped."""
+    with pytest.raises(CommandError) as caught:
+        SIMULATOR.step(SIMULATOR.start(), Control(**control))
+    error = caught.value
+    assert (error.name, error.limit) == (name, pytest.approx(limit))
+    assert error.value == pytest.approx(value)
+    assert f"{name} = {value:g}" in str(error)
+    assert f"{limit:g}" in str(error)
+
+
+@pytest.mark.parametrize("name", ["db_x", "db_y", "db_theta", "dg_y"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_command_that_is_no_number_is_refused(name, value):
+    """NaN and infinity."""
+    with pytest.raises(CommandError, match=rf"{name} = .*finite"):
+        SIMULATOR.step(SIMULATOR.start(), Control(**{name: value}))
+
+
+@pytest.mark.parametrize(
+    ("name", "step", "travel"), [("db_x", 1.0, 110.0), ("dg_y", 0.5, 15.0), ("db_y", -0.5, 15.0)]
+)
+def test_travel_is_limited(name, step, travel):
+    """To the stroke and the guide's and base's range, in single steps and in a rollout."""
+    times = round(travel / abs(step))
+    end = repeat(SIMULATOR, SIMULATOR.start(), Control(**{name: step}), times)[-1]
+    with pytest.raises(CommandError, match=rf"{name} = .*in all at (most|least) -?{travel:g} mm"):
+        SIMULATOR.step(end, Control(**{name: step / 100}))
+    rows = np.repeat([[Control(**{name: step}).row()]], times + 1, axis=1)
+    SIMULATOR.rollout(SIMULATOR.start(), rows[:, :-1])
+    with pytest.raises(CommandError, match=rf"{name} = "):
+        SIMULATOR.rollout(SIMULATOR.start(), rows)
+
+
+def test_guide_that_is_not_there_cannot_move():
+    """Limit 0."""
+    simulator = Simulator(PHANTOM.with_values({"setup.guide_to_skin_mm": None}))
+    with pytest.raises(CommandError) as caught:
+        simulator.step(simulator.start(), Control(dg_y=0.1))
+    assert (caught.value.name, caught.value.limit) == ("dg_y", 0.0)
+
+
+@pytest.mark.parametrize("shape", [(5,), (3, 5), (2, 3, 4), (1, 2, 3, 5)])
+def test_controls_of_another_shape_are_refused(shape):
+    """With the shape in the message."""
+    with pytest.raises(CommandError, match=r"shape \(N, m, 5\)"):
+        SIMULATOR.rollout(SIMULATOR.start(), np.zeros(shape))
+
+
+@pytest.mark.parametrize("flip", [0.0, 2.0, -0.5])
+def test_flip_is_minus_or_plus_one(flip):
+    """Nothing between."""
+    with pytest.raises(CommandError, match="flip"):
+        SIMULATOR.rollout(SIMULATOR.start(), [[[0.0, 0.0, 0.0, 0.0, flip]]])
+
+
+def test_control_rows_round_trip():
+    """Columns as in a rollout, flip as −1 or +1."""
+    control = Control(0.5, -0.1, 2e-3, 0.3, flip=True)
+    np.testing.assert_array_equal(control.row(), [0.5, -0.1, 2e-3, 0.3, 1.0])
+    assert Control.from_row(control.row()) == control
+    assert Control.from_row(Control().row()) == Control()
