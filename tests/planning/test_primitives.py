@@ -53,6 +53,14 @@ def test_shares_are_the_exponentials_and_steps_no_longer_than_asked():
     np.testing.assert_allclose(controls[0, :, 0], [*[1.0] * 6, *[0.6] * 5, *[0.5] * 6])
 
 
+def test_rounding_makes_no_further_step():
+    """2.1 / 0.7 is a little more than 3 in double precision."""
+    assert 2.1 / 0.7 > 3.0
+    one = replace(PROBLEM, travel=2.1, primitives=1)
+    controls, _ = schedule(one, primitives((0.7, 0, 0, 0, 1, 0)))
+    assert controls.shape == (1, 3, 5)
+
+
 def test_wanting_minus_from_the_start_turns_in_the_first_step():
     controls, wanted = schedule(PROBLEM, primitives(*[(1, 0, 0, 0, -1, 0)] * 3))
     assert controls[0, :, 4].tolist() == [1.0, *[-1.0] * 11]

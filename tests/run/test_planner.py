@@ -224,7 +224,8 @@ def test_without_a_guide_the_bevel_steers_and_the_limit_says_so():
     near = flexneedle.plan(PHANTOM.with_values(free), (40.0, 2.0))
     assert near.error <= 0.05
     assert not near.controls[:, 3].any()
-    far = coarse(free, (40.0, 14.0))
+    far = coarse({**free, "plan.guide_sigma_mm": 5.0}, (40.0, 14.0))
+    assert {entry["spread"][3] for entry in far.history} == {0.0}
     assert far.limit == "needle.bevel.offset_mm = 4 (only the bevel steers)"
 
 

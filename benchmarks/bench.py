@@ -1,0 +1,317 @@
+"""Measure speed: python benchmarks/bench.py [--json]. Figures and ratios of one run, no thresholds."""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from scipy.linalg.lapack import dpbsv
+
+import flexneedle
+from flexneedle.mechanics import needle as nd
+from flexneedle.mechanics.model import ESSENTIAL
+from flexneedle.mechanics.ogden import contact_law
+from flexneedle.simulator import Control, Simulator, State
+
+SCENARIO = flexneedle.load_scenario("phantom")
+DEPTH_MM, STEPS, SEQUENCES = 45.0, 74, 64
+DEPTHS_MM = (10, 20, 30, 40, 50, 60, 70, 80)
+US = 1e6
+FIRST_USE = """
+import time; begun = time.perf_counter()
+import flexneedle
+simulator = flexneedle.Simulator(flexneedle.load_scenario("phantom"), threads=1)
+state = simulator.step(simulator.start(), flexneedle.Control(db_x=1.0))
+simulator.rollout(state, [[[1.0, 0.0, 0.0, 0.0, -1.0]]])
+simulator.assimilate(state, (state.tip[0], 0.1))
+print(time.perf_counter() - begun)
+"""
+
+
+def seconds(call: Callable[[], Any], times: int = 1) -> float:
+    """Wall-clock time of one call, averaged over `times` in a row."""
+    begun = time.perf_counter()
+    for _ in range(times):
+        call()
+    return (time.perf_counter() - begun) / times
+
+
+def insertions(count: int, steps: int = STEPS, depth: float = DEPTH_MM) -> np.ndarray:
+    """Controls (count, steps, 5) of insertions to `depth` with a guide that wanders and a bevel that turns once."""
+    rng = np.random.default_rng(0)
+    controls = np.zeros((count, steps, 5))
+    controls[:, :, 0] = (SCENARIO.setup.tip_to_skin_mm + depth) / steps
+    controls[:, :, 3] = np.repeat(rng.normal(0.0, 0.05, (count, 6)), steps // 6 + 1, axis=1)[:, :steps]
+    controls[:, :, 4] = -1.0
+    controls[np.arange(count), rng.integers(steps // 2, steps, count), 4] = 1.0
+    return controls
+
+
+def after(simulator: Simulator, controls: np.ndarray) -> State:
+    """The state after a sequence (m, 5)."""
+    state = simulator.start()
+    for row in controls:
+        state = simulator.step(state, Control.from_row(row.tolist()))
+    return state
+
+
+# ---- a rollout step against one banded solve of its own matrix
+
+
+def elements(x: np.ndarray, stiffness: float) -> np.ndarray:
+    """Stiffness matrices (k, 4, 4) of Euler–Bernoulli elements between x (k + 1,), dofs y, θ left, y, θ right."""
+    h = np.diff(x)[:, None, None]
+    unit = np.array([[12, 6, -12, 6], [6, 4, -6, 2], [-12, -6, 12, -6], [6, 2, -6, 4]], dtype=float)
+    power = np.array([[0, 1, 0, 1], [1, 2, 1, 2], [0, 1, 0, 1], [1, 2, 1, 2]])
+    return stiffness * unit * h**power / h**3
+
+
+def last_system(state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Upper band (4, n) and right-hand side (n,) of the last Newton iteration, and the state's own y, θ (n,).
+
+    Two unknowns a node, y and θ, from the first node to the tip; the clamped base has none, and the row of
+    the guide's y, which is given, is that of the identity.
+    """
+    s, nodes, count = state.scalars, state.model.nodes, state.mesh.shape[1]
+    x = np.concatenate([[s[nd.BASE_X]], nodes.x[:count], [s[nd.TIP_X]]])
+    size = 2 * x.size
+    full = np.zeros((size, size))
+    for i, matrix in enumerate(elements(x, state.model.bending_stiffness)):
+        full[2 * i : 2 * i + 4, 2 * i : 2 * i + 4] += matrix
+    y = np.concatenate([[s[nd.BASE_Y]], state.mesh[0], [s[nd.TIP_Y]]])
+    turn = np.concatenate([[s[nd.BASE_TURN]], state.mesh[1], [s[nd.TIP_TURN]]])
+    known, load = np.stack([y, turn], axis=1).ravel(), np.zeros(size)
+    for i in range(count):
+        if nodes.kind[i] != ESSENTIAL:
+            ramp = min(1.0, (s[nd.TIP_X] - nodes.x[i]) / nodes.reach[i])
+            law = nodes.alpha[i], nodes.height[i], nodes.force[i], nodes.energy[i]
+            force, k, _ = contact_law(*law, state.compression[i])
+            full[2 * i + 2, 2 * i + 2] += ramp * k
+            load[2 * i + 2] = ramp * (force + k * y[i + 1])
+    _, slope = nd.spring_rest(state.model, s, s[nd.TIP_X])
+    force, k, *_ = nd._spring_law(state.model, s, s[nd.TIP_X], s[nd.SPRING_U])
+    full[-2, -2] += slope * k
+    load[-2] = force + slope * k * y[-1]
+    given = [0, 1, *(2 * i + 2 for i in range(count) if nodes.kind[i] == ESSENTIAL)]
+    load -= full[:, given] @ known[given]
+    full[given], full[:, given] = 0.0, 0.0
+    full[given, given], load[given] = 1.0, known[given]
+    full, load, known = full[2:, 2:], load[2:], known[2:]
+    band = np.zeros((4, load.size))
+    for k in range(4):
+        band[3 - k, k:] = np.diagonal(full, k)
+    return band, load, known
+
+
+def measure_step(repeats: int = 41) -> dict[str, Any]:
+    """One thread, all Newton iterations and the tissue law, interleaved with dpbsv on the final matrix."""
+    simulator, controls = Simulator(SCENARIO, threads=1), insertions(SEQUENCES)
+    start, state = simulator.start(), after(simulator, controls[0])
+    band, load, known = last_system(state)
+    _, solution, info = dpbsv(band, load)
+    pairs = []
+    for _ in range(repeats):
+        rollout = seconds(lambda: simulator.rollout(start, controls)) / (SEQUENCES * STEPS)
+        pairs.append((rollout, seconds(lambda: dpbsv(band, load), 2000)))
+    step, solve = (median(column) for column in zip(*pairs, strict=True))
+    return {
+        "step_us": US * step,
+        "dpbsv_us": US * solve,
+        "step_over_dpbsv": median(a / b for a, b in pairs),
+        "unknowns": load.size,
+        "dpbsv_info": int(info),
+        "dpbsv_differs_from_the_state_mm": float(np.abs(solution - known)[::2].max()),
+        "iterations_of_last_step": state.iterations,
+    }
+
+
+def measure_depth(repeats: int = 15) -> dict[str, Any]:
+    """Time of a step at each depth, four steps of 0.5 mm from there, and how it grows."""
+    simulator, controls = Simulator(SCENARIO, threads=1), insertions(128, 4)
+    controls[:, :, 0] = 0.5
+    states = []
+    for depth in DEPTHS_MM:
+        travel = SCENARIO.setup.tip_to_skin_mm + depth - 1.0
+        way = insertions(1, int(np.ceil(travel)), depth - 1.0)[0]
+        states.append(after(simulator, way))
+    rounds = [
+        [seconds(lambda s=s: simulator.rollout(s, controls)) / (128 * 4) for s in states]
+        for _ in range(repeats)
+    ]
+    times = US * np.median(rounds, axis=0)
+    slope, offset = np.polyfit(DEPTHS_MM, times, 1)
+    half = len(DEPTHS_MM) // 2
+    early, late = (
+        np.polyfit(DEPTHS_MM[part], times[part], 1)[0] for part in (slice(half), slice(half, None))
+    )
+    return {
+        "depth_mm": list(DEPTHS_MM),
+        "step_us": times.tolist(),
+        "fit_us": [float(offset), float(slope)],
+        "fit_residual_us": float(np.abs(times - offset - slope * np.array(DEPTHS_MM)).max()),
+        "exponent": float(np.polyfit(np.log(DEPTHS_MM), np.log(times), 1)[0]),
+        "slope_deep_over_shallow": float(late / early),
+    }
+
+
+def measure_threads(repeats: int = 15) -> dict[str, Any]:
+    """The same rollouts on one and on two threads, in turn."""
+    controls = insertions(512)
+    simulators = [Simulator(SCENARIO, threads=n) for n in (1, 2)]
+    pairs = [
+        [seconds(lambda s=s: s.rollout(s.start(), controls)) for s in simulators] for _ in range(repeats)
+    ]
+    return {"speedup": median(one / two for one, two in pairs), "cores": len(os.sched_getaffinity(0))}
+
+
+def measure_plan() -> dict[str, Any]:
+    """Plans of 128 samples and 25 iterations (no early stop), to the scenario's target."""
+    scenario = SCENARIO.with_values({"plan.samples": 128, "plan.iterations": 25, "plan.tolerance": 1e-6})
+    plans = [flexneedle.plan(scenario, seed=seed) for seed in range(3)]
+    return {
+        "plan_s": [plan.seconds for plan in plans],
+        "iterations": [plan.iterations for plan in plans],
+        "error_mm": [plan.error for plan in plans],
+    }
+
+
+def measure_period() -> dict[str, Any]:
+    """Control periods of three insertions: deciding and observing, without the phantom's own time."""
+    plan = flexneedle.plan(SCENARIO, seed=0)
+    done = [flexneedle.insert(SCENARIO, plan, seed=seed) for seed in range(2000, 2003)]
+    totals = 1e3 * np.array([period.durations["total"] for one in done for period in one.periods])
+    p50, p99, most = np.percentile(totals, (50, 99, 100)).tolist()
+    return {"period_ms": {"p50": p50, "p99": p99, "max": most}, "periods": totals.size}
+
+
+# ---- processes
+
+
+def measure_help(repeats: int = 5) -> dict[str, Any]:
+    """`flexneedle --help` as a user waits for it."""
+    command = [sys.executable, "-m", "flexneedle", "--help"]
+
+    def call() -> None:
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+    call()
+    return {"help_s": median(seconds(call) for _ in range(repeats))}
+
+
+def measure_start() -> dict[str, Any]:
+    """First and second process with an empty cache: time to the first results, and the files that are cached."""
+    with tempfile.TemporaryDirectory() as cache:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": cache}
+        starts = []
+        for _ in range(2):
+            done = subprocess.run(
+                [sys.executable, "-c", FIRST_USE], env=environment, check=True, capture_output=True, text=True
+            )
+            files = {p: p.stat().st_mtime_ns for p in Path(cache).rglob("*") if p.is_file()}
+            starts.append((float(done.stdout), files))
+    (first, made), (second, later) = starts
+    return {
+        "first_process_s": first,
+        "second_process_s": second,
+        "cache_files": len(made),
+        "written_by_second_process": len([p for p in later if made.get(p) != later[p]]),
+    }
+
+
+PARTS = {
+    "step": measure_step,
+    "depth": measure_depth,
+    "threads": measure_threads,
+    "plan": measure_plan,
+    "period": measure_period,
+    "help": measure_help,
+    "start": measure_start,
+}
+
+
+def rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """What was measured, its figure, a remark."""
+    step, depth, start = found["step"], found["depth"], found["start"]
+    period, times = found["period"]["period_ms"], dict(zip(DEPTHS_MM, depth["step_us"], strict=True))
+    a, b = depth["fit_us"]
+    plans = found["plan"]
+    return [
+        (
+            "rollout step",
+            f"{step['step_us']:.2f} µs",
+            f"{STEPS} steps to {DEPTH_MM:g} mm, one thread, everything in it",
+        ),
+        ("one dpbsv", f"{step['dpbsv_us']:.2f} µs", f"its final matrix, {step['unknowns']} unknowns, kd = 3"),
+        (
+            "step / dpbsv",
+            f"{step['step_over_dpbsv']:.2f}",
+            f"dpbsv gives the state again to {step['dpbsv_differs_from_the_state_mm']:.0e} mm",
+        ),
+        *((f"step at {mm} mm", f"{us:.2f} µs", "") for mm, us in times.items()),
+        ("growth with depth", f"d^{depth['exponent']:.2f}", "at most 1 is at most linear"),
+        ("straight fit", f"{a:.2f} + {b:.3f} d µs", f"largest deviation {depth['fit_residual_us']:.2f} µs"),
+        (
+            "slope deep / shallow",
+            f"{depth['slope_deep_over_shallow']:.2f}",
+            "1 is linear, above 1 grows faster",
+        ),
+        (
+            "2 threads / 1",
+            f"{found['threads']['speedup']:.2f} ×",
+            f"{found['threads']['cores']} cores at hand",
+        ),
+        (
+            "plan",
+            f"{median(plans['plan_s']):.2f} s",
+            f"N = 128, {plans['iterations'][0]} iterations, median of 3",
+        ),
+        (
+            "control period",
+            f"{period['p50']:.1f} ms",
+            f"p99 {period['p99']:.1f} ms, max {period['max']:.1f} ms",
+        ),
+        ("flexneedle --help", f"{found['help']['help_s']:.2f} s", "wall time, median of 5"),
+        (
+            "first process",
+            f"{start['first_process_s']:.1f} s",
+            f"compiles, {start['cache_files']} cache files",
+        ),
+        (
+            "second process",
+            f"{start['second_process_s']:.1f} s",
+            f"{start['written_by_second_process']} cache files written again",
+        ),
+    ]
+
+
+def main() -> None:
+    """Measure all and print a table, or one JSON object."""
+    parser = argparse.ArgumentParser(description="Measure the speed of flexneedle on this machine, now.")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    chosen = parser.parse_args()
+    load = os.getloadavg()[0]
+    found: dict[str, Any] = {}
+    for name, measure in PARTS.items():
+        print(f"measuring {name} …", file=sys.stderr, flush=True)
+        found[name] = measure()
+    found["load"] = {"before": load, "after": os.getloadavg()[0], "cores": len(os.sched_getaffinity(0))}
+    if chosen.json:
+        print(json.dumps(found))
+        return
+    for what, figure, remark in rows(found):
+        print(f"{what:<22}{figure:>20}   {remark}")
+    cores = found["load"]["cores"]
+    print(f"\nLoad average before the run {load:.2f} on {cores} cores; this run itself adds 1 to 2.")
+    print("Other work on the machine slows all of this, ratios less than times: measure on an idle one.")
+
+
+if __name__ == "__main__":
+    main()
