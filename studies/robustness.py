@@ -1,0 +1,213 @@
+"""Random control sequences in random tissue: no exception, no NaN, no unconverged step (`make robustness`).
+
+Every batch is one random scenario and many sequences of all five inputs within its limits, run by
+`Simulator.rollout`. Progress goes to stderr, a JSON summary to stdout; exit status 1 after any failure, 130
+after an interrupt. A batch is drawn from (seed, number of the batch) alone, so a failure is reproduced by
+`--seed S --batch K`.
+"""
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+import flexneedle
+from flexneedle import Control, Scenario, Simulator
+from flexneedle.scenario import GAUGES
+
+STEPS = 80
+BATCH = 20
+SHOWN = 5
+
+
+@dataclass
+class Tally:
+    """What a run has seen so far; `worst_residual_mm` is over single steps that are run again one by one."""
+
+    sequences: int = 0
+    steps: int = 0
+    unconverged: int = 0
+    not_finite: int = 0
+    exceptions: int = 0
+    fallback_steps: int = 0
+    checked_steps: int = 0
+    most_iterations: int = 0
+    worst_residual_mm: float = 0.0
+    failures: list[str] = field(default_factory=list)
+
+    @property
+    def failed(self) -> bool:
+        """Whether anything went wrong."""
+        return self.unconverged + self.not_finite + self.exceptions > 0
+
+
+def draw_layer(rng: np.random.Generator) -> dict[str, float]:
+    """μ 0.1 to 100 kPa and α 1 to 30, as the requirement has them; h and w around those of the phantom."""
+    return {
+        "shear_modulus_kpa": float(10 ** rng.uniform(-1, 2)),
+        "alpha": float(rng.uniform(1, 30)),
+        "compression_length_mm": float(rng.uniform(8, 40)),
+        "engaged_width_mm": float(rng.uniform(1, 15)),
+        "energy_weight": float(rng.uniform(0, 3)),
+    }
+
+
+def draw_scenario(rng: np.random.Generator) -> Scenario:
+    """1 to 5 layers, needles of 17 to 27 gauge with and without stylet, with and without a guide."""
+    layers = [draw_layer(rng) for _ in range(rng.integers(1, 6))]
+    for layer in layers[:-1]:
+        layer["thickness_mm"] = float(rng.choice([5.0, rng.uniform(0.05, 20.0)]))
+    thinnest = min(layer["compression_length_mm"] for layer in layers)
+    gap = float(rng.choice([0.5, 5.0, 28.5]))
+    setup = {
+        "tip_to_skin_mm": gap,
+        "stroke_mm": gap + 55.0,
+        "max_advance_mm": float(rng.choice([1.0, 3.0])),
+        "guide_to_skin_mm": gap + float(rng.uniform(1, 25)),
+    }
+    if rng.random() < 0.25:
+        del setup["guide_to_skin_mm"]
+    return Scenario.from_values(
+        {
+            "name": "Random",
+            "needle": {
+                "gauge": str(rng.choice(list(GAUGES))),
+                "stylet": bool(rng.random() < 0.5),
+                "length_mm": float(rng.uniform(110, 220)),
+                "bevel": {
+                    "offset_mm": float(rng.choice([0.0, rng.uniform(0, 0.69 * thinnest)])),
+                    "length_mm": float(rng.uniform(0.2, 8)),
+                },
+            },
+            "setup": setup,
+            "contact": {"spacing_mm": float(rng.choice([1.0, rng.uniform(0.25, 3.0)]))},
+            "tissue": layers,
+        }
+    )
+
+
+def draw_controls(scenario: Scenario, count: int, rng: np.random.Generator) -> np.ndarray:
+    """(count, STEPS, 5): steps up to the limits, both ways, every input in runs or from step to step."""
+    setup = scenario.setup
+    shape = (count, STEPS)
+    forward = _runs(rng, shape, 0.9)
+    length = np.where(rng.random(shape) < 0.85, rng.uniform(0.2, 1.0, shape), 10 ** rng.uniform(-9, 0, shape))
+    columns = [_bounded(forward * length * setup.max_advance_mm, 0.0, setup.stroke_mm)]
+    ranges = (
+        (setup.max_base_step_mm, setup.max_base_travel_mm),
+        (setup.max_base_turn_step, 0.15),
+        (setup.max_guide_step_mm if setup.has_guide else 0.0, setup.max_guide_travel_mm),
+    )
+    for step, travel in ranges:
+        # From still to bang-bang at the limit, with a direction of its own to each sequence.
+        swing = step * rng.choice([0.0, 0.1, 0.4, 1.0], (count, 1))
+        moves = swing * _runs(rng, shape, rng.uniform(0.5, 0.95)) * rng.uniform(0, 1, shape)
+        columns.append(_bounded(moves, -travel, travel))
+    columns.append(np.where(rng.random(shape) < rng.choice([0.02, 0.2], (count, 1)), 1.0, -1.0))
+    return np.stack(columns, axis=2)
+
+
+def _runs(rng: np.random.Generator, shape: tuple[int, int], forward: float) -> np.ndarray:
+    """−1 and +1 in runs of 1 to 12 steps, +1 with the given probability."""
+    signs = np.where(rng.random(shape) < forward, 1.0, -1.0)
+    hold = np.repeat(np.arange(shape[1] // 4 + 1), 4)[: shape[1]]
+    return np.where(rng.random((shape[0], 1)) < 0.5, signs, signs[:, hold])
+
+
+def _bounded(steps: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Steps cut off where their sum would leave low to high."""
+    place, kept = np.zeros(steps.shape[0]), np.empty_like(steps)
+    for k in range(steps.shape[1]):
+        kept[:, k] = np.clip(place + steps[:, k], low, high) - place
+        place += kept[:, k]
+    return kept
+
+
+def run_batch(seed: int, batch: int, count: int, tally: Tally) -> None:
+    """One scenario, `count` sequences; what goes wrong is counted, never raised."""
+    rng = np.random.default_rng((seed, batch))
+    scenario = draw_scenario(rng)
+    controls = draw_controls(scenario, BATCH, rng)[:count]
+    bevel = 1 if rng.random() < 0.5 else -1
+    again = f"--seed {seed} --batch {batch}"
+    try:
+        simulator = Simulator(scenario)
+        tips, energy, converged = simulator.rollout(simulator.start(bevel), controls)
+        _step_again(simulator, controls[batch % count], bevel, tally)
+    except Exception as error:  # noqa: BLE001 the study is about there being none
+        tally.exceptions += 1
+        tally.failures.append(f"{again}  # {type(error).__name__}: {error}")
+        return
+    finite = np.isfinite(tips).all(axis=2) & np.isfinite(energy)
+    tally.sequences += count
+    tally.steps += converged.size
+    tally.unconverged += int((~converged).sum())
+    tally.not_finite += int((~finite).sum())
+    for j, k in np.argwhere(~(finite & converged))[:1]:
+        kind = "unconverged" if finite[j, k] else "not finite"
+        tally.failures.append(f"{again}  # sequence {j}, step {k}: {kind}")
+
+
+def _step_again(simulator: Simulator, rows: np.ndarray, bevel: int, tally: Tally) -> None:
+    """One sequence step by step, for what a rollout does not report."""
+    state = simulator.start(bevel)
+    for row in rows:
+        state = simulator.step(state, Control.from_row(row))
+        tally.most_iterations = max(tally.most_iterations, state.iterations)
+        tally.fallback_steps += state.iterations > 8  # where the equilibrium is uncoupled, theory section 6
+        tally.worst_residual_mm = max(tally.worst_residual_mm, state.residual)
+        tally.checked_steps += 1
+
+
+def summary(tally: Tally, seed: int, seconds: float) -> str:
+    """The JSON summary."""
+    result = asdict(tally) | {
+        "failures": tally.failures[:SHOWN],
+        "seed": seed,
+        "seconds": round(seconds, 1),
+        "version": flexneedle.__version__,
+        "passed": not tally.failed,
+    }
+    return json.dumps(result, indent=2)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the study; 0 if nothing failed, 1 otherwise, 130 if interrupted."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--sequences", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--batch", type=int, help="only this batch, to reproduce a failure")
+    options = parser.parse_args(arguments)
+    if options.sequences < 1:
+        parser.error("--sequences must be 1 or more")
+    tally, start, interrupted = Tally(), time.perf_counter(), False
+    last = -(-options.sequences // BATCH)
+    batches = range(last) if options.batch is None else [options.batch]
+    try:
+        for done, batch in enumerate(batches):
+            left = options.sequences - done * BATCH
+            run_batch(options.seed, batch, min(BATCH, left), tally)
+            _progress(tally, len(batches), done + 1, start)
+    except KeyboardInterrupt:
+        interrupted = True
+        print("\ninterrupted", file=sys.stderr)
+    print(summary(tally, options.seed, time.perf_counter() - start))
+    if tally.failures:
+        print(f"reproduce: python studies/robustness.py {tally.failures[0]}", file=sys.stderr)
+    return 130 if interrupted else int(tally.failed)
+
+
+def _progress(tally: Tally, batches: int, done: int, start: float) -> None:
+    end = "\n" if done == batches else "\r"
+    seconds = time.perf_counter() - start
+    text = (
+        f"{tally.sequences} sequences, {tally.steps} steps, {len(tally.failures)} failures, {seconds:.0f} s"
+    )
+    print(f"batch {done}/{batches}: {text}", end=end, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
