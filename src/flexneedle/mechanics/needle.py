@@ -30,9 +30,8 @@ CLAMP_Y, CLAMP_TURN = range(28, 30)  # the part of base y and turn that no comma
 STATE_SIZE = 30
 
 # Rows of the work array, one column a node. A1, G1, B11, B12 are those before an essential node, all else after.
-A1, A2, G1, G2, B11, B12, B22, STIFFNESS, FORCE, ENERGY, SHARE, FIXED, NEW_U, Y, TURN, SHEAR, MOMENT = range(
-    17
-)
+A1, A2, G1, G2, B11, B12, B22, STIFFNESS, FORCE, ENERGY, SHARE, FIXED = range(12)
+NEW_U, Y, TURN, SHEAR, MOMENT = range(12, 17)
 WORK_ROWS = 17
 
 TOLERANCE_MM = 1e-7
@@ -58,7 +57,7 @@ def _sweep_out(
         a1 += length * a2
         g1 += length * g2
         turn = length * flexibility
-        b11 += length * (2.0 * b12 + length * (b22 + turn / 3.0))
+        b11 += length * (2.0 * b12 + length * (b22 + turn * (1.0 / 3.0)))
         b12 += length * (b22 + 0.5 * turn)
         b22 += turn
         if i == count:
@@ -74,8 +73,9 @@ def _sweep_out(
             force, k, energy = contact_law(
                 nodes.alpha[i], nodes.height[i], nodes.force[i], nodes.energy[i], u[i]
             )
-            ramp = min(1.0, (tip_x - x) / nodes.reach[i])
-            force, k = force * ramp, k * ramp
+            if tip_x - x < nodes.reach[i]:
+                ramp = (tip_x - x) / nodes.reach[i]
+                force, k, energy = force * ramp, k * ramp, energy * ramp
             share, fixed = 0.0, rest[i]
             if i >= fresh:
                 share = (x - s[CUT_X]) * per_length
@@ -92,7 +92,7 @@ def _sweep_out(
             b11 *= inverse
             b12 *= inverse
             w[A1, i], w[G1, i], w[B11, i], w[B12, i] = a1, g1, b11, b12
-            w[STIFFNESS, i], w[FORCE, i], w[ENERGY, i] = k, force, energy * ramp
+            w[STIFFNESS, i], w[FORCE, i], w[ENERGY, i] = k, force, energy
             w[SHARE, i], w[FIXED, i] = share, fixed
         w[A2, i], w[G2, i], w[B22, i] = a2, g2, b22
     return a1, a2, g1, g2, b11, b12, b22

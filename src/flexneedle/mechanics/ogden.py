@@ -26,8 +26,8 @@ def _power_law(
 ) -> tuple[float, float, float]:
     """(|force|, stiffness, energy) at a stretch above the floor."""
     t = math.exp(-0.5 * alpha * math.log(stretch))
-    s = 1.0 / (t * t)
-    r = 1.0 / stretch
+    both = 1.0 / (t * t * stretch)  # one division for t⁻² and 1/λ
+    s, r = both * stretch, both * t * t
     magnitude = force * (t - s) * r
     stiffness = force / height * ((alpha - 1.0) * s + (0.5 * alpha + 1.0) * t) * (r * r)
     return magnitude, stiffness, energy * (2.0 * t + s - 3.0)

@@ -16,7 +16,7 @@ from flexneedle.mechanics import insertion, model
 from flexneedle.mechanics import needle as nd
 from flexneedle.scenario import Scenario
 from flexneedle.simulator.control import Control, Limits
-from flexneedle.simulator.state import State, load_arrays, mechanics_difference, solved
+from flexneedle.simulator.state import State, load_arrays, mechanics_difference, mesh_of, solved
 
 Floats = NDArray[np.float64]
 _STEPS_WORTH_A_THREAD = 200
@@ -68,7 +68,7 @@ class Simulator:
         self._limits.check(self._moved(state), row[None])
         s, rest, u, w = self._work(state)
         count = insertion.advance(self._model, s, rest, u, w, row)
-        return solved(self.scenario, self._model, s, rest, u, w, count)
+        return solved(self.scenario, self._model, s, rest, u, mesh_of(self._model.nodes, w, count))
 
     def rollout(self, state: State, controls: ArrayLike) -> Rollout:
         """Run each of N sequences from `state`; controls (N, m, 5): db_x, db_y, db_theta, dg_y, flip (−1 or +1).
@@ -100,7 +100,7 @@ class Simulator:
         x, y = measured[1:][np.argsort(measured[1:, 0])].T
         self._check_points(state, x)
         after = self._assimilated(state, float(measured[0, 1]), x, y)
-        return Assimilation(after, float(measured[0, 0] - after.scalars[nd.TIP_X]))
+        return Assimilation(after, float(measured[0, 0] - after.tip[0]))
 
     def load(self, path: str | Path) -> State:
         """Read a state that `State.save` wrote; StateError with the differing key under another scenario."""
@@ -112,11 +112,10 @@ class Simulator:
         merged = self._model._replace(nodes=model.insert_essential(self._model.nodes, x))
         rest, u = np.insert(rest, place, y), np.insert(u, place, 0.0)
         w = np.zeros((nd.WORK_ROWS, rest.size))
-        insertion.settle(merged, s, rest, u, w, tip_y)
+        count = insertion.settle(merged, s, rest, u, w, tip_y)
         added = place + np.arange(x.size)
-        rest, u, w = np.delete(rest, added), np.delete(u, added), np.delete(w, added, axis=1)
-        count = int(np.searchsorted(self._model.nodes.x, s[nd.TIP_X]))
-        return solved(self.scenario, self._model, s, rest, u, w, count)
+        rest, u = np.delete(rest, added), np.delete(u, added)
+        return solved(self.scenario, self._model, s, rest, u, mesh_of(merged.nodes, w, count))
 
     def _check_points(self, state: State, x: Floats) -> None:
         guide = [self.scenario.setup.guide_x] if self.scenario.setup.guide_x is not None else []
@@ -135,7 +134,7 @@ class Simulator:
         w = np.zeros((nd.WORK_ROWS, rest.size))
         s[[nd.CUT_X, nd.CUT_Y, nd.CUT_TURN]] = s[[nd.TIP_X, nd.TIP_Y, nd.TIP_TURN]]
         count = insertion.settle(self._model, s, rest, u, w, held)
-        return solved(self.scenario, self._model, s, rest, u, w, count)
+        return solved(self.scenario, self._model, s, rest, u, mesh_of(self._model.nodes, w, count))
 
     def _rollout(self, state: State, controls: ArrayLike, *, deflection: bool) -> tuple[Any, ...]:
         self._own(state)

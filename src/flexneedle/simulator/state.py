@@ -5,20 +5,22 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.errors import StateError
 from flexneedle.mechanics import needle as nd
-from flexneedle.mechanics.model import CONTACT, Model
+from flexneedle.mechanics.model import CONTACT, Model, Nodes
 from flexneedle.mechanics.shape import beam_energy, equal_arc_nodes
 from flexneedle.scenario import Scenario
 
 Floats = NDArray[np.float64]
 _MECHANICS = ("needle.", "setup.", "tissue", "contact.")  # the keys that a state depends on
 _Array = TypeVar("_Array", bound=NDArray[Any])
-_MESH_ROWS = (nd.Y, nd.TURN, nd.SHEAR, nd.MOMENT, nd.FORCE, nd.ENERGY)
+_WORK_ROWS = (nd.Y, nd.TURN, nd.SHEAR, nd.MOMENT, nd.FORCE, nd.ENERGY)
+_X, _Y, _TURN, _SHEAR, _MOMENT, _FORCE, _ENERGY, _WEIGHTED = range(8)  # rows of a mesh
 
 
 class Contacts(NamedTuple):
@@ -48,7 +50,8 @@ class State:
     """The insertion at one instant. Arrays are read-only; angles in rad, lengths in mm, energies in mJ.
 
     `scalars` (STATE_SIZE,), `rest` (k,) and `compression` (k,) are what the next step starts from;
-    `mesh` (6, j) is the solution at the nodes behind the tip: y, θ, shear, moment, force, energy.
+    `mesh` (8, j) is the solution at the nodes behind the tip, measured points included: x, y, θ, shear, moment,
+    force on the needle, stored energy, the same times w_c.
     """
 
     scenario: Scenario
@@ -108,39 +111,43 @@ class State:
     @cached_property
     def contacts(self) -> Contacts:
         """The cut channel."""
-        nodes, count = self.model.nodes, self.mesh.shape[1]
+        nodes = self.model.nodes
         formed = (nodes.kind == CONTACT) & (nodes.x < self.scalars[nd.FRONT])
-        active = np.arange(nodes.x.size) < count
-        y = np.where(active, np.append(self.mesh[0], np.zeros(nodes.x.size - count)), self.rest)
-        stretch = np.where(active, 1.0 - np.abs(y - self.rest) / nodes.height, 1.0)
-        return Contacts(*(_frozen(a[formed]) for a in (nodes.x, self.rest, y, stretch, active)))
+        active = nodes.x < self.scalars[nd.TIP_X]
+        compression = np.where(active, self.compression, 0.0)
+        columns = (
+            nodes.x,
+            self.rest,
+            self.rest + compression,
+            1.0 - np.abs(compression) / nodes.height,
+            active,
+        )
+        return Contacts(*(_frozen(column[formed]) for column in columns))
 
     @cached_property
     def strain_energy(self) -> float:
         """Tissue strain energy Σ w_c W of the contacts (mJ), weighted by layer (paper eq. 12)."""
-        count = self.mesh.shape[1]
-        tissue = self.model.nodes.kind[:count] == CONTACT
-        return float(np.dot(self.model.nodes.weight[:count][tissue], self.mesh[5][tissue]))
+        # Summed in order, as the rollout kernel does, so that both agree to the last bit.
+        return float(np.cumsum(np.append(0.0, self.mesh[_WEIGHTED]))[-1])
 
     @cached_property
     def energy(self) -> float:
         """Stored energy of beam, contacts and tip spring (mJ), unweighted."""
-        tissue = self.model.nodes.kind[: self.mesh.shape[1]] == CONTACT
         x, _, _ = self._curve()
-        shear = np.append(self.scalars[nd.BASE_SHEAR], self.mesh[2])
-        moment = np.append(self.scalars[nd.BASE_MOMENT], self.mesh[3])
+        shear = np.append(self.scalars[nd.BASE_SHEAR], self.mesh[_SHEAR])
+        moment = np.append(self.scalars[nd.BASE_MOMENT], self.mesh[_MOMENT])
         beam = beam_energy(x, shear, moment, self.model.bending_stiffness)
-        return float(beam + self.mesh[5][tissue].sum() + self.scalars[nd.SPRING_ENERGY])
+        return float(beam + self.mesh[_ENERGY].sum() + self.scalars[nd.SPRING_ENERGY])
 
     @property
     def reactions(self) -> Reactions:
         """Forces of clamp, guide and held tip on the needle."""
         s = self.scalars
-        guide = self.scenario.setup.has_guide and self.mesh.shape[1] > 0
+        guide = self.mesh[_FORCE][self.mesh[_X] == self.scenario.setup.guide_x]
         return Reactions(
             -float(s[nd.BASE_SHEAR]),
             -float(s[nd.BASE_MOMENT]),
-            float(self.mesh[4, 0]) if guide else 0.0,
+            float(guide.sum()),
             float(s[nd.TIP_REACTION]),
         )
 
@@ -177,8 +184,7 @@ class State:
 
     def _curve(self) -> tuple[Floats, Floats, Floats]:
         """x, y, θ of base, nodes and tip."""
-        x = self.model.nodes.x[: self.mesh.shape[1]]
-        rows = zip(self.base, (x, self.mesh[0], self.mesh[1]), self.tip, strict=True)
+        rows = zip(self.base, self.mesh[: _TURN + 1], self.tip, strict=True)
         first, second, third = (np.concatenate([[base], inner, [tip]]) for base, inner, tip in rows)
         return first, second, third
 
@@ -206,10 +212,10 @@ def mechanics_difference(one: Scenario, other: Scenario) -> str | None:
 def load_arrays(path: str | Path, scenario: Scenario) -> dict[str, Floats]:
     """Read what `State.save` wrote; StateError if it is no state or of another scenario, with the differing key."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
         saved = Scenario.from_values(json.loads(str(arrays.pop("scenario"))), source=str(path))
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, AttributeError, EOFError, BadZipFile) as error:
         raise StateError(f"{path}: not a saved state ({error})") from error
     if (key := mechanics_difference(saved, scenario)) is not None:
         mine, theirs = scenario.flat().get(key), saved.flat().get(key)
@@ -221,13 +227,18 @@ def load_arrays(path: str | Path, scenario: Scenario) -> dict[str, Floats]:
     return {name: _frozen(array) for name, array in arrays.items()}
 
 
-def solved(
-    scenario: Scenario, model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, count: int
-) -> State:
-    """Freeze the work arrays of a solve into a state."""
-    mesh = w[list(_MESH_ROWS), :count]
-    mesh[5, model.nodes.kind[:count] != CONTACT] = 0.0
+def solved(scenario: Scenario, model: Model, s: Floats, rest: Floats, u: Floats, mesh: Floats) -> State:
+    """Freeze the work arrays of a solve and its `mesh_of` into a state."""
     return State(scenario, model, _frozen(s), _frozen(rest), _frozen(u), _frozen(mesh))
+
+
+def mesh_of(nodes: Nodes, w: Floats, count: int) -> Floats:
+    """Collect the solution at the `count` nodes behind the tip, (8, count), from the work array of a solve."""
+    mesh = np.concatenate([nodes.x[None, :count], w[list(_WORK_ROWS), :count], np.zeros((1, count))])
+    tissue = nodes.kind[:count] == CONTACT
+    mesh[_ENERGY] = np.where(tissue, mesh[_ENERGY], 0.0)
+    mesh[_WEIGHTED] = nodes.weight[:count] * mesh[_ENERGY]
+    return mesh
 
 
 def _frozen(array: _Array) -> _Array:
