@@ -134,6 +134,16 @@ def test_cost_is_that_of_the_chosen_steps(plan):
     assert choice.cost == pytest.approx(expected, rel=1e-9)
 
 
+def test_each_step_is_held_against_the_plans_own_guide_step(plan):
+    """With nothing but the guide's cost it repeats the plan, before a primitive's end and after it."""
+    alone = {"control.horizon": 1, "control.guide_weight": 1e6, "control.energy_weight_per_mj": 0.0}
+    scenario = PHANTOM.with_values(alone)
+    changes = np.flatnonzero(np.diff(plan.controls[:, 3]))
+    for k in (changes[0], changes[0] + 1):
+        choice = choose(plan, along(plan, k, scenario), scenario)
+        assert choice.dg_y == pytest.approx(plan.controls[k, 3], abs=1e-4)
+
+
 def test_no_random_search_of_many_samples_beats_it_by_much(plan):
     """One step ahead: the command is near the best of a fine grid."""
     scenario = PHANTOM.with_values({"control.horizon": 1})
@@ -194,4 +204,14 @@ def test_command_has_the_five_inputs_and_leaves_the_base_alone(plan):
 def test_arrived_at_the_depth_within_the_tolerance_or_past_it(plan, short, there):
     state = along(plan, 60)
     goal = replace(plan, target=(float(state.tip[0]) + short, 5.0))
-    assert controller.arrived(goal, believed(state), 0.01) is there
+    assert controller.arrived(PHANTOM, goal, believed(state)) is there
+
+
+@pytest.mark.parametrize(("more", "there"), [(0.02, False), (0.009, True)])
+def test_arrived_where_the_stroke_is_used_up(plan, more, there):
+    """The needle stays before the target, and the last advance goes to the end of the stroke at most."""
+    advanced = float(plan.controls[:60, 0].sum())
+    short = PHANTOM.with_values({"setup.stroke_mm": advanced + more, "target.depth_mm": 10.0})
+    state = along(plan, 60, short)
+    assert controller.arrived(short, plan, believed(state)) is there
+    assert choose(plan, state, short).db_x <= more + 1e-9
