@@ -109,6 +109,15 @@ def test_without_a_guide_none_is_moved(plan):
     assert choose(plan, Simulator(scenario).start(), scenario).dg_y == 0.0
 
 
+def test_spread_is_that_of_the_first_guide_step(plan):
+    """Not of the advance, which is fixed here, nor of a guide that can't move."""
+    state = along(plan, 30)
+    fixed = PHANTOM.with_values({"plan.advance_sigma_mm": 0.0})
+    assert 1e-3 < choose(plan, state, fixed).spread < 0.5
+    scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
+    assert choose(plan, Simulator(scenario).start(), scenario).spread == 0.0
+
+
 def test_same_seed_same_command_other_seed_another(plan):
     state = along(plan, 30, base_y=0.5)
     one, again, other = choose(plan, state, seed=5), choose(plan, state, seed=5), choose(plan, state, seed=6)

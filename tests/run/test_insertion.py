@@ -435,6 +435,16 @@ def test_a_model_that_does_not_converge_ends_the_run(plan, monkeypatch):
     assert not done.periods[0].converged
 
 
+def test_the_end_of_the_stroke_ends_the_run_and_is_said(plan):
+    short = PHANTOM.with_values({"setup.stroke_mm": 60.0, "target.depth_mm": 20.0})
+    tank = Tank(plan.bevel, scenario=short)
+    done = run(plan, tank.rig(), short)
+    assert sum(command[0] for _, command in tank.moves) == pytest.approx(60.0, abs=0.01)
+    left = plan.target[0] - done.periods[-1].estimate[0]
+    assert done.reason == f"the stroke ends {left:.2f} mm before the target depth"
+    assert not done.reached
+
+
 class Rounding(Tank):
     """A driver with a resolution of 0.05 mm in the guide."""
 
