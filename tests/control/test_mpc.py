@@ -182,10 +182,11 @@ def test_in_air_the_bevel_stays(plan):
     assert decision.why == "in air"
 
 
+@pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_in_tissue_the_bevel_turns_to_the_target(plan, side):
+def test_in_tissue_the_bevel_turns_to_the_target(plan, side, turned):
     """The target lies to one side of the tip's own line, further than either path bends."""
-    state = along(plan, 50)
+    state = Simulator(PHANTOM).step(along(plan, 50), Control(flip=turned))
     x, y, turn = state.tip
     away = replace(plan, target=(float(x) + 30.0, float(y + 30.0 * np.tan(turn) + 2.0 * side)))
     decision = controller.decide(Simulator(PHANTOM), away, believed(state), np.random.default_rng(0))
