@@ -210,7 +210,7 @@ def main() -> None:
         "--jobs", type=int, default=len(os.sched_getaffinity(0)), metavar="N", help="processes"
     )
     chosen = parser.parse_args()
-    runs = run_all(chosen.seeds, chosen.jobs)
+    runs = run_all(chosen.seeds, max(1, chosen.jobs))
     found = {name: summary([run for run in runs if run["controller"] == name]) for name in CONTROLLERS}
     if chosen.plot:
         draw(runs, found, chosen.plot)
