@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from flexneedle.scenario import Scenario
 
-__all__ = ["add_run_arguments", "chosen_scenario", "print_json", "print_table", "run_name"]
+__all__ = ["add_run_arguments", "chosen_scenario", "compile_first", "print_json", "print_table", "run_name"]
 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,6 +48,19 @@ def chosen_scenario(args: argparse.Namespace) -> Scenario:
         return scenario
     depth, lateral = args.target
     return scenario.with_values({"target.depth_mm": depth, "target.lateral_mm": lateral})
+
+
+def compile_first(scenario: Scenario) -> None:
+    """Compile the kernels; the first time this takes some seconds, and that is said."""
+    from flexneedle.mechanics.compile import compiled
+    from flexneedle.simulator import Simulator
+
+    from .progress import Progress
+
+    with Progress() as progress:
+        if not compiled():
+            progress.begin("Compiling the mechanics, this once")
+        Simulator(scenario).compile()
 
 
 def run_name(args: argparse.Namespace) -> str:

@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
-from .common import add_run_arguments, chosen_scenario, print_json, print_table, run_name
+from .common import add_run_arguments, chosen_scenario, compile_first, print_json, print_table, run_name
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -44,6 +44,7 @@ def _insert(args: argparse.Namespace) -> int:
     from .progress import Progress
 
     scenario = chosen_scenario(args)
+    compile_first(scenario)
     folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
     with Progress() as progress:
         show = _Show(progress, scenario)

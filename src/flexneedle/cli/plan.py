@@ -6,7 +6,7 @@ import argparse
 from math import degrees, isnan
 from typing import TYPE_CHECKING, Any
 
-from .common import add_run_arguments, chosen_scenario, print_json, print_table, run_name
+from .common import add_run_arguments, chosen_scenario, compile_first, print_json, print_table, run_name
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -38,6 +38,7 @@ def _plan(args: argparse.Namespace) -> int:
     from .progress import Progress
 
     scenario = chosen_scenario(args)
+    compile_first(scenario)
     strategies = _STRATEGIES if args.strategy == "both" else (args.strategy,)
     folder = Folder.claim(args.out, run_name(args), "plan", scenario, args.seed)
     with Progress() as progress:

@@ -33,6 +33,11 @@ def _cache_folder() -> str:
 _FOLDER = _cache_folder()
 
 
+def compiled() -> bool:
+    """Whether kernels of these sources lie in the cache, so that a start takes no compilation."""
+    return any(Path(_FOLDER).rglob("*.nbi"))
+
+
 def inner(function: _Function) -> _Function:
     """Compile a function that only other kernels call."""
     compiled: _Function = _njit(nogil=True, error_model="numpy")(function)

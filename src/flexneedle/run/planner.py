@@ -116,16 +116,16 @@ def _end_at_depth(simulator: Simulator, controls: Floats, bevel: int, depth: flo
         if abs(short) < _DEPTH_TOLERANCE_MM:
             break
         last = float(controls[-1, 0]) + short
-        left = setup.stroke_mm - float(controls[:-1, 0].sum())
+        stroke_left = setup.stroke_mm - float(controls[:, 0].sum())
         if last <= 0.0 and len(controls) > 1:
             controls = controls[:-1]
-        elif last > setup.max_advance_mm and left > setup.max_advance_mm:
+        elif last > setup.max_advance_mm and stroke_left > _DEPTH_TOLERANCE_MM:
             # The rest is no more than the shortening, so it takes a single further step.
-            extra = np.array([[min(short, setup.max_advance_mm), 0.0, 0.0, 0.0, -1.0]])
+            extra = np.array([[min(short, setup.max_advance_mm, stroke_left), 0.0, 0.0, 0.0, -1.0]])
             controls = np.concatenate([controls, extra])
         else:
             controls = controls.copy()
-            controls[-1, 0] = min(last, setup.max_advance_mm, left)
+            controls[-1, 0] = min(last, setup.max_advance_mm, float(controls[-1, 0]) + stroke_left)
     return controls
 
 

@@ -51,6 +51,11 @@ class Simulator:
         self._model = _build_model(scenario)
         self._limits = Limits.of(scenario)
 
+    def compile(self) -> None:
+        """Compile the kernels, or load them from the cache, instead of waiting for it in the first call of each."""
+        state = self.step(self.start(), Control())
+        self.rollout(state, np.array([[Control().row()]]))
+
     def start(self, bevel: int = 1) -> State:
         """Return the straight needle in air, `setup.tip_to_skin_mm` before the skin, bevel −1 or +1."""
         if bevel not in (-1, 1):
