@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexneedle.mechanics.ogden import FLOOR_STRETCH, contact_law, law_scales
+from reference.insertion import Tissue, ogden
 
 MU, ALPHA, HEIGHT, WIDTH = 1.82e-3, 8.74, 20.0, 5.2  # the phantom's first layer
 alphas = st.one_of(st.floats(0.05, 30.0), st.floats(-30.0, -0.05))
@@ -69,6 +70,18 @@ def test_law_is_convex_odd_in_force_and_finite(alpha, u):
     assert force <= 0.0
     assert law(-u, alpha) == (-force, stiffness, energy)
     assert all(map(math.isfinite, (force, stiffness, energy)))
+
+
+@settings(deadline=None, derandomize=True, max_examples=100)
+@given(alpha=alphas, u=st.floats(-40.0, 40.0))
+def test_law_is_that_of_the_reference(alpha, u):
+    """Above and below the floor stretch of 0.3, written out there as in equations 1 to 3."""
+    point = Tissue(*(np.array([value]) for value in (MU, alpha, HEIGHT, WIDTH * HEIGHT)))
+    energy, force, stiffness = (float(values[0]) for values in ogden(point, np.array([u])))
+    size = MU * WIDTH * HEIGHT / alpha**2
+    assert law(u, alpha)[0] == pytest.approx(force, rel=1e-9, abs=1e-14 * size)
+    assert law(u, alpha)[1] == pytest.approx(stiffness, rel=1e-9)
+    assert law(u, alpha)[2] == pytest.approx(energy, rel=1e-9, abs=1e-14 * size)
 
 
 @pytest.mark.parametrize("alpha", [-20.0, -2.0, 1.0, 8.74, 30.0])

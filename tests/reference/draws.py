@@ -9,16 +9,17 @@ GAUGES = ("18G", "19G", "20G", "21G", "22G", "23G")
 
 
 def draw_scenario(rng: np.random.Generator) -> Scenario:
-    """A needle in 1 to 3 layers, with or without guide."""
+    """A needle in 1 to 3 layers, with or without guide; without one it is stiff enough not to flop over."""
     values = flexneedle.load_scenario("phantom").values()
+    guided = rng.random() < 0.7
     values["needle"] = {
-        "gauge": str(rng.choice(GAUGES)),
-        "stylet": bool(rng.random() < 0.5),
+        "gauge": str(rng.choice(GAUGES if guided else GAUGES[:3])),
+        "stylet": bool(rng.random() < 0.5) or not guided,
         "length_mm": float(rng.uniform(130.0, 180.0)),
         "nodes": int(rng.integers(2, 80)),
         "bevel": {
-            "offset_mm": float(rng.choice([0.0, rng.uniform(0.0, 6.0)])),
-            "length_mm": float(rng.uniform(0.5, 6.0)),
+            "offset_mm": float(rng.choice([0.0, rng.uniform(0.0, 4.0)])),
+            "length_mm": float(rng.uniform(0.5, 5.0)),
         },
     }
     values["contact"] = {"spacing_mm": float(rng.choice([0.7, 1.0, 1.5, 2.0, rng.uniform(0.8, 3.0)]))}
@@ -27,7 +28,7 @@ def draw_scenario(rng: np.random.Generator) -> Scenario:
     setup = values["setup"]
     setup["tip_to_skin_mm"] = float(rng.choice([1.0, 10.0, 28.5]))
     setup["stroke_mm"] = setup["tip_to_skin_mm"] + 50.0
-    if rng.random() < 0.3:
+    if not guided:
         del setup["guide_to_skin_mm"]
     return Scenario.from_values(values)
 
@@ -54,8 +55,8 @@ def draw_controls(scenario: Scenario, steps: int, rng: np.random.Generator) -> n
     for start in back:
         forward[start : start + rng.integers(1, 12)] = False
     advance = _keep_within(np.where(forward, length, -length), 0.0, scenario.setup.stroke_mm)
-    swing = rng.uniform(0.0, 0.35)
-    lateral = rng.uniform(-swing, swing, (3, steps)) + rng.uniform(-0.05, 0.05, (3, 1))
+    swing = rng.uniform(0.0, 0.3)
+    lateral = rng.uniform(-swing, swing, (3, steps)) + rng.uniform(-0.04, 0.04, (3, 1))
     guide = _keep_within(lateral[0], -10.0, 10.0) if scenario.setup.has_guide else np.zeros(steps)
     base = _keep_within(lateral[1], -5.0, 5.0)
     turn = _keep_within(5e-3 * lateral[2], -0.05, 0.05)

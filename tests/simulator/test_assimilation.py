@@ -71,8 +71,7 @@ def test_measured_points_lie_on_the_mesh(state, x):
     assert np.abs(held.nodes - state.nodes)[:, 1].max() > 0.1
 
 
-@pytest.mark.xfail(reason="the node of a measured point is dropped after the solve", strict=True)
-@pytest.mark.parametrize("x", [-80.0, -20.0])
+@pytest.mark.parametrize("x", [-80.0, -20.0, 3.2, 15.3])
 def test_nodes_pass_through_measured_points(state, x):
     """The needle state is the curve that met the measurement, in unloaded spans too."""
     curve = CubicHermiteSpline(*state.nodes.T)

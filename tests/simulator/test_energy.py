@@ -11,11 +11,11 @@ import pytest
 
 from flexneedle import Control, Simulator, load_scenario
 from flexneedle.mechanics import needle as nd
-from flexneedle.mechanics.model import CONTACT
 from reference.cases import insert_to, repeat
 
 PHANTOM = load_scenario("phantom").with_values({"setup.max_base_turn_step_mrad": 50.0})
 SIMULATOR = Simulator(PHANTOM)
+X, FORCE, ENERGY = 0, 5, 6  # rows of `State.mesh`
 MOVES = {  # base y, base turn, guide y, held tip y: mm and rad in all
     "base": (2.0, 0.0, 0.0, 0.0),
     "turn": (0.0, 0.02, 0.0, 0.0),
@@ -41,12 +41,12 @@ def lateral_forces(state):
 
 def axial_force(state):
     """∂(energy)/∂x_t at a needle whose base and guide stay: growing points, growing spring, a push on a slope."""
-    count, nodes, s = state.mesh.shape[1], state.model.nodes, state.scalars
-    behind = state.tip[0] - nodes.x[:count]
-    growing = (nodes.kind[:count] == CONTACT) & (behind < nodes.reach[:count])
+    x, energy, s = state.mesh[X], state.mesh[ENERGY], state.scalars
+    behind = state.tip[0] - x
+    growing = (x > 0.0) & (behind < PHANTOM.contact.spacing_mm / 2)
     length = state.tip[0] - max(0.0, s[nd.FRONT] - PHANTOM.needle.bevel.length_mm)
     spring = s[nd.SPRING_ENERGY] / length if length > 0.0 else 0.0
-    return (state.mesh[5][growing] / behind[growing]).sum() + spring - s[nd.TIP_FORCE] * state.tip[2]
+    return (energy[growing] / behind[growing]).sum() + spring - s[nd.TIP_FORCE] * state.tip[2]
 
 
 def base_axial_force(state):
@@ -133,7 +133,7 @@ def test_energy_gradient_is_the_reaction(name):
 def test_forces_and_moments_on_the_needle_balance():
     """Clamp, guide, contacts, tip: the forces add up to nothing where the tip spring is out."""
     state = repeat(SIMULATOR, withdrawn(3.55), Control(db_y=0.2, dg_y=-0.3), 5)[-1]
-    contacts = state.mesh[4][state.model.nodes.kind[: state.mesh.shape[1]] == CONTACT]
+    contacts = state.mesh[FORCE][state.mesh[X] > 0.0]
     reactions, x = state.reactions, state.contacts.x[state.contacts.active]
     total = reactions.base_force + reactions.guide_force + contacts.sum()
     base_x = state.base[0]
