@@ -166,6 +166,23 @@ def test_same_seed_same_record_other_seed_another(plan):
     assert one.periods[0].spread != other.periods[0].spread
 
 
+def test_phantom_tracker_and_search_have_random_streams_of_their_own(plan, monkeypatch):
+    drawn = []
+
+    def virtual_rig(_scenario, _bevel, *seeds):
+        drawn.extend(np.random.default_rng(seed).random() for seed in seeds)
+
+    def no_run(_scenario, _plan, _rig, rng, *_args, **_options):
+        drawn.append(rng.random())
+
+    monkeypatch.setattr(insertion, "virtual_rig", virtual_rig)
+    monkeypatch.setattr(insertion, "run", no_run)
+    for seed in (0, 1, 0):
+        insertion.insert(PHANTOM, plan, seed)
+    assert len(set(drawn)) == 6
+    assert drawn[:3] == drawn[6:]
+
+
 def test_on_period_gets_each_period_as_it_ends(plan):
     seen = []
     tank = Tank(plan.bevel)
@@ -380,6 +397,17 @@ def test_a_bad_last_reading_holds_although_earlier_ones_were_good(plan, real):
     done = run(plan, Stage(loop(spoilt_tape(tank.tape, -1, garbled))).rig())
     assert done.outcome == "held"
     assert done.periods[0].verdict == "not a number"
+
+
+def test_a_bad_reading_at_the_target_depth_does_not_count_as_arrival(plan, real):
+    """The needle is held there, and done with the next good reading."""
+    done, tank = real
+    *way, last = tank.tape
+    held = run(plan, Stage(loop([*way, (garbled(last[-1]),), last])).rig())
+    assert [period.verdict for period in held.periods[-2:]] == ["not a number", "ok"]
+    assert len(held.periods) == len(done.periods) + 1
+    assert held.outcome == "done"
+    assert held.periods[-1].command == STILL
 
 
 # ---- refusals and other ends
