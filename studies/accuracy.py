@@ -81,7 +81,7 @@ def common(controller: str, plan: PlanRecord, seed: int) -> Run:
         "controller": controller,
         "target_mm": plan.target,
         "seed": seed,
-        "planned_error_mm": plan.error,
+        "planned_error_mm": plan.error_mm,
         "planned_flips": plan.flips,
         "planned_energy_mj": float(plan.strain_energy[-1]),
         "planned_periods": len(plan.controls),

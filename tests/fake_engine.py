@@ -17,7 +17,7 @@ def plan(scenario, target=None, strategy="manipulation", seed=0, progress=None, 
     """Plan as `flexneedle.plan` does; `miss` moves the end of the plan aside."""
     made = make_plan(strategy, target or scenario.target.position, seed)
     for iteration in range(1, 6):
-        progress({"iteration": iteration, "iterations": 5, "best": 9.0, "quantile": 9.0, "mean": 9.0})
+        progress({"iteration": iteration, "iterations": 5, "best": 9.0, "cost_mean": 9.0})
     limit = "setup.max_guide_travel_mm = 15" if miss > 1.0 else ""
     return replace(made, tips=made.tips + np.array([0.0, miss, 0.0]), limit=limit)
 
@@ -25,7 +25,7 @@ def plan(scenario, target=None, strategy="manipulation", seed=0, progress=None, 
 def insert(_scenario, plan, seed=0, *, force=False, on_period=None, miss=0.06, stop=None, outcome="done"):
     """Insert as `flexneedle.insert` does; stop: after so many periods, call that."""
     if not plan.reached and not force:
-        raise RunError(f"plan misses the target by {plan.error:.2f} mm, bound by {plan.limit}")
+        raise RunError(f"plan misses the target by {plan.error_mm:.2f} mm, bound by {plan.limit}")
     periods = []
     for period in make_periods(plan, miss, seed):
         periods.append(period)

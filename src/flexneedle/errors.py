@@ -7,7 +7,7 @@ class FlexneedleError(Exception):
     """Root of all errors that flexneedle raises on purpose."""
 
 
-class InputError(FlexneedleError):
+class InputError(FlexneedleError, ValueError):
     """What the user gave cannot be used (exit status 2)."""
 
 

@@ -89,6 +89,11 @@ def test_a_scenario_is_frozen():
         PHANTOM.needle.length_mm = 1.0
 
 
+def test_a_thickness_of_the_last_layer_is_accepted_and_not_used():
+    thick = PHANTOM.with_values({"tissue.1.thickness_mm": 5.0})
+    assert thick.layer_tops == PHANTOM.layer_tops
+
+
 def test_changes_by_dotted_key_leave_the_original_alone():
     changed = PHANTOM.with_values(
         {"needle.bevel.offset_mm": 0.0, "tissue.0.alpha": 5, "tissue[1].alpha": 6.0}

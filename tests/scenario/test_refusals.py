@@ -138,8 +138,6 @@ RULES = [
     ("target.depth_mm", 81.6, "beyond the stroke: must be at most 81.5"),
     ("target.lateral_mm", 15.1, "must be at most 15 in size, as far aside as the guide travels"),
     ("target.lateral_mm", -15.1, "must be at most 15 in size, as far aside as the guide travels"),
-    # layers
-    ("tissue[1].thickness_mm", 20.0, "leave it out: the last layer goes on"),
     # grids that would never end
     ("setup.max_advance_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
     ("contact.spacing_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),

@@ -74,7 +74,7 @@ def _rows(plan: PlanRecord) -> dict[str, str]:
     depth, aside = plan.target
     return {
         "target, depth and aside": f"{depth:g}, {aside:g} mm",
-        "distance from the target": f"{plan.error:.3f} mm",
+        "distance from the target": f"{plan.error_mm:.3f} mm",
         "angle of entry": "none" if isnan(angle) else f"{degrees(angle):+.2f}°",
         "bevel turns": str(plan.flips),
         "energy stored in the tissue": f"{plan.strain_energy[-1]:.3f} mJ",

@@ -40,8 +40,8 @@ class Settings:
 class Belief:
     """Gaussian over d coordinates after some iterations, the best sample so far, and how it came about.
 
-    history: a dict per iteration with mean (cost of the samples), best (so far), quantiles of the cost
-    (min, ρ, median, max) and spread (d,) of the belief.
+    history: a dict per iteration with mean and spread (standard deviation) of the belief, each (d,), cost_mean of
+    the samples, best (cost so far) and cost_quantiles (least, ρ, median, greatest).
     """
 
     mean: Floats
@@ -118,6 +118,11 @@ def minimize(
     return belief
 
 
+def _elite_spread(entry: dict[str, Any]) -> float:
+    least, worst, _, _ = entry["cost_quantiles"]
+    return float(worst - least)
+
+
 def _with(
     belief: Belief, mean: Floats, covariance: Floats, winner: Floats, costs: Floats, settings: Settings
 ) -> Belief:
@@ -125,17 +130,15 @@ def _with(
     ordered = np.sort(costs)
     better = bool(ordered[0] < belief.best_cost)
     best_cost = min(float(ordered[0]), belief.best_cost)
-    quantile = float(ordered[settings.elite - 1])
     entry = {
-        "mean": float(np.mean(costs)),
+        "mean": tuple(mean.tolist()),
+        "cost_mean": float(np.mean(costs)),
         "best": best_cost,
-        "quantile": quantile,
-        "quantiles": tuple(float(ordered[k]) for k in (0, settings.elite - 1, costs.size // 2, -1)),
+        "cost_quantiles": tuple(float(ordered[k]) for k in (0, settings.elite - 1, costs.size // 2, -1)),
         "spread": tuple(np.sqrt(np.diag(covariance)).tolist()),
     }
-    first: dict[str, Any] = belief.history[0] if belief.history else entry
-    scale = first["quantile"] - first["quantiles"][0]
-    converged = bool(quantile - float(ordered[0]) <= settings.tolerance * scale)
+    scale = _elite_spread(belief.history[0] if belief.history else entry)
+    converged = _elite_spread(entry) <= settings.tolerance * scale < np.inf
     best = winner if better else belief.best
     return Belief(
         mean, covariance, belief.initial_sigma, best, best_cost, converged, (*belief.history, entry)

@@ -76,7 +76,8 @@ def run(
     """Carry out `plan` on any rig; as `insert`."""
     if not plan.reached and not force:
         raise RunError(
-            f"plan misses the target by {plan.error:.2f} mm (limit 1 mm), bound by {plan.limit}; use --force to insert"
+            f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), bound by {plan.limit}; "
+            "use --force to insert"
         )
     periods: list[Period] = []
     ending = ("failed", "not at the target depth after four times the planned periods")

@@ -14,8 +14,8 @@ def plan_result(plan: PlanRecord) -> dict[str, Any]:
     """Return the result of a plan; tip in mm."""
     result: dict[str, Any] = plain(
         {
-            "tip_mm": plan.tip[:2],
-            "error_mm": plan.error,
+            "tip_mm": plan.tip_mm,
+            "error_mm": plan.error_mm,
             "reached": bool(plan.reached),
             "cost": plan.cost,
             "terms": plan.terms,
@@ -44,7 +44,7 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
             "tip_measured_mm": _measured_tip(insertion),
             "true_error_mm": insertion.true_error_mm,
             "residual_mm": insertion.residual_mm,
-            "planned_error_mm": plan.error,
+            "planned_error_mm": plan.error_mm,
             "reached": bool(insertion.reached),
             "flips": insertion.flips,
             "planned_flips": plan.flips,

@@ -41,21 +41,16 @@ def layer_problems(tissue: Sequence[Layer], bevel: Bevel) -> Iterator[Problem]:
     if not tissue:
         yield Problem("tissue", None, "needs at least one layer: add a [[tissue]]")
         return
-    for i, layer in enumerate(tissue):
-        yield from _thickness_problems(i, layer, is_last=i == len(tissue) - 1)
+    for i, layer in enumerate(tissue[:-1]):
+        if layer.thickness_mm is None:
+            yield Problem(
+                f"tissue.{i}.thickness_mm", None, "missing: only the last layer goes on without a thickness"
+            )
     shortest = min(range(len(tissue)), key=lambda i: tissue[i].compression_length_mm)
     limit = _GREATEST_OFFSET_SHARE * tissue[shortest].compression_length_mm
     if bevel.offset_mm >= limit:
         rule = f"must be below {limit:g}, 0.7 times tissue[{shortest}].compression_length_mm"
         yield Problem("needle.bevel.offset_mm", bevel.offset_mm, rule)
-
-
-def _thickness_problems(i: int, layer: Layer, *, is_last: bool) -> Iterator[Problem]:
-    key = f"tissue.{i}.thickness_mm"
-    if is_last and layer.thickness_mm is not None:
-        yield Problem(key, layer.thickness_mm, "leave it out: the last layer goes on")
-    if not is_last and layer.thickness_mm is None:
-        yield Problem(key, None, "missing: only the last layer goes on without a thickness")
 
 
 def target_problems(setup: Setup, target: Target) -> Iterator[Problem]:

@@ -26,7 +26,7 @@ class Layer(Section):
     name: Title = "tissue"
     """Name in tables and figures."""
     thickness_mm: Positive | None = None
-    """Thickness; the last layer has none, it goes on."""
+    """Thickness. The last layer goes on: it needs none, and one that is given is not used."""
     shear_modulus_kpa: Positive
     """μ of the Ogden law."""
     alpha: Annotated[float, AfterValidator(_usable_alpha)]

@@ -39,20 +39,24 @@ class PlanRecord:
     seconds: float = field(default=0.0, compare=False)  # wall clock
 
     @property
-    def tip(self) -> Pose:
-        """Pose of the tip at the end."""
-        x, y, turn = self.tips[-1]
-        return float(x), float(y), float(turn)
+    def tip_mm(self) -> tuple[float, float]:
+        """Place of the tip at the end."""
+        return float(self.tips[-1, 0]), float(self.tips[-1, 1])
 
     @property
-    def error(self) -> float:
+    def error_mm(self) -> float:
         """Planar distance from the planned tip to the target (mm)."""
         return float(np.hypot(self.tips[-1, 0] - self.target[0], self.tips[-1, 1] - self.target[1]))
 
     @property
+    def strain_energy_mj(self) -> float:
+        """Weighted tissue energy at the end."""
+        return float(self.strain_energy[-1])
+
+    @property
     def reached(self) -> bool:
         """Whether the plan ends within 1 mm, the radius of the paper's target circles."""
-        return self.error <= 1.0
+        return self.error_mm <= 1.0
 
     @property
     def flips(self) -> int:
