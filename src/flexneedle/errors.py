@@ -7,7 +7,7 @@ class FlexneedleError(Exception):
     """Root of all errors that flexneedle raises on purpose."""
 
 
-class InputError(FlexneedleError, ValueError):
+class InputError(FlexneedleError):
     """What the user gave cannot be used (exit status 2)."""
 
 
@@ -23,7 +23,7 @@ class ScenarioError(InputError):
         return "\n".join(self.args)
 
 
-class CommandError(InputError):
+class CommandError(InputError, ValueError):
     """A command to the simulator or a device is out of range.
 
     `name` is the input (`db_x`), `value` what was asked for, `limit` the bound that it passes (in the unit of
