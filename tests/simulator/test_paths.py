@@ -216,3 +216,18 @@ def test_strain_energy_weighs_the_layers_and_energy_does_not():
     assert len({state.energy for state in states}) == 1
     assert len({state.nodes.tobytes() for state in states}) == 1
     assert states[0].energy > both
+
+
+@pytest.mark.parametrize("alpha", [-47.0, -45.0, -38.0, 80.0])
+@pytest.mark.parametrize("modulus_kpa", [2.0, 20.0, 100.0])
+def test_steep_laws_converge(alpha, modulus_kpa):
+    """Where a full Newton step would pass the floor stretch and cycle."""
+    layer = {"alpha": alpha, "shear_modulus_kpa": modulus_kpa}
+    steep = {f"tissue.{i}.{key}": value for i in (0, 1) for key, value in layer.items()}
+    simulator = Simulator(PHANTOM.with_values({"needle.bevel.offset_mm": 13.0, **steep}))
+    controls = np.zeros((1, 70, 5))
+    controls[..., 0], controls[..., 4] = 1.0, -1.0
+    controls[0, 31:, 3], controls[0, 45, 4] = 0.2, 1.0
+    result = simulator.rollout(simulator.start(), controls)
+    assert result.converged.all()
+    assert np.isfinite(result.tips).all()

@@ -147,6 +147,18 @@ def test_held_tip_and_points_agree(points):
     assert not pair.too_far()
 
 
+def test_points_measured_among_fresh_cuts_agree():
+    """A long step that cuts several contacts, held between and behind them: the path's end is in every condition."""
+    pair = Pair(PHANTOM.with_values({"setup.max_advance_mm": 5.0}))
+    pair.step(12, db_x=4.0, dg_y=0.1)
+    x, y, _ = pair.state.tip
+    pair.hold(x, y + 0.2, [(x - 2.2, y - 0.1)])
+    assert pair.state.contacts.x[-3] > x - 4.0
+    found = pair.too_far()
+    assert found.pop("tip force", 0.0) < 1e-4  # 2.2 mm of needle are as stiff as 1 N/µm
+    assert not found
+
+
 def test_believed_load_and_base_agree():
     """What an observer corrects acts from the next step on."""
     pair = Pair()

@@ -86,3 +86,14 @@ def test_rollout_leaves_its_inputs_alone(controls):
     simulator.rollout(state, frozen.tolist())
     assert before == (state.scalars.tobytes(), state.rest.tobytes(), state.mesh.tobytes())
     np.testing.assert_array_equal(frozen, kept[:3])
+
+
+def test_strain_energy_of_a_rollout_is_weighted_by_layer(controls):
+    """As that of the states, with weights that are not 1."""
+    simulator = Simulator(PHANTOM.with_values({"tissue.0.energy_weight": 0.3, "tissue.1.energy_weight": 2.0}))
+    start = insert_to(simulator, 18.0)
+    state = start
+    for row in controls[0]:
+        state = simulator.step(state, Control.from_row(row))
+    assert state.tip[0] > 20.0
+    assert state.strain_energy == simulator.rollout(start, controls[:1]).strain_energy[0, -1]
