@@ -29,14 +29,14 @@ def wants_flip(
 ) -> tuple[bool, str]:
     """Whether to turn the bevel over, and why.
 
-    curvature: κ (1/mm); dead_band: share of the paths' separation at the target, κ s², by which the other path
-    must be nearer, and `noise` (mm) what it must be nearer in any case: closer to the target than that the paths
-    do not part by more than the tracker sees. A wide band in mm would forbid turns that still help.
+    The bevel is turned if the other path passes nearer and the present one misses by more than half of the paths'
+    separation at the target, ½κs², enlarged by the share `dead_band`, plus `noise` (mm): a band that shrinks towards
+    the target, where the paths hardly part, but not below what the tracker sees.
     """
     keep = closest_approach(pose, bevel * curvature, target)
     turn = closest_approach(pose, -bevel * curvature, target)
-    separation = curvature * float(np.sum(np.square(np.subtract(target, pose[:2]))))
-    flip = keep - turn > dead_band * separation + noise
+    half = 0.5 * curvature * float(np.sum(np.square(np.subtract(target, pose[:2]))))
+    flip = turn < keep and keep > (1.0 + dead_band) * half + noise
     return (
         flip,
         f"bevel {'turned' if flip else 'kept'}: keeping misses by {keep:.3f} mm, turning by {turn:.3f} mm",

@@ -11,6 +11,8 @@ from flexneedle.scenario import Scenario
 from flexneedle.simulator import Simulator
 from flexneedle.trace import PlanRecord
 
+_SURE = 3.0  # standard deviations of a reading: no bevel turn for less
+
 
 @dataclass(frozen=True)
 class Decision:
@@ -33,11 +35,10 @@ def decide(simulator: Simulator, plan: PlanRecord, estimate: Estimate, rng: np.r
             control.curvature,
             plan.target,
             control.flip_dead_band,
-            simulator.scenario.tracker.jitter_per_axis,
+            _SURE * simulator.scenario.tracker.jitter_per_axis,
         )
     choice = mpc.choose(simulator, plan, estimate.state, flip=flip, rng=rng)
-    command = (choice.db_x, 0.0, 0.0, choice.dg_y, 1 if flip else -1)
-    return Decision(command, why, choice.cost, choice.spread)
+    return Decision((*choice.steps, 1 if flip else -1), why, choice.cost, choice.spread)
 
 
 def arrived(scenario: Scenario, plan: PlanRecord, estimate: Estimate) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.planning import Settings, cross_entropy
-from flexneedle.scenario import Scenario
+from flexneedle.scenario import Scenario, elite_count
 from flexneedle.simulator import Simulator, State
 from flexneedle.trace import PlanRecord
 
@@ -16,10 +16,9 @@ _LEAST_ADVANCE = 0.5  # of the longest step: standing still is no way to reduce 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The command of a period: db_x, dg_y (mm), its cost, and the standard deviation left in dg_y (mm)."""
+    """The steps of a period (db_x, db_y, db_theta, dg_y; mm, rad), their cost, and the sd left in dg_y (mm)."""
 
-    db_x: float
-    dg_y: float
+    steps: tuple[float, float, float, float]
     cost: float
     spread: float
 
@@ -31,11 +30,12 @@ def choose(
     scenario = simulator.scenario
     steps, travel = scenario.control.horizon, travel_left(scenario, plan, state)
     reference, nominal = _window(plan, float(state.tip[0]), steps)
+    base = _planned_base(scenario, plan, state, steps)
     lower, upper, sigma = _bounds(scenario, steps)
     mean = np.clip(np.concatenate([nominal[:, 0], nominal[:, 3]]), lower, upper)
     settings = Settings(
         samples=scenario.control.samples,
-        elite=max(2, round(scenario.control.samples * scenario.plan.elite_fraction)),
+        elite=max(2, elite_count(scenario.control.samples, scenario.plan.elite_fraction)),
         iterations=scenario.control.iterations,
         smoothing=scenario.plan.smoothing,
         tolerance=scenario.plan.tolerance,
@@ -44,13 +44,14 @@ def choose(
     )
 
     def cost(z: Floats) -> Floats:
-        controls = _controls(scenario, state, z, travel, flip)
+        controls = _controls(scenario, state, z, base, travel, flip)
         return _cost(simulator, state, controls, reference, nominal)
 
     found = cross_entropy.minimize(cost, cross_entropy.start(mean, sigma), settings, rng)
-    first = _controls(scenario, state, found.best[None], travel, flip)[0, 0]
+    first = _controls(scenario, state, found.best[None], base, travel, flip)[0, 0]
     spread = float(np.sqrt(found.covariance[steps, steps]))
-    return Choice(float(first[0]), float(first[3]), found.best_cost, spread)
+    db_x, db_y, db_theta, dg_y = first[:4].tolist()
+    return Choice((db_x, db_y, db_theta, dg_y), found.best_cost, spread)
 
 
 def travel_left(scenario: Scenario, plan: PlanRecord, state: State) -> float:
@@ -70,6 +71,16 @@ def _window(plan: PlanRecord, x: float, steps: int) -> tuple[Floats, Floats]:
     return poses, controls
 
 
+def _planned_base(scenario: Scenario, plan: PlanRecord, state: State, steps: int) -> Floats:
+    """Steps (steps, 2) of base y and turn that bring the base where the plan has it, as fast as its limits allow."""
+    limit = np.array([scenario.setup.max_base_step_mm, scenario.setup.max_base_turn_step])
+    moved = np.concatenate([np.zeros((1, 2)), np.cumsum(plan.controls[:, 1:3], axis=0)])
+    grid = np.arange(len(moved))
+    at = float(np.interp(state.tip[0], plan.tips[:, 0], grid)) + np.arange(1, steps + 1)
+    goal = np.stack([np.interp(at, grid, moved[:, k]) for k in (0, 1)], axis=1)
+    return np.clip(np.diff(goal, axis=0, prepend=state.travel[None, 1:3]), -limit, limit)
+
+
 def _bounds(scenario: Scenario, steps: int) -> tuple[Floats, Floats, Floats]:
     """Lower, upper bound and first standard deviation of z = (advances, guide steps), each (2 steps,)."""
     setup, control = scenario.setup, scenario.control
@@ -84,8 +95,8 @@ def _bounds(scenario: Scenario, steps: int) -> tuple[Floats, Floats, Floats]:
     )
 
 
-def _controls(scenario: Scenario, state: State, z: Floats, travel: float, flip: bool) -> Floats:
-    """Controls (N, steps, 5) of z: the advance ends with the travel, the guide stays within its own."""
+def _controls(scenario: Scenario, state: State, z: Floats, base: Floats, travel: float, flip: bool) -> Floats:
+    """Controls (N, steps, 5) of z and the base's steps: the advance ends with the travel, the guide in its reach."""
     n, steps = len(z), z.shape[1] // 2
     reach = scenario.setup.max_guide_travel_mm
     moved = np.minimum(np.cumsum(z[:, :steps], axis=1), travel)
@@ -93,7 +104,8 @@ def _controls(scenario: Scenario, state: State, z: Floats, travel: float, flip: 
     controls = np.zeros((n, steps, 5))
     controls[:, :, 0] = np.diff(moved, axis=1, prepend=0.0)
     controls[:, :, 3] = np.diff(guide, axis=1, prepend=state.guide)
-    controls[:, :, 3] *= controls[:, :, 0] > 0.0
+    controls[:, :, 1:3] = base
+    controls[:, :, 1:4] *= controls[:, :, :1] > 0.0
     controls[:, :, 4] = -1.0
     controls[:, 0, 4] = 1.0 if flip else -1.0
     return controls

@@ -74,6 +74,7 @@ class Phantom:
 
     def apply(self, command: Command, duration: float) -> Command:
         """Carry out `command` evenly within `duration` s, in steps no longer than `phantom.step_mm`."""
+        self._simulator.check(self._state, Control.from_row(command))
         parts = max(1, math.ceil(abs(command[0]) / self._step - 1e-9))
         self._path = [(self._time, self._tip())]
         for k in range(parts):

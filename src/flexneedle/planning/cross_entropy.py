@@ -83,7 +83,7 @@ def ask(belief: Belief, settings: Settings, rng: np.random.Generator) -> Floats:
 
 
 def tell(belief: Belief, settings: Settings, samples: Floats, costs: Floats) -> Belief:
-    """Refit to the elite: all samples up to the ρ-quantile γ = J_⌈ρN⌉ of cost (paper eq. 6 and 7).
+    """Refit to the elite: the ⌈ρN⌉ samples of least cost, ties in the order drawn (paper eq. 6 and 7).
 
     A cost of infinity marks a failed sample; with no finite cost at all the belief stays as it is.
     """

@@ -173,7 +173,8 @@ def _binding_limit(
     guide = max(abs(state.guide) for state in states)
     if controls[:, 0].sum() > _AT_LIMIT * setup.stroke_mm and end[0] < goal[0] - 0.5:
         return f"setup.stroke_mm = {setup.stroke_mm:g}"
-    if strategy == "steering" or not setup.has_guide:
+    base_is_free = scenario.plan.base_sigma_mm > 0.0 or scenario.plan.base_turn_sigma > 0.0
+    if strategy == "steering" or not (setup.has_guide or base_is_free):
         return f"needle.bevel.offset_mm = {scenario.needle.bevel.offset_mm:g} (only the bevel steers)"
     if guide > _AT_LIMIT * setup.max_guide_travel_mm:
         return f"setup.max_guide_travel_mm = {setup.max_guide_travel_mm:g}"

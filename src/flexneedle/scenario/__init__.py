@@ -4,7 +4,7 @@ from .apparatus import Setup, Tracker
 from .files import dump_scenario, load_scenario, preset_names
 from .model import Scenario, check_target
 from .needle import GAUGES, Bevel, Needle
-from .settings import Control, Phantom, Plan, Target
+from .settings import Control, Phantom, Plan, Target, elite_count
 from .tissue import Contact, Layer
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "Tracker",
     "check_target",
     "dump_scenario",
+    "elite_count",
     "load_scenario",
     "preset_names",
 ]

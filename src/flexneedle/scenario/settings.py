@@ -1,5 +1,6 @@
 """The task and the settings of planner, controller and virtual phantom."""
 
+from math import ceil
 from typing import Annotated
 
 from pydantic import Field
@@ -21,6 +22,11 @@ class Target(Section):
     def position(self) -> tuple[float, float]:
         """(x, y), mm."""
         return self.depth_mm, self.lateral_mm
+
+
+def elite_count(samples: int, fraction: float) -> int:
+    """⌈ρN⌉, the slack for rounding of the product."""
+    return ceil(samples * fraction - 1e-9)
 
 
 class Plan(Section):
@@ -61,8 +67,8 @@ class Plan(Section):
 
     @property
     def elite_count(self) -> int:
-        """Number of elite samples, rounded to the nearest."""
-        return round(self.samples * self.elite_fraction)
+        """Number of elite samples, ⌈ρN⌉ (paper section III)."""
+        return elite_count(self.samples, self.elite_fraction)
 
     @property
     def base_turn_sigma(self) -> float:
@@ -89,10 +95,10 @@ class Control(Section):
     """The insertion ends this close to the target depth."""
     guide_weight: NonNegative = 0.05
     """Cost of a squared millimetre that a guide step departs from the plan's."""
-    energy_weight_per_mj: NonNegative = 2.0
+    energy_weight_per_mj: NonNegative = 4.0
     """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
     flip_dead_band: Fraction = 0.8
-    """Share of the two paths' separation by which turning the bevel must be nearer to the target."""
+    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
     start_offset_sd_mm: NonNegative = 0.5
     """What the controller expects of the base clamp's lateral position: its standard deviation."""
     start_angle_sd_mrad: NonNegative = 3.0

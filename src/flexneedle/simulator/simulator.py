@@ -68,12 +68,16 @@ class Simulator:
 
     def step(self, state: State, control: Control) -> State:
         """Return the state after one control step; CommandError, with the limit, if it is out of range."""
-        self._own(state)
+        self.check(state, control)
         row = control.row()
-        self._limits.check(self._moved(state), row[None])
         s, rest, u, w = self._work(state)
         count = insertion.advance(self._model, s, rest, u, w, row)
         return solved(self.scenario, self._model, s, rest, u, mesh_of(self._model.nodes, w, count))
+
+    def check(self, state: State, control: Control) -> None:
+        """Raise CommandError, with value and limit, if `control` may not be applied to `state`."""
+        self._own(state)
+        self._limits.check(state.travel, control.row()[None])
 
     def rollout(self, state: State, controls: ArrayLike) -> Rollout:
         """Run each of N sequences from `state`; controls (N, m, 5): db_x, db_y, db_theta, dg_y, flip (−1 or +1).
@@ -146,7 +150,7 @@ class Simulator:
         u = np.ascontiguousarray(controls, dtype=float)
         if u.ndim != 3 or u.shape[2] != 5:
             raise CommandError("controls", float(u.ndim), 3.0, f"must have shape (N, m, 5), not {u.shape}")
-        self._limits.check(self._moved(state), u)
+        self._limits.check(state.travel, u)
         n, m = u.shape[:2]
         out = np.zeros((n, m, 3)), np.zeros((n, m)), np.zeros((n, m), dtype=np.bool_)
         spread = np.zeros((n, m) if deflection else (0, 0))
@@ -169,12 +173,6 @@ class Simulator:
         if (key := mechanics_difference(state.scenario, self.scenario)) is not None:
             theirs, mine = state.scenario.flat().get(key), self.scenario.flat().get(key)
             raise StateError(f"state of another scenario: {key} was {theirs}, is {mine}")
-
-    def _moved(self, state: State) -> Floats:
-        s = state.scalars
-        moved = s[[nd.BASE_X, nd.BASE_Y, nd.BASE_TURN, nd.GUIDE_Y]].copy()
-        moved[:3] -= self.scenario.start_base_x, s[nd.CLAMP_Y], s[nd.CLAMP_TURN]
-        return moved
 
     def _work(self, state: State) -> tuple[Floats, Floats, Floats, Floats]:
         w = np.zeros((nd.WORK_ROWS, state.rest.size))

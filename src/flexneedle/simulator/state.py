@@ -74,6 +74,14 @@ class State:
         return base
 
     @property
+    def travel(self) -> Floats:
+        """How far base x, y (mm), base θ (rad) and guide (mm) were commanded since the start, shape (4,)."""
+        s = self.scalars
+        travel: Floats = s[[nd.BASE_X, nd.BASE_Y, nd.BASE_TURN, nd.GUIDE_Y]]
+        travel[:3] -= self.scenario.start_base_x, s[nd.CLAMP_Y], s[nd.CLAMP_TURN]
+        return travel
+
+    @property
     def guide(self) -> float:
         """Lateral position of the guide (mm); 0 without a guide."""
         return float(self.scalars[nd.GUIDE_Y])

@@ -100,7 +100,7 @@ class Insertion:
     seed: int
     periods: tuple[Period, ...]
     outcome: str
-    reason: str  # one line, "" when done
+    reason: str  # one line; "" when done at the target depth
 
     @property
     def target(self) -> tuple[float, float]:
