@@ -89,10 +89,16 @@ def test_dead_band_is_a_share_of_the_separation_of_the_paths():
 
 
 def test_noise_of_the_tracker_is_needed_in_any_case():
-    assert flips(1, (40.0, -0.6), noise=1.1) is True
-    assert flips(1, (40.0, -0.6), noise=1.3) is False
-    assert flips(1, (40.0, -0.6), band=0.35, noise=0.55) is True  # 0.56 + 0.55 < 1.2
-    assert flips(1, (40.0, -0.6), band=0.45, noise=0.55) is False
+    assert flips(1, (40.0, -0.6), noise=0.55) is True
+    assert flips(1, (40.0, -0.6), noise=0.65) is False
+    assert flips(1, (40.0, -0.6), band=0.35, noise=0.3) is True  # 0.35 · 0.8 + 0.3 < 0.6
+    assert flips(1, (40.0, -0.6), band=0.45, noise=0.3) is False
+
+
+def test_a_target_far_off_the_line_turns_the_bevel_however_near_it_is():
+    """The two paths part by 0.025 mm over the last 5 mm; a gain of that size can't be asked for."""
+    assert flips(1, (5.0, -0.3), band=0.8, noise=0.12) is True
+    assert flips(1, (5.0, -0.1), band=0.8, noise=0.12) is False
 
 
 def test_without_advantage_or_curvature_or_with_the_target_behind_the_bevel_stays():

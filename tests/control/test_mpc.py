@@ -40,8 +40,8 @@ def believed(state):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_command_is_within_the_limits(plan, periods, seed):
     choice = choose(plan, along(plan, periods), seed=seed)
-    assert 0.5 <= choice.db_x <= 1.0
-    assert abs(choice.dg_y) <= 0.5
+    assert 0.5 <= choice.steps[0] <= 1.0
+    assert abs(choice.steps[3]) <= 0.5
     assert np.isfinite(choice.cost)
     assert choice.spread > 0.0
 
@@ -49,8 +49,8 @@ def test_command_is_within_the_limits(plan, periods, seed):
 def test_on_the_plan_it_goes_on_with_the_plan(plan):
     for periods in (10, 40, 60):
         choice = choose(plan, along(plan, periods))
-        assert choice.dg_y == pytest.approx(plan.controls[periods, 3], abs=0.06)
-        assert choice.db_x == pytest.approx(plan.controls[periods, 0], abs=0.1)
+        assert choice.steps[3] == pytest.approx(plan.controls[periods, 3], abs=0.06)
+        assert choice.steps[0] == pytest.approx(plan.controls[periods, 0], abs=0.1)
 
 
 @pytest.mark.parametrize("offset", [-1.5, 1.5])
@@ -58,7 +58,7 @@ def test_off_the_plan_the_guide_moves_back_to_it(plan, offset):
     """A base clamp off to one side moves the tip there; the guide goes the other way, against what was planned."""
     state = along(plan, 15, base_y=offset)
     side = np.sign(state.tip[1] - along(plan, 15).tip[1])
-    assert side * (choose(plan, state).dg_y - plan.controls[15, 3]) < -0.05
+    assert side * (choose(plan, state).steps[3] - plan.controls[15, 3]) < -0.05
 
 
 def test_the_deviation_shrinks_over_the_next_periods(plan):
@@ -71,7 +71,7 @@ def test_the_deviation_shrinks_over_the_next_periods(plan):
     first = deviation()
     for _ in range(12):
         choice = mpc.choose(simulator, plan, state, flip=False, rng=rng)
-        state = simulator.step(state, Control(db_x=choice.db_x, dg_y=choice.dg_y))
+        state = simulator.step(state, Control(db_x=choice.steps[0], dg_y=choice.steps[3]))
     assert first > 0.1
     assert deviation() < 0.2 * first
 
@@ -83,7 +83,7 @@ def test_guide_stays_within_its_reach(plan):
     simulator, state, rng = Simulator(scenario), Simulator(scenario).start(), np.random.default_rng(0)
     for _ in range(4):
         choice = mpc.choose(simulator, away, state, flip=False, rng=rng)
-        state = simulator.step(state, Control(db_x=choice.db_x, dg_y=choice.dg_y))
+        state = simulator.step(state, Control(db_x=choice.steps[0], dg_y=choice.steps[3]))
         assert abs(state.guide) <= 0.3 + 1e-9
     assert state.guide == pytest.approx(0.3)
 
@@ -93,20 +93,20 @@ def test_last_advance_ends_at_the_target_depth(plan, left):
     state = along(plan, len(plan.controls) - 1)
     near = replace(plan, target=(float(state.tip[0]) + left, 5.0))
     choice = choose(near, state)
-    assert choice.db_x == pytest.approx(left, abs=0.21 if left > 0.5 else 1e-12)
-    assert choice.db_x <= left + 1e-12
+    assert choice.steps[0] == pytest.approx(left, abs=0.21 if left > 0.5 else 1e-12)
+    assert choice.steps[0] <= left + 1e-12
 
 
 def test_past_the_target_nothing_moves_any_more(plan):
     state = along(plan, len(plan.controls))
     past = replace(plan, target=(float(state.tip[0]) - 0.5, 5.0))
     choice = choose(past, state)
-    assert (choice.db_x, choice.dg_y) == (0.0, 0.0)
+    assert (choice.steps[0], choice.steps[3]) == (0.0, 0.0)
 
 
 def test_without_a_guide_none_is_moved(plan):
     scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
-    assert choose(plan, Simulator(scenario).start(), scenario).dg_y == 0.0
+    assert choose(plan, Simulator(scenario).start(), scenario).steps[3] == 0.0
 
 
 def test_spread_is_that_of_the_first_guide_step(plan):
@@ -121,8 +121,8 @@ def test_spread_is_that_of_the_first_guide_step(plan):
 def test_same_seed_same_command_other_seed_another(plan):
     state = along(plan, 30, base_y=0.5)
     one, again, other = choose(plan, state, seed=5), choose(plan, state, seed=5), choose(plan, state, seed=6)
-    assert (one.db_x, one.dg_y, one.cost, one.spread) == (again.db_x, again.dg_y, again.cost, again.spread)
-    assert one.dg_y != other.dg_y
+    assert (one.steps, one.cost, one.spread) == (again.steps, again.cost, again.spread)
+    assert one.steps[3] != other.steps[3]
 
 
 def test_cost_is_that_of_the_chosen_steps(plan):
@@ -134,11 +134,11 @@ def test_cost_is_that_of_the_chosen_steps(plan):
     scenario = PHANTOM.with_values(weights)
     state = along(plan, 40, scenario, base_y=1.0)
     choice = choose(plan, state, scenario)
-    after = Simulator(scenario).step(state, Control(db_x=choice.db_x, dg_y=choice.dg_y))
+    after = Simulator(scenario).step(state, Control(db_x=choice.steps[0], dg_y=choice.steps[3]))
     at = np.interp(state.tip[0], plan.tips[:, 0], np.arange(len(plan.tips)))
     goal = [np.interp(at + 1, np.arange(len(plan.tips)), plan.tips[:, k]) for k in range(3)]
     off = (after.tip - goal) * [1.0, 1.0, 40.0]
-    guide = choice.dg_y - plan.controls[int(at + 1e-9), 3]
+    guide = choice.steps[3] - plan.controls[int(at + 1e-9), 3]
     expected = (off**2).sum() + 3.0 * guide**2 + 2.0 * after.strain_energy
     assert choice.cost == pytest.approx(expected, rel=1e-9)
 
@@ -150,7 +150,7 @@ def test_each_step_is_held_against_the_plans_own_guide_step(plan):
     changes = np.flatnonzero(np.diff(plan.controls[:, 3]))
     for k in (changes[0], changes[0] + 1):
         choice = choose(plan, along(plan, k, scenario), scenario)
-        assert choice.dg_y == pytest.approx(plan.controls[k, 3], abs=1e-4)
+        assert choice.steps[3] == pytest.approx(plan.controls[k, 3], abs=1e-4)
 
 
 def test_no_random_search_of_many_samples_beats_it_by_much(plan):
@@ -160,7 +160,7 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan):
     simulator, choice = Simulator(scenario), choose(plan, state, scenario)
     reference, nominal = mpc._window(plan, float(state.tip[0]), 1)
     grid = np.stack(np.meshgrid(np.linspace(0.5, 1, 41), np.linspace(-0.5, 0.5, 81)), axis=-1).reshape(-1, 2)
-    controls = mpc._controls(scenario, state, grid, 40.0, flip=False)
+    controls = mpc._controls(scenario, state, grid, np.zeros((1, 2)), 40.0, flip=False)
     best = mpc._cost(simulator, state, controls, reference, nominal).min()
     assert choice.cost <= best + 0.002
 
@@ -168,7 +168,7 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan):
 @pytest.mark.parametrize("flip", [True, False])
 def test_rollouts_turn_the_bevel_only_in_the_first_step_and_if_told(plan, flip):
     state = along(plan, 40)
-    controls = mpc._controls(PHANTOM, state, np.tile([0.9, 0.1], (3, 8)), 30.0, flip=flip)
+    controls = mpc._controls(PHANTOM, state, np.tile([0.9, 0.1], (3, 8)), np.zeros((8, 2)), 30.0, flip=flip)
     assert (controls[:, 0, 4] == (1.0 if flip else -1.0)).all()
     assert (controls[:, 1:, 4] == -1.0).all()
 
@@ -224,4 +224,16 @@ def test_arrived_where_the_stroke_is_used_up(plan, more, there):
     short = PHANTOM.with_values({"setup.stroke_mm": advanced + more, "target.depth_mm": 10.0})
     state = along(plan, 60, short)
     assert controller.arrived(short, plan, believed(state)) is there
-    assert choose(plan, state, short).db_x <= more + 1e-9
+    assert choose(plan, state, short).steps[0] <= more + 1e-9
+
+
+def test_planned_base_steps_are_followed_and_caught_up_with():
+    """A base step that was missed is made good, as fast as the limit allows; without planned ones none is made."""
+    plan = flexneedle.plan(PHANTOM.with_values({"plan.base_sigma_mm": 0.1, "plan.iterations": 2}), seed=3)
+    scenario = PHANTOM.with_values({"setup.max_base_step_mm": 0.2})
+    moved = np.cumsum(plan.controls[:, 1])
+    steps = mpc._planned_base(scenario, plan, Simulator(scenario).start(), 8)
+    assert abs(moved[:8]).max() > 0.01
+    np.testing.assert_allclose(np.cumsum(steps[:, 0]), moved[:8], atol=1e-12)
+    far = replace(plan, controls=plan.controls * [1.0, 1e3, 1.0, 1.0, 1.0])
+    assert abs(mpc._planned_base(scenario, far, Simulator(scenario).start(), 8)).max() == 0.2

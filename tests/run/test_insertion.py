@@ -186,13 +186,13 @@ def test_phantom_tracker_and_search_have_random_streams_of_their_own(plan, monke
 def test_on_period_gets_each_period_as_it_ends(plan):
     seen = []
     tank = Tank(plan.bevel)
-    part = replace(plan, target=(-20.0, 0.0), tips=np.append(plan.tips, [[-20.0, 0.0, 0.0]], axis=0))
+    part = replace(plan, target=(-20.0, 0.0))
 
     def watch(period):
         assert len(tank.moves) == len(seen) + 1  # before the next one moves
         seen.append(period)
 
-    done = run(part, tank.rig(), on_period=watch)
+    done = run(part, tank.rig(), on_period=watch, force=True)
     assert done.periods == tuple(seen)
     assert len(seen) > 5
 

@@ -35,9 +35,9 @@ NEW_U, Y, TURN, SHEAR, MOMENT = range(12, 17)
 WORK_ROWS = 17
 
 TOLERANCE_MM = 1e-7
-SLIDE_TOLERANCE_MM = 5e-7
-COUPLED_ITERATIONS = 8
-MAX_ITERATIONS = 60
+SLIDE_TOLERANCE_MM = 1e-7
+COUPLED_ITERATIONS = 15
+MAX_ITERATIONS = 100
 
 
 @inner
@@ -354,5 +354,6 @@ def solve(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, held: flo
         if error <= TOLERANCE_MM and slide <= SLIDE_TOLERANCE_MM:
             break
     s[ITERATIONS], s[RESIDUAL] = iteration, max(error, slide)
-    s[CONVERGED] = 1.0 if error <= TOLERANCE_MM and slide <= SLIDE_TOLERANCE_MM else 0.0
+    finite = math.isfinite(s[TIP_Y]) and math.isfinite(s[SHORTENING])
+    s[CONVERGED] = 1.0 if finite and error <= TOLERANCE_MM and slide <= SLIDE_TOLERANCE_MM else 0.0
     return count, fresh

@@ -147,7 +147,7 @@ class Simulator:
 
     def _rollout(self, state: State, controls: ArrayLike, *, deflection: bool) -> tuple[Any, ...]:
         self._own(state)
-        u = np.ascontiguousarray(controls, dtype=float)
+        u = np.array(controls, dtype=float, order="C")  # a copy: the kernel is compiled for writable arrays
         if u.ndim != 3 or u.shape[2] != 5:
             raise CommandError("controls", float(u.ndim), 3.0, f"must have shape (N, m, 5), not {u.shape}")
         self._limits.check(state.travel, u)
