@@ -47,7 +47,7 @@ class Simulator:
 
     def __init__(self, scenario: Scenario, threads: int | None = None) -> None:
         self.scenario = scenario
-        self.threads = threads or len(os.sched_getaffinity(0))
+        self.threads = threads or _cores()
         self._model = _build_model(scenario)
         self._limits = Limits.of(scenario)
 
@@ -187,6 +187,11 @@ class Simulator:
 
     def __setstate__(self, saved: dict[str, Any]) -> None:
         self.__init__(saved["scenario"], saved["threads"])  # type: ignore[misc]
+
+
+def _cores() -> int:
+    """How many cores the process may use, where the system tells."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _build_model(scenario: Scenario) -> model.Model:
