@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test bench robustness accuracy lint clean
+.PHONY: help setup demo test slow bench robustness accuracy lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -42,6 +42,9 @@ robustness: setup  ## 100,000 random insertions without a failure (long)
 
 accuracy: setup  ## the 15 targets of the paper, closed loop against open loop (long)
 	$(BIN)/python studies/accuracy.py
+
+slow: setup  ## the long tests: a thousand insertions against the reference
+	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
 
 lint: setup  ## style, types, layers
 	$(BIN)/ruff check .

@@ -108,3 +108,12 @@ def test_impossible_measurements_are_refused(state, tip, points, name):
         SIMULATOR.assimilate(state, tip, points)
     assert caught.value.name == name
     assert str(caught.value).startswith(name)
+
+
+def test_a_measured_point_has_two_coordinates():
+    """A pose or a flat list of points is not taken for something else."""
+    simulator = Simulator(load_scenario("phantom"))
+    state = simulator.start()
+    for tip, points in ((state.tip, ()), ((0.0, 0.0, 1.0, 2.0), ()), ((-28.5, 0.0), [(1.0, 2.0, 3.0)])):
+        with pytest.raises(CommandError, match="must be 2, x and y in mm"):
+            simulator.assimilate(state, tip, points)

@@ -92,7 +92,7 @@ def test_work_of_base_and_guide_is_the_energy_stored(name):
 
 @pytest.mark.parametrize("name", ["tip", "all"])
 def test_work_of_a_held_tip_is_the_energy_stored(name):
-    """Within 0.1 % by lateral work alone, to a hundred-thousandth with that of the slide along the hold."""
+    """Within 0.2 % by lateral work alone, to a hundred-thousandth with that of the slide along the hold."""
     lateral, axial, stored = travel(first_hold(withdrawn(3.55)), MOVES[name])
     assert abs(stored) > 0.02
     assert lateral == pytest.approx(stored, rel=2e-3)

@@ -20,7 +20,7 @@ from flexneedle.mechanics.compile import inner
 from flexneedle.mechanics.model import ESSENTIAL, Floats, Model
 from flexneedle.mechanics.ogden import FLOOR_STRETCH, contact_law
 
-# Scalars of a state (docs/theory.md section 6 lists them): pose of base and guide, tip pose and tip spring now,
+# Scalars of a state: pose of base and guide, tip pose and tip spring now,
 # tip pose and tip spring where the last step began to cut.
 BASE_X, BASE_Y, BASE_TURN, GUIDE_Y, BEVEL, SHORTENING, TIP_LOAD, TIP_X, TIP_Y, TIP_TURN = range(10)
 FRONT, REST, SPRING_U, CUT_X, CUT_Y, CUT_TURN, CUT_FRONT, CUT_REST = range(10, 18)
@@ -100,7 +100,7 @@ def _sweep_out(
 
 @inner
 def spring_rest(model: Model, s: Floats, tip_x: float) -> tuple[float, float]:
-    """(fixed, slope): the tip spring rests at fixed + (1 − slope) y_tip; docs/theory.md eq. 9."""
+    """(fixed, slope): the tip spring rests at fixed + (1 − slope) y_tip; docs/theory.md eq. 8."""
     cut = tip_x - s[CUT_FRONT]
     if cut <= 0.0:
         return s[CUT_REST], 1.0

@@ -1,5 +1,6 @@
 """Carry out an insertion: the closed loop against a driver and a tracker, by default the virtual phantom's."""
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -77,7 +78,7 @@ def run(
     if not plan.reached and not force:
         raise RunError(
             f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), bound by {plan.limit}; "
-            "use --force to insert"
+            "insert it with force (--force) if it is meant"
         )
     periods: list[Period] = []
     ending = ("failed", "not at the target depth after four times the planned periods")
@@ -86,7 +87,11 @@ def run(
         ending = so_far or ending
         if on_period is not None:
             on_period(period)
-    return Insertion(plan, seed, tuple(periods), *ending)
+    insertion = Insertion(plan, seed, tuple(periods), *ending)
+    if insertion.outcome == "done" and insertion.true_error_mm > 1.0:
+        missed = f"missed the target by {insertion.true_error_mm:.2f} mm"
+        return replace(insertion, reason="; ".join(filter(None, (insertion.reason, missed))))
+    return insertion
 
 
 def _periods(
@@ -96,7 +101,11 @@ def _periods(
     simulator = Simulator(scenario)
     estimate = observer.begin(simulator, plan.bevel)
     held_since: float | None = None
-    for index in range(_TOO_MANY * len(plan.controls)):
+    moves = 0
+    for index in itertools.count():
+        if moves == _TOO_MANY * len(plan.controls):
+            return
+        moves += held_since is None
         clocks = [time.perf_counter()]
         decision = _hold() if held_since is not None else controller.decide(simulator, plan, estimate, rng)
         clocks.append(time.perf_counter())

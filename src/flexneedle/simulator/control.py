@@ -58,21 +58,21 @@ class Limits:
         `moved` (4,) is how far each input has gone so far.
         """
         if not np.isfinite(controls).all():
-            self._refuse(controls, ~np.isfinite(controls), "a finite number")
+            self._refuse(controls, ~np.isfinite(controls), "must be a finite number")
         if (bad := np.abs(controls[..., 4]) != 1.0).any():
             raise CommandError("flip", float(controls[..., 4][bad][0]), 1.0, "must be −1 or +1")
         steps = controls[..., :4]
         if (bad := np.abs(steps) > self.step + _SLACK).any():
-            self._refuse(steps, bad, "at most", self.step)
+            self._refuse(steps, bad, "must be at most", self.step)
         travel = moved + np.cumsum(steps, axis=-2)
         if (bad := travel > self.travel[:, 1] + _SLACK).any():
-            self._refuse(travel, bad, "in all at most", self.travel[:, 1])
+            self._refuse(travel, bad, "steps in all must be at most", self.travel[:, 1])
         if (bad := travel < self.travel[:, 0] - _SLACK).any():
-            self._refuse(travel, bad, "in all at least", self.travel[:, 0])
+            self._refuse(travel, bad, "steps in all must be at least", self.travel[:, 0])
 
     def _refuse(self, values: Floats, bad: NDArray[np.bool_], rule: str, limit: Floats | None = None) -> None:
         index = tuple(np.argwhere(bad)[0])
         name, bound = COLUMNS[index[-1]], float("nan") if limit is None else float(limit[index[-1]])
         unit = "rad" if name == "db_theta" else "mm"
-        text = f"must be {rule}" if limit is None else f"must be {rule} {bound:g} {unit}"
+        text = rule if limit is None else f"{rule} {bound:g} {unit}"
         raise CommandError(name, float(values[index]), bound, text)

@@ -101,7 +101,7 @@ class Simulator:
         `state.reactions.tip_force` is what the tip needed beyond `state.tip_load` (N).
         """
         self._own(state)
-        measured = np.array([tip, *points], dtype=float).reshape(-1, 2)
+        measured = np.array([_point(tip), *map(_point, points)])
         if not np.isfinite(measured).all():
             raise CommandError(
                 "measured position", float(measured[~np.isfinite(measured)][0]), 0.0, "must be finite"
@@ -187,6 +187,13 @@ class Simulator:
 
     def __setstate__(self, saved: dict[str, Any]) -> None:
         self.__init__(saved["scenario"], saved["threads"])  # type: ignore[misc]
+
+
+def _point(values: Sequence[float]) -> tuple[float, float]:
+    """Return (x, y) of a measured point, and nothing else that it could be taken for."""
+    if len(values) != 2:
+        raise CommandError("coordinates of a measured point", len(values), 2, "must be 2, x and y in mm")
+    return float(values[0]), float(values[1])
 
 
 def _cores() -> int:
