@@ -336,7 +336,7 @@ def test_after_the_hold_limit_the_run_ends_with_its_record(plan, verdict, fault)
     assert done.periods[0].verdict == "ok"
 
 
-@pytest.mark.parametrize("limit", [0.1, 0.5])
+@pytest.mark.parametrize("limit", [0.1, 0.5, 12.0])  # 12 s are more readings than periods of a run
 def test_hold_limit_is_the_scenarios(plan, limit):
     scenario = PHANTOM.with_values({"control.hold_limit_s": limit})
     done = run(plan, Tank(plan.bevel, spoil=between(1.0, math.inf, lost)).rig(), scenario)
