@@ -179,7 +179,7 @@ def test_a_scenario_is_its_own_source():
 
 @pytest.mark.parametrize("target", [(25, -5), (81.5, 15), (1e-3, 0)])
 def test_a_target_within_reach_passes(target):
-    check_target(PHANTOM, *target)
+    assert check_target(PHANTOM, *target) is None
 
 
 @pytest.mark.parametrize(
