@@ -237,3 +237,22 @@ def test_planned_base_steps_are_followed_and_caught_up_with():
     np.testing.assert_allclose(np.cumsum(steps[:, 0]), moved[:8], atol=1e-12)
     far = replace(plan, controls=plan.controls * [1.0, 1e3, 1.0, 1.0, 1.0])
     assert abs(mpc._planned_base(scenario, far, Simulator(scenario).start(), 8)).max() == 0.2
+
+
+def test_controls_carry_the_base_steps_while_the_needle_advances(plan):
+    base = np.array([[0.1, 1e-3]] * 8)
+    z = np.tile(np.repeat([0.9, 0.0], 8), (2, 1))
+    controls = mpc._controls(PHANTOM, along(plan, 10), z, base, 2.0, flip=False)
+    np.testing.assert_allclose(controls[:, :3, 1:3], np.broadcast_to(base[:3], (2, 3, 2)))
+    assert (controls[:, 3:, :4] == 0.0).all()
+
+
+def test_the_bevel_rule_hears_of_three_standard_deviations_of_a_reading(plan, monkeypatch):
+    heard = []
+    rule = controller.bang_bang.wants_flip
+    monkeypatch.setattr(
+        controller.bang_bang, "wants_flip", lambda *args: heard.append(args[-1]) or rule(*args)
+    )
+    estimate = observer.Estimate(along(plan, 40), np.eye(2))
+    controller.decide(Simulator(PHANTOM), plan, estimate, np.random.default_rng(0))
+    assert heard == [pytest.approx(3 * PHANTOM.tracker.jitter_mm / 3**0.5)]

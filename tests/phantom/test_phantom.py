@@ -7,6 +7,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from flexneedle import load_scenario
+from flexneedle.errors import CommandError
 from flexneedle.phantom import Phantom, draw
 from flexneedle.phantom.phantom import Truth
 from flexneedle.simulator import Control, Simulator
@@ -161,3 +162,10 @@ def test_a_strong_bevel_is_drawn_within_the_rules():
     assert np.mean(offsets) == pytest.approx(10.0, abs=0.5)
     symmetric = PHANTOM.with_values({"needle.bevel.offset_mm": 0.0})
     assert drawn(0, symmetric).scenario.needle.bevel.offset_mm == 0.0
+
+
+def test_a_command_beyond_a_step_is_refused_before_it_is_divided():
+    phantom = Phantom(draw(PHANTOM, np.random.default_rng(3)), 1)
+    with pytest.raises(CommandError, match=r"db_x = 2: must be at most 1 mm"):
+        phantom.apply((2.0, 0.0, 0.0, 0.0, -1), 0.4)
+    assert phantom.now() == 0.0

@@ -182,11 +182,8 @@ class Simulator:
     def _pool(self) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(self.threads, thread_name_prefix="rollout")
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"scenario": self.scenario, "threads": self.threads}
-
-    def __setstate__(self, saved: dict[str, Any]) -> None:
-        self.__init__(saved["scenario"], saved["threads"])  # type: ignore[misc]
+    def __reduce__(self) -> tuple[type["Simulator"], tuple[Scenario, int]]:
+        return Simulator, (self.scenario, self.threads)
 
 
 def _point(values: Sequence[float]) -> tuple[float, float]:
