@@ -5,7 +5,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.control.interface import Task
+from flexneedle.control.observer import Estimate
+
 Floats = NDArray[np.float64]
+_SURE = 3.0  # standard deviations of a reading: no bevel turn for less
 
 
 def closest_approach(pose: Floats, curvature: float, target: tuple[float, float]) -> float:
@@ -40,4 +44,19 @@ def wants_flip(
     return (
         flip,
         f"bevel {'turned' if flip else 'kept'}: keeping misses by {keep:.3f} mm, turning by {turn:.3f} mm",
+    )
+
+
+def decide(task: Task, estimate: Estimate) -> tuple[bool, str]:
+    """`wants_flip` towards the plan's target, from the believed tip. In air the bevel has no effect and stays."""
+    if estimate.tip[0] <= 0.0:
+        return False, "in air"
+    control = task.scenario.control
+    return wants_flip(
+        estimate.tip,
+        estimate.state.bevel,
+        control.curvature,
+        task.plan.target,
+        control.flip_dead_band,
+        _SURE * task.scenario.tracker.jitter_per_axis,
     )

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.control.interface import travel_left
 from flexneedle.planning import Settings, cross_entropy
 from flexneedle.scenario import Scenario, elite_count
 from flexneedle.simulator import Simulator, State
@@ -52,12 +53,6 @@ def choose(
     spread = float(np.sqrt(found.covariance[steps, steps]))
     db_x, db_y, db_theta, dg_y = first[:4].tolist()
     return Choice((db_x, db_y, db_theta, dg_y), found.best_cost, spread)
-
-
-def travel_left(scenario: Scenario, plan: PlanRecord, state: State) -> float:
-    """Advance (mm) to the target depth, or to the end of the stroke if that comes first."""
-    stroke_left = scenario.start_base_x + scenario.setup.stroke_mm - float(state.base[0])
-    return max(0.0, min(plan.target[0] - float(state.tip[0]), stroke_left))
 
 
 def _window(plan: PlanRecord, x: float, steps: int) -> tuple[Floats, Floats]:

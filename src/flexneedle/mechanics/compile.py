@@ -18,24 +18,21 @@ _config: Any = _numba_config  # its settings are not declared
 _HERE = Path(__file__).parent
 
 
-def _cache_folder() -> str:
-    """The folder for this exact source: under NUMBA_CACHE_DIR, beside the code, or in the user's cache."""
+def _cache_folder(home: Path) -> str:
+    """The folder for the exact sources of `home` and here: under NUMBA_CACHE_DIR, beside the code, or the user's."""
     digest = hashlib.sha256()
-    for source in sorted(_HERE.glob("*.py")):
+    for source in sorted({*_HERE.glob("*.py"), *home.glob("*.py")}):
         digest.update(source.read_bytes())
-    beside = _HERE / "__pycache__"
+    beside = home / "__pycache__"
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "flexneedle"
-    writable = os.access(beside if beside.exists() else _HERE, os.W_OK)
+    writable = os.access(beside if beside.exists() else home, os.W_OK)
     base = Path(_config.CACHE_DIR) if _config.CACHE_DIR else (beside if writable else user)
     return str(base / f"kernels-{digest.hexdigest()[:16]}")
 
 
-_FOLDER = _cache_folder()
-
-
-def compiled() -> bool:
-    """Whether kernels of these sources lie in the cache, so that a start takes no compilation."""
-    return any(Path(_FOLDER).rglob("*.nbi"))
+def compiled(home: Path = _HERE) -> bool:
+    """Whether kernels of the sources in the folder `home` lie in the cache, so that a start takes no compilation."""
+    return any(Path(_cache_folder(home)).rglob("*.nbi"))
 
 
 def inner(function: _Function) -> _Function:
@@ -47,7 +44,8 @@ def inner(function: _Function) -> _Function:
 def kernel(function: _Function) -> _Function:
     """Compile an entry point, once for each version of the sources."""
     before = _config.CACHE_DIR
-    _config.CACHE_DIR = _FOLDER
+    source: Any = function
+    _config.CACHE_DIR = _cache_folder(Path(source.__code__.co_filename).parent)
     try:
         compiled: _Function = _njit(cache=True, nogil=True, error_model="numpy")(function)
         return compiled

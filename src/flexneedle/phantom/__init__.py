@@ -1,5 +1,7 @@
-"""The virtual phantom: what an insertion runs against without a rig."""
+"""A virtual phantom: what the controller's commands do to a needle in tissue that is not the controller's model."""
 
-from flexneedle.phantom.phantom import Phantom, draw
+from flexneedle.phantom.draw import Truth, draw
+from flexneedle.phantom.phantom import Condition, Phantom
+from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS
 
-__all__ = ["Phantom", "draw"]
+__all__ = ["DEFAULT_PLANT", "PLANTS", "Condition", "Phantom", "Truth", "draw"]

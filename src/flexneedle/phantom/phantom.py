@@ -1,67 +1,46 @@
-"""A virtual phantom with parameters of its own, drawn by a seed; a `Driver` and a `Clock`."""
+"""A virtual phantom behind the ports of a rig: a `Driver` and a `Clock`, and the truth for the record."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from flexneedle.phantom.draw import Truth
+from flexneedle.phantom.plants import plant
 from flexneedle.ports import Command
-from flexneedle.scenario import Scenario
-from flexneedle.simulator import Control, Simulator, State
+from flexneedle.simulator import Control
+from flexneedle.simulator.control import Limits
 
-_LARGEST_OFFSET = 0.699  # of the compression length
-
-
-@dataclass(frozen=True)
-class Truth:
-    """What really stands in the tank: its scenario, and where the clamp holds the base (mm, rad)."""
-
-    scenario: Scenario
-    base_y: float
-    base_turn: float
+Floats = NDArray[np.float64]
 
 
-def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
-    """Draw a phantom as `[phantom]` says: stiffness of each layer, bevel, start offset and angle; finer contacts."""
-    settings = scenario.phantom
-    factors = rng.uniform(*settings.shear_modulus_factor, len(scenario.tissue))
-    values: dict[str, float] = {
-        f"tissue.{k}.shear_modulus_kpa": layer.shear_modulus_kpa * float(factor)
-        for k, (layer, factor) in enumerate(zip(scenario.tissue, factors, strict=True))
-    }
-    values["needle.bevel.offset_mm"] = scenario.needle.bevel.offset_mm * _bevel_factor(scenario, rng)
-    values["contact.spacing_mm"] = settings.contact_spacing_mm
-    return Truth(
-        scenario.with_values(values),
-        float(rng.normal(0.0, settings.start_offset_sd_mm)),
-        float(rng.normal(0.0, settings.start_angle_sd)),
-    )
+class Condition(NamedTuple):
+    """How the needle in the tank is: tip pose (mm, rad), tissue strain energy (mJ), smallest stretch λ, convergence."""
 
-
-def _bevel_factor(scenario: Scenario, rng: np.random.Generator) -> float:
-    """Draw the factor on the bevel offset, from the part of its range that keeps the rule b < 0.7 h."""
-    low, high = scenario.phantom.bevel_factor
-    offset = scenario.needle.bevel.offset_mm
-    least = min(layer.compression_length_mm for layer in scenario.tissue)
-    most = min(high, _LARGEST_OFFSET * least / offset) if offset > 0.0 else high
-    return float(rng.uniform(min(low, most), most))
+    tip: Floats
+    strain_energy: float
+    least_stretch: float
+    converged: bool
 
 
 class Phantom:
     """The needle in the tank. Moves on command; the time that a command takes passes on its own clock."""
 
-    def __init__(self, truth: Truth, bevel: int) -> None:
-        self._simulator = Simulator(truth.scenario, threads=1)
-        start = self._simulator.start(bevel).believing(base_y=truth.base_y, base_turn=truth.base_turn)
-        self._state = self._simulator.step(start, Control())
-        self._step = truth.scenario.phantom.step_mm
+    def __init__(self, truth: Truth, bevel: int, kind: str = "exact") -> None:
+        self._plant = plant(kind, truth, bevel)
+        self._truth = truth
+        self._limits = Limits.of(truth.scenario)
+        self._moved = np.zeros(4)
         self._time = 0.0
-        self._path = [(0.0, self._tip())]  # of the last command
+        self._least_stretch = 1.0
+        self._path = [(0.0, *self._tip()[:2])]  # time, x, y
 
-    @property
-    def state(self) -> State:
-        """The truth, for the record; no controller gets it."""
-        return self._state
+    def condition(self) -> Condition:
+        """The truth, for the record; no controller gets it. The stretch is the smallest so far."""
+        return Condition(
+            self._tip(), self._plant.strain_energy, self._least_stretch, self._plant.converged
+        )
 
     def now(self) -> float:
         """Seconds since the start."""
@@ -69,27 +48,48 @@ class Phantom:
 
     def wait(self, seconds: float) -> None:
         """Let time pass with everything at rest."""
-        self._path = [(self._time, self._tip()), (self._time + seconds, self._tip())]
         self._time += seconds
+        self._path.append((self._time, *self._tip()[:2]))
 
     def apply(self, command: Command, duration: float) -> Command:
-        """Carry out `command` evenly within `duration` s, in steps no longer than `phantom.step_mm`."""
-        self._simulator.check(self._state, Control.from_row(command))
-        parts = max(1, math.ceil(abs(command[0]) / self._step - 1e-9))
-        self._path = [(self._time, self._tip())]
+        """Carry out `command` evenly within `duration` s, in steps no longer than `phantom.step_mm`.
+
+        Motors stop at the last multiple of their resolution on the way; the command is returned as it was applied.
+        """
+        self._limits.check(self._moved, Control.from_row(command).row()[None])
+        row = self._reachable(command)
+        parts = max(1, math.ceil(abs(row[0]) / self._truth.scenario.phantom.step_mm - 1e-9))
         for k in range(parts):
-            row = [*(value / parts for value in command[:4]), command[4] if k == 0 else -1.0]
-            self._state = self._simulator.step(self._state, Control.from_row(row))
-            self._path.append((self._time + duration * (k + 1) / parts, self._tip()))
+            self._plant.step(np.append(row[:4] / parts, row[4] if k == 0 else -1.0))
+            self._least_stretch = min(self._least_stretch, self._plant.least_stretch)
+            self._path.append((self._time + duration * (k + 1) / parts, *self._tip()[:2]))
+        self._moved += row[:4]
         self._time += duration
-        return command
+        db_x, db_y, db_theta, dg_y = row[:4].tolist()
+        return db_x, db_y, db_theta, dg_y, command[4]
 
     def tip_at(self, time: float) -> tuple[float, float]:
-        """Return the true tip (x, y) in mm at a time within the last command, for a tracker to measure."""
-        times, tips = [t for t, _ in self._path], np.array([tip for _, tip in self._path])
-        x, y = (float(np.interp(time, times, tips[:, k])) for k in (0, 1))
-        return x, y
+        """Return the true tip (x, y) in mm at a time, for a tracker to measure; at rest before the start."""
+        for (t0, x0, y0), (t1, x1, y1) in zip(self._path[-2::-1], self._path[:0:-1], strict=True):
+            if time > t0:
+                part = min(1.0, (time - t0) / (t1 - t0)) if t1 > t0 else 1.0
+                return x0 + part * (x1 - x0), y0 + part * (y1 - y0)
+        return self._path[0][1:]
 
-    def _tip(self) -> tuple[float, float]:
-        x, y, _ = self._state.tip
-        return float(x), float(y)
+    def _reachable(self, command: Command) -> Floats:
+        """The command cut to where the motors can stop; a turn of the base is not."""
+        row = np.array(command, dtype=float)
+        grid = self._truth.scenario.phantom.motor_resolution_mm
+        if grid > 0.0:
+            lengths = [0, 1, 3]
+            ends = (self._moved + row[:4])[lengths] / grid
+            towards = np.where(row[lengths] >= 0.0, np.floor(ends + 1e-6), np.ceil(ends - 1e-6))
+            steps = towards * grid - self._moved[lengths]
+            row[lengths] = np.where(row[lengths] == 0.0, 0.0, steps)
+        return row
+
+    def _tip(self) -> Floats:
+        """The pose of the tip, which is off the needle's axis by the run-out."""
+        x, y, turn = self._plant.tip
+        off = self._truth.run_out * self._plant.bevel
+        return np.array([x - off * math.sin(turn), y + off * math.cos(turn), turn])

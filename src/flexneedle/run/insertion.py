@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexneedle.control import controller, observer
+from flexneedle.control import observer
+from flexneedle.control.interface import Decision, Method, Task, at_depth
+from flexneedle.control.methods import DEFAULT, method
 from flexneedle.errors import RunError
-from flexneedle.phantom import Phantom, draw
+from flexneedle.phantom import DEFAULT_PLANT, Condition, Phantom, draw
 from flexneedle.ports import Clock, Command, Driver, Sample, Tracker
 from flexneedle.scenario import Scenario
-from flexneedle.simulator import Simulator, State
+from flexneedle.simulator import Simulator
 from flexneedle.trace import Insertion, Period, PlanRecord
 from flexneedle.tracking import OK, NoisyTracker, judge
 
@@ -29,7 +31,7 @@ class Rig:
     clock: Clock
     driver: Driver
     tracker: Tracker
-    truth: Callable[[], State] | None = None
+    truth: Callable[[], Condition] | None = None
 
 
 def insert(
@@ -37,31 +39,58 @@ def insert(
     plan: PlanRecord,
     seed: int = 0,
     *,
+    controller: str = DEFAULT,
+    phantom: str = DEFAULT_PLANT,
     force: bool = False,
+    threads: int | None = None,
     on_period: Callable[[Period], None] | None = None,
 ) -> Insertion:
     """Carry out `plan` in closed loop against the virtual phantom that `seed` draws; returns the whole record.
 
-    `on_period` gets each control period as it ends. Raises RunError if the plan misses its target by more than
-    1 mm, unless `force`. Same seed, same record, but for wall-clock durations.
+    controller: one of `control.methods.METHODS`; phantom: "exact" or "model", the formulation of the plant.
+    `threads` is for rollouts (default: all cores) and changes no result. `on_period` gets each control period as
+    it ends. Raises InputError for an unknown name, RunError if the plan misses its target by more than 1 mm,
+    unless `force`. Same seed, same record, but for wall-clock durations.
     """
     phantom_seed, tracker_seed, control_seed = np.random.SeedSequence(seed).spawn(3)
-    rig = virtual_rig(scenario, plan.bevel, phantom_seed, tracker_seed)
-    return run(
-        scenario, plan, rig, np.random.default_rng(control_seed), seed, force=force, on_period=on_period
+    rig = virtual_rig(scenario, plan.bevel, phantom_seed, tracker_seed, phantom)
+    rng = np.random.default_rng(control_seed)
+    insertion = run(
+        scenario,
+        plan,
+        rig,
+        rng,
+        seed,
+        controller=controller,
+        force=force,
+        threads=threads,
+        on_period=on_period,
     )
+    return replace(insertion, phantom=phantom)
 
 
 def virtual_rig(
-    scenario: Scenario, bevel: int, phantom_seed: np.random.SeedSequence, tracker_seed: np.random.SeedSequence
+    scenario: Scenario,
+    bevel: int,
+    phantom_seed: np.random.SeedSequence,
+    tracker_seed: np.random.SeedSequence,
+    phantom: str = DEFAULT_PLANT,
 ) -> Rig:
     """Return a virtual phantom behind the same ports as a rig."""
-    phantom = Phantom(draw(scenario, np.random.default_rng(phantom_seed)), bevel)
-    noise = np.random.default_rng(tracker_seed)
+    truth = draw(scenario, np.random.default_rng(phantom_seed))
+    tank = Phantom(truth, bevel, phantom)
+    step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
     tracker = NoisyTracker(
-        phantom.tip_at, phantom, scenario.tracker.period, scenario.tracker.jitter_per_axis, noise
+        tank.tip_at,
+        tank,
+        scenario.tracker.period,
+        scenario.tracker.jitter_per_axis,
+        np.random.default_rng(tracker_seed),
+        delay=scenario.phantom.delay_periods * step,
+        missing=scenario.phantom.missing_fraction,
+        bias=truth.bias,
     )
-    return Rig(phantom, phantom, tracker, lambda: phantom.state)
+    return Rig(tank, tank, tracker, tank.condition)
 
 
 def run(
@@ -71,10 +100,13 @@ def run(
     rng: np.random.Generator,
     seed: int = 0,
     *,
+    controller: str = DEFAULT,
     force: bool = False,
+    threads: int | None = None,
     on_period: Callable[[Period], None] | None = None,
 ) -> Insertion:
     """Carry out `plan` on any rig; as `insert`."""
+    chosen = method(controller)
     if not plan.reached and not force:
         raise RunError(
             f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), bound by {plan.limit}; "
@@ -82,12 +114,12 @@ def run(
         )
     periods: list[Period] = []
     ending = ("failed", "not at the target depth after four times the planned periods")
-    for period, so_far in _periods(scenario, plan, rig, rng):
+    for period, so_far in _periods(Task(Simulator(scenario, threads), plan), chosen, rig, rng):
         periods.append(period)
         ending = so_far or ending
         if on_period is not None:
             on_period(period)
-    insertion = Insertion(plan, seed, tuple(periods), *ending)
+    insertion = Insertion(plan, seed, tuple(periods), *ending, controller)
     if insertion.outcome == "done" and insertion.true_error_mm > 1.0:
         missed = f"missed the target by {insertion.true_error_mm:.2f} mm"
         return replace(insertion, reason="; ".join(filter(None, (insertion.reason, missed))))
@@ -95,36 +127,53 @@ def run(
 
 
 def _periods(
-    scenario: Scenario, plan: PlanRecord, rig: Rig, rng: np.random.Generator
+    task: Task, chosen: Method, rig: Rig, rng: np.random.Generator
 ) -> Iterator[tuple[Period, tuple[str, str] | None]]:
-    """Yield each period, and how the insertion ended with it: (outcome, reason), None while it goes on."""
-    simulator = Simulator(scenario)
-    estimate = observer.begin(simulator, plan.bevel)
+    """Yield each period, and how the insertion ended with it: (outcome, reason), None while it goes on.
+
+    After the last move the needle rests until the tracker has seen it at rest: readings come late.
+    """
+    estimate = observer.begin(task.simulator, task.plan.bevel, chosen.beliefs)
+    memory = chosen.begin(task)
     held_since: float | None = None
+    arrived_at: float | None = None
     moves = 0
     for index in itertools.count():
-        if moves == _TOO_MANY * len(plan.controls):
+        if moves == _TOO_MANY * len(task.plan.controls):
             return
-        moves += held_since is None
         clocks = [time.perf_counter()]
-        decision = _hold() if held_since is not None else controller.decide(simulator, plan, estimate, rng)
+        begun, wait = rig.clock.now(), task.scenario.tracker.period
+        if held_since is not None:
+            decision = Decision(_STILL, "held")
+        elif arrived_at is not None:
+            decision, wait = Decision(_STILL, "at rest for the last reading"), max(wait, begun - sample.time)
+        else:
+            decision, memory = chosen.decide(task, memory, estimate, rng)
+            moves, wait = moves + 1, 0.0
         clocks.append(time.perf_counter())
-        begun = rig.clock.now()
-        applied = _carry_out(scenario, rig, decision.command, held_since is not None)
+        applied = _carry_out(task.scenario, rig, decision.command, wait)
         clocks.append(time.perf_counter())
-        estimate, sample, verdict = _see(simulator, estimate, applied, begun, rig)
+        estimate, sample, verdict = _see(task.scenario, estimate, applied, begun, rig)
         clocks.append(time.perf_counter())
         now = rig.clock.now()
         held_since = None if verdict == OK else (now if held_since is None else held_since)
-        held = 0.0 if held_since is None else now - held_since
-        ending = _ending(scenario, plan, estimate, verdict, held)
-        yield _record(index, now, plan, rig, decision, applied, sample, verdict, estimate, clocks), ending
+        if arrived_at is None and verdict == OK and chosen.arrived(task, memory, estimate):
+            arrived_at = now
+        seen = arrived_at is not None and verdict == OK and sample.time > arrived_at - 1e-6
+        ending = _ending(task, estimate, verdict, 0.0 if held_since is None else now - held_since, seen)
+        yield _record(index, now, task.plan, rig, decision, applied, sample, verdict, estimate, clocks), ending
         if ending is not None:
             return
 
 
-def _hold() -> controller.Decision:
-    return controller.Decision(_STILL, "held", math.nan, math.nan)
+def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> Command:
+    """Move, for as long as the speed asks, rounded up to whole readings of the tracker; or wait so long (s)."""
+    if wait > 0.0:
+        rig.clock.wait(wait)
+        return command
+    reading = scenario.tracker.period
+    readings = math.ceil(abs(command[0]) / scenario.setup.insertion_speed_mm_s / reading - 1e-6)
+    return rig.driver.apply(command, max(1, readings) * reading)
 
 
 def _carry_out(scenario: Scenario, rig: Rig, command: Command, held: bool) -> Command:
@@ -138,43 +187,39 @@ def _carry_out(scenario: Scenario, rig: Rig, command: Command, held: bool) -> Co
 
 
 def _see(
-    simulator: Simulator, estimate: observer.Estimate, applied: Command, begun: float, rig: Rig
+    scenario: Scenario, estimate: observer.Estimate, applied: Command, begun: float, rig: Rig
 ) -> tuple[observer.Estimate, Sample, str]:
-    """Predict, read the tracker, judge its readings, correct by the good ones if the newest is good."""
-    control, now = simulator.scenario.control, rig.clock.now()
-    predicted = observer.predict(simulator, estimate, applied)
-
-    def verdict_of(sample: Sample) -> str:
-        tip = observer.predicted_tip(estimate.tip, predicted.tip, begun, now, sample.time)
-        stale = max(control.stale_after_s, now - begun if sample is not samples[-1] else 0.0)
-        return judge(sample, tip, now, stale, control.innovation_limit_mm)
-
+    """Predict, read the tracker, judge its readings, correct by the good ones."""
+    control, now = scenario.control, rig.clock.now()
+    predicted = observer.move(estimate, applied, begun, now)
     samples = rig.tracker.read()
-    verdicts = [verdict_of(sample) for sample in samples]
+    if not samples:
+        return replace(predicted, innovation=(0.0, 0.0)), _NO_SAMPLE, "missing: no reading"
+    # All but the newest were on their way while the needle moved.
+    ages = [control.stale_after_s + now - begun] * (len(samples) - 1) + [control.stale_after_s]
+    verdicts = [
+        judge(sample, predicted.tip_at(sample.time), now, age, control.innovation_limit_mm)
+        for sample, age in zip(samples, ages, strict=True)
+    ]
     good = [sample for sample, verdict in zip(samples, verdicts, strict=True) if verdict == OK]
-    if not samples or verdicts[-1] != OK:
-        unseen = replace(estimate, state=predicted, innovation=(0.0, 0.0))
-        return (
-            unseen,
-            samples[-1] if samples else _NO_SAMPLE,
-            verdicts[-1] if samples else "missing: no reading",
-        )
-    return observer.observe(simulator, estimate, predicted, begun, now, good), samples[-1], OK
+    if verdicts[-1] != OK:
+        predicted = replace(predicted, innovation=(0.0, 0.0))
+    return observer.observe(predicted, good), samples[-1], verdicts[-1]
 
 
 def _ending(
-    scenario: Scenario, plan: PlanRecord, estimate: observer.Estimate, verdict: str, held: float
+    task: Task, estimate: observer.Estimate, verdict: str, held: float, seen: bool
 ) -> tuple[str, str] | None:
     """How the insertion ends after this period, if it does."""
     if not estimate.state.converged:
         return "failed", f"the model did not converge: residual {estimate.state.residual:.3g} mm"
-    limit = scenario.control.hold_limit_s
+    limit = task.scenario.control.hold_limit_s
     if held > limit - 1e-9:
         return "held", f"held for {held:.2f} s (limit {limit:g} s): {verdict}"
-    if verdict != OK or not controller.arrived(scenario, plan, estimate):
+    if not seen:
         return None
-    short = plan.target[0] - float(estimate.tip[0])
-    if short > scenario.control.depth_tolerance_mm:
+    short = task.plan.target[0] - float(estimate.tip[0])
+    if short > task.scenario.control.depth_tolerance_mm and at_depth(task, None, estimate):
         return "done", f"the stroke ends {short:.2f} mm before the target depth"
     return "done", ""
 
@@ -184,7 +229,7 @@ def _record(
     now: float,
     plan: PlanRecord,
     rig: Rig,
-    decision: controller.Decision,
+    decision: Decision,
     applied: Command,
     sample: Sample,
     verdict: str,
@@ -213,13 +258,14 @@ def _record(
         decision=decision.why,
         true_tip=None if truth is None else _pose(truth.tip),
         true_strain_energy=None if truth is None else truth.strain_energy,
+        true_stretch=None if truth is None else truth.least_stretch,
         durations={
             "decide": clocks[1] - clocks[0],
             "apply": clocks[2] - clocks[1],
             "observe": clocks[3] - clocks[2],
             "total": clocks[1] - clocks[0] + clocks[3] - clocks[2],
         },
-        converged=state.converged,
+        converged=state.converged and (truth is None or truth.converged),
     )
 
 

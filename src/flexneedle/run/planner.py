@@ -26,11 +26,14 @@ def plan(
     strategy: str = "manipulation",
     seed: int = 0,
     progress: Callable[[dict[str, Any]], None] | None = None,
+    *,
+    threads: int | None = None,
 ) -> PlanRecord:
     """Plan an insertion to `target` (x, y) in mm (default: the scenario's), best found by cross-entropy.
 
     strategy: "manipulation" moves guide and bevel; "steering" lowers the bending stiffness and moves only the
-    bevel (paper section III-A). `progress` gets a dict after each iteration. Same seed, same plan.
+    bevel (paper section III-A). `progress` gets a dict after each iteration. `threads` is for
+    rollouts (default: all cores) and changes no result. Same seed, same plan.
     Raises ScenarioError for a target that the scenario excludes and InputError for an unknown strategy.
     """
     if strategy not in STRATEGIES:
@@ -38,7 +41,7 @@ def plan(
     goal = scenario.target.position if target is None else (float(target[0]), float(target[1]))
     check_target(scenario, *goal)
     begun = time.perf_counter()
-    simulator = Simulator(_strategic(scenario, strategy))
+    simulator = Simulator(_strategic(scenario, strategy), threads)
     solution = _search(simulator, goal, strategy, np.random.default_rng(seed), progress)
     controls = _end_at_depth(simulator, solution.controls, solution.bevel, goal[0])
     return _record(simulator, controls, solution, goal, strategy, seed, time.perf_counter() - begun)

@@ -107,7 +107,7 @@ class Control(Section):
     """A measured tip further than this from the predicted one is not believed."""
     hold_limit_s: Positive = 1.0
     """The insertion is given up after so long without a measurement to believe."""
-    stale_after_s: Positive = 0.1
+    stale_after_s: Positive = 0.3
     """A measurement older than this is not believed."""
 
     @property
@@ -122,18 +122,45 @@ class Control(Section):
 
 
 class Phantom(Section):
-    """Section `phantom`: how the virtual phantom differs from what the controller believes."""
+    """Section `phantom`: how the virtual phantom differs from what the controller believes.
+
+    The plant `model` has no initial bend, guide clearance, friction or variation of stiffness; `exact` has all.
+    """
 
     shear_modulus_factor: PositiveRange = (0.6, 1.6)
     """Range of the factor on μ, uniform, each layer on its own."""
+    shear_modulus_variation: Annotated[float, Field(ge=0, le=1)] = 0.2
+    """Standard deviation of μ along the depth, relative to the layer's."""
+    variation_length_mm: Positive = 10.0
+    """Depth over which that variation is correlated."""
+    layer_shift_sd_mm: NonNegative = 1.5
+    """Standard deviation of the depth of each layer boundary."""
     bevel_factor: NonNegativeRange = (0.5, 1.5)
     """Range of the factor on the bevel offset, uniform, as far as b stays below 0.7 h."""
     start_offset_sd_mm: NonNegative = 0.5
     """Standard deviation of the base clamp's lateral position."""
     start_angle_sd_mrad: NonNegative = 3.0
     """Standard deviation of the base clamp's slope."""
+    initial_bend_mm: NonNegative = 0.5
+    """How far the tip of the free needle is off the straight; the bend turns with the bevel, its side is drawn."""
+    run_out_mm: NonNegative = 0.2
+    """How far the tip moves aside when the bevel turns over; its side is drawn."""
+    guide_clearance_mm: NonNegative = 0.05
+    """Play of the needle in the guide, to either side."""
+    friction_mn_per_mm: NonNegative = 5.0
+    """Axial friction of tissue on the needle, for each mm in it."""
+    motor_resolution_mm: NonNegative = 0.01
+    """Base and guide stand on multiples of this; 0 is a perfect motor."""
+    delay_periods: NonNegative = 1.0
+    """Age of a reading when it arrives, in control periods at full step and speed."""
+    missing_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.01
+    """Share of the tracker's readings in which it sees no tip."""
+    tracker_bias_mm: NonNegative = 0.0
+    """Constant error of the tracker across the insertion axis; its side is drawn."""
     contact_spacing_mm: Positive = 0.5
     """Depth between the phantom's contact points."""
+    element_mm: Positive = 0.5
+    """Length of an element of the needle in the plant `exact`."""
     step_mm: Positive = 0.25
     """Greatest travel in one step of the phantom's own simulation."""
 
@@ -141,3 +168,8 @@ class Phantom(Section):
     def start_angle_sd(self) -> float:
         """Standard deviation of the base clamp's slope, rad."""
         return 1e-3 * self.start_angle_sd_mrad
+
+    @property
+    def friction(self) -> float:
+        """Axial friction, N/mm."""
+        return 1e-3 * self.friction_mn_per_mm

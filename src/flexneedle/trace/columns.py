@@ -48,6 +48,7 @@ _FIELDS: dict[str, tuple[tuple[str, _Scalar], ...]] = {
     "decision": (("decision", str),),
     "true_tip": _pose("true"),
     "true_strain_energy": (("true_strain_energy_mj", float),),
+    "true_stretch": (("true_stretch", float),),
     "converged": (("converged", _flag),),
 }
 

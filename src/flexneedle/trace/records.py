@@ -89,7 +89,8 @@ class Period:
     true_tip: Pose | None
     true_strain_energy: float | None
     durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
-    converged: bool = True  # the model's solve of this period
+    converged: bool = True  # the solves of this period, the model's and the virtual phantom's
+    true_stretch: float | None = None  # smallest stretch λ of the true tissue so far
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +102,8 @@ class Insertion:
     periods: tuple[Period, ...]
     outcome: str
     reason: str  # one line; "" when done at the target depth
+    controller: str = ""  # its name
+    phantom: str = ""  # formulation of the virtual phantom, "" on a rig
 
     @property
     def target(self) -> tuple[float, float]:

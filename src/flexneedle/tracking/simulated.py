@@ -1,4 +1,4 @@
-"""A simulated tip tracker with jitter, at a fixed rate."""
+"""A simulated tip tracker: jitter, bias, missing readings, and a delay, at a fixed rate."""
 
 import math
 from collections.abc import Callable
@@ -11,7 +11,9 @@ from flexneedle.ports import Clock, Sample
 class NoisyTracker:
     """Reads `tip_at(time)` → (x, y) in mm every `period` s with white noise of `jitter` mm on each axis.
 
-    A `Tracker`; all it shows of what it measures are noisy samples.
+    A reading arrives `delay` s after it was taken, with the time at which it was taken; `bias` (x, y) in mm is
+    added to all, and a share `missing` of them sees no tip. A `Tracker`; all it shows of what it measures are
+    such samples.
     """
 
     def __init__(
@@ -21,14 +23,19 @@ class NoisyTracker:
         period: float,
         jitter: float,
         rng: np.random.Generator,
+        *,
+        delay: float = 0.0,
+        missing: float = 0.0,
+        bias: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         self._tip_at, self._clock = tip_at, clock
         self._period, self._jitter, self._rng = period, jitter, rng
-        self._taken = 0  # readings so far; number k is taken at k periods
+        self._delay, self._missing, self._bias = delay, missing, bias
+        self._taken = -math.ceil(delay / period - 1e-6)  # the last reading; number k is taken at k periods
 
     def read(self) -> tuple[Sample, ...]:
-        """Return the readings since the last call, oldest first."""
-        due = math.floor(self._clock.now() / self._period + 1e-6)
+        """Return the readings that arrived since the last call, oldest first."""
+        due = math.floor((self._clock.now() - self._delay) / self._period + 1e-6)
         samples = tuple(self._sample(k * self._period) for k in range(self._taken + 1, due + 1))
         self._taken = max(due, self._taken)
         return samples
@@ -36,4 +43,6 @@ class NoisyTracker:
     def _sample(self, time: float) -> Sample:
         x, y = self._tip_at(time)
         noise = self._rng.normal(0.0, self._jitter, 2)
-        return Sample(time, x + float(noise[0]), y + float(noise[1]))
+        if self._missing > 0.0 and self._rng.random() < self._missing:
+            return Sample(time, None, None)
+        return Sample(time, x + self._bias[0] + float(noise[0]), y + self._bias[1] + float(noise[1]))

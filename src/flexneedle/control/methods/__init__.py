@@ -1,0 +1,17 @@
+"""The controllers by name. A further one is a file here with a METHOD, and a line below."""
+
+from flexneedle.control.interface import Method
+from flexneedle.control.methods import ce_mpc, offset_free
+from flexneedle.errors import InputError
+
+__all__ = ["DEFAULT", "METHODS", "method"]
+
+METHODS = {module.METHOD.name: module.METHOD for module in (offset_free, ce_mpc)}
+DEFAULT = offset_free.METHOD.name
+
+
+def method(name: str) -> Method:
+    """Return the controller of this name. Raises InputError with the choices."""
+    if name not in METHODS:
+        raise InputError(f"controller = {name!r}: must be one of {', '.join(METHODS)}")
+    return METHODS[name]

@@ -1,0 +1,28 @@
+"""`ce-mpc`: the paper as written: bang-bang bevel, cross-entropy MPC of advance and guide (eq. 13 to 15).
+
+The measured tip is an essential condition of the solve that takes it in, and released in the prediction.
+"""
+
+import numpy as np
+
+from flexneedle.control import bang_bang, mpc
+from flexneedle.control.interface import Decision, Method, Task
+from flexneedle.control.observer import Beliefs, Estimate
+
+
+def decide(
+    task: Task, memory: None, estimate: Estimate, rng: np.random.Generator
+) -> tuple[Decision, None]:
+    """Bevel by the rule, then the best first step of a short horizon along the plan."""
+    flip, why = bang_bang.decide(task, estimate)
+    choice = mpc.choose(estimate.simulator, task.plan, estimate.state, flip=flip, rng=rng)
+    return Decision((*choice.steps, 1 if flip else -1), why, choice.cost, choice.spread), memory
+
+
+METHOD = Method(
+    "ce-mpc",
+    "the paper as written: the measured tip is released in the prediction",
+    Beliefs(fits_start=False, learns_load=False),
+    begin=lambda _task: None,
+    decide=decide,
+)

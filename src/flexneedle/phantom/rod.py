@@ -1,0 +1,424 @@
+"""A planar, inextensible, unshearable elastic rod in cut tissue, with finite rotations (docs/theory.md section 11).
+
+The needle is a chain of N rigid segments of length h with angles θ_i, hinged by rotational springs: the discrete
+elastica, second order in h. Nodes follow as p_{i+1} = p_i + h τ(θ_i), so the length is kept exactly and the mesh
+travels with the needle. Equilibrium is the minimum of
+
+    E(θ) = Σ ½ B_i (θ_i − θ_{i−1} − κ₀ ℓ_i)² + Σ_i φ_i(p_i, θ_i) + φ_N(p_N)
+
+found by Newton's method. A segment is a stage of an optimal control problem with state (p_i, θ_{i−1}) and control
+θ_i, so that a Newton step is one Riccati sweep from the tip to the base and one pass back, O(N), with true second
+derivatives.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.mechanics.compile import inner, kernel
+
+Floats = NDArray[np.float64]
+
+# Scalars of a rod: base and guide, direction of the bevel, normal offset of the bevel's rest point from the tip,
+# length and pose of the front of the channel, tip pose, end load, results.
+BASE_X, BASE_Y, BASE_TURN, GUIDE_Y, BEVEL, OFFSET, CUT, FRONT_X, FRONT_Y, FRONT_TURN = range(10)
+TIP_X, TIP_Y, TIP_TURN, LOAD_X, LOAD_Y, SLIDE = range(10, 16)
+ITERATIONS, RESIDUAL, CONVERGED, ENERGY, STRAIN_ENERGY, LEAST_STRETCH = range(16, 22)
+BASE_FORCE_X, BASE_FORCE_Y, BASE_MOMENT, GUIDE_FORCE = range(22, 26)
+SIZE = 26
+
+# Rows of the channel, one column a point: place, its distance along the path, its segment, its law.
+C_X, C_Y, C_CUT, C_SEGMENT, C_HEIGHT, C_ALPHA, C_FORCE, C_ENERGY, C_WEIGHT = range(9)
+CHANNEL_ROWS = 9
+
+# Rows of the work array, one column a segment (the last one the tip): node, gradient, Hessian, gains, friction.
+X, Y, GX, GY, GT, HXX, HXY, HYY, HXT, HYT, HTT, K0, K1, K2, K3, FX, FY, TRIAL = range(18)
+WORK_ROWS = 18
+
+TOLERANCE_MM = 1e-9
+MAX_ITERATIONS = 60
+FLOOR_STRETCH = 0.3
+_LONGEST_MM = 2.0  # greatest move of a node in an iteration
+_SMALL_MM = 1e-4  # below it a Newton step is not doubted
+_STEADY = 0.1  # of a segment: how far a foot point may lie outside before its segment changes
+
+
+class Rod(NamedTuple):
+    """Constants: bending stiffness (N·mm²), segment length (mm), natural curvature (1/mm, for bevel +1), bevel
+    offset and length (mm), guide plane (mm, NaN: none), its clearance (mm) and stiffness (N/mm), friction (N/mm),
+    spacing of channel points (mm); tissue by depth in cells of `cell` mm: alpha, height (mm), force (N) and
+    energy (mJ) scales for 1 mm of needle, and layer weight.
+    """
+
+    stiffness: float
+    segment: float
+    curvature: float
+    bevel_offset: float
+    bevel_length: float
+    guide_x: float
+    clearance: float
+    guide_stiffness: float
+    friction: float
+    spacing: float
+    cell: float
+    alpha: Floats
+    height: Floats
+    force: Floats
+    energy: Floats
+    weight: Floats
+
+
+@inner
+def _law(
+    alpha: float, height: float, force: float, energy: float, u: float
+) -> tuple[float, float, float, float]:
+    """dW/du (N), d²W/du² (N/mm), W (mJ) and stretch of a one-term Ogden column displaced by u (mm)."""
+    stretch = 1.0 - abs(u) / height
+    beyond = 0.0
+    lam = stretch
+    if lam < FLOOR_STRETCH:
+        beyond = (FLOOR_STRETCH - lam) * height
+        lam = FLOOR_STRETCH
+    slope = force * (lam ** (-0.5 * alpha - 1.0) - lam ** (alpha - 1.0))
+    k = (
+        force
+        / height
+        * ((0.5 * alpha + 1.0) * lam ** (-0.5 * alpha - 2.0) + (alpha - 1.0) * lam ** (alpha - 2.0))
+    )
+    stored = energy * (2.0 * lam ** (-0.5 * alpha) + lam**alpha - 3.0) + (slope + 0.5 * k * beyond) * beyond
+    slope += k * beyond
+    return (slope if u >= 0.0 else -slope), k, stored, stretch
+
+
+@inner
+def _place(rod: Rod, s: Floats, w: Floats, theta: Floats) -> None:
+    """Nodes from angles; the tip into the scalars."""
+    n = theta.size
+    w[X, 0], w[Y, 0] = s[BASE_X], s[BASE_Y]
+    for i in range(n):
+        w[X, i + 1] = w[X, i] + rod.segment * math.cos(theta[i])
+        w[Y, i + 1] = w[Y, i] + rod.segment * math.sin(theta[i])
+    s[TIP_X], s[TIP_Y], s[TIP_TURN] = w[X, n], w[Y, n], theta[n - 1]
+
+
+@inner
+def _add_guide(rod: Rod, s: Floats, w: Floats, theta: Floats) -> float:
+    """The guide: a stiff wall beyond its clearance, across the needle. Returns its energy (mJ)."""
+    s[GUIDE_FORCE] = 0.0
+    if math.isnan(rod.guide_x) or w[X, theta.size] <= rod.guide_x:
+        return 0.0
+    i = 0
+    while w[X, i + 1] <= rod.guide_x:
+        i += 1
+    reach = rod.guide_x - w[X, i]
+    slope = math.tan(theta[i])
+    square = 1.0 + slope * slope
+    off = w[Y, i] + reach * slope - s[GUIDE_Y]
+    excess = abs(off) - rod.clearance
+    if excess <= 0.0:
+        return 0.0
+    k, f = rod.guide_stiffness, math.copysign(rod.guide_stiffness * excess, off)
+    arm = reach * square
+    w[GX, i] -= f * slope
+    w[GY, i] += f
+    w[GT, i] += f * arm
+    w[HXX, i] += k * slope * slope
+    w[HXY, i] -= k * slope
+    w[HYY, i] += k
+    w[HXT, i] -= k * slope * arm + f * square
+    w[HYT, i] += k * arm
+    w[HTT, i] += k * arm * arm + f * 2.0 * arm * slope
+    s[GUIDE_FORCE] = -f
+    return 0.5 * k * excess * excess
+
+
+@inner
+def _foot(rod: Rod, w: Floats, theta: Floats, x: float, y: float, first: int) -> tuple[int, float]:
+    """Segment under a channel point, and how far along it (mm); looked for from `first`."""
+    i = min(max(first, 0), theta.size - 1)
+    low, high = -_STEADY * rod.segment, (1.0 + _STEADY) * rod.segment
+    along = (x - w[X, i]) * math.cos(theta[i]) + (y - w[Y, i]) * math.sin(theta[i])
+    while along < low and i > 0:
+        i -= 1
+        along = (x - w[X, i]) * math.cos(theta[i]) + (y - w[Y, i]) * math.sin(theta[i])
+    while along > high and i < theta.size - 1:
+        i += 1
+        along = (x - w[X, i]) * math.cos(theta[i]) + (y - w[Y, i]) * math.sin(theta[i])
+    return i, along
+
+
+@inner
+def _add_channel(rod: Rod, s: Floats, w: Floats, theta: Floats, channel: Floats, count: int) -> float:
+    """Tissue at the channel's points, along the normal of the needle. Returns its energy (mJ)."""
+    n = theta.size
+    tip_cos, tip_sin = math.cos(theta[n - 1]), math.sin(theta[n - 1])
+    total, weighted, least = 0.0, 0.0, 1.0
+    for j in range(count):
+        x, y = channel[C_X, j], channel[C_Y, j]
+        behind = (w[X, n] - x) * tip_cos + (w[Y, n] - y) * tip_sin
+        if behind <= 0.0:
+            continue
+        i, along = _foot(rod, w, theta, x, y, int(channel[C_SEGMENT, j]))
+        channel[C_SEGMENT, j] = i
+        nx, ny = -math.sin(theta[i]), math.cos(theta[i])
+        u = (w[X, i] - x) * nx + (w[Y, i] - y) * ny
+        f, k, stored, stretch = _law(
+            channel[C_ALPHA, j], channel[C_HEIGHT, j], channel[C_FORCE, j], channel[C_ENERGY, j], u
+        )
+        ramp = min(1.0, behind / (0.5 * rod.spacing))
+        f, k, stored = f * ramp, k * ramp, stored * ramp
+        w[GX, i] += f * nx
+        w[GY, i] += f * ny
+        w[GT, i] += f * along
+        w[HXX, i] += k * nx * nx
+        w[HXY, i] += k * nx * ny
+        w[HYY, i] += k * ny * ny
+        w[HXT, i] += k * nx * along - f * ny
+        w[HYT, i] += k * ny * along + f * nx
+        w[HTT, i] += k * along * along - f * u
+        total += stored
+        weighted += channel[C_WEIGHT, j] * stored
+        least = min(least, stretch)
+    s[STRAIN_ENERGY], s[LEAST_STRETCH] = weighted, least
+    return total
+
+
+@inner
+def _cut_length(s: Floats) -> float:
+    """How far the tip is past the front of the channel, along its direction (mm); negative if pulled back."""
+    if s[CUT] <= 0.0:  # nothing cut yet: the skin is the front
+        return s[TIP_X] / math.cos(s[TIP_TURN])
+    return (s[TIP_X] - s[FRONT_X]) * math.cos(s[FRONT_TURN]) + (s[TIP_Y] - s[FRONT_Y]) * math.sin(
+        s[FRONT_TURN]
+    )
+
+
+@inner
+def _new_offset(rod: Rod, s: Floats, before: tuple[float, float, float]) -> tuple[float, float]:
+    """(ρ, g): normal offset of the bevel's rest point from the tip after the move, and −dρ/d(drift)."""
+    middle = 0.5 * (before[2] + s[TIP_TURN])
+    drift = -(s[TIP_X] - before[0]) * math.sin(middle) + (s[TIP_Y] - before[1]) * math.cos(middle)
+    cut = _cut_length(s)
+    if cut <= 0.0:
+        return (s[OFFSET] - drift if s[TIP_X] > 0.0 else 0.0), 1.0
+    wanted = s[BEVEL] * rod.bevel_offset
+    start = s[OFFSET] if s[CUT] > 0.0 else 0.0
+    ratio = cut / rod.bevel_length
+    g = -math.expm1(-ratio) / ratio
+    if s[CUT] <= 0.0:
+        drift = 0.0  # the way to the skin is no drift in tissue
+    return wanted + (start - wanted) * math.exp(-ratio) - g * drift, g
+
+
+@inner
+def _add_bevel(rod: Rod, s: Floats, w: Floats, n: int, before: tuple[float, float, float]) -> float:
+    """The bevel's spring, across the tip, in the tissue that it lies in. Returns its energy (mJ)."""
+    if s[TIP_X] <= 0.0:
+        return 0.0
+    offset, g = _new_offset(rod, s, before)
+    turn = s[TIP_TURN]
+    nx, ny, per_x = -math.sin(turn), math.cos(turn), 1.0 / math.cos(turn)
+    front = s[TIP_X] - min(0.0, _cut_length(s)) * math.cos(turn)
+    top, bottom = max(0.0, front - rod.bevel_length / per_x), s[TIP_X]
+    force, stiffness, stored = 0.0, 0.0, 0.0
+    first = int(top / rod.cell)
+    for c in range(first, min(int(bottom / rod.cell), rod.alpha.size - 1) + 1):
+        length = (min(bottom, (c + 1) * rod.cell) - max(top, c * rod.cell)) * per_x
+        if length > 0.0:
+            f, k, e, _ = _law(
+                rod.alpha[c], rod.height[c], rod.force[c] * length, rod.energy[c] * length, -offset
+            )
+            force, stiffness, stored = force + f, stiffness + k, stored + e
+    w[GX, n] += force * nx
+    w[GY, n] += force * ny
+    w[HXX, n] += g * stiffness * nx * nx
+    w[HXY, n] += g * stiffness * nx * ny
+    w[HYY, n] += g * stiffness * ny * ny
+    return stored
+
+
+@inner
+def _assemble(
+    rod: Rod,
+    s: Floats,
+    w: Floats,
+    theta: Floats,
+    channel: Floats,
+    count: int,
+    before: tuple[float, float, float],
+) -> float:
+    """Fill gradient and Hessian rows of the loads; returns the energy that Newton lowers (mJ)."""
+    n = theta.size
+    for row in range(GX, HTT + 1):
+        for i in range(n + 1):
+            w[row, i] = 0.0
+    total = _add_guide(rod, s, w, theta) + _add_channel(rod, s, w, theta, channel, count)
+    spring = _add_bevel(rod, s, w, n, before)
+    work = s[LOAD_X] * w[X, n] + s[LOAD_Y] * w[Y, n]
+    w[GX, n] -= s[LOAD_X]
+    w[GY, n] -= s[LOAD_Y]
+    for i in range(n):
+        w[GX, i] -= w[FX, i]
+        w[GY, i] -= w[FY, i]
+        work += w[FX, i] * w[X, i] + w[FY, i] * w[Y, i]
+    bend = 0.0
+    last = s[BASE_TURN]
+    for i in range(n):
+        length = 0.5 * rod.segment if i == 0 else rod.segment
+        turn = theta[i] - last - s[BEVEL] * rod.curvature * length
+        bend += 0.5 * rod.stiffness / length * turn * turn
+        last = theta[i]
+    s[ENERGY] = bend + total + spring
+    # The spring's force is g times steeper in the rest point than in the tip (`_new_offset`).
+    return bend + total + spring / max(_new_offset(rod, s, before)[1], 1e-6) - work
+
+
+@inner
+def _sweep(rod: Rod, s: Floats, w: Floats, theta: Floats) -> None:
+    """Riccati sweep from the tip to the base: the gains of a Newton step, and what holds the base."""
+    n = theta.size
+    pxx, pxy, pyy, pxt, pyt, ptt = w[HXX, n], w[HXY, n], w[HYY, n], 0.0, 0.0, 0.0
+    qx, qy, qt = w[GX, n], w[GY, n], 0.0
+    ax, ay = w[GX, n], w[GY, n]  # force on the rest of the needle, to be held at this node
+    turn, b = 0.0, 0.0
+    for i in range(n - 1, -1, -1):
+        length = 0.5 * rod.segment if i == 0 else rod.segment
+        b = rod.stiffness / length
+        turn = theta[i] - (s[BASE_TURN] if i == 0 else theta[i - 1]) - s[BEVEL] * rod.curvature * length
+        c, d = rod.segment * math.cos(theta[i]), rod.segment * math.sin(theta[i])
+        wx = w[HXT, i] - pxx * d + pxy * c + pxt
+        wy = w[HYT, i] - pxy * d + pyy * c + pyt
+        rest = w[HTT, i] + d * d * pxx - 2.0 * c * d * pxy + c * c * pyy + 2.0 * (c * pyt - d * pxt) + ptt
+        rest -= ax * c + ay * d
+        if rest <= -0.999 * b:  # buckling: give up the geometric part
+            rest += ax * c + ay * d
+        gradient = w[GT, i] + b * turn - d * qx + c * qy + qt
+        inverse = 1.0 / (b + rest)
+        w[K0, i], w[K1, i], w[K2, i], w[K3, i] = (
+            -gradient * inverse,
+            -wx * inverse,
+            -wy * inverse,
+            b * inverse,
+        )
+        pxx += w[HXX, i] - wx * wx * inverse
+        pxy += w[HXY, i] - wx * wy * inverse
+        pyy += w[HYY, i] - wy * wy * inverse
+        pxt, pyt, ptt = wx * b * inverse, wy * b * inverse, b * rest * inverse
+        qx += w[GX, i] - wx * gradient * inverse
+        qy += w[GY, i] - wy * gradient * inverse
+        qt = -b * turn + b * gradient * inverse
+        ax += w[GX, i]
+        ay += w[GY, i]
+    s[BASE_FORCE_X], s[BASE_FORCE_Y], s[BASE_MOMENT] = ax, ay, -b * turn
+
+
+@inner
+def _newton_step(rod: Rod, w: Floats, theta: Floats) -> float:
+    """Steps of the angles into TRIAL; returns the greatest move of a node (mm)."""
+    dx, dy, last, largest = 0.0, 0.0, 0.0, 0.0
+    for i in range(theta.size):
+        change = w[K0, i] + w[K1, i] * dx + w[K2, i] * dy + w[K3, i] * last
+        w[TRIAL, i] = change
+        dx -= rod.segment * math.sin(theta[i]) * change
+        dy += rod.segment * math.cos(theta[i]) * change
+        last = change
+        largest = max(largest, math.hypot(dx, dy))
+    return largest
+
+
+@inner
+def _lay_friction(rod: Rod, s: Floats, w: Floats, theta: Floats) -> None:
+    """Friction against the last slide, on the part of each segment that is in the tissue."""
+    for i in range(theta.size):
+        left, right = w[X, i], w[X, i + 1]
+        inside = 0.0
+        if right > 0.0 and right > left:
+            inside = rod.segment * min(1.0, right / (right - left))
+        w[FX, i] = -s[SLIDE] * rod.friction * inside * math.cos(theta[i])
+        w[FY, i] = -s[SLIDE] * rod.friction * inside * math.sin(theta[i])
+
+
+@inner
+def _solve(rod: Rod, s: Floats, w: Floats, theta: Floats, channel: Floats, count: int) -> None:
+    """Equilibrium for base, guide, bevel and loads in `s`, in place."""
+    n = theta.size
+    before = (s[TIP_X], s[TIP_Y], s[TIP_TURN])
+    _place(rod, s, w, theta)
+    _lay_friction(rod, s, w, theta)
+    energy = _assemble(rod, s, w, theta, channel, count, before)
+    largest = np.inf
+    iteration = 0
+    while iteration < MAX_ITERATIONS and largest > TOLERANCE_MM:
+        iteration += 1
+        _sweep(rod, s, w, theta)
+        largest = _newton_step(rod, w, theta)
+        share = min(1.0, _LONGEST_MM / max(largest, 1e-300))
+        for _ in range(12):
+            for i in range(n):
+                theta[i] += share * w[TRIAL, i]
+            _place(rod, s, w, theta)
+            trial = _assemble(rod, s, w, theta, channel, count, before)
+            if trial <= energy + 1e-12 or share * largest < _SMALL_MM:
+                break
+            for i in range(n):
+                theta[i] -= share * w[TRIAL, i]
+            share *= 0.5
+        energy = trial
+        if share < 1.0:
+            largest = np.inf
+    _sweep(rod, s, w, theta)
+    s[ITERATIONS], s[RESIDUAL] = iteration, _newton_step(rod, w, theta)
+    s[CONVERGED] = 1.0 if s[RESIDUAL] <= TOLERANCE_MM and math.isfinite(s[TIP_Y]) else 0.0
+    s[OFFSET] = _new_offset(rod, s, before)[0]
+
+
+@inner
+def _extend(rod: Rod, s: Floats, channel: Floats, count: int, segments: int) -> int:
+    """Leave the channel as the tip cut it, its points every `spacing` along the path; returns their number."""
+    cut = _cut_length(s)
+    if s[TIP_X] <= 0.0:
+        s[CUT], s[OFFSET] = 0.0, 0.0
+        return 0
+    if cut <= 0.0:
+        return count
+    if s[CUT] <= 0.0:
+        s[FRONT_X], s[FRONT_Y] = 0.0, s[TIP_Y] - s[TIP_X] * math.tan(s[TIP_TURN])
+    while (count + 0.5) * rod.spacing < s[CUT] + cut and count < channel.shape[1]:
+        share = ((count + 0.5) * rod.spacing - s[CUT]) / cut
+        x = s[FRONT_X] + share * (s[TIP_X] - s[FRONT_X])
+        c = min(int(x / rod.cell), rod.alpha.size - 1)
+        channel[C_X, count] = x
+        channel[C_Y, count] = s[FRONT_Y] + share * (s[TIP_Y] - s[FRONT_Y])
+        channel[C_CUT, count] = (count + 0.5) * rod.spacing
+        channel[C_SEGMENT, count] = segments - 1
+        channel[C_HEIGHT, count], channel[C_ALPHA, count] = rod.height[c], rod.alpha[c]
+        channel[C_FORCE, count] = rod.force[c] * rod.spacing
+        channel[C_ENERGY, count] = rod.energy[c] * rod.spacing
+        channel[C_WEIGHT, count] = rod.weight[c]
+        count += 1
+    s[CUT] += cut
+    s[FRONT_X], s[FRONT_Y], s[FRONT_TURN] = s[TIP_X], s[TIP_Y], s[TIP_TURN]
+    return count
+
+
+@kernel
+def step(
+    rod: Rod, s: Floats, theta: Floats, channel: Floats, count: int, w: Floats, command: Floats
+) -> int:
+    """Move base and guide by (db_x, db_y, db_theta, dg_y, flip), find the equilibrium, cut; all in place.
+
+    s (SIZE,), theta (N,), channel (CHANNEL_ROWS, M) of which `count` columns hold points, w (WORK_ROWS, N + 1).
+    Returns the new count.
+    """
+    s[BASE_X] += command[0]
+    s[BASE_Y] += command[1]
+    s[BASE_TURN] += command[2]
+    s[GUIDE_Y] += command[3]
+    if command[4] > 0.0:
+        s[BEVEL] = -s[BEVEL]
+    if command[0] != 0.0:
+        s[SLIDE] = math.copysign(1.0, command[0])
+    _solve(rod, s, w, theta, channel, count)
+    return _extend(rod, s, channel, count, theta.size)
