@@ -176,16 +176,6 @@ def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> C
     return rig.driver.apply(command, max(1, readings) * reading)
 
 
-def _carry_out(scenario: Scenario, rig: Rig, command: Command, held: bool) -> Command:
-    """Move, for as long as the speed asks, rounded up to whole readings of the tracker; or wait for one."""
-    reading = scenario.tracker.period
-    if held:
-        rig.clock.wait(reading)
-        return command
-    readings = math.ceil(abs(command[0]) / scenario.setup.insertion_speed_mm_s / reading - 1e-6)
-    return rig.driver.apply(command, max(1, readings) * reading)
-
-
 def _see(
     scenario: Scenario, estimate: observer.Estimate, applied: Command, begun: float, rig: Rig
 ) -> tuple[observer.Estimate, Sample, str]:
