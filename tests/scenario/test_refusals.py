@@ -43,8 +43,12 @@ POSITIVE = [
     "control.innovation_limit_mm",
     "control.hold_limit_s",
     "control.stale_after_s",
+    "control.resolved_rate.lookahead_mm",
+    "control.broyden_mpc.max_guide_travel_mm",
     "tracker.rate_hz",
+    "phantom.variation_length_mm",
     "phantom.contact_spacing_mm",
+    "phantom.element_mm",
     "phantom.step_mm",
 ]
 
@@ -70,9 +74,28 @@ NOT_NEGATIVE = [
     "control.flip_dead_band",
     "control.start_offset_sd_mm",
     "control.start_angle_sd_mrad",
+    "control.bevel_only.curvature_per_m",
+    "control.bevel_only.flip_dead_band",
+    "control.resolved_rate.curvature_per_m",
+    "control.resolved_rate.flip_dead_band",
+    "control.resolved_rate.gain",
+    "control.resolved_rate.damping",
+    "control.broyden_mpc.update_gain",
+    "control.broyden_mpc.guide_weight",
+    "control.broyden_mpc.guide_effect",
     "tracker.jitter_mm",
+    "phantom.shear_modulus_variation",
+    "phantom.layer_shift_sd_mm",
     "phantom.start_offset_sd_mm",
     "phantom.start_angle_sd_mrad",
+    "phantom.initial_bend_mm",
+    "phantom.run_out_mm",
+    "phantom.guide_clearance_mm",
+    "phantom.friction_mn_per_mm",
+    "phantom.motor_resolution_mm",
+    "phantom.delay_periods",
+    "phantom.missing_fraction",
+    "phantom.tracker_bias_mm",
 ]
 
 COUNTS = {
@@ -83,6 +106,7 @@ COUNTS = {
     "control.samples": (2, 100_000),
     "control.iterations": (1, 1_000),
     "control.horizon": (1, 1_000),
+    "control.broyden_mpc.horizon": (1, 20),
 }
 
 RULES = [
@@ -124,6 +148,10 @@ RULES = [
     ("plan.smoothing", 1.0, "must be below 1"),
     ("plan.steering_stiffness_factor", 0.0, ABOVE_ZERO),
     ("control.load_gain", 1.1, "must be at most 1"),
+    ("control.broyden_mpc.update_gain", 1.1, "must be at most 1"),
+    ("control.resolved_rate.flip_dead_band", 1.1, "must be at most 1"),
+    ("phantom.shear_modulus_variation", 1.1, "must be at most 1"),
+    ("phantom.missing_fraction", 1.0, "must be below 1"),
     ("phantom.shear_modulus_factor[0]", 0.0, ABOVE_ZERO),
     ("phantom.bevel_factor[0]", -0.1, "must be at least 0"),
     ("phantom.shear_modulus_factor", [1.6, 0.6], "the low end must not be above the high end"),

@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Task
-from flexneedle.control.observer import Estimate
 
 Floats = NDArray[np.float64]
 _SURE = 3.0  # standard deviations of a reading: no bevel turn for less

@@ -3,11 +3,11 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from flexneedle.control.observer import Beliefs, Estimate
+from flexneedle.control.estimate import Estimate
 from flexneedle.ports import Command
 from flexneedle.scenario import Scenario
 from flexneedle.simulator import Simulator, State
@@ -50,17 +50,25 @@ def at_depth(task: Task, _memory: Any, estimate: Estimate) -> bool:
     )
 
 
+class Observer(Protocol):
+    """What a controller lets be believed."""
+
+    def begin(self, simulator: Simulator, bevel: int) -> Estimate:
+        """The belief before the first reading."""
+        ...
+
+
 @dataclass(frozen=True)
 class Method:
     """A controller. Memory is a frozen value of its own kind: what it carries from one period to the next.
 
-    name: as in `--controller`; summary: one line for lists; beliefs: what its observer may learn;
+    name: as in `--controller`; summary: one line for lists; beliefs: its observer;
     begin: memory at the start; decide: the next command and the memory after it; arrived: whether it is done.
     """
 
     name: str
     summary: str
-    beliefs: Beliefs
+    beliefs: Observer
     begin: Callable[[Task], Any]
     decide: Callable[[Task, Any, Estimate, np.random.Generator], tuple[Decision, Any]]
     arrived: Callable[[Task, Any, Estimate], bool] = at_depth

@@ -1,4 +1,4 @@
-"""What the controller believes: the model's state, corrected by the tracker so that its prediction has no offset.
+"""An observer that corrects the state: the model follows the tracker, so that its prediction has no offset.
 
 Readings come late. Each belongs to the move in which it was taken; the belief is corrected there, and the moves
 since are predicted again (a fixed-lag filter).
@@ -12,17 +12,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexneedle.control.estimate import Estimate, Floats, Move, along, assigned, place
 from flexneedle.ports import Command, Sample
 from flexneedle.simulator import Control, Simulator, State
 
-Floats = NDArray[np.float64]
+__all__ = ["Beliefs", "Corrected", "Estimate"]
 
 
 @dataclass(frozen=True)
 class Beliefs:
-    """What an observer may learn: where the clamp holds the base, in air; a tip load, in tissue.
+    """What this observer may learn: where the clamp holds the base, in air; a tip load, in tissue.
 
     Without the load the measured tip is released again in the prediction, as in the paper.
     """
@@ -30,24 +30,20 @@ class Beliefs:
     fits_start: bool = True
     learns_load: bool = True
 
-
-@dataclass(frozen=True)
-class Move:
-    """What the driver did from `begun` to `ended` (s), and the good readings taken meanwhile."""
-
-    begun: float
-    ended: float
-    applied: Command
-    samples: tuple[Sample, ...] = ()
+    def begin(self, simulator: Simulator, bevel: int) -> "Corrected":
+        """Believe in a straight start, with the prior of the scenario."""
+        control = simulator.scenario.control
+        prior = np.diag([control.start_offset_sd_mm**2, control.start_angle_sd**2])
+        state = simulator.start(bevel)
+        return Corrected(simulator, self, state, state, prior, state.tip[None])
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
-    """What is believed: `state` is that of now.
+class Corrected:
+    """The belief; an `Estimate`. `state` is that of now.
 
     past: the belief before the first of `moves`, those of which readings may still come; tips (k + 1, 3): believed
-    tip pose at their ends, the start first; covariance (2, 2) of base y (mm) and turn (rad); innovation: that of
-    the last corrected move (mm); measured: tip (x, y) seen at its end (mm), None before the first reading.
+    tip pose at their ends, the start first; covariance (2, 2) of base y (mm) and turn (rad), before `moves`.
     """
 
     simulator: Simulator
@@ -66,60 +62,40 @@ class Estimate:
         return self.state.tip
 
     def tip_at(self, time: float) -> tuple[float, float]:
-        """Where the tip was believed to be (mm) at `time`, each move taken as even."""
-        if not self.moves:
-            x, y = self.tip[:2]
-            return float(x), float(y)
-        times = [self.moves[0].begun, *(move.ended for move in self.moves)]
-        return float(np.interp(time, times, self.tips[:, 0])), float(np.interp(time, times, self.tips[:, 1]))
+        """Where the tip was believed to be (mm) at `time`."""
+        return along(self.moves, self.tips, time)
+
+    def unseen(self) -> "Corrected":
+        """The same without an innovation."""
+        return replace(self, innovation=(0.0, 0.0))
+
+    def move(self, applied: Command, begun: float, ended: float) -> "Corrected":
+        """Move the believed needle as the driver did, from `begun` to `ended` (s)."""
+        state = self.simulator.step(self.state, Control.from_row(applied))
+        tips = np.concatenate([self.tips, state.tip[None]])
+        return replace(self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)))
+
+    def observe(self, samples: Sequence[Sample]) -> "Corrected":
+        """Correct by good samples (newest last); a move is closed once a reading of its end is in."""
+        moves = assigned(self.moves, samples)
+        newest = max((sample.time for sample in samples), default=-np.inf)
+        at = replace(self, state=self.past, moves=moves)
+        past, closed, tips = at, 0, [at.tip]
+        for k, done in enumerate(moves):
+            at = _followed(at, done)
+            tips.append(at.tip)
+            if closed == k and newest >= done.ended - 1e-9:
+                past, closed = at, k + 1
+        return replace(
+            at,
+            past=past.state,
+            covariance=past.covariance,
+            moves=moves[closed:],
+            tips=np.array(tips[closed:]),
+        )
 
 
-def begin(simulator: Simulator, bevel: int, beliefs: Beliefs = Beliefs()) -> Estimate:  # noqa: B008 - frozen
-    """Believe in a straight start, with the prior of the scenario."""
-    control = simulator.scenario.control
-    prior = np.diag([control.start_offset_sd_mm**2, control.start_angle_sd**2])
-    state = simulator.start(bevel)
-    return Estimate(simulator, beliefs, state, state, prior, state.tip[None])
-
-
-def move(estimate: Estimate, applied: Command, begun: float, ended: float) -> Estimate:
-    """Move the believed needle as the driver did, from `begun` to `ended` (s)."""
-    state = estimate.simulator.step(estimate.state, Control.from_row(applied))
-    return replace(
-        estimate,
-        state=state,
-        tips=np.concatenate([estimate.tips, state.tip[None]]),
-        moves=(*estimate.moves, Move(begun, ended, applied)),
-    )
-
-
-def observe(estimate: Estimate, samples: Sequence[Sample]) -> Estimate:
-    """Correct the belief by good samples (newest last); a move is closed once a reading of its end is in."""
-    moves = _assigned(estimate.moves, samples)
-    newest = max((sample.time for sample in samples), default=-np.inf)
-    at = replace(estimate, state=estimate.past, moves=moves)
-    past, closed, tips = at, 0, [at.tip]
-    for k, done in enumerate(moves):
-        at = _followed(at, done)
-        tips.append(at.tip)
-        if closed == k and newest >= done.ended - 1e-9:
-            past, closed = at, k + 1
-    return replace(
-        at, past=past.state, covariance=past.covariance, moves=moves[closed:], tips=np.array(tips[closed:])
-    )
-
-
-def _assigned(moves: tuple[Move, ...], samples: Sequence[Sample]) -> tuple[Move, ...]:
-    """Give each sample to the move in which it was taken; one of before to the first, one of after to the last."""
-    ends = np.array([done.ended for done in moves[:-1]])
-    owner = np.searchsorted(ends, [sample.time - 1e-9 for sample in samples])
-    return tuple(
-        replace(done, samples=done.samples + tuple(s for s, k in zip(samples, owner, strict=True) if k == j))
-        for j, done in enumerate(moves)
-    )
-
-
-def _followed(at: Estimate, done: Move) -> Estimate:
+def _followed(at: Corrected, done: Move) -> Corrected:
     """The belief after a move: predicted, and corrected by the mean innovation of its readings."""
     before, predicted = at.tip, at.simulator.step(at.state, Control.from_row(done.applied))
     if not done.samples:
@@ -139,23 +115,13 @@ def _followed(at: Estimate, done: Move) -> Estimate:
     return _fit_start(at, predicted, float(seen[1]), float(noise))
 
 
-def predicted_tip(
-    before: Floats, after: Floats, begun: float, ended: float, time: float
-) -> tuple[float, float]:
-    """Where the model had its tip (mm) at `time` within a move, assumed even."""
-    part = 1.0 if ended <= begun else min(1.0, max(0.0, (time - begun) / (ended - begun)))
-    x, y = before[:2] + part * (after[:2] - before[:2])
-    return float(x), float(y)
+def _innovation(before: Floats, after: Floats, done: Move, sample: Sample) -> Floats:
+    """Reading (mm) less prediction at its time, the move taken as even, shape (2,)."""
+    expected: Floats = before[:2] + done.part(sample.time) * (after[:2] - before[:2])
+    return np.asarray(place(sample)) - expected
 
 
-def _innovation(before: Floats, after: Floats, done: Move, sample: Sample) -> tuple[float, float]:
-    if sample.x is None or sample.y is None:
-        raise ValueError("an empty sample was not sorted out")
-    x, y = predicted_tip(before, after, done.begun, done.ended, sample.time)
-    return sample.x - x, sample.y - y
-
-
-def _fit_start(at: Estimate, predicted: State, seen: float, noise: float) -> Estimate:
+def _fit_start(at: Corrected, predicted: State, seen: float, noise: float) -> Corrected:
     """One step of recursive least squares on base y and turn; linear, since nothing but the guide touches."""
     simulator = at.simulator
     sensitivity = np.array(
@@ -177,7 +143,7 @@ def _tip_shift(simulator: Simulator, state: State, base_y: float, base_turn: flo
     return float(simulator.step(moved, Control()).tip[1] - state.tip[1])
 
 
-def _held(at: Estimate, predicted: State) -> State:
+def _held(at: Corrected, predicted: State) -> State:
     """The state with its tip where it was seen, and the load that this takes, low-passed, if it is learnt."""
     held = at.simulator.assimilate(predicted, np.add(predicted.tip[:2], at.innovation).tolist()).state
     if not at.beliefs.learns_load:

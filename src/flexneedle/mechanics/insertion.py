@@ -56,6 +56,38 @@ def advance(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, command
     return settle(model, s, rest, u, w, math.nan)
 
 
+@kernel
+def replay(
+    model: Model,
+    s: Floats,
+    rest: Floats,
+    u: Floats,
+    w: Floats,
+    controls: Floats,
+    bevel: Floats,
+    tips: Floats,
+) -> int:
+    """Carry out `controls` (m, 5) one after the other, each with its factor on the bevel offset, bevel (m,);
+    fills tips (m, 3).
+
+    Other arrays and result as in `settle`.
+    """
+    count = 0
+    for k in range(controls.shape[0]):
+        now = Model(
+            model.bending_stiffness,
+            model.length,
+            model.bevel_offset * bevel[k],
+            model.bevel_length,
+            model.nodes,
+            model.layers,
+            model.curvature,
+        )
+        count = advance(now, s, rest, u, w, controls[k])
+        tips[k, 0], tips[k, 1], tips[k, 2] = s[nd.TIP_X], s[nd.TIP_Y], s[nd.TIP_TURN]
+    return count
+
+
 @inner
 def _strain_energy(model: Model, w: Floats, count: int) -> float:
     """Tissue strain energy Σ w_c W (mJ) of the contacts after a solve (paper eq. 12)."""

@@ -40,7 +40,10 @@ class Layers(NamedTuple):
 
 
 class Model(NamedTuple):
-    """A needle in layered tissue: bending stiffness (N·mm²), length (mm), bevel offset and length (mm)."""
+    """A needle in layered tissue: bending stiffness (N·mm²), length (mm), bevel offset and length (mm).
+
+    curvature: of the free needle (1/mm), for bevel +1; it turns with the bevel.
+    """
 
     bending_stiffness: float
     length: float
@@ -48,6 +51,7 @@ class Model(NamedTuple):
     bevel_length: float
     nodes: Nodes
     layers: Layers
+    curvature: float = 0.0
 
 
 def tissue_layers(
@@ -90,3 +94,18 @@ def insert_essential(nodes: Nodes, x: Floats) -> Nodes:
     values: tuple[Any, ...] = (x, ESSENTIAL, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
     arrays: tuple[Any, ...] = nodes
     return Nodes(*(np.insert(array, place, value) for array, value in zip(arrays, values, strict=True)))
+
+
+def adapted(model: Model, stiffness: Floats, bevel: float, bend: float) -> Model:
+    """The model with factors on the modulus of each layer (k,) and on the bevel offset, and a natural bend.
+
+    bend: distance (mm) of the free tip from the straight, for bevel +1.
+    """
+    layer = np.searchsorted(model.layers.end, model.nodes.x, side="right")
+    nodes, layers = model.nodes, model.layers
+    return model._replace(
+        bevel_offset=model.bevel_offset * bevel,
+        nodes=nodes._replace(force=nodes.force * stiffness[layer], energy=nodes.energy * stiffness[layer]),
+        layers=layers._replace(force=layers.force * stiffness, energy=layers.energy * stiffness),
+        curvature=2.0 * bend / model.length**2,
+    )

@@ -49,12 +49,14 @@ def _sweep_out(
     flexibility = 1.0 / model.bending_stiffness
     x, a1, a2 = s[BASE_X], s[BASE_Y], s[BASE_TURN]
     g1, g2, b11, b12, b22 = 0.0, 0.0, 0.0, 0.0, 0.0
+    bend = s[BEVEL] * model.curvature
     per_length = 1.0 / (tip_x - s[CUT_X]) if fresh < count else 0.0
     path_y = (1.0 - s[COUPLING]) * s[PATH_Y]
     for i in range(count + 1):
         length = (nodes.x[i] if i < count else tip_x) - x
         x += length
-        a1 += length * a2
+        a1 += length * (a2 + 0.5 * length * bend)
+        a2 += length * bend
         g1 += length * g2
         turn = length * flexibility
         b11 += length * (2.0 * b12 + length * (b22 + turn * (1.0 / 3.0)))
@@ -184,6 +186,7 @@ def _sweep_back(
     """From the tip to the base: positions, loads and new compressions into `w`, the shortening ½∫y'² (mm) returned."""
     nodes = model.nodes
     flexibility = 1.0 / model.bending_stiffness
+    bend = s[BEVEL] * model.curvature
     x, y, turn, shear = tip
     y_tip = y
     moment = 0.0
@@ -191,7 +194,7 @@ def _sweep_back(
     for i in range(count - 1, -2, -1):
         length = x - (nodes.x[i] if i >= 0 else s[BASE_X])
         x -= length
-        middle = turn - (0.5 * moment + 0.125 * shear * length) * length * flexibility
+        middle = turn - (0.5 * moment + 0.125 * shear * length) * length * flexibility - 0.5 * length * bend
         moment += shear * length
         right = turn
         if i < 0:

@@ -38,9 +38,7 @@ class Phantom:
 
     def condition(self) -> Condition:
         """The truth, for the record; no controller gets it. The stretch is the smallest so far."""
-        return Condition(
-            self._tip(), self._plant.strain_energy, self._least_stretch, self._plant.converged
-        )
+        return Condition(self._tip(), self._plant.strain_energy, self._least_stretch, self._plant.converged)
 
     def now(self) -> float:
         """Seconds since the start."""

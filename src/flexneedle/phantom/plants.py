@@ -1,6 +1,7 @@
 """The needle in the tank, in two formulations: the geometrically exact rod, and the controller's own kind of model."""
 
 import math
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -119,9 +120,7 @@ class ExactPlant:
 
     def step(self, row: Floats) -> None:
         """Move, and cut."""
-        self._count = rd.step(
-            self.rod, self._s, self._theta, self._channel, self._count, self._work, row
-        )
+        self._count = rd.step(self.rod, self._s, self._theta, self._channel, self._count, self._work, row)
         self._converged &= bool(self._s[rd.CONVERGED] > 0.0)
 
     @property
@@ -199,7 +198,7 @@ def build_rod(truth: Truth, segments: int) -> rd.Rod:
     )
 
 
-PLANTS = {"exact": ExactPlant, "model": ModelPlant}
+PLANTS: dict[str, Callable[[Truth, int], Plant]] = {"exact": ExactPlant, "model": ModelPlant}
 DEFAULT_PLANT = "exact"
 
 
@@ -207,5 +206,4 @@ def plant(name: str, truth: Truth, bevel: int) -> Plant:
     """Return the plant of this name at the start. Raises InputError with the choices."""
     if name not in PLANTS:
         raise InputError(f"phantom = {name!r}: must be one of {', '.join(PLANTS)}")
-    made: Plant = PLANTS[name](truth, bevel)
-    return made
+    return PLANTS[name](truth, bevel)

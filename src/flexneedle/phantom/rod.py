@@ -22,26 +22,30 @@ from flexneedle.mechanics.compile import inner, kernel
 Floats = NDArray[np.float64]
 
 # Scalars of a rod: base and guide, direction of the bevel, normal offset of the bevel's rest point from the tip,
-# length and pose of the front of the channel, tip pose, end load, results.
+# length and pose of the front of the channel, tip pose, end load, results; CURVED is 1 if the Hessian has all
+# second derivatives, 0 for those of Gauss and Newton, which are never negative.
 BASE_X, BASE_Y, BASE_TURN, GUIDE_Y, BEVEL, OFFSET, CUT, FRONT_X, FRONT_Y, FRONT_TURN = range(10)
 TIP_X, TIP_Y, TIP_TURN, LOAD_X, LOAD_Y, SLIDE = range(10, 16)
 ITERATIONS, RESIDUAL, CONVERGED, ENERGY, STRAIN_ENERGY, LEAST_STRETCH = range(16, 22)
-BASE_FORCE_X, BASE_FORCE_Y, BASE_MOMENT, GUIDE_FORCE = range(22, 26)
-SIZE = 26
+BASE_FORCE_X, BASE_FORCE_Y, BASE_MOMENT, GUIDE_FORCE, CURVED = range(22, 27)
+SIZE = 27
 
 # Rows of the channel, one column a point: place, its distance along the path, its segment, its law.
 C_X, C_Y, C_CUT, C_SEGMENT, C_HEIGHT, C_ALPHA, C_FORCE, C_ENERGY, C_WEIGHT = range(9)
 CHANNEL_ROWS = 9
 
-# Rows of the work array, one column a segment (the last one the tip): node, gradient, Hessian, gains, friction.
-X, Y, GX, GY, GT, HXX, HXY, HYY, HXT, HYT, HTT, K0, K1, K2, K3, FX, FY, TRIAL = range(18)
-WORK_ROWS = 18
+# Rows of the work array, one column a segment (the last one the tip): node, gradient, Hessian, gains,
+# friction, Newton step, bending moment before it.
+X, Y, GX, GY, GT, HXX, HXY, HYY, HXT, HYT, HTT, K0, K1, K2, K3, FX, FY, TRIAL, MOMENT = range(19)
+WORK_ROWS = 19
 
 TOLERANCE_MM = 1e-9
+ACCEPTED_MM = 1e-6  # where a point grows in or the tip crosses the skin, a solve may stall short of it
 MAX_ITERATIONS = 60
 FLOOR_STRETCH = 0.3
 _LONGEST_MM = 2.0  # greatest move of a node in an iteration
-_SMALL_MM = 1e-4  # below it a Newton step is not doubted
+_SMALL_MM = 1e-8  # below it a Newton step is not doubted
+_HALVINGS = 16  # from the longest to a small one
 _STEADY = 0.1  # of a segment: how far a foot point may lie outside before its segment changes
 
 
@@ -127,11 +131,11 @@ def _add_guide(rod: Rod, s: Floats, w: Floats, theta: Floats) -> float:
     w[HXX, i] += k * slope * slope
     w[HXY, i] -= k * slope
     w[HYY, i] += k
-    w[HXT, i] -= k * slope * arm + f * square
+    w[HXT, i] -= k * slope * arm + s[CURVED] * f * square
     w[HYT, i] += k * arm
-    w[HTT, i] += k * arm * arm + f * 2.0 * arm * slope
+    w[HTT, i] += k * arm * arm + s[CURVED] * f * 2.0 * arm * slope
     s[GUIDE_FORCE] = -f
-    return 0.5 * k * excess * excess
+    return float(0.5 * k * excess * excess)
 
 
 @inner
@@ -175,6 +179,7 @@ def _add_channel(rod: Rod, s: Floats, w: Floats, theta: Floats, channel: Floats,
         w[HXX, i] += k * nx * nx
         w[HXY, i] += k * nx * ny
         w[HYY, i] += k * ny * ny
+        f *= s[CURVED]
         w[HXT, i] += k * nx * along - f * ny
         w[HYT, i] += k * ny * along + f * nx
         w[HTT, i] += k * along * along - f * u
@@ -189,10 +194,9 @@ def _add_channel(rod: Rod, s: Floats, w: Floats, theta: Floats, channel: Floats,
 def _cut_length(s: Floats) -> float:
     """How far the tip is past the front of the channel, along its direction (mm); negative if pulled back."""
     if s[CUT] <= 0.0:  # nothing cut yet: the skin is the front
-        return s[TIP_X] / math.cos(s[TIP_TURN])
-    return (s[TIP_X] - s[FRONT_X]) * math.cos(s[FRONT_TURN]) + (s[TIP_Y] - s[FRONT_Y]) * math.sin(
-        s[FRONT_TURN]
-    )
+        return float(s[TIP_X] / math.cos(s[TIP_TURN]))
+    dx, dy = s[TIP_X] - s[FRONT_X], s[TIP_Y] - s[FRONT_Y]
+    return float(dx * math.cos(s[FRONT_TURN]) + dy * math.sin(s[FRONT_TURN]))
 
 
 @inner
@@ -204,18 +208,16 @@ def _new_offset(rod: Rod, s: Floats, before: tuple[float, float, float]) -> tupl
     if cut <= 0.0:
         return (s[OFFSET] - drift if s[TIP_X] > 0.0 else 0.0), 1.0
     wanted = s[BEVEL] * rod.bevel_offset
-    start = s[OFFSET] if s[CUT] > 0.0 else 0.0
+    start = s[OFFSET] if s[CUT] > 0.0 else wanted  # the spring enters the skin fully compressed
     ratio = cut / rod.bevel_length
     g = -math.expm1(-ratio) / ratio
-    if s[CUT] <= 0.0:
-        drift = 0.0  # the way to the skin is no drift in tissue
     return wanted + (start - wanted) * math.exp(-ratio) - g * drift, g
 
 
 @inner
 def _add_bevel(rod: Rod, s: Floats, w: Floats, n: int, before: tuple[float, float, float]) -> float:
     """The bevel's spring, across the tip, in the tissue that it lies in. Returns its energy (mJ)."""
-    if s[TIP_X] <= 0.0:
+    if not s[TIP_X] > 0.0:  # nor if it is lost
         return 0.0
     offset, g = _new_offset(rod, s, before)
     turn = s[TIP_TURN]
@@ -248,53 +250,49 @@ def _assemble(
     channel: Floats,
     count: int,
     before: tuple[float, float, float],
-) -> float:
-    """Fill gradient and Hessian rows of the loads; returns the energy that Newton lowers (mJ)."""
+) -> None:
+    """Fill gradient and Hessian rows of the loads; the energy stored (mJ) into the scalars."""
     n = theta.size
     for row in range(GX, HTT + 1):
         for i in range(n + 1):
             w[row, i] = 0.0
     total = _add_guide(rod, s, w, theta) + _add_channel(rod, s, w, theta, channel, count)
-    spring = _add_bevel(rod, s, w, n, before)
-    work = s[LOAD_X] * w[X, n] + s[LOAD_Y] * w[Y, n]
+    total += _add_bevel(rod, s, w, n, before)
     w[GX, n] -= s[LOAD_X]
     w[GY, n] -= s[LOAD_Y]
     for i in range(n):
         w[GX, i] -= w[FX, i]
         w[GY, i] -= w[FY, i]
-        work += w[FX, i] * w[X, i] + w[FY, i] * w[Y, i]
-    bend = 0.0
     last = s[BASE_TURN]
     for i in range(n):
-        length = 0.5 * rod.segment if i == 0 else rod.segment
+        length = 0.5 * rod.segment if i == 0 else rod.segment  # half a segment from the clamp
         turn = theta[i] - last - s[BEVEL] * rod.curvature * length
-        bend += 0.5 * rod.stiffness / length * turn * turn
+        w[MOMENT, i] = rod.stiffness / length * turn
+        total += 0.5 * w[MOMENT, i] * turn
         last = theta[i]
-    s[ENERGY] = bend + total + spring
-    # The spring's force is g times steeper in the rest point than in the tip (`_new_offset`).
-    return bend + total + spring / max(_new_offset(rod, s, before)[1], 1e-6) - work
+    s[ENERGY] = total
 
 
 @inner
-def _sweep(rod: Rod, s: Floats, w: Floats, theta: Floats) -> None:
-    """Riccati sweep from the tip to the base: the gains of a Newton step, and what holds the base."""
+def _sweep(rod: Rod, s: Floats, w: Floats, theta: Floats) -> bool:
+    """Riccati sweep from the tip to the base: the gains of a Newton step, and what holds the base.
+
+    Returns False if the Hessian is not positive definite, where a Newton step may lead uphill.
+    """
     n = theta.size
     pxx, pxy, pyy, pxt, pyt, ptt = w[HXX, n], w[HXY, n], w[HYY, n], 0.0, 0.0, 0.0
     qx, qy, qt = w[GX, n], w[GY, n], 0.0
     ax, ay = w[GX, n], w[GY, n]  # force on the rest of the needle, to be held at this node
-    turn, b = 0.0, 0.0
     for i in range(n - 1, -1, -1):
-        length = 0.5 * rod.segment if i == 0 else rod.segment
-        b = rod.stiffness / length
-        turn = theta[i] - (s[BASE_TURN] if i == 0 else theta[i - 1]) - s[BEVEL] * rod.curvature * length
-        c, d = rod.segment * math.cos(theta[i]), rod.segment * math.sin(theta[i])
+        b = rod.stiffness / (0.5 * rod.segment if i == 0 else rod.segment)
+        c, d = w[X, i + 1] - w[X, i], w[Y, i + 1] - w[Y, i]
         wx = w[HXT, i] - pxx * d + pxy * c + pxt
         wy = w[HYT, i] - pxy * d + pyy * c + pyt
         rest = w[HTT, i] + d * d * pxx - 2.0 * c * d * pxy + c * c * pyy + 2.0 * (c * pyt - d * pxt) + ptt
-        rest -= ax * c + ay * d
-        if rest <= -0.999 * b:  # buckling: give up the geometric part
-            rest += ax * c + ay * d
-        gradient = w[GT, i] + b * turn - d * qx + c * qy + qt
+        rest -= s[CURVED] * (ax * c + ay * d)
+        if rest <= -0.999 * b:
+            return False
+        gradient = w[GT, i] + w[MOMENT, i] - d * qx + c * qy + qt
         inverse = 1.0 / (b + rest)
         w[K0, i], w[K1, i], w[K2, i], w[K3, i] = (
             -gradient * inverse,
@@ -308,24 +306,38 @@ def _sweep(rod: Rod, s: Floats, w: Floats, theta: Floats) -> None:
         pxt, pyt, ptt = wx * b * inverse, wy * b * inverse, b * rest * inverse
         qx += w[GX, i] - wx * gradient * inverse
         qy += w[GY, i] - wy * gradient * inverse
-        qt = -b * turn + b * gradient * inverse
+        qt = -w[MOMENT, i] + b * gradient * inverse
         ax += w[GX, i]
         ay += w[GY, i]
-    s[BASE_FORCE_X], s[BASE_FORCE_Y], s[BASE_MOMENT] = ax, ay, -b * turn
+    s[BASE_FORCE_X], s[BASE_FORCE_Y], s[BASE_MOMENT] = ax, ay, -w[MOMENT, 0]
+    return True
 
 
 @inner
-def _newton_step(rod: Rod, w: Floats, theta: Floats) -> float:
+def _newton_step(w: Floats, n: int) -> float:
     """Steps of the angles into TRIAL; returns the greatest move of a node (mm)."""
     dx, dy, last, largest = 0.0, 0.0, 0.0, 0.0
-    for i in range(theta.size):
+    for i in range(n):
         change = w[K0, i] + w[K1, i] * dx + w[K2, i] * dy + w[K3, i] * last
         w[TRIAL, i] = change
-        dx -= rod.segment * math.sin(theta[i]) * change
-        dy += rod.segment * math.cos(theta[i]) * change
+        dx -= (w[Y, i + 1] - w[Y, i]) * change
+        dy += (w[X, i + 1] - w[X, i]) * change
         last = change
         largest = max(largest, math.hypot(dx, dy))
     return largest
+
+
+@inner
+def _slope(w: Floats, n: int) -> float:
+    """Work of what is out of balance at these angles, along the step in TRIAL (mJ); negative while it leads on."""
+    dx, dy, last, total = 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        change = w[TRIAL, i]
+        total += w[GX, i] * dx + w[GY, i] * dy + w[GT, i] * change + w[MOMENT, i] * (change - last)
+        dx -= (w[Y, i + 1] - w[Y, i]) * change
+        dy += (w[X, i + 1] - w[X, i]) * change
+        last = change
+    return float(total + w[GX, n] * dx + w[GY, n] * dy)
 
 
 @inner
@@ -347,30 +359,36 @@ def _solve(rod: Rod, s: Floats, w: Floats, theta: Floats, channel: Floats, count
     before = (s[TIP_X], s[TIP_Y], s[TIP_TURN])
     _place(rod, s, w, theta)
     _lay_friction(rod, s, w, theta)
-    energy = _assemble(rod, s, w, theta, channel, count, before)
+    s[CURVED] = 1.0
+    _assemble(rod, s, w, theta, channel, count, before)
     largest = np.inf
     iteration = 0
     while iteration < MAX_ITERATIONS and largest > TOLERANCE_MM:
         iteration += 1
-        _sweep(rod, s, w, theta)
-        largest = _newton_step(rod, w, theta)
+        if not _sweep(rod, s, w, theta):  # about to buckle, or a guess far off
+            s[CURVED] = 0.0
+            _assemble(rod, s, w, theta, channel, count, before)
+            _sweep(rod, s, w, theta)
+            s[CURVED] = 1.0
+        largest = _newton_step(w, n)
         share = min(1.0, _LONGEST_MM / max(largest, 1e-300))
-        for _ in range(12):
+        # The forces are judged, not an energy: bevel and friction have none.
+        enough = -0.5 * _slope(w, n)
+        done = 0.0
+        for _ in range(_HALVINGS):
             for i in range(n):
-                theta[i] += share * w[TRIAL, i]
+                theta[i] += (share - done) * w[TRIAL, i]
             _place(rod, s, w, theta)
-            trial = _assemble(rod, s, w, theta, channel, count, before)
-            if trial <= energy + 1e-12 or share * largest < _SMALL_MM:
+            _assemble(rod, s, w, theta, channel, count, before)
+            if share * largest < _SMALL_MM or _slope(w, n) <= enough:
                 break
-            for i in range(n):
-                theta[i] -= share * w[TRIAL, i]
-            share *= 0.5
-        energy = trial
+            done, share = share, 0.5 * share
         if share < 1.0:
             largest = np.inf
-    _sweep(rod, s, w, theta)
-    s[ITERATIONS], s[RESIDUAL] = iteration, _newton_step(rod, w, theta)
-    s[CONVERGED] = 1.0 if s[RESIDUAL] <= TOLERANCE_MM and math.isfinite(s[TIP_Y]) else 0.0
+    stable = _sweep(rod, s, w, theta)
+    s[ITERATIONS], s[RESIDUAL] = iteration, _newton_step(w, n)
+    found = stable and s[RESIDUAL] <= ACCEPTED_MM and math.isfinite(s[TIP_X] + s[TIP_Y])
+    s[CONVERGED] = 1.0 if found else 0.0
     s[OFFSET] = _new_offset(rod, s, before)[0]
 
 
@@ -404,9 +422,7 @@ def _extend(rod: Rod, s: Floats, channel: Floats, count: int, segments: int) -> 
 
 
 @kernel
-def step(
-    rod: Rod, s: Floats, theta: Floats, channel: Floats, count: int, w: Floats, command: Floats
-) -> int:
+def step(rod: Rod, s: Floats, theta: Floats, channel: Floats, count: int, w: Floats, command: Floats) -> int:
     """Move base and guide by (db_x, db_y, db_theta, dg_y, flip), find the equilibrium, cut; all in place.
 
     s (SIZE,), theta (N,), channel (CHANNEL_ROWS, M) of which `count` columns hold points, w (WORK_ROWS, N + 1).

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexneedle.control import observer
+from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Decision, Method, Task, at_depth
 from flexneedle.control.methods import DEFAULT, method
 from flexneedle.errors import RunError
@@ -133,7 +133,7 @@ def _periods(
 
     After the last move the needle rests until the tracker has seen it at rest: readings come late.
     """
-    estimate = observer.begin(task.simulator, task.plan.bevel, chosen.beliefs)
+    estimate = chosen.beliefs.begin(task.simulator, task.plan.bevel)
     memory = chosen.begin(task)
     held_since: float | None = None
     arrived_at: float | None = None
@@ -177,14 +177,14 @@ def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> C
 
 
 def _see(
-    scenario: Scenario, estimate: observer.Estimate, applied: Command, begun: float, rig: Rig
-) -> tuple[observer.Estimate, Sample, str]:
+    scenario: Scenario, estimate: Estimate, applied: Command, begun: float, rig: Rig
+) -> tuple[Estimate, Sample, str]:
     """Predict, read the tracker, judge its readings, correct by the good ones."""
     control, now = scenario.control, rig.clock.now()
-    predicted = observer.move(estimate, applied, begun, now)
+    predicted = estimate.move(applied, begun, now)
     samples = rig.tracker.read()
     if not samples:
-        return replace(predicted, innovation=(0.0, 0.0)), _NO_SAMPLE, "missing: no reading"
+        return predicted.unseen(), _NO_SAMPLE, "missing: no reading"
     # All but the newest were on their way while the needle moved.
     ages = [control.stale_after_s + now - begun] * (len(samples) - 1) + [control.stale_after_s]
     verdicts = [
@@ -192,13 +192,12 @@ def _see(
         for sample, age in zip(samples, ages, strict=True)
     ]
     good = [sample for sample, verdict in zip(samples, verdicts, strict=True) if verdict == OK]
-    if verdicts[-1] != OK:
-        predicted = replace(predicted, innovation=(0.0, 0.0))
-    return observer.observe(predicted, good), samples[-1], verdicts[-1]
+    corrected = predicted.observe(good)
+    return corrected if verdicts[-1] == OK else corrected.unseen(), samples[-1], verdicts[-1]
 
 
 def _ending(
-    task: Task, estimate: observer.Estimate, verdict: str, held: float, seen: bool
+    task: Task, estimate: Estimate, verdict: str, held: float, seen: bool
 ) -> tuple[str, str] | None:
     """How the insertion ends after this period, if it does."""
     if not estimate.state.converged:
@@ -223,7 +222,7 @@ def _record(
     applied: Command,
     sample: Sample,
     verdict: str,
-    estimate: observer.Estimate,
+    estimate: Estimate,
     clocks: list[float],
 ) -> Period:
     state, truth = estimate.state, None if rig.truth is None else rig.truth()
@@ -235,7 +234,7 @@ def _record(
         sample=sample,
         verdict=verdict,
         innovation=estimate.innovation,
-        estimate=_pose(state.tip),
+        estimate=_pose(estimate.tip),
         shape=state.nodes,
         base=_pose(state.base),
         guide=state.guide,

@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from .fields import Fraction, NonNegative, NonNegativeRange, Positive, PositiveRange, Section, count
+from .methods import AdaptiveMpc, BevelOnly, BroydenMpc, ResolvedRate
 
 __all__ = ["Control", "Phantom", "Plan", "Target"]
 
@@ -109,6 +110,10 @@ class Control(Section):
     """The insertion is given up after so long without a measurement to believe."""
     stale_after_s: Positive = 0.3
     """A measurement older than this is not believed."""
+    adaptive_mpc: AdaptiveMpc = AdaptiveMpc()
+    bevel_only: BevelOnly = BevelOnly()
+    resolved_rate: ResolvedRate = ResolvedRate()
+    broyden_mpc: BroydenMpc = BroydenMpc()
 
     @property
     def curvature(self) -> float:

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
@@ -45,10 +45,12 @@ class Simulator:
     `threads` is for rollouts (default: all cores that the process may use); results do not depend on it.
     """
 
-    def __init__(self, scenario: Scenario, threads: int | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, threads: int | None = None, *, constants: model.Model | None = None
+    ) -> None:
         self.scenario = scenario
         self.threads = threads or _cores()
-        self._model = _build_model(scenario)
+        self._model = constants or _build_model(scenario)
         self._limits = Limits.of(scenario)
 
     def compile(self) -> None:
@@ -74,17 +76,41 @@ class Simulator:
         count = insertion.advance(self._model, s, rest, u, w, row)
         return solved(self.scenario, self._model, s, rest, u, mesh_of(self._model.nodes, w, count))
 
+    def replay(self, state: State, controls: ArrayLike, bevel: Floats) -> tuple[State, Floats]:
+        """Carry out controls (m, 5), m ≥ 1, as repeated `step` does, without limits, each with its factor on the bevel
+        offset, bevel (m,).
+
+        Returns the state at the end and the tips (m, 3).
+        """
+        self._own(state)
+        rows = np.array(controls, dtype=float, order="C")
+        s, rest, u, w = self._work(state)
+        tips = np.empty((len(rows), 3))
+        count = insertion.replay(self._model, s, rest, u, w, rows, bevel, tips)
+        mesh = mesh_of(self._model.nodes, w, count)
+        return solved(self.scenario, self._model, s, rest, u, mesh), tips
+
+    def adapted(self, stiffness: Sequence[float], bevel: float = 1.0, bend: float = 0.0) -> "Simulator":
+        """Return this simulator with what an observer has learnt, for states of the same scenario.
+
+        stiffness: factor on the modulus of each layer (k,); bevel: factor on its offset; bend: distance (mm) of the
+        free needle's tip from the straight, for bevel +1; the bend turns with the bevel.
+        """
+        constants = model.adapted(self._model, np.asarray(stiffness, dtype=float), bevel, bend)
+        return Simulator(self.scenario, self.threads, constants=constants)
+
     def check(self, state: State, control: Control) -> None:
         """Raise CommandError, with value and limit, if `control` may not be applied to `state`."""
         self._own(state)
         self._limits.check(state.travel, control.row()[None])
 
-    def rollout(self, state: State, controls: ArrayLike) -> Rollout:
+    def rollout(self, state: State, controls: ArrayLike, *, limits: bool = True) -> Rollout:
         """Run each of N sequences from `state`; controls (N, m, 5): db_x, db_y, db_theta, dg_y, flip (−1 or +1).
 
-        Equal to repeated `step`, bit by bit; CommandError if any value is out of range.
+        Equal to repeated `step`, bit by bit; CommandError if any value is out of range. Without `limits` a step
+        may be longer than a command: to look far ahead with few steps.
         """
-        return Rollout(*self._rollout(state, controls, deflection=False)[:3])
+        return Rollout(*self._rollout(state, controls, deflection=False, limits=limits)[:3])
 
     def rollout_with_deflection(self, state: State, controls: ArrayLike) -> tuple[Rollout, Floats]:
         """`rollout`, and the mean square lateral deflection of the needle (N, m) in mm²."""
@@ -145,12 +171,15 @@ class Simulator:
         count = insertion.settle(self._model, s, rest, u, w, held)
         return solved(self.scenario, self._model, s, rest, u, mesh_of(self._model.nodes, w, count))
 
-    def _rollout(self, state: State, controls: ArrayLike, *, deflection: bool) -> tuple[Any, ...]:
+    def _rollout(
+        self, state: State, controls: ArrayLike, *, deflection: bool, limits: bool = True
+    ) -> tuple[Any, ...]:
         self._own(state)
         u = np.array(controls, dtype=float, order="C")  # a copy: the kernel is compiled for writable arrays
         if u.ndim != 3 or u.shape[2] != 5:
             raise CommandError("controls", float(u.ndim), 3.0, f"must have shape (N, m, 5), not {u.shape}")
-        self._limits.check(state.travel, u)
+        if limits:
+            self._limits.check(state.travel, u)
         n, m = u.shape[:2]
         out = np.zeros((n, m, 3)), np.zeros((n, m)), np.zeros((n, m), dtype=np.bool_)
         spread = np.zeros((n, m) if deflection else (0, 0))
@@ -182,8 +211,12 @@ class Simulator:
     def _pool(self) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(self.threads, thread_name_prefix="rollout")
 
-    def __reduce__(self) -> tuple[type["Simulator"], tuple[Scenario, int]]:
-        return Simulator, (self.scenario, self.threads)
+    def __reduce__(self) -> tuple[Callable[..., "Simulator"], tuple[Scenario, int, model.Model]]:
+        return _restored, (self.scenario, self.threads, self._model)
+
+
+def _restored(scenario: Scenario, threads: int, constants: model.Model) -> Simulator:
+    return Simulator(scenario, threads, constants=constants)
 
 
 def _point(values: Sequence[float]) -> tuple[float, float]:

@@ -29,7 +29,9 @@ class NoisyTracker:
         bias: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         self._tip_at, self._clock = tip_at, clock
-        self._period, self._jitter, self._rng = period, jitter, rng
+        self._period, self._jitter = period, jitter
+        # Noise is drawn by reading: a longer delay, with more readings from before the start, changes no later one.
+        self._rng, self._rng_before = rng.spawn(2)
         self._delay, self._missing, self._bias = delay, missing, bias
         self._taken = -math.ceil(delay / period - 1e-6)  # the last reading; number k is taken at k periods
 
@@ -42,7 +44,8 @@ class NoisyTracker:
 
     def _sample(self, time: float) -> Sample:
         x, y = self._tip_at(time)
-        noise = self._rng.normal(0.0, self._jitter, 2)
-        if self._missing > 0.0 and self._rng.random() < self._missing:
+        rng = self._rng if time > 0.0 else self._rng_before
+        noise = rng.normal(0.0, self._jitter, 2)
+        if rng.random() < self._missing:
             return Sample(time, None, None)
         return Sample(time, x + self._bias[0] + float(noise[0]), y + self._bias[1] + float(noise[1]))

@@ -1,13 +1,24 @@
 """The controllers by name. A further one is a file here with a METHOD, and a line below."""
 
 from flexneedle.control.interface import Method
-from flexneedle.control.methods import ce_mpc, offset_free
+from flexneedle.control.methods import (
+    adaptive_mpc,
+    bevel_only,
+    broyden_mpc,
+    ce_mpc,
+    offset_free,
+    open_loop,
+    resolved_rate,
+)
 from flexneedle.errors import InputError
 
 __all__ = ["DEFAULT", "METHODS", "method"]
 
-METHODS = {module.METHOD.name: module.METHOD for module in (offset_free, ce_mpc)}
-DEFAULT = offset_free.METHOD.name
+METHODS = {
+    module.METHOD.name: module.METHOD
+    for module in (adaptive_mpc, offset_free, ce_mpc, open_loop, bevel_only, resolved_rate, broyden_mpc)
+}
+DEFAULT = adaptive_mpc.METHOD.name
 
 
 def method(name: str) -> Method:

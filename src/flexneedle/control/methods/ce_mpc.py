@@ -6,8 +6,9 @@ The measured tip is an essential condition of the solve that takes it in, and re
 import numpy as np
 
 from flexneedle.control import bang_bang, mpc
+from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Decision, Method, Task
-from flexneedle.control.observer import Beliefs, Estimate
+from flexneedle.control.observer import Beliefs
 
 
 def decide(

@@ -1,0 +1,35 @@
+"""`flexneedle report`: statistics, figures and a page about a study."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .common import print_json
+
+__all__ = ["add_parser"]
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser of `flexneedle`."""
+    parser = subparsers.add_parser(
+        "report", help="write a report on a study, complete or not: a page and its figures"
+    )
+    parser.add_argument("study", metavar="STUDY_DIR", type=Path, help="folder of the study")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report (STUDY_DIR/report)")
+    parser.add_argument(
+        "--tuning", type=Path, metavar="DIR", help="records of the controllers' tuning to show (docs/tuning)"
+    )
+    parser.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
+    parser.set_defaults(handler=_report)
+
+
+def _report(args: argparse.Namespace) -> int:
+    from flexneedle.run.report import write_report
+
+    report = write_report(args.study, args.out, args.tuning)
+    if args.json:
+        print_json(report.values())
+    else:
+        print(report.page)
+    return 0

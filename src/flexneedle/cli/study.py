@@ -1,0 +1,183 @@
+"""`flexneedle study`: many insertions, on all cores or on a cluster, into tables."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .common import compile_first, print_json
+
+if TYPE_CHECKING:
+    from flexneedle.run.study.grid import Study
+    from flexneedle.run.study.runner import Advance
+
+    from .progress import Progress
+
+__all__ = ["add_parser"]
+
+_TABLE_WIDTH = 120  # a row stays a row where it is piped to a file
+_STAGES = ("Planning", "Inserting")
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser of `flexneedle`."""
+    parser = subparsers.add_parser("study", help="carry out many insertions and keep them in tables")
+    parser.add_argument("study", metavar="STUDY", help="name of a shipped study, or path of a TOML file")
+    parser.add_argument(
+        "--workers", type=_workers, metavar="N", help="processes on this machine (one a usable core)"
+    )
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="run on the Dask cluster of this scheduler")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on with the study that --out holds, where it ended"
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder of the study (runs/<date>-study-<name>)"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    parser.set_defaults(handler=_study)
+
+
+def _workers(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value}: must be at least 1")
+    return value
+
+
+def _study(args: argparse.Namespace) -> int:
+    from flexneedle.errors import InputError, RunError
+    from flexneedle.run.study.folder import free_folder
+    from flexneedle.run.study.grid import load_study
+    from flexneedle.run.study.runner import run_study
+
+    from .progress import Progress
+
+    if args.resume and args.out is None:
+        raise InputError("--resume needs the folder of the study: give it with --out DIR")
+    if args.workers is not None and args.scheduler is not None:
+        raise InputError("--workers is for this machine: leave it out with --scheduler")
+    study = load_study(args.study)
+    folder = args.out or free_folder(study)
+    compile_first(study.points[0].scenario)
+    begun = time.monotonic()
+    try:
+        with Progress() as progress:
+            run_study(
+                study,
+                folder,
+                workers=args.workers,
+                scheduler=args.scheduler,
+                resume=args.resume,
+                on_advance=_Show(progress).advance,
+                command=_command(args, folder),
+            )
+    except KeyboardInterrupt:
+        print(f"flexneedle: interrupted; go on with: {_command(args, folder, '--resume')}", file=sys.stderr)
+        return 130
+    except RunError as error:
+        raise RunError(f"{error}: {_command(args, folder, '--resume')}") from error
+    return _report(study, folder, args.json, time.monotonic() - begun)
+
+
+def _command(args: argparse.Namespace, folder: Path, *more: str) -> str:
+    """The command line, as it can be given again."""
+    words = ["flexneedle", "study", args.study]
+    words += ["--workers", str(args.workers)] if args.workers is not None else []
+    words += ["--scheduler", args.scheduler] if args.scheduler is not None else []
+    return shlex.join([*words, "--out", str(folder), *more])
+
+
+class _Show:
+    """Turns what the runner tells into progress, with rate and time left."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._first: tuple[float, int] | None = None
+
+    def advance(self, advance: Advance) -> None:
+        now, done = time.monotonic(), advance.insertions
+        planning, inserting = _STAGES
+        self._progress.show(
+            planning,
+            advance.plans,
+            max(advance.all_plans, 1),
+            f"{advance.plans} of {advance.all_plans} plans",
+        )
+        begun, before = self._first = self._first or (now, done)
+        note = f"{done} of {advance.all_insertions}"
+        if done > before and now > begun:
+            rate = (done - before) / (now - begun)
+            note += f", {rate:.2g} a second, {_duration((advance.all_insertions - done) / rate)} left"
+        note += f", {advance.failed} failed" if advance.failed else ""
+        self._progress.show(inserting, done, advance.all_insertions, note)
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+def _report(study: Study, folder: Path, as_json: bool, seconds: float) -> int:
+    from flexneedle.run.study.summary import summarise
+
+    summary = summarise(folder, study)
+    summary["time"]["wall_s"] = seconds
+    if as_json:
+        print_json(summary)
+    else:
+        _table(summary)
+    return 0 if "done" in summary["outcomes"] else 1
+
+
+def _table(summary: Mapping[str, Any]) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(soft_wrap=True, highlight=False)
+    console.width = max(console.width, _TABLE_WIDTH)
+    table = Table(box=box.SIMPLE, show_edge=False)
+    heads = ("", "done", "mean ± sd", "median", "95 %", "max", "flips", "energy", "periods")
+    for number, head in enumerate(heads):
+        table.add_column(head, justify="right" if number else "left")
+    for name, part in ((_label(group["settings"]), group) for group in summary["groups"]):
+        table.add_row(*map(Text, (name, *_cells(part))))
+    table.add_row(*map(Text, ("all", *_cells(summary))))
+    spent = summary["time"]
+    console.print(Text(summary["title"], style="bold"), table, sep="\n\n")
+    console.print(
+        "\nTrue error in mm; flips with the plan's; mean tissue energy and most periods over the plan's."
+    )
+    console.print(
+        f"Work: {spent['plan_s']:.1f} s plan, {spent['control_s']:.1f} s control, {spent['plant_s']:.1f} s plant, "
+        f"{spent['rest_s']:.1f} s rest; {spent['wall_s']:.1f} s on the clock"
+    )
+    console.print(Text(f"Tables: {summary['folder']}"))
+
+
+def _label(settings: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} {value}" if "." in key else str(value) for key, value in settings.items())
+
+
+def _cells(part: Mapping[str, Any]) -> Sequence[str]:
+    error, periods = part["true_error_mm"], part["period_ratio"]
+    done = part["outcomes"].get("done", 0)
+    return (
+        f"{done} of {part['insertions']}",
+        f"{_number(error['mean'])} ± {_number(error['sd'])}",
+        *(_number(error[name]) for name in ("median", "p95", "max")),
+        f"{_number(part['flips'], 1)} ({_number(part['planned_flips'], 1)})",
+        _number(part["energy_ratio"], 2),
+        _number(periods["max"], 2),
+    )
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,101 @@
+"""What every observer offers: the believed needle, corrected by readings that come late."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.ports import Command, Sample
+from flexneedle.simulator import Simulator, State
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Move:
+    """What the driver did from `begun` to `ended` (s), and the good readings taken meanwhile."""
+
+    begun: float
+    ended: float
+    applied: Command
+    samples: tuple[Sample, ...] = ()
+
+    def part(self, time: float) -> float:
+        """Share of the move that is done at `time`."""
+        if self.ended <= self.begun:
+            return 1.0
+        return min(1.0, max(0.0, (time - self.begun) / (self.ended - self.begun)))
+
+
+class Estimate(Protocol):
+    """A frozen belief about the insertion now."""
+
+    @property
+    def simulator(self) -> Simulator:
+        """The model that predicts, with what was learnt about its constants."""
+        ...
+
+    @property
+    def state(self) -> State:
+        """State of that model now."""
+        ...
+
+    @property
+    def tip(self) -> Floats:
+        """Pose (3,) of the tip now, as a tracker without errors would see it."""
+        ...
+
+    @property
+    def innovation(self) -> tuple[float, float]:
+        """What the last reading told against the prediction (mm)."""
+        ...
+
+    @property
+    def measured(self) -> tuple[float, float] | None:
+        """Tip (x, y) seen at the end of the last move of which there is a reading (mm), None before the first."""
+        ...
+
+    def tip_at(self, time: float) -> tuple[float, float]:
+        """Where the tip was believed to be (mm) at `time`, each move taken as even."""
+        ...
+
+    def move(self, applied: Command, begun: float, ended: float) -> "Estimate":
+        """The belief after the driver moved so, from `begun` to `ended` (s)."""
+        ...
+
+    def observe(self, samples: Sequence[Sample]) -> "Estimate":
+        """The belief corrected by good readings, the newest last."""
+        ...
+
+    def unseen(self) -> "Estimate":
+        """The belief of a period without a reading to believe: no innovation."""
+        ...
+
+
+def assigned(moves: tuple[Move, ...], samples: Sequence[Sample]) -> tuple[Move, ...]:
+    """Give each sample to the move in which it was taken; one of before to the first, one of after to the last."""
+    ends = np.array([done.ended for done in moves[:-1]])
+    owner = np.searchsorted(ends, [sample.time - 1e-9 for sample in samples])
+    return tuple(
+        done
+        if not (new := tuple(s for s, k in zip(samples, owner, strict=True) if k == j))
+        else Move(done.begun, done.ended, done.applied, done.samples + new)
+        for j, done in enumerate(moves)
+    )
+
+
+def along(moves: tuple[Move, ...], tips: Floats, time: float) -> tuple[float, float]:
+    """Place (mm) at `time` on the way through tips (k + 1, 3), those before and after each of k moves."""
+    if not moves:
+        return float(tips[-1, 0]), float(tips[-1, 1])
+    times = [moves[0].begun, *(done.ended for done in moves)]
+    return float(np.interp(time, times, tips[:, 0])), float(np.interp(time, times, tips[:, 1]))
+
+
+def place(sample: Sample) -> tuple[float, float]:
+    """Where a good sample saw the tip (mm). Raises ValueError for one that saw nothing: it was not sorted out."""
+    if sample.x is None or sample.y is None:
+        raise ValueError("an empty sample was not sorted out")
+    return sample.x, sample.y

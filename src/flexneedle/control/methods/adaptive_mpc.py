@@ -1,0 +1,130 @@
+"""`adaptive-mpc`: cross-entropy MPC of the guide along the plan, on a model that learns the insertion.
+
+Start, needle and tissue are identified from the readings (`control.identification`). The horizon is a few steps of
+full advance; where it reaches the target, the miss there weighs most. The bevel follows the paper's rule; near the
+target it turns only if the model agrees.
+"""
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from flexneedle.control import bang_bang
+from flexneedle.control.estimate import Estimate, Floats
+from flexneedle.control.identification import Identification, Identified
+from flexneedle.control.interface import Decision, Method, Task, travel_left
+from flexneedle.planning import Settings, cross_entropy
+
+
+@dataclass(frozen=True, eq=False)
+class Ahead:
+    """The way that a decision looks ahead, m steps in n pieces.
+
+    advance (m,): mm; piece (m,): the piece of each step; path (m, 2): wanted y (mm) of the model's tip, and angle;
+    guide (m,): the plan's steps (mm); weight (m,): of the deviation after each step.
+    """
+
+    advance: Floats
+    piece: Floats
+    path: Floats
+    guide: Floats
+    weight: Floats
+    flip: bool
+
+
+def decide(
+    task: Task, memory: None, estimate: Estimate, rng: np.random.Generator
+) -> tuple[Decision, None]:
+    """The bevel by the rule, near the target also by the model; then the best first step of the guide."""
+    belief = cast(Identified, estimate)  # METHOD below names its observer
+    flip, why = bang_bang.decide(task, belief)
+    decision = _search(task, belief, rng, flip=flip, why=why)
+    if flip and _near(task, belief):
+        kept = _search(task, belief, rng, flip=False, why=f"{why}; the model keeps it")
+        decision = min(decision, kept, key=lambda choice: choice.cost)
+    return decision, memory
+
+
+def _near(task: Task, belief: Identified) -> bool:
+    """Whether the horizon reaches the target."""
+    reach = task.scenario.control.adaptive_mpc.horizon * task.scenario.setup.max_advance_mm
+    return travel_left(task.scenario, task.plan, belief.state) <= reach + 1e-9
+
+
+def _ahead(task: Task, belief: Identified, *, flip: bool) -> Ahead:
+    settings, most = task.scenario.control.adaptive_mpc, task.scenario.setup.max_advance_mm
+    left = travel_left(task.scenario, task.plan, belief.state)
+    steps = max(1, min(settings.horizon, int(np.ceil(left / most - 1e-9))))
+    advance = np.diff(np.minimum(np.arange(steps + 1) * most, left))
+    depth = float(belief.state.tip[0]) + np.append(0.0, np.cumsum(advance))
+    planned = [np.interp(depth, task.plan.tips[:, 0], task.plan.tips[:, k]) for k in (1, 2)]
+    path, weight = np.stack(planned, axis=1)[1:], np.ones(steps)
+    if _near(task, belief):
+        path[-1, 0], weight[-1] = task.plan.target[1], settings.target_weight
+    path[:, 0] -= belief.off_axis(-belief.state.bevel if flip else belief.state.bevel)
+    guide = np.diff(np.interp(depth, task.plan.tips[:, 0], task.plan.guide))
+    pieces = min(settings.pieces, steps)
+    return Ahead(advance, np.arange(steps) * pieces // steps, path, guide, weight, flip)
+
+
+def _search(task: Task, belief: Identified, rng: np.random.Generator, *, flip: bool, why: str) -> Decision:
+    """Cross-entropy over the guide's step in each piece."""
+    setup, settings = task.scenario.setup, task.scenario.control.adaptive_mpc
+    ahead = _ahead(task, belief, flip=flip)
+    pieces = int(ahead.piece[-1]) + 1
+    most = setup.max_guide_step_mm if setup.has_guide else 0.0
+    mean = np.array([ahead.guide[ahead.piece == k].mean() for k in range(pieces)])
+    found = cross_entropy.minimize(
+        lambda z: _cost(task, belief, ahead, z),
+        cross_entropy.start(
+            np.clip(mean, -most, most), np.full(pieces, min(settings.guide_sigma_mm, most))
+        ),
+        Settings(
+            samples=settings.samples,
+            elite=max(2, settings.samples // 8),
+            iterations=settings.iterations,
+            smoothing=task.scenario.plan.smoothing,
+            tolerance=task.scenario.plan.tolerance,
+            lower=np.full(pieces, -most),
+            upper=np.full(pieces, most),
+        ),
+        rng,
+    )
+    db_x, db_y, db_theta, dg_y, _ = _controls(task, belief, ahead, found.best[None])[0, 0].tolist()
+    spread = float(np.sqrt(found.covariance[0, 0]))
+    return Decision((db_x, db_y, db_theta, dg_y, 1 if flip else -1), why, found.best_cost, spread)
+
+
+def _controls(task: Task, belief: Identified, ahead: Ahead, z: Floats) -> Floats:
+    """Controls (N, m, 5) of guide steps z (N, n); the guide stays within its reach."""
+    reach = task.scenario.setup.max_guide_travel_mm
+    steps = z[:, ahead.piece] * (ahead.advance / task.scenario.setup.max_advance_mm)
+    guide = np.clip(belief.state.guide + np.cumsum(steps, axis=1), -reach, reach)
+    controls = np.zeros((len(z), ahead.advance.size, 5))
+    controls[:, :, 0] = ahead.advance
+    controls[:, :, 3] = np.diff(guide, axis=1, prepend=belief.state.guide)
+    controls[:, :, 4] = -1.0
+    controls[:, 0, 4] = 1.0 if ahead.flip else -1.0
+    return controls
+
+
+def _cost(task: Task, belief: Identified, ahead: Ahead, z: Floats) -> Floats:
+    """Weighted squared deviation from the path (mm²), departure from the plan's guide steps, tissue energy."""
+    settings = task.scenario.control.adaptive_mpc
+    controls = _controls(task, belief, ahead, z)
+    tips, energy, converged = belief.simulator.rollout(belief.state, controls)
+    off = (tips[:, :, 1:] - ahead.path) * (1.0, settings.orientation_weight_mm)
+    costs: Floats = (off**2).sum(axis=2) @ ahead.weight
+    costs += settings.guide_weight * ((controls[:, :, 3] - ahead.guide) ** 2).sum(axis=1)
+    costs += settings.energy_weight_per_mj * energy.sum(axis=1)
+    return np.where(converged.all(axis=1), costs, np.inf)
+
+
+METHOD = Method(
+    "adaptive-mpc",
+    "cross-entropy MPC on a model that learns start, needle and tissue from the readings",
+    Identification(),
+    begin=lambda _task: None,
+    decide=decide,
+)

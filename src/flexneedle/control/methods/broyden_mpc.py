@@ -1,0 +1,167 @@
+"""`broyden-mpc`: no model of needle or tissue: a Jacobian learnt from readings, and linear MPC of the guide.
+
+Bernardes et al., Data-driven adaptive needle insertion assist for transperineal prostate interventions (Phys. Med.
+Biol. 2023, doi:10.1088/1361-6560/accefa): the Jacobian from inputs (insertion, place of the guide) to the measured
+tip takes 0.65 of Broyden's rank-one update after each step; the guide's places over four steps, within 6 mm of the
+axis, are those that bring the predicted tip nearest to where it should be; the first is carried out. The bevel is
+never turned. Two things are fitted to this package: an MPC step is a control step and not 10 mm of insertion by
+hand, and the tip is to follow the planned path where theirs has the target straight ahead.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.control.estimate import Estimate
+from flexneedle.control.interface import Decision, Method, Task, travel_left
+from flexneedle.control.observer import Beliefs
+from flexneedle.errors import InputError
+from flexneedle.scenario import Setup
+from flexneedle.scenario.methods import BroydenMpc
+from flexneedle.trace import PlanRecord
+
+Floats = NDArray[np.float64]
+_LEAST_INSERTION_MM = 0.5  # between two updates: less tells more of the tracker's noise than of the needle
+_RIDGE = 1e-9  # mm² for a squared millimetre of the guide: one answer where the guide has no effect
+_RELEASE = 1e-12  # slope of the cost that counts as rounding
+_KEPT = 8  # control steps: readings are younger
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """Jacobian (2, 2) from (insertion, guide) to the tip (x, y); the last (tip x, insertion, guide) as commanded.
+
+    seen: tip (x, y) and inputs (insertion, guide), each (2,), of the newest update; None before a reading.
+    """
+
+    jacobian: Floats
+    history: tuple[tuple[float, float, float], ...] = ()
+    seen: tuple[Floats, Floats] | None = None
+
+
+def begin(task: Task) -> Learnt:
+    """Start with a tip that goes straight on, and aside with the guide. Raises InputError without a guide."""
+    if not task.scenario.setup.has_guide:
+        raise InputError("controller = 'broyden-mpc': steers with the guide: give setup.guide_to_skin_mm")
+    return Learnt(np.diag([1.0, task.scenario.control.broyden_mpc.guide_effect]))
+
+
+def decide(
+    task: Task, learnt: Learnt, estimate: Estimate, _rng: np.random.Generator
+) -> tuple[Decision, Learnt]:
+    """Learn from a new reading, predict the tip to now, and take the first of the best steps of the guide."""
+    scenario, state = task.scenario, estimate.state
+    settings, setup = scenario.control.broyden_mpc, scenario.setup
+    inputs = np.array([state.travel[0], state.guide])
+    learnt = remember(learnt, float(state.tip[0]), inputs)
+    left = travel_left(scenario, task.plan, state)
+    advance = min(setup.max_advance_mm, left)
+    if estimate.measured is None or left <= 0.0:
+        return Decision((advance, 0.0, 0.0, 0.0, -1), "no reading yet"), learnt
+    tip = np.array(estimate.measured)
+    then = inputs_at(learnt, float(tip[0]))
+    learnt = learn(learnt, tip, then, settings.update_gain)
+    tip = tip + learnt.jacobian @ (inputs - then)
+    ahead = np.minimum(setup.max_advance_mm * np.arange(1, settings.horizon + 1), left)
+    moves, cost = guide_moves(settings, setup, task.plan, learnt.jacobian, tip, ahead, state.guide)
+    slope, effect = learnt.jacobian[1].tolist()
+    why = f"bevel kept: never turned; tip moves {slope:.3f} aside with insertion, {effect:.3f} with the guide"
+    return Decision((advance, 0.0, 0.0, float(moves[0]), -1), why, cost), learnt
+
+
+def remember(learnt: Learnt, x: float, inputs: Floats) -> Learnt:
+    """Note that the tip is at depth x (mm) with these inputs: tells later when a reading was taken."""
+    insertion, guide = inputs.tolist()
+    history = (*learnt.history, (x, insertion, guide))[-_KEPT:]
+    return Learnt(learnt.jacobian, history, learnt.seen)
+
+
+def inputs_at(learnt: Learnt, x: float) -> Floats:
+    """Inputs (2,) when the tip was at depth x (mm), within what is remembered."""
+    depth, *inputs = np.array(learnt.history).T
+    return np.array([np.interp(x, depth, values) for values in inputs])
+
+
+def learn(learnt: Learnt, tip: Floats, inputs: Floats, gain: float) -> Learnt:
+    """Update by a reading of the tip, once the needle went far enough on since the last."""
+    if learnt.seen is None:
+        return Learnt(learnt.jacobian, learnt.history, (tip, inputs))
+    last_tip, last_inputs = learnt.seen
+    if inputs[0] - last_inputs[0] < _LEAST_INSERTION_MM:
+        return learnt
+    jacobian = broyden(learnt.jacobian, inputs - last_inputs, tip - last_tip, gain)
+    return Learnt(jacobian, learnt.history, (tip, inputs))
+
+
+def broyden(jacobian: Floats, moved: Floats, seen: Floats, gain: float) -> Floats:
+    """The nearest matrix that maps `moved` to `seen` (Broyden 1965), or a share `gain` of the way to it."""
+    return jacobian + gain * np.outer(seen - jacobian @ moved, moved) / (moved @ moved)
+
+
+def guide_moves(
+    settings: BroydenMpc,
+    setup: Setup,
+    plan: PlanRecord,
+    jacobian: Floats,
+    tip: Floats,
+    ahead: Floats,
+    guide: float,
+) -> tuple[Floats, float]:
+    """Places of the guide (mm, from now) after each of n steps that end `ahead` (n,) of the tip, and their cost.
+
+    Cost: squared distance (mm²) of tip and planned path, and `guide_weight` times the squared guide steps.
+    """
+    n = len(ahead)
+    goal = np.interp(tip[0] + ahead, *_path(plan))
+    steps = np.sqrt(settings.guide_weight) * (np.eye(n) - np.eye(n, k=-1))
+    matrix = np.concatenate([jacobian[1, 1] * np.eye(n), steps])
+    right = np.concatenate([goal - tip[1] - jacobian[1, 0] * ahead, np.zeros(n)])
+    reach = min(settings.max_guide_travel_mm, setup.max_guide_travel_mm)
+    furthest = setup.max_guide_step_mm * np.arange(1, n + 1)
+    lower, upper = np.maximum(-furthest, -reach - guide), np.minimum(furthest, reach - guide)
+    moves = bounded_least_squares(matrix, right, np.minimum(lower, 0.0), np.maximum(upper, 0.0))
+    return moves, float(np.sum((matrix @ moves - right) ** 2))
+
+
+def _path(plan: PlanRecord) -> tuple[Floats, Floats]:
+    """Depth and lateral place of the planned path, led to the target at its end."""
+    x, y = (np.append(plan.tips[:-1, k], plan.target[k]) for k in (0, 1))
+    return x, y
+
+
+def bounded_least_squares(matrix: Floats, right: Floats, lower: Floats, upper: Floats) -> Floats:
+    """Least ‖A z − b‖² for lower ≤ 0 ≤ upper, exact: the primal active-set method from z = 0.
+
+    A singular A gets the answer nearest to 0, by a ridge.
+    """
+    hessian = matrix.T @ matrix + _RIDGE * np.eye(len(lower))
+    slope = matrix.T @ right
+    z, held = np.zeros(len(lower)), np.zeros(len(lower), dtype=bool)
+    for _ in range(10 * len(lower)):  # a few in practice; each lowers the cost
+        best = np.where(held, z, 0.0)
+        free = np.ix_(~held, ~held)
+        best[~held] = np.linalg.solve(hessian[free], (slope - hessian @ best)[~held])
+        bound = np.clip(best, lower, upper)
+        if (bound == best).all():
+            z, push = best, (slope - hessian @ best) * held
+            push = np.where(z == lower, np.maximum(push, 0.0), np.minimum(push, 0.0)) * (lower < upper)
+            if np.abs(push).max() <= _RELEASE:
+                break
+            held[np.abs(push).argmax()] = False
+            continue
+        with np.errstate(divide="ignore", invalid="ignore"):
+            part = np.where(bound != best, (bound - z) / (best - z), np.inf)
+        first = int(part.argmin())
+        z = z + part[first] * (best - z)
+        z[first], held[first] = bound[first], True
+    return z
+
+
+METHOD = Method(
+    "broyden-mpc",
+    "guide by linear MPC with a Jacobian learnt from readings (Broyden), no model",
+    Beliefs(),
+    begin=begin,
+    decide=decide,
+)

@@ -1,0 +1,35 @@
+"""`open-loop`: the plan as it stands, whatever the tracker sees."""
+
+import numpy as np
+
+from flexneedle.control.estimate import Estimate
+from flexneedle.control.interface import Decision, Method, Task
+from flexneedle.control.observer import Beliefs
+from flexneedle.simulator.control import Limits
+
+
+def decide(task: Task, done: int, estimate: Estimate, _rng: np.random.Generator) -> tuple[Decision, int]:
+    """Go to where base and guide stand after `done` + 1 planned steps.
+
+    Places are replayed, not steps: what a motor of finite resolution left out of a step is made good in the next.
+    """
+    limits, controls = Limits.of(task.scenario), task.plan.controls
+    place = np.clip(controls[: done + 1, :4].sum(axis=0), *limits.travel.T)
+    db_x, db_y, db_theta, dg_y = np.clip(place - estimate.state.travel, -limits.step, limits.step).tolist()
+    command = (db_x, db_y, db_theta, dg_y, 1 if controls[done, 4] > 0.0 else -1)
+    return Decision(command, f"planned step {done + 1}"), done + 1
+
+
+def arrived(task: Task, done: int, _estimate: Estimate) -> bool:
+    """Whether the planned steps are used up."""
+    return done >= len(task.plan.controls)
+
+
+METHOD = Method(
+    "open-loop",
+    "the plan replayed, without feedback",
+    Beliefs(),
+    begin=lambda _task: 0,
+    decide=decide,
+    arrived=arrived,
+)

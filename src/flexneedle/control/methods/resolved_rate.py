@@ -1,0 +1,100 @@
+"""`resolved-rate`: the guide moves by the damped inverse of a Jacobian that the model gives.
+
+Steering from the base with the Jacobian of a mechanical model of needle and tissue: DiMaio and Salcudean, Needle
+insertion modeling and simulation (IEEE Trans. Robot. Autom. 2003) and Needle steering and motion planning in soft
+tissues (IEEE Trans. Biomed. Eng. 2005); Glozman and Shoham, Image-guided robotic flexible needle steering (IEEE
+Trans. Robot. 2007). Here the Jacobian is that of the tip's place a little ahead, by a small disturbance of the
+guide, and the plan gives the motion from which the guide departs. What the newest reading was off the prediction is
+taken to stay, or else the model, released from the measured tip, would fall back towards its own equilibrium. The
+advance needs no Jacobian: the tip's depth follows the base one to one.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.control.estimate import Estimate
+from flexneedle.control.interface import Decision, Method, Task, travel_left
+from flexneedle.control.methods.bevel_only import turn
+from flexneedle.control.observer import Beliefs
+from flexneedle.errors import InputError
+from flexneedle.scenario import Setup
+from flexneedle.simulator import Simulator, State
+from flexneedle.trace import PlanRecord
+
+Floats = NDArray[np.float64]
+_DISTURBANCE_MM = 0.05  # of the guide: above rounding, small against the 10 mm in which the tissue stiffens
+
+
+def begin(task: Task) -> None:
+    """Nothing to remember. Raises InputError without a guide."""
+    if not task.scenario.setup.has_guide:
+        raise InputError("controller = 'resolved-rate': steers with the guide: give setup.guide_to_skin_mm")
+
+
+def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generator) -> tuple[Decision, None]:
+    """Bevel by the rule; the planned guide step, and what takes the tip back to the planned path."""
+    scenario, state = task.scenario, estimate.state
+    settings, setup = scenario.control.resolved_rate, scenario.setup
+    left = travel_left(scenario, task.plan, state)
+    flip, why = turn(settings, task, estimate)
+    if left <= 0.0:
+        return Decision((0.0, 0.0, 0.0, 0.0, -1), "at the target depth"), memory
+    disturbance = min(_DISTURBANCE_MM, 0.5 * setup.max_guide_step_mm, 0.5 * setup.max_guide_travel_mm)
+    way = min(left, max(setup.max_advance_mm, settings.lookahead_mm))
+    controls = nominal(setup, task.plan, state, way, disturbance, flip=flip)
+    end, jacobian = sensitivity(estimate.simulator, state, controls, disturbance)
+    off = planned_y(task.plan, float(end[0])) - float(end[1]) - estimate.innovation[1]
+    wanted = float(controls[0, 3]) + settings.gain * damped_inverse(jacobian, settings.damping) * off
+    step = max(-setup.max_guide_step_mm, min(setup.max_guide_step_mm, wanted))
+    guide = max(-setup.max_guide_travel_mm, min(setup.max_guide_travel_mm, state.guide + step))
+    command = (float(controls[0, 0]), 0.0, 0.0, guide - state.guide, 1 if flip else -1)
+    why = f"{why}; tip off by {-off:.3f} mm ahead, moves {jacobian:.3f} with the guide"
+    return Decision(command, why), memory
+
+
+def nominal(setup: Setup, plan: PlanRecord, state: State, way: float, margin: float, *, flip: bool) -> Floats:
+    """Controls (n, 5) that insert by `way` (mm) with the guide as planned, `margin` (mm) inside its limits."""
+    count = max(1, math.ceil(way / setup.max_advance_mm - 1e-9))
+    ends = np.minimum(setup.max_advance_mm * np.arange(1, count + 1), way)
+    depth = float(state.tip[0]) + np.append(0.0, ends)
+    steps = np.diff(np.interp(depth, plan.tips[:, 0], plan.guide))
+    limit, reach = setup.max_guide_step_mm - margin, setup.max_guide_travel_mm - margin
+    guide = np.clip(state.guide + np.cumsum(np.clip(steps, -limit, limit)), -reach, reach)
+    controls = np.zeros((count, 5))
+    controls[:, 0] = np.diff(ends, prepend=0.0)
+    controls[:, 3] = np.diff(guide, prepend=state.guide)
+    controls[:, 4] = -1.0
+    controls[0, 4] = 1.0 if flip else -1.0
+    return controls
+
+
+def sensitivity(
+    simulator: Simulator, state: State, controls: Floats, disturbance: float
+) -> tuple[Floats, float]:
+    """Tip pose (3,) after `controls`, and its lateral motion for that of the guide in their first step."""
+    three = np.stack([controls] * 3)
+    three[1:, 0, 3] += disturbance, -disturbance
+    end, more, less = simulator.rollout(state, three).tips[:, -1]
+    return end, float(more[1] - less[1]) / (2.0 * disturbance)
+
+
+def planned_y(plan: PlanRecord, x: float) -> float:
+    """Lateral place (mm) of the planned path at depth x, led to the target at its end."""
+    depth, lateral = plan.tips[:-1, 0], plan.tips[:-1, 1]
+    return float(np.interp(x, np.append(depth, plan.target[0]), np.append(lateral, plan.target[1])))
+
+
+def damped_inverse(jacobian: float, damping: float) -> float:
+    """J/(J² + λ²), which minimises (J u − 1)² + λ² u²; 0 where both are 0."""
+    return jacobian / (jacobian**2 + damping**2) if jacobian or damping else 0.0
+
+
+METHOD = Method(
+    "resolved-rate",
+    "guide by the damped inverse of the model's Jacobian, bevel by the rule",
+    Beliefs(),
+    begin=begin,
+    decide=decide,
+)

@@ -1,0 +1,100 @@
+"""Paired mean differences with their intervals, one row each, against a line at zero."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isnan
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from flexneedle.plot.studies.layout import FAINT, Look, Panels, head, legend, panel_width, panels, short
+from flexneedle.plot.style import INK, QUIET, signed, styled
+
+__all__ = ["DifferencePanel", "DifferenceRow", "difference_figure"]
+
+_ROW = 0.3  # inches
+
+
+@dataclass(frozen=True)
+class DifferenceRow:
+    """A mean difference (mm) with the ends of its interval, NaN where there is none."""
+
+    name: str
+    look: Look
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class DifferencePanel:
+    """Rows under one title."""
+
+    title: str
+    note: str
+    color: str
+    rows: Sequence[DifferenceRow]
+
+
+def difference_figure(shown: Sequence[DifferencePanel], label: str) -> Figure:
+    """Return the figure: a panel each, their rows in the same order, on one scale called `label`."""
+    with styled():
+        widest = max(len(short(row.name, 34)) for panel in shown for row in panel.rows)
+        left = max(0.75, 0.3 + 0.062 * widest)
+        most = max(len(panel.rows) for panel in shown)
+        made = panels(len(shown), (_ROW * most + 0.15) / panel_width(len(shown), left), left)
+        for ax, panel in zip(made.axes, shown, strict=True):
+            _draw(ax, panel)
+            head(ax, panel.title, panel.note, panel.color)
+        _share(made, shown, label)
+        legend(made.figure, _handles())
+    return made.figure
+
+
+def _draw(ax: Axes, panel: DifferencePanel) -> None:
+    ax.axvline(0.0, color=INK, linewidth=0.8, zorder=1, label="no difference")
+    ax.set_ylim(len(panel.rows) - 0.4, -0.6)
+    ax.set_yticks(range(len(panel.rows)), [short(row.name, 34) for row in panel.rows])
+    ax.tick_params(axis="y", length=0)
+    ax.grid(axis="x", color=FAINT, linewidth=0.4)
+    ax.set_axisbelow(True)
+    for level, row in enumerate(panel.rows):
+        sure = row.low > 0.0 or row.high < 0.0
+        face = row.look.color if sure else "white"
+        if not isnan(row.low):
+            ax.plot(
+                [row.low, row.high],
+                [level, level],
+                color=row.look.color,
+                linewidth=2.0,
+                zorder=3,
+                label="interval",
+            )
+        mark: dict[str, Any] = {"markersize": 6, "markeredgewidth": 1.4, "markeredgecolor": row.look.color}
+        ax.plot([row.mean], [level], row.look.marker, zorder=4, label="mean", markerfacecolor=face, **mark)
+
+
+def _share(made: Panels, shown: Sequence[DifferencePanel], label: str) -> None:
+    rows = [row for panel in shown for row in panel.rows]
+    known = [v for row in rows for v in (row.mean, row.low, row.high) if not isnan(v)] or [0.0]
+    low, high = min(0.0, *known), max(0.0, *known)
+    pad = 0.06 * (high - low) or 0.05
+    for ax in made.axes:
+        ax.set_xlim(low - pad, high + pad)
+        ax.locator_params(axis="x", nbins=9 if made.columns == 1 else 5)
+        ax.xaxis.set_major_formatter(lambda value, _: signed(round(value, 9)))
+        ax.tick_params(labelleft=ax in made.leftmost, labelbottom=ax in made.lowest)
+    for ax in made.lowest:
+        ax.set_xlabel(label, labelpad=1.0)
+
+
+def _handles() -> list[Line2D]:
+    full: dict[str, Any] = {"color": QUIET, "marker": "o", "markersize": 6, "markeredgewidth": 1.4}
+    return [
+        Line2D([], [], linewidth=2.0, label="mean with 95 % interval", **full),
+        Line2D(
+            [], [], linewidth=2.0, markerfacecolor="white", label="not separable from no difference", **full
+        ),
+    ]

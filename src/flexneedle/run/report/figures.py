@@ -1,0 +1,332 @@
+"""Which figures the rows of a study support, and what goes into them."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from math import isnan
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from flexneedle.plot import save
+from flexneedle.plot import studies as plots
+from flexneedle.run.report.design import Design, Factor
+from flexneedle.run.report.rows import Codes, Flags, Floats, Rows
+from flexneedle.run.report.statistics import Estimate
+from flexneedle.run.report.summary import Difference, finished
+
+__all__ = ["Drawn", "draw_figures"]
+
+_MOST_DEPTHS, _DEPTH_BANDS = 8, 5
+_MOST_ROWS = 40  # levels of names that are still an axis
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure on disk: title and what it shows, as the page says it; alt: what one sees, for who does not."""
+
+    name: str
+    title: str
+    caption: str
+    alt: str
+    png: Path
+    svg: Path
+
+
+@dataclass(frozen=True, eq=False)
+class _Sheet:
+    name: str
+    title: str
+    caption: str
+    alt: str
+    draw: Callable[[], Figure]
+
+
+@dataclass(frozen=True, eq=False)
+class _Facts:
+    """What all figures are made from; `known`: rows that finished and whose true error is known."""
+
+    rows: Rows
+    design: Design
+    looks: Sequence[plots.Look]
+    error: Floats
+    done: Flags
+    known: Flags
+
+    def of(self, controller: int) -> Flags:
+        """Return which rows a controller has."""
+        return np.asarray(self.design.controller.codes == controller)
+
+    @property
+    def controllers(self) -> list[tuple[int, str]]:
+        """Numbers and names of as many controllers as there are panels."""
+        return list(enumerate(self.design.controller.names))[: plots.MOST_PANELS]
+
+
+def draw_figures(
+    rows: Rows,
+    design: Design,
+    looks: Sequence[int],
+    against: Sequence[Difference],
+    cases: Sequence[Difference],
+    folder: Path,
+) -> list[Drawn]:
+    """Draw every figure that the rows support into a folder, PNG and SVG each, and return them in reading order.
+
+    looks: number of the look of each controller; against, cases: paired differences of controllers and of cases.
+    """
+    error, done = rows.number("true_error_mm"), finished(rows)
+    facts = _Facts(rows, design, [plots.look(k) for k in looks], error, done, done & ~np.isnan(error))
+    drawn = []
+    for sheet in _sheets(facts, against, cases):
+        png, svg = save(sheet.draw(), folder, sheet.name)
+        drawn.append(Drawn(sheet.name, sheet.title, sheet.caption, sheet.alt, png, svg))
+    return drawn
+
+
+def _sheets(facts: _Facts, against: Sequence[Difference], cases: Sequence[Difference]) -> Iterator[_Sheet]:
+    if _tips(facts).size and not np.isnan(_tips(facts)).all():
+        yield _targeting(facts)
+    if not facts.known.any():
+        return
+    if facts.design.controller.varies:
+        yield _by_controller(facts)
+    depth = _depth_levels(facts.rows)
+    if len(depth[1]) > 1 or not facts.design.controller.varies:
+        yield _by_depth(facts, *depth)
+    for number, axis in enumerate(facts.design.axes):
+        if len(axis.names) <= _MOST_ROWS:
+            yield _along(facts, axis, number)
+    if any(not isnan(d.mean_mm.value) for d in against):
+        yield _against(facts, against)
+    if any(not isnan(d.mean_mm.value) for d in cases):
+        yield _cases(facts, cases)
+    if (facts.known & (facts.rows.number("strain_energy_mj") > 0)).any():
+        yield _energy(facts)
+
+
+def _targeting(facts: _Facts) -> _Sheet:
+    rows = facts.rows
+    targets = np.stack([rows.number("target_depth_mm"), rows.number("target_lateral_mm")], axis=1)
+    tips = _tips(facts)
+    panels = [
+        plots.TargetPanel(
+            name, _note(facts, own), _alarm(facts, own), look, targets[own], tips[own], facts.done[own]
+        )
+        for name, own, look in _panels_of_targets(facts)
+    ]
+    number = len(np.unique(targets, axis=0))
+    return _Sheet(
+        "targeting",
+        "Where the tips ended",
+        f"True tips of all insertions and the {number} target{'s' if number > 1 else ''}, each in its circle of "
+        "1 mm radius, to scale.",
+        "Map of targets with circles of 1 mm and a dot for each true tip. " + _means(panels),
+        lambda: plots.targeting_figure(panels),
+    )
+
+
+def _panels_of_targets(facts: _Facts) -> list[tuple[str, Flags, plots.Look]]:
+    """Return what has a panel: the levels of the first factor after a single controller, or the controllers."""
+    design = facts.design
+    single = [f for f in design.factors[1:] if len(f.names) <= plots.MOST_PANELS]
+    if design.controller.varies or not single:
+        return [(name, facts.of(k), facts.looks[k]) for k, name in facts.controllers]
+    factor = single[0]
+    return [
+        (factor.level(k), np.asarray(factor.codes == k), facts.looks[0]) for k in range(len(factor.names))
+    ]
+
+
+def _by_controller(facts: _Facts) -> _Sheet:
+    rows = [
+        plots.ErrorRow(name, look, facts.error[own & facts.known], int(own.sum()))
+        for k, name in enumerate(facts.design.controller.names)
+        for own, look in ((facts.of(k), facts.looks[k]),)
+    ]
+    return _Sheet(
+        "errors",
+        "True error by controller",
+        "Every finished insertion is a dot" + _pooled(facts) + ". Errors are on a logarithmic scale.",
+        "Rows of dots, one row for each controller. "
+        + "; ".join(_middle(row.name, row.errors) for row in rows if len(row.errors))
+        + ".",
+        lambda: plots.error_rows_figure(rows),
+    )
+
+
+def _by_depth(facts: _Facts, codes: Codes, names: Sequence[str]) -> _Sheet:
+    panels = [
+        plots.ErrorPanel(
+            name, _note(facts, facts.of(k)), _alarm(facts, facts.of(k)), _depth_rows(facts, k, codes, names)
+        )
+        for k, name in facts.controllers
+    ]
+    return _Sheet(
+        "errors-by-depth",
+        "True error by depth of the target",
+        "Every finished insertion is a dot" + _pooled(facts) + ". Errors are on a logarithmic scale.",
+        "Rows of dots for each depth of the target, a panel for each controller. "
+        + "; ".join(f"{p.title}: medians {_listed(p.rows[1:] or p.rows)}" for p in panels)
+        + ".",
+        lambda: plots.errors_by_level_figure(panels, "depth of the target (mm)"),
+    )
+
+
+def _depth_rows(facts: _Facts, controller: int, codes: Codes, names: Sequence[str]) -> list[plots.ErrorRow]:
+    own, look = facts.of(controller), facts.looks[controller]
+    chosen = [("all", own), *((name, own & (codes == k)) for k, name in enumerate(names))]
+    return [
+        plots.ErrorRow(name, look, facts.error[flags & facts.known], int(flags.sum()))
+        for name, flags in (chosen if len(names) > 1 else chosen[:1])
+    ]
+
+
+def _along(facts: _Facts, axis: Factor, number: int) -> _Sheet:
+    places = axis.places if axis.numeric else np.arange(len(axis.names), dtype=float)
+    levels = range(len(axis.names))
+    sweeps = []
+    for k, name in facts.controllers:
+        own = [facts.of(k) & (axis.codes == level) for level in levels]
+        errors = [facts.error[flags & facts.known] for flags in own]
+        sweeps.append(plots.Sweep(name, facts.looks[k], errors, [int(flags.sum()) for flags in own]))
+    with_it = f" With it change {_and(axis.along)}." if axis.along else ""
+    return _Sheet(
+        f"error-along-{number + 1}",
+        f"True error against {axis.label}",
+        f"Median, middle half (25 to 75 %) and mean of the finished insertions{_pooled(facts, axis)}.{with_it}",
+        f"Lines of median and mean true error over {axis.label}. "
+        + "; ".join(
+            f"{s.name}: medians "
+            + ", ".join(
+                f"{np.median(e):.3f} mm at {n}" for e, n in zip(s.errors, axis.names, strict=True) if len(e)
+            )
+            for s in sweeps
+        )
+        + ".",
+        lambda: plots.sweep_figure(sweeps, axis.label, places, axis.names),
+    )
+
+
+def _against(facts: _Facts, differences: Sequence[Difference]) -> _Sheet:
+    names = facts.design.controller.names
+    ours = differences[0].name
+    rows = [_row(d.against, facts.looks[names.index(d.against)], d.mean_mm) for d in differences]
+    panel = plots.DifferencePanel(
+        f"{ours} minus each other controller", "left of zero: smaller errors", facts.looks[0].color, rows
+    )
+    return _Sheet(
+        "controllers",
+        f"{ours} against the other controllers",
+        f"Mean paired difference of the true error: {ours} minus the other, on the same phantoms and targets.",
+        "Mean differences with their intervals: " + _told(rows) + ".",
+        lambda: plots.difference_figure([panel], "difference of the true error (mm)"),
+    )
+
+
+def _cases(facts: _Facts, differences: Sequence[Difference]) -> _Sheet:
+    base, controllers = facts.design.cases.names[0], facts.controllers
+    first = [d for d in differences if d.controller == controllers[0][1]]
+    order = [d.name for d in sorted(first, key=lambda d: -_or_lowest(d.mean_mm.value))]
+    panels = []
+    for k, name in controllers:
+        own = {d.name: d.mean_mm for d in differences if d.controller == name}
+        rows = [_row(case, facts.looks[k], own[case]) for case in order]
+        at_base = facts.error[facts.of(k) & facts.known & (facts.design.cases.codes == 0)]
+        note = f"base case: mean {at_base.mean():.3f} mm" if len(at_base) else "base case: not known"
+        panels.append(plots.DifferencePanel(name, note, facts.looks[k].color, rows))
+    return _Sheet(
+        "cases",
+        f"Cases against the base case, {base}",
+        f"Mean paired difference of the true error: the case minus {base}, on the same phantoms and targets; "
+        "the largest on top.",
+        "Mean differences with their intervals. "
+        + "; ".join(f"{panel.title}: {_told(panel.rows)}" for panel in panels)
+        + ".",
+        lambda: plots.difference_figure(panels, "more error (mm)"),
+    )
+
+
+def _energy(facts: _Facts) -> _Sheet:
+    energy = facts.rows.number("strain_energy_mj")
+    panels = []
+    for k, name in facts.controllers:
+        own = facts.of(k) & facts.known & (energy > 0)
+        note = (
+            f"medians {np.median(energy[own]):.2f} mJ, {np.median(facts.error[own]):.3f} mm"
+            if own.any()
+            else ""
+        )
+        panels.append(plots.EnergyPanel(name, note, facts.looks[k], energy[own], facts.error[own]))
+    return _Sheet(
+        "energy",
+        "Tissue energy against true error",
+        "Every finished insertion is a dot" + _pooled(facts) + ". Both scales are logarithmic.",
+        "Energy stored in the tissue at the end against true error. "
+        + "; ".join(f"{p.title}: {p.note}" for p in panels)
+        + ".",
+        lambda: plots.energy_figure(panels),
+    )
+
+
+def _tips(facts: _Facts) -> Floats:
+    return np.stack([facts.rows.number("tip_x_mm"), facts.rows.number("tip_y_mm")], axis=1)
+
+
+def _depth_levels(rows: Rows) -> tuple[Codes, list[str]]:
+    """Return the depth of each row's target as a level, and the names; many depths are put into bands."""
+    depth = rows.number("target_depth_mm")
+    levels, codes = np.unique(depth, return_inverse=True)
+    if len(levels) <= _MOST_DEPTHS:
+        return codes, [f"{level:g}" for level in levels.tolist()]
+    edges = np.linspace(levels[0], levels[-1], _DEPTH_BANDS + 1)
+    band = np.searchsorted(edges[1:-1], depth, side="right")
+    used, dense = np.unique(band, return_inverse=True)
+    return dense, [f"{edges[k]:.3g} to {edges[k + 1]:.3g}" for k in used.tolist()]
+
+
+def _note(facts: _Facts, own: Flags) -> str:
+    """Say mean, 95 % and maximum of rows in one short line."""
+    errors = facts.error[own & facts.known]
+    if len(errors) == 0:
+        return f"n = {int(own.sum())}"
+    return f"mean {errors.mean():.2f}, 95 % {np.quantile(errors, 0.95):.2f}, max {errors.max():.2f} mm"
+
+
+def _alarm(facts: _Facts, own: Flags) -> str:
+    missing = int((own & ~facts.done).sum())
+    return f"{missing} not finished" if missing else ""
+
+
+def _pooled(facts: _Facts, axis: Factor | None = None) -> str:
+    """Say over what else the rows are taken together."""
+    others = [f for f in facts.design.factors[1:] if axis is None or f.key != axis.key]
+    return f", all levels of {_and([factor.label for factor in others])} together" if others else ""
+
+
+def _row(name: str, look: plots.Look, found: Estimate) -> plots.DifferenceRow:
+    return plots.DifferenceRow(name, look, found.value, found.low, found.high)
+
+
+def _means(panels: Sequence[plots.TargetPanel]) -> str:
+    return "; ".join(f"{panel.title}: {panel.note}" for panel in panels) + "."
+
+
+def _middle(name: str, errors: Floats) -> str:
+    return f"{name}: median {np.median(errors):.3f} mm, 95 % {np.quantile(errors, 0.95):.3f} mm"
+
+
+def _listed(rows: Sequence[plots.ErrorRow]) -> str:
+    return ", ".join(f"{np.median(row.errors):.3f} mm at {row.name}" for row in rows if len(row.errors))
+
+
+def _told(rows: Sequence[plots.DifferenceRow]) -> str:
+    return ", ".join(f"{row.name} {row.mean:+.3f} mm ({row.low:+.3f} to {row.high:+.3f})" for row in rows)
+
+
+def _and(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))
+
+
+def _or_lowest(value: float) -> float:
+    return float("-inf") if isnan(value) else value

@@ -1,0 +1,91 @@
+"""What a study comes to, as a whole: all that the page and the summary say."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import prod
+from typing import Any
+
+from flexneedle.control.methods import DEFAULT, METHODS
+from flexneedle.run.report.design import Design, design_of
+from flexneedle.run.report.reading import StudyRecord
+from flexneedle.run.report.summary import (
+    Difference,
+    Ending,
+    Group,
+    case_differences,
+    controller_differences,
+    endings,
+    groups_of,
+    worst,
+)
+
+__all__ = ["Findings", "controllers_in_order", "findings_of", "planned_insertions", "title_of"]
+
+_MOST_KINDS = 20  # of endings that are listed
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What a study comes to. planned: insertions that it asks for, None if it does not say."""
+
+    study: StudyRecord
+    planned: int | None
+    design: Design
+    groups: Sequence[Group]
+    against: Sequence[Difference]
+    cases: Sequence[Difference]
+    endings: Sequence[Ending]
+    worst: Sequence[int]
+
+    @property
+    def finished(self) -> int:
+        """How many insertions finished."""
+        return sum(group.finished for group in self.groups)
+
+
+def findings_of(study: StudyRecord) -> Findings:
+    """Return what a study comes to."""
+    rows, asked = study.rows, _asked(study.about)
+    design = design_of(rows, controllers_in_order(), asked.get("axes") or (), _base_case(asked))
+    return Findings(
+        study,
+        planned_insertions(study.about),
+        design,
+        groups_of(rows, design),
+        controller_differences(rows, design) if design.controller.varies else [],
+        case_differences(rows, design) if design.cases.varies else [],
+        endings(rows)[:_MOST_KINDS],
+        worst(rows),
+    )
+
+
+def planned_insertions(about: Mapping[str, Any]) -> int | None:
+    """Return how many insertions a study asks for: repeats × cases × values of each axis; None if it does not say."""
+    asked = _asked(about)
+    if "repeats" not in asked or "axes" not in asked:
+        return None
+    return (
+        int(asked["repeats"]) * max(1, len(asked.get("cases") or ())) * prod(map(len, asked["axes"].values()))
+    )
+
+
+def title_of(about: Mapping[str, Any]) -> str:
+    """Return the title of a study, or its name."""
+    asked = _asked(about)
+    return str(asked.get("title") or asked.get("name") or "Study")
+
+
+def _asked(about: Mapping[str, Any]) -> Mapping[str, Any]:
+    inner = about.get("study", about)
+    return inner if isinstance(inner, Mapping) else {}
+
+
+def _base_case(asked: Mapping[str, Any]) -> str | None:
+    """Return the first case that sets nothing."""
+    cases = asked.get("cases") or {}
+    return next((name for name, settings in cases.items() if not settings), None)
+
+
+def controllers_in_order() -> list[str]:
+    """Return the controllers, the default first."""
+    return sorted(METHODS, key=lambda name: name != DEFAULT)

@@ -1,0 +1,132 @@
+"""The page of a report: sections of safe HTML, made from findings."""
+
+import base64
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from math import isnan
+
+from flexneedle.run.report import provenance, tables
+from flexneedle.run.report.figures import Drawn
+from flexneedle.run.report.findings import Findings, title_of
+from flexneedle.run.report.html import Html, document, element, joined
+from flexneedle.run.report.reading import Tuning
+from flexneedle.run.report.summary import HIT_MM, Difference, Group
+from flexneedle.run.report.times import times
+from flexneedle.run.report.wording import interval, mm, number, signed
+
+__all__ = ["page_text"]
+
+_LARGEST_SVG = 1_000_000  # bytes; larger figures stand in the page as PNG
+
+
+def page_text(
+    findings: Findings, figures: Sequence[Drawn], again: Mapping[int, str], tuning: Sequence[Tuning] = ()
+) -> str:
+    """Return the whole page. again: command of each listed row; tuning: records of the controllers' tuning."""
+    title = title_of(findings.study.about)
+    sections = (
+        _opening(findings, title),
+        _figures(figures),
+        tables.groups(findings),
+        tables.controllers(findings.against),
+        tables.cases(findings),
+        tables.endings(findings, again),
+        tables.worst(findings, again),
+        provenance.made_with(findings, tuning),
+        provenance.method(),
+        times(findings),
+    )
+    style = (files("flexneedle.run.report") / "report.css").read_text(encoding="utf-8")
+    main = element("main", *(Html("\n" + section) for section in sections if section is not None))
+    return document(f"{title}: report", style, main)
+
+
+def _opening(findings: Findings, title: str) -> Html:
+    rows, planned = findings.study.rows, findings.planned
+    done = findings.finished
+    unfinished = planned is not None and len(rows) < planned
+    return element(
+        "header",
+        element("p", "flexneedle study", class_="quiet"),
+        element("h1", title),
+        element(
+            "p",
+            f"This study is not complete: {len(rows)} of {planned} insertions are in. All below is about those.",
+            class_="alarm",
+            role="status",
+        )
+        if unfinished
+        else None,
+        element("p", f"{len(rows)} insertions, {done} finished" + _unfinished(len(rows) - done) + "."),
+        _unconverged(sum(group.unconverged for group in findings.groups)),
+        _key_figures(findings.groups[0]) if findings.groups else None,
+        element("ul", *(element("li", _sentence(d)) for d in findings.against), class_="verdicts")
+        if findings.against
+        else None,
+    )
+
+
+def _unfinished(count: int) -> str:
+    return f"; {count} did not, and are counted and listed below" if count else ""
+
+
+def _unconverged(count: int) -> Html | None:
+    if not count:
+        return None
+    return element("p", f"{count} insertions have periods whose solve did not converge: see the table.")
+
+
+def _key_figures(group: Group) -> Html:
+    """Return the figures of the first group: that of the default controller at the first settings."""
+    found = group.estimates
+    shown = (
+        ("mean true error", mm(found["mean_mm"].value), interval(found["mean_mm"], " mm")),
+        ("95 % below", mm(found["p95_mm"].value), interval(found["p95_mm"], " mm")),
+        ("largest", mm(group.largest_mm), _beyond(group)),
+        ("finished", f"{group.finished} of {group.count}", f"{group.missed} more than {HIT_MM:g} mm off"),
+        (
+            "tissue energy / plan's",
+            number(found["energy_ratio"].value, 2),
+            interval(found["energy_ratio"], "", 2),
+        ),
+    )
+    boxes = (
+        element("div", element("dt", name), element("dd", value, element("small", below)))
+        for name, value, below in shown
+    )
+    return joined((element("p", group.name, class_="quiet"), element("dl", *boxes, class_="key")))
+
+
+def _beyond(group: Group) -> str:
+    if isnan(group.beyond_largest):
+        return ""
+    return f"at most {100 * group.beyond_largest:.2g} % of all lie beyond"
+
+
+def _sentence(difference: Difference) -> Html:
+    """Say whether the first controller is better, worse or not separable from another."""
+    ours, other, found = difference.name, difference.against, difference.mean_mm
+    numbers = f"{signed(found.value)} mm ({interval(found, ' mm', 3)}, {difference.pairs} pairs)"
+    if difference.verdict is None:
+        return joined((f"{ours} and {other} cannot be compared: too few pairs of finished insertions.",))
+    if difference.verdict == "not separable":
+        return joined((f"{ours} is not separable from {other} in mean true error: ", numbers, "."))
+    mark = element("span", difference.verdict, class_=difference.verdict)
+    return joined((f"{ours} is ", mark, f" than {other} in mean true error: ", numbers, "."))
+
+
+def _figures(figures: Sequence[Drawn]) -> Html:
+    return element("section", element("h2", "Figures"), *map(_figure, figures))
+
+
+def _figure(drawn: Drawn) -> Html:
+    large = drawn.svg.stat().st_size > _LARGEST_SVG
+    path, kind = (drawn.png, "image/png") if large else (drawn.svg, "image/svg+xml")
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    image = element("img", src=f"data:{kind};base64,{data}", alt=drawn.alt)
+    return element(
+        "figure",
+        element("h3", drawn.title, id=f"figure-{drawn.name}"),
+        element("div", image, class_="scroll"),
+        element("figcaption", f"{drawn.caption} ({drawn.png.name}, {drawn.svg.name})"),
+    )

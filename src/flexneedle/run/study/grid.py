@@ -1,0 +1,181 @@
+"""The grid of a study: every insertion that it asks for, in a fixed order, each with its scenario and seed."""
+
+import itertools
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flexneedle.control.methods import DEFAULT, METHODS
+from flexneedle.errors import InputError, ScenarioError
+from flexneedle.phantom import DEFAULT_PLANT, PLANTS
+from flexneedle.run.planner import STRATEGIES
+from flexneedle.run.study.spec import ALL, SEED, Axis, StudyFile, base_of, is_seed, read_study, settings_of
+from flexneedle.scenario import Scenario
+from flexneedle.scenario.problems import Problem, printable, to_line
+from flexneedle.trace.plain import plain
+
+__all__ = ["Insertion", "Point", "Study", "load_study"]
+
+_DEFAULTS = {"controller": DEFAULT, "plant": DEFAULT_PLANT, "strategy": STRATEGIES[0], "plan_seed": 0}
+_CHOICES = {"controller": tuple(METHODS), "plant": tuple(PLANTS), "strategy": STRATEGIES}
+_MOST_INSERTIONS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point of the grid: everything that its insertions share.
+
+    varied: what the axes chose, but for the target; target_number: place of the target among those of the study.
+    """
+
+    scenario: Scenario
+    case: str
+    controller: str
+    plant: str
+    strategy: str
+    plan_seed: int
+    target_number: int
+    varied: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Insertion:
+    """One insertion of a study: its row, its point, which repeat it is, and the seed of its phantom."""
+
+    index: int
+    point: Point
+    repeat: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study, multiplied out. definition: all that it depends on, as plain values; seeds: of an axis, else ()."""
+
+    definition: Mapping[str, Any]
+    points: tuple[Point, ...]
+    repeats: int
+    first_seed: int
+    seeds: tuple[int, ...]
+
+    @property
+    def name(self) -> str:
+        """Name in the name of the folder."""
+        return str(self.definition["name"])
+
+    @property
+    def title(self) -> str:
+        """Title in tables and reports."""
+        return str(self.definition["title"])
+
+    def __len__(self) -> int:
+        return len(self.points) * self.repeats
+
+    def insertion(self, index: int) -> Insertion:
+        """Return the insertion of a row.
+
+        Without an axis of seeds, every target and repeat has a phantom of its own, and the same one at every
+        other setting of the study: comparisons are paired.
+        """
+        number, repeat = divmod(index, self.repeats)
+        point = self.points[number]
+        own = self.first_seed + point.target_number * self.repeats + repeat
+        return Insertion(index, point, repeat, self.seeds[repeat] if self.seeds else own)
+
+
+def load_study(source: str | Path | Study) -> Study:
+    """Return the study of a shipped name or a TOML file; a study is returned as it is.
+
+    Raises InputError with one line for each problem: file, key, value, rule.
+    """
+    if isinstance(source, Study):
+        return source
+    file, home, label = read_study(source)
+    try:
+        return _multiplied(file, base_of(file, home))
+    except InputError as error:
+        raise InputError("\n".join(f"{label}: {line}" for line in str(error).splitlines())) from None
+
+
+def _multiplied(file: StudyFile, base: Scenario) -> Study:
+    axes = {axis.key: _values(axis) for axis in file.axes}
+    seeds = tuple(axes.pop(SEED, ()))
+    repeats = len(seeds) or file.repeats
+    wanted = math.prod((len(file.cases) or 1, repeats, *map(len, axes.values())))
+    if wanted > _MOST_INSERTIONS:
+        raise InputError(f"asks for {wanted} insertions: must be at most {_MOST_INSERTIONS}")
+    _check_left_out(file.without, base)
+    fixed = _DEFAULTS | settings_of(file.values)
+    cases = {case.name: settings_of(case.values) for case in file.cases}
+    points = tuple(_points(base, dict.fromkeys(file.without), fixed, cases or {"": {}}, axes))
+    definition = {
+        "name": file.name,
+        "title": file.title,
+        "scenario": base.values(),
+        "without": list(file.without),
+        "values": fixed,
+        "cases": cases,
+        "axes": axes,
+        "repeats": repeats,
+        "first_seed": file.first_seed,
+        "seeds": list(seeds),
+    }
+    return Study(plain(definition), points, repeats, file.first_seed, seeds)
+
+
+def _values(axis: Axis) -> list[Any]:
+    if axis.key in _CHOICES and axis.values == ALL:
+        return list(_CHOICES[axis.key])
+    if isinstance(axis.values, dict):
+        first = axis.values["from"]
+        return list(range(first, first + axis.values["count"]))
+    return list(axis.values)
+
+
+def _check_left_out(keys: tuple[str, ...], base: Scenario) -> None:
+    for key in keys:
+        if key not in base.flat():
+            raise InputError(f"without = {json.dumps(key)}: the scenario has no such value")
+
+
+def _points(
+    base: Scenario,
+    left_out: Mapping[str, None],
+    fixed: Mapping[str, Any],
+    cases: Mapping[str, Mapping[str, Any]],
+    axes: Mapping[str, list[Any]],
+) -> Iterator[Point]:
+    """Yield the points: cases vary slowest, then the axes in their order; later settings go over earlier ones."""
+    targets: dict[tuple[float, float], int] = {}
+    for case, values in itertools.product(cases, itertools.product(*axes.values())):
+        chosen = dict(zip(axes, values, strict=True))
+        settings = {**fixed, **cases[case], **settings_of(chosen)}
+        named = {"case": case, **chosen} if case else chosen
+        where = printable(", ".join(f"{key} = {value}" for key, value in named.items()))
+        run = {key: settings.pop(key) for key in _DEFAULTS}
+        _check_run(run)
+        scenario = _varied(base, {**left_out, **settings}, where)
+        number = targets.setdefault(scenario.target.position, len(targets))
+        varied = {key: value for key, value in chosen.items() if not key.startswith("target")}
+        yield Point(scenario, case, **run, target_number=number, varied=varied)
+
+
+def _check_run(run: Mapping[str, Any]) -> None:
+    for key, choices in _CHOICES.items():
+        if run[key] not in choices:
+            raise InputError(to_line(Problem(key, run[key], f"must be one of {', '.join(choices)}")))
+    if not is_seed(run["plan_seed"]):
+        raise InputError(
+            to_line(Problem("plan_seed", run["plan_seed"], "must be a whole number, at least 0"))
+        )
+
+
+def _varied(base: Scenario, settings: Mapping[str, Any], where: str) -> Scenario:
+    try:
+        return base.with_values(settings)
+    except ScenarioError as error:
+        at = f" (at {where})" if where else ""
+        raise InputError("\n".join(problem + at for problem in error.problems)) from None

@@ -1,0 +1,70 @@
+"""The plans of a study: one for all points that plan the same, kept as JSON beside the tables."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from flexneedle.errors import InputError
+from flexneedle.run.study.files import replace_file
+from flexneedle.run.study.grid import Point
+from flexneedle.run.study.rows import Planned
+from flexneedle.trace import PlanRecord
+from flexneedle.trace.plain import plan_from_values, to_text
+
+__all__ = ["Plans", "plan_key"]
+
+_SECTIONS = ("needle", "setup", "tissue", "contact", "target", "plan")
+
+
+def plan_key(point: Point) -> str:
+    """Return the name of a point's plan: a digest of all that the planner sees."""
+    values = point.scenario.values()
+    seen = [{name: values[name] for name in _SECTIONS}, point.strategy, point.plan_seed]
+    return hashlib.sha256(json.dumps(seen, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class Plans:
+    """Plans by key, in memory and in a folder. A point that has none (`refusals`) is planned again next time."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._made: dict[str, tuple[PlanRecord, float]] = {}
+        self.refusals: dict[str, str] = {}
+
+    def plan(self, key: str) -> PlanRecord | None:
+        """Return the plan of a key, as it stands on disk, or None if there is none (yet)."""
+        made = self._find(key)
+        return made[0] if made else None
+
+    def seconds(self, key: str) -> float | None:
+        """Return the seconds that a plan took, or None if there is no plan."""
+        made = self._find(key)
+        return made[1] if made else None
+
+    def keep(self, key: str, planned: Planned) -> None:
+        """Keep what planning came to."""
+        if planned.refusal:
+            self.refusals[key] = planned.refusal
+        else:
+            self._folder.mkdir(exist_ok=True)
+            text = to_text({"seconds": planned.seconds, "plan": planned.values})
+            replace_file(self._path(key), text.encode())
+
+    def _path(self, key: str) -> Path:
+        return self._folder / f"{key}.json"
+
+    def _find(self, key: str) -> tuple[PlanRecord, float] | None:
+        if key not in self._made and self._path(key).exists():
+            self._made[key] = _read(self._path(key))
+        return self._made.get(key)
+
+
+def _read(path: Path) -> tuple[PlanRecord, float]:
+    try:
+        values: Any = json.loads(path.read_text(encoding="utf-8"))
+        return plan_from_values(values["plan"]), float(values["seconds"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: damaged: {type(error).__name__} {error}: remove it to plan again"
+        ) from None

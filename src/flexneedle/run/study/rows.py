@@ -1,0 +1,170 @@
+"""What a worker does: plan, or carry out insertions and return a row for each. A failure is a row, too."""
+
+import fcntl
+import os
+import tempfile
+import time
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from flexneedle.errors import RunError
+from flexneedle.phantom import PLANTS, Phantom, Truth
+from flexneedle.run.folder import versions
+from flexneedle.run.insertion import insert
+from flexneedle.run.planner import plan
+from flexneedle.run.study.grid import Point
+from flexneedle.scenario import load_scenario
+from flexneedle.simulator import Simulator
+from flexneedle.trace import Insertion, PlanRecord
+from flexneedle.trace.plain import plain, plan_values
+
+__all__ = ["RESULTS", "TIMES", "Done", "Job", "Planned", "carry_out", "compile_kernels", "make_plan"]
+
+RESULTS = {
+    "true_error_mm": float,
+    "residual_mm": float,
+    "tip_x_mm": float,
+    "tip_y_mm": float,
+    "flips": int,
+    "planned_flips": int,
+    "strain_energy_mj": float,
+    "planned_strain_energy_mj": float,
+    "planned_error_mm": float,
+    "guide_travel_mm": float,
+    "peak_stretch": float,
+    "periods": int,
+    "planned_periods": int,
+    "unconverged_periods": int,
+    "outcome": str,
+    "reason": str,
+}
+"""What an insertion came to: the columns and their types; null where it is not known."""
+TIMES = {"control_s": float, "plant_s": float, "total_s": float}
+"""Wall-clock times of an insertion."""
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """Insertions of one point: (index, seed) of each. Without a plan, `refusal` says why there is none."""
+
+    point: Point
+    plan: PlanRecord | None
+    refusal: str
+    insertions: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A plan as plain values and the seconds that it took, or why there is none."""
+
+    values: dict[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+    refusal: str = ""
+
+
+@dataclass(frozen=True)
+class Done:
+    """Rows of a job, each with its index, results and times, and the versions of the worker."""
+
+    rows: list[dict[str, Any]]
+    versions: dict[str, str]
+
+
+def compile_kernels() -> None:
+    """Compile the kernels of model and plants, or load them from the cache."""
+    scenario = load_scenario("phantom")  # kernels are the same for every scenario
+    Simulator(scenario, threads=1).compile()
+    for kind in PLANTS:
+        Phantom(Truth(scenario), 1, kind).apply((0.0, 0.0, 0.0, 0.0, -1), 0.0)
+
+
+def make_plan(point: Point) -> Planned:
+    """Plan for a point, on one thread."""
+    _ready()
+    try:
+        made = plan(point.scenario, strategy=point.strategy, seed=point.plan_seed, threads=1)
+    except Exception as error:  # noqa: BLE001  whatever a plan fails with is said in each of its rows
+        return Planned(refusal=f"no plan: {_told(error)}")
+    return Planned(plan_values(made), made.seconds)
+
+
+def carry_out(job: Job) -> Done:
+    """Carry out the insertions of a job, on one thread."""
+    _ready()
+    return Done([{"index": index, **_row(job, seed)} for index, seed in job.insertions], versions())
+
+
+def _row(job: Job, seed: int) -> dict[str, Any]:
+    begun = time.perf_counter()
+    results = dict.fromkeys(RESULTS) | _planned(job.plan) | {"outcome": "error", "reason": job.refusal}
+    times: dict[str, float] = {}
+    if job.plan is not None:
+        try:
+            insertion = _insertion(job, job.plan, seed)
+        except RunError as error:
+            results |= {"outcome": "refused", "reason": str(error)}
+        except Exception as error:  # noqa: BLE001  one insertion must not end a study; its row says what it was
+            results["reason"] = _told(error)
+        else:
+            results |= _results(insertion)
+            times = _times(insertion)
+    values: dict[str, Any] = plain(results | times | {"total_s": time.perf_counter() - begun})
+    return values
+
+
+def _insertion(job: Job, made: PlanRecord, seed: int) -> Insertion:
+    point = job.point
+    return insert(point.scenario, made, seed, controller=point.controller, phantom=point.plant, threads=1)
+
+
+def _planned(made: PlanRecord | None) -> dict[str, Any]:
+    if made is None:
+        return {}
+    return {
+        "planned_flips": made.flips,
+        "planned_strain_energy_mj": made.strain_energy_mj,
+        "planned_error_mm": made.error_mm,
+        "planned_periods": len(made.controls),
+    }
+
+
+def _results(insertion: Insertion) -> dict[str, Any]:
+    periods = insertion.periods
+    last = periods[-1]
+    tip = last.true_tip or (None, None, None)
+    return {
+        "true_error_mm": insertion.true_error_mm,
+        "residual_mm": insertion.residual_mm,
+        "tip_x_mm": tip[0],
+        "tip_y_mm": tip[1],
+        "flips": insertion.flips,
+        "strain_energy_mj": last.true_strain_energy,
+        "guide_travel_mm": sum(abs(period.applied[3]) for period in periods),
+        "peak_stretch": last.true_stretch,
+        "periods": len(periods),
+        "unconverged_periods": sum(not period.converged for period in periods),
+        "outcome": insertion.outcome,
+        "reason": insertion.reason,
+    }
+
+
+def _times(insertion: Insertion) -> dict[str, float]:
+    periods = insertion.periods
+    return {
+        "control_s": sum(period.durations["decide"] + period.durations["observe"] for period in periods),
+        "plant_s": sum(period.durations["apply"] for period in periods),
+    }
+
+
+def _told(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+@cache
+def _ready() -> None:
+    """Compile before the first work of a process; one process of a machine at a time, or the cache suffers."""
+    with (Path(tempfile.gettempdir()) / f"flexneedle-{os.getuid()}.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        compile_kernels()

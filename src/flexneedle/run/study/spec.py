@@ -1,0 +1,224 @@
+"""Study files: what is varied, read from TOML, every problem in one line."""
+
+import tomllib
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from importlib.resources import files
+from os import fspath
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError, model_validator
+
+from flexneedle.errors import InputError
+from flexneedle.scenario import Scenario, load_scenario, preset_names
+from flexneedle.scenario.dotted import flatten
+from flexneedle.scenario.fields import Section, Title, count
+from flexneedle.scenario.problems import Problem, describe, printable, refuse
+
+__all__ = [
+    *("ALL", "NAMED", "SEED", "Axis", "Case", "StudyFile"),
+    *("base_of", "is_seed", "read_study", "settings_of", "study_names"),
+]
+
+SEED, ALL = "seed", "all"
+NAMED = ("controller", "plant", "strategy")
+_TARGET = "target"
+_TARGET_KEYS = ("target.depth_mm", "target.lateral_mm")
+_SHIPPED = files("flexneedle.run") / "studies"
+_SUFFIX = ".toml"
+_LARGEST_FILE = 1_000_000
+_MOST_VALUES = 100_000
+
+
+class Axis(Section):
+    """One `[[axes]]`: a key and the values that it takes, each with each of the other axes'."""
+
+    key: str
+    """A key of the scenario, or target, controller, plant, strategy, plan_seed, seed."""
+    values: Any
+    """A list; "all" for every controller, plant or strategy; {from, count} for seeds that follow each other."""
+
+    @model_validator(mode="after")
+    def _check_values(self) -> "Axis":
+        refuse(_value_problems(self.key, self.values))
+        return self
+
+
+class Case(Section):
+    """One `[[cases]]`: values that are set together, under a name."""
+
+    name: Title
+    """In the column `case`."""
+    values: dict[str, Any] = Field(default_factory=dict)
+    """Values by dotted key; left out, the case is the base."""
+
+    @model_validator(mode="after")
+    def _check_values(self) -> "Case":
+        refuse(_settings_problems(self.values))
+        return self
+
+
+class StudyFile(Section):
+    """A study as its file says it; nothing is looked up or multiplied out yet."""
+
+    name: Title
+    """In the name of the folder."""
+    title: Title = "Study"
+    """In tables and reports."""
+    scenario: str = "phantom"
+    """The base: a preset's name, or a path from the folder of the study file."""
+    without: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """Keys of the base that are left out, such as diameters where a gauge is given."""
+    values: dict[str, Any] = Field(default_factory=dict)
+    """Values by dotted key that hold for the whole study."""
+    axes: Annotated[tuple[Axis, ...], Field(strict=False)] = ()
+    cases: Annotated[tuple[Case, ...], Field(strict=False)] = ()
+    repeats: int = count(1, least=1, most=_MOST_VALUES)
+    """Insertions at each point of the grid, each with a seed of its own."""
+    first_seed: Annotated[int, Field(ge=0)] = 0
+    """Seed of the first insertion."""
+
+    @model_validator(mode="after")
+    def _check_together(self) -> "StudyFile":
+        refuse(
+            (
+                *_settings_problems(self.values),
+                *_case_problems(self),
+                *_key_problems(self),
+                *_seed_problems(self),
+            )
+        )
+        return self
+
+
+def study_names() -> list[str]:
+    """Return the names of the studies that come with the package."""
+    return sorted(
+        entry.name.removesuffix(_SUFFIX) for entry in _SHIPPED.iterdir() if entry.name.endswith(_SUFFIX)
+    )
+
+
+def read_study(source: str | Path) -> tuple[StudyFile, Path, str]:
+    """Return the study of a shipped name or of a TOML file, the folder of the file, and its label in messages.
+
+    Raises InputError with one line for each problem: file, key, value, rule.
+    """
+    if isinstance(source, str) and source in study_names():
+        data, home = (_SHIPPED / (source + _SUFFIX)).read_bytes(), Path()
+    else:
+        data, home = _read(Path(source)), Path(source).parent
+    label = printable(fspath(source))
+    return _parsed(data, label), home, label
+
+
+def base_of(file: StudyFile, home: Path) -> Scenario:
+    """Return the base scenario of a study whose file lies in the folder `home`. Raises ScenarioError."""
+    return load_scenario(file.scenario if file.scenario in preset_names() else home / file.scenario)
+
+
+def settings_of(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by dotted key, a target [depth, lateral] as the two keys of the scenario."""
+    flat = flatten(values)
+    if _TARGET in flat:
+        flat |= dict(zip(_TARGET_KEYS, flat.pop(_TARGET), strict=True))
+    return flat
+
+
+def _keys_of(key: str) -> tuple[str, ...]:
+    """Return the keys that an axis sets."""
+    return _TARGET_KEYS if key == _TARGET else (key,)
+
+
+def _read(path: Path) -> bytes:
+    label = printable(fspath(path)) or '""'
+    try:
+        with path.open("rb") as file:
+            data = file.read(_LARGEST_FILE + 1)
+    except FileNotFoundError:
+        names = ", ".join(study_names())
+        raise InputError(f"{label}: no such file, and no such study (studies: {names})") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{label}: cannot be read: {reason}") from None
+    if len(data) > _LARGEST_FILE:
+        raise InputError(f"{label}: larger than {_LARGEST_FILE} bytes, not a study file")
+    return data
+
+
+def _parsed(data: bytes, label: str) -> StudyFile:
+    try:
+        values = tomllib.loads(data.decode("utf-8-sig"))
+    except RecursionError:
+        raise InputError(f"{label}: not TOML: nested too deeply") from None
+    except ValueError as error:  # UnicodeDecodeError is one
+        raise InputError(f"{label}: not TOML: {printable(str(error))}") from None
+    try:
+        return StudyFile.model_validate(values)
+    except ValidationError as error:
+        raise InputError("\n".join(f"{label}: {line}" for line in describe(error, StudyFile))) from None
+
+
+def _value_problems(key: str, values: Any) -> Iterator[Problem]:
+    if key in NAMED and values == ALL:
+        return
+    if key == SEED and isinstance(values, dict):
+        yield from _range_problems(values)
+    elif not isinstance(values, list) or not values:
+        yield Problem("values", values, "must be a list of at least one value")
+    elif twice := [text for text, times in Counter(map(repr, values)).items() if times > 1]:
+        yield Problem("values", values, f"has {twice[0]} twice")
+    elif key == _TARGET:
+        yield from (problem for value in values for problem in _target_problems("values", value))
+    elif key == SEED and not all(map(is_seed, values)):
+        yield Problem("values", values, "must be whole numbers, at least 0")
+
+
+def _range_problems(values: dict[str, Any]) -> Iterator[Problem]:
+    fine = set(values) == {"from", "count"} and all(map(is_seed, values.values()))
+    if not fine or not 1 <= values["count"] <= _MOST_VALUES:
+        rule = f"must be a list, or {{from, count}}: whole numbers, count 1 to {_MOST_VALUES}"
+        yield Problem("values", values, rule)
+
+
+def _target_problems(key: str, value: Any) -> Iterator[Problem]:
+    if not isinstance(value, list) or len(value) != 2:
+        yield Problem(key, value, "a target must be two numbers, [depth, lateral] in mm")
+
+
+def is_seed(value: Any) -> bool:
+    """Whether a value is a whole number, at least 0."""
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _settings_problems(values: Mapping[str, Any]) -> Iterator[Problem]:
+    flat = flatten(values)
+    if _TARGET in flat:
+        yield from _target_problems(f"values.{_TARGET}", flat[_TARGET])
+    if SEED in flat:
+        rule = "seeds are set by first_seed and repeats, or by an axis"
+        yield Problem(f"values.{SEED}", flat[SEED], rule)
+
+
+def _case_problems(study: StudyFile) -> Iterator[Problem]:
+    for name, times in Counter(case.name for case in study.cases).items():
+        if times > 1:
+            yield Problem("cases", name, "two cases have this name")
+
+
+def _key_problems(study: StudyFile) -> Iterator[Problem]:
+    """No key is set by two axes, or by an axis and a case."""
+    axes = Counter(key for axis in study.axes for key in _keys_of(axis.key))
+    for key, times in axes.items():
+        if times > 1:
+            yield Problem("axes", key, "two axes set this key")
+    for number, case in enumerate(study.cases):
+        for key in settings_of(case.values):
+            if key in axes:
+                yield Problem(f"cases.{number}.values", key, "an axis sets this key too")
+
+
+def _seed_problems(study: StudyFile) -> Iterator[Problem]:
+    if any(axis.key == SEED for axis in study.axes):
+        for key in sorted({"repeats", "first_seed"} & study.model_fields_set):
+            yield Problem(key, getattr(study, key), "leave it out: an axis gives the seeds")

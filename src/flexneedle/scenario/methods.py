@@ -1,0 +1,88 @@
+"""Settings of single controllers, tables below `control`. The cross-entropy controllers have theirs in `control`."""
+
+from .fields import Fraction, NonNegative, Positive, Section, count
+
+__all__ = ["AdaptiveMpc", "BevelOnly", "BevelRule", "BroydenMpc", "ResolvedRate"]
+
+
+class BevelRule(Section):
+    """The bang-bang rule of a controller that has its own."""
+
+    curvature_per_m: NonNegative = 0.962
+    """κ of the two paths of the bang-bang rule."""
+    flip_dead_band: Fraction = 0.722
+    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
+
+    @property
+    def curvature(self) -> float:
+        """κ, 1/mm."""
+        return 1e-3 * self.curvature_per_m
+
+
+class BevelOnly(BevelRule):
+    """Section `control.bevel_only`: the bevel alone steers."""
+
+
+class ResolvedRate(BevelRule):
+    """Section `control.resolved_rate`: the guide follows the damped inverse of the model's Jacobian."""
+
+    gain: NonNegative = 1.0
+    """Share of the tip's predicted deviation that a control step is to remove."""
+    damping: NonNegative = 0.03
+    """λ of the damped least squares, as the tip's lateral motion for that of the guide."""
+    lookahead_mm: Positive = 5.0
+    """How far ahead of the tip its deviation is predicted, at most to the target depth."""
+
+
+class BroydenMpc(Section):
+    """Section `control.broyden_mpc`: a Jacobian learnt from readings, and linear MPC of the guide."""
+
+    update_gain: Fraction = 0.65
+    """Share of Broyden's update of the Jacobian that is made; 1 repeats the newest motion exactly."""
+    horizon: int = count(4, least=1, most=20)
+    """Steps that the linear MPC looks ahead."""
+    max_guide_travel_mm: Positive = 6.0
+    """Greatest lateral distance of the guide from the axis, if that of the setup is not smaller."""
+    guide_weight: NonNegative = 0.01
+    """Cost of a squared millimetre of a guide step, in mm² of the tip."""
+    guide_effect: NonNegative = 1.0
+    """The first Jacobian's lateral motion of the tip for that of the guide; for advance it is a straight line."""
+
+
+class AdaptiveMpc(Section):
+    """Section `control.adaptive_mpc`: `adaptive-mpc`, its search and the priors of what it identifies."""
+
+    samples: int = count(32, least=8, most=100_000)
+    """Control sequences in an iteration of a period."""
+    iterations: int = count(3, least=1, most=1_000)
+    """Iterations of a period."""
+    horizon: int = count(8, least=1, most=1_000)
+    """Steps that a period looks ahead."""
+    pieces: int = count(4, least=1, most=1_000)
+    """Pieces of the horizon, each with one guide step."""
+    guide_sigma_mm: NonNegative = 0.2
+    """First standard deviation of the guide step."""
+    target_weight: NonNegative = 30.0
+    """Weight of the deviation at the target, against 1 on the way."""
+    orientation_weight_mm: NonNegative = 5.0
+    """Cost of an angle off the planned path, as a distance: 1 rad weighs as much as this."""
+    guide_weight: NonNegative = 0.05
+    """Cost of a squared millimetre that a guide step departs from the plan's."""
+    energy_weight_per_mj: NonNegative = 4.0
+    """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
+    bend_sd_mm: NonNegative = 0.5
+    """Prior of the natural bend of the needle, over its length: standard deviation."""
+    run_out_sd_mm: NonNegative = 0.1
+    """Prior of the distance of the seen tip from the needle's axis: standard deviation."""
+    modulus_log_sd: NonNegative = 0.3
+    """Prior of the logarithm of the factor on each layer's modulus: standard deviation."""
+    bevel_sd: NonNegative = 0.3
+    """Prior of the factor on the bevel offset: standard deviation."""
+    bevel_walk_sd: NonNegative = 0.3
+    """Standard deviation of that factor's change from knot to knot."""
+    knot_mm: Positive = 5.0
+    """Depth between the knots of that factor."""
+    model_sd_mm: Positive = 0.015
+    """Standard deviation of a reading's mean that no parameter explains."""
+    residual_gain: Fraction = 0.4
+    """Gain of the low-pass over what the fit leaves."""

@@ -1,0 +1,59 @@
+"""`flexneedle report`: where the page is, the statistics as JSON, and errors in one line."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from flexneedle.cli import main as cli
+from study_rows import OURS, make_rows, unfinished, write_study
+
+
+@pytest.fixture
+def study(tmp_path):
+    rows = make_rows((OURS, "open-loop"), targets=((25.0, 0.0), (40.0, 5.0)), repeats=3)
+    rows[2] = unfinished(rows[2], "refused", "plan misses the target")
+    return write_study(tmp_path / "study", rows, {"title": "Mine"})
+
+
+def run(capsys, *argv):
+    """Return exit status, stdout and stderr."""
+    status = cli.main(argv)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def test_the_path_of_the_page_is_printed(capsys, study):
+    status, out, err = run(capsys, "report", str(study))
+    assert (status, out.strip(), err) == (0, str(study / "report" / "report.html"), "")
+    assert Path(out.strip()).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+
+
+def test_json_has_all_statistics_at_full_precision(capsys, study, tmp_path):
+    status, out, _ = run(capsys, "report", str(study), "--out", str(tmp_path / "here"), "--json")
+    values = json.loads(out)
+    assert status == 0
+    assert list(values) == [
+        *("study", "report", "figures", "insertions", "planned", "finished", "statistics"),
+        *("groups", "controllers", "cases", "endings", "worst"),
+    ]
+    assert (values["study"], values["insertions"], values["finished"], values["planned"]) == (
+        "Mine",
+        12,
+        11,
+        None,
+    )
+    assert values["report"] == str(tmp_path / "here" / "report.html")
+    assert all(Path(path).is_file() for path in values["figures"])
+    mean = values["groups"][0]["estimates"]["mean_mm"]
+    assert mean["low"] < mean["value"] < mean["high"]
+    assert len(repr(mean["value"])) > 12
+    assert values["controllers"][0]["verdict"] == "better"
+    assert values["endings"][0]["reason"] == "plan misses the target"
+
+
+def test_no_study_is_bad_input(capsys, tmp_path):
+    status, out, err = run(capsys, "report", str(tmp_path / "nowhere"))
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert "no such folder" in err

@@ -1,0 +1,154 @@
+"""What every controller of the field keeps to: limits, mirror symmetry, determinism, and an end at the target depth."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+import flexneedle
+from flexneedle.control.interface import Task, travel_left
+from flexneedle.control.methods import DEFAULT, METHODS, method
+from flexneedle.errors import InputError
+from flexneedle.simulator import Control, Simulator
+
+PHANTOM = flexneedle.load_scenario("phantom")
+FIELD = ("open-loop", "bevel-only", "resolved-rate", "broyden-mpc")
+WITHOUT_GUIDE = ("open-loop", "bevel-only")
+
+
+def drive(name, plan, scenario, believed, readings, *, steps, plant=None):
+    """Commands of a controller whose belief is the plant itself and whose readings are a step late, plus `readings`."""
+    task = Task(Simulator(scenario, threads=1), plan)
+    chosen, simulator = METHODS[name], Simulator(plant or scenario, threads=1)
+    memory, rng = chosen.begin(task), np.random.default_rng(0)
+    state, last, commands = simulator.start(plan.bevel), None, []
+    for off in readings[:steps]:
+        seen = None if last is None else tuple((last + np.array([0.0, off])).tolist())
+        estimate = believed(replace(state, scenario=scenario), measured=seen, innovation=(0.0, off))
+        decision, memory = chosen.decide(task, memory, estimate, rng)
+        commands.append(decision.command)
+        last, state = state.tip[:2], simulator.step(state, Control.from_row(decision.command))
+        if chosen.arrived(task, memory, believed(state)):
+            break
+    return np.array(commands), state
+
+
+def test_they_are_there_under_their_names():
+    assert set(FIELD) <= set(METHODS)
+    assert DEFAULT not in FIELD
+    for name in FIELD:
+        assert method(name).name == name
+        assert method(name).summary
+    with pytest.raises(InputError, match=r"controller = 'pid': must be one of .*broyden-mpc"):
+        method("pid")
+
+
+@given(
+    name=st.sampled_from(FIELD), stretch=st.floats(-3.0, 3.0), step=st.floats(0.01, 0.5),
+    reach=st.floats(0.02, 15.0), advance=st.floats(0.3, 2.0),
+    readings=st.lists(st.floats(-3.0, 3.0), min_size=12, max_size=12), gain=st.floats(0.0, 20.0),
+)  # fmt: skip
+@hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
+def test_limits_are_kept_whatever_the_target_and_the_readings(
+    quick_plan, believed, name, stretch, step, reach, advance, readings, gain
+):
+    """The simulator raises CommandError for a step or place out of range; the plan is one of a larger setup."""
+    scenario = PHANTOM.with_values(
+        {
+            "setup.max_guide_step_mm": step, "setup.max_guide_travel_mm": reach, "target.lateral_mm": 0.0,
+            "setup.max_advance_mm": advance, "control.resolved_rate.gain": gain,
+        }
+    )  # fmt: skip
+    wide = replace(
+        quick_plan, tips=quick_plan.tips * [1.0, stretch, stretch], target=(40.0, 5.0 * stretch),
+        controls=quick_plan.controls * [1.0, 1.0, 1.0, stretch, 1.0], guide=quick_plan.guide * stretch,
+    )  # fmt: skip
+    commands, state = drive(name, wide, scenario, believed, readings, steps=12)
+    assert np.isfinite(commands).all()
+    assert np.abs(commands[:, 3]).max() <= step + 1e-12
+    assert np.abs(np.cumsum(commands[:, 3])).max() <= reach + 1e-9
+    assert (commands[:, 0] > 0.0).all()
+    assert commands[:, 0].max() <= advance + 1e-12
+    assert state.converged
+
+
+@cache
+def noise():
+    return tuple(np.random.default_rng(5).normal(0.0, 0.05, 80).tolist())
+
+
+@pytest.mark.parametrize("name", FIELD)
+def test_mirrored_plan_and_readings_give_mirrored_commands(quick_plan, mirrored, believed, name):
+    """Through a whole insertion into tissue of another stiffness, with flips where the method makes them."""
+    plant = PHANTOM.with_values({f"tissue.{k}.shear_modulus_kpa": 5.0 for k in (0, 1)})
+    scenario = PHANTOM.with_values({"control.resolved_rate.curvature_per_m": 3.0})
+    here, end = drive(name, quick_plan, scenario, believed, noise(), steps=80, plant=plant)
+    away = tuple(-off for off in noise())
+    there, other_end = drive(name, mirrored(quick_plan), scenario, believed, away, steps=80, plant=plant)
+    np.testing.assert_allclose(there, here * [1.0, -1.0, -1.0, -1.0, 1.0], atol=1e-9)
+    np.testing.assert_allclose(other_end.tip, end.tip * [1.0, -1.0, -1.0], atol=1e-9)
+    assert np.abs(here[:, 3]).max() > 0.0 or name == "bevel-only"
+
+
+@pytest.mark.parametrize("name", ["bevel-only", "resolved-rate", "broyden-mpc"])
+def test_the_end_is_at_the_target_depth(quick_plan, believed, name):
+    _, state = drive(name, quick_plan, PHANTOM, believed, noise(), steps=80)
+    assert 0.0 <= travel_left(PHANTOM, quick_plan, state) <= PHANTOM.control.depth_tolerance_mm
+
+
+@pytest.mark.parametrize("name", ["resolved-rate", "broyden-mpc"])
+def test_with_exact_readings_the_guide_takes_the_tip_to_the_target(quick_plan, believed, name):
+    """In tissue thrice as stiff as planned for, where the plan alone misses."""
+    plant = PHANTOM.with_values({f"tissue.{k}.shear_modulus_kpa": 6.0 for k in (0, 1)})
+    _, blind = drive("open-loop", quick_plan, PHANTOM, believed, [0.0] * 80, steps=80, plant=plant)
+    _, steered = drive(name, quick_plan, PHANTOM, believed, [0.0] * 80, steps=80, plant=plant)
+    assert abs(blind.tip[1] - 5.0) > 0.2
+    assert abs(steered.tip[1] - 5.0) < 0.2 * abs(blind.tip[1] - 5.0)
+
+
+# ---- on the exact plant, with its delay, noise, missing readings, play and friction
+
+
+@cache
+def inserted(name, plan, seed=5000, **changes):
+    scenario = PHANTOM.with_values(dict(changes))
+    return flexneedle.insert(scenario, plan, seed, controller=name, force=True, threads=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"), [("open-loop", 3.0), ("bevel-only", 7.0), ("resolved-rate", 0.4), ("broyden-mpc", 0.5)]
+)
+def test_a_whole_insertion_into_the_exact_plant_ends_done(quick_plan, name, limit):
+    done = inserted(name, quick_plan)
+    assert (done.outcome, done.controller) == ("done", name)
+    assert done.true_error_mm < limit
+    assert done.periods[-1].true_tip[0] == pytest.approx(40.0, abs=0.15 if name != "open-loop" else 0.5)
+    assert all(period.converged and period.decision for period in done.periods)
+    assert len(done.periods) <= 1.1 * len(quick_plan.controls) + 2
+    if name in ("open-loop", "broyden-mpc"):
+        assert done.flips == 0
+    if name == "bevel-only":
+        assert all(period.command[1:4] == (0.0, 0.0, 0.0) for period in done.periods)
+
+
+@pytest.mark.parametrize("name", FIELD)
+def test_the_same_seed_gives_the_same_commands(quick_plan, name):
+    again = flexneedle.insert(PHANTOM, quick_plan, 5000, controller=name, force=True, threads=1)
+    one = [period.applied for period in inserted(name, quick_plan).periods]
+    assert [period.applied for period in again.periods] == one
+
+
+@pytest.mark.parametrize("name", FIELD)
+def test_without_a_guide_they_work_or_say_what_they_need(name):
+    bare = PHANTOM.with_values({"setup.guide_to_skin_mm": None, "plan.iterations": 2})
+    plan = flexneedle.plan(bare, (25.0, 0.0), seed=0, threads=1)
+    if name in WITHOUT_GUIDE:
+        done = flexneedle.insert(bare, plan, 5000, controller=name, force=True, threads=1)
+        assert done.outcome == "done"
+        return
+    with pytest.raises(InputError, match=f"controller = '{name}': steers with the guide"):
+        flexneedle.insert(bare, plan, 5000, controller=name, force=True, threads=1)

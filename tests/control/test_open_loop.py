@@ -1,0 +1,91 @@
+"""Open loop: places of the plan are replayed, in spite of motors that stop short, and nothing is looked at."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.control.interface import Task
+from flexneedle.control.methods import METHODS
+from flexneedle.simulator import Control, Simulator
+
+PHANTOM = flexneedle.load_scenario("phantom")
+OPEN = METHODS["open-loop"]
+RNG = np.random.default_rng(0)
+
+
+def truncated(moved, row, grid=0.01):
+    """A row as motors carry it out that stop at the last multiple of `grid` on the way."""
+    ends = (moved + row) / grid
+    return np.where(row >= 0.0, np.floor(ends + 1e-6), np.ceil(ends - 1e-6)) * grid - moved
+
+
+def replayed(plan, believed, scenario=PHANTOM, motor=truncated):
+    """Commands, and where base x and guide stood after each, through a driver with a motor."""
+    task = Task(Simulator(scenario, threads=1), plan)
+    state, memory = task.simulator.start(plan.bevel), OPEN.begin(task)
+    commands, places = [], []
+    while not OPEN.arrived(task, memory, believed(state)):
+        decision, memory = OPEN.decide(task, memory, believed(state), RNG)
+        row = np.array(decision.command)
+        row[[0, 3]] = motor(state.travel[[0, 3]], row[[0, 3]])
+        commands.append(decision.command)
+        state = task.simulator.step(state, Control.from_row(row.tolist()))
+        places.append(state.travel[[0, 3]])
+    return commands, np.array(places)
+
+
+def test_places_follow_the_plan_through_a_motor_that_stops_short(quick_plan, believed):
+    """Never more than one resolution behind; repeating the steps themselves loses some at each."""
+    planned = np.cumsum(quick_plan.controls[:, [0, 3]], axis=0)
+    _, places = replayed(quick_plan, believed)
+    assert places.shape == planned.shape
+    assert np.abs(places - planned).max() < 0.01 + 1e-6
+    lost = np.zeros(2)
+    for row in quick_plan.controls[:, [0, 3]]:
+        lost = lost + truncated(lost, row)
+    assert np.abs(lost - planned[-1]).max() > 0.1
+
+
+def test_a_perfect_motor_gets_the_planned_steps(quick_plan, believed):
+    commands, _ = replayed(quick_plan, believed, motor=lambda _moved, row: row)
+    np.testing.assert_allclose(commands, quick_plan.controls, atol=1e-9)
+
+
+def test_bevel_turns_where_planned(quick_plan, believed):
+    turns = quick_plan.controls.copy()
+    turns[[12, 40], 4] = 1.0
+    commands, _ = replayed(replace(quick_plan, controls=turns), believed)
+    assert [k for k, command in enumerate(commands) if command[4] > 0] == [12, 40]
+
+
+def test_base_steps_are_replayed_too(quick_plan, believed):
+    turned = quick_plan.controls.copy()
+    turned[:10, 1:3] = 0.1, 2e-4
+    commands, _ = replayed(replace(quick_plan, controls=turned), believed)
+    np.testing.assert_allclose(np.sum(commands, axis=0)[1:3], [1.0, 2e-3], atol=1e-12)
+
+
+def test_what_the_tracker_sees_changes_nothing(quick_plan, believed, along):
+    task, state = Task(Simulator(PHANTOM, threads=1), quick_plan), along(quick_plan, 20)
+    blind = OPEN.decide(task, 20, believed(state), RNG)[0].command
+    seeing = OPEN.decide(task, 20, believed(state, measured=(1.0, 9.0), innovation=(0.5, 3.0)), RNG)[
+        0
+    ].command
+    assert blind == seeing == pytest.approx(tuple(quick_plan.controls[20]))
+
+
+def test_it_has_arrived_once_the_steps_are_used_up_and_not_before(quick_plan, believed, along):
+    task, count = Task(Simulator(PHANTOM, threads=1), quick_plan), len(quick_plan.controls)
+    far = believed(along(quick_plan, 5))
+    assert not OPEN.arrived(task, count - 1, far)
+    assert OPEN.arrived(task, count, far)
+
+
+def test_steps_and_reach_of_a_smaller_setup_are_kept(quick_plan, believed):
+    """A plan of a larger setup: slower and less far aside, without an exception."""
+    tight = {"setup.max_guide_step_mm": 0.05, "setup.max_guide_travel_mm": 0.4, "target.lateral_mm": 0.0}
+    commands, places = replayed(quick_plan, believed, PHANTOM.with_values(tight))
+    assert max(abs(command[3]) for command in commands) <= 0.05
+    assert np.abs(places[:, 1]).max() == pytest.approx(0.4)

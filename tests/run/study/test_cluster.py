@@ -1,0 +1,78 @@
+"""A study on a real Dask scheduler with two workers, one of which is killed in the middle."""
+
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+from threading import Timer
+
+import pyarrow.parquet as pq
+import pytest
+
+from flexneedle.errors import InputError
+from flexneedle.run.study import pools
+from flexneedle.run.study.runner import run_study
+
+distributed = pytest.importorskip("distributed")
+
+
+@contextmanager
+def process(part, *argv):
+    """Run a part of Dask in a process of its own, with its log on stderr."""
+    command = [sys.executable, "-m", f"distributed.cli.dask_{part}", *argv, "--no-dashboard"]
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        yield running
+    finally:
+        running.kill()
+        running.communicate()
+
+
+@contextmanager
+def scheduler():
+    """Run a scheduler and give its address. After two minutes it is killed, which ends whoever waits for it."""
+    with process("scheduler", "--host", "127.0.0.1", "--port", "0") as running:
+        watchdog = Timer(120, running.kill)
+        watchdog.start()
+        try:
+            yield next(line for line in running.stderr if "Scheduler at:" in line).split("at:")[1].strip()
+        finally:
+            watchdog.cancel()
+
+
+def worker(address):
+    """Run a worker with one thread, which nothing starts again."""
+    return process("worker", address, "--nthreads", "1", "--no-nanny", "--death-timeout", "60")
+
+
+def test_a_killed_worker_loses_no_row_and_repeats_none(quick, uninterrupted, tmp_path):
+    told = []
+    with scheduler() as address, worker(address) as first, worker(address) as second:
+        with distributed.Client(address, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=30)
+
+        def kill_one(advance):
+            told.append(advance.insertions)
+            if advance.insertions == 3 and first.poll() is None:
+                first.kill()
+
+        out = run_study(quick, tmp_path / "a", scheduler=address, on_advance=kill_one)
+        assert first.wait(timeout=30) == -signal.SIGKILL
+        assert second.poll() is None
+    assert told[-1] == 16
+    assert (out / "runs.parquet").read_bytes() == (uninterrupted / "runs.parquet").read_bytes()
+    assert len((out / "journal.jsonl").read_text().splitlines()) == 16
+    assert len(pq.read_table(out / "timing.parquet")) == 16
+
+
+def test_a_scheduler_that_does_not_answer_leaves_no_folder(quick, tmp_path, monkeypatch):
+    monkeypatch.setattr(pools, "_CONNECT_S", 0.2)
+    with pytest.raises(InputError, match=r"^tcp://127\.0\.0\.1:9: no Dask scheduler answers: "):
+        run_study(quick, tmp_path / "a", scheduler="tcp://127.0.0.1:9")
+    assert not (tmp_path / "a").exists()
+
+
+def test_without_dask_the_extra_is_named(quick, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"pip install 'flexneedle\[cluster\]'"):
+        run_study(quick, tmp_path / "a", scheduler="tcp://127.0.0.1:9")
