@@ -30,7 +30,10 @@ _REFRESH = 3  # moves after which the Jacobian is computed anew
 _NEAR_MM = 2.0  # tissue does not matter for a tip further before the skin
 _WIDEST = 4.0  # standard deviations that a parameter may leave its prior
 _RECENT = 12  # moves whose residuals are low-passed
-_LEAST_FACTOR, _LARGEST_FACTOR = -3.0, 3.4  # of the bevel offset: 0.7 of the compression length with the preset's
+_LEAST_FACTOR, _LARGEST_FACTOR = (
+    -3.0,
+    3.4,
+)  # of the bevel offset: 0.7 of the compression length with the preset's
 
 
 @dataclass(frozen=True)
@@ -179,20 +182,23 @@ def _with_knots(scenario: Scenario, parameters: Floats, rows: Floats) -> Floats:
 def _factors(scenario: Scenario, parameters: Floats, depth: Floats) -> Floats:
     """Factor on the bevel offset at depths (mm)."""
     knots = parameters[MODULUS + len(scenario.tissue) :]
-    return np.interp(depth, np.arange(knots.size) * scenario.control.adaptive_mpc.knot_mm, knots)
+    factors: Floats = np.interp(depth, np.arange(knots.size) * scenario.control.adaptive_mpc.knot_mm, knots)
+    return factors
 
 
 def _adapted(nominal: Simulator, parameters: Floats, depth: float) -> Simulator:
     """The model with the learnt constants, those of `depth` (mm) where they vary along it."""
     layers = len(nominal.scenario.tissue)
     bevel = float(_factors(nominal.scenario, parameters, np.array(depth)))
-    return nominal.adapted(np.exp(parameters[MODULUS : MODULUS + layers]), bevel, float(parameters[BEND]))
+    return nominal.adapted(
+        np.exp(parameters[MODULUS : MODULUS + layers]).tolist(), bevel, float(parameters[BEND])
+    )
 
 
 def _simulated(nominal: Simulator, bevel: int, rows: Floats, parameters: Floats) -> tuple[State, Floats]:
     """The insertion so far with these parameters: the state now, and the tips (m + 1, 3)."""
     layers = len(nominal.scenario.tissue)
-    modulus = np.exp(parameters[MODULUS : MODULUS + layers])
+    modulus = np.exp(parameters[MODULUS : MODULUS + layers]).tolist()
     simulator = nominal.adapted(modulus, 1.0, float(parameters[BEND]))
     start = nominal.start(bevel).believing(
         base_y=float(parameters[BASE_Y]), base_turn=float(parameters[BASE_TURN])
@@ -213,7 +219,8 @@ def _jacobian(
     """Derivative (r, K) of the predicted readings; old rows are kept for a few moves, new ones take the last one's."""
     old = belief.jacobian
     if old.shape[1] == parameters.size and readings.y.size % _REFRESH and old.shape[0] > 0:
-        return old[np.minimum(np.arange(readings.y.size), old.shape[0] - 1)]
+        kept: Floats = old[np.minimum(np.arange(readings.y.size), old.shape[0] - 1)]
+        return kept
     deep = belief.tips[-1, 0] > -_NEAR_MM
     jacobian = np.zeros((readings.y.size, parameters.size))
     jacobian[:, RUN_OUT] = readings.between(_sides(belief.first_bevel, rows))

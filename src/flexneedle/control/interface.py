@@ -45,9 +45,7 @@ def travel_left(scenario: Scenario, plan: PlanRecord, state: State) -> float:
 
 def at_depth(task: Task, _memory: Any, estimate: Estimate) -> bool:
     """Whether the believed tip is at the target depth, within the tolerance, or past it, or the stroke is used up."""
-    return (
-        travel_left(task.scenario, task.plan, estimate.state) <= task.scenario.control.depth_tolerance_mm
-    )
+    return travel_left(task.scenario, task.plan, estimate.state) <= task.scenario.control.depth_tolerance_mm
 
 
 class Observer(Protocol):

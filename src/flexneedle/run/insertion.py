@@ -137,7 +137,7 @@ def _periods(
     memory = chosen.begin(task)
     held_since: float | None = None
     arrived_at: float | None = None
-    moves = 0
+    sample, moves = _NO_SAMPLE, 0
     for index in itertools.count():
         if moves == _TOO_MANY * len(task.plan.controls):
             return
@@ -161,7 +161,10 @@ def _periods(
             arrived_at = now
         seen = arrived_at is not None and verdict == OK and sample.time > arrived_at - 1e-6
         ending = _ending(task, estimate, verdict, 0.0 if held_since is None else now - held_since, seen)
-        yield _record(index, now, task.plan, rig, decision, applied, sample, verdict, estimate, clocks), ending
+        yield (
+            _record(index, now, task.plan, rig, decision, applied, sample, verdict, estimate, clocks),
+            ending,
+        )
         if ending is not None:
             return
 
@@ -196,9 +199,7 @@ def _see(
     return corrected if verdicts[-1] == OK else corrected.unseen(), samples[-1], verdicts[-1]
 
 
-def _ending(
-    task: Task, estimate: Estimate, verdict: str, held: float, seen: bool
-) -> tuple[str, str] | None:
+def _ending(task: Task, estimate: Estimate, verdict: str, held: float, seen: bool) -> tuple[str, str] | None:
     """How the insertion ends after this period, if it does."""
     if not estimate.state.converged:
         return "failed", f"the model did not converge: residual {estimate.state.residual:.3g} mm"

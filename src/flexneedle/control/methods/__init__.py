@@ -14,7 +14,7 @@ from flexneedle.errors import InputError
 
 __all__ = ["DEFAULT", "METHODS", "method"]
 
-METHODS = {
+METHODS: dict[str, Method] = {
     module.METHOD.name: module.METHOD
     for module in (adaptive_mpc, offset_free, ce_mpc, open_loop, bevel_only, resolved_rate, broyden_mpc)
 }

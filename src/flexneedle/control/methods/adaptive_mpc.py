@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexneedle.control import bang_bang
 from flexneedle.control.estimate import Estimate, Floats
@@ -26,16 +27,14 @@ class Ahead:
     """
 
     advance: Floats
-    piece: Floats
+    piece: NDArray[np.intp]
     path: Floats
     guide: Floats
     weight: Floats
     flip: bool
 
 
-def decide(
-    task: Task, memory: None, estimate: Estimate, rng: np.random.Generator
-) -> tuple[Decision, None]:
+def decide(task: Task, memory: None, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, None]:
     """The bevel by the rule, near the target also by the model; then the best first step of the guide."""
     belief = cast(Identified, estimate)  # METHOD below names its observer
     flip, why = bang_bang.decide(task, belief)
@@ -77,9 +76,7 @@ def _search(task: Task, belief: Identified, rng: np.random.Generator, *, flip: b
     mean = np.array([ahead.guide[ahead.piece == k].mean() for k in range(pieces)])
     found = cross_entropy.minimize(
         lambda z: _cost(task, belief, ahead, z),
-        cross_entropy.start(
-            np.clip(mean, -most, most), np.full(pieces, min(settings.guide_sigma_mm, most))
-        ),
+        cross_entropy.start(np.clip(mean, -most, most), np.full(pieces, min(settings.guide_sigma_mm, most))),
         Settings(
             samples=settings.samples,
             elite=max(2, settings.samples // 8),

@@ -11,9 +11,7 @@ from flexneedle.control.interface import Decision, Method, Task
 from flexneedle.control.observer import Beliefs
 
 
-def decide(
-    task: Task, memory: None, estimate: Estimate, rng: np.random.Generator
-) -> tuple[Decision, None]:
+def decide(task: Task, memory: None, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, None]:
     """Bevel by the rule, then the best first step of a short horizon along the plan."""
     flip, why = bang_bang.decide(task, estimate)
     choice = mpc.choose(estimate.simulator, task.plan, estimate.state, flip=flip, rng=rng)
