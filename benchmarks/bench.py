@@ -28,6 +28,8 @@ US = 1e6
 FIRST_USE = """
 import time; begun = time.perf_counter()
 import flexneedle
+from flexneedle.run.kernels import compile_kernels
+compile_kernels()
 simulator = flexneedle.Simulator(flexneedle.load_scenario("phantom"), threads=1)
 state = simulator.step(simulator.start(), flexneedle.Control(db_x=1.0))
 simulator.rollout(state, [[[1.0, 0.0, 0.0, 0.0, -1.0]]])

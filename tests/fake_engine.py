@@ -22,7 +22,19 @@ def plan(scenario, target=None, strategy="manipulation", seed=0, progress=None, 
     return replace(made, tips=made.tips + np.array([0.0, miss, 0.0]), limit=limit)
 
 
-def insert(_scenario, plan, seed=0, *, force=False, on_period=None, miss=0.06, stop=None, outcome="done"):
+def insert(
+    _scenario,
+    plan,
+    seed=0,
+    *,
+    controller="adaptive-mpc",
+    phantom="exact",
+    force=False,
+    on_period=None,
+    miss=0.06,
+    stop=None,
+    outcome="done",
+):
     """Insert as `flexneedle.insert` does; stop: after so many periods, call that."""
     if not plan.reached and not force:
         raise RunError(f"plan misses the target by {plan.error_mm:.2f} mm, bound by {plan.limit}")
@@ -32,7 +44,8 @@ def insert(_scenario, plan, seed=0, *, force=False, on_period=None, miss=0.06, s
         on_period(period)
         if stop is not None and len(periods) == stop[0]:
             stop[1]()
-    return Insertion(plan, seed, tuple(periods), outcome, "" if outcome == "done" else "no sample for 1.00 s")
+    reason = "" if outcome == "done" else "no sample for 1.00 s"
+    return Insertion(plan, seed, tuple(periods), outcome, reason, controller, phantom)
 
 
 def install(setattr_, **options):

@@ -69,6 +69,7 @@ def one_row(index, case, controller, settings, target, own, repeat, factor, seed
         "seed": own,
         "plan_seed": 0,
         "repeat": repeat,
+        "plan": f"plan-{depth:g}-{aside:g}",
         "true_error_mm": float(error),
         "residual_mm": float(error * 0.8 + 0.03),
         "tip_x_mm": depth + float(0.3 * error * np.cos(angle)),
@@ -107,7 +108,14 @@ def write_study(folder, rows, about=None, timing=True):
     pq.write_table(pa.table(columns_of(rows)), folder / "runs.parquet")
     if timing:
         times = [
-            {"index": r["index"], "plan_s": 0.5, "control_s": 0.4, "plant_s": 0.2, "total_s": 0.62}
+            {
+                "index": r["index"],
+                "plan": r["plan"],
+                "plan_s": 0.5,
+                "control_s": 0.4,
+                "plant_s": 0.2,
+                "total_s": 0.62,
+            }
             for r in rows
         ]
         pq.write_table(pa.Table.from_pylist(times), folder / "timing.parquet")

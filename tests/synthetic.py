@@ -78,6 +78,7 @@ def make_periods(plan, miss=0.06, seed=0):
             strain_energy=plan.strain_energy[k + 1] * 1.1, tip_load=0.01 * off,
             path=tuple(tip), cost=1.5 - inside, spread=0.05, decision="nearer path" if flip < 0 else "turn",
             true_tip=true, true_strain_energy=plan.strain_energy[k + 1] * 1.25,
+            true_stretch=float(1.0 - 0.17 * inside**2),
             durations={"observe": 0.001, "decide": 0.004, "total": 0.0051 + 1e-5 * k},
         )  # fmt: skip
 
@@ -98,4 +99,5 @@ def blind(period):
         innovation=(0.0, 0.0),
         true_tip=None,
         true_strain_energy=None,
+        true_stretch=None,
     )

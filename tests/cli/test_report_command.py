@@ -35,7 +35,7 @@ def test_json_has_all_statistics_at_full_precision(capsys, study, tmp_path):
     assert status == 0
     assert list(values) == [
         *("study", "report", "figures", "insertions", "planned", "finished", "statistics"),
-        *("groups", "controllers", "cases", "endings", "worst"),
+        *("groups", "controllers", "controllers_by_depth", "cases", "endings", "worst"),
     ]
     assert (values["study"], values["insertions"], values["finished"], values["planned"]) == (
         "Mine",
@@ -50,6 +50,22 @@ def test_json_has_all_statistics_at_full_precision(capsys, study, tmp_path):
     assert len(repr(mean["value"])) > 12
     assert values["controllers"][0]["verdict"] == "better"
     assert values["endings"][0]["reason"] == "plan misses the target"
+
+
+def test_tuning_is_shown_if_its_records_are_there(capsys, study, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = study / "report" / "report.html"
+    run(capsys, "report", str(study))
+    assert "Tuning of the controllers" not in page.read_text(encoding="utf-8")
+    record = {"method": OURS, "chosen": {}, "budget_insertions": 200, "phantom_seeds": [1000, 1063]}
+    for folder in ("docs/tuning", "elsewhere"):
+        Path(folder).mkdir(parents=True)
+    Path("docs/tuning/a.json").write_text(json.dumps({**record, "trials": [{"score_mm": 0.07}]}))
+    Path("elsewhere/a.json").write_text(json.dumps({**record, "trials": [{"score_mm": 0.08}]}))
+    run(capsys, "report", str(study))
+    assert "0.070" in page.read_text(encoding="utf-8").split("Tuning of the controllers")[1]
+    run(capsys, "report", str(study), "--tuning", "elsewhere")
+    assert "0.080" in page.read_text(encoding="utf-8").split("Tuning of the controllers")[1]
 
 
 def test_no_study_is_bad_input(capsys, tmp_path):

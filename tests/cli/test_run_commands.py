@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -12,11 +13,15 @@ import pytest
 import fake_engine
 from fake_engine import install
 from flexneedle.cli import main as cli
+from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.errors import RunError
+from flexneedle.phantom import DEFAULT_PLANT, PLANTS
 from flexneedle.trace.columns import COLUMNS
+from flexneedle.trace.reader import read_trace
 
 INSERTION_FILES = ["insertion.png", "insertion.svg", "run.json", "trace.mcap"]
 INSERT_KEYS = [
+    *("controller", "phantom"),
     *("target_mm", "tip_true_mm", "tip_measured_mm", "true_error_mm", "residual_mm", "planned_error_mm"),
     *("reached", "flips", "planned_flips", "strain_energy_mj", "planned_strain_energy_mj", "steps"),
     *("converged", "seed", "run_dir", "timing"),
@@ -92,6 +97,75 @@ def test_insert_json_is_one_object_with_all_digits(engine, capsys):
     stored = json.loads((Path(result["run_dir"]) / "run.json").read_text())
     assert stored["result"] == {key: result[key] for key in INSERT_KEYS if key not in ("run_dir", "timing")}
     assert stored["status"] == "done"
+
+
+def test_controller_and_phantom_are_carried_out_and_recorded(engine, capsys, in_tmp):
+    engine()
+    status, out, _ = run(capsys, "insert", "--controller", "open-loop", "--phantom", "model", "--out", "a")
+    assert status == 0
+    assert re.search(r"^ controller +open-loop", out, re.MULTILINE)
+    assert re.search(r"^ phantom +model", out, re.MULTILINE)
+    stored = json.loads((in_tmp / "a/run.json").read_text())
+    for values in (stored, stored["result"]):
+        assert (values["controller"], values["phantom"]) == ("open-loop", "model")
+    about = read_trace(in_tmp / "a/trace.mcap").about
+    assert (about["controller"], about["phantom"]) == ("open-loop", "model")
+    assert "open-loop, model phantom" in (in_tmp / "a/insertion.svg").read_text()
+
+
+def test_by_default_the_default_controller_steers_in_the_exact_phantom(engine, capsys):
+    engine()
+    result = json.loads(run(capsys, "insert", "--json")[1])
+    assert (result["controller"], result["phantom"]) == (DEFAULT, DEFAULT_PLANT) == (DEFAULT, "exact")
+    with pytest.raises(SystemExit):
+        cli.main(["insert", "--help"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"who steers ({DEFAULT})" in told
+    assert all(f"{kind}," in told for kind in PLANTS)
+
+
+def test_every_controller_is_listed_with_its_summary(capsys, in_tmp):
+    status, out, err = run(capsys, "insert", "--list")
+    assert (status, err, names(in_tmp)) == (0, "", [])
+    lines = dict(line.split(maxsplit=1) for line in out.splitlines())
+    assert list(lines) == list(METHODS)
+    assert all(lines[name].startswith(method.summary) for name, method in METHODS.items())
+    assert [name for name, line in lines.items() if line.endswith("(default)")] == [DEFAULT]
+
+
+@pytest.mark.parametrize(
+    ("argv", "line"),
+    [
+        (["--controller", "pid"], f"controller = 'pid': must be one of {', '.join(METHODS)}"),
+        (["--phantom", "jelly"], "phantom = 'jelly': must be one of exact, model"),
+    ],
+)
+def test_a_name_that_there_is_not_is_a_line_with_the_choices(capsys, in_tmp, argv, line):
+    assert run(capsys, "insert", *argv) == (2, "", f"flexneedle: {line}\n")
+    assert names(in_tmp) == []
+
+
+@pytest.mark.parametrize(("argv", "seed"), [([], 5), (["--plan-seed", "0"], 0), (["--plan-seed", "8"], 8)])
+def test_the_plan_may_have_a_seed_of_its_own(engine, capsys, in_tmp, argv, seed):
+    engine()
+    run(capsys, "insert", "--seed", "5", "--out", "a", *argv)
+    stored = json.loads((in_tmp / "a/run.json").read_text())
+    assert (stored["seed"], stored["plans"]["manipulation"]["seed"]) == (5, seed)
+
+
+def test_an_insertion_that_fails_is_recorded_with_its_controller(engine, capsys, in_tmp):
+    engine(plan_miss=2.5)
+    run(capsys, "insert", "--controller", "ce-mpc", "--out", "a")
+    stored = json.loads((in_tmp / "a/run.json").read_text())
+    assert (stored["status"], stored["controller"], stored["phantom"]) == ("failed", "ce-mpc", "exact")
+
+
+def test_the_first_compilation_is_announced(engine, capsys, monkeypatch):
+    engine()
+    monkeypatch.setattr("flexneedle.run.kernels.all_compiled", lambda: False)
+    assert "Compiling the mechanics, this once …" in run(capsys, "plan")[2]
+    monkeypatch.setattr("flexneedle.run.kernels.all_compiled", lambda: True)
+    assert "Compiling" not in run(capsys, "plan")[2]
 
 
 def test_the_target_is_depth_then_aside(engine, capsys):
@@ -231,6 +305,7 @@ def test_bad_input_is_a_line_and_2_and_leaves_nothing(argv, capsys, in_tmp):
     "argv",
     [
         ["insert", "--seed", "-1"],
+        ["insert", "--plan-seed", "-1"],
         ["insert", "--target", "1"],
         ["insert", "--strategy", "both"],
         ["export", "x"],

@@ -4,12 +4,15 @@ import json
 import re
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from flexneedle.cli import main as cli
+from flexneedle.cli import study as study_command
 from flexneedle.run.study import pools, rows
+from flexneedle.run.study.runner import Advance
 
 STUDY = """\
 name = "my study"
@@ -134,6 +137,35 @@ def test_some_failures_are_counted_and_all_failures_fail(capsys, monkeypatch):
     status, out, _ = run(capsys, "my.toml", "--out", "table")
     assert status == 1
     assert re.search(r"^ all +0 of 4 +– ± – ", out, re.MULTILINE)
+
+
+def test_the_rate_is_that_of_insertions_alone_and_counts_no_earlier_ones(monkeypatch):
+    now, notes = 100.0, []
+    monkeypatch.setattr(study_command.time, "monotonic", lambda: now)
+
+    class Listener:
+        def show(self, stage, _done, _total, note):
+            notes.append((stage, note))
+
+    show = study_command._Show(Listener())
+    for plans, done, later in ((0, 40, 50.0), (1, 40, 8.0), (2, 41, 10.0), (2, 46, 0.0)):
+        show.advance(Advance(plans, 2, done, 100, 3))
+        now += later
+    told = [note for stage, note in notes if stage == "Inserting"]
+    assert told[:3] == [f"{done} of 100, 3 failed" for done in (40, 40, 41)]
+    assert told[3] == "46 of 100, 0.5 a second, 1 min 48 s left, 3 failed"
+
+
+def test_unconverged_periods_are_told(capsys, monkeypatch):
+    insert = rows.insert
+
+    def unconverged(*args, **options):
+        done = insert(*args, **options)
+        return replace(done, periods=(replace(done.periods[0], converged=False), *done.periods[1:]))
+
+    monkeypatch.setattr(rows, "insert", unconverged)
+    _, out, _ = run(capsys, "my.toml", "--out", "a")
+    assert "4 periods did not converge: see unconverged_periods in the table." in out
 
 
 def test_a_lost_worker_is_one_line_with_the_way_to_go_on(capsys, monkeypatch):

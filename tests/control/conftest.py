@@ -37,13 +37,15 @@ def mirrored():
 
 @pytest.fixture(scope="session")
 def along():
-    """The state after so many steps of a plan, in a scenario of its own if one is given."""
+    """The state after so many steps of a plan, in a scenario of its own if one is given, then corrected."""
 
-    def go(plan, steps, scenario=PHANTOM):
+    def go(plan, steps, scenario=PHANTOM, **corrections):
         simulator = Simulator(scenario, threads=1)
         state = simulator.start(plan.bevel)
         for row in plan.controls[:steps]:
             state = simulator.step(state, Control.from_row(row.tolist()))
+        if corrections:
+            state = simulator.step(state.believing(**corrections), Control())
         return state
 
     return go

@@ -13,6 +13,7 @@ import flexneedle
 from flexneedle.control.interface import Task, travel_left
 from flexneedle.control.methods import DEFAULT, METHODS, method
 from flexneedle.errors import InputError
+from flexneedle.phantom import PLANTS
 from flexneedle.simulator import Control, Simulator
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -48,32 +49,61 @@ def test_they_are_there_under_their_names():
 
 
 @given(
-    name=st.sampled_from(FIELD), stretch=st.floats(-3.0, 3.0), step=st.floats(0.01, 0.5),
-    reach=st.floats(0.02, 15.0), advance=st.floats(0.3, 2.0),
+    name=st.sampled_from((*FIELD, "ce-mpc")), base=st.floats(-0.6, 0.6), stretch=st.floats(-3.0, 3.0),
+    step=st.floats(0.01, 0.5), reach=st.floats(0.02, 15.0), advance=st.floats(0.3, 2.0),
     readings=st.lists(st.floats(-3.0, 3.0), min_size=12, max_size=12), gain=st.floats(0.0, 20.0),
 )  # fmt: skip
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
 def test_limits_are_kept_whatever_the_target_and_the_readings(
-    quick_plan, believed, name, stretch, step, reach, advance, readings, gain
+    quick_plan, believed, name, base, stretch, step, reach, advance, readings, gain
 ):
     """The simulator raises CommandError for a step or place out of range; the plan is one of a larger setup."""
     scenario = PHANTOM.with_values(
         {
             "setup.max_guide_step_mm": step, "setup.max_guide_travel_mm": reach, "target.lateral_mm": 0.0,
             "setup.max_advance_mm": advance, "control.resolved_rate.gain": gain,
+            "setup.max_base_step_mm": step, "setup.max_base_travel_mm": reach,
+            "control.samples": 8, "control.iterations": 1,
         }
     )  # fmt: skip
     wide = replace(
         quick_plan, tips=quick_plan.tips * [1.0, stretch, stretch], target=(40.0, 5.0 * stretch),
-        controls=quick_plan.controls * [1.0, 1.0, 1.0, stretch, 1.0], guide=quick_plan.guide * stretch,
+        controls=quick_plan.controls * [1.0, 1.0, 1.0, stretch, 1.0] + [0.0, base, 0.1 * base, 0.0, 0.0],
+        guide=quick_plan.guide * stretch,
     )  # fmt: skip
     commands, state = drive(name, wide, scenario, believed, readings, steps=12)
     assert np.isfinite(commands).all()
     assert np.abs(commands[:, 3]).max() <= step + 1e-12
     assert np.abs(np.cumsum(commands[:, 3])).max() <= reach + 1e-9
+    assert np.abs(commands[:, 1]).max() <= step + 1e-12
+    assert np.abs(commands[:, 2]).max() <= 5e-3 + 1e-12
+    assert np.abs(np.cumsum(commands[:, 1])).max() <= reach + 1e-9
     assert (commands[:, 0] > 0.0).all()
     assert commands[:, 0].max() <= advance + 1e-12
     assert state.converged
+
+
+@pytest.mark.parametrize("name", ["resolved-rate", "broyden-mpc"])
+def test_towards_a_path_far_aside_the_guide_goes_to_the_end_of_its_reach_and_no_further(
+    quick_plan, believed, name
+):
+    scenario = PHANTOM.with_values({"setup.max_guide_travel_mm": 0.8, "target.lateral_mm": 0.0})
+    away = replace(quick_plan, tips=quick_plan.tips + np.array([0.0, 6.0, 0.0]), target=(40.0, 11.0))
+    commands, _ = drive(name, away, scenario, believed, [0.0] * 8, steps=8)
+    assert np.cumsum(commands[:, 3]).max() == pytest.approx(0.8, abs=1e-9)
+    assert np.abs(commands[:, 3]).max() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("name", ["open-loop", "ce-mpc", "resolved-rate", "broyden-mpc"])
+def test_planned_motion_of_the_base_is_followed(quick_plan, believed, name):
+    """To where the plan has it at the tip's depth; the other methods look at nothing but guide or bevel."""
+    moving = quick_plan.controls.copy()
+    moving[:60, 1:3] = 0.02, 1e-4
+    plan = replace(quick_plan, controls=moving)
+    commands, state = drive(name, plan, PHANTOM, believed, [0.0] * 30, steps=30)
+    depth = [-28.5, *(-28.5 + np.cumsum(commands[:, 0]))]
+    planned = np.interp(depth[-1], plan.tips[:, 0], np.arange(len(plan.tips)))
+    np.testing.assert_allclose(state.travel[1:3], planned * np.array([0.02, 1e-4]), rtol=0.03)
 
 
 @cache
@@ -107,7 +137,7 @@ def test_with_exact_readings_the_guide_takes_the_tip_to_the_target(quick_plan, b
     _, blind = drive("open-loop", quick_plan, PHANTOM, believed, [0.0] * 80, steps=80, plant=plant)
     _, steered = drive(name, quick_plan, PHANTOM, believed, [0.0] * 80, steps=80, plant=plant)
     assert abs(blind.tip[1] - 5.0) > 0.2
-    assert abs(steered.tip[1] - 5.0) < 0.2 * abs(blind.tip[1] - 5.0)
+    assert abs(steered.tip[1] - 5.0) < 0.25 * abs(blind.tip[1] - 5.0)
 
 
 # ---- on the exact plant, with its delay, noise, missing readings, play and friction
@@ -133,6 +163,24 @@ def test_a_whole_insertion_into_the_exact_plant_ends_done(quick_plan, name, limi
         assert done.flips == 0
     if name == "bevel-only":
         assert all(period.command[1:4] == (0.0, 0.0, 0.0) for period in done.periods)
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+@pytest.mark.parametrize("name", METHODS)
+def test_every_controller_finishes_on_every_plant_with_its_commands_carried_out(quick_plan, name, plant):
+    """What a motor leaves out of a step is less than its resolution; nothing else is cut from a command."""
+    few = {"control.samples": 8, "control.iterations": 1}
+    few |= {f"control.adaptive_mpc.{key}": value for key, value in (("samples", 8), ("iterations", 1))}
+    scenario = PHANTOM.with_values(few)
+    done = flexneedle.insert(scenario, quick_plan, 5001, controller=name, phantom=plant, threads=1)
+    assert (done.outcome, done.controller, done.phantom) == ("done", name, plant)
+    left_out = np.subtract(
+        [period.command for period in done.periods], [period.applied for period in done.periods]
+    )
+    assert np.abs(left_out[:, :4]).max() <= PHANTOM.phantom.motor_resolution_mm + 1e-9
+    assert (left_out[:, 4] == 0.0).all()
+    assert all(period.converged for period in done.periods)
+    assert np.isfinite(done.true_error_mm)
 
 
 @pytest.mark.parametrize("name", FIELD)

@@ -6,39 +6,32 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.control import controller, mpc, observer
+from flexneedle.control import bang_bang, mpc
+from flexneedle.control.interface import Task, at_depth
+from flexneedle.control.methods import METHODS
 from flexneedle.simulator import Control, Simulator
 
 PHANTOM = flexneedle.load_scenario("phantom")
 
 
 @pytest.fixture(scope="module")
-def plan():
-    return flexneedle.plan(PHANTOM, (40.0, 5.0), seed=1)
-
-
-def along(plan, periods, scenario=PHANTOM, **corrections):
-    """The state after so many steps of the plan, then corrected."""
-    simulator = Simulator(scenario)
-    state = simulator.start(plan.bevel)
-    for row in plan.controls[:periods]:
-        state = simulator.step(state, Control.from_row(row.tolist()))
-    if corrections:
-        state = simulator.step(state.believing(**corrections), Control())
-    return state
+def plan(quick_plan):
+    return quick_plan
 
 
 def choose(plan, state, scenario=PHANTOM, seed=0, *, flip=False):
-    return mpc.choose(Simulator(scenario), plan, state, flip=flip, rng=np.random.default_rng(seed))
+    return mpc.choose(Simulator(scenario, 1), plan, state, flip=flip, rng=np.random.default_rng(seed))
 
 
-def believed(state):
-    return replace(observer.begin(Simulator(state.scenario), 1), state=state)
+def decide(plan, estimate, seed=0):
+    """What the paper's controller decides."""
+    task = Task(Simulator(PHANTOM, threads=1), plan)
+    return METHODS["ce-mpc"].decide(task, None, estimate, np.random.default_rng(seed))[0]
 
 
 @pytest.mark.parametrize("periods", [0, 20, 45, 70])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_command_is_within_the_limits(plan, periods, seed):
+def test_command_is_within_the_limits(plan, periods, seed, along):
     choice = choose(plan, along(plan, periods), seed=seed)
     assert 0.5 <= choice.steps[0] <= 1.0
     assert abs(choice.steps[3]) <= 0.5
@@ -46,7 +39,7 @@ def test_command_is_within_the_limits(plan, periods, seed):
     assert choice.spread > 0.0
 
 
-def test_on_the_plan_it_goes_on_with_the_plan(plan):
+def test_on_the_plan_it_goes_on_with_the_plan(plan, along):
     for periods in (10, 40, 60):
         choice = choose(plan, along(plan, periods))
         assert choice.steps[3] == pytest.approx(plan.controls[periods, 3], abs=0.06)
@@ -54,14 +47,14 @@ def test_on_the_plan_it_goes_on_with_the_plan(plan):
 
 
 @pytest.mark.parametrize("offset", [-1.5, 1.5])
-def test_off_the_plan_the_guide_moves_back_to_it(plan, offset):
+def test_off_the_plan_the_guide_moves_back_to_it(plan, offset, along):
     """A base clamp off to one side moves the tip there; the guide goes the other way, against what was planned."""
     state = along(plan, 15, base_y=offset)
     side = np.sign(state.tip[1] - along(plan, 15).tip[1])
     assert side * (choose(plan, state).steps[3] - plan.controls[15, 3]) < -0.05
 
 
-def test_the_deviation_shrinks_over_the_next_periods(plan):
+def test_the_deviation_shrinks_over_the_next_periods(plan, along):
     simulator, state = Simulator(PHANTOM), along(plan, 10, base_y=1.0)
     rng = np.random.default_rng(0)
 
@@ -89,7 +82,7 @@ def test_guide_stays_within_its_reach(plan):
 
 
 @pytest.mark.parametrize("left", [0.7, 0.3, 1e-6])
-def test_last_advance_ends_at_the_target_depth(plan, left):
+def test_last_advance_ends_at_the_target_depth(plan, left, along):
     state = along(plan, len(plan.controls) - 1)
     near = replace(plan, target=(float(state.tip[0]) + left, 5.0))
     choice = choose(near, state)
@@ -97,7 +90,7 @@ def test_last_advance_ends_at_the_target_depth(plan, left):
     assert choice.steps[0] <= left + 1e-12
 
 
-def test_past_the_target_nothing_moves_any_more(plan):
+def test_past_the_target_nothing_moves_any_more(plan, along):
     state = along(plan, len(plan.controls))
     past = replace(plan, target=(float(state.tip[0]) - 0.5, 5.0))
     choice = choose(past, state)
@@ -109,7 +102,7 @@ def test_without_a_guide_none_is_moved(plan):
     assert choose(plan, Simulator(scenario).start(), scenario).steps[3] == 0.0
 
 
-def test_spread_is_that_of_the_first_guide_step(plan):
+def test_spread_is_that_of_the_first_guide_step(plan, along):
     """Not of the advance, which is fixed here, nor of a guide that can't move."""
     state = along(plan, 30)
     fixed = PHANTOM.with_values({"plan.advance_sigma_mm": 0.0})
@@ -118,14 +111,14 @@ def test_spread_is_that_of_the_first_guide_step(plan):
     assert choose(plan, Simulator(scenario).start(), scenario).spread == 0.0
 
 
-def test_same_seed_same_command_other_seed_another(plan):
+def test_same_seed_same_command_other_seed_another(plan, along):
     state = along(plan, 30, base_y=0.5)
     one, again, other = choose(plan, state, seed=5), choose(plan, state, seed=5), choose(plan, state, seed=6)
     assert (one.steps, one.cost, one.spread) == (again.steps, again.cost, again.spread)
     assert one.steps[3] != other.steps[3]
 
 
-def test_cost_is_that_of_the_chosen_steps(plan):
+def test_cost_is_that_of_the_chosen_steps(plan, along):
     """With a horizon of one step it can be computed again: pose against the planned one, guide, energy."""
     weights = {
         "control.horizon": 1, "control.orientation_weight_mm": 40.0, "control.guide_weight": 3.0,
@@ -143,7 +136,7 @@ def test_cost_is_that_of_the_chosen_steps(plan):
     assert choice.cost == pytest.approx(expected, rel=1e-9)
 
 
-def test_each_step_is_held_against_the_plans_own_guide_step(plan):
+def test_each_step_is_held_against_the_plans_own_guide_step(plan, along):
     """With nothing but the guide's cost it repeats the plan, before a primitive's end and after it."""
     alone = {"control.horizon": 1, "control.guide_weight": 1e6, "control.energy_weight_per_mj": 0.0}
     scenario = PHANTOM.with_values(alone)
@@ -153,7 +146,7 @@ def test_each_step_is_held_against_the_plans_own_guide_step(plan):
         assert choice.steps[3] == pytest.approx(plan.controls[k, 3], abs=1e-4)
 
 
-def test_no_random_search_of_many_samples_beats_it_by_much(plan):
+def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
     """One step ahead: the command is near the best of a fine grid."""
     scenario = PHANTOM.with_values({"control.horizon": 1})
     state = along(plan, 40, scenario, base_y=1.0)
@@ -166,80 +159,90 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan):
 
 
 @pytest.mark.parametrize("flip", [True, False])
-def test_rollouts_turn_the_bevel_only_in_the_first_step_and_if_told(plan, flip):
+def test_rollouts_turn_the_bevel_only_in_the_first_step_and_if_told(plan, flip, along):
     state = along(plan, 40)
     controls = mpc._controls(PHANTOM, state, np.tile([0.9, 0.1], (3, 8)), np.zeros((8, 2)), 30.0, flip=flip)
     assert (controls[:, 0, 4] == (1.0 if flip else -1.0)).all()
     assert (controls[:, 1:, 4] == -1.0).all()
 
 
-def test_in_air_the_bevel_stays(plan):
+def test_in_air_the_bevel_stays(plan, along, believed):
     """Even where the rule would turn it."""
     state = along(plan, 5)
     away = replace(plan, target=(40.0, -5.0))
-    decision = controller.decide(Simulator(PHANTOM), away, believed(state), np.random.default_rng(0))
+    decision = decide(away, believed(state))
     assert decision.command[4] == -1
     assert decision.why == "in air"
 
 
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_in_tissue_the_bevel_turns_to_the_target(plan, side, turned):
+def test_in_tissue_the_bevel_turns_to_the_target(plan, side, turned, along, believed):
     """The target lies to one side of the tip's own line, further than either path bends."""
     state = Simulator(PHANTOM).step(along(plan, 50), Control(flip=turned))
     x, y, turn = state.tip
     away = replace(plan, target=(float(x) + 30.0, float(y + 30.0 * np.tan(turn) + 2.0 * side)))
-    decision = controller.decide(Simulator(PHANTOM), away, believed(state), np.random.default_rng(0))
+    decision = decide(away, believed(state))
     assert decision.command[4] == (-1 if side == state.bevel else 1)
     assert decision.why.startswith("bevel kept" if side == state.bevel else "bevel turned")
 
 
-def test_the_rollouts_know_of_the_turn(plan):
+def test_the_rollouts_know_of_the_turn(plan, along):
     """A predicted cost of its own: the bevel that the rule chose acts on the steps that are searched."""
     state, scenario = along(plan, 50), PHANTOM.with_values({"control.energy_weight_per_mj": 0.0})
     kept, turned = (choose(plan, state, scenario, flip=flip) for flip in (False, True))
     assert kept.cost != turned.cost
 
 
-def test_command_has_the_five_inputs_and_leaves_the_base_alone(plan):
-    decision = controller.decide(
-        Simulator(PHANTOM), plan, believed(along(plan, 30)), np.random.default_rng(0)
-    )
+def test_command_has_the_five_inputs_and_leaves_the_base_alone(plan, along, believed):
+    decision = decide(plan, believed(along(plan, 30)))
     assert len(decision.command) == 5
     assert decision.command[1:3] == (0.0, 0.0)
     assert decision.command[4] in (-1, 1)
 
 
 @pytest.mark.parametrize(("short", "there"), [(0.02, False), (0.009, True), (-0.5, True)])
-def test_arrived_at_the_depth_within_the_tolerance_or_past_it(plan, short, there):
+def test_arrived_at_the_depth_within_the_tolerance_or_past_it(plan, short, there, along, believed):
     state = along(plan, 60)
     goal = replace(plan, target=(float(state.tip[0]) + short, 5.0))
-    assert controller.arrived(PHANTOM, goal, believed(state)) is there
+    assert at_depth(Task(Simulator(PHANTOM), goal), None, believed(state)) is there
 
 
 @pytest.mark.parametrize(("more", "there"), [(0.02, False), (0.009, True)])
-def test_arrived_where_the_stroke_is_used_up(plan, more, there):
+def test_arrived_where_the_stroke_is_used_up(plan, more, there, along, believed):
     """The needle stays before the target, and the last advance goes to the end of the stroke at most."""
     advanced = float(plan.controls[:60, 0].sum())
     short = PHANTOM.with_values({"setup.stroke_mm": advanced + more, "target.depth_mm": 10.0})
     state = along(plan, 60, short)
-    assert controller.arrived(short, plan, believed(state)) is there
+    assert at_depth(Task(Simulator(short), plan), None, believed(state)) is there
     assert choose(plan, state, short).steps[0] <= more + 1e-9
 
 
 def test_planned_base_steps_are_followed_and_caught_up_with():
-    """A base step that was missed is made good, as fast as the limit allows; without planned ones none is made."""
+    """A base step that was missed is made good, as fast as the limits allow, which hold for its travel too."""
     plan = flexneedle.plan(PHANTOM.with_values({"plan.base_sigma_mm": 0.1, "plan.iterations": 2}), seed=3)
     scenario = PHANTOM.with_values({"setup.max_base_step_mm": 0.2})
     moved = np.cumsum(plan.controls[:, 1])
-    steps = mpc._planned_base(scenario, plan, Simulator(scenario).start(), 8)
+    state = Simulator(scenario).start()
+    steps = mpc.planned_base(scenario.setup, plan, state, plan.tips[1:9, 0])
     assert abs(moved[:8]).max() > 0.01
     np.testing.assert_allclose(np.cumsum(steps[:, 0]), moved[:8], atol=1e-12)
-    far = replace(plan, controls=plan.controls * [1.0, 1e3, 1.0, 1.0, 1.0])
-    assert abs(mpc._planned_base(scenario, far, Simulator(scenario).start(), 8)).max() == 0.2
+    away = moved[20] + np.sign(moved[20]) * 0.5
+    ahead = replace(plan, controls=plan.controls * [1.0, away / moved[20], 1.0, 1.0, 1.0])
+    caught_up = mpc.planned_base(scenario.setup, ahead, state, np.full(9, plan.tips[21, 0]))
+    assert abs(caught_up).max() == pytest.approx(0.2)
+    assert caught_up[:, 0].sum() == pytest.approx(away)
+    far = replace(plan, controls=plan.controls * [1.0, 1e4, 1.0, 1.0, 1.0])
+    to_the_end = mpc.planned_base(scenario.setup, far, state, np.repeat(plan.tips[-1:, 0], 400))
+    assert abs(np.cumsum(to_the_end[:, 0])).max() == pytest.approx(15.0)
 
 
-def test_controls_carry_the_base_steps_while_the_needle_advances(plan):
+def test_without_planned_base_steps_none_is_made(plan, along):
+    steps = mpc.planned_base(PHANTOM.setup, plan, along(plan, 30), plan.tips[31:35, 0])
+    np.testing.assert_array_equal(steps, np.zeros((4, 2)))
+
+
+def test_controls_carry_the_base_steps_while_the_needle_advances(plan, along):
     base = np.array([[0.1, 1e-3]] * 8)
     z = np.tile(np.repeat([0.9, 0.0], 8), (2, 1))
     controls = mpc._controls(PHANTOM, along(plan, 10), z, base, 2.0, flip=False)
@@ -247,12 +250,9 @@ def test_controls_carry_the_base_steps_while_the_needle_advances(plan):
     assert (controls[:, 3:, :4] == 0.0).all()
 
 
-def test_the_bevel_rule_hears_of_three_standard_deviations_of_a_reading(plan, monkeypatch):
+def test_the_bevel_rule_hears_of_three_standard_deviations_of_a_reading(plan, monkeypatch, along, believed):
     heard = []
-    rule = controller.bang_bang.wants_flip
-    monkeypatch.setattr(
-        controller.bang_bang, "wants_flip", lambda *args: heard.append(args[-1]) or rule(*args)
-    )
-    estimate = observer.Estimate(along(plan, 40), np.eye(2))
-    controller.decide(Simulator(PHANTOM), plan, estimate, np.random.default_rng(0))
+    rule = bang_bang.wants_flip
+    monkeypatch.setattr(bang_bang, "wants_flip", lambda *args: heard.append(args[-1]) or rule(*args))
+    decide(plan, believed(along(plan, 40)))
     assert heard == [pytest.approx(3 * PHANTOM.tracker.jitter_mm / 3**0.5)]

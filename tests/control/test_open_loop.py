@@ -85,7 +85,7 @@ def test_it_has_arrived_once_the_steps_are_used_up_and_not_before(quick_plan, be
 
 def test_steps_and_reach_of_a_smaller_setup_are_kept(quick_plan, believed):
     """A plan of a larger setup: slower and less far aside, without an exception."""
-    tight = {"setup.max_guide_step_mm": 0.05, "setup.max_guide_travel_mm": 0.4, "target.lateral_mm": 0.0}
+    tight = {"setup.max_guide_step_mm": 0.02, "setup.max_guide_travel_mm": 0.4, "target.lateral_mm": 0.0}
     commands, places = replayed(quick_plan, believed, PHANTOM.with_values(tight))
-    assert max(abs(command[3]) for command in commands) <= 0.05
+    assert max(abs(command[3]) for command in commands) <= 0.02
     assert np.abs(places[:, 1]).max() == pytest.approx(0.4)

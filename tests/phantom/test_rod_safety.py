@@ -118,6 +118,7 @@ def test_a_channel_without_room_ends_the_cut_not_the_program():
     for _ in range(10):
         bench.step(db_x=1.0)
     assert bench.count == 5
+    assert not bench.converged  # tissue without its points
 
 
 def test_a_needle_deeper_than_the_known_tissue_meets_the_last_of_it():

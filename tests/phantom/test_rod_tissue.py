@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from flexneedle.mechanics import ogden
 from flexneedle.phantom import rod as rd
 from reference.rods import IDEAL, Bench, move, plant, uncompiled
-from reference.validation import MOVES, bent, energy_balance, friction_balance
+from reference.validation import MOVES, bent, energy_balance, friction_balance, insertion_balance
 
 PLAIN = uncompiled(rd)
 LAW = uncompiled(ogden)
@@ -226,6 +226,17 @@ def test_a_push_with_friction_stores_and_dissipates_the_work_of_the_base():
     assert lost == pytest.approx(0.372, abs=0.001)
     assert stored > 0.01
     assert done == pytest.approx(stored + lost, abs=1.5e-3 * lost)
+
+
+def test_work_on_an_insertion_is_stored_or_dissipated():
+    """Cutting, guide motion and a flip: what is missing falls with the step, to two ten-thousandths of the work."""
+    gaps = [abs(insertion_balance(step, friction=0.0).gap) for step in (0.5, 0.25, 0.125, 0.0625)]
+    assert (np.diff(np.log2(gaps)) < -0.75).all()
+    assert gaps[-1] < 3e-4
+    rubbed = insertion_balance(0.125, friction=5.0)
+    assert rubbed.friction > 3.9  # 5 mN/mm over 40 mm
+    assert abs(rubbed.gap) < 2e-5
+    assert min(rubbed.needle, rubbed.tissue) > 0.01
 
 
 def test_friction_is_5_mn_a_millimetre_against_the_last_slide():

@@ -88,6 +88,22 @@ def difference_panels(number, rows=12):
     ]  # fmt: skip
 
 
+def far_apart():
+    """Differences of hundredths and of millimetres."""
+    ends = (
+        (-0.09, -0.05, -0.015),
+        (-3.6, -3.2, -2.6),
+        (-0.02, 0.01, 0.04),
+        (-0.01, 0, 0.005),
+        (0.1, 0.2, 0.3),
+    )
+    rows = [
+        plots.DifferenceRow(f"other {k}", plots.look(k), m, low, high)
+        for k, (low, m, high) in enumerate(ends)
+    ]
+    return plots.DifferencePanel("default", "left of zero: smaller errors", "#000000", rows)
+
+
 PLACES = np.array([0.0, 0.5, 1.0, 1.5, 2.0])
 LEVELS = ("0", "0.5", "1", "1.5", "2")
 FIGURES = {
@@ -110,6 +126,7 @@ FIGURES = {
     "energy, one": lambda: plots.energy_figure(energy_panels(1)),
     "energy, all": lambda: plots.energy_figure(energy_panels(7)),
     "differences, one": lambda: plots.difference_figure(difference_panels(1), "more error (mm)"),
+    "differences, far apart": lambda: plots.difference_figure([far_apart()], "more error (mm)"),
     "differences, all": lambda: plots.difference_figure(difference_panels(7, 5), "more error (mm)"),
 }
 
@@ -287,6 +304,24 @@ def test_differences_that_hold_zero_are_hollow():
     assert faces == [plots.look(0).color, plots.look(0).color, "white", "white"]
     ends = [line.get_xdata().tolist() for line in lines(ax, "interval")]
     assert ends == [[row.low, row.high] for row in rows[:3]]
+
+
+def test_differences_of_different_size_can_all_be_read():
+    figure = plots.difference_figure([far_apart()], "difference (mm)")
+    shown_texts(figure)
+    (ax,) = figure.axes
+    place = ax.transAxes.inverted().transform
+    ends = [ax.transData.transform([(x, 0) for x in line.get_xdata()]) for line in lines(ax, "interval")]
+    widths = [place(b)[0] - place(a)[0] for a, b in ends]
+    assert min(widths) > 0.02
+    assert [text for text in texts(figure) if text in ("−3", "−1", "−0.1", "0", "0.1")]
+    zero, near, nearer = (place(ax.transData.transform((x, 0)))[0] for x in (0.0, 0.04, 0.02))
+    assert near - zero == pytest.approx(2 * (nearer - zero))
+
+
+def test_differences_of_one_size_have_an_even_scale():
+    (ax,) = plots.difference_figure(difference_panels(1), "difference (mm)").axes
+    assert ax.get_xscale() == "linear"
 
 
 def test_an_error_of_nothing_is_still_drawn():

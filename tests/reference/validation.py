@@ -6,10 +6,11 @@ from itertools import pairwise
 import numpy as np
 
 from flexneedle import Control, Simulator
+from flexneedle.phantom import Truth
 from flexneedle.phantom import rod as rd
 from reference import closed_forms, elastica
 from reference.cases import EI, FOUNDATION, long_beam
-from reference.rods import IDEAL, PERFECT, Bench, move, plant
+from reference.rods import IDEAL, PERFECT, Bench, Shooting, move, plant
 
 LOADS = {1.0: 0.3017, 2.0: 0.4935, 5.0: 0.7138}
 """PL²/EI of a cantilever, and the deflection of its tip over its length as tables have it."""
@@ -17,6 +18,8 @@ LOADS = {1.0: 0.3017, 2.0: 0.4935, 5.0: 0.7138}
 SMALL = {"element": 0.25, "spacing": 0.25, "step": 0.125}
 """Resolution (mm) of the comparison with the controller's model; SHIPPED is the phantom's own."""
 SHIPPED = {"element": 0.5, "spacing": 0.5, "step": 0.25}
+FINE = {"element": 0.125, "spacing": 0.125, "step": 0.0625}
+_RIGID = 1e5  # N/mm: the guide of the controller's model does not give
 
 BASE, TURN, GUIDE = "base", "turn", "guide"
 MOVES = {  # base y (mm), base turn (rad), guide y (mm)
@@ -115,6 +118,7 @@ def model_gap(scale: float, layers: int, *, element: float, spacing: float, step
     scenario = scaled(scale, layers, element, spacing)
     rows = commands(scale, 44.5, step)
     simulator, needle = Simulator(scenario, threads=1), plant(scenario)
+    needle.rod = needle.rod._replace(guide_stiffness=_RIGID)
     state, tips = simulator.start(), []
     for row in rows:
         state = simulator.step(state, Control.from_row(row.tolist()))
@@ -146,6 +150,60 @@ def curvature_error(resolution: float, bevel_length: float) -> float:
     """The same relative to docs/theory.md eq. 10."""
     expected = closed_forms.steady_curvature(0.01, bevel_length, FOUNDATION, EI)
     return path_curvature(resolution, bevel_length) / expected - 1.0
+
+
+# --- the same plant worked out otherwise
+
+ROUGH = IDEAL.with_values(
+    {
+        "needle.length_mm": 100.0,
+        "setup.tip_to_skin_mm": 1.0,
+        "setup.guide_to_skin_mm": 20.0,
+        "setup.stroke_mm": 50.0,
+        "target.depth_mm": 20.0,
+        "tissue.0.thickness_mm": 8.0,
+        "phantom.contact_spacing_mm": 1.0,
+        "phantom.guide_clearance_mm": 0.05,
+    }
+)
+"""A short needle in two thin layers. With imperfections, for a check that takes no hour."""
+START = {
+    "base_y": 0.4,
+    "base_turn": 0.003,
+    "bend": 0.5,
+    "variation": tuple((1.0 + 0.3 * np.sin(0.3 * np.arange(200))).tolist()),
+}
+_STEP_MM = 0.47  # never a whole number of them to a channel point
+
+
+def wander(steps: int = 48):
+    """Commands in all inputs: in, drawn back from half way, in again; the bevel turned over twice."""
+    for k in range(steps):
+        yield {
+            "db_x": -_STEP_MM if 24 <= k < 30 else _STEP_MM,
+            "db_y": 0.02 * np.sin(k / 9.0),
+            "db_theta": 4e-4 * np.cos(k / 7.0),
+            "dg_y": 0.12 * np.cos(k / 10.0),
+            "flip": k in (14, 38),
+        }
+
+
+def push(parts: int):
+    """14 mm ahead under a guide that moves aside, each step in so many."""
+    for k in range(30 * parts):
+        yield {"db_x": _STEP_MM / parts, "dg_y": 0.12 / parts * np.cos(k / parts / 10.0)}
+
+
+def shot(scenario, rows) -> np.ndarray:
+    """Poses of the tip (m, 3) by shooting."""
+    needle = Shooting(Truth(scenario, cell_mm=0.5, **START))
+    return np.array([needle.step(**row).tip for row in rows])
+
+
+def stepped(scenario, rows, element: float) -> np.ndarray:
+    """Poses of the tip (m, 3) of the plant."""
+    needle = plant(scenario.with_values({"phantom.element_mm": element}), cell=0.5, **START)
+    return np.array([move(needle, **row).tip for row in rows])
 
 
 # --- work and energy
@@ -183,8 +241,149 @@ def friction_balance(steps: int, friction: float = 5.0) -> tuple[float, float, f
     return done, stored, 1e-3 * friction * 0.5 * (inside_length(needle) ** 2 - before**2)
 
 
+def slide(before: np.ndarray, after: np.ndarray) -> float:
+    """How far the needle in the tissue moved along itself, summed over its length (mm²), from its nodes (N + 1, 2)."""
+    way = np.diff(0.5 * (before + after), axis=0)
+    length = np.hypot(*way.T)
+    along = (0.5 * (after - before)[:-1] + 0.5 * (after - before)[1:]) * way / length[:, None]
+    left, right = 0.5 * (before + after)[:-1, 0], 0.5 * (before + after)[1:, 0]
+    inside = np.clip(right / (right - left), 0.0, 1.0) * length
+    return float(inside @ along.sum(axis=1))
+
+
+@dataclass(frozen=True)
+class Balance:
+    """Energies of an insertion, mJ."""
+
+    base: float  # work of the base
+    guide: float  # and of the guide
+    bevel: float  # and of the tissue on the bevel: what cutting feeds into the needle
+    needle: float  # stored in its bending
+    tissue: float  # stored along the channel
+    spring: float  # stored in the guide
+    friction: float  # dissipated
+
+    @property
+    def work(self) -> float:
+        """What went in."""
+        return self.base + self.guide + self.bevel
+
+    @property
+    def gap(self) -> float:
+        """What went in less what is there or dissipated, over what went in."""
+        return 1.0 - (self.needle + self.tissue + self.spring + self.friction) / self.work
+
+
+def insertion_balance(step: float, *, spacing=0.5, element=0.5, depth=40.0, friction=5.0) -> Balance:
+    """Work by the trapezoid rule over an insertion with guide motion and a flip, and where it went."""
+    needle = plant(scaled(1.0, 2, element, spacing).with_values({"phantom.friction_mn_per_mm": friction}))
+    done, lost, last, before = np.zeros(3), 0.0, np.zeros(6), needle.nodes
+    for row in commands(1.0, depth, step):
+        needle.step(row)
+        nodes, forces = needle.nodes, np.array([*needle._s[_FORCES], *-needle._work[[rd.GX, rd.GY], -1]])
+        shares = 0.5 * (forces + last) * [*row[:4], *(nodes - before)[-1]]
+        done += [shares[:3].sum(), shares[3], shares[4:].sum()]
+        lost += 1e-3 * friction * slide(before, nodes)
+        last, before = forces, nodes
+    s, w, rod = move(needle)._s, needle._work, needle.rod
+    bends = np.full(needle._theta.size, rod.segment)
+    bends[0] *= 0.5
+    return Balance(
+        *done.tolist(),
+        needle=float((w[rd.MOMENT, :-1] ** 2 * bends).sum() / (2.0 * rod.stiffness)),
+        tissue=needle.strain_energy,
+        spring=float(s[rd.GUIDE_FORCE] ** 2 / (2.0 * rod.guide_stiffness)),
+        friction=lost,
+    )
+
+
 def inside_length(needle) -> float:
     """Arc length (mm) of the needle in the tissue."""
     x, _ = needle.nodes.T
     arc = needle.rod.segment * np.arange(x.size)
     return float(arc[-1] - np.interp(0.0, x, arc))
+
+
+# --- all of it, for the page
+
+SEGMENTS = np.array([16, 32, 64, 128, 256])
+SCALES = (2.0, 2**0.5, 1.0, 0.5**0.5, 0.5, 0.125**0.5, 0.25, 0.03125**0.5, 0.125)
+MESHES = {0.5: SHIPPED, 0.25: SMALL, 0.125: FINE}
+CUBIC = slice(3, 8)  # of SCALES: where the cube of the angle is most of the difference
+RESOLUTIONS, BEVELS = (1.0, 0.5, 0.25), (1.0, 3.0)
+STEPS = (0.5, 0.25, 0.125, 0.0625)
+ELEMENTS = np.array([2.0, 1.0, 0.5, 0.25, 0.125])
+SIZES = {  # of one kind, the rest as shipped; the last is what the others are compared with
+    "element": np.array([2.0, 1.0, 0.5, 0.25, 0.0625]),
+    "step": np.array([0.5, 0.25, 0.125, 0.0625, 0.015625]),
+    "spacing": np.array([1.0, 0.5, 0.25, 0.125]),
+}
+
+
+@dataclass(frozen=True)
+class Found:
+    """All that is computed; sizes in mm, angles in rad, energies in mJ."""
+
+    cantilever: dict[float, np.ndarray]  # by load: errors of the tip (x/L, y/L, θ) by SEGMENTS
+    shapes: dict[float, np.ndarray]  # nodes over L
+    buckling: float
+    gaps: dict[int, dict[float, list[Gap]]]  # by layers and element, along SCALES
+    curvature: dict[float, list[float]]  # by bevel length: relative errors by RESOLUTIONS
+    moves: dict[str, tuple[float, float]]  # work and change of the stored energy
+    balances: dict[float, list[Balance]]  # by friction, along STEPS
+    second: np.ndarray  # largest distances from the second solver (x, y, θ) by ELEMENTS
+    rubbed: list[float]  # the same with friction at the end, for one and two parts of a step
+    refined: dict[str, np.ndarray]  # distances (mm) from the finest, by SIZES
+
+
+def compute() -> Found:
+    """Everything."""
+    beams = {load: cantilevers(load) for load in LOADS}
+    return Found(
+        cantilever={load: errors for load, (errors, _) in beams.items()},
+        shapes={load: nodes for load, (_, nodes) in beams.items()},
+        buckling=buckling_factor(64),
+        gaps={layers: {h: model_gaps(layers, h) for h in MESHES} for layers in (1, 2)},
+        curvature={b: [curvature_error(r, b) for r in RESOLUTIONS] for b in BEVELS},
+        moves={name: energy_balance(name, 40) for name in MOVES},
+        balances={f: [insertion_balance(step, friction=f) for step in STEPS] for f in (0.0, 5.0)},
+        second=second_solver(),
+        rubbed=[rubbed(parts) for parts in (1, 2)],
+        refined={name: refined(name) for name in SIZES},
+    )
+
+
+def cantilevers(load: float) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the tip by SEGMENTS, and the nodes of the finest over the length."""
+    errors = np.array([cantilever_error(load, n) for n in SEGMENTS.tolist()])
+    bench = Bench(length=100.0, segments=int(SEGMENTS[-1])).loaded(y=load * 1000.0 / 100.0**2)
+    return errors, bench.nodes / 100.0
+
+
+def model_gaps(layers: int, element: float) -> list[Gap]:
+    """Exact plant against the controller's model, along SCALES."""
+    return [model_gap(scale, layers, **MESHES[element]) for scale in SCALES]
+
+
+def second_solver() -> np.ndarray:
+    """Largest distances of the tip on the way, by ELEMENTS."""
+    expected = shot(ROUGH, wander())
+    paths = (stepped(ROUGH, wander(), h) for h in ELEMENTS.tolist())
+    return np.array([np.abs(path - expected).max(axis=0) for path in paths])
+
+
+def rubbed(parts: int) -> float:
+    """Distance of the tips (mm) after a push with ten times the friction, each step in so many parts."""
+    scenario = ROUGH.with_values({"phantom.friction_mn_per_mm": 50.0})
+    ends = (
+        stepped(scenario, push(parts), 0.25),
+        shot(scenario, push(parts)),
+    )
+    return float(np.hypot(*(ends[0] - ends[1])[-1, :2]))
+
+
+def refined(name: str) -> np.ndarray:
+    """Distances of the tip from that of the finest size."""
+    cell = {"cell": 0.125} if name == "spacing" else {}
+    tips = np.array([inserted_tip(**{name: size}, **cell)[:2] for size in SIZES[name].tolist()])
+    return np.hypot(*(tips[:-1] - tips[-1]).T)

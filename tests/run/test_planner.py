@@ -93,6 +93,8 @@ def test_same_seed_same_bytes_whatever_the_threads(monkeypatch):
     for name in ("controls", "tips", "shapes", "strain_energy"):
         assert getattr(one, name).tobytes() == getattr(again, name).tobytes()
     assert one.history == again.history
+    two = coarse(seed=3, threads=2)
+    assert two.controls.tobytes() == one.controls.tobytes()
     assert one.controls.tobytes() != other.controls.tobytes()
 
 

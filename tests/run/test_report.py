@@ -189,6 +189,58 @@ def test_a_default_that_is_worse_is_said_to_be(report_on, rows):
     assert f"{OURS} is worse than open-loop in mean true error: +" in report_on(rows)[1].text
 
 
+def test_where_the_default_stands_among_the_others_is_said_first(report_on):
+    rows = make_rows((OURS, "open-loop", "bevel-only"), targets=TARGETS, repeats=8)
+    assert f"{OURS} is better than every other controller in mean true error." in report_on(rows)[1].text
+    for row in rows:
+        if row["controller"] != "bevel-only":
+            row["true_error_mm"] = 0.9 + 0.001 * row["seed"]
+    _, page = report_on(rows)
+    assert (
+        f"{OURS} is better than 0 of 2 other controllers in mean true error; "
+        "not separable from open-loop; worse than bevel-only." in page.text
+    )
+
+
+def test_differences_are_given_at_each_depth(report_on):
+    rows = make_rows(BOTH, targets=TARGETS, repeats=4)
+    for row in rows:
+        deep = row["target_depth_mm"] == 45.0
+        row["true_error_mm"] = (0.3 if row["controller"] == OURS else 0.1 if deep else 0.6) + 1e-4 * row[
+            "seed"
+        ]
+    report, page = report_on(rows)
+    found = report.values()["controllers_by_depth"]
+    assert {depth: one["mean_mm"]["value"] for depth, (one,) in found.items()} == pytest.approx(
+        {"25": -0.3, "40": -0.3, "45": 0.2}
+    )
+    assert [one["verdict"] for (one,) in found.values()] == ["better", "better", "worse"]
+    assert "45 mm deep" in page.text
+    assert "+0.200" in page.text
+
+
+def test_what_the_insertions_took_stands_beside_the_plans(report_on):
+    rows = make_rows(targets=TARGETS, repeats=4)
+    for row in rows:
+        row |= {"flips": 3, "planned_flips": 1, "periods": 66, "planned_periods": 60}
+        row |= {"strain_energy_mj": 0.006, "planned_strain_energy_mj": 0.005, "unconverged_periods": 0}
+    rows[0] |= {"unconverged_periods": 2, "periods": 72}
+    rows[1] |= {"unconverged_periods": 5}
+    report, page = report_on(rows)
+    head = page.text[: page.text.index("Figures")]
+    assert "bevel turns 3.00 plan's 1.00" in head
+    assert "tissue energy / plan's 1.20 1.20 to 1.20" in head
+    assert "periods / plan's 1.11 largest 1.20" in head
+    assert "periods not converged 7 in 2 insertions" in head
+    assert report.values()["groups"][0]["unconverged_periods"] == 7
+
+
+def test_small_energies_are_not_said_to_be_none(drawn_on):
+    rows = [row | {"strain_energy_mj": 0.0042} for row in make_rows(targets=TARGETS, repeats=2)]
+    report, _ = drawn_on(rows)
+    assert "medians 0.0042 mJ" in {drawn.name: drawn for drawn in report.figures}["energy"].alt
+
+
 def test_command_versions_and_definitions_are_there(report_on, rows):
     _, page = report_on(rows, ABOUT | {"date": "2026-11-21"})
     for text in (

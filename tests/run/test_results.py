@@ -55,11 +55,17 @@ def test_what_is_not_known_is_null():
     unseen = Insertion(PLAN, 0, tuple(map(blind, make_insertion().periods)), "done", "")
     result = insertion_result(unseen)
     unknown = {name for name, value in result.items() if value is None}
-    assert unknown == {"tip_true_mm", "tip_measured_mm", "true_error_mm", "residual_mm", "strain_energy_mj"}
+    errors = {"true_error_mm", "residual_mm"}
+    assert unknown == {"phantom", "tip_true_mm", "tip_measured_mm", "strain_energy_mj"} | errors
     assert result["reached"] is False
     empty = Insertion(PLAN, 0, (), "failed", "")
     assert insertion_result(empty)["steps"] == 0
     assert insertion_timing(empty)["period_ms"] == {"p50": None, "p99": None, "max": None}
+
+
+def test_the_result_says_who_steered_what():
+    result = insertion_result(replace(make_insertion(), controller="ce-mpc", phantom="model"))
+    assert (result["controller"], result["phantom"]) == ("ce-mpc", "model")
 
 
 def test_one_unconverged_period_is_not_hidden():

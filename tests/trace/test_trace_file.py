@@ -95,11 +95,20 @@ def test_a_blind_period_comes_back(tmp_path):
     (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
     assert to_row(again) == to_row(period)
     assert (again.sample.x, again.true_tip, again.true_strain_energy) == (None, None, None)
+    assert again.true_stretch is None
     assert (again.verdict, again.sample.time) == ("missing", period.sample.time)
+
+
+def test_the_smallest_stretch_of_the_true_tissue_is_a_column(trace_file):
+    """To the last bit, as every scalar."""
+    found = [float(to_row(period)["true_stretch"]) for period in read_trace(trace_file).periods]
+    assert found == [period.true_stretch for period in PERIODS]
+    assert found[0] == 1.0
 
 
 def test_columns_carry_units():
     bare = {"index", "verdict", "bevel", "cost", "decision", "converged", "command_flip", "applied_flip"}
+    bare |= {"true_stretch"}  # a ratio
     units = {"mm", "rad", "s", "mj", "n"}
     assert {name for name in COLUMNS if name.rsplit("_", 1)[-1] not in units} == bare
 

@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from flexneedle.scenario import Scenario
 
-__all__ = ["add_run_arguments", "chosen_scenario", "compile_first", "print_json", "print_table", "run_name"]
+__all__ = [
+    *(
+        "add_run_arguments",
+        "chosen_scenario",
+        "compile_first",
+        "print_json",
+        "print_table",
+        "run_name",
+        "seed",
+    ),
+]
 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,14 +35,15 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("X", "Y"),
         help="depth and lateral place of the target in mm (as in the scenario)",
     )
-    parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="same seed, same result (0)")
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="same seed, same result (0)")
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the run (runs/<date>-<scenario>-<seed>)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
 
 
-def _seed(text: str) -> int:
+def seed(text: str) -> int:
+    """Return a seed as it was given; argparse says what is wrong with another."""
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"{value}: must be at least 0")
@@ -50,17 +61,16 @@ def chosen_scenario(args: argparse.Namespace) -> Scenario:
     return scenario.with_values({"target.depth_mm": depth, "target.lateral_mm": lateral})
 
 
-def compile_first(scenario: Scenario) -> None:
-    """Compile the kernels; the first time this takes some seconds, and that is said."""
-    from flexneedle.mechanics.compile import compiled
-    from flexneedle.simulator import Simulator
+def compile_first() -> None:
+    """Compile the kernels; the first time this takes a while, and that is said."""
+    from flexneedle.run.kernels import all_compiled, compile_kernels
 
     from .progress import Progress
 
     with Progress() as progress:
-        if not compiled():
+        if not all_compiled():
             progress.begin("Compiling the mechanics, this once")
-        Simulator(scenario).compile()
+        compile_kernels()
 
 
 def run_name(args: argparse.Namespace) -> str:

@@ -6,11 +6,20 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
-from .common import add_run_arguments, chosen_scenario, compile_first, print_json, print_table, run_name
+from .common import (
+    add_run_arguments,
+    chosen_scenario,
+    compile_first,
+    print_json,
+    print_table,
+    run_name,
+    seed,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from flexneedle.run.recording import Choices
     from flexneedle.scenario import Scenario
     from flexneedle.trace import Insertion, Period
 
@@ -32,6 +41,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="how to plan: manipulation moves guide and bevel, steering only the bevel (manipulation)",
     )
     parser.add_argument(
+        "--plan-seed", type=seed, metavar="N", help="seed of the plan (that of the insertion, --seed)"
+    )
+    parser.add_argument(
+        "--controller", metavar="NAME", help="who steers (adaptive-mpc); --list says which there are"
+    )
+    parser.add_argument(
+        "--phantom",
+        metavar="KIND",
+        help="what is steered: exact, a finer formulation of its own with a rig's imperfections, or model, the "
+        "controller's own kind of model with other parameters (exact)",
+    )
+    parser.add_argument("--list", action="store_true", help="list the controllers, and do nothing else")
+    parser.add_argument(
         "--force", action="store_true", help="insert even if the plan misses the target by more than 1 mm"
     )
     parser.set_defaults(handler=_insert)
@@ -43,23 +65,40 @@ def _insert(args: argparse.Namespace) -> int:
 
     from .progress import Progress
 
-    scenario = chosen_scenario(args)
-    compile_first(scenario)
+    if args.list:
+        return _list()
+    choices, scenario = _choices(args), chosen_scenario(args)
+    compile_first()
     folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
     with Progress() as progress:
         show = _Show(progress, scenario)
         insertion = record_insertion(
             folder,
             scenario,
-            args.strategy,
-            args.seed,
-            force=args.force,
+            choices,
             on_iteration=show.iteration,
             on_period=show.period,
         )
         if insertion.outcome == "done":
             progress.finish("Inserting")
     return _report(insertion, args.json, folder.path)
+
+
+def _choices(args: argparse.Namespace) -> Choices:
+    from flexneedle.run.recording import Choices
+
+    chosen = {"controller": args.controller, "phantom": args.phantom}
+    named = {name: value for name, value in chosen.items() if value is not None}
+    return Choices(args.seed, args.strategy, args.plan_seed, force=args.force, **named)
+
+
+def _list() -> int:
+    from flexneedle.control.methods import DEFAULT, METHODS
+
+    width = max(map(len, METHODS))
+    for name, method in METHODS.items():
+        print(f"{name:{width}}  {method.summary}{' (default)' if name == DEFAULT else ''}")
+    return 0
 
 
 class _Show:
@@ -103,6 +142,8 @@ def _table(insertion: Insertion, folder: Path) -> None:
     result, timing = insertion_result(insertion), insertion_timing(insertion)
     depth, aside = insertion.target
     rows = [
+        ("controller", insertion.controller),
+        ("phantom", insertion.phantom),
         ("target, depth and aside", f"{depth:g}, {aside:g} mm"),
         ("true distance from the target", _number(result["true_error_mm"], "mm")),
         ("  by the tracker", _number(result["residual_mm"], "mm")),

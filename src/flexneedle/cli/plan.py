@@ -38,7 +38,7 @@ def _plan(args: argparse.Namespace) -> int:
     from .progress import Progress
 
     scenario = chosen_scenario(args)
-    compile_first(scenario)
+    compile_first()
     strategies = _STRATEGIES if args.strategy == "both" else (args.strategy,)
     folder = Folder.claim(args.out, run_name(args), "plan", scenario, args.seed)
     with Progress() as progress:

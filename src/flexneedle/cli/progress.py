@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from time import monotonic
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["Progress"]
 
 _LINES = 5  # of a stage, without a terminal
+_PAUSE_S = 60.0  # the longest without a line
 
 
 class Progress:
@@ -22,6 +24,7 @@ class Progress:
         self._bars = _bars() if sys.stderr.isatty() else None
         self._tasks: dict[str, TaskID] = {}
         self._told: dict[str, int] = {}
+        self._last = monotonic()
 
     def __enter__(self) -> Self:
         if self._bars is not None:
@@ -48,9 +51,13 @@ class Progress:
             self.begin(stage)
         if self._bars is not None:
             self._bars.update(self._tasks[stage], completed=done, total=total, note=note)
-        elif (lines := int(_LINES * done / total + 1e-9)) > self._told[stage]:
+        elif (lines := int(_LINES * done / total + 1e-9)) > self._told[stage] or self._is_long_ago():
             self._told[stage] = lines
+            self._last = monotonic()
             _tell(f"{stage} {done / total:.0%}: {note}")
+
+    def _is_long_ago(self) -> bool:
+        return monotonic() > self._last + _PAUSE_S
 
     def finish(self, stage: str) -> None:
         """Show a stage as done, whatever was left of it."""
@@ -68,8 +75,9 @@ def _bars() -> Bars:
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as Bars
 
+    # In a narrow terminal bar and times make room for the rest.
     columns: tuple[Any, ...] = (
-        TextColumn("{task.description:24}"),
+        TextColumn("{task.description}"),
         BarColumn(bar_width=24),
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),

@@ -9,6 +9,8 @@ from .common import print_json
 
 __all__ = ["add_parser"]
 
+_TUNING = Path("docs/tuning")
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle`."""
@@ -18,7 +20,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("study", metavar="STUDY_DIR", type=Path, help="folder of the study")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report (STUDY_DIR/report)")
     parser.add_argument(
-        "--tuning", type=Path, metavar="DIR", help="records of the controllers' tuning to show (docs/tuning)"
+        "--tuning",
+        type=Path,
+        metavar="DIR",
+        help=f"records of the controllers' tuning to show ({_TUNING}, if it is there)",
     )
     parser.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
     parser.set_defaults(handler=_report)
@@ -27,7 +32,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _report(args: argparse.Namespace) -> int:
     from flexneedle.run.report import write_report
 
-    report = write_report(args.study, args.out, args.tuning)
+    tuning = args.tuning or (_TUNING if _TUNING.is_dir() else None)
+    report = write_report(args.study, args.out, tuning)
     if args.json:
         print_json(report.values())
     else:

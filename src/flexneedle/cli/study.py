@@ -63,7 +63,7 @@ def _study(args: argparse.Namespace) -> int:
         raise InputError("--workers is for this machine: leave it out with --scheduler")
     study = load_study(args.study)
     folder = args.out or free_folder(study)
-    compile_first(study.points[0].scenario)
+    compile_first()
     begun = time.monotonic()
     try:
         with Progress() as progress:
@@ -97,7 +97,8 @@ class _Show:
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
-        self._first: tuple[float, int] | None = None
+        self._before: int | None = None  # done by an earlier run of the study
+        self._first: tuple[float, int] | None = None  # when the first was in, and how many there were then
 
     def advance(self, advance: Advance) -> None:
         now, done = time.monotonic(), advance.insertions
@@ -108,13 +109,20 @@ class _Show:
             max(advance.all_plans, 1),
             f"{advance.plans} of {advance.all_plans} plans",
         )
-        begun, before = self._first = self._first or (now, done)
         note = f"{done} of {advance.all_insertions}"
-        if done > before and now > begun:
-            rate = (done - before) / (now - begun)
+        if rate := self._rate(now, done):
             note += f", {rate:.2g} a second, {_duration((advance.all_insertions - done) / rate)} left"
         note += f", {advance.failed} failed" if advance.failed else ""
         self._progress.show(inserting, done, advance.all_insertions, note)
+
+    def _rate(self, now: float, done: int) -> float:
+        """Insertions a second since the first was in, so that plans made before do not count; 0 if not known yet."""
+        if self._before is None:
+            self._before = done
+        if self._first is None and done > self._before:
+            self._first = now, done
+        begun, first = self._first or (now, done)
+        return (done - first) / (now - begun) if now > begun else 0.0
 
 
 def _duration(seconds: float) -> str:
@@ -150,11 +158,14 @@ def _table(summary: Mapping[str, Any]) -> None:
     for name, part in ((_label(group["settings"]), group) for group in summary["groups"]):
         table.add_row(*map(Text, (name, *_cells(part))))
     table.add_row(*map(Text, ("all", *_cells(summary))))
-    spent = summary["time"]
+    spent, unconverged = summary["time"], summary["unconverged_periods"]
     console.print(Text(summary["title"], style="bold"), table, sep="\n\n")
     console.print(
-        "\nTrue error in mm; flips with the plan's; mean tissue energy and most periods over the plan's."
+        "\nOver the insertions that are done: true error in mm; flips with the plan's; mean tissue energy and most "
+        "periods over the plan's."
     )
+    if unconverged:
+        console.print(f"{unconverged} periods did not converge: see unconverged_periods in the table.")
     console.print(
         f"Work: {spent['plan_s']:.1f} s plan, {spent['control_s']:.1f} s control, {spent['plant_s']:.1f} s plant, "
         f"{spent['rest_s']:.1f} s rest; {spent['wall_s']:.1f} s on the clock"

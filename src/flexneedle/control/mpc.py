@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from flexneedle.control.interface import travel_left
 from flexneedle.planning import Settings, cross_entropy
-from flexneedle.scenario import Scenario, elite_count
+from flexneedle.scenario import Scenario, Setup, elite_count
 from flexneedle.simulator import Simulator, State
 from flexneedle.trace import PlanRecord
 
@@ -31,7 +31,7 @@ def choose(
     scenario = simulator.scenario
     steps, travel = scenario.control.horizon, travel_left(scenario, plan, state)
     reference, nominal = _window(plan, float(state.tip[0]), steps)
-    base = _planned_base(scenario, plan, state, steps)
+    base = planned_base(scenario.setup, plan, state, reference[:, 0])
     lower, upper, sigma = _bounds(scenario, steps)
     mean = np.clip(np.concatenate([nominal[:, 0], nominal[:, 3]]), lower, upper)
     settings = Settings(
@@ -66,14 +66,20 @@ def _window(plan: PlanRecord, x: float, steps: int) -> tuple[Floats, Floats]:
     return poses, controls
 
 
-def _planned_base(scenario: Scenario, plan: PlanRecord, state: State, steps: int) -> Floats:
-    """Steps (steps, 2) of base y and turn that bring the base where the plan has it, as fast as its limits allow."""
-    limit = np.array([scenario.setup.max_base_step_mm, scenario.setup.max_base_turn_step])
+def planned_base(setup: Setup, plan: PlanRecord, state: State, depth: Floats) -> Floats:
+    """Steps (n, 2) of base y (mm) and turn (rad) to where the plan has the base with its tip at `depth` (n,), mm.
+
+    A base that lags behind catches up as fast as its limits allow.
+    """
+    limit = np.array([setup.max_base_step_mm, setup.max_base_turn_step])
     moved = np.concatenate([np.zeros((1, 2)), np.cumsum(plan.controls[:, 1:3], axis=0)])
-    grid = np.arange(len(moved))
-    at = float(np.interp(state.tip[0], plan.tips[:, 0], grid)) + np.arange(1, steps + 1)
-    goal = np.stack([np.interp(at, grid, moved[:, k]) for k in (0, 1)], axis=1)
-    return np.clip(np.diff(goal, axis=0, prepend=state.travel[None, 1:3]), -limit, limit)
+    goal = np.stack([np.interp(depth, plan.tips[:, 0], moved[:, k]) for k in (0, 1)], axis=1)
+    goal[:, 0] = np.clip(goal[:, 0], -setup.max_base_travel_mm, setup.max_base_travel_mm)
+    steps, place = np.zeros_like(goal), state.travel[1:3]
+    for step, end in zip(steps, goal, strict=True):
+        step[:] = np.clip(end - place, -limit, limit)
+        place = place + step
+    return steps
 
 
 def _bounds(scenario: Scenario, steps: int) -> tuple[Floats, Floats, Floats]:

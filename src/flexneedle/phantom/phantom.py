@@ -13,6 +13,7 @@ from flexneedle.simulator import Control
 from flexneedle.simulator.control import Limits
 
 Floats = NDArray[np.float64]
+_WHOLE = 1e-8  # of a motor step: rounding of a place that stands on one
 
 
 class Condition(NamedTuple):
@@ -32,6 +33,7 @@ class Phantom:
         self._truth = truth
         self._limits = Limits.of(truth.scenario)
         self._moved = np.zeros(4)
+        self._owed = np.zeros(4)  # what rounding to motor steps has left undone so far
         self._time = 0.0
         self._least_stretch = 1.0
         self._path = [(0.0, *self._tip()[:2])]  # time, x, y
@@ -52,10 +54,11 @@ class Phantom:
     def apply(self, command: Command, duration: float) -> Command:
         """Carry out `command` evenly within `duration` s, in steps no longer than `phantom.step_mm`.
 
-        Motors stop at the last multiple of their resolution on the way; the command is returned as it was applied.
+        Motors go to the multiple of their resolution that is nearest to the sum of all commands, so that no rounding
+        adds up; the command is returned as it was applied. Raises CommandError if it breaks a limit of the setup.
         """
         self._limits.check(self._moved, Control.from_row(command).row()[None])
-        row = self._reachable(command)
+        row = self._rounded(command)
         parts = max(1, math.ceil(abs(row[0]) / self._truth.scenario.phantom.step_mm - 1e-9))
         for k in range(parts):
             self._plant.step(np.append(row[:4] / parts, row[4] if k == 0 else -1.0))
@@ -74,16 +77,19 @@ class Phantom:
                 return x0 + part * (x1 - x0), y0 + part * (y1 - y0)
         return self._path[0][1:]
 
-    def _reachable(self, command: Command) -> Floats:
-        """The command cut to where the motors can stop; a turn of the base is not."""
+    def _rounded(self, command: Command) -> Floats:
+        """The command in whole motor steps, within the limits; a turn of the base is not rounded."""
         row = np.array(command, dtype=float)
         grid = self._truth.scenario.phantom.motor_resolution_mm
         if grid > 0.0:
             lengths = [0, 1, 3]
-            ends = (self._moved + row[:4])[lengths] / grid
-            towards = np.where(row[lengths] >= 0.0, np.floor(ends + 1e-6), np.ceil(ends - 1e-6))
-            steps = towards * grid - self._moved[lengths]
-            row[lengths] = np.where(row[lengths] == 0.0, 0.0, steps)
+            stands, asked = self._moved[lengths], row[lengths] + self._owed[lengths]
+            step, travel = self._limits.step[lengths], self._limits.travel[lengths]
+            lowest = np.ceil(np.maximum(stands - step, travel[:, 0]) / grid - _WHOLE)
+            highest = np.floor(np.minimum(stands + step, travel[:, 1]) / grid + _WHOLE)
+            place = grid * np.clip(np.rint((stands + asked) / grid), lowest, highest)
+            row[lengths] = np.where(row[lengths] == 0.0, 0.0, place - stands)
+            self._owed[lengths] = np.clip(asked - row[lengths], -0.5 * grid, 0.5 * grid)
         return row
 
     def _tip(self) -> Floats:

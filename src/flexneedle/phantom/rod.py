@@ -416,6 +416,8 @@ def _extend(rod: Rod, s: Floats, channel: Floats, count: int, segments: int) -> 
         channel[C_ENERGY, count] = rod.energy[c] * rod.spacing
         channel[C_WEIGHT, count] = rod.weight[c]
         count += 1
+    if (count + 0.5) * rod.spacing < s[CUT] + cut:  # tissue without its points is no equilibrium
+        s[CONVERGED] = 0.0
     s[CUT] += cut
     s[FRONT_X], s[FRONT_Y], s[FRONT_TURN] = s[TIP_X], s[TIP_Y], s[TIP_TURN]
     return count

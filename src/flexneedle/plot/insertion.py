@@ -206,7 +206,7 @@ def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion) -> None:
     for side in ("top", "right"):
         ax.spines[side].set_visible(True)
     ax.locator_params(nbins=5)
-    ax.set_xlabel(_errors(insertion), labelpad=3.0)
+    ax.set_xlabel("\n".join((*_errors(insertion), *_method(insertion))), labelpad=3.0)
 
 
 def _last_tip(insertion: Insertion) -> Floats:
@@ -215,6 +215,12 @@ def _last_tip(insertion: Insertion) -> Floats:
     return end
 
 
-def _errors(insertion: Insertion) -> str:
+def _errors(insertion: Insertion) -> list[str]:
     values = (("true error", insertion.true_error_mm), ("by the tracker", insertion.residual_mm))
-    return "\n".join(f"{name} {value:.3f} mm" for name, value in values if not np.isnan(value))
+    return [f"{name} {value:.3f} mm" for name, value in values if not np.isnan(value)]
+
+
+def _method(insertion: Insertion) -> list[str]:
+    """Say who steered, and what, as far as it is known."""
+    phantom = f"{insertion.phantom} phantom" if insertion.phantom else ""
+    return [", ".join(filter(None, (insertion.controller, phantom)))]

@@ -45,4 +45,5 @@ def _insertion(run: RunFile) -> tuple[Insertion, str]:
     killed = run.status == "running"
     outcome, reason = ("interrupted", _UNFINISHED) if killed else (run.status, run.reason)
     plan = next(iter(run.plans.values()))
-    return Insertion(plan, run.seed, trace.periods, outcome, reason), trace.note
+    how = (outcome, reason, run.controller, run.phantom)
+    return Insertion(plan, run.seed, trace.periods, *how), trace.note

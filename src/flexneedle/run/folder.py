@@ -1,7 +1,8 @@
 """The folder of a run: claimed once, `run.json` always whole, read back with clear errors.
 
-`run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing
-and plans. All but `timing`, which holds the date and the wall-clock times, is the same for the same seed.
+`run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing and
+plans; that of an insertion also controller and phantom. All but `timing`, which holds the date and the wall-clock
+times, is the same for the same seed.
 """
 
 import json
@@ -31,7 +32,10 @@ _FORMAT = 1
 
 @dataclass(frozen=True, eq=False)
 class RunFile:
-    """`run.json`, read back. status: "running" (or killed), "done", "held", "failed" or "interrupted"."""
+    """`run.json`, read back. status: "running" (or killed), "done", "held", "failed" or "interrupted".
+
+    controller, phantom: of an insertion, "" where they are not recorded.
+    """
 
     folder: Path
     kind: str
@@ -42,6 +46,8 @@ class RunFile:
     plans: dict[str, PlanRecord]
     result: Mapping[str, Any] | None
     timing: Mapping[str, Any]
+    controller: str
+    phantom: str
 
 
 @dataclass(eq=False)
@@ -118,6 +124,7 @@ def _checked(path: Path, values: Any) -> RunFile:
     try:
         plans = {name: plan_from_values(plan) for name, plan in values["plans"].items()}
         named = {name: values[name] for name in ("kind", "status", "reason", "seed", "result", "timing")}
+        named |= {name: values.get(name, "") for name in ("controller", "phantom")}
         return RunFile(path.parent, scenario=Scenario.from_values(values["scenario"]), plans=plans, **named)
     except ScenarioError as error:
         raise InputError(f"{path}: damaged: {error.problems[0]}") from None

@@ -2,9 +2,13 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from flexneedle.control.methods import DEFAULT, method
+from flexneedle.errors import InputError
+from flexneedle.phantom import DEFAULT_PLANT, PLANTS
 from flexneedle.run.figures import draw_run
 from flexneedle.run.folder import TRACE_FILE, Folder, versions
 from flexneedle.run.results import insertion_result, insertion_timing, plan_result, plan_timing
@@ -12,11 +16,31 @@ from flexneedle.scenario import Scenario
 from flexneedle.trace import Insertion, Period, PlanRecord
 from flexneedle.trace.writer import TraceWriter
 
-__all__ = ["OnIteration", "OnPeriod", "record_insertion", "record_plans"]
+__all__ = ["Choices", "OnIteration", "OnPeriod", "record_insertion", "record_plans"]
 
 OnIteration = Callable[[str, dict[str, Any]], None]
 """Hears of each iteration of the planner: the strategy, and what `plan` tells."""
 OnPeriod = Callable[[Period], None]
+
+
+@dataclass(frozen=True)
+class Choices:
+    """How to plan and to insert. plan_seed: of the planner, None for `seed`; force: insert whatever the plan misses.
+
+    Raises InputError, with the choices, for a controller or a phantom that there is not.
+    """
+
+    seed: int
+    strategy: str = "manipulation"
+    plan_seed: int | None = None
+    controller: str = DEFAULT
+    phantom: str = DEFAULT_PLANT
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        method(self.controller)
+        if self.phantom not in PLANTS:
+            raise InputError(f"phantom = {self.phantom!r}: must be one of {', '.join(PLANTS)}")
 
 
 def record_plans(
@@ -39,10 +63,8 @@ def record_plans(
 def record_insertion(
     folder: Folder,
     scenario: Scenario,
-    strategy: str,
-    seed: int,
+    choices: Choices,
     *,
-    force: bool,
     on_iteration: OnIteration,
     on_period: OnPeriod,
 ) -> Insertion:
@@ -51,9 +73,11 @@ def record_insertion(
     An insertion that is interrupted (Ctrl-C) comes back with its periods and the outcome "interrupted". An
     error, or an interruption of the planning, is marked in `run.json` and passed on.
     """
+    folder.values |= {"controller": choices.controller, "phantom": choices.phantom}
     with _marked(folder):
-        plan = _plan(folder, scenario, strategy, seed, on_iteration)
-        insertion = _insert(folder, scenario, plan, seed, force, on_period)
+        plan_seed = choices.seed if choices.plan_seed is None else choices.plan_seed
+        plan = _plan(folder, scenario, choices.strategy, plan_seed, on_iteration)
+        insertion = _insert(folder, scenario, plan, choices, on_period)
         folder.values["result"] = insertion_result(insertion)
         folder.timing |= insertion_timing(insertion)
         folder.end(insertion.outcome, insertion.reason)
@@ -74,12 +98,14 @@ def _plan(
 
 
 def _insert(
-    folder: Folder, scenario: Scenario, plan: PlanRecord, seed: int, force: bool, on_period: OnPeriod
+    folder: Folder, scenario: Scenario, plan: PlanRecord, choices: Choices, on_period: OnPeriod
 ) -> Insertion:
     from flexneedle.run.insertion import insert
 
     periods: list[Period] = []
-    about = {"seed": str(seed), "scenario": scenario.name, "strategy": plan.strategy, **versions()}
+    controller, phantom = choices.controller, choices.phantom
+    about = {"seed": str(choices.seed), "scenario": scenario.name, "strategy": plan.strategy}
+    about |= {"controller": controller, "phantom": phantom, **versions()}
     path = folder.path / TRACE_FILE
     with TraceWriter(path, plan, about=about, scenario=scenario.values()) as trace:
 
@@ -88,10 +114,12 @@ def _insert(
             periods.append(period)
             on_period(period)
 
+        options: dict[str, Any] = {"controller": controller, "phantom": phantom, "force": choices.force}
         try:
-            return insert(scenario, plan, seed, force=force, on_period=keep)
+            return insert(scenario, plan, choices.seed, on_period=keep, **options)
         except KeyboardInterrupt:
-            return Insertion(plan, seed, tuple(periods), "interrupted", "stopped by the user")
+            ending = "interrupted", "stopped by the user", controller, phantom
+            return Insertion(plan, choices.seed, tuple(periods), *ending)
 
 
 @contextmanager

@@ -39,6 +39,8 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
     plan, last = insertion.plan, insertion.periods[-1] if insertion.periods else None
     result: dict[str, Any] = plain(
         {
+            "controller": insertion.controller,
+            "phantom": insertion.phantom or None,
             "target_mm": insertion.target,
             "tip_true_mm": last.true_tip[:2] if last and last.true_tip else None,
             "tip_measured_mm": _measured_tip(insertion),

@@ -260,6 +260,15 @@ def test_each_imperfection_is_changed_alone():
     assert all(after == 2 * before for before, after in changed.values())
 
 
+def test_no_imperfection_makes_readings_so_late_that_all_are_refused():
+    study = load_study("imperfections")
+    for case in study.definition["cases"]:
+        scenario = settings(study, case)
+        period = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
+        late = scenario.phantom.delay_periods * period
+        assert late + 2 * scenario.tracker.period < scenario.control.stale_after_s
+
+
 def test_the_tip_starts_as_far_ahead_of_the_guide_at_every_distance():
     setups = [point.scenario.setup for point in load_study("guide-distance").points]
     assert {setup.guide_to_skin_mm - setup.tip_to_skin_mm for setup in setups} == {12.5}

@@ -1,6 +1,7 @@
 """Studies on real worker processes: the same tables for any number of them and any interruption."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -8,6 +9,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import contextmanager
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -307,6 +309,28 @@ def test_the_summary_agrees_with_the_table(quick, uninterrupted):
     assert sum(group["insertions"] for group in summary["groups"]) == SIZE
     last = [row["true_error_mm"] for row in table if row["case"] == "bias" and row["plant"] == "model"]
     assert summary["groups"][-1]["true_error_mm"]["max"] == max(last)
+
+
+def test_the_summary_is_over_what_finished_and_counts_the_rest(quick, uninterrupted, tmp_path):
+    table = pq.read_table(uninterrupted / "runs.parquet")
+    changed = table.to_pylist()
+    changed[0] |= {
+        "outcome": "held",
+        "true_error_mm": 50.0,
+        "flips": 90,
+        "periods": 1,
+        "unconverged_periods": 3,
+    }
+    pq.write_table(pa.Table.from_pylist(changed, schema=table.schema), tmp_path / "runs.parquet")
+    shutil.copy(uninterrupted / "timing.parquet", tmp_path)
+    summary = summarise(tmp_path, load_study(quick))
+    assert (summary["insertions"], summary["outcomes"]) == (SIZE, {"done": SIZE - 1, "held": 1})
+    rest = changed[1:]
+    assert summary["true_error_mm"]["mean"] == pytest.approx(
+        sum(r["true_error_mm"] for r in rest) / (SIZE - 1)
+    )
+    assert summary["flips"] == pytest.approx(sum(row["flips"] for row in rest) / (SIZE - 1))
+    assert summary["unconverged_periods"] == 3
 
 
 def test_a_plan_counts_once_in_the_time(quick, uninterrupted):

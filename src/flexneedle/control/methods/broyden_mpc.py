@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Decision, Method, Task, travel_left
+from flexneedle.control.mpc import planned_base
 from flexneedle.control.observer import Beliefs
 from flexneedle.errors import InputError
 from flexneedle.scenario import Setup
@@ -57,8 +58,9 @@ def decide(
     learnt = remember(learnt, float(state.tip[0]), inputs)
     left = travel_left(scenario, task.plan, state)
     advance = min(setup.max_advance_mm, left)
+    db_y, db_theta = planned_base(setup, task.plan, state, state.tip[:1] + advance)[0].tolist()
     if estimate.measured is None or left <= 0.0:
-        return Decision((advance, 0.0, 0.0, 0.0, -1), "no reading yet"), learnt
+        return Decision((advance, db_y, db_theta, 0.0, -1), "no reading yet"), learnt
     tip = np.array(estimate.measured)
     then = inputs_at(learnt, float(tip[0]))
     learnt = learn(learnt, tip, then, settings.update_gain)
@@ -67,7 +69,7 @@ def decide(
     moves, cost = guide_moves(settings, setup, task.plan, learnt.jacobian, tip, ahead, state.guide)
     slope, effect = learnt.jacobian[1].tolist()
     why = f"bevel kept: never turned; tip moves {slope:.3f} aside with insertion, {effect:.3f} with the guide"
-    return Decision((advance, 0.0, 0.0, float(moves[0]), -1), why, cost), learnt
+    return Decision((advance, db_y, db_theta, float(moves[0]), -1), why, cost), learnt
 
 
 def remember(learnt: Learnt, x: float, inputs: Floats) -> Learnt:

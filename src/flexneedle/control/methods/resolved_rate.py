@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Decision, Method, Task, travel_left
 from flexneedle.control.methods.bevel_only import turn
+from flexneedle.control.mpc import planned_base
 from flexneedle.control.observer import Beliefs
 from flexneedle.errors import InputError
 from flexneedle.scenario import Setup
@@ -49,13 +50,14 @@ def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generat
     wanted = float(controls[0, 3]) + settings.gain * damped_inverse(jacobian, settings.damping) * off
     step = max(-setup.max_guide_step_mm, min(setup.max_guide_step_mm, wanted))
     guide = max(-setup.max_guide_travel_mm, min(setup.max_guide_travel_mm, state.guide + step))
-    command = (float(controls[0, 0]), 0.0, 0.0, guide - state.guide, 1 if flip else -1)
+    db_x, db_y, db_theta = controls[0, :3].tolist()
+    command = (db_x, db_y, db_theta, guide - state.guide, 1 if flip else -1)
     why = f"{why}; tip off by {-off:.3f} mm ahead, moves {jacobian:.3f} with the guide"
     return Decision(command, why), memory
 
 
 def nominal(setup: Setup, plan: PlanRecord, state: State, way: float, margin: float, *, flip: bool) -> Floats:
-    """Controls (n, 5) that insert by `way` (mm) with the guide as planned, `margin` (mm) inside its limits."""
+    """Controls (n, 5) that insert by `way` (mm) as planned, the guide `margin` (mm) inside its limits."""
     count = max(1, math.ceil(way / setup.max_advance_mm - 1e-9))
     ends = np.minimum(setup.max_advance_mm * np.arange(1, count + 1), way)
     depth = float(state.tip[0]) + np.append(0.0, ends)
@@ -64,6 +66,7 @@ def nominal(setup: Setup, plan: PlanRecord, state: State, way: float, margin: fl
     guide = np.clip(state.guide + np.cumsum(np.clip(steps, -limit, limit)), -reach, reach)
     controls = np.zeros((count, 5))
     controls[:, 0] = np.diff(ends, prepend=0.0)
+    controls[:, 1:3] = planned_base(setup, plan, state, depth[1:])
     controls[:, 3] = np.diff(guide, prepend=state.guide)
     controls[:, 4] = -1.0
     controls[0, 4] = 1.0 if flip else -1.0

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isnan
+from math import floor, inf, isnan, log10
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -15,6 +15,7 @@ from flexneedle.plot.style import INK, QUIET, signed, styled
 __all__ = ["DifferencePanel", "DifferenceRow", "difference_figure"]
 
 _ROW = 0.3  # inches
+_WIDE = 10.0  # times what lies evenly around zero: from there on, decades
 
 
 @dataclass(frozen=True)
@@ -80,14 +81,37 @@ def _share(made: Panels, shown: Sequence[DifferencePanel], label: str) -> None:
     rows = [row for panel in shown for row in panel.rows]
     known = [v for row in rows for v in (row.mean, row.low, row.high) if not isnan(v)] or [0.0]
     low, high = min(0.0, *known), max(0.0, *known)
-    pad = 0.06 * (high - low) or 0.05
+    even = _even(rows)
     for ax in made.axes:
-        ax.set_xlim(low - pad, high + pad)
-        ax.locator_params(axis="x", nbins=9 if made.columns == 1 else 5)
+        if max(high, -low) > _WIDE * even:
+            _over_decades(ax, low, high, even, 9 if made.columns == 1 else 5)
+        else:
+            pad = 0.06 * (high - low) or 0.05
+            ax.set_xlim(low - pad, high + pad)
+            ax.locator_params(axis="x", nbins=9 if made.columns == 1 else 5)
         ax.xaxis.set_major_formatter(lambda value, _: signed(round(value, 9)))
         ax.tick_params(labelleft=ax in made.leftmost, labelbottom=ax in made.lowest)
     for ax in made.lowest:
         ax.set_xlabel(label, labelpad=1.0)
+
+
+def _even(rows: Sequence[DifferenceRow]) -> float:
+    """Return how far around zero the scale must be even: over the intervals that hold zero, or to the nearest end."""
+    known = [(abs(row.low), abs(row.high), row.low <= 0.0 <= row.high) for row in rows if not isnan(row.low)]
+    holding = [max(low, high) for low, high, holds in known if holds]
+    nearest = [min(low, high) for low, high, _ in known]
+    return max(holding) if holding else min(nearest, default=inf)
+
+
+def _over_decades(ax: Axes, low: float, high: float, even: float, most: int) -> None:
+    """Make the scale even within ±`even` around zero, and logarithmic beyond."""
+    ax.set_xscale("symlog", linthresh=even)
+    ax.set_xlim(min(1.3 * low, -1.3 * even), max(1.3 * high, 1.3 * even))
+    sizes = [float(f"{digit}e{k}") for k in range(floor(log10(even)) - 1, 4) for digit in (1, 3)]
+    beyond = [sign * size for size in sizes if size > 0.3 * even for sign in (-1.0, 1.0)]
+    inside = sorted([0.0, *(value for value in beyond if low <= value <= high)])
+    ax.set_xticks(inside if len(inside) <= most else [v for v in inside if f"{abs(v):e}"[0] in "01"])
+    ax.set_xticks([], minor=True)
 
 
 def _handles() -> list[Line2D]:

@@ -39,7 +39,7 @@ def scenario_of(rows: Rows, row: int) -> Scenario | None:
     settings = {
         name: value
         for name in rows.columns
-        if name.split(".")[0] in _SECTIONS
+        if "." in name and name.split(".")[0] in _SECTIONS
         for value in (rows.value(name, row),)
         if value is not None
     }

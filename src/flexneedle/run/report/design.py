@@ -125,7 +125,7 @@ def _changing_together(rows: Rows, keys: Sequence[str]) -> list[list[str]]:
 
 def _axis(rows: Rows, keys: Sequence[str], declared: set[str]) -> Factor:
     """Return the axis of keys that change together, along the one that says most."""
-    key = min(keys, key=lambda key: (key not in declared, key == _GAUGE, not _is_numeric(rows, key)))
+    key = min(keys, key=lambda key: (key not in declared, key != _GAUGE, not _is_numeric(rows, key)))
     return _along(rows, key, tuple(other for other in keys if other != key))
 
 

@@ -13,11 +13,10 @@ from flexneedle.plot import studies as plots
 from flexneedle.run.report.design import Design, Factor
 from flexneedle.run.report.rows import Codes, Flags, Floats, Rows
 from flexneedle.run.report.statistics import Estimate
-from flexneedle.run.report.summary import Difference, finished
+from flexneedle.run.report.summary import Difference, depth_levels, finished
 
 __all__ = ["Drawn", "draw_figures"]
 
-_MOST_DEPTHS, _DEPTH_BANDS = 8, 5
 _MOST_ROWS = 40  # levels of names that are still an axis
 
 
@@ -91,7 +90,7 @@ def _sheets(facts: _Facts, against: Sequence[Difference], cases: Sequence[Differ
         return
     if facts.design.controller.varies:
         yield _by_controller(facts)
-    depth = _depth_levels(facts.rows)
+    depth = depth_levels(facts.rows)
     if len(depth[1]) > 1 or not facts.design.controller.varies:
         yield _by_depth(facts, *depth)
     for number, axis in enumerate(facts.design.axes):
@@ -218,7 +217,8 @@ def _against(facts: _Facts, differences: Sequence[Difference]) -> _Sheet:
     return _Sheet(
         "controllers",
         f"{ours} against the other controllers",
-        f"Mean paired difference of the true error: {ours} minus the other, on the same phantoms and targets.",
+        f"Mean paired difference of the true error: {ours} minus the other, on the same phantoms and targets. "
+        "Where differences are far from each other in size, the scale is even around zero and logarithmic beyond.",
         "Mean differences with their intervals: " + _told(rows) + ".",
         lambda: plots.difference_figure([panel], "difference of the true error (mm)"),
     )
@@ -253,7 +253,7 @@ def _energy(facts: _Facts) -> _Sheet:
     for k, name in facts.controllers:
         own = facts.of(k) & facts.known & (energy > 0)
         note = (
-            f"medians {np.median(energy[own]):.2f} mJ, {np.median(facts.error[own]):.3f} mm"
+            f"medians {np.median(energy[own]):.2g} mJ, {np.median(facts.error[own]):.3f} mm"
             if own.any()
             else ""
         )
@@ -271,18 +271,6 @@ def _energy(facts: _Facts) -> _Sheet:
 
 def _tips(facts: _Facts) -> Floats:
     return np.stack([facts.rows.number("tip_x_mm"), facts.rows.number("tip_y_mm")], axis=1)
-
-
-def _depth_levels(rows: Rows) -> tuple[Codes, list[str]]:
-    """Return the depth of each row's target as a level, and the names; many depths are put into bands."""
-    depth = rows.number("target_depth_mm")
-    levels, codes = np.unique(depth, return_inverse=True)
-    if len(levels) <= _MOST_DEPTHS:
-        return codes, [f"{level:g}" for level in levels.tolist()]
-    edges = np.linspace(levels[0], levels[-1], _DEPTH_BANDS + 1)
-    band = np.searchsorted(edges[1:-1], depth, side="right")
-    used, dense = np.unique(band, return_inverse=True)
-    return dense, [f"{edges[k]:.3g} to {edges[k + 1]:.3g}" for k in used.tolist()]
 
 
 def _note(facts: _Facts, own: Flags) -> str:

@@ -14,6 +14,7 @@ from flexneedle.run.report.summary import (
     Group,
     case_differences,
     controller_differences,
+    differences_by_depth,
     endings,
     groups_of,
     worst,
@@ -33,6 +34,7 @@ class Findings:
     design: Design
     groups: Sequence[Group]
     against: Sequence[Difference]
+    against_by_depth: Mapping[str, Sequence[Difference]]
     cases: Sequence[Difference]
     endings: Sequence[Ending]
     worst: Sequence[int]
@@ -53,6 +55,7 @@ def findings_of(study: StudyRecord) -> Findings:
         design,
         groups_of(rows, design),
         controller_differences(rows, design) if design.controller.varies else [],
+        differences_by_depth(rows, design) if design.controller.varies else {},
         case_differences(rows, design) if design.cases.varies else [],
         endings(rows)[:_MOST_KINDS],
         worst(rows),

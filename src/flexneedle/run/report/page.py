@@ -1,7 +1,7 @@
 """The page of a report: sections of safe HTML, made from findings."""
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from math import isnan
 
@@ -28,7 +28,7 @@ def page_text(
         _opening(findings, title),
         _figures(figures),
         tables.groups(findings),
-        tables.controllers(findings.against),
+        tables.controllers(findings),
         tables.cases(findings),
         tables.endings(findings, again),
         tables.worst(findings, again),
@@ -60,9 +60,7 @@ def _opening(findings: Findings, title: str) -> Html:
         element("p", f"{len(rows)} insertions, {done} finished" + _unfinished(len(rows) - done) + "."),
         _unconverged(sum(group.unconverged for group in findings.groups)),
         _key_figures(findings.groups[0]) if findings.groups else None,
-        element("ul", *(element("li", _sentence(d)) for d in findings.against), class_="verdicts")
-        if findings.against
-        else None,
+        _standing(findings.against) if findings.against else None,
     )
 
 
@@ -84,11 +82,7 @@ def _key_figures(group: Group) -> Html:
         ("95 % below", mm(found["p95_mm"].value), interval(found["p95_mm"], " mm")),
         ("largest", mm(group.largest_mm), _beyond(group)),
         ("finished", f"{group.finished} of {group.count}", f"{group.missed} more than {HIT_MM:g} mm off"),
-        (
-            "tissue energy / plan's",
-            number(found["energy_ratio"].value, 2),
-            interval(found["energy_ratio"], "", 2),
-        ),
+        *_effort(group),
     )
     boxes = (
         element("div", element("dt", name), element("dd", value, element("small", below)))
@@ -97,10 +91,59 @@ def _key_figures(group: Group) -> Html:
     return joined((element("p", group.name, class_="quiet"), element("dl", *boxes, class_="key")))
 
 
+def _effort(group: Group) -> tuple[tuple[str, str, str], ...]:
+    """Return what the insertions took, beside what the plans said."""
+    found = group.estimates
+    return (
+        (
+            "bevel turns",
+            number(found["flips"].value, 2),
+            f"plan's {number(found['planned_flips'].value, 2)}",
+        ),
+        (
+            "tissue energy / plan's",
+            number(found["energy_ratio"].value, 2),
+            interval(found["energy_ratio"], "", 2),
+        ),
+        (
+            "periods / plan's",
+            number(found["period_ratio"].value, 2),
+            f"largest {number(group.largest_period_ratio, 2)}",
+        ),
+        ("periods not converged", str(group.unconverged_periods), f"in {group.unconverged} insertions"),
+    )
+
+
 def _beyond(group: Group) -> str:
     if isnan(group.beyond_largest):
         return ""
     return f"at most {100 * group.beyond_largest:.2g} % of all lie beyond"
+
+
+def _standing(against: Sequence[Difference]) -> Html:
+    """Say where the first controller stands among the others, then against each."""
+    ours, better = against[0].name, [d for d in against if d.verdict == "better"]
+    told = (
+        f"{ours} is better than every other controller in mean true error."
+        if len(better) == len(against)
+        else f"{ours} is better than {len(better)} of {len(against)} other controllers in mean true error; "
+        + "; ".join(_rest(against))
+        + "."
+    )
+    each = element("ul", *(element("li", _sentence(d)) for d in against), class_="verdicts")
+    return joined((element("p", element("strong", told)), each))
+
+
+def _rest(against: Sequence[Difference]) -> Iterator[str]:
+    """Yield those that the first controller is not better than."""
+    for verdict, words in (
+        ("not separable", "not separable from"),
+        ("worse", "worse than"),
+        (None, "not compared with"),
+    ):
+        names = [d.against for d in against if d.verdict == verdict]
+        if names:
+            yield f"{words} {', '.join(names)}"
 
 
 def _sentence(difference: Difference) -> Html:

@@ -49,6 +49,10 @@ class Report:
             },
             "groups": [asdict(group) for group in found.groups],
             "controllers": [asdict(difference) for difference in found.against],
+            "controllers_by_depth": {
+                depth: [asdict(difference) for difference in differences]
+                for depth, differences in found.against_by_depth.items()
+            },
             "cases": [asdict(difference) for difference in found.cases],
             "endings": [asdict(ending) for ending in found.endings],
             "worst": [

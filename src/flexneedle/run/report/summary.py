@@ -28,6 +28,8 @@ __all__ = [
     "Group",
     "case_differences",
     "controller_differences",
+    "depth_levels",
+    "differences_by_depth",
     "endings",
     "finished",
     "groups_of",
@@ -35,6 +37,7 @@ __all__ = [
 ]
 
 DONE = "done"
+_MOST_DEPTHS, _DEPTH_BANDS = 8, 5
 HIT_MM = 1.0  # radius of the paper's target circles
 _NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
@@ -45,7 +48,8 @@ class Group:
 
     name: its levels as one line; levels: name of the level by factor; count, finished: insertions; known: finished
     ones whose true error is known; missed: of those, ended more than 1 mm from the target; unconverged: insertions
-    with a period that did not converge, finished or not; seeds: different ones; largest_mm: of the true errors;
+    with a period that did not converge, finished or not, and how many such periods; seeds: different ones;
+    largest_mm: of the true errors; largest_period_ratio: of the periods over the plan's;
     beyond_largest: share of all insertions that may lie beyond it, with 95 % confidence; estimates: by name, over
     the finished.
     """
@@ -57,6 +61,7 @@ class Group:
     known: int
     missed: int
     unconverged: int
+    unconverged_periods: int
     seeds: int
     largest_mm: float
     largest_period_ratio: float
@@ -116,6 +121,7 @@ def _group(rows: Rows, members: Codes, done: Flags, name: str, levels: dict[str,
     error = rows.number("true_error_mm")[ended]
     known = error[~np.isnan(error)]
     seeds = seed_codes(rows)[ended]
+    unconverged = np.nan_to_num(rows.number("unconverged_periods")[members])
     ratios = _quotient(rows.number("periods")[ended], rows.number("planned_periods")[ended])
     return Group(
         name=name,
@@ -124,7 +130,8 @@ def _group(rows: Rows, members: Codes, done: Flags, name: str, levels: dict[str,
         finished=len(ended),
         known=len(known),
         missed=int((known > HIT_MM).sum()),
-        unconverged=int((rows.number("unconverged_periods")[members] > 0).sum()),
+        unconverged=int((unconverged > 0).sum()),
+        unconverged_periods=int(unconverged.sum()),
         seeds=len(np.unique(seeds)),
         largest_mm=_largest(known),
         largest_period_ratio=_largest(ratios[~np.isnan(ratios)]),
@@ -158,11 +165,36 @@ def _estimates(rows: Rows, ended: Codes, seeds: Codes) -> dict[str, Estimate]:
 
 def controller_differences(rows: Rows, design: Design) -> list[Difference]:
     """Return the first controller against each other one, in insertions of the same seed, target and settings."""
+    everywhere = np.ones(len(rows), dtype=bool)
+    return _against_first(rows, design, everywhere)
+
+
+def differences_by_depth(rows: Rows, design: Design) -> dict[str, list[Difference]]:
+    """Return the same at each depth of the target, by the name of the depth."""
+    codes, names = depth_levels(rows)
+    return {name: _against_first(rows, design, codes == k) for k, name in enumerate(names)}
+
+
+def depth_levels(rows: Rows) -> tuple[Codes, list[str]]:
+    """Return the depth of each row's target as a level, and the names; many depths are put into bands."""
+    depth = rows.number("target_depth_mm")
+    levels, codes = np.unique(depth, return_inverse=True)
+    if len(levels) <= _MOST_DEPTHS:
+        return codes, [f"{level:g}" for level in levels.tolist()]
+    edges = np.linspace(levels[0], levels[-1], _DEPTH_BANDS + 1)
+    band = np.searchsorted(edges[1:-1], depth, side="right")
+    used, dense = np.unique(band, return_inverse=True)
+    return dense, [f"{edges[k]:.3g} to {edges[k + 1]:.3g}" for k in used.tolist()]
+
+
+def _against_first(rows: Rows, design: Design, among: Flags) -> list[Difference]:
     ours, *others = range(len(design.controller.names))
     keys = _pair_keys(rows, [factor.exact for factor in (design.cases, *design.axes, *design.others)])
     codes, names = design.controller.codes, design.controller.names
     return [
-        _difference(rows, keys, (codes == ours, codes == other), (names[ours], names[other], ""))
+        _difference(
+            rows, keys, (among & (codes == ours), among & (codes == other)), (names[ours], names[other], "")
+        )
         for other in others
     ]
 

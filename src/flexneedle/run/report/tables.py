@@ -1,6 +1,6 @@
 """The sections with tables: groups, paired differences, endings, the worst."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from flexneedle.run.report.findings import Findings
 from flexneedle.run.report.html import Html, element, joined, table
@@ -62,8 +62,9 @@ def _with(text: str, estimate: Estimate, digits: int = 3) -> Html:
     return joined((text, element("small", interval(estimate, "", digits))))
 
 
-def controllers(differences: Sequence[Difference]) -> Html | None:
-    """Return the paired differences of the default controller from each other one."""
+def controllers(findings: Findings) -> Html | None:
+    """Return the paired differences of the default controller from each other one, in all and by depth."""
+    differences = findings.against
     if not differences:
         return None
     ours = differences[0].name
@@ -75,7 +76,24 @@ def controllers(differences: Sequence[Difference]) -> Html | None:
             ("other", *_DIFFERENCE),
             [(d.against, *_difference(d)) for d in differences],
         ),
+        _by_depth(findings, ours) if len(findings.against_by_depth) > 1 else None,
     )
+
+
+def _by_depth(findings: Findings, ours: str) -> Html:
+    depths = findings.against_by_depth
+    rows = zip(*depths.values(), strict=True)
+    return table(
+        f"The same by depth of the target: {ours} minus the other (mm)",
+        ("other", *(f"{depth} mm deep" for depth in depths)),
+        [(row[0].against, *map(_marked, row)) for row in rows],
+    )
+
+
+def _marked(found: Difference) -> Html:
+    """Return a difference in the colour of its verdict."""
+    text = element("span", signed(found.mean_mm.value), class_=(found.verdict or "unknown").split()[0])
+    return joined((text, element("small", interval(found.mean_mm, ""))))
 
 
 def cases(findings: Findings) -> Html | None:
@@ -129,7 +147,7 @@ def endings(findings: Findings, again: Mapping[int, str]) -> Html:
     caption = f"How insertions ended that did not finish, or finished (“{DONE}”) with a remark"
     return element(
         "section",
-        element("h2", "Not finished"),
+        element("h2", "Endings"),
         element("p", told),
         table(caption, heads, listed) if listed else None,
     )

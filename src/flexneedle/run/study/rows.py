@@ -10,17 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import RunError
-from flexneedle.phantom import PLANTS, Phantom, Truth
 from flexneedle.run.folder import versions
 from flexneedle.run.insertion import insert
+from flexneedle.run.kernels import compile_kernels
 from flexneedle.run.planner import plan
 from flexneedle.run.study.grid import Point
-from flexneedle.scenario import load_scenario
-from flexneedle.simulator import Simulator
 from flexneedle.trace import Insertion, PlanRecord
 from flexneedle.trace.plain import plain, plan_values
 
-__all__ = ["RESULTS", "TIMES", "Done", "Job", "Planned", "carry_out", "compile_kernels", "make_plan"]
+__all__ = ["RESULTS", "TIMES", "Done", "Job", "Planned", "carry_out", "make_plan"]
 
 RESULTS = {
     "true_error_mm": float,
@@ -70,14 +68,6 @@ class Done:
 
     rows: list[dict[str, Any]]
     versions: dict[str, str]
-
-
-def compile_kernels() -> None:
-    """Compile the kernels of model and plants, or load them from the cache."""
-    scenario = load_scenario("phantom")  # kernels are the same for every scenario
-    Simulator(scenario, threads=1).compile()
-    for kind in PLANTS:
-        Phantom(Truth(scenario), 1, kind).apply((0.0, 0.0, 0.0, 0.0, -1), 0.0)
 
 
 def make_plan(point: Point) -> Planned:

@@ -12,12 +12,13 @@ from typing import Any
 
 from flexneedle.errors import InputError, RunError
 from flexneedle.run.folder import versions
+from flexneedle.run.kernels import compile_kernels
 from flexneedle.run.study import pools
 from flexneedle.run.study.folder import PLANS_FOLDER, free_folder, open_folder
 from flexneedle.run.study.grid import Point, Study, load_study
 from flexneedle.run.study.journal import Journal
 from flexneedle.run.study.plans import Plans, plan_key
-from flexneedle.run.study.rows import Done, Job, Planned, carry_out, compile_kernels, make_plan
+from flexneedle.run.study.rows import Done, Job, Planned, carry_out, make_plan
 from flexneedle.run.study.tables import write_tables
 
 __all__ = ["Advance", "run_study"]

@@ -21,7 +21,8 @@ _Row = Mapping[str, Any]
 def summarise(folder: Path, study: Study) -> dict[str, Any]:
     """Return outcomes, errors (mm), bevel turns, energy (mJ), periods and times (s) of a study's folder, plain.
 
-    Statistics are over the insertions whose value is known. Groups are the cases with all that the axes vary,
+    Statistics are over the insertions that finished and whose value is known, as in the report; unconverged periods
+    are those of all. Groups are the cases with all that the axes vary,
     but for targets and seeds; without any of them there is none.
     """
     wanted = ["index", "outcome", "true_error_mm", "residual_mm", "flips", "planned_flips", _ENERGY]
@@ -60,10 +61,11 @@ def _hashable(value: Any) -> Any:
     return tuple(map(_hashable, value)) if isinstance(value, list) else value
 
 
-def _statistics(rows: Sequence[_Row]) -> dict[str, Any]:
+def _statistics(members: Sequence[_Row]) -> dict[str, Any]:
+    rows = [row for row in members if row["outcome"] == "done"]
     return {
-        "insertions": len(rows),
-        "outcomes": dict(Counter(row["outcome"] for row in rows).most_common()),
+        "insertions": len(members),
+        "outcomes": dict(Counter(row["outcome"] for row in members).most_common()),
         "true_error_mm": _spread([row["true_error_mm"] for row in rows]),
         "residual_mm": _spread([row["residual_mm"] for row in rows]),
         "flips": _mean(rows, "flips"),
@@ -72,13 +74,12 @@ def _statistics(rows: Sequence[_Row]) -> dict[str, Any]:
         "planned_strain_energy_mj": _mean(rows, _PLANNED_ENERGY),
         "energy_ratio": _mean(rows, _ENERGY) / _mean(rows, _PLANNED_ENERGY),
         "period_ratio": _spread([_ratio(row["periods"], row["planned_periods"]) for row in rows]),
-        "unconverged_periods": sum(row["unconverged_periods"] or 0 for row in rows),
+        "unconverged_periods": sum(row["unconverged_periods"] or 0 for row in members),
     }
 
 
 def _mean(rows: Sequence[_Row], name: str) -> float:
-    """Mean over the rows that were carried out, of which the planned values are those to compare with."""
-    values = [row[name] for row in rows if row["periods"] is not None and row[name] is not None]
+    values = [row[name] for row in rows if row[name] is not None]
     return float(np.mean(values)) if values else float("nan")
 
 

@@ -1,0 +1,439 @@
+"""What the exact plant is held against: writes docs/validation.md and its pictures.
+
+    python studies/validation.py [--out DIR]
+
+The problems are those of the tests (tests/reference/validation.py), which assert what is written down here. Needs scipy
+for the closed forms; about a minute on one core. Same bytes at every run.
+"""
+
+import argparse
+import sys
+import textwrap
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+
+from flexneedle.plot import style  # noqa: E402
+from reference import closed_forms, elastica  # noqa: E402
+from reference import validation as problems  # noqa: E402
+from reference.cases import EI, FOUNDATION  # noqa: E402
+
+COMMAND = "*`python studies/validation.py`, or `make validation`*"
+COLOURS = (style.ESTIMATE, style.TRUE, style.TARGET, style.MEASURED)
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+MARKS = ("o", "s", "^", "D")
+
+
+# --- the document
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Markdown; the first column is text, the others are numbers."""
+    lines = [head, ("---", *["---:"] * (len(head) - 1)), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def small(value: float) -> str:
+    """Two digits, and a power of ten below a thousandth."""
+    if abs(value) >= 1e-3:
+        return style.signed(value, ".2g")
+    mantissa, exponent = f"{value:.1e}".split("e")
+    return f"{mantissa}e{int(exponent)}".replace("-", "−")
+
+
+def power(sizes: Sequence[float] | np.ndarray, errors: Sequence[float] | np.ndarray) -> str:
+    """The fitted order."""
+    return f"{problems.order(sizes, errors):.2f}"
+
+
+def document(found: problems.Found) -> str:
+    """docs/validation.md."""
+    parts = [
+        "# Validation of the exact plant",
+        INTRODUCTION,
+        summary(found),
+        COMMAND,
+        *needle(found),
+        *model(found),
+        *bevel(found),
+        *energy(found),
+        *solver(found),
+        *refinement(found),
+        "## What this does not show",
+        LIMITS,
+    ]
+    return "\n\n".join(wrapped(part) for part in parts) + "\n"
+
+
+def wrapped(text: str) -> str:
+    """Prose in lines of 120 characters; headings, tables and pictures as they are."""
+    if text.startswith(("#", "|", "!", "*")):
+        return text
+    return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
+
+
+INTRODUCTION = (
+    "The needle in the virtual phantom (`--phantom exact`, [theory.md](theory.md) section 11) against closed forms, a"
+    " second solver and the controller's model. A script computes every figure here and draws the pictures; the tests"
+    " assert them (`pytest tests/phantom`). That a plant solves its equations says nothing about tissue."
+)
+LIMITS = (
+    "The exact plant shares the tissue's law (1), springs across the needle and the rule of the bevel's rest point with"
+    " the controller's model, so no figure here judges those: only an experiment can. What differs are kinematics,"
+    " mesh, place and direction of the tissue's forces, imperfections and the whole solver."
+)
+
+
+def summary(found: problems.Found) -> str:
+    """What one wants to know first."""
+    finest = {load: errors[-1] for load, errors in found.cantilever.items()}
+    rows = [
+        (
+            f"cantilever, PL²/EI = {load:g}: tip deflection over L",
+            f"{problems.LOADS[load]:.4f}",
+            f"{elastica.cantilever(load)[1] + errors[1]:.4f}",
+        )
+        for load, errors in finest.items()
+    ]
+    last = found.gaps[1][0.125][problems.CUBIC]
+    worst = max(abs(errors[-1]) for errors in found.curvature.values())
+    moved = max(abs(done / stored - 1.0) for done, stored in found.moves.values())
+    rows += [
+        (
+            "its order in the length of a segment",
+            "2",
+            power(1.0 / problems.SEGMENTS, found.cantilever[5.0][:, 1]),
+        ),
+        ("buckling load over Euler's", "1", f"{found.buckling:.5f}"),
+        (
+            "difference from the controller's model, order in the angle",
+            "3",
+            power([gap.angle for gap in last], [gap.aside for gap in last]),
+        ),
+        ("steady bevel curvature, relative error", "0", small(worst)),
+        ("work without cutting over stored energy, less 1", "0", small(moved)),
+        ("insertion: share of the work neither stored nor dissipated", "0", small(abs(lost(found)))),
+        ("second solver: largest distance of the tips aside (mm)", "0", small(found.second[-1, 1])),
+    ]
+    return table(("check", "expected", "found"), rows)
+
+
+def lost(found: problems.Found) -> float:
+    """Of the work on an insertion with friction and the finest step."""
+    return found.balances[5.0][-1].gap
+
+
+def needle(found: problems.Found) -> list[str]:
+    """Section on the rod alone."""
+    rows = []
+    for load, errors in found.cantilever.items():
+        expected, orders = (
+            elastica.cantilever(load),
+            [power(1.0 / problems.SEGMENTS, column) for column in errors.T],
+        )
+        rows.append(
+            (
+                f"{load:g}",
+                f"{problems.LOADS[load]:.4f}",
+                f"{expected[1]:.6f}",
+                f"{expected[1] + errors[-1, 1]:.6f}",
+                *(small(value) for value in np.abs(errors[-1])),
+                ", ".join(orders),
+            )
+        )
+    head = ("PL²/EI", "table, y/L", "elastica, y/L", f"plant, {problems.SEGMENTS[-1]} segments")
+    return [
+        "## The needle alone",
+        "A cantilever under a dead load P across its end, against the elastica by elliptic integrals (Bisshopp and"
+        " Drucker 1945) and the tables' four digits. The discrete rod is of second order.",
+        table((*head, "error x/L", "error y/L", "error θ (rad)", "orders x, y, θ"), rows),
+        "![Bent cantilevers on the tips of the elastica, and the error over the number of segments]"
+        "(images/validation-needle.png)",
+        COMMAND,
+        f"A straight column of 64 segments stands up to {found.buckling:.5f} times Euler's load π²EI/4L².",
+    ]
+
+
+def model(found: problems.Found) -> list[str]:
+    """Section on the controller's model."""
+    one, two = found.gaps[1], found.gaps[2][0.125]
+    rows = [
+        (
+            f"{fine.angle:.4f}",
+            *(small(one[h][k].aside) for h in problems.MESHES),
+            small(fine.energy),
+            f"{two[k].angle:.4f}",
+            small(two[k].aside),
+        )
+        for k, fine in enumerate(one[0.125])
+    ]
+    last = one[0.125][problems.CUBIC]
+    slope = power([gap.angle for gap in last], [gap.aside for gap in last])
+    meshes = [f"apart (mm), segments of {h:g} mm" for h in problems.MESHES]
+    return [
+        "## The controller's model at small angles",
+        "The same insertion to 44.5 mm with guide motion and a flip in both formulations, bevel offset and guide motion"
+        " scaled together: the largest distance of the two tips on the way, by the largest slope of the tip. Contact"
+        " points are as far apart as segments are long, steps half as long. Mirrored commands give the mirror image, so"
+        " what finite rotations change begins with the third power of the angle.",
+        f"Found with the finest mesh and one layer, from {last[-1].angle:.3f} to {last[0].angle:.3f} rad: the power"
+        f" {slope}. At smaller angles the error of the mesh is left, in proportion to the angle; at larger ones higher"
+        " powers follow. With two layers the same, less smoothly: single contact points lie in another layer than the"
+        " model's. The guide does not give here, as the model's (1e5 N/mm in place of the phantom's 1e3).",
+        table(
+            (
+                "slope (rad), one layer",
+                *meshes,
+                "tissue energy, relative",
+                "slope, two layers",
+                "apart, 0.125 mm",
+            ),
+            rows,
+        ),
+        "![Distance of the two formulations over the angle, with the third power](images/validation-model.png)",
+        COMMAND,
+    ]
+
+
+def bevel(found: problems.Found) -> list[str]:
+    """Section on steady curvature."""
+    rows = []
+    for length, errors in found.curvature.items():
+        expected = closed_forms.steady_curvature(0.01, length, FOUNDATION, EI)
+        shares = (f"{style.signed(100.0 * error, '+.3f')} %" for error in errors)
+        rows.append((f"{length:g}", f"{expected:.4e}".replace("e-0", "e−"), *shares))
+    return [
+        "## Steady curvature of the bevel",
+        "Far from skin and base at small strain the path is a circle, κ = F/(EIβ) with the spring's force less what the"
+        " slide takes from it ([theory.md](theory.md) eq. 10). Needle 1/β = 10 mm, 250 mm deep, offset 0.01 mm; the"
+        " curvature over the last 60 mm.",
+        table(
+            (
+                "bevel length (mm)",
+                "κ (1/mm)",
+                *(f"error, points and segments of {r:g} mm" for r in problems.RESOLUTIONS),
+            ),
+            rows,
+        ),
+        COMMAND,
+    ]
+
+
+def energy(found: problems.Found) -> list[str]:
+    """Section on energies."""
+    moved = [
+        (name, style.signed(done, ".6f"), style.signed(stored, ".6f"), small(done / stored - 1.0))
+        for name, (done, stored) in found.moves.items()
+    ]
+    rows = [
+        (
+            f"{step:g}",
+            f"{friction:g}",
+            *(f"{style.signed(value, '.5f')}" for value in (b.base, b.guide, b.bevel)),
+            *(f"{value:.5f}" for value in (b.needle, b.tissue + b.spring, b.friction)),
+            small(b.gap),
+        )
+        for friction, balances in found.balances.items()
+        for step, b in zip(problems.STEPS, balances, strict=True)
+    ]
+    gaps = [balance.gap for balance in found.balances[0.0]]
+    return [
+        "## Energy",
+        "Without cutting, nothing is lost: work of base and guide (forces by the trapezoid rule, 40 steps) and the"
+        " change of the stored energy, mJ, of a bent needle 28 mm deep that is moved where it is.",
+        table(("what moves", "work", "stored", "work/stored − 1"), moved),
+        COMMAND,
+        "An insertion to 40 mm with guide motion and a flip: work of base, of guide and of the tissue on the bevel"
+        " (negative where the tip goes against its push), against what is stored in needle, tissue and guide and what"
+        " friction takes along the slide of the needle, mJ. The share of the work that is missing falls with the step,"
+        f" without friction with the power {power(problems.STEPS, gaps)}.",
+        table(
+            (
+                *("step (mm)", "friction (mN/mm)", "base", "guide", "bevel"),
+                *("needle", "tissue and guide", "friction", "missing share"),
+            ),
+            rows,
+        ),
+        COMMAND,
+    ]
+
+
+def solver(found: problems.Found) -> list[str]:
+    """Section on the second solver."""
+    rows = [
+        (f"{h:g}", *(small(value) for value in gaps))
+        for h, gaps in zip(problems.ELEMENTS.tolist(), found.second, strict=True)
+    ]
+    orders = [power(problems.ELEMENTS, column) for column in found.second.T]
+    return [
+        "## A second solver",
+        "`Shooting` in `tests/reference/rods.py` integrates the continuous rod from the tip to the base, forces in"
+        " balance in place of a minimum of energy, and looks for the tip that brings the far end to the clamp. 48 steps"
+        " in all inputs, drawn back in between, two flips, two layers, varying stiffness, start error, bend and guide"
+        " clearance; largest differences of the tip on the way:",
+        table(("segment (mm)", "x (mm)", "y (mm)", "θ (rad)"), [*rows, ("order", *orders)]),
+        "θ is of first order since the last segment has the slope half a segment before the tip and the needle's own"
+        f" bend goes on to its end: {small(found.second[2, 2])} rad with segments of 0.5 mm. With ten times the shipped"
+        f" friction the tips are {small(found.rubbed[0])} mm apart, {small(found.rubbed[1])} mm with half the step:"
+        " friction has the direction that the needle had before the step.",
+        COMMAND,
+    ]
+
+
+def refinement(found: problems.Found) -> list[str]:
+    """Section on element, step and spacing."""
+    key = {"element": "element_mm", "step": "step_mm", "spacing": "contact_spacing_mm"}
+    rows = [
+        (
+            f"`{key[name]}`",
+            f"{size:g}",
+            small(error),
+            "shipped" if size == problems.SHIPPED[name] else "",
+        )
+        for name, errors in found.refined.items()
+        for size, error in zip(problems.SIZES[name].tolist(), errors, strict=False)
+    ]
+    finest = ", ".join(f"{problems.SIZES[name][-1]:g}" for name in problems.SIZES)
+    return [
+        "## Refinement of an insertion",
+        "The tip after 44.5 mm with guide motion and a flip on the paper's phantom without imperfections: distance from"
+        f" the same with {finest} mm for element, step and spacing. Not smooth, since single channel points change"
+        " their segment or layer or are cut a step later.",
+        table(("key of `[phantom]`", "mm", "distance (mm)", ""), rows),
+        f"Orders: element {power(problems.SIZES['element'][:-1], found.refined['element'])}, step"
+        f" {power(problems.SIZES['step'][:-1], found.refined['step'])}, spacing"
+        f" {power(problems.SIZES['spacing'][:-1], found.refined['spacing'])}.",
+        "![Distance from the finest over element, step and spacing; distance from the second solver over the element]"
+        "(images/validation-insertion.png)",
+        COMMAND,
+    ]
+
+
+# --- pictures
+
+
+def draw(found: problems.Found, folder: Path) -> list[Path]:
+    """The three pictures, PNG and SVG."""
+    paths = []
+    for name, draw_one in (("needle", draw_needle), ("model", draw_model), ("insertion", draw_insertion)):
+        with style.styled():
+            figure = style.new_figure(3.3)
+            draw_one(figure, found)
+            paths += style.save(figure, folder, f"validation-{name}")
+    return paths
+
+
+def logarithmic(figure: Any, left: float, title: str, x: str, y: str) -> Any:
+    """Axes for powers."""
+    ax = style.axes(figure, left, 0.3, 3.55, 2.45)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.yaxis.set_major_formatter(lambda value, _: "10" + f"{round(np.log10(value))}".translate(RAISED))
+    ax.set_title(title)
+    ax.set_xlabel(x)
+    ax.set_ylabel(y)
+    return ax
+
+
+def guide_line(ax: Any, x: Sequence[float], start: float, slope: float, label: str) -> None:
+    """A power through (x[0], start)."""
+    ends = np.array([x[0], x[-1]])
+    ax.plot(
+        ends, start * (ends / ends[0]) ** slope, "--", color=style.QUIET, linewidth=1.0, label=label, zorder=1
+    )
+
+
+def series(
+    ax: Any, k: int, x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray, label: str
+) -> None:
+    """One of several lines."""
+    ax.plot(x, y, MARKS[k] + "-", color=COLOURS[k], markersize=3.5, linewidth=1.1, label=label)
+
+
+def draw_needle(figure: Any, found: problems.Found) -> None:
+    """Bent cantilevers, and their errors."""
+    ax = style.axes(figure, 0.6, 0.3, 3.6, 2.45)
+    errors = logarithmic(figure, 5.2, "Error of the tip", "segments", "distance over L")
+    for k, (load, nodes) in enumerate(found.shapes.items()):
+        ax.plot(*nodes.T, color=COLOURS[k], label=f"PL²/EI = {load:g}")
+        ax.plot(*elastica.cantilever(load)[:2], MARKS[k], color=style.INK, markersize=5, fillstyle="none")
+        distance = np.hypot(*found.cantilever[load][:, :2].T)
+        series(errors, k, problems.SEGMENTS, distance, f"PL²/EI = {load:g}")
+    guide_line(errors, problems.SEGMENTS, 2.0 * distance[0], -2.0, "second order")
+    errors.set_xticks(problems.SEGMENTS, [str(n) for n in problems.SEGMENTS])
+    errors.minorticks_off()
+    ax.set_title("Cantilevers; marks: tips of the elastica")
+    ax.set_xlabel("x/L")
+    ax.set_ylabel("y/L")
+    ax.set_aspect("equal", adjustable="box")
+    ax.legend(loc="upper left")
+    errors.legend(loc="lower left")
+
+
+def draw_model(figure: Any, found: problems.Found) -> None:
+    """Distance of the formulations over the angle, one layer and two."""
+    for panel, (layers, title) in enumerate({1: "Exact plant and model, one layer", 2: "Two layers"}.items()):
+        ax = logarithmic(figure, 0.7 + 4.5 * panel, title, "largest slope of the tip (rad)", "")
+        for k, (h, found_gaps) in enumerate(found.gaps[layers].items()):
+            angle, aside = np.array([(gap.angle, gap.aside) for gap in found_gaps]).T
+            series(ax, k, angle, aside, f"segments of {h:g} mm")
+        middle = len(problems.SCALES) // 2
+        start = aside[middle] * (angle[0] / angle[middle]) ** 3
+        guide_line(ax, angle, start, 3.0, "third power")
+        ax.set_ylim(1e-6, 1.0)
+        ax.set_xticks([0.005, 0.01, 0.02, 0.05, 0.1], ["0.005", "0.01", "0.02", "0.05", "0.1"])
+        ax.minorticks_off()
+    figure.axes[0].set_ylabel("largest distance of the tips (mm)")
+    figure.axes[0].legend(loc="upper left")
+
+
+def draw_insertion(figure: Any, found: problems.Found) -> None:
+    """Refinement, and the second solver."""
+    ax = logarithmic(
+        figure, 0.8, "Refinement", "size over the shipped one", "distance of the tip from the finest (mm)"
+    )
+    for k, (name, errors) in enumerate(found.refined.items()):
+        shipped = problems.SHIPPED[name]
+        series(ax, k, problems.SIZES[name][:-1] / shipped, errors, f"{name} (shipped: {shipped:g} mm)")
+    first = found.refined["element"][0]
+    guide_line(ax, (4.0, 0.25), 2.0 * first, 2.0, "second order")
+    ax.set_xticks([0.25, 0.5, 1, 2, 4], ["¼", "½", "1", "2", "4"])
+    other = logarithmic(figure, 5.2, "Second solver", "segment (mm)", "largest difference of the tip")
+    for k, name in enumerate(("x (mm)", "y (mm)", "θ (rad)")):
+        series(other, k, problems.ELEMENTS, found.second[:, k], name)
+    guide_line(other, problems.ELEMENTS, 2.0 * found.second[0, 1], 2.0, "second order")
+    other.set_xticks(problems.ELEMENTS, [f"{h:g}" for h in problems.ELEMENTS])
+    for one in (ax, other):
+        one.minorticks_off()
+        one.legend(loc="lower right")
+
+
+def write(found: problems.Found, folder: Path) -> list[Path]:
+    """validation.md and images/ in the folder; returns the paths."""
+    images = folder / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    page = folder / "validation.md"
+    page.write_text(document(found), encoding="utf-8")
+    return [page, *draw(found, images)]
+
+
+def main() -> None:
+    """Compute, print the summary, write."""
+    parser = argparse.ArgumentParser(description="Validation of the exact plant.")
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "docs", metavar="DIR", help="folder of validation.md"
+    )
+    chosen = parser.parse_args()
+    found = problems.compute()
+    print(summary(found), end="\n\n")
+    for path in write(found, chosen.out):
+        print(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,213 @@
+"""Simulators with learnt constants: a bent needle in closed form, other tissue, and insertions carried out again."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from flexneedle import Control, Simulator, load_scenario
+from flexneedle.mechanics import needle as nd
+from reference import closed_forms as exact
+from reference.cases import EI, FOUNDATION, LENGTH_MM, insert_to, long_beam, repeat
+
+PHANTOM = load_scenario("phantom")
+BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
+STIFFNESS = PHANTOM.needle.bending_stiffness
+LENGTH = PHANTOM.needle.length_mm
+ONES = (1.0, 1.0)
+
+
+def bent(scenario, bend, bevel=1):
+    """The needle at the start, with its natural bend."""
+    simulator = Simulator(scenario, threads=1).adapted(ONES, 1.0, bend)
+    return simulator, simulator.step(simulator.start(bevel), Control())
+
+
+# ---- natural bend
+
+
+@pytest.mark.parametrize("bend", [0.5, -1.2])
+@pytest.mark.parametrize("bevel", [1, -1])
+def test_a_free_needle_is_an_arc_that_turns_with_the_bevel(bend, bevel):
+    """y = ½κx², κ = 2w/L², in every node, unstrained; shortened by ½∫y'² = κ²L³/6."""
+    _, state = bent(BARE, bend, bevel)
+    kappa = bevel * 2.0 * bend / LENGTH**2
+    x = state.nodes[:, 0] - state.base[0]
+    np.testing.assert_allclose(state.nodes[:, 1], 0.5 * kappa * x**2, atol=1e-11)
+    np.testing.assert_allclose(state.nodes[:, 2], kappa * x, atol=1e-13)
+    assert state.tip[1] == pytest.approx(bevel * bend, rel=1e-3)
+    assert LENGTH - x[-1] == pytest.approx(kappa**2 * LENGTH**3 / 6.0, rel=1e-3)
+    assert state.energy == pytest.approx(0.0, abs=1e-15)
+    assert state.reactions.base_force == pytest.approx(0.0, abs=1e-13)
+    assert state.converged
+
+
+def test_a_turn_of_the_bevel_mirrors_the_free_needle():
+    simulator, state = bent(BARE, 0.7)
+    turned = simulator.step(state, Control(flip=True))
+    np.testing.assert_allclose(turned.nodes, state.nodes * [1.0, -1.0, -1.0], atol=1e-10)
+
+
+def test_bend_and_end_load_of_a_cantilever_add_up():
+    simulator, state = bent(BARE, 0.3)
+    load = 0.005
+    loaded = simulator.step(state.believing(tip_load=load), Control())
+    x = loaded.nodes[:, 0] - loaded.base[0]
+    curve = exact.cantilever(x, load, STIFFNESS, x[-1]) + 0.5 * (2.0 * 0.3 / LENGTH**2) * x**2
+    np.testing.assert_allclose(loaded.nodes[:, 1], curve, atol=1e-10)
+    assert loaded.energy == pytest.approx(load**2 * x[-1] ** 3 / (6.0 * STIFFNESS), rel=1e-9)
+
+
+@pytest.mark.parametrize("bevel", [1, -1])
+def test_a_guide_straightens_a_bent_needle(bevel):
+    """Clamp and guide `a` apart: force −3EIκ/2a, slope κa/4 there, energy 3EIκ²a/8, and an arc beyond."""
+    _, state = bent(PHANTOM, 0.8, bevel)
+    arm, over = -41.0 - state.base[0], state.tip[0] + 41.0
+    kappa = bevel * 2.0 * 0.8 / LENGTH**2
+    assert state.tip[1] == pytest.approx(kappa * arm * over / 4.0 + 0.5 * kappa * over**2, rel=1e-9)
+    assert state.tip[2] == pytest.approx(kappa * arm / 4.0 + kappa * over, rel=1e-9)
+    assert state.reactions.guide_force == pytest.approx(-1.5 * STIFFNESS * kappa / arm, rel=1e-9)
+    assert state.energy == pytest.approx(3.0 * STIFFNESS * kappa**2 * arm / 8.0, rel=1e-9)
+
+
+def test_work_of_the_guide_is_the_energy_of_a_bent_needle():
+    """dE/dg is the guide's force: exact for the mean of both ends, as the needle in air is linear."""
+    simulator, one = bent(PHANTOM, 0.8)
+    other = simulator.step(one, Control(dg_y=0.4))
+    mean = 0.5 * (one.reactions.guide_force + other.reactions.guide_force)
+    assert abs(other.energy - one.energy) > 5e-4
+    assert other.energy - one.energy == pytest.approx(0.4 * mean, rel=1e-3)
+
+
+def test_a_bent_end_in_tissue_is_the_beam_on_springs_with_an_end_moment():
+    """y = 2EIκβ²/k and θ = κ/β at the free end (Hetényi 1946), second order in the spacing."""
+    depth, beta, kappa = 160.0, 1 / LENGTH_MM, 1e-5
+    errors = []
+    for spacing in (2.0, 1.0, 0.5):
+        scenario = long_beam(depth, spacing=spacing)
+        simulator = Simulator(scenario, threads=1)
+        state = simulator.step(simulator.start(), Control(db_x=depth + 1.0))
+        length = scenario.needle.length_mm
+        state = simulator.adapted((1.0,), 1.0, 0.5 * kappa * length**2).step(state, Control())
+        errors.append(
+            [
+                state.tip[1] / (2.0 * EI * kappa * beta**2 / FOUNDATION) - 1.0,
+                state.tip[2] / (kappa / beta) - 1.0,
+            ]
+        )
+    order = np.log2(np.abs(np.divide(errors[:-1], errors[1:])))
+    assert np.abs(errors[-1]).max() < 3e-3
+    assert order.min() > 1.7
+
+
+def test_bevel_and_bend_mirror_together():
+    """Through the skin and into tissue, with guide motion and a turn."""
+    here = Simulator(PHANTOM, threads=1).adapted((1.3, 0.8), 1.4, 0.6)
+    states = {}
+    for side in (1, -1):
+        state = here.start(side)
+        for k in range(45):
+            control = Control(db_x=1.0, dg_y=0.05 * side, flip=k == 36)
+            state = here.step(state, control)
+        states[side] = state
+    np.testing.assert_allclose(states[-1].nodes, states[1].nodes * [1.0, -1.0, -1.0], atol=1e-9)
+    assert states[-1].strain_energy == pytest.approx(states[1].strain_energy, rel=1e-7)
+
+
+# ---- factors
+
+
+def test_factors_on_modulus_and_bevel_are_those_of_another_scenario():
+    other = PHANTOM.with_values(
+        {
+            "tissue.0.shear_modulus_kpa": 1.82 * 1.7, "tissue.1.shear_modulus_kpa": 3.63 * 0.6,
+            "needle.bevel.offset_mm": 4.0 * 0.4,
+        }
+    )  # fmt: skip
+    adapted, expected = Simulator(PHANTOM, threads=1).adapted((1.7, 0.6), 0.4), Simulator(other, threads=1)
+    one, two = insert_to(adapted, 27.0), insert_to(expected, 27.0)
+    for control in (Control(db_x=1.0, dg_y=0.3, flip=True), Control(db_x=0.4, dg_y=-0.2)):
+        one, two = adapted.step(one, control), expected.step(two, control)
+    np.testing.assert_allclose(one.nodes, two.nodes, atol=1e-9)
+    assert one.strain_energy == pytest.approx(two.strain_energy, rel=1e-9)
+    rows = np.tile(Control(db_x=1.0, dg_y=0.1).row(), (2, 5, 1))
+    np.testing.assert_array_equal(
+        adapted.rollout(one, rows).tips[0, -1], repeat(adapted, one, Control(db_x=1.0, dg_y=0.1), 5)[-1].tip
+    )
+
+
+def test_factors_of_one_and_no_bend_are_the_simulator_itself():
+    simulator = Simulator(PHANTOM, threads=1)
+    assert insert_to(simulator.adapted(ONES), 12.0) == insert_to(simulator, 12.0)
+
+
+def test_adapting_leaves_the_simulator_as_it_was():
+    simulator = Simulator(PHANTOM, threads=2)
+    before = insert_to(simulator, 12.0)
+    assert simulator.adapted((3.0, 3.0), 0.0, 2.0).threads == 2
+    assert insert_to(simulator, 12.0) == before
+
+
+# ---- carrying out again
+
+
+def rows_of(count):
+    rng = np.random.default_rng(8)
+    rows = np.zeros((count, 5))
+    rows[:, 0], rows[:, 3] = rng.uniform(0.3, 1.0, count), rng.uniform(-0.2, 0.25, count)
+    rows[:, 4] = np.where(rng.random(count) < 0.1, 1.0, -1.0)
+    return rows
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.5])
+def test_a_replay_is_repeated_steps_bit_for_bit(bend):
+    """Each with its own factor on the bevel offset; from the start and from the midst."""
+    simulator = Simulator(PHANTOM, threads=1)
+    rows, factors = rows_of(80), np.linspace(0.2, 1.8, 80)
+    assert (rows[:, 4] > 0).sum() > 3
+    learnt = simulator.adapted((1.2, 0.7), 1.0, bend)
+    state = simulator.start().believing(base_y=0.3, base_turn=-1e-3)
+    for first, last in ((0, 50), (50, 80)):
+        after, tips = learnt.replay(state, rows[first:last], factors[first:last])
+        for k in range(first, last):
+            state = simulator.adapted((1.2, 0.7), float(factors[k]), bend).step(
+                state, Control.from_row(rows[k])
+            )
+            np.testing.assert_array_equal(tips[k - first], state.tip)
+        assert after == state
+        assert after.strain_energy == state.strain_energy
+    assert state.tip[0] > 15.0
+
+
+def test_a_replay_changes_neither_state_nor_controls():
+    simulator = Simulator(PHANTOM, threads=1)
+    state, rows, factors = insert_to(simulator, 5.0), rows_of(10), np.ones(10)
+    before = state.scalars.copy(), state.rest.copy(), state.compression.copy(), rows.copy()
+    one, _ = simulator.replay(state, rows, factors)
+    again, _ = simulator.replay(state, rows, factors)
+    assert one == again
+    for kept, now in zip(before, (state.scalars, state.rest, state.compression, rows), strict=True):
+        np.testing.assert_array_equal(kept, now)
+    assert not one.scalars.flags.writeable
+
+
+def test_a_replay_takes_steps_longer_than_a_command():
+    simulator = Simulator(PHANTOM, threads=1)
+    state, tips = simulator.replay(simulator.start(), [[20.0, 0.0, 0.0, 1.0, -1.0]], np.ones(1))
+    assert state.converged
+    np.testing.assert_array_equal(tips[0], state.tip)
+    assert tips[0, 0] == pytest.approx(-8.5, abs=0.01)
+
+
+def test_a_pickled_simulator_keeps_what_it_learnt():
+    """And its threads, after they were used."""
+    simulator = Simulator(PHANTOM, threads=2).adapted((1.5, 0.5), 1.3, 0.4)
+    state = insert_to(simulator, 10.0)
+    rows = np.tile(rows_of(30), (16, 1, 1))
+    tips = simulator.rollout(state, rows).tips
+    twin = pickle.loads(pickle.dumps(simulator))
+    assert twin.threads == 2
+    assert twin.scenario == simulator.scenario
+    assert insert_to(twin, 10.0) == state
+    np.testing.assert_array_equal(twin.rollout(state, rows).tips, tips)
+    assert state.scalars[nd.TIP_Y] != insert_to(Simulator(PHANTOM), 10.0).scalars[nd.TIP_Y]
