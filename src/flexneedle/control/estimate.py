@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from statistics import fmean
 from typing import Protocol
 
 import numpy as np
@@ -21,6 +23,15 @@ class Move:
     ended: float
     applied: Command
     samples: tuple[Sample, ...] = ()
+
+    @cached_property
+    def mean(self) -> tuple[float, float, float, float] | None:
+        """Of its readings: the share of the move done, x, y (mm), and their number; None without any."""
+        if not self.samples:
+            return None
+        part = [self.part(sample.time) for sample in self.samples]
+        x, y = zip(*map(place, self.samples), strict=True)
+        return fmean(part), fmean(x), fmean(y), float(len(part))
 
     def part(self, time: float) -> float:
         """Share of the move that is done at `time`."""

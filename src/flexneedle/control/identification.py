@@ -1,39 +1,41 @@
 """An observer that corrects the model: start, needle and tissue are fitted to all readings of the insertion.
 
-Maximum a posteriori by Gauss–Newton: the whole insertion is simulated again with other constants, which costs a few
-milliseconds, and the lateral readings choose among them. Parameters, with normal priors from the scenario:
+Maximum a posteriori by Gauss–Newton, one step a period: the insertion is simulated again with other constants, which
+costs less than a millisecond, and the lateral readings choose among them. Parameters, with normal priors from the
+scenario:
 
-    base y (mm), base turn (rad), natural bend of the needle (mm), run-out (mm), ln of the factor on the modulus of
-    each layer, and the factor on the bevel offset at knots along the depth, a random walk.
+    base y (mm), base turn (rad), natural bend of the needle (mm), run-out (mm), factor on the bevel offset,
+    ln of the factor on each layer's modulus, shift (mm) of each boundary between layers,
+    ln of a further factor on the modulus in cells along the depth, correlated over a length.
 
-The walk takes up what varies along the depth; being a bevel's force, it turns over with the bevel. What the fit leaves
-is low-passed and carried on as a constant.
+So what lies ahead of the tip is believed as far as it is correlated with what was passed. What the fit leaves is
+low-passed and carried on as a constant.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from flexneedle.control.estimate import Floats, Move, along, assigned, place
+from flexneedle.control.estimate import Floats, Move, along, assigned
 from flexneedle.ports import Command, Sample
 from flexneedle.scenario import Scenario
-from flexneedle.simulator import Control, Simulator, State
+from flexneedle.simulator import Control, Learnt, Simulator, State
 
 __all__ = ["Identification", "Identified"]
 
-BASE_Y, BASE_TURN, BEND, RUN_OUT, MODULUS = range(5)
-_STEPS = (0.05, 3e-4, 0.05, 0.05)  # for differences: mm, rad, mm, mm
-_FACTOR_STEP = 0.05
-_REFRESH = 3  # moves after which the Jacobian is computed anew
-_NEAR_MM = 2.0  # tissue does not matter for a tip further before the skin
+BASE_Y, BASE_TURN, BEND, RUN_OUT, BEVEL, MODULUS = range(6)
+_STEPS = (0.05, 3e-4, 0.05, 0.05, 0.05)  # for differences: mm, rad, mm, mm, 1
+_LOG_STEP = 0.05
+_SHIFT_STEP = 0.2  # mm
+_MOVES_A_STRETCH = 8  # in tissue; one stretch in air
 _WIDEST = 4.0  # standard deviations that a parameter may leave its prior
+_LARGEST_BEVEL = 3.4  # factor: 0.7 of the compression length with the preset's
 _RECENT = 12  # moves whose residuals are low-passed
-_LEAST_FACTOR, _LARGEST_FACTOR = (
-    -3.0,
-    3.4,
-)  # of the bevel offset: 0.7 of the compression length with the preset's
+_SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a Gauss–Newton step: the first that fits no worse
+_REST = np.array([[0.0, 0.0, 0.0, 0.0, -1.0]])
 
 
 @dataclass(frozen=True)
@@ -42,28 +44,26 @@ class Identification:
 
     def begin(self, simulator: Simulator, bevel: int) -> "Identified":
         """Believe in the scenario."""
-        layers = len(simulator.scenario.tissue)
-        parameters = np.append(np.zeros(MODULUS + layers), 1.0)
-        state = simulator.start(bevel)
-        return Identified(simulator, simulator, bevel, parameters, state, state.tip[None])
+        state, prior = simulator.start(bevel), _Prior.of(simulator.scenario)
+        return Identified(simulator, prior, simulator, prior.mean, state, state.tip[None], ((0, state),))
 
 
 @dataclass(frozen=True, eq=False)
 class Identified:
     """The belief; an `Estimate`.
 
-    nominal: the scenario's model; first_bevel: at the start; parameters (K,); tips (m + 1, 3): of the model at the
-    ends of the m moves, the start first; jacobian (r, K) of the first r readings.
+    nominal: the scenario's model, and the prior about it; simulator: the model with parameters (K,); state: of it now;
+    tips (m + 1, 3): of it at the ends of the m moves, the start first; stops: its state before some of the moves.
     """
 
     nominal: Simulator
+    prior: "_Prior"
     simulator: Simulator
-    first_bevel: int
     parameters: Floats
     state: State
     tips: Floats
+    stops: tuple[tuple[int, State], ...]
     moves: tuple[Move, ...] = ()
-    jacobian: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     residual: float = 0.0
     innovation: tuple[float, float] = (0.0, 0.0)
     measured: tuple[float, float] | None = None
@@ -75,14 +75,20 @@ class Identified:
         tip[1] += self.off_axis(self.state.bevel)
         return tip
 
-    def off_axis(self, bevel: int) -> float:
+    @property
+    def run_out(self) -> float:
+        """Lateral distance (mm) of the seen tip from the needle's axis, with the bevel up."""
+        return float(self.parameters[RUN_OUT])
+
+    def off_axis(self, bevel: float) -> float:
         """Lateral distance (mm) of the seen tip from the model's with the bevel on that side."""
-        return float(self.parameters[RUN_OUT]) * bevel + self.residual
+        return self.run_out * bevel + self.residual
 
     def tip_at(self, time: float) -> tuple[float, float]:
         """Where the tip was believed to be (mm) at `time`."""
         x, y = along(self.moves, self.tips, time)
-        return x, y + self.off_axis(self.state.bevel)
+        turned_since = sum(done.applied[4] > 0.0 for done in self.moves if done.begun >= time)
+        return x, y + self.off_axis(self.state.bevel * (-1) ** turned_since)
 
     def unseen(self) -> "Identified":
         """The same without an innovation."""
@@ -98,171 +104,217 @@ class Identified:
         """Fit the parameters to all readings so far, one Gauss–Newton step, and simulate with them to now."""
         if not samples or not self.moves:
             return self.unseen()
-        moves = assigned(self.moves, samples)
-        readings = _readings(moves)
-        rows = np.array([done.applied for done in moves])
-        simulate = partial(_simulated, self.nominal, self.first_bevel, rows)
-        parameters = _with_knots(self.nominal.scenario, self.parameters, rows)
-        before = readings.predicted(simulate(parameters)[1], rows, self.first_bevel, parameters)
-        jacobian = _jacobian(self, simulate, readings, rows, parameters, before)
-        parameters = _improved(self.nominal.scenario, readings, parameters, before, jacobian)
-        state, tips = simulate(parameters)
-        left = readings.y - readings.predicted(tips, rows, self.first_bevel, parameters)
-        ahead = readings.x - readings.between(tips[:, 0])
-        newest = int(readings.index[-1])
-        x, y = tips[newest + 1, :2] + (ahead[-1], left[-1])
-        run_out = parameters[RUN_OUT] * _sides(self.first_bevel, rows)[newest + 1]
+        seen = replace(self, moves=assigned(self.moves, samples))
+        readings = seen._readings
+        fitted = _improved(seen, readings)
+        left = readings.left(fitted)
+        ahead = readings.x - readings.between(fitted.tips[:, 0])
+        newest = int(readings.index[-1]) + 1
+        x, y = fitted.tips[newest, :2] + (ahead[-1], left[-1] + fitted.run_out * readings.sides[-1])
+        inside = fitted.tips[-1, 0] > 0.0
+        return replace(
+            fitted,
+            residual=_low_passed(self.nominal.scenario, left) if inside else 0.0,
+            innovation=(float(ahead[-1]), float(left[-1])),
+            measured=(float(x), float(y)),
+        )
+
+    @cached_property
+    def rows(self) -> Floats:
+        """The commands of the moves (m, 5)."""
+        return np.array([done.applied for done in self.moves])
+
+    @cached_property
+    def _readings(self) -> "_Readings":
+        means = [(k, *done.mean) for k, done in enumerate(self.moves) if done.mean is not None]
+        index, part, x, y, count = np.array(means, dtype=float).T
+        turns = np.cumprod(np.where(self.rows[:, 4] > 0.0, -1.0, 1.0))
+        first = self.state.bevel * turns[-1]
+        moves = index.astype(int)
+        return _Readings(moves, part, x, y, count, (first * turns)[moves])
+
+    def _with(self, parameters: Floats) -> "Identified":
+        """The belief in these parameters: the insertion simulated again, in stretches."""
+        simulator = _adapted(self.nominal, parameters)
+        state = _started(self, simulator, parameters)
+        inside = int(np.argmax(np.append(self.tips[1:, 0], np.inf) > 0.0))
+        ends = [*range(min(inside, len(self.rows)), len(self.rows), _MOVES_A_STRETCH), len(self.rows)]
+        stops, parts, first = [], [state.tip[None]], 0
+        for last in ends:
+            stops.append((first, state))
+            if last > first:
+                state, tips = simulator.replay(state, self.rows[first:last])
+                parts.append(tips)
+            first = last
         return replace(
             self,
-            simulator=_adapted(self.nominal, parameters, _depths(self.nominal.scenario, rows)[-1]),
+            simulator=simulator,
             parameters=parameters,
             state=state,
-            tips=tips,
-            moves=moves,
-            jacobian=jacobian,
-            residual=_low_passed(self.nominal.scenario, left) if tips[-1, 0] > 0.0 else 0.0,
-            innovation=(float(ahead[-1]), float(left[-1])),
-            measured=(float(x), float(y + run_out)),
+            tips=np.concatenate(parts),
+            stops=tuple(stops),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class _Readings:
-    """Means of the readings of each move that has any, each (r,): move, share of it done, x, y (mm), variance (mm²)."""
+    """Means of the readings of each move that has any: the move, the share of it done, x, y (mm), their number, and
+    the bevel's side, which turns before its move; each (r,).
+    """
 
-    index: Floats
+    index: NDArray[np.intp]
     part: Floats
     x: Floats
     y: Floats
     count: Floats
+    sides: Floats
 
     def between(self, ends: Floats) -> Floats:
         """A quantity at the readings, from its values at the ends of the moves (m + 1,)."""
-        k = self.index.astype(int)
-        between: Floats = (1.0 - self.part) * ends[k] + self.part * ends[k + 1]
+        between: Floats = (1.0 - self.part) * ends[self.index] + self.part * ends[self.index + 1]
         return between
 
-    def predicted(self, tips: Floats, rows: Floats, bevel: int, parameters: Floats) -> Floats:
-        """The model's lateral readings (r,), mm."""
-        return self.between(tips[:, 1] + parameters[RUN_OUT] * _sides(bevel, rows))
+    def left(self, belief: Identified) -> Floats:
+        """The lateral readings (r,) less those of the model, mm."""
+        left: Floats = self.y - self.between(belief.tips[:, 1]) - belief.run_out * self.sides
+        return left
+
+    def variance(self, scenario: Scenario) -> Floats:
+        """Of the lateral readings (r,), mm²: their jitter and what no parameter explains."""
+        unexplained = scenario.control.adaptive_mpc.model_sd_mm**2
+        variance: Floats = scenario.tracker.jitter_per_axis**2 / self.count + unexplained
+        return variance
 
 
-def _readings(moves: tuple[Move, ...]) -> _Readings:
-    seen = [(k, done) for k, done in enumerate(moves) if done.samples]
-    means = [
-        (
-            k,
-            np.mean([done.part(sample.time) for sample in done.samples]),
-            *np.mean([place(sample) for sample in done.samples], axis=0),
-            len(done.samples),
+@dataclass(frozen=True, eq=False)
+class _Prior:
+    """Normal prior of the parameters: mean (K,), precision (K, K), bounds (2, K); steps for differences (K,); the depth
+    of the tip (mm) from which each matters to it (K,).
+    """
+
+    mean: Floats
+    precision: Floats
+    bounds: Floats
+    steps: Floats
+    begins: Floats
+
+    @staticmethod
+    def of(scenario: Scenario) -> "_Prior":
+        """The scenario's."""
+        control, settings = scenario.control, scenario.control.adaptive_mpc
+        layers, cells = len(scenario.tissue), _cells(scenario)
+        single = (
+            [control.start_offset_sd_mm, control.start_angle_sd, settings.bend_sd_mm]
+            + [settings.run_out_sd_mm, settings.bevel_sd]
+            + [settings.modulus_log_sd] * layers
+            + [settings.boundary_sd_mm] * (layers - 1)
         )
-        for k, done in seen
-    ]
-    return _Readings(*np.array(means, dtype=float).T)
+        sd = np.maximum([*single, *[settings.variation_sd] * cells], 1e-6)
+        mean = np.where(np.arange(sd.size) == BEVEL, 1.0, 0.0)
+        precision = np.diag(sd**-2.0)
+        precision[-cells:, -cells:] = _uncorrelating(cells, settings.cell_mm / settings.variation_length_mm)
+        precision[-cells:, -cells:] /= sd[-1] ** 2
+        bounds = mean + np.outer((-_WIDEST, _WIDEST), sd)
+        bounds[:, BEVEL] = 0.0, _LARGEST_BEVEL
+        logs, shifts = [_LOG_STEP] * layers, [_SHIFT_STEP] * (layers - 1)
+        steps = np.array([*_STEPS, *logs, *shifts, *[_LOG_STEP] * cells])
+        tops = np.array(scenario.layer_tops) - _WIDEST * settings.boundary_sd_mm
+        tops[0] = 0.0
+        starts = settings.cell_mm * np.arange(cells)
+        begins = np.concatenate([[-np.inf] * BEVEL, [0.0], tops, tops[1:], starts])
+        return _Prior(mean, precision, bounds, steps, begins)
+
+    def cost(self, parameters: Floats) -> float:
+        """Minus the logarithm of the density, but for a constant."""
+        off = parameters - self.mean
+        return float(0.5 * off @ self.precision @ off)
 
 
-def _sides(bevel: int, rows: Floats) -> Floats:
-    """Direction of the bevel at the ends of the moves, the start first, (m + 1,)."""
-    return bevel * np.cumprod(np.append(1.0, np.where(rows[:, 4] > 0.0, -1.0, 1.0)))
+def _uncorrelating(size: int, distance: float) -> Floats:
+    """Inverse of the correlation exp(−distance |i − j|): that of a Markov chain, so tridiagonal."""
+    share = np.exp(-distance)
+    inner = np.full(size, 1.0 + share**2)
+    inner[[0, -1]] = 1.0
+    beside = np.full(size - 1, -share)
+    inverse: Floats = (np.diag(inner) + np.diag(beside, 1) + np.diag(beside, -1)) / (1.0 - share**2)
+    return inverse
 
 
-def _depths(scenario: Scenario, rows: Floats) -> Floats:
-    """Depth of a straight needle's tip before and after the moves (m + 1,), mm."""
-    start = scenario.setup.start_tip_x
-    return start + np.append(0.0, np.cumsum(rows[:, 0]))
+def _cells(scenario: Scenario) -> int:
+    """Cells from the skin to the end of the stroke."""
+    return max(2, int(np.ceil(scenario.setup.max_depth / scenario.control.adaptive_mpc.cell_mm)))
 
 
-def _with_knots(scenario: Scenario, parameters: Floats, rows: Floats) -> Floats:
-    """The parameters with a knot of the bevel's factor at or past the tip; a new one believes its neighbour."""
-    depth = max(0.0, float(_depths(scenario, rows).max()))
-    needed = MODULUS + len(scenario.tissue) + 1 + int(np.ceil(depth / scenario.control.adaptive_mpc.knot_mm))
-    return np.append(parameters, np.full(max(0, needed - parameters.size), parameters[-1]))
-
-
-def _factors(scenario: Scenario, parameters: Floats, depth: Floats) -> Floats:
-    """Factor on the bevel offset at depths (mm)."""
-    knots = parameters[MODULUS + len(scenario.tissue) :]
-    factors: Floats = np.interp(depth, np.arange(knots.size) * scenario.control.adaptive_mpc.knot_mm, knots)
-    return factors
-
-
-def _adapted(nominal: Simulator, parameters: Floats, depth: float) -> Simulator:
-    """The model with the learnt constants, those of `depth` (mm) where they vary along it."""
+def _adapted(nominal: Simulator, parameters: Floats) -> Simulator:
+    """The model with these constants."""
     layers = len(nominal.scenario.tissue)
-    bevel = float(_factors(nominal.scenario, parameters, np.array(depth)))
+    shift = MODULUS + layers
+    variation = shift + layers - 1
     return nominal.adapted(
-        np.exp(parameters[MODULUS : MODULUS + layers]).tolist(), bevel, float(parameters[BEND])
+        Learnt(
+            shift=parameters[shift:variation],
+            stiffness=np.exp(parameters[MODULUS:shift]),
+            cell=nominal.scenario.control.adaptive_mpc.cell_mm,
+            variation=np.exp(parameters[variation:]),
+            bevel=float(parameters[BEVEL]),
+            bend=float(parameters[BEND]),
+        )
     )
 
 
-def _simulated(nominal: Simulator, bevel: int, rows: Floats, parameters: Floats) -> tuple[State, Floats]:
-    """The insertion so far with these parameters: the state now, and the tips (m + 1, 3)."""
-    layers = len(nominal.scenario.tissue)
-    modulus = np.exp(parameters[MODULUS : MODULUS + layers]).tolist()
-    simulator = nominal.adapted(modulus, 1.0, float(parameters[BEND]))
-    start = nominal.start(bevel).believing(
-        base_y=float(parameters[BASE_Y]), base_turn=float(parameters[BASE_TURN])
-    )
-    rest = np.array([[0.0, 0.0, 0.0, 0.0, -1.0]])  # takes up the start
-    factors = _factors(nominal.scenario, parameters, _depths(nominal.scenario, rows))
-    return simulator.replay(start, np.concatenate([rest, rows]), factors)
+def _started(belief: Identified, simulator: Simulator, parameters: Floats) -> State:
+    """The state of the start, settled with these parameters."""
+    start = belief.nominal.start(belief.stops[0][1].bevel)
+    believed = start.believing(base_y=float(parameters[BASE_Y]), base_turn=float(parameters[BASE_TURN]))
+    return simulator.replay(believed, _REST)[0]
 
 
-def _jacobian(
-    belief: Identified,
-    simulate: partial[tuple[State, Floats]],
-    readings: _Readings,
-    rows: Floats,
-    parameters: Floats,
-    before: Floats,
-) -> Floats:
-    """Derivative (r, K) of the predicted readings; old rows are kept for a few moves, new ones take the last one's."""
-    old = belief.jacobian
-    if old.shape[1] == parameters.size and readings.y.size % _REFRESH and old.shape[0] > 0:
-        kept: Floats = old[np.minimum(np.arange(readings.y.size), old.shape[0] - 1)]
-        return kept
-    deep = belief.tips[-1, 0] > -_NEAR_MM
-    jacobian = np.zeros((readings.y.size, parameters.size))
-    jacobian[:, RUN_OUT] = readings.between(_sides(belief.first_bevel, rows))
-    for k in (BASE_Y, BASE_TURN, BEND, *(range(MODULUS, parameters.size) if deep else ())):
-        step = _STEPS[k] if k < MODULUS else _FACTOR_STEP
-        other = parameters.copy()
-        other[k] += step
-        tips = simulate(other)[1]
-        jacobian[:, k] = (readings.predicted(tips, rows, belief.first_bevel, other) - before) / step
+def _improved(belief: Identified, readings: _Readings) -> Identified:
+    """One Gauss–Newton step to the maximum a posteriori, as long as it fits no worse, within the bounds."""
+    prior = belief.prior
+    jacobian, variance = _jacobian(belief, readings), readings.variance(belief.nominal.scenario)
+    weighted = jacobian.T / variance
+    gradient = weighted @ readings.left(belief) - prior.precision @ (belief.parameters - prior.mean)
+    step = np.linalg.solve(weighted @ jacobian + prior.precision, gradient)
+    goal = np.clip(belief.parameters + step, *prior.bounds)
+
+    def cost(other: Identified) -> float:
+        return float(0.5 * (readings.left(other) ** 2 / variance).sum()) + prior.cost(other.parameters)
+
+    most, fitted = cost(belief), belief
+    for share in _SHARES:
+        fitted = belief._with(belief.parameters + share * (goal - belief.parameters))
+        if cost(fitted) <= most:
+            break
+    return fitted
+
+
+def _jacobian(belief: Identified, readings: _Readings) -> Floats:
+    """Derivative (r, K) of the predicted readings, by forward differences; the motion before a parameter matters is
+    not simulated again.
+    """
+    prior, deepest = belief.prior, belief.tips[:, 0].max()
+    jacobian = np.zeros((readings.y.size, prior.mean.size))
+    jacobian[:, RUN_OUT] = readings.sides
+    for k in range(prior.mean.size):
+        if k == RUN_OUT or deepest < prior.begins[k]:
+            continue
+        parameters = belief.parameters.copy()
+        parameters[k] += prior.steps[k]
+        tips = _tips(belief, parameters, float(prior.begins[k]))
+        jacobian[:, k] = readings.between(tips[:, 1] - belief.tips[:, 1]) / prior.steps[k]
     return jacobian
 
 
-def _improved(
-    scenario: Scenario, readings: _Readings, parameters: Floats, before: Floats, jacobian: Floats
-) -> Floats:
-    """One Gauss–Newton step to the maximum a posteriori, within the widest sensible range."""
-    settings = scenario.control.adaptive_mpc
-    variance = scenario.tracker.jitter_per_axis**2 / readings.count + settings.model_sd_mm**2
-    precision, mean, widest = _prior(scenario, parameters.size)
-    weighted = jacobian.T / variance
-    gradient = weighted @ (readings.y - before) - precision @ (parameters - mean)
-    moved = parameters + np.linalg.solve(weighted @ jacobian + precision, gradient)
-    return np.clip(moved, *widest)
-
-
-def _prior(scenario: Scenario, size: int) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
-    """Precision (K, K) and mean (K,) of the parameters, and their bounds (2 × (K,))."""
-    control, settings = scenario.control, scenario.control.adaptive_mpc
-    knots = MODULUS + len(scenario.tissue)
-    sd = np.array([control.start_offset_sd_mm, control.start_angle_sd, settings.bend_sd_mm])
-    sd = np.concatenate([sd, [settings.run_out_sd_mm], np.full(knots - MODULUS, settings.modulus_log_sd)])
-    sd = np.maximum(sd, 1e-9)
-    precision = np.zeros((size, size))
-    precision[range(knots), range(knots)] = sd**-2.0
-    precision[knots, knots] = max(settings.bevel_sd, 1e-9) ** -2.0
-    walk = max(settings.bevel_walk_sd, 1e-9) ** -2.0
-    for k in range(knots + 1, size):
-        precision[k - 1 : k + 1, k - 1 : k + 1] += walk * np.array([[1.0, -1.0], [-1.0, 1.0]])
-    mean = np.where(np.arange(size) < knots, 0.0, 1.0)
-    low = np.append(-_WIDEST * sd, np.full(size - knots, _LEAST_FACTOR))
-    high = np.append(_WIDEST * sd, np.full(size - knots, _LARGEST_FACTOR))
-    return precision, mean, (low, high)
+def _tips(belief: Identified, parameters: Floats, begins: float) -> Floats:
+    """The tips (m + 1, 3) with parameters that differ only in what matters from the tip depth `begins` (mm) on."""
+    simulator = _adapted(belief.nominal, parameters)
+    reached = int(np.argmax(np.append(belief.tips[:, 0], np.inf) > begins))  # by the move before this one
+    first, state = max((stop for stop in belief.stops if stop[0] < max(1, reached)), key=lambda stop: stop[0])
+    if first == 0:
+        state = _started(belief, simulator, parameters)
+    before = np.concatenate([belief.tips[:first], state.tip[None]])
+    return np.concatenate([before, simulator.replay(state, belief.rows[first:])[1]])
 
 
 def _low_passed(scenario: Scenario, left: Floats) -> float:

@@ -58,32 +58,15 @@ def advance(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, command
 
 @kernel
 def replay(
-    model: Model,
-    s: Floats,
-    rest: Floats,
-    u: Floats,
-    w: Floats,
-    controls: Floats,
-    bevel: Floats,
-    tips: Floats,
+    model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, controls: Floats, tips: Floats
 ) -> int:
-    """Carry out `controls` (m, 5) one after the other, each with its factor on the bevel offset, bevel (m,);
-    fills tips (m, 3).
+    """Carry out `controls` (m, 5) one after the other; fills tips (m, 3).
 
     Other arrays and result as in `settle`.
     """
     count = 0
     for k in range(controls.shape[0]):
-        now = Model(
-            model.bending_stiffness,
-            model.length,
-            model.bevel_offset * bevel[k],
-            model.bevel_length,
-            model.nodes,
-            model.layers,
-            model.curvature,
-        )
-        count = advance(now, s, rest, u, w, controls[k])
+        count = advance(model, s, rest, u, w, controls[k])
         tips[k, 0], tips[k, 1], tips[k, 2] = s[nd.TIP_X], s[nd.TIP_Y], s[nd.TIP_TURN]
     return count
 

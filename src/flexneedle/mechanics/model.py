@@ -96,16 +96,56 @@ def insert_essential(nodes: Nodes, x: Floats) -> Nodes:
     return Nodes(*(np.insert(array, place, value) for array, value in zip(arrays, values, strict=True)))
 
 
-def adapted(model: Model, stiffness: Floats, bevel: float, bend: float) -> Model:
-    """The model with factors on the modulus of each layer (k,) and on the bevel offset, and a natural bend.
+class Learnt(NamedTuple):
+    """What an observer has learnt about a model's constants.
 
-    bend: distance (mm) of the free tip from the straight, for bevel +1.
+    shift (k − 1,): of the ends of all layers but the last (mm); stiffness (k,): factor on the modulus of each layer;
+    cell: length (mm) of cells along the depth from the skin; variation (c,): further factor on the modulus in each,
+    the last one goes on; bevel: factor on the bevel offset; bend: distance (mm) of the free needle's tip from the
+    straight, for bevel +1, with which it turns.
     """
-    layer = np.searchsorted(model.layers.end, model.nodes.x, side="right")
-    nodes, layers = model.nodes, model.layers
+
+    shift: Floats
+    stiffness: Floats
+    cell: float = 1.0
+    variation: Floats = np.ones(1)
+    bevel: float = 1.0
+    bend: float = 0.0
+
+
+def adapted(model: Model, learnt: Learnt) -> Model:
+    """The model with other constants, its contact points where they were.
+
+    A contact's force is that of the tissue along its interval; its law that of the layer at its middle.
+    """
+    old, nodes = model.layers, model.nodes
+    ends = np.maximum.accumulate(np.maximum(0.0, old.end[:-1] + learnt.shift))
+    cells = learnt.cell * np.arange(1, learnt.variation.size)
+    bottoms = np.sort(np.concatenate([ends, cells]))
+    tops = np.append(-np.inf, bottoms)
+    layer = ends.searchsorted(tops, side="right")
+    factor = learnt.stiffness[layer] * learnt.variation[cells.searchsorted(tops, side="right")]
+    scales = np.stack([old.force, old.energy])[:, layer] * factor
+    at = ends.searchsorted(nodes.x, side="right")
+    contact = nodes.kind == CONTACT
+    force, energy = np.where(contact, _integrals(bottoms, scales, nodes), (nodes.force, nodes.energy))
+    alpha, height = np.where(contact, np.stack([old.alpha, old.height])[:, at], (nodes.alpha, nodes.height))
     return model._replace(
-        bevel_offset=model.bevel_offset * bevel,
-        nodes=nodes._replace(force=nodes.force * stiffness[layer], energy=nodes.energy * stiffness[layer]),
-        layers=layers._replace(force=layers.force * stiffness, energy=layers.energy * stiffness),
-        curvature=2.0 * bend / model.length**2,
+        bevel_offset=model.bevel_offset * learnt.bevel,
+        nodes=nodes._replace(alpha=alpha, height=height, force=force, energy=energy),
+        layers=Layers(np.append(bottoms, np.inf), old.alpha[layer], old.height[layer], scales[0], scales[1]),
+        curvature=2.0 * learnt.bend / model.length**2,
     )
+
+
+def _integrals(bottoms: Floats, densities: Floats, nodes: Nodes) -> Floats:
+    """Integrals (2, n) along the intervals of the contact points of densities (2, l) constant in each layer."""
+    tops = np.append(0.0, bottoms)
+    before = np.concatenate([np.zeros((2, 1)), np.cumsum(densities[:, :-1] * np.diff(tops), axis=1)], axis=1)
+
+    def up_to(x: Floats) -> Floats:
+        inside = bottoms.searchsorted(x, side="right")
+        total: Floats = before[:, inside] + densities[:, inside] * (x - tops[inside])
+        return total
+
+    return up_to(nodes.x + nodes.reach) - up_to(nodes.x - nodes.reach)

@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from flexneedle import mechanics, phantom
 from flexneedle.mechanics.compile import compiled
 from flexneedle.phantom import PLANTS, Phantom, Truth
@@ -23,6 +21,6 @@ def compile_kernels() -> None:
     scenario = load_scenario("phantom")  # kernels are the same for every scenario
     simulator, still = Simulator(scenario, threads=1), Control().row()
     simulator.compile()
-    simulator.replay(simulator.start(), still[None], np.ones(1))
+    simulator.replay(simulator.start(), still[None])
     for kind in PLANTS:
         Phantom(Truth(scenario), 1, kind).apply((0.0, 0.0, 0.0, 0.0, -1), 0.0)

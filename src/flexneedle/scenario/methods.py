@@ -52,7 +52,7 @@ class BroydenMpc(Section):
 class AdaptiveMpc(Section):
     """Section `control.adaptive_mpc`: `adaptive-mpc`, its search and the priors of what it identifies."""
 
-    samples: int = count(32, least=8, most=100_000)
+    samples: int = count(24, least=8, most=100_000)
     """Control sequences in an iteration of a period."""
     iterations: int = count(3, least=1, most=1_000)
     """Iterations of a period."""
@@ -68,8 +68,24 @@ class AdaptiveMpc(Section):
     """Cost of an angle off the planned path, as a distance: 1 rad weighs as much as this."""
     guide_weight: NonNegative = 0.05
     """Cost of a squared millimetre that a guide step departs from the plan's."""
-    energy_weight_per_mj: NonNegative = 4.0
+    energy_weight_per_mj: NonNegative = 8.0
     """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
+    route_mm: Positive = 8.0
+    """Depth after which the way to the target is found again."""
+    route_samples: int = count(32, least=8, most=100_000)
+    """Control sequences in an iteration of that."""
+    route_iterations: int = count(5, least=1, most=1_000)
+    """Iterations of it."""
+    route_pieces: int = count(4, least=1, most=1_000)
+    """Pieces of the way, each with one guide step and one side of the bevel."""
+    route_guide_sigma_mm: NonNegative = 0.1
+    """First standard deviation of the guide step there."""
+    route_energy_weight_mm_per_mj: NonNegative = 25.0
+    """Cost of the tissue's strain energy at the target, against a mm of miss."""
+    route_guide_weight_per_mm: NonNegative = 0.025
+    """Cost of a squared guide step, against a mm of miss."""
+    route_turn_weight_mm: NonNegative = 0.005
+    """Cost of turning the bevel, against a mm of miss."""
     bend_sd_mm: NonNegative = 0.5
     """Prior of the natural bend of the needle, over its length: standard deviation."""
     run_out_sd_mm: NonNegative = 0.1
@@ -78,10 +94,14 @@ class AdaptiveMpc(Section):
     """Prior of the logarithm of the factor on each layer's modulus: standard deviation."""
     bevel_sd: NonNegative = 0.3
     """Prior of the factor on the bevel offset: standard deviation."""
-    bevel_walk_sd: NonNegative = 0.3
-    """Standard deviation of that factor's change from knot to knot."""
-    knot_mm: Positive = 5.0
-    """Depth between the knots of that factor."""
+    boundary_sd_mm: NonNegative = 1.5
+    """Prior of the place of each boundary between layers: standard deviation."""
+    variation_sd: NonNegative = 0.2
+    """Prior of the logarithm of the modulus along the depth, about that of its layer: standard deviation."""
+    variation_length_mm: Positive = 10.0
+    """Length over which that is correlated."""
+    cell_mm: Positive = 2.5
+    """Length of the cells in which it is taken as constant."""
     model_sd_mm: Positive = 0.015
     """Standard deviation of a reading's mean that no parameter explains."""
     residual_gain: Fraction = 0.4

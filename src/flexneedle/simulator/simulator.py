@@ -76,9 +76,8 @@ class Simulator:
         count = insertion.advance(self._model, s, rest, u, w, row)
         return solved(self.scenario, self._model, s, rest, u, mesh_of(self._model.nodes, w, count))
 
-    def replay(self, state: State, controls: ArrayLike, bevel: Floats) -> tuple[State, Floats]:
-        """Carry out controls (m, 5), m ≥ 1, as repeated `step` does, without limits, each with its factor on the bevel
-        offset, bevel (m,).
+    def replay(self, state: State, controls: ArrayLike) -> tuple[State, Floats]:
+        """Carry out controls (m, 5), m ≥ 1, as repeated `step` does, but without limits.
 
         Returns the state at the end and the tips (m, 3).
         """
@@ -86,18 +85,13 @@ class Simulator:
         rows = np.array(controls, dtype=float, order="C")
         s, rest, u, w = self._work(state)
         tips = np.empty((len(rows), 3))
-        count = insertion.replay(self._model, s, rest, u, w, rows, bevel, tips)
+        count = insertion.replay(self._model, s, rest, u, w, rows, tips)
         mesh = mesh_of(self._model.nodes, w, count)
         return solved(self.scenario, self._model, s, rest, u, mesh), tips
 
-    def adapted(self, stiffness: Sequence[float], bevel: float = 1.0, bend: float = 0.0) -> "Simulator":
-        """Return this simulator with what an observer has learnt, for states of the same scenario.
-
-        stiffness: factor on the modulus of each layer (k,); bevel: factor on its offset; bend: distance (mm) of the
-        free needle's tip from the straight, for bevel +1; the bend turns with the bevel.
-        """
-        constants = model.adapted(self._model, np.asarray(stiffness, dtype=float), bevel, bend)
-        return Simulator(self.scenario, self.threads, constants=constants)
+    def adapted(self, learnt: model.Learnt) -> "Simulator":
+        """Return this simulator with what an observer has learnt, for states of the same scenario."""
+        return Simulator(self.scenario, self.threads, constants=model.adapted(self._model, learnt))
 
     def check(self, state: State, control: Control) -> None:
         """Raise CommandError, with value and limit, if `control` may not be applied to `state`."""

@@ -1,8 +1,9 @@
-"""`adaptive-mpc`: cross-entropy MPC of the guide along the plan, on a model that learns the insertion.
+"""`adaptive-mpc`: cross-entropy MPC on a model that learns the insertion from the readings.
 
-Start, needle and tissue are identified from the readings (`control.identification`). The horizon is a few steps of
-full advance; where it reaches the target, the miss there weighs most. The bevel follows the paper's rule; near the
-target it turns only if the model agrees.
+Start, needle and tissue are identified (`control.identification`). With what was learnt the way to the target is found
+again every few millimetres (`control.route`), guide and bevel alike; a short horizon of steps of full advance follows
+it, and weighs the miss most where it reaches the target. The paper's rule may turn the bevel besides, if the model
+agrees.
 """
 
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from flexneedle.control import bang_bang
 from flexneedle.control.estimate import Estimate, Floats
 from flexneedle.control.identification import Identification, Identified
 from flexneedle.control.interface import Decision, Method, Task, travel_left
+from flexneedle.control.mpc import planned_base
+from flexneedle.control.route import Route, of_plan, renewed
 from flexneedle.planning import Settings, cross_entropy
 
 
@@ -23,26 +26,39 @@ class Ahead:
     """The way that a decision looks ahead, m steps in n pieces.
 
     advance (m,): mm; piece (m,): the piece of each step; path (m, 2): wanted y (mm) of the model's tip, and angle;
-    guide (m,): the plan's steps (mm); weight (m,): of the deviation after each step.
+    guide (m,): the route's steps (mm); base (m, 2): the plan's steps of base y and turn; weight (m,): of the deviation
+    after each step.
     """
 
     advance: Floats
     piece: NDArray[np.intp]
     path: Floats
     guide: Floats
+    base: Floats
     weight: Floats
     flip: bool
 
 
-def decide(task: Task, memory: None, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, None]:
-    """The bevel by the rule, near the target also by the model; then the best first step of the guide."""
+def decide(task: Task, memory: Route, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, Route]:
+    """The way, the bevel, then the best first step of the guide."""
     belief = cast(Identified, estimate)  # METHOD below names its observer
+    route = _followed(task, memory, belief, rng)
+    due = float(belief.state.tip[0]) + 0.5 * task.scenario.setup.max_advance_mm
+    if any(turn <= due for turn in route.turns):
+        return _search(task, belief, route, rng, flip=True, why="bevel turned: on the way"), route.after(due)
     flip, why = bang_bang.decide(task, belief)
-    decision = _search(task, belief, rng, flip=flip, why=why)
-    if flip and _near(task, belief):
-        kept = _search(task, belief, rng, flip=False, why=f"{why}; the model keeps it")
+    decision = _search(task, belief, route, rng, flip=flip, why=why)
+    if flip:
+        kept = _search(task, belief, route, rng, flip=False, why=f"{why}; the model keeps it")
         decision = min(decision, kept, key=lambda choice: choice.cost)
-    return decision, memory
+    return decision, route
+
+
+def _followed(task: Task, route: Route, belief: Identified, rng: np.random.Generator) -> Route:
+    """The route, found again if it is time, but for the horizon before the target."""
+    if float(belief.state.tip[0]) < route.renew_at or _near(task, belief):
+        return route
+    return renewed(task, belief, route, rng)
 
 
 def _near(task: Task, belief: Identified) -> bool:
@@ -51,26 +67,29 @@ def _near(task: Task, belief: Identified) -> bool:
     return travel_left(task.scenario, task.plan, belief.state) <= reach + 1e-9
 
 
-def _ahead(task: Task, belief: Identified, *, flip: bool) -> Ahead:
-    settings, most = task.scenario.control.adaptive_mpc, task.scenario.setup.max_advance_mm
+def _ahead(task: Task, belief: Identified, route: Route, *, flip: bool) -> Ahead:
+    settings, setup = task.scenario.control.adaptive_mpc, task.scenario.setup
     left = travel_left(task.scenario, task.plan, belief.state)
-    steps = max(1, min(settings.horizon, int(np.ceil(left / most - 1e-9))))
-    advance = np.diff(np.minimum(np.arange(steps + 1) * most, left))
+    steps = max(1, min(settings.horizon, int(np.ceil(left / setup.max_advance_mm - 1e-9))))
+    advance = np.diff(np.minimum(np.arange(steps + 1) * setup.max_advance_mm, left))
     depth = float(belief.state.tip[0]) + np.append(0.0, np.cumsum(advance))
-    planned = [np.interp(depth, task.plan.tips[:, 0], task.plan.tips[:, k]) for k in (1, 2)]
-    path, weight = np.stack(planned, axis=1)[1:], np.ones(steps)
+    path = np.stack([np.interp(depth[1:], route.depth, route.tips[:, k]) for k in (0, 1)], axis=1)
+    weight = np.ones(steps)
     if _near(task, belief):
         path[-1, 0], weight[-1] = task.plan.target[1], settings.target_weight
     path[:, 0] -= belief.off_axis(-belief.state.bevel if flip else belief.state.bevel)
-    guide = np.diff(np.interp(depth, task.plan.tips[:, 0], task.plan.guide))
+    guide = np.diff(np.interp(depth, route.depth, route.guide))
     pieces = min(settings.pieces, steps)
-    return Ahead(advance, np.arange(steps) * pieces // steps, path, guide, weight, flip)
+    base = planned_base(setup, task.plan, belief.state, depth[1:])
+    return Ahead(advance, np.arange(steps) * pieces // steps, path, guide, base, weight, flip)
 
 
-def _search(task: Task, belief: Identified, rng: np.random.Generator, *, flip: bool, why: str) -> Decision:
+def _search(
+    task: Task, belief: Identified, route: Route, rng: np.random.Generator, *, flip: bool, why: str
+) -> Decision:
     """Cross-entropy over the guide's step in each piece."""
     setup, settings = task.scenario.setup, task.scenario.control.adaptive_mpc
-    ahead = _ahead(task, belief, flip=flip)
+    ahead = _ahead(task, belief, route, flip=flip)
     pieces = int(ahead.piece[-1]) + 1
     most = setup.max_guide_step_mm if setup.has_guide else 0.0
     mean = np.array([ahead.guide[ahead.piece == k].mean() for k in range(pieces)])
@@ -100,6 +119,7 @@ def _controls(task: Task, belief: Identified, ahead: Ahead, z: Floats) -> Floats
     guide = np.clip(belief.state.guide + np.cumsum(steps, axis=1), -reach, reach)
     controls = np.zeros((len(z), ahead.advance.size, 5))
     controls[:, :, 0] = ahead.advance
+    controls[:, :, 1:3] = ahead.base
     controls[:, :, 3] = np.diff(guide, axis=1, prepend=belief.state.guide)
     controls[:, :, 4] = -1.0
     controls[:, 0, 4] = 1.0 if ahead.flip else -1.0
@@ -107,7 +127,7 @@ def _controls(task: Task, belief: Identified, ahead: Ahead, z: Floats) -> Floats
 
 
 def _cost(task: Task, belief: Identified, ahead: Ahead, z: Floats) -> Floats:
-    """Weighted squared deviation from the path (mm²), departure from the plan's guide steps, tissue energy."""
+    """Weighted squared deviation from the path (mm²), departure from the route's guide steps, tissue energy."""
     settings = task.scenario.control.adaptive_mpc
     controls = _controls(task, belief, ahead, z)
     tips, energy, converged = belief.simulator.rollout(belief.state, controls)
@@ -122,6 +142,6 @@ METHOD = Method(
     "adaptive-mpc",
     "cross-entropy MPC on a model that learns start, needle and tissue from the readings",
     Identification(),
-    begin=lambda _task: None,
+    begin=lambda task: of_plan(task.plan),
     decide=decide,
 )
