@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow bench robustness accuracy lint clean
+.PHONY: help setup demo test slow bench robustness validation accuracy controllers tuning lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -40,8 +40,21 @@ bench: setup  ## measure speed
 robustness: setup  ## 100,000 random insertions without a failure (long)
 	$(BIN)/python studies/robustness.py
 
-accuracy: setup  ## the 15 targets of the paper, closed loop against open loop (long)
-	$(BIN)/python studies/accuracy.py
+validation: setup  ## hold the exact plant against closed forms and a second solver; writes docs/validation.md
+	$(BIN)/python studies/validation.py
+
+accuracy: setup  ## the paper's experiment, 150 insertions with the exact plant, and its report (DIR=runs/accuracy)
+	$(BIN)/flexneedle study phantom --out $(or $(DIR),runs/accuracy)
+	$(BIN)/flexneedle report $(or $(DIR),runs/accuracy)
+
+controllers: setup  ## every controller on the same phantoms, and the report (DIR=runs/controllers; long)
+	$(BIN)/flexneedle study controllers --out $(or $(DIR),runs/controllers)
+	$(BIN)/flexneedle report $(or $(DIR),runs/controllers)
+
+tuning: setup  ## tune each controller with 200 insertions; writes docs/tuning (long)
+	for method in adaptive-mpc offset-free ce-mpc bevel-only resolved-rate broyden-mpc; do \
+	  $(BIN)/python studies/tune.py $$method || exit 1; \
+	done
 
 slow: setup  ## the long tests: a thousand insertions against the reference
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)

@@ -85,6 +85,14 @@ SPACES: dict[str, dict[str, Range]] = {
         "control.broyden_mpc.guide_effect": Range(0.3, 2.0),
     },
     "ce-mpc": CROSS_ENTROPY,
+    # Less weight on the tissue's energy means less error: those weights are set by what the tissue may take.
+    "adaptive-mpc": {
+        "control.adaptive_mpc.target_weight": Range(10.0, 90.0),
+        "control.adaptive_mpc.orientation_weight_mm": Range(2.0, 12.5),
+        "control.adaptive_mpc.guide_weight": Range(0.0125, 0.2),
+        "control.adaptive_mpc.model_sd_mm": Range(0.0075, 0.03),
+        "control.adaptive_mpc.route_turn_weight_mm": Range(0.00125, 0.02),
+    },
     "offset-free": CROSS_ENTROPY | {"control.load_gain": Range(0.1, 1.0, log=False)},
 }
 

@@ -322,10 +322,10 @@ def test_replayed_readings_before_another_phantom_give_the_same_commands(plan, r
 
 
 def test_other_readings_give_other_commands(plan, real):
-    """The replay would notice a change: one reading off by 0.3 mm alters the commands that follow."""
+    """The replay would notice a change: one reading off by 1.5 mm alters the commands that follow."""
     done, tank = real
     at = 40
-    changed = [replace(tank.tape[at][-1], y=tank.tape[at][-1].y + 0.3)]
+    changed = [replace(tank.tape[at][-1], y=tank.tape[at][-1].y + 1.5)]
     tape = [*tank.tape[:at], (*tank.tape[at][:-1], *changed), *tank.tape[at + 1 :]]
     other = run(plan, Stage(loop(tape), tank.applied[: at + 1]).rig())
     commands = [[period.command for period in one.periods] for one in (done, other)]

@@ -7,6 +7,7 @@ import pytest
 
 from flexneedle import Control, Simulator, load_scenario
 from flexneedle.mechanics import needle as nd
+from flexneedle.simulator import Learnt
 from reference import closed_forms as exact
 from reference.cases import EI, FOUNDATION, LENGTH_MM, insert_to, long_beam, repeat
 
@@ -14,12 +15,17 @@ PHANTOM = load_scenario("phantom")
 BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
 STIFFNESS = PHANTOM.needle.bending_stiffness
 LENGTH = PHANTOM.needle.length_mm
-ONES = (1.0, 1.0)
+
+
+def learnt(stiffness=(1.0, 1.0), shift=None, **others):
+    """What is believed of the tissue, no boundary displaced if nothing is said about it."""
+    still = np.zeros(len(stiffness) - 1)
+    return Learnt(still if shift is None else np.array(shift), np.array(stiffness), **others)
 
 
 def bent(scenario, bend, bevel=1):
     """The needle at the start, with its natural bend."""
-    simulator = Simulator(scenario, threads=1).adapted(ONES, 1.0, bend)
+    simulator = Simulator(scenario, threads=1).adapted(learnt(bend=bend))
     return simulator, simulator.step(simulator.start(bevel), Control())
 
 
@@ -88,7 +94,7 @@ def test_a_bent_end_in_tissue_is_the_beam_on_springs_with_an_end_moment():
         simulator = Simulator(scenario, threads=1)
         state = simulator.step(simulator.start(), Control(db_x=depth + 1.0))
         length = scenario.needle.length_mm
-        state = simulator.adapted((1.0,), 1.0, 0.5 * kappa * length**2).step(state, Control())
+        state = simulator.adapted(learnt((1.0,), bend=0.5 * kappa * length**2)).step(state, Control())
         errors.append(
             [
                 state.tip[1] / (2.0 * EI * kappa * beta**2 / FOUNDATION) - 1.0,
@@ -102,7 +108,7 @@ def test_a_bent_end_in_tissue_is_the_beam_on_springs_with_an_end_moment():
 
 def test_bevel_and_bend_mirror_together():
     """Through the skin and into tissue, with guide motion and a turn."""
-    here = Simulator(PHANTOM, threads=1).adapted((1.3, 0.8), 1.4, 0.6)
+    here = Simulator(PHANTOM, threads=1).adapted(learnt((1.3, 0.8), (1.6,), bevel=1.4, bend=0.6))
     states = {}
     for side in (1, -1):
         state = here.start(side)
@@ -124,7 +130,8 @@ def test_factors_on_modulus_and_bevel_are_those_of_another_scenario():
             "needle.bevel.offset_mm": 4.0 * 0.4,
         }
     )  # fmt: skip
-    adapted, expected = Simulator(PHANTOM, threads=1).adapted((1.7, 0.6), 0.4), Simulator(other, threads=1)
+    adapted = Simulator(PHANTOM, threads=1).adapted(learnt((1.7, 0.6), bevel=0.4))
+    expected = Simulator(other, threads=1)
     one, two = insert_to(adapted, 27.0), insert_to(expected, 27.0)
     for control in (Control(db_x=1.0, dg_y=0.3, flip=True), Control(db_x=0.4, dg_y=-0.2)):
         one, two = adapted.step(one, control), expected.step(two, control)
@@ -136,15 +143,72 @@ def test_factors_on_modulus_and_bevel_are_those_of_another_scenario():
     )
 
 
-def test_factors_of_one_and_no_bend_are_the_simulator_itself():
+def agree(one, two, atol=1e-9):
+    """The same insertion, whatever the scenario is called."""
+    np.testing.assert_allclose(one.nodes, two.nodes, atol=atol)
+    np.testing.assert_allclose(one.contacts.rest_y, two.contacts.rest_y, atol=atol)
+    assert one.strain_energy == pytest.approx(two.strain_energy, rel=1e-7)
+
+
+def turned(state, simulator):
+    """A few steps on, with a turn and guide motion."""
+    for control in (Control(db_x=1.0, dg_y=0.3, flip=True), Control(db_x=0.4, dg_y=-0.2), Control(db_x=1.0)):
+        state = simulator.step(state, control)
+    return state
+
+
+@pytest.mark.parametrize("shift", [3.0, -2.0])
+def test_a_displaced_boundary_is_that_of_another_scenario(shift):
+    """By whole intervals, so that the contact points of both stand at the same places."""
+    other = Simulator(PHANTOM.with_values({"tissue.0.thickness_mm": 20.0 + shift}), threads=1)
+    adapted = Simulator(PHANTOM, threads=1).adapted(learnt(shift=(shift,)))
+    agree(turned(insert_to(adapted, 27.0), adapted), turned(insert_to(other, 27.0), other))
+
+
+def test_a_boundary_displaced_by_part_of_an_interval_is_nearly_that_of_another_scenario():
+    """There the interval is divided: a hundredth of what the shift does."""
+    other = Simulator(PHANTOM.with_values({"tissue.0.thickness_mm": 21.4}), threads=1)
     simulator = Simulator(PHANTOM, threads=1)
-    assert insert_to(simulator.adapted(ONES), 12.0) == insert_to(simulator, 12.0)
+    adapted = simulator.adapted(learnt(shift=(1.4,)))
+    ends = [turned(insert_to(one, 35.0), one).tip[1] for one in (adapted, other, simulator)]
+    assert abs(ends[2] - ends[1]) > 5e-3
+    assert abs(ends[0] - ends[1]) < 0.02 * abs(ends[2] - ends[1])
+
+
+def test_a_boundary_past_the_skin_leaves_the_layer_below_alone():
+    adapted = Simulator(PHANTOM, threads=1).adapted(learnt((5.0, 1.0), (-30.0,)))
+    other = Simulator(PHANTOM.with_values({"tissue.0.shear_modulus_kpa": 3.63}), threads=1)
+    agree(turned(insert_to(adapted, 27.0), adapted), turned(insert_to(other, 27.0), other))
+
+
+def test_cells_along_the_depth_are_the_layers_of_another_scenario():
+    factors = (1.5, 0.6, 1.2, 0.4, 1.7, 0.9, 1.3, 0.8, 1.1)  # of 4 mm each, the last goes on
+    layers = PHANTOM.values()["tissue"]
+    cells = [
+        {**layers[k >= 5], "name": str(k), "thickness_mm": 4.0,
+         "shear_modulus_kpa": layers[k >= 5]["shear_modulus_kpa"] * factor}
+        for k, factor in enumerate(factors)
+    ]  # fmt: skip
+    other = Simulator(PHANTOM.with_values({"tissue": cells}), threads=1)
+    adapted = Simulator(PHANTOM, threads=1).adapted(learnt(cell=4.0, variation=np.array(factors)))
+    agree(turned(insert_to(adapted, 37.0), adapted), turned(insert_to(other, 37.0), other))
+
+
+@pytest.mark.parametrize("cell", [1.0, 2.5, 7.0])
+def test_factors_of_one_and_no_bend_are_the_simulator_itself(cell):
+    """Through the boundary, to 1e-12."""
+    simulator = Simulator(PHANTOM, threads=1)
+    same = simulator.adapted(learnt(cell=cell, variation=np.ones(30)))
+    one, two = (turned(insert_to(by, 22.0), by) for by in (simulator, same))
+    np.testing.assert_allclose(one.nodes, two.nodes, atol=1e-12, rtol=1e-12)
+    np.testing.assert_allclose(one.scalars, two.scalars, atol=1e-11, rtol=1e-12)
+    assert one.strain_energy == pytest.approx(two.strain_energy, rel=1e-12)
 
 
 def test_adapting_leaves_the_simulator_as_it_was():
     simulator = Simulator(PHANTOM, threads=2)
     before = insert_to(simulator, 12.0)
-    assert simulator.adapted((3.0, 3.0), 0.0, 2.0).threads == 2
+    assert simulator.adapted(learnt((3.0, 3.0), (1.0,), bevel=0.0, bend=2.0)).threads == 2
     assert insert_to(simulator, 12.0) == before
 
 
@@ -161,18 +225,16 @@ def rows_of(count):
 
 @pytest.mark.parametrize("bend", [0.0, 0.5])
 def test_a_replay_is_repeated_steps_bit_for_bit(bend):
-    """Each with its own factor on the bevel offset; from the start and from the midst."""
-    simulator = Simulator(PHANTOM, threads=1)
-    rows, factors = rows_of(80), np.linspace(0.2, 1.8, 80)
+    """From the start and from the midst."""
+    simulator, rows = Simulator(PHANTOM, threads=1), rows_of(80)
     assert (rows[:, 4] > 0).sum() > 3
-    learnt = simulator.adapted((1.2, 0.7), 1.0, bend)
+    believed = learnt((1.2, 0.7), (1.3,), cell=2.5, variation=np.linspace(0.5, 1.5, 12), bevel=1.4, bend=bend)
+    adapted = simulator.adapted(believed)
     state = simulator.start().believing(base_y=0.3, base_turn=-1e-3)
     for first, last in ((0, 50), (50, 80)):
-        after, tips = learnt.replay(state, rows[first:last], factors[first:last])
+        after, tips = adapted.replay(state, rows[first:last])
         for k in range(first, last):
-            state = simulator.adapted((1.2, 0.7), float(factors[k]), bend).step(
-                state, Control.from_row(rows[k])
-            )
+            state = adapted.step(state, Control.from_row(rows[k]))
             np.testing.assert_array_equal(tips[k - first], state.tip)
         assert after == state
         assert after.strain_energy == state.strain_energy
@@ -181,10 +243,10 @@ def test_a_replay_is_repeated_steps_bit_for_bit(bend):
 
 def test_a_replay_changes_neither_state_nor_controls():
     simulator = Simulator(PHANTOM, threads=1)
-    state, rows, factors = insert_to(simulator, 5.0), rows_of(10), np.ones(10)
+    state, rows = insert_to(simulator, 5.0), rows_of(10)
     before = state.scalars.copy(), state.rest.copy(), state.compression.copy(), rows.copy()
-    one, _ = simulator.replay(state, rows, factors)
-    again, _ = simulator.replay(state, rows, factors)
+    one, _ = simulator.replay(state, rows)
+    again, _ = simulator.replay(state, rows)
     assert one == again
     for kept, now in zip(before, (state.scalars, state.rest, state.compression, rows), strict=True):
         np.testing.assert_array_equal(kept, now)
@@ -193,7 +255,7 @@ def test_a_replay_changes_neither_state_nor_controls():
 
 def test_a_replay_takes_steps_longer_than_a_command():
     simulator = Simulator(PHANTOM, threads=1)
-    state, tips = simulator.replay(simulator.start(), [[20.0, 0.0, 0.0, 1.0, -1.0]], np.ones(1))
+    state, tips = simulator.replay(simulator.start(), [[20.0, 0.0, 0.0, 1.0, -1.0]])
     assert state.converged
     np.testing.assert_array_equal(tips[0], state.tip)
     assert tips[0, 0] == pytest.approx(-8.5, abs=0.01)
@@ -201,7 +263,7 @@ def test_a_replay_takes_steps_longer_than_a_command():
 
 def test_a_pickled_simulator_keeps_what_it_learnt():
     """And its threads, after they were used."""
-    simulator = Simulator(PHANTOM, threads=2).adapted((1.5, 0.5), 1.3, 0.4)
+    simulator = Simulator(PHANTOM, threads=2).adapted(learnt((1.5, 0.5), (2.2,), bevel=1.3, bend=0.4))
     state = insert_to(simulator, 10.0)
     rows = np.tile(rows_of(30), (16, 1, 1))
     tips = simulator.rollout(state, rows).tips

@@ -125,27 +125,31 @@ def adapted(model: Model, learnt: Learnt) -> Model:
     tops = np.append(-np.inf, bottoms)
     layer = ends.searchsorted(tops, side="right")
     factor = learnt.stiffness[layer] * learnt.variation[cells.searchsorted(tops, side="right")]
-    scales = np.stack([old.force, old.energy])[:, layer] * factor
+    scales = old.force[layer] * factor, old.energy[layer] * factor
     at = ends.searchsorted(nodes.x, side="right")
     contact = nodes.kind == CONTACT
-    force, energy = np.where(contact, _integrals(bottoms, scales, nodes), (nodes.force, nodes.energy))
-    alpha, height = np.where(contact, np.stack([old.alpha, old.height])[:, at], (nodes.alpha, nodes.height))
+    force, energy = (_integral(bottoms, scale, nodes) for scale in scales)
     return model._replace(
         bevel_offset=model.bevel_offset * learnt.bevel,
-        nodes=nodes._replace(alpha=alpha, height=height, force=force, energy=energy),
+        nodes=nodes._replace(
+            alpha=np.where(contact, old.alpha[at], nodes.alpha),
+            height=np.where(contact, old.height[at], nodes.height),
+            force=np.where(contact, force, nodes.force),
+            energy=np.where(contact, energy, nodes.energy),
+        ),
         layers=Layers(np.append(bottoms, np.inf), old.alpha[layer], old.height[layer], scales[0], scales[1]),
         curvature=2.0 * learnt.bend / model.length**2,
     )
 
 
-def _integrals(bottoms: Floats, densities: Floats, nodes: Nodes) -> Floats:
-    """Integrals (2, n) along the intervals of the contact points of densities (2, l) constant in each layer."""
+def _integral(bottoms: Floats, density: Floats, nodes: Nodes) -> Floats:
+    """Integral (n,) along the intervals of the contact points of a density (l,), constant in each layer."""
     tops = np.append(0.0, bottoms)
-    before = np.concatenate([np.zeros((2, 1)), np.cumsum(densities[:, :-1] * np.diff(tops), axis=1)], axis=1)
+    before = np.append(0.0, np.cumsum(density[:-1] * np.diff(tops)))
 
     def up_to(x: Floats) -> Floats:
         inside = bottoms.searchsorted(x, side="right")
-        total: Floats = before[:, inside] + densities[:, inside] * (x - tops[inside])
+        total: Floats = before[inside] + density[inside] * (x - tops[inside])
         return total
 
     return up_to(nodes.x + nodes.reach) - up_to(nodes.x - nodes.reach)
