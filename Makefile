@@ -52,7 +52,7 @@ controllers: setup  ## every controller on the same phantoms, and the report (DI
 	$(BIN)/flexneedle report $(or $(DIR),runs/controllers)
 
 tuning: setup  ## tune each controller with 200 insertions; writes docs/tuning (long)
-	for method in adaptive-mpc offset-free ce-mpc bevel-only resolved-rate broyden-mpc; do \
+	for method in adaptive-mpc ce-mpc bevel-only resolved-rate broyden-mpc; do \
 	  $(BIN)/python studies/tune.py $$method || exit 1; \
 	done
 

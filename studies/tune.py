@@ -58,15 +58,6 @@ class Range:
 
 BAND = Range(0.0, 1.0, log=False)
 CURVATURE = Range(0.05, 3.0)
-CROSS_ENTROPY = {
-    "control.samples": Range(16, 128, whole=True),
-    "control.horizon": Range(2, 16, whole=True),
-    "control.orientation_weight_mm": Range(0.3, 20.0),
-    "control.guide_weight": Range(1e-3, 1.0),
-    "control.energy_weight_per_mj": Range(0.1, 20.0),
-    "control.flip_dead_band": BAND,
-    "control.curvature_per_m": CURVATURE,
-}
 SPACES: dict[str, dict[str, Range]] = {
     "bevel-only": {
         "control.bevel_only.curvature_per_m": CURVATURE,
@@ -84,7 +75,15 @@ SPACES: dict[str, dict[str, Range]] = {
         "control.broyden_mpc.guide_weight": Range(1e-4, 1.0),
         "control.broyden_mpc.guide_effect": Range(0.3, 2.0),
     },
-    "ce-mpc": CROSS_ENTROPY,
+    "ce-mpc": {
+        "control.samples": Range(16, 128, whole=True),
+        "control.horizon": Range(2, 16, whole=True),
+        "control.orientation_weight_mm": Range(0.3, 20.0),
+        "control.guide_weight": Range(1e-3, 1.0),
+        "control.energy_weight_per_mj": Range(0.1, 20.0),
+        "control.flip_dead_band": BAND,
+        "control.curvature_per_m": CURVATURE,
+    },
     # Less weight on the tissue's energy means less error: those weights are set by what the tissue may take.
     "adaptive-mpc": {
         "control.adaptive_mpc.target_weight": Range(10.0, 90.0),
@@ -93,7 +92,6 @@ SPACES: dict[str, dict[str, Range]] = {
         "control.adaptive_mpc.model_sd_mm": Range(0.0075, 0.03),
         "control.adaptive_mpc.route_turn_weight_mm": Range(0.00125, 0.02),
     },
-    "offset-free": CROSS_ENTROPY | {"control.load_gain": Range(0.1, 1.0, log=False)},
 }
 
 

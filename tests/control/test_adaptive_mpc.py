@@ -89,7 +89,7 @@ def test_the_bevel_follows_the_rule_if_the_model_agrees_and_in_air_it_stays(quic
         state = Simulator(PHANTOM).step(along(quick_plan, steps), Control(flip=turned))
         away, belief = aimed(quick_plan, state, 2.0 * side), belief_of(state)
         task = Task(belief.nominal, away)
-        flip, why = bang_bang.decide(task, belief)
+        flip, why = bang_bang.decide(task, belief, PHANTOM.control.adaptive_mpc)
         assert flip is (side != state.bevel and not in_air)
         decision, rng = decide(away, belief), np.random.default_rng(0)
         expected = [
@@ -135,6 +135,17 @@ def test_a_turn_takes_the_run_out_over_to_the_other_side(quick_plan, monkeypatch
     seen = decide(straight(quick_plan, (float(x), float(y) - 0.5)), replace(belief, parameters=parameters))
     assert (plain.command[4], seen.command[4]) == (1, 1)
     assert seen.cost == pytest.approx(plain.cost, rel=1e-6)
+
+
+def test_the_rule_has_its_own_settings(quick_plan, along):
+    """Its dead band is that of this controller, not that of `control`."""
+    state = along(quick_plan, 50)
+    away = aimed(quick_plan, state, -0.6 * state.bevel)
+    for band, wanted in ((0.0, True), (1.0, False)):
+        keys = {"curvature_per_m": 4.0, "flip_dead_band": band}
+        scenario = QUICK.with_values({f"control.adaptive_mpc.{key}": value for key, value in keys.items()})
+        why = decide(away, belief_of(state, scenario)).why
+        assert why.startswith("bevel turned" if wanted else "bevel kept")
 
 
 def test_a_rule_that_keeps_the_bevel_is_not_asked_again(quick_plan, along, monkeypatch):
@@ -369,7 +380,7 @@ def test_a_way_that_was_found_is_the_one_that_is_followed(quick_plan, along, mon
     overdue = replace(on_plan(quick_plan, belief_of(state)), renew_at=0.0)
     decision, after = decided(quick_plan, belief_of(state), way=overdue)
     assert len(sought) == 1
-    assert after is shifted
+    np.testing.assert_array_equal(after.tips, shifted.tips)
     other = replace(quick_plan, tips=np.add(quick_plan.tips, [0.0, 0.3, 0.0]))
     assert decision.command == pytest.approx(decide(other, belief_of(state)).command, abs=1e-12)
     assert decision.command[3] > decide(quick_plan, belief_of(state)).command[3] + 0.01
@@ -391,6 +402,17 @@ def test_turns_on_the_way_are_made_once_at_their_depth(quick_plan, along, monkey
     assert way.turns == (30.0,)
     np.testing.assert_allclose(depths, [6.3, 7.9, 15.6], atol=0.5 + 1e-6)
     assert whys == ["bevel turned: on the way"] * 3
+
+
+def test_two_turns_within_a_step_are_none(quick_plan, along, monkeypatch):
+    """They would bring the bevel back to its side, and both are over."""
+    monkeypatch.setattr(bang_bang, "decide", lambda *_: (False, "bevel kept"))
+    belief = belief_of(along(quick_plan, 32, QUICK), QUICK)
+    depth = float(belief.state.tip[0])
+    way = replace(on_plan(quick_plan, belief), turns=(depth + 0.1, depth + 0.3, depth + 20.0))
+    decision, after = decided(quick_plan, belief, way=way)
+    assert decision.command[4] < 0.0
+    assert after.turns == (depth + 20.0,)
 
 
 def test_turns_of_the_plan_in_air_are_made_as_planned(quick_plan):

@@ -243,9 +243,7 @@ def test_without_fitting_the_start_the_measured_tip_is_held_in_air_too():
     assert corrected.move(AHEAD, 1.0, 2.0).tip[1] == pytest.approx(0.0, abs=1e-9)  # released
 
 
-@pytest.mark.parametrize(
-    ("name", "learns"), [("ce-mpc", False), ("offset-free", True), ("resolved-rate", True)]
-)
+@pytest.mark.parametrize(("name", "learns"), [("ce-mpc", False), ("resolved-rate", True)])
 def test_the_papers_controller_releases_the_measured_tip_and_learns_nothing(name, learns):
     """In air no base offset, in tissue no load; the others keep both."""
     simulator = Simulator(PHANTOM)

@@ -118,24 +118,24 @@ def test_it_is_that_of_the_learnt_model(quick_plan, along):
 
 
 def test_its_places_lie_on_the_way_of_the_needle(quick_plan, along):
-    """Those of steps of two millimetres, the side of the bevel taken into account."""
-    belief = running_out(belief_of(along(quick_plan, 40), residual=-0.05), 0.2)
-    way = found(quick_plan, belief)
-    state, bevel = belief.state, belief.state.bevel
-    for k, (y, turn) in enumerate(way.tips[1:]):
-        flip = float(way.depth[k]) in way.turns
-        bevel = -bevel if flip else bevel
-        row = [
-            way.depth[k + 1] - way.depth[k],
-            0.0,
-            0.0,
-            way.guide[k + 1] - way.guide[k],
-            1.0 if flip else -1.0,
-        ]
-        state, _ = belief.simulator.replay(state, [row])
-        assert (y, turn) == pytest.approx((state.tip[1] + 0.2 * bevel - 0.05, state.tip[2]), abs=1e-9)
-    assert np.diff(way.depth).max() <= 2.0 + 1e-9
-    np.testing.assert_allclose(np.diff(way.depth), np.diff(way.depth)[0])
+    """Those of even steps of two millimetres; a turn is made before its step, at the depth that is told."""
+    cheap = PHANTOM.with_values({"control.adaptive_mpc.route_turn_weight_mm": 0.0})
+    belief = running_out(belief_of(along(quick_plan, 35), cheap, residual=-0.05), 0.2)
+    turned = 0
+    for seed, side in ((0, 10.0), (0, -10.0), (1, 5.0)):
+        way = found(replace(quick_plan, target=(40.0, side)), belief, seed)
+        state = belief.state
+        for k, (y, turn) in enumerate(way.tips[1:]):
+            flip = 1.0 if float(way.depth[k]) in way.turns else -1.0
+            advance, guide = np.diff(way.depth)[k], np.diff(way.guide)[k]
+            state, _ = belief.simulator.replay(state, [[advance, 0.0, 0.0, guide, flip]])
+            assert (y, turn) == pytest.approx(
+                (state.tip[1] + 0.2 * state.bevel - 0.05, state.tip[2]), abs=1e-9
+            )
+        turned += len(way.turns)
+        assert np.diff(way.depth).max() <= 2.0 + 1e-9
+        np.testing.assert_allclose(np.diff(way.depth), np.diff(way.depth)[0])
+    assert turned > 0
 
 
 @given(

@@ -14,7 +14,7 @@ from flexneedle.plot import save
 from flexneedle.plot import studies as plots
 
 TARGETS = np.array([(depth, aside) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for aside in (-5.0, 0.0, 5.0)])
-NAMES = ("offset-free", "open-loop", "bevel-only", "resolved-rate", "broyden-mpc", "ce-mpc", "another one")
+NAMES = ("adaptive-mpc", "open-loop", "bevel-only", "resolved-rate", "broyden-mpc", "ce-mpc", "another one")
 
 
 def lognormal(middle, count=150, seed=0):

@@ -39,7 +39,10 @@ def test_inner_units_are_mm_newton_megapascal_radian_second():
     assert PHANTOM.tissue[0].shear_modulus == pytest.approx(1.82e-3)
     assert PHANTOM.setup.max_base_turn_step == pytest.approx(5e-3)
     assert PHANTOM.plan.elite_count == 16
-    assert PHANTOM.control.curvature == pytest.approx(5e-4)
+    for key in ("control", "control.adaptive_mpc", "control.bevel_only", "control.resolved_rate"):
+        changed = PHANTOM.with_values({f"{key}.curvature_per_m": 0.7}).control
+        rule = getattr(changed, key.removeprefix("control."), changed)
+        assert rule.curvature == pytest.approx(7e-4)
     assert PHANTOM.tracker.period == 0.025
     assert PHANTOM.phantom.start_angle_sd == pytest.approx(3e-3)
     assert PHANTOM.with_values({"plan.base_turn_sigma_mrad": 2.0}).plan.base_turn_sigma == pytest.approx(2e-3)

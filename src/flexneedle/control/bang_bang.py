@@ -1,6 +1,7 @@
 """The bang-bang rule for the bevel: two kinematic paths, the nearer to the target wins (paper eq. 14 and 15)."""
 
 import math
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,16 +48,29 @@ def wants_flip(
     )
 
 
-def decide(task: Task, estimate: Estimate) -> tuple[bool, str]:
+class Rule(Protocol):
+    """A controller's settings of the rule."""
+
+    @property
+    def curvature(self) -> float:
+        """κ, 1/mm."""
+        ...
+
+    @property
+    def flip_dead_band(self) -> float:
+        """As in `wants_flip`."""
+        ...
+
+
+def decide(task: Task, estimate: Estimate, rule: Rule) -> tuple[bool, str]:
     """`wants_flip` towards the plan's target, from the believed tip. In air the bevel has no effect and stays."""
     if estimate.tip[0] <= 0.0:
         return False, "in air"
-    control = task.scenario.control
     return wants_flip(
         estimate.tip,
         estimate.state.bevel,
-        control.curvature,
+        rule.curvature,
         task.plan.target,
-        control.flip_dead_band,
+        rule.flip_dead_band,
         _SURE * task.scenario.tracker.jitter_per_axis,
     )

@@ -276,6 +276,8 @@ def _improved(belief: Identified, readings: _Readings) -> Identified:
     weighted = jacobian.T / variance
     gradient = weighted @ readings.left(belief) - prior.precision @ (belief.parameters - prior.mean)
     step = np.linalg.solve(weighted @ jacobian + prior.precision, gradient)
+    if not np.isfinite(step).all():
+        return belief._with(belief.parameters)
     goal = np.clip(belief.parameters + step, *prior.bounds)
 
     def cost(other: Identified) -> float:
@@ -284,7 +286,7 @@ def _improved(belief: Identified, readings: _Readings) -> Identified:
     most, fitted = cost(belief), belief
     for share in _SHARES:
         fitted = belief._with(belief.parameters + share * (goal - belief.parameters))
-        if cost(fitted) <= most:
+        if fitted.state.converged and cost(fitted) <= most:
             break
     return fitted
 

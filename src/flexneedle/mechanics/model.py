@@ -116,7 +116,7 @@ class Learnt(NamedTuple):
 def adapted(model: Model, learnt: Learnt) -> Model:
     """The model with other constants, its contact points where they were.
 
-    A contact's force is that of the tissue along its interval; its law that of the layer at its middle.
+    A contact is as stiff as the tissue along its interval; its law is that of the layer at its middle.
     """
     old, nodes = model.layers, model.nodes
     ends = np.maximum.accumulate(np.maximum(0.0, old.end[:-1] + learnt.shift))
@@ -128,7 +128,9 @@ def adapted(model: Model, learnt: Learnt) -> Model:
     scales = old.force[layer] * factor, old.energy[layer] * factor
     at = ends.searchsorted(nodes.x, side="right")
     contact = nodes.kind == CONTACT
-    force, energy = (_integral(bottoms, scale, nodes) for scale in scales)
+    law = old.alpha / old.height  # a force scale times this is a stiffness, which adds up whatever the laws
+    force = _integral(bottoms, scales[0] * law[layer], nodes) / law[at]
+    energy = force * (old.energy / old.force)[at]
     return model._replace(
         bevel_offset=model.bevel_offset * learnt.bevel,
         nodes=nodes._replace(

@@ -26,11 +26,15 @@ class BevelOnly(BevelRule):
 class ResolvedRate(BevelRule):
     """Section `control.resolved_rate`: the guide follows the damped inverse of the model's Jacobian."""
 
-    gain: NonNegative = 1.0
+    curvature_per_m: NonNegative = 1.52
+    """κ of the two paths of the bang-bang rule."""
+    flip_dead_band: Fraction = 0.833
+    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
+    gain: NonNegative = 0.87
     """Share of the tip's predicted deviation that a control step is to remove."""
     damping: NonNegative = 0.03
     """λ of the damped least squares, as the tip's lateral motion for that of the guide."""
-    lookahead_mm: Positive = 5.0
+    lookahead_mm: Positive = 9.53
     """How far ahead of the tip its deviation is predicted, at most to the target depth."""
 
 
@@ -45,13 +49,17 @@ class BroydenMpc(Section):
     """Greatest lateral distance of the guide from the axis, if that of the setup is not smaller."""
     guide_weight: NonNegative = 0.01
     """Cost of a squared millimetre of a guide step, in mm² of the tip."""
-    guide_effect: NonNegative = 1.0
+    guide_effect: NonNegative = 0.508
     """The first Jacobian's lateral motion of the tip for that of the guide; for advance it is a straight line."""
 
 
-class AdaptiveMpc(Section):
+class AdaptiveMpc(BevelRule):
     """Section `control.adaptive_mpc`: `adaptive-mpc`, its search and the priors of what it identifies."""
 
+    curvature_per_m: NonNegative = 0.5
+    """κ of the two paths of the bang-bang rule."""
+    flip_dead_band: Fraction = 0.8
+    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
     samples: int = count(24, least=8, most=100_000)
     """Control sequences in an iteration of a period."""
     iterations: int = count(3, least=1, most=1_000)
@@ -72,9 +80,9 @@ class AdaptiveMpc(Section):
     """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
     route_mm: Positive = 8.0
     """Depth after which the way to the target is found again."""
-    route_samples: int = count(32, least=8, most=100_000)
+    route_samples: int = count(96, least=8, most=100_000)
     """Control sequences in an iteration of that."""
-    route_iterations: int = count(5, least=1, most=1_000)
+    route_iterations: int = count(8, least=1, most=1_000)
     """Iterations of it."""
     route_pieces: int = count(4, least=1, most=1_000)
     """Pieces of the way, each with one guide step and one side of the bevel."""

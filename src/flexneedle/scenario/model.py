@@ -47,7 +47,7 @@ class Scenario(Section):
                 layer_problems(self.tissue, self.needle.bevel),
                 target_problems(self.setup, self.target),
                 plan_problems(self.plan),
-                grid_problems(self.setup, self.contact, self.phantom, self.tracker),
+                grid_problems(self.setup, self.contact, self.phantom, self.tracker, self.control),
             )
         )
         return self

@@ -6,7 +6,6 @@ from flexneedle.control.methods import (
     bevel_only,
     broyden_mpc,
     ce_mpc,
-    offset_free,
     open_loop,
     resolved_rate,
 )
@@ -16,7 +15,7 @@ __all__ = ["DEFAULT", "METHODS", "method"]
 
 METHODS: dict[str, Method] = {
     module.METHOD.name: module.METHOD
-    for module in (adaptive_mpc, offset_free, ce_mpc, open_loop, bevel_only, resolved_rate, broyden_mpc)
+    for module in (adaptive_mpc, ce_mpc, open_loop, bevel_only, resolved_rate, broyden_mpc)
 }
 DEFAULT = adaptive_mpc.METHOD.name
 

@@ -44,9 +44,10 @@ def decide(task: Task, memory: Route, estimate: Estimate, rng: np.random.Generat
     belief = cast(Identified, estimate)  # METHOD below names its observer
     route = _followed(task, memory, belief, rng)
     due = float(belief.state.tip[0]) + 0.5 * task.scenario.setup.max_advance_mm
-    if any(turn <= due for turn in route.turns):
-        return _search(task, belief, route, rng, flip=True, why="bevel turned: on the way"), route.after(due)
-    flip, why = bang_bang.decide(task, belief)
+    turns, route = sum(turn <= due for turn in route.turns), route.after(due)
+    if turns % 2 == 1:
+        return _search(task, belief, route, rng, flip=True, why="bevel turned: on the way"), route
+    flip, why = bang_bang.decide(task, belief, task.scenario.control.adaptive_mpc)
     decision = _search(task, belief, route, rng, flip=flip, why=why)
     if flip:
         kept = _search(task, belief, route, rng, flip=False, why=f"{why}; the model keeps it")

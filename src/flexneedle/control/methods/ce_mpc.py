@@ -15,7 +15,7 @@ from flexneedle.control.observer import Beliefs
 
 def decide(task: Task, memory: None, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, None]:
     """Bevel by the rule, then the best first step of a short horizon along the plan."""
-    flip, why = bang_bang.decide(task, estimate)
+    flip, why = bang_bang.decide(task, estimate, task.scenario.control)
     choice = mpc.choose(estimate.simulator, task.plan, estimate.state, flip=flip, rng=rng)
     return Decision((*choice.steps, 1 if flip else -1), why, choice.cost, choice.spread), memory
 
