@@ -8,9 +8,9 @@ __all__ = ["AdaptiveMpc", "BevelOnly", "BevelRule", "BroydenMpc", "ResolvedRate"
 class BevelRule(Section):
     """The bang-bang rule of a controller that has its own."""
 
-    curvature_per_m: NonNegative = 0.962
+    curvature_per_m: NonNegative = 0.646
     """κ of the two paths of the bang-bang rule."""
-    flip_dead_band: Fraction = 0.722
+    flip_dead_band: Fraction = 0.875
     """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
 
     @property
@@ -26,15 +26,15 @@ class BevelOnly(BevelRule):
 class ResolvedRate(BevelRule):
     """Section `control.resolved_rate`: the guide follows the damped inverse of the model's Jacobian."""
 
-    curvature_per_m: NonNegative = 1.52
+    curvature_per_m: NonNegative = 0.0834
     """κ of the two paths of the bang-bang rule."""
-    flip_dead_band: Fraction = 0.833
+    flip_dead_band: Fraction = 0.625
     """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
-    gain: NonNegative = 0.87
+    gain: NonNegative = 1.38
     """Share of the tip's predicted deviation that a control step is to remove."""
-    damping: NonNegative = 0.03
+    damping: NonNegative = 0.0533
     """λ of the damped least squares, as the tip's lateral motion for that of the guide."""
-    lookahead_mm: Positive = 9.53
+    lookahead_mm: Positive = 10.0
     """How far ahead of the tip its deviation is predicted, at most to the target depth."""
 
 
@@ -47,9 +47,9 @@ class BroydenMpc(Section):
     """Steps that the linear MPC looks ahead."""
     max_guide_travel_mm: Positive = 6.0
     """Greatest lateral distance of the guide from the axis, if that of the setup is not smaller."""
-    guide_weight: NonNegative = 0.01
+    guide_weight: NonNegative = 0.000316
     """Cost of a squared millimetre of a guide step, in mm² of the tip."""
-    guide_effect: NonNegative = 0.508
+    guide_effect: NonNegative = 0.982
     """The first Jacobian's lateral motion of the tip for that of the guide; for advance it is a straight line."""
 
 
@@ -70,11 +70,11 @@ class AdaptiveMpc(BevelRule):
     """Pieces of the horizon, each with one guide step."""
     guide_sigma_mm: NonNegative = 0.2
     """First standard deviation of the guide step."""
-    target_weight: NonNegative = 30.0
+    target_weight: NonNegative = 68.4
     """Weight of the deviation at the target, against 1 on the way."""
-    orientation_weight_mm: NonNegative = 5.0
+    orientation_weight_mm: NonNegative = 2.51
     """Cost of an angle off the planned path, as a distance: 1 rad weighs as much as this."""
-    guide_weight: NonNegative = 0.05
+    guide_weight: NonNegative = 0.0707
     """Cost of a squared millimetre that a guide step departs from the plan's."""
     energy_weight_per_mj: NonNegative = 8.0
     """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
@@ -92,7 +92,7 @@ class AdaptiveMpc(BevelRule):
     """Cost of the tissue's strain energy at the target, against a mm of miss."""
     route_guide_weight_per_mm: NonNegative = 0.025
     """Cost of a squared guide step, against a mm of miss."""
-    route_turn_weight_mm: NonNegative = 0.005
+    route_turn_weight_mm: NonNegative = 0.0141
     """Cost of turning the bevel, against a mm of miss."""
     bend_sd_mm: NonNegative = 0.5
     """Prior of the natural bend of the needle, over its length: standard deviation."""
@@ -110,7 +110,7 @@ class AdaptiveMpc(BevelRule):
     """Length over which that is correlated."""
     cell_mm: Positive = 2.5
     """Length of the cells in which it is taken as constant."""
-    model_sd_mm: Positive = 0.015
+    model_sd_mm: Positive = 0.0126
     """Standard deviation of a reading's mean that no parameter explains."""
     residual_gain: Fraction = 0.4
     """Gain of the low-pass over what the fit leaves."""

@@ -80,25 +80,25 @@ class Plan(Section):
 class Control(Section):
     """Section `control`: the closed loop, and the search of `ce-mpc`; other controllers have theirs below."""
 
-    samples: int = count(23, least=2, most=100_000)
+    samples: int = count(21, least=2, most=100_000)
     """Control sequences in an iteration of a period."""
     iterations: int = count(4, least=1, most=1_000)
     """Iterations of a period."""
-    horizon: int = count(3, least=1, most=1_000)
+    horizon: int = count(7, least=1, most=1_000)
     """Steps that a period looks ahead."""
-    orientation_weight_mm: NonNegative = 1.54
+    orientation_weight_mm: NonNegative = 11.8
     """Cost of an angle off the planned path, as a distance: 1 rad weighs as much as this."""
-    curvature_per_m: NonNegative = 0.61
+    curvature_per_m: NonNegative = 0.232
     """κ of the two paths of the bang-bang rule."""
     load_gain: Fraction = 0.3
     """Share of a new tip load that is learnt in a period."""
     depth_tolerance_mm: Positive = 0.01
     """The insertion ends this close to the target depth."""
-    guide_weight: NonNegative = 0.00147
+    guide_weight: NonNegative = 0.075
     """Cost of a squared millimetre that a guide step departs from the plan's."""
-    energy_weight_per_mj: NonNegative = 0.242
+    energy_weight_per_mj: NonNegative = 2.74
     """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
-    flip_dead_band: Fraction = 0.389
+    flip_dead_band: Fraction = 0.875
     """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
     start_offset_sd_mm: NonNegative = 0.5
     """What the controller expects of the base clamp's lateral position: its standard deviation."""
