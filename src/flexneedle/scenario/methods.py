@@ -80,7 +80,7 @@ class AdaptiveMpc(BevelRule):
     """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
     route_mm: Positive = 8.0
     """Depth after which the way to the target is found again."""
-    route_samples: int = count(96, least=8, most=100_000)
+    route_samples: int = count(64, least=8, most=100_000)
     """Control sequences in an iteration of that."""
     route_iterations: int = count(8, least=1, most=1_000)
     """Iterations of it."""
