@@ -21,8 +21,9 @@ _HERE = Path(__file__).parent
 def _cache_folder(home: Path) -> str:
     """The folder for the exact sources of `home` and here: under NUMBA_CACHE_DIR, beside the code, or the user's."""
     digest = hashlib.sha256()
-    for source in sorted({*_HERE.glob("*.py"), *home.glob("*.py")}):
-        digest.update(source.read_bytes())
+    for folder in dict.fromkeys((_HERE, home)):  # in this order, wherever they lie
+        for source in sorted(folder.glob("*.py")):
+            digest.update(source.read_bytes())
     beside = home / "__pycache__"
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "flexneedle"
     writable = os.access(beside if beside.exists() else home, os.W_OK)
