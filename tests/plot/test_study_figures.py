@@ -232,7 +232,10 @@ def test_targets_that_are_many_are_laid_on_one_another():
 def test_unknown_tips_are_left_out():
     panel = target_panel(unfinished=(0,))
     panel.tips[0] = np.nan
-    plots.targeting_figure([panel]).canvas.draw()
+    drawn = [dot.get_offsets() for ax in plots.targeting_figure([panel]).axes for dot in dots(ax, "true tip")]
+    places = np.concatenate([np.ma.filled(offsets, np.nan) for offsets in drawn])
+    assert len(places) > 0
+    assert np.isfinite(places).all(axis=1).sum() == len(drawn) * (len(panel.tips) - 1)
 
 
 def test_rows_show_quartiles_median_mean_and_95_percent():

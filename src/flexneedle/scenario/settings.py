@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from .fields import Fraction, NonNegative, NonNegativeRange, Positive, PositiveRange, Section, count
-from .methods import AdaptiveMpc, BevelOnly, BroydenMpc, ResolvedRate
+from .methods import AdaptiveMpc, BevelOnly, BevelRule, BroydenMpc, ResolvedRate
 
 __all__ = ["Control", "Phantom", "Plan", "Target"]
 
@@ -77,7 +77,7 @@ class Plan(Section):
         return 1e-3 * self.base_turn_sigma_mrad
 
 
-class Control(Section):
+class Control(BevelRule):
     """Section `control`: the closed loop, and the search of `ce-mpc`; other controllers have theirs below."""
 
     samples: int = count(21, least=2, most=100_000)
@@ -114,11 +114,6 @@ class Control(Section):
     bevel_only: BevelOnly = BevelOnly()
     resolved_rate: ResolvedRate = ResolvedRate()
     broyden_mpc: BroydenMpc = BroydenMpc()
-
-    @property
-    def curvature(self) -> float:
-        """κ, 1/mm."""
-        return 1e-3 * self.curvature_per_m
 
     @property
     def start_angle_sd(self) -> float:
