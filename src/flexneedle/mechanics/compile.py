@@ -37,8 +37,11 @@ def compiled(home: Path = _HERE) -> bool:
 
 
 def inner(function: _Function) -> _Function:
-    """Compile a function that only other kernels call."""
-    compiled: _Function = _njit(nogil=True, error_model="numpy")(function)
+    """Compile a function that only other kernels call, and that makes no array.
+
+    Its caller owns the arrays: counting references to them would take a third of a step.
+    """
+    compiled: _Function = _njit(nogil=True, error_model="numpy", _nrt=False)(function)
     return compiled
 
 
