@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow bench robustness validation accuracy controllers tuning lint clean
+.PHONY: help setup demo test slow bench robustness validation accuracy controllers studies tuning lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -44,14 +44,21 @@ validation: setup  ## hold the exact plant against closed forms and a second sol
 	$(BIN)/python studies/validation.py
 
 accuracy: setup  ## the paper's experiment, 150 insertions with the exact plant, and its report (DIR=runs/accuracy)
-	$(BIN)/flexneedle study phantom --out $(or $(DIR),runs/accuracy)
+	$(BIN)/flexneedle study phantom --resume --out $(or $(DIR),runs/accuracy)
 	$(BIN)/flexneedle report $(or $(DIR),runs/accuracy)
 
 controllers: setup  ## every controller on the same phantoms, and the report (DIR=runs/controllers; long)
-	$(BIN)/flexneedle study controllers --out $(or $(DIR),runs/controllers)
+	$(BIN)/flexneedle study controllers --resume --out $(or $(DIR),runs/controllers)
 	$(BIN)/flexneedle report $(or $(DIR),runs/controllers)
 
-tuning: setup  ## tune each controller with 200 insertions; writes docs/tuning (long)
+studies: setup  ## 15,000 insertions with other plants, guides and needles, and their reports (two hours)
+	for study in mismatch mismatch-doubled imperfections guide-distance gauges; do \
+	  $(BIN)/flexneedle study $$study --resume --out runs/$$study && \
+	  $(BIN)/flexneedle report runs/$$study || exit 1; \
+	done
+	$(BIN)/python studies/worst.py runs/mismatch-doubled
+
+tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedle/run/tuning (long)
 	for method in adaptive-mpc ce-mpc bevel-only resolved-rate broyden-mpc; do \
 	  $(BIN)/python studies/tune.py $$method || exit 1; \
 	done

@@ -89,7 +89,7 @@ class Period:
     true_tip: Pose | None
     true_strain_energy: float | None
     durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
-    converged: bool = True  # the solves of this period, the model's and the virtual phantom's
+    converged: bool = True  # the model's solve of this period, and all of the virtual phantom's so far
     true_stretch: float | None = None  # smallest stretch λ of the true tissue so far
 
 

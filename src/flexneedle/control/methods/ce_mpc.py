@@ -1,4 +1,4 @@
-"""`ce-mpc`: the paper as written: bang-bang bevel, cross-entropy MPC of advance and guide (eq. 13 to 15).
+"""`ce-mpc`: the paper's controller: bang-bang bevel, cross-entropy MPC of advance and guide (eq. 13 to 15).
 
 The measured tip is an essential condition of the solve that takes it in, and released in the prediction. The rule has
 the error threshold that the paper proposes against needless turns; the cost of eq. 13 has small further terms for
@@ -22,7 +22,7 @@ def decide(task: Task, memory: None, estimate: Estimate, rng: np.random.Generato
 
 METHOD = Method(
     "ce-mpc",
-    "the paper as written: the measured tip is released in the prediction",
+    "the paper's: the measured tip is released in the prediction",
     Beliefs(fits_start=False, learns_load=False),
     begin=lambda _task: None,
     decide=decide,
