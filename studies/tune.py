@@ -6,10 +6,13 @@ METHOD is a controller as in `flexneedle insert --controller`; its search space 
 of the space and four that cover it evenly, are tried on the same cases: the 15 targets of the paper in turn, each on
 a phantom of its own (exact plant, preset `phantom`). After twenty cases the best two go on, to seventy: single errors
 scatter by as much as their mean, so more settings with fewer cases each would be told apart by chance. The score is the
-mean true error and a quarter of its 95 % quantile (mm); an insertion that is
-not done counts 5 mm. The table goes to stdout, everything to DIR/METHOD.json (default: docs/tuning), the same bytes
-for any number of processes. The shipped settings play no part, so that the result can be had again once they are
-changed to it. Making the plans is outside the budget.
+mean true error and a quarter of its 95 % quantile (mm); an insertion that is not done counts 5 mm. Making the plans
+is outside the budget. The table goes to stdout, everything to DIR/METHOD.json (default: the records that the package
+ships, src/flexneedle/run/tuning), the same bytes for any number of processes.
+
+Every setting of the space is set in each trial, whatever is shipped for it, so that the result can be had again once
+the shipped settings are changed to it. The other settings are the shipped ones. A space may hold knowledge from before
+its tuning: the middle of that of adaptive-mpc was found by hand, with further insertions. NOTES says so in the record.
 """
 
 import argparse
@@ -34,10 +37,16 @@ TARGETS = [(depth, aside) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for aside 
 STRIDE = 4  # through the targets: any few cases in a row mix depths and sides
 ROUNDS = ((5, 20), (2, 50))  # settings that are left, and the further cases that each gets
 BUDGET = sum(settings * cases for settings, cases in ROUNDS)
-FIRST_SEED = 5000  # of the phantoms, one a case; evaluations stay below
+FIRST_SEED = 5000  # of the phantoms, one a case; evaluations use 100000 and up
 FAILED_MM = 5.0
 PLAN_SEED = 0
 SCORE = f"mean + 0.25 * 95 % quantile of the true error (mm); an insertion that is not done counts {FAILED_MM:g} mm"
+# What went into a result beside its budget, by method.
+NOTES = {
+    "adaptive-mpc": "its structure and the middle of its space come from further insertions, seeds 5000 to 5179 "
+    "(docs/decisions/0009-identify-and-renew.md)",
+}
+RECORDS = Path(__file__).resolve().parents[1] / "src/flexneedle/run/tuning"
 Settings = dict[str, float]
 
 
@@ -165,6 +174,7 @@ def result(method: str, seed: int, trials: list[Trial]) -> dict[str, Any]:
         "budget_insertions": BUDGET,
         "rounds": [{"settings": settings, "further_cases": cases} for settings, cases in ROUNDS],
         "phantom_seeds": [FIRST_SEED, FIRST_SEED + sum(cases for _, cases in ROUNDS) - 1],
+        "note": NOTES.get(method, ""),
         "plan_seed": PLAN_SEED,
         "search_seed": seed,
         "scenario": "phantom",
@@ -211,7 +221,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("method", choices=sorted(SPACES), metavar="METHOD", help=", ".join(sorted(SPACES)))
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the settings that are tried")
-    parser.add_argument("--out", type=Path, default=Path("docs/tuning"), metavar="DIR")
+    parser.add_argument("--out", type=Path, default=RECORDS, metavar="DIR")
     chosen = parser.parse_args(arguments)
     rng = np.random.default_rng(chosen.seed)
     first = [Trial(settings) for settings in candidates(SPACES[chosen.method], ROUNDS[0][0], rng)]

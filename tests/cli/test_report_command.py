@@ -52,20 +52,30 @@ def test_json_has_all_statistics_at_full_precision(capsys, study, tmp_path):
     assert values["endings"][0]["reason"] == "plan misses the target"
 
 
-def test_tuning_is_shown_if_its_records_are_there(capsys, study, tmp_path, monkeypatch):
+def test_the_shipped_tuning_is_shown_or_that_of_a_folder(capsys, study, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = study / "report" / "report.html"
-    run(capsys, "report", str(study))
-    assert "Tuning of the controllers" not in page.read_text(encoding="utf-8")
+
+    def shown(*argv):
+        run(capsys, "report", str(study), *argv)
+        return page.read_text(encoding="utf-8").split("Tuning of the controllers")[1]
+
+    assert "5000 to 5069" in shown()
     record = {"method": OURS, "chosen": {}, "budget_insertions": 200, "phantom_seeds": [1000, 1063]}
-    for folder in ("docs/tuning", "elsewhere"):
-        Path(folder).mkdir(parents=True)
-    Path("docs/tuning/a.json").write_text(json.dumps({**record, "trials": [{"score_mm": 0.07}]}))
-    Path("elsewhere/a.json").write_text(json.dumps({**record, "trials": [{"score_mm": 0.08}]}))
-    run(capsys, "report", str(study))
-    assert "0.070" in page.read_text(encoding="utf-8").split("Tuning of the controllers")[1]
-    run(capsys, "report", str(study), "--tuning", "elsewhere")
-    assert "0.080" in page.read_text(encoding="utf-8").split("Tuning of the controllers")[1]
+    Path("elsewhere").mkdir()
+    Path("elsewhere/a.json").write_text(json.dumps({**record, "note": "", "trials": [{"score_mm": 0.08}]}))
+    there = shown("--tuning", "elsewhere")
+    assert "1000 to 1063" in there
+    assert "0.080" in there
+    assert "5000 to 5069" not in there
+
+
+def test_help_says_which_studies_can_be_reported(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["report", "--help"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert "complete or interrupted (Ctrl-C)" in told
+    assert "after kill -9, give `flexneedle study` with --resume first" in told
 
 
 def test_no_study_is_bad_input(capsys, tmp_path):

@@ -9,13 +9,15 @@ from .common import print_json
 
 __all__ = ["add_parser"]
 
-_TUNING = Path("docs/tuning")
-
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle`."""
     parser = subparsers.add_parser(
-        "report", help="write a report on a study, complete or not: a page and its figures"
+        "report",
+        help="write a report on a study: a page and its figures",
+        description="Write a report on a study: a page and its figures. The study may be complete or interrupted "
+        "(Ctrl-C). One that still runs, or was killed (kill -9), may have no tables yet: after kill -9, give "
+        "`flexneedle study` with --resume first.",
     )
     parser.add_argument("study", metavar="STUDY_DIR", type=Path, help="folder of the study")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report (STUDY_DIR/report)")
@@ -23,7 +25,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--tuning",
         type=Path,
         metavar="DIR",
-        help=f"records of the controllers' tuning to show ({_TUNING}, if it is there)",
+        help="records of the controllers' tuning to show (those of the package)",
     )
     parser.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
     parser.set_defaults(handler=_report)
@@ -32,8 +34,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _report(args: argparse.Namespace) -> int:
     from flexneedle.run.report import write_report
 
-    tuning = args.tuning or (_TUNING if _TUNING.is_dir() else None)
-    report = write_report(args.study, args.out, tuning)
+    report = write_report(args.study, args.out, args.tuning)
     if args.json:
         print_json(report.values())
     else:

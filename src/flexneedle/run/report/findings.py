@@ -7,7 +7,7 @@ from typing import Any
 
 from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.run.report.design import Design, design_of
-from flexneedle.run.report.reading import StudyRecord
+from flexneedle.run.report.reading import StudyRecord, asked
 from flexneedle.run.report.summary import (
     Difference,
     Ending,
@@ -47,8 +47,8 @@ class Findings:
 
 def findings_of(study: StudyRecord) -> Findings:
     """Return what a study comes to."""
-    rows, asked = study.rows, _asked(study.about)
-    design = design_of(rows, controllers_in_order(), asked.get("axes") or (), _base_case(asked))
+    rows, wanted = study.rows, asked(study.about)
+    design = design_of(rows, controllers_in_order(), wanted.get("axes", ()), _base_case(wanted))
     return Findings(
         study,
         planned_insertions(study.about),
@@ -64,29 +64,22 @@ def findings_of(study: StudyRecord) -> Findings:
 
 def planned_insertions(about: Mapping[str, Any]) -> int | None:
     """Return how many insertions a study asks for: repeats × cases × values of each axis; None if it does not say."""
-    asked = _asked(about)
-    if "repeats" not in asked or "axes" not in asked:
+    wanted = asked(about)
+    if "repeats" not in wanted or "axes" not in wanted:
         return None
-    return (
-        int(asked["repeats"]) * max(1, len(asked.get("cases") or ())) * prod(map(len, asked["axes"].values()))
-    )
+    repeats: int = wanted["repeats"]
+    return repeats * max(1, len(wanted.get("cases", ()))) * prod(map(len, wanted["axes"].values()))
 
 
 def title_of(about: Mapping[str, Any]) -> str:
     """Return the title of a study, or its name."""
-    asked = _asked(about)
-    return str(asked.get("title") or asked.get("name") or "Study")
+    wanted = asked(about)
+    return str(wanted.get("title") or wanted.get("name") or "Study")
 
 
-def _asked(about: Mapping[str, Any]) -> Mapping[str, Any]:
-    inner = about.get("study", about)
-    return inner if isinstance(inner, Mapping) else {}
-
-
-def _base_case(asked: Mapping[str, Any]) -> str | None:
+def _base_case(wanted: Mapping[str, Any]) -> str | None:
     """Return the first case that sets nothing."""
-    cases = asked.get("cases") or {}
-    return next((name for name, settings in cases.items() if not settings), None)
+    return next((name for name, settings in wanted.get("cases", {}).items() if not settings), None)
 
 
 def controllers_in_order() -> list[str]:

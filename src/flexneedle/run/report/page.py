@@ -12,7 +12,7 @@ from flexneedle.run.report.html import Html, document, element, joined
 from flexneedle.run.report.reading import Tuning
 from flexneedle.run.report.summary import HIT_MM, Difference, Group
 from flexneedle.run.report.times import times
-from flexneedle.run.report.wording import interval, mm, number, signed
+from flexneedle.run.report.wording import insertions, interval, mm, number, signed
 
 __all__ = ["page_text"]
 
@@ -57,7 +57,7 @@ def _opening(findings: Findings, title: str) -> Html:
         )
         if unfinished
         else None,
-        element("p", f"{len(rows)} insertions, {done} finished" + _unfinished(len(rows) - done) + "."),
+        element("p", f"{insertions(len(rows))}, {done} finished" + _unfinished(len(rows) - done) + "."),
         _unconverged(sum(group.unconverged for group in findings.groups)),
         _key_figures(findings.groups[0]) if findings.groups else None,
         _standing(findings.against) if findings.against else None,
@@ -71,7 +71,9 @@ def _unfinished(count: int) -> str:
 def _unconverged(count: int) -> Html | None:
     if not count:
         return None
-    return element("p", f"{count} insertions have periods whose solve did not converge: see the table.")
+    have = "has" if count == 1 else "have"
+    told = f"{insertions(count)} {have} periods whose solve did not converge: see the table."
+    return element("p", told)
 
 
 def _key_figures(group: Group) -> Html:
@@ -110,7 +112,7 @@ def _effort(group: Group) -> tuple[tuple[str, str, str], ...]:
             number(found["period_ratio"].value, 2),
             f"largest {number(group.largest_period_ratio, 2)}",
         ),
-        ("periods not converged", str(group.unconverged_periods), f"in {group.unconverged} insertions"),
+        ("periods not converged", str(group.unconverged_periods), f"in {insertions(group.unconverged)}"),
     )
 
 

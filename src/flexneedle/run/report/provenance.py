@@ -1,7 +1,6 @@
 """The sections on what a study was made with, and on what its numbers mean."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from flexneedle.run.report.findings import Findings
 from flexneedle.run.report.html import Html, element, joined, table
@@ -18,33 +17,31 @@ _SHARE = f"{100 * CONFIDENCE:g} %"
 def made_with(findings: Findings, tuning: Sequence[Tuning]) -> Html:
     """Return versions, the tuning of the controllers that took part, and all settings."""
     rows = findings.study.rows
-    versions = _versions(findings.study.about, rows)
-    listed = [(name, words(", ".join(used))) for name, used in versions.items()]
-    mixed = any(len(used) > 1 for used in versions.values())
     return element(
         "section",
         element("h2", "What it was made with"),
-        element("p", "The rows were made with different versions.", class_="alarm") if mixed else None,
-        table("Versions", ("package", words("version")), listed),
+        table("Versions", ("package", words("version")), _versions(rows)),
         _tuning(rows, [t for t in tuning if t.method in findings.design.controller.names]),
         _settings(rows),
     )
 
 
-def _versions(about: Mapping[str, Any], rows: Rows) -> dict[str, list[str]]:
+def _versions(rows: Rows) -> list[tuple[str, Html]]:
     columns = [name for name in rows.columns if name.startswith("version_")]
-    found = {name.removeprefix("version_"): sorted(set(rows.text(name))) for name in columns}
-    return found or {str(name): [str(value)] for name, value in dict(about.get("versions") or {}).items()}
+    return [
+        (name.removeprefix("version_"), words(", ".join(sorted(set(rows.text(name)))))) for name in columns
+    ]
 
 
 def _tuning(rows: Rows, tuning: Sequence[Tuning]) -> Html | None:
     """Return what tuning chose for each controller, and whether the study used it."""
     if not tuning:
         return None
-    heads = ("controller", "budget (insertions)", "phantom seeds", "best score (mm)")
+    heads = ("controller", "budget (insertions)", "phantom seeds", words("note"), "best score (mm)")
     listed = [
         (
-            *(tuned.method, tuned.budget, f"{tuned.seeds[0]} to {tuned.seeds[1]}", number(tuned.score_mm)),
+            *(tuned.method, tuned.budget, f"{tuned.seeds[0]} to {tuned.seeds[1]}"),
+            *(words(tuned.note or "–"), number(tuned.score_mm)),
             words(", ".join(f"{key} = {plain_value(value)}" for key, value in tuned.chosen.items())),
             words(_used(rows, tuned)),
         )

@@ -67,11 +67,11 @@ def write_report(folder: Path, out: Path | None = None, tuning: Path | None = No
     """Write the report on the study in `folder` to `out` (default: `report` inside it), and return it.
 
     tuning: a folder with records of the controllers' tuning (`studies/tune.py`), to be shown beside the study's
-    settings. The same rows give the same files to the byte, but for the page's section on the run: command, date
-    and times. Raises InputError if the folder holds no study, is damaged, or holds no insertion yet; if `tuning`
-    holds no records; or if `out` cannot be written.
+    settings; by default those of the package. The same rows give the same files to the byte, but for the page's
+    section on the run: command, date and times. Raises InputError if the folder holds no study, is damaged, or holds
+    no insertion yet; if `tuning` holds no records; or if `out` cannot be written.
     """
-    tuned = [] if tuning is None else read_tuning(tuning)
+    tuned = read_tuning(tuning)
     findings = findings_of(read_study(folder))
     place = folder / "report" if out is None else out
     try:

@@ -15,7 +15,6 @@ __all__ = ["times"]
 def times(findings: Findings) -> Html:
     """Return what differs from one run of a study to the next: command, date, and where the time went."""
     about, timing, written = findings.study.about, findings.study.timing, _written(findings)
-    date = next((about[name] for name in ("date", "started", "begun") if about.get(name)), None)
     return element(
         "section",
         element("h2", "This run of the study"),
@@ -24,7 +23,6 @@ def times(findings: Findings) -> Html:
         ),
         element("p", "Command:"),
         element("pre", element("code", str(about.get("command") or "not recorded"))),
-        element("p", f"Date: {date}") if date else None,
         element("p", f"{STUDY_FILE} was written {written}.") if written else None,
         element("p", "No times are recorded.") if timing is None else _division(timing),
         id="run",

@@ -7,7 +7,7 @@ from flexneedle.run.report.html import Html, element, joined
 from flexneedle.run.report.rows import Rows
 from flexneedle.run.report.statistics import Estimate
 
-__all__ = ["cell", "code", "interval", "mm", "number", "plain_value", "signed", "words"]
+__all__ = ["cell", "code", "insertions", "interval", "mm", "number", "plain_value", "signed", "words"]
 
 
 def plain_value(value: Any) -> str:
@@ -31,6 +31,10 @@ def code(text: str) -> object:
     # An option stays with its dashes and its value where the line breaks.
     parts = text.replace(" --", "\n--").split("\n")
     return element("code", joined(part for k in parts for part in (element("span", k), " ")))
+
+
+def insertions(count: int) -> str:
+    return f"{count} insertion" if count == 1 else f"{count} insertions"
 
 
 def number(value: float, digits: int = 3) -> str:

@@ -1,0 +1,154 @@
+"""Tuning: the records that the package ships, its shipped settings, and the search itself, without an insertion."""
+
+import importlib.util
+import json
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import flexneedle
+from flexneedle.control.methods import METHODS
+from flexneedle.run.report.reading import read_tuning
+from flexneedle.trace.plain import to_text
+
+SCRIPT = Path(__file__).resolve().parents[1] / "studies" / "tune.py"
+SHIPPED = files("flexneedle.run") / "tuning"
+TUNED = sorted(item.name.removesuffix(".json") for item in SHIPPED.iterdir())
+NOT_TUNED = {"offset-free", "open-loop"}
+
+
+@pytest.fixture(scope="module")
+def tune():
+    """studies/tune.py as a module."""
+    spec = importlib.util.spec_from_file_location("tune", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
+
+
+def text_of(method):
+    return (SHIPPED / f"{method}.json").read_text(encoding="utf-8")
+
+
+def record_of(method):
+    return json.loads(text_of(method))
+
+
+@pytest.mark.parametrize("method", TUNED)
+def test_shipped_settings_are_those_that_tuning_chose(method):
+    shipped, chosen = flexneedle.load_scenario("phantom").flat(), record_of(method)["chosen"]
+    assert chosen
+    assert {key: shipped[key] for key in chosen} == chosen
+
+
+def test_every_controller_with_a_space_has_a_record(tune):
+    assert sorted(tune.SPACES) == TUNED
+    assert set(METHODS) - NOT_TUNED == set(TUNED)
+
+
+@pytest.mark.parametrize("method", TUNED)
+def test_records_are_what_the_script_writes(tune, method):
+    """Budget, seeds, space and note are those of the script as it is; what was found follows from the trials."""
+    record = record_of(method)
+    assert to_text(record) == text_of(method)
+    trials = [tune.Trial(trial["settings"], (trial["mean_mm"],)) for trial in record["trials"]]
+    written = json.loads(to_text(tune.result(method, record["search_seed"], trials)))
+    assert list(written) == list(record)
+    found = {"trials", "versions"}
+    assert {k: v for k, v in written.items() if k not in found} == {
+        k: v for k, v in record.items() if k not in found
+    }
+    tried = tune.candidates(tune.SPACES[method], 5, np.random.default_rng(record["search_seed"]))
+    assert sorted(map(repr, tried)) == sorted(repr(trial["settings"]) for trial in record["trials"])
+    assert sum(trial["cases"] for trial in record["trials"]) == record["budget_insertions"]
+
+
+def test_what_went_into_a_result_beside_its_budget_is_noted():
+    notes = {tuned.method: tuned.note for tuned in read_tuning()}
+    assert "seeds 5000 to 5179" in notes.pop("adaptive-mpc")
+    assert set(notes.values()) == {""}
+
+
+def test_each_controller_gets_200_insertions(tune):
+    assert tune.BUDGET == 200
+
+
+def test_the_first_candidate_is_the_middle_of_the_space(tune):
+    space = {
+        "even": tune.Range(1.0, 3.0, log=False),
+        "log": tune.Range(0.01, 1.0),
+        "whole": tune.Range(2, 18, whole=True),
+    }
+    first = tune.candidates(space, 5, np.random.default_rng(0))[0]
+    assert first == {"even": 2.0, "log": 0.1, "whole": 6}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_other_candidates_cover_each_range_evenly(tune, seed):
+    space = {"even": tune.Range(0.0, 8.0, log=False), "log": tune.Range(1.0, 1e4)}
+    tried = tune.candidates(space, 5, np.random.default_rng(seed))[1:]
+    assert sorted(settings["even"] for settings in tried) == [1.0, 3.0, 5.0, 7.0]
+    in_log = sorted(np.log10(settings["log"]) for settings in tried)
+    assert_allclose(in_log, [0.5, 1.5, 2.5, 3.5], atol=1e-3)  # three digits are kept
+
+
+def test_ranges_are_tried_in_values_of_three_digits(tune):
+    assert tune.Range(0.1, 1.0).at(0.5) == 0.316
+    assert tune.Range(2, 16, whole=True).at(0.3) == 4
+
+
+class Race:
+    """Insertions whose error is that of their settings, more in later cases by `drift`; each is kept."""
+
+    def __init__(self, errors, drift=None):
+        self.errors, self.drift, self.tasks = errors, drift or {}, []
+
+    def error_of(self, task):
+        method, settings, plan, seed = task
+        self.tasks.append((method, settings["x"], plan, seed))
+        late = seed >= 5000 + 20
+        return self.errors[settings["x"]] + late * self.drift.get(settings["x"], 0.0)
+
+
+@pytest.fixture
+def halved(tune, monkeypatch):
+    """Return a function that races five settings, in one thread, and returns all trials."""
+
+    def run(race):
+        monkeypatch.setattr(tune, "error_of", race.error_of)
+        trials = [tune.Trial({"x": name}) for name in race.errors]
+        with ThreadPoolExecutor(1) as executor:
+            return tune.halve(trials, "ce-mpc", [f"plan {k}" for k in range(15)], executor)
+
+    return run
+
+
+def test_the_best_go_on_and_the_best_of_them_is_first(halved):
+    race = Race({"a": 0.5, "b": 0.2, "c": 0.4, "d": 0.1, "e": 0.3})
+    trials = halved(race)
+    assert [trial.settings["x"] for trial in trials] == ["d", "b", "e", "c", "a"]
+    assert [len(trial.errors) for trial in trials] == [70, 70, 20, 20, 20]
+    assert_allclose([trial.score for trial in trials], 1.25 * np.array([0.1, 0.2, 0.3, 0.4, 0.5]))
+
+
+def test_the_last_round_decides_between_those_that_went_on(halved):
+    race = Race({"a": 0.5, "b": 0.2, "c": 0.4, "d": 0.1, "e": 0.3}, drift={"d": 1.0})
+    assert [trial.settings["x"] for trial in halved(race)][:2] == ["b", "d"]
+
+
+def test_all_settings_meet_the_same_cases_and_no_case_twice(halved):
+    race = Race({"a": 0.5, "b": 0.2, "c": 0.4, "d": 0.1, "e": 0.3})
+    halved(race)
+    assert len(race.tasks) == len(set(race.tasks)) == 200
+    cases = {name: [task[2:] for task in race.tasks if task[1] == name] for name in race.errors}
+    assert [seed for _, seed in cases["d"]] == list(range(5000, 5070))
+    assert cases["d"] == cases["b"]
+    assert cases["a"] == cases["c"] == cases["e"] == cases["d"][:20]
+    assert len({plan for plan, _ in cases["d"][:15]}) == 15
