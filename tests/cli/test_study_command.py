@@ -88,7 +88,7 @@ def test_the_record_has_the_command_versions_and_the_whole_study(capsys):
     assert record["command"] == "flexneedle study my.toml --workers 2 --out a"
     assert record["study"]["scenario"]["name"] == "Two-layer tissue phantom"
     assert record["study"]["axes"] == {"plant": ["exact", "model"], "target.depth_mm": [8, 10]}
-    assert set(record["versions"]) == {"flexneedle", "python", "numpy", "numba"}
+    assert set(record["versions"]) == {"flexneedle", "python", "numpy", "numba", "pyarrow", "source"}
 
 
 def test_a_folder_is_used_again_only_to_resume(capsys):

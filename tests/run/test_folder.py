@@ -1,15 +1,21 @@
 """The folder of a run: claimed once, never torn, read back with clear errors."""
 
+import itertools
 import json
 import os
 import re
+import subprocess
+import sys
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import flexneedle
 from flexneedle.errors import InputError
-from flexneedle.run.folder import Folder, read_run
+from flexneedle.run import folder as folder_module
+from flexneedle.run.folder import Folder, read_run, versions
 from flexneedle.scenario import load_scenario
 from flexneedle.trace.plain import plain, plan_from_values, plan_values, to_text
 from synthetic import make_plan
@@ -67,6 +73,15 @@ def test_a_folder_that_holds_a_run_is_refused(tmp_path, name):
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "precious")]
 
 
+def test_a_folder_that_holds_a_study_is_refused(tmp_path):
+    (tmp_path / "study.json").write_text("precious")
+    with pytest.raises(
+        InputError, match=r"holds a study already \(study\.json\): give another folder with --out$"
+    ):
+        claim(tmp_path)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("study.json", "precious")]
+
+
 def test_a_folder_with_other_files_is_used(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     claim(tmp_path)
@@ -79,6 +94,8 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
         claim(tmp_path / "file")
     with pytest.raises(InputError, match="cannot be made: Not a directory"):
         claim(tmp_path / "file" / "below")
+    with pytest.raises(InputError, match="cannot be made: File name too long"):
+        claim(tmp_path / ("a" * 300))
 
 
 def test_without_a_place_for_runs_there_is_a_clear_error(in_tmp):
@@ -158,3 +175,68 @@ def test_text_is_json_with_a_row_a_line():
         '{\n "a": [\n  [0.0, 1.0],\n  [2.0, 3.0]\n ],\n "b": [],\n "c": {},\n'
         ' "d": {\n  "e": null,\n  "f": [1, "µ"]\n }\n}\n'
     )
+
+
+@pytest.fixture
+def package(tmp_path):
+    """Return a function that makes a copy of a small package and returns the digest of its sources."""
+    copies = itertools.count()
+
+    def digest(**changed):
+        files = {"a.py": b"1", "b/c.toml": b"2", "b/d.json": b"3"} | {
+            name.replace("__", "/").replace("_", "."): data for name, data in changed.items()
+        }
+        home = tmp_path / str(next(copies))
+        for name, data in files.items():
+            if data is not None:
+                (home / name).parent.mkdir(parents=True, exist_ok=True)
+                (home / name).write_bytes(data)
+        return folder_module._source(home)
+
+    return digest
+
+
+def test_the_same_sources_have_the_same_digest_wherever_they_lie(package):
+    assert package() == package()
+    assert re.fullmatch(r"[0-9a-f]{12}", package())
+
+
+def test_what_python_and_the_system_leave_beside_the_sources_does_not_count(package):
+    assert package() == package(a_pyc=b"4", a_nbi=b"5", b__readme_md=b"6")
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        *({"a_py": b"x"}, {"b__c_toml": b"x"}, {"b__d_json": b"x"}, {"a_py": None}, {"e_py": b""}),
+        *(
+            {"a_py": None, "e_py": b"1"},
+            {"b__d_json": None, "d_json": b"3"},
+            {"a_py": b"3", "b__d_json": b"1"},
+        ),
+    ],
+)
+def test_any_change_of_a_source_changes_the_digest(package, changed):
+    assert package(**changed) != package()
+
+
+def test_versions_have_the_digest_of_this_package_and_of_what_writes_tables():
+    found = versions()
+    assert found["source"] == folder_module._source.__wrapped__(Path(flexneedle.__file__).parent)
+    assert set(found) == {"flexneedle", "python", "numpy", "numba", "pyarrow", "source"}
+
+
+def test_versions_load_nothing_heavy():
+    code = (
+        "import sys; from flexneedle.run.folder import versions; versions();"
+        "print(*{'pyarrow', 'numba', 'matplotlib'} & set(sys.modules), len(versions()))"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout == "6\n"
+
+
+def test_the_sources_are_read_once():
+    versions()
+    misses = folder_module._source.cache_info().misses
+    versions()
+    assert folder_module._source.cache_info().misses == misses

@@ -37,6 +37,13 @@ class Progress:
         if self._bars is not None:
             self._bars.stop()
 
+    def say(self, line: str) -> None:
+        """Say a line that belongs to no stage."""
+        if self._bars is None:
+            _tell(line)
+        else:
+            self._bars.console.print(line, markup=False, highlight=False)
+
     def begin(self, stage: str) -> None:
         """Show a stage of which nothing is done yet."""
         if self._bars is None:

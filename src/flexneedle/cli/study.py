@@ -43,16 +43,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _workers(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value}: must be at least 1")
-    return value
+    if not (text.isascii() and text.isdigit() and int(text) >= 1):
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number, at least 1")
+    return int(text)
 
 
 def _study(args: argparse.Namespace) -> int:
     from flexneedle.errors import InputError, RunError
     from flexneedle.run.study.folder import free_folder
     from flexneedle.run.study.grid import load_study
+    from flexneedle.run.study.pools import check_address
     from flexneedle.run.study.runner import run_study
 
     from .progress import Progress
@@ -61,6 +61,8 @@ def _study(args: argparse.Namespace) -> int:
         raise InputError("--resume needs the folder of the study: give it with --out DIR")
     if args.workers is not None and args.scheduler is not None:
         raise InputError("--workers is for this machine: leave it out with --scheduler")
+    if args.scheduler is not None:
+        check_address(args.scheduler)
     study = load_study(args.study)
     folder = args.out or free_folder(study)
     compile_first()
@@ -74,6 +76,7 @@ def _study(args: argparse.Namespace) -> int:
                 scheduler=args.scheduler,
                 resume=args.resume,
                 on_advance=_Show(progress).advance,
+                on_no_workers=lambda: progress.say(f"{args.scheduler} has no workers yet: waiting for them"),
                 command=_command(args, folder),
             )
     except KeyboardInterrupt:
@@ -97,26 +100,36 @@ class _Show:
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
+        self._planning, self._inserting = _Pace(), _Pace()
+        self._planned = False  # told that no plan is missing
+
+    def advance(self, advance: Advance) -> None:
+        planning, inserting = _STAGES
+        if not self._planned:
+            self._planned = advance.plans == advance.all_plans
+            left = self._planning.left(advance.plans, advance.all_plans)
+            note = f"{advance.plans} of {advance.all_plans} plans{left}"
+            total = max(advance.all_plans, 1)
+            self._progress.show(planning, total if self._planned else advance.plans, total, note)
+        note = f"{advance.insertions} of {advance.all_insertions}"
+        note += self._inserting.left(advance.insertions, advance.all_insertions)
+        note += f", {advance.failed} failed" if advance.failed else ""
+        self._progress.show(inserting, advance.insertions, advance.all_insertions, note)
+
+
+class _Pace:
+    """How fast a stage goes. It is timed from the first that is in: neither work before nor other stages count."""
+
+    def __init__(self) -> None:
         self._before: int | None = None  # done by an earlier run of the study
         self._first: tuple[float, int] | None = None  # when the first was in, and how many there were then
 
-    def advance(self, advance: Advance) -> None:
-        now, done = time.monotonic(), advance.insertions
-        planning, inserting = _STAGES
-        self._progress.show(
-            planning,
-            advance.plans,
-            max(advance.all_plans, 1),
-            f"{advance.plans} of {advance.all_plans} plans",
-        )
-        note = f"{done} of {advance.all_insertions}"
-        if rate := self._rate(now, done):
-            note += f", {rate:.2g} a second, {_duration((advance.all_insertions - done) / rate)} left"
-        note += f", {advance.failed} failed" if advance.failed else ""
-        self._progress.show(inserting, done, advance.all_insertions, note)
+    def left(self, done: int, total: int) -> str:
+        """Return rate and time left as an addition to a note, empty while they are not known."""
+        rate = self._rate(time.monotonic(), done)
+        return f", {rate:.2g} a second, {_duration((total - done) / rate)} left" if rate else ""
 
     def _rate(self, now: float, done: int) -> float:
-        """Insertions a second since the first was in, so that plans made before do not count; 0 if not known yet."""
         if self._before is None:
             self._before = done
         if self._first is None and done > self._before:
@@ -133,6 +146,7 @@ def _duration(seconds: float) -> str:
 
 def _report(study: Study, folder: Path, as_json: bool, seconds: float) -> int:
     from flexneedle.run.study.summary import summarise
+    from flexneedle.scenario.problems import printable
 
     summary = summarise(folder, study)
     summary["time"]["wall_s"] = seconds
@@ -140,7 +154,12 @@ def _report(study: Study, folder: Path, as_json: bool, seconds: float) -> int:
         print_json(summary)
     else:
         _table(summary)
-    return 0 if "done" in summary["outcomes"] else 1
+    if "done" in summary["outcomes"]:
+        return 0
+    if summary["first_failure"] is not None:
+        told = printable(summary["first_failure"])
+        print(f"flexneedle: no insertion was done; the first ended so: {told}", file=sys.stderr)
+    return 1
 
 
 def _table(summary: Mapping[str, Any]) -> None:

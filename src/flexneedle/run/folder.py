@@ -5,6 +5,7 @@ plans; that of an insertion also controller and phantom. All but `timing`, which
 times, is the same for the same seed.
 """
 
+import hashlib
 import json
 import os
 import platform
@@ -12,6 +13,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
@@ -24,9 +26,12 @@ from flexneedle.trace import PlanRecord
 from flexneedle.trace.plain import plan_from_values, plan_values, to_text
 from flexneedle.trace.shield import uninterrupted
 
-__all__ = ["RUN_FILE", "TRACE_FILE", "Folder", "RunFile", "read_run", "versions"]
+__all__ = ["RUN_FILE", "STUDY_FILE", "TRACE_FILE", "Folder", "RunFile", "read_run", "versions"]
 
-RUN_FILE, TRACE_FILE = "run.json", "trace.mcap"
+RUN_FILE, TRACE_FILE, STUDY_FILE = "run.json", "trace.mcap", "study.json"
+_PACKAGE = Path(__file__).parents[1]
+_SOURCES = (".py", ".toml", ".json")
+_DIGITS = 12
 _FORMAT = 1
 
 
@@ -63,7 +68,7 @@ class Folder:
     def claim(cls, out: Path | None, name: str, kind: str, scenario: Scenario, seed: int) -> "Folder":
         """Make the folder `out`, or one below `runs/` named by date, `name` and seed, and mark it as running.
 
-        Raises InputError if the folder holds a run already or cannot be made.
+        Raises InputError if the folder holds a run or a study already or cannot be made.
         """
         now = datetime.now(UTC)
         path = _make(out) if out is not None else _make_new(Path("runs"), f"{now:%Y%m%dT%H%M%SZ}", name, seed)
@@ -95,13 +100,30 @@ class Folder:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions on which the numbers of a run depend."""
+    """Return the versions on which the numbers of a run, and the bytes of a table, depend.
+
+    source: a digest of the code and data of this package, which tells an edited copy from the release.
+    """
     return {
         "flexneedle": __version__,
         "python": platform.python_version(),
         "numpy": version("numpy"),
         "numba": version("numba"),
+        "pyarrow": version("pyarrow"),
+        "source": _source(_PACKAGE),
     }
+
+
+@cache
+def _source(package: Path) -> str:
+    """Return a digest of the sources below a folder, wherever it lies: relative path and bytes of each."""
+    digest = hashlib.sha256()
+    found = (path for path in package.rglob("*") if path.suffix in _SOURCES and path.is_file())
+    paths = {path.relative_to(package).as_posix(): path for path in found}
+    for name in sorted(paths):
+        data = paths[name].read_bytes()
+        digest.update(f"{name}\0{len(data)}\0".encode() + data)
+    return digest.hexdigest()[:_DIGITS]
 
 
 def read_run(folder: Path) -> RunFile:
@@ -133,10 +155,11 @@ def _checked(path: Path, values: Any) -> RunFile:
 
 
 def _make(path: Path) -> Path:
-    held = next((name for name in (RUN_FILE, TRACE_FILE) if (path / name).exists()), None)
-    if held is not None:
-        raise InputError(f"{path}: holds a run already ({held}): give another folder with --out")
     try:
+        held = next((name for name in (RUN_FILE, TRACE_FILE, STUDY_FILE) if (path / name).exists()), None)
+        if held is not None:
+            kind = "study" if held == STUDY_FILE else "run"
+            raise InputError(f"{path}: holds a {kind} already ({held}): give another folder with --out")
         path.mkdir(parents=True, exist_ok=True)
         (path / RUN_FILE).touch(exist_ok=False)  # of two runs at the same moment, one gets the folder
     except FileExistsError:

@@ -72,6 +72,68 @@ def test_a_scheduler_that_does_not_answer_leaves_no_folder(quick, tmp_path, monk
     assert not (tmp_path / "a").exists()
 
 
+def test_a_scheduler_without_workers_is_told_and_one_with_workers_is_not():
+    told = []
+    with scheduler() as address:
+        with pools.cluster(address, lambda: told.append("none")):
+            assert told == ["none"]
+        with worker(address), distributed.Client(address, set_as_default=False) as client:
+            client.wait_for_workers(1, timeout=30)
+            with pools.cluster(address, lambda: told.append("none")):
+                assert told == ["none"]
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        *("", "foo", "foo:bar", "tcp://", "tcp://host", "tcp://:8786", "tcp://host:", "tcp://host:0"),
+        *("tcp://host:65536", "tcp://host:8786/x", "tcp://a b:1", "tcp://host:1\n", "tcp://host:٣"),
+        *("http://localhost:1", "inproc://x", "127.0.0.1:8786", "TCP://host:1", "tcp://user@[::1:1"),
+    ],
+)
+def test_what_cannot_be_an_address_is_refused_at_once(quick, tmp_path, address, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(
+        InputError, match=r"^--scheduler = \".*\": must be protocol://host:port, such as "
+    ) as caught:
+        run_study(quick, tmp_path / "a", scheduler=address)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://127.0.0.1:1", "tls://login-1.cluster:8786", "ws://[::1]:65535", "wss://h_1:80"]
+)
+def test_what_can_be_an_address_is_tried(address):
+    pools.check_address(address)
+
+
+def test_tls_without_a_certificate_is_one_line(quick, tmp_path):
+    with pytest.raises(
+        InputError, match=r"^tls://127\.0\.0\.1:9: needs a certificate: set distributed\.comm\.tls"
+    ):
+        run_study(quick, tmp_path / "a", scheduler="tls://127.0.0.1:9")
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (OSError(), "OSError"),
+        (ImportError("versions\ndiffer"), "versions differ"),
+        (TypeError("TLS\nexpects"), "TLS expects"),
+        (ValueError("a\x1bb"), r"a\x1bb"),
+    ],
+)
+def test_whatever_keeps_a_client_from_connecting_is_one_line(quick, tmp_path, monkeypatch, error, told):
+    def fail(*_args, **_options):
+        raise error
+
+    monkeypatch.setattr(distributed, "Client", fail)
+    with pytest.raises(InputError) as caught:
+        run_study(quick, tmp_path / "a", scheduler="tcp://host:1")
+    assert str(caught.value) == f"tcp://host:1: no Dask scheduler answers: {told}"
+
+
 def test_without_dask_the_extra_is_named(quick, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'flexneedle\[cluster\]'"):

@@ -3,17 +3,19 @@
 import itertools
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 
 from flexneedle.control.methods import METHODS
 from flexneedle.errors import InputError
 from flexneedle.run.study.grid import load_study
-from flexneedle.run.study.spec import study_names
+from flexneedle.run.study.spec import LARGEST_SEED, study_names
 from flexneedle.scenario import dump_scenario, load_scenario
 
 PHANTOM = load_scenario("phantom")
 CONTROLLERS = tuple(METHODS)[:2]
 CHOICES = "must be one of " + ", ".join(METHODS)
+SEEDS = f"from 0 to {LARGEST_SEED}"
 DEPTHS, LATERALS = (25, 30, 35, 40, 45), (-5, 0, 5)
 
 
@@ -121,6 +123,21 @@ def test_a_study_that_only_has_a_name_is_one_insertion_of_the_preset(study):
     assert (only.point.scenario, only.point.case, only.seed, only.point.plan_seed) == (PHANTOM, "", 0, 0)
 
 
+def test_the_largest_seeds_fit_into_a_table(study):
+    longest = f"first_seed = {LARGEST_SEED}\nrepeats = 100_000\n" + axis("target.depth_mm", "[30, 40]")
+    axes = axis("seed", f"{{from = {LARGEST_SEED}, count = 2}}") + axis("plan_seed", f"[0, {LARGEST_SEED}]")
+    for text in (longest, axes):
+        whole = study(text)
+        last = whole.insertion(len(whole) - 1)
+        seeds = pa.array([last.seed, last.point.plan_seed], pa.int64()).to_pylist()
+        assert seeds == [last.seed, last.point.plan_seed]
+        assert last.seed > LARGEST_SEED
+
+
+def test_true_is_no_number_that_stands_twice(study):
+    assert "twice" not in refusal(study, axis("plan.samples", "[16, 1, true]"))[0]
+
+
 def axis(key, values):
     return f"[[axes]]\nkey = '{key}'\nvalues = {values}\n"
 
@@ -130,14 +147,20 @@ def axis(key, values):
     [
         ("repeat = 3", "repeat = 3: unknown key; did you mean repeats?"),
         ("repeats = 0", "repeats = 0: must be at least 1"),
-        ("first_seed = -1", "first_seed = -1: must be at least 0"),
+        ("first_seed = -1", f"first_seed = -1: must be from 0 to {LARGEST_SEED}"),
+        (
+            f"first_seed = {LARGEST_SEED + 1}",
+            f"first_seed = {LARGEST_SEED + 1}: must be from 0 to {LARGEST_SEED}",
+        ),
+        ("first_seed = true", "first_seed = true: must be a whole number"),
         ("scenario = 'no.toml'", "/no.toml: no such file"),
         ("x = ", "not TOML: "),
         ("without = ['needle.gauge']", 'without = "needle.gauge": the scenario has no such value'),
         ("[values]\ncontroller = 'pid'", f'controller = "pid": {CHOICES}'),
         ("[values]\nplant = 'real'", 'plant = "real": must be one of exact, model'),
         ("[values]\nstrategy = 'x'", 'strategy = "x": must be one of manipulation, steering'),
-        ("[values]\nplan_seed = 1.5", "plan_seed = 1.5: must be a whole number, at least 0"),
+        ("[values]\nplan_seed = 1.5", f"plan_seed = 1.5: must be a whole number {SEEDS}"),
+        (axis("plan_seed", f"[1, {2**63}]"), f"plan_seed = {2**63}: must be a whole number {SEEDS}"),
         ("[values]\nseed = 3", "values.seed = 3: seeds are set by first_seed and repeats, or by an axis"),
         ("[values]\ntarget = 3", "values.target = 3: a target must be two numbers, [depth, lateral] in mm"),
         ("[values]\nphantom.runout_mm = 3", "phantom.runout_mm = 3: unknown key; did you mean run_out_mm?"),
@@ -147,10 +170,17 @@ def axis(key, values):
         (axis("plan.samples", "[]"), "axes[0].values = []: must be a list of at least one value"),
         (axis("plan.samples", "'all'"), 'axes[0].values = "all": must be a list of at least one value'),
         (axis("plan.samples", "[8, 9, 8]"), "axes[0].values = [8, 9, 8]: has 8 twice"),
+        (axis("setup.stroke_mm", "[100, 100.0]"), "axes[0].values = [100, 100.0]: has 100 twice"),
+        (axis("target", "[[30, 0], [30.0, -0.0]]"), "[30.0, -0.0]]: has [30, 0] twice"),
         (axis("controller", f"['{CONTROLLERS[0]}', 'x']"), f'controller = "x": {CHOICES}'),
         (axis("target", "[[30, 0], 40]"), "axes[0].values = 40: a target must be two numbers"),
         (axis("target", "[[30, 0], [400, 0]]"), "target.depth_mm = 400.0: beyond the stroke"),
-        (axis("seed", "[1, -2]"), "axes[0].values = [1, -2]: must be whole numbers, at least 0"),
+        (axis("seed", "[1, -2]"), f"axes[0].values = [1, -2]: must be whole numbers {SEEDS}"),
+        (axis("seed", f"[1, {LARGEST_SEED + 1}]"), f"{LARGEST_SEED + 1}]: must be whole numbers {SEEDS}"),
+        (
+            axis("seed", f"{{from = {2**62 + 1}, count = 2}}"),
+            f"from a whole number, 0 to {LARGEST_SEED}, count 1",
+        ),
         (axis("seed", "{from = 1}"), "axes[0].values = {…}: must be a list, or {from, count}"),
         ("repeats = 2\n" + axis("seed", "[1]"), "repeats = 2: leave it out: an axis gives the seeds"),
         (2 * axis("plan.samples", "[16]"), 'axes = "plan.samples": two axes set this key'),

@@ -13,7 +13,7 @@ from flexneedle.run.study import rows
 from flexneedle.run.study.grid import load_study
 from flexneedle.run.study.journal import Journal
 from flexneedle.run.study.plans import Plans, plan_key
-from flexneedle.run.study.rows import Job, carry_out, make_plan
+from flexneedle.run.study.rows import RESULTS, Job, carry_out, make_plan
 
 
 @pytest.fixture(scope="module")
@@ -151,38 +151,90 @@ def test_a_damaged_plan_is_named(tmp_path):
         Plans(tmp_path).plan("a")
 
 
-ROWS = [{"index": 4, "x": 0.1 + 0.2, "y": 5e-324, "z": None}, {"index": 1, "x": -0.0, "y": 1e308, "z": "µ\n"}]
+def test_a_plan_that_is_a_folder_is_named(tmp_path):
+    (tmp_path / "a.json").mkdir()
+    with pytest.raises(InputError, match=r"a\.json: cannot be read: Is a directory: remove it to plan again"):
+        Plans(tmp_path).plan("a")
+
+
+def test_a_file_in_place_of_the_plans_is_named_before_any_plan_is_made(tmp_path):
+    (tmp_path / "plans").touch()
+    with pytest.raises(InputError, match=r"plans: is no folder, which plans need: move it away"):
+        Plans(tmp_path / "plans")
+
+
+UNKNOWN = dict.fromkeys(RESULTS) | {"outcome": "held", "reason": ""}
+ROWS = [
+    UNKNOWN | {"index": 4, "true_error_mm": 0.1 + 0.2, "tip_x_mm": 5e-324, "total_s": 1.5},
+    UNKNOWN | {"index": 1, "tip_y_mm": -0.0, "tip_x_mm": 1e308, "flips": 3, "reason": "µ\n"},
+]
 
 
 def test_rows_come_back_from_the_journal_with_all_their_digits(tmp_path):
-    with Journal(tmp_path / "j") as journal:
+    with Journal(tmp_path / "j", 5) as journal:
         journal.add(ROWS)
-    with Journal(tmp_path / "j") as journal:
+    with Journal(tmp_path / "j", 5) as journal:
         assert [json.dumps(journal.rows[row["index"]]) for row in ROWS] == [json.dumps(row) for row in ROWS]
 
 
 @pytest.mark.parametrize("kept", [1, 20, -1])
 def test_a_torn_last_line_is_dropped_and_the_journal_goes_on(tmp_path, kept):
     path = tmp_path / "j"
-    with Journal(path) as journal:
+    with Journal(path, 5) as journal:
         journal.add(ROWS)
     first, second = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(first + second[:kept])
-    with Journal(path) as journal:
+    with Journal(path, 5) as journal:
         assert list(journal.rows) == [4]
         journal.add([ROWS[1]])
     assert path.read_bytes() == first + second
 
 
-def test_a_journal_that_was_changed_is_refused_with_the_line(tmp_path):
+def line(**changed):
+    return json.dumps(ROWS[0] | changed)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('{"index": ', "not a row in JSON"),
+        ("[3]", "not a row in JSON"),
+        ("[" * 100_000, "not a row in JSON"),
+        ('{"index": 3}', "true_error_mm: missing"),
+        ("{}", "index: must be a whole number from 0 to 4"),
+        (line(index=99), "index = 99: must be a whole number from 0 to 4"),
+        (line(index=5), "index = 5: must be a whole number from 0 to 4"),
+        (line(index=-1), "index = -1: must be a whole number from 0 to 4"),
+        (line(index="a"), 'index = "a": must be a whole number from 0 to 4'),
+        (line(index=True), "index = true: must be a whole number from 0 to 4"),
+        (line(index=1.0), "index = 1.0: must be a whole number from 0 to 4"),
+        (line(index=[1]), "index = [1]: must be a whole number from 0 to 4"),
+        (line(flips="x"), 'flips = "x": of a wrong type, or too large'),
+        (line(flips=2**63), f"flips = {2**63}: of a wrong type, or too large"),
+        (line(flips=1.5), "flips = 1.5: of a wrong type, or too large"),
+        (line(periods=True), "periods = true: of a wrong type, or too large"),
+        (line(tip_x_mm="x"), 'tip_x_mm = "x": of a wrong type, or too large'),
+        (line(tip_x_mm=math.nan), "tip_x_mm = nan: of a wrong type, or too large"),
+        (line(tip_x_mm=10**400), "tip_x_mm = a very large number: of a wrong type, or too large"),
+        (line(outcome=None), "outcome: of a wrong type, or too large"),
+        (line(total_s="x"), 'total_s = "x": of a wrong type, or too large'),
+    ],
+)
+def test_a_journal_that_was_changed_is_refused_with_the_line_and_left_alone(tmp_path, text, told):
     path = tmp_path / "j"
-    path.write_text('{"index": 1}\n{"index": \n{"index": 3}\n')
-    with pytest.raises(InputError, match="j: damaged at line 2"):
-        Journal(path)
+    path.write_text(f"{line()}\n{text}\n{line(index=3)}\n")
+    before = path.read_bytes()
+    with pytest.raises(InputError) as caught:
+        Journal(path, 5)
+    assert str(caught.value) == f"{path}: damaged at line 2: {told}"
+    assert path.read_bytes() == before
 
 
 def test_only_one_process_writes_a_journal(tmp_path):
-    with Journal(tmp_path / "j"), pytest.raises(InputError, match="another process is at work on this study"):
-        Journal(tmp_path / "j")
-    with Journal(tmp_path / "j") as again:
+    with (
+        Journal(tmp_path / "j", 5),
+        pytest.raises(InputError, match="another process is at work on this study"),
+    ):
+        Journal(tmp_path / "j", 5)
+    with Journal(tmp_path / "j", 5) as again:
         assert again.rows == {}

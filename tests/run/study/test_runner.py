@@ -199,6 +199,7 @@ def test_failures_are_rows_and_the_study_ends(quick, tmp_path, monkeypatch):
     assert told[-1].failed == 12
     summary = summarise(out, load_study(quick))
     assert summary["outcomes"] == {"error": 8, "done": 4, "refused": 4}
+    assert summary["first_failure"] == "error: no plan: FloatingPointError: overflow"
     json.dumps(summary, allow_nan=False)
 
 
@@ -277,6 +278,45 @@ def test_other_versions_do_not_go_on_with_a_study(quick, uninterrupted, monkeypa
         run_study(quick, uninterrupted, resume=True)
 
 
+def test_edited_code_does_not_go_on_with_a_study(quick, uninterrupted, monkeypatch):
+    monkeypatch.setattr(
+        "flexneedle.run.study.folder.versions", lambda: {**versions(), "source": "0123456789ab"}
+    )
+    with pytest.raises(InputError) as caught:
+        run_study(quick, uninterrupted, resume=True)
+    assert str(caught.value) == (
+        f"{uninterrupted}: cannot resume: the code of flexneedle is not that which began the study: "
+        f"versions.source is {versions()['source']} in the folder, 0123456789ab now"
+    )
+
+
+def test_a_study_of_code_that_is_not_on_record_does_not_go_on(quick, uninterrupted, tmp_path):
+    record = json.loads((uninterrupted / "study.json").read_text())
+    del record["versions"]["source"], record["versions"]["pyarrow"]
+    (tmp_path / "study.json").write_text(json.dumps(record))
+    with pytest.raises(
+        InputError, match=r"cannot resume: .*versions\.\w+ is not recorded in the folder, \S+ now$"
+    ):
+        run_study(quick, tmp_path, resume=True)
+
+
+def test_a_row_beyond_the_study_is_refused(quick, uninterrupted, tmp_path):
+    out = shutil.copytree(uninterrupted, tmp_path / "a")
+    text = (out / "journal.jsonl").read_text()
+    beyond = json.loads(text.splitlines()[0]) | {"index": SIZE}
+    (out / "journal.jsonl").write_text(f"{text}{json.dumps(beyond)}\n")
+    with pytest.raises(
+        InputError, match="damaged at line 17: index = 16: must be a whole number from 0 to 15"
+    ):
+        run_study(quick, out, resume=True)
+    assert tables(out) == tables(uninterrupted)
+
+
+def test_a_name_that_is_too_long_for_a_folder_is_refused(quick, tmp_path):
+    with pytest.raises(InputError, match=r"a: cannot be written: File name too long$"):
+        run_study(quick, tmp_path / ("a" * 300))
+
+
 @pytest.mark.usefixtures("in_threads")
 def test_a_study_that_was_killed_before_it_began_is_begun(quick, uninterrupted, tmp_path):
     (tmp_path / "journal.jsonl").touch()
@@ -294,6 +334,7 @@ def test_the_summary_agrees_with_the_table(quick, uninterrupted):
     errors = sorted(row["true_error_mm"] for row in table)
     mean = sum(errors) / SIZE
     assert summary["complete"]
+    assert summary["first_failure"] is None
     assert summary["outcomes"] == {"done": SIZE}
     spread = summary["true_error_mm"]
     assert (spread["mean"], spread["max"]) == (pytest.approx(mean), errors[-1])

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
-from flexneedle.run.folder import versions
+from flexneedle.run.folder import STUDY_FILE, versions
 from flexneedle.run.study.files import replace_file
 from flexneedle.run.study.grid import Study
 from flexneedle.run.study.journal import Journal
@@ -22,8 +22,9 @@ from flexneedle.trace.plain import to_text
 
 __all__ = ["JOURNAL_FILE", "PLANS_FOLDER", "STUDY_FILE", "free_folder", "open_folder"]
 
-STUDY_FILE, JOURNAL_FILE, PLANS_FOLDER = "study.json", "journal.jsonl", "plans"
+JOURNAL_FILE, PLANS_FOLDER = "journal.jsonl", "plans"
 _FORMAT = 1
+_SOURCE = "versions.source"
 
 
 def free_folder(study: Study) -> Path:
@@ -41,10 +42,10 @@ def open_folder(path: Path, study: Study, resume: bool, command: str = "") -> Jo
     something else, a study without `resume`, another study, or one of other versions; or if another process
     is at work on it.
     """
-    _check(path, study, resume)
     try:
+        _check(path, study, resume)
         path.mkdir(parents=True, exist_ok=True)
-        journal = Journal(path / JOURNAL_FILE)
+        journal = Journal(path / JOURNAL_FILE, len(study))
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     try:
@@ -89,5 +90,11 @@ def _first_difference(stored: Mapping[str, Any], asked: Mapping[str, Any]) -> st
     for key in there | here:
         if there.get(key) != here.get(key):
             name = key.removeprefix("study.")
-            return printable(f"{name} is {there.get(key)} in the folder, {here.get(key)} now")
+            before, now = (_told(values, key) for values in (there, here))
+            edited = "the code of flexneedle is not that which began the study: " if key == _SOURCE else ""
+            return printable(f"{edited}{name} is {before} in the folder, {now} now")
     return None
+
+
+def _told(values: Mapping[str, Any], key: str) -> str:
+    return str(values[key]) if key in values else "not recorded"

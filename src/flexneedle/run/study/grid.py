@@ -12,7 +12,17 @@ from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.errors import InputError, ScenarioError
 from flexneedle.phantom import DEFAULT_PLANT, PLANTS
 from flexneedle.run.planner import STRATEGIES
-from flexneedle.run.study.spec import ALL, SEED, Axis, StudyFile, base_of, is_seed, read_study, settings_of
+from flexneedle.run.study.spec import (
+    ALL,
+    LARGEST_SEED,
+    SEED,
+    Axis,
+    StudyFile,
+    base_of,
+    is_seed,
+    read_study,
+    settings_of,
+)
 from flexneedle.scenario import Scenario
 from flexneedle.scenario.problems import Problem, printable, to_line
 from flexneedle.trace.plain import plain
@@ -168,9 +178,8 @@ def _check_run(run: Mapping[str, Any]) -> None:
         if run[key] not in choices:
             raise InputError(to_line(Problem(key, run[key], f"must be one of {', '.join(choices)}")))
     if not is_seed(run["plan_seed"]):
-        raise InputError(
-            to_line(Problem("plan_seed", run["plan_seed"], "must be a whole number, at least 0"))
-        )
+        rule = f"must be a whole number from 0 to {LARGEST_SEED}"
+        raise InputError(to_line(Problem("plan_seed", run["plan_seed"], rule)))
 
 
 def _varied(base: Scenario, settings: Mapping[str, Any], where: str) -> Scenario:

@@ -25,9 +25,14 @@ def plan_key(point: Point) -> str:
 
 
 class Plans:
-    """Plans by key, in memory and in a folder. A point that has none (`refusals`) is planned again next time."""
+    """Plans by key, in memory and in a folder. A point that has none (`refusals`) is planned again next time.
+
+    Raises InputError if what has the name of the folder is none.
+    """
 
     def __init__(self, folder: Path) -> None:
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: is no folder, which plans need: move it away")
         self._folder = folder
         self._made: dict[str, tuple[PlanRecord, float]] = {}
         self.refusals: dict[str, str] = {}
@@ -64,6 +69,8 @@ def _read(path: Path) -> tuple[PlanRecord, float]:
     try:
         values: Any = json.loads(path.read_text(encoding="utf-8"))
         return plan_from_values(values["plan"]), float(values["seconds"])
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}: remove it to plan again") from None
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{path}: damaged: {type(error).__name__} {error}: remove it to plan again"

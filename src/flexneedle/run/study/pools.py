@@ -2,18 +2,22 @@
 
 import multiprocessing
 import os
+import re
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 from flexneedle.errors import InputError
 from flexneedle.run.study.worker import set_up
+from flexneedle.scenario.problems import Problem, printable, to_line
 
-__all__ = ["cluster", "local", "usable_cores"]
+__all__ = ["check_address", "cluster", "local", "usable_cores"]
 
 _CONNECT_S = 20
+_LAST_PORT = 65535
+_ADDRESS = re.compile(r"(tcp|tls|ws|wss)://(\[[0-9A-Fa-f:.]+\]|[^\s/:@?#\[\]]+):(?P<port>[0-9]{1,5})")
 
 
 def usable_cores() -> int:
@@ -41,21 +45,41 @@ def _without_ctrl_c() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+def check_address(address: str) -> None:
+    """Raise InputError unless this can be the address of a Dask scheduler."""
+    found = _ADDRESS.fullmatch(address)
+    if found is None or not 1 <= int(found["port"]) <= _LAST_PORT:
+        rule = "must be protocol://host:port, such as tcp://host:8786; protocols: tcp, tls, ws, wss"
+        raise InputError(to_line(Problem("--scheduler", address, rule)))
+
+
 @contextmanager
-def cluster(address: str) -> Iterator[Executor]:
+def cluster(address: str, on_no_workers: Callable[[], None] = lambda: None) -> Iterator[Executor]:
     """Give the workers of the Dask scheduler at `address` (`tcp://host:8786`).
 
-    Its tasks are not pure: each is carried out, also where two look the same. Raises InputError if the extra
-    `cluster` is not installed or no scheduler answers.
+    Its tasks are not pure: each is carried out, also where two look the same. `on_no_workers` is called if it has
+    none yet; tasks wait for them. Raises InputError for an address that cannot be one, or if the extra `cluster`
+    is not installed or no scheduler answers.
     """
+    check_address(address)
+    with _client(address) as client:
+        if not client.nthreads():
+            on_no_workers()
+        yield client.get_executor(pure=False)
+
+
+def _client(address: str) -> Any:
     try:
-        from distributed import Client
+        from distributed import Client, Security
     except ImportError:
         raise InputError("--scheduler needs Dask: pip install 'flexneedle[cluster]'") from None
+    connect, secure = cast("Any", Client), cast("Any", Security)  # not typed
+    security = secure()
+    # Asked here, as a client that fails for it takes long to close and says so on stderr.
+    if address.startswith("tls:") and security.get_connection_args("client")["ssl_context"] is None:
+        raise InputError(f"{address}: needs a certificate: set distributed.comm.tls in Dask's configuration")
     try:
-        connect: Any = Client  # not typed
-        client = connect(address, timeout=_CONNECT_S, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{address}: no Dask scheduler answers: {str(error).splitlines()[0]}") from None
-    with client:
-        yield client.get_executor(pure=False)
+        return connect(address, timeout=_CONNECT_S, security=security, set_as_default=False)
+    except Exception as error:  # noqa: BLE001  Dask raises what it trips over in the answer of any server
+        told = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(printable(f"{address}: no Dask scheduler answers: {told}")) from None

@@ -155,6 +155,7 @@ def _told(error: Exception) -> str:
 @cache
 def _ready() -> None:
     """Compile before the first work of a process; one process of a machine at a time, or the cache suffers."""
+    versions()  # while the source on the disk is what was loaded: it is looked at once
     with (Path(tempfile.gettempdir()) / f"flexneedle-{os.getuid()}.lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         compile_kernels()

@@ -46,14 +46,16 @@ def run_study(
     scheduler: str | None = None,
     resume: bool = False,
     on_advance: Callable[[Advance], None] | None = None,
+    on_no_workers: Callable[[], None] = lambda: None,
     command: str = "",
 ) -> Path:
     """Carry out a study, a shipped name or a TOML file, and return its folder (default: a new one in `runs/`).
 
     It runs on `workers` processes (default: one a usable core), or on the Dask cluster whose `scheduler` is at
-    an address. `resume` goes on with the study that `out` holds. Whatever ends it early, the finished rows are
-    kept; `runs.parquet` is the same, to the bit, for any number of workers and interruptions. `command` is for
-    the record. A script that calls this needs an `if __name__ == "__main__"` guard: workers import it.
+    an address; `on_no_workers` is called if that has no workers yet, for which the study then waits. `resume`
+    goes on with the study that `out` holds. Whatever ends it early, the finished rows are kept; `runs.parquet`
+    is the same, to the bit, for any number of workers and interruptions. `command` is for the record. A script
+    that calls this needs an `if __name__ == "__main__"` guard: workers import it.
 
     Raises InputError for a study, folder or scheduler that cannot be used; RunError if a worker dies or differs
     from this process in versions; KeyboardInterrupt, after the tables are written, if the user stops it.
@@ -64,7 +66,10 @@ def run_study(
     folder = free_folder(study) if out is None else Path(out)
     chunk = 1 if scheduler is None else math.ceil(len(study) / _CLUSTER_JOBS)
     # The pool first: a scheduler that does not answer leaves no folder behind.
-    with _pool(workers, scheduler) as pool, open_folder(folder, study, resume, command) as journal:
+    with (
+        _pool(workers, scheduler, on_no_workers) as pool,
+        open_folder(folder, study, resume, command) as journal,
+    ):
         engine = _Engine(study, folder, journal, on_advance or (lambda _: None))
         try:
             if len(journal.rows) < len(study):
@@ -75,8 +80,10 @@ def run_study(
     return folder
 
 
-def _pool(workers: int | None, scheduler: str | None) -> AbstractContextManager[Executor]:
-    return pools.local(workers) if scheduler is None else pools.cluster(scheduler)
+def _pool(
+    workers: int | None, scheduler: str | None, on_no_workers: Callable[[], None]
+) -> AbstractContextManager[Executor]:
+    return pools.local(workers) if scheduler is None else pools.cluster(scheduler, on_no_workers)
 
 
 class _Engine:

@@ -2,13 +2,13 @@
 
 import tomllib
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from importlib.resources import files
 from os import fspath
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from flexneedle.errors import InputError
 from flexneedle.scenario import Scenario, load_scenario, preset_names
@@ -17,7 +17,7 @@ from flexneedle.scenario.fields import Section, Title, count
 from flexneedle.scenario.problems import Problem, describe, printable, refuse
 
 __all__ = [
-    *("ALL", "NAMED", "SEED", "Axis", "Case", "StudyFile"),
+    *("ALL", "LARGEST_SEED", "NAMED", "SEED", "Axis", "Case", "StudyFile"),
     *("base_of", "is_seed", "read_study", "settings_of", "study_names"),
 ]
 
@@ -29,6 +29,19 @@ _SHIPPED = files("flexneedle.run") / "studies"
 _SUFFIX = ".toml"
 _LARGEST_FILE = 1_000_000
 _MOST_VALUES = 100_000
+LARGEST_SEED = 2**62
+"""A first seed and all that follow it fit into the 64 bits of a column."""
+
+
+def is_seed(value: Any) -> bool:
+    """Whether a value is a whole number from 0 to `LARGEST_SEED`."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= LARGEST_SEED
+
+
+def _seed(value: int) -> int:
+    if not is_seed(value):
+        raise ValueError(f"must be from 0 to {LARGEST_SEED}")
+    return value
 
 
 class Axis(Section):
@@ -76,7 +89,7 @@ class StudyFile(Section):
     cases: Annotated[tuple[Case, ...], Field(strict=False)] = ()
     repeats: int = count(1, least=1, most=_MOST_VALUES)
     """Insertions at each point of the grid, each with a seed of its own."""
-    first_seed: Annotated[int, Field(ge=0)] = 0
+    first_seed: Annotated[int, AfterValidator(_seed)] = 0
     """Seed of the first insertion."""
 
     @model_validator(mode="after")
@@ -166,29 +179,41 @@ def _value_problems(key: str, values: Any) -> Iterator[Problem]:
         yield from _range_problems(values)
     elif not isinstance(values, list) or not values:
         yield Problem("values", values, "must be a list of at least one value")
-    elif twice := [text for text, times in Counter(map(repr, values)).items() if times > 1]:
-        yield Problem("values", values, f"has {twice[0]} twice")
+    elif (twice := _twice(values)) is not None:
+        yield Problem("values", values, f"has {twice!r} twice")
     elif key == _TARGET:
         yield from (problem for value in values for problem in _target_problems("values", value))
     elif key == SEED and not all(map(is_seed, values)):
-        yield Problem("values", values, "must be whole numbers, at least 0")
+        yield Problem("values", values, f"must be whole numbers from 0 to {LARGEST_SEED}")
+
+
+def _twice(values: list[Any]) -> Any:
+    """Return a value that stands in a list twice, or None; equal numbers are the same value, 25 and 25.0 too."""
+    times = Counter(map(_comparable, values))
+    return next((value for value in values if times[_comparable(value)] > 1), None)
+
+
+def _comparable(value: Any) -> Hashable:
+    if isinstance(value, list):
+        return tuple(map(_comparable, value))
+    if isinstance(value, dict):
+        return frozenset((key, _comparable(item)) for key, item in value.items())
+    return (bool, value) if isinstance(value, bool) else value  # True is no 1 here
 
 
 def _range_problems(values: dict[str, Any]) -> Iterator[Problem]:
     fine = set(values) == {"from", "count"} and all(map(is_seed, values.values()))
     if not fine or not 1 <= values["count"] <= _MOST_VALUES:
-        rule = f"must be a list, or {{from, count}}: whole numbers, count 1 to {_MOST_VALUES}"
+        rule = (
+            f"must be a list, or {{from, count}}: from a whole number, 0 to {LARGEST_SEED}, "
+            f"count 1 to {_MOST_VALUES}"
+        )
         yield Problem("values", values, rule)
 
 
 def _target_problems(key: str, value: Any) -> Iterator[Problem]:
     if not isinstance(value, list) or len(value) != 2:
         yield Problem(key, value, "a target must be two numbers, [depth, lateral] in mm")
-
-
-def is_seed(value: Any) -> bool:
-    """Whether a value is a whole number, at least 0."""
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
 def _settings_problems(values: Mapping[str, Any]) -> Iterator[Problem]:

@@ -21,12 +21,12 @@ _Row = Mapping[str, Any]
 def summarise(folder: Path, study: Study) -> dict[str, Any]:
     """Return outcomes, errors (mm), bevel turns, energy (mJ), periods and times (s) of a study's folder, plain.
 
-    Statistics are over the insertions that finished and whose value is known, as in the report; unconverged periods
-    are those of all. Groups are the cases with all that the axes vary,
-    but for targets and seeds; without any of them there is none.
+    Statistics are over the insertions that finished and whose value is known, as in the report; unconverged
+    periods are those of all. `first_failure` has outcome and reason of the first that did not finish, or None.
+    Groups are the cases with all that the axes vary, but for targets and seeds; without any of them there is none.
     """
     wanted = ["index", "outcome", "true_error_mm", "residual_mm", "flips", "planned_flips", _ENERGY]
-    wanted += [_PLANNED_ENERGY, "periods", "planned_periods", "unconverged_periods"]
+    wanted += [_PLANNED_ENERGY, "periods", "planned_periods", "unconverged_periods", "reason"]
     rows = pq.read_table(folder / RUNS_FILE, columns=wanted).to_pylist()
     result: dict[str, Any] = plain(
         {
@@ -34,6 +34,7 @@ def summarise(folder: Path, study: Study) -> dict[str, Any]:
             "title": study.title,
             "folder": str(folder),
             "complete": len(rows) == len(study),
+            "first_failure": next((_told(row) for row in rows if row["outcome"] != "done"), None),
             **_statistics(rows),
             "groups": [
                 {"settings": dict(settings), **_statistics(members)}
@@ -43,6 +44,10 @@ def summarise(folder: Path, study: Study) -> dict[str, Any]:
         }
     )
     return result
+
+
+def _told(row: _Row) -> str:
+    return f"{row['outcome']}: {row['reason']}" if row["reason"] else str(row["outcome"])
 
 
 def _groups(rows: Sequence[_Row], study: Study) -> dict[tuple[tuple[str, Any], ...], list[_Row]]:
