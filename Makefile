@@ -56,7 +56,7 @@ studies: setup  ## 15,000 insertions with other plants, guides and needles, and 
 	  $(BIN)/flexneedle study $$study --resume --out runs/$$study && \
 	  $(BIN)/flexneedle report runs/$$study || exit 1; \
 	done
-	$(BIN)/python studies/worst.py runs/mismatch-doubled
+	$(BIN)/python studies/worst.py runs/mismatch-doubled --out docs/images
 
 tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedle/run/tuning (long)
 	for method in adaptive-mpc ce-mpc bevel-only resolved-rate broyden-mpc; do \

@@ -1,15 +1,17 @@
 """Explain the errors of a study: what was drawn where they are large, and what the worst insertions come from.
 
-    python studies/worst.py FOLDER [--study NAME] [--worst N] [--jobs N] [--out DIR]
+    python studies/worst.py FOLDER [--study STUDY] [--worst N] [--samples N] [--jobs N] [--out DIR]
 
-FOLDER is that of a finished study (`flexneedle study NAME --out FOLDER`), NAME a shipped one or a TOML file (default:
-mismatch-doubled). Prints Markdown tables: the distribution of the true error; the N worst insertions (default: 10) with
-what their phantoms are; and each of these carried out again with one imperfection left out, all else drawn alike, or
-with other samples of the controller. The figure DIR/mismatch-doubled.png, named after the study, shows the error over
-what was drawn.
+FOLDER is that of a study (`flexneedle study STUDY --out FOLDER`), STUDY what it was made of, if that is not shipped.
+Prints Markdown tables: the distribution of the true error; the N worst insertions (default: 10) with what their
+phantoms are; and each of these carried out again, with one imperfection left out and all else drawn alike. The worst of
+thousands had bad luck besides, which any change ends: so each is carried out several times (`--samples`, default 5),
+with other samples of the controller's searches. The figure DIR/STUDY.png (default: FOLDER) shows the error over what
+was drawn.
 """
 
 import argparse
+import json
 import math
 import sys
 from collections.abc import Sequence
@@ -24,20 +26,23 @@ import pyarrow.parquet as pq
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
+from flexneedle.errors import InputError
 from flexneedle.phantom import draw
 from flexneedle.plot import style
 from flexneedle.run.insertion import run as carry_out
 from flexneedle.run.insertion import virtual_rig
+from flexneedle.run.planner import plan as make_plan
+from flexneedle.run.study.folder import STUDY_FILE
 from flexneedle.run.study.grid import Insertion, Study, load_study
 from flexneedle.run.study.plans import Plans, plan_key
 from flexneedle.scenario import Scenario
 from flexneedle.trace import PlanRecord
 
 LAST_MM = 10.0  # before the target
-AS_DRAWN, ANOTHER = "as drawn", "other samples"
+NOTHING, OTHER_PLAN = "nothing", "other plans"
 WITHOUT: dict[str, dict[str, Any]] = {
-    AS_DRAWN: {},
-    ANOTHER: {},
+    NOTHING: {},
+    OTHER_PLAN: {},
     "moduli": {"phantom.shear_modulus_factor": [1.0, 1.0]},
     "variation": {"phantom.shear_modulus_variation": 0.0},
     "boundary": {"phantom.layer_shift_sd_mm": 0.0},
@@ -50,11 +55,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
         "phantom.missing_fraction": 0.0,
     },
 }
-"""What is left out of the phantom, the rest as it was drawn: no draw depends on the size of another.
-
-The worst of thousands had bad luck besides, and most changes end it: `ANOTHER` tells how much, with the same phantom
-and other samples of the controller's searches.
-"""
+"""What is left out of the phantom, the rest as it was drawn: no draw depends on the size of another."""
 
 
 @dataclass(frozen=True)
@@ -108,13 +109,15 @@ class Ended:
     stretch: float
 
 
-def carried_out(insertion: Insertion, plan: PlanRecord, variant: str) -> Ended:
-    """Carry it out in a variant of its scenario."""
+def carried_out(insertion: Insertion, plan: PlanRecord, variant: str = NOTHING, sample: int = 0) -> Ended:
+    """Carry it out in a variant of its scenario; sample 0 is the one that it had, others search with other samples."""
     point = insertion.point
     scenario = point.scenario.with_values(WITHOUT[variant])
+    if variant == OTHER_PLAN:
+        plan = make_plan(scenario, strategy=point.strategy, seed=point.plan_seed + sample, threads=1)
     phantom, tracker, control = np.random.SeedSequence(insertion.seed).spawn(3)
     rig = virtual_rig(scenario, plan.bevel, phantom, tracker, point.plant)
-    rng = np.random.default_rng(control.spawn(1)[0] if variant == ANOTHER else control)
+    rng = np.random.default_rng(control if sample == 0 else control.spawn(sample)[-1])
     run = carry_out(scenario, plan, rig, rng, controller=point.controller, force=True, threads=1)
     last = run.periods[-1]
     x, y, _ = last.true_tip or (math.nan, math.nan, math.nan)
@@ -170,12 +173,14 @@ def print_worst(insertions: Sequence[Insertion], ends: Sequence[Ended]) -> None:
 
 
 def print_without(insertions: Sequence[Insertion], errors: np.ndarray) -> None:
-    """Errors (N, k) with one thing left out."""
+    """Means and largest of errors (N, variants, samples)."""
     rows = [
-        (str(insertion.index), *(f"{error:.2f}" for error in line))
+        (str(insertion.index), *(f"{runs.mean():.2f} ({runs.max():.2f})" for runs in line))
         for insertion, line in zip(insertions, errors, strict=True)
     ]
-    print_table(("index", *WITHOUT), [*rows, ("mean", *(f"{error:.2f}" for error in errors.mean(axis=0)))])
+    print_table(
+        ("index", *WITHOUT), [*rows, ("mean", *(f"{runs.mean():.2f}" for runs in errors.swapaxes(0, 1)))]
+    )
 
 
 def over(axes: Axes, values: np.ndarray, error: np.ndarray, label: str) -> None:
@@ -183,7 +188,7 @@ def over(axes: Axes, values: np.ndarray, error: np.ndarray, label: str) -> None:
     order = np.argsort(values, kind="stable")
     groups = np.array_split(order, 12)
     middle = [float(np.median(values[group])) for group in groups]
-    for share, colour, line in ((0.5, style.ESTIMATE, "-"), (0.95, style.TRUE, "--"), (0.99, style.BAD, ":")):
+    for share, colour, line in ((0.5, style.ESTIMATE, "-"), (0.95, style.TRUE, "--"), (0.99, style.INK, ":")):
         levels = [float(np.quantile(error[group], share)) for group in groups]
         axes.plot(middle, levels, line, color=colour, marker="o", markersize=2.5, label=f"{100 * share:g} %")
     axes.set_xlabel(label)
@@ -231,41 +236,65 @@ def draw_figure(study: Study, index: np.ndarray, error: np.ndarray, folder: Path
         style.save(figure, folder, study.name)
 
 
+def of_folder(folder: Path, source: str | None) -> Study:
+    """The study that a folder holds. Raises InputError if `source` is another."""
+    stored = json.loads((folder / STUDY_FILE).read_text(encoding="utf-8"))["study"]
+    study = load_study(source or stored["name"])
+    if json.loads(json.dumps(study.definition)) != stored:
+        raise InputError(f"{folder}: not the study {study.name}: name its file with --study")
+    return study
+
+
+def again(pool: Executor, plans: Plans, worst: Sequence[Insertion], samples: int) -> list[list[list[Ended]]]:
+    """Each of the worst in each variant with each sample (N, variants, samples)."""
+    calls = [
+        [
+            [
+                pool.submit(carried_out, insertion, plans.plan(plan_key(insertion.point)), variant, sample)
+                for sample in range(1, samples + 1)
+            ]
+            for variant in WITHOUT
+        ]
+        for insertion in worst
+    ]
+    return [[[call.result() for call in runs] for runs in line] for line in calls]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--study", default="mismatch-doubled")
+    parser.add_argument("--study")
     parser.add_argument("--worst", type=int, default=10)
+    parser.add_argument("--samples", type=int, default=5)
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=Path("docs/images"))
+    parser.add_argument("--out", type=Path)
     chosen = parser.parse_args(arguments)
-    study, plans = load_study(chosen.study), Plans(chosen.folder / "plans")
-    rows = pq.read_table(chosen.folder / "runs.parquet").to_pydict()
+    try:
+        study = of_folder(chosen.folder, chosen.study)
+        rows = pq.read_table(chosen.folder / "runs.parquet").to_pydict()
+    except (OSError, InputError) as error:
+        parser.error(str(error))
+    plans = Plans(chosen.folder / "plans")
     done = np.array(rows["outcome"]) == "done"
     index, error = np.array(rows["index"])[done], np.array(rows["true_error_mm"], dtype=float)[done]
     print_distribution(np.array(rows["target_depth_mm"])[done], error)
-    worst = [study.insertion(int(k)) for k in index[np.argsort(-error, kind="stable")[: chosen.worst]]]
+    order = np.argsort(-error, kind="stable")[: chosen.worst]
+    worst = [study.insertion(int(k)) for k in index[order]]
     with ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as pool:
-        ends = again(pool, plans, worst)
-    print_worst(worst, [line[0] for line in ends])
-    print_without(worst, np.array([[end.error for end in line] for line in ends]))
-    draw_figure(study, index, error, chosen.out)
+        own = [pool.submit(carried_out, one, plans.plan(plan_key(one.point))) for one in worst]
+        ends = [call.result() for call in own]
+        if not np.array_equal([end.error for end in ends], error[order]):
+            parser.error(f"{chosen.folder}: its insertions come out otherwise now: study it again")
+        print_worst(worst, ends)
+        others = again(pool, plans, worst, chosen.samples)
+    print_without(worst, np.array([[[end.error for end in runs] for runs in line] for line in others]))
+    folder = chosen.out or chosen.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    draw_figure(study, index, error, folder)
     return 0
-
-
-def again(pool: Executor, plans: Plans, worst: Sequence[Insertion]) -> list[list[Ended]]:
-    """Each of the worst in each variation (N, k)."""
-    calls = [
-        [
-            pool.submit(carried_out, insertion, plans.plan(plan_key(insertion.point)), variant)
-            for variant in WITHOUT
-        ]
-        for insertion in worst
-    ]
-    return [[call.result() for call in line] for line in calls]
 
 
 if __name__ == "__main__":
