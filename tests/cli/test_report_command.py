@@ -11,7 +11,7 @@ from study_rows import OURS, make_rows, unfinished, write_study
 
 @pytest.fixture
 def study(tmp_path):
-    rows = make_rows((OURS, "open-loop"), targets=((25.0, 0.0), (40.0, 5.0)), repeats=3)
+    rows = make_rows((OURS, "open-loop"), targets=((25.0, 0.0), (40.0, 5.0)), repeats=6)
     rows[2] = unfinished(rows[2], "refused", "plan misses the target")
     return write_study(tmp_path / "study", rows, {"title": "Mine"})
 
@@ -39,8 +39,8 @@ def test_json_has_all_statistics_at_full_precision(capsys, study, tmp_path):
     ]
     assert (values["study"], values["insertions"], values["finished"], values["planned"]) == (
         "Mine",
-        12,
-        11,
+        24,
+        23,
         None,
     )
     assert values["report"] == str(tmp_path / "here" / "report.html")

@@ -68,6 +68,7 @@ def test_a_study_leaves_tables_in_a_new_folder_and_prints_one(capsys, in_threads
     assert out.endswith(f"Tables: runs/{folder.name}\n")
     assert re.search(r"^Inserting 100%: 4 of 4, [\d.]+ a second, 0 s left$", err, re.MULTILINE)
     assert "Planning 100%: 2 of 2 plans" in err
+    assert f"Two targets: 4 insertions, in runs/{folder.name}\n" in err
     assert "\x1b" not in out + err
 
 

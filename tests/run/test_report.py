@@ -204,7 +204,7 @@ def test_where_the_default_stands_among_the_others_is_said_first(report_on):
 
 
 def test_differences_are_given_at_each_depth(report_on):
-    rows = make_rows(BOTH, targets=TARGETS, repeats=4)
+    rows = make_rows(BOTH, targets=TARGETS, repeats=10)
     for row in rows:
         deep = row["target_depth_mm"] == 45.0
         row["true_error_mm"] = (0.3 if row["controller"] == OURS else 0.1 if deep else 0.6) + 1e-4 * row[

@@ -281,12 +281,12 @@ def test_too_few_pairs_give_no_verdict(read):
 def test_pairs_never_cross_settings(read):
     """Errors that depend on the axis alone, the same for both controllers, differ in no pair."""
     values = [0.01 * k for k in range(30)]  # so many that they are put into bins
-    rows = make_rows(("open-loop", OURS), axes={"tracker.jitter_mm": values}, targets=TARGETS, repeats=2)
+    rows = make_rows(("open-loop", OURS), axes={"tracker.jitter_mm": values}, targets=TARGETS, repeats=5)
     shuffled = np.random.default_rng(0).permutation(len(rows)).tolist()
     for row, index in zip(rows, shuffled, strict=True):
         row |= {"true_error_mm": 0.1 + row["tracker.jitter_mm"], "index": index}
     (found,) = compared(rows, read)
-    assert (found.pairs, found.mean_mm.low, found.mean_mm.high) == (120, 0.0, 0.0)
+    assert (found.pairs, found.mean_mm.low, found.mean_mm.high) == (300, 0.0, 0.0)
 
 
 def test_cases_are_compared_with_the_base_for_each_controller(read):

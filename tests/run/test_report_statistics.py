@@ -70,9 +70,17 @@ def test_no_rows_and_one_seed_have_no_interval():
 
 
 def test_a_constant_has_an_interval_of_no_width():
-    found = estimates({"m": mean(np.full(9, 0.25)), "sd": sd(np.full(9, 0.25))}, own(9))
+    found = estimates({"m": mean(np.full(10, 0.25)), "sd": sd(np.full(10, 0.25))}, own(10))
     assert (found["m"].low, found["m"].value, found["m"].high) == (0.25, 0.25, 0.25)
     assert found["sd"].high == 0.0
+
+
+def test_nine_phantoms_have_no_interval_and_ten_do():
+    """However many insertions each has: a percentile bootstrap of a few is far too narrow."""
+    values = np.random.default_rng(0).normal(size=40)
+    few, enough = (estimates({"m": mean(values)}, np.arange(40) % phantoms)["m"] for phantoms in (9, 10))
+    assert np.isnan([few.low, few.high]).all()
+    assert enough.low < few.value == enough.value < enough.high
 
 
 def test_the_interval_of_a_mean_is_as_wide_as_theory_says():

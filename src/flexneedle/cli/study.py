@@ -69,6 +69,7 @@ def _study(args: argparse.Namespace) -> int:
     begun = time.monotonic()
     try:
         with Progress() as progress:
+            progress.say(f"{study.title}: {len(study)} insertions, in {folder}")
             run_study(
                 study,
                 folder,

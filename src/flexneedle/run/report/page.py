@@ -10,6 +10,7 @@ from flexneedle.run.report.figures import Drawn
 from flexneedle.run.report.findings import Findings, title_of
 from flexneedle.run.report.html import Html, document, element, joined
 from flexneedle.run.report.reading import Tuning
+from flexneedle.run.report.statistics import LEAST_CLUSTERS
 from flexneedle.run.report.summary import HIT_MM, Difference, Group
 from flexneedle.run.report.times import times
 from flexneedle.run.report.wording import insertions, interval, mm, number, signed
@@ -153,7 +154,11 @@ def _sentence(difference: Difference) -> Html:
     ours, other, found = difference.name, difference.against, difference.mean_mm
     numbers = f"{signed(found.value)} mm ({interval(found, ' mm', 3)}, {difference.pairs} pairs)"
     if difference.verdict is None:
-        return joined((f"{ours} and {other} cannot be compared: too few pairs of finished insertions.",))
+        return joined(
+            (
+                f"{ours} and {other} cannot be compared: fewer than {LEAST_CLUSTERS} phantoms with finished pairs.",
+            )
+        )
     if difference.verdict == "not separable":
         return joined((f"{ours} is not separable from {other} in mean true error: ", numbers, "."))
     mark = element("span", difference.verdict, class_=difference.verdict)

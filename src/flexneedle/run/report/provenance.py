@@ -6,7 +6,7 @@ from flexneedle.run.report.findings import Findings
 from flexneedle.run.report.html import Html, element, joined, table
 from flexneedle.run.report.reading import Tuning
 from flexneedle.run.report.rows import Rows
-from flexneedle.run.report.statistics import CONFIDENCE, RESAMPLES, SEED
+from flexneedle.run.report.statistics import CONFIDENCE, LEAST_CLUSTERS, RESAMPLES, SEED
 from flexneedle.run.report.wording import number, plain_value, words
 
 __all__ = ["made_with", "method"]
@@ -92,7 +92,8 @@ def method() -> Html:
                     "energy is that stored in the tissue at the end."),
             element("li", f"Intervals hold {_SHARE}: percentile bootstrap with {RESAMPLES} resamples, seed {SEED}. "
                     "Drawn again are seeds with all their insertions, because insertions with the same seed meet "
-                    "the same virtual phantom. Several intervals are not corrected for being several."),
+                    f"the same virtual phantom; fewer than {LEAST_CLUSTERS} of them give no interval and no verdict. "
+                    "Several intervals are not corrected for being several."),
             element("li", "A maximum has no bootstrap interval, as no resample exceeds it. Given instead is the "
                     f"share of all insertions that, with {_SHARE} confidence, at most lies beyond it."),
             element("li", "Differences are between insertions alike in seed, target, repeat and all other settings, "

@@ -32,6 +32,7 @@ Counts = NDArray[np.int64]
 Statistic = Callable[[Counts], Floats]
 """From how often each row counts, (b, n), to the value of the statistic in each of the b samples, (b,)."""
 
+LEAST_CLUSTERS = 10
 RESAMPLES, CONFIDENCE, SEED = 2000, 0.95, 0
 _CHUNK = 2_000_000  # counts held in memory at once
 
@@ -100,11 +101,11 @@ def estimates(
     """Return each statistic of n rows with its percentile bootstrap interval.
 
     clusters (n,): rows with the same number, 0 to c − 1, are drawn together. All statistics see the same samples.
-    With fewer than two clusters there is no interval (NaN).
+    With fewer than `LEAST_CLUSTERS` there is no interval (NaN): a percentile bootstrap of a few is far too narrow.
     """
     once = np.ones((1, len(clusters)), dtype=np.int64)
     values = {name: float(statistic(once)[0]) for name, statistic in statistics.items()}
-    if len(clusters) == 0 or clusters.max() == clusters.min():
+    if len(np.unique(clusters)) < LEAST_CLUSTERS:
         return {name: Estimate(value) for name, value in values.items()}
     drawn: dict[str, list[Floats]] = {name: [] for name in statistics}
     for counts in _samples(clusters, resamples, np.random.default_rng(seed)):

@@ -32,6 +32,7 @@ __all__ = ["Insertion", "Point", "Study", "load_study"]
 _DEFAULTS = {"controller": DEFAULT, "plant": DEFAULT_PLANT, "strategy": STRATEGIES[0], "plan_seed": 0}
 _CHOICES = {"controller": tuple(METHODS), "plant": tuple(PLANTS), "strategy": STRATEGIES}
 _MOST_INSERTIONS = 1_000_000
+_BESIDES = f"; besides: {', '.join(_DEFAULTS)}, as an axis also {SEED}"
 
 
 @dataclass(frozen=True)
@@ -187,4 +188,5 @@ def _varied(base: Scenario, settings: Mapping[str, Any], where: str) -> Scenario
         return base.with_values(settings)
     except ScenarioError as error:
         at = f" (at {where})" if where else ""
-        raise InputError("\n".join(problem + at for problem in error.problems)) from None
+        lines = (problem + (_BESIDES if "unknown key" in problem else "") + at for problem in error.problems)
+        raise InputError("\n".join(lines)) from None
