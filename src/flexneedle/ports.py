@@ -1,5 +1,6 @@
 """What the closed loop needs of the world: a clock, something that moves the needle, something that sees its tip."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -7,13 +8,53 @@ Command = tuple[float, float, float, float, int]
 """db_x, db_y (mm), db_theta (rad), dg_y (mm), flip (−1, or +1 to turn the bevel)."""
 
 
+Point = tuple[float, float, float]
+"""x, y, z (mm)."""
+Quaternion = tuple[float, float, float, float]
+"""Unit quaternion w, x, y, z: turns the sensor's frame into the tracker's. The sensor's z axis is the needle's."""
+
+VISIBLE = "ok"
+"""Status of a sensor that the tracker sees."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One sensor in one frame of a tracker, in the tracker's frame; what it does not know is None.
+
+    indicator: how far the two coils of a 6-DOF sensor disagree (paper, section IV-B); 5-DOF sensors may have one, too.
+    status: VISIBLE, or in a few words why there is no position.
+    """
+
+    position: Point | None
+    orientation: Quaternion | None = None
+    indicator: float | None = None
+    status: str = VISIBLE
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a tracker saw at one time (s, on the clock of the run): readings by name of the sensor, such as "tip".
+
+    number: the tracker's own count of frames; it goes on while frames are lost.
+    """
+
+    time: float
+    number: int
+    readings: Mapping[str, Reading]
+
+
 @dataclass(frozen=True)
 class Sample:
-    """One reading of the tip tracker: time it was taken (s), tip x and y (mm), None where it saw nothing."""
+    """The tip in one frame: time it was taken (s); x, y in the plane and z out of it (mm), None where it was not seen.
+
+    frame: what the tracker said, for those who judge it; None if there is no more than the tip.
+    """
 
     time: float
     x: float | None
     y: float | None
+    z: float | None = None
+    frame: Frame | None = None
 
 
 class Clock(Protocol):
@@ -37,7 +78,15 @@ class Driver(Protocol):
 
 
 class Tracker(Protocol):
-    """Sees the tip of the needle."""
+    """Sees sensors: a device, a recording or a simulation."""
+
+    def read(self) -> tuple[Frame, ...]:
+        """The frames since the last call, oldest first; empty if there was none. Never waits for the next."""
+        ...
+
+
+class TipTracker(Protocol):
+    """Sees the tip of the needle, in the frame of the stage."""
 
     def read(self) -> tuple[Sample, ...]:
         """The readings since the last call, oldest first; empty if there was none."""

@@ -13,7 +13,7 @@ from flexneedle.control.interface import Decision, Method, Task, at_depth
 from flexneedle.control.methods import DEFAULT, method
 from flexneedle.errors import RunError
 from flexneedle.phantom import DEFAULT_PLANT, Condition, Phantom, draw
-from flexneedle.ports import Clock, Command, Driver, Sample, Tracker
+from flexneedle.ports import Clock, Command, Driver, Sample, TipTracker
 from flexneedle.scenario import Scenario
 from flexneedle.simulator import Simulator
 from flexneedle.trace import Insertion, Period, PlanRecord
@@ -30,7 +30,7 @@ class Rig:
 
     clock: Clock
     driver: Driver
-    tracker: Tracker
+    tracker: TipTracker
     truth: Callable[[], Condition] | None = None
 
 

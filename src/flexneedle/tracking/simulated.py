@@ -12,7 +12,7 @@ class NoisyTracker:
     """Reads `tip_at(time)` → (x, y) in mm every `period` s with white noise of `jitter` mm on each axis.
 
     A reading arrives `delay` s after it was taken, with the time at which it was taken; `bias` (x, y) in mm is
-    added to all, and a share `missing` of them sees no tip. A `Tracker`; all it shows of what it measures are
+    added to all, and a share `missing` of them sees no tip. A `TipTracker`; all it shows of what it measures are
     such samples.
     """
 

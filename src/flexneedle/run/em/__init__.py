@@ -1,0 +1,1 @@
+"""What `flexneedle em` does: tracker data in, results, tables and figures out."""
