@@ -371,7 +371,7 @@ def test_a_plan_cannot_be_exported(engine, capsys):
     engine()
     run(capsys, "plan", "--out", "here")
     assert run(capsys, "export", "here", "--csv") == (
-        1,
+        2,
         "",
         "flexneedle: here: holds a plan, not an insertion\n",
     )

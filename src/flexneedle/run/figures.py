@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from flexneedle.errors import RunError
+from flexneedle.errors import InputError, RunError
 from flexneedle.plot import insertion_figure, plan_figure, save
 from flexneedle.run.folder import TRACE_FILE, RunFile, read_run
 from flexneedle.trace import Insertion
@@ -34,7 +34,7 @@ def load_insertion(folder: Path) -> tuple[Insertion, str]:
     """
     run = read_run(folder)
     if run.kind != "insertion":
-        raise RunError(f"{folder}: holds a {run.kind}, not an insertion")
+        raise InputError(f"{folder}: holds a {run.kind}, not an insertion")
     if not run.plans:
         raise RunError(f"{folder}: the run ended before it had a plan")
     return _insertion(run)
