@@ -30,8 +30,8 @@ from flexneedle.errors import InputError
 from flexneedle.phantom import draw
 from flexneedle.plot import style
 from flexneedle.run.insertion import run as carry_out
-from flexneedle.run.insertion import virtual_rig
 from flexneedle.run.planner import plan as make_plan
+from flexneedle.run.rig import Seeds, virtual_rig
 from flexneedle.run.study.folder import STUDY_FILE
 from flexneedle.run.study.grid import Insertion, Study, load_study
 from flexneedle.run.study.plans import Plans, plan_key
@@ -115,8 +115,8 @@ def carried_out(insertion: Insertion, plan: PlanRecord, variant: str = NOTHING, 
     scenario = point.scenario.with_values(WITHOUT[variant])
     if variant == OTHER_PLAN:
         plan = make_plan(scenario, strategy=point.strategy, seed=point.plan_seed + sample, threads=1)
-    phantom, tracker, control = np.random.SeedSequence(insertion.seed).spawn(3)
-    rig = virtual_rig(scenario, plan.bevel, phantom, tracker, point.plant)
+    phantom, tracker, control, room = np.random.SeedSequence(insertion.seed).spawn(4)
+    rig = virtual_rig(scenario, plan.bevel, Seeds(phantom, tracker, room), point.plant)
     rng = np.random.default_rng(control if sample == 0 else control.spawn(sample)[-1])
     run = carry_out(scenario, plan, rig, rng, controller=point.controller, force=True, threads=1)
     last = run.periods[-1]

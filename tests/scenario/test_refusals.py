@@ -48,6 +48,12 @@ POSITIVE = [
     "control.adaptive_mpc.cell_mm",
     "control.adaptive_mpc.model_sd_mm",
     "control.resolved_rate.lookahead_mm",
+    "monitor.indicator_limit",
+    "monitor.indicator_window_s",
+    "monitor.abort_after_s",
+    "monitor.speed_limit_mm_s",
+    "monitor.frozen_travel_mm",
+    "monitor.out_of_plane_limit_mm",
     "control.broyden_mpc.max_guide_travel_mm",
     "tracker.rate_hz",
     "phantom.variation_length_mm",
@@ -105,7 +111,10 @@ NOT_NEGATIVE = [
     "control.broyden_mpc.update_gain",
     "control.broyden_mpc.guide_weight",
     "control.broyden_mpc.guide_effect",
+    "monitor.jump_margin_mm",
+    "monitor.lost_after_s",
     "tracker.jitter_mm",
+    "tracker.tip_offset_mm",
     "phantom.shear_modulus_variation",
     "phantom.layer_shift_sd_mm",
     "phantom.start_offset_sd_mm",
@@ -121,6 +130,7 @@ NOT_NEGATIVE = [
 ]
 
 COUNTS = {
+    "monitor.references": (0, 100),
     "needle.nodes": (2, 10_000),
     "plan.samples": (2, 100_000),
     "plan.iterations": (1, 10_000),
@@ -177,6 +187,8 @@ RULES = [
     ("plan.smoothing", 1.0, "must be below 1"),
     ("plan.steering_stiffness_factor", 0.0, ABOVE_ZERO),
     ("control.load_gain", 1.1, "must be at most 1"),
+    ("monitor.resume_fraction", 0.0, ABOVE_ZERO),
+    ("monitor.resume_fraction", 1.1, "must be at most 1"),
     ("control.adaptive_mpc.residual_gain", 1.1, "must be at most 1"),
     ("control.broyden_mpc.update_gain", 1.1, "must be at most 1"),
     ("control.resolved_rate.flip_dead_band", 1.1, "must be at most 1"),
@@ -207,6 +219,7 @@ RULES = [
     ("contact.spacing_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
     ("phantom.contact_spacing_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
     ("phantom.step_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
+    ("tracker.workspace_center_mm[0]", 1e7, "must be at most 1e+06"),
     ("tracker.rate_hz", 1e6, "must be at most 50000, 10000 readings in a control step"),
     # unknown keys
     ("needle.lenght_mm", 150.0, "unknown key; did you mean length_mm? valid keys: gauge, stylet,"),

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from flexneedle.errors import InputError
+from flexneedle.ports import Frame, Reading, Sample
+from flexneedle.trace import Judged
 from flexneedle.trace.columns import COLUMNS, to_row
 from flexneedle.trace.reader import read_trace
 from flexneedle.trace.topics import TOPICS
@@ -104,6 +107,42 @@ def test_the_smallest_stretch_of_the_true_tissue_is_a_column(trace_file):
     found = [float(to_row(period)["true_stretch"]) for period in read_trace(trace_file).periods]
     assert found == [period.true_stretch for period in PERIODS]
     assert found[0] == 1.0
+
+
+@pytest.mark.parametrize(
+    "sample",
+    [
+        Sample(0.1, 30.1, 1 / 3),
+        Sample(0.1, None, None, None),
+        Sample(
+            0.1,
+            30.1,
+            1 / 3,
+            -0.7,
+            Frame(
+                0.1,
+                4711,
+                {
+                    "tip": Reading((1 / 7, 2.0, 3.0), (0.5, 0.5, -0.5, 0.5)),
+                    "ref1": Reading((4.0, 5.0, 6.0), (1.0, 0.0, 0.0, 0.0), 0.0547),
+                    "ref 2": Reading(None, status="out of volume"),
+                },
+            ),
+        ),
+    ],
+)
+def test_readings_come_back_to_the_last_bit_with_their_verdicts(tmp_path, sample):
+    told = (Judged(sample, "ok"), Judged(sample, "frozen: the same in 4 readings"))
+    period = replace(PERIODS[3], readings=told, sample=sample)
+    (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
+    assert again.readings == told
+    assert (again.sample.x, again.sample.z) == (sample.x, sample.z)
+
+
+def test_a_period_has_its_own_readings_and_not_those_of_the_one_before(tmp_path):
+    told = replace(PERIODS[3], readings=(Judged(Sample(0.1, 1.0, 2.0), "ok"),))
+    first, second = read_trace(write(tmp_path / "trace.mcap", [told, PERIODS[4]])).periods
+    assert (len(first.readings), len(second.readings)) == (1, 0)
 
 
 def test_columns_carry_units():

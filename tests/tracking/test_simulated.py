@@ -7,7 +7,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from flexneedle import load_scenario
-from flexneedle.run.insertion import virtual_rig
+from flexneedle.run.rig import Seeds, virtual_rig
 from flexneedle.tracking import NoisyTracker
 
 PERIOD = 0.025
@@ -141,7 +141,7 @@ def test_the_rigs_delay_is_a_control_period_at_full_step_and_speed():
         scenario = load_scenario("phantom").with_values(
             {"phantom.delay_periods": periods, "phantom.missing_fraction": 0.0, "tracker.jitter_mm": 0.0}
         )
-        rig = virtual_rig(scenario, 1, np.random.SeedSequence(1), np.random.SeedSequence(2))
+        rig = virtual_rig(scenario, 1, Seeds(*map(np.random.SeedSequence, (1, 2, 3))))
         tips = [rig.truth().tip[:2]]
         for _ in range(4):
             rig.driver.apply((1.0, 0.0, 0.0, 0.2, -1), 0.2)

@@ -36,7 +36,7 @@ class Phantom:
         self._owed = np.zeros(4)  # what rounding to motor steps has left undone so far
         self._time = 0.0
         self._least_stretch = 1.0
-        self._path = [(0.0, *self._tip()[:2])]  # time, x, y
+        self._path = [(0.0, *self._tip())]  # time, x, y, slope
 
     def condition(self) -> Condition:
         """The truth, for the record; no controller gets it. The stretch is the smallest so far."""
@@ -49,7 +49,7 @@ class Phantom:
     def wait(self, seconds: float) -> None:
         """Let time pass with everything at rest."""
         self._time += seconds
-        self._path.append((self._time, *self._tip()[:2]))
+        self._path.append((self._time, *self._tip()))
 
     def apply(self, command: Command, duration: float) -> Command:
         """Carry out `command` evenly within `duration` s, in steps no longer than `phantom.step_mm`.
@@ -63,7 +63,7 @@ class Phantom:
         for k in range(parts):
             self._plant.step(np.append(row[:4] / parts, row[4] if k == 0 else -1.0))
             self._least_stretch = min(self._least_stretch, self._plant.least_stretch)
-            self._path.append((self._time + duration * (k + 1) / parts, *self._tip()[:2]))
+            self._path.append((self._time + duration * (k + 1) / parts, *self._tip()))
         self._moved += row[:4]
         self._time += duration
         db_x, db_y, db_theta, dg_y = row[:4].tolist()
@@ -71,10 +71,14 @@ class Phantom:
 
     def tip_at(self, time: float) -> tuple[float, float]:
         """Return the true tip (x, y) in mm at a time, for a tracker to measure; at rest before the start."""
-        for (t0, x0, y0), (t1, x1, y1) in zip(self._path[-2::-1], self._path[:0:-1], strict=True):
+        return self.pose_at(time)[:2]
+
+    def pose_at(self, time: float) -> tuple[float, float, float]:
+        """Return the true tip and its slope (x, y, θ), mm and rad, at a time; at rest before the start."""
+        for (t0, x0, y0, a0), (t1, x1, y1, a1) in zip(self._path[-2::-1], self._path[:0:-1], strict=True):
             if time > t0:
                 part = min(1.0, (time - t0) / (t1 - t0)) if t1 > t0 else 1.0
-                return x0 + part * (x1 - x0), y0 + part * (y1 - y0)
+                return x0 + part * (x1 - x0), y0 + part * (y1 - y0), a0 + part * (a1 - a0)
         return self._path[0][1:]
 
     def _rounded(self, command: Command) -> Floats:

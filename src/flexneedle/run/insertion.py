@@ -4,34 +4,24 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Decision, Method, Task, at_depth
 from flexneedle.control.methods import DEFAULT, method
 from flexneedle.errors import RunError
-from flexneedle.phantom import DEFAULT_PLANT, Condition, Phantom, draw
-from flexneedle.ports import Clock, Command, Driver, Sample, TipTracker
+from flexneedle.phantom import DEFAULT_PLANT
+from flexneedle.ports import Command
+from flexneedle.run.rig import Rig, Seeds, virtual_rig
+from flexneedle.run.sight import Sight, see
 from flexneedle.scenario import Scenario
 from flexneedle.simulator import Simulator
 from flexneedle.trace import Insertion, Period, PlanRecord
-from flexneedle.tracking import OK, NoisyTracker, judge
+from flexneedle.tracking import OK, Watch
 
 _TOO_MANY = 4  # times the planned periods: the loop is not getting there
 _STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
-_NO_SAMPLE = Sample(0.0, None, None)
-
-
-@dataclass(frozen=True)
-class Rig:
-    """What the closed loop moves and sees; `truth` is for the record alone, None on hardware."""
-
-    clock: Clock
-    driver: Driver
-    tracker: TipTracker
-    truth: Callable[[], Condition] | None = None
 
 
 def insert(
@@ -52,8 +42,8 @@ def insert(
     it ends. Raises InputError for an unknown name, RunError if the plan misses its target by more than 1 mm,
     unless `force`. Same seed, same record, but for wall-clock durations.
     """
-    phantom_seed, tracker_seed, control_seed = np.random.SeedSequence(seed).spawn(3)
-    rig = virtual_rig(scenario, plan.bevel, phantom_seed, tracker_seed, phantom)
+    phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
+    rig = virtual_rig(scenario, plan.bevel, Seeds(phantom_seed, tracker_seed, room_seed), phantom)
     rng = np.random.default_rng(control_seed)
     insertion = run(
         scenario,
@@ -67,30 +57,6 @@ def insert(
         on_period=on_period,
     )
     return replace(insertion, phantom=phantom)
-
-
-def virtual_rig(
-    scenario: Scenario,
-    bevel: int,
-    phantom_seed: np.random.SeedSequence,
-    tracker_seed: np.random.SeedSequence,
-    phantom: str = DEFAULT_PLANT,
-) -> Rig:
-    """Return a virtual phantom behind the same ports as a rig."""
-    truth = draw(scenario, np.random.default_rng(phantom_seed))
-    tank = Phantom(truth, bevel, phantom)
-    step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
-    tracker = NoisyTracker(
-        tank.tip_at,
-        tank,
-        scenario.tracker.period,
-        scenario.tracker.jitter_per_axis,
-        np.random.default_rng(tracker_seed),
-        delay=scenario.phantom.delay_periods * step,
-        missing=scenario.phantom.missing_fraction,
-        bias=truth.bias,
-    )
-    return Rig(tank, tank, tracker, tank.condition)
 
 
 def run(
@@ -133,38 +99,40 @@ def _periods(
 
     After the last move the needle rests until the tracker has seen it at rest: readings come late.
     """
-    estimate = chosen.beliefs.begin(task.simulator, task.plan.bevel)
+    scenario = task.scenario
+    sight = Sight(chosen.beliefs.begin(task.simulator, task.plan.bevel), Watch(scenario.monitor))
     memory = chosen.begin(task)
     held_since: float | None = None
     arrived_at: float | None = None
-    sample, moves = _NO_SAMPLE, 0
+    moves = 0
     for index in itertools.count():
         if moves == _TOO_MANY * len(task.plan.controls):
             return
         clocks = [time.perf_counter()]
-        begun, wait = rig.clock.now(), task.scenario.tracker.period
+        begun, wait = rig.clock.now(), scenario.tracker.period
         if held_since is not None:
             decision = Decision(_STILL, "held")
         elif arrived_at is not None:
-            decision, wait = Decision(_STILL, "at rest for the last reading"), max(wait, begun - sample.time)
+            decision, wait = (
+                Decision(_STILL, "at rest for the last reading"),
+                max(wait, begun - sight.sample.time),
+            )
         else:
-            decision, memory = chosen.decide(task, memory, estimate, rng)
+            decision, memory = chosen.decide(task, memory, sight.estimate, rng)
             moves, wait = moves + 1, 0.0
         clocks.append(time.perf_counter())
-        applied = _carry_out(task.scenario, rig, decision.command, wait)
+        applied = _carry_out(scenario, rig, decision.command, wait)
         clocks.append(time.perf_counter())
-        estimate, sample, verdict = _see(task.scenario, estimate, applied, begun, rig)
+        moved = sight.estimate.move(applied, begun, rig.clock.now())
+        sight = see(scenario, moved, sight.watch, begun, rig.clock.now(), rig.tracker)
         clocks.append(time.perf_counter())
-        now = rig.clock.now()
-        held_since = None if verdict == OK else (now if held_since is None else held_since)
-        if arrived_at is None and verdict == OK and chosen.arrived(task, memory, estimate):
+        now, good = rig.clock.now(), sight.verdict == OK
+        held_since = None if good else (now if held_since is None else held_since)
+        if arrived_at is None and good and chosen.arrived(task, memory, sight.estimate):
             arrived_at = now
-        seen = arrived_at is not None and verdict == OK and sample.time > arrived_at - 1e-6
-        ending = _ending(task, estimate, verdict, 0.0 if held_since is None else now - held_since, seen)
-        yield (
-            _record(index, now, task.plan, rig, decision, applied, sample, verdict, estimate, clocks),
-            ending,
-        )
+        seen = arrived_at is not None and good and sight.sample.time > arrived_at - 1e-6
+        ending = _ending(task, sight, 0.0 if held_since is None else now - held_since, seen)
+        yield _record(index, now, task.plan, rig, decision, applied, sight, clocks), ending
         if ending is not None:
             return
 
@@ -179,33 +147,13 @@ def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> C
     return rig.driver.apply(command, max(1, readings) * reading)
 
 
-def _see(
-    scenario: Scenario, estimate: Estimate, applied: Command, begun: float, rig: Rig
-) -> tuple[Estimate, Sample, str]:
-    """Predict, read the tracker, judge its readings, correct by the good ones."""
-    control, now = scenario.control, rig.clock.now()
-    predicted = estimate.move(applied, begun, now)
-    samples = rig.tracker.read()
-    if not samples:
-        return predicted.unseen(), _NO_SAMPLE, "missing: no reading"
-    # All but the newest were on their way while the needle moved.
-    ages = [control.stale_after_s + now - begun] * (len(samples) - 1) + [control.stale_after_s]
-    verdicts = [
-        judge(sample, predicted.tip_at(sample.time), now, age, control.innovation_limit_mm)
-        for sample, age in zip(samples, ages, strict=True)
-    ]
-    good = [sample for sample, verdict in zip(samples, verdicts, strict=True) if verdict == OK]
-    corrected = predicted.observe(good)
-    return corrected if verdicts[-1] == OK else corrected.unseen(), samples[-1], verdicts[-1]
-
-
-def _ending(task: Task, estimate: Estimate, verdict: str, held: float, seen: bool) -> tuple[str, str] | None:
-    """How the insertion ends after this period, if it does."""
+def _ending(task: Task, sight: Sight, held: float, seen: bool) -> tuple[str, str] | None:
+    """How the insertion ends after this period, if it does; held: for how long it has been (s)."""
+    estimate = sight.estimate
     if not estimate.state.converged:
         return "failed", f"the model did not converge: residual {estimate.state.residual:.3g} mm"
-    limit = task.scenario.control.hold_limit_s
-    if held > limit - 1e-9:
-        return "held", f"held for {held:.2f} s (limit {limit:g} s): {verdict}"
+    if sight.verdict != OK and held > sight.limit - 1e-9:
+        return "held", f"held for {held:.2f} s (limit {sight.limit:g} s): {sight.verdict}"
     if not seen:
         return None
     short = task.plan.target[0] - float(estimate.tip[0])
@@ -221,19 +169,19 @@ def _record(
     rig: Rig,
     decision: Decision,
     applied: Command,
-    sample: Sample,
-    verdict: str,
-    estimate: Estimate,
+    sight: Sight,
     clocks: list[float],
 ) -> Period:
+    estimate = sight.estimate
     state, truth = estimate.state, None if rig.truth is None else rig.truth()
     return Period(
         index=index,
         time=now,
         command=decision.command,
         applied=applied,
-        sample=sample,
-        verdict=verdict,
+        sample=sight.sample,
+        verdict=sight.verdict,
+        readings=sight.readings,
         innovation=estimate.innovation,
         estimate=_pose(estimate.tip),
         shape=state.nodes,

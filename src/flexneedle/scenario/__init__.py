@@ -3,7 +3,9 @@
 from .apparatus import Setup, Tracker
 from .files import dump_scenario, load_scenario, preset_names
 from .model import Scenario, check_target
+from .monitor import Monitor
 from .needle import GAUGES, Bevel, Needle
+from .registration import Registration
 from .settings import Control, Phantom, Plan, Target, elite_count
 from .tissue import Contact, Layer
 
@@ -13,9 +15,11 @@ __all__ = [
     "Contact",
     "Control",
     "Layer",
+    "Monitor",
     "Needle",
     "Phantom",
     "Plan",
+    "Registration",
     "Scenario",
     "Setup",
     "Target",

@@ -1,8 +1,13 @@
 """What holds, moves and measures the needle."""
 
 from math import sqrt
+from typing import Annotated
 
+from pydantic import BeforeValidator
+
+from .environment import AnySeed, Environment, Vector, expanded
 from .fields import NonNegative, Positive, Section
+from .registration import Registration
 
 __all__ = ["Setup", "Tracker"]
 
@@ -68,7 +73,18 @@ class Tracker(Section):
     rate_hz: Positive = 40.0
     """Readings a second."""
     jitter_mm: NonNegative = 0.07
-    """RMS length of the 3D deviation vector."""
+    """RMS length of the 3D deviation vector; in an environment, that has its own."""
+    tip_offset_mm: NonNegative = 0.0
+    """Calibrated distance from the sensor to the tip of the needle, along the needle."""
+    workspace_center_mm: Vector = (20.0, 0.0, 0.0)
+    """Where the middle of the environment's workspace lies in the frame of the insertion."""
+    field_seed: AnySeed | None = None
+    """Which room of the environment; left out, each insertion draws its own from its seed."""
+    environment: Annotated[Environment | None, BeforeValidator(expanded)] = None
+    """The name of a shipped environment, or a table of one's own; "none" or left out, there is white noise alone."""
+
+    registration: Registration | None = None
+    """How the tracker's frame lies in the insertion's; left out, they are one."""
 
     @property
     def period(self) -> float:

@@ -10,7 +10,9 @@ from flexneedle.errors import ScenarioError
 
 from .apparatus import Setup, Tracker
 from .dotted import flatten, set_value, split_key
+from .environment import environment_names, expanded
 from .fields import Section, Title
+from .monitor import Monitor
 from .needle import Needle
 from .problems import describe, key_path, refuse, to_line
 from .rules import geometry_problems, grid_problems, layer_problems, plan_problems, target_problems
@@ -18,6 +20,8 @@ from .settings import Control, Phantom, Plan, Target
 from .tissue import Contact, Layer
 
 __all__ = ["Scenario", "check_target"]
+
+_ENVIRONMENT = "tracker.environment"
 
 
 class Scenario(Section):
@@ -37,6 +41,7 @@ class Scenario(Section):
     plan: Plan = Plan()
     control: Control = Control()
     tracker: Tracker = Tracker()
+    monitor: Monitor = Monitor()
     phantom: Phantom = Phantom()
 
     @model_validator(mode="after")
@@ -72,7 +77,7 @@ class Scenario(Section):
         """
         values = self.values()
         for key, value in changes.items():
-            set_value(values, key, value)
+            set_value(values, key, _expanded(key, value))
         return self.from_values(values)
 
     def flat(self) -> dict[str, Any]:
@@ -98,6 +103,12 @@ class Scenario(Section):
         for layer in self.tissue[:-1]:
             tops.append(tops[-1] + (layer.thickness_mm or 0.0))
         return tuple(tops)
+
+
+def _expanded(key: str, value: Any) -> Any:
+    """Return the table of an environment's name, so that later changes can go into it; an unknown name as it is."""
+    known = key == _ENVIRONMENT and value in environment_names()
+    return expanded(value) if known else value
 
 
 def check_target(scenario: Scenario, depth: float, lateral: float) -> None:

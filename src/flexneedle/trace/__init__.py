@@ -1,5 +1,5 @@
 """What a run leaves behind: plain records, and their file on disk."""
 
-from flexneedle.trace.records import Insertion, Period, PlanRecord
+from flexneedle.trace.records import Insertion, Judged, Period, PlanRecord
 
-__all__ = ["Insertion", "Period", "PlanRecord"]
+__all__ = ["Insertion", "Judged", "Period", "PlanRecord"]

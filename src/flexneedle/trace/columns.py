@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from flexneedle.ports import Sample
-from flexneedle.trace.records import Floats, Period
+from flexneedle.trace.records import Floats, Judged, Period
 
 __all__ = ["COLUMNS", "from_row", "to_row"]
 
@@ -33,7 +33,7 @@ _FIELDS: dict[str, tuple[tuple[str, _Scalar], ...]] = {
     "time": (("time_s", float),),
     "command": _command("command"),
     "applied": _command("applied"),
-    "sample": (("sample_time_s", float), ("sample_x_mm", float), ("sample_y_mm", float)),
+    "sample": tuple((f"sample_{part}", float) for part in ("time_s", "x_mm", "y_mm", "z_mm")),
     "verdict": (("verdict", str),),
     "innovation": (("innovation_x_mm", float), ("innovation_y_mm", float)),
     "estimate": _pose("estimate"),
@@ -61,14 +61,17 @@ def to_row(period: Period) -> dict[str, str]:
     return dict(cell for field in _FIELDS for cell in _cells(field, getattr(period, field)))
 
 
-def from_row(row: Mapping[str, str], shape: Floats, durations: dict[str, float]) -> Period:
-    """Return the period of a row; raises KeyError or ValueError where the row is not one of `to_row`."""
-    return Period(shape=shape, durations=durations, **{field: _value(field, row) for field in _FIELDS})
+def from_row(
+    row: Mapping[str, str], shape: Floats, durations: dict[str, float], readings: tuple[Judged, ...] = ()
+) -> Period:
+    """Return the period of a row with what no row holds; raises KeyError or ValueError for other rows."""
+    values = {field: _value(field, row) for field in _FIELDS}
+    return Period(shape=shape, durations=durations, readings=readings, **values)
 
 
 def _cells(field: str, value: Any) -> Iterator[tuple[str, str]]:
     if isinstance(value, Sample):
-        value = (value.time, value.x, value.y)
+        value = (value.time, value.x, value.y, value.z)
     columns = _FIELDS[field]
     parts = value if isinstance(value, tuple) else (value,) * len(columns)
     for (name, kind), part in zip(columns, parts, strict=True):

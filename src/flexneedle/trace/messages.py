@@ -5,6 +5,7 @@ the right hand. Time is that of the run and starts at 0.
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from math import cos, sin
 
 import numpy as np
@@ -17,10 +18,13 @@ __all__ = [
     "FRAME",
     "STORE",
     "DiagnosticArray",
+    "DiagnosticStatus",
+    "Judgement",
     "Message",
     "Path",
     "diagnostics",
     "joints",
+    "judgements",
     "nanoseconds",
     "number",
     "path",
@@ -47,6 +51,16 @@ Header = ros.std_msgs__msg__Header
 FRAME = "skin"
 JOINTS = ["base_x", "base_y", "base_theta", "guide_y", "bevel"]
 STORE = get_typestore(Stores.ROS2_HUMBLE)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A text, whether it is a good one, and values by key."""
+
+    text: str
+    good: bool
+    values: Mapping[str, str]
+
 
 Message = PoseStamped | Path | JointState | Float64 | Vector3Stamped | DiagnosticArray
 
@@ -93,9 +107,18 @@ def diagnostics(
     time: float, name: str, values: Mapping[str, str], *, text: str = "", good: bool = True
 ) -> DiagnosticArray:
     """Return one status with its values by key; level OK, or WARN if it is not good."""
-    level = DiagnosticStatus.OK if good else DiagnosticStatus.WARN
-    pairs = [KeyValue(key, value) for key, value in values.items()]
-    return DiagnosticArray(_header(time), [DiagnosticStatus(level, name, text, "", pairs)])
+    return judgements(time, name, [Judgement(text, good, values)])
+
+
+def judgements(time: float, name: str, told: Iterable[Judgement]) -> DiagnosticArray:
+    """Return a status for each judgement, all of one name."""
+    return DiagnosticArray(_header(time), [_status(name, one) for one in told])
+
+
+def _status(name: str, told: Judgement) -> DiagnosticStatus:
+    level = DiagnosticStatus.OK if told.good else DiagnosticStatus.WARN
+    pairs = [KeyValue(key, value) for key, value in told.values.items()]
+    return DiagnosticStatus(level, name, told.text, "", pairs)
 
 
 def _header(time: float) -> Header:

@@ -14,10 +14,11 @@ from mcap.stream_reader import CRCValidationError, StreamReader
 
 from flexneedle.errors import InputError
 from flexneedle.trace.columns import from_row
-from flexneedle.trace.messages import STORE, DiagnosticArray, points_of
+from flexneedle.trace.messages import STORE, DiagnosticArray, DiagnosticStatus, points_of
 from flexneedle.trace.messages import Path as PathMessage
-from flexneedle.trace.records import Floats, Period
-from flexneedle.trace.topics import SHAPE, STATUS, TIMING, TOPICS
+from flexneedle.trace.readings import from_values
+from flexneedle.trace.records import Floats, Judged, Period
+from flexneedle.trace.topics import READINGS, SHAPE, STATUS, TIMING, TOPICS
 
 __all__ = ["Trace", "read_trace"]
 
@@ -69,6 +70,7 @@ class _Collector:
         self._topics: dict[int, str] = {}
         self._shape: Floats = np.empty((0, 3))
         self._durations: dict[str, float] = {}
+        self._readings: tuple[Judged, ...] = ()
 
     def take(self, record: McapRecord) -> None:
         """Take one record of the file."""
@@ -82,16 +84,20 @@ class _Collector:
             self.scenario = json.loads(record.data)
 
     def _hear(self, topic: str, data: bytes) -> None:
-        if topic not in (SHAPE, TIMING, STATUS):
+        if topic not in (SHAPE, READINGS, TIMING, STATUS):
             return
         message = STORE.deserialize_cdr(data, TOPICS[topic])
         if isinstance(message, PathMessage):
             self._shape = points_of(message)
         elif isinstance(message, DiagnosticArray) and topic == TIMING:
-            self._durations = {name[:-2]: float(value) for name, value in _pairs(message)}
+            self._durations = {name[:-2]: float(value) for name, value in _pairs(message.status[0])}
+        elif isinstance(message, DiagnosticArray) and topic == READINGS:
+            told = message.status
+            self._readings = tuple(from_values(dict(_pairs(status)), status.message) for status in told)
         elif isinstance(message, DiagnosticArray):
-            self.periods.append(from_row(dict(_pairs(message)), self._shape, self._durations))
+            row = dict(_pairs(message.status[0]))
+            self.periods.append(from_row(row, self._shape, self._durations, self._readings))
 
 
-def _pairs(message: DiagnosticArray) -> Iterator[tuple[str, str]]:
-    return ((pair.key, pair.value) for pair in message.status[0].values)
+def _pairs(status: DiagnosticStatus) -> Iterator[tuple[str, str]]:
+    return ((pair.key, pair.value) for pair in status.values)

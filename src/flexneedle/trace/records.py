@@ -64,6 +64,14 @@ class PlanRecord:
         return int(np.count_nonzero(self.controls[:, 4] > 0.0))
 
 
+@dataclass(frozen=True)
+class Judged:
+    """A reading of the tracker, and "ok" or why it was not believed."""
+
+    sample: Sample
+    verdict: str
+
+
 @dataclass(frozen=True, eq=False)
 class Period:
     """One control period. `true_*` is the virtual phantom's, None on a rig; the controller never sees it."""
@@ -91,6 +99,7 @@ class Period:
     durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
     converged: bool = True  # the model's solve of this period, and all of the virtual phantom's so far
     true_stretch: float | None = None  # smallest stretch λ of the true tissue so far
+    readings: tuple[Judged, ...] = ()  # all that came in the period, oldest first; `sample` is the newest
 
 
 @dataclass(frozen=True, eq=False)

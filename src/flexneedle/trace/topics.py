@@ -6,20 +6,24 @@ from math import isfinite
 
 from flexneedle.trace.columns import to_row
 from flexneedle.trace.messages import (
+    Judgement,
     Message,
     diagnostics,
     joints,
+    judgements,
     nanoseconds,
     number,
     path,
     pose,
     vector,
 )
+from flexneedle.trace.readings import to_values
 from flexneedle.trace.records import Floats, Period
 
 __all__ = [
     "LATCHED",
     "PLAN",
+    "READINGS",
     "SHAPE",
     "STATUS",
     "TIMING",
@@ -30,6 +34,7 @@ __all__ = [
 ]
 
 PLAN, SHAPE, STATUS, TIMING = "/plan/path", "/needle/shape", "/control/status", "/timing"
+READINGS = "/tracker/readings"
 
 _POSE, _PATH, _JOINTS = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path", "sensor_msgs/msg/JointState"
 _NUMBER, _STATUS = "std_msgs/msg/Float64", "diagnostic_msgs/msg/DiagnosticArray"
@@ -50,6 +55,7 @@ TOPICS: dict[str, str] = {
     "/control/innovation": "geometry_msgs/msg/Vector3Stamped",  # m
     "/tissue/strain_energy": _NUMBER,  # J, of the estimate
     "/tissue/true_strain_energy": _NUMBER,  # J, of the virtual phantom
+    READINGS: _STATUS,  # a status for each reading of the period: what the tracker said, and whether it was believed
     TIMING: _STATUS,  # wall-clock durations of the period, s
     STATUS: _STATUS,  # every scalar of the period, exact, in the columns of the CSV; ends the period
 }
@@ -108,6 +114,8 @@ def _tissue(period: Period) -> Iterator[tuple[str, Message]]:
 
 
 def _status(period: Period) -> Iterator[tuple[str, Message]]:
+    told = [Judgement(one.verdict, one.verdict == "ok", to_values(one)) for one in period.readings]
+    yield READINGS, judgements(period.time, "reading", told)
     durations = {f"{name}_s": repr(float(seconds)) for name, seconds in period.durations.items()}
     yield TIMING, diagnostics(period.time, "timing", durations)
     good = period.verdict == "ok"

@@ -1,6 +1,7 @@
-"""The tip tracker: a simulated one, and the judgement of readings before anything believes them."""
+"""The tracker: simulated ones, what may be believed of one, its registration, its evaluation."""
 
-from flexneedle.tracking.judgement import OK, judge
+from flexneedle.tracking.monitor import Watch
+from flexneedle.tracking.rules import OK
 from flexneedle.tracking.simulated import NoisyTracker
 
-__all__ = ["OK", "NoisyTracker", "judge"]
+__all__ = ["OK", "NoisyTracker", "Watch"]

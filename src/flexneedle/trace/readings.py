@@ -1,0 +1,62 @@
+"""A judged reading of the tracker as text by key, exact, and back: one status of `/tracker/readings`."""
+
+from collections.abc import Iterator, Mapping
+
+from flexneedle.ports import Frame, Reading, Sample
+from flexneedle.trace.records import Judged
+
+__all__ = ["from_values", "to_values"]
+
+_PLACE, _TURN = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
+
+
+def to_values(judged: Judged) -> dict[str, str]:
+    """Return what the reading says of the tip, then of each sensor of its frame; what is not known is left out."""
+    sample, frame = judged.sample, judged.sample.frame
+    values = {"time_s": repr(float(sample.time))}
+    values |= _numbers(_PLACE, (sample.x, sample.y, sample.z))
+    if frame is not None:
+        values |= {"frame_time_s": repr(float(frame.time)), "frame_number": str(frame.number)}
+        for name, reading in frame.readings.items():
+            values |= {f"{name}.{key}": text for key, text in _sensor(reading)}
+    return values
+
+
+def from_values(values: Mapping[str, str], verdict: str) -> Judged:
+    """Return the reading of such a status; raises KeyError or ValueError where it is none."""
+    x, y, z = (_number(values, key) for key in _PLACE)
+    return Judged(Sample(float(values["time_s"]), x, y, z, _frame(values)), verdict)
+
+
+def _frame(values: Mapping[str, str]) -> Frame | None:
+    if "frame_number" not in values:
+        return None
+    names = [key.removesuffix(".status") for key in values if key.endswith(".status")]
+    readings = {name: _reading(values, name) for name in names}
+    return Frame(float(values["frame_time_s"]), int(values["frame_number"]), readings)
+
+
+def _reading(values: Mapping[str, str], name: str) -> Reading:
+    x, y, z = (_number(values, f"{name}.{key}") for key in _PLACE)
+    w, i, j, k = (_number(values, f"{name}.{key}") for key in _TURN)
+    return Reading(
+        None if x is None or y is None or z is None else (x, y, z),
+        None if w is None or i is None or j is None or k is None else (w, i, j, k),
+        _number(values, f"{name}.indicator"),
+        values[f"{name}.status"],
+    )
+
+
+def _sensor(reading: Reading) -> Iterator[tuple[str, str]]:
+    yield "status", reading.status
+    yield from _numbers(_PLACE, reading.position or ()).items()
+    yield from _numbers(_TURN, reading.orientation or ()).items()
+    yield from _numbers(("indicator",), (reading.indicator,)).items()
+
+
+def _numbers(keys: tuple[str, ...], values: tuple[float | None, ...]) -> dict[str, str]:
+    return {key: repr(float(value)) for key, value in zip(keys, values, strict=False) if value is not None}
+
+
+def _number(values: Mapping[str, str], key: str) -> float | None:
+    return float(values[key]) if key in values else None

@@ -1,0 +1,99 @@
+"""The watch over the tracker: what it remembers of past readings, and whether it lets the needle move."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from flexneedle.ports import Sample
+from flexneedle.scenario import Monitor
+from flexneedle.tracking import rules
+from flexneedle.tracking.rules import OK
+
+__all__ = ["Watch"]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    sample: Sample
+    predicted: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Watch:
+    """What the monitor remembers. Frozen: `take` and `look` return the next one.
+
+    recent: readings within the window; good: the last one without fault; distorted: whether the field held the needle.
+    """
+
+    settings: Monitor
+    tip: str = "tip"
+    recent: tuple[_Seen, ...] = ()
+    good: Sample | None = None
+    distorted: bool = False
+
+    def take(
+        self, sample: Sample, predicted: tuple[float, float], now: float, oldest: float, furthest: float
+    ) -> "tuple[Watch, str]":
+        """Take in a reading; return what is wrong with it, or OK.
+
+        predicted: the model's tip (mm) at its time; now (s); oldest: age (s), furthest: distance (mm) from the
+        prediction beyond which no reading is believed.
+        """
+        verdict = rules.not_a_number(sample)
+        if verdict != OK:
+            return self, verdict
+        since = sample.time - self.settings.indicator_window_s + 1e-9
+        kept = tuple(seen for seen in self.recent if seen.sample.time > since)
+        watch = replace(self, recent=(*kept, _Seen(sample, predicted)))
+        verdict = rules.first_bad(watch._faults(sample, predicted, now, oldest, furthest))
+        return (replace(watch, good=sample) if verdict == OK else watch), verdict
+
+    def only_missed(self, newest: Sample) -> Sample | None:
+        """Return the last good reading if the tip was lost in the newest frame, but not for long; None otherwise.
+
+        Only of a tracker that tells frames: it is known to be alive, and to look.
+        """
+        if not self.settings.enabled or newest.frame is None or rules.missing(newest) == OK:
+            return None
+        lost_for = math.inf if self.good is None else newest.time - self.good.time
+        return self.good if lost_for <= self.settings.lost_after_s + 1e-9 else None
+
+    def look(self) -> "tuple[Watch, str]":
+        """Judge the field by the reference sensors; return why the needle may not move, or OK.
+
+        A tracker that tells nothing but the tip is not held against: there is nothing to judge.
+        """
+        settings, frames = self.settings, [seen.sample.frame for seen in self.recent]
+        if not settings.enabled or all(frame is None for frame in frames):
+            return self, OK
+        indicators: dict[str, list[float]] = {}
+        for frame in frames:
+            for name, reading in frame.readings.items() if frame is not None else ():
+                if name != self.tip and reading.indicator is not None:
+                    indicators.setdefault(name, []).append(reading.indicator)
+        window, share = settings.indicator_window_s, settings.resume_fraction if self.distorted else 1.0
+        verdict = rules.unseen_references(indicators, settings.references, window)
+        if verdict == OK:
+            verdict = rules.distortion(indicators, share * settings.indicator_limit, window)
+        return replace(self, distorted=verdict != OK), verdict
+
+    def _faults(
+        self, sample: Sample, predicted: tuple[float, float], now: float, oldest: float, furthest: float
+    ) -> Iterator[str]:
+        settings = self.settings
+        yield rules.missing(sample, self.tip)
+        yield rules.stale(sample.time, now, oldest)
+        if sample.x is not None and sample.y is not None:
+            yield rules.innovation((sample.x, sample.y), predicted, furthest)
+        if settings.enabled:
+            yield rules.out_of_plane(sample.z, settings.out_of_plane_limit_mm)
+            yield rules.jump(sample, self.good, settings.speed_limit_mm_s, settings.jump_margin_mm)
+            places = [self._place(seen.sample) for seen in self.recent]
+            yield rules.frozen(places, [seen.predicted for seen in self.recent], settings.frozen_travel_mm)
+
+    def _place(self, sample: Sample) -> rules.Place | None:
+        """What the tracker itself said of the tip: a map to the stage or an offset makes no frozen sensor move."""
+        told = None if sample.frame is None else sample.frame.readings.get(self.tip)
+        if told is not None:
+            return told.position
+        return None if sample.x is None or sample.y is None else (sample.x, sample.y)

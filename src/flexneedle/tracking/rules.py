@@ -1,0 +1,118 @@
+"""What makes a reading, or the field that it was taken in, one not to act on: each rule a pure function.
+
+A rule returns OK, or in a few words what is wrong, with the value and the limit. A bad reading is reported, never
+repaired.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from statistics import median
+
+from flexneedle.ports import Sample
+
+Place = tuple[float, ...]
+
+__all__ = [
+    "OK",
+    "distortion",
+    "first_bad",
+    "frozen",
+    "innovation",
+    "jump",
+    "missing",
+    "not_a_number",
+    "out_of_plane",
+    "stale",
+    "unseen_references",
+]
+
+OK = "ok"
+
+
+def first_bad(verdicts: Iterable[str]) -> str:
+    """Return the first verdict that is not OK, or OK; the rest of a generator is not looked at."""
+    return next((verdict for verdict in verdicts if verdict != OK), OK)
+
+
+def missing(sample: Sample, tip: str = "tip") -> str:
+    """A reading in which the tracker does not see the tip; says why if the tracker does."""
+    if sample.x is not None and sample.y is not None:
+        return OK
+    told = None if sample.frame is None else sample.frame.readings.get(tip)
+    return f"missing: tracker sees no tip{f' ({told.status})' if told and told.position is None else ''}"
+
+
+def not_a_number(sample: Sample) -> str:
+    """Time or place is not finite."""
+    values = (sample.time, sample.x, sample.y, sample.z)
+    return OK if all(math.isfinite(value) for value in values if value is not None) else "not a number"
+
+
+def stale(time: float, now: float, limit: float) -> str:
+    """A reading older than `limit`, or dated so far ahead (s)."""
+    if now - time > limit:
+        return f"stale: {now - time:.3f} s old, limit {limit:g} s"
+    if time > now + limit:
+        return f"stale: dated {time - now:.3f} s ahead"
+    return OK
+
+
+def innovation(place: tuple[float, float], predicted: tuple[float, float], limit: float) -> str:
+    """A tip further from the model's than `limit` (mm)."""
+    distance = math.hypot(place[0] - predicted[0], place[1] - predicted[1])
+    return OK if distance <= limit else f"innovation {distance:.2f} mm, limit {limit:g} mm"
+
+
+def out_of_plane(z: float | None, limit: float) -> str:
+    """A tip further than `limit` (mm) from the plane of the insertion; OK where the tracker does not know."""
+    return OK if z is None or abs(z) <= limit else f"out of plane: {z:.2f} mm, limit {limit:g} mm"
+
+
+def jump(sample: Sample, before: Sample | None, speed: float, margin: float) -> str:
+    """A tip that moved faster than `speed` (mm/s) since the last good reading, with `margin` (mm) for noise."""
+    if before is None:
+        return OK
+    moved = math.dist(*_shared(sample, before))
+    limit = speed * abs(sample.time - before.time) + margin
+    return OK if moved <= limit else f"jump of {moved:.2f} mm, limit {limit:.2f} mm"
+
+
+def frozen(
+    places: Sequence[Place | None], predicted: Sequence[tuple[float, float]], travel_limit: float
+) -> str:
+    """A reading the same to the last digit while the model's tip travelled more than `travel_limit` (mm).
+
+    places, predicted: of the readings up to the newest, oldest first; None where nothing was seen.
+    """
+    newest = places[-1] if places else None
+    if newest is None:
+        return OK
+    same = next((k for k, place in enumerate(reversed(places)) if place != newest), len(places))
+    travel = math.dist(predicted[-same], predicted[-1])
+    if travel <= travel_limit:
+        return OK
+    return f"frozen: the same in {same} readings while the tip should have moved {travel:.2f} mm"
+
+
+def unseen_references(indicators: Mapping[str, Sequence[float]], needed: int, window: float) -> str:
+    """Fewer than `needed` reference sensors told an indicator within the window (s)."""
+    told = sum(bool(values) for values in indicators.values())
+    if told >= needed:
+        return OK
+    return f"field not known: {told} of {needed} reference sensors seen within {window:g} s"
+
+
+def distortion(indicators: Mapping[str, Sequence[float]], limit: float, window: float) -> str:
+    """The median indicator of a reference sensor over the window (s) is above the limit; names the worst one."""
+    medians = {name: median(values) for name, values in indicators.items() if values}
+    worst = max(medians, key=lambda name: medians[name], default=None)
+    if worst is None or medians[worst] <= limit:
+        return OK
+    return f"field distorted: {worst} {medians[worst]:.4f}, limit {limit:.4f} (median over {window:g} s)"
+
+
+def _shared(one: Sample, other: Sample) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Places of two readings in the coordinates that both know."""
+    pairs = ((one.x, other.x), (one.y, other.y), (one.z, other.z))
+    known = [(a, b) for a, b in pairs if a is not None and b is not None]
+    return tuple(a for a, _ in known), tuple(b for _, b in known)

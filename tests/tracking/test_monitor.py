@@ -1,0 +1,160 @@
+"""The watch: the order of its rules, its window, its hysteresis, and that it never changes itself."""
+
+from dataclasses import replace
+
+import pytest
+
+from flexneedle.ports import Frame, Reading, Sample
+from flexneedle.scenario import Monitor
+from flexneedle.tracking import OK, Watch
+
+RATE = 40.0
+SETTINGS = Monitor()
+
+
+def frame(time, indicators=(0.02, 0.02, 0.02), tip=(1.0, 2.0, 3.0)):
+    """A frame with one reference sensor for each indicator; None is one that the tracker does not see."""
+    readings = {"tip": Reading(tip, status=OK if tip else "out of volume")}
+    for k, indicator in enumerate(indicators, 1):
+        readings[f"ref{k}"] = Reading(None if indicator is None else (0.0, 0.0, 0.0), indicator=indicator)
+    return Frame(time, round(time * RATE), readings)
+
+
+def told(watch, indicators, begin, count):
+    """The watch after `count` readings at rest, and its verdict on the field after each."""
+    verdicts = []
+    for k in range(count):
+        time = begin + k / RATE
+        sample = Sample(time, 30.0 + 1e-6 * k, 1.0, 0.0, frame(time, indicators))
+        watch, verdict = watch.take(sample, (30.0, 1.0), time, 0.3, 2.0)
+        assert verdict == OK
+        watch, field = watch.look()
+        verdicts.append(field)
+    return watch, verdicts
+
+
+def one(sample, watch=None, now=None, predicted=(30.0, 1.0)):
+    watch = watch or Watch(SETTINGS)
+    return watch.take(sample, predicted, sample.time if now is None else now, 0.3, 2.0)[1]
+
+
+def test_a_clean_field_lets_the_needle_move_from_the_first_reading_on():
+    assert set(told(Watch(SETTINGS), (0.02, 0.03, 0.054), 0.0, 100)[1]) == {OK}
+
+
+def test_half_a_second_of_distortion_holds_and_names_the_sensor():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 40)
+    _, verdicts = told(watch, (0.02, 0.09, 0.02), 1.0, 40)
+    first = next(k for k, verdict in enumerate(verdicts) if verdict != OK)
+    assert first in (19, 20, 21)
+    assert verdicts[-1] == "field distorted: ref2 0.0900, limit 0.0492 (median over 1 s)"
+    assert set(verdicts[:first]) == {OK}
+
+
+def test_single_readings_above_the_threshold_do_not_hold():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 2)
+    for k in range(2, 200):
+        watch, verdicts = told(watch, (0.5 if k % 3 == 0 else 0.02, 0.02, 0.02), k / RATE, 1)
+        assert verdicts == [OK]
+
+
+def test_once_held_the_indicator_has_to_fall_below_the_lower_limit():
+    watch, verdicts = told(Watch(SETTINGS), (0.06, 0.02, 0.02), 0.0, 1)
+    assert verdicts[0].startswith("field distorted")
+    watch, verdicts = told(watch, (0.052, 0.02, 0.02), 0.1, 80)
+    assert verdicts[-1] == "field distorted: ref1 0.0520, limit 0.0492 (median over 1 s)"
+    watch, verdicts = told(watch, (0.049, 0.02, 0.02), 3.0, 80)
+    assert verdicts[-1] == OK
+    assert told(watch, (0.052, 0.02, 0.02), 6.0, 80)[1][-1] == OK
+
+
+def test_what_left_the_window_is_forgotten():
+    watch, _ = told(Watch(SETTINGS), (0.09, 0.02, 0.02), 0.0, 40)
+    assert len(watch.recent) == 40
+    assert told(watch, (0.02, 0.02, 0.02), 50.0, 1)[1] == [OK]
+
+
+def test_a_lost_reference_holds_after_the_window_and_not_before():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 40)
+    _, verdicts = told(watch, (0.02, None, 0.02), 1.0, 60)
+    held = [verdict != OK for verdict in verdicts]
+    assert held.index(True) in (38, 39, 40)
+    assert verdicts[-1] == "field not known: 2 of 3 reference sensors seen within 1 s"
+
+
+def test_as_many_references_are_needed_as_the_scenario_says():
+    for needed, verdict in ((2, OK), (3, "field not known: 2 of 3 reference sensors seen within 1 s")):
+        watch = Watch(SETTINGS.model_copy(update={"references": needed}))
+        assert told(watch, (0.02, 0.02), 0.0, 1)[1] == [verdict]
+
+
+def test_a_tracker_that_tells_only_the_tip_is_not_held_against():
+    watch, verdict = Watch(SETTINGS).take(Sample(0.0, 30.0, 1.0), (30.0, 1.0), 0.0, 0.3, 2.0)
+    assert verdict == OK
+    assert watch.look()[1] == OK
+
+
+@pytest.mark.parametrize(
+    ("sample", "verdict"),
+    [
+        (Sample(1.0, float("nan"), 1.0), "not a number"),
+        (Sample(1.0, None, None), "missing: tracker sees no tip"),
+        (Sample(1.0, None, None, frame=frame(1.0, tip=None)), "missing: tracker sees no tip (out of volume)"),
+        (Sample(1.0, 30.0, 1.0, 6.0), "out of plane: 6.00 mm, limit 5 mm"),
+        (Sample(1.0, 33.0, 1.0), "innovation 3.00 mm, limit 2 mm"),
+    ],
+)
+def test_each_fault_of_a_reading_is_named(sample, verdict):
+    assert one(sample) == verdict
+
+
+def test_an_old_reading_is_stale():
+    assert one(Sample(1.0, 30.0, 1.0), now=1.5) == "stale: 0.500 s old, limit 0.3 s"
+
+
+def test_a_jump_counts_from_the_last_good_reading():
+    watch, _ = Watch(SETTINGS).take(Sample(1.0, 30.0, 1.0), (30.0, 1.0), 1.0, 0.3, 2.0)
+    far = Sample(1.025, 31.9, 1.0)
+    watch, verdict = watch.take(far, (30.0, 1.0), 1.025, 0.3, 2.0)
+    assert verdict == "jump of 1.90 mm, limit 1.50 mm"
+    assert watch.good == Sample(1.0, 30.0, 1.0)
+    assert one(Sample(1.05, 31.9, 1.0), watch) == OK  # so far it may have come by now
+
+
+def test_a_frozen_sensor_is_seen_although_the_map_to_the_tip_changes():
+    watch = Watch(SETTINGS)
+    for k in range(4):
+        sample = Sample(k / RATE, 30.0 + 0.01 * k, 1.0, 0.0, frame(k / RATE))
+        watch, verdict = watch.take(sample, (30.0 + 0.125 * k, 1.0), sample.time, 0.3, 2.0)
+    assert verdict == "frozen: the same in 4 readings while the tip should have moved 0.38 mm"
+
+
+def test_a_tip_lost_in_a_few_frames_is_not_held_against_the_tracker():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
+    last = watch.good
+
+    def lost(time, seen_by=watch):
+        return seen_by.only_missed(Sample(time, None, None, None, frame(time, tip=None)))
+
+    assert lost(last.time + 0.1) == last
+    assert lost(last.time + 0.125) is None
+    assert lost(last.time + 0.1, Watch(SETTINGS)) is None  # never seen
+    assert watch.only_missed(Sample(last.time + 0.025, None, None)) is None  # no frame
+    assert watch.only_missed(last) is None  # not lost
+    off = replace(watch, settings=SETTINGS.model_copy(update={"enabled": False}))
+    assert lost(last.time + 0.025, off) is None
+
+
+def test_switched_off_it_still_refuses_what_no_loop_can_use():
+    off = Watch(SETTINGS.model_copy(update={"enabled": False}))
+    assert one(Sample(1.0, 30.0, 1.0, 60.0), off) == OK
+    assert one(Sample(1.0, None, None), off).startswith("missing")
+    assert one(Sample(1.0, 33.0, 1.0), off).startswith("innovation")
+    assert told(off, (5.0, 5.0, 5.0), 0.0, 80)[1][-1] == OK
+
+
+def test_the_watch_itself_never_changes():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 10)
+    kept = replace(watch)
+    told(watch, (0.9, 0.9, 0.9), 0.25, 40)
+    assert watch == kept
