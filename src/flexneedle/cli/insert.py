@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .common import (
@@ -17,8 +18,6 @@ from .common import (
 )
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from flexneedle.run.recording import Choices
     from flexneedle.scenario import Scenario
     from flexneedle.trace import Insertion, Period
@@ -52,6 +51,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="what is steered: exact, a finer formulation of its own with a rig's imperfections, or model, the "
         "controller's own kind of model with other parameters (exact)",
     )
+    parser.add_argument(
+        "--registration", type=Path, metavar="FILE", help="where the tracker stands, as em register found it"
+    )
     parser.add_argument("--list", action="store_true", help="list the controllers, and do nothing else")
     parser.add_argument(
         "--force", action="store_true", help="insert even if the plan misses the target by more than 1 mm"
@@ -68,6 +70,10 @@ def _insert(args: argparse.Namespace) -> int:
     if args.list:
         return _list()
     choices, scenario = _choices(args), chosen_scenario(args)
+    if args.registration is not None:
+        from flexneedle.run.em.register import load_registration
+
+        scenario = load_registration(args.registration, scenario)
     compile_first()
     folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
     with Progress() as progress:

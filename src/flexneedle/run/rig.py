@@ -57,24 +57,13 @@ def virtual_rig(
     """
     truth = draw(scenario, np.random.default_rng(seeds.phantom))
     tank = Phantom(truth, bevel, phantom)
-    step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
-    delay, missing = scenario.phantom.delay_periods * step, scenario.phantom.missing_fraction
-    rng, settings = np.random.default_rng(seeds.tracker), scenario.tracker
-    if settings.environment is not None:
-        tracker: TipTracker = _field_tracker(
-            scenario, settings.environment, tank, truth.bias, delay, rng, seeds.room, plate_distance_at
-        )
+    room_rng, registration_rng = np.random.default_rng(seeds.room).spawn(2)
+    errors = _Errors(truth.bias, _registration_error(scenario.tracker.registration, registration_rng))
+    rng, environment = np.random.default_rng(seeds.tracker), scenario.tracker.environment
+    if environment is None:
+        tracker: TipTracker = _noisy_tracker(scenario, tank, errors, rng)
     else:
-        tracker = NoisyTracker(
-            tank.tip_at,
-            tank,
-            settings.period,
-            settings.jitter_per_axis,
-            rng,
-            delay=delay,
-            missing=missing,
-            bias=truth.bias,
-        )
+        tracker = _field_tracker(scenario, environment, tank, errors, rng, room_rng, plate_distance_at)
     return Rig(tank, tank, tracker, tank.condition)
 
 
@@ -85,19 +74,49 @@ def to_stage(registration: Registration | None) -> Rigid:
     return Rigid(to_matrix(np.array(registration.rotation)), np.array(registration.translation_mm))
 
 
+@dataclass(frozen=True)
+class _Errors:
+    """Constant errors: bias (x, y) in mm, and the map by which the registration is off."""
+
+    bias: tuple[float, float]
+    registration: Rigid
+
+
+def _noisy_tracker(
+    scenario: Scenario, tank: Phantom, errors: _Errors, rng: np.random.Generator
+) -> NoisyTracker:
+    """The tracker with white noise alone."""
+
+    def tip_at(time: float) -> tuple[float, float]:
+        x, y = tank.tip_at(time)
+        if scenario.tracker.registration is None:
+            return x, y
+        x, y, _ = errors.registration.apply(np.array((x, y, 0.0))).tolist()
+        return x, y
+
+    return NoisyTracker(
+        tip_at,
+        tank,
+        scenario.tracker.period,
+        scenario.tracker.jitter_per_axis,
+        rng,
+        delay=_delay(scenario),
+        missing=scenario.phantom.missing_fraction,
+        bias=errors.bias,
+    )
+
+
 def _field_tracker(
     scenario: Scenario,
     environment: Environment,
     tank: Phantom,
-    bias: tuple[float, float],
-    delay: float,
+    errors: _Errors,
     rng: np.random.Generator,
-    room_seed: np.random.SeedSequence,
+    room_rng: np.random.Generator,
     plate_distance_at: Callable[[float], float] | None,
 ) -> InPlane:
-    """The tracker in its environment: room, references and error of the registration as the seed draws them."""
-    settings, room_rng = scenario.tracker, np.random.default_rng(room_seed)
-    drawn = int(room_rng.integers(2**62))
+    """The tracker in its environment: room and references as `room_rng` draws them."""
+    settings, drawn = scenario.tracker, int(room_rng.integers(2**62))
     room = Room(environment, drawn if settings.field_seed is None else settings.field_seed)
     center, offset = settings.workspace_center_mm, settings.tip_offset_mm
     references = placed_references(room, center, _PLACED * scenario.monitor.indicator_limit, room_rng)
@@ -105,7 +124,7 @@ def _field_tracker(
 
     def poses_at(time: float) -> Mapping[str, Pose]:
         x, y, turn = tank.pose_at(time)
-        tip = x + bias[0], y + bias[1], 0.0
+        tip = x + errors.bias[0], y + errors.bias[1], 0.0
         return {TIP: tip_sensor_pose(tip, (math.cos(turn), math.sin(turn), 0.0), offset), **references}
 
     tracker = FieldTracker(
@@ -115,12 +134,18 @@ def _field_tracker(
         settings.period,
         rng,
         center=center,
-        delay=delay,
+        delay=_delay(scenario),
         missing=scenario.phantom.missing_fraction,
-        to_tracker=registered.inverse().after(_registration_error(settings.registration, room_rng)),
+        to_tracker=registered.inverse().after(errors.registration),
         plate_distance_at=plate_distance_at,
     )
     return InPlane(tracker, registered, offset)
+
+
+def _delay(scenario: Scenario) -> float:
+    """Age of a reading when it arrives (s): so many control periods at full step and speed."""
+    step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
+    return scenario.phantom.delay_periods * step
 
 
 def _registration_error(registration: Registration | None, rng: np.random.Generator) -> Rigid:

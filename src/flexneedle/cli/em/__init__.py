@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from . import check, evaluate, record, register, watch
+
 __all__ = ["add_parser"]
 
-_COMMANDS: tuple[Any, ...] = ()
+_COMMANDS: tuple[Any, ...] = (evaluate, check, register, record, watch)
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

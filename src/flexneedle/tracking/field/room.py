@@ -169,36 +169,30 @@ class _Draws:
 
     def sensor(self, name: str, rng: Rng, shared: tuple[Field, Field]) -> SensorFields:
         """Return the fields of a sensor. The draws are the same whatever the sizes."""
-        constant, *smooth = _direction(rng), *(_weights(rng) for _ in range(4))
-        still = self._still(name == TIP, constant, smooth[0], shared[0], smooth[2])
+        of_still, of_plate, of_coils, of_plate_coils = (_weights(rng) for _ in range(4))
+        still = self._still(name == TIP, self._mixed(of_still, shared[0]), of_coils)
         plate = self._environment.plate
         if plate is None:
             return SensorFields(still[0], None, still[1])
-        near = self._near_plate(plate, name == TIP, smooth[1], shared[1], smooth[3])
+        near = self._near_plate(plate, name == TIP, self._mixed(of_plate, shared[1]), of_plate_coils)
         return SensorFields(still[0], near[0], still[1], near[1])
 
-    def _still(
-        self, is_tip: bool, constant: Floats, own: Field, common: Field, of_coils: Field
-    ) -> tuple[Part, Part | None]:
+    def _still(self, is_tip: bool, field: Field, of_coils: Field) -> tuple[Part, Part | None]:
         """Error without a plate, and by how much coils differ."""
         environment, envelope = self._environment, growing(self._environment)
-        field = self._blended(self._mixed(own, common), constant, environment.constant)
         if is_tip:
             return self._sized(field, environment.tip.bias_mm, envelope), None
         bias = self._sized(field, environment.reference.bias_mm, envelope)
         return bias, self._sized(of_coils, environment.reference.coils_mm, envelope)
 
     def _near_plate(
-        self, plate: Plate, is_tip: bool, own: Field, common: Field, of_coils: Field
+        self, plate: Plate, is_tip: bool, field: Field, of_coils: Field
     ) -> tuple[Part, Part | None]:
         """What a plate adds, and by how much coils differ in that."""
         envelope = decaying(plate, plate.decay_mm)
-        normal = np.array(plate.normal) / np.linalg.norm(plate.normal)
-        field = self._blended(self._mixed(own, common), -normal, plate.pull)
         if is_tip:
             return self._sized(field, plate.tip_mm, envelope), None
-        # A pull that grows toward the plate moves the nearer coil more, away from the other: this adds to that.
-        apart = self._blended(of_coils, normal, plate.coils_pull)
+        apart = self._pulled(of_coils, plate)
         return (
             self._sized(field, plate.reference_mm, envelope),
             self._sized(apart, plate.coils_mm, decaying(plate, plate.coils_decay_mm)),
@@ -208,10 +202,11 @@ class _Draws:
         share = self._environment.shared
         return own.scaled(sqrt(1.0 - share)).plus(common.scaled(sqrt(share)))
 
-    def _blended(self, smooth: Field, constant: Floats, share: float) -> Field:
-        """Return a field of which a share of the square is constant."""
-        varied = smooth.scaled(sqrt(1.0 - share) / _rms(smooth.at(self._features)))
-        return varied.plus(Field(np.zeros_like(smooth.weights), sqrt(share) * constant))
+    def _pulled(self, smooth: Field, plate: Plate) -> Field:
+        """Return a field of which a share of the square is along the plate's normal, the same everywhere."""
+        varied = smooth.scaled(sqrt(1.0 - plate.coils_pull) / _rms(smooth.at(self._features)))
+        normal = np.array(plate.normal) / np.linalg.norm(plate.normal)
+        return varied.plus(Field(np.zeros_like(smooth.weights), sqrt(plate.coils_pull) * normal))
 
     def _sized(self, field: Field, size: float, envelope: Envelope) -> Part:
         """Return the field so scaled that its RMS length on the grid, a plate at 100 mm, is `size` mm."""
@@ -225,9 +220,3 @@ def _rms(vectors: Floats) -> float:
 
 def _weights(rng: Rng) -> Field:
     return Field(rng.normal(0.0, 1.0, (2 * _WAVES, 3)), np.zeros(3))
-
-
-def _direction(rng: Rng) -> Floats:
-    vector = rng.normal(0.0, 1.0, 3)
-    unit: Floats = vector / np.linalg.norm(vector)
-    return unit

@@ -1,0 +1,65 @@
+"""`flexneedle em check`: the indicator with the rig's power off and on."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from flexneedle.errors import InputError
+from flexneedle.run.em.evaluate import Options, read_grids
+from flexneedle.tracking.evaluation import published
+from flexneedle.tracking.evaluation.grid import Grid
+from flexneedle.tracking.evaluation.power import Power, compare
+
+__all__ = ["Check", "check"]
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """What the power of the rig does to each sensor that has an indicator both times."""
+
+    sensors: list[Power]
+
+    @property
+    def above(self) -> bool:
+        """Whether the indicator of any sensor is above the threshold with power on."""
+        return any(found.above for found in self.sensors)
+
+    def values(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {"above": self.above, "paper_powered": published.POWERED, "results": [asdict(s) for s in self.sensors]}
+
+
+def check(off: Path, on: Path | None, names: tuple[str | None, str | None], threshold: float, options: Options) ->
+Check:
+    """Return the comparison of two tables, or of two environments of the table `off`.
+
+    names: of the environments with power off and on; None: the only one of its table, or "off" and "on" if there is
+    one table. Raises InputError for a table that cannot be used, or where no sensor has an indicator both times.
+    """
+    grids = read_grids(off, options)[0]
+    if on is None:
+        chosen = (_of(off, grids, names[0] or "off"), _of(off, grids, names[1] or "on"))
+    else:
+        chosen = (_of(off, grids, names[0]), _of(on, read_grids(on, options)[0], names[1]))
+    before, after = ({grid.sensor: grid for grid in own if grid.indicators.count} for own in chosen)
+    both = [name for name in before if name in after]
+    if not both:
+        raise InputError(
+            f"{on or off}: no sensor has an indicator both with power off ({_listed(before)}) and on ({_listed(after)})"
+        )
+    return Check([compare(before[name], after[name], threshold) for name in both])
+
+
+def _of(path: Path, grids: Sequence[Grid], environment: str | None) -> list[Grid]:
+    there = list(dict.fromkeys(grid.environment for grid in grids))
+    if environment is None and len(there) == 1:
+        return list(grids)
+    if environment not in there:
+        asked = "holds several environments" if environment is None else f"no environment {environment!r}"
+        raise InputError(f"{path}: {asked}: choose one by --off or --on: {', '.join(there)}")
+    return [grid for grid in grids if grid.environment == environment]
+
+
+def _listed(grids: dict[str, Grid]) -> str:
+    return ", ".join(grids) or "none"

@@ -1,0 +1,229 @@
+"""Recording a tracker on a grid: point by point onto the disk, and on from there after any interruption."""
+
+import csv
+import fcntl
+import io
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import dist, hypot
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from flexneedle.errors import InputError, RunError
+from flexneedle.ports import VISIBLE, Clock, Frame, Reading
+from flexneedle.trace.shield import uninterrupted
+from flexneedle.tracking.table import COLUMNS
+
+from .grid import Grid, Stop
+from .trackers import LiveTracker
+
+__all__ = ["EXTRA", "Guide", "Session", "open_session", "record"]
+
+EXTRA = ("time_s", "frame_number", "repeat")
+"""Columns beside those of a table of measurements. Times go on over interruptions."""
+_HEADER = (*COLUMNS, *EXTRA)
+_PAUSE_S = 0.01
+
+
+@dataclass(frozen=True)
+class Guide:
+    """Who moves the stage. ask: to move it to a stop, returns when it is there; say: tells how it goes.
+
+    insists: whether a point that failed is asked for again, or ends the recording.
+    """
+
+    ask: Callable[[Stop], None]
+    say: Callable[[str], None]
+    insists: bool = True
+
+
+@dataclass
+class Session:
+    """An open table, locked, and the stops that it has no rows of yet. last_time: the last time in it, s."""
+
+    file: BinaryIO
+    left: Sequence[Stop]
+    done: int
+    last_time: float
+
+    def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Add the rows of a stop, and return when they are on the disk."""
+        with uninterrupted():
+            self.file.write(_text(rows))
+            self.file.flush()
+            os.fsync(self.file.fileno())
+
+
+@contextmanager
+def open_session(path: Path, grid: Grid) -> Iterator[Session]:
+    """Open a table, new or begun, with the stops that are left.
+
+    Rows of a stop that are not all there are dropped: it is measured again. Raises InputError if the table is
+    another grid's, is damaged, or is being written.
+    """
+    try:
+        file = path.open("a+b")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InputError(f"{path}: another process is writing it") from None
+        yield _resumed(path, file, grid)
+
+
+def record(session: Session, tracker: LiveTracker, clock: Clock, grid: Grid, guide: Guide) -> int:
+    """Measure the stops that are left and return their number.
+
+    Raises RunError if a point cannot be measured and the guide does not insist.
+    """
+    start = session.last_time
+    for stop in session.left:
+        frames = _measure(tracker, clock, grid, guide, stop)
+        session.add([row for frame in frames for row in _rows(grid, stop, frame, start)])
+    return len(session.left)
+
+
+def _measure(tracker: LiveTracker, clock: Clock, grid: Grid, guide: Guide, stop: Stop) -> list[Frame]:
+    while True:
+        guide.ask(stop)
+        clock.wait(grid.file.settle_s)
+        frames, complaint = _samples(tracker, clock, grid)
+        if not complaint:
+            return frames
+        if not guide.insists:
+            raise RunError(f"point {stop.point_id}, repeat {stop.repeat}: {complaint}")
+        guide.say(f"{complaint}; once more")
+
+
+def _samples(tracker: LiveTracker, clock: Clock, grid: Grid) -> tuple[list[Frame], str]:
+    """Return the frames of a point at rest, taken from now on, or what is wrong.
+
+    While the stage drifts the oldest frames are let go for new ones.
+    """
+    began, wanted, sensors = clock.now(), grid.file.samples, tuple(grid.file.sensors)
+    good: list[Frame] = []
+    complaint = "no frames"
+    while clock.now() - began <= grid.file.rest.timeout_s:
+        for frame in tracker.read():
+            if frame.time < began:
+                continue
+            ill = _ill(frame, sensors)
+            complaint = ill or complaint
+            good = good if ill else [*good, frame][-wanted:]
+            if not ill and len(good) == wanted:
+                complaint = _drifting(good, sensors, grid.file.rest.drift_mm)
+                if not complaint:
+                    return good, ""
+        complaint = complaint if tracker.status == VISIBLE else tracker.status
+        clock.wait(_PAUSE_S)
+    return [], f"no {wanted} good samples within {grid.file.rest.timeout_s:g} s: {complaint}"
+
+
+def _ill(frame: Frame, sensors: Sequence[str]) -> str:
+    absent = Reading(None, status="no such sensor")
+    found = {name: frame.readings.get(name, absent) for name in sensors}
+    return "; ".join(
+        f"{name}: {reading.status}" for name, reading in found.items() if reading.position is None
+    )
+
+
+def _drifting(frames: Sequence[Frame], sensors: Sequence[str], limit: float) -> str:
+    """Return which sensor moves, by the means of the first and the last third of its samples; "" if none does."""
+    third = max(1, len(frames) // 3)
+    for name in sensors:
+        places = np.array([frame.readings[name].position for frame in frames], dtype=float)
+        drift = dist(places[:third].mean(axis=0), places[-third:].mean(axis=0))
+        if drift > limit:
+            return f"{name} moves: {drift:.2f} mm from the first to the last third, limit {limit:g} mm"
+    return ""
+
+
+def _rows(grid: Grid, stop: Stop, frame: Frame, start: float) -> list[dict[str, Any]]:
+    return [
+        _row(stop, frame.readings[name], told, grid.file.environment)
+        | {"time_s": start + frame.time, "frame_number": frame.number, "repeat": stop.repeat}
+        for name, told in grid.file.sensors.items()
+    ]
+
+
+def _row(stop: Stop, reading: Reading, sensor: str, environment: str) -> dict[str, Any]:
+    if reading.position is None:
+        raise RunError(f"{sensor}: no position")
+    turn = reading.orientation or (None,) * 4
+    return (
+        {"point_id": stop.point_id, "sensor": sensor, "environment": environment}
+        | dict(zip(("true_x_mm", "true_y_mm", "true_z_mm"), stop.place, strict=True))
+        | dict(zip(("x_mm", "y_mm", "z_mm"), reading.position, strict=True))
+        | dict(zip(("qw", "qx", "qy", "qz"), turn, strict=True))
+        # The field generator stands at the origin of an Aurora's frame.
+        | {"indicator": reading.indicator, "distance_mm": hypot(*reading.position)}
+    )
+
+
+def _text(rows: Sequence[Mapping[str, Any]]) -> bytes:
+    text = io.StringIO()
+    csv.DictWriter(text, _HEADER, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()
+
+
+# Going on where a table ends
+
+
+def _resumed(path: Path, file: BinaryIO, grid: Grid) -> Session:
+    file.seek(0)
+    data = file.read()
+    header = ",".join(_HEADER).encode() + b"\n"
+    if not data.startswith(header):
+        if not header.startswith(data):
+            raise InputError(f"{path}: is no table of `em record`: give another file with --out")
+        file.truncate(0)  # new, or cut in its first line
+        file.write(header)
+        data = header
+    lines = data[len(header) :].splitlines(keepends=True)
+    whole = lines if not lines or lines[-1].endswith(b"\n") else lines[:-1]  # the last one may be torn
+    stops, size = list(grid.stops()), grid.file.samples * len(grid.file.sensors)
+    done = len(whole) // size
+    _check_rows(path, whole[: done * size], stops, grid)
+    file.truncate(len(header) + sum(map(len, whole[: done * size])))
+    last = float(_cells(whole[done * size - 1])["time_s"]) if done else 0.0
+    return Session(file, stops[done:], done, last)
+
+
+def _check_rows(path: Path, lines: Sequence[bytes], stops: Sequence[Stop], grid: Grid) -> None:
+    size = grid.file.samples * len(grid.file.sensors)
+    for number, line in enumerate(lines):
+        stop = stops[number // size] if number // size < len(stops) else None
+        if not _belongs(line, stop, grid):
+            raise InputError(f"{path}: line {number + 2}: is not of this grid: give another file with --out")
+
+
+def _belongs(line: bytes, stop: Stop | None, grid: Grid) -> bool:
+    cells = _cells(line)
+    if stop is None or len(cells) != len(_HEADER):
+        return False
+    try:
+        place = tuple(float(cells[f"true_{axis}_mm"]) for axis in "xyz")
+        same = (int(cells["repeat"]), int(cells["point_id"]), place) == (
+            stop.repeat,
+            stop.point_id,
+            stop.place,
+        )
+        float(cells["time_s"])
+    except ValueError:
+        return False
+    return (
+        same
+        and cells["environment"] == grid.file.environment
+        and cells["sensor"] in grid.file.sensors.values()
+    )
+
+
+def _cells(line: bytes) -> dict[str, str]:
+    cells = next(csv.reader([line.decode("utf-8", "replace")]), [])
+    return dict(zip(_HEADER, cells, strict=False))

@@ -1,0 +1,56 @@
+"""From what a user writes to the tracker that it names."""
+
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Protocol
+
+from flexneedle.devices.aurora import Aurora
+from flexneedle.devices.aurora.readings import NAMES
+from flexneedle.devices.recording import read_frames
+from flexneedle.devices.replay import Replay
+from flexneedle.errors import InputError
+from flexneedle.ports import Clock, Tracker
+
+__all__ = ["FORMS", "LiveTracker", "open_tracker"]
+
+FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE[@SPEED]"
+"""How trackers are written."""
+
+
+class LiveTracker(Tracker, Protocol):
+    """A tracker that says how it is."""
+
+    @property
+    def status(self) -> str:
+        """ "ok" while frames come, or in a few words why none do."""
+        ...
+
+
+def open_tracker(spec: str, clock: Clock) -> AbstractContextManager[LiveTracker]:
+    """Return the tracker that `spec` names, at work; leaving the context puts it to rest.
+
+    `aurora:/dev/ttyUSB0` has the sensors tip, ref1, ref2, ref3 at the ports 1 to 4; `aurora:/dev/ttyUSB0=ref1,tip`
+    names those of ports 1 and 2. `replay:FILE@2` plays a recording twice as fast.
+    Raises InputError for anything else, RunError if no tracker answers.
+    """
+    kind, _, rest = spec.partition(":")
+    if not rest or kind not in ("aurora", "replay"):
+        raise InputError(f"tracker {spec}: must be {FORMS}")
+    return _aurora(rest, clock) if kind == "aurora" else _replay(rest, clock)
+
+
+def _aurora(rest: str, clock: Clock) -> Aurora:
+    port, _, names = rest.partition("=")
+    chosen = tuple(names.split(",")) if names else NAMES
+    if not all(name.isidentifier() for name in chosen) or len({*chosen}) < len(chosen):
+        raise InputError(f"tracker aurora:{rest}: the names must be words, each once, such as tip,ref1")
+    return Aurora(port, clock, chosen)
+
+
+def _replay(rest: str, clock: Clock) -> Replay:
+    file, _, speed = rest.rpartition("@") if "@" in rest else (rest, "", "")
+    try:
+        factor = float(speed) if speed else 1.0
+    except ValueError:
+        raise InputError(f"tracker replay:{rest}: {speed} is no speed") from None
+    return Replay(read_frames(Path(file)), clock, factor)

@@ -1,0 +1,113 @@
+"""Watching a tracker live: its frames, what they are judged as, and a recording of them."""
+
+import csv
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+
+from flexneedle.devices.recording import COLUMNS, rows_of
+from flexneedle.devices.replay import Replay
+from flexneedle.errors import InputError
+from flexneedle.ports import VISIBLE, Clock, Frame
+from flexneedle.scenario import Monitor
+from flexneedle.tracking import rules
+from flexneedle.tracking.table import TIP
+
+from .trackers import LiveTracker
+
+__all__ = ["Judge", "View", "judge_field", "watch"]
+
+Judge = Callable[[Sequence[Frame]], str]
+"""Says of the frames of the last seconds, oldest first, whether they are to be trusted: "ok" or why not."""
+
+_PAUSE_S = 0.01
+_HISTORY = 400  # frames: 10 s
+
+
+@dataclass(frozen=True)
+class View:
+    """What there is to show: the newest frame (None before the first), new or not; how the tracker is; the verdict."""
+
+    time: float
+    frame: Frame | None
+    is_new: bool
+    status: str
+    verdict: str
+
+
+def watch(
+    tracker: LiveTracker,
+    clock: Clock,
+    show: Callable[[View], None],
+    seconds: float = inf,
+    judge: Judge | None = None,
+    record: Path | None = None,
+) -> int:
+    """Show each new frame, and the state now and then where none comes, for so long or until a replay ends.
+
+    judge: `judge_field` with the default monitor, if left out. record: a CSV of all frames, which must not be there
+    yet. Returns the number of frames. Raises InputError if the file cannot be written.
+    """
+    chosen = judge if judge is not None else _default_judge
+    history: deque[Frame] = deque(maxlen=_HISTORY)
+    start, count, shown_at = clock.now(), 0, -inf
+    with ExitStack() as files:
+        keep = _recorder(files, record)
+        while (now := clock.now()) - start < seconds:
+            frames = tracker.read()
+            for frame in frames:
+                history.append(frame)
+                keep(frame)
+                show(View(now, frame, True, tracker.status, chosen(history)))
+            count += len(frames)
+            if frames:
+                shown_at = now
+            elif now - shown_at > 0.5:
+                show(_without_new(now, history, tracker.status))
+                shown_at = now
+            if isinstance(tracker, Replay) and tracker.ended:
+                break
+            clock.wait(_PAUSE_S)
+    return count
+
+
+def _without_new(now: float, history: Sequence[Frame], status: str) -> View:
+    last = history[-1] if history else None
+    return View(now, last, False, status, "no new frames" if status == VISIBLE else status)
+
+
+def judge_field(frames: Sequence[Frame], settings: Monitor) -> str:
+    """Return the first thing that is wrong: sensors without a position, then the field by the monitor's rules."""
+    ill = "; ".join(f"{name}: {r.status}" for name, r in frames[-1].readings.items() if r.status != VISIBLE)
+    if ill:
+        return ill
+    since = frames[-1].time - settings.indicator_window_s
+    told: dict[str, list[float]] = {}
+    for frame in frames:
+        for name, reading in frame.readings.items() if frame.time > since else ():
+            if name != TIP and reading.indicator is not None:
+                told.setdefault(name, []).append(reading.indicator)
+    window = settings.indicator_window_s
+    unseen = rules.unseen_references(told, settings.references, window)
+    return unseen if unseen != VISIBLE else rules.distortion(told, settings.indicator_limit, window)
+
+
+def _default_judge(frames: Sequence[Frame]) -> str:
+    return judge_field(frames, Monitor())
+
+
+def _recorder(files: ExitStack, path: Path | None) -> Callable[[Frame], None]:
+    if path is None:
+        return lambda _: None
+    try:
+        file = files.enter_context(path.open("x", newline="", encoding="utf-8"))
+    except FileExistsError:
+        raise InputError(f"{path}: is there already: give another file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    return lambda frame: writer.writerows(rows_of(frame))

@@ -1,0 +1,1 @@
+"""How far a tracker can be trusted, from repeated measurements on a grid (paper, section IV-B)."""

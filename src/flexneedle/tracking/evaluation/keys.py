@@ -1,0 +1,75 @@
+"""Numbers for the cells of a table: each sensor, environment, grid point and bin of distance that occurs."""
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from flexneedle.errors import InputError
+from flexneedle.tracking.evaluation.checks import refuse
+
+__all__ = ["Keys", "Names"]
+
+Indices = NDArray[np.int64]
+
+_POINT_BITS, _BIN_BITS, _FEW_BITS = 32, 14, 8
+_MOST = {"sensor": 1 << _FEW_BITS, "environment": 1 << _FEW_BITS, "point_id": 1 << _POINT_BITS}
+MOST_BINS = (1 << _BIN_BITS) - 1
+
+
+class Names:
+    """The names that a column held, each with a number in the order of their first rows."""
+
+    def __init__(self, column: str) -> None:
+        self.column, self.names = column, list[str]()
+        self._numbers: dict[str, int] = {}
+
+    def numbers(self, labels: Any, start: int) -> Indices:
+        """Return the number (r,) of each label; raises InputError where one is empty, or if there are too many."""
+        own = [self._number(value) for value in labels.dictionary.to_pylist()]
+        nothing = len(own)
+        places = labels.indices.fill_null(nothing).to_numpy(zero_copy_only=False)
+        found: Indices = np.array([*own, -1], dtype=np.int64)[places]
+        refuse(found < 0, start, f"{self.column} is empty")
+        if len(self.names) > _MOST[self.column]:
+            raise InputError(
+                f"{self.column}: more than {_MOST[self.column]} different ones: is it the right column?"
+            )
+        return found
+
+    def _number(self, value: Any) -> int:
+        text = "" if value is None else str(value)
+        if not text.strip():
+            return -1
+        if text not in self._numbers:
+            self._numbers[text] = len(self.names)
+            self.names.append(text)
+        return self._numbers[text]
+
+
+class Keys:
+    """Cells in the order of their first rows, and what each is of."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[int, int] = {}
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def cells(self, sensor: Indices, environment: Indices, point: Indices, bins: Indices) -> Indices:
+        """Return the number (r,) of the cell of each row; bins: from −1."""
+        code = ((sensor << _FEW_BITS | environment) << _POINT_BITS | point) << _BIN_BITS | (bins + 1)
+        found = pa.array(code).dictionary_encode()
+        numbers = self._numbers
+        own = [numbers.setdefault(value, len(numbers)) for value in found.dictionary.to_pylist()]
+        cells: Indices = np.array(own, dtype=np.int64)[found.indices.to_numpy()]
+        return cells
+
+    def columns(self) -> tuple[Indices, Indices, Indices, Indices]:
+        """Return sensor, environment, point and bin (g,) of each cell."""
+        code = np.fromiter(self._numbers, dtype=np.int64, count=len(self._numbers))
+        point = code >> _BIN_BITS & ((1 << _POINT_BITS) - 1)
+        pair = code >> (_BIN_BITS + _POINT_BITS)
+        few = (1 << _FEW_BITS) - 1
+        return pair >> _FEW_BITS, pair & few, point, (code & ((1 << _BIN_BITS) - 1)) - 1

@@ -1,0 +1,120 @@
+"""Tables of measurements, CSV or Parquet, batch by batch: no more than a few megabytes are in memory at once.
+
+What a file is, its first bytes tell, not its name. Errors are one line each; a file that was cut in the middle is
+refused, since nobody knows what is missing.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as csv
+import pyarrow.parquet as parquet
+from numpy.typing import NDArray
+
+from flexneedle.errors import InputError
+from flexneedle.tracking.evaluation.columns import chosen_columns
+from flexneedle.tracking.evaluation.text import read_layout
+from flexneedle.tracking.table import COLUMNS
+
+__all__ = ["LABELS", "Batch", "read_batches"]
+
+LABELS = ("point_id", "sensor", "environment")
+"""Columns of names; numbers are taken as text, 1 and "1" are the same. All other columns are of numbers."""
+
+_BLOCK = 2 << 20  # bytes of CSV in a batch
+_ROWS = 1 << 17  # rows of Parquet in a batch
+_MAGIC = b"PAR1"
+_NULLS = [*csv.ConvertOptions().null_values, "None", "none", "MISSING", "missing"]
+
+Floats = NDArray[np.float64]
+_Choose = Callable[[list[str]], dict[str, str]]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Some rows: labels as Arrow dictionary arrays (r,), numbers as float64 (r,), NaN where a field is empty."""
+
+    rows: int
+    labels: Mapping[str, Any]
+    numbers: Mapping[str, Floats]
+
+
+def read_batches(
+    path: Path, theirs: Mapping[str, str], required: Iterable[str], optional: Iterable[str]
+) -> Iterator[Batch]:
+    """Yield the rows of a table with their columns under our names; `theirs`: see `column_map`.
+
+    Raises InputError, which does not name the file, if it cannot be read, lacks a column, or was cut off.
+    """
+    try:
+        yield from _read(path, theirs, tuple(required), tuple(optional))
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}") from None
+    except (pa.ArrowException, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read: {' '.join(str(error).split())}") from None
+
+
+def _read(
+    path: Path, theirs: Mapping[str, str], required: tuple[str, ...], optional: tuple[str, ...]
+) -> Iterator[Batch]:
+    with path.open("rb") as file:
+        start = file.read(len(_MAGIC))
+    if not start:
+        raise InputError("is empty")
+    opened = _parquet if start == _MAGIC else _csv
+    chosen, batches = opened(path, lambda header: chosen_columns(header, theirs, required, optional))
+    for batch in batches:
+        yield _batch(batch, chosen)
+
+
+def _parquet(path: Path, choose: _Choose) -> tuple[dict[str, str], Iterator[Any]]:
+    try:
+        schema = parquet.read_schema(path)
+    except pa.ArrowInvalid:
+        raise InputError("a Parquet file that was cut off, or is damaged: it has no footer") from None
+    chosen = choose(list(schema.names))
+    texts = [their for our, their in chosen.items() if our in LABELS and _is_text(schema.field(their).type)]
+    file = parquet.ParquetFile(path, read_dictionary=texts)
+    return chosen, file.iter_batches(_ROWS, columns=list(chosen.values()))
+
+
+def _is_text(kind: Any) -> bool:
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
+
+
+def _csv(path: Path, choose: _Choose) -> tuple[dict[str, str], Iterator[Any]]:
+    layout = read_layout(path)
+    chosen = choose(layout.header)
+    layout.refuse_cut(path, [their for our, their in chosen.items() if our in LABELS], chosen.values())
+    names = pa.dictionary(pa.int32(), pa.string())
+    types = {their: names if our in LABELS else pa.float64() for our, their in chosen.items()}
+    reader = csv.open_csv(
+        path,
+        csv.ReadOptions(block_size=_BLOCK, column_names=list(layout.unique_names()), skip_rows=1),
+        csv.ParseOptions(delimiter=layout.delimiter),
+        csv.ConvertOptions(column_types=types, include_columns=list(chosen.values()), null_values=_NULLS),
+    )
+    return chosen, iter(reader)
+
+
+def _batch(batch: Any, chosen: Mapping[str, str]) -> Batch:
+    columns = {our: batch.column(batch.schema.get_field_index(their)) for our, their in chosen.items()}
+    labels = {our: _labels(columns[our]) for our in columns if our in LABELS}
+    numbers = {our: _numbers(our, columns[our]) for our in COLUMNS if our in columns and our not in LABELS}
+    return Batch(batch.num_rows, labels, numbers)
+
+
+def _labels(column: Any) -> Any:
+    return column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
+
+
+def _numbers(name: str, column: Any) -> Floats:
+    try:
+        numbers: Floats = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
+        raise InputError(f"{name}: must be a column of numbers, not of {column.type}") from None
+    return numbers

@@ -1,0 +1,85 @@
+"""How a CSV file is laid out, by its first line, and whether it was cut in the middle, by its last."""
+
+import csv
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from flexneedle.errors import InputError
+
+__all__ = ["Layout", "read_layout"]
+
+_DELIMITERS = ",;\t"
+_TAIL = 1 << 16  # bytes
+_FIRST_LINE = 1 << 20  # bytes; more is no header
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Names of the columns of a CSV file, and the character between them."""
+
+    header: list[str]
+    delimiter: str
+
+    def unique_names(self) -> Iterator[str]:
+        """Yield the names; one that is there a second time gets a number, since Arrow needs them to differ."""
+        seen: dict[str, int] = {}
+        for name in self.header:
+            seen[name] = seen.get(name, 0) + 1
+            yield name if seen[name] == 1 else f"{name} ({seen[name]})"
+
+    def refuse_cut(self, path: Path, labels: Collection[str], used: Collection[str]) -> None:
+        """Raise InputError if the last line, being without a line end, seems to be a part of what was written.
+
+        It is one if it has fewer fields than the header; or if its last field is a beginning of a name that other
+        rows have, or a number with fewer decimals than any other. A cut between two digits of numbers that are
+        written with all kinds of lengths may pass; one at a line end cannot be seen at all.
+        """
+        lines = _tail(path)
+        if not lines:
+            return
+        *before, last = list(csv.reader(lines, delimiter=self.delimiter))
+        ends = [row[-1] for row in before[1:] if len(row) == len(self.header)]
+        short = len(last) < len(self.header)
+        if short or (self.header[-1] in used and _is_part(last[-1], ends, self.header[-1] in labels)):
+            raise InputError(
+                f"cut in the middle: the last line has no line end and is not whole ({lines[-1][:60]!r}); "
+                "write the file again, or take that line away"
+            )
+
+
+def read_layout(path: Path) -> Layout:
+    """Return the layout of a CSV file. Raises InputError if there is no header or nothing below it."""
+    with path.open("rb") as file:
+        first = file.readline(_FIRST_LINE)
+        more = file.read(1)
+    text = first.decode("utf-8-sig", errors="replace").rstrip("\r\n")
+    if (not first.endswith(b"\n") and len(first) == _FIRST_LINE) or "\0" in text:
+        raise InputError("neither CSV nor Parquet")
+    if not text.strip():
+        raise InputError("the first line must name the columns")
+    if not more:
+        raise InputError(f"has no rows, only one line: {text[:60]!r}")
+    delimiter = max(_DELIMITERS, key=text.count)
+    return Layout([name.strip() for name in next(csv.reader([text], delimiter=delimiter))], delimiter)
+
+
+def _tail(path: Path) -> list[str]:
+    """Return the last lines, the first of them perhaps not whole, or none if the file ends with a line end."""
+    with path.open("rb") as file:
+        size = file.seek(0, 2)
+        file.seek(max(0, size - _TAIL))
+        data = file.read()
+    return [] if data.endswith((b"\n", b"\r")) else data.decode("utf-8", errors="replace").splitlines()
+
+
+def _is_part(field: str, others: list[str], label: bool) -> bool:
+    if not others:
+        return False
+    if label:
+        return field not in others and any(other.startswith(field) for other in others)
+    return _decimals(field) < min(map(_decimals, others))
+
+
+def _decimals(number: str) -> int:
+    return len(number.partition(".")[2]) if number else -1
