@@ -53,6 +53,7 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
             "strain_energy_mj": last.true_strain_energy if last else None,
             "planned_strain_energy_mj": plan.strain_energy[-1],
             "steps": len(insertion.periods),
+            "held_s": insertion.held_s,
             "converged": all(period.converged for period in insertion.periods),
             "seed": insertion.seed,
         }

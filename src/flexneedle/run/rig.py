@@ -9,7 +9,6 @@ import numpy as np
 from flexneedle.phantom import DEFAULT_PLANT, Condition, Phantom, draw
 from flexneedle.ports import Clock, Driver, TipTracker
 from flexneedle.scenario import Registration, Scenario
-from flexneedle.scenario.environment import Environment
 from flexneedle.tracking import NoisyTracker
 from flexneedle.tracking.field import FieldTracker, Pose, Room, tip_sensor_pose
 from flexneedle.tracking.placement import placed_references
@@ -18,7 +17,7 @@ from flexneedle.tracking.quaternion import to_matrix
 from flexneedle.tracking.registration import Rigid, fit_rigid, identity
 from flexneedle.tracking.table import TIP
 
-__all__ = ["Rig", "Seeds", "to_stage", "virtual_rig"]
+__all__ = ["Rig", "Seeds", "to_stage", "virtual_rig", "virtual_room"]
 
 _PLACED = 0.75  # of the threshold: below it a lab leaves a reference where it is
 
@@ -57,14 +56,34 @@ def virtual_rig(
     """
     truth = draw(scenario, np.random.default_rng(seeds.phantom))
     tank = Phantom(truth, bevel, phantom)
-    room_rng, registration_rng = np.random.default_rng(seeds.room).spawn(2)
-    errors = _Errors(truth.bias, _registration_error(scenario.tracker.registration, registration_rng))
-    rng, environment = np.random.default_rng(seeds.tracker), scenario.tracker.environment
-    if environment is None:
+    errors = _Errors(truth.bias, _registration_error(scenario.tracker.registration, seeds.room))
+    rng, around = (
+        np.random.default_rng(seeds.tracker),
+        virtual_room(scenario, seeds.room, None if plate_distance_at is None else plate_distance_at(0.0)),
+    )
+    if around is None:
         tracker: TipTracker = _noisy_tracker(scenario, tank, errors, rng)
     else:
-        tracker = _field_tracker(scenario, environment, tank, errors, rng, room_rng, plate_distance_at)
+        tracker = _field_tracker(scenario, around, tank, errors, rng, plate_distance_at)
     return Rig(tank, tank, tracker, tank.condition)
+
+
+def virtual_room(
+    scenario: Scenario, seed: np.random.SeedSequence, plate_distance: float | None = None
+) -> tuple[Room, Mapping[str, Pose]] | None:
+    """Return the room that a virtual rig of this seed stands in, and its reference sensors in the stage's frame.
+
+    None for a scenario without an environment. plate_distance: where the plate is (mm) while a lab places the
+    references; left out, as in the environment.
+    """
+    settings = scenario.tracker
+    if settings.environment is None:
+        return None
+    rng = np.random.default_rng(seed)
+    drawn = int(rng.integers(2**62))
+    room = Room(settings.environment, drawn if settings.field_seed is None else settings.field_seed)
+    limit = _PLACED * scenario.monitor.indicator_limit
+    return room, placed_references(room, settings.workspace_center_mm, limit, rng, plate_distance)
 
 
 def to_stage(registration: Registration | None) -> Rigid:
@@ -108,18 +127,15 @@ def _noisy_tracker(
 
 def _field_tracker(
     scenario: Scenario,
-    environment: Environment,
+    around: tuple[Room, Mapping[str, Pose]],
     tank: Phantom,
     errors: _Errors,
     rng: np.random.Generator,
-    room_rng: np.random.Generator,
     plate_distance_at: Callable[[float], float] | None,
 ) -> InPlane:
-    """The tracker in its environment: room and references as `room_rng` draws them."""
-    settings, drawn = scenario.tracker, int(room_rng.integers(2**62))
-    room = Room(environment, drawn if settings.field_seed is None else settings.field_seed)
+    """The tracker in its environment: in such a room, with such references."""
+    (room, references), settings = around, scenario.tracker
     center, offset = settings.workspace_center_mm, settings.tip_offset_mm
-    references = placed_references(room, center, _PLACED * scenario.monitor.indicator_limit, room_rng)
     registered = to_stage(settings.registration)
 
     def poses_at(time: float) -> Mapping[str, Pose]:
@@ -148,10 +164,11 @@ def _delay(scenario: Scenario) -> float:
     return scenario.phantom.delay_periods * step
 
 
-def _registration_error(registration: Registration | None, rng: np.random.Generator) -> Rigid:
+def _registration_error(registration: Registration | None, seed: np.random.SeedSequence) -> Rigid:
     """By how much a registration from such fiducials, measured so well, is off the truth."""
     if registration is None or registration.localisation_mm == 0.0:
         return identity()
+    rng = np.random.default_rng(seed).spawn(1)[0]
     fiducials = np.array(registration.fiducials_mm)
     noise = rng.normal(0.0, registration.localisation_mm / math.sqrt(3.0), fiducials.shape)
     return fit_rigid(fiducials + noise, fiducials)

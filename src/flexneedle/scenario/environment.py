@@ -70,8 +70,6 @@ class Plate(Section):
     """Direction from the plate to the workspace, of any length."""
     decay_mm: Positive = 40.0
     """Distance over which the distortion falls to 1/e."""
-    pull: Fraction = 0.3
-    """Share of the squared distortion that is a pull along the normal, one for all places but for the decay."""
     tip_mm: NonNegative = 0.0
     """Distortion of the tip sensor."""
     reference_mm: NonNegative = 0.0
@@ -81,7 +79,7 @@ class Plate(Section):
     coils_decay_mm: Positive = 60.0
     """Distance over which that difference falls to 1/e."""
     coils_pull: Fraction = 0.8
-    """Share of its square that is along the normal, one for all places but for the decay."""
+    """Share of its square that is along the normal, and but for the decay the same everywhere."""
 
 
 class Environment(Section):
@@ -97,8 +95,6 @@ class Environment(Section):
     """Distance over which errors stay alike: their correlation is e^(-r²/2ℓ²)."""
     shared: Fraction = 0.5
     """Share of the squared error that all sensors have in common at one place."""
-    constant: Fraction = 0.0
-    """Share of the squared error without a plate that is one for all places."""
     generator_mm: Annotated[Vector, AfterValidator(_a_direction)] = (0.0, 700.0, 0.0)
     """Where the field generator stands."""
     growth: Annotated[float, Field(ge=0, le=10)] = 0.0

@@ -1,4 +1,4 @@
-"""Scenario files: presets, reading, writing."""
+"""Scenario files: presets, reading, writing. Files of environments, too."""
 
 import tomllib
 from importlib.resources import files
@@ -7,13 +7,15 @@ from pathlib import Path
 from typing import IO
 
 import tomli_w
+from pydantic import ValidationError
 
 from flexneedle.errors import ScenarioError
 
+from .environment import Environment, environment_data, environment_names
 from .model import Scenario
-from .problems import printable
+from .problems import describe, printable
 
-__all__ = ["dump_scenario", "load_scenario", "preset_names"]
+__all__ = ["dump_scenario", "load_environment", "load_scenario", "preset_names"]
 
 _PRESETS = files(__package__) / "presets"
 _SUFFIX = ".toml"
@@ -41,9 +43,27 @@ def load_scenario(source: str | Path | Scenario) -> Scenario:
     if isinstance(source, str) and source in preset_names():
         data = (_PRESETS / (source + _SUFFIX)).read_bytes()
     else:
-        data = _read(source)
+        data = _read(source, "a scenario file", f"preset (presets: {', '.join(preset_names())})")
     label = printable(fspath(source))
     return Scenario.from_values(_parse(data, label), label)
+
+
+def load_environment(source: str | Path) -> Environment:
+    """Return the tracker's environment of a shipped name or of a TOML file, whose keys are those of
+    `tracker.environment`.
+
+    Raises ScenarioError with one line for each problem: file, key, value, rule.
+    """
+    names = environment_names()
+    if isinstance(source, str) and source in names:
+        data = environment_data(source)
+    else:
+        data = _read(source, "an environment file", f"environment (environments: {', '.join(names)})")
+    label = printable(fspath(source))
+    try:
+        return Environment.model_validate(_parse(data, label))
+    except ValidationError as error:
+        raise ScenarioError(*(f"{label}: {line}" for line in describe(error, Environment))) from None
 
 
 def dump_scenario(scenario: Scenario) -> str:
@@ -51,25 +71,25 @@ def dump_scenario(scenario: Scenario) -> str:
     return tomli_w.dumps(scenario.values())
 
 
-def _read(source: str | Path) -> bytes:
+def _read(source: str | Path, kind: str, shipped: str) -> bytes:
+    """Read a file; kind: "a scenario file"; shipped: what else its name might have been."""
     label = printable(fspath(source)) or '""'
     try:
         with Path(source).open("rb") as file:
-            return _read_bounded(file, label)
+            return _read_bounded(file, label, kind)
     except FileNotFoundError:
-        presets = ", ".join(preset_names())
-        raise ScenarioError(f"{label}: no such file, and no such preset (presets: {presets})") from None
+        raise ScenarioError(f"{label}: no such file, and no such {shipped}") from None
     except IsADirectoryError:
-        raise ScenarioError(f"{label}: is a directory, not a scenario file") from None
+        raise ScenarioError(f"{label}: is a directory, not {kind}") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ScenarioError(f"{label}: cannot be read: {reason}") from None
 
 
-def _read_bounded(file: IO[bytes], label: str) -> bytes:
+def _read_bounded(file: IO[bytes], label: str, kind: str) -> bytes:
     data = file.read(_LARGEST_FILE + 1)
     if len(data) > _LARGEST_FILE:
-        raise ScenarioError(f"{label}: larger than {_LARGEST_FILE} bytes, not a scenario file")
+        raise ScenarioError(f"{label}: larger than {_LARGEST_FILE} bytes, not {kind}")
     return data
 
 

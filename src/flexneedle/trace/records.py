@@ -1,6 +1,7 @@
 """Records of a plan and of an insertion: frozen data, mm and rad, no behaviour beyond summaries."""
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -135,6 +136,13 @@ class Insertion:
     def flips(self) -> int:
         """Bevel turns as applied."""
         return sum(period.applied[4] > 0 for period in self.periods)
+
+    @property
+    def held_s(self) -> float:
+        """For how long (s) the needle was held because of the tracker's readings."""
+        ends = [0.0, *(period.time for period in self.periods)]
+        spans = zip(self.periods, pairwise(ends), strict=True)
+        return sum((end - begin for period, (begin, end) in spans if period.decision == "held"), 0.0)
 
     @property
     def reached(self) -> bool:

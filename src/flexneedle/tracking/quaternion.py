@@ -72,6 +72,6 @@ def along(directions: Floats) -> Floats:
     """
     x, y, z = directions.T
     opposite = z < -1.0 + 1e-12
-    raw = np.array((np.where(opposite, 0.0, 1.0 + z), np.where(opposite, 1.0, -y), x, 0.0 * z))
+    raw = np.array((np.where(opposite, 0.0, 1.0 + z), np.where(opposite, 1.0, -y), x, np.zeros_like(z)))
     turns: Floats = (raw / np.sqrt(np.sum(raw**2, axis=0))).T
     return turns

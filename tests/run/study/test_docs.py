@@ -32,9 +32,10 @@ def test_every_shipped_study_is_told():
             "imperfections",
             "guide-distance",
             "gauges",
+            "tracker",
         )
     ]
-    assert len(study_names()) == 7
+    assert len(study_names()) == 8
 
 
 def test_every_column_is_told(quick, uninterrupted):

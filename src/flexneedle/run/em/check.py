@@ -27,11 +27,16 @@ class Check:
 
     def values(self) -> dict[str, Any]:
         """Return it as plain values."""
-        return {"above": self.above, "paper_powered": published.POWERED, "results": [asdict(s) for s in self.sensors]}
+        return {
+            "above": self.above,
+            "paper_powered": published.POWERED,
+            "results": [asdict(s) for s in self.sensors],
+        }
 
 
-def check(off: Path, on: Path | None, names: tuple[str | None, str | None], threshold: float, options: Options) ->
-Check:
+def check(
+    off: Path, on: Path | None, names: tuple[str | None, str | None], threshold: float, options: Options
+) -> Check:
     """Return the comparison of two tables, or of two environments of the table `off`.
 
     names: of the environments with power off and on; None: the only one of its table, or "off" and "on" if there is
@@ -46,7 +51,8 @@ Check:
     both = [name for name in before if name in after]
     if not both:
         raise InputError(
-            f"{on or off}: no sensor has an indicator both with power off ({_listed(before)}) and on ({_listed(after)})"
+            f"{on or off}: no sensor has an indicator both with power off ({_listed(before)}) "
+            f"and on ({_listed(after)})"
         )
     return Check([compare(before[name], after[name], threshold) for name in both])
 

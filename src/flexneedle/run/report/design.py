@@ -15,6 +15,8 @@ __all__ = ["Design", "Factor", "column_label", "design_of"]
 
 _GAUGE = "needle.gauge"
 _GUIDE = "setup.guide_to_skin_mm"
+_ENVIRONMENT = "tracker.environment."
+_WHICH = _ENVIRONMENT + "name"
 _MOST_LEVELS, _BINS = 20, 10
 _UNITS = {
     "per_mm": "1/mm", "per_m": "1/m", "per_mj": "1/mJ", "mn_per_mm": "mN/mm", "mm_s": "mm/s",
@@ -82,7 +84,7 @@ def design_of(
     cases = _by_name(rows, "case", "case", () if base is None else (base,))
     varying = [key for key in rows.columns if _is_setting(key) and len(rows.codes(key)[1]) > 1]
     by_case = [key for key in varying if cases.varies and _follows(rows.codes(key)[0], cases.codes)]
-    free = [key for key in varying if key not in by_case]
+    free = [key for key in varying if key not in by_case and not _said_by_name(rows, key, varying)]
     axes = [_axis(rows, keys, set(declared)) for keys in _changing_together(rows, free)]
     as_axis = _case_axis(rows, cases, by_case, set(declared))
     return Design(
@@ -99,6 +101,8 @@ def column_label(key: str) -> str:
         return "needle gauge"
     if key == _GUIDE:
         return "G, distance from guide to skin (mm)"
+    if key == _WHICH:
+        return "environment of the tracker"
     *way, last = key.split(".")
     unit = next((end for end in sorted(_UNITS, key=len, reverse=True) if last.endswith("_" + end)), "")
     words = last.removesuffix("_" + unit).replace("_", " ") if unit else last.replace("_", " ")
@@ -108,6 +112,16 @@ def column_label(key: str) -> str:
 
 def _is_setting(key: str) -> bool:
     return "." in key and not key.startswith("target.")
+
+
+def _said_by_name(rows: Rows, key: str, varying: Sequence[str]) -> bool:
+    """Whether a setting of the tracker's environment is no more than what the environment's name has said."""
+    return (
+        key.startswith(_ENVIRONMENT)
+        and key != _WHICH
+        and _WHICH in varying
+        and _follows(rows.codes(key)[0], rows.codes(_WHICH)[0])
+    )
 
 
 def _follows(codes: Codes, leader: Codes) -> bool:
@@ -189,7 +203,8 @@ def _named(
 ) -> Factor:
     rank = np.empty(len(order), dtype=np.int64)
     rank[list(order)] = np.arange(len(order))
-    names = tuple(_name(levels[k]) for k in order)
+    without = "none" if key == _WHICH else _name(None)
+    names = tuple(without if levels[k] is None else _name(levels[k]) for k in order)
     return Factor(key, label, names, np.full(len(names), nan), rank[codes], rank[codes], False, along)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
 from flexneedle.tracking.evaluation.grid import Grid, Places
-from flexneedle.tracking.evaluation.intervals import CONFIDENCE, Interval, intervals
+from flexneedle.tracking.evaluation.intervals import CONFIDENCE, Interval, intervals, quantile_interval
 from flexneedle.tracking.registration import Rigid, fiducial_error, fit_rigid
 
 __all__ = [
@@ -39,7 +39,8 @@ class Accuracy:
 
     n_points: with a sample; n_unseen: without; n_single: with one, which adds an error, but no scatter. sd_mm: of the
     errors, n − 1. bias_mm: mean error vector. beyond_max: with 95 % confidence no more than this share of the volume
-    has errors beyond `max_mm` (Wilks 1941); a maximum has no useful bootstrap interval. intervals: bootstrap, 95 %.
+    has errors beyond `max_mm` (Wilks 1941); a maximum has no useful bootstrap interval. intervals: 95 %, by bootstrap;
+    that of p95_mm from order statistics.
     """
 
     n_points: int
@@ -125,16 +126,16 @@ def accuracy(grid: Grid) -> Accuracy:
 
 def _intervals(error: Floats, seen: Places) -> dict[str, Interval]:
     squares, scatter, count = error**2, seen.position.scatter.sum(axis=1), seen.position.count
-    return intervals(
+    found = intervals(
         {
             "rmse_mm": lambda chosen: np.sqrt(squares[chosen].mean(axis=1)),
-            "p95_mm": lambda chosen: np.quantile(error[chosen], P95, axis=1),
             "jitter_mm": lambda chosen: np.sqrt(scatter[chosen].sum(axis=1) / count[chosen].sum(axis=1)),
             "mean_mm": lambda chosen: error[chosen].mean(axis=1),
             "sd_mm": lambda chosen: error[chosen].std(axis=1, ddof=1),
         },
         len(error),
     )
+    return {**found, "p95_mm": quantile_interval(error, P95)}
 
 
 def register(grid: Grid) -> tuple[Grid, Registration]:

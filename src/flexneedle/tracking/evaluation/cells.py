@@ -1,17 +1,17 @@
 """From the rows of a table to its grids, in one pass and in constant memory per grid point."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
-from flexneedle.tracking.evaluation.checks import refuse, seen_rows, unit_quaternions
+from flexneedle.tracking.evaluation.checks import check_true, refuse, seen_rows, unit_quaternions
 from flexneedle.tracking.evaluation.grid import Grid, Places, Sums, merged
-from flexneedle.tracking.evaluation.histogram import Histogram
+from flexneedle.tracking.evaluation.histogram import Histogram, Singles
 from flexneedle.tracking.evaluation.keys import MOST_BINS, Keys, Names
-from flexneedle.tracking.evaluation.moments import Moments, add_counts
+from flexneedle.tracking.evaluation.moments import Moments, add_counts, grown
 from flexneedle.tracking.evaluation.reading import Batch
 from flexneedle.tracking.table import REFERENCE, TIP
 
@@ -28,20 +28,9 @@ _ORDER = (TIP, REFERENCE, "ideal", "noisy")
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Columns = Sequence[Floats]
+Mask = Any  # an array of booleans
 Pair = tuple[int, int]
-
-
-@dataclass(eq=False)
-class _Singles:
-    """Single indicator values of a sensor in an environment."""
-
-    histogram: Histogram = field(default_factory=Histogram.empty)
-    low: float = np.inf
-    high: float = -np.inf
-
-    def add(self, values: Floats) -> None:
-        self.histogram.add(values)
-        self.low, self.high = min(self.low, float(values.min())), max(self.high, float(values.max()))
 
 
 class _Cells:
@@ -56,7 +45,7 @@ class _Cells:
         self.true, self.position = Moments(3), Moments(3)
         self.distance, self.indicator = Moments(1), Moments(1)
         self.orientation = Moments(len(_UPPER[0]))
-        self.singles: dict[Pair, _Singles] = {}
+        self._singles = Singles()
 
     def add(self, batch: Batch) -> None:
         """Take in a batch. Raises InputError for a row that breaks a rule."""
@@ -66,26 +55,30 @@ class _Cells:
             names.numbers(batch.labels[name], start) for name, names in self.names.items()
         )
         distance = batch.numbers.get("distance_mm")
-        cell = self.keys.cells(sensor, environment, point, self._bins(distance, start))
+        cell, pair = self.keys.cells(sensor, environment, point, self._bins(distance, start))
         true, position = self._lengths(batch, _TRUE), self._lengths(batch, _POSITION)
-        refuse(
-            ~np.isfinite(true).all(axis=0), start, "true_x_mm, true_y_mm, true_z_mm: must be finite numbers"
-        )
+        check_true(true, start)
         seen = seen_rows(position, start)
-        groups = len(self.keys)
-        self.missing = add_counts(self.missing, cell[~seen], groups)
-        for moments, columns in ((self.true, true), (self.position, position)):
-            _add(moments, cell, columns, seen, groups)
+        if seen is not None:
+            self.missing = add_counts(self.missing, cell[~seen], len(self.keys))
+        self._add(self.true, cell, true, seen)
+        self._add(self.position, cell, position, seen)
+        self._check_moved(cell, true, seen, start)
         if distance is not None:
-            _add(self.distance, cell, distance[None] * self._scale, seen & ~np.isnan(distance), groups)
-        if _QUATERNION[0] in batch.numbers:
+            self._add(self.distance, cell, (distance * self._scale,), _both(seen, ~np.isnan(distance)))
+        if any(name in batch.numbers for name in _QUATERNION):
             self._add_orientation(batch, cell, seen, start)
-        self._add_indicator(batch, cell, seen, (sensor, environment), start)
-        self._check_true(cell, true, start)
+        self._add_indicator(batch.numbers["indicator"], cell, seen, pair, start)
 
-    def _lengths(self, batch: Batch, names: tuple[str, ...]) -> Floats:
-        stacked = np.stack([batch.numbers[name] for name in names])
-        return stacked if self._scale == 1.0 else stacked * self._scale
+    def _add(self, moments: Moments, cell: Indices, columns: Columns, there: Mask | None) -> None:
+        if there is None:
+            moments.add(cell, columns, len(self.keys))
+        else:
+            moments.add(cell[there], [column[there] for column in columns], len(self.keys))
+
+    def _lengths(self, batch: Batch, names: tuple[str, ...]) -> Columns:
+        columns = (batch.numbers[name] for name in names)
+        return tuple(columns if self._scale == 1.0 else (column * self._scale for column in columns))
 
     def _bins(self, distance: Floats | None, start: int) -> Indices:
         if distance is None:
@@ -104,27 +97,33 @@ class _Cells:
         numbers: Indices = np.where(np.isnan(bins), -1, bins).astype(np.int64)
         return numbers
 
-    def _check_true(self, cell: Indices, true: Floats, start: int) -> None:
-        off = np.abs(true - self.true.pivot[cell].T).max(axis=0)
-        refuse(off > SAME_MM, start, f"{_MOVED} (here by {off.max():.4g} mm)")
+    def _check_moved(self, cell: Indices, true: Columns, seen: Mask | None, start: int) -> None:
+        for k, column in enumerate(true):
+            off = column - self.true.pivot[:, k].take(cell)
+            if seen is not None:
+                off[~seen] = 0.0
+            if max(off.max(), -off.min()) > SAME_MM:
+                refuse(np.abs(off) > SAME_MM, start, f"{_MOVED} (here by {np.abs(off).max():.4g} mm)")
 
-    def _add_orientation(self, batch: Batch, cell: Indices, seen: NDArray[np.bool_], start: int) -> None:
+    def _add_orientation(self, batch: Batch, cell: Indices, seen: Mask | None, start: int) -> None:
+        if any(name not in batch.numbers for name in _QUATERNION):
+            raise InputError("qw, qx, qy, qz: all four columns must be there, or none")
         quaternion, there = unit_quaternions(np.stack([batch.numbers[name] for name in _QUATERNION]), start)
-        products = np.stack([quaternion[i] * quaternion[j] for i, j in zip(*_UPPER, strict=True)])
-        _add(self.orientation, cell, products, seen & there, len(self.keys))
+        products = [quaternion[i] * quaternion[j] for i, j in zip(*_UPPER, strict=True)]
+        self._add(self.orientation, cell, products, _both(seen, there))
 
     def _add_indicator(
-        self, batch: Batch, cell: Indices, seen: NDArray[np.bool_], pair: tuple[Indices, Indices], start: int
+        self, values: Floats, cell: Indices, seen: Mask | None, pair: Indices, start: int
     ) -> None:
-        values = batch.numbers["indicator"]
         refuse((values < 0.0) | np.isinf(values), start, "indicator: must be finite and at least 0, or empty")
-        there = seen & ~np.isnan(values)
-        _add(self.indicator, cell, values[None], there, len(self.keys))
-        code = pair[0] * (1 << 16) + pair[1]
-        for number in np.flatnonzero(np.bincount(np.unique(code))) if there.any() else ():
-            own = values[there & (code == number)]
-            if len(own):
-                self.singles.setdefault(divmod(int(number), 1 << 16), _Singles()).add(own)
+        there = _both(seen, ~np.isnan(values))
+        self._add(self.indicator, cell, (values,), there)
+        some = slice(None) if there is None else there
+        self._singles.add(pair[some], values[some], len(self.keys.pairs))
+
+    def singles_of(self, sensor: int, environment: int) -> tuple[Histogram, tuple[float, float]]:
+        """Return single values of the indicator, see `Singles`."""
+        return self._singles.of(self.keys.pairs[sensor, environment])
 
 
 _MOVED = (
@@ -147,34 +146,34 @@ def collect(batches: Iterable[Batch], bin_mm: float, unit: str = "mm") -> tuple[
     return _grids(cells), cells.rows
 
 
-def _add(moments: Moments, cell: Indices, columns: Floats, there: NDArray[np.bool_], groups: int) -> None:
-    if there.all():
-        moments.add(cell, columns, groups)
-    else:
-        moments.add(cell[there], columns[:, there], groups)
+def _both(one: Mask | None, other: Mask) -> Mask | None:
+    """Return the rows that are in both; None stands for all."""
+    both = other if one is None else one & other
+    return None if both.all() else both
 
 
 def _grids(cells: _Cells) -> list[Grid]:
     sensor, environment, point, bins = cells.keys.columns()
     moments = (cells.true, cells.position, cells.distance, cells.indicator, cells.orientation)
-    places = Places(point, bins, cells.missing, *(_sums(entry, len(cells.keys)) for entry in moments))
-    pairs = {(int(s), int(e)) for s, e in zip(sensor, environment, strict=True)}
+    missing = grown(cells.missing, len(cells.keys))
+    places = Places(point, bins, missing, *(_sums(entry, len(cells.keys)) for entry in moments))
     order = _order(cells.names["point_id"].names)
     names = cells.names["sensor"].names, cells.names["environment"].names
     return [
         _grid(cells, pair, places[(sensor == pair[0]) & (environment == pair[1])], order)
-        for pair in sorted(pairs, key=lambda pair: (_rank(names[0][pair[0]]), _rank(names[1][pair[1]])))
+        for pair in sorted(
+            cells.keys.pairs, key=lambda pair: (_rank(names[0][pair[0]]), _rank(names[1][pair[1]]))
+        )
     ]
 
 
 def _grid(cells: _Cells, pair: Pair, own: Places, order: Mapping[int, int]) -> Grid:
     chosen = np.array(sorted(set(own.point.tolist()), key=order.__getitem__), dtype=np.int64)
-    singles = cells.singles.get(pair, _Singles())
     points = merged(own, chosen)
     sensor, environment = (cells.names[name].names[number] for name, number in zip(_PAIR, pair, strict=True))
     _check_moved(own, points, chosen)
     names = tuple(cells.names["point_id"].names[number] for number in chosen.tolist())
-    return Grid(sensor, environment, names, points, own, singles.histogram, (singles.low, singles.high))
+    return Grid(sensor, environment, names, points, own, *cells.singles_of(*pair))
 
 
 _PAIR = ("sensor", "environment")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BIN", "Histogram"]
+__all__ = ["BIN", "Histogram", "Singles"]
 
 BIN = 1e-4
 """Width of a bin: the last digit of the indicator in NDI's replies in text."""
@@ -21,16 +21,6 @@ class Histogram:
     """How many samples lie within half a bin of each multiple of `BIN`; the last bin holds all beyond 9.9."""
 
     counts: Counts
-
-    @classmethod
-    def empty(cls) -> "Histogram":
-        """Return a histogram without samples."""
-        return cls(np.zeros(_BINS, dtype=np.int64))
-
-    def add(self, values: Floats) -> None:
-        """Count values (r,), none of them negative."""
-        bins = np.minimum(values * (1.0 / BIN) + 0.5, _BINS - 1).astype(np.int64)
-        np.add.at(self.counts, bins, 1)
 
     @property
     def count(self) -> int:
@@ -48,3 +38,30 @@ class Histogram:
         """Return the share of samples in bins above `limit`; NaN without samples."""
         first = int(np.floor(limit / BIN + 0.5)) + 1
         return float(self.counts[first:].sum() / self.count) if self.count else float("nan")
+
+
+class Singles:
+    """Histograms and ranges of the indicators of several sensors and environments: one for each number from 0."""
+
+    def __init__(self) -> None:
+        self._counts: Counts = np.zeros(0, dtype=np.int64)
+        self._low, self._high = np.zeros(0), np.zeros(0)
+
+    def add(self, number: Counts, values: Floats, numbers: int) -> None:
+        """Count values (r,), none of them negative, under `number` (r,), all below `numbers`."""
+        added = numbers - len(self._low)
+        if added > 0:
+            self._counts = np.concatenate([self._counts, np.zeros(added * _BINS, dtype=np.int64)])
+            self._low = np.concatenate([self._low, np.full(added, np.inf)])
+            self._high = np.concatenate([self._high, np.full(added, -np.inf)])
+        bins = np.minimum(values * (1.0 / BIN) + 0.5, _BINS - 1).astype(np.int64)
+        np.add.at(self._counts, bins + number * _BINS, 1)
+        np.minimum.at(self._low, number, values)
+        np.maximum.at(self._high, number, values)
+
+    def of(self, number: int) -> tuple[Histogram, tuple[float, float]]:
+        """Return the histogram, and the least and the largest value (∞ and −∞ without any)."""
+        if number >= len(self._low):
+            return Histogram(np.zeros(_BINS, dtype=np.int64)), (np.inf, -np.inf)
+        counts = self._counts[number * _BINS : (number + 1) * _BINS]
+        return Histogram(counts), (float(self._low[number]), float(self._high[number]))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from flexneedle.tracking.evaluation.accuracy import P95, errors
 from flexneedle.tracking.evaluation.grid import Grid
-from flexneedle.tracking.evaluation.intervals import Interval, intervals
+from flexneedle.tracking.evaluation.intervals import Interval, intervals, quantile_interval
 
 __all__ = ["Constant", "Line", "Singles", "Summary", "constant", "line", "means", "summary"]
 
@@ -83,15 +83,18 @@ def summary(grid: Grid) -> Summary | None:
         max=float(values.max()),
         min=float(values.min()),
         p95=float(np.quantile(values, P95)),
-        intervals=intervals(
-            {
-                "mean": lambda chosen: values[chosen].mean(axis=1),
-                "sd": lambda chosen: values[chosen].std(axis=1, ddof=1),
-                "p95": lambda chosen: np.quantile(values[chosen], P95, axis=1),
-            },
-            len(values),
-        ),
+        intervals={**_intervals(values), "p95": quantile_interval(values, P95)},
         samples=_singles(grid),
+    )
+
+
+def _intervals(values: Floats) -> dict[str, Interval]:
+    return intervals(
+        {
+            "mean": lambda chosen: values[chosen].mean(axis=1),
+            "sd": lambda chosen: values[chosen].std(axis=1, ddof=1),
+        },
+        len(values),
     )
 
 
@@ -138,5 +141,5 @@ def _fit(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     middle, height = x.mean(axis=1, keepdims=True), y.mean(axis=1, keepdims=True)
     spread = ((x - middle) ** 2).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        slope = ((x - middle) * (y - height)).sum(axis=1) / np.where(spread > 0.0, spread, nan)
+        slope = ((x - middle) * (y - height)).sum(axis=1) / np.where(np.ptp(x, axis=1) > 0.0, spread, nan)
     return slope, height[:, 0] - slope * middle[:, 0]

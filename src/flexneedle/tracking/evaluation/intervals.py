@@ -10,7 +10,16 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CONFIDENCE", "LEAST_POINTS", "RESAMPLES", "SEED", "Interval", "Statistic", "intervals"]
+__all__ = [
+    "CONFIDENCE",
+    "LEAST_POINTS",
+    "RESAMPLES",
+    "SEED",
+    "Interval",
+    "Statistic",
+    "intervals",
+    "quantile_interval",
+]
 
 CONFIDENCE, RESAMPLES, SEED = 0.95, 2000, 0
 LEAST_POINTS = 10
@@ -33,6 +42,33 @@ def intervals(statistics: Mapping[str, Statistic], points: int, seed: int = SEED
         for name, statistic in statistics.items():
             drawn[name].append(statistic(chosen))
     return {name: _ends(np.concatenate(values)) for name, values in drawn.items()}
+
+
+def quantile_interval(values: Floats, share: float) -> Interval:
+    """Return a 95 % interval of the quantile at `share` of what values (n,) were drawn from, None if they are too few.
+
+    It ends at order statistics, and so holds for any distribution (Conover 1999, section 3.2): a bootstrap of a far
+    quantile is too narrow. The upper end is infinite where even the largest value may lie below the quantile, which
+    for 95 % is so with fewer than 72 points.
+    """
+    count = len(values)
+    if count < LEAST_POINTS:
+        return None
+    tail = (1.0 - CONFIDENCE) / 2.0
+    below = _binomial(count, share)  # k: chance that at most k of the values are below the quantile
+    lower = int(np.searchsorted(below, tail, side="right"))
+    upper = int(np.searchsorted(below, 1.0 - tail)) + 1
+    ends = np.concatenate([[-np.inf], np.sort(values), [np.inf]])
+    return float(ends[lower]), float(ends[upper])
+
+
+def _binomial(count: int, share: float) -> Floats:
+    """Return the cumulative binomial distribution (count + 1,), 0 < share < 1."""
+    k = np.arange(count)
+    steps = np.log((count - k) / (k + 1.0)) + np.log(share / (1.0 - share))
+    logs = np.concatenate([[0.0], np.cumsum(steps)])
+    chances = np.exp(logs - logs.max())
+    return np.asarray(np.cumsum(chances / chances.sum()))
 
 
 def _samples(points: int, seed: int) -> Iterator[Indices]:

@@ -14,6 +14,7 @@ __all__ = ["Keys", "Names"]
 Indices = NDArray[np.int64]
 
 _POINT_BITS, _BIN_BITS, _FEW_BITS = 32, 14, 8
+_PAIR_SHIFT = _POINT_BITS + _BIN_BITS
 _MOST = {"sensor": 1 << _FEW_BITS, "environment": 1 << _FEW_BITS, "point_id": 1 << _POINT_BITS}
 MOST_BINS = (1 << _BIN_BITS) - 1
 
@@ -49,27 +50,37 @@ class Names:
 
 
 class Keys:
-    """Cells in the order of their first rows, and what each is of."""
+    """Cells in the order of their first rows, and what each is of.
+
+    pairs: the number of each sensor and environment (their numbers) that occur together.
+    """
 
     def __init__(self) -> None:
-        self._numbers: dict[int, int] = {}
+        self._cells: dict[int, int] = {}
+        self.pairs: dict[tuple[int, int], int] = {}
 
     def __len__(self) -> int:
-        return len(self._numbers)
+        return len(self._cells)
 
-    def cells(self, sensor: Indices, environment: Indices, point: Indices, bins: Indices) -> Indices:
-        """Return the number (r,) of the cell of each row; bins: from −1."""
+    def cells(
+        self, sensor: Indices, environment: Indices, point: Indices, bins: Indices
+    ) -> tuple[Indices, Indices]:
+        """Return the number of the cell, and of sensor and environment, of each row (r,); bins: from −1."""
         code = ((sensor << _FEW_BITS | environment) << _POINT_BITS | point) << _BIN_BITS | (bins + 1)
         found = pa.array(code).dictionary_encode()
-        numbers = self._numbers
-        own = [numbers.setdefault(value, len(numbers)) for value in found.dictionary.to_pylist()]
-        cells: Indices = np.array(own, dtype=np.int64)[found.indices.to_numpy()]
-        return cells
+        own = found.dictionary.to_pylist()
+        places = found.indices.to_numpy()
+        cells = np.array([self._cells.setdefault(value, len(self._cells)) for value in own], dtype=np.int64)
+        pairs = np.array([self._pair(value >> _PAIR_SHIFT) for value in own], dtype=np.int64)
+        return cells.take(places), pairs.take(places)
+
+    def _pair(self, code: int) -> int:
+        return self.pairs.setdefault(divmod(code, 1 << _FEW_BITS), len(self.pairs))
 
     def columns(self) -> tuple[Indices, Indices, Indices, Indices]:
         """Return sensor, environment, point and bin (g,) of each cell."""
-        code = np.fromiter(self._numbers, dtype=np.int64, count=len(self._numbers))
+        code = np.fromiter(self._cells, dtype=np.int64, count=len(self._cells))
         point = code >> _BIN_BITS & ((1 << _POINT_BITS) - 1)
-        pair = code >> (_BIN_BITS + _POINT_BITS)
+        pair = code >> _PAIR_SHIFT
         few = (1 << _FEW_BITS) - 1
         return pair >> _FEW_BITS, pair & few, point, (code & ((1 << _BIN_BITS) - 1)) - 1

@@ -35,7 +35,9 @@ class Moments:
         self._set_pivots(group, columns)
         self.count += np.bincount(group, minlength=groups)
         for k, column in enumerate(columns):
-            off = column - self.pivot[:, k][group]
+            off = column - self.pivot[:, k].take(group)
+            if not off.any():
+                continue  # as with true positions, which are the same in all rows of a group
             self._first[:, k] += np.bincount(group, off, groups)
             off *= off
             self._second[:, k] += np.bincount(group, off, groups)

@@ -5,6 +5,7 @@ refused, since nobody knows what is missing.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,8 +68,16 @@ def _read(
         raise InputError("is empty")
     opened = _parquet if start == _MAGIC else _csv
     chosen, batches = opened(path, lambda header: chosen_columns(header, theirs, required, optional))
-    for batch in batches:
-        yield _batch(batch, chosen)
+    yield from _ahead(_batch(batch, chosen) for batch in batches)
+
+
+def _ahead(batches: Iterator[Batch]) -> Iterator[Batch]:
+    """Yield the batches; while one is in use, the next is being read (Arrow does that without the interpreter)."""
+    with ThreadPoolExecutor(1) as reader:
+        coming = reader.submit(next, batches, None)
+        while (batch := coming.result()) is not None:
+            coming = reader.submit(next, batches, None)
+            yield batch
 
 
 def _parquet(path: Path, choose: _Choose) -> tuple[dict[str, str], Iterator[Any]]:

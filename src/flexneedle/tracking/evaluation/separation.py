@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 from flexneedle.tracking.evaluation.accuracy import P95
 from flexneedle.tracking.evaluation.grid import Grid
 from flexneedle.tracking.evaluation.indicator import Constant, Line, constant, line, means
-from flexneedle.tracking.evaluation.intervals import LEAST_POINTS, RESAMPLES, SEED, Interval, intervals
+from flexneedle.tracking.evaluation.intervals import (
+    LEAST_POINTS,
+    RESAMPLES,
+    SEED,
+    Interval,
+    quantile_interval,
+)
 
 __all__ = ["Confusion", "Separation", "area", "roc", "separation"]
 
@@ -75,7 +81,7 @@ def separation(sensor: str, ideal: Grid | None, noisy: Grid | None) -> Separatio
         constant(low_error) if len(low) else None,
         line(high, high_error) if len(high) else None,
         threshold,
-        _threshold_interval(low),
+        quantile_interval(low, P95),
         ideal.indicators.quantile(P95) if ideal and len(low) else None,
         (_above(ideal, threshold), _above(noisy, threshold)),
         _confusion(low, high, threshold) if both and threshold is not None else None,
@@ -113,10 +119,6 @@ def area(low: Floats, high: Floats) -> float:
 def _confusion(low: Floats, high: Floats, threshold: float) -> Confusion:
     first, second = int((low > threshold).sum()), int((high > threshold).sum())
     return Confusion(len(low) - first, first, len(high) - second, second)
-
-
-def _threshold_interval(low: Floats) -> Interval:
-    return intervals({"": lambda chosen: np.quantile(low[chosen], P95, axis=1)}, len(low))[""]
 
 
 def _area_interval(low: Floats, high: Floats) -> Interval:

@@ -1,0 +1,326 @@
+"""A metal plate comes near while the needle is inserted: when is it held, and how far off is the tip then?
+
+    python studies/monitor.py [--runs N] [--jobs N] [--out DIR]
+
+Each run draws a target of the paper's fifteen, a phantom, a room of the environment `ideal`, the depth of the tip at
+which the plate of `noisy` begins to come, from 400 mm to 30 mm below the needle, and its speed, 30 to 400 mm/s. It is
+carried out three times with the same random numbers: without the plate, with the plate and without the monitor, with
+both. Prints Markdown tables; the figure is DIR/monitor.png (default: docs/images). The curve of missed and false holds
+over the threshold is read off the runs without the monitor.
+"""
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from flexneedle import Scenario, load_scenario
+from flexneedle.phantom import DEFAULT_PLANT
+from flexneedle.plot import style
+from flexneedle.run.insertion import run as carry_out
+from flexneedle.run.planner import plan as make_plan
+from flexneedle.run.rig import Seeds, virtual_rig, virtual_room
+
+FIRST_SEED = 300_000
+FAR_MM, NEAR_MM = 400.0, 30.0
+SPEEDS_MM_S = (30.0, 400.0)
+TARGETS = [(depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0)]
+THRESHOLDS = np.geomspace(0.015, 1.5, 61)
+LIMIT_MM = 1.0
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Approach:
+    """A run: its seed, target (mm), the time (s) at which the plate begins to come, its speed (mm/s)."""
+
+    seed: int
+    target: tuple[float, float]
+    begins: float
+    speed: float
+
+    def distance_at(self, time: float) -> float:
+        """How far the plate is from the middle of the workspace (mm)."""
+        return max(NEAR_MM, FAR_MM - self.speed * max(0.0, time - self.begins))
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """A run that was carried out, period by period (n,): time (s), largest median indicator of the references over a
+    second, true and believed tip (n, 2) and the plate's distortion of its reading (mm), whether the field held it.
+    """
+
+    time: Floats
+    indicator: Floats
+    tip: Floats
+    believed: Floats
+    distortion: Floats
+    held: NDArray[np.bool_]
+    outcome: str
+
+
+def approach(scenario: Scenario, number: int) -> Approach:
+    """Draw run `number`."""
+    rng = np.random.default_rng([FIRST_SEED, number])
+    target = TARGETS[number % len(TARGETS)]
+    start, speed = scenario.setup.start_tip_x, scenario.setup.insertion_speed_mm_s
+    depth = rng.uniform(0.0, target[0] - 5.0)
+    low, high = map(math.log, SPEEDS_MM_S)
+    return Approach(FIRST_SEED + number, target, (depth - start) / speed, math.exp(rng.uniform(low, high)))
+
+
+def world(plate: bool, monitor: bool) -> Scenario:
+    """The phantom in `ideal`; with the plate of `noisy`."""
+    ideal = load_scenario("phantom").with_values({"tracker.environment": "ideal", "monitor.enabled": monitor})
+    noisy = ideal.with_values({"tracker.environment": "noisy"}).tracker.environment
+    if not plate or noisy is None or noisy.plate is None:
+        return ideal
+    return ideal.with_values({"tracker.environment.plate": noisy.plate.model_dump(mode="json")})
+
+
+def carried_out(drawn: Approach, plate: bool, monitor: bool) -> Told:
+    """Carry out a run."""
+    scenario = world(plate, monitor)
+    depth, lateral = drawn.target
+    scenario = scenario.with_values({"target.depth_mm": depth, "target.lateral_mm": lateral})
+    plan = make_plan(scenario, seed=0, threads=1)
+    phantom, tracker, control, room = np.random.SeedSequence(drawn.seed).spawn(4)
+    rig = virtual_rig(
+        scenario,
+        plan.bevel,
+        Seeds(phantom, tracker, room),
+        DEFAULT_PLANT,
+        plate_distance_at=drawn.distance_at if plate else None,
+    )
+    done = carry_out(scenario, plan, rig, np.random.default_rng(control), force=True, threads=1)
+    periods, around = done.periods, virtual_room(scenario, room, drawn.distance_at(0.0))
+    tips = np.array([period.true_tip[:2] for period in periods if period.true_tip])
+    off = np.zeros(len(tips))
+    if plate and around is not None:
+        places = np.column_stack([tips, np.zeros(len(tips))]) - scenario.tracker.workspace_center_mm
+        off = np.array(
+            [
+                np.linalg.norm(around[0].distortion("tip", place[None], drawn.distance_at(period.time)))
+                for place, period in zip(places, periods, strict=True)
+            ]
+        )
+    return Told(
+        np.array([period.time for period in periods]),
+        medians(periods, scenario.monitor.indicator_window_s),
+        tips,
+        np.array([period.estimate[:2] for period in periods]),
+        off,
+        np.array([period.verdict.startswith("field") for period in periods]),
+        done.outcome,
+    )
+
+
+def medians(periods: Sequence[Any], window: float) -> Floats:
+    """Largest median indicator of the references over the window, after each period."""
+    seen: list[tuple[float, dict[str, float]]] = []
+    largest = []
+    for period in periods:
+        for judged in period.readings:
+            told = judged.sample.frame.readings
+            values = {name: one.indicator for name, one in told.items() if one.indicator is not None}
+            seen.append((judged.sample.time, values))
+        seen = [one for one in seen if one[0] > seen[-1][0] - window + 1e-9]
+        names = {name for _, values in seen for name in values}
+        largest.append(max(median(values[name] for _, values in seen if name in values) for name in names))
+    return np.array(largest)
+
+
+def unchosen(number: int) -> float:
+    """Largest median indicator of the three references where the environment has them, in the room of run `number`."""
+    scenario = world(plate=False, monitor=True).with_values({"monitor.indicator_limit": 9.9})
+    phantom, tracker, _, room = np.random.SeedSequence(FIRST_SEED + number).spawn(4)
+    rig = virtual_rig(scenario, 1, Seeds(phantom, tracker, room))
+    rig.clock.wait(scenario.monitor.indicator_window_s)
+    frames = [sample.frame for sample in rig.tracker.read() if sample.frame is not None]
+    told = [[one.indicator for one in frame.readings.values()] for frame in frames]
+    values = np.array([[math.nan if value is None else value for value in line] for line in told])
+    return float(np.nanmax(np.nanmedian(values[:, 1:], axis=0)))
+
+
+def first(flags: NDArray[np.bool_]) -> int | None:
+    """Index of the first true one."""
+    return int(flags.argmax()) if flags.any() else None
+
+
+def apart(one: Told, other: Told, index: int) -> float:
+    """Distance (mm) of the true tips of two runs after a period; the shorter one stays where it ended."""
+    return float(
+        np.hypot(*(one.tip[min(index, len(one.tip) - 1)] - other.tip[min(index, len(other.tip) - 1)]))
+    )
+
+
+@dataclass(frozen=True)
+class Hold:
+    """What a hold came to: s after the plate began to come and after its distortion of the tip's reading passed 0.5 mm
+    (NaN if it never did), mm that the true tip is then off the run without a plate, and off the believed one.
+    """
+
+    after_begin: float
+    after_distortion: float
+    moved: float
+    unknown: float
+
+
+def hold_of(drawn: Approach, clean: Told, told: Told) -> Hold | None:
+    """The first hold of a run with plate and monitor; None if there was none."""
+    index = first(told.held)
+    if index is None:
+        return None
+    late = first(told.distortion > 0.5)
+    return Hold(
+        float(told.time[index]) - drawn.begins,
+        math.nan if late is None else float(told.time[index] - told.time[late]),
+        apart(told, clean, index),
+        float(np.hypot(*(told.tip[index] - told.believed[index]))),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """All runs: as drawn; without the plate; with it, without the monitor; with both; `unchosen` of each room (n,)."""
+
+    drawn: Sequence[Approach]
+    clean: Sequence[Told]
+    free: Sequence[Told]
+    kept: Sequence[Told]
+    unchosen: Floats
+
+    def holds(self) -> list[tuple[float, Hold]]:
+        """The speed of the plate (mm/s) and the hold of each run that was held."""
+        found = zip(self.drawn, self.clean, self.kept, strict=True)
+        return [(one.speed, hold) for one, other, told in found if (hold := hold_of(one, other, told))]
+
+    def unaware(self) -> list[float]:
+        """How far the true tip is off the believed one without a plate, at the times of the holds (mm)."""
+        pairs = [(one, first(told.held)) for one, told in zip(self.clean, self.kept, strict=True)]
+        held = [(one, min(index, len(one.tip) - 1)) for one, index in pairs if index is not None]
+        return [float(np.hypot(*(one.tip[index] - one.believed[index]))) for one, index in held]
+
+
+def curve(runs: Runs) -> tuple[Floats, Floats, Floats]:
+    """For each threshold: share of runs without a plate that it holds (false), the same with references that nobody
+    put where the field is clean, and share of distorted runs that it does not hold (missed).
+
+    Distorted are those with a plate in which the reading of the tip is off by more than 1 mm because of it, a second
+    or more before the end; missed are those of them in which the indicator has not passed the threshold within that
+    second.
+    """
+    false = [np.mean([one.indicator.max() > limit for one in runs.clean]) for limit in THRESHOLDS]
+    anywhere = [np.mean(runs.unchosen > limit) for limit in THRESHOLDS]
+    passed = [(one, first(one.distortion > LIMIT_MM)) for one in runs.free]
+    until = [(one, float(one.time[index]) + 1.0) for one, index in passed if index is not None]
+    largest = np.array([one.indicator[one.time <= time].max() for one, time in until if one.time[-1] >= time])
+    missed = [np.mean(largest <= limit) for limit in THRESHOLDS]
+    return np.array(false), np.array(anywhere), np.array(missed)
+
+
+def row(name: str, values: Sequence[float]) -> str:
+    """A line of the table."""
+    known = np.array(values)[np.isfinite(values)]
+    cells = [np.mean(known), *np.percentile(known, (50, 95, 100))]
+    return f"| {name} | {len(known)} | " + " | ".join(f"{cell:.2f}" for cell in cells) + " |"
+
+
+def print_tables(runs: Runs) -> None:
+    """Print what the runs came to."""
+    holds = [hold for _, hold in runs.holds()]
+    never = sum(one.held.any() for one in runs.clean)
+    print(f"{len(runs.kept)} runs: {len(holds)} held by the field; without a plate {never}.")
+    print("\n| | n | mean | median | 95 % | max |\n|---|---:|---:|---:|---:|---:|")
+    print(row("time from the plate's start to the hold, s", [hold.after_begin for hold in holds]))
+    print(row("time from 0.5 mm of distortion to the hold, s", [hold.after_distortion for hold in holds]))
+    print(row("true tip at the hold off the run without a plate, mm", [hold.moved for hold in holds]))
+    print(row("true tip at the hold off the believed one, mm", [hold.unknown for hold in holds]))
+    print(row("the same at that time without a plate, mm", runs.unaware()))
+    ends = [apart(one, other, len(one.tip)) for one, other in zip(runs.free, runs.clean, strict=True)]
+    print(row("without the monitor, true tip at the end off that without a plate, mm", ends))
+    share = np.mean([max(hold.moved, hold.unknown) <= LIMIT_MM for hold in holds])
+    print(f"\nAt most {LIMIT_MM:g} mm off at the hold, by both measures: {share:.1%} of the runs held.")
+    print("\n| threshold | held without a plate | references not placed | distorted, not held within 1 s |")
+    print("|---:|---:|---:|---:|")
+    for limit, *shares in list(zip(THRESHOLDS, *curve(runs), strict=True))[::5]:
+        print(f"| {limit:.3f} | " + " | ".join(f"{share:.1%}" for share in shares) + " |")
+
+
+def draw_figure(runs: Runs, folder: Path) -> None:
+    """Time to the hold over the plate's speed, error at the hold, and the choice of the threshold."""
+    speeds, holds = zip(*runs.holds(), strict=True)
+    with style.styled():
+        figure = style.new_figure(3.65)
+        times, errors, choice = (style.axes(figure, left, 0.35, 2.25, 2.2) for left in (0.55, 3.6, 6.6))
+        times.plot(speeds, [hold.after_begin for hold in holds], ".", color=style.ESTIMATE, ms=4)
+        times.set(xscale="log", xlabel="speed of the plate (mm/s)", ylim=(0, None))
+        times.set_title("From the plate's start to the hold (s)")
+        plain_ticks(times, [30, 50, 100, 200, 400])
+        for values, name, color, line in (
+            ([hold.moved for hold in holds], "off the run without a plate", style.TRUE, "-"),
+            ([hold.unknown for hold in holds], "off the believed tip", style.ESTIMATE, "--"),
+        ):
+            ordered = np.sort(values)
+            errors.step(
+                ordered, (np.arange(ordered.size) + 1) / ordered.size, color=color, ls=line, label=name
+            )
+        errors.axvline(LIMIT_MM, color=style.QUIET, lw=0.8)
+        errors.set(
+            xlabel="true tip at the hold (mm)", title="Share of holds below", xlim=(0, None), ylim=(0, 1.02)
+        )
+        errors.legend(loc="upper center", bbox_to_anchor=(0.45, -0.17))
+        false, anywhere, missed = curve(runs)
+        choice.plot(THRESHOLDS, false, color=style.ESTIMATE, label="held without a plate")
+        choice.plot(THRESHOLDS, anywhere, color=style.ESTIMATE, ls=":", label="references not placed")
+        choice.plot(THRESHOLDS, missed, color=style.TRUE, ls="--", label="distorted, not held")
+        choice.axvline(load_scenario("phantom").monitor.indicator_limit, color=style.QUIET, lw=0.8)
+        choice.set(xscale="log", xlabel="threshold of the indicator", title="Share of runs", ylim=(0, 1.02))
+        plain_ticks(choice, [0.02, 0.05, 0.1, 0.2, 0.5, 1.0])
+        choice.legend(loc="upper center", bbox_to_anchor=(0.45, -0.17))
+        style.save(figure, folder, "monitor")
+
+
+def plain_ticks(ax: Axes, ticks: Sequence[float]) -> None:
+    """Ticks of a logarithmic axis as plain numbers."""
+    ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    ax.set_xticks([], minor=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--runs", type=int, default=200)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path("docs/images"))
+    chosen = parser.parse_args(arguments)
+    drawn = [approach(load_scenario("phantom"), number) for number in range(chosen.runs)]
+    with ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as pool:
+        calls = [
+            [pool.submit(carried_out, one, plate, monitor) for one in drawn]
+            for plate, monitor in ((False, True), (True, False), (True, True))
+        ]
+        anywhere = [pool.submit(unchosen, number) for number in range(chosen.runs)]
+        told = [[call.result() for call in line] for line in calls]
+        runs = Runs(drawn, *told, np.array([call.result() for call in anywhere]))
+    print_tables(runs)
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    draw_figure(runs, chosen.out)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,129 @@
+"""`flexneedle em evaluate` and `em check`: what they print, write and return."""
+
+import json
+
+import numpy as np
+import pytest
+
+from em_tables import GRID, plain, random_rows, rows_of, write_csv
+from flexneedle.cli import main as cli
+
+
+@pytest.fixture
+def table(tmp_path):
+    rng = np.random.default_rng(0)
+    rows = random_rows(1, samples=5)
+    for name, error, level in (("ideal", 0.5, 0.02), ("noisy", 2.0, 0.2)):
+        samples = GRID[:, None] + rng.normal(0.0, error, (27, 1, 3)) + rng.normal(0.0, 0.04, (27, 5, 3))
+        rows += rows_of(GRID, samples, "reference", name, (level * rng.uniform(0.5, 1.5, 27)).tolist())
+    rows = [{**row, "distance_mm": 700.0 + row["true_x_mm"]} for row in rows]
+    return write_csv(tmp_path / "mine.csv", rows)
+
+
+def run(capsys, *argv):
+    """Return exit status, stdout and stderr."""
+    status = cli.main(list(map(str, argv)))
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def test_tables_are_printed_beside_the_papers_and_the_makers_values(capsys, table, tmp_path):
+    status, out, err = run(capsys, "em", "evaluate", table, "--out", tmp_path / "out", "--register")
+    assert (status, err) == (0, "")
+    for told in (
+        "tip, ideal",
+        " paper",
+        "0.65",
+        " maker",
+        "0.48",
+        "threshold",
+        "area under the ROC",
+        "rigid fit",
+    ):
+        assert told in out
+    assert str(tmp_path / "out") in out
+
+
+def test_json_is_one_object_in_full_precision_and_is_written_as_well(capsys, table, tmp_path):
+    status, out, _ = run(capsys, "em", "evaluate", table, "--json", "--out", tmp_path / "out")
+    values = json.loads(out)
+    assert status == 0
+    assert json.loads((tmp_path / "out" / "evaluation.json").read_text()) == values
+    tip = values["results"][0]
+    assert (tip["sensor"], tip["environment"]) == ("tip", "ideal")
+    for name, value in plain(random_rows(1, samples=5)).items():
+        assert tip[name] == pytest.approx(value, abs=1e-12)
+    assert values["indicator"][0]["sensor"] == "tip"
+    names = [path.rsplit("/", 1)[-1] for path in values["figures"]]
+    assert names == [
+        f"{name}.{kind}" for name in ("field", "indicator", "roc", "distance") for kind in ("png", "svg")
+    ]
+
+
+def test_the_same_table_gives_the_same_bytes(capsys, table, tmp_path):
+    for name in ("one", "two"):
+        run(capsys, "em", "evaluate", table, "--out", tmp_path / name)
+    for path in (tmp_path / "one").iterdir():
+        if path.name != "evaluation.json":  # which names its folder
+            assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
+
+
+def test_without_a_folder_one_is_made_below_runs_and_none_is_written_over(
+    capsys, table, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    run(capsys, "em", "evaluate", table)
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert folder.name.endswith("-em-mine")
+    status, _, err = run(capsys, "em", "evaluate", table, "--out", folder)
+    assert (status, err.count("\n")) == (2, 1)
+    assert "holds evaluation.json already" in err
+
+
+def test_a_table_that_cannot_be_used_is_one_line_and_status_2(capsys, tmp_path):
+    path = write_csv(tmp_path / "t.csv", [{"a": 1.0}])
+    status, out, err = run(capsys, "em", "evaluate", path, "--out", tmp_path / "out")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"flexneedle: {path}: no column point_id, true_x_mm")
+    assert not (tmp_path / "out").exists()
+
+
+def powered(path, mean, environment="on", points=27):
+    values = mean * np.linspace(0.5, 1.5, points)
+    rows = rows_of(GRID[:points], GRID[:points, None], "reference", environment, values.tolist())
+    return write_csv(path, rows)
+
+
+def test_check_compares_two_tables_and_its_status_says_whether_power_is_too_much(capsys, tmp_path):
+    off = powered(tmp_path / "off.csv", 0.02, "off")
+    status, out, _ = run(capsys, "em", "check", off, powered(tmp_path / "on.csv", 0.04))
+    assert status == 0
+    assert "power adds 0.0200 (95 % interval" in out
+    assert "mean 0.0400 with power on, not above the threshold of 0.0547 (" in out
+    status, out, _ = run(capsys, "em", "check", off, powered(tmp_path / "on.csv", 0.06), "--json")
+    values = json.loads(out)
+    assert (status, values["above"], values["paper_powered"]) == (1, True, 0.04)
+    assert values["results"][0]["difference"] == pytest.approx(0.04)
+    assert values["results"][0]["paired"] is True
+    assert values["results"][0]["points_above"] == 16
+
+
+def test_check_finds_both_environments_in_one_table_by_name(capsys, tmp_path):
+    both = powered(tmp_path / "both.csv", 0.02, "quiet")
+    text = both.read_text() + powered(tmp_path / "on.csv", 0.03).read_text().split("\n", 1)[1]
+    both.write_text(text)
+    status, out, _ = run(capsys, "em", "check", both, "--off", "quiet", "--threshold", "0.025")
+    assert status == 1
+    assert "above the threshold of 0.025" in out
+    status, _, err = run(capsys, "em", "check", both)
+    assert status == 2
+    assert "no environment 'off': choose one by --off or --on: on, quiet" in err
+
+
+def test_check_with_few_or_other_points_says_so(capsys, tmp_path):
+    few = [powered(tmp_path / f"{n}.csv", 0.02, points=n) for n in (4, 20, 27)]
+    assert "too few grid points for an interval" in run(capsys, "em", "check", few[0], few[0])[1]
+    values = json.loads(run(capsys, "em", "check", few[1], few[2], "--json")[1])
+    assert values["results"][0]["paired"] is False
+    low, high = values["results"][0]["difference_interval"]
+    assert low < 0.0 < high

@@ -1,0 +1,116 @@
+"""`flexneedle em simulate` from the command line."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pyarrow.csv
+import pyarrow.parquet as pq
+import pytest
+
+from flexneedle.cli.main import main
+from flexneedle.scenario import load_scenario
+from flexneedle.scenario.environment import Environment
+
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "tracking" / "simulate.md"
+
+FEW = ("--points", "2", "--samples", "2", "--repeats", "1")
+
+
+def simulate(*arguments):
+    return main(["em", "simulate", *map(str, arguments)])
+
+
+def test_without_arguments_but_a_size_both_environments_go_into_a_csv(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert simulate(*FEW) == 0
+    assert capsys.readouterr().out == "measurements.csv\n"
+    table = pyarrow.csv.read_csv(tmp_path / "measurements.csv")
+    assert table.num_rows == 2 * 2 * 8 * 2
+    assert set(table["environment"].to_pylist()) == {"ideal", "noisy"}
+
+
+def test_an_environment_of_ones_own_goes_into_the_table_by_its_name(tmp_path):
+    mine = tmp_path / "mine.toml"
+    mine.write_text('name = "operating room"\nlength_mm = 80\n[plate]\nreference_mm = 2\n')
+    out = tmp_path / "out.parquet"
+    assert simulate(*FEW, "--environment", mine, "ideal", "--seed", 3, "--field-seed", 4, "--out", out) == 0
+    assert set(pq.read_table(out)["environment"].to_pylist()) == {"operating room", "ideal"}
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("length_mm = 80\n", "mine.toml: name: missing"),
+        ('name = "a"\nlenght_mm = 80\n', "unknown key; did you mean length_mm?"),
+        ('name = "a"\nlength_mm = 0\n', "mine.toml: length_mm = 0: must be above 0"),
+        ("name = \n", "mine.toml: not TOML"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_said_in_one_line(tmp_path, capsys, content, told):
+    mine = tmp_path / "mine.toml"
+    mine.write_text(content)
+    assert simulate(*FEW, "--environment", mine, "--out", tmp_path / "out.csv") == 2
+    complaint = capsys.readouterr().err
+    assert told in complaint
+    assert complaint.count("\n") == 1
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_an_unknown_name_tells_the_names_there_are(tmp_path, capsys):
+    assert simulate("--environment", "nosy", "--out", tmp_path / "out.csv") == 2
+    told = "nosy: no such file, and no such environment (environments: ideal, noisy)"
+    assert told in capsys.readouterr().err
+
+
+def test_a_folder_is_no_environment(tmp_path, capsys):
+    assert simulate("--environment", tmp_path, "--out", tmp_path / "out.csv") == 2
+    assert "is a directory, not an environment file" in capsys.readouterr().err
+
+
+def test_the_suffix_is_checked_before_the_work(tmp_path, capsys):
+    assert simulate("--out", tmp_path / "out.txt") == 2
+    assert "must end in .csv or .parquet" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("option", "value"), [("--points", "1"), ("--samples", "0"), ("--seed", "-1")])
+def test_counts_have_bounds(option, value, capsys):
+    with pytest.raises(SystemExit) as ended:
+        simulate(option, value)
+    assert ended.value.code == 2
+    assert "must be" in capsys.readouterr().err
+
+
+# ---- the page that explains it
+
+
+def examples():
+    return re.findall(r"```toml\n(.*?)```", DOCS.read_text(), re.DOTALL)
+
+
+def test_the_environment_on_the_page_can_be_simulated(tmp_path):
+    _, room = examples()
+    (tmp_path / "room.toml").write_text(room)
+    out = tmp_path / "out.csv"
+    assert simulate(*FEW, "--environment", tmp_path / "room.toml", "ideal", "--out", out) == 0
+    assert "operating room" in out.read_text()
+
+
+def test_the_scenario_on_the_page_is_one():
+    values = tomllib.loads(examples()[0])["tracker"]
+    scenario = load_scenario("phantom").with_values({f"tracker.{key}": values[key] for key in values})
+    assert scenario.tracker.tip_offset_mm == 6.0
+    assert scenario.tracker.environment.name == "noisy"
+
+
+def test_the_page_lists_every_setting_with_its_default():
+    """All keys of the tables, by name; defaults are those of an environment with nothing but a name and a plate."""
+    page = DOCS.read_text()
+    settings = page.split("## Settings")[1].split("\n## ")[0]
+    flat = load_scenario("phantom").with_values({"tracker.environment": {"name": "a", "plate": {}}}).flat()
+    opening = "tracker.environment."
+    keys = [key.removeprefix(opening) for key in flat if key.startswith(opening)]
+    assert len(keys) > 20
+    told = set(re.findall(r"`([a-z0-9_.]+)`", settings))
+    assert [key for key in keys if key not in told and key.split(".")[-1] not in told] == []
+    assert Environment(name="a").length_mm == 60.0

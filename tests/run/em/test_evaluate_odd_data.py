@@ -1,0 +1,218 @@
+"""Tables that are damaged, incomplete or of another kind: one clear line, or a stated treatment."""
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from em_tables import GRID, plain, random_rows, rows_of, write_csv
+from flexneedle.errors import InputError
+from flexneedle.run.em.evaluate import Options, evaluate
+
+
+@pytest.fixture
+def rows():
+    return random_rows(seed=2, samples=3)
+
+
+def refusal(path, **options):
+    with pytest.raises(InputError) as caught:
+        evaluate(path, Options(**options))
+    told = str(caught.value)
+    assert "\n" not in told
+    assert str(path) in told
+    return told
+
+
+def one(path, **options):
+    return evaluate(path, Options(**options)).values()["results"][0]
+
+
+def test_missing_columns_are_named_with_the_way_to_map_them(tmp_path, rows):
+    without = [{k: v for k, v in row.items() if k not in ("x_mm", "sensor")} for row in rows]
+    told = refusal(write_csv(tmp_path / "t.csv", without))
+    assert "no column x_mm, sensor" in told
+    assert "--columns THEIRS=OURS" in told
+
+
+def test_columns_of_other_names_are_mapped_and_all_others_ignored(tmp_path, rows):
+    theirs = {"point_id": "Point", "x_mm": "X [mm]", "indicator": "a=b"}
+    named = [{theirs.get(key, key): value for key, value in row.items()} | {"note": "é, 'x'"} for row in rows]
+    path = write_csv(tmp_path / "t.csv", named)
+    pairs = tuple(f"{their}={our}" for our, their in theirs.items())
+    assert one(path, columns=pairs)["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+    mapping = tmp_path / "map.toml"
+    mapping.write_text('"Point" = "point_id"\n"X [mm]" = "x_mm"\n"a=b" = "indicator"\n')
+    assert one(path, columns=(str(mapping),)) == one(path, columns=pairs)
+    assert "'X' (for x_mm)" in refusal(path, columns=("X=x_mm",))
+
+
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        (("X=x",), "no column 'x': one of point_id, true_x_mm"),
+        (("X=x_mm", "Y=x_mm"), "x_mm is both 'X' and 'Y'"),
+        (("nowhere.toml",), "neither a pair nor a file"),
+    ],
+)
+def test_a_mapping_that_makes_no_sense_is_refused(tmp_path, rows, columns, expected):
+    with pytest.raises(InputError, match=expected):
+        evaluate(write_csv(tmp_path / "t.csv", rows), Options(columns=columns))
+
+
+@pytest.mark.parametrize("names", [("x_mm", "y_mm", "z_mm"), ("true_x_mm", "true_y_mm", "true_z_mm")])
+def test_one_frame_in_metres_is_refused_and_named(tmp_path, rows, names):
+    path = write_csv(tmp_path / "t.csv", in_metres(rows, names))
+    assert f"{', '.join(names)} look like metres" in refusal(path)
+    assert one(path, unit="mm")["n_points"] == len(GRID)
+
+
+def test_both_frames_in_metres_are_refused_and_read_when_it_is_said(tmp_path, rows):
+    both = ("x_mm", "y_mm", "z_mm", "true_x_mm", "true_y_mm", "true_z_mm")
+    path = write_csv(tmp_path / "t.csv", in_metres(rows, both))
+    assert "look like metres" in refusal(path)
+    assert one(path, unit="m")["jitter_mm"] == pytest.approx(plain(rows)["jitter_mm"])
+    assert one(path, unit="m")["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+
+
+def test_a_grid_of_a_tenth_of_a_millimetre_is_just_small(tmp_path):
+    tiny = rows_of(GRID / 500.0, [[p / 500.0 + 0.05, p / 500.0 + 0.06] for p in GRID])
+    assert one(write_csv(tmp_path / "t.csv", tiny))["max_mm"] == pytest.approx(0.055 * 3**0.5)
+
+
+def in_metres(rows, names):
+    return [{key: value / 1000.0 if key in names else value for key, value in row.items()} for row in rows]
+
+
+def test_samples_without_a_position_are_left_out_and_counted(tmp_path, rows):
+    lost = [dict(row) for row in rows]
+    for row in lost[:5]:
+        row |= {"x_mm": None, "y_mm": float("nan"), "z_mm": None}
+    path = write_csv(tmp_path / "t.csv", lost)
+    evaluation = evaluate(path, Options())
+    found = evaluation.values()["results"][0]
+    assert (found["n_missing"], found["n_samples"], found["n_points"], found["n_unseen"]) == (5, 76, 26, 1)
+    assert found["rmse_mm"] == pytest.approx(plain(rows[5:])["rmse_mm"])
+    assert found["jitter_mm"] == pytest.approx(plain(rows[5:])["jitter_mm"])
+    assert "tip, ideal: 5 of 81 samples have no position: left out" in evaluation.notes
+    assert "tip, ideal: 1 of 27 grid points have no sample at all: left out" in evaluation.notes
+
+
+def test_a_sensor_that_was_never_seen_is_refused(tmp_path, rows):
+    lost = [{**row, "x_mm": None, "y_mm": None, "z_mm": None} for row in rows]
+    assert "sensor 'tip', environment 'ideal': all samples are missing" in refusal(
+        write_csv(tmp_path / "t.csv", lost)
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"x_mm": None}, "row 8: x_mm, y_mm, z_mm: all three must be there, or none"),
+        ({"z_mm": float("inf")}, "row 8: x_mm, y_mm, z_mm: must be finite"),
+        ({"y_mm": -3.697314e28}, "row 8: x_mm, y_mm, z_mm: must be finite and at most 1e+06 mm"),
+        ({"true_y_mm": None}, "row 8: true_x_mm, true_y_mm, true_z_mm: must be there"),
+        ({"true_y_mm": 7.5}, "row 8: the true position of a point_id changes by more than 0.001 mm"),
+        ({"indicator": -1.0}, "row 8: indicator: must be finite and at least 0, or empty"),
+        ({"indicator": float("inf")}, "row 8: indicator: must be finite"),
+        ({"sensor": ""}, "row 8: sensor is empty"),
+        ({"point_id": ""}, "row 8: point_id is empty"),
+        ({"x_mm": "1,5"}, "conversion error"),
+    ],
+)
+def test_a_row_that_breaks_a_rule_is_named(tmp_path, rows, change, expected):
+    rows[7] |= change
+    assert expected in refusal(write_csv(tmp_path / "t.csv", rows))
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "expected"),
+    [((1.0, None, 0.0, 0.0), "all four must be there"), ((0.9, 0.0, 0.0, 0.0), "must be a unit quaternion")],
+)
+def test_orientations_must_be_whole_unit_quaternions(tmp_path, rows, quaternion, expected):
+    rows = [{**row, "qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0} for row in rows]
+    rows[4] |= dict(zip(("qw", "qx", "qy", "qz"), quaternion, strict=True))
+    assert f"row 5: qw, qx, qy, qz: {expected}" in refusal(write_csv(tmp_path / "t.csv", rows))
+    some = [{k: v for k, v in row.items() if k != "qz"} for row in rows]
+    assert "qw, qx, qy, qz: all four columns" in refusal(write_csv(tmp_path / "some.csv", some))
+
+
+def test_equal_rows_are_samples_like_all_others(tmp_path, rows):
+    twice = one(write_csv(tmp_path / "t.csv", [*rows, *rows]))
+    assert twice["n_samples"] == 2 * len(rows)
+    for name, value in plain(rows).items():
+        assert twice[name] == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "is empty"),
+        ("point_id,x_mm\n", "has no rows"),
+        ("\n\n", "must name the columns"),
+        ("\0\1\2\n3", "neither"),
+    ],
+)
+def test_a_file_without_a_table_is_refused(tmp_path, text, expected):
+    path = tmp_path / "t.csv"
+    path.write_text(text)
+    assert expected in refusal(path)
+
+
+def test_a_file_that_is_not_there_or_is_a_folder_is_refused(tmp_path):
+    assert "cannot be read: No such file" in refusal(tmp_path / "nowhere.csv")
+    assert "cannot be read" in refusal(tmp_path)
+
+
+def test_a_csv_file_cut_anywhere_in_its_last_line_is_refused(tmp_path, rows):
+    whole = write_csv(tmp_path / "whole.csv", rows).read_bytes()
+    start = whole.rstrip(b"\n").rfind(b"\n") + 1
+    path = tmp_path / "t.csv"
+    for end in range(start + 1, len(whole) - 1):
+        path.write_bytes(whole[:end])
+        assert "cut in the middle" in refusal(path)
+
+
+def test_a_csv_file_cut_in_its_last_number_is_refused(tmp_path, rows):
+    fixed = [{**row, "distance_mm": 700.125} for row in rows]
+    whole = write_csv(tmp_path / "t.csv", fixed).read_bytes()
+    for lost in range(2, 8):
+        (tmp_path / "t.csv").write_bytes(whole[:-lost])
+        assert "cut in the middle" in refusal(tmp_path / "t.csv")
+
+
+def test_a_last_line_that_only_lacks_its_line_end_is_used(tmp_path, rows):
+    path = write_csv(tmp_path / "t.csv", rows)
+    path.write_bytes(path.read_bytes()[:-1])
+    assert one(path)["n_samples"] == len(rows)
+
+
+def test_a_line_cut_before_others_were_added_is_refused(tmp_path, rows):
+    path = write_csv(tmp_path / "t.csv", rows)
+    lines = path.read_text().splitlines()
+    lines[40] = lines[40][:30]
+    path.write_text("\n".join(lines) + "\n")
+    assert "cannot be read: CSV parse error" in refusal(path)
+
+
+def test_a_parquet_file_that_was_cut_is_refused(tmp_path, rows):
+    path = tmp_path / "t.parquet"
+    pq.write_table(pa.Table.from_pylist(rows), path)
+    whole = path.read_bytes()
+    for part in (10, len(whole) // 2, len(whole) - 3):
+        path.write_bytes(whole[:part])
+        assert "a Parquet file that was cut off, or is damaged" in refusal(path)
+
+
+def test_a_parquet_column_of_text_is_no_column_of_numbers(tmp_path, rows):
+    path = tmp_path / "t.parquet"
+    pq.write_table(pa.Table.from_pylist([{**row, "x_mm": "left"} for row in rows]), path)
+    assert "x_mm: must be a column of numbers, not of string" in refusal(path)
+
+
+def test_semicolons_tabs_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path, rows):
+    expected = plain(rows)["rmse_mm"]
+    for delimiter in (";", "\t"):
+        path = write_csv(tmp_path / "t.csv", rows, delimiter=delimiter)
+        assert one(path)["rmse_mm"] == pytest.approx(expected)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    assert one(path)["rmse_mm"] == pytest.approx(expected)

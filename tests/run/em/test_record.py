@@ -1,0 +1,291 @@
+"""Recording on a grid: right rows, at rest, each point once whatever interrupts it."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+from itertools import product
+
+import numpy as np
+import pytest
+
+from emulated import DEADLINE_S, emulated, until
+from flexneedle.errors import InputError, RunError
+from flexneedle.ports import VISIBLE, Frame, Reading
+from flexneedle.run.em import record as recording
+from flexneedle.run.em.grid import read_grid
+from flexneedle.run.em.record import EXTRA, Guide, open_session, record
+from flexneedle.tracking.table import COLUMNS
+
+GRID = """\
+environment = "ideal, by the window"
+samples = 6
+repeats = 2
+points_mm = [[0, 0, 0], [10, 0, 0], [10, 20, 0]]
+[sensors]
+tip = "tip"
+ref1 = "reference"
+[rest]
+drift_mm = 0.2
+timeout_s = 2.0
+"""
+
+
+class Stage:
+    """A tracker of a stage that is moved by hand, the clock, and the guide: no time passes but by waiting."""
+
+    def __init__(self):
+        self.time, self.place, self.speed = 0.0, np.zeros(3), 0.0
+        self.asked, self.said = [], []
+        self.ailment, self.status = None, VISIBLE
+        self._told = 0
+
+    def now(self):
+        return self.time
+
+    def wait(self, seconds):
+        self.time += seconds
+
+    def read(self):
+        numbers = range(self._told + 1, int(self.time * 40) + 1)
+        self._told = max(self._told, int(self.time * 40))
+        return tuple(map(self._frame, numbers))
+
+    def _frame(self, number):
+        x, y, z = self.place
+        x += 100.0 + self.speed * number / 40
+        reading = Reading((x, y, z), (1.0, 0.0, 0.0, 0.0), 0.02)
+        return Frame(number / 40, number, {"tip": reading, "ref1": reading} | (self.ailment or {}))
+
+    def ask(self, stop):
+        self.asked.append((stop.repeat, stop.point_id))
+        self.place = np.array(stop.place)
+        self.time += 3.0
+
+    def guide(self, **settings):
+        return Guide(self.ask, self.said.append, **settings)
+
+
+@pytest.fixture
+def grid(tmp_path):
+    (tmp_path / "grid.toml").write_text(GRID)
+    return read_grid(str(tmp_path / "grid.toml"))
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "table.csv"
+
+
+def run(out, grid, stage, **settings):
+    with open_session(out, grid) as session:
+        return record(session, stage, stage, grid, stage.guide(**settings))
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+ALL = list(product((1, 2), (1, 2, 3)))
+
+
+def assert_whole(path, samples=6, stops=ALL, sensors=("tip", "reference")):
+    """Every stop has all its rows, once, in order."""
+    found = [(int(row["repeat"]), int(row["point_id"]), row["sensor"]) for row in rows_of(path)]
+    assert found == [(*stop, name) for stop in stops for _ in range(samples) for name in sensors]
+
+
+def test_each_point_has_its_samples_with_where_the_stage_was(grid, out):
+    stage = Stage()
+    assert run(out, grid, stage) == 6
+    assert stage.asked == ALL
+    assert_whole(out)
+    assert tuple(rows_of(out)[0]) == (*COLUMNS, *EXTRA)
+    for row in rows_of(out):
+        true = np.array([float(row[f"true_{axis}_mm"]) for axis in "xyz"])
+        told = np.array([float(row[f"{axis}_mm"]) for axis in "xyz"])
+        np.testing.assert_array_equal(told - true, (100.0, 0.0, 0.0))
+        assert float(row["distance_mm"]) == pytest.approx(np.linalg.norm(told))
+        assert (row["environment"], row["indicator"], row["qw"]) == ("ideal, by the window", "0.02", "1.0")
+
+
+def test_no_sample_is_from_before_the_stage_was_there(grid, out):
+    run(out, grid, Stage())
+    first = [float(row["time_s"]) for row in rows_of(out)][::12]
+    assert (np.diff(first) >= 3.0).all()
+    assert first[0] >= 3.0
+
+
+def test_a_moving_stage_is_waited_for(grid, out):
+    """It moves at 5 mm/s for its first second, and the samples are from after that."""
+    stage = Stage()
+    wait = stage.wait
+
+    def wait_and_slow_down(seconds):
+        wait(seconds)
+        stage.speed = 5.0 if stage.time < 4.0 else 0.0
+
+    stage.wait = wait_and_slow_down
+    run(out, grid, stage)
+    assert_whole(out)
+    assert float(rows_of(out)[0]["time_s"]) > 3.9
+
+
+def test_a_stage_that_never_rests_is_told_and_asked_for_again(grid, out):
+    stage = Stage()
+    stage.speed = 5.0
+
+    def say(line):
+        stage.said.append(line)
+        stage.speed = 0.0
+
+    with open_session(out, grid) as session:
+        record(session, stage, stage, grid, Guide(stage.ask, say))
+    (said,) = stage.said
+    assert said == (
+        "no 6 good samples within 2 s: tip moves: 0.50 mm from the first to the last third, limit 0.2 mm; once more"
+    )
+    assert stage.asked == [(1, 1), *ALL]
+    assert_whole(out)
+
+
+@pytest.mark.parametrize(
+    ("ailment", "says"),
+    [
+        ({"tip": Reading(None, status="out of volume")}, "tip: out of volume"),
+        ({"ref1": Reading(None, status="missing")}, "ref1: missing"),
+    ],
+)
+def test_a_point_that_cannot_be_measured_ends_a_recording_without_a_person(grid, out, ailment, says):
+    stage = Stage()
+    stage.ailment = ailment
+    with pytest.raises(RunError, match=f"point 1, repeat 1: no 6 good samples within 2 s: {says}"):
+        run(out, grid, stage, insists=False)
+    assert rows_of(out) == []
+
+
+def test_a_sensor_that_the_tracker_does_not_have_is_named(grid, out):
+    stage = Stage()
+    stage._frame = lambda number: Frame(number / 40, number, {"tip": Reading((0.0, 0.0, 0.0))})
+    with pytest.raises(RunError, match="ref1: no such sensor"):
+        run(out, grid, stage, insists=False)
+
+
+def test_a_silent_tracker_says_why(grid, out):
+    stage = Stage()
+    stage.read, stage.status = (lambda: ()), "no reply"
+    with pytest.raises(RunError, match="no reply"):
+        run(out, grid, stage, insists=False)
+
+
+@pytest.mark.parametrize("stopped_after", range(7))
+def test_stopped_at_any_point_it_goes_on_with_the_next(grid, out, stopped_after):
+    stage = Stage()
+    ask = stage.ask
+
+    def ask_until(stop):
+        if len(stage.asked) == stopped_after:
+            raise KeyboardInterrupt
+        ask(stop)
+
+    stage.ask = ask_until
+    if stopped_after < 6:
+        with pytest.raises(KeyboardInterrupt):
+            run(out, grid, stage)
+    else:
+        run(out, grid, stage)
+    again = Stage()
+    run(out, grid, again)
+    assert stage.asked + again.asked == ALL
+    assert_whole(out)
+    assert (np.diff([float(row["time_s"]) for row in rows_of(out)]) >= 0).all(), "times go on"
+
+
+@pytest.mark.parametrize("cut", [1, 20, 200, 400, 1000, 2000, 4000])
+def test_a_table_that_was_cut_anywhere_is_completed(grid, out, cut):
+    run(out, grid, Stage())
+    whole = out.stat().st_size
+    os.truncate(out, max(0, whole - cut) if cut > 1 else 1)
+    run(out, grid, Stage())
+    assert_whole(out)
+
+
+def test_zeros_that_a_power_cut_left_are_dropped(grid, out):
+    run(out, grid, Stage())
+    with out.open("ab") as file:
+        file.write(bytes(500))
+    run(out, grid, Stage())
+    assert_whole(out)
+
+
+def test_a_whole_table_is_left_as_it_is(grid, out):
+    run(out, grid, Stage())
+    before = out.read_bytes()
+    assert run(out, grid, Stage()) == 0
+    assert out.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("environment = ", "# environment = \nenvironment = 'noisy' #"),
+        ("[10, 0, 0]", "[11, 0, 0]"),
+        ("samples = 6", "samples = 5"),
+        ("repeats = 2", "repeats = 1"),
+        ('ref1 = "reference"', 'ref1 = "other"'),
+    ],
+)
+def test_a_table_of_another_grid_is_left_alone(grid, out, tmp_path, old, new):
+    run(out, grid, Stage())
+    before = out.read_bytes()
+    (tmp_path / "other.toml").write_text(GRID.replace(old, new))
+    with pytest.raises(InputError, match=r"line \d+: is not of this grid"):
+        run(out, read_grid(str(tmp_path / "other.toml")), Stage())
+    assert out.read_bytes() == before
+
+
+def test_a_file_that_is_no_such_table_is_left_alone(grid, out):
+    out.write_text("my notes\n")
+    with pytest.raises(InputError, match="is no table of `em record`"):
+        run(out, grid, Stage())
+    assert out.read_text() == "my notes\n"
+
+
+def test_a_damaged_line_is_found(grid, out):
+    run(out, grid, Stage())
+    lines = out.read_text().splitlines(keepends=True)
+    out.write_text("".join([*lines[:3], lines[3].replace("1", "x", 1), *lines[4:]]))
+    with pytest.raises(InputError, match="line 4: is not of this grid"):
+        run(out, grid, Stage())
+
+
+def test_two_recordings_do_not_share_a_table(grid, out):
+    with open_session(out, grid), pytest.raises(InputError, match="another process is writing it"):
+        run(out, grid, Stage())
+
+
+def test_each_point_is_on_the_disk_before_the_next_is_asked_for(grid, out, monkeypatch):
+    synced = []
+    monkeypatch.setattr(recording.os, "fsync", lambda _: synced.append(len(rows_of(out))))
+    run(out, grid, Stage())
+    assert synced == [12, 24, 36, 48, 60, 72]
+
+
+def test_killed_in_the_middle_it_neither_loses_nor_repeats_a_point(tmp_path, out):
+    """Real processes, a real line, and kill -9."""
+    count = 40
+    points = [[n, 0, 0] for n in range(count)]
+    text = f'environment = "ideal"\nsamples = 4\nrepeats = 1\npoints_mm = {points}\n[rest]\ndrift_mm = 10.0\n'
+    (tmp_path / "line.toml").write_text(text)
+    with emulated() as path:
+        command = [sys.executable, "-m", "flexneedle", "em", "record", "--tracker", f"aurora:{path}"]
+        command += ["--grid", str(tmp_path / "line.toml"), "--out", str(out), "--dwell", "0"]
+        for rows in (20, 60):
+            process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+            until(lambda wanted=rows: out.exists() and out.read_bytes().count(b"\n") > wanted)
+            process.send_signal(signal.SIGKILL)
+            process.wait(DEADLINE_S)
+        subprocess.run(command, check=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    assert_whole(out, 4, [(1, n + 1) for n in range(count)], ("tip",))

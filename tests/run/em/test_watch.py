@@ -1,0 +1,95 @@
+"""Watching: every frame shown and kept, and a verdict on each."""
+
+import pytest
+
+from flexneedle.devices.recording import read_frames
+from flexneedle.devices.replay import Replay
+from flexneedle.errors import InputError
+from flexneedle.ports import VISIBLE, Frame, Reading
+from flexneedle.run.em.watch import judge_field, watch
+from flexneedle.scenario import Monitor
+
+
+class Clock:
+    """Time passes by waiting alone."""
+
+    time = 0.0
+
+    def now(self):
+        return self.time
+
+    def wait(self, seconds):
+        self.time += seconds
+
+
+def frames(count, indicator=0.02, **readings):
+    told = {name: Reading((1.0, 2.0, 3.0), None, indicator) for name in ("tip", "ref1", "ref2", "ref3")}
+    return [Frame(n / 40, n, told | readings) for n in range(count)]
+
+
+class Silent:
+    """A tracker that says nothing and why."""
+
+    status = "no reply"
+
+    def read(self):
+        return ()
+
+
+def test_each_frame_is_shown_once_with_its_verdict():
+    clock, views = Clock(), []
+    assert watch(Replay(frames(60), clock), clock, views.append) == 60
+    assert [view.frame.number for view in views if view.is_new] == list(range(60))
+    assert {view.verdict for view in views if view.is_new} == {VISIBLE}
+
+
+def test_a_judge_of_ones_own_sees_the_history():
+    clock, views = Clock(), []
+    watch(Replay(frames(500), clock), clock, views.append, judge=lambda history: str(len(history)))
+    assert [view.verdict for view in views[:3]] == ["1", "2", "3"]
+    assert views[-1].verdict == "400"
+
+
+def test_it_stops_after_its_time():
+    clock, views = Clock(), []
+    assert watch(Replay(frames(60), clock), clock, views.append, seconds=0.5) == 20
+
+
+def test_where_nothing_comes_it_says_so_now_and_then():
+    clock, views = Clock(), []
+    assert watch(Silent(), clock, views.append, seconds=3.0) == 0
+    assert 4 <= len(views) <= 6
+    assert {(view.frame, view.verdict) for view in views} == {(None, "no reply")}
+
+
+def test_what_is_recorded_can_be_replayed(tmp_path):
+    path, clock = tmp_path / "kept.csv", Clock()
+    watch(Replay(frames(60, tip=Reading(None, status="missing")), clock), clock, lambda _: None, record=path)
+    kept = read_frames(path)
+    assert [frame.number for frame in kept] == list(range(60))
+    assert kept[7].readings["tip"] == Reading(None, status="missing")
+    assert kept[7].readings["ref1"].indicator == 0.02
+
+
+def test_a_recording_overwrites_nothing(tmp_path):
+    (tmp_path / "kept.csv").write_text("mine")
+    clock = Clock()
+    with pytest.raises(InputError, match="is there already"):
+        watch(Replay(frames(1), clock), clock, lambda _: None, record=tmp_path / "kept.csv")
+    assert (tmp_path / "kept.csv").read_text() == "mine"
+
+
+def test_a_good_field_is_ok_and_a_distorted_one_is_not():
+    assert judge_field(frames(40), Monitor()) == VISIBLE
+    assert "field distorted" in judge_field(frames(40, indicator=0.06), Monitor())
+    assert judge_field(frames(80, indicator=0.06)[:20] + frames(80)[20:], Monitor()) == VISIBLE, (
+        "of the last second"
+    )
+
+
+def test_a_sensor_without_a_position_and_too_few_references_are_told():
+    lost = Reading(None, status="out of volume")
+    assert judge_field(frames(5, ref2=lost), Monitor()) == "ref2: out of volume"
+    alone = [Frame(0.0, 1, {"tip": Reading((0.0, 0.0, 0.0))})]
+    assert "field not known: 0 of 3" in judge_field(alone, Monitor())
+    assert judge_field(alone, Monitor(references=0)) == VISIBLE
