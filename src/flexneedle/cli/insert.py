@@ -159,6 +159,7 @@ def _table(insertion: Insertion, folder: Path) -> None:
         ("bevel turns", str(insertion.flips)),
         ("  as planned", str(insertion.plan.flips)),
         ("control periods", str(result["steps"])),
+        *([("held for the tracker", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
         ("time of the plan", _number(timing["plan_seconds"], "s")),
         ("time of a period, median", _number(timing["period_ms"]["p50"], "ms")),
     ]

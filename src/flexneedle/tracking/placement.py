@@ -1,5 +1,6 @@
 """Where a lab puts its reference sensors: around the workspace, and where the field is clean."""
 
+import math
 from collections.abc import Callable, Mapping
 from functools import partial
 
@@ -12,7 +13,9 @@ from flexneedle.tracking.field.sensors import Floats, noiseless, noisy
 __all__ = ["placed_references"]
 
 _TRIES = 20
-_APART_MM = 15.0  # sd of a place on each axis about the first one
+_APART_MM = (
+    10.0  # sd of the second place on each axis about the first one; the longer it takes the further away
+)
 _READINGS = 40
 
 
@@ -35,10 +38,11 @@ def placed_references(
 
 def _clean(told: Callable[[Pose], float], first: Pose, limit: float, rng: np.random.Generator) -> Pose:
     best, least = first, told(first)
-    for _ in range(_TRIES - 1):
+    for tried in range(1, _TRIES):
         if least < limit:
             break
-        x, y, z = (np.array(first.position) + rng.normal(0.0, _APART_MM, 3)).tolist()
+        apart = _APART_MM * math.sqrt(tried)
+        x, y, z = (np.array(first.position) + rng.normal(0.0, apart, 3)).tolist()
         pose = Pose((x, y, z), first.orientation)
         if (value := told(pose)) < least:
             best, least = pose, value

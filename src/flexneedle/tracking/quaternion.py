@@ -8,17 +8,22 @@ Floats = NDArray[np.float64]
 __all__ = ["along", "from_matrix", "from_vector", "product", "to_matrix", "z_axis"]
 
 
+_PRODUCT = np.array(
+    [
+        [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, -1]],
+        [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
+        [[0, 0, 1, 0], [0, 0, 0, -1], [1, 0, 0, 0], [0, 1, 0, 0]],
+        [[0, 0, 0, 1], [0, 0, 1, 0], [0, -1, 0, 0], [1, 0, 0, 0]],
+    ],
+    dtype=float,
+)
+"""Element i of a product is the sum over j, k of this times element j of the first and k of the second turn."""
+
+
 def product(first: Floats, second: Floats) -> Floats:
     """Return the turn `second`, then `first`: (n, 4) or (4,), as both are."""
-    w, x, y, z = first.T
-    a, b, c, d = second.T
-    parts = (
-        w * a - x * b - y * c - z * d,
-        w * b + x * a + y * d - z * c,
-        w * c - x * d + y * a + z * b,
-        w * d + x * c - y * b + z * a,
-    )
-    return np.array(parts).T
+    turned: Floats = np.einsum("ijk,...j,...k->...i", _PRODUCT, first, second)
+    return turned
 
 
 def from_vector(vectors: Floats) -> Floats:

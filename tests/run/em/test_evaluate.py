@@ -1,6 +1,7 @@
 """`em evaluate` against answers worked out by hand, a second implementation, and laws that any evaluation obeys."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -15,6 +16,7 @@ from em_tables import GRID, plain, random_rows, rows_of, write_csv
 from flexneedle.errors import InputError
 from flexneedle.run.em.evaluate import Options, evaluate
 from flexneedle.tracking.evaluation import reading
+from flexneedle.tracking.evaluation.columns import column_map
 
 LAWS = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 # Two points, (0, 0, 0) and (10, 0, 0). Means off by (3, 4, 0) and (0, 0, 1): errors 5 and 1. Samples ±1 along x at the
@@ -58,7 +60,7 @@ def test_samples_that_are_not_as_many_at_each_point_weigh_alike_in_the_jitter_on
     assert found["rmse_mm"] == pytest.approx(math.sqrt((1 + 4) / 2))
     assert found["jitter_mm"] == pytest.approx(math.sqrt(2 / 4))
     assert (found["n_single"], found["samples_least"], found["samples_most"]) == (1, 1, 3)
-    assert any("1 grid points have a single sample" in note for note in evaluation.notes)
+    assert any("1 grid points have one sample (an error each" in note for note in evaluation.notes)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1000.0, -2500.0])
@@ -188,7 +190,9 @@ def test_distances_are_binned_and_the_smallest_within_the_limit_is_found(tmp_pat
         around = np.array([(off, 0.01, 0.0), (off, -0.01, 0.0)])
         own = rows_of(GRID, GRID[:, None] + around)
         rows += [{**row, "distance_mm": distance} for row in own]
-    found = only(write_csv(tmp_path / "t.csv", rows))["distance"]
+    evaluation = evaluate(write_csv(tmp_path / "t.csv", rows), Options())
+    assert evaluation.notes[0].startswith("tip, ideal: points were measured at several distances")
+    found = evaluation.values()["results"][0]["distance"]
     assert [b["distance_mm"] for b in found["bins"]] == pytest.approx(list(error))
     assert [b["rmse_mm"] for b in found["bins"]] == pytest.approx(list(error.values()))
     assert [b["jitter_mm"] for b in found["bins"]] == pytest.approx([0.01] * 5)
@@ -246,3 +250,10 @@ def test_repeatability_has_n_minus_one_and_the_axes_apart(tmp_path):
     )  # sums of squares 2 and 8 over two degrees of freedom
     assert found["sd_mm"] == pytest.approx(math.sqrt(5.0))
     assert (found["worst_mm"], found["worst_at"]) == (pytest.approx(math.sqrt(8.0)), "1")
+
+
+def test_the_documented_mapping_file_is_one(tmp_path):
+    text = (Path(__file__).parents[3] / "docs/tracking/evaluate.md").read_text(encoding="utf-8")
+    mapping = tmp_path / "map.toml"
+    mapping.write_text(text.split("```toml\n")[1].split("```")[0])
+    assert column_map([str(mapping)]) == {"x_mm": "X [mm]", "point_id": "id"}

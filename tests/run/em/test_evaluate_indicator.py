@@ -93,3 +93,9 @@ def test_a_line_through_equal_indicators_is_not_known():
     found = line(np.full(12, 0.1), np.arange(12.0))
     assert np.isnan(found.slope_mm)
     assert found.intervals == {"slope_mm": None, "intercept_mm": None}
+
+
+def test_the_scatter_about_the_line_has_n_minus_two():
+    found = line(np.array([0.0, 1.0, 2.0, 3.0]), np.array([1.0, -1.0, -1.0, 1.0]))
+    assert (found.slope_mm, found.intercept_mm) == pytest.approx((0.0, 0.0))
+    assert found.scatter_mm == pytest.approx(np.sqrt(4.0 / 2.0))

@@ -85,7 +85,7 @@ def in_metres(rows, names):
 
 def test_samples_without_a_position_are_left_out_and_counted(tmp_path, rows):
     lost = [dict(row) for row in rows]
-    for row in lost[:5]:
+    for row in lost[:5]:  # all three of the first point, two of the second
         row |= {"x_mm": None, "y_mm": float("nan"), "z_mm": None}
     path = write_csv(tmp_path / "t.csv", lost)
     evaluation = evaluate(path, Options())
@@ -93,8 +93,8 @@ def test_samples_without_a_position_are_left_out_and_counted(tmp_path, rows):
     assert (found["n_missing"], found["n_samples"], found["n_points"], found["n_unseen"]) == (5, 76, 26, 1)
     assert found["rmse_mm"] == pytest.approx(plain(rows[5:])["rmse_mm"])
     assert found["jitter_mm"] == pytest.approx(plain(rows[5:])["jitter_mm"])
-    assert "tip, ideal: 5 of 81 samples have no position: left out" in evaluation.notes
-    assert "tip, ideal: 1 of 27 grid points have no sample at all: left out" in evaluation.notes
+    left_out = "5 of 81 samples have no position (left out); 1 of 27 grid points have no sample (left out)"
+    assert evaluation.notes[0].startswith(f"tip, ideal: {left_out}; 1 grid points have one sample")
 
 
 def test_a_sensor_that_was_never_seen_is_refused(tmp_path, rows):
@@ -216,3 +216,23 @@ def test_semicolons_tabs_a_byte_order_mark_and_windows_line_ends_are_read(tmp_pa
         assert one(path)["rmse_mm"] == pytest.approx(expected)
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
     assert one(path)["rmse_mm"] == pytest.approx(expected)
+
+
+def test_names_with_blanks_around_them_are_the_same_names(tmp_path, rows):
+    for number, row in enumerate(rows):
+        row["sensor"] = ("tip", " tip", "tip ")[number % 3]
+    assert one(write_csv(tmp_path / "t.csv", rows))["n_samples"] == len(rows)
+
+
+def test_a_parquet_table_may_have_whole_numbers_categories_and_no_indicator_at_all(tmp_path, rows):
+    table = pa.Table.from_pylist(rows)
+    for name, column in (
+        ("true_x_mm", table["true_x_mm"].cast(pa.int16())),
+        ("sensor", table["sensor"].dictionary_encode()),
+        ("indicator", pa.nulls(len(rows))),
+    ):
+        table = table.set_column(table.schema.get_field_index(name), name, column)
+    pq.write_table(table, tmp_path / "t.parquet")
+    found = one(tmp_path / "t.parquet")
+    assert found["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+    assert found["indicator"] is None

@@ -100,6 +100,19 @@ def test_an_environments_rows_do_not_depend_on_what_else_is_measured():
     assert not np.allclose(*(column(table, "y_mm")[:5] for table in (both, alone)))
 
 
+def test_two_environments_have_noise_of_their_own():
+    twins = [environment(name=name, tip={"jitter_mm": 0.1}) for name in ("one", "other")]
+    one, other = np.split(column(measure(twins, SMALL), "x_mm"), 2)
+    assert (one != other).all()
+
+
+def test_two_sensors_have_noise_of_their_own():
+    both = environment(tip={"jitter_mm": 0.1}, reference={"jitter_mm": 0.1}, tilt_jitter_mrad=0.0)
+    table = measure([both], Experiment(points=2, samples=500))
+    off = [column(table, "x_mm", name) - column(table, "true_x_mm", name) for name in ("tip", "reference")]
+    assert abs(np.corrcoef(off)[0, 1]) < 0.05
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_same_seed_same_bytes(tmp_path, suffix):
     files = [tmp_path / f"{name}{suffix}" for name in ("one", "same", "other")]

@@ -82,14 +82,18 @@ def test_a_recording_overwrites_nothing(tmp_path):
 def test_a_good_field_is_ok_and_a_distorted_one_is_not():
     assert judge_field(frames(40), Monitor()) == VISIBLE
     assert "field distorted" in judge_field(frames(40, indicator=0.06), Monitor())
-    assert judge_field(frames(80, indicator=0.06)[:20] + frames(80)[20:], Monitor()) == VISIBLE, (
-        "of the last second"
-    )
+
+
+def test_the_field_is_that_of_the_last_second_at_the_references():
+    improved = frames(100, indicator=0.06)[:60] + frames(100)[60:]
+    assert judge_field(improved, Monitor()) == VISIBLE
+    at_the_tip = Reading((1.0, 2.0, 3.0), None, 0.5)
+    assert judge_field(frames(40, tip=at_the_tip), Monitor()) == VISIBLE
 
 
 def test_a_sensor_without_a_position_and_too_few_references_are_told():
     lost = Reading(None, status="out of volume")
     assert judge_field(frames(5, ref2=lost), Monitor()) == "ref2: out of volume"
-    alone = [Frame(0.0, 1, {"tip": Reading((0.0, 0.0, 0.0))})]
+    alone = [Frame(0.0, 1, {"tip": Reading((0.0, 0.0, 0.0), None, 0.02)})]
     assert "field not known: 0 of 3" in judge_field(alone, Monitor())
     assert judge_field(alone, Monitor(references=0)) == VISIBLE

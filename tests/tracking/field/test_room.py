@@ -10,6 +10,7 @@ from flexneedle.tracking.field.room import SENSORS, Room, grid
 from rooms import environment
 
 GRID = grid(100.0)
+EVEN = 1e6  # a length over which a field is the same all over the workspace
 ABOVE = {"normal": [0.0, 0.0, 2.0], "distance_mm": 100.0}
 
 
@@ -28,16 +29,15 @@ def test_the_grid_is_that_of_the_paper():
     size=st.floats(0.01, 10.0),
     length=st.floats(10.0, 300.0),
     shared=st.floats(0.0, 1.0),
-    constant=st.floats(0.0, 1.0),
     power=st.floats(0.0, 4.0),
 )
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=40)
-def test_every_room_has_the_size_of_its_environment(seed, size, length, shared, constant, power):
+def test_every_room_has_the_size_of_its_environment(seed, size, length, shared, power):
     """RMS over the paper's grid, for each sensor, with and without a plate."""
     plate = ABOVE | {"tip_mm": 2 * size, "reference_mm": 3 * size, "decay_mm": length}
     tracker = environment(
         tip={"bias_mm": size}, reference={"bias_mm": 0.5 * size}, plate=plate,
-        length_mm=length, shared=shared, constant=constant, growth=power,
+        length_mm=length, shared=shared, growth=power,
     )  # fmt: skip
     room = Room(tracker, seed)
     for sensor in SENSORS:
@@ -76,17 +76,11 @@ def test_sensors_share_what_the_environment_says():
         assert np.mean(product) == pytest.approx(shared, abs=0.08)
 
 
-def test_an_error_that_is_constant_is_one_for_all_places():
-    room = Room(environment(tip={"bias_mm": 1.0}, constant=1.0), 1)
-    error = room.error("tip", GRID)
-    np.testing.assert_allclose(error, np.tile(error[0], (125, 1)), atol=1e-12)
-
-
 def test_errors_grow_with_the_distance_to_the_generator():
-    tracker = {"tip": {"bias_mm": 1.0}, "constant": 1.0, "generator_mm": [0.0, 500.0, 0.0]}
+    tracker = {"tip": {"bias_mm": 1.0}, "length_mm": EVEN, "generator_mm": [0.0, 500.0, 0.0]}
     points = np.array([[0.0, 50.0, 0.0], [0.0, -50.0, 0.0]])
     near, far = np.linalg.norm(Room(environment(**tracker, growth=4.0), 1).error("tip", points), axis=-1)
-    assert far / near == pytest.approx((550.0 / 450.0) ** 4)
+    assert far / near == pytest.approx((550.0 / 450.0) ** 4, rel=1e-3)
 
 
 # ---- the plate
@@ -101,21 +95,20 @@ def test_a_plates_distortion_falls_by_e_over_its_decay_length():
 
 
 def test_the_distance_of_a_point_is_along_the_normal():
-    """With nothing but the pull of the plate: toward it, e^(50/40) more for a point 50 mm nearer."""
-    plate = {"normal": [3.0, 0.0, 4.0], "tip_mm": 1.0, "decay_mm": 40.0, "pull": 1.0, "distance_mm": 120.0}
-    room = Room(environment(plate=plate), 2)
+    """e^(50/40) more for a point 50 mm nearer to the plate, and as much for one beside."""
+    plate = {"normal": [3.0, 0.0, 4.0], "tip_mm": 1.0, "decay_mm": 40.0, "distance_mm": 120.0}
+    room = Room(environment(plate=plate, length_mm=EVEN), 2)
     normal = np.array([0.6, 0.0, 0.8])
     middle, nearer, beside = room.distortion("tip", np.array([0 * normal, -50 * normal, [8.0, 9.0, -6.0]]))
-    np.testing.assert_allclose(nearer, np.exp(50.0 / 40.0) * middle)
-    np.testing.assert_allclose(beside, middle)
-    np.testing.assert_allclose(middle / np.linalg.norm(middle), -normal)
+    np.testing.assert_allclose(nearer, np.exp(50.0 / 40.0) * middle, rtol=1e-2)
+    np.testing.assert_allclose(beside, middle, rtol=1e-2)
 
 
 def test_behind_the_plate_it_is_as_at_the_plate():
-    plate = ABOVE | {"tip_mm": 1.0, "decay_mm": 40.0, "pull": 1.0}
-    room = Room(environment(plate=plate), 2)
+    plate = ABOVE | {"tip_mm": 1.0, "decay_mm": 40.0}
+    room = Room(environment(plate=plate, length_mm=EVEN), 2)
     at, behind = room.distortion("tip", np.array([[0.0, 0.0, -30.0], [0.0, 0.0, -45.0]]), 30.0)
-    np.testing.assert_allclose(at, behind)
+    np.testing.assert_allclose(at, behind, rtol=1e-2)
 
 
 @given(nearer=st.floats(1.0, 60.0), distance=st.floats(70.0, 300.0), seed=st.integers(0, 1000))
@@ -131,6 +124,23 @@ def test_no_plate_no_distortion():
     room = Room(environment(tip={"bias_mm": 1.0}), 1)
     assert not room.distortion("tip", GRID).any()
     assert not room.distortion("tip", GRID, 10.0).any()
+
+
+LENGTHS = st.sampled_from([1e-6, 1.0, 1e6])
+
+
+@given(length=LENGTHS, edge=LENGTHS, decay=LENGTHS, away=LENGTHS, power=st.sampled_from([0.0, 10.0]))
+@hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
+def test_whatever_an_environment_may_say_its_errors_are_numbers(length, edge, decay, away, power):
+    plate = {"tip_mm": 1e6, "reference_mm": 1e-6, "coils_mm": 1.0, "decay_mm": decay, "coils_decay_mm": decay}
+    tracker = environment(
+        tip={"bias_mm": 1e6}, length_mm=length, workspace_mm=edge, plate=plate | {"distance_mm": 0.0},
+        generator_mm=[away, 0.0, 0.0], growth=power,
+    )  # fmt: skip
+    room = Room(tracker, 1)
+    points = np.concatenate([grid(edge), GRID])
+    assert np.isfinite(room.error("tip", points)).all()
+    assert np.isfinite(room.coil_errors("ref1", points, np.ones((len(points), 1)), 50.0)).all()
 
 
 # ---- seeds

@@ -49,8 +49,8 @@ def test_a_reference_is_off_by_the_mean_of_its_coils():
     apart = {"bias_mm": 1.0, "coils_mm": 2.0, "spacing_mm": 0.01}
     with_, without = environment(reference=apart), environment(reference=apart | {"coils_mm": 0.0})
     middle = seen(with_, "ref1").coils.mean(axis=1)
-    np.testing.assert_allclose(middle, seen(without, "ref1").coils.mean(axis=1), atol=1e-4)
-    np.testing.assert_allclose(middle, GRID + Room(with_, 1).error("ref1", GRID), atol=1e-4)
+    np.testing.assert_allclose(middle, seen(without, "ref1").coils.mean(axis=1), atol=1e-3)
+    np.testing.assert_allclose(middle, GRID + Room(with_, 1).error("ref1", GRID), atol=1e-3)
 
 
 # ---- noise
@@ -103,19 +103,19 @@ def test_the_indicator_is_the_relative_error_of_the_distance(distance, value):
 
 
 def test_a_distortion_that_is_one_for_all_places_is_not_seen_a_gradient_is():
-    """The indicator of a plate's pull along the axis of the coils: the slope of the distortion."""
-    plate = {"reference_mm": 1.0, "pull": 1.0, "distance_mm": 100.0}
+    """The indicator: the slope of the distortion along the axis of the coils."""
+    plate, short = {"reference_mm": 1.0, "distance_mm": 100.0}, {"spacing_mm": 0.01}
     mild, steep = (
-        environment(plate=plate | {"decay_mm": decay}, reference={"spacing_mm": 0.01})
-        for decay in (1e5, 50.0)
+        environment(plate=plate | {"decay_mm": decay}, reference=short, length_mm=1e6)
+        for decay in (1e6, 50.0)
     )
     assert indicator(seen(mild, "ref1").coils, 0.01).max() < 1e-4
-    slope = np.linalg.norm(Room(steep, 1).distortion("ref1", GRID), axis=-1) / 50.0
-    np.testing.assert_allclose(indicator(seen(steep, "ref1").coils, 0.01), slope, rtol=1e-3)
+    slope = np.abs(Room(steep, 1).distortion("ref1", GRID)[:, 2]) / 50.0
+    np.testing.assert_allclose(indicator(seen(steep, "ref1").coils, 0.01), slope, rtol=1e-2)
 
 
 def test_the_indicator_grows_as_the_plate_comes_nearer():
-    tracker = environment(plate={"reference_mm": 1.0, "coils_mm": 2.0, "coils_pull": 1.0, "pull": 1.0})
+    tracker = environment(plate={"coils_mm": 2.0, "coils_pull": 1.0})
     values = [indicator(seen(tracker, "ref1", plate=at).coils, 10.0) for at in (300.0, 200.0, 120.0, 80.0)]
     assert (np.diff(values, axis=0) > 0.0).all()
     assert np.max(values[0]) < 0.02

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from . import check, evaluate, record, register, watch
+from . import check, evaluate, record, register, simulate, watch
 
 __all__ = ["add_parser"]
 
-_COMMANDS: tuple[Any, ...] = (evaluate, check, register, record, watch)
+_COMMANDS: tuple[Any, ...] = (evaluate, check, simulate, register, record, watch)
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

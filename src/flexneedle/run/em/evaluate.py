@@ -6,6 +6,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flexneedle.errors import InputError
 from flexneedle.run.study.files import replace_file
 from flexneedle.trace.plain import to_text
@@ -151,7 +153,8 @@ def write_evaluation(evaluation: Evaluation, folder: Path, figures: Iterable[Pat
 
 def notes(grids: Sequence[Grid], options: Options) -> list[str]:
     """Return what is odd about the data, and how it was treated, a line each."""
-    return [f"{grid.sensor}, {grid.environment}: {note}" for grid in grids for note in _odd(grid)] + _lacking(
+    told = ((grid, "; ".join(_odd(grid))) for grid in grids)
+    return [f"{grid.sensor}, {grid.environment}: {odd}" for grid, odd in told if odd] + _lacking(
         grids, options
     )
 
@@ -160,16 +163,16 @@ def _odd(grid: Grid) -> Iterator[str]:
     count, missing = grid.points.position.count, int(grid.points.missing.sum())
     single, unseen, known = int((count == 1).sum()), int((count == 0).sum()), count[count > 0]
     if missing:
-        yield f"{missing} of {missing + int(count.sum())} samples have no position: left out"
+        yield f"{missing} of {missing + int(count.sum())} samples have no position (left out)"
     if unseen:
-        yield f"{unseen} of {len(count)} grid points have no sample at all: left out"
+        yield f"{unseen} of {len(count)} grid points have no sample (left out)"
     if single:
-        yield f"{single} grid points have a single sample: an error each, nothing for the jitter"
+        yield f"{single} grid points have one sample (an error each, nothing for the jitter)"
     if len(known) and known.min() != known.max():
-        yield (
-            f"{known.min()} to {known.max()} samples a grid point: each point counts alike in the errors, "
-            "each sample in the jitter"
-        )
+        weights = "points weigh alike in the errors, samples in the jitter"
+        yield f"{known.min()} to {known.max()} samples a grid point ({weights})"
+    if np.bincount(grid.cells.point[grid.cells.position.count > 0]).max(initial=0) > 1:
+        yield "points were measured at several distances (pooled in all figures but those by distance)"
 
 
 def _lacking(grids: Sequence[Grid], options: Options) -> list[str]:

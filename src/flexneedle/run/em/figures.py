@@ -6,6 +6,7 @@ import numpy as np
 
 from flexneedle.plot import em as plots
 from flexneedle.plot import save
+from flexneedle.plot.style import signed
 from flexneedle.run.em.evaluate import Evaluation, Result
 from flexneedle.tracking.evaluation.accuracy import error_vectors
 from flexneedle.tracking.evaluation.grid import Grid
@@ -26,7 +27,11 @@ def draw_evaluation(evaluation: Evaluation, folder: Path) -> list[Path]:
     lines = [_roc(evaluation, found) for found in evaluation.separations if found.confusion]
     if lines:
         paths += save(plots.roc_figure(lines), folder, "roc")
-    far = [_distance(result) for result in evaluation.results if result.distances]
+    far = [
+        _distance(result)
+        for result in evaluation.results
+        if result.distances and len(result.distances.bins) > 1
+    ]
     return paths + (save(plots.distance_figure(far), folder, "distance") if far else [])
 
 
@@ -51,7 +56,7 @@ def _indicator(evaluation: Evaluation, found: Separation) -> plots.IndicatorPane
 
 def _line_told(line: Line) -> str:
     sign = "+" if line.intercept_mm >= 0.0 else "−"
-    return f"{line.slope_mm:.3f} I {sign} {abs(line.intercept_mm):.3f} mm"
+    return f"{signed(line.slope_mm, '.3f')} I {sign} {abs(line.intercept_mm):.3f} mm"
 
 
 def _is_of(result: Result, found: Separation) -> bool:

@@ -9,11 +9,14 @@ from flexneedle.devices.aurora.readings import NAMES
 from flexneedle.devices.recording import read_frames
 from flexneedle.devices.replay import Replay
 from flexneedle.errors import InputError
-from flexneedle.ports import Clock, Tracker
+from flexneedle.ports import Clock, Frame, Reading, Sample, Tracker
+from flexneedle.run.folder import TRACE_FILE
+from flexneedle.trace.reader import read_trace
+from flexneedle.tracking.table import TIP
 
-__all__ = ["FORMS", "LiveTracker", "open_tracker"]
+__all__ = ["FORMS", "LiveTracker", "frames_of_run", "open_tracker"]
 
-FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE[@SPEED]"
+FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE[@SPEED] (a recording, or the folder of a run)"
 """How trackers are written."""
 
 
@@ -30,7 +33,8 @@ def open_tracker(spec: str, clock: Clock) -> AbstractContextManager[LiveTracker]
     """Return the tracker that `spec` names, at work; leaving the context puts it to rest.
 
     `aurora:/dev/ttyUSB0` has the sensors tip, ref1, ref2, ref3 at the ports 1 to 4; `aurora:/dev/ttyUSB0=ref1,tip`
-    names those of ports 1 and 2. `replay:FILE@2` plays a recording twice as fast.
+    names those of ports 1 and 2. `replay:FILE@2` plays a recording, or what a run in a
+    folder was told, twice as fast.
     Raises InputError for anything else, RunError if no tracker answers.
     """
     kind, _, rest = spec.partition(":")
@@ -53,4 +57,27 @@ def _replay(rest: str, clock: Clock) -> Replay:
         factor = float(speed) if speed else 1.0
     except ValueError:
         raise InputError(f"tracker replay:{rest}: {speed} is no speed") from None
-    return Replay(read_frames(Path(file)), clock, factor)
+    path = Path(file)
+    return Replay(frames_of_run(path) if path.is_dir() else read_frames(path), clock, factor)
+
+
+def frames_of_run(folder: Path) -> tuple[Frame, ...]:
+    """Return what the tracker told in a recorded insertion, in its own frame; each frame once.
+
+    A tracker that told of the tip alone gives frames of the tip, in the frame of the stage, with z = 0 where it told
+    none. Raises InputError if there is no trace of readings.
+    """
+    periods = read_trace(folder / TRACE_FILE).periods
+    told = [judged.sample for period in periods for judged in period.readings]
+    frames = {frame.number: frame for frame in (_frame(n, sample) for n, sample in enumerate(told))}
+    if not frames:
+        raise InputError(f"{folder}: the run has no readings of a tracker")
+    return tuple(frames.values())
+
+
+def _frame(number: int, sample: Sample) -> Frame:
+    if sample.frame is not None:
+        return sample.frame
+    seen = sample.x is not None and sample.y is not None
+    place = (sample.x or 0.0, sample.y or 0.0, sample.z or 0.0)
+    return Frame(sample.time, number, {TIP: Reading(place) if seen else Reading(None, status="missing")})

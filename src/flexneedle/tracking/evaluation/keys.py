@@ -29,10 +29,10 @@ class Names:
     def numbers(self, labels: Any, start: int) -> Indices:
         """Return the number (r,) of each label; raises InputError where one is empty, or if there are too many."""
         own = [self._number(value) for value in labels.dictionary.to_pylist()]
-        nothing = len(own)
-        places = labels.indices.fill_null(nothing).to_numpy(zero_copy_only=False)
-        found: Indices = np.array([*own, -1], dtype=np.int64)[places]
-        refuse(found < 0, start, f"{self.column} is empty")
+        places = labels.indices.fill_null(len(own)) if labels.null_count else labels.indices
+        found: Indices = np.array([*own, -1], dtype=np.int64).take(places.to_numpy())
+        if found.min() < 0:
+            refuse(found < 0, start, f"{self.column} is empty")
         if len(self.names) > _MOST[self.column]:
             raise InputError(
                 f"{self.column}: more than {_MOST[self.column]} different ones: is it the right column?"
@@ -40,8 +40,8 @@ class Names:
         return found
 
     def _number(self, value: Any) -> int:
-        text = "" if value is None else str(value)
-        if not text.strip():
+        text = "" if value is None else str(value).strip()
+        if not text:
             return -1
         if text not in self._numbers:
             self._numbers[text] = len(self.names)

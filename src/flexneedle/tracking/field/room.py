@@ -27,6 +27,7 @@ SENSORS = (TIP, *REFERENCES)
 SIZES_AT = 100.0
 """Distance of the plate from the middle of the workspace, mm, at which its sizes are meant."""
 _WAVES = 64
+_STEEPEST = 300.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,16 +84,16 @@ class Room:
         return self._sum(None, plate, points, self._features(points), plate_distance)
 
     def coil_errors(
-        self, sensor: str, points: Floats, side: float, plate_distance: float | None = None
+        self, sensor: str, points: Floats, sides: Floats, plate_distance: float | None = None
     ) -> Floats:
-        """Return how far one of a reference's coils is read off at `points` (n, 3): (n, 3), mm.
+        """Return how far a reference's coils are read off at `points` (n, 3): (n, 3), mm.
 
-        side: −1 for its first coil, +1 for the second, which lie askew, so that their errors differ at one place.
+        sides (n, 1): −1 for its first coil, +1 for the second; they lie askew, so their errors differ at one place.
         """
         fields, features = self._fields[sensor], self._features(points)
         error = self._sum(fields.bias, fields.plate, points, features, plate_distance)
         apart = self._sum(fields.coils, fields.plate_coils, points, features, plate_distance)
-        return error + 0.5 * side * apart
+        return error + 0.5 * sides * apart
 
     def _features(self, points: Floats) -> Floats:
         phase = points @ self._wave_vectors
@@ -139,8 +140,8 @@ def growing(environment: Environment) -> Envelope:
     def factor(points: Floats, _: float | None) -> Floats:
         if power == 0.0:
             return np.ones((len(points), 1))
-        away: Floats = np.linalg.norm(points - generator, axis=-1, keepdims=True) / middle
-        return away**power
+        away: Floats = np.sum((points - generator) ** 2, axis=-1, keepdims=True) / middle**2
+        return away ** (0.5 * power)
 
     return factor
 
@@ -154,7 +155,8 @@ def decaying(plate: Plate, length: float) -> Envelope:
 
     def factor(points: Floats, distance: float | None) -> Floats:
         away = points @ normal + (plate.distance_mm if distance is None else distance)
-        decay: Floats = np.exp((SIZES_AT - np.maximum(away, 0.0)) / length)
+        # The bound keeps squares finite where a large workspace meets a short decay.
+        decay: Floats = np.exp(np.minimum((SIZES_AT - np.maximum(away, 0.0)) / length, _STEEPEST))
         return decay
 
     return factor

@@ -49,13 +49,10 @@ def noiseless(
         off = room.error(sensor, places, plate_distance)
         return Noiseless((places + off)[:, None], _tilted(room.environment, off, turns))
     half = 0.5 * room.environment.reference.spacing_mm * z_axis(turns)
-    coils = np.stack(
-        [
-            place + room.coil_errors(sensor, place, side, plate_distance)
-            for side, place in ((-1.0, places - half), (1.0, places + half))
-        ],
-        axis=1,
-    )
+    ends = np.concatenate((places - half, places + half))
+    sides = np.repeat((-1.0, 1.0), len(places))[:, None]
+    first, second = np.split(ends + room.coil_errors(sensor, ends, sides, plate_distance), 2)
+    coils = np.stack((first, second), axis=1)
     off = coils.mean(axis=1) - places
     return Noiseless(coils, _tilted(room.environment, off, turns))
 

@@ -1,0 +1,146 @@
+"""Insertions with a simulated electromagnetic tracker: its room, its monitor, its sensor behind the tip."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.run.insertion import run
+from flexneedle.run.rig import Seeds, virtual_rig, virtual_room
+from flexneedle.tracking.field import Room, reference_poses
+from flexneedle.tracking.field.sensors import indicator, noiseless
+from flexneedle.tracking.placement import placed_references
+from rooms import STILL, shipped
+
+PHANTOM = flexneedle.load_scenario("phantom")
+PLATE = shipped("noisy").plate
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return flexneedle.plan(PHANTOM, (30.0, 0.0), seed=1)
+
+
+@pytest.fixture(scope="module")
+def inserted(plan):
+    """Return the insertion in an environment with a plate that moves; each carried out once."""
+
+    @cache
+    def insert(environment, enabled=True, seed=3, plate_at=None):
+        scenario = PHANTOM.with_values({"tracker.environment": environment, "monitor.enabled": enabled})
+        if plate_at is not None:
+            plate = {"tracker.environment.plate": PLATE.model_dump(mode="json")}
+            scenario = scenario.with_values(plate)
+        phantom, tracker, control, room = np.random.SeedSequence(seed).spawn(4)
+        rig = virtual_rig(
+            scenario, plan.bevel, Seeds(phantom, tracker, room), "model", plate_distance_at=plate_at
+        )
+        return run(scenario, plan, rig, np.random.default_rng(control))
+
+    return insert
+
+
+def passing(time):
+    """A plate that lies near from the 4th to the 7th second."""
+    return 50.0 if 4.0 <= time < 7.0 else 1000.0
+
+
+def test_in_a_clean_field_nothing_is_held(inserted):
+    done = inserted("ideal")
+    assert done.outcome == "done"
+    assert done.held_s == 0.0
+    assert done.true_error_mm < 2.0
+    told = done.periods[-1].readings[-1].sample
+    assert set(told.frame.readings) == {"tip", "ref1", "ref2", "ref3"}
+    assert 0.0 < abs(told.z) < 3.0
+
+
+def test_over_metal_the_needle_is_held_and_the_insertion_given_up(inserted):
+    held = inserted("noisy")
+    assert held.outcome == "held"
+    assert held.reason.startswith("held for 10.00 s (limit 10 s): field distorted: ref")
+    assert held.held_s == pytest.approx(10.0, abs=0.3)
+    assert held.true_error_mm > 20.0  # before the skin
+
+
+def test_without_the_monitor_it_goes_on_over_metal(inserted):
+    assert inserted("noisy", enabled=False).outcome == "done"
+
+
+def test_a_plate_that_comes_and_goes_holds_the_needle_as_long_as_it_is_there(inserted):
+    done = inserted("ideal", plate_at=passing)
+    field = [period for period in done.periods if period.verdict.startswith("field distorted")]
+    assert 4.3 < field[0].time < 5.1  # half a second of readings, which come 0.2 s late
+    assert 7.3 < field[-1].time < 8.1
+    held = [period for period in done.periods if field[0].time < period.time <= field[-1].time]
+    assert {period.decision for period in held} == {"held"}
+    assert {period.applied for period in held} == {(0.0, 0.0, 0.0, 0.0, -1)}
+    assert {period.innovation for period in held} == {(0.0, 0.0)}  # nothing is learnt from a distorted field
+    assert done.outcome == "done"
+    assert done.held_s == pytest.approx(field[-1].time - field[0].time, abs=0.1)
+
+
+def test_without_a_plate_the_same_run_is_not_held(inserted):
+    assert inserted("ideal", plate_at=lambda _: 1000.0).held_s == 0.0
+
+
+def test_each_insertion_has_a_room_of_its_own_unless_one_is_chosen():
+    def errors(**values):
+        scenario = PHANTOM.with_values({"tracker.environment": "ideal", **values})
+        rooms = [virtual_room(scenario, np.random.SeedSequence(seed))[0] for seed in (1, 2)]
+        return [room.error("tip", np.zeros((1, 3))) for room in rooms]
+
+    one, other = errors()
+    assert np.abs(one - other).max() > 1e-3
+    one, other = errors(**{"tracker.field_seed": 5})
+    np.testing.assert_array_equal(one, other)
+
+
+def rig_of(**values):
+    scenario = PHANTOM.with_values(
+        {
+            "tracker.environment": STILL,
+            "phantom.missing_fraction": 0.0,
+            "phantom.delay_periods": 0.0,
+            **values,
+        }
+    )
+    return virtual_rig(scenario, 1, Seeds(*map(np.random.SeedSequence, (1, 2, 3))), "model")
+
+
+@pytest.mark.parametrize("offset", [0.0, 8.0])
+def test_a_sensor_behind_the_tip_tells_where_the_tip_is(offset):
+    rig = rig_of(**{"tracker.tip_offset_mm": offset})
+    for _ in range(30):
+        rig.driver.apply((1.0, 0.0, 0.0, 0.2, -1), 0.2)
+    sample = rig.tracker.read()[-1]
+    np.testing.assert_allclose((sample.x, sample.y), rig.truth().tip[:2], atol=1e-9)
+    sensor = np.array(sample.frame.readings["tip"].position)
+    assert np.linalg.norm(sensor[:2] - rig.truth().tip[:2]) == pytest.approx(offset, abs=1e-9)
+
+
+def clean_indicators(room, poses):
+    """What the references tell without noise."""
+    spacing = room.environment.reference.spacing_mm
+    seen = [
+        noiseless(room, name, np.array([pose.position]), np.array([pose.orientation]))
+        for name, pose in poses.items()
+    ]
+    return np.array([indicator(one.coils, spacing)[0] for one in seen])
+
+
+def test_references_are_put_where_the_field_is_clean():
+    """At their first places some are above three quarters of the threshold; then none is, but for noise."""
+    limit = 0.75 * PHANTOM.monitor.indicator_limit
+    above = moved = 0
+    for seed in range(60):
+        room, rng = Room(shipped("ideal"), seed), np.random.default_rng(seed)
+        first = reference_poses(room.environment, (0.0, 0.0, 0.0))
+        placed = placed_references(room, (0.0, 0.0, 0.0), limit, rng)
+        dirty = clean_indicators(room, first) > limit
+        above += dirty.any()
+        moved += placed != first
+        assert clean_indicators(room, placed).max() < 1.1 * limit
+    assert 5 < above < 40
+    assert abs(moved - above) < 6

@@ -1,0 +1,69 @@
+"""studies/environments.py: the shipped environments meet the paper's Tables I and II; its own arithmetic."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
+import environments
+
+CASES = [(name, figure) for name, figures in environments.PAPER.items() for figure in figures]
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Two measurements with seeds of which nothing was chosen."""
+    return environments.measured(("ideal", "noisy"), (910_001, 910_002), other_rooms=False)
+
+
+@pytest.mark.parametrize(("name", "figure"), CASES)
+def test_the_shipped_environments_meet_the_paper(found, name, figure):
+    """In every measurement, not in the median alone: within 10 %, maxima and minima within 25 %."""
+    paper = environments.PAPER[name][figure]
+    share = 0.25 if figure.endswith(("max", "min")) else 0.10
+    np.testing.assert_allclose(found[name][figure], paper, rtol=share)
+
+
+def test_in_noisy_no_indicator_is_below_the_threshold(found):
+    """As the paper says of its Table II."""
+    assert found["noisy"]["𝓘 min"].min() > 0.0547
+
+
+def test_both_shipped_environments_are_one_room_with_and_without_a_plate():
+    one, other = map(environments.load_environment, ("ideal", "noisy"))
+    same = {"plate": None, "name": "", "tip": one.tip, "reference": one.reference}
+    assert one.model_copy(update=same) == other.model_copy(update=same)
+    assert one.tip.bias_mm == other.tip.bias_mm
+    jitter = {"jitter_mm": 0.0}
+    assert one.reference.model_copy(update=jitter) == other.reference.model_copy(update=jitter)
+
+
+def by_hand(sensor, indicator):
+    """Two points: 3, 4, 0 mm off with 0.1 mm to either side; 0, 0, 2 mm off without jitter, and a missing sample."""
+    x, y, z = [3.1, 2.9, 10.0, 10.0, None], [4.0, 4.0, 0.0, 0.0, None], [0.0, 0.0, 2.0, 2.0, None]
+    true = [0.0, 0.0, 10.0, 10.0, 10.0]
+    return pa.table(
+        {
+            "point_id": [0, 0, 1, 1, 1],
+            "true_x_mm": true, "true_y_mm": [0.0] * 5, "true_z_mm": [0.0] * 5,
+            "x_mm": x, "y_mm": y, "z_mm": z,
+            "indicator": pa.array(indicator, pa.float64()),
+            "sensor": [sensor] * 5, "environment": ["noisy"] * 5,
+        }
+    )  # fmt: skip
+
+
+def test_the_figures_of_two_points_by_hand():
+    table = pa.concat_tables([by_hand("tip", [None] * 5), by_hand("reference", [0.1, 0.3, 0.05, 0.05, None])])
+    found = environments.statistics(table, "noisy")
+    assert found["reference RMSE"] == pytest.approx(np.sqrt((25 + 4) / 2))
+    assert found["reference max"] == pytest.approx(5.0)
+    assert found["reference 95 %"] == pytest.approx(2.0 + 0.95 * 3.0)
+    assert found["reference jitter"] == pytest.approx(np.sqrt(2 * 0.1**2 / 4))
+    assert (found["𝓘 mean"], found["𝓘 max"], found["𝓘 min"]) == pytest.approx((0.125, 0.2, 0.05))
+    assert found["𝓘 sd"] == pytest.approx(0.15 / np.sqrt(2))
+    assert found["slope"] == pytest.approx(3.0 / 0.15)
+    assert found["intercept"] == pytest.approx(2.0 - 20 * 0.05)
