@@ -1,0 +1,147 @@
+"""The monitor's experiment: what it draws, what it reads off its runs, and that its three runs are of one kind."""
+
+import importlib.util
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flexneedle import load_scenario
+from flexneedle.ports import Frame, Reading, Sample
+from flexneedle.trace import Judged
+from synthetic import make_periods, make_plan
+
+_SCRIPT = Path(__file__).parents[1] / "studies" / "monitor.py"
+
+
+@pytest.fixture(scope="module")
+def study():
+    spec = importlib.util.spec_from_file_location("monitor_study", _SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["monitor_study"] = module  # where its dataclasses look for their own names
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["monitor_study"]
+
+
+def told(study, indicator, tip=None, distortion=0.0, held=(), step=0.2):
+    """A run of n periods; `held` lists those that the field holds."""
+    count = len(indicator)
+    time = step * np.arange(1, count + 1)
+    straight = np.column_stack([np.arange(count), np.zeros(count)]).astype(float)
+    tips = straight if tip is None else np.asarray(tip, dtype=float)
+    flags = np.isin(np.arange(count), held)
+    off = np.broadcast_to(np.asarray(distortion, dtype=float), count)
+    return study.Told(time, np.asarray(indicator, dtype=float), tips, straight, off, flags, "done")
+
+
+def test_draws_depend_on_the_number_alone_and_stay_in_their_ranges(study):
+    scenario = load_scenario("phantom")
+    drawn = [study.approach(scenario, number) for number in range(100)]
+    assert drawn[7] == study.approach(scenario, 7)
+    assert len({one.target for one in drawn}) == 15
+    assert all(30.0 <= one.speed <= 400.0 for one in drawn)
+    depths = [one.begins * 5.0 - 28.5 for one in drawn]
+    assert all(-1e-9 <= depth <= one.target[0] - 5.0 for depth, one in zip(depths, drawn, strict=True))
+
+
+def test_the_plate_comes_evenly_and_stops_below_the_needle(study):
+    one = study.Approach(0, (40.0, 0.0), begins=2.0, speed=100.0)
+    assert [one.distance_at(time) for time in (0.0, 2.0, 3.0, 5.7, 99.0)] == [400.0, 400.0, 300.0, 30.0, 30.0]
+
+
+def test_worlds_differ_in_plate_and_monitor_alone(study):
+    bare, plated = study.world(False, True), study.world(True, True)
+    assert bare.tracker.environment.plate is None
+    assert plated.tracker.environment.plate is not None
+    assert plated.tracker.environment.model_copy(update={"plate": None}) == bare.tracker.environment
+    assert not study.world(False, False).monitor.enabled
+
+
+def test_medians_are_those_of_the_worst_reference_over_the_window(study):
+    plan = make_plan()
+    periods = list(make_periods(plan))[:10]
+    values = np.random.default_rng(0).uniform(0.0, 0.1, (10, 4, 2))
+    for k, period in enumerate(periods):
+        readings = [
+            Judged(
+                Sample(
+                    0.2 * k + 0.05 * j,
+                    0.0,
+                    0.0,
+                    0.0,
+                    Frame(
+                        0.0,
+                        0,
+                        {
+                            "tip": Reading((0.0, 0.0, 0.0)),
+                            "ref1": Reading((0.0, 0.0, 0.0), indicator=values[k, j, 0]),
+                            "ref2": Reading((0.0, 0.0, 0.0), indicator=values[k, j, 1]),
+                        },
+                    ),
+                ),
+                "ok",
+            )
+            for j in range(4)
+        ]
+        object.__setattr__(period, "readings", tuple(readings))
+    flat = values.reshape(40, 2)
+    expected = [np.median(flat[max(0, 4 * k + 4 - 20) : 4 * k + 4], axis=0).max() for k in range(10)]
+    np.testing.assert_allclose(study.medians(periods, 1.0), expected)
+
+
+def test_a_hold_is_timed_from_the_start_and_from_the_distortion(study):
+    drawn = study.Approach(0, (40.0, 0.0), begins=0.5, speed=100.0)
+    clean = told(study, [0.0] * 10)
+    off = [[k, 0.0 if k < 6 else 0.3] for k in range(10)]
+    run = told(study, [0.0] * 10, off, distortion=[0.0] * 4 + [0.6] * 6, held=(6, 7))
+    hold = study.hold_of(drawn, clean, run)
+    assert hold.after_begin == pytest.approx(1.4 - 0.5)
+    assert hold.after_distortion == pytest.approx(1.4 - 1.0)
+    assert (hold.moved, hold.unknown) == (pytest.approx(0.3), pytest.approx(0.3))
+    assert study.hold_of(drawn, clean, told(study, [0.0] * 10)) is None
+    never = study.hold_of(drawn, clean, told(study, [0.0] * 10, held=(3,)))
+    assert math.isnan(never.after_distortion)
+
+
+def test_where_one_run_is_shorter_its_last_place_counts(study):
+    short, long = told(study, [0.0] * 3), told(study, [0.0] * 8)
+    assert study.apart(long, short, 7) == pytest.approx(5.0)
+
+
+def test_the_curve_counts_false_and_missed_holds(study):
+    """Three clean runs; of four with a plate one is never distorted, one too late, one is seen in time, one is not."""
+    clean = [told(study, [level] * 20) for level in (0.01, 0.03, 0.05)]
+    late = [0.0] * 17 + [2.0] * 3
+    early = [0.0] * 5 + [2.0] * 15
+    free = [
+        told(study, [0.01] * 20),
+        told(study, [0.01] * 20, distortion=late),
+        told(study, [0.01] * 8 + [0.2] * 12, distortion=early),
+        told(study, [0.01] * 11 + [0.2] * 9, distortion=early),
+    ]
+    runs = study.Runs([], clean, free, [], np.array([0.02, 0.06]))
+    false, anywhere, missed = study.curve(runs)
+    at = [int(np.argmin(np.abs(study.THRESHOLDS - limit))) for limit in (0.02, 0.04, 0.1, 0.5)]
+    np.testing.assert_allclose(false[at], [2 / 3, 1 / 3, 0.0, 0.0])
+    np.testing.assert_allclose(anywhere[at[1:]], [0.5, 0.0, 0.0])
+    np.testing.assert_allclose(missed[at], [0.5, 0.5, 0.5, 1.0])
+
+
+def test_a_run_is_carried_out_and_a_plate_is_what_holds_it(study):
+    drawn = study.Approach(300_001, (25.0, 0.0), begins=4.0, speed=200.0)
+    clean, kept = study.carried_out(drawn, False, True), study.carried_out(drawn, True, True)
+    assert not clean.held.any()
+    assert not clean.distortion.any()
+    assert kept.distortion.max() > 1.0
+    hold = study.hold_of(drawn, clean, kept)
+    assert 0.0 < hold.after_begin < 4.0
+    assert hold.moved < 1.0
+
+
+def test_references_that_nobody_placed_tell_more(study):
+    levels = [study.unchosen(number) for number in range(12)]
+    assert max(levels) > 0.041
+    assert min(levels) > 0.0
