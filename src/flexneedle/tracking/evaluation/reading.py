@@ -88,7 +88,13 @@ def _parquet(path: Path, choose: _Choose) -> tuple[dict[str, str], Iterator[Any]
     chosen = choose(list(schema.names))
     texts = [their for our, their in chosen.items() if our in LABELS and _is_text(schema.field(their).type)]
     file = parquet.ParquetFile(path, read_dictionary=texts)
-    return chosen, file.iter_batches(_ROWS, columns=list(chosen.values()))
+    return chosen, _row_groups(file, list(chosen.values()))
+
+
+def _row_groups(file: Any, columns: list[str]) -> Iterator[Any]:
+    """Yield batches of one row group after the other: read in one go, Arrow keeps what it read of the whole file."""
+    for number in range(file.num_row_groups):
+        yield from file.iter_batches(_ROWS, row_groups=[number], columns=columns)
 
 
 def _is_text(kind: Any) -> bool:

@@ -1,0 +1,107 @@
+"""Time and memory of `flexneedle em evaluate`: python benchmarks/em.py [--rows N] [--times N] [--json].
+
+Makes a table of N shuffled rows (10 million; 125 grid points, two sensors, two environments; all digits) as CSV and as
+Parquet in a temporary folder (1.5 GB), runs the command on each in a process of its own, figures included, and prints
+wall-clock time, processor time and the largest resident memory. No thresholds; other work on the machine adds to the
+wall clock.
+"""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as csv
+import pyarrow.parquet as parquet
+
+ROWS, PART = 10_000_000, 1_000_000
+GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def parts(rows: int, rng: np.random.Generator) -> Iterator[pa.Table]:
+    """Yield tables of a million rows in random order, a metre from the origin."""
+    bias = rng.normal(0.0, 0.35, (2, 2, *GRID.shape))
+    for start in range(0, rows, PART):
+        count = min(PART, rows - start)
+        point, sensor, noisy = (rng.integers(0, n, count) for n in (len(GRID), 2, 2))
+        measured = GRID[point] + 1000.0 + bias[sensor, noisy, point] + rng.normal(0.0, 0.04, (count, 3))
+        yield pa.table(
+            {
+                "point_id": point,
+                **{f"true_{axis}_mm": GRID[point, k] + 1000.0 for k, axis in enumerate("xyz")},
+                **{f"{axis}_mm": measured[:, k] for k, axis in enumerate("xyz")},
+                "indicator": rng.gamma(3.0, 0.008 + 0.06 * noisy),
+                "sensor": np.array(["tip", "reference"])[sensor],
+                "environment": np.array(["ideal", "noisy"])[noisy],
+            }
+        )
+
+
+def write(folder: Path, rows: int) -> list[Path]:
+    """Write the table twice and return the paths."""
+    paths = [folder / "table.csv", folder / "table.parquet"]
+    writers = None
+    for part in parts(rows, np.random.default_rng(0)):
+        if writers is None:
+            writers = csv.CSVWriter(paths[0], part.schema), parquet.ParquetWriter(paths[1], part.schema)
+        for writer in writers:
+            writer.write_table(part)
+    for writer in writers or ():
+        writer.close()
+    return paths
+
+
+def measure(path: Path, out: Path) -> dict[str, float | str]:
+    """Run the command on a table and return its time and memory."""
+    command = [sys.executable, "-m", "flexneedle", "em", "evaluate", str(path), "--out", str(out), "--json"]
+    begun = time.perf_counter()
+    silent = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+    child = os.posix_spawn(sys.executable, command, os.environ, file_actions=silent)
+    _, status, used = os.wait4(child, 0)
+    if status:
+        raise RuntimeError(f"{' '.join(command)}: status {os.waitstatus_to_exitcode(status)}")
+    return {
+        "table": path.name,
+        "mb": path.stat().st_size / 1e6,
+        "seconds": time.perf_counter() - begun,
+        "processor_seconds": used.ru_utime + used.ru_stime,
+        "memory_mb": used.ru_maxrss / 1e3,
+    }
+
+
+def main() -> None:
+    """Print a line for each run."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rows", type=int, default=ROWS)
+    parser.add_argument("--times", type=int, default=2, help="runs of each (2)")
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with ProcessPoolExecutor(
+            1, get_context("spawn")
+        ) as apart:  # a child's memory counts its parent's at birth
+            paths = apart.submit(write, folder, args.rows).result()
+        found = [measure(path, folder / f"{path.name}-{k}") for k in range(args.times) for path in paths]
+    if args.json:
+        print(json.dumps({"rows": args.rows, "runs": found}))
+        return
+    for run in found:
+        line = (
+            "{table:14} {mb:6.0f} MB  {seconds:5.1f} s  {processor_seconds:5.1f} s CPU  {memory_mb:4.0f} MB"
+        )
+        print(line.format(**run))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""`flexneedle em watch`: what a tracker says now, and whether to trust it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from contextlib import ExitStack
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rich.table import Table
+
+    from flexneedle.ports import Reading
+    from flexneedle.run.em.watch import View
+
+__all__ = ["add_parser"]
+
+_LINE_EVERY_S = 1.0
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser of `flexneedle em`."""
+    parser = subparsers.add_parser(
+        "watch",
+        help="show live values and verdicts of a tracker",
+        description="A live table in a terminal, a line a second elsewhere, until Ctrl-C or the end of a replay.",
+    )
+    parser.add_argument(
+        "--tracker", required=True, metavar="SPEC", help="such as aurora:/dev/ttyUSB0 or replay:FILE@2"
+    )
+    parser.add_argument("--record", type=Path, metavar="FILE", help="keep all frames in a new CSV")
+    parser.add_argument("--seconds", type=float, default=inf, metavar="S", help="stop after so long")
+    parser.add_argument("--json", action="store_true", help="print one JSON object a frame, a line each")
+    parser.set_defaults(handler=_watch)
+
+
+def _watch(args: argparse.Namespace) -> int:
+    from flexneedle.devices.clock import WallClock
+    from flexneedle.run.em.trackers import open_tracker
+    from flexneedle.run.em.watch import watch
+
+    clock = WallClock()
+    try:
+        with ExitStack() as stack:
+            tracker = stack.enter_context(open_tracker(args.tracker, clock))
+            watch(tracker, clock, _shower(stack, args.json), args.seconds, record=args.record)
+    except KeyboardInterrupt:
+        print(file=sys.stderr)  # it is how a watch ends
+    return 0
+
+
+def _shower(stack: ExitStack, as_json: bool) -> Callable[[View], None]:
+    """Return what shows a view: JSON, a live table, or a line now and then."""
+    if as_json:
+        return _print_json
+    return _live_table(stack) if sys.stdout.isatty() else _line_printer()
+
+
+def _print_json(view: View) -> None:
+    told: dict[str, Any] = {"time_s": view.time, "frame_number": None, "status": view.status}
+    told |= {"verdict": view.verdict, "sensors": {}}
+    if view.frame is not None and view.is_new:
+        told |= {"time_s": view.frame.time, "frame_number": view.frame.number}
+        told["sensors"] = {name: _values(reading) for name, reading in view.frame.readings.items()}
+    print(json.dumps(told, allow_nan=False), flush=True)
+
+
+def _values(reading: Reading) -> dict[str, Any]:
+    return {
+        "position_mm": reading.position,
+        "quaternion": reading.orientation,
+        "indicator": reading.indicator,
+        "status": reading.status,
+    }
+
+
+def _line_printer() -> Callable[[View], None]:
+    due = -inf
+
+    def show(view: View) -> None:
+        nonlocal due
+        if view.time >= due:
+            due = view.time + _LINE_EVERY_S
+            print(_line(view), flush=True)
+
+    return show
+
+
+def _line(view: View) -> str:
+    if view.frame is None or not view.is_new:
+        return f"{view.time:8.2f} s  {view.verdict}"
+    sensors = "  ".join(f"{name} {_cell(reading)}" for name, reading in view.frame.readings.items())
+    return f"{view.time:8.2f} s  frame {view.frame.number}  {sensors}  verdict: {view.verdict}"
+
+
+def _cell(reading: Reading) -> str:
+    if reading.position is None:
+        return reading.status
+    x, y, z = reading.position
+    told = "" if reading.indicator is None else f" I {reading.indicator:.4f}"
+    return f"{x:.2f} {y:.2f} {z:.2f} mm{told}"
+
+
+def _live_table(stack: ExitStack) -> Callable[[View], None]:
+    from rich.live import Live
+
+    live = stack.enter_context(Live(auto_refresh=True, refresh_per_second=10))
+    return lambda view: live.update(_table(view))
+
+
+def _table(view: View) -> Table:
+    from rich.table import Table
+    from rich.text import Text
+
+    number = "none yet" if view.frame is None else str(view.frame.number)
+    table = Table(title=f"{view.time:.1f} s, frame {number}", caption=Text(f"verdict: {view.verdict}"))
+    for head in ("sensor", "x mm", "y mm", "z mm", "indicator", "status"):
+        table.add_column(head, justify="left" if head in ("sensor", "status") else "right")
+    for name, reading in view.frame.readings.items() if view.frame is not None and view.is_new else ():
+        place = (
+            ("", "", "") if reading.position is None else tuple(f"{part:.2f}" for part in reading.position)
+        )
+        told = "" if reading.indicator is None else f"{reading.indicator:.4f}"
+        table.add_row(*map(Text, (name, *place, told, reading.status)))
+    return table

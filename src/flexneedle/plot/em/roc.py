@@ -1,0 +1,97 @@
+"""What a threshold of the indicator tells apart: detected distortion over false alarms, and both over the threshold."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+from numpy.typing import NDArray
+
+from flexneedle.plot.studies.layout import look
+from flexneedle.plot.style import QUIET, WIDTH, axes, new_figure, styled
+
+__all__ = ["RocLine", "roc_figure"]
+
+_SIDE, _LEFT, _RIGHT, _GAP, _TOP, _FOOT = 3.4, 0.75, 0.2, 0.85, 0.3, 0.5  # inches
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RocLine:
+    """A sensor: shares (k,) of grid points above each threshold in the ideal and noisy environment, and their values.
+
+    chosen: these shares (false alarms, detected) at the threshold in use, told in words by `note`.
+    """
+
+    sensor: str
+    false_alarms: Floats
+    detected: Floats
+    values: tuple[Floats, Floats]
+    threshold: float
+    chosen: tuple[float, float]
+    note: str
+
+
+def roc_figure(lines: Sequence[RocLine]) -> Figure:
+    """Return the figure: the ROC of each sensor, and beside it the shares above each threshold."""
+    with styled():
+        figure = new_figure(_TOP + _SIDE + _FOOT)
+        _draw_roc(axes(figure, _LEFT, _TOP, _SIDE, _SIDE), lines)
+        left = _LEFT + _SIDE + _GAP
+        _draw_shares(axes(figure, left, _TOP, WIDTH - left - _RIGHT, _SIDE), lines)
+    return figure
+
+
+def _draw_roc(ax: Axes, lines: Sequence[RocLine]) -> None:
+    ax.plot([0, 1], [0, 1], color=QUIET, linewidth=0.8, linestyle=(0, (1, 2)), zorder=1)
+    for number, line in enumerate(lines):
+        own = look(number)
+        ax.plot(
+            line.false_alarms,
+            line.detected,
+            color=own.color,
+            linestyle=_dashes(number),
+            zorder=3,
+            clip_on=False,
+        )
+        mark: dict[str, Any] = {
+            "color": own.color,
+            "markersize": 7,
+            "markeredgecolor": "white",
+            "clip_on": False,
+        }
+        ax.plot(*line.chosen, own.marker, label=f"{line.sensor}: {line.note}", zorder=4, **mark)
+    _share_axis(ax, "y", "detected: noisy grid points above")
+    _share_axis(ax, "x", "false alarms: ideal grid points above")
+    ax.set_title("Each threshold of the indicator")
+    ax.legend(loc="lower right", handletextpad=0.6, fontsize=7.5)
+
+
+def _draw_shares(ax: Axes, lines: Sequence[RocLine]) -> None:
+    for number, line in enumerate(lines):
+        color = look(number).color
+        for values, style, name in zip(line.values, ((0, (1, 1)), "-"), ("ideal", "noisy"), strict=True):
+            above = 1.0 - np.arange(len(values) + 1) / len(values)
+            ends = np.concatenate([[0.0], np.sort(values)])
+            label = f"{line.sensor}, {name}"
+            ax.step(ends, above, where="post", color=color, linestyle=style, label=label, zorder=3)
+        ax.axvline(line.threshold, color=color, linewidth=0.9, linestyle=(0, (4, 2)), zorder=1)
+    ax.set_xlim(left=0.0)
+    ax.set_xlabel("threshold of the indicator (dashed: in use)")
+    _share_axis(ax, "y", "grid points above")
+    ax.set_title("Above the threshold")
+    ax.legend(loc="upper right")
+
+
+def _share_axis(ax: Axes, name: str, label: str) -> None:
+    getattr(ax, f"set_{name}lim")(0.0, 1.0)
+    getattr(ax, f"set_{name}label")(label)
+    getattr(ax, f"{name}axis").set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+
+
+def _dashes(number: int) -> Any:
+    return (0, (6, 1.5 * number)) if number else "-"

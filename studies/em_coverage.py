@@ -1,0 +1,192 @@
+"""How often the 95 % intervals of `flexneedle em evaluate` cover what was planted, over random data sets.
+
+    python studies/em_coverage.py [--sets N] [--seed N]
+
+Each data set is a table of 125 grid points × 20 samples of a reference sensor in two environments, with planted bias,
+jitter, threshold, slope and intercept drawn at random, and goes through the same code as a user's table. Beside it the
+same with a smooth bias field, which breaks what the intervals assume: that grid points are independent draws. About two
+minutes on one core. Prints a table: coverage, and the median of the estimate over what was planted.
+"""
+
+import argparse
+import sys
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pyarrow as pa
+from scipy import stats
+
+from flexneedle.tracking.evaluation.accuracy import accuracy
+from flexneedle.tracking.evaluation.cells import collect
+from flexneedle.tracking.evaluation.reading import Batch
+from flexneedle.tracking.evaluation.separation import separation
+
+GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+POINTS, SAMPLES = len(GRID), 20
+SMOOTH_MM = 40.0
+ELSEWHERE = np.random.default_rng(1).uniform(0.0, 100.0, (1000, 3))
+
+
+@dataclass(frozen=True)
+class Planted:
+    """What a data set is drawn from: mean bias and sd of an axis (mm), jitter (mm), indicator, line."""
+
+    bias: float
+    spread: float
+    jitter: float
+    shape: float
+    level: float
+    slope: float
+    intercept: float
+    scatter: float
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> "Planted":
+        """Values around the paper's."""
+        return cls(
+            *(
+                float(rng.uniform(*ends))
+                for ends in ((0.0, 0.5), (0.2, 0.5), (0.03, 0.1), (2.0, 5.0), (0.015, 0.03))
+            ),
+            *(float(rng.uniform(*ends)) for ends in ((5.0, 12.0), (0.0, 0.3), (0.5, 1.6))),
+        )
+
+    def values(self) -> dict[str, float]:
+        """The truth of each estimate: of errors by the noncentral χ distribution, three degrees of freedom."""
+        axis = np.sqrt(self.spread**2 + self.jitter**2 / 3 / SAMPLES)
+        law = stats.ncx2(3, self.bias**2 / axis**2)
+        errors = axis * np.sqrt(law.ppf((np.arange(20000) + 0.5) / 20000))
+        return {
+            "rmse": float(np.sqrt(self.bias**2 + 3 * axis**2)),
+            "p95": float(axis * np.sqrt(law.ppf(0.95))),
+            "mean": float(errors.mean()),
+            "sd": float(errors.std()),
+            "jitter": self.jitter * np.sqrt(1 - 1 / SAMPLES),  # the paper divides by N M, not N (M − 1)
+            "threshold": float(stats.gamma.ppf(0.95, self.shape, scale=self.level / self.shape)),
+            "slope": self.slope,
+            "intercept": self.intercept,
+        }
+
+
+@cache
+def smoothness() -> np.ndarray:
+    """Cholesky factor of the covariance of a smooth unit field at the grid points and at ELSEWHERE."""
+    places = np.concatenate([GRID, ELSEWHERE])
+    apart = ((places[:, None] - places[None]) ** 2).sum(axis=2)
+    return np.linalg.cholesky(np.exp(-apart / (2 * SMOOTH_MM**2)) + 1e-6 * np.eye(len(places)))
+
+
+def field(rng: np.random.Generator, smooth: bool) -> np.ndarray:
+    """Unit normal errors (k, 3) at the grid points and ELSEWHERE: independent, or alike within SMOOTH_MM."""
+    drawn = rng.normal(size=(POINTS + len(ELSEWHERE), 3))
+    return smoothness() @ drawn if smooth else drawn
+
+
+def throughout(error: np.ndarray) -> dict[str, float]:
+    """What this field's errors (k, 3) come to in the whole volume."""
+    length = np.linalg.norm(error, axis=1)
+    return {
+        "rmse": float(np.sqrt((length**2).mean())),
+        "p95": float(np.quantile(length, 0.95)),
+        "mean": float(length.mean()),
+        "sd": float(length.std()),
+    }
+
+
+def batch(
+    rng: np.random.Generator, planted: Planted, environment: str, error: np.ndarray, level: np.ndarray
+) -> Batch:
+    """Rows with errors (n, 3) and mean indicators (n,) of the grid points, and the planted jitter."""
+    place = np.repeat(np.arange(POINTS), SAMPLES)
+    noise = rng.normal(0.0, planted.jitter / np.sqrt(3), (len(place), 3))
+    measured = (GRID + error)[place] + noise
+    own = {"sensor": "reference", "environment": environment}
+    names = {"point_id": place.astype(str), **{name: [value] * len(place) for name, value in own.items()}}
+    labels = {name: pa.array(values).dictionary_encode() for name, values in names.items()}
+    numbers = {f"true_{axis}_mm": GRID[place, k].copy() for k, axis in enumerate("xyz")}
+    numbers |= {f"{axis}_mm": measured[:, k].copy() for k, axis in enumerate("xyz")}
+    return Batch(len(place), labels, {**numbers, "indicator": level[place]})
+
+
+def batches(rng: np.random.Generator, planted: Planted, smooth: bool) -> tuple[list[Batch], dict[str, float]]:
+    """Both environments of a data set, and what the errors in `ideal` come to in the whole volume."""
+    towards = rng.normal(size=3)
+    error = planted.bias * towards / np.linalg.norm(towards) + planted.spread * field(rng, smooth)
+    ideal = rng.gamma(planted.shape, planted.level / planted.shape, POINTS)
+    noisy = rng.uniform(0.2, 0.6, POINTS)
+    scatter = (
+        np.clip(rng.normal(size=POINTS), -2.5, 2.5) * planted.scatter * noisy
+    )  # grows with the indicator
+    length = planted.slope * noisy + planted.intercept + np.maximum(scatter, -planted.slope * noisy)
+    along = rng.normal(size=(POINTS, 3))
+    along *= (length / np.linalg.norm(along, axis=1))[:, None]
+    both = batch(rng, planted, "ideal", error[:POINTS], ideal), batch(rng, planted, "noisy", along, noisy)
+    return list(both), throughout(error[POINTS:])
+
+
+def judged(tables: list[Batch]) -> dict[str, tuple[float, tuple[float, float]]]:
+    """Estimate and interval of everything that was planted."""
+    ideal, noisy = collect(tables, bin_mm=50.0)[0]
+    found, said = accuracy(ideal), separation("reference", ideal, noisy)
+    parts = ((found, ("rmse", "p95", "mean", "sd", "jitter")), (said.noisy, ("slope", "intercept")))
+    return {
+        **{
+            name: (getattr(part, f"{name}_mm"), part.intervals[f"{name}_mm"])
+            for part, names in parts
+            for name in names
+        },
+        "threshold": (said.threshold, said.threshold_interval),
+    }
+
+
+def study(
+    sets: int, seed: int, smooth: bool
+) -> list[tuple[dict[str, float], dict[str, tuple], dict[str, float]]]:
+    """What was planted, what was found, and what holds in the whole volume, for each data set."""
+    done = []
+    for own in np.random.SeedSequence(seed).spawn(sets):
+        rng = np.random.default_rng(own)
+        planted = Planted.draw(rng)
+        tables, volume = batches(rng, planted, smooth)
+        done.append((planted.values(), judged(tables), volume))
+    return done
+
+
+def coverage(done: list, name: str, truth: int) -> str:
+    """Share of the intervals that cover the truth: what was planted (0), or what holds in the volume (2)."""
+    if name not in done[0][truth]:
+        return ""
+    held = [
+        found[name][1][0] <= own[name] <= found[name][1][1] for own, found in ((d[truth], d[1]) for d in done)
+    ]
+    return f"{np.mean(held):.3f}"
+
+
+def main() -> int:
+    """Print the table; status 1 if an interval of independent points covers less than 90 %."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--sets", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    plain, smooth = (study(args.sets, args.seed, smooth) for smooth in (False, True))
+    heads = (
+        "coverage",
+        "median of estimate / planted",
+        "smooth field: any such field",
+        "smooth field: this one's volume",
+    )
+    print(f"| {args.sets} data sets | {' | '.join(heads)} |\n|---|---:|---:|---:|---:|")
+    shares = []
+    for name in plain[0][0]:
+        ratio = np.median([found[name][0] / planted[name] for planted, found, _ in plain])
+        shares.append(coverage(plain, name, 0))
+        row = shares[-1], f"{ratio:.3f}", coverage(smooth, name, 0), coverage(smooth, name, 2)
+        print(f"| {name} | {' | '.join(row)} |")
+    return int(min(map(float, shares)) < 0.9)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,115 @@
+"""Figures of an evaluation hold what they must: judged by their artists, not by their pixels."""
+
+import numpy as np
+import pytest
+from matplotlib.collections import PathCollection
+from matplotlib.quiver import Quiver
+from matplotlib.text import Text
+from numpy.testing import assert_allclose
+
+from flexneedle.plot import em as plots
+
+GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def words(figure):
+    return "\n".join(text.get_text() for text in figure.findobj(Text))
+
+
+def field_row(true=GRID, error=0.5, title="tip, ideal"):
+    return plots.FieldRow(title, true, np.random.default_rng(0).normal(0.0, error, true.shape))
+
+
+def arrows(figure):
+    return [[one for one in ax.collections if isinstance(one, Quiver)] for ax in figure.axes]
+
+
+def test_each_height_is_a_slice_and_each_grid_point_an_arrow_along_its_error():
+    row = field_row()
+    figure = plots.field_figure([row])
+    drawn = [one[0] for one in arrows(figure) if one]
+    assert [len(one.U) for one in drawn] == [25] * 5
+    chosen = GRID[:, 2] == 25.0
+    factor = (drawn[1].U / row.error[chosen, 0])[0]
+    assert_allclose(np.stack([drawn[1].U, drawn[1].V], axis=1), factor * row.error[chosen, :2])
+    assert f"arrows {round(factor)} times as long" in words(figure)
+    assert_allclose(drawn[1].get_array(), np.linalg.norm(row.error[chosen], axis=1))
+    assert "z = 25 mm" in words(figure)
+
+
+def test_a_cloud_of_points_is_cut_into_five_slabs_that_hold_them_all():
+    true = np.random.default_rng(1).uniform(-50, 50, (300, 3))
+    drawn = [one[0] for one in arrows(plots.field_figure([field_row(true)])) if one]
+    assert len(drawn) == 5
+    assert sum(len(one.U) for one in drawn) == 300
+
+
+@pytest.mark.parametrize("true", [GRID[:1], GRID[:2], GRID[GRID[:, 2] == 0.0]])
+def test_a_plane_a_pair_and_a_single_point_can_be_drawn(true):
+    figure = plots.field_figure([field_row(true), field_row(true, error=0.0)])
+    assert sum(len(one[0].U) for one in arrows(figure) if one) == 2 * len(true)
+
+
+def test_more_sensors_than_there_is_room_for_are_counted():
+    figure = plots.field_figure([field_row(title=f"coil {k}") for k in range(8)])
+    assert "2 more not shown" in words(figure)
+    assert "coil 5" in words(figure)
+    assert "coil 6" not in words(figure)
+
+
+def panel(**changes):
+    ideal = plots.Shown("ideal", np.linspace(0.01, 0.06, 20), np.full(20, 0.5), "0.500 ± 0.100 mm")
+    noisy = plots.Shown("noisy", np.linspace(0.1, 0.5, 40), np.linspace(1.0, 5.0, 40), "10.000 I + 0.000 mm")
+    values = {
+        "ideal": ideal,
+        "noisy": noisy,
+        "constant": (0.5, 0.1),
+        "line": (10.0, 0.0),
+        "threshold": 0.055,
+    }
+    return plots.IndicatorPanel("reference", **{**values, **changes})
+
+
+def test_indicators_beyond_three_tenths_are_not_shown_but_counted():
+    figure = plots.indicator_figure([panel()])
+    (ax,) = figure.axes
+    assert ax.get_xlim() == (0.0, 0.3)
+    shown = [one.get_offsets() for one in ax.collections if isinstance(one, PathCollection)]
+    assert [len(one) for one in shown] == [20, 20]
+    assert "(20 points beyond I = 0.3 not shown)" in words(figure)
+    assert "threshold 0.0550" in words(figure)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"noisy": None, "line": None},
+        {"ideal": None, "constant": None, "threshold": None},
+        {"line": (np.nan, np.nan)},
+        {"constant": (0.5, np.nan)},
+    ],
+)
+def test_an_environment_or_a_fit_may_be_lacking(changes):
+    assert "reference" in words(plots.indicator_figure([panel(**changes), panel()]))
+
+
+def test_the_limit_and_the_verdict_stand_beside_the_rmse_by_distance():
+    far, rmse = np.array([500.0, 600.0, 700.0]), np.array([1.2, 0.8, 0.5])
+    lines = [plots.DistanceLine("tip, ideal", far, rmse, 0.7, "within 0.7 mm from 700 mm")]
+    figure = plots.distance_figure(
+        [*lines, plots.DistanceLine("coil, ideal", far, 2 * rmse, None, "no limit")]
+    )
+    assert "limit 0.7" in words(figure)
+    assert "within 0.7 mm from 700 mm" in words(figure)
+    assert_allclose(figure.axes[0].lines[0].get_xydata(), np.stack([far, rmse], axis=1))
+
+
+def test_the_roc_marks_the_threshold_in_use():
+    curve = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.9, 1.0])
+    values = np.linspace(0.01, 0.06, 20), np.linspace(0.05, 0.4, 20)
+    figure = plots.roc_figure(
+        [plots.RocLine("reference", *curve, values, 0.055, (0.05, 0.95), "area 0.9500")]
+    )
+    marked = [line.get_xydata()[0] for line in figure.axes[0].lines if len(line.get_xydata()) == 1]
+    assert_allclose(marked, [(0.05, 0.95)])
+    assert "area 0.9500" in words(figure)
