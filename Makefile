@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow bench robustness validation accuracy controllers studies tuning lint clean
+.PHONY: help setup demo test slow bench robustness validation accuracy controllers studies tracker tuning lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -34,8 +34,10 @@ demo: setup  ## plan and steer one insertion on the phantom
 test: setup  ## run the tests
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
-bench: setup  ## measure speed
+bench: setup  ## measure speed: mechanics, ten million rows of tracker data, 60 s of an emulated tracker
 	$(BIN)/python benchmarks/bench.py
+	$(BIN)/python benchmarks/em.py
+	$(BIN)/python benchmarks/aurora.py
 
 robustness: setup  ## 100,000 random insertions without a failure (long)
 	$(BIN)/python studies/robustness.py
@@ -57,6 +59,13 @@ studies: setup  ## 15,000 insertions with other plants, guides and needles, and 
 	  $(BIN)/flexneedle report runs/$$study || exit 1; \
 	done
 	$(BIN)/python studies/worst.py runs/mismatch-doubled --out docs/images
+
+tracker: setup  ## the simulated tracker beside the paper's tables, its estimators, its monitor, and insertions with it (long)
+	$(BIN)/python studies/environments.py
+	$(BIN)/python studies/em_coverage.py
+	$(BIN)/flexneedle study tracker --resume --out runs/tracker
+	$(BIN)/flexneedle report runs/tracker
+	$(BIN)/python studies/monitor.py
 
 tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedle/run/tuning (long)
 	for method in adaptive-mpc ce-mpc bevel-only resolved-rate broyden-mpc; do \

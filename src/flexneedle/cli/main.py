@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 from flexneedle import __version__
 from flexneedle.errors import FlexneedleError, InputError
 
-from . import em, export, insert, plan, report, scenario, study, view
+from . import em, emulate, export, insert, plan, report, scenario, study, view
 
 __all__ = ["build_parser", "main"]
 
-_COMMANDS = (plan, insert, study, report, view, export, scenario, em)
+_COMMANDS = (plan, insert, study, report, view, export, scenario, em, emulate)
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -1,0 +1,78 @@
+"""Read an emulated Aurora for a minute: python benchmarks/aurora.py [--seconds S] [--json].
+
+Frames that came and frames that were lost at 40 Hz, how long `read()` held the caller up, and how far the times of
+the frames are from an even line; then the same caller with a tracker that falls silent. Exit status 1 if a frame
+was lost.
+"""
+
+import argparse
+import json
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+from time import perf_counter
+
+import numpy as np
+
+from flexneedle.devices.aurora import Aurora
+from flexneedle.devices.clock import WallClock
+
+PERIOD_S = 0.02  # of the caller's loop
+
+
+def main() -> int:
+    """Run both measurements and print them."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    sound = measure(args.seconds)
+    silent = measure(6.0, "--fault", "silence@1:3")
+    if args.json:
+        print(json.dumps({"sound": sound, "silent from 1 to 4 s": silent}))
+    else:
+        for title, result in (("sound line", sound), ("silent from 1 to 4 s", silent)):
+            print(title, *(f"  {name}: {value}" for name, value in result.items()), sep="\n")
+    return 1 if sound["frames lost"] else 0
+
+
+def measure(seconds: float, *arguments: str) -> dict[str, float]:
+    """Read for so long; return what came and what it cost the caller."""
+    frames, waits = [], []
+    with emulated(*arguments) as path, Aurora(path, clock := WallClock()) as aurora:
+        start = clock.now()
+        while clock.now() - start < seconds:
+            begun = perf_counter()
+            frames += aurora.read()
+            waits.append(perf_counter() - begun)
+            clock.wait(PERIOD_S)
+        counts = aurora.counts
+    numbers = np.array([frame.number for frame in frames])
+    times = np.array([frame.time for frame in frames])
+    start_times = times - numbers / 40
+    return {
+        "frames": counts.frames,
+        "frames lost": counts.missed,
+        "connections made again": counts.reconnections,
+        "longest read(), ms": round(1e3 * max(waits), 3),
+        "times off an even line, largest, ms": round(
+            1e3 * float(np.abs(start_times - np.median(start_times)).max()), 3
+        ),
+    }
+
+
+@contextmanager
+def emulated(*arguments: str):
+    """Run the emulator; give its path."""
+    command = [sys.executable, "-m", "flexneedle", "emulate", "aurora", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        yield process.stdout.readline().strip()
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,62 @@
+"""`flexneedle emulate`: a device on a pseudo-terminal, to try and test without the real one."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from pathlib import Path
+
+from .common import seed
+
+__all__ = ["add_parser"]
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser of `flexneedle`."""
+    parser = subparsers.add_parser("emulate", help="emulate a device, to try without hardware")
+    devices = parser.add_subparsers(title="devices", metavar="DEVICE", required=True)
+    aurora = devices.add_parser(
+        "aurora",
+        help="an NDI Aurora on a pseudo-terminal",
+        description="Print the path of the emulated device and answer there until interrupted (Ctrl-C).",
+    )
+    aurora.add_argument(
+        "--link", type=Path, metavar="PATH", help="path of the device (one in a new folder under /tmp)"
+    )
+    aurora.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="KIND[=DETAIL]@SECONDS[:DURATION]",
+        help="what goes wrong, in seconds since tracking began; may be given again. See docs/tracking/aurora.md",
+    )
+    aurora.add_argument("--sensors", type=int, choices=range(1, 5), default=4, help="sensors plugged in (4)")
+    aurora.add_argument("--firmware", metavar="TEXT", help="freeze tag that it shows in VER (AURORA Rev 008)")
+    aurora.add_argument("--no-bx", action="store_true", help="know no binary readings, as old firmware")
+    aurora.add_argument("--seed", type=seed, default=0, metavar="N", help="of jitter and garbled bytes (0)")
+    aurora.set_defaults(handler=_emulate_aurora)
+
+
+def _emulate_aurora(args: argparse.Namespace) -> int:
+    from time import monotonic
+
+    from flexneedle.devices.emulator.aurora import FIRMWARE, fresh
+    from flexneedle.devices.emulator.faults import parse_fault
+    from flexneedle.devices.emulator.server import Serial, Session, serve
+    from flexneedle.devices.priority import come_first
+
+    faults = [parse_fault(spec) for spec in args.fault]
+    device = fresh(args.sensors, args.firmware or FIRMWARE, knows_bx=not args.no_bx)
+    with Serial(args.link) as serial:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the link goes then, too
+        come_first()  # a real one does not wait for this machine's other work
+        try:
+            print(serial.link, flush=True)
+            serve(Session(device, faults, args.seed, monotonic()), serial, _say)
+        except KeyboardInterrupt:
+            return 0
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

@@ -1,0 +1,119 @@
+"""The functions of ndicapi's C library that the link needs, by ctypes.
+
+Not through ndicapi's own Python module: it makes a str of each reply, so that a sound binary reply about three
+sensors or more raises UnicodeDecodeError, and one with a wrong checksum ends the process (ndicapi 3.7.6).
+docs/decisions has the measurements.
+"""
+
+import ctypes
+import re
+from importlib.util import find_spec
+
+from flexneedle.errors import InputError
+
+__all__ = ["INSTALL", "TIMEOUT", "Device", "library_path"]
+
+TIMEOUT, CHECKSUM, LOST = 0x103, 0x100, (0x104, 0x105)
+"""Codes of ndicapi: no reply in time, a wrong checksum, the line gave way in writing or reading."""
+INSTALL = "reading an Aurora needs ndicapi: pip install 'flexneedle[aurora]'"
+
+_CHARS, _INT, _POINTER = ctypes.c_char_p, ctypes.c_int, ctypes.c_void_p
+_LOCATION, _POSE = 14, 8
+_ERROR = re.compile(rb"ERROR([0-9A-F]{2})")
+_FUNCTIONS = {
+    "ndiOpenSerial": (_POINTER, _CHARS),
+    "ndiCloseSerial": (None, _POINTER),
+    "ndiGetDeviceHandle": (_INT, _POINTER),
+    "ndiSerialTimeout": (_INT, _INT, _INT),
+    "ndiSerialComm": (_INT, _INT, _INT, _CHARS, _INT),
+    "ndiCommand": (_CHARS, _POINTER, _CHARS),
+    "ndiGetError": (_INT, _POINTER),
+    "ndiErrorString": (_CHARS, _INT),
+    "ndiGetPHSRNumberOfHandles": (_INT, _POINTER),
+    "ndiGetPHSRHandle": (_INT, _POINTER, _INT),
+    "ndiGetPHINFPortLocation": (_INT, _POINTER, _CHARS),
+    "ndiGetBXTransform": (_INT, _POINTER, _INT, ctypes.POINTER(ctypes.c_float)),
+    "ndiGetBXPortStatus": (_INT, _POINTER, _INT),
+    "ndiGetBXFrame": (ctypes.c_ulong, _POINTER, _INT),
+    "ndiGetTXTransform": (_INT, _POINTER, _INT, ctypes.POINTER(ctypes.c_double)),
+    "ndiGetTXPortStatus": (_INT, _POINTER, _INT),
+    "ndiGetTXFrame": (ctypes.c_ulong, _POINTER, _INT),
+}
+
+
+def library_path() -> str:
+    """Return the file of ndicapi's library. Raises InputError if it is not installed."""
+    found = find_spec("ndicapy")
+    if found is None or found.origin is None:
+        raise InputError(INSTALL)
+    return found.origin
+
+
+class Device:
+    """An open serial line to a tracker. Raises OSError if it cannot be opened."""
+
+    def __init__(self, path: str) -> None:
+        self._c = _library()
+        self._device = self._c.ndiOpenSerial(path.encode())
+        if not self._device:
+            raise OSError("the port cannot be opened (is another program using it?)")
+
+    def close(self) -> None:
+        """Close the line."""
+        self._c.ndiCloseSerial(self._device)
+
+    def wait_at_most(self, seconds: float) -> None:
+        """Set how long a command waits for its reply (tenths of a second)."""
+        self._c.ndiSerialTimeout(self._c.ndiGetDeviceHandle(self._device), round(seconds * 1000))
+
+    def speed(self, baud: int) -> None:
+        """Set the speed of this end of the line."""
+        self._c.ndiSerialComm(self._c.ndiGetDeviceHandle(self._device), baud, b"8N1", 0)
+
+    def command(self, text: str | None) -> int:
+        """Send a command, or a serial break (None); return 0 or the code of what went wrong."""
+        reply = self._c.ndiCommand(self._device, None if text is None else text.encode()) or b""
+        code = int(self._c.ndiGetError(self._device))
+        # ndicapi looks for a binary checksum at the end of every reply to BX, also of an error in text.
+        error = _ERROR.match(reply) if code == CHECKSUM else None
+        return code if error is None else int(error[1], 16)
+
+    def explain(self, code: int) -> str:
+        """Return a code in words."""
+        return str(self._c.ndiErrorString(code).decode("ascii", "replace"))
+
+    def found(self) -> list[int]:
+        """Return the port handles in the last reply to PHSR."""
+        return [
+            self._c.ndiGetPHSRHandle(self._device, n)
+            for n in range(self._c.ndiGetPHSRNumberOfHandles(self._device))
+        ]
+
+    def location(self) -> tuple[str, str]:
+        """Return port and channel in the last reply to PHINF."""
+        text = ctypes.create_string_buffer(_LOCATION)
+        self._c.ndiGetPHINFPortLocation(self._device, text)
+        place = text.raw.decode("ascii", "replace")
+        return place[10:12], place[12:14]
+
+    def reading(self, letters: str, handle: int) -> tuple[int, int, int, tuple[float, ...]]:
+        """Return frame number, what kind of nothing is known (0: something is), port status and pose.
+
+        letters: "BX" or "TX", of which the last reply is read. The pose is q0, qx, qy, qz, x, y, z (mm), indicator.
+        """
+        number = ctypes.c_float if letters == "BX" else ctypes.c_double
+        pose = (number * _POSE)()
+        gone = getattr(self._c, f"ndiGet{letters}Transform")(self._device, handle, pose)
+        status = getattr(self._c, f"ndiGet{letters}PortStatus")(self._device, handle)
+        frame = getattr(self._c, f"ndiGet{letters}Frame")(self._device, handle)
+        # ndicapi joins signed bytes: with bit 7 set all above it are set as well and mean nothing.
+        status &= 0xFF if letters == "BX" and status & 0x80 else 0xFFFF
+        return int(frame) & 0xFFFF_FFFF, int(gone), int(status), tuple(pose)
+
+
+def _library() -> ctypes.CDLL:
+    library = ctypes.CDLL(library_path())
+    for name, (result, *arguments) in _FUNCTIONS.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    return library

@@ -1,0 +1,175 @@
+"""One connection to an Aurora, as a process of its own: `python -m flexneedle.devices.aurora.link PORT [break]`.
+
+It finds the tracker, enables every sensor, and polls; each line on stdout is one JSON list:
+
+    ["ready", {handle: [port, channel], …}]
+    ["frame", number, seconds of the monotonic clock when it arrived, {handle: [gone, port status, frame, [8 numbers]]}]
+    ["trouble", kind, words]
+    ["end", words]
+
+A process, because the C library blocks for as long as a silent device makes it, because garbage on the line may
+crash it, and because a planner that holds Python's lock for a frame or two would lose them.
+"""
+
+import json
+import os
+import signal
+import sys
+from time import monotonic, sleep
+from typing import Any, NoReturn
+
+from flexneedle.devices.priority import come_first
+
+from .library import CHECKSUM, LOST, TIMEOUT, Device
+
+__all__ = ["GIVE_UP_S", "main"]
+
+GIVE_UP_S = 1.0
+"""So long without a new frame, and the connection is given up."""
+
+_SLOW, _FAST = 9600, 115200
+_TO_FAST, _TO_SLOW = "COMM:50000", "COMM:00000"  # 8N1, no handshake
+_POLL_S = 0.003  # between two readings; a real line takes longer than that for each
+_HELLO_S, _BREAK_S, _SET_UP_S, _READ_S = 0.5, 7.0, 5.0, 0.3
+_OPTIONS = "0801"  # transforms and status, also outside of the volume
+_UNKNOWN_COMMAND = 0x01
+_ROUNDS = 4  # of initialising: the second sensor of a port shows up after the first
+
+
+class _End(Exception):
+    """The connection ends, and why."""
+
+
+def main(path: str, may_break: bool) -> None:
+    """Connect, and poll until told to stop (SIGTERM) or until there is nothing to read any more."""
+    signal.signal(signal.SIGTERM, _stop)
+    come_first()
+    try:
+        device = Device(path)
+        try:
+            _connect(device, may_break)
+            _read(device)
+        finally:
+            device.close()
+    except (_End, OSError) as end:
+        _tell("end", str(end))
+
+
+def _stop(*_: object) -> NoReturn:
+    raise SystemExit
+
+
+def _tell(*message: Any) -> None:
+    line = json.dumps(message) + "\n"
+    os.write(sys.stdout.fileno(), line.encode())  # at once, and whole
+
+
+def _connect(device: Device, may_break: bool) -> None:
+    """Find the tracker at the speed it is at after power-on, or at the one that an earlier connection left."""
+    device.wait_at_most(_HELLO_S)
+    for speed in (_SLOW, _FAST):
+        device.speed(speed)
+        if device.command("INIT:") == 0:
+            break
+    else:
+        if not may_break:
+            raise _End("no answer")
+        device.wait_at_most(_BREAK_S)
+        _demand(device, None, "no answer, also not to a serial break")
+        _demand(device, "INIT:", "reset, but not initialised")
+    device.wait_at_most(_SET_UP_S)
+    _demand(device, _TO_FAST, "the speed of the line cannot be set")
+
+
+def _demand(device: Device, command: str | None, complaint: str) -> None:
+    code = device.command(command)
+    if code:
+        raise _End(f"{complaint}: {device.explain(code)}")
+
+
+def _read(device: Device) -> None:
+    """Enable the sensors, track, and leave the tracker as it was found if it still listens."""
+    ports = _set_up(device)
+    letters = _start(device)
+    _tell("ready", ports)
+    listens = True
+    try:
+        listens = _poll(device, letters, [int(handle) for handle in ports])
+    finally:
+        if listens:
+            device.wait_at_most(_HELLO_S)
+            device.command("TSTOP:")
+            device.command(_TO_SLOW)
+
+
+def _set_up(device: Device) -> dict[str, tuple[str, str]]:
+    """Initialise and enable every sensor; return port and channel by port handle."""
+    ports: dict[str, tuple[str, str]] = {}
+    for _ in range(_ROUNDS):
+        _demand(device, "PHSR:02", "the sensors cannot be listed")
+        waiting = [handle for handle in device.found() if str(handle) not in ports]
+        for handle in waiting:
+            _demand(device, f"PINIT:{handle:02X}", f"port handle {handle:02X} cannot be initialised")
+            _demand(device, f"PHINF:{handle:02X}0020", f"port handle {handle:02X} cannot be described")
+            ports[str(handle)] = device.location()
+        if not waiting:
+            break
+    if not ports:
+        raise _End("no sensor is plugged in")
+    for handle in map(int, ports):
+        _demand(device, f"PENA:{handle:02X}D", f"port handle {handle:02X} cannot be enabled")
+    return ports
+
+
+def _start(device: Device) -> str:
+    """Start tracking; return the command that reads: BX, or TX where BX is not known."""
+    _demand(device, "TSTART:", "tracking cannot be started")
+    device.wait_at_most(_READ_S)
+    return "TX" if device.command(f"BX:{_OPTIONS}") == _UNKNOWN_COMMAND else "BX"
+
+
+def _poll(device: Device, letters: str, handles: list[int]) -> bool:
+    """Tell each new frame until there are none; return whether the tracker still answered then.
+
+    The first frame is only what the next is compared with: a frame number that does not move brings no frame,
+    whoever asks.
+    """
+    last, fresh_at, why = -1, monotonic(), "no frame"
+    while monotonic() - fresh_at < GIVE_UP_S:
+        code = device.command(f"{letters}:{_OPTIONS}")
+        arrived = monotonic()
+        if code:
+            kind, why = _trouble(device, code)
+            _tell("trouble", kind, why)
+            if code in LOST:
+                break
+        else:
+            found = {handle: device.reading(letters, handle) for handle in handles}
+            number = max(frame for frame, *_ in found.values())
+            if number < last:
+                why = "the frame number went back"
+                break
+            if last < 0 or number == last:
+                why = "the frame number stands still"
+            else:
+                _tell("frame", number, arrived, {h: (g, s, n, p) for h, (n, g, s, p) in found.items()})
+                fresh_at = arrived
+            last = number
+        sleep(_POLL_S)
+    _tell("end", why)
+    return code not in (TIMEOUT, *LOST)
+
+
+def _trouble(device: Device, code: int) -> tuple[str, str]:
+    """Return the kind of a failed reading, and it in words."""
+    if code == TIMEOUT:
+        return "no reply", "no reply"
+    if code == CHECKSUM:
+        return "garbled", "replies are garbled"
+    if code in LOST:
+        return "unplugged", "the line is broken: is the cable plugged in?"
+    return "error", f"error {code:02X}: {device.explain(code)}"
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2:] == ["break"])

@@ -1,0 +1,49 @@
+"""When frames were taken, from when they arrived: number by number, on a line that no arrival is earlier than."""
+
+from collections import deque
+
+__all__ = ["Numbering", "Timeline"]
+
+_WINDOW = 400  # frames: 10 s, over which a clock that is off by 100 ppm drifts by 1 ms
+
+
+class Timeline:
+    """Times of frames that are taken at a fixed rate (Hz) and arrive late by a little, never early.
+
+    Frame n arrives at aₙ = t₀ + n/rate + latency, latency ≥ 0 and now and then near its least. The time told is
+    t₀ + n/rate with t₀ = min(a − n/rate) over the last 400 frames: late by the least latency alone, whatever the
+    others were. Times rise strictly and are never after the arrival.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self._period = 1 / rate
+        self._starts: deque[float] = deque(maxlen=_WINDOW)
+        self._last: float | None = None
+
+    def stamp(self, number: int, arrival: float) -> float:
+        """Return when frame `number` was taken (s, on the clock of `arrival`). Call it with rising numbers."""
+        self._starts.append(arrival - number * self._period)
+        time = min(self._starts) + number * self._period
+        if self._last is not None:  # an earlier start was learnt: let the time go on nevertheless
+            time = min(arrival, max(time, self._last + self._period / 2))
+        self._last = time
+        return time
+
+
+class Numbering:
+    """Frame numbers that go on over reconnections, also where the tracker counts from the start again."""
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._shift = 0
+        self._last: tuple[int, float] | None = None
+
+    def count(self, number: int, arrival: float) -> int:
+        """Return the number of a frame; one not above the last goes on by the time that has passed."""
+        told = number + self._shift
+        if self._last is not None and told <= self._last[0]:
+            last, before = self._last
+            told = last + max(1, round((arrival - before) * self._rate))
+            self._shift = told - number
+        self._last = told, arrival
+        return told

@@ -1,0 +1,150 @@
+"""The emulated Aurora on a pseudo-terminal: bytes in, bytes out, the cable and the clock. Runs until interrupted."""
+
+import os
+import pty
+import select
+import tempfile
+import tty
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+from typing import NoReturn, Self
+
+import numpy as np
+
+from flexneedle.errors import InputError
+
+from . import codec
+from .aurora import Aurora, Seen, answer
+from .faults import Fault, active
+from .motion import RATE_HZ, SENSORS, pose
+
+__all__ = ["Serial", "Session", "serve"]
+
+_IDLE_S = 0.1  # the longest that the loop sleeps
+_LONGEST_LINE = 4096
+
+
+@dataclass
+class Session:
+    """The device and its faults over time. Times are seconds on one clock, first of all that of power-on."""
+
+    device: Aurora
+    faults: Sequence[Fault]
+    seed: int
+    power_on: float
+    tracked_since: float | None = None
+
+    def __post_init__(self) -> None:
+        self._random = np.random.default_rng((self.seed, 1))
+
+    def faults_at(self, now: float) -> dict[str, Fault]:
+        """Return the faults that are on, by kind; there are none before tracking first begins."""
+        if self.tracked_since is None:
+            return {}
+        return {fault.kind: fault for fault in active(self.faults, now - self.tracked_since)}
+
+    def reply(self, line: bytes, now: float) -> tuple[float, bytes]:
+        """Return when to answer a command, and with what (b"" is silence)."""
+        faults = self.faults_at(now)
+        if "silence" in faults:
+            return now, b""
+        if "error" in faults:
+            return now, codec.text(f"ERROR{faults['error'].detail}")
+        self.device, whole = answer(self.device, line, self._seen(now, faults))
+        if self.device.mode == "tracking" and self.tracked_since is None:
+            self.tracked_since = now
+        late = float(faults["delay"].detail) if "delay" in faults else 0.0
+        return now + late, self._damaged(whole, faults)
+
+    def _seen(self, now: float, faults: dict[str, Fault]) -> Seen:
+        if "frozen" in faults and self.tracked_since is not None:
+            now = self.tracked_since + faults["frozen"].start
+        number = int((now - self.power_on) * RATE_HZ) & 0xFFFF_FFFF
+        on = () if self.tracked_since is None else active(self.faults, now - self.tracked_since)
+        ailments = {fault.detail: fault.kind for fault in on if fault.detail in SENSORS}
+        return Seen(number, {name: pose(name, number, self.seed) for name in SENSORS}, ailments)
+
+    def _damaged(self, whole: bytes, faults: dict[str, Fault]) -> bytes:
+        if "cut" in faults:
+            return whole[: len(whole) // 2]
+        if "garbled" not in faults:
+            return whole
+        at, flipped = self._random.integers(len(whole)), self._random.integers(1, 256)
+        return whole[:at] + bytes([whole[at] ^ int(flipped)]) + whole[at + 1 :]
+
+
+class Serial:
+    """A pseudo-terminal and a link to it. Plugged in and out; the link's path stays the same. Use it as a context.
+
+    link: its path, or None for one in a new folder. Raises InputError if something else is there.
+    """
+
+    def __init__(self, link: Path | None) -> None:
+        self._folder = None if link is not None else tempfile.TemporaryDirectory(prefix="flexneedle-")
+        self.link = link if link is not None else Path(self._folder.name) / "aurora"  # type: ignore[union-attr]
+        if os.path.lexists(self.link) and not self.link.is_symlink():
+            raise InputError(f"{self.link}: is there already and is no link")
+        self.ends: tuple[int, int] | None = None
+        """Descriptors of the device's end and of the host's; the latter stays open, or the former would fail."""
+
+    def __enter__(self) -> Self:
+        self.plug()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.unplug()
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    def plug(self) -> None:
+        """Make the pseudo-terminal and the link. Raises InputError if the link cannot be made."""
+        device, host = pty.openpty()
+        self.ends = device, host
+        tty.setraw(host)  # no echo, no line editing, before the first host opens it
+        os.set_blocking(device, False)
+        try:
+            self.link.unlink(missing_ok=True)
+            self.link.symlink_to(os.ttyname(host))
+        except OSError as error:
+            raise InputError(f"{self.link}: the link cannot be made: {error.strerror}") from None
+
+    def unplug(self) -> None:
+        """Hang up on the host and take the link away."""
+        if self.ends is not None:
+            self.link.unlink(missing_ok=True)
+            for end in self.ends:
+                os.close(end)
+        self.ends = None
+
+    def read(self, seconds: float) -> bytes:
+        """Return what the host has written, waiting at most so long for it."""
+        if self.ends is None:
+            select.select([], [], [], seconds)
+            return b""
+        ready, _, _ = select.select([self.ends[0]], [], [], max(0.0, seconds))
+        return os.read(self.ends[0], _LONGEST_LINE) if ready else b""
+
+    def write(self, data: bytes) -> None:
+        """Send to the host; what it does not take is lost, as on a wire."""
+        if self.ends is not None and data:
+            with suppress(BlockingIOError):
+                os.write(self.ends[0], data)
+
+
+def serve(session: Session, serial: Serial, say: Callable[[str], None] = lambda _: None) -> NoReturn:
+    """Answer until interrupted. say: told when the cable is pulled or plugged in."""
+    heard, due = b"", list[tuple[float, bytes]]()
+    while True:
+        pulled = "unplug" in session.faults_at(monotonic())
+        if pulled != (serial.ends is None):
+            (serial.unplug if pulled else serial.plug)()
+            heard, due = b"", []
+            say("unplugged" if pulled else f"plugged in again: {serial.link}")
+        heard += serial.read(min([_IDLE_S, *(time - monotonic() for time, _ in due)]))
+        *lines, heard = heard[-_LONGEST_LINE:].split(b"\r")
+        due += [session.reply(line, monotonic()) for line in lines]
+        while due and due[0][0] <= monotonic():
+            serial.write(due.pop(0)[1])

@@ -1,0 +1,217 @@
+"""The adapter and the emulator, each a process, on a real pseudo-terminal: every fault ends in a verdict.
+
+No test looks at how long something took, only at what came of it.
+"""
+
+import os
+import signal
+
+import numpy as np
+import psutil
+import pytest
+
+from emulated import assert_true_and_new, emulated, read_until, until
+from flexneedle.devices.aurora import Aurora, library, tracker
+from flexneedle.devices.clock import WallClock
+from flexneedle.errors import InputError, RunError
+from flexneedle.ports import VISIBLE
+
+ALL = {"tip", "ref1", "ref2", "ref3"}
+
+
+def seen(frames, name="tip"):
+    """Return the statuses of a sensor, each run of the same once, without how a fault begins or ends."""
+    told = [frame.readings[name].status for frame in frames]
+    return [status for n, status in enumerate(told) if n == 0 or status != told[n - 1]]
+
+
+def number(count):
+    return lambda frames: len(frames) >= count
+
+
+def in_order(*wanted, name="tip"):
+    return lambda frames: seen(frames, name)[: len(wanted)] == list(wanted)
+
+
+def test_at_40_hz_no_frame_is_lost_and_every_one_is_right():
+    """80 in a row; a machine under load may stall any process for more than a frame, so the row may begin later."""
+
+    def in_a_row(frames):
+        return len(frames) > 80 and frames[-1].number - frames[-81].number == 80
+
+    with emulated("--seed", "3") as path, Aurora(path, WallClock()) as aurora:
+        frames, _ = read_until(aurora, in_a_row)
+        counts = aurora.counts
+    assert_true_and_new(frames, seed=3)
+    assert {frozenset(frame.readings) for frame in frames} == {frozenset(ALL)}
+    assert {r.status for frame in frames for r in frame.readings.values()} == {VISIBLE}
+    assert (counts.reconnections, counts.dropped, counts.troubles) == (0, 0, {})
+    np.testing.assert_allclose(np.diff([frame.time for frame in frames][-80:]), 1 / 40, atol=0.004)
+
+
+def test_times_are_those_of_the_runs_clock():
+    clock = WallClock()
+    with emulated("--sensors", "1") as path, Aurora(path, clock) as aurora:
+        before = clock.now()
+        frames, _ = read_until(aurora, number(3))
+        assert before - 1.0 < frames[0].time < frames[-1].time <= clock.now()
+
+
+def test_old_firmware_is_read_in_text():
+    with emulated("--no-bx") as path, Aurora(path, WallClock()) as aurora:
+        frames, _ = read_until(aurora, number(10))
+    assert seen(frames) == [VISIBLE]
+    x, y, _ = frames[0].readings["tip"].position
+    np.testing.assert_allclose(np.hypot(x, y), 30.0, atol=0.5)
+
+
+def test_ports_can_be_named():
+    with emulated("--sensors", "3") as path, Aurora(path, WallClock(), ("ref1", "tip")) as aurora:
+        (frame, *_), _ = read_until(aurora, number(1))
+    assert set(frame.readings) == {"ref1", "tip", "port3"}
+    assert frame.readings["tip"].position[0] > 55, "what stands at port 2"
+
+
+def test_each_sensor_says_what_ails_it_and_the_others_go_on():
+    faults = ("missing=tip", "out-of-volume=ref1", "partly-out=ref2", "broken=ref3")
+    arguments = [part for fault in faults for part in ("--fault", f"{fault}@0.3:0.3")]
+    said = {"tip": "missing", "ref1": "out of volume", "ref2": "partly out of volume", "ref3": "broken coil"}
+    with emulated(*arguments) as path, Aurora(path, WallClock()) as aurora:
+        frames, _ = read_until(
+            aurora, lambda f: all(in_order(VISIBLE, words, VISIBLE, name=n)(f) for n, words in said.items())
+        )
+    assert_true_and_new(frames)
+    for name, words in said.items():
+        assert {f.readings[name].position is None for f in frames if f.readings[name].status == words} == {
+            True
+        }
+
+
+@pytest.mark.parametrize("firmware", [[], ["--no-bx"]])
+def test_a_sensor_that_is_switched_off_is_disabled(firmware):
+    with emulated("--fault", "disabled@0.3:0.3", *firmware) as path, Aurora(path, WallClock()) as aurora:
+        frames, _ = read_until(aurora, in_order(VISIBLE, "disabled", VISIBLE))
+    assert seen(frames, "ref1") == [VISIBLE]
+
+
+@pytest.mark.parametrize(
+    ("fault", "trouble", "words"),
+    [
+        ("error=1A", "error", "error 1A"),
+        ("garbled", "garbled", "garbled"),
+        ("cut", "no reply", "no reply"),
+    ],
+)
+def test_bad_replies_are_dropped_counted_and_told(fault, trouble, words):
+    with emulated("--fault", f"{fault}@0.3:0.5") as path, Aurora(path, WallClock()) as aurora:
+        frames, statuses = read_until(aurora, lambda f: f and f[-1].number - f[0].number > 50)
+        counts = aurora.counts
+    assert_true_and_new(frames)
+    assert counts.troubles[trouble] >= 1
+    assert counts.missed >= 15
+    assert counts.reconnections == 0
+    assert any(words in status for status in statuses)
+
+
+def test_late_replies_are_late_and_not_wrong():
+    with emulated("--fault", "delay=0.2@0.5:0.6") as path, Aurora(path, WallClock()) as aurora:
+        frames, statuses = read_until(aurora, lambda f: f and f[-1].number - f[0].number > 60)
+        missed = aurora.counts.missed
+    assert_true_and_new(frames)
+    assert missed >= 10
+    assert any(status.startswith("no frame for") for status in statuses)
+    lateness = np.diff([f.time - f.number / 40 for f in frames])
+    assert np.abs(lateness).max() < 0.02, "a late reply tells of the time when it was taken"
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("silence@0.3:1.5", "no reply"),
+        ("frozen@0.3:2.5", "stands still"),
+        ("unplug@0.3:1", "is the cable plugged in?"),
+        ("error@0.3:1.5", "error 0D"),
+    ],
+)
+def test_a_broken_connection_is_told_and_made_again(fault, words):
+    with emulated("--fault", fault) as path, Aurora(path, WallClock()) as aurora:
+        frames, statuses = read_until(
+            aurora, lambda f: f and np.diff([g.number for g in f]).max(initial=0) > 30
+        )
+        counts = aurora.counts
+    assert_true_and_new(frames)
+    assert counts.reconnections >= 1
+    assert counts.missed >= 30
+    assert any(words in status for status in statuses)
+
+
+def test_without_an_end_a_fault_is_told_for_as_long_as_it_lasts():
+    with emulated("--fault", "unplug@0.2") as path, Aurora(path, WallClock()) as aurora:
+        until(lambda: "cannot be opened" in aurora.status)
+        aurora.read()
+        assert aurora.read() == ()
+
+
+def link_of_this_process():
+    (link,) = [child for child in psutil.Process().children() if "aurora.link" in " ".join(child.cmdline())]
+    return link
+
+
+@pytest.mark.parametrize(("kill", "words"), [(signal.SIGKILL, "the link"), (signal.SIGSTOP, "the link hung")])
+def test_a_link_that_crashes_or_hangs_is_replaced(kill, words, monkeypatch):
+    monkeypatch.setattr(tracker, "_SILENT_S", 0.5)
+    with emulated() as path, Aurora(path, WallClock()) as aurora:
+        before, _ = read_until(aurora, number(3))
+        os.kill(link_of_this_process().pid, kill)
+        after, statuses = read_until(aurora, lambda f: aurora.counts.reconnections == 1 and len(f) >= 3)
+        counts = aurora.counts
+    assert_true_and_new(before + after)
+    assert counts.troubles == {"crash": 1}
+    assert any(words in status for status in statuses)
+
+
+def test_one_who_does_not_read_loses_the_oldest_frames_and_is_told(monkeypatch):
+    monkeypatch.setattr(tracker, "_QUEUE", 5)
+    with emulated("--sensors", "1") as path, Aurora(path, WallClock()) as aurora:
+        until(lambda: aurora.counts.dropped >= 5)
+        frames = aurora.read()
+        counts = aurora.counts
+    assert len(frames) == 5
+    assert counts.frames >= counts.dropped + 5
+
+
+def test_closing_leaves_no_process_and_a_tracker_that_can_be_opened_again():
+    with emulated() as path:
+        for _ in range(2):
+            with Aurora(path, WallClock()) as aurora:
+                read_until(aurora, number(1))
+                link = link_of_this_process()
+            assert not link.is_running()
+
+
+def test_a_port_that_is_not_there_is_refused_with_those_that_are(tmp_path):
+    with pytest.raises(InputError, match=r"nothing: no such port; serial ports found: ") as refusal:
+        Aurora(str(tmp_path / "nothing"), WallClock())
+    assert "\n" not in str(refusal.value)
+
+
+def test_what_is_no_serial_port_is_refused_in_one_line():
+    with pytest.raises(RunError, match="/dev/null: no tracker: the port cannot be opened") as refusal:
+        Aurora("/dev/null", WallClock())
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.slow
+def test_a_port_with_nothing_behind_it_is_refused():
+    """Slow: the tracker is given its time to come back from a serial break."""
+    device, host = os.openpty()
+    with pytest.raises(RunError, match="no tracker: no answer, also not to a serial break"):
+        Aurora(os.ttyname(host), WallClock())
+    os.close(device)
+    os.close(host)
+
+
+def test_without_ndicapi_its_extra_is_named(monkeypatch):
+    monkeypatch.setattr(library, "find_spec", lambda _: None)
+    with pytest.raises(InputError, match=r"pip install 'flexneedle\[aurora\]'"):
+        Aurora("/dev/null", WallClock())

@@ -1,0 +1,61 @@
+"""An emulated Aurora in a process of its own, and waiting for what a real line brings."""
+
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+from threading import Event
+from time import monotonic
+
+import numpy as np
+
+from flexneedle.devices.emulator.motion import pose
+
+DEADLINE_S = 20.0
+
+
+@contextmanager
+def emulated(*arguments, end=signal.SIGINT):
+    """Run `flexneedle emulate aurora` with these arguments; give the path of the device."""
+    command = [sys.executable, "-m", "flexneedle", "emulate", "aurora", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        yield process.stdout.readline().strip()
+    finally:
+        process.send_signal(end)
+        _, errors = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 0, errors
+
+
+def until(condition, seconds=DEADLINE_S):
+    """Ask again and again until the condition holds; fail at the deadline."""
+    deadline = monotonic() + seconds
+    while not condition():
+        assert monotonic() < deadline, "the condition did not come about in time"
+        Event().wait(0.002)
+
+
+def read_until(tracker, condition, seconds=DEADLINE_S):
+    """Return all frames up to when the condition on them holds, and the statuses seen meanwhile."""
+    frames, statuses = [], set()
+
+    def holds():
+        frames.extend(tracker.read())
+        statuses.add(tracker.status)
+        return condition(frames)
+
+    until(holds, seconds)
+    return frames, statuses
+
+
+def assert_true_and_new(frames, seed=0):
+    """Every frame is new and later than the one before, and no position is another than the emulated one."""
+    assert (np.diff([frame.number for frame in frames]) > 0).all()
+    assert (np.diff([frame.time for frame in frames]) > 0).all()
+    for frame in frames:
+        for name, reading in frame.readings.items():
+            if reading.position is not None:
+                true = pose(name, frame.number, seed)
+                np.testing.assert_allclose(reading.position, true.position, atol=1e-4)
+                np.testing.assert_allclose(reading.orientation, true.orientation, atol=1e-6)
+                np.testing.assert_allclose(reading.indicator, true.indicator, atol=1e-6)
