@@ -108,6 +108,14 @@ def test_each_fault_of_a_reading_is_named(sample, verdict):
     assert one(sample) == verdict
 
 
+def test_a_frame_told_again_is_not_believed_and_not_remembered():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
+    again = Sample(0.075, 30.0, 1.0, 0.0, frame(2 / RATE))
+    after, verdict = watch.take(again, (30.0, 1.0), 0.075, 0.3, 2.0)
+    assert verdict == "stale: frame 2 after frame 2"
+    assert after is watch
+
+
 def test_an_old_reading_is_stale():
     assert one(Sample(1.0, 30.0, 1.0), now=1.5) == "stale: 0.500 s old, limit 0.3 s"
 

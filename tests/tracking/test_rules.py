@@ -50,6 +50,16 @@ def test_age_at_the_limit_is_believed_and_beyond_it_not():
     assert rules.stale(10.6, 10.0, 0.5) == "stale: dated 0.600 s ahead"
 
 
+def test_a_frame_told_again_is_stale_whatever_its_time():
+    frames = [Frame(time, number, {}) for time, number in ((1.0, 7), (1.025, 7), (1.025, 6), (1.025, 8))]
+    assert [rules.repeated(frame, frames[0]) for frame in frames[1:]] == [
+        "stale: frame 7 after frame 7",
+        "stale: frame 6 after frame 7",
+        OK,
+    ]
+    assert rules.repeated(None, frames[0]) == rules.repeated(frames[0], None) == OK
+
+
 @pytest.mark.parametrize("way", WAYS)
 def test_innovation_is_the_distance_and_its_limit_is_still_believed(way):
     def at(distance):

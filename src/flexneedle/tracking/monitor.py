@@ -1,15 +1,33 @@
 """The watch over the tracker: what it remembers of past readings, and whether it lets the needle move."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from flexneedle.ports import Sample
+from flexneedle.ports import Frame, Sample
 from flexneedle.scenario import Monitor
 from flexneedle.tracking import rules
 from flexneedle.tracking.rules import OK
+from flexneedle.tracking.table import TIP
 
-__all__ = ["Watch"]
+__all__ = ["Watch", "field_verdict"]
+
+
+def field_verdict(frames: Sequence[Frame], settings: Monitor, distorted: bool = False) -> str:
+    """Judge the field by the reference sensors of frames, oldest first: all sensors but the tip.
+
+    Those of the last window count. distorted: whether it was so far; it has to fall below the lower limit then.
+    """
+    window = settings.indicator_window_s
+    since = frames[-1].time - window + 1e-9
+    indicators: dict[str, list[float]] = {}
+    for frame in frames:
+        for name, reading in frame.readings.items() if frame.time > since else ():
+            if name != TIP and reading.indicator is not None:
+                indicators.setdefault(name, []).append(reading.indicator)
+    limit = settings.indicator_limit * (settings.resume_fraction if distorted else 1.0)
+    unseen = rules.unseen_references(indicators, settings.references, window)
+    return unseen if unseen != OK else rules.distortion(indicators, limit, window)
 
 
 @dataclass(frozen=True)
@@ -26,7 +44,6 @@ class Watch:
     """
 
     settings: Monitor
-    tip: str = "tip"
     recent: tuple[_Seen, ...] = ()
     good: Sample | None = None
     distorted: bool = False
@@ -39,7 +56,8 @@ class Watch:
         predicted: the model's tip (mm) at its time; now (s); oldest: age (s), furthest: distance (mm) from the
         prediction beyond which no reading is believed.
         """
-        verdict = rules.not_a_number(sample)
+        before = self.recent[-1].sample.frame if self.recent else None
+        verdict = rules.first_bad([rules.not_a_number(sample), rules.repeated(sample.frame, before)])
         if verdict != OK:
             return self, verdict
         since = sample.time - self.settings.indicator_window_s + 1e-9
@@ -63,25 +81,17 @@ class Watch:
 
         A tracker that tells nothing but the tip is not held against: there is nothing to judge.
         """
-        settings, frames = self.settings, [seen.sample.frame for seen in self.recent]
-        if not settings.enabled or all(frame is None for frame in frames):
+        frames = [seen.sample.frame for seen in self.recent if seen.sample.frame is not None]
+        if not self.settings.enabled or not frames:
             return self, OK
-        indicators: dict[str, list[float]] = {}
-        for frame in frames:
-            for name, reading in frame.readings.items() if frame is not None else ():
-                if name != self.tip and reading.indicator is not None:
-                    indicators.setdefault(name, []).append(reading.indicator)
-        window, share = settings.indicator_window_s, settings.resume_fraction if self.distorted else 1.0
-        verdict = rules.unseen_references(indicators, settings.references, window)
-        if verdict == OK:
-            verdict = rules.distortion(indicators, share * settings.indicator_limit, window)
+        verdict = field_verdict(frames, self.settings, self.distorted)
         return replace(self, distorted=verdict != OK), verdict
 
     def _faults(
         self, sample: Sample, predicted: tuple[float, float], now: float, oldest: float, furthest: float
     ) -> Iterator[str]:
         settings = self.settings
-        yield rules.missing(sample, self.tip)
+        yield rules.missing(sample)
         yield rules.stale(sample.time, now, oldest)
         if sample.x is not None and sample.y is not None:
             yield rules.innovation((sample.x, sample.y), predicted, furthest)
@@ -93,7 +103,7 @@ class Watch:
 
     def _place(self, sample: Sample) -> rules.Place | None:
         """What the tracker itself said of the tip: a map to the stage or an offset makes no frozen sensor move."""
-        told = None if sample.frame is None else sample.frame.readings.get(self.tip)
+        told = None if sample.frame is None else sample.frame.readings.get(TIP)
         if told is not None:
             return told.position
         return None if sample.x is None or sample.y is None else (sample.x, sample.y)

@@ -8,7 +8,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 
-from flexneedle.ports import Sample
+from flexneedle.ports import Frame, Sample
+from flexneedle.tracking.table import TIP
 
 Place = tuple[float, ...]
 
@@ -22,6 +23,7 @@ __all__ = [
     "missing",
     "not_a_number",
     "out_of_plane",
+    "repeated",
     "stale",
     "unseen_references",
 ]
@@ -34,11 +36,11 @@ def first_bad(verdicts: Iterable[str]) -> str:
     return next((verdict for verdict in verdicts if verdict != OK), OK)
 
 
-def missing(sample: Sample, tip: str = "tip") -> str:
+def missing(sample: Sample) -> str:
     """A reading in which the tracker does not see the tip; says why if the tracker does."""
     if sample.x is not None and sample.y is not None:
         return OK
-    told = None if sample.frame is None else sample.frame.readings.get(tip)
+    told = None if sample.frame is None else sample.frame.readings.get(TIP)
     return f"missing: tracker sees no tip{f' ({told.status})' if told and told.position is None else ''}"
 
 
@@ -55,6 +57,13 @@ def stale(time: float, now: float, limit: float) -> str:
     if time > now + limit:
         return f"stale: dated {time - now:.3f} s ahead"
     return OK
+
+
+def repeated(frame: Frame | None, before: Frame | None) -> str:
+    """A frame that was told before, or one that comes after a later one, whatever its time stamp says."""
+    if frame is None or before is None or frame.number > before.number:
+        return OK
+    return f"stale: frame {frame.number} after frame {before.number}"
 
 
 def innovation(place: tuple[float, float], predicted: tuple[float, float], limit: float) -> str:

@@ -13,8 +13,7 @@ from flexneedle.devices.replay import Replay
 from flexneedle.errors import InputError
 from flexneedle.ports import VISIBLE, Clock, Frame
 from flexneedle.scenario import Monitor
-from flexneedle.tracking import rules
-from flexneedle.tracking.table import TIP
+from flexneedle.tracking.monitor import field_verdict
 
 from .trackers import LiveTracker
 
@@ -84,15 +83,7 @@ def judge_field(frames: Sequence[Frame], settings: Monitor) -> str:
     ill = "; ".join(f"{name}: {r.status}" for name, r in frames[-1].readings.items() if r.status != VISIBLE)
     if ill:
         return ill
-    since = frames[-1].time - settings.indicator_window_s
-    told: dict[str, list[float]] = {}
-    for frame in frames:
-        for name, reading in frame.readings.items() if frame.time > since else ():
-            if name != TIP and reading.indicator is not None:
-                told.setdefault(name, []).append(reading.indicator)
-    window = settings.indicator_window_s
-    unseen = rules.unseen_references(told, settings.references, window)
-    return unseen if unseen != VISIBLE else rules.distortion(told, settings.indicator_limit, window)
+    return field_verdict(frames, settings)
 
 
 def _default_judge(frames: Sequence[Frame]) -> str:
