@@ -23,7 +23,7 @@ INSERTION_FILES = ["insertion.png", "insertion.svg", "run.json", "trace.mcap"]
 INSERT_KEYS = [
     *("controller", "phantom"),
     *("target_mm", "tip_true_mm", "tip_measured_mm", "true_error_mm", "residual_mm", "planned_error_mm"),
-    *("reached", "flips", "planned_flips", "strain_energy_mj", "planned_strain_energy_mj", "steps"),
+    *("reached", "outcome", "reason", "flips", "planned_flips", "strain_energy_mj", "planned_strain_energy_mj", "steps"),
     "held_s",
     *("converged", "seed", "run_dir", "timing"),
 ]

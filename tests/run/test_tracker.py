@@ -1,5 +1,6 @@
 """Insertions with a simulated electromagnetic tracker: its room, its monitor, its sensor behind the tip."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -79,6 +80,73 @@ def test_a_plate_that_comes_and_goes_holds_the_needle_as_long_as_it_is_there(ins
     assert {period.innovation for period in held} == {(0.0, 0.0)}  # nothing is learnt from a distorted field
     assert done.outcome == "done"
     assert done.held_s == pytest.approx(field[-1].time - field[0].time, abs=0.1)
+
+
+class Interrupted:
+    """A tracker that tells nothing in the calls, or nothing of the tip, within a span (s)."""
+
+    def __init__(self, tracker, clock, span, calls):
+        self.tracker, self.clock, self.span, self.calls, self.late = tracker, clock, span, calls, ()
+
+    def read(self):
+        if self.calls and self.span[0] <= self.clock.now() < self.span[1]:
+            self.late += self.tracker.read()
+            return ()
+        samples, self.late = self.late + self.tracker.read(), ()
+        lost = [
+            replace(sample, x=None, y=None) if self.span[0] <= sample.time < self.span[1] else sample
+            for sample in samples
+        ]
+        return samples if self.calls else tuple(lost)
+
+
+def interrupted(plan, span, calls, **values):
+    scenario = PHANTOM.with_values(
+        {"tracker.environment": "ideal", "tracker.environment.plate": PLATE.model_dump(mode="json"), **values}
+    )
+    phantom, tracker, control, room = np.random.SeedSequence(3).spawn(4)
+    seeds = Seeds(phantom, tracker, room)
+    rig = virtual_rig(scenario, plan.bevel, seeds, "model", plate_distance_at=passing)
+    rig = replace(rig, tracker=Interrupted(rig.tracker, rig.clock, span, calls))
+    return run(scenario, plan, rig, np.random.default_rng(control))
+
+
+def test_a_call_between_two_frames_ends_no_hold_and_aborts_nothing(plan):
+    done = interrupted(plan, (6.0, 6.06), calls=True)
+    silent = [period for period in done.periods if not period.readings]
+    assert silent
+    assert all(period.verdict.startswith("field distorted") for period in silent)
+    assert done.outcome == "done"
+
+
+def test_a_hold_for_a_reading_has_a_clock_of_its_own_after_a_hold_for_the_field(plan):
+    """The tip is lost while the field clears, for 0.7 s: less than the second that a reading is waited for."""
+    done = interrupted(plan, (7.0, 8.3), calls=False)
+    verdicts = [period.verdict.split(":")[0] for period in done.periods if period.decision == "held"]
+    assert {"field distorted", "missing"} <= set(verdicts)
+    assert done.outcome == "done"
+    lost = interrupted(plan, (7.0, 9.5), calls=False)
+    assert lost.outcome == "held"
+    assert "(limit 1 s): missing" in lost.reason
+
+
+def test_silence_of_the_tracker_holds_once_its_last_reading_is_stale(plan):
+    done = interrupted(plan, (2.0, 2.6), calls=True, **{"phantom.delay_periods": 0.0})
+    silent = [period for period in done.periods if not period.readings]
+    assert {period.verdict for period in silent} == {"ok", "missing: no reading"}
+    assert done.outcome == "done"
+
+
+def test_nothing_moves_before_the_field_was_judged(inserted):
+    for environment, verdict in (("ideal", "ok"), ("noisy", "field distorted")):
+        first = inserted(environment).periods[0]
+        assert first.time == 0.0
+        assert first.applied == (0.0, 0.0, 0.0, 0.0, -1)
+        assert len(first.readings) == 40
+        assert first.verdict.startswith(verdict)
+    held = inserted("noisy")
+    assert {period.applied for period in held.periods} == {(0.0, 0.0, 0.0, 0.0, -1)}
+    assert held.periods[-1].true_tip == held.periods[0].true_tip
 
 
 def test_without_a_plate_the_same_run_is_not_held(inserted):

@@ -47,7 +47,7 @@ def test_half_a_second_of_distortion_holds_and_names_the_sensor():
     _, verdicts = told(watch, (0.02, 0.09, 0.02), 1.0, 40)
     first = next(k for k, verdict in enumerate(verdicts) if verdict != OK)
     assert first in (19, 20, 21)
-    assert verdicts[-1] == "field distorted: ref2 0.0900, limit 0.0492 (median over 1 s)"
+    assert verdicts[-1] == "field distorted: ref2 0.0900, to fall below 0.0492 (median over 1 s)"
     assert set(verdicts[:first]) == {OK}
 
 
@@ -62,7 +62,7 @@ def test_once_held_the_indicator_has_to_fall_below_the_lower_limit():
     watch, verdicts = told(Watch(SETTINGS), (0.06, 0.02, 0.02), 0.0, 1)
     assert verdicts[0].startswith("field distorted")
     watch, verdicts = told(watch, (0.052, 0.02, 0.02), 0.1, 80)
-    assert verdicts[-1] == "field distorted: ref1 0.0520, limit 0.0492 (median over 1 s)"
+    assert verdicts[-1] == "field distorted: ref1 0.0520, to fall below 0.0492 (median over 1 s)"
     watch, verdicts = told(watch, (0.049, 0.02, 0.02), 3.0, 80)
     assert verdicts[-1] == OK
     assert told(watch, (0.052, 0.02, 0.02), 6.0, 80)[1][-1] == OK
@@ -135,6 +135,24 @@ def test_a_frozen_sensor_is_seen_although_the_map_to_the_tip_changes():
         sample = Sample(k / RATE, 30.0 + 0.01 * k, 1.0, 0.0, frame(k / RATE))
         watch, verdict = watch.take(sample, (30.0 + 0.125 * k, 1.0), sample.time, 0.3, 2.0)
     assert verdict == "frozen: the same in 4 readings while the tip should have moved 0.38 mm"
+
+
+@pytest.mark.parametrize("time", [1e6, -50.0, float("nan")])
+def test_a_reading_of_another_time_changes_no_judgement_of_the_field(time):
+    watch, _ = told(Watch(SETTINGS), (0.2, 0.02, 0.02), 0.0, 40)
+    sample = Sample(time, 30.0, 1.0, 0.0, replace(frame(1.0, (0.01, 0.01, 0.01)), number=1000))
+    after, verdict = watch.take(sample, (30.0, 1.0), 1.0, 0.3, 2.0)
+    assert verdict.startswith(("stale", "not a number"))
+    assert after is watch
+    assert after.look()[1].startswith("field distorted")
+
+
+def test_the_last_good_reading_counts_until_it_is_old_and_only_of_frames():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
+    assert watch.last_good(0.35, 0.3) == watch.good
+    assert watch.last_good(0.36, 0.3) is None
+    bare, _ = Watch(SETTINGS).take(Sample(0.0, 30.0, 1.0), (30.0, 1.0), 0.0, 0.3, 2.0)
+    assert bare.last_good(0.0, 0.3) is None
 
 
 def test_a_tip_lost_in_a_few_frames_is_not_held_against_the_tracker():

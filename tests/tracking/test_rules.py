@@ -118,7 +118,12 @@ def test_the_last_digit_makes_a_reading_new():
     assert rules.frozen(places, travelled(4, 1.0), 0.3) == OK
 
 
-@pytest.mark.parametrize("places", [[], [None], [(30.0, 1.0), None], [(30.0, 1.0), None, (30.0, 1.0)]])
+def test_frames_without_the_tip_do_not_thaw_a_frozen_one():
+    places = [(30.0, 1.0), None] * 4 + [(30.0, 1.0)]
+    assert rules.frozen(places, travelled(9, 0.1), 0.3).startswith("frozen: the same in 5 readings")
+
+
+@pytest.mark.parametrize("places", [[], [None], [(30.0, 1.0), None]])
 def test_what_was_not_seen_is_not_frozen(places):
     assert rules.frozen(places, travelled(len(places), 1.0), 0.3) == OK
 

@@ -4,7 +4,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from flexneedle.errors import RunError
 from flexneedle.phantom import DEFAULT_PLANT
 from flexneedle.ports import Command
 from flexneedle.run.rig import Rig, Seeds, virtual_rig
-from flexneedle.run.sight import Sight, see
+from flexneedle.run.sight import Sight, look_around, see
 from flexneedle.scenario import Scenario
 from flexneedle.simulator import Simulator
 from flexneedle.trace import Insertion, Period, PlanRecord
@@ -99,18 +99,23 @@ def _periods(
 
     After the last move the needle rests until the tracker has seen it at rest: readings come late.
     """
-    scenario = task.scenario
-    sight = Sight(chosen.beliefs.begin(task.simulator, task.plan.bevel), Watch(scenario.monitor))
-    memory = chosen.begin(task)
-    held_since: float | None = None
+    scenario, memory = task.scenario, chosen.begin(task)
+    belief = chosen.beliefs.begin(task.simulator, task.plan.bevel)
+    start = time.perf_counter()
+    sight = look_around(scenario, belief, Watch(scenario.monitor), rig.clock.now(), rig.tracker)
+    held, indices = _held(None, sight, rig.clock.now()), itertools.count()
+    if sight.readings:
+        clocks = [start, start, start, time.perf_counter()]
+        looks = Decision(_STILL, "looks before it moves")
+        yield _record(next(indices), rig.clock.now(), task.plan, rig, looks, _STILL, sight, clocks), None
     arrived_at: float | None = None
     moves = 0
-    for index in itertools.count():
+    for index in indices:
         if moves == _TOO_MANY * len(task.plan.controls):
             return
         clocks = [time.perf_counter()]
         begun, wait = rig.clock.now(), scenario.tracker.period
-        if held_since is not None:
+        if held is not None:
             decision = Decision(_STILL, "held")
         elif arrived_at is not None:
             decision, wait = (
@@ -127,14 +132,29 @@ def _periods(
         sight = see(scenario, moved, sight.watch, begun, rig.clock.now(), rig.tracker)
         clocks.append(time.perf_counter())
         now, good = rig.clock.now(), sight.verdict == OK
-        held_since = None if good else (now if held_since is None else held_since)
+        held = _held(held, sight, now)
         if arrived_at is None and good and chosen.arrived(task, memory, sight.estimate):
             arrived_at = now
         seen = arrived_at is not None and good and sight.sample.time > arrived_at - 1e-6
-        ending = _ending(task, sight, 0.0 if held_since is None else now - held_since, seen)
+        ending = _ending(task, sight, None if held is None else now - held.since, seen)
         yield _record(index, now, task.plan, rig, decision, applied, sight, clocks), ending
         if ending is not None:
             return
+
+
+@dataclass(frozen=True)
+class _Held:
+    """Whether the needle is held for the field, or for a reading, and since when (s)."""
+
+    field: bool
+    since: float
+
+
+def _held(held: _Held | None, sight: Sight, now: float) -> _Held | None:
+    """The hold after a verdict: each of the two causes has a clock and a limit of its own."""
+    if sight.verdict == OK:
+        return None
+    return held if held is not None and held.field == sight.field else _Held(sight.field, now)
 
 
 def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> Command:
@@ -147,13 +167,13 @@ def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> C
     return rig.driver.apply(command, max(1, readings) * reading)
 
 
-def _ending(task: Task, sight: Sight, held: float, seen: bool) -> tuple[str, str] | None:
-    """How the insertion ends after this period, if it does; held: for how long it has been (s)."""
-    estimate = sight.estimate
+def _ending(task: Task, sight: Sight, held: float | None, seen: bool) -> tuple[str, str] | None:
+    """How the insertion ends after this period, if it does; held: for how long it has been (s), None if it is not."""
+    estimate, limit = sight.estimate, sight.limit(task.scenario)
     if not estimate.state.converged:
         return "failed", f"the model did not converge: residual {estimate.state.residual:.3g} mm"
-    if sight.verdict != OK and held > sight.limit - 1e-9:
-        return "held", f"held for {held:.2f} s (limit {sight.limit:g} s): {sight.verdict}"
+    if held is not None and held > limit - 1e-9:
+        return "held", f"held for {held:.2f} s (limit {limit:g} s): {sight.verdict}"
     if not seen:
         return None
     short = task.plan.target[0] - float(estimate.tip[0])

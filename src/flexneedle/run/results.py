@@ -48,6 +48,8 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
             "residual_mm": insertion.residual_mm,
             "planned_error_mm": plan.error_mm,
             "reached": bool(insertion.reached),
+            "outcome": insertion.outcome,
+            "reason": insertion.reason,
             "flips": insertion.flips,
             "planned_flips": plan.flips,
             "strain_energy_mj": last.true_strain_energy if last else None,

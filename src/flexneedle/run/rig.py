@@ -151,6 +151,7 @@ def _field_tracker(
         rng,
         center=center,
         delay=_delay(scenario),
+        ahead=scenario.monitor.indicator_window_s,  # it runs before the needle does
         missing=scenario.phantom.missing_fraction,
         to_tracker=registered.inverse().after(errors.registration),
         plate_distance_at=plate_distance_at,

@@ -1,5 +1,6 @@
 """What the closed loop makes of the tracker's readings in a period: judged, believed or not."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from flexneedle.control.estimate import Estimate
@@ -8,7 +9,7 @@ from flexneedle.scenario import Scenario
 from flexneedle.trace import Judged
 from flexneedle.tracking import OK, Watch
 
-__all__ = ["Sight", "see"]
+__all__ = ["Sight", "look_around", "see"]
 
 _NO_SAMPLE = Sample(0.0, None, None)
 
@@ -17,8 +18,8 @@ _NO_SAMPLE = Sample(0.0, None, None)
 class Sight:
     """The belief after the readings of a period, all of them with their verdicts, and the verdict of the period.
 
-    sample: the reading that the verdict is about, an empty one without any; limit: how long (s) the needle may be
-    held for such a verdict.
+    sample: the reading that the verdict is about, an empty one without any; field: whether the verdict is about the
+    field, not about a reading.
     """
 
     estimate: Estimate
@@ -26,7 +27,28 @@ class Sight:
     readings: tuple[Judged, ...] = ()
     sample: Sample = _NO_SAMPLE
     verdict: str = OK
-    limit: float = 0.0
+    field: bool = False
+
+    def limit(self, scenario: Scenario) -> float:
+        """For how long (s) the needle may be held for such a verdict."""
+        return scenario.monitor.abort_after_s if self.field else scenario.control.hold_limit_s
+
+
+def look_around(
+    scenario: Scenario, estimate: Estimate, watch: Watch, now: float, tracker: TipTracker
+) -> Sight:
+    """Judge what the tracker told before the needle moves; nothing of it is learnt, and no news is no bad news."""
+    samples = tracker.read()
+    if not samples:
+        return Sight(estimate, watch)
+    span = now - samples[0].time + scenario.control.stale_after_s
+    watch, readings = _judged(scenario, estimate, watch, samples, [span] * len(samples), now)
+    watch, field = watch.look()
+    newest = readings[-1]
+    verdict = field if field != OK else newest.verdict
+    if verdict == newest.verdict and watch.only_missed(newest.sample) is not None:
+        verdict = OK
+    return Sight(estimate, watch, readings, newest.sample, verdict, field != OK)
 
 
 def see(
@@ -36,27 +58,48 @@ def see(
 
     begun, now: of the move that `predicted` ends with (s). In a distorted field no reading is believed.
     """
-    control = scenario.control
+    stale_after = scenario.control.stale_after_s
     samples = tracker.read()
     if not samples:
-        return Sight(predicted.unseen(), watch, verdict="missing: no reading", limit=control.hold_limit_s)
+        return _without_news(predicted, watch, now, stale_after)
     # All but the newest were on their way while the needle moved.
-    ages = [control.stale_after_s + now - begun] * (len(samples) - 1) + [control.stale_after_s]
+    ages = [stale_after + now - begun] * (len(samples) - 1) + [stale_after]
+    watch, readings = _judged(scenario, predicted, watch, samples, ages, now)
+    newest = readings[-1]
+    watch, field = watch.look()
+    if field != OK:
+        return Sight(predicted.unseen(), watch, readings, newest.sample, field, field=True)
+    good = [reading.sample for reading in readings if reading.verdict == OK]
+    corrected = predicted.observe(good)
+    if newest.verdict == OK:
+        return Sight(corrected, watch, readings, newest.sample)
+    if (before := watch.only_missed(newest.sample)) is not None:
+        return Sight(corrected if good else corrected.unseen(), watch, readings, before)
+    return Sight(corrected.unseen(), watch, readings, newest.sample, newest.verdict)
+
+
+def _without_news(predicted: Estimate, watch: Watch, now: float, stale_after: float) -> Sight:
+    """A period between two frames: the field is as it was, and the last good reading counts until it is stale."""
+    if watch.field != OK:
+        return Sight(predicted.unseen(), watch, verdict=watch.field, field=True)
+    if (before := watch.last_good(now, stale_after)) is not None:
+        return Sight(predicted.unseen(), watch, sample=before)
+    return Sight(predicted.unseen(), watch, verdict="missing: no reading")
+
+
+def _judged(
+    scenario: Scenario,
+    believed: Estimate,
+    watch: Watch,
+    samples: Sequence[Sample],
+    ages: Sequence[float],
+    now: float,
+) -> tuple[Watch, tuple[Judged, ...]]:
+    """Take in samples, each not to be older than its age (s)."""
     readings = []
     for sample, age in zip(samples, ages, strict=True):
         watch, verdict = watch.take(
-            sample, predicted.tip_at(sample.time), now, age, control.innovation_limit_mm
+            sample, believed.tip_at(sample.time), now, age, scenario.control.innovation_limit_mm
         )
         readings.append(Judged(sample, verdict))
-    newest, told = readings[-1], tuple(readings)
-    watch, field = watch.look()
-    if field != OK:
-        limit = scenario.monitor.abort_after_s
-        return Sight(predicted.unseen(), watch, told, newest.sample, field, limit)
-    good = [reading.sample for reading in readings if reading.verdict == OK]
-    corrected, limit = predicted.observe(good), control.hold_limit_s
-    if newest.verdict == OK:
-        return Sight(corrected, watch, told, newest.sample, OK, limit)
-    if (before := watch.only_missed(newest.sample)) is not None:
-        return Sight(corrected if good else corrected.unseen(), watch, told, before, OK, limit)
-    return Sight(corrected.unseen(), watch, told, newest.sample, newest.verdict, limit)
+    return watch, tuple(readings)

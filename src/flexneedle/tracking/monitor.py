@@ -1,6 +1,5 @@
 """The watch over the tracker: what it remembers of past readings, and whether it lets the needle move."""
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -27,7 +26,7 @@ def field_verdict(frames: Sequence[Frame], settings: Monitor, distorted: bool = 
                 indicators.setdefault(name, []).append(reading.indicator)
     limit = settings.indicator_limit * (settings.resume_fraction if distorted else 1.0)
     unseen = rules.unseen_references(indicators, settings.references, window)
-    return unseen if unseen != OK else rules.distortion(indicators, limit, window)
+    return unseen if unseen != OK else rules.distortion(indicators, limit, window, distorted)
 
 
 @dataclass(frozen=True)
@@ -40,41 +39,53 @@ class _Seen:
 class Watch:
     """What the monitor remembers. Frozen: `take` and `look` return the next one.
 
-    recent: readings within the window; good: the last one without fault; distorted: whether the field held the needle.
+    recent: readings within the window; good: the last one without fault; field: the last verdict on the field.
     """
 
     settings: Monitor
     recent: tuple[_Seen, ...] = ()
     good: Sample | None = None
-    distorted: bool = False
+    field: str = OK
 
     def take(
         self, sample: Sample, predicted: tuple[float, float], now: float, oldest: float, furthest: float
     ) -> "tuple[Watch, str]":
-        """Take in a reading; return what is wrong with it, or OK.
+        """Take in a reading; return what is wrong with it, or OK. One of another time is not remembered.
 
         predicted: the model's tip (mm) at its time; now (s); oldest: age (s), furthest: distance (mm) from the
         prediction beyond which no reading is believed.
         """
         before = self.recent[-1].sample.frame if self.recent else None
-        verdict = rules.first_bad([rules.not_a_number(sample), rules.repeated(sample.frame, before)])
+        verdict = rules.first_bad(
+            (
+                rules.not_a_number(sample),
+                rules.repeated(sample.frame, before),
+                rules.stale(sample.time, now, oldest),
+            )
+        )
         if verdict != OK:
             return self, verdict
         since = sample.time - self.settings.indicator_window_s + 1e-9
         kept = tuple(seen for seen in self.recent if seen.sample.time > since)
         watch = replace(self, recent=(*kept, _Seen(sample, predicted)))
-        verdict = rules.first_bad(watch._faults(sample, predicted, now, oldest, furthest))
+        verdict = rules.first_bad(watch._faults(sample, predicted, furthest))
         return (replace(watch, good=sample) if verdict == OK else watch), verdict
+
+    def last_good(self, now: float, oldest: float) -> Sample | None:
+        """Return the last good reading, if it is not older than `oldest` (s) and of a tracker that tells frames."""
+        good = self.good
+        if not self.settings.enabled or good is None or good.frame is None or now - good.time > oldest + 1e-9:
+            return None
+        return good
 
     def only_missed(self, newest: Sample) -> Sample | None:
         """Return the last good reading if the tip was lost in the newest frame, but not for long; None otherwise.
 
         Only of a tracker that tells frames: it is known to be alive, and to look.
         """
-        if not self.settings.enabled or newest.frame is None or rules.missing(newest) == OK:
+        if newest.frame is None or rules.missing(newest) == OK:
             return None
-        lost_for = math.inf if self.good is None else newest.time - self.good.time
-        return self.good if lost_for <= self.settings.lost_after_s + 1e-9 else None
+        return self.last_good(newest.time, self.settings.lost_after_s)
 
     def look(self) -> "tuple[Watch, str]":
         """Judge the field by the reference sensors; return why the needle may not move, or OK.
@@ -84,15 +95,12 @@ class Watch:
         frames = [seen.sample.frame for seen in self.recent if seen.sample.frame is not None]
         if not self.settings.enabled or not frames:
             return self, OK
-        verdict = field_verdict(frames, self.settings, self.distorted)
-        return replace(self, distorted=verdict != OK), verdict
+        verdict = field_verdict(frames, self.settings, self.field != OK)
+        return replace(self, field=verdict), verdict
 
-    def _faults(
-        self, sample: Sample, predicted: tuple[float, float], now: float, oldest: float, furthest: float
-    ) -> Iterator[str]:
+    def _faults(self, sample: Sample, predicted: tuple[float, float], furthest: float) -> Iterator[str]:
         settings = self.settings
         yield rules.missing(sample)
-        yield rules.stale(sample.time, now, oldest)
         if sample.x is not None and sample.y is not None:
             yield rules.innovation((sample.x, sample.y), predicted, furthest)
         if settings.enabled:

@@ -93,11 +93,12 @@ def frozen(
 
     places, predicted: of the readings up to the newest, oldest first; None where nothing was seen.
     """
-    newest = places[-1] if places else None
-    if newest is None:
+    if not places or places[-1] is None:
         return OK
-    same = next((k for k, place in enumerate(reversed(places)) if place != newest), len(places))
-    travel = math.dist(predicted[-same], predicted[-1])
+    seen = [(place, model) for place, model in zip(places, predicted, strict=True) if place is not None]
+    newest, now = seen[-1]
+    same = next((k for k, (place, _) in enumerate(reversed(seen)) if place != newest), len(seen))
+    travel = math.dist(seen[-same][1], now)
     if travel <= travel_limit:
         return OK
     return f"frozen: the same in {same} readings while the tip should have moved {travel:.2f} mm"
@@ -111,13 +112,19 @@ def unseen_references(indicators: Mapping[str, Sequence[float]], needed: int, wi
     return f"field not known: {told} of {needed} reference sensors seen within {window:g} s"
 
 
-def distortion(indicators: Mapping[str, Sequence[float]], limit: float, window: float) -> str:
-    """The median indicator of a reference sensor over the window (s) is above the limit; names the worst one."""
+def distortion(
+    indicators: Mapping[str, Sequence[float]], limit: float, window: float, held: bool = False
+) -> str:
+    """The median indicator of a reference sensor over the window (s) is above the limit; names the worst one.
+
+    held: whether it was above before, so that the limit is the lower one, for going on.
+    """
     medians = {name: median(values) for name, values in indicators.items() if values}
     worst = max(medians, key=lambda name: medians[name], default=None)
     if worst is None or medians[worst] <= limit:
         return OK
-    return f"field distorted: {worst} {medians[worst]:.4f}, limit {limit:.4f} (median over {window:g} s)"
+    rule = "to fall below" if held else "limit"
+    return f"field distorted: {worst} {medians[worst]:.4f}, {rule} {limit:.4f} (median over {window:g} s)"
 
 
 def _shared(one: Sample, other: Sample) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -229,7 +229,7 @@ def test_the_studies_of_the_package_can_be_carried_out():
         "imperfections": 16 * 150,
         "guide-distance": 7 * 150,
         "gauges": 8 * 150,
-        "tracker": 6 * 150,
+        "tracker": 5 * 150,
     }
 
 

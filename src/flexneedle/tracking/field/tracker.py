@@ -23,7 +23,8 @@ class FieldTracker:
     """Reads the sensors of `poses_at(time)`, by name, poses in the stage's frame, every `period` s. A `Tracker`.
 
     room: its errors, whose middle lies at `center` (mm) in the stage's frame. A frame arrives `delay` s after it was
-    taken, with the time at which it was taken; each sensor on its own sees nothing in a share `missing` of them.
+    taken, with the time at which it was taken; the first one was taken `delay` and `ahead` s before the start. Each
+    sensor on its own sees nothing in a share `missing` of them.
     to_tracker maps the stage's frame to that in which readings are told. plate_distance_at(time): how far the plate
     is from the middle, mm; left out, as in the environment. The roll of the tip sensor, which has one coil, is not
     known: its orientation is the shortest turn to its axis.
@@ -39,6 +40,7 @@ class FieldTracker:
         *,
         center: Point = (0.0, 0.0, 0.0),
         delay: float = 0.0,
+        ahead: float = 0.0,
         missing: float = 0.0,
         to_tracker: Rigid | None = None,
         plate_distance_at: Callable[[float], float] | None = None,
@@ -53,7 +55,9 @@ class FieldTracker:
         after, before = rng.spawn(2)
         self._rngs = dict(zip(SENSORS, after.spawn(len(SENSORS)), strict=True))
         self._rngs_before = dict(zip(SENSORS, before.spawn(len(SENSORS)), strict=True))
-        self._taken = -math.ceil(delay / period - 1e-6)  # the last frame; number k is taken at k periods
+        self._taken = -math.ceil(
+            (delay + ahead) / period - 1e-6
+        )  # the last frame; number k is taken at k periods
         self._first = self._taken + 1
         self._still: dict[str, tuple[tuple[Pose, float | None], Noiseless]] = {}
 
