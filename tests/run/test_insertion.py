@@ -1,6 +1,7 @@
 """The closed loop against trackers and drivers that fail, and against no phantom at all."""
 
 import dataclasses
+import itertools
 import math
 import pkgutil
 import subprocess
@@ -61,7 +62,7 @@ class Stage:
     """No phantom: a clock that adds up, a driver and a tracker that play tapes; off tape commands are carried out."""
 
     def __init__(self, tape, applied=()):
-        self.time, self.tape, self.applied = 0.0, iter(tape), iter(applied)
+        self.time, self.tape, self.applied = 0.0, itertools.chain([()], tape), iter(applied)
 
     def now(self):
         return self.time
@@ -74,7 +75,7 @@ class Stage:
         return next(self.applied, command)
 
     def read(self):
-        return next(self.tape) if self.time > 0.0 else ()
+        return next(self.tape)
 
     def rig(self):
         return Rig(self, self, self)
