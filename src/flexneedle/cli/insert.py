@@ -87,7 +87,7 @@ def _insert(args: argparse.Namespace) -> int:
         )
         if insertion.outcome == "done":
             progress.finish("Inserting")
-    return _report(insertion, args.json, folder.path)
+    return _report(scenario, insertion, args.json, folder.path)
 
 
 def _choices(args: argparse.Namespace) -> Choices:
@@ -127,7 +127,7 @@ class _Show:
         self._progress.show("Inserting", done, self._travel, f"tip at {depth:.1f} mm")
 
 
-def _report(insertion: Insertion, as_json: bool, folder: Path) -> int:
+def _report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:
     from flexneedle.run.results import insertion_result, insertion_timing
 
     if insertion.outcome == "interrupted":
@@ -137,11 +137,11 @@ def _report(insertion: Insertion, as_json: bool, folder: Path) -> int:
         result, timing = insertion_result(insertion), insertion_timing(insertion)
         print_json({**result, "run_dir": str(folder), "timing": timing})
     else:
-        _table(insertion, folder)
+        _table(scenario, insertion, folder)
     return 0 if insertion.reached else 1
 
 
-def _table(insertion: Insertion, folder: Path) -> None:
+def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
     from flexneedle.run.results import insertion_result, insertion_timing
     from flexneedle.trace.summary import verdict
 
@@ -154,6 +154,7 @@ def _table(insertion: Insertion, folder: Path) -> None:
         ("true distance from the target", _number(result["true_error_mm"], "mm")),
         ("  by the tracker", _number(result["residual_mm"], "mm")),
         ("  as planned", _number(result["planned_error_mm"], "mm")),
+        *_registration(scenario, insertion),
         ("energy in the true tissue", _number(result["strain_energy_mj"], "mJ")),
         ("  as planned", _number(result["planned_strain_energy_mj"], "mJ")),
         ("bevel turns", str(insertion.flips)),
@@ -164,6 +165,15 @@ def _table(insertion: Insertion, folder: Path) -> None:
         ("time of a period, median", _number(timing["period_ms"]["p50"], "ms")),
     ]
     print_table(verdict(insertion)[:1].upper() + verdict(insertion)[1:], rows, folder)
+
+
+def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, str]]:
+    from flexneedle.run.em.register import expected_error
+
+    if scenario.tracker.registration is None:
+        return []
+    error = expected_error(scenario.tracker.registration, (*insertion.target, 0.0))
+    return [("  expected error of the registration", _number(error, "mm"))]
 
 
 def _number(value: float | None, unit: str) -> str:

@@ -14,10 +14,21 @@ from flexneedle.errors import InputError
 
 Floats = NDArray[np.float64]
 
-__all__ = ["Rigid", "fiducial_error", "fit_rigid", "identity", "localisation_error", "target_error"]
+__all__ = [
+    "Rigid",
+    "fiducial_error",
+    "fit_rigid",
+    "identity",
+    "localisation_error",
+    "refuse_nonsense",
+    "target_error",
+]
 
 _FLAT = 1e-6  # second spread over the first, below which points lie on a line
 _LEAST = 3
+_SIZES = 3.0  # times that two clouds of the same body may differ in size, with any error worth a registration
+_LOOSE = 0.1  # residual over size from which on nothing was registered
+_MIRRORED = 0.3  # residual of a mirrored fit over that of the best rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +70,33 @@ def fit_rigid(moving: Floats, fixed: Floats) -> Rigid:
     mirrored = np.linalg.det(left @ right) < 0.0
     rotation = right.T @ np.diag([1.0, 1.0, -1.0 if mirrored else 1.0]) @ left.T
     return Rigid(rotation, aim - rotation @ middle)
+
+
+def refuse_nonsense(moving: Floats, fixed: Floats) -> None:
+    """Raise InputError where pairs (n, 3) cannot be of one rigid body: other units, a mirrored frame, no fit at all."""
+    size, aim = _radius(moving), _radius(fixed)
+    if not 1.0 / _SIZES < aim / size < _SIZES:
+        raise InputError(
+            f"the tracker's points lie {size:.3g} mm about their middle, the stage's {aim:.3g} mm (RMS): "
+            "both must be in mm, and the sensor must have moved with the stage"
+        )
+    error = fiducial_error(fit_rigid(moving, fixed), moving, fixed)
+    mirror = moving * np.array([1.0, 1.0, -1.0])
+    mirrored = fiducial_error(fit_rigid(mirror, fixed), mirror, fixed)
+    if mirrored < _MIRRORED * error and error > _LOOSE * aim:
+        raise InputError(
+            f"a mirrored frame fits far better (residual {mirrored:.3g} mm, not {error:.3g} mm): "
+            "one of the two frames is left-handed, or an axis has the wrong sign"
+        )
+    if error > _LOOSE * aim:
+        raise InputError(
+            f"the fit leaves {error:.3g} mm (RMS) of points that lie {aim:.3g} mm about their middle: "
+            "are points swapped, axes exchanged, or did the sensor not move?"
+        )
+
+
+def _radius(points: Floats) -> float:
+    return math.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1)))
 
 
 def fiducial_error(rigid: Rigid, moving: Floats, fixed: Floats) -> float:

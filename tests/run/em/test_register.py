@@ -65,6 +65,26 @@ def test_rows_of_a_point_are_averaged_and_unseen_ones_left_out(tmp_path):
     assert found.pairs.missing == 3
 
 
+def test_metres_are_read_where_that_is_said(tmp_path):
+    data = [(row[0], *(1e-3 * value for value in row[1:7]), row[7]) for row in rows(0.3)]
+    told = register(read_pairs(table(tmp_path, data), unit="m"))
+    np.testing.assert_allclose(told.fiducial, register(read_pairs(table(tmp_path, rows(0.3)))).fiducial)
+
+
+def test_a_target_that_is_no_place_is_refused_and_nothing_is_written(tmp_path, capsys):
+    out = tmp_path / "r.toml"
+    with pytest.raises(SystemExit):
+        main(["em", "register", str(table(tmp_path, rows())), "--target", "nan", "0", "0", "--out", str(out)])
+    assert "must be a finite number" in capsys.readouterr().err
+    assert not list(tmp_path.glob("r.*"))
+
+
+def test_a_row_without_an_id_is_no_other_point(tmp_path):
+    data = [("1", *rows()[0][1:]), ("", *rows()[1][1:]), *rows()[2:]]
+    data[1], data[0] = data[0], data[1]
+    assert len(read_pairs(table(tmp_path, data)).names) == 8
+
+
 def test_without_point_ids_each_row_is_a_point(tmp_path):
     path = table(tmp_path, [row[1:7] for row in rows()], HEAD[9:-7])
     assert register(read_pairs(path)).values()["points"] == 8
@@ -82,8 +102,35 @@ def test_without_point_ids_each_row_is_a_point(tmp_path):
         ([*rows(), ("p0", 1, 2, 3, 4, 5, 6, "ref1")], "point p0 has several places on the stage"),
         ([*rows(), *rows(sensor="tip")], "choose one with --sensor: ref1, tip"),
         ([(*row[:4], "", "", "", "ref1") for row in rows()], "no reading has a place"),
+        ([(*row[:4], *(1e-3 * v for v in row[4:7]), "ref1") for row in rows()], "both must be in mm"),
+        ([(*row[:4], -row[4], *row[5:]) for row in rows()], "one of the two frames is left-handed"),
+        (
+            [(*a[:4], *b[4:]) for a, b in zip(rows(), rows()[1:] + rows()[:1], strict=True)],
+            "are points swapped",
+        ),
+        (
+            [(*row[:4], 1.0 + 1e-3 * k, 2.0, 3.0 + 1e-6 * k**2, "ref1") for k, row in enumerate(rows())],
+            "have moved",
+        ),
+        (
+            [*rows()[1:], (*rows()[0][:4], -3.697314e28, -3.697314e28, -3.697314e28, "ref1")],
+            "row 8 has a coordinate b",
+        ),
     ],
-    ids=["empty", "two", "half a place", "two places", "two sensors", "unseen"],
+    ids=[
+        *(
+            "empty",
+            "two",
+            "half a place",
+            "two places",
+            "two sensors",
+            "unseen",
+            "metres",
+            "mirrored",
+            "swapped",
+        ),
+        *("not moved", "code"),
+    ],
 )
 def test_what_cannot_be_registered_is_refused(tmp_path, data, words, capsys):
     assert main(["em", "register", str(table(tmp_path, data)), "--out", str(tmp_path / "r.toml")]) == 2

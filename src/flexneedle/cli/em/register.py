@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,7 +33,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--target",
         nargs=3,
-        type=float,
+        type=_finite,
         action="append",
         default=[],
         metavar=("X", "Y", "Z"),
@@ -45,6 +46,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="THEIRS=OURS",
         help="a column of another name, or a TOML file of such; may be repeated",
     )
+    parser.add_argument("--unit", choices=("mm", "m"), default="mm", help="of all coordinates (mm)")
     parser.add_argument(
         "--out", type=Path, default=Path("registration.toml"), metavar="FILE", help="(registration.toml)"
     )
@@ -52,13 +54,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(handler=_register)
 
 
-def _register(args: argparse.Namespace) -> int:
-    from flexneedle.run.em.register import draw_registration, read_pairs, register, write_registration
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text}: must be a finite number")
+    return value
 
-    pairs = read_pairs(args.data, args.columns, args.sensor, args.environment)
+
+def _register(args: argparse.Namespace) -> int:
+    from flexneedle.run.em.register import read_pairs, register, write_registration
+
+    pairs = read_pairs(args.data, args.columns, args.sensor, args.environment, args.unit)
     registered = register(pairs, [tuple(target) for target in args.target])
     write_registration(registered, args.out)
-    draw_registration(registered, args.out)
     if args.json:
         print_json({**registered.values(), "file": str(args.out)})
     else:

@@ -24,6 +24,7 @@ from flexneedle.tracking.registration import (
     fiducial_error,
     fit_rigid,
     localisation_error,
+    refuse_nonsense,
     target_error,
 )
 from flexneedle.tracking.table import REQUIRED
@@ -31,7 +32,7 @@ from flexneedle.tracking.table import REQUIRED
 __all__ = [
     "Pairs",
     "Registered",
-    "draw_registration",
+    "expected_error",
     "load_registration",
     "read_pairs",
     "register",
@@ -43,6 +44,8 @@ Point = tuple[float, float, float]
 
 _NUMBERS = REQUIRED[1:7]
 _LABELS = ("point_id", "sensor", "environment")
+_FURTHEST_MM = 1e6
+_SAME_MM = 1e-3
 _HEAD = """\
 # The tracker's frame in the stage's, by flexneedle em register. Paste the first table into a scenario, or give this
 # file to flexneedle insert --registration.
@@ -113,28 +116,37 @@ class Registered:
 
 
 def read_pairs(
-    data: Path, columns: Sequence[str] = (), sensor: str | None = None, environment: str | None = None
+    data: Path,
+    columns: Sequence[str] = (),
+    sensor: str | None = None,
+    environment: str | None = None,
+    unit: str = "mm",
 ) -> Pairs:
     """Return the fiducials of a table: each row one, or rows of one `point_id` taken together.
 
-    columns: as for `em evaluate`; sensor, environment: which, where the table has several. Raises InputError.
+    columns: as for `em evaluate`; sensor, environment: which, where the table has several; unit: "mm" or "m", of all
+    coordinates. Raises InputError.
     """
     theirs = column_map(columns)
     chosen = {"sensor": sensor, "environment": environment}
     try:
         rows = [_rows(batch) for batch in read_batches(data, theirs, _NUMBERS, _LABELS)]
+        if not rows:
+            raise InputError("has no rows")
         labels = {name: np.concatenate([part[0][name] for part in rows]) for name in _LABELS}
-        numbers = np.concatenate([part[1] for part in rows])
+        numbers = np.concatenate([part[1] for part in rows]) * {"mm": 1.0, "m": 1e3}[unit]
         return _pairs(labels, numbers, _kept(labels, chosen))
     except InputError as error:
         raise InputError(f"{data}: {error}") from None
-    except ValueError:
-        raise InputError(f"{data}: has no rows") from None
 
 
 def register(pairs: Pairs, targets: Sequence[Point] = ()) -> Registered:
-    """Return the registration of the pairs; without targets its error is told at the middle of the fiducials."""
+    """Return the registration of the pairs; without targets its error is told at the middle of the fiducials.
+
+    Raises InputError for pairs that no rigid body can have.
+    """
     rigid = fit_rigid(pairs.tracker, pairs.stage)
+    refuse_nonsense(pairs.tracker, pairs.stage)
     residuals = np.linalg.norm(rigid.apply(pairs.tracker) - pairs.stage, axis=1)
     fiducial = fiducial_error(rigid, pairs.tracker, pairs.stage)
     localisation = localisation_error(fiducial, len(pairs.names))
@@ -143,8 +155,22 @@ def register(pairs: Pairs, targets: Sequence[Point] = ()) -> Registered:
     return Registered(pairs, rigid, residuals, _left_out(pairs), fiducial, localisation, places, expected)
 
 
+def expected_error(registration: Registration, target: Point) -> float:
+    """Return the expected RMS error (mm) of a registration at a target in the stage's frame."""
+    fiducials = np.array(registration.fiducials_mm)
+    return float(target_error(fiducials, registration.localisation_mm, np.array([target]))[0])
+
+
 def write_registration(registered: Registered, path: Path) -> None:
-    """Write a TOML file: a table for a scenario, and the errors. Raises InputError if the file is there already."""
+    """Write a TOML file, a table for a scenario and the errors, and its picture beside it, `.png` and `.svg`.
+
+    Raises InputError if the file is there already.
+    """
+    if path.exists():
+        raise InputError(f"{path}: is there already: name another with --out")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: no such folder: {path.parent}")
+    _draw(registered, path)
     values = {
         "tracker": {"registration": registered.registration.model_dump(mode="json")},
         "result": registered.values(),
@@ -158,8 +184,7 @@ def write_registration(registered: Registered, path: Path) -> None:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def draw_registration(registered: Registered, path: Path) -> list[Path]:
-    """Draw the registration beside its file `path`, `.png` and `.svg`; return the paths."""
+def _draw(registered: Registered, path: Path) -> None:
     stage, error = registered.pairs.stage, registered.localisation
     figure = registration_figure(
         stage,
@@ -167,7 +192,7 @@ def draw_registration(registered: Registered, path: Path) -> list[Path]:
         registered.targets,
         lambda points: target_error(stage, error, points),
     )
-    return save(figure, path.parent, path.stem)
+    save(figure, path.parent, path.stem)
 
 
 def load_registration(path: Path, scenario: Scenario) -> Scenario:
@@ -214,17 +239,22 @@ def _pairs(labels: Mapping[str, NDArray[Any]], numbers: Floats, kept: NDArray[np
     kept_seen = kept & ~unseen
     if not kept_seen.any():
         raise InputError("no reading has a place")
+    far = kept_seen & (np.abs(numbers) > _FURTHEST_MM).any(axis=1)
+    if far.any():
+        raise InputError(
+            f"row {int(far.argmax()) + 1} has a coordinate beyond 1 km: a code for a missing place?"
+        )
     if not np.isfinite(numbers[kept_seen]).all():
         row = int(np.flatnonzero(kept_seen & ~np.isfinite(numbers).all(axis=1))[0])
         raise InputError(f"row {row + 1} has a coordinate that is not a finite number")
-    names = [str(name) if name is not None else str(k + 1) for k, name in enumerate(labels["point_id"])]
+    names = [str(name) if name is not None else f"row {k + 1}" for k, name in enumerate(labels["point_id"])]
     names = [name for name, keep in zip(names, kept_seen, strict=True) if keep]
     order = {name: k for k, name in enumerate(dict.fromkeys(names))}
     point = np.array([order[name] for name in names], dtype=np.int64)
     count = np.bincount(point, minlength=len(order))
     places = stage[kept_seen]
     first = np.unique(point, return_index=True)[1]
-    apart = np.abs(places - places[first][point]).max(axis=1, initial=0.0) > 1e-6
+    apart = np.abs(places - places[first][point]).max(axis=1, initial=0.0) > _SAME_MM
     if apart.any():
         raise InputError(
             f"point {names[int(apart.argmax())]} has several places on the stage: one point, one place"

@@ -44,7 +44,7 @@ class _Cells:
         self.missing = np.zeros(0, dtype=np.int64)
         self.true, self.position = Moments(3), Moments(3)
         self.distance, self.indicator = Moments(1), Moments(1)
-        self.orientation = Moments(len(_UPPER[0]))
+        self.orientation = Moments(len(_UPPER[0]), scattered=False)
         self._singles = Singles()
 
     def add(self, batch: Batch) -> None:
@@ -61,14 +61,15 @@ class _Cells:
         seen = seen_rows(position, start)
         if seen is not None:
             self.missing = add_counts(self.missing, cell[~seen], len(self.keys))
-        self._add(self.true, cell, true, seen)
+        self._add(self.true, cell, true, None)
         self._add(self.position, cell, position, seen)
-        self._check_moved(cell, true, seen, start)
+        self._check_moved(cell, true, start)
         if distance is not None:
             self._add(self.distance, cell, (distance * self._scale,), _both(seen, ~np.isnan(distance)))
         if any(name in batch.numbers for name in _QUATERNION):
             self._add_orientation(batch, cell, seen, start)
-        self._add_indicator(batch.numbers["indicator"], cell, seen, pair, start)
+        if "indicator" in batch.numbers:
+            self._add_indicator(batch.numbers["indicator"], cell, seen, pair, start)
 
     def _add(self, moments: Moments, cell: Indices, columns: Columns, there: Mask | None) -> None:
         if there is None:
@@ -97,11 +98,9 @@ class _Cells:
         numbers: Indices = np.where(np.isnan(bins), -1, bins).astype(np.int64)
         return numbers
 
-    def _check_moved(self, cell: Indices, true: Columns, seen: Mask | None, start: int) -> None:
+    def _check_moved(self, cell: Indices, true: Columns, start: int) -> None:
         for k, column in enumerate(true):
             off = column - self.true.pivot[:, k].take(cell)
-            if seen is not None:
-                off[~seen] = 0.0
             if max(off.max(), -off.min()) > SAME_MM:
                 refuse(np.abs(off) > SAME_MM, start, f"{_MOVED} (here by {np.abs(off).max():.4g} mm)")
 

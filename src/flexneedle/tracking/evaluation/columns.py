@@ -44,12 +44,26 @@ def chosen_columns(
     if missing:
         raise InputError(
             f"no column {', '.join(missing)}; there are {_listed(header)}. A column of another name: {_HINT}"
+            + _constant(missing)
         )
     found = {our: their for our, their in wanted.items() if their in header}
     twice = [their for their in found.values() if header.count(their) > 1]
     if twice:
         raise InputError(f"two columns are called {twice[0]!r}")
+    for their in found.values():
+        shared = [our for our, other in found.items() if other == their]
+        if len(shared) > 1:
+            raise InputError(
+                f"{_HINT}: the column {their!r} would be {' and '.join(shared)}: which is the other?"
+            )
     return found
+
+
+def _constant(missing: Iterable[str]) -> str:
+    options = [f"--{name} NAME" for name in ("sensor", "environment") if name in missing]
+    return (
+        f"; a table of one {' and '.join(o[2:-5] for o in options)}: {' '.join(options)}" if options else ""
+    )
 
 
 def _pair(text: str) -> tuple[str, str]:

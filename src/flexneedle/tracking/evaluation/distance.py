@@ -43,6 +43,20 @@ class Distances:
     exceeded_mm: tuple[float, ...]
     bins: tuple[Stretch, ...]
 
+    @property
+    def told(self) -> str:
+        """Where the limit is kept, in words: in the nearest bin, that it begins there is not known."""
+        if self.limit_mm is None:
+            return "no limit"
+        if self.smallest_mm is None:
+            return "nowhere"
+        nearest = self.smallest_mm == self.bins[0].distance_mm
+        if not self.exceeded_mm:
+            return "everywhere measured" if nearest else f"from {self.smallest_mm:.0f} mm"
+        within = (b.distance_mm for b in self.bins if b.distance_mm < self.exceeded_mm[0])
+        start = f"up to {max(within):.0f} mm" if nearest else f"from {self.smallest_mm:.0f} mm"
+        return f"{start}, not at {', '.join(f'{distance:.0f}' for distance in self.exceeded_mm)} mm"
+
 
 def distances(grid: Grid, bin_mm: float, limit_mm: float | None) -> Distances | None:
     """Return the errors by distance, None if the table has no distances."""

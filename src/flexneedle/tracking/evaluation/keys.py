@@ -68,11 +68,11 @@ class Keys:
         """Return the number of the cell, and of sensor and environment, of each row (r,); bins: from −1."""
         code = ((sensor << _FEW_BITS | environment) << _POINT_BITS | point) << _BIN_BITS | (bins + 1)
         found = pa.array(code).dictionary_encode()
-        own = found.dictionary.to_pylist()
-        places = found.indices.to_numpy()
-        cells = np.array([self._cells.setdefault(value, len(self._cells)) for value in own], dtype=np.int64)
-        pairs = np.array([self._pair(value >> _PAIR_SHIFT) for value in own], dtype=np.int64)
-        return cells.take(places), pairs.take(places)
+        own, places = found.dictionary.to_numpy(), found.indices.to_numpy()
+        numbers = [self._cells.setdefault(value, len(self._cells)) for value in own.tolist()]
+        codes, which = np.unique(own >> _PAIR_SHIFT, return_inverse=True)
+        pairs = np.array([self._pair(value) for value in codes.tolist()], dtype=np.int64).take(which)
+        return np.array(numbers, dtype=np.int64).take(places), pairs.take(places)
 
     def _pair(self, code: int) -> int:
         return self.pairs.setdefault(divmod(code, 1 << _FEW_BITS), len(self.pairs))

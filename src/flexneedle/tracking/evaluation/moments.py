@@ -21,11 +21,11 @@ Number = TypeVar("Number", np.int64, np.float64)
 class Moments:
     """Of `width` columns in groups that may become more: `count` (g,), `mean` and `scatter` (g, width).
 
-    pivot (g, width): the first sample of each.
+    pivot (g, width): the first sample of each. scattered: whether the scatter is kept; without, it is NaN.
     """
 
-    def __init__(self, width: int) -> None:
-        self.width = width
+    def __init__(self, width: int, scattered: bool = True) -> None:
+        self.width, self._scattered = width, scattered
         self.count: Counts = np.zeros(0, dtype=np.int64)
         self.pivot, self._first, self._second = (np.zeros((0, width)) for _ in range(3))
 
@@ -39,6 +39,8 @@ class Moments:
             if not off.any():
                 continue  # as with true positions, which are the same in all rows of a group
             self._first[:, k] += np.bincount(group, off, groups)
+            if not self._scattered:
+                continue
             off *= off
             self._second[:, k] += np.bincount(group, off, groups)
 
@@ -50,6 +52,8 @@ class Moments:
     @property
     def scatter(self) -> Floats:
         """Sums of squares about the mean (g, width); NaN where a group has no sample."""
+        if not self._scattered:
+            return np.full_like(self.pivot, np.nan)
         scatter: Floats = np.maximum(self._second - self._first**2 / self._known(), 0.0)
         return scatter
 
@@ -65,6 +69,8 @@ class Moments:
 
     def _set_pivots(self, group: Indices, columns: Sequence[Floats] | Floats) -> None:
         """Make the first sample of each group that had none its pivot."""
+        if self.count.all():
+            return
         fresh = np.flatnonzero(self.count[group] == 0)
         new, first = np.unique(group[fresh], return_index=True)
         for k, column in enumerate(columns):

@@ -4,9 +4,10 @@ What a file is, its first bytes tell, not its name. Errors are one line each; a 
 refused, since nobody knows what is missing.
 """
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +19,23 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
 from flexneedle.tracking.evaluation.columns import chosen_columns
-from flexneedle.tracking.evaluation.text import read_layout
+from flexneedle.tracking.evaluation.text import Layout, read_layout
 from flexneedle.tracking.table import COLUMNS
 
-__all__ = ["LABELS", "Batch", "read_batches"]
+__all__ = ["LABELS", "Batch", "labelled", "read_batches"]
 
 LABELS = ("point_id", "sensor", "environment")
 """Columns of names; numbers are taken as text, 1 and "1" are the same. All other columns are of numbers."""
 
-_BLOCK = 2 << 20  # bytes of CSV in a batch
+_BLOCK = 4 << 20  # bytes of CSV in a batch
 _ROWS = 1 << 17  # rows of Parquet in a batch
 _MAGIC = b"PAR1"
-_NULLS = [*csv.ConvertOptions().null_values, "None", "none", "MISSING", "missing"]
+_NULLS = [*csv.ConvertOptions().null_values, " ", "None", "none", "MISSING", "missing"]
 
 Floats = NDArray[np.float64]
+_NO_NUMBER = re.compile(
+    r"In CSV column #(\d+): CSV conversion error to double: invalid value '(.*)'", re.DOTALL
+)
 _Choose = Callable[[list[str]], dict[str, str]]
 
 
@@ -57,6 +61,20 @@ def read_batches(
         raise InputError(f"cannot be read: {error.strerror or error}") from None
     except (pa.ArrowException, UnicodeDecodeError) as error:
         raise InputError(f"cannot be read: {' '.join(str(error).split())}") from None
+
+
+def labelled(batches: Iterable[Batch], names: Mapping[str, str]) -> Iterator[Batch]:
+    """Yield the batches with a label that is the same in all rows for each of `names`, by column.
+
+    Raises InputError if the table has such a column itself.
+    """
+    for batch in batches:
+        twice = [name for name in names if name in batch.labels]
+        if twice:
+            raise InputError(f"has a column {twice[0]}: --{twice[0]} is for a table without")
+        zeros = np.zeros(batch.rows, dtype=np.int32)
+        added = {name: pa.DictionaryArray.from_arrays(zeros, [value]) for name, value in names.items()}
+        yield replace(batch, labels={**batch.labels, **added}) if added else batch
 
 
 def _read(
@@ -105,15 +123,25 @@ def _csv(path: Path, choose: _Choose) -> tuple[dict[str, str], Iterator[Any]]:
     layout = read_layout(path)
     chosen = choose(layout.header)
     layout.refuse_cut(path, [their for our, their in chosen.items() if our in LABELS], chosen.values())
+    return chosen, _csv_batches(path, layout, chosen)
+
+
+def _csv_batches(path: Path, layout: Layout, chosen: Mapping[str, str]) -> Iterator[Any]:
     names = pa.dictionary(pa.int32(), pa.string())
     types = {their: names if our in LABELS else pa.float64() for our, their in chosen.items()}
-    reader = csv.open_csv(
-        path,
-        csv.ReadOptions(block_size=_BLOCK, column_names=list(layout.unique_names()), skip_rows=1),
-        csv.ParseOptions(delimiter=layout.delimiter),
-        csv.ConvertOptions(column_types=types, include_columns=list(chosen.values()), null_values=_NULLS),
-    )
-    return chosen, iter(reader)
+    try:
+        yield from csv.open_csv(
+            path,
+            csv.ReadOptions(block_size=_BLOCK, column_names=list(layout.unique_names()), skip_rows=1),
+            csv.ParseOptions(delimiter=layout.delimiter),
+            csv.ConvertOptions(column_types=types, include_columns=list(chosen.values()), null_values=_NULLS),
+        )
+    except pa.ArrowInvalid as error:
+        found = _NO_NUMBER.search(str(error))
+        if found is None:
+            raise
+        # Arrow knows neither the row nor the name of the column.
+        raise InputError(layout.no_number(path, int(found[1]), found[2], chosen)) from None
 
 
 def _batch(batch: Any, chosen: Mapping[str, str]) -> Batch:

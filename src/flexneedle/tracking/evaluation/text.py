@@ -1,7 +1,8 @@
 """How a CSV file is laid out, by its first line, and whether it was cut in the middle, by its last."""
 
 import csv
-from collections.abc import Collection, Iterator
+import re
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from flexneedle.errors import InputError
 __all__ = ["Layout", "read_layout"]
 
 _DELIMITERS = ",;\t"
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(e[-+]?\d+)?", re.IGNORECASE)
 _TAIL = 1 << 16  # bytes
 _FIRST_LINE = 1 << 20  # bytes; more is no header
 
@@ -27,6 +29,23 @@ class Layout:
         for name in self.header:
             seen[name] = seen.get(name, 0) + 1
             yield name if seen[name] == 1 else f"{name} ({seen[name]})"
+
+    def no_number(self, path: Path, column: int, value: str, chosen: Mapping[str, str]) -> str:
+        """Return what is wrong with a field in a column (from 0) that is no number; `chosen`: their names by ours."""
+        their = self.header[column]
+        our = next((our for our, other in chosen.items() if other == their), their)
+        row, name = self._row_of(path, column, value), our if our == their else f"{their!r} (for {our})"
+        advice = ": write a decimal point, not a comma" if _DECIMAL_COMMA.fullmatch(value) else ""
+        where = "" if row is None else f"row {row}: "
+        return f"{where}{name}: {value[:60]!r} is no number{advice}"
+
+    def _row_of(self, path: Path, column: int, value: str) -> int | None:
+        """Return the first row (1: below the header) whose field in a column is `value`, None if there is none."""
+        with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+            rows = (row for row in csv.reader(file, delimiter=self.delimiter) if row)
+            next(rows, None)
+            fields = (row[column].strip() if column < len(row) else "" for row in rows)
+            return next((k for k, field in enumerate(fields, 1) if field == value.strip()), None)
 
     def refuse_cut(self, path: Path, labels: Collection[str], used: Collection[str]) -> None:
         """Raise InputError if the last line, being without a line end, seems to be a part of what was written.
