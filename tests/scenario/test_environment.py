@@ -73,7 +73,7 @@ def test_every_leaf_fits_into_a_column_of_a_study():
             "nosy",
             'tracker.environment = "nosy": must be one of none, ideal, noisy, or a table',
         ),
-        ("environment", 3, "tracker.environment = 3: must be a table"),
+        ("environment", 3, "tracker.environment = 3: must be one of none, ideal, noisy, or a table"),
         ("environment", {}, "tracker.environment.name: missing"),
         ("environment", {"name": "a", "plat": {}}, "did you mean plate?"),
         ("environment", {"name": "a", "plate": {"normal": [0, 0, 0]}}, "must be a direction, not zero"),

@@ -4,6 +4,7 @@ Places are in the frame of the environment: origin in the middle of the workspac
 """
 
 import tomllib
+from collections.abc import Mapping
 from importlib.resources import files
 from typing import Annotated, Any
 
@@ -126,9 +127,9 @@ def environment_data(name: str) -> bytes:
 def expanded(value: Any) -> Any:
     """Return the table of a shipped environment's name, None for "none"; anything else as it is.
 
-    Raises ValueError for a text that is no such name.
+    Raises ValueError for what is neither.
     """
-    if not isinstance(value, str):
+    if value is None or isinstance(value, Mapping | Environment):
         return value
     if value == NONE:
         return None

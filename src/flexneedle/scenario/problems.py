@@ -111,7 +111,11 @@ def _rule(detail: ErrorDetails) -> str:
             return f"must be one of {context['expected'].replace(' or ', ', ').replace(chr(39), '')}"
         case "string_too_long":
             return f"must have at most {context['max_length']} characters"
-        case "too_short" | "too_long":
+        case "too_short":
+            return f"must have at least {context['min_length']} entries"
+        case "too_long" if context["max_length"] != 2:
+            return f"must have at most {context['max_length']} entries"
+        case "too_long":
             return "must be two numbers, low and high"
         case "value_error":
             return str(context["error"])

@@ -172,6 +172,19 @@ def test_a_file_without_a_registration_is_refused(tmp_path, text, words):
         load_registration(tmp_path / "none.toml", PHANTOM)
 
 
+@pytest.mark.parametrize(
+    ("points", "rule"),
+    [
+        ([[0.0, 0.0, 0.0]], "must have at least 3 entries"),
+        ([[float(k), 2.0 * k, 0.0] for k in range(4)], "must not lie on a line"),
+        ([[1.0, 1.0, 1.0]] * 3, "must not lie on a line"),
+    ],
+)
+def test_a_scenario_refuses_fiducials_that_fix_nothing(points, rule):
+    with pytest.raises(InputError, match=rule):
+        PHANTOM.with_values({"tracker.registration.fiducials_mm": points})
+
+
 # ---- in insertions
 
 
