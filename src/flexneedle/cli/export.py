@@ -1,4 +1,4 @@
-"""`flexneedle export`: the periods of a run for other programs."""
+"""`flexneedle export`: the periods of a run, or the tracker's readings, for other programs."""
 
 from __future__ import annotations
 
@@ -6,38 +6,67 @@ import argparse
 import sys
 from pathlib import Path
 
+from flexneedle.errors import InputError
+
 __all__ = ["add_parser"]
 
-_DEFAULT, _STDOUT = "periods.csv", "-"
+_PERIODS, _READINGS, _STDOUT = "periods.csv", "readings.csv", "-"
+_MORE = """
+--readings: one row a reading of the tracker, the units in the header.
+  time_s, period, frame_number    when it was taken, in which control period it
+                                  came, the tracker's own count of frames
+  verdict                         ok, or why it was not believed
+  x_mm, y_mm, z_mm                tip of the needle, in the frame of the stage
+  NAME.x_mm, NAME.y_mm, NAME.z_mm, NAME.qw, NAME.qx, NAME.qy, NAME.qz,
+  NAME.indicator, NAME.status     each sensor (tip, ref1, ...) as the tracker
+                                  told it, in the tracker's frame
+What is not known is empty. A tracker that tells no frames has no sensors.
+"""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser("export", help="export the control periods of a run")
-    parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run")
-    parser.add_argument(
-        "--csv",
-        nargs="?",
-        const="",
-        required=True,
-        metavar="FILE",
-        help=f"as CSV, units in the header; {_STDOUT} is stdout (RUN/{_DEFAULT})",
+    parser = subparsers.add_parser(
+        "export",
+        help="export the control periods or the tracker's readings of a run",
+        epilog=_MORE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run")
+    what = parser.add_mutually_exclusive_group(required=True)
+    for option, rows, default in (
+        ("--csv", "control periods", _PERIODS),
+        ("--readings", "readings of the tracker", _READINGS),
+    ):
+        what.add_argument(
+            option,
+            nargs="?",
+            const="",
+            metavar="FILE",
+            help=f"{rows} as CSV, units in the header; {_STDOUT} is stdout (RUN/{default})",
+        )
     parser.set_defaults(handler=_export)
 
 
 def _export(args: argparse.Namespace) -> int:
-    from flexneedle.run.export import write_csv
+    from flexneedle.run.export import write_csv, write_readings
     from flexneedle.run.figures import load_insertion
 
+    if args.csv is not None:
+        write, name, default = write_csv, args.csv, _PERIODS
+    else:
+        write, name, default = write_readings, args.readings, _READINGS
     insertion, note = load_insertion(args.run)
     if note:
         print(f"flexneedle: {note}", file=sys.stderr)
-    if args.csv == _STDOUT:
-        write_csv(sys.stdout, insertion.periods)
+    if name == _STDOUT:
+        write(sys.stdout, insertion.periods)
         return 0
-    path = Path(args.csv) if args.csv else args.run / _DEFAULT
-    with path.open("w", encoding="utf-8", newline="") as file:
-        write_csv(file, insertion.periods)
+    path = Path(name) if name else args.run / default
+    try:
+        with path.open("w", encoding="utf-8", newline="") as file:
+            write(file, insertion.periods)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     print(path)
     return 0

@@ -1,11 +1,15 @@
-"""What the figures show, as arrays: paths, turns of the bevel, errors, guide and energy over depth."""
+"""What the figures show, as arrays: paths, turns of the bevel, errors, guide and energy over depth, the field."""
 
-from collections.abc import Iterable
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.ports import Frame
 from flexneedle.trace import Insertion, PlanRecord
 
 __all__ = [
@@ -13,15 +17,20 @@ __all__ = [
     "applied_turns",
     "estimated_path",
     "good_samples",
+    "held_spans",
     "lateral_error",
     "planned_turns",
     "refused_samples",
     "shapes_on_the_way",
     "true_energy",
     "true_path",
+    "worst_indicator",
 ]
 
 Floats = NDArray[np.float64]
+
+_TIP = "tip"  # the sensor in the needle; all others of a frame are references
+_NOT_REMEMBERED = ("stale", "not a number")  # verdicts on readings that the monitor leaves out of its window
 
 
 @dataclass(frozen=True)
@@ -94,6 +103,57 @@ def shapes_on_the_way(tips: Floats, shapes: list[Floats], count: int = 4) -> lis
     wanted = np.linspace(depth[0], depth[-1], count + 1)[:-1]
     chosen = dict.fromkeys(int(np.argmin(np.abs(depth - x))) for x in wanted)
     return [shapes[k] for k in chosen if k != len(shapes) - 1]
+
+
+def held_spans(insertion: Insertion) -> list[tuple[float, float]]:
+    """Return begin and end (s) of the times at which the needle was held, each as long as it lasted."""
+    ends = [0.0, *(period.time for period in insertion.periods)]
+    spans: list[tuple[float, float]] = []
+    for period, (begin, end) in zip(insertion.periods, pairwise(ends), strict=True):
+        if period.decision != "held":
+            continue
+        if spans and spans[-1][1] == begin:
+            spans[-1] = (spans[-1][0], end)
+        else:
+            spans.append((begin, end))
+    return spans
+
+
+def worst_indicator(insertion: Insertion, window: float) -> Floats:
+    """Return time (s) of each reading and the largest median indicator of a reference then (k, 2).
+
+    The median of a sensor is over the window (s) before, as the monitor takes it. NaN where no reference told one
+    within it; no row at all if none ever did.
+    """
+    frames = list(_frames(insertion))
+    if not any(_indicators(frame) for frame in frames):
+        return np.empty((0, 2))
+    times = [frame.time for frame in frames]
+    begins = [bisect_right(times, time - window + 1e-9) for time in times]
+    return np.array([(time, _worst(frames[begins[k] : k + 1])) for k, time in enumerate(times)])
+
+
+def _frames(insertion: Insertion) -> Iterator[Frame]:
+    for period in insertion.periods:
+        for judged in period.readings:
+            if judged.sample.frame is not None and not judged.verdict.startswith(_NOT_REMEMBERED):
+                yield judged.sample.frame
+
+
+def _indicators(frame: Frame) -> dict[str, float]:
+    return {
+        name: reading.indicator
+        for name, reading in frame.readings.items()
+        if name != _TIP and reading.indicator is not None
+    }
+
+
+def _worst(frames: Sequence[Frame]) -> float:
+    by_sensor: dict[str, list[float]] = {}
+    for frame in frames:
+        for name, value in _indicators(frame).items():
+            by_sensor.setdefault(name, []).append(value)
+    return max(map(median, by_sensor.values()), default=float("nan"))
 
 
 def _points(pairs: Iterable[tuple[float | None, float | None]]) -> Floats:

@@ -1,6 +1,9 @@
-"""The figure of an insertion: the scene to scale, below it what happened over depth; the end magnified."""
+"""The figure of an insertion: the scene to scale, below it what happened over depth; the end magnified.
 
-from textwrap import shorten
+Where a tracker told of the field, a panel over time shows that, and when the needle was held.
+"""
+
+from textwrap import shorten, wrap
 from typing import Any
 
 import numpy as np
@@ -10,7 +13,7 @@ from matplotlib.lines import Line2D
 
 from flexneedle.plot import curves, scene
 from flexneedle.plot.curves import Floats
-from flexneedle.plot.panels import Line, draw_panel
+from flexneedle.plot.panels import Line, draw_panel, draw_timeline
 from flexneedle.plot.style import (
     BAD,
     ESTIMATE,
@@ -37,6 +40,8 @@ __all__ = ["insertion_figure"]
 _LEFT, _RIGHT, _HEAD = 0.62, 0.15, 0.72
 _PANEL_WIDTH, _PANEL_HEIGHT, _PANEL_GAP = 4.55, 0.88, 0.3
 _CLOSE_UP = 2.6
+_FIELD_BELOW, _FIELD_WIDTH, _FIELD_HEIGHT = 0.72, 6.9, 1.0
+_CHARACTERS, _TITLE_LINE, _VERDICT_LINE = 88, 0.21, 0.19  # of a line of the head; heights in inches
 _FAR = 6.0  # mm; further from the target, the close-up shows the tip instead
 
 
@@ -51,30 +56,42 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
     ]
     window = scene.view_of(scenario, max(plan.target[0], float(known[1][:, 0].max())), known)
     width = WIDTH - _LEFT - _RIGHT
-    below = _HEAD + width * window.ratio + 0.98
+    title, ended = _title(scenario, insertion), wrap(verdict(insertion), _CHARACTERS)
+    head = _HEAD + (len(title) - 1) * _TITLE_LINE + (len(ended) - 1) * _VERDICT_LINE
+    below = head + width * window.ratio + 0.98
+    field = curves.worst_indicator(insertion, scenario.monitor.indicator_window_s)
+    foot = below + 3 * _PANEL_HEIGHT + 2 * _PANEL_GAP
     with styled():
-        figure = new_figure(below + 3 * _PANEL_HEIGHT + 2 * _PANEL_GAP + 0.45)
-        _head(figure, scenario, insertion)
-        _scene(axes(figure, _LEFT, _HEAD, width, width * window.ratio), scenario, insertion, window)
+        figure = new_figure(foot + (_FIELD_BELOW + _FIELD_HEIGHT if len(field) else 0.0) + 0.45)
+        _head(figure, title, ended, insertion)
+        _scene(axes(figure, _LEFT, head, width, width * window.ratio), scenario, insertion, window)
         _legend(figure, below - 0.5, insertion)
         _panels(figure, scenario, insertion, below)
+        if len(field):
+            ax = axes(figure, _LEFT, foot + _FIELD_BELOW, _FIELD_WIDTH, _FIELD_HEIGHT)
+            _field(ax, scenario, insertion, field)
         _close_up(axes(figure, WIDTH - _RIGHT - _CLOSE_UP, below, _CLOSE_UP, _CLOSE_UP), scenario, insertion)
     return figure
 
 
-def _head(figure: Figure, scenario: Scenario, insertion: Insertion) -> None:
+def _title(scenario: Scenario, insertion: Insertion) -> list[str]:
     depth, aside = insertion.target
     name = shorten(scenario.name, 60, placeholder=" …")
-    title = f"{name}: target {signed(depth)} mm deep, {signed(aside)} mm aside (seed {insertion.seed})"
-    height = float(figure.get_figheight())
-    left = 0.12 / WIDTH
-    figure.text(left, 1 - 0.1 / height, title, fontsize=11, weight="bold", va="top")
-    ended = shorten(verdict(insertion), 100, placeholder=" …")
-    color = TARGET if insertion.reached else BAD
-    figure.text(left, 1 - 0.36 / height, ended, fontsize=10, color=color, weight="bold", va="top").set_gid(
-        "verdict"
+    return wrap(
+        f"{name}: target {signed(depth)} mm deep, {signed(aside)} mm aside (seed {insertion.seed})",
+        _CHARACTERS,
     )
-    figure.text(1 - _RIGHT / WIDTH, 1 - 0.37 / height, _counts(insertion), color=INK, va="top", ha="right")
+
+
+def _head(figure: Figure, title: list[str], ended: list[str], insertion: Insertion) -> None:
+    height = float(figure.get_figheight())
+    left, second = 0.12 / WIDTH, 0.36 + (len(title) - 1) * _TITLE_LINE
+    figure.text(left, 1 - 0.1 / height, "\n".join(title), fontsize=11, weight="bold", va="top")
+    color = TARGET if insertion.reached else BAD
+    said: dict[str, Any] = {"fontsize": 10, "color": color, "weight": "bold", "va": "top", "gid": "verdict"}
+    figure.text(left, 1 - second / height, "\n".join(ended), **said)
+    place = (1 - _RIGHT / WIDTH, 1 - (second + 0.01) / height)
+    figure.text(*place, _counts(insertion), color=INK, va="top", ha="right")
 
 
 def _counts(insertion: Insertion) -> str:
@@ -113,7 +130,7 @@ def _paths(ax: Axes, insertion: Insertion, scale: float = 1.0) -> None:
 
 def _legend(figure: Figure, top: float, insertion: Insertion) -> None:
     """Name the lines and marks of the scene in one row below it."""
-    handles = _handles(len(curves.refused_samples(insertion)) > 0)
+    handles = _handles(insertion)
     figure.legend(
         handles=handles,
         loc="upper center",
@@ -125,20 +142,29 @@ def _legend(figure: Figure, top: float, insertion: Insertion) -> None:
     )
 
 
-def _handles(refused: bool) -> list[Line2D]:
+def _handles(insertion: Insertion) -> list[Line2D]:
     planned, applied = scene.turn_style(PLAN, solid=False), scene.turn_style(ESTIMATE, solid=True)
-    samples = [Line2D([], [], color=MEASURED, marker=".", linestyle="none", label="tracker")]
-    if refused:
-        samples += [Line2D([], [], color=QUIET, marker="x", markersize=4, linestyle="none", label="refused")]
+    true, estimated = curves.true_path(insertion), curves.estimated_path(insertion)
+    good, refused = curves.good_samples(insertion), curves.refused_samples(insertion)
+    name = "refused" if len(good) else "tracker, refused"
+    seen: tuple[tuple[bool, dict[str, Any]], ...] = (
+        (_travels(true), {"color": TRUE, "linewidth": 1.3, "label": "true path"}),
+        (_travels(estimated), {"color": ESTIMATE, "ls": ":", "linewidth": 1.6, "label": "estimated path"}),
+        (len(good) > 0, {"color": MEASURED, "marker": ".", "ls": "none", "label": "tracker"}),
+        (len(refused) > 0, {"color": QUIET, "marker": "x", "markersize": 4, "ls": "none", "label": name}),
+    )
     return [
         Line2D([], [], color=NEEDLE, alpha=0.75, linewidth=4.0, label="needle"),
         Line2D([], [], color=PLAN, linestyle="--", linewidth=1.1, label="planned path"),
-        Line2D([], [], color=TRUE, linewidth=1.3, label="true path"),
-        Line2D([], [], color=ESTIMATE, linestyle=":", linewidth=1.6, label="estimated path"),
-        *samples,
+        *(Line2D([], [], **how) for shown, how in seen if shown),
         Line2D([], [], marker="^", label="bevel turn, planned", **planned),
         Line2D([], [], marker="^", label="applied", **applied),
     ]
+
+
+def _travels(path: Floats) -> bool:
+    """Whether a path (k, 2) can be seen as one, not only as a point."""
+    return len(path) > 0 and bool(np.ptp(path, axis=0).max() > 0.5)
 
 
 def _panels(figure: Figure, scenario: Scenario, insertion: Insertion, top: float) -> None:
@@ -185,6 +211,23 @@ def _energy_lines(insertion: Insertion) -> list[Line]:
         Line("planned", plan.tips[:, 0], plan.strain_energy, PLAN, "--"),
         Line("true", truth[:, 0], truth[:, 1], TRUE),
     ]
+
+
+def _field(ax: Axes, scenario: Scenario, insertion: Insertion, field: Floats) -> None:
+    """Draw the largest indicator of the references over time, the monitor's limits, and when the needle was held."""
+    monitor, held = scenario.monitor, curves.held_spans(insertion)
+    span = (min(0.0, float(field[0, 0])), max(insertion.periods[-1].time, float(field[-1, 0])))
+    shaded = f"; shaded: needle held, {insertion.held_s:.2f} s" if held else ""
+    title = f"Largest indicator of the references (median over {monitor.indicator_window_s:g} s{shaded})"
+    limits = [(f"limit {monitor.indicator_limit:g}", monitor.indicator_limit, "--")]
+    if not monitor.enabled:
+        limits = [("limit, not watched", monitor.indicator_limit, "--")]
+    elif held and monitor.resume_fraction < 1.0:
+        lower = monitor.indicator_limit * monitor.resume_fraction
+        limits.append((f"goes on below {lower:.4f}", lower, ":"))
+    lines = [Line(name, np.array(span), np.full(2, y), BAD, style) for name, y, style in limits]
+    draw_timeline(ax, title, [Line("references", field[:, 0], field[:, 1], MEASURED), *lines], span, held)
+    ax.set_xlabel("time (s)", labelpad=1.0)
 
 
 def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion) -> None:

@@ -1,4 +1,4 @@
-"""Panels over the depth of the tip: lines with their names at their ends."""
+"""Panels over the depth of the tip, or over time: lines with their names at their ends."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,20 +6,22 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patheffects import withStroke
 
 from flexneedle.plot.curves import Floats
 from flexneedle.plot.scene import tint_layers
-from flexneedle.plot.style import QUIET
+from flexneedle.plot.style import BAD, QUIET
 from flexneedle.scenario import Scenario
 
-__all__ = ["Line", "draw_panel", "spread_out"]
+__all__ = ["Line", "draw_panel", "draw_timeline", "spread_out"]
 
 _GAP = 0.17  # least distance of two names, as a share of the panel's height
+_SEEN = 0.008  # least extent of a line that is seen as one, as a share of the panel's width
 
 
 @dataclass(frozen=True)
 class Line:
-    """A curve y (k,) over depth x (k,) with its name and how it is drawn."""
+    """A curve y (k,) over depth or time x (k,) with its name and how it is drawn."""
 
     name: str
     x: Floats
@@ -32,7 +34,10 @@ class Line:
 def draw_panel(
     ax: Axes, scenario: Scenario, title: str, lines: Sequence[Line], span: tuple[float, float], least: float
 ) -> None:
-    """Draw lines over depth `span`; the y axis shows at least `least` in all."""
+    """Draw lines over depth `span`; the y axis shows at least `least` in all.
+
+    A line that stayed in one place is a dot with its name beside it; a panel without any line says so.
+    """
     ax.set_title(title)
     ax.set_xlim(*span)
     tint_layers(ax, scenario, span[1])
@@ -42,7 +47,55 @@ def draw_panel(
         ax.plot(line.x, line.y, label=line.name, zorder=3, **_how(line))
     _set_height(ax, lines, least)
     ax.locator_params(axis="y", nbins=4)
-    _name_lines(ax, [line for line in lines if len(line.x)])
+    known = [line for line in lines if len(line.x)]
+    dots = [line for line in known if _is_dot(line, span[1] - span[0])]
+    _name_lines(ax, [line for line in known if line not in dots])
+    for line in dots:
+        _draw_dot(ax, line)
+    if len(dots) == len(known):
+        ax.set_title(_why_empty(lines), loc="right", color=QUIET, fontsize=8, weight="normal")
+
+
+def draw_timeline(
+    ax: Axes,
+    title: str,
+    lines: Sequence[Line],
+    span: tuple[float, float],
+    held: Sequence[tuple[float, float]],
+) -> None:
+    """Draw lines over time `span` (s) on an axis from 0, and shade the times `held` (begin, end)."""
+    ax.set_title(title)
+    ax.set_xlim(*span)
+    for begin, end in held:
+        ax.axvspan(begin, end, color=BAD, linewidth=0.5, alpha=0.2, zorder=0, label="held")
+    for line in lines:
+        ax.plot(line.x, line.y, label=line.name, zorder=3, **_how(line))
+    ax.set_ylim(0.0, 1.15 * max(float(np.nanmax(line.y)) for line in lines))
+    ax.locator_params(axis="y", nbins=4)
+    _name_lines(ax, lines)
+
+
+def _why_empty(lines: Sequence[Line]) -> str:
+    """Say why a panel shows no line: the tip stayed about where it was, or there is no data."""
+    unknown = [line.name for line in lines if not len(line.x)]
+    still = ["the tip hardly moved"] if len(unknown) < len(lines) else []
+    return "; ".join(still + ([f"no data: {', '.join(unknown)}"] if unknown else []))
+
+
+def _is_dot(line: Line, width: float) -> bool:
+    return not line.marker and bool(np.ptp(line.x) < _SEEN * width)
+
+
+def _draw_dot(ax: Axes, line: Line) -> None:
+    """Draw the end of a line as a dot, and its name where there is more room: above it or below."""
+    end = (float(line.x[-1]), float(line.y[-1]))
+    how: dict[str, Any] = {"color": line.color, "markersize": 3.5, "markeredgewidth": 0.0, "clip_on": False}
+    ax.plot(*end, "o", zorder=3.5, label=line.name, **how)
+    low, high = ax.get_ylim()
+    shift, align = (8, "bottom") if end[1] < (low + high) / 2 else (-8, "top")
+    name: dict[str, Any] = {"color": line.color, "fontsize": 8, "va": align, "zorder": 6}
+    name["path_effects"] = [withStroke(linewidth=2.5, foreground="white")]  # a line may pass behind it
+    ax.annotate(line.name, end, (3, shift), textcoords="offset points", **name)
 
 
 def _how(line: Line) -> dict[str, Any]:

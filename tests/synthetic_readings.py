@@ -1,0 +1,38 @@
+"""Readings of a tracker with a tip and references, made up for a made-up insertion."""
+
+from dataclasses import replace
+
+from flexneedle.ports import Frame, Reading, Sample
+from flexneedle.trace import Judged
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+FRAMES = 8  # in a period of 0.2 s
+
+
+def frame_of(number, time, indicators, place=(1.0, 2.0, 3.0)):
+    """Return a frame with the tip at `place` and references with these indicators by name, None where unseen."""
+    tip = Reading(place, UPRIGHT) if place else Reading(None, status="out of volume")
+    references = {
+        name: Reading(None, status="missing") if value is None else Reading((50.0, 0.0, 0.0), UPRIGHT, value)
+        for name, value in indicators.items()
+    }
+    return Frame(time, number, {"tip": tip, **references})
+
+
+def with_readings(period, indicator=lambda _: 0.03, verdict="ok"):
+    """Return the period with the frames of its 0.2 s; `indicator` of the worst reference over time (s)."""
+    times = [period.time - 0.2 + 0.025 * (k + 1) for k in range(FRAMES)]
+    numbers = range(FRAMES * period.index, FRAMES * (period.index + 1))
+    frames = [
+        frame_of(number, time, {"ref1": 0.01, "ref2": indicator(time), "ref3": 0.02})
+        for number, time in zip(numbers, times, strict=True)
+    ]
+    told = tuple(
+        Judged(Sample(frame.time, period.sample.x, period.sample.y, 0.0, frame), verdict) for frame in frames
+    )
+    return replace(period, readings=told)
+
+
+def held(period, reason="field distorted: ref2 0.0812, limit 0.0547 (median over 1 s)"):
+    """Return the period as one in which the needle was held."""
+    return replace(period, decision="held", verdict=reason)
