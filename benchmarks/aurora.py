@@ -66,7 +66,7 @@ def measure(seconds: float, *arguments: str) -> dict[str, float]:
 def emulated(*arguments: str):
     """Run the emulator; give its path."""
     command = [sys.executable, "-m", "flexneedle", "emulate", "aurora", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
     try:
         yield process.stdout.readline().strip()
     finally:

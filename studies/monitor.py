@@ -15,6 +15,7 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
@@ -30,6 +31,7 @@ from flexneedle.plot import style
 from flexneedle.run.insertion import run as carry_out
 from flexneedle.run.planner import plan as make_plan
 from flexneedle.run.rig import Seeds, virtual_rig, virtual_room
+from flexneedle.trace import PlanRecord
 
 FIRST_SEED = 300_000
 FAR_MM, NEAR_MM = 400.0, 30.0
@@ -89,12 +91,18 @@ def world(plate: bool, monitor: bool) -> Scenario:
     return ideal.with_values({"tracker.environment.plate": noisy.plate.model_dump(mode="json")})
 
 
+@cache
+def planned(target: tuple[float, float]) -> PlanRecord:
+    """The plan for a target; neither tracker nor monitor matter to it."""
+    return make_plan(load_scenario("phantom"), target=target, seed=0, threads=1)
+
+
 def carried_out(drawn: Approach, plate: bool, monitor: bool) -> Told:
     """Carry out a run."""
     scenario = world(plate, monitor)
     depth, lateral = drawn.target
     scenario = scenario.with_values({"target.depth_mm": depth, "target.lateral_mm": lateral})
-    plan = make_plan(scenario, seed=0, threads=1)
+    plan = planned(drawn.target)
     phantom, tracker, control, room = np.random.SeedSequence(drawn.seed).spawn(4)
     rig = virtual_rig(
         scenario,

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 from contextlib import contextmanager
+from subprocess import PIPE
 from threading import Event
 from time import monotonic
 
@@ -15,16 +16,30 @@ DEADLINE_S = 20.0
 
 
 @contextmanager
-def emulated(*arguments, end=signal.SIGINT):
-    """Run `flexneedle emulate aurora` with these arguments; give the path of the device."""
+def emulator(*arguments, end=signal.SIGINT):
+    """Run `flexneedle emulate aurora` with these arguments; give the path of the device and a function that writes a
+    line to it and returns what it answers."""
     command = [sys.executable, "-m", "flexneedle", "emulate", "aurora", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True)
+
+    def tell(line):
+        process.stdin.write(f"{line}\n")
+        process.stdin.flush()
+        return process.stderr.readline().strip()
+
     try:
-        yield process.stdout.readline().strip()
+        yield process.stdout.readline().strip(), tell
     finally:
         process.send_signal(end)
         _, errors = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0, errors
+
+
+@contextmanager
+def emulated(*arguments, end=signal.SIGINT):
+    """Run `flexneedle emulate aurora` with these arguments; give the path of the device."""
+    with emulator(*arguments, end=end) as (path, _):
+        yield path
 
 
 def until(condition, seconds=DEADLINE_S):

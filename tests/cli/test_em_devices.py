@@ -51,17 +51,19 @@ def test_a_fault_that_makes_no_sense_is_bad_input(capsys):
 def test_a_recording_asks_at_each_point_and_says_where_it_wrote(capsys, tmp_path, monkeypatch):
     (tmp_path / "grid.toml").write_text(GRID)
     out = str(tmp_path / "table.csv")
-    with emulated("--sensors", "1") as path:
+    with emulated("--sensors", "1", "--still") as path:
         arguments = ("--tracker", f"aurora:{path}", "--grid", str(tmp_path / "grid.toml"), "--out", out)
         monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
         status, _, err = run(capsys, "em", "record", *arguments)
         assert status == 1
-        assert "point 1 of 2, repeat 1 of 1: stage at 0, 0, 0 mm? Enter: " in err
-        assert "no more input on stdin" in err
+        assert "point 1 of 2, repeat 1 of 1: stage at 0, 0, 0 mm? Enter:\n" in err
+        assert "\nflexneedle: no more input on stdin" in err, "on a line of its own"
         status, printed, err = run(capsys, "em", "record", *arguments, "--dwell", "0")
     assert (status, printed) == (0, f"{out}\n")
     assert "goes on after 1 recorded points" in err
     assert "point 2 of 2" in err
+    status, printed, err = run(capsys, "em", "record", *arguments)
+    assert (status, printed, err) == (0, f"{out}\n", f"{out}: is complete already: 2 points\n")
 
 
 def test_a_tracker_that_is_not_there_is_bad_input(capsys, tmp_path):
@@ -97,5 +99,91 @@ def test_a_watch_prints_json_lines_and_keeps_what_it_saw(capsys, tmp_path):
     assert len(lines[-1]["sensors"]["ref1"]["position_mm"]) == 3
     status, out, _ = run(capsys, "em", "watch", "--tracker", f"replay:{kept}@10")
     assert status == 0
-    assert "tip missing  ref1 " in out
+    assert "tip missing  ref1 I 0.0" in out
+    assert max(map(len, out.splitlines())) < 120
     assert "verdict: tip: missing" in out
+
+
+class Terminal(io.StringIO):
+    """What is typed at a terminal."""
+
+    def isatty(self):
+        return True
+
+
+MOVING = GRID.replace("[1, 0, 0]", "[50, 0, 0]")
+
+
+def record_moving(capsys, tmp_path, monkeypatch, typed, *more):
+    """Record a tip that rests while the stage goes 50 mm."""
+    (tmp_path / "grid.toml").write_text(MOVING)
+    monkeypatch.setattr("sys.stdin", typed)
+    with emulated("--sensors", "1", "--still") as path:
+        out = tmp_path / "table.csv"
+        arguments = ("--tracker", f"aurora:{path}", "--grid", str(tmp_path / "grid.toml"), "--out", str(out))
+        status, _, err = run(capsys, "em", "record", *arguments, *more)
+    return status, err, out.read_text().count("\n") - 1
+
+
+def test_at_a_terminal_one_is_asked_whether_to_keep_what_does_not_fit_the_stage(
+    capsys, tmp_path, monkeypatch
+):
+    status, err, rows = record_moving(capsys, tmp_path, monkeypatch, Terminal("\n\n\nk\n"))
+    assert (status, rows) == (0, 8)
+    assert err.count("and the stage 50.0 mm: they may differ by 10.0 mm\n") == 2
+    assert err.count("Enter measures this point again, k keeps it: ") == 2
+
+
+def test_without_a_terminal_what_does_not_fit_the_stage_is_refused_unless_forced(
+    capsys, tmp_path, monkeypatch
+):
+    status, err, rows = record_moving(capsys, tmp_path, monkeypatch, io.StringIO("\n" * 9))
+    assert (status, rows) == (1, 4)
+    assert "and the stage 50.0 mm: they may differ by 10.0 mm (--force records all the same)\n" in err
+    status, err, rows = record_moving(capsys, tmp_path, monkeypatch, io.StringIO(), "--dwell", "0", "--force")
+    assert (status, rows) == (0, 8)
+    assert "recorded all the same" in err
+
+
+def test_an_end_of_input_at_a_terminal_ends_the_line_of_the_question(capsys, tmp_path, monkeypatch):
+    status, err, _ = record_moving(capsys, tmp_path, monkeypatch, Terminal())
+    assert status == 1
+    assert "Enter: \nflexneedle: no more input on stdin" in err
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--dwell", "-1"), ("--dwell", "inf"), ("--seconds", "-1"), ("--seconds", "nan")]
+)
+def test_times_that_are_none_are_refused(capsys, option, value):
+    command = ("record", "--grid", "cube", "--out", "x.csv") if option == "--dwell" else ("watch",)
+    with pytest.raises(SystemExit) as refusal:
+        run(capsys, "em", *command, "--tracker", "aurora:x", option, value)
+    assert refusal.value.code == 2
+    assert f"argument {option}: {value}: must be " in capsys.readouterr().err
+
+
+def test_a_recording_that_is_not_there_is_named_once(capsys):
+    status, out, err = run(capsys, "em", "watch", "--tracker", "replay:nothere.csv")
+    assert (status, out) == (2, "")
+    assert err == "flexneedle: nothere.csv: cannot be read: No such file or directory\n"
+
+
+def test_a_short_replay_shows_the_first_frame_each_turn_of_the_verdict_and_the_last(capsys, tmp_path):
+    rows = [
+        f"{n / 40},{n},{name},{status},{place},0.02"
+        for n in range(20)
+        for name, status, place in (
+            ("tip", *(("missing", ",,") if 5 <= n < 10 else ("ok", "1,2,3"))),
+            ("ref1", "ok", "4,5,6"),
+        )
+    ]
+    path = tmp_path / "short.csv"
+    path.write_text("\n".join(["time_s,frame_number,sensor,status,x_mm,y_mm,z_mm,indicator", *rows, ""]))
+    status, out, _ = run(capsys, "em", "watch", "--tracker", f"replay:{path}")
+    lines = out.splitlines()
+    assert status == 0
+    assert [line.split("frame ")[1].split()[0] for line in lines] == ["0", "5", "10", "19"]
+    assert lines[0].endswith("frame 0  tip 1.00 2.00 3.00 mm I 0.0200  ref1 I 0.0200  verdict: ok")
+    assert "tip missing" in lines[1]
+    status, out, _ = run(capsys, "em", "watch", "--tracker", f"replay:{path}@9", "--references", "3")
+    assert "field not known: 1 of 3" in out

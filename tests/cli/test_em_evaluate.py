@@ -1,6 +1,7 @@
 """`flexneedle em evaluate` and `em check`: what they print, write and return."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ def run(capsys, *argv):
 
 def test_tables_are_printed_beside_the_papers_and_the_makers_values(capsys, table, tmp_path):
     status, out, err = run(capsys, "em", "evaluate", table, "--out", tmp_path / "out", "--register")
-    assert (status, err) == (0, "")
+    assert (status, err) == (0, "note: tip: not in noisy, only in ideal\n")
     for told in (
         "tip, ideal",
         " paper",
@@ -39,6 +40,8 @@ def test_tables_are_printed_beside_the_papers_and_the_makers_values(capsys, tabl
         "threshold",
         "area under the ROC",
         "rigid fit",
+        "reference, noisy: slope (mm)",
+        " is kept",
     ):
         assert told in out
     assert str(tmp_path / "out") in out
@@ -115,6 +118,7 @@ def test_check_finds_both_environments_in_one_table_by_name(capsys, tmp_path):
     status, out, _ = run(capsys, "em", "check", both, "--off", "quiet", "--threshold", "0.025")
     assert status == 1
     assert "above the threshold of 0.025" in out
+    assert re.search(r"paper, power on +0\.0400", out)
     status, _, err = run(capsys, "em", "check", both)
     assert status == 2
     assert "no environment 'off': choose one by --off or --on: on, quiet" in err
@@ -123,7 +127,73 @@ def test_check_finds_both_environments_in_one_table_by_name(capsys, tmp_path):
 def test_check_with_few_or_other_points_says_so(capsys, tmp_path):
     few = [powered(tmp_path / f"{n}.csv", 0.02, points=n) for n in (4, 20, 27)]
     assert "too few grid points for an interval" in run(capsys, "em", "check", few[0], few[0])[1]
+    told = "reference: grid points: 20 in power off, 27 in power on, 20 of them in all: different places are compared"
+    assert run(capsys, "em", "check", few[1], few[2])[2] == f"note: {told}\n"
     values = json.loads(run(capsys, "em", "check", few[1], few[2], "--json")[1])
     assert values["results"][0]["paired"] is False
     low, high = values["results"][0]["difference_interval"]
     assert low < 0.0 < high
+
+
+def test_check_names_a_sensor_that_was_there_once_only(capsys, tmp_path):
+    off, on = powered(tmp_path / "off.csv", 0.02), powered(tmp_path / "on.csv", 0.02)
+    on.write_text(on.read_text() + on.read_text().split("\n", 1)[1].replace("reference", "ref2"))
+    status, _, err = run(capsys, "em", "check", off, on)
+    assert (status, err) == (0, "note: ref2: not in power off, only in power on\n")
+    assert json.loads(run(capsys, "em", "check", off, on, "--json")[1])["notes"] == [err[6:-1]]
+
+
+def test_environments_keep_their_own_names_in_tables(capsys, table, tmp_path):
+    table.write_text(table.read_text().replace(",ideal", ",lab empty").replace(",noisy", ",with table"))
+    argv = (
+        "em",
+        "evaluate",
+        table,
+        "--ideal",
+        "lab empty",
+        "--noisy",
+        "with table",
+        "--out",
+        tmp_path / "out",
+    )
+    _, out, _ = run(capsys, *argv)
+    for told in ("reference, lab empty: error", "reference, with table: slope", "lab empty: points below"):
+        assert told in out
+    assert " ideal" not in out
+    assert " noisy" not in out
+
+
+def test_a_misspelt_environment_ends_it_before_a_folder_is_made(capsys, table, tmp_path):
+    status, _, err = run(capsys, "em", "evaluate", table, "--ideal", "idael", "--out", tmp_path / "out")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "--ideal: no environment 'idael': there is ideal, noisy" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_table_of_points_is_not_written_over(capsys, table, tmp_path):
+    (tmp_path / "points.csv").write_text("mine")
+    status, _, err = run(capsys, "em", "evaluate", table, "--out", tmp_path)
+    assert status == 2
+    assert "holds points.csv already" in err
+    assert (tmp_path / "points.csv").read_text() == "mine"
+
+
+def test_a_table_without_names_gets_them_from_options(capsys, tmp_path):
+    rows = [{k: v for k, v in row.items() if k not in ("sensor", "environment")} for row in random_rows(1)]
+    path = write_csv(tmp_path / "t.csv", rows)
+    argv = ("em", "evaluate", path, "--sensor", "coil", "--environment", "lab", "--out", tmp_path / "out")
+    status, out, err = run(capsys, *argv)
+    assert (status, err) == (0, "")
+    assert " coil, lab" in out
+    with pytest.raises(SystemExit):
+        run(capsys, *argv[:3], "--sensor", " ")
+
+
+@pytest.mark.parametrize("command", ["evaluate", "check"])
+def test_an_unknown_option_brings_the_usage_of_its_command(capsys, command):
+    with pytest.raises(SystemExit) as ended:
+        run(capsys, "em", command, "t.csv", "--registr")
+    assert ended.value.code == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"usage: flexneedle em {command} ")
+    assert f"flexneedle em {command}: error: unrecognized arguments: --registr" in err

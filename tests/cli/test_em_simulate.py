@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from flexneedle.cli.main import main
+from flexneedle.run.em.evaluate import Options, evaluate
 from flexneedle.scenario import load_scenario
 from flexneedle.scenario.environment import Environment
 
@@ -73,6 +74,20 @@ def test_the_suffix_is_checked_before_the_work(tmp_path, capsys):
     assert "must end in .csv or .parquet" in capsys.readouterr().err
 
 
+def test_a_table_that_is_there_is_not_written_over(tmp_path, capsys):
+    out = tmp_path / "precious.csv"
+    out.write_text("mine")
+    assert simulate(*FEW, "--out", out) == 2
+    assert capsys.readouterr().err == f"flexneedle: {out}: is there already: name another with --out\n"
+    assert out.read_text() == "mine"
+
+
+def test_a_folder_that_is_not_there_is_bad_input(tmp_path, capsys):
+    out = tmp_path / "nodir" / "foo.csv"
+    assert simulate(*FEW, "--out", out) == 2
+    assert capsys.readouterr().err == f"flexneedle: {out}: no folder {out.parent}\n"
+
+
 @pytest.mark.parametrize(("option", "value"), [("--points", "1"), ("--samples", "0"), ("--seed", "-1")])
 def test_counts_have_bounds(option, value, capsys):
     with pytest.raises(SystemExit) as ended:
@@ -94,6 +109,15 @@ def test_the_environment_on_the_page_can_be_simulated(tmp_path):
     out = tmp_path / "out.csv"
     assert simulate(*FEW, "--environment", tmp_path / "room.toml", "ideal", "--out", out) == 0
     assert "operating room" in out.read_text()
+
+
+def test_the_indicator_sees_the_plate_on_the_page(tmp_path):
+    """It sees along the axis of the coils alone: beside them it would say nothing."""
+    (tmp_path / "room.toml").write_text(examples()[1])
+    arguments = ("--points", 4, "--samples", 10, "--repeats", 1, "--out", tmp_path / "out.csv")
+    assert simulate(*arguments, "--environment", tmp_path / "room.toml", "ideal") == 0
+    (found,) = evaluate(tmp_path / "out.csv", Options(noisy="operating room")).separations
+    assert found.auc > 0.9
 
 
 def test_the_scenario_on_the_page_is_one():

@@ -50,6 +50,30 @@ def test_a_plane_a_pair_and_a_single_point_can_be_drawn(true):
     assert sum(len(one[0].U) for one in arrows(figure) if one) == 2 * len(true)
 
 
+@pytest.mark.parametrize("shift", [0.0, 240.0])  # of 240, a tenth would be a grid step
+def test_nearly_all_arrows_end_inside_their_panel_and_none_is_drawn_beyond_it(shift):
+    row = field_row()
+    row = plots.FieldRow(row.title, row.true, row.error + np.array([shift, 0.0, 0.0]))
+    figure = plots.field_figure([row])
+    drawn = [(ax, one) for ax in figure.axes for one in ax.collections if isinstance(one, Quiver)]
+    ends = np.concatenate([one.XY + np.stack([one.U, one.V], axis=1) for _, one in drawn])
+    (low, high), (bottom, top) = drawn[0][0].get_xlim(), drawn[0][0].get_ylim()
+    inside = (ends > (low, bottom)).all(axis=1) & (ends < (high, top)).all(axis=1)
+    assert inside.mean() >= 0.95
+    assert all(one.get_clip_on() for _, one in drawn)
+    lengths = np.concatenate([np.hypot(one.U, one.V) for _, one in drawn])
+    assert np.quantile(lengths, 0.95) > 3.0  # mm: seen at all
+
+
+def test_planes_stand_two_side_by_side():
+    plane = GRID[GRID[:, 2] == 0.0]
+    one, two, three = (plots.field_figure([field_row(plane)] * k) for k in (1, 2, 3))
+    assert two.get_figheight() <= one.get_figheight() < three.get_figheight() < 2 * two.get_figheight()
+    left, right = (ax.get_position() for ax in two.axes[::2])
+    assert left.y0 == right.y0
+    assert left.x1 < 0.5 < right.x0
+
+
 def test_more_sensors_than_there_is_room_for_are_counted():
     figure = plots.field_figure([field_row(title=f"coil {k}") for k in range(8)])
     assert "2 more not shown" in words(figure)
@@ -70,14 +94,31 @@ def panel(**changes):
     return plots.IndicatorPanel("reference", **{**values, **changes})
 
 
-def test_indicators_beyond_three_tenths_are_not_shown_but_counted():
+def shown_points(figure):
+    return [one.get_offsets() for one in figure.axes[0].collections if isinstance(one, PathCollection)]
+
+
+def test_all_indicators_are_shown():
     figure = plots.indicator_figure([panel()])
-    (ax,) = figure.axes
-    assert ax.get_xlim() == (0.0, 0.3)
-    shown = [one.get_offsets() for one in ax.collections if isinstance(one, PathCollection)]
-    assert [len(one) for one in shown] == [20, 20]
-    assert "(20 points beyond I = 0.3 not shown)" in words(figure)
+    assert [len(one) for one in shown_points(figure)] == [20, 40]
+    assert figure.axes[0].get_xlim() == pytest.approx((0.0, 1.04 * 0.5))
+    assert "not shown" not in words(figure)
     assert "threshold 0.0550" in words(figure)
+
+
+def test_a_few_indicators_far_out_are_counted_instead():
+    indicator, error = np.append(np.linspace(0.1, 0.5, 40), 6.0), np.append(np.full(40, 2.0), 90.0)
+    figure = plots.indicator_figure([panel(noisy=plots.Shown("noisy", indicator, error, "a line"))])
+    assert [len(one) for one in shown_points(figure)] == [20, 40]
+    assert "(1 point beyond, up to I = 6, not shown)" in words(figure)
+    (ax,) = figure.axes
+    assert 0.5 < ax.get_xlim()[1] < 0.7
+    assert ax.get_ylim()[1] < 5.0
+
+
+def test_a_threshold_beyond_all_indicators_is_shown():
+    figure = plots.indicator_figure([panel(noisy=None, line=None, threshold=0.9)])
+    assert figure.axes[0].get_xlim()[1] > 0.9
 
 
 @pytest.mark.parametrize(
@@ -108,8 +149,19 @@ def test_the_roc_marks_the_threshold_in_use():
     curve = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.9, 1.0])
     values = np.linspace(0.01, 0.06, 20), np.linspace(0.05, 0.4, 20)
     figure = plots.roc_figure(
-        [plots.RocLine("reference", *curve, values, 0.055, (0.05, 0.95), "area 0.9500")]
+        [
+            plots.RocLine(
+                "reference", ("lab", "with table"), *curve, values, 0.055, (0.05, 0.95), "area 0.9500"
+            )
+        ]
     )
     marked = [line.get_xydata()[0] for line in figure.axes[0].lines if len(line.get_xydata()) == 1]
     assert_allclose(marked, [(0.05, 0.95)])
     assert "area 0.9500" in words(figure)
+    for told in (
+        "points above (lab)",
+        "points above (with table)",
+        "reference, lab",
+        "reference, with table",
+    ):
+        assert told in words(figure)

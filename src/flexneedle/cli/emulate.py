@@ -19,7 +19,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     aurora = devices.add_parser(
         "aurora",
         help="an NDI Aurora on a pseudo-terminal",
-        description="Print the path of the emulated device and answer there until interrupted (Ctrl-C).",
+        description="Print the path of the emulated device and answer there until interrupted (Ctrl-C). "
+        "The tip moves along an arc; a line X Y Z on stdin (mm, the tracker's frame) lets it rest there.",
     )
     aurora.add_argument(
         "--link", type=Path, metavar="PATH", help="path of the device (one in a new folder under /tmp)"
@@ -31,6 +32,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="KIND[=DETAIL]@SECONDS[:DURATION]",
         help="what goes wrong, in seconds since tracking began; may be given again. See docs/tracking/aurora.md",
     )
+    aurora.add_argument("--still", action="store_true", help="the tip rests from the start")
     aurora.add_argument("--sensors", type=int, choices=range(1, 5), default=4, help="sensors plugged in (4)")
     aurora.add_argument("--firmware", metavar="TEXT", help="freeze tag that it shows in VER (AURORA Rev 008)")
     aurora.add_argument("--no-bx", action="store_true", help="know no binary readings, as old firmware")
@@ -43,6 +45,8 @@ def _emulate_aurora(args: argparse.Namespace) -> int:
 
     from flexneedle.devices.emulator.aurora import FIRMWARE, fresh
     from flexneedle.devices.emulator.faults import parse_fault
+    from flexneedle.devices.emulator.motion import CENTRE
+    from flexneedle.devices.emulator.orders import Orders
     from flexneedle.devices.emulator.server import Serial, Session, serve
     from flexneedle.devices.priority import come_first
 
@@ -53,7 +57,8 @@ def _emulate_aurora(args: argparse.Namespace) -> int:
         come_first()  # a real one does not wait for this machine's other work
         try:
             print(serial.link, flush=True)
-            serve(Session(device, faults, args.seed, monotonic()), serial, _say)
+            session = Session(device, faults, args.seed, monotonic(), rest=CENTRE if args.still else None)
+            serve(session, serial, Orders(None if sys.stdin is None else sys.stdin.fileno()), _say)
         except KeyboardInterrupt:
             return 0
 

@@ -8,6 +8,7 @@ import io
 import os
 import sys
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from flexneedle import __version__
 from flexneedle.errors import FlexneedleError, InputError
@@ -19,9 +20,19 @@ __all__ = ["build_parser", "main"]
 _COMMANDS = (plan, insert, study, report, view, export, scenario, em, emulate)
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose commands name their own usage, not that of `flexneedle`, where an argument is unknown."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        known, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return known, unknown
+
+
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser; each command sets `handler`, which takes the arguments and returns the status."""
-    parser = argparse.ArgumentParser(
+    parser: argparse.ArgumentParser = _Parser(
         prog="flexneedle",
         description="Simulate, plan and steer flexible bevel-tip needles in soft tissue. For research only.",
     )

@@ -54,7 +54,7 @@ def _csv_rows(path: Path) -> Iterator[Mapping[str, Any]]:
             _check_columns(path, reader.fieldnames or ())
             yield from reader
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from None
+        raise _unreadable(path, error) from None
 
 
 def _parquet_rows(path: Path) -> Iterator[Mapping[str, Any]]:
@@ -62,11 +62,19 @@ def _parquet_rows(path: Path) -> Iterator[Mapping[str, Any]]:
     from pyarrow import parquet
 
     try:
-        table = parquet.read_table(path)
+        with path.open("rb") as file:
+            table = parquet.read_table(file)
     except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from None
+        raise _unreadable(path, error) from None
     _check_columns(path, table.column_names)
     yield from table.to_pylist()
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    reason = (
+        error.strerror if isinstance(error, OSError) and error.strerror else error
+    )  # not the path once more
+    return InputError(f"{path}: cannot be read: {reason}")
 
 
 def _check_columns(path: Path, columns: Iterable[str]) -> None:
@@ -90,16 +98,16 @@ def _frame(path: Path, rows: list[tuple[int, Mapping[str, Any]]]) -> Frame:
 
 
 def _known(row: Mapping[str, Any], column: str) -> float:
-    number = _number(row[column])
+    number = _number(row, column)
     if number is None:
         raise ValueError(f"{column} is empty")
     return number
 
 
 def _reading(row: Mapping[str, Any]) -> Reading:
-    place = [_number(row[name]) for name in _PLACE]
-    turn = [_number(row.get(name)) for name in _TURN]
-    indicator = _number(row.get("indicator"))
+    place = [_number(row, name) for name in _PLACE]
+    turn = [_number(row, name) for name in _TURN]
+    indicator = _number(row, "indicator")
     match place:
         case [float(x), float(y), float(z)]:
             status = row.get("status") or VISIBLE
@@ -113,11 +121,15 @@ def _reading(row: Mapping[str, Any]) -> Reading:
     return Reading(position, None, indicator, status)
 
 
-def _number(value: Any) -> float | None:
-    """Return a number, or None for an empty cell. Raises ValueError."""
+def _number(row: Mapping[str, Any], column: str) -> float | None:
+    """Return a number, or None for an empty cell or a column that is not there. Raises ValueError."""
+    value = row.get(column)
     if value is None or value == "":
         return None
-    number = float(value)
+    try:
+        number = float(value)
+    except ValueError:
+        raise ValueError(f"{column} = {value}: must be a number, with a decimal point") from None
     if not isfinite(number):
-        raise ValueError(f"{value} is no finite number")
+        raise ValueError(f"{column} = {value}: must be finite")
     return number

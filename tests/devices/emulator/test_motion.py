@@ -27,6 +27,14 @@ def test_the_tip_moves_on_an_arc_at_a_needle_like_speed():
     np.testing.assert_allclose(speed, 2 * np.pi * 30 / 20, rtol=0.05)
 
 
+def test_a_tip_that_rests_is_where_it_was_told_but_for_the_same_jitter():
+    rest = (10.0, 20.0, -300.0)
+    places = np.array([pose("tip", n, 0, rest).position for n in range(800)])
+    np.testing.assert_allclose(places.mean(axis=0), rest, atol=0.01)
+    np.testing.assert_allclose(np.sqrt(((places - rest) ** 2).sum(axis=1).mean()), 0.07, rtol=0.1)
+    assert pose("ref1", 5, 0, rest) == pose("ref1", 5, 0)
+
+
 def test_the_tips_z_axis_lies_along_its_motion():
     def z_axis(w, x, y, z):
         return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])

@@ -50,7 +50,10 @@ def test_ndicapi_is_told_of_missing_sensors_and_of_errors():
         ndicapy.ndiClose(device)
 
 
-@pytest.mark.parametrize(("firmware", "sensors"), [("AURORA Rev 008", 4), ("AURORA Rev 009", 2)])
+@pytest.mark.parametrize(
+    ("firmware", "sensors"),
+    [("AURORA Rev 008", 4), pytest.param("AURORA Rev 009", 2, marks=pytest.mark.slow)],
+)
 def test_scikit_surgerynditracker_tracks(firmware, sensors):
     """It reads text from revision 8 and binary from later ones."""
     peer = pytest.importorskip("sksurgerynditracker.nditracker")

@@ -60,7 +60,7 @@ def test_samples_that_are_not_as_many_at_each_point_weigh_alike_in_the_jitter_on
     assert found["rmse_mm"] == pytest.approx(math.sqrt((1 + 4) / 2))
     assert found["jitter_mm"] == pytest.approx(math.sqrt(2 / 4))
     assert (found["n_single"], found["samples_least"], found["samples_most"]) == (1, 1, 3)
-    assert any("1 grid points have one sample (an error each" in note for note in evaluation.notes)
+    assert any("one sample at 1 grid point (an error each" in note for note in evaluation.notes)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1000.0, -2500.0])
@@ -202,6 +202,7 @@ def test_distances_are_binned_and_the_smallest_within_the_limit_is_found(tmp_pat
         610.0,
         pytest.approx((700.0,)),
     )
+    assert evaluation.results[0].distances.told == "from 610 mm, not at 700 mm"
     assert only(tmp_path / "t.csv", limit_mm=0.1)["distance"]["smallest_mm"] is None
     wide = only(tmp_path / "t.csv", bin_mm=1000.0)
     assert len(wide["distance"]["bins"]) == 1

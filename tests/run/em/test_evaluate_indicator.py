@@ -77,6 +77,20 @@ def test_percentiles_of_single_samples_come_from_bins_of_a_ten_thousandth(tmp_pa
     assert found["p95"] == pytest.approx(np.quantile(values.mean(axis=1), 0.95))
 
 
+def test_single_samples_of_shuffled_sensors_and_environments_are_not_mixed_up(tmp_path):
+    rng, rows = np.random.default_rng(1), []
+    for k, (sensor, name) in enumerate((s, e) for s in ("ref2", "ref1") for e in ("noisy", "ideal")):
+        values = rng.uniform(k + 1.0, k + 1.5, N).tolist()
+        rows += rows_of(GRID, [[p] for p in GRID], sensor, name, values)
+    rng.shuffle(rows)
+    found = evaluate(write_csv(tmp_path / "t.csv", rows), Options()).values()["results"]
+    starts = {("ref2", "noisy"): 1.0, ("ref2", "ideal"): 2.0, ("ref1", "noisy"): 3.0, ("ref1", "ideal"): 4.0}
+    for one in found:
+        start, samples = starts[one["sensor"], one["environment"]], one["indicator"]["samples"]
+        assert start <= samples["min"] < samples["p95"] < start + 0.5001
+        assert samples["max"] == pytest.approx(one["indicator"]["max"])
+
+
 @pytest.mark.parametrize(
     ("low", "high", "expected"),
     [([1, 2], [3, 4], 1.0), ([3, 4], [1, 2], 0.0), ([1, 2], [1, 2], 0.5), ([1, 2, 3], [2, 4], 4.5 / 6)],

@@ -52,11 +52,56 @@ def test_columns_of_other_names_are_mapped_and_all_others_ignored(tmp_path, rows
         (("X=x",), "no column 'x': one of point_id, true_x_mm"),
         (("X=x_mm", "Y=x_mm"), "x_mm is both 'X' and 'Y'"),
         (("nowhere.toml",), "neither a pair nor a file"),
+        (("x_mm=y_mm",), "the column 'x_mm' would be x_mm and y_mm"),
     ],
 )
 def test_a_mapping_that_makes_no_sense_is_refused(tmp_path, rows, columns, expected):
     with pytest.raises(InputError, match=expected):
         evaluate(write_csv(tmp_path / "t.csv", rows), Options(columns=columns))
+
+
+def test_a_field_that_is_no_number_is_named_by_row_and_by_both_names_wherever_its_column_is(tmp_path, rows):
+    named = [
+        {"note": "0,0", "X": row["x_mm"], **{k: v for k, v in row.items() if k != "x_mm"}} for row in rows
+    ]
+    named[20]["X"] = "12 mm"
+    told = refusal(write_csv(tmp_path / "t.csv", named, delimiter=";"), columns=("X=x_mm",))
+    assert "row 21: 'X' (for x_mm): '12 mm' is no number" in told
+
+
+def test_an_empty_field_between_blanks_is_empty(tmp_path, rows):
+    path = write_csv(tmp_path / "t.csv", [{**row, "indicator": None} for row in rows])
+    path.write_text(path.read_text().replace(",", ", "))
+    assert one(path)["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+
+
+def test_two_columns_may_change_their_names(tmp_path, rows):
+    swapped = [{**row, "x_mm": row["y_mm"], "y_mm": row["x_mm"]} for row in rows]
+    path = write_csv(tmp_path / "t.csv", swapped)
+    assert one(path, columns=("x_mm=y_mm", "y_mm=x_mm"))["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_a_table_of_one_sensor_needs_no_names_and_no_indicator(tmp_path, rows, suffix):
+    bare = [{k: v for k, v in row.items() if k not in ("sensor", "environment", "indicator")} for row in rows]
+    path = tmp_path / f"t.{suffix}"
+    write_csv(path, bare) if suffix == "csv" else pq.write_table(pa.Table.from_pylist(bare), path)
+    told = refusal(path)
+    assert "no column sensor, environment;" in told
+    assert "a table of one sensor and environment: --sensor NAME --environment NAME" in told
+    found = one(path, sensor="tip", environment="ideal")
+    assert (found["sensor"], found["environment"], found["indicator"]) == ("tip", "ideal", None)
+    assert found["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+
+
+def test_a_name_for_all_rows_is_refused_where_the_table_has_names(tmp_path, rows):
+    told = refusal(write_csv(tmp_path / "t.csv", rows), sensor="coil")
+    assert "has a column sensor: --sensor is for a table without" in told
+
+
+def test_the_true_place_of_a_point_without_a_sample_is_held_against_the_others(tmp_path, rows):
+    rows[7] |= {"x_mm": None, "y_mm": None, "z_mm": None, "true_x_mm": 99.0}
+    assert "row 8: the true position of a point_id changes" in refusal(write_csv(tmp_path / "t.csv", rows))
 
 
 @pytest.mark.parametrize("names", [("x_mm", "y_mm", "z_mm"), ("true_x_mm", "true_y_mm", "true_z_mm")])
@@ -93,8 +138,8 @@ def test_samples_without_a_position_are_left_out_and_counted(tmp_path, rows):
     assert (found["n_missing"], found["n_samples"], found["n_points"], found["n_unseen"]) == (5, 76, 26, 1)
     assert found["rmse_mm"] == pytest.approx(plain(rows[5:])["rmse_mm"])
     assert found["jitter_mm"] == pytest.approx(plain(rows[5:])["jitter_mm"])
-    left_out = "5 of 81 samples have no position (left out); 1 of 27 grid points have no sample (left out)"
-    assert evaluation.notes[0].startswith(f"tip, ideal: {left_out}; 1 grid points have one sample")
+    left_out = "5 of 81 samples have no position (left out); no sample at 1 of 27 grid points (left out)"
+    assert evaluation.notes[0].startswith(f"tip, ideal: {left_out}; one sample at 1 grid point (")
 
 
 def test_a_sensor_that_was_never_seen_is_refused(tmp_path, rows):
@@ -116,7 +161,8 @@ def test_a_sensor_that_was_never_seen_is_refused(tmp_path, rows):
         ({"indicator": float("inf")}, "row 8: indicator: must be finite"),
         ({"sensor": ""}, "row 8: sensor is empty"),
         ({"point_id": ""}, "row 8: point_id is empty"),
-        ({"x_mm": "1,5"}, "conversion error"),
+        ({"x_mm": "1,5"}, "row 8: x_mm: '1,5' is no number: write a decimal point, not a comma"),
+        ({"z_mm": "abc"}, "row 8: z_mm: 'abc' is no number"),
     ],
 )
 def test_a_row_that_breaks_a_rule_is_named(tmp_path, rows, change, expected):
@@ -236,3 +282,31 @@ def test_a_parquet_table_may_have_whole_numbers_categories_and_no_indicator_at_a
     found = one(tmp_path / "t.parquet")
     assert found["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
     assert found["indicator"] is None
+
+
+def test_metres_are_refused_also_where_nothing_jitters(tmp_path, rows):
+    """One sample a point, or samples that a tracker rounds: the jitter is 0, not just small."""
+    both = ("true_x_mm", "true_y_mm", "true_z_mm", "x_mm", "y_mm", "z_mm")
+    single = list({(row["sensor"], row["environment"], row["point_id"]): row for row in rows}.values())
+    assert "look like metres" in refusal(write_csv(tmp_path / "t.csv", in_metres(single, both)))
+
+
+@pytest.mark.parametrize("names", [("--1",), ("²",), ("-",)])
+def test_point_ids_may_be_any_text(tmp_path, rows, names):
+    known = list(dict.fromkeys(row["point_id"] for row in rows))
+    other = dict(zip(known[:1], names, strict=True))
+    renamed = [row | {"point_id": other.get(row["point_id"], row["point_id"])} for row in rows]
+    found = one(write_csv(tmp_path / "t.csv", renamed))
+    assert found["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+
+
+def test_an_empty_label_of_a_short_dictionary_is_refused_in_one_line(tmp_path, rows):
+    """128 names and an empty one, numbered by single bytes as a categorical column is."""
+    many = [row | {"point_id": str(k)} for k, row in enumerate((rows * 130)[:129])]
+    table = pa.Table.from_pylist(many)
+    names = pa.array([str(k) for k in range(128)])
+    indices = pa.array([*range(128), None], pa.int8())
+    column = pa.DictionaryArray.from_arrays(indices, names)
+    table = table.set_column(table.schema.get_field_index("point_id"), "point_id", column)
+    pq.write_table(table, tmp_path / "t.parquet")
+    assert "point_id is empty" in refusal(tmp_path / "t.parquet")

@@ -59,6 +59,14 @@ def test_the_shipped_example_is_the_papers_grid():
         (LATTICE.replace("[1, 2, 2]", "[1, 2, 2"), "no TOML"),
         (LATTICE.replace("10.0", "-10.0"), "must be above 0"),
         (LATTICE.replace("[grid]", "[sensors]\n[grid]"), "must name at least one sensor"),
+        (
+            'environment = "x"\npoints_mm = [[0, 0, 0], [1, 0, 0], [0, 0, 0.0]]',
+            "points_mm = [0.0, 0.0, 0.0]: is listed twice",
+        ),
+        (
+            LATTICE.replace("[grid]", '[sensors]\nref1 = "reference"\nref2 = "reference"\n[grid]'),
+            'sensors.ref2 = "reference": is the name of ref1 already',
+        ),
         (LATTICE.replace("[grid]", "samples = 1\n[grid]"), "samples = 1: must be at least 2"),
     ],
 )

@@ -166,18 +166,135 @@ def test_a_point_that_cannot_be_measured_ends_a_recording_without_a_person(grid,
     assert rows_of(out) == []
 
 
-def test_a_sensor_that_the_tracker_does_not_have_is_named(grid, out):
+def test_a_sensor_that_the_tracker_does_not_have_is_named_before_the_stage_is_moved(grid, out):
     stage = Stage()
     stage._frame = lambda number: Frame(number / 40, number, {"tip": Reading((0.0, 0.0, 0.0))})
-    with pytest.raises(RunError, match="ref1: no such sensor"):
-        run(out, grid, stage, insists=False)
+    with pytest.raises(InputError, match=r"sensors\.ref1: the tracker has no such sensor; it has tip$"):
+        run(out, grid, stage)
+    assert stage.asked == []
 
 
 def test_a_silent_tracker_says_why(grid, out):
     stage = Stage()
     stage.read, stage.status = (lambda: ()), "no reply"
-    with pytest.raises(RunError, match="no reply"):
-        run(out, grid, stage, insists=False)
+    with pytest.raises(RunError, match="no frames within 2 s: no reply"):
+        run(out, grid, stage)
+    assert (stage.asked, stage.said) == ([], ["no frames: no reply"])
+
+
+def test_a_tracker_that_falls_silent_for_a_while_is_told_once_and_so_is_its_return(grid, out):
+    stage = Stage()
+    read = stage.read
+    stage.read = lambda: () if 3.1 < stage.time < 4.6 else read()
+    stage.status = "unplugged"
+    run(out, grid, stage)
+    assert stage.said == ["no frames: unplugged", "frames come again"]
+    assert_whole(out)
+
+
+class Stuck(Stage):
+    """Its tip takes a share of each way, however far the stage goes; the reference goes all of it."""
+
+    def __init__(self, share=0.0):
+        super().__init__()
+        self.share = share
+
+    def _frame(self, number):
+        frame = super()._frame(number)
+        x, y, z = frame.readings["ref1"].position
+        return Frame(
+            frame.time, number, {**frame.readings, "tip": Reading((self.share * x, self.share * y, z))}
+        )
+
+
+@pytest.mark.parametrize("insists", [True, False])
+def test_a_sensor_that_stays_while_the_stage_moves_ends_the_recording(grid, out, insists):
+    with pytest.raises(RunError) as refusal:
+        run(out, grid, Stuck(), insists=insists)
+    assert str(refusal.value) == (
+        "tip moved 0.0 mm from point 1 to point 2 and the stage 10.0 mm: they may differ by 5.0 mm "
+        "(--force records all the same)"
+    )
+    assert_whole(out, stops=ALL[:1])
+
+
+@pytest.mark.parametrize(
+    ("share", "spacing", "agrees"), [(0.52, 10, True), (0.48, 10, False), (1.48, 10, True)]
+)
+def test_small_ways_may_differ_by_5_mm(tmp_path, out, share, spacing, agrees):
+    assert_agrees(tmp_path, out, share, spacing, agrees)
+
+
+@pytest.mark.parametrize(
+    ("share", "spacing", "agrees"),
+    [(0.81, 100, True), (0.79, 100, False), (1.19, 100, True), (1.21, 100, False)],
+)
+def test_long_ways_may_differ_by_20_percent(tmp_path, out, share, spacing, agrees):
+    assert_agrees(tmp_path, out, share, spacing, agrees)
+
+
+def assert_agrees(tmp_path, out, share, spacing, agrees):
+    text = f'environment = "x"\nsamples = 4\nrepeats = 1\npoints_mm = [[0, 0, 0], [{spacing}, 0, 0]]\n'
+    (tmp_path / "two.toml").write_text(text)
+    grid = read_grid(str(tmp_path / "two.toml"))
+    if agrees:
+        assert run(out, grid, Stuck(share)) == 2
+    else:
+        with pytest.raises(RunError, match="and the stage"):
+            run(out, grid, Stuck(share))
+
+
+def test_who_knows_better_keeps_the_point(grid, out):
+    stage, doubts = Stuck(), []
+    run(out, grid, stage, keeps=lambda doubt: not doubts.append(doubt))
+    assert_whole(out)
+    assert len(doubts) == 5
+    assert stage.asked == ALL
+
+
+def test_who_does_not_keep_it_measures_it_again(grid, out):
+    """The stage was not moved to the second point when it was asked to, and is once the doubt is told."""
+    stage, doubts = Stage(), []
+
+    def forget_the_second(stop):
+        place = stage.place
+        stage.ask(stop)
+        stage.place = place if len(stage.asked) == 2 else stage.place
+
+    def mend(doubt):
+        doubts.append(doubt)
+        if len(doubts) > 1:
+            raise KeyboardInterrupt
+        stage.place = np.array([10.0, 0.0, 0.0])
+        return False
+
+    with open_session(out, grid) as session:
+        record(session, stage, stage, grid, Guide(forget_the_second, print, keeps=mend))
+    assert stage.asked == ALL
+    assert_whole(out)
+    assert {row["x_mm"] for row in rows_of(out) if row["point_id"] == "2"} == {"110.0"}
+
+
+def test_the_last_point_before_an_interruption_counts_too(grid, out):
+    stage = Stage()
+
+    def ask_once(stop):
+        if stage.asked:
+            raise KeyboardInterrupt
+        stage.ask(stop)
+
+    with open_session(out, grid) as session, pytest.raises(KeyboardInterrupt):
+        record(session, stage, stage, grid, Guide(ask_once, print))
+    again = Stage()
+    again.ask = lambda _: None  # it stays where it was
+    with pytest.raises(RunError, match=r"tip moved 0\.0 mm from point 1 to point 2 and the stage 10\.0 mm"):
+        run(out, grid, again)
+
+
+def test_a_table_is_a_csv(grid, tmp_path):
+    with pytest.raises(InputError, match=r"table\.parquet: a CSV is written"):
+        run(tmp_path / "table.parquet", grid, Stage())
+    assert not (tmp_path / "table.parquet").exists()
 
 
 @pytest.mark.parametrize("stopped_after", range(7))
@@ -275,17 +392,16 @@ def test_each_point_is_on_the_disk_before_the_next_is_asked_for(grid, out, monke
 
 def test_killed_in_the_middle_it_neither_loses_nor_repeats_a_point(tmp_path, out):
     """Real processes, a real line, and kill -9."""
-    count = 40
+    count = 16
     points = [[n, 0, 0] for n in range(count)]
-    text = f'environment = "ideal"\nsamples = 4\nrepeats = 1\npoints_mm = {points}\n[rest]\ndrift_mm = 10.0\n'
+    text = f'environment = "ideal"\nsamples = 4\nrepeats = 1\npoints_mm = {points}\n'
     (tmp_path / "line.toml").write_text(text)
-    with emulated() as path:
+    with emulated("--still") as path:
         command = [sys.executable, "-m", "flexneedle", "em", "record", "--tracker", f"aurora:{path}"]
         command += ["--grid", str(tmp_path / "line.toml"), "--out", str(out), "--dwell", "0"]
-        for rows in (20, 60):
-            process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-            until(lambda wanted=rows: out.exists() and out.read_bytes().count(b"\n") > wanted)
-            process.send_signal(signal.SIGKILL)
-            process.wait(DEADLINE_S)
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        until(lambda: out.exists() and out.read_bytes().count(b"\n") > 20)
+        process.send_signal(signal.SIGKILL)
+        process.wait(DEADLINE_S)
         subprocess.run(command, check=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     assert_whole(out, 4, [(1, n + 1) for n in range(count)], ("tip",))

@@ -6,7 +6,7 @@ from flexneedle.devices.recording import read_frames
 from flexneedle.devices.replay import Replay
 from flexneedle.errors import InputError
 from flexneedle.ports import VISIBLE, Frame, Reading
-from flexneedle.run.em.watch import judge_field, watch
+from flexneedle.run.em.watch import field_judge, judge_field, watch
 from flexneedle.scenario import Monitor
 
 
@@ -97,3 +97,30 @@ def test_a_sensor_without_a_position_and_too_few_references_are_told():
     alone = [Frame(0.0, 1, {"tip": Reading((0.0, 0.0, 0.0), None, 0.02)})]
     assert "field not known: 0 of 3" in judge_field(alone, Monitor())
     assert judge_field(alone, Monitor(references=0)) == VISIBLE
+
+
+def test_a_recording_is_a_csv(tmp_path):
+    clock = Clock()
+    with pytest.raises(InputError, match="a CSV is written"):
+        watch(Replay(frames(1), clock), clock, lambda _: None, record=tmp_path / "kept.parquet")
+    assert not (tmp_path / "kept.parquet").exists()
+
+
+def sensors(*names, indicator=0.02):
+    return [
+        Frame(n / 40, n, {name: Reading((0.0, 0.0, 0.0), None, indicator) for name in names})
+        for n in range(40)
+    ]
+
+
+def test_without_a_number_the_field_is_judged_by_the_references_that_there_are():
+    judge = field_judge()
+    assert judge(sensors("tip", "ref1")) == VISIBLE
+    assert "field distorted" in judge(sensors("tip", "ref1", indicator=0.06))
+    assert "field not known" in judge(sensors("tip")), "nobody saw it"
+    assert judge(sensors("tip", "ref1", "ref2", "ref3", "ref4")) == VISIBLE
+
+
+def test_the_number_of_references_can_be_asked_for():
+    assert "field not known: 1 of 2" in field_judge(2)(sensors("tip", "ref1"))
+    assert field_judge(0)(sensors("tip")) == VISIBLE

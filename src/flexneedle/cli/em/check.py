@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from flexneedle.cli.common import print_json
 
 from .evaluate import add_table_arguments, positive, table_options
-from .tables import number, print_rows, span
+from .tables import number, print_notes, print_rows, span
 
 if TYPE_CHECKING:
     from flexneedle.run.em.check import Check
@@ -57,10 +57,12 @@ def _check(args: argparse.Namespace) -> int:
 
 def _print(found: Check) -> None:
     rows = [row for sensor in found.sensors for row in _rows(sensor)]
+    rows.append((" paper, power on", number(found.paper, ".4f"), *[""] * 5))
     heads = ("indicator", "mean", "95 %", "max", "points", "samples", "samples above")
     print_rows("Indicator with power off and on, means at grid points", heads, rows)
     for sensor in found.sensors:
         print(_verdict(sensor))
+    print_notes(found.notes)
 
 
 def _rows(sensor: Power) -> list[tuple[str, ...]]:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexneedle.cli.common import print_json
 
-from .tables import number, print_rows, span
+from .tables import number, print_notes, print_rows, span
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -39,12 +38,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="first fit the tracker's frame to the stage's (rigid, least squares), by sensor and environment",
     )
     add_table_arguments(parser)
-    parser.add_argument(
-        "--ideal", default="ideal", metavar="NAME", help="environment that sets the threshold (ideal)"
-    )
-    parser.add_argument(
-        "--noisy", default="noisy", metavar="NAME", help="environment to tell it from (noisy)"
-    )
+    parser.add_argument("--ideal", metavar="NAME", help="environment that sets the threshold (ideal)")
+    parser.add_argument("--noisy", metavar="NAME", help="environment to tell it from (noisy)")
     parser.add_argument(
         "--bin-mm", type=positive, default=50.0, metavar="MM", help="width of the bins of distance_mm (50)"
     )
@@ -74,6 +69,10 @@ def add_table_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--unit", choices=("mm", "m"), help="of all lengths (mm, refused where they look like metres)"
     )
+    for name in ("sensor", "environment"):
+        parser.add_argument(
+            f"--{name}", type=_name, metavar="NAME", help=f"of all rows, for a table without a column {name}"
+        )
 
 
 def positive(text: str) -> float:
@@ -84,31 +83,38 @@ def positive(text: str) -> float:
     return value
 
 
+def _name(text: str) -> str:
+    if not text.strip():
+        raise argparse.ArgumentTypeError("must be a name")
+    return text.strip()
+
+
 def table_options(args: argparse.Namespace) -> Options:
     """Return how the table is to be read."""
     from flexneedle.run.em.evaluate import Options
 
-    return Options(columns=tuple(args.columns), unit=args.unit)
+    return Options(
+        columns=tuple(args.columns), unit=args.unit, sensor=args.sensor, environment=args.environment
+    )
 
 
 def _evaluate(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
-    from flexneedle.run.em.evaluate import RESULT_FILE, evaluate, write_evaluation
+    from flexneedle.run.em.evaluate import RESULT_FILES, evaluate, write_evaluation
     from flexneedle.run.em.figures import draw_evaluation
     from flexneedle.run.em.place import claim
 
     told = ("register", "bin_mm", "limit_mm", "ideal", "noisy")
     options = replace(table_options(args), **{name: getattr(args, name) for name in told})
     evaluation = evaluate(args.data, options)
-    folder = claim(args.out, args.data.stem, RESULT_FILE)
+    folder = claim(args.out, args.data.stem, RESULT_FILES)
     values = write_evaluation(evaluation, folder, draw_evaluation(evaluation, folder))
     if args.json:
         print_json(values)
         return 0
-    for note in evaluation.notes:
-        print(f"flexneedle: {note}", file=sys.stderr)
     _print(evaluation)
+    print_notes(evaluation.notes)
     print(f"Record and figures: {folder}")
     return 0
 
@@ -123,9 +129,10 @@ def _print(evaluation: Evaluation) -> None:
         print_rows(
             "Indicator, means at grid points", ("", "mean", "sd", "max", "min", "95 %", "points"), shown
         )
-    fits = [row for found in evaluation.separations for row in _separation_rows(found)]
+    pair = evaluation.options.pair
+    fits = [row for found in evaluation.separations for row in _separation_rows(found, *pair)]
     if fits:
-        print_rows("Indicator and error", ("", "", "95 % interval"), fits)
+        print_rows("Indicator and error", ("", "", "95 % interval", "paper"), fits)
     for start in range(0, len(results), _SIDE_BY_SIDE):
         some = results[start : start + _SIDE_BY_SIDE]
         print_rows("Further (mm)", ("", *(result.title for result in some)), _further(some))
@@ -157,30 +164,49 @@ def _indicator_rows(result: Result) -> Iterator[tuple[str, ...]]:
     yield (" single samples", *(number(value, ".4f") for value in single), f"{one.n_samples}")
     paper = published.INDICATOR.get(result.grid.environment)
     if paper and published.kind(result.grid.sensor) == REFERENCE:
-        yield (" paper", *(number(paper[key], ".4f") for key in ("mean", "sd", "max", "min")), "", "")
+        yield (" paper", *(number(paper.get(key), ".4f") for key in ("mean", "sd", "max", "min", "p95")), "")
 
 
-def _separation_rows(found: Separation) -> Iterator[tuple[str, str, str]]:
+def _separation_rows(found: Separation, ideal: str, noisy: str) -> Iterator[tuple[str, ...]]:
+    """The rows, with the paper's values for its own sensor in its own environments."""
+    from flexneedle.tracking.evaluation import published
+    from flexneedle.tracking.table import REFERENCE
+
+    of_paper = published.kind(found.sensor) == REFERENCE
+    of_paper &= (ideal, noisy) == (published.IDEAL, published.NOISY)
+    fits = published.FITS
+    papers = {
+        f"{ideal}: error (mm)": f"{fits['mean_mm']} ± {fits['sd_mm']}",
+        f"{noisy}: slope (mm)": str(fits["slope_mm"]),
+        f"{noisy}: intercept (mm)": str(fits["intercept_mm"]),
+        "threshold": str(published.THRESHOLD),
+    }
+    for row in _found_rows(found, ideal, noisy):
+        told = row[0].removeprefix(found.sensor).lstrip(", :")
+        yield (*row, papers.get(told, "") if of_paper else "")
+
+
+def _found_rows(found: Separation, ideal: str, noisy: str) -> Iterator[tuple[str, str, str]]:
     name = found.sensor
     if found.ideal:
         flat, ends = found.ideal, found.ideal.intervals
         yield (
-            f"{name}: error in ideal (mm)",
+            f"{name}, {ideal}: error (mm)",
             f"{number(flat.mean_mm)} ± {number(flat.sd_mm)}",
             span(ends["mean_mm"]),
         )
     if found.noisy:
         line, ends = found.noisy, found.noisy.intervals
-        yield f"{name}: slope in noisy (mm)", number(line.slope_mm), span(ends["slope_mm"])
-        yield f"{name}: intercept in noisy (mm)", number(line.intercept_mm), span(ends["intercept_mm"])
-        yield f"{name}: scatter about the line (mm)", number(line.scatter_mm), ""
+        yield f"{name}, {noisy}: slope (mm)", number(line.slope_mm), span(ends["slope_mm"])
+        yield f"{name}, {noisy}: intercept (mm)", number(line.intercept_mm), span(ends["intercept_mm"])
+        yield f"{name}, {noisy}: scatter about the line (mm)", number(line.scatter_mm), ""
     if found.threshold is not None:
         yield f"{name}: threshold", number(found.threshold, ".4f"), span(found.threshold_interval, ".4f")
         yield f"{name}: threshold of single samples", number(found.samples_threshold, ".4f"), ""
     if found.confusion and found.auc is not None:
         c = found.confusion
-        yield f"{name}: ideal below, above", f"{c.ideal_below}, {c.ideal_above}", ""
-        yield f"{name}: noisy below, above", f"{c.noisy_below}, {c.noisy_above}", ""
+        yield f"{name}, {ideal}: points below, above", f"{c.ideal_below}, {c.ideal_above}", ""
+        yield f"{name}, {noisy}: points below, above", f"{c.noisy_below}, {c.noisy_above}", ""
         yield f"{name}: area under the ROC", number(found.auc, ".4f"), span(found.auc_interval, ".4f")
 
 
@@ -201,9 +227,8 @@ def _further(results: list[Result]) -> Iterator[tuple[str, ...]]:
         yield row("orientation jitter (°)", [number(t.jitter_deg if t else None) for t in turns])
         yield row(" of the sensor's axis (°)", [number(t.axis_jitter_deg if t else None) for t in turns])
     if any(r.distances for r in results):
-        yield row("rmse within a limit of", [_limit(r) for r in results])
-        yield row(" from a distance of", [_smallest(r) for r in results])
-        yield row(" exceeded again at", [_exceeded(r) for r in results])
+        yield row("limit on the rmse at a distance", [_limit(r) for r in results])
+        yield row(" is kept", [r.distances.told if r.distances else "–" for r in results])
     fits = [r.registration for r in results]
     if any(fits):
         yield row("rigid fit, residual", [number(fit.residual_mm if fit else None) for fit in fits])
@@ -215,15 +240,3 @@ def _further(results: list[Result]) -> Iterator[tuple[str, ...]]:
 def _limit(result: Result) -> str:
     found = result.distances
     return number(found.limit_mm if found else None, "g")
-
-
-def _smallest(result: Result) -> str:
-    found = result.distances
-    return number(found.smallest_mm if found else None, ".0f")
-
-
-def _exceeded(result: Result) -> str:
-    found = result.distances
-    return (
-        ", ".join(f"{distance:.0f}" for distance in found.exceeded_mm) if found and found.exceeded_mm else "–"
-    )

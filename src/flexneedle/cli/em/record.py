@@ -5,8 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from .seconds import wait_seconds
 
 if TYPE_CHECKING:
     from flexneedle.run.em.grid import Grid, Stop
@@ -35,9 +38,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--dwell",
-        type=float,
+        type=wait_seconds,
         metavar="S",
         help="don't ask: give the stage so many seconds to reach each point by itself",
+    )
+    parser.add_argument(
+        "--force",
+        action="store_true",
+        help="record also where a sensor moved otherwise than the stage, by more than 5 mm and 20 %% of its way",
     )
     parser.set_defaults(handler=_record)
 
@@ -54,23 +62,26 @@ def _record(args: argparse.Namespace) -> int:
             if session.done:
                 _say(f"{args.out}: goes on after {session.done} recorded points")
             with open_tracker(args.tracker, clock) as tracker:
-                record(session, tracker, clock, grid, _guide(grid, args.dwell, clock.wait))
+                record(session, tracker, clock, grid, _guide(grid, args.dwell, args.force, clock.wait))
+        else:
+            _say(f"{args.out}: is complete already: {session.done} points")
     print(args.out)
     return 0
 
 
-def _guide(grid: Grid, dwell: float | None, wait: Callable[[float], None]) -> Guide:
-    """Return the guide: a person who presses Enter, or time."""
+def _guide(grid: Grid, dwell: float | None, force: bool, wait: Callable[[float], None]) -> Guide:
+    """Return the guide: a person who presses Enter, or time. Only who sits at a terminal is asked what to keep."""
     from flexneedle.run.em.record import Guide
-
-    if dwell is None:
-        return Guide(lambda stop: _ask(grid, stop), _say)
 
     def give_time(stop: Stop) -> None:
         _say(_where(grid, stop))
-        wait(dwell)
+        wait(dwell or 0.0)
 
-    return Guide(give_time, _say, insists=False)
+    by_itself = dwell is not None
+    guide = Guide(give_time if by_itself else lambda stop: _ask(grid, stop), _say, insists=not by_itself)
+    if force:
+        return replace(guide, keeps=_force)
+    return replace(guide, keeps=_keeps) if not by_itself and sys.stdin.isatty() else guide
 
 
 def _where(grid: Grid, stop: Stop) -> str:
@@ -80,11 +91,34 @@ def _where(grid: Grid, stop: Stop) -> str:
 
 
 def _ask(grid: Grid, stop: Stop) -> None:
+    _answer(f"{_where(grid, stop)}? Enter:")
+
+
+def _keeps(doubt: str) -> bool:
+    _say(doubt)
+    return _answer("Enter measures this point again, k keeps it:") == "k"
+
+
+def _force(doubt: str) -> bool:
+    _say(f"{doubt}; recorded all the same")
+    return True
+
+
+def _answer(question: str) -> str:
+    """Return what is typed in a line. Whatever is written next begins a line of its own. Raises RunError."""
     from flexneedle.errors import RunError
 
-    print(f"{_where(grid, stop)}? Enter: ", end="", file=sys.stderr, flush=True)
-    if not sys.stdin.readline():
+    echoes = sys.stdin.isatty()
+    print(question, end=" " if echoes else "\n", file=sys.stderr, flush=True)
+    line = ""
+    try:
+        line = sys.stdin.readline()
+    finally:
+        if echoes and not line.endswith("\n"):
+            print(file=sys.stderr)
+    if not line:
         raise RunError("no more input on stdin: go on with the same --out, or use --dwell without a person")
+    return line.strip()
 
 
 def _say(line: str) -> None:

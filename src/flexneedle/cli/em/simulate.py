@@ -49,7 +49,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         type=Path,
         default=Path("measurements.csv"),
         metavar="FILE",
-        help="the table, CSV or Parquet by its suffix (measurements.csv)",
+        help="the table, CSV or Parquet by its suffix, a new file (measurements.csv)",
     )
     parser.set_defaults(handler=_simulate)
 
@@ -65,10 +65,10 @@ def _count(least: int, most: int) -> Callable[[str], int]:
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    from flexneedle.run.em.simulate import Experiment, check_suffix, measure, write_measurements
+    from flexneedle.run.em.simulate import Experiment, check_new, measure, write_measurements
     from flexneedle.scenario.files import load_environment
 
-    check_suffix(args.out)
+    check_new(args.out)
     experiment = Experiment(args.seed, args.field_seed, args.points, args.samples, args.repeats)
     table = measure([load_environment(source) for source in args.environment], experiment)
     write_measurements(table, args.out)

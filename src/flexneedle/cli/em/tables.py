@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Sequence
 from math import isfinite
 
-__all__ = ["number", "print_rows", "span"]
+__all__ = ["number", "print_notes", "print_rows", "span"]
 
 _WIDEST = 200
 
@@ -24,6 +25,13 @@ def span(ends: tuple[float, float] | None, form: str = ".3f") -> str:
         if isfinite(ends[1])
         else f"from {number(ends[0], form)}"
     )
+
+
+def print_notes(notes: Iterable[str]) -> None:
+    """Print what a reader of results must know about the data, on stderr, after what is on stdout already."""
+    sys.stdout.flush()
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
 
 
 def print_rows(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -10,12 +10,14 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .seconds import some_seconds
+
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from rich.table import Table
 
-    from flexneedle.ports import Reading
+    from flexneedle.ports import Frame, Reading
     from flexneedle.run.em.watch import View
 
 __all__ = ["add_parser"]
@@ -28,13 +30,21 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "watch",
         help="show live values and verdicts of a tracker",
-        description="A live table in a terminal, a line a second elsewhere, until Ctrl-C or the end of a replay.",
+        description="A live table in a terminal, a line a second and at each turn of the verdict elsewhere, until "
+        "Ctrl-C or the end of a replay.",
     )
     parser.add_argument(
         "--tracker", required=True, metavar="SPEC", help="such as aurora:/dev/ttyUSB0 or replay:FILE@2"
     )
     parser.add_argument("--record", type=Path, metavar="FILE", help="keep all frames in a new CSV")
-    parser.add_argument("--seconds", type=float, default=inf, metavar="S", help="stop after so long")
+    parser.add_argument("--seconds", type=some_seconds, default=inf, metavar="S", help="stop after so long")
+    parser.add_argument(
+        "--references",
+        type=int,
+        choices=range(7),
+        metavar="N",
+        help="reference sensors without which the field is not known (those that the tracker has, 3 at most)",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object a frame, a line each")
     parser.set_defaults(handler=_watch)
 
@@ -42,13 +52,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _watch(args: argparse.Namespace) -> int:
     from flexneedle.devices.clock import WallClock
     from flexneedle.run.em.trackers import open_tracker
-    from flexneedle.run.em.watch import watch
+    from flexneedle.run.em.watch import field_judge, watch
 
     clock = WallClock()
     try:
         with ExitStack() as stack:
             tracker = stack.enter_context(open_tracker(args.tracker, clock))
-            watch(tracker, clock, _shower(stack, args.json), args.seconds, record=args.record)
+            judge = field_judge(args.references)
+            watch(tracker, clock, _shower(stack, args.json), args.seconds, judge, args.record)
     except KeyboardInterrupt:
         print(file=sys.stderr)  # it is how a watch ends
     return 0
@@ -58,7 +69,11 @@ def _shower(stack: ExitStack, as_json: bool) -> Callable[[View], None]:
     """Return what shows a view: JSON, a live table, or a line now and then."""
     if as_json:
         return _print_json
-    return _live_table(stack) if sys.stdout.isatty() else _line_printer()
+    if sys.stdout.isatty():
+        return _live_table(stack)
+    lines = _Lines()
+    stack.callback(lines.finish)
+    return lines.show
 
 
 def _print_json(view: View) -> None:
@@ -79,31 +94,55 @@ def _values(reading: Reading) -> dict[str, Any]:
     }
 
 
-def _line_printer() -> Callable[[View], None]:
-    due = -inf
+class _Lines:
+    """Prints a view a second, each at which the verdict turns from good to bad or back, and in the end the last."""
 
-    def show(view: View) -> None:
-        nonlocal due
-        if view.time >= due:
-            due = view.time + _LINE_EVERY_S
-            print(_line(view), flush=True)
+    def __init__(self) -> None:
+        self._due = -inf
+        self._last: View | None = None
+        self._printed: View | None = None
 
-    return show
+    def show(self, view: View) -> None:
+        """Print a view, or not yet."""
+        self._last = view
+        if view.time >= self._due or self._turned(view):
+            self._due = view.time + _LINE_EVERY_S
+            self._print(view)
+
+    def finish(self) -> None:
+        """Print the last view, if it was not."""
+        if self._last is not None and self._last is not self._printed:
+            self._print(self._last)
+
+    def _turned(self, view: View) -> bool:
+        from flexneedle.ports import VISIBLE
+
+        before = self._printed
+        return before is not None and (view.verdict == VISIBLE) != (before.verdict == VISIBLE)
+
+    def _print(self, view: View) -> None:
+        self._printed = view
+        print(_line(view), flush=True)
 
 
 def _line(view: View) -> str:
     if view.frame is None or not view.is_new:
-        return f"{view.time:8.2f} s  {view.verdict}"
-    sensors = "  ".join(f"{name} {_cell(reading)}" for name, reading in view.frame.readings.items())
-    return f"{view.time:8.2f} s  frame {view.frame.number}  {sensors}  verdict: {view.verdict}"
+        return f"{view.time:8.2f} s  verdict: {view.verdict}"
+    time, sensors = view.frame.time, "  ".join(_cells(view.frame))
+    return f"{time:8.2f} s  frame {view.frame.number}  {sensors}  verdict: {view.verdict}"
 
 
-def _cell(reading: Reading) -> str:
-    if reading.position is None:
-        return reading.status
-    x, y, z = reading.position
-    told = "" if reading.indicator is None else f" I {reading.indicator:.4f}"
-    return f"{x:.2f} {y:.2f} {z:.2f} mm{told}"
+def _cells(frame: Frame) -> Iterator[str]:
+    """Place and indicator of the tip, or of the first sensor; of the others, which stand around it, the indicator."""
+    from flexneedle.tracking.table import TIP
+
+    first = TIP if TIP in frame.readings else next(iter(frame.readings), "")
+    for name, reading in frame.readings.items():
+        if reading.position is None:
+            yield f"{name} {reading.status}"
+            continue
+        place = " {:.2f} {:.2f} {:.2f} mm".format(*reading.position) if name == first else ""
+        yield f"{name}{place}" + ("" if reading.indicator is None else f" I {reading.indicator:.4f}")
 
 
 def _live_table(stack: ExitStack) -> Callable[[View], None]:

@@ -6,8 +6,10 @@ docs/decisions has the measurements.
 """
 
 import ctypes
+import os
 import re
 from importlib.util import find_spec
+from pathlib import Path
 
 from flexneedle.errors import InputError
 
@@ -56,7 +58,7 @@ class Device:
         self._c = _library()
         self._device = self._c.ndiOpenSerial(path.encode())
         if not self._device:
-            raise OSError("the port cannot be opened (is another program using it?)")
+            raise OSError(_why_not_opened(path))
 
     def close(self) -> None:
         """Close the line."""
@@ -109,6 +111,20 @@ class Device:
         # ndicapi joins signed bytes: with bit 7 set all above it are set as well and mean nothing.
         status &= 0xFF if letters == "BX" and status & 0x80 else 0xFFFF
         return int(frame) & 0xFFFF_FFFF, int(gone), int(status), tuple(pose)
+
+
+def _why_not_opened(path: str) -> str:
+    if not Path(path).exists():
+        return "the port is gone: is the cable plugged in?"
+    try:
+        port = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    except OSError as error:
+        return f"the port cannot be opened: {error.strerror}"
+    try:
+        is_serial = os.isatty(port)
+    finally:
+        os.close(port)
+    return "the port cannot be opened (is another program using it?)" if is_serial else "it is no serial port"
 
 
 def _library() -> ctypes.CDLL:

@@ -15,13 +15,15 @@ from typing import NoReturn, Self
 import numpy as np
 
 from flexneedle.errors import InputError
+from flexneedle.ports import Point
 
 from . import codec
 from .aurora import Aurora, Seen, answer
 from .faults import Fault, active
 from .motion import RATE_HZ, SENSORS, pose
+from .orders import Orders, parse_place
 
-__all__ = ["Serial", "Session", "serve"]
+__all__ = ["Serial", "Session", "obey", "serve"]
 
 _IDLE_S = 0.1  # the longest that the loop sleeps
 _LONGEST_LINE = 4096
@@ -29,13 +31,17 @@ _LONGEST_LINE = 4096
 
 @dataclass
 class Session:
-    """The device and its faults over time. Times are seconds on one clock, first of all that of power-on."""
+    """The device and its faults over time. Times are seconds on one clock, first of all that of power-on.
+
+    rest: where the tip rests (mm, the tracker's frame), None while it moves along its arc.
+    """
 
     device: Aurora
     faults: Sequence[Fault]
     seed: int
     power_on: float
     tracked_since: float | None = None
+    rest: Point | None = None
 
     def __post_init__(self) -> None:
         self._random = np.random.default_rng((self.seed, 1))
@@ -65,7 +71,7 @@ class Session:
         number = int((now - self.power_on) * RATE_HZ) & 0xFFFF_FFFF
         on = () if self.tracked_since is None else active(self.faults, now - self.tracked_since)
         ailments = {fault.detail: fault.kind for fault in on if fault.detail in SENSORS}
-        return Seen(number, {name: pose(name, number, self.seed) for name in SENSORS}, ailments)
+        return Seen(number, {name: pose(name, number, self.seed, self.rest) for name in SENSORS}, ailments)
 
     def _damaged(self, whole: bytes, faults: dict[str, Fault]) -> bytes:
         if "cut" in faults:
@@ -119,13 +125,16 @@ class Serial:
                 os.close(end)
         self.ends = None
 
-    def read(self, seconds: float) -> bytes:
-        """Return what the host has written, waiting at most so long for it."""
-        if self.ends is None:
-            select.select([], [], [], seconds)
-            return b""
-        ready, _, _ = select.select([self.ends[0]], [], [], max(0.0, seconds))
-        return os.read(self.ends[0], _LONGEST_LINE) if ready else b""
+    @property
+    def sources(self) -> list[int]:
+        """What to wait for: the device's end, or nothing."""
+        return [] if self.ends is None else [self.ends[0]]
+
+    def read(self) -> bytes:
+        """Return what the host has written, without waiting for it."""
+        with suppress(BlockingIOError):
+            return b"".join(os.read(source, _LONGEST_LINE) for source in self.sources)
+        return b""
 
     def write(self, data: bytes) -> None:
         """Send to the host; what it does not take is lost, as on a wire."""
@@ -134,8 +143,8 @@ class Serial:
                 os.write(self.ends[0], data)
 
 
-def serve(session: Session, serial: Serial, say: Callable[[str], None] = lambda _: None) -> NoReturn:
-    """Answer until interrupted. say: told when the cable is pulled or plugged in."""
+def serve(session: Session, serial: Serial, orders: Orders, say: Callable[[str], None]) -> NoReturn:
+    """Answer until interrupted. say: told when the cable is pulled or plugged in, and where the tip rests now."""
     heard, due = b"", list[tuple[float, bytes]]()
     while True:
         pulled = "unplug" in session.faults_at(monotonic())
@@ -143,8 +152,21 @@ def serve(session: Session, serial: Serial, say: Callable[[str], None] = lambda 
             (serial.unplug if pulled else serial.plug)()
             heard, due = b"", []
             say("unplugged" if pulled else f"plugged in again: {serial.link}")
-        heard += serial.read(min([_IDLE_S, *(time - monotonic() for time, _ in due)]))
+        idle = max(0.0, min([_IDLE_S, *(time - monotonic() for time, _ in due)]))
+        ready, _, _ = select.select([*serial.sources, *orders.sources], [], [], idle)
+        for order in orders.read(ready):
+            say(obey(session, order))
+        heard += serial.read()
         *lines, heard = heard[-_LONGEST_LINE:].split(b"\r")
         due += [session.reply(line, monotonic()) for line in lines]
         while due and due[0][0] <= monotonic():
             serial.write(due.pop(0)[1])
+
+
+def obey(session: Session, order: str) -> str:
+    """Rest the tip where a line says; return where it is, or what is wrong with the line."""
+    try:
+        session.rest = parse_place(order)
+    except InputError as error:
+        return str(error)
+    return "the tip rests at {:g} {:g} {:g} mm".format(*session.rest)

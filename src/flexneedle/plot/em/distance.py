@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from flexneedle.plot.style import WIDTH, axes, new_figure, styled
 __all__ = ["DistanceLine", "distance_figure"]
 
 _LEFT, _RIGHT, _TOP, _FOOT, _HIGH = 0.6, 2.95, 0.3, 0.5, 3.0  # inches
+_NOTE = 30  # characters in a line beside the panel
 
 Floats = NDArray[np.float64]
 
@@ -36,7 +38,7 @@ def distance_figure(lines: Sequence[DistanceLine]) -> Figure:
         ax = axes(figure, _LEFT, _TOP, WIDTH - _LEFT - _RIGHT, _HIGH)
         for number, line in enumerate(lines):
             own = look(number)
-            label = f"{line.name}\n{line.note}"
+            label = f"{line.name}\n{fill(line.note, _NOTE)}"
             ax.plot(line.distance, line.rmse, color=own.color, marker=own.marker, markersize=4.5, label=label)
         for limit in dict.fromkeys(line.limit for line in lines if line.limit is not None):
             number = next(k for k, line in enumerate(lines) if line.limit == limit)

@@ -39,17 +39,19 @@ def field_figure(rows: Sequence[FieldRow]) -> Figure:
     shown = rows[:MOST_ROWS]
     layers = [_slices(row.true[:, 2]) for row in shown]
     columns = max(map(len, layers))
-    width = (WIDTH - _LEFT - _RIGHT - (columns - 1) * _GAP) / columns
-    width = min(width, 3.0)
+    across = 2 if columns == 1 and len(shown) > 1 else 1  # planes, two side by side
+    share = WIDTH / across
+    width = min((share - _LEFT - _RIGHT - (columns - 1) * _GAP) / columns, 3.0)
     with styled():
-        figure = new_figure(len(shown) * (width + _TITLE) + _FOOT)
+        figure = new_figure(-(-len(shown) // across) * (width + _TITLE) + _FOOT)
         for number, (row, slices) in enumerate(zip(shown, layers, strict=True)):
-            top = _TITLE + number * (width + _TITLE)
-            made = [axes(figure, _LEFT + k * (width + _GAP), top, width, width) for k in range(len(slices))]
+            down, right = divmod(number, across)
+            top, left = _TITLE + down * (width + _TITLE), _LEFT + right * share
+            made = [axes(figure, left + k * (width + _GAP), top, width, width) for k in range(len(slices))]
             _draw_row(made, row, slices)
-            side = axes(figure, _LEFT + len(slices) * (width + _GAP), top, 0.1, width)
+            side = axes(figure, left + len(slices) * (width + _GAP), top, 0.1, width)
             _draw_scale(figure, side, row)
-            below = shown[number + 1] if number + 1 < len(shown) else None
+            below = shown[number + across] if number + across < len(shown) else None
             _label_x(made, below is None or _frame(below.true) != _frame(row.true), below is None)
         if len(rows) > MOST_ROWS:
             figure.text(
@@ -67,7 +69,7 @@ def _label_x(made: Sequence[Axes], numbers: bool, name: bool) -> None:
 
 def _draw_row(made: Sequence[Axes], row: FieldRow, slices: Sequence[NDArray[np.int64]]) -> None:
     length = np.linalg.norm(row.error, axis=1)
-    factor = _factor(row.true, length, max(map(len, slices)))
+    factor = _factor(row, max(map(len, slices)))
     left, right, bottom, top = _frame(row.true)
     for ax, chosen in zip(made, slices, strict=True):
         _draw_slice(ax, row, chosen, length, factor)
@@ -105,7 +107,6 @@ def _draw_slice(ax: Axes, row: FieldRow, chosen: NDArray[np.int64], length: Floa
         scale=1.0,
         width=0.012,
         zorder=3,
-        clip_on=False,
         **how,
     )
     ax.scatter(x, y, c=length[chosen], s=9, linewidths=0.0, zorder=2, **how)
@@ -138,14 +139,30 @@ def _level(height: Floats) -> str:
     return f"z = {signed(low, '.3g')} to {signed(high, '.3g')} mm"
 
 
-def _factor(true: Floats, length: Floats, in_slice: int) -> float:
-    """Return how much longer to draw: 1, 2 or 5 times a power of ten, the 95th percentile as long as a grid step."""
-    step = float(np.ptp(true[:, :2], axis=0).max()) / max(1.0, np.sqrt(in_slice) - 1.0)
-    typical = float(np.quantile(length, 0.95))
+def _factor(row: FieldRow, in_slice: int) -> float:
+    """Return how much longer to draw: 1, 2 or 5 times a power of ten.
+
+    The 95th percentile is at most as long as a grid step, and at least 95 % of the arrows end inside the frame; the
+    others are cut at its edge.
+    """
+    step = float(np.ptp(row.true[:, :2], axis=0).max()) / max(1.0, np.sqrt(in_slice) - 1.0)
+    typical = float(np.quantile(np.linalg.norm(row.error, axis=1), 0.95))
     if not (step > 0.0 and typical > 0.0):
         return 1.0
-    decade = 10.0 ** np.floor(np.log10(step / typical))
-    return float(decade * max(digit for digit in (1.0, 2.0, 5.0) if digit * decade <= step / typical))
+    most = min(step / typical, float(np.quantile(_room(row), 0.05, method="inverted_cdf")))
+    decade = 10.0 ** np.floor(np.log10(most))
+    return float(decade * max(digit for digit in (1.0, 2.0, 5.0) if digit * decade <= most * (1.0 + 1e-9)))
+
+
+def _room(row: FieldRow) -> Floats:
+    """Return by how much each arrow (n,) could be lengthened before it leaves the frame."""
+    left, right, bottom, top = _frame(row.true)
+    place, error = row.true[:, :2], row.error[:, :2]
+    ends = np.where(error > 0.0, np.array([right, top]), np.array([left, bottom]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        times = np.where(error != 0.0, (ends - place) / error, np.inf)
+    room: Floats = times.min(axis=1)
+    return room
 
 
 def _frame(true: Floats) -> tuple[float, float, float, float]:

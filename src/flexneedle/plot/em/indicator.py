@@ -10,12 +10,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from flexneedle.plot.studies.layout import short
 from flexneedle.plot.style import ESTIMATE, INK, TARGET, TRUE, WIDTH, axes, new_figure, styled
 
 __all__ = ["IndicatorPanel", "Shown", "indicator_figure"]
 
-BEYOND = 0.3
-"""As in the paper, larger indicator values are not shown; how many there are is said."""
+FAR, CUT = 2.0, 1.2
+"""An environment whose largest indicator is beyond FAR times its 95th percentile is shown to CUT times that; how many
+points lie beyond is said. All others are shown whole."""
 _LEFT, _RIGHT, _TOP, _FOOT, _GAP, _HIGH = 0.6, 0.25, 0.42, 0.5, 0.62, 3.4  # inches
 _LOOKS = ((ESTIMATE, "o"), (TRUE, "^"))
 
@@ -58,14 +60,14 @@ def indicator_figure(panels: Sequence[IndicatorPanel]) -> Figure:
 
 def _draw(ax: Axes, panel: IndicatorPanel) -> None:
     pairs = zip((panel.ideal, panel.noisy), _LOOKS, strict=True)
-    handles = [_scatter(ax, shown, color, marker) for shown, (color, marker) in pairs if shown]
-    widest = max(float(shown.indicator.max()) for shown in (panel.ideal, panel.noisy) if shown)
-    ax.set_xlim(0.0, BEYOND if widest > BEYOND else 1.04 * widest or 1.0)
-    ax.set_ylim(0.0, _highest(panel))
+    widest = _widest(panel)
+    handles = [_scatter(ax, shown, color, marker, widest) for shown, (color, marker) in pairs if shown]
+    ax.set_xlim(0.0, widest)
+    ax.set_ylim(0.0, _highest(panel, widest))
     if panel.constant:
-        _draw_constant(ax, *panel.constant, panel)
+        _draw_constant(ax, *panel.constant, panel, widest)
     if panel.line and panel.noisy and np.isfinite(panel.line[0]):
-        _draw_line(ax, *panel.line, panel.noisy.indicator)
+        _draw_line(ax, *panel.line, panel.noisy.indicator, widest)
     if panel.threshold is not None:
         _draw_threshold(ax, panel.threshold)
     ax.set_title(panel.sensor, pad=16.0)
@@ -75,30 +77,38 @@ def _draw(ax: Axes, panel: IndicatorPanel) -> None:
     legend.set_zorder(5)
 
 
-def _scatter(ax: Axes, shown: Shown, color: str, marker: str) -> Line2D:
-    many, inside = len(shown.indicator) > 1500, shown.indicator <= BEYOND
+def _widest(panel: IndicatorPanel) -> float:
+    """Return the largest indicator shown."""
+    reach = [_reach(shown.indicator) for shown in (panel.ideal, panel.noisy) if shown]
+    return 1.04 * max([*reach, panel.threshold or 0.0]) or 1.0
+
+
+def _reach(values: Floats) -> float:
+    most, usual = float(values.max()), float(np.quantile(values, 0.95))
+    return CUT * usual if usual > 0.0 and most > FAR * usual else most
+
+
+def _scatter(ax: Axes, shown: Shown, color: str, marker: str, widest: float) -> Line2D:
+    many, inside = len(shown.indicator) > 1500, shown.indicator <= widest
     how: dict[str, Any] = {"color": color, "marker": marker, "linewidths": 0.0}
     x, y, size = shown.indicator[inside], shown.error[inside], 4 if many else 13
     ax.scatter(x, y, size, alpha=0.55, rasterized=many, zorder=3, **how)
-    return Line2D([], [], color=color, marker=marker, markersize=4.5, linestyle="none", label=_label(shown))
+    label, beyond = f"{short(shown.name, 40)}: {shown.told}", len(shown.indicator) - len(x)
+    if beyond:
+        points = "point" if beyond == 1 else "points"
+        label += f"\n({beyond} {points} beyond, up to I = {float(shown.indicator.max()):.3g}, not shown)"
+    return Line2D([], [], color=color, marker=marker, markersize=4.5, linestyle="none", label=label)
 
 
-def _label(shown: Shown) -> str:
-    beyond = int((shown.indicator > BEYOND).sum())
-    return f"{shown.name}: {shown.told}" + (
-        f"\n({beyond} points beyond I = {BEYOND:g} not shown)" if beyond else ""
-    )
-
-
-def _highest(panel: IndicatorPanel) -> float:
-    inside = [shown.error[shown.indicator <= BEYOND] for shown in (panel.ideal, panel.noisy) if shown]
+def _highest(panel: IndicatorPanel, widest: float) -> float:
+    inside = [shown.error[shown.indicator <= widest] for shown in (panel.ideal, panel.noisy) if shown]
     return 1.28 * float(np.concatenate([*inside, [1e-6]]).max())  # room for the legend
 
 
-def _draw_constant(ax: Axes, mean: float, sd: float, panel: IndicatorPanel) -> None:
+def _draw_constant(ax: Axes, mean: float, sd: float, panel: IndicatorPanel, widest: float) -> None:
     reach = panel.threshold if panel.threshold is not None else 0.0
     if panel.ideal:
-        reach = max(reach, min(BEYOND, float(panel.ideal.indicator.max())))
+        reach = max(reach, min(widest, float(panel.ideal.indicator.max())))
     if np.isfinite(sd):
         ax.fill_between(
             [0.0, reach], mean - sd, mean + sd, color=ESTIMATE, alpha=0.15, linewidth=0.0, zorder=1
@@ -106,8 +116,8 @@ def _draw_constant(ax: Axes, mean: float, sd: float, panel: IndicatorPanel) -> N
     ax.plot([0.0, reach], [mean, mean], color=INK, linewidth=1.6, zorder=4)
 
 
-def _draw_line(ax: Axes, slope: float, intercept: float, indicator: Floats) -> None:
-    ends = np.array([indicator.min(), min(indicator.max(), BEYOND)])
+def _draw_line(ax: Axes, slope: float, intercept: float, indicator: Floats, widest: float) -> None:
+    ends = np.array([indicator.min(), min(indicator.max(), widest)])
     ax.plot(ends, slope * ends + intercept, color=INK, linewidth=1.6, linestyle=(0, (5, 1.5)), zorder=4)
 
 

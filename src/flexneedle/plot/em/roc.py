@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
-from flexneedle.plot.studies.layout import look
+from flexneedle.plot.studies.layout import look, short
 from flexneedle.plot.style import QUIET, WIDTH, axes, new_figure, styled
 
 __all__ = ["RocLine", "roc_figure"]
@@ -22,12 +22,14 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class RocLine:
-    """A sensor: shares (k,) of grid points above each threshold in the ideal and noisy environment, and their values.
+    """A sensor: shares (k,) of grid points above each threshold in an ideal and a noisy environment, and their values.
 
+    environments: the names of these two.
     chosen: these shares (false alarms, detected) at the threshold in use, told in words by `note`.
     """
 
     sensor: str
+    environments: tuple[str, str]
     false_alarms: Floats
     detected: Floats
     values: tuple[Floats, Floats]
@@ -65,8 +67,9 @@ def _draw_roc(ax: Axes, lines: Sequence[RocLine]) -> None:
             "clip_on": False,
         }
         ax.plot(*line.chosen, own.marker, label=f"{line.sensor}: {line.note}", zorder=4, **mark)
-    _share_axis(ax, "y", "detected: noisy grid points above")
-    _share_axis(ax, "x", "false alarms: ideal grid points above")
+    ideal, noisy = (short(name, 30) for name in lines[0].environments)
+    _share_axis(ax, "y", f"detected: grid points above ({noisy})")
+    _share_axis(ax, "x", f"false alarms: grid points above ({ideal})")
     ax.set_title("Each threshold of the indicator")
     ax.legend(loc="lower right", handletextpad=0.6, fontsize=7.5)
 
@@ -74,10 +77,10 @@ def _draw_roc(ax: Axes, lines: Sequence[RocLine]) -> None:
 def _draw_shares(ax: Axes, lines: Sequence[RocLine]) -> None:
     for number, line in enumerate(lines):
         color = look(number).color
-        for values, style, name in zip(line.values, ((0, (1, 1)), "-"), ("ideal", "noisy"), strict=True):
+        for values, style, name in zip(line.values, ((0, (1, 1)), "-"), line.environments, strict=True):
             above = 1.0 - np.arange(len(values) + 1) / len(values)
             ends = np.concatenate([[0.0], np.sort(values)])
-            label = f"{line.sensor}, {name}"
+            label = short(f"{line.sensor}, {name}", 36)
             ax.step(ends, above, where="post", color=color, linestyle=style, label=label, zorder=3)
         ax.axvline(line.threshold, color=color, linewidth=0.9, linestyle=(0, (4, 2)), zorder=1)
     ax.set_xlim(left=0.0)

@@ -1,12 +1,13 @@
 """`flexneedle em check`: the indicator with the rig's power off and on."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
 from flexneedle.run.em.evaluate import Options, read_grids
+from flexneedle.run.em.notes import differing_points, lacking_sensors
 from flexneedle.tracking.evaluation import published
 from flexneedle.tracking.evaluation.grid import Grid
 from flexneedle.tracking.evaluation.power import Power, compare
@@ -16,20 +17,27 @@ __all__ = ["Check", "check"]
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What the power of the rig does to each sensor that has an indicator both times."""
+    """What the power of the rig does to each sensor with an indicator both times; notes: what cannot be compared."""
 
     sensors: list[Power]
+    notes: list[str]
 
     @property
     def above(self) -> bool:
         """Whether the indicator of any sensor is above the threshold with power on."""
         return any(found.above for found in self.sensors)
 
+    @property
+    def paper(self) -> float:
+        """The indicator of the paper's rig with power on."""
+        return published.POWERED
+
     def values(self) -> dict[str, Any]:
         """Return it as plain values."""
         return {
             "above": self.above,
-            "paper_powered": published.POWERED,
+            "paper_powered": self.paper,
+            "notes": self.notes,
             "results": [asdict(s) for s in self.sensors],
         }
 
@@ -54,7 +62,13 @@ def check(
             f"{on or off}: no sensor has an indicator both with power off ({_listed(before)}) "
             f"and on ({_listed(after)})"
         )
-    return Check([compare(before[name], after[name], threshold) for name in both])
+    powered = [
+        replace(grid, environment=f"power {power}")
+        for power, own in (("off", before), ("on", after))
+        for grid in own.values()
+    ]
+    told = [*lacking_sensors(powered), *differing_points(powered)]
+    return Check([compare(before[name], after[name], threshold) for name in both], told)
 
 
 def _of(path: Path, grids: Sequence[Grid], environment: str | None) -> list[Grid]:

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from flexneedle.errors import InputError
+from flexneedle.run.em.notes import notes
+from flexneedle.run.em.points import POINTS_FILE, points_text
 from flexneedle.run.study.files import replace_file
 from flexneedle.trace.plain import to_text
 from flexneedle.tracking.evaluation import published
@@ -19,24 +19,24 @@ from flexneedle.tracking.evaluation.distance import Distances, distances
 from flexneedle.tracking.evaluation.grid import Grid
 from flexneedle.tracking.evaluation.indicator import Summary, summary
 from flexneedle.tracking.evaluation.orientation import Orientation, orientation
-from flexneedle.tracking.evaluation.reading import read_batches
+from flexneedle.tracking.evaluation.reading import labelled, read_batches
 from flexneedle.tracking.evaluation.repeatability import Repeatability, Spacing, repeatability, spacing
 from flexneedle.tracking.evaluation.separation import Separation, separation
 from flexneedle.tracking.evaluation.units import refuse_metres
 from flexneedle.tracking.table import OPTIONAL, REFERENCE, REQUIRED
 
 __all__ = [
-    "RESULT_FILE",
+    "RESULT_FILES",
     "Evaluation",
     "Options",
     "Result",
     "evaluate",
-    "notes",
     "read_grids",
     "write_evaluation",
 ]
 
-RESULT_FILE = "evaluation.json"
+_RESULT_FILE = "evaluation.json"
+RESULT_FILES = (_RESULT_FILE, POINTS_FILE)
 _FORMAT = 1
 
 
@@ -46,7 +46,8 @@ class Options:
 
     columns: pairs "theirs=ours" or paths of TOML files with such; unit: "mm", "m", or None for millimetres that are
     refused where they look like metres; limit_mm: RMSE for the smallest distance (None: the maker's, where the sensor
-    is one of the paper's); ideal, noisy: names of the environments that the indicator is to tell apart.
+    is one of the paper's); ideal, noisy: names of the environments that the indicator is to tell apart (None: the
+    paper's, where there are such); sensor, environment: of all rows, for a table without such a column.
     """
 
     columns: tuple[str, ...] = ()
@@ -54,8 +55,15 @@ class Options:
     unit: str | None = None
     bin_mm: float = 50.0
     limit_mm: float | None = None
-    ideal: str = published.IDEAL
-    noisy: str = published.NOISY
+    ideal: str | None = None
+    noisy: str | None = None
+    sensor: str | None = None
+    environment: str | None = None
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """Names of the environments that the indicator is to tell apart."""
+        return self.ideal or published.IDEAL, self.noisy or published.NOISY
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +131,7 @@ def evaluate(data: Path, options: Options) -> Evaluation:
     """Return the evaluation of a table, read once. Raises InputError for one that cannot be used."""
     grids, rows = read_grids(data, options)
     with _about(data):
+        _check_names(grids, options)
         results = [_result(grid, options) for grid in grids]
     judged = [result.grid for result in results]
     separations = [
@@ -130,14 +139,19 @@ def evaluate(data: Path, options: Options) -> Evaluation:
         for sensor in dict.fromkeys(grid.sensor for grid in judged)
         if (found := separation(sensor, *_environments(judged, sensor, options))) is not None
     ]
-    return Evaluation(data, options, rows, results, separations, notes(judged, options))
+    odd = notes(judged, options.pair, hinted=not options.register)
+    return Evaluation(data, options, rows, results, separations, odd)
 
 
 def read_grids(data: Path, options: Options) -> tuple[list[Grid], int]:
     """Return the grids of a table, and how many rows it has. Raises InputError for one that cannot be used."""
     theirs = column_map(options.columns)
+    given = {"sensor": options.sensor, "environment": options.environment}
+    names = {column: name for column, name in given.items() if name is not None}
+    optional = (*OPTIONAL, "indicator", *names)
+    required = [column for column in REQUIRED if column not in optional]
     with _about(data):
-        batches = read_batches(data, theirs, REQUIRED, OPTIONAL)
+        batches = labelled(read_batches(data, theirs, required, optional), names)
         grids, rows = collect(batches, options.bin_mm, options.unit or "mm")
         if options.unit is None:
             refuse_metres(grids)
@@ -145,45 +159,21 @@ def read_grids(data: Path, options: Options) -> tuple[list[Grid], int]:
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path, figures: Iterable[Path]) -> dict[str, Any]:
-    """Write `evaluation.json` and return its values."""
-    values = {**evaluation.values(), "folder": str(folder), "figures": [str(path) for path in figures]}
-    replace_file(folder / RESULT_FILE, to_text(values).encode())
+    """Write `points.csv` and `evaluation.json` and return the values of the latter."""
+    points = folder / POINTS_FILE
+    replace_file(points, points_text([result.grid for result in evaluation.results]).encode())
+    files = {"folder": str(folder), "points": str(points), "figures": [str(path) for path in figures]}
+    values = {**evaluation.values(), **files}
+    replace_file(folder / _RESULT_FILE, to_text(values).encode())
     return values
 
 
-def notes(grids: Sequence[Grid], options: Options) -> list[str]:
-    """Return what is odd about the data, and how it was treated, a line each."""
-    told = ((grid, "; ".join(_odd(grid))) for grid in grids)
-    return [f"{grid.sensor}, {grid.environment}: {odd}" for grid, odd in told if odd] + _lacking(
-        grids, options
-    )
-
-
-def _odd(grid: Grid) -> Iterator[str]:
-    count, missing = grid.points.position.count, int(grid.points.missing.sum())
-    single, unseen, known = int((count == 1).sum()), int((count == 0).sum()), count[count > 0]
-    if missing:
-        yield f"{missing} of {missing + int(count.sum())} samples have no position (left out)"
-    if unseen:
-        yield f"{unseen} of {len(count)} grid points have no sample (left out)"
-    if single:
-        yield f"{single} grid points have one sample (an error each, nothing for the jitter)"
-    if len(known) and known.min() != known.max():
-        weights = "points weigh alike in the errors, samples in the jitter"
-        yield f"{known.min()} to {known.max()} samples a grid point ({weights})"
-    if np.bincount(grid.cells.point[grid.cells.position.count > 0]).max(initial=0) > 1:
-        yield "points were measured at several distances (pooled in all figures but those by distance)"
-
-
-def _lacking(grids: Sequence[Grid], options: Options) -> list[str]:
-    there = {grid.environment for grid in grids if grid.points.indicator.count.any()}
-    lacking = [name for name in (options.ideal, options.noisy) if name not in there]
-    if not there or not lacking:
-        return []
-    return [
-        f"no indicator in an environment called {' or '.join(lacking)} (there is {', '.join(sorted(there))}): "
-        "--ideal and --noisy name the two that it is to tell apart"
-    ]
+def _check_names(grids: Sequence[Grid], options: Options) -> None:
+    there = list(dict.fromkeys(grid.environment for grid in grids))
+    for option in ("ideal", "noisy"):
+        name = getattr(options, option)
+        if name is not None and name not in there:
+            raise InputError(f"--{option}: no environment {name!r}: there is {', '.join(there)}")
 
 
 @contextmanager
@@ -213,7 +203,8 @@ def _result(grid: Grid, options: Options) -> Result:
 
 def _environments(grids: Sequence[Grid], sensor: str, options: Options) -> tuple[Grid | None, Grid | None]:
     own = {grid.environment: grid for grid in grids if grid.sensor == sensor}
-    return own.get(options.ideal), own.get(options.noisy)
+    ideal, noisy = options.pair
+    return own.get(ideal), own.get(noisy)
 
 
 def _values(part: Any) -> dict[str, Any] | None:
@@ -222,10 +213,11 @@ def _values(part: Any) -> dict[str, Any] | None:
 
 def _separation_values(found: Separation, options: Options) -> dict[str, Any]:
     confusion = found.confusion
+    ideal, noisy = options.pair
     return {
         "sensor": found.sensor,
-        "ideal_environment": options.ideal,
-        "noisy_environment": options.noisy,
+        "ideal_environment": ideal,
+        "noisy_environment": noisy,
         "ideal": _values(found.ideal),
         "noisy": _values(found.noisy),
         "threshold": found.threshold,

@@ -42,7 +42,7 @@ def _field(result: Result) -> plots.FieldRow:
 
 def _indicator(evaluation: Evaluation, found: Separation) -> plots.IndicatorPanel:
     own = {result.grid.environment: result.grid for result in evaluation.results if _is_of(result, found)}
-    ideal, noisy = own.get(evaluation.options.ideal), own.get(evaluation.options.noisy)
+    ideal, noisy = (own.get(name) for name in evaluation.options.pair)
     flat, line = found.ideal, found.noisy
     return plots.IndicatorPanel(
         found.sensor,
@@ -72,12 +72,20 @@ def _roc(evaluation: Evaluation, found: Separation) -> plots.RocLine:
     if confusion is None or threshold is None:
         raise ValueError("a ROC needs both environments")
     own = {result.grid.environment: result.grid for result in evaluation.results if _is_of(result, found)}
-    values = [means(own[name])[0] for name in (evaluation.options.ideal, evaluation.options.noisy)]
+    names = evaluation.options.pair
+    values = [means(own[name])[0] for name in names]
     chosen = confusion.false_alarms, confusion.detected
     told = f"{100.0 * chosen[1]:.1f} % detected,\n{100.0 * chosen[0]:.1f} % false alarms"
     note = f"area {found.auc:.4f}\nat {threshold:.4f}: {told}"
     return plots.RocLine(
-        found.sensor, found.false_alarms, found.detected, (values[0], values[1]), threshold, chosen, note
+        found.sensor,
+        names,
+        found.false_alarms,
+        found.detected,
+        (values[0], values[1]),
+        threshold,
+        chosen,
+        note,
     )
 
 
@@ -86,12 +94,5 @@ def _distance(result: Result) -> plots.DistanceLine:
     if found is None:
         raise ValueError("there are no distances")
     distance, rmse = (np.array([getattr(b, name) for b in found.bins]) for name in ("distance_mm", "rmse_mm"))
-    if found.limit_mm is None:
-        note = "no limit"
-    elif found.smallest_mm is None:
-        note = f"nowhere within {found.limit_mm:g} mm"
-    else:
-        note = f"within {found.limit_mm:g} mm from {found.smallest_mm:.0f} mm" + (
-            ", not beyond" if found.exceeded_mm else ""
-        )
+    note = found.told if found.limit_mm is None else f"within {found.limit_mm:g} mm {found.told}"
     return plots.DistanceLine(result.title, distance, rmse, found.limit_mm, note)

@@ -75,11 +75,24 @@ class GridFile(Section):
     def _check_together(self) -> "GridFile":
         both = (self.grid is None) == (not self.points_mm)
         none = not self.sensors
+        twice = [place for n, place in enumerate(self.points_mm) if place in self.points_mm[:n]][:1]
         refuse(
             [Problem("grid", None, "give either the table grid or the list points_mm")] * both
             + [Problem("sensors", None, 'must name at least one sensor, such as tip = "tip"')] * none
+            + [Problem("points_mm", place, "is listed twice") for place in twice]
+            + _shared_names(self.sensors)
         )
         return self
+
+
+def _shared_names(sensors: dict[str, str]) -> list[Problem]:
+    """Two sensors of one name in the table would be taken for one."""
+    first = {told: name for name, told in reversed(sensors.items())}
+    return [
+        Problem(f"sensors.{name}", told, f"is the name of {first[told]} already: give each sensor its own")
+        for name, told in sensors.items()
+        if first[told] != name
+    ]
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The folder that the results of a tracker's evaluation go to."""
 
 import re
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
@@ -10,14 +11,15 @@ from flexneedle.errors import InputError
 __all__ = ["claim"]
 
 
-def claim(out: Path | None, name: str, result: str) -> Path:
+def claim(out: Path | None, name: str, results: Iterable[str]) -> Path:
     """Make the folder `out`, or a new one below `runs/` named by date and `name`, and return it.
 
-    Raises InputError if `out` holds the file `result` already, or cannot be made.
+    Raises InputError if `out` holds one of the files `results` already, or cannot be made.
     """
     path = out if out is not None else _free(name)
-    if (path / result).exists():
-        raise InputError(f"{path}: holds {result} already: give another folder with --out")
+    for result in results:
+        if (path / result).exists():
+            raise InputError(f"{path}: holds {result} already: give another folder with --out")
     try:
         path.mkdir(parents=True, exist_ok=True)
     except FileExistsError:

@@ -7,18 +7,20 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from math import dist, hypot
+from math import dist, hypot, inf
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexneedle.errors import InputError, RunError
-from flexneedle.ports import VISIBLE, Clock, Frame, Reading
+from flexneedle.ports import VISIBLE, Clock, Frame, Point, Reading
 from flexneedle.trace.shield import uninterrupted
 from flexneedle.tracking.table import COLUMNS
 
 from .grid import Grid, Stop
+from .steps import Visit, disagreement
 from .trackers import LiveTracker
 
 __all__ = ["EXTRA", "Guide", "Session", "open_session", "record"]
@@ -27,28 +29,37 @@ EXTRA = ("time_s", "frame_number", "repeat")
 """Columns beside those of a table of measurements. Times go on over interruptions."""
 _HEADER = (*COLUMNS, *EXTRA)
 _PAUSE_S = 0.01
+_SILENT_S = 1.0  # so long without a frame, and it is said
+
+
+def _refuse(doubt: str) -> bool:
+    raise RunError(f"{doubt} (--force records all the same)")
 
 
 @dataclass(frozen=True)
 class Guide:
     """Who moves the stage. ask: to move it to a stop, returns when it is there; say: tells how it goes.
 
-    insists: whether a point that failed is asked for again, or ends the recording.
+    insists: whether a point that failed is asked for again, or ends the recording. keeps: told that a sensor moved
+    otherwise than the stage; returns whether the point is kept, or measured again, or raises RunError.
     """
 
     ask: Callable[[Stop], None]
     say: Callable[[str], None]
     insists: bool = True
+    keeps: Callable[[str], bool] = _refuse
 
 
 @dataclass
 class Session:
-    """An open table, locked, and the stops that it has no rows of yet. last_time: the last time in it, s."""
+    """An open table, locked, and the stops that it has no rows of yet. last_time: the last time in it, s; last: its
+    last stop, if it has any."""
 
     file: BinaryIO
     left: Sequence[Stop]
     done: int
     last_time: float
+    last: Visit | None
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Add the rows of a stop, and return when they are on the disk."""
@@ -65,6 +76,8 @@ def open_session(path: Path, grid: Grid) -> Iterator[Session]:
     Rows of a stop that are not all there are dropped: it is measured again. Raises InputError if the table is
     another grid's, is damaged, or is being written.
     """
+    if path.suffix == ".parquet":
+        raise InputError(f"{path}: a CSV is written: give a name that ends in .csv")
     try:
         file = path.open("a+b")
     except OSError as error:
@@ -80,28 +93,69 @@ def open_session(path: Path, grid: Grid) -> Iterator[Session]:
 def record(session: Session, tracker: LiveTracker, clock: Clock, grid: Grid, guide: Guide) -> int:
     """Measure the stops that are left and return their number.
 
-    Raises RunError if a point cannot be measured and the guide does not insist.
+    Raises InputError if the tracker lacks a sensor of the grid, RunError if it tells nothing, or if a point cannot be
+    measured and the guide does not insist.
     """
-    start = session.last_time
+    if session.left:
+        _check_sensors(tracker, clock, grid, guide.say)
+    start, before = session.last_time, session.last
     for stop in session.left:
-        frames = _measure(tracker, clock, grid, guide, stop)
+        frames, before = _measure(tracker, clock, grid, guide, stop, before)
         session.add([row for frame in frames for row in _rows(grid, stop, frame, start)])
     return len(session.left)
 
 
-def _measure(tracker: LiveTracker, clock: Clock, grid: Grid, guide: Guide, stop: Stop) -> list[Frame]:
+def _check_sensors(tracker: LiveTracker, clock: Clock, grid: Grid, say: Callable[[str], None]) -> None:
+    """Before the stage is moved for nothing: look for the grid's sensors in the first frame."""
+    frames = next(filter(None, _arriving(tracker, clock, grid.file.rest.timeout_s, say)), ())
+    if not frames:
+        raise RunError(f"no frames within {grid.file.rest.timeout_s:g} s: {tracker.status}")
+    there = frames[-1].readings
+    for name in grid.file.sensors:
+        if name not in there:
+            raise InputError(f"sensors.{name}: the tracker has no such sensor; it has {', '.join(there)}")
+
+
+def _arriving(
+    tracker: LiveTracker, clock: Clock, seconds: float, say: Callable[[str], None]
+) -> Iterator[tuple[Frame, ...]]:
+    """Give what the tracker tells, again and again for so long; say when nothing comes, and when it does again."""
+    began = heard = clock.now()
+    while (now := clock.now()) - began <= seconds:
+        frames = tracker.read()
+        if frames and heard == inf:
+            say("frames come again")
+        if frames:
+            heard = now
+        elif now - heard > _SILENT_S:
+            say(f"no frames: {tracker.status}")
+            heard = inf  # it is said
+        yield frames
+        clock.wait(_PAUSE_S)
+
+
+def _measure(
+    tracker: LiveTracker, clock: Clock, grid: Grid, guide: Guide, stop: Stop, before: Visit | None
+) -> tuple[list[Frame], Visit]:
+    guide.ask(stop)
     while True:
-        guide.ask(stop)
         clock.wait(grid.file.settle_s)
-        frames, complaint = _samples(tracker, clock, grid)
+        frames, complaint = _samples(tracker, clock, grid, guide.say)
         if not complaint:
-            return frames
+            visit = _visit(grid, stop, frames)
+            doubt = "" if before is None else disagreement(before, visit)
+            if not doubt or guide.keeps(doubt):
+                return frames, visit
+            continue
         if not guide.insists:
             raise RunError(f"point {stop.point_id}, repeat {stop.repeat}: {complaint}")
         guide.say(f"{complaint}; once more")
+        guide.ask(stop)
 
 
-def _samples(tracker: LiveTracker, clock: Clock, grid: Grid) -> tuple[list[Frame], str]:
+def _samples(
+    tracker: LiveTracker, clock: Clock, grid: Grid, say: Callable[[str], None]
+) -> tuple[list[Frame], str]:
     """Return the frames of a point at rest, taken from now on, or what is wrong.
 
     While the stage drifts the oldest frames are let go for new ones.
@@ -109,8 +163,8 @@ def _samples(tracker: LiveTracker, clock: Clock, grid: Grid) -> tuple[list[Frame
     began, wanted, sensors = clock.now(), grid.file.samples, tuple(grid.file.sensors)
     good: list[Frame] = []
     complaint = "no frames"
-    while clock.now() - began <= grid.file.rest.timeout_s:
-        for frame in tracker.read():
+    for frames in _arriving(tracker, clock, grid.file.rest.timeout_s, say):
+        for frame in frames:
             if frame.time < began:
                 continue
             ill = _ill(frame, sensors)
@@ -121,7 +175,6 @@ def _samples(tracker: LiveTracker, clock: Clock, grid: Grid) -> tuple[list[Frame
                 if not complaint:
                     return good, ""
         complaint = complaint if tracker.status == VISIBLE else tracker.status
-        clock.wait(_PAUSE_S)
     return [], f"no {wanted} good samples within {grid.file.rest.timeout_s:g} s: {complaint}"
 
 
@@ -137,11 +190,24 @@ def _drifting(frames: Sequence[Frame], sensors: Sequence[str], limit: float) -> 
     """Return which sensor moves, by the means of the first and the last third of its samples; "" if none does."""
     third = max(1, len(frames) // 3)
     for name in sensors:
-        places = np.array([frame.readings[name].position for frame in frames], dtype=float)
+        places = _places(frames, name)
         drift = dist(places[:third].mean(axis=0), places[-third:].mean(axis=0))
         if drift > limit:
             return f"{name} moves: {drift:.2f} mm from the first to the last third, limit {limit:g} mm"
     return ""
+
+
+def _places(frames: Sequence[Frame], name: str) -> NDArray[np.float64]:
+    return np.array([frame.readings[name].position for frame in frames], dtype=float)
+
+
+def _visit(grid: Grid, stop: Stop, frames: Sequence[Frame]) -> Visit:
+    return Visit(stop, {told: _mean(_places(frames, name)) for name, told in grid.file.sensors.items()})
+
+
+def _mean(places: NDArray[np.float64]) -> Point:
+    x, y, z = map(float, places.mean(axis=0))
+    return x, y, z
 
 
 def _rows(grid: Grid, stop: Stop, frame: Frame, start: float) -> list[dict[str, Any]]:
@@ -191,8 +257,19 @@ def _resumed(path: Path, file: BinaryIO, grid: Grid) -> Session:
     done = len(whole) // size
     _check_rows(path, whole[: done * size], stops, grid)
     file.truncate(len(header) + sum(map(len, whole[: done * size])))
-    last = float(_cells(whole[done * size - 1])["time_s"]) if done else 0.0
-    return Session(file, stops[done:], done, last)
+    if not done:
+        return Session(file, stops, 0, 0.0, None)
+    rows = [_cells(line) for line in whole[(done - 1) * size : done * size]]
+    return Session(file, stops[done:], done, float(rows[-1]["time_s"]), _visited(stops[done - 1], rows))
+
+
+def _visited(stop: Stop, rows: Sequence[Mapping[str, str]]) -> Visit:
+    names = {row["sensor"] for row in rows}
+    return Visit(stop, {n: _mean(np.array([_place(r) for r in rows if r["sensor"] == n])) for n in names})
+
+
+def _place(row: Mapping[str, str]) -> Point:
+    return float(row["x_mm"]), float(row["y_mm"]), float(row["z_mm"])
 
 
 def _check_rows(path: Path, lines: Sequence[bytes], stops: Sequence[Stop], grid: Grid) -> None:
@@ -215,6 +292,7 @@ def _belongs(line: bytes, stop: Stop | None, grid: Grid) -> bool:
             stop.place,
         )
         float(cells["time_s"])
+        _place(cells)
     except ValueError:
         return False
     return (

@@ -20,7 +20,7 @@ from flexneedle.tracking.field.sensors import Noiseless, Readings, noiseless, no
 from flexneedle.tracking.quaternion import along, z_axis
 from flexneedle.tracking.table import COLUMNS, REFERENCE, TIP
 
-__all__ = ["SUFFIXES", "Experiment", "check_suffix", "measure", "write_measurements"]
+__all__ = ["SUFFIXES", "Experiment", "check_new", "measure", "write_measurements"]
 
 Floats = NDArray[np.float64]
 SUFFIXES = (".csv", ".parquet")
@@ -64,20 +64,27 @@ def measure(environments: Sequence[Environment], experiment: Experiment) -> pa.T
 
 
 def write_measurements(table: pa.Table, path: Path) -> None:
-    """Write a table to a file of one of the `SUFFIXES`, whole or not at all. Raises InputError for another."""
-    check_suffix(path)
+    """Write a table to a new file of one of the `SUFFIXES`, whole or not at all. Raises InputError; see `check_new`."""
+    check_new(path)
     sink = io.BytesIO()
     if path.suffix == ".csv":
         pyarrow.csv.write_csv(table, sink, pyarrow.csv.WriteOptions(quoting_style="needed"))
     else:
         pq.write_table(table, sink, compression="zstd")
-    replace_file(path, sink.getvalue())
+    try:
+        replace_file(path, sink.getvalue())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def check_suffix(path: Path) -> None:
-    """Raise InputError for a file that is neither CSV nor Parquet by its name."""
+def check_new(path: Path) -> None:
+    """Raise InputError for a file that is neither CSV nor Parquet by its name, is there, or has no folder."""
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: must end in {' or '.join(SUFFIXES)}")
+    if path.exists():
+        raise InputError(f"{path}: is there already: name another with --out")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: no folder {path.parent}")
 
 
 def _measured(environment: Environment, sensor: str, experiment: Experiment) -> pa.Table:

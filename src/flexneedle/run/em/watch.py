@@ -14,10 +14,11 @@ from flexneedle.errors import InputError
 from flexneedle.ports import VISIBLE, Clock, Frame
 from flexneedle.scenario import Monitor
 from flexneedle.tracking.monitor import field_verdict
+from flexneedle.tracking.table import TIP
 
 from .trackers import LiveTracker
 
-__all__ = ["Judge", "View", "judge_field", "watch"]
+__all__ = ["Judge", "View", "field_judge", "judge_field", "watch"]
 
 Judge = Callable[[Sequence[Frame]], str]
 """Says of the frames of the last seconds, oldest first, whether they are to be trusted: "ok" or why not."""
@@ -47,10 +48,10 @@ def watch(
 ) -> int:
     """Show each new frame, and the state now and then where none comes, for so long or until a replay ends.
 
-    judge: `judge_field` with the default monitor, if left out. record: a CSV of all frames, which must not be there
-    yet. Returns the number of frames. Raises InputError if the file cannot be written.
+    judge: `field_judge()`, if left out. record: a CSV of all frames, which must not be there yet. Returns the number
+    of frames. Raises InputError if the file cannot be written.
     """
-    chosen = judge if judge is not None else _default_judge
+    chosen = judge if judge is not None else field_judge()
     history: deque[Frame] = deque(maxlen=_HISTORY)
     start, count, shown_at = clock.now(), 0, -inf
     with ExitStack() as files:
@@ -86,13 +87,24 @@ def judge_field(frames: Sequence[Frame], settings: Monitor) -> str:
     return field_verdict(frames, settings)
 
 
-def _default_judge(frames: Sequence[Frame]) -> str:
-    return judge_field(frames, Monitor())
+def field_judge(references: int | None = None) -> Judge:
+    """Return `judge_field` by the default monitor with so many references; without a number, with those that the
+    tracker has: one at least, and no more than an insertion asks for."""
+    default = Monitor()
+
+    def judge(frames: Sequence[Frame]) -> str:
+        there = sum(name != TIP for name in frames[-1].readings)
+        wanted = max(1, min(default.references, there)) if references is None else references
+        return judge_field(frames, default.model_copy(update={"references": wanted}))
+
+    return judge
 
 
 def _recorder(files: ExitStack, path: Path | None) -> Callable[[Frame], None]:
     if path is None:
         return lambda _: None
+    if path.suffix == ".parquet":
+        raise InputError(f"{path}: a CSV is written: give a name that ends in .csv")
     try:
         file = files.enter_context(path.open("x", newline="", encoding="utf-8"))
     except FileExistsError:

@@ -194,7 +194,7 @@ def _sums(moments: Moments, cells: int) -> Sums:
 
 def _order(names: list[str]) -> dict[int, int]:
     """Return the rank of each grid point: by number where all are numbers, else by name."""
-    numeric = all(name.lstrip("-").isdigit() for name in names)
+    numeric = all(name.removeprefix("-").isdecimal() for name in names)
     ranked = sorted(range(len(names)), key=lambda k: (int(names[k]) if numeric else 0, names[k]))
     return {number: rank for rank, number in enumerate(ranked)}
 

@@ -29,7 +29,9 @@ class Names:
     def numbers(self, labels: Any, start: int) -> Indices:
         """Return the number (r,) of each label; raises InputError where one is empty, or if there are too many."""
         own = [self._number(value) for value in labels.dictionary.to_pylist()]
-        places = labels.indices.fill_null(len(own)) if labels.null_count else labels.indices
+        # Wide enough for the number that stands for an empty one: that of a short dictionary may not be.
+        indices = labels.indices.cast("int64")
+        places = indices.fill_null(len(own)) if labels.null_count else indices
         found: Indices = np.array([*own, -1], dtype=np.int64).take(places.to_numpy())
         if found.min() < 0:
             refuse(found < 0, start, f"{self.column} is empty")

@@ -36,7 +36,7 @@ def _reason(seen: Places) -> str:
         return f"x_mm, y_mm, z_mm look like metres: {told}"
     if low * wide < measured < high * wide:
         return f"true_x_mm, true_y_mm, true_z_mm look like metres: {told}"
-    tiny = 0.0 < wide < _GRID_MM and measured < _GRID_MM and 0.0 < jitter(seen) < _JITTER_MM
+    tiny = 0.0 < wide < _GRID_MM and measured < _GRID_MM and jitter(seen) < _JITTER_MM
     if tiny and float(np.abs(_aligned(position) - _aligned(true)).max()) < _ERROR_MM:
         return f"true and measured positions look like metres: {told}, jitter {jitter(seen):.1g}"
     return ""
