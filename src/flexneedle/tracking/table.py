@@ -18,7 +18,7 @@ REQUIRED = (
     "environment",
 )
 """Columns that every table has: the grid point and where the stage put the sensor, what the tracker said, of which
-sensor and in which environment. The indicator may be empty where a sensor has none."""
+sensor and in which environment. The indicator may be empty, or left out, where a sensor has none."""
 
 OPTIONAL = ("qw", "qx", "qy", "qz", "distance_mm")
 """Columns that a table may have: orientation as a unit quaternion, distance from sensor to field generator."""
