@@ -8,6 +8,8 @@ import pytest
 
 from emulated import emulated
 from flexneedle.cli import main as cli
+from flexneedle.devices.emulator.server import Serial
+from flexneedle.errors import InputError
 
 GRID = """\
 environment = "ideal"
@@ -39,7 +41,31 @@ def test_the_emulator_replaces_no_file(capsys, tmp_path):
     (tmp_path / "mine").write_text("mine")
     status, _, err = run(capsys, "emulate", "aurora", "--link", str(tmp_path / "mine"))
     assert (status, (tmp_path / "mine").read_text()) == (2, "mine")
-    assert "is there already and is no link" in err
+    assert "is there already: name another, or take it away" in err
+
+
+def test_the_emulator_takes_no_link_but_one_that_a_killed_emulator_left(tmp_path):
+    target, link = tmp_path / "kept.txt", tmp_path / "dev"
+    target.write_text("mine")
+    link.symlink_to(target)
+    with pytest.raises(InputError, match="is there already"):
+        Serial(link)
+    assert link.readlink() == target
+    link.unlink()
+    link.symlink_to("/dev/pts/999999")
+    with Serial(link) as serial:
+        with pytest.raises(InputError, match="is there already"):
+            Serial(link)
+        assert serial.link.exists()
+    assert not link.is_symlink()
+
+
+def test_an_emulator_that_ends_leaves_the_link_of_another(tmp_path):
+    link = tmp_path / "dev"
+    with Serial(link):
+        link.unlink()
+        link.symlink_to("/dev/null")
+    assert link.readlink().name == "null"
 
 
 def test_a_fault_that_makes_no_sense_is_bad_input(capsys):

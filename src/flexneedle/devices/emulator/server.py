@@ -82,6 +82,11 @@ class Session:
         return whole[:at] + bytes([whole[at] ^ int(flipped)]) + whole[at + 1 :]
 
 
+def _is_left_over(link: Path) -> bool:
+    """Whether it is a link to a terminal that is gone, as an emulator that was killed leaves it."""
+    return link.is_symlink() and not link.exists() and link.readlink().parent == Path("/dev/pts")
+
+
 class Serial:
     """A pseudo-terminal and a link to it. Plugged in and out; the link's path stays the same. Use it as a context.
 
@@ -91,8 +96,8 @@ class Serial:
     def __init__(self, link: Path | None) -> None:
         self._folder = None if link is not None else tempfile.TemporaryDirectory(prefix="flexneedle-")
         self.link = link if link is not None else Path(self._folder.name) / "aurora"  # type: ignore[union-attr]
-        if os.path.lexists(self.link) and not self.link.is_symlink():
-            raise InputError(f"{self.link}: is there already and is no link")
+        if os.path.lexists(self.link) and not _is_left_over(self.link):
+            raise InputError(f"{self.link}: is there already: name another, or take it away")
         self.ends: tuple[int, int] | None = None
         """Descriptors of the device's end and of the host's; the latter stays open, or the former would fail."""
 
@@ -112,7 +117,8 @@ class Serial:
         tty.setraw(host)  # no echo, no line editing, before the first host opens it
         os.set_blocking(device, False)
         try:
-            self.link.unlink(missing_ok=True)
+            if _is_left_over(self.link):
+                self.link.unlink()
             self.link.symlink_to(os.ttyname(host))
         except OSError as error:
             raise InputError(f"{self.link}: the link cannot be made: {error.strerror}") from None
@@ -120,7 +126,9 @@ class Serial:
     def unplug(self) -> None:
         """Hang up on the host and take the link away."""
         if self.ends is not None:
-            self.link.unlink(missing_ok=True)
+            # Another's link, made since, stays.
+            if self.link.is_symlink() and self.link.readlink() == Path(os.ttyname(self.ends[1])):
+                self.link.unlink()
             for end in self.ends:
                 os.close(end)
         self.ends = None
