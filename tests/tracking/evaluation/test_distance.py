@@ -2,6 +2,8 @@
 
 import pytest
 
+from em_tables import write_csv
+from flexneedle.run.em.evaluate import Options, evaluate
 from flexneedle.tracking.evaluation.distance import Distances, Stretch
 
 
@@ -29,3 +31,28 @@ def test_the_nearest_bin_is_not_where_a_limit_begins(smallest, exceeded, told):
 
 def test_without_a_limit_none_is_kept():
     assert Distances(50.0, None, None, (), bins([0.4])).told == "no limit"
+
+
+def test_the_rmse_of_a_bin_is_held_against_the_limit_not_its_largest_error(tmp_path):
+    """At 610 mm errors of 3 mm, at 710 mm of 0.2 and 0.9 mm, whose RMS is 0.65 mm: 0.7 mm is kept from there on."""
+    places = [(0, 610.0, 3.0), (1, 610.0, 3.0), (2, 710.0, 0.2), (3, 710.0, 0.9)]
+    rows = [
+        {
+            "point_id": point,
+            "true_x_mm": 25.0 * point,
+            "true_y_mm": 0.0,
+            "true_z_mm": 0.0,
+            "x_mm": 25.0 * point + error,
+            "y_mm": 0.0,
+            "z_mm": 0.0,
+            "indicator": 0.02,
+            "sensor": "coil",
+            "environment": "lab",
+            "distance_mm": distance,
+        }
+        for point, distance, error in places
+        for _ in range(2)
+    ]
+    found = evaluate(write_csv(tmp_path / "t.csv", rows), Options(limit_mm=0.7)).values()["results"][0]
+    assert found["distance"]["smallest_mm"] == pytest.approx(710.0)
+    assert [one["rmse_mm"] for one in found["distance"]["bins"]] == pytest.approx([3.0, 0.425**0.5])
