@@ -94,8 +94,11 @@ class Serial:
     """
 
     def __init__(self, link: Path | None) -> None:
-        self._folder = None if link is not None else tempfile.TemporaryDirectory(prefix="flexneedle-")
-        self.link = link if link is not None else Path(self._folder.name) / "aurora"  # type: ignore[union-attr]
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        if link is None:
+            self._folder = tempfile.TemporaryDirectory(prefix="flexneedle-")
+            link = Path(self._folder.name) / "aurora"
+        self.link = link
         if os.path.lexists(self.link) and not _is_left_over(self.link):
             raise InputError(f"{self.link}: is there already: name another, or take it away")
         self.ends: tuple[int, int] | None = None
