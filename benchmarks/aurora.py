@@ -7,7 +7,6 @@ was lost.
 
 import argparse
 import json
-import signal
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -70,7 +69,7 @@ def emulated(*arguments: str):
     try:
         yield process.stdout.readline().strip()
     finally:
-        process.send_signal(signal.SIGINT)
+        process.terminate()  # SIGINT is ignored where a shell put this in the background
         process.wait()
 
 

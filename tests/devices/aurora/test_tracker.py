@@ -33,6 +33,16 @@ def in_order(*wanted, name="tip"):
     return lambda frames: seen(frames, name)[: len(wanted)] == list(wanted)
 
 
+def process_of(word):
+    """Return the process below this one whose command line has a word with `word` in it."""
+    (found,) = [
+        child
+        for child in psutil.Process().children(recursive=True)
+        if any(word in part for part in child.cmdline())
+    ]
+    return found
+
+
 def test_at_40_hz_no_frame_is_lost_and_every_one_is_right():
     """40 in a row; a machine under load may stall any process for more than a frame, so the row may begin later."""
 
@@ -47,6 +57,22 @@ def test_at_40_hz_no_frame_is_lost_and_every_one_is_right():
     assert {r.status for frame in frames for r in frame.readings.values()} == {VISIBLE}
     assert (counts.reconnections, counts.dropped, counts.troubles) == (0, 0, {})
     np.testing.assert_allclose(np.diff([frame.time for frame in frames][-40:]), 1 / 40, atol=0.004)
+
+
+def test_an_emulator_that_is_kept_waiting_loses_no_frames_and_a_link_that_is_does():
+    """Stopped for six frames: the emulated device stands still meanwhile; but nobody stops time for the link."""
+    with emulated() as path, Aurora(path, WallClock()) as aurora:
+        device, link = process_of("emulate"), process_of("aurora.link")
+        missed = [aurora.counts.missed]
+        for process in (device, link):
+            read_until(aurora, number(5))
+            process.suspend()
+            until(lambda: aurora.status != VISIBLE)
+            process.resume()
+            read_until(aurora, number(10))
+            missed.append(aurora.counts.missed)
+    assert missed[1] - missed[0] <= 2
+    assert missed[2] - missed[1] >= 5
 
 
 def test_times_are_those_of_the_runs_clock():
@@ -153,11 +179,6 @@ def test_without_an_end_a_fault_is_told_for_as_long_as_it_lasts():
         assert aurora.read() == ()
 
 
-def link_of_this_process():
-    (link,) = [child for child in psutil.Process().children() if "aurora.link" in " ".join(child.cmdline())]
-    return link
-
-
 @pytest.mark.parametrize(
     ("kill", "words"),
     [pytest.param(signal.SIGKILL, "the link", marks=pytest.mark.slow), (signal.SIGSTOP, "the link hung")],
@@ -167,7 +188,7 @@ def test_a_link_that_crashes_or_hangs_is_replaced(kill, words, monkeypatch):
     monkeypatch.setattr(tracker, "_STOP_S", 0.2)
     with emulated() as path, Aurora(path, WallClock()) as aurora:
         before, _ = read_until(aurora, number(3))
-        os.kill(link_of_this_process().pid, kill)
+        os.kill(process_of("aurora.link").pid, kill)
         after, statuses = read_until(aurora, lambda f: aurora.counts.reconnections == 1 and len(f) >= 3)
         counts = aurora.counts
     assert_true_and_new(before + after)
@@ -190,7 +211,7 @@ def test_closing_leaves_no_process_and_a_tracker_that_can_be_opened_again():
         for _ in range(2):
             with Aurora(path, WallClock()) as aurora:
                 read_until(aurora, number(1))
-                link = link_of_this_process()
+                link = process_of("aurora.link")
             assert not link.is_running()
 
 

@@ -23,15 +23,17 @@ from .faults import Fault, active
 from .motion import RATE_HZ, SENSORS, pose
 from .orders import Orders, parse_place
 
-__all__ = ["Serial", "Session", "obey", "serve"]
+__all__ = ["Serial", "Session", "device_time", "obey", "serve"]
 
-_IDLE_S = 0.1  # the longest that the loop sleeps
+_TICK_S = 0.005  # the longest that the loop sleeps
+_LONGEST_STEP_S = 2 * _TICK_S
+_CATCHING_UP, _MOST_BEHIND_S = 1.1, 0.5
 _LONGEST_LINE = 4096
 
 
 @dataclass
 class Session:
-    """The device and its faults over time. Times are seconds on one clock, first of all that of power-on.
+    """The device and its faults over time. Times are seconds on the device's clock, first of all that of power-on.
 
     rest: where the tip rests (mm, the tracker's frame), None while it moves along its arc.
     """
@@ -154,23 +156,37 @@ class Serial:
                 os.write(self.ends[0], data)
 
 
+def device_time(before: float, served: float, now: float) -> float:
+    """Return the device's time (s) at `now`, from that `before`, when it was last `served`.
+
+    It is real time, but does not leap where the machine kept this process waiting: it stands, as the device does
+    whose part the process plays, and then runs a tenth faster until it has caught up. Else a machine that takes the
+    processor away for a frame's length (virtual machines do, for tens of ms) would lose frames that no line loses.
+    After longer than half a second it leaps: then the process was stopped.
+    """
+    stepped = before + _CATCHING_UP * min(now - served, _LONGEST_STEP_S)
+    return max(now - _MOST_BEHIND_S, min(now, stepped))
+
+
 def serve(session: Session, serial: Serial, orders: Orders, say: Callable[[str], None]) -> NoReturn:
     """Answer until interrupted. say: told when the cable is pulled or plugged in, and where the tip rests now."""
     heard, due = b"", list[tuple[float, bytes]]()
+    now = served = monotonic()
     while True:
-        pulled = "unplug" in session.faults_at(monotonic())
+        pulled = "unplug" in session.faults_at(now)
         if pulled != (serial.ends is None):
             (serial.unplug if pulled else serial.plug)()
             heard, due = b"", []
             say("unplugged" if pulled else f"plugged in again: {serial.link}")
-        idle = max(0.0, min([_IDLE_S, *(time - monotonic() for time, _ in due)]))
+        idle = max(0.0, min([_TICK_S, *(time - now for time, _ in due)]))
         ready, _, _ = select.select([*serial.sources, *orders.sources], [], [], idle)
+        now, served = device_time(now, served, real := monotonic()), real
         for order in orders.read(ready):
             say(obey(session, order))
         heard += serial.read()
         *lines, heard = heard[-_LONGEST_LINE:].split(b"\r")
-        due += [session.reply(line, monotonic()) for line in lines]
-        while due and due[0][0] <= monotonic():
+        due += [session.reply(line, now) for line in lines]
+        while due and due[0][0] <= now:
             serial.write(due.pop(0)[1])
 
 
