@@ -103,6 +103,16 @@ def test_the_area_counts_pairs_and_equals_that_under_the_curve(low, high, expect
     assert (false_alarms[0], detected[0], false_alarms[-1], detected[-1]) == (0.0, 0.0, 1.0, 1.0)
 
 
+def test_ties_count_half_in_the_interval_of_the_area_too(tmp_path):
+    level = np.where(np.arange(N) < 20, 0.1, 0.2)  # alike in both, most pairs tie
+    path = table(tmp_path / "t.csv", (level, np.ones(N)), (level, np.ones(N)))
+    (found,) = evaluate(path, Options()).values()["indicator"]
+    low, high = found["auc_interval"]
+    assert found["auc"] == pytest.approx(0.5)
+    assert low < 0.5 < high
+    assert low + high == pytest.approx(1.0, abs=0.05)
+
+
 def test_a_line_through_equal_indicators_is_not_known():
     found = line(np.full(12, 0.1), np.arange(12.0))
     assert np.isnan(found.slope_mm)
