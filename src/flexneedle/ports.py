@@ -14,7 +14,7 @@ Quaternion = tuple[float, float, float, float]
 """Unit quaternion w, x, y, z: turns the sensor's frame into the tracker's. The sensor's z axis is the needle's."""
 
 VISIBLE = "ok"
-"""Status of a sensor that the tracker sees."""
+"""Status of a sensor that the tracker sees, and of a tracker that sends frames."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +84,20 @@ class Tracker(Protocol):
         """The frames since the last call, oldest first; empty if there was none. Never waits for the next."""
         ...
 
+    @property
+    def status(self) -> str:
+        """VISIBLE while frames come, or in a few words why none do."""
+        ...
+
 
 class TipTracker(Protocol):
     """Sees the tip of the needle, in the frame of the stage."""
 
     def read(self) -> tuple[Sample, ...]:
         """The readings since the last call, oldest first; empty if there was none."""
+        ...
+
+    @property
+    def status(self) -> str:
+        """VISIBLE while readings come, or in a few words why none do."""
         ...

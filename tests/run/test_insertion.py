@@ -18,7 +18,7 @@ import flexneedle
 import flexneedle.control
 from flexneedle.errors import InputError, RunError
 from flexneedle.phantom import Phantom, draw
-from flexneedle.ports import Sample
+from flexneedle.ports import VISIBLE, Sample
 from flexneedle.run import insertion
 from flexneedle.run.rig import Rig, Seeds, virtual_rig
 from flexneedle.simulator import State
@@ -33,6 +33,8 @@ HELD, RESTING = "held", "at rest for the last reading"
 
 class Tank:
     """A phantom whose driver calls are counted, behind a tracker whose batches are changed and taped."""
+
+    status = VISIBLE
 
     def __init__(self, bevel, seed=2000, spoil=lambda batch: batch, scenario=PHANTOM, delay=0.0):
         self.phantom = Phantom(draw(scenario, np.random.default_rng(seed)), bevel)
@@ -60,6 +62,8 @@ class Tank:
 
 class Stage:
     """No phantom: a clock that adds up, a driver and a tracker that play tapes; off tape commands are carried out."""
+
+    status = VISIBLE
 
     def __init__(self, tape, applied=()):
         self.time, self.tape, self.applied = 0.0, itertools.chain([()], tape), iter(applied)

@@ -85,6 +85,8 @@ def test_a_plate_that_comes_and_goes_holds_the_needle_as_long_as_it_is_there(ins
 class Interrupted:
     """A tracker that tells nothing in the calls, or nothing of the tip, within a span (s)."""
 
+    status = "unplugged"
+
     def __init__(self, tracker, clock, span, calls):
         self.tracker, self.clock, self.span, self.calls, self.late = tracker, clock, span, calls, ()
 
@@ -133,7 +135,7 @@ def test_a_hold_for_a_reading_has_a_clock_of_its_own_after_a_hold_for_the_field(
 def test_silence_of_the_tracker_holds_once_its_last_reading_is_stale(plan):
     done = interrupted(plan, (2.0, 2.6), calls=True, **{"phantom.delay_periods": 0.0})
     silent = [period for period in done.periods if not period.readings]
-    assert {period.verdict for period in silent} == {"ok", "missing: no reading"}
+    assert {period.verdict for period in silent} == {"ok", "missing: no reading (unplugged)"}
     assert done.outcome == "done"
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from flexneedle.control.estimate import Estimate
-from flexneedle.ports import Sample, TipTracker
+from flexneedle.ports import VISIBLE, Sample, TipTracker
 from flexneedle.scenario import Scenario
 from flexneedle.trace import Judged
 from flexneedle.tracking import OK, Watch
@@ -61,7 +61,7 @@ def see(
     stale_after = scenario.control.stale_after_s
     samples = tracker.read()
     if not samples:
-        return _without_news(predicted, watch, now, stale_after)
+        return _without_news(predicted, watch, now, stale_after, tracker.status)
     # All but the newest were on their way while the needle moved.
     ages = [stale_after + now - begun] * (len(samples) - 1) + [stale_after]
     watch, readings = _judged(scenario, predicted, watch, samples, ages, now)
@@ -78,13 +78,17 @@ def see(
     return Sight(corrected.unseen(), watch, readings, newest.sample, newest.verdict)
 
 
-def _without_news(predicted: Estimate, watch: Watch, now: float, stale_after: float) -> Sight:
-    """A period between two frames: the field is as it was, and the last good reading counts until it is stale."""
+def _without_news(predicted: Estimate, watch: Watch, now: float, stale_after: float, status: str) -> Sight:
+    """A period between two frames: the field is as it was, and the last good reading counts until it is stale.
+
+    status: of the tracker, which may know why it is silent.
+    """
     if watch.field != OK:
         return Sight(predicted.unseen(), watch, verdict=watch.field, field=True)
     if (before := watch.last_good(now, stale_after)) is not None:
         return Sight(predicted.unseen(), watch, sample=before)
-    return Sight(predicted.unseen(), watch, verdict="missing: no reading")
+    why = "" if status == VISIBLE else f" ({status})"
+    return Sight(predicted.unseen(), watch, verdict=f"missing: no reading{why}")
 
 
 def _judged(

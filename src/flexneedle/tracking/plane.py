@@ -37,3 +37,8 @@ class InPlane:
         """Return the tip in each frame since the last call, oldest first."""
         frames = self._tracker.read()
         return tuple(tip_in_plane(frame, self._to_stage, self._tip_offset) for frame in frames)
+
+    @property
+    def status(self) -> str:
+        """As the tracker says it."""
+        return self._tracker.status

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flexneedle.ports import Clock, Sample
+from flexneedle.ports import VISIBLE, Clock, Sample
 
 
 class NoisyTracker:
@@ -41,6 +41,11 @@ class NoisyTracker:
         samples = tuple(self._sample(k * self._period) for k in range(self._taken + 1, due + 1))
         self._taken = max(due, self._taken)
         return samples
+
+    @property
+    def status(self) -> str:
+        """VISIBLE: it never falls silent."""
+        return VISIBLE
 
     def _sample(self, time: float) -> Sample:
         x, y = self._tip_at(time)

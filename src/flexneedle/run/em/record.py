@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.errors import InputError, RunError
-from flexneedle.ports import VISIBLE, Clock, Frame, Point, Reading
+from flexneedle.ports import VISIBLE, Clock, Frame, Point, Reading, Tracker
 from flexneedle.trace.shield import uninterrupted
 from flexneedle.tracking.table import COLUMNS
 
 from .grid import Grid, Stop
 from .steps import Visit, disagreement
-from .trackers import LiveTracker
 
 __all__ = ["EXTRA", "Guide", "Session", "open_session", "record"]
 
@@ -90,7 +89,7 @@ def open_session(path: Path, grid: Grid) -> Iterator[Session]:
         yield _resumed(path, file, grid)
 
 
-def record(session: Session, tracker: LiveTracker, clock: Clock, grid: Grid, guide: Guide) -> int:
+def record(session: Session, tracker: Tracker, clock: Clock, grid: Grid, guide: Guide) -> int:
     """Measure the stops that are left and return their number.
 
     Raises InputError if the tracker lacks a sensor of the grid, RunError if it tells nothing, or if a point cannot be
@@ -105,7 +104,7 @@ def record(session: Session, tracker: LiveTracker, clock: Clock, grid: Grid, gui
     return len(session.left)
 
 
-def _check_sensors(tracker: LiveTracker, clock: Clock, grid: Grid, say: Callable[[str], None]) -> None:
+def _check_sensors(tracker: Tracker, clock: Clock, grid: Grid, say: Callable[[str], None]) -> None:
     """Before the stage is moved for nothing: look for the grid's sensors in the first frame."""
     frames = next(filter(None, _arriving(tracker, clock, grid.file.rest.timeout_s, say)), ())
     if not frames:
@@ -117,7 +116,7 @@ def _check_sensors(tracker: LiveTracker, clock: Clock, grid: Grid, say: Callable
 
 
 def _arriving(
-    tracker: LiveTracker, clock: Clock, seconds: float, say: Callable[[str], None]
+    tracker: Tracker, clock: Clock, seconds: float, say: Callable[[str], None]
 ) -> Iterator[tuple[Frame, ...]]:
     """Give what the tracker tells, again and again for so long; say when nothing comes, and when it does again."""
     began = heard = clock.now()
@@ -135,7 +134,7 @@ def _arriving(
 
 
 def _measure(
-    tracker: LiveTracker, clock: Clock, grid: Grid, guide: Guide, stop: Stop, before: Visit | None
+    tracker: Tracker, clock: Clock, grid: Grid, guide: Guide, stop: Stop, before: Visit | None
 ) -> tuple[list[Frame], Visit]:
     guide.ask(stop)
     while True:
@@ -154,7 +153,7 @@ def _measure(
 
 
 def _samples(
-    tracker: LiveTracker, clock: Clock, grid: Grid, say: Callable[[str], None]
+    tracker: Tracker, clock: Clock, grid: Grid, say: Callable[[str], None]
 ) -> tuple[list[Frame], str]:
     """Return the frames of a point at rest, taken from now on, or what is wrong.
 

@@ -2,7 +2,6 @@
 
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Protocol
 
 from flexneedle.devices.aurora import Aurora
 from flexneedle.devices.aurora.readings import NAMES
@@ -14,22 +13,13 @@ from flexneedle.run.folder import TRACE_FILE
 from flexneedle.trace.reader import read_trace
 from flexneedle.tracking.table import TIP
 
-__all__ = ["FORMS", "LiveTracker", "frames_of_run", "open_tracker"]
+__all__ = ["FORMS", "frames_of_run", "open_tracker"]
 
 FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE[@SPEED] (a recording, or the folder of a run)"
 """How trackers are written."""
 
 
-class LiveTracker(Tracker, Protocol):
-    """A tracker that says how it is."""
-
-    @property
-    def status(self) -> str:
-        """ "ok" while frames come, or in a few words why none do."""
-        ...
-
-
-def open_tracker(spec: str, clock: Clock) -> AbstractContextManager[LiveTracker]:
+def open_tracker(spec: str, clock: Clock) -> AbstractContextManager[Tracker]:
     """Return the tracker that `spec` names, at work; leaving the context puts it to rest.
 
     `aurora:/dev/ttyUSB0` has the sensors tip, ref1, ref2, ref3 at the ports 1 to 4; `aurora:/dev/ttyUSB0=ref1,tip`

@@ -11,12 +11,10 @@ from pathlib import Path
 from flexneedle.devices.recording import COLUMNS, rows_of
 from flexneedle.devices.replay import Replay
 from flexneedle.errors import InputError
-from flexneedle.ports import VISIBLE, Clock, Frame
+from flexneedle.ports import VISIBLE, Clock, Frame, Tracker
 from flexneedle.scenario import Monitor
 from flexneedle.tracking.monitor import field_verdict
 from flexneedle.tracking.table import TIP
-
-from .trackers import LiveTracker
 
 __all__ = ["Judge", "View", "field_judge", "judge_field", "watch"]
 
@@ -39,7 +37,7 @@ class View:
 
 
 def watch(
-    tracker: LiveTracker,
+    tracker: Tracker,
     clock: Clock,
     show: Callable[[View], None],
     seconds: float = inf,

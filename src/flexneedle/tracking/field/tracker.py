@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from flexneedle.ports import Clock, Frame, Point, Quaternion, Reading
+from flexneedle.ports import VISIBLE, Clock, Frame, Point, Quaternion, Reading
 from flexneedle.tracking.field.poses import Pose
 from flexneedle.tracking.field.room import SENSORS, Floats, Room
 from flexneedle.tracking.field.sensors import Noiseless, Readings, noiseless, noisy
@@ -67,6 +67,11 @@ class FieldTracker:
         frames = tuple(self._frame(k) for k in range(self._taken + 1, due + 1))
         self._taken = max(due, self._taken)
         return frames
+
+    @property
+    def status(self) -> str:
+        """VISIBLE: it never falls silent."""
+        return VISIBLE
 
     def _frame(self, number: int) -> Frame:
         time = number * self._period
