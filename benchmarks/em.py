@@ -1,4 +1,4 @@
-"""Time and memory of `flexneedle em evaluate`: python benchmarks/em.py [--rows N] [--times N] [--json].
+"""Time and memory of `flexneedle em evaluate`: python benchmarks/em.py [--rows N] [--times N] [--all-columns] [--json].
 
 Makes a table of N shuffled rows (10 million; 125 grid points, two sensors, two environments; all digits) as CSV and as
 Parquet in a temporary folder (1.5 GB), runs the command on each in a process of its own, figures included, and prints
@@ -26,14 +26,15 @@ ROWS, PART = 10_000_000, 1_000_000
 GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def parts(rows: int, rng: np.random.Generator) -> Iterator[pa.Table]:
-    """Yield tables of a million rows in random order, a metre from the origin."""
+def parts(rows: int, rng: np.random.Generator, all_columns: bool) -> Iterator[pa.Table]:
+    """Yield tables of a million rows in random order, a metre from the origin; all_columns: those that may be left
+    out, too (orientation and distance)."""
     bias = rng.normal(0.0, 0.35, (2, 2, *GRID.shape))
     for start in range(0, rows, PART):
         count = min(PART, rows - start)
         point, sensor, noisy = (rng.integers(0, n, count) for n in (len(GRID), 2, 2))
         measured = GRID[point] + 1000.0 + bias[sensor, noisy, point] + rng.normal(0.0, 0.04, (count, 3))
-        yield pa.table(
+        table = pa.table(
             {
                 "point_id": point,
                 **{f"true_{axis}_mm": GRID[point, k] + 1000.0 for k, axis in enumerate("xyz")},
@@ -43,13 +44,22 @@ def parts(rows: int, rng: np.random.Generator) -> Iterator[pa.Table]:
                 "environment": np.array(["ideal", "noisy"])[noisy],
             }
         )
+        yield _with_optional(table, GRID[point], rng) if all_columns else table
 
 
-def write(folder: Path, rows: int) -> list[Path]:
+def _with_optional(table: pa.Table, places: np.ndarray, rng: np.random.Generator) -> pa.Table:
+    turns = np.array([1.0, 0.0, 0.0, 0.0]) + rng.normal(0.0, 0.01, (len(places), 4))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    for k, name in enumerate(("qw", "qx", "qy", "qz")):
+        table = table.append_column(name, [turns[:, k]])
+    return table.append_column("distance_mm", [np.linalg.norm(places + 100.0, axis=1)])
+
+
+def write(folder: Path, rows: int, all_columns: bool) -> list[Path]:
     """Write the table twice and return the paths."""
     paths = [folder / "table.csv", folder / "table.parquet"]
     writers = None
-    for part in parts(rows, np.random.default_rng(0)):
+    for part in parts(rows, np.random.default_rng(0), all_columns):
         if writers is None:
             writers = csv.CSVWriter(paths[0], part.schema), parquet.ParquetWriter(paths[1], part.schema)
         for writer in writers:
@@ -84,6 +94,7 @@ def main() -> None:
     )
     parser.add_argument("--rows", type=int, default=ROWS)
     parser.add_argument("--times", type=int, default=2, help="runs of each (2)")
+    parser.add_argument("--all-columns", action="store_true", help="orientations and distances, too")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
@@ -91,7 +102,7 @@ def main() -> None:
         with ProcessPoolExecutor(
             1, get_context("spawn")
         ) as apart:  # a child's memory counts its parent's at birth
-            paths = apart.submit(write, folder, args.rows).result()
+            paths = apart.submit(write, folder, args.rows, args.all_columns).result()
         found = [measure(path, folder / f"{path.name}-{k}") for k in range(args.times) for path in paths]
     if args.json:
         print(json.dumps({"rows": args.rows, "runs": found}))
