@@ -157,6 +157,29 @@ def test_figures_are_those_that_the_rows_support(drawn_on, options, expected):
     assert names(drawn_on(make_rows(**{"targets": TARGETS, "repeats": 3} | options))[0]) == expected
 
 
+def test_cases_of_one_controller_are_drawn_apart_everywhere(drawn_on):
+    """Cases are there to differ: taken together their errors would be of nothing in particular."""
+    cases = {"base": {}, "skew": {"phantom.run_out_mm": 1.0}, "bent": {"phantom.initial_bend_mm": 1.0}}
+    rows = make_rows(cases=cases, targets=TARGETS, repeats=3)
+    for row in rows:
+        row["true_error_mm"] = 0.7 if row["case"] == "bent" else 0.2
+    drawn = {one.name: one for one in drawn_on(rows)[0].figures}
+    for name in ("targeting", "errors-by-depth", "energy"):
+        base, bent = drawn[name].alt.split("bent: ")
+        assert "base: " in base
+        assert "0.2" in base
+        assert "0.7" in bent
+        assert "together" not in drawn[name].caption
+
+
+def test_what_has_no_panel_of_its_own_is_said_to_be_taken_together(drawn_on):
+    axes = {"contact.spacing_mm": [0.5, 1.0], "needle.gauge": ["18G", "21G"]}
+    drawn = {one.name: one for one in drawn_on(make_rows(axes=axes, targets=TARGETS, repeats=3))[0].figures}
+    for name in ("errors-by-depth", "energy"):
+        assert "contact.spacing_mm" not in drawn[name].caption
+        assert "all levels of needle gauge together" in drawn[name].caption
+
+
 def test_a_study_of_which_nothing_finished_is_reported(drawn_on, rows):
     report, page = drawn_on([unfinished(row, "refused", "plan misses") for row in rows])
     assert names(report) == []

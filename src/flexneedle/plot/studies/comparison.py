@@ -64,6 +64,8 @@ def _draw(ax: Axes, panel: DifferencePanel) -> None:
     for level, row in enumerate(panel.rows):
         sure = row.low > 0.0 or row.high < 0.0
         face = row.look.color if sure else "white"
+        if isnan(row.mean):
+            _say(ax, level, "nothing to compare")
         if not isnan(row.low):
             ax.plot(
                 [row.low, row.high],
@@ -75,6 +77,12 @@ def _draw(ax: Axes, panel: DifferencePanel) -> None:
             )
         mark: dict[str, Any] = {"markersize": 6, "markeredgewidth": 1.4, "markeredgecolor": row.look.color}
         ax.plot([row.mean], [level], row.look.marker, zorder=4, label="mean", markerfacecolor=face, **mark)
+
+
+def _say(ax: Axes, level: int, words: str) -> None:
+    ground = {"facecolor": "white", "linewidth": 0.0, "pad": 1.0}  # over the line at zero
+    placed: dict[str, Any] = {"transform": ax.get_yaxis_transform(), "va": "center", "bbox": ground}
+    ax.text(0.01, level, words, color=QUIET, fontsize=8, **placed)
 
 
 def _share(made: Panels, shown: Sequence[DifferencePanel], label: str) -> None:

@@ -61,7 +61,7 @@ def _handles(others: bool, ax: Axes) -> list[Line2D]:
     low, high = ax.get_ylim()
     limit = Line2D([], [], color=TARGET, linewidth=1.0, linestyle=(0, (4, 2)), label="1 mm")
     dot: dict[str, Any] = {"marker": "o", "markersize": 3.5, "linestyle": "none"}
-    grey = [Line2D([], [], color=FAINT, label="of the other controllers", **dot)] if others else []
+    grey = [Line2D([], [], color=FAINT, label="of the other panels", **dot)] if others else []
     return [
         Line2D([], [], color=QUIET, label="an insertion", **dot),
         *grey,

@@ -10,6 +10,7 @@ from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
@@ -140,7 +141,9 @@ def _count_outside(ax: Axes, tips: Floats, low: Floats, high: Floats) -> None:
     outside = int(((known < low) | (known > high)).any(axis=1).sum())
     if outside:
         text = f"{outside} tip{'s' if outside > 1 else ''} outside"
-        ax.text(0.99, 0.98, text, transform=ax.transAxes, ha="right", va="top", color=BAD, fontsize=8)
+        placed: dict[str, Any] = {"ha": "right", "va": "top", "transform": ax.transAxes, "zorder": 5}
+        halo = withStroke(linewidth=2.0, foreground="white")  # readable over tips
+        ax.text(0.99, 0.98, text, color=BAD, fontsize=8, path_effects=[halo], **placed)
 
 
 def _known(points: Floats) -> Floats:

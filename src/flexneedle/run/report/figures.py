@@ -112,7 +112,7 @@ def _targeting(facts: _Facts) -> _Sheet:
         plots.TargetPanel(
             name, _note(facts, own), _alarm(facts, own), look, targets[own], tips[own], facts.done[own]
         )
-        for name, own, look in _panels_of_targets(facts)
+        for name, own, look in _panels(facts)
     ]
     number = len(np.unique(targets, axis=0))
     return _Sheet(
@@ -125,16 +125,20 @@ def _targeting(facts: _Facts) -> _Sheet:
     )
 
 
-def _panels_of_targets(facts: _Facts) -> list[tuple[str, Flags, plots.Look]]:
+def _panels(facts: _Facts) -> list[tuple[str, Flags, plots.Look]]:
     """Return what has a panel: the levels of the first factor after a single controller, or the controllers."""
-    design = facts.design
-    single = [f for f in design.factors[1:] if len(f.names) <= plots.MOST_PANELS]
-    if design.controller.varies or not single:
+    factor = _shown_apart(facts)
+    if factor is None:
         return [(name, facts.of(k), facts.looks[k]) for k, name in facts.controllers]
-    factor = single[0]
     return [
         (factor.level(k), np.asarray(factor.codes == k), facts.looks[0]) for k in range(len(factor.names))
     ]
+
+
+def _shown_apart(facts: _Facts) -> Factor | None:
+    if facts.design.controller.varies:
+        return None
+    return next((f for f in facts.design.factors[1:] if len(f.names) <= plots.MOST_PANELS), None)
 
 
 def _by_controller(facts: _Facts) -> _Sheet:
@@ -157,23 +161,26 @@ def _by_controller(facts: _Facts) -> _Sheet:
 def _by_depth(facts: _Facts, codes: Codes, names: Sequence[str]) -> _Sheet:
     panels = [
         plots.ErrorPanel(
-            name, _note(facts, facts.of(k)), _alarm(facts, facts.of(k)), _depth_rows(facts, k, codes, names)
+            name, _note(facts, own), _alarm(facts, own), _depth_rows(facts, own, look, codes, names)
         )
-        for k, name in facts.controllers
+        for name, own, look in _panels(facts)
     ]
     return _Sheet(
         "errors-by-depth",
         "True error by depth of the target",
-        "Every finished insertion is a dot" + _pooled(facts) + ". Errors are on a logarithmic scale.",
-        "Rows of dots for each depth of the target, a panel for each controller. "
+        "Every finished insertion is a dot"
+        + _pooled(facts, _shown_apart(facts))
+        + ". Errors are on a logarithmic scale.",
+        "Rows of dots for each depth of the target. "
         + "; ".join(f"{p.title}: medians {_listed(p.rows[1:] or p.rows)}" for p in panels)
         + ".",
         lambda: plots.errors_by_level_figure(panels, "depth of the target (mm)"),
     )
 
 
-def _depth_rows(facts: _Facts, controller: int, codes: Codes, names: Sequence[str]) -> list[plots.ErrorRow]:
-    own, look = facts.of(controller), facts.looks[controller]
+def _depth_rows(
+    facts: _Facts, own: Flags, look: plots.Look, codes: Codes, names: Sequence[str]
+) -> list[plots.ErrorRow]:
     chosen = [("all", own), *((name, own & (codes == k)) for k, name in enumerate(names))]
     return [
         plots.ErrorRow(name, look, facts.error[flags & facts.known], int(flags.sum()))
@@ -250,18 +257,20 @@ def _cases(facts: _Facts, differences: Sequence[Difference]) -> _Sheet:
 def _energy(facts: _Facts) -> _Sheet:
     energy = facts.rows.number("strain_energy_mj")
     panels = []
-    for k, name in facts.controllers:
-        own = facts.of(k) & facts.known & (energy > 0)
+    for name, rows, look in _panels(facts):
+        own = rows & facts.known & (energy > 0)
         note = (
             f"medians {np.median(energy[own]):.2g} mJ, {np.median(facts.error[own]):.3f} mm"
             if own.any()
             else ""
         )
-        panels.append(plots.EnergyPanel(name, note, facts.looks[k], energy[own], facts.error[own]))
+        panels.append(plots.EnergyPanel(name, note, look, energy[own], facts.error[own]))
     return _Sheet(
         "energy",
         "Tissue energy against true error",
-        "Every finished insertion is a dot" + _pooled(facts) + ". Both scales are logarithmic.",
+        "Every finished insertion is a dot"
+        + _pooled(facts, _shown_apart(facts))
+        + ". Both scales are logarithmic.",
         "Energy stored in the tissue at the end against true error. "
         + "; ".join(f"{p.title}: {p.note}" for p in panels)
         + ".",
