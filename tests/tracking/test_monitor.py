@@ -16,7 +16,9 @@ def frame(time, indicators=(0.02, 0.02, 0.02), tip=(1.0, 2.0, 3.0)):
     """A frame with one reference sensor for each indicator; None is one that the tracker does not see."""
     readings = {"tip": Reading(tip, status=OK if tip else "out of volume")}
     for k, indicator in enumerate(indicators, 1):
-        readings[f"ref{k}"] = Reading(None if indicator is None else (0.0, 0.0, 0.0), indicator=indicator)
+        seen = indicator is not None
+        place, status = ((0.0, 0.0, 0.0), OK) if seen else (None, "out of volume")
+        readings[f"ref{k}"] = Reading(place, indicator=indicator, status=status)
     return Frame(time, round(time * RATE), readings)
 
 
@@ -79,7 +81,7 @@ def test_a_lost_reference_holds_after_the_window_and_not_before():
     _, verdicts = told(watch, (0.02, None, 0.02), 1.0, 60)
     held = [verdict != OK for verdict in verdicts]
     assert held.index(True) in (38, 39, 40)
-    assert verdicts[-1] == "field not known: 2 of 3 reference sensors seen within 1 s"
+    assert verdicts[-1] == "field not known: 2 of 3 reference sensors seen within 1 s (ref2: out of volume)"
 
 
 def test_as_many_references_are_needed_as_the_scenario_says():

@@ -148,8 +148,10 @@ def test_the_median_at_the_limit_passes():
 
 def test_reference_sensors_that_tell_nothing_leave_the_field_unknown():
     told = {"ref1": [0.01], "ref2": []}
-    assert rules.unseen_references(told, 1, 1.0) == OK
-    assert (
-        rules.unseen_references(told, 2, 1.0) == "field not known: 1 of 2 reference sensors seen within 1 s"
-    )
-    assert rules.unseen_references({}, 0, 1.0) == OK
+    assert rules.unseen_references(told, 1, 1.0, {}) == OK
+    unknown = "field not known: 1 of 2 reference sensors seen within 1 s"
+    assert rules.unseen_references(told, 2, 1.0, {}) == unknown
+    lost = Reading(None, status="out of volume")
+    newest = {"tip": lost, "ref1": Reading((0.0, 0.0, 0.0)), "ref2": lost}
+    assert rules.unseen_references(told, 2, 1.0, newest) == unknown + " (ref2: out of volume)"
+    assert rules.unseen_references({}, 0, 1.0, {}) == OK

@@ -25,7 +25,7 @@ def field_verdict(frames: Sequence[Frame], settings: Monitor, distorted: bool = 
             if name != TIP and reading.indicator is not None:
                 indicators.setdefault(name, []).append(reading.indicator)
     limit = settings.indicator_limit * (settings.resume_fraction if distorted else 1.0)
-    unseen = rules.unseen_references(indicators, settings.references, window)
+    unseen = rules.unseen_references(indicators, settings.references, window, frames[-1].readings)
     return unseen if unseen != OK else rules.distortion(indicators, limit, window, distorted)
 
 

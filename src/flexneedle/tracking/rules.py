@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 
-from flexneedle.ports import Frame, Sample
+from flexneedle.ports import VISIBLE, Frame, Reading, Sample
 from flexneedle.tracking.table import TIP
 
 Place = tuple[float, ...]
@@ -104,12 +104,19 @@ def frozen(
     return f"frozen: the same in {same} readings while the tip should have moved {travel:.2f} mm"
 
 
-def unseen_references(indicators: Mapping[str, Sequence[float]], needed: int, window: float) -> str:
-    """Fewer than `needed` reference sensors told an indicator within the window (s)."""
+def unseen_references(
+    indicators: Mapping[str, Sequence[float]], needed: int, window: float, newest: Mapping[str, Reading]
+) -> str:
+    """Fewer than `needed` reference sensors told an indicator within the window (s).
+
+    newest: what the tracker last said of its sensors, by name; it may say what ails them.
+    """
     told = sum(bool(values) for values in indicators.values())
     if told >= needed:
         return OK
-    return f"field not known: {told} of {needed} reference sensors seen within {window:g} s"
+    ill = [f"{name}: {r.status}" for name, r in newest.items() if name != TIP and r.status != VISIBLE]
+    why = f" ({', '.join(ill)})" if ill else ""
+    return f"field not known: {told} of {needed} reference sensors seen within {window:g} s{why}"
 
 
 def distortion(
