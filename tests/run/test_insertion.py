@@ -47,7 +47,7 @@ class Tank:
 
     def read(self):
         if self.phantom.now() == 0.0:
-            return self.eye.read()  # nothing: it looks first once the needle moves
+            return self.eye.read()  # it looks before the needle moves
         self.tape.append(self.spoil(self.eye.read()))
         return self.tape[-1]
 
@@ -66,7 +66,8 @@ class Stage:
     status = VISIBLE
 
     def __init__(self, tape, applied=()):
-        self.time, self.tape, self.applied = 0.0, itertools.chain([()], tape), iter(applied)
+        first = (Sample(0.0, -28.5, 0.0),)  # where the needle starts
+        self.time, self.tape, self.applied = 0.0, itertools.chain([first], tape), iter(applied)
 
     def now(self):
         return self.time
@@ -661,7 +662,7 @@ class Stuck(Stage):
         return STILL
 
     def read(self):
-        return (Sample(self.time, -28.5, 0.0),) if self.time > 0.0 else ()
+        return (Sample(self.time, -28.5, 0.0),)
 
 
 def test_a_needle_that_does_not_move_fails_after_four_times_the_planned_periods(plan):
@@ -754,7 +755,7 @@ def test_virtual_rig_is_a_phantom_of_its_seed_behind_the_ports():
     assert str(rig.truth()) == str(again.truth()) != str(other.truth())
     at_rest = rig.tracker.read()
     assert at_rest == again.tracker.read()
-    assert len(at_rest) == 8
+    assert len(at_rest) == 9  # the first was there at the start
     tip = rig.truth().tip[:2]
     rig.driver.apply((1.0, 0.0, 0.0, 0.0, -1), 0.2)
     samples = rig.tracker.read()

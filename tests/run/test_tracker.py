@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 import flexneedle
+from flexneedle.ports import Frame, Reading
 from flexneedle.run.insertion import run
-from flexneedle.run.rig import Seeds, virtual_rig, virtual_room
+from flexneedle.run.rig import Rig, Seeds, to_stage, virtual_rig, virtual_room
 from flexneedle.tracking.field import Room, reference_poses
 from flexneedle.tracking.field.sensors import indicator, noiseless
 from flexneedle.tracking.placement import placed_references
+from flexneedle.tracking.plane import InPlane
 from rooms import STILL, shipped
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -217,3 +219,82 @@ def test_references_are_put_where_the_field_is_clean():
     assert 5 < above < 40
     assert abs(moved - above) < 6
     assert dirty_still <= 1
+
+
+class Bench:
+    """A clock that adds up, a driver that moves nothing, and a tracker that tells what `told_at(time)` says: readings
+    by sensor at 40 Hz since a second before the start, None for no frame."""
+
+    def __init__(self, told_at, status="unplugged"):
+        self.time, self.told_at, self.status, self.number = 0.0, told_at, status, -40
+
+    def now(self):
+        assert self.time < 60.0, "nobody ends it"
+        return self.time
+
+    def wait(self, seconds):
+        self.time += seconds
+
+    def apply(self, command, duration):
+        self.time += duration
+        return command
+
+    def read(self):
+        numbers = range(self.number, round(self.time * 40) + 1)
+        self.number = numbers.stop
+        told = [(number, self.told_at(number / 40)) for number in numbers]
+        return tuple(Frame(n / 40, n + 40, readings) for n, readings in told if readings is not None)
+
+
+def on_bench(plan, told_at, status="unplugged", **values):
+    bench = Bench(told_at, status)
+    rig = Rig(bench, bench, InPlane(bench, to_stage(None)))
+    return run(PHANTOM.with_values(values), plan, rig, np.random.default_rng(0))
+
+
+AT_START = Reading((-28.5, 0.0, 0.0))
+LOST = Reading(None, status="out of volume")
+
+
+def references(indicator):
+    return {name: Reading((0.0, 50.0, 0.0), indicator=indicator) for name in ("ref1", "ref2", "ref3")}
+
+
+def test_causes_that_take_turns_hold_nothing_forever(plan):
+    """The tip is never seen, a reference only for half a second in 0.8 s: 1 s of one cause is soon over."""
+
+    def told_at(time):
+        return {"tip": LOST, **references(0.02)} | ({"ref2": LOST} if time % 0.8 >= 0.5 else {})
+
+    done = on_bench(plan, told_at, **{"monitor.indicator_window_s": 0.1})
+    causes = {period.verdict.split(":")[0] for period in done.periods}
+    assert causes == {"missing", "field not known"}
+    assert done.outcome == "held"
+    assert "(limit 1 s): missing: tracker sees no tip (out of volume)" in done.reason
+    assert done.periods[-1].time < 2.0
+
+
+def test_nothing_moves_before_the_tracker_told_anything(plan):
+    """As a real one that is still connecting, in a field that turns out to be distorted."""
+
+    def told_at(time):
+        return {"tip": AT_START, **references(0.2)} if time > 0.1 else None
+
+    done = on_bench(plan, told_at, status="connecting")
+    assert done.periods[0].verdict == "missing: no reading (connecting)"
+    assert {period.applied for period in done.periods} == {(0.0, 0.0, 0.0, 0.0, -1)}
+    assert done.reason.startswith("held for 10.0")
+    kinds = list(dict.fromkeys(period.verdict.split(":")[0] for period in done.periods))
+    assert kinds == ["missing", "field not known", "field distorted"]
+
+
+def test_a_tracker_that_falls_silent_in_a_distorted_field_is_said_to_be_silent(plan):
+    def told_at(time):
+        return {"tip": AT_START, **references(0.2)} if time < 0.5 else None
+
+    done = on_bench(plan, told_at)
+    assert done.outcome == "held"
+    assert done.reason.endswith("(limit 1 s): missing: no reading (unplugged)")
+    assert 1.5 < done.periods[-1].time < 2.0
+    silent = [period for period in done.periods if not period.readings]
+    assert {period.verdict.split(":")[0] for period in silent} == {"field distorted", "missing"}

@@ -29,10 +29,16 @@ def test_a_tip_that_is_not_seen_is_missing(sample):
 
 
 def test_the_trackers_own_reason_is_told():
-    frame = Frame(1.0, 7, {"tip": Reading(None, status="out of volume"), "ref1": Reading((0.0, 0.0, 0.0))})
-    assert (
-        rules.missing(Sample(1.0, None, None, frame=frame)) == "missing: tracker sees no tip (out of volume)"
-    )
+    place = (0.0, 0.0, 0.0)
+    for told, why in (
+        (Reading(None, status="out of volume"), "out of volume"),
+        (Reading(place, status="out of volume"), "out of volume"),
+        (Reading(None), "no place"),
+        (Reading(place), "no orientation"),
+    ):
+        frame = Frame(1.0, 7, {"tip": told, "ref1": Reading(place)})
+        found = rules.missing(Sample(1.0, None, None, frame=frame))
+        assert found == f"missing: tracker sees no tip ({why})"
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -97,35 +103,25 @@ def test_a_jump_out_of_the_plane_counts_where_both_readings_know_it():
     assert rules.jump(Sample(1.1, 30.0, 1.0), before, 20.0, 1.0) == OK
 
 
-def travelled(count, step):
-    return [(30.0 + step * k, 1.0) for k in range(count)]
-
-
 def test_a_reading_that_stays_while_the_needle_moves_is_frozen():
-    places = [(29.0, 1.0), *[(30.0, 1.0)] * 4]
-    assert rules.frozen(places, travelled(5, 0.1), 0.3) == OK
-    assert rules.frozen(places, travelled(5, 0.101), 0.3) == (
+    assert rules.frozen(4, (30.0, 1.0), (30.3, 1.0), 0.3 + 1e-9) == OK
+    assert rules.frozen(4, (30.0, 1.0), (30.18, 1.241), 0.3) == (
         "frozen: the same in 4 readings while the tip should have moved 0.30 mm"
     )
 
 
-def test_a_reading_that_stays_at_rest_is_not_frozen():
-    assert rules.frozen([(30.0, 1.0)] * 40, [(30.0, 1.0)] * 40, 0.3) == OK
+def test_an_indicator_is_one_of_a_sensor_that_is_seen_and_a_number_that_one_can_be():
+    place = (0.0, 0.0, 0.0)
+    assert [rules.tells_indicator(Reading(place, indicator=i)) for i in (0.0, 0.02, 9.9)] == [True] * 3
+    for indicator in (None, math.nan, math.inf, -1.0):
+        assert not rules.tells_indicator(Reading(place, indicator=indicator))
+    assert not rules.tells_indicator(Reading(None, indicator=0.02))
+    assert not rules.tells_indicator(Reading(place, indicator=0.02, status="out of volume"))
 
 
-def test_the_last_digit_makes_a_reading_new():
-    places = [(30.0, 1.0)] * 3 + [(math.nextafter(30.0, 31.0), 1.0)]
-    assert rules.frozen(places, travelled(4, 1.0), 0.3) == OK
-
-
-def test_frames_without_the_tip_do_not_thaw_a_frozen_one():
-    places = [(30.0, 1.0), None] * 4 + [(30.0, 1.0)]
-    assert rules.frozen(places, travelled(9, 0.1), 0.3).startswith("frozen: the same in 5 readings")
-
-
-@pytest.mark.parametrize("places", [[], [None], [(30.0, 1.0), None]])
-def test_what_was_not_seen_is_not_frozen(places):
-    assert rules.frozen(places, travelled(len(places), 1.0), 0.3) == OK
+def test_a_field_that_was_looked_at_for_too_short_is_not_known():
+    assert rules.too_short(0.475, 0.5, 3) == "field not known: looked at for 0.47 s, 0.5 s needed"
+    assert rules.too_short(0.5, 0.5, 3) == rules.too_short(0.0, 0.5, 0) == OK
 
 
 def test_the_worst_median_is_named():

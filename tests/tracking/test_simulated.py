@@ -31,8 +31,16 @@ def moving(time):
     return 10.0 + max(time, 0.0), -max(time, 0.0)
 
 
-def tracker(watch, tip_at=moving, period=PERIOD, jitter=0.0, seed=0, **faults):
+def fresh(watch, tip_at=moving, period=PERIOD, jitter=0.0, seed=0, **faults):
     return NoisyTracker(tip_at, watch, period, jitter, np.random.default_rng(seed), **faults)
+
+
+def tracker(watch, *arguments, **settings):
+    """One whose first reading, which is there at the start, was taken."""
+    eye = fresh(watch, *arguments, **settings)
+    (first,) = eye.read()
+    assert first.time <= 0.0
+    return eye
 
 
 def readings(count, seed=0, jitter=0.1, **faults):
@@ -80,6 +88,14 @@ def test_no_reading_is_lost_to_rounding(delay):
         times.extend(sample.time for sample in batch)
     late = np.ceil(delay / PERIOD - 1e-6)
     np.testing.assert_allclose(times, PERIOD * (np.arange(1, 4001) - late), atol=1e-9)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.025, 0.2, 0.21])
+def test_one_reading_of_the_needle_at_rest_is_there_at_the_start_and_never_missing(delay):
+    for seed in range(20):
+        (first,) = fresh(Watch(), jitter=0.1, seed=seed, delay=delay, missing=0.9).read()
+        assert -PERIOD < first.time + delay <= 1e-9
+        assert 0.0 < np.hypot(first.x - 10.0, first.y) < 0.6
 
 
 # ---- delay

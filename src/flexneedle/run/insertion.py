@@ -104,7 +104,9 @@ def _periods(
     start = time.perf_counter()
     sight = look_around(scenario, belief, Watch(scenario.monitor), rig.clock.now(), rig.tracker)
     held, indices = _held(None, sight, rig.clock.now()), itertools.count()
-    if sight.readings:
+    if (
+        held is not None or sight.sample.frame is not None
+    ):  # a tip alone that is where it should be tells nothing
         clocks = [start, start, start, time.perf_counter()]
         looks = Decision(_STILL, "looks before it moves")
         yield _record(next(indices), rig.clock.now(), task.plan, rig, looks, _STILL, sight, clocks), None
@@ -136,7 +138,7 @@ def _periods(
         if arrived_at is None and good and chosen.arrived(task, memory, sight.estimate):
             arrived_at = now
         seen = arrived_at is not None and good and sight.sample.time > arrived_at - 1e-6
-        ending = _ending(task, sight, None if held is None else now - held.since, seen)
+        ending = _ending(task, sight, None if held is None else held.lasted(sight.field), seen)
         yield _record(index, now, task.plan, rig, decision, applied, sight, clocks), ending
         if ending is not None:
             return
@@ -144,17 +146,32 @@ def _periods(
 
 @dataclass(frozen=True)
 class _Held:
-    """Whether the needle is held for the field, or for a reading, and since when (s)."""
+    """A needle that is held: for how long (s) for the field and for readings, and for which of them since `at`."""
 
+    at: float
     field: bool
-    since: float
+    for_field: float = 0.0
+    for_readings: float = 0.0
+
+    def lasted(self, field: bool) -> float:
+        """For how long it has been held for one of the two causes (s)."""
+        return self.for_field if field else self.for_readings
 
 
 def _held(held: _Held | None, sight: Sight, now: float) -> _Held | None:
-    """The hold after a verdict: each of the two causes has a clock and a limit of its own."""
+    """The hold after a verdict. Each of the two causes has a clock and a limit of its own; a clock stands while the
+    needle is held for the other cause, and only a good verdict sets it back: causes in turn hold nothing forever."""
     if sight.verdict == OK:
         return None
-    return held if held is not None and held.field == sight.field else _Held(sight.field, now)
+    if held is None:
+        return _Held(now, sight.field)
+    passed = now - held.at
+    return _Held(
+        now,
+        sight.field,
+        held.for_field + (passed if held.field else 0.0),
+        held.for_readings + (0.0 if held.field else passed),
+    )
 
 
 def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> Command:

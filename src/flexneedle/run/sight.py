@@ -37,10 +37,10 @@ class Sight:
 def look_around(
     scenario: Scenario, estimate: Estimate, watch: Watch, now: float, tracker: TipTracker
 ) -> Sight:
-    """Judge what the tracker told before the needle moves; nothing of it is learnt, and no news is no bad news."""
+    """Judge what the tracker told before the needle moves: something good, or it stays. Nothing of it is learnt."""
     samples = tracker.read()
     if not samples:
-        return Sight(estimate, watch)
+        return _without_news(estimate, watch, now, scenario.control.stale_after_s, tracker.status)
     span = now - samples[0].time + scenario.control.stale_after_s
     watch, readings = _judged(scenario, estimate, watch, samples, [span] * len(samples), now)
     watch, field = watch.look()
@@ -79,11 +79,11 @@ def see(
 
 
 def _without_news(predicted: Estimate, watch: Watch, now: float, stale_after: float, status: str) -> Sight:
-    """A period between two frames: the field is as it was, and the last good reading counts until it is stale.
+    """A period between two frames: until the last one is stale the field is as it was, and a good reading counts.
 
     status: of the tracker, which may know why it is silent.
     """
-    if watch.field != OK:
+    if watch.field != OK and watch.heard(now, stale_after):
         return Sight(predicted.unseen(), watch, verdict=watch.field, field=True)
     if (before := watch.last_good(now, stale_after)) is not None:
         return Sight(predicted.unseen(), watch, sample=before)

@@ -15,18 +15,26 @@ __all__ = ["Watch", "field_verdict"]
 def field_verdict(frames: Sequence[Frame], settings: Monitor, distorted: bool = False) -> str:
     """Judge the field by the reference sensors of frames, oldest first: all sensors but the tip.
 
-    Those of the last window count. distorted: whether it was so far; it has to fall below the lower limit then.
+    The frames of the last window count, and a sensor that told an indicator in half of them: a median over a few
+    readings would be no better than these. distorted: whether it was so far; it has to fall below the lower limit then.
     """
     window = settings.indicator_window_s
     since = frames[-1].time - window + 1e-9
+    recent = [frame for frame in frames if frame.time > since]
     indicators: dict[str, list[float]] = {}
-    for frame in frames:
-        for name, reading in frame.readings.items() if frame.time > since else ():
-            if name != TIP and reading.indicator is not None:
-                indicators.setdefault(name, []).append(reading.indicator)
+    for frame in recent:
+        for name, reading in frame.readings.items():
+            if name != TIP and rules.tells_indicator(reading):
+                indicators.setdefault(name, []).append(reading.indicator or 0.0)
+    known = {name: values for name, values in indicators.items() if 2 * len(values) >= len(recent)}
     limit = settings.indicator_limit * (settings.resume_fraction if distorted else 1.0)
-    unseen = rules.unseen_references(indicators, settings.references, window, frames[-1].readings)
-    return unseen if unseen != OK else rules.distortion(indicators, limit, window, distorted)
+    return rules.first_bad(
+        (
+            rules.too_short(recent[-1].time - recent[0].time, window / 2, settings.references),
+            rules.unseen_references(known, settings.references, window, recent[-1].readings),
+            rules.distortion(known, limit, window, distorted),
+        )
+    )
 
 
 @dataclass(frozen=True)
@@ -39,13 +47,17 @@ class _Seen:
 class Watch:
     """What the monitor remembers. Frozen: `take` and `look` return the next one.
 
-    recent: readings within the window; good: the last one without fault; field: the last verdict on the field.
+    recent: readings within the window; still: the first and the number of those at the newest one's place;
+    good: the last one without fault; field: the last verdict on the field; distorted: whether it was since it was last
+    known good.
     """
 
     settings: Monitor
     recent: tuple[_Seen, ...] = ()
+    still: tuple[_Seen, int] | None = None
     good: Sample | None = None
     field: str = OK
+    distorted: bool = False
 
     def take(
         self, sample: Sample, predicted: tuple[float, float], now: float, oldest: float, furthest: float
@@ -67,9 +79,14 @@ class Watch:
             return self, verdict
         since = sample.time - self.settings.indicator_window_s + 1e-9
         kept = tuple(seen for seen in self.recent if seen.sample.time > since)
-        watch = replace(self, recent=(*kept, _Seen(sample, predicted)))
+        seen = _Seen(sample, predicted)
+        watch = replace(self, recent=(*kept, seen), still=self._still(seen))
         verdict = rules.first_bad(watch._faults(sample, predicted, furthest))
         return (replace(watch, good=sample) if verdict == OK else watch), verdict
+
+    def heard(self, now: float, oldest: float) -> bool:
+        """Whether the tracker told anything, good or not, that is not older than `oldest` (s)."""
+        return bool(self.recent) and now - self.recent[-1].sample.time <= oldest + 1e-9
 
     def last_good(self, now: float, oldest: float) -> Sample | None:
         """Return the last good reading, if it is not older than `oldest` (s) and of a tracker that tells frames."""
@@ -95,8 +112,9 @@ class Watch:
         frames = [seen.sample.frame for seen in self.recent if seen.sample.frame is not None]
         if not self.settings.enabled or not frames:
             return self, OK
-        verdict = field_verdict(frames, self.settings, self.field != OK)
-        return replace(self, field=verdict), verdict
+        verdict = field_verdict(frames, self.settings, self.distorted)
+        distorted = verdict.startswith(rules.DISTORTED) or (self.distorted and verdict != OK)
+        return replace(self, field=verdict, distorted=distorted), verdict
 
     def _faults(self, sample: Sample, predicted: tuple[float, float], furthest: float) -> Iterator[str]:
         settings = self.settings
@@ -106,8 +124,17 @@ class Watch:
         if settings.enabled:
             yield rules.out_of_plane(sample.z, settings.out_of_plane_limit_mm)
             yield rules.jump(sample, self.good, settings.speed_limit_mm_s, settings.jump_margin_mm)
-            places = [self._place(seen.sample) for seen in self.recent]
-            yield rules.frozen(places, [seen.predicted for seen in self.recent], settings.frozen_travel_mm)
+            if self.still is not None:
+                first, count = self.still
+                yield rules.frozen(count, first.predicted, predicted, settings.frozen_travel_mm)
+
+    def _still(self, newest: _Seen) -> tuple[_Seen, int] | None:
+        """Return the first and the number of readings at the newest one's place, those without a tip left out."""
+        place = self._place(newest.sample)
+        if place is None or self.still is None:
+            return self.still if place is None else (newest, 1)
+        first, count = self.still
+        return (first, count + 1) if self._place(first.sample) == place else (newest, 1)
 
     def _place(self, sample: Sample) -> rules.Place | None:
         """What the tracker itself said of the tip: a map to the stage or an offset makes no frozen sensor move."""

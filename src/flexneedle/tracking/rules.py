@@ -14,6 +14,7 @@ from flexneedle.tracking.table import TIP
 Place = tuple[float, ...]
 
 __all__ = [
+    "DISTORTED",
     "OK",
     "distortion",
     "first_bad",
@@ -25,10 +26,14 @@ __all__ = [
     "out_of_plane",
     "repeated",
     "stale",
+    "tells_indicator",
+    "too_short",
     "unseen_references",
 ]
 
 OK = "ok"
+DISTORTED = "field distorted"
+"""How a verdict begins that a reference sensor's indicator is above the limit."""
 
 
 def first_bad(verdicts: Iterable[str]) -> str:
@@ -41,7 +46,10 @@ def missing(sample: Sample) -> str:
     if sample.x is not None and sample.y is not None:
         return OK
     told = None if sample.frame is None else sample.frame.readings.get(TIP)
-    return f"missing: tracker sees no tip{f' ({told.status})' if told and told.position is None else ''}"
+    if told is None:
+        return "missing: tracker sees no tip"
+    why = told.status if told.status != VISIBLE else "no place" if told.position is None else "no orientation"
+    return f"missing: tracker sees no tip ({why})"
 
 
 def not_a_number(sample: Sample) -> str:
@@ -86,22 +94,29 @@ def jump(sample: Sample, before: Sample | None, speed: float, margin: float) -> 
     return OK if moved <= limit else f"jump of {moved:.2f} mm, limit {limit:.2f} mm"
 
 
-def frozen(
-    places: Sequence[Place | None], predicted: Sequence[tuple[float, float]], travel_limit: float
-) -> str:
-    """A reading the same to the last digit while the model's tip travelled more than `travel_limit` (mm).
+def frozen(count: int, first: tuple[float, float], now: tuple[float, float], travel_limit: float) -> str:
+    """A reading the same to the last digit, `count` times, while the model's tip travelled over `travel_limit` (mm).
 
-    places, predicted: of the readings up to the newest, oldest first; None where nothing was seen.
+    first, now: the model's tip (mm) at the first of these readings and at the newest.
     """
-    if not places or places[-1] is None:
-        return OK
-    seen = [(place, model) for place, model in zip(places, predicted, strict=True) if place is not None]
-    newest, now = seen[-1]
-    same = next((k for k, (place, _) in enumerate(reversed(seen)) if place != newest), len(seen))
-    travel = math.dist(seen[-same][1], now)
+    travel = math.dist(first, now)
     if travel <= travel_limit:
         return OK
-    return f"frozen: the same in {same} readings while the tip should have moved {travel:.2f} mm"
+    return f"frozen: the same in {count} readings while the tip should have moved {travel:.2f} mm"
+
+
+def tells_indicator(reading: Reading) -> bool:
+    """Whether a reference sensor is seen and its indicator a number that one can be; a code such as −1 is none."""
+    indicator = reading.indicator
+    seen = reading.status == VISIBLE and reading.position is not None
+    return seen and indicator is not None and 0.0 <= indicator < math.inf
+
+
+def too_short(span: float, least: float, needed: int) -> str:
+    """Reference sensors, if any are `needed`, were looked at for less than `least` (s)."""
+    if needed == 0 or span >= least - 1e-9:
+        return OK
+    return f"field not known: looked at for {span:.2f} s, {least:g} s needed"
 
 
 def unseen_references(
@@ -131,7 +146,7 @@ def distortion(
     if worst is None or medians[worst] <= limit:
         return OK
     rule = "to fall below" if held else "limit"
-    return f"field distorted: {worst} {medians[worst]:.4f}, {rule} {limit:.4f} (median over {window:g} s)"
+    return f"{DISTORTED}: {worst} {medians[worst]:.4f}, {rule} {limit:.4f} (median over {window:g} s)"
 
 
 def _shared(one: Sample, other: Sample) -> tuple[tuple[float, ...], tuple[float, ...]]:

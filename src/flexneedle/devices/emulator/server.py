@@ -27,7 +27,7 @@ __all__ = ["Serial", "Session", "device_time", "obey", "serve"]
 
 _TICK_S = 0.005  # the longest that the loop sleeps
 _LONGEST_STEP_S = 2 * _TICK_S
-_CATCHING_UP, _MOST_BEHIND_S = 1.1, 0.5
+_CATCHING_UP, _MOST_BEHIND_S = 1.1, 0.2
 _LONGEST_LINE = 4096
 
 
@@ -162,7 +162,7 @@ def device_time(before: float, served: float, now: float) -> float:
     It is real time, but does not leap where the machine kept this process waiting: it stands, as the device does
     whose part the process plays, and then runs a tenth faster until it has caught up. Else a machine that takes the
     processor away for a frame's length (virtual machines do, for tens of ms) would lose frames that no line loses.
-    After longer than half a second it leaps: then the process was stopped.
+    After more than 0.2 s it leaps, so that its frames do not look stale: then the process was stopped.
     """
     stepped = before + _CATCHING_UP * min(now - served, _LONGEST_STEP_S)
     return max(now - _MOST_BEHIND_S, min(now, stepped))

@@ -254,7 +254,7 @@ def _resumed(path: Path, file: BinaryIO, grid: Grid) -> Session:
     whole = lines if not lines or lines[-1].endswith(b"\n") else lines[:-1]  # the last one may be torn
     stops, size = list(grid.stops()), grid.file.samples * len(grid.file.sensors)
     done = len(whole) // size
-    _check_rows(path, whole[: done * size], stops, grid)
+    _check_rows(path, whole, stops, grid)
     file.truncate(len(header) + sum(map(len, whole[: done * size])))
     if not done:
         return Session(file, stops, 0, 0.0, None)
