@@ -197,9 +197,9 @@ def test_a_recording_that_is_not_there_is_named_once(capsys):
 def test_a_short_replay_shows_the_first_frame_each_turn_of_the_verdict_and_the_last(capsys, tmp_path):
     rows = [
         f"{n / 40},{n},{name},{status},{place},0.02"
-        for n in range(20)
+        for n in range(60)
         for name, status, place in (
-            ("tip", *(("missing", ",,") if 5 <= n < 10 else ("ok", "1,2,3"))),
+            ("tip", *(("missing", ",,") if 25 <= n < 30 else ("ok", "1,2,3"))),
             ("ref1", "ok", "4,5,6"),
         )
     ]
@@ -208,8 +208,9 @@ def test_a_short_replay_shows_the_first_frame_each_turn_of_the_verdict_and_the_l
     status, out, _ = run(capsys, "em", "watch", "--tracker", f"replay:{path}")
     lines = out.splitlines()
     assert status == 0
-    assert [line.split("frame ")[1].split()[0] for line in lines] == ["0", "5", "10", "19"]
-    assert lines[0].endswith("frame 0  tip 1.00 2.00 3.00 mm I 0.0200  ref1 I 0.0200  verdict: ok")
-    assert "tip missing" in lines[1]
+    assert [line.split("frame ")[1].split()[0] for line in lines] == ["0", "20", "25", "30", "59"]
+    assert lines[0].endswith("verdict: field not known: looked at for 0.00 s, 0.5 s needed")
+    assert lines[1].endswith("frame 20  tip 1.00 2.00 3.00 mm I 0.0200  ref1 I 0.0200  verdict: ok")
+    assert "tip missing" in lines[2]
     status, out, _ = run(capsys, "em", "watch", "--tracker", f"replay:{path}@9", "--references", "3")
     assert "field not known: 1 of 3" in out

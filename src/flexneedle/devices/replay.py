@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import isfinite
 from typing import Self
 
 from flexneedle.errors import InputError
@@ -12,18 +11,17 @@ __all__ = ["Replay"]
 
 
 class Replay:
-    """Plays frames on a clock from now on: what was recorded after t seconds comes after t/speed.
+    """Plays frames on a clock from now on: what was recorded after t seconds comes after t seconds.
 
-    frames: oldest first. speed: above 0; 2 is twice as fast. The times told are those of the replay, the numbers
-    those of the recording. Raises InputError if there are no frames or the speed is no speed.
+    frames: oldest first. The times told are those of the clock, the numbers those of the recording. At another speed
+    it is the clock that runs faster, so that ages and windows stay those of the recording.
+    Raises InputError if there are no frames.
     """
 
-    def __init__(self, frames: Sequence[Frame], clock: Clock, speed: float = 1.0) -> None:
-        if not (isfinite(speed) and speed > 0):
-            raise InputError(f"speed = {speed:g}: must be above 0")
+    def __init__(self, frames: Sequence[Frame], clock: Clock) -> None:
         if not frames:
             raise InputError("a replay needs at least one frame")
-        self._frames, self._clock, self._speed = frames, clock, speed
+        self._frames, self._clock = frames, clock
         self._start, self._next = clock.now(), 0
 
     def __enter__(self) -> Self:
@@ -50,4 +48,4 @@ class Replay:
         return "the recording has ended" if self.ended else VISIBLE
 
     def _due(self, frame: Frame) -> float:
-        return self._start + (frame.time - self._frames[0].time) / self._speed
+        return self._start + frame.time - self._frames[0].time

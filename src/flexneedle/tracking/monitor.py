@@ -30,8 +30,8 @@ def field_verdict(frames: Sequence[Frame], settings: Monitor, distorted: bool = 
     limit = settings.indicator_limit * (settings.resume_fraction if distorted else 1.0)
     return rules.first_bad(
         (
-            rules.too_short(recent[-1].time - recent[0].time, window / 2, settings.references),
             rules.unseen_references(known, settings.references, window, recent[-1].readings),
+            rules.too_short(recent[-1].time - recent[0].time, window / 2, settings.references),
             rules.distortion(known, limit, window, distorted),
         )
     )

@@ -350,6 +350,7 @@ def test_a_whole_table_is_left_as_it_is(grid, out):
         ("environment = ", "# environment = \nenvironment = 'noisy' #"),
         ("[10, 0, 0]", "[11, 0, 0]"),
         ("samples = 6", "samples = 5"),
+        ("samples = 6", "samples = 60"),  # a stop of which has more rows than the whole table
         ("repeats = 2", "repeats = 1"),
         ('ref1 = "reference"', 'ref1 = "other"'),
     ],

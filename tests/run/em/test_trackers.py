@@ -10,14 +10,13 @@ from flexneedle.devices.replay import Replay
 from flexneedle.errors import InputError
 from flexneedle.ports import Frame, Reading, Sample
 from flexneedle.run.em import trackers
-from flexneedle.run.em.trackers import frames_of_run, open_tracker
+from flexneedle.run.em.trackers import clock_for, frames_of_run, open_tracker
 from flexneedle.trace.records import Judged
 
 RECORDING = "time_s,frame_number,sensor,x_mm,y_mm,z_mm\n0.0,1,tip,1,2,3\n1.0,2,tip,1,2,3\n"
 
 
-@pytest.mark.parametrize(("ending", "due"), [("", 1.0), ("@2", 0.5), ("@0.5", 2.0)])
-def test_a_file_is_replayed_at_its_speed(tmp_path, ending, due):
+def test_a_file_is_replayed_as_it_was_recorded(tmp_path):
     class Now:
         time = 0.0
 
@@ -26,13 +25,31 @@ def test_a_file_is_replayed_at_its_speed(tmp_path, ending, due):
 
     path, clock = tmp_path / "recorded.csv", Now()
     path.write_text(RECORDING)
-    with open_tracker(f"replay:{path}{ending}", clock) as replay:
+    with open_tracker(f"replay:{path}@2", clock) as replay:
         assert isinstance(replay, Replay)
         assert len(replay.read()) == 1
-        clock.time = 0.99 * due
+        clock.time = 0.99
         assert replay.read() == ()
-        clock.time = 1.01 * due
+        clock.time = 1.01
         assert len(replay.read()) == 1
+
+
+def test_a_faster_replay_has_a_faster_clock(monkeypatch):
+    now, slept = [100.0], []
+    monkeypatch.setattr("flexneedle.devices.clock.monotonic", lambda: now[0])
+    monkeypatch.setattr("flexneedle.devices.clock.sleep", slept.append)
+    clocks = [clock_for(spec) for spec in ("replay:a.csv@4", "replay:a.csv", "aurora:/dev/tty@4")]
+    now[0] = 101.0
+    assert [clock.now() for clock in clocks] == [4.0, 1.0, 1.0]
+    for clock in clocks:
+        clock.wait(1.0)
+    assert slept == [0.25, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("speed", ["0", "-1", "nan", "inf"])
+def test_a_speed_that_is_none_is_refused(speed):
+    with pytest.raises(InputError, match="the speed must be above 0"):
+        clock_for(f"replay:a.csv@{speed}")
 
 
 @pytest.mark.parametrize(

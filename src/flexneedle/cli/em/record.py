@@ -51,12 +51,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _record(args: argparse.Namespace) -> int:
-    from flexneedle.devices.clock import WallClock
     from flexneedle.run.em.grid import read_grid
     from flexneedle.run.em.record import open_session, record
-    from flexneedle.run.em.trackers import open_tracker
+    from flexneedle.run.em.trackers import clock_for, open_tracker
 
-    grid, clock = read_grid(args.grid), WallClock()
+    grid, clock = read_grid(args.grid), clock_for(args.tracker)
     with open_session(args.out, grid) as session:
         if session.left:
             if session.done:

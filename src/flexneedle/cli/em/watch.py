@@ -50,11 +50,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _watch(args: argparse.Namespace) -> int:
-    from flexneedle.devices.clock import WallClock
-    from flexneedle.run.em.trackers import open_tracker
+    from flexneedle.run.em.trackers import clock_for, open_tracker
     from flexneedle.run.em.watch import field_judge, watch
 
-    clock = WallClock()
+    clock = clock_for(args.tracker)
     try:
         with ExitStack() as stack:
             tracker = stack.enter_context(open_tracker(args.tracker, clock))

@@ -1,10 +1,12 @@
 """From what a user writes to the tracker that it names."""
 
 from contextlib import AbstractContextManager
+from math import isfinite
 from pathlib import Path
 
 from flexneedle.devices.aurora import Aurora
 from flexneedle.devices.aurora.readings import NAMES
+from flexneedle.devices.clock import WallClock
 from flexneedle.devices.recording import read_frames
 from flexneedle.devices.replay import Replay
 from flexneedle.errors import InputError
@@ -13,7 +15,7 @@ from flexneedle.run.folder import TRACE_FILE
 from flexneedle.trace.reader import read_trace
 from flexneedle.tracking.table import TIP
 
-__all__ = ["FORMS", "frames_of_run", "open_tracker"]
+__all__ = ["FORMS", "clock_for", "frames_of_run", "open_tracker"]
 
 FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE[@SPEED] (a recording, or the folder of a run)"
 """How trackers are written."""
@@ -23,14 +25,23 @@ def open_tracker(spec: str, clock: Clock) -> AbstractContextManager[Tracker]:
     """Return the tracker that `spec` names, at work; leaving the context puts it to rest.
 
     `aurora:/dev/ttyUSB0` has the sensors tip, ref1, ref2, ref3 at the ports 1 to 4; `aurora:/dev/ttyUSB0=ref1,tip`
-    names those of ports 1 and 2. `replay:FILE@2` plays a recording, or what a run in a
-    folder was told, twice as fast.
+    names those of ports 1 and 2. `replay:FILE` plays a recording, or what a run in a
+    folder was told; how fast is the clock's matter (`clock_for`).
     Raises InputError for anything else, RunError if no tracker answers.
     """
     kind, _, rest = spec.partition(":")
     if not rest or kind not in ("aurora", "replay"):
         raise InputError(f"tracker {spec}: must be {FORMS}")
     return _aurora(rest, clock) if kind == "aurora" else _replay(rest, clock)
+
+
+def clock_for(spec: str) -> WallClock:
+    """Return the clock on which the tracker that `spec` names is to be read: at `replay:FILE@2` it runs twice as fast.
+
+    Raises InputError as `open_tracker`.
+    """
+    kind, _, rest = spec.partition(":")
+    return WallClock(_file_and_speed(rest)[1] if kind == "replay" else 1.0)
 
 
 def _aurora(rest: str, clock: Clock) -> Aurora:
@@ -42,13 +53,20 @@ def _aurora(rest: str, clock: Clock) -> Aurora:
 
 
 def _replay(rest: str, clock: Clock) -> Replay:
-    file, _, speed = rest.rpartition("@") if "@" in rest else (rest, "", "")
+    path = Path(_file_and_speed(rest)[0])
+    return Replay(frames_of_run(path) if path.is_dir() else read_frames(path), clock)
+
+
+def _file_and_speed(rest: str) -> tuple[str, float]:
+    """Return the parts of FILE@SPEED. Raises InputError if the speed is none."""
+    file, _, told = rest.rpartition("@") if "@" in rest else (rest, "", "1")
     try:
-        factor = float(speed) if speed else 1.0
+        speed = float(told)
     except ValueError:
-        raise InputError(f"tracker replay:{rest}: {speed} is no speed") from None
-    path = Path(file)
-    return Replay(frames_of_run(path) if path.is_dir() else read_frames(path), clock, factor)
+        raise InputError(f"tracker replay:{rest}: {told} is no speed") from None
+    if not (isfinite(speed) and speed > 0.0):
+        raise InputError(f"tracker replay:{rest}: the speed must be above 0")
+    return file, speed
 
 
 def frames_of_run(folder: Path) -> tuple[Frame, ...]:
