@@ -108,6 +108,8 @@ def test_check_compares_two_tables_and_its_status_says_whether_power_is_too_much
     assert (status, values["above"], values["paper_powered"]) == (1, True, 0.04)
     assert values["results"][0]["difference"] == pytest.approx(0.04)
     assert values["results"][0]["paired"] is True
+    low, high = values["results"][0]["difference_interval"]
+    assert 0.03 < low <= 0.04 + 1e-12 <= high + 2e-12 < 0.05  # with power on it is more
     assert values["results"][0]["points_above"] == 16
 
 

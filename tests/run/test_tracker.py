@@ -149,6 +149,8 @@ def test_nothing_moves_before_the_field_was_judged(inserted):
         assert len(first.readings) == 40
         assert first.verdict.startswith(verdict)
     held = inserted("noisy")
+    verdicts = {one.verdict.split(":")[0] for period in held.periods for one in period.readings}
+    assert verdicts == {"field distorted", "missing"}  # none is told to be good
     assert {period.applied for period in held.periods} == {(0.0, 0.0, 0.0, 0.0, -1)}
     assert held.periods[-1].true_tip == held.periods[0].true_tip
 
@@ -179,6 +181,23 @@ def rig_of(**values):
         }
     )
     return virtual_rig(scenario, 1, Seeds(*map(np.random.SeedSequence, (1, 2, 3))), "model")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_bias_of_the_scenario_is_in_an_environment_too(seed):
+    scenario = PHANTOM.with_values(
+        {
+            "tracker.environment": STILL,
+            "phantom.missing_fraction": 0.0,
+            "phantom.delay_periods": 0.0,
+            "phantom.tracker_bias_mm": 0.3,
+        }
+    )
+    rig = virtual_rig(scenario, 1, Seeds(*map(np.random.SeedSequence, (seed, 2, 3))), "model")
+    rig.driver.apply((1.0, 0.0, 0.0, 0.2, -1), 0.2)
+    sample = rig.tracker.read()[-1]
+    off = np.array((sample.x, sample.y)) - rig.truth().tip[:2]
+    assert np.hypot(*off) == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("offset", [0.0, 8.0])
@@ -219,6 +238,15 @@ def test_references_are_put_where_the_field_is_clean():
     assert 5 < above < 40
     assert abs(moved - above) < 6
     assert dirty_still <= 1
+
+
+def test_references_are_placed_about_the_workspace_wherever_it_is():
+    room, limit = Room(shipped("noisy"), 3), 0.04
+    centers = ((0.0, 0.0, 0.0), (20.0, -5.0, 7.0))
+    here, there = (placed_references(room, c, limit, np.random.default_rng(0)) for c in centers)
+    assert here != reference_poses(room.environment, centers[0])  # some were moved
+    for name, pose in here.items():
+        np.testing.assert_allclose(np.subtract(there[name].position, centers[1]), pose.position, atol=1e-9)
 
 
 class Bench:

@@ -1,7 +1,7 @@
 """What the closed loop makes of the tracker's readings in a period: judged, believed or not."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from flexneedle.control.estimate import Estimate
 from flexneedle.ports import VISIBLE, Sample, TipTracker
@@ -48,7 +48,8 @@ def look_around(
     verdict = field if field != OK else newest.verdict
     if verdict == newest.verdict and watch.only_missed(newest.sample) is not None:
         verdict = OK
-    return Sight(estimate, watch, readings, newest.sample, verdict, field != OK)
+    told = _refused(readings, field) if field != OK else readings
+    return Sight(estimate, watch, told, newest.sample, verdict, field != OK)
 
 
 def see(
@@ -68,7 +69,7 @@ def see(
     newest = readings[-1]
     watch, field = watch.look()
     if field != OK:
-        return Sight(predicted.unseen(), watch, readings, newest.sample, field, field=True)
+        return Sight(predicted.unseen(), watch, _refused(readings, field), newest.sample, field, field=True)
     good = [reading.sample for reading in readings if reading.verdict == OK]
     corrected = predicted.observe(good)
     if newest.verdict == OK:
@@ -89,6 +90,11 @@ def _without_news(predicted: Estimate, watch: Watch, now: float, stale_after: fl
         return Sight(predicted.unseen(), watch, sample=before)
     why = "" if status == VISIBLE else f" ({status})"
     return Sight(predicted.unseen(), watch, verdict=f"missing: no reading{why}")
+
+
+def _refused(readings: Sequence[Judged], field: str) -> tuple[Judged, ...]:
+    """The readings of a period in a field that is not good: none counts, also where nothing else is wrong with it."""
+    return tuple(replace(one, verdict=field) if one.verdict == OK else one for one in readings)
 
 
 def _judged(

@@ -20,6 +20,7 @@ __all__ = [
     "fit_rigid",
     "identity",
     "localisation_error",
+    "misfit",
     "refuse_nonsense",
     "target_error",
 ]
@@ -27,6 +28,7 @@ __all__ = [
 _FLAT = 1e-6  # second spread over the first, below which points lie on a line
 _LEAST = 3
 _SIZES = 3.0  # times that two clouds of the same body may differ in size, with any error worth a registration
+_SMALLEST = 0.5  # mm: clouds below are in metres, or of no use
 _LOOSE = 0.1  # residual over size from which on nothing was registered
 _MIRRORED = 0.3  # residual of a mirrored fit over that of the best rotation
 
@@ -75,24 +77,37 @@ def fit_rigid(moving: Floats, fixed: Floats) -> Rigid:
 def refuse_nonsense(moving: Floats, fixed: Floats) -> None:
     """Raise InputError where pairs (n, 3) cannot be of one rigid body: other units, a mirrored frame, no fit at all."""
     size, aim = _radius(moving), _radius(fixed)
+    if aim < _SMALLEST:
+        raise InputError(
+            f"the stage's points lie {aim:.3g} mm about their middle (RMS), at least {_SMALLEST:g} mm are needed: "
+            "are they in metres?"
+        )
     if not 1.0 / _SIZES < aim / size < _SIZES:
         raise InputError(
             f"the tracker's points lie {size:.3g} mm about their middle, the stage's {aim:.3g} mm (RMS): "
             "both must be in mm, and the sensor must have moved with the stage"
         )
+    if (complaint := misfit(moving, fixed)) is not None:
+        raise InputError(complaint)
+
+
+def misfit(moving: Floats, fixed: Floats) -> str | None:
+    """Say in one line what is wrong where no rotation takes pairs (n, 3) to each other: a mirrored frame, or no fit."""
+    aim = _radius(fixed)
     error = fiducial_error(fit_rigid(moving, fixed), moving, fixed)
     mirror = moving * np.array([1.0, 1.0, -1.0])
     mirrored = fiducial_error(fit_rigid(mirror, fixed), mirror, fixed)
     if mirrored < _MIRRORED * error and error > _LOOSE * aim:
-        raise InputError(
+        return (
             f"a mirrored frame fits far better (residual {mirrored:.3g} mm, not {error:.3g} mm): "
             "one of the two frames is left-handed, or an axis has the wrong sign"
         )
     if error > _LOOSE * aim:
-        raise InputError(
+        return (
             f"the fit leaves {error:.3g} mm (RMS) of points that lie {aim:.3g} mm about their middle: "
             "are points swapped, axes exchanged, or did the sensor not move?"
         )
+    return None
 
 
 def _radius(points: Floats) -> float:

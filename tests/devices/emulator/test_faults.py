@@ -24,6 +24,8 @@ def test_a_fault_has_a_kind_a_detail_a_start_and_a_duration():
         ("missing=ref9@1", "sensors: tip, ref1"),
         ("error=XY@1", "two hexadecimal digits"),
         ("delay=x@1", "x is no number of seconds"),
+        ("delay=-1@1", "replies can only come later"),
+        ("delay=nan@1", "replies can only come later"),
         ("silence=3@1", "silence takes no detail"),
         ("silence@1.2.3", "1.2.3 is no number of seconds"),
     ],

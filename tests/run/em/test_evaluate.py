@@ -183,6 +183,21 @@ def test_sensors_and_environments_are_judged_apart_in_the_papers_order(tmp_path)
         assert found[key]["rmse_mm"] == pytest.approx(plain(random_rows(seed, bias=bias))["rmse_mm"])
 
 
+def test_errors_over_distance_are_those_after_registration(tmp_path):
+    turn = Rotation.from_euler("xyz", (10, 20, 30), degrees=True)
+    rows = []
+    for row in random_rows(0):
+        place = turn.apply([row[f"{axis}_mm"] for axis in "xyz"]) + 300.0
+        rows.append(
+            {**row, "distance_mm": 612.0}
+            | dict(zip(("x_mm", "y_mm", "z_mm"), map(float, place), strict=True))
+        )
+    (found,) = evaluate(write_csv(tmp_path / "t.csv", rows), Options(register=True)).values()["results"]
+    (bin_,) = found["distance"]["bins"]
+    assert bin_["rmse_mm"] == pytest.approx(found["rmse_mm"])
+    assert bin_["rmse_mm"] < 1.5
+
+
 def test_distances_are_binned_and_the_smallest_within_the_limit_is_found(tmp_path):
     error = {400.0: 2.0, 500.0: 0.9, 610.0: 0.3, 700.0: 0.8, 805.0: 0.2}
     rows = []
@@ -238,6 +253,7 @@ def test_a_tracker_that_measures_too_long_errs_in_proportion_to_the_distance(tmp
     found = only(write_csv(tmp_path / "t.csv", rows_of(GRID, [[1.01 * p + 300.0] for p in GRID])))
     apart = np.linalg.norm(GRID[:, None] - GRID[None], axis=2)[np.triu_indices(27, 1)]
     assert found["relative_distance"]["n_pairs"] == 351
+    assert found["relative_distance"]["mean_mm"] == pytest.approx(0.01 * apart.mean())  # too long is positive
     assert found["relative_distance"]["rms_mm"] == pytest.approx(0.01 * np.sqrt((apart**2).mean()))
     assert found["relative_distance"]["max_mm"] == pytest.approx(0.01 * np.sqrt(3) * 50)
     assert found["relative_distance"]["neighbours"] == 54

@@ -69,9 +69,7 @@ def test_percentiles_of_single_samples_come_from_bins_of_a_ten_thousandth(tmp_pa
     for row, value in zip(rows, values.ravel().tolist(), strict=True):
         row["indicator"] = value
     found = evaluate(write_csv(tmp_path / "t.csv", rows), Options()).values()["results"][0]["indicator"]
-    assert found["samples"]["p95"] == pytest.approx(
-        np.quantile(values, 0.95, method="inverted_cdf"), abs=0.5001e-4
-    )
+    assert found["samples"]["p95"] == pytest.approx(np.quantile(values, 0.95), abs=0.5001e-4)
     assert found["samples"]["max"] == values.max()
     assert found["samples"]["min"] == values.min()
     assert found["p95"] == pytest.approx(np.quantile(values.mean(axis=1), 0.95))
@@ -89,6 +87,26 @@ def test_single_samples_of_shuffled_sensors_and_environments_are_not_mixed_up(tm
         start, samples = starts[one["sensor"], one["environment"]], one["indicator"]["samples"]
         assert start <= samples["min"] < samples["p95"] < start + 0.5001
         assert samples["max"] == pytest.approx(one["indicator"]["max"])
+
+
+def test_one_sample_a_point_has_the_same_threshold_twice(tmp_path):
+    level = np.linspace(0.01, 0.5, N) ** 2
+    (found,) = evaluate(
+        table(tmp_path / "t.csv", (level, np.ones(N)), (level, np.ones(N))), Options()
+    ).values()["indicator"]
+    assert found["samples_threshold"] == pytest.approx(found["threshold"], abs=0.5001e-4)
+    above = np.mean(level > found["threshold"])
+    assert found["samples_above"] == {"ideal": above, "noisy": above}
+
+
+def test_what_single_samples_beyond_the_bins_do_is_not_known(tmp_path):
+    level = np.where(np.arange(N) < 10, 0.01, 50.0)
+    (found,) = evaluate(
+        table(tmp_path / "t.csv", (level, np.ones(N)), (level, np.ones(N))), Options()
+    ).values()["indicator"]
+    assert found["threshold"] == pytest.approx(50.0)
+    assert np.isnan(found["samples_threshold"])
+    assert all(np.isnan(share) for share in found["samples_above"].values())
 
 
 @pytest.mark.parametrize(

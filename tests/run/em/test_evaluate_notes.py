@@ -44,6 +44,22 @@ def test_nothing_is_said_about_the_frame_where_a_fit_would_not_help_or_was_made(
     assert notes(tmp_path, rows, register=case == "registered") == []
 
 
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda p: p * (1, 1, -1), "a mirrored frame fits far better"),
+        (lambda p: p[:, [0, 2, 1]] * (1, 1, 2.0), "the fit leaves"),
+    ],
+)
+def test_a_rigid_fit_that_does_not_fit_is_told(tmp_path, change, says):
+    places = np.repeat(
+        change(GRID + np.random.default_rng(0).normal(0.0, 0.1, GRID.shape))[:, None], 2, axis=1
+    )
+    (told,) = notes(tmp_path, rows_of(GRID, places), register=True)
+    assert told.startswith(f"tip, ideal: {says}")
+    assert notes(tmp_path, turned(random_rows(0)), register=True) == []
+
+
 def test_grid_points_that_only_one_environment_has_are_counted(tmp_path):
     some = [row for row in random_rows(1, environment="noisy") if row["point_id"] < 21]
     assert notes(tmp_path, random_rows(0) + some) == [

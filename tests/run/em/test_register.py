@@ -103,6 +103,10 @@ def test_without_point_ids_each_row_is_a_point(tmp_path):
         ([*rows(), *rows(sensor="tip")], "choose one with --sensor: ref1, tip"),
         ([(*row[:4], "", "", "", "ref1") for row in rows()], "no reading has a place"),
         ([(*row[:4], *(1e-3 * v for v in row[4:7]), "ref1") for row in rows()], "both must be in mm"),
+        (
+            [(row[0], *(1e-3 * v for v in row[1:7]), "ref1") for row in rows()],
+            "are they in metres",
+        ),
         ([(*row[:4], -row[4], *row[5:]) for row in rows()], "one of the two frames is left-handed"),
         (
             [(*a[:4], *b[4:]) for a, b in zip(rows(), rows()[1:] + rows()[:1], strict=True)],
@@ -126,6 +130,7 @@ def test_without_point_ids_each_row_is_a_point(tmp_path):
             "two sensors",
             "unseen",
             "metres",
+            "both in metres",
             "mirrored",
             "swapped",
         ),

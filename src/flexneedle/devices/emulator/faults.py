@@ -65,7 +65,8 @@ def _check_detail(spec: str, kind: str, detail: str) -> None:
     if kind == "error" and not re.fullmatch(r"[0-9A-F]{2}", detail):
         raise InputError(f"--fault {spec}: the code must be two hexadecimal digits, such as 0D")
     if kind == "delay":
-        _seconds(spec, detail)
+        if not _seconds(spec, detail) > 0.0:
+            raise InputError(f"--fault {spec}: replies can only come later, such as delay=0.2")
     elif detail and kind not in _DEFAULTS:
         raise InputError(f"--fault {spec}: {kind} takes no detail")
 

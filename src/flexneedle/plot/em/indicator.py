@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from flexneedle.plot.studies.layout import short
-from flexneedle.plot.style import ESTIMATE, INK, TARGET, TRUE, WIDTH, axes, new_figure, styled
+from flexneedle.plot.style import ESTIMATE, INK, QUIET, TARGET, TRUE, WIDTH, axes, new_figure, styled
 
 __all__ = ["IndicatorPanel", "Shown", "indicator_figure"]
 
@@ -46,8 +46,8 @@ class IndicatorPanel:
     threshold: float | None
 
 
-def indicator_figure(panels: Sequence[IndicatorPanel]) -> Figure:
-    """Return the figure with a panel for each sensor, side by side."""
+def indicator_figure(panels: Sequence[IndicatorPanel], more: int = 0) -> Figure:
+    """Return the figure with a panel for each sensor, side by side; more: how many others there are, which it says."""
     with styled():
         figure = new_figure(_TOP + _HIGH + _FOOT)
         width = (WIDTH - _LEFT - _RIGHT - (len(panels) - 1) * _GAP) / len(panels)
@@ -55,6 +55,9 @@ def indicator_figure(panels: Sequence[IndicatorPanel]) -> Figure:
             ax = axes(figure, _LEFT + number * (width + _GAP), _TOP, width, _HIGH)
             _draw(ax, panel)
         figure.axes[0].set_ylabel("error of the mean position (mm)")
+        if more:
+            told = f"{more} more sensor{'s' if more > 1 else ''} not shown"
+            figure.text(0.99, 0.005, told, ha="right", color=QUIET, fontsize=8)
     return figure
 
 

@@ -23,7 +23,9 @@ def draw_evaluation(evaluation: Evaluation, folder: Path) -> list[Path]:
     paths = save(plots.field_figure([_field(result) for result in evaluation.results]), folder, "field")
     panels = [_indicator(evaluation, found) for found in evaluation.separations[:MOST_PANELS]]
     if panels:
-        paths += save(plots.indicator_figure(panels), folder, "indicator")
+        paths += save(
+            plots.indicator_figure(panels, len(evaluation.separations) - len(panels)), folder, "indicator"
+        )
     lines = [_roc(evaluation, found) for found in evaluation.separations if found.confusion]
     if lines:
         paths += save(plots.roc_figure(lines), folder, "roc")

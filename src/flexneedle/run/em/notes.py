@@ -7,6 +7,7 @@ import numpy as np
 from flexneedle.errors import InputError
 from flexneedle.tracking.evaluation.accuracy import errors, register, root_mean_square
 from flexneedle.tracking.evaluation.grid import Grid
+from flexneedle.tracking.registration import misfit
 
 __all__ = ["differing_points", "lacking_sensors", "notes"]
 
@@ -26,6 +27,7 @@ def notes(grids: Sequence[Grid], pair: tuple[str, str], hinted: bool) -> list[st
         *(f"{_title(grid)}: {odd}" for grid, odd in told if odd),
         *lacking_sensors(grids),
         *differing_points(grids),
+        *misfits(grids),
         *(_own_frame(grids) if hinted else ()),
         *_lacking(grids, pair),
     ]
@@ -77,6 +79,14 @@ def _odd(grid: Grid) -> Iterator[str]:
         yield f"{known.min()} to {known.max()} samples a grid point ({weights})"
     if np.bincount(grid.cells.point[grid.cells.position.count > 0]).max(initial=0) > 1:
         yield "points were measured at several distances (pooled in all figures but those by distance)"
+
+
+def misfits(grids: Sequence[Grid]) -> Iterator[str]:
+    """Yield a line for each grid that was registered although no rotation takes it to the stage's."""
+    for grid in grids:
+        seen = grid.points[grid.seen]
+        if grid.rigid is not None and (told := misfit(seen.position.mean, seen.true.mean)) is not None:
+            yield f"{_title(grid)}: {told}"
 
 
 def _own_frame(grids: Sequence[Grid]) -> Iterator[str]:

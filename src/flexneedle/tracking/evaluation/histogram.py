@@ -28,16 +28,22 @@ class Histogram:
         return int(self.counts.sum())
 
     def quantile(self, share: float) -> float:
-        """Return the least value, to half a bin, that `share` of the samples don't exceed; NaN without samples."""
+        """Return the quantile with linear interpolation, to half a bin; NaN without samples, or beyond 9.9."""
         if not self.count:
             return float("nan")
-        rank = max(1, int(np.ceil(share * self.count - 1e-9)))
-        return float(np.searchsorted(np.cumsum(self.counts), rank) * BIN)
+        place = share * (self.count - 1)
+        ranks = np.floor(place) + 1.0, np.ceil(place) + 1.0
+        low, high = np.searchsorted(np.cumsum(self.counts), ranks)
+        if high == _BINS - 1:
+            return float("nan")
+        return float((low + (place - np.floor(place)) * (high - low)) * BIN)
 
     def above(self, limit: float) -> float:
-        """Return the share of samples in bins above `limit`; NaN without samples."""
+        """Return the share of samples in bins above `limit`; NaN without samples, or where the limit is beyond 9.9."""
         first = int(np.floor(limit / BIN + 0.5)) + 1
-        return float(self.counts[first:].sum() / self.count) if self.count else float("nan")
+        if not self.count or first >= _BINS:
+            return float("nan")
+        return float(self.counts[first:].sum() / self.count)
 
 
 class Singles:
