@@ -51,6 +51,8 @@ def test_a_clean_field_lets_the_needle_move_once_half_a_window_of_it_was_seen():
 def test_after_silence_in_a_distorted_field_one_clean_frame_is_not_enough():
     watch, verdicts = told(Watch(SETTINGS), (0.09, 0.02, 0.02), 0.0, 40)
     assert verdicts[-1].startswith("field distorted")
+    _, verdicts = told(watch, (0.052, 0.02, 0.02), 2.5, 30)
+    assert verdicts[-1] == "field distorted: ref1 0.0520, to fall below 0.0492 (median over 1 s)"
     _, verdicts = told(watch, (0.02, 0.02, 0.02), 2.5, 30)
     assert all(verdict.startswith("field not known: looked at for") for verdict in verdicts[:20])
     assert verdicts[-1] == OK
