@@ -1,8 +1,9 @@
 """Read an emulated Aurora for a minute: python benchmarks/aurora.py [--seconds S] [--json].
 
 Frames that came and frames that were lost at 40 Hz, how long `read()` held the caller up, and how far the times of
-the frames are from an even line; then the same caller with a tracker that falls silent. Exit status 1 if a frame
-was lost.
+the frames are from an even line; then the same caller with a tracker that falls silent. And what the machine did
+meanwhile: by how much the caller, which only sleeps, woke late at most, and how much processor time the host took away
+(Linux in a virtual machine). Who is stopped for a frame's 25 ms loses it. Exit status 1 if a frame was lost.
 """
 
 import argparse
@@ -13,6 +14,7 @@ from contextlib import contextmanager
 from time import perf_counter
 
 import numpy as np
+import psutil
 
 from flexneedle.devices.aurora import Aurora
 from flexneedle.devices.clock import WallClock
@@ -38,14 +40,17 @@ def main() -> int:
 
 def measure(seconds: float, *arguments: str) -> dict[str, float]:
     """Read for so long; return what came and what it cost the caller."""
-    frames, waits = [], []
+    frames, waits, late = [], [], 0.0
+    stolen = getattr(psutil.cpu_times(), "steal", 0.0)
     with emulated(*arguments) as path, Aurora(path, clock := WallClock()) as aurora:
         start = clock.now()
         while clock.now() - start < seconds:
             begun = perf_counter()
             frames += aurora.read()
             waits.append(perf_counter() - begun)
+            begun = perf_counter()
             clock.wait(PERIOD_S)
+            late = max(late, perf_counter() - begun - PERIOD_S)
         counts = aurora.counts
     numbers = np.array([frame.number for frame in frames])
     times = np.array([frame.time for frame in frames])
@@ -58,6 +63,8 @@ def measure(seconds: float, *arguments: str) -> dict[str, float]:
         "times off an even line, largest, ms": round(
             1e3 * float(np.abs(start_times - np.median(start_times)).max()), 3
         ),
+        "caller woke late by, at most, ms": round(1e3 * late, 1),
+        "processor time taken away, s": round(getattr(psutil.cpu_times(), "steal", 0.0) - stolen, 1),
     }
 
 
