@@ -116,6 +116,11 @@ def test_a_few_indicators_far_out_are_counted_instead():
     assert ax.get_ylim()[1] < 5.0
 
 
+def test_sensors_that_are_left_out_are_counted():
+    assert "5 more sensors not shown" in words(plots.indicator_figure([panel()] * 3, 5))
+    assert "1 more sensor not shown" in words(plots.indicator_figure([panel()] * 3, 1))
+
+
 def test_a_threshold_beyond_all_indicators_is_shown():
     figure = plots.indicator_figure([panel(noisy=None, line=None, threshold=0.9)])
     assert figure.axes[0].get_xlim()[1] > 0.9

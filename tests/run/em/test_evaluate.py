@@ -81,7 +81,7 @@ def test_parquet_and_csv_say_the_same_whatever_the_type_of_the_ids(tmp_path):
     pq.write_table(text, tmp_path / "text.parquet", row_group_size=7)
     for name in ("t.parquet", "text.parquet"):
         (found,) = results(tmp_path / name).values()
-        same(found, *as_csv.values())
+        assert_same(found, *as_csv.values())
 
 
 @LAWS
@@ -91,7 +91,7 @@ def test_the_order_of_rows_does_not_matter(tmp_path, random):
     before = only(write_csv(tmp_path / "t.csv", rows))
     random.shuffle(rows)
     after = only(write_csv(tmp_path / "t.csv", rows))
-    same(after, before)
+    assert_same(after, before)
 
 
 @LAWS
@@ -101,7 +101,7 @@ def test_the_size_of_batches_does_not_matter(tmp_path, block):
     before = only(path)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reading, "_BLOCK", block)
-        same(only(path), before)
+        assert_same(only(path), before)
 
 
 @LAWS
@@ -131,7 +131,7 @@ def test_where_the_tracker_stands_does_not_change_jitter_or_distances(tmp_path, 
     )
 
 
-def same(one, other):
+def assert_same(one, other):
     for name in ("rmse_mm", "p95_mm", "max_mm", "jitter_mm", "mean_mm", "sd_mm"):
         assert one[name] == pytest.approx(other[name], abs=1e-12)
     assert_allclose(one["intervals"]["rmse_mm"], other["intervals"]["rmse_mm"], atol=1e-12)

@@ -1,0 +1,146 @@
+"""Insertions for tests: phantoms behind trackers that are changed and taped, and tapes without a phantom."""
+
+import dataclasses
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.phantom import Phantom, draw
+from flexneedle.ports import VISIBLE, Sample
+from flexneedle.run import insertion
+from flexneedle.run.rig import Rig
+from flexneedle.tracking import NoisyTracker
+
+PHANTOM = flexneedle.load_scenario("phantom")
+STILL = (0.0, 0.0, 0.0, 0.0, -1)
+READING = PHANTOM.tracker.period
+HELD, RESTING = "held", "at rest for the last reading"
+
+
+class Tank:
+    """A phantom whose driver calls are counted, behind a tracker whose batches are changed and taped."""
+
+    status = VISIBLE
+
+    def __init__(self, bevel, seed=2000, spoil=lambda batch: batch, scenario=PHANTOM, delay=0.0):
+        self.phantom = Phantom(draw(scenario, np.random.default_rng(seed)), bevel)
+        self.spoil, self.tape, self.moves, self.applied = spoil, [], [], []
+        noise = np.random.default_rng(seed + 1)
+        jitter = scenario.tracker.jitter_per_axis
+        self.eye = NoisyTracker(
+            self.phantom.tip_at, self.phantom, scenario.tracker.period, jitter, noise, delay=delay
+        )
+
+    def read(self):
+        if self.phantom.now() == 0.0:
+            return self.eye.read()  # it looks before the needle moves
+        self.tape.append(self.spoil(self.eye.read()))
+        return self.tape[-1]
+
+    def apply(self, command, duration):
+        self.moves.append((self.phantom.now(), command))
+        self.applied.append(self.phantom.apply(command, duration))
+        return self.applied[-1]
+
+    def rig(self):
+        return Rig(self.phantom, self, self, self.phantom.condition)
+
+
+class Stage:
+    """No phantom: a clock that adds up, a driver and a tracker that play tapes; off tape commands are carried out."""
+
+    status = VISIBLE
+
+    def __init__(self, tape, applied=()):
+        first = (Sample(0.0, -28.5, 0.0),)  # where the needle starts
+        self.time, self.tape, self.applied = 0.0, itertools.chain([first], tape), iter(applied)
+
+    def now(self):
+        return self.time
+
+    def wait(self, seconds):
+        self.time += seconds
+
+    def apply(self, command, duration):
+        self.time += duration
+        return next(self.applied, command)
+
+    def read(self):
+        return next(self.tape)
+
+    def rig(self):
+        return Rig(self, self, self)
+
+
+def run(plan, rig, scenario=PHANTOM, seed=5, **options):
+    return insertion.run(scenario, plan, rig, np.random.default_rng(seed), **options)
+
+
+class Enough(Exception):
+    """No need to carry out the rest."""
+
+
+def first_periods(count, plan, rig, scenario=PHANTOM, **options):
+    """The first periods of an insertion that is then broken off."""
+    seen = []
+
+    def watch(period):
+        seen.append(period)
+        if len(seen) == count:
+            raise Enough
+
+    with pytest.raises(Enough):
+        run(plan, rig, scenario, on_period=watch, **options)
+    return seen
+
+
+def facts(period):
+    """All of a period but its wall-clock durations, as values that compare."""
+    names = [field.name for field in dataclasses.fields(period) if field.name != "durations"]
+    values = {name: getattr(period, name) for name in names}
+    return {k: repr(v) if not isinstance(v, np.ndarray) else v.tobytes() for k, v in values.items()}
+
+
+def acted(period):
+    """All of a period but the readings that it was made of."""
+    return {name: value for name, value in facts(period).items() if name != "readings"}
+
+
+def believed(period):
+    """What the controller did and believed, without the truth."""
+    return {name: value for name, value in facts(period).items() if not name.startswith("true_")}
+
+
+def moving(done):
+    """The periods in which the driver was asked to move."""
+    return [period for period in done.periods if period.decision not in (HELD, RESTING)]
+
+
+def lost(_sample):
+    return None
+
+
+def blind(sample):
+    return replace(sample, x=None, y=None)
+
+
+def spoilt_tape(tape, which, fault):
+    """One reading of every batch with several is spoilt or left out."""
+    changed = []
+    for batch in tape:
+        readings = list(batch)
+        if len(readings) > 2:
+            bad = fault(readings[which])
+            readings[which : which + 1 or None] = [] if bad is None else [bad]
+        changed.append(tuple(readings))
+    return changed
+
+
+def loop(tape):
+    """The tape, and its last batch as often as asked for."""
+    yield from tape
+    while True:
+        yield tape[-1]

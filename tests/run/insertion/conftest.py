@@ -1,0 +1,64 @@
+"""Insertions that several tests look at, each carried out once."""
+
+from functools import cache
+
+import pytest
+
+import flexneedle
+import flexneedle.control
+from insertions import (
+    PHANTOM,
+    Stage,
+    Tank,
+    loop,
+    lost,
+    run,
+    spoilt_tape,
+)
+
+
+@pytest.fixture(scope="session")
+def plan():
+    return flexneedle.plan(PHANTOM, (40.0, 5.0), seed=1)
+
+
+@pytest.fixture(scope="session")
+def real(plan):
+    """An insertion against a phantom, and what its tracker said, at once."""
+    tank = Tank(plan.bevel)
+    return run(plan, tank.rig()), tank
+
+
+@pytest.fixture(scope="session")
+def late(plan):
+    """The same with readings that come a control period late."""
+    tank = Tank(plan.bevel, delay=0.2)
+    return run(plan, tank.rig()), tank
+
+
+@pytest.fixture(scope="session")
+def replayed(plan, real):
+    """What `real` was, without its phantom: only readings, and what the driver said that it did."""
+    tank = real[1]
+    return run(plan, Stage(tank.tape, tank.applied).rig())
+
+
+@pytest.fixture(scope="session")
+def thinned(plan, real):
+    """The same where one reading of every batch is left out."""
+    tank = real[1]
+    return run(plan, Stage(loop(spoilt_tape(tank.tape, 1, lost)), tank.applied).rig())
+
+
+@pytest.fixture(scope="session")
+def inserted(plan):
+    """Return the insertion of a seed in the virtual rig, each kind of it carried out once."""
+
+    @cache
+    def insert(seed, phantom="exact", controller="adaptive-mpc", threads=None, **values):
+        scenario = PHANTOM.with_values({key.replace("__", "."): value for key, value in values.items()})
+        return flexneedle.insert(
+            scenario, plan, seed, phantom=phantom, controller=controller, threads=threads
+        )
+
+    return insert

@@ -1,0 +1,156 @@
+"""The closed loop against a tracker that fails: it holds the needle, goes on, or gives up."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from insertions import (
+    PHANTOM,
+    READING,
+    STILL,
+    Stage,
+    Tank,
+    acted,
+    blind,
+    loop,
+    lost,
+    run,
+    spoilt_tape,
+)
+
+
+def garbled(sample):
+    return replace(sample, y=math.nan)
+
+
+def old(sample):
+    return replace(sample, time=sample.time - 0.5)
+
+
+def jumping(sample):
+    return replace(sample, y=sample.y + 3.0)
+
+
+FAULTS = {
+    "missing: no reading": lost,
+    "missing: tracker sees no tip": blind,
+    "not a number": garbled,
+    "stale: 0.500 s old": old,
+    "innovation 3": jumping,
+}
+
+
+def between(first, last, fault):
+    """Spoil the readings that were taken within [first, last) s."""
+
+    def spoil(batch):
+        spoilt = [fault(sample) if first <= sample.time < last else sample for sample in batch]
+        return tuple(sample for sample in spoilt if sample is not None)
+
+    return spoil
+
+
+@pytest.mark.parametrize(("verdict", "fault"), FAULTS.items(), ids=FAULTS)
+@pytest.mark.parametrize("begin", [1.99, 8.01])  # in air, in tissue
+def test_bad_readings_hold_the_needle_until_good_ones_return(plan, verdict, fault, begin):
+    tank = Tank(plan.bevel, spoil=between(begin, begin + 0.6, fault))
+    done = run(plan, tank.rig())
+    bad = [period for period in done.periods if period.verdict != "ok"]
+    first = bad[0].index
+    assert [period.index for period in bad] == list(range(first, first + len(bad)))  # one spell
+    assert all(period.verdict[:11] == verdict[:11] for period in bad)
+    assert begin < bad[0].time < begin + 0.25
+    assert begin + 0.55 < bad[-1].time < begin + 0.65
+    # The period in which it was noticed had moved; then nothing moves, nor is anything assimilated.
+    held = done.periods[first + 1 : first + len(bad) + 1]
+    assert [period.command for period in held] == [STILL] * len(held)
+    assert [period.applied for period in held] == [STILL] * len(held)
+    assert {period.decision for period in held} == {"held"}
+    assert not [time for time, _ in tank.moves if bad[0].time - 1e-9 <= time < held[-1].time - 1e-9]
+    assert len({period.true_tip for period in (bad[0], *held)}) == 1
+    assert {period.innovation for period in bad} == {(0.0, 0.0)}
+    for period in bad[1:]:
+        np.testing.assert_allclose(period.estimate, bad[0].estimate, atol=1e-6)
+        assert period.tip_load == bad[0].tip_load
+    # With the first good reading it goes on, and arrives.
+    resumed = done.periods[held[-1].index + 1]
+    assert held[-1].verdict == "ok"
+    assert resumed.command[0] > 0.0
+    assert done.outcome == "done"
+    assert done.true_error_mm < 1.0
+    assert len(done.periods) - len(held) <= 1.1 * len(plan.controls)
+
+
+@pytest.mark.parametrize(("verdict", "fault"), FAULTS.items(), ids=FAULTS)
+def test_after_the_hold_limit_the_run_ends_with_its_record(plan, verdict, fault):
+    tank = Tank(plan.bevel, spoil=between(3.01, math.inf, fault))
+    done = run(plan, tank.rig())
+    bad = [period for period in done.periods if period.verdict != "ok"]
+    assert done.outcome == "held"
+    assert done.reason.startswith("held for 1.0")
+    assert verdict in done.reason
+    assert "limit 1 s" in done.reason
+    assert not done.reached
+    assert bad[-1].index == done.periods[-1].index
+    assert bad[-1].time - bad[0].time == pytest.approx(1.0, abs=1e-6)
+    assert len(bad) == 41  # of 25 ms each after the first
+    assert tank.moves[-1][0] < bad[0].time
+    assert done.periods[0].verdict == "ok"
+
+
+@pytest.mark.parametrize("limit", [0.1, 0.5, 12.0])  # 12 s are more readings than periods of a run
+def test_hold_limit_is_the_scenarios(plan, limit):
+    scenario = PHANTOM.with_values({"control.hold_limit_s": limit})
+    done = run(plan, Tank(plan.bevel, spoil=between(1.0, math.inf, lost)).rig(), scenario)
+    bad = [period.time for period in done.periods if period.verdict != "ok"]
+    assert bad[-1] - bad[0] == pytest.approx(limit, abs=READING)
+
+
+def test_a_second_spell_has_its_own_second(plan):
+    """0.8 s twice with good readings between: no abort."""
+    first, second = between(3.0, 3.8, lost), between(5.0, 5.8, lost)
+    done = run(plan, Tank(plan.bevel, spoil=lambda batch: second(first(batch))).rig())
+    assert done.outcome == "done"
+
+
+def test_limits_of_age_and_innovation_are_the_scenarios(plan):
+    def offset(sample):
+        return replace(sample, time=sample.time - 0.05, y=sample.y + 0.5)
+
+    def verdicts(scenario):
+        done = run(plan, Tank(plan.bevel, spoil=between(8.0, 8.4, offset)).rig(), scenario)
+        return {period.verdict.split()[0] for period in done.periods}
+
+    assert verdicts(PHANTOM) == {"ok"}
+    assert verdicts(PHANTOM.with_values({"control.innovation_limit_mm": 0.3})) == {"ok", "innovation"}
+    assert verdicts(PHANTOM.with_values({"control.stale_after_s": 0.03})) == {"ok", "stale:"}
+
+
+@pytest.mark.parametrize("fault", [blind, garbled, jumping])
+def test_a_bad_reading_among_good_ones_is_left_out(plan, real, thinned, fault):
+    """Just as if it had never been there."""
+    tank = real[1]
+    one = run(plan, Stage(loop(spoilt_tape(tank.tape, 1, fault)), tank.applied).rig())
+    assert list(map(acted, one.periods)) == list(map(acted, thinned.periods))
+    assert one.outcome == "done"
+
+
+def test_a_bad_last_reading_holds_although_earlier_ones_were_good(plan, real):
+    _, tank = real
+    done = run(plan, Stage(loop(spoilt_tape(tank.tape, -1, garbled)), tank.applied).rig())
+    assert done.outcome == "held"
+    assert done.periods[0].verdict == "not a number"
+
+
+def test_a_bad_reading_at_the_target_depth_does_not_count_as_arrival(plan, real):
+    """The needle is held there, and done with the next good reading."""
+    done, tank = real
+    *way, last = tank.tape
+    again = (replace(last[-1], time=last[-1].time + READING),)
+    held = run(plan, Stage([*way, (garbled(last[-1]),), again], tank.applied).rig())
+    assert [period.verdict for period in held.periods[-2:]] == ["not a number", "ok"]
+    assert len(held.periods) == len(done.periods) + 1
+    assert held.outcome == "done"
+    assert held.periods[-1].command == STILL

@@ -1,0 +1,116 @@
+"""The closed loop with readings that come late or not at all."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from insertions import (
+    HELD,
+    PHANTOM,
+    READING,
+    RESTING,
+    STILL,
+    Stage,
+    blind,
+    first_periods,
+    moving,
+    run,
+)
+
+
+def test_after_the_last_move_it_rests_until_that_is_seen(plan, late):
+    """The readings of the last move come a period later; the record ends with one of the needle at rest."""
+    done, tank = late
+    assert (done.outcome, done.reason) == ("done", "")
+    rests = [period for period in done.periods if period.decision == RESTING]
+    assert rests
+    assert list(done.periods[-len(rests) :]) == rests
+    arrival = done.periods[-len(rests) - 1]
+    assert arrival.decision != RESTING
+    assert arrival.estimate[0] >= plan.target[0] - PHANTOM.control.depth_tolerance_mm
+    assert {(period.command, period.applied) for period in rests} == {(STILL, STILL)}
+    assert len(tank.moves) == len(done.periods) - len(rests)
+    assert {period.true_tip for period in rests} == {arrival.true_tip}
+    assert done.periods[-1].sample.time > arrival.time - 1e-6
+    assert all(period.sample.time < arrival.time - 1e-6 for period in done.periods[: -len(rests)])
+    assert done.periods[-1].time == pytest.approx(arrival.time + 0.2)
+    assert tank.phantom.now() == done.periods[-1].time
+    off = np.subtract((done.periods[-1].sample.x, done.periods[-1].sample.y), arrival.true_tip[:2])
+    assert np.abs(off).max() < 4.0 * PHANTOM.tracker.jitter_per_axis
+
+
+def test_without_a_delay_there_is_no_rest(real):
+    assert RESTING not in {period.decision for period in real[0].periods}
+
+
+def test_late_readings_are_used_for_the_time_at_which_they_were_taken(late, real):
+    """Innovations are as small as those of readings at once: a needle that moves 1 mm a period is not 1 mm off."""
+    for done, tank in (late, real):
+        off = np.array([period.innovation for period in done.periods[20:]])
+        assert np.sqrt((off**2).mean(axis=0)).max() < 0.15
+        assert all(period.verdict == "ok" for period in done.periods)
+        assert tank.tape[30][-1].time == pytest.approx(
+            done.periods[30].time - (0.2 if tank is late[1] else 0.0)
+        )
+
+
+def test_no_reading_of_a_batch_is_lost_for_having_been_on_its_way(plan, late):
+    """The eldest are 0.375 s old when they are read, 0.3 s the limit: they came while the needle moved, and count."""
+    done, tank = late
+
+    def estimates(tape, scenario=PHANTOM):
+        periods = first_periods(12, plan, Stage(tape, tank.applied).rig(), scenario)
+        return [period.estimate for period in periods]
+
+    real = [period.estimate for period in done.periods[:12]]
+    patient = PHANTOM.with_values({"control.stale_after_s": 10.0})
+    assert estimates(tank.tape) == real
+    assert estimates(tank.tape, patient) == real
+    assert estimates([batch[-1:] for batch in tank.tape]) != real
+
+
+def test_a_bad_reading_of_the_needle_at_rest_holds_until_a_good_one(plan, late):
+    """It has arrived all the same: no further move."""
+    done, tank = late
+    tape, rests = list(tank.tape), sum(period.decision == RESTING for period in done.periods)
+    spoilt = tuple(map(blind, tape[-1]))
+    again = [replace(sample, time=sample.time + READING) for sample in tape[-1]]
+    held = run(plan, Stage([*tape[:-1], spoilt, again], tank.applied).rig())
+    assert held.outcome == "done"
+    assert len(held.periods) == len(done.periods) + 1
+    assert [period.decision for period in held.periods[-rests - 1 :]] == [*[RESTING] * rests, HELD]
+    assert [period.verdict for period in held.periods[-2:]] == ["missing: tracker sees no tip", "ok"]
+
+
+def test_missing_readings_hold_the_needle_for_one_reading_each(plan, inserted):
+    """A fifth of all, as the scenario says: whenever the newest sees no tip; the rest of the loop is as ever."""
+    done = inserted(2001, phantom__missing_fraction=0.2)
+    assert done.outcome == "done"
+    blind = [period.index for period in done.periods if period.verdict == "missing: tracker sees no tip"]
+    assert len(blind) > 5
+    for index in blind:
+        after = done.periods[index + 1]
+        assert (after.decision, after.command) == (HELD, STILL)
+        assert after.time - done.periods[index].time == pytest.approx(READING)
+        assert after.true_tip == done.periods[index].true_tip
+    assert {period.index for period in done.periods if period.decision == HELD} == {k + 1 for k in blind}
+    assert len(moving(done)) <= 1.1 * len(plan.controls)
+    assert done.true_error_mm < 1.0
+
+
+def test_a_delay_beyond_the_age_limit_holds_from_the_start(inserted):
+    """As the scenario says it: no reading younger than 0.3 s, none believed, nothing hidden."""
+    done = inserted(2001, phantom__delay_periods=1.75)
+    assert done.outcome == "held"
+    assert "stale: 0.350 s old, limit 0.3 s" in done.reason
+    assert done.periods[-1].time == pytest.approx(1.2)
+
+
+@pytest.mark.parametrize("controller", ["open-loop", "bevel-only"])
+def test_the_rest_does_not_depend_on_the_controller(inserted, controller):
+    done = inserted(2003, controller=controller)
+    assert (done.outcome, done.controller) == ("done", controller)
+    assert done.periods[-1].decision in (RESTING, HELD)
+    last = moving(done)[-1]
+    assert done.periods[-1].sample.time > last.time - 1e-6
