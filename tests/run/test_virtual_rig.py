@@ -5,10 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from flexneedle.run.rig import Seeds, virtual_rig
-from insertions import (
-    PHANTOM,
-)
+from flexneedle.run.rig import Seeds, virtual_rig, virtual_room
+from insertions import PHANTOM
 
 
 def rig_of(seed=4, phantom="exact", **values):
@@ -65,3 +63,19 @@ def test_the_plant_is_the_one_that_was_asked_for():
         tips[name] = rig.truth().tip
     apart = np.hypot(*(tips["exact"] - tips["model"])[:2])
     assert 1e-3 < apart < 2.0  # a bend of 0.5 mm and the like lie between them
+
+
+def test_references_are_placed_with_a_moving_plate_where_it_begins():
+    """400 mm away it disturbs none; where it ends, 30 mm below the needle, a lab would have looked for other places."""
+    scenario = PHANTOM.with_values({"tracker.environment": "noisy"})
+    seeds = Seeds(*map(np.random.SeedSequence, (4, 5, 6)))
+
+    def distance_at(time):
+        return 400.0 if time <= 0.0 else 30.0
+
+    frame = virtual_rig(scenario, 1, seeds, plate_distance_at=distance_at).tracker.read()[0].frame
+    (_, far), (_, near) = (virtual_room(scenario, seeds.room, distance_at(time)) for time in (0.0, 1.0))
+    for name, pose in far.items():
+        read = np.array(frame.readings[name].position)
+        assert math.dist(read, pose.position) < 3.0  # what the room adds
+    assert max(math.dist(far[name].position, near[name].position) for name in far) > 10.0

@@ -287,6 +287,24 @@ def test_every_number_of_the_schema_is_covered_by_a_test_of_its_bounds():
     assert numbers - names == {"tissue.name"}
 
 
+def test_a_window_without_two_frames_would_never_know_the_field():
+    """One that the monitor does not judge by may be as short as one likes."""
+    short = {"tracker.environment": "ideal", "monitor.indicator_window_s": 0.04}
+    with pytest.raises(ScenarioError) as caught:
+        PHANTOM.with_values(short)
+    (line,) = caught.value.problems
+    assert line.endswith(
+        "monitor.indicator_window_s = 0.04: must be at least 0.05, 2 frames at tracker.rate_hz (40)"
+    )
+    PHANTOM.with_values(short | {"monitor.indicator_window_s": 0.05})
+    for unjudged in (
+        {"tracker.environment": "none"},
+        {"monitor.references": 0},
+        {"monitor.enabled": False},
+    ):
+        PHANTOM.with_values(short | unjudged)
+
+
 def test_cells_are_not_so_short_that_a_fit_would_never_end():
     (line,) = problems(changed("control.adaptive_mpc.cell_mm", 1e-3))
     assert line.startswith("control.adaptive_mpc.cell_mm = 0.001: must be at least")

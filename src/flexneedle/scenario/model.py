@@ -15,7 +15,14 @@ from .fields import Section, Title
 from .monitor import Monitor
 from .needle import Needle
 from .problems import describe, key_path, refuse, to_line
-from .rules import geometry_problems, grid_problems, layer_problems, plan_problems, target_problems
+from .rules import (
+    geometry_problems,
+    grid_problems,
+    layer_problems,
+    monitor_problems,
+    plan_problems,
+    target_problems,
+)
 from .settings import Control, Phantom, Plan, Target
 from .tissue import Contact, Layer
 
@@ -52,6 +59,7 @@ class Scenario(Section):
                 layer_problems(self.tissue, self.needle.bevel),
                 target_problems(self.setup, self.target),
                 plan_problems(self.plan),
+                monitor_problems(self.monitor, self.tracker),
                 grid_problems(self.setup, self.contact, self.phantom, self.tracker, self.control),
             )
         )

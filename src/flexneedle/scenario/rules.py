@@ -4,18 +4,27 @@ from collections.abc import Iterator, Sequence
 from math import isfinite
 
 from .apparatus import Setup, Tracker
+from .monitor import Monitor
 from .needle import Bevel, Needle
 from .problems import Problem
 from .settings import Control, Phantom, Plan, Target
 from .tissue import Contact, Layer
 
-__all__ = ["geometry_problems", "grid_problems", "layer_problems", "plan_problems", "target_problems"]
+__all__ = [
+    "geometry_problems",
+    "grid_problems",
+    "layer_problems",
+    "monitor_problems",
+    "plan_problems",
+    "target_problems",
+]
 
 # The stretch 1 − b/h of a bevel that is held sideways stays above the floor stretch 0.3 of the tissue law.
 _GREATEST_OFFSET_SHARE = 0.7
 _MOST_GRID_POINTS = 20_000
 _MOST_READINGS_A_STEP = 10_000
 _MOST_CELLS = 200
+_FRAMES_IN_A_WINDOW = 2
 
 
 def geometry_problems(needle: Needle, setup: Setup) -> Iterator[Problem]:
@@ -99,3 +108,12 @@ def grid_problems(
     if tracker.rate_hz > fastest:
         rule = f"must be at most {fastest:g}, {_MOST_READINGS_A_STEP} readings in a control step"
         yield Problem("tracker.rate_hz", tracker.rate_hz, rule)
+
+
+def monitor_problems(monitor: Monitor, tracker: Tracker) -> Iterator[Problem]:
+    """Two frames in the window, or the field would never be known and the needle never move."""
+    least = _FRAMES_IN_A_WINDOW * tracker.period
+    judged = monitor.enabled and monitor.references > 0 and tracker.environment is not None
+    if judged and monitor.indicator_window_s < least:
+        rule = f"must be at least {least:g}, {_FRAMES_IN_A_WINDOW} frames at tracker.rate_hz ({tracker.rate_hz:g})"
+        yield Problem("monitor.indicator_window_s", monitor.indicator_window_s, rule)

@@ -1,0 +1,142 @@
+"""What is made of the readings of a period: before the needle moves, between two frames, with the tip lost."""
+
+from dataclasses import replace
+
+import pytest
+
+import flexneedle
+from flexneedle.ports import VISIBLE, Frame, Reading, Sample
+from flexneedle.run.sight import look_around, see
+from flexneedle.tracking import OK, Watch
+
+SCENARIO = flexneedle.load_scenario("phantom")
+TIP = (30.0, 1.0)
+RATE = 40.0
+STALE_AFTER = SCENARIO.control.stale_after_s
+
+
+class Belief:
+    """A tip at rest. heard: how many readings it was corrected by, None for a period without any."""
+
+    def __init__(self, heard=0):
+        self.heard = heard
+
+    def tip_at(self, _time):
+        return TIP
+
+    def observe(self, samples):
+        return Belief(len(samples))
+
+    def unseen(self):
+        return Belief(None)
+
+
+class Eye:
+    """A tracker that tells these samples."""
+
+    def __init__(self, *samples, status=VISIBLE):
+        self.samples, self.status = samples, status
+
+    def read(self):
+        return self.samples
+
+
+def sample(time, *, seen=True, indicator=0.02):
+    references = {f"ref{k}": Reading((0.0, 0.0, 0.0), indicator=indicator) for k in (1, 2, 3)}
+    tip = Reading((*TIP, time)) if seen else Reading(None, status="out of volume")
+    x, y, z = (*TIP, 0.0) if seen else (None, None, None)
+    return Sample(time, x, y, z, Frame(time, round(time * RATE), {"tip": tip, **references}))
+
+
+def second(end=1.0, **kind):
+    """The samples of a second up to `end`."""
+    return [sample(end - k / RATE, **kind) for k in range(40, -1, -1)]
+
+
+def before(now, *samples, watch=None):
+    return look_around(SCENARIO, Belief(), watch or Watch(SCENARIO.monitor), now, Eye(*samples))
+
+
+def during(watch, now, *samples, status=VISIBLE):
+    return see(SCENARIO, Belief(), watch, now - 0.2, now, Eye(*samples, status=status))
+
+
+def test_before_the_needle_moves_all_that_was_told_counts_however_long_ago():
+    """The readings of a second have a limit of age of 0.3 s only from there on that the tracker could tell them."""
+    sight = before(1.0 + 0.9 * STALE_AFTER, *second())
+    assert sight.verdict == OK
+    assert {reading.verdict for reading in sight.readings} == {OK}
+
+
+@pytest.mark.parametrize(("lost", "verdict"), [(3, OK), (6, "missing: tracker sees no tip (out of volume)")])
+def test_before_the_needle_moves_the_tip_may_be_lost_for_a_tenth_of_a_second(lost, verdict):
+    samples = second()
+    samples[-lost:] = [sample(one.time, seen=False) for one in samples[-lost:]]
+    sight = before(1.0, *samples)
+    assert sight.verdict == verdict
+    assert not sight.field
+
+
+def test_before_the_needle_moves_a_lost_tip_does_not_hide_the_field():
+    samples = second(indicator=0.2)
+    samples[-1] = sample(1.0, seen=False, indicator=0.2)
+    sight = before(1.0, *samples)
+    assert sight.verdict.startswith("field distorted")
+    assert sight.field
+
+
+def test_between_two_frames_a_good_field_is_as_it_was_and_nothing_is_learnt():
+    watch = before(1.0, *second()).watch
+    sight = during(watch, 1.0 + 0.9 * STALE_AFTER)
+    assert (sight.verdict, sight.estimate.heard) == (OK, None)
+
+
+def test_between_two_frames_a_distorted_field_is_as_it_was_and_nothing_is_learnt():
+    watch = before(1.0, *second(indicator=0.2)).watch
+    sight = during(watch, 1.0 + 0.9 * STALE_AFTER)
+    assert sight.verdict.startswith("field distorted")
+    assert (sight.field, sight.estimate.heard) == (True, None)
+
+
+def test_after_the_age_limit_silence_is_silence_whatever_the_field_was():
+    for indicator in (0.02, 0.2):
+        watch = before(1.0, *second(indicator=indicator)).watch
+        sight = during(watch, 1.0 + 1.1 * STALE_AFTER, status="no reply")
+        assert sight.verdict == "missing: no reading (no reply)"
+        assert (sight.field, sight.estimate.heard) == (False, None)
+
+
+def test_in_a_distorted_field_no_reading_corrects_the_belief():
+    watch, told = before(1.0, *second()).watch, []
+    for now in (1.2, 1.4, 1.6, 1.8):
+        sight = during(watch, now, *(sample(now - k / RATE, indicator=0.2) for k in range(7, -1, -1)))
+        watch = sight.watch
+        told.append((sight.verdict.split(":")[0], sight.estimate.heard))
+        assert {reading.verdict for reading in sight.readings} == {sight.verdict}
+    assert told == [("ok", 8), ("ok", 8), ("field distorted", None), ("field distorted", None)]
+
+
+def test_readings_on_their_way_while_the_needle_moved_may_be_older_than_the_newest():
+    """A move of 0.2 s: of two readings as old as that and the limit together the newest is stale, the other is not."""
+    watch = before(1.0, *second()).watch
+    age = STALE_AFTER + 0.1
+    sight = during(watch, 1.2 + age, sample(1.1), sample(1.2))
+    assert [reading.verdict for reading in sight.readings] == [OK, f"stale: {age:.3f} s old, limit 0.3 s"]
+    assert sight.estimate.heard is None
+
+
+def test_a_newest_frame_without_the_tip_keeps_the_good_readings_of_the_period():
+    watch = before(1.0, *second()).watch
+    good, blind = [sample(1.0 + k / RATE) for k in (1, 2)], sample(1.0 + 3 / RATE, seen=False)
+    sight = during(watch, blind.time, *good, blind)
+    assert (sight.verdict, sight.estimate.heard, sight.sample) == (OK, 2, good[-1])
+    alone = during(watch, 1.0 + 1 / RATE, sample(1.0 + 1 / RATE, seen=False))
+    assert (alone.verdict, alone.estimate.heard, alone.sample.time) == (OK, None, 1.0)
+
+
+def test_a_broken_last_reading_is_the_verdict_and_earlier_good_ones_are_not_told_as_seen():
+    watch = before(1.0, *second()).watch
+    jumped = replace(sample(1.05), y=TIP[1] + 3.0)
+    sight = during(watch, 1.05, sample(1.025), jumped)
+    assert sight.verdict.startswith("innovation 3.00 mm")
+    assert sight.estimate.heard is None
