@@ -237,7 +237,10 @@ def test_a_line_cut_before_others_were_added_is_refused(tmp_path, rows):
     lines = path.read_text().splitlines()
     lines[40] = lines[40][:30]
     path.write_text("\n".join(lines) + "\n")
-    assert "cannot be read: CSV parse error" in refusal(path)
+    assert f"row 40: has {lines[40].count(',') + 1} fields, the header has 10: '{lines[40]}'" in refusal(path)
+    lines[40] = lines[39] + ",7"
+    path.write_text("\n".join(lines) + "\n")
+    assert "row 40: has 11 fields, the header has 10" in refusal(path)
 
 
 def test_a_parquet_file_that_was_cut_is_refused(tmp_path, rows):
@@ -253,6 +256,8 @@ def test_a_parquet_column_of_text_is_no_column_of_numbers(tmp_path, rows):
     path = tmp_path / "t.parquet"
     pq.write_table(pa.Table.from_pylist([{**row, "x_mm": "left"} for row in rows]), path)
     assert "x_mm: must be a column of numbers, not of string" in refusal(path)
+    pq.write_table(pa.Table.from_pylist([{**row, "indicator": True} for row in rows]), path)
+    assert "indicator: must be a column of numbers, not of bool" in refusal(path)
 
 
 def test_semicolons_tabs_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path, rows):
@@ -275,13 +280,14 @@ def test_a_parquet_table_may_have_whole_numbers_categories_and_no_indicator_at_a
     for name, column in (
         ("true_x_mm", table["true_x_mm"].cast(pa.int16())),
         ("sensor", table["sensor"].dictionary_encode()),
+        ("environment", table["environment"].cast(pa.binary())),
         ("indicator", pa.nulls(len(rows))),
     ):
         table = table.set_column(table.schema.get_field_index(name), name, column)
     pq.write_table(table, tmp_path / "t.parquet")
     found = one(tmp_path / "t.parquet")
     assert found["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
-    assert found["indicator"] is None
+    assert (found["sensor"], found["environment"], found["indicator"]) == ("tip", "ideal", None)
 
 
 def test_metres_are_refused_also_where_nothing_jitters(tmp_path, rows):

@@ -36,6 +36,7 @@ Floats = NDArray[np.float64]
 _NO_NUMBER = re.compile(
     r"In CSV column #(\d+): CSV conversion error to double: invalid value '(.*)'", re.DOTALL
 )
+_OTHER_LENGTH = "CSV parse error: Expected"
 _Choose = Callable[[list[str]], dict[str, str]]
 
 
@@ -137,11 +138,12 @@ def _csv_batches(path: Path, layout: Layout, chosen: Mapping[str, str]) -> Itera
             csv.ConvertOptions(column_types=types, include_columns=list(chosen.values()), null_values=_NULLS),
         )
     except pa.ArrowInvalid as error:
-        found = _NO_NUMBER.search(str(error))
-        if found is None:
-            raise
         # Arrow knows neither the row nor the name of the column.
-        raise InputError(layout.no_number(path, int(found[1]), found[2], chosen)) from None
+        if found := _NO_NUMBER.search(str(error)):
+            raise InputError(layout.no_number(path, int(found[1]), found[2], chosen)) from None
+        if _OTHER_LENGTH in str(error) and (told := layout.other_length(path)):
+            raise InputError(told) from None
+        raise
 
 
 def _batch(batch: Any, chosen: Mapping[str, str]) -> Batch:
@@ -152,10 +154,14 @@ def _batch(batch: Any, chosen: Mapping[str, str]) -> Batch:
 
 
 def _labels(column: Any) -> Any:
+    if pa.types.is_binary(column.type) or pa.types.is_large_binary(column.type):
+        column = column.cast(pa.string())  # how some writers mark their text
     return column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
 
 
 def _numbers(name: str, column: Any) -> Floats:
+    if pa.types.is_boolean(column.type):  # Arrow would make 0 and 1 of it
+        raise InputError(f"{name}: must be a column of numbers, not of {column.type}")
     try:
         numbers: Floats = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError):

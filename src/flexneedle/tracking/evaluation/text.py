@@ -39,13 +39,26 @@ class Layout:
         where = "" if row is None else f"row {row}: "
         return f"{where}{name}: {value[:60]!r} is no number{advice}"
 
+    def other_length(self, path: Path) -> str:
+        """Return which row has more or fewer fields than the header; "" if none has."""
+        wanted = len(self.header)
+        for number, row in self._rows(path):
+            if len(row) != wanted:
+                text = self.delimiter.join(row)
+                return f"row {number}: has {len(row)} fields, the header has {wanted}: {text[:60]!r}"
+        return ""
+
     def _row_of(self, path: Path, column: int, value: str) -> int | None:
-        """Return the first row (1: below the header) whose field in a column is `value`, None if there is none."""
+        """Return the first row whose field in a column is `value`, None if there is none."""
+        fields = ((k, row[column].strip() if column < len(row) else "") for k, row in self._rows(path))
+        return next((k for k, field in fields if field == value.strip()), None)
+
+    def _rows(self, path: Path) -> Iterator[tuple[int, list[str]]]:
+        """Yield the rows below the header with their numbers, from 1."""
         with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
             rows = (row for row in csv.reader(file, delimiter=self.delimiter) if row)
             next(rows, None)
-            fields = (row[column].strip() if column < len(row) else "" for row in rows)
-            return next((k for k, field in enumerate(fields, 1) if field == value.strip()), None)
+            yield from enumerate(rows, 1)
 
     def refuse_cut(self, path: Path, labels: Collection[str], used: Collection[str]) -> None:
         """Raise InputError if the last line, being without a line end, seems to be a part of what was written.
