@@ -170,3 +170,27 @@ def test_the_roc_marks_the_threshold_in_use():
         "reference, with table",
     ):
         assert told in words(figure)
+
+
+@pytest.mark.parametrize("count", [1, 7])
+def test_legends_stay_inside_of_the_figure_and_off_the_lines_however_many_and_long_the_names(count):
+    names = [f"sensor number {k} of the six-degree kind on the left arm of the stand" for k in range(count)]
+    pair = "the laboratory after all the metal had been carried out", "the same with its table"
+    values = np.linspace(0.0, 1.0, 9), np.linspace(0.5, 2.0, 9)
+    note = "within 1.4 mm up to 700 mm, and the first bin beyond is too far off"
+    roc = plots.roc_figure(
+        [
+            plots.RocLine(
+                name, pair, *values, values, 0.5, (0.05, 0.95), "0.0547, 5.6 % false, 98.4 % detected"
+            )
+            for name in names
+        ]
+    )
+    distance = plots.distance_figure([plots.DistanceLine(name, *values, 0.7, note) for name in names])
+    for figure in (roc, distance):
+        figure.draw_without_rendering()
+        for ax in figure.axes:
+            box = ax.get_legend().get_window_extent()
+            assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
+            assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
+            assert not any(box.overlaps(other.get_window_extent()) for other in figure.axes)

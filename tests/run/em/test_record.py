@@ -192,6 +192,22 @@ def test_a_tracker_that_falls_silent_for_a_while_is_told_once_and_so_is_its_retu
     assert_whole(out)
 
 
+def test_a_sensor_that_is_lost_for_a_while_is_waited_for_and_told_once(grid, out):
+    """For 1.5 s at the first point; for half a second, at the second, nothing is said."""
+    stage = Stage()
+    frame, lost = stage._frame, {"tip": Reading(None, status="missing")}
+
+    def blink(number):
+        told = frame(number)
+        spell = 3.1 < told.time < 4.6 or 7.5 < told.time < 8.3
+        return Frame(told.time, number, told.readings | lost) if spell else told
+
+    stage._frame = blink
+    run(out, grid, stage)
+    assert stage.said == ["waiting: tip: missing"]
+    assert_whole(out)
+
+
 class Stuck(Stage):
     """Its tip takes a share of each way, however far the stage goes; the reference goes all of it."""
 

@@ -9,13 +9,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from flexneedle.plot.studies.layout import look
+from flexneedle.plot.studies.layout import look, short
 from flexneedle.plot.style import WIDTH, axes, new_figure, styled
 
 __all__ = ["DistanceLine", "distance_figure"]
 
 _LEFT, _RIGHT, _TOP, _FOOT, _HIGH = 0.6, 2.95, 0.3, 0.5, 3.0  # inches
-_NOTE = 30  # characters in a line beside the panel
+_NOTE, _NAME = 30, 30  # characters in a line beside the panel
+_ROW = 0.145  # inches of a line beside the panel
 
 Floats = NDArray[np.float64]
 
@@ -34,11 +35,13 @@ class DistanceLine:
 def distance_figure(lines: Sequence[DistanceLine]) -> Figure:
     """Return the figure with a line for each sensor and environment, and its limit dashed in the same colour."""
     with styled():
-        figure = new_figure(_TOP + _HIGH + _FOOT)
-        ax = axes(figure, _LEFT, _TOP, WIDTH - _LEFT - _RIGHT, _HIGH)
-        for number, line in enumerate(lines):
+        labels = [f"{short(line.name, _NAME)}\n{fill(line.note, _NOTE)}" for line in lines]
+        rows = sum(label.count("\n") + 2 for label in labels)
+        high = max(_HIGH, _ROW * rows - _FOOT)  # the legend may be as long as the figure
+        figure = new_figure(_TOP + high + _FOOT)
+        ax = axes(figure, _LEFT, _TOP, WIDTH - _LEFT - _RIGHT, high)
+        for number, (line, label) in enumerate(zip(lines, labels, strict=True)):
             own = look(number)
-            label = f"{line.name}\n{fill(line.note, _NOTE)}"
             ax.plot(line.distance, line.rmse, color=own.color, marker=own.marker, markersize=4.5, label=label)
         for limit in dict.fromkeys(line.limit for line in lines if line.limit is not None):
             number = next(k for k, line in enumerate(lines) if line.limit == limit)

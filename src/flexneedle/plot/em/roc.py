@@ -15,7 +15,9 @@ from flexneedle.plot.style import QUIET, WIDTH, axes, new_figure, styled
 
 __all__ = ["RocLine", "roc_figure"]
 
-_SIDE, _LEFT, _RIGHT, _GAP, _TOP, _FOOT = 3.4, 0.75, 0.2, 0.85, 0.3, 0.5  # inches
+_SIDE, _LEFT, _RIGHT, _GAP, _TOP, _FOOT = 3.4, 0.75, 0.2, 0.85, 0.3, 0.55  # inches
+_ENTRY = 0.185  # inches of a legend
+_NAME = 24  # characters
 
 Floats = NDArray[np.float64]
 
@@ -39,9 +41,9 @@ class RocLine:
 
 
 def roc_figure(lines: Sequence[RocLine]) -> Figure:
-    """Return the figure: the ROC of each sensor, and beside it the shares above each threshold."""
+    """Return the figure: the ROC of each sensor, and beside it the shares above each threshold; legends below."""
     with styled():
-        figure = new_figure(_TOP + _SIDE + _FOOT)
+        figure = new_figure(_TOP + _SIDE + _FOOT + _ENTRY * (2 * len(lines) + 0.5))
         _draw_roc(axes(figure, _LEFT, _TOP, _SIDE, _SIDE), lines)
         left = _LEFT + _SIDE + _GAP
         _draw_shares(axes(figure, left, _TOP, WIDTH - left - _RIGHT, _SIDE), lines)
@@ -66,12 +68,12 @@ def _draw_roc(ax: Axes, lines: Sequence[RocLine]) -> None:
             "markeredgecolor": "white",
             "clip_on": False,
         }
-        ax.plot(*line.chosen, own.marker, label=f"{line.sensor}: {line.note}", zorder=4, **mark)
+        ax.plot(*line.chosen, own.marker, label=f"{short(line.sensor, _NAME)}: {line.note}", zorder=4, **mark)
     ideal, noisy = (short(name, 30) for name in lines[0].environments)
     _share_axis(ax, "y", f"detected: grid points above ({noisy})")
     _share_axis(ax, "x", f"false alarms: grid points above ({ideal})")
     ax.set_title("Each threshold of the indicator")
-    ax.legend(loc="lower right", handletextpad=0.6, fontsize=7.5)
+    _legend_below(ax)
 
 
 def _draw_shares(ax: Axes, lines: Sequence[RocLine]) -> None:
@@ -80,14 +82,25 @@ def _draw_shares(ax: Axes, lines: Sequence[RocLine]) -> None:
         for values, style, name in zip(line.values, ((0, (1, 1)), "-"), line.environments, strict=True):
             above = 1.0 - np.arange(len(values) + 1) / len(values)
             ends = np.concatenate([[0.0], np.sort(values)])
-            label = short(f"{line.sensor}, {name}", 36)
+            label = f"{short(line.sensor, _NAME)}, {short(name, _NAME)}"
             ax.step(ends, above, where="post", color=color, linestyle=style, label=label, zorder=3)
         ax.axvline(line.threshold, color=color, linewidth=0.9, linestyle=(0, (4, 2)), zorder=1)
     ax.set_xlim(left=0.0)
     ax.set_xlabel("threshold of the indicator (dashed: in use)")
     _share_axis(ax, "y", "grid points above")
     ax.set_title("Above the threshold")
-    ax.legend(loc="upper right")
+    _legend_below(ax)
+
+
+def _legend_below(ax: Axes) -> None:
+    """Below the axis, however many lines there are: inside they would hide what they name."""
+    ax.legend(
+        loc="upper left",
+        bbox_to_anchor=(-0.02, -_FOOT / _SIDE),
+        borderaxespad=0.0,
+        borderpad=0.0,
+        fontsize=7.5,
+    )
 
 
 def _share_axis(ax: Axes, name: str, label: str) -> None:

@@ -28,7 +28,7 @@ EXTRA = ("time_s", "frame_number", "repeat")
 """Columns beside those of a table of measurements. Times go on over interruptions."""
 _HEADER = (*COLUMNS, *EXTRA)
 _PAUSE_S = 0.01
-_SILENT_S = 1.0  # so long without a frame, and it is said
+_SILENT_S = 1.0  # so long without a frame, or a good one, and it is said
 
 
 def _refuse(doubt: str) -> bool:
@@ -155,19 +155,22 @@ def _measure(
 def _samples(
     tracker: Tracker, clock: Clock, grid: Grid, say: Callable[[str], None]
 ) -> tuple[list[Frame], str]:
-    """Return the frames of a point at rest, taken from now on, or what is wrong.
+    """Return the frames of a point at rest, taken from now on, or what is wrong; say what is waited for.
 
     While the stage drifts the oldest frames are let go for new ones.
     """
     began, wanted, sensors = clock.now(), grid.file.samples, tuple(grid.file.sensors)
     good: list[Frame] = []
-    complaint = "no frames"
+    complaint, said, well = "no frames", "", began
     for frames in _arriving(tracker, clock, grid.file.rest.timeout_s, say):
         for frame in frames:
             if frame.time < began:
                 continue
             ill = _ill(frame, sensors)
-            complaint = ill or complaint
+            complaint, well = ill or complaint, well if ill else frame.time
+            if ill != said and frame.time - well > _SILENT_S:
+                say(f"waiting: {ill}")
+                said = ill
             good = good if ill else [*good, frame][-wanted:]
             if not ill and len(good) == wanted:
                 complaint = _drifting(good, sensors, grid.file.rest.drift_mm)
