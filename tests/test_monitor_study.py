@@ -108,7 +108,23 @@ def test_a_hold_is_timed_from_the_start_and_from_the_distortion(study):
 
 def test_where_one_run_is_shorter_its_last_place_counts(study):
     short, long = told(study, [0.0] * 3), told(study, [0.0] * 8)
-    assert study.apart(long, short, 7) == pytest.approx(5.0)
+    assert study.apart(long, short, 1.6) == pytest.approx(5.0)
+    assert study.apart(long, short, math.inf) == pytest.approx(5.0)
+
+
+def test_runs_are_compared_at_one_time_however_long_their_periods_are(study):
+    """1 mm in 0.2 s, and 1 mm in 0.4 s: after 1.6 s the eighth and the fourth place, 4 mm apart."""
+    fast, slow = told(study, [0.0] * 10), told(study, [0.0] * 10, step=0.4)
+    assert study.apart(fast, slow, 1.6) == pytest.approx(4.0)
+    kept = told(study, [0.0] * 10, held=(7,))
+    off = [[k, 0.1 * k] for k in range(10)]
+    runs = study.Runs([], [told(study, [0.0] * 10, off, step=0.4)], [], [kept], np.array([]))
+    assert runs.unaware() == [pytest.approx(0.3)]
+
+
+def test_a_run_that_is_held_without_a_plate_has_no_way_to_be_off(study):
+    kept, drawn = told(study, [0.0] * 10, held=(7,)), study.Approach(0, (40.0, 0.0), begins=0.5, speed=100.0)
+    assert math.isnan(study.hold_of(drawn, told(study, [0.0] * 2, held=(0, 1)), kept).moved)
 
 
 def test_the_curve_counts_false_and_missed_holds(study):

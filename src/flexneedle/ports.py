@@ -31,6 +31,11 @@ class Reading:
     status: str = VISIBLE
 
 
+def is_reference(sensor: str) -> bool:
+    """Whether a sensor is one that stands still around the workspace, by its name: ref1, ref2, reference, …"""
+    return sensor.lower().startswith("ref")
+
+
 @dataclass(frozen=True)
 class Frame:
     """What a tracker saw at one time (s, on the clock of the run): readings by name of the sensor, such as "tip".

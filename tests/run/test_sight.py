@@ -1,5 +1,6 @@
 """What is made of the readings of a period: before the needle moves, between two frames, with the tip lost."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -85,6 +86,24 @@ def test_before_the_needle_moves_a_lost_tip_does_not_hide_the_field():
     assert sight.field
 
 
+def test_before_the_needle_moves_the_newest_frame_is_of_now():
+    """Frames of a minute ago, each as good as can be, of a tracker that went silent."""
+    sight = before(61.0, *second())
+    assert sight.verdict == "stale: 60.000 s old, limit 0.3 s"
+    blind = [*second()[:-1], sample(1.0, seen=False)]
+    assert before(61.0, *blind).verdict == "stale: 60.000 s old, limit 0.3 s"
+    undated = [replace(sample(0.0), time=math.nan), *second()]
+    assert before(61.0, *undated).verdict == "stale: 60.000 s old, limit 0.3 s"
+
+
+def test_an_old_frame_told_again_without_the_tip_is_not_taken_for_one_that_lost_it():
+    watch = before(1.0, *second()).watch
+    for again in (sample(1.0, seen=False), replace(sample(1.025, seen=False), time=math.nan)):
+        sight = during(watch, 1.05, again)
+        assert sight.verdict in ("stale: frame 40 after frame 40", "not a number")
+        assert sight.estimate.heard is None
+
+
 def test_between_two_frames_a_good_field_is_as_it_was_and_nothing_is_learnt():
     watch = before(1.0, *second()).watch
     sight = during(watch, 1.0 + 0.9 * STALE_AFTER)
@@ -106,14 +125,42 @@ def test_after_the_age_limit_silence_is_silence_whatever_the_field_was():
         assert (sight.field, sight.estimate.heard) == (False, None)
 
 
+def periods(watch, *indicators):
+    """What is made of control periods of 0.2 s from second 1 on, in each of which the references tell this."""
+    sights = []
+    for k, indicator in enumerate(indicators, 1):
+        now = 1.0 + 0.2 * k
+        told = (sample(now - n / RATE, indicator=indicator) for n in range(7, -1, -1))
+        sights.append(during(sights[-1].watch if sights else watch, now, *told))
+    return sights
+
+
 def test_in_a_distorted_field_no_reading_corrects_the_belief():
-    watch, told = before(1.0, *second()).watch, []
-    for now in (1.2, 1.4, 1.6, 1.8):
-        sight = during(watch, now, *(sample(now - k / RATE, indicator=0.2) for k in range(7, -1, -1)))
-        watch = sight.watch
-        told.append((sight.verdict.split(":")[0], sight.estimate.heard))
-        assert {reading.verdict for reading in sight.readings} == {sight.verdict}
-    assert told == [("ok", 8), ("ok", 8), ("field distorted", None), ("field distorted", None)]
+    """It is in doubt for half a second before the median over a second says so."""
+    sights = periods(before(1.0, *second()).watch, 0.2, 0.2, 0.2, 0.2)
+    assert [sight.verdict.split(":")[0] for sight in sights] == [
+        "ok",
+        "ok",
+        "field distorted",
+        "field distorted",
+    ]
+    for sight in sights:
+        assert sight.estimate.heard is None
+        assert not sight.saw_after(0.0)
+        (told,) = {reading.verdict for reading in sight.readings}
+        in_doubt = "field in doubt: ref1 0.2000, limit 0.0547 (median over 0.2 s)"
+        assert told == (in_doubt if sight.verdict == OK else sight.verdict)
+
+
+def test_a_field_in_doubt_for_a_moment_holds_nothing_and_is_believed_again():
+    sights = periods(before(1.0, *second()).watch, 0.02, 0.2, 0.02)
+    assert [(sight.verdict, sight.estimate.heard) for sight in sights] == [(OK, 8), (OK, None), (OK, 8)]
+    assert [sight.saw_after(1.0) for sight in sights] == [True, False, True]
+
+
+def test_a_monitor_that_is_switched_off_has_no_doubts():
+    off = SCENARIO.with_values({"monitor.enabled": False}).monitor
+    assert periods(Watch(off), 0.2)[0].estimate.heard == 8
 
 
 def test_readings_on_their_way_while_the_needle_moved_may_be_older_than_the_newest():

@@ -50,6 +50,7 @@ POSITIVE = [
     "control.resolved_rate.lookahead_mm",
     "monitor.indicator_limit",
     "monitor.indicator_window_s",
+    "monitor.doubt_window_s",
     "monitor.abort_after_s",
     "monitor.speed_limit_mm_s",
     "monitor.frozen_travel_mm",

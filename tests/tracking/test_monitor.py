@@ -11,6 +11,7 @@ from flexneedle.tracking import OK, Watch
 
 RATE = 40.0
 SETTINGS = Monitor()
+MISSED = "missing: tracker sees no tip (out of volume)"
 
 
 def frame(time, indicators=(0.02, 0.02, 0.02), tip=(1.0, 2.0, 3.0)):
@@ -86,6 +87,39 @@ def test_references_out_of_volume_are_not_seen_whatever_they_tell():
         "field not known: 0 of 3 reference sensors seen within 1 s "
         "(ref1: out of volume, ref2: out of volume, ref3: out of volume)"
     )
+
+
+def test_no_other_sensor_stands_in_for_a_reference_but_each_may_tell_of_distortion():
+    def verdict(other, ref3):
+        """Of a second of frames in which ref3 is seen or not, and a second coil in the needle tells an indicator."""
+        watch = Watch(SETTINGS)
+        for k in range(40):
+            place = Reading((0.0, 0.0, 0.0), indicator=0.01)
+            readings = {
+                "tip": Reading((1.0 + 1e-6 * k, 2.0, 3.0)),
+                "ref1": place,
+                "ref2": place,
+                "ref3": ref3,
+            }
+            told_by = Frame(k / RATE, k, readings | {"tip.2": replace(place, indicator=other)})
+            watch, _ = watch.take(Sample(k / RATE, 30.0, 1.0, 0.0, told_by), (30.0, 1.0), k / RATE, 0.3, 2.0)
+        return watch.look()[1]
+
+    seen, lost = Reading((0.0, 0.0, 0.0), indicator=0.01), Reading(None, status="out of volume")
+    assert verdict(0.01, seen) == OK
+    assert verdict(0.01, lost) == (
+        "field not known: 2 of 3 reference sensors seen within 1 s "
+        "(ref3: out of volume, no reference by its name: tip.2)"
+    )
+    assert verdict(0.2, seen).startswith("field distorted: tip.2 0.2000")
+
+
+def test_only_the_last_window_is_judged():
+    """0.2 for 2 s, then clean: after half a second more than half of a window of 1 s is clean, of 2 s is not."""
+    watch, _ = told(Watch(SETTINGS), (0.2, 0.02, 0.02), 0.0, 80)
+    _, verdicts = told(watch, (0.02, 0.02, 0.02), 2.0, 40)
+    assert verdicts[18].startswith("field distorted")
+    assert verdicts[20] == OK
 
 
 def still(places, step, settings=SETTINGS):
@@ -202,6 +236,8 @@ def test_a_jump_counts_from_the_last_good_reading():
     assert verdict == "jump of 1.90 mm, limit 1.50 mm"
     assert watch.good == Sample(1.0, 30.0, 1.0)
     assert one(Sample(1.05, 31.9, 1.0), watch) == OK  # so far it may have come by now
+    # Near the jump, and still too far from where it was last well seen.
+    assert one(Sample(1.03, 31.8, 1.0), watch) == "jump of 1.80 mm, limit 1.60 mm"
 
 
 def test_a_frozen_sensor_is_seen_although_the_map_to_the_tip_changes():
@@ -235,13 +271,16 @@ def test_a_tip_lost_in_a_few_frames_is_not_held_against_the_tracker():
     last = watch.good
 
     def lost(time, seen_by=watch):
-        return seen_by.only_missed(Sample(time, None, None, None, frame(time, tip=None)))
+        return seen_by.only_missed(Sample(time, None, None, None, frame(time, tip=None)), MISSED)
 
     assert lost(last.time + 0.1) == last
     assert lost(last.time + 0.125) is None
     assert lost(last.time + 0.1, Watch(SETTINGS)) is None  # never seen
-    assert watch.only_missed(Sample(last.time + 0.025, None, None)) is None  # no frame
-    assert watch.only_missed(last) is None  # not lost
+    assert watch.only_missed(Sample(last.time + 0.025, None, None), MISSED) is None  # no frame
+    assert watch.only_missed(last, OK) is None  # not lost
+    again = Sample(last.time, None, None, None, frame(last.time, tip=None))
+    for verdict in ("stale: frame 2 after frame 2", "stale: 0.450 s old, limit 0.3 s", "not a number"):
+        assert watch.only_missed(again, verdict) is None  # it tells nothing of the tip
     off = replace(watch, settings=SETTINGS.model_copy(update={"enabled": False}))
     assert lost(last.time + 0.025, off) is None
 

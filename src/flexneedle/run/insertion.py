@@ -137,7 +137,7 @@ def _periods(
         held = _held(held, sight, now)
         if arrived_at is None and good and chosen.arrived(task, memory, sight.estimate):
             arrived_at = now
-        seen = arrived_at is not None and good and sight.sample.time > arrived_at - 1e-6
+        seen = arrived_at is not None and good and sight.saw_after(arrived_at)
         ending = _ending(task, sight, None if held is None else held.lasted(sight.field), seen)
         yield _record(index, now, task.plan, rig, decision, applied, sight, clocks), ending
         if ending is not None:

@@ -1,5 +1,6 @@
 """What the closed loop makes of the tracker's readings in a period: judged, believed or not."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -29,6 +30,10 @@ class Sight:
     verdict: str = OK
     field: bool = False
 
+    def saw_after(self, time: float) -> bool:
+        """Whether a reading that may be believed was taken after `time` (s)."""
+        return any(one.verdict == OK and one.sample.time > time - 1e-6 for one in self.readings)
+
     def limit(self, scenario: Scenario) -> float:
         """For how long (s) the needle may be held for such a verdict."""
         return scenario.monitor.abort_after_s if self.field else scenario.control.hold_limit_s
@@ -39,14 +44,16 @@ def look_around(
 ) -> Sight:
     """Judge what the tracker told before the needle moves: something good, or it stays. Nothing of it is learnt."""
     samples = tracker.read()
+    stale_after = scenario.control.stale_after_s
     if not samples:
-        return _without_news(estimate, watch, now, scenario.control.stale_after_s, tracker.status)
-    span = now - samples[0].time + scenario.control.stale_after_s
-    watch, readings = _judged(scenario, estimate, watch, samples, [span] * len(samples), now)
+        return _without_news(estimate, watch, now, stale_after, tracker.status)
+    # The tracker may have been at work for long; but nothing moves on what it told last if that was long ago.
+    ages = [math.inf] * (len(samples) - 1) + [stale_after]
+    watch, readings = _judged(scenario, estimate, watch, samples, ages, now)
     watch, field = watch.look()
     newest = readings[-1]
     verdict = field if field != OK else newest.verdict
-    if verdict == newest.verdict and watch.only_missed(newest.sample) is not None:
+    if verdict == newest.verdict and watch.only_missed(newest.sample, newest.verdict) is not None:
         verdict = OK
     told = _refused(readings, field) if field != OK else readings
     return Sight(estimate, watch, told, newest.sample, verdict, field != OK)
@@ -57,7 +64,8 @@ def see(
 ) -> Sight:
     """Read the tracker, judge its readings and the field, correct the prediction by what may be believed.
 
-    begun, now: of the move that `predicted` ends with (s). In a distorted field no reading is believed.
+    begun, now: of the move that `predicted` ends with (s). In a field that is distorted, or in doubt, no reading is
+    believed.
     """
     stale_after = scenario.control.stale_after_s
     samples = tracker.read()
@@ -70,12 +78,15 @@ def see(
     watch, field = watch.look()
     if field != OK:
         return Sight(predicted.unseen(), watch, _refused(readings, field), newest.sample, field, field=True)
+    if (doubt := watch.doubt()) != OK:
+        readings = _refused(readings, doubt)
     good = [reading.sample for reading in readings if reading.verdict == OK]
     corrected = predicted.observe(good)
+    learnt = corrected if good else corrected.unseen()
     if newest.verdict == OK:
-        return Sight(corrected, watch, readings, newest.sample)
-    if (before := watch.only_missed(newest.sample)) is not None:
-        return Sight(corrected if good else corrected.unseen(), watch, readings, before)
+        return Sight(learnt, watch, readings, newest.sample)
+    if (before := watch.only_missed(newest.sample, newest.verdict)) is not None:
+        return Sight(learnt, watch, readings, before)
     return Sight(corrected.unseen(), watch, readings, newest.sample, newest.verdict)
 
 

@@ -18,6 +18,8 @@ class Monitor(Section):
     """Threshold of a reference sensor's indicator: above it the field is distorted (paper)."""
     indicator_window_s: Positive = 1.0
     """The median over so long is held against the threshold: single readings pass it now and then in a clean field."""
+    doubt_window_s: Positive = 0.2
+    """While the median over so short a time is above the threshold, no reading corrects the model."""
     resume_fraction: Annotated[float, Field(gt=0, le=1)] = 0.9
     """Once held, all indicators have to fall below this share of the threshold."""
     abort_after_s: Positive = 10.0

@@ -13,20 +13,14 @@ __all__ = ["Watch", "field_verdict"]
 
 
 def field_verdict(frames: Sequence[Frame], settings: Monitor, distorted: bool = False) -> str:
-    """Judge the field by the reference sensors of frames, oldest first: all sensors but the tip.
+    """Judge the field by the sensors of frames, oldest first: by all but the tip, and enough of them references.
 
     The frames of the last window count, and a sensor that told an indicator in half of them: a median over a few
     readings would be no better than these. distorted: whether it was so far; it has to fall below the lower limit then.
     """
     window = settings.indicator_window_s
-    since = frames[-1].time - window + 1e-9
-    recent = [frame for frame in frames if frame.time > since]
-    indicators: dict[str, list[float]] = {}
-    for frame in recent:
-        for name, reading in frame.readings.items():
-            if name != TIP and rules.tells_indicator(reading):
-                indicators.setdefault(name, []).append(reading.indicator or 0.0)
-    known = {name: values for name, values in indicators.items() if 2 * len(values) >= len(recent)}
+    recent = _within(frames, window)
+    known = _indicators(recent)
     limit = settings.indicator_limit * (settings.resume_fraction if distorted else 1.0)
     return rules.first_bad(
         (
@@ -35,6 +29,21 @@ def field_verdict(frames: Sequence[Frame], settings: Monitor, distorted: bool = 
             rules.distortion(known, limit, window, distorted),
         )
     )
+
+
+def _within(frames: Sequence[Frame], window: float) -> list[Frame]:
+    since = frames[-1].time - window + 1e-9
+    return [frame for frame in frames if frame.time > since]
+
+
+def _indicators(frames: Sequence[Frame]) -> dict[str, list[float]]:
+    """Indicators by sensor, of those but the tip that told one in half of the frames."""
+    told: dict[str, list[float]] = {}
+    for frame in frames:
+        for name, reading in frame.readings.items():
+            if name != TIP and rules.tells_indicator(reading):
+                told.setdefault(name, []).append(reading.indicator or 0.0)
+    return {name: values for name, values in told.items() if 2 * len(values) >= len(frames)}
 
 
 @dataclass(frozen=True)
@@ -95,12 +104,13 @@ class Watch:
             return None
         return good
 
-    def only_missed(self, newest: Sample) -> Sample | None:
+    def only_missed(self, newest: Sample, verdict: str) -> Sample | None:
         """Return the last good reading if the tip was lost in the newest frame, but not for long; None otherwise.
 
-        Only of a tracker that tells frames: it is known to be alive, and to look.
+        verdict: on that frame; one that is stale itself, or dated nowhere, tells nothing of the tip. Only of a tracker
+        that tells frames: it is known to be alive, and to look.
         """
-        if newest.frame is None or rules.missing(newest) == OK:
+        if newest.frame is None or not verdict.startswith(rules.MISSING):
             return None
         return self.last_good(newest.time, self.settings.lost_after_s)
 
@@ -109,12 +119,26 @@ class Watch:
 
         A tracker that tells nothing but the tip is not held against: there is nothing to judge.
         """
-        frames = [seen.sample.frame for seen in self.recent if seen.sample.frame is not None]
+        frames = self._frames()
         if not self.settings.enabled or not frames:
             return self, OK
         verdict = field_verdict(frames, self.settings, self.distorted)
         distorted = verdict.startswith(rules.DISTORTED) or (self.distorted and verdict != OK)
         return replace(self, field=verdict, distorted=distorted), verdict
+
+    def doubt(self) -> str:
+        """Return why what is measured now is not to be learnt from, although the field holds no needle yet, or OK.
+
+        The median over a second needs half of one to tell that a plate came near; the readings of that time are bent.
+        """
+        frames, settings = self._frames(), self.settings
+        if not settings.enabled or not frames:
+            return OK
+        window = settings.doubt_window_s
+        return rules.doubtful(_indicators(_within(frames, window)), settings.indicator_limit, window)
+
+    def _frames(self) -> list[Frame]:
+        return [seen.sample.frame for seen in self.recent if seen.sample.frame is not None]
 
     def _faults(self, sample: Sample, predicted: tuple[float, float], furthest: float) -> Iterator[str]:
         settings = self.settings

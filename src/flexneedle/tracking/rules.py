@@ -8,15 +8,17 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 
-from flexneedle.ports import VISIBLE, Frame, Reading, Sample
+from flexneedle.ports import VISIBLE, Frame, Reading, Sample, is_reference
 from flexneedle.tracking.table import TIP
 
 Place = tuple[float, ...]
 
 __all__ = [
     "DISTORTED",
+    "MISSING",
     "OK",
     "distortion",
+    "doubtful",
     "first_bad",
     "frozen",
     "innovation",
@@ -32,6 +34,8 @@ __all__ = [
 ]
 
 OK = "ok"
+MISSING = "missing"
+"""How a verdict begins that there is no tip to judge."""
 DISTORTED = "field distorted"
 """How a verdict begins that a reference sensor's indicator is above the limit."""
 
@@ -47,9 +51,9 @@ def missing(sample: Sample) -> str:
         return OK
     told = None if sample.frame is None else sample.frame.readings.get(TIP)
     if told is None:
-        return "missing: tracker sees no tip"
+        return f"{MISSING}: tracker sees no tip"
     why = told.status if told.status != VISIBLE else "no place" if told.position is None else "no orientation"
-    return f"missing: tracker sees no tip ({why})"
+    return f"{MISSING}: tracker sees no tip ({why})"
 
 
 def not_a_number(sample: Sample) -> str:
@@ -124,29 +128,47 @@ def unseen_references(
 ) -> str:
     """Fewer than `needed` reference sensors told an indicator within the window (s).
 
-    newest: what the tracker last said of its sensors, by name; it may say what ails them.
+    newest: what the tracker last said of its sensors, by name; it may say what ails them. No other sensor stands in
+    for a reference, such as a second one in the needle.
     """
-    told = sum(bool(values) for values in indicators.values())
+    told = sum(bool(values) and is_reference(name) for name, values in indicators.items())
     if told >= needed:
         return OK
-    ill = [f"{name}: {r.status}" for name, r in newest.items() if name != TIP and r.status != VISIBLE]
-    why = f" ({', '.join(ill)})" if ill else ""
-    return f"field not known: {told} of {needed} reference sensors seen within {window:g} s{why}"
+    others = [name for name in newest if name != TIP]
+    ill = [f"{name}: {newest[name].status}" for name in others if newest[name].status != VISIBLE]
+    nameless = [name for name in others if not is_reference(name)]
+    why = [*ill, *([f"no reference by its name: {', '.join(nameless)}"] if nameless else [])]
+    return f"field not known: {told} of {needed} reference sensors seen within {window:g} s" + (
+        f" ({', '.join(why)})" if why else ""
+    )
 
 
 def distortion(
     indicators: Mapping[str, Sequence[float]], limit: float, window: float, held: bool = False
 ) -> str:
-    """The median indicator of a reference sensor over the window (s) is above the limit; names the worst one.
+    """The median indicator of a sensor over the window (s) is above the limit; names the worst one.
 
     held: whether it was above before, so that the limit is the lower one, for going on.
     """
-    medians = {name: median(values) for name, values in indicators.items() if values}
-    worst = max(medians, key=lambda name: medians[name], default=None)
-    if worst is None or medians[worst] <= limit:
+    name, value = _worst(indicators)
+    if value <= limit:
         return OK
     rule = "to fall below" if held else "limit"
-    return f"{DISTORTED}: {worst} {medians[worst]:.4f}, {rule} {limit:.4f} (median over {window:g} s)"
+    return f"{DISTORTED}: {name} {value:.4f}, {rule} {limit:.4f} (median over {window:g} s)"
+
+
+def doubtful(indicators: Mapping[str, Sequence[float]], limit: float, window: float) -> str:
+    """The same over a window (s) too short to hold the needle for: what is measured now is better not learnt from."""
+    name, value = _worst(indicators)
+    if value <= limit:
+        return OK
+    return f"field in doubt: {name} {value:.4f}, limit {limit:.4f} (median over {window:g} s)"
+
+
+def _worst(indicators: Mapping[str, Sequence[float]]) -> tuple[str, float]:
+    """Sensor with the largest median indicator, and that; 0 if none told any."""
+    medians = {name: median(values) for name, values in indicators.items() if values}
+    return max(medians.items(), key=lambda item: item[1], default=("", 0.0))
 
 
 def _shared(one: Sample, other: Sample) -> tuple[tuple[float, ...], tuple[float, ...]]:

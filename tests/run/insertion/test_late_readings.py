@@ -100,11 +100,12 @@ def test_missing_readings_hold_the_needle_for_one_reading_each(plan, inserted):
 
 
 def test_a_delay_beyond_the_age_limit_holds_from_the_start(inserted):
-    """As the scenario says it: no reading younger than 0.3 s, none believed, nothing hidden."""
+    """As the scenario says it: no reading younger than 0.3 s, none believed, nothing hidden, and nothing moves."""
     done = inserted(2001, phantom__delay_periods=1.75)
     assert done.outcome == "held"
     assert "stale: 0.350 s old, limit 0.3 s" in done.reason
-    assert done.periods[-1].time == pytest.approx(1.2)
+    assert done.periods[-1].time == pytest.approx(1.0)
+    assert {period.command for period in done.periods} == {STILL}
 
 
 @pytest.mark.parametrize("controller", ["open-loop", "bevel-only"])
