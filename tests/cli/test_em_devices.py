@@ -98,6 +98,24 @@ def test_a_tracker_that_is_not_there_is_bad_input(capsys, tmp_path):
     assert "no such port; serial ports found: " in err
 
 
+def test_without_a_tracker_a_recording_leaves_nothing_behind_and_a_begun_one_as_it_was(capsys, tmp_path):
+    (tmp_path / "grid.toml").write_text(GRID)
+    out = tmp_path / "table.csv"
+    arguments = ("em", "record", "--grid", str(tmp_path / "grid.toml"), "--out", str(out), "--dwell", "0")
+    nowhere = ("--tracker", f"aurora:{tmp_path}/nothing")
+    status, printed, err = run(capsys, *arguments, *nowhere)
+    assert (status, printed) == (2, "")
+    assert "no such port" in err
+    assert not out.exists()
+    with emulated("--sensors", "1", "--still") as path:
+        assert run(capsys, *arguments, "--tracker", f"aurora:{path}")[0] == 0
+    lines = out.read_text().splitlines(keepends=True)
+    begun = "".join(lines[:7]) + lines[7][:9]  # one stop and a torn part of the next
+    out.write_text(begun)
+    assert run(capsys, *arguments, *nowhere)[0] == 2
+    assert out.read_text() == begun
+
+
 def test_a_watch_prints_json_lines_and_keeps_what_it_saw(capsys, tmp_path):
     kept = tmp_path / "kept.csv"
     with emulated("--fault", "missing@0") as path:
@@ -148,7 +166,7 @@ def record_moving(capsys, tmp_path, monkeypatch, typed, *more):
         out = tmp_path / "table.csv"
         arguments = ("--tracker", f"aurora:{path}", "--grid", str(tmp_path / "grid.toml"), "--out", str(out))
         status, _, err = run(capsys, "em", "record", *arguments, *more)
-    return status, err, out.read_text().count("\n") - 1
+    return status, err, out.read_text().count("\n") - 1 if out.exists() else 0
 
 
 def test_at_a_terminal_one_is_asked_whether_to_keep_what_does_not_fit_the_stage(

@@ -62,7 +62,8 @@ def test_a_position_of_a_sensor_that_was_not_well_is_not_taken(table):
         ({"x_mm": "nan"}, "line 3: x_mm = nan: must be finite"),
         ({"x_mm": "0,5"}, "line 3: x_mm = 0,5: must be a number, with a decimal point"),
         ({"time_s": ""}, "line 3: time_s is empty"),
-        ({"sensor": ""}, "a sensor has no name"),
+        ({"sensor": ""}, "line 3: a sensor has no name"),
+        ({"sensor": "tip"}, "line 3: frame 4 has the sensor tip already: each once in a frame"),
         ({"time_s": 0.01}, "frame 4: time_s goes back"),
     ],
 )
@@ -71,6 +72,14 @@ def test_a_damaged_recording_is_refused_in_one_line(table, change, says):
     with pytest.raises(InputError, match=says) as refusal:
         read_frames(table(rows))
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_rows_that_are_there_twice_are_refused(table, suffix):
+    """The same row again, and another one of the same sensor in the same frame, wherever it stands in the frame."""
+    for again in (ROWS[0], {**ROWS[0], "x_mm": 9.0}):
+        with pytest.raises(InputError, match="line 4: frame 4 has the sensor tip already"):
+            read_frames(table([*ROWS[:2], again, *ROWS[2:]], suffix))
 
 
 def test_what_is_no_recording_is_refused(table, tmp_path):

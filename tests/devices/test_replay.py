@@ -2,7 +2,7 @@
 
 import pytest
 
-from flexneedle.devices.replay import Replay
+from flexneedle.devices.replay import ENDED, Replay
 from flexneedle.errors import InputError
 from flexneedle.ports import VISIBLE, Frame, Reading
 
@@ -44,7 +44,7 @@ def test_its_status_tells_the_end():
         assert replay.status == VISIBLE
         clock.time = 1.0
         replay.read()
-        assert replay.status == "the recording has ended"
+        assert replay.status == ENDED == "the recording has ended"
 
 
 def test_nothing_cannot_be_replayed():

@@ -12,6 +12,8 @@ from flexneedle.tracking.registration import (
     fit_rigid,
     identity,
     localisation_error,
+    misfit,
+    refuse_nonsense,
     target_error,
 )
 
@@ -115,3 +117,29 @@ def test_expected_errors_are_those_that_occur():
 def test_what_cannot_be_registered_is_refused(moving, words):
     with pytest.raises(InputError, match=words):
         fit_rigid(moving, moving.copy())
+
+
+CUBE = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]) * 40.0
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"),
+    [
+        (4.0, "both must be in mm"),
+        (0.25, "both must be in mm"),
+        (2.0, "the fit leaves"),
+        (0.85, "the fit leaves"),
+    ],
+)
+def test_clouds_of_other_sizes_are_no_rigid_body(scale, words):
+    with pytest.raises(InputError, match=words):
+        refuse_nonsense(scale * CUBE + 500.0, CUBE)
+
+
+def test_a_residual_up_to_a_tenth_of_the_size_is_let_pass():
+    """A cloud s times as large leaves |s - 1| of its size."""
+    for scale in (0.92, 1.0, 1.08):
+        assert misfit(scale * CUBE + 500.0, CUBE) is None
+        refuse_nonsense(scale * CUBE + 500.0, CUBE)
+    for scale in (0.88, 1.12):
+        assert "the fit leaves 8.31 mm" in misfit(scale * CUBE, CUBE)

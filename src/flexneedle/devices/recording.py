@@ -84,17 +84,26 @@ def _check_columns(path: Path, columns: Iterable[str]) -> None:
 
 
 def _frame(path: Path, rows: list[tuple[int, Mapping[str, Any]]]) -> Frame:
-    readings, stamps = {}, []
+    readings: dict[str, Reading] = {}
+    stamps = []
     for line, row in rows:
         try:
             stamps.append((_known(row, "time_s"), _known(row, "frame_number")))
-            readings[str(row["sensor"] or "")] = _reading(row)
+            readings[_new_sensor(row, readings)] = _reading(row)
         except (ValueError, TypeError) as error:
             raise InputError(f"{path}: line {line}: {error}") from None
-    if "" in readings:
-        raise InputError(f"{path}: line {rows[0][0]}: a sensor has no name")
     time, number = stamps[0]
     return Frame(time, int(number), readings)
+
+
+def _new_sensor(row: Mapping[str, Any], known: Iterable[str]) -> str:
+    """Return the name of a row's sensor. Raises ValueError if there is none, or it is known in this frame."""
+    name = str(row["sensor"] or "")
+    if not name:
+        raise ValueError("a sensor has no name")
+    if name in known:
+        raise ValueError(f"frame {row['frame_number']} has the sensor {name} already: each once in a frame")
+    return name
 
 
 def _known(row: Mapping[str, Any], column: str) -> float:

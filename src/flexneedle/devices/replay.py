@@ -7,7 +7,10 @@ from typing import Self
 from flexneedle.errors import InputError
 from flexneedle.ports import VISIBLE, Clock, Frame
 
-__all__ = ["Replay"]
+__all__ = ["ENDED", "Replay"]
+
+ENDED = "the recording has ended"
+"""The status of a replay after its last frame: there is no more to come."""
 
 
 class Replay:
@@ -44,8 +47,8 @@ class Replay:
 
     @property
     def status(self) -> str:
-        """VISIBLE while there is more to come."""
-        return "the recording has ended" if self.ended else VISIBLE
+        """VISIBLE while there is more to come, then ENDED."""
+        return ENDED if self.ended else VISIBLE
 
     def _due(self, frame: Frame) -> float:
         return self._start + frame.time - self._frames[0].time

@@ -135,3 +135,10 @@ def test_a_sensor_at_the_edge_of_the_volume_has_a_pose_and_a_bit(ailment, bits):
 def test_a_reading_in_binary_leaves_out_what_is_not_known():
     assert ailing("missing", "BX:0801")[6:-2] == struct.pack("<BBBIIH", 1, 0x0A, 2, 0x31, 7, 0)
     assert ailing("disabled", "BX:0801")[6:-2] == struct.pack("<BBBH", 1, 0x0A, 4, 0)
+
+
+@pytest.mark.parametrize("letters", ["TX", "BX"])
+def test_what_ails_the_whole_system_stands_at_the_end_of_a_reading(letters):
+    device, _ = say(set_up(1), "TSTART:")
+    _, reply = say(device, f"{letters}:0801", seen=Seen(7, SEEN.poses, system=0x21))
+    assert reply.endswith("0021") if letters == "TX" else reply[-4:-2] == b"\x21\0"

@@ -131,6 +131,16 @@ def test_ties_count_half_in_the_interval_of_the_area_too(tmp_path):
     assert low + high == pytest.approx(1.0, abs=0.05)
 
 
+def test_the_interval_of_the_area_is_that_of_points_drawn_again_one_by_one(tmp_path):
+    rng = np.random.default_rng(5)
+    low, high = rng.normal(0.05, 0.01, N), rng.normal(0.06, 0.01, N)
+    path = table(tmp_path / "t.csv", (low, np.ones(N)), (high, np.ones(N)))
+    (found,) = evaluate(path, Options()).values()["indicator"]
+    drawn = [np.mean(rng.choice(high, N)[:, None] > rng.choice(low, N)) for _ in range(2000)]
+    ends = np.quantile(drawn, (0.025, 0.975))
+    assert found["auc_interval"] == pytest.approx(ends, abs=0.1 * np.ptp(ends))
+
+
 def test_a_line_through_equal_indicators_is_not_known():
     found = line(np.full(12, 0.1), np.arange(12.0))
     assert np.isnan(found.slope_mm)

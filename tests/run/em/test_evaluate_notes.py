@@ -44,6 +44,18 @@ def test_nothing_is_said_about_the_frame_where_a_fit_would_not_help_or_was_made(
     assert notes(tmp_path, rows, register=case == "registered") == []
 
 
+@pytest.mark.parametrize(("times", "said"), [(4.5, False), (5.5, True)])
+def test_the_frame_is_told_from_five_times_the_residual_on(tmp_path, times, said):
+    """Places 1 % too far from the middle: a fit leaves that, and takes out a shift that makes `times` of it."""
+    middle = GRID.mean(axis=0)
+    left = 0.01 * np.sqrt(((GRID - middle) ** 2).sum(axis=1).mean())
+    shift = np.array([0.0, 0.0, left * np.sqrt(times**2 - 1.0)])
+    places = np.repeat((middle + 1.01 * (GRID - middle) + shift)[:, None], 2, axis=1)
+    told = notes(tmp_path, rows_of(GRID, places))
+    assert len(told) == said
+    assert all(f"the RMSE of {times * left:.3g} mm would be {left:.2g} mm after" in note for note in told)
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [

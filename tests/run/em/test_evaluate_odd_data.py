@@ -1,10 +1,14 @@
 """Tables that are damaged, incomplete or of another kind: one clear line, or a stated treatment."""
 
+import json
+
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from em_tables import GRID, plain, random_rows, rows_of, write_csv
+from flexneedle.cli.main import main
 from flexneedle.errors import InputError
 from flexneedle.run.em.evaluate import Options, evaluate
 
@@ -119,6 +123,20 @@ def test_both_frames_in_metres_are_refused_and_read_when_it_is_said(tmp_path, ro
     assert one(path, unit="m")["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
 
 
+def test_a_poor_tracker_in_metres_is_refused_too(tmp_path):
+    poor = in_metres(random_rows(seed=0, bias=3.0), ("x_mm", "y_mm", "z_mm"))  # errors of 5 mm in 50
+    assert "x_mm, y_mm, z_mm look like metres" in refusal(write_csv(tmp_path / "t.csv", poor))
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.02, 0.03, 0.05])
+def test_a_sensor_that_is_stuck_is_evaluated(tmp_path, noise):
+    """Its readings span a thousandth of the grid, more or less, but not as a grid does."""
+    rng = np.random.default_rng(0)
+    stuck = rows_of(GRID, np.array([7.0, -3.0, 90.0]) + rng.normal(0.0, noise, (27, 1, 3)))
+    found = one(write_csv(tmp_path / "t.csv", stuck))
+    assert found["max_mm"] == pytest.approx(np.linalg.norm(GRID - (7.0, -3.0, 90.0), axis=1).max(), abs=0.2)
+
+
 def test_a_grid_of_a_tenth_of_a_millimetre_is_just_small(tmp_path):
     tiny = rows_of(GRID / 500.0, [[p / 500.0 + 0.05, p / 500.0 + 0.06] for p in GRID])
     assert one(write_csv(tmp_path / "t.csv", tiny))["max_mm"] == pytest.approx(0.055 * 3**0.5)
@@ -126,6 +144,38 @@ def test_a_grid_of_a_tenth_of_a_millimetre_is_just_small(tmp_path):
 
 def in_metres(rows, names):
     return [{key: value / 1000.0 if key in names else value for key, value in row.items()} for row in rows]
+
+
+def single(rows):
+    return list({row["point_id"]: row for row in rows}.values())
+
+
+def test_one_sample_at_each_point_tells_nothing_about_the_jitter(tmp_path, rows, capsys):
+    turned = [{**row, "qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "distance_mm": 700.0} for row in rows]
+    path = write_csv(tmp_path / "t.csv", single(turned))
+    assert main(["em", "evaluate", str(path), "--json", "--out", str(tmp_path / "json")]) == 0
+    told = capsys.readouterr()
+    (found,) = json.loads(told.out)["results"]
+    assert found["rmse_mm"] == pytest.approx(plain(single(rows))["rmse_mm"])
+    assert (found["jitter_mm"], found["intervals"]["jitter_mm"]) == (None, None)
+    assert found["distance"]["bins"][0]["jitter_mm"] is None
+    turns = {found["orientation"][name] for name in ("jitter_deg", "worst_deg", "axis_jitter_deg")}
+    assert turns == {None}
+    assert main(["em", "evaluate", str(path), "--out", str(tmp_path / "tables")]) == 0
+    told = capsys.readouterr()
+    errors, interval = (
+        next(x for x in told.out.splitlines() if x.strip().startswith(s)) for s in ("tip, i", "95")
+    )
+    assert errors.split()[-3:] == ["–", "27", "27"]  # jitter, points, samples
+    assert interval.split()[-2] == "from"  # the 95 %: beyond there is nothing for maximum and jitter
+    assert "one sample at each grid point (jitter and repeatability are not known)" in told.err
+
+
+def test_two_samples_at_a_single_point_are_enough_for_a_jitter(tmp_path, rows):
+    some = single(rows) + rows[:1]
+    found = one(write_csv(tmp_path / "t.csv", some))
+    assert found["jitter_mm"] == pytest.approx(plain(some)["jitter_mm"])
+    assert found["intervals"]["jitter_mm"] is not None
 
 
 def test_samples_without_a_position_are_left_out_and_counted(tmp_path, rows):
@@ -232,6 +282,19 @@ def test_a_last_line_that_only_lacks_its_line_end_is_used(tmp_path, rows):
     assert one(path)["n_samples"] == len(rows)
 
 
+def test_a_whole_file_whose_last_number_is_short_needs_a_line_end(tmp_path, rows):
+    fixed = [{**row, "distance_mm": 700.125} for row in rows]
+    fixed[-1]["distance_mm"] = 700.5
+    path = write_csv(tmp_path / "t.csv", fixed)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1])
+    assert "or add a line end if it is whole" in refusal(path)
+    path.write_bytes(whole)
+    assert one(path)["n_samples"] == len(rows)
+    path.write_bytes(whole[:-10])  # a field is missing, so it is not whole
+    assert "line end if" not in refusal(path)
+
+
 def test_a_line_cut_before_others_were_added_is_refused(tmp_path, rows):
     path = write_csv(tmp_path / "t.csv", rows)
     lines = path.read_text().splitlines()
@@ -293,8 +356,7 @@ def test_a_parquet_table_may_have_whole_numbers_categories_and_no_indicator_at_a
 def test_metres_are_refused_also_where_nothing_jitters(tmp_path, rows):
     """One sample a point, or samples that a tracker rounds: the jitter is 0, not just small."""
     both = ("true_x_mm", "true_y_mm", "true_z_mm", "x_mm", "y_mm", "z_mm")
-    single = list({(row["sensor"], row["environment"], row["point_id"]): row for row in rows}.values())
-    assert "look like metres" in refusal(write_csv(tmp_path / "t.csv", in_metres(single, both)))
+    assert "look like metres" in refusal(write_csv(tmp_path / "t.csv", in_metres(single(rows), both)))
 
 
 @pytest.mark.parametrize("names", [("--1",), ("²",), ("-",)])

@@ -163,7 +163,7 @@ def test_a_point_that_cannot_be_measured_ends_a_recording_without_a_person(grid,
     stage.ailment = ailment
     with pytest.raises(RunError, match=f"point 1, repeat 1: no 6 good samples within 2 s: {says}"):
         run(out, grid, stage, insists=False)
-    assert rows_of(out) == []
+    assert not out.exists(), "nothing was measured"
 
 
 def test_a_sensor_that_the_tracker_does_not_have_is_named_before_the_stage_is_moved(grid, out):
@@ -343,6 +343,22 @@ def test_a_table_that_was_cut_anywhere_is_completed(grid, out, cut):
     os.truncate(out, max(0, whole - cut) if cut > 1 else 1)
     run(out, grid, Stage())
     assert_whole(out)
+
+
+def test_a_table_stays_as_it_was_until_there_is_something_to_add(grid, out):
+    """A stop that was torn, and a file without anything: whoever opens them and measures nothing touches nothing."""
+    run(out, grid, Stage())
+    os.truncate(out, out.stat().st_size - 1000)
+    torn = out.read_bytes()
+    with open_session(out, grid) as session:
+        assert session.done == 5
+    assert out.read_bytes() == torn
+    run(out, grid, Stage())
+    assert_whole(out)
+    out.write_bytes(b"")
+    with open_session(out, grid):
+        pass
+    assert out.read_bytes() == b"", "it is the user's"
 
 
 def test_zeros_that_a_power_cut_left_are_dropped(grid, out):

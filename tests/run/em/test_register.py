@@ -65,6 +65,17 @@ def test_rows_of_a_point_are_averaged_and_unseen_ones_left_out(tmp_path):
     assert found.pairs.missing == 3
 
 
+def test_what_other_sensors_and_unseen_rows_hold_is_of_no_concern(tmp_path):
+    code = -3.697314e28
+    others = [("p0", 1, 2, 3, code, code, code, "tip"), ("p1", "", 2, 3, 4, 5, 6, "tip")]
+    data = [*others, *rows(0.3), ("p2", "", "", "", "", "", "", "ref1")]
+    found = read_pairs(table(tmp_path, data), sensor="ref1")
+    alone = read_pairs(table(tmp_path, rows(0.3), name="alone.csv"))
+    np.testing.assert_array_equal(found.tracker, alone.tracker)
+    np.testing.assert_array_equal(found.stage, alone.stage)
+    assert (found.names, found.missing) == (alone.names, 1)
+
+
 def test_metres_are_read_where_that_is_said(tmp_path):
     data = [(row[0], *(1e-3 * value for value in row[1:7]), row[7]) for row in rows(0.3)]
     told = register(read_pairs(table(tmp_path, data), unit="m"))
@@ -97,7 +108,7 @@ def test_without_point_ids_each_row_is_a_point(tmp_path):
         (rows()[:2], "2 pairs of points"),
         (
             [*rows()[:5], ("p9", 1, 2, 3, 4, "", 6, "ref1")],
-            "row 6 has a coordinate that is not a finite number",
+            "row 6: x_mm, y_mm, z_mm: all three must be there, or none",
         ),
         ([*rows(), ("p0", 1, 2, 3, 4, 5, 6, "ref1")], "point p0 has several places on the stage"),
         ([*rows(), *rows(sensor="tip")], "choose one with --sensor: ref1, tip"),
@@ -118,7 +129,7 @@ def test_without_point_ids_each_row_is_a_point(tmp_path):
         ),
         (
             [*rows()[1:], (*rows()[0][:4], -3.697314e28, -3.697314e28, -3.697314e28, "ref1")],
-            "row 8 has a coordinate b",
+            "row 8: x_mm, y_mm, z_mm: must be finite and at most 1e+06 mm (a code for a missing place?)",
         ),
     ],
     ids=[

@@ -34,6 +34,16 @@ def test_a_file_is_replayed_as_it_was_recorded(tmp_path):
         assert len(replay.read()) == 1
 
 
+def test_a_file_may_have_an_at_sign_in_its_name(tmp_path, monkeypatch):
+    monkeypatch.setattr(trackers, "WallClock", lambda speed: speed)
+    path = tmp_path / "k@home.csv"
+    path.write_text(RECORDING)
+    assert [clock_for(f"replay:{path}"), clock_for(f"replay:{path}@2")] == [1.0, 2.0]
+    for spec in (f"replay:{path}", f"replay:{path}@2"):
+        with open_tracker(spec, WallClock()) as replay:
+            assert len(replay.read()) == 1
+
+
 def test_a_faster_replay_has_a_faster_clock(monkeypatch):
     now, slept = [100.0], []
     monkeypatch.setattr("flexneedle.devices.clock.monotonic", lambda: now[0])
@@ -71,7 +81,7 @@ def test_an_aurora_has_a_port_and_names(monkeypatch, spec, port, names):
         ("polaris:/dev/ttyUSB0", "must be aurora:PORT"),
         ("aurora", "must be aurora:PORT"),
         ("replay:", "must be aurora:PORT"),
-        ("replay:file.csv@fast", "fast is no speed"),
+        ("replay:file.csv@fast", "fast is no speed, and there is no file file.csv@fast"),
         ("aurora:/dev/ttyUSB0=tip,tip", "each once"),
         ("aurora:/dev/ttyUSB0=tip,", "each once"),
     ],

@@ -1,8 +1,10 @@
 """Where a limit is kept, in words."""
 
+import math
+
 import pytest
 
-from em_tables import write_csv
+from em_tables import rows_of, write_csv
 from flexneedle.run.em.evaluate import Options, evaluate
 from flexneedle.tracking.evaluation.distance import Distances, Stretch
 
@@ -56,3 +58,17 @@ def test_the_rmse_of_a_bin_is_held_against_the_limit_not_its_largest_error(tmp_p
     found = evaluate(write_csv(tmp_path / "t.csv", rows), Options(limit_mm=0.7)).values()["results"][0]
     assert found["distance"]["smallest_mm"] == pytest.approx(710.0)
     assert [one["rmse_mm"] for one in found["distance"]["bins"]] == pytest.approx([3.0, 0.425**0.5])
+
+
+def test_errors_of_a_bin_are_those_of_its_points(tmp_path):
+    """Errors of 1 to 5 mm at five points, two samples 0.1 mm about each mean; a sixth point is farther away."""
+    true = [(25.0 * k, 0.0, 0.0) for k in range(6)]
+    samples = [[(x, k + 1.0, 0.1), (x, k + 1.0, -0.1)] for k, (x, _, _) in enumerate(true)]
+    rows = rows_of(true, samples, "coil")
+    rows = [{**row, "distance_mm": 710.0 if row["point_id"] < 5 else 790.0} for row in rows]
+    found = evaluate(write_csv(tmp_path / "t.csv", rows), Options()).values()["results"][0]["distance"][
+        "bins"
+    ]
+    near = [found[0][name] for name in ("rmse_mm", "p95_mm", "max_mm", "jitter_mm")]
+    assert near == pytest.approx([math.sqrt(11.0), 4.8, 5.0, 0.1])
+    assert [bin_["n_points"] for bin_ in found] == [5, 1]

@@ -8,20 +8,28 @@ docs/decisions has the measurements.
 import ctypes
 import os
 import re
+import select
 from importlib.util import find_spec
 from pathlib import Path
+from time import monotonic
 
 from flexneedle.errors import InputError
 
-__all__ = ["INSTALL", "TIMEOUT", "Device", "library_path"]
+__all__ = ["DISABLED", "INSTALL", "TIMEOUT", "Device", "library_path"]
 
+DISABLED = 1
+"""What ndicapi says of a sensor that is not enabled, instead of its transform."""
 TIMEOUT, CHECKSUM, LOST = 0x103, 0x100, (0x104, 0x105)
 """Codes of ndicapi: no reply in time, a wrong checksum, the line gave way in writing or reading."""
 INSTALL = "reading an Aurora needs ndicapi: pip install 'flexneedle[aurora]'"
 
 _CHARS, _INT, _POINTER = ctypes.c_char_p, ctypes.c_int, ctypes.c_void_p
-_LOCATION, _POSE = 14, 8
+_POSE = 8
 _ERROR = re.compile(rb"ERROR([0-9A-F]{2})")
+_HANDLES = re.compile(rb"([0-9A-F]{2})((?:[0-9A-F]{5})*)")
+_LOCATION = re.compile(rb".{10}([0-9]{2})([0-9A-F]{2})")
+_REVISION = re.compile(rb"(?:[A-Z]\.[0-9]{3}\.[0-9]{3}|ERROR[0-9A-F]{2})[0-9A-F]{4}\r")
+_QUIET_S = 0.02
 _FUNCTIONS = {
     "ndiOpenSerial": (_POINTER, _CHARS),
     "ndiCloseSerial": (None, _POINTER),
@@ -31,12 +39,11 @@ _FUNCTIONS = {
     "ndiCommand": (_CHARS, _POINTER, _CHARS),
     "ndiGetError": (_INT, _POINTER),
     "ndiErrorString": (_CHARS, _INT),
-    "ndiGetPHSRNumberOfHandles": (_INT, _POINTER),
-    "ndiGetPHSRHandle": (_INT, _POINTER, _INT),
-    "ndiGetPHINFPortLocation": (_INT, _POINTER, _CHARS),
     "ndiGetBXTransform": (_INT, _POINTER, _INT, ctypes.POINTER(ctypes.c_float)),
     "ndiGetBXPortStatus": (_INT, _POINTER, _INT),
     "ndiGetBXFrame": (ctypes.c_ulong, _POINTER, _INT),
+    "ndiGetBXSystemStatus": (_INT, _POINTER),
+    "ndiGetTXSystemStatus": (_INT, _POINTER),
     "ndiGetTXTransform": (_INT, _POINTER, _INT, ctypes.POINTER(ctypes.c_double)),
     "ndiGetTXPortStatus": (_INT, _POINTER, _INT),
     "ndiGetTXFrame": (ctypes.c_ulong, _POINTER, _INT),
@@ -59,6 +66,7 @@ class Device:
         self._device = self._c.ndiOpenSerial(path.encode())
         if not self._device:
             raise OSError(_why_not_opened(path))
+        self._reply = b""
 
     def close(self) -> None:
         """Close the line."""
@@ -74,29 +82,49 @@ class Device:
 
     def command(self, text: str | None) -> int:
         """Send a command, or a serial break (None); return 0 or the code of what went wrong."""
-        reply = self._c.ndiCommand(self._device, None if text is None else text.encode()) or b""
+        self._reply = self._c.ndiCommand(self._device, None if text is None else text.encode()) or b""
         code = int(self._c.ndiGetError(self._device))
         # ndicapi looks for a binary checksum at the end of every reply to BX, also of an error in text.
-        error = _ERROR.match(reply) if code == CHECKSUM else None
+        error = _ERROR.match(self._reply) if code == CHECKSUM else None
         return code if error is None else int(error[1], 16)
+
+    def in_step(self, seconds: float) -> bool:
+        """Let replies that are still on their way pass, for so long at most; return whether there are no more.
+
+        A reply that comes after its command timed out would be taken for that of the next, and be as old as that is
+        late. So a question is asked whose answer is like no reading, APIREV; what comes before that is of before.
+        """
+        port = self._c.ndiGetDeviceHandle(self._device)
+        heard, end = b"", monotonic() + seconds
+        os.write(port, b"APIREV \r")
+        while (left := end - monotonic()) > 0.0:
+            if select.select([port], [], [], left)[0]:
+                heard = (heard + os.read(port, 4096))[-256:]
+            if _REVISION.search(heard) and not select.select([port], [], [], _QUIET_S)[0]:
+                return True
+        return False
 
     def explain(self, code: int) -> str:
         """Return a code in words."""
         return str(self._c.ndiErrorString(code).decode("ascii", "replace"))
 
     def found(self) -> list[int]:
-        """Return the port handles in the last reply to PHSR."""
-        return [
-            self._c.ndiGetPHSRHandle(self._device, n)
-            for n in range(self._c.ndiGetPHSRNumberOfHandles(self._device))
-        ]
+        """Return the port handles in the last reply, to PHSR. Raises ValueError if it is no such reply.
+
+        Read here and not by ndicapi, as the location: where a reply is short it goes on with that of before.
+        """
+        form = _HANDLES.fullmatch(self._reply)
+        handles = [] if form is None else [int(form[2][k : k + 2], 16) for k in range(0, len(form[2]), 5)]
+        if form is None or len(set(handles)) != int(form[1], 16):
+            raise ValueError(f"no list of port handles: {self._reply.decode('ascii', 'replace')!r}")
+        return handles
 
     def location(self) -> tuple[str, str]:
-        """Return port and channel in the last reply to PHINF."""
-        text = ctypes.create_string_buffer(_LOCATION)
-        self._c.ndiGetPHINFPortLocation(self._device, text)
-        place = text.raw.decode("ascii", "replace")
-        return place[10:12], place[12:14]
+        """Return port and channel in the last reply, to PHINF. Raises ValueError if it is no such reply."""
+        form = _LOCATION.fullmatch(self._reply)
+        if form is None:
+            raise ValueError(f"no location of a port: {self._reply.decode('ascii', 'replace')!r}")
+        return form[1].decode(), form[2].decode()
 
     def reading(self, letters: str, handle: int) -> tuple[int, int, int, tuple[float, ...]]:
         """Return frame number, what kind of nothing is known (0: something is), port status and pose.
@@ -111,6 +139,10 @@ class Device:
         # ndicapi joins signed bytes: with bit 7 set all above it are set as well and mean nothing.
         status &= 0xFF if letters == "BX" and status & 0x80 else 0xFFFF
         return int(frame) & 0xFFFF_FFFF, int(gone), int(status), tuple(pose)
+
+    def system_status(self, letters: str) -> int:
+        """Return the bits (0 to 6) that the last reply to BX or TX ends with: what ails the whole tracker."""
+        return int(getattr(self._c, f"ndiGet{letters}SystemStatus")(self._device)) & 0x7F
 
 
 def _why_not_opened(path: str) -> str:

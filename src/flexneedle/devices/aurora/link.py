@@ -3,7 +3,7 @@
 It finds the tracker, enables every sensor, and polls; each line on stdout is one JSON list:
 
     ["ready", {handle: [port, channel], …}]
-    ["frame", number, seconds of the monotonic clock when it arrived, {handle: [gone, port status, frame, [8 numbers]]}]
+    ["frame", number, seconds of the monotonic clock when it was asked for, {handle: [gone, port status, frame, pose]}]
     ["trouble", kind, words]
     ["end", words]
 
@@ -20,7 +20,7 @@ from typing import Any, NoReturn
 
 from flexneedle.devices.priority import come_first
 
-from .library import CHECKSUM, LOST, TIMEOUT, Device
+from .library import CHECKSUM, DISABLED, LOST, TIMEOUT, Device
 
 __all__ = ["GIVE_UP_S", "main"]
 
@@ -33,6 +33,16 @@ _POLL_S = 0.003  # between two readings; a real line takes longer than that for 
 _HELLO_S, _BREAK_S, _SET_UP_S, _READ_S = 0.5, 7.0, 5.0, 0.3
 _OPTIONS = "0801"  # transforms and status, also outside of the volume
 _UNKNOWN_COMMAND = 0x01
+_SYSTEM = {
+    0x01: "synchronisation error",
+    0x02: "too much interference",
+    0x04: "checksum error",
+    0x08: "processing exception",
+    0x10: "hardware failure",
+    0x20: "hardware change: is the field generator connected?",
+}
+"""Bits of the system status with which no reading is worth anything. Others tell of sensors plugged in or out."""
+_MOST_A_SECOND = 200  # frames: no tracker of this kind counts faster
 _ROUNDS = 4  # of initialising: the second sensor of a port shows up after the first
 
 
@@ -69,16 +79,19 @@ def _connect(device: Device, may_break: bool) -> None:
     device.wait_at_most(_HELLO_S)
     for speed in (_SLOW, _FAST):
         device.speed(speed)
-        if device.command("INIT:") == 0:
+        code = device.command("INIT:")
+        if code == 0:
             break
     else:
         if not may_break:
-            raise _End("no answer")
+            raise _End("no answer" if code == TIMEOUT else _trouble(device, code)[1])
         device.wait_at_most(_BREAK_S)
         _demand(device, None, "no answer, also not to a serial break")
         _demand(device, "INIT:", "reset, but not initialised")
     device.wait_at_most(_SET_UP_S)
     _demand(device, _TO_FAST, "the speed of the line cannot be set")
+    if not device.in_step(GIVE_UP_S):
+        raise _End("no reply")
 
 
 def _demand(device: Device, command: str | None, complaint: str) -> None:
@@ -104,21 +117,41 @@ def _read(device: Device) -> None:
 
 def _set_up(device: Device) -> dict[str, tuple[str, str]]:
     """Initialise and enable every sensor; return port and channel by port handle."""
+    for handle in _listed(device, "01"):  # of a sensor that is gone
+        _demand(device, f"PHF:{handle:02X}", f"port handle {handle:02X} cannot be freed")
     ports: dict[str, tuple[str, str]] = {}
     for _ in range(_ROUNDS):
-        _demand(device, "PHSR:02", "the sensors cannot be listed")
-        waiting = [handle for handle in device.found() if str(handle) not in ports]
+        waiting = [handle for handle in _listed(device, "02") if str(handle) not in ports]
         for handle in waiting:
             _demand(device, f"PINIT:{handle:02X}", f"port handle {handle:02X} cannot be initialised")
-            _demand(device, f"PHINF:{handle:02X}0020", f"port handle {handle:02X} cannot be described")
-            ports[str(handle)] = device.location()
+            ports[str(handle)] = _location(device, handle)
         if not waiting:
             break
     if not ports:
         raise _End("no sensor is plugged in")
+    if len(set(ports.values())) < len(ports):  # one would be taken for the other
+        raise _End("two port handles say that they are at the same port")
     for handle in map(int, ports):
         _demand(device, f"PENA:{handle:02X}D", f"port handle {handle:02X} cannot be enabled")
     return ports
+
+
+def _listed(device: Device, which: str) -> list[int]:
+    complaint = "the sensors cannot be listed"
+    _demand(device, f"PHSR:{which}", complaint)
+    try:
+        return device.found()
+    except ValueError as error:
+        raise _End(f"{complaint}: {error}") from None
+
+
+def _location(device: Device, handle: int) -> tuple[str, str]:
+    complaint = f"port handle {handle:02X} cannot be described"
+    _demand(device, f"PHINF:{handle:02X}0020", complaint)
+    try:
+        return device.location()
+    except ValueError as error:
+        raise _End(f"{complaint}: {error}") from None
 
 
 def _start(device: Device) -> str:
@@ -132,32 +165,39 @@ def _poll(device: Device, letters: str, handles: list[int]) -> bool:
     """Tell each new frame until there are none; return whether the tracker still answered then.
 
     The first frame is only what the next is compared with: a frame number that does not move brings no frame,
-    whoever asks.
+    whoever asks. A frame is dated by when it was asked for, since an answer may be late on its way.
     """
     last, fresh_at, why = -1, monotonic(), "no frame"
-    while monotonic() - fresh_at < GIVE_UP_S:
+    while (asked := monotonic()) - fresh_at < GIVE_UP_S:
         code = device.command(f"{letters}:{_OPTIONS}")
-        arrived = monotonic()
         if code:
             kind, why = _trouble(device, code)
             _tell("trouble", kind, why)
-            if code in LOST:
+            if code in LOST or (code == TIMEOUT and not device.in_step(GIVE_UP_S)):
                 break
+        elif ill := _SYSTEM.get(_lowest(device.system_status(letters) & sum(_SYSTEM))):
+            why = f"the tracker says: {ill}"
+            _tell("trouble", "system", why)
         else:
             found = {handle: device.reading(letters, handle) for handle in handles}
             number = max(frame for frame, *_ in found.values())
-            if number < last:
-                why = "the frame number went back"
+            if last >= 0 and not last <= number <= last + _MOST_A_SECOND * (1.0 + asked - fresh_at):
+                why = "the frame number went back" if number < last else "the frame number leapt"
                 break
             if last < 0 or number == last:
-                why = "the frame number stands still"
+                disabled = all(gone == DISABLED for _, gone, *_ in found.values())
+                why = "all sensors are disabled" if disabled else "the frame number stands still"
             else:
-                _tell("frame", number, arrived, {h: (g, s, n, p) for h, (n, g, s, p) in found.items()})
-                fresh_at = arrived
+                _tell("frame", number, asked, {h: (g, s, n, p) for h, (n, g, s, p) in found.items()})
+                fresh_at = monotonic()
             last = number
         sleep(_POLL_S)
     _tell("end", why)
     return code not in (TIMEOUT, *LOST)
+
+
+def _lowest(bits: int) -> int:
+    return bits & -bits
 
 
 def _trouble(device: Device, code: int) -> tuple[str, str]:

@@ -6,17 +6,23 @@ from typing import Any
 
 from flexneedle.ports import VISIBLE, Reading
 
+from .library import DISABLED
+
 __all__ = ["NAMES", "reading", "readings", "sensor_name"]
 
 NAMES = ("tip", "ref1", "ref2", "ref3")
 """Sensors at the ports 1 to 4, unless said otherwise."""
 
-_SEEN, _DISABLED, _MISSING = 0, 1, 2
+_SEEN, _MISSING = 0, 2
 _STALE = Reading(None, status="stale")
 _BITS = {
     0x0040: "out of volume",
     0x0100: "broken coil",
+    0x0200: "disturbed",
+    0x0400: "signal too small",
+    0x0800: "signal too large",
     0x1000: "processing exception",
+    0x2000: "hardware failure",
     0x0080: "partly out of volume",
 }
 _OCCUPIED = 0x01
@@ -60,7 +66,7 @@ def reading(gone: int, status: int, pose: Sequence[float]) -> Reading:
 
 
 def _why_not(gone: int, status: int) -> str:
-    if gone == _DISABLED:  # ndicapi does not read its port status then
+    if gone == DISABLED:  # ndicapi does not read its port status then
         return "disabled"
     if not status & _OCCUPIED:
         return "unplugged"

@@ -39,7 +39,8 @@ _BREAK_EVERY = 3
 @dataclass(frozen=True)
 class Counts:
     """What happened so far: frames told, frame numbers that never came, frames that nobody read in time,
-    connections after the first, and failed readings by kind ("garbled", "no reply", "error", "unplugged")."""
+    connections after the first, and failed readings by kind ("garbled", "no reply", "error", "system", "unplugged";
+    "crash" for a link that ended otherwise)."""
 
     frames: int
     missed: int
@@ -74,7 +75,11 @@ class Aurora:
         self._first, self._stop = Event(), Event()
         self._thread = Thread(target=self._keep_connected, name="aurora", daemon=True)
         self._thread.start()
-        self._await_first()
+        try:
+            self._await_first()
+        except BaseException:  # Ctrl-C as well: nothing is to go on holding the port
+            self.close()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -116,7 +121,6 @@ class Aurora:
     def _await_first(self) -> None:
         self._first.wait()
         if self._stop.is_set():
-            self._thread.join()
             raise RunError(f"{self._path}: no tracker: {self._reason}")
 
     def _keep_connected(self) -> None:
@@ -124,7 +128,11 @@ class Aurora:
         try:
             while not self._stop.is_set():
                 # A break resets the tracker and may take seconds: first, and then only where nothing else helped.
-                tracked = self._connect_once(attempt % _BREAK_EVERY == 0)
+                try:
+                    tracked = self._connect_once(attempt % _BREAK_EVERY == 0)
+                except (OSError, ValueError) as error:  # no process to be had, or it tells nonsense
+                    tracked = False
+                    self._crashed(f"the link cannot be run: {error}")
                 if not self._first.is_set():
                     return
                 pause, attempt = (
@@ -162,12 +170,13 @@ class Aurora:
                     self._take(json.loads(line))
                 heard_at, limit = monotonic(), _SILENT_S
             elif monotonic() - heard_at > limit:
+                self._set_reason("no reply: the link hung")
                 return
 
     def _take(self, message: list[Any]) -> None:
         match message:
-            case ["frame", number, arrived, found]:
-                self._take_frame(number, arrived, found)
+            case ["frame", number, asked, found]:
+                self._take_frame(number, asked, found)
             case ["ready", ports]:
                 named = {h: sensor_name(port, channel, self._names) for h, (port, channel) in ports.items()}
                 with self._lock:
@@ -181,15 +190,15 @@ class Aurora:
             case ["end", words]:
                 self._set_reason(words)
 
-    def _take_frame(self, device_number: int, arrived: float, found: Mapping[str, Sequence[Any]]) -> None:
-        number = self._numbering.count(device_number, arrived)
-        time = self._timeline.stamp(number, arrived) + self._offset
+    def _take_frame(self, device_number: int, asked: float, found: Mapping[str, Sequence[Any]]) -> None:
+        number = self._numbering.count(device_number, asked)
+        time = self._timeline.stamp(number, asked) + self._offset
         frame = Frame(time, number, readings(found, device_number, self._named))
         with self._lock:
             self._missed += 0 if self._last is None else number - self._last[0] - 1
             self._dropped += len(self._frames) == _QUEUE
             self._told += 1
-            self._last, self._reason = (number, arrived), VISIBLE
+            self._last, self._reason = (number, asked), VISIBLE
             self._frames.append(frame)
 
     def _judge_end(self, code: int, errors: IO[bytes]) -> None:
@@ -198,10 +207,13 @@ class Aurora:
             return
         errors.seek(0)
         said = errors.read().decode(errors="replace").strip().splitlines()
+        hung = "no reply: the link hung" if code == -signal.SIGKILL else f"the link ended with status {code}"
+        self._crashed(said[-1] if said else hung)
+
+    def _crashed(self, words: str) -> None:
         with self._lock:
             self._troubles["crash"] += 1
-        hung = "no reply: the link hung" if code == -signal.SIGKILL else f"the link ended with status {code}"
-        self._set_reason(said[-1] if said else hung)
+            self._reason = words
 
     def _set_reason(self, words: str) -> None:
         with self._lock:

@@ -56,11 +56,13 @@ class Aurora:
 
 @dataclass(frozen=True)
 class Seen:
-    """What there is to read now: the frame's number, the poses by sensor, and what ails a sensor, if anything."""
+    """What there is to read now: the frame's number, the poses by sensor, what ails a sensor, if anything, and the bits
+    of what ails the whole system."""
 
     number: int
     poses: Mapping[str, Pose]
     ailments: Mapping[str, str] = field(default_factory=dict)
+    system: int = 0
 
 
 class _Refusal(Exception):
@@ -311,7 +313,7 @@ def _tx(aurora: Aurora, options: int, seen: Seen) -> bytes:
         f"{handle:02X}{words[kind] if pose is None else codec.transform_text(pose)}{bits:08X}{seen.number:08X}\n"
         for handle, kind, bits, pose in rows
     )
-    return codec.text(f"{len(rows):02X}{told}0000")
+    return codec.text(f"{len(rows):02X}{told}{seen.system:04X}")
 
 
 def _bx(aurora: Aurora, options: int, seen: Seen) -> bytes:
@@ -323,7 +325,7 @@ def _bx(aurora: Aurora, options: int, seen: Seen) -> bytes:
             continue  # it has no more to tell
         body += b"" if pose is None else codec.transform_binary(pose)
         body += bits.to_bytes(4, "little") + seen.number.to_bytes(4, "little")
-    return codec.binary(bytes(body) + b"\0\0")
+    return codec.binary(bytes(body) + seen.system.to_bytes(2, "little"))
 
 
 def _reported(aurora: Aurora) -> list[tuple[int, Port]]:

@@ -18,6 +18,7 @@ KINDS = {
     "broken": "a coil of a sensor is broken (tip, or broken=SENSOR)",
     "disabled": "a sensor is switched off (tip, or disabled=SENSOR)",
     "error": "every command is answered with an error (0D, or error=CODE in hexadecimal)",
+    "system": "the field generator is disconnected (20, or system=BITS of the system status in hexadecimal)",
     "garbled": "a byte of each reply is wrong",
     "cut": "the second half of each reply is lost",
     "silence": "no reply",
@@ -28,7 +29,7 @@ KINDS = {
 """Each kind of fault, and what its detail is."""
 
 _OF_A_SENSOR = ("missing", "out-of-volume", "partly-out", "broken", "disabled")
-_DEFAULTS = dict.fromkeys(_OF_A_SENSOR, SENSORS[0]) | {"error": "0D", "delay": "0.2"}
+_DEFAULTS = dict.fromkeys(_OF_A_SENSOR, SENSORS[0]) | {"error": "0D", "system": "20", "delay": "0.2"}
 _FORM = re.compile(r"(?P<kind>[a-z-]+)(=(?P<detail>[^@]+))?@(?P<start>[0-9.]+)(:(?P<duration>[0-9.]+))?")
 
 
@@ -62,8 +63,8 @@ def parse_fault(spec: str) -> Fault:
 def _check_detail(spec: str, kind: str, detail: str) -> None:
     if kind in _OF_A_SENSOR and detail not in SENSORS:
         raise InputError(f"--fault {spec}: no such sensor; sensors: {', '.join(SENSORS)}")
-    if kind == "error" and not re.fullmatch(r"[0-9A-F]{2}", detail):
-        raise InputError(f"--fault {spec}: the code must be two hexadecimal digits, such as 0D")
+    if kind in ("error", "system") and not re.fullmatch(r"[0-9A-F]{2}", detail):
+        raise InputError(f"--fault {spec}: must be two hexadecimal digits, such as {_DEFAULTS[kind]}")
     if kind == "delay":
         if not _seconds(spec, detail) > 0.0:
             raise InputError(f"--fault {spec}: replies can only come later, such as delay=0.2")

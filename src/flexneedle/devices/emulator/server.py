@@ -73,7 +73,8 @@ class Session:
         number = int((now - self.power_on) * RATE_HZ) & 0xFFFF_FFFF
         on = () if self.tracked_since is None else active(self.faults, now - self.tracked_since)
         ailments = {fault.detail: fault.kind for fault in on if fault.detail in SENSORS}
-        return Seen(number, {name: pose(name, number, self.seed, self.rest) for name in SENSORS}, ailments)
+        poses = {name: pose(name, number, self.seed, self.rest) for name in SENSORS}
+        return Seen(number, poses, ailments, int(faults["system"].detail, 16) if "system" in faults else 0)
 
     def _damaged(self, whole: bytes, faults: dict[str, Fault]) -> bytes:
         if "cut" in faults:

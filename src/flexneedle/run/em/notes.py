@@ -72,7 +72,9 @@ def _odd(grid: Grid) -> Iterator[str]:
         yield f"{missing} of {missing + int(count.sum())} samples have no position (left out)"
     if unseen:
         yield f"no sample at {unseen} of {_points(len(count))} (left out)"
-    if single:
+    if len(known) and single == len(known):
+        yield "one sample at each grid point (jitter and repeatability are not known)"
+    elif single:
         yield f"one sample at {_points(single)} (an error each, nothing for the jitter)"
     if len(known) and known.min() != known.max():
         weights = "points weigh alike in the errors, samples in the jitter"

@@ -27,6 +27,7 @@ __all__ = ["EXTRA", "Guide", "Session", "open_session", "record"]
 EXTRA = ("time_s", "frame_number", "repeat")
 """Columns beside those of a table of measurements. Times go on over interruptions."""
 _HEADER = (*COLUMNS, *EXTRA)
+_FIRST_LINE = ",".join(_HEADER).encode() + b"\n"
 _PAUSE_S = 0.01
 _SILENT_S = 1.0  # so long without a frame, or a good one, and it is said
 
@@ -51,10 +52,11 @@ class Guide:
 
 @dataclass
 class Session:
-    """An open table, locked, and the stops that it has no rows of yet. last_time: the last time in it, s; last: its
-    last stop, if it has any."""
+    """An open table, locked, and the stops that it has no rows of yet. size: of what is kept of it, bytes; it is
+    written from there. last_time: the last time in it, s; last: its last stop, if it has any."""
 
     file: BinaryIO
+    size: int
     left: Sequence[Stop]
     done: int
     last_time: float
@@ -62,22 +64,27 @@ class Session:
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Add the rows of a stop, and return when they are on the disk."""
+        data = _text(rows) if self.size else _FIRST_LINE + _text(rows)
         with uninterrupted():
-            self.file.write(_text(rows))
+            self.file.truncate(self.size)
+            self.file.write(data)
             self.file.flush()
             os.fsync(self.file.fileno())
+            self.size += len(data)
 
 
 @contextmanager
 def open_session(path: Path, grid: Grid) -> Iterator[Session]:
     """Open a table, new or begun, with the stops that are left.
 
-    Rows of a stop that are not all there are dropped: it is measured again. Raises InputError if the table is
-    another grid's, is damaged, or is being written.
+    Rows of a stop that are not all there are dropped with the first that are added (at once if no stop is left): it
+    is measured again. Until then the table stays as it was, and a new one without rows is taken away in the end.
+    Raises InputError if the table is another grid's, is damaged, or is being written.
     """
     if path.suffix == ".parquet":
         raise InputError(f"{path}: a CSV is written: give a name that ends in .csv")
     try:
+        new = not path.exists()
         file = path.open("a+b")
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
@@ -86,7 +93,12 @@ def open_session(path: Path, grid: Grid) -> Iterator[Session]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise InputError(f"{path}: another process is writing it") from None
-        yield _resumed(path, file, grid)
+        session = _resumed(path, file, grid)
+        try:
+            yield session
+        finally:
+            if new and not session.size:
+                path.unlink(missing_ok=True)
 
 
 def record(session: Session, tracker: Tracker, clock: Clock, grid: Grid, guide: Guide) -> int:
@@ -246,23 +258,23 @@ def _text(rows: Sequence[Mapping[str, Any]]) -> bytes:
 def _resumed(path: Path, file: BinaryIO, grid: Grid) -> Session:
     file.seek(0)
     data = file.read()
-    header = ",".join(_HEADER).encode() + b"\n"
-    if not data.startswith(header):
-        if not header.startswith(data):
+    stops = list(grid.stops())
+    if not data.startswith(_FIRST_LINE):
+        if not _FIRST_LINE.startswith(data):
             raise InputError(f"{path}: is no table of `em record`: give another file with --out")
-        file.truncate(0)  # new, or cut in its first line
-        file.write(header)
-        data = header
-    lines = data[len(header) :].splitlines(keepends=True)
+        return Session(file, 0, stops, 0, 0.0, None)  # new, or cut in its first line
+    lines = data[len(_FIRST_LINE) :].splitlines(keepends=True)
     whole = lines if not lines or lines[-1].endswith(b"\n") else lines[:-1]  # the last one may be torn
-    stops, size = list(grid.stops()), grid.file.samples * len(grid.file.sensors)
+    size = grid.file.samples * len(grid.file.sensors)
     done = len(whole) // size
     _check_rows(path, whole, stops, grid)
-    file.truncate(len(header) + sum(map(len, whole[: done * size])))
+    kept = len(_FIRST_LINE) + sum(map(len, whole[: done * size]))
+    if done == len(stops):
+        file.truncate(kept)  # nothing will be added
     if not done:
-        return Session(file, stops, 0, 0.0, None)
+        return Session(file, kept, stops, 0, 0.0, None)
     rows = [_cells(line) for line in whole[(done - 1) * size : done * size]]
-    return Session(file, stops[done:], done, float(rows[-1]["time_s"]), _visited(stops[done - 1], rows))
+    return Session(file, kept, stops[done:], done, float(rows[-1]["time_s"]), _visited(stops[done - 1], rows))
 
 
 def _visited(stop: Stop, rows: Sequence[Mapping[str, str]]) -> Visit:

@@ -16,8 +16,11 @@ from flexneedle.plot.em.registration import registration_figure
 from flexneedle.plot.style import save
 from flexneedle.scenario import Registration, Scenario
 from flexneedle.scenario.problems import describe
+from flexneedle.tracking.evaluation.cells import MILLIMETRES_IN, SAME_MM
+from flexneedle.tracking.evaluation.checks import check_true, seen_rows
 from flexneedle.tracking.evaluation.columns import column_map
-from flexneedle.tracking.evaluation.reading import read_batches
+from flexneedle.tracking.evaluation.moments import Moments
+from flexneedle.tracking.evaluation.reading import LABELS, read_batches
 from flexneedle.tracking.quaternion import from_matrix
 from flexneedle.tracking.registration import (
     Rigid,
@@ -43,9 +46,6 @@ Floats = NDArray[np.float64]
 Point = tuple[float, float, float]
 
 _NUMBERS = REQUIRED[1:7]
-_LABELS = ("point_id", "sensor", "environment")
-_FURTHEST_MM = 1e6
-_SAME_MM = 1e-3
 _HEAD = """\
 # The tracker's frame in the stage's, by flexneedle em register. Paste the first table into a scenario, or give this
 # file to flexneedle insert --registration.
@@ -130,11 +130,11 @@ def read_pairs(
     theirs = column_map(columns)
     chosen = {"sensor": sensor, "environment": environment}
     try:
-        rows = [_rows(batch) for batch in read_batches(data, theirs, _NUMBERS, _LABELS)]
+        rows = [_rows(batch) for batch in read_batches(data, theirs, _NUMBERS, LABELS)]
         if not rows:
             raise InputError("has no rows")
-        labels = {name: np.concatenate([part[0][name] for part in rows]) for name in _LABELS}
-        numbers = np.concatenate([part[1] for part in rows]) * {"mm": 1.0, "m": 1e3}[unit]
+        labels = {name: np.concatenate([part[0][name] for part in rows]) for name in LABELS}
+        numbers = np.concatenate([part[1] for part in rows]) * MILLIMETRES_IN[unit]
         return _pairs(labels, numbers, _kept(labels, chosen))
     except InputError as error:
         raise InputError(f"{data}: {error}") from None
@@ -215,7 +215,7 @@ def load_registration(path: Path, scenario: Scenario) -> Scenario:
 def _rows(batch: Any) -> tuple[dict[str, NDArray[Any]], Floats]:
     texts = {
         name: np.array(batch.labels[name].to_pylist() if name in batch.labels else [None] * batch.rows)
-        for name in _LABELS
+        for name in LABELS
     }
     return texts, np.column_stack([batch.numbers[name] for name in _NUMBERS])
 
@@ -234,36 +234,26 @@ def _kept(labels: Mapping[str, NDArray[Any]], chosen: Mapping[str, str | None]) 
 
 
 def _pairs(labels: Mapping[str, NDArray[Any]], numbers: Floats, kept: NDArray[np.bool_]) -> Pairs:
-    stage, tracker = numbers[:, :3], numbers[:, 3:]
-    unseen = np.isnan(tracker).all(axis=1)
-    kept_seen = kept & ~unseen
-    if not kept_seen.any():
+    stage, tracker = numbers[:, :3].T, numbers[:, 3:].T
+    # Rows that were not chosen pass for unseen ones: whatever they hold is of no concern.
+    own = seen_rows(list(np.where(kept, tracker, np.nan)), 1)
+    seen = kept if own is None else own
+    if not seen.any():
         raise InputError("no reading has a place")
-    far = kept_seen & (np.abs(numbers) > _FURTHEST_MM).any(axis=1)
-    if far.any():
-        raise InputError(
-            f"row {int(far.argmax()) + 1} has a coordinate beyond 1 km: a code for a missing place?"
-        )
-    if not np.isfinite(numbers[kept_seen]).all():
-        row = int(np.flatnonzero(kept_seen & ~np.isfinite(numbers).all(axis=1))[0])
-        raise InputError(f"row {row + 1} has a coordinate that is not a finite number")
-    names = [str(name) if name is not None else f"row {k + 1}" for k, name in enumerate(labels["point_id"])]
-    names = [name for name, keep in zip(names, kept_seen, strict=True) if keep]
+    check_true(list(np.where(seen, stage, 0.0)), 1)
+    ids = [str(name) if name is not None else f"row {k + 1}" for k, name in enumerate(labels["point_id"])]
+    names = [name for name, there in zip(ids, seen.tolist(), strict=True) if there]
     order = {name: k for k, name in enumerate(dict.fromkeys(names))}
     point = np.array([order[name] for name in names], dtype=np.int64)
-    count = np.bincount(point, minlength=len(order))
-    places = stage[kept_seen]
-    first = np.unique(point, return_index=True)[1]
-    apart = np.abs(places - places[first][point]).max(axis=1, initial=0.0) > _SAME_MM
+    places, readings = Moments(3), Moments(3)
+    places.add(point, stage[:, seen], len(order))
+    readings.add(point, tracker[:, seen], len(order))
+    apart = np.abs(stage[:, seen].T - places.pivot[point]).max(axis=1) > SAME_MM
     if apart.any():
         raise InputError(
             f"point {names[int(apart.argmax())]} has several places on the stage: one point, one place"
         )
-    seen = tracker[kept_seen]
-    means = np.column_stack(
-        [np.bincount(point, seen[:, k] - seen[0, k], len(order)) / count for k in range(3)]
-    )
-    return Pairs(tuple(order), places[first], means + seen[0], count, int((kept & unseen).sum()))
+    return Pairs(tuple(order), places.pivot, readings.mean, readings.count, int((kept & ~seen).sum()))
 
 
 def _left_out(pairs: Pairs) -> Floats:

@@ -58,12 +58,15 @@ def _replay(rest: str, clock: Clock) -> Replay:
 
 
 def _file_and_speed(rest: str) -> tuple[str, float]:
-    """Return the parts of FILE@SPEED. Raises InputError if the speed is none."""
-    file, _, told = rest.rpartition("@") if "@" in rest else (rest, "", "1")
+    """Return the parts of FILE@SPEED; a file that is there may have an @ in its name. Raises InputError if the speed
+    is none."""
+    if "@" not in rest or Path(rest).exists():
+        return rest, 1.0
+    file, _, told = rest.rpartition("@")
     try:
         speed = float(told)
     except ValueError:
-        raise InputError(f"tracker replay:{rest}: {told} is no speed") from None
+        raise InputError(f"tracker replay:{rest}: {told} is no speed, and there is no file {rest}") from None
     if not (isfinite(speed) and speed > 0.0):
         raise InputError(f"tracker replay:{rest}: the speed must be above 0")
     return file, speed

@@ -9,17 +9,18 @@ from math import inf
 from pathlib import Path
 
 from flexneedle.devices.recording import COLUMNS, rows_of
-from flexneedle.devices.replay import Replay
+from flexneedle.devices.replay import ENDED
 from flexneedle.errors import InputError
-from flexneedle.ports import VISIBLE, Clock, Frame, Tracker
+from flexneedle.ports import VISIBLE, Clock, Frame, Tracker, is_reference
 from flexneedle.scenario import Monitor
 from flexneedle.tracking.monitor import field_verdict
-from flexneedle.tracking.table import TIP
+from flexneedle.tracking.rules import DISTORTED, OK
 
 __all__ = ["Judge", "View", "field_judge", "judge_field", "watch"]
 
-Judge = Callable[[Sequence[Frame]], str]
-"""Says of the frames of the last seconds, oldest first, whether they are to be trusted: "ok" or why not."""
+Judge = Callable[[Sequence[Frame], bool], tuple[str, bool]]
+"""Says of the frames of the last seconds, oldest first, whether they are to be trusted: "ok" or why not. It is told
+whether the field was distorted so far, and says whether it is now."""
 
 _PAUSE_S = 0.01
 _HISTORY = 400  # frames: 10 s
@@ -51,7 +52,7 @@ def watch(
     """
     chosen = judge if judge is not None else field_judge()
     history: deque[Frame] = deque(maxlen=_HISTORY)
-    start, count, shown_at = clock.now(), 0, -inf
+    start, count, shown_at, distorted = clock.now(), 0, -inf, False
     with ExitStack() as files:
         keep = _recorder(files, record)
         while (now := clock.now()) - start < seconds:
@@ -59,14 +60,15 @@ def watch(
             for frame in frames:
                 history.append(frame)
                 keep(frame)
-                show(View(now, frame, True, tracker.status, chosen(history)))
+                verdict, distorted = chosen(history, distorted)
+                show(View(now, frame, True, tracker.status, verdict))
             count += len(frames)
             if frames:
                 shown_at = now
             elif now - shown_at > 0.5:
                 show(_without_new(now, history, tracker.status))
                 shown_at = now
-            if isinstance(tracker, Replay) and tracker.ended:
+            if tracker.status == ENDED:
                 break
             clock.wait(_PAUSE_S)
     return count
@@ -77,12 +79,15 @@ def _without_new(now: float, history: Sequence[Frame], status: str) -> View:
     return View(now, last, False, status, "no new frames" if status == VISIBLE else status)
 
 
-def judge_field(frames: Sequence[Frame], settings: Monitor) -> str:
-    """Return the first thing that is wrong: sensors without a position, then the field by the monitor's rules."""
+def judge_field(frames: Sequence[Frame], settings: Monitor, distorted: bool = False) -> tuple[str, bool]:
+    """Return the first thing that is wrong: sensors without a position, then the field by the monitor's rules.
+
+    And whether the field is distorted: as the monitor holds an insertion, until the field is known to be good again.
+    distorted: whether it was so far.
+    """
+    field = field_verdict(frames, settings, distorted)
     ill = "; ".join(f"{name}: {r.status}" for name, r in frames[-1].readings.items() if r.status != VISIBLE)
-    if ill:
-        return ill
-    return field_verdict(frames, settings)
+    return ill or field, field.startswith(DISTORTED) or (distorted and field != OK)
 
 
 def field_judge(references: int | None = None) -> Judge:
@@ -90,10 +95,10 @@ def field_judge(references: int | None = None) -> Judge:
     tracker has: one at least, and no more than an insertion asks for."""
     default = Monitor()
 
-    def judge(frames: Sequence[Frame]) -> str:
-        there = sum(name != TIP for name in frames[-1].readings)
+    def judge(frames: Sequence[Frame], distorted: bool) -> tuple[str, bool]:
+        there = sum(map(is_reference, frames[-1].readings))
         wanted = max(1, min(default.references, there)) if references is None else references
-        return judge_field(frames, default.model_copy(update={"references": wanted}))
+        return judge_field(frames, default.model_copy(update={"references": wanted}), distorted)
 
     return judge
 

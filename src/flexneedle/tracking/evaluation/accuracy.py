@@ -2,7 +2,7 @@
 
 err_i = ‖P̄_i − P_i‖ with the mean P̄_i of the samples at grid point i, rmse = √(Σ err_i² / N) over the N points, each
 of the same weight, jitter = √(Σ_i Σ_j ‖P̄_i − P̃_ij‖² / Σ_i M_i) over all samples: with M at each point that is the
-paper's.
+paper's. A point with one sample adds nothing to the sum of squares; if all points have one, the jitter is unknown.
 """
 
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class Accuracy:
     n_points: with a sample; n_unseen: without; n_single: with one, which adds an error, but no scatter. sd_mm: of the
     errors, n − 1. bias_mm: mean error vector. beyond_max: with 95 % confidence no more than this share of the volume
     has errors beyond `max_mm` (Wilks 1941); a maximum has no useful bootstrap interval. intervals: 95 %, by bootstrap;
-    that of p95_mm from order statistics.
+    that of p95_mm from order statistics. jitter_mm: NaN, without an interval, if no point has two samples.
     """
 
     n_points: int
@@ -91,9 +91,11 @@ def root_mean_square(values: Floats) -> float:
 
 
 def jitter(places: Places) -> float:
-    """Return the jitter over all samples (mm), NaN without any."""
-    count = int(places.position.count.sum())
-    return float(np.sqrt(np.nansum(places.position.scatter) / count)) if count else nan
+    """Return the jitter over all samples (mm), NaN if no place has two."""
+    count = places.position.count
+    if count.max(initial=0) < 2:
+        return nan
+    return float(np.sqrt(np.nansum(places.position.scatter) / count.sum()))
 
 
 def accuracy(grid: Grid) -> Accuracy:
@@ -135,6 +137,8 @@ def _intervals(error: Floats, seen: Places) -> dict[str, Interval]:
         },
         len(error),
     )
+    if count.max() < 2:
+        found["jitter_mm"] = None
     return {**found, "p95_mm": quantile_interval(error, P95)}
 
 

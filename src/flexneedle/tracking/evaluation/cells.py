@@ -15,7 +15,7 @@ from flexneedle.tracking.evaluation.moments import Moments, add_counts, grown
 from flexneedle.tracking.evaluation.reading import Batch
 from flexneedle.tracking.table import REFERENCE, TIP
 
-__all__ = ["MILLIMETRES_IN", "collect"]
+__all__ = ["MILLIMETRES_IN", "SAME_MM", "collect"]
 
 MILLIMETRES_IN = {"mm": 1.0, "m": 1000.0}
 SAME_MM = 1e-3
@@ -118,7 +118,7 @@ class _Cells:
         there = _both(seen, ~np.isnan(values))
         self._add(self.indicator, cell, (values,), there)
         some = slice(None) if there is None else there
-        self._singles.add(pair[some], values[some], len(self.keys.pairs))
+        self._singles.add(pair[some], values[some])
 
     def singles_of(self, sensor: int, environment: int) -> tuple[Histogram, tuple[float, float]]:
         """Return single values of the indicator, see `Singles`."""

@@ -39,7 +39,11 @@ def seen_rows(position: Columns, start: int) -> Mask | None:
         "x_mm, y_mm, z_mm: all three must be there, or none (a missing sample)",
     )
     far = (np.abs(position) > FARTHEST_MM).any(axis=0)
-    refuse(far, start, f"x_mm, y_mm, z_mm: must be finite and at most {FARTHEST_MM:g} mm")
+    refuse(
+        far,
+        start,
+        f"x_mm, y_mm, z_mm: must be finite and at most {FARTHEST_MM:g} mm (a code for a missing place?)",
+    )
     return seen
 
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.tracking.evaluation.moments import grown
+
 __all__ = ["BIN", "Histogram", "Singles"]
 
 BIN = 1e-4
@@ -14,11 +16,16 @@ _BINS = round(_HIGHEST / BIN) + 2  # one more for all that is beyond
 
 Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]
+_NONE: Counts = np.zeros(0, dtype=np.int64)
+_NO_RANGE = (np.inf, -np.inf)
 
 
 @dataclass(frozen=True, eq=False)
 class Histogram:
-    """How many samples lie within half a bin of each multiple of `BIN`; the last bin holds all beyond 9.9."""
+    """How many samples lie within half a bin of each multiple of `BIN`, from 0 to the last that has some.
+
+    All beyond 9.9 are in a bin of their own, number `_BINS` − 1.
+    """
 
     counts: Counts
 
@@ -47,27 +54,31 @@ class Histogram:
 
 
 class Singles:
-    """Histograms and ranges of the indicators of several sensors and environments: one for each number from 0."""
+    """Histograms and ranges of the indicators of several sensors and environments, each of which has a number.
+
+    One without samples takes no room, and no histogram is longer than its largest value needs.
+    """
 
     def __init__(self) -> None:
-        self._counts: Counts = np.zeros(0, dtype=np.int64)
-        self._low, self._high = np.zeros(0), np.zeros(0)
+        self._counts: dict[int, Counts] = {}
+        self._ranges: dict[int, tuple[float, float]] = {}
 
-    def add(self, number: Counts, values: Floats, numbers: int) -> None:
-        """Count values (r,), none of them negative, under `number` (r,), all below `numbers`."""
-        added = numbers - len(self._low)
-        if added > 0:
-            self._counts = np.concatenate([self._counts, np.zeros(added * _BINS, dtype=np.int64)])
-            self._low = np.concatenate([self._low, np.full(added, np.inf)])
-            self._high = np.concatenate([self._high, np.full(added, -np.inf)])
+    def add(self, number: Counts, values: Floats) -> None:
+        """Count values (r,), none of them negative, under `number` (r,), from 0 and below 65536."""
+        order = np.argsort(number.astype(np.uint16), kind="stable")  # in linear time, with 16 bits
+        ordered = number[order]
+        starts = np.flatnonzero(np.diff(ordered, prepend=-1))
+        for one, rows in zip(ordered[starts].tolist(), np.split(order, starts)[1:], strict=True):
+            self._add(one, values[rows])
+
+    def _add(self, number: int, values: Floats) -> None:
         bins = np.minimum(values * (1.0 / BIN) + 0.5, _BINS - 1).astype(np.int64)
-        np.add.at(self._counts, bins + number * _BINS, 1)
-        np.minimum.at(self._low, number, values)
-        np.maximum.at(self._high, number, values)
+        counts = grown(self._counts.get(number, _NONE), int(bins.max()) + 1)
+        np.add.at(counts, bins, 1)
+        low, high = self._ranges.get(number, _NO_RANGE)
+        self._counts[number] = counts
+        self._ranges[number] = min(low, float(values.min())), max(high, float(values.max()))
 
     def of(self, number: int) -> tuple[Histogram, tuple[float, float]]:
         """Return the histogram, and the least and the largest value (∞ and −∞ without any)."""
-        if number >= len(self._low):
-            return Histogram(np.zeros(_BINS, dtype=np.int64)), (np.inf, -np.inf)
-        counts = self._counts[number * _BINS : (number + 1) * _BINS]
-        return Histogram(counts), (float(self._low[number]), float(self._high[number]))
+        return Histogram(self._counts.get(number, _NONE)), self._ranges.get(number, _NO_RANGE)

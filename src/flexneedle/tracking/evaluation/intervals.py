@@ -17,6 +17,7 @@ __all__ = [
     "SEED",
     "Interval",
     "Statistic",
+    "ends",
     "intervals",
     "quantile_interval",
 ]
@@ -41,7 +42,7 @@ def intervals(statistics: Mapping[str, Statistic], points: int, seed: int = SEED
     for chosen in _samples(points, seed):
         for name, statistic in statistics.items():
             drawn[name].append(statistic(chosen))
-    return {name: _ends(np.concatenate(values)) for name, values in drawn.items()}
+    return {name: ends(np.concatenate(values)) for name, values in drawn.items()}
 
 
 def quantile_interval(values: Floats, share: float) -> Interval:
@@ -78,7 +79,8 @@ def _samples(points: int, seed: int) -> Iterator[Indices]:
         yield rng.integers(0, points, (min(most, RESAMPLES - start), points))
 
 
-def _ends(values: Floats) -> Interval:
+def ends(values: Floats) -> Interval:
+    """Return the 95 % percentile interval of what samples drawn again gave (b,); NaN among them are left out."""
     tail = (1.0 - CONFIDENCE) / 2.0
     low, high = np.nanquantile(values, (tail, 1.0 - tail)).tolist()
     return low, high

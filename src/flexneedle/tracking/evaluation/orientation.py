@@ -6,6 +6,7 @@ sin²(φ_j / 2): 2 arcsin √(1 − λ) is the RMS angle, but for terms of fourt
 """
 
 from dataclasses import dataclass
+from math import nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ class Orientation:
     """RMS angle (degrees) of single samples from the mean orientation at their grid point, over all samples.
 
     axis_jitter_deg: of the sensor's z axis alone, which is the needle's: a 5-DOF sensor knows no turn about it.
+    NaN if no point has two samples.
     """
 
     n_samples: int
@@ -40,6 +42,8 @@ def orientation(grid: Grid) -> Orientation | None:
     if not there.any():
         return None
     count, matrices = sums.count[there], _matrices(sums.mean[there])
+    if count.max() < 2:
+        return Orientation(int(count.sum()), nan, nan, "", nan)
     squares = np.linalg.eigvalsh(matrices)[:, :3].sum(axis=1).clip(0.0, 1.0)  # 1 − λ, without cancelling
     worst = int(squares.argmax())
     return Orientation(

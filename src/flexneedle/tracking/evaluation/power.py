@@ -9,7 +9,7 @@ from flexneedle.errors import InputError
 from flexneedle.tracking.evaluation.accuracy import P95
 from flexneedle.tracking.evaluation.grid import Grid
 from flexneedle.tracking.evaluation.indicator import means
-from flexneedle.tracking.evaluation.intervals import LEAST_POINTS, RESAMPLES, SEED, Interval, intervals
+from flexneedle.tracking.evaluation.intervals import LEAST_POINTS, RESAMPLES, SEED, Interval, ends, intervals
 
 __all__ = ["Level", "Power", "compare"]
 
@@ -100,5 +100,4 @@ def _apart(low: Floats, high: Floats) -> Interval:
         np.array([values[rng.integers(0, len(values), len(values))].mean() for _ in range(RESAMPLES)])
         for values in (low, high)
     )
-    ends = np.quantile(second - first, (0.025, 0.975)).tolist()
-    return ends[0], ends[1]
+    return ends(second - first)

@@ -4,6 +4,7 @@ OFFICIAL: the maker's figures (NDI 2013) as the paper quotes them in Table I; ME
 II. Where text and tables of the paper differ (0.17 and 0.25 mm against 0.65 and 0.61 mm), these are the tables'.
 """
 
+import re
 from collections.abc import Mapping
 
 from flexneedle.tracking.table import REFERENCE, TIP
@@ -25,21 +26,22 @@ MEASURED: Mapping[tuple[str, str], Figures] = {
     (REFERENCE, IDEAL): {"rmse_mm": 0.61, "p95_mm": 0.91, "max_mm": 1.16, "jitter_mm": 0.08},
     (REFERENCE, NOISY): {"rmse_mm": 2.70, "p95_mm": 5.27, "max_mm": 8.16, "jitter_mm": 0.07},
 }
+THRESHOLD = 0.0547
+"""95th percentile of the indicator in `ideal`."""
 INDICATOR: Mapping[str, Figures] = {
-    IDEAL: {"mean": 0.0239, "sd": 0.0138, "max": 0.0779, "min": 0.0061, "p95": 0.0547},
+    IDEAL: {"mean": 0.0239, "sd": 0.0138, "max": 0.0779, "min": 0.0061, "p95": THRESHOLD},
     NOISY: {"mean": 0.1944, "sd": 0.1049, "max": 0.4784, "min": 0.0684},
 }
 FITS: Figures = {"mean_mm": 0.575, "sd_mm": 0.211, "slope_mm": 9.591, "intercept_mm": 0.051}
 """err = mean ± sd in `ideal`, err = slope · 𝓘 + intercept in `noisy`, of the reference sensor."""
-THRESHOLD = 0.0547
-"""95th percentile of the indicator in `ideal`."""
 POWERED = 0.04
 """The indicator with the needle driver's power on."""
+_A_REFERENCE = re.compile(rf"(ref|{REFERENCE})\d*")
 
 
 def kind(sensor: str) -> str | None:
-    """Return which of the paper's sensors one of this name is: the tip, a reference (ref1, ref2, …), or None."""
+    """Return which of the paper's sensors one of this name is: the tip, a reference (ref, ref1, …), or None."""
     name = sensor.strip().lower()
     if name == TIP:
         return TIP
-    return REFERENCE if name == REFERENCE or name.removeprefix("ref").isdecimal() else None
+    return REFERENCE if _A_REFERENCE.fullmatch(name) else None

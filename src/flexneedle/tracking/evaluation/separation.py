@@ -14,6 +14,7 @@ from flexneedle.tracking.evaluation.intervals import (
     RESAMPLES,
     SEED,
     Interval,
+    ends,
     quantile_interval,
 )
 
@@ -133,8 +134,7 @@ def _area_interval(low: Floats, high: Floats) -> Interval:
     rng = np.random.default_rng(SEED)
     first, second = (rng.multinomial(len(v), np.full(len(v), 1.0 / len(v)), RESAMPLES) for v in (low, high))
     areas = np.einsum("bi,bi->b", first @ wins, second) / (len(low) * len(high))
-    ends = np.quantile(areas, (0.025, 0.975)).tolist()
-    return ends[0], ends[1]
+    return ends(areas)
 
 
 def _above(grid: Grid | None, threshold: float | None) -> float | None:

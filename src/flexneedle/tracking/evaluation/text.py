@@ -64,8 +64,8 @@ class Layout:
         """Raise InputError if the last line, being without a line end, seems to be a part of what was written.
 
         It is one if it has fewer fields than the header; or if its last field is a beginning of a name that other
-        rows have, or a number with fewer decimals than any other. A cut between two digits of numbers that are
-        written with all kinds of lengths may pass; one at a line end cannot be seen at all.
+        rows have, or a number with fewer decimals than any other. A cut between two digits of whole numbers,
+        or of numbers written with all kinds of lengths, may pass; one at a line end cannot be seen at all.
         """
         lines = _tail(path)
         if not lines:
@@ -74,9 +74,10 @@ class Layout:
         ends = [row[-1] for row in before[1:] if len(row) == len(self.header)]
         short = len(last) < len(self.header)
         if short or (self.header[-1] in used and _is_part(last[-1], ends, self.header[-1] in labels)):
+            advice = "" if short else ", or add a line end if it is whole"
             raise InputError(
-                f"cut in the middle: the last line has no line end and is not whole ({lines[-1][:60]!r}); "
-                "write the file again, or take that line away"
+                f"cut in the middle: the last line has no line end and seems not to be whole ({lines[-1][:60]!r}); "
+                f"write the file again, or take that line away{advice}"
             )
 
 
