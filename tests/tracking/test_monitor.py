@@ -49,6 +49,15 @@ def test_a_clean_field_lets_the_needle_move_once_half_a_window_of_it_was_seen():
     assert set(verdicts[20:]) == {OK}
 
 
+def test_a_gap_between_frames_is_no_time_that_was_looked_at():
+    """0.35 s of frames, 0.65 s of none: as each new frame comes, one of before is a second old."""
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 15)
+    _, verdicts = told(watch, (0.02, 0.02, 0.02), 1.0, 24)
+    assert verdicts[1] == "field not known: looked at for 0.35 s, 0.5 s needed"
+    known = [verdict == OK for verdict in verdicts]
+    assert known == [False] * 20 + [True] * 4
+
+
 def test_after_silence_in_a_distorted_field_one_clean_frame_is_not_enough():
     watch, verdicts = told(Watch(SETTINGS), (0.09, 0.02, 0.02), 0.0, 40)
     assert verdicts[-1].startswith("field distorted")

@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from statistics import median
 
 from flexneedle.ports import Frame, Sample
 from flexneedle.scenario import Monitor
@@ -9,7 +11,7 @@ from flexneedle.tracking import rules
 from flexneedle.tracking.rules import OK
 from flexneedle.tracking.table import TIP
 
-__all__ = ["Watch", "field_verdict"]
+__all__ = ["Watch", "field_verdict", "is_distorted"]
 
 
 def field_verdict(frames: Sequence[Frame], settings: Monitor, distorted: bool = False) -> str:
@@ -25,10 +27,21 @@ def field_verdict(frames: Sequence[Frame], settings: Monitor, distorted: bool = 
     return rules.first_bad(
         (
             rules.unseen_references(known, settings.references, window, recent[-1].readings),
-            rules.too_short(recent[-1].time - recent[0].time, window / 2, settings.references),
+            rules.too_short(_looked_at(recent), window / 2, settings.references),
             rules.distortion(known, limit, window, distorted),
         )
     )
+
+
+def is_distorted(verdict: str, before: bool) -> bool:
+    """Whether the field is to be held for distorted after a verdict: once it was, until it is known to be good."""
+    return verdict.startswith(rules.DISTORTED) or (before and verdict != OK)
+
+
+def _looked_at(frames: Sequence[Frame]) -> float:
+    """For how long (s) the tracker was looked at: a gap between frames counts as one period of frames."""
+    steps = [later.time - earlier.time for earlier, later in pairwise(frames)]
+    return len(steps) * median(steps) if steps else 0.0
 
 
 def _within(frames: Sequence[Frame], window: float) -> list[Frame]:
@@ -123,8 +136,7 @@ class Watch:
         if not self.settings.enabled or not frames:
             return self, OK
         verdict = field_verdict(frames, self.settings, self.distorted)
-        distorted = verdict.startswith(rules.DISTORTED) or (self.distorted and verdict != OK)
-        return replace(self, field=verdict, distorted=distorted), verdict
+        return replace(self, field=verdict, distorted=is_distorted(verdict, self.distorted)), verdict
 
     def doubt(self) -> str:
         """Return why what is measured now is not to be learnt from, although the field holds no needle yet, or OK.

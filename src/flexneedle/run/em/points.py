@@ -36,7 +36,7 @@ def _rows(grid: Grid) -> Iterator[Sequence[str]]:
     points = grid.points
     count = points.position.count
     with np.errstate(invalid="ignore"):
-        jitter = np.sqrt(points.position.scatter.sum(axis=1) / np.where(count > 0, count, np.nan))
+        jitter = np.sqrt(points.position.scatter.sum(axis=1) / np.where(count > 1, count, np.nan))
     places = np.column_stack([points.true.mean, points.position.mean, error_vectors(points), errors(points)])
     others = np.column_stack([jitter, points.indicator.mean[:, 0]])
     counts = zip(count.tolist(), points.missing.tolist(), strict=True)

@@ -13,8 +13,7 @@ from flexneedle.devices.replay import ENDED
 from flexneedle.errors import InputError
 from flexneedle.ports import VISIBLE, Clock, Frame, Tracker, is_reference
 from flexneedle.scenario import Monitor
-from flexneedle.tracking.monitor import field_verdict
-from flexneedle.tracking.rules import DISTORTED, OK
+from flexneedle.tracking.monitor import field_verdict, is_distorted
 
 __all__ = ["Judge", "View", "field_judge", "judge_field", "watch"]
 
@@ -87,7 +86,7 @@ def judge_field(frames: Sequence[Frame], settings: Monitor, distorted: bool = Fa
     """
     field = field_verdict(frames, settings, distorted)
     ill = "; ".join(f"{name}: {r.status}" for name, r in frames[-1].readings.items() if r.status != VISIBLE)
-    return ill or field, field.startswith(DISTORTED) or (distorted and field != OK)
+    return ill or field, is_distorted(field, distorted)
 
 
 def field_judge(references: int | None = None) -> Judge:
