@@ -302,6 +302,20 @@ def test_causes_that_take_turns_hold_nothing_forever(plan):
     assert done.periods[-1].time < 2.0
 
 
+def test_time_held_for_a_reading_is_no_time_held_for_the_field(plan):
+    """The field is bent but from 6 to 8 s, the median follows in half a second; until then nobody sees the tip."""
+
+    def told_at(time):
+        seen = {"tip": LOST if 6.0 <= time < 8.6 else AT_START}
+        return seen | references(0.02 if 6.0 <= time < 8.0 else 0.2)
+
+    done = on_bench(plan, told_at, **{"control.hold_limit_s": 5.0})
+    kinds = [period.verdict.split(":")[0] for period in done.periods]
+    assert list(dict.fromkeys(kinds)) == ["field distorted", "missing"]
+    assert done.reason.startswith("held for 10.0")
+    assert done.periods[-1].time == pytest.approx(12.0, abs=0.1)  # of which 2 s are not the field's
+
+
 def test_nothing_moves_before_the_tracker_told_anything(plan):
     """As a real one that is still connecting, in a field that turns out to be distorted."""
 

@@ -79,3 +79,23 @@ def test_references_are_placed_with_a_moving_plate_where_it_begins():
         read = np.array(frame.readings[name].position)
         assert math.dist(read, pose.position) < 3.0  # what the room adds
     assert max(math.dist(far[name].position, near[name].position) for name in far) > 10.0
+
+
+def test_the_rigs_sensor_points_along_the_needle():
+    """Its z axis; the guide is moved aside, so that the needle lies askew."""
+    rig = rig_of(tracker__environment="ideal", tracker__tip_offset_mm=8.0)
+    for _ in range(30):
+        rig.driver.apply((1.0, 0.0, 0.0, 0.3, -1), 0.2)
+    turn = rig.truth().tip[2]
+    w, x, y, z = rig.tracker.read()[-1].frame.readings["tip"].orientation
+    axis = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z)
+    assert abs(turn) > 0.05
+    np.testing.assert_allclose(axis, (math.cos(turn), math.sin(turn), 0.0), atol=0.02)
+
+
+def test_references_are_placed_where_they_tell_three_quarters_of_the_threshold_at_most(monkeypatch):
+    limits = []
+    monkeypatch.setattr("flexneedle.run.rig.placed_references", lambda *given: limits.append(given[2]) or {})
+    scenario = PHANTOM.with_values({"tracker.environment": "ideal", "monitor.indicator_limit": 0.08})
+    virtual_room(scenario, np.random.SeedSequence(1))
+    assert limits == [pytest.approx(0.06)]
