@@ -141,7 +141,7 @@ def test_check_names_a_sensor_that_was_there_once_only(capsys, tmp_path):
     off, on = powered(tmp_path / "off.csv", 0.02), powered(tmp_path / "on.csv", 0.02)
     on.write_text(on.read_text() + on.read_text().split("\n", 1)[1].replace("reference", "ref2"))
     status, _, err = run(capsys, "em", "check", off, on)
-    assert (status, err) == (0, "note: ref2: not in power off, only in power on\n")
+    assert (status, err) == (0, "note: ref2: no indicator in power off, only in power on\n")
     assert json.loads(run(capsys, "em", "check", off, on, "--json")[1])["notes"] == [err[6:-1]]
 
 

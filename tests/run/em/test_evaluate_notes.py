@@ -44,6 +44,16 @@ def test_nothing_is_said_about_the_frame_where_a_fit_would_not_help_or_was_made(
     assert notes(tmp_path, rows, register=case == "registered") == []
 
 
+def test_a_place_with_a_second_id_is_told(tmp_path):
+    rows = random_rows(0)
+    assert notes(tmp_path, rows) == []
+    for row in rows[3:6]:
+        row["point_id"] = "first again"
+    assert notes(tmp_path, rows)[0].startswith(
+        "tip, ideal: 1 of 28 grid points under a second point_id (counted as"
+    )
+
+
 @pytest.mark.parametrize(("times", "said"), [(4.5, False), (5.5, True)])
 def test_the_frame_is_told_from_five_times_the_residual_on(tmp_path, times, said):
     """Places 1 % too far from the middle: a fit leaves that, and takes out a shift that makes `times` of it."""

@@ -67,7 +67,7 @@ def check(
         for power, own in (("off", before), ("on", after))
         for grid in own.values()
     ]
-    told = [*lacking_sensors(powered), *differing_points(powered)]
+    told = [*lacking_sensors(powered, "no indicator in"), *differing_points(powered)]
     return Check([compare(before[name], after[name], threshold) for name in both], told)
 
 

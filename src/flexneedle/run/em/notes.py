@@ -6,6 +6,7 @@ import numpy as np
 
 from flexneedle.errors import InputError
 from flexneedle.tracking.evaluation.accuracy import errors, register, root_mean_square
+from flexneedle.tracking.evaluation.cells import SAME_MM
 from flexneedle.tracking.evaluation.grid import Grid
 from flexneedle.tracking.registration import misfit
 
@@ -33,14 +34,14 @@ def notes(grids: Sequence[Grid], pair: tuple[str, str], hinted: bool) -> list[st
     ]
 
 
-def lacking_sensors(grids: Sequence[Grid]) -> Iterator[str]:
-    """Yield a line for each sensor that is not in all environments."""
+def lacking_sensors(grids: Sequence[Grid], absent: str = "not in") -> Iterator[str]:
+    """Yield a line for each sensor that is not in all environments, which `absent` tells in words."""
     everywhere = list(dict.fromkeys(grid.environment for grid in grids))
     for sensor in dict.fromkeys(grid.sensor for grid in grids):
         own = [grid.environment for grid in grids if grid.sensor == sensor]
         lacking = [name for name in everywhere if name not in own]
         if lacking:
-            yield f"{sensor}: not in {', '.join(lacking)}, only in {', '.join(own)}"
+            yield f"{sensor}: {absent} {', '.join(lacking)}, only in {', '.join(own)}"
 
 
 def differing_points(grids: Sequence[Grid]) -> Iterator[str]:
@@ -68,6 +69,9 @@ def _points(count: int) -> str:
 def _odd(grid: Grid) -> Iterator[str]:
     count, missing = grid.points.position.count, int(grid.points.missing.sum())
     single, unseen, known = int((count == 1).sum()), int((count == 0).sum()), count[count > 0]
+    places = np.unique(np.round(grid.points.true.mean / SAME_MM), axis=0)
+    if len(places) < len(count):
+        yield f"{len(count) - len(places)} of {_points(len(count))} under a second point_id (counted as points)"
     if missing:
         yield f"{missing} of {missing + int(count.sum())} samples have no position (left out)"
     if unseen:
