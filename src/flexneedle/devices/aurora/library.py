@@ -93,15 +93,21 @@ class Device:
 
         A reply that comes after its command timed out would be taken for that of the next, and be as old as that is
         late. So a question is asked whose answer is like no reading, APIREV; what comes before that is of before.
+        A line that gives way has no more replies to wait for, and is not in step.
         """
         port = self._c.ndiGetDeviceHandle(self._device)
         heard, end = b"", monotonic() + seconds
-        os.write(port, b"APIREV \r")
-        while (left := end - monotonic()) > 0.0:
-            if select.select([port], [], [], left)[0]:
-                heard = (heard + os.read(port, 4096))[-256:]
-            if _REVISION.search(heard) and not select.select([port], [], [], _QUIET_S)[0]:
-                return True
+        try:
+            os.write(port, b"APIREV \r")
+            while (left := end - monotonic()) > 0.0:
+                if select.select([port], [], [], left)[0]:
+                    if not (data := os.read(port, 4096)):
+                        return False
+                    heard = (heard + data)[-256:]
+                if _REVISION.search(heard) and not select.select([port], [], [], _QUIET_S)[0]:
+                    return True
+        except OSError:
+            return False
         return False
 
     def explain(self, code: int) -> str:
