@@ -1,6 +1,7 @@
 """Tables that are damaged, incomplete or of another kind: one clear line, or a stated treatment."""
 
 import json
+import threading
 
 import numpy as np
 import pyarrow as pa
@@ -230,6 +231,15 @@ def test_orientations_must_be_whole_unit_quaternions(tmp_path, rows, quaternion,
     assert f"row 5: qw, qx, qy, qz: {expected}" in refusal(write_csv(tmp_path / "t.csv", rows))
     some = [{k: v for k, v in row.items() if k != "qz"} for row in rows]
     assert "qw, qx, qy, qz: all four columns" in refusal(write_csv(tmp_path / "some.csv", some))
+
+
+def test_a_refusal_leaves_no_thread_that_reads_on(tmp_path, rows):
+    """Also while somebody still holds the error, and with it the frames in which it came about."""
+    rows[7]["z_mm"] = float("inf")
+    with pytest.raises(InputError) as held:
+        evaluate(write_csv(tmp_path / "t.csv", rows), Options())
+    assert held.tb is not None
+    assert not [thread.name for thread in threading.enumerate() if "ThreadPool" in thread.name]
 
 
 def test_equal_rows_are_samples_like_all_others(tmp_path, rows):

@@ -1,7 +1,7 @@
 """`flexneedle em evaluate`: a table of measurements in, errors, indicator and figures out."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -150,9 +150,8 @@ def read_grids(data: Path, options: Options) -> tuple[list[Grid], int]:
     names = {column: name for column, name in given.items() if name is not None}
     optional = (*OPTIONAL, "indicator", *names)
     required = [column for column in REQUIRED if column not in optional]
-    with _about(data):
-        batches = labelled(read_batches(data, theirs, required, optional), names)
-        grids, rows = collect(batches, options.bin_mm, options.unit or "mm")
+    with _about(data), closing(read_batches(data, theirs, required, optional)) as batches:
+        grids, rows = collect(labelled(batches, names), options.bin_mm, options.unit or "mm")
         if options.unit is None:
             refuse_metres(grids)
     return grids, rows

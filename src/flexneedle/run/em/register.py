@@ -2,6 +2,7 @@
 
 import tomllib
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -130,7 +131,8 @@ def read_pairs(
     theirs = column_map(columns)
     chosen = {"sensor": sensor, "environment": environment}
     try:
-        rows = [_rows(batch) for batch in read_batches(data, theirs, _NUMBERS, LABELS)]
+        with closing(read_batches(data, theirs, _NUMBERS, LABELS)) as batches:
+            rows = [_rows(batch) for batch in batches]
         if not rows:
             raise InputError("has no rows")
         labels = {name: np.concatenate([part[0][name] for part in rows]) for name in LABELS}

@@ -5,7 +5,7 @@ refused, since nobody knows what is missing.
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -51,9 +51,11 @@ class Batch:
 
 def read_batches(
     path: Path, theirs: Mapping[str, str], required: Iterable[str], optional: Iterable[str]
-) -> Iterator[Batch]:
+) -> Generator[Batch, None, None]:
     """Yield the rows of a table with their columns under our names; `theirs`: see `column_map`.
 
+    Close it: another thread reads ahead for it, and one that is left to the garbage collector is ended wherever that
+    comes to it, also within the start of another thread, which then waits for itself.
     Raises InputError, which does not name the file, if it cannot be read, lacks a column, or was cut off.
     """
     try:
