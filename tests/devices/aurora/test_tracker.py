@@ -97,6 +97,15 @@ def test_times_are_those_of_the_runs_clock():
         assert before - 1.0 < frames[0].time < frames[-1].time <= clock.now()
 
 
+@pytest.mark.parametrize("delay", [0.6, pytest.param(0.4, marks=pytest.mark.slow)])
+def test_a_tracker_that_always_answers_too_late_tells_nothing(delay):
+    """From the first reading on: no answer is taken for that of a later command, and so for a newer frame."""
+    with emulated("--fault", f"delay={delay}@0") as path, Aurora(path, WallClock()) as aurora:
+        until(lambda: aurora.counts.troubles.get("no reply", 0) >= 2)
+        assert aurora.read() == ()
+        assert aurora.status in ("no reply", "no answer")
+
+
 def test_old_firmware_is_read_in_text():
     with emulated("--no-bx") as path, Aurora(path, WallClock()) as aurora:
         frames, _ = read_until(aurora, number(10))

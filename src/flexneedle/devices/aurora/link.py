@@ -103,10 +103,11 @@ def _demand(device: Device, command: str | None, complaint: str) -> None:
 def _read(device: Device) -> None:
     """Enable the sensors, track, and leave the tracker as it was found if it still listens."""
     ports = _set_up(device)
-    letters = _start(device)
-    _tell("ready", ports)
+    _demand(device, "TSTART:", "tracking cannot be started")
     listens = True
     try:
+        letters = _letters(device)
+        _tell("ready", ports)
         listens = _poll(device, letters, [int(handle) for handle in ports])
     finally:
         if listens:
@@ -154,11 +155,13 @@ def _location(device: Device, handle: int) -> tuple[str, str]:
         raise _End(f"{complaint}: {error}") from None
 
 
-def _start(device: Device) -> str:
-    """Start tracking; return the command that reads: BX, or TX where BX is not known."""
-    _demand(device, "TSTART:", "tracking cannot be started")
+def _letters(device: Device) -> str:
+    """Return the command that reads: BX, or TX where BX is not known."""
     device.wait_at_most(_READ_S)
-    return "TX" if device.command(f"BX:{_OPTIONS}") == _UNKNOWN_COMMAND else "BX"
+    code = device.command(f"BX:{_OPTIONS}")
+    if code == TIMEOUT and not device.in_step(GIVE_UP_S):
+        raise _End("no reply")
+    return "TX" if code == _UNKNOWN_COMMAND else "BX"
 
 
 def _poll(device: Device, letters: str, handles: list[int]) -> bool:
