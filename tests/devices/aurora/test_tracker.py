@@ -78,6 +78,7 @@ def missed_while_suspended(aurora, process):
     return aurora.counts.missed - before
 
 
+@pytest.mark.slow
 def test_an_emulator_that_is_kept_waiting_loses_no_frames_and_a_link_that_is_does():
     """The emulated device stands still meanwhile; but nobody stops time for the link.
 
@@ -97,7 +98,7 @@ def test_times_are_those_of_the_runs_clock():
         assert before - 1.0 < frames[0].time < frames[-1].time <= clock.now()
 
 
-@pytest.mark.parametrize("delay", [0.6, pytest.param(0.4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("delay", [0.4, pytest.param(0.6, marks=pytest.mark.slow)])
 def test_a_tracker_that_always_answers_too_late_tells_nothing(delay):
     """From the first reading on: no answer is taken for that of a later command, and so for a newer frame."""
     with emulated("--fault", f"delay={delay}@0") as path, Aurora(path, WallClock()) as aurora:
@@ -165,7 +166,6 @@ def test_bad_replies_are_dropped_counted_and_told(fault, trouble, words):
         counts = aurora.counts
     assert_true_and_new(frames)
     assert counts.troubles[trouble] >= 1
-    assert counts.reconnections == 0
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import os
 import re
 import select
 from importlib.util import find_spec
+from math import inf
 from pathlib import Path
 from time import monotonic
 
@@ -29,7 +30,7 @@ _ERROR = re.compile(rb"ERROR([0-9A-F]{2})")
 _HANDLES = re.compile(rb"([0-9A-F]{2})((?:[0-9A-F]{5})*)")
 _LOCATION = re.compile(rb".{10}([0-9]{2})([0-9A-F]{2})")
 _REVISION = re.compile(rb"(?:[A-Z]\.[0-9]{3}\.[0-9]{3}|ERROR[0-9A-F]{2})[0-9A-F]{4}\r")
-_QUIET_S = 0.02
+_QUIET_S, _ASK_AGAIN_S = 0.02, 0.2
 _FUNCTIONS = {
     "ndiOpenSerial": (_POINTER, _CHARS),
     "ndiCloseSerial": (None, _POINTER),
@@ -92,19 +93,26 @@ class Device:
         """Let replies that are still on their way pass, for so long at most; return whether there are no more.
 
         A reply that comes after its command timed out would be taken for that of the next, and be as old as that is
-        late. So a question is asked whose answer is like no reading, APIREV; what comes before that is of before.
+        late. So a question is asked whose answer is like no reading, APIREV, and again where the answer is lost; what
+        comes before it is of before, and what was asked twice is answered within the time that the first answer took.
         A line that gives way has no more replies to wait for, and is not in step.
         """
         port = self._c.ndiGetDeviceHandle(self._device)
-        heard, end = b"", monotonic() + seconds
+        heard, begun, latency = b"", monotonic(), inf
+        ask_at = begun
         try:
-            os.write(port, b"APIREV \r")
-            while (left := end - monotonic()) > 0.0:
-                if select.select([port], [], [], left)[0]:
+            while (now := monotonic()) < begun + seconds:
+                if latency == inf and now >= ask_at:
+                    os.write(port, b"APIREV \r")
+                    ask_at = now + _ASK_AGAIN_S
+                pause = max(0.0, ask_at - now) if latency == inf else max(_QUIET_S, latency)
+                if select.select([port], [], [], pause)[0]:
                     if not (data := os.read(port, 4096)):
                         return False
                     heard = (heard + data)[-256:]
-                if _REVISION.search(heard) and not select.select([port], [], [], _QUIET_S)[0]:
+                    if latency == inf and _REVISION.search(heard):
+                        latency = monotonic() - begun
+                elif latency < inf:
                     return True
         except OSError:
             return False

@@ -30,7 +30,7 @@ GIVE_UP_S = 1.0
 _SLOW, _FAST = 9600, 115200
 _TO_FAST, _TO_SLOW = "COMM:50000", "COMM:00000"  # 8N1, no handshake
 _POLL_S = 0.003  # between two readings; a real line takes longer than that for each
-_HELLO_S, _BREAK_S, _SET_UP_S, _READ_S = 0.5, 7.0, 5.0, 0.3
+_HELLO_S, _BREAK_S, _SET_UP_S, _READ_S, _IN_STEP_S = 0.5, 7.0, 5.0, 0.3, 2.0
 _OPTIONS = "0801"  # transforms and status, also outside of the volume
 _UNKNOWN_COMMAND = 0x01
 _SYSTEM = {
@@ -90,7 +90,7 @@ def _connect(device: Device, may_break: bool) -> None:
         _demand(device, "INIT:", "reset, but not initialised")
     device.wait_at_most(_SET_UP_S)
     _demand(device, _TO_FAST, "the speed of the line cannot be set")
-    if not device.in_step(GIVE_UP_S):
+    if not device.in_step(_IN_STEP_S):
         raise _End("no reply")
 
 
@@ -159,7 +159,7 @@ def _letters(device: Device) -> str:
     """Return the command that reads: BX, or TX where BX is not known."""
     device.wait_at_most(_READ_S)
     code = device.command(f"BX:{_OPTIONS}")
-    if code == TIMEOUT and not device.in_step(GIVE_UP_S):
+    if code == TIMEOUT and not device.in_step(_IN_STEP_S):
         raise _End("no reply")
     return "TX" if code == _UNKNOWN_COMMAND else "BX"
 
@@ -176,7 +176,7 @@ def _poll(device: Device, letters: str, handles: list[int]) -> bool:
         if code:
             kind, why = _trouble(device, code)
             _tell("trouble", kind, why)
-            if code in LOST or (code == TIMEOUT and not device.in_step(GIVE_UP_S)):
+            if code in LOST or (code == TIMEOUT and not device.in_step(_IN_STEP_S)):
                 break
         elif ill := _SYSTEM.get(_lowest(device.system_status(letters) & sum(_SYSTEM))):
             why = f"the tracker says: {ill}"
