@@ -98,7 +98,8 @@ def test_times_are_those_of_the_runs_clock():
         assert before - 1.0 < frames[0].time < frames[-1].time <= clock.now()
 
 
-@pytest.mark.parametrize("delay", [0.4, pytest.param(0.6, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [0.4, 0.6])
 def test_a_tracker_that_always_answers_too_late_tells_nothing(delay):
     """From the first reading on: no answer is taken for that of a later command, and so for a newer frame."""
     with emulated("--fault", f"delay={delay}@0") as path, Aurora(path, WallClock()) as aurora:
