@@ -87,7 +87,10 @@ def test_an_emulator_that_is_kept_waiting_loses_no_frames_and_a_link_that_is_doe
     with emulated() as path, Aurora(path, WallClock()) as aurora:
         device, link = process_of("emulate"), process_of("aurora.link")
         until(lambda: missed_while_suspended(aurora, device) <= 2)
+        before = aurora.counts.missed
         until(lambda: missed_while_suspended(aurora, link) >= 5)
+        assert aurora.counts.missed >= before + 5
+        assert aurora.counts.reconnections == 0
 
 
 def test_times_are_those_of_the_runs_clock():
