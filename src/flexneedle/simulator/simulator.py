@@ -237,7 +237,14 @@ def _build_model(scenario: Scenario) -> model.Model:
     weight = np.array([layer.energy_weight for layer in tissue])
     depth = max(scenario.setup.max_depth, 0.0)
     nodes = model.contact_nodes(layers, weight, scenario.contact.spacing_mm, depth, scenario.setup.guide_x)
-    bevel = needle.bevel
+    bevel, spacing = needle.bevel, scenario.contact.spacing_mm
     return model.Model(
-        needle.bending_stiffness, needle.length_mm, bevel.offset_mm, bevel.length_mm, nodes, layers
+        needle.bending_stiffness,
+        needle.length_mm,
+        bevel.offset_mm,
+        bevel.length_mm,
+        nodes,
+        layers,
+        part=model.SKIN_PART * spacing,
+        zone=model.SKIN_ZONE * spacing,
     )
