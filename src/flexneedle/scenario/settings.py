@@ -141,6 +141,11 @@ class Phantom(Section):
     """Standard deviation of the base clamp's lateral position."""
     start_angle_sd_mrad: NonNegative = 3.0
     """Standard deviation of the base clamp's slope."""
+    start_axial_sd_mm: NonNegative = 1.0
+    """Standard deviation of the position of base and tip along the axis at the start (needle length, clamp, skin), at
+    most half of the distance to the skin, to the guide, and of what the base has left at full stroke."""
+    youngs_modulus_variation: Annotated[float, Field(ge=0, lt=1)] = 0.05
+    """Largest deviation of the needle's modulus, uniform to either side, relative to the scenario's."""
     initial_bend_mm: NonNegative = 0.5
     """How far the tip of the free needle is off the straight; the bend turns with the bevel, its side is drawn."""
     run_out_mm: NonNegative = 0.2

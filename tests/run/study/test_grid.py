@@ -226,7 +226,7 @@ def test_the_studies_of_the_package_can_be_carried_out():
         "controllers": 150 * len(METHODS),
         "mismatch": 5 * 150,
         "mismatch-doubled": 10_005,
-        "imperfections": 16 * 150,
+        "imperfections": 18 * 150,
         "guide-distance": 7 * 150,
         "gauges": 8 * 150,
         "tracker": 5 * 150,
@@ -269,9 +269,9 @@ def test_mismatch_grows_from_none_through_the_preset_to_the_doubled():
 
 def test_the_long_study_has_the_doubled_mismatch_and_seeds_of_its_own():
     study = load_study("mismatch-doubled")
-    assert {point.scenario.phantom for point in study.points} == {
-        settings(load_study("mismatch"), "s = 2").phantom
-    }
+    (phantom,) = {point.scenario.phantom for point in study.points}
+    published = {"start_axial_sd_mm": 0.0, "youngs_modulus_variation": 0.0}
+    assert phantom == settings(load_study("mismatch"), "s = 2").phantom.model_copy(update=published)
     assert len({insertion.seed for insertion in insertions(study)}) == len(study) >= 10_000
     assert min(insertion.seed for insertion in insertions(study)) == 200_000
 
