@@ -186,7 +186,7 @@ def test_a_draw_depends_on_the_seed_alone():
 
 
 def test_every_entry_of_the_scenario_is_looked_at():
-    assert {*DOUBLED, "contact_spacing_mm"} == set(PHANTOM.values()["phantom"])
+    assert {*DOUBLED, "contact_spacing_mm", "structure"} == set(PHANTOM.values()["phantom"])
 
 
 @pytest.mark.parametrize("key", DOUBLED)

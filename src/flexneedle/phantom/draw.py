@@ -2,9 +2,11 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from flexneedle.phantom.structure import guide_to_skin, structure_values, with_hidden_layer
 from flexneedle.scenario import Scenario
 
 _LARGEST_OFFSET = 0.699  # of the compression length
@@ -36,7 +38,7 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
     """
     settings = scenario.phantom
     factors = rng.uniform(*settings.shear_modulus_factor, len(scenario.tissue))
-    values: dict[str, float] = {
+    values: dict[str, Any] = structure_values(scenario) | {
         f"tissue.{k}.shear_modulus_kpa": layer.shear_modulus_kpa * float(factor)
         for k, (layer, factor) in enumerate(zip(scenario.tissue, factors, strict=True))
     }
@@ -51,7 +53,7 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
     variation = _variation(scenario, cell, rng)
     values |= _start(scenario, rng) | _modulus(scenario, rng)
     return Truth(
-        scenario.with_values(values),
+        with_hidden_layer(scenario.with_values(values), scenario),
         base_y,
         base_turn,
         bend_side * settings.initial_bend_mm,
@@ -67,6 +69,7 @@ def _bevel_factor(scenario: Scenario, rng: np.random.Generator) -> float:
     low, high = scenario.phantom.bevel_factor
     offset = scenario.needle.bevel.offset_mm
     least = min(layer.compression_length_mm for layer in scenario.tissue)
+    least *= scenario.phantom.structure.compression_length_factor
     most = min(high, _LARGEST_OFFSET * least / offset) if offset > 0.0 else high
     return float(rng.uniform(min(low, most), most))
 
@@ -113,7 +116,7 @@ def _start_range(scenario: Scenario) -> tuple[float, float]:
     has left at full stroke. A tip in the tissue or behind the guide is seen, and corrected before an insertion begins.
     """
     setup = scenario.setup
-    gap, guide = setup.tip_to_skin_mm, setup.guide_to_skin_mm
+    gap, guide = setup.tip_to_skin_mm, guide_to_skin(scenario)
     left = scenario.needle.length_mm + gap - (guide or 0.0) - setup.stroke_mm
     behind = math.inf if guide is None else guide - gap
     return -0.5 * min(behind, setup.max_depth), 0.5 * min(gap, left)

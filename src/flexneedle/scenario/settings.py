@@ -7,6 +7,7 @@ from pydantic import Field
 
 from .fields import Fraction, NonNegative, NonNegativeRange, Positive, PositiveRange, Section, count
 from .methods import AdaptiveMpc, BevelOnly, BevelRule, BroydenMpc, ResolvedRate
+from .structure import Structure
 
 __all__ = ["Control", "Phantom", "Plan", "Target"]
 
@@ -168,6 +169,7 @@ class Phantom(Section):
     """Length of an element of the needle in the plant `exact`."""
     step_mm: Positive = 0.25
     """Greatest travel in one step of the phantom's own simulation."""
+    structure: Structure = Structure()
 
     @property
     def start_angle_sd(self) -> float:

@@ -285,7 +285,8 @@ def test_each_imperfection_is_changed_alone():
         ((key, value),) = [(key, value) for key, value in values.items() if base[key] != value]
         changed[key] = (base[key], value)
     own = {f"phantom.{name}" for name in type(PHANTOM.phantom).model_fields}
-    assert own - set(changed) == {f"phantom.{name}_mm" for name in ("contact_spacing", "element", "step")}
+    sizes = {f"phantom.{name}_mm" for name in ("contact_spacing", "element", "step")}
+    assert own - set(changed) == {*sizes, "phantom.structure"}
     assert changed.pop("phantom.tracker_bias_mm") == (0.0, 0.3)
     assert changed.pop("phantom.shear_modulus_factor") == ([0.6, 1.6], [0.3, 2.5])
     assert changed.pop("phantom.bevel_factor") == ([0.5, 1.5], [0.0, 2.0])
