@@ -16,7 +16,8 @@ from flexneedle.errors import InputError
 from flexneedle.phantom import PLANTS
 from flexneedle.simulator import Control, Simulator
 
-PHANTOM = flexneedle.load_scenario("phantom")
+# No observer estimates an axial start error yet.
+PHANTOM = flexneedle.load_scenario("phantom").with_values({"phantom.start_axial_sd_mm": 0.0})
 FIELD = ("open-loop", "bevel-only", "resolved-rate", "broyden-mpc")
 WITHOUT_GUIDE = ("open-loop", "bevel-only")
 

@@ -1,7 +1,9 @@
 """What stands in the tank: drawn by a seed alone, each entry as `[phantom]` says, whatever the other entries are."""
 
+import hashlib
+import json
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from hypothesis import strategies as st
 
 from flexneedle import load_scenario
 from flexneedle.phantom import Truth, draw
+from flexneedle.scenario.worlds import world
 from reference.rods import IDEAL
 
 PHANTOM = load_scenario("phantom")
@@ -38,6 +41,8 @@ DOUBLED = {  # entries of [phantom]: twice as much as shipped, and what of the t
     "bevel_factor": ([1.0, 3.0], {"bevel"}),
     "start_offset_sd_mm": (1.0, {"base_y"}),
     "start_angle_sd_mrad": (6.0, {"base_turn"}),
+    "start_axial_sd_mm": (2.0, {"start"}),
+    "youngs_modulus_variation": (0.1, {"modulus"}),
     "initial_bend_mm": (1.0, {"bend"}),
     "run_out_mm": (0.4, {"run_out"}),
     "guide_clearance_mm": (0.1, set()),
@@ -63,12 +68,19 @@ def factors(truth, scenario=PHANTOM):
     ]
 
 
+def axial_error(truth, scenario=PHANTOM):
+    """How much further along the axis base and tip start than the scenario says (mm)."""
+    return scenario.setup.tip_to_skin_mm - truth.scenario.setup.tip_to_skin_mm
+
+
 def entries(truth):
     """What was drawn, by name."""
     return {
         "layers": factors(truth),
         "boundaries": truth.scenario.layer_tops,
         "bevel": truth.scenario.needle.bevel.offset_mm / PHANTOM.needle.bevel.offset_mm,
+        "start": axial_error(truth),
+        "modulus": truth.scenario.needle.youngs_modulus_gpa / PHANTOM.needle.youngs_modulus_gpa,
         **{
             name: getattr(truth, name)
             for name in ("base_y", "base_turn", "bend", "run_out", "bias", "variation")
@@ -95,30 +107,39 @@ def test_a_draw_is_within_its_ranges_and_changes_nothing_else(seed):
         abs(found["run_out"]) == 0.1
     )  # to either side of the axis: the tip moves by 0.2 when the bevel turns
     assert found["bias"] == (0.0, 0.0)
+    assert 0.95 <= found["modulus"] <= 1.05
     changed = {key for key, value in truth.scenario.flat().items() if PHANTOM.flat()[key] != value}
     expected = {f"tissue.{k}.shear_modulus_kpa" for k in (0, 1)} | {"tissue.0.thickness_mm"}
+    expected |= {"needle.youngs_modulus_gpa", "setup.tip_to_skin_mm"}
     assert changed == expected | {"needle.bevel.offset_mm", "contact.spacing_mm"}
     assert truth.scenario.contact.spacing_mm == PHANTOM.phantom.contact_spacing_mm == 0.5
 
 
 def test_factors_are_uniform(many):
-    """Each layer and the bevel on its own; mean, sd and the ends of the range."""
+    """Each layer, the bevel and the modulus (× 10) on its own; mean, sd and the ends of the range."""
     found = np.array([[*factors(truth), entries(truth)["bevel"]] for truth in many])
-    np.testing.assert_allclose(found.mean(axis=0), [1.1, 1.1, 1.0], atol=0.03)
+    modulus = np.array([entries(truth)["modulus"] for truth in many])
+    found = np.column_stack([found, 10.0 * modulus])
+    np.testing.assert_allclose(found.mean(axis=0), [1.1, 1.1, 1.0, 10.0], atol=0.03)
     np.testing.assert_allclose(found.std(axis=0), 1.0 / math.sqrt(12), rtol=0.06)
-    np.testing.assert_allclose(found.min(axis=0), [0.6, 0.6, 0.5], atol=0.01)
-    np.testing.assert_allclose(found.max(axis=0), [1.6, 1.6, 1.5], atol=0.01)
-    assert np.abs(np.corrcoef(found.T) - np.eye(3)).max() < 0.1
+    np.testing.assert_allclose(found.min(axis=0), [0.6, 0.6, 0.5, 9.5], atol=0.01)
+    np.testing.assert_allclose(found.max(axis=0), [1.6, 1.6, 1.5, 10.5], atol=0.01)
+    assert np.abs(np.corrcoef(found.T) - np.eye(4)).max() < 0.1
 
 
 def test_start_and_layer_boundary_are_normal(many):
     """Means, standard deviations, and 68 in a hundred within one of them; each on its own."""
-    found = np.array([(truth.base_y, truth.base_turn, truth.scenario.layer_tops[1] - 20.0) for truth in many])
-    found /= [0.5, 0.003, 1.5]
+    found = np.array(
+        [
+            (truth.base_y, truth.base_turn, axial_error(truth), truth.scenario.layer_tops[1] - 20.0)
+            for truth in many
+        ]
+    )
+    found /= [0.5, 0.003, 1.0, 1.5]
     np.testing.assert_allclose(found.mean(axis=0), 0.0, atol=0.1)
     np.testing.assert_allclose(found.std(axis=0), 1.0, rtol=0.06)
     np.testing.assert_allclose((np.abs(found) < 1.0).mean(axis=0), 0.683, atol=0.05)
-    assert np.abs(np.corrcoef(found.T) - np.eye(3)).max() < 0.1
+    assert np.abs(np.corrcoef(found.T) - np.eye(4)).max() < 0.1
 
 
 def test_sides_are_drawn_evenly_and_on_their_own(many):
@@ -165,7 +186,7 @@ def test_a_draw_depends_on_the_seed_alone():
 
 
 def test_every_entry_of_the_scenario_is_looked_at():
-    assert {*DOUBLED, "contact_spacing_mm"} == set(PHANTOM.values()["phantom"])
+    assert {*DOUBLED, "contact_spacing_mm", "structure"} == set(PHANTOM.values()["phantom"])
 
 
 @pytest.mark.parametrize("key", DOUBLED)
@@ -242,3 +263,50 @@ def test_a_draw_knows_the_tissue_down_to_the_end_of_the_stroke_and_before_the_sk
     short = PHANTOM.with_values({"setup.stroke_mm": 60.0, "target.depth_mm": 25.0})
     truth = drawn(0, short)
     assert len(truth.variation) * truth.cell_mm == pytest.approx(31.5 + 8 * 0.25)
+
+
+def digest(truth):
+    """Of all that was drawn."""
+    values = truth.scenario.values()
+    values.pop("phantom")
+    rest = [getattr(truth, field.name) for field in fields(truth)][1:]
+    return hashlib.sha256(json.dumps([values, *rest], sort_keys=True).encode()).hexdigest()[:16]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "digests"),
+    [
+        (PHANTOM, ["19bc46bd731f2ccb", "2855547c1608994a", "f2069fab76f25b95"]),
+        (world(3), ["1ef7dc5fbc0393fa", "2832829beb92c7a0", "8eb0bcf98c4f9b67"]),
+        (world(8), ["5c205f939445041b", "b37d99972de5e624", "31f63e61fbba432a"]),
+    ],
+)
+def test_without_axial_error_and_modulus_variation_phantoms_are_those_published(scenario, digests):
+    """As drawn before these two were entries of `[phantom]`: with a guide, and without (world 8)."""
+    before = scenario.with_values({"phantom.start_axial_sd_mm": 0.0, "phantom.youngs_modulus_variation": 0.0})
+    assert [digest(drawn(seed, before)) for seed in (0, 7, 100000)] == digests
+
+
+@pytest.mark.parametrize(
+    ("changes", "low", "high"),
+    [
+        ({"setup.tip_to_skin_mm": 1.0, "setup.stroke_mm": 60.0}, -20.0, 0.5),
+        ({"setup.tip_to_skin_mm": 40.0, "setup.stroke_mm": 90.0}, -0.5, 20.0),
+        ({"needle.length_mm": 124.5}, -6.25, 1.0),
+        ({"setup.guide_to_skin_mm": None, "setup.stroke_mm": 60.0, "target.depth_mm": 31.5}, -15.75, 14.25),
+    ],
+    ids=["close to the skin", "close to the guide", "base close to the guide", "no guide"],
+)
+def test_a_start_error_leaves_half_of_the_way_to_skin_guide_and_stop(changes, low, high):
+    """However large its deviation: the truth is a scenario that both plants can begin with."""
+    scenario = PHANTOM.with_values({"phantom.start_axial_sd_mm": 50.0, **changes})
+    errors = [axial_error(drawn(seed, scenario), scenario) for seed in range(60)]
+    assert min(errors) == pytest.approx(low)
+    assert max(errors) == pytest.approx(high)
+
+
+def test_a_target_beyond_the_stroke_of_a_needle_that_starts_further_back_is_the_deepest_within_it():
+    scenario = PHANTOM.with_values({"target.depth_mm": PHANTOM.setup.max_depth})
+    for seed in range(20):
+        truth = drawn(seed, scenario).scenario
+        assert truth.target.depth_mm == min(scenario.target.depth_mm, truth.setup.max_depth)

@@ -389,6 +389,35 @@ def test_start_offset_and_slope_move_the_clamp(kind, seed):
     assert offset.base_y != 0.0 != slope.base_turn
 
 
+@both_plants
+@pytest.mark.parametrize("seed", range(3))
+def test_an_axial_start_error_moves_base_and_tip_and_leaves_the_stroke_as_it_is(kind, seed):
+    scenario = IDEAL.with_values({**COARSE, "phantom.start_axial_sd_mm": 3.0})
+    truth = draw(scenario, np.random.default_rng(seed))
+    error = scenario.setup.tip_to_skin_mm - truth.scenario.setup.tip_to_skin_mm
+    assert error != 0.0
+    phantom = Phantom(truth, 1, kind)
+    assert truth.scenario.start_base_x == pytest.approx(scenario.start_base_x + error)
+    np.testing.assert_allclose(tip(phantom), [scenario.setup.start_tip_x + error, 0.0, 0.0], atol=1e-9)
+    driven(phantom, STRAIGHT, times=110)
+    assert tip(phantom)[0] == pytest.approx(scenario.setup.max_depth + error, abs=0.5)  # but for its bend
+    assert phantom.condition().converged
+    with pytest.raises(CommandError):
+        driven(phantom, STRAIGHT)
+
+
+@both_plants
+def test_a_modulus_of_the_needle_is_that_of_another_scenario(kind):
+    truth = draw(IDEAL.with_values({"phantom.youngs_modulus_variation": 0.3}), np.random.default_rng(0))
+    modulus = truth.scenario.needle.youngs_modulus_gpa
+    assert abs(modulus - 200.0) > 1.0
+    spacing = {"contact.spacing_mm": IDEAL.phantom.contact_spacing_mm}
+    other = tank(IDEAL.with_values({**spacing, "needle.youngs_modulus_gpa": modulus}), kind)
+    found = tip(driven(Phantom(truth, 1, kind), AHEAD, times=40))
+    np.testing.assert_allclose(found, tip(driven(other, AHEAD, times=40)), atol=1e-9)
+    assert found[1] != tip(driven(tank(kind=kind), AHEAD, times=40))[1]
+
+
 def rough_truth(**changes):
     """A drawn phantom with all that is shipped, but for motors, and with these changes."""
     scenario = PHANTOM.with_values({"phantom.motor_resolution_mm": 0.0, **changes})

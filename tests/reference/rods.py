@@ -17,6 +17,8 @@ ZEROS = (
     "layer_shift_sd_mm",
     "start_offset_sd_mm",
     "start_angle_sd_mrad",
+    "start_axial_sd_mm",
+    "youngs_modulus_variation",
     "initial_bend_mm",
     "run_out_mm",
     "guide_clearance_mm",

@@ -61,6 +61,8 @@ POSITIVE = [
     "phantom.contact_spacing_mm",
     "phantom.element_mm",
     "phantom.step_mm",
+    "phantom.structure.compression_length_factor",
+    "phantom.structure.bevel_length_factor",
 ]
 
 NOT_NEGATIVE = [
@@ -120,6 +122,8 @@ NOT_NEGATIVE = [
     "phantom.layer_shift_sd_mm",
     "phantom.start_offset_sd_mm",
     "phantom.start_angle_sd_mrad",
+    "phantom.start_axial_sd_mm",
+    "phantom.youngs_modulus_variation",
     "phantom.initial_bend_mm",
     "phantom.run_out_mm",
     "phantom.guide_clearance_mm",
@@ -196,6 +200,8 @@ RULES = [
     ("control.adaptive_mpc.flip_dead_band", 1.1, "must be at most 1"),
     ("phantom.shear_modulus_variation", 1.1, "must be at most 1"),
     ("phantom.missing_fraction", 1.0, "must be below 1"),
+    ("phantom.youngs_modulus_variation", 1.0, "must be below 1"),
+    ("phantom.structure.guide_shift_mm", -2e6, "must be at least -1e+06"),
     ("phantom.shear_modulus_factor[0]", 0.0, ABOVE_ZERO),
     ("phantom.bevel_factor[0]", -0.1, "must be at least 0"),
     ("phantom.shear_modulus_factor", [1.6, 0.6], "the low end must not be above the high end"),

@@ -24,6 +24,7 @@ from .rules import (
     target_problems,
 )
 from .settings import Control, Phantom, Plan, Target
+from .structure import structure_problems
 from .tissue import Contact, Layer
 
 __all__ = ["Scenario", "check_target"]
@@ -56,6 +57,7 @@ class Scenario(Section):
         refuse(
             chain(
                 geometry_problems(self.needle, self.setup),
+                structure_problems(self.needle, self.setup, self.phantom.structure),
                 layer_problems(self.tissue, self.needle.bevel),
                 target_problems(self.setup, self.target),
                 plan_problems(self.plan),

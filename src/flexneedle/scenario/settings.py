@@ -7,6 +7,7 @@ from pydantic import Field
 
 from .fields import Fraction, NonNegative, NonNegativeRange, Positive, PositiveRange, Section, count
 from .methods import AdaptiveMpc, BevelOnly, BevelRule, BroydenMpc, ResolvedRate
+from .structure import Structure
 
 __all__ = ["Control", "Phantom", "Plan", "Target"]
 
@@ -141,6 +142,11 @@ class Phantom(Section):
     """Standard deviation of the base clamp's lateral position."""
     start_angle_sd_mrad: NonNegative = 3.0
     """Standard deviation of the base clamp's slope."""
+    start_axial_sd_mm: NonNegative = 1.0
+    """Standard deviation of the position of base and tip along the axis at the start (needle length, clamp, skin), at
+    most half of the distance to the skin, to the guide, and of what the base has left at full stroke."""
+    youngs_modulus_variation: Annotated[float, Field(ge=0, lt=1)] = 0.05
+    """Largest deviation of the needle's modulus, uniform to either side, relative to the scenario's."""
     initial_bend_mm: NonNegative = 0.5
     """How far the tip of the free needle is off the straight; the bend turns with the bevel, its side is drawn."""
     run_out_mm: NonNegative = 0.2
@@ -163,6 +169,7 @@ class Phantom(Section):
     """Length of an element of the needle in the plant `exact`."""
     step_mm: Positive = 0.25
     """Greatest travel in one step of the phantom's own simulation."""
+    structure: Structure = Structure()
 
     @property
     def start_angle_sd(self) -> float:

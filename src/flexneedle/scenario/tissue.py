@@ -6,7 +6,7 @@ from pydantic import AfterValidator
 
 from .fields import NonNegative, Positive, Section, Title
 
-__all__ = ["Contact", "Layer"]
+__all__ = ["Alpha", "Contact", "Layer"]
 
 # Between them the law's 0.3^(−α/2 − 1), at the floor stretch, and 2μ/α² stay clear of overflow and rounding.
 _ALPHA_SMALLEST, _ALPHA_LARGEST = 0.01, 100.0
@@ -20,6 +20,9 @@ def _usable_alpha(alpha: float) -> float:
     return alpha
 
 
+Alpha = Annotated[float, AfterValidator(_usable_alpha)]
+
+
 class Layer(Section):
     """One `[[tissue]]`: a layer whose law is the one-term Ogden law."""
 
@@ -29,7 +32,7 @@ class Layer(Section):
     """Thickness. The last layer goes on: it needs none, and one that is given is not used."""
     shear_modulus_kpa: Positive
     """μ of the Ogden law."""
-    alpha: Annotated[float, AfterValidator(_usable_alpha)]
+    alpha: Alpha
     """α of the Ogden law."""
     compression_length_mm: Positive
     """h, over which a displacement u of the needle compresses the tissue: stretch 1 − |u|/h."""
