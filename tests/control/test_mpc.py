@@ -9,6 +9,7 @@ import flexneedle
 from flexneedle.control import bang_bang, mpc
 from flexneedle.control.interface import Task, at_depth
 from flexneedle.control.methods import METHODS
+from flexneedle.planning.terms import Outcome, cost
 from flexneedle.simulator import Control, Simulator
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -154,7 +155,8 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
     reference, nominal = mpc._window(plan, float(state.tip[0]), 1)
     grid = np.stack(np.meshgrid(np.linspace(0.5, 1, 41), np.linspace(-0.5, 0.5, 81)), axis=-1).reshape(-1, 2)
     controls = mpc._controls(scenario, state, grid, np.zeros((1, 2)), 40.0, flip=False)
-    best = mpc._cost(simulator, state, controls, reference, nominal).min()
+    outcome = Outcome(controls, *simulator.rollout(state, controls))
+    best = cost(mpc._cost_terms(scenario.control, reference, nominal[:, 3]), outcome).min()
     assert choice.cost <= best + 0.002
 
 
