@@ -58,10 +58,11 @@ class Identification:
         scenario = simulator.scenario
         step = scenario.setup.max_advance_mm
         grid = np.arange(scenario.setup.start_tip_x - 5 * step, scenario.setup.max_depth + (_ROUND + 6) * step, step)
-        return Identified(
+        start = Identified(
             simulator, prior, simulator, prior.mean, state, state.tip[None], ((0, state),), grid,
             np.zeros((prior.mean.size, grid.size)), prior.precision,
         )
+        return start._differentiated(range(prior.mean.size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +94,7 @@ class Identified:
     curves: Floats
     precision: Floats
     axial: float = 0.0
+    axial_variance: float = _AX**2
     turn: int = 0
     perturbed: tuple[Perturbed, ...] = ()
     moves: tuple[Move, ...] = ()
@@ -141,7 +143,8 @@ class Identified:
             return self.unseen()
         seen = replace(self, moves=assigned(self.moves, samples))
         readings = seen._readings
-        seen = replace(seen, axial=readings.axial(seen))
+        axial, axial_variance = readings.axial(seen)
+        seen = replace(seen, axial=axial, axial_variance=axial_variance)
         fitted = _improved(seen._differentiated(), readings)
         left = readings.left(fitted)
         ahead = readings.x - readings.between(fitted.tips[:, 0])
@@ -158,7 +161,7 @@ class Identified:
     @cached_property
     def rows(self) -> Floats:
         """The commands of the moves (m, 5)."""
-        return np.array([done.applied for done in self.moves])
+        return np.array([done.applied for done in self.moves], dtype=float).reshape(-1, 5)
 
     @cached_property
     def _readings(self) -> "_Readings":
@@ -191,13 +194,37 @@ class Identified:
             stops=tuple(stops),
         )
 
-    def _differentiated(self) -> "Identified":
+    @cached_property
+    def covariance(self) -> Floats:
+        """Of the parameters (K, K), as the readings so far leave it."""
+        inverse: Floats = np.linalg.inv(self.precision)
+        return inverse
+
+    @property
+    def tip_sd(self) -> float:
+        """Standard deviation (mm) of the predicted distance of the next reading of the tip."""
+        slope = self._slopes(self.state.tip[:1])[0]
+        slope[RUN_OUT] = self.state.bevel
+        return float(np.sqrt(slope @ self.covariance @ slope + self.axial_variance))
+
+    def _slopes(self, depth: Floats) -> Floats:
+        """Derivatives (n, K) of the tip's lateral position at depths (n,), mm, but for the run-out's, from the curves."""
+        step = self.grid[1] - self.grid[0]
+        place = np.clip((depth - self.grid[0]) / step, 0.0, self.grid.size - 1.001)
+        left = place.astype(int)
+        part = place - left
+        slopes: Floats = ((1.0 - part) * self.curves[:, left] + part * self.curves[:, left + 1]).T
+        return slopes
+
+    def _differentiated(self, which: Sequence[int] | None = None) -> "Identified":
         """Simulate the curves whose turn it is anew, and a few steps ahead."""
         ahead = np.tile([[self.nominal.scenario.setup.max_advance_mm, 0.0, 0.0, 0.0, -1.0]], (_ROUND, 1))
         base = np.concatenate([self.tips, self.simulator.replay(self.state, ahead)[1]])
         depth = np.maximum.accumulate(base[:, 0])
         curves, members = self.curves.copy(), []
-        for k in self._due(float(depth[-1])):
+        for k in self._due(float(depth[-1])) if which is None else which:
+            if k == RUN_OUT or depth[-1] < self.prior.begins[k]:
+                continue
             parameters = self.parameters.copy()
             parameters[k] += self.prior.steps[k]
             member, tips = _perturbed(self, parameters, k, ahead)
@@ -244,12 +271,14 @@ class _Readings:
         variance: Floats = scenario.tracker.jitter_per_axis**2 / self.count + unexplained
         return variance
 
-    def axial(self, belief: Identified) -> float:
-        """Start error along the axis (mm), maximum a posteriori: all axial readings share it."""
+    def axial(self, belief: Identified) -> tuple[float, float]:
+        """Start error along the axis (mm) and its variance, maximum a posteriori: all axial readings share it."""
         without = self.between(belief.tips[:, 0]) - belief.axial
-        if _AX == 0.0: return 0.0
+        if _AX == 0.0: return 0.0, 0.0
         weight = 1.0 / (belief.nominal.scenario.tracker.jitter_per_axis ** 2 / self.count + _MS0**2)
-        return float(weight @ (self.x - without) / (weight.sum() + _AX**-2.0))
+        variance = 1.0 / (weight.sum() + _AX**-2.0)
+        return float(variance * (weight @ (self.x - without))), float(variance)
+
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
@@ -371,12 +400,7 @@ def _improved(belief: Identified, readings: _Readings) -> Identified:
 
 def _jacobian(estimate: Identified, readings: _Readings) -> Floats:
     """Derivative (r, K) of the predicted readings, from the curves."""
-    depth = readings.between(estimate.tips[:, 0])
-    step = estimate.grid[1] - estimate.grid[0]
-    place = np.clip((depth - estimate.grid[0]) / step, 0.0, estimate.grid.size - 1.001)
-    left = place.astype(int)
-    part = place - left
-    jacobian = ((1.0 - part) * estimate.curves[:, left] + part * estimate.curves[:, left + 1]).T
+    jacobian = estimate._slopes(readings.between(estimate.tips[:, 0]))
     jacobian[:, RUN_OUT] = readings.sides
     return jacobian
 

@@ -61,6 +61,10 @@ class Corrected:
         """Tip pose (3,)."""
         return self.state.tip
 
+    @property
+    def tip_sd(self) -> float:
+        return 0.0
+
     def tip_at(self, time: float) -> tuple[float, float]:
         """Where the tip was believed to be (mm) at `time`."""
         return along(self.moves, self.tips, time)
