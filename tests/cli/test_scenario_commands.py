@@ -11,6 +11,7 @@ import pytest
 
 import flexneedle
 from flexneedle.cli import main as cli
+from flexneedle.control.methods import checked
 from flexneedle.errors import RunError
 from flexneedle.scenario import Scenario, load_scenario
 
@@ -41,7 +42,7 @@ def test_show_prints_the_scenario_with_its_defaults(capsys, minimal_text, scenar
     status, out, err = run(capsys, "scenario", "show", path)
     assert (status, err) == (0, [])
     assert tomllib.loads(out)["plan"]["samples"] == 128
-    assert Scenario.from_values(tomllib.loads(out)) == load_scenario(path)
+    assert Scenario.from_values(tomllib.loads(out)) == checked(load_scenario(path))
 
 
 def test_check_says_ok(capsys, minimal_text, scenario_file):

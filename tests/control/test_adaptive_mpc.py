@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 import flexneedle
 from flexneedle.control import bang_bang, route
 from flexneedle.control.identification import RUN_OUT, Identification
-from flexneedle.control.interface import Task, travel_left
+from flexneedle.control.interface import travel_left
 from flexneedle.control.methods import DEFAULT, METHODS, adaptive_mpc
 from flexneedle.ports import Sample
 from flexneedle.simulator import Control, Learnt, Simulator
+from tasks import begun_with, task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
 FEW = {
@@ -30,7 +31,7 @@ HORIZON = PHANTOM.control.adaptive_mpc.horizon
 
 def belief_of(state, scenario=PHANTOM, **fields):
     """A belief that the needle is so."""
-    begun = Identification().begin(Simulator(scenario, threads=1), state.bevel)
+    begun = Identification().begin(begun_with(Simulator(scenario, threads=1), state.bevel))
     return replace(begun, state=replace(state, scenario=scenario), tips=state.tip[None], **fields)
 
 
@@ -42,7 +43,7 @@ def on_plan(plan, belief):
 def decided(plan, belief, seed=0, way=None):
     """Decision and the way after it."""
     return ADAPTIVE.decide(
-        Task(belief.nominal, plan), way or on_plan(plan, belief), belief, np.random.default_rng(seed)
+        task_of(belief.nominal, plan), way or on_plan(plan, belief), belief, np.random.default_rng(seed)
     )
 
 
@@ -59,8 +60,8 @@ def aimed(plan, state, aside, ahead=20.0):
 
 def carried_out(plan, scenario, plant=None, steps=100):
     """Commands of a whole insertion into a plant whose tip is seen at the end of each, and the states at the end."""
-    task, plant = Task(Simulator(scenario, threads=1), plan), plant or Simulator(scenario, threads=1)
-    estimate, rng = ADAPTIVE.beliefs.begin(task.simulator, plan.bevel), np.random.default_rng(0)
+    task, plant = task_of(Simulator(scenario, threads=1), plan), plant or Simulator(scenario, threads=1)
+    estimate, rng = ADAPTIVE.observer.begin(task), np.random.default_rng(0)
     truth, memory, commands = plant.start(plan.bevel), ADAPTIVE.begin(task), []
     for k in range(steps):
         decision, memory = ADAPTIVE.decide(task, memory, estimate, rng)
@@ -88,7 +89,7 @@ def test_the_bevel_follows_the_rule_if_the_model_agrees_and_in_air_it_stays(quic
     for steps, in_air in ((50, False), (5, True)):
         state = Simulator(PHANTOM).step(along(quick_plan, steps), Control(flip=turned))
         away, belief = aimed(quick_plan, state, 2.0 * side), belief_of(state)
-        task = Task(belief.nominal, away)
+        task = task_of(belief.nominal, away)
         flip, why = bang_bang.decide(task, belief, PHANTOM.control.adaptive_mpc)
         assert flip is (side != state.bevel and not in_air)
         decision, rng = decide(away, belief), np.random.default_rng(0)
@@ -187,8 +188,8 @@ def test_limits_are_kept_whatever_the_plan(quick_plan, step, reach, advance, str
         guide=quick_plan.guide * stretch, controls=quick_plan.controls * [1.0, 1.0, 1.0, stretch, 1.0],
     )  # fmt: skip
     simulator, rng = Simulator(scenario, threads=1), np.random.default_rng(seed)
-    task = Task(simulator, wide)
-    estimate, places, memory = Identification().begin(simulator, 1), [0.0], ADAPTIVE.begin(task)
+    task = task_of(simulator, wide)
+    estimate, places, memory = Identification().begin(begun_with(simulator, 1)), [0.0], ADAPTIVE.begin(task)
     if seed % 2:  # the way is looked for in air already
         memory = replace(memory, renew_at=-np.inf)
     for k in range(12):

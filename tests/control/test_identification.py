@@ -19,6 +19,7 @@ from flexneedle.control.identification import (
 from flexneedle.mechanics import needle as nd
 from flexneedle.ports import Sample
 from flexneedle.simulator import Control, Learnt, Simulator
+from tasks import begun_with
 
 PHANTOM = flexneedle.load_scenario("phantom")
 QUIET = PHANTOM.with_values({"tracker.jitter_mm": 1e-3, "control.adaptive_mpc.model_sd_mm": 3e-3})
@@ -95,7 +96,7 @@ def followed(needle, count, *, scenario=QUIET, noise=0.0, late=0, threads=1, per
     """The belief after so many moves, the readings coming so many moves late; the needle's states."""
     rows, rng = commands(count), np.random.default_rng(2)
     states = needle.inserted(scenario, rows)
-    estimate = Identification().begin(Simulator(scenario, threads), 1)
+    estimate = Identification().begin(begun_with(Simulator(scenario, threads), 1))
     batches = [readings(needle, states[k], states[k + 1], k, per_move, noise, rng) for k in range(len(rows))]
     for k, row in enumerate(rows):
         estimate = estimate.move(row, k, k + 1.0)
@@ -126,7 +127,7 @@ def ahead(estimate, needle, states, scenario=QUIET, steps=8):
 
 
 def test_it_begins_with_the_scenario():
-    estimate = Identification().begin(Simulator(PHANTOM, 1), -1)
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), -1))
     np.testing.assert_array_equal(estimate.tip, [-28.5, 0.0, 0.0])
     cells = int(np.ceil(81.5 / OWN.cell_mm))  # to the end of the stroke
     assert estimate.parameters.size == CELLS + cells
@@ -249,7 +250,11 @@ def test_more_noise_means_less_is_believed():
     moved = []
     for jitter in (1e-3, 0.05, 0.5):
         scenario = PHANTOM.with_values({"tracker.jitter_mm": jitter})
-        estimate = Identification().begin(Simulator(scenario, 1), 1).move((1.0, 0.0, 0.0, 0.0, -1), 0.0, 1.0)
+        estimate = (
+            Identification()
+            .begin(begun_with(Simulator(scenario, 1), 1))
+            .move((1.0, 0.0, 0.0, 0.0, -1), 0.0, 1.0)
+        )
         moved.append(estimate.observe([Sample(1.0, -27.5, 0.1)]).tip[1])
     assert 0.1 > moved[0] > moved[1] > moved[2] > 0.0
 
@@ -439,7 +444,7 @@ def test_a_step_never_fits_worse(monkeypatch):
     monkeypatch.setattr(idn.Identified, "_with", counted)
     for scenario, jump in ((PHANTOM, 1.0), (QUIET, 0.1)):
         estimate, states = (
-            Identification().begin(Simulator(scenario, 1), 1),
+            Identification().begin(begun_with(Simulator(scenario, 1), 1)),
             Needle().inserted(scenario, commands(50)),
         )
         for k, row in enumerate(commands(50)):
@@ -522,7 +527,7 @@ def test_a_jacobian_that_is_not_finite_leaves_the_parameters(monkeypatch):
 
 
 def test_readings_of_a_move_are_averaged_at_their_mean_time():
-    estimate = Identification().begin(Simulator(PHANTOM, 1), 1)
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
     for k in range(2):
         estimate = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 2.0 * k, 2.0 * k + 2.0)
     seen = [Sample(2.5, -27.3, 0.1), Sample(3.5, -26.7, 0.3)]
@@ -534,7 +539,7 @@ def test_readings_of_a_move_are_averaged_at_their_mean_time():
 
 @pytest.mark.parametrize("first", [1, -1])
 def test_a_reading_is_on_the_side_to_which_the_bevel_turned_before_its_move(first):
-    estimate = Identification().begin(Simulator(PHANTOM, 1), first)
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), first))
     for k, flip in enumerate((-1, 1, -1, 1, -1)):
         estimate = estimate.move((1.0, 0.0, 0.0, 0.0, flip), float(k), k + 1.0)
     seen = [Sample(k + 0.5, -28.0 + k, 0.0) for k in (0, 1, 3, 4)]
@@ -559,7 +564,7 @@ def test_parameters_stay_within_four_standard_deviations(off):
     """Readings far aside, in air and in tissue, and a solve that still converges."""
     rows = commands(50)
     states = Needle().inserted(PHANTOM, rows)
-    estimate = Identification().begin(Simulator(PHANTOM, 1), 1)
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
     for k, row in enumerate(rows):
         estimate = estimate.move(row, k, k + 1.0)
         x, y = states[k + 1].tip[:2]
@@ -581,7 +586,7 @@ def test_parameters_stay_within_four_standard_deviations(off):
 def test_mirrored_readings_give_the_mirrored_belief():
     needle, rows = NEEDLES["all"], commands(45)
     states = needle.inserted(PHANTOM, rows)
-    here, there = (Identification().begin(Simulator(PHANTOM, 1), side) for side in (1, -1))
+    here, there = (Identification().begin(begun_with(Simulator(PHANTOM, 1), side)) for side in (1, -1))
     for k, row in enumerate(rows):
         away = (*row[:3], -row[3], row[4])
         batch = readings(needle, states[k], states[k + 1], k, 2, 0.0, np.random.default_rng(0))
@@ -596,7 +601,7 @@ def test_a_turn_of_the_bevel_turns_bend_and_run_out_over():
     """In air: a believed bend of the free needle and a run-out show on the other side."""
     scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
     simulator = Simulator(scenario, 1)
-    estimate = Identification().begin(simulator, 1)
+    estimate = Identification().begin(begun_with(simulator, 1))
     parameters = estimate.parameters.copy()
     parameters[[BEND, RUN_OUT]] = 0.6, 0.1
     adapted = simulator.adapted(Learnt(np.zeros(1), np.ones(2), bend=0.6))
@@ -683,7 +688,7 @@ def test_without_readings_or_moves_the_belief_stays():
         assert kept.state is moved.state
         assert kept.parameters is moved.parameters
         assert kept.innovation == (0.0, 0.0)
-    start = Identification().begin(Simulator(PHANTOM, 1), 1)
+    start = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
     assert start.observe([Sample(0.0, -28.5, 0.4)]).state == start.state
 
 

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from flexneedle.scenario import Scenario
 
 __all__ = ["add_parser"]
 
@@ -34,24 +38,31 @@ def _list(_args: argparse.Namespace) -> int:
 
 
 def _show(args: argparse.Namespace) -> int:
-    from flexneedle.scenario import dump_scenario, load_scenario
+    from flexneedle.scenario import dump_scenario
 
-    print(dump_scenario(load_scenario(args.scenario)), end="")
+    print(dump_scenario(_checked(args)), end="")
     return 0
 
 
 def _check(args: argparse.Namespace) -> int:
+    print(f"{args.scenario}: ok, {_checked(args).name}")
+    return 0
+
+
+def _checked(args: argparse.Namespace) -> Scenario:
+    """The scenario with all defaults, those of the controllers too."""
+    from flexneedle.control.methods import checked
     from flexneedle.scenario import load_scenario
 
-    scenario = load_scenario(args.scenario)
-    print(f"{args.scenario}: ok, {scenario.name}")
-    return 0
+    return checked(load_scenario(args.scenario), source=args.scenario)
 
 
 def _schema(_args: argparse.Namespace) -> int:
     import json
 
-    from flexneedle.scenario import Scenario
+    from flexneedle.control.methods import METHODS
+    from flexneedle.control.tables import typed_scenario
 
-    print(json.dumps(Scenario.model_json_schema(), indent=2, ensure_ascii=False))
+    schema = typed_scenario(tuple(METHODS.values())).model_json_schema()
+    print(json.dumps(schema, indent=2, ensure_ascii=False))
     return 0

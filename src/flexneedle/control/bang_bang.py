@@ -1,13 +1,13 @@
 """The bang-bang rule for the bevel: two kinematic paths, the nearer to the target wins (paper eq. 14 and 15)."""
 
 import math
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Task
+from flexneedle.scenario.methods import BevelRule
 
 Floats = NDArray[np.float64]
 _SURE = 3.0  # standard deviations of a reading: no bevel turn for less
@@ -48,21 +48,7 @@ def wants_flip(
     )
 
 
-class Rule(Protocol):
-    """A controller's settings of the rule."""
-
-    @property
-    def curvature(self) -> float:
-        """κ, 1/mm."""
-        ...
-
-    @property
-    def flip_dead_band(self) -> float:
-        """As in `wants_flip`."""
-        ...
-
-
-def decide(task: Task, estimate: Estimate, rule: Rule) -> tuple[bool, str]:
+def decide(task: Task, estimate: Estimate, rule: BevelRule) -> tuple[bool, str]:
     """`wants_flip` towards the plan's target, from the believed tip. In air the bevel has no effect and stays."""
     if estimate.tip[0] <= 0.0:
         return False, "in air"

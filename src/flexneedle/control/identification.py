@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.control.estimate import Floats, Move, along, assigned
+from flexneedle.control.task import Task
 from flexneedle.ports import Command, Sample
 from flexneedle.scenario import Scenario
 from flexneedle.simulator import Control, Learnt, Simulator, State
@@ -42,9 +43,10 @@ _REST = np.array([[0.0, 0.0, 0.0, 0.0, -1.0]])
 class Identification:
     """This observer has no choices but the scenario's `[control.adaptive_mpc]`."""
 
-    def begin(self, simulator: Simulator, bevel: int) -> "Identified":
+    def begin(self, task: Task) -> "Identified":
         """Believe in the scenario."""
-        state, prior = simulator.start(bevel), _Prior.of(simulator.scenario)
+        simulator = task.simulator
+        state, prior = simulator.start(task.plan.bevel), _Prior.of(task.scenario)
         return Identified(simulator, prior, simulator, prior.mean, state, state.tip[None], ((0, state),))
 
 

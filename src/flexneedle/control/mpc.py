@@ -8,11 +8,34 @@ from numpy.typing import NDArray
 from flexneedle.control.interface import travel_left
 from flexneedle.planning import Settings, cross_entropy
 from flexneedle.scenario import Scenario, Setup, elite_count
+from flexneedle.scenario.fields import Fraction, NonNegative, count
+from flexneedle.scenario.methods import BevelRule
 from flexneedle.simulator import Simulator, State
 from flexneedle.trace import PlanRecord
 
 Floats = NDArray[np.float64]
 _LEAST_ADVANCE = 0.5  # of the longest step: standing still is no way to reduce the cost
+
+
+class CeMpc(BevelRule):
+    """Section `control.ce_mpc`: the search of `ce-mpc`, and its bang-bang rule."""
+
+    samples: int = count(21, least=2, most=100_000)
+    """Control sequences in an iteration of a period."""
+    iterations: int = count(4, least=1, most=1_000)
+    """Iterations of a period."""
+    horizon: int = count(7, least=1, most=1_000)
+    """Steps that a period looks ahead."""
+    orientation_weight_mm: NonNegative = 11.8
+    """Cost of an angle off the planned path, as a distance: 1 rad weighs as much as this."""
+    curvature_per_m: NonNegative = 0.232
+    """κ of the two paths of the bang-bang rule."""
+    flip_dead_band: Fraction = 0.875
+    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
+    guide_weight: NonNegative = 0.075
+    """Cost of a squared millimetre that a guide step departs from the plan's."""
+    energy_weight_per_mj: NonNegative = 2.74
+    """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,19 +48,25 @@ class Choice:
 
 
 def choose(
-    simulator: Simulator, plan: PlanRecord, state: State, *, flip: bool, rng: np.random.Generator
+    simulator: Simulator,
+    plan: PlanRecord,
+    state: State,
+    control: CeMpc,
+    *,
+    flip: bool,
+    rng: np.random.Generator,
 ) -> Choice:
     """Search the next steps of advance and guide for the least deviation from the planned tip poses."""
     scenario = simulator.scenario
-    steps, travel = scenario.control.horizon, travel_left(scenario, plan, state)
+    steps, travel = control.horizon, travel_left(scenario, plan, state)
     reference, nominal = _window(plan, float(state.tip[0]), steps)
     base = planned_base(scenario.setup, plan, state, reference[:, 0])
     lower, upper, sigma = _bounds(scenario, steps)
     mean = np.clip(np.concatenate([nominal[:, 0], nominal[:, 3]]), lower, upper)
     settings = Settings(
-        samples=scenario.control.samples,
-        elite=max(2, elite_count(scenario.control.samples, scenario.plan.elite_fraction)),
-        iterations=scenario.control.iterations,
+        samples=control.samples,
+        elite=max(2, elite_count(control.samples, scenario.plan.elite_fraction)),
+        iterations=control.iterations,
         smoothing=scenario.plan.smoothing,
         tolerance=scenario.plan.tolerance,
         lower=lower,
@@ -46,7 +75,7 @@ def choose(
 
     def cost(z: Floats) -> Floats:
         controls = _controls(scenario, state, z, base, travel, flip)
-        return _cost(simulator, state, controls, reference, nominal)
+        return _cost(simulator, state, control, controls, reference, nominal)
 
     found = cross_entropy.minimize(cost, cross_entropy.start(mean, sigma), settings, rng)
     first = _controls(scenario, state, found.best[None], base, travel, flip)[0, 0]
@@ -112,9 +141,10 @@ def _controls(scenario: Scenario, state: State, z: Floats, base: Floats, travel:
     return controls
 
 
-def _cost(simulator: Simulator, state: State, controls: Floats, reference: Floats, nominal: Floats) -> Floats:
+def _cost(
+    simulator: Simulator, state: State, control: CeMpc, controls: Floats, reference: Floats, nominal: Floats
+) -> Floats:
     """Squared SE(2) deviation of the tip, summed over the steps, and the guide's departure from the plan."""
-    control = simulator.scenario.control
     tips, energy, converged = simulator.rollout(state, controls)
     off = tips - reference
     off[:, :, 2] *= control.orientation_weight_mm

@@ -147,7 +147,7 @@ def _checked(path: Path, values: Any) -> RunFile:
         plans = {name: plan_from_values(plan) for name, plan in values["plans"].items()}
         named = {name: values[name] for name in ("kind", "status", "reason", "seed", "result", "timing")}
         named |= {name: values.get(name, "") for name in ("controller", "phantom")}
-        return RunFile(path.parent, scenario=Scenario.from_values(values["scenario"]), plans=plans, **named)
+        return RunFile(path.parent, scenario=Scenario.from_record(values["scenario"]), plans=plans, **named)
     except ScenarioError as error:
         raise InputError(f"{path}: damaged: {error.problems[0]}") from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flexneedle.control import tables
 from flexneedle.control.interface import Decision, Method, Task, at_depth
-from flexneedle.control.methods import DEFAULT, method
+from flexneedle.control.methods import DEFAULT, method, used
 from flexneedle.errors import RunError
 from flexneedle.phantom import DEFAULT_PLANT
 from flexneedle.ports import Command
@@ -78,9 +79,11 @@ def run(
             f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), bound by {plan.limit}; "
             "insert it with force (--force) if it is meant"
         )
+    scenario = used(scenario, chosen)
+    task = tables.task(chosen, Simulator(scenario, threads), plan)
     periods: list[Period] = []
     ending = ("failed", "not at the target depth after four times the planned periods")
-    for period, so_far in _periods(Task(Simulator(scenario, threads), plan), chosen, rig, rng):
+    for period, so_far in _periods(task, chosen, rig, rng):
         periods.append(period)
         ending = so_far or ending
         if on_period is not None:
@@ -100,7 +103,7 @@ def _periods(
     After the last move the needle rests until the tracker has seen it at rest: readings come late.
     """
     scenario, memory = task.scenario, chosen.begin(task)
-    belief = chosen.beliefs.begin(task.simulator, task.plan.bevel)
+    belief = chosen.observer.begin(task)
     start = time.perf_counter()
     sight = look_around(scenario, belief, Watch(scenario.monitor), rig.clock.now(), rig.tracker)
     held, indices = _held(None, sight, rig.clock.now()), itertools.count()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flexneedle.control.methods import DEFAULT, METHODS
+from flexneedle.control.methods import DEFAULT, METHODS, checked
 from flexneedle.errors import InputError, ScenarioError
 from flexneedle.phantom import DEFAULT_PLANT, PLANTS
 from flexneedle.run.planner import STRATEGIES
@@ -112,6 +112,7 @@ def load_study(source: str | Path | Study) -> Study:
 
 
 def _multiplied(file: StudyFile, base: Scenario) -> Study:
+    base = checked(base)
     axes = {axis.key: _values(axis) for axis in file.axes}
     seeds = tuple(axes.pop(SEED, ()))
     repeats = len(seeds) or file.repeats
@@ -185,7 +186,7 @@ def _check_run(run: Mapping[str, Any]) -> None:
 
 def _varied(base: Scenario, settings: Mapping[str, Any], where: str) -> Scenario:
     try:
-        return base.with_values(settings)
+        return checked(base.with_values(settings))
     except ScenarioError as error:
         at = f" (at {where})" if where else ""
         lines = (problem + (_BESIDES if "unknown key" in problem else "") + at for problem in error.problems)
