@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 import flexneedle
 from flexneedle.control import bang_bang, route
+from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.identification import RUN_OUT, Identification
 from flexneedle.control.interface import travel_left
 from flexneedle.control.methods import DEFAULT, METHODS, adaptive_mpc
@@ -26,7 +27,7 @@ QUICK = PHANTOM.with_values(FEW)
 ACCURATE = PHANTOM.with_values({"control.adaptive_mpc.energy_weight_per_mj": 0.0})
 BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
 ADAPTIVE = METHODS["adaptive-mpc"]
-HORIZON = PHANTOM.control.adaptive_mpc.horizon
+HORIZON = AdaptiveMpc().horizon
 
 
 def belief_of(state, scenario=PHANTOM, **fields):
@@ -90,7 +91,7 @@ def test_the_bevel_follows_the_rule_if_the_model_agrees_and_in_air_it_stays(quic
         state = Simulator(PHANTOM).step(along(quick_plan, steps), Control(flip=turned))
         away, belief = aimed(quick_plan, state, 2.0 * side), belief_of(state)
         task = task_of(belief.nominal, away)
-        flip, why = bang_bang.decide(task, belief, PHANTOM.control.adaptive_mpc)
+        flip, why = bang_bang.decide(task, belief, AdaptiveMpc())
         assert flip is (side != state.bevel and not in_air)
         decision, rng = decide(away, belief), np.random.default_rng(0)
         expected = [
@@ -251,7 +252,7 @@ def test_cost_is_that_of_the_chosen_step(quick_plan, along, left):
     depth = state.tip[0] + min(1.0, left)
     y, turn = (np.interp(depth, goal.tips[:, 0], goal.tips[:, k]) for k in (1, 2))
     near = left < 1.0
-    weight = scenario.control.adaptive_mpc.target_weight if near else 1.0
+    weight = AdaptiveMpc().target_weight if near else 1.0
     off = (after.tip[1] - (2.0 if near else y)) ** 2 + (40.0 * (after.tip[2] - turn)) ** 2
     planned = np.diff(np.interp([state.tip[0], depth], goal.tips[:, 0], goal.guide))[0]
     expected = weight * off + 3.0 * (decision.command[3] - planned) ** 2 + 2.0 * after.strain_energy
@@ -346,7 +347,7 @@ def counted(monkeypatch, way=None):
 
     def renewed(task, belief, old, _rng):
         sought.append(float(belief.state.tip[0]))
-        return way or replace(old, renew_at=sought[-1] + task.scenario.control.adaptive_mpc.route_mm)
+        return way or replace(old, renew_at=sought[-1] + task.settings.route_mm)
 
     monkeypatch.setattr(adaptive_mpc, "renewed", renewed)
     return sought

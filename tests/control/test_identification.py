@@ -7,6 +7,7 @@ import pytest
 
 import flexneedle
 from flexneedle.control import identification as idn
+from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.identification import (
     BASE_TURN,
     BASE_Y,
@@ -16,6 +17,7 @@ from flexneedle.control.identification import (
     RUN_OUT,
     Identification,
 )
+from flexneedle.errors import ScenarioError
 from flexneedle.mechanics import needle as nd
 from flexneedle.ports import Sample
 from flexneedle.simulator import Control, Learnt, Simulator
@@ -27,7 +29,7 @@ TURNS = (20, 40, 52)  # moves that turn the bevel, the first in air
 LAYERS = len(PHANTOM.tissue)
 SHIFT = MODULUS + LAYERS
 CELLS = SHIFT + LAYERS - 1
-OWN = PHANTOM.control.adaptive_mpc
+OWN = AdaptiveMpc()
 WAVES = tuple(
     (1.0 + 0.5 * np.sin(0.45 * np.arange(15))).tolist()
 )  # factors on the modulus in cells of 2.5 mm
@@ -241,7 +243,7 @@ def test_tissue_of_other_layers_is_identified_too(layers):
 def test_a_tracker_without_jitter_is_believed_but_for_what_no_parameter_explains():
     scenario = PHANTOM.with_values({"tracker.jitter_mm": 0.0})
     estimate, states = followed(NEEDLES["all"], 66, scenario=scenario)
-    np.testing.assert_array_equal(estimate._readings.variance(scenario), OWN.model_sd_mm**2)
+    np.testing.assert_array_equal(estimate._readings.variance(scenario, OWN), OWN.model_sd_mm**2)
     assert estimate.tip[1] == pytest.approx(NEEDLES["all"].seen(states[-1])[1], abs=0.01)
 
 
@@ -271,7 +273,8 @@ def test_the_prior_is_that_of_the_scenario():
         "control.adaptive_mpc.variation_sd": 0.15, "control.adaptive_mpc.variation_length_mm": 7.0,
         "control.adaptive_mpc.cell_mm": 4.0,
     }  # fmt: skip
-    prior = idn._Prior.of(PHANTOM.with_values(sds))
+    scenario = PHANTOM.with_values(sds)
+    prior = idn._Prior.of(scenario, begun_with(Simulator(scenario, 1)).settings)
     cells = 21  # of 4 mm in 81.5 mm
     apart = 4.0 * np.abs(np.subtract.outer(np.arange(cells), np.arange(cells)))
     covariance = np.zeros((CELLS + cells, CELLS + cells))
@@ -397,7 +400,7 @@ def test_the_stops_are_states_of_the_way():
 def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
     """Least squares of readings and prior stacked, each over its standard deviation."""
     belief, seen = off_the_prior(45, "bend")
-    sd = np.sqrt(QUIET.tracker.jitter_per_axis**2 / seen.count + QUIET.control.adaptive_mpc.model_sd_mm**2)
+    sd = np.sqrt(QUIET.tracker.jitter_per_axis**2 / seen.count + belief.settings.model_sd_mm**2)
     prior = np.linalg.cholesky(belief.prior.precision).T
     jacobian = idn._jacobian(belief, seen)
     matrix = np.concatenate([jacobian / sd[:, None], prior])
@@ -409,13 +412,21 @@ def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
     np.testing.assert_allclose(found, belief.parameters + step, rtol=1e-6, atol=1e-8)
 
 
+def test_cells_are_not_so_short_that_a_fit_would_never_end():
+    short = begun_with(Simulator(PHANTOM.with_values({"control.adaptive_mpc.cell_mm": 1e-3}), 1))
+    with pytest.raises(
+        ScenarioError, match=r"^control.adaptive_mpc.cell_mm = 0.001: must be at least 0.4075, "
+    ):
+        Identification().begin(short)
+
+
 # ---- its step back
 
 
 def misfit(belief, readings=None):
     """What the fit makes least: squares over variances, halved."""
     readings = readings or belief._readings
-    variance = readings.variance(belief.nominal.scenario)
+    variance = readings.variance(belief.nominal.scenario, belief.settings)
     off = belief.parameters - belief.prior.mean
     rows, p = np.array([done.applied for done in belief.moves]), belief.parameters
     y = belief.tips[:, 1]
@@ -549,11 +560,11 @@ def test_a_reading_is_on_the_side_to_which_the_bevel_turned_before_its_move(firs
 
 
 def test_the_low_pass_follows_the_newest_and_forgets():
-    gain = PHANTOM.control.adaptive_mpc.residual_gain
-    assert idn._low_passed(PHANTOM, np.array([1.0])) == pytest.approx(gain)
-    assert idn._low_passed(PHANTOM, np.array([1.0, 0.0])) == pytest.approx(gain * (1.0 - gain))
-    assert idn._low_passed(PHANTOM, np.full(200, 0.3)) == pytest.approx(0.3, rel=0.01)
-    assert idn._low_passed(PHANTOM, np.zeros(0)) == 0.0
+    gain = OWN.residual_gain
+    assert idn._low_passed(OWN, np.array([1.0])) == pytest.approx(gain)
+    assert idn._low_passed(OWN, np.array([1.0, 0.0])) == pytest.approx(gain * (1.0 - gain))
+    assert idn._low_passed(OWN, np.full(200, 0.3)) == pytest.approx(0.3, rel=0.01)
+    assert idn._low_passed(OWN, np.zeros(0)) == 0.0
 
 
 # ---- what holds whatever the readings

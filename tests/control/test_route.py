@@ -10,13 +10,14 @@ from hypothesis import strategies as st
 
 import flexneedle
 from flexneedle.control import route
+from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.identification import RUN_OUT, Identification
 from flexneedle.simulator import Control, Learnt, Simulator
 from tasks import begun_with, task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
 BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
-OWN = PHANTOM.control.adaptive_mpc
+OWN = AdaptiveMpc()
 
 
 def belief_of(state, scenario=PHANTOM, **fields):

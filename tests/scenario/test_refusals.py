@@ -315,11 +315,6 @@ def test_a_window_without_two_frames_would_never_know_the_field():
         PHANTOM.with_values(short | unjudged)
 
 
-def test_cells_are_not_so_short_that_a_fit_would_never_end():
-    (line,) = problems(changed("control.adaptive_mpc.cell_mm", 1e-3))
-    assert line.startswith("control.adaptive_mpc.cell_mm = 0.001: must be at least")
-
-
 @pytest.mark.parametrize("key", ["name", "needle", "setup", "tissue", "setup.stroke_mm", "tissue[0].alpha"])
 def test_a_required_key_is_missed(key):
     assert problems(changed(key, None)) == [f"{key}: missing"]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Task
-from flexneedle.scenario.methods import BevelRule
+from flexneedle.scenario.fields import Fraction, NonNegative, Section
 
 Floats = NDArray[np.float64]
 _SURE = 3.0  # standard deviations of a reading: no bevel turn for less
@@ -46,6 +46,20 @@ def wants_flip(
         flip,
         f"bevel {'turned' if flip else 'kept'}: keeping misses by {keep:.3f} mm, turning by {turn:.3f} mm",
     )
+
+
+class BevelRule(Section):
+    """A controller's settings of the rule."""
+
+    curvature_per_m: NonNegative = 0.646
+    """κ of the two paths of the bang-bang rule."""
+    flip_dead_band: Fraction = 0.875
+    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
+
+    @property
+    def curvature(self) -> float:
+        """κ, 1/mm."""
+        return 1e-3 * self.curvature_per_m
 
 
 def decide(task: Task, estimate: Estimate, rule: BevelRule) -> tuple[bool, str]:

@@ -19,10 +19,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.estimate import Floats, Move, along, assigned
 from flexneedle.control.task import Task
+from flexneedle.errors import ScenarioError
 from flexneedle.ports import Command, Sample
 from flexneedle.scenario import Scenario
+from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.simulator import Control, Learnt, Simulator, State
 
 __all__ = ["Identification", "Identified"]
@@ -34,6 +37,7 @@ _SHIFT_STEP = 0.2  # mm
 _MOVES_A_STRETCH = 8  # in tissue; one stretch in air
 _WIDEST = 4.0  # standard deviations that a parameter may leave its prior
 _LARGEST_BEVEL = 3.4  # factor: 0.7 of the compression length with the preset's
+_MOST_CELLS = 200
 _RECENT = 12  # moves whose residuals are low-passed
 _SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a Gauss–Newton step: the first that fits no worse
 _REST = np.array([[0.0, 0.0, 0.0, 0.0, -1.0]])
@@ -41,24 +45,29 @@ _REST = np.array([[0.0, 0.0, 0.0, 0.0, -1.0]])
 
 @dataclass(frozen=True)
 class Identification:
-    """This observer has no choices but the scenario's `[control.adaptive_mpc]`."""
+    """This observer has no choices but the settings of `adaptive-mpc`."""
 
     def begin(self, task: Task) -> "Identified":
-        """Believe in the scenario."""
-        simulator = task.simulator
-        state, prior = simulator.start(task.plan.bevel), _Prior.of(task.scenario)
-        return Identified(simulator, prior, simulator, prior.mean, state, state.tip[None], ((0, state),))
+        """Believe in the scenario. Raises ScenarioError for cells so short that a fit would never end."""
+        simulator, settings = task.simulator, task.settings
+        _check_cells(task.scenario, settings)
+        state, prior = simulator.start(task.plan.bevel), _Prior.of(task.scenario, settings)
+        return Identified(
+            simulator, settings, prior, simulator, prior.mean, state, state.tip[None], ((0, state),)
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Identified:
     """The belief; an `Estimate`.
 
-    nominal: the scenario's model, and the prior about it; simulator: the model with parameters (K,); state: of it now;
-    tips (m + 1, 3): of it at the ends of the m moves, the start first; stops: its state before some of the moves.
+    nominal: the scenario's model, with the controller's settings and the prior about it; simulator: the model with
+    parameters (K,); state: of it now; tips (m + 1, 3): of it at the ends of the m moves, the start first; stops: its
+    state before some of the moves.
     """
 
     nominal: Simulator
+    settings: AdaptiveMpc
     prior: "_Prior"
     simulator: Simulator
     parameters: Floats
@@ -116,7 +125,7 @@ class Identified:
         inside = fitted.tips[-1, 0] > 0.0
         return replace(
             fitted,
-            residual=_low_passed(self.nominal.scenario, left) if inside else 0.0,
+            residual=_low_passed(self.settings, left) if inside else 0.0,
             innovation=(float(ahead[-1]), float(left[-1])),
             measured=(float(x), float(y)),
         )
@@ -137,7 +146,7 @@ class Identified:
 
     def _with(self, parameters: Floats) -> "Identified":
         """The belief in these parameters: the insertion simulated again, in stretches."""
-        simulator = _adapted(self.nominal, parameters)
+        simulator = _adapted(self.nominal, self.settings, parameters)
         state = _started(self, simulator, parameters)
         inside = int(np.argmax(np.append(self.tips[1:, 0], np.inf) > 0.0))
         ends = [*range(min(inside, len(self.rows)), len(self.rows), _MOVES_A_STRETCH), len(self.rows)]
@@ -181,9 +190,9 @@ class _Readings:
         left: Floats = self.y - self.between(belief.tips[:, 1]) - belief.run_out * self.sides
         return left
 
-    def variance(self, scenario: Scenario) -> Floats:
+    def variance(self, scenario: Scenario, settings: AdaptiveMpc) -> Floats:
         """Of the lateral readings (r,), mm²: their jitter and what no parameter explains."""
-        unexplained = scenario.control.adaptive_mpc.model_sd_mm**2
+        unexplained = settings.model_sd_mm**2
         variance: Floats = scenario.tracker.jitter_per_axis**2 / self.count + unexplained
         return variance
 
@@ -201,10 +210,10 @@ class _Prior:
     begins: Floats
 
     @staticmethod
-    def of(scenario: Scenario) -> "_Prior":
+    def of(scenario: Scenario, settings: AdaptiveMpc) -> "_Prior":
         """The scenario's."""
-        control, settings = scenario.control, scenario.control.adaptive_mpc
-        layers, cells = len(scenario.tissue), _cells(scenario)
+        control = scenario.control
+        layers, cells = len(scenario.tissue), _cells(scenario, settings)
         single = (
             [control.start_offset_sd_mm, control.start_angle_sd, settings.bend_sd_mm]
             + [settings.run_out_sd_mm, settings.bevel_sd]
@@ -242,12 +251,20 @@ def _uncorrelating(size: int, distance: float) -> Floats:
     return inverse
 
 
-def _cells(scenario: Scenario) -> int:
+def _cells(scenario: Scenario, settings: AdaptiveMpc) -> int:
     """Cells from the skin to the end of the stroke."""
-    return max(2, int(np.ceil(scenario.setup.max_depth / scenario.control.adaptive_mpc.cell_mm)))
+    return max(2, int(np.ceil(scenario.setup.max_depth / settings.cell_mm)))
 
 
-def _adapted(nominal: Simulator, parameters: Floats) -> Simulator:
+def _check_cells(scenario: Scenario, settings: AdaptiveMpc) -> None:
+    """Raise ScenarioError for cells so short that a fit would never end."""
+    thinnest = scenario.setup.max_depth / _MOST_CELLS
+    if settings.cell_mm < thinnest:
+        rule = f"must be at least {thinnest:g}, the depth of the full stroke / {_MOST_CELLS}"
+        raise ScenarioError(to_line(Problem("control.adaptive_mpc.cell_mm", settings.cell_mm, rule)))
+
+
+def _adapted(nominal: Simulator, settings: AdaptiveMpc, parameters: Floats) -> Simulator:
     """The model with these constants."""
     layers = len(nominal.scenario.tissue)
     shift = MODULUS + layers
@@ -256,7 +273,7 @@ def _adapted(nominal: Simulator, parameters: Floats) -> Simulator:
         Learnt(
             shift=parameters[shift:variation],
             stiffness=np.exp(parameters[MODULUS:shift]),
-            cell=nominal.scenario.control.adaptive_mpc.cell_mm,
+            cell=settings.cell_mm,
             variation=np.exp(parameters[variation:]),
             bevel=float(parameters[BEVEL]),
             bend=float(parameters[BEND]),
@@ -274,7 +291,10 @@ def _started(belief: Identified, simulator: Simulator, parameters: Floats) -> St
 def _improved(belief: Identified, readings: _Readings) -> Identified:
     """One Gauss–Newton step to the maximum a posteriori, as long as it fits no worse, within the bounds."""
     prior = belief.prior
-    jacobian, variance = _jacobian(belief, readings), readings.variance(belief.nominal.scenario)
+    jacobian, variance = (
+        _jacobian(belief, readings),
+        readings.variance(belief.nominal.scenario, belief.settings),
+    )
     weighted = jacobian.T / variance
     gradient = weighted @ readings.left(belief) - prior.precision @ (belief.parameters - prior.mean)
     step = np.linalg.solve(weighted @ jacobian + prior.precision, gradient)
@@ -312,7 +332,7 @@ def _jacobian(belief: Identified, readings: _Readings) -> Floats:
 
 def _tips(belief: Identified, parameters: Floats, begins: float) -> Floats:
     """The tips (m + 1, 3) with parameters that differ only in what matters from the tip depth `begins` (mm) on."""
-    simulator = _adapted(belief.nominal, parameters)
+    simulator = _adapted(belief.nominal, belief.settings, parameters)
     reached = int(np.argmax(np.append(belief.tips[:, 0], np.inf) > begins))  # by the move before this one
     first, state = max((stop for stop in belief.stops if stop[0] < max(1, reached)), key=lambda stop: stop[0])
     if first == 0:
@@ -321,9 +341,9 @@ def _tips(belief: Identified, parameters: Floats, begins: float) -> Floats:
     return np.concatenate([before, simulator.replay(state, belief.rows[first:])[1]])
 
 
-def _low_passed(scenario: Scenario, left: Floats) -> float:
+def _low_passed(settings: AdaptiveMpc, left: Floats) -> float:
     """The residuals (r,) of the last moves, each less than the one after it."""
-    level, gain = 0.0, scenario.control.adaptive_mpc.residual_gain
+    level, gain = 0.0, settings.residual_gain
     for value in left[-_RECENT:].tolist():
         level += gain * (value - level)
     return level

@@ -14,7 +14,7 @@ from flexneedle.control.observer import Beliefs
 from flexneedle.control.task import Task
 from flexneedle.errors import InputError
 from flexneedle.ports import Command
-from flexneedle.scenario import Scenario
+from flexneedle.scenario import Control, Scenario
 from flexneedle.scenario.fields import Section
 from flexneedle.simulator import State
 from flexneedle.trace import PlanRecord
@@ -83,6 +83,8 @@ class Method:
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(str(self.name)):
             raise InputError(f"name = {self.name!r}: a controller's name must be like my-controller-2")
+        if self.table in Control.model_fields:
+            raise InputError(f"name = {self.name!r}: control.{self.table} is a setting of all controllers")
         for part in ("decide", "begin", "arrived"):
             if not callable(getattr(self, part)):
                 raise InputError(f"controller {self.name}: {part} must be a function")

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.control.bang_bang import BevelRule
 from flexneedle.control.interface import travel_left
 from flexneedle.planning import Settings, cross_entropy
 from flexneedle.scenario import Scenario, Setup, elite_count
 from flexneedle.scenario.fields import Fraction, NonNegative, count
-from flexneedle.scenario.methods import BevelRule
 from flexneedle.simulator import Simulator, State
 from flexneedle.trace import PlanRecord
 

@@ -52,7 +52,7 @@ def of_plan(plan: PlanRecord) -> Route:
 
 def renewed(task: Task, belief: Identified, route: Route, rng: np.random.Generator) -> Route:
     """The best way found from where the needle is believed to be to the target."""
-    settings = task.scenario.control.adaptive_mpc
+    settings = task.settings
     ahead = _Ahead.of(task, belief)
     pieces, most = int(ahead.piece[-1]) + 1, _LONG * ahead.guide_step
     mean = np.concatenate([_guide_steps(ahead, route), np.full(pieces, float(belief.state.bevel))])
@@ -98,7 +98,7 @@ class _Ahead:
     @staticmethod
     def of(task: Task, belief: Identified) -> "_Ahead":
         """Even steps, in even pieces."""
-        setup, settings = task.scenario.setup, task.scenario.control.adaptive_mpc
+        setup, settings = task.scenario.setup, task.settings
         left = travel_left(task.scenario, task.plan, belief.state)
         steps = max(1, int(np.ceil(left / (_LONG * setup.max_advance_mm) - 1e-9)))
         depth = float(belief.state.tip[0]) + np.linspace(0.0, left, steps + 1)
@@ -143,7 +143,7 @@ def _seen(belief: Identified, controls: Floats, tips: Floats) -> Floats:
 
 def _cost(task: Task, belief: Identified, ahead: _Ahead, z: Floats) -> Floats:
     """The miss (mm), and what tissue energy, guide motion and turns are worth against it (mm)."""
-    settings = task.scenario.control.adaptive_mpc
+    settings = task.settings
     controls = _controls(ahead, belief, z)
     tips, energy, converged = belief.simulator.rollout(belief.state, controls, limits=False)
     depth, lateral = task.plan.target

@@ -62,7 +62,7 @@ class Scenario(Section):
                 target_problems(self.setup, self.target),
                 plan_problems(self.plan),
                 monitor_problems(self.monitor, self.tracker),
-                grid_problems(self.setup, self.contact, self.phantom, self.tracker, self.control),
+                grid_problems(self.setup, self.contact, self.phantom, self.tracker),
             )
         )
         return self

@@ -6,7 +6,6 @@ from typing import Annotated, Any, Self
 from pydantic import ConfigDict, Field, model_validator
 
 from .fields import Fraction, NonNegative, NonNegativeRange, Positive, PositiveRange, Section, count
-from .methods import AdaptiveMpc
 from .problems import Problem, refuse, unknown_key
 
 __all__ = ["Control", "Phantom", "Plan", "Target"]
@@ -100,7 +99,6 @@ class Control(Section):
     """The insertion is given up after so long without a measurement to believe."""
     stale_after_s: Positive = 0.3
     """A measurement older than this is not believed."""
-    adaptive_mpc: AdaptiveMpc = AdaptiveMpc()
 
     @model_validator(mode="after")
     def _check_tables(self) -> Self:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.control import bang_bang
+from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.estimate import Estimate, Floats
 from flexneedle.control.identification import Identification, Identified
 from flexneedle.control.interface import Decision, Method, Task, travel_left
@@ -47,7 +48,7 @@ def decide(task: Task, memory: Route, estimate: Estimate, rng: np.random.Generat
     turns, route = sum(turn <= due for turn in route.turns), route.after(due)
     if turns % 2 == 1:
         return _search(task, belief, route, rng, flip=True, why="bevel turned: on the way"), route
-    flip, why = bang_bang.decide(task, belief, task.scenario.control.adaptive_mpc)
+    flip, why = bang_bang.decide(task, belief, task.settings)
     decision = _search(task, belief, route, rng, flip=flip, why=why)
     if flip:
         kept = _search(task, belief, route, rng, flip=False, why=f"{why}; the model keeps it")
@@ -64,12 +65,12 @@ def _followed(task: Task, route: Route, belief: Identified, rng: np.random.Gener
 
 def _near(task: Task, belief: Identified) -> bool:
     """Whether the horizon reaches the target."""
-    reach = task.scenario.control.adaptive_mpc.horizon * task.scenario.setup.max_advance_mm
+    reach: float = task.settings.horizon * task.scenario.setup.max_advance_mm
     return travel_left(task.scenario, task.plan, belief.state) <= reach + 1e-9
 
 
 def _ahead(task: Task, belief: Identified, route: Route, *, flip: bool) -> Ahead:
-    settings, setup = task.scenario.control.adaptive_mpc, task.scenario.setup
+    settings, setup = task.settings, task.scenario.setup
     left = travel_left(task.scenario, task.plan, belief.state)
     steps = max(1, min(settings.horizon, int(np.ceil(left / setup.max_advance_mm - 1e-9))))
     advance = np.diff(np.minimum(np.arange(steps + 1) * setup.max_advance_mm, left))
@@ -89,7 +90,7 @@ def _search(
     task: Task, belief: Identified, route: Route, rng: np.random.Generator, *, flip: bool, why: str
 ) -> Decision:
     """Cross-entropy over the guide's step in each piece."""
-    setup, settings = task.scenario.setup, task.scenario.control.adaptive_mpc
+    setup, settings = task.scenario.setup, task.settings
     ahead = _ahead(task, belief, route, flip=flip)
     pieces = int(ahead.piece[-1]) + 1
     most = setup.max_guide_step_mm if setup.has_guide else 0.0
@@ -129,7 +130,7 @@ def _controls(task: Task, belief: Identified, ahead: Ahead, z: Floats) -> Floats
 
 def _cost(task: Task, belief: Identified, ahead: Ahead, z: Floats) -> Floats:
     """Weighted squared deviation from the path (mm²), departure from the route's guide steps, tissue energy."""
-    settings = task.scenario.control.adaptive_mpc
+    settings = task.settings
     controls = _controls(task, belief, ahead, z)
     tips, energy, converged = belief.simulator.rollout(belief.state, controls)
     off = (tips[:, :, 1:] - ahead.path) * (1.0, settings.orientation_weight_mm)
@@ -145,4 +146,5 @@ METHOD = Method(
     Identification(),
     begin=lambda task: of_plan(task.plan),
     decide=decide,
+    settings=AdaptiveMpc,
 )

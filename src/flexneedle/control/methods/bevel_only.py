@@ -6,10 +6,9 @@ from flexneedle.control import bang_bang
 from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Decision, Method, Task, travel_left
 from flexneedle.control.observer import Beliefs
-from flexneedle.scenario.methods import BevelRule
 
 
-class BevelOnly(BevelRule):
+class BevelOnly(bang_bang.BevelRule):
     """Section `control.bevel_only`: the bevel alone steers."""
 
 

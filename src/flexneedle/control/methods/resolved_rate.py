@@ -22,7 +22,6 @@ from flexneedle.control.observer import Beliefs
 from flexneedle.errors import InputError
 from flexneedle.scenario import Setup
 from flexneedle.scenario.fields import Fraction, NonNegative, Positive
-from flexneedle.scenario.methods import BevelRule
 from flexneedle.simulator import Simulator, State
 from flexneedle.trace import PlanRecord
 
@@ -30,7 +29,7 @@ Floats = NDArray[np.float64]
 _DISTURBANCE_MM = 0.05  # of the guide: above rounding, small against the 10 mm in which the tissue stiffens
 
 
-class ResolvedRate(BevelRule):
+class ResolvedRate(bang_bang.BevelRule):
     """Section `control.resolved_rate`: the guide follows the damped inverse of the model's Jacobian."""
 
     curvature_per_m: NonNegative = 0.0834

@@ -1,22 +1,9 @@
-"""Settings of `adaptive-mpc`."""
+"""Settings of `adaptive-mpc`, of its search and of its observer."""
 
-from .fields import Fraction, NonNegative, Positive, Section, count
+from flexneedle.control.bang_bang import BevelRule
+from flexneedle.scenario.fields import Fraction, NonNegative, Positive, count
 
 __all__ = ["AdaptiveMpc"]
-
-
-class BevelRule(Section):
-    """The bang-bang rule of a controller that has its own."""
-
-    curvature_per_m: NonNegative = 0.646
-    """κ of the two paths of the bang-bang rule."""
-    flip_dead_band: Fraction = 0.875
-    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
-
-    @property
-    def curvature(self) -> float:
-        """κ, 1/mm."""
-        return 1e-3 * self.curvature_per_m
 
 
 class AdaptiveMpc(BevelRule):
