@@ -20,13 +20,25 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
     show = actions.add_parser("show", help="print a scenario with all its defaults, as TOML")
     show.add_argument("scenario", metavar="SCENARIO", help="preset name or path")
+    _add_controller(show)
     show.set_defaults(handler=_show)
 
     check = actions.add_parser("check", help="check a scenario: one line for each problem, exit status 2")
     check.add_argument("scenario", metavar="SCENARIO", help="path or preset name")
+    _add_controller(check)
     check.set_defaults(handler=_check)
 
     actions.add_parser("schema", help="print the JSON schema of scenario files").set_defaults(handler=_schema)
+
+
+def _add_controller(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--controller",
+        action="append",
+        default=[],
+        metavar="module:METHOD",
+        help="a controller of your own whose table the scenario may have; may be given several times",
+    )
 
 
 def _list(_args: argparse.Namespace) -> int:
@@ -52,9 +64,11 @@ def _check(args: argparse.Namespace) -> int:
 def _checked(args: argparse.Namespace) -> Scenario:
     """The scenario with all defaults, those of the controllers too."""
     from flexneedle.control.methods import checked
+    from flexneedle.run.parts import controller_of
     from flexneedle.scenario import load_scenario
 
-    return checked(load_scenario(args.scenario), source=args.scenario)
+    own = [controller_of(name)[1] for name in args.controller]
+    return checked(load_scenario(args.scenario), *own, source=args.scenario)
 
 
 def _schema(_args: argparse.Namespace) -> int:

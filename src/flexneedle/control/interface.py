@@ -17,6 +17,7 @@ from flexneedle.ports import Command
 from flexneedle.scenario import Control, Scenario
 from flexneedle.scenario.fields import Section
 from flexneedle.simulator import State
+from flexneedle.simulator.control import COLUMNS
 from flexneedle.trace import PlanRecord
 
 __all__ = ["Decision", "Method", "Observer", "Task", "at_depth", "travel_left"]
@@ -27,12 +28,21 @@ _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
 @dataclass(frozen=True)
 class Decision:
-    """A command, why, its predicted cost, and the standard deviation left in the guide step (mm; NaN: none)."""
+    """A command, why, its predicted cost, and the standard deviation left in the guide step (mm; NaN: none).
+
+    Raises InputError for a command of another length.
+    """
 
     command: Command
     why: str
     cost: float = math.nan
     spread: float = math.nan
+
+    def __post_init__(self) -> None:
+        if len(self.command) != len(COLUMNS):
+            raise InputError(
+                f"command = {self.command}: must have {len(COLUMNS)} numbers, {', '.join(COLUMNS)}"
+            )
 
 
 def travel_left(scenario: Scenario, plan: PlanRecord, state: State) -> float:

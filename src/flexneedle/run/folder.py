@@ -1,8 +1,8 @@
 """The folder of a run: claimed once, `run.json` always whole, read back with clear errors.
 
 `run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing and
-plans; that of an insertion also controller and phantom. All but `timing`, which holds the date and the wall-clock
-times, is the same for the same seed.
+plans; that of an insertion also controller, phantom and tracker. All but `timing`, which holds the date and the
+wall-clock times, is the same for the same seed.
 """
 
 import hashlib

@@ -7,6 +7,7 @@ from typing import Any
 
 from flexneedle.control.methods import checked
 from flexneedle.errors import ScenarioError
+from flexneedle.run.parts import is_own
 from flexneedle.run.report.rows import Rows
 from flexneedle.scenario import Scenario, dump_scenario, load_scenario, preset_names
 
@@ -63,6 +64,8 @@ def _command(rows: Rows, row: int, source: str) -> str:
     for option, name in options.items():
         value = rows.value(name, row)
         words += [option, str(value)] if value is not None else []
+    tracker = rows.value("tracker", row)
+    words += ["--tracker", str(tracker)] if is_own(tracker) else []
     return shlex.join(words)
 
 

@@ -49,7 +49,7 @@ class Axis(Section):
     """One `[[axes]]`: a key and the values that it takes, each with each of the other axes'."""
 
     key: Annotated[str, AfterValidator(current_key)]
-    """A key of the scenario, or target, controller, plant, strategy, plan_seed, seed."""
+    """A key of the scenario, or target, controller, plant, tracker, strategy, plan_seed, seed."""
     values: Any
     """A list; "all" for every controller, plant or strategy; {from, count} for seeds that follow each other."""
 
