@@ -21,9 +21,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.estimate import Floats, Move, along, assigned
+from flexneedle.control.task import Task
+from flexneedle.errors import ScenarioError
 from flexneedle.ports import Command, Sample
 from flexneedle.scenario import Scenario
+from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.simulator import Control, Learnt, Simulator, State
 
 __all__ = ["Identification", "Identified", "Perturbed"]
@@ -36,6 +40,7 @@ _SHIFT_STEP = 0.2  # mm
 _MOVES_A_STRETCH = 8  # in tissue; one stretch in air
 _WIDEST = 4.0  # standard deviations that a parameter may leave its prior
 _LARGEST_BEVEL = 0.699  # offset, in compression lengths: the law's limit
+_MOST_CELLS = 200
 _RECENT = 12  # moves whose residuals are low-passed
 _SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a Gauss–Newton step: the first that fits no worse
 _REST = np.array([[0.0, 0.0, 0.0, 0.0, -1.0]])
@@ -50,16 +55,17 @@ _MS0 = float(os.environ.get("MS0", "0.0126"))
 
 @dataclass(frozen=True)
 class Identification:
-    """This observer has no choices but the scenario's `[control.adaptive_mpc]`."""
+    """This observer has no choices but the settings of `adaptive-mpc`."""
 
-    def begin(self, simulator: Simulator, bevel: int) -> "Identified":
-        """Start from the scenario's values."""
-        state, prior = simulator.start(bevel), _Prior.of(simulator.scenario)
-        scenario = simulator.scenario
+    def begin(self, task: Task) -> "Identified":
+        """Start from the scenario's values. Raises ScenarioError for cells so short that a fit would never end."""
+        simulator, scenario, settings = task.simulator, task.scenario, task.settings
+        _check_cells(scenario, settings)
+        state, prior = simulator.start(task.plan.bevel), _Prior.of(scenario, settings)
         step = scenario.setup.max_advance_mm
         grid = np.arange(scenario.setup.start_tip_x - 5 * step, scenario.setup.max_depth + (_ROUND + 6) * step, step)
         start = Identified(
-            simulator, prior, simulator, prior.mean, state, state.tip[None], ((0, state),), grid,
+            simulator, settings, prior, simulator, prior.mean, state, state.tip[None], ((0, state),), grid,
             np.zeros((prior.mean.size, grid.size)), prior.precision,
         )
         return start._differentiated(range(prior.mean.size))
@@ -84,6 +90,7 @@ class Identified:
     """
 
     nominal: Simulator
+    settings: AdaptiveMpc
     prior: "_Prior"
     simulator: Simulator
     parameters: Floats
@@ -153,7 +160,7 @@ class Identified:
         inside = fitted.tips[-1, 0] > 0.0
         return replace(
             fitted,
-            residual=_low_passed(self.nominal.scenario, left) if inside else 0.0,
+            residual=_low_passed(self.settings, left) if inside else 0.0,
             innovation=(float(ahead[-1]), float(left[-1])),
             measured=(float(x), float(y)),
         )
@@ -174,7 +181,7 @@ class Identified:
 
     def _with(self, parameters: Floats) -> "Identified":
         """The estimate with these parameters: the insertion simulated again, in stretches."""
-        simulator = _adapted(self.nominal, parameters)
+        simulator = _adapted(self.nominal, self.settings, parameters)
         state = _started(self, simulator, parameters)
         inside = int(np.argmax(np.append(self.tips[1:, 0], np.inf) > 0.0))
         ends = [*range(min(inside, len(self.rows)), len(self.rows), _MOVES_A_STRETCH), len(self.rows)]
@@ -293,10 +300,10 @@ class _Prior:
     begins: Floats
 
     @staticmethod
-    def of(scenario: Scenario) -> "_Prior":
+    def of(scenario: Scenario, settings: AdaptiveMpc) -> "_Prior":
         """The scenario's."""
-        control, settings = scenario.control, scenario.control.adaptive_mpc
-        layers, cells = len(scenario.tissue), _cells(scenario)
+        control = scenario.control
+        layers, cells = len(scenario.tissue), _cells(scenario, settings)
         single = (
             [control.start_offset_sd_mm, control.start_angle_sd, settings.bend_sd_mm]
             + [settings.run_out_sd_mm, settings.bevel_sd]
@@ -334,12 +341,20 @@ def _uncorrelating(size: int, distance: float) -> Floats:
     return inverse
 
 
-def _cells(scenario: Scenario) -> int:
+def _cells(scenario: Scenario, settings: AdaptiveMpc) -> int:
     """Cells from the skin to the end of the stroke."""
-    return max(2, int(np.ceil(scenario.setup.max_depth / scenario.control.adaptive_mpc.cell_mm)))
+    return max(2, int(np.ceil(scenario.setup.max_depth / settings.cell_mm)))
 
 
-def _adapted(nominal: Simulator, parameters: Floats) -> Simulator:
+def _check_cells(scenario: Scenario, settings: AdaptiveMpc) -> None:
+    """Raise ScenarioError for cells so short that a fit would never end."""
+    thinnest = scenario.setup.max_depth / _MOST_CELLS
+    if settings.cell_mm < thinnest:
+        rule = f"must be at least {thinnest:g}, the depth of the full stroke / {_MOST_CELLS}"
+        raise ScenarioError(to_line(Problem("control.adaptive_mpc.cell_mm", settings.cell_mm, rule)))
+
+
+def _adapted(nominal: Simulator, settings: AdaptiveMpc, parameters: Floats) -> Simulator:
     """The model with these constants."""
     layers = len(nominal.scenario.tissue)
     shift = MODULUS + layers
@@ -348,7 +363,7 @@ def _adapted(nominal: Simulator, parameters: Floats) -> Simulator:
         Learnt(
             shift=parameters[shift:variation],
             stiffness=np.exp(parameters[MODULUS:shift]),
-            cell=nominal.scenario.control.adaptive_mpc.cell_mm,
+            cell=settings.cell_mm,
             variation=np.exp(parameters[variation:]),
             bevel=float(parameters[BEVEL]),
             bend=float(parameters[BEND]),
@@ -410,7 +425,7 @@ def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) 
 
     What was before the parameter matters is not simulated again.
     """
-    simulator, begins = _adapted(estimate.nominal, parameters), float(estimate.prior.begins[k])
+    simulator, begins = _adapted(estimate.nominal, estimate.settings, parameters), float(estimate.prior.begins[k])
     reached = int(np.argmax(np.append(estimate.tips[:, 0], np.inf) > begins))  # by the move before this one
     first, state = max((stop for stop in estimate.stops if stop[0] < max(1, reached)), key=lambda stop: stop[0])
     if first == 0:
@@ -422,9 +437,9 @@ def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) 
     return member, np.concatenate([before, tips, later])
 
 
-def _low_passed(scenario: Scenario, left: Floats) -> float:
+def _low_passed(settings: AdaptiveMpc, left: Floats) -> float:
     """The residuals (r,) of the last moves, each less than the one after it."""
-    level, gain = 0.0, scenario.control.adaptive_mpc.residual_gain
+    level, gain = 0.0, settings.residual_gain
     for value in left[-_RECENT:].tolist():
         level += gain * (value - level)
     return level

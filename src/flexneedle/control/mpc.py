@@ -6,14 +6,37 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.control.bang_bang import BevelRule
 from flexneedle.control.interface import travel_left
 from flexneedle.planning import Outcome, Search, Term, Variables, best, terms
-from flexneedle.scenario import Control, Scenario, Setup, elite_count
+from flexneedle.scenario import Scenario, Setup, elite_count
+from flexneedle.scenario.fields import Fraction, NonNegative, count
 from flexneedle.simulator import Simulator, State
 from flexneedle.trace import PlanRecord
 
 Floats = NDArray[np.float64]
 _LEAST_ADVANCE = 0.5  # of the longest step: standing still is no way to reduce the cost
+
+
+class CeMpc(BevelRule):
+    """Section `control.ce_mpc`: the search of `ce-mpc`, and its bang-bang rule."""
+
+    samples: int = count(21, least=2, most=100_000)
+    """Control sequences in an iteration of a period."""
+    iterations: int = count(4, least=1, most=1_000)
+    """Iterations of a period."""
+    horizon: int = count(7, least=1, most=1_000)
+    """Steps that a period looks ahead."""
+    orientation_weight_mm: NonNegative = 11.8
+    """Cost of an angle off the planned path, as a distance: 1 rad weighs as much as this."""
+    curvature_per_m: NonNegative = 0.232
+    """κ of the two paths of the bang-bang rule."""
+    flip_dead_band: Fraction = 0.875
+    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
+    guide_weight: NonNegative = 0.075
+    """Cost of a squared millimetre that a guide step departs from the plan's."""
+    energy_weight_per_mj: NonNegative = 2.74
+    """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,18 +49,24 @@ class Choice:
 
 
 def choose(
-    simulator: Simulator, plan: PlanRecord, state: State, *, flip: bool, rng: np.random.Generator
+    simulator: Simulator,
+    plan: PlanRecord,
+    state: State,
+    control: CeMpc,
+    *,
+    flip: bool,
+    rng: np.random.Generator,
 ) -> Choice:
     """Search the next steps of advance and guide for the least deviation from the planned tip poses."""
     scenario = simulator.scenario
-    steps, travel = scenario.control.horizon, travel_left(scenario, plan, state)
+    steps, travel = control.horizon, travel_left(scenario, plan, state)
     reference, nominal = _window(plan, float(state.tip[0]), steps)
     base = planned_base(scenario.setup, plan, state, reference[:, 0])
     variables = _variables(scenario, state, base, travel, nominal, flip=flip)
     search = Search(
-        samples=scenario.control.samples,
-        elite=max(2, elite_count(scenario.control.samples, scenario.plan.elite_fraction)),
-        iterations=scenario.control.iterations,
+        samples=control.samples,
+        elite=max(2, elite_count(control.samples, scenario.plan.elite_fraction)),
+        iterations=control.iterations,
         smoothing=scenario.plan.smoothing,
         tolerance=scenario.plan.tolerance,
     )
@@ -45,7 +74,7 @@ def choose(
     def rollout(controls: Floats) -> Outcome:
         return Outcome(controls, *simulator.rollout(state, controls))
 
-    found = best(variables, rollout, _cost_terms(scenario.control, reference, nominal[:, 3]), search, rng)
+    found = best(variables, rollout, _cost_terms(control, reference, nominal[:, 3]), search, rng)
     spread = float(np.sqrt(found.belief.covariance[steps, steps]))
     db_x, db_y, db_theta, dg_y = found.outcome.controls[0, 0, :4].tolist()
     return Choice((db_x, db_y, db_theta, dg_y), found.cost, spread)
@@ -97,7 +126,7 @@ def _variables(
     )
 
 
-def _cost_terms(control: Control, reference: Floats, nominal: Floats) -> tuple[Term, ...]:
+def _cost_terms(control: CeMpc, reference: Floats, nominal: Floats) -> tuple[Term, ...]:
     """Deviation from poses (steps, 3), departure from guide steps (steps,), tissue energy (paper eq. 13)."""
     poses = partial(terms.deviation, reference=reference, orientation=control.orientation_weight_mm)
     return (

@@ -6,6 +6,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.estimate import Estimate, Floats
 from flexneedle.control.identification import Identification, Identified
 from flexneedle.control.interface import Decision, Method, Task
@@ -98,4 +99,5 @@ METHOD = Method(
     Identification(),
     begin=begin,
     decide=decide,
+    settings=AdaptiveMpc,
 )

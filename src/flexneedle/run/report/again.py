@@ -5,7 +5,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from flexneedle.control.methods import checked
 from flexneedle.errors import ScenarioError
+from flexneedle.run.parts import is_own
 from flexneedle.run.report.rows import Rows
 from flexneedle.scenario import Scenario, dump_scenario, load_scenario, preset_names
 
@@ -19,7 +21,9 @@ def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
 
     A row whose settings make no scenario of this version has "".
     """
-    sources: dict[str, str] = {_target_left_out(load_scenario(name)): name for name in preset_names()}
+    sources: dict[str, str] = {
+        _target_left_out(checked(load_scenario(name))): name for name in preset_names()
+    }
     found = {}
     for row in dict.fromkeys(listed):
         scenario = scenario_of(rows, row)
@@ -44,7 +48,7 @@ def scenario_of(rows: Rows, row: int) -> Scenario | None:
         if value is not None
     }
     try:
-        return Scenario.from_values({"name": "Scenario of a study", **_nested(settings)})
+        return Scenario.from_record({"name": "Scenario of a study", **_nested(settings)})
     except (ScenarioError, TypeError):
         return None
 
@@ -60,6 +64,8 @@ def _command(rows: Rows, row: int, source: str) -> str:
     for option, name in options.items():
         value = rows.value(name, row)
         words += [option, str(value)] if value is not None else []
+    tracker = rows.value("tracker", row)
+    words += ["--tracker", str(tracker)] if is_own(tracker) else []
     return shlex.join(words)
 
 

@@ -91,7 +91,7 @@ def design_of(
         _by_name(rows, "controller", "controller", controllers),
         cases if as_axis is None else _single(cases),
         tuple(axes) if as_axis is None else (as_axis, *axes),
-        tuple(_by_name(rows, key, key) for key in ("plant", "strategy")),
+        tuple(_by_name(rows, key, key) for key in ("plant", "tracker", "strategy")),
     )
 
 

@@ -15,6 +15,7 @@ from flexneedle.scenario import Scenario, load_scenario, preset_names
 from flexneedle.scenario.dotted import flatten
 from flexneedle.scenario.fields import Section, Title, count
 from flexneedle.scenario.problems import Problem, describe, printable, refuse
+from flexneedle.scenario.renamed import current_key
 
 __all__ = [
     *("ALL", "LARGEST_SEED", "NAMED", "SEED", "Axis", "Case", "StudyFile"),
@@ -47,8 +48,8 @@ def _seed(value: int) -> int:
 class Axis(Section):
     """One `[[axes]]`: a key and the values that it takes, each with each of the other axes'."""
 
-    key: str
-    """A key of the scenario, or target, controller, plant, strategy, plan_seed, seed."""
+    key: Annotated[str, AfterValidator(current_key)]
+    """A key of the scenario, or target, controller, plant, tracker, strategy, plan_seed, seed."""
     values: Any
     """A list; "all" for every controller, plant or strategy; {from, count} for seeds that follow each other."""
 
@@ -81,7 +82,7 @@ class StudyFile(Section):
     """In tables and reports."""
     scenario: str = "phantom"
     """The base: a preset's name, or a path from the folder of the study file."""
-    without: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    without: Annotated[tuple[Annotated[str, AfterValidator(current_key)], ...], Field(strict=False)] = ()
     """Keys of the base that are left out, such as diameters where a gauge is given."""
     values: dict[str, Any] = Field(default_factory=dict)
     """Values by dotted key that hold for the whole study."""
@@ -132,7 +133,7 @@ def base_of(file: StudyFile, home: Path) -> Scenario:
 
 def settings_of(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return values by dotted key, a target [depth, lateral] as the two keys of the scenario."""
-    flat = flatten(values)
+    flat = {current_key(key): value for key, value in flatten(values).items()}
     if _TARGET in flat:
         flat |= dict(zip(_TARGET_KEYS, flat.pop(_TARGET), strict=True))
     return flat
