@@ -33,8 +33,8 @@ from flexneedle.simulator import Control, Learnt, Simulator, State
 __all__ = ["Identification", "Identified", "Perturbed"]
 
 import os
-BASE_Y, BASE_TURN, BEND, RUN_OUT, BEVEL, MODULUS = range(6)
-_STEPS = (0.05, 3e-4, 0.05, 0.05, 0.05)  # for differences: mm, rad, mm, mm, 1
+BASE_Y, BASE_TURN, BEND, RUN_OUT, BEVEL, CLEARANCE, MODULUS = range(7)
+_STEPS = (0.05, 3e-4, 0.05, 0.05, 0.05, 0.02)  # for differences: mm, rad, mm, mm, 1, mm
 _LOG_STEP = 0.05
 _SHIFT_STEP = 0.2  # mm
 _MOVES_A_STRETCH = 8  # in tissue; one stretch in air
@@ -45,9 +45,11 @@ _RECENT = 12  # moves whose residuals are low-passed
 _SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a Gauss–Newton step: the first that fits no worse
 _REST = np.array([[0.0, 0.0, 0.0, 0.0, -1.0]])
 _ROUND = 8  # periods in which all curves of derivatives are simulated once,
-_LEADING = (BASE_Y, BASE_TURN, BEND, BEVEL)  # but these are in
+_LEADING = (BASE_Y, BASE_TURN, BEND, BEVEL, CLEARANCE)  # but these are in
 _LEADING_ROUND = 2  # periods
 _STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
+_CL = float(os.environ.get("CL", "0.05"))
+_CLSD = float(os.environ.get("CLSD", "0.02"))
 _AX = float(os.environ.get("AX", "1.0"))
 _MS = float(os.environ.get("MS", "0.01"))
 _MS0 = float(os.environ.get("MS0", "0.0126"))
@@ -306,23 +308,25 @@ class _Prior:
         layers, cells = len(scenario.tissue), _cells(scenario, settings)
         single = (
             [control.start_offset_sd_mm, control.start_angle_sd, settings.bend_sd_mm]
-            + [settings.run_out_sd_mm, settings.bevel_sd]
+            + [settings.run_out_sd_mm, settings.bevel_sd, _CLSD if scenario.setup.has_guide else 0.0]
             + [settings.modulus_log_sd] * layers
             + [settings.boundary_sd_mm] * (layers - 1)
         )
         sd = np.maximum([*single, *[settings.variation_sd] * cells], 1e-6)
         mean = np.where(np.arange(sd.size) == BEVEL, 1.0, 0.0)
+        mean[CLEARANCE] = _CL if scenario.setup.has_guide else 0.0
         precision = np.diag(sd**-2.0)
         precision[-cells:, -cells:] = _uncorrelating(cells, settings.cell_mm / settings.variation_length_mm)
         precision[-cells:, -cells:] /= sd[-1] ** 2
         bounds = mean + np.outer((-_WIDEST, _WIDEST), sd)
+        bounds[0, CLEARANCE] = 0.0
         bounds[:, BEVEL] = 0.0, _largest_bevel(scenario)
         logs, shifts = [_LOG_STEP] * layers, [_SHIFT_STEP] * (layers - 1)
         steps = np.array([*_STEPS, *logs, *shifts, *[_LOG_STEP] * cells])
         tops = np.array(scenario.layer_tops) - _WIDEST * settings.boundary_sd_mm
         tops[0] = 0.0
         starts = settings.cell_mm * np.arange(cells)
-        begins = np.concatenate([[-np.inf] * BEVEL, [0.0], tops, tops[1:], starts])
+        begins = np.concatenate([[-np.inf] * BEVEL, [0.0, -np.inf], tops, tops[1:], starts])
         return _Prior(mean, precision, bounds, steps, begins)
 
     def cost(self, parameters: Floats) -> float:
@@ -367,6 +371,7 @@ def _adapted(nominal: Simulator, settings: AdaptiveMpc, parameters: Floats) -> S
             variation=np.exp(parameters[variation:]),
             bevel=float(parameters[BEVEL]),
             bend=float(parameters[BEND]),
+            clearance=float(parameters[CLEARANCE]),
         )
     )
 
