@@ -63,7 +63,7 @@ class Identification:
         """Start from the scenario's values. Raises ScenarioError for cells so short that a fit would never end."""
         simulator, scenario, settings = task.simulator, task.scenario, task.settings
         _check_cells(scenario, settings)
-        state, prior = simulator.start(task.plan.bevel), _Prior.of(scenario, settings)
+        state, prior = simulator.start(task.plan.bevel), _Prior.of(scenario, settings, task.plan.target[0])
         step = scenario.setup.max_advance_mm
         grid = np.arange(scenario.setup.start_tip_x - 5 * step, scenario.setup.max_depth + (_ROUND + 6) * step, step)
         start = Identified(
@@ -231,23 +231,35 @@ class Identified:
         base = np.concatenate([self.tips, self.simulator.replay(self.state, ahead)[1]])
         depth = np.maximum.accumulate(base[:, 0])
         curves, members = self.curves.copy(), []
-        for k in self._due(float(depth[-1])) if which is None else which:
-            if k == RUN_OUT or depth[-1] < self.prior.begins[k]:
+        for k in self._due() if which is None else which:
+            if k == RUN_OUT:
                 continue
             parameters = self.parameters.copy()
             parameters[k] += self.prior.steps[k]
+            if depth[-1] < self.prior.begins[k]:
+                simulator = _adapted(self.nominal, self.settings, parameters)
+                members.append(Perturbed(k, float(self.prior.steps[k]), simulator, self.state))
+                continue
             member, tips = _perturbed(self, parameters, k, ahead)
             members.append(member)
             curves[k] = np.interp(self.grid, depth, (tips[:, 1] - base[:, 1]) / self.prior.steps[k])
         return replace(self, curves=curves, perturbed=tuple(members), turn=self.turn + 1)
 
-    def _due(self, deepest: float) -> Iterator[int]:
-        """The parameters whose curves are to be simulated this period, of those that matter down to `deepest` (mm)."""
+    @property
+    def reading_variance(self) -> float:
+        """Of the mean of the readings of a control step (mm²)."""
+        scenario = self.nominal.scenario
+        step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
+        count = max(1.0, step / scenario.tracker.period)
+        return float(scenario.tracker.jitter_per_axis**2 / count + _unexplained(scenario)**2)
+
+    def _due(self) -> Iterator[int]:
+        """The parameters whose curves are to be simulated this period, ."""
         for place, k in enumerate(_LEADING):
-            if place % _LEADING_ROUND == self.turn % _LEADING_ROUND and deepest >= self.prior.begins[k]:
+            if place % _LEADING_ROUND == self.turn % _LEADING_ROUND:
                 yield k
         for k in range(MODULUS, self.parameters.size):
-            if k % _ROUND == self.turn % _ROUND and deepest >= self.prior.begins[k]:
+            if k % _ROUND == self.turn % _ROUND:
                 yield k
 
 
@@ -276,8 +288,7 @@ class _Readings:
 
     def variance(self, scenario: Scenario) -> Floats:
         """Of the lateral readings (r,), mm²: their jitter and what no parameter explains."""
-        unexplained = max(_MS0, _MS * scenario.needle.bevel.offset_mm)**2
-        variance: Floats = scenario.tracker.jitter_per_axis**2 / self.count + unexplained
+        variance: Floats = scenario.tracker.jitter_per_axis**2 / self.count + _unexplained(scenario)**2
         return variance
 
     def axial(self, belief: Identified) -> tuple[float, float]:
@@ -302,10 +313,10 @@ class _Prior:
     begins: Floats
 
     @staticmethod
-    def of(scenario: Scenario, settings: AdaptiveMpc) -> "_Prior":
+    def of(scenario: Scenario, settings: AdaptiveMpc, depth: float) -> "_Prior":
         """The scenario's."""
         control = scenario.control
-        layers, cells = len(scenario.tissue), _cells(scenario, settings)
+        layers, cells = len(scenario.tissue), _cells(depth, settings)
         single = (
             [control.start_offset_sd_mm, control.start_angle_sd, settings.bend_sd_mm]
             + [settings.run_out_sd_mm, settings.bevel_sd, _CLSD if scenario.setup.has_guide else 0.0]
@@ -335,6 +346,10 @@ class _Prior:
         return float(0.5 * off @ self.precision @ off)
 
 
+def _unexplained(scenario: Scenario) -> float:
+    return max(_MS0, _MS * scenario.needle.bevel.offset_mm)
+
+
 def _uncorrelating(size: int, distance: float) -> Floats:
     """Inverse of the correlation exp(−distance |i − j|): that of a Markov chain, so tridiagonal."""
     share = np.exp(-distance)
@@ -345,9 +360,9 @@ def _uncorrelating(size: int, distance: float) -> Floats:
     return inverse
 
 
-def _cells(scenario: Scenario, settings: AdaptiveMpc) -> int:
-    """Cells from the skin to the end of the stroke."""
-    return max(2, int(np.ceil(scenario.setup.max_depth / settings.cell_mm)))
+def _cells(depth: float, settings: AdaptiveMpc) -> int:
+    """Cells from the skin to the target's depth (mm); the last one goes on."""
+    return max(2, int(np.ceil(depth / settings.cell_mm)))
 
 
 def _check_cells(scenario: Scenario, settings: AdaptiveMpc) -> None:
