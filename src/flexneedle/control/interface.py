@@ -30,6 +30,8 @@ _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 class Decision:
     """A command, why, its predicted cost, and the standard deviation left in the guide step (mm; NaN: none).
 
+    miss, miss_sd: lateral miss predicted at the target, past it in +y or −y, and its standard deviation once the loop
+    has gone on correcting (mm; NaN: not predicted). The loop warns and holds by them.
     Raises InputError for a command of another length.
     """
 
@@ -37,6 +39,8 @@ class Decision:
     why: str
     cost: float = math.nan
     spread: float = math.nan
+    miss: float = math.nan
+    miss_sd: float = math.nan
 
     def __post_init__(self) -> None:
         if len(self.command) != len(COLUMNS):

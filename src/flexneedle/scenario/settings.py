@@ -95,7 +95,12 @@ class Control(Section):
     start_angle_sd_mrad: NonNegative = 3.0
     """What the controller expects of the base clamp's slope: its standard deviation."""
     innovation_limit_mm: Positive = 2.0
-    """A measured tip further than this from the predicted one is not believed."""
+    """A measured tip further than this, and three standard deviations of the prediction, from the predicted one is not
+    used."""
+    miss_limit_mm: Positive = 2.0
+    """The needle is held where no path is found that ends within this lateral distance of the target,"""
+    miss_confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95
+    """if the predicted miss is beyond it with at least this probability."""
     hold_limit_s: Positive = 1.0
     """The insertion is given up after so long without a measurement to believe."""
     stale_after_s: Positive = 0.3
