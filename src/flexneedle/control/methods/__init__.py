@@ -47,7 +47,7 @@ def checked(scenario: Scenario, *own: Method, source: str = "") -> Scenario:
 def used(scenario: Scenario, *own: Method, source: str = "") -> Scenario:
     """Return the scenario as `checked` does, for one use: a table may belong to a controller that is not in use.
 
-    Of such a table it warns (ScenarioWarning), in the same words whatever the source, so that it is said once.
+    Of such a table it warns (ScenarioWarning), in the same words whatever the source: it is printed once.
     """
     known = _with(own)
     for line in unowned(scenario, known):
