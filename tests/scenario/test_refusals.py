@@ -135,6 +135,7 @@ COUNTS = {
     "needle.nodes": (2, 10_000),
     "plan.samples": (2, 100_000),
     "plan.iterations": (1, 10_000),
+    "plan.max_iterations": (1, 10_000),
     "plan.primitives": (1, 1_000),
     "control.samples": (2, 100_000),
     "control.iterations": (1, 1_000),

@@ -61,7 +61,8 @@ class Method:
     """A controller. Memory is a frozen value of its own kind: what it carries from one period to the next.
 
     name: as in `--controller`; summary: one line for lists; beliefs: its observer;
-    begin: memory at the start; decide: the next command and the memory after it; arrived: whether it is done.
+    begin: memory at the start; decide: the next command and the memory after it; arrived: whether it is done;
+    needs_guide: whether it is refused where the guide may not move.
     """
 
     name: str
@@ -70,3 +71,4 @@ class Method:
     begin: Callable[[Task], Any]
     decide: Callable[[Task, Any, Estimate, np.random.Generator], tuple[Decision, Any]]
     arrived: Callable[[Task, Any, Estimate], bool] = at_depth
+    needs_guide: bool = False

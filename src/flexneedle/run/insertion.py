@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Decision, Method, Task, at_depth
 from flexneedle.control.methods import DEFAULT, method
 from flexneedle.errors import RunError
@@ -39,8 +40,9 @@ def insert(
 
     controller: one of `control.methods.METHODS`; phantom: "exact" or "model", the formulation of the plant.
     `threads` is for rollouts (default: all cores) and changes no result. `on_period` gets each control period as
-    it ends. Raises InputError for an unknown name, RunError if the plan misses its target by more than 1 mm,
-    unless `force`. Same seed, same record, but for wall-clock durations.
+    it ends. Raises InputError for an unknown name and for a controller that needs the guide where it may not move,
+    RunError if the plan misses its target by more than 1 mm, unless `force`. Same seed, same record, but for
+    wall-clock durations.
     """
     phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
     rig = virtual_rig(scenario, plan.bevel, Seeds(phantom_seed, tracker_seed, room_seed), phantom)
@@ -73,6 +75,7 @@ def run(
 ) -> Insertion:
     """Carry out `plan` on any rig; as `insert`."""
     chosen = method(controller)
+    check_guide(chosen, scenario.setup, plan.strategy)
     if not plan.reached and not force:
         raise RunError(
             f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), bound by {plan.limit}; "

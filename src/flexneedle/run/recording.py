@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from flexneedle.control.guide import check_guide
 from flexneedle.control.methods import DEFAULT, method
 from flexneedle.errors import InputError
 from flexneedle.phantom import DEFAULT_PLANT, PLANTS
@@ -75,6 +76,7 @@ def record_insertion(
     """
     folder.values |= {"controller": choices.controller, "phantom": choices.phantom}
     with _marked(folder):
+        check_guide(method(choices.controller), scenario.setup, choices.strategy)
         plan_seed = choices.seed if choices.plan_seed is None else choices.plan_seed
         plan = _plan(folder, scenario, choices.strategy, plan_seed, on_iteration)
         insertion = _insert(folder, scenario, plan, choices, on_period)

@@ -17,7 +17,6 @@ from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Decision, Method, Task, travel_left
 from flexneedle.control.mpc import planned_base
 from flexneedle.control.observer import Beliefs
-from flexneedle.errors import InputError
 from flexneedle.scenario import Setup
 from flexneedle.scenario.methods import BroydenMpc
 from flexneedle.trace import PlanRecord
@@ -42,9 +41,7 @@ class Learnt:
 
 
 def begin(task: Task) -> Learnt:
-    """Start with a tip that goes straight on, and aside with the guide. Raises InputError without a guide."""
-    if not task.scenario.setup.has_guide:
-        raise InputError("controller = 'broyden-mpc': steers with the guide: give setup.guide_to_skin_mm")
+    """Start with a tip that goes straight on, and aside with the guide."""
     return Learnt(np.diag([1.0, task.scenario.control.broyden_mpc.guide_effect]))
 
 
@@ -166,4 +163,5 @@ METHOD = Method(
     Beliefs(),
     begin=begin,
     decide=decide,
+    needs_guide=True,
 )

@@ -19,19 +19,12 @@ from flexneedle.control.interface import Decision, Method, Task, travel_left
 from flexneedle.control.methods.bevel_only import turn
 from flexneedle.control.mpc import planned_base
 from flexneedle.control.observer import Beliefs
-from flexneedle.errors import InputError
 from flexneedle.scenario import Setup
 from flexneedle.simulator import Simulator, State
 from flexneedle.trace import PlanRecord
 
 Floats = NDArray[np.float64]
 _DISTURBANCE_MM = 0.05  # of the guide: above rounding, small against the 10 mm in which the tissue stiffens
-
-
-def begin(task: Task) -> None:
-    """Nothing to remember. Raises InputError without a guide."""
-    if not task.scenario.setup.has_guide:
-        raise InputError("controller = 'resolved-rate': steers with the guide: give setup.guide_to_skin_mm")
 
 
 def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generator) -> tuple[Decision, None]:
@@ -98,6 +91,7 @@ METHOD = Method(
     "resolved-rate",
     "guide by the damped inverse of the model's Jacobian, bevel by the rule",
     Beliefs(),
-    begin=begin,
+    begin=lambda _task: None,
     decide=decide,
+    needs_guide=True,
 )
