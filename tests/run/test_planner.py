@@ -197,7 +197,7 @@ def test_mirrored_controls_mirror_the_plan():
             (40.0, 5.0),
             "steering",
             {},
-            "needle.bevel.offset_mm = 4 (only the bevel steers, from -1.80 to 1.80 mm",
+            "needle.bevel.offset_mm = 4 (only the bevel steers: -1.80 to 1.80 mm",
         ),
         ((60.0, 0.0), "steering", {"plan.accuracy_weight_per_mm": 0.0}, "plan.accuracy_weight_per_mm = 0"),
         ((45.0, 14.0), "manipulation", {"setup.max_guide_step_mm": 1e-3}, "setup.max_guide_step_mm = 0.001"),

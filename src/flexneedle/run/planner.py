@@ -182,7 +182,7 @@ def _binding_limit(simulator: Simulator, problem: Problem, controls: Floats, sta
     if _bevel_alone(problem):
         least, greatest = reach(_rollout(simulator), problem)
         if not least <= problem.target[1] <= greatest:
-            why = f"only the bevel steers, from {least:.2f} to {greatest:.2f} mm at this depth"
+            why = f"only the bevel steers: {least:.2f} to {greatest:.2f} mm"
             return f"needle.bevel.offset_mm = {scenario.needle.bevel.offset_mm:g} ({why})"
     if guide > _AT_LIMIT * setup.max_guide_travel_mm:
         return f"setup.max_guide_travel_mm = {setup.max_guide_travel_mm:g}"
