@@ -12,6 +12,7 @@ import numpy as np
 from flexneedle.control import tables
 from flexneedle.control.estimate import Estimate
 from flexneedle.control.forecast import hopeless, warning
+from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Decision, Method, Task, at_depth
 from flexneedle.control.methods import DEFAULT, used
 from flexneedle.errors import InputError, RunError
@@ -48,7 +49,7 @@ def insert(
     (docs/extend.md).
     `threads` is for rollouts (default: all cores) and changes no result. `on_period` gets each control period as
     it ends. Raises InputError for an unknown name or an object that is none, ScenarioError for a setting that the
-    controllers refuse, RunError if the plan misses its target by more than 1 mm,
+    controllers refuse, InputError for a controller that needs the guide where it may not move, RunError if the plan misses its target by more than 1 mm,
     unless `force`. Same seed, same record, but for wall-clock durations.
     """
     phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
@@ -84,6 +85,7 @@ def run(
 ) -> Insertion:
     """Carry out `plan` on any rig; as `insert`."""
     name, chosen = controller_of(controller)
+    check_guide(chosen, scenario.setup, plan.strategy)
     if not plan.reached and not force:
         raise RunError(
             f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), bound by {plan.limit}; "
