@@ -15,11 +15,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     actions.add_parser("list", help="list the presets").set_defaults(handler=_list)
 
     show = actions.add_parser("show", help="print a scenario with all its defaults, as TOML")
-    show.add_argument("scenario", metavar="SCENARIO", help="preset name or path")
+    show.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path")
     show.set_defaults(handler=_show)
 
     check = actions.add_parser("check", help="check a scenario: one line for each problem, exit status 2")
-    check.add_argument("scenario", metavar="SCENARIO", help="path or preset name")
+    check.add_argument("scenario", metavar="SCENARIO", help="path, preset name or world:NUMBER")
     check.set_defaults(handler=_check)
 
     actions.add_parser("schema", help="print the JSON schema of scenario files").set_defaults(handler=_schema)
