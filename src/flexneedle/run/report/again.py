@@ -8,6 +8,7 @@ from typing import Any
 from flexneedle.errors import ScenarioError
 from flexneedle.run.report.rows import Rows
 from flexneedle.scenario import Scenario, dump_scenario, load_scenario, preset_names
+from flexneedle.scenario.worlds import world_name
 
 __all__ = ["commands", "scenario_of"]
 
@@ -27,6 +28,9 @@ def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
             found[row] = ""
             continue
         key = _target_left_out(scenario)
+        if (name := _world_of(rows, row)) and _target_left_out(load_scenario(name)) == key:
+            found[row] = _command(rows, row, name)
+            continue
         if key not in sources:
             sources[key] = f"scenario-{1 + len(sources) - len(preset_names())}.toml"
             (folder / sources[key]).write_text(dump_scenario(scenario), encoding="utf-8", newline="\n")
@@ -47,6 +51,12 @@ def scenario_of(rows: Rows, row: int) -> Scenario | None:
         return Scenario.from_values({"name": "Scenario of a study", **_nested(settings)})
     except (ScenarioError, TypeError):
         return None
+
+
+def _world_of(rows: Rows, row: int) -> str:
+    """Return the name of a row's world, or ""."""
+    number = rows.value("world", row)
+    return "" if number is None else world_name(int(number), rows.value("world_case", row))
 
 
 def _command(rows: Rows, row: int, source: str) -> str:
