@@ -86,13 +86,13 @@ SPACES: dict[str, dict[str, Range]] = {
         "control.broyden_mpc.guide_effect": Range(0.3, 2.0),
     },
     "ce-mpc": {
-        "control.samples": Range(16, 128, whole=True),
-        "control.horizon": Range(2, 16, whole=True),
-        "control.orientation_weight_mm": Range(0.3, 20.0),
-        "control.guide_weight": Range(1e-3, 1.0),
-        "control.energy_weight_per_mj": Range(0.1, 20.0),
-        "control.flip_dead_band": BAND,
-        "control.curvature_per_m": CURVATURE,
+        "control.ce_mpc.samples": Range(16, 128, whole=True),
+        "control.ce_mpc.horizon": Range(2, 16, whole=True),
+        "control.ce_mpc.orientation_weight_mm": Range(0.3, 20.0),
+        "control.ce_mpc.guide_weight": Range(1e-3, 1.0),
+        "control.ce_mpc.energy_weight_per_mj": Range(0.1, 20.0),
+        "control.ce_mpc.flip_dead_band": BAND,
+        "control.ce_mpc.curvature_per_m": CURVATURE,
     },
     # Less weight on the tissue's energy means less error: those weights are set by what the tissue may take.
     "adaptive-mpc": {

@@ -29,6 +29,7 @@ def insert(
     *,
     controller="adaptive-mpc",
     phantom="exact",
+    tracker="scenario",
     force=False,
     on_period=None,
     miss=0.06,
@@ -36,6 +37,7 @@ def insert(
     outcome="done",
 ):
     """Insert as `flexneedle.insert` does; stop: after so many periods, call that."""
+    del tracker  # nothing is measured
     if not plan.reached and not force:
         raise RunError(f"plan misses the target by {plan.error_mm:.2f} mm, bound by {plan.limit}")
     periods = []

@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import flexneedle
-from flexneedle.control.methods import METHODS
+from flexneedle.control.methods import METHODS, checked
 from flexneedle.run.report.reading import read_tuning
 from flexneedle.trace.plain import to_text
 
@@ -43,7 +43,7 @@ def record_of(method):
 
 @pytest.mark.parametrize("method", TUNED)
 def test_shipped_settings_are_those_that_tuning_chose(method):
-    shipped, chosen = flexneedle.load_scenario("phantom").flat(), record_of(method)["chosen"]
+    shipped, chosen = checked(flexneedle.load_scenario("phantom")).flat(), record_of(method)["chosen"]
     assert chosen
     assert {key: shipped[key] for key in chosen} == chosen
 

@@ -7,10 +7,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .errors import CommandError, FlexneedleError, InputError, RunError, ScenarioError, StateError
+    from .control.estimate import Estimate
+    from .control.interface import Decision, Method, Task, travel_left
+    from .errors import (
+        CommandError,
+        FlexneedleError,
+        InputError,
+        RunError,
+        ScenarioError,
+        ScenarioWarning,
+        StateError,
+    )
+    from .phantom import Plant, Truth
+    from .ports import Sample, TipTracker
     from .run.insertion import insert
     from .run.planner import plan
-    from .scenario import Scenario, load_scenario
+    from .scenario import Scenario, Section, load_scenario
     from .simulator import Control, Simulator, State
 
 __version__ = "0.1.0"
@@ -18,25 +30,43 @@ __version__ = "0.1.0"
 __all__ = [
     "CommandError",
     "Control",
+    "Decision",
+    "Estimate",
     "FlexneedleError",
     "InputError",
+    "Method",
+    "Plant",
     "RunError",
+    "Sample",
     "Scenario",
     "ScenarioError",
+    "ScenarioWarning",
+    "Section",
     "Simulator",
     "State",
     "StateError",
+    "Task",
+    "TipTracker",
+    "Truth",
     "__version__",
     "insert",
     "load_scenario",
     "plan",
+    "travel_left",
 ]
 
 _HOMES = {
-    "errors": ("CommandError", "FlexneedleError", "InputError", "RunError", "ScenarioError", "StateError"),
+    "control.estimate": ("Estimate",),
+    "control.interface": ("Decision", "Method", "Task", "travel_left"),
+    "errors": (
+        *("CommandError", "FlexneedleError", "InputError", "RunError", "ScenarioError", "ScenarioWarning"),
+        "StateError",
+    ),
+    "phantom": ("Plant", "Truth"),
+    "ports": ("Sample", "TipTracker"),
     "run.insertion": ("insert",),
     "run.planner": ("plan",),
-    "scenario": ("Scenario", "load_scenario"),
+    "scenario": ("Scenario", "Section", "load_scenario"),
     "simulator": ("Control", "Simulator", "State"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

@@ -1,6 +1,14 @@
 """The one tree of errors. A message is one line: the value, the rule, the valid choices."""
 
-__all__ = ["CommandError", "FlexneedleError", "InputError", "RunError", "ScenarioError", "StateError"]
+__all__ = [
+    "CommandError",
+    "FlexneedleError",
+    "InputError",
+    "RunError",
+    "ScenarioError",
+    "ScenarioWarning",
+    "StateError",
+]
 
 
 class FlexneedleError(Exception):
@@ -44,3 +52,7 @@ class StateError(InputError):
 
 class RunError(FlexneedleError):
     """An insertion or a study could not be carried out (exit status 1)."""
+
+
+class ScenarioWarning(UserWarning):
+    """A scenario has a key that still works, or is not used, and should be changed. The message is one line."""

@@ -21,6 +21,7 @@ from flexneedle.trace.reader import read_trace
 from synthetic import make_periods
 from synthetic_readings import with_readings
 
+OWN = ", or module:NAME of your own"
 INSERTION_FILES = ["insertion.png", "insertion.svg", "run.json", "trace.mcap"]
 INSERT_KEYS = [
     *("controller", "phantom"),
@@ -148,8 +149,9 @@ def test_every_controller_is_listed_with_its_summary(capsys, in_tmp):
 @pytest.mark.parametrize(
     ("argv", "line"),
     [
-        (["--controller", "pid"], f"controller = 'pid': must be one of {', '.join(METHODS)}"),
-        (["--phantom", "jelly"], "phantom = 'jelly': must be one of exact, model"),
+        (["--controller", "pid"], f"controller = 'pid': must be one of {', '.join(METHODS)}{OWN}"),
+        (["--phantom", "jelly"], f"phantom = 'jelly': must be one of exact, model{OWN}"),
+        (["--tracker", "eye"], f"tracker = 'eye': must be one of scenario{OWN}"),
     ],
 )
 def test_a_name_that_there_is_not_is_a_line_with_the_choices(capsys, in_tmp, argv, line):

@@ -11,6 +11,7 @@ import pytest
 
 import flexneedle
 from flexneedle.cli import main as cli
+from flexneedle.control.methods import METHODS, checked
 from flexneedle.errors import RunError
 from flexneedle.scenario import Scenario, load_scenario
 
@@ -41,7 +42,46 @@ def test_show_prints_the_scenario_with_its_defaults(capsys, minimal_text, scenar
     status, out, err = run(capsys, "scenario", "show", path)
     assert (status, err) == (0, [])
     assert tomllib.loads(out)["plan"]["samples"] == 128
-    assert Scenario.from_values(tomllib.loads(out)) == load_scenario(path)
+    assert Scenario.from_values(tomllib.loads(out)) == checked(load_scenario(path))
+
+
+def test_show_prints_the_settings_of_every_controller_and_loads_back_equal(capsys, tmp_path):
+    out = run(capsys, "scenario", "show", "phantom")[1]
+    assert set(tomllib.loads(out)["control"]) >= {
+        method.table for method in METHODS.values() if method.settings is not None
+    }
+    path = tmp_path / "shown.toml"
+    path.write_text(out)
+    assert load_scenario(path) == checked(load_scenario("phantom"))
+    assert run(capsys, "scenario", "show", str(path)) == (0, out, [])
+
+
+def test_an_old_key_is_warned_of_in_one_line(capsys, minimal_text, scenario_file):
+    path = scenario_file(minimal_text + "\n[control]\nhorizon = 9\n")
+    status, out, err = run(capsys, "scenario", "show", str(path))
+    assert status == 0
+    assert tomllib.loads(out)["control"]["ce_mpc"]["horizon"] == 9
+    assert err == [f"flexneedle: {path}: control.horizon is now control.ce_mpc.horizon: rename it"]
+
+
+def test_check_refuses_keys_and_tables_that_no_controller_has(capsys, minimal_text, scenario_file):
+    tables = "\n[control.bevel_only]\ncurvature = 0.1\n[control.bevel_olny]\n"
+    path = scenario_file(minimal_text + tables)
+    for command in ("check", "show"):
+        status, out, (line,) = run(capsys, "scenario", command, str(path))
+        assert (status, out) == (2, "")
+        assert line.startswith(
+            f"flexneedle: {path}: control.bevel_olny: unknown table; did you mean bevel_only? tables: "
+        )
+    path = scenario_file(minimal_text + tables.rpartition("[")[0])
+    assert run(capsys, "scenario", "check", str(path)) == (
+        2,
+        "",
+        [
+            f"flexneedle: {path}: control.bevel_only.curvature = 0.1: unknown key; did you mean "
+            "curvature_per_m? valid keys: curvature_per_m, flip_dead_band"
+        ],
+    )
 
 
 def test_check_says_ok(capsys, minimal_text, scenario_file):
@@ -71,6 +111,8 @@ def test_schema_describes_every_key_with_a_unit_or_a_meaning(capsys):
         ("description" in field or "$ref" in field) for s in sections for field in s["properties"].values()
     ]
     assert all(described)
+    tables = schema["$defs"]["Control"]["properties"]
+    assert {"ce_mpc", "bevel_only", "load_gain"} <= set(tables)
 
 
 @pytest.mark.parametrize("argv", [["scenario"], ["scenario", "show"], ["nonsense"], []])

@@ -7,6 +7,7 @@ import pytest
 import flexneedle
 from flexneedle.control.observer import Beliefs
 from flexneedle.simulator import Control, Simulator
+from tasks import begun_with
 
 PHANTOM = flexneedle.load_scenario("phantom")
 
@@ -56,6 +57,8 @@ def believed():
     """An estimate of a state, with whatever else is to be believed."""
 
     def believe(state, **fields):
-        return replace(Beliefs().begin(Simulator(state.scenario, threads=1), 1), state=state, **fields)
+        return replace(
+            Beliefs().begin(begun_with(Simulator(state.scenario, threads=1), 1)), state=state, **fields
+        )
 
     return believe

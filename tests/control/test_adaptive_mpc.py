@@ -10,11 +10,13 @@ from hypothesis import strategies as st
 
 import flexneedle
 from flexneedle.control import bang_bang, route
+from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.identification import RUN_OUT, Identification
-from flexneedle.control.interface import Task, travel_left
+from flexneedle.control.interface import travel_left
 from flexneedle.control.methods import DEFAULT, METHODS, adaptive_mpc
 from flexneedle.ports import Sample
 from flexneedle.simulator import Control, Learnt, Simulator
+from tasks import begun_with, task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
 FEW = {
@@ -25,12 +27,12 @@ QUICK = PHANTOM.with_values(FEW)
 ACCURATE = PHANTOM.with_values({"control.adaptive_mpc.energy_weight_per_mj": 0.0})
 BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
 ADAPTIVE = METHODS["adaptive-mpc"]
-HORIZON = PHANTOM.control.adaptive_mpc.horizon
+HORIZON = AdaptiveMpc().horizon
 
 
 def belief_of(state, scenario=PHANTOM, **fields):
     """A belief that the needle is so."""
-    begun = Identification().begin(Simulator(scenario, threads=1), state.bevel)
+    begun = Identification().begin(begun_with(Simulator(scenario, threads=1), state.bevel))
     return replace(begun, state=replace(state, scenario=scenario), tips=state.tip[None], **fields)
 
 
@@ -42,7 +44,7 @@ def on_plan(plan, belief):
 def decided(plan, belief, seed=0, way=None):
     """Decision and the way after it."""
     return ADAPTIVE.decide(
-        Task(belief.nominal, plan), way or on_plan(plan, belief), belief, np.random.default_rng(seed)
+        task_of(belief.nominal, plan), way or on_plan(plan, belief), belief, np.random.default_rng(seed)
     )
 
 
@@ -59,8 +61,8 @@ def aimed(plan, state, aside, ahead=20.0):
 
 def carried_out(plan, scenario, plant=None, steps=100):
     """Commands of a whole insertion into a plant whose tip is seen at the end of each, and the states at the end."""
-    task, plant = Task(Simulator(scenario, threads=1), plan), plant or Simulator(scenario, threads=1)
-    estimate, rng = ADAPTIVE.beliefs.begin(task.simulator, plan.bevel), np.random.default_rng(0)
+    task, plant = task_of(Simulator(scenario, threads=1), plan), plant or Simulator(scenario, threads=1)
+    estimate, rng = ADAPTIVE.observer.begin(task), np.random.default_rng(0)
     truth, memory, commands = plant.start(plan.bevel), ADAPTIVE.begin(task), []
     for k in range(steps):
         decision, memory = ADAPTIVE.decide(task, memory, estimate, rng)
@@ -88,8 +90,8 @@ def test_the_bevel_follows_the_rule_if_the_model_agrees_and_in_air_it_stays(quic
     for steps, in_air in ((50, False), (5, True)):
         state = Simulator(PHANTOM).step(along(quick_plan, steps), Control(flip=turned))
         away, belief = aimed(quick_plan, state, 2.0 * side), belief_of(state)
-        task = Task(belief.nominal, away)
-        flip, why = bang_bang.decide(task, belief, PHANTOM.control.adaptive_mpc)
+        task = task_of(belief.nominal, away)
+        flip, why = bang_bang.decide(task, belief, AdaptiveMpc())
         assert flip is (side != state.bevel and not in_air)
         decision, rng = decide(away, belief), np.random.default_rng(0)
         expected = [
@@ -187,8 +189,8 @@ def test_limits_are_kept_whatever_the_plan(quick_plan, step, reach, advance, str
         guide=quick_plan.guide * stretch, controls=quick_plan.controls * [1.0, 1.0, 1.0, stretch, 1.0],
     )  # fmt: skip
     simulator, rng = Simulator(scenario, threads=1), np.random.default_rng(seed)
-    task = Task(simulator, wide)
-    estimate, places, memory = Identification().begin(simulator, 1), [0.0], ADAPTIVE.begin(task)
+    task = task_of(simulator, wide)
+    estimate, places, memory = Identification().begin(begun_with(simulator, 1)), [0.0], ADAPTIVE.begin(task)
     if seed % 2:  # the way is looked for in air already
         memory = replace(memory, renew_at=-np.inf)
     for k in range(12):
@@ -250,7 +252,7 @@ def test_cost_is_that_of_the_chosen_step(quick_plan, along, left):
     depth = state.tip[0] + min(1.0, left)
     y, turn = (np.interp(depth, goal.tips[:, 0], goal.tips[:, k]) for k in (1, 2))
     near = left < 1.0
-    weight = scenario.control.adaptive_mpc.target_weight if near else 1.0
+    weight = AdaptiveMpc().target_weight if near else 1.0
     off = (after.tip[1] - (2.0 if near else y)) ** 2 + (40.0 * (after.tip[2] - turn)) ** 2
     planned = np.diff(np.interp([state.tip[0], depth], goal.tips[:, 0], goal.guide))[0]
     expected = weight * off + 3.0 * (decision.command[3] - planned) ** 2 + 2.0 * after.strain_energy
@@ -345,7 +347,7 @@ def counted(monkeypatch, way=None):
 
     def renewed(task, belief, old, _rng):
         sought.append(float(belief.state.tip[0]))
-        return way or replace(old, renew_at=sought[-1] + task.scenario.control.adaptive_mpc.route_mm)
+        return way or replace(old, renew_at=sought[-1] + task.settings.route_mm)
 
     monkeypatch.setattr(adaptive_mpc, "renewed", renewed)
     return sought

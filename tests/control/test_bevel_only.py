@@ -7,9 +7,9 @@ import pytest
 
 import flexneedle
 from flexneedle.control import bang_bang
-from flexneedle.control.interface import Task
 from flexneedle.control.methods import METHODS
 from flexneedle.simulator import Control, Simulator
+from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
 BEVEL = METHODS["bevel-only"]
@@ -17,7 +17,7 @@ BEVEL = METHODS["bevel-only"]
 
 def command(plan, estimate, **settings):
     scenario = PHANTOM.with_values({f"control.bevel_only.{key}": value for key, value in settings.items()})
-    task = Task(Simulator(scenario, threads=1), plan)
+    task = task_of(Simulator(scenario, threads=1), plan, "bevel-only")
     decision, memory = BEVEL.decide(task, BEVEL.begin(task), estimate, np.random.default_rng(0))
     assert memory is None
     return decision.command

@@ -12,15 +12,15 @@ from hypothesis.extra.numpy import arrays
 from scipy.optimize import lsq_linear
 
 import flexneedle
-from flexneedle.control.interface import Task
 from flexneedle.control.methods import METHODS
 from flexneedle.control.methods import broyden_mpc as bm
 from flexneedle.errors import InputError
 from flexneedle.simulator import Simulator
+from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
 BROYDEN = METHODS["broyden-mpc"]
-SETTINGS = PHANTOM.control.broyden_mpc
+SETTINGS = bm.BroydenMpc()
 RNG = np.random.default_rng(0)
 NUMBERS = st.floats(-2.0, 2.0)
 MATRIX, VECTOR = arrays(float, (2, 2), elements=NUMBERS), arrays(float, 2, elements=NUMBERS)
@@ -152,7 +152,7 @@ def linear_run(plan, slope, effect, *, delay=1, steps=30, noise=0.0, guide_effec
     scenario = PHANTOM.with_values(
         {"control.broyden_mpc.guide_weight": 0.0, "control.broyden_mpc.guide_effect": guide_effect}
     )
-    task = Task(Simulator(scenario, threads=1), plan)
+    task = task_of(Simulator(scenario, threads=1), plan, "broyden-mpc")
     learnt, inputs, tips = BROYDEN.begin(task), [np.zeros(2)], [np.array([-28.5, 0.0])]
     rng = np.random.default_rng(1)
     for k in range(steps):
@@ -227,7 +227,7 @@ def test_inputs_are_those_of_when_the_tip_was_there():
 
 
 def test_memory_is_a_value_that_deciding_leaves_alone(quick_plan, along, believed):
-    task = Task(Simulator(PHANTOM, threads=1), quick_plan)
+    task = task_of(Simulator(PHANTOM, threads=1), quick_plan, "broyden-mpc")
     state = along(quick_plan, 30)
     seen = (state.tip[:2] - [2.0, 0.1], np.array([state.travel[0] - 2.0, state.guide]))
     learnt = bm.Learnt(np.array([[1.0, 0.0], [0.1, 0.9]]), (), seen)
@@ -243,7 +243,9 @@ def test_memory_is_a_value_that_deciding_leaves_alone(quick_plan, along, believe
 
 
 def test_without_a_guide_it_says_what_it_needs(quick_plan):
-    task = Task(Simulator(PHANTOM.with_values({"setup.guide_to_skin_mm": None})), quick_plan)
+    task = task_of(
+        Simulator(PHANTOM.with_values({"setup.guide_to_skin_mm": None})), quick_plan, "broyden-mpc"
+    )
     with pytest.raises(
         InputError, match=r"'broyden-mpc': steers with the guide: give setup\.guide_to_skin_mm"
     ):

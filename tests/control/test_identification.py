@@ -7,6 +7,7 @@ import pytest
 
 import flexneedle
 from flexneedle.control import identification as idn
+from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.identification import (
     BASE_TURN,
     BASE_Y,
@@ -16,9 +17,11 @@ from flexneedle.control.identification import (
     RUN_OUT,
     Identification,
 )
+from flexneedle.errors import ScenarioError
 from flexneedle.mechanics import needle as nd
 from flexneedle.ports import Sample
 from flexneedle.simulator import Control, Learnt, Simulator
+from tasks import begun_with
 
 PHANTOM = flexneedle.load_scenario("phantom")
 QUIET = PHANTOM.with_values({"tracker.jitter_mm": 1e-3, "control.adaptive_mpc.model_sd_mm": 3e-3})
@@ -26,7 +29,7 @@ TURNS = (20, 40, 52)  # moves that turn the bevel, the first in air
 LAYERS = len(PHANTOM.tissue)
 SHIFT = MODULUS + LAYERS
 CELLS = SHIFT + LAYERS - 1
-OWN = PHANTOM.control.adaptive_mpc
+OWN = AdaptiveMpc()
 WAVES = tuple(
     (1.0 + 0.5 * np.sin(0.45 * np.arange(15))).tolist()
 )  # factors on the modulus in cells of 2.5 mm
@@ -95,7 +98,7 @@ def followed(needle, count, *, scenario=QUIET, noise=0.0, late=0, threads=1, per
     """The belief after so many moves, the readings coming so many moves late; the needle's states."""
     rows, rng = commands(count), np.random.default_rng(2)
     states = needle.inserted(scenario, rows)
-    estimate = Identification().begin(Simulator(scenario, threads), 1)
+    estimate = Identification().begin(begun_with(Simulator(scenario, threads), 1))
     batches = [readings(needle, states[k], states[k + 1], k, per_move, noise, rng) for k in range(len(rows))]
     for k, row in enumerate(rows):
         estimate = estimate.move(row, k, k + 1.0)
@@ -126,7 +129,7 @@ def ahead(estimate, needle, states, scenario=QUIET, steps=8):
 
 
 def test_it_begins_with_the_scenario():
-    estimate = Identification().begin(Simulator(PHANTOM, 1), -1)
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), -1))
     np.testing.assert_array_equal(estimate.tip, [-28.5, 0.0, 0.0])
     cells = int(np.ceil(81.5 / OWN.cell_mm))  # to the end of the stroke
     assert estimate.parameters.size == CELLS + cells
@@ -240,7 +243,7 @@ def test_tissue_of_other_layers_is_identified_too(layers):
 def test_a_tracker_without_jitter_is_believed_but_for_what_no_parameter_explains():
     scenario = PHANTOM.with_values({"tracker.jitter_mm": 0.0})
     estimate, states = followed(NEEDLES["all"], 66, scenario=scenario)
-    np.testing.assert_array_equal(estimate._readings.variance(scenario), OWN.model_sd_mm**2)
+    np.testing.assert_array_equal(estimate._readings.variance(scenario, OWN), OWN.model_sd_mm**2)
     assert estimate.tip[1] == pytest.approx(NEEDLES["all"].seen(states[-1])[1], abs=0.01)
 
 
@@ -249,7 +252,11 @@ def test_more_noise_means_less_is_believed():
     moved = []
     for jitter in (1e-3, 0.05, 0.5):
         scenario = PHANTOM.with_values({"tracker.jitter_mm": jitter})
-        estimate = Identification().begin(Simulator(scenario, 1), 1).move((1.0, 0.0, 0.0, 0.0, -1), 0.0, 1.0)
+        estimate = (
+            Identification()
+            .begin(begun_with(Simulator(scenario, 1), 1))
+            .move((1.0, 0.0, 0.0, 0.0, -1), 0.0, 1.0)
+        )
         moved.append(estimate.observe([Sample(1.0, -27.5, 0.1)]).tip[1])
     assert 0.1 > moved[0] > moved[1] > moved[2] > 0.0
 
@@ -266,7 +273,8 @@ def test_the_prior_is_that_of_the_scenario():
         "control.adaptive_mpc.variation_sd": 0.15, "control.adaptive_mpc.variation_length_mm": 7.0,
         "control.adaptive_mpc.cell_mm": 4.0,
     }  # fmt: skip
-    prior = idn._Prior.of(PHANTOM.with_values(sds))
+    scenario = PHANTOM.with_values(sds)
+    prior = idn._Prior.of(scenario, begun_with(Simulator(scenario, 1)).settings)
     cells = 21  # of 4 mm in 81.5 mm
     apart = 4.0 * np.abs(np.subtract.outer(np.arange(cells), np.arange(cells)))
     covariance = np.zeros((CELLS + cells, CELLS + cells))
@@ -392,7 +400,7 @@ def test_the_stops_are_states_of_the_way():
 def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
     """Least squares of readings and prior stacked, each over its standard deviation."""
     belief, seen = off_the_prior(45, "bend")
-    sd = np.sqrt(QUIET.tracker.jitter_per_axis**2 / seen.count + QUIET.control.adaptive_mpc.model_sd_mm**2)
+    sd = np.sqrt(QUIET.tracker.jitter_per_axis**2 / seen.count + belief.settings.model_sd_mm**2)
     prior = np.linalg.cholesky(belief.prior.precision).T
     jacobian = idn._jacobian(belief, seen)
     matrix = np.concatenate([jacobian / sd[:, None], prior])
@@ -404,13 +412,21 @@ def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
     np.testing.assert_allclose(found, belief.parameters + step, rtol=1e-6, atol=1e-8)
 
 
+def test_cells_are_not_so_short_that_a_fit_would_never_end():
+    short = begun_with(Simulator(PHANTOM.with_values({"control.adaptive_mpc.cell_mm": 1e-3}), 1))
+    with pytest.raises(
+        ScenarioError, match=r"^control.adaptive_mpc.cell_mm = 0.001: must be at least 0.4075, "
+    ):
+        Identification().begin(short)
+
+
 # ---- its step back
 
 
 def misfit(belief, readings=None):
     """What the fit makes least: squares over variances, halved."""
     readings = readings or belief._readings
-    variance = readings.variance(belief.nominal.scenario)
+    variance = readings.variance(belief.nominal.scenario, belief.settings)
     off = belief.parameters - belief.prior.mean
     rows, p = np.array([done.applied for done in belief.moves]), belief.parameters
     y = belief.tips[:, 1]
@@ -439,7 +455,7 @@ def test_a_step_never_fits_worse(monkeypatch):
     monkeypatch.setattr(idn.Identified, "_with", counted)
     for scenario, jump in ((PHANTOM, 1.0), (QUIET, 0.1)):
         estimate, states = (
-            Identification().begin(Simulator(scenario, 1), 1),
+            Identification().begin(begun_with(Simulator(scenario, 1), 1)),
             Needle().inserted(scenario, commands(50)),
         )
         for k, row in enumerate(commands(50)):
@@ -522,7 +538,7 @@ def test_a_jacobian_that_is_not_finite_leaves_the_parameters(monkeypatch):
 
 
 def test_readings_of_a_move_are_averaged_at_their_mean_time():
-    estimate = Identification().begin(Simulator(PHANTOM, 1), 1)
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
     for k in range(2):
         estimate = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 2.0 * k, 2.0 * k + 2.0)
     seen = [Sample(2.5, -27.3, 0.1), Sample(3.5, -26.7, 0.3)]
@@ -534,7 +550,7 @@ def test_readings_of_a_move_are_averaged_at_their_mean_time():
 
 @pytest.mark.parametrize("first", [1, -1])
 def test_a_reading_is_on_the_side_to_which_the_bevel_turned_before_its_move(first):
-    estimate = Identification().begin(Simulator(PHANTOM, 1), first)
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), first))
     for k, flip in enumerate((-1, 1, -1, 1, -1)):
         estimate = estimate.move((1.0, 0.0, 0.0, 0.0, flip), float(k), k + 1.0)
     seen = [Sample(k + 0.5, -28.0 + k, 0.0) for k in (0, 1, 3, 4)]
@@ -544,11 +560,11 @@ def test_a_reading_is_on_the_side_to_which_the_bevel_turned_before_its_move(firs
 
 
 def test_the_low_pass_follows_the_newest_and_forgets():
-    gain = PHANTOM.control.adaptive_mpc.residual_gain
-    assert idn._low_passed(PHANTOM, np.array([1.0])) == pytest.approx(gain)
-    assert idn._low_passed(PHANTOM, np.array([1.0, 0.0])) == pytest.approx(gain * (1.0 - gain))
-    assert idn._low_passed(PHANTOM, np.full(200, 0.3)) == pytest.approx(0.3, rel=0.01)
-    assert idn._low_passed(PHANTOM, np.zeros(0)) == 0.0
+    gain = OWN.residual_gain
+    assert idn._low_passed(OWN, np.array([1.0])) == pytest.approx(gain)
+    assert idn._low_passed(OWN, np.array([1.0, 0.0])) == pytest.approx(gain * (1.0 - gain))
+    assert idn._low_passed(OWN, np.full(200, 0.3)) == pytest.approx(0.3, rel=0.01)
+    assert idn._low_passed(OWN, np.zeros(0)) == 0.0
 
 
 # ---- what holds whatever the readings
@@ -559,7 +575,7 @@ def test_parameters_stay_within_four_standard_deviations(off):
     """Readings far aside, in air and in tissue, and a solve that still converges."""
     rows = commands(50)
     states = Needle().inserted(PHANTOM, rows)
-    estimate = Identification().begin(Simulator(PHANTOM, 1), 1)
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
     for k, row in enumerate(rows):
         estimate = estimate.move(row, k, k + 1.0)
         x, y = states[k + 1].tip[:2]
@@ -581,7 +597,7 @@ def test_parameters_stay_within_four_standard_deviations(off):
 def test_mirrored_readings_give_the_mirrored_belief():
     needle, rows = NEEDLES["all"], commands(45)
     states = needle.inserted(PHANTOM, rows)
-    here, there = (Identification().begin(Simulator(PHANTOM, 1), side) for side in (1, -1))
+    here, there = (Identification().begin(begun_with(Simulator(PHANTOM, 1), side)) for side in (1, -1))
     for k, row in enumerate(rows):
         away = (*row[:3], -row[3], row[4])
         batch = readings(needle, states[k], states[k + 1], k, 2, 0.0, np.random.default_rng(0))
@@ -596,7 +612,7 @@ def test_a_turn_of_the_bevel_turns_bend_and_run_out_over():
     """In air: a believed bend of the free needle and a run-out show on the other side."""
     scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
     simulator = Simulator(scenario, 1)
-    estimate = Identification().begin(simulator, 1)
+    estimate = Identification().begin(begun_with(simulator, 1))
     parameters = estimate.parameters.copy()
     parameters[[BEND, RUN_OUT]] = 0.6, 0.1
     adapted = simulator.adapted(Learnt(np.zeros(1), np.ones(2), bend=0.6))
@@ -683,7 +699,7 @@ def test_without_readings_or_moves_the_belief_stays():
         assert kept.state is moved.state
         assert kept.parameters is moved.parameters
         assert kept.innovation == (0.0, 0.0)
-    start = Identification().begin(Simulator(PHANTOM, 1), 1)
+    start = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
     assert start.observe([Sample(0.0, -28.5, 0.4)]).state == start.state
 
 

@@ -10,11 +10,12 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 import flexneedle
-from flexneedle.control.interface import Task, travel_left
+from flexneedle.control.interface import travel_left
 from flexneedle.control.methods import DEFAULT, METHODS, method
 from flexneedle.errors import InputError
 from flexneedle.phantom import PLANTS
 from flexneedle.simulator import Control, Simulator
+from tasks import task_of
 
 # No observer estimates an axial start error yet.
 PHANTOM = flexneedle.load_scenario("phantom").with_values({"phantom.start_axial_sd_mm": 0.0})
@@ -24,7 +25,7 @@ WITHOUT_GUIDE = ("open-loop", "bevel-only")
 
 def drive(name, plan, scenario, believed, readings, *, steps, plant=None):
     """Commands of a controller whose belief is the plant itself and whose readings are a step late, plus `readings`."""
-    task = Task(Simulator(scenario, threads=1), plan)
+    task = task_of(Simulator(scenario, threads=1), plan, name)
     chosen, simulator = METHODS[name], Simulator(plant or scenario, threads=1)
     memory, rng = chosen.begin(task), np.random.default_rng(0)
     state, last, commands = simulator.start(plan.bevel), None, []
@@ -64,7 +65,7 @@ def test_limits_are_kept_whatever_the_target_and_the_readings(
             "setup.max_guide_step_mm": step, "setup.max_guide_travel_mm": reach, "target.lateral_mm": 0.0,
             "setup.max_advance_mm": advance, "control.resolved_rate.gain": gain,
             "setup.max_base_step_mm": step, "setup.max_base_travel_mm": reach,
-            "control.samples": 8, "control.iterations": 1,
+            "control.ce_mpc.samples": 8, "control.ce_mpc.iterations": 1,
         }
     )  # fmt: skip
     wide = replace(
@@ -170,7 +171,7 @@ def test_a_whole_insertion_into_the_exact_plant_ends_done(quick_plan, name, limi
 @pytest.mark.parametrize("name", METHODS)
 def test_every_controller_finishes_on_every_plant_with_its_commands_carried_out(quick_plan, name, plant):
     """What a motor leaves out of a step is less than its resolution; nothing else is cut from a command."""
-    few = {"control.samples": 8, "control.iterations": 1}
+    few = {"control.ce_mpc.samples": 8, "control.ce_mpc.iterations": 1}
     few |= {f"control.adaptive_mpc.{key}": value for key, value in (("samples", 8), ("iterations", 1))}
     scenario = PHANTOM.with_values(few)
     done = flexneedle.insert(scenario, quick_plan, 5001, controller=name, phantom=plant, threads=1)

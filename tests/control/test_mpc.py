@@ -9,7 +9,9 @@ import flexneedle
 from flexneedle.control import bang_bang, mpc
 from flexneedle.control.interface import Task, at_depth
 from flexneedle.control.methods import METHODS
+from flexneedle.planning.terms import Outcome, cost
 from flexneedle.simulator import Control, Simulator
+from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
 
@@ -20,12 +22,13 @@ def plan(quick_plan):
 
 
 def choose(plan, state, scenario=PHANTOM, seed=0, *, flip=False):
-    return mpc.choose(Simulator(scenario, 1), plan, state, flip=flip, rng=np.random.default_rng(seed))
+    task = task_of(Simulator(scenario, 1), plan, "ce-mpc")
+    return mpc.choose(task.simulator, plan, state, task.settings, flip=flip, rng=np.random.default_rng(seed))
 
 
 def decide(plan, estimate, seed=0):
     """What the paper's controller decides."""
-    task = Task(Simulator(PHANTOM, threads=1), plan)
+    task = task_of(Simulator(PHANTOM, threads=1), plan, "ce-mpc")
     return METHODS["ce-mpc"].decide(task, None, estimate, np.random.default_rng(seed))[0]
 
 
@@ -63,7 +66,7 @@ def test_the_deviation_shrinks_over_the_next_periods(plan, along):
 
     first = deviation()
     for _ in range(12):
-        choice = mpc.choose(simulator, plan, state, flip=False, rng=rng)
+        choice = mpc.choose(simulator, plan, state, mpc.CeMpc(), flip=False, rng=rng)
         state = simulator.step(state, Control(db_x=choice.steps[0], dg_y=choice.steps[3]))
     assert first > 0.1
     assert deviation() < 0.2 * first
@@ -75,7 +78,7 @@ def test_guide_stays_within_its_reach(plan):
     away = replace(plan, tips=plan.tips + np.array([0.0, 6.0, 0.0]))
     simulator, state, rng = Simulator(scenario), Simulator(scenario).start(), np.random.default_rng(0)
     for _ in range(4):
-        choice = mpc.choose(simulator, away, state, flip=False, rng=rng)
+        choice = mpc.choose(simulator, away, state, mpc.CeMpc(), flip=False, rng=rng)
         state = simulator.step(state, Control(db_x=choice.steps[0], dg_y=choice.steps[3]))
         assert abs(state.guide) <= 0.3 + 1e-9
     assert state.guide == pytest.approx(0.3)
@@ -121,8 +124,8 @@ def test_same_seed_same_command_other_seed_another(plan, along):
 def test_cost_is_that_of_the_chosen_steps(plan, along):
     """With a horizon of one step it can be computed again: pose against the planned one, guide, energy."""
     weights = {
-        "control.horizon": 1, "control.orientation_weight_mm": 40.0, "control.guide_weight": 3.0,
-        "control.energy_weight_per_mj": 2.0,
+        "control.ce_mpc.horizon": 1, "control.ce_mpc.orientation_weight_mm": 40.0, "control.ce_mpc.guide_weight": 3.0,
+        "control.ce_mpc.energy_weight_per_mj": 2.0,
     }  # fmt: skip
     scenario = PHANTOM.with_values(weights)
     state = along(plan, 40, scenario, base_y=1.0)
@@ -138,7 +141,11 @@ def test_cost_is_that_of_the_chosen_steps(plan, along):
 
 def test_each_step_is_held_against_the_plans_own_guide_step(plan, along):
     """With nothing but the guide's cost it repeats the plan, before a primitive's end and after it."""
-    alone = {"control.horizon": 1, "control.guide_weight": 1e6, "control.energy_weight_per_mj": 0.0}
+    alone = {
+        "control.ce_mpc.horizon": 1,
+        "control.ce_mpc.guide_weight": 1e6,
+        "control.ce_mpc.energy_weight_per_mj": 0.0,
+    }
     scenario = PHANTOM.with_values(alone)
     changes = np.flatnonzero(np.diff(plan.controls[:, 3]))
     for k in (changes[0], changes[0] + 1):
@@ -148,13 +155,14 @@ def test_each_step_is_held_against_the_plans_own_guide_step(plan, along):
 
 def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
     """One step ahead: the command is near the best of a fine grid."""
-    scenario = PHANTOM.with_values({"control.horizon": 1})
+    scenario = PHANTOM.with_values({"control.ce_mpc.horizon": 1})
     state = along(plan, 40, scenario, base_y=1.0)
     simulator, choice = Simulator(scenario), choose(plan, state, scenario)
     reference, nominal = mpc._window(plan, float(state.tip[0]), 1)
     grid = np.stack(np.meshgrid(np.linspace(0.5, 1, 41), np.linspace(-0.5, 0.5, 81)), axis=-1).reshape(-1, 2)
     controls = mpc._controls(scenario, state, grid, np.zeros((1, 2)), 40.0, flip=False)
-    best = mpc._cost(simulator, state, controls, reference, nominal).min()
+    outcome = Outcome(controls, *simulator.rollout(state, controls))
+    best = cost(mpc._cost_terms(mpc.CeMpc(horizon=1), reference, nominal[:, 3]), outcome).min()
     assert choice.cost <= best + 0.002
 
 
@@ -189,7 +197,7 @@ def test_in_tissue_the_bevel_turns_to_the_target(plan, side, turned, along, beli
 
 def test_the_rollouts_know_of_the_turn(plan, along):
     """A predicted cost of its own: the bevel that the rule chose acts on the steps that are searched."""
-    state, scenario = along(plan, 50), PHANTOM.with_values({"control.energy_weight_per_mj": 0.0})
+    state, scenario = along(plan, 50), PHANTOM.with_values({"control.ce_mpc.energy_weight_per_mj": 0.0})
     kept, turned = (choose(plan, state, scenario, flip=flip) for flip in (False, True))
     assert kept.cost != turned.cost
 

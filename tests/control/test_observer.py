@@ -12,6 +12,7 @@ from flexneedle.control.methods import METHODS
 from flexneedle.control.observer import Beliefs
 from flexneedle.ports import Sample
 from flexneedle.simulator import Control, Simulator
+from tasks import begun_with
 
 PHANTOM = flexneedle.load_scenario("phantom")
 QUIET = PHANTOM.with_values({"tracker.jitter_mm": 1e-3})
@@ -26,7 +27,7 @@ def believe_start(scenario, **corrections):
 
 def begun(simulator, state=None, bevel=1, **beliefs):
     """The belief at the start, or at a state."""
-    estimate = Beliefs(**beliefs).begin(simulator, bevel)
+    estimate = Beliefs(**beliefs).begin(begun_with(simulator, bevel))
     return estimate if state is None else replace(estimate, state=state, past=state, tips=state.tip[None])
 
 
@@ -247,7 +248,7 @@ def test_without_fitting_the_start_the_measured_tip_is_held_in_air_too():
 def test_the_papers_controller_releases_the_measured_tip_and_learns_nothing(name, learns):
     """In air no base offset, in tissue no load; the others keep both."""
     simulator = Simulator(PHANTOM)
-    begin = METHODS[name].beliefs.begin(simulator, 1)
+    begin = METHODS[name].observer.begin(begun_with(simulator, 1, name))
     for steps in (10, 40):
         state = in_tissue(simulator, steps)
         moved = replace(begin, state=state, past=state, tips=state.tip[None]).move(AHEAD, 0.0, 1.0)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.control.interface import Task
 from flexneedle.control.methods import METHODS
 from flexneedle.simulator import Control, Simulator
+from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
 OPEN = METHODS["open-loop"]
@@ -23,7 +23,7 @@ def truncated(moved, row, grid=0.01):
 
 def replayed(plan, believed, scenario=PHANTOM, motor=truncated):
     """Commands, and where base x and guide stood after each, through a driver with a motor."""
-    task = Task(Simulator(scenario, threads=1), plan)
+    task = task_of(Simulator(scenario, threads=1), plan, "open-loop")
     state, memory = task.simulator.start(plan.bevel), OPEN.begin(task)
     commands, places = [], []
     while not OPEN.arrived(task, memory, believed(state)):
@@ -68,7 +68,7 @@ def test_base_steps_are_replayed_too(quick_plan, believed):
 
 
 def test_what_the_tracker_sees_changes_nothing(quick_plan, believed, along):
-    task, state = Task(Simulator(PHANTOM, threads=1), quick_plan), along(quick_plan, 20)
+    task, state = task_of(Simulator(PHANTOM, threads=1), quick_plan, "open-loop"), along(quick_plan, 20)
     blind = OPEN.decide(task, 20, believed(state), RNG)[0].command
     seeing = OPEN.decide(task, 20, believed(state, measured=(1.0, 9.0), innovation=(0.5, 3.0)), RNG)[
         0
@@ -77,7 +77,7 @@ def test_what_the_tracker_sees_changes_nothing(quick_plan, believed, along):
 
 
 def test_it_has_arrived_once_the_steps_are_used_up_and_not_before(quick_plan, believed, along):
-    task, count = Task(Simulator(PHANTOM, threads=1), quick_plan), len(quick_plan.controls)
+    task, count = task_of(Simulator(PHANTOM, threads=1), quick_plan, "open-loop"), len(quick_plan.controls)
     far = believed(along(quick_plan, 5))
     assert not OPEN.arrived(task, count - 1, far)
     assert OPEN.arrived(task, count, far)

@@ -9,10 +9,10 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 import flexneedle
-from flexneedle.control.interface import Task
 from flexneedle.control.methods import METHODS, resolved_rate
 from flexneedle.errors import InputError
 from flexneedle.simulator import Control, Simulator
+from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
 RATE = METHODS["resolved-rate"]
@@ -20,7 +20,7 @@ RATE = METHODS["resolved-rate"]
 
 def decide(plan, estimate, **settings):
     scenario = PHANTOM.with_values({f"control.resolved_rate.{key}": value for key, value in settings.items()})
-    task = Task(Simulator(scenario, threads=1), plan)
+    task = task_of(Simulator(scenario, threads=1), plan, "resolved-rate")
     return RATE.decide(task, RATE.begin(task), estimate, np.random.default_rng(0))[0]
 
 
@@ -160,7 +160,9 @@ def test_a_look_ahead_of_less_than_a_step_is_one_step(quick_plan, along, believe
 
 
 def test_without_a_guide_it_says_what_it_needs(quick_plan):
-    task = Task(Simulator(PHANTOM.with_values({"setup.guide_to_skin_mm": None})), quick_plan)
+    task = task_of(
+        Simulator(PHANTOM.with_values({"setup.guide_to_skin_mm": None})), quick_plan, "resolved-rate"
+    )
     with pytest.raises(
         InputError, match=r"'resolved-rate': steers with the guide: give setup\.guide_to_skin_mm"
     ):

@@ -10,18 +10,19 @@ from hypothesis import strategies as st
 
 import flexneedle
 from flexneedle.control import route
+from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.identification import RUN_OUT, Identification
-from flexneedle.control.interface import Task
 from flexneedle.simulator import Control, Learnt, Simulator
+from tasks import begun_with, task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
 BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
-OWN = PHANTOM.control.adaptive_mpc
+OWN = AdaptiveMpc()
 
 
 def belief_of(state, scenario=PHANTOM, **fields):
     """A belief that the needle is so."""
-    begun = Identification().begin(Simulator(scenario, threads=1), state.bevel)
+    begun = Identification().begin(begun_with(Simulator(scenario, threads=1), state.bevel))
     return replace(begun, state=replace(state, scenario=scenario), tips=state.tip[None], **fields)
 
 
@@ -34,7 +35,7 @@ def running_out(belief, run_out):
 
 def found(plan, belief, seed=0, old=None):
     """The way from where the needle is believed to be."""
-    task = Task(belief.nominal, plan)
+    task = task_of(belief.nominal, plan)
     return route.renewed(task, belief, old or route.of_plan(plan), np.random.default_rng(seed))
 
 
@@ -204,7 +205,7 @@ def test_it_turns_where_the_sides_of_neighbouring_pieces_change(quick_plan, alon
     """The first is compared with the present side; a side of 0 or more is up."""
     state = along(quick_plan, 35)
     belief = belief_of(state)
-    ahead = route._Ahead.of(Task(belief.nominal, quick_plan), belief)
+    ahead = route._Ahead.of(task_of(belief.nominal, quick_plan), belief)
     pieces = int(ahead.piece[-1]) + 1
     assert pieces == OWN.route_pieces == 4
     firsts = np.searchsorted(ahead.piece, np.arange(pieces))
@@ -233,7 +234,7 @@ def test_cost_is_miss_tissue_energy_guide_and_turns(quick_plan, along):
         {f"control.adaptive_mpc.route_{key}": value for key, value in weights.items()}
     )
     belief = running_out(belief_of(along(quick_plan, 44), scenario, residual=0.04), 0.15)
-    task = Task(belief.nominal, replace(quick_plan, target=(40.0, 3.0)))
+    task = task_of(belief.nominal, replace(quick_plan, target=(40.0, 3.0)))
     ahead = route._Ahead.of(task, belief)
     z = np.array([[0.3, -0.1, 0.2, 0.1, 1.0, -1.0, -1.0, 1.0]]) * np.repeat(
         [1.0, float(belief.state.bevel)], 4
@@ -269,7 +270,7 @@ def test_the_same_random_numbers_lead_to_the_same_way(quick_plan, along):
 def test_it_is_no_worse_than_the_way_before(quick_plan, along):
     """By the cost that it is judged by: the search begins with the guide of the old way."""
     belief = belief_of(along(quick_plan, 40))
-    task, old = Task(belief.nominal, quick_plan), route.of_plan(quick_plan)
+    task, old = task_of(belief.nominal, quick_plan), route.of_plan(quick_plan)
     ahead = route._Ahead.of(task, belief)
     sides = np.full(4, float(belief.state.bevel))
     before = route._cost(task, belief, ahead, np.concatenate([route._guide_steps(ahead, old), sides])[None])

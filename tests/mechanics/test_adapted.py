@@ -26,7 +26,7 @@ def tissue(thickness=THICKNESS, alpha=(ALPHA,) * 3, height=(HEIGHT,) * 3):
 LAYERS = tissue()
 NODES = contact_nodes(LAYERS, np.array([1.0, 0.5, 0.7]), 1.0, 18.0, -41.0)
 CONTACTS = NODES.kind == CONTACT
-MODEL = Model(4000.0, 150.0, 4.0, 3.0, NODES, LAYERS)
+MODEL = Model(4000.0, 150.0, 4.0, 3.0, NODES, LAYERS, 0.25, 3.0)
 NO_SHIFT = np.zeros(2)
 ONES = np.ones(3)
 CELLS = np.array([1.5, 0.7, 1.2, 0.4, 2.0, 0.9])
@@ -93,7 +93,7 @@ def tip_spring(model, depth, u=0.7):
 def test_the_tip_spring_is_that_of_the_tissue_along_the_bevel(believed):
     """Its force is linear in ∫μw dx over the bevel's length, in which any number of boundaries may lie."""
     model = adapted(MODEL, believed)
-    one = tip_spring(Model(4000.0, 150.0, 4.0, 3.0, NODES, tissue((30.0, 1.0, np.inf))), 10.0)
+    one = tip_spring(Model(4000.0, 150.0, 4.0, 3.0, NODES, tissue((30.0, 1.0, np.inf)), 0.25, 3.0), 10.0)
     per_tissue = np.array(one[:3]) / (3.0 * MU[0] * WIDTH[0])
     for depth in (0.4, 2.0, 5.7, 6.2, 7.9, 10.1, 14.0):
         expected = per_tissue * along(max(0.0, depth - 3.0), depth, believed)

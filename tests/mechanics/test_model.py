@@ -23,20 +23,24 @@ def stiffness_per_point(nodes):
 
 
 def test_points_stand_in_the_middle_of_intervals():
-    """x = (i + ½)Δ, growing in over Δ/2."""
-    grid = nodes(2.0, 9.0, 4.0)
-    np.testing.assert_allclose(grid.x[:5], [1.0, 3.0, 5.0, 7.0, 9.0])
-    np.testing.assert_allclose(grid.reach, 1.0)
-    assert grid.x[-1] > 9.0
+    """Of Δ/4 down to Δ, of Δ/2 down to 3Δ, of Δ below; growing in over half of them."""
+    grid = nodes(2.0, 13.0, 4.0)
+    np.testing.assert_allclose(grid.x[:4], [0.25, 0.75, 1.25, 1.75])
+    np.testing.assert_allclose(grid.reach[:4], 0.25)
+    np.testing.assert_allclose(grid.x[4:8], [2.5, 3.5, 4.5, 5.5])
+    np.testing.assert_allclose(grid.reach[4:8], 0.5)
+    np.testing.assert_allclose(grid.x[8:12], [7.0, 9.0, 11.0, 13.0])
+    np.testing.assert_allclose(grid.reach[8:], 1.0)
+    assert grid.x[-1] > 13.0
 
 
 def test_layer_end_divides_an_interval():
     """Two points, each in the middle of its part, with its layer's law, weight and length."""
-    grid = nodes(2.0, 9.0, 4.5)
-    np.testing.assert_allclose(grid.x[1:5], [3.0, 4.25, 5.25, 7.0])
-    np.testing.assert_allclose(grid.reach[1:5], [1.0, 0.25, 0.75, 1.0])
-    np.testing.assert_allclose(grid.alpha[1:5], [8.0, 8.0, -3.0, -3.0])
-    np.testing.assert_allclose(grid.weight[1:5], [1.0, 1.0, 0.5, 0.5])
+    grid = nodes(2.0, 15.0, 10.5)
+    np.testing.assert_allclose(grid.x[9:13], [9.0, 10.25, 11.25, 13.0])
+    np.testing.assert_allclose(grid.reach[9:13], [1.0, 0.25, 0.75, 1.0])
+    np.testing.assert_allclose(grid.alpha[9:13], [8.0, 8.0, -3.0, -3.0])
+    np.testing.assert_allclose(grid.weight[9:13], [1.0, 1.0, 0.5, 0.5])
 
 
 @pytest.mark.parametrize("spacing", [0.3, 1.0, 2.0, 3.7])

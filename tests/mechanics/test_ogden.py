@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexneedle.mechanics.ogden import FLOOR_STRETCH, contact_law, law_scales
+from flexneedle.mechanics.ogden import FLOOR_STRETCH, contact_law, displaced_energy, law_scales
 from reference.insertion import Tissue, ogden
 
 MU, ALPHA, HEIGHT, WIDTH = 1.82e-3, 8.74, 20.0, 5.2  # the phantom's first layer
@@ -92,3 +92,11 @@ def test_floor_is_once_differentiable(alpha):
     np.testing.assert_allclose(above, below, rtol=1e-7)
     assert law(edge + 5.0, alpha)[1] == law(edge + 1.0, alpha)[1]
     assert law(edge + 5.0, alpha)[0] == pytest.approx(law(edge, alpha)[0] - 5.0 * law(edge + 1.0, alpha)[1])
+
+
+@pytest.mark.parametrize("u", [0.0, -1.0, 13.9])
+def test_displaced_energy_is_that_of_the_law(u):
+    scale = law_scales(MU, np.array([ALPHA, -3.0]), np.array([HEIGHT, 25.0]), WIDTH * HEIGHT)[1]
+    expected = [law(u)[2], law(u, -3.0, 25.0)[2]]
+    stored = displaced_energy(np.array([ALPHA, -3.0]), np.array([HEIGHT, 25.0]), scale, u)
+    np.testing.assert_allclose(stored, expected, rtol=1e-9, atol=1e-18)

@@ -220,15 +220,38 @@ def test_converged_once_the_elite_costs_spread_by_a_share_of_the_first_iteration
     assert second.done(settings) is converged
 
 
-def test_a_first_iteration_with_fewer_good_samples_than_the_elite_has_not_converged():
-    """Nor has the next one because the first one's spread was infinite."""
+def test_an_iteration_with_fewer_good_samples_than_the_elite_sets_no_scale():
+    """The first iteration whose elite is finite does: a spread of 1 at first, then a tenth of it."""
     settings = replace(FREE, samples=4, elite=2, tolerance=0.1)
     samples = np.arange(8.0).reshape(4, 2)
-    first = ce.tell(
-        ce.start(np.zeros(2), np.ones(2)), settings, samples, np.array([1.0, np.inf, np.inf, np.inf])
+    belief, converged = ce.start(np.zeros(2), np.ones(2)), []
+    for costs in (
+        [1.0, *[np.inf] * 3],
+        [np.inf] * 4,
+        [1.0, 2.0, 9.0, 9.0],
+        [0.0, 0.11, 9.0, 9.0],
+        [0.0, 0.09, 9.0, 9.0],
+    ):
+        belief = ce.tell(belief, settings, samples, np.array(costs))
+        converged.append(belief.converged)
+    assert converged == [False, False, False, False, True]
+
+
+def test_samples_of_the_first_iteration_can_be_given():
+    given = np.array([[3.0, 3.0], [1.5, -2.0], [0.0, 1.0]])
+    told = []
+
+    def cost(z):
+        told.append(z.copy())
+        return quadratic(z)
+
+    settings = replace(FREE, elite=2, iterations=2)
+    found = ce.minimize(
+        cost, ce.start(np.zeros(2), np.ones(2)), settings, np.random.default_rng(0), first=given
     )
-    assert not first.converged
-    assert not ce.tell(first, settings, samples, np.array([1.0, 9.0, 10.0, 11.0])).converged
+    np.testing.assert_array_equal(told[0], given)
+    assert [len(z) for z in told] == [3, 60]
+    assert found.best_cost == 0.0
 
 
 def test_search_stops_at_convergence_or_at_the_maximum_of_iterations():

@@ -138,7 +138,27 @@ class Reference:
         return self._solve(pose, cut)
 
     def step(self, pose: Pose, control: Control) -> Pose:
-        """One control step."""
+        """One control step, in parts that end where the tip is due at multiples of Δ/4 down to 3Δ."""
+        part, left = self.scenario.contact.spacing_mm / 4, 1.0
+        while left > 0.0:
+            x, share = pose.tip[0], left
+            if control.db_x > 0.0 and x < 12 * part and x + left * control.db_x > 0.0:
+                due = max(0.0, part * (np.floor(x / part + 1e-3) + 1))
+                share = min(left, (due - x) / control.db_x)
+            pose = self._move(
+                pose,
+                Control(
+                    share * control.db_x,
+                    share * control.db_y,
+                    share * control.db_theta,
+                    share * control.dg_y,
+                    control.flip and left == 1.0,
+                ),
+            )
+            left -= share if share < left else left
+        return pose
+
+    def _move(self, pose: Pose, control: Control) -> Pose:
         moved = replace(
             pose,
             base=np.add(pose.base, [control.db_x, control.db_y, control.db_theta]),
@@ -312,10 +332,11 @@ def _law_per_mm(layer):
 
 
 def _interval_edges(scenario: Scenario, ends):
-    """Edges of the intervals of length Δ, divided where a layer ends."""
+    """Edges of the intervals of length Δ, shorter below the skin, divided where a layer ends."""
     spacing = scenario.contact.spacing_mm
     depth = scenario.setup.stroke_mm - scenario.setup.tip_to_skin_mm
-    grid = spacing * np.arange(int(np.ceil(max(depth, 0.0) / spacing)) + 2)
+    count = max(int(np.ceil(max(depth, 0.0) / spacing)), 3) + 2
+    grid = spacing * np.concatenate([[0, 0.25, 0.5, 0.75, 1, 1.5, 2, 2.5], np.arange(3, count)])
     inside = [end for end in ends if end < grid[-1] and np.abs(grid - end).min() > 1e-6 * spacing]
     return np.sort(np.append(grid, inside))
 

@@ -26,8 +26,8 @@ assert all(before[name] == 1 for name in ("settle", "advance", "replay", "rollou
 quick = {"samples": 16, "iterations": 2}
 scenario = flexneedle.load_scenario("phantom").with_values({
     **{f"plan.{key}": value for key, value in quick.items()},
-    **{f"control.{key}": value for key, value in quick.items()},
-    "control.horizon": 2, "setup.tip_to_skin_mm": 4.0, "target.depth_mm": 8.0, "target.lateral_mm": 0.5,
+    **{f"control.ce_mpc.{key}": value for key, value in quick.items()},
+    "control.ce_mpc.horizon": 2, "setup.tip_to_skin_mm": 4.0, "target.depth_mm": 8.0, "target.lateral_mm": 0.5,
 })
 plans = [flexneedle.plan(scenario, strategy=strategy) for strategy in ("manipulation", "steering")]
 for name in METHODS:

@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from flexneedle.control.bang_bang import BevelRule
+from flexneedle.control.methods import checked
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario import GAUGES, Scenario, check_target, dump_scenario, load_scenario, preset_names
 
@@ -27,7 +29,7 @@ def test_the_preset_is_the_two_layer_phantom():
 def test_a_minimal_file_takes_its_settings_from_the_phantom(minimal_text, scenario_file):
     scenario = load_scenario(scenario_file(minimal_text))
     for section in ("contact", "target", "plan", "control", "tracker", "phantom"):
-        assert getattr(scenario, section) == getattr(PHANTOM, section)
+        assert getattr(checked(scenario), section) == getattr(checked(PHANTOM), section)
     assert scenario.needle.bevel == PHANTOM.needle.bevel
     assert scenario.needle.length_mm == 150.0
     assert not scenario.setup.has_guide
@@ -39,10 +41,7 @@ def test_inner_units_are_mm_newton_megapascal_radian_second():
     assert PHANTOM.tissue[0].shear_modulus == pytest.approx(1.82e-3)
     assert PHANTOM.setup.max_base_turn_step == pytest.approx(5e-3)
     assert PHANTOM.plan.elite_count == 16
-    for key in ("control", "control.adaptive_mpc", "control.bevel_only", "control.resolved_rate"):
-        changed = PHANTOM.with_values({f"{key}.curvature_per_m": 0.7}).control
-        rule = getattr(changed, key.removeprefix("control."), changed)
-        assert rule.curvature == pytest.approx(7e-4)
+    assert BevelRule(curvature_per_m=0.7).curvature == pytest.approx(7e-4)
     assert PHANTOM.tracker.period == 0.025
     assert PHANTOM.phantom.start_angle_sd == pytest.approx(3e-3)
     assert PHANTOM.with_values({"plan.base_turn_sigma_mrad": 2.0}).plan.base_turn_sigma == pytest.approx(2e-3)

@@ -141,3 +141,13 @@ def test_forces_and_moments_on_the_needle_balance():
     assert np.abs(contacts).max() > 1e-4
     assert total == pytest.approx(0.0, abs=1e-6)
     assert turning == pytest.approx(0.0, abs=1e-4)
+
+
+def test_energy_scale_is_that_of_all_tissue_above_a_depth_moved_aside_by_a_millimetre():
+    """20 mm of the first layer and 10 of the second, the density of each from the law; weighted by layer."""
+    phantom = load_scenario("phantom").with_values({"tissue.1.energy_weight": 3.0})
+    stretch = 1.0 - 1.0 / 20.0
+    strain = 2.0 * stretch ** (-8.74 / 2.0) + stretch**8.74 - 3.0
+    density = [2.0 * 1e-3 * kpa * 5.2 * 20.0 / 8.74**2 * strain for kpa in (1.82, 3.63)]
+    scale = Simulator(phantom, threads=1).energy_scale(30.0)
+    assert scale == pytest.approx(20.0 * density[0] + 3.0 * 10.0 * density[1], rel=1e-12)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from flexneedle.control.interface import Method
     from flexneedle.scenario import Scenario
 
 __all__ = [
@@ -54,11 +55,12 @@ def seed(text: str) -> int:
     return value
 
 
-def chosen_scenario(args: argparse.Namespace) -> Scenario:
-    """Return the scenario with the target that was asked for. Raises ScenarioError."""
+def chosen_scenario(args: argparse.Namespace, *own: Method) -> Scenario:
+    """Return the scenario with the target that was asked for and all settings of controllers. Raises ScenarioError."""
+    from flexneedle.control.methods import used
     from flexneedle.scenario import load_scenario
 
-    scenario = load_scenario(args.scenario)
+    scenario = used(load_scenario(args.scenario), *own, source=args.scenario)
     if args.target is None:
         return scenario
     depth, lateral = args.target

@@ -43,13 +43,20 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--plan-seed", type=seed, metavar="N", help="seed of the plan (that of the insertion, --seed)"
     )
     parser.add_argument(
-        "--controller", metavar="NAME", help="who steers (adaptive-mpc); --list says which there are"
+        "--controller",
+        metavar="NAME",
+        help="who steers (adaptive-mpc); --list says which there are; module:METHOD for one of your own",
     )
     parser.add_argument(
         "--phantom",
         metavar="KIND",
         help="what is steered: exact, a finer formulation of its own with a rig's imperfections, or model, the "
-        "controller's own kind of model with other parameters (exact)",
+        "controller's own kind of model with other parameters (exact); module:NAME for one of your own",
+    )
+    parser.add_argument(
+        "--tracker",
+        metavar="NAME",
+        help="what measures the tip: the tracker of the scenario, or module:NAME for one of your own (scenario)",
     )
     parser.add_argument(
         "--registration", type=Path, metavar="FILE", help="where the tracker stands, as em register found it"
@@ -63,13 +70,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def _insert(args: argparse.Namespace) -> int:
     from flexneedle.run.folder import Folder
+    from flexneedle.run.parts import own_controllers
     from flexneedle.run.recording import record_insertion
 
     from .progress import Progress
 
     if args.list:
         return _list()
-    choices, scenario = _choices(args), chosen_scenario(args)
+    choices = _choices(args)
+    scenario = chosen_scenario(args, *own_controllers([choices.controller]))
     if args.registration is not None:
         from flexneedle.run.em.register import load_registration
 
@@ -93,7 +102,7 @@ def _insert(args: argparse.Namespace) -> int:
 def _choices(args: argparse.Namespace) -> Choices:
     from flexneedle.run.recording import Choices
 
-    chosen = {"controller": args.controller, "phantom": args.phantom}
+    chosen = {"controller": args.controller, "phantom": args.phantom, "tracker": args.tracker}
     named = {name: value for name, value in chosen.items() if value is not None}
     return Choices(args.seed, args.strategy, args.plan_seed, force=args.force, **named)
 

@@ -7,11 +7,13 @@ import argparse
 import io
 import os
 import sys
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from flexneedle import __version__
-from flexneedle.errors import FlexneedleError, InputError
+from flexneedle.errors import FlexneedleError, InputError, ScenarioWarning
 
 from . import em, emulate, export, insert, plan, report, scenario, study, view
 
@@ -55,10 +57,30 @@ def _run(argv: Sequence[str] | None) -> int:
         )  # a name that the terminal cannot show is no failure
     try:
         args = build_parser().parse_args(argv)
-        status: int = args.handler(args)
+        with _warnings_in_lines():
+            status: int = args.handler(args)
         return status
     finally:
         sys.stdout.flush()  # here, where a closed pipe is still handled, --help included
+
+
+@contextmanager
+def _warnings_in_lines() -> Iterator[None]:
+    """Print each of the package's warnings as one line, once."""
+    told: set[str] = set()
+    show = warnings.showwarning
+
+    def print_once(message: Warning | str, category: type[Warning], *about: Any, **more: Any) -> None:
+        if not issubclass(category, ScenarioWarning):
+            show(message, category, *about, **more)
+        elif str(message) not in told:
+            told.add(str(message))
+            _complain(str(message))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", ScenarioWarning)
+        warnings.showwarning = print_once
+        yield
 
 
 def _guarded(command: Callable[[], int]) -> int:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from flexneedle.scenario import Scenario
 
 __all__ = ["add_parser"]
 
@@ -16,13 +20,25 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
     show = actions.add_parser("show", help="print a scenario with all its defaults, as TOML")
     show.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path")
+    _add_controller(show)
     show.set_defaults(handler=_show)
 
     check = actions.add_parser("check", help="check a scenario: one line for each problem, exit status 2")
     check.add_argument("scenario", metavar="SCENARIO", help="path, preset name or world:NUMBER")
+    _add_controller(check)
     check.set_defaults(handler=_check)
 
     actions.add_parser("schema", help="print the JSON schema of scenario files").set_defaults(handler=_schema)
+
+
+def _add_controller(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--controller",
+        action="append",
+        default=[],
+        metavar="module:METHOD",
+        help="a controller of your own whose table the scenario may have; may be given several times",
+    )
 
 
 def _list(_args: argparse.Namespace) -> int:
@@ -34,24 +50,33 @@ def _list(_args: argparse.Namespace) -> int:
 
 
 def _show(args: argparse.Namespace) -> int:
-    from flexneedle.scenario import dump_scenario, load_scenario
+    from flexneedle.scenario import dump_scenario
 
-    print(dump_scenario(load_scenario(args.scenario)), end="")
+    print(dump_scenario(_checked(args)), end="")
     return 0
 
 
 def _check(args: argparse.Namespace) -> int:
+    print(f"{args.scenario}: ok, {_checked(args).name}")
+    return 0
+
+
+def _checked(args: argparse.Namespace) -> Scenario:
+    """The scenario with all defaults, those of the controllers too."""
+    from flexneedle.control.methods import checked
+    from flexneedle.run.parts import controller_of
     from flexneedle.scenario import load_scenario
 
-    scenario = load_scenario(args.scenario)
-    print(f"{args.scenario}: ok, {scenario.name}")
-    return 0
+    own = [controller_of(name)[1] for name in args.controller]
+    return checked(load_scenario(args.scenario), *own, source=args.scenario)
 
 
 def _schema(_args: argparse.Namespace) -> int:
     import json
 
-    from flexneedle.scenario import Scenario
+    from flexneedle.control.methods import METHODS
+    from flexneedle.control.tables import typed_scenario
 
-    print(json.dumps(Scenario.model_json_schema(), indent=2, ensure_ascii=False))
+    schema = typed_scenario(tuple(METHODS.values())).model_json_schema()
+    print(json.dumps(schema, indent=2, ensure_ascii=False))
     return 0

@@ -1,13 +1,13 @@
 """The bang-bang rule for the bevel: two kinematic paths, the nearer to the target wins (paper eq. 14 and 15)."""
 
 import math
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Task
+from flexneedle.scenario.fields import Fraction, NonNegative, Section
 
 Floats = NDArray[np.float64]
 _SURE = 3.0  # standard deviations of a reading: no bevel turn for less
@@ -48,21 +48,21 @@ def wants_flip(
     )
 
 
-class Rule(Protocol):
+class BevelRule(Section):
     """A controller's settings of the rule."""
+
+    curvature_per_m: NonNegative = 0.646
+    """κ of the two paths of the bang-bang rule."""
+    flip_dead_band: Fraction = 0.875
+    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
 
     @property
     def curvature(self) -> float:
         """κ, 1/mm."""
-        ...
-
-    @property
-    def flip_dead_band(self) -> float:
-        """As in `wants_flip`."""
-        ...
+        return 1e-3 * self.curvature_per_m
 
 
-def decide(task: Task, estimate: Estimate, rule: Rule) -> tuple[bool, str]:
+def decide(task: Task, estimate: Estimate, rule: BevelRule) -> tuple[bool, str]:
     """`wants_flip` towards the plan's target, from the believed tip. In air the bevel has no effect and stays."""
     if estimate.tip[0] <= 0.0:
         return False, "in air"

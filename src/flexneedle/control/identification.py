@@ -1,68 +1,109 @@
 """An observer that corrects the model: start, needle and tissue are fitted to all readings of the insertion.
 
 Maximum a posteriori by Gauss–Newton, one step a period: the insertion is simulated again with other constants, which
-costs less than a millisecond, and the lateral readings choose among them. Parameters, with normal priors from the
-scenario:
+costs a millisecond, and the lateral readings choose among them. Parameters, with normal priors from the scenario:
 
     base y (mm), base turn (rad), natural bend of the needle (mm), run-out (mm), factor on the bevel offset,
     ln of the factor on each layer's modulus, shift (mm) of each boundary between layers,
     ln of a further factor on the modulus in cells along the depth, correlated over a length.
 
-So what lies ahead of the tip is believed as far as it is correlated with what was passed. What the fit leaves is
-low-passed and carried on as a constant.
+So what is ahead of the tip is estimated as far as it is correlated with what was passed. The start along the axis is a
+shift of all axial readings, fitted apart from the rest. What the fit leaves is low-passed and carried on as a constant.
+
+The derivative of the lateral position with respect to a parameter is kept as a curve over the depth of the tip, a few
+steps ahead of it too. Each period a few of the curves are simulated anew, in turn: none is older than `_ROUND` periods.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.estimate import Floats, Move, along, assigned
+from flexneedle.control.task import Task
+from flexneedle.errors import ScenarioError
 from flexneedle.ports import Command, Sample
 from flexneedle.scenario import Scenario
+from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.simulator import Control, Learnt, Simulator, State
 
-__all__ = ["Identification", "Identified"]
+__all__ = ["Identification", "Identified", "Perturbed"]
 
+import os
 BASE_Y, BASE_TURN, BEND, RUN_OUT, BEVEL, MODULUS = range(6)
 _STEPS = (0.05, 3e-4, 0.05, 0.05, 0.05)  # for differences: mm, rad, mm, mm, 1
 _LOG_STEP = 0.05
 _SHIFT_STEP = 0.2  # mm
 _MOVES_A_STRETCH = 8  # in tissue; one stretch in air
 _WIDEST = 4.0  # standard deviations that a parameter may leave its prior
-_LARGEST_BEVEL = 3.4  # factor: 0.7 of the compression length with the preset's
+_LARGEST_BEVEL = 0.699  # offset, in compression lengths: the law's limit
+_MOST_CELLS = 200
 _RECENT = 12  # moves whose residuals are low-passed
 _SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a Gauss–Newton step: the first that fits no worse
 _REST = np.array([[0.0, 0.0, 0.0, 0.0, -1.0]])
+_ROUND = 8  # periods in which all curves of derivatives are simulated once,
+_LEADING = (BASE_Y, BASE_TURN, BEND, BEVEL)  # but these are in
+_LEADING_ROUND = 2  # periods
+_STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
+_AX = float(os.environ.get("AX", "1.0"))
+_MS = float(os.environ.get("MS", "0.01"))
+_MS0 = float(os.environ.get("MS0", "0.0126"))
 
 
 @dataclass(frozen=True)
 class Identification:
-    """This observer has no choices but the scenario's `[control.adaptive_mpc]`."""
+    """This observer has no choices but the settings of `adaptive-mpc`."""
 
-    def begin(self, simulator: Simulator, bevel: int) -> "Identified":
-        """Believe in the scenario."""
-        state, prior = simulator.start(bevel), _Prior.of(simulator.scenario)
-        return Identified(simulator, prior, simulator, prior.mean, state, state.tip[None], ((0, state),))
+    def begin(self, task: Task) -> "Identified":
+        """Start from the scenario's values. Raises ScenarioError for cells so short that a fit would never end."""
+        simulator, scenario, settings = task.simulator, task.scenario, task.settings
+        _check_cells(scenario, settings)
+        state, prior = simulator.start(task.plan.bevel), _Prior.of(scenario, settings)
+        step = scenario.setup.max_advance_mm
+        grid = np.arange(scenario.setup.start_tip_x - 5 * step, scenario.setup.max_depth + (_ROUND + 6) * step, step)
+        start = Identified(
+            simulator, settings, prior, simulator, prior.mean, state, state.tip[None], ((0, state),), grid,
+            np.zeros((prior.mean.size, grid.size)), prior.precision,
+        )
+        return start._differentiated(range(prior.mean.size))
+
+
+@dataclass(frozen=True, eq=False)
+class Perturbed:
+    """The needle now if one parameter were `step` larger: its model and state."""
+
+    parameter: int
+    step: float
+    simulator: Simulator
+    state: State
 
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """The belief; an `Estimate`.
-
-    nominal: the scenario's model, and the prior about it; simulator: the model with parameters (K,); state: of it now;
-    tips (m + 1, 3): of it at the ends of the m moves, the start first; stops: its state before some of the moves.
+    """The estimate. nominal: the scenario's model, and the prior about it; simulator: the model with parameters (K,);
+    state: of it now; tips (m + 1, 3): of it at the ends of the m moves, the start first; stops: its state before some
+    of the moves; grid (g,), curves (K, g): derivatives of the tip's lateral position over its depth (mm);
+    precision (K, K): inverse covariance of the parameters; axial: start error along the axis (mm).
     """
 
     nominal: Simulator
+    settings: AdaptiveMpc
     prior: "_Prior"
     simulator: Simulator
     parameters: Floats
     state: State
     tips: Floats
     stops: tuple[tuple[int, State], ...]
+    grid: Floats
+    curves: Floats
+    precision: Floats
+    axial: float = 0.0
+    axial_variance: float = _AX**2
+    turn: int = 0
+    perturbed: tuple[Perturbed, ...] = ()
     moves: tuple[Move, ...] = ()
     residual: float = 0.0
     innovation: tuple[float, float] = (0.0, 0.0)
@@ -85,7 +126,7 @@ class Identified:
         return self.run_out * bevel + self.residual
 
     def tip_at(self, time: float) -> tuple[float, float]:
-        """Where the tip was believed to be (mm) at `time`."""
+        """Estimated place of the tip (mm) at `time`."""
         x, y = along(self.moves, self.tips, time)
         turned_since = sum(done.applied[4] > 0.0 for done in self.moves if done.begun >= time)
         return x, y + self.off_axis(self.state.bevel * (-1) ** turned_since)
@@ -95,10 +136,13 @@ class Identified:
         return replace(self, innovation=(0.0, 0.0))
 
     def move(self, applied: Command, begun: float, ended: float) -> "Identified":
-        """Move the believed needle as the driver did, from `begun` to `ended` (s)."""
+        """Move the estimated needle as the driver did, from `begun` to `ended` (s)."""
+        if applied == _STILL and self.moves and self.moves[-1].applied == _STILL:  # one rest, however long
+            last = replace(self.moves[-1], ended=ended)
+            return replace(self, moves=(*self.moves[:-1], last), perturbed=())
         state = self.simulator.step(self.state, Control.from_row(applied))
         tips = np.concatenate([self.tips, state.tip[None]])
-        return replace(self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)))
+        return replace(self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)), perturbed=())
 
     def observe(self, samples: Sequence[Sample]) -> "Identified":
         """Fit the parameters to all readings so far, one Gauss–Newton step, and simulate with them to now."""
@@ -106,7 +150,9 @@ class Identified:
             return self.unseen()
         seen = replace(self, moves=assigned(self.moves, samples))
         readings = seen._readings
-        fitted = _improved(seen, readings)
+        axial, axial_variance = readings.axial(seen)
+        seen = replace(seen, axial=axial, axial_variance=axial_variance)
+        fitted = _improved(seen._differentiated(), readings)
         left = readings.left(fitted)
         ahead = readings.x - readings.between(fitted.tips[:, 0])
         newest = int(readings.index[-1]) + 1
@@ -114,7 +160,7 @@ class Identified:
         inside = fitted.tips[-1, 0] > 0.0
         return replace(
             fitted,
-            residual=_low_passed(self.nominal.scenario, left) if inside else 0.0,
+            residual=_low_passed(self.settings, left) if inside else 0.0,
             innovation=(float(ahead[-1]), float(left[-1])),
             measured=(float(x), float(y)),
         )
@@ -122,7 +168,7 @@ class Identified:
     @cached_property
     def rows(self) -> Floats:
         """The commands of the moves (m, 5)."""
-        return np.array([done.applied for done in self.moves])
+        return np.array([done.applied for done in self.moves], dtype=float).reshape(-1, 5)
 
     @cached_property
     def _readings(self) -> "_Readings":
@@ -134,8 +180,8 @@ class Identified:
         return _Readings(moves, part, x, y, count, (first * turns)[moves])
 
     def _with(self, parameters: Floats) -> "Identified":
-        """The belief in these parameters: the insertion simulated again, in stretches."""
-        simulator = _adapted(self.nominal, parameters)
+        """The estimate with these parameters: the insertion simulated again, in stretches."""
+        simulator = _adapted(self.nominal, self.settings, parameters)
         state = _started(self, simulator, parameters)
         inside = int(np.argmax(np.append(self.tips[1:, 0], np.inf) > 0.0))
         ends = [*range(min(inside, len(self.rows)), len(self.rows), _MOVES_A_STRETCH), len(self.rows)]
@@ -154,6 +200,53 @@ class Identified:
             tips=np.concatenate(parts),
             stops=tuple(stops),
         )
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Of the parameters (K, K), as the readings so far leave it."""
+        inverse: Floats = np.linalg.inv(self.precision)
+        return inverse
+
+    @property
+    def tip_sd(self) -> float:
+        """Standard deviation (mm) of the predicted distance of the next reading of the tip."""
+        slope = self._slopes(self.state.tip[:1])[0]
+        slope[RUN_OUT] = self.state.bevel
+        return float(np.sqrt(slope @ self.covariance @ slope + self.axial_variance))
+
+    def _slopes(self, depth: Floats) -> Floats:
+        """Derivatives (n, K) of the tip's lateral position at depths (n,), mm, but for the run-out's, from the curves."""
+        step = self.grid[1] - self.grid[0]
+        place = np.clip((depth - self.grid[0]) / step, 0.0, self.grid.size - 1.001)
+        left = place.astype(int)
+        part = place - left
+        slopes: Floats = ((1.0 - part) * self.curves[:, left] + part * self.curves[:, left + 1]).T
+        return slopes
+
+    def _differentiated(self, which: Sequence[int] | None = None) -> "Identified":
+        """Simulate the curves whose turn it is anew, and a few steps ahead."""
+        ahead = np.tile([[self.nominal.scenario.setup.max_advance_mm, 0.0, 0.0, 0.0, -1.0]], (_ROUND, 1))
+        base = np.concatenate([self.tips, self.simulator.replay(self.state, ahead)[1]])
+        depth = np.maximum.accumulate(base[:, 0])
+        curves, members = self.curves.copy(), []
+        for k in self._due(float(depth[-1])) if which is None else which:
+            if k == RUN_OUT or depth[-1] < self.prior.begins[k]:
+                continue
+            parameters = self.parameters.copy()
+            parameters[k] += self.prior.steps[k]
+            member, tips = _perturbed(self, parameters, k, ahead)
+            members.append(member)
+            curves[k] = np.interp(self.grid, depth, (tips[:, 1] - base[:, 1]) / self.prior.steps[k])
+        return replace(self, curves=curves, perturbed=tuple(members), turn=self.turn + 1)
+
+    def _due(self, deepest: float) -> Iterator[int]:
+        """The parameters whose curves are to be simulated this period, of those that matter down to `deepest` (mm)."""
+        for place, k in enumerate(_LEADING):
+            if place % _LEADING_ROUND == self.turn % _LEADING_ROUND and deepest >= self.prior.begins[k]:
+                yield k
+        for k in range(MODULUS, self.parameters.size):
+            if k % _ROUND == self.turn % _ROUND and deepest >= self.prior.begins[k]:
+                yield k
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,9 +274,17 @@ class _Readings:
 
     def variance(self, scenario: Scenario) -> Floats:
         """Of the lateral readings (r,), mm²: their jitter and what no parameter explains."""
-        unexplained = scenario.control.adaptive_mpc.model_sd_mm**2
+        unexplained = max(_MS0, _MS * scenario.needle.bevel.offset_mm)**2
         variance: Floats = scenario.tracker.jitter_per_axis**2 / self.count + unexplained
         return variance
+
+    def axial(self, belief: Identified) -> tuple[float, float]:
+        """Start error along the axis (mm) and its variance, maximum a posteriori: all axial readings share it."""
+        without = self.between(belief.tips[:, 0]) - belief.axial
+        if _AX == 0.0: return 0.0, 0.0
+        weight = 1.0 / (belief.nominal.scenario.tracker.jitter_per_axis ** 2 / self.count + _MS0**2)
+        variance = 1.0 / (weight.sum() + _AX**-2.0)
+        return float(variance * (weight @ (self.x - without))), float(variance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,10 +300,10 @@ class _Prior:
     begins: Floats
 
     @staticmethod
-    def of(scenario: Scenario) -> "_Prior":
+    def of(scenario: Scenario, settings: AdaptiveMpc) -> "_Prior":
         """The scenario's."""
-        control, settings = scenario.control, scenario.control.adaptive_mpc
-        layers, cells = len(scenario.tissue), _cells(scenario)
+        control = scenario.control
+        layers, cells = len(scenario.tissue), _cells(scenario, settings)
         single = (
             [control.start_offset_sd_mm, control.start_angle_sd, settings.bend_sd_mm]
             + [settings.run_out_sd_mm, settings.bevel_sd]
@@ -215,7 +316,7 @@ class _Prior:
         precision[-cells:, -cells:] = _uncorrelating(cells, settings.cell_mm / settings.variation_length_mm)
         precision[-cells:, -cells:] /= sd[-1] ** 2
         bounds = mean + np.outer((-_WIDEST, _WIDEST), sd)
-        bounds[:, BEVEL] = 0.0, _LARGEST_BEVEL
+        bounds[:, BEVEL] = 0.0, _largest_bevel(scenario)
         logs, shifts = [_LOG_STEP] * layers, [_SHIFT_STEP] * (layers - 1)
         steps = np.array([*_STEPS, *logs, *shifts, *[_LOG_STEP] * cells])
         tops = np.array(scenario.layer_tops) - _WIDEST * settings.boundary_sd_mm
@@ -240,12 +341,20 @@ def _uncorrelating(size: int, distance: float) -> Floats:
     return inverse
 
 
-def _cells(scenario: Scenario) -> int:
+def _cells(scenario: Scenario, settings: AdaptiveMpc) -> int:
     """Cells from the skin to the end of the stroke."""
-    return max(2, int(np.ceil(scenario.setup.max_depth / scenario.control.adaptive_mpc.cell_mm)))
+    return max(2, int(np.ceil(scenario.setup.max_depth / settings.cell_mm)))
 
 
-def _adapted(nominal: Simulator, parameters: Floats) -> Simulator:
+def _check_cells(scenario: Scenario, settings: AdaptiveMpc) -> None:
+    """Raise ScenarioError for cells so short that a fit would never end."""
+    thinnest = scenario.setup.max_depth / _MOST_CELLS
+    if settings.cell_mm < thinnest:
+        rule = f"must be at least {thinnest:g}, the depth of the full stroke / {_MOST_CELLS}"
+        raise ScenarioError(to_line(Problem("control.adaptive_mpc.cell_mm", settings.cell_mm, rule)))
+
+
+def _adapted(nominal: Simulator, settings: AdaptiveMpc, parameters: Floats) -> Simulator:
     """The model with these constants."""
     layers = len(nominal.scenario.tissue)
     shift = MODULUS + layers
@@ -254,7 +363,7 @@ def _adapted(nominal: Simulator, parameters: Floats) -> Simulator:
         Learnt(
             shift=parameters[shift:variation],
             stiffness=np.exp(parameters[MODULUS:shift]),
-            cell=nominal.scenario.control.adaptive_mpc.cell_mm,
+            cell=settings.cell_mm,
             variation=np.exp(parameters[variation:]),
             bevel=float(parameters[BEVEL]),
             bend=float(parameters[BEND]),
@@ -262,11 +371,22 @@ def _adapted(nominal: Simulator, parameters: Floats) -> Simulator:
     )
 
 
-def _started(belief: Identified, simulator: Simulator, parameters: Floats) -> State:
+def _largest_bevel(scenario: Scenario) -> float:
+    """Largest factor on the bevel offset with which the law stays above its floor stretch."""
+    shortest = min(layer.compression_length_mm for layer in scenario.tissue)
+    offset = scenario.needle.bevel.offset_mm
+    return _LARGEST_BEVEL * shortest / offset if offset > 0.0 else 1.0
+
+
+def _started(estimate: Identified, simulator: Simulator, parameters: Floats) -> State:
     """The state of the start, settled with these parameters."""
-    start = belief.nominal.start(belief.stops[0][1].bevel)
-    believed = start.believing(base_y=float(parameters[BASE_Y]), base_turn=float(parameters[BASE_TURN]))
-    return simulator.replay(believed, _REST)[0]
+    start = estimate.nominal.start(estimate.stops[0][1].bevel)
+    moved = start.believing(
+        base_x=float(start.base[0]) + estimate.axial,
+        base_y=float(parameters[BASE_Y]),
+        base_turn=float(parameters[BASE_TURN]),
+    )
+    return simulator.replay(moved, _REST)[0]
 
 
 def _improved(belief: Identified, readings: _Readings) -> Identified:
@@ -275,7 +395,9 @@ def _improved(belief: Identified, readings: _Readings) -> Identified:
     jacobian, variance = _jacobian(belief, readings), readings.variance(belief.nominal.scenario)
     weighted = jacobian.T / variance
     gradient = weighted @ readings.left(belief) - prior.precision @ (belief.parameters - prior.mean)
-    step = np.linalg.solve(weighted @ jacobian + prior.precision, gradient)
+    precision = weighted @ jacobian + prior.precision
+    belief = replace(belief, precision=precision)
+    step = np.linalg.solve(precision, gradient)
     if not np.isfinite(step).all():
         return belief._with(belief.parameters)
     goal = np.clip(belief.parameters + step, *prior.bounds)
@@ -291,37 +413,33 @@ def _improved(belief: Identified, readings: _Readings) -> Identified:
     return fitted
 
 
-def _jacobian(belief: Identified, readings: _Readings) -> Floats:
-    """Derivative (r, K) of the predicted readings, by forward differences; the motion before a parameter matters is
-    not simulated again.
-    """
-    prior, deepest = belief.prior, belief.tips[:, 0].max()
-    jacobian = np.zeros((readings.y.size, prior.mean.size))
+def _jacobian(estimate: Identified, readings: _Readings) -> Floats:
+    """Derivative (r, K) of the predicted readings, from the curves."""
+    jacobian = estimate._slopes(readings.between(estimate.tips[:, 0]))
     jacobian[:, RUN_OUT] = readings.sides
-    for k in range(prior.mean.size):
-        if k == RUN_OUT or deepest < prior.begins[k]:
-            continue
-        parameters = belief.parameters.copy()
-        parameters[k] += prior.steps[k]
-        tips = _tips(belief, parameters, float(prior.begins[k]))
-        jacobian[:, k] = readings.between(tips[:, 1] - belief.tips[:, 1]) / prior.steps[k]
     return jacobian
 
 
-def _tips(belief: Identified, parameters: Floats, begins: float) -> Floats:
-    """The tips (m + 1, 3) with parameters that differ only in what matters from the tip depth `begins` (mm) on."""
-    simulator = _adapted(belief.nominal, parameters)
-    reached = int(np.argmax(np.append(belief.tips[:, 0], np.inf) > begins))  # by the move before this one
-    first, state = max((stop for stop in belief.stops if stop[0] < max(1, reached)), key=lambda stop: stop[0])
+def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) -> tuple[Perturbed, Floats]:
+    """The needle with another value of parameter k, and its tips (m + 1 + a, 3), the a steps `ahead` included.
+
+    What was before the parameter matters is not simulated again.
+    """
+    simulator, begins = _adapted(estimate.nominal, estimate.settings, parameters), float(estimate.prior.begins[k])
+    reached = int(np.argmax(np.append(estimate.tips[:, 0], np.inf) > begins))  # by the move before this one
+    first, state = max((stop for stop in estimate.stops if stop[0] < max(1, reached)), key=lambda stop: stop[0])
     if first == 0:
-        state = _started(belief, simulator, parameters)
-    before = np.concatenate([belief.tips[:first], state.tip[None]])
-    return np.concatenate([before, simulator.replay(state, belief.rows[first:])[1]])
+        state = _started(estimate, simulator, parameters)
+    before = np.concatenate([estimate.tips[:first], state.tip[None]])
+    now, tips = simulator.replay(state, estimate.rows[first:])
+    later = simulator.replay(now, ahead)[1]
+    member = Perturbed(k, float(estimate.prior.steps[k]), simulator, now)
+    return member, np.concatenate([before, tips, later])
 
 
-def _low_passed(scenario: Scenario, left: Floats) -> float:
+def _low_passed(settings: AdaptiveMpc, left: Floats) -> float:
     """The residuals (r,) of the last moves, each less than the one after it."""
-    level, gain = 0.0, scenario.control.adaptive_mpc.residual_gain
+    level, gain = 0.0, settings.residual_gain
     for value in left[-_RECENT:].tolist():
         level += gain * (value - level)
     return level

@@ -1,40 +1,48 @@
 """What every controller gets and gives; a method is a `begin` and a `decide`, in one file of `methods`."""
 
 import math
+import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from pydantic import ValidationError
 
 from flexneedle.control.estimate import Estimate
+from flexneedle.control.observer import Beliefs
+from flexneedle.control.task import Task
+from flexneedle.errors import InputError
 from flexneedle.ports import Command
-from flexneedle.scenario import Scenario
-from flexneedle.simulator import Simulator, State
+from flexneedle.scenario import Control, Scenario
+from flexneedle.scenario.fields import Section
+from flexneedle.simulator import State
+from flexneedle.simulator.control import COLUMNS
 from flexneedle.trace import PlanRecord
+
+__all__ = ["Decision", "Method", "Observer", "Task", "at_depth", "travel_left"]
+
+_CORRECTED_MODEL = Beliefs()
+_NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
 
 @dataclass(frozen=True)
 class Decision:
-    """A command, why, its predicted cost, and the standard deviation left in the guide step (mm; NaN: none)."""
+    """A command, why, its predicted cost, and the standard deviation left in the guide step (mm; NaN: none).
+
+    Raises InputError for a command of another length.
+    """
 
     command: Command
     why: str
     cost: float = math.nan
     spread: float = math.nan
 
-
-@dataclass(frozen=True, eq=False)
-class Task:
-    """What a controller is to carry out, and its model as the scenario has it."""
-
-    simulator: Simulator
-    plan: PlanRecord
-
-    @property
-    def scenario(self) -> Scenario:
-        """The scenario of model and settings."""
-        return self.simulator.scenario
+    def __post_init__(self) -> None:
+        if len(self.command) != len(COLUMNS):
+            raise InputError(
+                f"command = {self.command}: must have {len(COLUMNS)} numbers, {', '.join(COLUMNS)}"
+            )
 
 
 def travel_left(scenario: Scenario, plan: PlanRecord, state: State) -> float:
@@ -51,22 +59,64 @@ def at_depth(task: Task, _memory: Any, estimate: Estimate) -> bool:
 class Observer(Protocol):
     """What a controller lets be believed."""
 
-    def begin(self, simulator: Simulator, bevel: int) -> Estimate:
+    def begin(self, task: Task) -> Estimate:
         """The belief before the first reading."""
         ...
+
+
+def _nothing(_task: Task) -> None:
+    """No memory."""
 
 
 @dataclass(frozen=True)
 class Method:
     """A controller. Memory is a frozen value of its own kind: what it carries from one period to the next.
 
-    name: as in `--controller`; summary: one line for lists; beliefs: its observer;
-    begin: memory at the start; decide: the next command and the memory after it; arrived: whether it is done.
+    name: as in `--controller`, small letters, digits and hyphens; summary: one line for lists; observer: what makes
+    the estimate of the readings (default: the model, corrected by them);
+    decide: the next command and the memory after it; begin: memory at the start (default: None); arrived: whether it
+    is done (default: at the target depth);
+    settings: class of its settings, a default for each, which the scenario has in the table `control.<table>`.
+
+    Raises InputError for a name or settings that cannot be used.
     """
 
     name: str
     summary: str
-    beliefs: Observer
-    begin: Callable[[Task], Any]
+    observer: Observer = _CORRECTED_MODEL
+    _: KW_ONLY
     decide: Callable[[Task, Any, Estimate, np.random.Generator], tuple[Decision, Any]]
+    begin: Callable[[Task], Any] = _nothing
     arrived: Callable[[Task, Any, Estimate], bool] = at_depth
+    settings: type[Section] | None = None
+
+    def __post_init__(self) -> None:
+        if not _NAME.fullmatch(str(self.name)):
+            raise InputError(f"name = {self.name!r}: a controller's name must be like my-controller-2")
+        if self.table in Control.model_fields:
+            raise InputError(f"name = {self.name!r}: control.{self.table} is a setting of all controllers")
+        for part in ("decide", "begin", "arrived"):
+            if not callable(getattr(self, part)):
+                raise InputError(f"controller {self.name}: {part} must be a function")
+        if not callable(getattr(self.observer, "begin", None)):
+            raise InputError(f"controller {self.name}: observer must have a begin(task)")
+        _check_settings(self.name, self.settings)
+
+    @property
+    def table(self) -> str:
+        """Name of its table below `control`."""
+        return self.name.replace("-", "_")
+
+
+def _check_settings(name: str, settings: Any) -> None:
+    if settings is None:
+        return
+    if not (isinstance(settings, type) and issubclass(settings, Section)):
+        raise InputError(f"controller {name}: settings must be a class made from flexneedle.Section")
+    try:
+        settings()
+    except ValidationError as error:
+        keys = ", ".join(".".join(map(str, detail["loc"])) for detail in error.errors())
+        raise InputError(
+            f"controller {name}: settings must have a valid default for each key: {keys}"
+        ) from None

@@ -1,18 +1,42 @@
 """Cross-entropy model predictive control of advance and guide (paper eq. 13)."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.control.bang_bang import BevelRule
 from flexneedle.control.interface import travel_left
-from flexneedle.planning import Settings, cross_entropy
+from flexneedle.planning import Outcome, Search, Term, Variables, best, terms
 from flexneedle.scenario import Scenario, Setup, elite_count
+from flexneedle.scenario.fields import Fraction, NonNegative, count
 from flexneedle.simulator import Simulator, State
 from flexneedle.trace import PlanRecord
 
 Floats = NDArray[np.float64]
 _LEAST_ADVANCE = 0.5  # of the longest step: standing still is no way to reduce the cost
+
+
+class CeMpc(BevelRule):
+    """Section `control.ce_mpc`: the search of `ce-mpc`, and its bang-bang rule."""
+
+    samples: int = count(21, least=2, most=100_000)
+    """Control sequences in an iteration of a period."""
+    iterations: int = count(4, least=1, most=1_000)
+    """Iterations of a period."""
+    horizon: int = count(7, least=1, most=1_000)
+    """Steps that a period looks ahead."""
+    orientation_weight_mm: NonNegative = 11.8
+    """Cost of an angle off the planned path, as a distance: 1 rad weighs as much as this."""
+    curvature_per_m: NonNegative = 0.232
+    """κ of the two paths of the bang-bang rule."""
+    flip_dead_band: Fraction = 0.875
+    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
+    guide_weight: NonNegative = 0.075
+    """Cost of a squared millimetre that a guide step departs from the plan's."""
+    energy_weight_per_mj: NonNegative = 2.74
+    """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,34 +49,35 @@ class Choice:
 
 
 def choose(
-    simulator: Simulator, plan: PlanRecord, state: State, *, flip: bool, rng: np.random.Generator
+    simulator: Simulator,
+    plan: PlanRecord,
+    state: State,
+    control: CeMpc,
+    *,
+    flip: bool,
+    rng: np.random.Generator,
 ) -> Choice:
     """Search the next steps of advance and guide for the least deviation from the planned tip poses."""
     scenario = simulator.scenario
-    steps, travel = scenario.control.horizon, travel_left(scenario, plan, state)
+    steps, travel = control.horizon, travel_left(scenario, plan, state)
     reference, nominal = _window(plan, float(state.tip[0]), steps)
     base = planned_base(scenario.setup, plan, state, reference[:, 0])
-    lower, upper, sigma = _bounds(scenario, steps)
-    mean = np.clip(np.concatenate([nominal[:, 0], nominal[:, 3]]), lower, upper)
-    settings = Settings(
-        samples=scenario.control.samples,
-        elite=max(2, elite_count(scenario.control.samples, scenario.plan.elite_fraction)),
-        iterations=scenario.control.iterations,
+    variables = _variables(scenario, state, base, travel, nominal, flip=flip)
+    search = Search(
+        samples=control.samples,
+        elite=max(2, elite_count(control.samples, scenario.plan.elite_fraction)),
+        iterations=control.iterations,
         smoothing=scenario.plan.smoothing,
         tolerance=scenario.plan.tolerance,
-        lower=lower,
-        upper=upper,
     )
 
-    def cost(z: Floats) -> Floats:
-        controls = _controls(scenario, state, z, base, travel, flip)
-        return _cost(simulator, state, controls, reference, nominal)
+    def rollout(controls: Floats) -> Outcome:
+        return Outcome(controls, *simulator.rollout(state, controls))
 
-    found = cross_entropy.minimize(cost, cross_entropy.start(mean, sigma), settings, rng)
-    first = _controls(scenario, state, found.best[None], base, travel, flip)[0, 0]
-    spread = float(np.sqrt(found.covariance[steps, steps]))
-    db_x, db_y, db_theta, dg_y = first[:4].tolist()
-    return Choice((db_x, db_y, db_theta, dg_y), found.best_cost, spread)
+    found = best(variables, rollout, _cost_terms(control, reference, nominal[:, 3]), search, rng)
+    spread = float(np.sqrt(found.belief.covariance[steps, steps]))
+    db_x, db_y, db_theta, dg_y = found.outcome.controls[0, 0, :4].tolist()
+    return Choice((db_x, db_y, db_theta, dg_y), found.cost, spread)
 
 
 def _window(plan: PlanRecord, x: float, steps: int) -> tuple[Floats, Floats]:
@@ -82,17 +107,32 @@ def planned_base(setup: Setup, plan: PlanRecord, state: State, depth: Floats) ->
     return steps
 
 
-def _bounds(scenario: Scenario, steps: int) -> tuple[Floats, Floats, Floats]:
-    """Lower, upper bound and first standard deviation of z = (advances, guide steps), each (2 steps,)."""
-    setup, control = scenario.setup, scenario.control
+def _variables(
+    scenario: Scenario, state: State, base: Floats, travel: float, nominal: Floats, *, flip: bool
+) -> Variables:
+    """z = (advances, guide steps), each (2 steps,), about those of the plan (steps, 5)."""
+    setup, control, steps = scenario.setup, scenario.control, len(nominal)
     advance, guide = setup.max_advance_mm, setup.max_guide_step_mm if setup.has_guide else 0.0
     # A guide step must undo the start error within half the horizon; jitter asks for a little more.
     sigma = min(guide, 2.0 * (control.start_offset_sd_mm + scenario.tracker.jitter_per_axis) / steps)
-    ones = np.ones(steps)
+    lower = np.repeat([_LEAST_ADVANCE * advance, -guide], steps)
+    upper = np.repeat([advance, guide], steps)
+    return Variables(
+        lower=lower,
+        upper=upper,
+        mean=np.clip(np.concatenate([nominal[:, 0], nominal[:, 3]]), lower, upper),
+        sigma=np.repeat([scenario.plan.advance_sigma_mm, sigma], steps),
+        controls=lambda z: _controls(scenario, state, z, base, travel, flip),
+    )
+
+
+def _cost_terms(control: CeMpc, reference: Floats, nominal: Floats) -> tuple[Term, ...]:
+    """Deviation from poses (steps, 3), departure from guide steps (steps,), tissue energy (paper eq. 13)."""
+    poses = partial(terms.deviation, reference=reference, orientation=control.orientation_weight_mm)
     return (
-        np.concatenate([_LEAST_ADVANCE * advance * ones, -guide * ones]),
-        np.concatenate([advance * ones, guide * ones]),
-        np.concatenate([scenario.plan.advance_sigma_mm * ones, sigma * ones]),
+        Term("deviation", 1.0, poses),
+        Term("guide", control.guide_weight, partial(terms.guide_departure, nominal=nominal)),
+        Term("energy", control.energy_weight_per_mj, terms.energy_of_steps),
     )
 
 
@@ -110,15 +150,3 @@ def _controls(scenario: Scenario, state: State, z: Floats, base: Floats, travel:
     controls[:, :, 4] = -1.0
     controls[:, 0, 4] = 1.0 if flip else -1.0
     return controls
-
-
-def _cost(simulator: Simulator, state: State, controls: Floats, reference: Floats, nominal: Floats) -> Floats:
-    """Squared SE(2) deviation of the tip, summed over the steps, and the guide's departure from the plan."""
-    control = simulator.scenario.control
-    tips, energy, converged = simulator.rollout(state, controls)
-    off = tips - reference
-    off[:, :, 2] *= control.orientation_weight_mm
-    guide = controls[:, :, 3] - nominal[:, 3]
-    costs = (off**2).sum(axis=(1, 2)) + control.guide_weight * (guide**2).sum(axis=1)
-    costs += control.energy_weight_per_mj * energy.sum(axis=1)
-    return np.where(converged.all(axis=1), costs, np.inf)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flexneedle.control.estimate import Estimate, Floats, Move, along, assigned, place
+from flexneedle.control.task import Task
 from flexneedle.ports import Command, Sample
 from flexneedle.simulator import Control, Simulator, State
 
@@ -30,11 +31,11 @@ class Beliefs:
     fits_start: bool = True
     learns_load: bool = True
 
-    def begin(self, simulator: Simulator, bevel: int) -> "Corrected":
+    def begin(self, task: Task) -> "Corrected":
         """Believe in a straight start, with the prior of the scenario."""
-        control = simulator.scenario.control
+        simulator, control = task.simulator, task.scenario.control
         prior = np.diag([control.start_offset_sd_mm**2, control.start_angle_sd**2])
-        state = simulator.start(bevel)
+        state = simulator.start(task.plan.bevel)
         return Corrected(simulator, self, state, state, prior, state.tip[None])
 
 
@@ -60,6 +61,10 @@ class Corrected:
     def tip(self) -> Floats:
         """Tip pose (3,)."""
         return self.state.tip
+
+    @property
+    def tip_sd(self) -> float:
+        return 0.0
 
     def tip_at(self, time: float) -> tuple[float, float]:
         """Where the tip was believed to be (mm) at `time`."""

@@ -10,6 +10,7 @@ from flexneedle.mechanics.compile import inner, kernel
 from flexneedle.mechanics.model import ESSENTIAL, Floats, Model
 
 Bools = NDArray[np.bool_]
+_SAME_PLACE = 1e-3  # of a part: a tip this near the end of a part is there
 
 
 @inner
@@ -49,11 +50,40 @@ def settle(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, held: fl
     return count
 
 
+@inner
+def _end_of_part(model: Model, s: Floats, advance: float, done: float) -> float:
+    """Share of a step at which its next part ends, `done` being the share so far.
+
+    Down to the zone below the skin parts end where the tip is expected at a multiple of the part's length: the state stays
+    a continuous function of the command.
+    """
+    x = s[nd.TIP_X]
+    if advance <= 0.0 or x >= model.zone or x + (1.0 - done) * advance <= 0.0:
+        return 1.0
+    goal = max(0.0, model.part * (math.floor(x / model.part + _SAME_PLACE) + 1.0))
+    end = done + (goal - x) / advance
+    return end if end < 1.0 else 1.0
+
+
 @kernel
 def advance(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, command: Floats) -> int:
     """One step (X, C)_{k+1} = f((X, C)_k, U_k) (paper eq. 1); arrays and result as in `settle`."""
-    _move(model, s, rest, command)
-    return settle(model, s, rest, u, w, math.nan)
+    end = _end_of_part(model, s, command[0], 0.0)
+    if end == 1.0:
+        _move(model, s, rest, command)
+        return settle(model, s, rest, u, w, math.nan)
+    part = command.copy()
+    done, count, converged, residual = 0.0, 0, 1.0, 0.0
+    while done < 1.0:
+        part[:4] = (end - done) * command[:4]
+        _move(model, s, rest, part)
+        count = settle(model, s, rest, u, w, math.nan)
+        converged, residual = min(converged, s[nd.CONVERGED]), max(residual, s[nd.RESIDUAL])
+        part[4] = -1.0
+        done = end
+        end = _end_of_part(model, s, command[0], done)
+    s[nd.CONVERGED], s[nd.RESIDUAL] = converged, residual
+    return count
 
 
 @kernel

@@ -26,8 +26,8 @@ BASE_X, BASE_Y, BASE_TURN, GUIDE_Y, BEVEL, SHORTENING, TIP_LOAD, TIP_X, TIP_Y, T
 FRONT, REST, SPRING_U, CUT_X, CUT_Y, CUT_TURN, CUT_FRONT, CUT_REST = range(10, 18)
 TIP_FORCE, TIP_REACTION, SPRING_ENERGY, BASE_SHEAR, BASE_MOMENT = range(18, 23)
 COUPLING, PATH_Y, ITERATIONS, RESIDUAL, CONVERGED = range(23, 28)
-CLAMP_Y, CLAMP_TURN = range(28, 30)  # the part of base y and turn that no command moved
-STATE_SIZE = 30
+CLAMP_Y, CLAMP_TURN, CLAMP_X = range(28, 31)  # the part of base y, turn and x that no command moved
+STATE_SIZE = 31
 
 # Rows of the work array, one column a node. A1, G1, B11, B12 are those before an essential node, all else after.
 A1, A2, G1, G2, B11, B12, B22, STIFFNESS, FORCE, ENERGY, SHARE, FIXED = range(12)

@@ -52,3 +52,10 @@ def contact_law(
 def law_scales(shear_modulus: Floats, alpha: Floats, height: Floats, volume: Floats) -> tuple[Floats, Floats]:
     """Force scale 2μV/αh (N) and energy scale 2μV/α² (mJ) for μ in MPa, V in mm³, h in mm."""
     return 2.0 * shear_modulus * volume / (alpha * height), 2.0 * shear_modulus * volume / alpha**2
+
+
+def displaced_energy(alpha: Floats, height: Floats, energy: Floats, u: float) -> Floats:
+    """Energy (mJ) that contacts of energy scale `energy` store where they are moved aside by u (mm)."""
+    stretch = np.maximum(1.0 - abs(u) / height, FLOOR_STRETCH)
+    stored: Floats = energy * (2.0 * stretch ** (-0.5 * alpha) + stretch**alpha - 3.0)
+    return stored

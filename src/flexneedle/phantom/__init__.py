@@ -2,6 +2,6 @@
 
 from flexneedle.phantom.draw import Truth, draw
 from flexneedle.phantom.phantom import Condition, Phantom
-from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS
+from flexneedle.phantom.plants import DEFAULT_PLANT, PLANTS, Plant, PlantFactory
 
-__all__ = ["DEFAULT_PLANT", "PLANTS", "Condition", "Phantom", "Truth", "draw"]
+__all__ = ["DEFAULT_PLANT", "PLANTS", "Condition", "Phantom", "Plant", "PlantFactory", "Truth", "draw"]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.phantom.draw import Truth
-from flexneedle.phantom.plants import plant
+from flexneedle.phantom.plants import PlantFactory, plant
 from flexneedle.ports import Command
 from flexneedle.simulator import Control
 from flexneedle.simulator.control import Limits
@@ -28,7 +28,7 @@ class Condition(NamedTuple):
 class Phantom:
     """The needle in the tank. Moves on command; the time that a command takes passes on its own clock."""
 
-    def __init__(self, truth: Truth, bevel: int, kind: str = "exact") -> None:
+    def __init__(self, truth: Truth, bevel: int, kind: str | PlantFactory = "exact") -> None:
         self._plant = plant(kind, truth, bevel)
         self._truth = truth
         self._limits = Limits.of(truth.scenario)

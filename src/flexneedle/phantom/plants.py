@@ -198,12 +198,32 @@ def build_rod(truth: Truth, segments: int) -> rd.Rod:
     )
 
 
-PLANTS: dict[str, Callable[[Truth, int], Plant]] = {"exact": ExactPlant, "model": ModelPlant}
+PlantFactory = Callable[[Truth, int], Plant]
+"""Makes a plant at the start: for what is true of the tank, and the direction of the bevel, −1 or +1."""
+
+PLANTS: dict[str, PlantFactory] = {"exact": ExactPlant, "model": ModelPlant}
 DEFAULT_PLANT = "exact"
+_PARTS = ("step", "tip", "bevel", "strain_energy", "least_stretch", "converged")
 
 
-def plant(name: str, truth: Truth, bevel: int) -> Plant:
-    """Return the plant of this name at the start. Raises InputError with the choices."""
-    if name not in PLANTS:
-        raise InputError(f"phantom = {name!r}: must be one of {', '.join(PLANTS)}")
-    return PLANTS[name](truth, bevel)
+def plant(kind: str | PlantFactory, truth: Truth, bevel: int) -> Plant:
+    """Return the plant of a name, or what a factory makes, at the start.
+
+    Raises InputError for an unknown name, with the choices, or if the factory makes no plant.
+    """
+    if not isinstance(kind, str):
+        return _made(kind, truth, bevel)
+    if kind not in PLANTS:
+        raise InputError(f"phantom = {kind!r}: must be one of {', '.join(PLANTS)}")
+    return PLANTS[kind](truth, bevel)
+
+
+def _made(factory: PlantFactory, truth: Truth, bevel: int) -> Plant:
+    made, name = factory(truth, bevel), getattr(factory, "__name__", type(factory).__name__)
+    if lacks := [part for part in _PARTS if not hasattr(made, part)]:
+        raise InputError(
+            f"phantom = {name}: makes a {type(made).__name__}, no plant: it lacks {', '.join(lacks)}"
+        )
+    if np.shape(made.tip) != (3,):
+        raise InputError(f"phantom = {name}: its tip must be three numbers, x, y (mm) and slope (rad)")
+    return made

@@ -1,6 +1,23 @@
-"""The cross-entropy method, and insertion plans made with it. Knows arrays and a rollout function, no needle."""
+"""The cross-entropy method, the terms of a cost, and plans made with both. Knows arrays and a rollout, no needle."""
 
-from flexneedle.planning.cross_entropy import Belief, Settings, ask, minimize, tell
+from flexneedle.planning.cross_entropy import Belief, Search, Settings, ask, minimize, tell
+from flexneedle.planning.horizon import Found, Variables, best
 from flexneedle.planning.insertion import Problem, Solution, optimise
+from flexneedle.planning.terms import Outcome, Term
 
-__all__ = ["Belief", "Problem", "Settings", "Solution", "ask", "minimize", "optimise", "tell"]
+__all__ = [
+    "Belief",
+    "Found",
+    "Outcome",
+    "Problem",
+    "Search",
+    "Settings",
+    "Solution",
+    "Term",
+    "Variables",
+    "ask",
+    "best",
+    "minimize",
+    "optimise",
+    "tell",
+]

@@ -20,11 +20,10 @@ _FLOOR = 1e-3  # standard deviation that regularisation keeps, relative to the i
 
 
 @dataclass(frozen=True)
-class Settings:
+class Search:
     """N samples, the elite ρN of them, most iterations; smoothing β keeps that share of the old moments.
 
-    lower, upper (d,): bounds, enforced on the samples. tolerance: spread of the elite costs, relative to that of
-    the first iteration, at which the method has converged.
+    tolerance: spread of the elite costs, relative to the first finite one, at which the method has converged.
     """
 
     samples: int
@@ -32,6 +31,12 @@ class Settings:
     iterations: int
     smoothing: float
     tolerance: float
+
+
+@dataclass(frozen=True)
+class Settings(Search):
+    """A search within bounds: lower, upper (d,), enforced on the samples."""
+
     lower: Floats
     upper: Floats
 
@@ -106,10 +111,11 @@ def minimize(
     settings: Settings,
     rng: np.random.Generator,
     progress: Callable[[dict[str, Any]], None] | None = None,
+    first: Floats | None = None,
 ) -> Belief:
-    """Ask and tell until done. `cost` maps samples (N, d) to costs (N,)."""
+    """Ask and tell until done. `cost` maps samples (N, d) to costs (N,); `first` (n, d): of iteration 1."""
     while not belief.done(settings):
-        samples = ask(belief, settings, rng)
+        samples = ask(belief, settings, rng) if first is None or belief.iterations > 0 else first
         belief = tell(belief, settings, samples, cost(samples))
         if progress is not None:
             progress(
@@ -119,8 +125,9 @@ def minimize(
 
 
 def _elite_spread(entry: dict[str, Any]) -> float:
+    """Spread of an iteration's elite costs; infinite where one of them failed."""
     least, worst, _, _ = entry["cost_quantiles"]
-    return float(worst - least)
+    return float(worst - least) if np.isfinite(worst) else np.inf
 
 
 def _with(
@@ -137,7 +144,8 @@ def _with(
         "cost_quantiles": tuple(float(ordered[k]) for k in (0, settings.elite - 1, costs.size // 2, -1)),
         "spread": tuple(np.sqrt(np.diag(covariance)).tolist()),
     }
-    scale = _elite_spread(belief.history[0] if belief.history else entry)
+    spreads = (_elite_spread(earlier) for earlier in (*belief.history, entry))
+    scale = next((spread for spread in spreads if np.isfinite(spread)), np.inf)
     converged = _elite_spread(entry) <= settings.tolerance * scale < np.inf
     best = winner if better else belief.best
     return Belief(

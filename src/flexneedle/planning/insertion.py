@@ -8,16 +8,18 @@ changes.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.planning import cross_entropy as ce
+from flexneedle.planning import terms
+from flexneedle.planning.cross_entropy import Belief, Search
+from flexneedle.planning.horizon import Variables, best
+from flexneedle.planning.terms import Rollout, Term
 
 Floats = NDArray[np.float64]
-Rollout = Callable[[Floats], tuple[Floats, Floats, NDArray[np.bool_], Floats]]
-"""controls (N, m, 5) → tips (N, m, 3), strain energy (N, m), converged (N, m), mean square deflection (N, m)."""
 
 ADVANCE, BASE_Y, BASE_TURN, GUIDE, BEVEL, SHARE = range(6)
 COORDINATES = 6
@@ -55,38 +57,48 @@ class Solution:
     controls: Floats
     bevel: int
     terms: dict[str, float]
-    belief: ce.Belief
+    belief: Belief
 
 
 def optimise(
     rollout: Rollout,
     problem: Problem,
-    settings: dict[str, Any],
+    search: Search,
     rng: np.random.Generator,
     progress: Callable[[dict[str, Any]], None] | None = None,
 ) -> Solution:
-    """Search the primitives; `settings` are samples, elite, iterations, smoothing, tolerance of the method.
+    """Search the primitives.
 
     `rollout` starts with bevel +1 in air; a sample that wants −1 flips in its first step, which is not charged.
     """
-    n = problem.primitives
-    lower = np.tile([_LEAST_ADVANCE * problem.step[0], *-problem.step[1:], -_BEVEL_BOUND, -_SHARE_BOUND], n)
-    upper = np.tile([problem.step[0], *problem.step[1:], _BEVEL_BOUND, _SHARE_BOUND], n)
-    mean = np.tile([problem.step[0], 0.0, 0.0, 0.0, 0.0, 0.0], n)
-    searched = ce.minimize(
-        lambda z: np.sum(list(_terms(rollout, problem, z).values()), axis=0),
-        ce.start(mean, np.tile(problem.sigma, n), _correlation(n)),
-        ce.Settings(**settings, lower=lower, upper=upper),
-        rng,
-        progress,
-    )
-    best = searched.best[None]
-    controls, wanted = schedule(problem, best)
-    bevel = int(wanted[0, 0])
+    found = best(_variables(problem), rollout, cost_terms(problem), search, rng, progress=progress)
+    controls, wanted = schedule(problem, found.z[None])
     controls[0, 0, 4] = -1.0
     moving = controls[0, :, 0] > 0.0
-    terms = {name: float(value[0]) for name, value in _terms(rollout, problem, best).items()}
-    return Solution(controls[0, moving], bevel, terms, searched)
+    return Solution(controls[0, moving], int(wanted[0, 0]), found.terms, found.belief)
+
+
+def _variables(problem: Problem) -> Variables:
+    n, most = problem.primitives, [*problem.step[1:], _BEVEL_BOUND, _SHARE_BOUND]
+    return Variables(
+        lower=np.tile([_LEAST_ADVANCE * problem.step[0], *np.negative(most)], n),
+        upper=np.tile([problem.step[0], *most], n),
+        mean=np.tile([problem.step[0], 0.0, 0.0, 0.0, 0.0, 0.0], n),
+        sigma=np.tile(problem.sigma, n),
+        controls=lambda z: schedule(problem, z)[0],
+        correlation=_correlation(n),
+    )
+
+
+def cost_terms(problem: Problem) -> tuple[Term, ...]:
+    """The cost of a plan (paper eq. 9 and 10)."""
+    return (
+        Term("accuracy", problem.accuracy_weight, partial(terms.miss, target=problem.target)),
+        Term("energy", problem.energy_weight, terms.energy_at_end),
+        Term("deflection", problem.deflection_weight, terms.deflection),
+        Term("guide", problem.guide_weight, terms.guide_motion),
+        Term("flips", problem.flip_weight, partial(terms.rolls, first=1)),
+    )
 
 
 def _correlation(primitives: int) -> Floats:
@@ -135,24 +147,3 @@ def _within_reach(problem: Problem, primitives: Floats, count: NDArray[np.int64]
         lateral[:, p] = (moved - total) / n
         total = moved
     return lateral
-
-
-def _terms(rollout: Rollout, problem: Problem, z: Floats) -> dict[str, Floats]:
-    """Cost terms (N,) of primitives z, an infinite accuracy term where the model failed (paper eq. 9 and 10)."""
-    controls, _ = schedule(problem, z)
-    tips, energy, converged, deflection = rollout(controls)
-    depth, lateral = problem.target
-    end = tips[:, -1]
-    # The last step will be shortened to end at the target depth: follow the tip's own line to it.
-    at_depth = end[:, 1] + np.tan(end[:, 2]) * (depth - end[:, 0])
-    moving = controls[:, :, 0] > 0.0
-    inside = (tips[:, :, 0] > 0.0) & moving
-    flips = (controls[:, 1:, 4] > 0.0).sum(axis=1)
-    miss = np.where(converged.all(axis=1), np.abs(at_depth - lateral), np.inf)
-    return {
-        "accuracy": problem.accuracy_weight * miss,
-        "energy": problem.energy_weight * energy[:, -1],
-        "deflection": problem.deflection_weight * (deflection * inside).sum(axis=1),
-        "guide": problem.guide_weight * ((controls[:, :, 3] ** 2) * inside).sum(axis=1),
-        "flips": problem.flip_weight * flips,
-    }

@@ -1,8 +1,8 @@
 """The folder of a run: claimed once, `run.json` always whole, read back with clear errors.
 
 `run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing and
-plans; that of an insertion also controller and phantom. All but `timing`, which holds the date and the wall-clock
-times, is the same for the same seed.
+plans; that of an insertion also controller, phantom and tracker. All but `timing`, which holds the date and the
+wall-clock times, is the same for the same seed.
 """
 
 import hashlib
@@ -147,7 +147,7 @@ def _checked(path: Path, values: Any) -> RunFile:
         plans = {name: plan_from_values(plan) for name, plan in values["plans"].items()}
         named = {name: values[name] for name in ("kind", "status", "reason", "seed", "result", "timing")}
         named |= {name: values.get(name, "") for name in ("controller", "phantom")}
-        return RunFile(path.parent, scenario=Scenario.from_values(values["scenario"]), plans=plans, **named)
+        return RunFile(path.parent, scenario=Scenario.from_record(values["scenario"]), plans=plans, **named)
     except ScenarioError as error:
         raise InputError(f"{path}: damaged: {error.problems[0]}") from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:

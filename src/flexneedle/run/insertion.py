@@ -5,14 +5,18 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from flexneedle.control import tables
+from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Decision, Method, Task, at_depth
-from flexneedle.control.methods import DEFAULT, method
-from flexneedle.errors import RunError
-from flexneedle.phantom import DEFAULT_PLANT
+from flexneedle.control.methods import DEFAULT, used
+from flexneedle.errors import InputError, RunError
+from flexneedle.phantom import DEFAULT_PLANT, PlantFactory
 from flexneedle.ports import Command
+from flexneedle.run.parts import SCENARIO_TRACKER, TrackerFactory, controller_of, plant_of, tracker_of
 from flexneedle.run.rig import Rig, Seeds, virtual_rig
 from flexneedle.run.sight import Sight, look_around, see
 from flexneedle.scenario import Scenario
@@ -29,21 +33,27 @@ def insert(
     plan: PlanRecord,
     seed: int = 0,
     *,
-    controller: str = DEFAULT,
-    phantom: str = DEFAULT_PLANT,
+    controller: str | Method = DEFAULT,
+    phantom: str | PlantFactory = DEFAULT_PLANT,
+    tracker: str | TrackerFactory = SCENARIO_TRACKER,
     force: bool = False,
     threads: int | None = None,
     on_period: Callable[[Period], None] | None = None,
 ) -> Insertion:
     """Carry out `plan` in closed loop against the virtual phantom that `seed` draws; returns the whole record.
 
-    controller: one of `control.methods.METHODS`; phantom: "exact" or "model", the formulation of the plant.
+    controller: one of `control.methods.METHODS`; phantom: "exact" or "model", the formulation of the plant; tracker:
+    "scenario", the one that is described there. Each may be an object of your own, too, or its name `module:NAME`
+    (docs/extend.md).
     `threads` is for rollouts (default: all cores) and changes no result. `on_period` gets each control period as
-    it ends. Raises InputError for an unknown name, RunError if the plan misses its target by more than 1 mm,
+    it ends. Raises InputError for an unknown name or an object that is none, ScenarioError for a setting that the
+    controllers refuse, RunError if the plan misses its target by more than 1 mm,
     unless `force`. Same seed, same record, but for wall-clock durations.
     """
     phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
-    rig = virtual_rig(scenario, plan.bevel, Seeds(phantom_seed, tracker_seed, room_seed), phantom)
+    plant_name, plant = plant_of(phantom)
+    seeds = Seeds(phantom_seed, tracker_seed, room_seed)
+    rig = virtual_rig(scenario, plan.bevel, seeds, plant, tracker=tracker_of(tracker)[1])
     rng = np.random.default_rng(control_seed)
     insertion = run(
         scenario,
@@ -56,7 +66,7 @@ def insert(
         threads=threads,
         on_period=on_period,
     )
-    return replace(insertion, phantom=phantom)
+    return replace(insertion, phantom=plant_name)
 
 
 def run(
@@ -66,26 +76,28 @@ def run(
     rng: np.random.Generator,
     seed: int = 0,
     *,
-    controller: str = DEFAULT,
+    controller: str | Method = DEFAULT,
     force: bool = False,
     threads: int | None = None,
     on_period: Callable[[Period], None] | None = None,
 ) -> Insertion:
     """Carry out `plan` on any rig; as `insert`."""
-    chosen = method(controller)
+    name, chosen = controller_of(controller)
     if not plan.reached and not force:
         raise RunError(
             f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), bound by {plan.limit}; "
             "insert it with force (--force) if it is meant"
         )
+    scenario = used(scenario, chosen)
+    task = tables.task(chosen, Simulator(scenario, threads), plan)
     periods: list[Period] = []
     ending = ("failed", "not at the target depth after four times the planned periods")
-    for period, so_far in _periods(Task(Simulator(scenario, threads), plan), chosen, rig, rng):
+    for period, so_far in _periods(task, chosen, rig, rng):
         periods.append(period)
         ending = so_far or ending
         if on_period is not None:
             on_period(period)
-    insertion = Insertion(plan, seed, tuple(periods), *ending, controller)
+    insertion = Insertion(plan, seed, tuple(periods), *ending, name)
     if insertion.outcome == "done" and insertion.true_error_mm > 1.0:
         missed = f"missed the target by {insertion.true_error_mm:.2f} mm"
         return replace(insertion, reason="; ".join(filter(None, (insertion.reason, missed))))
@@ -100,7 +112,7 @@ def _periods(
     After the last move the needle rests until the tracker has seen it at rest: readings come late.
     """
     scenario, memory = task.scenario, chosen.begin(task)
-    belief = chosen.beliefs.begin(task.simulator, task.plan.bevel)
+    belief = chosen.observer.begin(task)
     start = time.perf_counter()
     sight = look_around(scenario, belief, Watch(scenario.monitor), rig.clock.now(), rig.tracker)
     held, indices = _held(None, sight, rig.clock.now()), itertools.count()
@@ -125,7 +137,7 @@ def _periods(
                 max(wait, begun - sight.sample.time),
             )
         else:
-            decision, memory = chosen.decide(task, memory, sight.estimate, rng)
+            decision, memory = _decided(chosen, task, memory, sight.estimate, rng)
             moves, wait = moves + 1, 0.0
         clocks.append(time.perf_counter())
         applied = _carry_out(scenario, rig, decision.command, wait)
@@ -142,6 +154,16 @@ def _periods(
         yield _record(index, now, task.plan, rig, decision, applied, sight, clocks), ending
         if ending is not None:
             return
+
+
+def _decided(
+    chosen: Method, task: Task, memory: Any, estimate: Estimate, rng: np.random.Generator
+) -> tuple[Decision, Any]:
+    """What the controller decides. Raises InputError if that is nothing to carry out."""
+    match answer := chosen.decide(task, memory, estimate, rng):
+        case (Decision(), _):
+            return answer
+    raise InputError(f"controller {chosen.name}: decide must return a Decision and the memory after it")
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
-from flexneedle.planning import Problem, Solution, optimise
+from flexneedle.planning import Outcome, Problem, Search, Solution, optimise
 from flexneedle.scenario import Scenario, check_target
 from flexneedle.simulator import Control, Simulator, State
 from flexneedle.trace import PlanRecord
@@ -65,18 +65,12 @@ def _search(
     plan = simulator.scenario.plan
     start = simulator.start()
 
-    def rollout(controls: Floats) -> tuple[Floats, Floats, NDArray[np.bool_], Floats]:
+    def rollout(controls: Floats) -> Outcome:
         result, deflection = simulator.rollout_with_deflection(start, controls)
-        return *result, deflection
+        return Outcome(controls, *result, deflection)
 
-    settings = {
-        "samples": plan.samples,
-        "elite": plan.elite_count,
-        "iterations": plan.iterations,
-        "smoothing": plan.smoothing,
-        "tolerance": plan.tolerance,
-    }
-    return optimise(rollout, _problem(simulator.scenario, goal, strategy), settings, rng, progress)
+    search = Search(plan.samples, plan.elite_count, plan.iterations, plan.smoothing, plan.tolerance)
+    return optimise(rollout, _problem(simulator.scenario, goal, strategy), search, rng, progress)
 
 
 def _problem(scenario: Scenario, goal: tuple[float, float], strategy: str) -> Problem:

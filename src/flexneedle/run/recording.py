@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from flexneedle.control.methods import DEFAULT, method
-from flexneedle.errors import InputError
-from flexneedle.phantom import DEFAULT_PLANT, PLANTS
+from flexneedle.control.methods import DEFAULT
+from flexneedle.phantom import DEFAULT_PLANT
 from flexneedle.run.figures import draw_run
 from flexneedle.run.folder import TRACE_FILE, Folder, versions
+from flexneedle.run.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
 from flexneedle.run.results import insertion_result, insertion_timing, plan_result, plan_timing
 from flexneedle.scenario import Scenario
 from flexneedle.trace import Insertion, Period, PlanRecord
@@ -27,7 +27,7 @@ OnPeriod = Callable[[Period], None]
 class Choices:
     """How to plan and to insert. plan_seed: of the planner, None for `seed`; force: insert whatever the plan misses.
 
-    Raises InputError, with the choices, for a controller or a phantom that there is not.
+    controller, phantom, tracker: a name, or module:NAME. Raises InputError, with the choices, for an unknown one.
     """
 
     seed: int
@@ -35,12 +35,16 @@ class Choices:
     plan_seed: int | None = None
     controller: str = DEFAULT
     phantom: str = DEFAULT_PLANT
+    tracker: str = SCENARIO_TRACKER
     force: bool = False
 
     def __post_init__(self) -> None:
-        method(self.controller)
-        if self.phantom not in PLANTS:
-            raise InputError(f"phantom = {self.phantom!r}: must be one of {', '.join(PLANTS)}")
+        controller_of(self.controller), plant_of(self.phantom), tracker_of(self.tracker)
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """What controls, what is controlled, what measures it: by name."""
+        return {"controller": self.controller, "phantom": self.phantom, "tracker": self.tracker}
 
 
 def record_plans(
@@ -73,7 +77,7 @@ def record_insertion(
     An insertion that is interrupted (Ctrl-C) comes back with its periods and the outcome "interrupted". An
     error, or an interruption of the planning, is marked in `run.json` and passed on.
     """
-    folder.values |= {"controller": choices.controller, "phantom": choices.phantom}
+    folder.values |= choices.parts
     with _marked(folder):
         plan_seed = choices.seed if choices.plan_seed is None else choices.plan_seed
         plan = _plan(folder, scenario, choices.strategy, plan_seed, on_iteration)
@@ -103,9 +107,8 @@ def _insert(
     from flexneedle.run.insertion import insert
 
     periods: list[Period] = []
-    controller, phantom = choices.controller, choices.phantom
     about = {"seed": str(choices.seed), "scenario": scenario.name, "strategy": plan.strategy}
-    about |= {"controller": controller, "phantom": phantom, **versions()}
+    about |= {**choices.parts, **versions()}
     path = folder.path / TRACE_FILE
     with TraceWriter(path, plan, about=about, scenario=scenario.values()) as trace:
 
@@ -114,11 +117,11 @@ def _insert(
             periods.append(period)
             on_period(period)
 
-        options: dict[str, Any] = {"controller": controller, "phantom": phantom, "force": choices.force}
+        options: dict[str, Any] = {**choices.parts, "force": choices.force}
         try:
             return insert(scenario, plan, choices.seed, on_period=keep, **options)
         except KeyboardInterrupt:
-            ending = "interrupted", "stopped by the user", controller, phantom
+            ending = "interrupted", "stopped by the user", choices.controller, choices.phantom
             return Insertion(plan, choices.seed, tuple(periods), *ending)
 
 

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexneedle.phantom import DEFAULT_PLANT, Condition, Phantom, draw
+from flexneedle.errors import InputError
+from flexneedle.phantom import DEFAULT_PLANT, Condition, Phantom, PlantFactory, draw
 from flexneedle.ports import Clock, Driver, TipTracker
+from flexneedle.run.parts import TrackerFactory
 from flexneedle.scenario import Registration, Scenario
 from flexneedle.tracking import NoisyTracker
 from flexneedle.tracking.field import FieldTracker, Pose, Room, tip_sensor_pose
@@ -45,27 +47,39 @@ def virtual_rig(
     scenario: Scenario,
     bevel: int,
     seeds: Seeds,
-    phantom: str = DEFAULT_PLANT,
+    phantom: str | PlantFactory = DEFAULT_PLANT,
     *,
+    tracker: TrackerFactory | None = None,
     plate_distance_at: Callable[[float], float] | None = None,
 ) -> Rig:
     """Return a virtual phantom behind the same ports as a rig.
 
+    tracker: makes the tracker; left out, it is the one that the scenario describes. Raises InputError if it makes none.
     plate_distance_at(time): how far a metal plate is from the middle of the tracker's workspace (mm), for one that
     moves; left out, it is the environment's.
     """
     truth = draw(scenario, np.random.default_rng(seeds.phantom))
     tank = Phantom(truth, bevel, phantom)
+    if tracker is not None:
+        own = _made(tracker, scenario, tank, np.random.default_rng(seeds.tracker))
+        return Rig(tank, tank, own, tank.condition)
     errors = _Errors(truth.bias, _registration_error(scenario.tracker.registration, seeds.room))
     rng, around = (
         np.random.default_rng(seeds.tracker),
         virtual_room(scenario, seeds.room, None if plate_distance_at is None else plate_distance_at(0.0)),
     )
     if around is None:
-        tracker: TipTracker = _noisy_tracker(scenario, tank, errors, rng)
+        described: TipTracker = _noisy_tracker(scenario, tank, errors, rng)
     else:
-        tracker = _field_tracker(scenario, around, tank, errors, rng, plate_distance_at)
-    return Rig(tank, tank, tracker, tank.condition)
+        described = _field_tracker(scenario, around, tank, errors, rng, plate_distance_at)
+    return Rig(tank, tank, described, tank.condition)
+
+
+def _made(factory: TrackerFactory, scenario: Scenario, tank: Phantom, rng: np.random.Generator) -> TipTracker:
+    made = factory(scenario, tank, rng)
+    if lacks := [part for part in ("read", "status") if not hasattr(made, part)]:
+        raise InputError(f"tracker: makes a {type(made).__name__}, no tracker: it lacks {', '.join(lacks)}")
+    return made
 
 
 def virtual_room(

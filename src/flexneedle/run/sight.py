@@ -12,6 +12,7 @@ from flexneedle.tracking import OK, Watch
 
 __all__ = ["Sight", "look_around", "see"]
 
+_SURE = 3.0  # standard deviations by which a prediction may be off besides the limit
 _NO_SAMPLE = Sample(0.0, None, None)
 
 
@@ -118,9 +119,8 @@ def _judged(
 ) -> tuple[Watch, tuple[Judged, ...]]:
     """Take in samples, each not to be older than its age (s)."""
     readings = []
+    limit = scenario.control.innovation_limit_mm + _SURE * believed.tip_sd
     for sample, age in zip(samples, ages, strict=True):
-        watch, verdict = watch.take(
-            sample, believed.tip_at(sample.time), now, age, scenario.control.innovation_limit_mm
-        )
+        watch, verdict = watch.take(sample, believed.tip_at(sample.time), now, age, limit)
         readings.append(Judged(sample, verdict))
     return watch, tuple(readings)

@@ -1,6 +1,7 @@
 """Scenarios: what is inserted, into what, towards what, and with which settings."""
 
 from .apparatus import Setup, Tracker
+from .fields import Section
 from .files import dump_scenario, load_scenario
 from .model import Scenario, check_target
 from .monitor import Monitor
@@ -22,6 +23,7 @@ __all__ = [
     "Plan",
     "Registration",
     "Scenario",
+    "Section",
     "Setup",
     "Target",
     "Tracker",

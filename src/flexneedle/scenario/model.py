@@ -1,12 +1,13 @@
 """The scenario: everything that plan and insertion depend on, but for the seed."""
 
+import warnings
 from collections.abc import Mapping
 from itertools import chain
 from typing import Annotated, Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from flexneedle.errors import ScenarioError
+from flexneedle.errors import ScenarioError, ScenarioWarning
 
 from .apparatus import Setup, Tracker
 from .dotted import flatten, set_value, split_key
@@ -15,6 +16,7 @@ from .fields import Section, Title
 from .monitor import Monitor
 from .needle import Needle
 from .problems import describe, key_path, refuse, to_line
+from .renamed import current_key, current_values
 from .rules import (
     geometry_problems,
     grid_problems,
@@ -62,19 +64,29 @@ class Scenario(Section):
                 target_problems(self.setup, self.target),
                 plan_problems(self.plan),
                 monitor_problems(self.monitor, self.tracker),
-                grid_problems(self.setup, self.contact, self.phantom, self.tracker, self.control),
+                grid_problems(self.setup, self.contact, self.phantom, self.tracker),
             )
         )
         return self
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any], source: str = "") -> Self:
-        """Return the scenario of nested tables, or raise ScenarioError, whose lines open with `source`."""
+        """Return the scenario of nested tables, or raise ScenarioError, whose lines open with `source`.
+
+        Warns (ScenarioWarning) of a key that has another name now.
+        """
         try:
-            return cls.model_validate(dict(values))
+            return cls.model_validate(dict(current_values(values, source)))
         except ValidationError as error:
             opening = f"{source}: " if source else ""
             raise ScenarioError(*(opening + line for line in describe(error, cls))) from None
+
+    @classmethod
+    def from_record(cls, values: Mapping[str, Any], source: str = "") -> Self:
+        """Return the scenario of a record, as `from_values`; nobody edits a record, so it warns of nothing."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ScenarioWarning)
+            return cls.from_values(values, source)
 
     def values(self) -> dict[str, Any]:
         """Return nested tables, with all defaults, without the keys that are left out."""
@@ -87,7 +99,7 @@ class Scenario(Section):
         """
         values = self.values()
         for key, value in changes.items():
-            set_value(values, key, _expanded(key, value))
+            set_value(values, current_key(key), _expanded(key, value))
         return self.from_values(values)
 
     def flat(self) -> dict[str, Any]:

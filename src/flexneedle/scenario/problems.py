@@ -10,7 +10,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 
 from .dotted import split_key
 
-__all__ = ["Problem", "describe", "key_path", "printable", "refuse", "to_line"]
+__all__ = ["Problem", "describe", "key_path", "printable", "refuse", "to_line", "unknown_key"]
 
 _BROKEN = "broken_rules"
 _LONGEST_VALUE = 60
@@ -72,7 +72,7 @@ def _lines(detail: ErrorDetails, model: type[BaseModel]) -> list[str]:
     if detail["type"] == "missing":
         return [_line(loc, None, "missing")]
     if detail["type"] == "extra_forbidden":
-        return [_line(loc, detail["input"], _unknown(str(loc[-1]), _section_at(loc[:-1], model)))]
+        return [_line(loc, detail["input"], _unknown(loc, model))]
     return [_line(loc, detail["input"], _rule(detail))]
 
 
@@ -134,11 +134,16 @@ _TYPE_RULES = {
 }
 
 
-def _unknown(key: str, section: type[BaseModel] | None) -> str:
-    valid = list(section.model_fields) if section else []
+def unknown_key(key: str, valid: Sequence[str]) -> str:
+    """Return the rule that an unknown key breaks, with the closest of the valid ones and all of them."""
     close = get_close_matches(key, valid, n=1)
     hint = f"did you mean {close[0]}? " if close else ""
     return f"unknown key; {hint}valid keys: {', '.join(valid)}"
+
+
+def _unknown(loc: tuple[int | str, ...], model: type[BaseModel]) -> str:
+    section = _section_at(loc[:-1], model)
+    return unknown_key(str(loc[-1]), list(section.model_fields) if section else [])
 
 
 def _section_at(loc: Sequence[str | int], model: type[BaseModel]) -> type[BaseModel] | None:

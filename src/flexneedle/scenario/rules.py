@@ -7,7 +7,7 @@ from .apparatus import Setup, Tracker
 from .monitor import Monitor
 from .needle import Bevel, Needle
 from .problems import Problem
-from .settings import Control, Phantom, Plan, Target
+from .settings import Phantom, Plan, Target
 from .tissue import Contact, Layer
 
 __all__ = [
@@ -23,7 +23,6 @@ __all__ = [
 _GREATEST_OFFSET_SHARE = 0.7
 _MOST_GRID_POINTS = 20_000
 _MOST_READINGS_A_STEP = 10_000
-_MOST_CELLS = 200
 _FRAMES_IN_A_WINDOW = 2
 
 
@@ -86,9 +85,7 @@ def plan_problems(plan: Plan) -> Iterator[Problem]:
         yield Problem("plan.elite_fraction", plan.elite_fraction, rule)
 
 
-def grid_problems(
-    setup: Setup, contact: Contact, phantom: Phantom, tracker: Tracker, control: Control
-) -> Iterator[Problem]:
+def grid_problems(setup: Setup, contact: Contact, phantom: Phantom, tracker: Tracker) -> Iterator[Problem]:
     """No spacing or step so small that a run would hang."""
     smallest = setup.stroke_mm / _MOST_GRID_POINTS
     grids = {
@@ -100,10 +97,6 @@ def grid_problems(
     for key, value in grids.items():
         if value < smallest:
             yield Problem(key, value, f"must be at least {smallest:g}, setup.stroke_mm / {_MOST_GRID_POINTS}")
-    thinnest = setup.max_depth / _MOST_CELLS
-    if control.adaptive_mpc.cell_mm < thinnest:
-        rule = f"must be at least {thinnest:g}, the depth of the full stroke / {_MOST_CELLS}"
-        yield Problem("control.adaptive_mpc.cell_mm", control.adaptive_mpc.cell_mm, rule)
     fastest = _MOST_READINGS_A_STEP * setup.insertion_speed_mm_s / setup.max_advance_mm
     if tracker.rate_hz > fastest:
         rule = f"must be at most {fastest:g}, {_MOST_READINGS_A_STEP} readings in a control step"

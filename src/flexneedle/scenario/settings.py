@@ -1,12 +1,12 @@
 """The task and the settings of planner, controller and virtual phantom."""
 
 from math import ceil
-from typing import Annotated
+from typing import Annotated, Any, Self
 
-from pydantic import Field
+from pydantic import ConfigDict, Field, model_validator
 
 from .fields import Fraction, NonNegative, NonNegativeRange, Positive, PositiveRange, Section, count
-from .methods import AdaptiveMpc, BevelOnly, BevelRule, BroydenMpc, ResolvedRate
+from .problems import Problem, refuse, unknown_key
 from .structure import Structure
 
 __all__ = ["Control", "Phantom", "Plan", "Target"]
@@ -78,29 +78,18 @@ class Plan(Section):
         return 1e-3 * self.base_turn_sigma_mrad
 
 
-class Control(BevelRule):
-    """Section `control`: the closed loop, and the search of `ce-mpc`; other controllers have theirs below."""
+class Control(Section):
+    """Section `control`: what all controllers share. The tables below it are each a controller's own.
 
-    samples: int = count(21, least=2, most=100_000)
-    """Control sequences in an iteration of a period."""
-    iterations: int = count(4, least=1, most=1_000)
-    """Iterations of a period."""
-    horizon: int = count(7, least=1, most=1_000)
-    """Steps that a period looks ahead."""
-    orientation_weight_mm: NonNegative = 11.8
-    """Cost of an angle off the planned path, as a distance: 1 rad weighs as much as this."""
-    curvature_per_m: NonNegative = 0.232
-    """κ of the two paths of the bang-bang rule."""
+    They are kept as they are given: the controllers check them (`flexneedle.control.tables`).
+    """
+
+    model_config = ConfigDict(extra="allow")
+
     load_gain: Fraction = 0.3
     """Share of a new tip load that is learnt in a period."""
     depth_tolerance_mm: Positive = 0.01
     """The insertion ends this close to the target depth."""
-    guide_weight: NonNegative = 0.075
-    """Cost of a squared millimetre that a guide step departs from the plan's."""
-    energy_weight_per_mj: NonNegative = 2.74
-    """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
-    flip_dead_band: Fraction = 0.875
-    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
     start_offset_sd_mm: NonNegative = 0.5
     """What the controller expects of the base clamp's lateral position: its standard deviation."""
     start_angle_sd_mrad: NonNegative = 3.0
@@ -111,10 +100,22 @@ class Control(BevelRule):
     """The insertion is given up after so long without a measurement to believe."""
     stale_after_s: Positive = 0.3
     """A measurement older than this is not believed."""
-    adaptive_mpc: AdaptiveMpc = AdaptiveMpc()
-    bevel_only: BevelOnly = BevelOnly()
-    resolved_rate: ResolvedRate = ResolvedRate()
-    broyden_mpc: BroydenMpc = BroydenMpc()
+
+    @model_validator(mode="after")
+    def _check_tables(self) -> Self:
+        """Refuse what is neither a key nor a table."""
+        valid = [*type(self).model_fields, "the controllers' tables"]
+        refuse(
+            Problem(key, value, unknown_key(key, valid))
+            for key, value in self.tables.items()
+            if not isinstance(value, dict)
+        )
+        return self
+
+    @property
+    def tables(self) -> dict[str, Any]:
+        """The controllers' tables by name, plain values."""
+        return dict(self.model_extra or {})
 
     @property
     def start_angle_sd(self) -> float:

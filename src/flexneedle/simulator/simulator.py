@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from flexneedle.errors import CommandError, StateError
 from flexneedle.mechanics import insertion, model
 from flexneedle.mechanics import needle as nd
+from flexneedle.mechanics.ogden import displaced_energy
 from flexneedle.scenario import Scenario
 from flexneedle.simulator.control import Control, Limits
 from flexneedle.simulator.state import State, load_arrays, mechanics_difference, mesh_of, solved
@@ -22,6 +23,7 @@ Floats = NDArray[np.float64]
 _STEPS_WORTH_A_THREAD = 200
 _CHUNKS_A_THREAD = 4
 _CLOSEST_POINTS_MM = 0.1
+_ASIDE_MM = 1.0
 
 
 class Rollout(NamedTuple):
@@ -131,6 +133,15 @@ class Simulator:
         after = self._assimilated(state, float(measured[0, 1]), x, y)
         return Assimilation(after, float(measured[0, 0] - after.tip[0]))
 
+    def energy_scale(self, depth: float) -> float:
+        """Strain energy (mJ) of all tissue down to `depth` (mm) moved aside by 1 mm, weighted by layer: what a plan's
+        energy is compared with.
+        """
+        nodes = self._model.nodes
+        above = nodes.x < depth
+        stored = displaced_energy(nodes.alpha, nodes.height, nodes.weight * nodes.energy, _ASIDE_MM)
+        return float(stored[above & (nodes.kind == model.CONTACT)].sum())
+
     def load(self, path: str | Path) -> State:
         """Read a state that `State.save` wrote; StateError with the differing key under another scenario."""
         return State(self.scenario, self._model, **load_arrays(path, self.scenario))
@@ -237,7 +248,14 @@ def _build_model(scenario: Scenario) -> model.Model:
     weight = np.array([layer.energy_weight for layer in tissue])
     depth = max(scenario.setup.max_depth, 0.0)
     nodes = model.contact_nodes(layers, weight, scenario.contact.spacing_mm, depth, scenario.setup.guide_x)
-    bevel = needle.bevel
+    bevel, spacing = needle.bevel, scenario.contact.spacing_mm
     return model.Model(
-        needle.bending_stiffness, needle.length_mm, bevel.offset_mm, bevel.length_mm, nodes, layers
+        needle.bending_stiffness,
+        needle.length_mm,
+        bevel.offset_mm,
+        bevel.length_mm,
+        nodes,
+        layers,
+        part=model.SKIN_PART * spacing,
+        zone=model.SKIN_ZONE * spacing,
     )

@@ -78,7 +78,7 @@ class State:
         """How far base x, y (mm), base θ (rad) and guide (mm) were commanded since the start, shape (4,)."""
         s = self.scalars
         travel: Floats = s[[nd.BASE_X, nd.BASE_Y, nd.BASE_TURN, nd.GUIDE_Y]]
-        travel[:3] -= self.scenario.start_base_x, s[nd.CLAMP_Y], s[nd.CLAMP_TURN]
+        travel[:3] -= self.scenario.start_base_x + s[nd.CLAMP_X], s[nd.CLAMP_Y], s[nd.CLAMP_TURN]
         return travel
 
     @property
@@ -160,13 +160,21 @@ class State:
         )
 
     def believing(
-        self, *, base_y: float | None = None, base_turn: float | None = None, tip_load: float | None = None
+        self,
+        *,
+        base_x: float | None = None,
+        base_y: float | None = None,
+        base_turn: float | None = None,
+        tip_load: float | None = None,
     ) -> "State":
         """Return the state with what an observer corrected (mm, rad, N); the next solve takes it up.
 
         A base that stands elsewhere than commanded has not used up its travel.
         """
         scalars = self.scalars.copy()
+        if base_x is not None:
+            scalars[nd.CLAMP_X] += base_x - scalars[nd.BASE_X]
+            scalars[nd.BASE_X] = base_x
         if base_y is not None:
             scalars[nd.CLAMP_Y] += base_y - scalars[nd.BASE_Y]
             scalars[nd.BASE_Y] = base_y
@@ -222,7 +230,7 @@ def load_arrays(path: str | Path, scenario: Scenario) -> dict[str, Floats]:
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-        saved = Scenario.from_values(json.loads(str(arrays.pop("scenario"))), source=str(path))
+        saved = Scenario.from_record(json.loads(str(arrays.pop("scenario"))), source=str(path))
     except (OSError, ValueError, KeyError, AttributeError, EOFError, BadZipFile) as error:
         raise StateError(f"{path}: not a saved state ({error})") from error
     if (key := mechanics_difference(saved, scenario)) is not None:

@@ -6,13 +6,13 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from flexneedle.control.methods import METHODS
+from flexneedle.control.methods import METHODS, checked
 from flexneedle.errors import InputError
 from flexneedle.run.study.grid import load_study
 from flexneedle.run.study.spec import LARGEST_SEED, study_names
 from flexneedle.scenario import dump_scenario, load_scenario
 
-PHANTOM = load_scenario("phantom")
+PHANTOM = checked(load_scenario("phantom"))
 CONTROLLERS = tuple(METHODS)[:2]
 CHOICES = "must be one of " + ", ".join(METHODS)
 SEEDS = f"from 0 to {LARGEST_SEED}"

@@ -114,7 +114,7 @@ def test_what_is_not_a_number_is_not_known(point, plan, monkeypatch):
     ("key", "same"),
     [
         ("phantom.run_out_mm", True),
-        ("control.samples", True),
+        ("control.ce_mpc.samples", True),
         ("tracker.jitter_mm", True),
         ("target.depth_mm", False),
         ("plan.samples", False),

@@ -259,7 +259,7 @@ def test_a_folder_with_something_else_is_not_used(quick, tmp_path):
     ("old", "new", "difference"),
     [
         ("repeats = 2", "repeats = 3", "repeats is 2 in the folder, 3 now"),
-        ("horizon = 2", "horizon = 3", "values.control.horizon is 2 in the folder, 3 now"),
+        ("horizon = 2", "horizon = 3", "values.control.ce_mpc.horizon is 2 in the folder, 3 now"),
         ("-0.5]", "-0.6]", r"axes.target is \[.*-0.5\]\] in the folder, \[.*-0.6\]\] now"),
     ],
 )

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pyarrow.parquet as pq
 import pytest
 
+from flexneedle.control.methods import checked
 from flexneedle.errors import InputError
 from flexneedle.run.study import rows
 from flexneedle.run.study.grid import load_study
@@ -51,7 +52,7 @@ def load(tmp_path):
 def test_the_scenario_of_a_point_is_that_of_its_world_and_case(load):
     study = load()
     for point in study.points:
-        assert point.scenario == world(point.world, point.case)
+        assert point.scenario == checked(world(point.world, point.case))
         assert point.world_case == point.case
         assert "world" not in point.varied
 

@@ -1,23 +1,28 @@
-"""The controllers by name. A further one is a file here with a METHOD, and a line below."""
+"""The controllers by name, the default first. A further one is a file here with a METHOD."""
+
+import warnings
+from importlib import import_module
+from pkgutil import iter_modules
 
 from flexneedle.control.interface import Method
-from flexneedle.control.methods import (
-    adaptive_mpc,
-    bevel_only,
-    broyden_mpc,
-    ce_mpc,
-    open_loop,
-    resolved_rate,
-)
-from flexneedle.errors import InputError
+from flexneedle.control.tables import completed, unowned
+from flexneedle.errors import InputError, ScenarioError, ScenarioWarning
+from flexneedle.scenario import Scenario
 
-__all__ = ["DEFAULT", "METHODS", "method"]
+__all__ = ["DEFAULT", "METHODS", "checked", "method", "used"]
 
-METHODS: dict[str, Method] = {
-    module.METHOD.name: module.METHOD
-    for module in (adaptive_mpc, ce_mpc, open_loop, bevel_only, resolved_rate, broyden_mpc)
-}
-DEFAULT = adaptive_mpc.METHOD.name
+DEFAULT = "adaptive-mpc"
+
+
+def _found() -> dict[str, Method]:
+    """The METHOD of each module of this package, by name: the default, then in the order of the alphabet."""
+    modules = [import_module(f"{__name__}.{module.name}") for module in iter_modules(__path__)]
+    methods = [module.METHOD for module in modules if hasattr(module, "METHOD")]
+    methods.sort(key=lambda method: (method.name != DEFAULT, method.name))
+    return {method.name: method for method in methods}
+
+
+METHODS: dict[str, Method] = _found()
 
 
 def method(name: str) -> Method:
@@ -25,3 +30,30 @@ def method(name: str) -> Method:
     if name not in METHODS:
         raise InputError(f"controller = {name!r}: must be one of {', '.join(METHODS)}")
     return METHODS[name]
+
+
+def checked(scenario: Scenario, *own: Method, source: str = "") -> Scenario:
+    """Return the scenario with all settings of the controllers here and of others (`own`).
+
+    Raises ScenarioError with one line for each problem, which opens with `source`; a table that belongs to none of them
+    is one.
+    """
+    known = _with(own)
+    if lines := unowned(scenario, known, source):
+        raise ScenarioError(*lines)
+    return completed(scenario, known, source)
+
+
+def used(scenario: Scenario, *own: Method, source: str = "") -> Scenario:
+    """Return the scenario as `checked` does, for one use: a table may belong to a controller that is not in use.
+
+    Of such a table it warns (ScenarioWarning).
+    """
+    known = _with(own)
+    for line in unowned(scenario, known, source):
+        warnings.warn(f"{line}; it is not used", ScenarioWarning, stacklevel=2)
+    return completed(scenario, known, source)
+
+
+def _with(own: tuple[Method, ...]) -> list[Method]:
+    return list(dict.fromkeys((*METHODS.values(), *own)))

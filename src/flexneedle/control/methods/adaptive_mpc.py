@@ -1,10 +1,4 @@
-"""`adaptive-mpc`: cross-entropy MPC on a model that learns the insertion from the readings.
-
-Start, needle and tissue are identified (`control.identification`). With what was learnt the way to the target is found
-again every few millimetres (`control.route`), guide and bevel alike; a short horizon of steps of full advance follows
-it, and weighs the miss most where it reaches the target. The paper's rule may turn the bevel besides, if the model
-agrees.
-"""
+"""`adaptive-mpc`: one search to the target, every period, on a model that is fitted to the readings."""
 
 from dataclasses import dataclass
 from typing import cast
@@ -12,137 +6,98 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.control import bang_bang
+from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.estimate import Estimate, Floats
 from flexneedle.control.identification import Identification, Identified
-from flexneedle.control.interface import Decision, Method, Task, travel_left
-from flexneedle.control.mpc import planned_base
-from flexneedle.control.route import Route, of_plan, renewed
+from flexneedle.control.interface import Decision, Method, Task
+from flexneedle.control.path import Ahead, Path, of_plan, proposals
 from flexneedle.planning import Settings, cross_entropy
+import os
+P = dict(wE=float(os.environ.get('WE','0.3')), wL=float(os.environ.get('WL','3')), wS=float(os.environ.get('WS','0.5')), wR=float(os.environ.get('WR','0.015')), N=int(os.environ.get('NS','24')), IT=int(os.environ.get('IT','2')), FIRST=int(os.environ.get('FIRST','4')))
 
 
 @dataclass(frozen=True, eq=False)
-class Ahead:
-    """The way that a decision looks ahead, m steps in n pieces.
-
-    advance (m,): mm; piece (m,): the piece of each step; path (m, 2): wanted y (mm) of the model's tip, and angle;
-    guide (m,): the route's steps (mm); base (m, 2): the plan's steps of base y and turn; weight (m,): of the deviation
-    after each step.
-    """
-
-    advance: Floats
-    piece: NDArray[np.intp]
-    path: Floats
-    guide: Floats
-    base: Floats
-    weight: Floats
-    flip: bool
+class Memory:
+    path: Path
+    first: bool = True
+    scale: float = 1.0
 
 
-def decide(task: Task, memory: Route, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, Route]:
-    """The way, the bevel, then the best first step of the guide."""
-    belief = cast(Identified, estimate)  # METHOD below names its observer
-    route = _followed(task, memory, belief, rng)
-    due = float(belief.state.tip[0]) + 0.5 * task.scenario.setup.max_advance_mm
-    turns, route = sum(turn <= due for turn in route.turns), route.after(due)
-    if turns % 2 == 1:
-        return _search(task, belief, route, rng, flip=True, why="bevel turned: on the way"), route
-    flip, why = bang_bang.decide(task, belief, task.scenario.control.adaptive_mpc)
-    decision = _search(task, belief, route, rng, flip=flip, why=why)
-    if flip:
-        kept = _search(task, belief, route, rng, flip=False, why=f"{why}; the model keeps it")
-        decision = min(decision, kept, key=lambda choice: choice.cost)
-    return decision, route
+def begin(task: Task) -> Memory:
+    return Memory(of_plan(task.plan), True, moved_energy(task.scenario, task.plan.target[0]))
 
 
-def _followed(task: Task, route: Route, belief: Identified, rng: np.random.Generator) -> Route:
-    """The route, found again if it is time, but for the horizon before the target."""
-    if float(belief.state.tip[0]) < route.renew_at or _near(task, belief):
-        return route
-    return renewed(task, belief, route, rng)
+def moved_energy(scenario, depth):
+    tops = [*scenario.layer_tops, np.inf]
+    total = 0.0
+    for k, layer in enumerate(scenario.tissue):
+        length = min(depth, tops[k + 1]) - tops[k]
+        if length <= 0.0:
+            continue
+        lam = 1.0 - 1.0 / layer.compression_length_mm
+        a = layer.alpha
+        w = 2.0 * layer.shear_modulus / a**2 * (2.0 * lam ** (-a / 2) + lam**a - 3.0)
+        total += layer.energy_weight * w * layer.engaged_width_mm * layer.compression_length_mm * length
+    return total
 
 
-def _near(task: Task, belief: Identified) -> bool:
-    """Whether the horizon reaches the target."""
-    reach = task.scenario.control.adaptive_mpc.horizon * task.scenario.setup.max_advance_mm
-    return travel_left(task.scenario, task.plan, belief.state) <= reach + 1e-9
+def decide(task: Task, memory: Memory, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, Memory]:
+    belief = cast(Identified, estimate)
+    state, setup = belief.state, task.scenario.setup
+    ahead = Ahead.of(task, state, memory.path)
+    count = P['N'] * (P['FIRST'] if memory.first else 1)
+    lower, upper = ahead.bounds
+    settings = Settings(samples=count, elite=max(3, count // 8), iterations=P['IT'], smoothing=0.3, tolerance=1e-9, lower=lower, upper=upper)
+    first = proposals(ahead, count, rng)
+    search = cross_entropy.start(ahead.in_hand, first.std(axis=0) + 1e-9)
+    samples = first
+    for k in range(P['IT']):
+        if k:
+            samples = cross_entropy.ask(search, settings, rng)
+        search = cross_entropy.tell(search, settings, samples, cost(task, belief, ahead, samples, memory.scale)[0])
+    path = ahead.corrected(search.best)
+    _, miss = cost(task, belief, ahead, search.best[None], memory.scale)
+    x = float(state.tip[0])
+    due = [r for r in path.rolls if ahead.due(r)]
+    later = [r for r in path.rolls if not ahead.due(r)]
+    path = Path(path.depth, path.guide, tuple(later))
+    advance = min(setup.max_advance_mm, ahead.left)
+    if later and later[0] < x + advance:
+        advance = later[0] - x
+    guide = float(np.clip(np.interp(x + advance, path.depth, path.guide) - state.guide, -ahead.step, ahead.step))
+    base = ahead.base[0] * min(1.0, advance / max(ahead.depth[1] - x, 1e-9))
+    why = f"predicted miss {miss[0]:.3f} mm, rolls at {', '.join(f'{r:.1f}' for r in later) or 'none'}"
+    command = (advance, float(base[0]), float(base[1]), guide, 1 if len(due) % 2 else -1)
+    return Decision(command, why, float(search.best_cost)), Memory(path, False, memory.scale)
 
 
-def _ahead(task: Task, belief: Identified, route: Route, *, flip: bool) -> Ahead:
-    settings, setup = task.scenario.control.adaptive_mpc, task.scenario.setup
-    left = travel_left(task.scenario, task.plan, belief.state)
-    steps = max(1, min(settings.horizon, int(np.ceil(left / setup.max_advance_mm - 1e-9))))
-    advance = np.diff(np.minimum(np.arange(steps + 1) * setup.max_advance_mm, left))
-    depth = float(belief.state.tip[0]) + np.append(0.0, np.cumsum(advance))
-    path = np.stack([np.interp(depth[1:], route.depth, route.tips[:, k]) for k in (0, 1)], axis=1)
-    weight = np.ones(steps)
-    if _near(task, belief):
-        path[-1, 0], weight[-1] = task.plan.target[1], settings.target_weight
-    path[:, 0] -= belief.off_axis(-belief.state.bevel if flip else belief.state.bevel)
-    guide = np.diff(np.interp(depth, route.depth, route.guide))
-    pieces = min(settings.pieces, steps)
-    base = planned_base(setup, task.plan, belief.state, depth[1:])
-    return Ahead(advance, np.arange(steps) * pieces // steps, path, guide, base, weight, flip)
-
-
-def _search(
-    task: Task, belief: Identified, route: Route, rng: np.random.Generator, *, flip: bool, why: str
-) -> Decision:
-    """Cross-entropy over the guide's step in each piece."""
-    setup, settings = task.scenario.setup, task.scenario.control.adaptive_mpc
-    ahead = _ahead(task, belief, route, flip=flip)
-    pieces = int(ahead.piece[-1]) + 1
-    most = setup.max_guide_step_mm if setup.has_guide else 0.0
-    mean = np.array([ahead.guide[ahead.piece == k].mean() for k in range(pieces)])
-    found = cross_entropy.minimize(
-        lambda z: _cost(task, belief, ahead, z),
-        cross_entropy.start(np.clip(mean, -most, most), np.full(pieces, min(settings.guide_sigma_mm, most))),
-        Settings(
-            samples=settings.samples,
-            elite=max(2, settings.samples // 8),
-            iterations=settings.iterations,
-            smoothing=task.scenario.plan.smoothing,
-            tolerance=task.scenario.plan.tolerance,
-            lower=np.full(pieces, -most),
-            upper=np.full(pieces, most),
-        ),
-        rng,
-    )
-    db_x, db_y, db_theta, dg_y, _ = _controls(task, belief, ahead, found.best[None])[0, 0].tolist()
-    spread = float(np.sqrt(found.covariance[0, 0]))
-    return Decision((db_x, db_y, db_theta, dg_y, 1 if flip else -1), why, found.best_cost, spread)
-
-
-def _controls(task: Task, belief: Identified, ahead: Ahead, z: Floats) -> Floats:
-    """Controls (N, m, 5) of guide steps z (N, n); the guide stays within its reach."""
-    reach = task.scenario.setup.max_guide_travel_mm
-    steps = z[:, ahead.piece] * (ahead.advance / task.scenario.setup.max_advance_mm)
-    guide = np.clip(belief.state.guide + np.cumsum(steps, axis=1), -reach, reach)
-    controls = np.zeros((len(z), ahead.advance.size, 5))
-    controls[:, :, 0] = ahead.advance
-    controls[:, :, 1:3] = ahead.base
-    controls[:, :, 3] = np.diff(guide, axis=1, prepend=belief.state.guide)
-    controls[:, :, 4] = -1.0
-    controls[:, 0, 4] = 1.0 if ahead.flip else -1.0
-    return controls
-
-
-def _cost(task: Task, belief: Identified, ahead: Ahead, z: Floats) -> Floats:
-    """Weighted squared deviation from the path (mm²), departure from the route's guide steps, tissue energy."""
-    settings = task.scenario.control.adaptive_mpc
-    controls = _controls(task, belief, ahead, z)
-    tips, energy, converged = belief.simulator.rollout(belief.state, controls)
-    off = (tips[:, :, 1:] - ahead.path) * (1.0, settings.orientation_weight_mm)
-    costs: Floats = (off**2).sum(axis=2) @ ahead.weight
-    costs += settings.guide_weight * ((controls[:, :, 3] - ahead.guide) ** 2).sum(axis=1)
-    costs += settings.energy_weight_per_mj * energy.sum(axis=1)
-    return np.where(converged.all(axis=1), costs, np.inf)
+def cost(task, belief, ahead, z, scale):
+    controls, depths = ahead.controls(z)
+    tips, energy, converged = belief.simulator.rollout(belief.state, controls, limits=False)
+    side = belief.state.bevel * np.cumprod(-np.sign(controls[:, :, 4]), axis=1)
+    seen = tips[:, :, 1] + belief.run_out * side + belief.residual
+    depth, lateral = task.plan.target
+    end = tips[:, -1]
+    miss = seen[:, -1] + np.tan(end[:, 2]) * (depth - end[:, 0]) - lateral
+    guided = ahead.step > 0.0
+    we, wl = (P['wE'], P['wL']) if guided else (1.0, 0.0)
+    x, y = belief.tip[:2]
+    share = np.clip((tips[:, :, 0] - x) / max(depth - x, 1e-9), 0.0, 1.0)
+    line = y + share * (lateral - y)
+    weight = controls[:, :, 0] * share
+    off = (np.abs(seen - line) * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12)
+    adv = np.maximum(controls[:, :, 0], 1e-9)
+    slope = (controls[:, :, 3] ** 2 / adv).sum(axis=1) / max(ahead.left, 1e-9)
+    rolls = (controls[:, :, 4] > 0.0).sum(axis=1)
+    costs = np.abs(miss) + we * energy[:, -1] / scale + wl * off + P['wS'] * slope + P['wR'] * rolls
+    return np.where(converged.all(axis=1), costs, np.inf), miss
 
 
 METHOD = Method(
     "adaptive-mpc",
-    "cross-entropy MPC on a model that learns start, needle and tissue from the readings",
+    "one search to the target on a model that is fitted to the readings",
     Identification(),
-    begin=lambda task: of_plan(task.plan),
+    begin=begin,
     decide=decide,
+    settings=AdaptiveMpc,
 )

@@ -19,7 +19,7 @@ from flexneedle.control.mpc import planned_base
 from flexneedle.control.observer import Beliefs
 from flexneedle.errors import InputError
 from flexneedle.scenario import Setup
-from flexneedle.scenario.methods import BroydenMpc
+from flexneedle.scenario.fields import Fraction, NonNegative, Positive, Section, count
 from flexneedle.trace import PlanRecord
 
 Floats = NDArray[np.float64]
@@ -27,6 +27,21 @@ _LEAST_INSERTION_MM = 0.5  # between two updates: less tells more of the tracker
 _RIDGE = 1e-9  # mm² for a squared millimetre of the guide: one answer where the guide has no effect
 _RELEASE = 1e-12  # slope of the cost that counts as rounding
 _KEPT = 8  # control steps: readings are younger
+
+
+class BroydenMpc(Section):
+    """Section `control.broyden_mpc`: a Jacobian learnt from readings, and linear MPC of the guide."""
+
+    update_gain: Fraction = 0.65
+    """Share of Broyden's update of the Jacobian that is made; 1 repeats the newest motion exactly."""
+    horizon: int = count(4, least=1, most=20)
+    """Steps that the linear MPC looks ahead."""
+    max_guide_travel_mm: Positive = 6.0
+    """Greatest lateral distance of the guide from the axis, if that of the setup is not smaller."""
+    guide_weight: NonNegative = 0.000316
+    """Cost of a squared millimetre of a guide step, in mm² of the tip."""
+    guide_effect: NonNegative = 0.982
+    """The first Jacobian's lateral motion of the tip for that of the guide; for advance it is a straight line."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +60,7 @@ def begin(task: Task) -> Learnt:
     """Start with a tip that goes straight on, and aside with the guide. Raises InputError without a guide."""
     if not task.scenario.setup.has_guide:
         raise InputError("controller = 'broyden-mpc': steers with the guide: give setup.guide_to_skin_mm")
-    return Learnt(np.diag([1.0, task.scenario.control.broyden_mpc.guide_effect]))
+    return Learnt(np.diag([1.0, task.settings.guide_effect]))
 
 
 def decide(
@@ -53,7 +68,7 @@ def decide(
 ) -> tuple[Decision, Learnt]:
     """Learn from a new reading, predict the tip to now, and take the first of the best steps of the guide."""
     scenario, state = task.scenario, estimate.state
-    settings, setup = scenario.control.broyden_mpc, scenario.setup
+    settings, setup = task.settings, scenario.setup
     inputs = np.array([state.travel[0], state.guide])
     learnt = remember(learnt, float(state.tip[0]), inputs)
     left = travel_left(scenario, task.plan, state)
@@ -166,4 +181,5 @@ METHOD = Method(
     Beliefs(),
     begin=begin,
     decide=decide,
+    settings=BroydenMpc,
 )

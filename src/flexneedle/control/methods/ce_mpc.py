@@ -2,7 +2,7 @@
 
 The measured tip is an essential condition of the solve that takes it in, and released in the prediction. The rule has
 the error threshold that the paper proposes against needless turns; the cost of eq. 13 has small further terms for
-the guide's departure from the plan and for tissue energy, which the settings of `control` can leave out.
+the guide's departure from the plan and for tissue energy, which the settings can leave out.
 """
 
 import numpy as np
@@ -15,8 +15,8 @@ from flexneedle.control.observer import Beliefs
 
 def decide(task: Task, memory: None, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, None]:
     """Bevel by the rule, then the best first step of a short horizon along the plan."""
-    flip, why = bang_bang.decide(task, estimate, task.scenario.control)
-    choice = mpc.choose(estimate.simulator, task.plan, estimate.state, flip=flip, rng=rng)
+    flip, why = bang_bang.decide(task, estimate, task.settings)
+    choice = mpc.choose(estimate.simulator, task.plan, estimate.state, task.settings, flip=flip, rng=rng)
     return Decision((*choice.steps, 1 if flip else -1), why, choice.cost, choice.spread), memory
 
 
@@ -26,4 +26,5 @@ METHOD = Method(
     Beliefs(fits_start=False, learns_load=False),
     begin=lambda _task: None,
     decide=decide,
+    settings=mpc.CeMpc,
 )

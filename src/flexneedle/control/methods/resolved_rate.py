@@ -14,18 +14,34 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.control import bang_bang
 from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Decision, Method, Task, travel_left
-from flexneedle.control.methods.bevel_only import turn
 from flexneedle.control.mpc import planned_base
 from flexneedle.control.observer import Beliefs
 from flexneedle.errors import InputError
 from flexneedle.scenario import Setup
+from flexneedle.scenario.fields import Fraction, NonNegative, Positive
 from flexneedle.simulator import Simulator, State
 from flexneedle.trace import PlanRecord
 
 Floats = NDArray[np.float64]
 _DISTURBANCE_MM = 0.05  # of the guide: above rounding, small against the 10 mm in which the tissue stiffens
+
+
+class ResolvedRate(bang_bang.BevelRule):
+    """Section `control.resolved_rate`: the guide follows the damped inverse of the model's Jacobian."""
+
+    curvature_per_m: NonNegative = 0.0834
+    """κ of the two paths of the bang-bang rule."""
+    flip_dead_band: Fraction = 0.625
+    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
+    gain: NonNegative = 1.38
+    """Share of the tip's predicted deviation that a control step is to remove."""
+    damping: NonNegative = 0.0533
+    """λ of the damped least squares, as the tip's lateral motion for that of the guide."""
+    lookahead_mm: Positive = 10.0
+    """How far ahead of the tip its deviation is predicted, at most to the target depth."""
 
 
 def begin(task: Task) -> None:
@@ -37,9 +53,9 @@ def begin(task: Task) -> None:
 def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generator) -> tuple[Decision, None]:
     """Bevel by the rule; the planned guide step, and what takes the tip back to the planned path."""
     scenario, state = task.scenario, estimate.state
-    settings, setup = scenario.control.resolved_rate, scenario.setup
+    settings, setup = task.settings, scenario.setup
     left = travel_left(scenario, task.plan, state)
-    flip, why = turn(settings, task, estimate)
+    flip, why = bang_bang.decide(task, estimate, settings)
     if left <= 0.0:
         return Decision((0.0, 0.0, 0.0, 0.0, -1), "at the target depth"), memory
     disturbance = min(_DISTURBANCE_MM, 0.5 * setup.max_guide_step_mm, 0.5 * setup.max_guide_travel_mm)
@@ -100,4 +116,5 @@ METHOD = Method(
     Beliefs(),
     begin=begin,
     decide=decide,
+    settings=ResolvedRate,
 )

@@ -133,8 +133,8 @@ def _said_by_world(rows: Rows, key: str, cases: Factor) -> bool:
 
 
 def _unsaid(rows: Rows, cases: Factor) -> list[str]:
-    """Return plant and strategy, but for what the case of a world says."""
-    keys = ["plant", "strategy"]
+    """Return plant, tracker and strategy, but for what the case of a world says."""
+    keys = ["plant", "tracker", "strategy"]
     return [k for k in keys if _guides(rows) == () or not _follows(rows.codes(k)[0], cases.codes)]
 
 

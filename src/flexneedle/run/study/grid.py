@@ -9,9 +9,19 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from flexneedle.control.methods import DEFAULT, METHODS
+from flexneedle.control.interface import Method
+from flexneedle.control.methods import DEFAULT, METHODS, checked
 from flexneedle.errors import InputError, ScenarioError
 from flexneedle.phantom import DEFAULT_PLANT, PLANTS
+from flexneedle.run.parts import (
+    SCENARIO_TRACKER,
+    controller_of,
+    digests,
+    is_own,
+    own_controllers,
+    plant_of,
+    tracker_of,
+)
 from flexneedle.run.planner import STRATEGIES
 from flexneedle.run.study.spec import (
     ALL,
@@ -34,13 +44,21 @@ from flexneedle.trace.plain import plain
 
 __all__ = ["Insertion", "Point", "Study", "load_study"]
 
-_DEFAULTS = {"controller": DEFAULT, "plant": DEFAULT_PLANT, "strategy": STRATEGIES[0], "plan_seed": 0}
+_DEFAULTS = {
+    "controller": DEFAULT,
+    "plant": DEFAULT_PLANT,
+    "tracker": SCENARIO_TRACKER,
+    "strategy": STRATEGIES[0],
+    "plan_seed": 0,
+}
 _CHOICES = {
     "controller": tuple(METHODS),
     "plant": tuple(PLANTS),
+    "tracker": (SCENARIO_TRACKER,),
     "strategy": STRATEGIES,
     WORLD_CASE: CASES,
 }
+_OWN = {"controller": controller_of, "plant": plant_of, "tracker": tracker_of}
 _STEERED_BY_GUIDE = ("resolved-rate", "broyden-mpc")
 _MOST_INSERTIONS = 1_000_000
 _BESIDES = f"; besides: {', '.join(_DEFAULTS)}, {WORLD_CASE}, as an axis also {SEED}, {WORLD}"
@@ -58,6 +76,7 @@ class Point:
     case: str
     controller: str
     plant: str
+    tracker: str
     strategy: str
     plan_seed: int
     target_number: int
@@ -133,10 +152,13 @@ def _multiplied(file: StudyFile, base: Scenario) -> Study:
     wanted = math.prod((len(file.cases) or 1, repeats, *map(len, axes.values())))
     if wanted > _MOST_INSERTIONS:
         raise InputError(f"asks for {wanted} insertions: must be at most {_MOST_INSERTIONS}")
-    _check_left_out(file.without, base)
     fixed = _DEFAULTS | settings_of(file.values)
     cases = {case.name: settings_of(case.values) for case in file.cases}
-    points = tuple(_points(base, dict.fromkeys(file.without), fixed, cases or {"": {}}, axes))
+    given = {key: _given(key, fixed, cases, axes) for key in _OWN}
+    own = own_controllers(given["controller"])
+    base = checked(base, *own)
+    _check_left_out(file.without, base)
+    points = tuple(_points(base, dict.fromkeys(file.without), fixed, cases or {"": {}}, axes, own))
     definition = {
         "name": file.name,
         "title": file.title,
@@ -149,8 +171,19 @@ def _multiplied(file: StudyFile, base: Scenario) -> Study:
         "first_seed": file.first_seed,
         "seeds": list(seeds),
         "insertions": len(points) * repeats,
+        "own": digests(name for names in given.values() for name in names),
     }
     return Study(plain(definition), points, repeats, file.first_seed, seeds)
+
+
+def _given(
+    key: str,
+    fixed: Mapping[str, Any],
+    cases: Mapping[str, Mapping[str, Any]],
+    axes: Mapping[str, list[Any]],
+) -> list[Any]:
+    """All values that a study gives to a key."""
+    return [fixed[key], *(case[key] for case in cases.values() if key in case), *axes.get(key, ())]
 
 
 def _values(axis: Axis) -> list[Any]:
@@ -174,6 +207,7 @@ def _points(
     fixed: Mapping[str, Any],
     cases: Mapping[str, Mapping[str, Any]],
     axes: Mapping[str, list[Any]],
+    own: tuple[Method, ...],
 ) -> Iterator[Point]:
     """Yield the points: cases vary slowest, then the axes in their order; later settings go over earlier ones."""
     targets: dict[tuple[float, float], int] = {}
@@ -189,7 +223,7 @@ def _points(
         if number is not None and _is_skipped(worlds(number), run["controller"], world_case):
             continue
         start = base if number is None else worlds(number, world_case)
-        scenario = _varied(start, {**left_out, **settings}, where)
+        scenario = _varied(start, {**left_out, **settings}, own, where)
         if number is None:
             number, of_world = targets.setdefault(scenario.target.position, len(targets)), {}
         else:
@@ -207,16 +241,19 @@ def _is_skipped(scenario: Scenario, controller: str, world_case: str) -> bool:
 
 def _check_run(run: Mapping[str, Any]) -> None:
     for key, choices in _CHOICES.items():
-        if run[key] not in choices:
-            raise InputError(to_line(Problem(key, run[key], f"must be one of {', '.join(choices)}")))
+        if key in _OWN and is_own(run[key]):
+            _OWN[key](run[key])
+        elif run[key] not in choices:
+            more = ", or module:NAME of your own" if key in _OWN else ""
+            raise InputError(to_line(Problem(key, run[key], f"must be one of {', '.join(choices)}{more}")))
     if not is_seed(run["plan_seed"]):
         rule = f"must be a whole number from 0 to {LARGEST_SEED}"
         raise InputError(to_line(Problem("plan_seed", run["plan_seed"], rule)))
 
 
-def _varied(base: Scenario, settings: Mapping[str, Any], where: str) -> Scenario:
+def _varied(base: Scenario, settings: Mapping[str, Any], own: tuple[Method, ...], where: str) -> Scenario:
     try:
-        return base.with_values(settings)
+        return checked(base.with_values(settings), *own)
     except ScenarioError as error:
         at = f" (at {where})" if where else ""
         lines = (problem + (_BESIDES if "unknown key" in problem else "") + at for problem in error.problems)

@@ -121,7 +121,15 @@ def _reach(point: Point, seed: int) -> dict[str, Any]:
 
 def _insertion(job: Job, made: PlanRecord, seed: int) -> Insertion:
     point = job.point
-    return insert(point.scenario, made, seed, controller=point.controller, phantom=point.plant, threads=1)
+    return insert(
+        point.scenario,
+        made,
+        seed,
+        controller=point.controller,
+        phantom=point.plant,
+        tracker=point.tracker,
+        threads=1,
+    )
 
 
 def _planned(made: PlanRecord | None) -> dict[str, Any]:

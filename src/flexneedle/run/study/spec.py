@@ -15,6 +15,7 @@ from flexneedle.scenario import Scenario, load_scenario, preset_names
 from flexneedle.scenario.dotted import flatten
 from flexneedle.scenario.fields import Section, Title, count
 from flexneedle.scenario.problems import Problem, describe, printable, refuse
+from flexneedle.scenario.renamed import current_key
 from flexneedle.scenario.worlds import LARGEST_WORLD
 
 __all__ = [
@@ -50,8 +51,8 @@ def _seed(value: int) -> int:
 class Axis(Section):
     """One `[[axes]]`: a key and the values that it takes, each with each of the other axes'."""
 
-    key: str
-    """A key of the scenario, or target, controller, plant, strategy, plan_seed, seed, world, world_case."""
+    key: Annotated[str, AfterValidator(current_key)]
+    """A key of the scenario, or target, controller, plant, tracker, strategy, plan_seed, seed, world, world_case."""
     values: Any
     """A list; "all" for every controller, plant, strategy or case of a world; {from, count} for seeds or worlds that
     follow each other."""
@@ -85,7 +86,7 @@ class StudyFile(Section):
     """In tables and reports."""
     scenario: str = "phantom"
     """The base: a preset's name, or a path from the folder of the study file."""
-    without: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    without: Annotated[tuple[Annotated[str, AfterValidator(current_key)], ...], Field(strict=False)] = ()
     """Keys of the base that are left out, such as diameters where a gauge is given."""
     values: dict[str, Any] = Field(default_factory=dict)
     """Values by dotted key that hold for the whole study."""
@@ -149,7 +150,7 @@ def of_worlds(file: StudyFile, first: int, count: int) -> StudyFile:
 
 def settings_of(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return values by dotted key, a target [depth, lateral] as the two keys of the scenario."""
-    flat = flatten(values)
+    flat = {current_key(key): value for key, value in flatten(values).items()}
     if _TARGET in flat:
         flat |= dict(zip(_TARGET_KEYS, flat.pop(_TARGET), strict=True))
     return flat

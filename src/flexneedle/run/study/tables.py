@@ -20,6 +20,7 @@ _TYPES = {float: pa.float64(), int: pa.int64(), str: pa.string(), bool: pa.bool_
 _ABOUT = {
     "controller": str,
     "plant": str,
+    "tracker": str,
     "strategy": str,
     "target_depth_mm": float,
     "target_lateral_mm": float,
@@ -86,6 +87,7 @@ def _about(insertion: Insertion, key: str) -> dict[str, Any]:
     return {
         "controller": point.controller,
         "plant": point.plant,
+        "tracker": point.tracker,
         "strategy": point.strategy,
         "target_depth_mm": depth,
         "target_lateral_mm": lateral,

@@ -1,56 +1,9 @@
-"""Settings of single controllers, tables below `control`. The cross-entropy controllers have theirs in `control`."""
+"""Settings of `adaptive-mpc`, of its search and of its observer."""
 
-from .fields import Fraction, NonNegative, Positive, Section, count
+from flexneedle.control.bang_bang import BevelRule
+from flexneedle.scenario.fields import Fraction, NonNegative, Positive, count
 
-__all__ = ["AdaptiveMpc", "BevelOnly", "BevelRule", "BroydenMpc", "ResolvedRate"]
-
-
-class BevelRule(Section):
-    """The bang-bang rule of a controller that has its own."""
-
-    curvature_per_m: NonNegative = 0.646
-    """κ of the two paths of the bang-bang rule."""
-    flip_dead_band: Fraction = 0.875
-    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
-
-    @property
-    def curvature(self) -> float:
-        """κ, 1/mm."""
-        return 1e-3 * self.curvature_per_m
-
-
-class BevelOnly(BevelRule):
-    """Section `control.bevel_only`: the bevel alone steers."""
-
-
-class ResolvedRate(BevelRule):
-    """Section `control.resolved_rate`: the guide follows the damped inverse of the model's Jacobian."""
-
-    curvature_per_m: NonNegative = 0.0834
-    """κ of the two paths of the bang-bang rule."""
-    flip_dead_band: Fraction = 0.625
-    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
-    gain: NonNegative = 1.38
-    """Share of the tip's predicted deviation that a control step is to remove."""
-    damping: NonNegative = 0.0533
-    """λ of the damped least squares, as the tip's lateral motion for that of the guide."""
-    lookahead_mm: Positive = 10.0
-    """How far ahead of the tip its deviation is predicted, at most to the target depth."""
-
-
-class BroydenMpc(Section):
-    """Section `control.broyden_mpc`: a Jacobian learnt from readings, and linear MPC of the guide."""
-
-    update_gain: Fraction = 0.65
-    """Share of Broyden's update of the Jacobian that is made; 1 repeats the newest motion exactly."""
-    horizon: int = count(4, least=1, most=20)
-    """Steps that the linear MPC looks ahead."""
-    max_guide_travel_mm: Positive = 6.0
-    """Greatest lateral distance of the guide from the axis, if that of the setup is not smaller."""
-    guide_weight: NonNegative = 0.000316
-    """Cost of a squared millimetre of a guide step, in mm² of the tip."""
-    guide_effect: NonNegative = 0.982
-    """The first Jacobian's lateral motion of the tip for that of the guide; for advance it is a straight line."""
+__all__ = ["AdaptiveMpc"]
 
 
 class AdaptiveMpc(BevelRule):

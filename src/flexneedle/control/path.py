@@ -1,0 +1,194 @@
+"""The path in hand: the guide over absolute depth and the depths at which the bevel rolls, and what may replace it.
+
+A sample corrects the path: lateral corrections of the guide at a few knots between now and the target, and the depths of
+up to `SLOTS` rolls. Sample 0 corrects nothing, so what is in hand is lost only to something better on the same model.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.control.interface import Task, travel_left
+from flexneedle.control.mpc import planned_base
+from flexneedle.simulator import State
+from flexneedle.trace import PlanRecord
+
+__all__ = ["KNOTS", "SLOTS", "Ahead", "Path", "of_plan", "proposals"]
+
+Floats = NDArray[np.float64]
+KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
+"""Where the guide is corrected, as shares of the way from now to the target."""
+SLOTS = 4
+"""Rolls that a path holds at most."""
+_FINE, _COARSE = 2, 2.0  # control steps of the rollout at first, and the length of its later steps in control steps
+_DUE = 0.05  # of a control step: a roll this near is made now
+_STEEPEST = 0.03  # slope of the largest correction of the guide, mm per mm of the way left
+_FURTHEST = 0.3  # largest move of a roll, of the way left
+_DECADES = 2.0  # over which the scales of the samples spread
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """The guide's lateral position (r,) over the depth (r,) of the tip, mm, and the depths of the rolls, ascending."""
+
+    depth: Floats
+    guide: Floats
+    rolls: tuple[float, ...]
+
+    def without_rolls_before(self, depth: float) -> "Path":
+        """The path once the tip is at `depth` (mm)."""
+        return replace(self, rolls=tuple(roll for roll in self.rolls if roll > depth))
+
+
+def of_plan(plan: PlanRecord) -> Path:
+    """The plan's path; of its rolls those that fit."""
+    rolls = plan.tips[:-1][plan.controls[:, 4] > 0.0][:, 0]
+    keep = np.concatenate([[True], np.diff(plan.tips[:, 0]) > 1e-9])
+    return Path(plan.tips[keep, 0], plan.guide[keep], tuple(rolls[:SLOTS].tolist()))
+
+
+@dataclass(frozen=True, eq=False)
+class Ahead:
+    """The way from now to the target in m steps: depth (m + 1,) of their ends, base (m, 2) of each; mm, rad.
+
+    state: the estimated needle now; path: in hand; step, reach: the guide's limits (mm) a control step and in all;
+    advance: longest control step (mm).
+    """
+
+    depth: Floats
+    base: Floats
+    state: State
+    path: Path
+    step: float
+    reach: float
+    advance: float
+
+    @staticmethod
+    def of(task: Task, state: State, path: Path) -> "Ahead":
+        """Two control steps, then longer ones."""
+        setup, left = task.scenario.setup, travel_left(task.scenario, task.plan, state)
+        longest = setup.max_advance_mm
+        fine = min(_FINE * longest, left)
+        first = np.linspace(0.0, fine, max(1, int(np.ceil(fine / longest - 1e-9))) + 1)
+        rest = left - fine
+        steps = int(np.ceil(rest / (_COARSE * longest) - 1e-9))
+        depth = float(state.tip[0]) + np.append(first, fine + rest * np.arange(1, steps + 1) / max(steps, 1))
+        may_move = setup.has_guide and task.plan.strategy != "steering"
+        return Ahead(
+            depth,
+            planned_base(setup, task.plan, state, depth[1:]),
+            state,
+            path,
+            setup.max_guide_step_mm if may_move else 0.0,
+            setup.max_guide_travel_mm,
+            longest,
+        )
+
+    @property
+    def left(self) -> float:
+        """Way left to the target depth (mm)."""
+        return float(self.depth[-1] - self.depth[0])
+
+    @property
+    def unused(self) -> float:
+        """Depth (mm) of a roll that is not made."""
+        return float(self.depth[-1]) + 0.5 * self.left + self.advance
+
+    @property
+    def bounds(self) -> tuple[Floats, Floats]:
+        """Of a sample, (d,) each."""
+        wide = 2.0 * self.reach if self.step > 0.0 else 0.0
+        lower = [np.full(KNOTS.size, -wide), np.full(SLOTS, self.depth[0])]
+        upper = [np.full(KNOTS.size, wide), np.full(SLOTS, self.unused)]
+        return np.concatenate(lower), np.concatenate(upper)
+
+    @property
+    def in_hand(self) -> Floats:
+        """The sample (d,) that corrects nothing."""
+        rolls = np.full(SLOTS, self.unused)
+        rolls[: len(self.path.rolls)] = np.maximum(self.path.rolls, self.depth[0])
+        return np.concatenate([np.zeros(KNOTS.size), rolls])
+
+    def controls(self, z: Floats) -> tuple[Floats, Floats]:
+        """Controls (N, m, 5) of samples z (N, d), and the depths (N, m + 1) of the tip before and after each step."""
+        depth, roll = self._grid(z[:, KNOTS.size :])
+        guide = self._guide(z[:, : KNOTS.size], depth)
+        controls = np.zeros((*depth[:, 1:].shape, 5))
+        controls[:, :, 0] = np.diff(depth, axis=1)
+        controls[:, :, 1:3] = self.base
+        controls[:, :, 3] = np.diff(guide, axis=1)
+        controls[:, :, 4] = np.where(roll, 1.0, -1.0)
+        return controls, depth
+
+    def _grid(self, rolls: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """Depths (N, m + 1) with a boundary at each roll (N, s), and whether the bevel rolls before each step (N, m).
+
+        So the cost is continuous in the depth of a roll. Two rolls at one boundary cancel.
+        """
+        n, m = len(rolls), self.depth.size - 1
+        depth = np.tile(self.depth, (n, 1))
+        middle = 0.5 * (self.depth[1:] + self.depth[:-1])
+        rows = np.arange(n)
+        times = np.zeros((n, m + 1), dtype=int)
+        for roll in rolls.T:
+            at = np.searchsorted(middle, roll)
+            made = roll < self.depth[-1]
+            inner = made & (at > 0) & (at < m)
+            depth[rows[inner], at[inner]] = roll[inner]
+            times[rows[made], at[made]] += 1
+        return depth, (times % 2 == 1)[:, :m]
+
+    def _guide(self, corrections: Floats, depth: Floats) -> Floats:
+        """Guide positions (N, m + 1) within the limits, of corrections (N, k) at the knots."""
+        share = (depth - self.depth[0]) / max(self.left, 1e-9)
+        knots = np.append(0.0, KNOTS)
+        padded = np.concatenate([np.zeros((len(corrections), 1)), corrections], axis=1)
+        at = np.clip(np.searchsorted(knots, share, side="right") - 1, 0, KNOTS.size - 1)
+        part = (share - knots[at]) / (knots[at + 1] - knots[at])
+        rows = np.arange(len(corrections))[:, None]
+        wanted = np.interp(depth, self.path.depth, self.path.guide)
+        wanted += (1.0 - part) * padded[rows, at] + part * padded[rows, at + 1]
+        wanted = np.clip(wanted, -self.reach, self.reach)
+        most = self.step * np.diff(depth, axis=1) / self.advance
+        guide = np.empty_like(wanted)
+        guide[:, 0] = self.state.guide
+        for k in range(most.shape[1]):
+            guide[:, k + 1] = np.clip(
+                wanted[:, k + 1], guide[:, k] - most[:, k], guide[:, k] + most[:, k]
+            )
+        return guide
+
+    def corrected(self, z: Floats) -> Path:
+        """The path (in place of the one in hand) that a sample (d,) makes."""
+        controls, depth = self.controls(z[None])
+        guide = self.state.guide + np.append(0.0, np.cumsum(controls[0, :, 3]))
+        return Path(depth[0], guide, tuple(depth[0, :-1][controls[0, :, 4] > 0.0].tolist()))
+
+    def due(self, roll: float) -> bool:
+        """Whether a roll at this depth is to be made now."""
+        return roll <= self.depth[0] + _DUE * self.advance
+
+
+def proposals(ahead: Ahead, count: int, rng: np.random.Generator) -> Floats:
+    """Samples (count, d) around the path in hand, which is the first; of scales over two decades.
+
+    A quarter moves the guide alone, a quarter the rolls alone, a sixth puts in a pair of rolls, the rest moves all.
+    """
+    z = np.tile(ahead.in_hand, (count, 1))
+    k = KNOTS.size
+    kind = np.arange(count) % 12
+    scale = 10.0 ** rng.uniform(-_DECADES, 0.0, (count, 2))
+    guide = _STEEPEST * ahead.left * scale[:, :1] * rng.standard_normal((count, k))
+    rolls = _FURTHEST * ahead.left * scale[:, 1:] * rng.standard_normal((count, SLOTS))
+    if ahead.step > 0.0:
+        z[:, :k] += np.where(((kind < 3) | (kind >= 8))[:, None], guide, 0.0)
+    used = z[0, k:] < ahead.depth[-1]
+    z[:, k:] += np.where((kind >= 3)[:, None] & used, rolls, 0.0)
+    pair = np.flatnonzero((kind == 6) | (kind == 7)) if ahead.step > 0.0 else np.flatnonzero(kind % 2 == 0)
+    if used.sum() <= SLOTS - 2:
+        middle = rng.uniform(ahead.depth[0], ahead.depth[-1], pair.size)
+        half = 0.5 * ahead.left * 10.0 ** rng.uniform(-1.5, 0.0, pair.size)
+        z[pair, -2], z[pair, -1] = middle - half, middle + half
+    z[0] = ahead.in_hand
+    return np.clip(z, *ahead.bounds)

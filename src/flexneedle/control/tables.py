@@ -1,0 +1,75 @@
+"""The controllers' tables of a scenario: checked by the controllers that own them, and filled with their defaults.
+
+A scenario keeps the tables below `control` as they are given, since it knows no controller.
+"""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+from functools import cache
+from typing import Any
+
+from pydantic import ValidationError, create_model
+
+from flexneedle.control.interface import Method
+from flexneedle.control.task import Task
+from flexneedle.errors import InputError, ScenarioError
+from flexneedle.scenario import Control, Scenario
+from flexneedle.scenario.problems import describe, key_path
+from flexneedle.simulator import Simulator
+from flexneedle.trace import PlanRecord
+
+__all__ = ["completed", "task", "typed_scenario", "unowned"]
+
+
+@cache
+def typed_scenario(methods: tuple[Method, ...]) -> type[Scenario]:
+    """Return the class of scenarios whose tables of these controllers are of the controllers' own classes.
+
+    Raises InputError if two of them would share a table.
+    """
+    owners = {method.table: method for method in methods}
+    for method in methods:
+        if owners[method.table] != method:
+            raise InputError(f"two controllers are called {method.name}: give one of them another name")
+    tables: dict[str, Any] = {
+        table: (owner.settings, owner.settings()) for table, owner in owners.items() if owner.settings
+    }
+    control = create_model("Control", __base__=Control, __doc__=Control.__doc__, **tables)
+    fields: dict[str, Any] = {"control": (control, control())}
+    return create_model("Scenario", __base__=Scenario, __doc__=Scenario.__doc__, **fields)
+
+
+def completed(scenario: Scenario, methods: Iterable[Method], source: str = "") -> Scenario:
+    """Return the scenario with all settings of these controllers, those of other tables as they are.
+
+    Raises ScenarioError with one line for each problem, which opens with `source`.
+    """
+    return Scenario.from_values(_typed(scenario, tuple(methods), source).values())
+
+
+def task(method: Method, simulator: Simulator, plan: PlanRecord) -> Task:
+    """Return what `method` is to carry out, with its settings of the simulator's scenario. Raises ScenarioError."""
+    control = _typed(simulator.scenario, (method,), "").control
+    return Task(simulator, plan, getattr(control, method.table) if method.settings else None)
+
+
+def unowned(scenario: Scenario, methods: Iterable[Method], source: str = "") -> list[str]:
+    """Return a line for each table below `control` that belongs to none of these controllers."""
+    known = [method.table for method in methods if method.settings]
+    opening = f"{source}: " if source else ""
+    lines = []
+    for table in sorted(set(scenario.control.tables) - set(known)):
+        close = get_close_matches(table, known, n=1)
+        hint = f"did you mean {close[0]}? " if close else ""
+        rule = f"unknown table; {hint}tables: {', '.join(known)}; one of your own needs its --controller"
+        lines.append(f"{opening}{key_path(('control', table))}: {rule}")
+    return lines
+
+
+def _typed(scenario: Scenario, methods: tuple[Method, ...], source: str) -> Scenario:
+    model = typed_scenario(methods)
+    try:
+        return model.model_validate(scenario.model_dump(exclude_none=True))
+    except ValidationError as error:
+        opening = f"{source}: " if source else ""
+        raise ScenarioError(*(opening + line for line in describe(error, model))) from None

@@ -1,0 +1,27 @@
+"""What a controller is to carry out."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from flexneedle.scenario import Scenario
+from flexneedle.simulator import Simulator
+from flexneedle.trace import PlanRecord
+
+__all__ = ["Task"]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A plan, the model as the scenario has it, and the controller's own settings.
+
+    settings: of the class that the `Method` names, checked; None for a controller without any.
+    """
+
+    simulator: Simulator
+    plan: PlanRecord
+    settings: Any = None
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of model and settings."""
+        return self.simulator.scenario

@@ -1,0 +1,89 @@
+"""The search behind every plan and every predictive controller: the best of the sequences that some variables describe.
+
+    found = best(variables, rollout, terms, search, rng)
+
+Cross-entropy draws samples z (N, d) of the variables within their bounds, `variables.controls` turns them into
+controls, `rollout` carries these out, and the terms charge for what came of it.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.planning import cross_entropy as ce
+from flexneedle.planning.terms import Outcome, Rollout, Term, charges, cost
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Variables:
+    """What is searched: d coordinates that describe a sequence of controls.
+
+    lower, upper, mean, sigma (d,): bounds, and the first mean and standard deviation; a coordinate of sigma 0 stays.
+    controls: z (N, d) → (N, m, 5). correlation (d, d): of the first samples (default: none).
+    """
+
+    lower: Floats
+    upper: Floats
+    mean: Floats
+    sigma: Floats
+    controls: Callable[[Floats], Floats]
+    correlation: Floats | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The best sample z (d,), its cost, the cost's weighted terms by name, its rollout (N = 1), and the search."""
+
+    z: Floats
+    cost: float
+    terms: dict[str, float]
+    outcome: Outcome
+    belief: ce.Belief
+
+
+def best(
+    variables: Variables,
+    rollout: Rollout,
+    terms: Sequence[Term],
+    search: ce.Search,
+    rng: np.random.Generator,
+    *,
+    incumbent: Floats | None = None,
+    first: Floats | None = None,
+    progress: Callable[[dict[str, Any]], None] | None = None,
+) -> Found:
+    """Search for the sample of least cost; infinite if none converged, z being the mean then.
+
+    incumbent (k, d): further samples of the first iteration. The best sample is kept, so what is found is never worse.
+    first (n, d): samples of the first iteration in place of the Gaussian's, whatever their number.
+    """
+    settings = ce.Settings(**vars(search), lower=variables.lower, upper=variables.upper)
+    belief = ce.start(variables.mean, variables.sigma, variables.correlation)
+
+    def evaluate(z: Floats) -> Floats:
+        return cost(terms, rollout(variables.controls(z)))
+
+    opening = _opening(belief, settings, rng, incumbent, first)
+    belief = ce.minimize(evaluate, belief, settings, rng, progress, opening)
+    outcome = rollout(variables.controls(belief.best[None]))
+    charged = {name: float(value[0]) for name, value in charges(terms, outcome).items()}
+    return Found(belief.best, belief.best_cost, charged, outcome, belief)
+
+
+def _opening(
+    belief: ce.Belief,
+    settings: ce.Settings,
+    rng: np.random.Generator,
+    incumbent: Floats | None,
+    first: Floats | None,
+) -> Floats:
+    """Samples (n, d) of the first iteration, the incumbent's in front."""
+    drawn = ce.ask(belief, settings, rng) if first is None else first
+    samples = drawn if incumbent is None else np.concatenate([incumbent, drawn])
+    kept: Floats = np.clip(samples, settings.lower, settings.upper)
+    return kept

@@ -1,0 +1,145 @@
+"""The terms of a cost, a function each: what rollouts did → (N,). A cost is a weighted sum of some of them.
+
+| term | unit | its weight's unit, for a cost in mm |
+|---|---|---|
+| `miss` | mm | 1 |
+| `energy_at_end` | mJ | mm/mJ |
+| `guide_slope` | 1 | mm |
+| `rolls` | 1 | mm |
+| `distance_from_line` | mm | 1 |
+| `deflection` | mm², summed over steps | 1/mm |
+| `guide_motion` | mm², summed over steps | 1/mm |
+| `deviation` | mm², summed over steps | 1/mm |
+| `guide_departure` | mm², summed over steps | 1/mm |
+| `energy_of_steps` | mJ, summed over steps | mm/mJ |
+
+The terms with sums over steps are those of the paper (eq. 10 and 13) and depend on the length of a step.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """N sequences of m steps and what they led to.
+
+    controls (N, m, 5): db_x, db_y, db_theta, dg_y (mm, rad), flip (−1 or +1); tips (N, m, 3): after each step, mm and
+    rad; energy (N, m): strain energy of the tissue, mJ; converged (N, m); deflection (N, m): mean square of the
+    needle's lateral deflection, mm², where a term needs it.
+    """
+
+    controls: Floats
+    tips: Floats
+    energy: Floats
+    converged: NDArray[np.bool_]
+    deflection: Floats = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """(N, m): steps that advance and end with the tip in the tissue; the others do nothing to it."""
+        inside: NDArray[np.bool_] = (self.tips[:, :, 0] > 0.0) & (self.controls[:, :, 0] > 0.0)
+        return inside
+
+
+Rollout = Callable[[Floats], Outcome]
+"""Carries out controls (N, m, 5)."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """A term of a cost: `weight` times `value` of an outcome, which is (N,)."""
+
+    name: str
+    weight: float
+    value: Callable[[Outcome], Floats]
+
+
+def charges(terms: Sequence[Term], outcome: Outcome) -> dict[str, Floats]:
+    """The weighted terms (N,) by name."""
+    return {term.name: term.weight * term.value(outcome) for term in terms}
+
+
+def cost(terms: Sequence[Term], outcome: Outcome) -> Floats:
+    """The sum (N,) of the weighted terms; infinite where the model did not converge."""
+    total: Floats = np.sum(list(charges(terms, outcome).values()), axis=0)
+    return np.where(outcome.converged.all(axis=1), total, np.inf)
+
+
+def miss(outcome: Outcome, target: Point) -> Floats:
+    """Lateral distance (mm) from the target at its depth, to which the tip's own line is followed from the end."""
+    end = outcome.tips[:, -1]
+    distance: Floats = np.abs(end[:, 1] + np.tan(end[:, 2]) * (target[0] - end[:, 0]) - target[1])
+    return distance
+
+
+def energy_at_end(outcome: Outcome) -> Floats:
+    """Strain energy of the tissue after the last step (mJ)."""
+    return outcome.energy[:, -1]
+
+
+def energy_of_steps(outcome: Outcome) -> Floats:
+    """Strain energy of the tissue, summed over the steps (mJ)."""
+    total: Floats = outcome.energy.sum(axis=1)
+    return total
+
+
+def guide_slope(outcome: Outcome) -> Floats:
+    """Mean square of the guide's motion for that of the base, over the travel: ∫(dg/db_x)² db_x / ∫db_x."""
+    advance = outcome.controls[:, :, 0]
+    squares = np.divide(
+        outcome.controls[:, :, 3] ** 2, advance, out=np.zeros_like(advance), where=advance > 0.0
+    )
+    slope: Floats = squares.sum(axis=1) / np.maximum(advance.sum(axis=1), np.finfo(float).tiny)
+    return slope
+
+
+def rolls(outcome: Outcome, first: int = 0) -> Floats:
+    """Half-turns of the bevel, from step `first` on."""
+    count: Floats = (outcome.controls[:, first:, 4] > 0.0).sum(axis=1).astype(float)
+    return count
+
+
+def distance_from_line(outcome: Outcome, start: Point, target: Point) -> Floats:
+    """Mean lateral distance (mm) of the tip from the line between two points, over the advance in the tissue."""
+    x, y = outcome.tips[:, :, 0], outcome.tips[:, :, 1]
+    slope = (target[1] - start[1]) / (target[0] - start[0])
+    away = np.abs(y - start[1] - slope * (x - start[0]))
+    share = np.where(outcome.inside, outcome.controls[:, :, 0], 0.0)
+    mean: Floats = (away * share).sum(axis=1) / np.maximum(share.sum(axis=1), np.finfo(float).tiny)
+    return mean
+
+
+def deflection(outcome: Outcome) -> Floats:
+    """Mean square deflection of the needle (mm²), summed over the steps in the tissue (paper eq. 10)."""
+    total: Floats = (outcome.deflection * outcome.inside).sum(axis=1)
+    return total
+
+
+def guide_motion(outcome: Outcome) -> Floats:
+    """Squared guide steps (mm²), summed over the steps in the tissue (paper eq. 10)."""
+    total: Floats = ((outcome.controls[:, :, 3] ** 2) * outcome.inside).sum(axis=1)
+    return total
+
+
+def deviation(outcome: Outcome, reference: Floats, orientation: float) -> Floats:
+    """Squared SE(2) deviation (mm²) from poses (m, 3), summed over the steps (paper eq. 13).
+
+    orientation: the distance (mm) that 1 rad weighs as much as.
+    """
+    off = outcome.tips - reference
+    off[:, :, 2] *= orientation
+    total: Floats = (off**2).sum(axis=(1, 2))
+    return total
+
+
+def guide_departure(outcome: Outcome, nominal: Floats) -> Floats:
+    """Squared differences (mm²) of the guide steps from `nominal` (m,), summed over the steps."""
+    total: Floats = ((outcome.controls[:, :, 3] - nominal) ** 2).sum(axis=1)
+    return total

@@ -1,0 +1,128 @@
+"""The controllers' tables of a scenario: kept raw, checked by their owners, filled with defaults."""
+
+import tomllib
+from dataclasses import replace
+
+import pytest
+
+import flexneedle
+from flexneedle.control import tables
+from flexneedle.control.interface import Method
+from flexneedle.control.methods import DEFAULT, METHODS, checked, used
+from flexneedle.errors import InputError, ScenarioError, ScenarioWarning
+from flexneedle.scenario import Scenario, dump_scenario
+from flexneedle.scenario.fields import NonNegative, Section
+from flexneedle.simulator import Simulator
+
+PHANTOM = flexneedle.load_scenario("phantom")
+
+
+class Gains(Section):
+    """Settings of a controller of one's own."""
+
+    gain: NonNegative = 0.5
+    """Share of the error."""
+
+
+def decide(_task, memory, _estimate, _rng):
+    raise NotImplementedError
+
+
+OWN = Method("my-pid", "a controller of one's own", decide=decide, settings=Gains)
+
+
+def test_the_default_controller_is_first_and_the_others_are_in_order():
+    names = list(METHODS)
+    assert names[0] == DEFAULT
+    assert names[1:] == sorted(names[1:])
+    assert {"ce-mpc", "open-loop", "bevel-only", "resolved-rate", "broyden-mpc"} <= set(names)
+
+
+def test_a_scenario_keeps_a_table_as_it_is_given():
+    raw = {"gain": "high", "limits": [1, {"a": 2}], "on": True}
+    scenario = Scenario.from_values({**PHANTOM.values(), "control": {"my_pid": raw}})
+    assert scenario.control.tables == {"my_pid": raw}
+    assert Scenario.from_values(tomllib.loads(dump_scenario(scenario))) == scenario
+
+
+def test_all_defaults_are_filled_in_and_nothing_else_changes():
+    full = checked(PHANTOM.with_values({"control.bevel_only.curvature_per_m": 0.3}), OWN)
+    for name, method in METHODS.items():
+        if method.settings is not None:
+            own = full.control.tables[method.table]
+            assert set(own) == set(method.settings.model_fields), name
+    assert full.control.tables["my_pid"] == {"gain": 0.5}
+    assert full.control.tables["bevel_only"] == {
+        **METHODS["bevel-only"].settings().model_dump(),
+        "curvature_per_m": 0.3,
+    }
+    assert full.values() | {"control": 0} == PHANTOM.values() | {"control": 0}
+    assert checked(full, OWN) == full
+
+
+def test_a_task_has_the_settings_of_its_controller():
+    scenario = PHANTOM.with_values({"control.my_pid.gain": 0.25})
+    task = tables.task(OWN, Simulator(scenario, 1), None)
+    assert task.settings == Gains(gain=0.25)
+    assert tables.task(METHODS["open-loop"], Simulator(scenario, 1), None).settings is None
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("my_pid.gian", 1, "control.my_pid.gian = 1: unknown key; did you mean gain? valid keys: gain"),
+        ("my_pid.gain", -1, "control.my_pid.gain = -1: must be at least 0"),
+        ("my_pid.gain", "1", 'control.my_pid.gain = "1": must be a number'),
+        (
+            "ce_mpc.horizons",
+            1,
+            "control.ce_mpc.horizons = 1: unknown key; did you mean horizon? valid keys: ",
+        ),
+    ],
+)
+def test_a_wrong_setting_is_one_line_wherever_it_is_used(key, value, told):
+    scenario = PHANTOM.with_values({f"control.{key}": value})
+    for check in (checked, used):
+        with pytest.raises(ScenarioError) as caught:
+            check(scenario, OWN, source="x.toml")
+        (line,) = caught.value.problems
+        assert line.startswith(f"x.toml: {told}")
+
+
+def test_a_table_of_nobody_is_refused_by_a_check_and_warned_of_in_use():
+    scenario = PHANTOM.with_values({"control.my_pdi.gain": 1})
+    told = r"^x.toml: control.my_pdi: unknown table; did you mean my_pid\? tables: adaptive_mpc, .*, my_pid; one of"
+    with pytest.raises(ScenarioError, match=told):
+        checked(scenario, OWN, source="x.toml")
+    with pytest.warns(ScenarioWarning, match=told):
+        assert used(scenario, OWN, source="x.toml").control.tables["my_pdi"] == {"gain": 1}
+
+
+def test_two_controllers_do_not_share_a_table():
+    with pytest.raises(InputError, match="two controllers are called ce-mpc: give one of them another name"):
+        checked(PHANTOM, replace(OWN, name="ce-mpc"))
+
+
+class NoDefault(Section):
+    """Settings without a default."""
+
+    gain: float
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"name": "My PID"}, "name = 'My PID': a controller's name must be like my-controller-2"),
+        ({"name": None}, "name = None: a controller's name must be like"),
+        ({"name": "load-gain"}, "name = 'load-gain': control.load_gain is a setting of all controllers"),
+        ({"decide": None}, "controller my-pid: decide must be a function"),
+        ({"arrived": 3}, "controller my-pid: arrived must be a function"),
+        ({"observer": object()}, r"controller my-pid: observer must have a begin\(task\)"),
+        ({"settings": dict}, "controller my-pid: settings must be a class made from flexneedle.Section"),
+        ({"settings": Gains()}, "controller my-pid: settings must be a class made from flexneedle.Section"),
+        ({"settings": NoDefault}, "controller my-pid: settings must have a valid default for each key: gain"),
+    ],
+)
+def test_a_method_that_cannot_work_is_refused_when_it_is_made(change, told):
+    with pytest.raises(InputError, match=f"^{told}"):
+        replace(OWN, **change)

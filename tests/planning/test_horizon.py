@@ -1,0 +1,119 @@
+"""The search of sequences: bounds, the incumbent, samples of the first iteration, what is returned."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from flexneedle.planning import cross_entropy as ce
+from flexneedle.planning import horizon, terms
+from flexneedle.planning.terms import Outcome, Term
+
+SEARCH = ce.Search(samples=16, elite=4, iterations=3, smoothing=0.2, tolerance=1e-9)
+TARGET = (4.0, 1.5)
+
+
+def controls(z):
+    """Guide steps z (N, 4), 1 mm of advance each."""
+    made = np.zeros((*z.shape, 5))
+    made[:, :, 0], made[:, :, 3], made[:, :, 4] = 1.0, z, -1.0
+    return made
+
+
+VARIABLES = horizon.Variables(
+    np.full(4, -1.0), np.full(4, 1.0), np.zeros(4), np.array([0.3, 0.3, 0.3, 0.0]), controls
+)
+TERMS = (
+    Term("miss", 1.0, lambda outcome: terms.miss(outcome, TARGET)),
+    Term("guide", 0.1, terms.guide_motion),
+)
+
+
+def rigid(rows, failed=lambda tips: np.zeros(tips.shape[:2], dtype=bool)):
+    """A tip that goes where the guide goes."""
+    moved = np.cumsum(rows, axis=1)
+    tips = np.stack([moved[:, :, 0], moved[:, :, 3], np.zeros(moved.shape[:2])], axis=2)
+    return Outcome(rows, tips, np.zeros(tips.shape[:2]), ~failed(tips))
+
+
+class Taped:
+    """A rollout that keeps the samples it was given."""
+
+    def __init__(self):
+        self.rows = []
+
+    def __call__(self, rows):
+        self.rows.append(rows[:, :, 3].copy())
+        return rigid(rows)
+
+
+def search(rollout=rigid, variables=VARIABLES, settings=SEARCH, seed=0, **options):
+    return horizon.best(variables, rollout, TERMS, settings, np.random.default_rng(seed), **options)
+
+
+def test_what_is_found_is_told_with_its_terms_and_rollout():
+    found = search()
+    np.testing.assert_array_equal(found.outcome.controls, controls(found.z[None]))
+    assert found.cost == sum(found.terms.values()) == found.belief.best_cost
+    assert found.terms["miss"] == pytest.approx(abs(found.z.sum() - 1.5))
+    assert list(found.terms) == ["miss", "guide"]
+
+
+def test_it_is_cross_entropy_on_the_cost_and_nothing_else():
+    """The same samples, the same bytes as the method called by hand."""
+    settings = ce.Settings(**vars(SEARCH), lower=VARIABLES.lower, upper=VARIABLES.upper)
+    by_hand = ce.minimize(
+        lambda z: terms.cost(TERMS, rigid(controls(z))),
+        ce.start(VARIABLES.mean, VARIABLES.sigma),
+        settings,
+        np.random.default_rng(0),
+    )
+    found = search()
+    assert found.belief.mean.tobytes() == by_hand.mean.tobytes()
+    assert found.belief.history == by_hand.history
+
+
+def test_a_correlation_is_that_of_the_first_samples():
+    tape = Taped()
+    together = replace(
+        VARIABLES, sigma=np.array([0.1, 0.1, 0, 0]), correlation=np.eye(4) + 0.99 * np.eye(4)[[1, 0, 3, 2]]
+    )
+    search(tape, together, replace(SEARCH, samples=2000, iterations=1))
+    assert np.corrcoef(tape.rows[0][:, :2].T)[0, 1] > 0.97
+
+
+@given(seed=st.integers(0, 2**32), z=st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4))
+@hypothesis_settings(deadline=None, derandomize=True, max_examples=40)
+def test_it_is_never_worse_than_the_incumbent(seed, z):
+    incumbent = np.array([z])
+    before = terms.cost(TERMS, rigid(controls(incumbent)))[0]
+    assert search(seed=seed, settings=replace(SEARCH, iterations=2), incumbent=incumbent).cost <= before
+
+
+def test_an_incumbent_that_no_sample_beats_is_what_is_found():
+    best = np.array([[0.375, 0.375, 0.375, 0.375]])  # the last one has no sigma: no sample comes there
+    found = search(incumbent=np.concatenate([best, best + 0.1]))
+    np.testing.assert_array_equal(found.z, best[0])
+
+
+def test_incumbents_come_before_the_samples_of_the_first_iteration_and_are_kept_in_bounds():
+    tape, first = Taped(), np.tile([[0.1], [0.2], [9.0], [0.3], [0.4]], (1, 4))
+    search(tape, incumbent=np.full((2, 4), 5.0), first=first)
+    expected = [1.0, 1.0, 0.1, 0.2, 1.0, 0.3, 0.4]
+    np.testing.assert_array_equal(tape.rows[0][:, 0], expected)
+    assert [len(rows) for rows in tape.rows] == [7, 16, 16, 1]
+
+
+def test_where_every_sample_fails_the_cost_is_infinite_and_the_mean_is_kept():
+    found = search(lambda rows: rigid(rows, lambda tips: np.ones(tips.shape[:2], dtype=bool)))
+    assert found.cost == np.inf
+    np.testing.assert_array_equal(found.z, VARIABLES.mean)
+
+
+def test_each_iteration_is_shown():
+    calls = []
+    search(progress=calls.append)
+    assert [call["iteration"] for call in calls] == [1, 2, 3]

@@ -1,0 +1,88 @@
+"""Each term of a cost against numbers by hand, on rollouts that are written down."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from flexneedle.planning import terms
+from flexneedle.planning.terms import Outcome, Term
+
+# Two sequences of three steps. The first one's first step ends in air; the second one's last is padding.
+ADVANCE = np.array([[1.0, 2.0, 2.0], [1.0, 0.5, 0.0]])
+GUIDE = np.array([[0.1, 0.2, -0.4], [0.3, 0.0, 0.0]])
+FLIP = np.array([[1.0, -1.0, 1.0], [-1.0, 1.0, -1.0]])
+X = np.array([[-0.5, 1.5, 3.5], [0.5, 1.0, 1.0]])
+Y = np.array([[0.0, 0.2, 0.5], [1.0, -1.0, -1.0]])
+TURN = np.array([[0.0, 0.1, 0.2], [0.0, 0.0, -0.3]])
+CONTROLS = np.stack([ADVANCE, 0 * X, 0 * X, GUIDE, FLIP], axis=2)
+OUTCOME = Outcome(
+    CONTROLS,
+    np.stack([X, Y, TURN], axis=2),
+    np.array([[0.0, 1.0, 4.0], [2.0, 3.0, 3.0]]),
+    np.ones((2, 3), dtype=bool),
+    np.array([[5.0, 6.0, 7.0], [8.0, 9.0, 10.0]]),
+)
+
+
+@pytest.mark.parametrize(
+    ("term", "expected"),
+    [
+        (
+            partial(terms.miss, target=(4.0, -0.5)),
+            [0.5 + 0.5 * np.tan(0.2) + 0.5, abs(-1.0 - 3.0 * np.tan(0.3) + 0.5)],
+        ),
+        (terms.energy_at_end, [4.0, 3.0]),
+        (terms.energy_of_steps, [5.0, 8.0]),
+        (terms.guide_slope, [(0.01 + 0.04 / 2 + 0.16 / 2) / 5.0, 0.09 / 1.5]),
+        (terms.rolls, [2.0, 1.0]),
+        (partial(terms.rolls, first=1), [1.0, 1.0]),
+        (terms.deflection, [6.0 + 7.0, 8.0 + 9.0]),
+        (terms.guide_motion, [0.04 + 0.16, 0.09]),
+        (partial(terms.guide_departure, nominal=np.array([0.1, 0.0, 0.1])), [0.04 + 0.25, 0.04 + 0.01]),
+    ],
+)
+def test_term_against_numbers_by_hand(term, expected):
+    np.testing.assert_allclose(term(OUTCOME), expected, rtol=1e-14)
+
+
+def test_distance_from_the_line_is_a_mean_over_the_advance_in_tissue():
+    """From (0, 0) with slope −1/4: at 1.5 and 3.5 by 0.575 and 1.375, two mm each; at 0.5 and 1 by 1.125 and 0.75."""
+    found = terms.distance_from_line(OUTCOME, (0.0, 0.0), (4.0, -1.0))
+    np.testing.assert_allclose(found, [(0.575 + 1.375) / 2, (1.125 * 1.0 + 0.75 * 0.5) / 1.5], rtol=1e-14)
+
+
+def test_distance_from_the_line_knows_where_the_line_starts():
+    found = terms.distance_from_line(OUTCOME, (1.5, 0.2), (3.5, 0.5))
+    assert found[0] == pytest.approx(0.0, abs=1e-15)
+
+
+def test_in_air_and_without_an_advance_nothing_is_divided_by_zero():
+    still = replace(OUTCOME, controls=np.zeros_like(CONTROLS))
+    np.testing.assert_array_equal(terms.guide_slope(still), [0.0, 0.0])
+    np.testing.assert_array_equal(terms.distance_from_line(still, (0.0, 0.0), (4.0, 1.0)), [0.0, 0.0])
+
+
+def test_deviation_weighs_an_angle_as_a_distance_and_changes_no_tips():
+    before = OUTCOME.tips.copy()
+    off = OUTCOME.tips - 0.25
+    expected = (off[:, :, 0] ** 2 + off[:, :, 1] ** 2 + 9.0 * off[:, :, 2] ** 2).sum(axis=1)
+    np.testing.assert_allclose(terms.deviation(OUTCOME, np.full((3, 3), 0.25), 3.0), expected)
+    np.testing.assert_array_equal(OUTCOME.tips, before)
+
+
+def test_a_slope_does_not_depend_on_the_length_of_the_steps():
+    """Halving every step leaves the guide's slope, where the paper's sum of squares halves."""
+    halved = replace(OUTCOME, controls=np.repeat(CONTROLS, 2, axis=1) * [0.5, 1, 1, 0.5, 1])
+    np.testing.assert_allclose(terms.guide_slope(halved), terms.guide_slope(OUTCOME))
+
+
+def test_cost_is_the_weighted_sum_and_infinite_where_the_model_failed():
+    listed = (Term("energy", 2.0, terms.energy_at_end), Term("rolls", 0.5, terms.rolls))
+    charged = terms.charges(listed, OUTCOME)
+    np.testing.assert_allclose(charged["energy"], [8.0, 6.0])
+    np.testing.assert_allclose(charged["rolls"], [1.0, 0.5])
+    np.testing.assert_allclose(terms.cost(listed, OUTCOME), [9.0, 6.5])
+    failed = replace(OUTCOME, converged=np.array([[True, True, True], [True, False, True]]))
+    assert terms.cost(listed, failed).tolist() == [9.0, np.inf]

@@ -1,0 +1,85 @@
+"""Keys that have another name now: the old ones mean the new ones, with a warning."""
+
+import tomllib
+import warnings
+
+import pytest
+import tomli_w
+
+from flexneedle.control.methods import checked
+from flexneedle.errors import ScenarioError, ScenarioWarning
+from flexneedle.scenario import Scenario, dump_scenario, load_scenario
+
+PHANTOM = load_scenario("phantom")
+OLD = {
+    "samples": 30, "iterations": 2, "horizon": 9, "orientation_weight_mm": 4.0, "guide_weight": 0.5,
+    "energy_weight_per_mj": 1.0, "curvature_per_m": 0.7, "flip_dead_band": 0.25,
+}  # fmt: skip
+
+
+def warned(caught):
+    return [str(warning.message) for warning in caught]
+
+
+def old_file():
+    """Values of a scenario file from before the move."""
+    values = PHANTOM.values()
+    values["control"] = {"load_gain": 0.4, **OLD}
+    return values
+
+
+def test_old_keys_of_a_file_mean_the_new_ones_and_each_is_warned_of_once(scenario_file):
+    path = scenario_file(tomli_w.dumps(old_file()))
+    with pytest.warns(ScenarioWarning) as caught:
+        scenario = load_scenario(path)
+    assert scenario.control.tables == {"ce_mpc": OLD}
+    assert scenario.control.load_gain == 0.4
+    assert warned(caught) == [f"{path}: control.{key} is now control.ce_mpc.{key}: rename it" for key in OLD]
+
+
+@pytest.mark.parametrize("key", OLD)
+def test_an_old_dotted_key_means_the_new_one(key):
+    with pytest.warns(ScenarioWarning, match=f"^control.{key} is now control.ce_mpc.{key}: rename it$"):
+        changed = PHANTOM.with_values({f"control.{key}": OLD[key]})
+    assert changed == PHANTOM.with_values({f"control.ce_mpc.{key}": OLD[key]})
+    assert "control.ce_mpc." + key in changed.flat()
+
+
+def test_an_old_dotted_key_goes_over_the_new_one_that_is_there():
+    full = checked(PHANTOM)
+    with pytest.warns(ScenarioWarning):
+        assert full.with_values({"control.horizon": 3}).control.tables["ce_mpc"]["horizon"] == 3
+
+
+def test_both_names_of_a_key_are_refused():
+    values = old_file()
+    values["control"]["ce_mpc"] = {"horizon": 4}
+    with (
+        pytest.warns(ScenarioWarning),
+        pytest.raises(
+            ScenarioError, match=r"^x.toml: control.horizon = 9: is control.ce_mpc.horizon now, which is "
+        ),
+    ):
+        Scenario.from_values(values, "x.toml")
+
+
+def test_a_wrong_value_of_an_old_key_is_refused_under_the_new_name():
+    with pytest.warns(ScenarioWarning):
+        scenario = PHANTOM.with_values({"control.horizon": 0})
+    with pytest.raises(ScenarioError, match=r"^control.ce_mpc.horizon = 0: must be at least 1$"):
+        checked(scenario)
+
+
+def test_a_record_is_read_without_a_warning_and_its_values_are_left_alone():
+    values = old_file()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert Scenario.from_record(values).control.tables == {"ce_mpc": OLD}
+    assert values == old_file()
+
+
+def test_what_is_shipped_and_written_has_no_old_key():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = Scenario.from_values(tomllib.loads(dump_scenario(load_scenario("phantom"))))
+    assert again == PHANTOM

@@ -1,0 +1,16 @@
+"""Tasks for the tests of controllers."""
+
+from types import SimpleNamespace
+
+from flexneedle.control import tables
+from flexneedle.control.methods import DEFAULT, METHODS
+
+
+def task_of(simulator, plan, controller=DEFAULT):
+    """What a controller is to carry out, with its settings of the simulator's scenario."""
+    return tables.task(METHODS[controller], simulator, plan)
+
+
+def begun_with(simulator, bevel=1, controller=DEFAULT):
+    """A task whose plan is known by the bevel's side alone: enough for an observer."""
+    return task_of(simulator, SimpleNamespace(bevel=bevel), controller)

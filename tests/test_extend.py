@@ -1,0 +1,152 @@
+"""What docs/extend.md says works, from outside the package: its modules lie in a folder of the user's."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+import flexneedle
+from flexneedle.scenario import dump_scenario
+
+DOCS = (Path(__file__).parents[1] / "docs" / "extend.md").read_text(encoding="utf-8")
+MODULES = dict(re.findall(r"^`(\w+)\.py`:\n\n```python\n(.*?)```", DOCS, re.MULTILINE | re.DOTALL))
+PARTS = {"controller": "follow_path:METHOD", "phantom": "unicycle:Unicycle", "tracker": "camera:Camera"}
+QUICK = {
+    "plan.samples": 16, "plan.iterations": 2, "setup.tip_to_skin_mm": 4.0, "target.depth_mm": 8.0,
+    "target.lateral_mm": 0.5, "phantom.step_mm": 1.0, "phantom.contact_spacing_mm": 2.0, "phantom.element_mm": 2.0,
+}  # fmt: skip
+STUDY = """
+name = "own"
+scenario = "quick.toml"
+
+[[axes]]
+key = "controller"
+values = ["open-loop", "follow_path:METHOD"]
+
+[[axes]]
+key = "control.follow_path.gain"
+values = [0.0, 2.0]
+
+[[cases]]
+name = "scenario"
+
+[[cases]]
+name = "own"
+values = { plant = "unicycle:Unicycle", tracker = "camera:Camera" }
+"""
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """The folder of a lab: the modules of the page, a quick scenario with settings for the controller."""
+    folder = tmp_path_factory.mktemp("lab")
+    for name, code in MODULES.items():
+        (folder / f"{name}.py").write_text(code, encoding="utf-8")
+    scenario = flexneedle.load_scenario("phantom").with_values(QUICK | {"control.follow_path.gain": 0.25})
+    (folder / "quick.toml").write_text(dump_scenario(scenario), encoding="utf-8")
+    (folder / "own.toml").write_text(STUDY, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture
+def imported(lab, monkeypatch):
+    """Return a function that imports a part of the page by `module:NAME`."""
+    monkeypatch.syspath_prepend(lab)
+
+    def part(spec):
+        module, _, name = spec.partition(":")
+        return getattr(__import__(module), name)
+
+    yield part
+    for name in MODULES:
+        sys.modules.pop(name, None)
+
+
+def command(lab, *argv):
+    """Run the command in the folder; -P: Python itself does not put that into the path."""
+    line = [sys.executable, "-P", "-m", "flexneedle", *argv]
+    return subprocess.run(line, cwd=lab, capture_output=True, text=True, check=False)
+
+
+def test_each_example_is_some_thirty_lines():
+    assert list(MODULES) == ["follow_path", "unicycle", "camera"]
+    assert all(20 < len(code.splitlines()) < 36 for code in MODULES.values())
+
+
+def test_the_parts_are_carried_out_and_recorded_under_their_names(lab):
+    options = [word for key, name in PARTS.items() for word in (f"--{key}", name)]
+    done = command(lab, "insert", "quick.toml", "--force", "--json", "--out", "one", *options)
+    result, stored = json.loads(done.stdout), json.loads((lab / "one/run.json").read_text())
+    assert result["outcome"] == stored["status"] == "done", done.stderr
+    assert {key: stored[key] for key in PARTS} == PARTS
+    assert (result["controller"], result["phantom"]) == (PARTS["controller"], PARTS["phantom"])
+    assert stored["scenario"]["control"]["follow_path"] == {"gain": 0.25}
+    again = command(lab, "view", "one")
+    assert again.returncode == 0, again.stderr
+
+
+def test_a_scenario_with_the_table_is_checked_with_the_controller(lab):
+    refused = command(lab, "scenario", "check", "quick.toml")
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("flexneedle: quick.toml: control.follow_path: unknown table; ")
+    fine = command(lab, "scenario", "check", "quick.toml", "--controller", PARTS["controller"])
+    assert (fine.returncode, fine.stderr) == (0, "")
+
+
+def test_objects_are_carried_out_as_their_names_are(lab, imported, monkeypatch):
+    monkeypatch.chdir(lab)
+    scenario = flexneedle.load_scenario("quick.toml")
+    plan = flexneedle.plan(scenario, seed=0)
+    own = {key: imported(name) for key, name in PARTS.items()}
+    by_object = flexneedle.insert(scenario, plan, 3, force=True, **own)
+    by_name = flexneedle.insert(scenario, plan, 3, force=True, **PARTS)
+    assert by_object.outcome == "done"
+    assert [p.true_tip for p in by_object.periods] == [p.true_tip for p in by_name.periods]
+    assert (by_object.controller, by_object.phantom) == ("follow-path", "Unicycle")
+    assert (by_name.controller, by_name.phantom) == (PARTS["controller"], PARTS["phantom"])
+    stiff = scenario.with_values({"control.follow_path.gain": 2.0})
+    other = flexneedle.insert(stiff, plan, 3, force=True, **own)
+    assert other.periods[-1].guide != by_object.periods[-1].guide
+
+
+def test_a_study_takes_them_by_name_in_its_workers(lab):
+    done = command(lab, "study", "own.toml", "--workers", "2", "--out", "study", "--json")
+    assert done.returncode == 0, done.stderr
+    rows = pq.read_table(lab / "study/runs.parquet").to_pylist()
+    assert [(row["case"], row["controller"], row["control.follow_path.gain"]) for row in rows] == [
+        (case, controller, gain)
+        for case in ("scenario", "own")
+        for controller in ("open-loop", PARTS["controller"])
+        for gain in (0.0, 2.0)
+    ]
+    assert {(row["case"], row["plant"], row["tracker"]) for row in rows} == {
+        ("scenario", "exact", "scenario"),
+        ("own", PARTS["phantom"], PARTS["tracker"]),
+    }
+    assert {row["outcome"] for row in rows} == {"done"}, [row["reason"] for row in rows]
+    ends = {
+        (row["case"], row["controller"], row["control.follow_path.gain"]): row["tip_y_mm"] for row in rows
+    }
+    for case in ("scenario", "own"):
+        assert ends[case, "open-loop", 0.0] == ends[case, "open-loop", 2.0]
+        assert ends[case, PARTS["controller"], 0.0] != ends[case, PARTS["controller"], 2.0]
+    report = command(lab, "report", "study")
+    assert report.returncode == 0, report.stderr
+
+
+def test_a_study_is_not_resumed_with_an_edited_module(lab, tmp_path):
+    for file in lab.glob("*.*"):
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    short = STUDY.replace("[0.0, 2.0]", "[0.0]")
+    (tmp_path / "own.toml").write_text(short, encoding="utf-8")
+    assert command(tmp_path, "study", "own.toml", "--out", "study").returncode == 0
+    assert command(tmp_path, "study", "own.toml", "--out", "study", "--resume").returncode == 0
+    with (tmp_path / "camera.py").open("a", encoding="utf-8") as file:
+        file.write("# edited\n")
+    refused = command(tmp_path, "study", "own.toml", "--out", "study", "--resume")
+    assert refused.returncode == 2
+    assert "\nflexneedle: study: cannot resume: own.camera:Camera is " in refused.stderr
