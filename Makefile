@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow bench robustness validation accuracy controllers studies tracker steering tuning lint clean
+.PHONY: help setup demo test slow bench robustness validation accuracy controllers studies tracker steering worlds tuning lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -69,6 +69,10 @@ tracker: setup  ## the simulated tracker beside the paper's tables, its estimato
 
 steering: setup  ## steering plans on 100 random worlds, replayed on the exact plant
 	$(BIN)/python studies/steering.py
+
+worlds: setup  ## 200 random worlds in three cases with four controllers, and the report (DIR=runs/worlds; hours)
+	$(BIN)/flexneedle study worlds --resume --out $(or $(DIR),runs/worlds)
+	$(BIN)/flexneedle report $(or $(DIR),runs/worlds)
 
 tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedle/run/tuning (long)
 	for method in adaptive-mpc ce-mpc bevel-only resolved-rate broyden-mpc; do \

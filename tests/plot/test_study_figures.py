@@ -88,6 +88,19 @@ def difference_panels(number, rows=12):
     ]  # fmt: skip
 
 
+def share_panels(number, controllers=7, count=150):
+    return [
+        plots.SharePanel(
+            ("perfect", "real", "structure")[k], f"{count} worlds",
+            [
+                plots.ShareRow(NAMES[j], plots.look(j), lognormal(0.05 * (j + 1), count, j), count + j)
+                for j in range(controllers)
+            ],
+        )
+        for k in range(number)
+    ]  # fmt: skip
+
+
 def far_apart():
     """Differences of hundredths and of millimetres."""
     ends = (
@@ -125,6 +138,8 @@ FIGURES = {
     ),
     "energy, one": lambda: plots.energy_figure(energy_panels(1)),
     "energy, all": lambda: plots.energy_figure(energy_panels(7)),
+    "shares, one": lambda: plots.share_figure(share_panels(1)),
+    "shares, three": lambda: plots.share_figure(share_panels(3)),
     "differences, one": lambda: plots.difference_figure(difference_panels(1), "more error (mm)"),
     "differences, far apart": lambda: plots.difference_figure([far_apart()], "more error (mm)"),
     "differences, all": lambda: plots.difference_figure(difference_panels(7, 5), "more error (mm)"),
@@ -293,6 +308,22 @@ def test_a_level_without_a_finished_insertion_leaves_a_gap():
     ax = plots.sweep_figure([empty], "G (mm)", PLACES, LEVELS).axes[0]
     assert np.isnan(lines(ax, "median")[0].get_ydata()[4])
     assert {"not finished:", "40"} <= set(texts(ax.figure))
+
+
+def test_a_share_is_that_of_the_insertions_that_end_nearer():
+    """Steps at the errors; short of 100 % by what did not finish."""
+    row = plots.ShareRow("a", plots.look(0), np.array([0.4, 0.1, 0.2]), 4)
+    (ax,) = plots.share_figure([plots.SharePanel("real", "4 worlds", [row])]).axes
+    (line,) = lines(ax, "a")
+    assert_allclose(line.get_xdata()[:3], [0.1, 0.2, 0.4])
+    assert_allclose(line.get_ydata(), [25.0, 50.0, 75.0, 75.0])
+    assert line.get_drawstyle() == "steps-post"
+
+
+def test_where_nothing_finished_the_share_is_zero():
+    row = plots.ShareRow("a", plots.look(0), np.empty(0), 4)
+    (ax,) = plots.share_figure([plots.SharePanel("real", "4 worlds", [row])]).axes
+    assert lines(ax, "a")[0].get_ydata().tolist() == [0.0]
 
 
 def test_differences_that_hold_zero_are_hollow():

@@ -27,7 +27,11 @@ __all__ = [
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what `plan` and `insert` have in common."""
     parser.add_argument(
-        "scenario", metavar="SCENARIO", nargs="?", default="phantom", help="preset name or path (phantom)"
+        "scenario",
+        metavar="SCENARIO",
+        nargs="?",
+        default="phantom",
+        help="preset name, world:NUMBER or path (phantom)",
     )
     parser.add_argument(
         "--target",

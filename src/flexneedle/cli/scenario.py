@@ -19,12 +19,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     actions.add_parser("list", help="list the presets").set_defaults(handler=_list)
 
     show = actions.add_parser("show", help="print a scenario with all its defaults, as TOML")
-    show.add_argument("scenario", metavar="SCENARIO", help="preset name or path")
+    show.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path")
     _add_controller(show)
     show.set_defaults(handler=_show)
 
     check = actions.add_parser("check", help="check a scenario: one line for each problem, exit status 2")
-    check.add_argument("scenario", metavar="SCENARIO", help="path or preset name")
+    check.add_argument("scenario", metavar="SCENARIO", help="path, preset name or world:NUMBER")
     _add_controller(check)
     check.set_defaults(handler=_check)
 

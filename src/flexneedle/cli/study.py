@@ -29,6 +29,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser("study", help="carry out many insertions and keep them in tables")
     parser.add_argument("study", metavar="STUDY", help="name of a shipped study, or path of a TOML file")
     parser.add_argument(
+        "--worlds",
+        nargs=2,
+        type=int,
+        metavar=("FROM", "COUNT"),
+        help="first number and count of worlds, for a study of worlds (as in its file)",
+    )
+    parser.add_argument(
         "--workers", type=_workers, metavar="N", help="processes on this machine (one a usable core)"
     )
     parser.add_argument("--scheduler", metavar="ADDRESS", help="run on the Dask cluster of this scheduler")
@@ -63,7 +70,7 @@ def _study(args: argparse.Namespace) -> int:
         raise InputError("--workers is for this machine: leave it out with --scheduler")
     if args.scheduler is not None:
         check_address(args.scheduler)
-    study = load_study(args.study)
+    study = load_study(args.study, None if args.worlds is None else tuple(args.worlds))
     folder = args.out or free_folder(study)
     compile_first()
     begun = time.monotonic()
@@ -91,6 +98,7 @@ def _study(args: argparse.Namespace) -> int:
 def _command(args: argparse.Namespace, folder: Path, *more: str) -> str:
     """The command line, as it can be given again."""
     words = ["flexneedle", "study", args.study]
+    words += ["--worlds", *map(str, args.worlds)] if args.worlds is not None else []
     words += ["--workers", str(args.workers)] if args.workers is not None else []
     words += ["--scheduler", args.scheduler] if args.scheduler is not None else []
     return shlex.join([*words, "--out", str(folder), *more])

@@ -1,7 +1,6 @@
 """Scenario files: presets, reading, writing. Files of environments, too."""
 
 import tomllib
-from importlib.resources import files
 from os import fspath
 from pathlib import Path
 from typing import IO
@@ -13,27 +12,21 @@ from flexneedle.errors import ScenarioError
 
 from .environment import Environment, environment_data, environment_names
 from .model import Scenario
+from .preset import preset_names, preset_values
 from .problems import describe, printable
+from .worlds import NAME, named_world
 
-__all__ = ["dump_scenario", "load_environment", "load_scenario", "preset_names"]
+__all__ = ["dump_scenario", "load_environment", "load_scenario"]
 
-_PRESETS = files(__package__) / "presets"
-_SUFFIX = ".toml"
 # A scenario has a few kB; the bound keeps an endless file such as /dev/zero from filling the memory.
 _LARGEST_FILE = 1_000_000
 
 
-def preset_names() -> list[str]:
-    """Return the names of the scenarios that come with the package."""
-    return sorted(
-        entry.name.removesuffix(_SUFFIX) for entry in _PRESETS.iterdir() if entry.name.endswith(_SUFFIX)
-    )
-
-
 def load_scenario(source: str | Path | Scenario) -> Scenario:
-    """Return the scenario of a preset name or of a TOML file; a scenario is returned as it is.
+    """Return the scenario of a preset's name, of a world's (`world:100012`) or of a TOML file.
 
-    A text that is the name of a preset means the preset, also where a file has that name.
+    A scenario is returned as it is. A text that is the name of a preset means the preset, also where a file has that
+    name, and one that begins with `world:` a world.
     Raises ScenarioError with one line for each problem: file, key, value, rule.
     """
     if isinstance(source, Scenario):
@@ -41,9 +34,10 @@ def load_scenario(source: str | Path | Scenario) -> Scenario:
     if not isinstance(source, str | Path):
         raise ScenarioError(f"a scenario is a preset name, a path or a Scenario, not {type(source).__name__}")
     if isinstance(source, str) and source in preset_names():
-        data = (_PRESETS / (source + _SUFFIX)).read_bytes()
-    else:
-        data = _read(source, "a scenario file", f"preset (presets: {', '.join(preset_names())})")
+        return Scenario.from_values(preset_values(source), source)
+    if isinstance(source, str) and source.startswith(NAME):
+        return named_world(source)
+    data = _read(source, "a scenario file", f"preset (presets: {', '.join(preset_names())})")
     label = printable(fspath(source))
     return Scenario.from_values(_parse(data, label), label)
 

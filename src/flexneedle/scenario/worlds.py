@@ -13,29 +13,112 @@
 | stroke, needle length | 5 to 20 mm more than the target takes; 10 to 40 mm of needle left before the base stops |
 
 Everything else is as in the preset `phantom`. Numbers 0 to 999 are for choosing settings, 100,000 and up for reports.
+A world has three cases, which differ in `[phantom]` alone: `perfect` has no mismatch, `real` the preset's, `structure`
+(with a guide only) one kind of structural mismatch more, `structural` below.
 """
 
+import re
 from typing import Any
 
 import numpy as np
 
-from .files import load_scenario
+from flexneedle.errors import ScenarioError
+
 from .model import Scenario
 from .needle import GAUGES
+from .preset import preset_values
+from .problems import printable
 
-__all__ = ["TRAINING", "world"]
+__all__ = [
+    *("CASES", "LARGEST_WORLD", "NAME", "REAL", "STRUCTURE", "TRAINING"),
+    *("named_world", "structural", "world", "world_name"),
+]
 
 TRAINING = 1000
 """Worlds with a number below this are for choosing settings; no report may use them."""
+LARGEST_WORLD = 10**9
+PERFECT, REAL, STRUCTURE = "perfect", "real", "structure"
+CASES = (PERFECT, REAL, STRUCTURE)
+NAME = "world:"
+"""How the name of a world's scenario begins; then its number and, unless it is `real`, a colon and the case."""
 
 _STREAM = 0x776F726C64  # keeps worlds apart from what else is seeded by a small number
+_STRUCTURE_STREAM = _STREAM + 1
 _STEEL_GAUGES = tuple(list(GAUGES)[1:9])  # 18G to 25G
 _THINNEST_LAYER_MM = 4.0
 _BEYOND_TARGET_MM = 5.0
+_NAMED = re.compile(rf"{NAME}([0-9]{{1,18}})(?::([a-z]+))?")
+_NO_MISMATCH: dict[str, Any] = {
+    "phantom.shear_modulus_factor": [1.0, 1.0],
+    "phantom.bevel_factor": [1.0, 1.0],
+    **{
+        f"phantom.{key}": 0.0
+        for key in (
+            *("shear_modulus_variation", "layer_shift_sd_mm", "start_offset_sd_mm", "start_angle_sd_mrad"),
+            *("start_axial_sd_mm", "youngs_modulus_variation", "initial_bend_mm", "run_out_mm"),
+            *("guide_clearance_mm", "friction_mn_per_mm", "motor_resolution_mm", "delay_periods"),
+            *("missing_fraction", "tracker_bias_mm"),
+        )
+    },
+}
 
 
-def world(number: int) -> Scenario:
-    """Return the scenario of a world. Raises ValueError for a negative number."""
+def world(number: int, case: str = REAL) -> Scenario:
+    """Return the scenario of a world in one of the `CASES`.
+
+    Raises ScenarioError for a number that is none of a world's, an unknown case, and `structure` without a guide.
+    """
+    if not 0 <= number <= LARGEST_WORLD:
+        raise ScenarioError(f"world = {number}: must be a whole number from 0 to {LARGEST_WORLD}")
+    scenario = _real(number)
+    if case == REAL:
+        return scenario
+    if case == PERFECT:
+        return scenario.with_values(_NO_MISMATCH)
+    if case != STRUCTURE:
+        raise ScenarioError(f"world_case = {case!r}: must be one of {', '.join(CASES)}")
+    if not scenario.setup.has_guide:
+        raise ScenarioError(f"world {number} has no guide: its cases are {PERFECT} and {REAL}")
+    return scenario.with_values(structural(number, scenario))
+
+
+def world_name(number: int, case: str = REAL) -> str:
+    """Return the name by which `load_scenario` finds a world, such as `world:100012:structure`."""
+    return f"{NAME}{number}" + ("" if case == REAL else f":{case}")
+
+
+def named_world(name: str) -> Scenario:
+    """Return the world of a name. Raises ScenarioError."""
+    found = _NAMED.fullmatch(name)
+    if found is None:
+        rule = f"must be {NAME}NUMBER or {NAME}NUMBER:CASE, cases: {', '.join(CASES)}"
+        raise ScenarioError(f"{printable(name)}: {rule}")
+    return world(int(found[1]), found[2] or REAL)
+
+
+def structural(number: int, scenario: Scenario) -> dict[str, Any]:
+    """Return the structural mismatch of a world with a guide, by dotted key: one kind, each as likely, uniform.
+
+    α 3 to 20; compression length × 0.7 to 1.5; bevel length × 0.5 to 2; a hidden layer of 1 to 4 mm, three to six
+    times as stiff, anywhere before the target; guide up to 3 mm from its place, at most half of the way to the tip.
+    """
+    rng = np.random.default_rng([_STRUCTURE_STREAM, number])
+    thickness = _rounded(rng.uniform(1.0, 4.0))
+    top = _rounded(rng.uniform(0.0, scenario.target.depth_mm - thickness))
+    factor = _rounded(rng.uniform(3.0, 6.0))
+    room = 0.5 * ((scenario.setup.guide_to_skin_mm or 0.0) - scenario.setup.tip_to_skin_mm)
+    kinds: list[tuple[str, Any]] = [
+        ("alpha", _rounded(rng.uniform(3.0, 20.0))),
+        ("compression_length_factor", _rounded(rng.uniform(0.7, 1.5))),
+        ("bevel_length_factor", _rounded(rng.uniform(0.5, 2.0))),
+        ("hidden_layer", {"top_mm": top, "thickness_mm": thickness, "modulus_factor": factor}),
+        ("guide_shift_mm", _rounded(rng.uniform(-3.0, min(3.0, room)))),
+    ]
+    key, value = kinds[int(rng.integers(len(kinds)))]
+    return {f"phantom.structure.{key}": value}
+
+
+def _real(number: int) -> Scenario:
     rng = np.random.default_rng([_STREAM, number])
     needle = _needle(rng)
     bevel = _rounded(rng.uniform(1.0, 5.0))
@@ -43,7 +126,7 @@ def world(number: int) -> Scenario:
     lateral = _rounded(rng.uniform(-0.11, 0.11) * depth)
     tissue = _tissue(rng, depth)
     setup, length = _setup(rng, depth)
-    base = load_scenario("phantom").values()
+    base = Scenario.from_values(preset_values("phantom")).values()
     layer = base["tissue"][0]
     values: dict[str, Any] = {
         "name": f"World {number}",

@@ -9,8 +9,10 @@ import pyarrow.parquet as pq
 from flexneedle.control.methods import METHODS
 from flexneedle.run.study.grid import load_study
 from flexneedle.run.study.spec import study_names
+from flexneedle.scenario import load_scenario
 
-DOCS = (Path(__file__).parents[3] / "docs" / "studies.md").read_text()
+DOCS_FOLDER = Path(__file__).parents[3] / "docs"
+DOCS = (DOCS_FOLDER / "studies.md").read_text()
 
 
 def test_the_example_is_a_study_of_the_size_that_it_seems(tmp_path):
@@ -19,6 +21,13 @@ def test_the_example_is_a_study_of_the_size_that_it_seems(tmp_path):
     path.write_text(text)
     assert len(load_study(path)) == 2 * 2 * 3 * len(METHODS) * 10
     assert tomllib.loads(text)["name"] == "friction"
+
+
+def test_the_example_of_structural_mismatch_loads():
+    text = re.search(r"```toml\n(.*?)```", (DOCS_FOLDER / "worlds.md").read_text(), re.DOTALL)[1]
+    structure = tomllib.loads(text)["phantom"]["structure"]
+    scenario = load_scenario("phantom").with_values({"phantom.structure": structure})
+    assert scenario.phantom.structure.hidden_layer.top_mm == 12.0
 
 
 def test_every_shipped_study_is_told():
@@ -33,9 +42,10 @@ def test_every_shipped_study_is_told():
             "guide-distance",
             "gauges",
             "tracker",
+            "worlds",
         )
     ]
-    assert len(study_names()) == 8
+    assert len(study_names()) == 9
 
 
 def test_every_column_is_told(quick, uninterrupted):

@@ -190,7 +190,7 @@ def axis(key, values):
         ("[values]\nsetup.stroke_mm = 'a'", 'setup.stroke_mm = "a": must be a number'),
         (axis("setup.stroke_mm", "[100, 140]"), "setup.stroke_mm = 140.0: the base would reach the guide"),
         (axis("plan.sample", "[16]"), "plan.sample = 16: unknown key; did you mean samples?"),
-        (axis("controler", '["ce-mpc"]'), "plan_seed, as an axis also seed"),
+        (axis("controler", '["ce-mpc"]'), "plan_seed, world_case, as an axis also seed, world"),
         (axis("plan.samples", "[]"), "axes[0].values = []: must be a list of at least one value"),
         (axis("plan.samples", "'all'"), 'axes[0].values = "all": must be a list of at least one value'),
         (axis("plan.samples", "[8, 9, 8]"), "axes[0].values = [8, 9, 8]: has 8 twice"),
@@ -253,6 +253,7 @@ def test_the_studies_of_the_package_can_be_carried_out():
         "guide-distance": 7 * 150,
         "gauges": 8 * 150,
         "tracker": 5 * 150,
+        "worlds": 2202,
     }
 
 

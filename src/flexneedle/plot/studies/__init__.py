@@ -1,6 +1,7 @@
 """Figures of studies. They see arrays and names, no tables; `run.report` chooses which a study supports."""
 
 from flexneedle.plot.studies.comparison import DifferencePanel, DifferenceRow, difference_figure
+from flexneedle.plot.studies.cumulative import SharePanel, ShareRow, share_figure
 from flexneedle.plot.studies.distributions import (
     ErrorPanel,
     ErrorRow,
@@ -20,6 +21,8 @@ __all__ = [
     "ErrorPanel",
     "ErrorRow",
     "Look",
+    "SharePanel",
+    "ShareRow",
     "Sweep",
     "TargetPanel",
     "difference_figure",
@@ -27,6 +30,7 @@ __all__ = [
     "error_rows_figure",
     "errors_by_level_figure",
     "look",
+    "share_figure",
     "sweep_figure",
     "targeting_figure",
 ]

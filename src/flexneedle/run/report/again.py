@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Iterable
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from flexneedle.errors import ScenarioError
 from flexneedle.run.parts import is_own
 from flexneedle.run.report.rows import Rows
 from flexneedle.scenario import Scenario, dump_scenario, load_scenario, preset_names
+from flexneedle.scenario.worlds import world_name
 
 __all__ = ["commands", "scenario_of"]
 
@@ -17,13 +19,15 @@ _SECTIONS = frozenset(Scenario.model_fields)
 
 
 def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
-    """Return the command of each listed row, to be given in `folder`; scenarios that are no presets are written there.
+    """Return the command of each listed row, to be given in `folder`.
 
+    Scenarios that are neither presets nor worlds are written there.
     A row whose settings make no scenario of this version has "".
     """
     sources: dict[str, str] = {
         _target_left_out(checked(load_scenario(name))): name for name in preset_names()
     }
+    numbers = count(1)
     found = {}
     for row in dict.fromkeys(listed):
         scenario = scenario_of(rows, row)
@@ -31,8 +35,10 @@ def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
             found[row] = ""
             continue
         key = _target_left_out(scenario)
+        if name := _world_of(rows, row):
+            sources.setdefault(_target_left_out(checked(load_scenario(name))), name)
         if key not in sources:
-            sources[key] = f"scenario-{1 + len(sources) - len(preset_names())}.toml"
+            sources[key] = f"scenario-{next(numbers)}.toml"
             (folder / sources[key]).write_text(dump_scenario(scenario), encoding="utf-8", newline="\n")
         found[row] = _command(rows, row, sources[key])
     return found
@@ -51,6 +57,12 @@ def scenario_of(rows: Rows, row: int) -> Scenario | None:
         return Scenario.from_record({"name": "Scenario of a study", **_nested(settings)})
     except (ScenarioError, TypeError):
         return None
+
+
+def _world_of(rows: Rows, row: int) -> str:
+    """Return the name of a row's world, or ""."""
+    number = rows.value("world", row)
+    return "" if number is None else world_name(int(number), rows.value("world_case", row))
 
 
 def _command(rows: Rows, row: int, source: str) -> str:

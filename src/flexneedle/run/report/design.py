@@ -17,6 +17,7 @@ _GAUGE = "needle.gauge"
 _GUIDE = "setup.guide_to_skin_mm"
 _ENVIRONMENT = "tracker.environment."
 _WHICH = _ENVIRONMENT + "name"
+_WORLD = "world"
 _MOST_LEVELS, _BINS = 20, 10
 _UNITS = {
     "per_mm": "1/mm", "per_m": "1/m", "per_mj": "1/mJ", "mn_per_mm": "mN/mm", "mm_s": "mm/s",
@@ -85,13 +86,14 @@ def design_of(
     varying = [key for key in rows.columns if _is_setting(key) and len(rows.codes(key)[1]) > 1]
     by_case = [key for key in varying if cases.varies and _follows(rows.codes(key)[0], cases.codes)]
     free = [key for key in varying if key not in by_case and not _said_by_name(rows, key, varying)]
+    free = [key for key in free if not _said_by_world(rows, key, cases)]
     axes = [_axis(rows, keys, set(declared)) for keys in _changing_together(rows, free)]
     as_axis = _case_axis(rows, cases, by_case, set(declared))
     return Design(
         _by_name(rows, "controller", "controller", controllers),
         cases if as_axis is None else _single(cases),
         tuple(axes) if as_axis is None else (as_axis, *axes),
-        tuple(_by_name(rows, key, key) for key in ("plant", "tracker", "strategy")),
+        (*(_by_name(rows, key, key) for key in _unsaid(rows, cases)), *_guides(rows)),
     )
 
 
@@ -122,6 +124,30 @@ def _said_by_name(rows: Rows, key: str, varying: Sequence[str]) -> bool:
         and _WHICH in varying
         and _follows(rows.codes(key)[0], rows.codes(_WHICH)[0])
     )
+
+
+def _said_by_world(rows: Rows, key: str, cases: Factor) -> bool:
+    """Whether a setting is no more than what the number of the world, and the case, have said."""
+    worlds = rows.codes(_WORLD)[0]
+    return _follows(rows.codes(key)[0], worlds * len(cases.names) + cases.codes)
+
+
+def _unsaid(rows: Rows, cases: Factor) -> list[str]:
+    """Return plant, tracker and strategy, but for what the case of a world says."""
+    keys = ["plant", "tracker", "strategy"]
+    return [k for k in keys if _guides(rows) == () or not _follows(rows.codes(k)[0], cases.codes)]
+
+
+def _guides(rows: Rows) -> tuple[Factor, ...]:
+    """Return the factor of worlds with a guide and without; none in other studies."""
+    if rows.codes(_WORLD)[1] == [None]:
+        return ()
+    without = np.isnan(rows.number(_GUIDE))
+    codes = without.astype(np.int64)
+    names = ("with a guide", "no guide")
+    used = [names[k] for k in np.unique(codes).tolist()]
+    dense = np.unique(codes, return_inverse=True)[1].astype(np.int64)
+    return (Factor("guide", "guide", tuple(used), np.full(len(used), nan), dense, dense),)
 
 
 def _follows(codes: Codes, leader: Codes) -> bool:

@@ -14,6 +14,7 @@ from flexneedle.run.report.design import Design, Factor
 from flexneedle.run.report.rows import Codes, Flags, Floats, Rows
 from flexneedle.run.report.statistics import Estimate
 from flexneedle.run.report.summary import Difference, depth_levels, finished
+from flexneedle.run.report.worlds import failures, has_worlds
 
 __all__ = ["Drawn", "draw_figures"]
 
@@ -84,7 +85,10 @@ def draw_figures(
 
 
 def _sheets(facts: _Facts, against: Sequence[Difference], cases: Sequence[Difference]) -> Iterator[_Sheet]:
-    if _tips(facts).size and not np.isnan(_tips(facts)).all():
+    if has_worlds(facts.rows):  # a target each: no map of them
+        if facts.known.any():
+            yield _shares(facts)
+    elif _tips(facts).size and not np.isnan(_tips(facts)).all():
         yield _targeting(facts)
     if not facts.known.any():
         return
@@ -102,6 +106,37 @@ def _sheets(facts: _Facts, against: Sequence[Difference], cases: Sequence[Differ
         yield _cases(facts, cases)
     if (facts.known & (facts.rows.number("strain_energy_mj") > 0)).any():
         yield _energy(facts)
+
+
+def _shares(facts: _Facts) -> _Sheet:
+    failed, cases = failures(facts.rows), facts.design.cases
+    panels = []
+    for level, title in enumerate(cases.names[: plots.MOST_PANELS]):
+        case = cases.codes == level
+        rows = [
+            plots.ShareRow(name, facts.looks[k], facts.error[own & facts.known], int((own & counted).sum()))
+            for k, name in facts.controllers
+            for own, counted in ((facts.of(k) & case, facts.done | failed),)
+            if own.any()
+        ]
+        worlds = len(np.unique(facts.rows.number("world")[case]))
+        panels.append(plots.SharePanel(title or "all", f"{worlds} worlds", rows))
+    return _Sheet(
+        "shares",
+        "True error in worlds",
+        "Share of the insertions that end nearer to their target than an error. A line that ends below 100 % is short "
+        "of failures. Errors are on a logarithmic scale.",
+        "Cumulative distributions of the true error, a line for each controller. "
+        + "; ".join(
+            f"{p.title}: "
+            + ", ".join(
+                f"{row.name} median {np.median(row.errors):.3f} mm" for row in p.rows if len(row.errors)
+            )
+            for p in panels
+        )
+        + ".",
+        lambda: plots.share_figure(panels),
+    )
 
 
 def _targeting(facts: _Facts) -> _Sheet:

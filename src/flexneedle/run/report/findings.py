@@ -19,6 +19,7 @@ from flexneedle.run.report.summary import (
     groups_of,
     worst,
 )
+from flexneedle.run.report.worlds import WorldGroup, has_worlds, world_groups
 
 __all__ = ["Findings", "controllers_in_order", "findings_of", "planned_insertions", "title_of"]
 
@@ -27,7 +28,10 @@ _MOST_KINDS = 20  # of endings that are listed
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What a study comes to. planned: insertions that it asks for, None if it does not say."""
+    """What a study comes to. planned: insertions that it asks for, None if it does not say.
+
+    worst: rows with the largest errors, in worlds those of the first controller; worlds: empty in other studies.
+    """
 
     study: StudyRecord
     planned: int | None
@@ -38,6 +42,7 @@ class Findings:
     cases: Sequence[Difference]
     endings: Sequence[Ending]
     worst: Sequence[int]
+    worlds: Sequence[WorldGroup]
 
     @property
     def finished(self) -> int:
@@ -58,13 +63,19 @@ def findings_of(study: StudyRecord) -> Findings:
         differences_by_depth(rows, design) if design.controller.varies else {},
         case_differences(rows, design) if design.cases.varies else [],
         endings(rows)[:_MOST_KINDS],
-        worst(rows),
+        worst(rows, among=design.controller.codes == 0 if has_worlds(rows) else None),
+        world_groups(rows, design),
     )
 
 
 def planned_insertions(about: Mapping[str, Any]) -> int | None:
-    """Return how many insertions a study asks for: repeats × cases × values of each axis; None if it does not say."""
+    """Return how many insertions a study asks for: those that it names, or repeats × cases × values of each axis.
+
+    None if it does not say.
+    """
     wanted = asked(about)
+    if isinstance(named := wanted.get("insertions"), int):
+        return named
     if "repeats" not in wanted or "axes" not in wanted:
         return None
     repeats: int = wanted["repeats"]

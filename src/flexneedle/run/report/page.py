@@ -14,6 +14,7 @@ from flexneedle.run.report.statistics import LEAST_CLUSTERS
 from flexneedle.run.report.summary import HIT_MM, Difference, Group
 from flexneedle.run.report.times import times
 from flexneedle.run.report.wording import insertions, interval, mm, number, signed
+from flexneedle.run.report.worlds import world_table
 
 __all__ = ["page_text"]
 
@@ -28,6 +29,7 @@ def page_text(
     sections = (
         _opening(findings, title),
         _figures(figures),
+        world_table(findings.worlds),
         tables.groups(findings),
         tables.controllers(findings),
         tables.cases(findings),

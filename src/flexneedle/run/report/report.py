@@ -54,6 +54,7 @@ class Report:
                 for depth, differences in found.against_by_depth.items()
             },
             "cases": [asdict(difference) for difference in found.cases],
+            "worlds": [asdict(group) for group in found.worlds],
             "endings": [asdict(ending) for ending in found.endings],
             "worst": [
                 {"index": rows.value("index", row), "true_error_mm": rows.value("true_error_mm", row)}

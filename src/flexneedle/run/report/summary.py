@@ -1,7 +1,7 @@
 """What the rows of a study come to: groups, paired differences, what did not finish, the worst."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from math import isnan, nan
@@ -33,6 +33,8 @@ __all__ = [
     "endings",
     "finished",
     "groups_of",
+    "members_of",
+    "pair_keys",
     "worst",
 ]
 
@@ -103,17 +105,23 @@ def finished(rows: Rows) -> Flags:
 
 def groups_of(rows: Rows, design: Design) -> list[Group]:
     """Return the groups of a design in the order of its factors."""
+    done = finished(rows)
+    factors = {factor.key: factor for factor in design.factors}
+    groups = []
+    for levels, members in members_of(design):
+        at = (factors[key].level(factors[key].names.index(name)) for key, name in levels.items())
+        groups.append(_group(rows, members, done, ", ".join(at), levels))
+    return groups
+
+
+def members_of(design: Design) -> Iterator[tuple[dict[str, str], Codes]]:
+    """Yield the levels of every factor, by its key, and the rows that share them, in the order of the factors."""
     factors = design.factors
     combined = np.stack([factor.codes for factor in factors], axis=1)
     levels, codes = np.unique(combined, axis=0, return_inverse=True)
-    done = finished(rows)
-    groups = []
     for number, chosen in enumerate(levels.tolist()):
-        found = list(zip(factors, chosen, strict=True))
-        name = ", ".join(factor.level(k) for factor, k in found)
-        at = {factor.key: factor.names[k] for factor, k in found}
-        groups.append(_group(rows, np.flatnonzero(codes.ravel() == number), done, name, at))
-    return groups
+        names = {factor.key: factor.names[k] for factor, k in zip(factors, chosen, strict=True)}
+        yield names, np.flatnonzero(codes.ravel() == number)
 
 
 def _group(rows: Rows, members: Codes, done: Flags, name: str, levels: dict[str, str]) -> Group:
@@ -189,7 +197,7 @@ def depth_levels(rows: Rows) -> tuple[Codes, list[str]]:
 
 def _against_first(rows: Rows, design: Design, among: Flags) -> list[Difference]:
     ours, *others = range(len(design.controller.names))
-    keys = _pair_keys(rows, [factor.exact for factor in (design.cases, *design.axes, *design.others)])
+    keys = pair_keys(rows, [factor.exact for factor in (design.cases, *design.axes, *design.others)])
     codes, names = design.controller.codes, design.controller.names
     return [
         _difference(
@@ -202,7 +210,7 @@ def _against_first(rows: Rows, design: Design, among: Flags) -> list[Difference]
 def case_differences(rows: Rows, design: Design) -> list[Difference]:
     """Return each case against the base case, the first, for each controller."""
     factors = (design.controller, *design.axes, *design.others)
-    keys = _pair_keys(rows, [factor.exact for factor in factors])
+    keys = pair_keys(rows, [factor.exact for factor in factors])
     cases, controller = design.cases, design.controller
     return [
         _difference(
@@ -231,11 +239,15 @@ def endings(rows: Rows) -> list[Ending]:
     return sorted(kinds, key=lambda kind: (kind.outcome == DONE, -kind.count))
 
 
-def worst(rows: Rows, number: int = 10) -> list[int]:
-    """Return the rows with the largest true errors, finished or not, the largest first."""
-    error = rows.number("true_error_mm")
-    order = np.argsort(-error, kind="stable")  # NaN last
-    return [int(row) for row in order[:number] if not isnan(error[row])]
+def worst(rows: Rows, number: int = 10, among: Flags | None = None) -> list[int]:
+    """Return the rows with the largest true errors beyond their reach, finished or not, the largest first.
+
+    A reach that is not known is 0; among (n,): which rows may be among them (default: all).
+    """
+    excess = rows.number("true_error_mm") - np.nan_to_num(rows.number("reach_mm"))
+    excess = excess if among is None else np.where(among, excess, nan)
+    order = np.argsort(-excess, kind="stable")  # NaN last
+    return [int(row) for row in order[:number] if not isnan(excess[row])]
 
 
 def _difference(
@@ -260,7 +272,7 @@ def _verdict(difference: Estimate) -> str | None:
     return "worse" if difference.low > 0.0 else "not separable"
 
 
-def _pair_keys(rows: Rows, factors: Sequence[Codes]) -> Codes:
+def pair_keys(rows: Rows, factors: Sequence[Codes]) -> Codes:
     """Return a number (n,) for each row, the same for rows alike in seed, target, repeat and factors."""
     names = ("seed", "plan_seed", "target_depth_mm", "target_lateral_mm", "repeat")
     columns = np.stack([*(rows.codes(name)[0] for name in names), *factors], axis=1)

@@ -175,11 +175,15 @@ def worst(findings: Findings, again: Mapping[int, str]) -> Html | None:
         *("index", *(factor.label for factor in factors), "target (mm)", "seed", "true error (mm)"),
         *("residual (mm)", "planned (mm)", "outcome", words("to run it again")),
     )
+    caption = "Insertions with the largest true errors, finished or not"
+    if findings.worlds:
+        ours = findings.design.controller.names[0]
+        caption = f"Insertions of {ours} with the largest true errors beyond their reach, finished or not"
     return element(
         "section",
         element("h2", "The ten worst" if len(listed) == 10 else "The worst"),
         element(
             "p", "Give the commands in the folder of this page: scenario files that they name lie beside it."
         ),
-        table("Insertions with the largest true errors, finished or not", heads, listed),
+        table(caption, heads, listed),
     )

@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,19 @@ from flexneedle.run.study.spec import (
     ALL,
     LARGEST_SEED,
     SEED,
+    WORLD,
+    WORLD_CASE,
     Axis,
     StudyFile,
     base_of,
     is_seed,
+    of_worlds,
     read_study,
     settings_of,
 )
 from flexneedle.scenario import Scenario
 from flexneedle.scenario.problems import Problem, printable, to_line
+from flexneedle.scenario.worlds import CASES, REAL, STRUCTURE, world
 from flexneedle.trace.plain import plain
 
 __all__ = ["Insertion", "Point", "Study", "load_study"]
@@ -51,17 +56,20 @@ _CHOICES = {
     "plant": tuple(PLANTS),
     "tracker": (SCENARIO_TRACKER,),
     "strategy": STRATEGIES,
+    WORLD_CASE: CASES,
 }
 _OWN = {"controller": controller_of, "plant": plant_of, "tracker": tracker_of}
+_STEERED_BY_GUIDE = ("resolved-rate", "broyden-mpc")
 _MOST_INSERTIONS = 1_000_000
-_BESIDES = f"; besides: {', '.join(_DEFAULTS)}, as an axis also {SEED}"
+_BESIDES = f"; besides: {', '.join(_DEFAULTS)}, {WORLD_CASE}, as an axis also {SEED}, {WORLD}"
 
 
 @dataclass(frozen=True)
 class Point:
     """A point of the grid: everything that its insertions share.
 
-    varied: what the axes chose, but for the target; target_number: place of the target among those of the study.
+    varied: what the axes chose, but for target and world; target_number: place of the target among those of the
+    study, or the number of its world; world: that number, None if the scenario is no world; world_case: which case.
     """
 
     scenario: Scenario
@@ -73,6 +81,8 @@ class Point:
     plan_seed: int
     target_number: int
     varied: Mapping[str, Any]
+    world: int | None = None
+    world_case: str = ""
 
 
 @dataclass(frozen=True)
@@ -111,8 +121,8 @@ class Study:
     def insertion(self, index: int) -> Insertion:
         """Return the insertion of a row.
 
-        Without an axis of seeds, every target and repeat has a phantom of its own, and the same one at every
-        other setting of the study: comparisons are paired.
+        Without an axis of seeds, every target (or world) and repeat has a phantom of its own, and the same one at
+        every other setting of the study: comparisons are paired.
         """
         number, repeat = divmod(index, self.repeats)
         point = self.points[number]
@@ -120,16 +130,17 @@ class Study:
         return Insertion(index, point, repeat, self.seeds[repeat] if self.seeds else own)
 
 
-def load_study(source: str | Path | Study) -> Study:
+def load_study(source: str | Path | Study, worlds: tuple[int, int] | None = None) -> Study:
     """Return the study of a shipped name or a TOML file; a study is returned as it is.
 
+    worlds: first number and count, instead of those of the file's axis of worlds.
     Raises InputError with one line for each problem: file, key, value, rule.
     """
     if isinstance(source, Study):
         return source
     file, home, label = read_study(source)
     try:
-        return _multiplied(file, base_of(file, home))
+        return _multiplied(file if worlds is None else of_worlds(file, *worlds), base_of(file, home))
     except InputError as error:
         raise InputError("\n".join(f"{label}: {line}" for line in str(error).splitlines())) from None
 
@@ -159,6 +170,7 @@ def _multiplied(file: StudyFile, base: Scenario) -> Study:
         "repeats": repeats,
         "first_seed": file.first_seed,
         "seeds": list(seeds),
+        "insertions": len(points) * repeats,
         "own": digests(name for names in given.values() for name in names),
     }
     return Study(plain(definition), points, repeats, file.first_seed, seeds)
@@ -199,17 +211,32 @@ def _points(
 ) -> Iterator[Point]:
     """Yield the points: cases vary slowest, then the axes in their order; later settings go over earlier ones."""
     targets: dict[tuple[float, float], int] = {}
+    worlds = cache(world)  # a point each: every controller has the same ones
     for case, values in itertools.product(cases, itertools.product(*axes.values())):
         chosen = dict(zip(axes, values, strict=True))
         settings = {**fixed, **cases[case], **settings_of(chosen)}
         named = {"case": case, **chosen} if case else chosen
         where = printable(", ".join(f"{key} = {value}" for key, value in named.items()))
         run = {key: settings.pop(key) for key in _DEFAULTS}
-        _check_run(run)
-        scenario = _varied(base, {**left_out, **settings}, own, where)
-        number = targets.setdefault(scenario.target.position, len(targets))
-        varied = {key: value for key, value in chosen.items() if not key.startswith("target")}
-        yield Point(scenario, case, **run, target_number=number, varied=varied)
+        number, world_case = settings.pop(WORLD, None), settings.pop(WORLD_CASE, REAL)
+        _check_run(run | {WORLD_CASE: world_case})
+        if number is not None and _is_skipped(worlds(number), run["controller"], world_case):
+            continue
+        start = base if number is None else worlds(number, world_case)
+        scenario = _varied(start, {**left_out, **settings}, own, where)
+        if number is None:
+            number, of_world = targets.setdefault(scenario.target.position, len(targets)), {}
+        else:
+            of_world = {WORLD: number, WORLD_CASE: world_case}
+        varied = {
+            key: value for key, value in chosen.items() if key != WORLD and not key.startswith("target")
+        }
+        yield Point(scenario, case, **run, target_number=number, varied=varied, **of_world)
+
+
+def _is_skipped(scenario: Scenario, controller: str, world_case: str) -> bool:
+    """Whether a world without a guide has no such case, or the controller nothing to steer with."""
+    return not scenario.setup.has_guide and (world_case == STRUCTURE or controller in _STEERED_BY_GUIDE)
 
 
 def _check_run(run: Mapping[str, Any]) -> None:

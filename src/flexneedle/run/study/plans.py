@@ -12,15 +12,24 @@ from flexneedle.run.study.rows import Planned
 from flexneedle.trace import PlanRecord
 from flexneedle.trace.plain import plan_from_values, to_text
 
-__all__ = ["Plans", "plan_key"]
+__all__ = ["Plans", "plan_key", "truth_key"]
 
-_SECTIONS = ("needle", "setup", "tissue", "contact", "target", "plan")
+_MECHANICS = ("needle", "setup", "tissue", "contact", "target")
 
 
 def plan_key(point: Point) -> str:
     """Return the name of a point's plan: a digest of all that the planner sees."""
+    return _digest(point, ("plan",), point.strategy, point.plan_seed)
+
+
+def truth_key(point: Point) -> str:
+    """Return a digest of all that the reach of a point's phantoms depends on, but for the seed."""
+    return _digest(point, ("plan", "phantom"), point.plant)
+
+
+def _digest(point: Point, sections: tuple[str, ...], *settings: object) -> str:
     values = point.scenario.values()
-    seen = [{name: values[name] for name in _SECTIONS}, point.strategy, point.plan_seed]
+    seen = [{name: values[name] for name in (*_MECHANICS, *sections)}, *settings]
     return hashlib.sha256(json.dumps(seen, sort_keys=True).encode()).hexdigest()[:16]
 
 

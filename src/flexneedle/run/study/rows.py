@@ -15,6 +15,7 @@ from flexneedle.run.folder import versions
 from flexneedle.run.insertion import insert
 from flexneedle.run.kernels import compile_kernels
 from flexneedle.run.planner import plan
+from flexneedle.run.reach import reach
 from flexneedle.run.study.grid import Point
 from flexneedle.trace import Insertion, PlanRecord
 from flexneedle.trace.plain import plain, plan_values
@@ -37,6 +38,7 @@ RESULTS = {
     "planned_periods": int,
     "held_s": float,
     "unconverged_periods": int,
+    "reach_mm": float,
     "outcome": str,
     "reason": str,
 }
@@ -47,12 +49,16 @@ TIMES = {"control_s": float, "plant_s": float, "total_s": float}
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """Insertions of one point: (index, seed) of each. Without a plan, `refusal` says why there is none."""
+    """Insertions of one point: (index, seed) of each. Without a plan, `refusal` says why there is none.
+
+    bounded: whether their reach is wanted; one of all points with the same truth is enough.
+    """
 
     point: Point
     plan: PlanRecord | None
     refusal: str
     insertions: tuple[tuple[int, int], ...]
+    bounded: bool = False
 
 
 @dataclass(frozen=True)
@@ -102,8 +108,16 @@ def _row(job: Job, seed: int) -> dict[str, Any]:
         else:
             results |= _results(insertion)
             times = _times(insertion)
-    values: dict[str, Any] = plain(results | times | {"total_s": time.perf_counter() - begun})
+    times["total_s"] = time.perf_counter() - begun
+    values: dict[str, Any] = plain(results | times | (_reach(job.point, seed) if job.bounded else {}))
     return values
+
+
+def _reach(point: Point, seed: int) -> dict[str, Any]:
+    try:
+        return {"reach_mm": reach(point.scenario, seed, point.plant)}
+    except Exception as error:  # noqa: BLE001  as in an insertion
+        return {"outcome": "error", "reason": f"no reach: {_told(error)}"}
 
 
 def _insertion(job: Job, made: PlanRecord, seed: int) -> Insertion:

@@ -17,7 +17,7 @@ from flexneedle.run.study import pools
 from flexneedle.run.study.folder import PLANS_FOLDER, free_folder, open_folder
 from flexneedle.run.study.grid import Point, Study, load_study
 from flexneedle.run.study.journal import Journal
-from flexneedle.run.study.plans import Plans, plan_key
+from flexneedle.run.study.plans import Plans, plan_key, truth_key
 from flexneedle.run.study.rows import Done, Job, Planned, carry_out, make_plan
 from flexneedle.run.study.tables import write_tables
 
@@ -96,6 +96,7 @@ class _Engine:
         self._study, self._journal, self._on_advance = study, journal, on_advance
         self._versions = versions()
         self._left = _left(study, journal.rows)
+        self._bounding = _bounding(study)
         self._all_plans = len(self._left)
         self._failed = sum(map(_is_failure, journal.rows.values()))
 
@@ -123,7 +124,8 @@ class _Engine:
         made, refusal = self.plans.plan(key), self.plans.refusals.get(key, "")
         for point, insertions in self._left[key]:
             for first in range(0, len(insertions), chunk):
-                job = Job(point, made, refusal, insertions[first : first + chunk])
+                chosen = insertions[first : first + chunk]
+                job = Job(point, made, refusal, chosen, id(point) in self._bounding)
                 calls.submit(carry_out, job, self._keep)
 
     def _keep(self, done: Done) -> None:
@@ -151,6 +153,15 @@ def _left(study: Study, done: Container[int]) -> _Left:
             insertions = tuple((index, study.insertion(index).seed) for index in indices)
             left.setdefault(plan_key(point), []).append((point, insertions))
     return left
+
+
+def _bounding(study: Study) -> set[int]:
+    """Return the points, by id, whose insertions also find the reach: the first with each truth, of those in worlds."""
+    first: dict[str, int] = {}
+    for point in study.points:
+        if point.world is not None:
+            first.setdefault(truth_key(point), id(point))
+    return set(first.values())
 
 
 def _is_failure(row: Mapping[str, Any]) -> bool:

@@ -16,14 +16,16 @@ from flexneedle.scenario.dotted import flatten
 from flexneedle.scenario.fields import Section, Title, count
 from flexneedle.scenario.problems import Problem, describe, printable, refuse
 from flexneedle.scenario.renamed import current_key
+from flexneedle.scenario.worlds import LARGEST_WORLD
 
 __all__ = [
-    *("ALL", "LARGEST_SEED", "NAMED", "SEED", "Axis", "Case", "StudyFile"),
-    *("base_of", "is_seed", "read_study", "settings_of", "study_names"),
+    *("ALL", "LARGEST_SEED", "NAMED", "SEED", "WORLD", "WORLD_CASE", "Axis", "Case", "StudyFile"),
+    *("base_of", "is_seed", "of_worlds", "read_study", "settings_of", "study_names"),
 ]
 
 SEED, ALL = "seed", "all"
-NAMED = ("controller", "plant", "strategy")
+WORLD, WORLD_CASE = "world", "world_case"
+NAMED = ("controller", "plant", "strategy", WORLD_CASE)
 _TARGET = "target"
 _TARGET_KEYS = ("target.depth_mm", "target.lateral_mm")
 _SHIPPED = files("flexneedle.run") / "studies"
@@ -32,6 +34,7 @@ _LARGEST_FILE = 1_000_000
 _MOST_VALUES = 100_000
 LARGEST_SEED = 2**62
 """A first seed and all that follow it fit into the 64 bits of a column."""
+_LARGEST = {SEED: LARGEST_SEED, WORLD: LARGEST_WORLD}
 
 
 def is_seed(value: Any) -> bool:
@@ -49,9 +52,10 @@ class Axis(Section):
     """One `[[axes]]`: a key and the values that it takes, each with each of the other axes'."""
 
     key: Annotated[str, AfterValidator(current_key)]
-    """A key of the scenario, or target, controller, plant, tracker, strategy, plan_seed, seed."""
+    """A key of the scenario, or target, controller, plant, tracker, strategy, plan_seed, seed, world, world_case."""
     values: Any
-    """A list; "all" for every controller, plant or strategy; {from, count} for seeds that follow each other."""
+    """A list; "all" for every controller, plant, strategy or case of a world; {from, count} for seeds or worlds that
+    follow each other."""
 
     @model_validator(mode="after")
     def _check_values(self) -> "Axis":
@@ -101,6 +105,7 @@ class StudyFile(Section):
                 *_case_problems(self),
                 *_key_problems(self),
                 *_seed_problems(self),
+                *_world_problems(self),
             )
         )
         return self
@@ -129,6 +134,18 @@ def read_study(source: str | Path) -> tuple[StudyFile, Path, str]:
 def base_of(file: StudyFile, home: Path) -> Scenario:
     """Return the base scenario of a study whose file lies in the folder `home`. Raises ScenarioError."""
     return load_scenario(file.scenario if file.scenario in preset_names() else home / file.scenario)
+
+
+def of_worlds(file: StudyFile, first: int, count: int) -> StudyFile:
+    """Return the study on other worlds. Raises InputError if it has no axis of worlds, or for numbers of none."""
+    if all(axis.key != WORLD for axis in file.axes):
+        raise InputError("has no axis of worlds")
+    if not (0 <= first <= LARGEST_WORLD and 1 <= count <= _MOST_VALUES):
+        rule = f"must be a first number, 0 to {LARGEST_WORLD}, and a count, 1 to {_MOST_VALUES}"
+        raise InputError(f"worlds = {first}, {count}: {rule}")
+    values = {"from": first, "count": count}
+    axes = (Axis(key=WORLD, values=values) if axis.key == WORLD else axis for axis in file.axes)
+    return file.model_copy(update={"axes": tuple(axes)})
 
 
 def settings_of(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -176,16 +193,16 @@ def _parsed(data: bytes, label: str) -> StudyFile:
 def _value_problems(key: str, values: Any) -> Iterator[Problem]:
     if key in NAMED and values == ALL:
         return
-    if key == SEED and isinstance(values, dict):
-        yield from _range_problems(values)
+    if key in _LARGEST and isinstance(values, dict):
+        yield from _range_problems(values, _LARGEST[key])
     elif not isinstance(values, list) or not values:
         yield Problem("values", values, "must be a list of at least one value")
     elif (twice := _twice(values)) is not None:
         yield Problem("values", values, f"has {twice!r} twice")
     elif key == _TARGET:
         yield from (problem for value in values for problem in _target_problems("values", value))
-    elif key == SEED and not all(map(is_seed, values)):
-        yield Problem("values", values, f"must be whole numbers from 0 to {LARGEST_SEED}")
+    elif key in _LARGEST and not all(is_seed(value) and value <= _LARGEST[key] for value in values):
+        yield Problem("values", values, f"must be whole numbers from 0 to {_LARGEST[key]}")
 
 
 def _twice(values: list[Any]) -> Any:
@@ -202,11 +219,11 @@ def _comparable(value: Any) -> Hashable:
     return (bool, value) if isinstance(value, bool) else value  # True is no 1 here
 
 
-def _range_problems(values: dict[str, Any]) -> Iterator[Problem]:
+def _range_problems(values: dict[str, Any], largest: int) -> Iterator[Problem]:
     fine = set(values) == {"from", "count"} and all(map(is_seed, values.values()))
-    if not fine or not 1 <= values["count"] <= _MOST_VALUES:
+    if not fine or not 1 <= values["count"] <= _MOST_VALUES or values["from"] > largest:
         rule = (
-            f"must be a list, or {{from, count}}: from a whole number, 0 to {LARGEST_SEED}, "
+            f"must be a list, or {{from, count}}: from a whole number, 0 to {largest}, "
             f"count 1 to {_MOST_VALUES}"
         )
         yield Problem("values", values, rule)
@@ -224,6 +241,8 @@ def _settings_problems(values: Mapping[str, Any]) -> Iterator[Problem]:
     if SEED in flat:
         rule = "seeds are set by first_seed and repeats, or by an axis"
         yield Problem(f"values.{SEED}", flat[SEED], rule)
+    if WORLD in flat:
+        yield Problem(f"values.{WORLD}", flat[WORLD], "worlds are set by an axis")
 
 
 def _case_problems(study: StudyFile) -> Iterator[Problem]:
@@ -248,3 +267,13 @@ def _seed_problems(study: StudyFile) -> Iterator[Problem]:
     if any(axis.key == SEED for axis in study.axes):
         for key in sorted({"repeats", "first_seed"} & study.model_fields_set):
             yield Problem(key, getattr(study, key), "leave it out: an axis gives the seeds")
+
+
+def _world_problems(study: StudyFile) -> Iterator[Problem]:
+    """An axis of worlds gives the scenarios; only worlds have cases."""
+    axes = {axis.key for axis in study.axes}
+    if WORLD in axes:
+        for key in sorted({"scenario", "without"} & study.model_fields_set):
+            yield Problem(key, getattr(study, key), "leave it out: an axis gives the worlds")
+    elif WORLD_CASE in axes.union(study.values, *(case.values for case in study.cases)):
+        yield Problem(WORLD_CASE, None, "needs an axis of worlds")

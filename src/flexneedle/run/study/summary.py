@@ -12,9 +12,10 @@ from flexneedle.run.study.grid import Study
 from flexneedle.run.study.tables import RUNS_FILE, TIMING_FILE
 from flexneedle.trace.plain import plain
 
-__all__ = ["summarise"]
+__all__ = ["is_failure", "summarise"]
 
 _ENERGY, _PLANNED_ENERGY = "strain_energy_mj", "planned_strain_energy_mj"
+_WITHIN_REACH_MM = 1.0
 _Row = Mapping[str, Any]
 
 
@@ -22,11 +23,13 @@ def summarise(folder: Path, study: Study) -> dict[str, Any]:
     """Return outcomes, errors (mm), bevel turns, energy (mJ), periods and times (s) of a study's folder, plain.
 
     Statistics are over the insertions that finished and whose value is known, as in the report; unconverged
-    periods are those of all. `first_failure` has outcome and reason of the first that did not finish, or None.
-    Groups are the cases with all that the axes vary, but for targets and seeds; without any of them there is none.
+    periods are those of all; failures are those that did not finish though the target was within 1 mm of the reach
+    (without a known reach, all that did not finish). `first_failure` has outcome and reason of the first that did
+    not finish, or None. Groups are the cases with all that the axes vary, but for targets, worlds and seeds;
+    without any of them there is none.
     """
     wanted = ["index", "outcome", "true_error_mm", "residual_mm", "flips", "planned_flips", _ENERGY]
-    wanted += [_PLANNED_ENERGY, "periods", "planned_periods", "unconverged_periods", "reason"]
+    wanted += [_PLANNED_ENERGY, "periods", "planned_periods", "unconverged_periods", "reach_mm", "reason"]
     rows = pq.read_table(folder / RUNS_FILE, columns=wanted).to_pylist()
     result: dict[str, Any] = plain(
         {
@@ -44,6 +47,12 @@ def summarise(folder: Path, study: Study) -> dict[str, Any]:
         }
     )
     return result
+
+
+def is_failure(row: _Row) -> bool:
+    """Whether an insertion did not finish though its target, as far as is known, was within 1 mm of the reach."""
+    reach = row["reach_mm"]
+    return row["outcome"] != "done" and (reach is None or reach <= _WITHIN_REACH_MM)
 
 
 def _told(row: _Row) -> str:
@@ -70,6 +79,7 @@ def _statistics(members: Sequence[_Row]) -> dict[str, Any]:
     rows = [row for row in members if row["outcome"] == "done"]
     return {
         "insertions": len(members),
+        "failures": sum(map(is_failure, members)),
         "outcomes": dict(Counter(row["outcome"] for row in members).most_common()),
         "true_error_mm": _spread([row["true_error_mm"] for row in rows]),
         "residual_mm": _spread([row["residual_mm"] for row in rows]),

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 from flexneedle.run.folder import versions
 from flexneedle.run.study.files import replace_file
 from flexneedle.run.study.grid import Insertion, Study
-from flexneedle.run.study.plans import Plans, plan_key
+from flexneedle.run.study.plans import Plans, plan_key, truth_key
 from flexneedle.run.study.rows import RESULTS, TIMES
 
 __all__ = ["RUNS_FILE", "TIMING_FILE", "write_tables"]
@@ -28,6 +28,8 @@ _ABOUT = {
     "plan_seed": int,
     "repeat": int,
     "plan": str,
+    "world": int,
+    "world_case": str,
 }
 _TIMING = {"index": int, "plan": str, "plan_s": float, **TIMES}
 
@@ -40,11 +42,23 @@ def write_tables(folder: Path, study: Study, rows: Mapping[int, Mapping[str, Any
     insertions = [study.insertion(index) for index in sorted(rows)]
     keys = {id(point): plan_key(point) for point in study.points}
     of_plan = [keys[id(insertion.point)] for insertion in insertions]
-    results = [rows[insertion.index] for insertion in insertions]
+    results = _with_reach(insertions, [rows[insertion.index] for insertion in insertions])
     _write(folder / RUNS_FILE, _runs(study, insertions, of_plan, results))
     seconds = {key: plans.seconds(key) for key in set(of_plan)}
     timing = [{**row, "plan": key, "plan_s": seconds[key]} for row, key in zip(results, of_plan, strict=True)]
     _write(folder / TIMING_FILE, pa.table(_columns(timing, _TIMING)))
+
+
+def _with_reach(
+    insertions: Sequence[Insertion], results: Sequence[Mapping[str, Any]]
+) -> list[Mapping[str, Any]]:
+    """Return the results with the reach that one of the insertions with the same truth has found."""
+    digests = {id(i.point): "" if i.point.world is None else truth_key(i.point) for i in insertions}
+    keys = [(digests[id(insertion.point)], insertion.seed) for insertion in insertions]
+    known = {
+        key: row["reach_mm"] for key, row in zip(keys, results, strict=True) if row["reach_mm"] is not None
+    }
+    return [{**row, "reach_mm": known.get(key)} for key, row in zip(keys, results, strict=True)]
 
 
 def _runs(
@@ -81,6 +95,8 @@ def _about(insertion: Insertion, key: str) -> dict[str, Any]:
         "plan_seed": point.plan_seed,
         "repeat": insertion.repeat,
         "plan": key,
+        "world": point.world,
+        "world_case": point.world_case,
     }
 
 

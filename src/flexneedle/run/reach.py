@@ -1,0 +1,60 @@
+"""How near to its target an insertion could come, whatever the controller (docs/worlds.md)."""
+
+import math
+
+import numpy as np
+
+from flexneedle.phantom import DEFAULT_PLANT, Phantom, Truth, draw
+from flexneedle.run.planner import plan
+from flexneedle.scenario import Scenario
+
+__all__ = ["reach"]
+
+_SEARCH = {
+    "plan.samples": 160,
+    "plan.iterations": 25,
+    "plan.energy_weight_per_mj": 0.0,
+    "plan.deflection_weight": 0.0,
+    "plan.guide_weight": 0.0,
+    "plan.flip_weight": 0.0,
+}
+"""4000 rollouts, 20 times what the default controller spends on a decision, and the miss alone as their cost."""
+
+
+def reach(scenario: Scenario, seed: int, phantom: str = DEFAULT_PLANT) -> float:
+    """Return the miss (mm) that the needle in the tank cannot avoid, or about, in the insertion of a seed.
+
+    With a guide (or a base that may move): of the best that a search with 4000 rollouts finds on the model with the
+    phantom's true parameters. Without: the distance from the target to the interval between the ends of the plant
+    inserted with its bevel always on one side and on the other; by continuity all between them can be hit. NaN if
+    the plant does not converge.
+    """
+    truth = draw(scenario, np.random.default_rng(np.random.SeedSequence(seed).spawn(4)[0]))
+    base_moves = scenario.plan.base_sigma_mm > 0.0 or scenario.plan.base_turn_sigma > 0.0
+    if scenario.setup.has_guide or base_moves:
+        return plan(truth.scenario.with_values(_SEARCH), threads=1).error_mm
+    depth, lateral = scenario.target.position
+    ends = [straight_end(truth, bevel, phantom, depth) for bevel in (-1, 1)]
+    low, high = sorted(y for _, y in ends)
+    short = max(depth - x for x, _ in ends)
+    return math.hypot(short, max(0.0, low - lateral, lateral - high))
+
+
+def straight_end(truth: Truth, bevel: int, phantom: str, depth: float) -> tuple[float, float]:
+    """Return the tip (x, y) in mm of a plant inserted to a depth, base and bevel as they are, or at full stroke.
+
+    NaN if the plant does not converge.
+    """
+    setup = truth.scenario.setup
+    tank = Phantom(truth, bevel, phantom)
+    before = after = tank.condition()
+    moved = 0.0
+    while after.tip[0] < depth and moved < setup.stroke_mm:
+        step = min(setup.max_advance_mm, setup.stroke_mm - moved)
+        tank.apply((step, 0.0, 0.0, 0.0, -1), step / setup.insertion_speed_mm_s)
+        moved += step
+        before, after = after, tank.condition()
+    if not after.converged:
+        return math.nan, math.nan
+    x = min(depth, float(after.tip[0]))
+    return x, float(np.interp(x, (before.tip[0], after.tip[0]), (before.tip[1], after.tip[1])))

@@ -1,0 +1,168 @@
+"""Worlds: random scenarios by number, their ranges, their cases, their names."""
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from flexneedle import load_scenario
+from flexneedle.errors import ScenarioError
+from flexneedle.scenario.worlds import CASES, LARGEST_WORLD, structural, world, world_name
+
+PRESET = load_scenario("phantom").values()
+NUMBERS = st.integers(0, LARGEST_WORLD)
+DRAWN = ("name", "needle", "setup", "tissue", "target")
+many_worlds = hypothesis_settings(deadline=None, derandomize=True, max_examples=150)
+
+
+def digest(number):
+    values = world(number).values()
+    text = json.dumps({name: values[name] for name in (*DRAWN, "contact")}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [
+        (0, "1ee9b20fd97fb886"),
+        (3, "af92a6c2f66628a8"),
+        (8, "6ab774a2d4cc558a"),
+        (500, "941c08d0e4a42c8e"),
+        (100000, "b210b5013f9003d8"),
+        (100199, "677216abfd6dfce7"),
+    ],
+)
+def test_a_number_gives_the_same_bytes_forever(number, expected):
+    """Figures of worlds are published by number: a change of the distribution needs other numbers."""
+    assert digest(number) == expected
+
+
+@given(number=NUMBERS)
+@many_worlds
+def test_every_world_is_within_its_ranges_and_else_the_preset(number):
+    scenario = world(number)
+    needle, setup, target = scenario.needle, scenario.setup, scenario.target
+    if needle.gauge is None:
+        assert needle.youngs_modulus_gpa == 60.0
+        assert 0.5 <= needle.outer_diameter <= 1.1
+    else:
+        assert needle.youngs_modulus_gpa == 200.0
+        assert 18 <= int(needle.gauge[:2]) <= 25
+    assert 1.0 <= needle.bevel.offset_mm <= 5.0
+    assert 25.0 <= target.depth_mm <= 95.0
+    assert abs(target.lateral_mm) <= 0.11 * target.depth_mm + 1e-3
+    assert 1 <= len(scenario.tissue) <= 4
+    assert all(0.8 <= layer.shear_modulus_kpa <= 12.0 for layer in scenario.tissue)
+    assert all(thickness >= 4.0 - 2e-3 for thickness in np.diff(scenario.layer_tops))
+    assert scenario.layer_tops[-1] <= target.depth_mm + 5.0 + 5e-3
+    assert 5.0 - 1e-3 <= setup.max_depth - target.depth_mm <= 20.0 + 1e-3
+    if setup.guide_to_skin_mm is None:
+        assert 1.0 <= setup.tip_to_skin_mm <= 60.0
+    else:
+        assert 15.0 <= setup.guide_to_skin_mm <= 60.0
+        assert 1.0 <= setup.tip_to_skin_mm <= 0.9 * setup.guide_to_skin_mm + 1e-3
+    values = scenario.values()
+    assert {name: values[name] for name in PRESET if name not in DRAWN} == {
+        name: PRESET[name] for name in PRESET if name not in DRAWN
+    }
+
+
+def test_worlds_are_as_varied_as_they_say():
+    """Shares of a thousand: steel 70 %, stylet in half of it, guide 80 %, layers evenly."""
+    worlds = [world(number) for number in range(1000)]
+    steel = [found.needle for found in worlds if found.needle.gauge is not None]
+    assert len(steel) == pytest.approx(700, abs=45)
+    assert sum(needle.stylet for needle in steel) == pytest.approx(0.5 * len(steel), abs=45)
+    assert sum(found.setup.has_guide for found in worlds) == pytest.approx(800, abs=40)
+    layers = np.bincount([len(found.tissue) for found in worlds], minlength=5)[1:]
+    np.testing.assert_allclose(layers, 250, atol=45)
+    sides = np.sign([found.target.lateral_mm for found in worlds])
+    assert abs(sides.mean()) < 0.1
+
+
+def difference(number, case):
+    """What a case changes in the real world."""
+    real, other = world(number).flat(), world(number, case).flat()
+    return {key: other[key] for key in other if real.get(key) != other[key]}
+
+
+@given(number=NUMBERS)
+@many_worlds
+def test_a_perfect_world_has_no_mismatch_and_the_same_mesh(number):
+    changed = difference(number, "perfect")
+    assert set(changed) == {
+        key
+        for key in world(number).flat()
+        if key.startswith("phantom.")
+        and key not in ("phantom.variation_length_mm", "phantom.tracker_bias_mm")  # 0 in the preset
+        and not key.endswith(("spacing_mm", "element_mm", "step_mm"))
+        and ".structure." not in key
+    }
+    assert all(value in (0.0, [1.0, 1.0]) for value in changed.values())
+
+
+@given(number=NUMBERS)
+@many_worlds
+def test_a_structural_world_has_one_kind_of_mismatch_more(number):
+    scenario = world(number)
+    if not scenario.setup.has_guide:
+        with pytest.raises(ScenarioError, match="has no guide"):
+            world(number, "structure")
+        return
+    found = world(number, "structure").phantom.structure
+    changed = {key.split(".")[2] for key in difference(number, "structure")}
+    assert len(changed) == 1
+    room = 0.5 * (scenario.setup.guide_to_skin_mm - scenario.setup.tip_to_skin_mm)
+    assert 3.0 <= (found.alpha or 3.0) <= 20.0
+    assert 0.7 <= found.compression_length_factor <= 1.5
+    assert 0.5 <= found.bevel_length_factor <= 2.0
+    assert -3.0 <= found.guide_shift_mm <= min(3.0, room) + 1e-3
+    if hidden := found.hidden_layer:
+        assert 1.0 <= hidden.thickness_mm <= 4.0
+        assert 3.0 <= hidden.modulus_factor <= 6.0
+        assert hidden.top_mm + hidden.thickness_mm <= scenario.target.depth_mm + 1e-3
+
+
+def test_each_kind_of_structural_mismatch_is_as_likely():
+    guided = [(number, found) for number in range(1000) if (found := world(number)).setup.has_guide]
+    kinds = [next(iter(structural(number, found))) for number, found in guided]
+    _, count = np.unique(kinds, return_counts=True)
+    np.testing.assert_allclose(count, len(guided) / 5, atol=35)
+
+
+@given(number=NUMBERS, case=st.sampled_from(CASES[:2]))
+@many_worlds
+def test_a_world_is_found_by_its_name(number, case):
+    assert load_scenario(world_name(number, case)) == world(number, case)
+
+
+def test_names_of_worlds_are_short_and_the_real_one_needs_no_case():
+    assert [world_name(100012, case) for case in CASES] == [
+        "world:100012:perfect",
+        "world:100012",
+        "world:100012:structure",
+    ]
+    assert load_scenario("world:100012:real") == world(100012)
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("world:", "world:: must be world:NUMBER or world:NUMBER:CASE, cases: perfect, real, structure"),
+        ("world:-1", "world:-1: must be world:NUMBER"),
+        ("world:1.5", "world:1.5: must be world:NUMBER"),
+        ("world:7:", "world:7:: must be world:NUMBER"),
+        ("world:7\n", "world:7\\n: must be world:NUMBER"),
+        ("world:1000000001", "world = 1000000001: must be a whole number from 0 to 1000000000"),
+        ("world:7:ideal", "world_case = 'ideal': must be one of perfect, real, structure"),
+    ],
+)
+def test_a_name_of_no_world_is_refused_in_one_line(name, told):
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(name)
+    (line,) = caught.value.problems
+    assert line.startswith(told)
