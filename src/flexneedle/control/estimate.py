@@ -68,6 +68,11 @@ class Estimate(Protocol):
         """Tip (x, y) seen at the end of the last move of which there is a reading (mm), None before the first."""
         ...
 
+    @property
+    def tip_sd(self) -> float:
+        """Standard deviation (mm) of the predicted distance of the next reading of the tip."""
+        ...
+
     def tip_at(self, time: float) -> tuple[float, float]:
         """Where the tip was believed to be (mm) at `time`, each move taken as even."""
         ...

@@ -15,7 +15,7 @@ steps ahead of it too. Each period a few of the curves are simulated anew, in tu
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,24 +23,27 @@ from numpy.typing import NDArray
 
 from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.estimate import Floats, Move, along, assigned
+from flexneedle.control.prior import (
+    BASE_TURN,
+    BASE_Y,
+    BEND,
+    BEVEL,
+    CLEARANCE,
+    LEAST_SD,
+    MODULUS,
+    RUN_OUT,
+    Prior,
+    check_cells,
+    unexplained,
+)
 from flexneedle.control.task import Task
-from flexneedle.errors import ScenarioError
 from flexneedle.ports import Command, Sample
 from flexneedle.scenario import Scenario
-from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.simulator import Control, Learnt, Simulator, State
 
 __all__ = ["Identification", "Identified", "Perturbed"]
 
-import os
-BASE_Y, BASE_TURN, BEND, RUN_OUT, BEVEL, CLEARANCE, MODULUS = range(7)
-_STEPS = (0.05, 3e-4, 0.05, 0.05, 0.05, 0.02)  # for differences: mm, rad, mm, mm, 1, mm
-_LOG_STEP = 0.05
-_SHIFT_STEP = 0.2  # mm
 _MOVES_A_STRETCH = 8  # in tissue; one stretch in air
-_WIDEST = 4.0  # standard deviations that a parameter may leave its prior
-_LARGEST_BEVEL = 0.699  # offset, in compression lengths: the law's limit
-_MOST_CELLS = 200
 _RECENT = 12  # moves whose residuals are low-passed
 _SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a Gauss–Newton step: the first that fits no worse
 _REST = np.array([[0.0, 0.0, 0.0, 0.0, -1.0]])
@@ -48,11 +51,6 @@ _ROUND = 8  # periods in which all curves of derivatives are simulated once,
 _LEADING = (BASE_Y, BASE_TURN, BEND, BEVEL, CLEARANCE)  # but these are in
 _LEADING_ROUND = 2  # periods
 _STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
-_CL = float(os.environ.get("CL", "0.05"))
-_CLSD = float(os.environ.get("CLSD", "0.02"))
-_AX = float(os.environ.get("AX", "1.0"))
-_MS = float(os.environ.get("MS", "0.01"))
-_MS0 = float(os.environ.get("MS0", "0.0126"))
 
 
 @dataclass(frozen=True)
@@ -62,13 +60,25 @@ class Identification:
     def begin(self, task: Task) -> "Identified":
         """Start from the scenario's values. Raises ScenarioError for cells so short that a fit would never end."""
         simulator, scenario, settings = task.simulator, task.scenario, task.settings
-        _check_cells(scenario, settings)
-        state, prior = simulator.start(task.plan.bevel), _Prior.of(scenario, settings, task.plan.target[0])
+        check_cells(scenario, settings)
+        state, prior = simulator.start(task.plan.bevel), Prior.of(scenario, settings, task.plan.target[0])
         step = scenario.setup.max_advance_mm
-        grid = np.arange(scenario.setup.start_tip_x - 5 * step, scenario.setup.max_depth + (_ROUND + 6) * step, step)
+        grid = np.arange(
+            scenario.setup.start_tip_x - 5 * step, scenario.setup.max_depth + (_ROUND + 6) * step, step
+        )
         start = Identified(
-            simulator, settings, prior, simulator, prior.mean, state, state.tip[None], ((0, state),), grid,
-            np.zeros((prior.mean.size, grid.size)), prior.precision,
+            simulator,
+            settings,
+            prior,
+            simulator,
+            prior.mean,
+            state,
+            state.tip[None],
+            ((0, state),),
+            grid,
+            np.zeros((prior.mean.size, grid.size)),
+            prior.precision,
+            axial_variance=scenario.control.start_axial_sd_mm**2,
         )
         return start._differentiated(range(prior.mean.size))
 
@@ -93,7 +103,7 @@ class Identified:
 
     nominal: Simulator
     settings: AdaptiveMpc
-    prior: "_Prior"
+    prior: Prior
     simulator: Simulator
     parameters: Floats
     state: State
@@ -103,7 +113,7 @@ class Identified:
     curves: Floats
     precision: Floats
     axial: float = 0.0
-    axial_variance: float = _AX**2
+    axial_variance: float = 0.0
     turn: int = 0
     perturbed: tuple[Perturbed, ...] = ()
     moves: tuple[Move, ...] = ()
@@ -144,7 +154,9 @@ class Identified:
             return replace(self, moves=(*self.moves[:-1], last), perturbed=())
         state = self.simulator.step(self.state, Control.from_row(applied))
         tips = np.concatenate([self.tips, state.tip[None]])
-        return replace(self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)), perturbed=())
+        return replace(
+            self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)), perturbed=()
+        )
 
     def observe(self, samples: Sequence[Sample]) -> "Identified":
         """Fit the parameters to all readings so far, one Gauss–Newton step, and simulate with them to now."""
@@ -154,7 +166,7 @@ class Identified:
         readings = seen._readings
         axial, axial_variance = readings.axial(seen)
         seen = replace(seen, axial=axial, axial_variance=axial_variance)
-        fitted = _improved(seen._differentiated(), readings)
+        fitted = _improved(seen, readings)._differentiated()
         left = readings.left(fitted)
         ahead = readings.x - readings.between(fitted.tips[:, 0])
         newest = int(readings.index[-1]) + 1
@@ -206,7 +218,7 @@ class Identified:
     @cached_property
     def covariance(self) -> Floats:
         """Of the parameters (K, K), as the readings so far leave it."""
-        inverse: Floats = np.linalg.inv(self.precision)
+        inverse: Floats = np.linalg.inv(self.precision).astype(np.float64)
         return inverse
 
     @property
@@ -251,7 +263,7 @@ class Identified:
         scenario = self.nominal.scenario
         step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
         count = max(1.0, step / scenario.tracker.period)
-        return float(scenario.tracker.jitter_per_axis**2 / count + _unexplained(scenario)**2)
+        return float(scenario.tracker.jitter_per_axis**2 / count + unexplained(scenario, self.settings) ** 2)
 
     def _due(self) -> Iterator[int]:
         """The parameters whose curves are to be simulated this period, ."""
@@ -286,91 +298,20 @@ class _Readings:
         left: Floats = self.y - self.between(belief.tips[:, 1]) - belief.run_out * self.sides
         return left
 
-    def variance(self, scenario: Scenario) -> Floats:
+    def variance(self, scenario: Scenario, settings: AdaptiveMpc) -> Floats:
         """Of the lateral readings (r,), mm²: their jitter and what no parameter explains."""
-        variance: Floats = scenario.tracker.jitter_per_axis**2 / self.count + _unexplained(scenario)**2
+        variance: Floats = (
+            scenario.tracker.jitter_per_axis**2 / self.count + unexplained(scenario, settings) ** 2
+        )
         return variance
 
     def axial(self, belief: Identified) -> tuple[float, float]:
         """Start error along the axis (mm) and its variance, maximum a posteriori: all axial readings share it."""
         without = self.between(belief.tips[:, 0]) - belief.axial
-        if _AX == 0.0: return 0.0, 0.0
-        weight = 1.0 / (belief.nominal.scenario.tracker.jitter_per_axis ** 2 / self.count + _MS0**2)
-        variance = 1.0 / (weight.sum() + _AX**-2.0)
+        scenario = belief.nominal.scenario
+        weight = 1.0 / self.variance(scenario, belief.settings)
+        variance = 1.0 / (weight.sum() + max(scenario.control.start_axial_sd_mm, LEAST_SD) ** -2.0)
         return float(variance * (weight @ (self.x - without))), float(variance)
-
-
-@dataclass(frozen=True, eq=False)
-class _Prior:
-    """Normal prior of the parameters: mean (K,), precision (K, K), bounds (2, K); steps for differences (K,); the depth
-    of the tip (mm) from which each matters to it (K,).
-    """
-
-    mean: Floats
-    precision: Floats
-    bounds: Floats
-    steps: Floats
-    begins: Floats
-
-    @staticmethod
-    def of(scenario: Scenario, settings: AdaptiveMpc, depth: float) -> "_Prior":
-        """The scenario's."""
-        control = scenario.control
-        layers, cells = len(scenario.tissue), _cells(depth, settings)
-        single = (
-            [control.start_offset_sd_mm, control.start_angle_sd, settings.bend_sd_mm]
-            + [settings.run_out_sd_mm, settings.bevel_sd, _CLSD if scenario.setup.has_guide else 0.0]
-            + [settings.modulus_log_sd] * layers
-            + [settings.boundary_sd_mm] * (layers - 1)
-        )
-        sd = np.maximum([*single, *[settings.variation_sd] * cells], 1e-6)
-        mean = np.where(np.arange(sd.size) == BEVEL, 1.0, 0.0)
-        mean[CLEARANCE] = _CL if scenario.setup.has_guide else 0.0
-        precision = np.diag(sd**-2.0)
-        precision[-cells:, -cells:] = _uncorrelating(cells, settings.cell_mm / settings.variation_length_mm)
-        precision[-cells:, -cells:] /= sd[-1] ** 2
-        bounds = mean + np.outer((-_WIDEST, _WIDEST), sd)
-        bounds[0, CLEARANCE] = 0.0
-        bounds[:, BEVEL] = 0.0, _largest_bevel(scenario)
-        logs, shifts = [_LOG_STEP] * layers, [_SHIFT_STEP] * (layers - 1)
-        steps = np.array([*_STEPS, *logs, *shifts, *[_LOG_STEP] * cells])
-        tops = np.array(scenario.layer_tops) - _WIDEST * settings.boundary_sd_mm
-        tops[0] = 0.0
-        starts = settings.cell_mm * np.arange(cells)
-        begins = np.concatenate([[-np.inf] * BEVEL, [0.0, -np.inf], tops, tops[1:], starts])
-        return _Prior(mean, precision, bounds, steps, begins)
-
-    def cost(self, parameters: Floats) -> float:
-        """Minus the logarithm of the density, but for a constant."""
-        off = parameters - self.mean
-        return float(0.5 * off @ self.precision @ off)
-
-
-def _unexplained(scenario: Scenario) -> float:
-    return max(_MS0, _MS * scenario.needle.bevel.offset_mm)
-
-
-def _uncorrelating(size: int, distance: float) -> Floats:
-    """Inverse of the correlation exp(−distance |i − j|): that of a Markov chain, so tridiagonal."""
-    share = np.exp(-distance)
-    inner = np.full(size, 1.0 + share**2)
-    inner[[0, -1]] = 1.0
-    beside = np.full(size - 1, -share)
-    inverse: Floats = (np.diag(inner) + np.diag(beside, 1) + np.diag(beside, -1)) / (1.0 - share**2)
-    return inverse
-
-
-def _cells(depth: float, settings: AdaptiveMpc) -> int:
-    """Cells from the skin to the target's depth (mm); the last one goes on."""
-    return max(2, int(np.ceil(depth / settings.cell_mm)))
-
-
-def _check_cells(scenario: Scenario, settings: AdaptiveMpc) -> None:
-    """Raise ScenarioError for cells so short that a fit would never end."""
-    thinnest = scenario.setup.max_depth / _MOST_CELLS
-    if settings.cell_mm < thinnest:
-        rule = f"must be at least {thinnest:g}, the depth of the full stroke / {_MOST_CELLS}"
-        raise ScenarioError(to_line(Problem("control.adaptive_mpc.cell_mm", settings.cell_mm, rule)))
 
 
 def _adapted(nominal: Simulator, settings: AdaptiveMpc, parameters: Floats) -> Simulator:
@@ -391,13 +332,6 @@ def _adapted(nominal: Simulator, settings: AdaptiveMpc, parameters: Floats) -> S
     )
 
 
-def _largest_bevel(scenario: Scenario) -> float:
-    """Largest factor on the bevel offset with which the law stays above its floor stretch."""
-    shortest = min(layer.compression_length_mm for layer in scenario.tissue)
-    offset = scenario.needle.bevel.offset_mm
-    return _LARGEST_BEVEL * shortest / offset if offset > 0.0 else 1.0
-
-
 def _started(estimate: Identified, simulator: Simulator, parameters: Floats) -> State:
     """The state of the start, settled with these parameters."""
     start = estimate.nominal.start(estimate.stops[0][1].bevel)
@@ -412,7 +346,10 @@ def _started(estimate: Identified, simulator: Simulator, parameters: Floats) -> 
 def _improved(belief: Identified, readings: _Readings) -> Identified:
     """One Gauss–Newton step to the maximum a posteriori, as long as it fits no worse, within the bounds."""
     prior = belief.prior
-    jacobian, variance = _jacobian(belief, readings), readings.variance(belief.nominal.scenario)
+    jacobian, variance = (
+        _jacobian(belief, readings),
+        readings.variance(belief.nominal.scenario, belief.settings),
+    )
     weighted = jacobian.T / variance
     gradient = weighted @ readings.left(belief) - prior.precision @ (belief.parameters - prior.mean)
     precision = weighted @ jacobian + prior.precision
@@ -445,9 +382,14 @@ def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) 
 
     What was before the parameter matters is not simulated again.
     """
-    simulator, begins = _adapted(estimate.nominal, estimate.settings, parameters), float(estimate.prior.begins[k])
+    simulator, begins = (
+        _adapted(estimate.nominal, estimate.settings, parameters),
+        float(estimate.prior.begins[k]),
+    )
     reached = int(np.argmax(np.append(estimate.tips[:, 0], np.inf) > begins))  # by the move before this one
-    first, state = max((stop for stop in estimate.stops if stop[0] < max(1, reached)), key=lambda stop: stop[0])
+    first, state = max(
+        (stop for stop in estimate.stops if stop[0] < max(1, reached)), key=lambda stop: stop[0]
+    )
     if first == 0:
         state = _started(estimate, simulator, parameters)
     before = np.concatenate([estimate.tips[:first], state.tip[None]])

@@ -3,6 +3,7 @@
 Readings come late. Each belongs to the move in which it was taken; the belief is corrected there, and the moves
 since are predicted again (a fixed-lag filter).
 
+The start error along the axis is fitted to all readings (a scalar Kalman filter): axial motion is rigid.
 In air the free end is short and stiff, and noise reads as force: there the start offset and angle of the base
 are fitted (recursive least squares with a prior). In tissue the measured tip is an essential condition, and the
 force that it needs, low-passed, stays as a tip load in the prediction.
@@ -17,6 +18,8 @@ from flexneedle.control.estimate import Estimate, Floats, Move, along, assigned,
 from flexneedle.control.task import Task
 from flexneedle.ports import Command, Sample
 from flexneedle.simulator import Control, Simulator, State
+
+_DRIFT = 0.5  # of the path that the bevel bends: how far a model may be off it
 
 __all__ = ["Beliefs", "Corrected", "Estimate"]
 
@@ -36,7 +39,9 @@ class Beliefs:
         simulator, control = task.simulator, task.scenario.control
         prior = np.diag([control.start_offset_sd_mm**2, control.start_angle_sd**2])
         state = simulator.start(task.plan.bevel)
-        return Corrected(simulator, self, state, state, prior, state.tip[None])
+        axial = control.start_axial_sd_mm**2
+        drift = _DRIFT * _bevel_reach(simulator, task.plan.target[0]) / task.plan.target[0] ** 2
+        return Corrected(simulator, self, state, state, prior, axial, state.tip[None], drift)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +49,8 @@ class Corrected:
     """The belief; an `Estimate`. `state` is that of now.
 
     past: the belief before the first of `moves`, those of which readings may still come; tips (k + 1, 3): believed
-    tip pose at their ends, the start first; covariance (2, 2) of base y (mm) and turn (rad), before `moves`.
+    tip pose at their ends, the start first; covariance (2, 2) of base y (mm) and turn (rad), and axial, the variance of
+    the start along the axis (mm²), before `moves`; drift: standard deviation of the path's curvature (1/mm).
     """
 
     simulator: Simulator
@@ -52,7 +58,9 @@ class Corrected:
     state: State
     past: State
     covariance: Floats
+    axial: float
     tips: Floats
+    drift: float
     moves: tuple[Move, ...] = ()
     innovation: tuple[float, float] = (0.0, 0.0)
     measured: tuple[float, float] | None = None
@@ -64,7 +72,10 @@ class Corrected:
 
     @property
     def tip_sd(self) -> float:
-        return 0.0
+        """Standard deviation (mm) of the predicted distance of the next reading of the tip."""
+        arm = np.array([1.0, self.simulator.scenario.needle.length_mm])
+        off_path = self.drift * max(0.0, float(self.state.tip[0])) ** 2
+        return float(np.sqrt(arm @ self.covariance @ arm + self.axial + off_path**2))
 
     def tip_at(self, time: float) -> tuple[float, float]:
         """Where the tip was believed to be (mm) at `time`."""
@@ -95,6 +106,7 @@ class Corrected:
             at,
             past=past.state,
             covariance=past.covariance,
+            axial=past.axial,
             moves=moves[closed:],
             tips=np.array(tips[closed:]),
         )
@@ -107,6 +119,8 @@ def _followed(at: Corrected, done: Move) -> Corrected:
         return replace(at, state=predicted)
     seen = np.mean([_innovation(before, predicted.tip, done, sample) for sample in done.samples], axis=0)
     measured = predicted.tip[:2] + seen
+    noise = float(at.simulator.scenario.tracker.jitter_per_axis / np.sqrt(len(done.samples)))
+    at, predicted = _moved_along(at, predicted, float(seen[0]), noise)
     at = replace(
         at,
         innovation=(float(seen[0]), float(seen[1])),
@@ -116,14 +130,30 @@ def _followed(at: Corrected, done: Move) -> Corrected:
         return replace(at, state=_held(at, predicted))
     if not at.beliefs.fits_start:
         return replace(at, state=at.simulator.assimilate(predicted, measured.tolist()).state)
-    noise = at.simulator.scenario.tracker.jitter_per_axis / np.sqrt(len(done.samples))
-    return _fit_start(at, predicted, float(seen[1]), float(noise))
+    return _fit_start(at, predicted, float(seen[1]), noise)
 
 
 def _innovation(before: Floats, after: Floats, done: Move, sample: Sample) -> Floats:
     """Reading (mm) less prediction at its time, the move taken as even, shape (2,)."""
     expected: Floats = before[:2] + done.part(sample.time) * (after[:2] - before[:2])
     return np.asarray(place(sample)) - expected
+
+
+def _moved_along(at: Corrected, predicted: State, seen: float, noise: float) -> tuple[Corrected, State]:
+    """One step of a Kalman filter on the start along the axis, and the needle so far further."""
+    gain = at.axial / (at.axial + noise**2 + 1e-12)
+    moved = predicted.believing(base_x=float(predicted.base[0]) + gain * seen)
+    return replace(at, axial=(1.0 - gain) * at.axial), at.simulator.step(moved, Control())
+
+
+def _bevel_reach(simulator: Simulator, depth: float) -> float:
+    """Lateral distance (mm) of the tip from the straight at `depth` (mm), with the bevel never rolled."""
+    setup = simulator.scenario.setup
+    travel = min(depth + setup.tip_to_skin_mm, setup.stroke_mm)
+    steps = int(np.ceil(travel / setup.max_advance_mm - 1e-9))
+    controls = np.zeros((1, steps, 5))
+    controls[:, :, 0], controls[:, :, 4] = travel / steps, -1.0
+    return abs(float(simulator.rollout(simulator.start(), controls).tips[0, -1, 1]))
 
 
 def _fit_start(at: Corrected, predicted: State, seen: float, noise: float) -> Corrected:

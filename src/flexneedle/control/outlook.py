@@ -11,12 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.control.identification import RUN_OUT, Identified
+from flexneedle.control.identification import Identified
+from flexneedle.control.prior import RUN_OUT
 
 __all__ = ["Outlook"]
 
 Floats = NDArray[np.float64]
-_ = 0
+import os
+
+_BLIND = float(os.environ.get("BLIND", "4"))
+_FLOOR = float(os.environ.get("FLOOR", "0.02"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,21 +39,26 @@ class Outlook:
         return Outlook(estimate.grid, estimate.curves)
 
     def renewed(self, estimate: Identified, controls: Floats, tips: Floats) -> "Outlook":
-        """With the derivatives of the parameters that the estimate has just perturbed, along controls (m, 5) → tips (m, 3)."""
+        """With the derivatives of the parameters that the estimate has just perturbed, along controls (m, 5).
+
+        tips (m, 3): as these controls lead them, by the tracker.
+        """
         curves = self.curves.copy()
         side = estimate.state.bevel * np.cumprod(-np.sign(controls[:, 4]))
+        lateral = tips[:, 1] - estimate.run_out * side - estimate.residual  # of the needle's axis
         depth = np.maximum.accumulate(tips[:, 0])
         for one in estimate.perturbed:
             moved = one.simulator.rollout(one.state, controls[None], limits=False).tips[0]
-            curves[one.parameter] = np.interp(self.grid, depth, (moved[:, 1] - tips[:, 1]) / one.step)
+            curves[one.parameter] = np.interp(self.grid, depth, (moved[:, 1] - lateral) / one.step)
         curves[RUN_OUT] = np.interp(self.grid, depth, side)
         return replace(self, curves=curves)
 
-    def sd(self, estimate: Identified, target: float, blind: float) -> float:
-        """Standard deviation (mm) of the miss at the depth `target`, readings counting up to `blind` mm before it."""
+    def sd(self, estimate: Identified, target: float) -> float:
+        """Standard deviation (mm) of the miss at the depth `target`."""
+        blind = _BLIND
         begin = float(estimate.state.tip[0])
         to_come = (self.grid > begin) & (self.grid <= target - blind)
         slopes = self.curves[:, to_come]
         precision = estimate.precision + slopes @ slopes.T / estimate.reading_variance
         end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
-        return float(np.sqrt(end @ np.linalg.solve(precision, end)))
+        return float(np.sqrt(end @ np.linalg.solve(precision, end) + _FLOOR**2))

@@ -9,8 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.control.guide import most_guide_step
 from flexneedle.control.interface import Task, travel_left
 from flexneedle.control.mpc import planned_base
+from flexneedle.ports import Command
 from flexneedle.simulator import State
 from flexneedle.trace import PlanRecord
 
@@ -21,7 +23,10 @@ KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
 """Where the guide is corrected, as shares of the way from now to the target."""
 SLOTS = 4
 """Rolls that a path holds at most."""
-_FINE, _COARSE = 2, 2.0  # control steps of the rollout at first, and the length of its later steps in control steps
+_FINE, _COARSE = (
+    2,
+    2.0,
+)  # control steps of the rollout at first, and the length of its later steps in control steps
 _DUE = 0.05  # of a control step: a roll this near is made now
 _STEEPEST = 0.03  # slope of the largest correction of the guide, mm per mm of the way left
 _FURTHEST = 0.3  # largest move of a roll, of the way left
@@ -35,10 +40,6 @@ class Path:
     depth: Floats
     guide: Floats
     rolls: tuple[float, ...]
-
-    def without_rolls_before(self, depth: float) -> "Path":
-        """The path once the tip is at `depth` (mm)."""
-        return replace(self, rolls=tuple(roll for roll in self.rolls if roll > depth))
 
 
 def of_plan(plan: PlanRecord) -> Path:
@@ -74,13 +75,12 @@ class Ahead:
         rest = left - fine
         steps = int(np.ceil(rest / (_COARSE * longest) - 1e-9))
         depth = float(state.tip[0]) + np.append(first, fine + rest * np.arange(1, steps + 1) / max(steps, 1))
-        may_move = setup.has_guide and task.plan.strategy != "steering"
         return Ahead(
             depth,
             planned_base(setup, task.plan, state, depth[1:]),
             state,
             path,
-            setup.max_guide_step_mm if may_move else 0.0,
+            most_guide_step(setup, task.plan.strategy),
             setup.max_guide_travel_mm,
             longest,
         )
@@ -154,9 +154,7 @@ class Ahead:
         guide = np.empty_like(wanted)
         guide[:, 0] = self.state.guide
         for k in range(most.shape[1]):
-            guide[:, k + 1] = np.clip(
-                wanted[:, k + 1], guide[:, k] - most[:, k], guide[:, k] + most[:, k]
-            )
+            guide[:, k + 1] = np.clip(wanted[:, k + 1], guide[:, k] - most[:, k], guide[:, k] + most[:, k])
         return guide
 
     def corrected(self, z: Floats) -> Path:
@@ -165,9 +163,22 @@ class Ahead:
         guide = self.state.guide + np.append(0.0, np.cumsum(controls[0, :, 3]))
         return Path(depth[0], guide, tuple(depth[0, :-1][controls[0, :, 4] > 0.0].tolist()))
 
-    def due(self, roll: float) -> bool:
-        """Whether a roll at this depth is to be made now."""
-        return roll <= self.depth[0] + _DUE * self.advance
+    def first(self, path: Path) -> tuple[Command, Path]:
+        """The command of this period, and what is left of a path after it.
+
+        A roll that is due is made at once; before one that is near the advance ends where it is due.
+        """
+        x = float(self.depth[0])
+        due = x + _DUE * self.advance
+        later = tuple(roll for roll in path.rolls if roll > due)
+        flip = (len(path.rolls) - len(later)) % 2 == 1
+        advance = min(self.advance, self.left, *(roll - x for roll in later[:1]))
+        guide = float(np.interp(x + advance, path.depth, path.guide)) - self.state.guide
+        db_y, db_theta = (
+            (self.base[0] * advance / (self.depth[1] - x)).tolist() if self.left > 0.0 else (0.0, 0.0)
+        )
+        step = max(-self.step, min(self.step, guide))
+        return (advance, db_y, db_theta, step, 1 if flip else -1), replace(path, rolls=later)
 
 
 def proposals(ahead: Ahead, count: int, rng: np.random.Generator) -> Floats:

@@ -9,7 +9,11 @@ from flexneedle.mechanics.ogden import law_scales
 
 Floats = NDArray[np.float64]
 
-CONTACT, ESSENTIAL, GUIDE = 0, 1, 2  # kinds of node: a tissue spring, a prescribed lateral position, that of the guide
+CONTACT, ESSENTIAL, GUIDE = (
+    0,
+    1,
+    2,
+)  # kinds of node: a tissue spring, a prescribed lateral position, that of the guide
 # Edges of the intervals of the contact points just below the skin, in spacings. There the free needle is held by little
 # but its tip: with even intervals and steps a thin one ends up to 0.3 mm off, with these 0.04 mm (decision 0014).
 _SKIN_EDGES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5)
@@ -80,7 +84,10 @@ def contact_nodes(
     Below the skin the intervals are shorter. An interval that a layer's end divides becomes two, so that the stiffness
     per length is exact at any spacing.
     """
-    grid = np.concatenate([_SKIN_EDGES, np.arange(SKIN_ZONE, max(np.ceil(depth / spacing), SKIN_ZONE) + 1.5)]) * spacing
+    grid = (
+        np.concatenate([_SKIN_EDGES, np.arange(SKIN_ZONE, max(np.ceil(depth / spacing), SKIN_ZONE) + 1.5)])
+        * spacing
+    )
     ends = layers.end[layers.end < grid[-1]]
     edges = np.union1d(grid, ends[np.abs(ends[:, None] - grid).min(axis=1, initial=np.inf) > 1e-6 * spacing])
     x, length = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)

@@ -27,7 +27,9 @@ FRONT, REST, SPRING_U, CUT_X, CUT_Y, CUT_TURN, CUT_FRONT, CUT_REST = range(10, 1
 TIP_FORCE, TIP_REACTION, SPRING_ENERGY, BASE_SHEAR, BASE_MOMENT = range(18, 23)
 COUPLING, PATH_Y, ITERATIONS, RESIDUAL, CONVERGED = range(23, 28)
 CLAMP_Y, CLAMP_TURN, CLAMP_X = range(28, 31)  # the part of base y, turn and x that no command moved
-GUIDE_SIDE = 31  # of a guide with clearance: 1 the needle bears on its upper wall, −1 on its lower one, 0 on none
+GUIDE_SIDE = (
+    31  # of a guide with clearance: 1 the needle bears on its upper wall, −1 on its lower one, 0 on none
+)
 STATE_SIZE = 32
 
 # Rows of the work array, one column a node. A1, G1, B11, B12 are those before an essential node, all else after.
@@ -191,9 +193,7 @@ def _tip(model: Model, s: Floats, tip_x: float, held: float, ahead: tuple[float,
 
 
 @inner
-def _sweep_back(
-    model: Model, s: Floats, u: Floats, w: Floats, tip: tuple[float, ...], count: int
-) -> float:
+def _sweep_back(model: Model, s: Floats, u: Floats, w: Floats, tip: tuple[float, ...], count: int) -> float:
     """From the tip to the base: positions, loads and new compressions into `w`, the shortening ½∫y'² (mm) returned."""
     nodes = model.nodes
     flexibility = 1.0 / model.bending_stiffness

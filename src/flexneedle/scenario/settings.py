@@ -99,6 +99,8 @@ class Control(Section):
     innovation_limit_mm: Positive = 2.0
     """A measured tip further than this, and three standard deviations of the prediction, from the predicted one is not
     used."""
+    start_axial_sd_mm: NonNegative = 1.0
+    """What the controller expects of the tip's position along the axis at the start: its standard deviation."""
     miss_limit_mm: Positive = 2.0
     """The needle is held where no path is found that ends within this lateral distance of the target,"""
     miss_confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95

@@ -1,103 +1,121 @@
-"""`adaptive-mpc`: one search to the target, every period, on a model that is fitted to the readings."""
+"""`adaptive-mpc`, the default: one search to the target, every period, on a model that is fitted to the readings.
+
+Start, needle, guide and tissue are identified (`control.identification`). The path in hand, the guide over depth and the
+depths at which the bevel rolls, begins as the plan's (`control.path`). Cross-entropy looks for a better one among its
+corrections, guide and rolls together, each carried out on the fitted model from now to the target. The cost is a
+length: the miss, and what tissue energy, the guide's slope, rolls and the distance from the line to the target are worth
+against it, each relative to a scale of the scenario's own, so that one setting serves every needle.
+
+What is predicted of the end, the miss and its standard deviation, goes with each decision (`control.outlook`).
+"""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.estimate import Estimate, Floats
+from flexneedle.control.forecast import probability_beyond
+from flexneedle.control.guide import guide_may_move
 from flexneedle.control.identification import Identification, Identified
 from flexneedle.control.interface import Decision, Method, Task
-from flexneedle.control.path import Ahead, Path, of_plan, proposals
 from flexneedle.control.outlook import Outlook
-from flexneedle.planning import Settings, cross_entropy
-import os
-P = dict(wE=float(os.environ.get('WE','0.3')), wL=float(os.environ.get('WL','3')), wS=float(os.environ.get('WS','0.5')), wR=float(os.environ.get('WR','0.015')), N=int(os.environ.get('NS','24')), IT=int(os.environ.get('IT','2')), FIRST=int(os.environ.get('FIRST','4')))
+from flexneedle.control.path import Ahead, Path, of_plan, proposals
+from flexneedle.planning import Found, Outcome, Search, Term, Variables, best, terms
+
+_ELITE = 8  # one in so many samples
+_LEAST_ELITE = 3
+_SMOOTHING = 0.3
+_TOLERANCE = 1e-6
+_LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
 @dataclass(frozen=True, eq=False)
 class Memory:
+    """What is carried from period to period: the path in hand, and the derivatives of what is ahead.
+
+    scale: energy (mJ) of the tissue down to the target where it is moved aside by 1 mm.
+    """
+
     path: Path
-    first: bool = True
-    scale: float = 1.0
+    scale: float
     outlook: Outlook | None = None
 
 
 def begin(task: Task) -> Memory:
-    return Memory(of_plan(task.plan), True, moved_energy(task.scenario, task.plan.target[0]))
+    """The plan's path."""
+    return Memory(of_plan(task.plan), task.simulator.energy_scale(task.plan.target[0]))
 
 
-def moved_energy(scenario, depth):
-    tops = [*scenario.layer_tops, np.inf]
-    total = 0.0
-    for k, layer in enumerate(scenario.tissue):
-        length = min(depth, tops[k + 1]) - tops[k]
-        if length <= 0.0:
-            continue
-        lam = 1.0 - 1.0 / layer.compression_length_mm
-        a = layer.alpha
-        w = 2.0 * layer.shear_modulus / a**2 * (2.0 * lam ** (-a / 2) + lam**a - 3.0)
-        total += layer.energy_weight * w * layer.engaged_width_mm * layer.compression_length_mm * length
-    return total
+def decide(
+    task: Task, memory: Memory, estimate: Estimate, rng: np.random.Generator
+) -> tuple[Decision, Memory]:
+    """The first step of the best path found."""
+    fitted = cast(Identified, estimate)  # METHOD below names its observer
+    settings = task.settings
+    ahead = Ahead.of(task, fitted.state, memory.path)
+    found = _search(task, fitted, ahead, memory.scale, 1 if memory.outlook else settings.effort, rng)
+    outlook, miss, sd = _forecast(task, memory, fitted, found)
+    if probability_beyond(task.scenario.control.miss_limit_mm, miss, sd) > _LOST:
+        ahead = Ahead.of(task, fitted.state, ahead.corrected(found.z))
+        found = _search(task, fitted, ahead, memory.scale, settings.effort, rng)
+        outlook, miss, sd = _forecast(task, memory, fitted, found)
+    path = ahead.corrected(found.z)
+    command, left = ahead.first(path)
+    rolls = ", ".join(f"{roll:.1f}" for roll in left.rolls) or "none"
+    why = f"rolls at {rolls} mm; predicted miss {miss:+.3f} ± {sd:.3f} mm"
+    spread = float(np.sqrt(found.belief.covariance[0, 0]))
+    return Decision(command, why, found.cost, spread, miss, sd), Memory(left, memory.scale, outlook)
 
 
-def decide(task: Task, memory: Memory, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, Memory]:
-    belief = cast(Identified, estimate)
-    state, setup = belief.state, task.scenario.setup
-    ahead = Ahead.of(task, state, memory.path)
-    count = P['N'] * (P['FIRST'] if memory.first else 1)
-    lower, upper = ahead.bounds
-    settings = Settings(samples=count, elite=max(3, count // 8), iterations=P['IT'], smoothing=0.3, tolerance=1e-9, lower=lower, upper=upper)
+def _search(
+    task: Task, fitted: Identified, ahead: Ahead, scale: float, effort: int, rng: np.random.Generator
+) -> Found:
+    """The best correction of the path in hand, itself among the samples."""
+    settings = task.settings
+    count = effort * settings.samples
     first = proposals(ahead, count, rng)
-    search = cross_entropy.start(ahead.in_hand, first.std(axis=0) + 1e-9)
-    samples = first
-    for k in range(P['IT']):
-        if k:
-            samples = cross_entropy.ask(search, settings, rng)
-        search = cross_entropy.tell(search, settings, samples, cost(task, belief, ahead, samples, memory.scale)[0])
-    path = ahead.corrected(search.best)
-    _, miss = cost(task, belief, ahead, search.best[None], memory.scale)
-    x = float(state.tip[0])
-    due = [r for r in path.rolls if ahead.due(r)]
-    later = [r for r in path.rolls if not ahead.due(r)]
-    path = Path(path.depth, path.guide, tuple(later))
-    advance = min(setup.max_advance_mm, ahead.left)
-    if later and later[0] < x + advance:
-        advance = later[0] - x
-    guide = float(np.clip(np.interp(x + advance, path.depth, path.guide) - state.guide, -ahead.step, ahead.step))
-    base = ahead.base[0] * min(1.0, advance / max(ahead.depth[1] - x, 1e-9))
-    outlook = memory.outlook or Outlook.of(belief)
-    chosen, _ = ahead.controls(search.best[None])
-    tips = belief.simulator.rollout(state, chosen, limits=False).tips[0]
-    outlook = outlook.renewed(belief, chosen[0], tips)
-    sds = [outlook.sd(belief, task.plan.target[0], b) for b in (0.0, 3.0, 6.0, 12.0)]
-    why = "SD " + " ".join(f"{v:.4f}" for v in (miss[0], *sds)) + f" predicted miss {miss[0]:.3f} mm, rolls at {', '.join(f'{r:.1f}' for r in later) or 'none'}"
-    command = (advance, float(base[0]), float(base[1]), guide, 1 if len(due) % 2 else -1)
-    return Decision(command, why, float(search.best_cost)), Memory(path, False, memory.scale, outlook)
+    lower, upper = ahead.bounds
+    variables = Variables(lower, upper, ahead.in_hand, first.std(axis=0), lambda z: ahead.controls(z)[0])
+    elite = max(_LEAST_ELITE, count // _ELITE)
+    search = Search(count, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
+    return best(
+        variables, partial(_seen, fitted), _terms(task, fitted, ahead, scale), search, rng, first=first
+    )
 
 
-def cost(task, belief, ahead, z, scale):
-    controls, depths = ahead.controls(z)
-    tips, energy, converged = belief.simulator.rollout(belief.state, controls, limits=False)
-    side = belief.state.bevel * np.cumprod(-np.sign(controls[:, :, 4]), axis=1)
-    seen = tips[:, :, 1] + belief.run_out * side + belief.residual
+def _seen(fitted: Identified, controls: Floats) -> Outcome:
+    """Controls (N, m, 5) on the fitted model, with the tips as a tracker without errors would see them."""
+    tips, energy, converged = fitted.simulator.rollout(fitted.state, controls, limits=False)
+    side = fitted.state.bevel * np.cumprod(-np.sign(controls[:, :, 4]), axis=1)
+    tips[:, :, 1] += fitted.run_out * side + fitted.residual
+    return Outcome(controls, tips, energy, converged)
+
+
+def _terms(task: Task, fitted: Identified, ahead: Ahead, scale: float) -> tuple[Term, ...]:
+    settings, target = task.settings, task.plan.target
+    guided = guide_may_move(task.scenario.setup, task.plan.strategy)
+    energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
+    line = settings.line_weight if guided else settings.unguided_line_weight
+    start = float(fitted.tip[0]), float(fitted.tip[1])
+    return (
+        Term("miss", 1.0, partial(terms.miss, target=target)),
+        Term("energy", energy / scale, terms.energy_at_end),
+        Term("line", line, partial(terms.distance_from_line, start=start, target=target)),
+        Term("slope", settings.slope_weight_mm, terms.guide_slope),
+        Term("rolls", settings.roll_weight_mm, terms.rolls),
+    )
+
+
+def _forecast(task: Task, memory: Memory, fitted: Identified, found: Found) -> tuple[Outlook, float, float]:
+    """Derivatives ahead, the miss that is predicted (mm, past the target in +y), and its standard deviation (mm)."""
     depth, lateral = task.plan.target
-    end = tips[:, -1]
-    miss = seen[:, -1] + np.tan(end[:, 2]) * (depth - end[:, 0]) - lateral
-    guided = ahead.step > 0.0
-    we, wl = (P['wE'], P['wL']) if guided else (1.0, 0.0)
-    x, y = belief.tip[:2]
-    share = np.clip((tips[:, :, 0] - x) / max(depth - x, 1e-9), 0.0, 1.0)
-    line = y + share * (lateral - y)
-    weight = controls[:, :, 0] * share
-    off = (np.abs(seen - line) * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12)
-    adv = np.maximum(controls[:, :, 0], 1e-9)
-    slope = (controls[:, :, 3] ** 2 / adv).sum(axis=1) / max(ahead.left, 1e-9)
-    rolls = (controls[:, :, 4] > 0.0).sum(axis=1)
-    costs = np.abs(miss) + we * energy[:, -1] / scale + wl * off + P['wS'] * slope + P['wR'] * rolls
-    return np.where(converged.all(axis=1), costs, np.inf), miss
+    tips = found.outcome.tips[0]
+    x, y, turn = tips[-1].tolist()
+    outlook = (memory.outlook or Outlook.of(fitted)).renewed(fitted, found.outcome.controls[0], tips)
+    return outlook, float(y + np.tan(turn) * (depth - x) - lateral), outlook.sd(fitted, depth)
 
 
 METHOD = Method(
