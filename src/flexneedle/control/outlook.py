@@ -1,9 +1,13 @@
 """What the controller expects of the end: how uncertain the miss is that its model predicts.
 
-The estimate's parameters are normal with the covariance that the readings leave. Readings to come will narrow them, and the
-path will be corrected, until the tip is so near the target that no correction takes effect: the standard deviation of the
-miss is that of the parameters then, through the derivative of the tip's lateral position at the target, and what no
-parameter explains. Readings to come count by their place alone, as in any linear least squares.
+The estimate's parameters are normal, with the covariance P that the readings leave. Readings to come narrow them to P', and
+the path is corrected meanwhile, until the tip is so near the target that a correction takes no effect. With c, the
+derivative of the tip's lateral position at the target, the variance of the miss is
+
+    c P' c + σ² + min(m², c P c)
+
+σ is what no parameter explains. The last term is for a miss m that is predicted although a path without one was searched
+for: where the needle is at the limit of what it can do, what is learned on the way cannot be corrected either.
 """
 
 from dataclasses import dataclass, replace
@@ -17,15 +21,13 @@ from flexneedle.control.prior import RUN_OUT
 __all__ = ["Outlook"]
 
 Floats = NDArray[np.float64]
-import os
-
-_BLIND = float(os.environ.get("BLIND", "4"))
-_FLOOR = float(os.environ.get("FLOOR", "0.02"))
+_BLIND = 5.0  # control steps before the target in which a correction takes no effect
+_UNEXPLAINED = 2.0  # standard deviations of the mean of a control step's readings
 
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """Derivatives curves (K, g) of the tip's lateral position ahead with respect to the parameters, over depth grid (g,).
+    """Derivatives (K, g) of the tip's lateral position ahead with respect to the parameters, over the depth grid (g,).
 
     A few of them are simulated anew each period, along the path in hand (`Identified.perturbed`).
     """
@@ -35,7 +37,7 @@ class Outlook:
 
     @staticmethod
     def of(estimate: Identified) -> "Outlook":
-        """Nothing known of what is ahead."""
+        """Before the first path: as far ahead as the estimate itself needs them."""
         return Outlook(estimate.grid, estimate.curves)
 
     def renewed(self, estimate: Identified, controls: Floats, tips: Floats) -> "Outlook":
@@ -53,12 +55,13 @@ class Outlook:
         curves[RUN_OUT] = np.interp(self.grid, depth, side)
         return replace(self, curves=curves)
 
-    def sd(self, estimate: Identified, target: float) -> float:
-        """Standard deviation (mm) of the miss at the depth `target`."""
-        blind = _BLIND
-        begin = float(estimate.state.tip[0])
-        to_come = (self.grid > begin) & (self.grid <= target - blind)
-        slopes = self.curves[:, to_come]
-        precision = estimate.precision + slopes @ slopes.T / estimate.reading_variance
+    def sd(self, estimate: Identified, target: float, miss: float) -> float:
+        """Standard deviation (mm) of the miss at the depth `target` (mm), where `miss` is predicted (mm)."""
+        step = estimate.nominal.scenario.setup.max_advance_mm
         end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
-        return float(np.sqrt(end @ np.linalg.solve(precision, end) + _FLOOR**2))
+        to_come = (self.grid > estimate.state.tip[0]) & (self.grid <= target - _BLIND * step)
+        slopes = self.curves[:, to_come]
+        then = estimate.precision + slopes @ slopes.T / estimate.reading_variance
+        known = end @ np.linalg.solve(then, end) + _UNEXPLAINED**2 * estimate.reading_variance
+        now = float(end @ np.linalg.solve(estimate.precision, end))
+        return float(np.sqrt(float(known) + min(miss**2, now)))

@@ -1,10 +1,10 @@
 """`adaptive-mpc`, the default: one search to the target, every period, on a model that is fitted to the readings.
 
-Start, needle, guide and tissue are identified (`control.identification`). The path in hand, the guide over depth and the
-depths at which the bevel rolls, begins as the plan's (`control.path`). Cross-entropy looks for a better one among its
-corrections, guide and rolls together, each carried out on the fitted model from now to the target. The cost is a
-length: the miss, and what tissue energy, the guide's slope, rolls and the distance from the line to the target are worth
-against it, each relative to a scale of the scenario's own, so that one setting serves every needle.
+Start, needle, guide and tissue are identified (`control.identification`). The path in hand, the guide over depth and
+the depths at which the bevel rolls, begins as the plan's (`control.path`). Cross-entropy searches for a better one
+among its corrections, guide and rolls together, each carried out on the fitted model from now to the target. The cost
+is a length: the miss, and what tissue energy, the guide's slope, rolls and the distance from the line to the target are
+worth against it, each relative to a scale of the scenario's own, so that one setting serves every needle.
 
 What is predicted of the end, the miss and its standard deviation, goes with each decision (`control.outlook`).
 """
@@ -81,9 +81,7 @@ def _search(
     variables = Variables(lower, upper, ahead.in_hand, first.std(axis=0), lambda z: ahead.controls(z)[0])
     elite = max(_LEAST_ELITE, count // _ELITE)
     search = Search(count, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
-    return best(
-        variables, partial(_seen, fitted), _terms(task, fitted, ahead, scale), search, rng, first=first
-    )
+    return best(variables, partial(_seen, fitted), _terms(task, fitted, scale), search, rng, first=first)
 
 
 def _seen(fitted: Identified, controls: Floats) -> Outcome:
@@ -94,7 +92,7 @@ def _seen(fitted: Identified, controls: Floats) -> Outcome:
     return Outcome(controls, tips, energy, converged)
 
 
-def _terms(task: Task, fitted: Identified, ahead: Ahead, scale: float) -> tuple[Term, ...]:
+def _terms(task: Task, fitted: Identified, scale: float) -> tuple[Term, ...]:
     settings, target = task.settings, task.plan.target
     guided = guide_may_move(task.scenario.setup, task.plan.strategy)
     energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
@@ -114,8 +112,9 @@ def _forecast(task: Task, memory: Memory, fitted: Identified, found: Found) -> t
     depth, lateral = task.plan.target
     tips = found.outcome.tips[0]
     x, y, turn = tips[-1].tolist()
+    miss = float(y + np.tan(turn) * (depth - x) - lateral)
     outlook = (memory.outlook or Outlook.of(fitted)).renewed(fitted, found.outcome.controls[0], tips)
-    return outlook, float(y + np.tan(turn) * (depth - x) - lateral), outlook.sd(fitted, depth)
+    return outlook, miss, outlook.sd(fitted, depth, miss)
 
 
 METHOD = Method(
