@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow bench robustness validation accuracy controllers studies tracker worlds tuning lint clean
+.PHONY: help setup demo test slow bench robustness validation accuracy controllers studies tracker steering worlds tuning lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -66,6 +66,9 @@ tracker: setup  ## the simulated tracker beside the paper's tables, its estimato
 	$(BIN)/flexneedle study tracker --resume --out runs/tracker
 	$(BIN)/flexneedle report runs/tracker
 	$(BIN)/python studies/monitor.py
+
+steering: setup  ## steering plans on 100 random worlds, replayed on the exact plant
+	$(BIN)/python studies/steering.py
 
 worlds: setup  ## 200 random worlds in three cases with four controllers, and the report (DIR=runs/worlds; hours)
 	$(BIN)/flexneedle study worlds --resume --out $(or $(DIR),runs/worlds)

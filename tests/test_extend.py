@@ -97,6 +97,15 @@ def test_a_scenario_with_the_table_is_checked_with_the_controller(lab):
     assert (fine.returncode, fine.stderr) == (0, "")
 
 
+def test_the_table_of_a_controller_that_is_not_used_is_warned_of_once(lab):
+    for argv in (["plan"], ["insert", "--force", "--controller", "open-loop", "--phantom", "model"]):
+        done = command(lab, *argv, "quick.toml", "--out", f"other-{argv[0]}")
+        assert done.returncode in (0, 1)
+        (line,) = [line for line in done.stderr.splitlines() if "follow_path" in line]
+        assert line.startswith("flexneedle: control.follow_path: unknown table; tables: adaptive_mpc, ")
+        assert line.endswith("; it is not used")
+
+
 def test_objects_are_carried_out_as_their_names_are(lab, imported, monkeypatch):
     monkeypatch.chdir(lab)
     scenario = flexneedle.load_scenario("quick.toml")
@@ -128,6 +137,7 @@ def test_a_study_takes_them_by_name_in_its_workers(lab):
         ("own", PARTS["phantom"], PARTS["tracker"]),
     }
     assert {row["outcome"] for row in rows} == {"done"}, [row["reason"] for row in rows]
+    assert "arning" not in done.stderr
     ends = {
         (row["case"], row["controller"], row["control.follow_path.gain"]): row["tip_y_mm"] for row in rows
     }

@@ -14,7 +14,6 @@ from scipy.optimize import lsq_linear
 import flexneedle
 from flexneedle.control.methods import METHODS
 from flexneedle.control.methods import broyden_mpc as bm
-from flexneedle.errors import InputError
 from flexneedle.simulator import Simulator
 from tasks import task_of
 
@@ -240,13 +239,3 @@ def test_memory_is_a_value_that_deciding_leaves_alone(quick_plan, along, believe
         np.testing.assert_array_equal(kept, now)
     assert learnt.history == ()
     assert not np.array_equal(after.jacobian, learnt.jacobian)
-
-
-def test_without_a_guide_it_says_what_it_needs(quick_plan):
-    task = task_of(
-        Simulator(PHANTOM.with_values({"setup.guide_to_skin_mm": None})), quick_plan, "broyden-mpc"
-    )
-    with pytest.raises(
-        InputError, match=r"'broyden-mpc': steers with the guide: give setup\.guide_to_skin_mm"
-    ):
-        BROYDEN.begin(task)

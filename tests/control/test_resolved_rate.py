@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 import flexneedle
 from flexneedle.control.methods import METHODS, resolved_rate
-from flexneedle.errors import InputError
 from flexneedle.simulator import Control, Simulator
 from tasks import task_of
 
@@ -157,13 +156,3 @@ def test_the_last_advance_ends_at_the_target_depth(quick_plan, along, believed):
 def test_a_look_ahead_of_less_than_a_step_is_one_step(quick_plan, along, believed):
     state = believed(along(quick_plan, 30))
     assert decide(quick_plan, state, lookahead_mm=0.01) == decide(quick_plan, state, lookahead_mm=1.0)
-
-
-def test_without_a_guide_it_says_what_it_needs(quick_plan):
-    task = task_of(
-        Simulator(PHANTOM.with_values({"setup.guide_to_skin_mm": None})), quick_plan, "resolved-rate"
-    )
-    with pytest.raises(
-        InputError, match=r"'resolved-rate': steers with the guide: give setup\.guide_to_skin_mm"
-    ):
-        RATE.begin(task)

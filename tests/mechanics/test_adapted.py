@@ -6,7 +6,7 @@ import pytest
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.model import (
     CONTACT,
-    ESSENTIAL,
+    GUIDE,
     Learnt,
     Model,
     adapted,
@@ -153,7 +153,7 @@ def test_the_law_of_a_contact_is_that_of_the_layer_at_its_middle():
 
 
 def test_the_guide_is_no_tissue():
-    guide = NODES.kind == ESSENTIAL
+    guide = NODES.kind == GUIDE
     assert guide.sum() == 1
     changed = adapted(MODEL, learnt(shift=(-7.0, 0.0), stiffness=np.full(3, 9.0))).nodes
     for name in NODES._fields:

@@ -237,6 +237,30 @@ def test_an_iteration_with_fewer_good_samples_than_the_elite_sets_no_scale():
     assert converged == [False, False, False, False, True]
 
 
+def stalling(usual, falls):
+    """Whether each iteration has converged whose best cost falls so much, elites spread by 10, tolerance a tenth."""
+    settings = replace(FREE, samples=4, elite=2, tolerance=0.1, usual=usual)
+    belief, converged, best = ce.start(np.zeros(2), np.ones(2)), [], 0.0
+    for fall in falls:
+        best -= fall
+        belief = ce.tell(
+            belief, settings, np.arange(8.0).reshape(4, 2), best + np.array([0.0, 10.0, 11.0, 12.0])
+        )
+        converged.append(belief.converged)
+    return converged
+
+
+@pytest.mark.parametrize(("usual", "first"), [(3, 11), (15, 15), (None, None)])
+def test_from_the_usual_number_on_ten_iterations_that_hardly_gain_are_enough(usual, first):
+    """Ten falls of 0.0999 are less than a tenth of the spread of 10; eleven iterations are needed to see them."""
+    expected = [first is not None and k + 1 >= first for k in range(20)]
+    assert stalling(usual, [0.0999] * 20) == expected
+
+
+def test_while_the_best_cost_falls_the_search_goes_on():
+    assert not any(stalling(3, [0.1001] * 30))
+
+
 def test_samples_of_the_first_iteration_can_be_given():
     given = np.array([[3.0, 3.0], [1.5, -2.0], [0.0, 1.0]])
     told = []

@@ -15,7 +15,7 @@ from flexneedle.planning.insertion import Problem, optimise, schedule
 from flexneedle.planning.terms import Outcome, charges
 
 PROBLEM = Problem(
-    target=(8.0, 2.0), travel=12.0, primitives=3,
+    target=(8.0, 2.0), travel=12.0, air=4.0, primitives=3,
     step=np.array([1.0, 0.5, 0.005, 0.5]), reach=np.array([20.0, 1.0, np.inf, 2.0]),
     sigma=np.array([0.1, 0.0, 0.0, 0.25, 1.0, 0.3]),
     accuracy_weight=20.0, energy_weight=5.0, deflection_weight=0.002, guide_weight=1.0, flip_weight=0.3,

@@ -348,6 +348,16 @@ def test_no_labels_of_plans_overlap():
     assert overlapping(plan_figure(PHANTOM, [make_plan(), make_plan("steering")])) == []
 
 
+def test_a_long_reason_of_a_miss_stays_within_the_figure():
+    limit = "needle.bevel.offset_mm = 4 (only the bevel steers: -1.80 to 1.80 mm)"
+    missed = replace(make_plan("steering"), target=(40.0, 12.0), limit=limit)
+    figure = plan_figure(PHANTOM, [make_plan(), missed])
+    assert overlapping(figure) == []
+    (title,) = figure.findobj(lambda artist: isinstance(artist, Text) and "MISSES" in artist.get_text())
+    figure.canvas.draw()
+    assert title.get_window_extent().x1 <= figure.bbox.x1
+
+
 def test_without_a_guide_the_base_is_shown(minimal_text, scenario_file, insertion):
     scenario = load_scenario(scenario_file(minimal_text))
     figure = insertion_figure(scenario, insertion)

@@ -140,6 +140,7 @@ COUNTS = {
     "needle.nodes": (2, 10_000),
     "plan.samples": (2, 100_000),
     "plan.iterations": (1, 10_000),
+    "plan.max_iterations": (1, 10_000),
     "plan.primitives": (1, 1_000),
     "control.ce_mpc.samples": (2, 100_000),
     "control.ce_mpc.iterations": (1, 1_000),

@@ -33,8 +33,8 @@ from flexneedle.simulator import Control, Learnt, Simulator, State
 __all__ = ["Identification", "Identified", "Perturbed"]
 
 import os
-BASE_Y, BASE_TURN, BEND, RUN_OUT, BEVEL, MODULUS = range(6)
-_STEPS = (0.05, 3e-4, 0.05, 0.05, 0.05)  # for differences: mm, rad, mm, mm, 1
+BASE_Y, BASE_TURN, BEND, RUN_OUT, BEVEL, CLEARANCE, MODULUS = range(7)
+_STEPS = (0.05, 3e-4, 0.05, 0.05, 0.05, 0.02)  # for differences: mm, rad, mm, mm, 1, mm
 _LOG_STEP = 0.05
 _SHIFT_STEP = 0.2  # mm
 _MOVES_A_STRETCH = 8  # in tissue; one stretch in air
@@ -45,9 +45,11 @@ _RECENT = 12  # moves whose residuals are low-passed
 _SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a Gauss–Newton step: the first that fits no worse
 _REST = np.array([[0.0, 0.0, 0.0, 0.0, -1.0]])
 _ROUND = 8  # periods in which all curves of derivatives are simulated once,
-_LEADING = (BASE_Y, BASE_TURN, BEND, BEVEL)  # but these are in
+_LEADING = (BASE_Y, BASE_TURN, BEND, BEVEL, CLEARANCE)  # but these are in
 _LEADING_ROUND = 2  # periods
 _STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
+_CL = float(os.environ.get("CL", "0.05"))
+_CLSD = float(os.environ.get("CLSD", "0.02"))
 _AX = float(os.environ.get("AX", "1.0"))
 _MS = float(os.environ.get("MS", "0.01"))
 _MS0 = float(os.environ.get("MS0", "0.0126"))
@@ -61,7 +63,7 @@ class Identification:
         """Start from the scenario's values. Raises ScenarioError for cells so short that a fit would never end."""
         simulator, scenario, settings = task.simulator, task.scenario, task.settings
         _check_cells(scenario, settings)
-        state, prior = simulator.start(task.plan.bevel), _Prior.of(scenario, settings)
+        state, prior = simulator.start(task.plan.bevel), _Prior.of(scenario, settings, task.plan.target[0])
         step = scenario.setup.max_advance_mm
         grid = np.arange(scenario.setup.start_tip_x - 5 * step, scenario.setup.max_depth + (_ROUND + 6) * step, step)
         start = Identified(
@@ -229,23 +231,35 @@ class Identified:
         base = np.concatenate([self.tips, self.simulator.replay(self.state, ahead)[1]])
         depth = np.maximum.accumulate(base[:, 0])
         curves, members = self.curves.copy(), []
-        for k in self._due(float(depth[-1])) if which is None else which:
-            if k == RUN_OUT or depth[-1] < self.prior.begins[k]:
+        for k in self._due() if which is None else which:
+            if k == RUN_OUT:
                 continue
             parameters = self.parameters.copy()
             parameters[k] += self.prior.steps[k]
+            if depth[-1] < self.prior.begins[k]:
+                simulator = _adapted(self.nominal, self.settings, parameters)
+                members.append(Perturbed(k, float(self.prior.steps[k]), simulator, self.state))
+                continue
             member, tips = _perturbed(self, parameters, k, ahead)
             members.append(member)
             curves[k] = np.interp(self.grid, depth, (tips[:, 1] - base[:, 1]) / self.prior.steps[k])
         return replace(self, curves=curves, perturbed=tuple(members), turn=self.turn + 1)
 
-    def _due(self, deepest: float) -> Iterator[int]:
-        """The parameters whose curves are to be simulated this period, of those that matter down to `deepest` (mm)."""
+    @property
+    def reading_variance(self) -> float:
+        """Of the mean of the readings of a control step (mm²)."""
+        scenario = self.nominal.scenario
+        step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
+        count = max(1.0, step / scenario.tracker.period)
+        return float(scenario.tracker.jitter_per_axis**2 / count + _unexplained(scenario)**2)
+
+    def _due(self) -> Iterator[int]:
+        """The parameters whose curves are to be simulated this period, ."""
         for place, k in enumerate(_LEADING):
-            if place % _LEADING_ROUND == self.turn % _LEADING_ROUND and deepest >= self.prior.begins[k]:
+            if place % _LEADING_ROUND == self.turn % _LEADING_ROUND:
                 yield k
         for k in range(MODULUS, self.parameters.size):
-            if k % _ROUND == self.turn % _ROUND and deepest >= self.prior.begins[k]:
+            if k % _ROUND == self.turn % _ROUND:
                 yield k
 
 
@@ -274,8 +288,7 @@ class _Readings:
 
     def variance(self, scenario: Scenario) -> Floats:
         """Of the lateral readings (r,), mm²: their jitter and what no parameter explains."""
-        unexplained = max(_MS0, _MS * scenario.needle.bevel.offset_mm)**2
-        variance: Floats = scenario.tracker.jitter_per_axis**2 / self.count + unexplained
+        variance: Floats = scenario.tracker.jitter_per_axis**2 / self.count + _unexplained(scenario)**2
         return variance
 
     def axial(self, belief: Identified) -> tuple[float, float]:
@@ -300,35 +313,41 @@ class _Prior:
     begins: Floats
 
     @staticmethod
-    def of(scenario: Scenario, settings: AdaptiveMpc) -> "_Prior":
+    def of(scenario: Scenario, settings: AdaptiveMpc, depth: float) -> "_Prior":
         """The scenario's."""
         control = scenario.control
-        layers, cells = len(scenario.tissue), _cells(scenario, settings)
+        layers, cells = len(scenario.tissue), _cells(depth, settings)
         single = (
             [control.start_offset_sd_mm, control.start_angle_sd, settings.bend_sd_mm]
-            + [settings.run_out_sd_mm, settings.bevel_sd]
+            + [settings.run_out_sd_mm, settings.bevel_sd, _CLSD if scenario.setup.has_guide else 0.0]
             + [settings.modulus_log_sd] * layers
             + [settings.boundary_sd_mm] * (layers - 1)
         )
         sd = np.maximum([*single, *[settings.variation_sd] * cells], 1e-6)
         mean = np.where(np.arange(sd.size) == BEVEL, 1.0, 0.0)
+        mean[CLEARANCE] = _CL if scenario.setup.has_guide else 0.0
         precision = np.diag(sd**-2.0)
         precision[-cells:, -cells:] = _uncorrelating(cells, settings.cell_mm / settings.variation_length_mm)
         precision[-cells:, -cells:] /= sd[-1] ** 2
         bounds = mean + np.outer((-_WIDEST, _WIDEST), sd)
+        bounds[0, CLEARANCE] = 0.0
         bounds[:, BEVEL] = 0.0, _largest_bevel(scenario)
         logs, shifts = [_LOG_STEP] * layers, [_SHIFT_STEP] * (layers - 1)
         steps = np.array([*_STEPS, *logs, *shifts, *[_LOG_STEP] * cells])
         tops = np.array(scenario.layer_tops) - _WIDEST * settings.boundary_sd_mm
         tops[0] = 0.0
         starts = settings.cell_mm * np.arange(cells)
-        begins = np.concatenate([[-np.inf] * BEVEL, [0.0], tops, tops[1:], starts])
+        begins = np.concatenate([[-np.inf] * BEVEL, [0.0, -np.inf], tops, tops[1:], starts])
         return _Prior(mean, precision, bounds, steps, begins)
 
     def cost(self, parameters: Floats) -> float:
         """Minus the logarithm of the density, but for a constant."""
         off = parameters - self.mean
         return float(0.5 * off @ self.precision @ off)
+
+
+def _unexplained(scenario: Scenario) -> float:
+    return max(_MS0, _MS * scenario.needle.bevel.offset_mm)
 
 
 def _uncorrelating(size: int, distance: float) -> Floats:
@@ -341,9 +360,9 @@ def _uncorrelating(size: int, distance: float) -> Floats:
     return inverse
 
 
-def _cells(scenario: Scenario, settings: AdaptiveMpc) -> int:
-    """Cells from the skin to the end of the stroke."""
-    return max(2, int(np.ceil(scenario.setup.max_depth / settings.cell_mm)))
+def _cells(depth: float, settings: AdaptiveMpc) -> int:
+    """Cells from the skin to the target's depth (mm); the last one goes on."""
+    return max(2, int(np.ceil(depth / settings.cell_mm)))
 
 
 def _check_cells(scenario: Scenario, settings: AdaptiveMpc) -> None:
@@ -367,6 +386,7 @@ def _adapted(nominal: Simulator, settings: AdaptiveMpc, parameters: Floats) -> S
             variation=np.exp(parameters[variation:]),
             bevel=float(parameters[BEVEL]),
             bend=float(parameters[BEND]),
+            clearance=float(parameters[CLEARANCE]),
         )
     )
 

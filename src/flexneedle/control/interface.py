@@ -30,6 +30,8 @@ _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 class Decision:
     """A command, why, its predicted cost, and the standard deviation left in the guide step (mm; NaN: none).
 
+    miss, miss_sd: lateral miss predicted at the target, past it in +y or −y, and its standard deviation once the loop
+    has gone on correcting (mm; NaN: not predicted). The loop warns and holds by them.
     Raises InputError for a command of another length.
     """
 
@@ -37,6 +39,8 @@ class Decision:
     why: str
     cost: float = math.nan
     spread: float = math.nan
+    miss: float = math.nan
+    miss_sd: float = math.nan
 
     def __post_init__(self) -> None:
         if len(self.command) != len(COLUMNS):
@@ -76,7 +80,8 @@ class Method:
     the estimate of the readings (default: the model, corrected by them);
     decide: the next command and the memory after it; begin: memory at the start (default: None); arrived: whether it
     is done (default: at the target depth);
-    settings: class of its settings, a default for each, which the scenario has in the table `control.<table>`.
+    settings: class of its settings, a default for each, which the scenario has in the table `control.<table>`; needs_guide: whether
+    it is refused where the guide may not move.
 
     Raises InputError for a name or settings that cannot be used.
     """
@@ -89,6 +94,7 @@ class Method:
     begin: Callable[[Task], Any] = _nothing
     arrived: Callable[[Task, Any, Estimate], bool] = at_depth
     settings: type[Section] | None = None
+    needs_guide: bool = False
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(str(self.name)):

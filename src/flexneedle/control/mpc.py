@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.control.bang_bang import BevelRule
+from flexneedle.control.guide import most_guide_step
 from flexneedle.control.interface import travel_left
 from flexneedle.planning import Outcome, Search, Term, Variables, best, terms
 from flexneedle.scenario import Scenario, Setup, elite_count
@@ -62,7 +63,8 @@ def choose(
     steps, travel = control.horizon, travel_left(scenario, plan, state)
     reference, nominal = _window(plan, float(state.tip[0]), steps)
     base = planned_base(scenario.setup, plan, state, reference[:, 0])
-    variables = _variables(scenario, state, base, travel, nominal, flip=flip)
+    guide = most_guide_step(scenario.setup, plan.strategy)
+    variables = _variables(scenario, state, base, travel, nominal, guide, flip=flip)
     search = Search(
         samples=control.samples,
         elite=max(2, elite_count(control.samples, scenario.plan.elite_fraction)),
@@ -108,11 +110,17 @@ def planned_base(setup: Setup, plan: PlanRecord, state: State, depth: Floats) ->
 
 
 def _variables(
-    scenario: Scenario, state: State, base: Floats, travel: float, nominal: Floats, *, flip: bool
+    scenario: Scenario,
+    state: State,
+    base: Floats,
+    travel: float,
+    nominal: Floats,
+    guide: float,
+    *,
+    flip: bool,
 ) -> Variables:
-    """z = (advances, guide steps), each (2 steps,), about those of the plan (steps, 5)."""
-    setup, control, steps = scenario.setup, scenario.control, len(nominal)
-    advance, guide = setup.max_advance_mm, setup.max_guide_step_mm if setup.has_guide else 0.0
+    """z = (advances, guide steps), each (steps,), about those of the plan (steps, 5); guide: the longest step (mm)."""
+    control, steps, advance = scenario.control, len(nominal), scenario.setup.max_advance_mm
     # A guide step must undo the start error within half the horizon; jitter asks for a little more.
     sigma = min(guide, 2.0 * (control.start_offset_sd_mm + scenario.tracker.jitter_per_axis) / steps)
     lower = np.repeat([_LEAST_ADVANCE * advance, -guide], steps)

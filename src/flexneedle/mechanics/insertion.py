@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.compile import inner, kernel
-from flexneedle.mechanics.model import ESSENTIAL, Floats, Model
+from flexneedle.mechanics.model import CONTACT, GUIDE, Floats, Model
 
 Bools = NDArray[np.bool_]
 _SAME_PLACE = 1e-3  # of a part: a tip this near the end of a part is there
@@ -24,7 +24,7 @@ def _move(model: Model, s: Floats, rest: Floats, command: Floats) -> None:
     s[nd.GUIDE_Y] += command[3]
     if command[4] > 0.0:
         s[nd.BEVEL] = -s[nd.BEVEL]
-    if rest.size > 0 and model.nodes.kind[0] == ESSENTIAL:
+    if rest.size > 0 and model.nodes.kind[0] == GUIDE:
         rest[0] = s[nd.GUIDE_Y]
 
 
@@ -32,7 +32,7 @@ def _move(model: Model, s: Floats, rest: Floats, command: Floats) -> None:
 def _end_cut(model: Model, s: Floats, rest: Floats, w: Floats, count: int, fresh: int) -> None:
     """Leave the channel and the tip spring as the step cut them; out of the skin the channel is closed."""
     for i in range(fresh, count):
-        if model.nodes.kind[i] != ESSENTIAL:
+        if model.nodes.kind[i] == CONTACT:
             rest[i] = w[nd.FIXED, i] + w[nd.SHARE, i] * s[nd.TIP_Y]
     fixed, slope = nd.spring_rest(model, s, s[nd.TIP_X])
     s[nd.REST] = fixed + (1.0 - slope) * s[nd.TIP_Y]
@@ -106,7 +106,7 @@ def _strain_energy(model: Model, w: Floats, count: int) -> float:
     """Tissue strain energy Σ w_c W (mJ) of the contacts after a solve (paper eq. 12)."""
     total = 0.0
     for i in range(count):
-        if model.nodes.kind[i] != ESSENTIAL:
+        if model.nodes.kind[i] == CONTACT:
             total += model.nodes.weight[i] * w[nd.ENERGY, i]
     return total
 

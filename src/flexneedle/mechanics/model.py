@@ -9,7 +9,7 @@ from flexneedle.mechanics.ogden import law_scales
 
 Floats = NDArray[np.float64]
 
-CONTACT, ESSENTIAL = 0, 1  # kinds of node: a tissue spring, a prescribed lateral position
+CONTACT, ESSENTIAL, GUIDE = 0, 1, 2  # kinds of node: a tissue spring, a prescribed lateral position, that of the guide
 # Edges of the intervals of the contact points just below the skin, in spacings. There the free needle is held by little
 # but its tip: with even intervals and steps a thin one ends up to 0.3 mm off, with these 0.04 mm (decision 0014).
 _SKIN_EDGES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5)
@@ -20,7 +20,7 @@ SKIN_PART = 0.25  # of this length, in spacings
 class Nodes(NamedTuple):
     """What can load the needle, by increasing x: the guide, then the contact points (each array (n,)).
 
-    x: position (mm); kind: CONTACT or ESSENTIAL; reach: length over which a contact grows in behind
+    x: position (mm); kind: CONTACT, ESSENTIAL or GUIDE; reach: length over which a contact grows in behind
     the tip (mm); alpha, height, force, energy: its law (`ogden`); weight: layer weight w_c.
     """
 
@@ -48,7 +48,7 @@ class Model(NamedTuple):
     """A needle in layered tissue: bending stiffness (N·mm²), length (mm), bevel offset and length (mm).
 
     curvature: of the free needle (1/mm), for bevel +1; it turns with the bevel. part, zone: length (mm) of the parts
-    of a step down to the depth `zone` (mm).
+    of a step down to the depth `zone` (mm); clearance: of the needle in the guide, to either side (mm).
     """
 
     bending_stiffness: float
@@ -60,6 +60,7 @@ class Model(NamedTuple):
     part: float
     zone: float
     curvature: float = 0.0
+    clearance: float = 0.0
 
 
 def tissue_layers(
@@ -94,13 +95,13 @@ def contact_nodes(
         layers.energy[layer] * length,
         weight[layer],
     )
-    return contacts if guide_x is None else insert_essential(contacts, np.array([guide_x]))
+    return contacts if guide_x is None else insert_essential(contacts, np.array([guide_x]), GUIDE)
 
 
-def insert_essential(nodes: Nodes, x: Floats) -> Nodes:
-    """`nodes` with essential nodes added at `x` (mm), in order of x."""
+def insert_essential(nodes: Nodes, x: Floats, kind: int = ESSENTIAL) -> Nodes:
+    """`nodes` with essential nodes of a kind added at `x` (mm), in order of x."""
     place = np.searchsorted(nodes.x, x)
-    values: tuple[Any, ...] = (x, ESSENTIAL, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+    values: tuple[Any, ...] = (x, kind, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
     arrays: tuple[Any, ...] = nodes
     return Nodes(*(np.insert(array, place, value) for array, value in zip(arrays, values, strict=True)))
 
@@ -111,7 +112,7 @@ class Learnt(NamedTuple):
     shift (k − 1,): of the ends of all layers but the last (mm); stiffness (k,): factor on the modulus of each layer;
     cell: length (mm) of cells along the depth from the skin; variation (c,): further factor on the modulus in each,
     the last one goes on; bevel: factor on the bevel offset; bend: distance (mm) of the free needle's tip from the
-    straight, for bevel +1, with which it turns.
+    straight, for bevel +1, with which it turns; clearance: of the needle in the guide, to either side (mm).
     """
 
     shift: Floats
@@ -120,6 +121,7 @@ class Learnt(NamedTuple):
     variation: Floats = np.ones(1)
     bevel: float = 1.0
     bend: float = 0.0
+    clearance: float = 0.0
 
 
 def adapted(model: Model, learnt: Learnt) -> Model:
@@ -150,6 +152,7 @@ def adapted(model: Model, learnt: Learnt) -> Model:
         ),
         layers=Layers(np.append(bottoms, np.inf), old.alpha[layer], old.height[layer], scales[0], scales[1]),
         curvature=2.0 * learnt.bend / model.length**2,
+        clearance=learnt.clearance,
     )
 
 

@@ -17,7 +17,7 @@ import math
 import numpy as np
 
 from flexneedle.mechanics.compile import inner
-from flexneedle.mechanics.model import ESSENTIAL, Floats, Model
+from flexneedle.mechanics.model import CONTACT, GUIDE, Floats, Model
 from flexneedle.mechanics.ogden import FLOOR_STRETCH, contact_law
 
 # Scalars of a state: pose of base and guide, tip pose and tip spring now,
@@ -27,7 +27,8 @@ FRONT, REST, SPRING_U, CUT_X, CUT_Y, CUT_TURN, CUT_FRONT, CUT_REST = range(10, 1
 TIP_FORCE, TIP_REACTION, SPRING_ENERGY, BASE_SHEAR, BASE_MOMENT = range(18, 23)
 COUPLING, PATH_Y, ITERATIONS, RESIDUAL, CONVERGED = range(23, 28)
 CLAMP_Y, CLAMP_TURN, CLAMP_X = range(28, 31)  # the part of base y, turn and x that no command moved
-STATE_SIZE = 31
+GUIDE_SIDE = 31  # of a guide with clearance: 1 the needle bears on its upper wall, −1 on its lower one, 0 on none
+STATE_SIZE = 32
 
 # Rows of the work array, one column a node. A1, G1, B11, B12 are those before an essential node, all else after.
 A1, A2, G1, G2, B11, B12, B22, STIFFNESS, FORCE, ENERGY, SHARE, FIXED = range(12)
@@ -38,6 +39,14 @@ TOLERANCE_MM = 1e-7
 SLIDE_TOLERANCE_MM = 1e-7
 COUPLED_ITERATIONS = 15
 MAX_ITERATIONS = 100
+
+
+@inner
+def _prescribed(model: Model, s: Floats, rest: Floats, i: int) -> float:
+    """Lateral position (mm) that an essential node has; NaN at a guide with clearance that the needle does not touch."""
+    if model.nodes.kind[i] != GUIDE or model.clearance <= 0.0:
+        return float(rest[i])
+    return float(rest[i] + s[GUIDE_SIDE] * model.clearance) if s[GUIDE_SIDE] != 0.0 else math.nan
 
 
 @inner
@@ -64,13 +73,15 @@ def _sweep_out(
         b22 += turn
         if i == count:
             break
-        if nodes.kind[i] == ESSENTIAL:
+        if nodes.kind[i] != CONTACT:
             w[A1, i], w[G1, i], w[B11, i], w[B12, i] = a1, g1, b11, b12
-            gain = b12 / b11
-            a2 += gain * (rest[i] - a1)
-            g2 -= gain * g1
-            b22 -= gain * b12
-            a1, g1, b11, b12 = rest[i], 0.0, 0.0, 0.0
+            w[FIXED, i] = _prescribed(model, s, rest, i)
+            if not math.isnan(w[FIXED, i]):
+                gain = b12 / b11
+                a2 += gain * (w[FIXED, i] - a1)
+                g2 -= gain * g1
+                b22 -= gain * b12
+                a1, g1, b11, b12 = w[FIXED, i], 0.0, 0.0, 0.0
         else:
             force, k, energy = contact_law(
                 nodes.alpha[i], nodes.height[i], nodes.force[i], nodes.energy[i], u[i]
@@ -181,7 +192,7 @@ def _tip(model: Model, s: Floats, tip_x: float, held: float, ahead: tuple[float,
 
 @inner
 def _sweep_back(
-    model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, tip: tuple[float, ...], count: int
+    model: Model, s: Floats, u: Floats, w: Floats, tip: tuple[float, ...], count: int
 ) -> float:
     """From the tip to the base: positions, loads and new compressions into `w`, the shortening ½∫y'² (mm) returned."""
     nodes = model.nodes
@@ -199,8 +210,12 @@ def _sweep_back(
         right = turn
         if i < 0:
             turn = s[BASE_TURN]
-        elif nodes.kind[i] == ESSENTIAL:
-            y = rest[i]
+        elif nodes.kind[i] != CONTACT and math.isnan(w[FIXED, i]):
+            y = w[A1, i] + y_tip * w[G1, i] + w[B11, i] * shear + w[B12, i] * moment
+            turn = w[A2, i] + y_tip * w[G2, i] + w[B12, i] * shear + w[B22, i] * moment
+            w[SHEAR, i], w[MOMENT, i], w[Y, i], w[TURN, i], w[FORCE, i] = shear, moment, y, turn, 0.0
+        elif nodes.kind[i] != CONTACT:
+            y = w[FIXED, i]
             turn = w[A2, i] + y_tip * w[G2, i] + w[B22, i] * moment
             w[SHEAR, i], w[MOMENT, i], w[Y, i], w[TURN, i] = shear, moment, y, turn
             free = w[A1, i] + y_tip * w[G1, i] + w[B11, i] * shear + w[B12, i] * moment
@@ -227,7 +242,7 @@ def _limit(
     """(error, fraction) of `_judge`, the worst over all contacts."""
     nodes = model.nodes
     for i in range(count):
-        if nodes.kind[i] != ESSENTIAL:
+        if nodes.kind[i] == CONTACT:
             sharpness = (abs(nodes.alpha[i]) + 2.0) / nodes.height[i]
             left, part = _judge(nodes.height[i], sharpness, u[i], w[NEW_U, i])
             error, fraction = max(error, left), min(fraction, part)
@@ -238,7 +253,7 @@ def _limit(
 def _move_by(model: Model, u: Floats, w: Floats, count: int, fraction: float) -> None:
     """Take `fraction` of the Newton step; the energies follow to third order in the full step."""
     for i in range(count):
-        if model.nodes.kind[i] != ESSENTIAL:
+        if model.nodes.kind[i] == CONTACT:
             change = w[NEW_U, i] - u[i]
             w[ENERGY, i] -= (w[FORCE, i] - 0.5 * w[STIFFNESS, i] * change) * change
             u[i] += fraction * change
@@ -254,7 +269,7 @@ def _overshoot(
     force, k, _, _, _ = _spring_law(model, s, tip_x, s[SPRING_U])
     slope = (force - k * change - _spring_law(model, s, tip_x, s[SPRING_U] + t * change)[0]) * change
     for i in range(count):
-        if nodes.kind[i] != ESSENTIAL:
+        if nodes.kind[i] == CONTACT:
             change = w[NEW_U, i] - u[i]
             ramp = min(1.0, (tip_x - nodes.x[i]) / nodes.reach[i])
             force, _, _ = contact_law(
@@ -308,7 +323,7 @@ def _iterate(
         fresh -= 1
     ahead = _sweep_out(model, s, rest, u, w, tip_x, count, fresh)
     y, turn, force, new_u, stored, error, fraction, reaction = _tip(model, s, tip_x, held, ahead)
-    shortening = _sweep_back(model, s, rest, u, w, (tip_x, y, turn, force), count)
+    shortening = _sweep_back(model, s, u, w, (tip_x, y, turn, force), count)
     error, fraction = _limit(model, u, w, count, error, fraction)
     if not coupled and error > TOLERANCE_MM:
         fraction = min(fraction, _line_search(model, s, u, w, count, tip_x, new_u))
@@ -323,6 +338,22 @@ def _iterate(
     elif error <= TOLERANCE_MM:
         s[SHORTENING] = shortening
     return count, fresh, error if fraction == 1.0 else math.inf, slide
+
+
+@inner
+def _guide_agrees(model: Model, s: Floats, rest: Floats, w: Floats, count: int) -> bool:
+    """Whether the needle bears on the wall of the guide that it was taken to bear on; else that is changed.
+
+    A wall only pushes, and between the walls nothing does: one inequality of a convex problem, so that few changes do.
+    """
+    if count == 0 or model.nodes.kind[0] != GUIDE or model.clearance <= 0.0:
+        return True
+    side, off = s[GUIDE_SIDE], w[Y, 0] - rest[0]
+    if side != 0.0:
+        s[GUIDE_SIDE] = 0.0 if w[FORCE, 0] * side > 0.0 else side
+    elif abs(off) > model.clearance:
+        s[GUIDE_SIDE] = math.copysign(1.0, off)
+    return bool(s[GUIDE_SIDE] == side)
 
 
 @inner
@@ -354,7 +385,7 @@ def solve(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, held: flo
             s[COUPLING], s[SHORTENING] = 0.0, start
             guess(model, s, u)
         count, fresh, error, slide = _iterate(model, s, rest, u, w, held)
-        if error <= TOLERANCE_MM and slide <= SLIDE_TOLERANCE_MM:
+        if error <= TOLERANCE_MM and slide <= SLIDE_TOLERANCE_MM and _guide_agrees(model, s, rest, w, count):
             break
     s[ITERATIONS], s[RESIDUAL] = iteration, max(error, slide)
     finite = math.isfinite(s[TIP_Y]) and math.isfinite(s[SHORTENING])

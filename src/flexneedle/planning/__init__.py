@@ -3,6 +3,7 @@
 from flexneedle.planning.cross_entropy import Belief, Search, Settings, ask, minimize, tell
 from flexneedle.planning.horizon import Found, Variables, best
 from flexneedle.planning.insertion import Problem, Solution, optimise
+from flexneedle.planning.steering import reach, steer
 from flexneedle.planning.terms import Outcome, Term
 
 __all__ = [
@@ -19,5 +20,7 @@ __all__ = [
     "best",
     "minimize",
     "optimise",
+    "reach",
+    "steer",
     "tell",
 ]

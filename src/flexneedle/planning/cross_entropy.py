@@ -8,14 +8,15 @@
 A coordinate whose sigma is 0 stays at its mean: its covariance entries are zero.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+_PATIENCE = 10  # iterations
 _FLOOR = 1e-3  # standard deviation that regularisation keeps, relative to the initial one
 
 
@@ -23,7 +24,8 @@ _FLOOR = 1e-3  # standard deviation that regularisation keeps, relative to the i
 class Search:
     """N samples, the elite ρN of them, most iterations; smoothing β keeps that share of the old moments.
 
-    tolerance: spread of the elite costs, relative to the first finite one, at which the method has converged.
+    tolerance: spread of the elite costs, relative to the first finite one, at which the method has converged. usual:
+    from this iteration on it has converged, too, once ten iterations lowered the best cost by no more than that.
     """
 
     samples: int
@@ -31,6 +33,7 @@ class Search:
     iterations: int
     smoothing: float
     tolerance: float
+    usual: int | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -118,9 +121,9 @@ def minimize(
         samples = ask(belief, settings, rng) if first is None or belief.iterations > 0 else first
         belief = tell(belief, settings, samples, cost(samples))
         if progress is not None:
-            progress(
-                {"iteration": belief.iterations, "iterations": settings.iterations, **belief.history[-1]}
-            )
+            done = belief.iterations
+            usual = max(done, settings.usual or settings.iterations)
+            progress({"iteration": done, "iterations": usual, **belief.history[-1]})
     return belief
 
 
@@ -128,6 +131,19 @@ def _elite_spread(entry: dict[str, Any]) -> float:
     """Spread of an iteration's elite costs; infinite where one of them failed."""
     least, worst, _, _ = entry["cost_quantiles"]
     return float(worst - least) if np.isfinite(worst) else np.inf
+
+
+def _converged(history: Sequence[dict[str, Any]], settings: Settings) -> bool:
+    """Whether the elite's costs hardly differ any more, or the best has hardly fallen for a while."""
+    spreads = [_elite_spread(entry) for entry in history]
+    little = settings.tolerance * next((spread for spread in spreads if np.isfinite(spread)), np.inf)
+    if not np.isfinite(little):
+        return False
+    if spreads[-1] <= little:
+        return True
+    if settings.usual is None or len(history) < max(settings.usual, _PATIENCE + 1):
+        return False
+    return bool(history[-1 - _PATIENCE]["best"] - history[-1]["best"] <= little)
 
 
 def _with(
@@ -144,10 +160,7 @@ def _with(
         "cost_quantiles": tuple(float(ordered[k]) for k in (0, settings.elite - 1, costs.size // 2, -1)),
         "spread": tuple(np.sqrt(np.diag(covariance)).tolist()),
     }
-    spreads = (_elite_spread(earlier) for earlier in (*belief.history, entry))
-    scale = next((spread for spread in spreads if np.isfinite(spread)), np.inf)
-    converged = _elite_spread(entry) <= settings.tolerance * scale < np.inf
-    best = winner if better else belief.best
+    best, history = winner if better else belief.best, (*belief.history, entry)
     return Belief(
-        mean, covariance, belief.initial_sigma, best, best_cost, converged, (*belief.history, entry)
+        mean, covariance, belief.initial_sigma, best, best_cost, _converged(history, settings), history
     )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flexneedle.planning import terms
 from flexneedle.planning.cross_entropy import Belief, Search
-from flexneedle.planning.horizon import Variables, best
+from flexneedle.planning.horizon import Found, Variables, best
 from flexneedle.planning.terms import Rollout, Term
 
 Floats = NDArray[np.float64]
@@ -33,12 +33,14 @@ _BEVEL_CORRELATION = 0.8  # of ε of neighbouring primitives at first: few flips
 class Problem:
     """What to reach and with what: mm, rad.
 
-    travel: insertion from the start to the target depth; step (4,) and reach (4,): largest step of base x, y, θ,
-    guide and largest sum of steps; sigma (6,): first standard deviation of each coordinate, 0 if not free.
+    travel: insertion from the start to the target depth, of which `air` comes before the skin; step (4,) and reach
+    (4,): largest step of base x, y, θ, guide and largest sum of steps; sigma (6,): first standard deviation of each
+    coordinate, 0 if not free.
     """
 
     target: tuple[float, float]
     travel: float
+    air: float
     primitives: int
     step: Floats
     reach: Floats
@@ -56,6 +58,7 @@ class Solution:
 
     controls: Floats
     bevel: int
+    cost: float
     terms: dict[str, float]
     belief: Belief
 
@@ -72,10 +75,17 @@ def optimise(
     `rollout` starts with bevel +1 in air; a sample that wants −1 flips in its first step, which is not charged.
     """
     found = best(_variables(problem), rollout, cost_terms(problem), search, rng, progress=progress)
-    controls, wanted = schedule(problem, found.z[None])
-    controls[0, 0, 4] = -1.0
-    moving = controls[0, :, 0] > 0.0
-    return Solution(controls[0, moving], int(wanted[0, 0]), found.terms, found.belief)
+    return solution(found)
+
+
+def solution(found: Found) -> Solution:
+    """What was found, without steps that do not advance, and with the bevel set before the first."""
+    controls = found.outcome.controls[0]
+    facing = np.cumprod(-controls[:, 4])
+    moving = controls[:, 0] > 0.0
+    controls, facing = controls[moving], facing[moving]
+    controls[:, 4] = np.where(np.diff(facing, prepend=facing[0]) != 0.0, 1.0, -1.0)
+    return Solution(controls, int(facing[0]), found.cost, found.terms, found.belief)
 
 
 def _variables(problem: Problem) -> Variables:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from math import cos, degrees, isnan, sin
-from textwrap import shorten
+from textwrap import fill, shorten
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -33,6 +33,7 @@ __all__ = ["plan_figure"]
 _LEFT, _RIGHT, _HEAD, _BETWEEN = 0.62, 0.15, 0.66, 0.75
 _PANEL_WIDTH, _PANEL_HEIGHT, _PANEL_GAP = 4.2, 0.9, 0.3
 _BARS_WIDTH = 2.0
+_TITLE_CHARACTERS = 95
 
 
 def plan_figure(scenario: Scenario, plans: Sequence[PlanRecord]) -> Figure:
@@ -78,7 +79,7 @@ def _scene(ax: Axes, scenario: Scenario, plan: PlanRecord, window: scene.View, c
     scene.draw_turns(ax, curves.planned_turns(plan), PLAN, solid=False, label="bevel turn, planned")
     _entry(ax, plan)
     ax.set_title(
-        f"{plan.strategy}: {plan_verdict(plan)} (cost {plan.cost:.2f})",
+        fill(f"{plan.strategy}: {plan_verdict(plan)} (cost {plan.cost:.2f})", _TITLE_CHARACTERS),
         color=TARGET if plan.reached else BAD,
         fontsize=9.5,
     )

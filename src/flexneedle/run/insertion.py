@@ -11,6 +11,8 @@ import numpy as np
 
 from flexneedle.control import tables
 from flexneedle.control.estimate import Estimate
+from flexneedle.control.forecast import hopeless, warning
+from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Decision, Method, Task, at_depth
 from flexneedle.control.methods import DEFAULT, used
 from flexneedle.errors import InputError, RunError
@@ -47,7 +49,7 @@ def insert(
     (docs/extend.md).
     `threads` is for rollouts (default: all cores) and changes no result. `on_period` gets each control period as
     it ends. Raises InputError for an unknown name or an object that is none, ScenarioError for a setting that the
-    controllers refuse, RunError if the plan misses its target by more than 1 mm,
+    controllers refuse, InputError for a controller that needs the guide where it may not move, RunError if the plan misses its target by more than 1 mm,
     unless `force`. Same seed, same record, but for wall-clock durations.
     """
     phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
@@ -83,6 +85,7 @@ def run(
 ) -> Insertion:
     """Carry out `plan` on any rig; as `insert`."""
     name, chosen = controller_of(controller)
+    check_guide(chosen, scenario.setup, plan.strategy)
     if not plan.reached and not force:
         raise RunError(
             f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), bound by {plan.limit}; "
@@ -92,7 +95,7 @@ def run(
     task = tables.task(chosen, Simulator(scenario, threads), plan)
     periods: list[Period] = []
     ending = ("failed", "not at the target depth after four times the planned periods")
-    for period, so_far in _periods(task, chosen, rig, rng):
+    for period, so_far in _periods(task, chosen, rig, rng, force=force):
         periods.append(period)
         ending = so_far or ending
         if on_period is not None:
@@ -105,7 +108,7 @@ def run(
 
 
 def _periods(
-    task: Task, chosen: Method, rig: Rig, rng: np.random.Generator
+    task: Task, chosen: Method, rig: Rig, rng: np.random.Generator, *, force: bool
 ) -> Iterator[tuple[Period, tuple[str, str] | None]]:
     """Yield each period, and how the insertion ended with it: (outcome, reason), None while it goes on.
 
@@ -123,6 +126,8 @@ def _periods(
         looks = Decision(_STILL, "looks before it moves")
         yield _record(next(indices), rig.clock.now(), task.plan, rig, looks, _STILL, sight, clocks), None
     arrived_at: float | None = None
+    lost = ""  # why no path leads to the target,
+    lost_at: float | None = None  # and since when
     moves = 0
     for index in indices:
         if moves == _TOO_MANY * len(task.plan.controls):
@@ -138,7 +143,12 @@ def _periods(
             )
         else:
             decision, memory = _decided(chosen, task, memory, sight.estimate, rng)
-            moves, wait = moves + 1, 0.0
+            lost = "" if force else hopeless(decision, scenario.control)
+            lost_at = (begun if lost_at is None else lost_at) if lost else None
+            if lost:
+                decision = replace(decision, command=_STILL, why=f"held: {lost}")
+            else:
+                moves, wait = moves + 1, 0.0
         clocks.append(time.perf_counter())
         applied = _carry_out(scenario, rig, decision.command, wait)
         clocks.append(time.perf_counter())
@@ -151,6 +161,8 @@ def _periods(
             arrived_at = now
         seen = arrived_at is not None and good and sight.saw_after(arrived_at)
         ending = _ending(task, sight, None if held is None else held.lasted(sight.field), seen)
+        if lost_at is not None and now - lost_at > scenario.control.hold_limit_s - 1e-9:
+            ending = ending or ("held", lost)
         yield _record(index, now, task.plan, rig, decision, applied, sight, clocks), ending
         if ending is not None:
             return
@@ -253,6 +265,9 @@ def _record(
         cost=decision.cost,
         spread=decision.spread,
         decision=decision.why,
+        miss=decision.miss,
+        miss_sd=decision.miss_sd,
+        warning=warning(decision),
         true_tip=None if truth is None else _pose(truth.tip),
         true_strain_energy=None if truth is None else truth.strain_energy,
         true_stretch=None if truth is None else truth.least_stretch,

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
-from flexneedle.planning import Outcome, Problem, Search, Solution, optimise
-from flexneedle.scenario import Scenario, check_target
+from flexneedle.planning import Outcome, Problem, Search, Solution, optimise, reach, steer
+from flexneedle.planning.insertion import BASE_Y, GUIDE
+from flexneedle.scenario import Plan, Scenario, check_target, elite_count
 from flexneedle.simulator import Control, Simulator, State
 from flexneedle.trace import PlanRecord
 
@@ -17,6 +18,8 @@ Floats = NDArray[np.float64]
 STRATEGIES = ("manipulation", "steering")
 _DEPTH_TOLERANCE_MM = 1e-6
 _SHARE_SIGMA = 0.1  # of the logarithm of a primitive's share of the travel
+_SHARE_OF_A_SEARCH = 4  # of plan.samples goes into each number of rolls and side, which have few coordinates
+_LEAST_SAMPLES = 8
 _AT_LIMIT = 0.999  # share of a limit that counts as reached
 
 
@@ -31,9 +34,9 @@ def plan(
 ) -> PlanRecord:
     """Plan an insertion to `target` (x, y) in mm (default: the scenario's), best found by cross-entropy.
 
-    strategy: "manipulation" moves guide and bevel; "steering" lowers the bending stiffness and moves only the
-    bevel (paper section III-A). `progress` gets a dict after each iteration. `threads` is for
-    rollouts (default: all cores) and changes no result. Same seed, same plan.
+    strategy: "manipulation" moves guide and bevel; "steering" moves only the bevel (paper section III-A, but on the
+    needle itself, not on a softer one). `progress` gets a dict after each iteration. `threads` is for rollouts
+    (default: all cores) and changes no result. Same seed, same plan.
     Raises ScenarioError for a target that the scenario excludes and InputError for an unknown strategy.
     """
     if strategy not in STRATEGIES:
@@ -41,36 +44,76 @@ def plan(
     goal = scenario.target.position if target is None else (float(target[0]), float(target[1]))
     check_target(scenario, *goal)
     begun = time.perf_counter()
-    simulator = Simulator(_strategic(scenario, strategy), threads)
-    solution = _search(simulator, goal, strategy, np.random.default_rng(seed), progress)
+    simulator = Simulator(scenario, threads)
+    problem = _problem(scenario, goal, strategy)
+    solution = _search(simulator, problem, np.random.default_rng(seed), progress)
     controls = _end_at_depth(simulator, solution.controls, solution.bevel, goal[0])
-    return _record(simulator, controls, solution, goal, strategy, seed, time.perf_counter() - begun)
+    states = [simulator.start(solution.bevel)]
+    for row in controls:
+        states.append(simulator.step(states[-1], Control.from_row(row.tolist())))
+    return PlanRecord(
+        strategy=strategy,
+        target=goal,
+        seed=seed,
+        bevel=solution.bevel,
+        controls=controls,
+        tips=np.array([state.tip for state in states]),
+        strain_energy=np.array([state.strain_energy for state in states]),
+        guide=np.array([state.guide for state in states]),
+        shapes=np.array([state.nodes for state in states]),
+        cost=solution.cost,
+        terms=solution.terms,
+        iterations=solution.belief.iterations,
+        converged=solution.belief.converged,
+        history=solution.belief.history,
+        limit=_binding_limit(simulator, problem, controls, states),
+        seconds=time.perf_counter() - begun,
+    )
 
 
-def _strategic(scenario: Scenario, strategy: str) -> Scenario:
-    """The scenario that the planner simulates: steering makes the needle follow its tip."""
-    if strategy == "manipulation":
-        return scenario
-    factor = scenario.plan.steering_stiffness_factor
-    return scenario.with_values({"needle.youngs_modulus_gpa": factor * scenario.needle.youngs_modulus_gpa})
+def bevel_reach(scenario: Scenario, depth: float, threads: int | None = None) -> tuple[float, float]:
+    """Least and greatest lateral position (mm) at a depth (mm) that the bevel alone can reach."""
+    simulator = Simulator(scenario, threads)
+    return reach(_rollout(simulator), _problem(scenario, (depth, 0.0), "steering"))
 
 
 def _search(
     simulator: Simulator,
-    goal: tuple[float, float],
-    strategy: str,
+    problem: Problem,
     rng: np.random.Generator,
     progress: Callable[[dict[str, Any]], None] | None,
 ) -> Solution:
-    plan = simulator.scenario.plan
+    """The best primitives, or, where nothing but the bevel is free, the best rolls."""
+    plan, rollout = simulator.scenario.plan, _rollout(simulator)
+    if _bevel_alone(problem):
+        search = _settings(plan, max(_LEAST_SAMPLES, plan.samples // _SHARE_OF_A_SEARCH))
+        return steer(rollout, problem, search, rng, progress)
+    return optimise(rollout, problem, _settings(plan, plan.samples), rng, progress)
+
+
+def _rollout(simulator: Simulator) -> Callable[[Floats], Outcome]:
     start = simulator.start()
 
     def rollout(controls: Floats) -> Outcome:
         result, deflection = simulator.rollout_with_deflection(start, controls)
         return Outcome(controls, *result, deflection)
 
-    search = Search(plan.samples, plan.elite_count, plan.iterations, plan.smoothing, plan.tolerance)
-    return optimise(rollout, _problem(simulator.scenario, goal, strategy), search, rng, progress)
+    return rollout
+
+
+def _settings(plan: Plan, samples: int) -> Search:
+    return Search(
+        samples=samples,
+        elite=max(2, elite_count(samples, plan.elite_fraction)),
+        iterations=max(plan.iterations, plan.max_iterations),
+        smoothing=plan.smoothing,
+        tolerance=plan.tolerance,
+        usual=plan.iterations,
+    )
+
+
+def _bevel_alone(problem: Problem) -> bool:
+    return not problem.sigma[BASE_Y : GUIDE + 1].any()
 
 
 def _problem(scenario: Scenario, goal: tuple[float, float], strategy: str) -> Problem:
@@ -93,6 +136,7 @@ def _problem(scenario: Scenario, goal: tuple[float, float], strategy: str) -> Pr
     return Problem(
         target=goal,
         travel=setup.tip_to_skin_mm + goal[0],
+        air=setup.tip_to_skin_mm,
         primitives=plan.primitives,
         step=np.array([setup.max_advance_mm, setup.max_base_step_mm, setup.max_base_turn_step, guide_step]),
         reach=np.array([setup.stroke_mm, setup.max_base_travel_mm, np.inf, setup.max_guide_travel_mm]),
@@ -126,53 +170,20 @@ def _end_at_depth(simulator: Simulator, controls: Floats, bevel: int, depth: flo
     return controls
 
 
-def _record(
-    simulator: Simulator,
-    controls: Floats,
-    solution: Solution,
-    goal: tuple[float, float],
-    strategy: str,
-    seed: int,
-    seconds: float,
-) -> PlanRecord:
-    states = [simulator.start(solution.bevel)]
-    for row in controls:
-        states.append(simulator.step(states[-1], Control.from_row(row.tolist())))
-    belief = solution.belief
-    return PlanRecord(
-        strategy=strategy,
-        target=goal,
-        seed=seed,
-        bevel=solution.bevel,
-        controls=controls,
-        tips=np.array([state.tip for state in states]),
-        strain_energy=np.array([state.strain_energy for state in states]),
-        guide=np.array([state.guide for state in states]),
-        shapes=np.array([state.nodes for state in states]),
-        cost=belief.best_cost,
-        terms=solution.terms,
-        iterations=belief.iterations,
-        converged=belief.converged,
-        history=belief.history,
-        limit=_binding_limit(simulator.scenario, controls, states, goal, strategy),
-        seconds=seconds,
-    )
-
-
-def _binding_limit(
-    scenario: Scenario, controls: Floats, states: list[State], goal: tuple[float, float], strategy: str
-) -> str:
+def _binding_limit(simulator: Simulator, problem: Problem, controls: Floats, states: list[State]) -> str:
     """Name the key that keeps the plan from its target; empty if it gets there."""
-    end = states[-1].tip
-    if np.hypot(end[0] - goal[0], end[1] - goal[1]) <= 1.0:
+    scenario, end = simulator.scenario, states[-1].tip
+    if np.hypot(end[0] - problem.target[0], end[1] - problem.target[1]) <= 1.0:
         return ""
     setup = scenario.setup
     guide = max(abs(state.guide) for state in states)
-    if controls[:, 0].sum() > _AT_LIMIT * setup.stroke_mm and end[0] < goal[0] - 0.5:
+    if controls[:, 0].sum() > _AT_LIMIT * setup.stroke_mm and end[0] < problem.target[0] - 0.5:
         return f"setup.stroke_mm = {setup.stroke_mm:g}"
-    base_is_free = scenario.plan.base_sigma_mm > 0.0 or scenario.plan.base_turn_sigma > 0.0
-    if strategy == "steering" or not (setup.has_guide or base_is_free):
-        return f"needle.bevel.offset_mm = {scenario.needle.bevel.offset_mm:g} (only the bevel steers)"
+    if _bevel_alone(problem):
+        least, greatest = reach(_rollout(simulator), problem)
+        if not least <= problem.target[1] <= greatest:
+            why = f"only the bevel steers: {least:.2f} to {greatest:.2f} mm"
+            return f"needle.bevel.offset_mm = {scenario.needle.bevel.offset_mm:g} ({why})"
     if guide > _AT_LIMIT * setup.max_guide_travel_mm:
         return f"setup.max_guide_travel_mm = {setup.max_guide_travel_mm:g}"
     if np.abs(controls[:, 3]).max() > _AT_LIMIT * setup.max_guide_step_mm:

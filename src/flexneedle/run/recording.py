@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from flexneedle.control.guide import check_guide
 from flexneedle.control.methods import DEFAULT
 from flexneedle.phantom import DEFAULT_PLANT
 from flexneedle.run.figures import draw_run
@@ -79,6 +80,7 @@ def record_insertion(
     """
     folder.values |= choices.parts
     with _marked(folder):
+        check_guide(controller_of(choices.controller)[1], scenario.setup, choices.strategy)
         plan_seed = choices.seed if choices.plan_seed is None else choices.plan_seed
         plan = _plan(folder, scenario, choices.strategy, plan_seed, on_iteration)
         insertion = _insert(folder, scenario, plan, choices, on_period)

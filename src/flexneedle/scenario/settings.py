@@ -37,7 +37,9 @@ class Plan(Section):
     samples: int = count(128, least=2, most=100_000)
     """N, control sequences in an iteration."""
     iterations: int = count(25, least=1, most=10_000)
-    """Greatest number of iterations."""
+    """Usual number of iterations: after these, the search ends once ten more hardly lower the cost."""
+    max_iterations: int = count(200, least=1, most=10_000)
+    """Greatest number of iterations, if `iterations` is not greater."""
     elite_fraction: Annotated[float, Field(gt=0, le=1)] = 0.125
     """ρ, share of the samples from which mean and covariance are fitted."""
     smoothing: Annotated[float, Field(ge=0, lt=1)] = 0.4
@@ -45,7 +47,7 @@ class Plan(Section):
     primitives: int = count(6, least=1, most=1_000)
     """Pieces of a control sequence, each constant over several steps."""
     tolerance: Positive = 1e-3
-    """The search has converged once the costs of the elite spread less than this, relative to the first iteration."""
+    """Spread of the elite's costs, relative to the first iteration, at which the search has converged."""
     advance_sigma_mm: NonNegative = 0.03
     """First standard deviation of the advance of a step; 0 keeps it fixed."""
     guide_sigma_mm: NonNegative = 0.06
@@ -64,8 +66,8 @@ class Plan(Section):
     """R, cost of the guide's travel in a step."""
     flip_weight: NonNegative = 0.3
     """R of a turn of the bevel."""
-    steering_stiffness_factor: Annotated[float, Field(gt=0, le=1)] = 0.1
-    """Bending stiffness of the needle in the strategy `steering`, relative to its own."""
+    steering_stiffness_factor: Annotated[float, Field(gt=0, le=1)] | None = None
+    """Accepted and not used: `steering` is planned on the needle itself."""
 
     @property
     def elite_count(self) -> int:
@@ -95,7 +97,12 @@ class Control(Section):
     start_angle_sd_mrad: NonNegative = 3.0
     """What the controller expects of the base clamp's slope: its standard deviation."""
     innovation_limit_mm: Positive = 2.0
-    """A measured tip further than this from the predicted one is not believed."""
+    """A measured tip further than this, and three standard deviations of the prediction, from the predicted one is not
+    used."""
+    miss_limit_mm: Positive = 2.0
+    """The needle is held where no path is found that ends within this lateral distance of the target,"""
+    miss_confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95
+    """if the predicted miss is beyond it with at least this probability."""
     hold_limit_s: Positive = 1.0
     """The insertion is given up after so long without a measurement to believe."""
     stale_after_s: Positive = 0.3

@@ -100,6 +100,9 @@ class Period:
     durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
     converged: bool = True  # the model's solve of this period, and all of the virtual phantom's so far
     true_stretch: float | None = None  # smallest stretch λ of the true tissue so far
+    miss: float = float("nan")  # lateral, predicted at the target (mm), NaN: not predicted
+    miss_sd: float = float("nan")  # its standard deviation (mm)
+    warning: str = ""  # that the insertion is likely to miss
     readings: tuple[Judged, ...] = ()  # all that came in the period, oldest first; `sample` is the newest
 
 
@@ -138,11 +141,16 @@ class Insertion:
         return sum(period.applied[4] > 0 for period in self.periods)
 
     @property
+    def warning(self) -> str:
+        """The first warning on the way, empty without one."""
+        return next((period.warning for period in self.periods if period.warning), "")
+
+    @property
     def held_s(self) -> float:
-        """For how long (s) the needle was held because of the tracker's readings."""
+        """For how long (s) the needle was held."""
         ends = [0.0, *(period.time for period in self.periods)]
         spans = zip(self.periods, pairwise(ends), strict=True)
-        return sum((end - begin for period, (begin, end) in spans if period.decision == "held"), 0.0)
+        return sum((end - begin for period, (begin, end) in spans if period.decision.startswith("held")), 0.0)
 
     @property
     def reached(self) -> bool:

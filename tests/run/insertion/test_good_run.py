@@ -15,6 +15,7 @@ import pytest
 import flexneedle
 import flexneedle.control
 from flexneedle.errors import InputError
+from flexneedle.phantom import PLANTS
 from flexneedle.run import insertion
 from flexneedle.run.rig import Rig
 from flexneedle.trace import Insertion
@@ -130,7 +131,7 @@ def test_unknown_names_of_plant_and_controller_are_refused_with_the_choices(plan
 def test_phantom_tracker_and_search_have_random_streams_of_their_own(plan, monkeypatch):
     drawn, plants = [], []
 
-    def virtual_rig(_scenario, _bevel, seeds, phantom):
+    def virtual_rig(_scenario, _bevel, seeds, phantom, **_options):
         drawn.extend(np.random.default_rng(seed).random() for seed in dataclasses.astuple(seeds))
         plants.append(phantom)
 
@@ -144,7 +145,7 @@ def test_phantom_tracker_and_search_have_random_streams_of_their_own(plan, monke
         insertion.insert(PHANTOM, plan, seed, phantom=phantom)
     assert len(set(drawn)) == 8
     assert drawn[:4] == drawn[8:]
-    assert plants == ["exact", "exact", "model"]
+    assert plants == [PLANTS["exact"], PLANTS["exact"], PLANTS["model"]]
 
 
 def test_on_period_gets_each_period_as_it_ends(plan):

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 
 from flexneedle.control.methods import METHODS, checked
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, ScenarioWarning
 from flexneedle.run.study.grid import load_study
 from flexneedle.run.study.spec import LARGEST_SEED, study_names
 from flexneedle.scenario import dump_scenario, load_scenario
@@ -110,6 +110,29 @@ def test_keys_of_the_base_can_be_left_out(study):
     )
     needle = study(text).points[0].scenario.needle
     assert (needle.gauge, needle.outer_diameter_mm, needle.outer_diameter) == ("19G", None, 1.067)
+
+
+def test_old_names_of_keys_mean_the_new_ones_in_values_cases_and_axes(study):
+    axis = '[[axes]]\nkey = "control.horizon"\nvalues = [3, 4]\n'
+    rest = '[values]\ncontrol.samples = 9\n[[cases]]\nname = "a"\nvalues = { control.iterations = 2 }\n'
+    with pytest.warns(ScenarioWarning) as caught:
+        points = study(rest + axis).points
+    assert {str(warning.message).split()[0] for warning in caught} == {
+        "control.horizon",
+        "control.samples",
+        "control.iterations",
+    }
+    tables = [point.scenario.control.tables["ce_mpc"] for point in points]
+    assert [(t["horizon"], t["samples"], t["iterations"]) for t in tables] == [(3, 9, 2), (4, 9, 2)]
+    assert [dict(point.varied) for point in points] == [{"control.ce_mpc.horizon": k} for k in (3, 4)]
+    twice = axis + '[[cases]]\nname = "a"\nvalues = { control.ce_mpc.horizon = 2 }\n'
+    with pytest.warns(ScenarioWarning), pytest.raises(InputError, match="an axis sets this key too"):
+        study(twice)
+
+
+def test_a_table_of_no_controller_of_the_study_is_refused(study):
+    with pytest.raises(InputError, match=r"control.ce_mcp: unknown table; did you mean ce_mpc\? tables: "):
+        study("[values]\ncontrol.ce_mcp.horizon = 3\n")
 
 
 def test_a_scenario_is_found_beside_the_study_file(study, tmp_path):

@@ -47,10 +47,10 @@ def checked(scenario: Scenario, *own: Method, source: str = "") -> Scenario:
 def used(scenario: Scenario, *own: Method, source: str = "") -> Scenario:
     """Return the scenario as `checked` does, for one use: a table may belong to a controller that is not in use.
 
-    Of such a table it warns (ScenarioWarning).
+    Of such a table it warns (ScenarioWarning), in the same words whatever the source: it is printed once.
     """
     known = _with(own)
-    for line in unowned(scenario, known, source):
+    for line in unowned(scenario, known):
         warnings.warn(f"{line}; it is not used", ScenarioWarning, stacklevel=2)
     return completed(scenario, known, source)
 

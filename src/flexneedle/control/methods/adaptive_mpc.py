@@ -11,6 +11,7 @@ from flexneedle.control.estimate import Estimate, Floats
 from flexneedle.control.identification import Identification, Identified
 from flexneedle.control.interface import Decision, Method, Task
 from flexneedle.control.path import Ahead, Path, of_plan, proposals
+from flexneedle.control.outlook import Outlook
 from flexneedle.planning import Settings, cross_entropy
 import os
 P = dict(wE=float(os.environ.get('WE','0.3')), wL=float(os.environ.get('WL','3')), wS=float(os.environ.get('WS','0.5')), wR=float(os.environ.get('WR','0.015')), N=int(os.environ.get('NS','24')), IT=int(os.environ.get('IT','2')), FIRST=int(os.environ.get('FIRST','4')))
@@ -21,6 +22,7 @@ class Memory:
     path: Path
     first: bool = True
     scale: float = 1.0
+    outlook: Outlook | None = None
 
 
 def begin(task: Task) -> Memory:
@@ -66,9 +68,14 @@ def decide(task: Task, memory: Memory, estimate: Estimate, rng: np.random.Genera
         advance = later[0] - x
     guide = float(np.clip(np.interp(x + advance, path.depth, path.guide) - state.guide, -ahead.step, ahead.step))
     base = ahead.base[0] * min(1.0, advance / max(ahead.depth[1] - x, 1e-9))
-    why = f"predicted miss {miss[0]:.3f} mm, rolls at {', '.join(f'{r:.1f}' for r in later) or 'none'}"
+    outlook = memory.outlook or Outlook.of(belief)
+    chosen, _ = ahead.controls(search.best[None])
+    tips = belief.simulator.rollout(state, chosen, limits=False).tips[0]
+    outlook = outlook.renewed(belief, chosen[0], tips)
+    sds = [outlook.sd(belief, task.plan.target[0], b) for b in (0.0, 3.0, 6.0, 12.0)]
+    why = "SD " + " ".join(f"{v:.4f}" for v in (miss[0], *sds)) + f" predicted miss {miss[0]:.3f} mm, rolls at {', '.join(f'{r:.1f}' for r in later) or 'none'}"
     command = (advance, float(base[0]), float(base[1]), guide, 1 if len(due) % 2 else -1)
-    return Decision(command, why, float(search.best_cost)), Memory(path, False, memory.scale)
+    return Decision(command, why, float(search.best_cost)), Memory(path, False, memory.scale, outlook)
 
 
 def cost(task, belief, ahead, z, scale):

@@ -17,7 +17,6 @@ from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Decision, Method, Task, travel_left
 from flexneedle.control.mpc import planned_base
 from flexneedle.control.observer import Beliefs
-from flexneedle.errors import InputError
 from flexneedle.scenario import Setup
 from flexneedle.scenario.fields import Fraction, NonNegative, Positive, Section, count
 from flexneedle.trace import PlanRecord
@@ -57,9 +56,7 @@ class Learnt:
 
 
 def begin(task: Task) -> Learnt:
-    """Start with a tip that goes straight on, and aside with the guide. Raises InputError without a guide."""
-    if not task.scenario.setup.has_guide:
-        raise InputError("controller = 'broyden-mpc': steers with the guide: give setup.guide_to_skin_mm")
+    """Start with a tip that goes straight on, and aside with the guide."""
     return Learnt(np.diag([1.0, task.settings.guide_effect]))
 
 
@@ -182,4 +179,5 @@ METHOD = Method(
     begin=begin,
     decide=decide,
     settings=BroydenMpc,
+    needs_guide=True,
 )

@@ -19,7 +19,6 @@ from flexneedle.control.estimate import Estimate
 from flexneedle.control.interface import Decision, Method, Task, travel_left
 from flexneedle.control.mpc import planned_base
 from flexneedle.control.observer import Beliefs
-from flexneedle.errors import InputError
 from flexneedle.scenario import Setup
 from flexneedle.scenario.fields import Fraction, NonNegative, Positive
 from flexneedle.simulator import Simulator, State
@@ -42,12 +41,6 @@ class ResolvedRate(bang_bang.BevelRule):
     """λ of the damped least squares, as the tip's lateral motion for that of the guide."""
     lookahead_mm: Positive = 10.0
     """How far ahead of the tip its deviation is predicted, at most to the target depth."""
-
-
-def begin(task: Task) -> None:
-    """Nothing to remember. Raises InputError without a guide."""
-    if not task.scenario.setup.has_guide:
-        raise InputError("controller = 'resolved-rate': steers with the guide: give setup.guide_to_skin_mm")
 
 
 def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generator) -> tuple[Decision, None]:
@@ -114,7 +107,8 @@ METHOD = Method(
     "resolved-rate",
     "guide by the damped inverse of the model's Jacobian, bevel by the rule",
     Beliefs(),
-    begin=begin,
+    begin=lambda _task: None,
     decide=decide,
     settings=ResolvedRate,
+    needs_guide=True,
 )

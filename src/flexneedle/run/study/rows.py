@@ -4,12 +4,13 @@ import fcntl
 import os
 import tempfile
 import time
+import warnings
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from flexneedle.errors import RunError
+from flexneedle.errors import RunError, ScenarioWarning
 from flexneedle.run.folder import versions
 from flexneedle.run.insertion import insert
 from flexneedle.run.kernels import compile_kernels
@@ -121,15 +122,18 @@ def _reach(point: Point, seed: int) -> dict[str, Any]:
 
 def _insertion(job: Job, made: PlanRecord, seed: int) -> Insertion:
     point = job.point
-    return insert(
-        point.scenario,
-        made,
-        seed,
-        controller=point.controller,
-        phantom=point.plant,
-        tracker=point.tracker,
-        threads=1,
-    )
+    with warnings.catch_warnings():
+        # The study has checked its tables: that of another of its controllers is nothing to warn of.
+        warnings.simplefilter("ignore", ScenarioWarning)
+        return insert(
+            point.scenario,
+            made,
+            seed,
+            controller=point.controller,
+            phantom=point.plant,
+            tracker=point.tracker,
+            threads=1,
+        )
 
 
 def _planned(made: PlanRecord | None) -> dict[str, Any]:

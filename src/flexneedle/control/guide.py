@@ -1,0 +1,29 @@
+"""Whether a controller may move the guide: there is one, and the plan does not leave it where it is."""
+
+from flexneedle.control.interface import Method
+from flexneedle.errors import InputError
+from flexneedle.scenario import Setup
+
+__all__ = ["check_guide", "guide_may_move", "most_guide_step"]
+
+_STILL = "steering"  # the strategy in which the bevel alone steers
+
+
+def guide_may_move(setup: Setup, strategy: str) -> bool:
+    """Whether the guide may move in an insertion that was planned with this strategy."""
+    return setup.has_guide and strategy != _STILL
+
+
+def most_guide_step(setup: Setup, strategy: str) -> float:
+    """Greatest lateral travel (mm) of the guide in a control step; 0 if it may not move."""
+    return setup.max_guide_step_mm if guide_may_move(setup, strategy) else 0.0
+
+
+def check_guide(method: Method, setup: Setup, strategy: str) -> None:
+    """Raise InputError if a controller needs the guide and may not move it."""
+    if not method.needs_guide or guide_may_move(setup, strategy):
+        return
+    name = f"controller = {method.name!r}: steers with the guide"
+    if not setup.has_guide:
+        raise InputError(f"{name}: give setup.guide_to_skin_mm")
+    raise InputError(f"{name}, which strategy = {strategy!r} leaves where it is: plan with 'manipulation'")

@@ -1,0 +1,145 @@
+"""Steering plans on random worlds: are they what the named needle does, and what an exact needle does?
+
+    python studies/steering.py [--worlds FIRST COUNT] [--jobs N] [--out FILE]
+
+Each world keeps its needle, tissue, apparatus and depth; its target is drawn within 90 % of what the bevel alone
+reaches there. The guide stays where it is. The plan is replayed (`open-loop`) on the exact plant without any
+imperfection. The table goes to stdout, a row for each world to FILE as JSON. Worlds below 1000 are for choosing
+settings, those from 100,000 on for reports.
+"""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import flexneedle
+from flexneedle.run.planner import bevel_reach
+from flexneedle.scenario import Scenario
+from flexneedle.scenario.worlds import TRAINING, world
+
+SHARE_OF_REACH = 0.9
+PLANNED_MM, CLAIMED_MM = 0.1, 0.2
+NO_MISMATCH: dict[str, Any] = {
+    "shear_modulus_factor": [1.0, 1.0],
+    "shear_modulus_variation": 0.0,
+    "layer_shift_sd_mm": 0.0,
+    "bevel_factor": [1.0, 1.0],
+    "start_offset_sd_mm": 0.0,
+    "start_angle_sd_mrad": 0.0,
+    "initial_bend_mm": 0.0,
+    "run_out_mm": 0.0,
+    "guide_clearance_mm": 0.0,
+    "friction_mn_per_mm": 0.0,
+    "motor_resolution_mm": 0.0,
+    "delay_periods": 0.0,
+    "missing_fraction": 0.0,
+    "tracker_bias_mm": 0.0,
+}
+
+
+def perfect(number: int) -> Scenario:
+    """A world whose plant has no imperfection."""
+    return world(number).with_values({f"phantom.{key}": value for key, value in NO_MISMATCH.items()})
+
+
+def draw_target(scenario: Scenario, number: int) -> tuple[float, float]:
+    """A target at the world's depth, uniform within 90 % of the bevel's reach, and within the apparatus' limit (mm)."""
+    depth, most = scenario.target.depth_mm, scenario.setup.max_lateral
+    least, greatest = bevel_reach(scenario, depth, threads=1)
+    middle, half = 0.5 * (least + greatest), 0.5 * SHARE_OF_REACH * (greatest - least)
+    lateral = middle + half * float(np.random.default_rng(number).uniform(-1.0, 1.0))
+    return depth, float(np.clip(lateral, -most, most))
+
+
+def steer(number: int, scenario: Scenario | None = None) -> dict[str, Any]:
+    """Plan and replay one world; errors in mm."""
+    scenario = scenario or perfect(number)
+    target = draw_target(scenario, number)
+    plan = flexneedle.plan(scenario, target, "steering", seed=number, threads=1)
+    done = flexneedle.insert(scenario, plan, seed=number, controller="open-loop", force=True, threads=1)
+    truth = done.periods[-1].true_tip
+    return {
+        "world": number,
+        "guide": scenario.setup.has_guide,
+        "target_mm": target,
+        "planned_error_mm": plan.error_mm,
+        "claim_error_mm": float(np.hypot(truth[0] - plan.tip_mm[0], truth[1] - plan.tip_mm[1])),
+        "rolls": plan.flips,
+        "converged": plan.converged,
+        "guide_moved_mm": float(np.abs(plan.guide).max()),
+        "seconds": plan.seconds,
+    }
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Markdown: all worlds, those with a guide, those without."""
+    groups = {
+        "all": rows,
+        "with a guide": [row for row in rows if row["guide"]],
+        "without": [row for row in rows if not row["guide"]],
+    }
+    head = (
+        f"| worlds | n | planned to {PLANNED_MM} mm | and the exact needle within {CLAIMED_MM} mm of the claim "
+        "| planned error, median, max | from the claim, median, 95 %, max | rolls, mean, max | s a plan, median |"
+    )
+    return "\n".join(
+        [head, "|---|" + "---:|" * 7, *(line(name, rows) for name, rows in groups.items() if rows)]
+    )
+
+
+def line(name: str, rows: Iterable[dict[str, Any]]) -> str:
+    """A row of the table."""
+    planned, claim, rolls, seconds = (
+        np.array([row[key] for row in rows], dtype=float)
+        for key in ("planned_error_mm", "claim_error_mm", "rolls", "seconds")
+    )
+    both = (planned <= PLANNED_MM) & (claim <= CLAIMED_MM)
+    cells = [
+        name,
+        str(planned.size),
+        str(int((planned <= PLANNED_MM).sum())),
+        str(int(both.sum())),
+        f"{np.median(planned):.4f}, {planned.max():.4f}",
+        f"{np.median(claim):.3f}, {np.quantile(claim, 0.95):.3f}, {claim.max():.3f}",
+        f"{rolls.mean():.2f}, {rolls.max():.0f}",
+        f"{np.median(seconds):.2f}",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the study; exit status 1 if fewer than 95 % of the targets meet both bounds."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--worlds", nargs=2, type=int, default=(100_000, 100), metavar=("FIRST", "COUNT"))
+    parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), metavar="N")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="a row for each world, as JSON")
+    args = parser.parse_args(argv)
+    first, count = args.worlds
+    if count < 1 or first < 0 or first < 100 * TRAINING < first + count:
+        parser.error(
+            f"worlds = {first} {count}: must be 0 or more, at least one, on one side of {100 * TRAINING}"
+        )
+    with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
+        rows = list(pool.map(steer, range(first, first + count)))
+    print(table(rows))
+    for row in sorted(rows, key=lambda row: -row["claim_error_mm"])[:5]:
+        print(
+            f"world {row['world']}: {row['claim_error_mm']:.3f} mm from the claim, {row['rolls']} rolls",
+            file=sys.stderr,
+        )
+    if args.out is not None:
+        args.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    good = sum(row["planned_error_mm"] <= PLANNED_MM and row["claim_error_mm"] <= CLAIMED_MM for row in rows)
+    return 0 if good >= 0.95 * len(rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,78 @@
+"""Whether the guide may move, and who is refused where it may not."""
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.control import mpc
+from flexneedle.control.guide import check_guide, guide_may_move, most_guide_step
+from flexneedle.control.methods import METHODS
+from flexneedle.errors import InputError
+from flexneedle.run.folder import Folder
+from flexneedle.run.recording import Choices, record_insertion
+from flexneedle.simulator import Simulator
+
+PHANTOM = flexneedle.load_scenario("phantom")
+BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
+GUIDE_CONTROLLERS = ("resolved-rate", "broyden-mpc")
+
+
+@pytest.fixture(scope="module")
+def steered():
+    """A plan in which the bevel alone steers."""
+    quick = PHANTOM.with_values({"plan.samples": 32, "plan.iterations": 4, "plan.max_iterations": 4})
+    return flexneedle.plan(quick, (30.0, 0.5), "steering", threads=1)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "strategy", "free"),
+    [(PHANTOM, "manipulation", True), (PHANTOM, "steering", False), (BARE, "manipulation", False)],
+)
+def test_the_guide_may_move_where_there_is_one_and_the_plan_does_not_leave_it_still(scenario, strategy, free):
+    assert guide_may_move(scenario.setup, strategy) is free
+    assert most_guide_step(scenario.setup, strategy) == (0.5 if free else 0.0)
+
+
+@pytest.mark.parametrize("name", list(METHODS))
+def test_only_controllers_of_the_guide_are_refused_without_one(name):
+    check_guide(METHODS[name], PHANTOM.setup, "manipulation")
+    if name not in GUIDE_CONTROLLERS:
+        check_guide(METHODS[name], BARE.setup, "manipulation")
+        check_guide(METHODS[name], PHANTOM.setup, "steering")
+        return
+    with pytest.raises(InputError, match=rf"'{name}': steers with the guide: give setup\.guide_to_skin_mm"):
+        check_guide(METHODS[name], BARE.setup, "manipulation")
+    with pytest.raises(InputError, match=rf"'{name}': .* strategy = 'steering' leaves where it is"):
+        check_guide(METHODS[name], PHANTOM.setup, "steering")
+
+
+@pytest.mark.parametrize("name", GUIDE_CONTROLLERS)
+def test_a_steering_plan_is_refused_before_anything_moves(name, steered):
+    with pytest.raises(InputError, match="leaves where it is: plan with 'manipulation'"):
+        flexneedle.insert(PHANTOM, steered, controller=name, threads=1)
+
+
+def test_the_refusal_comes_before_the_plan(tmp_path):
+    folder = Folder.claim(tmp_path / "run", "run", "insertion", PHANTOM, 0)
+    choices = Choices(0, "steering", controller="resolved-rate")
+
+    def heard(*_):
+        raise AssertionError("planned")
+
+    with pytest.raises(InputError, match="steers with the guide"):
+        record_insertion(folder, PHANTOM, choices, on_iteration=heard, on_period=heard)
+
+
+def test_ce_mpc_leaves_the_guide_where_it_is(steered, along):
+    """With a base clamp that is off, which it would move the guide for otherwise."""
+    state = along(steered, 40, base_y=1.0)
+    choice = mpc.choose(Simulator(PHANTOM, 1), steered, state, flip=False, rng=np.random.default_rng(0))
+    assert choice.steps[3] == 0.0
+    assert choice.spread == 0.0
+
+
+@pytest.mark.parametrize("name", ["ce-mpc", "bevel-only", "open-loop"])
+def test_a_steering_plan_is_carried_out_with_the_guide_still(name, steered):
+    done = flexneedle.insert(PHANTOM, steered, 5000, controller=name, threads=1)
+    assert done.outcome == "done"
+    assert {period.applied[3] for period in done.periods} == {0.0}
