@@ -14,8 +14,7 @@ from flexneedle.run import insertion
 from flexneedle.run.rig import Rig
 from flexneedle.tracking import NoisyTracker
 
-# No observer estimates an axial start error yet.
-PHANTOM = flexneedle.load_scenario("phantom").with_values({"phantom.start_axial_sd_mm": 0.0})
+PHANTOM = flexneedle.load_scenario("phantom")
 STILL = (0.0, 0.0, 0.0, 0.0, -1)
 READING = PHANTOM.tracker.period
 HELD, RESTING = "held", "at rest for the last reading"

@@ -17,7 +17,7 @@ from flexneedle.phantom import PLANTS
 from flexneedle.simulator import Control, Simulator
 from tasks import task_of
 
-# No observer estimates an axial start error yet.
+# Only the default controller estimates an axial start error.
 PHANTOM = flexneedle.load_scenario("phantom").with_values({"phantom.start_axial_sd_mm": 0.0})
 FIELD = ("open-loop", "bevel-only", "resolved-rate", "broyden-mpc")
 WITHOUT_GUIDE = ("open-loop", "bevel-only")

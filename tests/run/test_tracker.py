@@ -16,8 +16,7 @@ from flexneedle.tracking.placement import placed_references
 from flexneedle.tracking.plane import InPlane
 from rooms import STILL, shipped
 
-# No observer estimates an axial start error yet.
-PHANTOM = flexneedle.load_scenario("phantom").with_values({"phantom.start_axial_sd_mm": 0.0})
+PHANTOM = flexneedle.load_scenario("phantom")
 PLATE = shipped("noisy").plate
 
 

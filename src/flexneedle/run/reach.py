@@ -13,6 +13,7 @@ __all__ = ["reach"]
 _SEARCH = {
     "plan.samples": 160,
     "plan.iterations": 25,
+    "plan.max_iterations": 25,
     "plan.energy_weight_per_mj": 0.0,
     "plan.deflection_weight": 0.0,
     "plan.guide_weight": 0.0,

@@ -19,7 +19,7 @@ first_seed = 7
 plan = { samples = 16, iterations = 2 }
 control.ce_mpc = { samples = 8, iterations = 1, horizon = 2 }
 setup.tip_to_skin_mm = 4.0
-phantom = { step_mm = 1.0, contact_spacing_mm = 2.0, element_mm = 2.0, start_axial_sd_mm = 0.0 }
+phantom = { step_mm = 1.0, contact_spacing_mm = 2.0, element_mm = 2.0 }
 
 [[cases]]
 name = "base"
