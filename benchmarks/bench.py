@@ -178,7 +178,9 @@ def measure_threads(repeats: int = 15) -> dict[str, Any]:
 
 def measure_plan() -> dict[str, Any]:
     """Plans of 128 samples and 25 iterations (no early stop), to the scenario's target."""
-    scenario = SCENARIO.with_values({"plan.samples": 128, "plan.iterations": 25, "plan.tolerance": 1e-6})
+    scenario = SCENARIO.with_values(
+        {"plan.samples": 128, "plan.iterations": 25, "plan.max_iterations": 25, "plan.tolerance": 1e-6}
+    )
     plans = [flexneedle.plan(scenario, seed=seed) for seed in range(3)]
     return {
         "plan_s": [plan.seconds for plan in plans],
