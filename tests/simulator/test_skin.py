@@ -1,4 +1,4 @@
-"""Below the skin a free needle is held by little but its tip: what is cut there is resolved, at any step of a command."""
+"""Below the skin a free needle is held by little but its tip: what is cut there is resolved, at any length of a step."""
 
 import numpy as np
 import pytest
