@@ -44,7 +44,7 @@ SCORE = f"mean + 0.25 * 95 % quantile of the true error (mm); an insertion that 
 # What went into a result beside its budget, by method.
 NOTES = {
     "adaptive-mpc": "its structure and the middle of its space come from further insertions, seeds 5000 to 5179 "
-    "(docs/decisions/0009-identify-and-renew.md)",
+    "(docs/decisions/0009-identify-and-search.md)",
 }
 RECORDS = Path(__file__).resolve().parents[1] / "src/flexneedle/run/tuning"
 Settings = dict[str, float]

@@ -52,7 +52,8 @@ class Model(NamedTuple):
     """A needle in layered tissue: bending stiffness (N·mm²), length (mm), bevel offset and length (mm).
 
     curvature: of the free needle (1/mm), for bevel +1; it turns with the bevel. part, zone: length (mm) of the parts
-    of a step down to the depth `zone` (mm); clearance: of the needle in the guide, to either side (mm).
+    of a step down to the depth `zone` (mm); clearance: of the needle in the guide, to either side (mm);
+    tolerance: estimated distance from equilibrium at which a solve ends (mm).
     """
 
     bending_stiffness: float
@@ -65,6 +66,7 @@ class Model(NamedTuple):
     zone: float
     curvature: float = 0.0
     clearance: float = 0.0
+    tolerance: float = 1e-7
 
 
 def tissue_layers(

@@ -35,8 +35,6 @@ A1, A2, G1, G2, B11, B12, B22, STIFFNESS, FORCE, ENERGY, SHARE, FIXED = range(12
 NEW_U, Y, TURN, SHEAR, MOMENT = range(12, 17)
 WORK_ROWS = 17
 
-TOLERANCE_MM = 1e-7
-SLIDE_TOLERANCE_MM = 1e-7
 COUPLED_ITERATIONS = 15
 MAX_ITERATIONS = 100
 
@@ -329,7 +327,7 @@ def _iterate(
     y, turn, force, new_u, stored, error, fraction, reaction = _tip(model, s, tip_x, held, ahead)
     shortening = _sweep_back(model, s, u, w, (tip_x, y, turn, force), count)
     error, fraction = _limit(model, u, w, count, error, fraction)
-    if not coupled and error > TOLERANCE_MM:
+    if not coupled and error > model.tolerance:
         fraction = min(fraction, _line_search(model, s, u, w, count, tip_x, new_u))
     _move_by(model, u, w, count, fraction)
     s[SPRING_U] += fraction * (new_u - s[SPRING_U])
@@ -339,7 +337,7 @@ def _iterate(
     if coupled:
         slide = abs(shortening - s[SHORTENING])
         s[SHORTENING] = shortening
-    elif error <= TOLERANCE_MM:
+    elif error <= model.tolerance:
         s[SHORTENING] = shortening
     return count, fresh, error if fraction == 1.0 else math.inf, slide
 
@@ -389,9 +387,9 @@ def solve(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, held: flo
             s[COUPLING], s[SHORTENING] = 0.0, start
             guess(model, s, u)
         count, fresh, error, slide = _iterate(model, s, rest, u, w, held)
-        if error <= TOLERANCE_MM and slide <= SLIDE_TOLERANCE_MM and _guide_agrees(model, s, rest, w, count):
+        if error <= model.tolerance and slide <= model.tolerance and _guide_agrees(model, s, rest, w, count):
             break
     s[ITERATIONS], s[RESIDUAL] = iteration, max(error, slide)
     finite = math.isfinite(s[TIP_Y]) and math.isfinite(s[SHORTENING])
-    s[CONVERGED] = 1.0 if finite and error <= TOLERANCE_MM and slide <= SLIDE_TOLERANCE_MM else 0.0
+    s[CONVERGED] = 1.0 if finite and error <= model.tolerance and slide <= model.tolerance else 0.0
     return count, fresh

@@ -23,6 +23,7 @@ Floats = NDArray[np.float64]
 _STEPS_WORTH_A_THREAD = 200
 _CHUNKS_A_THREAD = 4
 _CLOSEST_POINTS_MM = 0.1
+_AHEAD_TOLERANCE_MM = 1e-4  # of rollouts without limits
 _ASIDE_MM = 1.0
 
 
@@ -104,7 +105,7 @@ class Simulator:
         """Run each of N sequences from `state`; controls (N, m, 5): db_x, db_y, db_theta, dg_y, flip (−1 or +1).
 
         Equal to repeated `step`, bit by bit; CommandError if any value is out of range. Without `limits` a step
-        may be longer than a command: to look far ahead with few steps.
+        may be longer than a command, and each is solved to 1e-4 mm only: to look far ahead with little work.
         """
         return Rollout(*self._rollout(state, controls, deflection=False, limits=limits)[:3])
 
@@ -189,9 +190,10 @@ class Simulator:
         out = np.zeros((n, m, 3)), np.zeros((n, m)), np.zeros((n, m), dtype=np.bool_)
         spread = np.zeros((n, m) if deflection else (0, 0))
         start = state.scalars, state.rest, state.compression
+        constants = self._model if limits else self._model._replace(tolerance=_AHEAD_TOLERANCE_MM)
 
         def run(first: int, last: int) -> None:
-            insertion.rollout(self._model, *start, u, first, last, *out, spread)
+            insertion.rollout(constants, *start, u, first, last, *out, spread)
 
         threads = min(self.threads, n * m // _STEPS_WORTH_A_THREAD)
         if threads <= 1:
