@@ -228,6 +228,14 @@ class Identified:
         slope[RUN_OUT] = self.state.bevel
         return float(np.sqrt(slope @ self.covariance @ slope + self.axial_variance))
 
+    @property
+    def roll_sd(self) -> float:
+        """Standard deviation (mm) of how far the tip goes to the side if the bevel rolls now."""
+        slope = np.zeros(self.parameters.size)
+        slope[BEND] = 2.0 * self._slopes(self.state.tip[:1])[0, BEND]
+        slope[RUN_OUT] = 2.0
+        return float(np.sqrt(slope @ self.covariance @ slope))
+
     def _slopes(self, depth: Floats) -> Floats:
         """Derivatives (n, K) of the tip's lateral position at depths (n,), mm, but for the run-out's, from the curves."""
         step = self.grid[1] - self.grid[0]

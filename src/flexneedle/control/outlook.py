@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from flexneedle.control.identification import Identified
 from flexneedle.control.prior import RUN_OUT
 
-__all__ = ["Outlook"]
+__all__ = ["UNCORRECTED", "Outlook"]
 
 Floats = NDArray[np.float64]
-_BLIND = 5.0  # control steps before the target in which a correction takes no effect
+UNCORRECTED = 5.0
+"""Control steps before the target in which a correction takes no effect."""
 _UNEXPLAINED = 2.0  # standard deviations of the mean of a control step's readings
 
 
@@ -59,7 +60,7 @@ class Outlook:
         """Standard deviation (mm) of the miss at the depth `target` (mm), where `miss` is predicted (mm)."""
         step = estimate.nominal.scenario.setup.max_advance_mm
         end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
-        to_come = (self.grid > estimate.state.tip[0]) & (self.grid <= target - _BLIND * step)
+        to_come = (self.grid > estimate.state.tip[0]) & (self.grid <= target - UNCORRECTED * step)
         slopes = self.curves[:, to_come]
         then = estimate.precision + slopes @ slopes.T / estimate.reading_variance
         known = end @ np.linalg.solve(then, end) + _UNEXPLAINED**2 * estimate.reading_variance

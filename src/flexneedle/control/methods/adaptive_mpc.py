@@ -20,8 +20,8 @@ from flexneedle.control.estimate import Estimate, Floats
 from flexneedle.control.forecast import probability_beyond
 from flexneedle.control.guide import guide_may_move
 from flexneedle.control.identification import Identification, Identified
-from flexneedle.control.interface import Decision, Method, Task
-from flexneedle.control.outlook import Outlook
+from flexneedle.control.interface import Decision, Method, Task, travel_left
+from flexneedle.control.outlook import UNCORRECTED, Outlook
 from flexneedle.control.path import Ahead, Path, of_plan, proposals
 from flexneedle.planning import Found, Outcome, Search, Term, Variables, best, terms
 
@@ -97,13 +97,17 @@ def _terms(task: Task, fitted: Identified, scale: float) -> tuple[Term, ...]:
     guided = guide_may_move(task.scenario.setup, task.plan.strategy)
     energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
     line = settings.line_weight if guided else settings.unguided_line_weight
+    reach = UNCORRECTED * task.scenario.setup.max_advance_mm
+    late = partial(terms.late_rolls, depth=target[0], length=reach)
+    share = min(1.0, travel_left(task.scenario, task.plan, fitted.state) / target[0])  # of the way
     start = float(fitted.tip[0]), float(fitted.tip[1])
     return (
         Term("miss", 1.0, partial(terms.miss, target=target)),
         Term("energy", energy / scale, terms.energy_at_end),
         Term("line", line, partial(terms.distance_from_line, start=start, target=target)),
-        Term("slope", settings.slope_weight_mm, terms.guide_slope),
+        Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
         Term("rolls", settings.roll_weight_mm, terms.rolls),
+        Term("late", settings.late_roll_weight * fitted.roll_sd, late),
     )
 
 
