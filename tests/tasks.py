@@ -12,5 +12,6 @@ def task_of(simulator, plan, controller=DEFAULT):
 
 
 def begun_with(simulator, bevel=1, controller=DEFAULT):
-    """A task whose plan is known by the bevel's side alone: enough for an observer."""
-    return task_of(simulator, SimpleNamespace(bevel=bevel), controller)
+    """A task whose plan has no more than the bevel's side and a target: enough for an observer."""
+    target = simulator.scenario.target.position
+    return task_of(simulator, SimpleNamespace(bevel=bevel, target=target), controller)

@@ -172,7 +172,7 @@ def test_a_whole_insertion_into_the_exact_plant_ends_done(quick_plan, name, limi
 def test_every_controller_finishes_on_every_plant_with_its_commands_carried_out(quick_plan, name, plant):
     """What a motor leaves out of a step is less than its resolution; nothing else is cut from a command."""
     few = {"control.ce_mpc.samples": 8, "control.ce_mpc.iterations": 1}
-    few |= {f"control.adaptive_mpc.{key}": value for key, value in (("samples", 8), ("iterations", 1))}
+    few |= {f"control.adaptive_mpc.{key}": value for key, value in (("samples", 12), ("iterations", 1))}
     scenario = PHANTOM.with_values(few)
     done = flexneedle.insert(scenario, quick_plan, 5001, controller=name, phantom=plant, threads=1)
     assert (done.outcome, done.controller, done.phantom) == ("done", name, plant)

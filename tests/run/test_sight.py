@@ -22,6 +22,8 @@ class Belief:
     def __init__(self, heard=0):
         self.heard = heard
 
+    tip_sd = 0.0
+
     def tip_at(self, _time):
         return TIP
 

@@ -51,7 +51,7 @@ class Decision:
 
 def travel_left(scenario: Scenario, plan: PlanRecord, state: State) -> float:
     """Advance (mm) to the target depth, or to the end of the stroke if that comes first."""
-    stroke_left = scenario.start_base_x + scenario.setup.stroke_mm - float(state.base[0])
+    stroke_left = scenario.setup.stroke_mm - float(state.travel[0])  # as commanded, wherever the base began
     return max(0.0, min(plan.target[0] - float(state.tip[0]), stroke_left))
 
 

@@ -54,8 +54,8 @@ def settle(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, held: fl
 def _end_of_part(model: Model, s: Floats, advance: float, done: float) -> float:
     """Share of a step at which its next part ends, `done` being the share so far.
 
-    Down to the zone below the skin parts end where the tip is expected at a multiple of the part's length: the state stays
-    a continuous function of the command.
+    Down to the zone below the skin parts end where the tip is expected at a multiple of the part's length: the state
+    stays a continuous function of the command.
     """
     x = s[nd.TIP_X]
     if advance <= 0.0 or x >= model.zone or x + (1.0 - done) * advance <= 0.0:

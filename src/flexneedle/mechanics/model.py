@@ -13,7 +13,7 @@ CONTACT, ESSENTIAL, GUIDE = (
     0,
     1,
     2,
-)  # kinds of node: a tissue spring, a prescribed lateral position, that of the guide
+)  # kinds of node: a tissue spring, a prescribed lateral position, the guide's
 # Edges of the intervals of the contact points just below the skin, in spacings. There the free needle is held by little
 # but its tip: with even intervals and steps a thin one ends up to 0.3 mm off, with these 0.04 mm (decision 0014).
 _SKIN_EDGES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5)

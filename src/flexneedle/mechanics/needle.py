@@ -27,9 +27,7 @@ FRONT, REST, SPRING_U, CUT_X, CUT_Y, CUT_TURN, CUT_FRONT, CUT_REST = range(10, 1
 TIP_FORCE, TIP_REACTION, SPRING_ENERGY, BASE_SHEAR, BASE_MOMENT = range(18, 23)
 COUPLING, PATH_Y, ITERATIONS, RESIDUAL, CONVERGED = range(23, 28)
 CLAMP_Y, CLAMP_TURN, CLAMP_X = range(28, 31)  # the part of base y, turn and x that no command moved
-GUIDE_SIDE = (
-    31  # of a guide with clearance: 1 the needle bears on its upper wall, −1 on its lower one, 0 on none
-)
+GUIDE_SIDE = 31  # the wall of a guide with clearance that the needle bears on: 1 upper, −1 lower, 0 none
 STATE_SIZE = 32
 
 # Rows of the work array, one column a node. A1, G1, B11, B12 are those before an essential node, all else after.
@@ -43,10 +41,21 @@ MAX_ITERATIONS = 100
 
 @inner
 def _prescribed(model: Model, s: Floats, rest: Floats, i: int) -> float:
-    """Lateral position (mm) that an essential node has; NaN at a guide with clearance that the needle does not touch."""
+    """Lateral position (mm) of an essential node; NaN at a guide with clearance that the needle does not touch."""
     if model.nodes.kind[i] != GUIDE or model.clearance <= 0.0:
         return float(rest[i])
     return float(rest[i] + s[GUIDE_SIDE] * model.clearance) if s[GUIDE_SIDE] != 0.0 else math.nan
+
+
+@inner
+def _contact(model: Model, u: Floats, i: int, behind: float) -> tuple[float, float, float]:
+    """Force (N), stiffness (N/mm) and energy (mJ) of a contact so far (mm) behind the tip, over which it grows in."""
+    nodes = model.nodes
+    force, k, energy = contact_law(nodes.alpha[i], nodes.height[i], nodes.force[i], nodes.energy[i], u[i])
+    if behind < nodes.reach[i]:
+        ramp = behind / nodes.reach[i]
+        force, k, energy = force * ramp, k * ramp, energy * ramp
+    return force, k, energy
 
 
 @inner
@@ -83,12 +92,7 @@ def _sweep_out(
                 b22 -= gain * b12
                 a1, g1, b11, b12 = w[FIXED, i], 0.0, 0.0, 0.0
         else:
-            force, k, energy = contact_law(
-                nodes.alpha[i], nodes.height[i], nodes.force[i], nodes.energy[i], u[i]
-            )
-            if tip_x - x < nodes.reach[i]:
-                ramp = (tip_x - x) / nodes.reach[i]
-                force, k, energy = force * ramp, k * ramp, energy * ramp
+            force, k, energy = _contact(model, u, i, tip_x - x)
             share, fixed = 0.0, rest[i]
             if i >= fresh:
                 share = (x - s[CUT_X]) * per_length

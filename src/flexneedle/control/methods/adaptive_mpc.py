@@ -103,7 +103,7 @@ def _terms(task: Task, fitted: Identified, scale: float) -> tuple[Term, ...]:
     start = float(fitted.tip[0]), float(fitted.tip[1])
     return (
         Term("miss", 1.0, partial(terms.miss, target=target)),
-        Term("energy", energy / scale, terms.energy_at_end),
+        Term("energy", energy / scale if scale > 0.0 else 0.0, terms.energy_at_end),
         Term("line", line, partial(terms.distance_from_line, start=start, target=target)),
         Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
         Term("rolls", settings.roll_weight_mm, terms.rolls),

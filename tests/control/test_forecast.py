@@ -1,0 +1,89 @@
+"""What follows from a predicted miss: its probability, a warning, a hold."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import norm
+
+import flexneedle
+from flexneedle.control.forecast import hopeless, probability_beyond, warning
+from flexneedle.control.interface import Decision
+
+CONTROL = flexneedle.load_scenario("phantom").control
+STILL = (0.0, 0.0, 0.0, 0.0, -1)
+LIMIT, SURE = CONTROL.miss_limit_mm, norm.ppf(CONTROL.miss_confidence)
+
+
+def predicting(miss, sd):
+    """A decision that predicts a miss (mm)."""
+    return Decision(STILL, "", miss=miss, miss_sd=sd)
+
+
+@given(st.floats(0.0, 10.0), st.floats(-20.0, 20.0), st.floats(1e-3, 10.0))
+def test_the_probability_is_that_of_a_normal_miss_on_either_side(limit, miss, sd):
+    expected = norm.cdf(-limit, miss, sd) + norm.sf(limit, miss, sd)
+    assert probability_beyond(limit, miss, sd) == pytest.approx(expected, rel=1e-9, abs=1e-15)
+
+
+@pytest.mark.parametrize(("miss", "beyond"), [(1.99, 0.0), (-1.99, 0.0), (2.01, 1.0), (-2.01, 1.0)])
+def test_a_miss_that_is_certain_is_beyond_the_limit_or_not(miss, beyond):
+    assert probability_beyond(2.0, miss, 0.0) == beyond
+    assert probability_beyond(2.0, miss, 1e-9) == pytest.approx(beyond)
+
+
+@pytest.mark.parametrize(("miss", "sd"), [(math.nan, math.nan), (math.nan, 1.0), (9.0, math.nan)])
+def test_what_is_not_predicted_holds_and_warns_of_nothing(miss, sd):
+    assert probability_beyond(LIMIT, miss, sd) == 0.0
+    assert hopeless(predicting(miss, sd), CONTROL) == ""
+    assert warning(predicting(miss, sd)) == ""
+
+
+def test_a_decision_predicts_nothing_by_default():
+    assert hopeless(Decision(STILL, ""), CONTROL) == warning(Decision(STILL, "")) == ""
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("sd", [0.05, 0.4])
+def test_the_needle_is_held_from_the_confidence_on(side, sd):
+    """Where the limit is as many standard deviations away as the confidence asks for."""
+    bound = LIMIT + SURE * sd
+    assert hopeless(predicting(side * (bound - 1e-6), sd), CONTROL) == ""
+    held = hopeless(predicting(side * (bound + 1e-6), sd), CONTROL)
+    assert held.startswith(f"no path to the target found: predicted miss {side * bound:+.2f} ± {sd:.2f} mm")
+    assert "control.miss_limit_mm = 2 " in held
+    assert "(limit 0.95)" in held
+    assert held.endswith("use --force to insert anyway")
+
+
+def test_limit_and_confidence_are_the_scenarios():
+    strict = flexneedle.load_scenario("phantom").with_values(
+        {"control.miss_limit_mm": 0.5, "control.miss_confidence": 0.5}
+    )
+    assert hopeless(predicting(0.51, 0.3), CONTROL) == ""
+    assert "control.miss_limit_mm = 0.5 " in hopeless(predicting(0.51, 0.3), strict.control)
+
+
+def test_who_is_unsure_is_not_held_but_warned():
+    """A miss of 3 mm that may as well be none."""
+    decision = predicting(3.0, 5.0)
+    assert hopeless(decision, CONTROL) == ""
+    assert warning(decision).startswith(
+        "predicted miss +3.00 ± 5.00 mm: beyond 1 mm with a probability of 0.8"
+    )
+
+
+@given(st.floats(-5.0, 5.0), st.floats(1e-3, 3.0))
+def test_whoever_is_held_is_warned_too(miss, sd):
+    decision = predicting(miss, sd)
+    assert warning(decision) or not hopeless(decision, CONTROL)
+
+
+@given(st.floats(0.0, 5.0), st.floats(1e-3, 3.0), st.floats(0.01, 2.0))
+def test_a_larger_miss_is_no_less_likely_to_be_warned_of(miss, sd, more):
+    assert warning(predicting(miss + more, sd)) or not warning(predicting(miss, sd))
+
+
+def test_no_warning_of_a_good_path():
+    assert warning(predicting(0.05, 0.1)) == ""

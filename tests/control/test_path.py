@@ -1,0 +1,299 @@
+"""The path in hand, what may replace it, and its first step: within the limits, and nothing in hand is lost."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+import flexneedle
+from flexneedle.control.path import KNOTS, SLOTS, Ahead, Path, of_plan, proposals
+from flexneedle.simulator import Control, Simulator
+from tasks import task_of
+
+PHANTOM = flexneedle.load_scenario("phantom")
+BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
+STEP, REACH = PHANTOM.setup.max_guide_step_mm, PHANTOM.setup.max_guide_travel_mm
+
+
+def ahead_of(plan, state, path=None, scenario=PHANTOM):
+    """The way ahead of a state, by default on the plan's path."""
+    simulator = Simulator(scenario, threads=1)
+    return Ahead.of(task_of(simulator, plan), replace(state, scenario=scenario), path or of_plan(plan))
+
+
+def level(*rolls, guide=0.0):
+    """A path with the guide at one place (mm)."""
+    return Path(np.array([-28.5, 40.0]), np.full(2, guide), rolls)
+
+
+def started(x, guide=0.0, simulator=None):
+    """A needle pushed to x (mm) with its guide at a place (mm)."""
+    simulator = simulator or Simulator(PHANTOM, threads=1)
+    state = simulator.start()
+    for _ in range(3):
+        rows = [[x - state.tip[0], 0.0, 0.0, guide - state.guide, -1.0]]
+        state = simulator.replay(state, rows)[0]
+    return state
+
+
+# ---- the plan's path
+
+
+def test_it_begins_as_the_plans(quick_plan):
+    """The guide at every depth, the bevel rolled where the plan rolls it."""
+    turning = quick_plan.controls.copy()
+    turning[:, 4] = -1.0
+    turning[[12, 40, 60], 4] = 1.0
+    path = of_plan(replace(quick_plan, controls=turning))
+    np.testing.assert_array_equal(np.interp(quick_plan.tips[:, 0], path.depth, path.guide), quick_plan.guide)
+    assert path.rolls == tuple(quick_plan.tips[[12, 40, 60], 0])
+
+
+def test_of_more_rolls_than_fit_the_first_are_kept(quick_plan):
+    turning = quick_plan.controls.copy()
+    turning[:, 4] = 1.0
+    assert of_plan(replace(quick_plan, controls=turning)).rolls == tuple(quick_plan.tips[:SLOTS, 0])
+
+
+def test_depths_ascend_where_a_plan_stands_still(quick_plan):
+    """Steps without an advance, as where only the guide is moved."""
+    tips, guide = quick_plan.tips.copy(), quick_plan.guide
+    tips[5:8, 0] = tips[4, 0]
+    path = of_plan(replace(quick_plan, tips=tips))
+    assert (np.diff(path.depth) > 0.0).all()
+    assert path.guide.size == guide.size - 3
+
+
+# ---- sample 0
+
+
+@pytest.mark.parametrize("steps", [0, 20, 45, 66])
+def test_the_sample_that_corrects_nothing_is_the_path_in_hand(quick_plan, along, steps):
+    """The same guide at the ends of the steps, the same rolls."""
+    state = along(quick_plan, steps)
+    x = float(state.tip[0])
+    path = replace(of_plan(quick_plan), rolls=(x + 0.35 * (40.0 - x), x + 0.7 * (40.0 - x)))
+    ahead = ahead_of(quick_plan, state, path)
+    controls, depth = ahead.controls(ahead.in_hand[None])
+    guide = state.guide + np.cumsum(controls[0, :, 3])
+    np.testing.assert_allclose(guide, np.interp(depth[0, 1:], path.depth, path.guide), atol=2e-3)
+    kept = ahead.corrected(ahead.in_hand)
+    assert kept.rolls == pytest.approx(path.rolls)
+    again = ahead_of(quick_plan, state, kept)
+    np.testing.assert_allclose(again.controls(again.in_hand[None])[0], controls, atol=1e-12)
+
+
+def test_what_is_found_is_the_path_in_hand_of_the_next_period(quick_plan, along):
+    """Any sample, made the path in hand, is the sample that corrects nothing."""
+    state = along(quick_plan, 30)
+    ahead = ahead_of(quick_plan, state)
+    for z in proposals(ahead, 48, np.random.default_rng(2)):
+        after = ahead_of(quick_plan, state, ahead.corrected(z))
+        np.testing.assert_allclose(
+            after.controls(after.in_hand[None])[0][:, :, [0, 3]].sum(axis=1),
+            ahead.controls(z[None])[0][:, :, [0, 3]].sum(axis=1), atol=1e-9,
+        )  # fmt: skip
+        flips = [
+            np.flatnonzero(each.controls(one[None])[0][0, :, 4] > 0.0)
+            for each, one in ((after, after.in_hand), (ahead, z))
+        ]
+        np.testing.assert_array_equal(*flips)
+
+
+# ---- samples
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    x=st.floats(-25.0, 39.9),
+    guide=st.floats(-1.0, 1.0),
+    offset=st.floats(-9.0, 9.0),
+)
+@hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
+def test_every_sample_within_the_bounds_keeps_every_limit(quick_plan, seed, x, guide, offset):
+    """Wherever the path in hand has the guide, in or out of reach."""
+    state = started(x, guide * REACH)
+    path = level(x + 3.0, 35.0, guide=offset)
+    ahead = ahead_of(quick_plan, state, path)
+    lower, upper = ahead.bounds
+    z = np.random.default_rng(seed).uniform(lower, upper, (40, lower.size))
+    z[::3, : KNOTS.size] = 0.0
+    z[::4, -1] = z[::4, -2]  # two rolls at one depth
+    controls, depth = ahead.controls(z)
+    advance = controls[:, :, 0]
+    assert (advance >= 0.0).all()
+    np.testing.assert_allclose(advance.sum(axis=1), 40.0 - state.tip[0], atol=1e-9)
+    np.testing.assert_allclose(np.diff(depth, axis=1), advance, atol=1e-12)
+    place = state.guide + np.cumsum(controls[:, :, 3], axis=1)
+    assert np.abs(place).max() <= REACH + 1e-9
+    assert (np.abs(controls[:, :, 3]) <= STEP * advance / PHANTOM.setup.max_advance_mm + 1e-9).all()
+    assert set(np.unique(controls[:, :, 4])) <= {-1.0, 1.0}
+    inside = z[:, KNOTS.size :] < 0.5 * (ahead.depth[-1] + ahead.depth[-2])  # others are too late for a step
+    np.testing.assert_array_equal((controls[:, :, 4] > 0.0).sum(axis=1) % 2, inside.sum(axis=1) % 2)
+
+
+@pytest.mark.parametrize("guide", [0.0, 1.5])
+def test_the_end_is_continuous_in_the_depth_of_a_roll(quick_plan, guide):
+    """From here to the target: no jump where the roll goes from one step of the rollout to the next."""
+    simulator = Simulator(PHANTOM, threads=1)
+    state = started(12.0, guide)
+    ahead = ahead_of(quick_plan, state, level(guide=guide))
+    depths = np.arange(12.6, 39.0, 0.02)
+    z = np.tile(ahead.in_hand, (depths.size, 1))
+    z[:, KNOTS.size] = depths
+    ends = simulator.rollout(state, ahead.controls(z)[0], limits=False).tips[:, -1, 1]
+    assert np.ptp(ends) > 1.0
+    assert np.abs(np.diff(ends)).max() < 0.01 * np.ptp(ends)
+
+
+def test_a_roll_is_made_at_its_own_depth(quick_plan):
+    ahead = ahead_of(quick_plan, started(10.0), level())
+    z = ahead.in_hand[None].repeat(3, axis=0)
+    z[:, KNOTS.size] = 11.0, 17.3, 30.01
+    controls, depth = ahead.controls(z)
+    rolls = [depth[k, :-1][controls[k, :, 4] > 0.0].tolist() for k in range(3)]
+    assert np.ravel(rolls) == pytest.approx([11.0, 17.3, 30.01])
+
+
+def test_two_rolls_at_one_place_cancel(quick_plan):
+    ahead = ahead_of(quick_plan, started(10.0), level(20.0, 20.0))
+    assert (ahead.controls(ahead.in_hand[None])[0][:, :, 4] < 0.0).all()
+    assert ahead.corrected(ahead.in_hand).rolls == ()
+
+
+def test_a_guide_that_may_not_move_is_not_moved(quick_plan):
+    """None, or one that steering leaves where it is."""
+    for plan, scenario in ((quick_plan, BARE), (replace(quick_plan, strategy="steering"), PHANTOM)):
+        state = started(10.0, simulator=Simulator(scenario, threads=1))
+        ahead = ahead_of(plan, state, scenario=scenario)
+        controls, _ = ahead.controls(proposals(ahead, 60, np.random.default_rng(0)))
+        np.testing.assert_array_equal(controls[:, :, 3], 0.0)
+        assert ahead.first(ahead.path)[0][3] == 0.0
+
+
+def test_base_motion_of_the_plan_is_followed(quick_plan):
+    """Where the plan has the base at a depth, in the samples and in the command."""
+    moving = quick_plan.controls.copy()
+    moving[:60, 1:3] = 0.02, 1e-4
+    plan, state = replace(quick_plan, controls=moving), started(float(quick_plan.tips[30, 0]))
+    simulator = Simulator(PHANTOM, threads=1)
+    state = simulator.replay(state, [[0.0, 0.6, 30e-4, 0.0, -1.0]])[0]
+    ahead = ahead_of(plan, state)
+    assert ahead.first(ahead.path)[0][1:3] == pytest.approx((0.02, 1e-4), rel=0.02)
+    controls, _ = ahead.controls(ahead.in_hand[None])
+    total = controls[0, :, 1:3].sum(axis=0)
+    np.testing.assert_allclose(total, [30 * 0.02, 30 * 1e-4], rtol=1e-6)
+
+
+# ---- proposals
+
+
+@pytest.mark.parametrize("rolls", [(), (20.0,), (15.0, 20.0, 25.0, 30.0)])
+@pytest.mark.parametrize("scenario", [PHANTOM, BARE], ids=["guide", "bare"])
+def test_proposals_are_around_the_path_in_hand_which_is_the_first(quick_plan, rolls, scenario):
+    state = started(10.0, simulator=Simulator(scenario, threads=1))
+    ahead = ahead_of(quick_plan, state, level(*rolls), scenario)
+    z = proposals(ahead, 96, np.random.default_rng(1))
+    lower, upper = ahead.bounds
+    assert z.shape == (96, KNOTS.size + SLOTS)
+    np.testing.assert_array_equal(z[0], ahead.in_hand)
+    assert ((z >= lower) & (z <= upper)).all()
+    moved = np.abs(z - ahead.in_hand) > 0.0
+    guide, bevel = moved[:, : KNOTS.size].any(axis=1), moved[:, KNOTS.size :].any(axis=1)
+    if scenario is PHANTOM:
+        assert (guide & ~bevel).any()
+        assert not rolls or (guide & bevel).any()
+    assert bevel.any()
+    new_pair = (z[:, KNOTS.size :] < 40.0).sum(axis=1) >= len(rolls) + 2
+    assert new_pair.any() is (np.True_ if len(rolls) + 2 <= SLOTS else np.False_)
+    np.testing.assert_array_equal(z, proposals(ahead, 96, np.random.default_rng(1)))
+
+
+# ---- the first step
+
+
+def carried_out(plan, path, state, simulator):
+    """Depths at which the bevel rolls, the advances, and the state at the target, the model carrying out the path."""
+    rolls, advances, task = [], [], task_of(simulator, plan)
+    for _ in range(200):
+        ahead = Ahead.of(task, state, path)
+        if ahead.left <= 1e-9:
+            return rolls, advances, state, path
+        command, path = ahead.first(path)
+        if command[4] > 0.0:
+            rolls.append(float(state.tip[0]))
+        advances.append(command[0])
+        state = simulator.step(state, Control.from_row(command))
+    raise AssertionError("it never gets there")
+
+
+@pytest.mark.parametrize(
+    "rolls", [(), (20.0,), (10.0001,), (12.03, 12.4, 12.9), (10.5, 17.77, 31.0, 39.5), (-20.0, 15.0)]
+)
+def test_rolls_are_executed_once_at_their_depth(quick_plan, rolls):
+    """Within a tenth of a control step; of those that the tip has passed one is made at once."""
+    simulator = Simulator(PHANTOM, threads=1)
+    made, _, end, left = carried_out(quick_plan, level(*rolls), started(10.0), simulator)
+    assert made == pytest.approx(np.maximum(rolls, 10.0).tolist(), abs=0.1 * PHANTOM.setup.max_advance_mm)
+    assert left.rolls == ()
+    assert end.bevel == (-1) ** len(rolls)
+
+
+def test_two_rolls_that_are_due_are_none(quick_plan):
+    """They would bring the bevel back to its side; both are over."""
+    ahead = ahead_of(quick_plan, started(10.0), level(9.0, 10.01, 25.0))
+    command, after = ahead.first(ahead.path)
+    assert command[4] == -1
+    assert after.rolls == (25.0,)
+
+
+def test_the_advance_ends_where_the_next_roll_is_due(quick_plan):
+    for roll, advance in ((10.6, 0.6), (10.3, 0.3), (11.0, 1.0), (11.4, 1.0), (39.0, 1.0)):
+        ahead = ahead_of(quick_plan, started(10.0), level(roll))
+        command, after = ahead.first(ahead.path)
+        assert command[0] == pytest.approx(advance, abs=1e-6)
+        assert (command[4], after.rolls) == (-1, (roll,))
+
+
+def test_every_step_is_the_longest_but_before_rolls_and_at_the_end(quick_plan):
+    simulator = Simulator(PHANTOM, threads=1)
+    _, advances, end, _ = carried_out(quick_plan, level(20.25), started(10.0), simulator)
+    assert end.tip[0] == pytest.approx(40.0, abs=1e-6)
+    short = [advance for advance in advances if advance < 1.0 - 1e-9]
+    assert len(short) <= 4
+    assert min(advances) > 0.0
+
+
+@pytest.mark.parametrize("left", [0.7, 0.02, 1e-6])
+def test_the_last_advance_ends_at_the_target_depth(quick_plan, left):
+    state = started(20.0)
+    near = replace(quick_plan, target=(float(state.tip[0]) + left, 5.0))
+    ahead = ahead_of(near, state, level())
+    assert ahead.first(ahead.path)[0][0] == pytest.approx(left, rel=1e-6)
+
+
+def test_at_the_depth_nothing_moves(quick_plan):
+    state = started(20.0)
+    past = replace(quick_plan, target=(float(state.tip[0]) - 0.1, 9.0))
+    ahead = ahead_of(past, state, level())
+    controls, _ = ahead.controls(proposals(ahead, 24, np.random.default_rng(0)))
+    np.testing.assert_allclose(controls[:, :, :4], 0.0, atol=1e-12)
+    assert ahead.first(ahead.path)[0][:4] == pytest.approx((0.0, 0.0, 0.0, 0.0), abs=1e-12)
+
+
+def test_the_stroke_ends_the_advance(quick_plan):
+    short = PHANTOM.with_values({"setup.stroke_mm": 48.9, "target.depth_mm": 10.0})
+    state = started(20.0)
+    ahead = ahead_of(quick_plan, state, level(), short)
+    assert ahead.first(ahead.path)[0][0] == pytest.approx(48.9 - float(state.travel[0]), abs=1e-9)
+
+
+@pytest.mark.parametrize("wanted", [4.0, -4.0])
+def test_a_guide_far_from_its_path_comes_back_as_fast_as_it_may(quick_plan, wanted):
+    ahead = ahead_of(quick_plan, started(10.0), level(guide=wanted))
+    assert ahead.first(ahead.path)[0][3] == pytest.approx(np.sign(wanted) * STEP)
+    controls, _ = ahead.controls(ahead.in_hand[None])
+    assert np.abs(np.cumsum(controls[0, :, 3])).max() == pytest.approx(min(abs(wanted), REACH))

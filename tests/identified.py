@@ -1,0 +1,161 @@
+"""Needles of the model's own kind with other constants, followed by the observer that fits the model."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+import flexneedle
+from flexneedle.control.adaptive_settings import AdaptiveMpc
+from flexneedle.control.identification import Identification
+from flexneedle.control.prior import BASE_TURN, BASE_Y, BEND, BEVEL, CLEARANCE, MODULUS, RUN_OUT
+from flexneedle.ports import Sample
+from flexneedle.simulator import Control, Learnt, Simulator
+from tasks import begun_with
+
+PHANTOM = flexneedle.load_scenario("phantom")
+QUIET = PHANTOM.with_values(
+    {
+        "tracker.jitter_mm": 1e-3, "control.adaptive_mpc.model_sd": 0.0,
+        "control.adaptive_mpc.least_model_sd_mm": 3e-3,
+    }
+)  # fmt: skip
+TURNS = (20, 40, 52)  # moves that turn the bevel, the first in air
+LAYERS = len(PHANTOM.tissue)
+SHIFT = MODULUS + LAYERS
+CELLS = SHIFT + LAYERS - 1
+OWN = AdaptiveMpc()
+WAVES = tuple(
+    (1.0 + 0.5 * np.sin(0.45 * np.arange(15))).tolist()
+)  # factors on the modulus in cells of 2.5 mm
+
+
+def commands(count):
+    """Advance by 1 mm a move; the guide goes here and there."""
+    guide = 0.12 * np.sin(0.35 * np.arange(count)) + 0.05
+    return [(1.0, 0.0, 0.0, float(guide[k]), 1 if k in TURNS else -1) for k in range(count)]
+
+
+@dataclass(frozen=True)
+class Needle:
+    """What a needle of the model's kind, and its tissue, have of their own."""
+
+    base_y: float = 0.0
+    base_turn: float = 0.0
+    bend: float = 0.0
+    run_out: float = 0.0
+    modulus: tuple[float, ...] = (1.0, 1.0)
+    shift: tuple[float, ...] = (0.0,)
+    variation: tuple[float, ...] = field(default=(1.0,), repr=False)
+    bevel: float = 1.0
+    clearance: float = OWN.clearance_mm
+    base_x: float = 0.0
+
+    def inserted(self, scenario, rows):
+        """States before and after each row, stepped one by one."""
+        simulator = self.simulator(scenario)
+        start = Simulator(scenario, 1).start()
+        base_x = float(start.base[0]) + self.base_x
+        state = start.believing(base_x=base_x, base_y=self.base_y, base_turn=self.base_turn)
+        states = [simulator.step(state, Control())]
+        for row in rows:
+            states.append(simulator.step(states[-1], Control.from_row(row)))
+        return states
+
+    def simulator(self, scenario):
+        """The simulator with this needle's constants."""
+        tissue = np.array(self.shift), np.array(self.modulus), 2.5, np.array(self.variation)
+        return Simulator(scenario, threads=1).adapted(Learnt(*tissue, self.bevel, self.bend, self.clearance))
+
+    def seen(self, state):
+        """Tip (x, y) as a tracker sees it."""
+        return np.add(state.tip[:2], [0.0, self.run_out * state.bevel])
+
+
+NEEDLES = {
+    "base offset": Needle(base_y=0.5),
+    "base turn": Needle(base_turn=-3e-3),
+    "bend": Needle(bend=0.6),
+    "run-out": Needle(run_out=-0.15),
+    "modulus": Needle(modulus=(1.6, 1.5)),
+    "bevel": Needle(bevel=1.4),
+    "clearance": Needle(clearance=0.12),
+    "modulus along the depth": Needle(variation=WAVES),
+    "all": Needle(-0.4, 2e-3, -0.4, 0.1, (0.8, 1.3), (1.3,), WAVES, 0.7),
+}
+
+
+def readings(needle, before, after, start, count, noise, rng):
+    """Of an even move of one second; a bevel turns before its move, and the run-out with it."""
+    parts = (np.arange(count) + 1) / count
+    out = needle.seen(after) - after.tip[:2]
+    first, last = before.tip[:2] + out, after.tip[:2] + out
+    points = [first + part * (last - first) + rng.normal(0.0, noise, 2) for part in parts]
+    return [Sample(float(start + part), *point.tolist()) for part, point in zip(parts, points, strict=True)]
+
+
+def followed(needle, count, *, scenario=QUIET, noise=0.0, late=0, threads=1, per_move=2):
+    """The belief after so many moves, the readings coming so many moves late; the needle's states."""
+    rows, rng = commands(count), np.random.default_rng(2)
+    states = needle.inserted(scenario, rows)
+    estimate = Identification().begin(begun_with(Simulator(scenario, threads), 1))
+    batches = [readings(needle, states[k], states[k + 1], k, per_move, noise, rng) for k in range(len(rows))]
+    for k, row in enumerate(rows):
+        estimate = estimate.move(row, k, k + 1.0)
+        if k >= late:
+            estimate = estimate.observe(batches[k - late])
+    for batch in batches[count - late :] if late else ():
+        estimate = estimate.observe(batch)
+    return estimate, states
+
+
+def ahead(estimate, needle, states, scenario=QUIET, steps=8):
+    """Errors (mm) of the seen tip after some steps on, of the belief and of the uncorrected model; no readings."""
+    nominal, own = Simulator(scenario, threads=1), needle.simulator(scenario)
+    naive = nominal.start()
+    for row in commands(len(states) - 1):
+        naive = nominal.step(naive, Control.from_row(row))
+    truth = states[-1]
+    for k in range(steps):
+        row = (1.0, 0.0, 0.0, 0.1, -1)
+        truth = own.step(truth, Control.from_row(row))
+        naive = nominal.step(naive, Control.from_row(row))
+        estimate = estimate.move(row, 100.0 + k, 101.0 + k)
+    goal = needle.seen(truth)[1]
+    return abs(estimate.tip[1] - goal), abs(naive.tip[1] - goal)
+
+
+def off_the_prior(count=55, needle="all"):
+    """A belief after some moves with parameters that are neither the prior's nor fitted, and its readings."""
+    estimate, _ = followed(NEEDLES[needle], count)
+    sd = np.sqrt(1.0 / np.diag(estimate.prior.precision))
+    off = np.random.default_rng(3).normal(0.0, 0.2, sd.size) * sd
+    belief = estimate._with(estimate.parameters + off)._differentiated(range(sd.size))
+    return belief, belief._readings
+
+
+def learnt_of(parameters):
+    """What the parameters say of tissue and needle."""
+    tissue = parameters[SHIFT:CELLS], np.exp(parameters[MODULUS:SHIFT]), 2.5, np.exp(parameters[CELLS:])
+    return Learnt(*tissue, *parameters[[BEVEL, BEND, CLEARANCE]].tolist())
+
+
+def stepped(parameters, rows, axial=0.0):
+    """States of a needle with these parameters, the start first, moved one step after another."""
+    nominal = Simulator(QUIET, 1)
+    simulator = nominal.adapted(learnt_of(parameters))
+    start = nominal.start()
+    base_x = float(start.base[0]) + axial
+    state = start.believing(base_x=base_x, base_y=parameters[BASE_Y], base_turn=parameters[BASE_TURN])
+    states = [simulator.step(state, Control())]
+    for row in rows:
+        states.append(simulator.step(states[-1], Control.from_row(row)))
+    return states
+
+
+def predicted(parameters, rows, seen, axial=0.0):
+    """Readings of such a needle: at even moves, and on the bevel's side of its axis."""
+    states = stepped(parameters, rows, axial)
+    y = np.array([state.tip[1] for state in states])
+    side = np.array([state.bevel for state in states])
+    ends = y[seen.index + 1]
+    return y[seen.index] + seen.part * (ends - y[seen.index]) + parameters[RUN_OUT] * side[seen.index + 1]

@@ -1,0 +1,179 @@
+"""A guide with clearance: an inequality, so that the needle bears on one wall, which pushes, or on none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flexneedle import Control, Simulator, load_scenario
+from flexneedle.mechanics import needle as nd
+from flexneedle.simulator import Learnt
+from reference.cases import repeat
+
+PHANTOM = load_scenario("phantom")
+GUIDE_X = PHANTOM.setup.guide_x
+EXACT = Simulator(PHANTOM, threads=1)
+TOLERANCE = 1e-9  # mm
+
+
+def loose(clearance, **others):
+    """The simulator of the phantom with a clearance (mm)."""
+    return EXACT.adapted(Learnt(np.zeros(1), np.ones(2), clearance=clearance, **others))
+
+
+def off_centre(state):
+    """Lateral position (mm) of the needle in the guide, from the guide's middle."""
+    return float(state.mesh[1][state.mesh[0] == GUIDE_X][0]) - state.guide
+
+
+def loaded(clearance, depth, guide, base_y=0.0, base_turn=0.0):
+    """States of an insertion to a depth (mm), the guide moved by 0.1 mm a step as far as `guide` (mm) in tissue."""
+    simulator = loose(clearance)
+    start = simulator.start().believing(base_y=base_y, base_turn=base_turn)
+    states = [simulator.step(start, Control())]
+    states += repeat(simulator, states[-1], Control(db_x=1.0), int(depth - PHANTOM.setup.start_tip_x))
+    steps = int(np.ceil(abs(guide) / 0.1))
+    return states + repeat(simulator, states[-1], Control(dg_y=guide / max(steps, 1)), steps)
+
+
+# ---- in air, where the needle is straight until something touches it
+
+
+@pytest.mark.parametrize("guide", [0.0, 0.049, -0.049])
+def test_a_needle_free_within_the_clearance_bears_no_force(guide):
+    state = loose(0.05).step(EXACT.start(), Control(dg_y=guide))
+    np.testing.assert_allclose(state.nodes[:, 1], 0.0, atol=1e-12)
+    assert state.reactions.guide_force == 0.0
+    assert state.reactions.base_force == pytest.approx(0.0, abs=1e-12)
+    assert off_centre(state) == pytest.approx(-guide, abs=1e-12)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_beyond_the_clearance_one_wall_pushes(side):
+    """It is where the wall is, and pushed as an exact guide that is moved less by the clearance would."""
+    state = loose(0.05).step(EXACT.start(), Control(dg_y=0.3 * side))
+    exact = EXACT.step(EXACT.start(), Control(dg_y=0.25 * side))
+    assert off_centre(state) == pytest.approx(-0.05 * side, abs=1e-12)
+    assert np.sign(state.reactions.guide_force) == side
+    assert state.reactions.guide_force == pytest.approx(exact.reactions.guide_force, rel=1e-9)
+    np.testing.assert_allclose(state.tip, exact.tip, atol=1e-9)
+
+
+def test_from_wall_to_wall_the_needle_follows_late():
+    """The guide goes up, down and up again: the needle moves only once the clearance is taken up."""
+    simulator, state, path = loose(0.05), EXACT.start(), []
+    for dg_y in [0.02] * 10 + [-0.02] * 20 + [0.02] * 20:
+        state = simulator.step(state, Control(dg_y=dg_y))
+        path.append((state.guide, off_centre(state)))
+    guide, off = np.array(path).T
+    at_wall = np.where(np.abs(guide) > 0.05, -0.05 * np.sign(guide), -guide)  # straight unless it is pushed
+    np.testing.assert_allclose(off, at_wall, atol=1e-9)
+
+
+def test_a_flip_takes_a_bent_needle_from_one_wall_to_the_other():
+    simulator = loose(0.05, bend=1.0)
+    state = simulator.step(simulator.start(), Control())
+    turned = simulator.step(state, Control(flip=True))
+    assert state.converged
+    assert turned.converged
+    assert off_centre(state) == pytest.approx(0.05)
+    assert off_centre(turned) == pytest.approx(-0.05)
+    assert turned.reactions.guide_force == pytest.approx(-state.reactions.guide_force, rel=1e-9)
+
+
+@settings(deadline=None, derandomize=True, max_examples=40)
+@given(
+    clearance=st.floats(1e-3, 0.5), guide=st.floats(-0.5, 0.5),
+    base_y=st.floats(-1.0, 1.0), base_turn=st.floats(-5e-3, 5e-3),
+)  # fmt: skip
+def test_of_all_places_between_the_walls_the_needle_takes_that_of_least_energy(
+    clearance, guide, base_y, base_turn
+):
+    """Each place is what a guide without clearance would prescribe."""
+    start = EXACT.start().believing(base_y=base_y, base_turn=base_turn)
+    found = loose(clearance).step(start, Control(dg_y=guide))
+    places = guide + clearance * np.linspace(-1.0, 1.0, 21)
+    energies = [EXACT.step(start, Control(dg_y=place)).energy for place in places.clip(-0.5, 0.5)]
+    assert found.energy <= min(energies) + 1e-12
+    there = EXACT.replay(start, [[0.0, 0.0, 0.0, guide + off_centre(found), -1.0]])[0]
+    assert found.energy == pytest.approx(there.energy, rel=1e-9, abs=1e-15)
+
+
+# ---- in tissue
+
+
+@settings(deadline=None, derandomize=True, max_examples=30)
+@given(
+    clearance=st.floats(1e-3, 0.5), guide=st.floats(-3.0, 3.0), depth=st.integers(-20, 30),
+    base_y=st.floats(-1.0, 1.0), base_turn=st.floats(-5e-3, 5e-3),
+)  # fmt: skip
+def test_force_and_gap_are_complementary(clearance, guide, depth, base_y, base_turn):
+    """A wall only pushes, the needle is never beyond one, and where it touches none nothing pushes."""
+    for state in loaded(clearance, depth, guide, base_y, base_turn):
+        off, force = off_centre(state), state.reactions.guide_force
+        lower, upper = max(0.0, force), max(0.0, -force)  # of the lower wall upwards, and of the upper one
+        assert abs(off) <= clearance + TOLERANCE
+        assert lower * (clearance + off) == pytest.approx(0.0, abs=TOLERANCE)
+        assert upper * (clearance - off) == pytest.approx(0.0, abs=TOLERANCE)
+        assert state.converged
+
+
+@pytest.mark.parametrize("guide", [2.0, -2.0])
+def test_it_bears_on_the_wall_that_follows_it(guide):
+    """Tissue holds the needle back where the guide goes."""
+    state = loaded(0.1, 20, guide)[-1]
+    assert off_centre(state) == pytest.approx(-0.1 * np.sign(guide), abs=1e-12)
+    assert np.sign(state.reactions.guide_force) == np.sign(guide)
+
+
+def test_a_small_clearance_is_nearly_none():
+    """What it does to the tip is in proportion to it."""
+    exact = loaded(0.0, 20, 1.0)[-1].tip
+    off = [np.abs(loaded(clearance, 20, 1.0)[-1].tip - exact).max() for clearance in (1e-3, 1e-2, 1e-1)]
+    assert off[0] > 0.0
+    np.testing.assert_allclose(np.divide(off[1:], off[:-1]), 10.0, rtol=0.1)
+
+
+def test_without_clearance_nothing_of_it_is_left():
+    """Bit for bit, whatever wall the needle was on before."""
+    bears = loaded(0.1, 10, 1.0)[-1]
+    assert bears.scalars[nd.GUIDE_SIDE] == -1.0
+    scalars = bears.scalars.copy()
+    scalars[nd.GUIDE_SIDE] = 0.0
+    command = Control(db_x=1.0, dg_y=-0.2)
+    here, there = (EXACT.step(state, command) for state in (bears, replace(bears, scalars=scalars)))
+    for name in ("rest", "compression", "mesh"):
+        np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
+    np.testing.assert_array_equal(here.scalars[: nd.GUIDE_SIDE], there.scalars[: nd.GUIDE_SIDE])
+    assert off_centre(here) == 0.0
+
+
+def test_a_needle_without_a_guide_has_no_clearance():
+    bare = Simulator(PHANTOM.with_values({"setup.guide_to_skin_mm": None}), threads=1)
+    wide = bare.adapted(Learnt(np.zeros(1), np.ones(2), clearance=0.1))
+    none = bare.adapted(Learnt(np.zeros(1), np.ones(2)))
+    rows = np.tile([1.0, 0.0, 0.0, 0.0, -1.0], (60, 1))
+    np.testing.assert_array_equal(wide.replay(bare.start(), rows)[1], none.replay(bare.start(), rows)[1])
+
+
+def test_rollouts_converge_and_equal_steps():
+    """A guide that goes from wall to wall, rolls of the bevel, an uneven advance: bit for bit as one by one."""
+    rng = np.random.default_rng(4)
+    controls = np.zeros((48, 60, 5))
+    controls[:, :, 0] = rng.uniform(0.3, 1.0, (48, 60))
+    controls[:, :, 3] = rng.uniform(-0.1, 0.1, (48, 60))
+    controls[:, :, 4] = np.where(rng.random((48, 60)) < 0.05, 1.0, -1.0)
+    simulator = loose(0.08)
+    rolled = simulator.rollout(simulator.start(), controls)
+    assert rolled.converged.all()
+    walls = set()
+    for sample in (0, 7, 23):
+        state = simulator.start()
+        for row, tip in zip(controls[sample], rolled.tips[sample], strict=True):
+            state = simulator.step(state, Control.from_row(row))
+            walls.add(float(state.scalars[nd.GUIDE_SIDE]))
+            np.testing.assert_array_equal(state.tip, tip)
+            assert state.iterations <= nd.COUPLED_ITERATIONS
+    assert walls == {-1.0, 0.0, 1.0}
