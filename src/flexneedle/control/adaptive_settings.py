@@ -18,7 +18,7 @@ class AdaptiveMpc(Section):
     """Cost of the energy that the tissue down to the target has where it is moved aside by 1 mm."""
     unguided_energy_weight_mm: NonNegative = 1.0
     """The same where the guide may not move."""
-    line_weight: NonNegative = 3.0
+    line_weight: NonNegative = 5.0
     """Cost of the mean distance of the tip from the line to the target."""
     unguided_line_weight: NonNegative = 0.0
     """The same where the guide may not move."""

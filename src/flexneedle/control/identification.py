@@ -229,6 +229,12 @@ class Identified:
         return float(np.sqrt(slope @ self.covariance @ slope + self.axial_variance))
 
     @property
+    def lag(self) -> float:
+        """Time (s) from the newest reading to the end of the last move."""
+        times = (sample.time for done in reversed(self.moves) for sample in reversed(done.samples))
+        return self.moves[-1].ended - next(times, 0.0) if self.moves else 0.0
+
+    @property
     def roll_sd(self) -> float:
         """Standard deviation (mm) of how far the tip goes to the side if the bevel rolls now."""
         slope = np.zeros(self.parameters.size)

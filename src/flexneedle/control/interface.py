@@ -31,7 +31,8 @@ class Decision:
     """A command, why, its predicted cost, and the standard deviation left in the guide step (mm; NaN: none).
 
     miss, miss_sd: lateral miss predicted at the target, past it in +y or −y, and its standard deviation once the loop
-    has gone on correcting (mm; NaN: not predicted). The loop warns and holds by them.
+    has gone on correcting (mm; NaN: not predicted). The loop warns and holds by them. rest: for how long (s) the needle
+    rests, instead of the command, so that late readings come in.
     Raises InputError for a command of another length.
     """
 
@@ -41,6 +42,7 @@ class Decision:
     spread: float = math.nan
     miss: float = math.nan
     miss_sd: float = math.nan
+    rest: float = 0.0
 
     def __post_init__(self) -> None:
         if len(self.command) != len(COLUMNS):

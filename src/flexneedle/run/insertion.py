@@ -148,7 +148,8 @@ def _periods(
             if lost:
                 decision = replace(decision, command=_STILL, why=f"held: {lost}")
             else:
-                moves, wait = moves + 1, 0.0
+                moves, wait = moves + 1, decision.rest
+                decision = replace(decision, command=_STILL) if decision.rest > 0.0 else decision
         clocks.append(time.perf_counter())
         applied = _carry_out(scenario, rig, decision.command, wait)
         clocks.append(time.perf_counter())

@@ -29,6 +29,7 @@ _ELITE = 8  # one in so many samples
 _LEAST_ELITE = 3
 _SMOOTHING = 0.3
 _TOLERANCE = 1e-6
+_RESTS = (4.0, 2.0, 1.0)  # control steps before the target at which the needle rests
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
@@ -36,12 +37,13 @@ _LOST = 0.5  # probability of a miss beyond the limit from which a longer search
 class Memory:
     """What is carried from period to period: the path in hand, and the derivatives of what is ahead.
 
-    scale: energy (mJ) of the tissue down to the target where it is moved aside by 1 mm.
+    scale: energy (mJ) of the tissue down to the target where it is moved aside by 1 mm; rests: made so far.
     """
 
     path: Path
     scale: float
     outlook: Outlook | None = None
+    rests: int = 0
 
 
 def begin(task: Task) -> Memory:
@@ -64,10 +66,25 @@ def decide(
         outlook, miss, sd = _forecast(task, memory, fitted, found)
     path = ahead.corrected(found.z)
     command, left = ahead.first(path)
+    rest, rests = _rest(task, memory, fitted, ahead.left)
     rolls = ", ".join(f"{roll:.1f}" for roll in left.rolls) or "none"
     why = f"rolls at {rolls} mm; predicted miss {miss:+.3f} ± {sd:.3f} mm"
     spread = float(np.sqrt(found.belief.covariance[0, 0]))
-    return Decision(command, why, found.cost, spread, miss, sd), Memory(left, memory.scale, outlook)
+    after = Memory(path if rest > 0.0 else left, memory.scale, outlook, rests)
+    return Decision(command, why, found.cost, spread, miss, sd, rest), after
+
+
+def _rest(task: Task, memory: Memory, fitted: Identified, left: float) -> tuple[float, int]:
+    """For how long (s) to rest now, and how often the needle has rested: at a few distances from the target (mm, left).
+
+    A reading comes late: at rest it catches up, and what it shows can still be corrected.
+    """
+    setup = task.scenario.setup
+    step = setup.max_advance_mm
+    if memory.rests == len(_RESTS) or left > _RESTS[memory.rests] * step + 1e-9:
+        return 0.0, memory.rests
+    rests = sum(left <= distance * step + 1e-9 for distance in _RESTS)
+    return fitted.lag + step / setup.insertion_speed_mm_s, rests
 
 
 def _search(
