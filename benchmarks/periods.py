@@ -34,9 +34,13 @@ def line(label: str, values: np.ndarray) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--worlds", nargs=2, type=int, default=(FIRST, COUNT), metavar=("FIRST", "COUNT"))
-    parser.add_argument("--threads", type=int, default=None, metavar="N", help="of rollouts (default: all cores)")
+    parser.add_argument(
+        "--threads", type=int, default=None, metavar="N", help="of rollouts (default: all cores)"
+    )
     args = parser.parse_args()
     compile_kernels()
     first, count = args.worlds

@@ -243,7 +243,7 @@ class Identified:
         return float(np.sqrt(slope @ self.covariance @ slope))
 
     def _slopes(self, depth: Floats) -> Floats:
-        """Derivatives (n, K) of the tip's lateral position at depths (n,), mm, but for the run-out's, from the curves."""
+        """Derivatives (n, K) of the tip's lateral position at depths (n,), mm, from the curves; 0 for the run-out."""
         step = self.grid[1] - self.grid[0]
         place = np.clip((depth - self.grid[0]) / step, 0.0, self.grid.size - 1.001)
         left = place.astype(int)

@@ -82,8 +82,8 @@ class Method:
     the estimate of the readings (default: the model, corrected by them);
     decide: the next command and the memory after it; begin: memory at the start (default: None); arrived: whether it
     is done (default: at the target depth);
-    settings: class of its settings, a default for each, which the scenario has in the table `control.<table>`; needs_guide: whether
-    it is refused where the guide may not move.
+    settings: class of its settings, a default for each, which the scenario has in the table `control.<table>`;
+    needs_guide: whether it is refused where the guide may not move.
 
     Raises InputError for a name or settings that cannot be used.
     """

@@ -1,13 +1,13 @@
 """What the controller expects of the end: how uncertain the miss is that its model predicts.
 
-The estimate's parameters are normal, with the covariance P that the readings leave. Readings to come narrow them to P', and
-the path is corrected meanwhile, until the tip is so near the target that a correction takes no effect. With c, the
+The estimate's parameters are normal, with the covariance P that the readings leave. Readings to come narrow them to P',
+and the path is corrected meanwhile, until the tip is so near the target that a correction takes no effect. With c, the
 derivative of the tip's lateral position at the target, the variance of the miss is
 
     c P' c + σ² + min(m², c P c)
 
-σ is what no parameter explains. The last term is for a miss m that is predicted although a path without one was searched
-for: where the needle is at the limit of what it can do, what is learned on the way cannot be corrected either.
+σ is what no parameter explains. The last term is for a miss m that is predicted although a path without one was
+searched for: where the needle is at the limit of what it can do, what is learned on the way cannot be corrected either.
 """
 
 from dataclasses import dataclass, replace
