@@ -34,8 +34,9 @@ demo: setup  ## plan and steer one insertion on the phantom
 test: setup  ## run the tests
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
-bench: setup  ## measure speed: mechanics, ten million rows of tracker data, 60 s of an emulated tracker
+bench: setup  ## measure speed: mechanics, control periods, ten million rows of tracker data, 60 s of an emulated tracker
 	$(BIN)/python benchmarks/bench.py
+	$(BIN)/python benchmarks/periods.py
 	$(BIN)/python benchmarks/em.py
 	$(BIN)/python benchmarks/aurora.py
 

@@ -27,27 +27,11 @@ from flexneedle.scenario.worlds import TRAINING, world
 
 SHARE_OF_REACH = 0.9
 PLANNED_MM, CLAIMED_MM = 0.1, 0.2
-NO_MISMATCH: dict[str, Any] = {
-    "shear_modulus_factor": [1.0, 1.0],
-    "shear_modulus_variation": 0.0,
-    "layer_shift_sd_mm": 0.0,
-    "bevel_factor": [1.0, 1.0],
-    "start_offset_sd_mm": 0.0,
-    "start_angle_sd_mrad": 0.0,
-    "initial_bend_mm": 0.0,
-    "run_out_mm": 0.0,
-    "guide_clearance_mm": 0.0,
-    "friction_mn_per_mm": 0.0,
-    "motor_resolution_mm": 0.0,
-    "delay_periods": 0.0,
-    "missing_fraction": 0.0,
-    "tracker_bias_mm": 0.0,
-}
 
 
 def perfect(number: int) -> Scenario:
     """A world whose plant has no imperfection."""
-    return world(number).with_values({f"phantom.{key}": value for key, value in NO_MISMATCH.items()})
+    return world(number, "perfect")
 
 
 def draw_target(scenario: Scenario, number: int) -> tuple[float, float]:

@@ -14,18 +14,20 @@ class AdaptiveMpc(Section):
     """Iterations of a period."""
     effort: int = count(3, least=1, most=1_000)
     """Times the samples in the first period, and where no path was found that ends near the target."""
-    energy_weight_mm: NonNegative = 0.3
+    energy_weight_mm: NonNegative = 0.2
     """Cost of the energy that the tissue down to the target has where it is moved aside by 1 mm."""
     unguided_energy_weight_mm: NonNegative = 1.0
     """The same where the guide may not move."""
-    line_weight: NonNegative = 3.0
+    line_weight: NonNegative = 5.0
     """Cost of the mean distance of the tip from the line to the target."""
     unguided_line_weight: NonNegative = 0.0
     """The same where the guide may not move."""
     slope_weight_mm: NonNegative = 0.5
     """Cost of a mean squared slope of 1 of the guide's path."""
-    roll_weight_mm: NonNegative = 0.015
+    roll_weight_mm: NonNegative = 0.03
     """Cost of a roll of the bevel."""
+    late_roll_weight: NonNegative = 1.0
+    """Cost of how far a roll just before the target may move the tip, in its standard deviations."""
     bend_sd_mm: NonNegative = 0.5
     """Prior of the natural bend of the needle, over its length: standard deviation."""
     run_out_sd_mm: NonNegative = 0.1

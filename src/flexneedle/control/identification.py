@@ -228,8 +228,22 @@ class Identified:
         slope[RUN_OUT] = self.state.bevel
         return float(np.sqrt(slope @ self.covariance @ slope + self.axial_variance))
 
+    @property
+    def lag(self) -> float:
+        """Time (s) from the newest reading to the end of the last move."""
+        times = (sample.time for done in reversed(self.moves) for sample in reversed(done.samples))
+        return self.moves[-1].ended - next(times, 0.0) if self.moves else 0.0
+
+    @property
+    def roll_sd(self) -> float:
+        """Standard deviation (mm) of how far the tip goes to the side if the bevel rolls now."""
+        slope = np.zeros(self.parameters.size)
+        slope[BEND] = 2.0 * self._slopes(self.state.tip[:1])[0, BEND]
+        slope[RUN_OUT] = 2.0
+        return float(np.sqrt(slope @ self.covariance @ slope))
+
     def _slopes(self, depth: Floats) -> Floats:
-        """Derivatives (n, K) of the tip's lateral position at depths (n,), mm, but for the run-out's, from the curves."""
+        """Derivatives (n, K) of the tip's lateral position at depths (n,), mm, from the curves; 0 for the run-out."""
         step = self.grid[1] - self.grid[0]
         place = np.clip((depth - self.grid[0]) / step, 0.0, self.grid.size - 1.001)
         left = place.astype(int)

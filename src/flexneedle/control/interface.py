@@ -31,7 +31,8 @@ class Decision:
     """A command, why, its predicted cost, and the standard deviation left in the guide step (mm; NaN: none).
 
     miss, miss_sd: lateral miss predicted at the target, past it in +y or −y, and its standard deviation once the loop
-    has gone on correcting (mm; NaN: not predicted). The loop warns and holds by them.
+    has gone on correcting (mm; NaN: not predicted). The loop warns and holds by them. rest: for how long (s) the needle
+    rests, instead of the command, so that late readings come in.
     Raises InputError for a command of another length.
     """
 
@@ -41,6 +42,7 @@ class Decision:
     spread: float = math.nan
     miss: float = math.nan
     miss_sd: float = math.nan
+    rest: float = 0.0
 
     def __post_init__(self) -> None:
         if len(self.command) != len(COLUMNS):
@@ -80,8 +82,8 @@ class Method:
     the estimate of the readings (default: the model, corrected by them);
     decide: the next command and the memory after it; begin: memory at the start (default: None); arrived: whether it
     is done (default: at the target depth);
-    settings: class of its settings, a default for each, which the scenario has in the table `control.<table>`; needs_guide: whether
-    it is refused where the guide may not move.
+    settings: class of its settings, a default for each, which the scenario has in the table `control.<table>`;
+    needs_guide: whether it is refused where the guide may not move.
 
     Raises InputError for a name or settings that cannot be used.
     """

@@ -1,13 +1,13 @@
 """What the controller expects of the end: how uncertain the miss is that its model predicts.
 
-The estimate's parameters are normal, with the covariance P that the readings leave. Readings to come narrow them to P', and
-the path is corrected meanwhile, until the tip is so near the target that a correction takes no effect. With c, the
+The estimate's parameters are normal, with the covariance P that the readings leave. Readings to come narrow them to P',
+and the path is corrected meanwhile, until the tip is so near the target that a correction takes no effect. With c, the
 derivative of the tip's lateral position at the target, the variance of the miss is
 
     c P' c + σ² + min(m², c P c)
 
-σ is what no parameter explains. The last term is for a miss m that is predicted although a path without one was searched
-for: where the needle is at the limit of what it can do, what is learned on the way cannot be corrected either.
+σ is what no parameter explains. The last term is for a miss m that is predicted although a path without one was
+searched for: where the needle is at the limit of what it can do, what is learned on the way cannot be corrected either.
 """
 
 from dataclasses import dataclass, replace
@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from flexneedle.control.identification import Identified
 from flexneedle.control.prior import RUN_OUT
 
-__all__ = ["Outlook"]
+__all__ = ["UNCORRECTED", "Outlook"]
 
 Floats = NDArray[np.float64]
-_BLIND = 5.0  # control steps before the target in which a correction takes no effect
+UNCORRECTED = 5.0
+"""Control steps before the target in which a correction takes no effect."""
 _UNEXPLAINED = 2.0  # standard deviations of the mean of a control step's readings
 
 
@@ -59,7 +60,7 @@ class Outlook:
         """Standard deviation (mm) of the miss at the depth `target` (mm), where `miss` is predicted (mm)."""
         step = estimate.nominal.scenario.setup.max_advance_mm
         end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
-        to_come = (self.grid > estimate.state.tip[0]) & (self.grid <= target - _BLIND * step)
+        to_come = (self.grid > estimate.state.tip[0]) & (self.grid <= target - UNCORRECTED * step)
         slopes = self.curves[:, to_come]
         then = estimate.precision + slopes @ slopes.T / estimate.reading_variance
         known = end @ np.linalg.solve(then, end) + _UNEXPLAINED**2 * estimate.reading_variance

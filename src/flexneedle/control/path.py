@@ -1,7 +1,8 @@
 """The path in hand: the guide over absolute depth and the depths at which the bevel rolls, and what may replace it.
 
-A sample corrects the path: lateral corrections of the guide at a few knots between now and the target, and the depths of
-up to `SLOTS` rolls. Sample 0 corrects nothing, so what is in hand is lost only to something better on the same model.
+A sample corrects the path: lateral corrections of the guide at a few knots between now and the target, and the depths
+of up to `SLOTS` rolls. Sample 0 corrects nothing, so what is in hand is lost only to something better on the
+same model.
 """
 
 from dataclasses import dataclass, replace

@@ -6,6 +6,7 @@
 | `energy_at_end` | mJ | mm/mJ |
 | `guide_slope` | 1 | mm |
 | `rolls` | 1 | mm |
+| `late_rolls` | 1 | mm |
 | `distance_from_line` | mm | 1 |
 | `deflection` | mm², summed over steps | 1/mm |
 | `guide_motion` | mm², summed over steps | 1/mm |
@@ -104,6 +105,14 @@ def rolls(outcome: Outcome, first: int = 0) -> Floats:
     """Half-turns of the bevel, from step `first` on."""
     count: Floats = (outcome.controls[:, first:, 4] > 0.0).sum(axis=1).astype(float)
     return count
+
+
+def late_rolls(outcome: Outcome, depth: float, length: float) -> Floats:
+    """Half-turns of the bevel, each as e^(−d/length) with d the distance (mm) that is left to the depth (mm) then."""
+    before = outcome.tips[:, :, 0] - outcome.controls[:, :, 0]
+    near = np.exp(np.minimum(0.0, before - depth) / length)
+    sum_: Floats = (near * (outcome.controls[:, :, 4] > 0.0)).sum(axis=1)
+    return sum_
 
 
 def distance_from_line(outcome: Outcome, start: Point, target: Point) -> Floats:

@@ -48,9 +48,9 @@ def insert(
     "scenario", the one that is described there. Each may be an object of your own, too, or its name `module:NAME`
     (docs/extend.md).
     `threads` is for rollouts (default: all cores) and changes no result. `on_period` gets each control period as
-    it ends. Raises InputError for an unknown name or an object that is none, ScenarioError for a setting that the
-    controllers refuse, InputError for a controller that needs the guide where it may not move, RunError if the plan misses its target by more than 1 mm,
-    unless `force`. Same seed, same record, but for wall-clock durations.
+    it ends. Raises InputError for an unknown name or an object that is none, and for a controller that needs the guide
+    where it may not move, ScenarioError for a setting that the controllers refuse, RunError if the plan misses its
+    target by more than 1 mm, unless `force`. Same seed, same record, but for wall-clock durations.
     """
     phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
     plant_name, plant = plant_of(phantom)
@@ -148,7 +148,8 @@ def _periods(
             if lost:
                 decision = replace(decision, command=_STILL, why=f"held: {lost}")
             else:
-                moves, wait = moves + 1, 0.0
+                moves, wait = moves + 1, decision.rest
+                decision = replace(decision, command=_STILL) if decision.rest > 0.0 else decision
         clocks.append(time.perf_counter())
         applied = _carry_out(scenario, rig, decision.command, wait)
         clocks.append(time.perf_counter())

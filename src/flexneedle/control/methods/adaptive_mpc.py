@@ -20,8 +20,8 @@ from flexneedle.control.estimate import Estimate, Floats
 from flexneedle.control.forecast import probability_beyond
 from flexneedle.control.guide import guide_may_move
 from flexneedle.control.identification import Identification, Identified
-from flexneedle.control.interface import Decision, Method, Task
-from flexneedle.control.outlook import Outlook
+from flexneedle.control.interface import Decision, Method, Task, travel_left
+from flexneedle.control.outlook import UNCORRECTED, Outlook
 from flexneedle.control.path import Ahead, Path, of_plan, proposals
 from flexneedle.planning import Found, Outcome, Search, Term, Variables, best, terms
 
@@ -29,6 +29,7 @@ _ELITE = 8  # one in so many samples
 _LEAST_ELITE = 3
 _SMOOTHING = 0.3
 _TOLERANCE = 1e-6
+_RESTS = (4.0, 2.0, 1.0)  # control steps before the target at which the needle rests
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
@@ -36,12 +37,13 @@ _LOST = 0.5  # probability of a miss beyond the limit from which a longer search
 class Memory:
     """What is carried from period to period: the path in hand, and the derivatives of what is ahead.
 
-    scale: energy (mJ) of the tissue down to the target where it is moved aside by 1 mm.
+    scale: energy (mJ) of the tissue down to the target where it is moved aside by 1 mm; rests: made so far.
     """
 
     path: Path
     scale: float
     outlook: Outlook | None = None
+    rests: int = 0
 
 
 def begin(task: Task) -> Memory:
@@ -64,10 +66,25 @@ def decide(
         outlook, miss, sd = _forecast(task, memory, fitted, found)
     path = ahead.corrected(found.z)
     command, left = ahead.first(path)
+    rest, rests = _rest(task, memory, fitted, ahead.left)
     rolls = ", ".join(f"{roll:.1f}" for roll in left.rolls) or "none"
     why = f"rolls at {rolls} mm; predicted miss {miss:+.3f} ± {sd:.3f} mm"
     spread = float(np.sqrt(found.belief.covariance[0, 0]))
-    return Decision(command, why, found.cost, spread, miss, sd), Memory(left, memory.scale, outlook)
+    after = Memory(path if rest > 0.0 else left, memory.scale, outlook, rests)
+    return Decision(command, why, found.cost, spread, miss, sd, rest), after
+
+
+def _rest(task: Task, memory: Memory, fitted: Identified, left: float) -> tuple[float, int]:
+    """For how long (s) to rest now, and how often the needle has rested: at a few distances from the target (mm, left).
+
+    A reading comes late: at rest it catches up, and what it shows can still be corrected.
+    """
+    setup = task.scenario.setup
+    step = setup.max_advance_mm
+    if memory.rests == len(_RESTS) or left > _RESTS[memory.rests] * step + 1e-9:
+        return 0.0, memory.rests
+    rests = sum(left <= distance * step + 1e-9 for distance in _RESTS)
+    return fitted.lag + step / setup.insertion_speed_mm_s, rests
 
 
 def _search(
@@ -97,13 +114,17 @@ def _terms(task: Task, fitted: Identified, scale: float) -> tuple[Term, ...]:
     guided = guide_may_move(task.scenario.setup, task.plan.strategy)
     energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
     line = settings.line_weight if guided else settings.unguided_line_weight
+    reach = UNCORRECTED * task.scenario.setup.max_advance_mm
+    late = partial(terms.late_rolls, depth=target[0], length=reach)
+    share = min(1.0, travel_left(task.scenario, task.plan, fitted.state) / target[0])  # of the way
     start = float(fitted.tip[0]), float(fitted.tip[1])
     return (
         Term("miss", 1.0, partial(terms.miss, target=target)),
         Term("energy", energy / scale if scale > 0.0 else 0.0, terms.energy_at_end),
         Term("line", line, partial(terms.distance_from_line, start=start, target=target)),
-        Term("slope", settings.slope_weight_mm, terms.guide_slope),
+        Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
         Term("rolls", settings.roll_weight_mm, terms.rolls),
+        Term("late", settings.late_roll_weight * fitted.roll_sd, late),
     )
 
 

@@ -59,7 +59,6 @@ _CHOICES = {
     WORLD_CASE: CASES,
 }
 _OWN = {"controller": controller_of, "plant": plant_of, "tracker": tracker_of}
-_STEERED_BY_GUIDE = ("resolved-rate", "broyden-mpc")
 _MOST_INSERTIONS = 1_000_000
 _BESIDES = f"; besides: {', '.join(_DEFAULTS)}, {WORLD_CASE}, as an axis also {SEED}, {WORLD}"
 
@@ -236,7 +235,9 @@ def _points(
 
 def _is_skipped(scenario: Scenario, controller: str, world_case: str) -> bool:
     """Whether a world without a guide has no such case, or the controller nothing to steer with."""
-    return not scenario.setup.has_guide and (world_case == STRUCTURE or controller in _STEERED_BY_GUIDE)
+    return not scenario.setup.has_guide and (
+        world_case == STRUCTURE or controller_of(controller)[1].needs_guide
+    )
 
 
 def _check_run(run: Mapping[str, Any]) -> None:
