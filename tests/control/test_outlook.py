@@ -49,7 +49,7 @@ def test_it_is_that_of_a_monte_carlo_of_a_linear_problem(now, variance):
     outlook, estimate = linear(precision, curves, now, variance)
     rng, n = np.random.default_rng(1), 20_000
     truth = rng.multivariate_normal(np.zeros(2), np.linalg.inv(precision), n)
-    ahead = curves[:, (now < GRID) & (GRID <= TARGET - ol._BLIND)]
+    ahead = curves[:, (now < GRID) & (GRID <= TARGET - ol.UNCORRECTED)]
     readings = truth @ ahead + rng.normal(0.0, np.sqrt(variance), (n, ahead.shape[1]))
     gain = np.linalg.solve(precision + ahead @ ahead.T / variance, ahead / variance)
     estimated = readings @ gain.T
@@ -61,7 +61,7 @@ def test_it_is_that_of_a_monte_carlo_of_a_linear_problem(now, variance):
 def test_past_the_last_correction_nothing_is_learned():
     """What is known now is all that will be."""
     precision, curves = two_parameters()
-    outlook, estimate = linear(precision, curves, now=TARGET - ol._BLIND)
+    outlook, estimate = linear(precision, curves, now=TARGET - ol.UNCORRECTED)
     end = curves[:, GRID == TARGET].ravel()
     expected = np.sqrt(end @ np.linalg.inv(precision) @ end + floor(estimate) ** 2)
     assert outlook.sd(estimate, TARGET, 0.0) == pytest.approx(expected)
