@@ -11,7 +11,7 @@ import numpy as np
 
 from flexneedle.control import tables
 from flexneedle.control.estimate import Estimate
-from flexneedle.control.forecast import hopeless, warning
+from flexneedle.control.forecast import hopeless, likely_misses, missed, warning
 from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Decision, Method, Task, at_depth
 from flexneedle.control.methods import DEFAULT, used
@@ -128,7 +128,7 @@ def _periods(
     arrived_at: float | None = None
     lost = ""  # why no path leads to the target,
     lost_at: float | None = None  # and since when
-    moves = 0
+    moves = in_a_row = 0
     for index in indices:
         if moves == _TOO_MANY * len(task.plan.controls):
             return
@@ -143,6 +143,7 @@ def _periods(
             )
         else:
             decision, memory = _decided(chosen, task, memory, sight.estimate, rng)
+            in_a_row = likely_misses(decision, in_a_row)
             lost = "" if force else hopeless(decision, scenario.control)
             lost_at = (begun if lost_at is None else lost_at) if lost else None
             if lost:
@@ -164,7 +165,11 @@ def _periods(
         ending = _ending(task, sight, None if held is None else held.lasted(sight.field), seen)
         if lost_at is not None and now - lost_at > scenario.control.hold_limit_s - 1e-9:
             ending = ending or ("held", lost)
-        yield _record(index, now, task.plan, rig, decision, applied, sight, clocks), ending
+        warns = warning(decision, in_a_row)
+        if ending is not None and ending[0] == "done":
+            warns = missed(_pose(sight.estimate.tip)[:2], task.plan.target)
+        period = _record(index, now, task.plan, rig, decision, applied, sight, clocks)
+        yield replace(period, warning=warns), ending
         if ending is not None:
             return
 
@@ -268,7 +273,6 @@ def _record(
         decision=decision.why,
         miss=decision.miss,
         miss_sd=decision.miss_sd,
-        warning=warning(decision),
         true_tip=None if truth is None else _pose(truth.tip),
         true_strain_energy=None if truth is None else truth.strain_energy,
         true_stretch=None if truth is None else truth.least_stretch,
