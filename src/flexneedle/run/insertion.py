@@ -165,13 +165,19 @@ def _periods(
         ending = _ending(task, sight, None if held is None else held.lasted(sight.field), seen)
         if lost_at is not None and now - lost_at > scenario.control.hold_limit_s - 1e-9:
             ending = ending or ("held", lost)
-        warns = warning(decision, in_a_row)
-        if ending is not None and ending[0] == "done":
-            warns = missed(_pose(sight.estimate.tip)[:2], task.plan.target)
         period = _record(index, now, task.plan, rig, decision, applied, sight, clocks)
-        yield replace(period, warning=warns), ending
+        yield replace(period, warning=_warning(task, decision, in_a_row, sight, ending)), ending
         if ending is not None:
             return
+
+
+def _warning(
+    task: Task, decision: Decision, in_a_row: int, sight: Sight, ending: tuple[str, str] | None
+) -> str:
+    """What a period warns of: on the way what is predicted, at the end where the tip is estimated to be."""
+    if ending is not None and ending[0] == "done":
+        return missed(_pose(sight.estimate.tip)[:2], task.plan.target)
+    return warning(decision, in_a_row)
 
 
 def _decided(
