@@ -93,9 +93,9 @@ def readings(needle, before, after, start, count, noise, rng):
     return [Sample(float(start + part), *point.tolist()) for part, point in zip(parts, points, strict=True)]
 
 
-def followed(needle, count, *, scenario=QUIET, noise=0.0, late=0, threads=1, per_move=2):
+def followed(needle, count, *, scenario=QUIET, noise=0.0, late=0, threads=1, per_move=2, rows=None):
     """The belief after so many moves, the readings coming so many moves late; the needle's states."""
-    rows, rng = commands(count), np.random.default_rng(2)
+    rows, rng = rows or commands(count), np.random.default_rng(2)
     states = needle.inserted(scenario, rows)
     estimate = Identification().begin(begun_with(Simulator(scenario, threads), 1))
     batches = [readings(needle, states[k], states[k + 1], k, per_move, noise, rng) for k in range(len(rows))]
@@ -109,8 +109,9 @@ def followed(needle, count, *, scenario=QUIET, noise=0.0, late=0, threads=1, per
 
 
 def ahead(estimate, needle, states, scenario=QUIET, steps=8):
-    """Errors (mm) of the seen tip after some steps on, of the belief and of the uncorrected model; no readings."""
-    nominal, own = Simulator(scenario, threads=1), needle.simulator(scenario)
+    """Errors (mm) of the seen tip after some steps on, of the belief and of the prior's mean; no readings."""
+    plain = Needle(modulus=(1.0,) * len(needle.modulus), shift=(0.0,) * len(needle.shift))
+    nominal, own = plain.simulator(scenario), needle.simulator(scenario)
     naive = nominal.start()
     for row in commands(len(states) - 1):
         naive = nominal.step(naive, Control.from_row(row))

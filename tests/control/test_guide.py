@@ -7,6 +7,7 @@ import flexneedle
 from flexneedle.control import mpc
 from flexneedle.control.guide import check_guide, guide_may_move, most_guide_step
 from flexneedle.control.methods import METHODS
+from flexneedle.control.mpc import CeMpc
 from flexneedle.errors import InputError
 from flexneedle.run.folder import Folder
 from flexneedle.run.recording import Choices, record_insertion
@@ -66,7 +67,9 @@ def test_the_refusal_comes_before_the_plan(tmp_path):
 def test_ce_mpc_leaves_the_guide_where_it_is(steered, along):
     """With a base clamp that is off, which it would move the guide for otherwise."""
     state = along(steered, 40, base_y=1.0)
-    choice = mpc.choose(Simulator(PHANTOM, 1), steered, state, flip=False, rng=np.random.default_rng(0))
+    choice = mpc.choose(
+        Simulator(PHANTOM, 1), steered, state, CeMpc(), flip=False, rng=np.random.default_rng(0)
+    )
     assert choice.steps[3] == 0.0
     assert choice.spread == 0.0
 

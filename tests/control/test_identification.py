@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexneedle.control.identification import Identification
+from flexneedle.control.identification import Identification, Identified
 from flexneedle.control.prior import BASE_TURN, BASE_Y, BEND, BEVEL, CLEARANCE, MODULUS, RUN_OUT, unexplained
 from flexneedle.ports import Sample
 from flexneedle.simulator import Control, Learnt, Simulator
@@ -26,6 +26,15 @@ from identified import (
     stepped,
 )
 from tasks import begun_with
+
+STILL = (0.0, 0.0, 0.0, 0.0, -1)
+TIGHT = QUIET.with_values({f"control.adaptive_mpc.clearance{key}_mm": 0.0 for key in ("", "_sd")})
+
+
+@pytest.fixture
+def all_fresh(monkeypatch):
+    """Every derivative simulated in every period."""
+    monkeypatch.setattr(Identified, "_due", lambda self: iter(range(self.parameters.size)))
 
 
 def test_it_begins_with_the_scenario():
@@ -55,11 +64,29 @@ def test_it_predicts_a_needle_with_other_constants(needle):
     x, y = needle.seen(states[-1])
     varied = len(needle.variation) > 1
     assert estimate.tip[0] == pytest.approx(x, abs=0.03)
-    assert estimate.tip[1] == pytest.approx(y, abs=5e-3 if varied else 1e-3)
+    assert estimate.tip[1] == pytest.approx(y, abs=0.03 if varied else 1e-3)
     learnt, naive = ahead(estimate, needle, states)
     assert naive > 0.1
     assert learnt < (0.12 if varied else 0.05)
     assert learnt < (0.4 if varied else 0.1) * naive
+
+
+@pytest.mark.usefixtures("all_fresh")
+@pytest.mark.parametrize("name", ["all", "modulus along the depth"])
+def test_with_every_derivative_of_now_it_follows_the_tip_closely(name):
+    """What is left of the tip's distance otherwise is due to derivatives of a few periods ago."""
+    estimate, states = followed(NEEDLES[name], 70)
+    assert estimate.tip[1] == pytest.approx(NEEDLES[name].seen(states[-1])[1], abs=5e-3)
+
+
+def test_at_rest_the_tip_is_found_too_with_derivatives_that_are_renewed_alternately():
+    """A few periods of readings, no moves."""
+    needle = NEEDLES["all"]
+    estimate, states = followed(needle, 70)
+    x, y = needle.seen(states[-1]).tolist()
+    for k in range(8):
+        estimate = estimate.move(STILL, 70.0 + k, 71.0 + k).observe([Sample(71.0 + k, x, y)])
+    assert estimate.tip[1] == pytest.approx(y, abs=5e-3)
 
 
 @pytest.mark.parametrize("name", ["all", "modulus along the depth"])
@@ -112,6 +139,20 @@ def test_what_the_readings_tell_apart_is_found():
     assert np.sign(found[[BASE_Y, BEND]]).tolist() == [np.sign(needle.base_y), np.sign(needle.bend)]
 
 
+@pytest.mark.xfail(reason="in air the fit may stay at the other wall of the guide")
+def test_in_air_the_wall_that_the_needle_bears_on_is_found():
+    """With a tracker that is nearly exact, whatever the start: the tip of one more move is predicted."""
+    rows = [(1.0, 0.0, 0.0, 0.03 * float(np.sin(0.3 * k)), -1) for k in range(27)]
+    off = []
+    for seed in (4, 8, 12):
+        rng = np.random.default_rng(seed)
+        base_y, base_turn = rng.normal(0.0, 0.5), rng.normal(0.0, 3e-3)
+        needle = Needle(base_y, base_turn, rng.choice([-0.5, 0.5]), rng.choice([-0.1, 0.1]))
+        estimate, states = followed(needle, 27, rows=rows)
+        off.append(abs(estimate.tip[1] - needle.seen(states[-1])[1]))
+    assert max(off) < 5e-3, off
+
+
 def test_a_base_offset_alone_is_told_by_its_lever():
     """In air the tip goes y = b (1 − lever): what base y and turn do to it together is found, not each."""
     needle = Needle(base_y=0.5)
@@ -141,18 +182,21 @@ def test_tissue_of_other_layers_is_identified_too(layers):
     assert estimate.state.converged
 
 
+@pytest.mark.usefixtures("all_fresh")
 def test_a_tracker_without_jitter_is_believed_but_for_what_no_parameter_explains():
     scenario = PHANTOM.with_values({"tracker.jitter_mm": 0.0})
     estimate, states = followed(NEEDLES["all"], 66, scenario=scenario)
     np.testing.assert_array_equal(estimate._readings.variance(scenario, OWN), unexplained(scenario, OWN) ** 2)
-    assert estimate.tip[1] == pytest.approx(NEEDLES["all"].seen(states[-1])[1], abs=0.01)
+    assert estimate.tip[1] == pytest.approx(
+        NEEDLES["all"].seen(states[-1])[1], abs=unexplained(scenario, OWN)
+    )
 
 
 def test_more_noise_means_less_is_believed():
-    """One reading 0.1 mm off: in a noisy tracker's case the tip moves less."""
+    """One reading 0.1 mm off: in a noisy tracker's case the tip moves less. The guide is exact, the rest is linear."""
     moved = []
     for jitter in (1e-3, 0.05, 0.5):
-        scenario = QUIET.with_values({"tracker.jitter_mm": jitter})
+        scenario = TIGHT.with_values({"tracker.jitter_mm": jitter})
         estimate = (
             Identification()
             .begin(begun_with(Simulator(scenario, 1), 1))
@@ -180,6 +224,74 @@ def test_what_is_known_for_sure_is_not_fitted():
     moved = np.abs(estimate.parameters - estimate.prior.mean)
     assert moved[BASE_Y] + 100.0 * moved[BASE_TURN] > 0.05
     assert moved[BEND:].max() < 1e-5
+
+
+# ---- the start along the axis
+
+
+@pytest.mark.parametrize("base_x", [2.0, -2.0, 0.4])
+def test_an_error_along_the_axis_is_recovered(base_x):
+    """Of twice the prior's standard deviation: the tip is at its depth, with the tissue that is there."""
+    needle = Needle(base_x=base_x, base_y=0.2, modulus=(1.3, 0.8))
+    estimate, states = followed(needle, 66)
+    assert estimate.axial == pytest.approx(base_x, abs=0.01)
+    np.testing.assert_allclose(estimate.tip[:2], needle.seen(states[-1]), atol=0.01)
+    np.testing.assert_allclose(estimate.state.travel[0], 66.0)
+
+
+def test_the_error_along_the_axis_is_as_uncertain_as_it_is_off():
+    """Within its standard deviation two times in three, over needles and noise as the prior and the tracker have."""
+    scenario = PHANTOM.with_values(
+        {"control.adaptive_mpc.model_sd": 0.0, "control.adaptive_mpc.least_model_sd_mm": 1e-4}
+    )
+    noise, rng, rows = scenario.tracker.jitter_per_axis, np.random.default_rng(8), commands(6)
+    off = []
+    for _ in range(60):
+        needle = Needle(base_x=float(rng.normal(0.0, scenario.control.start_axial_sd_mm)))
+        states = needle.inserted(scenario, rows)
+        estimate = Identification().begin(begun_with(Simulator(scenario, 1), 1))
+        for k, row in enumerate(rows):
+            estimate = estimate.move(row, k, k + 1.0)
+            estimate = estimate.observe(readings(needle, states[k], states[k + 1], k, 2, noise, rng))
+        off.append((estimate.axial - needle.base_x) / np.sqrt(estimate.axial_variance))
+    assert np.sqrt(estimate.axial_variance) == pytest.approx(noise / np.sqrt(12.0), rel=0.01)
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.25)
+
+
+def test_where_the_start_along_the_axis_is_known_it_is_not_fitted():
+    known = QUIET.with_values({"control.start_axial_sd_mm": 0.0})
+    estimate, _ = followed(Needle(base_x=1.0), 10, scenario=known)
+    assert abs(estimate.axial) < 1e-3
+
+
+# ---- rest
+
+
+def test_idle_periods_are_one_move_and_cost_no_simulation(monkeypatch):
+    """However many: its readings are those of all of them, and the needle is not simulated again to move it."""
+    needle = NEEDLES["bend"]
+    estimate, states = followed(needle, 30)
+    resting = estimate.move(STILL, 30.0, 31.0)
+    assert len(resting.moves) == 31
+    np.testing.assert_allclose(resting.tip, estimate.tip, atol=1e-6)
+    resting = resting.observe([Sample(31.0, *needle.seen(states[-1]).tolist())])
+
+    def none(*_):
+        raise AssertionError("nothing moves")
+
+    with monkeypatch.context() as no_simulation:
+        for name in ("step", "replay", "rollout"):
+            no_simulation.setattr(Simulator, name, none)
+        longer = resting
+        for k in range(20):
+            longer = longer.move(STILL, 31.0 + k, 32.0 + k)
+    assert longer.state is resting.state
+    assert (len(longer.moves), longer.tips.shape) == (31, resting.tips.shape)
+    assert (longer.moves[-1].begun, longer.moves[-1].ended) == (30.0, 51.0)
+    seen = longer.observe([Sample(50.0, *needle.seen(states[-1]).tolist())])
+    assert len(seen.moves[-1].samples) == 2
+    assert seen.tip_at(40.5) == pytest.approx(tuple(seen.tip[:2]), abs=1e-6)
+    assert len(seen.move((1.0, 0.0, 0.0, 0.0, -1), 51.0, 52.0).moves) == 32
 
 
 # ---- what holds whatever the readings
@@ -244,14 +356,14 @@ def test_a_turn_of_the_bevel_turns_bend_and_run_out_over():
 
 def test_a_bevel_turns_before_its_move_and_so_does_the_run_out():
     """A needle that is known, run-out included, is still known after readings in the midst of a turn's move."""
-    needle = NEEDLES["run-out"]
-    estimate, _ = followed(needle, 20)
+    needle = replace(NEEDLES["run-out"], clearance=0.0)
+    estimate, _ = followed(needle, 20, scenario=TIGHT)
     assert commands(21)[20][4] == 1
-    before, after = needle.inserted(QUIET, commands(21))[20:22]
+    before, after = needle.inserted(TIGHT, commands(21))[20:22]
     moved = estimate.move(commands(21)[20], 20.0, 21.0)
     assert moved.tip[1] == pytest.approx(needle.seen(after)[1], abs=2e-3)
     corrected = moved.observe(readings(needle, before, after, 20, 4, 0.0, np.random.default_rng(0)))
-    assert corrected.tip[1] == pytest.approx(needle.seen(after)[1], abs=1e-3)
+    assert corrected.tip[1] == pytest.approx(needle.seen(after)[1], abs=2e-3)
     assert corrected.parameters[RUN_OUT] == pytest.approx(-0.15, abs=0.01)
 
 
@@ -268,13 +380,14 @@ def test_where_the_tip_was_is_on_the_side_of_the_bevel_then():
     assert states[-1].bevel == -1
 
 
+@pytest.mark.usefixtures("all_fresh")
 @pytest.mark.parametrize("late", [1, 3])
 def test_late_readings_lead_to_the_same_belief(late):
     """The fit takes all readings at once, so only the number of its steps so far differs."""
     needle = replace(NEEDLES["all"], variation=(1.0,))
     in_time, _ = followed(needle, 50)
     behind, states = followed(needle, 50, late=late)
-    np.testing.assert_allclose(behind.tip[1:], in_time.tip[1:], atol=1e-3)
+    np.testing.assert_allclose(behind.tip[1:], in_time.tip[1:], atol=unexplained(QUIET, OWN))
     assert behind.tip[1] == pytest.approx(needle.seen(states[-1])[1], abs=0.01)
     assert len(behind.moves) == 50
 
@@ -290,6 +403,7 @@ def test_the_belief_now_is_the_fitted_insertion_carried_out_again():
     assert estimate.simulator.step(states[-1], forward) == now.step(states[-1], forward)
 
 
+@pytest.mark.usefixtures("all_fresh")
 def test_innovation_and_measured_tip_are_those_of_the_newest_reading():
     needle = NEEDLES["run-out"]
     estimate, _ = followed(needle, 45)

@@ -163,7 +163,8 @@ def test_stiffer_tissue_than_believed_leaves_next_to_no_offset():
 
 def test_load_takes_the_gain_times_the_reaction_and_the_tip_goes_where_it_was_seen():
     simulator = Simulator(PHANTOM)
-    moved = begun(simulator, in_tissue(simulator).believing(tip_load=0.001)).move(AHEAD, 0.0, 1.0)
+    known = replace(begun(simulator, in_tissue(simulator).believing(tip_load=0.001)), axial=0.0)
+    moved = known.move(AHEAD, 0.0, 1.0)
     predicted = moved.state
     x, y = predicted.tip[:2] + np.array([0.05, 0.3])
     corrected = moved.observe([Sample(1.0, x, y)])
@@ -178,6 +179,24 @@ def test_load_takes_the_gain_times_the_reaction_and_the_tip_goes_where_it_was_se
     np.testing.assert_allclose(corrected.measured, (x, y), atol=1e-12)
 
 
+@pytest.mark.parametrize("axial", [0.0, 1.0])
+@pytest.mark.parametrize("off", [(0.4, 0.3), (-0.6, -0.2)])
+def test_a_contact_that_is_cut_is_on_the_measured_path_wherever_the_tip_is_along_the_axis(axial, off):
+    """The tip is where it was measured, and what the move cut rests on the line to it."""
+    simulator = Simulator(PHANTOM)
+    start = replace(begun(simulator, in_tissue(simulator)), axial=axial)
+    moved = start.move(AHEAD, 0.0, 1.0)
+    x, y = np.add(moved.tip[:2], off).tolist()
+    corrected = moved.observe([Sample(1.0, x, y)])
+    assert corrected.tip[1] == pytest.approx(y, abs=1e-9)
+    assert corrected.tip[0] == pytest.approx(moved.tip[0] + axial * off[0], abs=0.03)
+    before, after, contacts = start.tip, corrected.tip, corrected.state.contacts
+    fresh = contacts.x > before[0]
+    assert fresh.any()
+    line = before[1] + (contacts.x[fresh] - before[0]) / (after[0] - before[0]) * (after[1] - before[1])
+    np.testing.assert_allclose(contacts.rest_y[fresh], line, atol=1e-6)
+
+
 def test_innovations_of_a_period_are_averaged_at_the_times_of_the_readings():
     """A tip that goes evenly and readings that are off by 0.1, 0.2 and 0.6: the innovation is 0.3."""
     simulator = Simulator(PHANTOM)
@@ -189,7 +208,8 @@ def test_innovations_of_a_period_are_averaged_at_the_times_of_the_readings():
         readings.append(Sample(7.0 + 2.0 * part, float(x) - off, float(y) + off))
     corrected = predicted.observe(readings)
     np.testing.assert_allclose(corrected.innovation, [-0.3, 0.3], atol=1e-12)
-    assert corrected.tip[1] == pytest.approx(predicted.tip[1] + 0.3, abs=1e-9)
+    assert corrected.tip[1] == pytest.approx(corrected.measured[1], abs=1e-9)
+    np.testing.assert_allclose(corrected.measured, np.add(predicted.tip[:2], [-0.3, 0.3]), atol=1e-12)
 
 
 @pytest.mark.parametrize(("time", "part"), [(7.0, 0.0), (7.5, 0.25), (9.0, 1.0), (6.0, 0.0), (11.0, 1.0)])

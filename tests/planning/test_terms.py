@@ -86,3 +86,14 @@ def test_cost_is_the_weighted_sum_and_infinite_where_the_model_failed():
     np.testing.assert_allclose(terms.cost(listed, OUTCOME), [9.0, 6.5])
     failed = replace(OUTCOME, converged=np.array([[True, True, True], [True, False, True]]))
     assert terms.cost(listed, failed).tolist() == [9.0, np.inf]
+
+
+def test_a_late_roll_costs_more_the_nearer_the_target_and_one_at_it_one():
+    controls, tips = np.zeros((3, 2, 5)), np.zeros((3, 2, 3))
+    controls[:, :, 0], controls[:, :, 4] = 5.0, -1.0
+    controls[0, 0, 4] = controls[1, 1, 4] = 1.0  # the third rolls nothing
+    tips[:, :, 0] = 35.0, 40.0
+    late = terms.late_rolls(replace(OUTCOME, controls=controls, tips=tips), depth=40.0, length=5.0)
+    np.testing.assert_allclose(late, [np.exp(-2.0), np.exp(-1.0), 0.0])
+    at_target = terms.late_rolls(replace(OUTCOME, controls=controls, tips=tips), depth=35.0, length=5.0)
+    assert at_target[1] == 1.0

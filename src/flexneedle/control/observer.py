@@ -120,17 +120,17 @@ def _followed(at: Corrected, done: Move) -> Corrected:
     seen = np.mean([_innovation(before, predicted.tip, done, sample) for sample in done.samples], axis=0)
     measured = predicted.tip[:2] + seen
     noise = float(at.simulator.scenario.tracker.jitter_per_axis / np.sqrt(len(done.samples)))
-    at, predicted = _moved_along(at, predicted, float(seen[0]), noise)
+    at, predicted = _moved_along(at, done, float(seen[0]), noise)
     at = replace(
         at,
         innovation=(float(seen[0]), float(seen[1])),
         measured=(float(measured[0]), float(measured[1])),
     )
     if predicted.tip[0] > 0.0:
-        return replace(at, state=_held(at, predicted))
+        return replace(at, state=_held(at, predicted, measured))
     if not at.beliefs.fits_start:
         return replace(at, state=at.simulator.assimilate(predicted, measured.tolist()).state)
-    return _fit_start(at, predicted, float(seen[1]), noise)
+    return _fit_start(at, predicted, float(measured[1] - predicted.tip[1]), noise)
 
 
 def _innovation(before: Floats, after: Floats, done: Move, sample: Sample) -> Floats:
@@ -139,11 +139,15 @@ def _innovation(before: Floats, after: Floats, done: Move, sample: Sample) -> Fl
     return np.asarray(place(sample)) - expected
 
 
-def _moved_along(at: Corrected, predicted: State, seen: float, noise: float) -> tuple[Corrected, State]:
-    """One step of a Kalman filter on the start along the axis, and the needle so far further."""
+def _moved_along(at: Corrected, done: Move, off: float, noise: float) -> tuple[Corrected, State]:
+    """One step of a Kalman filter on the start along the axis, and the move predicted again with it.
+
+    As one step with the correction: what it cuts is still free to follow the measured tip.
+    """
     gain = at.axial / (at.axial + noise**2 + 1e-12)
-    moved = predicted.believing(base_x=float(predicted.base[0]) + gain * seen)
-    return replace(at, axial=(1.0 - gain) * at.axial), at.simulator.step(moved, Control())
+    moved = at.state.believing(base_x=float(at.state.base[0]) + gain * off)
+    predicted = at.simulator.step(moved, Control.from_row(done.applied))
+    return replace(at, axial=(1.0 - gain) * at.axial), predicted
 
 
 def _bevel_reach(simulator: Simulator, depth: float) -> float:
@@ -178,9 +182,9 @@ def _tip_shift(simulator: Simulator, state: State, base_y: float, base_turn: flo
     return float(simulator.step(moved, Control()).tip[1] - state.tip[1])
 
 
-def _held(at: Corrected, predicted: State) -> State:
-    """The state with its tip where it was seen, and the load that this takes, low-passed, if it is learnt."""
-    held = at.simulator.assimilate(predicted, np.add(predicted.tip[:2], at.innovation).tolist()).state
+def _held(at: Corrected, predicted: State, measured: Floats) -> State:
+    """The state with its tip where it was measured, and the load that this takes, low-passed, if it is learnt."""
+    held = at.simulator.assimilate(predicted, measured.tolist()).state
     if not at.beliefs.learns_load:
         return held
     gain = at.simulator.scenario.control.load_gain

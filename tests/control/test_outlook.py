@@ -1,0 +1,139 @@
+"""The standard deviation of the predicted miss: that of a linear problem by Monte Carlo, and what bounds it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from flexneedle.control import outlook as ol
+from flexneedle.control.outlook import Outlook
+from flexneedle.control.prior import RUN_OUT
+from identified import NEEDLES, followed
+
+TARGET = 40.0
+GRID = np.arange(-30.0, 60.0)
+
+
+def linear(precision, curves, now=0.0, variance=1e-3):
+    """Outlook and estimate of a linear problem: the tip is at the parameters' sum, each times its curve (K, g)."""
+    setup = SimpleNamespace(max_advance_mm=1.0)
+    estimate = SimpleNamespace(
+        precision=np.asarray(precision),
+        reading_variance=variance,
+        nominal=SimpleNamespace(scenario=SimpleNamespace(setup=setup)),
+        state=SimpleNamespace(tip=np.array([now, 0.0, 0.0])),
+    )
+    return Outlook(GRID, np.asarray(curves)), estimate
+
+
+def two_parameters():
+    """An offset and a bend that shows beyond the skin, both uncertain."""
+    return np.diag([1.0 / 0.3**2, 1.0 / 0.8**2]), np.stack(
+        [np.ones(GRID.size), (np.maximum(GRID, 0.0) / TARGET) ** 2]
+    )
+
+
+def floor(estimate):
+    """Of the miss: what no parameter explains (mm)."""
+    return ol._UNEXPLAINED * np.sqrt(estimate.reading_variance)
+
+
+@pytest.mark.parametrize("now", [-20.0, 5.0, 25.0, 34.0])
+@pytest.mark.parametrize("variance", [1e-4, 1e-2, 0.3])
+def test_it_is_that_of_a_monte_carlo_of_a_linear_problem(now, variance):
+    """Parameters as uncertain as now, readings up to the last correction, a path to the target of the estimate then."""
+    precision, curves = two_parameters()
+    outlook, estimate = linear(precision, curves, now, variance)
+    rng, n = np.random.default_rng(1), 20_000
+    truth = rng.multivariate_normal(np.zeros(2), np.linalg.inv(precision), n)
+    ahead = curves[:, (now < GRID) & (GRID <= TARGET - ol.UNCORRECTED)]
+    readings = truth @ ahead + rng.normal(0.0, np.sqrt(variance), (n, ahead.shape[1]))
+    gain = np.linalg.solve(precision + ahead @ ahead.T / variance, ahead / variance)
+    estimated = readings @ gain.T
+    end = curves[:, GRID == TARGET].ravel()
+    miss = (truth - estimated) @ end + rng.normal(0.0, floor(estimate), n)
+    assert outlook.sd(estimate, TARGET, 0.0) == pytest.approx(miss.std(), rel=0.03)
+
+
+def test_past_the_last_correction_nothing_is_learned():
+    """What is known now is all that will be."""
+    precision, curves = two_parameters()
+    outlook, estimate = linear(precision, curves, now=TARGET - ol.UNCORRECTED)
+    end = curves[:, GRID == TARGET].ravel()
+    expected = np.sqrt(end @ np.linalg.inv(precision) @ end + floor(estimate) ** 2)
+    assert outlook.sd(estimate, TARGET, 0.0) == pytest.approx(expected)
+
+
+@given(
+    miss=st.floats(-30.0, 30.0), now=st.floats(-25.0, 39.0), variance=st.floats(1e-6, 1.0),
+    sds=st.tuples(st.floats(1e-3, 3.0), st.floats(1e-3, 3.0)),
+)  # fmt: skip
+@hypothesis_settings(deadline=None, derandomize=True)
+def test_it_is_never_below_what_is_unexplained_and_grows_with_a_miss_that_stays(miss, now, variance, sds):
+    """By the miss at first, and by what is uncertain now at most."""
+    _, curves = two_parameters()
+    outlook, estimate = linear(np.diag(np.array(sds) ** -2.0), curves, now, variance)
+    least, sd = outlook.sd(estimate, TARGET, 0.0), outlook.sd(estimate, TARGET, miss)
+    assert floor(estimate) <= least <= sd
+    end = curves[:, GRID == TARGET].ravel()
+    uncertain = np.sqrt(end**2 @ np.array(sds) ** 2)
+    grown = np.sqrt(max(sd**2 - least**2, 0.0))
+    assert grown == pytest.approx(min(abs(miss), uncertain), rel=1e-6, abs=1e-6)
+    assert outlook.sd(estimate, TARGET, -miss) == sd
+
+
+def test_the_nearer_the_target_the_less_will_be_learned():
+    precision, curves = two_parameters()
+    sds = []
+    for now in (-20.0, 0.0, 15.0, 30.0, 35.0):
+        outlook, estimate = linear(precision, curves, now, variance=0.02)
+        sds.append(outlook.sd(estimate, TARGET, 0.0))
+    assert (np.diff(sds) >= 0.0).all()
+    assert sds[-1] > 2.0 * sds[0]
+
+
+# ---- its derivatives
+
+
+def ahead_of(estimate, steps=12):
+    """Controls (m, 5) with a roll on the way, and the tips (m, 3) as the estimated needle goes, by the tracker."""
+    rows = [(2.0, 0.0, 0.0, 0.05, 1 if k == 5 else -1) for k in range(steps)]
+    state, tips = estimate.state, []
+    for row in rows:
+        state = estimate.simulator.replay(state, [row])[0]
+        tips.append(np.add(state.tip, [0.0, estimate.off_axis(state.bevel), 0.0]))
+    return np.array(rows), np.array(tips)
+
+
+def test_what_was_just_perturbed_is_renewed_along_the_path_ahead():
+    """The difference of two needles that are both carried on, one of them with another value; the rest is kept."""
+    estimate, _ = followed(NEEDLES["all"], 40)
+    controls, tips = ahead_of(estimate)
+    old = Outlook.of(estimate)
+    new = old.renewed(estimate, controls, tips)
+    passed = (new.grid > tips[0, 0]) & (new.grid < tips[-1, 0])
+    renewed = {one.parameter for one in estimate.perturbed} | {RUN_OUT}
+    for one in estimate.perturbed:
+        moved, axis = one.state, estimate.state
+        expected = []
+        for row in controls:
+            moved = one.simulator.replay(moved, [row])[0]
+            axis = estimate.simulator.replay(axis, [row])[0]
+            expected.append((moved.tip[1] - axis.tip[1]) / one.step)
+        by_hand = np.interp(new.grid[passed], tips[:, 0], expected)
+        scale = np.abs(by_hand).max()
+        np.testing.assert_allclose(new.curves[one.parameter][passed], by_hand, atol=0.01 * scale + 2e-3)
+    for k in set(range(estimate.parameters.size)) - renewed:
+        np.testing.assert_array_equal(new.curves[k], old.curves[k])
+
+
+def test_the_run_out_is_on_the_bevels_side():
+    estimate, _ = followed(NEEDLES["run-out"], 30)
+    controls, tips = ahead_of(estimate)
+    curve = Outlook.of(estimate).renewed(estimate, controls, tips).curves[RUN_OUT]
+    side = estimate.state.bevel
+    assert np.interp(tips[3, 0], estimate.grid, curve) == side
+    assert np.interp(tips[9, 0], estimate.grid, curve) == -side
