@@ -123,6 +123,7 @@ class _Show:
         self._progress = progress
         self._start = scenario.setup.start_tip_x
         self._travel = scenario.target.depth_mm - self._start
+        self._warned = False
         progress.begin("Planning")
 
     def iteration(self, _strategy: str, info: dict[str, Any]) -> None:
@@ -132,6 +133,9 @@ class _Show:
     def period(self, period: Period) -> None:
         self._progress.finish("Planning")
         depth = period.estimate[0]
+        if period.warning and not self._warned:
+            self._warned = True
+            self._progress.say(f"flexneedle: warning at {depth:.1f} mm: {period.warning}")
         done = min(max(depth - self._start, 0.0), self._travel)
         self._progress.show("Inserting", done, self._travel, f"tip at {depth:.1f} mm")
 

@@ -5,10 +5,11 @@ import math
 from flexneedle.control.interface import Decision
 from flexneedle.scenario import Control
 
-__all__ = ["hopeless", "probability_beyond", "warning"]
+__all__ = ["hopeless", "likely_misses", "missed", "probability_beyond", "warning"]
 
 _RADIUS_MM = 1.0  # of the paper's target circles: an insertion that ends beyond has missed
-_LIKELY = 0.2  # probability of that from which a warning is given
+_LIKELY = 0.5  # probability of that from which a decision counts towards a warning
+_IN_A_ROW = 3  # such decisions make one: a single prediction, right after the skin say, may be off
 
 
 def probability_beyond(limit: float, miss: float, sd: float) -> float:
@@ -37,12 +38,20 @@ def hopeless(decision: Decision, control: Control) -> str:
     )
 
 
-def warning(decision: Decision) -> str:
-    """A line if the insertion is likely to miss by more than 1 mm; empty otherwise."""
+def likely_misses(decision: Decision, before: int) -> int:
+    """How many decisions in a row, with this one, predict a miss of more than 1 mm; `before` it there were so many."""
     probability = probability_beyond(_RADIUS_MM, decision.miss, decision.miss_sd)
-    if probability < _LIKELY:
+    return before + 1 if probability >= _LIKELY else 0
+
+
+def warning(decision: Decision, in_a_row: int) -> str:
+    """A line if so many decisions in a row predict a miss of more than 1 mm; empty otherwise."""
+    if in_a_row < _IN_A_ROW:
         return ""
-    return (
-        f"predicted miss {decision.miss:+.2f} ± {decision.miss_sd:.2f} mm: "
-        f"beyond {_RADIUS_MM:g} mm with a probability of {probability:.2f}"
-    )
+    return f"predicted miss {decision.miss:+.2f} ± {decision.miss_sd:.2f} mm: likely beyond {_RADIUS_MM:g} mm"
+
+
+def missed(tip: tuple[float, float], target: tuple[float, float]) -> str:
+    """A line if the estimated tip (mm) ended more than 1 mm from the target (mm); empty otherwise."""
+    distance = math.dist(tip, target)
+    return f"the estimated tip ended {distance:.2f} mm from the target" if distance > _RADIUS_MM else ""

@@ -4,9 +4,9 @@ The estimate's parameters are normal, with the covariance P that the readings le
 and the path is corrected meanwhile, until the tip is so near the target that a correction takes no effect. With c, the
 derivative of the tip's lateral position at the target, the variance of the miss is
 
-    c P' c + σ² + min(m², c P c)
+    c P' c + σ² + (κ l)² + min(m², c P c)
 
-σ is what no parameter explains. The last term is for a miss m that is predicted although a path without one was
+σ is what no parameter explains of a reading, κ l of a path of length l that is left. The last term is for a miss m that is predicted although a path without one was
 searched for: where the needle is at the limit of what it can do, what is learned on the way cannot be corrected either.
 """
 
@@ -24,6 +24,7 @@ Floats = NDArray[np.float64]
 UNCORRECTED = 5.0
 """Control steps before the target in which a correction takes no effect."""
 _UNEXPLAINED = 2.0  # standard deviations of the mean of a control step's readings
+_DRIFT = 0.0015  # mm per mm of path
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,5 +65,6 @@ class Outlook:
         slopes = self.curves[:, to_come]
         then = estimate.precision + slopes @ slopes.T / estimate.reading_variance
         known = end @ np.linalg.solve(then, end) + _UNEXPLAINED**2 * estimate.reading_variance
+        known += (_DRIFT * (target - float(estimate.state.tip[0]))) ** 2
         now = float(end @ np.linalg.solve(estimate.precision, end))
         return float(np.sqrt(float(known) + min(miss**2, now)))

@@ -11,7 +11,7 @@ import numpy as np
 
 from flexneedle.control import tables
 from flexneedle.control.estimate import Estimate
-from flexneedle.control.forecast import hopeless, warning
+from flexneedle.control.forecast import hopeless, likely_misses, missed, warning
 from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Decision, Method, Task, at_depth
 from flexneedle.control.methods import DEFAULT, used
@@ -128,7 +128,7 @@ def _periods(
     arrived_at: float | None = None
     lost = ""  # why no path leads to the target,
     lost_at: float | None = None  # and since when
-    moves = 0
+    moves = in_a_row = 0
     for index in indices:
         if moves == _TOO_MANY * len(task.plan.controls):
             return
@@ -143,6 +143,7 @@ def _periods(
             )
         else:
             decision, memory = _decided(chosen, task, memory, sight.estimate, rng)
+            in_a_row = likely_misses(decision, in_a_row)
             lost = "" if force else hopeless(decision, scenario.control)
             lost_at = (begun if lost_at is None else lost_at) if lost else None
             if lost:
@@ -164,9 +165,19 @@ def _periods(
         ending = _ending(task, sight, None if held is None else held.lasted(sight.field), seen)
         if lost_at is not None and now - lost_at > scenario.control.hold_limit_s - 1e-9:
             ending = ending or ("held", lost)
-        yield _record(index, now, task.plan, rig, decision, applied, sight, clocks), ending
+        period = _record(index, now, task.plan, rig, decision, applied, sight, clocks)
+        yield replace(period, warning=_warning(task, decision, in_a_row, sight, ending)), ending
         if ending is not None:
             return
+
+
+def _warning(
+    task: Task, decision: Decision, in_a_row: int, sight: Sight, ending: tuple[str, str] | None
+) -> str:
+    """What a period warns of: on the way what is predicted, at the end where the tip is estimated to be."""
+    if ending is not None and ending[0] == "done":
+        return missed(_pose(sight.estimate.tip)[:2], task.plan.target)
+    return warning(decision, in_a_row)
 
 
 def _decided(
@@ -268,7 +279,6 @@ def _record(
         decision=decision.why,
         miss=decision.miss,
         miss_sd=decision.miss_sd,
-        warning=warning(decision),
         true_tip=None if truth is None else _pose(truth.tip),
         true_strain_energy=None if truth is None else truth.strain_energy,
         true_stretch=None if truth is None else truth.least_stretch,

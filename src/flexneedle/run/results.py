@@ -50,6 +50,7 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
             "reached": bool(insertion.reached),
             "outcome": insertion.outcome,
             "reason": insertion.reason,
+            "warning": insertion.warning or None,
             "flips": insertion.flips,
             "planned_flips": plan.flips,
             "strain_energy_mj": last.true_strain_energy if last else None,

@@ -7,6 +7,7 @@ import time
 import warnings
 from dataclasses import dataclass, field
 from functools import cache
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +40,22 @@ RESULTS = {
     "held_s": float,
     "unconverged_periods": int,
     "reach_mm": float,
+    "predicted_quarter_mm": float,
+    "predicted_quarter_sd_mm": float,
+    "predicted_half_mm": float,
+    "predicted_half_sd_mm": float,
+    "predicted_three_quarters_mm": float,
+    "predicted_three_quarters_sd_mm": float,
+    "warning": str,
     "outcome": str,
     "reason": str,
 }
-"""What an insertion came to: the columns and their types; null where it is not known."""
+"""What an insertion came to: the columns and their types; null where it is not known.
+
+predicted_…: lateral miss that the controller predicted when the tip was at that part of the target's depth, and its
+standard deviation.
+"""
+_PARTS = {"quarter": 0.25, "half": 0.5, "three_quarters": 0.75}
 TIMES = {"control_s": float, "plant_s": float, "total_s": float}
 """Wall-clock times of an insertion."""
 
@@ -163,9 +176,22 @@ def _results(insertion: Insertion) -> dict[str, Any]:
         "periods": len(periods),
         "held_s": insertion.held_s,
         "unconverged_periods": sum(not period.converged for period in periods),
+        **_predictions(insertion),
+        "warning": insertion.warning,
         "outcome": insertion.outcome,
         "reason": insertion.reason,
     }
+
+
+def _predictions(insertion: Insertion) -> dict[str, float | None]:
+    """Miss and standard deviation (mm) of the first decision with the tip at each part of the target's depth."""
+    found: dict[str, float | None] = {}
+    for name, part in _PARTS.items():
+        depth = part * insertion.target[0]
+        first = next((p for p in insertion.periods if p.estimate[0] >= depth and not isnan(p.miss)), None)
+        found[f"predicted_{name}_mm"] = None if first is None else first.miss
+        found[f"predicted_{name}_sd_mm"] = None if first is None else first.miss_sd
+    return found
 
 
 def _times(insertion: Insertion) -> dict[str, float]:
