@@ -115,8 +115,8 @@ def believed(period):
 
 
 def moving(done):
-    """The periods in which the driver was asked to move."""
-    return [period for period in done.periods if period.decision not in (HELD, RESTING)]
+    """The periods in which the driver was asked to move: not those of a rest or a hold."""
+    return [period for period in done.periods if period.command != STILL]
 
 
 def lost(_sample):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 import flexneedle
-from flexneedle.control.forecast import hopeless, probability_beyond, warning
+from flexneedle.control.forecast import hopeless, likely_misses, missed, probability_beyond, warning
 from flexneedle.control.interface import Decision
 
 CONTROL = flexneedle.load_scenario("phantom").control
@@ -37,11 +37,12 @@ def test_a_miss_that_is_certain_is_beyond_the_limit_or_not(miss, beyond):
 def test_what_is_not_predicted_holds_and_warns_of_nothing(miss, sd):
     assert probability_beyond(LIMIT, miss, sd) == 0.0
     assert hopeless(predicting(miss, sd), CONTROL) == ""
-    assert warning(predicting(miss, sd)) == ""
+    assert likely_misses(predicting(miss, sd), 5) == 0
 
 
 def test_a_decision_predicts_nothing_by_default():
-    assert hopeless(Decision(STILL, ""), CONTROL) == warning(Decision(STILL, "")) == ""
+    assert hopeless(Decision(STILL, ""), CONTROL) == ""
+    assert likely_misses(Decision(STILL, ""), 5) == 0
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -65,25 +66,46 @@ def test_limit_and_confidence_are_the_scenarios():
     assert "control.miss_limit_mm = 0.5 " in hopeless(predicting(0.51, 0.3), strict.control)
 
 
-def test_who_is_unsure_is_not_held_but_warned():
-    """A miss of 3 mm that may as well be none."""
-    decision = predicting(3.0, 5.0)
-    assert hopeless(decision, CONTROL) == ""
-    assert warning(decision).startswith(
-        "predicted miss +3.00 ± 5.00 mm: beyond 1 mm with a probability of 0.8"
-    )
+def warned(decisions):
+    """Warnings of decisions one after another."""
+    in_a_row, lines = 0, []
+    for decision in decisions:
+        in_a_row = likely_misses(decision, in_a_row)
+        lines.append(warning(decision, in_a_row))
+    return lines
+
+
+def test_several_likely_misses_in_a_row_make_a_warning():
+    """One alone does not, nor do as many with a good one in between."""
+    bad, good = predicting(3.0, 0.5), predicting(0.1, 0.1)
+    lines = warned([bad] * 5)
+    first = next(k for k, line in enumerate(lines) if line)
+    assert first > 0
+    assert lines[first:] == ["predicted miss +3.00 ± 0.50 mm: likely beyond 1 mm"] * (5 - first)
+    assert warned(([bad] * first + [good]) * 4) == [""] * (4 * (first + 1))
+
+
+def test_it_is_likely_from_a_probability_of_one_half_on():
+    """With a small standard deviation: where the predicted miss itself is beyond 1 mm, on either side."""
+    for miss, likely in ((0.999, 0), (1.001, 1), (-0.999, 0), (-1.001, 1)):
+        assert likely_misses(predicting(miss, 0.05), 0) == likely
+    assert likely_misses(predicting(1.5, 0.05), 4) == 5
+    assert likely_misses(predicting(0.0, 0.05), 4) == 0
+
+
+def test_without_a_prediction_nothing_is_warned_of():
+    """At rest, after decisions that were: there is no figure to warn with."""
+    assert warning(predicting(math.nan, math.nan), 9) == ""
 
 
 @given(st.floats(-5.0, 5.0), st.floats(1e-3, 3.0))
 def test_whoever_is_held_is_warned_too(miss, sd):
     decision = predicting(miss, sd)
-    assert warning(decision) or not hopeless(decision, CONTROL)
+    assert warning(decision, 9) or not hopeless(decision, CONTROL)
 
 
-@given(st.floats(0.0, 5.0), st.floats(1e-3, 3.0), st.floats(0.01, 2.0))
-def test_a_larger_miss_is_no_less_likely_to_be_warned_of(miss, sd, more):
-    assert warning(predicting(miss + more, sd)) or not warning(predicting(miss, sd))
-
-
-def test_no_warning_of_a_good_path():
-    assert warning(predicting(0.05, 0.1)) == ""
+@pytest.mark.parametrize(("tip", "line"), [((40.0, 6.1), "1.10"), ((38.5, 3.0), "2.50"), ((40.6, 5.6), "")])
+def test_an_end_beyond_a_millimetre_of_the_target_is_warned_of(tip, line):
+    """Depth included."""
+    expected = f"the estimated tip ended {line} mm from the target" if line else ""
+    assert missed(tip, (40.0, 5.0)) == expected

@@ -37,8 +37,9 @@ def two_parameters():
 
 
 def floor(estimate):
-    """Of the miss: what no parameter explains (mm)."""
-    return ol._UNEXPLAINED * np.sqrt(estimate.reading_variance)
+    """Of the miss: what no parameter explains of a reading, and of the path that is left (mm)."""
+    drift = ol._DRIFT * (TARGET - estimate.state.tip[0])
+    return float(np.hypot(ol._UNEXPLAINED * np.sqrt(estimate.reading_variance), drift))
 
 
 @pytest.mark.parametrize("now", [-20.0, 5.0, 25.0, 34.0])
@@ -90,7 +91,7 @@ def test_the_nearer_the_target_the_less_will_be_learned():
     sds = []
     for now in (-20.0, 0.0, 15.0, 30.0, 35.0):
         outlook, estimate = linear(precision, curves, now, variance=0.02)
-        sds.append(outlook.sd(estimate, TARGET, 0.0))
+        sds.append(np.sqrt(outlook.sd(estimate, TARGET, 0.0) ** 2 - floor(estimate) ** 2))
     assert (np.diff(sds) >= 0.0).all()
     assert sds[-1] > 2.0 * sds[0]
 

@@ -36,7 +36,7 @@ def wants_flip(
 
     The bevel is turned if the other path passes nearer and the present one misses by more than half of the paths'
     separation at the target, ½κs², enlarged by the share `dead_band`, plus `noise` (mm): a band that shrinks towards
-    the target, where the paths hardly part, but not below what the tracker sees.
+    the target, where the paths hardly part, but not below what the tracker resolves.
     """
     keep = closest_approach(pose, bevel * curvature, target)
     turn = closest_approach(pose, -bevel * curvature, target)
@@ -63,7 +63,7 @@ class BevelRule(Section):
 
 
 def decide(task: Task, estimate: Estimate, rule: BevelRule) -> tuple[bool, str]:
-    """`wants_flip` towards the plan's target, from the believed tip. In air the bevel has no effect and stays."""
+    """`wants_flip` towards the plan's target, from the estimated tip. In air the bevel has no effect and stays."""
     if estimate.tip[0] <= 0.0:
         return False, "in air"
     return wants_flip(

@@ -1,4 +1,4 @@
-"""What every observer offers: the believed needle, corrected by readings that come late."""
+"""What every observer offers: the estimated needle, corrected by readings that come late."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -41,11 +41,11 @@ class Move:
 
 
 class Estimate(Protocol):
-    """A frozen belief about the insertion now."""
+    """A frozen estimate of the insertion now."""
 
     @property
     def simulator(self) -> Simulator:
-        """The model that predicts, with what was learnt about its constants."""
+        """The model that predicts, with the estimated constants."""
         ...
 
     @property
@@ -55,17 +55,17 @@ class Estimate(Protocol):
 
     @property
     def tip(self) -> Floats:
-        """Pose (3,) of the tip now, as a tracker without errors would see it."""
+        """Pose (3,) of the tip now, as a tracker without errors would measure it."""
         ...
 
     @property
     def innovation(self) -> tuple[float, float]:
-        """What the last reading told against the prediction (mm)."""
+        """The last reading less its prediction (mm)."""
         ...
 
     @property
     def measured(self) -> tuple[float, float] | None:
-        """Tip (x, y) seen at the end of the last move of which there is a reading (mm), None before the first."""
+        """Tip (x, y) measured at the end of the last move of which there is a reading (mm), None before the first."""
         ...
 
     @property
@@ -74,19 +74,19 @@ class Estimate(Protocol):
         ...
 
     def tip_at(self, time: float) -> tuple[float, float]:
-        """Where the tip was believed to be (mm) at `time`, each move taken as even."""
+        """Estimated position of the tip (mm) at `time`, each move taken as even."""
         ...
 
     def move(self, applied: Command, begun: float, ended: float) -> "Estimate":
-        """The belief after the driver moved so, from `begun` to `ended` (s)."""
+        """The estimate after the driver moved so, from `begun` to `ended` (s)."""
         ...
 
     def observe(self, samples: Sequence[Sample]) -> "Estimate":
-        """The belief corrected by good readings, the newest last."""
+        """The estimate corrected by good readings, the newest last."""
         ...
 
     def unseen(self) -> "Estimate":
-        """The belief of a period without a reading to believe: no innovation."""
+        """The estimate of a period without a good reading: no innovation."""
         ...
 
 
@@ -103,7 +103,7 @@ def assigned(moves: tuple[Move, ...], samples: Sequence[Sample]) -> tuple[Move, 
 
 
 def along(moves: tuple[Move, ...], tips: Floats, time: float) -> tuple[float, float]:
-    """Place (mm) at `time` on the way through tips (k + 1, 3), those before and after each of k moves."""
+    """Position (mm) at `time` on the path through tips (k + 1, 3), those before and after each of k moves."""
     if not moves:
         return float(tips[-1, 0]), float(tips[-1, 1])
     times = [moves[0].begun, *(done.ended for done in moves)]
@@ -111,7 +111,7 @@ def along(moves: tuple[Move, ...], tips: Floats, time: float) -> tuple[float, fl
 
 
 def place(sample: Sample) -> tuple[float, float]:
-    """Where a good sample saw the tip (mm). Raises ValueError for one that saw nothing: it was not sorted out."""
+    """Tip (mm) as a good sample has it. Raises ValueError for an empty sample."""
     if sample.x is None or sample.y is None:
         raise ValueError("an empty sample was not sorted out")
     return sample.x, sample.y

@@ -45,8 +45,8 @@ def likely_misses(decision: Decision, before: int) -> int:
 
 
 def warning(decision: Decision, in_a_row: int) -> str:
-    """A line if so many decisions in a row predict a miss of more than 1 mm; empty otherwise."""
-    if in_a_row < _IN_A_ROW:
+    """A line if so many decisions in a row predict a miss of more than 1 mm; empty otherwise or without one."""
+    if in_a_row < _IN_A_ROW or math.isnan(decision.miss):
         return ""
     return f"predicted miss {decision.miss:+.2f} ± {decision.miss_sd:.2f} mm: likely beyond {_RADIUS_MM:g} mm"
 

@@ -11,7 +11,8 @@ So what is ahead of the tip is estimated as far as it is correlated with what wa
 shift of all axial readings, fitted apart from the rest. What the fit leaves is low-passed and carried on as a constant.
 
 The derivative of the lateral position with respect to a parameter is kept as a curve over the depth of the tip, a few
-steps ahead of it too. Each period a few of the curves are simulated anew, in turn: none is older than `_ROUND` periods.
+steps ahead of it too. Each period a few of the curves are simulated anew, alternately: none is older than `_ROUND`
+periods.
 """
 
 from collections.abc import Iterator, Sequence
@@ -123,22 +124,22 @@ class Identified:
 
     @property
     def tip(self) -> Floats:
-        """Tip pose (3,) as seen: the model's and what its axis is off."""
+        """Tip pose (3,) as it is measured: the model's, and its distance from the needle's axis."""
         tip = self.state.tip
         tip[1] += self.off_axis(self.state.bevel)
         return tip
 
     @property
     def run_out(self) -> float:
-        """Lateral distance (mm) of the seen tip from the needle's axis, with the bevel up."""
+        """Lateral distance (mm) of the measured tip from the needle's axis, with the bevel up."""
         return float(self.parameters[RUN_OUT])
 
     def off_axis(self, bevel: float) -> float:
-        """Lateral distance (mm) of the seen tip from the model's with the bevel on that side."""
+        """Lateral distance (mm) of the measured tip from the model's with the bevel on that side."""
         return self.run_out * bevel + self.residual
 
     def tip_at(self, time: float) -> tuple[float, float]:
-        """Estimated place of the tip (mm) at `time`."""
+        """Estimated position of the tip (mm) at `time`."""
         x, y = along(self.moves, self.tips, time)
         turned_since = sum(done.applied[4] > 0.0 for done in self.moves if done.begun >= time)
         return x, y + self.off_axis(self.state.bevel * (-1) ** turned_since)
@@ -280,7 +281,7 @@ class Identified:
         return float(scenario.tracker.jitter_per_axis**2 / count + unexplained(scenario, self.settings) ** 2)
 
     def _due(self) -> Iterator[int]:
-        """The parameters whose curves are to be simulated this period, ."""
+        """The parameters whose curves are simulated this period."""
         for place, k in enumerate(_LEADING):
             if place % _LEADING_ROUND == self.turn % _LEADING_ROUND:
                 yield k

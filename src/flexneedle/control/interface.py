@@ -58,15 +58,15 @@ def travel_left(scenario: Scenario, plan: PlanRecord, state: State) -> float:
 
 
 def at_depth(task: Task, _memory: Any, estimate: Estimate) -> bool:
-    """Whether the believed tip is at the target depth, within the tolerance, or past it, or the stroke is used up."""
+    """Whether the estimated tip is at the target depth, within the tolerance, or past it, or the stroke is used up."""
     return travel_left(task.scenario, task.plan, estimate.state) <= task.scenario.control.depth_tolerance_mm
 
 
 class Observer(Protocol):
-    """What a controller lets be believed."""
+    """Makes the estimate that a controller decides on."""
 
     def begin(self, task: Task) -> Estimate:
-        """The belief before the first reading."""
+        """The estimate before the first reading."""
         ...
 
 

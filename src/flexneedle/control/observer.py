@@ -1,6 +1,6 @@
 """An observer that corrects the state: the model follows the tracker, so that its prediction has no offset.
 
-Readings come late. Each belongs to the move in which it was taken; the belief is corrected there, and the moves
+Readings come late. Each belongs to the move in which it was taken; the estimate is corrected there, and the moves
 since are predicted again (a fixed-lag filter).
 
 The start error along the axis is fitted to all readings (a scalar Kalman filter): axial motion is rigid.
@@ -26,7 +26,7 @@ __all__ = ["Beliefs", "Corrected", "Estimate"]
 
 @dataclass(frozen=True)
 class Beliefs:
-    """What this observer may learn: where the clamp holds the base, in air; a tip load, in tissue.
+    """What this observer may estimate: where the clamp holds the base, in air; a tip load, in tissue.
 
     Without the load the measured tip is released again in the prediction, as in the paper.
     """
@@ -35,7 +35,7 @@ class Beliefs:
     learns_load: bool = True
 
     def begin(self, task: Task) -> "Corrected":
-        """Believe in a straight start, with the prior of the scenario."""
+        """Begin with a straight start and the prior of the scenario."""
         simulator, control = task.simulator, task.scenario.control
         prior = np.diag([control.start_offset_sd_mm**2, control.start_angle_sd**2])
         state = simulator.start(task.plan.bevel)
@@ -46,9 +46,9 @@ class Beliefs:
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """The belief; an `Estimate`. `state` is that of now.
+    """An `Estimate`. `state` is that of now.
 
-    past: the belief before the first of `moves`, those of which readings may still come; tips (k + 1, 3): believed
+    past: the state before the first of `moves`, those of which readings may still come; tips (k + 1, 3): estimated
     tip pose at their ends, the start first; covariance (2, 2) of base y (mm) and turn (rad), and axial, the variance of
     the start along the axis (mm²), before `moves`; drift: standard deviation of the path's curvature (1/mm).
     """
@@ -78,7 +78,7 @@ class Corrected:
         return float(np.sqrt(arm @ self.covariance @ arm + self.axial + off_path**2))
 
     def tip_at(self, time: float) -> tuple[float, float]:
-        """Where the tip was believed to be (mm) at `time`."""
+        """Estimated position of the tip (mm) at `time`."""
         return along(self.moves, self.tips, time)
 
     def unseen(self) -> "Corrected":
@@ -86,7 +86,7 @@ class Corrected:
         return replace(self, innovation=(0.0, 0.0))
 
     def move(self, applied: Command, begun: float, ended: float) -> "Corrected":
-        """Move the believed needle as the driver did, from `begun` to `ended` (s)."""
+        """Move the estimated needle as the driver did, from `begun` to `ended` (s)."""
         state = self.simulator.step(self.state, Control.from_row(applied))
         tips = np.concatenate([self.tips, state.tip[None]])
         return replace(self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)))
@@ -113,7 +113,7 @@ class Corrected:
 
 
 def _followed(at: Corrected, done: Move) -> Corrected:
-    """The belief after a move: predicted, and corrected by the mean innovation of its readings."""
+    """The estimate after a move: predicted, and corrected by the mean innovation of its readings."""
     before, predicted = at.tip, at.simulator.step(at.state, Control.from_row(done.applied))
     if not done.samples:
         return replace(at, state=predicted)
@@ -183,7 +183,7 @@ def _tip_shift(simulator: Simulator, state: State, base_y: float, base_turn: flo
 
 
 def _held(at: Corrected, predicted: State, measured: Floats) -> State:
-    """The state with its tip where it was measured, and the load that this takes, low-passed, if it is learnt."""
+    """The state with its tip where it was measured, and the load that this takes, low-passed, if it is estimated."""
     held = at.simulator.assimilate(predicted, measured.tolist()).state
     if not at.beliefs.learns_load:
         return held

@@ -6,8 +6,9 @@ derivative of the tip's lateral position at the target, the variance of the miss
 
     c P' c + σ² + (κ l)² + min(m², c P c)
 
-σ is what no parameter explains of a reading, κ l of a path of length l that is left. The last term is for a miss m that is predicted although a path without one was
-searched for: where the needle is at the limit of what it can do, what is learned on the way cannot be corrected either.
+σ is what no parameter explains of a reading, κ l of a path of length l that is left. The last term is for a miss m that
+is predicted although a path without one was searched for: where the needle is at the limit of what it can do, what
+later readings show cannot be corrected either.
 """
 
 from dataclasses import dataclass, replace

@@ -21,7 +21,7 @@ __all__ = ["KNOTS", "SLOTS", "Ahead", "Path", "of_plan", "proposals"]
 
 Floats = NDArray[np.float64]
 KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
-"""Where the guide is corrected, as shares of the way from now to the target."""
+"""Where the guide is corrected, as shares of the path from now to the target."""
 SLOTS = 4
 """Rolls that a path holds at most."""
 _FINE, _COARSE = (
@@ -29,8 +29,8 @@ _FINE, _COARSE = (
     2.0,
 )  # control steps of the rollout at first, and the length of its later steps in control steps
 _DUE = 0.05  # of a control step: a roll this near is made now
-_STEEPEST = 0.03  # slope of the largest correction of the guide, mm per mm of the way left
-_FURTHEST = 0.3  # largest move of a roll, of the way left
+_STEEPEST = 0.03  # slope of the largest correction of the guide, mm per mm of the path left
+_FURTHEST = 0.3  # largest move of a roll, of the path left
 _DECADES = 2.0  # over which the scales of the samples spread
 
 
@@ -52,7 +52,7 @@ def of_plan(plan: PlanRecord) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class Ahead:
-    """The way from now to the target in m steps: depth (m + 1,) of their ends, base (m, 2) of each; mm, rad.
+    """The path from now to the target in m steps: depth (m + 1,) of their ends, base (m, 2) of each; mm, rad.
 
     state: the estimated needle now; path: in hand; step, reach: the guide's limits (mm) a control step and in all;
     advance: longest control step (mm).
@@ -88,7 +88,7 @@ class Ahead:
 
     @property
     def left(self) -> float:
-        """Way left to the target depth (mm)."""
+        """Path left to the target depth (mm)."""
         return float(self.depth[-1] - self.depth[0])
 
     @property

@@ -89,7 +89,7 @@ def run(
     if not plan.reached and not force:
         raise RunError(
             f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), bound by {plan.limit}; "
-            "insert it with force (--force) if it is meant"
+            "use --force to insert it anyway"
         )
     scenario = used(scenario, chosen)
     task = tables.task(chosen, Simulator(scenario, threads), plan)
@@ -112,7 +112,7 @@ def _periods(
 ) -> Iterator[tuple[Period, tuple[str, str] | None]]:
     """Yield each period, and how the insertion ended with it: (outcome, reason), None while it goes on.
 
-    After the last move the needle rests until the tracker has seen it at rest: readings come late.
+    After the last move the needle rests until the tracker has measured it at rest: readings come late.
     """
     scenario, memory = task.scenario, chosen.begin(task)
     belief = chosen.observer.begin(task)
@@ -121,7 +121,7 @@ def _periods(
     held, indices = _held(None, sight, rig.clock.now()), itertools.count()
     if (
         held is not None or sight.sample.frame is not None
-    ):  # a tip alone that is where it should be tells nothing
+    ):  # a tip alone that is where it should be is no news
         clocks = [start, start, start, time.perf_counter()]
         looks = Decision(_STILL, "looks before it moves")
         yield _record(next(indices), rig.clock.now(), task.plan, rig, looks, _STILL, sight, clocks), None
@@ -205,8 +205,9 @@ class _Held:
 
 
 def _held(held: _Held | None, sight: Sight, now: float) -> _Held | None:
-    """The hold after a verdict. Each of the two causes has a clock and a limit of its own; a clock stands while the
-    needle is held for the other cause, and only a good verdict sets it back: causes in turn hold nothing forever."""
+    """The hold after a verdict. Each of the two causes has a clock and a limit of its own; a clock stops while the
+    needle is held for the other cause, and only a good verdict sets it back: alternating causes do not hold forever.
+    """
     if sight.verdict == OK:
         return None
     if held is None:

@@ -1,4 +1,4 @@
-"""What the closed loop makes of the tracker's readings in a period: judged, believed or not."""
+"""What the closed loop makes of the tracker's readings in a period: judged, used or not."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ _NO_SAMPLE = Sample(0.0, None, None)
 
 @dataclass(frozen=True)
 class Sight:
-    """The belief after the readings of a period, all of them with their verdicts, and the verdict of the period.
+    """The estimate after the readings of a period, all of them with their verdicts, and the verdict of the period.
 
     sample: the reading that the verdict is about, an empty one without any; field: whether the verdict is about the
     field, not about a reading.
@@ -32,7 +32,7 @@ class Sight:
     field: bool = False
 
     def saw_after(self, time: float) -> bool:
-        """Whether a reading that may be believed was taken after `time` (s)."""
+        """Whether a good reading was taken after `time` (s)."""
         return any(one.verdict == OK and one.sample.time > time - 1e-6 for one in self.readings)
 
     def limit(self, scenario: Scenario) -> float:
@@ -43,12 +43,12 @@ class Sight:
 def look_around(
     scenario: Scenario, estimate: Estimate, watch: Watch, now: float, tracker: TipTracker
 ) -> Sight:
-    """Judge what the tracker told before the needle moves: something good, or it stays. Nothing of it is learnt."""
+    """Judge the readings before the needle moves: a good one, or it stays. The estimate is not corrected by them."""
     samples = tracker.read()
     stale_after = scenario.control.stale_after_s
     if not samples:
         return _without_news(estimate, watch, now, stale_after, tracker.status)
-    # The tracker may have been at work for long; but nothing moves on what it told last if that was long ago.
+    # The tracker may have been at work for long; but nothing moves on its last reading if that is old.
     ages = [math.inf] * (len(samples) - 1) + [stale_after]
     watch, readings = _judged(scenario, estimate, watch, samples, ages, now)
     watch, field = watch.look()
@@ -56,23 +56,23 @@ def look_around(
     verdict = field if field != OK else newest.verdict
     if verdict == newest.verdict and watch.only_missed(newest.sample, newest.verdict) is not None:
         verdict = OK
-    told = _refused(readings, field) if field != OK else readings
-    return Sight(estimate, watch, told, newest.sample, verdict, field != OK)
+    judged = _refused(readings, field) if field != OK else readings
+    return Sight(estimate, watch, judged, newest.sample, verdict, field != OK)
 
 
 def see(
     scenario: Scenario, predicted: Estimate, watch: Watch, begun: float, now: float, tracker: TipTracker
 ) -> Sight:
-    """Read the tracker, judge its readings and the field, correct the prediction by what may be believed.
+    """Read the tracker, judge its readings and the field, correct the prediction by the good ones.
 
     begun, now: of the move that `predicted` ends with (s). In a field that is distorted, or in doubt, no reading is
-    believed.
+    used.
     """
     stale_after = scenario.control.stale_after_s
     samples = tracker.read()
     if not samples:
         return _without_news(predicted, watch, now, stale_after, tracker.status)
-    # All but the newest were on their way while the needle moved.
+    # All but the newest were in transit while the needle moved.
     ages = [stale_after + now - begun] * (len(samples) - 1) + [stale_after]
     watch, readings = _judged(scenario, predicted, watch, samples, ages, now)
     newest = readings[-1]
@@ -83,11 +83,11 @@ def see(
         readings = _refused(readings, doubt)
     good = [reading.sample for reading in readings if reading.verdict == OK]
     corrected = predicted.observe(good)
-    learnt = corrected if good else corrected.unseen()
+    estimate = corrected if good else corrected.unseen()
     if newest.verdict == OK:
-        return Sight(learnt, watch, readings, newest.sample)
+        return Sight(estimate, watch, readings, newest.sample)
     if (before := watch.only_missed(newest.sample, newest.verdict)) is not None:
-        return Sight(learnt, watch, readings, before)
+        return Sight(estimate, watch, readings, before)
     return Sight(corrected.unseen(), watch, readings, newest.sample, newest.verdict)
 
 
@@ -111,7 +111,7 @@ def _refused(readings: Sequence[Judged], field: str) -> tuple[Judged, ...]:
 
 def _judged(
     scenario: Scenario,
-    believed: Estimate,
+    predicted: Estimate,
     watch: Watch,
     samples: Sequence[Sample],
     ages: Sequence[float],
@@ -119,8 +119,8 @@ def _judged(
 ) -> tuple[Watch, tuple[Judged, ...]]:
     """Take in samples, each not to be older than its age (s)."""
     readings = []
-    limit = scenario.control.innovation_limit_mm + _SURE * believed.tip_sd
+    limit = scenario.control.innovation_limit_mm + _SURE * predicted.tip_sd
     for sample, age in zip(samples, ages, strict=True):
-        watch, verdict = watch.take(sample, believed.tip_at(sample.time), now, age, limit)
+        watch, verdict = watch.take(sample, predicted.tip_at(sample.time), now, age, limit)
         readings.append(Judged(sample, verdict))
     return watch, tuple(readings)

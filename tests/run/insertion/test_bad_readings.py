@@ -117,7 +117,7 @@ def test_a_second_spell_has_its_own_second(plan):
 
 def test_limits_of_age_and_innovation_are_the_scenarios(plan):
     def offset(sample):
-        return replace(sample, time=sample.time - 0.05, y=sample.y + 0.5)
+        return replace(sample, time=sample.time - 0.05, y=sample.y + 1.2)
 
     def verdicts(scenario):
         done = run(plan, Tank(plan.bevel, spoil=between(8.0, 8.4, offset)).rig(), scenario)

@@ -82,11 +82,12 @@ def test_force_goes_on_and_warns(plan):
     done, tank = inserted(in_air(plan), [3.0], force=True)
     assert done.outcome == "done"
     assert len(tank.moves) >= 8
-    assert done.warning == "predicted miss +3.00 ± 0.10 mm: beyond 1 mm with a probability of 1.00"
-    assert all(period.warning for period in moving(done))
+    assert done.warning == "predicted miss +3.00 ± 0.10 mm: likely beyond 1 mm"
+    assert sum(bool(period.warning) for period in moving(done)) > len(moving(done)) - 4
+    assert not any("nan" in period.warning for period in done.periods)
 
 
-@pytest.mark.parametrize(("miss", "sd", "warned"), [(1.5, 0.1, True), (0.0, 2.0, True), (0.5, 0.1, False)])
+@pytest.mark.parametrize(("miss", "sd", "warned"), [(1.5, 0.1, True), (-1.1, 0.5, True), (0.5, 0.1, False)])
 def test_a_likely_miss_is_warned_of_and_not_held(plan, miss, sd, warned):
     done, _ = inserted(in_air(plan), [miss], sd)
     assert done.outcome == "done"
@@ -105,6 +106,9 @@ def test_a_controller_that_predicts_nothing_is_neither_held_nor_warned_of(plan):
 def test_the_hold_and_the_warning_are_in_all_records_and_read_back(plan, tmp_path):
     """Trace, CSV and JSON."""
     done, _ = inserted(plan, [0.2, 1.5, 3.0], force=False)
+    warned = [bool(period.warning) for period in done.periods]
+    assert warned[:2] == [False, False]
+    assert warned[-1]
     with TraceWriter(tmp_path / "trace.mcap", plan, about={}, scenario={}) as writer:
         for period in done.periods:
             writer.add(period)
@@ -118,11 +122,11 @@ def test_the_hold_and_the_warning_are_in_all_records_and_read_back(plan, tmp_pat
     rows = list(csv.DictReader(io.StringIO(text.getvalue())))
     assert [float(row["miss_mm"]) for row in rows[:3]] == [0.2, 1.5, 3.0]
     assert [float(row["miss_sd_mm"]) for row in rows[:3]] == [0.1] * 3
-    assert [bool(row["warning"]) for row in rows[:3]] == [False, True, True]
+    assert [bool(row["warning"]) for row in rows] == warned
     assert rows[2]["decision"].startswith(HELD)
     result = json.loads(json.dumps(insertion_result(done)))
     assert (result["outcome"], result["reached"]) == ("held", False)
-    assert result["reason"] == done.reason
+    assert (result["reason"], result["warning"]) == (done.reason, done.warning)
 
 
 def test_a_target_that_guide_and_bevel_cannot_reach_is_held_and_forced(plan):

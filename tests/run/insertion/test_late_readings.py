@@ -30,7 +30,7 @@ def test_after_the_last_move_it_rests_until_that_is_seen(plan, late):
     assert arrival.decision != RESTING
     assert arrival.estimate[0] >= plan.target[0] - PHANTOM.control.depth_tolerance_mm
     assert {(period.command, period.applied) for period in rests} == {(STILL, STILL)}
-    assert len(tank.moves) == len(done.periods) - len(rests)
+    assert len(tank.moves) == len(moving(done))
     assert {period.true_tip for period in rests} == {arrival.true_tip}
     assert done.periods[-1].sample.time > arrival.time - 1e-6
     assert all(period.sample.time < arrival.time - 1e-6 for period in done.periods[: -len(rests)])

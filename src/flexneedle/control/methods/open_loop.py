@@ -1,4 +1,4 @@
-"""`open-loop`: the plan as it stands, whatever the tracker sees."""
+"""`open-loop`: the plan as it stands, whatever the tracker measures."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from flexneedle.simulator.control import Limits
 
 
 def decide(task: Task, done: int, estimate: Estimate, _rng: np.random.Generator) -> tuple[Decision, int]:
-    """Go to where base and guide stand after `done` + 1 planned steps.
+    """Go to where base and guide are after `done` + 1 planned steps.
 
     Places are replayed, not steps: what a motor of finite resolution left out of a step is made good in the next.
     """
