@@ -179,6 +179,26 @@ def test_load_takes_the_gain_times_the_reaction_and_the_tip_goes_where_it_was_se
     np.testing.assert_allclose(corrected.measured, (x, y), atol=1e-12)
 
 
+@pytest.mark.parametrize("base_x", [2.0, -2.0])
+def test_the_start_along_the_axis_is_found_and_how_surely(base_x):
+    """The mean of all readings, weighed with the prior; the tip's own uncertainty shrinks with it."""
+    simulator = Simulator(PHANTOM)
+    start = simulator.start()
+    truth = believe_start(PHANTOM, base_x=float(start.base[0]) + base_x)
+    estimate = begun(simulator)
+    sds = [estimate.tip_sd]
+    for k in range(10):
+        before, truth = truth, simulator.step(truth, Control(db_x=1.0))
+        estimate = estimate.move(AHEAD, k, k + 1.0).observe(samples_between(before, truth, k))
+        sds.append(estimate.tip_sd)
+    control, jitter = PHANTOM.control, PHANTOM.tracker.jitter_per_axis
+    precision = control.start_axial_sd_mm**-2.0 + 40.0 / jitter**2
+    assert estimate.axial == pytest.approx(1.0 / precision, rel=1e-6)
+    assert estimate.tip[0] == pytest.approx(truth.tip[0], abs=0.01)
+    assert estimate.state.travel[0] == pytest.approx(10.0)
+    assert (np.diff(sds) < 0.0).all()
+
+
 @pytest.mark.parametrize("axial", [0.0, 1.0])
 @pytest.mark.parametrize("off", [(0.4, 0.3), (-0.6, -0.2)])
 def test_a_contact_that_is_cut_is_on_the_measured_path_wherever_the_tip_is_along_the_axis(axial, off):
