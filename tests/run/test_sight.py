@@ -189,3 +189,19 @@ def test_a_broken_last_reading_is_the_verdict_and_earlier_good_ones_are_not_told
     sight = during(watch, 1.05, sample(1.025), jumped)
     assert sight.verdict.startswith("innovation 3.00 mm")
     assert sight.estimate.heard is None
+
+
+class Unsure(Belief):
+    """A tip whose prediction is off by half a millimetre."""
+
+    tip_sd = 0.5
+
+
+def test_the_limit_of_the_innovation_widens_with_the_uncertainty_of_the_prediction():
+    """By three standard deviations: at the start a rig may be off by more than the limit."""
+    limit = SCENARIO.control.innovation_limit_mm
+    for estimate, most in ((Belief(), limit), (Unsure(), limit + 1.5)):
+        for off, verdict in ((most - 0.01, OK), (most + 0.01, "innovation")):
+            one = Sample(1.0, TIP[0], TIP[1] + off)
+            sight = see(SCENARIO, estimate, Watch(SCENARIO.monitor), 0.8, 1.0, Eye(one))
+            assert sight.readings[0].verdict.split()[0] == verdict
