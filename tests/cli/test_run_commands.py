@@ -30,6 +30,7 @@ INSERT_KEYS = [
         "reached",
         "outcome",
         "reason",
+        "warning",
         "flips",
         "planned_flips",
         "strain_energy_mj",

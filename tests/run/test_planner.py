@@ -121,7 +121,7 @@ def test_steering_reaches_the_target_with_the_guide_still():
     assert plan.converged
     assert (plan.controls[:, 1:4] == 0.0).all()
     assert (plan.guide == 0.0).all()
-    assert plan.strain_energy[-1] > planned(NEAR).strain_energy[-1]
+    assert plan.cost > planned(NEAR).cost  # which may move the guide as well
     assert abs(entry_angle(plan)) < abs(entry_angle(planned(NEAR)))
 
 

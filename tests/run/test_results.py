@@ -56,7 +56,7 @@ def test_what_is_not_known_is_null():
     result = insertion_result(unseen)
     unknown = {name for name, value in result.items() if value is None}
     errors = {"true_error_mm", "residual_mm"}
-    assert unknown == {"phantom", "tip_true_mm", "tip_measured_mm", "strain_energy_mj"} | errors
+    assert unknown == {"phantom", "tip_true_mm", "tip_measured_mm", "strain_energy_mj", "warning"} | errors
     assert result["reached"] is False
     empty = Insertion(PLAN, 0, (), "failed", "")
     assert insertion_result(empty)["steps"] == 0

@@ -12,9 +12,8 @@ from flexneedle.errors import ScenarioError
 
 from .environment import Environment, environment_data, environment_names
 from .model import Scenario
-from .preset import preset_names, preset_values
+from .preset import WORLD, preset_names, preset_values
 from .problems import describe, printable
-from .worlds import NAME, named_world
 
 __all__ = ["dump_scenario", "load_environment", "load_scenario"]
 
@@ -35,7 +34,9 @@ def load_scenario(source: str | Path | Scenario) -> Scenario:
         raise ScenarioError(f"a scenario is a preset name, a path or a Scenario, not {type(source).__name__}")
     if isinstance(source, str) and source in preset_names():
         return Scenario.from_values(preset_values(source), source)
-    if isinstance(source, str) and source.startswith(NAME):
+    if isinstance(source, str) and source.startswith(WORLD):
+        from .worlds import named_world  # loads NumPy, which no other scenario needs
+
         return named_world(source)
     data = _read(source, "a scenario file", f"preset (presets: {', '.join(preset_names())})")
     label = printable(fspath(source))

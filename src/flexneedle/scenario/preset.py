@@ -1,10 +1,13 @@
-"""The scenarios that come with the package."""
+"""The scenarios that come with the package, and how the name of one that is drawn begins."""
 
 import tomllib
 from importlib.resources import files
 from typing import Any
 
-__all__ = ["preset_names", "preset_values"]
+__all__ = ["WORLD", "preset_names", "preset_values"]
+
+WORLD = "world:"
+"""How the name of a world's scenario begins; then its number and, unless it is `real`, a colon and the case."""
 
 _PRESETS = files(__package__) / "presets"
 _SUFFIX = ".toml"

@@ -26,11 +26,11 @@ from flexneedle.errors import ScenarioError
 
 from .model import Scenario
 from .needle import GAUGES
-from .preset import preset_values
+from .preset import WORLD, preset_values
 from .problems import printable
 
 __all__ = [
-    *("CASES", "LARGEST_WORLD", "NAME", "REAL", "STRUCTURE", "TRAINING"),
+    *("CASES", "LARGEST_WORLD", "REAL", "STRUCTURE", "TRAINING"),
     *("named_world", "structural", "world", "world_name"),
 ]
 
@@ -39,15 +39,13 @@ TRAINING = 1000
 LARGEST_WORLD = 10**9
 PERFECT, REAL, STRUCTURE = "perfect", "real", "structure"
 CASES = (PERFECT, REAL, STRUCTURE)
-NAME = "world:"
-"""How the name of a world's scenario begins; then its number and, unless it is `real`, a colon and the case."""
 
 _STREAM = 0x776F726C64  # keeps worlds apart from what else is seeded by a small number
 _STRUCTURE_STREAM = _STREAM + 1
 _STEEL_GAUGES = tuple(list(GAUGES)[1:9])  # 18G to 25G
 _THINNEST_LAYER_MM = 4.0
 _BEYOND_TARGET_MM = 5.0
-_NAMED = re.compile(rf"{NAME}([0-9]{{1,18}})(?::([a-z]+))?")
+_NAMED = re.compile(rf"{WORLD}([0-9]{{1,18}})(?::([a-z]+))?")
 _NO_MISMATCH: dict[str, Any] = {
     "phantom.shear_modulus_factor": [1.0, 1.0],
     "phantom.bevel_factor": [1.0, 1.0],
@@ -84,14 +82,14 @@ def world(number: int, case: str = REAL) -> Scenario:
 
 def world_name(number: int, case: str = REAL) -> str:
     """Return the name by which `load_scenario` finds a world, such as `world:100012:structure`."""
-    return f"{NAME}{number}" + ("" if case == REAL else f":{case}")
+    return f"{WORLD}{number}" + ("" if case == REAL else f":{case}")
 
 
 def named_world(name: str) -> Scenario:
     """Return the world of a name. Raises ScenarioError."""
     found = _NAMED.fullmatch(name)
     if found is None:
-        rule = f"must be {NAME}NUMBER or {NAME}NUMBER:CASE, cases: {', '.join(CASES)}"
+        rule = f"must be {WORLD}NUMBER or {WORLD}NUMBER:CASE, cases: {', '.join(CASES)}"
         raise ScenarioError(f"{printable(name)}: {rule}")
     return world(int(found[1]), found[2] or REAL)
 

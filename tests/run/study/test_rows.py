@@ -163,7 +163,7 @@ def test_a_file_in_place_of_the_plans_is_named_before_any_plan_is_made(tmp_path)
         Plans(tmp_path / "plans")
 
 
-UNKNOWN = dict.fromkeys(RESULTS) | {"outcome": "held", "reason": ""}
+UNKNOWN = dict.fromkeys(RESULTS) | {"warning": "", "outcome": "held", "reason": ""}
 ROWS = [
     UNKNOWN | {"index": 4, "true_error_mm": 0.1 + 0.2, "tip_x_mm": 5e-324, "total_s": 1.5},
     UNKNOWN | {"index": 1, "tip_y_mm": -0.0, "tip_x_mm": 1e308, "flips": 3, "reason": "µ\n"},

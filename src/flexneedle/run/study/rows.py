@@ -109,7 +109,8 @@ def carry_out(job: Job) -> Done:
 
 def _row(job: Job, seed: int) -> dict[str, Any]:
     begun = time.perf_counter()
-    results = dict.fromkeys(RESULTS) | _planned(job.plan) | {"outcome": "error", "reason": job.refusal}
+    results = dict.fromkeys(RESULTS) | _planned(job.plan)
+    results |= {"warning": "", "outcome": "error", "reason": job.refusal}
     times: dict[str, float] = {}
     if job.plan is not None:
         try:
