@@ -76,7 +76,7 @@ worlds: setup  ## 200 random worlds in three cases with four controllers, and th
 	$(BIN)/flexneedle report $(or $(DIR),runs/worlds)
 
 tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedle/run/tuning (long)
-	for method in adaptive-mpc ce-mpc bevel-only resolved-rate broyden-mpc; do \
+	for method in ce-mpc bevel-only resolved-rate broyden-mpc; do \
 	  $(BIN)/python studies/tune.py $$method || exit 1; \
 	done
 

@@ -11,8 +11,8 @@ is outside the budget. The table goes to stdout, everything to DIR/METHOD.json (
 ships, src/flexneedle/run/tuning), the same bytes for any number of processes.
 
 Every setting of the space is set in each trial, whatever is shipped for it, so that the result can be had again once
-the shipped settings are changed to it. The other settings are the shipped ones. A space may hold knowledge from before
-its tuning: the middle of that of adaptive-mpc was found by hand, with further insertions. NOTES says so in the record.
+the shipped settings are changed to it. The other settings are the shipped ones. The weights of `adaptive-mpc` are not tuned
+here but chosen on random worlds (docs/decisions/0009-identify-and-search.md). NOTES may hold a remark for a record.
 """
 
 import argparse
@@ -42,10 +42,7 @@ FAILED_MM = 5.0
 PLAN_SEED = 0
 SCORE = f"mean + 0.25 * 95 % quantile of the true error (mm); an insertion that is not done counts {FAILED_MM:g} mm"
 # What went into a result beside its budget, by method.
-NOTES = {
-    "adaptive-mpc": "its structure and the middle of its space come from further insertions, seeds 5000 to 5179 "
-    "(docs/decisions/0009-identify-and-search.md)",
-}
+NOTES: dict[str, str] = {}
 RECORDS = Path(__file__).resolve().parents[1] / "src/flexneedle/run/tuning"
 Settings = dict[str, float]
 
@@ -93,14 +90,6 @@ SPACES: dict[str, dict[str, Range]] = {
         "control.ce_mpc.energy_weight_per_mj": Range(0.1, 20.0),
         "control.ce_mpc.flip_dead_band": BAND,
         "control.ce_mpc.curvature_per_m": CURVATURE,
-    },
-    # Less weight on the tissue's energy means less error: those weights are set by what the tissue may take.
-    "adaptive-mpc": {
-        "control.adaptive_mpc.target_weight": Range(10.0, 90.0),
-        "control.adaptive_mpc.orientation_weight_mm": Range(2.0, 12.5),
-        "control.adaptive_mpc.guide_weight": Range(0.0125, 0.2),
-        "control.adaptive_mpc.model_sd_mm": Range(0.0075, 0.03),
-        "control.adaptive_mpc.route_turn_weight_mm": Range(0.00125, 0.02),
     },
 }
 

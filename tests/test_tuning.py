@@ -19,7 +19,7 @@ from flexneedle.trace.plain import to_text
 SCRIPT = Path(__file__).resolve().parents[1] / "studies" / "tune.py"
 SHIPPED = files("flexneedle.run") / "tuning"
 TUNED = sorted(item.name.removesuffix(".json") for item in SHIPPED.iterdir())
-NOT_TUNED = {"open-loop"}
+NOT_TUNED = {"open-loop", "adaptive-mpc"}  # nothing to choose; chosen on random worlds
 
 
 @pytest.fixture(scope="module")

@@ -30,6 +30,7 @@ _FINE, _COARSE = (
 )  # control steps of the rollout at first, and the length of its later steps in control steps
 _DUE = 0.05  # of a control step: a roll this near is made now
 _STEEPEST = 0.03  # slope of the largest correction of the guide, mm per mm of the path left
+_SHARE_OF_A_STEP = 0.5  # of the guide's limit in a control step: what matters next to the target
 _FURTHEST = 0.3  # largest move of a roll, of the path left
 _DECADES = 2.0  # over which the scales of the samples spread
 
@@ -191,7 +192,8 @@ def proposals(ahead: Ahead, count: int, rng: np.random.Generator) -> Floats:
     k = KNOTS.size
     kind = np.arange(count) % 12
     scale = 10.0 ** rng.uniform(-_DECADES, 0.0, (count, 2))
-    guide = _STEEPEST * ahead.left * scale[:, :1] * rng.standard_normal((count, k))
+    widest = _STEEPEST * ahead.left + _SHARE_OF_A_STEP * ahead.step
+    guide = widest * scale[:, :1] * rng.standard_normal((count, k))
     rolls = _FURTHEST * ahead.left * scale[:, 1:] * rng.standard_normal((count, SLOTS))
     if ahead.step > 0.0:
         z[:, :k] += np.where(((kind < 3) | (kind >= 8))[:, None], guide, 0.0)

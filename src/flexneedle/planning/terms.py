@@ -73,11 +73,15 @@ def cost(terms: Sequence[Term], outcome: Outcome) -> Floats:
     return np.where(outcome.converged.all(axis=1), total, np.inf)
 
 
-def miss(outcome: Outcome, target: Point) -> Floats:
-    """Lateral distance (mm) from the target at its depth, to which the tip's own line is followed from the end."""
+def miss(outcome: Outcome, target: Point, blur: float = 0.0) -> Floats:
+    """Lateral distance (mm) from the target at its depth, to which the tip's own line is followed from the end.
+
+    blur (mm): of a distance d that is known no better than this, √(d² + blur²) − blur counts.
+    """
     end = outcome.tips[:, -1]
-    distance: Floats = np.abs(end[:, 1] + np.tan(end[:, 2]) * (target[0] - end[:, 0]) - target[1])
-    return distance
+    distance = end[:, 1] + np.tan(end[:, 2]) * (target[0] - end[:, 0]) - target[1]
+    blurred: Floats = np.hypot(distance, blur) - blur
+    return blurred
 
 
 def energy_at_end(outcome: Outcome) -> Floats:

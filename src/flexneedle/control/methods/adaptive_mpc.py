@@ -37,13 +37,15 @@ _LOST = 0.5  # probability of a miss beyond the limit from which a longer search
 class Memory:
     """What is carried from period to period: the path in hand, and the derivatives of what is ahead.
 
-    scale: energy (mJ) of the tissue down to the target where it is moved aside by 1 mm; rests: made so far.
+    scale: energy (mJ) of the tissue down to the target where it is moved aside by 1 mm; rests: made so far;
+    blur: standard deviation of the predicted miss (mm), had none been predicted.
     """
 
     path: Path
     scale: float
     outlook: Outlook | None = None
     rests: int = 0
+    blur: float = 0.0
 
 
 def begin(task: Task) -> Memory:
@@ -58,11 +60,11 @@ def decide(
     fitted = cast(Identified, estimate)  # METHOD below names its observer
     settings = task.settings
     ahead = Ahead.of(task, fitted.state, memory.path)
-    found = _search(task, fitted, ahead, memory.scale, 1 if memory.outlook else settings.effort, rng)
+    found = _search(task, fitted, ahead, memory, 1 if memory.outlook else settings.effort, rng)
     outlook, miss, sd = _forecast(task, memory, fitted, found)
     if probability_beyond(task.scenario.control.miss_limit_mm, miss, sd) > _LOST:
         ahead = Ahead.of(task, fitted.state, ahead.corrected(found.z))
-        found = _search(task, fitted, ahead, memory.scale, settings.effort, rng)
+        found = _search(task, fitted, ahead, memory, settings.effort, rng)
         outlook, miss, sd = _forecast(task, memory, fitted, found)
     path = ahead.corrected(found.z)
     command, left = ahead.first(path)
@@ -70,7 +72,13 @@ def decide(
     rolls = ", ".join(f"{roll:.1f}" for roll in left.rolls) or "none"
     why = f"rolls at {rolls} mm; predicted miss {miss:+.3f} ± {sd:.3f} mm"
     spread = float(np.sqrt(found.belief.covariance[0, 0]))
-    after = Memory(path if rest > 0.0 else left, memory.scale, outlook, rests)
+    after = Memory(
+        path if rest > 0.0 else left,
+        memory.scale,
+        outlook,
+        rests,
+        outlook.sd(fitted, task.plan.target[0], 0.0),
+    )
     return Decision(command, why, found.cost, spread, miss, sd, rest), after
 
 
@@ -88,7 +96,7 @@ def _rest(task: Task, memory: Memory, fitted: Identified, left: float) -> tuple[
 
 
 def _search(
-    task: Task, fitted: Identified, ahead: Ahead, scale: float, effort: int, rng: np.random.Generator
+    task: Task, fitted: Identified, ahead: Ahead, memory: Memory, effort: int, rng: np.random.Generator
 ) -> Found:
     """The best correction of the path in hand, itself among the samples."""
     settings = task.settings
@@ -98,7 +106,7 @@ def _search(
     variables = Variables(lower, upper, ahead.in_hand, first.std(axis=0), lambda z: ahead.controls(z)[0])
     elite = max(_LEAST_ELITE, count // _ELITE)
     search = Search(count, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
-    return best(variables, partial(_seen, fitted), _terms(task, fitted, scale), search, rng, first=first)
+    return best(variables, partial(_seen, fitted), _terms(task, fitted, memory), search, rng, first=first)
 
 
 def _seen(fitted: Identified, controls: Floats) -> Outcome:
@@ -109,7 +117,7 @@ def _seen(fitted: Identified, controls: Floats) -> Outcome:
     return Outcome(controls, tips, energy, converged)
 
 
-def _terms(task: Task, fitted: Identified, scale: float) -> tuple[Term, ...]:
+def _terms(task: Task, fitted: Identified, memory: Memory) -> tuple[Term, ...]:
     settings, target = task.settings, task.plan.target
     guided = guide_may_move(task.scenario.setup, task.plan.strategy)
     energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
@@ -119,8 +127,8 @@ def _terms(task: Task, fitted: Identified, scale: float) -> tuple[Term, ...]:
     share = min(1.0, travel_left(task.scenario, task.plan, fitted.state) / target[0])  # of the way
     start = float(fitted.tip[0]), float(fitted.tip[1])
     return (
-        Term("miss", 1.0, partial(terms.miss, target=target)),
-        Term("energy", energy / scale if scale > 0.0 else 0.0, terms.energy_at_end),
+        Term("miss", 1.0, partial(terms.miss, target=target, blur=memory.blur)),
+        Term("energy", energy / memory.scale if memory.scale > 0.0 else 0.0, terms.energy_at_end),
         Term("line", line, partial(terms.distance_from_line, start=start, target=target)),
         Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
         Term("rolls", settings.roll_weight_mm, terms.rolls),
