@@ -11,8 +11,9 @@ is outside the budget. The table goes to stdout, everything to DIR/METHOD.json (
 ships, src/flexneedle/run/tuning), the same bytes for any number of processes.
 
 Every setting of the space is set in each trial, whatever is shipped for it, so that the result can be had again once
-the shipped settings are changed to it. The other settings are the shipped ones. The weights of `adaptive-mpc` are not tuned
-here but chosen on random worlds (docs/decisions/0009-identify-and-search.md). NOTES may hold a remark for a record.
+the shipped settings are changed to it. The other settings are the shipped ones. The weights of `adaptive-mpc` are not
+tuned here but chosen on random worlds (docs/decisions/0009-identify-and-search.md). NOTES may hold a remark for a
+record.
 """
 
 import argparse

@@ -133,7 +133,7 @@ def test_what_is_in_hand_is_never_given_up_for_something_worse(quick_plan, along
         path = replace(of_plan(quick_plan), rolls=rolls)
         ahead = adaptive_mpc.Ahead.of(task, belief.state, path)
         kept = ahead.controls(ahead.in_hand[None])[0]
-        terms = adaptive_mpc._terms(task, belief, ADAPTIVE.begin(task).scale)
+        terms = adaptive_mpc._terms(task, belief, ADAPTIVE.begin(task))
         in_hand = float(cost(terms, adaptive_mpc._seen(belief, kept))[0])
         assert decided(quick_plan, belief, path=path)[0].cost <= in_hand + 1e-9
 

@@ -97,3 +97,14 @@ def test_a_late_roll_costs_more_the_nearer_the_target_and_one_at_it_one():
     np.testing.assert_allclose(late, [np.exp(-2.0), np.exp(-1.0), 0.0])
     at_target = terms.late_rolls(replace(OUTCOME, controls=controls, tips=tips), depth=35.0, length=5.0)
     assert at_target[1] == 1.0
+
+
+@pytest.mark.parametrize("blur", [0.0, 0.01, 0.3, 5.0])
+def test_a_miss_counts_as_far_as_it_is_known(blur):
+    """As its square where it is far below what is known, in full, less that, where it is far above; on either side."""
+    tips = np.zeros((4, 1, 3))
+    tips[:, 0, 0], tips[:, 0, 1] = 40.0, (1e-3, -1e-3, 100.0, -100.0)
+    miss = terms.miss(replace(OUTCOME, tips=tips), (40.0, 0.0), blur)
+    near = 1e-3 if blur == 0.0 else 0.5e-6 / blur
+    np.testing.assert_allclose(miss[:2], near, rtol=0.01)
+    np.testing.assert_allclose(miss[2:], 100.0 - blur, rtol=2e-3)
