@@ -24,8 +24,8 @@ __all__ = ["UNCORRECTED", "Outlook"]
 Floats = NDArray[np.float64]
 UNCORRECTED = 5.0
 """Control steps before the target in which a correction takes no effect."""
-_UNEXPLAINED = 2.0  # standard deviations of the mean of a control step's readings
-_DRIFT = 0.0015  # mm per mm of path
+_UNEXPLAINED = 1.0  # standard deviations of the mean of a control step's readings
+_DRIFT = 0.0008  # mm per mm of path
 
 
 @dataclass(frozen=True, eq=False)
