@@ -49,7 +49,8 @@ def belief_of(state, scenario=PHANTOM, **fields):
 def decided(plan, belief, seed=0, path=None):
     """Decision and memory after it, with a path in hand that is the plan's unless another is given."""
     task = task_of(belief.nominal, plan)
-    memory = replace(ADAPTIVE.begin(task), path=path or after(of_plan(plan), belief.state.tip[0]))
+    begun, path = ADAPTIVE.begin(task), path or after(of_plan(plan), belief.state.tip[0])
+    memory = replace(begun, path=path, bevel=belief.state.bevel)
     return ADAPTIVE.decide(task, memory, belief, np.random.default_rng(seed))
 
 
@@ -136,6 +137,30 @@ def test_what_is_in_hand_is_never_given_up_for_something_worse(quick_plan, along
         terms = adaptive_mpc._terms(task, belief, ADAPTIVE.begin(task))
         in_hand = float(cost(terms, adaptive_mpc._seen(belief, kept))[0])
         assert decided(quick_plan, belief, path=path)[0].cost <= in_hand + 1e-9
+
+
+@pytest.mark.parametrize("carried_out", [False, True])
+def test_a_roll_stays_in_hand_until_the_needle_has_rolled(quick_plan, along, carried_out):
+    """A period that is held leaves the bevel where it is: the roll that was due in it is still planned."""
+    belief = belief_of(along(quick_plan, 40), QUICK)
+    task, x = task_of(belief.nominal, quick_plan), float(belief.state.tip[0])
+    path = replace(of_plan(quick_plan), rolls=(x,))
+    memory = replace(
+        ADAPTIVE.begin(task), path=path, rolled=replace(path, rolls=()), bevel=belief.state.bevel
+    )
+    if carried_out:
+        belief = replace(belief, state=belief.simulator.step(belief.state, Control(flip=True)))
+    seen = []
+    search = adaptive_mpc._search
+
+    def spied(task, fitted, ahead, *rest):
+        seen.append(ahead.path.rolls)
+        return search(task, fitted, ahead, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(adaptive_mpc, "_search", spied)
+        ADAPTIVE.decide(task, memory, belief, np.random.default_rng(0))
+    assert seen[0] == (() if carried_out else (x,))
 
 
 def test_the_miss_is_that_of_the_path_that_is_found(quick_plan, along):

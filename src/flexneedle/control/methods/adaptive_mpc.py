@@ -37,11 +37,15 @@ _LOST = 0.5  # probability of a miss beyond the limit from which a longer search
 class Memory:
     """What is carried from period to period: the path in hand, and the derivatives of what is ahead.
 
+    path: as decided; rolled: the same without the roll that the command makes; bevel: side of the bevel before it.
+    Which of the two is in hand shows in the next estimate: a needle that is held, or rests, does not roll.
     scale: energy (mJ) of the tissue down to the target where it is moved aside by 1 mm; rests: made so far;
     blur: standard deviation of the predicted miss (mm), had none been predicted.
     """
 
     path: Path
+    rolled: Path
+    bevel: int
     scale: float
     outlook: Outlook | None = None
     rests: int = 0
@@ -50,7 +54,8 @@ class Memory:
 
 def begin(task: Task) -> Memory:
     """The plan's path."""
-    return Memory(of_plan(task.plan), task.simulator.energy_scale(task.plan.target[0]))
+    path, scale = of_plan(task.plan), task.simulator.energy_scale(task.plan.target[0])
+    return Memory(path, path, task.plan.bevel, scale)
 
 
 def decide(
@@ -59,7 +64,8 @@ def decide(
     """The first step of the best path found."""
     fitted = cast(Identified, estimate)  # METHOD below names its observer
     settings = task.settings
-    ahead = Ahead.of(task, fitted.state, memory.path)
+    in_hand = memory.path if fitted.state.bevel == memory.bevel else memory.rolled
+    ahead = Ahead.of(task, fitted.state, in_hand)
     found = _search(task, fitted, ahead, memory, 1 if memory.outlook else settings.effort, rng)
     outlook, miss, sd = _forecast(task, memory, fitted, found)
     if probability_beyond(task.scenario.control.miss_limit_mm, miss, sd) > _LOST:
@@ -67,13 +73,15 @@ def decide(
         found = _search(task, fitted, ahead, memory, settings.effort, rng)
         outlook, miss, sd = _forecast(task, memory, fitted, found)
     path = ahead.corrected(found.z)
-    command, left = ahead.first(path)
+    command, rolled = ahead.first(path)
     rest, rests = _rest(task, memory, fitted, ahead.left)
-    rolls = ", ".join(f"{roll:.1f}" for roll in left.rolls) or "none"
+    rolls = ", ".join(f"{roll:.1f}" for roll in rolled.rolls) or "none"
     why = f"rolls at {rolls} mm; predicted miss {miss:+.3f} ± {sd:.3f} mm"
     spread = float(np.sqrt(found.belief.covariance[0, 0]))
     after = Memory(
-        path if rest > 0.0 else left,
+        path,
+        rolled,
+        fitted.state.bevel,
         memory.scale,
         outlook,
         rests,
