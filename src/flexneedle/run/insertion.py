@@ -126,14 +126,14 @@ def _periods(
         looks = Decision(_STILL, "looks before it moves")
         yield _record(next(indices), rig.clock.now(), task.plan, rig, looks, _STILL, sight, clocks), None
     arrived_at: float | None = None
-    lost = ""  # why no path leads to the target,
-    lost_at: float | None = None  # and since when
+    lost = _Lost()
     moves = in_a_row = 0
     for index in indices:
         if moves == _TOO_MANY * len(task.plan.controls):
             return
         clocks = [time.perf_counter()]
         begun, wait = rig.clock.now(), scenario.tracker.period
+        decides = held is None and arrived_at is None
         if held is not None:
             decision = Decision(_STILL, "held")
         elif arrived_at is not None:
@@ -144,10 +144,9 @@ def _periods(
         else:
             decision, memory = _decided(chosen, task, memory, sight.estimate, rng)
             in_a_row = likely_misses(decision, in_a_row)
-            lost = "" if force else hopeless(decision, scenario.control)
-            lost_at = (begun if lost_at is None else lost_at) if lost else None
-            if lost:
-                decision = replace(decision, command=_STILL, why=f"held: {lost}")
+            lost = lost.after("" if force else hopeless(decision, scenario.control))
+            if lost.why:
+                decision = replace(decision, command=_STILL, why=f"held: {lost.why}")
             else:
                 moves, wait = moves + 1, decision.rest
                 decision = replace(decision, command=_STILL) if decision.rest > 0.0 else decision
@@ -163,8 +162,8 @@ def _periods(
             arrived_at = now
         seen = arrived_at is not None and good and sight.saw_after(arrived_at)
         ending = _ending(task, sight, None if held is None else held.lasted(sight.field), seen)
-        if lost_at is not None and now - lost_at > scenario.control.hold_limit_s - 1e-9:
-            ending = ending or ("held", lost)
+        lost = lost.lasting(now - begun) if decides else lost
+        ending = ending or lost.ending(scenario.control.hold_limit_s)
         period = _record(index, now, task.plan, rig, decision, applied, sight, clocks)
         yield replace(period, warning=_warning(task, decision, in_a_row, sight, ending)), ending
         if ending is not None:
@@ -202,6 +201,29 @@ class _Held:
     def lasted(self, field: bool) -> float:
         """For how long it has been held for one of the two causes (s)."""
         return self.for_field if field else self.for_readings
+
+
+@dataclass(frozen=True)
+class _Lost:
+    """Why no path leads to the target, empty if one does, and for how long (s) the needle has been held for that.
+
+    The clock stands while the needle is held for the tracker; a decision that finds a path sets it back.
+    """
+
+    why: str = ""
+    lasted: float = 0.0
+
+    def after(self, why: str) -> "_Lost":
+        """After a decision."""
+        return _Lost(why, self.lasted) if why else _Lost()
+
+    def lasting(self, seconds: float) -> "_Lost":
+        """After a period that was held, or that was not."""
+        return _Lost(self.why, self.lasted + seconds) if self.why else self
+
+    def ending(self, limit: float) -> tuple[str, str] | None:
+        """How the insertion ends, if it has lasted for `limit` (s)."""
+        return ("held", self.why) if self.why and self.lasted > limit - 1e-9 else None
 
 
 def _held(held: _Held | None, sight: Sight, now: float) -> _Held | None:
