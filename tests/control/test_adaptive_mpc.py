@@ -16,6 +16,7 @@ from flexneedle.control.path import of_plan
 from flexneedle.control.prior import RUN_OUT
 from flexneedle.planning.terms import cost
 from flexneedle.ports import Sample
+from flexneedle.scenario.worlds import world
 from flexneedle.simulator import Control, Learnt, Simulator
 from tasks import begun_with, task_of
 
@@ -363,3 +364,11 @@ def test_deciding_changes_nothing_of_belief_plan_and_memory(quick_plan, along):
     ADAPTIVE.decide(task_of(belief.nominal, quick_plan), memory, belief, np.random.default_rng(0))
     for kept, there in zip(before, arrays, strict=True):
         np.testing.assert_array_equal(kept, there)
+
+
+@pytest.mark.parametrize("number", [31, 68])
+def test_a_soft_needle_is_steered_where_its_tip_bends_off_below_the_skin(number):
+    """There the tip moves by millimetres within a step, and a reading is not on the chord of its move."""
+    scenario = world(number, "perfect")
+    plan = flexneedle.plan(scenario, seed=0)
+    assert flexneedle.insert(scenario, plan, seed=number, phantom="model").true_error_mm < 0.2

@@ -153,7 +153,7 @@ def test_a_base_offset_alone_is_told_by_its_lever():
     """In air the tip goes y = b (1 − lever): what base y and turn do to it together is found, not each."""
     needle = Needle(base_y=0.5)
     estimate, states = followed(needle, 20)
-    np.testing.assert_allclose(estimate.tip, states[-1].tip, atol=1e-3)
+    np.testing.assert_allclose(estimate.tip, states[-1].tip, atol=2e-3)
     assert abs(estimate.parameters[BASE_Y]) + 100.0 * abs(estimate.parameters[BASE_TURN]) > 0.2
 
 

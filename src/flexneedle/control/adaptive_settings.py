@@ -14,11 +14,11 @@ class AdaptiveMpc(Section):
     """Iterations of a period."""
     effort: int = count(3, least=1, most=1_000)
     """Times the samples in the first period, and where no path was found that ends near the target."""
-    energy_weight_mm: NonNegative = 0.7
+    energy_weight_mm: NonNegative = 0.4
     """Cost of the energy that the tissue down to the target has where it is moved aside by 1 mm."""
     unguided_energy_weight_mm: NonNegative = 1.0
     """The same where the guide may not move."""
-    line_weight: NonNegative = 1.0
+    line_weight: NonNegative = 0.3
     """Cost of the mean distance of the tip from the line to the target."""
     unguided_line_weight: NonNegative = 0.0
     """The same where the guide may not move."""

@@ -320,6 +320,13 @@ class _Readings:
         )
         return variance
 
+    def bent(self, belief: Identified) -> Floats:
+        """How far (r,) a reading may be from the chord of its move, mm: the tip's path bends below the skin."""
+        y = belief.tips[:, 1]
+        change = np.abs(np.diff(y, n=2, prepend=y[0], append=y[-1]))
+        sag: Floats = 0.25 * np.maximum(change[self.index], change[self.index + 1])
+        return sag
+
     def axial(self, belief: Identified) -> tuple[float, float]:
         """Start error along the axis (mm) and its variance, maximum a posteriori: all axial readings share it."""
         without = self.between(belief.tips[:, 0]) - belief.axial
@@ -363,7 +370,7 @@ def _improved(belief: Identified, readings: _Readings) -> Identified:
     prior = belief.prior
     jacobian, variance = (
         _jacobian(belief, readings),
-        readings.variance(belief.nominal.scenario, belief.settings),
+        readings.variance(belief.nominal.scenario, belief.settings) + readings.bent(belief) ** 2,
     )
     weighted = jacobian.T / variance
     gradient = weighted @ readings.left(belief) - prior.precision @ (belief.parameters - prior.mean)

@@ -387,9 +387,11 @@ def solve(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, held: flo
             s[COUPLING], s[SHORTENING] = 0.0, start
             guess(model, s, u)
         count, fresh, error, slide = _iterate(model, s, rest, u, w, held)
-        if error <= model.tolerance and slide <= model.tolerance and _guide_agrees(model, s, rest, w, count):
+        agrees = error <= model.tolerance and slide <= model.tolerance
+        agrees = agrees and _guide_agrees(model, s, rest, w, count)
+        if agrees:
             break
     s[ITERATIONS], s[RESIDUAL] = iteration, max(error, slide)
     finite = math.isfinite(s[TIP_Y]) and math.isfinite(s[SHORTENING])
-    s[CONVERGED] = 1.0 if finite and error <= model.tolerance and slide <= model.tolerance else 0.0
+    s[CONVERGED] = 1.0 if finite and agrees else 0.0
     return count, fresh
