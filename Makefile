@@ -55,7 +55,7 @@ controllers: setup  ## every controller on the same phantoms, and the report (DI
 	$(BIN)/flexneedle report $(or $(DIR),runs/controllers)
 
 studies: setup  ## 15,000 insertions with other plants, guides and needles, and their reports (two hours)
-	for study in mismatch mismatch-doubled imperfections guide-distance gauges; do \
+	for study in phantom-published odd-targets mismatch mismatch-doubled imperfections guide-distance gauges; do \
 	  $(BIN)/flexneedle study $$study --resume --out runs/$$study && \
 	  $(BIN)/flexneedle report runs/$$study || exit 1; \
 	done

@@ -35,6 +35,8 @@ def test_every_shipped_study_is_told():
     assert re.findall(r"^\| `([a-z-]+)`", table, re.MULTILINE) == [
         *(
             "phantom",
+            "phantom-published",
+            "odd-targets",
             "controllers",
             "mismatch",
             "mismatch-doubled",
@@ -45,7 +47,7 @@ def test_every_shipped_study_is_told():
             "worlds",
         )
     ]
-    assert len(study_names()) == 9
+    assert len(study_names()) == 11
 
 
 def test_every_column_is_told(quick, uninterrupted):

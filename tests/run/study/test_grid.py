@@ -246,6 +246,8 @@ def test_the_studies_of_the_package_can_be_carried_out():
     sizes = {name: len(load_study(name)) for name in study_names()}
     assert sizes == {
         "phantom": 150,
+        "phantom-published": 150,
+        "odd-targets": 150,
         "controllers": 150 * len(METHODS),
         "mismatch": 5 * 150,
         "mismatch-doubled": 10_005,
@@ -262,6 +264,21 @@ def test_the_phantom_study_has_the_papers_targets_and_seeds_of_its_own():
     targets = [insertion.point.scenario.target.position for insertion in all_of_it]
     assert targets == [target for target in itertools.product(DEPTHS, LATERALS) for _ in range(10)]
     assert [insertion.seed for insertion in all_of_it] == list(range(100000, 100150))
+
+
+def test_the_published_phantoms_are_those_of_the_phantom_study_without_what_is_new():
+    """Drawn last, the new imperfections change nothing else."""
+    old, new = (insertions(load_study(name)) for name in ("phantom-published", "phantom"))
+    assert [insertion.seed for insertion in old] == [insertion.seed for insertion in new]
+    assert {insertion.point.scenario.phantom.start_axial_sd_mm for insertion in old} == {0.0}
+    assert {insertion.point.scenario.phantom.youngs_modulus_variation for insertion in old} == {0.0}
+
+
+def test_odd_targets_are_off_the_papers_grid():
+    all_of_it = insertions(load_study("odd-targets"))
+    targets = {insertion.point.scenario.target.position for insertion in all_of_it}
+    assert not targets & set(itertools.product(DEPTHS, LATERALS))
+    assert {insertion.seed for insertion in all_of_it} == set(range(300000, 300150))
 
 
 def test_the_controllers_meet_the_phantoms_of_the_phantom_study():
