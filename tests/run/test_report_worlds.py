@@ -41,6 +41,15 @@ ERRORS = {  # of the perfect case, by controller and world (mm)
 REACH = {1: 0.0, 2: 0.0, 3: 0.0, 4: 0.0, 15: 0.0, 16: 4.0, 31: 3.0}
 
 
+SIGMAS = {
+    1: (0.5, 1.0, 1.9),
+    2: (1.0, -2.1, 1.0),
+    3: (3.0, -3.0, 2.0),
+    15: (None, None, 0.0),
+}  # of the default
+WARNED = (2, 15)  # worlds of the default's perfect case with a warning
+
+
 def row_of(study, index, bounded):
     insertion = study.insertion(index)
     point = insertion.point
@@ -51,6 +60,7 @@ def row_of(study, index, bounded):
         "true_error_mm": error,
         "tip_x_mm": depth,
         "tip_y_mm": lateral + (error or 0.0),
+        **predicted(point, error),
         "strain_energy_mj": 2.0 ** (point.world % 3),
         "planned_strain_energy_mj": 1.0,
         "unconverged_periods": 0,
@@ -58,6 +68,18 @@ def row_of(study, index, bounded):
         "outcome": "done" if error is not None else "held",
         "reason": "" if error is not None else "held for 1.00 s",
     }
+
+
+def predicted(point, error):
+    """A standard deviation of 0.1 mm, and predictions that are off by so many of them."""
+    if (point.controller, point.case) != (DEFAULT, "perfect"):
+        return {}
+    places = zip(("quarter", "half", "three_quarters"), SIGMAS.get(point.world, [None] * 3), strict=True)
+    found = {"warning": "predicted miss" if point.world in WARNED else ""}
+    for place, off in places:
+        if off is not None:
+            found |= {f"predicted_{place}_mm": error + 0.1 * off, f"predicted_{place}_sd_mm": 0.1}
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +145,27 @@ def test_what_does_not_finish_is_a_failure_only_within_reach(report):
 def test_energy_is_a_geometric_mean(report):
     """2, 4 and 1 times the plan's in worlds 1, 2, 3."""
     assert_allclose(group(report, DEFAULT, "perfect", "with a guide").energy_ratio, 2.0)
+
+
+def test_predictions_are_counted_where_there_are_any(report):
+    """Of the default's perfect case alone; coverage is over the insertions that have a prediction at the place."""
+    guided, free = report.findings.predictions
+    assert guided.levels == {"controller": DEFAULT, "case": "perfect", "guide": "with a guide"}
+    assert (guided.count, free.count) == (3, 1)
+    assert_allclose(guided.covered, (2 / 3, 1 / 3, 2 / 3))
+    assert_allclose(free.covered, (np.nan, np.nan, 1.0))
+
+
+def test_warnings_in_vain_and_misses_without_one_are_counted(report):
+    """World 1 ends at 0.02 mm, 2 at 0.5, which is not below 0.5, 3 at 1.6 without a warning, 15 at 0.1 with one."""
+    guided, free = report.findings.predictions
+    assert (guided.in_vain, guided.unwarned) == (0.0, 1)
+    assert (free.in_vain, free.unwarned) == (1.0, 0)
+
+
+def test_the_page_has_the_predictions_and_so_has_the_summary(report):
+    assert "covered at ¼ of the depth" in report.page.read_text(encoding="utf-8")
+    assert [group["unwarned"] for group in report.values()["predictions"]] == [1, 0]
 
 
 def test_the_worst_are_those_furthest_beyond_their_reach_of_the_default_controller(report):

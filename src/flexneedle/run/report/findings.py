@@ -7,6 +7,7 @@ from typing import Any
 
 from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.run.report.design import Design, design_of
+from flexneedle.run.report.predictions import Predictions, predictions_of
 from flexneedle.run.report.reading import StudyRecord, asked
 from flexneedle.run.report.summary import (
     Difference,
@@ -30,7 +31,8 @@ _MOST_KINDS = 20  # of endings that are listed
 class Findings:
     """What a study comes to. planned: insertions that it asks for, None if it does not say.
 
-    worst: rows with the largest errors, in worlds those of the first controller; worlds: empty in other studies.
+    worst: rows with the largest errors, in worlds those of the first controller; worlds: empty in other studies;
+    predictions: of the controllers that predict.
     """
 
     study: StudyRecord
@@ -43,6 +45,7 @@ class Findings:
     endings: Sequence[Ending]
     worst: Sequence[int]
     worlds: Sequence[WorldGroup]
+    predictions: Sequence[Predictions]
 
     @property
     def finished(self) -> int:
@@ -65,6 +68,7 @@ def findings_of(study: StudyRecord) -> Findings:
         endings(rows)[:_MOST_KINDS],
         worst(rows, among=design.controller.codes == 0 if has_worlds(rows) else None),
         world_groups(rows, design),
+        predictions_of(rows, design),
     )
 
 

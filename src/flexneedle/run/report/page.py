@@ -9,6 +9,7 @@ from flexneedle.run.report import provenance, tables
 from flexneedle.run.report.figures import Drawn
 from flexneedle.run.report.findings import Findings, title_of
 from flexneedle.run.report.html import Html, document, element, joined
+from flexneedle.run.report.predictions import prediction_table
 from flexneedle.run.report.reading import Tuning
 from flexneedle.run.report.statistics import LEAST_CLUSTERS
 from flexneedle.run.report.summary import HIT_MM, Difference, Group
@@ -31,6 +32,7 @@ def page_text(
         _figures(figures),
         world_table(findings.worlds),
         tables.groups(findings),
+        prediction_table(findings.predictions),
         tables.controllers(findings),
         tables.cases(findings),
         tables.endings(findings, again),

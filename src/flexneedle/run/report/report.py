@@ -55,6 +55,7 @@ class Report:
             },
             "cases": [asdict(difference) for difference in found.cases],
             "worlds": [asdict(group) for group in found.worlds],
+            "predictions": [asdict(group) for group in found.predictions],
             "endings": [asdict(ending) for ending in found.endings],
             "worst": [
                 {"index": rows.value("index", row), "true_error_mm": rows.value("true_error_mm", row)}
