@@ -104,8 +104,16 @@ def test_whoever_is_held_is_warned_too(miss, sd):
     assert warning(decision, 9) or not hopeless(decision, CONTROL)
 
 
-@pytest.mark.parametrize(("tip", "line"), [((40.0, 6.1), "1.10"), ((38.5, 3.0), "2.50"), ((40.6, 5.6), "")])
-def test_an_end_beyond_a_millimetre_of_the_target_is_warned_of(tip, line):
-    """Depth included."""
-    expected = f"the estimated tip ended {line} mm from the target" if line else ""
-    assert missed(tip, (40.0, 5.0)) == expected
+@pytest.mark.parametrize(
+    ("true", "estimated", "line"),
+    [
+        (1.1, 0.3, "missed the target by 1.10 mm"),
+        (0.9, 1.3, ""),
+        (math.nan, 2.5, "the estimated tip ended 2.50 mm from the target"),
+        (math.nan, 0.9, ""),
+    ],
+)
+def test_an_end_beyond_a_millimetre_of_the_target_is_missed_by_the_truth_where_it_is_known(
+    true, estimated, line
+):
+    assert missed(true, estimated) == line

@@ -9,7 +9,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 import flexneedle
-from flexneedle.control.path import KNOTS, SLOTS, Ahead, Path, of_plan, proposals
+from flexneedle.control.path import KNOTS, LEAST_SLOTS, Ahead, Path, of_plan, proposals
 from flexneedle.simulator import Control, Simulator
 from tasks import task_of
 
@@ -52,10 +52,19 @@ def test_it_begins_as_the_plans(quick_plan):
     assert path.rolls == tuple(quick_plan.tips[[12, 40, 60], 0])
 
 
-def test_of_more_rolls_than_fit_the_first_are_kept(quick_plan):
+def test_no_roll_of_the_plan_is_lost(quick_plan):
+    """However many there are: all are in the path, in the sample that corrects nothing, and in its controls."""
     turning = quick_plan.controls.copy()
-    turning[:, 4] = 1.0
-    assert of_plan(replace(quick_plan, controls=turning)).rolls == tuple(quick_plan.tips[:SLOTS, 0])
+    turning[:, 4] = -1.0
+    turning[35:70:5, 4] = 1.0
+    plan = replace(quick_plan, controls=turning)
+    path = of_plan(plan)
+    assert path.rolls == tuple(quick_plan.tips[35:70:5, 0])
+    ahead = ahead_of(plan, started(0.0), path)
+    controls, depth = ahead.controls(ahead.in_hand[None])
+    assert tuple(depth[0, :-1][controls[0, :, 4] > 0.0]) == path.rolls
+    z = proposals(ahead, 24, np.random.default_rng(0))
+    np.testing.assert_array_equal(z[0], ahead.in_hand)
 
 
 def test_depths_ascend_where_a_plan_stands_still(quick_plan):
@@ -198,7 +207,7 @@ def test_proposals_are_around_the_path_in_hand_which_is_the_first(quick_plan, ro
     ahead = ahead_of(quick_plan, state, level(*rolls), scenario)
     z = proposals(ahead, 96, np.random.default_rng(1))
     lower, upper = ahead.bounds
-    assert z.shape == (96, KNOTS.size + SLOTS)
+    assert z.shape == (96, KNOTS.size + ahead.slots)
     np.testing.assert_array_equal(z[0], ahead.in_hand)
     assert ((z >= lower) & (z <= upper)).all()
     moved = np.abs(z - ahead.in_hand) > 0.0
@@ -208,7 +217,7 @@ def test_proposals_are_around_the_path_in_hand_which_is_the_first(quick_plan, ro
         assert not rolls or (guide & bevel).any()
     assert bevel.any()
     new_pair = (z[:, KNOTS.size :] < 40.0).sum(axis=1) >= len(rolls) + 2
-    assert new_pair.any() is (np.True_ if len(rolls) + 2 <= SLOTS else np.False_)
+    assert new_pair.any() is (np.True_ if len(rolls) + 2 <= LEAST_SLOTS else np.False_)
     np.testing.assert_array_equal(z, proposals(ahead, 96, np.random.default_rng(1)))
 
 

@@ -90,21 +90,24 @@ def test_a_correlation_is_that_of_the_first_samples():
 def test_it_is_never_worse_than_the_incumbent(seed, z):
     incumbent = np.array([z])
     before = terms.cost(TERMS, rigid(controls(incumbent)))[0]
-    assert search(seed=seed, settings=replace(SEARCH, iterations=2), incumbent=incumbent).cost <= before
+    others = np.random.default_rng(seed).uniform(-1.0, 1.0, (16, 4))
+    found = search(
+        seed=seed, settings=replace(SEARCH, iterations=2), first=np.concatenate([incumbent, others])
+    )
+    assert found.cost <= before
 
 
 def test_an_incumbent_that_no_sample_beats_is_what_is_found():
     best = np.array([[0.375, 0.375, 0.375, 0.375]])  # the last one has no sigma: no sample comes there
-    found = search(incumbent=np.concatenate([best, best + 0.1]))
+    found = search(first=np.concatenate([best, best + np.linspace(0.1, 0.6, 16)[:, None]]))
     np.testing.assert_array_equal(found.z, best[0])
 
 
-def test_incumbents_come_before_the_samples_of_the_first_iteration_and_are_kept_in_bounds():
+def test_given_samples_are_those_of_the_first_iteration_and_are_kept_in_bounds():
     tape, first = Taped(), np.tile([[0.1], [0.2], [9.0], [0.3], [0.4]], (1, 4))
-    search(tape, incumbent=np.full((2, 4), 5.0), first=first)
-    expected = [1.0, 1.0, 0.1, 0.2, 1.0, 0.3, 0.4]
-    np.testing.assert_array_equal(tape.rows[0][:, 0], expected)
-    assert [len(rows) for rows in tape.rows] == [7, 16, 16, 1]
+    search(tape, first=first)
+    np.testing.assert_array_equal(tape.rows[0][:, 0], [0.1, 0.2, 1.0, 0.3, 0.4])
+    assert [len(rows) for rows in tape.rows] == [5, 16, 16, 1]
 
 
 def test_where_every_sample_fails_the_cost_is_infinite_and_the_mean_is_kept():

@@ -134,12 +134,6 @@ def test_steering_is_what_the_named_needle_does():
     assert plan.terms["flips"] == pytest.approx(PHANTOM.plan.flip_weight * plan.flips)
 
 
-def test_the_old_key_of_a_softer_needle_is_accepted_and_changes_nothing():
-    old = {"plan.steering_stiffness_factor": 0.1}
-    plans = [coarse(changes, NEAR, strategy="steering") for changes in ({}, old)]
-    assert plans[0].controls.tobytes() == plans[1].controls.tobytes()
-
-
 def test_the_reach_of_the_bevel_is_where_the_two_insertions_without_a_roll_end():
     least, greatest = bevel_reach(PHANTOM, 40.0)
     assert least == pytest.approx(-greatest)

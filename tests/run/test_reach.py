@@ -8,6 +8,7 @@ import pytest
 import flexneedle
 import synthetic
 from flexneedle.phantom import draw
+from flexneedle.phantom.plants import ModelPlant
 from flexneedle.run.reach import reach, straight_end
 from flexneedle.scenario.worlds import world
 from flexneedle.trace import Insertion
@@ -87,6 +88,13 @@ def test_with_a_guide_the_reach_is_what_a_long_search_leaves():
     tight = {"setup.max_guide_travel_mm": 0.2, "needle.bevel.offset_mm": 0.0, "target.lateral_mm": 0.2}
     bound = GUIDED.with_values({**tight, "setup.max_guide_step_mm": 1e-3})
     assert 0.05 < reach(bound, 0, "model") < 0.2
+
+
+def test_the_reach_is_that_of_a_plant_of_ones_own_too():
+    """As a factory, and as `module:NAME`, which a study has."""
+    expected = reach(FREE, 0, "model")
+    assert reach(FREE, 0, ModelPlant) == expected
+    assert reach(FREE, 0, "flexneedle.phantom.plants:ModelPlant") == expected
 
 
 def test_a_plant_that_does_not_converge_has_no_reach(monkeypatch):

@@ -188,7 +188,6 @@ RULES = [
     ("plan.elite_fraction", 1.1, "must be at most 1"),
     ("plan.elite_fraction", 0.005, "must leave at least 2 elite samples of plan.samples (128)"),
     ("plan.smoothing", 1.0, "must be below 1"),
-    ("plan.steering_stiffness_factor", 0.0, ABOVE_ZERO),
     ("control.load_gain", 1.1, "must be at most 1"),
     ("monitor.resume_fraction", 0.0, ABOVE_ZERO),
     ("monitor.resume_fraction", 1.1, "must be at most 1"),

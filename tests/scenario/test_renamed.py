@@ -51,6 +51,29 @@ def test_an_old_dotted_key_goes_over_the_new_one_that_is_there():
         assert full.with_values({"control.horizon": 3}).control.tables["ce_mpc"]["horizon"] == 3
 
 
+RETIRED = {
+    "plan": {"steering_stiffness_factor": 0.1},
+    "control": {"adaptive_mpc": {"horizon": 8, "route_mm": 8.0}},
+}
+
+
+def test_a_key_that_nothing_reads_any_more_is_left_out_with_a_warning():
+    """A file of before is accepted; what stays in its tables is what this version reads."""
+    values = PHANTOM.values() | RETIRED
+    values["control"] = {"adaptive_mpc": RETIRED["control"]["adaptive_mpc"] | {"model_sd_mm": 0.02}}
+    with pytest.warns(ScenarioWarning) as caught:
+        scenario = Scenario.from_values(values, "x.toml")
+    assert scenario.control.tables == {"adaptive_mpc": {"least_model_sd_mm": 0.02}}
+    assert checked(scenario).control.tables["adaptive_mpc"]["least_model_sd_mm"] == 0.02
+    assert scenario.plan == PHANTOM.plan
+    assert warned(caught) == [
+        "x.toml: control.adaptive_mpc.model_sd_mm is now control.adaptive_mpc.least_model_sd_mm: rename it",
+        "x.toml: plan.steering_stiffness_factor = 0.1 is ignored, no setting of this version: remove it",
+        "x.toml: control.adaptive_mpc.horizon = 8 is ignored, no setting of this version: remove it",
+        "x.toml: control.adaptive_mpc.route_mm = 8.0 is ignored, no setting of this version: remove it",
+    ]
+
+
 def test_both_names_of_a_key_are_refused():
     values = old_file()
     values["control"]["ce_mpc"] = {"horizon": 4}

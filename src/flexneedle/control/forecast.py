@@ -51,7 +51,8 @@ def warning(decision: Decision, in_a_row: int) -> str:
     return f"predicted miss {decision.miss:+.2f} ± {decision.miss_sd:.2f} mm: likely beyond {_RADIUS_MM:g} mm"
 
 
-def missed(tip: tuple[float, float], target: tuple[float, float]) -> str:
-    """A line if the estimated tip (mm) ended more than 1 mm from the target (mm); empty otherwise."""
-    distance = math.dist(tip, target)
-    return f"the estimated tip ended {distance:.2f} mm from the target" if distance > _RADIUS_MM else ""
+def missed(true: float, estimated: float) -> str:
+    """A line if an insertion ended more than 1 mm from its target; distances in mm, the true one NaN if unknown."""
+    if not math.isnan(true):
+        return f"missed the target by {true:.2f} mm" if true > _RADIUS_MM else ""
+    return f"the estimated tip ended {estimated:.2f} mm from the target" if estimated > _RADIUS_MM else ""

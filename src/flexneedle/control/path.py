@@ -1,8 +1,8 @@
 """The path in hand: the guide over absolute depth and the depths at which the bevel rolls, and what may replace it.
 
 A sample corrects the path: lateral corrections of the guide at a few knots between now and the target, and the depths
-of up to `SLOTS` rolls. Sample 0 corrects nothing, so what is in hand is lost only to something better on the
-same model.
+of the rolls, `LEAST_SLOTS` or as many as the path has. Sample 0 corrects nothing, so what is in hand is lost only to
+something better on the same model.
 """
 
 from dataclasses import dataclass, replace
@@ -17,17 +17,14 @@ from flexneedle.ports import Command
 from flexneedle.simulator import State
 from flexneedle.trace import PlanRecord
 
-__all__ = ["KNOTS", "SLOTS", "Ahead", "Path", "of_plan", "proposals"]
+__all__ = ["KNOTS", "LEAST_SLOTS", "Ahead", "Path", "of_plan", "proposals"]
 
 Floats = NDArray[np.float64]
 KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
 """Where the guide is corrected, as shares of the path from now to the target."""
-SLOTS = 4
-"""Rolls that a path holds at most."""
-_FINE, _COARSE = (
-    2,
-    2.0,
-)  # control steps of the rollout at first, and the length of its later steps in control steps
+LEAST_SLOTS = 4
+"""Rolls that a search may make, or as many as the path in hand has."""
+_FINE, _COARSE = 2, 2.0  # control steps of the rollout at first; length of its later steps, in control steps
 _DUE = 0.05  # of a control step: a roll this near is made now
 _STEEPEST = 0.03  # slope of the largest correction of the guide, mm per mm of the path left
 _SHARE_OF_A_STEP = 0.5  # of the guide's limit in a control step: what matters next to the target
@@ -45,10 +42,10 @@ class Path:
 
 
 def of_plan(plan: PlanRecord) -> Path:
-    """The plan's path; of its rolls those that fit."""
+    """The plan's path."""
     rolls = plan.tips[:-1][plan.controls[:, 4] > 0.0][:, 0]
     keep = np.concatenate([[True], np.diff(plan.tips[:, 0]) > 1e-9])
-    return Path(plan.tips[keep, 0], plan.guide[keep], tuple(rolls[:SLOTS].tolist()))
+    return Path(plan.tips[keep, 0], plan.guide[keep], tuple(rolls.tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +90,11 @@ class Ahead:
         return float(self.depth[-1] - self.depth[0])
 
     @property
+    def slots(self) -> int:
+        """Rolls that a sample describes."""
+        return max(LEAST_SLOTS, len(self.path.rolls))
+
+    @property
     def unused(self) -> float:
         """Depth (mm) of a roll that is not made."""
         return float(self.depth[-1]) + 0.5 * self.left + self.advance
@@ -101,14 +103,14 @@ class Ahead:
     def bounds(self) -> tuple[Floats, Floats]:
         """Of a sample, (d,) each."""
         wide = 2.0 * self.reach if self.step > 0.0 else 0.0
-        lower = [np.full(KNOTS.size, -wide), np.full(SLOTS, self.depth[0])]
-        upper = [np.full(KNOTS.size, wide), np.full(SLOTS, self.unused)]
+        lower = [np.full(KNOTS.size, -wide), np.full(self.slots, self.depth[0])]
+        upper = [np.full(KNOTS.size, wide), np.full(self.slots, self.unused)]
         return np.concatenate(lower), np.concatenate(upper)
 
     @property
     def in_hand(self) -> Floats:
         """The sample (d,) that corrects nothing."""
-        rolls = np.full(SLOTS, self.unused)
+        rolls = np.full(self.slots, self.unused)
         rolls[: len(self.path.rolls)] = np.maximum(self.path.rolls, self.depth[0])
         return np.concatenate([np.zeros(KNOTS.size), rolls])
 
@@ -186,7 +188,8 @@ class Ahead:
 def proposals(ahead: Ahead, count: int, rng: np.random.Generator) -> Floats:
     """Samples (count, d) around the path in hand, which is the first; of scales over two decades.
 
-    A quarter moves the guide alone, a quarter the rolls alone, a sixth puts in a pair of rolls, the rest moves all.
+    With a guide a quarter moves it alone, a quarter the rolls alone, a sixth puts in a pair of rolls, the rest moves
+    all; without one three quarters move rolls, a half puts in a pair.
     """
     z = np.tile(ahead.in_hand, (count, 1))
     k = KNOTS.size
@@ -194,13 +197,13 @@ def proposals(ahead: Ahead, count: int, rng: np.random.Generator) -> Floats:
     scale = 10.0 ** rng.uniform(-_DECADES, 0.0, (count, 2))
     widest = _STEEPEST * ahead.left + _SHARE_OF_A_STEP * ahead.step
     guide = widest * scale[:, :1] * rng.standard_normal((count, k))
-    rolls = _FURTHEST * ahead.left * scale[:, 1:] * rng.standard_normal((count, SLOTS))
+    rolls = _FURTHEST * ahead.left * scale[:, 1:] * rng.standard_normal((count, ahead.slots))
     if ahead.step > 0.0:
         z[:, :k] += np.where(((kind < 3) | (kind >= 8))[:, None], guide, 0.0)
     used = z[0, k:] < ahead.depth[-1]
     z[:, k:] += np.where((kind >= 3)[:, None] & used, rolls, 0.0)
     pair = np.flatnonzero((kind == 6) | (kind == 7)) if ahead.step > 0.0 else np.flatnonzero(kind % 2 == 0)
-    if used.sum() <= SLOTS - 2:
+    if used.sum() <= ahead.slots - 2:
         middle = rng.uniform(ahead.depth[0], ahead.depth[-1], pair.size)
         half = 0.5 * ahead.left * 10.0 ** rng.uniform(-1.5, 0.0, pair.size)
         z[pair, -2], z[pair, -1] = middle - half, middle + half

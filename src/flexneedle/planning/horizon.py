@@ -53,14 +53,13 @@ def best(
     search: ce.Search,
     rng: np.random.Generator,
     *,
-    incumbent: Floats | None = None,
     first: Floats | None = None,
     progress: Callable[[dict[str, Any]], None] | None = None,
 ) -> Found:
     """Search for the sample of least cost; infinite if none converged, z being the mean then.
 
-    incumbent (k, d): further samples of the first iteration. The best sample is kept, so what is found is never worse.
-    first (n, d): samples of the first iteration in place of the Gaussian's, whatever their number.
+    first (n, d): samples of the first iteration in place of the Gaussian's, at least an elite. The best sample is
+    kept: what is found is never worse than an incumbent among them.
     """
     settings = ce.Settings(**vars(search), lower=variables.lower, upper=variables.upper)
     belief = ce.start(variables.mean, variables.sigma, variables.correlation)
@@ -68,22 +67,9 @@ def best(
     def evaluate(z: Floats) -> Floats:
         return cost(terms, rollout(variables.controls(z)))
 
-    opening = _opening(belief, settings, rng, incumbent, first)
+    opening = ce.ask(belief, settings, rng) if first is None else first
+    opening = np.clip(opening, settings.lower, settings.upper)
     belief = ce.minimize(evaluate, belief, settings, rng, progress, opening)
     outcome = rollout(variables.controls(belief.best[None]))
     charged = {name: float(value[0]) for name, value in charges(terms, outcome).items()}
     return Found(belief.best, belief.best_cost, charged, outcome, belief)
-
-
-def _opening(
-    belief: ce.Belief,
-    settings: ce.Settings,
-    rng: np.random.Generator,
-    incumbent: Floats | None,
-    first: Floats | None,
-) -> Floats:
-    """Samples (n, d) of the first iteration, the incumbent's in front."""
-    drawn = ce.ask(belief, settings, rng) if first is None else first
-    samples = drawn if incumbent is None else np.concatenate([incumbent, drawn])
-    kept: Floats = np.clip(samples, settings.lower, settings.upper)
-    return kept

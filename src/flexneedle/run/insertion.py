@@ -101,9 +101,9 @@ def run(
         if on_period is not None:
             on_period(period)
     insertion = Insertion(plan, seed, tuple(periods), *ending, name)
-    if insertion.outcome == "done" and insertion.true_error_mm > 1.0:
-        missed = f"missed the target by {insertion.true_error_mm:.2f} mm"
-        return replace(insertion, reason="; ".join(filter(None, (insertion.reason, missed))))
+    if insertion.outcome == "done":
+        line = missed(insertion.true_error_mm, math.dist(periods[-1].estimate[:2], plan.target))
+        return replace(insertion, reason="; ".join(filter(None, (insertion.reason, line))))
     return insertion
 
 
@@ -165,18 +165,9 @@ def _periods(
         lost = lost.lasting(now - begun) if decides else lost
         ending = ending or lost.ending(scenario.control.hold_limit_s)
         period = _record(index, now, task.plan, rig, decision, applied, sight, clocks)
-        yield replace(period, warning=_warning(task, decision, in_a_row, sight, ending)), ending
+        yield replace(period, warning=warning(decision, in_a_row)), ending
         if ending is not None:
             return
-
-
-def _warning(
-    task: Task, decision: Decision, in_a_row: int, sight: Sight, ending: tuple[str, str] | None
-) -> str:
-    """What a period warns of: on the way what is predicted, at the end where the tip is estimated to be."""
-    if ending is not None and ending[0] == "done":
-        return missed(_pose(sight.estimate.tip)[:2], task.plan.target)
-    return warning(decision, in_a_row)
 
 
 def _decided(

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from flexneedle.phantom import DEFAULT_PLANT, Phantom, Truth, draw
+from flexneedle.phantom import DEFAULT_PLANT, Phantom, PlantFactory, Truth, draw
+from flexneedle.run.parts import plant_of
 from flexneedle.run.planner import plan
 from flexneedle.scenario import Scenario
 
@@ -19,14 +20,14 @@ _SEARCH = {
     "plan.guide_weight": 0.0,
     "plan.flip_weight": 0.0,
 }
-"""4000 rollouts, 20 times what the default controller spends on a decision, and the miss alone as their cost."""
+"""At most 4000 rollouts, 20 times what the default controller spends on its longest decision, for the miss alone."""
 
 
-def reach(scenario: Scenario, seed: int, phantom: str = DEFAULT_PLANT) -> float:
+def reach(scenario: Scenario, seed: int, phantom: str | PlantFactory = DEFAULT_PLANT) -> float:
     """Return the miss (mm) that the needle in the tank cannot avoid, or about, in the insertion of a seed.
 
-    With a guide (or a base that may move): of the best that a search with 4000 rollouts finds on the model with the
-    phantom's true parameters. Without: the distance from the target to the interval between the ends of the plant
+    With a guide (or a base that may move): of the best that a search with up to 4000 rollouts finds on the model with
+    the phantom's true parameters. Without: the distance from the target to the interval between the ends of the plant
     inserted with its bevel always on one side and on the other; by continuity all between them can be hit. NaN if
     the plant does not converge.
     """
@@ -35,13 +36,13 @@ def reach(scenario: Scenario, seed: int, phantom: str = DEFAULT_PLANT) -> float:
     if scenario.setup.has_guide or base_moves:
         return plan(truth.scenario.with_values(_SEARCH), threads=1).error_mm
     depth, lateral = scenario.target.position
-    ends = [straight_end(truth, bevel, phantom, depth) for bevel in (-1, 1)]
+    ends = [straight_end(truth, bevel, plant_of(phantom)[1], depth) for bevel in (-1, 1)]
     low, high = sorted(y for _, y in ends)
     short = max(depth - x for x, _ in ends)
     return math.hypot(short, max(0.0, low - lateral, lateral - high))
 
 
-def straight_end(truth: Truth, bevel: int, phantom: str, depth: float) -> tuple[float, float]:
+def straight_end(truth: Truth, bevel: int, phantom: str | PlantFactory, depth: float) -> tuple[float, float]:
     """Return the tip (x, y) in mm of a plant inserted to a depth, base and bevel as they are, or at full stroke.
 
     NaN if the plant does not converge.

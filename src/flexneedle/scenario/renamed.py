@@ -1,4 +1,5 @@
-"""Keys of scenarios that have another name now: the old one means the new one, and a warning says so."""
+"""Keys of older scenarios: one with another name now means the new one, one that nothing reads is left out; each with a
+warning."""
 
 import copy
 import warnings
@@ -15,7 +16,16 @@ _CE_MPC = (
     *("samples", "iterations", "horizon", "orientation_weight_mm", "guide_weight", "energy_weight_per_mj"),
     *("curvature_per_m", "flip_dead_band"),
 )
-_RENAMED = {f"control.{key}": f"control.ce_mpc.{key}" for key in _CE_MPC}
+_RENAMED = {f"control.{key}": f"control.ce_mpc.{key}" for key in _CE_MPC} | {
+    "control.adaptive_mpc.model_sd_mm": "control.adaptive_mpc.least_model_sd_mm"
+}
+_ROUTE = ("mm", "samples", "iterations", "pieces", "guide_sigma_mm", "energy_weight_mm_per_mj")
+_ADAPTIVE = (
+    *("curvature_per_m", "flip_dead_band", "horizon", "pieces", "guide_sigma_mm", "target_weight"),
+    *("orientation_weight_mm", "guide_weight", "energy_weight_per_mj", *(f"route_{key}" for key in _ROUTE)),
+    *("route_guide_weight_per_mm", "route_turn_weight_mm"),
+)
+_RETIRED = ("plan.steering_stiffness_factor", *(f"control.adaptive_mpc.{key}" for key in _ADAPTIVE))
 
 
 def current_key(key: str, source: str = "") -> str:
@@ -28,28 +38,31 @@ def current_key(key: str, source: str = "") -> str:
 
 
 def current_values(values: Mapping[str, Any], source: str = "") -> Mapping[str, Any]:
-    """Return nested tables under the present names, with a warning for each old one.
+    """Return nested tables under the present names, without what nothing reads, with a warning for each old key.
 
     Raises ScenarioError if both an old key and its new one are given.
     """
-    given = _given(values)
-    old = [key for key in _RENAMED if key in given]
-    if not old:
+    given, opening = _given(values), f"{source}: " if source else ""
+    renamed, retired = ([key for key in keys if key in given] for keys in (_RENAMED, _RETIRED))
+    if not renamed and not retired:
         return values
-    renamed = copy.deepcopy(dict(values))
-    for key in old:
+    current = copy.deepcopy(dict(values))
+    for key in renamed:
         new = current_key(key, source)
         if new in given:
-            opening = f"{source}: " if source else ""
             raise ScenarioError(
                 f"{opening}{key} = {given[key]}: is {new} now, which is given too: remove one"
             )
-        set_value(renamed, new, given[key])
-        set_value(renamed, key, None)
-    return renamed
+        set_value(current, new, given[key])
+        set_value(current, key, None)
+    for key in retired:
+        line = f"{opening}{key} = {given[key]} is ignored, no setting of this version: remove it"
+        warnings.warn(line, ScenarioWarning, stacklevel=2)
+        set_value(current, key, None)
+    return current
 
 
 def _given(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of section `control` by dotted key."""
-    control = values.get("control")
-    return flatten({"control": control}) if isinstance(control, Mapping) else {}
+    """The values of the sections that have old keys, by dotted key."""
+    sections = {name: values.get(name) for name in ("control", "plan")}
+    return flatten({name: section for name, section in sections.items() if isinstance(section, Mapping)})

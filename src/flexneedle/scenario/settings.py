@@ -66,8 +66,6 @@ class Plan(Section):
     """R, cost of the guide's travel in a step."""
     flip_weight: NonNegative = 0.3
     """R of a turn of the bevel."""
-    steering_stiffness_factor: Annotated[float, Field(gt=0, le=1)] | None = None
-    """Accepted and not used: `steering` is planned on the needle itself."""
 
     @property
     def elite_count(self) -> int:

@@ -103,6 +103,15 @@ def test_a_controller_that_predicts_nothing_is_neither_held_nor_warned_of(plan):
     assert all(np.isnan(period.miss) for period in done.periods)
 
 
+def test_a_miss_that_nothing_predicted_is_the_reason_and_no_warning(plan):
+    """So that a study can count the misses that came without a warning on the way."""
+    aside = replace(in_air(plan), target=(-20.0, 3.0))
+    done, _ = inserted(aside, [0.0])
+    assert done.outcome == "done"
+    assert done.reason.startswith("missed the target by 3.")
+    assert done.warning == ""
+
+
 def test_the_hold_and_the_warning_are_in_all_records_and_read_back(plan, tmp_path):
     """Trace, CSV and JSON."""
     done, _ = inserted(plan, [0.2, 1.5, 3.0], force=False)

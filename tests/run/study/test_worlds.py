@@ -15,6 +15,7 @@ from flexneedle.run.study.runner import _bounding
 from flexneedle.run.study.summary import is_failure
 from flexneedle.run.study.tables import write_tables
 from flexneedle.scenario.worlds import CASES, world
+from synthetic import make_insertion
 
 FREE, GUIDED = 15, 3  # worlds without and with a guide
 STUDY = f"""
@@ -148,13 +149,18 @@ def test_a_job_finds_the_reach_if_it_is_wanted(load, monkeypatch):
         assert row["outcome"] == "error"
 
 
-def test_a_reach_that_fails_is_told_in_its_row(load, monkeypatch):
+def test_a_reach_that_fails_is_told_in_the_row_and_the_insertion_stands(load, monkeypatch):
+    done = make_insertion()
+
     def reach(*_args):
         raise ZeroDivisionError("nowhere")
 
     monkeypatch.setattr(rows, "reach", reach)
-    (row,) = carry_out(Job(load().points[0], None, "no plan", ((0, 5),), True)).rows
-    assert (row["outcome"], row["reason"]) == ("error", "no reach: ZeroDivisionError: nowhere")
+    monkeypatch.setattr(rows, "_insertion", lambda *_args: done)
+    monkeypatch.setattr(rows, "_times", lambda _insertion: {})
+    (row,) = carry_out(Job(load().points[0], done.plan, "", ((0, 5),), True)).rows
+    assert (row["outcome"], row["reason"]) == ("done", "no reach: ZeroDivisionError: nowhere")
+    assert row["reach_mm"] is None
 
 
 def test_the_table_has_the_reach_in_every_row_of_the_same_truth(load, tmp_path):
@@ -184,6 +190,13 @@ def _bounding_rows(study):
 )
 def test_a_refusal_is_a_failure_where_the_target_is_within_reach(outcome, reach, failure):
     assert is_failure({"outcome": outcome, "reach_mm": reach}) == failure
+
+
+@pytest.mark.parametrize(("outcome", "failure"), [("held", True), ("refused", False), ("failed", False)])
+def test_a_hold_is_a_failure_up_to_the_miss_at_which_a_controller_may_hold(outcome, failure):
+    row = {"outcome": outcome, "reach_mm": 1.5, "control.miss_limit_mm": 2.0}
+    assert is_failure(row) is failure
+    assert not is_failure(row | {"reach_mm": 2.1})
 
 
 def test_points_with_another_needle_have_another_reach(load):

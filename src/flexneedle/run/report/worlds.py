@@ -118,7 +118,7 @@ def _open_loop(rows: Rows, design: Design, error: Floats) -> Floats:
 
 def failures(rows: Rows) -> Flags:
     """Return which rows (n,) did not finish though the target, as far as is known, was within 1 mm of the reach."""
-    columns = ("outcome", "reach_mm")
+    columns = ("outcome", "reach_mm", "control.miss_limit_mm")
     found = ({name: rows.value(name, row) for name in columns} for row in range(len(rows)))
     return np.array([is_failure(row) for row in found], dtype=bool)
 

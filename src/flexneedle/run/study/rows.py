@@ -123,15 +123,19 @@ def _row(job: Job, seed: int) -> dict[str, Any]:
             results |= _results(insertion)
             times = _times(insertion)
     times["total_s"] = time.perf_counter() - begun
-    values: dict[str, Any] = plain(results | times | (_reach(job.point, seed) if job.bounded else {}))
+    if job.bounded:
+        results["reach_mm"], failed = _reach(job.point, seed)
+        results["reason"] = "; ".join(filter(None, (results["reason"], failed)))
+    values: dict[str, Any] = plain(results | times)
     return values
 
 
-def _reach(point: Point, seed: int) -> dict[str, Any]:
+def _reach(point: Point, seed: int) -> tuple[float | None, str]:
+    """The reach (mm), or why there is none: the insertion's own outcome stands."""
     try:
-        return {"reach_mm": reach(point.scenario, seed, point.plant)}
+        return reach(point.scenario, seed, point.plant), ""
     except Exception as error:  # noqa: BLE001  as in an insertion
-        return {"outcome": "error", "reason": f"no reach: {_told(error)}"}
+        return None, f"no reach: {_told(error)}"
 
 
 def _insertion(job: Job, made: PlanRecord, seed: int) -> Insertion:
