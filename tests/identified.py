@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import flexneedle
-from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.identification import Identification
+from flexneedle.control.methods.adaptive_mpc import AdaptiveMpc
 from flexneedle.control.prior import BASE_TURN, BASE_Y, BEND, BEVEL, CLEARANCE, MODULUS, RUN_OUT
 from flexneedle.ports import Sample
 from flexneedle.simulator import Control, Learnt, Simulator

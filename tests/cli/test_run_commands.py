@@ -134,7 +134,7 @@ def test_by_default_the_default_controller_steers_in_the_exact_phantom(engine, c
     with pytest.raises(SystemExit):
         cli.main(["insert", "--help"])
     told = " ".join(capsys.readouterr().out.split())
-    assert f"who steers ({DEFAULT})" in told
+    assert f"(default: {DEFAULT})" in told
     assert all(f"{kind}," in told for kind in PLANTS)
 
 

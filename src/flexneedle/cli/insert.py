@@ -37,7 +37,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--strategy",
         choices=("manipulation", "steering"),
         default="manipulation",
-        help="how to plan: manipulation moves guide and bevel, steering only the bevel (manipulation)",
+        help="how to plan: manipulation moves guide and bevel, steering only the bevel (default: manipulation)",
     )
     parser.add_argument(
         "--plan-seed", type=seed, metavar="N", help="seed of the plan (that of the insertion, --seed)"
@@ -45,18 +45,18 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--controller",
         metavar="NAME",
-        help="who steers (adaptive-mpc); --list says which there are; module:METHOD for one of your own",
+        help="controller: a name (see --list), or module:METHOD for one of your own (default: adaptive-mpc)",
     )
     parser.add_argument(
         "--phantom",
         metavar="KIND",
         help="what is steered: exact, a finer formulation of its own with a rig's imperfections, or model, the "
-        "controller's own kind of model with other parameters (exact); module:NAME for one of your own",
+        "controller's own kind of model with other parameters; module:NAME for one of your own (default: exact)",
     )
     parser.add_argument(
         "--tracker",
         metavar="NAME",
-        help="what measures the tip: the tracker of the scenario, or module:NAME for one of your own (scenario)",
+        help="what measures the tip: scenario, its tracker, or module:NAME for one of your own (default: scenario)",
     )
     parser.add_argument(
         "--registration", type=Path, metavar="FILE", help="where the tracker stands, as em register found it"
@@ -175,7 +175,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         ("bevel turns", str(insertion.flips)),
         ("  as planned", str(insertion.plan.flips)),
         ("control periods", str(result["steps"])),
-        *([("held for the tracker", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
+        *([("held", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
         ("time of the plan", _number(timing["plan_seconds"], "s")),
         ("time of a period, median", _number(timing["period_ms"]["p50"], "ms")),
     ]

@@ -4,6 +4,7 @@ Maximum a posteriori by Gauss–Newton, one step a period: the insertion is simu
 costs a millisecond, and the lateral readings choose among them. Parameters, with normal priors from the scenario:
 
     base y (mm), base turn (rad), natural bend of the needle (mm), run-out (mm), factor on the bevel offset,
+    clearance of the needle in the guide (mm),
     ln of the factor on each layer's modulus, shift (mm) of each boundary between layers,
     ln of a further factor on the modulus in cells along the depth, correlated over a length.
 
@@ -22,7 +23,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.estimate import Floats, Move, along, assigned
 from flexneedle.control.prior import (
     BASE_TURN,
@@ -34,6 +34,7 @@ from flexneedle.control.prior import (
     MODULUS,
     RUN_OUT,
     Prior,
+    Priors,
     check_cells,
     unexplained,
 )
@@ -103,7 +104,7 @@ class Identified:
     """
 
     nominal: Simulator
-    settings: AdaptiveMpc
+    settings: Priors
     prior: Prior
     simulator: Simulator
     parameters: Floats
@@ -313,7 +314,7 @@ class _Readings:
         left: Floats = self.y - self.between(belief.tips[:, 1]) - belief.run_out * self.sides
         return left
 
-    def variance(self, scenario: Scenario, settings: AdaptiveMpc) -> Floats:
+    def variance(self, scenario: Scenario, settings: Priors) -> Floats:
         """Of the lateral readings (r,), mm²: their jitter and what no parameter explains."""
         variance: Floats = (
             scenario.tracker.jitter_per_axis**2 / self.count + unexplained(scenario, settings) ** 2
@@ -336,7 +337,7 @@ class _Readings:
         return float(variance * (weight @ (self.x - without))), float(variance)
 
 
-def _adapted(nominal: Simulator, settings: AdaptiveMpc, parameters: Floats) -> Simulator:
+def _adapted(nominal: Simulator, settings: Priors, parameters: Floats) -> Simulator:
     """The model with these constants."""
     layers = len(nominal.scenario.tissue)
     shift = MODULUS + layers
@@ -421,7 +422,7 @@ def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) 
     return member, np.concatenate([before, tips, later])
 
 
-def _low_passed(settings: AdaptiveMpc, left: Floats) -> float:
+def _low_passed(settings: Priors, left: Floats) -> float:
     """The residuals (r,) of the last moves, each less than the one after it."""
     level, gain = 0.0, settings.residual_gain
     for value in left[-_RECENT:].tolist():

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario import Scenario
+from flexneedle.scenario.fields import Fraction, NonNegative, Positive, Section
 from flexneedle.scenario.problems import Problem, to_line
 
 __all__ = [
     *("BASE_TURN", "BASE_Y", "BEND", "BEVEL", "CLEARANCE", "LEAST_SD", "MODULUS", "RUN_OUT"),
-    *("Prior", "check_cells", "unexplained"),
+    *("Prior", "Priors", "check_cells", "unexplained"),
 ]
 
 Floats = NDArray[np.float64]
@@ -30,6 +30,37 @@ _SHIFT_STEP = 0.2  # mm
 _WIDEST = 4.0  # standard deviations that a parameter may leave its prior
 _LARGEST_BEVEL = 0.699  # offset, in compression lengths: the law's limit
 _MOST_CELLS = 200
+
+
+class Priors(Section):
+    """Settings of the observer, keys of the section of the controller that has it."""
+
+    bend_sd_mm: NonNegative = 0.5
+    """Prior of the natural bend of the needle, over its length: standard deviation."""
+    run_out_sd_mm: NonNegative = 0.1
+    """Prior of the distance of the measured tip from the needle's axis: standard deviation."""
+    clearance_mm: NonNegative = 0.05
+    """Prior of the clearance of the needle in the guide, to either side: mean."""
+    clearance_sd_mm: NonNegative = 0.02
+    """Prior of the clearance of the needle in the guide, to either side: standard deviation."""
+    modulus_log_sd: NonNegative = 0.3
+    """Prior of the logarithm of the factor on each layer's modulus: standard deviation."""
+    bevel_sd: NonNegative = 0.3
+    """Prior of the factor on the bevel offset: standard deviation."""
+    boundary_sd_mm: NonNegative = 1.5
+    """Prior of the depth of each boundary between layers: standard deviation."""
+    variation_sd: NonNegative = 0.2
+    """Prior of the logarithm of the modulus along the depth, about that of its layer: standard deviation."""
+    variation_length_mm: Positive = 10.0
+    """Length over which the variation of the modulus along the depth is correlated."""
+    cell_mm: Positive = 2.5
+    """Length of the cells in which the modulus is taken as constant."""
+    model_sd: NonNegative = 0.01
+    """Standard deviation of a reading's mean that no parameter explains, relative to the bevel offset."""
+    least_model_sd_mm: Positive = 0.0126
+    """Least standard deviation of a reading's mean that no parameter explains."""
+    residual_gain: Fraction = 0.4
+    """Gain of the low-pass over what the fit leaves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +76,7 @@ class Prior:
     begins: Floats
 
     @staticmethod
-    def of(scenario: Scenario, settings: AdaptiveMpc, depth: float) -> "Prior":
+    def of(scenario: Scenario, settings: Priors, depth: float) -> "Prior":
         """The scenario's."""
         control = scenario.control
         layers, cells = len(scenario.tissue), _cells(depth, settings)
@@ -82,7 +113,7 @@ class Prior:
         return float(0.5 * off @ self.precision @ off)
 
 
-def unexplained(scenario: Scenario, settings: AdaptiveMpc) -> float:
+def unexplained(scenario: Scenario, settings: Priors) -> float:
     """Standard deviation (mm) of the mean of a move's readings that no parameter explains."""
     return max(settings.least_model_sd_mm, settings.model_sd * scenario.needle.bevel.offset_mm)
 
@@ -97,12 +128,12 @@ def _uncorrelating(size: int, distance: float) -> Floats:
     return inverse
 
 
-def _cells(depth: float, settings: AdaptiveMpc) -> int:
+def _cells(depth: float, settings: Priors) -> int:
     """Cells from the skin to the target's depth (mm); the last one goes on."""
     return max(2, int(np.ceil(depth / settings.cell_mm)))
 
 
-def check_cells(scenario: Scenario, settings: AdaptiveMpc) -> None:
+def check_cells(scenario: Scenario, settings: Priors) -> None:
     """Raise ScenarioError for cells so short that a fit would never end."""
     thinnest = scenario.setup.max_depth / _MOST_CELLS
     if settings.cell_mm < thinnest:

@@ -61,7 +61,7 @@ def unowned(scenario: Scenario, methods: Iterable[Method], source: str = "") -> 
     for table in sorted(set(scenario.control.tables) - set(known)):
         close = get_close_matches(table, known, n=1)
         hint = f"did you mean {close[0]}? " if close else ""
-        rule = f"unknown table; {hint}tables: {', '.join(known)}; one of your own needs its --controller"
+        rule = f"unknown table; {hint}tables: {', '.join(known)}; for one of your own give --controller module:METHOD"
         lines.append(f"{opening}{key_path(('control', table))}: {rule}")
     return lines
 

@@ -87,7 +87,7 @@ class Control(Section):
     model_config = ConfigDict(extra="allow")
 
     load_gain: Fraction = 0.3
-    """Share of a new tip load that is learnt in a period."""
+    """Share of a new tip load that is estimated in a period."""
     depth_tolerance_mm: Positive = 0.01
     """The insertion ends this close to the target depth."""
     start_offset_sd_mm: NonNegative = 0.5
@@ -95,18 +95,17 @@ class Control(Section):
     start_angle_sd_mrad: NonNegative = 3.0
     """What the controller expects of the base clamp's slope: its standard deviation."""
     innovation_limit_mm: Positive = 2.0
-    """A measured tip further than this, and three standard deviations of the prediction, from the predicted one is not
-    used."""
+    """A reading further from its prediction than this plus three standard deviations is not used."""
     start_axial_sd_mm: NonNegative = 1.0
     """What the controller expects of the tip's position along the axis at the start: its standard deviation."""
     miss_limit_mm: Positive = 2.0
-    """The needle is held where no path is found that ends within this lateral distance of the target,"""
+    """The needle is held where no path is found that ends within this lateral distance of the target."""
     miss_confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95
-    """if the predicted miss is beyond it with at least this probability."""
+    """The needle is held if the predicted miss exceeds its limit with at least this probability."""
     hold_limit_s: Positive = 1.0
-    """The insertion is given up after so long without a measurement to believe."""
+    """The insertion ends after this time without a usable reading, or without a path to the target."""
     stale_after_s: Positive = 0.3
-    """A measurement older than this is not believed."""
+    """A reading older than this is not used."""
 
     @model_validator(mode="after")
     def _check_tables(self) -> Self:
@@ -131,7 +130,7 @@ class Control(Section):
 
 
 class Phantom(Section):
-    """Section `phantom`: how the virtual phantom differs from what the controller believes.
+    """Section `phantom`: how the virtual phantom differs from what the controller assumes.
 
     The plant `model` has no initial bend, guide clearance, friction or variation of stiffness; `exact` has all.
     """

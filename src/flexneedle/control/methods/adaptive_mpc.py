@@ -15,7 +15,6 @@ from typing import cast
 
 import numpy as np
 
-from flexneedle.control.adaptive_settings import AdaptiveMpc
 from flexneedle.control.estimate import Estimate, Floats
 from flexneedle.control.forecast import probability_beyond
 from flexneedle.control.guide import guide_may_move
@@ -23,7 +22,9 @@ from flexneedle.control.identification import Identification, Identified
 from flexneedle.control.interface import Decision, Method, Task, travel_left
 from flexneedle.control.outlook import UNCORRECTED, Outlook
 from flexneedle.control.path import Ahead, Path, of_plan, proposals
+from flexneedle.control.prior import Priors
 from flexneedle.planning import Found, Outcome, Search, Term, Variables, best, terms
+from flexneedle.scenario.fields import NonNegative, count
 
 _ELITE = 8  # one in so many samples
 _LEAST_ELITE = 3
@@ -31,6 +32,31 @@ _SMOOTHING = 0.3
 _TOLERANCE = 1e-6
 _RESTS = (4.0, 2.0, 1.0)  # control steps before the target at which the needle rests
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
+
+
+class AdaptiveMpc(Priors):
+    """Section `control.adaptive_mpc`. The cost of a path is in mm; its weights hold for any needle and tissue."""
+
+    samples: int = count(24, least=12, most=100_000)
+    """Paths in an iteration of a period."""
+    iterations: int = count(2, least=1, most=1_000)
+    """Iterations of a period."""
+    effort: int = count(3, least=1, most=1_000)
+    """Factor on the samples in the first period, and where no path was found that ends near the target."""
+    energy_weight_mm: NonNegative = 0.4
+    """Cost of the energy that the tissue down to the target has where it is displaced by 1 mm."""
+    unguided_energy_weight_mm: NonNegative = 1.0
+    """Cost of that energy where the guide may not move."""
+    line_weight: NonNegative = 0.3
+    """Cost of the mean distance of the tip from the line to the target."""
+    unguided_line_weight: NonNegative = 0.0
+    """Cost of that distance where the guide may not move."""
+    slope_weight_mm: NonNegative = 0.5
+    """Cost of a mean squared slope of 1 of the guide's path, by the share of the path that is left."""
+    roll_weight_mm: NonNegative = 0.03
+    """Cost of a roll of the bevel."""
+    late_roll_weight: NonNegative = 1.0
+    """Cost of how far a roll just before the target may move the tip, in its standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +134,12 @@ def _search(
 ) -> Found:
     """The best correction of the path in hand, itself among the samples."""
     settings = task.settings
-    count = effort * settings.samples
-    first = proposals(ahead, count, rng)
+    samples = effort * settings.samples
+    first = proposals(ahead, samples, rng)
     lower, upper = ahead.bounds
     variables = Variables(lower, upper, ahead.in_hand, first.std(axis=0), lambda z: ahead.controls(z)[0])
-    elite = max(_LEAST_ELITE, count // _ELITE)
-    search = Search(count, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
+    elite = max(_LEAST_ELITE, samples // _ELITE)
+    search = Search(samples, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
     return best(variables, partial(_seen, fitted), _terms(task, fitted, memory), search, rng, first=first)
 
 

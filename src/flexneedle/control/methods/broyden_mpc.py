@@ -1,4 +1,4 @@
-"""`broyden-mpc`: no model of needle or tissue: a Jacobian learnt from readings, and linear MPC of the guide.
+"""`broyden-mpc`: no model of needle or tissue: a Jacobian estimated from readings, and linear MPC of the guide.
 
 Bernardes et al., Data-driven adaptive needle insertion assist for transperineal prostate interventions (Phys. Med.
 Biol. 2023, doi:10.1088/1361-6560/accefa): the Jacobian from inputs (insertion, place of the guide) to the measured
@@ -29,7 +29,7 @@ _KEPT = 8  # control steps: readings are younger
 
 
 class BroydenMpc(Section):
-    """Section `control.broyden_mpc`: a Jacobian learnt from readings, and linear MPC of the guide."""
+    """Section `control.broyden_mpc`: a Jacobian estimated from readings, and linear MPC of the guide."""
 
     update_gain: Fraction = 0.65
     """Share of Broyden's update of the Jacobian that is made; 1 repeats the newest motion exactly."""
@@ -61,51 +61,51 @@ def begin(task: Task) -> Learnt:
 
 
 def decide(
-    task: Task, learnt: Learnt, estimate: Estimate, _rng: np.random.Generator
+    task: Task, estimated: Learnt, estimate: Estimate, _rng: np.random.Generator
 ) -> tuple[Decision, Learnt]:
     """Learn from a new reading, predict the tip to now, and take the first of the best steps of the guide."""
     scenario, state = task.scenario, estimate.state
     settings, setup = task.settings, scenario.setup
     inputs = np.array([state.travel[0], state.guide])
-    learnt = remember(learnt, float(state.tip[0]), inputs)
+    estimated = remember(estimated, float(state.tip[0]), inputs)
     left = travel_left(scenario, task.plan, state)
     advance = min(setup.max_advance_mm, left)
     db_y, db_theta = planned_base(setup, task.plan, state, state.tip[:1] + advance)[0].tolist()
     if estimate.measured is None or left <= 0.0:
-        return Decision((advance, db_y, db_theta, 0.0, -1), "no reading yet"), learnt
+        return Decision((advance, db_y, db_theta, 0.0, -1), "no reading yet"), estimated
     tip = np.array(estimate.measured)
-    then = inputs_at(learnt, float(tip[0]))
-    learnt = learn(learnt, tip, then, settings.update_gain)
-    tip = tip + learnt.jacobian @ (inputs - then)
+    then = inputs_at(estimated, float(tip[0]))
+    estimated = learn(estimated, tip, then, settings.update_gain)
+    tip = tip + estimated.jacobian @ (inputs - then)
     ahead = np.minimum(setup.max_advance_mm * np.arange(1, settings.horizon + 1), left)
-    moves, cost = guide_moves(settings, setup, task.plan, learnt.jacobian, tip, ahead, state.guide)
-    slope, effect = learnt.jacobian[1].tolist()
+    moves, cost = guide_moves(settings, setup, task.plan, estimated.jacobian, tip, ahead, state.guide)
+    slope, effect = estimated.jacobian[1].tolist()
     why = f"bevel kept: never turned; tip moves {slope:.3f} aside with insertion, {effect:.3f} with the guide"
-    return Decision((advance, db_y, db_theta, float(moves[0]), -1), why, cost), learnt
+    return Decision((advance, db_y, db_theta, float(moves[0]), -1), why, cost), estimated
 
 
-def remember(learnt: Learnt, x: float, inputs: Floats) -> Learnt:
+def remember(estimated: Learnt, x: float, inputs: Floats) -> Learnt:
     """Note that the tip is at depth x (mm) with these inputs: tells later when a reading was taken."""
     insertion, guide = inputs.tolist()
-    history = (*learnt.history, (x, insertion, guide))[-_KEPT:]
-    return Learnt(learnt.jacobian, history, learnt.seen)
+    history = (*estimated.history, (x, insertion, guide))[-_KEPT:]
+    return Learnt(estimated.jacobian, history, estimated.seen)
 
 
-def inputs_at(learnt: Learnt, x: float) -> Floats:
+def inputs_at(estimated: Learnt, x: float) -> Floats:
     """Inputs (2,) when the tip was at depth x (mm), within what is remembered."""
-    depth, *inputs = np.array(learnt.history).T
+    depth, *inputs = np.array(estimated.history).T
     return np.array([np.interp(x, depth, values) for values in inputs])
 
 
-def learn(learnt: Learnt, tip: Floats, inputs: Floats, gain: float) -> Learnt:
+def learn(estimated: Learnt, tip: Floats, inputs: Floats, gain: float) -> Learnt:
     """Update by a reading of the tip, once the needle went far enough on since the last."""
-    if learnt.seen is None:
-        return Learnt(learnt.jacobian, learnt.history, (tip, inputs))
-    last_tip, last_inputs = learnt.seen
+    if estimated.seen is None:
+        return Learnt(estimated.jacobian, estimated.history, (tip, inputs))
+    last_tip, last_inputs = estimated.seen
     if inputs[0] - last_inputs[0] < _LEAST_INSERTION_MM:
-        return learnt
-    jacobian = broyden(learnt.jacobian, inputs - last_inputs, tip - last_tip, gain)
-    return Learnt(jacobian, learnt.history, (tip, inputs))
+        return estimated
+    jacobian = broyden(estimated.jacobian, inputs - last_inputs, tip - last_tip, gain)
+    return Learnt(jacobian, estimated.history, (tip, inputs))
 
 
 def broyden(jacobian: Floats, moved: Floats, seen: Floats, gain: float) -> Floats:
@@ -174,7 +174,7 @@ def bounded_least_squares(matrix: Floats, right: Floats, lower: Floats, upper: F
 
 METHOD = Method(
     "broyden-mpc",
-    "guide by linear MPC with a Jacobian learnt from readings (Broyden), no model",
+    "guide by linear MPC with a Jacobian estimated from readings (Broyden), no model",
     Beliefs(),
     begin=begin,
     decide=decide,

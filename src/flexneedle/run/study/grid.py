@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Method
 from flexneedle.control.methods import DEFAULT, METHODS, checked
 from flexneedle.errors import InputError, ScenarioError
@@ -223,6 +224,7 @@ def _points(
             continue
         start = base if number is None else worlds(number, world_case)
         scenario = _varied(start, {**left_out, **settings}, own, where)
+        _check_guide(run, scenario, where)
         if number is None:
             number, of_world = targets.setdefault(scenario.target.position, len(targets)), {}
         else:
@@ -238,6 +240,17 @@ def _is_skipped(scenario: Scenario, controller: str, world_case: str) -> bool:
     return not scenario.setup.has_guide and (
         world_case == STRUCTURE or controller_of(controller)[1].needs_guide
     )
+
+
+def _check_guide(run: Mapping[str, Any], scenario: Scenario, where: str) -> None:
+    try:
+        check_guide(controller_of(run["controller"])[1], scenario.setup, run["strategy"])
+    except InputError as error:
+        raise InputError(f"{error}{_at(where)}") from None
+
+
+def _at(where: str) -> str:
+    return f" (at {where})" if where else ""
 
 
 def _check_run(run: Mapping[str, Any]) -> None:
@@ -256,6 +269,6 @@ def _varied(base: Scenario, settings: Mapping[str, Any], own: tuple[Method, ...]
     try:
         return checked(base.with_values(settings), *own)
     except ScenarioError as error:
-        at = f" (at {where})" if where else ""
-        lines = (problem + (_BESIDES if "unknown key" in problem else "") + at for problem in error.problems)
+        besides = (_BESIDES if "unknown key" in problem else "" for problem in error.problems)
+        lines = (problem + more + _at(where) for problem, more in zip(error.problems, besides, strict=True))
         raise InputError("\n".join(lines)) from None
