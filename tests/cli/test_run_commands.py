@@ -210,7 +210,7 @@ def test_a_held_insertion_fails_with_its_reason(engine, capsys, in_tmp):
 
 def test_an_unreachable_plan_is_refused_and_recorded(engine, capsys, in_tmp):
     engine(plan_miss=2.5)
-    status, out, err = run(capsys, "insert", "--json", "--out", "here")
+    status, out, err = run(capsys, "insert", "--json", "--out", "here", "--controller", "open-loop")
     assert (status, out) == (1, "")
     assert err.splitlines()[-1].startswith("flexneedle: plan misses the target by 2.51 mm, bound by setup.")
     assert names(in_tmp / "here") == ["plan.png", "plan.svg", "run.json", "trace.mcap"]
@@ -219,7 +219,7 @@ def test_an_unreachable_plan_is_refused_and_recorded(engine, capsys, in_tmp):
 
 def test_force_inserts_all_the_same(engine, capsys):
     engine(plan_miss=2.5)
-    status, out, _ = run(capsys, "insert", "--json", "--force")
+    status, out, _ = run(capsys, "insert", "--json", "--force", "--controller", "open-loop")
     assert status == 1
     assert json.loads(out)["planned_error_mm"] == pytest.approx(2.51)
 

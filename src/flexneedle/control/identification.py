@@ -231,6 +231,11 @@ class Identified:
         return float(np.sqrt(slope @ self.covariance @ slope + self.axial_variance))
 
     @property
+    def bevel_sd(self) -> float:
+        """Standard deviation of the factor on the bevel offset, relative to it."""
+        return float(np.sqrt(self.covariance[BEVEL, BEVEL]) / max(self.parameters[BEVEL], LEAST_SD))
+
+    @property
     def lag(self) -> float:
         """Time (s) from the newest reading to the end of the last move."""
         times = (sample.time for done in reversed(self.moves) for sample in reversed(done.samples))

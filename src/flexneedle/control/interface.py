@@ -83,7 +83,8 @@ class Method:
     decide: the next command and the memory after it; begin: memory at the start (default: None); arrived: whether it
     is done (default: at the target depth);
     settings: class of its settings, a default for each, which the scenario has in the table `control.<table>`;
-    needs_guide: whether it is refused where the guide may not move.
+    needs_guide: whether it is refused where the guide may not move;
+    predicts: whether its decisions predict the miss. The loop holds by that, so a plan that misses is not refused.
 
     Raises InputError for a name or settings that cannot be used.
     """
@@ -97,6 +98,7 @@ class Method:
     arrived: Callable[[Task, Any, Estimate], bool] = at_depth
     settings: type[Section] | None = None
     needs_guide: bool = False
+    predicts: bool = False
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(str(self.name)):

@@ -67,5 +67,9 @@ class Outlook:
         then = estimate.precision + slopes @ slopes.T / estimate.reading_variance
         known = end @ np.linalg.solve(then, end) + _UNEXPLAINED**2 * estimate.reading_variance
         known += (_DRIFT * (target - float(estimate.state.tip[0]))) ** 2
-        now = float(end @ np.linalg.solve(estimate.precision, end))
-        return float(np.sqrt(float(known) + min(miss**2, now)))
+        return float(np.sqrt(float(known) + min(miss**2, self.sd_now(estimate, target) ** 2)))
+
+    def sd_now(self, estimate: Identified, target: float) -> float:
+        """Standard deviation (mm) of the tip's lateral position at the depth `target` (mm), if nothing is corrected."""
+        end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
+        return float(np.sqrt(end @ np.linalg.solve(estimate.precision, end)))

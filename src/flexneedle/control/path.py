@@ -114,6 +114,15 @@ class Ahead:
         rolls[: len(self.path.rolls)] = np.maximum(self.path.rolls, self.depth[0])
         return np.concatenate([np.zeros(KNOTS.size), rolls])
 
+    @property
+    def constant(self) -> Floats:
+        """Samples (4, d) that roll now or not, and after the first step or not (the last index), and never again."""
+        z = np.tile(self.in_hand, (4, 1))
+        z[:, KNOTS.size :] = self.unused
+        z[2:, KNOTS.size] = self.depth[0]
+        z[1::2, KNOTS.size + 1] = self.depth[1]
+        return z
+
     def controls(self, z: Floats) -> tuple[Floats, Floats]:
         """Controls (N, m, 5) of samples z (N, d), and the depths (N, m + 1) of the tip before and after each step."""
         depth, roll = self._grid(z[:, KNOTS.size :])

@@ -73,14 +73,19 @@ def cost(terms: Sequence[Term], outcome: Outcome) -> Floats:
     return np.where(outcome.converged.all(axis=1), total, np.inf)
 
 
+def past(outcome: Outcome, target: Point) -> Floats:
+    """How far (mm) past the target in +y the tip is at its depth, to which its own line is followed from the end."""
+    end = outcome.tips[:, -1]
+    distance: Floats = end[:, 1] + np.tan(end[:, 2]) * (target[0] - end[:, 0]) - target[1]
+    return distance
+
+
 def miss(outcome: Outcome, target: Point, blur: float = 0.0) -> Floats:
-    """Lateral distance (mm) from the target at its depth, to which the tip's own line is followed from the end.
+    """Lateral distance (mm) from the target at its depth, as `past` has it.
 
     blur (mm): of a distance d that is known no better than this, √(d² + blur²) − blur counts.
     """
-    end = outcome.tips[:, -1]
-    distance = end[:, 1] + np.tan(end[:, 2]) * (target[0] - end[:, 0]) - target[1]
-    blurred: Floats = np.hypot(distance, blur) - blur
+    blurred: Floats = np.hypot(past(outcome, target), blur) - blur
     return blurred
 
 

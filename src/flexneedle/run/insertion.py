@@ -86,7 +86,7 @@ def run(
     """Carry out `plan` on any rig; as `insert`."""
     name, chosen = controller_of(controller)
     check_guide(chosen, scenario.setup, plan.strategy)
-    if not plan.reached and not force:
+    if not (plan.reached or force or chosen.predicts):
         raise RunError(
             f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), bound by {plan.limit}; "
             "use --force to insert it anyway"

@@ -8,6 +8,7 @@ import pytest
 
 import flexneedle
 import flexneedle.control
+from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.errors import RunError
 from flexneedle.ports import Sample
 from flexneedle.run.rig import Rig
@@ -32,12 +33,20 @@ def missing_by(plan, miss):
 def test_a_plan_that_misses_by_more_than_a_millimetre_is_refused_unless_forced(plan):
     tank = Tank(plan.bevel)
     with pytest.raises(RunError, match=r"misses the target by 1\.01 mm .*bound by setup\.max_guide_step_mm"):
-        run(missing_by(plan, 1.01), tank.rig())
+        run(missing_by(plan, 1.01), tank.rig(), controller="open-loop")
     assert tank.moves == []
     with pytest.raises(RunError):
-        flexneedle.insert(PHANTOM, missing_by(plan, 1.01), seed=2001)
+        flexneedle.insert(PHANTOM, missing_by(plan, 1.01), seed=2001, controller="open-loop")
     for miss, force in ((1.01, True), (0.99, False)):
-        assert first_periods(1, missing_by(plan, miss), Tank(plan.bevel).rig(), force=force)
+        rig = Tank(plan.bevel).rig()
+        assert first_periods(1, missing_by(plan, miss), rig, force=force, controller="open-loop")
+
+
+def test_a_controller_that_predicts_the_miss_is_held_by_that_and_not_by_the_plan(plan):
+    """What the plan misses by says nothing of the phantom's needle; whether it can be reached is found on the way."""
+    assert METHODS[DEFAULT].predicts
+    assert not any(method.predicts for name, method in METHODS.items() if name != DEFAULT)
+    assert first_periods(1, missing_by(plan, 1.01), Tank(plan.bevel).rig())
 
 
 class Stuck(Stage):

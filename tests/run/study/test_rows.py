@@ -67,6 +67,7 @@ def test_unconverged_periods_are_counted(point, plan, monkeypatch):
 
 def test_a_plan_that_misses_is_refused_in_a_row_without_results(point, plan):
     tips = plan.tips + np.array([0.0, 1.5, 0.0])
+    point = replace(point, controller="open-loop")
     row = only_row(Job(point, replace(plan, tips=tips, limit="some limit"), "", ((0, 11),)))
     assert row["outcome"] == "refused"
     assert row["reason"].startswith("plan misses the target by 1.")

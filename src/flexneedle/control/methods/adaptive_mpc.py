@@ -9,6 +9,7 @@ worth against it, each relative to a scale of the scenario's own, so that one se
 What is predicted of the end, the miss and its standard deviation, goes with each decision (`control.outlook`).
 """
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import cast
@@ -55,6 +56,8 @@ class AdaptiveMpc(Priors):
     """Cost of a mean squared slope of 1 of the guide's path, by the share of the path that is left."""
     roll_weight_mm: NonNegative = 0.03
     """Cost of a roll of the bevel."""
+    reach_weight: NonNegative = 10.0
+    """Cost of how far the target is expected to be out of the bevel's reach, where the guide may not move."""
     late_roll_weight: NonNegative = 1.0
     """Cost of how far a roll just before the target may move the tip, in its standard deviations."""
 
@@ -140,7 +143,44 @@ def _search(
     variables = Variables(lower, upper, ahead.in_hand, first.std(axis=0), lambda z: ahead.controls(z)[0])
     elite = max(_LEAST_ELITE, samples // _ELITE)
     search = Search(samples, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
-    return best(variables, partial(_seen, fitted), _terms(task, fitted, memory), search, rng, first=first)
+    charged = _terms(task, fitted, memory)
+    if ahead.step == 0.0:
+        charged = (*charged, Term("reach", settings.reach_weight, _Shortfall.of(task, fitted, ahead, memory)))
+    return best(variables, partial(_seen, fitted), charged, search, rng, first=first)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shortfall:
+    """How far the target is expected to be out of the bevel's reach after the first control step, (2,) mm: the bevel as
+    it is, or rolled before it. With the bevel alone, reach that is given away does not come back.
+    """
+
+    expected: Floats
+
+    @staticmethod
+    def of(task: Task, fitted: Identified, ahead: Ahead, memory: Memory) -> "_Shortfall":
+        """The reach is what is between the ends with the bevel on either side from the second step on; normal."""
+        outcome = _seen(fitted, ahead.controls(ahead.constant)[0])
+        past = terms.past(outcome, task.plan.target).reshape(2, 2)
+        low, high = past.min(axis=1), past.max(axis=1)
+        middle = (memory.outlook or Outlook.of(fitted)).sd_now(fitted, task.plan.target[0])
+        sd = np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
+        if not outcome.converged.all():
+            return _Shortfall(np.zeros(2))
+        return _Shortfall(_above_zero(low, sd) + _above_zero(-high, sd))
+
+    def __call__(self, outcome: Outcome) -> Floats:
+        """Of samples (N,)."""
+        value: Floats = self.expected[(outcome.controls[:, 0, 4] > 0.0).astype(int)]
+        return value
+
+
+def _above_zero(mean: Floats, sd: Floats) -> Floats:
+    """Mean of the part above zero of normal values: ∫₀^∞ x N(mean, sd²) dx."""
+    z = mean / np.maximum(sd, np.finfo(float).tiny)
+    below = np.array([0.5 * math.erfc(-value / math.sqrt(2.0)) for value in z])
+    part: Floats = mean * below + sd * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+    return part
 
 
 def _seen(fitted: Identified, controls: Floats) -> Outcome:
@@ -172,12 +212,10 @@ def _terms(task: Task, fitted: Identified, memory: Memory) -> tuple[Term, ...]:
 
 def _forecast(task: Task, memory: Memory, fitted: Identified, found: Found) -> tuple[Outlook, float, float]:
     """Derivatives ahead, the miss that is predicted (mm, past the target in +y), and its standard deviation (mm)."""
-    depth, lateral = task.plan.target
-    tips = found.outcome.tips[0]
-    x, y, turn = tips[-1].tolist()
-    miss = float(y + np.tan(turn) * (depth - x) - lateral)
-    outlook = (memory.outlook or Outlook.of(fitted)).renewed(fitted, found.outcome.controls[0], tips)
-    return outlook, miss, outlook.sd(fitted, depth, miss)
+    miss = float(terms.past(found.outcome, task.plan.target)[0])
+    before = memory.outlook or Outlook.of(fitted)
+    outlook = before.renewed(fitted, found.outcome.controls[0], found.outcome.tips[0])
+    return outlook, miss, outlook.sd(fitted, task.plan.target[0], miss)
 
 
 METHOD = Method(
@@ -187,4 +225,5 @@ METHOD = Method(
     begin=begin,
     decide=decide,
     settings=AdaptiveMpc,
+    predicts=True,
 )
