@@ -35,7 +35,16 @@ def test_json_has_all_statistics_at_full_precision(capsys, study, tmp_path):
     assert status == 0
     assert list(values) == [
         *("study", "report", "figures", "insertions", "planned", "finished", "statistics"),
-        *("groups", "controllers", "controllers_by_depth", "cases", "worlds", "endings", "worst"),
+        *(
+            "groups",
+            "controllers",
+            "controllers_by_depth",
+            "cases",
+            "worlds",
+            "predictions",
+            "endings",
+            "worst",
+        ),
     ]
     assert (values["study"], values["insertions"], values["finished"], values["planned"]) == (
         "Mine",

@@ -265,20 +265,29 @@ def test_a_draw_knows_the_tissue_down_to_the_end_of_the_stroke_and_before_the_sk
     assert len(truth.variation) * truth.cell_mm == pytest.approx(31.5 + 8 * 0.25)
 
 
+def rounded(value):
+    """To 12 digits: the last ones of exp and log differ from processor to processor."""
+    if isinstance(value, float):
+        return float(f"{value:.12g}")
+    if isinstance(value, dict):
+        return {key: rounded(one) for key, one in value.items()}
+    return list(map(rounded, value)) if isinstance(value, list | tuple) else value
+
+
 def digest(truth):
     """Of all that was drawn."""
     values = truth.scenario.values()
     values = {name: values[name] for name in ("needle", "setup", "tissue", "contact", "target")}
     rest = [getattr(truth, field.name) for field in fields(truth)][1:]
-    return hashlib.sha256(json.dumps([values, *rest], sort_keys=True).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps(rounded([values, *rest]), sort_keys=True).encode()).hexdigest()[:16]
 
 
 @pytest.mark.parametrize(
     ("scenario", "digests"),
     [
-        (PHANTOM, ["41a8d16489ba244f", "bbea703784ce73ed", "e5d2ba91d1239490"]),
-        (world(3), ["ecd73474de8a6f21", "4095bb5a67cb43f4", "d356c73bee160aae"]),
-        (world(15), ["11630338c554fd67", "065e0188181f10a5", "413850463f2ca55b"]),
+        (PHANTOM, ["858a94ebf9c32a91", "4675914ecd03cc17", "72f72a01a96d11b2"]),
+        (world(3), ["06a58745625cfad1", "5f66c5499aa74278", "cd2f5fd461570bce"]),
+        (world(15), ["f0d773d2e4f25312", "cc3203a4f0060a10", "105f39294b7cf02f"]),
     ],
 )
 def test_without_axial_error_and_modulus_variation_phantoms_are_those_published(scenario, digests):
