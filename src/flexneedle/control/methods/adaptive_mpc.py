@@ -56,7 +56,7 @@ class AdaptiveMpc(Priors):
     """Cost of a mean squared slope of 1 of the guide's path, by the share of the path that is left."""
     roll_weight_mm: NonNegative = 0.03
     """Cost of a roll of the bevel."""
-    reach_weight: NonNegative = 10.0
+    reach_weight: NonNegative = 30.0
     """Cost of how far the target is expected to be out of the bevel's reach, where the guide may not move."""
     late_roll_weight: NonNegative = 1.0
     """Cost of how far a roll just before the target may move the tip, in its standard deviations."""
