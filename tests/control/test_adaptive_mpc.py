@@ -14,8 +14,10 @@ from flexneedle.control.interface import travel_left
 from flexneedle.control.methods import DEFAULT, METHODS, adaptive_mpc
 from flexneedle.control.path import of_plan
 from flexneedle.control.prior import RUN_OUT
+from flexneedle.planning import terms
 from flexneedle.planning.terms import cost
 from flexneedle.ports import Sample
+from flexneedle.run.planner import bevel_reach
 from flexneedle.scenario.worlds import world
 from flexneedle.simulator import Control, Learnt, Simulator
 from tasks import begun_with, task_of
@@ -127,6 +129,87 @@ def test_off_the_plan_it_finds_a_path_that_ends_nearer_the_target(quick_plan, al
     assert abs(decide(quick_plan, belief).miss) < 0.3 * abs(kept)
 
 
+def weights(scenario, plan, x, memory=None):
+    """Of the terms of the cost at a depth of the tip."""
+    simulator = Simulator(scenario, threads=1)
+    state = simulator.start()
+    while state.tip[0] < x:
+        state = simulator.step(state, Control(db_x=1.0))
+    belief, task = belief_of(state, scenario), task_of(simulator, plan)
+    memory = memory or ADAPTIVE.begin(task)
+    ahead = adaptive_mpc.Ahead.of(task, state, memory.path)
+    listed = adaptive_mpc._terms(task, belief, memory, ahead)
+    return {term.name: term.weight for term in listed}, task, belief, ahead
+
+
+def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
+    """Energy against that of this tissue displaced, the slope by the path that is left, late rolls by what they do."""
+    found, task, belief, ahead = weights(PHANTOM, quick_plan, 10.0)
+    settings, scale = task.settings, task.simulator.energy_scale(40.0)
+    assert found == {
+        "miss": 1.0,
+        "energy": settings.energy_weight_mm / scale,
+        "line": settings.line_weight,
+        "slope": settings.slope_weight_mm * ahead.left / 40.0,
+        "rolls": settings.roll_weight_mm,
+        "late": settings.late_roll_weight * belief.roll_sd,
+    }
+    assert 0.7 < ahead.left / 40.0 < 0.8
+    assert belief.roll_sd > 0.0
+    bare, task, _, _ = weights(BARE, quick_plan, 10.0)
+    assert bare["energy"] == task.settings.unguided_energy_weight_mm / scale
+    assert bare["line"] == task.settings.unguided_line_weight
+    assert bare["reach"] == task.settings.reach_weight
+
+
+def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
+    """The standard deviation that the last decision predicted, had it predicted no miss."""
+    belief = belief_of(along(quick_plan, 40), QUICK)
+    task = task_of(belief.nominal, quick_plan)
+    memory = replace(ADAPTIVE.begin(task), blur=0.3)
+    ahead = adaptive_mpc.Ahead.of(task, belief.state, memory.path)
+    outcome = adaptive_mpc._seen(belief, ahead.controls(ahead.in_hand[None])[0])
+    (term,) = (term for term in adaptive_mpc._terms(task, belief, memory, ahead) if term.name == "miss")
+    past = float(terms.past(outcome, quick_plan.target)[0])
+    assert abs(past) > 1e-3
+    assert term.value(outcome)[0] == pytest.approx(np.hypot(past, 0.3) - 0.3)
+
+
+@given(st.floats(-3.0, 3.0), st.floats(0.01, 2.0))
+def test_what_is_expected_above_zero_is_the_integral(mean, sd):
+    x = np.linspace(0.0, mean + 9.0 * sd, 20001)
+    density = np.exp(-0.5 * ((x - mean) / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
+    expected = np.trapezoid(x * density, x) if x[-1] > 0.0 else 0.0
+    found = adaptive_mpc._above_zero(np.array([mean]), np.array([sd]))[0]
+    assert found == pytest.approx(expected, abs=1e-4 * sd)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("bevel", [1, -1])
+def test_reach_is_not_given_away_by_a_step_with_the_bevel_on_the_wrong_side(quick_plan, side, bevel):
+    """To a target near the end of what the bevel can reach."""
+    simulator = Simulator(BARE, threads=1)
+    state = simulator.replay(simulator.start(bevel), [[31.0, 0.0, 0.0, 0.0, -1.0]])[0]
+    belief = belief_of(state, BARE)
+    least, greatest = bevel_reach(BARE, 40.0, threads=1)
+    plan = replace(quick_plan, target=(40.0, 0.9 * (greatest if side > 0 else least)), bevel=bevel)
+    task = task_of(simulator, plan)
+    ahead = adaptive_mpc.Ahead.of(task, state, replace(of_plan(plan), rolls=()))
+    kept, rolled = adaptive_mpc._Shortfall.of(task, belief, ahead, ADAPTIVE.begin(task)).expected
+    assert min(kept, rolled) >= 0.0
+    assert (kept < rolled) == (side == bevel)
+
+
+def test_it_rests_four_two_and_one_steps_before_the_target(quick_plan):
+    """For as long as a reading takes to come in, and a control step; the command waits."""
+    decisions, _, _ = carried_out(quick_plan, QUICK)
+    rests = [k for k, decision in enumerate(decisions) if decision.rest > 0.0]
+    left = [sum(decision.command[0] for decision in decisions[k:] if not decision.rest) for k in rests]
+    np.testing.assert_allclose(left, [4.0, 2.0, 1.0], atol=1.0)
+    assert len(rests) == 3
+    assert all(decisions[k].rest >= 0.2 for k in rests)
+
+
 def test_what_is_in_hand_is_never_given_up_for_something_worse(quick_plan, along):
     """The cost that is found is at most that of the path in hand, of any roll and guide."""
     belief = belief_of(along(quick_plan, 40), QUICK)
@@ -135,8 +218,8 @@ def test_what_is_in_hand_is_never_given_up_for_something_worse(quick_plan, along
         path = replace(of_plan(quick_plan), rolls=rolls)
         ahead = adaptive_mpc.Ahead.of(task, belief.state, path)
         kept = ahead.controls(ahead.in_hand[None])[0]
-        terms = adaptive_mpc._terms(task, belief, ADAPTIVE.begin(task))
-        in_hand = float(cost(terms, adaptive_mpc._seen(belief, kept))[0])
+        listed = adaptive_mpc._terms(task, belief, ADAPTIVE.begin(task), ahead)
+        in_hand = float(cost(listed, adaptive_mpc._seen(belief, kept))[0])
         assert decided(quick_plan, belief, path=path)[0].cost <= in_hand + 1e-9
 
 

@@ -20,7 +20,7 @@ from flexneedle.control.estimate import Estimate, Floats
 from flexneedle.control.forecast import probability_beyond
 from flexneedle.control.guide import guide_may_move
 from flexneedle.control.identification import Identification, Identified
-from flexneedle.control.interface import Decision, Method, Task, travel_left
+from flexneedle.control.interface import Decision, Method, Task
 from flexneedle.control.outlook import UNCORRECTED, Outlook
 from flexneedle.control.path import Ahead, Path, of_plan, proposals
 from flexneedle.control.prior import Priors
@@ -143,10 +143,39 @@ def _search(
     variables = Variables(lower, upper, ahead.in_hand, first.std(axis=0), lambda z: ahead.controls(z)[0])
     elite = max(_LEAST_ELITE, samples // _ELITE)
     search = Search(samples, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
-    charged = _terms(task, fitted, memory)
-    if ahead.step == 0.0:
-        charged = (*charged, Term("reach", settings.reach_weight, _Shortfall.of(task, fitted, ahead, memory)))
+    charged = _terms(task, fitted, memory, ahead)
     return best(variables, partial(_seen, fitted), charged, search, rng, first=first)
+
+
+def _seen(fitted: Identified, controls: Floats) -> Outcome:
+    """Controls (N, m, 5) on the fitted model, with the tips as a tracker without errors would see them."""
+    tips, energy, converged = fitted.simulator.rollout(fitted.state, controls, limits=False)
+    side = fitted.state.bevel * np.cumprod(-np.sign(controls[:, :, 4]), axis=1)
+    tips[:, :, 1] += fitted.run_out * side + fitted.residual
+    return Outcome(controls, tips, energy, converged)
+
+
+def _terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tuple[Term, ...]:
+    settings, target = task.settings, task.plan.target
+    guided = guide_may_move(task.scenario.setup, task.plan.strategy)
+    energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
+    line = settings.line_weight if guided else settings.unguided_line_weight
+    late = partial(terms.late_rolls, depth=target[0], length=UNCORRECTED * task.scenario.setup.max_advance_mm)
+    share = min(1.0, ahead.left / target[0])  # of the path
+    start = float(fitted.tip[0]), float(fitted.tip[1])
+    return (
+        Term("miss", 1.0, partial(terms.miss, target=target, blur=memory.blur)),
+        Term("energy", energy / memory.scale if memory.scale > 0.0 else 0.0, terms.energy_at_end),
+        Term("line", line, partial(terms.distance_from_line, start=start, target=target)),
+        Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
+        Term("rolls", settings.roll_weight_mm, terms.rolls),
+        Term("late", settings.late_roll_weight * fitted.roll_sd, late),
+        *(
+            []
+            if guided
+            else [Term("reach", settings.reach_weight, _Shortfall.of(task, fitted, ahead, memory))]
+        ),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,33 +210,6 @@ def _above_zero(mean: Floats, sd: Floats) -> Floats:
     below = np.array([0.5 * math.erfc(-value / math.sqrt(2.0)) for value in z])
     part: Floats = mean * below + sd * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
     return part
-
-
-def _seen(fitted: Identified, controls: Floats) -> Outcome:
-    """Controls (N, m, 5) on the fitted model, with the tips as a tracker without errors would see them."""
-    tips, energy, converged = fitted.simulator.rollout(fitted.state, controls, limits=False)
-    side = fitted.state.bevel * np.cumprod(-np.sign(controls[:, :, 4]), axis=1)
-    tips[:, :, 1] += fitted.run_out * side + fitted.residual
-    return Outcome(controls, tips, energy, converged)
-
-
-def _terms(task: Task, fitted: Identified, memory: Memory) -> tuple[Term, ...]:
-    settings, target = task.settings, task.plan.target
-    guided = guide_may_move(task.scenario.setup, task.plan.strategy)
-    energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
-    line = settings.line_weight if guided else settings.unguided_line_weight
-    reach = UNCORRECTED * task.scenario.setup.max_advance_mm
-    late = partial(terms.late_rolls, depth=target[0], length=reach)
-    share = min(1.0, travel_left(task.scenario, task.plan, fitted.state) / target[0])  # of the way
-    start = float(fitted.tip[0]), float(fitted.tip[1])
-    return (
-        Term("miss", 1.0, partial(terms.miss, target=target, blur=memory.blur)),
-        Term("energy", energy / memory.scale if memory.scale > 0.0 else 0.0, terms.energy_at_end),
-        Term("line", line, partial(terms.distance_from_line, start=start, target=target)),
-        Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
-        Term("rolls", settings.roll_weight_mm, terms.rolls),
-        Term("late", settings.late_roll_weight * fitted.roll_sd, late),
-    )
 
 
 def _forecast(task: Task, memory: Memory, fitted: Identified, found: Found) -> tuple[Outlook, float, float]:
