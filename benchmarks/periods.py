@@ -2,8 +2,8 @@
 
     python benchmarks/periods.py [--worlds FIRST COUNT] [--threads N]
 
-Each world's insertion with the mismatch that ships; of each period the time to decide and to observe (ms), without what
-the plant takes. A control step of 1 mm at 5 mm/s lasts 200 ms. Plans are made before and not counted.
+Each world's insertion with the mismatch that ships; of each period with a decision the time to decide and to observe
+(ms), without what the plant takes. A control step of 1 mm at 5 mm/s lasts 200 ms. Plans are made before and not counted.
 """
 
 import argparse
@@ -18,12 +18,12 @@ FIRST, COUNT = 100_000, 40
 
 
 def periods_of(number: int, threads: int | None) -> np.ndarray:
-    """Times (n, 2) of the moving periods of one world's insertion: decide, observe (ms)."""
+    """Times (n, 2) of the periods of one world's insertion in which was decided: decide, observe (ms)."""
     scenario = world(number)
     plan = flexneedle.plan(scenario, seed=number, threads=threads)
     insertion = flexneedle.insert(scenario, plan, seed=number, force=True, threads=threads)
-    moving = [period.durations for period in insertion.periods if period.applied[0] > 0.0]
-    return 1e3 * np.array([[spent["decide"], spent["observe"]] for spent in moving]).reshape(-1, 2)
+    decided = [period.durations for period in insertion.periods if np.isfinite(period.miss)]
+    return 1e3 * np.array([[spent["decide"], spent["observe"]] for spent in decided]).reshape(-1, 2)
 
 
 def line(label: str, values: np.ndarray) -> str:
