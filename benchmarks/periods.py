@@ -3,7 +3,7 @@
     python benchmarks/periods.py [--worlds FIRST COUNT] [--threads N]
 
 Each world's insertion with the mismatch that ships; of each period with a decision the time to decide and to observe
-(ms), without what the plant takes. A control step of 1 mm at 5 mm/s lasts 200 ms. Plans are made before and not counted.
+(ms), without what the plant takes. A control step of 1 mm at 5 mm/s lasts 200 ms. Plans are made before, not counted.
 """
 
 import argparse
