@@ -5,7 +5,7 @@
 METHOD is a controller as in `flexneedle insert --controller`; its search space is in SPACES. Five settings, the middle
 of the space and four that cover it evenly, are tried on the same cases: the 15 targets of the paper in turn, each on
 a phantom of its own (exact plant, preset `phantom`). After twenty cases the best two go on, to seventy: single errors
-scatter by as much as their mean, so more settings with fewer cases each would be told apart by chance. The score is the
+scatter by as much as their mean, so more settings with fewer cases each would be ranked by chance. The score is the
 mean true error and a quarter of its 95 % quantile (mm); an insertion that is not done counts 5 mm. Making the plans
 is outside the budget. The table goes to stdout, everything to DIR/METHOD.json (default: the records that the package
 ships, src/flexneedle/run/tuning), the same bytes for any number of processes.
@@ -34,7 +34,7 @@ from flexneedle.run.folder import versions
 from flexneedle.trace import PlanRecord
 from flexneedle.trace.plain import to_text
 
-TARGETS = [(depth, aside) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for aside in (-5.0, 0.0, 5.0)]
+TARGETS = [(depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0)]
 STRIDE = 4  # through the targets: any few cases in a row mix depths and sides
 ROUNDS = ((5, 20), (2, 50))  # settings that are left, and the further cases that each gets
 BUDGET = sum(settings * cases for settings, cases in ROUNDS)

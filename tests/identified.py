@@ -19,10 +19,12 @@ QUIET = PHANTOM.with_values(
         "control.adaptive_mpc.least_model_sd_mm": 3e-3,
     }
 )  # fmt: skip
+TIGHT = QUIET.with_values({f"control.adaptive_mpc.clearance{key}_mm": 0.0 for key in ("", "_sd")})
 TURNS = (20, 40, 52)  # moves that turn the bevel, the first in air
 LAYERS = len(PHANTOM.tissue)
 SHIFT = MODULUS + LAYERS
 CELLS = SHIFT + LAYERS - 1
+STILL = (0.0, 0.0, 0.0, 0.0, -1)
 OWN = AdaptiveMpc()
 WAVES = tuple(
     (1.0 + 0.5 * np.sin(0.45 * np.arange(15))).tolist()

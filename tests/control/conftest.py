@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 import flexneedle
+from flexneedle.control.identification import Identified
 from flexneedle.control.observer import Beliefs
 from flexneedle.simulator import Control, Simulator
 from tasks import begun_with
@@ -62,3 +63,9 @@ def believed():
         )
 
     return believe
+
+
+@pytest.fixture
+def all_fresh(monkeypatch):
+    """Every derivative simulated in every period."""
+    monkeypatch.setattr(Identified, "_due", lambda self: iter(range(self.parameters.size)))

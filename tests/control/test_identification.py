@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flexneedle.control.identification import Identification, Identified
+from flexneedle.control.identification import Identification
 from flexneedle.control.prior import BASE_TURN, BASE_Y, BEND, BEVEL, CLEARANCE, MODULUS, RUN_OUT, unexplained
 from flexneedle.ports import Sample
 from flexneedle.simulator import Simulator
@@ -14,6 +14,8 @@ from identified import (
     PHANTOM,
     QUIET,
     SHIFT,
+    STILL,
+    TIGHT,
     WAVES,
     Needle,
     ahead,
@@ -22,15 +24,6 @@ from identified import (
     readings,
 )
 from tasks import begun_with
-
-STILL = (0.0, 0.0, 0.0, 0.0, -1)
-TIGHT = QUIET.with_values({f"control.adaptive_mpc.clearance{key}_mm": 0.0 for key in ("", "_sd")})
-
-
-@pytest.fixture
-def all_fresh(monkeypatch):
-    """Every derivative simulated in every period."""
-    monkeypatch.setattr(Identified, "_due", lambda self: iter(range(self.parameters.size)))
 
 
 def test_it_begins_with_the_scenario():

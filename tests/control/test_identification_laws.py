@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexneedle.control.identification import Identification, Identified
+from flexneedle.control.identification import Identification
 from flexneedle.control.prior import BASE_TURN, BASE_Y, BEND, BEVEL, CLEARANCE, MODULUS, RUN_OUT, unexplained
 from flexneedle.ports import Sample
 from flexneedle.simulator import Control, Learnt, Simulator
@@ -16,6 +16,7 @@ from identified import (
     PHANTOM,
     QUIET,
     SHIFT,
+    TIGHT,
     Needle,
     commands,
     followed,
@@ -24,15 +25,6 @@ from identified import (
     stepped,
 )
 from tasks import begun_with
-
-STILL = (0.0, 0.0, 0.0, 0.0, -1)
-TIGHT = QUIET.with_values({f"control.adaptive_mpc.clearance{key}_mm": 0.0 for key in ("", "_sd")})
-
-
-@pytest.fixture
-def all_fresh(monkeypatch):
-    """Every derivative simulated in every period."""
-    monkeypatch.setattr(Identified, "_due", lambda self: iter(range(self.parameters.size)))
 
 
 @pytest.mark.parametrize("off", [1.9, -1.9])

@@ -161,11 +161,11 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
     from flexneedle.trace.summary import verdict
 
     result, timing = insertion_result(insertion), insertion_timing(insertion)
-    depth, aside = insertion.target
+    depth, lateral = insertion.target
     rows = [
         ("controller", insertion.controller),
         ("phantom", insertion.phantom),
-        ("target, depth and aside", f"{depth:g}, {aside:g} mm"),
+        ("target, depth and lateral offset", f"{depth:g}, {lateral:g} mm"),
         ("true distance from the target", _number(result["true_error_mm"], "mm")),
         ("  by the tracker", _number(result["residual_mm"], "mm")),
         ("  as planned", _number(result["planned_error_mm"], "mm")),

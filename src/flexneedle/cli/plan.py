@@ -71,9 +71,9 @@ def _rows(plan: PlanRecord) -> dict[str, str]:
     from flexneedle.trace.summary import entry_angle
 
     angle = entry_angle(plan)
-    depth, aside = plan.target
+    depth, lateral = plan.target
     return {
-        "target, depth and aside": f"{depth:g}, {aside:g} mm",
+        "target, depth and lateral offset": f"{depth:g}, {lateral:g} mm",
         "distance from the target": f"{plan.error_mm:.3f} mm",
         "angle of entry": "none" if isnan(angle) else f"{degrees(angle):+.2f}°",
         "bevel turns": str(plan.flips),

@@ -157,7 +157,7 @@ class Phantom(Section):
     initial_bend_mm: NonNegative = 0.5
     """How far the tip of the free needle is off the straight; the bend turns with the bevel, its side is drawn."""
     run_out_mm: NonNegative = 0.2
-    """How far the tip moves aside when the bevel turns over; its side is drawn."""
+    """How far the tip moves laterally when the bevel rolls; its side is drawn."""
     guide_clearance_mm: NonNegative = 0.05
     """Play of the needle in the guide, to either side."""
     friction_mn_per_mm: NonNegative = 5.0

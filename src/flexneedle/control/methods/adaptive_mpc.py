@@ -68,7 +68,7 @@ class Memory:
 
     path: as decided; rolled: the same without the roll that the command makes; bevel: side of the bevel before it.
     Which of the two is in hand shows in the next estimate: a needle that is held, or rests, does not roll.
-    scale: energy (mJ) of the tissue down to the target where it is moved aside by 1 mm; rests: made so far;
+    scale: energy (mJ) of the tissue down to the target where it is displaced by 1 mm; rests: made so far;
     blur: standard deviation of the predicted miss (mm), had none been predicted.
     """
 

@@ -22,7 +22,9 @@ from flexneedle.scenario.fields import Fraction, NonNegative, Positive, Section,
 from flexneedle.trace import PlanRecord
 
 Floats = NDArray[np.float64]
-_LEAST_INSERTION_MM = 0.5  # between two updates: less tells more of the tracker's noise than of the needle
+_LEAST_INSERTION_MM = (
+    0.5  # between two updates: a shorter one shows more of the tracker's noise than of the needle
+)
 _RIDGE = 1e-9  # mm² for a squared millimetre of the guide: one answer where the guide has no effect
 _RELEASE = 1e-12  # slope of the cost that counts as rounding
 _KEPT = 8  # control steps: readings are younger
@@ -56,7 +58,7 @@ class Learnt:
 
 
 def begin(task: Task) -> Learnt:
-    """Start with a tip that goes straight on, and aside with the guide."""
+    """Start with a tip that continues straight, and follows the guide laterally."""
     return Learnt(np.diag([1.0, task.settings.guide_effect]))
 
 
@@ -80,12 +82,12 @@ def decide(
     ahead = np.minimum(setup.max_advance_mm * np.arange(1, settings.horizon + 1), left)
     moves, cost = guide_moves(settings, setup, task.plan, estimated.jacobian, tip, ahead, state.guide)
     slope, effect = estimated.jacobian[1].tolist()
-    why = f"bevel kept: never turned; tip moves {slope:.3f} aside with insertion, {effect:.3f} with the guide"
+    why = f"bevel kept: never rolled; tip moves {slope:.3f} laterally with insertion, {effect:.3f} with the guide"
     return Decision((advance, db_y, db_theta, float(moves[0]), -1), why, cost), estimated
 
 
 def remember(estimated: Learnt, x: float, inputs: Floats) -> Learnt:
-    """Note that the tip is at depth x (mm) with these inputs: tells later when a reading was taken."""
+    """Note that the tip is at depth x (mm) with these inputs, by which later readings are placed."""
     insertion, guide = inputs.tolist()
     history = (*estimated.history, (x, insertion, guide))[-_KEPT:]
     return Learnt(estimated.jacobian, history, estimated.seen)

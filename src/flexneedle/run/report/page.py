@@ -77,8 +77,8 @@ def _unconverged(count: int) -> Html | None:
     if not count:
         return None
     have = "has" if count == 1 else "have"
-    told = f"{insertions(count)} {have} periods whose solve did not converge: see the table."
-    return element("p", told)
+    line = f"{insertions(count)} {have} periods whose solve did not converge: see the table."
+    return element("p", line)
 
 
 def _key_figures(group: Group) -> Html:
@@ -130,7 +130,7 @@ def _beyond(group: Group) -> str:
 def _standing(against: Sequence[Difference]) -> Html:
     """Say where the first controller stands among the others, then against each."""
     ours, better = against[0].name, [d for d in against if d.verdict == "better"]
-    told = (
+    verdict = (
         f"{ours} is better than every other controller in mean true error."
         if len(better) == len(against)
         else f"{ours} is better than {len(better)} of {len(against)} other controllers in mean true error; "
@@ -138,7 +138,7 @@ def _standing(against: Sequence[Difference]) -> Html:
         + "."
     )
     each = element("ul", *(element("li", _sentence(d)) for d in against), class_="verdicts")
-    return joined((element("p", element("strong", told)), each))
+    return joined((element("p", element("strong", verdict)), each))
 
 
 def _rest(against: Sequence[Difference]) -> Iterator[str]:
