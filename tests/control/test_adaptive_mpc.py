@@ -143,27 +143,28 @@ def weights(scenario, plan, x, memory=None):
 
 
 def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
-    """Energy against that of this tissue displaced, the slope by the path that is left, late rolls by what they do."""
+    """Energy against that of this tissue displaced, line and slope by the path left, late rolls by what they do."""
     found, task, belief, ahead = weights(PHANTOM, quick_plan, 10.0)
     settings, scale = task.settings, task.simulator.energy_scale(40.0)
     assert found == {
         "miss": 1.0,
         "energy": settings.energy_weight_mm / scale,
-        "line": settings.line_weight,
+        "line": settings.line_weight * ahead.left / 40.0,
         "slope": settings.slope_weight_mm * ahead.left / 40.0,
         "rolls": settings.roll_weight_mm,
         "late": settings.late_roll_weight * belief.roll_sd,
+        "reach": settings.reach_weight,
     }
     assert 0.7 < ahead.left / 40.0 < 0.8
     assert belief.roll_sd > 0.0
     bare, task, _, _ = weights(BARE, quick_plan, 10.0)
     assert bare["energy"] == task.settings.unguided_energy_weight_mm / scale
     assert bare["line"] == task.settings.unguided_line_weight
-    assert bare["reach"] == task.settings.reach_weight
+    assert bare["reach"] == task.settings.unguided_reach_weight
 
 
 def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
-    """The standard deviation that the last decision predicted, had it predicted no miss."""
+    """The standard deviation that the last decision predicted, had it predicted no miss, by the path that is left."""
     belief = belief_of(along(quick_plan, 40), QUICK)
     task = task_of(belief.nominal, quick_plan)
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
@@ -172,7 +173,9 @@ def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
     (term,) = (term for term in adaptive_mpc._terms(task, belief, memory, ahead) if term.name == "miss")
     past = float(terms.past(outcome, quick_plan.target)[0])
     assert abs(past) > 1e-3
-    assert term.value(outcome)[0] == pytest.approx(np.hypot(past, 0.3) - 0.3)
+    blur = 0.3 * ahead.left / 40.0
+    assert blur < 0.25
+    assert term.value(outcome)[0] == pytest.approx(np.hypot(past, blur) - blur)
 
 
 @given(st.floats(-3.0, 3.0), st.floats(0.01, 2.0))

@@ -44,20 +44,22 @@ class AdaptiveMpc(Priors):
     """Iterations of a period."""
     effort: int = count(3, least=1, most=1_000)
     """Factor on the samples in the first period, and where no path was found that ends near the target."""
-    energy_weight_mm: NonNegative = 0.4
+    energy_weight_mm: NonNegative = 0.5
     """Cost of the energy that the tissue down to the target has where it is displaced by 1 mm."""
     unguided_energy_weight_mm: NonNegative = 1.0
     """Cost of that energy where the guide may not move."""
-    line_weight: NonNegative = 0.3
-    """Cost of the mean distance of the tip from the line to the target."""
+    line_weight: NonNegative = 0.4
+    """Cost of the mean distance of the tip from the line to the target, by the share of the path that is left."""
     unguided_line_weight: NonNegative = 0.0
     """Cost of that distance where the guide may not move."""
     slope_weight_mm: NonNegative = 0.5
     """Cost of a mean squared slope of 1 of the guide's path, by the share of the path that is left."""
     roll_weight_mm: NonNegative = 0.03
     """Cost of a roll of the bevel."""
-    reach_weight: NonNegative = 30.0
-    """Cost of how far the target is expected to be out of the bevel's reach, where the guide may not move."""
+    reach_weight: NonNegative = 1.0
+    """Cost of how far the target is expected to be out of the bevel's reach, with the guide as it is."""
+    unguided_reach_weight: NonNegative = 30.0
+    """Cost of that where the guide may not move."""
     late_roll_weight: NonNegative = 1.0
     """Cost of how far a roll just before the target may move the tip, in its standard deviations."""
 
@@ -160,28 +162,26 @@ def _terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tupl
     guided = guide_may_move(task.scenario.setup, task.plan.strategy)
     energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
     line = settings.line_weight if guided else settings.unguided_line_weight
+    reach = settings.reach_weight if guided else settings.unguided_reach_weight
     late = partial(terms.late_rolls, depth=target[0], length=UNCORRECTED * task.scenario.setup.max_advance_mm)
     share = min(1.0, ahead.left / target[0])  # of the path
     start = float(fitted.tip[0]), float(fitted.tip[1])
     return (
-        Term("miss", 1.0, partial(terms.miss, target=target, blur=memory.blur)),
+        Term("miss", 1.0, partial(terms.miss, target=target, blur=memory.blur * share)),
         Term("energy", energy / memory.scale if memory.scale > 0.0 else 0.0, terms.energy_at_end),
-        Term("line", line, partial(terms.distance_from_line, start=start, target=target)),
+        Term("line", line * share, partial(terms.distance_from_line, start=start, target=target)),
         Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
         Term("rolls", settings.roll_weight_mm, terms.rolls),
         Term("late", settings.late_roll_weight * fitted.roll_sd, late),
-        *(
-            []
-            if guided
-            else [Term("reach", settings.reach_weight, _Shortfall.of(task, fitted, ahead, memory))]
-        ),
+        Term("reach", reach, _Shortfall.of(task, fitted, ahead, memory)),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Shortfall:
     """How far the target is expected to be out of the bevel's reach after the first control step, (2,) mm: the bevel as
-    it is, or rolled before it. With the bevel alone, reach that is given away does not come back.
+    it is, or rolled before it. With the bevel alone, reach that is given away does not come back; with a guide, the
+    bevel is what still moves the tip when the guide is far behind it.
     """
 
     expected: Floats
