@@ -175,7 +175,7 @@ def test_tissue_of_other_layers_is_identified_too(layers):
 def test_a_tracker_without_jitter_is_believed_but_for_what_no_parameter_explains():
     scenario = PHANTOM.with_values({"tracker.jitter_mm": 0.0})
     estimate, states = followed(NEEDLES["all"], 66, scenario=scenario)
-    np.testing.assert_array_equal(estimate._readings.variance(scenario, OWN), unexplained(scenario, OWN) ** 2)
+    np.testing.assert_array_equal(estimate.variance(estimate._readings), unexplained(scenario, OWN) ** 2)
     assert estimate.tip[1] == pytest.approx(
         NEEDLES["all"].seen(states[-1])[1], abs=unexplained(scenario, OWN)
     )

@@ -143,7 +143,7 @@ def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
 
 def misfit(belief, readings, before):
     """What the fit makes least: squares over variances, halved; the variances are those of the estimate `before`."""
-    variance = readings.variance(belief.nominal.scenario, belief.settings) + readings.bent(before) ** 2
+    variance = belief.variance(readings) + readings.bent(before.tips[:, 1]) ** 2
     off = belief.parameters - belief.prior.mean
     rows, p = np.array([done.applied for done in belief.moves]), belief.parameters
     y = belief.tips[:, 1]

@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.control.estimate import Floats, Move, along, assigned
 from flexneedle.control.prior import (
@@ -38,9 +37,9 @@ from flexneedle.control.prior import (
     check_cells,
     unexplained,
 )
+from flexneedle.control.readings import Readings, shared
 from flexneedle.control.task import Task
 from flexneedle.ports import Command, Sample
-from flexneedle.scenario import Scenario
 from flexneedle.simulator import Control, Learnt, Simulator, State
 
 __all__ = ["Identification", "Identified", "Perturbed"]
@@ -166,11 +165,12 @@ class Identified:
             return self.unseen()
         seen = replace(self, moves=assigned(self.moves, samples))
         readings = seen._readings
-        axial, axial_variance = readings.axial(seen)
+        without = readings.ahead(seen.tips[:, 0]) + seen.axial
+        prior_sd = max(self.nominal.scenario.control.start_axial_sd_mm, LEAST_SD)
+        axial, axial_variance = shared(without, seen.variance(readings), prior_sd)
         seen = replace(seen, axial=axial, axial_variance=axial_variance)
         fitted = _improved(seen, readings)._differentiated()
-        left = readings.left(fitted)
-        ahead = readings.x - readings.between(fitted.tips[:, 0])
+        left, ahead = fitted.left(readings), readings.ahead(fitted.tips[:, 0])
         newest = int(readings.index[-1]) + 1
         x, y = fitted.tips[newest, :2] + (ahead[-1], left[-1] + fitted.run_out * readings.sides[-1])
         inside = fitted.tips[-1, 0] > 0.0
@@ -187,13 +187,17 @@ class Identified:
         return np.array([done.applied for done in self.moves], dtype=float).reshape(-1, 5)
 
     @cached_property
-    def _readings(self) -> "_Readings":
-        means = [(k, *done.mean) for k, done in enumerate(self.moves) if done.mean is not None]
-        index, part, x, y, count = np.array(means, dtype=float).T
-        turns = np.cumprod(np.where(self.rows[:, 4] > 0.0, -1.0, 1.0))
-        first = self.state.bevel * turns[-1]
-        moves = index.astype(int)
-        return _Readings(moves, part, x, y, count, (first * turns)[moves])
+    def _readings(self) -> Readings:
+        return Readings.of(self.moves, self.state.bevel)
+
+    def variance(self, readings: Readings) -> Floats:
+        """Of the means of readings (r,), mm²: their jitter and what no parameter explains."""
+        scenario = self.nominal.scenario
+        return readings.variance(scenario.tracker.jitter_per_axis, unexplained(scenario, self.settings))
+
+    def left(self, readings: Readings) -> Floats:
+        """The lateral readings (r,) less those of the model, mm."""
+        return readings.left(self.tips[:, 1], self.run_out)
 
     def _with(self, parameters: Floats) -> "Identified":
         """The estimate with these parameters: the insertion simulated again, in stretches."""
@@ -296,52 +300,6 @@ class Identified:
                 yield k
 
 
-@dataclass(frozen=True, eq=False)
-class _Readings:
-    """Means of the readings of each move that has any: the move, the share of it done, x, y (mm), their number, and
-    the bevel's side, which turns before its move; each (r,).
-    """
-
-    index: NDArray[np.intp]
-    part: Floats
-    x: Floats
-    y: Floats
-    count: Floats
-    sides: Floats
-
-    def between(self, ends: Floats) -> Floats:
-        """A quantity at the readings, from its values at the ends of the moves (m + 1,)."""
-        between: Floats = (1.0 - self.part) * ends[self.index] + self.part * ends[self.index + 1]
-        return between
-
-    def left(self, belief: Identified) -> Floats:
-        """The lateral readings (r,) less those of the model, mm."""
-        left: Floats = self.y - self.between(belief.tips[:, 1]) - belief.run_out * self.sides
-        return left
-
-    def variance(self, scenario: Scenario, settings: Priors) -> Floats:
-        """Of the lateral readings (r,), mm²: their jitter and what no parameter explains."""
-        variance: Floats = (
-            scenario.tracker.jitter_per_axis**2 / self.count + unexplained(scenario, settings) ** 2
-        )
-        return variance
-
-    def bent(self, belief: Identified) -> Floats:
-        """How far (r,) a reading may be from the chord of its move, mm: the tip's path bends below the skin."""
-        y = belief.tips[:, 1]
-        change = np.abs(np.diff(y, n=2, prepend=y[0], append=y[-1]))
-        sag: Floats = 0.25 * np.maximum(change[self.index], change[self.index + 1])
-        return sag
-
-    def axial(self, belief: Identified) -> tuple[float, float]:
-        """Start error along the axis (mm) and its variance, maximum a posteriori: all axial readings share it."""
-        without = self.between(belief.tips[:, 0]) - belief.axial
-        scenario = belief.nominal.scenario
-        weight = 1.0 / self.variance(scenario, belief.settings)
-        variance = 1.0 / (weight.sum() + max(scenario.control.start_axial_sd_mm, LEAST_SD) ** -2.0)
-        return float(variance * (weight @ (self.x - without))), float(variance)
-
-
 def _adapted(nominal: Simulator, settings: Priors, parameters: Floats) -> Simulator:
     """The model with these constants."""
     layers = len(nominal.scenario.tissue)
@@ -371,15 +329,13 @@ def _started(estimate: Identified, simulator: Simulator, parameters: Floats) -> 
     return simulator.replay(moved, _REST)[0]
 
 
-def _improved(belief: Identified, readings: _Readings) -> Identified:
+def _improved(belief: Identified, readings: Readings) -> Identified:
     """One Gauss–Newton step to the maximum a posteriori, as long as it fits no worse, within the bounds."""
     prior = belief.prior
-    jacobian, variance = (
-        _jacobian(belief, readings),
-        readings.variance(belief.nominal.scenario, belief.settings) + readings.bent(belief) ** 2,
-    )
+    jacobian = _jacobian(belief, readings)
+    variance = belief.variance(readings) + readings.bent(belief.tips[:, 1]) ** 2
     weighted = jacobian.T / variance
-    gradient = weighted @ readings.left(belief) - prior.precision @ (belief.parameters - prior.mean)
+    gradient = weighted @ belief.left(readings) - prior.precision @ (belief.parameters - prior.mean)
     precision = weighted @ jacobian + prior.precision
     belief = replace(belief, precision=precision)
     step = np.linalg.solve(precision, gradient)
@@ -388,7 +344,7 @@ def _improved(belief: Identified, readings: _Readings) -> Identified:
     goal = np.clip(belief.parameters + step, *prior.bounds)
 
     def cost(other: Identified) -> float:
-        return float(0.5 * (readings.left(other) ** 2 / variance).sum()) + prior.cost(other.parameters)
+        return float(0.5 * (other.left(readings) ** 2 / variance).sum()) + prior.cost(other.parameters)
 
     most, fitted = cost(belief), belief
     for share in _SHARES:
@@ -398,7 +354,7 @@ def _improved(belief: Identified, readings: _Readings) -> Identified:
     return fitted
 
 
-def _jacobian(estimate: Identified, readings: _Readings) -> Floats:
+def _jacobian(estimate: Identified, readings: Readings) -> Floats:
     """Derivative (r, K) of the predicted readings, from the curves."""
     jacobian = estimate._slopes(readings.between(estimate.tips[:, 0]))
     jacobian[:, RUN_OUT] = readings.sides
