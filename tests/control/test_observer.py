@@ -199,6 +199,21 @@ def test_the_start_along_the_axis_is_found_and_how_surely(base_x):
     assert (np.diff(sds) < 0.0).all()
 
 
+def test_the_next_reading_is_as_uncertain_as_the_path_since_the_last_one_is_long():
+    """From the skin by drift x², from a reading at s by drift (x² − s²), each beside what the start leaves."""
+    simulator = Simulator(PHANTOM)
+    estimate = replace(begun(simulator, in_tissue(simulator)), drift=0.01)
+    seen = estimate.move(AHEAD, 0.0, 1.0).observe(
+        [Sample(1.0, float(estimate.tip[0]) + 1.0, float(estimate.tip[1]))]
+    )
+    later = seen.move(AHEAD, 1.0, 2.0)
+    for one, since in [(estimate, 0.0), (later, seen.measured[0])]:
+        depth, start = float(one.tip[0]), replace(one, drift=0.0).tip_sd
+        assert depth > since + 0.5
+        assert one.tip_sd == pytest.approx(np.hypot(start, 0.01 * (depth**2 - since**2)))
+    assert later.tip_sd < estimate.tip_sd
+
+
 @pytest.mark.parametrize("axial", [0.0, 1.0])
 @pytest.mark.parametrize("off", [(0.4, 0.3), (-0.6, -0.2)])
 def test_a_contact_that_is_cut_is_on_the_measured_path_wherever_the_tip_is_along_the_axis(axial, off):

@@ -72,9 +72,13 @@ class Corrected:
 
     @property
     def tip_sd(self) -> float:
-        """Standard deviation (mm) of the predicted distance of the next reading of the tip."""
+        """Standard deviation (mm) of the predicted distance of the next reading of the tip.
+
+        A path that leaves the model's by drift · x² since the skin does so by drift · (x² − s²) since a reading at s.
+        """
         arm = np.array([1.0, self.simulator.scenario.needle.length_mm])
-        off_path = self.drift * max(0.0, float(self.state.tip[0])) ** 2
+        depth, seen = max(0.0, float(self.state.tip[0])), max(0.0, self.measured[0] if self.measured else 0.0)
+        off_path = self.drift * max(0.0, depth**2 - seen**2)
         return float(np.sqrt(arm @ self.covariance @ arm + self.axial + off_path**2))
 
     def tip_at(self, time: float) -> tuple[float, float]:
