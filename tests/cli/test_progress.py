@@ -57,7 +57,7 @@ def test_a_narrow_terminal_shows_every_note_whole(monkeypatch):
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "80")
-    note = "9000 of 10005, 0.56 a second, 12 min 15 s left, 3 failed"
+    note = "9000 of 10005, 0.56 a second, 12 min 15 s left, 3 not done"
     with Progress() as progress:
         progress.show("Inserting", 9000, 10005, note)
     assert f"{note}\n" in terminal.getvalue()

@@ -131,7 +131,7 @@ def test_some_failures_are_counted_and_all_failures_fail(capsys, monkeypatch):
     monkeypatch.setattr(rows, "insert", some)
     status, out, err = run(capsys, "my.toml", "--out", "some", "--json")
     assert (status, json.loads(out)["outcomes"]) == (0, {"error": 2, "done": 2})
-    assert ", 2 failed" in err
+    assert ", 2 not done" in err
     monkeypatch.setattr(rows, "insert", None)
     status, out, _ = run(capsys, "my.toml", "--out", "all", "--json")
     assert (status, json.loads(out)["outcomes"]) == (1, {"error": 4})
@@ -153,8 +153,8 @@ def test_the_rate_is_that_of_insertions_alone_and_counts_no_earlier_ones(monkeyp
         show.advance(Advance(plans, 2, done, 100, 3))
         now += later
     told = [note for stage, note in notes if stage == "Inserting"]
-    assert told[:3] == [f"{done} of 100, 3 failed" for done in (40, 40, 41)]
-    assert told[3] == "46 of 100, 0.5 a second, 1 min 48 s left, 3 failed"
+    assert told[:3] == [f"{done} of 100, 3 not done" for done in (40, 40, 41)]
+    assert told[3] == "46 of 100, 0.5 a second, 1 min 48 s left, 3 not done"
 
 
 def test_unconverged_periods_are_told(capsys, monkeypatch):

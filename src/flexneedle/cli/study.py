@@ -122,7 +122,7 @@ class _Show:
             self._progress.show(planning, total if self._planned else advance.plans, total, note)
         note = f"{advance.insertions} of {advance.all_insertions}"
         note += self._inserting.left(advance.insertions, advance.all_insertions)
-        note += f", {advance.failed} failed" if advance.failed else ""
+        note += f", {advance.unfinished} not done" if advance.unfinished else ""
         self._progress.show(inserting, advance.insertions, advance.all_insertions, note)
 
 

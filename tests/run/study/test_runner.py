@@ -171,7 +171,7 @@ def test_a_study_tells_how_far_it_is(quick, tmp_path):
     run_study(quick, tmp_path / "a", on_advance=told.append)
     assert [(a.plans, a.insertions) for a in (told[0], told[-1])] == [(0, 0), (2, SIZE)]
     assert [a.insertions for a in told] == sorted(a.insertions for a in told)
-    assert {(a.all_plans, a.all_insertions, a.failed) for a in told} == {(2, SIZE, 0)}
+    assert {(a.all_plans, a.all_insertions, a.unfinished) for a in told} == {(2, SIZE, 0)}
 
 
 @pytest.mark.usefixtures("in_threads")
@@ -196,7 +196,7 @@ def test_failures_are_rows_and_the_study_ends(quick, tmp_path, monkeypatch):
     assert outcomes == {7: "error", 8: "error", 9: "done", 10: "refused"}
     assert {row["reason"] for row in table if row["seed"] < 9} == {"no plan: FloatingPointError: overflow"}
     assert all((row["true_error_mm"] is None) == (row["outcome"] != "done") for row in table)
-    assert told[-1].failed == 12
+    assert told[-1].unfinished == 12
     summary = summarise(out, load_study(quick))
     assert summary["outcomes"] == {"error": 8, "done": 4, "refused": 4}
     assert summary["first_failure"] == "error: no plan: FloatingPointError: overflow"

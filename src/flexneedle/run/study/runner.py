@@ -29,13 +29,13 @@ _CLUSTER_JOBS = 1000  # a job brings its plan along: about 100 kB that the sched
 
 @dataclass(frozen=True)
 class Advance:
-    """How far a study has come: plans and insertions that are done, of how many, and how many of them failed."""
+    """How far a study has come: plans and insertions that are done, of how many; insertions that did not finish."""
 
     plans: int
     all_plans: int
     insertions: int
     all_insertions: int
-    failed: int
+    unfinished: int
 
 
 def run_study(
@@ -98,7 +98,7 @@ class _Engine:
         self._left = _left(study, journal.rows)
         self._bounding = _bounding(study)
         self._all_plans = len(self._left)
-        self._failed = sum(map(_is_failure, journal.rows.values()))
+        self._unfinished = sum(map(_is_unfinished, journal.rows.values()))
 
     def run(self, executor: Executor, chunk: int) -> None:
         """Carry out what is left, `chunk` insertions of a point in a job."""
@@ -134,13 +134,13 @@ class _Engine:
                 f"a worker has other versions than this process: {done.versions}, {self._versions}"
             )
         self._journal.add(done.rows)
-        self._failed += sum(map(_is_failure, done.rows))
+        self._unfinished += sum(map(_is_unfinished, done.rows))
         self._tell()
 
     def _tell(self) -> None:
         missing = sum(self.plans.plan(key) is None and key not in self.plans.refusals for key in self._left)
         made, rows = self._all_plans - missing, len(self._journal.rows)
-        self._on_advance(Advance(made, self._all_plans, rows, len(self._study), self._failed))
+        self._on_advance(Advance(made, self._all_plans, rows, len(self._study), self._unfinished))
 
 
 def _left(study: Study, done: Container[int]) -> _Left:
@@ -164,7 +164,7 @@ def _bounding(study: Study) -> set[int]:
     return set(first.values())
 
 
-def _is_failure(row: Mapping[str, Any]) -> bool:
+def _is_unfinished(row: Mapping[str, Any]) -> bool:
     return bool(row["outcome"] != "done")
 
 
