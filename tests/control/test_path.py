@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
@@ -168,9 +168,24 @@ def test_a_roll_is_made_at_its_own_depth(quick_plan):
 
 
 def test_two_rolls_at_one_place_cancel(quick_plan):
-    ahead = ahead_of(quick_plan, started(10.0), level(20.0, 20.0))
-    assert (ahead.controls(ahead.in_hand[None])[0][:, :, 4] < 0.0).all()
-    assert ahead.corrected(ahead.in_hand).rolls == ()
+    """Those before and after them do not."""
+    for rolls, left in [((20.0, 20.0), ()), ((10.0, 20.0, 20.0, 30.0), (10.0, 30.0)), ((20.0,) * 3, (20.0,))]:
+        ahead = ahead_of(quick_plan, started(9.0), level(*rolls))
+        assert ahead.corrected(ahead.in_hand).rolls == left
+
+
+@given(rolls=st.lists(st.floats(9.2, 30.0), max_size=4))
+@hypothesis_settings(deadline=None, derandomize=True, max_examples=100)
+def test_rolls_that_are_near_each_other_are_all_made(quick_plan, rolls):
+    """Where they are, in order, but for those within a twentieth of a control step of each other."""
+    rolls = tuple(sorted(rolls))
+    assume((np.diff(rolls) > 0.051).all())
+    ahead = ahead_of(quick_plan, started(9.0), level(*rolls))
+    depth = ahead.controls(ahead.in_hand[None])[1]
+    assert (np.diff(depth) >= 0.0).all()
+    assert depth[0, -1] == ahead.depth[-1]
+    assert ahead.corrected(ahead.in_hand).rolls == pytest.approx(rolls, abs=0.5)
+    assert ahead.corrected(ahead.in_hand).rolls[1:] == rolls[1:]
 
 
 def test_a_guide_that_may_not_move_is_not_moved(quick_plan):

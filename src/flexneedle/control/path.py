@@ -137,20 +137,22 @@ class Ahead:
     def _grid(self, rolls: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Depths (N, m + 1) with a boundary at each roll (N, s), and whether the bevel rolls before each step (N, m).
 
-        So the cost is continuous in the depth of a roll. Two rolls at one boundary cancel.
+        So the cost is continuous in the depth of a roll. Each has a boundary of its own, the nearest or the next one
+        that is free, as long as there is one before the last step; two rolls at one place cancel.
         """
         n, m = len(rolls), self.depth.size - 1
-        depth = np.tile(self.depth, (n, 1))
+        depth, rolled = np.tile(self.depth, (n, 1)), np.zeros((n, m + 1), dtype=bool)
         middle = 0.5 * (self.depth[1:] + self.depth[:-1])
-        rows = np.arange(n)
-        times = np.zeros((n, m + 1), dtype=int)
-        for roll in rolls.T:
-            at = np.searchsorted(middle, roll)
-            made = roll < self.depth[-1]
-            inner = made & (at > 0) & (at < m)
+        rows, last = np.arange(n), np.full(n, -1)
+        for roll in _without_twins(np.sort(rolls, axis=1), _DUE * self.advance).T:
+            nearest = np.searchsorted(middle, roll)
+            made = (roll < self.depth[-1]) & (nearest < m)
+            at = np.minimum(np.maximum(nearest, last + 1), m - 1)
+            inner = made & (at > 0)
             depth[rows[inner], at[inner]] = roll[inner]
-            times[rows[made], at[made]] += 1
-        return depth, (times % 2 == 1)[:, :m]
+            rolled[rows[made], at[made]] ^= True
+            last = np.where(made, at, last)
+        return depth, rolled[:, :m]
 
     def _guide(self, corrections: Floats, depth: Floats) -> Floats:
         """Guide positions (N, m + 1) within the limits, of corrections (N, k) at the knots."""
@@ -192,6 +194,15 @@ class Ahead:
         )
         step = max(-self.step, min(self.step, guide))
         return (advance, db_y, db_theta, step, 1 if flip else -1), replace(path, rolls=later)
+
+
+def _without_twins(rolls: Floats, near: float) -> Floats:
+    """Ascending rolls (N, s), those infinite that another one within `near` (mm) undoes."""
+    left = rolls.copy()
+    for k in range(left.shape[1] - 1):
+        twins = np.isfinite(left[:, k]) & (left[:, k + 1] - left[:, k] <= near)
+        left[twins, k : k + 2] = np.inf
+    return left
 
 
 def proposals(ahead: Ahead, count: int, rng: np.random.Generator) -> Floats:
