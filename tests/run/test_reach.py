@@ -100,3 +100,12 @@ def test_the_reach_is_that_of_a_plant_of_ones_own_too():
 def test_a_plant_that_does_not_converge_has_no_reach(monkeypatch):
     monkeypatch.setattr("flexneedle.phantom.plants.ModelPlant.converged", property(lambda _: False))
     assert math.isnan(reach(FREE, 0, "model"))
+
+
+def test_a_guide_that_steering_leaves_where_it_is_does_not_widen_the_reach():
+    """A target that guide and bevel reach and the bevel alone does not."""
+    low, high = sorted(end(GUIDED, bevel)[1] for bevel in (-1, 1))
+    scenario = GUIDED.with_values({"target.lateral_mm": high + 1.0})
+    assert reach(scenario, 0, "model") < 0.1
+    assert reach(scenario, 0, "model", "steering") == pytest.approx(1.0, abs=1e-9)
+    assert low < high

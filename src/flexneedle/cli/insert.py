@@ -65,7 +65,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--force",
         action="store_true",
-        help="insert even if the plan misses the target by more than 1 mm, and go on where no path to it is found",
+        help="insert even if the plan misses the target by more than 1 mm (refused where the controller does not "
+        "predict the miss), and go on where no path to it is found",
     )
     parser.set_defaults(handler=_insert)
 

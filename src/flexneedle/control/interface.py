@@ -33,7 +33,7 @@ class Decision:
     miss, miss_sd: lateral miss predicted at the target, past it in +y or −y, and its standard deviation once the loop
     has gone on correcting (mm; NaN: not predicted). The loop warns and holds by them. rest: for how long (s) the needle
     rests, instead of the command, so that late readings come in.
-    Raises InputError for a command of another length.
+    Raises InputError for a command that is not five numbers, a negative miss_sd, a rest that is negative or not finite.
     """
 
     command: Command
@@ -45,10 +45,25 @@ class Decision:
     rest: float = 0.0
 
     def __post_init__(self) -> None:
-        if len(self.command) != len(COLUMNS):
+        object.__setattr__(self, "command", _plain_command(self.command))
+        if self.miss_sd < 0.0:
             raise InputError(
-                f"command = {self.command}: must have {len(COLUMNS)} numbers, {', '.join(COLUMNS)}"
+                f"miss_sd = {self.miss_sd}: must be at least 0, or NaN where nothing is predicted"
             )
+        if not (math.isfinite(self.rest) and self.rest >= 0.0):
+            raise InputError(f"rest = {self.rest}: must be finite and at least 0 (s)")
+
+
+def _plain_command(command: Any) -> Command:
+    """The command as plain numbers, of whatever kind they are."""
+    try:
+        x, y, turn, guide, flip = map(float, command)
+    except (TypeError, ValueError):
+        rule = f"must have {len(COLUMNS)} numbers, {', '.join(COLUMNS)}"
+        raise InputError(f"command = {command}: {rule}") from None
+    if flip not in (-1.0, 1.0):
+        raise InputError(f"command = {command}: flip must be -1 or 1")
+    return x, y, turn, guide, int(flip)
 
 
 def travel_left(scenario: Scenario, plan: PlanRecord, state: State) -> float:
@@ -74,7 +89,7 @@ def _nothing(_task: Task) -> None:
     """No memory."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Method:
     """A controller. Memory is a frozen value of its own kind: what it carries from one period to the next.
 
@@ -124,9 +139,17 @@ def _check_settings(name: str, settings: Any) -> None:
     if not (isinstance(settings, type) and issubclass(settings, Section)):
         raise InputError(f"controller {name}: settings must be a class made from flexneedle.Section")
     try:
-        settings()
+        default = settings()
     except ValidationError as error:
-        keys = ", ".join(".".join(map(str, detail["loc"])) for detail in error.errors())
         raise InputError(
-            f"controller {name}: settings must have a valid default for each key: {keys}"
+            f"controller {name}: settings must have a valid default for each key: {_keys(error)}"
         ) from None
+    try:
+        settings.model_validate(default.model_dump(mode="json", exclude_none=True))
+    except ValidationError as error:
+        rule = "must be what a TOML file holds, numbers, texts, true, false or lists of them"
+        raise InputError(f"controller {name}: settings {rule}: {_keys(error)}") from None
+
+
+def _keys(error: ValidationError) -> str:
+    return ", ".join(".".join(map(str, detail["loc"])) for detail in error.errors())

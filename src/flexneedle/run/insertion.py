@@ -50,7 +50,8 @@ def insert(
     `threads` is for rollouts (default: all cores) and changes no result. `on_period` gets each control period as
     it ends. Raises InputError for an unknown name or an object that is none, and for a controller that needs the guide
     where it may not move, ScenarioError for a setting that the controllers refuse, RunError if the plan misses its
-    target by more than 1 mm, unless `force`. Same seed, same record, but for wall-clock durations.
+    target by more than 1 mm, unless `force` or the controller predicts the miss itself, as the default does. Same seed,
+    same record, but for wall-clock durations.
     """
     phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
     plant_name, plant = plant_of(phantom)

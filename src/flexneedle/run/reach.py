@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from flexneedle.control.guide import guide_may_move
 from flexneedle.phantom import DEFAULT_PLANT, Phantom, PlantFactory, Truth, draw
 from flexneedle.run.parts import plant_of
 from flexneedle.run.planner import plan
@@ -20,20 +21,25 @@ _SEARCH = {
     "plan.guide_weight": 0.0,
     "plan.flip_weight": 0.0,
 }
-"""At most 4000 rollouts, 20 times what the default controller spends on its longest decision, for the miss alone."""
+"""At most 4000 rollouts, 14 times those of the longest decision of the default controller, for the miss alone."""
 
 
-def reach(scenario: Scenario, seed: int, phantom: str | PlantFactory = DEFAULT_PLANT) -> float:
+def reach(
+    scenario: Scenario,
+    seed: int,
+    phantom: str | PlantFactory = DEFAULT_PLANT,
+    strategy: str = "manipulation",
+) -> float:
     """Return the miss (mm) that the needle in the tank cannot avoid, or about, in the insertion of a seed.
 
-    With a guide (or a base that may move): of the best that a search with up to 4000 rollouts finds on the model with
-    the phantom's true parameters. Without: the distance from the target to the interval between the ends of the plant
-    inserted with its bevel always on one side and on the other; by continuity all between them can be hit. NaN if
-    the plant does not converge.
+    strategy: of the plans, "manipulation" or "steering". Where guide or base may move: of the best that a search with
+    up to 4000 rollouts finds on the model with the phantom's true parameters. Where neither may: the distance from the
+    target to the interval between the ends of the plant inserted with its bevel always on one side and on the other; by
+    continuity all between them can be hit. NaN if the plant does not converge.
     """
     truth = draw(scenario, np.random.default_rng(np.random.SeedSequence(seed).spawn(4)[0]))
     base_moves = scenario.plan.base_sigma_mm > 0.0 or scenario.plan.base_turn_sigma > 0.0
-    if scenario.setup.has_guide or base_moves:
+    if guide_may_move(scenario.setup, strategy) or base_moves:
         return plan(truth.scenario.with_values(_SEARCH), threads=1).error_mm
     depth, lateral = scenario.target.position
     ends = [straight_end(truth, bevel, plant_of(phantom)[1], depth) for bevel in (-1, 1)]

@@ -108,13 +108,13 @@ class Period:
 
 @dataclass(frozen=True, eq=False)
 class Insertion:
-    """A whole insertion. outcome: "done", "held" (aborted after bad samples), "failed" or "interrupted"."""
+    """A whole insertion. outcome: "done", "held" (bad readings, no path to the target), "failed" or "interrupted"."""
 
     plan: PlanRecord
     seed: int
     periods: tuple[Period, ...]
     outcome: str
-    reason: str  # one line; "" when done at the target depth
+    reason: str  # one line; "" when done within 1 mm of the target, or where that is not known
     controller: str = ""  # its name
     phantom: str = ""  # formulation of the virtual phantom, "" on a rig
 

@@ -25,6 +25,7 @@ from flexneedle.control.outlook import UNCORRECTED, Outlook
 from flexneedle.control.path import Ahead, Path, of_plan, proposals
 from flexneedle.control.prior import Priors
 from flexneedle.planning import Found, Outcome, Search, Term, Variables, best, terms
+from flexneedle.ports import Command
 from flexneedle.scenario.fields import NonNegative, count
 
 _ELITE = 8  # one in so many samples
@@ -32,6 +33,7 @@ _LEAST_ELITE = 3
 _SMOOTHING = 0.3
 _TOLERANCE = 1e-6
 _RESTS = (4.0, 2.0, 1.0)  # control steps before the target at which the needle rests
+_STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
@@ -98,6 +100,8 @@ def decide(
     in_hand = memory.path if fitted.state.bevel == memory.bevel else memory.rolled
     ahead = Ahead.of(task, fitted.state, in_hand)
     found = _search(task, fitted, ahead, memory, 1 if memory.outlook else settings.effort, rng)
+    if not math.isfinite(found.cost):
+        return Decision(_STILL, "no path converges on the fitted model", found.cost), memory
     outlook, miss, sd = _forecast(task, memory, fitted, found)
     if probability_beyond(task.scenario.control.miss_limit_mm, miss, sd) > _LOST:
         ahead = Ahead.of(task, fitted.state, ahead.corrected(found.z))

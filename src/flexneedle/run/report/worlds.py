@@ -145,7 +145,7 @@ def world_table(groups: Sequence[WorldGroup]) -> Html | None:
     )
     caption = (
         "Errors, shares and energy are over the finished insertions; energy is a geometric mean. A failure did not "
-        "finish though its target was within 1 mm of the reach."
+        "finish though its target was within 1 mm of the reach, or was held within control.miss_limit_mm of it."
     )
     rows = [_row(group) for group in groups]
     return element(

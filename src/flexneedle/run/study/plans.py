@@ -24,7 +24,7 @@ def plan_key(point: Point) -> str:
 
 def truth_key(point: Point) -> str:
     """Return a digest of all that the reach of a point's phantoms depends on, but for the seed."""
-    return _digest(point, ("plan", "phantom"), point.plant)
+    return _digest(point, ("plan", "phantom"), point.plant, point.strategy)
 
 
 def _digest(point: Point, sections: tuple[str, ...], *settings: object) -> str:

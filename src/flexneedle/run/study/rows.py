@@ -133,7 +133,7 @@ def _row(job: Job, seed: int) -> dict[str, Any]:
 def _reach(point: Point, seed: int) -> tuple[float | None, str]:
     """The reach (mm), or why there is none: the insertion's own outcome stands."""
     try:
-        return reach(point.scenario, seed, point.plant), ""
+        return reach(point.scenario, seed, point.plant, point.strategy), ""
     except Exception as error:  # noqa: BLE001  as in an insertion
         return None, f"no reach: {_told(error)}"
 
