@@ -141,7 +141,11 @@ def test_the_reach_is_found_once_for_all_controllers_of_a_world_and_case(load):
 def test_a_job_finds_the_reach_if_it_is_wanted(load, monkeypatch):
     point = load().points[0]
     monkeypatch.setattr(
-        rows, "reach", lambda scenario, seed, _plant: (point.scenario is scenario) * seed * 0.1
+        rows,
+        "reach",
+        lambda scenario, seed, _plant, strategy: (
+            (point.scenario is scenario and strategy == "manipulation") * seed * 0.1
+        ),
     )
     for bounded, expected in ((True, 0.5), (False, None)):
         (row,) = carry_out(Job(point, None, "no plan", ((0, 5),), bounded)).rows
