@@ -15,7 +15,7 @@ from synthetic import make_periods, make_plan
 
 
 def plan(scenario, target=None, strategy="manipulation", seed=0, progress=None, *, miss=0.0):
-    """Plan as `flexneedle.plan` does; `miss` moves the end of the plan aside."""
+    """Plan as `flexneedle.plan` does; `miss` displaces the end of the plan."""
     made = make_plan(strategy, target or scenario.target.position, seed)
     for iteration in range(1, 6):
         progress({"iteration": iteration, "iterations": 5, "best": 9.0, "cost_mean": 9.0})

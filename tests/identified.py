@@ -57,7 +57,7 @@ class Needle:
         simulator = self.simulator(scenario)
         start = Simulator(scenario, 1).start()
         base_x = float(start.base[0]) + self.base_x
-        state = start.believing(base_x=base_x, base_y=self.base_y, base_turn=self.base_turn)
+        state = start.with_estimate(base_x=base_x, base_y=self.base_y, base_turn=self.base_turn)
         states = [simulator.step(state, Control())]
         for row in rows:
             states.append(simulator.step(states[-1], Control.from_row(row)))
@@ -69,7 +69,7 @@ class Needle:
         return Simulator(scenario, threads=1).adapted(Learnt(*tissue, self.bevel, self.bend, self.clearance))
 
     def seen(self, state):
-        """Tip (x, y) as a tracker sees it."""
+        """Tip (x, y) as a tracker measures it."""
         return np.add(state.tip[:2], [0.0, self.run_out * state.bevel])
 
 
@@ -96,7 +96,7 @@ def readings(needle, before, after, start, count, noise, rng):
 
 
 def followed(needle, count, *, scenario=QUIET, noise=0.0, late=0, threads=1, per_move=2, rows=None):
-    """The belief after so many moves, the readings coming so many moves late; the needle's states."""
+    """The estimate after some moves, the readings coming a number of moves late; the needle's states."""
     rows, rng = rows or commands(count), np.random.default_rng(2)
     states = needle.inserted(scenario, rows)
     estimate = Identification().begin(begun_with(Simulator(scenario, threads), 1))
@@ -111,7 +111,7 @@ def followed(needle, count, *, scenario=QUIET, noise=0.0, late=0, threads=1, per
 
 
 def ahead(estimate, needle, states, scenario=QUIET, steps=8):
-    """Errors (mm) of the seen tip after some steps on, of the belief and of the prior's mean; no readings."""
+    """Errors (mm) of the measured tip after further steps, of the estimate and of the prior's mean; no readings."""
     plain = Needle(modulus=(1.0,) * len(needle.modulus), shift=(0.0,) * len(needle.shift))
     nominal, own = plain.simulator(scenario), needle.simulator(scenario)
     naive = nominal.start()
@@ -128,12 +128,12 @@ def ahead(estimate, needle, states, scenario=QUIET, steps=8):
 
 
 def off_the_prior(count=55, needle="all"):
-    """A belief after some moves with parameters that are neither the prior's nor fitted, and its readings."""
+    """An estimate after some moves with parameters that are neither the prior's nor fitted, and its readings."""
     estimate, _ = followed(NEEDLES[needle], count)
     sd = np.sqrt(1.0 / np.diag(estimate.prior.precision))
     off = np.random.default_rng(3).normal(0.0, 0.2, sd.size) * sd
-    belief = estimate._with(estimate.parameters + off)._differentiated(range(sd.size))
-    return belief, belief._readings
+    off_prior = estimate._with(estimate.parameters + off)._differentiated(range(sd.size))
+    return off_prior, off_prior._readings
 
 
 def learnt_of(parameters):
@@ -148,7 +148,7 @@ def stepped(parameters, rows, axial=0.0):
     simulator = nominal.adapted(learnt_of(parameters))
     start = nominal.start()
     base_x = float(start.base[0]) + axial
-    state = start.believing(base_x=base_x, base_y=parameters[BASE_Y], base_turn=parameters[BASE_TURN])
+    state = start.with_estimate(base_x=base_x, base_y=parameters[BASE_Y], base_turn=parameters[BASE_TURN])
     states = [simulator.step(state, Control())]
     for row in rows:
         states.append(simulator.step(states[-1], Control.from_row(row)))

@@ -36,9 +36,9 @@ def test_without_a_terminal_a_minute_never_passes_without_a_line(capsys, monkeyp
         for done in range(100):
             now += 25.0
             progress.show("Inserting", done, 1000, f"{done} of 1000")
-    told = capsys.readouterr().err.splitlines()[1:]
-    assert told[:3] == ["Inserting 0%: 2 of 1000", "Inserting 0%: 5 of 1000", "Inserting 1%: 8 of 1000"]
-    assert len(told) == 33
+    message = capsys.readouterr().err.splitlines()[1:]
+    assert message[:3] == ["Inserting 0%: 2 of 1000", "Inserting 0%: 5 of 1000", "Inserting 1%: 8 of 1000"]
+    assert len(message) == 33
 
 
 def test_in_a_terminal_there_is_a_bar_with_times(capsys, monkeypatch):

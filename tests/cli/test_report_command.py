@@ -81,9 +81,9 @@ def test_tuning_is_shown_from_a_folder(capsys, study, tmp_path, monkeypatch):
 def test_help_says_which_studies_can_be_reported(capsys):
     with pytest.raises(SystemExit):
         cli.main(["report", "--help"])
-    told = " ".join(capsys.readouterr().out.split())
-    assert "complete or interrupted (Ctrl-C)" in told
-    assert "after kill -9, give `flexneedle study` with --resume first" in told
+    message = " ".join(capsys.readouterr().out.split())
+    assert "complete or interrupted (Ctrl-C)" in message
+    assert "after kill -9, give `flexneedle study` with --resume first" in message
 
 
 def test_no_study_is_bad_input(capsys, tmp_path):

@@ -133,9 +133,9 @@ def test_by_default_the_default_controller_steers_in_the_exact_phantom(engine, c
     assert (result["controller"], result["phantom"]) == (DEFAULT, DEFAULT_PLANT) == (DEFAULT, "exact")
     with pytest.raises(SystemExit):
         cli.main(["insert", "--help"])
-    told = " ".join(capsys.readouterr().out.split())
-    assert f"(default: {DEFAULT})" in told
-    assert all(f"{kind}," in told for kind in PLANTS)
+    message = " ".join(capsys.readouterr().out.split())
+    assert f"(default: {DEFAULT})" in message
+    assert all(f"{kind}," in message for kind in PLANTS)
 
 
 def test_every_controller_is_listed_with_its_summary(capsys, in_tmp):
@@ -435,16 +435,16 @@ def test_a_tracker_without_frames_exports_the_tip_alone(engine, capsys):
 def test_export_into_a_folder_that_there_is_not_is_a_line(engine, capsys, what):
     engine()
     run(capsys, "insert", "--out", "here")
-    told = (2, "", "flexneedle: nodir/foo.csv: cannot be written: No such file or directory\n")
-    assert run(capsys, "export", "here", what, "nodir/foo.csv") == told
+    message = (2, "", "flexneedle: nodir/foo.csv: cannot be written: No such file or directory\n")
+    assert run(capsys, "export", "here", what, "nodir/foo.csv") == message
 
 
 def test_the_help_of_export_names_the_columns_of_readings(capsys):
     with pytest.raises(SystemExit):
         cli.main(["export", "--help"])
-    told = capsys.readouterr().out
+    message = capsys.readouterr().out
     columns = ("time_s", "period", "frame_number", "verdict", "x_mm", "NAME.qw", "NAME.indicator")
-    assert [name for name in columns if name not in told] == []
+    assert [name for name in columns if name not in message] == []
 
 
 def test_a_plan_cannot_be_exported(engine, capsys):

@@ -152,9 +152,9 @@ def test_the_rate_is_that_of_insertions_alone_and_counts_no_earlier_ones(monkeyp
     for plans, done, later in ((0, 40, 50.0), (1, 40, 8.0), (2, 41, 10.0), (2, 46, 0.0)):
         show.advance(Advance(plans, 2, done, 100, 3))
         now += later
-    told = [note for stage, note in notes if stage == "Inserting"]
-    assert told[:3] == [f"{done} of 100, 3 not done" for done in (40, 40, 41)]
-    assert told[3] == "46 of 100, 0.5 a second, 1 min 48 s left, 3 not done"
+    message = [note for stage, note in notes if stage == "Inserting"]
+    assert message[:3] == [f"{done} of 100, 3 not done" for done in (40, 40, 41)]
+    assert message[3] == "46 of 100, 0.5 a second, 1 min 48 s left, 3 not done"
 
 
 def test_unconverged_periods_are_told(capsys, monkeypatch):

@@ -47,22 +47,22 @@ def along():
         for row in plan.controls[:steps]:
             state = simulator.step(state, Control.from_row(row.tolist()))
         if corrections:
-            state = simulator.step(state.believing(**corrections), Control())
+            state = simulator.step(state.with_estimate(**corrections), Control())
         return state
 
     return go
 
 
 @pytest.fixture(scope="session")
-def believed():
-    """An estimate of a state, with whatever else is to be believed."""
+def estimated():
+    """An estimate of a state, with any of its other fields."""
 
-    def believe(state, **fields):
+    def estimate(state, **fields):
         return replace(
             Beliefs().begin(begun_with(Simulator(state.scenario, threads=1), 1)), state=state, **fields
         )
 
-    return believe
+    return estimate
 
 
 @pytest.fixture

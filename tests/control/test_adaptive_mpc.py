@@ -1,4 +1,4 @@
-"""The default controller: what it finds on the model that it believes, and that its limits and its memory hold."""
+"""The default controller: what it finds on the model that it estimates, and that its limits and its memory hold."""
 
 from dataclasses import replace
 
@@ -43,18 +43,18 @@ ROLLING = BARE.with_values(
 ADAPTIVE = METHODS["adaptive-mpc"]
 
 
-def belief_of(state, scenario=PHANTOM, **fields):
-    """A belief that the needle is so."""
+def estimate_of(state, scenario=PHANTOM, **fields):
+    """An estimate that the needle is so."""
     begun = Identification().begin(begun_with(Simulator(scenario, threads=1), state.bevel))
     return replace(begun, state=replace(state, scenario=scenario), tips=state.tip[None], **fields)
 
 
-def decided(plan, belief, seed=0, path=None):
+def decided(plan, estimate, seed=0, path=None):
     """Decision and memory after it, with a path in hand that is the plan's unless another is given."""
-    task = task_of(belief.nominal, plan)
-    begun, path = ADAPTIVE.begin(task), path or after(of_plan(plan), belief.state.tip[0])
-    memory = replace(begun, path=path, bevel=belief.state.bevel)
-    return ADAPTIVE.decide(task, memory, belief, np.random.default_rng(seed))
+    task = task_of(estimate.nominal, plan)
+    begun, path = ADAPTIVE.begin(task), path or after(of_plan(plan), estimate.state.tip[0])
+    memory = replace(begun, path=path, bevel=estimate.state.bevel)
+    return ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(seed))
 
 
 def after(path, x):
@@ -62,12 +62,12 @@ def after(path, x):
     return replace(path, rolls=tuple(roll for roll in path.rolls if roll > x))
 
 
-def decide(plan, belief, seed=0):
-    return decided(plan, belief, seed)[0]
+def decide(plan, estimate, seed=0):
+    return decided(plan, estimate, seed)[0]
 
 
 def aimed(plan, state, offset, ahead=20.0):
-    """The plan with a target so far ahead of a tip, and so far off its line (mm)."""
+    """The plan with a target so far ahead of a tip, and off its line (mm)."""
     x, y, turn = state.tip
     return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(turn) + offset)))
 
@@ -100,7 +100,7 @@ def test_it_is_the_default():
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("turned", [False, True])
 def test_without_a_guide_it_rolls_the_bevel_to_a_target_on_either_side(quick_plan, side, turned):
-    """To where the bevel alone goes, rolled now or not; a roll is in the path where there is no other way."""
+    """To where the bevel alone goes, rolled now or not; a roll is in the path where there is no other path."""
     simulator = Simulator(ROLLING, threads=1)
     state = simulator.start()
     for k in range(35):
@@ -112,7 +112,7 @@ def test_without_a_guide_it_rolls_the_bevel_to_a_target_on_either_side(quick_pla
     ]
     goal, other = sorted(ends, key=lambda tip: -side * tip[1])
     plan = replace(quick_plan, target=(float(goal[0]), float(goal[1])))
-    decision, memory = decided(plan, belief_of(state, ROLLING), path=replace(of_plan(plan), rolls=()))
+    decision, memory = decided(plan, estimate_of(state, ROLLING), path=replace(of_plan(plan), rolls=()))
     rolled = (decision.command[4] > 0.0) + len(memory.path.rolls)
     assert abs(goal[1] - other[1]) > 1.0
     assert abs(decision.miss) < 0.25 * abs(goal[1] - other[1])
@@ -122,11 +122,11 @@ def test_without_a_guide_it_rolls_the_bevel_to_a_target_on_either_side(quick_pla
 @pytest.mark.parametrize("offset", [-1.0, 1.0])
 def test_off_the_plan_it_finds_a_path_that_ends_nearer_the_target(quick_plan, along, offset):
     """With a base clamp that is off, where the plan's guide would miss."""
-    belief = belief_of(along(quick_plan, 20, base_y=offset), ACCURATE)
-    ahead = adaptive_mpc.Ahead.of(task_of(belief.nominal, quick_plan), belief.state, of_plan(quick_plan))
-    kept = adaptive_mpc._seen(belief, ahead.controls(ahead.in_hand[None])[0]).tips[0, -1, 1] - 5.0
+    estimate = estimate_of(along(quick_plan, 20, base_y=offset), ACCURATE)
+    ahead = adaptive_mpc.Ahead.of(task_of(estimate.nominal, quick_plan), estimate.state, of_plan(quick_plan))
+    kept = adaptive_mpc._seen(estimate, ahead.controls(ahead.in_hand[None])[0]).tips[0, -1, 1] - 5.0
     assert abs(kept) > 0.3
-    assert abs(decide(quick_plan, belief).miss) < 0.3 * abs(kept)
+    assert abs(decide(quick_plan, estimate).miss) < 0.3 * abs(kept)
 
 
 def weights(scenario, plan, x, memory=None):
@@ -135,16 +135,16 @@ def weights(scenario, plan, x, memory=None):
     state = simulator.start()
     while state.tip[0] < x:
         state = simulator.step(state, Control(db_x=1.0))
-    belief, task = belief_of(state, scenario), task_of(simulator, plan)
+    estimate, task = estimate_of(state, scenario), task_of(simulator, plan)
     memory = memory or ADAPTIVE.begin(task)
     ahead = adaptive_mpc.Ahead.of(task, state, memory.path)
-    listed = adaptive_mpc._terms(task, belief, memory, ahead)
-    return {term.name: term.weight for term in listed}, task, belief, ahead
+    listed = adaptive_mpc._terms(task, estimate, memory, ahead)
+    return {term.name: term.weight for term in listed}, task, estimate, ahead
 
 
 def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
     """Energy against that of this tissue displaced, line and slope by the path left, late rolls by what they do."""
-    found, task, belief, ahead = weights(PHANTOM, quick_plan, 10.0)
+    found, task, estimate, ahead = weights(PHANTOM, quick_plan, 10.0)
     settings, scale = task.settings, task.simulator.energy_scale(40.0)
     assert found == {
         "miss": 1.0,
@@ -152,11 +152,11 @@ def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
         "line": settings.line_weight * ahead.left / 40.0,
         "slope": settings.slope_weight_mm * ahead.left / 40.0,
         "rolls": settings.roll_weight_mm,
-        "late": settings.late_roll_weight * belief.roll_sd,
+        "late": settings.late_roll_weight * estimate.roll_sd,
         "reach": settings.reach_weight,
     }
     assert 0.7 < ahead.left / 40.0 < 0.8
-    assert belief.roll_sd > 0.0
+    assert estimate.roll_sd > 0.0
     bare, task, _, _ = weights(BARE, quick_plan, 10.0)
     assert bare["energy"] == task.settings.unguided_energy_weight_mm / scale
     assert bare["line"] == task.settings.unguided_line_weight
@@ -165,12 +165,12 @@ def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
 
 def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
     """The standard deviation that the last decision predicted, had it predicted no miss, by the path that is left."""
-    belief = belief_of(along(quick_plan, 40), QUICK)
-    task = task_of(belief.nominal, quick_plan)
+    estimate = estimate_of(along(quick_plan, 40), QUICK)
+    task = task_of(estimate.nominal, quick_plan)
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
-    ahead = adaptive_mpc.Ahead.of(task, belief.state, memory.path)
-    outcome = adaptive_mpc._seen(belief, ahead.controls(ahead.in_hand[None])[0])
-    (term,) = (term for term in adaptive_mpc._terms(task, belief, memory, ahead) if term.name == "miss")
+    ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
+    outcome = adaptive_mpc._seen(estimate, ahead.controls(ahead.in_hand[None])[0])
+    (term,) = (term for term in adaptive_mpc._terms(task, estimate, memory, ahead) if term.name == "miss")
     past = float(terms.past(outcome, quick_plan.target)[0])
     assert abs(past) > 1e-3
     blur = 0.3 * ahead.left / 40.0
@@ -193,12 +193,12 @@ def test_reach_is_not_given_away_by_a_step_with_the_bevel_on_the_wrong_side(quic
     """To a target near the end of what the bevel can reach."""
     simulator = Simulator(BARE, threads=1)
     state = simulator.replay(simulator.start(bevel), [[31.0, 0.0, 0.0, 0.0, -1.0]])[0]
-    belief = belief_of(state, BARE)
+    estimate = estimate_of(state, BARE)
     least, greatest = bevel_reach(BARE, 40.0, threads=1)
     plan = replace(quick_plan, target=(40.0, 0.9 * (greatest if side > 0 else least)), bevel=bevel)
     task = task_of(simulator, plan)
     ahead = adaptive_mpc.Ahead.of(task, state, replace(of_plan(plan), rolls=()))
-    kept, rolled = adaptive_mpc._Shortfall.of(task, belief, ahead, ADAPTIVE.begin(task)).expected
+    kept, rolled = adaptive_mpc._Shortfall.of(task, estimate, ahead, ADAPTIVE.begin(task)).expected
     assert min(kept, rolled) >= 0.0
     assert (kept < rolled) == (side == bevel)
 
@@ -215,28 +215,28 @@ def test_it_rests_four_two_and_one_steps_before_the_target(quick_plan):
 
 def test_what_is_in_hand_is_never_given_up_for_something_worse(quick_plan, along):
     """The cost that is found is at most that of the path in hand, of any roll and guide."""
-    belief = belief_of(along(quick_plan, 40), QUICK)
-    task = task_of(belief.nominal, quick_plan)
+    estimate = estimate_of(along(quick_plan, 40), QUICK)
+    task = task_of(estimate.nominal, quick_plan)
     for rolls in ((), (20.0,), (15.0, 18.0)):
         path = replace(of_plan(quick_plan), rolls=rolls)
-        ahead = adaptive_mpc.Ahead.of(task, belief.state, path)
+        ahead = adaptive_mpc.Ahead.of(task, estimate.state, path)
         kept = ahead.controls(ahead.in_hand[None])[0]
-        listed = adaptive_mpc._terms(task, belief, ADAPTIVE.begin(task), ahead)
-        in_hand = float(cost(listed, adaptive_mpc._seen(belief, kept))[0])
-        assert decided(quick_plan, belief, path=path)[0].cost <= in_hand + 1e-9
+        listed = adaptive_mpc._terms(task, estimate, ADAPTIVE.begin(task), ahead)
+        in_hand = float(cost(listed, adaptive_mpc._seen(estimate, kept))[0])
+        assert decided(quick_plan, estimate, path=path)[0].cost <= in_hand + 1e-9
 
 
 @pytest.mark.parametrize("carried_out", [False, True])
 def test_a_roll_stays_in_hand_until_the_needle_has_rolled(quick_plan, along, carried_out):
     """A period that is held leaves the bevel where it is: the roll that was due in it is still planned."""
-    belief = belief_of(along(quick_plan, 40), QUICK)
-    task, x = task_of(belief.nominal, quick_plan), float(belief.state.tip[0])
+    estimate = estimate_of(along(quick_plan, 40), QUICK)
+    task, x = task_of(estimate.nominal, quick_plan), float(estimate.state.tip[0])
     path = replace(of_plan(quick_plan), rolls=(x,))
     memory = replace(
-        ADAPTIVE.begin(task), path=path, rolled=replace(path, rolls=()), bevel=belief.state.bevel
+        ADAPTIVE.begin(task), path=path, rolled=replace(path, rolls=()), bevel=estimate.state.bevel
     )
     if carried_out:
-        belief = replace(belief, state=belief.simulator.step(belief.state, Control(flip=True)))
+        estimate = replace(estimate, state=estimate.simulator.step(estimate.state, Control(flip=True)))
     seen = []
     search = adaptive_mpc._search
 
@@ -246,19 +246,19 @@ def test_a_roll_stays_in_hand_until_the_needle_has_rolled(quick_plan, along, car
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(adaptive_mpc, "_search", spied)
-        ADAPTIVE.decide(task, memory, belief, np.random.default_rng(0))
+        ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))
     assert seen[0] == (() if carried_out else (x,))
 
 
 def test_the_miss_is_that_of_the_path_that_is_found(quick_plan, along):
-    """Carried out on the model that is believed: to rollouts with long steps."""
-    belief = belief_of(along(quick_plan, 45))
-    decision, memory = decided(quick_plan, belief)
-    task, state, path = task_of(belief.nominal, quick_plan), belief.state, memory.path
-    state = belief.simulator.step(state, Control.from_row(decision.command))
+    """Carried out on the model that is estimated: to rollouts with long steps."""
+    estimate = estimate_of(along(quick_plan, 45))
+    decision, memory = decided(quick_plan, estimate)
+    task, state, path = task_of(estimate.nominal, quick_plan), estimate.state, memory.path
+    state = estimate.simulator.step(state, Control.from_row(decision.command))
     while travel_left(PHANTOM, quick_plan, state) > 1e-9:
         command, path = adaptive_mpc.Ahead.of(task, state, path).first(path)
-        state = belief.simulator.step(state, Control.from_row(command))
+        state = estimate.simulator.step(state, Control.from_row(command))
     assert state.tip[1] - 5.0 == pytest.approx(decision.miss, abs=0.02)
     assert decision.miss_sd > 0.0
     assert f"{decision.miss:+.3f} ± {decision.miss_sd:.3f} mm" in decision.why
@@ -267,33 +267,33 @@ def test_the_miss_is_that_of_the_path_that_is_found(quick_plan, along):
 def test_what_the_axis_is_off_is_off_the_target_too(quick_plan, along):
     """A tip measured 0.2 mm off the model's, and the target with it: the same command."""
     state = along(quick_plan, 45)
-    here = decide(quick_plan, belief_of(state))
+    here = decide(quick_plan, estimate_of(state))
     beside = replace(quick_plan, target=(quick_plan.target[0], quick_plan.target[1] + 0.2))
-    left = belief_of(state, residual=0.2)
+    left = estimate_of(state, residual=0.2)
     assert decide(beside, left).command == pytest.approx(here.command, abs=1e-6)
     assert decide(quick_plan, left).command[3] != pytest.approx(here.command[3], abs=1e-3)
 
 
 def test_a_roll_takes_the_run_out_to_the_other_side(quick_plan, along):
     """The tips of a rollout are those that the tracker will measure."""
-    belief = belief_of(along(quick_plan, 45))
-    parameters = belief.parameters.copy()
+    estimate = estimate_of(along(quick_plan, 45))
+    parameters = estimate.parameters.copy()
     parameters[RUN_OUT] = 0.5
     controls = np.zeros((1, 4, 5))
     controls[..., 0], controls[..., 4] = 1.0, (-1.0, 1.0, -1.0, -1.0)
-    plain = adaptive_mpc._seen(belief, controls).tips
-    seen = adaptive_mpc._seen(replace(belief, parameters=parameters), controls).tips
-    side = belief.state.bevel * np.array([1.0, -1.0, -1.0, -1.0])
+    plain = adaptive_mpc._seen(estimate, controls).tips
+    seen = adaptive_mpc._seen(replace(estimate, parameters=parameters), controls).tips
+    side = estimate.state.bevel * np.array([1.0, -1.0, -1.0, -1.0])
     np.testing.assert_allclose(seen[0, :, 1] - plain[0, :, 1], 0.5 * side, atol=1e-12)
     np.testing.assert_array_equal(seen[0, :, [0, 2]], plain[0, :, [0, 2]])
 
 
 def test_the_fitted_model_is_the_one_that_predicts(quick_plan, along):
     """Tissue thrice as stiff asks for another guide step, from the same state."""
-    belief = belief_of(along(quick_plan, 55, base_y=0.3))
-    stiff = replace(belief, simulator=belief.nominal.adapted(Learnt(np.zeros(1), np.full(2, 3.0))))
-    assert decide(quick_plan, stiff).cost != decide(quick_plan, belief).cost
-    assert decide(quick_plan, stiff).command[3] != decide(quick_plan, belief).command[3]
+    estimate = estimate_of(along(quick_plan, 55, base_y=0.3))
+    stiff = replace(estimate, simulator=estimate.nominal.adapted(Learnt(np.zeros(1), np.full(2, 3.0))))
+    assert decide(quick_plan, stiff).cost != decide(quick_plan, estimate).cost
+    assert decide(quick_plan, stiff).command[3] != decide(quick_plan, estimate).command[3]
 
 
 def test_cost_is_a_length_that_no_scale_of_tissue_changes(quick_plan, along):
@@ -304,7 +304,7 @@ def test_cost_is_a_length_that_no_scale_of_tissue_changes(quick_plan, along):
         stiffer | {"needle.youngs_modulus_gpa": factor * PHANTOM.needle.youngs_modulus_gpa}
     )
     here, there = (
-        decide(quick_plan, belief_of(along(quick_plan, 40, scenario), scenario))
+        decide(quick_plan, estimate_of(along(quick_plan, 40, scenario), scenario))
         for scenario in (PHANTOM, scaled)
     )
     assert there.cost == pytest.approx(here.cost, rel=1e-6)
@@ -321,13 +321,13 @@ def test_a_longer_search_is_made_where_no_path_is_found(quick_plan, along, monke
         return search(*args)
 
     monkeypatch.setattr(adaptive_mpc, "_search", spied)
-    belief = belief_of(along(quick_plan, 55))
-    _, memory = decided(quick_plan, belief)
-    task = task_of(belief.nominal, quick_plan)
-    ADAPTIVE.decide(task, memory, belief, np.random.default_rng(0))
+    estimate = estimate_of(along(quick_plan, 55))
+    _, memory = decided(quick_plan, estimate)
+    task = task_of(estimate.nominal, quick_plan)
+    ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))
     assert efforts == [task.settings.effort, 1]
     far = replace(quick_plan, target=(40.0, 14.0))
-    decision, _ = ADAPTIVE.decide(task_of(belief.nominal, far), memory, belief, np.random.default_rng(0))
+    decision, _ = ADAPTIVE.decide(task_of(estimate.nominal, far), memory, estimate, np.random.default_rng(0))
     assert efforts[2:] == [1, task.settings.effort]
     assert decision.miss < -2.0
 
@@ -373,15 +373,15 @@ def test_the_stroke_is_what_was_commanded_wherever_the_base_began(quick_plan, al
     advanced = float(quick_plan.controls[:50, 0].sum())
     short = PHANTOM.with_values({"setup.stroke_mm": advanced + 0.4, "target.depth_mm": 10.0})
     state = along(quick_plan, 50, short)
-    state = state.believing(base_x=float(state.base[0]) + axial)
+    state = state.with_estimate(base_x=float(state.base[0]) + axial)
     assert travel_left(short, quick_plan, state) == pytest.approx(0.4)
-    assert decide(quick_plan, belief_of(state, short)).command[0] == pytest.approx(0.4)
+    assert decide(quick_plan, estimate_of(state, short)).command[0] == pytest.approx(0.4)
 
 
 def test_a_target_above_the_first_contact_point_is_decided_on_too(quick_plan):
     """There is no tissue to spare."""
     shallow = replace(quick_plan, target=(0.05, 0.1))
-    decision = decide(shallow, belief_of(Simulator(PHANTOM, 1).start()))
+    decision = decide(shallow, estimate_of(Simulator(PHANTOM, 1).start()))
     assert np.isfinite([*decision.command, decision.cost, decision.miss, decision.miss_sd]).all()
 
 
@@ -390,7 +390,7 @@ def test_a_target_above_the_first_contact_point_is_decided_on_too(quick_plan):
 
 def test_a_whole_insertion_into_another_tissue_ends_at_the_target(quick_plan):
     """Stiffer tissue, a weaker bevel and a bent needle, where the plan alone misses by far more, in the mean of a few
-    searches: a stiff deep layer shows late, and the way that is left then depends on the path before.
+    searches: a stiff deep layer shows late, and the path that is left then depends on the path before.
     """
     plant = Simulator(PHANTOM, threads=1).adapted(
         Learnt(np.zeros(1), np.array([2.0, 1.5]), bevel=0.5, bend=0.4)
@@ -436,23 +436,23 @@ def test_the_predicted_miss_gets_no_less_sure_on_the_way(quick_plan):
 
 
 def test_the_same_random_numbers_lead_to_the_same_decision(quick_plan, along):
-    belief = belief_of(along(quick_plan, 45, base_y=0.5))
-    one, again, other = (decide(quick_plan, belief, seed) for seed in (5, 5, 6))
+    estimate = estimate_of(along(quick_plan, 45, base_y=0.5))
+    one, again, other = (decide(quick_plan, estimate, seed) for seed in (5, 5, 6))
     assert one == again
     assert other.command[3] != one.command[3]
-    many = replace(belief, simulator=Simulator(PHANTOM, threads=3))
+    many = replace(estimate, simulator=Simulator(PHANTOM, threads=3))
     assert decide(quick_plan, many, 5) == one
 
 
 def test_deciding_changes_nothing_of_belief_plan_and_memory(quick_plan, along):
-    belief = belief_of(along(quick_plan, 45), residual=0.1)
-    _, memory = decided(quick_plan, belief)
+    estimate = estimate_of(along(quick_plan, 45), residual=0.1)
+    _, memory = decided(quick_plan, estimate)
     arrays = (
-        belief.parameters, belief.tips, belief.state.scalars, belief.curves, quick_plan.tips, quick_plan.guide,
+        estimate.parameters, estimate.tips, estimate.state.scalars, estimate.curves, quick_plan.tips, quick_plan.guide,
         memory.path.depth, memory.path.guide, memory.outlook.curves,
     )  # fmt: skip
     before = [array.copy() for array in arrays]
-    ADAPTIVE.decide(task_of(belief.nominal, quick_plan), memory, belief, np.random.default_rng(0))
+    ADAPTIVE.decide(task_of(estimate.nominal, quick_plan), memory, estimate, np.random.default_rng(0))
     for kept, there in zip(before, arrays, strict=True):
         np.testing.assert_array_equal(kept, there)
 
@@ -467,8 +467,8 @@ def test_a_soft_needle_is_steered_where_its_tip_bends_off_below_the_skin(number)
 
 def test_where_no_path_converges_it_stands_still_and_says_so(quick_plan, along, monkeypatch):
     """What was in hand stays in hand, and nothing is predicted."""
-    belief = belief_of(along(quick_plan, 20), QUICK)
-    task = task_of(belief.nominal, quick_plan)
+    estimate = estimate_of(along(quick_plan, 20), QUICK)
+    task = task_of(estimate.nominal, quick_plan)
     memory, seen = ADAPTIVE.begin(task), adaptive_mpc._seen
 
     def lost(fitted, controls):
@@ -476,7 +476,7 @@ def test_where_no_path_converges_it_stands_still_and_says_so(quick_plan, along, 
         return replace(outcome, converged=np.zeros_like(outcome.converged))
 
     monkeypatch.setattr(adaptive_mpc, "_seen", lost)
-    decision, after = ADAPTIVE.decide(task, memory, belief, np.random.default_rng(0))
+    decision, after = ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))
     assert decision.command == (0.0, 0.0, 0.0, 0.0, -1)
     assert decision.why == "no path converges on the fitted model"
     assert np.isnan(decision.miss)

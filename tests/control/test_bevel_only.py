@@ -29,32 +29,32 @@ def aimed(plan, state, aside, ahead=20.0):
     return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(turn) + aside)))
 
 
-def test_it_advances_at_full_step_and_moves_nothing_aside(quick_plan, believed, along):
+def test_it_advances_at_full_step_and_moves_nothing_aside(quick_plan, estimated, along):
     for steps in (0, 20, 50):
-        assert command(quick_plan, believed(along(quick_plan, steps)))[:4] == (1.0, 0.0, 0.0, 0.0)
+        assert command(quick_plan, estimated(along(quick_plan, steps)))[:4] == (1.0, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("left", [0.7, 0.02])
-def test_the_last_advance_ends_at_the_target_depth(quick_plan, believed, along, left):
+def test_the_last_advance_ends_at_the_target_depth(quick_plan, estimated, along, left):
     state = along(quick_plan, 50)
-    assert command(aimed(quick_plan, state, 0.0, ahead=left), believed(state))[0] == pytest.approx(left)
+    assert command(aimed(quick_plan, state, 0.0, ahead=left), estimated(state))[0] == pytest.approx(left)
 
 
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_the_bevel_turns_to_the_target_in_tissue_and_stays_in_air(quick_plan, believed, along, side, turned):
+def test_the_bevel_turns_to_the_target_in_tissue_and_stays_in_air(quick_plan, estimated, along, side, turned):
     for steps, in_air in ((50, False), (5, True)):
         state = Simulator(PHANTOM).step(along(quick_plan, steps), Control(flip=turned))
         right_way = state.bevel == side
-        given = command(aimed(quick_plan, state, 2.0 * side), believed(state))
+        given = command(aimed(quick_plan, state, 2.0 * side), estimated(state))
         assert given[4] == (-1 if right_way or in_air else 1)
 
 
-def test_curvature_and_dead_band_are_its_own(quick_plan, believed, along):
+def test_curvature_and_dead_band_are_its_own(quick_plan, estimated, along):
     """Off the line by a share of half the paths' separation: the dead band decides, of that curvature."""
     state = along(quick_plan, 50)
     half = 0.5 * 10e-3 * 20.0**2
-    estimate = believed(state)
+    estimate = estimated(state)
     for share, flips in ((1.3, False), (1.8, True)):
         away = aimed(quick_plan, state, -(share - 1.0) * half * state.bevel)
         assert (command(away, estimate, curvature_per_m=10.0, flip_dead_band=0.5)[4] == 1) is flips
@@ -63,8 +63,8 @@ def test_curvature_and_dead_band_are_its_own(quick_plan, believed, along):
     assert command(away, estimate, curvature_per_m=0.0)[4] == -1  # both paths are the same line
 
 
-def test_the_rule_hears_of_three_standard_deviations_of_a_reading(quick_plan, believed, along, monkeypatch):
+def test_the_rule_hears_of_three_standard_deviations_of_a_reading(quick_plan, estimated, along, monkeypatch):
     heard, rule = [], bang_bang.wants_flip
     monkeypatch.setattr(bang_bang, "wants_flip", lambda *args: heard.append(args[2:]) or rule(*args))
-    command(quick_plan, believed(along(quick_plan, 50)), curvature_per_m=2.0, flip_dead_band=0.25)
+    command(quick_plan, estimated(along(quick_plan, 50)), curvature_per_m=2.0, flip_dead_band=0.25)
     assert heard == [(pytest.approx(2e-3), quick_plan.target, 0.25, pytest.approx(3 * 0.07 / 3**0.5))]

@@ -183,7 +183,7 @@ def test_a_linear_needle_is_learnt_and_kept_on_its_path(quick_plan, slope, effec
 
 @pytest.mark.parametrize("delay", [1, 2])
 @pytest.mark.parametrize("effect", [0.6, 1.5])
-def test_with_another_effect_of_the_guide_than_first_believed_it_swings_and_settles(
+def test_with_another_effect_of_the_guide_than_first_estimated_it_swings_and_settles(
     quick_plan, effect, delay
 ):
     """Small guide steps tell little of the guide's effect, so the first Jacobian is forgotten slowly."""
@@ -225,13 +225,13 @@ def test_inputs_are_those_of_when_the_tip_was_there():
     assert len(learnt.history) == 8
 
 
-def test_memory_is_a_value_that_deciding_leaves_alone(quick_plan, along, believed):
+def test_memory_is_a_value_that_deciding_leaves_alone(quick_plan, along, estimated):
     task = task_of(Simulator(PHANTOM, threads=1), quick_plan, "broyden-mpc")
     state = along(quick_plan, 30)
     seen = (state.tip[:2] - [2.0, 0.1], np.array([state.travel[0] - 2.0, state.guide]))
     learnt = bm.Learnt(np.array([[1.0, 0.0], [0.1, 0.9]]), (), seen)
     before = learnt.jacobian.copy(), learnt.seen[0].copy(), learnt.seen[1].copy()
-    estimate = believed(state, measured=tuple(state.tip[:2].tolist()))
+    estimate = estimated(state, measured=tuple(state.tip[:2].tolist()))
     one, after = BROYDEN.decide(task, learnt, estimate, RNG)
     again, _ = BROYDEN.decide(task, learnt, estimate, RNG)
     assert one == again

@@ -54,10 +54,10 @@ def test_it_predicts_a_needle_with_other_constants(needle):
     varied = len(needle.variation) > 1
     assert estimate.tip[0] == pytest.approx(x, abs=0.03)
     assert estimate.tip[1] == pytest.approx(y, abs=0.03 if varied else 1e-3)
-    learnt, naive = ahead(estimate, needle, states)
+    fitted, naive = ahead(estimate, needle, states)
     assert naive > 0.1
-    assert learnt < (0.12 if varied else 0.05)
-    assert learnt < (0.4 if varied else 0.1) * naive
+    assert fitted < (0.12 if varied else 0.05)
+    assert fitted < (0.4 if varied else 0.1) * naive
 
 
 @pytest.mark.usefixtures("all_fresh")
@@ -82,9 +82,9 @@ def test_at_rest_the_tip_is_found_too_with_derivatives_that_are_renewed_alternat
 def test_it_predicts_with_the_noise_of_a_tracker_too(name):
     noise = PHANTOM.tracker.jitter_per_axis
     estimate, states = followed(NEEDLES[name], 70, scenario=PHANTOM, noise=noise, per_move=8)
-    learnt, naive = ahead(estimate, NEEDLES[name], states, PHANTOM)
-    assert learnt < 0.15
-    assert learnt < 0.4 * naive
+    fitted, naive = ahead(estimate, NEEDLES[name], states, PHANTOM)
+    assert fitted < 0.15
+    assert fitted < 0.4 * naive
 
 
 def test_a_displaced_boundary_is_found():
@@ -92,8 +92,8 @@ def test_a_displaced_boundary_is_found():
     needle, noise = Needle(modulus=(1.0, 2.0), shift=(-3.0,)), PHANTOM.tracker.jitter_per_axis
     estimate, states = followed(needle, 70, scenario=PHANTOM, noise=noise, per_move=8)
     assert estimate.parameters[SHIFT] == pytest.approx(-3.0, abs=1.0)
-    learnt, naive = ahead(estimate, needle, states, PHANTOM)
-    assert learnt < 0.1 * naive
+    fitted, naive = ahead(estimate, needle, states, PHANTOM)
+    assert fitted < 0.1 * naive
 
 
 def test_the_modulus_along_the_depth_is_found():
@@ -105,7 +105,7 @@ def test_the_modulus_along_the_depth_is_found():
     assert np.ptp(np.log(WAVES[:13])) > 0.9
 
 
-def test_what_lies_ahead_of_the_tip_is_believed_as_far_as_it_is_correlated():
+def test_what_is_ahead_of_the_tip_is_estimated_as_far_as_it_is_correlated():
     """Towards the prior's mean by exp(−cell/length) a cell."""
     for needle, length in (("modulus along the depth", 10.0), ("all", 4.0)):
         scenario = QUIET.with_values({"control.adaptive_mpc.variation_length_mm": length})
@@ -120,7 +120,7 @@ def test_what_lies_ahead_of_the_tip_is_believed_as_far_as_it_is_correlated():
 
 
 def test_what_the_readings_tell_apart_is_found():
-    """Run-out jumps with the bevel; the rest shows along the way, some of it only in part."""
+    """Run-out jumps with the bevel; the rest shows along the path, some of it only in part."""
     needle = NEEDLES["all"]
     estimate, _ = followed(needle, 70)
     found = estimate.parameters
@@ -165,14 +165,14 @@ def test_tissue_of_other_layers_is_identified_too(layers):
     estimate, states = followed(needle, 65, scenario=scenario)
     assert estimate.parameters.size == MODULUS + 2 * layers - 1 + 16
     assert estimate.prior.mean.shape == estimate.prior.steps.shape == estimate.prior.begins.shape
-    learnt, naive = ahead(estimate, needle, states, scenario)
+    fitted, naive = ahead(estimate, needle, states, scenario)
     assert naive > 0.1
-    assert learnt < 0.3 * naive
+    assert fitted < 0.3 * naive
     assert estimate.state.converged
 
 
 @pytest.mark.usefixtures("all_fresh")
-def test_a_tracker_without_jitter_is_believed_but_for_what_no_parameter_explains():
+def test_a_tracker_without_jitter_is_trusted_but_for_what_no_parameter_explains():
     scenario = PHANTOM.with_values({"tracker.jitter_mm": 0.0})
     estimate, states = followed(NEEDLES["all"], 66, scenario=scenario)
     np.testing.assert_array_equal(estimate.variance(estimate._readings), unexplained(scenario, OWN) ** 2)

@@ -29,7 +29,7 @@ from tasks import begun_with
 
 @pytest.mark.parametrize("off", [1.9, -1.9])
 def test_parameters_stay_within_four_standard_deviations(off):
-    """Readings far aside, in air and in tissue, and a solve that still converges."""
+    """Readings far off laterally, in air and in tissue, and a solve that still converges."""
     rows = commands(50)
     states = Needle().inserted(PHANTOM, rows)
     estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
@@ -52,7 +52,7 @@ def test_parameters_stay_within_four_standard_deviations(off):
         assert np.isfinite(estimate.tip).all()
 
 
-def test_mirrored_readings_give_the_mirrored_belief():
+def test_mirrored_readings_give_the_mirrored_estimate():
     needle, rows = NEEDLES["all"], commands(45)
     states = needle.inserted(PHANTOM, rows)
     here, there = (Identification().begin(begun_with(Simulator(PHANTOM, 1), side)) for side in (1, -1))
@@ -67,7 +67,7 @@ def test_mirrored_readings_give_the_mirrored_belief():
 
 
 def test_a_turn_of_the_bevel_turns_bend_and_run_out_over():
-    """In air: a believed bend of the free needle and a run-out show on the other side."""
+    """In air: an estimated bend of the free needle and a run-out show on the other side."""
     scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
     simulator = Simulator(scenario, 1)
     estimate = Identification().begin(begun_with(simulator, 1))
@@ -112,8 +112,8 @@ def test_where_the_tip_was_is_on_the_side_of_the_bevel_then():
 
 @pytest.mark.usefixtures("all_fresh")
 @pytest.mark.parametrize("late", [1, 3])
-def test_late_readings_lead_to_the_same_belief(late):
-    """The fit takes all readings at once, so only the number of its steps so far differs."""
+def test_late_readings_lead_to_the_same_estimate(late):
+    """The fit takes all readings at once, so only the number of its steps differs."""
     needle = replace(NEEDLES["all"], variation=(1.0,))
     in_time, _ = followed(needle, 50)
     behind, states = followed(needle, 50, late=late)
@@ -123,7 +123,7 @@ def test_late_readings_lead_to_the_same_belief(late):
 
 
 def test_the_belief_now_is_the_fitted_insertion_carried_out_again():
-    """Bit for bit: base at the start, and each step with the needle and tissue that were learnt."""
+    """Bit for bit: base at the start, and each step with the needle and tissue that were fitted."""
     estimate, _ = followed(NEEDLES["all"], 45)
     states = stepped(estimate.parameters, commands(45), estimate.axial)
     assert states[-1] == estimate.state
@@ -152,7 +152,7 @@ def test_in_air_nothing_is_left_over():
     assert estimate.residual == 0.0
 
 
-def test_without_readings_or_moves_the_belief_stays():
+def test_without_readings_or_moves_the_estimate_stays():
     estimate, _ = followed(NEEDLES["bend"], 30)
     moved = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 30.0, 31.0)
     for kept in (moved.observe([]), moved.unseen()):

@@ -32,7 +32,7 @@ def test_another_command_is_refused(command, rule):
 
 
 @pytest.mark.parametrize(
-    ("value", "told"),
+    ("value", "message"),
     [
         ({"miss": 0.1, "miss_sd": -0.1}, "miss_sd = -0.1: must be at least 0, or NaN"),
         ({"rest": -1.0}, "rest = -1.0: must be finite and at least 0"),
@@ -40,6 +40,6 @@ def test_another_command_is_refused(command, rule):
         ({"rest": math.nan}, "rest = nan: must be finite"),
     ],
 )
-def test_a_prediction_or_a_rest_that_means_nothing_is_refused(value, told):
-    with pytest.raises(InputError, match=f"^{told}"):
+def test_a_prediction_or_a_rest_that_means_nothing_is_refused(value, message):
+    with pytest.raises(InputError, match=f"^{message}"):
         Decision((0.0, 0.0, 0.0, 0.0, -1), "", **value)

@@ -23,7 +23,7 @@ FIELD = ("open-loop", "bevel-only", "resolved-rate", "broyden-mpc")
 WITHOUT_GUIDE = ("open-loop", "bevel-only")
 
 
-def drive(name, plan, scenario, believed, readings, *, steps, plant=None):
+def drive(name, plan, scenario, estimated, readings, *, steps, plant=None):
     """Commands of a controller whose belief is the plant itself and whose readings are a step late, plus `readings`."""
     task = task_of(Simulator(scenario, threads=1), plan, name)
     chosen, simulator = METHODS[name], Simulator(plant or scenario, threads=1)
@@ -31,11 +31,11 @@ def drive(name, plan, scenario, believed, readings, *, steps, plant=None):
     state, last, commands = simulator.start(plan.bevel), None, []
     for off in readings[:steps]:
         seen = None if last is None else tuple((last + np.array([0.0, off])).tolist())
-        estimate = believed(replace(state, scenario=scenario), measured=seen, innovation=(0.0, off))
+        estimate = estimated(replace(state, scenario=scenario), measured=seen, innovation=(0.0, off))
         decision, memory = chosen.decide(task, memory, estimate, rng)
         commands.append(decision.command)
         last, state = state.tip[:2], simulator.step(state, Control.from_row(decision.command))
-        if chosen.arrived(task, memory, believed(state)):
+        if chosen.arrived(task, memory, estimated(state)):
             break
     return np.array(commands), state
 
@@ -57,7 +57,7 @@ def test_they_are_there_under_their_names():
 )  # fmt: skip
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
 def test_limits_are_kept_whatever_the_target_and_the_readings(
-    quick_plan, believed, name, base, stretch, step, reach, advance, readings, gain
+    quick_plan, estimated, name, base, stretch, step, reach, advance, readings, gain
 ):
     """The simulator raises CommandError for a step or place out of range; the plan is one of a larger setup."""
     scenario = PHANTOM.with_values(
@@ -73,7 +73,7 @@ def test_limits_are_kept_whatever_the_target_and_the_readings(
         controls=quick_plan.controls * [1.0, 1.0, 1.0, stretch, 1.0] + [0.0, base, 0.1 * base, 0.0, 0.0],
         guide=quick_plan.guide * stretch,
     )  # fmt: skip
-    commands, state = drive(name, wide, scenario, believed, readings, steps=12)
+    commands, state = drive(name, wide, scenario, estimated, readings, steps=12)
     assert np.isfinite(commands).all()
     assert np.abs(commands[:, 3]).max() <= step + 1e-12
     assert np.abs(np.cumsum(commands[:, 3])).max() <= reach + 1e-9
@@ -87,22 +87,22 @@ def test_limits_are_kept_whatever_the_target_and_the_readings(
 
 @pytest.mark.parametrize("name", ["resolved-rate", "broyden-mpc"])
 def test_towards_a_path_far_aside_the_guide_goes_to_the_end_of_its_reach_and_no_further(
-    quick_plan, believed, name
+    quick_plan, estimated, name
 ):
     scenario = PHANTOM.with_values({"setup.max_guide_travel_mm": 0.8, "target.lateral_mm": 0.0})
     away = replace(quick_plan, tips=quick_plan.tips + np.array([0.0, 6.0, 0.0]), target=(40.0, 11.0))
-    commands, _ = drive(name, away, scenario, believed, [0.0] * 8, steps=8)
+    commands, _ = drive(name, away, scenario, estimated, [0.0] * 8, steps=8)
     assert np.cumsum(commands[:, 3]).max() == pytest.approx(0.8, abs=1e-9)
     assert np.abs(commands[:, 3]).max() == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("name", ["open-loop", "ce-mpc", "resolved-rate", "broyden-mpc"])
-def test_planned_motion_of_the_base_is_followed(quick_plan, believed, name):
+def test_planned_motion_of_the_base_is_followed(quick_plan, estimated, name):
     """To where the plan has it at the tip's depth; the other methods look at nothing but guide or bevel."""
     moving = quick_plan.controls.copy()
     moving[:60, 1:3] = 0.02, 1e-4
     plan = replace(quick_plan, controls=moving)
-    commands, state = drive(name, plan, PHANTOM, believed, [0.0] * 30, steps=30)
+    commands, state = drive(name, plan, PHANTOM, estimated, [0.0] * 30, steps=30)
     depth = [-28.5, *(-28.5 + np.cumsum(commands[:, 0]))]
     planned = np.interp(depth[-1], plan.tips[:, 0], np.arange(len(plan.tips)))
     np.testing.assert_allclose(state.travel[1:3], planned * np.array([0.02, 1e-4]), rtol=0.03)
@@ -114,30 +114,30 @@ def noise():
 
 
 @pytest.mark.parametrize("name", FIELD)
-def test_mirrored_plan_and_readings_give_mirrored_commands(quick_plan, mirrored, believed, name):
+def test_mirrored_plan_and_readings_give_mirrored_commands(quick_plan, mirrored, estimated, name):
     """Through a whole insertion into tissue of another stiffness, with flips where the method makes them."""
     plant = PHANTOM.with_values({f"tissue.{k}.shear_modulus_kpa": 5.0 for k in (0, 1)})
     scenario = PHANTOM.with_values({"control.resolved_rate.curvature_per_m": 3.0})
-    here, end = drive(name, quick_plan, scenario, believed, noise(), steps=80, plant=plant)
+    here, end = drive(name, quick_plan, scenario, estimated, noise(), steps=80, plant=plant)
     away = tuple(-off for off in noise())
-    there, other_end = drive(name, mirrored(quick_plan), scenario, believed, away, steps=80, plant=plant)
+    there, other_end = drive(name, mirrored(quick_plan), scenario, estimated, away, steps=80, plant=plant)
     np.testing.assert_allclose(there, here * [1.0, -1.0, -1.0, -1.0, 1.0], atol=1e-9)
     np.testing.assert_allclose(other_end.tip, end.tip * [1.0, -1.0, -1.0], atol=1e-9)
     assert np.abs(here[:, 3]).max() > 0.0 or name == "bevel-only"
 
 
 @pytest.mark.parametrize("name", ["bevel-only", "resolved-rate", "broyden-mpc"])
-def test_the_end_is_at_the_target_depth(quick_plan, believed, name):
-    _, state = drive(name, quick_plan, PHANTOM, believed, noise(), steps=80)
+def test_the_end_is_at_the_target_depth(quick_plan, estimated, name):
+    _, state = drive(name, quick_plan, PHANTOM, estimated, noise(), steps=80)
     assert 0.0 <= travel_left(PHANTOM, quick_plan, state) <= PHANTOM.control.depth_tolerance_mm
 
 
 @pytest.mark.parametrize("name", ["resolved-rate", "broyden-mpc"])
-def test_with_exact_readings_the_guide_takes_the_tip_to_the_target(quick_plan, believed, name):
+def test_with_exact_readings_the_guide_takes_the_tip_to_the_target(quick_plan, estimated, name):
     """In tissue thrice as stiff as planned for, where the plan alone misses."""
     plant = PHANTOM.with_values({f"tissue.{k}.shear_modulus_kpa": 6.0 for k in (0, 1)})
-    _, blind = drive("open-loop", quick_plan, PHANTOM, believed, [0.0] * 80, steps=80, plant=plant)
-    _, steered = drive(name, quick_plan, PHANTOM, believed, [0.0] * 80, steps=80, plant=plant)
+    _, blind = drive("open-loop", quick_plan, PHANTOM, estimated, [0.0] * 80, steps=80, plant=plant)
+    _, steered = drive(name, quick_plan, PHANTOM, estimated, [0.0] * 80, steps=80, plant=plant)
     assert abs(blind.tip[1] - 5.0) > 0.2
     assert abs(steered.tip[1] - 5.0) < 0.25 * abs(blind.tip[1] - 5.0)
 

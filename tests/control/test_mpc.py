@@ -174,23 +174,23 @@ def test_rollouts_turn_the_bevel_only_in_the_first_step_and_if_told(plan, flip, 
     assert (controls[:, 1:, 4] == -1.0).all()
 
 
-def test_in_air_the_bevel_stays(plan, along, believed):
+def test_in_air_the_bevel_stays(plan, along, estimated):
     """Even where the rule would turn it."""
     state = along(plan, 5)
     away = replace(plan, target=(40.0, -5.0))
-    decision = decide(away, believed(state))
+    decision = decide(away, estimated(state))
     assert decision.command[4] == -1
     assert decision.why == "in air"
 
 
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_in_tissue_the_bevel_turns_to_the_target(plan, side, turned, along, believed):
+def test_in_tissue_the_bevel_turns_to_the_target(plan, side, turned, along, estimated):
     """The target lies to one side of the tip's own line, further than either path bends."""
     state = Simulator(PHANTOM).step(along(plan, 50), Control(flip=turned))
     x, y, turn = state.tip
     away = replace(plan, target=(float(x) + 30.0, float(y + 30.0 * np.tan(turn) + 2.0 * side)))
-    decision = decide(away, believed(state))
+    decision = decide(away, estimated(state))
     assert decision.command[4] == (-1 if side == state.bevel else 1)
     assert decision.why.startswith("bevel kept" if side == state.bevel else "bevel turned")
 
@@ -202,27 +202,27 @@ def test_the_rollouts_know_of_the_turn(plan, along):
     assert kept.cost != turned.cost
 
 
-def test_command_has_the_five_inputs_and_leaves_the_base_alone(plan, along, believed):
-    decision = decide(plan, believed(along(plan, 30)))
+def test_command_has_the_five_inputs_and_leaves_the_base_alone(plan, along, estimated):
+    decision = decide(plan, estimated(along(plan, 30)))
     assert len(decision.command) == 5
     assert decision.command[1:3] == (0.0, 0.0)
     assert decision.command[4] in (-1, 1)
 
 
 @pytest.mark.parametrize(("short", "there"), [(0.02, False), (0.009, True), (-0.5, True)])
-def test_arrived_at_the_depth_within_the_tolerance_or_past_it(plan, short, there, along, believed):
+def test_arrived_at_the_depth_within_the_tolerance_or_past_it(plan, short, there, along, estimated):
     state = along(plan, 60)
     goal = replace(plan, target=(float(state.tip[0]) + short, 5.0))
-    assert at_depth(Task(Simulator(PHANTOM), goal), None, believed(state)) is there
+    assert at_depth(Task(Simulator(PHANTOM), goal), None, estimated(state)) is there
 
 
 @pytest.mark.parametrize(("more", "there"), [(0.02, False), (0.009, True)])
-def test_arrived_where_the_stroke_is_used_up(plan, more, there, along, believed):
+def test_arrived_where_the_stroke_is_used_up(plan, more, there, along, estimated):
     """The needle stays before the target, and the last advance goes to the end of the stroke at most."""
     advanced = float(plan.controls[:60, 0].sum())
     short = PHANTOM.with_values({"setup.stroke_mm": advanced + more, "target.depth_mm": 10.0})
     state = along(plan, 60, short)
-    assert at_depth(Task(Simulator(short), plan), None, believed(state)) is there
+    assert at_depth(Task(Simulator(short), plan), None, estimated(state)) is there
     assert choose(plan, state, short).steps[0] <= more + 1e-9
 
 
@@ -258,9 +258,9 @@ def test_controls_carry_the_base_steps_while_the_needle_advances(plan, along):
     assert (controls[:, 3:, :4] == 0.0).all()
 
 
-def test_the_bevel_rule_hears_of_three_standard_deviations_of_a_reading(plan, monkeypatch, along, believed):
+def test_the_bevel_rule_hears_of_three_standard_deviations_of_a_reading(plan, monkeypatch, along, estimated):
     heard = []
     rule = bang_bang.wants_flip
     monkeypatch.setattr(bang_bang, "wants_flip", lambda *args: heard.append(args[-1]) or rule(*args))
-    decide(plan, believed(along(plan, 40)))
+    decide(plan, estimated(along(plan, 40)))
     assert heard == [pytest.approx(3 * PHANTOM.tracker.jitter_mm / 3**0.5)]

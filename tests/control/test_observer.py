@@ -19,14 +19,14 @@ QUIET = PHANTOM.with_values({"tracker.jitter_mm": 1e-3})
 AHEAD = (1.0, 0.0, 0.0, 0.0, -1)
 
 
-def believe_start(scenario, **corrections):
+def start_with(scenario, **corrections):
     """A needle in air whose base isn't where the model has it."""
     simulator = Simulator(scenario)
-    return simulator.step(simulator.start().believing(**corrections), Control())
+    return simulator.step(simulator.start().with_estimate(**corrections), Control())
 
 
 def begun(simulator, state=None, bevel=1, **beliefs):
-    """The belief at the start, or at a state."""
+    """The estimate at the start, or at a state."""
     estimate = Beliefs(**beliefs).begin(begun_with(simulator, bevel))
     return estimate if state is None else replace(estimate, state=state, past=state, tips=state.tip[None])
 
@@ -40,7 +40,7 @@ def in_tissue(simulator, steps=40):
 
 
 def samples_between(before, after, start=0.0, count=4):
-    """Exact readings of the tip on its way through a period of one second."""
+    """Exact readings of the tip during a period of one second."""
     parts = (np.arange(count) + 1) / count
     points = before.tip[:2] + parts[:, None] * (after.tip[:2] - before.tip[:2])
     return [Sample(float(start + t), float(x), float(y)) for t, (x, y) in zip(parts, points, strict=True)]
@@ -52,14 +52,14 @@ def follow(truth, estimate, plant, steps, *, noise=0.0, force=0.0, guide=0.0):
     command = (*AHEAD[:3], guide, AHEAD[4])
     seen = []
     for k in range(steps):
-        before, truth = truth, plant.step(truth.believing(tip_load=force), Control.from_row(command))
+        before, truth = truth, plant.step(truth.with_estimate(tip_load=force), Control.from_row(command))
         readings = [replace(s, y=s.y + rng.normal(0.0, noise)) for s in samples_between(before, truth, k)]
         estimate = estimate.move(command, k, k + 1.0).observe(readings)
         seen.append(estimate.innovation)
     return truth, estimate, np.array(seen)
 
 
-def test_begin_believes_in_a_straight_start_with_the_prior_of_the_scenario():
+def test_it_begins_with_a_straight_start_with_the_prior_of_the_scenario():
     estimate = begun(Simulator(PHANTOM), bevel=-1)
     np.testing.assert_array_equal(estimate.tip, [-28.5, 0.0, 0.0])
     assert estimate.state.bevel == -1
@@ -78,9 +78,9 @@ def test_a_move_moves_the_needle_as_the_driver_did():
 
 @pytest.mark.parametrize(("base_y", "base_turn"), [(0.6, 0.0), (0.0, 0.004), (-0.5, 0.003)])
 def test_in_air_the_tip_effect_of_base_offset_and_slope_is_recovered(base_y, base_turn):
-    """Guide at rest: the tip tells one combination of the two, and that is what the path needs."""
+    """Guide at rest: the tip shows one combination of the two, and that is what the path needs."""
     simulator, plant = Simulator(QUIET), Simulator(QUIET)
-    truth = believe_start(QUIET, base_y=base_y, base_turn=base_turn)
+    truth = start_with(QUIET, base_y=base_y, base_turn=base_turn)
     assert abs(truth.tip[1]) > 0.01
     truth, estimate, _ = follow(truth, begun(simulator), plant, 25)
     np.testing.assert_allclose(estimate.tip[:2], truth.tip[:2], atol=2e-3)
@@ -89,9 +89,9 @@ def test_in_air_the_tip_effect_of_base_offset_and_slope_is_recovered(base_y, bas
 
 
 def test_in_air_it_still_predicts_well_as_the_needle_goes_in():
-    """What was learnt in air holds 10 mm deep without any further reading."""
+    """What was estimated in air holds 10 mm deep without any further reading."""
     simulator = Simulator(QUIET)
-    truth, estimate, _ = follow(believe_start(QUIET, base_y=0.6), begun(simulator), simulator, 28)
+    truth, estimate, _ = follow(start_with(QUIET, base_y=0.6), begun(simulator), simulator, 28)
     assert truth.tip[0] < 0.0
     state, naive = estimate.state, Simulator(QUIET).start()
     for _ in range(28):
@@ -104,16 +104,17 @@ def test_in_air_it_still_predicts_well_as_the_needle_goes_in():
 def test_fit_in_air_is_the_least_squares_solution_with_the_prior():
     """Against the normal equations of all periods at once, on a needle whose tip is linear in the base."""
     simulator, noise = Simulator(PHANTOM), PHANTOM.tracker.jitter_per_axis
-    truth, estimate = believe_start(PHANTOM, base_y=0.7, base_turn=-0.002), begun(simulator)
+    truth, estimate = start_with(PHANTOM, base_y=0.7, base_turn=-0.002), begun(simulator)
     information, moment = np.diag([0.5**-2, 0.003**-2]), np.zeros(2)
     straight = simulator.start()
     for k in range(6):
         truth = simulator.step(truth, Control(db_x=1.0))
         straight = simulator.step(straight, Control(db_x=1.0))
-        ways = [{"base_y": 0.1}, {"base_turn": 1e-3}]
+        shifts = [{"base_y": 0.1}, {"base_turn": 1e-3}]
         h = [
-            (simulator.step(straight.believing(**way), Control()).tip[1] - straight.tip[1]) / (0.1, 1e-3)[i]
-            for i, way in enumerate(ways)
+            (simulator.step(straight.with_estimate(**shift), Control()).tip[1] - straight.tip[1])
+            / (0.1, 1e-3)[i]
+            for i, shift in enumerate(shifts)
         ]
         reading = truth.tip[1] + 0.02 * (-1) ** k
         information += np.outer(h, h) / (noise**2 / 2)
@@ -139,7 +140,7 @@ def test_in_tissue_the_prediction_has_no_offset_under_a_constant_disturbance(loa
 
 @pytest.mark.parametrize(("gain", "learns"), [(0.0, True), (0.3, False)])
 def test_without_learning_the_load_the_offset_stays(gain, learns):
-    """The paper's way: the measured tip is released in the prediction."""
+    """As in the paper: the measured tip is released in the prediction."""
     simulator = Simulator(QUIET.with_values({"control.load_gain": gain}))
     state = in_tissue(simulator)
     begin = begun(simulator, state, learns_load=learns)
@@ -148,7 +149,7 @@ def test_without_learning_the_load_the_offset_stays(gain, learns):
     assert np.abs(seen[-5:, 1]).min() > 0.3 * abs(seen[0, 1])
 
 
-def test_stiffer_tissue_than_believed_leaves_next_to_no_offset():
+def test_stiffer_tissue_than_estimated_leaves_next_to_no_offset():
     """A disturbance that grows slowly as the needle goes in: a twentieth of what not learning leaves."""
     left = []
     for gain in (PHANTOM.control.load_gain, 0.0):
@@ -163,7 +164,7 @@ def test_stiffer_tissue_than_believed_leaves_next_to_no_offset():
 
 def test_load_takes_the_gain_times_the_reaction_and_the_tip_goes_where_it_was_seen():
     simulator = Simulator(PHANTOM)
-    known = replace(begun(simulator, in_tissue(simulator).believing(tip_load=0.001)), axial=0.0)
+    known = replace(begun(simulator, in_tissue(simulator).with_estimate(tip_load=0.001)), axial=0.0)
     moved = known.move(AHEAD, 0.0, 1.0)
     predicted = moved.state
     x, y = predicted.tip[:2] + np.array([0.05, 0.3])
@@ -184,7 +185,7 @@ def test_the_start_along_the_axis_is_found_and_how_surely(base_x):
     """The mean of all readings, weighed with the prior; the tip's own uncertainty shrinks with it."""
     simulator = Simulator(PHANTOM)
     start = simulator.start()
-    truth = believe_start(PHANTOM, base_x=float(start.base[0]) + base_x)
+    truth = start_with(PHANTOM, base_x=float(start.base[0]) + base_x)
     estimate = begun(simulator)
     sds = [estimate.tip_sd]
     for k in range(10):
@@ -289,7 +290,7 @@ def test_an_empty_reading_is_refused():
 
 
 def test_without_fitting_the_start_the_measured_tip_is_held_in_air_too():
-    """As the paper has it; the base is believed to stand where it was commanded."""
+    """As in the paper; the base is estimated where it was commanded."""
     simulator = Simulator(PHANTOM)
     predicted = begun(simulator, fits_start=False, learns_load=False).move(AHEAD, 0.0, 1.0)
     x, y = predicted.tip[:2] + np.array([0.0, 0.5])
@@ -328,7 +329,7 @@ COMMANDS = [(1.0, 0.0, 0.0, step, 1 if k == 2 else -1) for k, step in enumerate(
 
 
 def gathered(estimate, late, *, readings):
-    """The belief after all moves, each period's readings coming so many periods late; then the last ones at rest."""
+    """The estimate after all moves, readings a number of periods late; then the last ones at rest."""
     for k, command in enumerate(COMMANDS):
         estimate = estimate.move(command, k, k + 1.0)
         if k >= late:
@@ -342,7 +343,7 @@ def noisy_readings(state, simulator, count, rng):
     """Readings of each period of a needle under a load that the model lacks, and noise."""
     batches = []
     for k, command in enumerate(COMMANDS):
-        before, state = state, simulator.step(state.believing(tip_load=0.002), Control.from_row(command))
+        before, state = state, simulator.step(state.with_estimate(tip_load=0.002), Control.from_row(command))
         batch = samples_between(before, state, k, count)
         batches.append([replace(s, y=s.y + rng.normal(0.0, 0.05)) for s in batch])
     return batches
@@ -368,8 +369,8 @@ def test_late_readings_correct_as_if_they_had_come_in_time(depth, count, late):
 
 
 @pytest.mark.parametrize("late", [1, 3])
-def test_what_is_believed_before_late_readings_is_what_they_left_moved_on(late):
-    """The belief now is the one corrected `late` periods ago, stepped through the moves since."""
+def test_the_estimate_before_late_readings_is_what_they_left_moved_on(late):
+    """The estimate now is the one corrected `late` periods ago, stepped through the moves since."""
     simulator = Simulator(PHANTOM)
     state = in_tissue(simulator, 36)
     readings = noisy_readings(state, simulator, 4, np.random.default_rng(4))

@@ -21,13 +21,13 @@ def truncated(moved, row, grid=0.01):
     return np.where(row >= 0.0, np.floor(ends + 1e-6), np.ceil(ends - 1e-6)) * grid - moved
 
 
-def replayed(plan, believed, scenario=PHANTOM, motor=truncated):
+def replayed(plan, estimated, scenario=PHANTOM, motor=truncated):
     """Commands, and where base x and guide stood after each, through a driver with a motor."""
     task = task_of(Simulator(scenario, threads=1), plan, "open-loop")
     state, memory = task.simulator.start(plan.bevel), OPEN.begin(task)
     commands, places = [], []
-    while not OPEN.arrived(task, memory, believed(state)):
-        decision, memory = OPEN.decide(task, memory, believed(state), RNG)
+    while not OPEN.arrived(task, memory, estimated(state)):
+        decision, memory = OPEN.decide(task, memory, estimated(state), RNG)
         row = np.array(decision.command)
         row[[0, 3]] = motor(state.travel[[0, 3]], row[[0, 3]])
         commands.append(decision.command)
@@ -36,10 +36,10 @@ def replayed(plan, believed, scenario=PHANTOM, motor=truncated):
     return commands, np.array(places)
 
 
-def test_places_follow_the_plan_through_a_motor_that_stops_short(quick_plan, believed):
+def test_places_follow_the_plan_through_a_motor_that_stops_short(quick_plan, estimated):
     """Never more than one resolution behind; repeating the steps themselves loses some at each."""
     planned = np.cumsum(quick_plan.controls[:, [0, 3]], axis=0)
-    _, places = replayed(quick_plan, believed)
+    _, places = replayed(quick_plan, estimated)
     assert places.shape == planned.shape
     assert np.abs(places - planned).max() < 0.01 + 1e-6
     lost = np.zeros(2)
@@ -48,44 +48,44 @@ def test_places_follow_the_plan_through_a_motor_that_stops_short(quick_plan, bel
     assert np.abs(lost - planned[-1]).max() > 0.1
 
 
-def test_a_perfect_motor_gets_the_planned_steps(quick_plan, believed):
-    commands, _ = replayed(quick_plan, believed, motor=lambda _moved, row: row)
+def test_a_perfect_motor_gets_the_planned_steps(quick_plan, estimated):
+    commands, _ = replayed(quick_plan, estimated, motor=lambda _moved, row: row)
     np.testing.assert_allclose(commands, quick_plan.controls, atol=1e-9)
 
 
-def test_bevel_turns_where_planned(quick_plan, believed):
+def test_bevel_turns_where_planned(quick_plan, estimated):
     turns = quick_plan.controls.copy()
     turns[[12, 40], 4] = 1.0
-    commands, _ = replayed(replace(quick_plan, controls=turns), believed)
+    commands, _ = replayed(replace(quick_plan, controls=turns), estimated)
     assert [k for k, command in enumerate(commands) if command[4] > 0] == [12, 40]
 
 
-def test_base_steps_are_replayed_too(quick_plan, believed):
+def test_base_steps_are_replayed_too(quick_plan, estimated):
     turned = quick_plan.controls.copy()
     turned[:10, 1:3] = 0.1, 2e-4
-    commands, _ = replayed(replace(quick_plan, controls=turned), believed)
+    commands, _ = replayed(replace(quick_plan, controls=turned), estimated)
     np.testing.assert_allclose(np.sum(commands, axis=0)[1:3], [1.0, 2e-3], atol=1e-12)
 
 
-def test_what_the_tracker_sees_changes_nothing(quick_plan, believed, along):
+def test_what_the_tracker_sees_changes_nothing(quick_plan, estimated, along):
     task, state = task_of(Simulator(PHANTOM, threads=1), quick_plan, "open-loop"), along(quick_plan, 20)
-    blind = OPEN.decide(task, 20, believed(state), RNG)[0].command
-    seeing = OPEN.decide(task, 20, believed(state, measured=(1.0, 9.0), innovation=(0.5, 3.0)), RNG)[
+    blind = OPEN.decide(task, 20, estimated(state), RNG)[0].command
+    seeing = OPEN.decide(task, 20, estimated(state, measured=(1.0, 9.0), innovation=(0.5, 3.0)), RNG)[
         0
     ].command
     assert blind == seeing == pytest.approx(tuple(quick_plan.controls[20]))
 
 
-def test_it_has_arrived_once_the_steps_are_used_up_and_not_before(quick_plan, believed, along):
+def test_it_has_arrived_once_the_steps_are_used_up_and_not_before(quick_plan, estimated, along):
     task, count = task_of(Simulator(PHANTOM, threads=1), quick_plan, "open-loop"), len(quick_plan.controls)
-    far = believed(along(quick_plan, 5))
+    far = estimated(along(quick_plan, 5))
     assert not OPEN.arrived(task, count - 1, far)
     assert OPEN.arrived(task, count, far)
 
 
-def test_steps_and_reach_of_a_smaller_setup_are_kept(quick_plan, believed):
+def test_steps_and_reach_of_a_smaller_setup_are_kept(quick_plan, estimated):
     """A plan of a larger setup: slower and less far aside, without an exception."""
     tight = {"setup.max_guide_step_mm": 0.02, "setup.max_guide_travel_mm": 0.4, "target.lateral_mm": 0.0}
-    commands, places = replayed(quick_plan, believed, PHANTOM.with_values(tight))
+    commands, places = replayed(quick_plan, estimated, PHANTOM.with_values(tight))
     assert max(abs(command[3]) for command in commands) <= 0.02
     assert np.abs(places[:, 1]).max() == pytest.approx(0.4)

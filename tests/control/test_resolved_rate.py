@@ -64,20 +64,20 @@ def test_damped_inverse_by_hand():
     assert resolved_rate.damped_inverse(0.0, 0.2) == resolved_rate.damped_inverse(0.0, 0.0) == 0.0
 
 
-def test_on_the_plan_it_goes_on_with_the_plan(quick_plan, along, believed):
+def test_on_the_plan_it_goes_on_with_the_plan(quick_plan, along, estimated):
     for steps in (10, 40, 60):
-        command = decide(quick_plan, believed(along(quick_plan, steps))).command
+        command = decide(quick_plan, estimated(along(quick_plan, steps))).command
         assert command[3] == pytest.approx(quick_plan.controls[steps, 3], abs=0.02)
         assert command[:3] == (1.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("offset", [-0.2, 0.2])
 def test_off_the_plan_the_guide_step_is_the_damped_inverse_of_the_deviation_ahead(
-    quick_plan, along, believed, offset
+    quick_plan, along, estimated, offset
 ):
     """All of the law, with steps taken one by one in place of what it calls."""
     on_plan = along(quick_plan, 45)
-    state = Simulator(PHANTOM, threads=1).step(on_plan.believing(base_y=offset), Control())
+    state = Simulator(PHANTOM, threads=1).step(on_plan.with_estimate(base_y=offset), Control())
     depth = state.tip[0] + np.arange(6)
     planned = np.diff(np.interp(depth, quick_plan.tips[:, 0], quick_plan.guide))
     rows = [[1.0, 0.0, 0.0, step, -1.0] for step in planned]
@@ -85,29 +85,29 @@ def test_off_the_plan_the_guide_step_is_the_damped_inverse_of_the_deviation_ahea
     right, left = (stepped(state, disturbed(rows, by)).tip[1] for by in (0.05, -0.05))
     jacobian = (right - left) / 0.1
     off = np.interp(end[0], quick_plan.tips[:, 0], quick_plan.tips[:, 1]) - end[1]
-    given = decide(quick_plan, believed(state), gain=0.4, damping=0.2, lookahead_mm=5.0, curvature_per_m=0.0)
+    given = decide(quick_plan, estimated(state), gain=0.4, damping=0.2, lookahead_mm=5.0, curvature_per_m=0.0)
     step = planned[0] + 0.4 * jacobian * off / (jacobian**2 + 0.2**2)
     assert given.command == (1.0, 0.0, 0.0, pytest.approx(step, rel=1e-9), -1)
-    back = decide(quick_plan, believed(on_plan), gain=0.4, damping=0.2, curvature_per_m=0.0).command[3]
+    back = decide(quick_plan, estimated(on_plan), gain=0.4, damping=0.2, curvature_per_m=0.0).command[3]
     assert np.sign(given.command[3] - back) == -np.sign(end[1] - stepped(on_plan, rows).tip[1])
 
 
-def test_what_the_newest_reading_was_off_is_taken_to_stay(quick_plan, along, believed):
+def test_what_the_newest_reading_was_off_is_taken_to_stay(quick_plan, along, estimated):
     """A tip seen 0.01 mm aside of the prediction shifts the step by as much of the guide as moves it back."""
     state, settings = along(quick_plan, 45), {"gain": 0.5, "damping": 0.1, "lookahead_mm": 3.0}
-    plain = decide(quick_plan, believed(state), **settings).command[3]
-    seen = decide(quick_plan, believed(state, innovation=(0.4, 0.01)), **settings).command[3]
+    plain = decide(quick_plan, estimated(state), **settings).command[3]
+    seen = decide(quick_plan, estimated(state, innovation=(0.4, 0.01)), **settings).command[3]
     rows = resolved_rate.nominal(PHANTOM.setup, quick_plan, state, 3.0, 0.05, flip=False)
     _, jacobian = resolved_rate.sensitivity(Simulator(PHANTOM, threads=1), state, rows, 0.05)
     assert plain - seen == pytest.approx(0.5 * resolved_rate.damped_inverse(jacobian, 0.1) * 0.01, rel=1e-6)
 
 
-def test_without_gain_the_plan_is_all_there_is(quick_plan, along, believed):
+def test_without_gain_the_plan_is_all_there_is(quick_plan, along, estimated):
     state = along(quick_plan, 30)
-    off = Simulator(PHANTOM, threads=1).step(state.believing(base_y=1.0), Control())
+    off = Simulator(PHANTOM, threads=1).step(state.with_estimate(base_y=1.0), Control())
     depth = off.tip[0] + np.array([0.0, 1.0])
     planned = np.diff(np.interp(depth, quick_plan.tips[:, 0], quick_plan.guide))[0]
-    assert decide(quick_plan, believed(off), gain=0.0).command[3] == pytest.approx(planned)
+    assert decide(quick_plan, estimated(off), gain=0.0).command[3] == pytest.approx(planned)
 
 
 @given(
@@ -141,18 +141,18 @@ def test_the_path_is_led_to_the_target_at_its_end(quick_plan):
     assert resolved_rate.planned_y(goal, float(x)) == pytest.approx(y)
 
 
-def test_at_the_target_depth_nothing_moves_any_more(quick_plan, along, believed):
+def test_at_the_target_depth_nothing_moves_any_more(quick_plan, along, estimated):
     state = along(quick_plan, 60)
     past = replace(quick_plan, target=(float(state.tip[0]), 9.0))
-    assert decide(past, believed(state)).command == (0.0, 0.0, 0.0, 0.0, -1)
+    assert decide(past, estimated(state)).command == (0.0, 0.0, 0.0, 0.0, -1)
 
 
-def test_the_last_advance_ends_at_the_target_depth(quick_plan, along, believed):
+def test_the_last_advance_ends_at_the_target_depth(quick_plan, along, estimated):
     state = along(quick_plan, 60)
     near = replace(quick_plan, target=(float(state.tip[0]) + 0.3, 5.0))
-    assert decide(near, believed(state)).command[0] == pytest.approx(0.3)
+    assert decide(near, estimated(state)).command[0] == pytest.approx(0.3)
 
 
-def test_a_look_ahead_of_less_than_a_step_is_one_step(quick_plan, along, believed):
-    state = believed(along(quick_plan, 30))
+def test_a_look_ahead_of_less_than_a_step_is_one_step(quick_plan, along, estimated):
+    state = estimated(along(quick_plan, 30))
     assert decide(quick_plan, state, lookahead_mm=0.01) == decide(quick_plan, state, lookahead_mm=1.0)

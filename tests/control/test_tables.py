@@ -68,7 +68,7 @@ def test_a_task_has_the_settings_of_its_controller():
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "told"),
+    ("key", "value", "message"),
     [
         ("my_pid.gian", 1, "control.my_pid.gian = 1: unknown key; did you mean gain? valid keys: gain"),
         ("my_pid.gain", -1, "control.my_pid.gain = -1: must be at least 0"),
@@ -80,21 +80,21 @@ def test_a_task_has_the_settings_of_its_controller():
         ),
     ],
 )
-def test_a_wrong_setting_is_one_line_wherever_it_is_used(key, value, told):
+def test_a_wrong_setting_is_one_line_wherever_it_is_used(key, value, message):
     scenario = PHANTOM.with_values({f"control.{key}": value})
     for check in (checked, used):
         with pytest.raises(ScenarioError) as caught:
             check(scenario, OWN, source="x.toml")
         (line,) = caught.value.problems
-        assert line.startswith(f"x.toml: {told}")
+        assert line.startswith(f"x.toml: {message}")
 
 
 def test_a_table_of_nobody_is_refused_by_a_check_and_warned_of_in_use():
     scenario = PHANTOM.with_values({"control.my_pdi.gain": 1})
-    told = r"control.my_pdi: unknown table; did you mean my_pid\? tables: adaptive_mpc, .*, my_pid; for one of your own"
-    with pytest.raises(ScenarioError, match="^x.toml: " + told):
+    message = r"control.my_pdi: unknown table; did you mean my_pid\? tables: adaptive_mpc, .*, my_pid; for one of your"
+    with pytest.raises(ScenarioError, match="^x.toml: " + message):
         checked(scenario, OWN, source="x.toml")
-    with pytest.warns(ScenarioWarning, match=f"^{told}.*; it is not used$"):
+    with pytest.warns(ScenarioWarning, match=f"^{message}.*; it is not used$"):
         assert used(scenario, OWN, source="x.toml").control.tables["my_pdi"] == {"gain": 1}
 
 
@@ -125,7 +125,7 @@ class ByName:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"name": "My PID"}, "name = 'My PID': a controller's name must be like my-controller-2"),
         ({"name": None}, "name = None: a controller's name must be like"),
@@ -139,8 +139,8 @@ class ByName:
         ({"settings": NotInToml}, "controller my-pid: settings must be what a TOML file holds.*: gains"),
     ],
 )
-def test_a_method_that_cannot_work_is_refused_when_it_is_made(change, told):
-    with pytest.raises(InputError, match=f"^{told}"):
+def test_a_method_that_cannot_work_is_refused_when_it_is_made(change, message):
+    with pytest.raises(InputError, match=f"^{message}"):
         replace(OWN, **change)
 
 

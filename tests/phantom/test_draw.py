@@ -63,8 +63,8 @@ def drawn(seed, scenario=PHANTOM):
 def factors(truth, scenario=PHANTOM):
     """Stiffness of each layer, relative to the scenario."""
     return [
-        true.shear_modulus_kpa / told.shear_modulus_kpa
-        for true, told in zip(truth.scenario.tissue, scenario.tissue, strict=True)
+        true.shear_modulus_kpa / message.shear_modulus_kpa
+        for true, message in zip(truth.scenario.tissue, scenario.tissue, strict=True)
     ]
 
 

@@ -57,7 +57,7 @@ def test_the_needle_starts_where_the_clamp_really_holds_it(kind):
     """Just as the controller's model with that base, but for the mesh."""
     phantom = tank(kind=kind, bevel=-1, base_y=0.4, base_turn=-0.002)
     simulator = Simulator(IDEAL)
-    expected = simulator.step(simulator.start(-1).believing(base_y=0.4, base_turn=-0.002), Control())
+    expected = simulator.step(simulator.start(-1).with_estimate(base_y=0.4, base_turn=-0.002), Control())
     np.testing.assert_allclose(tip(phantom), expected.tip, atol=1e-3)
     assert abs(tip(phantom)[1]) > 0.01
     assert phantom._plant.bevel == -1

@@ -192,7 +192,7 @@ def test_a_target_within_reach_passes(target):
         ((81.6, 0), "target.depth_mm = 81.6: beyond the stroke: must be at most 81.5"),
         (
             (40, -15.1),
-            "target.lateral_mm = -15.1: must be at most 15 in size, as far aside as the guide travels",
+            "target.lateral_mm = -15.1: must be at most 15 in size, the lateral travel of the guide",
         ),
         ((40, math.inf), "target.lateral_mm = inf: must be at most 15 in size"),
     ],
@@ -205,7 +205,7 @@ def test_a_target_out_of_reach_is_refused(target, told):
 
 def test_without_a_guide_a_target_lies_as_far_aside_as_the_base_travels():
     scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None, "setup.max_base_travel_mm": 6.0})
-    with pytest.raises(ScenarioError, match="at most 6 in size, as far aside as the base travels"):
+    with pytest.raises(ScenarioError, match="at most 6 in size, the lateral travel of the base"):
         check_target(scenario, 40, 7)
 
 

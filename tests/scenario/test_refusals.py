@@ -219,8 +219,8 @@ RULES = [
     ("setup.stroke_mm", 137.5, "the base would reach the guide: must be below 137.5"),
     ("target.depth_mm", 0.0, "must be above 0, the skin"),
     ("target.depth_mm", 81.6, "beyond the stroke: must be at most 81.5"),
-    ("target.lateral_mm", 15.1, "must be at most 15 in size, as far aside as the guide travels"),
-    ("target.lateral_mm", -15.1, "must be at most 15 in size, as far aside as the guide travels"),
+    ("target.lateral_mm", 15.1, "must be at most 15 in size, the lateral travel of the guide"),
+    ("target.lateral_mm", -15.1, "must be at most 15 in size, the lateral travel of the guide"),
     # grids that would never end
     ("setup.max_advance_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
     ("contact.spacing_mm", 1e-3, "must be at least 0.0055, setup.stroke_mm / 20000"),
@@ -270,9 +270,9 @@ def changed(key, value):
 @pytest.mark.parametrize(("key", "value", "rule"), RULES, ids=lambda part: str(part)[:30])
 def test_a_broken_rule_is_told_in_one_line(key, value, rule):
     (line,) = problems(changed(key, value))
-    told_key, told = line.split(": ", maxsplit=1)
+    told_key, message = line.split(": ", maxsplit=1)
     assert told_key.split(" = ")[0] == key
-    assert told.startswith(rule)
+    assert message.startswith(rule)
 
 
 @pytest.mark.parametrize("key", POSITIVE)
@@ -400,18 +400,18 @@ json_like = st.recursive(
 def test_any_value_gives_a_scenario_or_one_line_each(key, value):
     try:
         checked(PHANTOM.with_values({key: value}))
-        told = ["fine"]
+        message = ["fine"]
     except ScenarioError as error:
-        told = list(error.problems)
-    assert told
-    assert all(line.isprintable() for line in told)
+        message = list(error.problems)
+    assert message
+    assert all(line.isprintable() for line in message)
 
 
 # files
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         (b'name = "\xff"', "not UTF-8 (at line 1)"),
         ('name = "a"\n'.encode("utf-16"), "not UTF-8 (at line 1)"),
@@ -424,11 +424,11 @@ def test_any_value_gives_a_scenario_or_one_line_each(key, value):
     ],
     ids=["latin", "utf-16", "end", "syntax", "deep", "digits", "large", "empty"],
 )
-def test_a_file_that_is_no_scenario_is_refused(content, told, scenario_file):
+def test_a_file_that_is_no_scenario_is_refused(content, message, scenario_file):
     path = scenario_file(content)
     with pytest.raises(ScenarioError) as caught:
         load_scenario(path)
-    assert caught.value.problems[0].startswith(f"{path}: {told}")
+    assert caught.value.problems[0].startswith(f"{path}: {message}")
 
 
 def test_a_syntax_error_names_its_line(scenario_file):
@@ -450,7 +450,7 @@ def test_a_byte_order_mark_and_windows_line_ends_are_accepted(minimal_text, scen
 
 
 @pytest.mark.parametrize(
-    ("source", "told"),
+    ("source", "message"),
     [
         ("phantm", "phantm: no such file, and no such preset (presets: phantom)"),
         ("", '"": is a directory'),
@@ -462,11 +462,11 @@ def test_a_byte_order_mark_and_windows_line_ends_are_accepted(minimal_text, scen
         (None, "a scenario is a preset name, a path or a Scenario, not NoneType"),
     ],
 )
-def test_a_source_that_cannot_be_read_is_refused(source, told):
+def test_a_source_that_cannot_be_read_is_refused(source, message):
     with pytest.raises(ScenarioError) as caught:
         load_scenario(source)
     (line,) = caught.value.problems
-    assert line.startswith(told)
+    assert line.startswith(message)
     assert line.isprintable()
 
 

@@ -57,7 +57,7 @@ def test_a_turn_of_the_bevel_mirrors_the_free_needle():
 def test_bend_and_end_load_of_a_cantilever_add_up():
     simulator, state = bent(BARE, 0.3)
     load = 0.005
-    loaded = simulator.step(state.believing(tip_load=load), Control())
+    loaded = simulator.step(state.with_estimate(tip_load=load), Control())
     x = loaded.nodes[:, 0] - loaded.base[0]
     curve = exact.cantilever(x, load, STIFFNESS, x[-1]) + 0.5 * (2.0 * 0.3 / LENGTH**2) * x**2
     np.testing.assert_allclose(loaded.nodes[:, 1], curve, atol=1e-10)
@@ -230,7 +230,7 @@ def test_a_replay_is_repeated_steps_bit_for_bit(bend):
     assert (rows[:, 4] > 0).sum() > 3
     believed = learnt((1.2, 0.7), (1.3,), cell=2.5, variation=np.linspace(0.5, 1.5, 12), bevel=1.4, bend=bend)
     adapted = simulator.adapted(believed)
-    state = simulator.start().believing(base_y=0.3, base_turn=-1e-3)
+    state = simulator.start().with_estimate(base_y=0.3, base_turn=-1e-3)
     for first, last in ((0, 50), (50, 80)):
         after, tips = adapted.replay(state, rows[first:last])
         for k in range(first, last):

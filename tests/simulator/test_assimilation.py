@@ -42,7 +42,7 @@ def test_reaction_is_the_load_that_the_model_lacks(state):
     held, slide = SIMULATOR.assimilate(state, (x, y + 0.4))
     assert held.reactions.tip_force > 1e-3
     assert state.reactions.tip_force == 0.0
-    believed = held.believing(tip_load=held.reactions.tip_force)
+    believed = held.with_estimate(tip_load=held.reactions.tip_force)
     again, innovation = SIMULATOR.assimilate(believed, (x, y + 0.4))
     assert again.reactions.tip_force == pytest.approx(0.0, abs=1e-8)
     assert innovation == pytest.approx(slide, abs=1e-5)

@@ -25,7 +25,7 @@ def free_needle(**changes):
 def test_cantilever_with_an_end_load_is_exact_to_rounding(load):
     """In every node, over the length that the shortening leaves."""
     simulator = free_needle()
-    state = simulator.step(simulator.start().believing(tip_load=load), Control())
+    state = simulator.step(simulator.start().with_estimate(tip_load=load), Control())
     stiffness = simulator.scenario.needle.bending_stiffness
     x, length = state.nodes[:, 0] - state.base[0], state.tip[0] - state.base[0]
     np.testing.assert_allclose(
@@ -42,7 +42,7 @@ def test_arc_length_is_kept_to_second_order():
     """A cantilever shortens by ½∫y'² = P²L⁵/15(EI)² (equation 5)."""
     simulator = free_needle()
     load = 0.01
-    state = simulator.step(simulator.start().believing(tip_load=load), Control())
+    state = simulator.step(simulator.start().with_estimate(tip_load=load), Control())
     length = state.tip[0] - state.base[0]
     short = load**2 * length**5 / (15 * simulator.scenario.needle.bending_stiffness**2)
     assert short > 0.02
@@ -96,7 +96,7 @@ def loaded_free_end(depth, spacing):
     beta, load = 1 / LENGTH_MM, 1e-3 * FOUNDATION * LENGTH_MM / 2
     simulator = Simulator(long_beam(depth, spacing=spacing))
     state = simulator.step(simulator.start(), Control(db_x=depth + 1.0))
-    state = simulator.step(state.believing(tip_load=load), Control())
+    state = simulator.step(state.with_estimate(tip_load=load), Control())
     y = exact.free_end(0.0, load, FOUNDATION, beta)
     turn = exact.free_end_slope(load, FOUNDATION, beta)
     return np.array([state.tip[1] / y, state.tip[2] / turn, state.energy / (load * y / 2)]) - 1

@@ -31,7 +31,7 @@ def off_centre(state):
 def loaded(clearance, depth, guide, base_y=0.0, base_turn=0.0):
     """States of an insertion to a depth (mm), the guide moved by 0.1 mm a step as far as `guide` (mm) in tissue."""
     simulator = loose(clearance)
-    start = simulator.start().believing(base_y=base_y, base_turn=base_turn)
+    start = simulator.start().with_estimate(base_y=base_y, base_turn=base_turn)
     states = [simulator.step(start, Control())]
     states += repeat(simulator, states[-1], Control(db_x=1.0), int(depth - PHANTOM.setup.start_tip_x))
     steps = int(np.ceil(abs(guide) / 0.1))
@@ -92,7 +92,7 @@ def test_of_all_places_between_the_walls_the_needle_takes_that_of_least_energy(
     clearance, guide, base_y, base_turn
 ):
     """Each place is what a guide without clearance would prescribe."""
-    start = EXACT.start().believing(base_y=base_y, base_turn=base_turn)
+    start = EXACT.start().with_estimate(base_y=base_y, base_turn=base_turn)
     found = loose(clearance).step(start, Control(dg_y=guide))
     places = guide + clearance * np.linspace(-1.0, 1.0, 21)
     energies = [EXACT.step(start, Control(dg_y=place)).energy for place in places.clip(-0.5, 0.5)]

@@ -56,7 +56,7 @@ class Pair:
 
     def believe(self, **corrections):
         """Base and load corrected in both."""
-        self.state = self.state.believing(**corrections)
+        self.state = self.state.with_estimate(**corrections)
         base, load = self.pose.base.copy(), corrections.get("tip_load", self.pose.load)
         base[1:] = corrections.get("base_y", base[1]), corrections.get("base_turn", base[2])
         self.pose = replace(self.pose, base=base, load=load)

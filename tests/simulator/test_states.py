@@ -41,10 +41,10 @@ def test_copies_are_equal_and_go_on_the_same(state, duplicate):
 def test_states_compare_by_value(state):
     """A step makes a difference, and so does a belief; other things are not states."""
     assert state != SIMULATOR.step(state, Control(db_x=0.1))
-    assert state != state.believing(tip_load=1e-3)
+    assert state != state.with_estimate(tip_load=1e-3)
     assert SIMULATOR.step(state, ON) == SIMULATOR.step(state, ON)
     assert state != 3
-    assert state.believing() == state
+    assert state.with_estimate() == state
 
 
 def test_saved_state_loads_equal(state, tmp_path):

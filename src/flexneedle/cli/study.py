@@ -105,12 +105,12 @@ def _command(args: argparse.Namespace, folder: Path, *more: str) -> str:
 
 
 class _Show:
-    """Turns what the runner tells into progress, with rate and time left."""
+    """Turns what the runner reports into progress, with rate and time left."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
         self._planning, self._inserting = _Pace(), _Pace()
-        self._planned = False  # told that no plan is missing
+        self._planned = False  # reported that no plan is missing
 
     def advance(self, advance: Advance) -> None:
         planning, inserting = _STAGES
@@ -166,8 +166,8 @@ def _report(study: Study, folder: Path, as_json: bool, seconds: float) -> int:
     if "done" in summary["outcomes"]:
         return 0
     if summary["first_failure"] is not None:
-        told = printable(summary["first_failure"])
-        print(f"flexneedle: no insertion was done; the first ended so: {told}", file=sys.stderr)
+        message = printable(summary["first_failure"])
+        print(f"flexneedle: no insertion was done; the first ended so: {message}", file=sys.stderr)
     return 1
 
 

@@ -321,7 +321,7 @@ def _adapted(nominal: Simulator, settings: Priors, parameters: Floats) -> Simula
 def _started(estimate: Identified, simulator: Simulator, parameters: Floats) -> State:
     """The state of the start, settled with these parameters."""
     start = estimate.nominal.start(estimate.stops[0][1].bevel)
-    moved = start.believing(
+    moved = start.with_estimate(
         base_x=float(start.base[0]) + estimate.axial,
         base_y=float(parameters[BASE_Y]),
         base_turn=float(parameters[BASE_TURN]),

@@ -149,7 +149,7 @@ def _moved_along(at: Corrected, done: Move, off: float, noise: float) -> tuple[C
     As one step with the correction: what it cuts is still free to follow the measured tip.
     """
     gain = at.axial / (at.axial + noise**2 + 1e-12)
-    moved = at.state.believing(base_x=float(at.state.base[0]) + gain * off)
+    moved = at.state.with_estimate(base_x=float(at.state.base[0]) + gain * off)
     predicted = at.simulator.step(moved, Control.from_row(done.applied))
     return replace(at, axial=(1.0 - gain) * at.axial), predicted
 
@@ -174,7 +174,7 @@ def _fit_start(at: Corrected, predicted: State, seen: float, noise: float) -> Co
     gain = spread / (sensitivity @ spread + noise**2 + 1e-12)
     base_y, base_turn = predicted.base[1:] + gain * seen
     corrected = simulator.step(
-        predicted.believing(base_y=float(base_y), base_turn=float(base_turn)), Control()
+        predicted.with_estimate(base_y=float(base_y), base_turn=float(base_turn)), Control()
     )
     return replace(at, state=corrected, covariance=at.covariance - np.outer(gain, spread))
 
@@ -182,7 +182,7 @@ def _fit_start(at: Corrected, predicted: State, seen: float, noise: float) -> Co
 def _tip_shift(simulator: Simulator, state: State, base_y: float, base_turn: float) -> float:
     """Lateral shift of the tip (mm) for a shift of the base (mm, rad)."""
     _, y, turn = state.base
-    moved = state.believing(base_y=float(y) + base_y, base_turn=float(turn) + base_turn)
+    moved = state.with_estimate(base_y=float(y) + base_y, base_turn=float(turn) + base_turn)
     return float(simulator.step(moved, Control()).tip[1] - state.tip[1])
 
 
@@ -192,4 +192,4 @@ def _held(at: Corrected, predicted: State, measured: Floats) -> State:
     if not at.beliefs.learns_load:
         return held
     gain = at.simulator.scenario.control.load_gain
-    return held.believing(tip_load=held.tip_load + gain * held.reactions.tip_force)
+    return held.with_estimate(tip_load=held.tip_load + gain * held.reactions.tip_force)

@@ -58,7 +58,7 @@ class ModelPlant:
 
     def __init__(self, truth: Truth, bevel: int) -> None:
         self._simulator = Simulator(truth.scenario, threads=1)
-        start = self._simulator.start(bevel).believing(base_y=truth.base_y, base_turn=truth.base_turn)
+        start = self._simulator.start(bevel).with_estimate(base_y=truth.base_y, base_turn=truth.base_turn)
         self._state = self._simulator.step(start, Control())
         self._converged = self._state.converged
 

@@ -63,7 +63,7 @@ def layer_problems(tissue: Sequence[Layer], bevel: Bevel) -> Iterator[Problem]:
 
 
 def target_problems(setup: Setup, target: Target) -> Iterator[Problem]:
-    """Return what keeps a target out of reach: not in the tissue, beyond the stroke, or too far aside."""
+    """Return what keeps a target out of reach: not in the tissue, beyond the stroke or the lateral travel."""
     depth, lateral = target.depth_mm, target.lateral_mm
     if not (isfinite(depth) and depth > 0):
         yield Problem("target.depth_mm", depth, "must be above 0, the skin")
@@ -74,7 +74,7 @@ def target_problems(setup: Setup, target: Target) -> Iterator[Problem]:
         yield Problem("target.depth_mm", depth, rule)
     if not abs(lateral) <= setup.max_lateral:
         mover = "guide" if setup.has_guide else "base"
-        rule = f"must be at most {setup.max_lateral:g} in size, as far aside as the {mover} travels"
+        rule = f"must be at most {setup.max_lateral:g} in size, the lateral travel of the {mover}"
         yield Problem("target.lateral_mm", lateral, rule)
 
 

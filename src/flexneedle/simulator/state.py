@@ -159,7 +159,7 @@ class State:
             float(s[nd.TIP_REACTION]),
         )
 
-    def believing(
+    def with_estimate(
         self,
         *,
         base_x: float | None = None,

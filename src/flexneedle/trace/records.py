@@ -67,7 +67,7 @@ class PlanRecord:
 
 @dataclass(frozen=True)
 class Judged:
-    """A reading of the tracker, and "ok" or why it was not believed."""
+    """A reading of the tracker, and "ok" or why it was rejected."""
 
     sample: Sample
     verdict: str

@@ -1,4 +1,4 @@
-"""How an insertion ends but at its target, and drivers that do not do what they were told."""
+"""How an insertion ends but at its target, and drivers that do not carry out the command."""
 
 import math
 from dataclasses import replace
@@ -43,14 +43,14 @@ def test_a_plan_that_misses_by_more_than_a_millimetre_is_refused_unless_forced(p
 
 
 def test_a_controller_that_predicts_the_miss_is_held_by_that_and_not_by_the_plan(plan):
-    """What the plan misses by says nothing of the phantom's needle; whether it can be reached is found on the way."""
+    """The plan's miss is no evidence on the phantom's needle; the insertion finds whether it can be reached."""
     assert METHODS[DEFAULT].predicts
     assert not any(method.predicts for name, method in METHODS.items() if name != DEFAULT)
     assert first_periods(1, missing_by(plan, 1.01), Tank(plan.bevel).rig())
 
 
 class Stuck(Stage):
-    """A driver that doesn't move, and a tracker that sees that."""
+    """A driver that doesn't move, and a tracker that measures that."""
 
     def __init__(self):
         super().__init__([])

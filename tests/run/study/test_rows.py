@@ -196,7 +196,7 @@ def line(**changed):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ('{"index": ', "not a row in JSON"),
         ("[3]", "not a row in JSON"),
@@ -221,13 +221,13 @@ def line(**changed):
         (line(total_s="x"), 'total_s = "x": of a wrong type, or too large'),
     ],
 )
-def test_a_journal_that_was_changed_is_refused_with_the_line_and_left_alone(tmp_path, text, told):
+def test_a_journal_that_was_changed_is_refused_with_the_line_and_left_alone(tmp_path, text, message):
     path = tmp_path / "j"
     path.write_text(f"{line()}\n{text}\n{line(index=3)}\n")
     before = path.read_bytes()
     with pytest.raises(InputError) as caught:
         Journal(path, 5)
-    assert str(caught.value) == f"{path}: damaged at line 2: {told}"
+    assert str(caught.value) == f"{path}: damaged at line 2: {message}"
     assert path.read_bytes() == before
 
 

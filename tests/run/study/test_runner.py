@@ -167,11 +167,11 @@ def test_plans_are_made_once_also_by_a_study_that_goes_on(quick, tmp_path, monke
 
 @pytest.mark.usefixtures("in_threads")
 def test_a_study_tells_how_far_it_is(quick, tmp_path):
-    told = []
-    run_study(quick, tmp_path / "a", on_advance=told.append)
-    assert [(a.plans, a.insertions) for a in (told[0], told[-1])] == [(0, 0), (2, SIZE)]
-    assert [a.insertions for a in told] == sorted(a.insertions for a in told)
-    assert {(a.all_plans, a.all_insertions, a.unfinished) for a in told} == {(2, SIZE, 0)}
+    message = []
+    run_study(quick, tmp_path / "a", on_advance=message.append)
+    assert [(a.plans, a.insertions) for a in (message[0], message[-1])] == [(0, 0), (2, SIZE)]
+    assert [a.insertions for a in message] == sorted(a.insertions for a in message)
+    assert {(a.all_plans, a.all_insertions, a.unfinished) for a in message} == {(2, SIZE, 0)}
 
 
 @pytest.mark.usefixtures("in_threads")
@@ -188,15 +188,15 @@ def test_failures_are_rows_and_the_study_ends(quick, tmp_path, monkeypatch):
 
     monkeypatch.setattr(rows, "plan", plan)
     monkeypatch.setattr(rows, "insert", insert)
-    told = []
-    out = run_study(quick, tmp_path / "a", on_advance=told.append)
+    message = []
+    out = run_study(quick, tmp_path / "a", on_advance=message.append)
     table = runs(out)
     assert len(table) == SIZE
     outcomes = {row["seed"]: row["outcome"] for row in table}
     assert outcomes == {7: "error", 8: "error", 9: "done", 10: "refused"}
     assert {row["reason"] for row in table if row["seed"] < 9} == {"no plan: FloatingPointError: overflow"}
     assert all((row["true_error_mm"] is None) == (row["outcome"] != "done") for row in table)
-    assert told[-1].unfinished == 12
+    assert message[-1].unfinished == 12
     summary = summarise(out, load_study(quick))
     assert summary["outcomes"] == {"error": 8, "done": 4, "refused": 4}
     assert summary["first_failure"] == "error: no plan: FloatingPointError: overflow"

@@ -93,7 +93,7 @@ FAR = '[[axes]]\nkey = "target"\nvalues = [[10, 50]]'
 
 
 @pytest.mark.parametrize(
-    ("text", "worlds", "told"),
+    ("text", "worlds", "message"),
     [
         (STUDY, (-1, 4), "worlds = -1, 4: must be a first number, 0 to 1000000000, and a count, 1 to 100000"),
         (STUDY, (0, 0), "worlds = 0, 0: must be a first number"),
@@ -111,10 +111,10 @@ FAR = '[[axes]]\nkey = "target"\nvalues = [[10, 50]]'
         (ODD, None, 'world_case = "odd": must be one of perfect, real, structure'),
     ],
 )
-def test_a_study_of_worlds_that_cannot_be_is_refused(load, text, worlds, told):
+def test_a_study_of_worlds_that_cannot_be_is_refused(load, text, worlds, message):
     with pytest.raises(InputError) as caught:
         load(text, worlds)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_the_shipped_study_has_two_hundred_worlds_that_nothing_was_chosen_on():

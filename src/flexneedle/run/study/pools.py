@@ -81,5 +81,5 @@ def _client(address: str) -> Any:
     try:
         return connect(address, timeout=_CONNECT_S, security=security, set_as_default=False)
     except Exception as error:  # noqa: BLE001  Dask raises what it trips over in the answer of any server
-        told = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(printable(f"{address}: no Dask scheduler answers: {told}")) from None
+        message = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(printable(f"{address}: no Dask scheduler answers: {message}")) from None

@@ -210,5 +210,7 @@ def _lost_workers_told() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        told = " ".join(f"{type(error).__name__} {error}".split())
-        raise RunError(f"workers were lost ({told}); finished rows are kept, go on with --resume") from error
+        message = " ".join(f"{type(error).__name__} {error}".split())
+        raise RunError(
+            f"workers were lost ({message}); finished rows are kept, go on with --resume"
+        ) from error
