@@ -198,7 +198,7 @@ def test_reach_is_not_given_away_by_a_step_with_the_bevel_on_the_wrong_side(quic
     plan = replace(quick_plan, target=(40.0, 0.9 * (greatest if side > 0 else least)), bevel=bevel)
     task = task_of(simulator, plan)
     ahead = adaptive_mpc.Ahead.of(task, state, replace(of_plan(plan), rolls=()))
-    kept, rolled = adaptive_mpc._Shortfall.of(task, estimate, ahead, ADAPTIVE.begin(task)).expected
+    kept, rolled = adaptive_mpc._out_of_reach(task, estimate, ahead, ADAPTIVE.begin(task))
     assert min(kept, rolled) >= 0.0
     assert (kept < rolled) == (side == bevel)
 

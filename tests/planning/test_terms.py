@@ -38,6 +38,7 @@ OUTCOME = Outcome(
         (terms.guide_slope, [(0.01 + 0.04 / 2 + 0.16 / 2) / 5.0, 0.09 / 1.5]),
         (terms.rolls, [2.0, 1.0]),
         (partial(terms.rolls, first=1), [1.0, 1.0]),
+        (partial(terms.out_of_reach, expected=np.array([0.3, 0.7])), [0.7, 0.3]),
         (terms.deflection, [6.0 + 7.0, 8.0 + 9.0]),
         (terms.guide_motion, [0.04 + 0.16, 0.09]),
         (partial(terms.guide_departure, nominal=np.array([0.1, 0.0, 0.1])), [0.04 + 0.25, 0.04 + 0.01]),

@@ -8,6 +8,7 @@
 | `rolls` | 1 | mm |
 | `late_rolls` | 1 | mm |
 | `distance_from_line` | mm | 1 |
+| `out_of_reach` | mm | 1 |
 | `deflection` | mm², summed over steps | 1/mm |
 | `guide_motion` | mm², summed over steps | 1/mm |
 | `deviation` | mm², summed over steps | 1/mm |
@@ -132,6 +133,15 @@ def distance_from_line(outcome: Outcome, start: Point, target: Point) -> Floats:
     share = np.where(outcome.inside, outcome.controls[:, :, 0], 0.0)
     mean: Floats = (away * share).sum(axis=1) / np.maximum(share.sum(axis=1), np.finfo(float).tiny)
     return mean
+
+
+def out_of_reach(outcome: Outcome, expected: Floats) -> Floats:
+    """How far (mm) the target is expected to be out of the bevel's reach after the first step.
+
+    expected (2,): with the bevel as it is, and with the bevel rolled before that step.
+    """
+    value: Floats = expected[(outcome.controls[:, 0, 4] > 0.0).astype(int)]
+    return value
 
 
 def deflection(outcome: Outcome) -> Floats:

@@ -177,35 +177,28 @@ def _terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tupl
         Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
         Term("rolls", settings.roll_weight_mm, terms.rolls),
         Term("late", settings.late_roll_weight * fitted.roll_sd, late),
-        Term("reach", reach, _Shortfall.of(task, fitted, ahead, memory)),
+        Term(
+            "reach", reach, partial(terms.out_of_reach, expected=_out_of_reach(task, fitted, ahead, memory))
+        ),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Shortfall:
-    """How far the target is expected to be out of the bevel's reach after the first control step, (2,) mm: the bevel as
-    it is, or rolled before it. With the bevel alone, reach that is given away does not come back; with a guide, the
-    bevel is what still moves the tip when the guide is far behind it.
+def _out_of_reach(task: Task, fitted: Identified, ahead: Ahead, memory: Memory) -> Floats:
+    """How far the target is expected to be out of the bevel's reach after the first step, (2,) mm: the bevel as it is,
+    or rolled before it. The reach, what is between the ends with the bevel on either side from the second step on, is
+    known as a normal value is.
+
+    With the bevel alone, reach that is given away does not come back; with a guide, the bevel is what still moves the
+    tip when the guide is far behind it.
     """
-
-    expected: Floats
-
-    @staticmethod
-    def of(task: Task, fitted: Identified, ahead: Ahead, memory: Memory) -> "_Shortfall":
-        """The reach is what is between the ends with the bevel on either side from the second step on; normal."""
-        outcome = _seen(fitted, ahead.controls(ahead.constant)[0])
-        past = terms.past(outcome, task.plan.target).reshape(2, 2)
-        low, high = past.min(axis=1), past.max(axis=1)
-        middle = (memory.outlook or Outlook.of(fitted)).sd_now(fitted, task.plan.target[0])
-        sd = np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
-        if not outcome.converged.all():
-            return _Shortfall(np.zeros(2))
-        return _Shortfall(_above_zero(low, sd) + _above_zero(-high, sd))
-
-    def __call__(self, outcome: Outcome) -> Floats:
-        """Of samples (N,)."""
-        value: Floats = self.expected[(outcome.controls[:, 0, 4] > 0.0).astype(int)]
-        return value
+    outcome = _seen(fitted, ahead.controls(ahead.constant)[0])
+    if not outcome.converged.all():
+        return np.zeros(2)
+    past = terms.past(outcome, task.plan.target).reshape(2, 2)
+    low, high = past.min(axis=1), past.max(axis=1)
+    middle = (memory.outlook or Outlook.of(fitted)).sd_now(fitted, task.plan.target[0])
+    sd = np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
+    return _above_zero(low, sd) + _above_zero(-high, sd)
 
 
 def _above_zero(mean: Floats, sd: Floats) -> Floats:
