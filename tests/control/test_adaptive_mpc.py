@@ -9,6 +9,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 import flexneedle
+from flexneedle.control.estimate import Move
 from flexneedle.control.identification import Identification
 from flexneedle.control.interface import travel_left
 from flexneedle.control.methods import DEFAULT, METHODS, adaptive_mpc
@@ -148,6 +149,7 @@ def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
     settings, scale = task.settings, task.simulator.energy_scale(40.0)
     assert found == {
         "miss": 1.0,
+        "large miss": (ahead.left / 40.0) ** -settings.urgency - 1.0,
         "energy": settings.energy_weight_mm / scale,
         "line": settings.line_weight * ahead.left / 40.0,
         "slope": settings.slope_weight_mm * ahead.left / 40.0,
@@ -161,6 +163,12 @@ def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
     assert bare["energy"] == task.settings.unguided_energy_weight_mm / scale
     assert bare["line"] == task.settings.unguided_line_weight
     assert bare["reach"] == task.settings.unguided_reach_weight
+
+
+def test_near_the_target_a_large_miss_gets_no_more_urgent(quick_plan):
+    """As late as a correction takes no effect any more."""
+    late, later = (weights(PHANTOM, quick_plan, x)[0]["large miss"] for x in (36.0, 38.0))
+    assert late == later == pytest.approx((adaptive_mpc.UNCORRECTED / 40.0) ** -1.5 - 1.0)
 
 
 def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
@@ -211,6 +219,23 @@ def test_it_rests_four_two_and_one_steps_before_the_target(quick_plan):
     np.testing.assert_allclose(left, [4.0, 2.0, 1.0], atol=1.0)
     assert len(rests) == 3
     assert all(decisions[k].rest >= 0.2 for k in rests)
+
+
+def test_it_rests_once_after_a_step_that_the_fit_does_not_explain(quick_plan, along):
+    """Four standard deviations off, to either side; in air, and where the needle has just rested, it goes on."""
+
+    def rest(state, sd, command=(1.0, 0.0, 0.0, 0.0, -1)):
+        estimate = estimate_of(state)
+        off = sd * np.sqrt(estimate.reading_variance)
+        estimate = replace(estimate, innovation=(0.0, off), moves=(Move(0.0, 1.0, command),))
+        return decide(quick_plan, estimate).rest
+
+    inside = along(quick_plan, 40)
+    assert rest(inside, 4.1) > 0.0
+    assert rest(inside, -4.1) > 0.0
+    assert rest(inside, 3.9) == 0.0
+    assert rest(inside, 4.1, STILL) == 0.0
+    assert rest(along(quick_plan, 3), 4.1) == 0.0
 
 
 def test_what_is_in_hand_is_never_given_up_for_something_worse(quick_plan, along):

@@ -109,3 +109,17 @@ def test_a_miss_counts_as_far_as_it_is_known(blur):
     near = 1e-3 if blur == 0.0 else 0.5e-6 / blur
     np.testing.assert_allclose(miss[:2], near, rtol=0.01)
     np.testing.assert_allclose(miss[2:], 100.0 - blur, rtol=2e-3)
+
+
+@pytest.mark.parametrize("blur", [0.0, 0.3])
+def test_a_large_miss_is_one_beyond_its_standard_deviation(blur):
+    """Nothing of one that is far below it counts, half of one that equals it, all of one that is far above."""
+    tips = np.zeros((4, 1, 3))
+    tips[:, 0, 0], tips[:, 0, 1] = 40.0, (1e-4, 0.1, -0.1, 100.0)
+    outcome = replace(OUTCOME, tips=tips)
+    share = terms.large_miss(outcome, (40.0, 0.0), blur, 0.1) / terms.miss(outcome, (40.0, 0.0), blur)
+    np.testing.assert_allclose(share, [1e-6, 0.5, 0.5, 1.0], rtol=1e-5)
+    assert (
+        terms.large_miss(replace(OUTCOME, tips=0.0 * tips + (40.0, 0.0, 0.0)), (40.0, 0.0), blur, 0.0)[0]
+        == 0.0
+    )

@@ -89,6 +89,7 @@ NOT_NEGATIVE = [
     "control.start_offset_sd_mm",
     "control.start_angle_sd_mrad",
     "control.start_axial_sd_mm",
+    "control.adaptive_mpc.urgency",
     "control.adaptive_mpc.energy_weight_mm",
     "control.adaptive_mpc.unguided_energy_weight_mm",
     "control.adaptive_mpc.line_weight",

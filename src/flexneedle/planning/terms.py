@@ -3,6 +3,7 @@
 | term | unit | its weight's unit, for a cost in mm |
 |---|---|---|
 | `miss` | mm | 1 |
+| `large_miss` | mm | 1 |
 | `energy_at_end` | mJ | mm/mJ |
 | `guide_slope` | 1 | mm |
 | `rolls` | 1 | mm |
@@ -88,6 +89,15 @@ def miss(outcome: Outcome, target: Point, blur: float = 0.0) -> Floats:
     """
     blurred: Floats = np.hypot(past(outcome, target), blur) - blur
     return blurred
+
+
+def large_miss(outcome: Outcome, target: Point, blur: float, sd: float) -> Floats:
+    """The `miss` (mm) as far as it is large for its standard deviation (mm): d² / (d² + sd²) of it, at a distance d."""
+    square = past(outcome, target) ** 2
+    least = np.finfo(float).tiny
+    share = square / np.maximum(square + sd**2, least)
+    large: Floats = share * miss(outcome, target, blur)
+    return large
 
 
 def energy_at_end(outcome: Outcome) -> Floats:

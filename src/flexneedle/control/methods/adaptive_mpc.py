@@ -34,6 +34,7 @@ _SMOOTHING = 0.3
 _TOLERANCE = 1e-6
 _RESTS = (4.0, 2.0, 1.0)  # control steps before the target at which the needle rests
 _STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
+_SURPRISE = 4.0  # standard deviations of a reading, left by the fit, from which the needle rests
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
@@ -46,7 +47,10 @@ class AdaptiveMpc(Priors):
     """Iterations of a period."""
     effort: int = count(3, least=1, most=1_000)
     """Factor on the samples in the first period, and where no path was found that ends near the target."""
-    energy_weight_mm: NonNegative = 0.5
+    urgency: NonNegative = 1.5
+    """A miss that is large for its standard deviation counts by the inverse of the share of the path that is left, to
+    this power."""
+    energy_weight_mm: NonNegative = 0.7
     """Cost of the energy that the tissue down to the target has where it is displaced by 1 mm."""
     unguided_energy_weight_mm: NonNegative = 1.0
     """Cost of that energy where the guide may not move."""
@@ -126,16 +130,25 @@ def decide(
 
 
 def _rest(task: Task, memory: Memory, fitted: Identified, left: float) -> tuple[float, int]:
-    """For how long (s) to rest now, and how often the needle has rested: at a few distances from the target (mm, left).
+    """For how long (s) to rest now, and how often the needle has rested before the target.
 
-    A reading comes late: at rest it catches up, and what it shows can still be corrected.
+    A reading comes late: at rest it catches up, and what it shows can still be corrected. So the needle rests at a few
+    distances from the target (`left`, mm), and after a step in the tissue whose readings the fit does not explain.
     """
     setup = task.scenario.setup
     step = setup.max_advance_mm
-    if memory.rests == len(_RESTS) or left > _RESTS[memory.rests] * step + 1e-9:
-        return 0.0, memory.rests
-    rests = sum(left <= distance * step + 1e-9 for distance in _RESTS)
-    return fitted.lag + step / setup.insertion_speed_mm_s, rests
+    catching_up = fitted.lag + step / setup.insertion_speed_mm_s
+    rests = max(memory.rests, sum(left <= distance * step + 1e-9 for distance in _RESTS))
+    if rests > memory.rests or _surprised(fitted):
+        return catching_up, rests
+    return 0.0, rests
+
+
+def _surprised(fitted: Identified) -> bool:
+    """Whether the readings of a step in the tissue are far from what the fit to them explains."""
+    stepped = bool(fitted.moves) and fitted.moves[-1].applied[0] > 0.0
+    off = abs(fitted.innovation[1]) / math.sqrt(fitted.reading_variance)
+    return stepped and float(fitted.state.tip[0]) > 0.0 and off > _SURPRISE
 
 
 def _search(
@@ -167,11 +180,16 @@ def _terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tupl
     energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
     line = settings.line_weight if guided else settings.unguided_line_weight
     reach = settings.reach_weight if guided else settings.unguided_reach_weight
-    late = partial(terms.late_rolls, depth=target[0], length=UNCORRECTED * task.scenario.setup.max_advance_mm)
+    uncorrected = UNCORRECTED * task.scenario.setup.max_advance_mm
+    late = partial(terms.late_rolls, depth=target[0], length=uncorrected)
     share = min(1.0, ahead.left / target[0])  # of the path
+    urgent = min(1.0, max(ahead.left, uncorrected) / target[0])
+    miss = partial(terms.miss, target=target, blur=memory.blur * share)
+    large = partial(terms.large_miss, target=target, blur=memory.blur * share, sd=memory.blur)
     start = float(fitted.tip[0]), float(fitted.tip[1])
     return (
-        Term("miss", 1.0, partial(terms.miss, target=target, blur=memory.blur * share)),
+        Term("miss", 1.0, miss),
+        Term("large miss", urgent**-settings.urgency - 1.0, large),
         Term("energy", energy / memory.scale if memory.scale > 0.0 else 0.0, terms.energy_at_end),
         Term("line", line * share, partial(terms.distance_from_line, start=start, target=target)),
         Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
