@@ -14,6 +14,7 @@ from flexneedle.errors import ScenarioError
 from flexneedle.scenario import Scenario
 from flexneedle.scenario.fields import Fraction, NonNegative, Positive, Section
 from flexneedle.scenario.problems import Problem, to_line
+from flexneedle.scenario.tissue import MOST_BEVEL
 
 __all__ = [
     *("BASE_TURN", "BASE_Y", "BEND", "BEVEL", "CLEARANCE", "LEAST_SD", "MODULUS", "RUN_OUT"),
@@ -28,7 +29,6 @@ _STEPS = (0.05, 3e-4, 0.05, 0.05, 0.05, 0.02)  # for differences: mm, rad, mm, m
 _LOG_STEP = 0.05
 _SHIFT_STEP = 0.2  # mm
 _WIDEST = 4.0  # standard deviations that a parameter may leave its prior
-_LARGEST_BEVEL = 0.699  # offset, in compression lengths: the law's limit
 _MOST_CELLS = 200
 
 
@@ -145,4 +145,4 @@ def _largest_bevel(scenario: Scenario) -> float:
     """Largest factor on the bevel offset with which the law stays above its floor stretch."""
     shortest = min(layer.compression_length_mm for layer in scenario.tissue)
     offset = scenario.needle.bevel.offset_mm
-    return _LARGEST_BEVEL * shortest / offset if offset > 0.0 else 1.0
+    return MOST_BEVEL * shortest / offset if offset > 0.0 else 1.0

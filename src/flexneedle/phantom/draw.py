@@ -8,8 +8,8 @@ import numpy as np
 
 from flexneedle.phantom.structure import guide_to_skin, structure_values, with_hidden_layer
 from flexneedle.scenario import Scenario
+from flexneedle.scenario.tissue import MOST_BEVEL
 
-_LARGEST_OFFSET = 0.699  # of the compression length
 _THINNEST_MM = 0.1  # layer that displaced boundaries leave
 
 
@@ -65,12 +65,12 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
 
 
 def _bevel_factor(scenario: Scenario, rng: np.random.Generator) -> float:
-    """Draw the factor on the bevel offset, from the part of its range that keeps the rule b < 0.7 h."""
+    """Draw the factor on the bevel offset, from the part of its range that keeps the bevel's rule."""
     low, high = scenario.phantom.bevel_factor
     offset = scenario.needle.bevel.offset_mm
     least = min(layer.compression_length_mm for layer in scenario.tissue)
     least *= scenario.phantom.structure.compression_length_factor
-    most = min(high, _LARGEST_OFFSET * least / offset) if offset > 0.0 else high
+    most = min(high, MOST_BEVEL * least / offset) if offset > 0.0 else high
     return float(rng.uniform(min(low, most), most))
 
 

@@ -8,7 +8,7 @@ from .monitor import Monitor
 from .needle import Bevel, Needle
 from .problems import Problem
 from .settings import Phantom, Plan, Target
-from .tissue import Contact, Layer
+from .tissue import LARGEST_BEVEL, Contact, Layer
 
 __all__ = [
     "geometry_problems",
@@ -19,8 +19,6 @@ __all__ = [
     "target_problems",
 ]
 
-# The stretch 1 − b/h of a bevel that is held sideways stays above the floor stretch 0.3 of the tissue law.
-_GREATEST_OFFSET_SHARE = 0.7
 _MOST_GRID_POINTS = 20_000
 _MOST_READINGS_A_STEP = 10_000
 _FRAMES_IN_A_WINDOW = 2
@@ -56,9 +54,9 @@ def layer_problems(tissue: Sequence[Layer], bevel: Bevel) -> Iterator[Problem]:
                 f"tissue.{i}.thickness_mm", None, "missing: only the last layer goes on without a thickness"
             )
     shortest = min(range(len(tissue)), key=lambda i: tissue[i].compression_length_mm)
-    limit = _GREATEST_OFFSET_SHARE * tissue[shortest].compression_length_mm
+    limit = LARGEST_BEVEL * tissue[shortest].compression_length_mm
     if bevel.offset_mm >= limit:
-        rule = f"must be below {limit:g}, 0.7 times tissue[{shortest}].compression_length_mm"
+        rule = f"must be below {limit:g}, {LARGEST_BEVEL:g} times tissue[{shortest}].compression_length_mm"
         yield Problem("needle.bevel.offset_mm", bevel.offset_mm, rule)
 
 

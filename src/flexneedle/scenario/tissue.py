@@ -6,7 +6,13 @@ from pydantic import AfterValidator
 
 from .fields import NonNegative, Positive, Section, Title
 
-__all__ = ["Alpha", "Contact", "Layer"]
+__all__ = ["LARGEST_BEVEL", "MOST_BEVEL", "Alpha", "Contact", "Layer"]
+
+LARGEST_BEVEL = 0.7
+"""Bevel offset over compression length that a scenario stays below: the stretch 1 − b/h of a bevel that is held
+sideways is then above the floor stretch 0.3 of the law."""
+MOST_BEVEL = 0.699
+"""The most of it that is drawn or fitted."""
 
 # Between them the law's 0.3^(−α/2 − 1), at the floor stretch, and 2μ/α² stay clear of overflow and rounding.
 _ALPHA_SMALLEST, _ALPHA_LARGEST = 0.01, 100.0
