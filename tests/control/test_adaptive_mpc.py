@@ -16,7 +16,7 @@ from flexneedle.control.methods import DEFAULT, METHODS, adaptive_mpc
 from flexneedle.control.path import of_plan
 from flexneedle.control.prior import RUN_OUT
 from flexneedle.planning import terms
-from flexneedle.planning.terms import cost
+from flexneedle.planning.terms import charges, cost
 from flexneedle.ports import Sample
 from flexneedle.run.planner import bevel_reach
 from flexneedle.scenario.worlds import world
@@ -184,6 +184,30 @@ def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
     blur = 0.3 * ahead.left / 40.0
     assert blur < 0.25
     assert term.value(outcome)[0] == pytest.approx(np.hypot(past, blur) - blur)
+
+
+def test_near_the_target_what_is_above_its_standard_deviation_is_urgent_and_what_is_below_is_not(
+    quick_plan, along
+):
+    """Half of a miss that equals the standard deviation, in full, though what blurs it counts by the path left."""
+    estimate = estimate_of(along(quick_plan, 60), QUICK)
+    task = task_of(estimate.nominal, quick_plan)
+    memory = replace(ADAPTIVE.begin(task), blur=0.3)
+    ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
+    outcome = adaptive_mpc._seen(estimate, ahead.controls(ahead.in_hand[None])[0])
+    off = terms.past(outcome, quick_plan.target)[0]
+    tips = np.repeat(outcome.tips, 3, axis=0)
+    tips[:, -1, 1] += np.array([0.01, 0.3, 30.0]) - off
+    charged = charges(adaptive_mpc._terms(task, estimate, memory, ahead)[:2], replace(outcome, tips=tips))
+    share = charged["large miss"] / charged["miss"] / (max(ahead.left, 5.0) / 40.0) ** -1.5
+    full = 1.0 - (max(ahead.left, 5.0) / 40.0) ** 1.5
+    assert ahead.left < 12.0
+    np.testing.assert_allclose(share / full, [0.0011, 0.5, 1.0], rtol=0.01)
+
+
+def test_the_blur_is_the_standard_deviation_that_was_predicted_without_a_miss(quick_plan, along):
+    decision, memory = decided(quick_plan, estimate_of(along(quick_plan, 40), QUICK))
+    assert 0.0 < memory.blur <= decision.miss_sd
 
 
 @given(st.floats(-3.0, 3.0), st.floats(0.01, 2.0))
@@ -505,4 +529,5 @@ def test_where_no_path_converges_it_stands_still_and_says_so(quick_plan, along, 
     assert decision.command == (0.0, 0.0, 0.0, 0.0, -1)
     assert decision.why == "no path converges on the fitted model"
     assert np.isnan(decision.miss)
+    assert decision.cost == np.inf
     assert after is memory

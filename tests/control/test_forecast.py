@@ -40,6 +40,10 @@ def test_what_is_not_predicted_holds_and_warns_of_nothing(miss, sd):
     assert likely_misses(predicting(miss, sd), 5) == 0
 
 
+def test_where_nothing_was_found_the_needle_is_held_for_that():
+    assert hopeless(Decision(STILL, "no path converges", math.inf), CONTROL) == "no path converges"
+
+
 def test_a_decision_predicts_nothing_by_default():
     assert hopeless(Decision(STILL, ""), CONTROL) == ""
     assert likely_misses(Decision(STILL, ""), 5) == 0

@@ -43,13 +43,13 @@ def test_only_controllers_of_the_guide_are_refused_without_one(name):
         return
     with pytest.raises(InputError, match=rf"'{name}': steers with the guide: give setup\.guide_to_skin_mm"):
         check_guide(METHODS[name], BARE.setup, "manipulation")
-    with pytest.raises(InputError, match=rf"'{name}': .* strategy = 'steering' leaves where it is"):
+    with pytest.raises(InputError, match=rf"'{name}': .* strategy = 'steering' does not move it"):
         check_guide(METHODS[name], PHANTOM.setup, "steering")
 
 
 @pytest.mark.parametrize("name", GUIDE_CONTROLLERS)
 def test_a_steering_plan_is_refused_before_anything_moves(name, steered):
-    with pytest.raises(InputError, match="leaves where it is: plan with 'manipulation'"):
+    with pytest.raises(InputError, match="does not move it: use 'manipulation'"):
         flexneedle.insert(PHANTOM, steered, controller=name, threads=1)
 
 

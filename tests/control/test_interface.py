@@ -22,6 +22,8 @@ def test_a_command_of_any_sequence_becomes_plain_numbers(kind):
         ((1.0, 0.0), "must have 5 numbers"),
         (None, "must have 5 numbers"),
         ((1.0, 0.0, 0.0, "far", -1), "must have 5 numbers"),
+        ((math.nan, 0.0, 0.0, 0.0, -1), "must have finite numbers"),
+        ((1.0, 0.0, 0.0, math.inf, -1), "must have finite numbers"),
         ((1.0, 0.0, 0.0, 0.0, 0), "flip must be -1 or 1"),
         ((1.0, 0.0, 0.0, 0.0, math.nan), "flip must be -1 or 1"),
     ],

@@ -59,6 +59,11 @@ def test_distance_from_the_line_knows_where_the_line_starts():
     assert found[0] == pytest.approx(0.0, abs=1e-15)
 
 
+def test_distance_from_a_line_without_length_is_that_from_its_height():
+    found = terms.distance_from_line(OUTCOME, (3.5, 0.2), (3.5, 0.5))
+    assert found[0] == pytest.approx((0.0 + 0.3) / 2)
+
+
 def test_in_air_and_without_an_advance_nothing_is_divided_by_zero():
     still = replace(OUTCOME, controls=np.zeros_like(CONTROLS))
     np.testing.assert_array_equal(terms.guide_slope(still), [0.0, 0.0])

@@ -349,7 +349,7 @@ def test_no_labels_of_plans_overlap():
 
 
 def test_a_long_reason_of_a_miss_stays_within_the_figure():
-    limit = "needle.bevel.offset_mm = 4 (only the bevel steers: -1.80 to 1.80 mm)"
+    limit = "needle.bevel.offset_mm = 4 (the bevel alone reaches -1.80 to 1.80 mm lateral)"
     missed = replace(make_plan("steering"), target=(40.0, 12.0), limit=limit)
     figure = plan_figure(PHANTOM, [make_plan(), missed])
     assert overlapping(figure) == []

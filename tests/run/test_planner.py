@@ -190,7 +190,7 @@ def test_mirrored_controls_mirror_the_plan():
             (40.0, 5.0),
             "steering",
             {},
-            "needle.bevel.offset_mm = 4 (only the bevel steers: -1.80 to 1.80 mm",
+            "needle.bevel.offset_mm = 4 (the bevel alone reaches -1.80 to 1.80 mm lateral",
         ),
         ((60.0, 0.0), "steering", {"plan.accuracy_weight_per_mm": 0.0}, "plan.accuracy_weight_per_mm = 0"),
         ((45.0, 14.0), "manipulation", {"setup.max_guide_step_mm": 1e-3}, "setup.max_guide_step_mm = 0.001"),
@@ -285,7 +285,7 @@ def test_without_a_guide_the_bevel_steers_and_the_limit_says_so():
     assert not near.controls[:, 3].any()
     far = coarse({**free, "plan.guide_sigma_mm": 5.0}, (40.0, 14.0))
     assert not far.controls[:, 3].any()
-    assert far.limit.startswith("needle.bevel.offset_mm = 4 (only the bevel steers")
+    assert far.limit.startswith("needle.bevel.offset_mm = 4 (the bevel alone reaches")
 
 
 def test_progress_comes_after_each_iteration():

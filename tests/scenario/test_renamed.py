@@ -45,6 +45,14 @@ def test_an_old_dotted_key_means_the_new_one(key):
     assert "control.ce_mpc." + key in changed.flat()
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_an_old_dotted_key_beside_the_new_one_is_refused(order):
+    both = [("control.samples", 32), ("control.ce_mpc.samples", 33)][::order]
+    message = "^control.samples = 32: the key is control.ce_mpc.samples now, which is given, too: remove one"
+    with pytest.raises(ScenarioError, match=message), pytest.warns(ScenarioWarning):
+        PHANTOM.with_values(dict(both))
+
+
 def test_an_old_dotted_key_goes_over_the_new_one_that_is_there():
     full = checked(PHANTOM)
     with pytest.warns(ScenarioWarning):
@@ -80,7 +88,7 @@ def test_both_names_of_a_key_are_refused():
     with (
         pytest.warns(ScenarioWarning),
         pytest.raises(
-            ScenarioError, match=r"^x.toml: control.horizon = 9: is control.ce_mpc.horizon now, which is "
+            ScenarioError, match=r"^x.toml: control.horizon = 9: the key is control.ce_mpc.horizon now, "
         ),
     ):
         Scenario.from_values(values, "x.toml")

@@ -65,8 +65,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--force",
         action="store_true",
-        help="insert even if the plan misses the target by more than 1 mm (refused where the controller does not "
-        "predict the miss), and go on where no path to it is found",
+        help="insert even if the plan misses the target by more than 1 mm, and go on where the controller predicts a "
+        "miss beyond control.miss_limit_mm",
     )
     parser.set_defaults(handler=_insert)
 
@@ -74,7 +74,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _insert(args: argparse.Namespace) -> int:
     from flexneedle.run.folder import Folder
     from flexneedle.run.parts import own_controllers
-    from flexneedle.run.recording import record_insertion
+    from flexneedle.run.recording import check_choices, record_insertion
 
     from .progress import Progress
 
@@ -86,6 +86,7 @@ def _insert(args: argparse.Namespace) -> int:
         from flexneedle.run.em.register import load_registration
 
         scenario = load_registration(args.registration, scenario)
+    check_choices(scenario, choices)
     compile_first()
     folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
     with Progress() as progress:

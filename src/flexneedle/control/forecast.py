@@ -26,7 +26,9 @@ def probability_beyond(limit: float, miss: float, sd: float) -> float:
 
 
 def hopeless(decision: Decision, control: Control) -> str:
-    """Why the needle is to be held: no path found ends within the limit; empty if one may."""
+    """Why the needle is to be held: no path was found, or none that ends within the limit; empty if one may."""
+    if decision.cost == math.inf:
+        return decision.why
     limit = control.miss_limit_mm
     probability = probability_beyond(limit, decision.miss, decision.miss_sd)
     if probability < control.miss_confidence:

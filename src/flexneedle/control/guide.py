@@ -26,4 +26,4 @@ def check_guide(method: Method, setup: Setup, strategy: str) -> None:
     name = f"controller = {method.name!r}: steers with the guide"
     if not setup.has_guide:
         raise InputError(f"{name}: give setup.guide_to_skin_mm")
-    raise InputError(f"{name}, which strategy = {strategy!r} leaves where it is: plan with 'manipulation'")
+    raise InputError(f"{name}, and strategy = {strategy!r} does not move it: use 'manipulation'")

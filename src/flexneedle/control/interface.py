@@ -30,10 +30,13 @@ _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 class Decision:
     """A command, why, its predicted cost, and the standard deviation left in the guide step (mm; NaN: none).
 
+    An infinite cost says that nothing was found that can be carried out: the loop holds, with `why` as the reason.
+
     miss, miss_sd: lateral miss predicted at the target, past it in +y or −y, and its standard deviation once the loop
     has gone on correcting (mm; NaN: not predicted). The loop warns and holds by them. rest: for how long (s) the needle
     rests, instead of the command, so that late readings come in.
-    Raises InputError for a command that is not five numbers, a negative miss_sd, a rest that is negative or not finite.
+    Raises InputError for a command that is not five finite numbers, a negative miss_sd, or a rest that is negative or
+    not finite.
     """
 
     command: Command
@@ -61,6 +64,8 @@ def _plain_command(command: Any) -> Command:
     except (TypeError, ValueError):
         rule = f"must have {len(COLUMNS)} numbers, {', '.join(COLUMNS)}"
         raise InputError(f"command = {command}: {rule}") from None
+    if not all(map(math.isfinite, (x, y, turn, guide))):
+        raise InputError(f"command = {command}: must have finite numbers, {', '.join(COLUMNS)}")
     if flip not in (-1.0, 1.0):
         raise InputError(f"command = {command}: flip must be -1 or 1")
     return x, y, turn, guide, int(flip)

@@ -92,7 +92,9 @@ def miss(outcome: Outcome, target: Point, blur: float = 0.0) -> Floats:
 
 
 def large_miss(outcome: Outcome, target: Point, blur: float, sd: float) -> Floats:
-    """The `miss` (mm) as far as it is large for its standard deviation (mm): d² / (d² + sd²) of it, at a distance d."""
+    """A share of the `miss` (mm) that is near 0 for a distance d far below its standard deviation (mm) and near 1 far
+    above it: d² / (d² + sd²).
+    """
     square = past(outcome, target) ** 2
     least = np.finfo(float).tiny
     share = square / np.maximum(square + sd**2, least)
@@ -138,7 +140,8 @@ def late_rolls(outcome: Outcome, depth: float, length: float) -> Floats:
 def distance_from_line(outcome: Outcome, start: Point, target: Point) -> Floats:
     """Mean lateral distance (mm) of the tip from the line between two points, over the advance in the tissue."""
     x, y = outcome.tips[:, :, 0], outcome.tips[:, :, 1]
-    slope = (target[1] - start[1]) / (target[0] - start[0])
+    length = target[0] - start[0]
+    slope = (target[1] - start[1]) / length if length != 0.0 else 0.0
     away = np.abs(y - start[1] - slope * (x - start[0]))
     share = np.where(outcome.inside, outcome.controls[:, :, 0], 0.0)
     mean: Floats = (away * share).sum(axis=1) / np.maximum(share.sum(axis=1), np.finfo(float).tiny)

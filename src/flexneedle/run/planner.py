@@ -1,5 +1,6 @@
 """Plan an insertion: the cross-entropy method on rollouts of the simulator (paper section III-A)."""
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -171,19 +172,22 @@ def _end_at_depth(simulator: Simulator, controls: Floats, bevel: int, depth: flo
 
 
 def _binding_limit(simulator: Simulator, problem: Problem, controls: Floats, states: list[State]) -> str:
-    """Name the key that keeps the plan from its target; empty if it gets there."""
+    """Name the key that keeps the plan from its target; empty if it gets there.
+
+    A target out of the bevel's reach is named however near the plan comes to it.
+    """
     scenario, end = simulator.scenario, states[-1].tip
-    if np.hypot(end[0] - problem.target[0], end[1] - problem.target[1]) <= 1.0:
-        return ""
-    setup = scenario.setup
+    setup, near = scenario.setup, math.dist(end[:2], problem.target) <= 1.0
     guide = max(abs(state.guide) for state in states)
     if controls[:, 0].sum() > _AT_LIMIT * setup.stroke_mm and end[0] < problem.target[0] - 0.5:
         return f"setup.stroke_mm = {setup.stroke_mm:g}"
     if _bevel_alone(problem):
         least, greatest = reach(_rollout(simulator), problem)
         if not least <= problem.target[1] <= greatest:
-            why = f"only the bevel steers: {least:.2f} to {greatest:.2f} mm"
+            why = f"the bevel alone reaches {least:.2f} to {greatest:.2f} mm lateral"
             return f"needle.bevel.offset_mm = {scenario.needle.bevel.offset_mm:g} ({why})"
+    if near:
+        return ""
     if guide > _AT_LIMIT * setup.max_guide_travel_mm:
         return f"setup.max_guide_travel_mm = {setup.max_guide_travel_mm:g}"
     if np.abs(controls[:, 3]).max() > _AT_LIMIT * setup.max_guide_step_mm:

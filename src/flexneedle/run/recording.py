@@ -65,6 +65,11 @@ def record_plans(
     return folder.plans
 
 
+def check_choices(scenario: Scenario, choices: Choices) -> None:
+    """Raise InputError for a controller that needs the guide where it may not move."""
+    check_guide(controller_of(choices.controller)[1], scenario.setup, choices.strategy)
+
+
 def record_insertion(
     folder: Folder,
     scenario: Scenario,
@@ -80,7 +85,7 @@ def record_insertion(
     """
     folder.values |= choices.parts
     with _marked(folder):
-        check_guide(controller_of(choices.controller)[1], scenario.setup, choices.strategy)
+        check_choices(scenario, choices)
         plan_seed = choices.seed if choices.plan_seed is None else choices.plan_seed
         plan = _plan(folder, scenario, choices.strategy, plan_seed, on_iteration)
         insertion = _insert(folder, scenario, plan, choices, on_period)

@@ -16,7 +16,7 @@ from .fields import Section, Title
 from .monitor import Monitor
 from .needle import Needle
 from .problems import describe, key_path, refuse, to_line
-from .renamed import current_key, current_values
+from .renamed import current_key, current_values, given_twice
 from .rules import (
     geometry_problems,
     grid_problems,
@@ -97,9 +97,11 @@ class Scenario(Section):
 
         Raises ScenarioError if a key is unknown or the copy breaks a rule.
         """
-        values = self.values()
+        values, changed = self.values(), {key: current_key(key) for key in changes}
         for key, value in changes.items():
-            set_value(values, current_key(key), _expanded(key, value))
+            if changed[key] != key and changed[key] in changes:
+                raise ScenarioError(given_twice(key, value))
+            set_value(values, changed[key], _expanded(key, value))
         return self.from_values(values)
 
     def flat(self) -> dict[str, Any]:

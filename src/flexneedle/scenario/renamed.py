@@ -37,6 +37,11 @@ def current_key(key: str, source: str = "") -> str:
     return _RENAMED[key]
 
 
+def given_twice(key: str, value: Any) -> str:
+    """Return what is wrong with an old key where the new one is given, too."""
+    return f"{key} = {value}: the key is {_RENAMED[key]} now, which is given, too: remove one of the two"
+
+
 def current_values(values: Mapping[str, Any], source: str = "") -> Mapping[str, Any]:
     """Return nested tables under the present names, without what nothing reads, with a warning for each old key.
 
@@ -50,9 +55,7 @@ def current_values(values: Mapping[str, Any], source: str = "") -> Mapping[str, 
     for key in renamed:
         new = current_key(key, source)
         if new in given:
-            raise ScenarioError(
-                f"{opening}{key} = {given[key]}: is {new} now, which is given too: remove one"
-            )
+            raise ScenarioError(f"{opening}{given_twice(key, given[key])}")
         set_value(current, new, given[key])
         set_value(current, key, None)
     for key in retired:

@@ -20,9 +20,9 @@ def entry_angle(plan: PlanRecord) -> float:
 
 def plan_verdict(plan: PlanRecord) -> str:
     """Say in one line how near a plan comes, and which limit binds if that is not near enough."""
-    if plan.reached:
-        return f"reaches the target to {plan.error_mm:.3f} mm"
     binding = f", limited by {plan.limit}" if plan.limit else ""
+    if plan.reached:
+        return f"reaches the target to {plan.error_mm:.3f} mm{binding}"
     return f"MISSES the target: best distance {plan.error_mm:.3f} mm, more than 1 mm{binding}"
 
 

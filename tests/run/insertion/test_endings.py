@@ -1,5 +1,6 @@
 """How an insertion ends but at its target, and drivers that do not carry out the command."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -8,7 +9,7 @@ import pytest
 
 import flexneedle
 import flexneedle.control
-from flexneedle.control.methods import DEFAULT, METHODS
+from flexneedle.control.methods import DEFAULT, METHODS, adaptive_mpc
 from flexneedle.errors import RunError
 from flexneedle.ports import Sample
 from flexneedle.run.rig import Rig
@@ -80,6 +81,21 @@ def test_a_model_that_does_not_converge_ends_the_run(plan, monkeypatch):
     assert done.reason.startswith("the model did not converge")
     assert len(done.periods) == 1
     assert not done.periods[0].converged
+
+
+def test_where_no_path_converges_the_needle_is_held_for_that(plan, monkeypatch):
+    seen, calls = adaptive_mpc._seen, itertools.count()
+
+    def lost(fitted, controls):
+        outcome = seen(fitted, controls)
+        kept = next(calls) < 20
+        return outcome if kept else replace(outcome, converged=np.zeros_like(outcome.converged))
+
+    monkeypatch.setattr(adaptive_mpc, "_seen", lost)
+    done = run(plan, Tank(plan.bevel).rig(), controller=DEFAULT)
+    assert (done.outcome, done.reason) == ("held", "no path converges on the fitted model")
+    assert {period.applied for period in done.periods[-3:]} == {STILL}
+    assert done.periods[-1].decision == "held: no path converges on the fitted model"
 
 
 def test_a_plant_that_does_not_converge_is_said_in_its_periods(plan):

@@ -15,6 +15,7 @@ from functools import partial
 from typing import cast
 
 import numpy as np
+from pydantic import Field
 
 from flexneedle.control.estimate import Estimate, Floats
 from flexneedle.control.forecast import probability_beyond
@@ -47,9 +48,9 @@ class AdaptiveMpc(Priors):
     """Iterations of a period."""
     effort: int = count(3, least=1, most=1_000)
     """Factor on the samples in the first period, and where no path was found that ends near the target."""
-    urgency: NonNegative = 1.5
-    """A miss that is large for its standard deviation counts by the inverse of the share of the path that is left, to
-    this power."""
+    urgency: float = Field(default=1.5, ge=0.0, le=10.0)
+    """A predicted miss above its standard deviation costs more near the target: 1 / (share of the path left) to this
+    power; the share counts as at least five control steps. 0: the same everywhere."""
     energy_weight_mm: NonNegative = 0.7
     """Cost of the energy that the tissue down to the target has where it is displaced by 1 mm."""
     unguided_energy_weight_mm: NonNegative = 1.0
@@ -114,8 +115,9 @@ def decide(
     path = ahead.corrected(found.z)
     command, rolled = ahead.first(path)
     rest, rests = _rest(task, memory, fitted, ahead.left)
-    rolls = ", ".join(f"{roll:.1f}" for roll in rolled.rolls) or "none"
-    why = f"rolls at {rolls} mm; predicted miss {miss:+.3f} ± {sd:.3f} mm"
+    depths = ", ".join(f"{roll:.1f}" for roll in rolled.rolls)
+    rolls = f"rolls at {depths} mm" if depths else "no roll"
+    why = f"{rolls}; predicted miss {miss:+.3f} ± {sd:.3f} mm"
     spread = float(np.sqrt(found.belief.covariance[0, 0]))
     after = Memory(
         path,
@@ -182,8 +184,9 @@ def _terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tupl
     reach = settings.reach_weight if guided else settings.unguided_reach_weight
     uncorrected = UNCORRECTED * task.scenario.setup.max_advance_mm
     late = partial(terms.late_rolls, depth=target[0], length=uncorrected)
-    share = min(1.0, ahead.left / target[0])  # of the path
-    urgent = min(1.0, max(ahead.left, uncorrected) / target[0])
+    whole = max(target[0], uncorrected)
+    share = min(1.0, ahead.left / whole)  # of the path
+    urgent = min(1.0, max(ahead.left, uncorrected) / whole)
     miss = partial(terms.miss, target=target, blur=memory.blur * share)
     large = partial(terms.large_miss, target=target, blur=memory.blur * share, sd=memory.blur)
     start = float(fitted.tip[0]), float(fitted.tip[1])
@@ -203,8 +206,8 @@ def _terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tupl
 
 def _out_of_reach(task: Task, fitted: Identified, ahead: Ahead, memory: Memory) -> Floats:
     """How far the target is expected to be out of the bevel's reach after the first step, (2,) mm: the bevel as it is,
-    or rolled before it. The reach, what is between the ends with the bevel on either side from the second step on, is
-    known as a normal value is.
+    or rolled before it. The reach is the interval between the ends with the bevel on either side from the second step
+    on; its bounds are normal values.
 
     With the bevel alone, reach that is given away does not come back; with a guide, the bevel is what still moves the
     tip when the guide is far behind it.
