@@ -91,7 +91,7 @@ def test_a_wrong_setting_is_one_line_wherever_it_is_used(key, value, message):
 
 def test_a_table_of_nobody_is_refused_by_a_check_and_warned_of_in_use():
     scenario = PHANTOM.with_values({"control.my_pdi.gain": 1})
-    message = r"control.my_pdi: unknown table; did you mean my_pid\? tables: adaptive_mpc, .*, my_pid; for one of your"
+    message = r"control.my_pdi: unknown table; did you mean my_pid\? tables: adaptive_mpc, .*, my_pid; one of your own"
     with pytest.raises(ScenarioError, match="^x.toml: " + message):
         checked(scenario, OWN, source="x.toml")
     with pytest.warns(ScenarioWarning, match=f"^{message}.*; it is not used$"):

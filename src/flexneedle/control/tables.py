@@ -61,7 +61,8 @@ def unowned(scenario: Scenario, methods: Iterable[Method], source: str = "") -> 
     for table in sorted(set(scenario.control.tables) - set(known)):
         close = get_close_matches(table, known, n=1)
         hint = f"did you mean {close[0]}? " if close else ""
-        rule = f"unknown table; {hint}tables: {', '.join(known)}; for one of your own give --controller module:METHOD"
+        own = "one of your own controllers needs --controller module:METHOD"
+        rule = f"unknown table; {hint}tables: {', '.join(known)}; {own}"
         lines.append(f"{opening}{key_path(('control', table))}: {rule}")
     return lines
 

@@ -30,7 +30,7 @@ def reach(
     phantom: str | PlantFactory = DEFAULT_PLANT,
     strategy: str = "manipulation",
 ) -> float:
-    """Return the miss (mm) that the needle in the tank cannot avoid, or about, in the insertion of a seed.
+    """Return the miss (mm) that an ideal controller is left with in the insertion of a seed, to about 0.5 mm.
 
     strategy: of the plans, "manipulation" or "steering". Where guide or base may move: of the best that a search with
     up to 4000 rollouts finds on the model with the phantom's true parameters. Where neither may: the distance from the

@@ -25,7 +25,8 @@ _BEYOND_REACH_MM = 0.5
 class WorldGroup:
     """The insertions that share a level of every factor; errors (mm) and shares are over the finished ones.
 
-    count, finished, failures: insertions; a failure did not finish though the target was within 1 mm of the reach.
+    count, finished, failures: insertions; a failure did not finish though its reach is at most
+    1 mm, or was held though it is at most `control.miss_limit_mm`.
     Shares (0 to 1): above 1 mm; within the greater of 0.1 mm and twice the open loop's error in the same world, and
     within that error + 0.2 mm, where open loop finished; within the reach + 0.5 mm, where it is known.
     energy_ratio: geometric mean of the true tissue's energy over the plan's. NaN is what is not known.
