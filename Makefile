@@ -75,7 +75,7 @@ worlds: setup  ## 200 random worlds in three cases with four controllers, and th
 	$(BIN)/flexneedle study worlds --resume --out $(or $(DIR),runs/worlds)
 	$(BIN)/flexneedle report $(or $(DIR),runs/worlds)
 
-tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedle/run/tuning (long)
+tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedle/study/tuning (long)
 	for method in ce-mpc bevel-only resolved-rate broyden-mpc; do \
 	  $(BIN)/python studies/tune.py $$method || exit 1; \
 	done

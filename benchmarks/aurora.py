@@ -16,8 +16,8 @@ from time import perf_counter
 import numpy as np
 import psutil
 
-from flexneedle.devices.aurora import Aurora
-from flexneedle.devices.clock import WallClock
+from flexneedle.rig.devices.aurora.tracker import Aurora
+from flexneedle.rig.devices.clock import WallClock
 
 PERIOD_S = 0.02  # of the caller's loop
 

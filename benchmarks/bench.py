@@ -19,7 +19,9 @@ import flexneedle
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.model import ESSENTIAL
 from flexneedle.mechanics.ogden import contact_law
-from flexneedle.simulator import Control, Simulator, State
+from flexneedle.simulator.control import Control
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.simulator.state import State
 
 SCENARIO = flexneedle.load_scenario("phantom")
 DEPTH_MM, STEPS, SEQUENCES = 45.0, 74, 64
@@ -28,7 +30,7 @@ US = 1e6
 FIRST_USE = """
 import time; begun = time.perf_counter()
 import flexneedle
-from flexneedle.run.kernels import compile_kernels
+from flexneedle.rig.kernels import compile_kernels
 compile_kernels()
 simulator = flexneedle.Simulator(flexneedle.load_scenario("phantom"), threads=1)
 state = simulator.step(simulator.start(), flexneedle.Control(db_x=1.0))

@@ -11,7 +11,7 @@ import argparse
 import numpy as np
 
 import flexneedle
-from flexneedle.run.kernels import compile_kernels
+from flexneedle.rig.kernels import compile_kernels
 from flexneedle.scenario.worlds import world
 
 FIRST, COUNT = 100_000, 40

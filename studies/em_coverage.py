@@ -18,10 +18,10 @@ import numpy as np
 import pyarrow as pa
 from scipy import stats
 
-from flexneedle.tracking.evaluation.accuracy import accuracy
-from flexneedle.tracking.evaluation.cells import collect
-from flexneedle.tracking.evaluation.reading import Batch
-from flexneedle.tracking.evaluation.separation import separation
+from flexneedle.em.evaluation.accuracy import accuracy
+from flexneedle.em.evaluation.cells import collect
+from flexneedle.em.evaluation.reading import Batch
+from flexneedle.em.evaluation.separation import separation
 
 GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 POINTS, SAMPLES = len(GRID), 20

@@ -16,9 +16,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from flexneedle.run.em.simulate import Experiment, measure
+from flexneedle.em.simulate import Experiment, measure
+from flexneedle.rig.tracking.table import REFERENCE, TIP
 from flexneedle.scenario.files import load_environment
-from flexneedle.tracking.table import REFERENCE, TIP
 
 Floats = NDArray[np.float64]
 IDEAL, NOISY = "ideal", "noisy"

@@ -26,12 +26,12 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from flexneedle import Scenario, load_scenario
-from flexneedle.phantom import DEFAULT_PLANT
+from flexneedle.planning.planner import plan as make_plan
 from flexneedle.plot import style
-from flexneedle.run.insertion import run as carry_out
-from flexneedle.run.planner import plan as make_plan
-from flexneedle.run.rig import Seeds, virtual_rig, virtual_room
-from flexneedle.trace import PlanRecord
+from flexneedle.rig.loop import run as carry_out
+from flexneedle.rig.phantom.plants import DEFAULT_PLANT
+from flexneedle.rig.virtual import Seeds, virtual_rig, virtual_room
+from flexneedle.types import PlanRecord
 
 FIRST_SEED = 300_000
 FAR_MM, NEAR_MM = 400.0, 30.0

@@ -16,7 +16,7 @@ import numpy as np
 
 import flexneedle
 from flexneedle import Control, Scenario, Simulator
-from flexneedle.scenario import GAUGES
+from flexneedle.scenario.sections.needle import GAUGES
 
 STEPS = 80
 BATCH = 20

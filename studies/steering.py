@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 import flexneedle
-from flexneedle.run.planner import bevel_reach
-from flexneedle.scenario import Scenario
+from flexneedle.planning.planner import bevel_reach
+from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.worlds import TRAINING, world
 
 SHARE_OF_REACH = 0.9

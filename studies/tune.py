@@ -8,7 +8,7 @@ a phantom of its own (exact plant, preset `phantom`). After twenty cases the bes
 scatter by as much as their mean, so more settings with fewer cases each would be ranked by chance. The score is the
 mean true error and a quarter of its 95 % quantile (mm); an insertion that is not done counts 5 mm. Making the plans
 is outside the budget. The table goes to stdout, everything to DIR/METHOD.json (default: the records that the package
-ships, src/flexneedle/run/tuning), the same bytes for any number of processes.
+ships, src/flexneedle/study/tuning), the same bytes for any number of processes.
 
 Every setting of the space is set in each trial, whatever is shipped for it, so that the result can be had again once
 the shipped settings are changed to it. The other settings are the shipped ones. The weights of `adaptive-mpc` are not
@@ -30,9 +30,9 @@ from typing import Any
 import numpy as np
 
 import flexneedle
-from flexneedle.run.folder import versions
-from flexneedle.trace import PlanRecord
+from flexneedle.trace.folder import versions
 from flexneedle.trace.plain import to_text
+from flexneedle.types import PlanRecord
 
 TARGETS = [(depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0)]
 STRIDE = 4  # through the targets: any few cases in a row mix depths and sides
@@ -44,7 +44,7 @@ PLAN_SEED = 0
 SCORE = f"mean + 0.25 * 95 % quantile of the true error (mm); an insertion that is not done counts {FAILED_MM:g} mm"
 # What went into a result beside its budget, by method.
 NOTES: dict[str, str] = {}
-RECORDS = Path(__file__).resolve().parents[1] / "src/flexneedle/run/tuning"
+RECORDS = Path(__file__).resolve().parents[1] / "src/flexneedle/study/tuning"
 Settings = dict[str, float]
 
 

@@ -27,16 +27,16 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from flexneedle.errors import InputError
-from flexneedle.phantom import draw
+from flexneedle.planning.planner import plan as make_plan
 from flexneedle.plot import style
-from flexneedle.run.insertion import run as carry_out
-from flexneedle.run.planner import plan as make_plan
-from flexneedle.run.rig import Seeds, virtual_rig
-from flexneedle.run.study.folder import STUDY_FILE
-from flexneedle.run.study.grid import Insertion, Study, load_study
-from flexneedle.run.study.plans import Plans, plan_key
-from flexneedle.scenario import Scenario
-from flexneedle.trace import PlanRecord
+from flexneedle.rig.loop import run as carry_out
+from flexneedle.rig.phantom.draw import draw
+from flexneedle.rig.virtual import Seeds, virtual_rig
+from flexneedle.scenario.model import Scenario
+from flexneedle.study.grid import Insertion, Study, load_study
+from flexneedle.study.plans import Plans, plan_key
+from flexneedle.trace.folder import STUDY_FILE
+from flexneedle.types import PlanRecord
 
 LAST_MM = 10.0  # before the target
 NOTHING, OTHER_PLAN = "nothing", "other plans"

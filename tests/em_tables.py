@@ -4,7 +4,7 @@ import csv
 
 import numpy as np
 
-from flexneedle.tracking.table import REQUIRED
+from flexneedle.rig.tracking.table import REQUIRED
 
 GRID = np.stack(np.meshgrid(*[np.arange(3) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from flexneedle.control.methods import METHODS
 from flexneedle.errors import RunError
-from flexneedle.trace import Insertion
+from flexneedle.types import Insertion
 from synthetic import make_periods, make_plan
 
 
@@ -53,7 +53,8 @@ def insert(
 
 def install(setattr_, **options):
     """Put both in the place of the real ones by `setattr_`; options change their defaults."""
-    from flexneedle.run import insertion, planner
+    from flexneedle.planning import planner
+    from flexneedle.rig import loop as insertion
 
     plan_options = {"miss": options.pop("plan_miss", 0.0)}
     setattr_(planner, "plan", partial(plan, **plan_options))

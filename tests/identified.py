@@ -5,11 +5,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import flexneedle
-from flexneedle.control.identification import Identification
 from flexneedle.control.methods.adaptive_mpc import AdaptiveMpc
-from flexneedle.control.prior import BASE_TURN, BASE_Y, BEND, BEVEL, CLEARANCE, MODULUS, RUN_OUT
-from flexneedle.ports import Sample
-from flexneedle.simulator import Control, Learnt, Simulator
+from flexneedle.estimation.identification import Identification
+from flexneedle.estimation.prior import BASE_TURN, BASE_Y, BEND, BEVEL, CLEARANCE, MODULUS, RUN_OUT
+from flexneedle.mechanics.model import Learnt
+from flexneedle.simulator.control import Control
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import Sample
 from tasks import begun_with
 
 PHANTOM = flexneedle.load_scenario("phantom")

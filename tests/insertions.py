@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.phantom import Phantom, draw
-from flexneedle.ports import VISIBLE, Sample
-from flexneedle.run import insertion
-from flexneedle.run.rig import Rig
-from flexneedle.tracking import NoisyTracker
+from flexneedle.rig import loop as insertion
+from flexneedle.rig.phantom.draw import draw
+from flexneedle.rig.phantom.phantom import Phantom
+from flexneedle.rig.tracking.simulated import NoisyTracker
+from flexneedle.rig.virtual import Rig
+from flexneedle.types import VISIBLE, Sample
 
 PHANTOM = flexneedle.load_scenario("phantom")
 STILL = (0.0, 0.0, 0.0, 0.0, -1)

@@ -3,7 +3,7 @@
 from typing import Any
 
 from flexneedle import load_scenario
-from flexneedle.scenario.environment import Environment
+from flexneedle.scenario.sections.environment import Environment
 
 STILL: dict[str, Any] = {
     "name": "still",

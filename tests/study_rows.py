@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from flexneedle.control.methods import DEFAULT, checked
-from flexneedle.scenario import load_scenario
+from flexneedle.scenario.files import load_scenario
 
 TARGETS = tuple((depth, aside) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for aside in (-5.0, 0.0, 5.0))
 OURS = DEFAULT

@@ -5,8 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from flexneedle.ports import Sample
-from flexneedle.trace import Insertion, Period, PlanRecord
+from flexneedle.types import Insertion, Period, PlanRecord, Sample
 
 START, LENGTH, GUIDE_X, STEP = -28.5, 150.0, -41.0, 1.0
 TURN_AT = 45  # the step that turns the bevel

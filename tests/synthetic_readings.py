@@ -2,8 +2,7 @@
 
 from dataclasses import replace
 
-from flexneedle.ports import Frame, Reading, Sample
-from flexneedle.trace import Judged
+from flexneedle.types import Frame, Judged, Reading, Sample
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 FRAMES = 8  # in a period of 0.2 s

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import flexneedle
-from flexneedle.scenario import dump_scenario
+from flexneedle.scenario.files import dump_scenario
 
 DOCS = (Path(__file__).parents[1] / "docs" / "extend.md").read_text(encoding="utf-8")
 MODULES = dict(re.findall(r"^`(\w+)\.py`:\n\n```python\n(.*?)```", DOCS, re.MULTILINE | re.DOTALL))

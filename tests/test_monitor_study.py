@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from flexneedle import load_scenario
-from flexneedle.ports import Frame, Reading, Sample
-from flexneedle.trace import Judged
+from flexneedle.types import Frame, Judged, Reading, Sample
 from synthetic import make_periods, make_plan
 
 _SCRIPT = Path(__file__).parents[1] / "studies" / "monitor.py"

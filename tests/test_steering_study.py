@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from flexneedle.run.planner import bevel_reach
+from flexneedle.planning.planner import bevel_reach
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import steering

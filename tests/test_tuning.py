@@ -13,11 +13,11 @@ from numpy.testing import assert_allclose
 
 import flexneedle
 from flexneedle.control.methods import METHODS, checked
-from flexneedle.run.report.reading import read_tuning
+from flexneedle.study.report.reading import read_tuning
 from flexneedle.trace.plain import to_text
 
 SCRIPT = Path(__file__).resolve().parents[1] / "studies" / "tune.py"
-SHIPPED = files("flexneedle.run") / "tuning"
+SHIPPED = files("flexneedle.study") / "tuning"
 TUNED = sorted(item.name.removesuffix(".json") for item in SHIPPED.iterdir())
 NOT_TUNED = {"open-loop", "adaptive-mpc"}  # nothing to choose; chosen on random worlds
 

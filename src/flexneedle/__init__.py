@@ -7,9 +7,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .control.estimate import Estimate
-    from .control.interface import Decision, Method, Task, travel_left
-    from .errors import (
+    from flexneedle.control.interface import Decision, Method, travel_left
+    from flexneedle.errors import (
         CommandError,
         FlexneedleError,
         InputError,
@@ -18,12 +17,20 @@ if TYPE_CHECKING:
         ScenarioWarning,
         StateError,
     )
-    from .phantom import Plant, Truth
-    from .ports import Sample, TipTracker
-    from .run.insertion import insert
-    from .run.planner import plan
-    from .scenario import Scenario, Section, load_scenario
-    from .simulator import Control, Simulator, State
+    from flexneedle.estimation.estimate import Estimate
+    from flexneedle.estimation.task import Task
+    from flexneedle.planning.planner import plan
+    from flexneedle.rig.loop import insert
+    from flexneedle.rig.phantom.draw import Truth
+    from flexneedle.rig.phantom.plants import Plant
+    from flexneedle.rig.ports import TipTracker
+    from flexneedle.scenario.files import load_scenario
+    from flexneedle.scenario.model import Scenario
+    from flexneedle.scenario.sections.fields import Section
+    from flexneedle.simulator.control import Control
+    from flexneedle.simulator.simulator import Simulator
+    from flexneedle.simulator.state import State
+    from flexneedle.types import Sample
 
 __version__ = "0.1.0"
 
@@ -56,18 +63,25 @@ __all__ = [
 ]
 
 _HOMES = {
-    "control.estimate": ("Estimate",),
-    "control.interface": ("Decision", "Method", "Task", "travel_left"),
+    "control.interface": ("Decision", "Method", "travel_left"),
     "errors": (
         *("CommandError", "FlexneedleError", "InputError", "RunError", "ScenarioError", "ScenarioWarning"),
         "StateError",
     ),
-    "phantom": ("Plant", "Truth"),
-    "ports": ("Sample", "TipTracker"),
-    "run.insertion": ("insert",),
-    "run.planner": ("plan",),
-    "scenario": ("Scenario", "Section", "load_scenario"),
-    "simulator": ("Control", "Simulator", "State"),
+    "estimation.estimate": ("Estimate",),
+    "estimation.task": ("Task",),
+    "planning.planner": ("plan",),
+    "rig.loop": ("insert",),
+    "rig.phantom.draw": ("Truth",),
+    "rig.phantom.plants": ("Plant",),
+    "rig.ports": ("TipTracker",),
+    "scenario.files": ("load_scenario",),
+    "scenario.model": ("Scenario",),
+    "scenario.sections.fields": ("Section",),
+    "simulator.control": ("Control",),
+    "simulator.simulator": ("Simulator",),
+    "simulator.state": ("State",),
+    "types": ("Sample",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -1,15 +1,5 @@
 """The one tree of errors. A message is one line: the value, the rule, the valid choices."""
 
-__all__ = [
-    "CommandError",
-    "FlexneedleError",
-    "InputError",
-    "RunError",
-    "ScenarioError",
-    "ScenarioWarning",
-    "StateError",
-]
-
 
 class FlexneedleError(Exception):
     """Root of all errors that flexneedle raises on purpose."""

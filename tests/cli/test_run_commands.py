@@ -15,7 +15,7 @@ from fake_engine import install
 from flexneedle.cli import main as cli
 from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.errors import RunError
-from flexneedle.phantom import DEFAULT_PLANT, PLANTS
+from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PLANTS
 from flexneedle.trace.columns import COLUMNS
 from flexneedle.trace.reader import read_trace
 from synthetic import make_periods
@@ -177,9 +177,9 @@ def test_an_insertion_that_fails_is_recorded_with_its_controller(engine, capsys,
 
 def test_the_first_compilation_is_announced(engine, capsys, monkeypatch):
     engine()
-    monkeypatch.setattr("flexneedle.run.kernels.all_compiled", lambda: False)
+    monkeypatch.setattr("flexneedle.rig.kernels.all_compiled", lambda: False)
     assert "Compiling the mechanics, this once …" in run(capsys, "plan")[2]
-    monkeypatch.setattr("flexneedle.run.kernels.all_compiled", lambda: True)
+    monkeypatch.setattr("flexneedle.rig.kernels.all_compiled", lambda: True)
     assert "Compiling" not in run(capsys, "plan")[2]
 
 
@@ -252,7 +252,7 @@ def test_ctrl_c_while_planning_marks_the_record(engine, capsys, in_tmp, monkeypa
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("flexneedle.run.planner.plan", interrupted)
+    monkeypatch.setattr("flexneedle.planning.planner.plan", interrupted)
     status, out, err = run(capsys, "insert", "--out", "here")
     assert (status, out, err.splitlines()[-1]) == (130, "", "flexneedle: interrupted")
     assert json.loads((in_tmp / "here/run.json").read_text())["status"] == "interrupted"

@@ -13,7 +13,8 @@ import flexneedle
 from flexneedle.cli import main as cli
 from flexneedle.control.methods import METHODS, checked
 from flexneedle.errors import RunError
-from flexneedle.scenario import Scenario, load_scenario
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.model import Scenario
 
 
 def run(capsys, *argv):
@@ -137,7 +138,7 @@ def test_errors_become_a_line_and_a_status(raised, status, told, capsys, monkeyp
     def fail(_source):
         raise raised
 
-    monkeypatch.setattr("flexneedle.scenario.load_scenario", fail)
+    monkeypatch.setattr("flexneedle.scenario.files.load_scenario", fail)
     assert run(capsys, "scenario", "show", "phantom") == (status, "", told)
 
 

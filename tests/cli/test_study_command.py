@@ -11,8 +11,8 @@ import pytest
 
 from flexneedle.cli import main as cli
 from flexneedle.cli import study as study_command
-from flexneedle.run.study import pools, rows
-from flexneedle.run.study.runner import Advance
+from flexneedle.study import pools, rows
+from flexneedle.study.runner import Advance
 
 STUDY = """\
 name = "my study"

@@ -9,18 +9,20 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 import flexneedle
-from flexneedle.control.estimate import Move
-from flexneedle.control.identification import Identification
 from flexneedle.control.interface import travel_left
 from flexneedle.control.methods import DEFAULT, METHODS, adaptive_mpc
 from flexneedle.control.path import of_plan
-from flexneedle.control.prior import RUN_OUT
+from flexneedle.estimation.estimate import Move
+from flexneedle.estimation.identification import Identification
+from flexneedle.estimation.prior import RUN_OUT
+from flexneedle.mechanics.model import Learnt
 from flexneedle.planning import terms
+from flexneedle.planning.planner import bevel_reach
 from flexneedle.planning.terms import charges, cost
-from flexneedle.ports import Sample
-from flexneedle.run.planner import bevel_reach
 from flexneedle.scenario.worlds import world
-from flexneedle.simulator import Control, Learnt, Simulator
+from flexneedle.simulator.control import Control
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import Sample
 from tasks import begun_with, task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")

@@ -8,7 +8,8 @@ import pytest
 import flexneedle
 from flexneedle.control import bang_bang
 from flexneedle.control.methods import METHODS
-from flexneedle.simulator import Control, Simulator
+from flexneedle.simulator.control import Control
+from flexneedle.simulator.simulator import Simulator
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")

@@ -14,7 +14,7 @@ from scipy.optimize import lsq_linear
 import flexneedle
 from flexneedle.control.methods import METHODS
 from flexneedle.control.methods import broyden_mpc as bm
-from flexneedle.simulator import Simulator
+from flexneedle.simulator.simulator import Simulator
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")

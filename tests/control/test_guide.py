@@ -9,9 +9,9 @@ from flexneedle.control.guide import check_guide, guide_may_move, most_guide_ste
 from flexneedle.control.methods import METHODS
 from flexneedle.control.mpc import CeMpc
 from flexneedle.errors import InputError
-from flexneedle.run.folder import Folder
-from flexneedle.run.recording import Choices, record_insertion
-from flexneedle.simulator import Simulator
+from flexneedle.runs.recording import Choices, record_insertion
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.trace.folder import Folder
 
 PHANTOM = flexneedle.load_scenario("phantom")
 BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})

@@ -13,8 +13,9 @@ import flexneedle
 from flexneedle.control.interface import travel_left
 from flexneedle.control.methods import DEFAULT, METHODS, method
 from flexneedle.errors import InputError
-from flexneedle.phantom import PLANTS
-from flexneedle.simulator import Control, Simulator
+from flexneedle.rig.phantom.plants import PLANTS
+from flexneedle.simulator.control import Control
+from flexneedle.simulator.simulator import Simulator
 from tasks import task_of
 
 # Only the default controller estimates an axial start error.

@@ -7,10 +7,12 @@ import pytest
 
 import flexneedle
 from flexneedle.control import bang_bang, mpc
-from flexneedle.control.interface import Task, at_depth
+from flexneedle.control.interface import at_depth
 from flexneedle.control.methods import METHODS
+from flexneedle.estimation.task import Task
 from flexneedle.planning.terms import Outcome, cost
-from flexneedle.simulator import Control, Simulator
+from flexneedle.simulator.control import Control
+from flexneedle.simulator.simulator import Simulator
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")

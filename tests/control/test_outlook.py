@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from flexneedle.control import outlook as ol
 from flexneedle.control.outlook import Outlook
-from flexneedle.control.prior import RUN_OUT
+from flexneedle.estimation.prior import RUN_OUT
 from identified import NEEDLES, followed
 
 TARGET = 40.0

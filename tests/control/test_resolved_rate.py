@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 import flexneedle
 from flexneedle.control.methods import METHODS, resolved_rate
-from flexneedle.simulator import Control, Simulator
+from flexneedle.simulator.control import Control
+from flexneedle.simulator.simulator import Simulator
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")

@@ -10,9 +10,10 @@ from flexneedle.control import tables
 from flexneedle.control.interface import Method
 from flexneedle.control.methods import DEFAULT, METHODS, checked, used
 from flexneedle.errors import InputError, ScenarioError, ScenarioWarning
-from flexneedle.scenario import Scenario, dump_scenario
-from flexneedle.scenario.fields import NonNegative, Section
-from flexneedle.simulator import Simulator
+from flexneedle.scenario.files import dump_scenario
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.fields import NonNegative, Section
+from flexneedle.simulator.simulator import Simulator
 
 PHANTOM = flexneedle.load_scenario("phantom")
 

@@ -4,15 +4,7 @@ import numpy as np
 import pytest
 
 from flexneedle.mechanics import needle as nd
-from flexneedle.mechanics.model import (
-    CONTACT,
-    GUIDE,
-    Learnt,
-    Model,
-    adapted,
-    contact_nodes,
-    tissue_layers,
-)
+from flexneedle.mechanics.model import CONTACT, GUIDE, Learnt, Model, adapted, contact_nodes, tissue_layers
 
 THICKNESS = (6.0, 3.5, np.inf)
 MU = np.array([1e-3, 4e-3, 2e-3])

@@ -9,12 +9,14 @@ import pytest
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.text import Text
 
-from flexneedle.plot import insertion_figure, plan_figure, save
 from flexneedle.plot.curves import held_spans, worst_indicator
+from flexneedle.plot.insertion import insertion_figure
 from flexneedle.plot.panels import spread_out
-from flexneedle.ports import Sample
-from flexneedle.scenario import Scenario, load_scenario
-from flexneedle.trace import Insertion, Judged
+from flexneedle.plot.plans import plan_figure
+from flexneedle.plot.style import save
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.model import Scenario
+from flexneedle.types import Insertion, Judged, Sample
 from synthetic import GUIDE_X, blind, make_insertion, make_plan
 from synthetic_readings import frame_of, held, with_readings
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from flexneedle import Control, Scenario, Simulator
-from flexneedle.simulator import State
+from flexneedle.simulator.state import State
 
 EI = 200e3 * np.pi * 0.4**4 / 64  # of `long_beam`, N·mm²
 LENGTH_MM = 10.0  # 1/β of `long_beam`

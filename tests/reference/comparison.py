@@ -3,7 +3,7 @@
 import numpy as np
 
 from flexneedle import Control, Scenario, Simulator
-from flexneedle.simulator import State
+from flexneedle.simulator.state import State
 from reference.insertion import Pose, Reference
 
 _AT_THE_FRONT = 1  # points that rounding puts on either side of it

@@ -3,7 +3,7 @@
 import numpy as np
 
 import flexneedle
-from flexneedle.scenario import Scenario
+from flexneedle.scenario.model import Scenario
 
 GAUGES = ("18G", "19G", "20G", "21G", "22G", "23G")
 

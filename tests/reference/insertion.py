@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexneedle.scenario import Scenario
-from flexneedle.simulator import Control
+from flexneedle.scenario.model import Scenario
+from flexneedle.simulator.control import Control
 
 TOLERANCE_MM = 1e-11
 _FLOOR = 0.3

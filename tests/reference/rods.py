@@ -8,9 +8,9 @@ from types import ModuleType
 import numpy as np
 
 from flexneedle import load_scenario
-from flexneedle.phantom import Truth
-from flexneedle.phantom import rod as rd
-from flexneedle.phantom.plants import ExactPlant
+from flexneedle.rig.phantom import rod as rd
+from flexneedle.rig.phantom.draw import Truth
+from flexneedle.rig.phantom.plants import ExactPlant
 
 ZEROS = (
     "shear_modulus_variation",
@@ -128,7 +128,7 @@ class Shooting:
     """Section 11 of docs/theory.md the plain way: the continuous rod, integrated from its tip to its base.
 
     Forces in balance take the place of a minimum of energy, Runge and Kutta's rule that of segments, and the pose of
-    the tip is looked for that brings the far end to the clamp. Nothing is shared with flexneedle.phantom.rod but what
+    the tip is looked for that brings the far end to the clamp. Nothing is shared with `rig.phantom.rod` but what
     the section says of a step; `points` are those of the channel, [x, y] in the order in which they were cut.
     """
 

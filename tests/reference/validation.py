@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 
 from flexneedle import Control, Simulator
-from flexneedle.phantom import Truth
-from flexneedle.phantom import rod as rd
+from flexneedle.rig.phantom import rod as rd
+from flexneedle.rig.phantom.draw import Truth
 from reference import closed_forms, elastica
 from reference.cases import EI, FOUNDATION, long_beam
 from reference.rods import IDEAL, PERFECT, Bench, Shooting, move, plant

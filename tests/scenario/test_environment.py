@@ -3,8 +3,9 @@
 import pytest
 
 from flexneedle.errors import ScenarioError
-from flexneedle.scenario import Scenario, dump_scenario, load_scenario
-from flexneedle.scenario.environment import environment_names
+from flexneedle.scenario.files import dump_scenario, load_scenario
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.environment import environment_names
 
 PLATE = "tracker.environment.plate.distance_mm"
 

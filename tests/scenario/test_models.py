@@ -12,7 +12,10 @@ from pydantic import ValidationError
 from flexneedle.control.bang_bang import BevelRule
 from flexneedle.control.methods import checked
 from flexneedle.errors import ScenarioError
-from flexneedle.scenario import GAUGES, Scenario, check_target, dump_scenario, load_scenario, preset_names
+from flexneedle.scenario.files import dump_scenario, load_scenario
+from flexneedle.scenario.model import Scenario, check_target
+from flexneedle.scenario.preset import preset_names
+from flexneedle.scenario.sections.needle import GAUGES
 
 PHANTOM = load_scenario("phantom")
 

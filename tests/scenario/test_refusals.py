@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from flexneedle.control.methods import checked
 from flexneedle.errors import ScenarioError
-from flexneedle.scenario import Scenario, load_scenario
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.model import Scenario
 
 PHANTOM = checked(load_scenario("phantom"))
 HUGE = 10**400

@@ -8,7 +8,8 @@ import tomli_w
 
 from flexneedle.control.methods import checked
 from flexneedle.errors import ScenarioError, ScenarioWarning
-from flexneedle.scenario import Scenario, dump_scenario, load_scenario
+from flexneedle.scenario.files import dump_scenario, load_scenario
+from flexneedle.scenario.model import Scenario
 
 PHANTOM = load_scenario("phantom")
 OLD = {

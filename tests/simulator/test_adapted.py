@@ -7,7 +7,7 @@ import pytest
 
 from flexneedle import Control, Simulator, load_scenario
 from flexneedle.mechanics import needle as nd
-from flexneedle.simulator import Learnt
+from flexneedle.mechanics.model import Learnt
 from reference import closed_forms as exact
 from reference.cases import EI, FOUNDATION, LENGTH_MM, insert_to, long_beam, repeat
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from flexneedle import Control, Simulator, load_scenario
 from flexneedle.mechanics import needle as nd
-from flexneedle.simulator import Learnt
+from flexneedle.mechanics.model import Learnt
 from reference.cases import repeat
 
 PHANTOM = load_scenario("phantom")

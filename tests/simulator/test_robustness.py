@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexneedle.simulator import Rollout
+from flexneedle.simulator.simulator import Rollout
 
 STUDY = Path(__file__).parents[2] / "studies" / "robustness.py"
 

@@ -16,12 +16,11 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from flexneedle.errors import InputError
-from flexneedle.ports import Frame, Reading, Sample
-from flexneedle.trace import Judged
 from flexneedle.trace.columns import COLUMNS, to_row
 from flexneedle.trace.reader import read_trace
 from flexneedle.trace.topics import TOPICS
 from flexneedle.trace.writer import TraceWriter
+from flexneedle.types import Frame, Judged, Reading, Sample
 from synthetic import blind, make_periods, make_plan
 
 PLAN = make_plan()

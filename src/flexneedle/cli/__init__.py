@@ -1,1 +1,1 @@
-"""The command line: reads arguments, calls `run`, prints. It knows no physics."""
+"""The command line: reads arguments, calls, prints. It knows no physics."""

@@ -7,9 +7,7 @@ import signal
 import sys
 from pathlib import Path
 
-from .common import seed
-
-__all__ = ["add_parser"]
+from flexneedle.console.common import seed
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -43,12 +41,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _emulate_aurora(args: argparse.Namespace) -> int:
     from time import monotonic
 
-    from flexneedle.devices.emulator.aurora import FIRMWARE, fresh
-    from flexneedle.devices.emulator.faults import parse_fault
-    from flexneedle.devices.emulator.motion import CENTRE
-    from flexneedle.devices.emulator.orders import Orders
-    from flexneedle.devices.emulator.server import Serial, Session, serve
-    from flexneedle.devices.priority import come_first
+    from flexneedle.rig.devices.priority import come_first
+    from flexneedle.rig.emulator.aurora import FIRMWARE, fresh
+    from flexneedle.rig.emulator.faults import parse_fault
+    from flexneedle.rig.emulator.motion import CENTRE
+    from flexneedle.rig.emulator.orders import Orders
+    from flexneedle.rig.emulator.server import Serial, Session, serve
 
     faults = [parse_fault(spec) for spec in args.fault]
     device = fresh(args.sensors, args.firmware or FIRMWARE, knows_bx=not args.no_bx)

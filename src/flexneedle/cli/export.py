@@ -8,8 +8,6 @@ from pathlib import Path
 
 from flexneedle.errors import InputError
 
-__all__ = ["add_parser"]
-
 _PERIODS, _READINGS, _STDOUT = "periods.csv", "readings.csv", "-"
 _MORE = """
 --readings: one row a reading of the tracker, the units in the header.
@@ -49,8 +47,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _export(args: argparse.Namespace) -> int:
-    from flexneedle.run.export import write_csv, write_readings
-    from flexneedle.run.figures import load_insertion
+    from flexneedle.runs.figures import load_insertion
+    from flexneedle.trace.export import write_csv, write_readings
 
     if args.csv is not None:
         write, name, default = write_csv, args.csv, _PERIODS

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .common import (
+from flexneedle.console.common import (
     add_run_arguments,
     chosen_scenario,
     compile_first,
@@ -18,13 +18,10 @@ from .common import (
 )
 
 if TYPE_CHECKING:
-    from flexneedle.run.recording import Choices
-    from flexneedle.scenario import Scenario
-    from flexneedle.trace import Insertion, Period
-
-    from .progress import Progress
-
-__all__ = ["add_parser"]
+    from flexneedle.console.progress import Progress
+    from flexneedle.runs.recording import Choices
+    from flexneedle.scenario.model import Scenario
+    from flexneedle.types import Insertion, Period
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -72,18 +69,17 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _insert(args: argparse.Namespace) -> int:
-    from flexneedle.run.folder import Folder
-    from flexneedle.run.parts import own_controllers
-    from flexneedle.run.recording import check_choices, record_insertion
-
-    from .progress import Progress
+    from flexneedle.console.progress import Progress
+    from flexneedle.rig.parts import own_controllers
+    from flexneedle.runs.recording import check_choices, record_insertion
+    from flexneedle.trace.folder import Folder
 
     if args.list:
         return _list()
     choices = _choices(args)
     scenario = chosen_scenario(args, *own_controllers([choices.controller]))
     if args.registration is not None:
-        from flexneedle.run.em.register import load_registration
+        from flexneedle.scenario.files import load_registration
 
         scenario = load_registration(args.registration, scenario)
     check_choices(scenario, choices)
@@ -104,7 +100,7 @@ def _insert(args: argparse.Namespace) -> int:
 
 
 def _choices(args: argparse.Namespace) -> Choices:
-    from flexneedle.run.recording import Choices
+    from flexneedle.runs.recording import Choices
 
     chosen = {"controller": args.controller, "phantom": args.phantom, "tracker": args.tracker}
     named = {name: value for name, value in chosen.items() if value is not None}
@@ -145,7 +141,7 @@ class _Show:
 
 
 def _report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:
-    from flexneedle.run.results import insertion_result, insertion_timing
+    from flexneedle.trace.results import insertion_result, insertion_timing
 
     if insertion.outcome == "interrupted":
         print(f"flexneedle: interrupted: the record is in {folder}", file=sys.stderr)
@@ -159,8 +155,7 @@ def _report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Pat
 
 
 def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
-    from flexneedle.run.results import insertion_result, insertion_timing
-    from flexneedle.trace.summary import verdict
+    from flexneedle.trace.results import insertion_result, insertion_timing
 
     result, timing = insertion_result(insertion), insertion_timing(insertion)
     depth, lateral = insertion.target
@@ -181,11 +176,11 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         ("time of the plan", _number(timing["plan_seconds"], "s")),
         ("time of a period, median", _number(timing["period_ms"]["p50"], "ms")),
     ]
-    print_table(verdict(insertion)[:1].upper() + verdict(insertion)[1:], rows, folder)
+    print_table(insertion.summary[:1].upper() + insertion.summary[1:], rows, folder)
 
 
 def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, str]]:
-    from flexneedle.run.em.register import expected_error
+    from flexneedle.rig.tracking.registration import expected_error
 
     if scenario.tracker.registration is None:
         return []

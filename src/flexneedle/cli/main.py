@@ -10,16 +10,15 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Any
 
 from flexneedle import __version__
+from flexneedle.cli import emulate, export, insert, plan, report, scenario, study, view
 from flexneedle.errors import FlexneedleError, InputError, ScenarioWarning
 
-from . import em, emulate, export, insert, plan, report, scenario, study, view
-
-__all__ = ["build_parser", "main"]
-
-_COMMANDS = (plan, insert, study, report, view, export, scenario, em, emulate)
+_EM = import_module("flexneedle.em.commands.group")  # by name: no room depends on em
+_COMMANDS = (plan, insert, study, report, view, export, scenario, _EM, emulate)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -6,14 +6,20 @@ import argparse
 from math import degrees, isnan
 from typing import TYPE_CHECKING, Any
 
-from .common import add_run_arguments, chosen_scenario, compile_first, print_json, print_table, run_name
+from flexneedle.console.common import (
+    add_run_arguments,
+    chosen_scenario,
+    compile_first,
+    print_json,
+    print_table,
+    run_name,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from flexneedle.trace import PlanRecord
+    from flexneedle.types import PlanRecord
 
-__all__ = ["add_parser"]
 
 _STRATEGIES = ("manipulation", "steering")
 
@@ -32,10 +38,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _plan(args: argparse.Namespace) -> int:
-    from flexneedle.run.folder import Folder
-    from flexneedle.run.recording import record_plans
-
-    from .progress import Progress
+    from flexneedle.console.progress import Progress
+    from flexneedle.runs.recording import record_plans
+    from flexneedle.trace.folder import Folder
 
     scenario = chosen_scenario(args)
     compile_first()
@@ -53,14 +58,13 @@ def _plan(args: argparse.Namespace) -> int:
 
 
 def _report(plans: dict[str, PlanRecord], as_json: bool, folder: Path) -> None:
-    from flexneedle.run.results import plan_result, plan_timing
-    from flexneedle.trace.summary import plan_verdict
+    from flexneedle.trace.results import plan_result, plan_timing
 
     if as_json:
         results = {name: {**plan_result(plan), "timing": plan_timing(plan)} for name, plan in plans.items()}
         print_json(results if len(results) > 1 else next(iter(results.values())))
         return
-    title = "\n".join(f"Plan ({name}) {plan_verdict(plan)}" for name, plan in plans.items())
+    title = "\n".join(f"Plan ({name}) {plan.summary}" for name, plan in plans.items())
     columns = [_rows(plan) for plan in plans.values()]
     names = dict.fromkeys(name for column in columns for name in column)
     rows = [(name, *(column.get(name, "") for column in columns)) for name in names]
@@ -68,9 +72,8 @@ def _report(plans: dict[str, PlanRecord], as_json: bool, folder: Path) -> None:
 
 
 def _rows(plan: PlanRecord) -> dict[str, str]:
-    from flexneedle.trace.summary import entry_angle
 
-    angle = entry_angle(plan)
+    angle = plan.entry_angle
     depth, lateral = plan.target
     return {
         "target, depth and lateral offset": f"{depth:g}, {lateral:g} mm",

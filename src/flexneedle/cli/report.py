@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .common import print_json
-
-__all__ = ["add_parser"]
+from flexneedle.console.common import print_json
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -32,7 +30,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _report(args: argparse.Namespace) -> int:
-    from flexneedle.run.report import write_report
+    from flexneedle.study.report.report import write_report
 
     report = write_report(args.study, args.out, args.tuning)
     if args.json:

@@ -6,9 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from flexneedle.scenario import Scenario
-
-__all__ = ["add_parser"]
+    from flexneedle.scenario.model import Scenario
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -42,7 +40,8 @@ def _add_controller(parser: argparse.ArgumentParser) -> None:
 
 
 def _list(_args: argparse.Namespace) -> int:
-    from flexneedle.scenario import load_scenario, preset_names
+    from flexneedle.scenario.files import load_scenario
+    from flexneedle.scenario.preset import preset_names
 
     for name in preset_names():
         print(f"{name:12} {load_scenario(name).name}")
@@ -50,7 +49,7 @@ def _list(_args: argparse.Namespace) -> int:
 
 
 def _show(args: argparse.Namespace) -> int:
-    from flexneedle.scenario import dump_scenario
+    from flexneedle.scenario.files import dump_scenario
 
     print(dump_scenario(_checked(args)), end="")
     return 0
@@ -64,8 +63,8 @@ def _check(args: argparse.Namespace) -> int:
 def _checked(args: argparse.Namespace) -> Scenario:
     """The scenario with all defaults, those of the controllers too."""
     from flexneedle.control.methods import checked
-    from flexneedle.run.parts import controller_of
-    from flexneedle.scenario import load_scenario
+    from flexneedle.rig.parts import controller_of
+    from flexneedle.scenario.files import load_scenario
 
     own = [controller_of(name)[1] for name in args.controller]
     return checked(load_scenario(args.scenario), *own, source=args.scenario)

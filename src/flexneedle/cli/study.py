@@ -10,15 +10,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .common import compile_first, print_json
+from flexneedle.console.common import compile_first, print_json
 
 if TYPE_CHECKING:
-    from flexneedle.run.study.grid import Study
-    from flexneedle.run.study.runner import Advance
+    from flexneedle.console.progress import Progress
+    from flexneedle.study.grid import Study
+    from flexneedle.study.runner import Advance
 
-    from .progress import Progress
-
-__all__ = ["add_parser"]
 
 _TABLE_WIDTH = 120  # a row stays a row where it is piped to a file
 _STAGES = ("Planning", "Inserting")
@@ -56,13 +54,12 @@ def _workers(text: str) -> int:
 
 
 def _study(args: argparse.Namespace) -> int:
+    from flexneedle.console.progress import Progress
     from flexneedle.errors import InputError, RunError
-    from flexneedle.run.study.folder import free_folder
-    from flexneedle.run.study.grid import load_study
-    from flexneedle.run.study.pools import check_address
-    from flexneedle.run.study.runner import run_study
-
-    from .progress import Progress
+    from flexneedle.study.folder import free_folder
+    from flexneedle.study.grid import load_study
+    from flexneedle.study.pools import check_address
+    from flexneedle.study.runner import run_study
 
     if args.resume and args.out is None:
         raise InputError("--resume needs the folder of the study: give it with --out DIR")
@@ -154,8 +151,8 @@ def _duration(seconds: float) -> str:
 
 
 def _report(study: Study, folder: Path, as_json: bool, seconds: float) -> int:
-    from flexneedle.run.study.summary import summarise
     from flexneedle.scenario.problems import printable
+    from flexneedle.study.summary import summarise
 
     summary = summarise(folder, study)
     summary["time"]["wall_s"] = seconds

@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-__all__ = ["add_parser"]
-
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle`."""
@@ -16,7 +14,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _view(args: argparse.Namespace) -> int:
-    from flexneedle.run.figures import draw_run
+    from flexneedle.runs.figures import draw_run
 
     for path in draw_run(args.run):
         print(path)

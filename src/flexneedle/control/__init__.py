@@ -1,1 +1,1 @@
-"""Closed-loop control of an insertion (paper section III-B): observe, decide, turn the bevel."""
+"""Closed-loop control of an insertion (paper section III-B): a controller a file in `methods`."""

@@ -5,9 +5,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.control.estimate import Estimate
-from flexneedle.control.interface import Task
-from flexneedle.scenario.fields import Fraction, NonNegative, Section
+from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.task import Task
+from flexneedle.scenario.sections.fields import Fraction, NonNegative, Section
 
 Floats = NDArray[np.float64]
 _SURE = 3.0  # standard deviations of a reading: no bevel turn for less

@@ -3,9 +3,7 @@
 import math
 
 from flexneedle.control.interface import Decision
-from flexneedle.scenario import Control
-
-__all__ = ["hopeless", "likely_misses", "missed", "probability_beyond", "warning"]
+from flexneedle.scenario.sections.settings import Control
 
 _RADIUS_MM = 1.0  # of the paper's target circles: an insertion that ends beyond has missed
 _LIKELY = 0.5  # probability of that from which a decision counts towards a warning

@@ -2,9 +2,7 @@
 
 from flexneedle.control.interface import Method
 from flexneedle.errors import InputError
-from flexneedle.scenario import Setup
-
-__all__ = ["check_guide", "guide_may_move", "most_guide_step"]
+from flexneedle.scenario.sections.apparatus import Setup
 
 _STILL = "steering"  # the strategy in which the bevel alone steers
 

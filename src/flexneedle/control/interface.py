@@ -9,18 +9,16 @@ from typing import Any, Protocol
 import numpy as np
 from pydantic import ValidationError
 
-from flexneedle.control.estimate import Estimate
-from flexneedle.control.observer import Beliefs
-from flexneedle.control.task import Task
 from flexneedle.errors import InputError
-from flexneedle.ports import Command
-from flexneedle.scenario import Control, Scenario
-from flexneedle.scenario.fields import Section
-from flexneedle.simulator import State
+from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.task import Task
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.fields import Section
+from flexneedle.scenario.sections.settings import Control
 from flexneedle.simulator.control import COLUMNS
-from flexneedle.trace import PlanRecord
-
-__all__ = ["Decision", "Method", "Observer", "Task", "at_depth", "travel_left"]
+from flexneedle.simulator.state import State
+from flexneedle.types import Command, PlanRecord
 
 _CORRECTED_MODEL = Beliefs()
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")

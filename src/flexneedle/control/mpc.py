@@ -9,11 +9,17 @@ from numpy.typing import NDArray
 from flexneedle.control.bang_bang import BevelRule
 from flexneedle.control.guide import most_guide_step
 from flexneedle.control.interface import travel_left
-from flexneedle.planning import Outcome, Search, Term, Variables, best, terms
-from flexneedle.scenario import Scenario, Setup, elite_count
-from flexneedle.scenario.fields import Fraction, NonNegative, count
-from flexneedle.simulator import Simulator, State
-from flexneedle.trace import PlanRecord
+from flexneedle.planning import terms
+from flexneedle.planning.cross_entropy import Search
+from flexneedle.planning.horizon import Variables, best
+from flexneedle.planning.terms import Outcome, Term
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.apparatus import Setup
+from flexneedle.scenario.sections.fields import Fraction, NonNegative, count
+from flexneedle.scenario.sections.settings import elite_count
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.simulator.state import State
+from flexneedle.types import PlanRecord
 
 Floats = NDArray[np.float64]
 _LEAST_ADVANCE = 0.5  # of the longest step: standing still is no way to reduce the cost

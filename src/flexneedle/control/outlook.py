@@ -16,10 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.control.identification import Identified
-from flexneedle.control.prior import RUN_OUT
-
-__all__ = ["UNCORRECTED", "Outlook"]
+from flexneedle.estimation.identification import Identified
+from flexneedle.estimation.prior import RUN_OUT
 
 Floats = NDArray[np.float64]
 UNCORRECTED = 5.0

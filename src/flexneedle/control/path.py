@@ -11,13 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.control.guide import most_guide_step
-from flexneedle.control.interface import Task, travel_left
+from flexneedle.control.interface import travel_left
 from flexneedle.control.mpc import planned_base
-from flexneedle.ports import Command
-from flexneedle.simulator import State
-from flexneedle.trace import PlanRecord
-
-__all__ = ["KNOTS", "LEAST_SLOTS", "Ahead", "Path", "of_plan", "proposals"]
+from flexneedle.estimation.task import Task
+from flexneedle.simulator.state import State
+from flexneedle.types import Command, PlanRecord
 
 Floats = NDArray[np.float64]
 KNOTS = np.array([0.1, 0.3, 0.6, 1.0])

@@ -11,14 +11,13 @@ from typing import Any
 from pydantic import ValidationError, create_model
 
 from flexneedle.control.interface import Method
-from flexneedle.control.task import Task
 from flexneedle.errors import InputError, ScenarioError
-from flexneedle.scenario import Control, Scenario
+from flexneedle.estimation.task import Task
+from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import describe, key_path
-from flexneedle.simulator import Simulator
-from flexneedle.trace import PlanRecord
-
-__all__ = ["completed", "task", "typed_scenario", "unowned"]
+from flexneedle.scenario.sections.settings import Control
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import PlanRecord
 
 
 @cache

@@ -9,23 +9,7 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.ports import Frame
-from flexneedle.trace import Insertion, PlanRecord
-
-__all__ = [
-    "Turn",
-    "applied_turns",
-    "estimated_path",
-    "good_samples",
-    "held_spans",
-    "lateral_error",
-    "planned_turns",
-    "refused_samples",
-    "shapes_on_the_way",
-    "true_energy",
-    "true_path",
-    "worst_indicator",
-]
+from flexneedle.types import Frame, Insertion, PlanRecord
 
 Floats = NDArray[np.float64]
 

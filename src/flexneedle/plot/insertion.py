@@ -30,11 +30,8 @@ from flexneedle.plot.style import (
     signed,
     styled,
 )
-from flexneedle.scenario import Scenario
-from flexneedle.trace import Insertion
-from flexneedle.trace.summary import verdict
-
-__all__ = ["insertion_figure"]
+from flexneedle.scenario.model import Scenario
+from flexneedle.types import Insertion
 
 # Places in inches from the top left.
 _LEFT, _RIGHT, _HEAD = 0.62, 0.15, 0.72
@@ -56,7 +53,7 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
     ]
     window = scene.view_of(scenario, max(plan.target[0], float(known[1][:, 0].max())), known)
     width = WIDTH - _LEFT - _RIGHT
-    title, ended = _title(scenario, insertion), wrap(verdict(insertion), _CHARACTERS)
+    title, ended = _title(scenario, insertion), wrap(insertion.summary, _CHARACTERS)
     head = _HEAD + (len(title) - 1) * _TITLE_LINE + (len(ended) - 1) * _VERDICT_LINE
     below = head + width * window.ratio + 0.98
     field = curves.worst_indicator(insertion, scenario.monitor.indicator_window_s)

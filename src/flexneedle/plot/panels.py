@@ -11,9 +11,7 @@ from matplotlib.patheffects import withStroke
 from flexneedle.plot.curves import Floats
 from flexneedle.plot.scene import tint_layers
 from flexneedle.plot.style import BAD, QUIET
-from flexneedle.scenario import Scenario
-
-__all__ = ["Line", "draw_panel", "draw_timeline", "spread_out"]
+from flexneedle.scenario.model import Scenario
 
 _GAP = 0.17  # least distance of two names, as a share of the panel's height
 _SEEN = 0.008  # least extent of a line that is seen as one, as a share of the panel's width

@@ -23,11 +23,8 @@ from flexneedle.plot.style import (
     signed,
     styled,
 )
-from flexneedle.scenario import Scenario
-from flexneedle.trace import PlanRecord
-from flexneedle.trace.summary import entry_angle, plan_verdict
-
-__all__ = ["plan_figure"]
+from flexneedle.scenario.model import Scenario
+from flexneedle.types import PlanRecord
 
 # Places in inches from the top left.
 _LEFT, _RIGHT, _HEAD, _BETWEEN = 0.62, 0.15, 0.66, 0.75
@@ -79,7 +76,7 @@ def _scene(ax: Axes, scenario: Scenario, plan: PlanRecord, window: scene.View, c
     scene.draw_turns(ax, curves.planned_turns(plan), PLAN, solid=False, label="bevel turn, planned")
     _entry(ax, plan)
     ax.set_title(
-        fill(f"{plan.strategy}: {plan_verdict(plan)} (cost {plan.cost:.2f})", _TITLE_CHARACTERS),
+        fill(f"{plan.strategy}: {plan.summary} (cost {plan.cost:.2f})", _TITLE_CHARACTERS),
         color=TARGET if plan.reached else BAD,
         fontsize=9.5,
     )
@@ -87,7 +84,7 @@ def _scene(ax: Axes, scenario: Scenario, plan: PlanRecord, window: scene.View, c
 
 def _entry(ax: Axes, plan: PlanRecord) -> None:
     """Show the direction in which the tip enters, and its angle."""
-    angle = entry_angle(plan)
+    angle = plan.entry_angle
     if isnan(angle):
         return
     y = float(np.interp(0.0, plan.tips[:, 0], plan.tips[:, 1]))

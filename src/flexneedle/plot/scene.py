@@ -10,22 +10,9 @@ from matplotlib.patches import Circle, Rectangle
 
 from flexneedle.plot.curves import Floats, Turn
 from flexneedle.plot.style import GUIDE, NEEDLE, QUIET, TARGET
-from flexneedle.scenario import Layer, Scenario
-from flexneedle.trace import PlanRecord
-
-__all__ = [
-    "View",
-    "draw_guide",
-    "draw_needle",
-    "draw_target",
-    "draw_tissue",
-    "draw_turns",
-    "name_bevel",
-    "name_target",
-    "tint_layers",
-    "turn_style",
-    "view_of",
-]
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.tissue import Layer
+from flexneedle.types import PlanRecord
 
 _AIR = "#ffffff"
 _TISSUES = ("#fbeee3", "#f3dcc8", "#e9c9ad", "#deb592")  # soft to stiff

@@ -11,26 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-__all__ = [
-    "BAD",
-    "ESTIMATE",
-    "GUIDE",
-    "INK",
-    "MEASURED",
-    "NEEDLE",
-    "PLAN",
-    "QUIET",
-    "STRATEGIES",
-    "TARGET",
-    "TRUE",
-    "WIDTH",
-    "axes",
-    "new_figure",
-    "save",
-    "signed",
-    "styled",
-]
-
 WIDTH = 9.0  # inches; shown 900 pixels wide, a point is 1.4 pixels
 
 # Okabe and Ito's colours, told apart by the colour-blind, with another line style or marker each.

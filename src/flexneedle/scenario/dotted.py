@@ -5,8 +5,6 @@ from typing import Any
 
 from flexneedle.errors import ScenarioError
 
-__all__ = ["flatten", "set_value", "split_key"]
-
 
 def split_key(key: str) -> list[str | int]:
     """Return the parts of a dotted key, indices as int."""

@@ -8,14 +8,12 @@ from typing import IO
 import tomli_w
 from pydantic import ValidationError
 
-from flexneedle.errors import ScenarioError
-
-from .environment import Environment, environment_data, environment_names
-from .model import Scenario
-from .preset import WORLD, preset_names, preset_values
-from .problems import describe, printable
-
-__all__ = ["dump_scenario", "load_environment", "load_scenario"]
+from flexneedle.errors import InputError, ScenarioError
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.preset import WORLD, preset_names, preset_values
+from flexneedle.scenario.problems import describe, printable
+from flexneedle.scenario.sections.environment import Environment, environment_data, environment_names
+from flexneedle.scenario.sections.registration import Registration
 
 # A scenario has a few kB; the bound keeps an endless file such as /dev/zero from filling the memory.
 _LARGEST_FILE = 1_000_000
@@ -35,7 +33,7 @@ def load_scenario(source: str | Path | Scenario) -> Scenario:
     if isinstance(source, str) and source in preset_names():
         return Scenario.from_values(preset_values(source), source)
     if isinstance(source, str) and source.startswith(WORLD):
-        from .worlds import named_world  # loads NumPy, which no other scenario needs
+        from flexneedle.scenario.worlds import named_world
 
         return named_world(source)
     data = _read(source, "a scenario file", f"preset (presets: {', '.join(preset_names())})")
@@ -59,6 +57,23 @@ def load_environment(source: str | Path) -> Environment:
         return Environment.model_validate(_parse(data, label))
     except ValidationError as error:
         raise ScenarioError(*(f"{label}: {line}" for line in describe(error, Environment))) from None
+
+
+def load_registration(path: Path, scenario: Scenario) -> Scenario:
+    """Return the scenario with the registration of a file. Raises InputError for a file that has none."""
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = values["tracker"]["registration"]
+        Registration.model_validate(table)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: no TOML: {error}") from None
+    except (KeyError, TypeError):
+        raise InputError(f"{path}: has no table [tracker.registration]; em register writes one") from None
+    except ValidationError as error:
+        raise InputError("\n".join(f"{path}: {line}" for line in describe(error, Registration))) from None
+    return scenario.with_values({"tracker.registration": table})
 
 
 def dump_scenario(scenario: Scenario) -> str:

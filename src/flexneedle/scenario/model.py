@@ -8,16 +8,10 @@ from typing import Annotated, Any, Self
 from pydantic import Field, ValidationError, model_validator
 
 from flexneedle.errors import ScenarioError, ScenarioWarning
-
-from .apparatus import Setup, Tracker
-from .dotted import flatten, set_value, split_key
-from .environment import environment_names, expanded
-from .fields import Section, Title
-from .monitor import Monitor
-from .needle import Needle
-from .problems import describe, key_path, refuse, to_line
-from .renamed import current_key, current_values, given_twice
-from .rules import (
+from flexneedle.scenario.dotted import flatten, set_value, split_key
+from flexneedle.scenario.problems import describe, key_path, refuse, to_line
+from flexneedle.scenario.renamed import current_key, current_values, given_twice
+from flexneedle.scenario.rules import (
     geometry_problems,
     grid_problems,
     layer_problems,
@@ -25,11 +19,14 @@ from .rules import (
     plan_problems,
     target_problems,
 )
-from .settings import Control, Phantom, Plan, Target
-from .structure import structure_problems
-from .tissue import Contact, Layer
-
-__all__ = ["Scenario", "check_target"]
+from flexneedle.scenario.sections.apparatus import Setup, Tracker
+from flexneedle.scenario.sections.environment import environment_names, expanded
+from flexneedle.scenario.sections.fields import Section, Title
+from flexneedle.scenario.sections.monitor import Monitor
+from flexneedle.scenario.sections.needle import Needle
+from flexneedle.scenario.sections.settings import Control, Phantom, Plan, Target
+from flexneedle.scenario.sections.structure import structure_problems
+from flexneedle.scenario.sections.tissue import Contact, Layer
 
 _ENVIRONMENT = "tracker.environment"
 

@@ -4,8 +4,6 @@ import tomllib
 from importlib.resources import files
 from typing import Any
 
-__all__ = ["WORLD", "preset_names", "preset_values"]
-
 WORLD = "world:"
 """How the name of a world's scenario begins; then its number and, unless it is `real`, a colon and the case."""
 

@@ -8,9 +8,7 @@ from typing import Any, NamedTuple, get_args
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from .dotted import split_key
-
-__all__ = ["Problem", "describe", "key_path", "printable", "refuse", "to_line", "unknown_key"]
+from flexneedle.scenario.dotted import split_key
 
 _BROKEN = "broken_rules"
 _LONGEST_VALUE = 60

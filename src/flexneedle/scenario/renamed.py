@@ -7,10 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from flexneedle.errors import ScenarioError, ScenarioWarning
-
-from .dotted import flatten, set_value
-
-__all__ = ["current_key", "current_values"]
+from flexneedle.scenario.dotted import flatten, set_value
 
 _CE_MPC = (
     *("samples", "iterations", "horizon", "orientation_weight_mm", "guide_weight", "energy_weight_per_mj"),

@@ -3,21 +3,12 @@
 from collections.abc import Iterator, Sequence
 from math import isfinite
 
-from .apparatus import Setup, Tracker
-from .monitor import Monitor
-from .needle import Bevel, Needle
-from .problems import Problem
-from .settings import Phantom, Plan, Target
-from .tissue import LARGEST_BEVEL, Contact, Layer
-
-__all__ = [
-    "geometry_problems",
-    "grid_problems",
-    "layer_problems",
-    "monitor_problems",
-    "plan_problems",
-    "target_problems",
-]
+from flexneedle.scenario.problems import Problem
+from flexneedle.scenario.sections.apparatus import Setup, Tracker
+from flexneedle.scenario.sections.monitor import Monitor
+from flexneedle.scenario.sections.needle import Bevel, Needle
+from flexneedle.scenario.sections.settings import Phantom, Plan, Target
+from flexneedle.scenario.sections.tissue import LARGEST_BEVEL, Contact, Layer
 
 _MOST_GRID_POINTS = 20_000
 _MOST_READINGS_A_STEP = 10_000

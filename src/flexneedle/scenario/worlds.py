@@ -23,16 +23,10 @@ from typing import Any
 import numpy as np
 
 from flexneedle.errors import ScenarioError
-
-from .model import Scenario
-from .needle import GAUGES
-from .preset import WORLD, preset_values
-from .problems import printable
-
-__all__ = [
-    *("CASES", "LARGEST_WORLD", "REAL", "STRUCTURE", "TRAINING"),
-    *("named_world", "structural", "world", "world_name"),
-]
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.preset import WORLD, preset_values
+from flexneedle.scenario.problems import printable
+from flexneedle.scenario.sections.needle import GAUGES
 
 TRAINING = 1000
 """Worlds with a number below this are for choosing settings; no report may use them."""

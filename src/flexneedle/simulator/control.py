@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.errors import CommandError
-from flexneedle.scenario import Scenario
+from flexneedle.scenario.model import Scenario
 
 Floats = NDArray[np.float64]
 COLUMNS = ("db_x", "db_y", "db_theta", "dg_y", "flip")

@@ -15,7 +15,7 @@ from flexneedle.errors import CommandError, StateError
 from flexneedle.mechanics import insertion, model
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.ogden import displaced_energy
-from flexneedle.scenario import Scenario
+from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.control import Control, Limits
 from flexneedle.simulator.state import State, load_arrays, mechanics_difference, mesh_of, solved
 

@@ -14,7 +14,7 @@ from flexneedle.errors import StateError
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.model import CONTACT, Model, Nodes
 from flexneedle.mechanics.shape import beam_energy, equal_arc_nodes
-from flexneedle.scenario import Scenario
+from flexneedle.scenario.model import Scenario
 
 Floats = NDArray[np.float64]
 _MECHANICS = ("needle.", "setup.", "tissue", "contact.")  # the keys that a state depends on

@@ -1,5 +1,1 @@
-"""What a run leaves behind: plain records, and their file on disk."""
-
-from flexneedle.trace.records import Insertion, Judged, Period, PlanRecord
-
-__all__ = ["Insertion", "Judged", "Period", "PlanRecord"]
+"""Files on disk: run folders, traces, tables."""

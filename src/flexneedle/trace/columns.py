@@ -6,10 +6,7 @@ Names end in their unit; numbers are exact (`repr`), so that a period comes back
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from flexneedle.ports import Sample
-from flexneedle.trace.records import Floats, Judged, Period
-
-__all__ = ["COLUMNS", "from_row", "to_row"]
+from flexneedle.types import Floats, Judged, Period, Sample
 
 _Scalar = Callable[[str], Any]
 

@@ -12,26 +12,7 @@ import numpy as np
 import rosbags.typesys.stores.ros2_humble as ros
 from rosbags.typesys import Stores, get_typestore
 
-from flexneedle.trace.records import Floats, Pose
-
-__all__ = [
-    "FRAME",
-    "STORE",
-    "DiagnosticArray",
-    "DiagnosticStatus",
-    "Judgement",
-    "Message",
-    "Path",
-    "diagnostics",
-    "joints",
-    "judgements",
-    "nanoseconds",
-    "number",
-    "path",
-    "points_of",
-    "pose",
-    "vector",
-]
+from flexneedle.types import Floats, Pose
 
 Time = ros.builtin_interfaces__msg__Time
 DiagnosticArray = ros.diagnostic_msgs__msg__DiagnosticArray

@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from flexneedle.trace.records import PlanRecord
-
-__all__ = ["plain", "plan_from_values", "plan_values", "to_text"]
+from flexneedle.types import PlanRecord
 
 _ARRAYS = ("controls", "tips", "strain_energy", "guide", "shapes")
 _WALL_CLOCK = "seconds"

@@ -17,10 +17,8 @@ from flexneedle.trace.columns import from_row
 from flexneedle.trace.messages import STORE, DiagnosticArray, DiagnosticStatus, points_of
 from flexneedle.trace.messages import Path as PathMessage
 from flexneedle.trace.readings import from_values
-from flexneedle.trace.records import Floats, Judged, Period
 from flexneedle.trace.topics import READINGS, SHAPE, STATUS, TIMING, TOPICS
-
-__all__ = ["Trace", "read_trace"]
+from flexneedle.types import Floats, Judged, Period
 
 
 @dataclass(frozen=True, eq=False)

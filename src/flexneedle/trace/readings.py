@@ -2,10 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 
-from flexneedle.ports import Frame, Reading, Sample
-from flexneedle.trace.records import Judged
-
-__all__ = ["from_values", "to_values"]
+from flexneedle.types import Frame, Judged, Reading, Sample
 
 _PLACE, _TURN = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
 

@@ -18,20 +18,7 @@ from flexneedle.trace.messages import (
     vector,
 )
 from flexneedle.trace.readings import to_values
-from flexneedle.trace.records import Floats, Period
-
-__all__ = [
-    "LATCHED",
-    "PLAN",
-    "READINGS",
-    "SHAPE",
-    "STATUS",
-    "TIMING",
-    "TOPICS",
-    "Spoken",
-    "period_messages",
-    "plan_message",
-]
+from flexneedle.types import Floats, Period
 
 PLAN, SHAPE, STATUS, TIMING = "/plan/path", "/needle/shape", "/control/status", "/timing"
 READINGS = "/tracker/readings"

@@ -13,11 +13,9 @@ from typing import Any, Self
 from mcap.writer import CompressionType, Writer
 
 from flexneedle.trace.messages import STORE
-from flexneedle.trace.records import Period, PlanRecord
 from flexneedle.trace.shield import uninterrupted
 from flexneedle.trace.topics import LATCHED, TOPICS, Spoken, period_messages, plan_message
-
-__all__ = ["TraceWriter"]
+from flexneedle.types import Period, PlanRecord
 
 # A period takes about 10 kB; a chunk or a buffer that fills up inside one would tear it.
 _ROOM = 1 << 24

@@ -7,9 +7,7 @@ from pkgutil import iter_modules
 from flexneedle.control.interface import Method
 from flexneedle.control.tables import completed, unowned
 from flexneedle.errors import InputError, ScenarioError, ScenarioWarning
-from flexneedle.scenario import Scenario
-
-__all__ = ["DEFAULT", "METHODS", "checked", "method", "used"]
+from flexneedle.scenario.model import Scenario
 
 DEFAULT = "adaptive-mpc"
 

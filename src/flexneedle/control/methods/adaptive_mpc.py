@@ -17,17 +17,21 @@ from typing import cast
 import numpy as np
 from pydantic import Field
 
-from flexneedle.control.estimate import Estimate, Floats
 from flexneedle.control.forecast import probability_beyond
 from flexneedle.control.guide import guide_may_move
-from flexneedle.control.identification import Identification, Identified
-from flexneedle.control.interface import Decision, Method, Task
+from flexneedle.control.interface import Decision, Method
 from flexneedle.control.outlook import UNCORRECTED, Outlook
 from flexneedle.control.path import Ahead, Path, of_plan, proposals
-from flexneedle.control.prior import Priors
-from flexneedle.planning import Found, Outcome, Search, Term, Variables, best, terms
-from flexneedle.ports import Command
-from flexneedle.scenario.fields import NonNegative, count
+from flexneedle.estimation.estimate import Estimate, Floats
+from flexneedle.estimation.identification import Identification, Identified
+from flexneedle.estimation.prior import Priors
+from flexneedle.estimation.task import Task
+from flexneedle.planning import terms
+from flexneedle.planning.cross_entropy import Search
+from flexneedle.planning.horizon import Found, Variables, best
+from flexneedle.planning.terms import Outcome, Term
+from flexneedle.scenario.sections.fields import NonNegative, count
+from flexneedle.types import Command
 
 _ELITE = 8  # one in so many samples
 _LEAST_ELITE = 3

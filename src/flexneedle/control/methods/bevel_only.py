@@ -3,9 +3,10 @@
 import numpy as np
 
 from flexneedle.control import bang_bang
-from flexneedle.control.estimate import Estimate
-from flexneedle.control.interface import Decision, Method, Task, travel_left
-from flexneedle.control.observer import Beliefs
+from flexneedle.control.interface import Decision, Method, travel_left
+from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.task import Task
 
 
 class BevelOnly(bang_bang.BevelRule):

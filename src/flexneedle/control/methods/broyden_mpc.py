@@ -13,13 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.control.estimate import Estimate
-from flexneedle.control.interface import Decision, Method, Task, travel_left
+from flexneedle.control.interface import Decision, Method, travel_left
 from flexneedle.control.mpc import planned_base
-from flexneedle.control.observer import Beliefs
-from flexneedle.scenario import Setup
-from flexneedle.scenario.fields import Fraction, NonNegative, Positive, Section, count
-from flexneedle.trace import PlanRecord
+from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.task import Task
+from flexneedle.scenario.sections.apparatus import Setup
+from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive, Section, count
+from flexneedle.types import PlanRecord
 
 Floats = NDArray[np.float64]
 _LEAST_INSERTION_MM = (

@@ -8,9 +8,10 @@ the guide's departure from the plan and for tissue energy, which the settings ca
 import numpy as np
 
 from flexneedle.control import bang_bang, mpc
-from flexneedle.control.estimate import Estimate
-from flexneedle.control.interface import Decision, Method, Task
-from flexneedle.control.observer import Beliefs
+from flexneedle.control.interface import Decision, Method
+from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.task import Task
 
 
 def decide(task: Task, memory: None, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, None]:

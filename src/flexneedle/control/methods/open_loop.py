@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from flexneedle.control.estimate import Estimate
-from flexneedle.control.interface import Decision, Method, Task
-from flexneedle.control.observer import Beliefs
+from flexneedle.control.interface import Decision, Method
+from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.task import Task
 from flexneedle.simulator.control import Limits
 
 

@@ -15,14 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.control import bang_bang
-from flexneedle.control.estimate import Estimate
-from flexneedle.control.interface import Decision, Method, Task, travel_left
+from flexneedle.control.interface import Decision, Method, travel_left
 from flexneedle.control.mpc import planned_base
-from flexneedle.control.observer import Beliefs
-from flexneedle.scenario import Setup
-from flexneedle.scenario.fields import Fraction, NonNegative, Positive
-from flexneedle.simulator import Simulator, State
-from flexneedle.trace import PlanRecord
+from flexneedle.estimation.estimate import Estimate
+from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.task import Task
+from flexneedle.scenario.sections.apparatus import Setup
+from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.simulator.state import State
+from flexneedle.types import PlanRecord
 
 Floats = NDArray[np.float64]
 _DISTURBANCE_MM = 0.05  # of the guide: above rounding, small against the 10 mm in which the tissue stiffens

@@ -1,0 +1,1 @@
+"""What commands share: arguments, progress, tables and JSON on stdout."""

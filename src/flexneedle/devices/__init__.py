@@ -1,1 +1,0 @@
-"""Real trackers behind the port `Tracker`, and the emulators to try them without."""

@@ -1,0 +1,1 @@
+"""Evaluating electromagnetic trackers, fitting registrations, recording grids. No other room imports it."""

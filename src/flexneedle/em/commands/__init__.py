@@ -1,0 +1,1 @@
+"""Commands of `flexneedle em`: read arguments, call, print."""

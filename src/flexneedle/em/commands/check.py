@@ -1,0 +1,87 @@
+"""`flexneedle em check`: whether the rig's own power distorts the tracker's field."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flexneedle.console.common import print_json
+from flexneedle.em.commands.evaluate import add_table_arguments, positive, table_options
+from flexneedle.em.commands.tables import number, print_notes, print_rows, span
+
+if TYPE_CHECKING:
+    from flexneedle.em.evaluation.check import Check
+    from flexneedle.em.evaluation.power import Power
+
+
+_THRESHOLD = 0.0547  # paper, section IV-B
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser of `flexneedle em`."""
+    parser = commands.add_parser(
+        "check",
+        help="compare the indicator with the rig's power off and on",
+        description="Compare the indicator of distortion with the rig's power off and on. The exit status is 1 if the "
+        "mean indicator of any sensor is above the threshold with power on.",
+    )
+    parser.add_argument(
+        "off", metavar="OFF", type=Path, help="table with power off, or with both environments"
+    )
+    parser.add_argument("on", metavar="ON", type=Path, nargs="?", help="table with power on")
+    for name in ("off", "on"):
+        told = f"environment with power {name} ({name}, or the only one of its table)"
+        parser.add_argument(f"--{name}", dest=f"{name}_name", metavar="NAME", help=told)
+    parser.add_argument(
+        "--threshold", type=positive, default=_THRESHOLD, metavar="I", help=f"of the indicator ({_THRESHOLD})"
+    )
+    add_table_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    parser.set_defaults(handler=_check)
+
+
+def _check(args: argparse.Namespace) -> int:
+    from flexneedle.em.evaluation.check import check
+
+    names = args.off_name, args.on_name
+    found = check(args.off, args.on, names, args.threshold, table_options(args))
+    if args.json:
+        print_json(found.values())
+    else:
+        _print(found)
+    return 1 if found.above else 0
+
+
+def _print(found: Check) -> None:
+    rows = [row for sensor in found.sensors for row in _rows(sensor)]
+    rows.append((" paper, power on", number(found.paper, ".4f"), *[""] * 5))
+    heads = ("indicator", "mean", "95 %", "max", "points", "samples", "samples above")
+    print_rows("Indicator with power off and on, means at grid points", heads, rows)
+    for sensor in found.sensors:
+        print(_verdict(sensor))
+    print_notes(found.notes)
+
+
+def _rows(sensor: Power) -> list[tuple[str, ...]]:
+    both = (("off", sensor.off), ("on", sensor.on))
+    return [
+        (
+            f"{sensor.sensor}, power {name}",
+            *(number(value, ".4f") for value in (level.mean, level.p95, level.max)),
+            f"{level.n_points}",
+            f"{level.n_samples}",
+            f"{100.0 * level.samples_above:.2f} %",
+        )
+        for name, level in both
+    ]
+
+
+def _verdict(sensor: Power) -> str:
+    ends, on = sensor.difference_interval, sensor.on
+    sure = f"95 % interval {span(ends, '.4f')}" if ends else "too few grid points for an interval"
+    side = "above" if sensor.above else "not above"
+    return (
+        f"{sensor.sensor}: power adds {number(sensor.difference, '.4f')} ({sure}); mean {on.mean:.4f} with power on, "
+        f"{side} the threshold of {sensor.threshold:g} ({sensor.points_above} of {on.n_points} points are above)"
+    )

@@ -1,0 +1,18 @@
+"""`flexneedle em`: measure an electromagnetic tracker, simulate one, read a real one."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from flexneedle.em.commands import check, evaluate, record, register, simulate, watch
+
+_COMMANDS: tuple[Any, ...] = (evaluate, check, simulate, register, record, watch)
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command and its own commands to the parser of `flexneedle`."""
+    parser = subparsers.add_parser("em", help="measure, simulate or read an electromagnetic tracker")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for command in _COMMANDS:
+        command.add_parser(commands)

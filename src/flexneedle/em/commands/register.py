@@ -1,0 +1,91 @@
+"""`flexneedle em register`: find how the tracker's frame lies in the stage's."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flexneedle.console.common import print_json, print_table
+
+if TYPE_CHECKING:
+    from flexneedle.em.register import Registered
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser of `flexneedle em`."""
+    parser = subparsers.add_parser(
+        "register", help="register the tracker's frame to the stage's from pairs of points"
+    )
+    parser.add_argument(
+        "data",
+        type=Path,
+        metavar="PAIRS",
+        help="CSV or Parquet with true_x_mm, …, x_mm, …; rows of one point_id are one point",
+    )
+    parser.add_argument("--sensor", metavar="NAME", help="which sensor, where the table has several")
+    parser.add_argument(
+        "--environment", metavar="NAME", help="which environment, where the table has several"
+    )
+    parser.add_argument(
+        "--target",
+        nargs=3,
+        type=_finite,
+        action="append",
+        default=[],
+        metavar=("X", "Y", "Z"),
+        help="where on the stage the expected error is wanted, mm; may be repeated (the middle of the points)",
+    )
+    parser.add_argument(
+        "--columns",
+        action="append",
+        default=[],
+        metavar="THEIRS=OURS",
+        help="a column of another name, or a TOML file of such; may be repeated",
+    )
+    parser.add_argument("--unit", choices=("mm", "m"), default="mm", help="of all coordinates (mm)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("registration.toml"), metavar="FILE", help="(registration.toml)"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    parser.set_defaults(handler=_register)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text}: must be a finite number")
+    return value
+
+
+def _register(args: argparse.Namespace) -> int:
+    from flexneedle.em.register import read_pairs, register, write_registration
+
+    pairs = read_pairs(args.data, args.columns, args.sensor, args.environment, args.unit)
+    registered = register(pairs, [tuple(target) for target in args.target])
+    write_registration(registered, args.out)
+    if args.json:
+        print_json({**registered.values(), "file": str(args.out)})
+    else:
+        _table(registered, args.out)
+    return 0
+
+
+def _table(registered: Registered, path: Path) -> None:
+    values = registered.values()
+    rows = [
+        ("points", str(values["points"])),
+        ("  readings, without a place", f"{values['samples']}, {values['missing']}"),
+        ("residual (FRE), RMS", f"{values['fre_mm']:.3f} mm"),
+        ("  largest", f"{values['max_residual_mm']:.3f} mm, point {values['worst_point']}"),
+        ("  each by the others, RMS", f"{values['left_out_rms_mm']:.3f} mm"),
+        ("error of a point (FLE), RMS", f"{values['fle_mm']:.3f} mm"),
+    ]
+    for target in values["tre"]:
+        x, y, z = target["target_mm"]
+        rows.append((f"expected error (TRE) at {x:.4g}, {y:.4g}, {z:.4g}", f"{target['tre_mm']:.3f} mm"))
+    w, i, j, k = values["rotation"]
+    rows.append(("rotation w, x, y, z", f"{w:.6f}, {i:.6f}, {j:.6f}, {k:.6f}"))
+    rows.append(("translation", ", ".join(f"{value:.3f}" for value in values["translation_mm"]) + " mm"))
+    print_table("Tracker registered to stage", rows, path)

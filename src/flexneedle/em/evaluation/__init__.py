@@ -1,0 +1,1 @@
+"""What a table of repeated measurements reveals about a tracker."""

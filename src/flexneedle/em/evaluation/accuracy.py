@@ -1,0 +1,156 @@
+"""Errors of a grid as in the paper, section IV-B (eqs. eq:mean_pos, eq:measurement_error, eq:em_rmse, eq:em_std).
+
+err_i = ‖P̄_i − P_i‖ with the mean P̄_i of the samples at grid point i, rmse = √(Σ err_i² / N) over the N points, each
+of the same weight, jitter = √(Σ_i Σ_j ‖P̄_i − P̃_ij‖² / Σ_i M_i) over all samples: with M at each point that is the
+paper's. A point with one sample adds nothing to the sum of squares; if all points have one, the jitter is unknown.
+"""
+
+from dataclasses import dataclass
+from math import nan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.em.evaluation.grid import Grid, Places
+from flexneedle.em.evaluation.intervals import CONFIDENCE, Interval, intervals, quantile_interval
+from flexneedle.errors import InputError
+from flexneedle.rig.tracking.registration import Rigid, fiducial_error, fit_rigid
+
+P95 = 0.95
+"""Quantiles: linear interpolation between ranks, (n − 1) q counted from 0 (Hyndman and Fan 1996, type 7)."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Errors of one sensor in one environment (mm), and what they were computed from.
+
+    n_points: with a sample; n_unseen: without; n_single: with one, which adds an error, but no scatter. sd_mm: of the
+    errors, n − 1. bias_mm: mean error vector. beyond_max: with 95 % confidence no more than this share of the volume
+    has errors beyond `max_mm` (Wilks 1941); a maximum has no useful bootstrap interval. intervals: 95 %, by bootstrap;
+    that of p95_mm from order statistics. jitter_mm: NaN, without an interval, if no point has two samples.
+    """
+
+    n_points: int
+    n_unseen: int
+    n_samples: int
+    n_missing: int
+    n_single: int
+    samples_least: int
+    samples_most: int
+    rmse_mm: float
+    p95_mm: float
+    max_mm: float
+    jitter_mm: float
+    mean_mm: float
+    sd_mm: float
+    bias_mm: tuple[float, float, float]
+    max_at: str
+    beyond_max: float
+    intervals: dict[str, Interval]
+
+
+@dataclass(frozen=True)
+class Registration:
+    """The rigid map from tracker to stage, p → R p + t: rows of R, t (mm); RMS of what is left (mm)."""
+
+    rotation: tuple[tuple[float, ...], ...]
+    translation_mm: tuple[float, ...]
+    angle_deg: float
+    residual_mm: float
+    n_points: int
+
+
+def error_vectors(places: Places) -> Floats:
+    """Return mean measured minus true position (n, 3), mm; NaN where there is no sample."""
+    vectors: Floats = places.position.mean - places.true.mean
+    return vectors
+
+
+def errors(places: Places) -> Floats:
+    """Return err_i (n,), mm."""
+    lengths: Floats = np.linalg.norm(error_vectors(places), axis=1)
+    return lengths
+
+
+def root_mean_square(values: Floats) -> float:
+    """Return √(Σ v² / n) of values (n,), NaN without any."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else nan
+
+
+def jitter(places: Places) -> float:
+    """Return the jitter over all samples (mm), NaN if no place has two."""
+    count = places.position.count
+    if count.max(initial=0) < 2:
+        return nan
+    return float(np.sqrt(np.nansum(places.position.scatter) / count.sum()))
+
+
+def accuracy(grid: Grid) -> Accuracy:
+    """Return the errors of a grid. Raises InputError if no point of it has a sample."""
+    seen = grid.points[grid.seen]
+    if not len(seen):
+        raise InputError(f"sensor {grid.sensor!r}, environment {grid.environment!r}: all samples are missing")
+    error, count = errors(seen), seen.position.count
+    bias = error_vectors(seen).mean(axis=0).tolist()
+    return Accuracy(
+        n_points=len(seen),
+        n_unseen=len(grid.points) - len(seen),
+        n_samples=int(count.sum()),
+        n_missing=int(grid.points.missing.sum()),
+        n_single=int((count == 1).sum()),
+        samples_least=int(count.min()),
+        samples_most=int(count.max()),
+        rmse_mm=root_mean_square(error),
+        p95_mm=float(np.quantile(error, P95)),
+        max_mm=float(error.max()),
+        jitter_mm=jitter(seen),
+        mean_mm=float(error.mean()),
+        sd_mm=float(error.std(ddof=1)) if len(error) > 1 else nan,
+        bias_mm=(bias[0], bias[1], bias[2]),
+        max_at=np.array(grid.names, dtype=object)[grid.seen][int(error.argmax())],
+        beyond_max=1.0 - (1.0 - CONFIDENCE) ** (1.0 / len(error)),
+        intervals=_intervals(error, seen),
+    )
+
+
+def _intervals(error: Floats, seen: Places) -> dict[str, Interval]:
+    squares, scatter, count = error**2, seen.position.scatter.sum(axis=1), seen.position.count
+    found = intervals(
+        {
+            "rmse_mm": lambda chosen: np.sqrt(squares[chosen].mean(axis=1)),
+            "jitter_mm": lambda chosen: np.sqrt(scatter[chosen].sum(axis=1) / count[chosen].sum(axis=1)),
+            "mean_mm": lambda chosen: error[chosen].mean(axis=1),
+            "sd_mm": lambda chosen: error[chosen].std(axis=1, ddof=1),
+        },
+        len(error),
+    )
+    if count.max() < 2:
+        found["jitter_mm"] = None
+    return {**found, "p95_mm": quantile_interval(error, P95)}
+
+
+def register(grid: Grid) -> tuple[Grid, Registration]:
+    """Return the grid after a rigid least-squares fit of its mean positions to the true ones, and the fit.
+
+    Raises InputError if there are fewer than three points, or all on a line.
+    """
+    seen = grid.points[grid.seen]
+    try:
+        rigid = fit_rigid(seen.position.mean, seen.true.mean)
+    except InputError as error:
+        raise InputError(
+            f"--register: sensor {grid.sensor!r}, environment {grid.environment!r}: {error}"
+        ) from None
+    residual = fiducial_error(rigid, seen.position.mean, seen.true.mean)
+    return grid.registered(rigid), _registration(rigid, residual, len(seen))
+
+
+def _registration(rigid: Rigid, residual: float, points: int) -> Registration:
+    # From the sine as well: the cosine alone loses small angles.
+    turn = rigid.rotation - rigid.rotation.T
+    sine = float(np.linalg.norm((turn[2, 1], turn[0, 2], turn[1, 0]))) / 2.0
+    angle = np.degrees(np.arctan2(sine, (np.trace(rigid.rotation) - 1.0) / 2.0))
+    rows = tuple(tuple(row) for row in rigid.rotation.tolist())
+    return Registration(rows, tuple(rigid.translation.tolist()), float(angle), residual, points)

@@ -1,0 +1,224 @@
+"""`flexneedle em evaluate`: a table of measurements in, errors, indicator and figures out."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from flexneedle.em.evaluation import published
+from flexneedle.em.evaluation.accuracy import Accuracy, Registration, accuracy, register
+from flexneedle.em.evaluation.cells import collect
+from flexneedle.em.evaluation.columns import column_map
+from flexneedle.em.evaluation.distance import Distances, distances
+from flexneedle.em.evaluation.grid import Grid
+from flexneedle.em.evaluation.indicator import Summary, summary
+from flexneedle.em.evaluation.notes import notes
+from flexneedle.em.evaluation.orientation import Orientation, orientation
+from flexneedle.em.evaluation.points import POINTS_FILE, points_text
+from flexneedle.em.evaluation.reading import labelled, read_batches
+from flexneedle.em.evaluation.repeatability import Repeatability, Spacing, repeatability, spacing
+from flexneedle.em.evaluation.separation import Separation, separation
+from flexneedle.em.evaluation.units import refuse_metres
+from flexneedle.errors import InputError
+from flexneedle.rig.tracking.table import OPTIONAL, REFERENCE, REQUIRED
+from flexneedle.trace.files import replace_file
+from flexneedle.trace.plain import to_text
+
+_RESULT_FILE = "evaluation.json"
+RESULT_FILES = (_RESULT_FILE, POINTS_FILE)
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a table is read and judged.
+
+    columns: pairs "theirs=ours" or paths of TOML files with such; unit: "mm", "m", or None for millimetres that are
+    refused where they look like metres; limit_mm: RMSE for the smallest distance (None: the maker's, where the sensor
+    is one of the paper's); ideal, noisy: names of the environments that the indicator is to tell apart (None: the
+    paper's, where there are such); sensor, environment: of all rows, for a table without such a column.
+    """
+
+    columns: tuple[str, ...] = ()
+    register: bool = False
+    unit: str | None = None
+    bin_mm: float = 50.0
+    limit_mm: float | None = None
+    ideal: str | None = None
+    noisy: str | None = None
+    sensor: str | None = None
+    environment: str | None = None
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """Names of the environments that the indicator is to tell apart."""
+        return self.ideal or published.IDEAL, self.noisy or published.NOISY
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """One sensor in one environment."""
+
+    grid: Grid
+    accuracy: Accuracy
+    registration: Registration | None
+    summary: Summary | None
+    spacing: Spacing
+    repeatability: Repeatability
+    orientation: Orientation | None
+    distances: Distances | None
+
+    @property
+    def title(self) -> str:
+        """Sensor and environment."""
+        return f"{self.grid.sensor}, {self.grid.environment}"
+
+    def values(self) -> dict[str, Any]:
+        """Return the result as plain values; lengths in mm, full precision."""
+        kind = published.kind(self.grid.sensor) or ""
+        return {
+            "sensor": self.grid.sensor,
+            "environment": self.grid.environment,
+            **asdict(self.accuracy),
+            "official": published.OFFICIAL.get(kind),
+            "paper": published.MEASURED.get((kind, self.grid.environment)),
+            "registration": _values(self.registration),
+            "relative_distance": asdict(self.spacing),
+            "repeatability": asdict(self.repeatability),
+            "orientation": _values(self.orientation),
+            "distance": _values(self.distances),
+            "indicator": _values(self.summary),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What a table came to. `notes`: how odd data was treated, a line each."""
+
+    data: Path
+    options: Options
+    rows: int
+    results: list[Result]
+    separations: list[Separation]
+    notes: list[str]
+
+    def values(self) -> dict[str, Any]:
+        """Return all of it as plain values, without the figures."""
+        return {
+            "format": _FORMAT,
+            "data": str(self.data),
+            "rows": self.rows,
+            "registered": self.options.register,
+            "unit": self.options.unit or "mm",
+            "notes": self.notes,
+            "results": [result.values() for result in self.results],
+            "indicator": [_separation_values(found, self.options) for found in self.separations],
+        }
+
+
+def evaluate(data: Path, options: Options) -> Evaluation:
+    """Return the evaluation of a table, read once. Raises InputError for one that cannot be used."""
+    grids, rows = read_grids(data, options)
+    with _about(data):
+        _check_names(grids, options)
+        results = [_result(grid, options) for grid in grids]
+    judged = [result.grid for result in results]
+    separations = [
+        found
+        for sensor in dict.fromkeys(grid.sensor for grid in judged)
+        if (found := separation(sensor, *_environments(judged, sensor, options))) is not None
+    ]
+    odd = notes(judged, options.pair, hinted=not options.register)
+    return Evaluation(data, options, rows, results, separations, odd)
+
+
+def read_grids(data: Path, options: Options) -> tuple[list[Grid], int]:
+    """Return the grids of a table, and how many rows it has. Raises InputError for one that cannot be used."""
+    theirs = column_map(options.columns)
+    given = {"sensor": options.sensor, "environment": options.environment}
+    names = {column: name for column, name in given.items() if name is not None}
+    optional = (*OPTIONAL, "indicator", *names)
+    required = [column for column in REQUIRED if column not in optional]
+    with _about(data), closing(read_batches(data, theirs, required, optional)) as batches:
+        grids, rows = collect(labelled(batches, names), options.bin_mm, options.unit or "mm")
+        if options.unit is None:
+            refuse_metres(grids)
+    return grids, rows
+
+
+def write_evaluation(evaluation: Evaluation, folder: Path, figures: Iterable[Path]) -> dict[str, Any]:
+    """Write `points.csv` and `evaluation.json` and return the values of the latter."""
+    points = folder / POINTS_FILE
+    replace_file(points, points_text([result.grid for result in evaluation.results]).encode())
+    files = {"folder": str(folder), "points": str(points), "figures": [str(path) for path in figures]}
+    values = {**evaluation.values(), **files}
+    replace_file(folder / _RESULT_FILE, to_text(values).encode())
+    return values
+
+
+def _check_names(grids: Sequence[Grid], options: Options) -> None:
+    there = list(dict.fromkeys(grid.environment for grid in grids))
+    for option in ("ideal", "noisy"):
+        name = getattr(options, option)
+        if name is not None and name not in there:
+            raise InputError(f"--{option}: no environment {name!r}: there is {', '.join(there)}")
+
+
+@contextmanager
+def _about(data: Path) -> Iterator[None]:
+    """Name the file in errors about it."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{data}: {error}") from None
+
+
+def _result(grid: Grid, options: Options) -> Result:
+    grid, registration = register(grid) if options.register else (grid, None)
+    official = published.OFFICIAL.get(published.kind(grid.sensor) or "", {})
+    limit = options.limit_mm if options.limit_mm is not None else official.get("rmse_mm")
+    return Result(
+        grid,
+        accuracy(grid),
+        registration,
+        summary(grid),
+        spacing(grid),
+        repeatability(grid),
+        orientation(grid),
+        distances(grid, options.bin_mm, limit),
+    )
+
+
+def _environments(grids: Sequence[Grid], sensor: str, options: Options) -> tuple[Grid | None, Grid | None]:
+    own = {grid.environment: grid for grid in grids if grid.sensor == sensor}
+    ideal, noisy = options.pair
+    return own.get(ideal), own.get(noisy)
+
+
+def _values(part: Any) -> dict[str, Any] | None:
+    return None if part is None else asdict(part)
+
+
+def _separation_values(found: Separation, options: Options) -> dict[str, Any]:
+    confusion = found.confusion
+    ideal, noisy = options.pair
+    return {
+        "sensor": found.sensor,
+        "ideal_environment": ideal,
+        "noisy_environment": noisy,
+        "ideal": _values(found.ideal),
+        "noisy": _values(found.noisy),
+        "threshold": found.threshold,
+        "threshold_interval": found.threshold_interval,
+        "samples_threshold": found.samples_threshold,
+        "samples_above": dict(zip(("ideal", "noisy"), found.samples_above, strict=True)),
+        "confusion": confusion
+        and {**asdict(confusion), "false_alarms": confusion.false_alarms, "detected": confusion.detected},
+        "auc": found.auc,
+        "auc_interval": found.auc_interval,
+        "roc": {"false_alarms": found.false_alarms, "detected": found.detected},
+        "paper": {"threshold": published.THRESHOLD, **published.FITS, "indicator": published.INDICATOR}
+        if published.kind(found.sensor) == REFERENCE
+        else None,
+    }

@@ -1,0 +1,100 @@
+"""The figures of an evaluation: as many as its data supports."""
+
+from pathlib import Path
+
+import numpy as np
+
+from flexneedle.em.evaluation.accuracy import error_vectors
+from flexneedle.em.evaluation.evaluate import Evaluation, Result
+from flexneedle.em.evaluation.grid import Grid
+from flexneedle.em.evaluation.indicator import Line, means
+from flexneedle.em.evaluation.separation import Separation
+from flexneedle.em.plot.distance import DistanceLine, distance_figure
+from flexneedle.em.plot.field import FieldRow, field_figure
+from flexneedle.em.plot.indicator import IndicatorPanel, Shown, indicator_figure
+from flexneedle.em.plot.roc import RocLine, roc_figure
+from flexneedle.plot.style import save, signed
+
+MOST_PANELS = 3
+
+
+def draw_evaluation(evaluation: Evaluation, folder: Path) -> list[Path]:
+    """Draw `field`, `indicator`, `roc` and `distance` as PNG and SVG, without those that have no data."""
+    paths = save(field_figure([_field(result) for result in evaluation.results]), folder, "field")
+    panels = [_indicator(evaluation, found) for found in evaluation.separations[:MOST_PANELS]]
+    if panels:
+        paths += save(
+            indicator_figure(panels, len(evaluation.separations) - len(panels)), folder, "indicator"
+        )
+    lines = [_roc(evaluation, found) for found in evaluation.separations if found.confusion]
+    if lines:
+        paths += save(roc_figure(lines), folder, "roc")
+    far = [
+        _distance(result)
+        for result in evaluation.results
+        if result.distances and len(result.distances.bins) > 1
+    ]
+    return paths + (save(distance_figure(far), folder, "distance") if far else [])
+
+
+def _field(result: Result) -> FieldRow:
+    seen = result.grid.points[result.grid.seen]
+    return FieldRow(result.title, seen.true.mean, error_vectors(seen))
+
+
+def _indicator(evaluation: Evaluation, found: Separation) -> IndicatorPanel:
+    own = {result.grid.environment: result.grid for result in evaluation.results if _is_of(result, found)}
+    ideal, noisy = (own.get(name) for name in evaluation.options.pair)
+    flat, line = found.ideal, found.noisy
+    return IndicatorPanel(
+        found.sensor,
+        _shown(ideal, f"{flat.mean_mm:.3f} ± {flat.sd_mm:.3f} mm") if ideal and flat else None,
+        _shown(noisy, _line_told(line)) if noisy and line else None,
+        (flat.mean_mm, flat.sd_mm) if flat else None,
+        (line.slope_mm, line.intercept_mm) if line else None,
+        found.threshold,
+    )
+
+
+def _line_told(line: Line) -> str:
+    sign = "+" if line.intercept_mm >= 0.0 else "−"
+    return f"{signed(line.slope_mm, '.3f')} I {sign} {abs(line.intercept_mm):.3f} mm"
+
+
+def _is_of(result: Result, found: Separation) -> bool:
+    return result.grid.sensor == found.sensor and result.summary is not None
+
+
+def _shown(grid: Grid, told: str) -> Shown:
+    return Shown(grid.environment, *means(grid), told)
+
+
+def _roc(evaluation: Evaluation, found: Separation) -> RocLine:
+    confusion, threshold = found.confusion, found.threshold
+    if confusion is None or threshold is None:
+        raise ValueError("a ROC needs both environments")
+    own = {result.grid.environment: result.grid for result in evaluation.results if _is_of(result, found)}
+    names = evaluation.options.pair
+    values = [means(own[name])[0] for name in names]
+    chosen = confusion.false_alarms, confusion.detected
+    told = f"{100.0 * chosen[1]:.1f} % detected,\n{100.0 * chosen[0]:.1f} % false alarms"
+    note = f"area {found.auc:.4f}\nat {threshold:.4f}: {told}"
+    return RocLine(
+        found.sensor,
+        names,
+        found.false_alarms,
+        found.detected,
+        (values[0], values[1]),
+        threshold,
+        chosen,
+        note,
+    )
+
+
+def _distance(result: Result) -> DistanceLine:
+    found = result.distances
+    if found is None:
+        raise ValueError("there are no distances")
+    distance, rmse = (np.array([getattr(b, name) for b in found.bins]) for name in ("distance_mm", "rmse_mm"))
+    note = found.told if found.limit_mm is None else f"within {found.limit_mm:g} mm {found.told}"
+    return DistanceLine(result.title, distance, rmse, found.limit_mm, note)

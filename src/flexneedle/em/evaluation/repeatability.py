@@ -1,0 +1,109 @@
+"""How well a tracker finds the same point again, and the distance between two points.
+
+These are what ASTM F2554 calls the repeatability of the coordinates of a single point and the relative point-to-point
+accuracy (linear). Neither needs the frames of tracker and stage to be registered. The figures are computed from a
+grid of means; they are not that standard's whole procedure, which turns the tool and changes the operator, too.
+"""
+
+from dataclasses import dataclass
+from math import nan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.em.evaluation.accuracy import P95, root_mean_square
+from flexneedle.em.evaluation.grid import Grid
+
+MOST_PAIRS = 1_000_000
+"""Up to so many pairs of grid points all are compared (1414 points); of more, as many drawn with a fixed seed."""
+_SAME_SPACING = 0.01  # pairs up to 1 % farther apart than the closest are neighbours
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Repeatability:
+    """Standard deviation of single samples about the mean at their grid point (mm), with n − 1 at each point.
+
+    axis_sd_mm: along the tracker's x, y, z; sd_mm: length of these three. median_mm, worst_mm: of the points' own.
+    NaN if no point has two samples.
+    """
+
+    axis_sd_mm: tuple[float, ...]
+    sd_mm: float
+    median_mm: float
+    worst_mm: float
+    worst_at: str
+
+
+@dataclass(frozen=True)
+class Spacing:
+    """Measured minus true distance (mm) between grid points: over all pairs, and over the closest neighbours.
+
+    sampled: the pairs are a drawn part of all. NaN with fewer than two points.
+    """
+
+    n_pairs: int
+    sampled: bool
+    mean_mm: float
+    sd_mm: float
+    rms_mm: float
+    p95_mm: float
+    max_mm: float
+    neighbours_apart_mm: float
+    neighbours: int
+    neighbours_rms_mm: float
+
+
+def repeatability(grid: Grid) -> Repeatability:
+    """Return the repeatability of single points of a grid."""
+    position = grid.points.position
+    several = position.count > 1
+    if not several.any():
+        return Repeatability((nan, nan, nan), nan, nan, nan, "")
+    scatter, freedom = position.scatter[several], position.count[several] - 1
+    axes = np.sqrt(scatter.sum(axis=0) / freedom.sum())
+    own = np.sqrt(scatter.sum(axis=1) / freedom)
+    names = np.array(grid.names, dtype=object)[several]
+    worst = int(own.argmax())
+    return Repeatability(
+        tuple(axes.tolist()),
+        float(np.linalg.norm(axes)),
+        float(np.median(own)),
+        float(own[worst]),
+        str(names[worst]),
+    )
+
+
+def spacing(grid: Grid, seed: int = 0) -> Spacing:
+    """Return the relative distance errors of a grid."""
+    seen = grid.points[grid.seen]
+    count = len(seen)
+    first, second = _pairs(count, seed)
+    if not len(first):
+        return Spacing(0, False, *(nan,) * 5, nan, 0, nan)
+    true = np.linalg.norm(seen.true.mean[first] - seen.true.mean[second], axis=1)
+    off = np.linalg.norm(seen.position.mean[first] - seen.position.mean[second], axis=1) - true
+    apart = float(true[true > 0.0].min(initial=np.inf))
+    near = (true > 0.0) & (true <= apart * (1.0 + _SAME_SPACING))
+    return Spacing(
+        n_pairs=len(off),
+        sampled=len(off) < count * (count - 1) // 2,
+        mean_mm=float(off.mean()),
+        sd_mm=float(off.std(ddof=1)) if len(off) > 1 else nan,
+        rms_mm=root_mean_square(off),
+        p95_mm=float(np.quantile(np.abs(off), P95)),
+        max_mm=float(np.abs(off).max()),
+        neighbours_apart_mm=apart,
+        neighbours=int(near.sum()),
+        neighbours_rms_mm=root_mean_square(off[near]),
+    )
+
+
+def _pairs(count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    if count * (count - 1) // 2 <= MOST_PAIRS:
+        first, second = np.triu_indices(count, 1)
+        return first, second
+    rng = np.random.default_rng(seed)
+    first, step = rng.integers(0, count, MOST_PAIRS), rng.integers(1, count, MOST_PAIRS)
+    return first, (first + step) % count

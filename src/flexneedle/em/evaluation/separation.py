@@ -1,0 +1,145 @@
+"""How well a threshold of the indicator tells two environments apart."""
+
+from dataclasses import dataclass
+from math import nan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.em.evaluation.accuracy import P95
+from flexneedle.em.evaluation.grid import Grid
+from flexneedle.em.evaluation.indicator import Constant, Line, constant, line, means
+from flexneedle.em.evaluation.intervals import (
+    LEAST_POINTS,
+    RESAMPLES,
+    SEED,
+    Interval,
+    ends,
+    quantile_interval,
+)
+
+_MOST_FOR_AREA = 2000
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Confusion:
+    """How many grid points lie above a threshold and how many do not, in either environment."""
+
+    ideal_below: int
+    ideal_above: int
+    noisy_below: int
+    noisy_above: int
+
+    @property
+    def false_alarms(self) -> float:
+        """Share of `ideal` above the threshold."""
+        return _share(self.ideal_above, self.ideal_below)
+
+    @property
+    def detected(self) -> float:
+        """Share of `noisy` above the threshold."""
+        return _share(self.noisy_above, self.noisy_below)
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """What the indicator of a sensor says, from the mean values at grid points; None where an environment is lacking.
+
+    threshold: 95th percentile in `ideal`. samples_threshold: the same of single samples, which is what a monitor sees;
+    samples_above: share of single samples above `threshold` in `ideal` and `noisy`. auc: how often a point of `noisy`
+    has the higher indicator of two, ties half. false_alarms, detected (k,): the ROC, from (0, 0) to (1, 1).
+    """
+
+    sensor: str
+    ideal: Constant | None
+    noisy: Line | None
+    threshold: float | None
+    threshold_interval: Interval
+    samples_threshold: float | None
+    samples_above: tuple[float | None, float | None]
+    confusion: Confusion | None
+    auc: float | None
+    auc_interval: Interval
+    false_alarms: Floats
+    detected: Floats
+
+
+def separation(sensor: str, ideal: Grid | None, noisy: Grid | None) -> Separation | None:
+    """Return the analysis of a sensor's indicator in one or two environments, None if it has none in either."""
+    low, low_error = means(ideal) if ideal else (np.empty(0), np.empty(0))
+    high, high_error = means(noisy) if noisy else (np.empty(0), np.empty(0))
+    if not len(low) and not len(high):
+        return None
+    threshold = float(np.quantile(low, P95)) if len(low) else None
+    both = bool(len(low) and len(high))
+    false_alarms, detected = roc(low, high) if both else (np.empty(0), np.empty(0))
+    return Separation(
+        sensor,
+        constant(low_error) if len(low) else None,
+        line(high, high_error) if len(high) else None,
+        threshold,
+        quantile_interval(low, P95),
+        ideal.indicators.quantile(P95) if ideal and len(low) else None,
+        (_above(ideal, threshold), _above(noisy, threshold)),
+        _confusion(low, high, threshold) if both and threshold is not None else None,
+        area(low, high) if both else None,
+        _area_interval(low, high) if both else None,
+        false_alarms,
+        detected,
+    )
+
+
+def roc(low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Return the shares (k,) of `low` and of `high` above each threshold, from (0, 0) to (1, 1).
+
+    Points on the straight line between their neighbours are left out.
+    """
+    levels = np.concatenate([np.unique(np.concatenate([low, high]))[::-1], [-np.inf]])
+    shares = (
+        1.0 - np.searchsorted(np.sort(values), levels, side="right") / len(values) for values in (low, high)
+    )
+    false_alarms, detected = shares
+    across, up = np.diff(false_alarms), np.diff(detected)
+    corner = np.abs(across[1:] * up[:-1] - across[:-1] * up[1:]) > 1e-12
+    kept = np.concatenate([[True], corner, [True]])
+    return false_alarms[kept], detected[kept]
+
+
+def area(low: Floats, high: Floats) -> float:
+    """Return the area under the ROC: the share of pairs with `high` above `low`, ties half (Mann and Whitney 1947)."""
+    ordered = np.sort(low)
+    below = np.searchsorted(ordered, high, side="left")
+    up_to = np.searchsorted(ordered, high, side="right")
+    return float((below + up_to).sum() / (2.0 * len(low) * len(high)))
+
+
+def _confusion(low: Floats, high: Floats, threshold: float) -> Confusion:
+    first, second = int((low > threshold).sum()), int((high > threshold).sum())
+    return Confusion(len(low) - first, first, len(high) - second, second)
+
+
+def _area_interval(low: Floats, high: Floats) -> Interval:
+    """Draw both environments again, each for itself; None if they are told apart perfectly, few, or very many.
+
+    With perfect separation every sample drawn again is perfect, too, which says nothing.
+    """
+    least, most = sorted((len(low), len(high)))
+    if least < LEAST_POINTS or most > _MOST_FOR_AREA or area(low, high) in (0.0, 1.0):
+        return None
+    wins = (high[None, :] > low[:, None]) + 0.5 * (high[None, :] == low[:, None])
+    rng = np.random.default_rng(SEED)
+    first, second = (rng.multinomial(len(v), np.full(len(v), 1.0 / len(v)), RESAMPLES) for v in (low, high))
+    areas = np.einsum("bi,bi->b", first @ wins, second) / (len(low) * len(high))
+    return ends(areas)
+
+
+def _above(grid: Grid | None, threshold: float | None) -> float | None:
+    if grid is None or threshold is None or not grid.indicators.count:
+        return None
+    return grid.indicators.above(threshold)
+
+
+def _share(one: int, other: int) -> float:
+    return one / (one + other) if one + other else nan

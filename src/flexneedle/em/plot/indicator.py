@@ -1,0 +1,128 @@
+"""Error over the indicator of distortion, as the paper's figure of indicator values."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from flexneedle.plot.layout import short
+from flexneedle.plot.style import ESTIMATE, INK, QUIET, TARGET, TRUE, WIDTH, axes, new_figure, styled
+
+FAR, CUT = 2.0, 1.2
+"""An environment whose largest indicator is beyond FAR times its 95th percentile is shown to CUT times that; how many
+points lie beyond is said. All others are shown whole."""
+_LEFT, _RIGHT, _TOP, _FOOT, _GAP, _HIGH = 0.6, 0.25, 0.42, 0.5, 0.62, 3.4  # inches
+_LOOKS = ((ESTIMATE, "o"), (TRUE, "^"))
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Mean indicator and error (mm) (n,) at the grid points of one environment, and its fit in words."""
+
+    name: str
+    indicator: Floats
+    error: Floats
+    told: str
+
+
+@dataclass(frozen=True, eq=False)
+class IndicatorPanel:
+    """A sensor: up to two environments, the constant fit (mean, sd), the line (slope, intercept), the threshold."""
+
+    sensor: str
+    ideal: Shown | None
+    noisy: Shown | None
+    constant: tuple[float, float] | None
+    line: tuple[float, float] | None
+    threshold: float | None
+
+
+def indicator_figure(panels: Sequence[IndicatorPanel], more: int = 0) -> Figure:
+    """Return the figure with a panel for each sensor, side by side; more: how many others there are, which it says."""
+    with styled():
+        figure = new_figure(_TOP + _HIGH + _FOOT)
+        width = (WIDTH - _LEFT - _RIGHT - (len(panels) - 1) * _GAP) / len(panels)
+        for number, panel in enumerate(panels):
+            ax = axes(figure, _LEFT + number * (width + _GAP), _TOP, width, _HIGH)
+            _draw(ax, panel)
+        figure.axes[0].set_ylabel("error of the mean position (mm)")
+        if more:
+            told = f"{more} more sensor{'s' if more > 1 else ''} not shown"
+            figure.text(0.99, 0.005, told, ha="right", color=QUIET, fontsize=8)
+    return figure
+
+
+def _draw(ax: Axes, panel: IndicatorPanel) -> None:
+    pairs = zip((panel.ideal, panel.noisy), _LOOKS, strict=True)
+    widest = _widest(panel)
+    handles = [_scatter(ax, shown, color, marker, widest) for shown, (color, marker) in pairs if shown]
+    ax.set_xlim(0.0, widest)
+    ax.set_ylim(0.0, _highest(panel, widest))
+    if panel.constant:
+        _draw_constant(ax, *panel.constant, panel, widest)
+    if panel.line and panel.noisy and np.isfinite(panel.line[0]):
+        _draw_line(ax, *panel.line, panel.noisy.indicator, widest)
+    if panel.threshold is not None:
+        _draw_threshold(ax, panel.threshold)
+    ax.set_title(panel.sensor, pad=16.0)
+    ax.set_xlabel("indicator I, mean at a grid point")
+    legend = ax.legend(handles=handles, loc="upper left", borderaxespad=0.2, frameon=True, framealpha=0.92)
+    legend.get_frame().set(edgecolor="none", facecolor="white")
+    legend.set_zorder(5)
+
+
+def _widest(panel: IndicatorPanel) -> float:
+    """Return the largest indicator shown."""
+    reach = [_reach(shown.indicator) for shown in (panel.ideal, panel.noisy) if shown]
+    return 1.04 * max([*reach, panel.threshold or 0.0]) or 1.0
+
+
+def _reach(values: Floats) -> float:
+    most, usual = float(values.max()), float(np.quantile(values, 0.95))
+    return CUT * usual if usual > 0.0 and most > FAR * usual else most
+
+
+def _scatter(ax: Axes, shown: Shown, color: str, marker: str, widest: float) -> Line2D:
+    many, inside = len(shown.indicator) > 1500, shown.indicator <= widest
+    how: dict[str, Any] = {"color": color, "marker": marker, "linewidths": 0.0}
+    x, y, size = shown.indicator[inside], shown.error[inside], 4 if many else 13
+    ax.scatter(x, y, size, alpha=0.55, rasterized=many, zorder=3, **how)
+    label, beyond = f"{short(shown.name, 40)}: {shown.told}", len(shown.indicator) - len(x)
+    if beyond:
+        points = "point" if beyond == 1 else "points"
+        label += f"\n({beyond} {points} beyond, up to I = {float(shown.indicator.max()):.3g}, not shown)"
+    return Line2D([], [], color=color, marker=marker, markersize=4.5, linestyle="none", label=label)
+
+
+def _highest(panel: IndicatorPanel, widest: float) -> float:
+    inside = [shown.error[shown.indicator <= widest] for shown in (panel.ideal, panel.noisy) if shown]
+    return 1.28 * float(np.concatenate([*inside, [1e-6]]).max())  # room for the legend
+
+
+def _draw_constant(ax: Axes, mean: float, sd: float, panel: IndicatorPanel, widest: float) -> None:
+    reach = panel.threshold if panel.threshold is not None else 0.0
+    if panel.ideal:
+        reach = max(reach, min(widest, float(panel.ideal.indicator.max())))
+    if np.isfinite(sd):
+        ax.fill_between(
+            [0.0, reach], mean - sd, mean + sd, color=ESTIMATE, alpha=0.15, linewidth=0.0, zorder=1
+        )
+    ax.plot([0.0, reach], [mean, mean], color=INK, linewidth=1.6, zorder=4)
+
+
+def _draw_line(ax: Axes, slope: float, intercept: float, indicator: Floats, widest: float) -> None:
+    ends = np.array([indicator.min(), min(indicator.max(), widest)])
+    ax.plot(ends, slope * ends + intercept, color=INK, linewidth=1.6, linestyle=(0, (5, 1.5)), zorder=4)
+
+
+def _draw_threshold(ax: Axes, threshold: float) -> None:
+    ax.axvline(threshold, color=TARGET, linewidth=1.2, linestyle=(0, (2, 1.5)), zorder=2)
+    label: dict[str, Any] = {"color": TARGET, "fontsize": 8, "va": "bottom", "ha": "left"}
+    ax.text(threshold, 1.005, f" threshold {threshold:.4f}", transform=ax.get_xaxis_transform(), **label)

@@ -1,0 +1,1 @@
+"""Recording a tracker on a grid of points, and watching one."""

@@ -1,0 +1,93 @@
+"""From what a user writes to the tracker that it names."""
+
+from contextlib import AbstractContextManager
+from math import isfinite
+from pathlib import Path
+
+from flexneedle.errors import InputError
+from flexneedle.rig.devices.aurora.readings import NAMES
+from flexneedle.rig.devices.aurora.tracker import Aurora
+from flexneedle.rig.devices.clock import WallClock
+from flexneedle.rig.devices.recording import read_frames
+from flexneedle.rig.devices.replay import Replay
+from flexneedle.rig.ports import Clock, Tracker
+from flexneedle.rig.tracking.table import TIP
+from flexneedle.trace.folder import TRACE_FILE
+from flexneedle.trace.reader import read_trace
+from flexneedle.types import Frame, Reading, Sample
+
+FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE[@SPEED] (a recording, or the folder of a run)"
+"""How trackers are written."""
+
+
+def open_tracker(spec: str, clock: Clock) -> AbstractContextManager[Tracker]:
+    """Return the tracker that `spec` names, at work; leaving the context puts it to rest.
+
+    `aurora:/dev/ttyUSB0` has the sensors tip, ref1, ref2, ref3 at the ports 1 to 4; `aurora:/dev/ttyUSB0=ref1,tip`
+    names those of ports 1 and 2. `replay:FILE` plays a recording, or what a run in a
+    folder was told; how fast is the clock's matter (`clock_for`).
+    Raises InputError for anything else, RunError if no tracker answers.
+    """
+    kind, _, rest = spec.partition(":")
+    if not rest or kind not in ("aurora", "replay"):
+        raise InputError(f"tracker {spec}: must be {FORMS}")
+    return _aurora(rest, clock) if kind == "aurora" else _replay(rest, clock)
+
+
+def clock_for(spec: str) -> WallClock:
+    """Return the clock on which the tracker that `spec` names is to be read: at `replay:FILE@2` it runs twice as fast.
+
+    Raises InputError as `open_tracker`.
+    """
+    kind, _, rest = spec.partition(":")
+    return WallClock(_file_and_speed(rest)[1] if kind == "replay" else 1.0)
+
+
+def _aurora(rest: str, clock: Clock) -> Aurora:
+    port, _, names = rest.partition("=")
+    chosen = tuple(names.split(",")) if names else NAMES
+    if not all(name.isidentifier() for name in chosen) or len({*chosen}) < len(chosen):
+        raise InputError(f"tracker aurora:{rest}: the names must be words, each once, such as tip,ref1")
+    return Aurora(port, clock, chosen)
+
+
+def _replay(rest: str, clock: Clock) -> Replay:
+    path = Path(_file_and_speed(rest)[0])
+    return Replay(frames_of_run(path) if path.is_dir() else read_frames(path), clock)
+
+
+def _file_and_speed(rest: str) -> tuple[str, float]:
+    """Return the parts of FILE@SPEED; a file that is there may have an @ in its name. Raises InputError if the speed
+    is none."""
+    if "@" not in rest or Path(rest).exists():
+        return rest, 1.0
+    file, _, told = rest.rpartition("@")
+    try:
+        speed = float(told)
+    except ValueError:
+        raise InputError(f"tracker replay:{rest}: {told} is no speed, and there is no file {rest}") from None
+    if not (isfinite(speed) and speed > 0.0):
+        raise InputError(f"tracker replay:{rest}: the speed must be above 0")
+    return file, speed
+
+
+def frames_of_run(folder: Path) -> tuple[Frame, ...]:
+    """Return what the tracker told in a recorded insertion, in its own frame; each frame once.
+
+    A tracker that told of the tip alone gives frames of the tip, in the frame of the stage, with z = 0 where it told
+    none. Raises InputError if there is no trace of readings.
+    """
+    periods = read_trace(folder / TRACE_FILE).periods
+    told = [judged.sample for period in periods for judged in period.readings]
+    frames = {frame.number: frame for frame in (_frame(n, sample) for n, sample in enumerate(told))}
+    if not frames:
+        raise InputError(f"{folder}: the run has no readings of a tracker")
+    return tuple(frames.values())
+
+
+def _frame(number: int, sample: Sample) -> Frame:
+    if sample.frame is not None:
+        return sample.frame
+    seen = sample.x is not None and sample.y is not None
+    place = (sample.x or 0.0, sample.y or 0.0, sample.z or 0.0)
+    return Frame(sample.time, number, {TIP: Reading(place) if seen else Reading(None, status="missing")})

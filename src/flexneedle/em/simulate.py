@@ -1,0 +1,130 @@
+"""`flexneedle em simulate`: the paper's measurement of a tracker (section IV-B), in a simulated environment."""
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import sqrt
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from flexneedle.errors import InputError
+from flexneedle.rig.tracking.field.room import REFERENCES, Room, grid
+from flexneedle.rig.tracking.field.sensors import Noiseless, Readings, noiseless, noisy
+from flexneedle.rig.tracking.quaternion import along, z_axis
+from flexneedle.rig.tracking.table import COLUMNS, REFERENCE, TIP
+from flexneedle.scenario.sections.environment import Environment
+from flexneedle.trace.files import replace_file
+
+Floats = NDArray[np.float64]
+SUFFIXES = (".csv", ".parquet")
+_MOST_SAMPLES = 20_000_000
+_ALONG_X = (sqrt(0.5), 0.0, sqrt(0.5), 0.0)
+_UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A cube of points³ over the workspace, gone through `repeats` times with so many `samples` a point.
+
+    seed: of the measurement; field_seed: which room, None for each environment's own.
+    """
+
+    seed: int = 0
+    field_seed: int | None = None
+    points: int = 5
+    samples: int = 100
+    repeats: int = 5
+
+
+def measure(environments: Sequence[Environment], experiment: Experiment) -> pa.Table:
+    """Return the table of both sensors in all environments: columns `COLUMNS`, in the order of the measurement.
+
+    The tip's sensor points along x, the reference stands upright. An environment's rows depend on it and on the
+    experiment alone. Raises InputError if two environments have one name, or for more rows than memory is for.
+    """
+    names = [environment.name for environment in environments]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"two environments have the name {twice}: a table tells them apart by it")
+    rows = 2 * len(names) * experiment.points**3 * experiment.samples * experiment.repeats
+    if rows > _MOST_SAMPLES:
+        raise InputError(f"{rows} samples: must be at most {_MOST_SAMPLES}")
+    return pa.concat_tables(
+        _measured(environment, sensor, experiment)
+        for environment in environments
+        for sensor in (TIP, REFERENCE)
+    )
+
+
+def write_measurements(table: pa.Table, path: Path) -> None:
+    """Write a table to a new file of one of the `SUFFIXES`, whole or not at all. Raises InputError; see `check_new`."""
+    check_new(path)
+    sink = io.BytesIO()
+    if path.suffix == ".csv":
+        pyarrow.csv.write_csv(table, sink, pyarrow.csv.WriteOptions(quoting_style="needed"))
+    else:
+        pq.write_table(table, sink, compression="zstd")
+    try:
+        replace_file(path, sink.getvalue())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def check_new(path: Path) -> None:
+    """Raise InputError for a file that is neither CSV nor Parquet by its name, is there, or has no folder."""
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"{path}: must end in {' or '.join(SUFFIXES)}")
+    if path.exists():
+        raise InputError(f"{path}: is there already: name another with --out")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: no folder {path.parent}")
+
+
+def _measured(environment: Environment, sensor: str, experiment: Experiment) -> pa.Table:
+    """The rows of one sensor in one environment."""
+    chosen = environment.field_seed if experiment.field_seed is None else experiment.field_seed
+    room = Room(environment, chosen)
+    places = grid(environment.workspace_mm, experiment.points)
+    # Grid points in order, so many samples each, and all that again and again.
+    order = np.tile(np.repeat(np.arange(len(places)), experiment.samples), experiment.repeats)
+    is_tip = sensor == TIP
+    turns = np.tile(_ALONG_X if is_tip else _UPRIGHT, (len(places), 1))
+    still = noiseless(room, TIP if is_tip else REFERENCES[0], places, turns)
+    rng = np.random.default_rng([experiment.seed, int(is_tip), *environment.name.encode()])
+    seen = noisy(environment, Noiseless(still.coils[order], still.turns[order]), rng)
+    missing = rng.random(len(order)) < environment.missing_fraction
+    away = np.linalg.norm(places - np.array(environment.generator_mm), axis=-1)
+    columns = {
+        "point_id": order,
+        **_named(("true_x_mm", "true_y_mm", "true_z_mm"), places[order]),
+        **_told(seen, missing, is_tip),
+        "sensor": [sensor] * len(order),
+        "environment": [environment.name] * len(order),
+        "distance_mm": away[order],
+    }
+    return pa.table({name: pa.array(columns[name]) for name in COLUMNS}, _SCHEMA)
+
+
+def _told(seen: Readings, missing: NDArray[np.bool_], is_tip: bool) -> dict[str, pa.Array]:
+    """What the tracker says in each sample, null in those that it misses."""
+    # The roll of one coil is not known.
+    turns = along(z_axis(seen.turns)) if is_tip else seen.turns
+    nothing = np.zeros(len(missing))
+    columns = _named(("x_mm", "y_mm", "z_mm"), seen.positions) | _named(("qw", "qx", "qy", "qz"), turns)
+    told = {name: pa.array(values, mask=missing) for name, values in columns.items()}
+    if seen.indicators is None:
+        return told | {"indicator": pa.array(nothing, mask=np.ones(len(missing), dtype=bool))}
+    return told | {"indicator": pa.array(seen.indicators, mask=missing)}
+
+
+def _named(names: Sequence[str], values: Floats) -> dict[str, Floats]:
+    return dict(zip(names, values.T, strict=True))
+
+
+_KINDS = {"point_id": pa.int64(), "sensor": pa.string(), "environment": pa.string()}
+_SCHEMA = pa.schema([(name, _KINDS.get(name, pa.float64())) for name in COLUMNS])

@@ -1,0 +1,1 @@
+"""Observers: the estimated needle, corrected by readings that come late."""

@@ -1,0 +1,118 @@
+"""What every observer offers: the estimated needle, corrected by readings that come late."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from statistics import fmean
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.simulator.state import State
+from flexneedle.types import Command, Sample
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Move:
+    """What the driver did from `begun` to `ended` (s), and the good readings taken meanwhile."""
+
+    begun: float
+    ended: float
+    applied: Command
+    samples: tuple[Sample, ...] = ()
+
+    @cached_property
+    def mean(self) -> tuple[float, float, float, float] | None:
+        """Of its readings: the share of the move done, x, y (mm), and their number; None without any."""
+        if not self.samples:
+            return None
+        part = [self.part(sample.time) for sample in self.samples]
+        x, y = zip(*map(place, self.samples), strict=True)
+        return fmean(part), fmean(x), fmean(y), float(len(part))
+
+    def part(self, time: float) -> float:
+        """Share of the move that is done at `time`."""
+        if self.ended <= self.begun:
+            return 1.0
+        return min(1.0, max(0.0, (time - self.begun) / (self.ended - self.begun)))
+
+
+class Estimate(Protocol):
+    """A frozen estimate of the insertion now."""
+
+    @property
+    def simulator(self) -> Simulator:
+        """The model that predicts, with the estimated constants."""
+        ...
+
+    @property
+    def state(self) -> State:
+        """State of that model now."""
+        ...
+
+    @property
+    def tip(self) -> Floats:
+        """Pose (3,) of the tip now, as a tracker without errors would measure it."""
+        ...
+
+    @property
+    def innovation(self) -> tuple[float, float]:
+        """The last reading less its prediction (mm)."""
+        ...
+
+    @property
+    def measured(self) -> tuple[float, float] | None:
+        """Tip (x, y) measured at the end of the last move of which there is a reading (mm), None before the first."""
+        ...
+
+    @property
+    def tip_sd(self) -> float:
+        """Standard deviation (mm) of the predicted distance of the next reading of the tip."""
+        ...
+
+    def tip_at(self, time: float) -> tuple[float, float]:
+        """Estimated position of the tip (mm) at `time`, each move taken as even."""
+        ...
+
+    def move(self, applied: Command, begun: float, ended: float) -> "Estimate":
+        """The estimate after the driver moved so, from `begun` to `ended` (s)."""
+        ...
+
+    def observe(self, samples: Sequence[Sample]) -> "Estimate":
+        """The estimate corrected by good readings, the newest last."""
+        ...
+
+    def unseen(self) -> "Estimate":
+        """The estimate of a period without a good reading: no innovation."""
+        ...
+
+
+def assigned(moves: tuple[Move, ...], samples: Sequence[Sample]) -> tuple[Move, ...]:
+    """Give each sample to the move in which it was taken; one of before to the first, one of after to the last."""
+    ends = np.array([done.ended for done in moves[:-1]])
+    owner = np.searchsorted(ends, [sample.time - 1e-9 for sample in samples])
+    return tuple(
+        done
+        if not (new := tuple(s for s, k in zip(samples, owner, strict=True) if k == j))
+        else Move(done.begun, done.ended, done.applied, done.samples + new)
+        for j, done in enumerate(moves)
+    )
+
+
+def along(moves: tuple[Move, ...], tips: Floats, time: float) -> tuple[float, float]:
+    """Position (mm) at `time` on the path through tips (k + 1, 3), those before and after each of k moves."""
+    if not moves:
+        return float(tips[-1, 0]), float(tips[-1, 1])
+    times = [moves[0].begun, *(done.ended for done in moves)]
+    return float(np.interp(time, times, tips[:, 0])), float(np.interp(time, times, tips[:, 1]))
+
+
+def place(sample: Sample) -> tuple[float, float]:
+    """Tip (mm) as a good sample has it. Raises ValueError for an empty sample."""
+    if sample.x is None or sample.y is None:
+        raise ValueError("an empty sample was not sorted out")
+    return sample.x, sample.y

@@ -1,0 +1,143 @@
+"""The prior of what `adaptive-mpc` identifies: normal, from the scenario and the settings, with bounds from the law.
+
+Parameters in order: base y (mm), base turn (rad), natural bend of the needle (mm), run-out (mm), factor on the bevel
+offset, clearance in the guide (mm), ln of the factor on each layer's modulus, shift (mm) of each boundary between
+layers, ln of a further factor on the modulus in cells along the depth, correlated over a length.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.errors import ScenarioError
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.problems import Problem, to_line
+from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive, Section
+from flexneedle.scenario.sections.tissue import MOST_BEVEL
+
+Floats = NDArray[np.float64]
+BASE_Y, BASE_TURN, BEND, RUN_OUT, BEVEL, CLEARANCE, MODULUS = range(7)
+LEAST_SD = 1e-6
+"""Of a parameter without a standard deviation: it is known."""
+_STEPS = (0.05, 3e-4, 0.05, 0.05, 0.05, 0.02)  # for differences: mm, rad, mm, mm, 1, mm
+_LOG_STEP = 0.05
+_SHIFT_STEP = 0.2  # mm
+_WIDEST = 4.0  # standard deviations that a parameter may leave its prior
+_MOST_CELLS = 200
+
+
+class Priors(Section):
+    """Settings of the observer, keys of the section of the controller that has it."""
+
+    bend_sd_mm: NonNegative = 0.5
+    """Prior of the natural bend of the needle, over its length: standard deviation."""
+    run_out_sd_mm: NonNegative = 0.1
+    """Prior of the distance of the measured tip from the needle's axis: standard deviation."""
+    clearance_mm: NonNegative = 0.05
+    """Prior of the clearance of the needle in the guide, to either side: mean."""
+    clearance_sd_mm: NonNegative = 0.02
+    """Prior of the clearance of the needle in the guide, to either side: standard deviation."""
+    modulus_log_sd: NonNegative = 0.3
+    """Prior of the logarithm of the factor on each layer's modulus: standard deviation."""
+    bevel_sd: NonNegative = 0.3
+    """Prior of the factor on the bevel offset: standard deviation."""
+    boundary_sd_mm: NonNegative = 1.5
+    """Prior of the depth of each boundary between layers: standard deviation."""
+    variation_sd: NonNegative = 0.2
+    """Prior of the logarithm of the modulus along the depth, about that of its layer: standard deviation."""
+    variation_length_mm: Positive = 10.0
+    """Length over which the variation of the modulus along the depth is correlated."""
+    cell_mm: Positive = 2.5
+    """Length of the cells in which the modulus is taken as constant."""
+    model_sd: NonNegative = 0.01
+    """Standard deviation of a reading's mean that no parameter explains, relative to the bevel offset."""
+    least_model_sd_mm: Positive = 0.0126
+    """Least standard deviation of a reading's mean that no parameter explains."""
+    residual_gain: Fraction = 0.4
+    """Gain of the low-pass over what the fit leaves."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Normal prior of the parameters: mean (K,), precision (K, K), bounds (2, K); steps for differences (K,); the depth
+    of the tip (mm) from which each matters to it (K,).
+    """
+
+    mean: Floats
+    precision: Floats
+    bounds: Floats
+    steps: Floats
+    begins: Floats
+
+    @staticmethod
+    def of(scenario: Scenario, settings: Priors, depth: float) -> "Prior":
+        """The scenario's."""
+        control = scenario.control
+        layers, cells = len(scenario.tissue), _cells(depth, settings)
+        single = (
+            [control.start_offset_sd_mm, control.start_angle_sd, settings.bend_sd_mm]
+            + [
+                settings.run_out_sd_mm,
+                settings.bevel_sd,
+                settings.clearance_sd_mm if scenario.setup.has_guide else 0.0,
+            ]
+            + [settings.modulus_log_sd] * layers
+            + [settings.boundary_sd_mm] * (layers - 1)
+        )
+        sd = np.maximum([*single, *[settings.variation_sd] * cells], LEAST_SD)
+        mean = np.where(np.arange(sd.size) == BEVEL, 1.0, 0.0)
+        mean[CLEARANCE] = settings.clearance_mm if scenario.setup.has_guide else 0.0
+        precision = np.diag(sd**-2.0)
+        precision[-cells:, -cells:] = _uncorrelating(cells, settings.cell_mm / settings.variation_length_mm)
+        precision[-cells:, -cells:] /= sd[-1] ** 2
+        bounds = mean + np.outer((-_WIDEST, _WIDEST), sd)
+        bounds[0, CLEARANCE] = 0.0
+        bounds[:, BEVEL] = 0.0, _largest_bevel(scenario)
+        logs, shifts = [_LOG_STEP] * layers, [_SHIFT_STEP] * (layers - 1)
+        steps = np.array([*_STEPS, *logs, *shifts, *[_LOG_STEP] * cells])
+        tops = np.array(scenario.layer_tops) - _WIDEST * settings.boundary_sd_mm
+        tops[0] = 0.0
+        starts = settings.cell_mm * np.arange(cells)
+        begins = np.concatenate([[-np.inf] * BEVEL, [0.0, -np.inf], tops, tops[1:], starts])
+        return Prior(mean, precision, bounds, steps, begins)
+
+    def cost(self, parameters: Floats) -> float:
+        """Minus the logarithm of the density, but for a constant."""
+        off = parameters - self.mean
+        return float(0.5 * off @ self.precision @ off)
+
+
+def unexplained(scenario: Scenario, settings: Priors) -> float:
+    """Standard deviation (mm) of the mean of a move's readings that no parameter explains."""
+    return max(settings.least_model_sd_mm, settings.model_sd * scenario.needle.bevel.offset_mm)
+
+
+def _uncorrelating(size: int, distance: float) -> Floats:
+    """Inverse of the correlation exp(−distance |i − j|): that of a Markov chain, so tridiagonal."""
+    share = np.exp(-distance)
+    inner = np.full(size, 1.0 + share**2)
+    inner[[0, -1]] = 1.0
+    beside = np.full(size - 1, -share)
+    inverse: Floats = (np.diag(inner) + np.diag(beside, 1) + np.diag(beside, -1)) / (1.0 - share**2)
+    return inverse
+
+
+def _cells(depth: float, settings: Priors) -> int:
+    """Cells from the skin to the target's depth (mm); the last one goes on."""
+    return max(2, int(np.ceil(depth / settings.cell_mm)))
+
+
+def check_cells(scenario: Scenario, settings: Priors) -> None:
+    """Raise ScenarioError for cells so short that a fit would never end."""
+    thinnest = scenario.setup.max_depth / _MOST_CELLS
+    if settings.cell_mm < thinnest:
+        rule = f"must be at least {thinnest:g}, the depth of the full stroke / {_MOST_CELLS}"
+        raise ScenarioError(to_line(Problem("control.adaptive_mpc.cell_mm", settings.cell_mm, rule)))
+
+
+def _largest_bevel(scenario: Scenario) -> float:
+    """Largest factor on the bevel offset with which the law stays above its floor stretch."""
+    shortest = min(layer.compression_length_mm for layer in scenario.tissue)
+    offset = scenario.needle.bevel.offset_mm
+    return MOST_BEVEL * shortest / offset if offset > 0.0 else 1.0

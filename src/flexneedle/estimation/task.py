@@ -1,0 +1,25 @@
+"""What a controller is to carry out."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from flexneedle.scenario.model import Scenario
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import PlanRecord
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A plan, the model as the scenario has it, and the controller's own settings.
+
+    settings: of the class that the `Method` names, checked; None for a controller without any.
+    """
+
+    simulator: Simulator
+    plan: PlanRecord
+    settings: Any = None
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of model and settings."""
+        return self.simulator.scenario

@@ -1,0 +1,200 @@
+"""Plan an insertion: the cross-entropy method on rollouts of the simulator (paper section III-A)."""
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.errors import InputError
+from flexneedle.planning.cross_entropy import Search
+from flexneedle.planning.insertion import BASE_Y, GUIDE, Problem, Solution, optimise
+from flexneedle.planning.steering import reach, steer
+from flexneedle.planning.terms import Outcome
+from flexneedle.scenario.model import Scenario, check_target
+from flexneedle.scenario.sections.settings import Plan, elite_count
+from flexneedle.simulator.control import Control
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.simulator.state import State
+from flexneedle.types import PlanRecord
+
+Floats = NDArray[np.float64]
+STRATEGIES = ("manipulation", "steering")
+_DEPTH_TOLERANCE_MM = 1e-6
+_SHARE_SIGMA = 0.1  # of the logarithm of a primitive's share of the travel
+_SHARE_OF_A_SEARCH = 4  # of plan.samples goes into each number of rolls and side, which have few coordinates
+_LEAST_SAMPLES = 8
+_AT_LIMIT = 0.999  # share of a limit that counts as reached
+
+
+def plan(
+    scenario: Scenario,
+    target: tuple[float, float] | None = None,
+    strategy: str = "manipulation",
+    seed: int = 0,
+    progress: Callable[[dict[str, Any]], None] | None = None,
+    *,
+    threads: int | None = None,
+) -> PlanRecord:
+    """Plan an insertion to `target` (x, y) in mm (default: the scenario's), best found by cross-entropy.
+
+    strategy: "manipulation" moves guide and bevel; "steering" moves only the bevel (paper section III-A, but on the
+    needle itself, not on a softer one). `progress` gets a dict after each iteration. `threads` is for rollouts
+    (default: all cores) and changes no result. Same seed, same plan.
+    Raises ScenarioError for a target that the scenario excludes and InputError for an unknown strategy.
+    """
+    if strategy not in STRATEGIES:
+        raise InputError(f"strategy = {strategy!r}: must be one of {', '.join(STRATEGIES)}")
+    goal = scenario.target.position if target is None else (float(target[0]), float(target[1]))
+    check_target(scenario, *goal)
+    begun = time.perf_counter()
+    simulator = Simulator(scenario, threads)
+    problem = _problem(scenario, goal, strategy)
+    solution = _search(simulator, problem, np.random.default_rng(seed), progress)
+    controls = _end_at_depth(simulator, solution.controls, solution.bevel, goal[0])
+    states = [simulator.start(solution.bevel)]
+    for row in controls:
+        states.append(simulator.step(states[-1], Control.from_row(row.tolist())))
+    return PlanRecord(
+        strategy=strategy,
+        target=goal,
+        seed=seed,
+        bevel=solution.bevel,
+        controls=controls,
+        tips=np.array([state.tip for state in states]),
+        strain_energy=np.array([state.strain_energy for state in states]),
+        guide=np.array([state.guide for state in states]),
+        shapes=np.array([state.nodes for state in states]),
+        cost=solution.cost,
+        terms=solution.terms,
+        iterations=solution.belief.iterations,
+        converged=solution.belief.converged,
+        history=solution.belief.history,
+        limit=_binding_limit(simulator, problem, controls, states),
+        seconds=time.perf_counter() - begun,
+    )
+
+
+def bevel_reach(scenario: Scenario, depth: float, threads: int | None = None) -> tuple[float, float]:
+    """Least and greatest lateral position (mm) at a depth (mm) that the bevel alone can reach."""
+    simulator = Simulator(scenario, threads)
+    return reach(_rollout(simulator), _problem(scenario, (depth, 0.0), "steering"))
+
+
+def _search(
+    simulator: Simulator,
+    problem: Problem,
+    rng: np.random.Generator,
+    progress: Callable[[dict[str, Any]], None] | None,
+) -> Solution:
+    """The best primitives, or, where nothing but the bevel is free, the best rolls."""
+    plan, rollout = simulator.scenario.plan, _rollout(simulator)
+    if _bevel_alone(problem):
+        search = _settings(plan, max(_LEAST_SAMPLES, plan.samples // _SHARE_OF_A_SEARCH))
+        return steer(rollout, problem, search, rng, progress)
+    return optimise(rollout, problem, _settings(plan, plan.samples), rng, progress)
+
+
+def _rollout(simulator: Simulator) -> Callable[[Floats], Outcome]:
+    start = simulator.start()
+
+    def rollout(controls: Floats) -> Outcome:
+        result, deflection = simulator.rollout_with_deflection(start, controls)
+        return Outcome(controls, *result, deflection)
+
+    return rollout
+
+
+def _settings(plan: Plan, samples: int) -> Search:
+    return Search(
+        samples=samples,
+        elite=max(2, elite_count(samples, plan.elite_fraction)),
+        iterations=max(plan.iterations, plan.max_iterations),
+        smoothing=plan.smoothing,
+        tolerance=plan.tolerance,
+        usual=plan.iterations,
+    )
+
+
+def _bevel_alone(problem: Problem) -> bool:
+    return not problem.sigma[BASE_Y : GUIDE + 1].any()
+
+
+def _problem(scenario: Scenario, goal: tuple[float, float], strategy: str) -> Problem:
+    setup, plan = scenario.setup, scenario.plan
+    guide_step = setup.max_guide_step_mm if setup.has_guide else 0.0
+    sigma = np.array(
+        [
+            plan.advance_sigma_mm,
+            plan.base_sigma_mm,
+            plan.base_turn_sigma,
+            plan.guide_sigma_mm,
+            1.0,
+            _SHARE_SIGMA,
+        ]
+    )
+    if strategy == "steering":
+        sigma[1:4] = 0.0
+    elif not setup.has_guide:
+        sigma[3] = 0.0
+    return Problem(
+        target=goal,
+        travel=setup.tip_to_skin_mm + goal[0],
+        air=setup.tip_to_skin_mm,
+        primitives=plan.primitives,
+        step=np.array([setup.max_advance_mm, setup.max_base_step_mm, setup.max_base_turn_step, guide_step]),
+        reach=np.array([setup.stroke_mm, setup.max_base_travel_mm, np.inf, setup.max_guide_travel_mm]),
+        sigma=sigma,
+        accuracy_weight=plan.accuracy_weight_per_mm,
+        energy_weight=plan.energy_weight_per_mj,
+        deflection_weight=plan.deflection_weight,
+        guide_weight=plan.guide_weight,
+        flip_weight=plan.flip_weight,
+    )
+
+
+def _end_at_depth(simulator: Simulator, controls: Floats, bevel: int, depth: float) -> Floats:
+    """Shorten or add last steps until the tip ends at the target depth."""
+    start, setup = simulator.start(bevel), simulator.scenario.setup
+    for _ in range(8):
+        short = depth - float(simulator.rollout(start, controls[None]).tips[0, -1, 0])
+        if abs(short) < _DEPTH_TOLERANCE_MM:
+            break
+        last = float(controls[-1, 0]) + short
+        stroke_left = setup.stroke_mm - float(controls[:, 0].sum())
+        if last <= 0.0 and len(controls) > 1:
+            controls = controls[:-1]
+        elif last > setup.max_advance_mm and stroke_left > _DEPTH_TOLERANCE_MM:
+            # The rest is no more than the shortening, so it takes a single further step.
+            extra = np.array([[min(short, setup.max_advance_mm, stroke_left), 0.0, 0.0, 0.0, -1.0]])
+            controls = np.concatenate([controls, extra])
+        else:
+            controls = controls.copy()
+            controls[-1, 0] = min(last, setup.max_advance_mm, float(controls[-1, 0]) + stroke_left)
+    return controls
+
+
+def _binding_limit(simulator: Simulator, problem: Problem, controls: Floats, states: list[State]) -> str:
+    """Name the key that keeps the plan from its target; empty if it gets there.
+
+    A target out of the bevel's reach is named however near the plan comes to it.
+    """
+    scenario, end = simulator.scenario, states[-1].tip
+    setup, near = scenario.setup, math.dist(end[:2], problem.target) <= 1.0
+    guide = max(abs(state.guide) for state in states)
+    if controls[:, 0].sum() > _AT_LIMIT * setup.stroke_mm and end[0] < problem.target[0] - 0.5:
+        return f"setup.stroke_mm = {setup.stroke_mm:g}"
+    if _bevel_alone(problem):
+        least, greatest = reach(_rollout(simulator), problem)
+        if not least <= problem.target[1] <= greatest:
+            why = f"the bevel alone reaches {least:.2f} to {greatest:.2f} mm lateral"
+            return f"needle.bevel.offset_mm = {scenario.needle.bevel.offset_mm:g} ({why})"
+    if near:
+        return ""
+    if guide > _AT_LIMIT * setup.max_guide_travel_mm:
+        return f"setup.max_guide_travel_mm = {setup.max_guide_travel_mm:g}"
+    if np.abs(controls[:, 3]).max() > _AT_LIMIT * setup.max_guide_step_mm:
+        return f"setup.max_guide_step_mm = {setup.max_guide_step_mm:g}"
+    return f"plan.accuracy_weight_per_mm = {scenario.plan.accuracy_weight_per_mm:g} (other costs outweigh the miss)"

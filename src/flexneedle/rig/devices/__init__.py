@@ -1,0 +1,1 @@
+"""Devices behind the ports of a rig."""

@@ -1,0 +1,1 @@
+"""NDI Aurora, behind the port `Tracker`."""

@@ -1,0 +1,53 @@
+"""`Replay`: frames that were recorded, once more, behind the port `Tracker`."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Self
+
+from flexneedle.errors import InputError
+from flexneedle.rig.ports import Clock
+from flexneedle.types import VISIBLE, Frame
+
+ENDED = "the recording has ended"
+"""The status of a replay after its last frame: there is no more to come."""
+
+
+class Replay:
+    """Plays frames on a clock from now on: what was recorded after t seconds comes after t seconds.
+
+    frames: oldest first. The times told are those of the clock, the numbers those of the recording. At another speed
+    it is the clock that runs faster, so that ages and windows stay those of the recording.
+    Raises InputError if there are no frames.
+    """
+
+    def __init__(self, frames: Sequence[Frame], clock: Clock) -> None:
+        if not frames:
+            raise InputError("a replay needs at least one frame")
+        self._frames, self._clock = frames, clock
+        self._start, self._next = clock.now(), 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        pass
+
+    def read(self) -> tuple[Frame, ...]:
+        """The frames since the last call, oldest first; empty if there was none."""
+        now, first = self._clock.now(), self._next
+        while not self.ended and self._due(self._frames[self._next]) <= now:
+            self._next += 1
+        return tuple(replace(frame, time=self._due(frame)) for frame in self._frames[first : self._next])
+
+    @property
+    def ended(self) -> bool:
+        """Whether the last frame was read."""
+        return self._next == len(self._frames)
+
+    @property
+    def status(self) -> str:
+        """VISIBLE while there is more to come, then ENDED."""
+        return ENDED if self.ended else VISIBLE
+
+    def _due(self, frame: Frame) -> float:
+        return self._start + frame.time - self._frames[0].time

@@ -1,0 +1,1 @@
+"""Emulators of devices, on their own protocols."""

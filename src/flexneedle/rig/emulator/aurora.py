@@ -1,0 +1,345 @@
+"""The emulated Aurora: what it answers to a command in a state. Pure: nothing is opened, sent or timed here.
+
+It has one wired port a sensor, with the port handles 0A, 0B, …; knows the commands that clients need to find,
+set up, start and read sensors; and keeps to the modes of the real one: nothing before INIT, no set-up while it
+tracks, no reading before. Names and numbers are those of NDI's Combined API.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+from flexneedle.rig.emulator import codec
+from flexneedle.rig.emulator.codec import Command
+from flexneedle.rig.emulator.motion import SENSORS, Pose
+
+FIRMWARE = "AURORA Rev 008"
+"""Freeze tag of the firmware. Clients choose between BX and TX by it."""
+
+_FIRST_HANDLE = 0x0A
+_OCCUPIED, _INITIALIZED, _ENABLED = 0x01, 0x10, 0x20
+_OUT_OF_VOLUME, _PARTLY_OUT, _BROKEN = 0x40, 0x80, 0x100
+_VALID, _MISSING, _DISABLED = 1, 2, 4
+_TRANSFORMS, _ALSO_OUT_OF_VOLUME = 0x0001, 0x0800
+_OFF, _SETUP, _TRACKING = "off", "setup", "tracking"
+
+
+@dataclass(frozen=True)
+class Port:
+    """A port handle; sensor is None for a handle that was asked for (PHRQ) and has nothing plugged in."""
+
+    number: int
+    sensor: str | None
+    initialized: bool = False
+    enabled: bool = False
+
+    @property
+    def status(self) -> int:
+        """Its bits in PHSR, PHINF, TX and BX."""
+        return (
+            (_OCCUPIED if self.sensor else 0)
+            | (_INITIALIZED if self.initialized else 0)
+            | (_ENABLED if self.enabled else 0)
+        )
+
+
+@dataclass(frozen=True)
+class Aurora:
+    """State of the device: mode, port handles, firmware, and whether it knows BX (old firmware does not)."""
+
+    ports: Mapping[int, Port]
+    mode: str = _OFF
+    firmware: str = FIRMWARE
+    knows_bx: bool = True
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What there is to read now: the frame's number, the poses by sensor, what ails a sensor, if anything, and the bits
+    of what ails the whole system."""
+
+    number: int
+    poses: Mapping[str, Pose]
+    ailments: Mapping[str, str] = field(default_factory=dict)
+    system: int = 0
+
+
+class _Refusal(Exception):
+    """A reply ERROR with a code."""
+
+
+def fresh(sensors: int = len(SENSORS), firmware: str = FIRMWARE, *, knows_bx: bool = True) -> Aurora:
+    """Return the device as it is after power-on with so many sensors plugged in."""
+    ports = {_FIRST_HANDLE + n: Port(n + 1, name) for n, name in enumerate(SENSORS[:sensors])}
+    return Aurora(ports, firmware=firmware, knows_bx=knows_bx)
+
+
+def answer(aurora: Aurora, line: bytes, seen: Seen) -> tuple[Aurora, bytes]:
+    """Return the state after a command (a line without its end) and the whole reply."""
+    command = codec.parse(line)
+    try:
+        if not command.intact:
+            raise _Refusal("04")
+        return _obey(aurora, command, seen)
+    except _Refusal as refusal:
+        return aurora, codec.text(f"ERROR{refusal}")
+
+
+def _obey(aurora: Aurora, command: Command, seen: Seen) -> tuple[Aurora, bytes]:
+    if command.name in _ANYWHERE:
+        return _ANYWHERE[command.name](aurora, command.arguments)
+    known = command.name in _SET_UP or command.name in ("TX", "TSTOP") or _is_bx(aurora, command.name)
+    if not known:
+        raise _Refusal("01")
+    if aurora.mode == _OFF:
+        raise _Refusal("10")
+    if (aurora.mode == _SETUP) != (command.name in _SET_UP):
+        raise _Refusal("0C")
+    if command.name in _SET_UP:
+        return _SET_UP[command.name](aurora, command.arguments)
+    if command.name == "TSTOP":
+        return replace(aurora, mode=_SETUP), codec.text("OKAY")
+    return aurora, (_tx if command.name == "TX" else _bx)(aurora, _options(command.arguments), seen)
+
+
+def _is_bx(aurora: Aurora, name: str) -> bool:
+    return name == "BX" and aurora.knows_bx
+
+
+def _options(arguments: str) -> int:
+    if not arguments:
+        return _TRANSFORMS
+    options = _hexadecimal(arguments, 4)
+    if options & ~(_TRANSFORMS | _ALSO_OUT_OF_VOLUME):
+        raise _Refusal("23")
+    return options
+
+
+def _hexadecimal(digits: str, length: int) -> int:
+    if len(digits) < length:
+        raise _Refusal("03")
+    try:
+        return int(digits[:length], 16)
+    except ValueError:
+        raise _Refusal("23") from None
+
+
+# Commands in any mode
+
+
+def _init(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+    """Enter set-up with all sensors to be initialised again."""
+    ports = {handle: Port(port.number, port.sensor) for handle, port in aurora.ports.items()}
+    return replace(aurora, mode=_SETUP, ports=ports), codec.text("OKAY")
+
+
+def _reset(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+    """A pseudo-terminal carries no serial break, so the command alone resets."""
+    ports = {handle: Port(port.number, port.sensor) for handle, port in aurora.ports.items()}
+    return replace(aurora, mode=_OFF, ports=ports), codec.text("RESET")
+
+
+def _okay(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+    return aurora, codec.text("OKAY")
+
+
+def _beep(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+    if arguments not in list("123456789"):
+        raise _Refusal("23")
+    return aurora, codec.text("1")
+
+
+def _comm(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+    """A pseudo-terminal has no speed: what is asked for is checked and granted."""
+    if len(arguments) < 5:
+        raise _Refusal("03")
+    allowed = ("01234567A", "01", "012", "01", "01")  # speed, data bits, parity, stop bits, handshake
+    if any(digit not in choices for digit, choices in zip(arguments, allowed, strict=False)):
+        raise _Refusal("23")
+    return aurora, codec.text("OKAY")
+
+
+def _version(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+    lines = ("AURORA Control Firmware", "NDI S/N: EMULATOR", f"Freeze Tag: {aurora.firmware}", "Emulated")
+    return aurora, codec.text("\n".join(lines) + "\n")
+
+
+def _revision(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+    return aurora, codec.text("D.001.007")
+
+
+def _information(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+    values = {"Features.Firmware.Version": aurora.firmware, "Features.Hardware.Model": "Aurora emulator"}
+    if arguments not in values:
+        raise _Refusal("34")
+    return aurora, codec.text(f"{arguments}={values[arguments]}")
+
+
+def _features(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+    """Only the number of ports is told (option 02)."""
+    if _hexadecimal(arguments, 2) != 0x02:
+        raise _Refusal("23")
+    return aurora, codec.text(f"{sum(port.sensor is not None for port in aurora.ports.values()):X}")
+
+
+# Commands in set-up
+
+
+def _port(aurora: Aurora, arguments: str) -> tuple[int, Port]:
+    handle = _hexadecimal(arguments, 2)
+    if handle not in aurora.ports:
+        raise _Refusal("08")
+    return handle, aurora.ports[handle]
+
+
+def _with(aurora: Aurora, handle: int, port: Port) -> tuple[Aurora, bytes]:
+    return replace(aurora, ports={**aurora.ports, handle: port}), codec.text("OKAY")
+
+
+_LISTED: dict[int, Callable[[Port], bool]] = {
+    0x00: lambda _: True,
+    0x01: lambda _: False,
+    0x02: lambda port: port.sensor is not None and not port.initialized,
+    0x03: lambda port: port.initialized and not port.enabled,
+    0x04: lambda port: port.enabled,
+}
+
+
+def _search(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+    option = _hexadecimal(arguments, 2) if arguments else 0
+    if option not in _LISTED:
+        raise _Refusal("23")
+    found = [(handle, port) for handle, port in aurora.ports.items() if _LISTED[option](port)]
+    listed = "".join(f"{handle:02X}{port.status:03X}" for handle, port in found)
+    return aurora, codec.text(f"{len(found):02X}{listed}")
+
+
+def _request(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+    handle = max(aurora.ports, default=_FIRST_HANDLE - 1) + 1
+    port = Port(0, None)
+    return replace(aurora, ports={**aurora.ports, handle: port}), codec.text(f"{handle:02X}")
+
+
+def _free(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+    freed, _ = _port(aurora, arguments)
+    ports = {handle: port for handle, port in aurora.ports.items() if handle != freed}
+    return replace(aurora, ports=ports), codec.text("OKAY")
+
+
+def _write(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+    """Take the description of a tool and forget it: the emulated ones have their own."""
+    _port(aurora, arguments)
+    return aurora, codec.text("OKAY")
+
+
+def _initialize(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+    handle, port = _port(aurora, arguments)
+    if port.sensor is None:
+        raise _Refusal("0D")
+    return _with(aurora, handle, replace(port, initialized=True))
+
+
+def _enable(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+    handle, port = _port(aurora, arguments)
+    if not port.initialized:
+        raise _Refusal("0E")
+    if arguments[2:3] not in ("S", "D", "B"):
+        raise _Refusal("09")
+    return _with(aurora, handle, replace(port, enabled=True))
+
+
+def _disable(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+    handle, port = _port(aurora, arguments)
+    return _with(aurora, handle, replace(port, enabled=False))
+
+
+def _describe(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+    """PHINF: the parts that the options ask for, in the order of their bits."""
+    _, port = _port(aurora, arguments)
+    options = _hexadecimal(arguments[2:], 4) if len(arguments) > 2 else 0x0001
+    if port.sensor is None:
+        return aurora, codec.text("UNOCCUPIED")
+    parts = {
+        0x0001: f"0200000{port.number}{'EMULATOR':<12}001{port.number:08X}{port.status & 0xFF:02X}",
+        0x0002: "00000000",
+        0x0004: f"{'EMULATED-SENSOR':<20}",
+        0x0008: "00",
+        0x0010: "00",
+        0x0020: f"0000000010{port.number:02d}00",
+        0x0040: "00",
+    }
+    return aurora, codec.text("".join(part for bit, part in parts.items() if options & bit))
+
+
+def _start(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+    return replace(aurora, mode=_TRACKING), codec.text("OKAY")
+
+
+_Handler = Callable[[Aurora, str], tuple[Aurora, bytes]]
+_ANYWHERE: dict[str, _Handler] = {
+    "INIT": _init,
+    "RESET": _reset,
+    "ECHO": lambda aurora, arguments: (aurora, codec.text(arguments)),
+    "BEEP": _beep,
+    "COMM": _comm,
+    "VER": _version,
+    "APIREV": _revision,
+    "GETINFO": _information,
+    "GET": _information,
+    "SFLIST": _features,
+    "LED": _okay,
+}
+_SET_UP: dict[str, _Handler] = {
+    "PHSR": _search,
+    "PHRQ": _request,
+    "PHF": _free,
+    "PVWR": _write,
+    "PINIT": _initialize,
+    "PENA": _enable,
+    "PDIS": _disable,
+    "PHINF": _describe,
+    "TSTART": _start,
+}
+
+
+# Readings
+
+
+def _tx(aurora: Aurora, options: int, seen: Seen) -> bytes:
+    rows = [(handle, *_reading(port, options, seen)) for handle, port in _reported(aurora)]
+    words = {_MISSING: "MISSING", _DISABLED: "DISABLED"}
+    told = "".join(
+        f"{handle:02X}{words[kind] if pose is None else codec.transform_text(pose)}{bits:08X}{seen.number:08X}\n"
+        for handle, kind, bits, pose in rows
+    )
+    return codec.text(f"{len(rows):02X}{told}{seen.system:04X}")
+
+
+def _bx(aurora: Aurora, options: int, seen: Seen) -> bytes:
+    body = bytearray([len(_reported(aurora))])
+    for handle, port in _reported(aurora):
+        kind, bits, pose = _reading(port, options, seen)
+        body += bytes((handle, kind))
+        if kind == _DISABLED:
+            continue  # it has no more to tell
+        body += b"" if pose is None else codec.transform_binary(pose)
+        body += bits.to_bytes(4, "little") + seen.number.to_bytes(4, "little")
+    return codec.binary(bytes(body) + seen.system.to_bytes(2, "little"))
+
+
+def _reported(aurora: Aurora) -> list[tuple[int, Port]]:
+    return [(handle, port) for handle, port in aurora.ports.items() if port.initialized]
+
+
+def _reading(port: Port, options: int, seen: Seen) -> tuple[int, int, Pose | None]:
+    """Return handle status, port status and pose, None where none is told."""
+    ailment = seen.ailments.get(port.sensor or "")
+    bits = port.status | _AILING_BITS.get(ailment or "", 0)
+    if not port.enabled or ailment == "disabled":
+        return _DISABLED, bits & ~_ENABLED, None
+    hidden = ailment == "out-of-volume" and not options & _ALSO_OUT_OF_VOLUME
+    if ailment in ("missing", "broken") or hidden:
+        return _MISSING, bits, None
+    return _VALID, bits, seen.poses[port.sensor or ""]
+
+
+_AILING_BITS = {"out-of-volume": _OUT_OF_VOLUME, "partly-out": _PARTLY_OUT, "broken": _BROKEN}

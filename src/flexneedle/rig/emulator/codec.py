@@ -1,0 +1,79 @@
+"""How NDI's serial protocol writes commands, replies and checksums (Combined API); no state, no device.
+
+A command is ASCII, `NAME:argumentsCRC\\r`, or `NAME arguments\\r` without a checksum. A reply is text, checksum and
+`\\r`, or binary behind a header of its own (`BX`). ndicapi's sources are where the layouts were looked up.
+"""
+
+import struct
+from dataclasses import dataclass
+
+from flexneedle.rig.emulator.motion import Pose
+
+_BINARY_START = 0xA5C4
+_POLYNOMIAL = 0xA001  # x^16 + x^15 + x^2 + 1, lowest bit first
+_CRC_DIGITS = 4
+
+
+def _divided(byte: int) -> int:
+    for _ in range(8):
+        byte = (byte >> 1) ^ (_POLYNOMIAL if byte & 1 else 0)
+    return byte
+
+
+_TABLE = tuple(map(_divided, range(256)))  # a byte at a time: a reply has some 200
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command as it came in; intact is False where its checksum is wrong."""
+
+    name: str
+    arguments: str
+    intact: bool = True
+
+
+def crc16(data: bytes) -> int:
+    """Return the checksum of the protocol (CRC-16/ARC: starts at 0)."""
+    crc = 0
+    for byte in data:
+        crc = (crc >> 8) ^ _TABLE[(crc ^ byte) & 0xFF]
+    return crc
+
+
+def parse(line: bytes) -> Command:
+    """Return the command in a line without its `\\r`; bytes that are no ASCII become characters of no command."""
+    name = line[: _name_length(line)].decode("ascii", "replace")
+    rest = line[len(name) :]
+    if not rest.startswith(b":"):
+        return Command(name, rest[1:].decode("ascii", "replace"))
+    body, checksum = line[:-_CRC_DIGITS], line[-_CRC_DIGITS:]
+    intact = len(rest) > _CRC_DIGITS and checksum.upper() == b"%04X" % crc16(body)
+    return Command(name, body[len(name) + 1 :].decode("ascii", "replace"), intact)
+
+
+def _name_length(line: bytes) -> int:
+    return next((at for at, byte in enumerate(line) if byte in b": "), len(line))
+
+
+def text(reply: str) -> bytes:
+    """Return a reply in text with its checksum and end."""
+    body = reply.encode("ascii")
+    return body + b"%04X\r" % crc16(body)
+
+
+def binary(body: bytes) -> bytes:
+    """Return a binary reply: start, length and their checksum, then body and its checksum, lowest byte first."""
+    header = struct.pack("<HH", _BINARY_START, len(body))
+    return header + struct.pack("<H", crc16(header)) + body + struct.pack("<H", crc16(body))
+
+
+def transform_text(pose: Pose) -> str:
+    """Return a pose as `TX` writes it: quaternion and indicator to 1e-4, position to 0.01 mm."""
+    turns = "".join(f"{round(part * 10_000):+06d}" for part in pose.orientation)
+    places = "".join(f"{round(part * 100):+07d}" for part in pose.position)
+    return f"{turns}{places}{round(pose.indicator * 10_000):+06d}"
+
+
+def transform_binary(pose: Pose) -> bytes:
+    """Return a pose as `BX` writes it: eight single-precision numbers."""
+    return struct.pack("<8f", *pose.orientation, *pose.position, pose.indicator)

@@ -1,0 +1,61 @@
+"""Where the emulated sensors are in each frame: the tip moves along an arc or rests, the references stand around it.
+
+The tracker's frame, as an Aurora has it: the field generator at z = 0, the volume in front of it at z < 0 (mm).
+Everything follows from seed, sensor, frame number and where the tip rests, so that any frame can be computed again.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from math import cos, pi, sin, sqrt
+
+import numpy as np
+
+from flexneedle.types import Point, Quaternion
+
+RATE_HZ = 40.0
+"""Frames a second."""
+SENSORS = ("tip", "ref1", "ref2", "ref3")
+"""The sensors at ports 1 to 4: a 5-DOF tip and three 6-DOF references."""
+
+CENTRE = (0.0, 0.0, -200.0)
+"""Middle of the arc (mm)."""
+
+_RADIUS_MM, _PERIOD_S = 30.0, 20.0
+_REFERENCES = {"ref1": (60.0, 0.0, -200.0), "ref2": (-60.0, 40.0, -200.0), "ref3": (-60.0, -40.0, -200.0)}
+_JITTER_MM = 0.07  # RMS length, of a tip in an ideal environment
+_INDICATOR, _INDICATOR_SPREAD = 0.024, 0.006
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A sensor in one frame: position (mm) and unit quaternion in the tracker's frame, indicator."""
+
+    position: Point
+    orientation: Quaternion
+    indicator: float
+
+
+@lru_cache(maxsize=64)  # a frame is asked for several times
+def pose(sensor: str, number: int, seed: int, rest: Point | None = None) -> Pose:
+    """Return a sensor's pose in a frame: the tip on its arc or at `rest` (mm), the others at rest, all with jitter."""
+    noise = np.random.default_rng((seed, SENSORS.index(sensor), number)).standard_normal(4)
+    place, turn = _at_rest(sensor, rest) or _on_the_arc(number)
+    x, y, z = (float(c + n * _JITTER_MM / sqrt(3)) for c, n in zip(place, noise[:3], strict=True))
+    return Pose((x, y, z), turn, float(abs(_INDICATOR + _INDICATOR_SPREAD * noise[3])))
+
+
+def _at_rest(sensor: str, rest: Point | None) -> tuple[Point, Quaternion] | None:
+    """Return place and turn of what stands still, None for a tip that moves."""
+    place = rest if sensor == "tip" else _REFERENCES[sensor]
+    return None if place is None else (place, (1.0, 0.0, 0.0, 0.0))
+
+
+def _on_the_arc(number: int) -> tuple[Point, Quaternion]:
+    """Return place and turn on a circle about z; the sensor's z axis lies along the motion, in the plane of x, y."""
+    angle = 2 * pi * number / (RATE_HZ * _PERIOD_S)
+    x, y, z = CENTRE
+    place = (x + _RADIUS_MM * cos(angle), y + _RADIUS_MM * sin(angle), z)
+    # z to x is a quarter turn about y; then about z to the tangent, a quarter turn ahead of the radius.
+    half = (angle + pi / 2) / 2
+    c, s = cos(half) / sqrt(2), sin(half) / sqrt(2)
+    return place, (c, -s, c, s)

@@ -1,0 +1,128 @@
+"""What really stands in the tank: drawn by a seed, as `[phantom]` says."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flexneedle.rig.phantom.structure import guide_to_skin, structure_values, with_hidden_layer
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.tissue import MOST_BEVEL
+
+_THINNEST_MM = 0.1  # layer that displaced boundaries leave
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Its scenario; where the clamp holds the base (mm, rad); and what no scenario has, with its sign (mm).
+
+    bend: tip of the free needle off the straight, for bevel +1; run_out: tip off the needle's axis, for bevel +1;
+    bias (x, y) of the tracker; variation: factor on μ in cells of `cell_mm` from the skin down.
+    """
+
+    scenario: Scenario
+    base_y: float = 0.0
+    base_turn: float = 0.0
+    bend: float = 0.0
+    run_out: float = 0.0
+    bias: tuple[float, float] = (0.0, 0.0)
+    variation: tuple[float, ...] = (1.0,)
+    cell_mm: float = 0.25
+
+
+def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
+    """Draw a phantom: tissue, bevel, start, needle and tracker; finer contacts than the scenario's.
+
+    A new entry is drawn last: it leaves the phantoms of a seed as they were without it.
+    """
+    settings = scenario.phantom
+    factors = rng.uniform(*settings.shear_modulus_factor, len(scenario.tissue))
+    values: dict[str, Any] = structure_values(scenario) | {
+        f"tissue.{k}.shear_modulus_kpa": layer.shear_modulus_kpa * float(factor)
+        for k, (layer, factor) in enumerate(zip(scenario.tissue, factors, strict=True))
+    }
+    values["needle.bevel.offset_mm"] = scenario.needle.bevel.offset_mm * _bevel_factor(scenario, rng)
+    values["contact.spacing_mm"] = settings.contact_spacing_mm
+    base_y = float(rng.normal(0.0, settings.start_offset_sd_mm))
+    base_turn = float(rng.normal(0.0, settings.start_angle_sd))
+    values |= _displaced(scenario, rng)
+    bend_side, run_out_side = rng.choice([-1.0, 1.0], 2).tolist()
+    angle = float(rng.uniform(0.0, 2.0 * math.pi))
+    cell = 0.5 * settings.contact_spacing_mm
+    variation = _variation(scenario, cell, rng)
+    values |= _start(scenario, rng) | _modulus(scenario, rng)
+    return Truth(
+        with_hidden_layer(scenario.with_values(values), scenario),
+        base_y,
+        base_turn,
+        bend_side * settings.initial_bend_mm,
+        0.5 * run_out_side * settings.run_out_mm,
+        (settings.tracker_bias_mm * math.cos(angle), settings.tracker_bias_mm * math.sin(angle)),
+        variation,
+        cell,
+    )
+
+
+def _bevel_factor(scenario: Scenario, rng: np.random.Generator) -> float:
+    """Draw the factor on the bevel offset, from the part of its range that keeps the bevel's rule."""
+    low, high = scenario.phantom.bevel_factor
+    offset = scenario.needle.bevel.offset_mm
+    least = min(layer.compression_length_mm for layer in scenario.tissue)
+    least *= scenario.phantom.structure.compression_length_factor
+    most = min(high, MOST_BEVEL * least / offset) if offset > 0.0 else high
+    return float(rng.uniform(min(low, most), most))
+
+
+def _displaced(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
+    """Thicknesses (mm) with each boundary displaced on its own; no layer vanishes."""
+    tops = np.array(scenario.layer_tops[1:])
+    bottoms = tops + rng.normal(0.0, scenario.phantom.layer_shift_sd_mm, tops.size)
+    values, top = {}, 0.0
+    for k, bottom in enumerate(bottoms.tolist()):
+        thickness = max(bottom - top, _THINNEST_MM)
+        values[f"tissue.{k}.thickness_mm"] = thickness
+        top += thickness
+    return values
+
+
+def _variation(scenario: Scenario, cell: float, rng: np.random.Generator) -> tuple[float, ...]:
+    """Factor on μ in cells down to the end of the stroke: log-normal of mean 1, exponentially correlated."""
+    settings = scenario.phantom
+    cells = math.ceil(max(scenario.setup.max_depth, 0.0) / cell) + 8
+    share = math.exp(-cell / settings.variation_length_mm)
+    level = rng.normal(0.0, 1.0, cells)
+    for k in range(1, cells):  # an Ornstein–Uhlenbeck process, sampled
+        level[k] = share * level[k - 1] + math.sqrt(1.0 - share**2) * level[k]
+    variance = math.log1p(settings.shear_modulus_variation**2)
+    return tuple(np.exp(math.sqrt(variance) * level - 0.5 * variance).tolist())
+
+
+def _start(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
+    """Draw the gap from tip to skin (mm): base and tip start further along the axis than in the scenario, or less far.
+
+    A target that is then beyond the stroke becomes the deepest one within it, as the truth is a valid scenario, too.
+    """
+    setup = scenario.setup
+    low, high = _start_range(scenario)
+    error = min(max(float(rng.normal(0.0, scenario.phantom.start_axial_sd_mm)), low), high)
+    gap = setup.tip_to_skin_mm - error
+    depth = min(scenario.target.depth_mm, setup.stroke_mm - gap)
+    return {"setup.tip_to_skin_mm": gap, "target.depth_mm": depth}
+
+
+def _start_range(scenario: Scenario) -> tuple[float, float]:
+    """Range of the error along the axis (mm): half of the distance to the skin, to the guide, and of what the base
+    has left at full stroke. A tip in the tissue or behind the guide is seen, and corrected before an insertion begins.
+    """
+    setup = scenario.setup
+    gap, guide = setup.tip_to_skin_mm, guide_to_skin(scenario)
+    left = scenario.needle.length_mm + gap - (guide or 0.0) - setup.stroke_mm
+    behind = math.inf if guide is None else guide - gap
+    return -0.5 * min(behind, setup.max_depth), 0.5 * min(gap, left)
+
+
+def _modulus(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
+    """Draw the needle's modulus, uniform around the scenario's."""
+    factor = 1.0 + scenario.phantom.youngs_modulus_variation * float(rng.uniform(-1.0, 1.0))
+    return {"needle.youngs_modulus_gpa": factor * scenario.needle.youngs_modulus_gpa}

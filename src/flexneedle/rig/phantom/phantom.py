@@ -1,0 +1,102 @@
+"""A virtual phantom behind the ports of a rig: a `Driver` and a `Clock`, and the truth for the record."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.rig.phantom.draw import Truth
+from flexneedle.rig.phantom.plants import PlantFactory, plant
+from flexneedle.simulator.control import Control, Limits
+from flexneedle.types import Command
+
+Floats = NDArray[np.float64]
+_WHOLE = 1e-8  # of a motor step: rounding of a place that stands on one
+
+
+class Condition(NamedTuple):
+    """How the needle in the tank is: tip pose (mm, rad), tissue strain energy (mJ), smallest stretch λ, convergence."""
+
+    tip: Floats
+    strain_energy: float
+    least_stretch: float
+    converged: bool
+
+
+class Phantom:
+    """The needle in the tank. Moves on command; the time that a command takes passes on its own clock."""
+
+    def __init__(self, truth: Truth, bevel: int, kind: str | PlantFactory = "exact") -> None:
+        self._plant = plant(kind, truth, bevel)
+        self._truth = truth
+        self._limits = Limits.of(truth.scenario)
+        self._moved = np.zeros(4)
+        self._owed = np.zeros(4)  # what rounding to motor steps has left undone so far
+        self._time = 0.0
+        self._least_stretch = 1.0
+        self._path = [(0.0, *self._tip())]  # time, x, y, slope
+
+    def condition(self) -> Condition:
+        """The truth, for the record; no controller gets it. The stretch is the smallest so far."""
+        return Condition(self._tip(), self._plant.strain_energy, self._least_stretch, self._plant.converged)
+
+    def now(self) -> float:
+        """Seconds since the start."""
+        return self._time
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass with everything at rest."""
+        self._time += seconds
+        self._path.append((self._time, *self._tip()))
+
+    def apply(self, command: Command, duration: float) -> Command:
+        """Carry out `command` evenly within `duration` s, in steps no longer than `phantom.step_mm`.
+
+        Motors go to the multiple of their resolution that is nearest to the sum of all commands, so that no rounding
+        adds up; the command is returned as it was applied. Raises CommandError if it breaks a limit of the setup.
+        """
+        self._limits.check(self._moved, Control.from_row(command).row()[None])
+        row = self._rounded(command)
+        parts = max(1, math.ceil(abs(row[0]) / self._truth.scenario.phantom.step_mm - 1e-9))
+        for k in range(parts):
+            self._plant.step(np.append(row[:4] / parts, row[4] if k == 0 else -1.0))
+            self._least_stretch = min(self._least_stretch, self._plant.least_stretch)
+            self._path.append((self._time + duration * (k + 1) / parts, *self._tip()))
+        self._moved += row[:4]
+        self._time += duration
+        db_x, db_y, db_theta, dg_y = row[:4].tolist()
+        return db_x, db_y, db_theta, dg_y, command[4]
+
+    def tip_at(self, time: float) -> tuple[float, float]:
+        """Return the true tip (x, y) in mm at a time, for a tracker to measure; at rest before the start."""
+        return self.pose_at(time)[:2]
+
+    def pose_at(self, time: float) -> tuple[float, float, float]:
+        """Return the true tip and its slope (x, y, θ), mm and rad, at a time; at rest before the start."""
+        for (t0, x0, y0, a0), (t1, x1, y1, a1) in zip(self._path[-2::-1], self._path[:0:-1], strict=True):
+            if time > t0:
+                part = min(1.0, (time - t0) / (t1 - t0)) if t1 > t0 else 1.0
+                return x0 + part * (x1 - x0), y0 + part * (y1 - y0), a0 + part * (a1 - a0)
+        return self._path[0][1:]
+
+    def _rounded(self, command: Command) -> Floats:
+        """The command in whole motor steps, within the limits; a turn of the base is not rounded."""
+        row = np.array(command, dtype=float)
+        grid = self._truth.scenario.phantom.motor_resolution_mm
+        if grid > 0.0:
+            lengths = [0, 1, 3]
+            stands, asked = self._moved[lengths], row[lengths] + self._owed[lengths]
+            step, travel = self._limits.step[lengths], self._limits.travel[lengths]
+            lowest = np.ceil(np.maximum(stands - step, travel[:, 0]) / grid - _WHOLE)
+            highest = np.floor(np.minimum(stands + step, travel[:, 1]) / grid + _WHOLE)
+            place = grid * np.clip(np.rint((stands + asked) / grid), lowest, highest)
+            row[lengths] = np.where(row[lengths] == 0.0, 0.0, place - stands)
+            self._owed[lengths] = np.clip(asked - row[lengths], -0.5 * grid, 0.5 * grid)
+        return row
+
+    def _tip(self) -> Floats:
+        """The pose of the tip, which is off the needle's axis by the run-out."""
+        x, y, turn = self._plant.tip
+        off = self._truth.run_out * self._plant.bevel
+        return np.array([x - off * math.sin(turn), y + off * math.cos(turn), turn])

@@ -1,0 +1,60 @@
+"""The structure of a phantom where `[phantom.structure]` says that it is not the scenario's."""
+
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+from flexneedle.scenario.model import Scenario
+
+_THINNEST_MM = 1e-3  # piece of a layer
+
+
+def guide_to_skin(scenario: Scenario) -> float | None:
+    """Distance (mm) of the phantom's guide from the skin, or None without a guide."""
+    guide = scenario.setup.guide_to_skin_mm
+    return None if guide is None else guide - scenario.phantom.structure.guide_shift_mm
+
+
+def structure_values(scenario: Scenario) -> dict[str, Any]:
+    """Return α, compression lengths, bevel length and guide of the phantom, by dotted key.
+
+    They replace `phantom.structure`, which is none of a truth's own.
+    """
+    structure = scenario.phantom.structure
+    values: dict[str, Any] = {
+        "phantom.structure": {},
+        "needle.bevel.length_mm": structure.bevel_length_factor * scenario.needle.bevel.length_mm,
+        "setup.guide_to_skin_mm": guide_to_skin(scenario),
+    }
+    for k, layer in enumerate(scenario.tissue):
+        length = structure.compression_length_factor * layer.compression_length_mm
+        values[f"tissue.{k}.compression_length_mm"] = length
+        values[f"tissue.{k}.alpha"] = layer.alpha if structure.alpha is None else structure.alpha
+    return values
+
+
+def with_hidden_layer(truth: Scenario, scenario: Scenario) -> Scenario:
+    """Return the truth with the hidden layer of the scenario, if that has one; layers that it cuts become several."""
+    hidden = scenario.phantom.structure.hidden_layer
+    if hidden is None:
+        return truth
+    top, bottom = hidden.top_mm, hidden.top_mm + hidden.thickness_mm
+    pieces: list[dict[str, Any]] = []
+    for layer, (first, last) in zip(truth.values()["tissue"], _extents(truth), strict=True):
+        for start, end in pairwise(_edges(first, last, (top, bottom))):
+            inside = top <= 0.5 * (start + end) < bottom
+            modulus = layer["shear_modulus_kpa"] * (hidden.modulus_factor if inside else 1.0)
+            pieces.append({**layer, "shear_modulus_kpa": modulus, "thickness_mm": end - start})
+    pieces[-1].pop("thickness_mm")
+    return truth.with_values({"tissue": pieces})
+
+
+def _extents(scenario: Scenario) -> Iterator[tuple[float, float]]:
+    """First and last depth (mm) of each layer; the last one goes on."""
+    return pairwise((*scenario.layer_tops, math.inf))
+
+
+def _edges(first: float, last: float, cuts: tuple[float, ...]) -> list[float]:
+    """Depths (mm) at which a layer begins, is cut, and ends."""
+    return [first, *(cut for cut in cuts if first + _THINNEST_MM < cut < last - _THINNEST_MM), last]

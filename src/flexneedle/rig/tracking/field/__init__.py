@@ -1,0 +1,1 @@
+"""A simulated electromagnetic tracker in its field."""

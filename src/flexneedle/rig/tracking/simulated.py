@@ -1,0 +1,59 @@
+"""A simulated tip tracker: jitter, bias, missing readings, and a delay, at a fixed rate."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from flexneedle.rig.ports import Clock
+from flexneedle.types import VISIBLE, Sample
+
+
+class NoisyTracker:
+    """Reads `tip_at(time)` → (x, y) in mm every `period` s with white noise of `jitter` mm on each axis.
+
+    A reading arrives `delay` s after it was taken, with the time at which it was taken; `bias` (x, y) in mm is
+    added to all, and a share `missing` of them sees no tip, but the first, which is there at the start: nobody begins
+    without. A `TipTracker`; all it shows of what it measures are such samples.
+    """
+
+    def __init__(
+        self,
+        tip_at: Callable[[float], tuple[float, float]],
+        clock: Clock,
+        period: float,
+        jitter: float,
+        rng: np.random.Generator,
+        *,
+        delay: float = 0.0,
+        missing: float = 0.0,
+        bias: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        self._tip_at, self._clock = tip_at, clock
+        self._period, self._jitter = period, jitter
+        # Noise is drawn by reading: a longer delay, with more readings from before the start, changes no later one.
+        self._rng, self._rng_before, self._rng_first = rng.spawn(3)
+        self._delay, self._missing, self._bias = delay, missing, bias
+        self._first = -math.ceil(delay / period - 1e-6)  # there at the start; number k is taken at k periods
+        self._taken = self._first - 1  # the last reading
+
+    def read(self) -> tuple[Sample, ...]:
+        """Return the readings that arrived since the last call, oldest first."""
+        due = math.floor((self._clock.now() - self._delay) / self._period + 1e-6)
+        samples = tuple(self._sample(k) for k in range(self._taken + 1, due + 1))
+        self._taken = max(due, self._taken)
+        return samples
+
+    @property
+    def status(self) -> str:
+        """VISIBLE: it never falls silent."""
+        return VISIBLE
+
+    def _sample(self, number: int) -> Sample:
+        time, is_first = number * self._period, number == self._first
+        x, y = self._tip_at(time)
+        rng = self._rng_first if is_first else self._rng if time > 0.0 else self._rng_before
+        noise = rng.normal(0.0, self._jitter, 2)
+        if rng.random() < self._missing and not is_first:
+            return Sample(time, None, None)
+        return Sample(time, x + self._bias[0] + float(noise[0]), y + self._bias[1] + float(noise[1]))

@@ -1,0 +1,192 @@
+"""What the closed loop moves and sees: a rig, and the virtual one that a scenario and its seeds make."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexneedle.errors import InputError
+from flexneedle.rig.parts import TrackerFactory
+from flexneedle.rig.phantom.draw import draw
+from flexneedle.rig.phantom.phantom import Condition, Phantom
+from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
+from flexneedle.rig.ports import Clock, Driver, TipTracker
+from flexneedle.rig.tracking.field.poses import Pose, tip_sensor_pose
+from flexneedle.rig.tracking.field.room import Room
+from flexneedle.rig.tracking.field.tracker import FieldTracker
+from flexneedle.rig.tracking.placement import placed_references
+from flexneedle.rig.tracking.plane import InPlane
+from flexneedle.rig.tracking.quaternion import to_matrix
+from flexneedle.rig.tracking.registration import Rigid, fit_rigid, identity
+from flexneedle.rig.tracking.simulated import NoisyTracker
+from flexneedle.rig.tracking.table import TIP
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.registration import Registration
+
+_PLACED = 0.75  # of the threshold: below it a lab leaves a reference where it is
+
+
+@dataclass(frozen=True)
+class Rig:
+    """What the closed loop moves and sees; `truth` is for the record alone, None on hardware."""
+
+    clock: Clock
+    driver: Driver
+    tracker: TipTracker
+    truth: Callable[[], Condition] | None = None
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """Where the randomness of a virtual rig comes from: what stands in the tank, the noise, the tracker's room."""
+
+    phantom: np.random.SeedSequence
+    tracker: np.random.SeedSequence
+    room: np.random.SeedSequence
+
+
+def virtual_rig(
+    scenario: Scenario,
+    bevel: int,
+    seeds: Seeds,
+    phantom: str | PlantFactory = DEFAULT_PLANT,
+    *,
+    tracker: TrackerFactory | None = None,
+    plate_distance_at: Callable[[float], float] | None = None,
+) -> Rig:
+    """Return a virtual phantom behind the same ports as a rig.
+
+    tracker: makes the tracker; left out, it is the one that the scenario describes. Raises InputError if it makes none.
+    plate_distance_at(time): how far a metal plate is from the middle of the tracker's workspace (mm), for one that
+    moves; left out, it is the environment's.
+    """
+    truth = draw(scenario, np.random.default_rng(seeds.phantom))
+    tank = Phantom(truth, bevel, phantom)
+    if tracker is not None:
+        own = _made(tracker, scenario, tank, np.random.default_rng(seeds.tracker))
+        return Rig(tank, tank, own, tank.condition)
+    errors = _Errors(truth.bias, _registration_error(scenario.tracker.registration, seeds.room))
+    rng, around = (
+        np.random.default_rng(seeds.tracker),
+        virtual_room(scenario, seeds.room, None if plate_distance_at is None else plate_distance_at(0.0)),
+    )
+    if around is None:
+        described: TipTracker = _noisy_tracker(scenario, tank, errors, rng)
+    else:
+        described = _field_tracker(scenario, around, tank, errors, rng, plate_distance_at)
+    return Rig(tank, tank, described, tank.condition)
+
+
+def _made(factory: TrackerFactory, scenario: Scenario, tank: Phantom, rng: np.random.Generator) -> TipTracker:
+    made = factory(scenario, tank, rng)
+    if lacks := [part for part in ("read", "status") if not hasattr(made, part)]:
+        raise InputError(f"tracker: makes a {type(made).__name__}, no tracker: it lacks {', '.join(lacks)}")
+    return made
+
+
+def virtual_room(
+    scenario: Scenario, seed: np.random.SeedSequence, plate_distance: float | None = None
+) -> tuple[Room, Mapping[str, Pose]] | None:
+    """Return the room that a virtual rig of this seed stands in, and its reference sensors in the stage's frame.
+
+    None for a scenario without an environment. plate_distance: where the plate is (mm) while a lab places the
+    references; left out, as in the environment.
+    """
+    settings = scenario.tracker
+    if settings.environment is None:
+        return None
+    rng = np.random.default_rng(seed)
+    drawn = int(rng.integers(2**62))
+    room = Room(settings.environment, drawn if settings.field_seed is None else settings.field_seed)
+    limit = _PLACED * scenario.monitor.indicator_limit
+    return room, placed_references(room, settings.workspace_center_mm, limit, rng, plate_distance)
+
+
+def to_stage(registration: Registration | None) -> Rigid:
+    """Return the map from the tracker's frame to the stage's; without a registration they are one."""
+    if registration is None:
+        return identity()
+    return Rigid(to_matrix(np.array(registration.rotation)), np.array(registration.translation_mm))
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Constant errors: bias (x, y) in mm, and the map by which the registration is off."""
+
+    bias: tuple[float, float]
+    registration: Rigid
+
+
+def _noisy_tracker(
+    scenario: Scenario, tank: Phantom, errors: _Errors, rng: np.random.Generator
+) -> NoisyTracker:
+    """The tracker with white noise alone."""
+
+    def tip_at(time: float) -> tuple[float, float]:
+        x, y = tank.tip_at(time)
+        if scenario.tracker.registration is None:
+            return x, y
+        x, y, _ = errors.registration.apply(np.array((x, y, 0.0))).tolist()
+        return x, y
+
+    return NoisyTracker(
+        tip_at,
+        tank,
+        scenario.tracker.period,
+        scenario.tracker.jitter_per_axis,
+        rng,
+        delay=_delay(scenario),
+        missing=scenario.phantom.missing_fraction,
+        bias=errors.bias,
+    )
+
+
+def _field_tracker(
+    scenario: Scenario,
+    around: tuple[Room, Mapping[str, Pose]],
+    tank: Phantom,
+    errors: _Errors,
+    rng: np.random.Generator,
+    plate_distance_at: Callable[[float], float] | None,
+) -> InPlane:
+    """The tracker in its environment: in such a room, with such references."""
+    (room, references), settings = around, scenario.tracker
+    center, offset = settings.workspace_center_mm, settings.tip_offset_mm
+    registered = to_stage(settings.registration)
+
+    def poses_at(time: float) -> Mapping[str, Pose]:
+        x, y, turn = tank.pose_at(time)
+        tip = x + errors.bias[0], y + errors.bias[1], 0.0
+        return {TIP: tip_sensor_pose(tip, (math.cos(turn), math.sin(turn), 0.0), offset), **references}
+
+    tracker = FieldTracker(
+        room,
+        poses_at,
+        tank,
+        settings.period,
+        rng,
+        center=center,
+        delay=_delay(scenario),
+        ahead=scenario.monitor.indicator_window_s,  # it runs before the needle does
+        missing=scenario.phantom.missing_fraction,
+        to_tracker=registered.inverse().after(errors.registration),
+        plate_distance_at=plate_distance_at,
+    )
+    return InPlane(tracker, registered, offset)
+
+
+def _delay(scenario: Scenario) -> float:
+    """Age of a reading when it arrives (s): so many control periods at full step and speed."""
+    step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
+    return scenario.phantom.delay_periods * step
+
+
+def _registration_error(registration: Registration | None, seed: np.random.SeedSequence) -> Rigid:
+    """By how much a registration from such fiducials, measured so well, is off the truth."""
+    if registration is None or registration.localisation_mm == 0.0:
+        return identity()
+    rng = np.random.default_rng(seed).spawn(1)[0]
+    fiducials = np.array(registration.fiducials_mm)
+    noise = rng.normal(0.0, registration.localisation_mm / math.sqrt(3.0), fiducials.shape)
+    return fit_rigid(fiducials + noise, fiducials)

@@ -1,1 +1,0 @@
-"""What `flexneedle em` does: tracker data in, results, tables and figures out."""

@@ -1,0 +1,145 @@
+"""Plan and insert with a record on disk: what the commands `plan` and `insert` do."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from flexneedle.control.guide import check_guide
+from flexneedle.control.methods import DEFAULT
+from flexneedle.rig.phantom.plants import DEFAULT_PLANT
+from flexneedle.runs.figures import draw_run
+from flexneedle.trace.folder import TRACE_FILE, Folder, versions
+from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
+from flexneedle.trace.results import insertion_result, insertion_timing, plan_result, plan_timing
+from flexneedle.scenario.model import Scenario
+from flexneedle.types import Insertion, Period, PlanRecord
+from flexneedle.trace.writer import TraceWriter
+
+
+OnIteration = Callable[[str, dict[str, Any]], None]
+"""Hears of each iteration of the planner: the strategy, and what `plan` tells."""
+OnPeriod = Callable[[Period], None]
+
+
+@dataclass(frozen=True)
+class Choices:
+    """How to plan and to insert. plan_seed: of the planner, None for `seed`; force: insert whatever the plan misses.
+
+    controller, phantom, tracker: a name, or module:NAME. Raises InputError, with the choices, for an unknown one.
+    """
+
+    seed: int
+    strategy: str = "manipulation"
+    plan_seed: int | None = None
+    controller: str = DEFAULT
+    phantom: str = DEFAULT_PLANT
+    tracker: str = SCENARIO_TRACKER
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        controller_of(self.controller), plant_of(self.phantom), tracker_of(self.tracker)
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """What controls, what is controlled, what measures it: by name."""
+        return {"controller": self.controller, "phantom": self.phantom, "tracker": self.tracker}
+
+
+def record_plans(
+    folder: Folder, scenario: Scenario, strategies: Sequence[str], seed: int, on_iteration: OnIteration
+) -> dict[str, PlanRecord]:
+    """Plan with each strategy and leave `run.json` and `plan.png`, `.svg` in the folder.
+
+    An error or an interruption is marked in `run.json` and passed on.
+    """
+    with _marked(folder):
+        for strategy in strategies:
+            _plan(folder, scenario, strategy, seed, on_iteration)
+        results = {name: plan_result(plan) for name, plan in folder.plans.items()}
+        folder.values["result"] = results
+        folder.end("done")
+        draw_run(folder.path)
+    return folder.plans
+
+
+def check_choices(scenario: Scenario, choices: Choices) -> None:
+    """Raise InputError for a controller that needs the guide where it may not move."""
+    check_guide(controller_of(choices.controller)[1], scenario.setup, choices.strategy)
+
+
+def record_insertion(
+    folder: Folder,
+    scenario: Scenario,
+    choices: Choices,
+    *,
+    on_iteration: OnIteration,
+    on_period: OnPeriod,
+) -> Insertion:
+    """Plan, carry out, and leave `run.json`, `trace.mcap` and `insertion.png`, `.svg` in the folder.
+
+    An insertion that is interrupted (Ctrl-C) comes back with its periods and the outcome "interrupted". An
+    error, or an interruption of the planning, is marked in `run.json` and passed on.
+    """
+    folder.values |= choices.parts
+    with _marked(folder):
+        check_choices(scenario, choices)
+        plan_seed = choices.seed if choices.plan_seed is None else choices.plan_seed
+        plan = _plan(folder, scenario, choices.strategy, plan_seed, on_iteration)
+        insertion = _insert(folder, scenario, plan, choices, on_period)
+        folder.values["result"] = insertion_result(insertion)
+        folder.timing |= insertion_timing(insertion)
+        folder.end(insertion.outcome, insertion.reason)
+        draw_run(folder.path)
+    return insertion
+
+
+def _plan(
+    folder: Folder, scenario: Scenario, strategy: str, seed: int, on_iteration: OnIteration
+) -> PlanRecord:
+    from flexneedle.planning.planner import plan
+
+    made = plan(scenario, strategy=strategy, seed=seed, progress=partial(on_iteration, strategy))
+    folder.plans[strategy] = made
+    folder.timing[strategy] = plan_timing(made)
+    folder.write()
+    return made
+
+
+def _insert(
+    folder: Folder, scenario: Scenario, plan: PlanRecord, choices: Choices, on_period: OnPeriod
+) -> Insertion:
+    from flexneedle.rig.loop import insert
+
+    periods: list[Period] = []
+    about = {"seed": str(choices.seed), "scenario": scenario.name, "strategy": plan.strategy}
+    about |= {**choices.parts, **versions()}
+    path = folder.path / TRACE_FILE
+    with TraceWriter(path, plan, about=about, scenario=scenario.values()) as trace:
+
+        def keep(period: Period) -> None:
+            trace.add(period)
+            periods.append(period)
+            on_period(period)
+
+        options: dict[str, Any] = {**choices.parts, "force": choices.force}
+        try:
+            return insert(scenario, plan, choices.seed, on_period=keep, **options)
+        except KeyboardInterrupt:
+            ending = "interrupted", "stopped by the user", choices.controller, choices.phantom
+            return Insertion(plan, choices.seed, tuple(periods), *ending)
+
+
+@contextmanager
+def _marked(folder: Folder) -> Iterator[None]:
+    """Mark in the folder how the block ended, if it did not end by itself, and draw what there is."""
+    try:
+        yield
+    except BaseException as error:
+        if folder.values["status"] == "running":
+            interrupted = isinstance(error, KeyboardInterrupt)
+            folder.end("interrupted" if interrupted else "failed", str(error) or type(error).__name__)
+            if folder.plans:
+                draw_run(folder.path)
+        raise

@@ -1,0 +1,57 @@
+"""What all sections of a scenario share: the base class and the kinds of numbers.
+
+Every quantity is bounded on both sides (1e-6 to 1e6 in its border unit), far outside of anything a needle
+meets, so that no product of valid settings overflows or vanishes.
+"""
+
+from typing import Annotated
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+SMALLEST, LARGEST = 1e-6, 1e6
+
+
+class Section(BaseModel):
+    """A table of the scenario file: frozen, no unknown keys, no strings for numbers, no inf or NaN."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        strict=True,
+        allow_inf_nan=False,
+        validate_default=True,
+        use_attribute_docstrings=True,
+    )
+
+
+def _not_tiny(value: float) -> float:
+    if value < SMALLEST:
+        raise ValueError(f"must be at least {SMALLEST:g}")
+    return value
+
+
+def _one_line(text: str) -> str:
+    if not text.isprintable() or not text.strip():
+        raise ValueError("must be one line of printable text")
+    return text
+
+
+def _low_first(limits: tuple[float, float]) -> tuple[float, float]:
+    if limits[0] > limits[1]:
+        raise ValueError("the low end must not be above the high end")
+    return limits
+
+
+Positive = Annotated[float, Field(gt=0, le=LARGEST), AfterValidator(_not_tiny)]
+NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Title = Annotated[str, Field(max_length=200), AfterValidator(_one_line)]
+# strict=False lets the list of a TOML file become a tuple; the numbers in it stay strict.
+PositiveRange = Annotated[tuple[Positive, Positive], Field(strict=False), AfterValidator(_low_first)]
+NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], Field(strict=False), AfterValidator(_low_first)]
+
+
+def count(default: int, *, least: int, most: int) -> int:
+    """Return the field of a whole number between `least` and `most`: more would only hang the machine."""
+    field: int = Field(default=default, ge=least, le=most)
+    return field

@@ -1,0 +1,56 @@
+"""Where the tracker stands: the rigid map from its frame to the stage's, as a registration found it."""
+
+from math import hypot
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
+
+from flexneedle.scenario.sections.environment import Vector
+from flexneedle.scenario.sections.fields import NonNegative, Section
+
+_UNIT = 1e-6
+
+
+def _unit(turn: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    length = hypot(*turn)
+    if abs(length - 1.0) > _UNIT:
+        raise ValueError(f"must be a unit quaternion w, x, y, z; its length is {length:.6g}")
+    return turn
+
+
+def _not_on_a_line(points: tuple[Vector, ...]) -> tuple[Vector, ...]:
+    middle = [sum(axis) / len(points) for axis in zip(*points, strict=True)]
+    arms = [[x - m for x, m in zip(point, middle, strict=True)] for point in points]
+    longest = max(arms, key=lambda arm: hypot(*arm))
+    reach = hypot(*longest)
+    across = max(hypot(*_cross(longest, arm)) for arm in arms)
+    if across <= 1e-6 * reach**2:
+        raise ValueError("must not lie on a line")
+    return points
+
+
+def _cross(a: list[float], b: list[float]) -> tuple[float, float, float]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+Turn = Annotated[tuple[float, float, float, float], Field(strict=False), AfterValidator(_unit)]
+
+
+class Registration(Section):
+    """Section `tracker.registration`: tracker to stage, and from how many points it was found how well.
+
+    `flexneedle em register` writes it.
+    """
+
+    rotation: Turn = (1.0, 0.0, 0.0, 0.0)
+    """Unit quaternion w, x, y, z that turns the tracker's axes into the stage's."""
+    translation_mm: Vector = (0.0, 0.0, 0.0)
+    """Where the tracker's origin lies in the stage's frame."""
+    localisation_mm: NonNegative = 0.0
+    """RMS error with which a fiducial was measured, as the residual tells."""
+    fiducials_mm: Annotated[
+        tuple[Vector, ...],
+        Field(strict=False, min_length=3, max_length=100_000),
+        AfterValidator(_not_on_a_line),
+    ]
+    """Where the fiducials are in the stage's frame."""

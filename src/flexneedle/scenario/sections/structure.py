@@ -1,0 +1,57 @@
+"""Mismatch of structure: what a phantom may have and no parameter of a controller's model describes."""
+
+from collections.abc import Iterator
+from typing import Annotated
+
+from pydantic import Field
+
+from flexneedle.scenario.problems import Problem
+from flexneedle.scenario.sections.apparatus import Setup
+from flexneedle.scenario.sections.fields import LARGEST, NonNegative, Positive, Section
+from flexneedle.scenario.sections.needle import Needle
+from flexneedle.scenario.sections.tissue import Alpha
+
+_SECTION = "phantom.structure."
+
+
+class HiddenLayer(Section):
+    """Section `phantom.structure.hidden_layer`: a layer of another modulus that the scenario does not have."""
+
+    top_mm: NonNegative
+    """Depth at which it begins."""
+    thickness_mm: Positive
+    """Thickness; layer boundaries may lie in it."""
+    modulus_factor: Positive
+    """Factor on μ of the tissue that it is in."""
+
+
+class Structure(Section):
+    """Section `phantom.structure`: left out, the phantom has the scenario's structure."""
+
+    alpha: Alpha | None = None
+    """α of the phantom's Ogden law, in all layers."""
+    compression_length_factor: Positive = 1.0
+    """Factor on h of all layers."""
+    bevel_length_factor: Positive = 1.0
+    """Factor on the length of the bevel."""
+    guide_shift_mm: Annotated[float, Field(ge=-LARGEST, le=LARGEST)] = 0.0
+    """Distance of the guide along the axis from its position in the scenario, positive towards the skin."""
+    hidden_layer: HiddenLayer | None = None
+    """Left out, there is none."""
+
+
+def structure_problems(needle: Needle, setup: Setup, structure: Structure) -> Iterator[Problem]:
+    """A bevel shorter than the needle; a guide, if it is shifted, behind the tip and before the base."""
+    bevel = structure.bevel_length_factor * needle.bevel.length_mm
+    if bevel >= needle.length_mm and needle.bevel.length_mm < needle.length_mm:
+        rule = f"makes the bevel {bevel:g} mm long: must be below needle.length_mm ({needle.length_mm:g})"
+        yield Problem(_SECTION + "bevel_length_factor", structure.bevel_length_factor, rule)
+    shift, guide = structure.guide_shift_mm, setup.guide_to_skin_mm
+    if shift and guide is None:
+        yield Problem(_SECTION + "guide_shift_mm", shift, "there is no guide (setup.guide_to_skin_mm)")
+    elif shift and guide is not None:
+        high = guide - setup.tip_to_skin_mm
+        low = setup.stroke_mm - needle.length_mm + high
+        if not low < shift < high:
+            rule = f"must be between {low:g} and {high:g}: guide behind the tip, and before the base at full stroke"
+            yield Problem(_SECTION + "guide_shift_mm", shift, rule)

@@ -1,0 +1,1 @@
+"""Studies: many insertions by a grid of conditions, and their report."""

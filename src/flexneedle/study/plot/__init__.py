@@ -1,0 +1,1 @@
+"""Figures of studies. They take arrays and names."""

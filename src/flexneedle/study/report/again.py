@@ -1,0 +1,113 @@
+"""How to run an insertion of a study again: the command, and the scenario file that it needs."""
+
+import shlex
+from collections.abc import Iterable
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from flexneedle.control.methods import checked
+from flexneedle.errors import ScenarioError
+from flexneedle.rig.parts import is_own
+from flexneedle.scenario.files import dump_scenario, load_scenario
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.preset import preset_names
+from flexneedle.scenario.worlds import world_name
+from flexneedle.study.report.rows import Rows
+
+_SECTIONS = frozenset(Scenario.model_fields)
+
+
+def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
+    """Return the command of each listed row, to be given in `folder`.
+
+    Scenarios that are neither presets nor worlds are written there.
+    A row whose settings make no scenario of this version has "".
+    """
+    sources: dict[str, str] = {
+        _target_left_out(checked(load_scenario(name))): name for name in preset_names()
+    }
+    numbers = count(1)
+    found = {}
+    for row in dict.fromkeys(listed):
+        scenario = scenario_of(rows, row)
+        if scenario is None:
+            found[row] = ""
+            continue
+        key = _target_left_out(scenario)
+        if name := _world_of(rows, row):
+            sources.setdefault(_target_left_out(checked(load_scenario(name))), name)
+        if key not in sources:
+            sources[key] = f"scenario-{next(numbers)}.toml"
+            (folder / sources[key]).write_text(dump_scenario(scenario), encoding="utf-8", newline="\n")
+        found[row] = _command(rows, row, sources[key])
+    return found
+
+
+def scenario_of(rows: Rows, row: int) -> Scenario | None:
+    """Return the scenario of a row, or None if its settings make none of this version."""
+    settings = {
+        name: value
+        for name in rows.columns
+        if "." in name and name.split(".")[0] in _SECTIONS
+        for value in (rows.value(name, row),)
+        if value is not None
+    }
+    try:
+        return Scenario.from_record({"name": "Scenario of a study", **_nested(settings)})
+    except (ScenarioError, TypeError):
+        return None
+
+
+def _world_of(rows: Rows, row: int) -> str:
+    """Return the name of a row's world, or ""."""
+    number = rows.value("world", row)
+    return "" if number is None else world_name(int(number), rows.value("world_case", row))
+
+
+def _command(rows: Rows, row: int, source: str) -> str:
+    words = ["flexneedle", "insert", source, "--target"]
+    words += [_number(rows.value(name, row)) for name in ("target_depth_mm", "target_lateral_mm")]
+    words += ["--seed", _number(rows.value("seed", row))]
+    plan_seed = rows.value("plan_seed", row)
+    if plan_seed is not None and plan_seed != rows.value("seed", row):
+        words += ["--plan-seed", _number(plan_seed)]
+    options = {"--controller": "controller", "--phantom": "plant", "--strategy": "strategy"}
+    for option, name in options.items():
+        value = rows.value(name, row)
+        words += [option, str(value)] if value is not None else []
+    tracker = rows.value("tracker", row)
+    words += ["--tracker", str(tracker)] if is_own(tracker) else []
+    return shlex.join(words)
+
+
+def _target_left_out(scenario: Scenario) -> str:
+    values = scenario.values()
+    return repr({name: value for name, value in values.items() if name not in ("name", "target")})
+
+
+def _nested(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return values by dotted key as nested tables; tables whose keys are 0, 1, … are lists."""
+    nested: dict[str, Any] = {}
+    for key, value in settings.items():
+        *way, last = key.split(".")
+        table = nested
+        for part in way:
+            table = table.setdefault(part, {})
+        table[last] = list(value) if isinstance(value, tuple) else value
+    made: dict[str, Any] = _lists(nested)
+    return made
+
+
+def _lists(value: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    inner = {key: _lists(item) for key, item in value.items()}
+    if inner and all(key.isdigit() for key in inner):
+        return [inner[key] for key in sorted(inner, key=int)]
+    return inner
+
+
+def _number(value: Any) -> str:
+    short = f"{value:g}" if isinstance(value, float) else ""
+    return short if short and float(short) == value else repr(value)

@@ -1,0 +1,280 @@
+"""What the rows of a study come to: groups, paired differences, what did not finish, the worst."""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from math import isnan, nan
+
+import numpy as np
+
+from flexneedle.study.report.design import Design
+from flexneedle.study.report.rows import Codes, Flags, Floats, Rows
+from flexneedle.study.report.statistics import Estimate, beyond_largest, estimates, mean, quantile, ratio, sd
+
+DONE = "done"
+_MOST_DEPTHS, _DEPTH_BANDS = 8, 5
+HIT_MM = 1.0  # radius of the paper's target circles
+_NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+
+
+@dataclass(frozen=True)
+class Group:
+    """The insertions that share a level of every factor.
+
+    name: its levels as one line; levels: name of the level by factor; count, finished: insertions; known: finished
+    ones whose true error is known; missed: of those, ended more than 1 mm from the target; unconverged: insertions
+    with a period that did not converge, finished or not, and how many such periods; seeds: different ones;
+    largest_mm: of the true errors; largest_period_ratio: of the periods over the plan's;
+    beyond_largest: share of all insertions that may lie beyond it, with 95 % confidence; estimates: by name, over
+    the finished.
+    """
+
+    name: str
+    levels: dict[str, str]
+    count: int
+    finished: int
+    known: int
+    missed: int
+    unconverged: int
+    unconverged_periods: int
+    seeds: int
+    largest_mm: float
+    largest_period_ratio: float
+    beyond_largest: float
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Mean paired difference (mm) of true errors, `name` minus `against`, in insertions alike in all else.
+
+    pairs: both finished; left_out: pairs of which one did not; verdict: "better" if the interval of the difference
+    lies below 0, "worse" if above, else "not separable"; None without an interval.
+    """
+
+    name: str
+    against: str
+    controller: str
+    pairs: int
+    left_out: int
+    mean_mm: Estimate
+    verdict: str | None
+
+
+@dataclass(frozen=True)
+class Ending:
+    """Endings of one kind: how many, which row is the first of them, and its reason."""
+
+    outcome: str
+    count: int
+    first: int
+    reason: str
+
+
+def finished(rows: Rows) -> Flags:
+    """Return which rows (n,) finished."""
+    return np.array([outcome == DONE for outcome in rows.text("outcome")], dtype=bool)
+
+
+def groups_of(rows: Rows, design: Design) -> list[Group]:
+    """Return the groups of a design in the order of its factors."""
+    done = finished(rows)
+    factors = {factor.key: factor for factor in design.factors}
+    groups = []
+    for levels, members in members_of(design):
+        at = (factors[key].level(factors[key].names.index(name)) for key, name in levels.items())
+        groups.append(_group(rows, members, done, ", ".join(at), levels))
+    return groups
+
+
+def members_of(design: Design) -> Iterator[tuple[dict[str, str], Codes]]:
+    """Yield the levels of every factor, by its key, and the rows that share them, in the order of the factors."""
+    factors = design.factors
+    combined = np.stack([factor.codes for factor in factors], axis=1)
+    levels, codes = np.unique(combined, axis=0, return_inverse=True)
+    for number, chosen in enumerate(levels.tolist()):
+        names = {factor.key: factor.names[k] for factor, k in zip(factors, chosen, strict=True)}
+        yield names, np.flatnonzero(codes.ravel() == number)
+
+
+def _group(rows: Rows, members: Codes, done: Flags, name: str, levels: dict[str, str]) -> Group:
+    ended = members[done[members]]
+    error = rows.number("true_error_mm")[ended]
+    known = error[~np.isnan(error)]
+    seeds = seed_codes(rows)[ended]
+    unconverged = np.nan_to_num(rows.number("unconverged_periods")[members])
+    ratios = _quotient(rows.number("periods")[ended], rows.number("planned_periods")[ended])
+    return Group(
+        name=name,
+        levels=levels,
+        count=len(members),
+        finished=len(ended),
+        known=len(known),
+        missed=int((known > HIT_MM).sum()),
+        unconverged=int((unconverged > 0).sum()),
+        unconverged_periods=int(unconverged.sum()),
+        seeds=len(np.unique(seeds)),
+        largest_mm=_largest(known),
+        largest_period_ratio=_largest(ratios[~np.isnan(ratios)]),
+        beyond_largest=beyond_largest(len(known)),
+        estimates=_estimates(rows, ended, seeds),
+    )
+
+
+def _estimates(rows: Rows, ended: Codes, seeds: Codes) -> dict[str, Estimate]:
+    names = (
+        *("true_error_mm", "residual_mm", "flips", "planned_flips", "strain_energy_mj"),
+        *("planned_strain_energy_mj", "periods", "planned_periods"),
+    )
+    column = {name: rows.number(name)[ended] for name in names}
+    error = column["true_error_mm"]
+    statistics = {
+        "mean_mm": mean(error),
+        "sd_mm": sd(error),
+        "median_mm": quantile(error, 0.5),
+        "p95_mm": quantile(error, 0.95),
+        "residual_mm": mean(column["residual_mm"]),
+        "flips": mean(column["flips"]),
+        "planned_flips": mean(column["planned_flips"]),
+        "energy_mj": mean(column["strain_energy_mj"]),
+        "planned_energy_mj": mean(column["planned_strain_energy_mj"]),
+        "energy_ratio": ratio(column["strain_energy_mj"], column["planned_strain_energy_mj"]),
+        "period_ratio": ratio(column["periods"], column["planned_periods"]),
+    }
+    return estimates(statistics, _dense(seeds))
+
+
+def controller_differences(rows: Rows, design: Design) -> list[Difference]:
+    """Return the first controller against each other one, in insertions of the same seed, target and settings."""
+    everywhere = np.ones(len(rows), dtype=bool)
+    return _against_first(rows, design, everywhere)
+
+
+def differences_by_depth(rows: Rows, design: Design) -> dict[str, list[Difference]]:
+    """Return the same at each depth of the target, by the name of the depth."""
+    codes, names = depth_levels(rows)
+    return {name: _against_first(rows, design, codes == k) for k, name in enumerate(names)}
+
+
+def depth_levels(rows: Rows) -> tuple[Codes, list[str]]:
+    """Return the depth of each row's target as a level, and the names; many depths are put into bands."""
+    depth = rows.number("target_depth_mm")
+    levels, codes = np.unique(depth, return_inverse=True)
+    if len(levels) <= _MOST_DEPTHS:
+        return codes, [f"{level:g}" for level in levels.tolist()]
+    edges = np.linspace(levels[0], levels[-1], _DEPTH_BANDS + 1)
+    band = np.searchsorted(edges[1:-1], depth, side="right")
+    used, dense = np.unique(band, return_inverse=True)
+    return dense, [f"{edges[k]:.3g} to {edges[k + 1]:.3g}" for k in used.tolist()]
+
+
+def _against_first(rows: Rows, design: Design, among: Flags) -> list[Difference]:
+    ours, *others = range(len(design.controller.names))
+    keys = pair_keys(rows, [factor.exact for factor in (design.cases, *design.axes, *design.others)])
+    codes, names = design.controller.codes, design.controller.names
+    return [
+        _difference(
+            rows, keys, (among & (codes == ours), among & (codes == other)), (names[ours], names[other], "")
+        )
+        for other in others
+    ]
+
+
+def case_differences(rows: Rows, design: Design) -> list[Difference]:
+    """Return each case against the base case, the first, for each controller."""
+    factors = (design.controller, *design.axes, *design.others)
+    keys = pair_keys(rows, [factor.exact for factor in factors])
+    cases, controller = design.cases, design.controller
+    return [
+        _difference(
+            rows,
+            keys,
+            ((cases.codes == case) & own, (cases.codes == 0) & own),
+            (cases.names[case], cases.names[0], name),
+        )
+        for number, name in enumerate(controller.names)
+        for own in (controller.codes == number,)
+        for case in range(1, len(cases.names))
+    ]
+
+
+def endings(rows: Rows) -> list[Ending]:
+    """Return how insertions ended that did not finish, or finished with a remark, the most frequent first.
+
+    Reasons that differ only in their numbers are one kind.
+    """
+    found: dict[tuple[str, str], list[int]] = {}
+    reasons = rows.text("reason")
+    for row, outcome in enumerate(rows.text("outcome")):
+        if outcome != DONE or reasons[row]:
+            found.setdefault((outcome, _NUMBER.sub("#", reasons[row])), []).append(row)
+    kinds = [Ending(outcome, len(at), at[0], reasons[at[0]]) for (outcome, _), at in found.items()]
+    return sorted(kinds, key=lambda kind: (kind.outcome == DONE, -kind.count))
+
+
+def worst(rows: Rows, number: int = 10, among: Flags | None = None) -> list[int]:
+    """Return the rows with the largest true errors beyond their reach, finished or not, the largest first.
+
+    A reach that is not known is 0; among (n,): which rows may be among them (default: all).
+    """
+    excess = rows.number("true_error_mm") - np.nan_to_num(rows.number("reach_mm"))
+    excess = excess if among is None else np.where(among, excess, nan)
+    order = np.argsort(-excess, kind="stable")  # NaN last
+    return [int(row) for row in order[:number] if not isnan(excess[row])]
+
+
+def _difference(
+    rows: Rows, keys: Codes, sides: tuple[Flags, Flags], names: tuple[str, str, str]
+) -> Difference:
+    error, done = rows.number("true_error_mm"), finished(rows)
+    one, other = (_by_key(keys, np.flatnonzero(side)) for side in sides)
+    both = np.array([(one[key], other[key]) for key in one if key in other], dtype=np.int64).reshape(-1, 2)
+    known = (done & ~np.isnan(error))[both].all(axis=1)
+    pairs = both[known]
+    difference = error[pairs[:, 0]] - error[pairs[:, 1]]
+    found = estimates({"mean": mean(difference)}, _dense(seed_codes(rows)[pairs[:, 0]]))["mean"]
+    name, against, controller = names
+    return Difference(name, against, controller, len(pairs), int((~known).sum()), found, _verdict(found))
+
+
+def _verdict(difference: Estimate) -> str | None:
+    if isnan(difference.low):
+        return None
+    if difference.high < 0.0:
+        return "better"
+    return "worse" if difference.low > 0.0 else "not separable"
+
+
+def pair_keys(rows: Rows, factors: Sequence[Codes]) -> Codes:
+    """Return a number (n,) for each row, the same for rows alike in seed, target, repeat and factors."""
+    names = ("seed", "plan_seed", "target_depth_mm", "target_lateral_mm", "repeat")
+    columns = np.stack([*(rows.codes(name)[0] for name in names), *factors], axis=1)
+    return np.unique(columns, axis=0, return_inverse=True)[1].ravel()
+
+
+def _by_key(keys: Codes, members: Codes) -> dict[tuple[int, int], int]:
+    """Return rows by key and by how many rows before have it, so that no row pairs twice."""
+    seen: dict[int, count[int]] = {}
+    return {
+        (key, next(seen.setdefault(key, count()))): row
+        for key, row in zip(keys[members].tolist(), members.tolist(), strict=True)
+    }
+
+
+def seed_codes(rows: Rows) -> Codes:
+    """Return a number (n,) for each row, the same for the same seed."""
+    return rows.codes("seed")[0]
+
+
+def _dense(codes: Codes) -> Codes:
+    return np.unique(codes, return_inverse=True)[1].astype(np.int64)
+
+
+def _quotient(over: Floats, under: Floats) -> Floats:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(under > 0, over / under, nan)
+
+
+def _largest(values: Floats) -> float:
+    return float(values.max()) if len(values) else nan

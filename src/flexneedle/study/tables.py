@@ -1,0 +1,117 @@
+"""The tables of a study in Parquet: a row an insertion, in the order of the grid, and times in a table apart."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from flexneedle.study.grid import Insertion, Study
+from flexneedle.study.plans import Plans, plan_key, truth_key
+from flexneedle.study.rows import RESULTS, TIMES
+from flexneedle.trace.files import replace_file
+from flexneedle.trace.folder import versions
+
+RUNS_FILE, TIMING_FILE = "runs.parquet", "timing.parquet"
+_TYPES = {float: pa.float64(), int: pa.int64(), str: pa.string(), bool: pa.bool_()}
+_ABOUT = {
+    "controller": str,
+    "plant": str,
+    "tracker": str,
+    "strategy": str,
+    "target_depth_mm": float,
+    "target_lateral_mm": float,
+    "seed": int,
+    "plan_seed": int,
+    "repeat": int,
+    "plan": str,
+    "world": int,
+    "world_case": str,
+}
+_TIMING = {"index": int, "plan": str, "plan_s": float, **TIMES}
+
+
+def write_tables(folder: Path, study: Study, rows: Mapping[int, Mapping[str, Any]], plans: Plans) -> None:
+    """Write `runs.parquet` and `timing.parquet` for the rows (by index) that there are.
+
+    The bytes of `runs.parquet` depend on study and versions alone, not on who did which row when.
+    """
+    insertions = [study.insertion(index) for index in sorted(rows)]
+    keys = {id(point): plan_key(point) for point in study.points}
+    of_plan = [keys[id(insertion.point)] for insertion in insertions]
+    results = _with_reach(insertions, [rows[insertion.index] for insertion in insertions])
+    _write(folder / RUNS_FILE, _runs(study, insertions, of_plan, results))
+    seconds = {key: plans.seconds(key) for key in set(of_plan)}
+    timing = [{**row, "plan": key, "plan_s": seconds[key]} for row, key in zip(results, of_plan, strict=True)]
+    _write(folder / TIMING_FILE, pa.table(_columns(timing, _TIMING)))
+
+
+def _with_reach(
+    insertions: Sequence[Insertion], results: Sequence[Mapping[str, Any]]
+) -> list[Mapping[str, Any]]:
+    """Return the results with the reach that one of the insertions with the same truth has found."""
+    digests = {id(i.point): "" if i.point.world is None else truth_key(i.point) for i in insertions}
+    keys = [(digests[id(insertion.point)], insertion.seed) for insertion in insertions]
+    known = {
+        key: row["reach_mm"] for key, row in zip(keys, results, strict=True) if row["reach_mm"] is not None
+    }
+    return [{**row, "reach_mm": known.get(key)} for key, row in zip(keys, results, strict=True)]
+
+
+def _runs(
+    study: Study,
+    insertions: Sequence[Insertion],
+    of_plan: Sequence[str],
+    results: Sequence[Mapping[str, Any]],
+) -> pa.Table:
+    flats = {id(point): point.scenario.flat() for point in study.points}
+    settings = [flats[id(insertion.point)] for insertion in insertions]
+    about = [_about(insertion, key) for insertion, key in zip(insertions, of_plan, strict=True)]
+    used = {f"version_{name}": [value] * len(insertions) for name, value in versions().items()}
+    cases = [{"index": insertion.index, "case": insertion.point.case} for insertion in insertions]
+    return pa.table(
+        _columns(cases, {"index": int, "case": str})
+        | _columns(settings, _kinds(list(flats.values())))
+        | _columns(about, _ABOUT)
+        | _columns(results, RESULTS)
+        | {name: pa.array(values, pa.string()) for name, values in used.items()}
+    )
+
+
+def _about(insertion: Insertion, key: str) -> dict[str, Any]:
+    point = insertion.point
+    depth, lateral = point.scenario.target.position
+    return {
+        "controller": point.controller,
+        "plant": point.plant,
+        "tracker": point.tracker,
+        "strategy": point.strategy,
+        "target_depth_mm": depth,
+        "target_lateral_mm": lateral,
+        "seed": insertion.seed,
+        "plan_seed": point.plan_seed,
+        "repeat": insertion.repeat,
+        "plan": key,
+        "world": point.world,
+        "world_case": point.world_case,
+    }
+
+
+def _columns(rows: Sequence[Mapping[str, Any]], kinds: Mapping[str, Any]) -> dict[str, pa.Array]:
+    return {name: pa.array([row.get(name) for row in rows], _type(kind)) for name, kind in kinds.items()}
+
+
+def _type(kind: Any) -> pa.DataType:
+    return pa.list_(pa.float64()) if kind is list else _TYPES[kind]
+
+
+def _kinds(flats: Sequence[Mapping[str, Any]]) -> dict[str, type]:
+    """Return the type of each scenario value, in the order of the schema; a value that all leave out has none."""
+    return {name: type(value) for flat in flats for name, value in flat.items()}
+
+
+def _write(path: Path, table: pa.Table) -> None:
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd")
+    replace_file(path, sink.getvalue().to_pybytes())

@@ -1,0 +1,193 @@
+"""The folder of a run: claimed once, `run.json` always whole, read back with clear errors.
+
+`run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing and
+plans; that of an insertion also controller, phantom and tracker. All but `timing`, which holds the date and the
+wall-clock times, is the same for the same seed.
+"""
+
+import hashlib
+import json
+import os
+import platform
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import version
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from flexneedle.errors import InputError, ScenarioError
+from flexneedle.scenario.model import Scenario
+from flexneedle.trace.plain import plan_from_values, plan_values, to_text
+from flexneedle.trace.shield import uninterrupted
+from flexneedle.types import PlanRecord
+
+RUN_FILE, TRACE_FILE, STUDY_FILE = "run.json", "trace.mcap", "study.json"
+_PACKAGE = Path(__file__).parents[1]
+_SOURCES = (".py", ".toml", ".json")
+_DIGITS = 12
+_FORMAT = 1
+
+
+@dataclass(frozen=True, eq=False)
+class RunFile:
+    """`run.json`, read back. status: "running" (or killed), "done", "held", "failed" or "interrupted".
+
+    controller, phantom: of an insertion, "" where they are not recorded.
+    """
+
+    folder: Path
+    kind: str
+    status: str
+    reason: str
+    seed: int
+    scenario: Scenario
+    plans: dict[str, PlanRecord]
+    result: Mapping[str, Any] | None
+    timing: Mapping[str, Any]
+    controller: str
+    phantom: str
+
+
+@dataclass(eq=False)
+class Folder:
+    """A claimed folder and what its `run.json` is to say; `write` says it."""
+
+    path: Path
+    values: dict[str, Any]
+    timing: dict[str, Any]
+    plans: dict[str, PlanRecord] = field(default_factory=dict)
+
+    @classmethod
+    def claim(cls, out: Path | None, name: str, kind: str, scenario: Scenario, seed: int) -> "Folder":
+        """Make the folder `out`, or one below `runs/` named by date, `name` and seed, and mark it as running.
+
+        Raises InputError if the folder holds a run or a study already or cannot be made.
+        """
+        now = datetime.now(UTC)
+        path = _make(out) if out is not None else _make_new(Path("runs"), f"{now:%Y%m%dT%H%M%SZ}", name, seed)
+        values = {
+            "format": _FORMAT,
+            "kind": kind,
+            "status": "running",
+            "reason": "",
+            "seed": seed,
+            "versions": versions(),
+            "scenario": scenario.values(),
+            "result": None,
+        }
+        folder = cls(path, values, {"started": f"{now:%Y-%m-%dT%H:%M:%SZ}"})
+        folder.write()
+        return folder
+
+    def write(self) -> None:
+        """Write `run.json`; readers see the old text or the new one, whole."""
+        plans = {name: plan_values(plan) for name, plan in self.plans.items()}
+        text = to_text({**self.values, "timing": self.timing, "plans": plans})
+        with uninterrupted():
+            _replace(self.path / RUN_FILE, text)
+
+    def end(self, status: str, reason: str = "") -> None:
+        """Set how the run ended, and write."""
+        self.values |= {"status": status, "reason": reason}
+        self.write()
+
+
+def versions() -> dict[str, str]:
+    """Return the versions on which the numbers of a run, and the bytes of a table, depend.
+
+    source: a digest of the code and data of this package, which tells an edited copy from the release.
+    """
+    return {
+        "flexneedle": version("flexneedle"),
+        "python": platform.python_version(),
+        "numpy": version("numpy"),
+        "numba": version("numba"),
+        "pyarrow": version("pyarrow"),
+        "source": _source(_PACKAGE),
+    }
+
+
+@cache
+def _source(package: Path) -> str:
+    """Return a digest of the sources below a folder, wherever it lies: relative path and bytes of each."""
+    digest = hashlib.sha256()
+    found = (path for path in package.rglob("*") if path.suffix in _SOURCES and path.is_file())
+    paths = {path.relative_to(package).as_posix(): path for path in found}
+    for name in sorted(paths):
+        data = paths[name].read_bytes()
+        digest.update(f"{name}\0{len(data)}\0".encode() + data)
+    return digest.hexdigest()[:_DIGITS]
+
+
+def read_run(folder: Path) -> RunFile:
+    """Return what `run.json` of a folder says. Raises InputError if there is none or it is damaged."""
+    path = folder / RUN_FILE
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{folder}: holds no run: there is no {RUN_FILE}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise InputError(f"{path}: damaged: {error}") from None
+    return _checked(path, values)
+
+
+def _checked(path: Path, values: Any) -> RunFile:
+    if not isinstance(values, dict) or values.get("format") != _FORMAT:
+        raise InputError(f"{path}: not a run of this version of flexneedle: format must be {_FORMAT}")
+    try:
+        plans = {name: plan_from_values(plan) for name, plan in values["plans"].items()}
+        named = {name: values[name] for name in ("kind", "status", "reason", "seed", "result", "timing")}
+        named |= {name: values.get(name, "") for name in ("controller", "phantom")}
+        return RunFile(path.parent, scenario=Scenario.from_record(values["scenario"]), plans=plans, **named)
+    except ScenarioError as error:
+        raise InputError(f"{path}: damaged: {error.problems[0]}") from None
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: damaged: {type(error).__name__} {error}") from None
+
+
+def _make(path: Path) -> Path:
+    try:
+        held = next((name for name in (RUN_FILE, TRACE_FILE, STUDY_FILE) if (path / name).exists()), None)
+        if held is not None:
+            kind = "study" if held == STUDY_FILE else "run"
+            raise InputError(f"{path}: holds a {kind} already ({held}): give another folder with --out")
+        path.mkdir(parents=True, exist_ok=True)
+        (path / RUN_FILE).touch(exist_ok=False)  # of two runs at the same moment, one gets the folder
+    except FileExistsError:
+        raise InputError(f"{path}: is there already, and no empty folder: give another with --out") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be made: {error.strerror}") from None
+    return path
+
+
+def _make_new(below: Path, date: str, name: str, seed: int) -> Path:
+    """Make a folder that was not there; a second run in the same second gets a number."""
+    plain_name = re.sub(r"[^\w.-]+", "-", name).strip("-.") or "scenario"
+    opening = f"{date}-{plain_name[:60]}-{seed}"
+    for number in count(1):
+        path = below / (opening if number == 1 else f"{opening}-{number}")
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            if not below.is_dir():
+                raise InputError(f"{below}: is no folder: give another with --out") from None
+            continue
+        except OSError as error:
+            raise InputError(f"{path}: cannot be made: {error.strerror}") from None
+        return _make(path)
+    raise InputError(f"{below / opening}: no free name")
+
+
+def _replace(path: Path, text: str) -> None:
+    draft = path.with_name(path.name + ".tmp")
+    with draft.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    draft.replace(path)

@@ -1,0 +1,252 @@
+"""What crosses rooms: frozen records of commands, measurements, plans and insertions. Units are mm, N, mJ, rad, s."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Pose = tuple[float, float, float]
+"""x (mm), y (mm), slope angle (rad)."""
+Command = tuple[float, float, float, float, int]
+"""db_x, db_y (mm), db_theta (rad), dg_y (mm), flip (−1, or +1 to turn the bevel)."""
+
+
+Point = tuple[float, float, float]
+"""x, y, z (mm)."""
+Quaternion = tuple[float, float, float, float]
+"""Unit quaternion w, x, y, z: turns the sensor's frame into the tracker's. The sensor's z axis is the needle's."""
+
+VISIBLE = "ok"
+"""Status of a sensor that the tracker sees, and of a tracker that sends frames."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One sensor in one frame of a tracker, in the tracker's frame; what it does not know is None.
+
+    indicator: how far the two coils of a 6-DOF sensor disagree (paper, section IV-B); 5-DOF sensors may have one, too.
+    status: VISIBLE, or in a few words why there is no position.
+    """
+
+    position: Point | None
+    orientation: Quaternion | None = None
+    indicator: float | None = None
+    status: str = VISIBLE
+
+
+def is_reference(sensor: str) -> bool:
+    """Whether a sensor is one that stands still around the workspace, by its name: ref1, ref2, reference, …"""
+    return sensor.lower().startswith("ref")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a tracker saw at one time (s, on the clock of the run): readings by name of the sensor, such as "tip".
+
+    number: the tracker's own count of frames; it goes on while frames are lost.
+    """
+
+    time: float
+    number: int
+    readings: Mapping[str, Reading]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The tip in one frame: time it was taken (s); x, y in the plane and z out of it (mm), None where it was not seen.
+
+    frame: what the tracker said, for those who judge it; None if there is no more than the tip.
+    """
+
+    time: float
+    x: float | None
+    y: float | None
+    z: float | None = None
+    frame: Frame | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PlanRecord:
+    """A planned insertion of m steps.
+
+    controls (m, 5): columns db_x, db_y, db_theta, dg_y, flip; tips (m + 1, 3): planned tip poses, the start first;
+    strain_energy (m + 1,): weighted tissue energy (mJ); guide (m + 1,): guide position (mm); shapes (m + 1, n, 3):
+    nodes of the needle; terms: cost by name; history: one dict per iteration of the planner.
+    """
+
+    strategy: str
+    target: tuple[float, float]
+    seed: int
+    bevel: int  # at the start, before the first step
+    controls: Floats
+    tips: Floats
+    strain_energy: Floats
+    guide: Floats
+    shapes: Floats
+    cost: float
+    terms: dict[str, float]
+    iterations: int
+    converged: bool
+    history: tuple[dict[str, Any], ...]
+    limit: str  # which limit binds if the target is out of reach, else ""
+    seconds: float = field(default=0.0, compare=False)  # wall clock
+
+    @property
+    def tip_mm(self) -> tuple[float, float]:
+        """Place of the tip at the end."""
+        return float(self.tips[-1, 0]), float(self.tips[-1, 1])
+
+    @property
+    def error_mm(self) -> float:
+        """Planar distance from the planned tip to the target (mm)."""
+        return float(np.hypot(self.tips[-1, 0] - self.target[0], self.tips[-1, 1] - self.target[1]))
+
+    @property
+    def strain_energy_mj(self) -> float:
+        """Weighted tissue energy at the end."""
+        return float(self.strain_energy[-1])
+
+    @property
+    def reached(self) -> bool:
+        """Whether the plan ends within 1 mm, the radius of the paper's target circles."""
+        return self.error_mm <= 1.0
+
+    @property
+    def entry_angle(self) -> float:
+        """Slope angle (rad) of the planned tip as it meets the skin; NaN if it never does."""
+        depth, angle = self.tips[:, 0], self.tips[:, 2]
+        inside = np.flatnonzero(depth >= 0.0)
+        if len(inside) == 0:
+            return float("nan")
+        after = max(int(inside[0]), 1)
+        ends = slice(after - 1, after + 1)
+        return float(np.interp(0.0, depth[ends], angle[ends]))
+
+    @property
+    def summary(self) -> str:
+        """One line: how near the plan comes, and which limit binds if that is not near enough."""
+        binding = f", limited by {self.limit}" if self.limit else ""
+        if self.reached:
+            return f"reaches the target to {self.error_mm:.3f} mm{binding}"
+        return f"MISSES the target: best distance {self.error_mm:.3f} mm, more than 1 mm{binding}"
+
+    @property
+    def flips(self) -> int:
+        """Bevel turns while inserting; the bevel at the start is set before and costs none."""
+        return int(np.count_nonzero(self.controls[:, 4] > 0.0))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A reading of the tracker, and "ok" or why it was rejected."""
+
+    sample: Sample
+    verdict: str
+
+
+@dataclass(frozen=True, eq=False)
+class Period:
+    """One control period. `true_*` is the virtual phantom's, None on a rig; the controller never sees it."""
+
+    index: int
+    time: float  # end of the period (s), simulated or of the rig
+    command: Command
+    applied: Command
+    sample: Sample
+    verdict: str  # "ok", or why the sample was not used
+    innovation: tuple[float, float]  # sample minus prediction (mm); 0, 0 without a usable sample
+    estimate: Pose
+    shape: Floats  # (n, 3) nodes of the estimated needle
+    base: Pose
+    guide: float
+    bevel: int
+    strain_energy: float  # of the estimate (mJ)
+    tip_load: float  # what the observer adds at the tip (N)
+    path: Pose  # planned pose at the estimated tip's depth
+    cost: float  # of the chosen command, as predicted
+    spread: float  # standard deviation left in the first guide step (mm)
+    decision: str  # why the bevel was turned or kept, or why the period was held
+    true_tip: Pose | None
+    true_strain_energy: float | None
+    durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
+    converged: bool = True  # the model's solve of this period, and all of the virtual phantom's so far
+    true_stretch: float | None = None  # smallest stretch λ of the true tissue so far
+    miss: float = float("nan")  # lateral, predicted at the target (mm), NaN: not predicted
+    miss_sd: float = float("nan")  # its standard deviation (mm)
+    warning: str = ""  # that the insertion is likely to miss
+    readings: tuple[Judged, ...] = ()  # all that came in the period, oldest first; `sample` is the newest
+
+
+@dataclass(frozen=True, eq=False)
+class Insertion:
+    """A whole insertion. outcome: "done", "held" (bad readings, no path to the target), "failed" or "interrupted"."""
+
+    plan: PlanRecord
+    seed: int
+    periods: tuple[Period, ...]
+    outcome: str
+    reason: str  # one line; "" when done within 1 mm of the target, or where that is not known
+    controller: str = ""  # its name
+    phantom: str = ""  # formulation of the virtual phantom, "" on a rig
+
+    @property
+    def target(self) -> tuple[float, float]:
+        """Target (x, y) in mm."""
+        return self.plan.target
+
+    @property
+    def true_error_mm(self) -> float:
+        """Planar distance from the true tip to the target at the last period, depth included; NaN if unknown."""
+        truth = self.periods[-1].true_tip if self.periods else None
+        return _distance(truth, self.target)
+
+    @property
+    def residual_mm(self) -> float:
+        """The same by the tracker's last good sample, as the paper reports it; NaN without one."""
+        good = [period.sample for period in self.periods if period.verdict == "ok"]
+        return _distance((good[-1].x, good[-1].y) if good else None, self.target)
+
+    @property
+    def flips(self) -> int:
+        """Bevel turns as applied."""
+        return sum(period.applied[4] > 0 for period in self.periods)
+
+    @property
+    def warning(self) -> str:
+        """The first warning on the way, empty without one."""
+        return next((period.warning for period in self.periods if period.warning), "")
+
+    @property
+    def held_s(self) -> float:
+        """For how long (s) the needle was held."""
+        ends = [0.0, *(period.time for period in self.periods)]
+        spans = zip(self.periods, pairwise(ends), strict=True)
+        return sum((end - begin for period, (begin, end) in spans if period.decision.startswith("held")), 0.0)
+
+    @property
+    def reached(self) -> bool:
+        """Whether the insertion was done and ended within 1 mm of the target."""
+        return self.outcome == "done" and self.true_error_mm <= 1.0
+
+    @property
+    def summary(self) -> str:
+        """One line: how the insertion ended."""
+        error = self.true_error_mm
+        if self.outcome != "done":
+            after = f"{self.outcome} after {len(self.periods)} periods"
+            return f"{after}: {self.reason}" if self.reason else after
+        if np.isnan(error):
+            return "done: the true tip is not known"
+        if self.reached:
+            return f"reached: the tip ended {error:.3f} mm from the target"
+        return f"MISSED: the tip ended {error:.3f} mm from the target, more than 1 mm"
+
+
+def _distance(point: Any, target: tuple[float, float]) -> float:
+    if point is None:
+        return float("nan")
+    return float(np.hypot(point[0] - target[0], point[1] - target[1]))

@@ -1,0 +1,390 @@
+"""Tables that are damaged, incomplete or of another kind: one clear line, or a stated treatment."""
+
+import json
+import threading
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from em_tables import GRID, plain, random_rows, rows_of, write_csv
+from flexneedle.cli.main import main
+from flexneedle.em.evaluation.evaluate import Options, evaluate
+from flexneedle.errors import InputError
+
+
+@pytest.fixture
+def rows():
+    return random_rows(seed=2, samples=3)
+
+
+def refusal(path, **options):
+    with pytest.raises(InputError) as caught:
+        evaluate(path, Options(**options))
+    told = str(caught.value)
+    assert "\n" not in told
+    assert str(path) in told
+    return told
+
+
+def one(path, **options):
+    return evaluate(path, Options(**options)).values()["results"][0]
+
+
+def test_missing_columns_are_named_with_the_way_to_map_them(tmp_path, rows):
+    without = [{k: v for k, v in row.items() if k not in ("x_mm", "sensor")} for row in rows]
+    told = refusal(write_csv(tmp_path / "t.csv", without))
+    assert "no column x_mm, sensor" in told
+    assert "--columns THEIRS=OURS" in told
+
+
+def test_columns_of_other_names_are_mapped_and_all_others_ignored(tmp_path, rows):
+    theirs = {"point_id": "Point", "x_mm": "X [mm]", "indicator": "a=b"}
+    named = [{theirs.get(key, key): value for key, value in row.items()} | {"note": "é, 'x'"} for row in rows]
+    path = write_csv(tmp_path / "t.csv", named)
+    pairs = tuple(f"{their}={our}" for our, their in theirs.items())
+    assert one(path, columns=pairs)["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+    mapping = tmp_path / "map.toml"
+    mapping.write_text('"Point" = "point_id"\n"X [mm]" = "x_mm"\n"a=b" = "indicator"\n')
+    assert one(path, columns=(str(mapping),)) == one(path, columns=pairs)
+    assert "'X' (for x_mm)" in refusal(path, columns=("X=x_mm",))
+
+
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        (("X=x",), "no column 'x': one of point_id, true_x_mm"),
+        (("X=x_mm", "Y=x_mm"), "x_mm is both 'X' and 'Y'"),
+        (("nowhere.toml",), "neither a pair nor a file"),
+        (("x_mm=y_mm",), "the column 'x_mm' would be x_mm and y_mm"),
+    ],
+)
+def test_a_mapping_that_makes_no_sense_is_refused(tmp_path, rows, columns, expected):
+    with pytest.raises(InputError, match=expected):
+        evaluate(write_csv(tmp_path / "t.csv", rows), Options(columns=columns))
+
+
+def test_a_field_that_is_no_number_is_named_by_row_and_by_both_names_wherever_its_column_is(tmp_path, rows):
+    named = [
+        {"note": "0,0", "X": row["x_mm"], **{k: v for k, v in row.items() if k != "x_mm"}} for row in rows
+    ]
+    named[20]["X"] = "12 mm"
+    told = refusal(write_csv(tmp_path / "t.csv", named, delimiter=";"), columns=("X=x_mm",))
+    assert "row 21: 'X' (for x_mm): '12 mm' is no number" in told
+
+
+def test_an_empty_field_between_blanks_is_empty(tmp_path, rows):
+    path = write_csv(tmp_path / "t.csv", [{**row, "indicator": None} for row in rows])
+    path.write_text(path.read_text().replace(",", ", "))
+    assert one(path)["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+
+
+def test_two_columns_may_change_their_names(tmp_path, rows):
+    swapped = [{**row, "x_mm": row["y_mm"], "y_mm": row["x_mm"]} for row in rows]
+    path = write_csv(tmp_path / "t.csv", swapped)
+    assert one(path, columns=("x_mm=y_mm", "y_mm=x_mm"))["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_a_table_of_one_sensor_needs_no_names_and_no_indicator(tmp_path, rows, suffix):
+    bare = [{k: v for k, v in row.items() if k not in ("sensor", "environment", "indicator")} for row in rows]
+    path = tmp_path / f"t.{suffix}"
+    write_csv(path, bare) if suffix == "csv" else pq.write_table(pa.Table.from_pylist(bare), path)
+    told = refusal(path)
+    assert "no column sensor, environment;" in told
+    assert "a table of one sensor and environment: --sensor NAME --environment NAME" in told
+    found = one(path, sensor="tip", environment="ideal")
+    assert (found["sensor"], found["environment"], found["indicator"]) == ("tip", "ideal", None)
+    assert found["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+
+
+def test_a_name_for_all_rows_is_refused_where_the_table_has_names(tmp_path, rows):
+    told = refusal(write_csv(tmp_path / "t.csv", rows), sensor="coil")
+    assert "has a column sensor: --sensor is for a table without" in told
+
+
+def test_the_true_place_of_a_point_without_a_sample_is_held_against_the_others(tmp_path, rows):
+    rows[7] |= {"x_mm": None, "y_mm": None, "z_mm": None, "true_x_mm": 99.0}
+    assert "row 8: the true position of a point_id changes" in refusal(write_csv(tmp_path / "t.csv", rows))
+
+
+@pytest.mark.parametrize("names", [("x_mm", "y_mm", "z_mm"), ("true_x_mm", "true_y_mm", "true_z_mm")])
+def test_one_frame_in_metres_is_refused_and_named(tmp_path, rows, names):
+    path = write_csv(tmp_path / "t.csv", in_metres(rows, names))
+    assert f"{', '.join(names)} look like metres" in refusal(path)
+    assert one(path, unit="mm")["n_points"] == len(GRID)
+
+
+def test_both_frames_in_metres_are_refused_and_read_when_it_is_said(tmp_path, rows):
+    both = ("x_mm", "y_mm", "z_mm", "true_x_mm", "true_y_mm", "true_z_mm")
+    path = write_csv(tmp_path / "t.csv", in_metres(rows, both))
+    assert "look like metres" in refusal(path)
+    assert one(path, unit="m")["jitter_mm"] == pytest.approx(plain(rows)["jitter_mm"])
+    assert one(path, unit="m")["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+
+
+def test_a_poor_tracker_in_metres_is_refused_too(tmp_path):
+    poor = in_metres(random_rows(seed=0, bias=3.0), ("x_mm", "y_mm", "z_mm"))  # errors of 5 mm in 50
+    assert "x_mm, y_mm, z_mm look like metres" in refusal(write_csv(tmp_path / "t.csv", poor))
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.02, 0.03, 0.05])
+def test_a_sensor_that_is_stuck_is_evaluated(tmp_path, noise):
+    """Its readings span a thousandth of the grid, more or less, but not as a grid does."""
+    rng = np.random.default_rng(0)
+    stuck = rows_of(GRID, np.array([7.0, -3.0, 90.0]) + rng.normal(0.0, noise, (27, 1, 3)))
+    found = one(write_csv(tmp_path / "t.csv", stuck))
+    assert found["max_mm"] == pytest.approx(np.linalg.norm(GRID - (7.0, -3.0, 90.0), axis=1).max(), abs=0.2)
+
+
+def test_a_grid_of_a_tenth_of_a_millimetre_is_just_small(tmp_path):
+    tiny = rows_of(GRID / 500.0, [[p / 500.0 + 0.05, p / 500.0 + 0.06] for p in GRID])
+    assert one(write_csv(tmp_path / "t.csv", tiny))["max_mm"] == pytest.approx(0.055 * 3**0.5)
+
+
+def in_metres(rows, names):
+    return [{key: value / 1000.0 if key in names else value for key, value in row.items()} for row in rows]
+
+
+def single(rows):
+    return list({row["point_id"]: row for row in rows}.values())
+
+
+def test_one_sample_at_each_point_tells_nothing_about_the_jitter(tmp_path, rows, capsys):
+    turned = [{**row, "qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "distance_mm": 700.0} for row in rows]
+    path = write_csv(tmp_path / "t.csv", single(turned))
+    assert main(["em", "evaluate", str(path), "--json", "--out", str(tmp_path / "json")]) == 0
+    told = capsys.readouterr()
+    (found,) = json.loads(told.out)["results"]
+    assert found["rmse_mm"] == pytest.approx(plain(single(rows))["rmse_mm"])
+    assert (found["jitter_mm"], found["intervals"]["jitter_mm"]) == (None, None)
+    assert found["distance"]["bins"][0]["jitter_mm"] is None
+    turns = {found["orientation"][name] for name in ("jitter_deg", "worst_deg", "axis_jitter_deg")}
+    assert turns == {None}
+    assert main(["em", "evaluate", str(path), "--out", str(tmp_path / "tables")]) == 0
+    told = capsys.readouterr()
+    errors, interval = (
+        next(x for x in told.out.splitlines() if x.strip().startswith(s)) for s in ("tip, i", "95")
+    )
+    assert errors.split()[-3:] == ["–", "27", "27"]  # jitter, points, samples
+    assert interval.split()[-2] == "from"  # the 95 %: beyond there is nothing for maximum and jitter
+    assert "one sample at each grid point (jitter and repeatability are not known)" in told.err
+
+
+def test_two_samples_at_a_single_point_are_enough_for_a_jitter(tmp_path, rows):
+    some = single(rows) + rows[:1]
+    found = one(write_csv(tmp_path / "t.csv", some))
+    assert found["jitter_mm"] == pytest.approx(plain(some)["jitter_mm"])
+    assert found["intervals"]["jitter_mm"] is not None
+
+
+def test_samples_without_a_position_are_left_out_and_counted(tmp_path, rows):
+    lost = [dict(row) for row in rows]
+    for row in lost[:5]:  # all three of the first point, two of the second
+        row |= {"x_mm": None, "y_mm": float("nan"), "z_mm": None}
+    path = write_csv(tmp_path / "t.csv", lost)
+    evaluation = evaluate(path, Options())
+    found = evaluation.values()["results"][0]
+    assert (found["n_missing"], found["n_samples"], found["n_points"], found["n_unseen"]) == (5, 76, 26, 1)
+    assert found["rmse_mm"] == pytest.approx(plain(rows[5:])["rmse_mm"])
+    assert found["jitter_mm"] == pytest.approx(plain(rows[5:])["jitter_mm"])
+    left_out = "5 of 81 samples have no position (left out); no sample at 1 of 27 grid points (left out)"
+    assert evaluation.notes[0].startswith(f"tip, ideal: {left_out}; one sample at 1 grid point (")
+
+
+def test_a_sensor_that_was_never_seen_is_refused(tmp_path, rows):
+    lost = [{**row, "x_mm": None, "y_mm": None, "z_mm": None} for row in rows]
+    assert "sensor 'tip', environment 'ideal': all samples are missing" in refusal(
+        write_csv(tmp_path / "t.csv", lost)
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"x_mm": None}, "row 8: x_mm, y_mm, z_mm: all three must be there, or none"),
+        ({"z_mm": float("inf")}, "row 8: x_mm, y_mm, z_mm: must be finite"),
+        ({"y_mm": -3.697314e28}, "row 8: x_mm, y_mm, z_mm: must be finite and at most 1e+06 mm"),
+        ({"true_y_mm": None}, "row 8: true_x_mm, true_y_mm, true_z_mm: must be there"),
+        ({"true_y_mm": 7.5}, "row 8: the true position of a point_id changes by more than 0.001 mm"),
+        ({"indicator": -1.0}, "row 8: indicator: must be finite and at least 0, or empty"),
+        ({"indicator": float("inf")}, "row 8: indicator: must be finite"),
+        ({"sensor": ""}, "row 8: sensor is empty"),
+        ({"point_id": ""}, "row 8: point_id is empty"),
+        ({"x_mm": "1,5"}, "row 8: x_mm: '1,5' is no number: write a decimal point, not a comma"),
+        ({"z_mm": "abc"}, "row 8: z_mm: 'abc' is no number"),
+    ],
+)
+def test_a_row_that_breaks_a_rule_is_named(tmp_path, rows, change, expected):
+    rows[7] |= change
+    assert expected in refusal(write_csv(tmp_path / "t.csv", rows))
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "expected"),
+    [((1.0, None, 0.0, 0.0), "all four must be there"), ((0.9, 0.0, 0.0, 0.0), "must be a unit quaternion")],
+)
+def test_orientations_must_be_whole_unit_quaternions(tmp_path, rows, quaternion, expected):
+    rows = [{**row, "qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0} for row in rows]
+    rows[4] |= dict(zip(("qw", "qx", "qy", "qz"), quaternion, strict=True))
+    assert f"row 5: qw, qx, qy, qz: {expected}" in refusal(write_csv(tmp_path / "t.csv", rows))
+    some = [{k: v for k, v in row.items() if k != "qz"} for row in rows]
+    assert "qw, qx, qy, qz: all four columns" in refusal(write_csv(tmp_path / "some.csv", some))
+
+
+def test_a_refusal_leaves_no_thread_that_reads_on(tmp_path, rows):
+    """Also while somebody still holds the error, and with it the frames in which it came about."""
+    rows[7]["z_mm"] = float("inf")
+    with pytest.raises(InputError) as held:
+        evaluate(write_csv(tmp_path / "t.csv", rows), Options())
+    assert held.tb is not None
+    assert not [thread.name for thread in threading.enumerate() if "ThreadPool" in thread.name]
+
+
+def test_equal_rows_are_samples_like_all_others(tmp_path, rows):
+    twice = one(write_csv(tmp_path / "t.csv", [*rows, *rows]))
+    assert twice["n_samples"] == 2 * len(rows)
+    for name, value in plain(rows).items():
+        assert twice[name] == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "is empty"),
+        ("point_id,x_mm\n", "has no rows"),
+        ("\n\n", "must name the columns"),
+        ("\0\1\2\n3", "neither"),
+    ],
+)
+def test_a_file_without_a_table_is_refused(tmp_path, text, expected):
+    path = tmp_path / "t.csv"
+    path.write_text(text)
+    assert expected in refusal(path)
+
+
+def test_a_file_that_is_not_there_or_is_a_folder_is_refused(tmp_path):
+    assert "cannot be read: No such file" in refusal(tmp_path / "nowhere.csv")
+    assert "cannot be read" in refusal(tmp_path)
+
+
+def test_a_csv_file_cut_anywhere_in_its_last_line_is_refused(tmp_path, rows):
+    whole = write_csv(tmp_path / "whole.csv", rows).read_bytes()
+    start = whole.rstrip(b"\n").rfind(b"\n") + 1
+    path = tmp_path / "t.csv"
+    for end in range(start + 1, len(whole) - 1):
+        path.write_bytes(whole[:end])
+        assert "cut in the middle" in refusal(path)
+
+
+def test_a_csv_file_cut_in_its_last_number_is_refused(tmp_path, rows):
+    fixed = [{**row, "distance_mm": 700.125} for row in rows]
+    whole = write_csv(tmp_path / "t.csv", fixed).read_bytes()
+    for lost in range(2, 8):
+        (tmp_path / "t.csv").write_bytes(whole[:-lost])
+        assert "cut in the middle" in refusal(tmp_path / "t.csv")
+
+
+def test_a_last_line_that_only_lacks_its_line_end_is_used(tmp_path, rows):
+    path = write_csv(tmp_path / "t.csv", rows)
+    path.write_bytes(path.read_bytes()[:-1])
+    assert one(path)["n_samples"] == len(rows)
+
+
+def test_a_whole_file_whose_last_number_is_short_needs_a_line_end(tmp_path, rows):
+    fixed = [{**row, "distance_mm": 700.125} for row in rows]
+    fixed[-1]["distance_mm"] = 700.5
+    path = write_csv(tmp_path / "t.csv", fixed)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1])
+    assert "or add a line end if it is whole" in refusal(path)
+    path.write_bytes(whole)
+    assert one(path)["n_samples"] == len(rows)
+    path.write_bytes(whole[:-10])  # a field is missing, so it is not whole
+    assert "line end if" not in refusal(path)
+
+
+def test_a_line_cut_before_others_were_added_is_refused(tmp_path, rows):
+    path = write_csv(tmp_path / "t.csv", rows)
+    lines = path.read_text().splitlines()
+    lines[40] = lines[40][:30]
+    path.write_text("\n".join(lines) + "\n")
+    assert f"row 40: has {lines[40].count(',') + 1} fields, the header has 10: '{lines[40]}'" in refusal(path)
+    lines[40] = lines[39] + ",7"
+    path.write_text("\n".join(lines) + "\n")
+    assert "row 40: has 11 fields, the header has 10" in refusal(path)
+
+
+def test_a_parquet_file_that_was_cut_is_refused(tmp_path, rows):
+    path = tmp_path / "t.parquet"
+    pq.write_table(pa.Table.from_pylist(rows), path)
+    whole = path.read_bytes()
+    for part in (10, len(whole) // 2, len(whole) - 3):
+        path.write_bytes(whole[:part])
+        assert "a Parquet file that was cut off, or is damaged" in refusal(path)
+
+
+def test_a_parquet_column_of_text_is_no_column_of_numbers(tmp_path, rows):
+    path = tmp_path / "t.parquet"
+    pq.write_table(pa.Table.from_pylist([{**row, "x_mm": "left"} for row in rows]), path)
+    assert "x_mm: must be a column of numbers, not of string" in refusal(path)
+    pq.write_table(pa.Table.from_pylist([{**row, "indicator": True} for row in rows]), path)
+    assert "indicator: must be a column of numbers, not of bool" in refusal(path)
+
+
+def test_semicolons_tabs_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path, rows):
+    expected = plain(rows)["rmse_mm"]
+    for delimiter in (";", "\t"):
+        path = write_csv(tmp_path / "t.csv", rows, delimiter=delimiter)
+        assert one(path)["rmse_mm"] == pytest.approx(expected)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    assert one(path)["rmse_mm"] == pytest.approx(expected)
+
+
+def test_names_with_blanks_around_them_are_the_same_names(tmp_path, rows):
+    for number, row in enumerate(rows):
+        row["sensor"] = ("tip", " tip", "tip ")[number % 3]
+    assert one(write_csv(tmp_path / "t.csv", rows))["n_samples"] == len(rows)
+
+
+def test_a_parquet_table_may_have_whole_numbers_categories_and_no_indicator_at_all(tmp_path, rows):
+    table = pa.Table.from_pylist(rows)
+    for name, column in (
+        ("true_x_mm", table["true_x_mm"].cast(pa.int16())),
+        ("sensor", table["sensor"].dictionary_encode()),
+        ("environment", table["environment"].cast(pa.binary())),
+        ("indicator", pa.nulls(len(rows))),
+    ):
+        table = table.set_column(table.schema.get_field_index(name), name, column)
+    pq.write_table(table, tmp_path / "t.parquet")
+    found = one(tmp_path / "t.parquet")
+    assert found["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+    assert (found["sensor"], found["environment"], found["indicator"]) == ("tip", "ideal", None)
+
+
+def test_metres_are_refused_also_where_nothing_jitters(tmp_path, rows):
+    """One sample a point, or samples that a tracker rounds: the jitter is 0, not just small."""
+    both = ("true_x_mm", "true_y_mm", "true_z_mm", "x_mm", "y_mm", "z_mm")
+    assert "look like metres" in refusal(write_csv(tmp_path / "t.csv", in_metres(single(rows), both)))
+
+
+@pytest.mark.parametrize("names", [("--1",), ("²",), ("-",)])
+def test_point_ids_may_be_any_text(tmp_path, rows, names):
+    known = list(dict.fromkeys(row["point_id"] for row in rows))
+    other = dict(zip(known[:1], names, strict=True))
+    renamed = [row | {"point_id": other.get(row["point_id"], row["point_id"])} for row in rows]
+    found = one(write_csv(tmp_path / "t.csv", renamed))
+    assert found["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
+
+
+def test_an_empty_label_of_a_short_dictionary_is_refused_in_one_line(tmp_path, rows):
+    """128 names and an empty one, numbered by single bytes as a categorical column is."""
+    many = [row | {"point_id": str(k)} for k, row in enumerate((rows * 130)[:129])]
+    table = pa.Table.from_pylist(many)
+    names = pa.array([str(k) for k in range(128)])
+    indices = pa.array([*range(128), None], pa.int8())
+    column = pa.DictionaryArray.from_arrays(indices, names)
+    table = table.set_column(table.schema.get_field_index("point_id"), "point_id", column)
+    pq.write_table(table, tmp_path / "t.parquet")
+    assert "point_id is empty" in refusal(tmp_path / "t.parquet")

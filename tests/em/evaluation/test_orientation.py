@@ -1,0 +1,36 @@
+"""Orientation jitter against angles computed one by one."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from em_tables import GRID, rows_of, write_csv
+from flexneedle.em.evaluation.evaluate import Options, evaluate
+
+
+def table(path, turns):
+    """A table with the given orientations (n, m) at n grid points, of either sign."""
+    rows = rows_of(GRID, np.repeat(GRID[:, None], len(turns[0]), axis=1))
+    quaternions = np.concatenate([own.as_quat() for own in turns])
+    for row, (x, y, z, w), sign in zip(
+        rows, quaternions.tolist(), np.resize([1, -1, -1], len(rows)), strict=True
+    ):
+        row |= {"qw": sign * w, "qx": sign * x, "qy": sign * y, "qz": sign * z}
+    return write_csv(path, rows)
+
+
+def test_any_mean_orientation_and_any_small_scatter_are_measured(tmp_path):
+    rng = np.random.default_rng(0)
+    middle = Rotation.random(len(GRID), random_state=1)
+    turns = [one * Rotation.from_rotvec(rng.normal(0.0, 0.003, (40, 3))) for one in middle]
+    found = evaluate(table(tmp_path / "t.csv", turns), Options()).values()["results"][0]["orientation"]
+    whole, axis = [], []
+    for own in turns:
+        whole.append((own.mean().inv() * own).magnitude())
+        directions = own.apply([0.0, 0.0, 1.0])
+        towards = directions.mean(axis=0) / np.linalg.norm(directions.mean(axis=0))
+        axis.append(np.arctan2(np.linalg.norm(np.cross(directions, towards), axis=1), directions @ towards))
+    assert found["jitter_deg"] == pytest.approx(np.degrees(np.sqrt(np.mean(np.square(whole)))), rel=1e-4)
+    assert found["axis_jitter_deg"] == pytest.approx(np.degrees(np.sqrt(np.mean(np.square(axis)))), rel=1e-4)
+    worst = int(found["worst_at"])
+    assert worst == np.argmax([np.mean(np.square(own)) for own in whole])

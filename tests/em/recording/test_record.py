@@ -1,0 +1,440 @@
+"""Recording on a grid: right rows, at rest, each point once whatever interrupts it."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+from itertools import product
+
+import numpy as np
+import pytest
+
+from emulated import DEADLINE_S, emulated, until
+from flexneedle.em.recording import record as recording
+from flexneedle.em.recording.grid import read_grid
+from flexneedle.em.recording.record import EXTRA, Guide, open_session, record
+from flexneedle.errors import InputError, RunError
+from flexneedle.rig.tracking.table import COLUMNS
+from flexneedle.types import VISIBLE, Frame, Reading
+
+GRID = """\
+environment = "ideal, by the window"
+samples = 6
+repeats = 2
+points_mm = [[0, 0, 0], [10, 0, 0], [10, 20, 0]]
+[sensors]
+tip = "tip"
+ref1 = "reference"
+[rest]
+drift_mm = 0.2
+timeout_s = 2.0
+"""
+
+
+class Stage:
+    """A tracker of a stage that is moved by hand, the clock, and the guide: no time passes but by waiting."""
+
+    def __init__(self):
+        self.time, self.place, self.speed = 0.0, np.zeros(3), 0.0
+        self.asked, self.said = [], []
+        self.ailment, self.status = None, VISIBLE
+        self._told = 0
+
+    def now(self):
+        return self.time
+
+    def wait(self, seconds):
+        self.time += seconds
+
+    def read(self):
+        numbers = range(self._told + 1, int(self.time * 40) + 1)
+        self._told = max(self._told, int(self.time * 40))
+        return tuple(map(self._frame, numbers))
+
+    def _frame(self, number):
+        x, y, z = self.place
+        x += 100.0 + self.speed * number / 40
+        reading = Reading((x, y, z), (1.0, 0.0, 0.0, 0.0), 0.02)
+        return Frame(number / 40, number, {"tip": reading, "ref1": reading} | (self.ailment or {}))
+
+    def ask(self, stop):
+        self.asked.append((stop.repeat, stop.point_id))
+        self.place = np.array(stop.place)
+        self.time += 3.0
+
+    def guide(self, **settings):
+        return Guide(self.ask, self.said.append, **settings)
+
+
+@pytest.fixture
+def grid(tmp_path):
+    (tmp_path / "grid.toml").write_text(GRID)
+    return read_grid(str(tmp_path / "grid.toml"))
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "table.csv"
+
+
+def run(out, grid, stage, **settings):
+    with open_session(out, grid) as session:
+        return record(session, stage, stage, grid, stage.guide(**settings))
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+ALL = list(product((1, 2), (1, 2, 3)))
+
+
+def assert_whole(path, samples=6, stops=ALL, sensors=("tip", "reference")):
+    """Every stop has all its rows, once, in order."""
+    found = [(int(row["repeat"]), int(row["point_id"]), row["sensor"]) for row in rows_of(path)]
+    assert found == [(*stop, name) for stop in stops for _ in range(samples) for name in sensors]
+
+
+def test_each_point_has_its_samples_with_where_the_stage_was(grid, out):
+    stage = Stage()
+    assert run(out, grid, stage) == 6
+    assert stage.asked == ALL
+    assert_whole(out)
+    assert tuple(rows_of(out)[0]) == (*COLUMNS, *EXTRA)
+    for row in rows_of(out):
+        true = np.array([float(row[f"true_{axis}_mm"]) for axis in "xyz"])
+        told = np.array([float(row[f"{axis}_mm"]) for axis in "xyz"])
+        np.testing.assert_array_equal(told - true, (100.0, 0.0, 0.0))
+        assert float(row["distance_mm"]) == pytest.approx(np.linalg.norm(told))
+        assert (row["environment"], row["indicator"], row["qw"]) == ("ideal, by the window", "0.02", "1.0")
+
+
+def test_no_sample_is_from_before_the_stage_was_there(grid, out):
+    run(out, grid, Stage())
+    first = [float(row["time_s"]) for row in rows_of(out)][::12]
+    assert (np.diff(first) >= 3.0).all()
+    assert first[0] >= 3.0
+
+
+def test_a_moving_stage_is_waited_for(grid, out):
+    """It moves at 5 mm/s for its first second, and the samples are from after that."""
+    stage = Stage()
+    wait = stage.wait
+
+    def wait_and_slow_down(seconds):
+        wait(seconds)
+        stage.speed = 5.0 if stage.time < 4.0 else 0.0
+
+    stage.wait = wait_and_slow_down
+    run(out, grid, stage)
+    assert_whole(out)
+    assert float(rows_of(out)[0]["time_s"]) > 3.9
+
+
+def test_a_stage_that_never_rests_is_told_and_asked_for_again(grid, out):
+    stage = Stage()
+    stage.speed = 5.0
+
+    def say(line):
+        stage.said.append(line)
+        stage.speed = 0.0
+
+    with open_session(out, grid) as session:
+        record(session, stage, stage, grid, Guide(stage.ask, say))
+    (said,) = stage.said
+    assert said == (
+        "no 6 good samples within 2 s: tip moves: 0.50 mm from the first to the last third, limit 0.2 mm; once more"
+    )
+    assert stage.asked == [(1, 1), *ALL]
+    assert_whole(out)
+
+
+@pytest.mark.parametrize(
+    ("ailment", "says"),
+    [
+        ({"tip": Reading(None, status="out of volume")}, "tip: out of volume"),
+        ({"ref1": Reading(None, status="missing")}, "ref1: missing"),
+    ],
+)
+def test_a_point_that_cannot_be_measured_ends_a_recording_without_a_person(grid, out, ailment, says):
+    stage = Stage()
+    stage.ailment = ailment
+    with pytest.raises(RunError, match=f"point 1, repeat 1: no 6 good samples within 2 s: {says}"):
+        run(out, grid, stage, insists=False)
+    assert not out.exists(), "nothing was measured"
+
+
+def test_a_sensor_that_the_tracker_does_not_have_is_named_before_the_stage_is_moved(grid, out):
+    stage = Stage()
+    stage._frame = lambda number: Frame(number / 40, number, {"tip": Reading((0.0, 0.0, 0.0))})
+    with pytest.raises(InputError, match=r"sensors\.ref1: the tracker has no such sensor; it has tip$"):
+        run(out, grid, stage)
+    assert stage.asked == []
+
+
+def test_a_silent_tracker_says_why(grid, out):
+    stage = Stage()
+    stage.read, stage.status = (lambda: ()), "no reply"
+    with pytest.raises(RunError, match="no frames within 2 s: no reply"):
+        run(out, grid, stage)
+    assert (stage.asked, stage.said) == ([], ["no frames: no reply"])
+
+
+def test_a_tracker_that_falls_silent_for_a_while_is_told_once_and_so_is_its_return(grid, out):
+    stage = Stage()
+    read = stage.read
+    stage.read = lambda: () if 3.1 < stage.time < 4.6 else read()
+    stage.status = "unplugged"
+    run(out, grid, stage)
+    assert stage.said == ["no frames: unplugged", "frames come again"]
+    assert_whole(out)
+
+
+def test_a_sensor_that_is_lost_for_a_while_is_waited_for_and_told_once(grid, out):
+    """For 1.5 s at the first point; for half a second, at the second, nothing is said."""
+    stage = Stage()
+    frame, lost = stage._frame, {"tip": Reading(None, status="missing")}
+
+    def blink(number):
+        told = frame(number)
+        spell = 3.1 < told.time < 4.6 or 7.5 < told.time < 8.3
+        return Frame(told.time, number, told.readings | lost) if spell else told
+
+    stage._frame = blink
+    run(out, grid, stage)
+    assert stage.said == ["waiting: tip: missing"]
+    assert_whole(out)
+
+
+class Stuck(Stage):
+    """Its tip takes a share of each way, however far the stage goes; the reference goes all of it."""
+
+    def __init__(self, share=0.0):
+        super().__init__()
+        self.share = share
+
+    def _frame(self, number):
+        frame = super()._frame(number)
+        x, y, z = frame.readings["ref1"].position
+        return Frame(
+            frame.time, number, {**frame.readings, "tip": Reading((self.share * x, self.share * y, z))}
+        )
+
+
+@pytest.mark.parametrize("insists", [True, False])
+def test_a_sensor_that_stays_while_the_stage_moves_ends_the_recording(grid, out, insists):
+    with pytest.raises(RunError) as refusal:
+        run(out, grid, Stuck(), insists=insists)
+    assert str(refusal.value) == (
+        "tip moved 0.0 mm from point 1 to point 2 and the stage 10.0 mm: they may differ by 5.0 mm "
+        "(--force records all the same)"
+    )
+    assert_whole(out, stops=ALL[:1])
+
+
+@pytest.mark.parametrize(
+    ("share", "spacing", "agrees"), [(0.52, 10, True), (0.48, 10, False), (1.48, 10, True)]
+)
+def test_small_ways_may_differ_by_5_mm(tmp_path, out, share, spacing, agrees):
+    assert_agrees(tmp_path, out, share, spacing, agrees)
+
+
+@pytest.mark.parametrize(
+    ("share", "spacing", "agrees"),
+    [(0.81, 100, True), (0.79, 100, False), (1.19, 100, True), (1.21, 100, False)],
+)
+def test_long_ways_may_differ_by_20_percent(tmp_path, out, share, spacing, agrees):
+    assert_agrees(tmp_path, out, share, spacing, agrees)
+
+
+def assert_agrees(tmp_path, out, share, spacing, agrees):
+    text = f'environment = "x"\nsamples = 4\nrepeats = 1\npoints_mm = [[0, 0, 0], [{spacing}, 0, 0]]\n'
+    (tmp_path / "two.toml").write_text(text)
+    grid = read_grid(str(tmp_path / "two.toml"))
+    if agrees:
+        assert run(out, grid, Stuck(share)) == 2
+    else:
+        with pytest.raises(RunError, match="and the stage"):
+            run(out, grid, Stuck(share))
+
+
+def test_who_knows_better_keeps_the_point(grid, out):
+    stage, doubts = Stuck(), []
+    run(out, grid, stage, keeps=lambda doubt: not doubts.append(doubt))
+    assert_whole(out)
+    assert len(doubts) == 5
+    assert stage.asked == ALL
+
+
+def test_who_does_not_keep_it_measures_it_again(grid, out):
+    """The stage was not moved to the second point when it was asked to, and is once the doubt is told."""
+    stage, doubts = Stage(), []
+
+    def forget_the_second(stop):
+        place = stage.place
+        stage.ask(stop)
+        stage.place = place if len(stage.asked) == 2 else stage.place
+
+    def mend(doubt):
+        doubts.append(doubt)
+        if len(doubts) > 1:
+            raise KeyboardInterrupt
+        stage.place = np.array([10.0, 0.0, 0.0])
+        return False
+
+    with open_session(out, grid) as session:
+        record(session, stage, stage, grid, Guide(forget_the_second, print, keeps=mend))
+    assert stage.asked == ALL
+    assert_whole(out)
+    assert {row["x_mm"] for row in rows_of(out) if row["point_id"] == "2"} == {"110.0"}
+
+
+def test_the_last_point_before_an_interruption_counts_too(grid, out):
+    stage = Stage()
+
+    def ask_once(stop):
+        if stage.asked:
+            raise KeyboardInterrupt
+        stage.ask(stop)
+
+    with open_session(out, grid) as session, pytest.raises(KeyboardInterrupt):
+        record(session, stage, stage, grid, Guide(ask_once, print))
+    again = Stage()
+    again.ask = lambda _: None  # it stays where it was
+    with pytest.raises(RunError, match=r"tip moved 0\.0 mm from point 1 to point 2 and the stage 10\.0 mm"):
+        run(out, grid, again)
+
+
+def test_a_table_is_a_csv(grid, tmp_path):
+    with pytest.raises(InputError, match=r"table\.parquet: a CSV is written"):
+        run(tmp_path / "table.parquet", grid, Stage())
+    assert not (tmp_path / "table.parquet").exists()
+
+
+@pytest.mark.parametrize("stopped_after", range(7))
+def test_stopped_at_any_point_it_goes_on_with_the_next(grid, out, stopped_after):
+    stage = Stage()
+    ask = stage.ask
+
+    def ask_until(stop):
+        if len(stage.asked) == stopped_after:
+            raise KeyboardInterrupt
+        ask(stop)
+
+    stage.ask = ask_until
+    if stopped_after < 6:
+        with pytest.raises(KeyboardInterrupt):
+            run(out, grid, stage)
+    else:
+        run(out, grid, stage)
+    again = Stage()
+    run(out, grid, again)
+    assert stage.asked + again.asked == ALL
+    assert_whole(out)
+    assert (np.diff([float(row["time_s"]) for row in rows_of(out)]) >= 0).all(), "times go on"
+
+
+@pytest.mark.parametrize("cut", [1, 20, 200, 400, 1000, 2000, 4000])
+def test_a_table_that_was_cut_anywhere_is_completed(grid, out, cut):
+    run(out, grid, Stage())
+    whole = out.stat().st_size
+    os.truncate(out, max(0, whole - cut) if cut > 1 else 1)
+    run(out, grid, Stage())
+    assert_whole(out)
+
+
+def test_a_table_stays_as_it_was_until_there_is_something_to_add(grid, out):
+    """A stop that was torn, and a file without anything: whoever opens them and measures nothing touches nothing."""
+    run(out, grid, Stage())
+    os.truncate(out, out.stat().st_size - 1000)
+    torn = out.read_bytes()
+    with open_session(out, grid) as session:
+        assert session.done == 5
+    assert out.read_bytes() == torn
+    run(out, grid, Stage())
+    assert_whole(out)
+    out.write_bytes(b"")
+    with open_session(out, grid):
+        pass
+    assert out.read_bytes() == b"", "it is the user's"
+
+
+def test_zeros_that_a_power_cut_left_are_dropped(grid, out):
+    run(out, grid, Stage())
+    with out.open("ab") as file:
+        file.write(bytes(500))
+    run(out, grid, Stage())
+    assert_whole(out)
+
+
+def test_a_whole_table_is_left_as_it_is(grid, out):
+    run(out, grid, Stage())
+    before = out.read_bytes()
+    assert run(out, grid, Stage()) == 0
+    assert out.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("environment = ", "# environment = \nenvironment = 'noisy' #"),
+        ("[10, 0, 0]", "[11, 0, 0]"),
+        ("samples = 6", "samples = 5"),
+        ("samples = 6", "samples = 60"),  # a stop of which has more rows than the whole table
+        ("repeats = 2", "repeats = 1"),
+        ('ref1 = "reference"', 'ref1 = "other"'),
+    ],
+)
+def test_a_table_of_another_grid_is_left_alone(grid, out, tmp_path, old, new):
+    run(out, grid, Stage())
+    before = out.read_bytes()
+    (tmp_path / "other.toml").write_text(GRID.replace(old, new))
+    with pytest.raises(InputError, match=r"line \d+: is not of this grid"):
+        run(out, read_grid(str(tmp_path / "other.toml")), Stage())
+    assert out.read_bytes() == before
+
+
+def test_a_file_that_is_no_such_table_is_left_alone(grid, out):
+    out.write_text("my notes\n")
+    with pytest.raises(InputError, match="is no table of `em record`"):
+        run(out, grid, Stage())
+    assert out.read_text() == "my notes\n"
+
+
+def test_a_damaged_line_is_found(grid, out):
+    run(out, grid, Stage())
+    lines = out.read_text().splitlines(keepends=True)
+    out.write_text("".join([*lines[:3], lines[3].replace("1", "x", 1), *lines[4:]]))
+    with pytest.raises(InputError, match="line 4: is not of this grid"):
+        run(out, grid, Stage())
+
+
+def test_two_recordings_do_not_share_a_table(grid, out):
+    with open_session(out, grid), pytest.raises(InputError, match="another process is writing it"):
+        run(out, grid, Stage())
+
+
+def test_each_point_is_on_the_disk_before_the_next_is_asked_for(grid, out, monkeypatch):
+    synced = []
+    monkeypatch.setattr(recording.os, "fsync", lambda _: synced.append(len(rows_of(out))))
+    run(out, grid, Stage())
+    assert synced == [12, 24, 36, 48, 60, 72]
+
+
+def test_killed_in_the_middle_it_neither_loses_nor_repeats_a_point(tmp_path, out):
+    """Real processes, a real line, and kill -9."""
+    count = 16
+    points = [[n, 0, 0] for n in range(count)]
+    text = f'environment = "ideal"\nsamples = 4\nrepeats = 1\npoints_mm = {points}\n'
+    (tmp_path / "line.toml").write_text(text)
+    with emulated("--still") as path:
+        command = [sys.executable, "-m", "flexneedle", "em", "record", "--tracker", f"aurora:{path}"]
+        command += ["--grid", str(tmp_path / "line.toml"), "--out", str(out), "--dwell", "0"]
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        until(lambda: out.exists() and out.read_bytes().count(b"\n") > 20)
+        process.send_signal(signal.SIGKILL)
+        process.wait(DEADLINE_S)
+        subprocess.run(command, check=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    assert_whole(out, 4, [(1, n + 1) for n in range(count)], ("tip",))

@@ -1,0 +1,183 @@
+"""Watching: every frame shown and kept, and a verdict on each."""
+
+import pytest
+
+from flexneedle.em.recording.watch import field_judge, judge_field, watch
+from flexneedle.errors import InputError
+from flexneedle.rig.devices.recording import read_frames
+from flexneedle.rig.devices.replay import ENDED, Replay
+from flexneedle.rig.monitor.watch import Watch
+from flexneedle.scenario.sections.monitor import Monitor
+from flexneedle.types import VISIBLE, Frame, Reading, Sample
+
+
+class Clock:
+    """Time passes by waiting alone."""
+
+    time = 0.0
+
+    def now(self):
+        return self.time
+
+    def wait(self, seconds):
+        self.time += seconds
+
+
+def frames(count, indicator=0.02, **readings):
+    told = {name: Reading((1.0, 2.0, 3.0), None, indicator) for name in ("tip", "ref1", "ref2", "ref3")}
+    return [Frame(n / 40, n, told | readings) for n in range(count)]
+
+
+class Silent:
+    """A tracker that says nothing and why."""
+
+    status = "no reply"
+
+    def read(self):
+        return ()
+
+
+def test_each_frame_is_shown_once_with_its_verdict():
+    clock, views = Clock(), []
+    assert watch(Replay(frames(60), clock), clock, views.append) == 60
+    assert [view.frame.number for view in views if view.is_new] == list(range(60))
+    verdicts = [view.verdict for view in views if view.is_new]
+    assert all(verdict.startswith("field not known: looked at for") for verdict in verdicts[:20])
+    assert set(verdicts[20:]) == {VISIBLE}
+
+
+def test_a_judge_of_ones_own_sees_the_history():
+    clock, views = Clock(), []
+    watch(
+        Replay(frames(500), clock), clock, views.append, judge=lambda history, _: (str(len(history)), False)
+    )
+    assert [view.verdict for view in views[:3]] == ["1", "2", "3"]
+    assert views[-1].verdict == "400"
+
+
+def test_it_stops_after_its_time():
+    clock, views = Clock(), []
+    assert watch(Replay(frames(60), clock), clock, views.append, seconds=0.5) == 20
+
+
+def test_where_nothing_comes_it_says_so_now_and_then():
+    clock, views = Clock(), []
+    assert watch(Silent(), clock, views.append, seconds=3.0) == 0
+    assert 4 <= len(views) <= 6
+    assert {(view.frame, view.verdict) for view in views} == {(None, "no reply")}
+
+
+def test_it_stops_when_the_tracker_says_that_there_is_no_more_to_come():
+    clock, tracker = Clock(), Silent()
+    tracker.status = ENDED
+    assert watch(tracker, clock, lambda _: None, seconds=3.0) == 0
+    assert clock.time == 0.0
+
+
+def test_what_is_recorded_can_be_replayed(tmp_path):
+    path, clock = tmp_path / "kept.csv", Clock()
+    watch(Replay(frames(60, tip=Reading(None, status="missing")), clock), clock, lambda _: None, record=path)
+    kept = read_frames(path)
+    assert [frame.number for frame in kept] == list(range(60))
+    assert kept[7].readings["tip"] == Reading(None, status="missing")
+    assert kept[7].readings["ref1"].indicator == 0.02
+
+
+def test_a_recording_overwrites_nothing(tmp_path):
+    (tmp_path / "kept.csv").write_text("mine")
+    clock = Clock()
+    with pytest.raises(InputError, match="is there already"):
+        watch(Replay(frames(1), clock), clock, lambda _: None, record=tmp_path / "kept.csv")
+    assert (tmp_path / "kept.csv").read_text() == "mine"
+
+
+def verdict(told, settings=None, distorted=False):
+    return judge_field(told, settings or Monitor(), distorted)[0]
+
+
+def test_a_good_field_is_ok_and_a_distorted_one_is_not():
+    assert judge_field(frames(40), Monitor()) == (VISIBLE, False)
+    said, distorted = judge_field(frames(40, indicator=0.06), Monitor())
+    assert "field distorted" in said
+    assert distorted
+
+
+def test_the_field_is_that_of_the_last_second_at_the_references():
+    improved = frames(100, indicator=0.06)[:60] + frames(100)[60:]
+    assert verdict(improved) == VISIBLE
+    at_the_tip = Reading((1.0, 2.0, 3.0), None, 0.5)
+    assert verdict(frames(40, tip=at_the_tip)) == VISIBLE
+
+
+def test_a_sensor_without_a_position_and_too_few_references_are_told():
+    lost = Reading(None, status="out of volume")
+    assert verdict(frames(5, ref2=lost)) == "ref2: out of volume"
+    alone = [Frame(0.0, 1, {"tip": Reading((0.0, 0.0, 0.0), None, 0.02)})]
+    assert "field not known: 0 of 3" in verdict(alone)
+    assert verdict(alone, Monitor(references=0)) == VISIBLE
+
+
+def stretch(begin, seconds, **readings):
+    """Frames from `begin` (s) on, with these readings of the sensors."""
+    first = round(begin * 40)
+    return [Frame(n / 40, n, readings) for n in range(first, first + round(seconds * 40))]
+
+
+def told(indicator, tip_status=VISIBLE):
+    seen = Reading((1.0, 2.0, 3.0), None, indicator)
+    tip = seen if tip_status == VISIBLE else Reading(None, status=tip_status)
+    return {"tip": tip, "ref1": seen, "ref2": seen, "ref3": seen}
+
+
+def test_a_field_that_was_distorted_stays_so_as_long_as_a_held_insertion_waits():
+    """Up over the limit, down below it, unknown, still not below the lower limit, good, and between the limits again;
+    the same with the tip unseen, which is what is said then."""
+    levels = (0.02, 0.06, 0.052, None, 0.052, 0.02, 0.052)
+    script = [(level, VISIBLE) for level in levels] + [(level, "missing") for level in levels[1:3]]
+    script += [(0.052, VISIBLE)]
+    seen = [f for k, one in enumerate(script) for f in stretch(1.5 * k, 1.5, **told(*one))]
+    clock, views, monitor = Clock(), [], Watch(Monitor())
+    watch(Replay(seen, clock), clock, views.append)
+    assert len(views) == len(seen)
+    for frame, view in zip(seen, views, strict=True):
+        monitor, _ = monitor.take(
+            Sample(frame.time, 0.0, 0.0, 0.0, frame), (0.0, 0.0), frame.time, 1.0, 1000.0
+        )
+        monitor, held = monitor.look()
+        unseen = frame.readings["tip"].status != VISIBLE
+        assert view.verdict == ("tip: missing" if unseen else held), frame.number
+    last = [views[60 * (k + 1) - 1].verdict for k in range(len(script))]
+    assert [said.split(":")[0] for said in last] == [
+        *("ok", "field distorted", "field distorted", "field not known", "field distorted", "ok", "ok"),
+        *("tip", "tip", "field distorted"),
+    ]
+
+
+def test_a_recording_is_a_csv(tmp_path):
+    clock = Clock()
+    with pytest.raises(InputError, match="a CSV is written"):
+        watch(Replay(frames(1), clock), clock, lambda _: None, record=tmp_path / "kept.parquet")
+    assert not (tmp_path / "kept.parquet").exists()
+
+
+def sensors(*names, indicator=0.02):
+    return [
+        Frame(n / 40, n, {name: Reading((0.0, 0.0, 0.0), None, indicator) for name in names})
+        for n in range(40)
+    ]
+
+
+def test_without_a_number_the_field_is_judged_by_the_references_that_there_are():
+    def judge(frames):
+        return field_judge()(frames, False)[0]
+
+    assert judge(sensors("tip", "ref1")) == VISIBLE
+    assert "field distorted" in judge(sensors("tip", "ref1", indicator=0.06))
+    assert "field not known" in judge(sensors("tip")), "nobody saw it"
+    assert judge(sensors("tip", "ref1", "ref2", "ref3", "ref4")) == VISIBLE
+    assert judge(sensors("tip", "tip2", "ref1")) == VISIBLE, "a second sensor in the needle is no reference"
+
+
+def test_the_number_of_references_can_be_asked_for():
+    assert "field not known: 1 of 2" in field_judge(2)(sensors("tip", "ref1"), False)[0]
+    assert field_judge(0)(sensors("tip"), False) == (VISIBLE, False)

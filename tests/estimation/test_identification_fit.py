@@ -1,0 +1,334 @@
+"""The parts of the fit: its derivatives, its step, and the step back, its readings and what is left uncertain."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flexneedle.estimation import identification as idn
+from flexneedle.estimation.identification import Identification
+from flexneedle.estimation.prior import BASE_TURN, BASE_Y, BEND, BEVEL, CLEARANCE, RUN_OUT, unexplained
+from flexneedle.mechanics import needle as nd
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import Sample
+from identified import (
+    CELLS,
+    NEEDLES,
+    OWN,
+    PHANTOM,
+    QUIET,
+    SHIFT,
+    Needle,
+    commands,
+    followed,
+    off_the_prior,
+    predicted,
+    readings,
+    stepped,
+)
+from tasks import begun_with
+
+# ---- its derivatives
+
+
+def finely(belief):
+    """The same with all its derivatives simulated now, on a grid so fine that nothing is lost between its points."""
+    grid = np.arange(belief.grid[0], belief.grid[-1], 0.05)
+    size = belief.parameters.size
+    return replace(belief, grid=grid, curves=np.zeros((size, grid.size)))._differentiated(range(size))
+
+
+def test_derivatives_agree_with_central_differences():
+    """Of the readings, by every parameter, at parameters off the prior; closely with small steps."""
+    belief, seen = off_the_prior()
+    fine = replace(belief, prior=replace(belief.prior, steps=1e-3 * belief.prior.steps))
+    jacobian, close = idn._jacobian(finely(belief), seen), idn._jacobian(finely(fine), seen)
+    assert jacobian.shape == (seen.y.size, belief.parameters.size)
+    for k in range(CELLS + 12):
+        step = np.zeros(belief.parameters.size)
+        step[k] = 1e-3 * belief.prior.steps[k]
+        rows = commands(55)
+        ends = (predicted(belief.parameters + s * step, rows, seen, belief.axial) for s in (1.0, -1.0))
+        central = np.subtract(*ends) / (2.0 * step[k])
+        scale = np.abs(central).max()
+        np.testing.assert_allclose(close[:, k], central, atol=6e-3 * scale + 1e-7)
+        # Half a step of a boundary may lie across the middle of a contact's interval, where the slope jumps;
+        # of the clearance, across where the needle leaves a wall.
+        off = 0.25 if SHIFT <= k < CELLS or k == CLEARANCE else 0.03
+        assert np.linalg.norm(jacobian[:, k] - central) <= off * np.linalg.norm(central) + 1e-6
+    deepest = belief.tips[:, 0].max()
+    np.testing.assert_array_equal(jacobian[:, CELLS + int(deepest // 2.5) + 1 :], 0.0)
+
+
+def test_a_fresh_curve_is_the_difference_of_two_whole_insertions():
+    """Those of the last period, over the depth passed and a few steps ahead."""
+    estimate, _ = followed(NEEDLES["all"], 50)
+    assert len(estimate.perturbed) > 3
+    forward = [(1.0, 0.0, 0.0, 0.0, -1)] * 4
+    rows = [*commands(50), *forward]
+
+    def lateral(parameters):
+        return np.array([state.tip for state in stepped(parameters, rows, estimate.axial)])
+
+    base = lateral(estimate.parameters)
+    depth = np.maximum.accumulate(base[:, 0])
+    passed = (estimate.grid > depth[0]) & (estimate.grid < depth[-1])
+    for one in estimate.perturbed:
+        k, step = one.parameter, estimate.prior.steps[one.parameter]
+        parameters = estimate.parameters.copy()
+        parameters[k] += step
+        difference = (lateral(parameters)[:, 1] - base[:, 1]) / step
+        expected = np.interp(estimate.grid[passed], depth, difference)
+        np.testing.assert_allclose(estimate.curves[k][passed], expected, rtol=1e-5, atol=2e-5)
+        assert one.step == step
+
+
+def test_no_derivative_is_older_than_a_round():
+    """All are simulated anew within it, those of start, needle and guide more often."""
+    rows, states = commands(40), Needle().inserted(PHANTOM, commands(40))
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
+    last, leading = {}, (BASE_Y, BASE_TURN, BEND, BEVEL, CLEARANCE)
+    for k, row in enumerate(rows):
+        batch = readings(Needle(), states[k], states[k + 1], k, 2, 0.0, np.random.default_rng(0))
+        estimate = estimate.move(row, k, k + 1.0).observe(batch)
+        last |= {one.parameter: k for one in estimate.perturbed}
+    everyone = set(range(estimate.parameters.size)) - {RUN_OUT}
+    assert set(last) == everyone
+    assert min(last.values()) > len(rows) - 1 - idn._ROUND
+    assert min(last[k] for k in leading) > len(rows) - 1 - idn._LEADING_ROUND
+    assert len(estimate.perturbed) < 0.5 * len(everyone)
+
+
+def test_derivatives_from_the_stops_are_those_from_the_start():
+    """What is not simulated again does not depend on the parameter."""
+    belief, seen = off_the_prior(66)
+    assert len(belief.stops) > 4
+    whole = replace(belief, stops=belief.stops[:1])
+    again = replace(whole, prior=replace(belief.prior, begins=np.full_like(belief.prior.begins, -np.inf)))
+    jacobian = idn._jacobian(finely(belief), seen)
+    np.testing.assert_allclose(jacobian, idn._jacobian(finely(whole), seen), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(jacobian, idn._jacobian(finely(again), seen), rtol=1e-6, atol=1e-6)
+    assert np.abs(jacobian[:, CELLS + 12]).max() > 1e-4
+
+
+def test_the_stops_are_states_of_the_way():
+    """Bit for bit those of stepping, at the start, before the move into the tissue, and every eight moves in it."""
+    belief, _ = off_the_prior(60)
+    states = stepped(belief.parameters, commands(60), belief.axial)
+    assert [first for first, _ in belief.stops] == [0, 28, 36, 44, 52]
+    for first, state in belief.stops:
+        assert state == states[first]
+    np.testing.assert_array_equal(belief.tips, [state.tip for state in states])
+
+
+def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
+    """Least squares of readings and prior stacked, each over its standard deviation."""
+    belief, seen = off_the_prior(45, "bend")
+    y = belief.tips[:, 1]
+    bends = np.abs(np.diff(np.concatenate([y[:1], y, y[-1:]]), n=2))
+    chord = 0.25 * np.maximum(bends[seen.index], bends[seen.index + 1])
+    assert chord.max() > 0.01
+    jitter = QUIET.tracker.jitter_per_axis / np.sqrt(seen.count)
+    sd = np.sqrt(jitter**2 + unexplained(QUIET, belief.settings) ** 2 + chord**2)
+    prior = np.linalg.cholesky(belief.prior.precision).T
+    jacobian = idn._jacobian(belief, seen)
+    matrix = np.concatenate([jacobian / sd[:, None], prior])
+    missing = seen.y - predicted(belief.parameters, commands(45), seen, belief.axial)
+    right = np.concatenate([missing / sd, prior @ (belief.prior.mean - belief.parameters)])
+    step = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    assert (np.abs(step) > 1e-4).sum() > 10
+    found = idn._improved(belief, seen).parameters
+    np.testing.assert_allclose(found, belief.parameters + step, rtol=1e-6, atol=1e-8)
+
+
+def misfit(belief, readings, before):
+    """What the fit makes least: squares over variances, halved; the variances are those of the estimate `before`."""
+    variance = belief.variance(readings) + readings.bent(before.tips[:, 1]) ** 2
+    off = belief.parameters - belief.prior.mean
+    rows, p = np.array([done.applied for done in belief.moves]), belief.parameters
+    y = belief.tips[:, 1]
+    y = y[readings.index] + readings.part * (y[readings.index + 1] - y[readings.index])
+    first = belief.stops[0][1].bevel
+    sides = first * np.cumprod(np.where(rows[:, 4] > 0.0, -1.0, 1.0))[readings.index]
+    left = readings.y - y - p[RUN_OUT] * sides
+    return 0.5 * (left**2 / variance).sum() + 0.5 * off @ belief.prior.precision @ off
+
+
+KNOWN = {"control.start_axial_sd_mm": 0.0}
+
+
+def test_a_step_never_fits_worse(monkeypatch):
+    """Over whole insertions, one with readings that jump from side to side; the start along the axis is known.
+
+    The first fit is left out: it takes up the clearance, which the start has not.
+    """
+    costs, tried, improved, with_ = [], [], idn._improved, idn.Identified._with
+
+    def spied(belief, seen):
+        tried.append(0)
+        fitted = improved(belief, seen)
+        if len(belief.moves) > 1:
+            costs.append((misfit(belief, seen, belief), misfit(fitted, seen, belief)))
+        return fitted
+
+    def counted(belief, parameters):
+        tried[-1] += 1
+        return with_(belief, parameters)
+
+    monkeypatch.setattr(idn, "_improved", spied)
+    monkeypatch.setattr(idn.Identified, "_with", counted)
+    for scenario, jump in ((PHANTOM, 1.0), (QUIET, 0.1)):
+        estimate, states = (
+            Identification().begin(begun_with(Simulator(scenario.with_values(KNOWN), 1), 1)),
+            Needle().inserted(scenario, commands(50)),
+        )
+        for k, row in enumerate(commands(50)):
+            x, y = states[k + 1].tip[:2].tolist()
+            off = jump * (-1) ** (k // 5)
+            estimate = estimate.move(row, k, k + 1.0).observe([Sample(k + 1.0, x, y + off)])
+    before, after = np.array(costs).T
+    assert (after <= before * (1.0 + 1e-8)).all()
+    assert len(set(tried)) >= 3
+    assert sum(tried) < 4 * len(tried)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 1e-3])
+def test_a_wrong_step_is_not_taken(monkeypatch, factor):
+    """A Jacobian that leads to a step the other way, or far too far: no parameter moves for the worse."""
+    belief, seen = off_the_prior(45)
+    jacobian = idn._jacobian
+    monkeypatch.setattr(idn, "_jacobian", lambda *args: factor * jacobian(*args))
+    fitted = idn._improved(belief, seen)
+    assert misfit(fitted, seen, belief) <= misfit(belief, seen, belief) * (1.0 + 1e-12)
+
+
+def spoilt(belief):
+    return replace(belief, tips=np.full_like(belief.tips, np.nan))
+
+
+def test_a_trial_step_that_ends_in_nan_is_refused(monkeypatch):
+    belief, seen = off_the_prior(45)
+    with_, tried = idn.Identified._with, []
+
+    def failing(self, parameters):
+        tried.append(parameters)
+        other = with_(self, parameters)
+        return spoilt(other) if len(tried) <= 2 else other
+
+    monkeypatch.setattr(idn.Identified, "_with", failing)
+    fitted = idn._improved(belief, seen)
+    assert len(tried) >= 3
+    assert np.isfinite(fitted.tips).all()
+    assert misfit(fitted, seen, belief) <= misfit(belief, seen, belief)
+
+
+def test_if_no_trial_step_can_be_had_the_parameters_stay(monkeypatch):
+    belief, seen = off_the_prior(45)
+    with_ = idn.Identified._with
+
+    def failing(self, parameters):
+        other = with_(self, parameters)
+        return other if np.array_equal(parameters, belief.parameters) else spoilt(other)
+
+    monkeypatch.setattr(idn.Identified, "_with", failing)
+    fitted = idn._improved(belief, seen)
+    np.testing.assert_array_equal(fitted.parameters, belief.parameters)
+    np.testing.assert_array_equal(fitted.tips, belief.tips)
+
+
+def test_a_trial_step_that_does_not_converge_is_refused(monkeypatch):
+    belief, seen = off_the_prior(45)
+    with_ = idn.Identified._with
+
+    def failing(self, parameters):
+        other = with_(self, parameters)
+        if np.array_equal(parameters, belief.parameters):
+            return other
+        scalars = other.state.scalars.copy()
+        scalars[nd.CONVERGED] = 0.0
+        return replace(other, state=replace(other.state, scalars=scalars))
+
+    monkeypatch.setattr(idn.Identified, "_with", failing)
+    assert idn._improved(belief, seen).state.converged
+
+
+def test_a_jacobian_that_is_not_finite_leaves_the_parameters(monkeypatch):
+    belief, seen = off_the_prior(45)
+    monkeypatch.setattr(idn, "_jacobian", lambda *_: np.full((seen.y.size, belief.parameters.size), np.nan))
+    np.testing.assert_array_equal(idn._improved(belief, seen).parameters, belief.parameters)
+
+
+def test_readings_of_a_move_are_averaged_at_their_mean_time():
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
+    for k in range(2):
+        estimate = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 2.0 * k, 2.0 * k + 2.0)
+    seen = [Sample(2.5, -27.3, 0.1), Sample(3.5, -26.7, 0.3)]
+    means = estimate.observe(seen)._readings
+    assert (means.index.tolist(), means.count.tolist()) == ([1], [2.0])
+    assert (means.part[0], means.x[0], means.y[0]) == pytest.approx((0.5, -27.0, 0.2))
+    np.testing.assert_allclose(means.between(np.array([0.0, 10.0, 20.0])), [15.0])
+
+
+@pytest.mark.parametrize("first", [1, -1])
+def test_a_reading_is_on_the_side_to_which_the_bevel_turned_before_its_move(first):
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), first))
+    for k, flip in enumerate((-1, 1, -1, 1, -1)):
+        estimate = estimate.move((1.0, 0.0, 0.0, 0.0, flip), float(k), k + 1.0)
+    seen = [Sample(k + 0.5, -28.0 + k, 0.0) for k in (0, 1, 3, 4)]
+    means = estimate.observe(seen)._readings
+    np.testing.assert_array_equal(means.index, [0, 1, 3, 4])
+    np.testing.assert_array_equal(means.sides, np.multiply(first, [1, -1, 1, 1]))
+
+
+def test_the_low_pass_follows_the_newest_and_forgets():
+    gain = OWN.residual_gain
+    assert idn._low_passed(OWN, np.array([1.0])) == pytest.approx(gain)
+    assert idn._low_passed(OWN, np.array([1.0, 0.0])) == pytest.approx(gain * (1.0 - gain))
+    assert idn._low_passed(OWN, np.full(200, 0.3)) == pytest.approx(0.3, rel=0.01)
+    assert idn._low_passed(OWN, np.zeros(0)) == 0.0
+
+
+# ---- what is left uncertain
+
+
+def prior_sd_of_the_tip(estimate):
+    """Standard deviation (mm) of the tip's lateral position at the start: each parameter moved on its own, by hand."""
+    prior = estimate.prior
+    slope = np.zeros(prior.mean.size)
+    start = stepped(prior.mean, [])[0].tip[1]
+    for k in range(prior.mean.size):
+        parameters = prior.mean.copy()
+        parameters[k] += prior.steps[k]
+        slope[k] = (stepped(parameters, [])[0].tip[1] - start) / prior.steps[k]
+    slope[RUN_OUT] = estimate.state.bevel
+    return float(np.sqrt(slope @ np.linalg.solve(prior.precision, slope)))
+
+
+def test_before_any_reading_the_tip_is_as_uncertain_as_the_prior_says():
+    """Across, and along the axis."""
+    estimate = Identification().begin(begun_with(Simulator(QUIET, 1), 1))
+    across = prior_sd_of_the_tip(estimate)
+    assert across > 0.1
+    assert estimate.tip_sd == pytest.approx(np.hypot(across, QUIET.control.start_axial_sd_mm), rel=1e-3)
+    np.testing.assert_allclose(estimate.covariance, np.linalg.inv(estimate.prior.precision))
+
+
+def test_readings_leave_nothing_more_uncertain():
+    """The covariance is below the prior's in every direction, and far below it at the end."""
+    rows, needle = commands(60), NEEDLES["all"]
+    states = needle.inserted(PHANTOM, rows)
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
+    volumes, prior = [], np.linalg.inv(estimate.prior.precision)
+    for k, row in enumerate(rows):
+        batch = readings(needle, states[k], states[k + 1], k, 4, 0.0, np.random.default_rng(0))
+        estimate = estimate.move(row, k, k + 1.0).observe(batch)
+        volumes.append(np.linalg.slogdet(estimate.covariance)[1])
+        assert np.linalg.eigvalsh(prior - estimate.covariance).min() > -1e-9
+    assert volumes[0] < np.linalg.slogdet(prior)[1]
+    assert volumes[-1] < volumes[len(volumes) // 2] < volumes[0]
+
+
+def test_readings_make_the_next_one_less_uncertain():
+    start = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
+    few, many = (followed(Needle(), count, scenario=PHANTOM)[0] for count in (2, 20))
+    assert start.tip_sd > few.tip_sd > many.tip_sd > 0.0

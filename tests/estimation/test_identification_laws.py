@@ -1,0 +1,190 @@
+"""The observer that fits the model: what holds whatever the readings, late, mirrored, far off or none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flexneedle.estimation.identification import Identification
+from flexneedle.estimation.prior import (
+    BASE_TURN,
+    BASE_Y,
+    BEND,
+    BEVEL,
+    CLEARANCE,
+    MODULUS,
+    RUN_OUT,
+    unexplained,
+)
+from flexneedle.mechanics.model import Learnt
+from flexneedle.simulator.control import Control
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import Sample
+from identified import (
+    CELLS,
+    NEEDLES,
+    OWN,
+    PHANTOM,
+    QUIET,
+    SHIFT,
+    TIGHT,
+    Needle,
+    commands,
+    followed,
+    learnt_of,
+    readings,
+    stepped,
+)
+from tasks import begun_with
+
+
+@pytest.mark.parametrize("off", [1.9, -1.9])
+def test_parameters_stay_within_four_standard_deviations(off):
+    """Readings far off laterally, in air and in tissue, and a solve that still converges."""
+    rows = commands(50)
+    states = Needle().inserted(PHANTOM, rows)
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
+    for k, row in enumerate(rows):
+        estimate = estimate.move(row, k, k + 1.0)
+        x, y = states[k + 1].tip[:2]
+        estimate = estimate.observe([Sample(k + 1.0, float(x), float(y) + off * (-1) ** (k // 10))])
+        found = estimate.parameters
+        assert abs(found[BASE_Y]) <= 4.0 * 0.5 + 1e-12
+        assert abs(found[BASE_TURN]) <= 4.0 * 3e-3 + 1e-12
+        assert abs(found[BEND]) <= 4.0 * OWN.bend_sd_mm + 1e-12
+        assert abs(found[RUN_OUT]) <= 4.0 * OWN.run_out_sd_mm + 1e-12
+        assert 0.0 <= found[CLEARANCE] <= OWN.clearance_mm + 4.0 * OWN.clearance_sd_mm + 1e-12
+        assert np.abs(found[MODULUS:SHIFT]).max() <= 4.0 * OWN.modulus_log_sd + 1e-12
+        assert np.abs(found[SHIFT:CELLS]).max() <= 4.0 * OWN.boundary_sd_mm + 1e-12
+        assert np.abs(found[CELLS:]).max() <= 4.0 * OWN.variation_sd + 1e-12
+        # An offset of 0.7 of the compression length is the furthest that a scenario may ask for.
+        assert 0.0 <= found[BEVEL] * 4.0 <= 0.7 * 20.0
+        assert estimate.state.converged
+        assert np.isfinite(estimate.tip).all()
+
+
+def test_mirrored_readings_give_the_mirrored_estimate():
+    needle, rows = NEEDLES["all"], commands(45)
+    states = needle.inserted(PHANTOM, rows)
+    here, there = (Identification().begin(begun_with(Simulator(PHANTOM, 1), side)) for side in (1, -1))
+    for k, row in enumerate(rows):
+        away = (*row[:3], -row[3], row[4])
+        batch = readings(needle, states[k], states[k + 1], k, 2, 0.0, np.random.default_rng(0))
+        here = here.move(row, k, k + 1.0).observe(batch)
+        there = there.move(away, k, k + 1.0).observe([replace(s, y=-s.y) for s in batch])
+    np.testing.assert_allclose(there.tip, here.tip * [1.0, -1.0, -1.0], atol=1e-6)
+    turned = np.where(np.isin(np.arange(here.parameters.size), (BASE_Y, BASE_TURN)), -1.0, 1.0)
+    np.testing.assert_allclose(there.parameters, turned * here.parameters, atol=1e-4)
+
+
+def test_a_turn_of_the_bevel_turns_bend_and_run_out_over():
+    """In air: an estimated bend of the free needle and a run-out show on the other side."""
+    scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
+    simulator = Simulator(scenario, 1)
+    estimate = Identification().begin(begun_with(simulator, 1))
+    parameters = estimate.parameters.copy()
+    parameters[[BEND, RUN_OUT]] = 0.6, 0.1
+    adapted = simulator.adapted(Learnt(np.zeros(1), np.ones(2), bend=0.6))
+    state = adapted.step(simulator.start(), Control())
+    bent = replace(estimate, simulator=adapted, state=state, parameters=parameters)
+    assert bent.tip[1] == pytest.approx(0.7, abs=1e-4)  # the bend shortens the needle a little
+    turned = bent.move((0.1, 0.0, 0.0, 0.0, 1), 0.0, 1.0)
+    np.testing.assert_allclose(turned.tip[1:], -bent.tip[1:], atol=1e-9)
+    assert bent.off_axis(-1) == pytest.approx(-bent.off_axis(1))
+    left = replace(bent, residual=0.03)
+    assert (left.off_axis(1), left.off_axis(-1)) == pytest.approx((0.13, -0.07))
+
+
+def test_a_bevel_turns_before_its_move_and_so_does_the_run_out():
+    """A needle that is known, run-out included, is still known after readings in the midst of a turn's move."""
+    needle = replace(NEEDLES["run-out"], clearance=0.0)
+    estimate, _ = followed(needle, 20, scenario=TIGHT)
+    assert commands(21)[20][4] == 1
+    before, after = needle.inserted(TIGHT, commands(21))[20:22]
+    moved = estimate.move(commands(21)[20], 20.0, 21.0)
+    assert moved.tip[1] == pytest.approx(needle.seen(after)[1], abs=2e-3)
+    corrected = moved.observe(readings(needle, before, after, 20, 4, 0.0, np.random.default_rng(0)))
+    assert corrected.tip[1] == pytest.approx(needle.seen(after)[1], abs=2e-3)
+    assert corrected.parameters[RUN_OUT] == pytest.approx(-0.15, abs=0.01)
+
+
+def test_where_the_tip_was_is_on_the_side_of_the_bevel_then():
+    """A turn is made as its move begins."""
+    needle = NEEDLES["run-out"]
+    estimate, states = followed(needle, 24)
+    out = float(estimate.parameters[RUN_OUT])
+    for time, flips in ((19.5, 0), (20.0, 0), (20.01, 1), (20.5, 1), (21.0, 1), (23.5, 1)):
+        whole, part = int(time), time - int(time)
+        axis = (1.0 - part) * estimate.tips[whole] + part * estimate.tips[min(24, whole + 1)]
+        assert estimate.tip_at(time) == pytest.approx((axis[0], axis[1] + out * (-1) ** flips), abs=1e-9)
+    assert estimate.tip_at(24.0) == pytest.approx(tuple(estimate.tip[:2]), abs=1e-12)
+    assert states[-1].bevel == -1
+
+
+@pytest.mark.usefixtures("all_fresh")
+@pytest.mark.parametrize("late", [1, 3])
+def test_late_readings_lead_to_the_same_estimate(late):
+    """The fit takes all readings at once, so only the number of its steps differs."""
+    needle = replace(NEEDLES["all"], variation=(1.0,))
+    in_time, _ = followed(needle, 50)
+    behind, states = followed(needle, 50, late=late)
+    np.testing.assert_allclose(behind.tip[1:], in_time.tip[1:], atol=unexplained(QUIET, OWN))
+    assert behind.tip[1] == pytest.approx(needle.seen(states[-1])[1], abs=0.01)
+    assert len(behind.moves) == 50
+
+
+def test_the_belief_now_is_the_fitted_insertion_carried_out_again():
+    """Bit for bit: base at the start, and each step with the needle and tissue that were fitted."""
+    estimate, _ = followed(NEEDLES["all"], 45)
+    states = stepped(estimate.parameters, commands(45), estimate.axial)
+    assert states[-1] == estimate.state
+    np.testing.assert_array_equal(estimate.tips, [state.tip for state in states])
+    now = Simulator(QUIET, 1).adapted(learnt_of(estimate.parameters))
+    forward = Control(db_x=1.0)
+    assert estimate.simulator.step(states[-1], forward) == now.step(states[-1], forward)
+
+
+@pytest.mark.usefixtures("all_fresh")
+def test_innovation_and_measured_tip_are_those_of_the_newest_reading():
+    needle = NEEDLES["run-out"]
+    estimate, _ = followed(needle, 45)
+    moved = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 45.0, 46.0)
+    x, y = np.add(moved.tip[:2], [0.01, 0.002])
+    seen = moved.observe([Sample(46.0, float(x), float(y))])
+    assert seen.measured == pytest.approx((x, y), abs=1e-9)
+    assert seen.innovation[0] == pytest.approx(0.01, abs=2e-3)
+    assert abs(seen.innovation[1]) < 0.002
+    assert seen.tip_at(46.0) == pytest.approx(tuple(seen.tip[:2]), abs=1e-12)
+    assert seen.unseen().innovation == (0.0, 0.0)
+
+
+def test_in_air_nothing_is_left_over():
+    estimate, _ = followed(Needle(base_y=0.3), 20, noise=0.05)
+    assert estimate.residual == 0.0
+
+
+def test_without_readings_or_moves_the_estimate_stays():
+    estimate, _ = followed(NEEDLES["bend"], 30)
+    moved = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 30.0, 31.0)
+    for kept in (moved.observe([]), moved.unseen()):
+        assert kept.state is moved.state
+        assert kept.parameters is moved.parameters
+        assert kept.innovation == (0.0, 0.0)
+    start = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
+    assert start.observe([Sample(0.0, -28.5, 0.4)]).state == start.state
+
+
+def test_observing_changes_nothing_of_the_old_belief_and_threads_nothing_of_the_new():
+    needle = NEEDLES["all"]
+    one, _ = followed(needle, 45, threads=1)
+    many, _ = followed(needle, 45, threads=4)
+    np.testing.assert_array_equal(one.parameters, many.parameters)
+    assert one.state == many.state
+    before = one.parameters.copy(), one.tips.copy(), one.state.scalars.copy(), one.moves
+    moved = one.move((1.0, 0.0, 0.0, 0.1, -1), 45.0, 46.0)
+    here, again = (moved.observe([Sample(46.0, 17.5, 1.0)]) for _ in range(2))
+    np.testing.assert_array_equal(here.parameters, again.parameters)
+    after = one.parameters, one.tips, one.state.scalars
+    for kept, now in zip(before[:3], after, strict=True):
+        np.testing.assert_array_equal(kept, now)
+    assert one.moves is before[3]

@@ -1,0 +1,447 @@
+"""The observer: what it learns from readings, in air and in tissue, late or in time; its prediction has no offset."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.control.methods import METHODS
+from flexneedle.estimation.estimate import Move, along, place
+from flexneedle.estimation.observer import Beliefs
+from flexneedle.simulator.control import Control
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import Sample
+from tasks import begun_with
+
+PHANTOM = flexneedle.load_scenario("phantom")
+QUIET = PHANTOM.with_values({"tracker.jitter_mm": 1e-3})
+AHEAD = (1.0, 0.0, 0.0, 0.0, -1)
+
+
+def start_with(scenario, **corrections):
+    """A needle in air whose base isn't where the model has it."""
+    simulator = Simulator(scenario)
+    return simulator.step(simulator.start().with_estimate(**corrections), Control())
+
+
+def begun(simulator, state=None, bevel=1, **beliefs):
+    """The estimate at the start, or at a state."""
+    estimate = Beliefs(**beliefs).begin(begun_with(simulator, bevel))
+    return estimate if state is None else replace(estimate, state=state, past=state, tips=state.tip[None])
+
+
+def in_tissue(simulator, steps=40):
+    """A needle that went straight in."""
+    state = simulator.start()
+    for _ in range(steps):
+        state = simulator.step(state, Control(db_x=1.0))
+    return state
+
+
+def samples_between(before, after, start=0.0, count=4):
+    """Exact readings of the tip during a period of one second."""
+    parts = (np.arange(count) + 1) / count
+    points = before.tip[:2] + parts[:, None] * (after.tip[:2] - before.tip[:2])
+    return [Sample(float(start + t), float(x), float(y)) for t, (x, y) in zip(parts, points, strict=True)]
+
+
+def follow(truth, estimate, plant, steps, *, noise=0.0, force=0.0, guide=0.0):
+    """Advance plant and estimate together; the estimates, and the innovations of each period."""
+    rng = np.random.default_rng(0)
+    command = (*AHEAD[:3], guide, AHEAD[4])
+    seen = []
+    for k in range(steps):
+        before, truth = truth, plant.step(truth.with_estimate(tip_load=force), Control.from_row(command))
+        readings = [replace(s, y=s.y + rng.normal(0.0, noise)) for s in samples_between(before, truth, k)]
+        estimate = estimate.move(command, k, k + 1.0).observe(readings)
+        seen.append(estimate.innovation)
+    return truth, estimate, np.array(seen)
+
+
+def test_it_begins_with_a_straight_start_with_the_prior_of_the_scenario():
+    estimate = begun(Simulator(PHANTOM), bevel=-1)
+    np.testing.assert_array_equal(estimate.tip, [-28.5, 0.0, 0.0])
+    assert estimate.state.bevel == -1
+    np.testing.assert_allclose(estimate.covariance, np.diag([0.5**2, 0.003**2]))
+    assert estimate.innovation == (0.0, 0.0)
+    assert estimate.measured is None
+
+
+def test_a_move_moves_the_needle_as_the_driver_did():
+    simulator = Simulator(PHANTOM)
+    estimate = begun(simulator)
+    moved = estimate.move((0.7, 0.0, 0.0, 0.2, 1), 0.0, 1.0)
+    assert moved.state == simulator.step(estimate.state, Control(db_x=0.7, dg_y=0.2, flip=True))
+    np.testing.assert_array_equal(moved.tip, moved.state.tip)
+
+
+@pytest.mark.parametrize(("base_y", "base_turn"), [(0.6, 0.0), (0.0, 0.004), (-0.5, 0.003)])
+def test_in_air_the_tip_effect_of_base_offset_and_slope_is_recovered(base_y, base_turn):
+    """Guide at rest: the tip shows one combination of the two, and that is what the path needs."""
+    simulator, plant = Simulator(QUIET), Simulator(QUIET)
+    truth = start_with(QUIET, base_y=base_y, base_turn=base_turn)
+    assert abs(truth.tip[1]) > 0.01
+    truth, estimate, _ = follow(truth, begun(simulator), plant, 25)
+    np.testing.assert_allclose(estimate.tip[:2], truth.tip[:2], atol=2e-3)
+    np.testing.assert_allclose(estimate.tip[2], truth.tip[2], atol=1e-4)
+    assert estimate.state.tip_load == 0.0
+
+
+def test_in_air_it_still_predicts_well_as_the_needle_goes_in():
+    """What was estimated in air holds 10 mm deep without any further reading."""
+    simulator = Simulator(QUIET)
+    truth, estimate, _ = follow(start_with(QUIET, base_y=0.6), begun(simulator), simulator, 28)
+    assert truth.tip[0] < 0.0
+    state, naive = estimate.state, Simulator(QUIET).start()
+    for _ in range(28):
+        naive = simulator.step(naive, Control(db_x=1.0))
+    for _ in range(10):
+        truth, state, naive = (simulator.step(s, Control(db_x=1.0)) for s in (truth, state, naive))
+    assert abs(state.tip[1] - truth.tip[1]) < 0.1 * abs(naive.tip[1] - truth.tip[1])
+
+
+def test_fit_in_air_is_the_least_squares_solution_with_the_prior():
+    """Against the normal equations of all periods at once, on a needle whose tip is linear in the base."""
+    simulator, noise = Simulator(PHANTOM), PHANTOM.tracker.jitter_per_axis
+    truth, estimate = start_with(PHANTOM, base_y=0.7, base_turn=-0.002), begun(simulator)
+    information, moment = np.diag([0.5**-2, 0.003**-2]), np.zeros(2)
+    straight = simulator.start()
+    for k in range(6):
+        truth = simulator.step(truth, Control(db_x=1.0))
+        straight = simulator.step(straight, Control(db_x=1.0))
+        shifts = [{"base_y": 0.1}, {"base_turn": 1e-3}]
+        h = [
+            (simulator.step(straight.with_estimate(**shift), Control()).tip[1] - straight.tip[1])
+            / (0.1, 1e-3)[i]
+            for i, shift in enumerate(shifts)
+        ]
+        reading = truth.tip[1] + 0.02 * (-1) ** k
+        information += np.outer(h, h) / (noise**2 / 2)
+        moment += np.array(h) * reading / (noise**2 / 2)
+        readings = [
+            Sample(k + 1.0, float(truth.tip[0]), float(reading))
+        ] * 2  # at the end, so two of variance σ²
+        estimate = estimate.move(AHEAD, k, k + 1.0).observe(readings)
+    np.testing.assert_allclose(estimate.state.base[1:], np.linalg.solve(information, moment), rtol=2e-3)
+    np.testing.assert_allclose(estimate.covariance, np.linalg.inv(information), rtol=2e-3)
+
+
+@pytest.mark.parametrize("load", [0.003, -0.003])
+def test_in_tissue_the_prediction_has_no_offset_under_a_constant_disturbance(load):
+    """A force on the tip that the model lacks: its prediction errs at first and no more at the end."""
+    simulator = Simulator(QUIET)
+    state = in_tissue(simulator)
+    _, estimate, seen = follow(state, begun(simulator, state), simulator, 30, force=load)
+    assert abs(seen[0, 1]) > 5e-3
+    assert np.abs(seen[-5:, 1]).max() < 0.05 * abs(seen[0, 1])
+    assert estimate.state.tip_load == pytest.approx(load, rel=0.25)
+
+
+@pytest.mark.parametrize(("gain", "learns"), [(0.0, True), (0.3, False)])
+def test_without_learning_the_load_the_offset_stays(gain, learns):
+    """As in the paper: the measured tip is released in the prediction."""
+    simulator = Simulator(QUIET.with_values({"control.load_gain": gain}))
+    state = in_tissue(simulator)
+    begin = begun(simulator, state, learns_load=learns)
+    _, estimate, seen = follow(state, begin, simulator, 30, force=0.003)
+    assert estimate.state.tip_load == 0.0
+    assert np.abs(seen[-5:, 1]).min() > 0.3 * abs(seen[0, 1])
+
+
+def test_stiffer_tissue_than_estimated_leaves_next_to_no_offset():
+    """A disturbance that grows slowly as the needle goes in: a twentieth of what not learning leaves."""
+    left = []
+    for gain in (PHANTOM.control.load_gain, 0.0):
+        soft, stiff = (
+            QUIET.with_values({f"tissue.{k}.shear_modulus_kpa": mu for k in (0, 1)}) for mu in (2.0, 6.0)
+        )
+        simulator, plant = Simulator(soft.with_values({"control.load_gain": gain})), Simulator(stiff)
+        *_, seen = follow(plant.start(), begun(simulator), plant, 65, guide=0.02)
+        left.append(np.abs(seen[-10:, 1]).max())
+    assert left[0] < 0.2 * left[1]
+
+
+def test_load_takes_the_gain_times_the_reaction_and_the_tip_goes_where_it_was_seen():
+    simulator = Simulator(PHANTOM)
+    known = replace(begun(simulator, in_tissue(simulator).with_estimate(tip_load=0.001)), axial=0.0)
+    moved = known.move(AHEAD, 0.0, 1.0)
+    predicted = moved.state
+    x, y = predicted.tip[:2] + np.array([0.05, 0.3])
+    corrected = moved.observe([Sample(1.0, x, y)])
+    held = simulator.assimilate(predicted, (x, y)).state
+    expected = 0.001 + PHANTOM.control.load_gain * held.reactions.tip_force
+    assert held.reactions.tip_force > 1e-4
+    assert corrected.state.tip_load == pytest.approx(expected, rel=1e-12)
+    np.testing.assert_array_equal(corrected.tip, held.tip)
+    assert corrected.tip[1] == pytest.approx(y, abs=1e-9)
+    assert corrected.tip[0] == pytest.approx(predicted.tip[0], abs=0.02)  # axial motion isn't corrected
+    np.testing.assert_allclose(corrected.innovation, [0.05, 0.3], atol=1e-12)
+    np.testing.assert_allclose(corrected.measured, (x, y), atol=1e-12)
+
+
+@pytest.mark.parametrize("base_x", [2.0, -2.0])
+def test_the_start_along_the_axis_is_found_and_how_surely(base_x):
+    """The mean of all readings, weighed with the prior; the tip's own uncertainty shrinks with it."""
+    simulator = Simulator(PHANTOM)
+    start = simulator.start()
+    truth = start_with(PHANTOM, base_x=float(start.base[0]) + base_x)
+    estimate = begun(simulator)
+    sds = [estimate.tip_sd]
+    for k in range(10):
+        before, truth = truth, simulator.step(truth, Control(db_x=1.0))
+        estimate = estimate.move(AHEAD, k, k + 1.0).observe(samples_between(before, truth, k))
+        sds.append(estimate.tip_sd)
+    control, jitter = PHANTOM.control, PHANTOM.tracker.jitter_per_axis
+    precision = control.start_axial_sd_mm**-2.0 + 40.0 / jitter**2
+    assert estimate.axial == pytest.approx(1.0 / precision, rel=1e-6)
+    assert estimate.tip[0] == pytest.approx(truth.tip[0], abs=0.01)
+    assert estimate.state.travel[0] == pytest.approx(10.0)
+    assert (np.diff(sds) < 0.0).all()
+
+
+def test_the_next_reading_is_as_uncertain_as_the_path_since_the_last_one_is_long():
+    """From the skin by drift x², from a reading at s by drift (x² − s²), each beside what the start leaves."""
+    simulator = Simulator(PHANTOM)
+    estimate = replace(begun(simulator, in_tissue(simulator)), drift=0.01)
+    seen = estimate.move(AHEAD, 0.0, 1.0).observe(
+        [Sample(1.0, float(estimate.tip[0]) + 1.0, float(estimate.tip[1]))]
+    )
+    later = seen.move(AHEAD, 1.0, 2.0)
+    for one, since in [(estimate, 0.0), (later, seen.measured[0])]:
+        depth, start = float(one.tip[0]), replace(one, drift=0.0).tip_sd
+        assert depth > since + 0.5
+        assert one.tip_sd == pytest.approx(np.hypot(start, 0.01 * (depth**2 - since**2)))
+    assert later.tip_sd < estimate.tip_sd
+
+
+@pytest.mark.parametrize("axial", [0.0, 1.0])
+@pytest.mark.parametrize("off", [(0.4, 0.3), (-0.6, -0.2)])
+def test_a_contact_that_is_cut_is_on_the_measured_path_wherever_the_tip_is_along_the_axis(axial, off):
+    """The tip is where it was measured, and what the move cut rests on the line to it."""
+    simulator = Simulator(PHANTOM)
+    start = replace(begun(simulator, in_tissue(simulator)), axial=axial)
+    moved = start.move(AHEAD, 0.0, 1.0)
+    x, y = np.add(moved.tip[:2], off).tolist()
+    corrected = moved.observe([Sample(1.0, x, y)])
+    assert corrected.tip[1] == pytest.approx(y, abs=1e-9)
+    assert corrected.tip[0] == pytest.approx(moved.tip[0] + axial * off[0], abs=0.03)
+    before, after, contacts = start.tip, corrected.tip, corrected.state.contacts
+    fresh = contacts.x > before[0]
+    assert fresh.any()
+    line = before[1] + (contacts.x[fresh] - before[0]) / (after[0] - before[0]) * (after[1] - before[1])
+    np.testing.assert_allclose(contacts.rest_y[fresh], line, atol=1e-6)
+
+
+def test_innovations_of_a_period_are_averaged_at_the_times_of_the_readings():
+    """A tip that goes evenly and readings that are off by 0.1, 0.2 and 0.6: the innovation is 0.3."""
+    simulator = Simulator(PHANTOM)
+    estimate = begun(simulator, in_tissue(simulator))
+    predicted = estimate.move((1.0, 0.0, 0.0, 0.3, -1), 7.0, 9.0)
+    readings = []
+    for off, part in ((0.1, 0.25), (0.2, 0.5), (0.6, 1.0)):
+        x, y = estimate.tip[:2] + part * (predicted.tip[:2] - estimate.tip[:2])
+        readings.append(Sample(7.0 + 2.0 * part, float(x) - off, float(y) + off))
+    corrected = predicted.observe(readings)
+    np.testing.assert_allclose(corrected.innovation, [-0.3, 0.3], atol=1e-12)
+    assert corrected.tip[1] == pytest.approx(corrected.measured[1], abs=1e-9)
+    np.testing.assert_allclose(corrected.measured, np.add(predicted.tip[:2], [-0.3, 0.3]), atol=1e-12)
+
+
+@pytest.mark.parametrize(("time", "part"), [(7.0, 0.0), (7.5, 0.25), (9.0, 1.0), (6.0, 0.0), (11.0, 1.0)])
+def test_the_tip_moves_evenly_within_a_move_and_rests_outside(time, part):
+    tips = np.array([[10.0, 1.0, 0.3], [12.0, 0.0, 0.2]])
+    x, y = along((Move(7.0, 9.0, AHEAD),), tips, time)
+    assert (x, y) == pytest.approx((10.0 + 2.0 * part, 1.0 - part))
+    assert Move(7.0, 9.0, AHEAD).part(time) == pytest.approx(part)
+
+
+def test_the_tip_goes_from_move_to_move():
+    moves = Move(0.0, 1.0, AHEAD), Move(1.0, 3.0, AHEAD)
+    tips = np.array([[0.0, 0.0, 0.0], [1.0, 0.2, 0.0], [2.0, 0.0, 0.0]])
+    assert along(moves, tips, 0.5) == pytest.approx((0.5, 0.1))
+    assert along(moves, tips, 2.5) == pytest.approx((1.75, 0.05))
+    assert along((), tips[2:], 99.0) == (2.0, 0.0)
+    estimate = begun(Simulator(PHANTOM))
+    assert estimate.tip_at(3.0) == (-28.5, 0.0)
+    two = estimate.move(AHEAD, 0.0, 1.0).move(AHEAD, 1.0, 3.0)
+    assert two.tip_at(2.0) == pytest.approx((-27.0, 0.0))
+
+
+def test_a_move_without_duration_is_done_at_once():
+    assert Move(5.0, 5.0, AHEAD).part(5.0) == 1.0
+
+
+def test_more_readings_are_trusted_more():
+    """In air a period's correction grows with the number of its readings, as their mean is less noisy."""
+    simulator = Simulator(PHANTOM.with_values({"tracker.jitter_mm": 1.0}))
+    predicted = begun(simulator).move(AHEAD, 0.0, 1.0)
+    x, y = predicted.tip[:2] + np.array([0.0, 0.5])
+    tips = [predicted.observe([Sample(1.0, x, y)] * n).tip[1] for n in (1, 4, 16)]
+    assert all(0.0 < less < more < 0.5 for less, more in pairwise(tips))
+
+
+def test_an_empty_reading_is_refused():
+    moved = begun(Simulator(PHANTOM)).move(AHEAD, 0.0, 1.0)
+    with pytest.raises(ValueError, match="not sorted out"):
+        moved.observe([Sample(1.0, None, None)])
+    with pytest.raises(ValueError, match="not sorted out"):
+        place(Sample(1.0, 3.0, None))
+
+
+def test_without_fitting_the_start_the_measured_tip_is_held_in_air_too():
+    """As in the paper; the base is estimated where it was commanded."""
+    simulator = Simulator(PHANTOM)
+    predicted = begun(simulator, fits_start=False, learns_load=False).move(AHEAD, 0.0, 1.0)
+    x, y = predicted.tip[:2] + np.array([0.0, 0.5])
+    corrected = predicted.observe([Sample(1.0, x, y)])
+    assert corrected.tip[1] == pytest.approx(0.5, abs=1e-9)
+    np.testing.assert_array_equal(corrected.state.base[1:], 0.0)
+    assert corrected.move(AHEAD, 1.0, 2.0).tip[1] == pytest.approx(0.0, abs=1e-9)  # released
+
+
+@pytest.mark.parametrize(("name", "learns"), [("ce-mpc", False), ("resolved-rate", True)])
+def test_the_papers_controller_releases_the_measured_tip_and_learns_nothing(name, learns):
+    """In air no base offset, in tissue no load; the others keep both."""
+    simulator = Simulator(PHANTOM)
+    begin = METHODS[name].observer.begin(begun_with(simulator, 1, name))
+    for steps in (10, 40):
+        state = in_tissue(simulator, steps)
+        moved = replace(begin, state=state, past=state, tips=state.tip[None]).move(AHEAD, 0.0, 1.0)
+        x, y = np.add(moved.tip[:2], [0.0, 0.3])
+        seen = moved.observe([Sample(1.0, float(x), float(y))]).state
+        assert bool(seen.base[1] != 0.0 or seen.tip_load != 0.0) is learns
+
+
+def test_unseen_keeps_the_belief_and_has_no_innovation():
+    simulator = Simulator(PHANTOM)
+    moved = begun(simulator, in_tissue(simulator)).move(AHEAD, 0.0, 1.0)
+    seen = moved.observe([Sample(1.0, *(moved.tip[:2] + 0.1))])
+    assert seen.innovation != (0.0, 0.0)
+    assert seen.unseen().innovation == (0.0, 0.0)
+    assert seen.unseen().state is seen.state
+
+
+# ---- late readings
+
+GUIDE = (0.3, -0.2, 0.1, 0.25, -0.3, 0.2)
+COMMANDS = [(1.0, 0.0, 0.0, step, 1 if k == 2 else -1) for k, step in enumerate(GUIDE)]
+
+
+def gathered(estimate, late, *, readings):
+    """The estimate after all moves, readings a number of periods late; then the last ones at rest."""
+    for k, command in enumerate(COMMANDS):
+        estimate = estimate.move(command, k, k + 1.0)
+        if k >= late:
+            estimate = estimate.observe(readings[k - late])
+    for batch in readings[len(readings) - late :] if late else ():
+        estimate = estimate.observe(batch)
+    return estimate
+
+
+def noisy_readings(state, simulator, count, rng):
+    """Readings of each period of a needle under a load that the model lacks, and noise."""
+    batches = []
+    for k, command in enumerate(COMMANDS):
+        before, state = state, simulator.step(state.with_estimate(tip_load=0.002), Control.from_row(command))
+        batch = samples_between(before, state, k, count)
+        batches.append([replace(s, y=s.y + rng.normal(0.0, 0.05)) for s in batch])
+    return batches
+
+
+def assert_same_belief(one, other):
+    assert one.state == other.state
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+    assert one.innovation == other.innovation
+    assert one.measured == other.measured
+
+
+@pytest.mark.parametrize("late", [1, 2, 4])
+@pytest.mark.parametrize("count", [1, 4])
+@pytest.mark.parametrize("depth", [10, 26, 40])
+def test_late_readings_correct_as_if_they_had_come_in_time(depth, count, late):
+    """Bit for bit, in air, through the skin and in tissue, once they are all in."""
+    simulator = Simulator(PHANTOM)
+    state = in_tissue(simulator, depth)
+    readings = noisy_readings(state, simulator, count, np.random.default_rng(3))
+    in_time = gathered(begun(simulator, state), 0, readings=readings)
+    assert_same_belief(gathered(begun(simulator, state), late, readings=readings), in_time)
+
+
+@pytest.mark.parametrize("late", [1, 3])
+def test_the_estimate_before_late_readings_is_what_they_left_moved_on(late):
+    """The estimate now is the one corrected `late` periods ago, stepped through the moves since."""
+    simulator = Simulator(PHANTOM)
+    state = in_tissue(simulator, 36)
+    readings = noisy_readings(state, simulator, 4, np.random.default_rng(4))
+    in_time, behind = begun(simulator, state), begun(simulator, state)
+    for k, command in enumerate(COMMANDS):
+        behind = behind.move(command, k, k + 1.0)
+        if k < late:
+            continue
+        in_time = in_time.move(COMMANDS[k - late], k - late, k - late + 1.0).observe(readings[k - late])
+        behind = behind.observe(readings[k - late])
+        expected = in_time.state
+        for missed in COMMANDS[k - late + 1 : k + 1]:
+            expected = simulator.step(expected, Control.from_row(missed))
+        assert behind.state == expected
+        assert len(behind.moves) == late
+        np.testing.assert_array_equal(behind.tips[0], in_time.tip)
+        np.testing.assert_array_equal(behind.tips[-1], expected.tip)
+
+
+@pytest.mark.parametrize("depth", [10, 36])
+def test_readings_out_of_order_and_split_over_calls_count_the_same(depth):
+    simulator = Simulator(PHANTOM)
+    state = in_tissue(simulator, depth)
+    readings = noisy_readings(state, simulator, 4, np.random.default_rng(5))
+    estimate = begun(simulator, state)
+    for k in range(3):
+        estimate = estimate.move(COMMANDS[k], k, k + 1.0)
+    together = [sample for batch in readings[:3] for sample in batch]
+    whole = estimate.observe(together)
+    shuffled = [together[k] for k in (5, 0, 11, 3, 8, 1, 2, 10, 4, 9, 6, 7)]
+    mixed = estimate.observe(shuffled)
+    np.testing.assert_allclose(mixed.state.scalars, whole.state.scalars, rtol=1e-9, atol=1e-12)
+    split = estimate.observe(together[:2]).observe(together[2:7]).observe(together[7:])
+    np.testing.assert_allclose(split.state.scalars, whole.state.scalars, rtol=1e-9, atol=1e-12)
+    for other in (mixed, split):
+        np.testing.assert_allclose(other.covariance, whole.covariance, rtol=1e-9, atol=1e-12)
+    assert split.moves == whole.moves == ()
+
+
+def test_a_reading_belongs_to_the_move_in_which_it_was_taken():
+    """One at the end of a move to that move; one from before the start to the first, one from after to the last."""
+    simulator = Simulator(PHANTOM)
+    estimate = begun(simulator).move(AHEAD, 0.0, 1.0).move(AHEAD, 1.0, 2.0).move(AHEAD, 2.0, 3.0)
+    at = {time: Sample(time, -27.0, 0.01) for time in (-0.5, 0.4, 1.0)}
+    seen = estimate.observe([at[-0.5], at[0.4]])
+    assert [done.samples for done in seen.moves] == [(at[-0.5], at[0.4]), (), ()]
+    assert [done.ended for done in seen.observe([at[1.0]]).moves] == [2.0, 3.0]  # the first move is closed
+    late = Sample(7.0, -25.5, 0.0)
+    assert estimate.observe([late]).moves == ()
+
+
+def test_without_readings_nothing_is_corrected_and_moves_stay_open():
+    simulator = Simulator(PHANTOM)
+    estimate = begun(simulator, in_tissue(simulator))
+    moved = estimate.move(AHEAD, 0.0, 1.0).move(AHEAD, 1.0, 2.0)
+    seen = moved.observe([])
+    assert seen.state == moved.state
+    assert seen.past is estimate.past
+    assert len(seen.moves) == 2
+    np.testing.assert_array_equal(seen.tips, moved.tips)
+    assert seen.measured is None
+
+
+def test_observing_leaves_the_old_belief_as_it_was():
+    simulator = Simulator(PHANTOM)
+    moved = begun(simulator, in_tissue(simulator, 20)).move(AHEAD, 0.0, 1.0)
+    before = moved.tips.copy(), moved.covariance.copy(), moved.state.scalars.copy(), moved.moves
+    one, other = (moved.observe([Sample(1.0, -7.5, 0.2)]) for _ in range(2))
+    assert_same_belief(one, other)
+    now = moved.tips, moved.covariance, moved.state.scalars
+    for kept, there in zip(before, now, strict=False):
+        np.testing.assert_array_equal(kept, there)
+    assert moved.moves == before[3]

@@ -1,0 +1,78 @@
+"""docs/tracking/aurora.md says what there is."""
+
+import csv
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from flexneedle.cli.main import build_parser
+from flexneedle.rig.devices.aurora.readings import reading
+from flexneedle.rig.emulator.faults import KINDS, parse_fault
+
+PAGE = (Path(__file__).parents[3] / "docs" / "tracking" / "aurora.md").read_text()
+COMMANDS = [
+    line.removeprefix("flexneedle ").removesuffix(" &")
+    for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
+    for line in block.splitlines()
+    if line.startswith("flexneedle")
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_its_commands_can_be_given(command):
+    args = build_parser().parse_args(shlex.split(command))
+    assert callable(args.handler)
+    assert all(parse_fault(fault).kind in KINDS for fault in getattr(args, "fault", []))
+
+
+def test_its_table_has_every_fault():
+    told = re.findall(
+        r"`([a-z-]+)`", "".join(line.split("|")[1] for line in PAGE.splitlines() if "|" in line)
+    )
+    assert set(KINDS) <= set(told)
+
+
+def test_its_table_has_every_status():
+    pose = (1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 0.02)
+    cases = [(gone, 1 << bit | 1) for gone in (0, 1, 2) for bit in range(16)] + [(0, 0)]
+    statuses = {reading(gone, bits, pose).status for gone, bits in cases}
+    statuses |= {"stale", reading(0, 1, (0.0,) * 8).status}
+    assert [status for status in sorted(statuses) if f"`{status}`" not in PAGE] == []
+
+
+def test_its_grid_is_the_one_that_comes_along():
+    (grid,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
+    assert grid == (files("flexneedle.em.recording") / "grids" / "cube.toml").read_text()
+
+
+def test_its_session_without_hardware_ends_with_an_evaluation(tmp_path):
+    """Real processes: the emulator, the recording of a small grid, its evaluation."""
+    (script,) = re.findall(r"```bash\n(.*?)```", PAGE, re.DOTALL)
+    paths = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    subprocess.run(
+        ["bash", "-c", script],
+        cwd=tmp_path,
+        env={**os.environ, "PATH": paths},
+        check=True,
+        capture_output=True,
+        timeout=60,
+    )
+    with (tmp_path / "try-aurora" / "table.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 8 * 10
+    for row in rows:
+        x, y, z = (float(row[f"true_{axis}_mm"]) for axis in "xyz")
+        told = [float(row[f"{axis}_mm"]) for axis in "xyz"]
+        assert told == pytest.approx((y, z, x - 250.0), abs=0.5), "where the tip was told to rest"
+    result = json.loads((tmp_path / "try-aurora" / "result" / "evaluation.json").read_text())
+    (tip,) = result["results"]
+    assert (tip["n_points"], tip["n_samples"]) == (8, 80)
+    assert tip["rmse_mm"] < 0.07, "less than the jitter: means of ten samples after a fit"
+    assert tip["jitter_mm"] == pytest.approx(0.07, rel=0.3)

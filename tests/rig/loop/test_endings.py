@@ -1,0 +1,155 @@
+"""How an insertion ends but at its target, and drivers that do not carry out the command."""
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import flexneedle
+import flexneedle.control
+from flexneedle.control.methods import DEFAULT, METHODS, adaptive_mpc
+from flexneedle.errors import RunError
+from flexneedle.rig.virtual import Rig
+from flexneedle.simulator.state import State
+from flexneedle.types import Sample
+from insertions import (
+    PHANTOM,
+    STILL,
+    Stage,
+    Tank,
+    first_periods,
+    moving,
+    run,
+)
+
+
+def missing_by(plan, miss):
+    tips = plan.tips.copy()
+    tips[-1] = plan.target[0], plan.target[1] + miss, tips[-1, 2]
+    return replace(plan, tips=tips, limit="setup.max_guide_step_mm = 0.5")
+
+
+def test_a_plan_that_misses_by_more_than_a_millimetre_is_refused_unless_forced(plan):
+    tank = Tank(plan.bevel)
+    with pytest.raises(RunError, match=r"misses the target by 1\.01 mm .*bound by setup\.max_guide_step_mm"):
+        run(missing_by(plan, 1.01), tank.rig(), controller="open-loop")
+    assert tank.moves == []
+    with pytest.raises(RunError):
+        flexneedle.insert(PHANTOM, missing_by(plan, 1.01), seed=2001, controller="open-loop")
+    for miss, force in ((1.01, True), (0.99, False)):
+        rig = Tank(plan.bevel).rig()
+        assert first_periods(1, missing_by(plan, miss), rig, force=force, controller="open-loop")
+
+
+def test_a_controller_that_predicts_the_miss_is_held_by_that_and_not_by_the_plan(plan):
+    """The plan's miss is no evidence on the phantom's needle; the insertion finds whether it can be reached."""
+    assert METHODS[DEFAULT].predicts
+    assert not any(method.predicts for name, method in METHODS.items() if name != DEFAULT)
+    assert first_periods(1, missing_by(plan, 1.01), Tank(plan.bevel).rig())
+
+
+class Stuck(Stage):
+    """A driver that doesn't move, and a tracker that measures that."""
+
+    def __init__(self):
+        super().__init__([])
+
+    def apply(self, command, duration):
+        super().apply(command, duration)
+        return STILL
+
+    def read(self):
+        return (Sample(self.time, -28.5, 0.0),)
+
+
+def test_a_needle_that_does_not_move_fails_after_four_times_the_planned_periods(plan):
+    short = replace(plan, controls=plan.controls[:5], tips=plan.tips[:6], guide=plan.guide[:6])
+    done = run(short, Stuck().rig(), force=True)
+    assert done.outcome == "failed"
+    assert "four times the planned periods" in done.reason
+    assert len(done.periods) == 20
+    assert {period.applied for period in done.periods} == {STILL}
+    assert done.periods[0].command[0] > 0.0
+
+
+def test_a_model_that_does_not_converge_ends_the_run(plan, monkeypatch):
+    monkeypatch.setattr(State, "converged", property(lambda _: False))
+    done = run(plan, Tank(plan.bevel).rig())
+    assert done.outcome == "failed"
+    assert done.reason.startswith("the model did not converge")
+    assert len(done.periods) == 1
+    assert not done.periods[0].converged
+
+
+def test_where_no_path_converges_the_needle_is_held_for_that(plan, monkeypatch):
+    seen, calls = adaptive_mpc._seen, itertools.count()
+
+    def lost(fitted, controls):
+        outcome = seen(fitted, controls)
+        kept = next(calls) < 20
+        return outcome if kept else replace(outcome, converged=np.zeros_like(outcome.converged))
+
+    monkeypatch.setattr(adaptive_mpc, "_seen", lost)
+    done = run(plan, Tank(plan.bevel).rig(), controller=DEFAULT)
+    assert (done.outcome, done.reason) == ("held", "no path converges on the fitted model")
+    assert {period.applied for period in done.periods[-3:]} == {STILL}
+    assert done.periods[-1].decision == "held: no path converges on the fitted model"
+
+
+def test_a_plant_that_does_not_converge_is_said_in_its_periods(plan):
+    """It ends nothing, since a controller knows nothing of it; but no period of it passes as good."""
+    tank = Tank(plan.bevel)
+    lost_after = 1.0
+
+    def truth():
+        return tank.phantom.condition()._replace(converged=tank.phantom.now() < lost_after)
+
+    in_air = replace(plan, target=(-20.0, 0.0))
+    done = run(in_air, Rig(tank.phantom, tank, tank, truth), force=True)
+    assert done.outcome == "done"
+    assert [period.converged for period in done.periods] == [p.time < lost_after for p in done.periods]
+    assert {period.converged for period in done.periods} == {True, False}
+
+
+def test_the_end_of_the_stroke_ends_the_run_and_is_said(plan):
+    short = PHANTOM.with_values({"setup.stroke_mm": 60.0, "target.depth_mm": 20.0})
+    tank = Tank(plan.bevel, scenario=short)
+    done = run(plan, tank.rig(), short)
+    assert sum(command[0] for _, command in tank.moves) == pytest.approx(60.0, abs=0.01)
+    left = plan.target[0] - done.periods[-1].estimate[0]
+    assert done.reason.startswith(
+        f"the stroke ends {left:.2f} mm before the target depth; missed the target by "
+    )
+    assert not done.reached
+
+
+class Rounding(Tank):
+    """A driver with a resolution of 0.05 mm in the guide."""
+
+    def apply(self, command, duration):
+        rounded = (*command[:3], round(command[3] / 0.05) * 0.05, command[4])
+        return super().apply(rounded, duration)
+
+
+def test_the_command_as_applied_is_recorded_and_believed(plan):
+    known = PHANTOM.with_values({"phantom.start_axial_sd_mm": 0.0, "control.start_axial_sd_mm": 0.0})
+    tank = Rounding(plan.bevel, scenario=known)
+    done = run(plan, tank.rig(), known)
+    assert any(period.command[3] != period.applied[3] for period in done.periods)
+    applied = np.cumsum([period.applied[3] for period in done.periods])
+    np.testing.assert_allclose([period.guide for period in done.periods], applied, atol=1e-12)
+    advance = sum(period.applied[0] for period in done.periods)
+    assert done.periods[-1].base[0] == pytest.approx(PHANTOM.start_base_x + advance)
+    assert [period.applied for period in moving(done)] == tank.applied
+    assert done.outcome == "done"
+
+
+def test_without_a_truth_the_true_error_is_not_known(real, replayed):
+    assert math.isnan(replayed.true_error_mm)
+    assert not replayed.reached
+    assert {period.true_tip for period in replayed.periods} == {None}
+    assert {period.true_strain_energy for period in replayed.periods} == {None}
+    assert {period.true_stretch for period in replayed.periods} == {None}
+    assert replayed.residual_mm == real[0].residual_mm

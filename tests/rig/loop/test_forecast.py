@@ -1,0 +1,181 @@
+"""What the loop does with the miss that a decision predicts: it warns, holds, gives up with the reason; or force."""
+
+import csv
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.control.interface import Decision, Method
+from flexneedle.scenario.worlds import world
+from flexneedle.trace.columns import to_row
+from flexneedle.trace.export import write_csv
+from flexneedle.trace.reader import read_trace
+from flexneedle.trace.results import insertion_result
+from flexneedle.trace.writer import TraceWriter
+from insertions import PHANTOM, STILL, Tank, moving, run
+
+SECONDS = PHANTOM.control.hold_limit_s
+HELD = "held: no path to the target found"
+
+
+def predicting(misses, sd=0.1):
+    """A controller that goes straight on and predicts these misses (mm), the last one for good."""
+
+    def decide(_task, memory, _estimate, _rng):
+        miss = misses[min(memory, len(misses) - 1)]
+        return Decision((1.0, 0.0, 0.0, 0.0, -1), "straight on", miss=miss, miss_sd=sd), memory + 1
+
+    return Method("straight-on", "goes straight on", decide=decide, begin=lambda _task: 0)
+
+
+def in_air(plan):
+    """The plan with a target in air: quick, and nothing bends."""
+    return replace(plan, target=(-20.0, 0.0))
+
+
+def inserted(plan, misses, sd=0.1, *, force=True, scenario=PHANTOM):
+    """An insertion with such a controller; whole plans need no force."""
+    tank = Tank(plan.bevel, scenario=scenario)
+    return run(plan, tank.rig(), scenario, controller=predicting(misses, sd), force=force), tank
+
+
+def test_without_a_path_the_needle_is_held_and_given_up_with_the_reason(plan):
+    """It does not move from the first such decision on; the reason has the miss, the limit and the remedy."""
+    done, tank = inserted(plan, [0.0] * 5 + [3.0], force=False)
+    assert done.outcome == "held"
+    assert done.reason.startswith("no path to the target found: predicted miss +3.00 ± 0.10 mm is beyond")
+    assert "control.miss_limit_mm = 2 " in done.reason
+    assert done.reason.endswith("use --force to insert anyway")
+    assert done.summary.endswith(done.reason)
+    assert len(tank.moves) == 5
+    stopped = [period for period in done.periods if period.decision.startswith(HELD)]
+    assert [period.index for period in stopped] == list(range(5, 5 + len(stopped)))
+    assert {period.applied for period in stopped} == {period.command for period in stopped} == {STILL}
+    before = done.periods[4].time
+    assert done.periods[-1].time - before == pytest.approx(SECONDS, abs=2.0 * PHANTOM.tracker.period)
+    assert done.held_s == pytest.approx(done.periods[-1].time - before)
+
+
+def test_how_long_it_is_held_is_the_scenarios(plan):
+    patient = PHANTOM.with_values({"control.hold_limit_s": 2.5})
+    done, _ = inserted(plan, [3.0], force=False, scenario=patient)
+    assert done.periods[-1].time == pytest.approx(2.5, abs=2.0 * PHANTOM.tracker.period)
+    assert done.outcome == "held"
+
+
+def test_with_a_path_again_it_goes_on(plan):
+    """Held for less than the limit; the next doubt has the whole limit again."""
+    misses = [0.0] * 3 + [3.0] * 10 + [0.0] * 3 + [3.0]
+    done, tank = inserted(plan, misses, force=False)
+    assert len(tank.moves) == 6
+    assert done.outcome == "held"
+    last = max(period.time for period in done.periods if not period.decision.startswith(HELD))
+    assert done.periods[-1].time - last == pytest.approx(SECONDS, abs=2.0 * PHANTOM.tracker.period)
+
+
+def test_force_goes_on_and_warns(plan):
+    done, tank = inserted(in_air(plan), [3.0], force=True)
+    assert done.outcome == "done"
+    assert len(tank.moves) >= 8
+    assert done.warning == "predicted miss +3.00 ± 0.10 mm: likely beyond 1 mm"
+    assert sum(bool(period.warning) for period in moving(done)) > len(moving(done)) - 4
+    assert not any("nan" in period.warning for period in done.periods)
+
+
+@pytest.mark.parametrize(("miss", "sd", "warned"), [(1.5, 0.1, True), (-1.1, 0.5, True), (0.5, 0.1, False)])
+def test_a_likely_miss_is_warned_of_and_not_held(plan, miss, sd, warned):
+    done, _ = inserted(in_air(plan), [miss], sd)
+    assert done.outcome == "done"
+    assert bool(done.warning) is warned
+    recorded = [(period.miss, period.miss_sd) for period in moving(done)]
+    assert set(recorded) == {(miss, sd)}
+
+
+def test_a_controller_that_predicts_nothing_is_neither_held_nor_warned_of(plan):
+    done, _ = inserted(in_air(plan), [np.nan], np.nan)
+    assert done.outcome == "done"
+    assert done.warning == ""
+    assert all(np.isnan(period.miss) for period in done.periods)
+
+
+def test_a_miss_that_nothing_predicted_is_the_reason_and_no_warning(plan):
+    """So that a study can count the misses that came without a warning on the way."""
+    aside = replace(in_air(plan), target=(-20.0, 3.0))
+    done, _ = inserted(aside, [0.0])
+    assert done.outcome == "done"
+    assert done.reason.startswith("missed the target by 3.")
+    assert done.warning == ""
+
+
+def test_the_hold_and_the_warning_are_in_all_records_and_read_back(plan, tmp_path):
+    """Trace, CSV and JSON."""
+    done, _ = inserted(plan, [0.2, 1.5, 3.0], force=False)
+    warned = [bool(period.warning) for period in done.periods]
+    assert warned[:2] == [False, False]
+    assert warned[-1]
+    with TraceWriter(tmp_path / "trace.mcap", plan, about={}, scenario={}) as writer:
+        for period in done.periods:
+            writer.add(period)
+    kept = read_trace(tmp_path / "trace.mcap")
+    assert kept.note == ""
+    assert list(map(to_row, kept.periods)) == list(map(to_row, done.periods))
+    assert [period.miss for period in kept.periods[:3]] == [0.2, 1.5, 3.0]
+    assert [period.warning for period in kept.periods] == [period.warning for period in done.periods]
+    text = io.StringIO(newline="")
+    write_csv(text, done.periods)
+    rows = list(csv.DictReader(io.StringIO(text.getvalue())))
+    assert [float(row["miss_mm"]) for row in rows[:3]] == [0.2, 1.5, 3.0]
+    assert [float(row["miss_sd_mm"]) for row in rows[:3]] == [0.1] * 3
+    assert [bool(row["warning"]) for row in rows] == warned
+    assert rows[2]["decision"].startswith(HELD)
+    result = json.loads(json.dumps(insertion_result(done)))
+    assert (result["outcome"], result["reached"]) == ("held", False)
+    assert (result["reason"], result["warning"]) == (done.reason, done.warning)
+
+
+def test_a_target_that_guide_and_bevel_cannot_reach_is_held_and_forced(plan):
+    """The plan's guide goes further than that of this rig, and the bevel is too weak to make up for it."""
+    narrow = PHANTOM.with_values(
+        {"setup.max_guide_travel_mm": 0.1, "needle.bevel.offset_mm": 0.5, "target.lateral_mm": 0.0}
+    )
+    tank = Tank(plan.bevel, scenario=narrow)
+    done = run(plan, tank.rig(), narrow)
+    assert done.outcome == "held"
+    assert done.reason.startswith("no path to the target found: predicted miss -")
+    assert done.periods[-1].estimate[0] < 0.0  # it is known before the needle enters
+    forced = run(plan, Tank(plan.bevel, scenario=narrow).rig(), narrow, force=True)
+    assert forced.outcome == "done"
+    assert forced.warning
+    assert forced.true_error_mm > narrow.control.miss_limit_mm
+    assert not forced.reached
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_with_a_perfect_model_it_ends_at_the_target(number):
+    """Worlds whose plant is the model, with the tracker's noise, and no warning."""
+    scenario = world(number, "perfect")
+    plan = flexneedle.plan(scenario, seed=0, threads=1)
+    done = flexneedle.insert(scenario, plan, 0, phantom="model", threads=1)
+    assert done.outcome == "done"
+    assert done.true_error_mm < 0.15
+    assert done.warning == ""
+
+
+@pytest.mark.parametrize("controller", ["adaptive-mpc", "resolved-rate", "ce-mpc"])
+@pytest.mark.parametrize("gap", [-2.0, 2.0])
+def test_the_depth_is_right_wherever_along_the_axis_the_needle_starts(plan, controller, gap):
+    """The scenario's tip is 2 mm further from the skin than the plant's, or nearer."""
+    nothing = {
+        key: value
+        for key, value in world(1, "perfect").flat().items()
+        if key.startswith("phantom.") and "structure" not in key
+    }
+    scenario = PHANTOM.with_values(nothing)
+    tank = Tank(plan.bevel, scenario=scenario.with_values({"setup.tip_to_skin_mm": 28.5 + gap}))
+    done = run(plan, tank.rig(), scenario, controller=controller)
+    assert done.outcome == "done"
+    assert done.periods[-1].true_tip[0] == pytest.approx(40.0, abs=0.1)

@@ -1,0 +1,310 @@
+"""The watch: the order of its rules, its window, its hysteresis, and that it never changes itself."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from flexneedle.rig.monitor.rules import OK
+from flexneedle.rig.monitor.watch import Watch
+from flexneedle.scenario.sections.monitor import Monitor
+from flexneedle.types import Frame, Reading, Sample
+
+RATE = 40.0
+SETTINGS = Monitor()
+MISSED = "missing: tracker sees no tip (out of volume)"
+
+
+def frame(time, indicators=(0.02, 0.02, 0.02), tip=(1.0, 2.0, 3.0)):
+    """A frame with one reference sensor for each indicator; None is one that the tracker does not see."""
+    readings = {"tip": Reading(tip, status=OK if tip else "out of volume")}
+    for k, indicator in enumerate(indicators, 1):
+        seen = indicator is not None
+        place, status = ((0.0, 0.0, 0.0), OK) if seen else (None, "out of volume")
+        readings[f"ref{k}"] = Reading(place, indicator=indicator, status=status)
+    return Frame(time, round(time * RATE), readings)
+
+
+def told(watch, indicators, begin, count):
+    """The watch after `count` readings at rest, and its verdict on the field after each."""
+    verdicts = []
+    for k in range(count):
+        time = begin + k / RATE
+        sample = Sample(time, 30.0 + 1e-6 * k, 1.0, 0.0, frame(time, indicators))
+        watch, verdict = watch.take(sample, (30.0, 1.0), time, 0.3, 2.0)
+        assert verdict == OK
+        watch, field = watch.look()
+        verdicts.append(field)
+    return watch, verdicts
+
+
+def one(sample, watch=None, now=None, predicted=(30.0, 1.0)):
+    watch = watch or Watch(SETTINGS)
+    return watch.take(sample, predicted, sample.time if now is None else now, 0.3, 2.0)[1]
+
+
+def test_a_clean_field_lets_the_needle_move_once_half_a_window_of_it_was_seen():
+    _, verdicts = told(Watch(SETTINGS), (0.02, 0.03, 0.054), 0.0, 100)
+    assert verdicts[0] == "field not known: looked at for 0.00 s, 0.5 s needed"
+    assert verdicts[19] == "field not known: looked at for 0.47 s, 0.5 s needed"
+    assert set(verdicts[20:]) == {OK}
+
+
+def test_a_gap_between_frames_is_no_time_that_was_looked_at():
+    """0.35 s of frames, 0.65 s of none: as each new frame comes, one of before is a second old."""
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 15)
+    _, verdicts = told(watch, (0.02, 0.02, 0.02), 1.0, 24)
+    assert verdicts[1] == "field not known: looked at for 0.35 s, 0.5 s needed"
+    known = [verdict == OK for verdict in verdicts]
+    assert known == [False] * 20 + [True] * 4
+
+
+def test_after_silence_in_a_distorted_field_one_clean_frame_is_not_enough():
+    watch, verdicts = told(Watch(SETTINGS), (0.09, 0.02, 0.02), 0.0, 40)
+    assert verdicts[-1].startswith("field distorted")
+    _, verdicts = told(watch, (0.052, 0.02, 0.02), 2.5, 30)
+    assert verdicts[-1] == "field distorted: ref1 0.0520, to fall below 0.0492 (median over 1 s)"
+    _, verdicts = told(watch, (0.02, 0.02, 0.02), 2.5, 30)
+    assert all(verdict.startswith("field not known: looked at for") for verdict in verdicts[:20])
+    assert verdicts[-1] == OK
+
+
+def test_a_reference_seen_now_and_then_is_not_known():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 40)
+    for k in range(40, 120):
+        watch, verdicts = told(watch, (0.02, 0.02 if k % 4 == 0 else None, 0.02), k / RATE, 1)
+    assert verdicts[-1].startswith("field not known: 2 of 3 reference sensors seen within 1 s")
+
+
+@pytest.mark.parametrize("code", [float("nan"), float("inf"), -1.0])
+def test_an_indicator_that_is_none_hides_no_distortion(code):
+    """ref2 tells 0.9 in every other frame: half of its readings are enough to judge by, and they are bad."""
+    watch = Watch(SETTINGS)
+    for k in range(80):
+        watch, verdicts = told(watch, (0.02, code if k % 2 else 0.9, 0.02), k / RATE, 1)
+    assert verdicts[-1].startswith("field distorted: ref2 0.9000")
+    _, verdicts = told(Watch(SETTINGS), (code, code, code), 0.0, 40)
+    assert verdicts[-1].startswith("field not known: 0 of 3")
+
+
+def test_references_out_of_volume_are_not_seen_whatever_they_tell():
+    ill = Reading((0.0, 0.0, 0.0), indicator=0.01, status="out of volume")
+    watch = Watch(SETTINGS)
+    for k in range(40):
+        told_by = Frame(k / RATE, k, {"tip": Reading((1.0, 2.0, 3.0)), "ref1": ill, "ref2": ill, "ref3": ill})
+        watch, _ = watch.take(Sample(k / RATE, 30.0, 1.0, 0.0, told_by), (30.0, 1.0), k / RATE, 0.3, 2.0)
+    assert watch.look()[1] == (
+        "field not known: 0 of 3 reference sensors seen within 1 s "
+        "(ref1: out of volume, ref2: out of volume, ref3: out of volume)"
+    )
+
+
+def test_no_other_sensor_stands_in_for_a_reference_but_each_may_tell_of_distortion():
+    def verdict(other, ref3):
+        """Of a second of frames in which ref3 is seen or not, and a second coil in the needle tells an indicator."""
+        watch = Watch(SETTINGS)
+        for k in range(40):
+            place = Reading((0.0, 0.0, 0.0), indicator=0.01)
+            readings = {
+                "tip": Reading((1.0 + 1e-6 * k, 2.0, 3.0)),
+                "ref1": place,
+                "ref2": place,
+                "ref3": ref3,
+            }
+            told_by = Frame(k / RATE, k, readings | {"tip.2": replace(place, indicator=other)})
+            watch, _ = watch.take(Sample(k / RATE, 30.0, 1.0, 0.0, told_by), (30.0, 1.0), k / RATE, 0.3, 2.0)
+        return watch.look()[1]
+
+    seen, lost = Reading((0.0, 0.0, 0.0), indicator=0.01), Reading(None, status="out of volume")
+    assert verdict(0.01, seen) == OK
+    assert verdict(0.01, lost) == (
+        "field not known: 2 of 3 reference sensors seen within 1 s "
+        "(ref3: out of volume, no reference by its name: tip.2)"
+    )
+    assert verdict(0.2, seen).startswith("field distorted: tip.2 0.2000")
+
+
+def test_only_the_last_window_is_judged():
+    """0.2 for 2 s, then clean: after half a second more than half of a window of 1 s is clean, of 2 s is not."""
+    watch, _ = told(Watch(SETTINGS), (0.2, 0.02, 0.02), 0.0, 80)
+    _, verdicts = told(watch, (0.02, 0.02, 0.02), 2.0, 40)
+    assert verdicts[18].startswith("field distorted")
+    assert verdicts[20] == OK
+
+
+def still(places, step, settings=SETTINGS):
+    """The verdict on the last of readings at such places (x, None: not seen), while the model's tip goes `step` mm on
+    in each."""
+    watch = Watch(settings)
+    for k, x in enumerate(places):
+        sample = Sample(k / RATE, x, None if x is None else 1.0)
+        watch, verdict = watch.take(sample, (30.0 + step * k, 1.0), k / RATE, 0.3, 1e9)
+    return verdict
+
+
+@pytest.mark.parametrize(
+    ("places", "step", "count"),
+    [
+        ([29.0, *[30.0] * 4], 0.1001, 4),
+        ([29.0, *[30.0] * 3], 0.1001, None),
+        ([30.0] * 400, 0.0, None),
+        ([30.0] * 400, 0.001, 400),  # slow, and longer than the window
+        ([30.0] * 3 + [math.nextafter(30.0, 31.0)], 0.2, None),  # the last digit makes a reading new
+        ([30.0, None] * 4 + [30.0], 0.1, 5),
+    ],
+)
+def test_a_tip_that_stays_the_same_while_the_needle_moves_is_frozen(places, step, count):
+    for settings in (SETTINGS, SETTINGS.model_copy(update={"indicator_window_s": 0.05})):
+        verdict = still(places, step, settings)
+        assert verdict == OK if count is None else verdict.startswith(f"frozen: the same in {count} readings")
+
+
+def test_half_a_second_of_distortion_holds_and_names_the_sensor():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 40)
+    _, verdicts = told(watch, (0.02, 0.09, 0.02), 1.0, 40)
+    first = next(k for k, verdict in enumerate(verdicts) if verdict != OK)
+    assert first in (19, 20, 21)
+    assert verdicts[-1] == "field distorted: ref2 0.0900, to fall below 0.0492 (median over 1 s)"
+    assert set(verdicts[:first]) == {OK}
+
+
+def test_single_readings_above_the_threshold_do_not_hold():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 40)
+    for k in range(40, 240):
+        watch, verdicts = told(watch, (0.5 if k % 3 == 0 else 0.02, 0.02, 0.02), k / RATE, 1)
+        assert verdicts == [OK]
+
+
+def test_once_held_the_indicator_has_to_fall_below_the_lower_limit():
+    watch, verdicts = told(Watch(SETTINGS), (0.06, 0.02, 0.02), 0.0, 40)
+    assert verdicts[-1].startswith("field distorted")
+    watch, verdicts = told(watch, (0.052, 0.02, 0.02), 1.0, 80)
+    assert verdicts[-1] == "field distorted: ref1 0.0520, to fall below 0.0492 (median over 1 s)"
+    watch, verdicts = told(watch, (0.049, 0.02, 0.02), 3.0, 80)
+    assert verdicts[-1] == OK
+    assert told(watch, (0.052, 0.02, 0.02), 6.0, 80)[1][-1] == OK
+
+
+def test_what_left_the_window_is_forgotten():
+    watch, _ = told(Watch(SETTINGS), (0.09, 0.02, 0.02), 0.0, 40)
+    assert len(watch.recent) == 40
+    watch, verdicts = told(watch, (0.02, 0.02, 0.02), 50.0, 40)
+    assert verdicts[-1] == OK
+    assert len(watch.recent) == 40
+
+
+def test_a_lost_reference_holds_after_half_a_window_and_not_before():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 40)
+    _, verdicts = told(watch, (0.02, None, 0.02), 1.0, 60)
+    held = [verdict != OK for verdict in verdicts]
+    assert held.index(True) in (19, 20, 21)
+    assert verdicts[-1] == "field not known: 2 of 3 reference sensors seen within 1 s (ref2: out of volume)"
+
+
+def test_as_many_references_are_needed_as_the_scenario_says():
+    for needed, verdict in ((2, OK), (3, "field not known: 2 of 3 reference sensors seen within 1 s")):
+        watch = Watch(SETTINGS.model_copy(update={"references": needed}))
+        assert told(watch, (0.02, 0.02), 0.0, 40)[1][-1] == verdict
+
+
+def test_a_tracker_that_tells_only_the_tip_is_not_held_against():
+    watch, verdict = Watch(SETTINGS).take(Sample(0.0, 30.0, 1.0), (30.0, 1.0), 0.0, 0.3, 2.0)
+    assert verdict == OK
+    assert watch.look()[1] == OK
+
+
+@pytest.mark.parametrize(
+    ("sample", "verdict"),
+    [
+        (Sample(1.0, float("nan"), 1.0), "not a number"),
+        (Sample(1.0, None, None), "missing: tracker sees no tip"),
+        (Sample(1.0, None, None, frame=frame(1.0, tip=None)), "missing: tracker sees no tip (out of volume)"),
+        (Sample(1.0, 30.0, 1.0, 6.0), "out of plane: 6.00 mm, limit 5 mm"),
+        (Sample(1.0, 33.0, 1.0), "innovation 3.00 mm, limit 2 mm"),
+    ],
+)
+def test_each_fault_of_a_reading_is_named(sample, verdict):
+    assert one(sample) == verdict
+
+
+def test_a_frame_told_again_is_not_believed_and_not_remembered():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
+    again = Sample(0.075, 30.0, 1.0, 0.0, frame(2 / RATE))
+    after, verdict = watch.take(again, (30.0, 1.0), 0.075, 0.3, 2.0)
+    assert verdict == "stale: frame 2 after frame 2"
+    assert after is watch
+
+
+def test_an_old_reading_is_stale():
+    assert one(Sample(1.0, 30.0, 1.0), now=1.5) == "stale: 0.500 s old, limit 0.3 s"
+
+
+def test_a_jump_counts_from_the_last_good_reading():
+    watch, _ = Watch(SETTINGS).take(Sample(1.0, 30.0, 1.0), (30.0, 1.0), 1.0, 0.3, 2.0)
+    far = Sample(1.025, 31.9, 1.0)
+    watch, verdict = watch.take(far, (30.0, 1.0), 1.025, 0.3, 2.0)
+    assert verdict == "jump of 1.90 mm, limit 1.50 mm"
+    assert watch.good == Sample(1.0, 30.0, 1.0)
+    assert one(Sample(1.05, 31.9, 1.0), watch) == OK  # so far it may have come by now
+    # Near the jump, and still too far from where it was last well seen.
+    assert one(Sample(1.03, 31.8, 1.0), watch) == "jump of 1.80 mm, limit 1.60 mm"
+
+
+def test_a_frozen_sensor_is_seen_although_the_map_to_the_tip_changes():
+    watch = Watch(SETTINGS)
+    for k in range(4):
+        sample = Sample(k / RATE, 30.0 + 0.01 * k, 1.0, 0.0, frame(k / RATE))
+        watch, verdict = watch.take(sample, (30.0 + 0.125 * k, 1.0), sample.time, 0.3, 2.0)
+    assert verdict == "frozen: the same in 4 readings while the tip should have moved 0.38 mm"
+
+
+@pytest.mark.parametrize("time", [1e6, -50.0, float("nan")])
+def test_a_reading_of_another_time_changes_no_judgement_of_the_field(time):
+    watch, _ = told(Watch(SETTINGS), (0.2, 0.02, 0.02), 0.0, 40)
+    sample = Sample(time, 30.0, 1.0, 0.0, replace(frame(1.0, (0.01, 0.01, 0.01)), number=1000))
+    after, verdict = watch.take(sample, (30.0, 1.0), 1.0, 0.3, 2.0)
+    assert verdict.startswith(("stale", "not a number"))
+    assert after is watch
+    assert after.look()[1].startswith("field distorted")
+
+
+def test_the_last_good_reading_counts_until_it_is_old_and_only_of_frames():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
+    assert watch.last_good(0.35, 0.3) == watch.good
+    assert watch.last_good(0.36, 0.3) is None
+    bare, _ = Watch(SETTINGS).take(Sample(0.0, 30.0, 1.0), (30.0, 1.0), 0.0, 0.3, 2.0)
+    assert bare.last_good(0.0, 0.3) is None
+
+
+def test_a_tip_lost_in_a_few_frames_is_not_held_against_the_tracker():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
+    last = watch.good
+
+    def lost(time, seen_by=watch):
+        return seen_by.only_missed(Sample(time, None, None, None, frame(time, tip=None)), MISSED)
+
+    assert lost(last.time + 0.1) == last
+    assert lost(last.time + 0.125) is None
+    assert lost(last.time + 0.1, Watch(SETTINGS)) is None  # never seen
+    assert watch.only_missed(Sample(last.time + 0.025, None, None), MISSED) is None  # no frame
+    assert watch.only_missed(last, OK) is None  # not lost
+    again = Sample(last.time, None, None, None, frame(last.time, tip=None))
+    for verdict in ("stale: frame 2 after frame 2", "stale: 0.450 s old, limit 0.3 s", "not a number"):
+        assert watch.only_missed(again, verdict) is None  # it tells nothing of the tip
+    off = replace(watch, settings=SETTINGS.model_copy(update={"enabled": False}))
+    assert lost(last.time + 0.025, off) is None
+
+
+def test_switched_off_it_still_refuses_what_no_loop_can_use():
+    off = Watch(SETTINGS.model_copy(update={"enabled": False}))
+    assert one(Sample(1.0, 30.0, 1.0, 60.0), off) == OK
+    assert one(Sample(1.0, None, None), off).startswith("missing")
+    assert one(Sample(1.0, 33.0, 1.0), off).startswith("innovation")
+    assert told(off, (5.0, 5.0, 5.0), 0.0, 80)[1][-1] == OK
+
+
+def test_the_watch_itself_never_changes():
+    watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 10)
+    kept = replace(watch)
+    told(watch, (0.9, 0.9, 0.9), 0.25, 40)
+    assert watch == kept

@@ -1,0 +1,292 @@
+"""Insertions of the exact plant: against the controller's model, against closed forms, and what it leaves behind."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from flexneedle.rig.phantom import rod as rd
+from reference.rods import IDEAL, Bench, move, plant
+from reference.validation import (
+    FINE,
+    ROUGH,
+    SHIPPED,
+    SMALL,
+    commands,
+    curvature_error,
+    inserted_tip,
+    model_gap,
+    order,
+    path_curvature,
+    push,
+    scaled,
+    shot,
+    stepped,
+    wander,
+)
+
+AHEAD, BACK = 0.25, -0.25
+START = 114  # steps of 0.25 mm to the skin
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_it_meets_the_controllers_model_at_small_angles(layers):
+    """Two formulations, one limit: what is between the tips falls with the cube of the angle."""
+    meshes = {2.0: SMALL, 1.0: SMALL, 0.5: FINE, 0.25: FINE}
+    gaps = [model_gap(scale, layers, **mesh) for scale, mesh in meshes.items()]
+    for larger, smaller in pairwise(gaps):
+        assert smaller.aside < larger.aside / 4.0
+    last = gaps[-2:]
+    assert order([gap.angle for gap in last], [gap.aside for gap in last]) == pytest.approx(3.0, abs=0.4)
+    assert gaps[0].aside > 0.1  # at 0.15 rad the linear beam is a tenth of a millimetre and more off
+    assert gaps[-1].aside < 1e-4
+    assert abs(gaps[-1].energy) < 2e-4
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_what_stays_between_them_shrinks_with_the_mesh(layers):
+    """At a hundredth of a radian: 0.3 µm for each mm of deflection on the shipped mesh, less on a finer one."""
+    coarse, fine = model_gap(0.25, layers, **SHIPPED), model_gap(0.25, layers, **SMALL)
+    assert coarse.aside < 5e-4
+    assert fine.aside < coarse.aside / 3.0
+
+
+def test_a_second_solver_finds_the_same_insertion():
+    """Shooting along the continuous rod: all inputs, two layers, clearance, bend, start error, varying stiffness."""
+    expected = shot(ROUGH, wander())
+    gaps = np.array([np.abs(stepped(ROUGH, wander(), h) - expected).max(axis=0) for h in (1.0, 0.5, 0.25)])
+    assert np.ptp(expected[:, 1]) > 1.0
+    assert gaps[-1, 0] < 1e-6
+    assert gaps[-1, 1] < 2e-5
+    assert order((1.0, 0.5, 0.25), gaps[:, 1]) == pytest.approx(2.0, abs=0.25)
+    # The last segment has the slope half a segment before the tip; natural curvature makes that first order.
+    assert order((1.0, 0.5, 0.25), gaps[:, 2]) == pytest.approx(1.0, abs=0.1)
+    assert gaps[-1, 2] < 2e-5
+
+
+def test_a_second_solver_finds_the_same_friction():
+    """Its direction is that of the needle before a step: an error that halves with the step."""
+    rubbed = ROUGH.with_values({"phantom.friction_mn_per_mm": 50.0})
+    ends = [shot(rubbed, push(parts))[-1] for parts in (1, 2)]
+    gaps = [abs(stepped(rubbed, push(k), 0.25)[-1, 1] - end[1]) for k, end in zip((1, 2), ends, strict=True)]
+    without = abs(stepped(ROUGH, push(2), 0.25)[-1, 1] - ends[1][1])
+    assert gaps[1] < 0.6 * gaps[0]
+    assert gaps[1] < without / 5.0
+
+
+@pytest.mark.parametrize("bevel_length", [1.0, 3.0])
+def test_steady_curvature_meets_its_closed_form_and_closer_when_refined(bevel_length):
+    """docs/theory.md eq. 10, several 1/β deep at small strain."""
+    error = [curvature_error(resolution, bevel_length) for resolution in (1.0, 0.5, 0.25)]
+    assert abs(error[0]) < 0.012
+    assert abs(error[1]) < 0.004
+    assert abs(error[2]) < 0.002
+    assert abs(error[2]) < abs(error[0]) / 4.0
+
+
+def test_steady_curvature_is_proportional_to_the_offset_at_small_strain():
+    """And not there at all without one."""
+    assert path_curvature(1.0, 3.0, bevel=0.0) == 0.0
+    assert path_curvature(1.0, 3.0, bevel=0.02) == pytest.approx(2.0 * path_curvature(1.0, 3.0), rel=2e-3)
+
+
+def test_an_insertion_converges_at_second_order_in_the_segment():
+    """Against sixteen times as many; 2 µm and less on the shipped mesh of 0.5 mm would be luck: 0.1 mm it isn't."""
+    counts = np.array([75, 150, 300, 600])
+    tips = np.array([inserted_tip(element=150.0 / n)[:2] for n in counts])
+    errors = np.hypot(*(tips - inserted_tip(element=150.0 / 2400)[:2]).T)
+    assert order(1.0 / counts, errors) == pytest.approx(2.0, abs=0.5)
+    assert errors[2] < 1e-4
+
+
+def test_an_insertion_does_not_depend_on_its_step():
+    """Half a millimetre or a sixteenth: within a thousandth, and closer."""
+    tips = np.array([inserted_tip(step=step)[:2] for step in (0.5, 0.25, 0.125, 0.0625)])
+    apart = np.hypot(*(tips[:-1] - tips[-1]).T)
+    assert (apart < [1e-3, 3e-4, 1e-4]).all()
+    assert (np.diff(apart) < 0.0).all()
+
+
+def test_contact_spacing_hardly_matters():
+    tips = np.array([inserted_tip(spacing=spacing, cell=0.125)[:2] for spacing in (1.0, 0.5, 0.25, 0.125)])
+    apart = np.hypot(*(tips[:-1] - tips[-1]).T)
+    assert (apart < [5e-3, 2e-3, 1e-3]).all()
+
+
+def test_the_spring_enters_the_skin_fully_compressed():
+    """docs/theory.md section 4, q = 0: the bevel turns the tip by its whole offset from the first cut on."""
+    needle = move(plant(), AHEAD, times=START + 1)
+    assert needle.tip[0] == pytest.approx(0.25, abs=1e-3)
+    ratio = 0.25 / 3.0
+    drift = needle.tip[1]
+    expected = 4.0 - drift * (1.0 - math.exp(-ratio)) / ratio
+    assert needle._s[rd.OFFSET] == pytest.approx(expected, rel=1e-3)
+    assert 0.0 < drift < 0.1
+
+
+def test_a_step_across_the_skin_may_be_long_or_short():
+    tips = [move(plant(), 0.5, times=57).tip]
+    for parts in (2, 8):
+        needle = move(plant(), 0.5, times=56)
+        tips.append(move(needle, 0.5 / parts, times=parts).tip)
+    assert tips[0][0] == pytest.approx(0.0, abs=1e-6)
+    deeper = [
+        move(move(plant(), 0.5, times=56), step, times=round(2.0 / step)).tip for step in (2.0, 0.5, 0.0625)
+    ]
+    assert deeper[-1][1] > 0.01
+    np.testing.assert_allclose([tip[1] for tip in deeper], deeper[-1][1], atol=3e-3)
+    np.testing.assert_allclose([tip[1] for tip in deeper[1:]], deeper[-1][1], atol=1e-3)
+
+
+def test_the_channel_lies_on_the_way_of_the_tip():
+    """A point wherever another 0.5 mm of needle have cut their way in; its layer is that of its depth."""
+    needle, way, cut = plant(), [], []
+    for row in commands(1.5, 44.5, AHEAD):
+        needle.step(row)
+        way.append(needle.tip[:2])
+        cut.append(needle._s[rd.CUT])
+    points = needle._channel[[rd.C_X, rd.C_Y], : needle._count]
+    at = 0.5 * (np.arange(needle._count) + 0.5)
+    assert at[-1] <= cut[-1] < at[-1] + 0.5
+    expected = [np.interp(at, cut, along) for along in np.transpose(way)]
+    np.testing.assert_allclose(points[:, 1:], np.array(expected)[:, 1:], atol=1e-9)
+    np.testing.assert_allclose(points[:, 0], np.array(expected)[:, 0], atol=0.02)  # from air into the skin
+    assert cut[-1] == pytest.approx(way[-1][0], rel=0.01)
+    force, deep = needle._channel[rd.C_FORCE, : needle._count], points[0] > 20.0
+    assert np.unique(force[~deep]).size == np.unique(force[deep]).size == 1
+    assert force[deep][0] / force[~deep][0] == pytest.approx(3.63 / 1.82)
+
+
+def test_a_slanted_needle_cuts_along_its_own_line_from_the_skin_on():
+    """In one step through the skin: points every 0.5 mm along the needle, the first 0.25 mm behind its entry."""
+    turn = 0.2
+    bench = Bench(length=60.0, segments=30, base=(-60.0, 0.0, turn)).step().step(db_x=3.0)
+    depth = 3.0 - 60.0 * (1.0 - math.cos(turn))
+    entry = bench.s[rd.TIP_Y] - depth * math.tan(turn)
+    along = 0.25 + 0.5 * np.arange(bench.count)
+    assert bench.count == 4
+    np.testing.assert_allclose(bench.channel[rd.C_X, :4], along * math.cos(turn), atol=1e-9)
+    np.testing.assert_allclose(bench.channel[rd.C_Y, :4], entry + along * math.sin(turn), atol=1e-9)
+    assert bench.s[rd.CUT] == pytest.approx(depth / math.cos(turn), rel=1e-12)
+
+
+def test_flip_without_insertion_changes_nothing_but_the_bevel():
+    """At rest, when pulling back, and twice before a push; a needle without a bend of its own."""
+    needle = move(plant(), AHEAD, times=START + 80)
+    tip = needle.tip
+    np.testing.assert_allclose(move(needle, flip=True).tip, tip, atol=1e-9)
+    assert needle.bevel == -1
+    move(needle, flip=True)
+    one, other = (move(plant(), AHEAD, times=START + 80) for _ in range(2))
+    np.testing.assert_allclose(move(one, BACK).tip, move(other, BACK, flip=True).tip, atol=1e-9)
+    assert move(needle, AHEAD, times=20).tip[1] == pytest.approx(
+        move(plant(), AHEAD, times=START + 100).tip[1], abs=1e-6
+    )
+
+
+def test_flip_bends_the_path_to_the_other_side():
+    on, turned = (move(plant(), AHEAD, times=START + 80) for _ in range(2))
+    move(on, AHEAD, times=60)
+    move(turned, AHEAD, flip=True)
+    move(turned, AHEAD, times=59)
+    assert turned.tip[2] < 0.0 < on.tip[2]
+    assert turned.tip[1] < on.tip[1] - 0.3
+
+
+def test_pulled_back_the_needle_follows_its_channel_and_pushed_again_it_is_where_it_was():
+    needle = plant()
+    for row in commands(1.0, 30.0, AHEAD):
+        needle.step(row)
+    before, cut, count = needle.tip, needle._s[rd.CUT], needle._count
+    for _ in range(40):
+        move(needle, BACK)
+    assert (needle._s[rd.CUT], needle._count) == (cut, count)
+    move(needle, AHEAD, times=40)
+    np.testing.assert_allclose(needle.tip, before, atol=1e-3)
+
+
+def test_the_bevels_spring_fades_out_as_the_tip_is_pulled_back():
+    """Over its length: 3 mm behind the front it is gone, and its part of the energy with it."""
+    needle = move(plant(), AHEAD, times=START + 120)
+    parts = []
+    for _ in range(16):
+        parts.append(np.hypot(*needle._work[[rd.GX, rd.GY], -1]))
+        move(needle, BACK)
+    force = np.array(parts)
+    assert (np.diff(force[:13]) < 0.0).all()
+    assert force[0] > 1e-3
+    assert not force[13:].any()
+
+
+def test_out_of_the_skin_the_channel_is_closed():
+    """The next entry cuts a new one where the tip is."""
+    needle = move(plant(), AHEAD, times=START + 40)
+    move(needle, BACK, times=44)
+    assert needle.tip[0] < 0.0
+    assert (needle._count, needle._s[rd.CUT], needle._s[rd.OFFSET]) == (0, 0.0, 0.0)
+    assert needle.strain_energy == 0.0
+    move(needle, dg_y=0.3, times=4)
+    entry = needle.tip[1]
+    move(needle, AHEAD, times=12)
+    assert needle._channel[rd.C_Y, 0] == pytest.approx(entry, abs=0.1)
+    assert entry > 1.0
+
+
+def test_softer_tissue_deflects_the_needle_in_proportion():
+    """At small strain, where the needle is much stiffer."""
+
+    def aside(factor):
+        values = {f"tissue.{k}.shear_modulus_kpa": 1e-3 * factor for k in (0, 1)}
+        return move(plant(IDEAL.with_values(values)), AHEAD, times=START + 120).tip[1]
+
+    assert aside(2.0) == pytest.approx(2.0 * aside(1.0), rel=2e-3)
+    assert aside(1.0) > 1e-5
+
+
+def test_stiffness_varies_with_the_depth_as_the_truth_has_it():
+    """A factor on μ for each cell: of contact points and of the bevel's spring."""
+    variation = tuple(1.0 + 0.5 * (k % 2) for k in range(400))  # 0.25 mm each
+    needle = move(plant(IDEAL, variation=variation, cell=0.25), AHEAD, times=START + 60)
+    plain = move(plant(IDEAL), AHEAD, times=START + 60)
+    points = needle._count
+    x = needle._channel[rd.C_X, :points]
+    expected = np.where((x / 0.25).astype(int) % 2 == 1, 1.5, 1.0)
+    ratio = needle._channel[rd.C_FORCE, :points] / plain._channel[rd.C_FORCE, :points]
+    np.testing.assert_allclose(ratio, expected)
+    np.testing.assert_allclose(
+        needle._channel[rd.C_ENERGY, :points] / plain._channel[rd.C_ENERGY, :points], expected
+    )
+    stiffer = move(plant(IDEAL, variation=(1.5,), cell=0.25), AHEAD, times=START + 4)
+    firm = {f"tissue.{k}.shear_modulus_kpa": 1.5 * (1.82, 3.63)[k] for k in (0, 1)}
+    np.testing.assert_allclose(stiffer.tip, move(plant(IDEAL.with_values(firm)), AHEAD, times=START + 4).tip)
+
+
+def test_strain_energy_is_weighted_by_layer_and_counts_contact_points():
+    """Without a bevel all energy outside the needle is in them; a weight of 3 on both layers triples what is told."""
+    weights = {f"tissue.{k}.energy_weight": 3.0 for k in (0, 1)}
+    blunt = scaled(0.0, 2, 0.5, 0.5).with_values({"needle.bevel.length_mm": 1e-6})
+    one, three = (plant(scenario) for scenario in (blunt, blunt.with_values(weights)))
+    for row in commands(1.0, 30.0, AHEAD):
+        one.step(row)
+        three.step(row)
+    assert one.strain_energy > 1e-3
+    assert three.strain_energy == pytest.approx(3.0 * one.strain_energy, rel=1e-12)
+    np.testing.assert_array_equal(three.tip, one.tip)
+    bend = 0.5 * (one._work[rd.MOMENT, :-1] ** 2).sum() * one.rod.segment / one.rod.stiffness
+    bend -= (
+        0.25 * one._work[rd.MOMENT, 0] ** 2 * one.rod.segment / one.rod.stiffness
+    )  # the first is half as long
+    guide = 0.5 * one._s[rd.GUIDE_FORCE] ** 2 / one.rod.guide_stiffness
+    assert one._s[rd.ENERGY] == pytest.approx(one.strain_energy + bend + guide, rel=1e-6)
+
+
+def test_least_stretch_is_that_of_the_most_compressed_point():
+    needle = plant()
+    for row in commands(1.5, 40.0, AHEAD):
+        needle.step(row)
+    x, y = needle.nodes.T
+    points = needle._channel[[rd.C_X, rd.C_Y], : needle._count].T
+    apart = np.abs(np.interp(points[:, 0], x, y) - points[:, 1])
+    assert needle.least_stretch == pytest.approx(1.0 - apart.max() / 20.0, abs=1e-3)
+    assert needle.least_stretch < 0.99

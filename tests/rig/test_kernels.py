@@ -1,0 +1,52 @@
+"""The kernels: compiled before anything is timed, and none later."""
+
+import subprocess
+import sys
+
+import pytest
+
+from flexneedle import mechanics
+from flexneedle.rig import kernels, phantom
+
+EVERYTHING = """
+import flexneedle
+from flexneedle.control.methods import METHODS
+from flexneedle.mechanics import insertion
+from flexneedle.rig.phantom import rod
+from flexneedle.rig.phantom.plants import PLANTS
+from flexneedle.rig.kernels import all_compiled, compile_kernels
+
+def signatures():
+    found = {name: value for part in (insertion, rod) for name, value in vars(part).items()}
+    return {name: len(value.signatures) for name, value in found.items() if hasattr(value, "signatures")}
+
+compile_kernels()
+before = signatures()
+assert all_compiled()
+assert all(before[name] == 1 for name in ("settle", "advance", "replay", "rollout", "step")), before
+quick = {"samples": 16, "iterations": 2}
+scenario = flexneedle.load_scenario("phantom").with_values({
+    **{f"plan.{key}": value for key, value in quick.items()},
+    **{f"control.ce_mpc.{key}": value for key, value in quick.items()},
+    "control.ce_mpc.horizon": 2, "setup.tip_to_skin_mm": 4.0, "target.depth_mm": 8.0, "target.lateral_mm": 0.5,
+})
+plans = [flexneedle.plan(scenario, strategy=strategy) for strategy in ("manipulation", "steering")]
+for name in METHODS:
+    for kind in PLANTS:
+        flexneedle.insert(scenario, plans[0], controller=name, phantom=kind, force=True)
+assert signatures() == before, (signatures(), before)
+"""
+
+
+def test_no_plan_and_no_insertion_compiles_anything_more():
+    command = [sys.executable, "-c", EVERYTHING]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("missing", [mechanics, phantom])
+def test_all_is_compiled_only_with_model_and_phantoms(monkeypatch, missing):
+    monkeypatch.setattr(kernels, "compiled", lambda home: str(home) not in str(missing.__file__))
+    assert not kernels.all_compiled()
+    monkeypatch.setattr(kernels, "compiled", lambda _home: True)
+    assert kernels.all_compiled()

@@ -1,0 +1,166 @@
+"""Parts of a user's own: what is none is refused in one line."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.cli import main as cli
+from flexneedle.control.methods import METHODS
+from flexneedle.errors import InputError
+from flexneedle.rig.parts import controller_of, plant_of, tracker_of
+from flexneedle.rig.phantom.draw import Truth
+from flexneedle.rig.phantom.phantom import Phantom
+from flexneedle.rig.phantom.plants import PLANTS
+from flexneedle.rig.virtual import Seeds, virtual_rig
+from synthetic import make_plan
+
+PHANTOM = flexneedle.load_scenario("phantom")
+
+LAB = """
+from flexneedle import Decision, Method
+from flexneedle.rig.phantom.phantom import Phantom
+
+def decide(task, memory, estimate, rng):
+    return Decision((1.0, 0.0, 0.0, 0.0, -1), "on"), memory
+
+def one(truth):
+    return None
+
+def nothing(truth, bevel):
+    return {}
+
+def blind(scenario, phantom, rng):
+    return object()
+
+class Half:
+    name = "half"
+    decide = staticmethod(decide)
+
+FINE = Method("fine", "goes on", decide=decide)
+SAME = Method("ce-mpc", "has the name of another", decide=decide)
+NUMBER = 3
+"""
+
+
+@pytest.fixture
+def lab(tmp_path, monkeypatch):
+    """The current directory, with modules of one's own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    before = set(sys.modules)
+    texts = {
+        "lab_parts": LAB,
+        "lab_syntax": "def decide(:\n",
+        "lab_needs": "import no_such_thing\n",
+        "lab_exits": "raise SystemExit(3)\n",
+        "lab_wrong": 'from flexneedle import Method\nMETHOD = Method("My PID", "", decide=print)\n',
+    }
+    for name, text in texts.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    yield tmp_path
+    for name in set(sys.modules) - before:
+        if name.startswith("lab_"):
+            del sys.modules[name]
+
+
+@pytest.mark.usefixtures("lab")
+def test_registered_parts_and_objects_are_found_under_their_names():
+    for name, method in METHODS.items():
+        assert controller_of(name) == controller_of(method) == (name, method)
+    for name, factory in PLANTS.items():
+        assert plant_of(name) == (name, factory)
+    assert tracker_of("scenario") == ("scenario", None)
+    name, own = controller_of("lab_parts:FINE")
+    assert (name, own.name) == ("lab_parts:FINE", "fine")
+    assert controller_of(own) == ("fine", own)
+
+
+@pytest.mark.parametrize(
+    ("option", "given", "told"),
+    [
+        ("controller", "lab_parts", "must be one of adaptive-mpc, "),
+        ("controller", "lab_parts:", "must be module:NAME, such as mycontroller:METHOD"),
+        ("controller", ":FINE", "must be module:NAME"),
+        ("controller", "lab-parts:FINE", "must be module:NAME"),
+        ("controller", "lab_there:FINE", "there is no module lab_there, neither in "),
+        ("controller", "lab_parts.sub:FINE", "there is no module lab_parts.sub, neither in "),
+        ("controller", "lab_parts:FIEN", "lab_parts has no FIEN; it has Decision, Method, Phantom, decide,"),
+        (
+            "controller",
+            "lab_parts:NUMBER",
+            "is an int, not a flexneedle.Method: it lacks name, summary, decide",
+        ),
+        ("controller", "lab_parts:Half", "is the class Half, not a flexneedle.Method: it lacks summary"),
+        ("controller", "lab_syntax:METHOD", "lab_syntax cannot be imported: SyntaxError: "),
+        ("controller", "lab_needs:METHOD", "lab_needs cannot be imported: it needs the module no_such_thing"),
+        ("controller", "lab_exits:METHOD", "lab_exits cannot be imported: SystemExit: 3"),
+        ("controller", "lab_wrong:METHOD", "name = 'My PID': a controller's name must be like"),
+        ("phantom", "jelly", "must be one of exact, model, or module:NAME of your own"),
+        ("phantom", "lab_parts:NUMBER", "is an int, not a function of (truth, bevel)"),
+        ("phantom", "lab_parts:one", "must be a function of (truth, bevel): too many positional arguments"),
+        ("tracker", "eye", "must be one of scenario, or module:NAME of your own"),
+        ("tracker", "lab_parts:one", "must be a function of (scenario, phantom, rng): too many"),
+    ],
+)
+def test_what_is_no_part_is_one_line(lab, capsys, option, given, told):
+    assert cli.main(["insert", f"--{option}", given]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"flexneedle: {option} = {given!r}: {told}")
+    assert not (lab / "runs").exists()
+
+
+@pytest.mark.usefixtures("lab")
+def test_a_controller_with_the_name_of_another_is_refused(capsys):
+    assert cli.main(["insert", "--controller", "lab_parts:SAME"]) == 2
+    assert "two controllers are called ce-mpc: give one of them another name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", [3, None, {"controller": 1}])
+def test_an_object_that_is_no_controller_is_refused(given):
+    with pytest.raises(
+        InputError, match=r"^controller = \w+: is an? \w+, not a flexneedle.Method: it lacks name"
+    ):
+        flexneedle.insert(PHANTOM, make_plan(), controller=given)
+
+
+def test_a_factory_that_makes_no_plant_is_refused():
+    with pytest.raises(
+        InputError, match="phantom = <lambda>: makes a dict, no plant: it lacks step, tip, bevel,"
+    ):
+        Phantom(Truth(PHANTOM), 1, lambda _truth, _bevel: {})
+
+
+def test_a_plant_whose_tip_is_no_pose_is_refused():
+    class Flat:
+        step = bevel = strain_energy = least_stretch = converged = 0
+
+        def __init__(self, _truth, _bevel):
+            self.tip = (0.0, 0.0)
+
+    with pytest.raises(InputError, match="phantom = Flat: its tip must be three numbers"):
+        Phantom(Truth(PHANTOM), 1, Flat)
+
+
+def test_a_factory_that_makes_no_tracker_is_refused():
+    seeds = Seeds(*(np.random.SeedSequence(k) for k in range(3)))
+    with pytest.raises(InputError, match="tracker: makes a object, no tracker: it lacks read, status"):
+        virtual_rig(PHANTOM, 1, seeds, "model", tracker=lambda *_: object())
+
+
+@pytest.mark.parametrize("answer", [None, (1, 2), (1.0, 0.0, 0.0, 0.0, -1)])
+def test_a_decision_that_is_none_is_refused(answer):
+    own = replace(METHODS["open-loop"], name="odd", decide=lambda *_: answer)
+    with pytest.raises(
+        InputError, match="controller odd: decide must return a Decision and the memory after it"
+    ):
+        flexneedle.insert(PHANTOM, make_plan(), controller=own, phantom="model", force=True)
+
+
+def test_a_command_has_five_numbers():
+    with pytest.raises(
+        InputError, match=r"command = \(1.0, 0.0\): must have 5 numbers, db_x, db_y, db_theta, dg_y, "
+    ):
+        flexneedle.Decision((1.0, 0.0), "short")

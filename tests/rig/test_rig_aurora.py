@@ -1,0 +1,84 @@
+"""The closed loop on a real clock, with an Aurora that is emulated in a process of its own and falls silent."""
+
+import re
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+import flexneedle
+from emulated import emulated, read_until, until
+from flexneedle.rig.devices.aurora.tracker import Aurora
+from flexneedle.rig.devices.clock import WallClock
+from flexneedle.rig.loop import run
+from flexneedle.rig.tracking.plane import InPlane
+from flexneedle.rig.virtual import Rig, to_stage
+
+STILL = (0.0, 0.0, 0.0, 0.0, -1)
+# The emulated tip moves on its own: all that asks for a needle's place is out of the way here.
+ANYWHERE = {
+    "control.innovation_limit_mm": 1e4,
+    "monitor.speed_limit_mm_s": 1e4,
+    "monitor.out_of_plane_limit_mm": 1e4,
+    "control.hold_limit_s": 0.4,
+}
+
+
+class Motors:
+    """A driver that takes its time and does what it is told."""
+
+    def __init__(self, clock):
+        self.clock = clock
+
+    def apply(self, command, duration):
+        self.clock.wait(duration)
+        return command
+
+
+def test_frames_move_the_needle_and_silence_holds_it():
+    scenario = flexneedle.load_scenario("phantom").with_values(ANYWHERE)
+    plan = flexneedle.plan(scenario, (40.0, 5.0), seed=0)
+    clock = WallClock()
+    with emulated("--fault", "silence@5:60") as path, Aurora(path, clock) as tracker:
+        read_until(tracker, lambda frames: frames and all(r.position for r in frames[-1].readings.values()))
+        read_until(tracker, lambda frames: len(frames) >= 40)
+        tip = InPlane(tracker, to_stage(None))
+        rig = Rig(
+            clock, Motors(clock), tip
+        )  # its tip does not go where the motors do: forced, or it is given up
+        done = run(scenario, plan, rig, np.random.default_rng(0), force=True)
+    assert done.outcome == "held"
+    assert re.search(
+        r"\(limit 0\.4 s\): missing: no reading \((no reply|no frame for 0\.\d s)\)$", done.reason
+    )
+    good = [period for period in done.periods if period.verdict == "ok"]
+    moved = [period for period in good if period.applied != STILL]
+    seen = [period for period in moved if period.readings]
+    assert seen
+    assert set(seen[-1].readings[-1].sample.frame.readings) == {"tip", "ref1", "ref2", "ref3"}
+    last = done.periods[-1].time
+    assert all(period.applied == STILL for period in done.periods if period.time > last - 0.35)
+    numbers = [one.sample.frame.number for period in done.periods for one in period.readings]
+    assert numbers == sorted(set(numbers))
+
+
+REGISTERED = """
+[tracker.registration]
+rotation = [0.7071067811865476, 0.7071067811865476, 0.0, 0.0]  # a quarter turn about x
+translation_mm = [1.0, 2.0, 3.0]
+fiducials_mm = [[0.0, 0.0, 0.0], [80.0, 0.0, 0.0], [0.0, 80.0, 0.0]]
+"""
+
+
+def test_the_example_in_the_docs_sees_the_tip_in_the_stages_frame(tmp_path, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs/tracking/register.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    preset = files("flexneedle.scenario").joinpath("presets/phantom.toml").read_text(encoding="utf-8")
+    (tmp_path / "mine.toml").write_text(preset + REGISTERED, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    with emulated("--still") as path:
+        names = {"driver": None, "samples": [], "until": until}
+        within = "    until(lambda: samples.extend(rig.tracker.read()) or samples)\n"
+        exec(code.replace("/dev/ttyUSB0", path) + within, names)
+    sample = names["samples"][0]
+    np.testing.assert_allclose((sample.x, sample.y, sample.z), (1.0, 202.0, 3.0), atol=1.0)

@@ -1,0 +1,343 @@
+"""Insertions with a simulated electromagnetic tracker: its room, its monitor, its sensor behind the tip."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from rooms import STILL, shipped
+
+import flexneedle
+from flexneedle.rig.loop import run
+from flexneedle.rig.tracking.field.poses import reference_poses
+from flexneedle.rig.tracking.field.room import Room
+from flexneedle.rig.tracking.field.sensors import indicator, noiseless
+from flexneedle.rig.tracking.placement import placed_references
+from flexneedle.rig.tracking.plane import InPlane
+from flexneedle.rig.virtual import Rig, Seeds, to_stage, virtual_rig, virtual_room
+from flexneedle.types import Frame, Reading
+
+PHANTOM = flexneedle.load_scenario("phantom")
+PLATE = shipped("noisy").plate
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return flexneedle.plan(PHANTOM, (30.0, 0.0), seed=1)
+
+
+@pytest.fixture(scope="module")
+def inserted(plan):
+    """Return the insertion in an environment with a plate that moves; each carried out once."""
+
+    @cache
+    def insert(environment, enabled=True, seed=3, plate_at=None):
+        scenario = PHANTOM.with_values({"tracker.environment": environment, "monitor.enabled": enabled})
+        if plate_at is not None:
+            plate = {"tracker.environment.plate": PLATE.model_dump(mode="json")}
+            scenario = scenario.with_values(plate)
+        phantom, tracker, control, room = np.random.SeedSequence(seed).spawn(4)
+        rig = virtual_rig(
+            scenario, plan.bevel, Seeds(phantom, tracker, room), "model", plate_distance_at=plate_at
+        )
+        return run(scenario, plan, rig, np.random.default_rng(control))
+
+    return insert
+
+
+def passing(time):
+    """A plate that lies near from the 4th to the 7th second."""
+    return 50.0 if 4.0 <= time < 7.0 else 1000.0
+
+
+def test_in_a_clean_field_nothing_is_held(inserted):
+    done = inserted("ideal")
+    assert done.outcome == "done"
+    assert done.held_s == 0.0
+    assert done.true_error_mm < 2.0
+    told = done.periods[-1].readings[-1].sample
+    assert set(told.frame.readings) == {"tip", "ref1", "ref2", "ref3"}
+    assert 0.0 < abs(told.z) < 3.0
+
+
+def test_over_metal_the_needle_is_held_and_the_insertion_given_up(inserted):
+    held = inserted("noisy")
+    assert held.outcome == "held"
+    assert held.reason.startswith("held for 10.00 s (limit 10 s): field distorted: ref")
+    assert held.held_s == pytest.approx(10.0, abs=0.3)
+    assert held.true_error_mm > 20.0  # before the skin
+
+
+def test_without_the_monitor_it_goes_on_over_metal(inserted):
+    assert inserted("noisy", enabled=False).outcome == "done"
+
+
+def test_a_plate_that_comes_and_goes_holds_the_needle_as_long_as_it_is_there(inserted):
+    done = inserted("ideal", plate_at=passing)
+    field = [period for period in done.periods if period.verdict.startswith("field distorted")]
+    assert 4.3 < field[0].time < 5.1  # half a second of readings, which come 0.2 s late
+    assert 7.3 < field[-1].time < 8.1
+    held = [period for period in done.periods if field[0].time < period.time <= field[-1].time]
+    assert {period.decision for period in held} == {"held"}
+    assert {period.applied for period in held} == {(0.0, 0.0, 0.0, 0.0, -1)}
+    assert {period.innovation for period in held} == {(0.0, 0.0)}  # nothing is learnt from a distorted field
+    assert done.outcome == "done"
+    assert done.held_s == pytest.approx(field[-1].time - field[0].time, abs=0.1)
+
+
+class Interrupted:
+    """A tracker that tells nothing in the calls, or nothing of the tip, within a span (s)."""
+
+    status = "unplugged"
+
+    def __init__(self, tracker, clock, span, calls):
+        self.tracker, self.clock, self.span, self.calls, self.late = tracker, clock, span, calls, ()
+
+    def read(self):
+        if self.calls and self.span[0] <= self.clock.now() < self.span[1]:
+            self.late += self.tracker.read()
+            return ()
+        samples, self.late = self.late + self.tracker.read(), ()
+        lost = [
+            replace(sample, x=None, y=None) if self.span[0] <= sample.time < self.span[1] else sample
+            for sample in samples
+        ]
+        return samples if self.calls else tuple(lost)
+
+
+def interrupted(plan, span, calls, **values):
+    scenario = PHANTOM.with_values(
+        {"tracker.environment": "ideal", "tracker.environment.plate": PLATE.model_dump(mode="json"), **values}
+    )
+    phantom, tracker, control, room = np.random.SeedSequence(3).spawn(4)
+    seeds = Seeds(phantom, tracker, room)
+    rig = virtual_rig(scenario, plan.bevel, seeds, "model", plate_distance_at=passing)
+    rig = replace(rig, tracker=Interrupted(rig.tracker, rig.clock, span, calls))
+    return run(scenario, plan, rig, np.random.default_rng(control))
+
+
+def test_a_call_between_two_frames_ends_no_hold_and_aborts_nothing(plan):
+    done = interrupted(plan, (6.0, 6.06), calls=True)
+    silent = [period for period in done.periods if not period.readings]
+    assert silent
+    assert all(period.verdict.startswith("field distorted") for period in silent)
+    assert done.outcome == "done"
+
+
+def test_a_hold_for_a_reading_has_a_clock_of_its_own_after_a_hold_for_the_field(plan):
+    """The tip is lost while the field clears, for 0.7 s: less than the second that a reading is waited for."""
+    done = interrupted(plan, (7.0, 8.3), calls=False)
+    verdicts = [period.verdict.split(":")[0] for period in done.periods if period.decision == "held"]
+    assert {"field distorted", "missing"} <= set(verdicts)
+    assert done.outcome == "done"
+    lost = interrupted(plan, (7.0, 9.5), calls=False)
+    assert lost.outcome == "held"
+    assert "(limit 1 s): missing" in lost.reason
+
+
+def test_silence_of_the_tracker_holds_once_its_last_reading_is_stale(plan):
+    done = interrupted(plan, (2.0, 2.6), calls=True, **{"phantom.delay_periods": 0.0})
+    silent = [period for period in done.periods if not period.readings]
+    assert {period.verdict for period in silent} == {"ok", "missing: no reading (unplugged)"}
+    assert done.outcome == "done"
+
+
+def test_nothing_moves_before_the_field_was_judged(inserted):
+    for environment, verdict in (("ideal", "ok"), ("noisy", "field distorted")):
+        first = inserted(environment).periods[0]
+        assert first.time == 0.0
+        assert first.applied == (0.0, 0.0, 0.0, 0.0, -1)
+        assert len(first.readings) == 40
+        assert first.verdict.startswith(verdict)
+    held = inserted("noisy")
+    verdicts = {one.verdict.split(":")[0] for period in held.periods for one in period.readings}
+    assert verdicts == {"field distorted", "missing"}  # none is told to be good
+    assert {period.applied for period in held.periods} == {(0.0, 0.0, 0.0, 0.0, -1)}
+    assert held.periods[-1].true_tip == held.periods[0].true_tip
+
+
+def test_without_a_plate_the_same_run_is_not_held(inserted):
+    assert inserted("ideal", plate_at=lambda _: 1000.0).held_s == 0.0
+
+
+def test_each_insertion_has_a_room_of_its_own_unless_one_is_chosen():
+    def errors(**values):
+        scenario = PHANTOM.with_values({"tracker.environment": "ideal", **values})
+        rooms = [virtual_room(scenario, np.random.SeedSequence(seed))[0] for seed in (1, 2)]
+        return [room.error("tip", np.zeros((1, 3))) for room in rooms]
+
+    one, other = errors()
+    assert np.abs(one - other).max() > 1e-3
+    one, other = errors(**{"tracker.field_seed": 5})
+    np.testing.assert_array_equal(one, other)
+
+
+def rig_of(**values):
+    scenario = PHANTOM.with_values(
+        {
+            "tracker.environment": STILL,
+            "phantom.missing_fraction": 0.0,
+            "phantom.delay_periods": 0.0,
+            **values,
+        }
+    )
+    return virtual_rig(scenario, 1, Seeds(*map(np.random.SeedSequence, (1, 2, 3))), "model")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_bias_of_the_scenario_is_in_an_environment_too(seed):
+    scenario = PHANTOM.with_values(
+        {
+            "tracker.environment": STILL,
+            "phantom.missing_fraction": 0.0,
+            "phantom.delay_periods": 0.0,
+            "phantom.tracker_bias_mm": 0.3,
+        }
+    )
+    rig = virtual_rig(scenario, 1, Seeds(*map(np.random.SeedSequence, (seed, 2, 3))), "model")
+    rig.driver.apply((1.0, 0.0, 0.0, 0.2, -1), 0.2)
+    sample = rig.tracker.read()[-1]
+    off = np.array((sample.x, sample.y)) - rig.truth().tip[:2]
+    assert np.hypot(*off) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("offset", [0.0, 8.0])
+def test_a_sensor_behind_the_tip_tells_where_the_tip_is(offset):
+    rig = rig_of(**{"tracker.tip_offset_mm": offset})
+    for _ in range(30):
+        rig.driver.apply((1.0, 0.0, 0.0, 0.2, -1), 0.2)
+    sample = rig.tracker.read()[-1]
+    np.testing.assert_allclose((sample.x, sample.y), rig.truth().tip[:2], atol=1e-9)
+    sensor = np.array(sample.frame.readings["tip"].position)
+    assert np.linalg.norm(sensor[:2] - rig.truth().tip[:2]) == pytest.approx(offset, abs=1e-9)
+
+
+def clean_indicators(room, poses):
+    """What the references tell without noise."""
+    spacing = room.environment.reference.spacing_mm
+    seen = [
+        noiseless(room, name, np.array([pose.position]), np.array([pose.orientation]))
+        for name, pose in poses.items()
+    ]
+    return np.array([indicator(one.coils, spacing)[0] for one in seen])
+
+
+def test_references_are_put_where_the_field_is_clean():
+    """At their first places some are above three quarters of the threshold; then hardly any is, but for noise."""
+    limit = 0.75 * PHANTOM.monitor.indicator_limit
+    above = moved = dirty_still = 0
+    for seed in range(60):
+        room, rng = Room(shipped("ideal"), seed), np.random.default_rng(seed)
+        first = reference_poses(room.environment, (0.0, 0.0, 0.0))
+        placed = placed_references(room, (0.0, 0.0, 0.0), limit, rng)
+        dirty = clean_indicators(room, first) > limit
+        above += dirty.any()
+        moved += placed != first
+        dirty_still += clean_indicators(room, placed).max() > 1.1 * limit
+        apart = [np.subtract(placed[name].position, first[name].position) for name in first]
+        assert np.linalg.norm(apart, axis=1).max() <= 30.0
+    assert 5 < above < 40
+    assert abs(moved - above) < 6
+    assert dirty_still <= 1
+
+
+def test_references_are_placed_about_the_workspace_wherever_it_is():
+    room, limit = Room(shipped("noisy"), 3), 0.04
+    centers = ((0.0, 0.0, 0.0), (20.0, -5.0, 7.0))
+    here, there = (placed_references(room, c, limit, np.random.default_rng(0)) for c in centers)
+    assert here != reference_poses(room.environment, centers[0])  # some were moved
+    for name, pose in here.items():
+        np.testing.assert_allclose(np.subtract(there[name].position, centers[1]), pose.position, atol=1e-9)
+
+
+class Bench:
+    """A clock that adds up, a driver that moves nothing, and a tracker that tells what `told_at(time)` says: readings
+    by sensor at 40 Hz since a second before the start, None for no frame."""
+
+    def __init__(self, told_at, status="unplugged"):
+        self.time, self.told_at, self.status, self.number = 0.0, told_at, status, -40
+
+    def now(self):
+        assert self.time < 60.0, "nobody ends it"
+        return self.time
+
+    def wait(self, seconds):
+        self.time += seconds
+
+    def apply(self, command, duration):
+        self.time += duration
+        return command
+
+    def read(self):
+        numbers = range(self.number, round(self.time * 40) + 1)
+        self.number = numbers.stop
+        told = [(number, self.told_at(number / 40)) for number in numbers]
+        return tuple(Frame(n / 40, n + 40, readings) for n, readings in told if readings is not None)
+
+
+def on_bench(plan, told_at, status="unplugged", **values):
+    bench = Bench(told_at, status)
+    rig = Rig(bench, bench, InPlane(bench, to_stage(None)))
+    return run(PHANTOM.with_values(values), plan, rig, np.random.default_rng(0))
+
+
+AT_START = Reading((-28.5, 0.0, 0.0))
+LOST = Reading(None, status="out of volume")
+
+
+def references(indicator):
+    return {name: Reading((0.0, 50.0, 0.0), indicator=indicator) for name in ("ref1", "ref2", "ref3")}
+
+
+def test_causes_that_take_turns_hold_nothing_forever(plan):
+    """The tip is never seen, a reference only for half a second in 0.8 s: 1 s of one cause is soon over."""
+
+    def told_at(time):
+        return {"tip": LOST, **references(0.02)} | ({"ref2": LOST} if time % 0.8 >= 0.5 else {})
+
+    done = on_bench(plan, told_at, **{"monitor.indicator_window_s": 0.1})
+    causes = {period.verdict.split(":")[0] for period in done.periods}
+    assert causes == {"missing", "field not known"}
+    assert done.outcome == "held"
+    assert "(limit 1 s): missing: tracker sees no tip (out of volume)" in done.reason
+    assert done.periods[-1].time < 2.0
+
+
+def test_time_held_for_a_reading_is_no_time_held_for_the_field(plan):
+    """The field is bent but from 6 to 8 s, the median follows in half a second; until then nobody sees the tip."""
+
+    def told_at(time):
+        seen = {"tip": LOST if 6.0 <= time < 8.6 else AT_START}
+        return seen | references(0.02 if 6.0 <= time < 8.0 else 0.2)
+
+    done = on_bench(plan, told_at, **{"control.hold_limit_s": 5.0})
+    kinds = [period.verdict.split(":")[0] for period in done.periods]
+    assert list(dict.fromkeys(kinds)) == ["field distorted", "missing"]
+    assert done.reason.startswith("held for 10.0")
+    assert done.periods[-1].time == pytest.approx(12.0, abs=0.1)  # of which 2 s are not the field's
+
+
+def test_nothing_moves_before_the_tracker_told_anything(plan):
+    """As a real one that is still connecting, in a field that turns out to be distorted."""
+
+    def told_at(time):
+        return {"tip": AT_START, **references(0.2)} if time > 0.1 else None
+
+    done = on_bench(plan, told_at, status="connecting")
+    assert done.periods[0].verdict == "missing: no reading (connecting)"
+    assert {period.applied for period in done.periods} == {(0.0, 0.0, 0.0, 0.0, -1)}
+    assert done.reason.startswith("held for 10.0")
+    kinds = list(dict.fromkeys(period.verdict.split(":")[0] for period in done.periods))
+    assert kinds == ["missing", "field not known", "field distorted"]
+
+
+def test_a_tracker_that_falls_silent_in_a_distorted_field_is_said_to_be_silent(plan):
+    def told_at(time):
+        return {"tip": AT_START, **references(0.2)} if time < 0.5 else None
+
+    done = on_bench(plan, told_at)
+    assert done.outcome == "held"
+    assert done.reason.endswith("(limit 1 s): missing: no reading (unplugged)")
+    assert 1.5 < done.periods[-1].time < 2.0
+    silent = [period for period in done.periods if not period.readings]
+    assert {period.verdict.split(":")[0] for period in silent} == {"field distorted", "missing"}

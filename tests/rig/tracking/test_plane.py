@@ -1,0 +1,75 @@
+"""From a tracker's frame to the tip in the plane: maps cancel, the offset goes along the measured axis."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+from rooms import Watch, environment
+from scipy.spatial.transform import Rotation
+
+from flexneedle.rig.tracking.field.poses import tip_sensor_pose
+from flexneedle.rig.tracking.field.room import Room
+from flexneedle.rig.tracking.field.tracker import FieldTracker
+from flexneedle.rig.tracking.plane import InPlane, tip_in_plane
+from flexneedle.rig.tracking.registration import Rigid, identity
+from flexneedle.types import Frame, Reading
+
+ANGLES = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3)
+PLACES = st.lists(st.floats(-300.0, 300.0), min_size=3, max_size=3)
+
+
+def frame(**readings):
+    return Frame(1.5, 7, readings)
+
+
+@given(angles=ANGLES, shift=PLACES, tip=PLACES, turn=st.floats(-1.0, 1.0), offset=st.floats(0.0, 20.0))
+@hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
+def test_to_the_tracker_and_back_is_where_the_tip_is(angles, shift, tip, turn, offset):
+    there = Rigid(Rotation.from_euler("xyz", angles).as_matrix(), np.array(shift))
+    watch = Watch()
+    direction = (np.cos(turn), np.sin(turn), 0.0)
+    eye = FieldTracker(
+        Room(environment(), 0),
+        lambda _: {"tip": tip_sensor_pose(tip, direction, offset)},
+        watch,
+        0.025,
+        np.random.default_rng(0),
+        to_tracker=there,
+    )
+    watch.wait(0.05)
+    samples = InPlane(eye, there.inverse(), offset).read()
+    assert len(samples) == 2
+    for sample in samples:
+        assert (sample.x, sample.y, sample.z) == pytest.approx(tuple(tip), abs=1e-9)
+        assert sample.time == sample.frame.time
+
+
+def test_the_tip_lies_ahead_of_its_sensor():
+    """A needle along y: half a turn of a quarter about −x takes z there."""
+    half = np.sqrt(0.5)
+    reading = Reading((1.0, 2.0, 3.0), (half, -half, 0.0, 0.0))
+    sample = tip_in_plane(frame(tip=reading), identity(), 5.0)
+    assert (sample.x, sample.y, sample.z) == pytest.approx((1.0, 7.0, 3.0))
+
+
+@pytest.mark.parametrize(
+    "readings",
+    [
+        {},
+        {"ref1": Reading((0.0, 0.0, 0.0))},
+        {"tip": Reading(None, status="missing")},
+        {"tip": Reading(None)},
+        {"tip": Reading((1.0, 2.0, 3.0), status="out of volume")},
+    ],
+)
+def test_a_tip_that_is_not_seen_has_no_coordinates_but_its_frame(readings):
+    sample = tip_in_plane(frame(**readings), identity())
+    assert (sample.time, sample.x, sample.y, sample.z) == (1.5, None, None, None)
+    assert sample.frame == frame(**readings)
+
+
+def test_without_an_orientation_only_a_sensor_at_the_very_tip_tells_where_it_is():
+    reading = frame(tip=Reading((1.0, 2.0, 3.0)))
+    assert tip_in_plane(reading, identity(), 5.0).x is None
+    assert tip_in_plane(reading, identity()).x == pytest.approx(1.0)

@@ -1,0 +1,531 @@
+"""Reports from the folder of a study: one page that needs nothing else, its figures, and honest words."""
+
+import base64
+import json
+import math
+import re
+import shlex
+import xml.etree.ElementTree as ElementTree
+from html.parser import HTMLParser
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from flexneedle.errors import InputError
+from flexneedle.scenario.files import load_scenario
+from flexneedle.study.report.findings import planned_insertions
+from flexneedle.study.report.report import write_report
+from study_rows import BASE, OURS, make_rows, unfinished, write_study
+
+TARGETS = ((25.0, 0.0), (40.0, 5.0), (45.0, -5.0))
+BOTH = (OURS, "open-loop")
+EVIL = "<script>alert(1)</script> & \"'><img src=x onerror=alert(2)>"
+ABOUT = {
+    "format": 1,
+    "command": "flexneedle study mine.toml --workers 2",
+    "versions": {"flexneedle": "0.3.0"},
+    "study": {
+        "name": "mine",
+        "title": "My study",
+        "cases": {},
+        "axes": {"controller": list(BOTH), "target": [list(target) for target in TARGETS]},
+        "repeats": 4,
+    },
+}
+
+
+class Page(HTMLParser):
+    """A page taken apart: tags with attributes, and the text outside of style."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.tags, self.open, self.words = [], [], []
+        self.feed(path.read_text(encoding="utf-8"))
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.words.append(data)
+
+    def all(self, tag):
+        return [attributes for name, attributes in self.tags if name == tag]
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.words).split())
+
+
+@pytest.fixture
+def drawn_on(tmp_path):
+    """Return a function from rows to a report and its page."""
+
+    def write(rows, about=None, tuning=None, **options):
+        report = write_report(write_study(tmp_path / "study", rows, about, **options), tuning=tuning)
+        return report, Page(report.page)
+
+    return write
+
+
+@pytest.fixture
+def report_on(drawn_on, monkeypatch):
+    """Return the same without figures, which take long."""
+    monkeypatch.setattr("flexneedle.study.report.report.draw_figures", lambda *_: [])
+    return drawn_on
+
+
+@pytest.fixture
+def rows():
+    return make_rows(BOTH, targets=TARGETS, repeats=4)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A report that tests only look at, and its page."""
+    rows = make_rows(BOTH, targets=TARGETS, repeats=4)
+    report = write_report(write_study(tmp_path_factory.mktemp("study"), rows, ABOUT))
+    return report, Page(report.page)
+
+
+def names(report):
+    return [drawn.name for drawn in report.figures]
+
+
+def test_a_page_needs_nothing_but_itself(plain):
+    report, page = plain
+    assert page.open == []
+    assert not {"script", "link", "iframe", "object", "base"} & {tag for tag, _ in page.tags}
+    assert all(image["src"].startswith("data:image/") for image in page.all("img"))
+    assert not any("href" in attributes or "srcset" in attributes for _, attributes in page.tags)
+    style = report.page.read_text(encoding="utf-8").split("<style>")[1].split("</style>")[0]
+    assert not re.search(r"url\(|@import|https?:", style)
+    policy = next(meta["content"] for meta in page.all("meta") if "http-equiv" in meta)
+    assert policy.startswith("default-src 'none'")
+
+
+def test_a_page_is_made_for_people(plain):
+    _, page = plain
+    assert page.all("html") == [{"lang": "en"}]
+    assert "My study: report" in page.text
+    assert {"name": "viewport", "content": "width=device-width, initial-scale=1"} in page.all("meta")
+    assert all(len(image["alt"]) > 40 for image in page.all("img"))
+    assert len(page.all("table")) == len(page.all("caption"))
+    assert [tag for tag, _ in page.tags if tag in ("h1", "main")] == ["main", "h1"]
+
+
+def test_figures_in_the_page_are_those_in_the_folder(plain):
+    report, page = plain
+    inside = [base64.b64decode(image["src"].split(",")[1]) for image in page.all("img")]
+    assert inside == [drawn.svg.read_bytes() for drawn in report.figures]
+    for data in inside:
+        assert ElementTree.fromstring(data).tag.endswith("svg")
+    assert all(drawn.png.read_bytes().startswith(b"\x89PNG") for drawn in report.figures)
+
+
+def test_a_large_drawing_stands_in_the_page_as_png(drawn_on, rows, monkeypatch):
+    monkeypatch.setattr("flexneedle.study.report.page._LARGEST_SVG", 1000)
+    _, page = drawn_on(rows, ABOUT)
+    assert all(image["src"].startswith("data:image/png;base64,") for image in page.all("img"))
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, ["targeting", "errors-by-depth", "energy"]),
+        ({"controllers": BOTH}, ["targeting", "errors", "errors-by-depth", "controllers", "energy"]),
+        (
+            {"axes": {"contact.spacing_mm": [0.5, 1.0], "needle.gauge": ["18G", "21G"]}},
+            ["targeting", "errors-by-depth", "error-along-1", "error-along-2", "energy"],
+        ),
+        (
+            {"cases": {"base": {}, "a": {"phantom.run_out_mm": 1.0}, "b": {"phantom.initial_bend_mm": 1.0}}},
+            ["targeting", "errors-by-depth", "cases", "energy"],
+        ),
+        ({"targets": TARGETS[:1]}, ["targeting", "errors-by-depth", "energy"]),
+        ({"targets": TARGETS[:1], "controllers": BOTH}, ["targeting", "errors", "controllers", "energy"]),
+    ],
+)
+def test_figures_are_those_that_the_rows_support(drawn_on, options, expected):
+    assert names(drawn_on(make_rows(**{"targets": TARGETS, "repeats": 3} | options))[0]) == expected
+
+
+def test_cases_of_one_controller_are_drawn_apart_everywhere(drawn_on):
+    """Cases are there to differ: taken together their errors would be of nothing in particular."""
+    cases = {"base": {}, "skew": {"phantom.run_out_mm": 1.0}, "bent": {"phantom.initial_bend_mm": 1.0}}
+    rows = make_rows(cases=cases, targets=TARGETS, repeats=3)
+    for row in rows:
+        row["true_error_mm"] = 0.7 if row["case"] == "bent" else 0.2
+    drawn = {one.name: one for one in drawn_on(rows)[0].figures}
+    for name in ("targeting", "errors-by-depth", "energy"):
+        base, bent = drawn[name].alt.split("bent: ")
+        assert "base: " in base
+        assert "0.2" in base
+        assert "0.7" in bent
+        assert "together" not in drawn[name].caption
+
+
+def test_what_has_no_panel_of_its_own_is_said_to_be_taken_together(drawn_on):
+    axes = {"contact.spacing_mm": [0.5, 1.0], "needle.gauge": ["18G", "21G"]}
+    drawn = {one.name: one for one in drawn_on(make_rows(axes=axes, targets=TARGETS, repeats=3))[0].figures}
+    for name in ("errors-by-depth", "energy"):
+        assert "contact.spacing_mm" not in drawn[name].caption
+        assert "all levels of needle gauge together" in drawn[name].caption
+
+
+def test_a_study_of_which_nothing_finished_is_reported(drawn_on, rows):
+    report, page = drawn_on([unfinished(row, "refused", "plan misses") for row in rows])
+    assert names(report) == []
+    assert "24 insertions, 0 finished; 24 did not" in page.text
+    assert "24 of 24 insertions did not finish." in page.text
+
+
+def test_tips_alone_are_drawn_where_nothing_finished(drawn_on, rows):
+    assert names(drawn_on([unfinished(row) for row in rows])[0]) == ["targeting"]
+
+
+def test_numbers_of_the_page_are_those_of_the_summary(plain):
+    report, page = plain
+    group = report.values()["groups"][0]
+    found = {name: estimate["value"] for name, estimate in group["estimates"].items()}
+    for text in (
+        f"{found['mean_mm']:.3f} ± {found['sd_mm']:.3f}",
+        f"{found['p95_mm']:.3f}",
+        f"{group['largest_mm']:.3f}",
+        f"{found['flips']:.2f} ({found['planned_flips']:.2f})",
+        f"{found['period_ratio']:.3f} ({group['largest_period_ratio']:.3f})",
+        f"{group['estimates']['mean_mm']['low']:.3f} to {group['estimates']['mean_mm']['high']:.3f}",
+    ):
+        assert text in page.text
+    assert f"{OURS} is better than open-loop in mean true error: −" in page.text
+
+
+def test_a_default_that_is_worse_is_said_to_be(report_on, rows):
+    for row in rows:
+        row["true_error_mm"] *= 100.0 if row["controller"] == OURS else 1.0
+    assert f"{OURS} is worse than open-loop in mean true error: +" in report_on(rows)[1].text
+
+
+def test_where_the_default_stands_among_the_others_is_said_first(report_on):
+    rows = make_rows((OURS, "open-loop", "bevel-only"), targets=TARGETS, repeats=8)
+    assert f"{OURS} is better than every other controller in mean true error." in report_on(rows)[1].text
+    for row in rows:
+        if row["controller"] != "bevel-only":
+            row["true_error_mm"] = 0.9 + 0.001 * row["seed"]
+    _, page = report_on(rows)
+    assert (
+        f"{OURS} is better than 0 of 2 other controllers in mean true error; "
+        "not separable from open-loop; worse than bevel-only." in page.text
+    )
+
+
+def test_differences_are_given_at_each_depth(report_on):
+    rows = make_rows(BOTH, targets=TARGETS, repeats=10)
+    for row in rows:
+        deep = row["target_depth_mm"] == 45.0
+        row["true_error_mm"] = (0.3 if row["controller"] == OURS else 0.1 if deep else 0.6) + 1e-4 * row[
+            "seed"
+        ]
+    report, page = report_on(rows)
+    found = report.values()["controllers_by_depth"]
+    assert {depth: one["mean_mm"]["value"] for depth, (one,) in found.items()} == pytest.approx(
+        {"25": -0.3, "40": -0.3, "45": 0.2}
+    )
+    assert [one["verdict"] for (one,) in found.values()] == ["better", "better", "worse"]
+    assert "45 mm deep" in page.text
+    assert "+0.200" in page.text
+
+
+def test_what_the_insertions_took_stands_beside_the_plans(report_on):
+    rows = make_rows(targets=TARGETS, repeats=4)
+    for row in rows:
+        row |= {"flips": 3, "planned_flips": 1, "periods": 66, "planned_periods": 60}
+        row |= {"strain_energy_mj": 0.006, "planned_strain_energy_mj": 0.005, "unconverged_periods": 0}
+    rows[0] |= {"unconverged_periods": 2, "periods": 72}
+    rows[1] |= {"unconverged_periods": 5}
+    report, page = report_on(rows)
+    head = page.text[: page.text.index("Figures")]
+    assert "bevel turns 3.00 plan's 1.00" in head
+    assert "tissue energy / plan's 1.20 1.20 to 1.20" in head
+    assert "periods / plan's 1.11 largest 1.20" in head
+    assert "periods not converged 7 in 2 insertions" in head
+    assert report.values()["groups"][0]["unconverged_periods"] == 7
+
+
+def test_small_energies_are_not_said_to_be_none(drawn_on):
+    rows = [row | {"strain_energy_mj": 0.0042} for row in make_rows(targets=TARGETS, repeats=2)]
+    report, _ = drawn_on(rows)
+    assert "medians 0.0042 mJ" in {drawn.name: drawn for drawn in report.figures}["energy"].alt
+
+
+def test_command_versions_and_definitions_are_there(report_on, rows):
+    _, page = report_on(rows, ABOUT)
+    for text in (
+        "flexneedle study mine.toml --workers 2",
+        "numba 0.68.0",
+        "linear interpolation",
+        "2000 resamples, seed 0",
+        "phantom.run_out_mm 0.2",
+    ):
+        assert text in page.text
+
+
+def test_tuning_is_shown_beside_the_settings_of_the_study(report_on, rows, tmp_path):
+    for method, gain, score in (("open-loop", 0.3, 0.2), (OURS, 0.5, 0.1), ("no-one", 0.1, 0.3)):
+        record = {"method": method, "chosen": {"control.load_gain": gain}, "budget_insertions": 200}
+        record |= {"phantom_seeds": [5000, 5049], "trials": [{"score_mm": score}]}
+        record |= {"note": "seeds 1 to 9 before" if method == OURS else ""}
+        (tmp_path / f"{method}.json").write_text(json.dumps(record))
+    text = report_on(rows, tuning=tmp_path)[1].text
+    gain = BASE["control.load_gain"]
+    assert gain == 0.3
+    assert "open-loop 200 5000 to 5049 – 0.200 control.load_gain = 0.3 as chosen" in text
+    ours = f"{OURS} 200 5000 to 5049 seeds 1 to 9 before 0.100 control.load_gain = 0.5"
+    assert f"{ours} not as chosen: control.load_gain" in text
+    assert "no-one" not in text
+
+
+def test_the_tuning_that_the_package_ships_is_shown_in_any_folder(report_on, rows, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = report_on([row | {"controller": "ce-mpc"} for row in rows])[1].text
+    told = text.split("Settings chosen by tuning")[1]
+    assert "ce-mpc 200 5000 to 5069 – " in told
+    assert "as chosen" in told
+    assert "resolved-rate" not in told
+
+
+@pytest.mark.parametrize("content", ["{", "{}", '{"method": "a"}'])
+def test_damaged_records_of_tuning_are_refused(report_on, rows, tmp_path, content):
+    with pytest.raises(InputError, match="holds no records of tuning"):
+        report_on(rows, tuning=tmp_path)
+    (tmp_path / "a.json").write_text(content)
+    with pytest.raises(InputError, match=r"a\.json: "):
+        report_on(rows, tuning=tmp_path)
+
+
+def test_what_did_not_finish_is_counted_and_listed(report_on, rows):
+    rows[0] = unfinished(rows[0], "held", "held for 1.03 s")
+    rows[5] = unfinished(rows[5], "held", "held for 2.00 s")
+    rows[7] = unfinished(rows[7], "error", "ZeroDivisionError: x") | {"unconverged_periods": 2}
+    report, page = report_on(rows)
+    assert "3 of 24 insertions did not finish." in page.text
+    assert "held 2 held for 1.03 s 0 flexneedle insert" in page.text
+    assert "error 1 ZeroDivisionError: x 7 flexneedle insert" in page.text
+    assert "1 insertion has periods whose solve did not converge" in page.text
+    assert report.values()["finished"] == 21
+    rows[9]["unconverged_periods"] = 1
+    assert "2 insertions have periods whose solve did not converge" in report_on(rows)[1].text
+    assert "1 insertion, 1 finished." in report_on(rows[9:10])[1].text
+
+
+def test_an_incomplete_study_is_said_to_be_first_of_all(report_on, rows):
+    _, page = report_on(rows[:17], ABOUT)
+    alarm = "This study is not complete: 17 of 24 insertions are in."
+    assert alarm in page.text
+    assert page.text.index(alarm) < page.text.index("mean true error")
+    assert "not complete" not in report_on(rows, ABOUT)[1].text
+
+
+def test_planned_insertions_are_repeats_times_cases_times_axes():
+    assert planned_insertions(ABOUT) == 4 * 2 * 3
+    with_cases = {"study": ABOUT["study"] | {"cases": {"a": {}, "b": {}}, "repeats": 10}}
+    assert planned_insertions(with_cases) == 120
+    assert planned_insertions({}) is None
+
+
+def test_the_worst_can_be_run_again(report_on):
+    rows = make_rows(("open-loop",), targets=TARGETS, repeats=5)
+    report, page = report_on(rows)
+    worst = report.values()["worst"]
+    assert len(worst) == 10
+    first = max(rows, key=lambda row: row["true_error_mm"])
+    assert worst[0]["index"] == first["index"]
+    assert worst[0]["command"] == (
+        f"flexneedle insert phantom --target {first['target_depth_mm']:g} {first['target_lateral_mm']:g} "
+        f"--seed {first['seed']} --plan-seed 0 --controller open-loop --phantom exact --strategy manipulation"
+    )
+    assert worst[0]["command"] in page.text
+
+
+def test_other_scenarios_are_written_for_it(report_on):
+    cases = {
+        "base": {},
+        "bent": {"phantom.initial_bend_mm": 5.0},
+        "soft": {"tissue.1.shear_modulus_kpa": 2.0},
+    }
+    rows = make_rows(cases=cases, targets=TARGETS, repeats=2)
+    for row in rows:
+        row["true_error_mm"] = {"base": 0.1, "bent": 2.0, "soft": 3.0}[row["case"]] + 1e-3 * row["index"]
+    report, _ = report_on(rows)
+    used = [shlex.split(entry["command"])[2] for entry in report.values()["worst"]]
+    assert used == ["scenario-1.toml"] * 6 + ["scenario-2.toml"] * 4
+    soft, bent = (load_scenario(report.page.parent / name) for name in ("scenario-1.toml", "scenario-2.toml"))
+    ours = {"target.depth_mm", "target.lateral_mm", "name"}
+    for scenario, changed in ((soft, cases["soft"]), (bent, cases["bent"])):
+        flat = {key: value for key, value in scenario.flat().items() if key not in ours}
+        assert flat == {key: value for key, value in (BASE | changed).items() if key not in ours}
+
+
+def test_settings_of_another_version_make_no_command(report_on, rows):
+    report, page = report_on([row | {"phantom.no_such_key": 1.0} for row in rows])
+    assert report.values()["worst"][0]["command"] == ""
+    assert "its settings make no scenario of this version" in page.text
+
+
+def test_text_from_data_is_only_text(drawn_on, rows):
+    about = {"command": EVIL, "study": {"name": EVIL, "title": EVIL}}
+    evil = [row | {"controller": EVIL, "case": EVIL, "version_numpy": EVIL} for row in rows[:12]]
+    evil[3] = unfinished(evil[3], EVIL, EVIL)
+    report, page = drawn_on([*evil, *rows[12:]], about)
+    assert not page.all("script")
+    assert all(
+        "onerror" not in attributes and set(attributes) <= {"src", "alt"} for attributes in page.all("img")
+    )
+    assert EVIL in " ".join(page.words)
+    assert all(b"<script>" not in drawn.svg.read_bytes() for drawn in report.figures)
+
+
+def test_two_reports_of_the_same_rows_differ_at_most_in_the_run(tmp_path, rows):
+    pages = []
+    for part, timing in (("first", True), ("second", False)):
+        about = ABOUT | {"command": f"flexneedle study mine --out {part}"}
+        report = write_report(
+            write_study(tmp_path / part, rows, about, timing=timing), tmp_path / f"{part}-report"
+        )
+        pages.append(re.sub(r'<section id="run">.*?</section>', "", report.page.read_text(), flags=re.DOTALL))
+    assert pages[0] == pages[1]
+    files = sorted(path.name for path in (tmp_path / "first-report").iterdir())
+    assert files == sorted(path.name for path in (tmp_path / "second-report").iterdir())
+    for name in set(files) - {"report.html"}:
+        assert (tmp_path / "first-report" / name).read_bytes() == (
+            tmp_path / "second-report" / name
+        ).read_bytes()
+
+
+def test_rows_in_another_order_are_the_same_study(report_on, rows):
+    first = report_on(rows)[0].values()["groups"]
+    assert report_on(rows[::-1])[0].values()["groups"] == first
+
+
+def test_time_is_divided_and_a_plan_counts_once(report_on, rows, tmp_path):
+    folder = write_study(tmp_path / "timed", rows)
+    times = [
+        {"index": k, "plan": f"{k % 2}", "plan_s": 3.0, "control_s": 0.5, "plant_s": 0.25, "total_s": 1.0}
+        for k in range(len(rows))
+    ]
+    pq.write_table(pa.Table.from_pylist(times), folder / "timing.parquet")
+    text = Page(write_report(folder).page).text
+    for line in (
+        "plan 6.0 20 % 3000",
+        "control 12.0 40 % 500",
+        "plant 6.0 20 % 250",
+        "insertions 6.0 20 % 250",
+    ):
+        assert line in text
+    assert "No times are recorded." in report_on(rows, timing=False)[1].text
+
+
+def test_a_report_goes_where_it_is_told(tmp_path, rows, report_on):
+    folder = tmp_path / "study"
+    assert report_on(rows)[0].page == folder / "report" / "report.html"
+    assert write_report(folder, tmp_path / "a" / "b").page == tmp_path / "a" / "b" / "report.html"
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be written"):
+        write_report(folder, tmp_path / "file")
+
+
+def lacking(folder, rows):
+    write_study(folder, [{key: value for key, value in row.items() if key != "outcome"} for row in rows])
+
+
+def twice(folder, rows):
+    write_study(folder, [*rows, rows[3]])
+
+
+def damaged(folder, rows):
+    path = write_study(folder, rows) / "runs.parquet"
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def no_json(folder, rows):
+    (write_study(folder, rows) / "study.json").write_text("{")
+
+
+def no_object(folder, rows):
+    (write_study(folder, rows) / "study.json").write_text("[1]")
+
+
+def only_begun(folder, _rows):
+    folder.mkdir()
+    (folder / "study.json").write_text("{}")
+
+
+def with_column(name, values):
+    """Return what writes a study with another column of that name: a value, or a list of them, a row each."""
+
+    def write(folder, rows):
+        given = values if isinstance(values, list) else [values] * len(rows)
+        write_study(folder, [row | {name: value} for row, value in zip(rows, given, strict=True)])
+
+    return write
+
+
+def with_study(**changed):
+    """Return what writes a study of which study.json says something else."""
+    return lambda folder, rows: write_study(folder, rows, ABOUT | {"study": ABOUT["study"] | changed})
+
+
+def without_rows(folder, rows):
+    path = write_study(folder, rows) / "runs.parquet"
+    pq.write_table(pq.read_table(path).slice(0, 0), path)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda *_: None, "no such folder: give the folder that"),
+        (lambda folder, _: folder.mkdir(), "holds no study: there is no runs.parquet"),
+        (only_begun, "the study was killed, or still goes on"),
+        (damaged, "runs.parquet: damaged, or no Parquet file"),
+        (without_rows, "holds no insertion"),
+        (lacking, "not the rows of a study: lacks the columns outcome"),
+        (twice, "damaged: index 3 stands more than once"),
+        (no_json, "study.json: damaged"),
+        (no_object, "must hold one JSON object"),
+        (with_column("index", "a"), "runs.parquet: .* index of row 1 is 'a': must be a whole number"),
+        (with_column("index", [*range(23), None]), "index of row 24 is None: must be a whole number"),
+        (with_column("controller", 3), "controller of row 1 is 3: must be text"),
+        (with_column("target_depth_mm", "far"), "target_depth_mm of row 1 is 'far': must be a finite number"),
+        (with_column("target_depth_mm", None), "target_depth_mm of row 1 is None: must be a finite number"),
+        (with_column("target_lateral_mm", math.inf), "target_lateral_mm of row 1 is inf: must be a finite"),
+        (with_column("seed", 0.5), "seed of row 1 is 0.5: must be a whole number"),
+        (with_column("seed", True), "seed of row 1 is True: must be a whole number"),
+        (with_column("true_error_mm", "0.1"), "true_error_mm of row 1 is '0.1': .* number .*, or missing"),
+        (with_column("true_error_mm", [0.1] * 23 + [math.inf]), "true_error_mm of row 24 is inf: must be a"),
+        (with_column("outcome", None), "outcome of row 1 is None: must be text"),
+        (with_column("outcome", [b"a\nb"] * 24), "runs.parquet: .* outcome is binary: columns must be of"),
+        (with_column("mine.own", {"a": 1}), "runs.parquet: .* mine.own is struct<.*>: columns must be of"),
+        (with_study(cases=3), "study.json: damaged: cases is 3: must be an object"),
+        (with_study(cases=["a"]), r"cases is \['a'\]: must be an object"),
+        (with_study(cases={"a": 3}), "cases is {'a': 3}: must be an object with an object of settings"),
+        (with_study(axes=[1, 2]), r"study.json: damaged: axes is \[1, 2\]: must be an object"),
+        (with_study(axes={"target": 3}), "axes is {'target': 3}: must be an object with a list of values"),
+        (with_study(repeats="x"), "repeats is 'x': must be a whole number, at least 1"),
+        (with_study(repeats=0), "repeats is 0: must be a whole number, at least 1"),
+        (lambda folder, rows: write_study(folder, rows, {"study": 3}), "study is 3: must be an object"),
+    ],
+)
+def test_what_cannot_be_reported_is_said_in_one_line(tmp_path, rows, spoil, message):
+    folder = tmp_path / "study"
+    spoil(folder, rows)
+    with pytest.raises(InputError, match=message) as caught:
+        write_report(folder)
+    assert "\n" not in str(caught.value)
+    assert str(folder) in str(caught.value)

@@ -1,0 +1,197 @@
+"""Reports on random worlds: errors against open loop and reach, the worst with the commands that repeat them."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from flexneedle.control.methods import DEFAULT
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.worlds import world
+from flexneedle.study.grid import load_study
+from flexneedle.study.plans import Plans
+from flexneedle.study.report.report import write_report
+from flexneedle.study.rows import RESULTS
+from flexneedle.study.runner import _bounding
+from flexneedle.study.tables import write_tables
+
+FREE, GUIDED = (15, 16, 31), (1, 2, 3, 4)
+STUDY = f"""
+name = "few"
+title = "A few worlds"
+[[cases]]
+name = "perfect"
+values = {{ world_case = "perfect", plant = "model" }}
+[[cases]]
+name = "structure"
+values = {{ world_case = "structure" }}
+[[axes]]
+key = "world"
+values = {[*FREE, *GUIDED]}
+[[axes]]
+key = "controller"
+values = ["{DEFAULT}", "open-loop"]
+"""
+ERRORS = {  # of the perfect case, by controller and world (mm)
+    DEFAULT: {1: 0.02, 2: 0.5, 3: 1.6, 4: None, 15: 0.1, 16: 4.4, 31: None},
+    "open-loop": {1: 0.01, 2: 0.2, 3: 1.5, 4: 0.1, 15: 0.3, 16: None, 31: 2.0},
+}
+REACH = {1: 0.0, 2: 0.0, 3: 0.0, 4: 0.0, 15: 0.0, 16: 4.0, 31: 3.0}
+
+
+SIGMAS = {
+    1: (0.5, 1.0, 1.9),
+    2: (1.0, -2.1, 1.0),
+    3: (3.0, -3.0, 2.0),
+    15: (None, None, 0.0),
+}  # of the default
+WARNED = (2, 15)  # worlds of the default's perfect case with a warning
+
+
+def row_of(study, index, bounded):
+    insertion = study.insertion(index)
+    point = insertion.point
+    error = ERRORS[point.controller][point.world] if point.case == "perfect" else 0.05
+    depth, lateral = point.scenario.target.position
+    return dict.fromkeys(RESULTS) | {
+        "index": index,
+        "true_error_mm": error,
+        "tip_x_mm": depth,
+        "tip_y_mm": lateral + (error or 0.0),
+        **predicted(point, error),
+        "strain_energy_mj": 2.0 ** (point.world % 3),
+        "planned_strain_energy_mj": 1.0,
+        "unconverged_periods": 0,
+        "reach_mm": REACH[point.world] if bounded else None,
+        "outcome": "done" if error is not None else "held",
+        "reason": "" if error is not None else "held for 1.00 s",
+    }
+
+
+def predicted(point, error):
+    """A standard deviation of 0.1 mm, and predictions that are off by so many of them."""
+    if (point.controller, point.case) != (DEFAULT, "perfect"):
+        return {}
+    places = zip(("quarter", "half", "three_quarters"), SIGMAS.get(point.world, [None] * 3), strict=True)
+    found = {"warning": "predicted miss" if point.world in WARNED else ""}
+    for place, off in places:
+        if off is not None:
+            found |= {f"predicted_{place}_mm": error + 0.1 * off, f"predicted_{place}_sd_mm": 0.1}
+    return found
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("worlds")
+    (folder / "few.toml").write_text(STUDY)
+    study = load_study(folder / "few.toml")
+    bounding = _bounding(study)
+    rows = {k: row_of(study, k, id(study.insertion(k).point) in bounding) for k in range(len(study))}
+    write_tables(folder, study, rows, Plans(folder / "plans"))
+    (folder / "study.json").write_text(json.dumps({"study": study.definition}))
+    return write_report(folder)
+
+
+def group(report, controller, case, guide):
+    levels = {"controller": controller, "case": case, "guide": guide}
+    (found,) = [group for group in report.findings.worlds if group.levels == levels]
+    return found
+
+
+def test_groups_are_controllers_cases_and_whether_there_is_a_guide(report):
+    """None of the hundred values that differ from world to world, and no plant, which the case has said."""
+    assert [list(group.levels.values()) for group in report.findings.worlds] == [
+        [controller, case, guide]
+        for controller in (DEFAULT, "open-loop")
+        for case, guide in (
+            ("perfect", "with a guide"),
+            ("perfect", "no guide"),
+            ("structure", "with a guide"),
+        )
+    ]
+    assert report.findings.planned == len(report.findings.study.rows) == 22
+
+
+def test_errors_are_those_of_the_finished_insertions(report):
+    found = group(report, DEFAULT, "perfect", "with a guide")
+    errors = [0.02, 0.5, 1.6]
+    assert (found.count, found.finished) == (4, 3)
+    expected = [np.median(errors), np.mean(errors), *np.quantile(errors, (0.95, 0.99)), 1.6, 1 / 3]
+    measured = (found.median_mm, found.mean_mm, found.p95_mm, found.p99_mm, found.max_mm, found.above)
+    assert_allclose(measured, expected)
+
+
+def test_shares_are_against_open_loop_and_reach_world_by_world(report):
+    guided = group(report, DEFAULT, "perfect", "with a guide")
+    assert_allclose(guided.within_twice_open_loop, 2 / 3)  # 0.02 ≤ 0.1, 0.5 > 0.4, 1.6 ≤ 3.0
+    assert_allclose(guided.within_open_loop, 2 / 3)  # 0.02 ≤ 0.21, 0.5 > 0.4, 1.6 ≤ 1.7
+    assert_allclose(guided.within_reach, 2 / 3)  # 0.02 and 0.5 ≤ 0.5, 1.6 above
+    free = group(report, DEFAULT, "perfect", "no guide")
+    assert (
+        free.within_twice_open_loop == free.within_open_loop == 1.0
+    )  # of world 15; in 16 open loop did not finish
+    assert free.within_reach == 1.0  # 4.4 ≤ 4.0 + 0.5
+    assert group(report, "open-loop", "perfect", "with a guide").within_open_loop == 1.0
+
+
+def test_what_does_not_finish_is_a_failure_only_within_reach(report):
+    assert group(report, DEFAULT, "perfect", "with a guide").failures == 1
+    assert group(report, DEFAULT, "perfect", "no guide").failures == 0  # world 31 is 3 mm out of reach
+    assert group(report, "open-loop", "perfect", "no guide").failures == 0
+
+
+def test_energy_is_a_geometric_mean(report):
+    """2, 4 and 1 times the plan's in worlds 1, 2, 3."""
+    assert_allclose(group(report, DEFAULT, "perfect", "with a guide").energy_ratio, 2.0)
+
+
+def test_predictions_are_counted_where_there_are_any(report):
+    """Of the default's perfect case alone; coverage is over the insertions that have a prediction at the place."""
+    guided, free = report.findings.predictions
+    assert guided.levels == {"controller": DEFAULT, "case": "perfect", "guide": "with a guide"}
+    assert (guided.count, free.count) == (3, 1)
+    assert_allclose(guided.covered, (2 / 3, 1 / 3, 2 / 3))
+    assert_allclose(free.covered, (np.nan, np.nan, 1.0))
+
+
+def test_warnings_in_vain_and_misses_without_one_are_counted(report):
+    """World 1 ends at 0.02 mm, 2 at 0.5, which is not below 0.5, 3 at 1.6 without a warning, 15 at 0.1 with one."""
+    guided, free = report.findings.predictions
+    assert (guided.in_vain, guided.unwarned) == (0.0, 1)
+    assert (free.in_vain, free.unwarned) == (1.0, 0)
+
+
+def test_the_page_has_the_predictions_and_so_has_the_summary(report):
+    assert "covered at ¼ of the depth" in report.page.read_text(encoding="utf-8")
+    assert [group["unwarned"] for group in report.values()["predictions"]] == [1, 0]
+
+
+def test_the_worst_are_those_furthest_beyond_their_reach_of_the_default_controller(report):
+    rows = report.findings.study.rows
+    worst = [(rows.value("controller", row), rows.value("world", row)) for row in report.findings.worst]
+    assert {name for name, _ in worst} == {DEFAULT}
+    assert [number for _, number in worst[:3]] == [3, 2, 16]
+
+
+def test_a_command_names_the_world_and_its_case(report):
+    """So that a line of the report is all that it takes; no scenario file lies beside the page."""
+    rows = report.findings.study.rows
+    for row, command in report.again.items():
+        name = re.match(r"flexneedle insert (world:\S+) --target", command)[1]
+        number, case = int(rows.value("world", row)), rows.value("case", row)
+        assert load_scenario(name) == world(number, case)
+        assert f"--seed {number} " in command
+        plant = "model" if case == "perfect" else "exact"
+        assert f"--controller {rows.value('controller', row)} --phantom {plant}" in command
+    assert not list(report.page.parent.glob("*.toml"))
+
+
+def test_the_page_has_the_table_and_the_figure(report):
+    text = report.page.read_text(encoding="utf-8")
+    assert "within reach + 0.5 mm" in text
+    assert report.figures[0].name == "shares"
+    assert "targeting" not in {drawn.name for drawn in report.figures}
+    assert "perfect: adaptive-mpc median 0.500 mm" in report.figures[0].alt
+    assert report.values()["worlds"][0]["levels"]["controller"] == DEFAULT

@@ -1,0 +1,27 @@
+"""Run the command line after two arguments: a signal, and the count of written rows after which it hits."""
+
+import os
+import signal
+import sys
+
+from flexneedle.study.journal import Journal
+
+
+def main():
+    """Send the signal once so many rows are written: Ctrl-C to all processes, as a terminal does, else to this."""
+    from flexneedle.cli.main import main as flexneedle
+
+    number, after = signal.Signals[sys.argv[1]], int(sys.argv[2])
+    add = Journal.add
+
+    def add_and_stop(journal, rows):
+        add(journal, rows)
+        if len(journal.rows) == after:
+            os.kill(0 if number == signal.SIGINT else os.getpid(), number)
+
+    Journal.add = add_and_stop
+    return flexneedle(sys.argv[3:])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

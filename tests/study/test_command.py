@@ -1,0 +1,143 @@
+"""What `flexneedle study` says when something is wrong, and while it plans."""
+
+import shutil
+from dataclasses import replace
+
+import pytest
+
+from flexneedle.cli import main as cli
+from flexneedle.cli import study as study_command
+from flexneedle.console.progress import Progress
+from flexneedle.study import pools, rows
+from flexneedle.study.runner import Advance
+
+
+def run(capsys, *argv):
+    """Return exit status, stdout and stderr."""
+    status = cli.main(tuple(map(str, argv)))
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+@pytest.mark.parametrize("text", ["two", "0", "-1", "1.5", "", "٢"])
+def test_workers_that_are_no_number_are_told_what_they_must_be(capsys, text):
+    with pytest.raises(SystemExit) as caught:
+        cli.main(("study", "phantom", f"--workers={text}"))
+    assert caught.value.code == 2
+    assert f"argument --workers: {text}: must be a whole number, at least 1\n" in capsys.readouterr().err
+
+
+def test_an_address_that_cannot_be_one_is_refused_before_the_study_is_looked_at(capsys):
+    status, out, err = run(capsys, "study", "nope", "--scheduler", "foo")
+    assert (status, out) == (2, "")
+    assert err.startswith('flexneedle: --scheduler = "foo": must be protocol://host:port')
+    assert err.count("\n") == 1
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_a_folder_with_too_long_a_name_is_bad_input(capsys, quick):
+    status, out, err = run(capsys, "study", quick, "--out", "a" * 300)
+    assert (status, out) == (2, "")
+    assert err.splitlines()[-1] == f"flexneedle: {'a' * 300}: cannot be written: File name too long"
+
+
+@pytest.mark.parametrize("command", ["insert", "plan"])
+def test_no_run_is_written_into_the_folder_of_a_study(capsys, uninterrupted, tmp_path, command):
+    shutil.copy(uninterrupted / "study.json", tmp_path)
+    status, out, err = run(capsys, command, "phantom", "--out", tmp_path)
+    assert (status, out) == (2, "")
+    assert err.splitlines()[-1].endswith("holds a study already (study.json): give another folder with --out")
+    assert [path.name for path in tmp_path.iterdir()] == ["study.json"]
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_a_study_of_which_nothing_is_done_says_why(capsys, quick, tmp_path, monkeypatch):
+    def broken(_scenario, _plan, seed, **_options):
+        raise ZeroDivisionError(f"seed\n{seed}")
+
+    monkeypatch.setattr(rows, "insert", broken)
+    told = "flexneedle: no insertion was done; the first ended so: error: ZeroDivisionError: seed 7"
+    status, _, err = run(capsys, "study", quick, "--out", tmp_path / "a")
+    assert (status, err.splitlines()[-1]) == (1, told)
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_a_study_of_which_something_is_done_does_not(capsys, quick, tmp_path, monkeypatch):
+    insert = rows.insert
+
+    def some(scenario, made, seed, **options):
+        done = insert(scenario, made, seed, **options)
+        return replace(done, outcome="held", reason="no sample") if seed == 7 else done
+
+    monkeypatch.setattr(rows, "insert", some)
+    status, _, err = run(capsys, "study", quick, "--out", tmp_path / "a")
+    assert status == 0
+    assert "no insertion" not in err
+
+
+def told(monkeypatch, advances):
+    """Return what is shown: (stage, done, total, note), for (plans, all plans, insertions, seconds until the next)."""
+    now, shown = 100.0, []
+    monkeypatch.setattr(study_command.time, "monotonic", lambda: now)
+
+    class Listener:
+        def show(self, *args):
+            shown.append(args)
+
+    show = study_command._Show(Listener())
+    for plans, all_plans, done, later in advances:
+        show.advance(Advance(plans, all_plans, done, 1050, 0))
+        now += later
+    return [args for args in shown if args[0] == "Planning"], [
+        args for args in shown if args[0] == "Inserting"
+    ]
+
+
+def test_planning_has_a_rate_and_a_time_left_from_the_plans_that_were_made_now(monkeypatch):
+    advances = [
+        (40, 105, 0, 30.0),
+        (41, 105, 0, 20.0),
+        (42, 105, 0, 20.0),
+        (45, 105, 0, 20.0),
+        (105, 105, 0, 1.0),
+    ]
+    planning, inserting = told(monkeypatch, advances)
+    assert [note for *_, note in planning] == [
+        *("40 of 105 plans", "41 of 105 plans"),
+        "42 of 105 plans, 0.05 a second, 21 min 0 s left",
+        "45 of 105 plans, 0.1 a second, 10 min 0 s left",
+        "105 of 105 plans, 1.1 a second, 0 s left",
+    ]
+    assert {note for *_, note in inserting} == {"0 of 1050"}
+
+
+def test_planning_that_is_done_is_told_once(monkeypatch):
+    planning, inserting = told(monkeypatch, [(1, 2, 0, 9.0), (2, 2, 0, 9.0), (2, 2, 1, 9.0), (2, 2, 2, 9.0)])
+    assert [done for _, done, *_ in planning] == [1, 2]
+    assert [done for _, done, *_ in inserting] == [0, 0, 1, 2]
+
+
+def test_a_study_without_plans_to_make_has_planned(monkeypatch):
+    assert told(monkeypatch, [(0, 0, 1050, 0.0)])[0] == [("Planning", 1, 1, "0 of 0 plans")]
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_a_cluster_without_workers_is_told(capsys, quick, tmp_path, monkeypatch):
+    def cluster(_address, on_no_workers):
+        on_no_workers()
+        return pools.local(1)
+
+    monkeypatch.setattr(pools, "cluster", cluster)
+    monkeypatch.setattr("flexneedle.study.runner._CLUSTER_JOBS", 4)
+    status, _, err = run(capsys, "study", quick, "--scheduler", "tcp://host:1", "--out", tmp_path / "a")
+    assert status == 0
+    assert "tcp://host:1 has no workers yet: waiting for them\n" in err
+
+
+def test_a_line_of_its_own_is_told_as_it_is_in_a_terminal_too(monkeypatch, capsys):
+    Progress().say("[red]x")
+    assert capsys.readouterr().err == "[red]x\n"
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    with Progress() as progress:
+        progress.say("[red]x")
+    assert "[red]x\n" in capsys.readouterr().err

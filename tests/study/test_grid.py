@@ -1,0 +1,367 @@
+"""What a study file asks for: the grid, its order, its seeds; and every rule of the file in one line."""
+
+import itertools
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from flexneedle.control.methods import METHODS, checked
+from flexneedle.errors import InputError, ScenarioWarning
+from flexneedle.scenario.files import dump_scenario, load_scenario
+from flexneedle.study.grid import load_study
+from flexneedle.study.spec import LARGEST_SEED, study_names
+
+PHANTOM = checked(load_scenario("phantom"))
+CONTROLLERS = tuple(METHODS)[:2]
+CHOICES = "must be one of " + ", ".join(METHODS)
+SEEDS = f"from 0 to {LARGEST_SEED}"
+DEPTHS, LATERALS = (25, 30, 35, 40, 45), (-5, 0, 5)
+
+
+@pytest.fixture
+def study(tmp_path):
+    """Return a function that loads a study from the text of its file, after a line with its name."""
+
+    def load(text):
+        path = tmp_path / "my.toml"
+        path.write_text(f'name = "my"\n{text}')
+        return load_study(path)
+
+    return load
+
+
+def insertions(study):
+    return [study.insertion(index) for index in range(len(study))]
+
+
+def refusal(study, text):
+    """Return the message about a study file, without the opening that names the file."""
+    with pytest.raises(InputError) as caught:
+        study(text)
+    lines = [line.split("my.toml: ", 1) for line in str(caught.value).splitlines()]
+    assert all(len(line) == 2 for line in lines)
+    return [line[1] for line in lines]
+
+
+TWO_BY_TWO = """
+repeats = 2
+first_seed = 50
+[[cases]]
+name = "base"
+[[cases]]
+name = "rough"
+values = { phantom.run_out_mm = 0.4 }
+[[axes]]
+key = "target"
+values = [[30, 0], [40, 5]]
+[[axes]]
+key = "controller"
+values = ["CONTROLLERS"]
+""".replace("CONTROLLERS", '", "'.join(CONTROLLERS))
+
+
+def test_cases_vary_slowest_then_axes_in_their_order_and_repeats_fastest(study):
+    got = [
+        (i.point.case, i.point.scenario.target.position, i.point.controller, i.repeat)
+        for i in insertions(study(TWO_BY_TWO))
+    ]
+    targets, controllers = [(30.0, 0.0), (40.0, 5.0)], list(CONTROLLERS)
+    assert got == list(itertools.product(["base", "rough"], targets, controllers, [0, 1]))
+
+
+def test_a_case_sets_its_values_and_nothing_else(study):
+    base, rough = (study(TWO_BY_TWO).points[k].scenario for k in (0, 4))
+    assert base == PHANTOM.with_values({"target.depth_mm": 30, "target.lateral_mm": 0})
+    assert rough == base.with_values({"phantom.run_out_mm": 0.4})
+
+
+def test_each_target_and_repeat_has_a_seed_of_its_own_and_the_same_one_at_all_other_settings(study):
+    seeds = {}
+    for insertion in insertions(study(TWO_BY_TWO)):
+        key = insertion.point.scenario.target.position, insertion.repeat
+        seeds.setdefault(key, set()).add(insertion.seed)
+    assert [min(own) for own in seeds.values()] == [50, 51, 52, 53]
+    assert all(len(own) == 1 for own in seeds.values())
+
+
+@pytest.mark.parametrize("values", ["[3, 5, 9]", "{ from = 3, count = 3 }"])
+def test_an_axis_of_seeds_gives_all_targets_the_same_seeds(study, values):
+    text = f'[[axes]]\nkey = "seed"\nvalues = {values}\n[[axes]]\nkey = "target.depth_mm"\nvalues = [30, 40]'
+    expected = [3, 5, 9] if values.startswith("[") else [3, 4, 5]
+    assert [(i.repeat, i.seed) for i in insertions(study(text))] == 2 * list(enumerate(expected))
+
+
+def test_values_hold_throughout_and_axes_and_cases_go_over_them(study):
+    text = "[values]\nplant = 'model'\nphantom.run_out_mm = 1.0\nplan_seed = 4\n" + TWO_BY_TWO.split("50")[1]
+    points = study(text).points
+    assert {(point.plant, point.plan_seed) for point in points} == {("model", 4)}
+    assert [point.scenario.phantom.run_out_mm for point in points] == [1.0] * 4 + [0.4] * 4
+
+
+def test_all_stands_for_every_controller(study):
+    points = study('[[axes]]\nkey = "controller"\nvalues = "all"').points
+    assert [point.controller for point in points] == list(METHODS)
+
+
+def test_keys_of_the_base_can_be_left_out(study):
+    text = (
+        'without = ["needle.outer_diameter_mm", "needle.inner_diameter_mm"]\n[values]\nneedle.gauge = "19G"'
+    )
+    needle = study(text).points[0].scenario.needle
+    assert (needle.gauge, needle.outer_diameter_mm, needle.outer_diameter) == ("19G", None, 1.067)
+
+
+def test_old_names_of_keys_mean_the_new_ones_in_values_cases_and_axes(study):
+    axis = '[[axes]]\nkey = "control.horizon"\nvalues = [3, 4]\n'
+    rest = '[values]\ncontrol.samples = 9\n[[cases]]\nname = "a"\nvalues = { control.iterations = 2 }\n'
+    with pytest.warns(ScenarioWarning) as caught:
+        points = study(rest + axis).points
+    assert {str(warning.message).split()[0] for warning in caught} == {
+        "control.horizon",
+        "control.samples",
+        "control.iterations",
+    }
+    tables = [point.scenario.control.tables["ce_mpc"] for point in points]
+    assert [(t["horizon"], t["samples"], t["iterations"]) for t in tables] == [(3, 9, 2), (4, 9, 2)]
+    assert [dict(point.varied) for point in points] == [{"control.ce_mpc.horizon": k} for k in (3, 4)]
+    twice = axis + '[[cases]]\nname = "a"\nvalues = { control.ce_mpc.horizon = 2 }\n'
+    with pytest.warns(ScenarioWarning), pytest.raises(InputError, match="an axis sets this key too"):
+        study(twice)
+
+
+def test_a_table_of_no_controller_of_the_study_is_refused(study):
+    with pytest.raises(InputError, match=r"control.ce_mcp: unknown table; did you mean ce_mpc\? tables: "):
+        study("[values]\ncontrol.ce_mcp.horizon = 3\n")
+
+
+def test_a_scenario_is_found_beside_the_study_file(study, tmp_path):
+    scenario = PHANTOM.with_values({"name": "Beside", "setup.stroke_mm": 100})
+    (tmp_path / "beside.toml").write_text(dump_scenario(scenario))
+    assert study('scenario = "beside.toml"').points[0].scenario == scenario
+
+
+def test_a_study_that_only_has_a_name_is_one_insertion_of_the_preset(study):
+    (only,) = insertions(study(""))
+    assert (only.point.scenario, only.point.case, only.seed, only.point.plan_seed) == (PHANTOM, "", 0, 0)
+
+
+def test_the_largest_seeds_fit_into_a_table(study):
+    longest = f"first_seed = {LARGEST_SEED}\nrepeats = 100_000\n" + axis("target.depth_mm", "[30, 40]")
+    axes = axis("seed", f"{{from = {LARGEST_SEED}, count = 2}}") + axis("plan_seed", f"[0, {LARGEST_SEED}]")
+    for text in (longest, axes):
+        whole = study(text)
+        last = whole.insertion(len(whole) - 1)
+        seeds = pa.array([last.seed, last.point.plan_seed], pa.int64()).to_pylist()
+        assert seeds == [last.seed, last.point.plan_seed]
+        assert last.seed > LARGEST_SEED
+
+
+def test_true_is_no_number_that_stands_twice(study):
+    assert "twice" not in refusal(study, axis("plan.samples", "[16, 1, true]"))[0]
+
+
+def axis(key, values):
+    return f"[[axes]]\nkey = '{key}'\nvalues = {values}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("repeat = 3", "repeat = 3: unknown key; did you mean repeats?"),
+        ("repeats = 0", "repeats = 0: must be at least 1"),
+        ("first_seed = -1", f"first_seed = -1: must be from 0 to {LARGEST_SEED}"),
+        (
+            f"first_seed = {LARGEST_SEED + 1}",
+            f"first_seed = {LARGEST_SEED + 1}: must be from 0 to {LARGEST_SEED}",
+        ),
+        ("first_seed = true", "first_seed = true: must be a whole number"),
+        ("scenario = 'no.toml'", "/no.toml: no such file"),
+        ("x = ", "not TOML: "),
+        ("without = ['needle.gauge']", 'without = "needle.gauge": the scenario has no such value'),
+        ("[values]\ncontroller = 'pid'", f'controller = "pid": {CHOICES}'),
+        ("[values]\nplant = 'real'", 'plant = "real": must be one of exact, model'),
+        ("[values]\nstrategy = 'x'", 'strategy = "x": must be one of manipulation, steering'),
+        ("[values]\nplan_seed = 1.5", f"plan_seed = 1.5: must be a whole number {SEEDS}"),
+        (axis("plan_seed", f"[1, {2**63}]"), f"plan_seed = {2**63}: must be a whole number {SEEDS}"),
+        ("[values]\nseed = 3", "values.seed = 3: seeds are set by first_seed and repeats, or by an axis"),
+        ("[values]\ntarget = 3", "values.target = 3: a target must be two numbers, [depth, lateral] in mm"),
+        ("[values]\nphantom.runout_mm = 3", "phantom.runout_mm = 3: unknown key; did you mean run_out_mm?"),
+        ("[values]\nsetup.stroke_mm = 'a'", 'setup.stroke_mm = "a": must be a number'),
+        (axis("setup.stroke_mm", "[100, 140]"), "setup.stroke_mm = 140.0: the base would reach the guide"),
+        (axis("plan.sample", "[16]"), "plan.sample = 16: unknown key; did you mean samples?"),
+        (axis("controler", '["ce-mpc"]'), "plan_seed, world_case, as an axis also seed, world"),
+        (axis("plan.samples", "[]"), "axes[0].values = []: must be a list of at least one value"),
+        (axis("plan.samples", "'all'"), 'axes[0].values = "all": must be a list of at least one value'),
+        (axis("plan.samples", "[8, 9, 8]"), "axes[0].values = [8, 9, 8]: has 8 twice"),
+        (axis("setup.stroke_mm", "[100, 100.0]"), "axes[0].values = [100, 100.0]: has 100 twice"),
+        (axis("target", "[[30, 0], [30.0, -0.0]]"), "[30.0, -0.0]]: has [30, 0] twice"),
+        (axis("controller", f"['{CONTROLLERS[0]}', 'x']"), f'controller = "x": {CHOICES}'),
+        (axis("target", "[[30, 0], 40]"), "axes[0].values = 40: a target must be two numbers"),
+        (axis("target", "[[30, 0], [400, 0]]"), "target.depth_mm = 400.0: beyond the stroke"),
+        (axis("seed", "[1, -2]"), f"axes[0].values = [1, -2]: must be whole numbers {SEEDS}"),
+        (axis("seed", f"[1, {LARGEST_SEED + 1}]"), f"{LARGEST_SEED + 1}]: must be whole numbers {SEEDS}"),
+        (
+            axis("seed", f"{{from = {2**62 + 1}, count = 2}}"),
+            f"from a whole number, 0 to {LARGEST_SEED}, count 1",
+        ),
+        (axis("seed", "{from = 1}"), "axes[0].values = {…}: must be a list, or {from, count}"),
+        ("repeats = 2\n" + axis("seed", "[1]"), "repeats = 2: leave it out: an axis gives the seeds"),
+        (2 * axis("plan.samples", "[16]"), 'axes = "plan.samples": two axes set this key'),
+        (
+            axis("target", "[[30, 0]]") + axis("target.depth_mm", "[30]"),
+            'axes = "target.depth_mm": two axes set this key',
+        ),
+        (
+            axis("plan.samples", "[16]") + "[[cases]]\nname = 'a'\nvalues = {plan.samples = 8}",
+            'cases[0].values = "plan.samples": an axis sets this key too',
+        ),
+        ("[[cases]]\nname = 'a'\n[[cases]]\nname = 'a'", 'cases = "a": two cases have this name'),
+        ("[[cases]]\nname = 'a'\nvalues = {seed = 1}", "cases[0].values.seed = 1: seeds are set by"),
+        ("[[axes]]\nvalues = [1]", "axes[0].key: missing"),
+        (
+            "repeats = 100_000\n" + axis("plan.samples", str(list(range(16, 28)))),
+            "asks for 1200000 insertions",
+        ),
+    ],
+)
+def test_a_bad_study_file_is_refused_in_one_line_that_says_what_is_wrong(study, text, line):
+    said = refusal(study, text)
+    assert line in said[0]
+    assert len(said) == 1
+
+
+def test_a_setting_that_breaks_a_rule_is_named_with_its_place_in_the_grid(study):
+    (said,) = refusal(study, axis("plan.samples", "[16, 32]") + axis("setup.stroke_mm", "[100, 140]"))
+    assert said.endswith("(at plan.samples = 16, setup.stroke_mm = 140)")
+
+
+def test_an_unknown_study_is_refused_with_the_names_of_those_that_there_are():
+    with pytest.raises(InputError, match=r"^nope: no such file, and no such study \(studies: controllers, "):
+        load_study("nope")
+
+
+def test_the_studies_of_the_package_can_be_carried_out():
+    """Loading checks every scenario of the grid against all rules, targets within the stroke included."""
+    sizes = {name: len(load_study(name)) for name in study_names()}
+    assert sizes == {
+        "phantom": 150,
+        "phantom-published": 150,
+        "odd-targets": 150,
+        "controllers": 150 * len(METHODS),
+        "mismatch": 5 * 150,
+        "mismatch-doubled": 10_005,
+        "imperfections": 18 * 150,
+        "guide-distance": 7 * 150,
+        "gauges": 8 * 150,
+        "tracker": 5 * 150,
+        "worlds": 2202,
+    }
+
+
+def test_the_phantom_study_has_the_papers_targets_and_seeds_of_its_own():
+    all_of_it = insertions(load_study("phantom"))
+    targets = [insertion.point.scenario.target.position for insertion in all_of_it]
+    assert targets == [target for target in itertools.product(DEPTHS, LATERALS) for _ in range(10)]
+    assert [insertion.seed for insertion in all_of_it] == list(range(100000, 100150))
+
+
+def test_the_published_phantoms_are_those_of_the_phantom_study_without_what_is_new():
+    """Drawn last, the new imperfections change nothing else."""
+    old, new = (insertions(load_study(name)) for name in ("phantom-published", "phantom"))
+    assert [insertion.seed for insertion in old] == [insertion.seed for insertion in new]
+    assert {insertion.point.scenario.phantom.start_axial_sd_mm for insertion in old} == {0.0}
+    assert {insertion.point.scenario.phantom.youngs_modulus_variation for insertion in old} == {0.0}
+
+
+def test_odd_targets_are_off_the_papers_grid():
+    all_of_it = insertions(load_study("odd-targets"))
+    targets = {insertion.point.scenario.target.position for insertion in all_of_it}
+    assert not targets & set(itertools.product(DEPTHS, LATERALS))
+    assert {insertion.seed for insertion in all_of_it} == set(range(300000, 300150))
+
+
+def test_the_controllers_meet_the_phantoms_of_the_phantom_study():
+    seeds = {}
+    for insertion in insertions(load_study("controllers")):
+        seeds.setdefault(insertion.point.controller, []).append(insertion.seed)
+    assert list(seeds) == list(METHODS)
+    assert all(own == list(range(100000, 100150)) for own in seeds.values())
+
+
+def settings(study, case):
+    return next(point.scenario for point in study.points if point.case == case)
+
+
+def test_mismatch_grows_from_none_through_the_preset_to_the_doubled():
+    study = load_study("mismatch")
+    at = {float(case[4:]): settings(study, case).phantom for case in study.definition["cases"]}
+    assert list(at) == [0.0, 0.5, 1.0, 1.5, 2.0]
+    assert at[1.0] == PHANTOM.phantom
+    assert (at[0.0].shear_modulus_factor, at[0.0].bevel_factor) == ((1.0, 1.0), (1.0, 1.0))
+    assert (at[2.0].shear_modulus_factor, at[2.0].bevel_factor) == ((0.3, 2.5), (0.0, 2.0))
+    for s, low, high in ((0.5, 0.0, 1.0), (1.5, 1.0, 2.0)):
+        ends = zip(at[low].shear_modulus_factor, at[high].shear_modulus_factor, strict=True)
+        assert at[s].shear_modulus_factor == pytest.approx([(a * b) ** 0.5 for a, b in ends], rel=1e-3)
+    for s, phantom in at.items():
+        assert phantom.bevel_factor == (1 - s / 2, 1 + s / 2)
+        assert (phantom.start_offset_sd_mm, phantom.start_angle_sd_mrad) == (0.5 * s, 3 * s)
+
+
+def test_the_long_study_has_the_doubled_mismatch_and_seeds_of_its_own():
+    study = load_study("mismatch-doubled")
+    (phantom,) = {point.scenario.phantom for point in study.points}
+    published = {"start_axial_sd_mm": 0.0, "youngs_modulus_variation": 0.0}
+    assert phantom == settings(load_study("mismatch"), "s = 2").phantom.model_copy(update=published)
+    assert len({insertion.seed for insertion in insertions(study)}) == len(study) >= 10_000
+    assert min(insertion.seed for insertion in insertions(study)) == 200_000
+
+
+def test_each_imperfection_is_changed_alone():
+    study = load_study("imperfections")
+    base = settings(study, "base").flat()
+    changed = {}
+    for case in list(study.definition["cases"])[1:]:
+        values = settings(study, case).flat()
+        ((key, value),) = [(key, value) for key, value in values.items() if base[key] != value]
+        changed[key] = (base[key], value)
+    own = {f"phantom.{name}" for name in type(PHANTOM.phantom).model_fields}
+    sizes = {f"phantom.{name}_mm" for name in ("contact_spacing", "element", "step")}
+    assert own - set(changed) == {*sizes, "phantom.structure"}
+    assert changed.pop("phantom.tracker_bias_mm") == (0.0, 0.3)
+    assert changed.pop("phantom.shear_modulus_factor") == ([0.6, 1.6], [0.3, 2.5])
+    assert changed.pop("phantom.bevel_factor") == ([0.5, 1.5], [0.0, 2.0])
+    assert all(after == 2 * before for before, after in changed.values())
+
+
+def test_no_imperfection_makes_readings_so_late_that_all_are_refused():
+    study = load_study("imperfections")
+    for case in study.definition["cases"]:
+        scenario = settings(study, case)
+        period = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
+        late = scenario.phantom.delay_periods * period
+        assert late + 2 * scenario.tracker.period < scenario.control.stale_after_s
+
+
+def test_the_tip_starts_as_far_ahead_of_the_guide_at_every_distance():
+    setups = [point.scenario.setup for point in load_study("guide-distance").points]
+    assert {setup.guide_to_skin_mm - setup.tip_to_skin_mm for setup in setups} == {12.5}
+    assert sorted({setup.guide_to_skin_mm for setup in setups}) == [20, 30, 40, 50, 60, 70, 80]
+
+
+def test_the_gauges_are_solid_needles_of_growing_number():
+    needles = [point.scenario.needle for point in load_study("gauges").points]
+    assert list(dict.fromkeys(needle.gauge for needle in needles)) == [
+        f"{number}G" for number in range(18, 26)
+    ]
+    assert {needle.inner_diameter for needle in needles} == {0.0}
+    assert {needle.outer_diameter for needle in needles if needle.gauge == "21G"} == {
+        PHANTOM.needle.outer_diameter
+    }
+
+
+def test_study_files_of_the_package_say_what_they_are_for():
+    for name in study_names():
+        text = (Path(load_study.__code__.co_filename).parent / "studies" / f"{name}.toml").read_text()
+        assert text.startswith("# ")
+        assert f'name = "{name}"' in text

@@ -1,0 +1,111 @@
+"""The reach: what the needle in the tank cannot do better, whoever steers."""
+
+import math
+
+import numpy as np
+import pytest
+
+import flexneedle
+import synthetic
+from flexneedle.rig.phantom.draw import draw
+from flexneedle.rig.phantom.plants import ModelPlant
+from flexneedle.scenario.worlds import world
+from flexneedle.study.reach import reach, straight_end
+from flexneedle.types import Insertion
+
+COARSE = {"phantom.step_mm": 1.0, "phantom.element_mm": 1.0, "phantom.contact_spacing_mm": 1.0}
+FREE = world(15, "perfect").with_values(COARSE)
+GUIDED = world(3, "perfect").with_values(COARSE)
+
+
+def end(scenario, bevel, phantom="model"):
+    truth = draw(scenario, np.random.default_rng(np.random.SeedSequence(0).spawn(4)[0]))
+    return straight_end(truth, bevel, phantom, scenario.target.depth_mm)
+
+
+@pytest.mark.parametrize("phantom", ["model", "exact"])
+def test_without_a_guide_the_ends_are_mirror_images(phantom):
+    right, left = (end(FREE, bevel, phantom) for bevel in (1, -1))
+    np.testing.assert_allclose(right, (left[0], -left[1]), atol=1e-9)
+    assert right[0] == FREE.target.depth_mm
+    assert right[1] > 1.0
+
+
+def test_an_end_is_that_of_the_needle_pushed_straight_to_the_depth():
+    """Against the simulator, in steps of the plant: tip at the depth, between two of them."""
+    simulator = flexneedle.Simulator(draw(FREE, np.random.default_rng(0)).scenario)
+    state = simulator.step(simulator.start(), flexneedle.Control())
+    tips = [state.tip]
+    while tips[-1][0] < FREE.target.depth_mm:
+        state = simulator.step(state, flexneedle.Control(db_x=1.0))
+        tips.append(state.tip)
+    x, y, _ = np.array(tips).T
+    assert end(FREE, 1)[1] == pytest.approx(np.interp(FREE.target.depth_mm, x, y), abs=1e-9)
+
+
+@pytest.mark.parametrize(("beyond", "expected"), [(-0.5, 0.0), (0.0, 0.0), (0.7, 0.7)])
+def test_without_a_guide_the_reach_is_the_distance_to_the_interval_between_the_ends(beyond, expected):
+    for side in (-1, 1):
+        lateral = side * (end(FREE, 1)[1] + beyond)
+        scenario = FREE.with_values({"target.lateral_mm": lateral})
+        assert reach(scenario, 0, "model") == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_reach_is_that_of_the_phantom_which_the_insertion_of_the_seed_meets(monkeypatch):
+    drawn = []
+
+    def recorded(scenario, rng):
+        drawn.append(draw(scenario, rng))
+        return drawn[-1]
+
+    monkeypatch.setattr("flexneedle.study.reach.draw", recorded)
+    monkeypatch.setattr("flexneedle.rig.virtual.draw", recorded)
+    monkeypatch.setattr(
+        "flexneedle.rig.loop.run", lambda _scenario, plan, *_, **__: Insertion(plan, 5, (), "", "")
+    )
+    scenario = world(15).with_values(COARSE)
+    reach(scenario, 5)
+    flexneedle.insert(scenario, synthetic.make_plan("manipulation", scenario.target.position, 0), 5)
+    assert drawn[0] == drawn[1] != draw(scenario, np.random.default_rng(5))
+
+
+def test_a_stroke_that_ends_before_the_target_is_out_of_reach():
+    """Of a needle that starts further back than the scenario says: by at least what is missing."""
+    depth = FREE.setup.max_depth
+    scenario = FREE.with_values({"target.depth_mm": depth, "phantom.start_axial_sd_mm": 3.0})
+    truths = [
+        draw(scenario, np.random.default_rng(np.random.SeedSequence(seed).spawn(4)[0])) for seed in range(9)
+    ]
+    missing = [depth - truth.scenario.setup.max_depth for truth in truths]
+    seed = int(np.argmax(missing))
+    assert missing[seed] > 1.0
+    assert reach(scenario, seed, "model") >= missing[seed]
+
+
+def test_with_a_guide_the_reach_is_what_a_long_search_leaves():
+    """Next to nothing on the way, metres where the guide's travel does not lead."""
+    assert reach(GUIDED, 0, "model") < 0.01
+    tight = {"setup.max_guide_travel_mm": 0.2, "needle.bevel.offset_mm": 0.0, "target.lateral_mm": 0.2}
+    bound = GUIDED.with_values({**tight, "setup.max_guide_step_mm": 1e-3})
+    assert 0.05 < reach(bound, 0, "model") < 0.2
+
+
+def test_the_reach_is_that_of_a_plant_of_ones_own_too():
+    """As a factory, and as `module:NAME`, which a study has."""
+    expected = reach(FREE, 0, "model")
+    assert reach(FREE, 0, ModelPlant) == expected
+    assert reach(FREE, 0, "flexneedle.rig.phantom.plants:ModelPlant") == expected
+
+
+def test_a_plant_that_does_not_converge_has_no_reach(monkeypatch):
+    monkeypatch.setattr("flexneedle.rig.phantom.plants.ModelPlant.converged", property(lambda _: False))
+    assert math.isnan(reach(FREE, 0, "model"))
+
+
+def test_a_guide_that_steering_leaves_where_it_is_does_not_widen_the_reach():
+    """A target that guide and bevel reach and the bevel alone does not."""
+    low, high = sorted(end(GUIDED, bevel)[1] for bevel in (-1, 1))
+    scenario = GUIDED.with_values({"target.lateral_mm": high + 1.0})
+    assert reach(scenario, 0, "model") < 0.1
+    assert reach(scenario, 0, "model", "steering") == pytest.approx(1.0, abs=1e-9)
+    assert low < high

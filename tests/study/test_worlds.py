@@ -1,0 +1,210 @@
+"""Studies of worlds: an axis of numbers, each with a scenario, a target and a phantom of its own, and a reach."""
+
+from dataclasses import replace
+
+import pyarrow.parquet as pq
+import pytest
+
+from flexneedle.control.methods import checked
+from flexneedle.errors import InputError
+from flexneedle.scenario.worlds import CASES, world
+from flexneedle.study import rows
+from flexneedle.study.grid import load_study
+from flexneedle.study.plans import Plans, plan_key, truth_key
+from flexneedle.study.rows import RESULTS, Job, carry_out
+from flexneedle.study.runner import _bounding
+from flexneedle.study.summary import is_failure
+from flexneedle.study.tables import write_tables
+from synthetic import make_insertion
+
+FREE, GUIDED = 15, 3  # worlds without and with a guide
+STUDY = f"""
+name = "few"
+[[cases]]
+name = "perfect"
+values = {{ world_case = "perfect", plant = "model" }}
+[[cases]]
+name = "real"
+values = {{ world_case = "real" }}
+[[cases]]
+name = "structure"
+values = {{ world_case = "structure" }}
+[[axes]]
+key = "world"
+values = [{FREE}, {GUIDED}]
+[[axes]]
+key = "controller"
+values = ["open-loop", "resolved-rate"]
+"""
+
+
+@pytest.fixture
+def load(tmp_path):
+    """Return a function that loads a study from a text."""
+
+    def study(text=STUDY, worlds=None):
+        path = tmp_path / "few.toml"
+        path.write_text(text)
+        return load_study(path, worlds)
+
+    return study
+
+
+def test_the_scenario_of_a_point_is_that_of_its_world_and_case(load):
+    study = load()
+    for point in study.points:
+        assert point.scenario == checked(world(point.world, point.case))
+        assert point.world_case == point.case
+        assert "world" not in point.varied
+
+
+def test_what_needs_a_guide_is_left_out_in_worlds_without_one(load):
+    """They are no insertions, and so no failures."""
+    found = {(point.case, point.world, point.controller) for point in load().points}
+    assert found == {
+        *((case, GUIDED, name) for case in CASES for name in ("open-loop", "resolved-rate")),
+        *((case, FREE, "open-loop") for case in CASES[:2]),
+    }
+    assert load().definition["insertions"] == len(load()) == len(found)
+
+
+def test_a_world_has_the_phantom_of_its_number_in_every_case_and_with_every_controller(load):
+    study = load()
+    seeds = [(study.insertion(index).point.world, study.insertion(index).seed) for index in range(len(study))]
+    assert all(number == seed for number, seed in seeds)
+
+
+def test_repeats_have_phantoms_of_their_own(load):
+    study = load("repeats = 3\nfirst_seed = 7\n" + STUDY)
+    seeds = {study.insertion(index).seed for index in range(len(study))}
+    assert seeds == {7 + 3 * number + repeat for number in (FREE, GUIDED) for repeat in range(3)}
+
+
+def test_other_worlds_may_be_asked_for(load):
+    chosen = load(worlds=(100, 4))
+    assert {point.world for point in chosen.points} == {100, 101, 102, 103}
+    assert chosen.definition["axes"]["world"] == [100, 101, 102, 103]
+
+
+NAMED = 'name = "a"\n'
+ODD = STUDY.replace('"structure" }', '"odd" }')
+FRACTION = STUDY.replace(f"[{FREE}, {GUIDED}]", "[1.5]")
+FAR = '[[axes]]\nkey = "target"\nvalues = [[10, 50]]'
+
+
+@pytest.mark.parametrize(
+    ("text", "worlds", "message"),
+    [
+        (STUDY, (-1, 4), "worlds = -1, 4: must be a first number, 0 to 1000000000, and a count, 1 to 100000"),
+        (STUDY, (0, 0), "worlds = 0, 0: must be a first number"),
+        (STUDY, (10**9, 2), "world = 1000000001: must be a whole number from 0 to 1000000000"),
+        (NAMED, (0, 2), "has no axis of worlds"),
+        (FRACTION, None, "values = [1.5]: must be whole numbers from 0 to 1000000000"),
+        (
+            'scenario = "phantom"' + STUDY,
+            None,
+            'scenario = "phantom": leave it out: an axis gives the worlds',
+        ),
+        (STUDY + FAR, None, "target.lateral_mm"),
+        (NAMED + "values = { world = 3 }", None, "values.world = 3: worlds are set by an axis"),
+        (NAMED + 'values = { world_case = "real" }', None, "world_case: needs an axis of worlds"),
+        (ODD, None, 'world_case = "odd": must be one of perfect, real, structure'),
+    ],
+)
+def test_a_study_of_worlds_that_cannot_be_is_refused(load, text, worlds, message):
+    with pytest.raises(InputError) as caught:
+        load(text, worlds)
+    assert message in str(caught.value)
+
+
+def test_the_shipped_study_has_two_hundred_worlds_that_nothing_was_chosen_on():
+    study = load_study("worlds")
+    numbers = {point.world for point in study.points}
+    assert numbers == set(range(100_000, 100_200))
+    for case, plant in (("perfect", "model"), ("real", "exact"), ("structure", "exact")):
+        points = [point for point in study.points if point.case == case]
+        assert {point.plant for point in points} == {plant}
+        worlds = numbers if case != "structure" else {n for n in numbers if world(n).setup.has_guide}
+        assert {point.world for point in points if point.controller == "open-loop"} == worlds
+
+
+def test_the_reach_is_found_once_for_all_controllers_of_a_world_and_case(load):
+    study = load()
+    bounding = [point for point in study.points if id(point) in _bounding(study)]
+    assert [(point.case, point.world) for point in bounding] == [
+        *(("perfect", FREE), ("perfect", GUIDED), ("real", FREE), ("real", GUIDED), ("structure", GUIDED))
+    ]
+    assert len({truth_key(point) for point in study.points}) == 5
+    assert len({plan_key(point) for point in study.points}) == 2
+
+
+def test_a_job_finds_the_reach_if_it_is_wanted(load, monkeypatch):
+    point = load().points[0]
+    monkeypatch.setattr(
+        rows,
+        "reach",
+        lambda scenario, seed, _plant, strategy: (
+            (point.scenario is scenario and strategy == "manipulation") * seed * 0.1
+        ),
+    )
+    for bounded, expected in ((True, 0.5), (False, None)):
+        (row,) = carry_out(Job(point, None, "no plan", ((0, 5),), bounded)).rows
+        assert row["reach_mm"] == expected
+        assert row["outcome"] == "error"
+
+
+def test_a_reach_that_fails_is_told_in_the_row_and_the_insertion_stands(load, monkeypatch):
+    done = make_insertion()
+
+    def reach(*_args):
+        raise ZeroDivisionError("nowhere")
+
+    monkeypatch.setattr(rows, "reach", reach)
+    monkeypatch.setattr(rows, "_insertion", lambda *_args: done)
+    monkeypatch.setattr(rows, "_times", lambda _insertion: {})
+    (row,) = carry_out(Job(load().points[0], done.plan, "", ((0, 5),), True)).rows
+    assert (row["outcome"], row["reason"]) == ("done", "no reach: ZeroDivisionError: nowhere")
+    assert row["reach_mm"] is None
+
+
+def test_the_table_has_the_reach_in_every_row_of_the_same_truth(load, tmp_path):
+    """Whichever controller's insertion has found it; unknown where none has yet."""
+    study = load()
+    empty = {**dict.fromkeys(RESULTS), "outcome": "done", "reason": ""}
+    found = {
+        index: {**empty, "index": index, "reach_mm": 0.1 * index if index in _bounding_rows(study) else None}
+        for index in range(len(study) - 2)
+    }
+    write_tables(tmp_path, study, found, Plans(tmp_path / "plans"))
+    table = pq.read_table(tmp_path / "runs.parquet").to_pylist()
+    of_truth = {
+        (row["case"], row["world"]): row["reach_mm"] for row in table if row["controller"] == "open-loop"
+    }
+    assert all(row["reach_mm"] == of_truth[row["case"], row["world"]] is not None for row in table)
+    assert {row["world_case"] for row in table} == {"perfect", "real"}
+
+
+def _bounding_rows(study):
+    return [index for index in range(len(study)) if id(study.insertion(index).point) in _bounding(study)]
+
+
+@pytest.mark.parametrize(
+    ("outcome", "reach", "failure"),
+    [("done", 0.0, False), ("held", 0.3, True), ("refused", 1.2, False), ("failed", None, True)],
+)
+def test_a_refusal_is_a_failure_where_the_target_is_within_reach(outcome, reach, failure):
+    assert is_failure({"outcome": outcome, "reach_mm": reach}) == failure
+
+
+@pytest.mark.parametrize(("outcome", "failure"), [("held", True), ("refused", False), ("failed", False)])
+def test_a_hold_is_a_failure_up_to_the_miss_at_which_a_controller_may_hold(outcome, failure):
+    row = {"outcome": outcome, "reach_mm": 1.5, "control.miss_limit_mm": 2.0}
+    assert is_failure(row) is failure
+    assert not is_failure(row | {"reach_mm": 2.1})
+
+
+def test_points_with_another_needle_have_another_reach(load):
+    point = load().points[0]
+    other = replace(point, scenario=point.scenario.with_values({"phantom.run_out_mm": 0.1}))
+    assert truth_key(other) != truth_key(point)
+    assert plan_key(other) == plan_key(point)
