@@ -31,7 +31,7 @@ from flexneedle.plot import style
 from flexneedle.rig.loop import run as carry_out
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT
 from flexneedle.rig.virtual import Seeds, virtual_rig, virtual_room
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 FIRST_SEED = 300_000
 FAR_MM, NEAR_MM = 400.0, 30.0
@@ -92,7 +92,7 @@ def world(plate: bool, monitor: bool) -> Scenario:
 
 
 @cache
-def planned(target: tuple[float, float]) -> PlanRecord:
+def planned(target: tuple[float, float]) -> Plan:
     """The plan for a target; neither tracker nor monitor matter to it."""
     return make_plan(load_scenario("phantom"), target=target, seed=0, threads=1)
 

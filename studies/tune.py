@@ -32,7 +32,7 @@ import numpy as np
 import flexneedle
 from flexneedle.trace.folder import versions
 from flexneedle.trace.plain import to_text
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 TARGETS = [(depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0)]
 STRIDE = 4  # through the targets: any few cases in a row mix depths and sides
@@ -120,7 +120,7 @@ def candidates(space: dict[str, Range], count: int, rng: np.random.Generator) ->
     ]
 
 
-def halve(trials: list[Trial], method: str, plans: list[PlanRecord], executor: Executor) -> list[Trial]:
+def halve(trials: list[Trial], method: str, plans: list[Plan], executor: Executor) -> list[Trial]:
     """All trials after the last round: the best first, of those that went furthest."""
     out: list[Trial] = []
     first = spent = 0
@@ -142,7 +142,7 @@ def halve(trials: list[Trial], method: str, plans: list[PlanRecord], executor: E
     return trials + out
 
 
-def error_of(task: tuple[str, Settings, PlanRecord, int]) -> float:
+def error_of(task: tuple[str, Settings, Plan, int]) -> float:
     """True error (mm) of one insertion."""
     method, settings, plan, seed = task
     scenario = flexneedle.load_scenario("phantom").with_values(settings)
@@ -150,7 +150,7 @@ def error_of(task: tuple[str, Settings, PlanRecord, int]) -> float:
     return done.true_error_mm if done.outcome == "done" else FAILED_MM
 
 
-def plan_for(target: tuple[float, float]) -> PlanRecord:
+def plan_for(target: tuple[float, float]) -> Plan:
     """The plan that all settings share."""
     return flexneedle.plan(flexneedle.load_scenario("phantom"), target, seed=PLAN_SEED, threads=1)
 

@@ -33,10 +33,10 @@ from flexneedle.rig.loop import run as carry_out
 from flexneedle.rig.phantom.draw import draw
 from flexneedle.rig.virtual import Seeds, virtual_rig
 from flexneedle.scenario.model import Scenario
-from flexneedle.study.grid import Insertion, Study, load_study
+from flexneedle.study.grid import Study, StudyInsertion, load_study
 from flexneedle.study.plans import Plans, plan_key
 from flexneedle.trace.folder import STUDY_FILE
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 LAST_MM = 10.0  # before the target
 NOTHING, OTHER_PLAN = "nothing", "other plans"
@@ -109,7 +109,7 @@ class Ended:
     stretch: float
 
 
-def carried_out(insertion: Insertion, plan: PlanRecord, variant: str = NOTHING, sample: int = 0) -> Ended:
+def carried_out(insertion: StudyInsertion, plan: Plan, variant: str = NOTHING, sample: int = 0) -> Ended:
     """Carry it out in a variant of its scenario; sample 0 is the one that it had, others search with other samples."""
     point = insertion.point
     scenario = point.scenario.with_values(WITHOUT[variant])
@@ -150,7 +150,7 @@ def print_distribution(depth: np.ndarray, error: np.ndarray) -> None:
     print_table(head, rows)
 
 
-def print_worst(insertions: Sequence[Insertion], ends: Sequence[Ended]) -> None:
+def print_worst(insertions: Sequence[StudyInsertion], ends: Sequence[Ended]) -> None:
     """What the phantoms of the worst are, and where their errors arose."""
     head = ("index", "target, mm", "seed", "error", "along", "control", "belief", "guide", "stretch")
     head += ("moduli ×", "ahead ×", "bevel ×", "offset, mm", "slope, mrad", "boundary, mm")
@@ -172,7 +172,7 @@ def print_worst(insertions: Sequence[Insertion], ends: Sequence[Ended]) -> None:
     print_table(head, rows)
 
 
-def print_without(insertions: Sequence[Insertion], errors: np.ndarray) -> None:
+def print_without(insertions: Sequence[StudyInsertion], errors: np.ndarray) -> None:
     """Means and largest of errors (N, variants, samples)."""
     rows = [
         (str(insertion.index), *(f"{runs.mean():.2f} ({runs.max():.2f})" for runs in line))
@@ -245,7 +245,9 @@ def of_folder(folder: Path, source: str | None) -> Study:
     return study
 
 
-def again(pool: Executor, plans: Plans, worst: Sequence[Insertion], samples: int) -> list[list[list[Ended]]]:
+def again(
+    pool: Executor, plans: Plans, worst: Sequence[StudyInsertion], samples: int
+) -> list[list[list[Ended]]]:
     """Each of the worst in each variant with each sample (N, variants, samples)."""
     calls = [
         [

@@ -6,7 +6,7 @@ import pytest
 
 import flexneedle
 from flexneedle.estimation.identification import Identified
-from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.observer import StateCorrection
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 from tasks import begun_with
@@ -60,7 +60,9 @@ def estimated():
 
     def estimate(state, **fields):
         return replace(
-            Beliefs().begin(begun_with(Simulator(state.scenario, threads=1), 1)), state=state, **fields
+            StateCorrection().begin(begun_with(Simulator(state.scenario, threads=1), 1)),
+            state=state,
+            **fields,
         )
 
     return estimate

@@ -8,10 +8,10 @@ import flexneedle
 from flexneedle.control.methods.adaptive_mpc import AdaptiveMpc
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.prior import BASE_TURN, BASE_Y, BEND, BEVEL, CLEARANCE, MODULUS, RUN_OUT
-from flexneedle.mechanics.model import Learnt
+from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Sample
+from flexneedle.types import Measurement
 from tasks import begun_with
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -68,7 +68,9 @@ class Needle:
     def simulator(self, scenario):
         """The simulator with this needle's constants."""
         tissue = np.array(self.shift), np.array(self.modulus), 2.5, np.array(self.variation)
-        return Simulator(scenario, threads=1).adapted(Learnt(*tissue, self.bevel, self.bend, self.clearance))
+        return Simulator(scenario, threads=1).adapted(
+            Adaptation(*tissue, self.bevel, self.bend, self.clearance)
+        )
 
     def seen(self, state):
         """Tip (x, y) as a tracker measures it."""
@@ -94,7 +96,9 @@ def readings(needle, before, after, start, count, noise, rng):
     out = needle.seen(after) - after.tip[:2]
     first, last = before.tip[:2] + out, after.tip[:2] + out
     points = [first + part * (last - first) + rng.normal(0.0, noise, 2) for part in parts]
-    return [Sample(float(start + part), *point.tolist()) for part, point in zip(parts, points, strict=True)]
+    return [
+        Measurement(float(start + part), *point.tolist()) for part, point in zip(parts, points, strict=True)
+    ]
 
 
 def followed(needle, count, *, scenario=QUIET, noise=0.0, late=0, threads=1, per_move=2, rows=None):
@@ -141,7 +145,7 @@ def off_the_prior(count=55, needle="all"):
 def learnt_of(parameters):
     """What the parameters say of tissue and needle."""
     tissue = parameters[SHIFT:CELLS], np.exp(parameters[MODULUS:SHIFT]), 2.5, np.exp(parameters[CELLS:])
-    return Learnt(*tissue, *parameters[[BEVEL, BEND, CLEARANCE]].tolist())
+    return Adaptation(*tissue, *parameters[[BEVEL, BEND, CLEARANCE]].tolist())
 
 
 def stepped(parameters, rows, axial=0.0):

@@ -13,7 +13,7 @@ from flexneedle.rig.phantom.draw import draw
 from flexneedle.rig.phantom.phantom import Phantom
 from flexneedle.rig.tracking.simulated import NoisyTracker
 from flexneedle.rig.virtual import Rig
-from flexneedle.types import VISIBLE, Sample
+from flexneedle.types import VISIBLE, Measurement
 
 PHANTOM = flexneedle.load_scenario("phantom")
 STILL = (0.0, 0.0, 0.0, 0.0, -1)
@@ -56,7 +56,7 @@ class Stage:
     status = VISIBLE
 
     def __init__(self, tape, applied=()):
-        first = (Sample(0.0, -28.5, 0.0),)  # where the needle starts
+        first = (Measurement(0.0, -28.5, 0.0),)  # where the needle starts
         self.time, self.tape, self.applied = 0.0, itertools.chain([first], tape), iter(applied)
 
     def now(self):

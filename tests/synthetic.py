@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from flexneedle.types import Insertion, Period, PlanRecord, Sample
+from flexneedle.types import Insertion, Measurement, Period, Plan
 
 START, LENGTH, GUIDE_X, STEP = -28.5, 150.0, -41.0, 1.0
 TURN_AT = 45  # the step that turns the bevel
@@ -48,7 +48,7 @@ def make_plan(strategy="manipulation", target=(40.0, 5.0), seed=0):
     )
     terms = {"accuracy": 0.2, "energy": 5 * energy[-1], "deflection": 1.9, "control": 1.2, "flips": 0.3}
     history = tuple({"iteration": k, "best": 9.0 / k, "quantile": 10.0 / k} for k in range(1, 13))
-    return PlanRecord(
+    return Plan(
         strategy, target, seed, 1, controls, tips, energy, guide, shapes, sum(terms.values()), terms,
         12, True, history, "", 0.71,
     )  # fmt: skip
@@ -70,7 +70,7 @@ def make_periods(plan, miss=0.06, seed=0):
         yield Period(
             index=k, time=0.2 * (k + 1), command=command,
             applied=(command[0], 0.0, 0.0, round(command[3], 2), flip),
-            sample=Sample(0.2 * (k + 1) - 0.025, true[0] + noise[0], true[1] + noise[1]),
+            sample=Measurement(0.2 * (k + 1) - 0.025, true[0] + noise[0], true[1] + noise[1]),
             verdict="ok", innovation=(noise[0], noise[1]), estimate=estimate,
             shape=plan.shapes[k + 1] + [0.0, off, 0.0], base=(tip[0] - LENGTH, 0.0, 0.0),
             guide=plan.guide[k + 1] + 0.3 * np.sin(0.2 * k), bevel=side,
@@ -90,7 +90,7 @@ def make_insertion(plan=None, miss=0.06, seed=0, outcome="done", reason="", peri
 
 def blind(period):
     """Return the period as it is when the tracker saw nothing and there is no phantom to ask."""
-    sample = Sample(period.sample.time, None, None)
+    sample = Measurement(period.sample.time, None, None)
     return replace(
         period,
         sample=sample,

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from flexneedle.types import Frame, Judged, Reading, Sample
+from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 FRAMES = 8  # in a period of 0.2 s
@@ -10,9 +10,11 @@ FRAMES = 8  # in a period of 0.2 s
 
 def frame_of(number, time, indicators, place=(1.0, 2.0, 3.0)):
     """Return a frame with the tip at `place` and references with these indicators by name, None where unseen."""
-    tip = Reading(place, UPRIGHT) if place else Reading(None, status="out of volume")
+    tip = SensorReading(place, UPRIGHT) if place else SensorReading(None, status="out of volume")
     references = {
-        name: Reading(None, status="missing") if value is None else Reading((50.0, 0.0, 0.0), UPRIGHT, value)
+        name: SensorReading(None, status="missing")
+        if value is None
+        else SensorReading((50.0, 0.0, 0.0), UPRIGHT, value)
         for name, value in indicators.items()
     }
     return Frame(time, number, {"tip": tip, **references})
@@ -27,7 +29,8 @@ def with_readings(period, indicator=lambda _: 0.03, verdict="ok"):
         for number, time in zip(numbers, times, strict=True)
     ]
     told = tuple(
-        Judged(Sample(frame.time, period.sample.x, period.sample.y, 0.0, frame), verdict) for frame in frames
+        CheckedMeasurement(Measurement(frame.time, period.sample.x, period.sample.y, 0.0, frame), verdict)
+        for frame in frames
     )
     return replace(period, readings=told)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flexneedle import load_scenario
-from flexneedle.types import Frame, Judged, Reading, Sample
+from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
 from synthetic import make_periods, make_plan
 
 _SCRIPT = Path(__file__).parents[1] / "studies" / "monitor.py"
@@ -65,8 +65,8 @@ def test_medians_are_those_of_the_worst_reference_over_the_window(study):
     values = np.random.default_rng(0).uniform(0.0, 0.1, (10, 4, 2))
     for k, period in enumerate(periods):
         readings = [
-            Judged(
-                Sample(
+            CheckedMeasurement(
+                Measurement(
                     0.2 * k + 0.05 * j,
                     0.0,
                     0.0,
@@ -75,9 +75,9 @@ def test_medians_are_those_of_the_worst_reference_over_the_window(study):
                         0.0,
                         0,
                         {
-                            "tip": Reading((0.0, 0.0, 0.0)),
-                            "ref1": Reading((0.0, 0.0, 0.0), indicator=values[k, j, 0]),
-                            "ref2": Reading((0.0, 0.0, 0.0), indicator=values[k, j, 1]),
+                            "tip": SensorReading((0.0, 0.0, 0.0)),
+                            "ref1": SensorReading((0.0, 0.0, 0.0), indicator=values[k, j, 0]),
+                            "ref2": SensorReading((0.0, 0.0, 0.0), indicator=values[k, j, 1]),
                         },
                     ),
                 ),

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from flexneedle.simulator.control import Control
     from flexneedle.simulator.simulator import Simulator
     from flexneedle.simulator.state import State
-    from flexneedle.types import Sample
+    from flexneedle.types import Measurement, Plan
 
 __version__ = "0.1.0"
 
@@ -41,10 +41,11 @@ __all__ = [
     "Estimate",
     "FlexneedleError",
     "InputError",
+    "Measurement",
     "Method",
+    "Plan",
     "Plant",
     "RunError",
-    "Sample",
     "Scenario",
     "ScenarioError",
     "ScenarioWarning",
@@ -81,7 +82,7 @@ _HOMES = {
     "simulator.control": ("Control",),
     "simulator.simulator": ("Simulator",),
     "simulator.state": ("State",),
-    "types": ("Sample",),
+    "types": ("Measurement",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -25,7 +25,7 @@ VISIBLE = "ok"
 
 
 @dataclass(frozen=True)
-class Reading:
+class SensorReading:
     """One sensor in one frame of a tracker, in the tracker's frame; what it does not know is None.
 
     indicator: how far the two coils of a 6-DOF sensor disagree (paper, section IV-B); 5-DOF sensors may have one, too.
@@ -52,11 +52,11 @@ class Frame:
 
     time: float
     number: int
-    readings: Mapping[str, Reading]
+    readings: Mapping[str, SensorReading]
 
 
 @dataclass(frozen=True)
-class Sample:
+class Measurement:
     """The tip in one frame: time it was taken (s); x, y in the plane and z out of it (mm), None where it was not seen.
 
     frame: what the tracker said, for those who judge it; None if there is no more than the tip.
@@ -70,7 +70,7 @@ class Sample:
 
 
 @dataclass(frozen=True, eq=False)
-class PlanRecord:
+class Plan:
     """A planned insertion of m steps.
 
     controls (m, 5): columns db_x, db_y, db_theta, dg_y, flip; tips (m + 1, 3): planned tip poses, the start first;
@@ -141,10 +141,10 @@ class PlanRecord:
 
 
 @dataclass(frozen=True)
-class Judged:
+class CheckedMeasurement:
     """A reading of the tracker, and "ok" or why it was rejected."""
 
-    sample: Sample
+    sample: Measurement
     verdict: str
 
 
@@ -156,7 +156,7 @@ class Period:
     time: float  # end of the period (s), simulated or of the rig
     command: Command
     applied: Command
-    sample: Sample
+    sample: Measurement
     verdict: str  # "ok", or why the sample was not used
     innovation: tuple[float, float]  # sample minus prediction (mm); 0, 0 without a usable sample
     estimate: Pose
@@ -178,14 +178,16 @@ class Period:
     miss: float = float("nan")  # lateral, predicted at the target (mm), NaN: not predicted
     miss_sd: float = float("nan")  # its standard deviation (mm)
     warning: str = ""  # that the insertion is likely to miss
-    readings: tuple[Judged, ...] = ()  # all that came in the period, oldest first; `sample` is the newest
+    readings: tuple[
+        CheckedMeasurement, ...
+    ] = ()  # all that came in the period, oldest first; `sample` is the newest
 
 
 @dataclass(frozen=True, eq=False)
 class Insertion:
     """A whole insertion. outcome: "done", "held" (bad readings, no path to the target), "failed" or "interrupted"."""
 
-    plan: PlanRecord
+    plan: Plan
     seed: int
     periods: tuple[Period, ...]
     outcome: str

@@ -148,7 +148,7 @@ def test_the_rate_is_that_of_insertions_alone_and_counts_no_earlier_ones(monkeyp
         def show(self, stage, _done, _total, note):
             notes.append((stage, note))
 
-    show = study_command._Show(Listener())
+    show = study_command._StudyProgress(Listener())
     for plans, done, later in ((0, 40, 50.0), (1, 40, 8.0), (2, 41, 10.0), (2, 46, 0.0)):
         show.advance(Advance(plans, 2, done, 100, 3))
         now += later

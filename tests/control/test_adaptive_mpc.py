@@ -15,14 +15,14 @@ from flexneedle.control.path import of_plan
 from flexneedle.estimation.estimate import Move
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.prior import RUN_OUT
-from flexneedle.mechanics.model import Learnt
+from flexneedle.mechanics.model import Adaptation
 from flexneedle.planning import terms
 from flexneedle.planning.planner import bevel_reach
 from flexneedle.planning.terms import charges, cost
 from flexneedle.scenario.worlds import world
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Sample
+from flexneedle.types import Measurement
 from tasks import begun_with, task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -86,7 +86,7 @@ def carried_out(plan, scenario, plant=None, steps=100, seed=0):
         command = STILL if decision.rest > 0.0 else decision.command
         truth = plant.step(truth, Control.from_row(command))
         x, y = truth.tip[:2].tolist()
-        estimate = estimate.move(command, k, k + 1.0).observe([Sample(k + 1.0, x, y)])
+        estimate = estimate.move(command, k, k + 1.0).observe([Measurement(k + 1.0, x, y)])
         if ADAPTIVE.arrived(task, memory, estimate):
             break
     return decisions, truth, estimate
@@ -342,7 +342,7 @@ def test_a_roll_takes_the_run_out_to_the_other_side(quick_plan, along):
 def test_the_fitted_model_is_the_one_that_predicts(quick_plan, along):
     """Tissue thrice as stiff asks for another guide step, from the same state."""
     estimate = estimate_of(along(quick_plan, 55, base_y=0.3))
-    stiff = replace(estimate, simulator=estimate.nominal.adapted(Learnt(np.zeros(1), np.full(2, 3.0))))
+    stiff = replace(estimate, simulator=estimate.nominal.adapted(Adaptation(np.zeros(1), np.full(2, 3.0))))
     assert decide(quick_plan, stiff).cost != decide(quick_plan, estimate).cost
     assert decide(quick_plan, stiff).command[3] != decide(quick_plan, estimate).command[3]
 
@@ -411,7 +411,7 @@ def test_limits_are_kept_whatever_the_plan(quick_plan, step, reach, advance, str
         simulator.check(estimate.state, Control.from_row(decision.command))
         estimate = estimate.move(decision.command, k, k + 1.0)
         x, y = estimate.tip[:2]
-        estimate = estimate.observe([Sample(k + 1.0, float(x), float(y) + rng.normal(0.0, 0.5))])
+        estimate = estimate.observe([Measurement(k + 1.0, float(x), float(y) + rng.normal(0.0, 0.5))])
         places.append(estimate.state.guide)
         assert 0.0 < decision.command[0] <= advance + 1e-12
     assert np.abs(np.diff(places)).max() <= step + 1e-12
@@ -444,7 +444,7 @@ def test_a_whole_insertion_into_another_tissue_ends_at_the_target(quick_plan):
     searches: a stiff deep layer shows late, and the path that is left then depends on the path before.
     """
     plant = Simulator(PHANTOM, threads=1).adapted(
-        Learnt(np.zeros(1), np.array([2.0, 1.5]), bevel=0.5, bend=0.4)
+        Adaptation(np.zeros(1), np.array([2.0, 1.5]), bevel=0.5, bend=0.4)
     )
     state = plant.start(quick_plan.bevel)
     for row in quick_plan.controls:

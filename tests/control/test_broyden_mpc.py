@@ -210,14 +210,16 @@ def test_before_the_first_reading_it_goes_straight_on(quick_plan):
 
 
 def test_an_old_reading_is_not_learnt_from_again():
-    learnt = bm.Learnt(np.eye(2), ((0.0, 28.5, 0.0),), (np.array([0.0, 0.0]), np.array([28.5, 0.0])))
+    learnt = bm.JacobianEstimate(
+        np.eye(2), ((0.0, 28.5, 0.0),), (np.array([0.0, 0.0]), np.array([28.5, 0.0]))
+    )
     assert bm.learn(learnt, np.array([0.02, 0.05]), np.array([28.52, 0.0]), 0.65) is learnt
     further = bm.learn(learnt, np.array([1.0, 0.05]), np.array([29.5, 0.0]), 0.65)
     assert further.jacobian[1, 0] == pytest.approx(0.65 * 0.05)
 
 
 def test_inputs_are_those_of_when_the_tip_was_there():
-    learnt = bm.Learnt(np.eye(2), ((1.0, 10.0, 0.2), (2.0, 11.0, 0.6), (2.5, 11.5, 0.6)))
+    learnt = bm.JacobianEstimate(np.eye(2), ((1.0, 10.0, 0.2), (2.0, 11.0, 0.6), (2.5, 11.5, 0.6)))
     np.testing.assert_allclose(bm.inputs_at(learnt, 1.25), [10.25, 0.3])
     np.testing.assert_allclose(bm.inputs_at(learnt, 9.0), [11.5, 0.6])
     for k in range(20):
@@ -229,7 +231,7 @@ def test_memory_is_a_value_that_deciding_leaves_alone(quick_plan, along, estimat
     task = task_of(Simulator(PHANTOM, threads=1), quick_plan, "broyden-mpc")
     state = along(quick_plan, 30)
     seen = (state.tip[:2] - [2.0, 0.1], np.array([state.travel[0] - 2.0, state.guide]))
-    learnt = bm.Learnt(np.array([[1.0, 0.0], [0.1, 0.9]]), (), seen)
+    learnt = bm.JacobianEstimate(np.array([[1.0, 0.0], [0.1, 0.9]]), (), seen)
     before = learnt.jacobian.copy(), learnt.seen[0].copy(), learnt.seen[1].copy()
     estimate = estimated(state, measured=tuple(state.tip[:2].tolist()))
     one, after = BROYDEN.decide(task, learnt, estimate, RNG)

@@ -9,7 +9,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 import flexneedle
-from flexneedle.control.path import KNOTS, LEAST_SLOTS, Ahead, Path, of_plan, proposals
+from flexneedle.control.path import KNOTS, LEAST_SLOTS, Ahead, GuidePath, of_plan, proposals
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 from tasks import task_of
@@ -27,7 +27,7 @@ def ahead_of(plan, state, path=None, scenario=PHANTOM):
 
 def level(*rolls, guide=0.0):
     """A path with the guide at one place (mm)."""
-    return Path(np.array([-28.5, 40.0]), np.full(2, guide), rolls)
+    return GuidePath(np.array([-28.5, 40.0]), np.full(2, guide), rolls)
 
 
 def started(x, guide=0.0, simulator=None):

@@ -15,7 +15,7 @@ from flexneedle.estimation.prior import (
     unexplained,
 )
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Sample
+from flexneedle.types import Measurement
 from identified import (
     CELLS,
     NEEDLES,
@@ -83,7 +83,7 @@ def test_at_rest_the_tip_is_found_too_with_derivatives_that_are_renewed_alternat
     estimate, states = followed(needle, 70)
     x, y = needle.seen(states[-1]).tolist()
     for k in range(8):
-        estimate = estimate.move(STILL, 70.0 + k, 71.0 + k).observe([Sample(71.0 + k, x, y)])
+        estimate = estimate.move(STILL, 70.0 + k, 71.0 + k).observe([Measurement(71.0 + k, x, y)])
     assert estimate.tip[1] == pytest.approx(y, abs=5e-3)
 
 
@@ -200,7 +200,7 @@ def test_more_noise_means_less_is_believed():
             .begin(begun_with(Simulator(scenario, 1), 1))
             .move((1.0, 0.0, 0.0, 0.0, -1), 0.0, 1.0)
         )
-        moved.append(estimate.observe([Sample(1.0, -27.5, 0.1)]).tip[1])
+        moved.append(estimate.observe([Measurement(1.0, -27.5, 0.1)]).tip[1])
     assert 0.1 > moved[0] > moved[1] > moved[2] > 0.0
 
 
@@ -272,7 +272,7 @@ def test_idle_periods_are_one_move_and_cost_no_simulation(monkeypatch):
     resting = estimate.move(STILL, 30.0, 31.0)
     assert len(resting.moves) == 31
     np.testing.assert_allclose(resting.tip, estimate.tip, atol=1e-6)
-    resting = resting.observe([Sample(31.0, *needle.seen(states[-1]).tolist())])
+    resting = resting.observe([Measurement(31.0, *needle.seen(states[-1]).tolist())])
 
     def none(*_):
         raise AssertionError("nothing moves")
@@ -286,7 +286,7 @@ def test_idle_periods_are_one_move_and_cost_no_simulation(monkeypatch):
     assert longer.state is resting.state
     assert (len(longer.moves), longer.tips.shape) == (31, resting.tips.shape)
     assert (longer.moves[-1].begun, longer.moves[-1].ended) == (30.0, 51.0)
-    seen = longer.observe([Sample(50.0, *needle.seen(states[-1]).tolist())])
+    seen = longer.observe([Measurement(50.0, *needle.seen(states[-1]).tolist())])
     assert len(seen.moves[-1].samples) == 2
     assert seen.tip_at(40.5) == pytest.approx(tuple(seen.tip[:2]), abs=1e-6)
     assert len(seen.move((1.0, 0.0, 0.0, 0.0, -1), 51.0, 52.0).moves) == 32

@@ -10,7 +10,7 @@ from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.prior import BASE_TURN, BASE_Y, BEND, BEVEL, CLEARANCE, RUN_OUT, unexplained
 from flexneedle.mechanics import needle as nd
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Sample
+from flexneedle.types import Measurement
 from identified import (
     CELLS,
     NEEDLES,
@@ -185,7 +185,7 @@ def test_a_step_never_fits_worse(monkeypatch):
         for k, row in enumerate(commands(50)):
             x, y = states[k + 1].tip[:2].tolist()
             off = jump * (-1) ** (k // 5)
-            estimate = estimate.move(row, k, k + 1.0).observe([Sample(k + 1.0, x, y + off)])
+            estimate = estimate.move(row, k, k + 1.0).observe([Measurement(k + 1.0, x, y + off)])
     before, after = np.array(costs).T
     assert (after <= before * (1.0 + 1e-8)).all()
     assert len(set(tried)) >= 3
@@ -262,7 +262,7 @@ def test_readings_of_a_move_are_averaged_at_their_mean_time():
     estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
     for k in range(2):
         estimate = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 2.0 * k, 2.0 * k + 2.0)
-    seen = [Sample(2.5, -27.3, 0.1), Sample(3.5, -26.7, 0.3)]
+    seen = [Measurement(2.5, -27.3, 0.1), Measurement(3.5, -26.7, 0.3)]
     means = estimate.observe(seen)._readings
     assert (means.index.tolist(), means.count.tolist()) == ([1], [2.0])
     assert (means.part[0], means.x[0], means.y[0]) == pytest.approx((0.5, -27.0, 0.2))
@@ -274,7 +274,7 @@ def test_a_reading_is_on_the_side_to_which_the_bevel_turned_before_its_move(firs
     estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), first))
     for k, flip in enumerate((-1, 1, -1, 1, -1)):
         estimate = estimate.move((1.0, 0.0, 0.0, 0.0, flip), float(k), k + 1.0)
-    seen = [Sample(k + 0.5, -28.0 + k, 0.0) for k in (0, 1, 3, 4)]
+    seen = [Measurement(k + 0.5, -28.0 + k, 0.0) for k in (0, 1, 3, 4)]
     means = estimate.observe(seen)._readings
     np.testing.assert_array_equal(means.index, [0, 1, 3, 4])
     np.testing.assert_array_equal(means.sides, np.multiply(first, [1, -1, 1, 1]))

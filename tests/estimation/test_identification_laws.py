@@ -16,10 +16,10 @@ from flexneedle.estimation.prior import (
     RUN_OUT,
     unexplained,
 )
-from flexneedle.mechanics.model import Learnt
+from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Sample
+from flexneedle.types import Measurement
 from identified import (
     CELLS,
     NEEDLES,
@@ -47,7 +47,7 @@ def test_parameters_stay_within_four_standard_deviations(off):
     for k, row in enumerate(rows):
         estimate = estimate.move(row, k, k + 1.0)
         x, y = states[k + 1].tip[:2]
-        estimate = estimate.observe([Sample(k + 1.0, float(x), float(y) + off * (-1) ** (k // 10))])
+        estimate = estimate.observe([Measurement(k + 1.0, float(x), float(y) + off * (-1) ** (k // 10))])
         found = estimate.parameters
         assert abs(found[BASE_Y]) <= 4.0 * 0.5 + 1e-12
         assert abs(found[BASE_TURN]) <= 4.0 * 3e-3 + 1e-12
@@ -84,7 +84,7 @@ def test_a_turn_of_the_bevel_turns_bend_and_run_out_over():
     estimate = Identification().begin(begun_with(simulator, 1))
     parameters = estimate.parameters.copy()
     parameters[[BEND, RUN_OUT]] = 0.6, 0.1
-    adapted = simulator.adapted(Learnt(np.zeros(1), np.ones(2), bend=0.6))
+    adapted = simulator.adapted(Adaptation(np.zeros(1), np.ones(2), bend=0.6))
     state = adapted.step(simulator.start(), Control())
     bent = replace(estimate, simulator=adapted, state=state, parameters=parameters)
     assert bent.tip[1] == pytest.approx(0.7, abs=1e-4)  # the bend shortens the needle a little
@@ -150,7 +150,7 @@ def test_innovation_and_measured_tip_are_those_of_the_newest_reading():
     estimate, _ = followed(needle, 45)
     moved = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 45.0, 46.0)
     x, y = np.add(moved.tip[:2], [0.01, 0.002])
-    seen = moved.observe([Sample(46.0, float(x), float(y))])
+    seen = moved.observe([Measurement(46.0, float(x), float(y))])
     assert seen.measured == pytest.approx((x, y), abs=1e-9)
     assert seen.innovation[0] == pytest.approx(0.01, abs=2e-3)
     assert abs(seen.innovation[1]) < 0.002
@@ -171,7 +171,7 @@ def test_without_readings_or_moves_the_estimate_stays():
         assert kept.parameters is moved.parameters
         assert kept.innovation == (0.0, 0.0)
     start = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
-    assert start.observe([Sample(0.0, -28.5, 0.4)]).state == start.state
+    assert start.observe([Measurement(0.0, -28.5, 0.4)]).state == start.state
 
 
 def test_observing_changes_nothing_of_the_old_belief_and_threads_nothing_of_the_new():
@@ -182,7 +182,7 @@ def test_observing_changes_nothing_of_the_old_belief_and_threads_nothing_of_the_
     assert one.state == many.state
     before = one.parameters.copy(), one.tips.copy(), one.state.scalars.copy(), one.moves
     moved = one.move((1.0, 0.0, 0.0, 0.1, -1), 45.0, 46.0)
-    here, again = (moved.observe([Sample(46.0, 17.5, 1.0)]) for _ in range(2))
+    here, again = (moved.observe([Measurement(46.0, 17.5, 1.0)]) for _ in range(2))
     np.testing.assert_array_equal(here.parameters, again.parameters)
     after = one.parameters, one.tips, one.state.scalars
     for kept, now in zip(before[:3], after, strict=True):

@@ -9,10 +9,10 @@ import pytest
 import flexneedle
 from flexneedle.control.methods import METHODS
 from flexneedle.estimation.estimate import Move, along, place
-from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.observer import StateCorrection
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Sample
+from flexneedle.types import Measurement
 from tasks import begun_with
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -28,7 +28,7 @@ def start_with(scenario, **corrections):
 
 def begun(simulator, state=None, bevel=1, **beliefs):
     """The estimate at the start, or at a state."""
-    estimate = Beliefs(**beliefs).begin(begun_with(simulator, bevel))
+    estimate = StateCorrection(**beliefs).begin(begun_with(simulator, bevel))
     return estimate if state is None else replace(estimate, state=state, past=state, tips=state.tip[None])
 
 
@@ -44,7 +44,9 @@ def samples_between(before, after, start=0.0, count=4):
     """Exact readings of the tip during a period of one second."""
     parts = (np.arange(count) + 1) / count
     points = before.tip[:2] + parts[:, None] * (after.tip[:2] - before.tip[:2])
-    return [Sample(float(start + t), float(x), float(y)) for t, (x, y) in zip(parts, points, strict=True)]
+    return [
+        Measurement(float(start + t), float(x), float(y)) for t, (x, y) in zip(parts, points, strict=True)
+    ]
 
 
 def follow(truth, estimate, plant, steps, *, noise=0.0, force=0.0, guide=0.0):
@@ -121,7 +123,7 @@ def test_fit_in_air_is_the_least_squares_solution_with_the_prior():
         information += np.outer(h, h) / (noise**2 / 2)
         moment += np.array(h) * reading / (noise**2 / 2)
         readings = [
-            Sample(k + 1.0, float(truth.tip[0]), float(reading))
+            Measurement(k + 1.0, float(truth.tip[0]), float(reading))
         ] * 2  # at the end, so two of variance σ²
         estimate = estimate.move(AHEAD, k, k + 1.0).observe(readings)
     np.testing.assert_allclose(estimate.state.base[1:], np.linalg.solve(information, moment), rtol=2e-3)
@@ -169,7 +171,7 @@ def test_load_takes_the_gain_times_the_reaction_and_the_tip_goes_where_it_was_se
     moved = known.move(AHEAD, 0.0, 1.0)
     predicted = moved.state
     x, y = predicted.tip[:2] + np.array([0.05, 0.3])
-    corrected = moved.observe([Sample(1.0, x, y)])
+    corrected = moved.observe([Measurement(1.0, x, y)])
     held = simulator.assimilate(predicted, (x, y)).state
     expected = 0.001 + PHANTOM.control.load_gain * held.reactions.tip_force
     assert held.reactions.tip_force > 1e-4
@@ -206,7 +208,7 @@ def test_the_next_reading_is_as_uncertain_as_the_path_since_the_last_one_is_long
     simulator = Simulator(PHANTOM)
     estimate = replace(begun(simulator, in_tissue(simulator)), drift=0.01)
     seen = estimate.move(AHEAD, 0.0, 1.0).observe(
-        [Sample(1.0, float(estimate.tip[0]) + 1.0, float(estimate.tip[1]))]
+        [Measurement(1.0, float(estimate.tip[0]) + 1.0, float(estimate.tip[1]))]
     )
     later = seen.move(AHEAD, 1.0, 2.0)
     for one, since in [(estimate, 0.0), (later, seen.measured[0])]:
@@ -224,7 +226,7 @@ def test_a_contact_that_is_cut_is_on_the_measured_path_wherever_the_tip_is_along
     start = replace(begun(simulator, in_tissue(simulator)), axial=axial)
     moved = start.move(AHEAD, 0.0, 1.0)
     x, y = np.add(moved.tip[:2], off).tolist()
-    corrected = moved.observe([Sample(1.0, x, y)])
+    corrected = moved.observe([Measurement(1.0, x, y)])
     assert corrected.tip[1] == pytest.approx(y, abs=1e-9)
     assert corrected.tip[0] == pytest.approx(moved.tip[0] + axial * off[0], abs=0.03)
     before, after, contacts = start.tip, corrected.tip, corrected.state.contacts
@@ -242,7 +244,7 @@ def test_innovations_of_a_period_are_averaged_at_the_times_of_the_readings():
     readings = []
     for off, part in ((0.1, 0.25), (0.2, 0.5), (0.6, 1.0)):
         x, y = estimate.tip[:2] + part * (predicted.tip[:2] - estimate.tip[:2])
-        readings.append(Sample(7.0 + 2.0 * part, float(x) - off, float(y) + off))
+        readings.append(Measurement(7.0 + 2.0 * part, float(x) - off, float(y) + off))
     corrected = predicted.observe(readings)
     np.testing.assert_allclose(corrected.innovation, [-0.3, 0.3], atol=1e-12)
     assert corrected.tip[1] == pytest.approx(corrected.measured[1], abs=1e-9)
@@ -278,16 +280,16 @@ def test_more_readings_are_trusted_more():
     simulator = Simulator(PHANTOM.with_values({"tracker.jitter_mm": 1.0}))
     predicted = begun(simulator).move(AHEAD, 0.0, 1.0)
     x, y = predicted.tip[:2] + np.array([0.0, 0.5])
-    tips = [predicted.observe([Sample(1.0, x, y)] * n).tip[1] for n in (1, 4, 16)]
+    tips = [predicted.observe([Measurement(1.0, x, y)] * n).tip[1] for n in (1, 4, 16)]
     assert all(0.0 < less < more < 0.5 for less, more in pairwise(tips))
 
 
 def test_an_empty_reading_is_refused():
     moved = begun(Simulator(PHANTOM)).move(AHEAD, 0.0, 1.0)
     with pytest.raises(ValueError, match="not sorted out"):
-        moved.observe([Sample(1.0, None, None)])
+        moved.observe([Measurement(1.0, None, None)])
     with pytest.raises(ValueError, match="not sorted out"):
-        place(Sample(1.0, 3.0, None))
+        place(Measurement(1.0, 3.0, None))
 
 
 def test_without_fitting_the_start_the_measured_tip_is_held_in_air_too():
@@ -295,7 +297,7 @@ def test_without_fitting_the_start_the_measured_tip_is_held_in_air_too():
     simulator = Simulator(PHANTOM)
     predicted = begun(simulator, fits_start=False, learns_load=False).move(AHEAD, 0.0, 1.0)
     x, y = predicted.tip[:2] + np.array([0.0, 0.5])
-    corrected = predicted.observe([Sample(1.0, x, y)])
+    corrected = predicted.observe([Measurement(1.0, x, y)])
     assert corrected.tip[1] == pytest.approx(0.5, abs=1e-9)
     np.testing.assert_array_equal(corrected.state.base[1:], 0.0)
     assert corrected.move(AHEAD, 1.0, 2.0).tip[1] == pytest.approx(0.0, abs=1e-9)  # released
@@ -310,14 +312,14 @@ def test_the_papers_controller_releases_the_measured_tip_and_learns_nothing(name
         state = in_tissue(simulator, steps)
         moved = replace(begin, state=state, past=state, tips=state.tip[None]).move(AHEAD, 0.0, 1.0)
         x, y = np.add(moved.tip[:2], [0.0, 0.3])
-        seen = moved.observe([Sample(1.0, float(x), float(y))]).state
+        seen = moved.observe([Measurement(1.0, float(x), float(y))]).state
         assert bool(seen.base[1] != 0.0 or seen.tip_load != 0.0) is learns
 
 
 def test_unseen_keeps_the_belief_and_has_no_innovation():
     simulator = Simulator(PHANTOM)
     moved = begun(simulator, in_tissue(simulator)).move(AHEAD, 0.0, 1.0)
-    seen = moved.observe([Sample(1.0, *(moved.tip[:2] + 0.1))])
+    seen = moved.observe([Measurement(1.0, *(moved.tip[:2] + 0.1))])
     assert seen.innovation != (0.0, 0.0)
     assert seen.unseen().innovation == (0.0, 0.0)
     assert seen.unseen().state is seen.state
@@ -415,11 +417,11 @@ def test_a_reading_belongs_to_the_move_in_which_it_was_taken():
     """One at the end of a move to that move; one from before the start to the first, one from after to the last."""
     simulator = Simulator(PHANTOM)
     estimate = begun(simulator).move(AHEAD, 0.0, 1.0).move(AHEAD, 1.0, 2.0).move(AHEAD, 2.0, 3.0)
-    at = {time: Sample(time, -27.0, 0.01) for time in (-0.5, 0.4, 1.0)}
+    at = {time: Measurement(time, -27.0, 0.01) for time in (-0.5, 0.4, 1.0)}
     seen = estimate.observe([at[-0.5], at[0.4]])
     assert [done.samples for done in seen.moves] == [(at[-0.5], at[0.4]), (), ()]
     assert [done.ended for done in seen.observe([at[1.0]]).moves] == [2.0, 3.0]  # the first move is closed
-    late = Sample(7.0, -25.5, 0.0)
+    late = Measurement(7.0, -25.5, 0.0)
     assert estimate.observe([late]).moves == ()
 
 
@@ -439,7 +441,7 @@ def test_observing_leaves_the_old_belief_as_it_was():
     simulator = Simulator(PHANTOM)
     moved = begun(simulator, in_tissue(simulator, 20)).move(AHEAD, 0.0, 1.0)
     before = moved.tips.copy(), moved.covariance.copy(), moved.state.scalars.copy(), moved.moves
-    one, other = (moved.observe([Sample(1.0, -7.5, 0.2)]) for _ in range(2))
+    one, other = (moved.observe([Measurement(1.0, -7.5, 0.2)]) for _ in range(2))
     assert_same_belief(one, other)
     now = moved.tips, moved.covariance, moved.state.scalars
     for kept, there in zip(before, now, strict=False):

@@ -10,7 +10,7 @@ from flexneedle.errors import ScenarioError
 from flexneedle.estimation import prior as prior_of
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.prior import BEVEL, CLEARANCE, Prior, unexplained
-from flexneedle.mechanics.model import Learnt
+from flexneedle.mechanics.model import Adaptation
 from flexneedle.scenario.worlds import world
 from flexneedle.simulator.simulator import Simulator
 from identified import CELLS, OWN, PHANTOM
@@ -87,7 +87,7 @@ def test_no_bevel_factor_leaves_what_the_law_allows(offset, heights, sd):
     assert high > 1.0
     assert high * offset <= 0.7 * min(heights)
     widest = Simulator(scenario, 1).adapted(
-        Learnt(np.zeros(len(heights) - 1), np.ones(len(heights)), bevel=high)
+        Adaptation(np.zeros(len(heights) - 1), np.ones(len(heights)), bevel=high)
     )
     assert widest._model.bevel_offset <= 0.7 * min(heights)
 

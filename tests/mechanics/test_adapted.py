@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from flexneedle.mechanics import needle as nd
-from flexneedle.mechanics.model import CONTACT, GUIDE, Learnt, Model, adapted, contact_nodes, tissue_layers
+from flexneedle.mechanics.model import (
+    CONTACT,
+    GUIDE,
+    Adaptation,
+    Model,
+    adapted,
+    contact_nodes,
+    tissue_layers,
+)
 
 THICKNESS = (6.0, 3.5, np.inf)
 MU = np.array([1e-3, 4e-3, 2e-3])
@@ -25,7 +33,7 @@ CELLS = np.array([1.5, 0.7, 1.2, 0.4, 2.0, 0.9])
 
 
 def learnt(shift=(0.0, 0.0), stiffness=(1.0, 1.0, 1.0), cell=1.0, variation=(1.0,), **others):
-    return Learnt(np.array(shift), np.array(stiffness), cell, np.array(variation), **others)
+    return Adaptation(np.array(shift), np.array(stiffness), cell, np.array(variation), **others)
 
 
 def modulus_width(x, believed):
@@ -178,7 +186,7 @@ def test_a_single_layer_has_no_boundary():
     layers = tissue_layers(*(np.array([value]) for value in (np.inf, MU[0], ALPHA, HEIGHT, WIDTH[0])))
     nodes = contact_nodes(layers, np.ones(1), 1.0, 8.0, None)
     model = MODEL._replace(nodes=nodes, layers=layers)
-    changed = adapted(model, Learnt(np.zeros(0), np.array([2.0]), 4.0, np.array([1.0, 3.0])))
+    changed = adapted(model, Adaptation(np.zeros(0), np.array([2.0]), 4.0, np.array([1.0, 3.0])))
     np.testing.assert_allclose(
         changed.nodes.force, np.where(nodes.x < 4.0, 2.0, 6.0) * nodes.force, rtol=1e-12
     )

@@ -11,10 +11,10 @@ from hypothesis.extra.numpy import arrays
 
 from flexneedle.planning import insertion
 from flexneedle.planning.cross_entropy import Search
-from flexneedle.planning.insertion import Problem, optimise, schedule
+from flexneedle.planning.insertion import PlanProblem, optimise, schedule
 from flexneedle.planning.terms import Outcome, charges
 
-PROBLEM = Problem(
+PROBLEM = PlanProblem(
     target=(8.0, 2.0), travel=12.0, air=4.0, primitives=3,
     step=np.array([1.0, 0.5, 0.005, 0.5]), reach=np.array([20.0, 1.0, np.inf, 2.0]),
     sigma=np.array([0.1, 0.0, 0.0, 0.25, 1.0, 0.3]),

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from flexneedle.planning import steering
 from flexneedle.planning.cross_entropy import Search
-from flexneedle.planning.insertion import Problem
+from flexneedle.planning.insertion import PlanProblem
 from flexneedle.planning.terms import Outcome
 
 SEARCH = Search(samples=16, elite=4, iterations=60, smoothing=0.2, tolerance=1e-6)
@@ -20,7 +20,7 @@ BEND = 0.01  # curvature of the tip's path, 1/mm
 
 def problem(lateral, **changes):
     """8 mm in air and 20 mm in tissue, steps of 3 mm, which do not divide it."""
-    made = Problem(
+    made = PlanProblem(
         target=(20.0, lateral), travel=28.0, air=8.0, primitives=1, step=np.array([3.0, 0.5, 0.005, 0.5]),
         reach=np.array([50.0, 1.0, np.inf, 2.0]), sigma=np.zeros(6),
         accuracy_weight=20.0, energy_weight=0.0, deflection_weight=0.0, guide_weight=0.0, flip_weight=0.01,

@@ -9,7 +9,7 @@ import flexneedle
 from flexneedle.rig.measuring import look_around, see
 from flexneedle.rig.monitor.rules import OK
 from flexneedle.rig.monitor.watch import Watch
-from flexneedle.types import VISIBLE, Frame, Reading, Sample
+from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading
 
 SCENARIO = flexneedle.load_scenario("phantom")
 TIP = (30.0, 1.0)
@@ -46,10 +46,10 @@ class Eye:
 
 
 def sample(time, *, seen=True, indicator=0.02):
-    references = {f"ref{k}": Reading((0.0, 0.0, 0.0), indicator=indicator) for k in (1, 2, 3)}
-    tip = Reading((*TIP, time)) if seen else Reading(None, status="out of volume")
+    references = {f"ref{k}": SensorReading((0.0, 0.0, 0.0), indicator=indicator) for k in (1, 2, 3)}
+    tip = SensorReading((*TIP, time)) if seen else SensorReading(None, status="out of volume")
     x, y, z = (*TIP, 0.0) if seen else (None, None, None)
-    return Sample(time, x, y, z, Frame(time, round(time * RATE), {"tip": tip, **references}))
+    return Measurement(time, x, y, z, Frame(time, round(time * RATE), {"tip": tip, **references}))
 
 
 def second(end=1.0, **kind):
@@ -203,6 +203,6 @@ def test_the_limit_of_the_innovation_widens_with_the_uncertainty_of_the_predicti
     limit = SCENARIO.control.innovation_limit_mm
     for estimate, most in ((Belief(), limit), (Unsure(), limit + 1.5)):
         for off, verdict in ((most - 0.01, OK), (most + 0.01, "innovation")):
-            one = Sample(1.0, TIP[0], TIP[1] + off)
+            one = Measurement(1.0, TIP[0], TIP[1] + off)
             sight = see(SCENARIO, estimate, Watch(SCENARIO.monitor), 0.8, 1.0, Eye(one))
             assert sight.readings[0].verdict.split()[0] == verdict

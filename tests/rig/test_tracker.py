@@ -5,7 +5,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from rooms import STILL, shipped
 
 import flexneedle
 from flexneedle.rig.loop import run
@@ -15,7 +14,8 @@ from flexneedle.rig.tracking.field.sensors import indicator, noiseless
 from flexneedle.rig.tracking.placement import placed_references
 from flexneedle.rig.tracking.plane import InPlane
 from flexneedle.rig.virtual import Rig, Seeds, to_stage, virtual_rig, virtual_room
-from flexneedle.types import Frame, Reading
+from flexneedle.types import Frame, SensorReading
+from rooms import STILL, shipped
 
 PHANTOM = flexneedle.load_scenario("phantom")
 PLATE = shipped("noisy").plate
@@ -281,12 +281,12 @@ def on_bench(plan, told_at, status="unplugged", **values):
     return run(PHANTOM.with_values(values), plan, rig, np.random.default_rng(0))
 
 
-AT_START = Reading((-28.5, 0.0, 0.0))
-LOST = Reading(None, status="out of volume")
+AT_START = SensorReading((-28.5, 0.0, 0.0))
+LOST = SensorReading(None, status="out of volume")
 
 
 def references(indicator):
-    return {name: Reading((0.0, 50.0, 0.0), indicator=indicator) for name in ("ref1", "ref2", "ref3")}
+    return {name: SensorReading((0.0, 50.0, 0.0), indicator=indicator) for name in ("ref1", "ref2", "ref3")}
 
 
 def test_causes_that_take_turns_hold_nothing_forever(plan):

@@ -7,7 +7,7 @@ import pytest
 
 from flexneedle import Control, Simulator, load_scenario
 from flexneedle.mechanics import needle as nd
-from flexneedle.mechanics.model import Learnt
+from flexneedle.mechanics.model import Adaptation
 from reference import closed_forms as exact
 from reference.cases import EI, FOUNDATION, LENGTH_MM, insert_to, long_beam, repeat
 
@@ -20,7 +20,7 @@ LENGTH = PHANTOM.needle.length_mm
 def learnt(stiffness=(1.0, 1.0), shift=None, **others):
     """What is believed of the tissue, no boundary displaced if nothing is said about it."""
     still = np.zeros(len(stiffness) - 1)
-    return Learnt(still if shift is None else np.array(shift), np.array(stiffness), **others)
+    return Adaptation(still if shift is None else np.array(shift), np.array(stiffness), **others)
 
 
 def bent(scenario, bend, bevel=1):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from flexneedle import Control, Simulator, load_scenario
 from flexneedle.mechanics import needle as nd
-from flexneedle.mechanics.model import Learnt
+from flexneedle.mechanics.model import Adaptation
 from reference.cases import repeat
 
 PHANTOM = load_scenario("phantom")
@@ -20,7 +20,7 @@ TOLERANCE = 1e-9  # mm
 
 def loose(clearance, **others):
     """The simulator of the phantom with a clearance (mm)."""
-    return EXACT.adapted(Learnt(np.zeros(1), np.ones(2), clearance=clearance, **others))
+    return EXACT.adapted(Adaptation(np.zeros(1), np.ones(2), clearance=clearance, **others))
 
 
 def off_centre(state):
@@ -152,8 +152,8 @@ def test_without_clearance_nothing_of_it_is_left():
 
 def test_a_needle_without_a_guide_has_no_clearance():
     bare = Simulator(PHANTOM.with_values({"setup.guide_to_skin_mm": None}), threads=1)
-    wide = bare.adapted(Learnt(np.zeros(1), np.ones(2), clearance=0.1))
-    none = bare.adapted(Learnt(np.zeros(1), np.ones(2)))
+    wide = bare.adapted(Adaptation(np.zeros(1), np.ones(2), clearance=0.1))
+    none = bare.adapted(Adaptation(np.zeros(1), np.ones(2)))
     rows = np.tile([1.0, 0.0, 0.0, 0.0, -1.0], (60, 1))
     np.testing.assert_array_equal(wide.replay(bare.start(), rows)[1], none.replay(bare.start(), rows)[1])
 

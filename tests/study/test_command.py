@@ -84,7 +84,7 @@ def told(monkeypatch, advances):
         def show(self, *args):
             shown.append(args)
 
-    show = study_command._Show(Listener())
+    show = study_command._StudyProgress(Listener())
     for plans, all_plans, done, later in advances:
         show.advance(Advance(plans, all_plans, done, 1050, 0))
         now += later

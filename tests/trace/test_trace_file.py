@@ -20,7 +20,7 @@ from flexneedle.trace.columns import COLUMNS, to_row
 from flexneedle.trace.reader import read_trace
 from flexneedle.trace.topics import TOPICS
 from flexneedle.trace.writer import TraceWriter
-from flexneedle.types import Frame, Judged, Reading, Sample
+from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
 from synthetic import blind, make_periods, make_plan
 
 PLAN = make_plan()
@@ -111,9 +111,9 @@ def test_the_smallest_stretch_of_the_true_tissue_is_a_column(trace_file):
 @pytest.mark.parametrize(
     "sample",
     [
-        Sample(0.1, 30.1, 1 / 3),
-        Sample(0.1, None, None, None),
-        Sample(
+        Measurement(0.1, 30.1, 1 / 3),
+        Measurement(0.1, None, None, None),
+        Measurement(
             0.1,
             30.1,
             1 / 3,
@@ -122,16 +122,16 @@ def test_the_smallest_stretch_of_the_true_tissue_is_a_column(trace_file):
                 0.1,
                 4711,
                 {
-                    "tip": Reading((1 / 7, 2.0, 3.0), (0.5, 0.5, -0.5, 0.5)),
-                    "ref1": Reading((4.0, 5.0, 6.0), (1.0, 0.0, 0.0, 0.0), 0.0547),
-                    "ref 2": Reading(None, status="out of volume"),
+                    "tip": SensorReading((1 / 7, 2.0, 3.0), (0.5, 0.5, -0.5, 0.5)),
+                    "ref1": SensorReading((4.0, 5.0, 6.0), (1.0, 0.0, 0.0, 0.0), 0.0547),
+                    "ref 2": SensorReading(None, status="out of volume"),
                 },
             ),
         ),
     ],
 )
 def test_readings_come_back_to_the_last_bit_with_their_verdicts(tmp_path, sample):
-    told = (Judged(sample, "ok"), Judged(sample, "frozen: the same in 4 readings"))
+    told = (CheckedMeasurement(sample, "ok"), CheckedMeasurement(sample, "frozen: the same in 4 readings"))
     period = replace(PERIODS[3], readings=told, sample=sample)
     (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
     assert again.readings == told
@@ -139,7 +139,7 @@ def test_readings_come_back_to_the_last_bit_with_their_verdicts(tmp_path, sample
 
 
 def test_a_period_has_its_own_readings_and_not_those_of_the_one_before(tmp_path):
-    told = replace(PERIODS[3], readings=(Judged(Sample(0.1, 1.0, 2.0), "ok"),))
+    told = replace(PERIODS[3], readings=(CheckedMeasurement(Measurement(0.1, 1.0, 2.0), "ok"),))
     first, second = read_trace(write(tmp_path / "trace.mcap", [told, PERIODS[4]])).periods
     assert (len(first.readings), len(second.readings)) == (1, 0)
 

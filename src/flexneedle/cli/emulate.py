@@ -46,7 +46,7 @@ def _emulate_aurora(args: argparse.Namespace) -> int:
     from flexneedle.rig.emulator.faults import parse_fault
     from flexneedle.rig.emulator.motion import CENTRE
     from flexneedle.rig.emulator.orders import Orders
-    from flexneedle.rig.emulator.server import Serial, Session, serve
+    from flexneedle.rig.emulator.server import EmulatorSession, Serial, serve
 
     faults = [parse_fault(spec) for spec in args.fault]
     device = fresh(args.sensors, args.firmware or FIRMWARE, knows_bx=not args.no_bx)
@@ -55,7 +55,9 @@ def _emulate_aurora(args: argparse.Namespace) -> int:
         come_first()  # a real one does not wait for this machine's other work
         try:
             print(serial.link, flush=True)
-            session = Session(device, faults, args.seed, monotonic(), rest=CENTRE if args.still else None)
+            session = EmulatorSession(
+                device, faults, args.seed, monotonic(), rest=CENTRE if args.still else None
+            )
             serve(session, serial, Orders(None if sys.stdin is None else sys.stdin.fileno()), _say)
         except KeyboardInterrupt:
             return 0

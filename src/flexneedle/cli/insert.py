@@ -86,7 +86,7 @@ def _insert(args: argparse.Namespace) -> int:
     compile_first()
     folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
     with Progress() as progress:
-        show = _Show(progress, scenario)
+        show = _InsertProgress(progress, scenario)
         insertion = record_insertion(
             folder,
             scenario,
@@ -116,7 +116,7 @@ def _list() -> int:
     return 0
 
 
-class _Show:
+class _InsertProgress:
     """Turns what planner and loop tell into progress."""
 
     def __init__(self, progress: Progress, scenario: Scenario) -> None:

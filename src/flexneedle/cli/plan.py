@@ -18,7 +18,7 @@ from flexneedle.console.common import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from flexneedle.types import PlanRecord
+    from flexneedle.types import Plan
 
 
 _STRATEGIES = ("manipulation", "steering")
@@ -57,7 +57,7 @@ def _plan(args: argparse.Namespace) -> int:
     return 0 if all(plan.reached for plan in plans.values()) else 1
 
 
-def _report(plans: dict[str, PlanRecord], as_json: bool, folder: Path) -> None:
+def _report(plans: dict[str, Plan], as_json: bool, folder: Path) -> None:
     from flexneedle.trace.results import plan_result, plan_timing
 
     if as_json:
@@ -71,7 +71,7 @@ def _report(plans: dict[str, PlanRecord], as_json: bool, folder: Path) -> None:
     print_table(title, rows, folder, heads=list(plans) if len(plans) > 1 else ())
 
 
-def _rows(plan: PlanRecord) -> dict[str, str]:
+def _rows(plan: Plan) -> dict[str, str]:
 
     angle = plan.entry_angle
     depth, lateral = plan.target

@@ -80,7 +80,7 @@ def _study(args: argparse.Namespace) -> int:
                 workers=args.workers,
                 scheduler=args.scheduler,
                 resume=args.resume,
-                on_advance=_Show(progress).advance,
+                on_advance=_StudyProgress(progress).advance,
                 on_no_workers=lambda: progress.say(f"{args.scheduler} has no workers yet: waiting for them"),
                 command=_command(args, folder),
             )
@@ -101,7 +101,7 @@ def _command(args: argparse.Namespace, folder: Path, *more: str) -> str:
     return shlex.join([*words, "--out", str(folder), *more])
 
 
-class _Show:
+class _StudyProgress:
     """Turns what the runner reports into progress, with rate and time left."""
 
     def __init__(self, progress: Progress) -> None:

@@ -3,7 +3,7 @@
 import math
 
 from flexneedle.control.interface import Decision
-from flexneedle.scenario.sections.settings import Control
+from flexneedle.scenario.sections.settings import ControlSettings
 
 _RADIUS_MM = 1.0  # of the paper's target circles: an insertion that ends beyond has missed
 _LIKELY = 0.5  # probability of that from which a decision counts towards a warning
@@ -23,7 +23,7 @@ def probability_beyond(limit: float, miss: float, sd: float) -> float:
     return 0.5 * (math.erfc((limit - miss) / scale) + math.erfc((limit + miss) / scale))
 
 
-def hopeless(decision: Decision, control: Control) -> str:
+def hopeless(decision: Decision, control: ControlSettings) -> str:
     """Why the needle is to be held: no path was found, or none that ends within the limit; empty if one may."""
     if decision.cost == math.inf:
         return decision.why

@@ -11,16 +11,16 @@ from pydantic import ValidationError
 
 from flexneedle.errors import InputError
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.fields import Section
-from flexneedle.scenario.sections.settings import Control
+from flexneedle.scenario.sections.settings import ControlSettings
 from flexneedle.simulator.control import COLUMNS
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, PlanRecord
+from flexneedle.types import Command, Plan
 
-_CORRECTED_MODEL = Beliefs()
+_CORRECTED_MODEL = StateCorrection()
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
 
@@ -69,7 +69,7 @@ def _plain_command(command: Any) -> Command:
     return x, y, turn, guide, int(flip)
 
 
-def travel_left(scenario: Scenario, plan: PlanRecord, state: State) -> float:
+def travel_left(scenario: Scenario, plan: Plan, state: State) -> float:
     """Advance (mm) to the target depth, or to the end of the stroke if that comes first."""
     stroke_left = scenario.setup.stroke_mm - float(state.travel[0])  # as commanded, wherever the base began
     return max(0.0, min(plan.target[0] - float(state.tip[0]), stroke_left))
@@ -121,7 +121,7 @@ class Method:
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(str(self.name)):
             raise InputError(f"name = {self.name!r}: a controller's name must be like my-controller-2")
-        if self.table in Control.model_fields:
+        if self.table in ControlSettings.model_fields:
             raise InputError(f"name = {self.name!r}: control.{self.table} is a setting of all controllers")
         for part in ("decide", "begin", "arrived"):
             if not callable(getattr(self, part)):

@@ -19,7 +19,7 @@ from flexneedle.scenario.sections.fields import Fraction, NonNegative, count
 from flexneedle.scenario.sections.settings import elite_count
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 Floats = NDArray[np.float64]
 _LEAST_ADVANCE = 0.5  # of the longest step: standing still is no way to reduce the cost
@@ -57,7 +57,7 @@ class Choice:
 
 def choose(
     simulator: Simulator,
-    plan: PlanRecord,
+    plan: Plan,
     state: State,
     control: CeMpc,
     *,
@@ -88,7 +88,7 @@ def choose(
     return Choice((db_x, db_y, db_theta, dg_y), found.cost, spread)
 
 
-def _window(plan: PlanRecord, x: float, steps: int) -> tuple[Floats, Floats]:
+def _window(plan: Plan, x: float, steps: int) -> tuple[Floats, Floats]:
     """Planned tip poses (steps, 3) after each step from where the plan is at x, and its controls (steps, 5)."""
     last = len(plan.tips) - 1
     at = float(np.interp(x, plan.tips[:, 0], np.arange(last + 1)))
@@ -99,7 +99,7 @@ def _window(plan: PlanRecord, x: float, steps: int) -> tuple[Floats, Floats]:
     return poses, controls
 
 
-def planned_base(setup: Setup, plan: PlanRecord, state: State, depth: Floats) -> Floats:
+def planned_base(setup: Setup, plan: Plan, state: State, depth: Floats) -> Floats:
     """Steps (n, 2) of base y (mm) and turn (rad) to where the plan has the base with its tip at `depth` (n,), mm.
 
     A base that lags behind catches up as fast as its limits allow.

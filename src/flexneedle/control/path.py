@@ -15,7 +15,7 @@ from flexneedle.control.interface import travel_left
 from flexneedle.control.mpc import planned_base
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, PlanRecord
+from flexneedle.types import Command, Plan
 
 Floats = NDArray[np.float64]
 KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
@@ -31,7 +31,7 @@ _DECADES = 2.0  # over which the scales of the samples spread
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class GuidePath:
     """The guide's lateral position (r,) over the depth (r,) of the tip, mm, and the depths of the rolls, ascending."""
 
     depth: Floats
@@ -39,11 +39,11 @@ class Path:
     rolls: tuple[float, ...]
 
 
-def of_plan(plan: PlanRecord) -> Path:
+def of_plan(plan: Plan) -> GuidePath:
     """The plan's path."""
     rolls = plan.tips[:-1][plan.controls[:, 4] > 0.0][:, 0]
     keep = np.concatenate([[True], np.diff(plan.tips[:, 0]) > 1e-9])
-    return Path(plan.tips[keep, 0], plan.guide[keep], tuple(rolls.tolist()))
+    return GuidePath(plan.tips[keep, 0], plan.guide[keep], tuple(rolls.tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,13 +57,13 @@ class Ahead:
     depth: Floats
     base: Floats
     state: State
-    path: Path
+    path: GuidePath
     step: float
     reach: float
     advance: float
 
     @staticmethod
-    def of(task: Task, state: State, path: Path) -> "Ahead":
+    def of(task: Task, state: State, path: GuidePath) -> "Ahead":
         """Two control steps, then longer ones."""
         setup, left = task.scenario.setup, travel_left(task.scenario, task.plan, state)
         longest = setup.max_advance_mm
@@ -170,13 +170,13 @@ class Ahead:
             guide[:, k + 1] = np.clip(wanted[:, k + 1], guide[:, k] - most[:, k], guide[:, k] + most[:, k])
         return guide
 
-    def corrected(self, z: Floats) -> Path:
+    def corrected(self, z: Floats) -> GuidePath:
         """The path (in place of the one in hand) that a sample (d,) makes."""
         controls, depth = self.controls(z[None])
         guide = self.state.guide + np.append(0.0, np.cumsum(controls[0, :, 3]))
-        return Path(depth[0], guide, tuple(depth[0, :-1][controls[0, :, 4] > 0.0].tolist()))
+        return GuidePath(depth[0], guide, tuple(depth[0, :-1][controls[0, :, 4] > 0.0].tolist()))
 
-    def first(self, path: Path) -> tuple[Command, Path]:
+    def first(self, path: GuidePath) -> tuple[Command, GuidePath]:
         """The command of this period, and what is left of a path after it.
 
         A roll that is due is made at once; before one that is near the advance ends where it is due.

@@ -15,9 +15,9 @@ from flexneedle.errors import InputError, ScenarioError
 from flexneedle.estimation.task import Task
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import describe, key_path
-from flexneedle.scenario.sections.settings import Control
+from flexneedle.scenario.sections.settings import ControlSettings
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 
 @cache
@@ -33,7 +33,9 @@ def typed_scenario(methods: tuple[Method, ...]) -> type[Scenario]:
     tables: dict[str, Any] = {
         table: (owner.settings, owner.settings()) for table, owner in owners.items() if owner.settings
     }
-    control = create_model("Control", __base__=Control, __doc__=Control.__doc__, **tables)
+    control = create_model(
+        "ControlSettings", __base__=ControlSettings, __doc__=ControlSettings.__doc__, **tables
+    )
     fields: dict[str, Any] = {"control": (control, control())}
     return create_model("Scenario", __base__=Scenario, __doc__=Scenario.__doc__, **fields)
 
@@ -46,7 +48,7 @@ def completed(scenario: Scenario, methods: Iterable[Method], source: str = "") -
     return Scenario.from_values(_typed(scenario, tuple(methods), source).values())
 
 
-def task(method: Method, simulator: Simulator, plan: PlanRecord) -> Task:
+def task(method: Method, simulator: Simulator, plan: Plan) -> Task:
     """Return what `method` is to carry out, with its settings of the simulator's scenario. Raises ScenarioError."""
     control = _typed(simulator.scenario, (method,), "").control
     return Task(simulator, plan, getattr(control, method.table) if method.settings else None)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, Sample
+from flexneedle.types import Command, Measurement
 
 Floats = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ class Move:
     begun: float
     ended: float
     applied: Command
-    samples: tuple[Sample, ...] = ()
+    samples: tuple[Measurement, ...] = ()
 
     @cached_property
     def mean(self) -> tuple[float, float, float, float] | None:
@@ -82,7 +82,7 @@ class Estimate(Protocol):
         """The estimate after the driver moved so, from `begun` to `ended` (s)."""
         ...
 
-    def observe(self, samples: Sequence[Sample]) -> "Estimate":
+    def observe(self, samples: Sequence[Measurement]) -> "Estimate":
         """The estimate corrected by good readings, the newest last."""
         ...
 
@@ -91,7 +91,7 @@ class Estimate(Protocol):
         ...
 
 
-def assigned(moves: tuple[Move, ...], samples: Sequence[Sample]) -> tuple[Move, ...]:
+def assigned(moves: tuple[Move, ...], samples: Sequence[Measurement]) -> tuple[Move, ...]:
     """Give each sample to the move in which it was taken; one of before to the first, one of after to the last."""
     ends = np.array([done.ended for done in moves[:-1]])
     owner = np.searchsorted(ends, [sample.time - 1e-9 for sample in samples])
@@ -111,7 +111,7 @@ def along(moves: tuple[Move, ...], tips: Floats, time: float) -> tuple[float, fl
     return float(np.interp(time, times, tips[:, 0])), float(np.interp(time, times, tips[:, 1]))
 
 
-def place(sample: Sample) -> tuple[float, float]:
+def place(sample: Measurement) -> tuple[float, float]:
     """Tip (mm) as a good sample has it. Raises ValueError for an empty sample."""
     if sample.x is None or sample.y is None:
         raise ValueError("an empty sample was not sorted out")

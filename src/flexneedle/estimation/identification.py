@@ -37,13 +37,13 @@ from flexneedle.estimation.prior import (
     check_cells,
     unexplained,
 )
-from flexneedle.estimation.readings import Readings, shared
+from flexneedle.estimation.readings import MoveMeans, shared
 from flexneedle.estimation.task import Task
-from flexneedle.mechanics.model import Learnt
+from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, Sample
+from flexneedle.types import Command, Measurement
 
 _MOVES_A_STRETCH = 8  # in tissue; one stretch in air
 _RECENT = 12  # moves whose residuals are low-passed
@@ -160,7 +160,7 @@ class Identified:
             self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)), perturbed=()
         )
 
-    def observe(self, samples: Sequence[Sample]) -> "Identified":
+    def observe(self, samples: Sequence[Measurement]) -> "Identified":
         """Fit the parameters to all readings so far, one Gauss–Newton step, and simulate with them to now."""
         if not samples or not self.moves:
             return self.unseen()
@@ -188,15 +188,15 @@ class Identified:
         return np.array([done.applied for done in self.moves], dtype=float).reshape(-1, 5)
 
     @cached_property
-    def _readings(self) -> Readings:
-        return Readings.of(self.moves, self.state.bevel)
+    def _readings(self) -> MoveMeans:
+        return MoveMeans.of(self.moves, self.state.bevel)
 
-    def variance(self, readings: Readings) -> Floats:
+    def variance(self, readings: MoveMeans) -> Floats:
         """Of the means of readings (r,), mm²: their jitter and what no parameter explains."""
         scenario = self.nominal.scenario
         return readings.variance(scenario.tracker.jitter_per_axis, unexplained(scenario, self.settings))
 
-    def left(self, readings: Readings) -> Floats:
+    def left(self, readings: MoveMeans) -> Floats:
         """The lateral readings (r,) less those of the model, mm."""
         return readings.left(self.tips[:, 1], self.run_out)
 
@@ -307,7 +307,7 @@ def _adapted(nominal: Simulator, settings: Priors, parameters: Floats) -> Simula
     shift = MODULUS + layers
     variation = shift + layers - 1
     return nominal.adapted(
-        Learnt(
+        Adaptation(
             shift=parameters[shift:variation],
             stiffness=np.exp(parameters[MODULUS:shift]),
             cell=settings.cell_mm,
@@ -330,7 +330,7 @@ def _started(estimate: Identified, simulator: Simulator, parameters: Floats) -> 
     return simulator.replay(moved, _REST)[0]
 
 
-def _improved(belief: Identified, readings: Readings) -> Identified:
+def _improved(belief: Identified, readings: MoveMeans) -> Identified:
     """One Gauss–Newton step to the maximum a posteriori, as long as it fits no worse, within the bounds."""
     prior = belief.prior
     jacobian = _jacobian(belief, readings)
@@ -355,7 +355,7 @@ def _improved(belief: Identified, readings: Readings) -> Identified:
     return fitted
 
 
-def _jacobian(estimate: Identified, readings: Readings) -> Floats:
+def _jacobian(estimate: Identified, readings: MoveMeans) -> Floats:
     """Derivative (r, K) of the predicted readings, from the curves."""
     jacobian = estimate._slopes(readings.between(estimate.tips[:, 0]))
     jacobian[:, RUN_OUT] = readings.sides

@@ -19,13 +19,13 @@ from flexneedle.estimation.task import Task
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, Sample
+from flexneedle.types import Command, Measurement
 
 _DRIFT = 0.5  # of the path that the bevel bends: how far a model may be off it
 
 
 @dataclass(frozen=True)
-class Beliefs:
+class StateCorrection:
     """What this observer may estimate: where the clamp holds the base, in air; a tip load, in tissue.
 
     Without the load the measured tip is released again in the prediction, as in the paper.
@@ -54,7 +54,7 @@ class Corrected:
     """
 
     simulator: Simulator
-    beliefs: Beliefs
+    beliefs: StateCorrection
     state: State
     past: State
     covariance: Floats
@@ -95,7 +95,7 @@ class Corrected:
         tips = np.concatenate([self.tips, state.tip[None]])
         return replace(self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)))
 
-    def observe(self, samples: Sequence[Sample]) -> "Corrected":
+    def observe(self, samples: Sequence[Measurement]) -> "Corrected":
         """Correct by good samples (newest last); a move is closed once a reading of its end is in."""
         moves = assigned(self.moves, samples)
         newest = max((sample.time for sample in samples), default=-np.inf)
@@ -137,7 +137,7 @@ def _followed(at: Corrected, done: Move) -> Corrected:
     return _fit_start(at, predicted, float(measured[1] - predicted.tip[1]), noise)
 
 
-def _innovation(before: Floats, after: Floats, done: Move, sample: Sample) -> Floats:
+def _innovation(before: Floats, after: Floats, done: Move, sample: Measurement) -> Floats:
     """Reading (mm) less prediction at its time, the move taken as even, shape (2,)."""
     expected: Floats = before[:2] + done.part(sample.time) * (after[:2] - before[:2])
     return np.asarray(place(sample)) - expected

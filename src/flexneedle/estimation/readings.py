@@ -10,7 +10,7 @@ from flexneedle.estimation.estimate import Floats, Move
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
+class MoveMeans:
     """Means of the readings of each move that has any: the move, the share of it done, x, y (mm), their number, and
     the bevel's side, which turns before its move; each (r,).
 
@@ -25,13 +25,13 @@ class Readings:
     sides: Floats
 
     @staticmethod
-    def of(moves: Sequence[Move], bevel: float) -> "Readings":
+    def of(moves: Sequence[Move], bevel: float) -> "MoveMeans":
         """Of moves with at least one reading among them; bevel: its side after the last one."""
         means = [(k, *done.mean) for k, done in enumerate(moves) if done.mean is not None]
         index, part, x, y, count = np.array(means, dtype=float).T
         turns = np.cumprod([-1.0 if done.applied[4] > 0.0 else 1.0 for done in moves])
         kept = index.astype(int)
-        return Readings(kept, part, x, y, count, (bevel * turns[-1] * turns)[kept])
+        return MoveMeans(kept, part, x, y, count, (bevel * turns[-1] * turns)[kept])
 
     def between(self, ends: Floats) -> Floats:
         """A quantity at the readings (r,)."""

@@ -5,7 +5,7 @@ from typing import Any
 
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,7 +16,7 @@ class Task:
     """
 
     simulator: Simulator
-    plan: PlanRecord
+    plan: Plan
     settings: Any = None
 
     @property

@@ -115,7 +115,7 @@ def insert_essential(nodes: Nodes, x: Floats, kind: int = ESSENTIAL) -> Nodes:
     return Nodes(*(np.insert(array, place, value) for array, value in zip(arrays, values, strict=True)))
 
 
-class Learnt(NamedTuple):
+class Adaptation(NamedTuple):
     """What an observer has learnt about a model's constants.
 
     shift (k − 1,): of the ends of all layers but the last (mm); stiffness (k,): factor on the modulus of each layer;
@@ -133,7 +133,7 @@ class Learnt(NamedTuple):
     clearance: float = 0.0
 
 
-def adapted(model: Model, learnt: Learnt) -> Model:
+def adapted(model: Model, learnt: Adaptation) -> Model:
     """The model with other constants, its contact points where they were.
 
     A contact is as stiff as the tissue along its interval; its law is that of the layer at its middle.

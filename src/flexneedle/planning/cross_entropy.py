@@ -45,7 +45,7 @@ class Settings(Search):
 
 
 @dataclass(frozen=True)
-class Belief:
+class SearchState:
     """Gaussian over d coordinates after some iterations, the best sample so far, and how it came about.
 
     history: a dict per iteration with mean and spread (standard deviation) of the belief, each (d,), cost_mean of
@@ -70,14 +70,14 @@ class Belief:
         return self.converged or self.iterations >= settings.iterations
 
 
-def start(mean: Floats, sigma: Floats, correlation: Floats | None = None) -> Belief:
+def start(mean: Floats, sigma: Floats, correlation: Floats | None = None) -> SearchState:
     """Begin with standard deviations `sigma` (d,) and a `correlation` (d, d), by default none."""
     mean, sigma = np.asarray(mean, dtype=float), np.asarray(sigma, dtype=float)
     correlation = np.eye(mean.size) if correlation is None else correlation
-    return Belief(mean, correlation * np.outer(sigma, sigma), sigma, mean)
+    return SearchState(mean, correlation * np.outer(sigma, sigma), sigma, mean)
 
 
-def ask(belief: Belief, settings: Settings, rng: np.random.Generator) -> Floats:
+def ask(belief: SearchState, settings: Settings, rng: np.random.Generator) -> Floats:
     """Draw samples (N, d) within the bounds; the first is the mean, the second the best so far."""
     noise = rng.standard_normal((settings.samples, belief.mean.size))
     free = belief.initial_sigma > 0.0
@@ -90,7 +90,7 @@ def ask(belief: Belief, settings: Settings, rng: np.random.Generator) -> Floats:
     return np.clip(samples, settings.lower, settings.upper)
 
 
-def tell(belief: Belief, settings: Settings, samples: Floats, costs: Floats) -> Belief:
+def tell(belief: SearchState, settings: Settings, samples: Floats, costs: Floats) -> SearchState:
     """Refit to the elite: the ⌈ρN⌉ samples of least cost, ties in the order drawn (paper eq. 6 and 7).
 
     A cost of infinity marks a failed sample; with no finite cost at all the belief stays as it is.
@@ -110,12 +110,12 @@ def tell(belief: Belief, settings: Settings, samples: Floats, costs: Floats) -> 
 
 def minimize(
     cost: Callable[[Floats], Floats],
-    belief: Belief,
+    belief: SearchState,
     settings: Settings,
     rng: np.random.Generator,
     progress: Callable[[dict[str, Any]], None] | None = None,
     first: Floats | None = None,
-) -> Belief:
+) -> SearchState:
     """Ask and tell until done. `cost` maps samples (N, d) to costs (N,); `first` (n, d): of iteration 1."""
     while not belief.done(settings):
         samples = ask(belief, settings, rng) if first is None or belief.iterations > 0 else first
@@ -147,8 +147,8 @@ def _converged(history: Sequence[dict[str, Any]], settings: Settings) -> bool:
 
 
 def _with(
-    belief: Belief, mean: Floats, covariance: Floats, winner: Floats, costs: Floats, settings: Settings
-) -> Belief:
+    belief: SearchState, mean: Floats, covariance: Floats, winner: Floats, costs: Floats, settings: Settings
+) -> SearchState:
     """Append an iteration to the history and keep the better of `winner` and the best so far."""
     ordered = np.sort(costs)
     better = bool(ordered[0] < belief.best_cost)
@@ -161,6 +161,6 @@ def _with(
         "spread": tuple(np.sqrt(np.diag(covariance)).tolist()),
     }
     best, history = winner if better else belief.best, (*belief.history, entry)
-    return Belief(
+    return SearchState(
         mean, covariance, belief.initial_sigma, best, best_cost, _converged(history, settings), history
     )

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.planning import cross_entropy as ce
-from flexneedle.planning.terms import Outcome, Rollout, Term, charges, cost
+from flexneedle.planning.terms import Outcome, RolloutFunction, Term, charges, cost
 
 Floats = NDArray[np.float64]
 
@@ -43,12 +43,12 @@ class Found:
     cost: float
     terms: dict[str, float]
     outcome: Outcome
-    belief: ce.Belief
+    belief: ce.SearchState
 
 
 def best(
     variables: Variables,
-    rollout: Rollout,
+    rollout: RolloutFunction,
     terms: Sequence[Term],
     search: ce.Search,
     rng: np.random.Generator,

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.planning import terms
-from flexneedle.planning.cross_entropy import Belief, Search
+from flexneedle.planning.cross_entropy import Search, SearchState
 from flexneedle.planning.horizon import Found, Variables, best
-from flexneedle.planning.terms import Rollout, Term
+from flexneedle.planning.terms import RolloutFunction, Term
 
 Floats = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ _BEVEL_CORRELATION = 0.8  # of ε of neighbouring primitives at first: few flips
 
 
 @dataclass(frozen=True)
-class Problem:
+class PlanProblem:
     """What to reach and with what: mm, rad.
 
     travel: insertion from the start to the target depth, of which `air` comes before the skin; step (4,) and reach
@@ -60,12 +60,12 @@ class Solution:
     bevel: int
     cost: float
     terms: dict[str, float]
-    belief: Belief
+    belief: SearchState
 
 
 def optimise(
-    rollout: Rollout,
-    problem: Problem,
+    rollout: RolloutFunction,
+    problem: PlanProblem,
     search: Search,
     rng: np.random.Generator,
     progress: Callable[[dict[str, Any]], None] | None = None,
@@ -88,7 +88,7 @@ def solution(found: Found) -> Solution:
     return Solution(controls, int(facing[0]), found.cost, found.terms, found.belief)
 
 
-def _variables(problem: Problem) -> Variables:
+def _variables(problem: PlanProblem) -> Variables:
     n, most = problem.primitives, [*problem.step[1:], _BEVEL_BOUND, _SHARE_BOUND]
     return Variables(
         lower=np.tile([_LEAST_ADVANCE * problem.step[0], *np.negative(most)], n),
@@ -100,7 +100,7 @@ def _variables(problem: Problem) -> Variables:
     )
 
 
-def cost_terms(problem: Problem) -> tuple[Term, ...]:
+def cost_terms(problem: PlanProblem) -> tuple[Term, ...]:
     """The cost of a plan (paper eq. 9 and 10)."""
     return (
         Term("accuracy", problem.accuracy_weight, partial(terms.miss, target=problem.target)),
@@ -121,7 +121,7 @@ def _correlation(primitives: int) -> Floats:
     return correlation
 
 
-def schedule(problem: Problem, z: Floats) -> tuple[Floats, Floats]:
+def schedule(problem: PlanProblem, z: Floats) -> tuple[Floats, Floats]:
     """Primitives z (N, 6 P) to controls (N, m, 5), padded with zero steps, and bevel directions (N, P).
 
     The sum of lateral steps is kept within reach here, before any rollout.
@@ -147,7 +147,7 @@ def schedule(problem: Problem, z: Floats) -> tuple[Floats, Floats]:
     return controls, wanted
 
 
-def _within_reach(problem: Problem, primitives: Floats, count: NDArray[np.int64]) -> Floats:
+def _within_reach(problem: PlanProblem, primitives: Floats, count: NDArray[np.int64]) -> Floats:
     """Lateral steps (N, P, 3) whose running sums stay within reach."""
     lateral = primitives[:, :, BASE_Y : GUIDE + 1].copy()
     total = np.zeros((len(primitives), 3))

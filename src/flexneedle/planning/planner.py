@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
 from flexneedle.planning.cross_entropy import Search
-from flexneedle.planning.insertion import BASE_Y, GUIDE, Problem, Solution, optimise
+from flexneedle.planning.insertion import BASE_Y, GUIDE, PlanProblem, Solution, optimise
 from flexneedle.planning.steering import reach, steer
 from flexneedle.planning.terms import Outcome
 from flexneedle.scenario.model import Scenario, check_target
-from flexneedle.scenario.sections.settings import Plan, elite_count
+from flexneedle.scenario.sections.settings import PlanSettings, elite_count
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 Floats = NDArray[np.float64]
 STRATEGIES = ("manipulation", "steering")
@@ -37,7 +37,7 @@ def plan(
     progress: Callable[[dict[str, Any]], None] | None = None,
     *,
     threads: int | None = None,
-) -> PlanRecord:
+) -> Plan:
     """Plan an insertion to `target` (x, y) in mm (default: the scenario's), best found by cross-entropy.
 
     strategy: "manipulation" moves guide and bevel; "steering" moves only the bevel (paper section III-A, but on the
@@ -57,7 +57,7 @@ def plan(
     states = [simulator.start(solution.bevel)]
     for row in controls:
         states.append(simulator.step(states[-1], Control.from_row(row.tolist())))
-    return PlanRecord(
+    return Plan(
         strategy=strategy,
         target=goal,
         seed=seed,
@@ -85,7 +85,7 @@ def bevel_reach(scenario: Scenario, depth: float, threads: int | None = None) ->
 
 def _search(
     simulator: Simulator,
-    problem: Problem,
+    problem: PlanProblem,
     rng: np.random.Generator,
     progress: Callable[[dict[str, Any]], None] | None,
 ) -> Solution:
@@ -107,7 +107,7 @@ def _rollout(simulator: Simulator) -> Callable[[Floats], Outcome]:
     return rollout
 
 
-def _settings(plan: Plan, samples: int) -> Search:
+def _settings(plan: PlanSettings, samples: int) -> Search:
     return Search(
         samples=samples,
         elite=max(2, elite_count(samples, plan.elite_fraction)),
@@ -118,11 +118,11 @@ def _settings(plan: Plan, samples: int) -> Search:
     )
 
 
-def _bevel_alone(problem: Problem) -> bool:
+def _bevel_alone(problem: PlanProblem) -> bool:
     return not problem.sigma[BASE_Y : GUIDE + 1].any()
 
 
-def _problem(scenario: Scenario, goal: tuple[float, float], strategy: str) -> Problem:
+def _problem(scenario: Scenario, goal: tuple[float, float], strategy: str) -> PlanProblem:
     setup, plan = scenario.setup, scenario.plan
     guide_step = setup.max_guide_step_mm if setup.has_guide else 0.0
     sigma = np.array(
@@ -139,7 +139,7 @@ def _problem(scenario: Scenario, goal: tuple[float, float], strategy: str) -> Pr
         sigma[1:4] = 0.0
     elif not setup.has_guide:
         sigma[3] = 0.0
-    return Problem(
+    return PlanProblem(
         target=goal,
         travel=setup.tip_to_skin_mm + goal[0],
         air=setup.tip_to_skin_mm,
@@ -176,7 +176,7 @@ def _end_at_depth(simulator: Simulator, controls: Floats, bevel: int, depth: flo
     return controls
 
 
-def _binding_limit(simulator: Simulator, problem: Problem, controls: Floats, states: list[State]) -> str:
+def _binding_limit(simulator: Simulator, problem: PlanProblem, controls: Floats, states: list[State]) -> str:
     """Name the key that keeps the plan from its target; empty if it gets there.
 
     A target out of the bevel's reach is named however near the plan comes to it.

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.horizon import Found, Variables, best
-from flexneedle.planning.insertion import Problem, Solution, cost_terms, solution
-from flexneedle.planning.terms import Rollout
+from flexneedle.planning.insertion import PlanProblem, Solution, cost_terms, solution
+from flexneedle.planning.terms import RolloutFunction
 
 Floats = NDArray[np.float64]
 
@@ -24,15 +24,15 @@ MOST_ROLLS = 4
 _USUAL_SEARCHES = 5  # one roll and two, from either side, and the last
 _WIDE, _NARROW = 0.3, 0.02  # first standard deviations of a roll's depth, as a share of the target's
 
-Progress = Callable[[dict[str, Any]], None]
+OnIteration = Callable[[dict[str, Any]], None]
 
 
 def steer(
-    rollout: Rollout,
-    problem: Problem,
+    rollout: RolloutFunction,
+    problem: PlanProblem,
     search: Search,
     rng: np.random.Generator,
-    progress: Progress | None = None,
+    progress: OnIteration | None = None,
 ) -> Solution:
     """Search the depths of 0 to 4 rolls from either side at the start, until one more roll is no gain.
 
@@ -63,13 +63,13 @@ def steer(
     return solution(best(variables, rollout, cost_terms(longer), search, rng, progress=shown))
 
 
-def _variables(problem: Problem, side: float, mean: Floats, sigma: float) -> Variables:
+def _variables(problem: PlanProblem, side: float, mean: Floats, sigma: float) -> Variables:
     """The depths of the rolls, as shares of the target's."""
     ones = np.ones(mean.size)
     return Variables(0.0 * ones, ones, mean, sigma * ones, lambda z: rolled(problem, z, side))
 
 
-def rolled(problem: Problem, z: Floats, side: float) -> Floats:
+def rolled(problem: PlanProblem, z: Floats, side: float) -> Floats:
     """Controls (N, m, 5) of an insertion that starts with the bevel to `side` and rolls it at shares z (N, k) of the
     target's depth, in any order.
 
@@ -89,7 +89,7 @@ def rolled(problem: Problem, z: Floats, side: float) -> Floats:
     return controls
 
 
-def reach(rollout: Rollout, problem: Problem) -> tuple[float, float]:
+def reach(rollout: RolloutFunction, problem: PlanProblem) -> tuple[float, float]:
     """Least and greatest lateral position (mm) at the target's depth that the bevel alone can reach."""
     ends = []
     for side in (-1.0, 1.0):
@@ -98,7 +98,7 @@ def reach(rollout: Rollout, problem: Problem) -> tuple[float, float]:
     return min(ends), max(ends)
 
 
-def _counted(progress: Progress | None, search: Search, found: list[Found]) -> Progress | None:
+def _counted(progress: OnIteration | None, search: Search, found: list[Found]) -> OnIteration | None:
     """`progress` with iterations and best cost counted through all searches."""
     if progress is None:
         return None

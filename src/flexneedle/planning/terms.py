@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-Point = tuple[float, float]
+PlanarPoint = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Outcome:
         return inside
 
 
-Rollout = Callable[[Floats], Outcome]
+RolloutFunction = Callable[[Floats], Outcome]
 """Carries out controls (N, m, 5)."""
 
 
@@ -75,14 +75,14 @@ def cost(terms: Sequence[Term], outcome: Outcome) -> Floats:
     return np.where(outcome.converged.all(axis=1), total, np.inf)
 
 
-def past(outcome: Outcome, target: Point) -> Floats:
+def past(outcome: Outcome, target: PlanarPoint) -> Floats:
     """How far (mm) past the target in +y the tip is at its depth, to which its own line is followed from the end."""
     end = outcome.tips[:, -1]
     distance: Floats = end[:, 1] + np.tan(end[:, 2]) * (target[0] - end[:, 0]) - target[1]
     return distance
 
 
-def miss(outcome: Outcome, target: Point, blur: float = 0.0) -> Floats:
+def miss(outcome: Outcome, target: PlanarPoint, blur: float = 0.0) -> Floats:
     """Lateral distance (mm) from the target at its depth, as `past` has it.
 
     blur (mm): of a distance d that is known no better than this, √(d² + blur²) − blur counts.
@@ -91,7 +91,7 @@ def miss(outcome: Outcome, target: Point, blur: float = 0.0) -> Floats:
     return blurred
 
 
-def large_miss(outcome: Outcome, target: Point, blur: float, sd: float) -> Floats:
+def large_miss(outcome: Outcome, target: PlanarPoint, blur: float, sd: float) -> Floats:
     """A share of the `miss` (mm) that is near 0 for a distance d far below its standard deviation (mm) and near 1 far
     above it: d² / (d² + sd²).
     """
@@ -137,7 +137,7 @@ def late_rolls(outcome: Outcome, depth: float, length: float) -> Floats:
     return sum_
 
 
-def distance_from_line(outcome: Outcome, start: Point, target: Point) -> Floats:
+def distance_from_line(outcome: Outcome, start: PlanarPoint, target: PlanarPoint) -> Floats:
     """Mean lateral distance (mm) of the tip from the line between two points, over the advance in the tissue."""
     x, y = outcome.tips[:, :, 0], outcome.tips[:, :, 1]
     length = target[0] - start[0]

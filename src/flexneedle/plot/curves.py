@@ -9,7 +9,7 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.types import Frame, Insertion, PlanRecord
+from flexneedle.types import Frame, Insertion, Plan
 
 Floats = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ class Turn:
     side: int
 
 
-def planned_turns(plan: PlanRecord) -> list[Turn]:
+def planned_turns(plan: Plan) -> list[Turn]:
     """Return the turns of a plan, each where the tip stands as the bevel turns."""
     steps = np.flatnonzero(plan.controls[:, 4] > 0.0)
     sides = plan.bevel * (-1) ** np.arange(1, len(steps) + 1)
@@ -65,7 +65,7 @@ def refused_samples(insertion: Insertion) -> Floats:
     return _points((sample.x, sample.y) for sample in refused if sample.x is not None)
 
 
-def lateral_error(plan: PlanRecord, points: Floats) -> Floats:
+def lateral_error(plan: Plan, points: Floats) -> Floats:
     """Return how far aside (mm, signed) of the planned path points (k, 2) lie, at their own depth."""
     order = np.argsort(plan.tips[:, 0], kind="stable")
     planned = np.interp(points[:, 0], plan.tips[order, 0], plan.tips[order, 1])

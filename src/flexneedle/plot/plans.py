@@ -24,7 +24,7 @@ from flexneedle.plot.style import (
     styled,
 )
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 # Places in inches from the top left.
 _LEFT, _RIGHT, _HEAD, _BETWEEN = 0.62, 0.15, 0.66, 0.75
@@ -33,7 +33,7 @@ _BARS_WIDTH = 2.0
 _TITLE_CHARACTERS = 95
 
 
-def plan_figure(scenario: Scenario, plans: Sequence[PlanRecord]) -> Figure:
+def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
     """Return the figure of one or more plans to the same target."""
     target = plans[0].target
     paths = [plan.tips for plan in plans]
@@ -55,7 +55,7 @@ def plan_figure(scenario: Scenario, plans: Sequence[PlanRecord]) -> Figure:
     return figure
 
 
-def _head(figure: Figure, scenario: Scenario, plan: PlanRecord) -> None:
+def _head(figure: Figure, scenario: Scenario, plan: Plan) -> None:
     depth, aside = plan.target
     name = shorten(scenario.name, 60, placeholder=" …")
     title = f"{name}: plan to {signed(depth)} mm deep, {signed(aside)} mm aside (seed {plan.seed})"
@@ -63,7 +63,7 @@ def _head(figure: Figure, scenario: Scenario, plan: PlanRecord) -> None:
     figure.text(0.12 / WIDTH, 1 - 0.1 / height, title, fontsize=11, weight="bold", va="top")
 
 
-def _scene(ax: Axes, scenario: Scenario, plan: PlanRecord, window: scene.View, color: str) -> None:
+def _scene(ax: Axes, scenario: Scenario, plan: Plan, window: scene.View, color: str) -> None:
     scene.draw_tissue(ax, scenario, window)
     before = curves.shapes_on_the_way(plan.tips, list(plan.shapes))
     scene.draw_needle(ax, plan.shapes[-1], before, scenario.needle.outer_diameter)
@@ -82,7 +82,7 @@ def _scene(ax: Axes, scenario: Scenario, plan: PlanRecord, window: scene.View, c
     )
 
 
-def _entry(ax: Axes, plan: PlanRecord) -> None:
+def _entry(ax: Axes, plan: Plan) -> None:
     """Show the direction in which the tip enters, and its angle."""
     angle = plan.entry_angle
     if isnan(angle):
@@ -109,7 +109,7 @@ def _entry(ax: Axes, plan: PlanRecord) -> None:
     )
 
 
-def _panels(figure: Figure, scenario: Scenario, plans: Sequence[PlanRecord], top: float) -> None:
+def _panels(figure: Figure, scenario: Scenario, plans: Sequence[Plan], top: float) -> None:
     span = (float(plans[0].tips[0, 0]), max(float(plan.tips[:, 0].max()) for plan in plans))
     contents = ((*_motion(scenario, plans), 0.4), ("Energy stored in the tissue (mJ)", _energy(plans), 0.01))
     for k, (title, lines, least) in enumerate(contents):
@@ -119,7 +119,7 @@ def _panels(figure: Figure, scenario: Scenario, plans: Sequence[PlanRecord], top
     ax.set_xlabel("depth of the tip (mm)", labelpad=1.0)
 
 
-def _motion(scenario: Scenario, plans: Sequence[PlanRecord]) -> tuple[str, list[Line]]:
+def _motion(scenario: Scenario, plans: Sequence[Plan]) -> tuple[str, list[Line]]:
     """Guide over depth, or the base aside where there is no guide."""
     guided = scenario.setup.has_guide
     values = [plan.guide if guided else np.cumsum([0.0, *plan.controls[:, 1]]) for plan in plans]
@@ -127,18 +127,18 @@ def _motion(scenario: Scenario, plans: Sequence[PlanRecord]) -> tuple[str, list[
     return title, _lines(plans, values)
 
 
-def _energy(plans: Sequence[PlanRecord]) -> list[Line]:
+def _energy(plans: Sequence[Plan]) -> list[Line]:
     return _lines(plans, [plan.strain_energy for plan in plans])
 
 
-def _lines(plans: Sequence[PlanRecord], values: Sequence[curves.Floats]) -> list[Line]:
+def _lines(plans: Sequence[Plan], values: Sequence[curves.Floats]) -> list[Line]:
     return [
         Line(plan.strategy, plan.tips[:, 0], value, color)
         for plan, value, color in zip(plans, values, STRATEGIES, strict=False)
     ]
 
 
-def _cost(ax: Axes, plans: Sequence[PlanRecord]) -> None:
+def _cost(ax: Axes, plans: Sequence[Plan]) -> None:
     """Draw the terms of the cost as bars, a colour for each plan, the value at the end."""
     names = list(dict.fromkeys(name for plan in plans for name in plan.terms))
     thick = 0.76 / len(plans)

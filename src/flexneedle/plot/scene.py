@@ -12,7 +12,7 @@ from flexneedle.plot.curves import Floats, Turn
 from flexneedle.plot.style import GUIDE, NEEDLE, QUIET, TARGET
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.tissue import Layer
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 _AIR = "#ffffff"
 _TISSUES = ("#fbeee3", "#f3dcc8", "#e9c9ad", "#deb592")  # soft to stiff
@@ -133,7 +133,7 @@ def name_target(ax: Axes, target: tuple[float, float]) -> None:
     ax.text(x + 1.6, y, "target,\n1 mm circle", color=TARGET, fontsize=8, va="center", linespacing=1.15)
 
 
-def name_bevel(ax: Axes, plan: PlanRecord) -> None:
+def name_bevel(ax: Axes, plan: Plan) -> None:
     """Write below the start of the tip which side the bevel faces before it turns."""
     x, foot = float(plan.tips[0, 0]), ax.get_ylim()[0] + 0.5
     marker = "^" if plan.bevel > 0 else "v"

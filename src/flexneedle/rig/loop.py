@@ -17,7 +17,7 @@ from flexneedle.control.methods import DEFAULT, used
 from flexneedle.errors import InputError, RunError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
-from flexneedle.rig.measuring import Sight, look_around, see
+from flexneedle.rig.measuring import Observation, look_around, see
 from flexneedle.rig.monitor.rules import OK
 from flexneedle.rig.monitor.watch import Watch
 from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, controller_of, plant_of, tracker_of
@@ -25,7 +25,7 @@ from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
 from flexneedle.rig.virtual import Rig, Seeds, virtual_rig
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Command, Insertion, Period, PlanRecord
+from flexneedle.types import Command, Insertion, Period, Plan
 
 _TOO_MANY = 4  # times the planned periods: the loop is not getting there
 _STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
@@ -33,7 +33,7 @@ _STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
 
 def insert(
     scenario: Scenario,
-    plan: PlanRecord,
+    plan: Plan,
     seed: int = 0,
     *,
     controller: str | Method = DEFAULT,
@@ -75,7 +75,7 @@ def insert(
 
 def run(
     scenario: Scenario,
-    plan: PlanRecord,
+    plan: Plan,
     rig: Rig,
     rng: np.random.Generator,
     seed: int = 0,
@@ -219,7 +219,7 @@ class _Lost:
         return ("held", self.why) if self.why and self.lasted > limit - 1e-9 else None
 
 
-def _held(held: _Held | None, sight: Sight, now: float) -> _Held | None:
+def _held(held: _Held | None, sight: Observation, now: float) -> _Held | None:
     """The hold after a verdict. Each of the two causes has a clock and a limit of its own; a clock stops while the
     needle is held for the other cause, and only a good verdict sets it back: alternating causes do not hold forever.
     """
@@ -246,7 +246,7 @@ def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> C
     return rig.driver.apply(command, max(1, readings) * reading)
 
 
-def _ending(task: Task, sight: Sight, held: float | None, seen: bool) -> tuple[str, str] | None:
+def _ending(task: Task, sight: Observation, held: float | None, seen: bool) -> tuple[str, str] | None:
     """How the insertion ends after this period, if it does; held: for how long it has been (s), None if it is not."""
     estimate, limit = sight.estimate, sight.limit(task.scenario)
     if not estimate.state.converged:
@@ -264,11 +264,11 @@ def _ending(task: Task, sight: Sight, held: float | None, seen: bool) -> tuple[s
 def _record(
     index: int,
     now: float,
-    plan: PlanRecord,
+    plan: Plan,
     rig: Rig,
     decision: Decision,
     applied: Command,
-    sight: Sight,
+    sight: Observation,
     clocks: list[float],
 ) -> Period:
     estimate = sight.estimate

@@ -9,14 +9,14 @@ from flexneedle.rig.monitor.rules import OK
 from flexneedle.rig.monitor.watch import Watch
 from flexneedle.rig.ports import TipTracker
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import VISIBLE, Judged, Sample
+from flexneedle.types import VISIBLE, CheckedMeasurement, Measurement
 
 _SURE = 3.0  # standard deviations by which a prediction may be off besides the limit
-_NO_SAMPLE = Sample(0.0, None, None)
+_NO_SAMPLE = Measurement(0.0, None, None)
 
 
 @dataclass(frozen=True)
-class Sight:
+class Observation:
     """The estimate after the readings of a period, all of them with their verdicts, and the verdict of the period.
 
     sample: the reading that the verdict is about, an empty one without any; field: whether the verdict is about the
@@ -25,8 +25,8 @@ class Sight:
 
     estimate: Estimate
     watch: Watch
-    readings: tuple[Judged, ...] = ()
-    sample: Sample = _NO_SAMPLE
+    readings: tuple[CheckedMeasurement, ...] = ()
+    sample: Measurement = _NO_SAMPLE
     verdict: str = OK
     field: bool = False
 
@@ -41,7 +41,7 @@ class Sight:
 
 def look_around(
     scenario: Scenario, estimate: Estimate, watch: Watch, now: float, tracker: TipTracker
-) -> Sight:
+) -> Observation:
     """Judge the readings before the needle moves: a good one, or it stays. The estimate is not corrected by them."""
     samples = tracker.read()
     stale_after = scenario.control.stale_after_s
@@ -56,12 +56,12 @@ def look_around(
     if verdict == newest.verdict and watch.only_missed(newest.sample, newest.verdict) is not None:
         verdict = OK
     judged = _refused(readings, field) if field != OK else readings
-    return Sight(estimate, watch, judged, newest.sample, verdict, field != OK)
+    return Observation(estimate, watch, judged, newest.sample, verdict, field != OK)
 
 
 def see(
     scenario: Scenario, predicted: Estimate, watch: Watch, begun: float, now: float, tracker: TipTracker
-) -> Sight:
+) -> Observation:
     """Read the tracker, judge its readings and the field, correct the prediction by the good ones.
 
     begun, now: of the move that `predicted` ends with (s). In a field that is distorted, or in doubt, no reading is
@@ -77,33 +77,37 @@ def see(
     newest = readings[-1]
     watch, field = watch.look()
     if field != OK:
-        return Sight(predicted.unseen(), watch, _refused(readings, field), newest.sample, field, field=True)
+        return Observation(
+            predicted.unseen(), watch, _refused(readings, field), newest.sample, field, field=True
+        )
     if (doubt := watch.doubt()) != OK:
         readings = _refused(readings, doubt)
     good = [reading.sample for reading in readings if reading.verdict == OK]
     corrected = predicted.observe(good)
     estimate = corrected if good else corrected.unseen()
     if newest.verdict == OK:
-        return Sight(estimate, watch, readings, newest.sample)
+        return Observation(estimate, watch, readings, newest.sample)
     if (before := watch.only_missed(newest.sample, newest.verdict)) is not None:
-        return Sight(estimate, watch, readings, before)
-    return Sight(corrected.unseen(), watch, readings, newest.sample, newest.verdict)
+        return Observation(estimate, watch, readings, before)
+    return Observation(corrected.unseen(), watch, readings, newest.sample, newest.verdict)
 
 
-def _without_news(predicted: Estimate, watch: Watch, now: float, stale_after: float, status: str) -> Sight:
+def _without_news(
+    predicted: Estimate, watch: Watch, now: float, stale_after: float, status: str
+) -> Observation:
     """A period between two frames: until the last one is stale the field is as it was, and a good reading counts.
 
     status: of the tracker, which may know why it is silent.
     """
     if watch.field != OK and watch.heard(now, stale_after):
-        return Sight(predicted.unseen(), watch, verdict=watch.field, field=True)
+        return Observation(predicted.unseen(), watch, verdict=watch.field, field=True)
     if (before := watch.last_good(now, stale_after)) is not None:
-        return Sight(predicted.unseen(), watch, sample=before)
+        return Observation(predicted.unseen(), watch, sample=before)
     why = "" if status == VISIBLE else f" ({status})"
-    return Sight(predicted.unseen(), watch, verdict=f"missing: no reading{why}")
+    return Observation(predicted.unseen(), watch, verdict=f"missing: no reading{why}")
 
 
-def _refused(readings: Sequence[Judged], field: str) -> tuple[Judged, ...]:
+def _refused(readings: Sequence[CheckedMeasurement], field: str) -> tuple[CheckedMeasurement, ...]:
     """The readings of a period in a field that is not good: none counts, also where nothing else is wrong with it."""
     return tuple(replace(one, verdict=field) if one.verdict == OK else one for one in readings)
 
@@ -112,14 +116,14 @@ def _judged(
     scenario: Scenario,
     predicted: Estimate,
     watch: Watch,
-    samples: Sequence[Sample],
+    samples: Sequence[Measurement],
     ages: Sequence[float],
     now: float,
-) -> tuple[Watch, tuple[Judged, ...]]:
+) -> tuple[Watch, tuple[CheckedMeasurement, ...]]:
     """Take in samples, each not to be older than its age (s)."""
     readings = []
     limit = scenario.control.innovation_limit_mm + _SURE * predicted.tip_sd
     for sample, age in zip(samples, ages, strict=True):
         watch, verdict = watch.take(sample, predicted.tip_at(sample.time), now, age, limit)
-        readings.append(Judged(sample, verdict))
+        readings.append(CheckedMeasurement(sample, verdict))
     return watch, tuple(readings)

@@ -2,7 +2,7 @@
 
 from typing import Protocol
 
-from flexneedle.types import Command, Frame, Sample
+from flexneedle.types import Command, Frame, Measurement
 
 
 class Clock(Protocol):
@@ -41,7 +41,7 @@ class Tracker(Protocol):
 class TipTracker(Protocol):
     """Sees the tip of the needle, in the frame of the stage."""
 
-    def read(self) -> tuple[Sample, ...]:
+    def read(self) -> tuple[Measurement, ...]:
         """The readings since the last call, oldest first; empty if there was none."""
         ...
 

@@ -12,7 +12,7 @@ from flexneedle.rig.phantom.draw import draw
 from flexneedle.rig.phantom.phantom import Condition, Phantom
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
 from flexneedle.rig.ports import Clock, Driver, TipTracker
-from flexneedle.rig.tracking.field.poses import Pose, tip_sensor_pose
+from flexneedle.rig.tracking.field.poses import SensorPose, tip_sensor_pose
 from flexneedle.rig.tracking.field.room import Room
 from flexneedle.rig.tracking.field.tracker import FieldTracker
 from flexneedle.rig.tracking.placement import placed_references
@@ -87,7 +87,7 @@ def _made(factory: TrackerFactory, scenario: Scenario, tank: Phantom, rng: np.ra
 
 def virtual_room(
     scenario: Scenario, seed: np.random.SeedSequence, plate_distance: float | None = None
-) -> tuple[Room, Mapping[str, Pose]] | None:
+) -> tuple[Room, Mapping[str, SensorPose]] | None:
     """Return the room that a virtual rig of this seed stands in, and its reference sensors in the stage's frame.
 
     None for a scenario without an environment. plate_distance: where the plate is (mm) while a lab places the
@@ -144,7 +144,7 @@ def _noisy_tracker(
 
 def _field_tracker(
     scenario: Scenario,
-    around: tuple[Room, Mapping[str, Pose]],
+    around: tuple[Room, Mapping[str, SensorPose]],
     tank: Phantom,
     errors: _Errors,
     rng: np.random.Generator,
@@ -155,7 +155,7 @@ def _field_tracker(
     center, offset = settings.workspace_center_mm, settings.tip_offset_mm
     registered = to_stage(settings.registration)
 
-    def poses_at(time: float) -> Mapping[str, Pose]:
+    def poses_at(time: float) -> Mapping[str, SensorPose]:
         x, y, turn = tank.pose_at(time)
         tip = x + errors.bias[0], y + errors.bias[1], 0.0
         return {TIP: tip_sensor_pose(tip, (math.cos(turn), math.sin(turn), 0.0), offset), **references}

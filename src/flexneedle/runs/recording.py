@@ -14,7 +14,7 @@ from flexneedle.trace.folder import TRACE_FILE, Folder, versions
 from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
 from flexneedle.trace.results import insertion_result, insertion_timing, plan_result, plan_timing
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Insertion, Period, PlanRecord
+from flexneedle.types import Insertion, Period, Plan
 from flexneedle.trace.writer import TraceWriter
 
 
@@ -49,7 +49,7 @@ class Choices:
 
 def record_plans(
     folder: Folder, scenario: Scenario, strategies: Sequence[str], seed: int, on_iteration: OnIteration
-) -> dict[str, PlanRecord]:
+) -> dict[str, Plan]:
     """Plan with each strategy and leave `run.json` and `plan.png`, `.svg` in the folder.
 
     An error or an interruption is marked in `run.json` and passed on.
@@ -97,7 +97,7 @@ def record_insertion(
 
 def _plan(
     folder: Folder, scenario: Scenario, strategy: str, seed: int, on_iteration: OnIteration
-) -> PlanRecord:
+) -> Plan:
     from flexneedle.planning.planner import plan
 
     made = plan(scenario, strategy=strategy, seed=seed, progress=partial(on_iteration, strategy))
@@ -108,7 +108,7 @@ def _plan(
 
 
 def _insert(
-    folder: Folder, scenario: Scenario, plan: PlanRecord, choices: Choices, on_period: OnPeriod
+    folder: Folder, scenario: Scenario, plan: Plan, choices: Choices, on_period: OnPeriod
 ) -> Insertion:
     from flexneedle.rig.loop import insert
 

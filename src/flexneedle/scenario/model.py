@@ -19,12 +19,12 @@ from flexneedle.scenario.rules import (
     plan_problems,
     target_problems,
 )
-from flexneedle.scenario.sections.apparatus import Setup, Tracker
+from flexneedle.scenario.sections.apparatus import Setup, TrackerSettings
 from flexneedle.scenario.sections.environment import environment_names, expanded
 from flexneedle.scenario.sections.fields import Section, Title
-from flexneedle.scenario.sections.monitor import Monitor
+from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.scenario.sections.needle import Needle
-from flexneedle.scenario.sections.settings import Control, Phantom, Plan, Target
+from flexneedle.scenario.sections.settings import ControlSettings, PhantomSettings, PlanSettings, Target
 from flexneedle.scenario.sections.structure import structure_problems
 from flexneedle.scenario.sections.tissue import Contact, Layer
 
@@ -45,11 +45,11 @@ class Scenario(Section):
     """Layers from the skin down."""
     contact: Contact = Contact()
     target: Target = Target()
-    plan: Plan = Plan()
-    control: Control = Control()
-    tracker: Tracker = Tracker()
-    monitor: Monitor = Monitor()
-    phantom: Phantom = Phantom()
+    plan: PlanSettings = PlanSettings()
+    control: ControlSettings = ControlSettings()
+    tracker: TrackerSettings = TrackerSettings()
+    monitor: MonitorSettings = MonitorSettings()
+    phantom: PhantomSettings = PhantomSettings()
 
     @model_validator(mode="after")
     def _check_sections_together(self) -> Self:

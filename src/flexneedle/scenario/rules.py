@@ -4,10 +4,10 @@ from collections.abc import Iterator, Sequence
 from math import isfinite
 
 from flexneedle.scenario.problems import Problem
-from flexneedle.scenario.sections.apparatus import Setup, Tracker
-from flexneedle.scenario.sections.monitor import Monitor
+from flexneedle.scenario.sections.apparatus import Setup, TrackerSettings
+from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.scenario.sections.needle import Bevel, Needle
-from flexneedle.scenario.sections.settings import Phantom, Plan, Target
+from flexneedle.scenario.sections.settings import PhantomSettings, PlanSettings, Target
 from flexneedle.scenario.sections.tissue import LARGEST_BEVEL, Contact, Layer
 
 _MOST_GRID_POINTS = 20_000
@@ -67,14 +67,16 @@ def target_problems(setup: Setup, target: Target) -> Iterator[Problem]:
         yield Problem("target.lateral_mm", lateral, rule)
 
 
-def plan_problems(plan: Plan) -> Iterator[Problem]:
+def plan_problems(plan: PlanSettings) -> Iterator[Problem]:
     """A covariance needs two elite samples."""
     if plan.elite_count < 2:
         rule = f"must leave at least 2 elite samples of plan.samples ({plan.samples})"
         yield Problem("plan.elite_fraction", plan.elite_fraction, rule)
 
 
-def grid_problems(setup: Setup, contact: Contact, phantom: Phantom, tracker: Tracker) -> Iterator[Problem]:
+def grid_problems(
+    setup: Setup, contact: Contact, phantom: PhantomSettings, tracker: TrackerSettings
+) -> Iterator[Problem]:
     """No spacing or step so small that a run would hang."""
     smallest = setup.stroke_mm / _MOST_GRID_POINTS
     grids = {
@@ -92,7 +94,7 @@ def grid_problems(setup: Setup, contact: Contact, phantom: Phantom, tracker: Tra
         yield Problem("tracker.rate_hz", tracker.rate_hz, rule)
 
 
-def monitor_problems(monitor: Monitor, tracker: Tracker) -> Iterator[Problem]:
+def monitor_problems(monitor: MonitorSettings, tracker: TrackerSettings) -> Iterator[Problem]:
     """Two frames in the window, or the field would never be known and the needle never move."""
     least = _FRAMES_IN_A_WINDOW * tracker.period
     judged = monitor.enabled and monitor.references > 0 and tracker.environment is not None

@@ -92,7 +92,7 @@ class Simulator:
         mesh = mesh_of(self._model.nodes, w, count)
         return solved(self.scenario, self._model, s, rest, u, mesh), tips
 
-    def adapted(self, learnt: model.Learnt) -> "Simulator":
+    def adapted(self, learnt: model.Adaptation) -> "Simulator":
         """Return this simulator with what an observer has learnt, for states of the same scenario."""
         return Simulator(self.scenario, self.threads, constants=model.adapted(self._model, learnt))
 

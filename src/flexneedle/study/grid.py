@@ -63,7 +63,7 @@ _BESIDES = f"; besides: {', '.join(_DEFAULTS)}, {WORLD_CASE}, as an axis also {S
 
 
 @dataclass(frozen=True)
-class Point:
+class GridPoint:
     """A point of the grid: everything that its insertions share.
 
     varied: what the axes chose, but for target and world; target_number: place of the target among those of the
@@ -84,11 +84,11 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Insertion:
+class StudyInsertion:
     """One insertion of a study: its row, its point, which repeat it is, and the seed of its phantom."""
 
     index: int
-    point: Point
+    point: GridPoint
     repeat: int
     seed: int
 
@@ -98,7 +98,7 @@ class Study:
     """A study, multiplied out. definition: all that it depends on, as plain values; seeds: of an axis, else ()."""
 
     definition: Mapping[str, Any]
-    points: tuple[Point, ...]
+    points: tuple[GridPoint, ...]
     repeats: int
     first_seed: int
     seeds: tuple[int, ...]
@@ -116,7 +116,7 @@ class Study:
     def __len__(self) -> int:
         return len(self.points) * self.repeats
 
-    def insertion(self, index: int) -> Insertion:
+    def insertion(self, index: int) -> StudyInsertion:
         """Return the insertion of a row.
 
         Without an axis of seeds, every target (or world) and repeat has a phantom of its own, and the same one at
@@ -125,7 +125,7 @@ class Study:
         number, repeat = divmod(index, self.repeats)
         point = self.points[number]
         own = self.first_seed + point.target_number * self.repeats + repeat
-        return Insertion(index, point, repeat, self.seeds[repeat] if self.seeds else own)
+        return StudyInsertion(index, point, repeat, self.seeds[repeat] if self.seeds else own)
 
 
 def load_study(source: str | Path | Study, worlds: tuple[int, int] | None = None) -> Study:
@@ -206,7 +206,7 @@ def _points(
     cases: Mapping[str, Mapping[str, Any]],
     axes: Mapping[str, list[Any]],
     own: tuple[Method, ...],
-) -> Iterator[Point]:
+) -> Iterator[GridPoint]:
     """Yield the points: cases vary slowest, then the axes in their order; later settings go over earlier ones."""
     targets: dict[tuple[float, float], int] = {}
     worlds = cache(world)  # a point each: every controller has the same ones
@@ -230,7 +230,7 @@ def _points(
         varied = {
             key: value for key, value in chosen.items() if key != WORLD and not key.startswith("target")
         }
-        yield Point(scenario, case, **run, target_number=number, varied=varied, **of_world)
+        yield GridPoint(scenario, case, **run, target_number=number, varied=varied, **of_world)
 
 
 def _is_skipped(scenario: Scenario, controller: str, world_case: str) -> bool:

@@ -6,26 +6,26 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
-from flexneedle.study.grid import Point
+from flexneedle.study.grid import GridPoint
 from flexneedle.study.rows import Planned
 from flexneedle.trace.files import replace_file
 from flexneedle.trace.plain import plan_from_values, to_text
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 _MECHANICS = ("needle", "setup", "tissue", "contact", "target")
 
 
-def plan_key(point: Point) -> str:
+def plan_key(point: GridPoint) -> str:
     """Return the name of a point's plan: a digest of all that the planner sees."""
     return _digest(point, ("plan",), point.strategy, point.plan_seed)
 
 
-def truth_key(point: Point) -> str:
+def truth_key(point: GridPoint) -> str:
     """Return a digest of all that the reach of a point's phantoms depends on, but for the seed."""
     return _digest(point, ("plan", "phantom"), point.plant, point.strategy)
 
 
-def _digest(point: Point, sections: tuple[str, ...], *settings: object) -> str:
+def _digest(point: GridPoint, sections: tuple[str, ...], *settings: object) -> str:
     values = point.scenario.values()
     seen = [{name: values[name] for name in (*_MECHANICS, *sections)}, *settings]
     return hashlib.sha256(json.dumps(seen, sort_keys=True).encode()).hexdigest()[:16]
@@ -41,10 +41,10 @@ class Plans:
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: is no folder, which plans need: move it away")
         self._folder = folder
-        self._made: dict[str, tuple[PlanRecord, float]] = {}
+        self._made: dict[str, tuple[Plan, float]] = {}
         self.refusals: dict[str, str] = {}
 
-    def plan(self, key: str) -> PlanRecord | None:
+    def plan(self, key: str) -> Plan | None:
         """Return the plan of a key, as it stands on disk, or None if there is none (yet)."""
         made = self._find(key)
         return made[0] if made else None
@@ -66,13 +66,13 @@ class Plans:
     def _path(self, key: str) -> Path:
         return self._folder / f"{key}.json"
 
-    def _find(self, key: str) -> tuple[PlanRecord, float] | None:
+    def _find(self, key: str) -> tuple[Plan, float] | None:
         if key not in self._made and self._path(key).exists():
             self._made[key] = _read(self._path(key))
         return self._made.get(key)
 
 
-def _read(path: Path) -> tuple[PlanRecord, float]:
+def _read(path: Path) -> tuple[Plan, float]:
     try:
         values: Any = json.loads(path.read_text(encoding="utf-8"))
         return plan_from_values(values["plan"]), float(values["seconds"])

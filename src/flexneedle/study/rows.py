@@ -15,11 +15,11 @@ from flexneedle.errors import RunError, ScenarioWarning
 from flexneedle.planning.planner import plan
 from flexneedle.rig.kernels import compile_kernels
 from flexneedle.rig.loop import insert
-from flexneedle.study.grid import Point
+from flexneedle.study.grid import GridPoint
 from flexneedle.study.reach import reach
 from flexneedle.trace.folder import versions
 from flexneedle.trace.plain import plain, plan_values
-from flexneedle.types import Insertion, PlanRecord
+from flexneedle.types import Insertion, Plan
 
 RESULTS = {
     "true_error_mm": float,
@@ -65,8 +65,8 @@ class Job:
     bounded: whether their reach is wanted; one of all points with the same truth is enough.
     """
 
-    point: Point
-    plan: PlanRecord | None
+    point: GridPoint
+    plan: Plan | None
     refusal: str
     insertions: tuple[tuple[int, int], ...]
     bounded: bool = False
@@ -89,7 +89,7 @@ class Done:
     versions: dict[str, str]
 
 
-def make_plan(point: Point) -> Planned:
+def make_plan(point: GridPoint) -> Planned:
     """Plan for a point, on one thread."""
     _ready()
     try:
@@ -128,7 +128,7 @@ def _row(job: Job, seed: int) -> dict[str, Any]:
     return values
 
 
-def _reach(point: Point, seed: int) -> tuple[float | None, str]:
+def _reach(point: GridPoint, seed: int) -> tuple[float | None, str]:
     """The reach (mm), or why there is none: the insertion's own outcome stands."""
     try:
         return reach(point.scenario, seed, point.plant, point.strategy), ""
@@ -136,7 +136,7 @@ def _reach(point: Point, seed: int) -> tuple[float | None, str]:
         return None, f"no reach: {_told(error)}"
 
 
-def _insertion(job: Job, made: PlanRecord, seed: int) -> Insertion:
+def _insertion(job: Job, made: Plan, seed: int) -> Insertion:
     point = job.point
     with warnings.catch_warnings():
         # The study has checked its tables: that of another of its controllers is nothing to warn of.
@@ -152,7 +152,7 @@ def _insertion(job: Job, made: PlanRecord, seed: int) -> Insertion:
         )
 
 
-def _planned(made: PlanRecord | None) -> dict[str, Any]:
+def _planned(made: Plan | None) -> dict[str, Any]:
     if made is None:
         return {}
     return {

@@ -14,14 +14,14 @@ from flexneedle.errors import InputError, RunError
 from flexneedle.rig.kernels import compile_kernels
 from flexneedle.study import pools
 from flexneedle.study.folder import PLANS_FOLDER, free_folder, open_folder
-from flexneedle.study.grid import Point, Study, load_study
+from flexneedle.study.grid import GridPoint, Study, load_study
 from flexneedle.study.journal import Journal
 from flexneedle.study.plans import Plans, plan_key, truth_key
 from flexneedle.study.rows import Done, Job, Planned, carry_out, make_plan
 from flexneedle.study.tables import write_tables
 from flexneedle.trace.folder import versions
 
-_Left = dict[str, list[tuple[Point, tuple[tuple[int, int], ...]]]]
+_Left = dict[str, list[tuple[GridPoint, tuple[tuple[int, int], ...]]]]
 _CLUSTER_JOBS = 1000  # a job brings its plan along: about 100 kB that the scheduler holds
 
 

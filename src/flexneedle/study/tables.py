@@ -7,7 +7,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from flexneedle.study.grid import Insertion, Study
+from flexneedle.study.grid import Study, StudyInsertion
 from flexneedle.study.plans import Plans, plan_key, truth_key
 from flexneedle.study.rows import RESULTS, TIMES
 from flexneedle.trace.files import replace_file
@@ -48,7 +48,7 @@ def write_tables(folder: Path, study: Study, rows: Mapping[int, Mapping[str, Any
 
 
 def _with_reach(
-    insertions: Sequence[Insertion], results: Sequence[Mapping[str, Any]]
+    insertions: Sequence[StudyInsertion], results: Sequence[Mapping[str, Any]]
 ) -> list[Mapping[str, Any]]:
     """Return the results with the reach that one of the insertions with the same truth has found."""
     digests = {id(i.point): "" if i.point.world is None else truth_key(i.point) for i in insertions}
@@ -61,7 +61,7 @@ def _with_reach(
 
 def _runs(
     study: Study,
-    insertions: Sequence[Insertion],
+    insertions: Sequence[StudyInsertion],
     of_plan: Sequence[str],
     results: Sequence[Mapping[str, Any]],
 ) -> pa.Table:
@@ -79,7 +79,7 @@ def _runs(
     )
 
 
-def _about(insertion: Insertion, key: str) -> dict[str, Any]:
+def _about(insertion: StudyInsertion, key: str) -> dict[str, Any]:
     point = insertion.point
     depth, lateral = point.scenario.target.position
     return {

@@ -6,7 +6,7 @@ Names end in their unit; numbers are exact (`repr`), so that a period comes back
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from flexneedle.types import Floats, Judged, Period, Sample
+from flexneedle.types import CheckedMeasurement, Floats, Measurement, Period
 
 _Scalar = Callable[[str], Any]
 
@@ -62,7 +62,10 @@ def to_row(period: Period) -> dict[str, str]:
 
 
 def from_row(
-    row: Mapping[str, str], shape: Floats, durations: dict[str, float], readings: tuple[Judged, ...] = ()
+    row: Mapping[str, str],
+    shape: Floats,
+    durations: dict[str, float],
+    readings: tuple[CheckedMeasurement, ...] = (),
 ) -> Period:
     """Return the period of a row with what no row holds; raises KeyError or ValueError for other rows."""
     values = {field: _value(field, row) for field in _FIELDS}
@@ -70,7 +73,7 @@ def from_row(
 
 
 def _cells(field: str, value: Any) -> Iterator[tuple[str, str]]:
-    if isinstance(value, Sample):
+    if isinstance(value, Measurement):
         value = (value.time, value.x, value.y, value.z)
     columns = _FIELDS[field]
     parts = value if isinstance(value, tuple) else (value,) * len(columns)
@@ -81,7 +84,7 @@ def _cells(field: str, value: Any) -> Iterator[tuple[str, str]]:
 def _value(field: str, row: Mapping[str, str]) -> Any:
     parts: Any = tuple(kind(row[name]) if row[name] or kind is str else None for name, kind in _FIELDS[field])
     if field == "sample":
-        return Sample(*parts)
+        return Measurement(*parts)
     if len(parts) == 1:
         return parts[0]
     return parts if parts[0] is not None else None

@@ -23,7 +23,7 @@ from flexneedle.errors import InputError, ScenarioError
 from flexneedle.scenario.model import Scenario
 from flexneedle.trace.plain import plan_from_values, plan_values, to_text
 from flexneedle.trace.shield import uninterrupted
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 RUN_FILE, TRACE_FILE, STUDY_FILE = "run.json", "trace.mcap", "study.json"
 _PACKAGE = Path(__file__).parents[1]
@@ -45,7 +45,7 @@ class RunFile:
     reason: str
     seed: int
     scenario: Scenario
-    plans: dict[str, PlanRecord]
+    plans: dict[str, Plan]
     result: Mapping[str, Any] | None
     timing: Mapping[str, Any]
     controller: str
@@ -59,7 +59,7 @@ class Folder:
     path: Path
     values: dict[str, Any]
     timing: dict[str, Any]
-    plans: dict[str, PlanRecord] = field(default_factory=dict)
+    plans: dict[str, Plan] = field(default_factory=dict)
 
     @classmethod
     def claim(cls, out: Path | None, name: str, kind: str, scenario: Scenario, seed: int) -> "Folder":

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 _ARRAYS = ("controls", "tips", "strain_energy", "guide", "shapes")
 _WALL_CLOCK = "seconds"
@@ -30,19 +30,19 @@ def plain(value: Any) -> Any:
     return value
 
 
-def plan_values(plan: PlanRecord) -> dict[str, Any]:
+def plan_values(plan: Plan) -> dict[str, Any]:
     """Return a plan as plain values, without the time that it took; arrays (mm, rad, mJ) come last."""
     names = [field.name for field in fields(plan) if field.name != _WALL_CLOCK]
     ordered = [name for name in names if name not in _ARRAYS] + list(_ARRAYS)
     return {name: plain(getattr(plan, name)) for name in ordered}
 
 
-def plan_from_values(values: Mapping[str, Any]) -> PlanRecord:
+def plan_from_values(values: Mapping[str, Any]) -> Plan:
     """Return the plan of `plan_values`; raises KeyError, TypeError or ValueError if it is not one."""
     given = {**values, **{name: np.array(values[name], dtype=float) for name in _ARRAYS}}
     given["controls"] = given["controls"].reshape(-1, 5)
     x, y = values["target"]
-    return PlanRecord(**{**given, "target": (x, y), "history": tuple(values["history"])})
+    return Plan(**{**given, "target": (x, y), "history": tuple(values["history"])})
 
 
 def to_text(values: Mapping[str, Any]) -> str:

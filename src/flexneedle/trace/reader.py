@@ -18,7 +18,7 @@ from flexneedle.trace.messages import STORE, DiagnosticArray, DiagnosticStatus, 
 from flexneedle.trace.messages import Path as PathMessage
 from flexneedle.trace.readings import from_values
 from flexneedle.trace.topics import READINGS, SHAPE, STATUS, TIMING, TOPICS
-from flexneedle.types import Floats, Judged, Period
+from flexneedle.types import CheckedMeasurement, Floats, Period
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class _Collector:
         self._topics: dict[int, str] = {}
         self._shape: Floats = np.empty((0, 3))
         self._durations: dict[str, float] = {}
-        self._readings: tuple[Judged, ...] = ()
+        self._readings: tuple[CheckedMeasurement, ...] = ()
 
     def take(self, record: McapRecord) -> None:
         """Take one record of the file."""

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator, Mapping
 
-from flexneedle.types import Frame, Judged, Reading, Sample
+from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
 
 _PLACE, _TURN = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
 
 
-def to_values(judged: Judged) -> dict[str, str]:
+def to_values(judged: CheckedMeasurement) -> dict[str, str]:
     """Return what the reading says of the tip, then of each sensor of its frame; what is not known is left out."""
     sample, frame = judged.sample, judged.sample.frame
     values = {"time_s": repr(float(sample.time))}
@@ -19,10 +19,10 @@ def to_values(judged: Judged) -> dict[str, str]:
     return values
 
 
-def from_values(values: Mapping[str, str], verdict: str) -> Judged:
+def from_values(values: Mapping[str, str], verdict: str) -> CheckedMeasurement:
     """Return the reading of such a status; raises KeyError or ValueError where it is none."""
     x, y, z = (_number(values, key) for key in _PLACE)
-    return Judged(Sample(float(values["time_s"]), x, y, z, _frame(values)), verdict)
+    return CheckedMeasurement(Measurement(float(values["time_s"]), x, y, z, _frame(values)), verdict)
 
 
 def _frame(values: Mapping[str, str]) -> Frame | None:
@@ -33,10 +33,10 @@ def _frame(values: Mapping[str, str]) -> Frame | None:
     return Frame(float(values["frame_time_s"]), int(values["frame_number"]), readings)
 
 
-def _reading(values: Mapping[str, str], name: str) -> Reading:
+def _reading(values: Mapping[str, str], name: str) -> SensorReading:
     x, y, z = (_number(values, f"{name}.{key}") for key in _PLACE)
     w, i, j, k = (_number(values, f"{name}.{key}") for key in _TURN)
-    return Reading(
+    return SensorReading(
         None if x is None or y is None or z is None else (x, y, z),
         None if w is None or i is None or j is None or k is None else (w, i, j, k),
         _number(values, f"{name}.indicator"),
@@ -44,7 +44,7 @@ def _reading(values: Mapping[str, str], name: str) -> Reading:
     )
 
 
-def _sensor(reading: Reading) -> Iterator[tuple[str, str]]:
+def _sensor(reading: SensorReading) -> Iterator[tuple[str, str]]:
     yield "status", reading.status
     yield from _numbers(_PLACE, reading.position or ()).items()
     yield from _numbers(_TURN, reading.orientation or ()).items()

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 
 from flexneedle.trace.plain import plain
-from flexneedle.types import Insertion, PlanRecord
+from flexneedle.types import Insertion, Plan
 
 
-def plan_result(plan: PlanRecord) -> dict[str, Any]:
+def plan_result(plan: Plan) -> dict[str, Any]:
     """Return the result of a plan; tip in mm."""
     result: dict[str, Any] = plain(
         {
@@ -27,7 +27,7 @@ def plan_result(plan: PlanRecord) -> dict[str, Any]:
     return result
 
 
-def plan_timing(plan: PlanRecord) -> dict[str, Any]:
+def plan_timing(plan: Plan) -> dict[str, Any]:
     """Return the wall-clock time of a plan."""
     return {"plan_seconds": plan.seconds}
 

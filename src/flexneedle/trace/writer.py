@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 from flexneedle.trace.messages import STORE
 from flexneedle.trace.shield import uninterrupted
 from flexneedle.trace.topics import LATCHED, TOPICS, Spoken, period_messages, plan_message
-from flexneedle.types import Period, PlanRecord
+from flexneedle.types import Period, Plan
 
 # A period takes about 10 kB; a chunk or a buffer that fills up inside one would tear it.
 _ROOM = 1 << 24
@@ -40,7 +40,7 @@ class TraceWriter:
     """
 
     def __init__(
-        self, path: Path, plan: PlanRecord, *, about: Mapping[str, str], scenario: Mapping[str, Any]
+        self, path: Path, plan: Plan, *, about: Mapping[str, str], scenario: Mapping[str, Any]
     ) -> None:
         self._file = path.open("xb", buffering=_ROOM)
         self._writer = Writer(self._file, chunk_size=_ROOM, compression=CompressionType.NONE)

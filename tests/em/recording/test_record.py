@@ -16,7 +16,7 @@ from flexneedle.em.recording.grid import read_grid
 from flexneedle.em.recording.record import EXTRA, Guide, open_session, record
 from flexneedle.errors import InputError, RunError
 from flexneedle.rig.tracking.table import COLUMNS
-from flexneedle.types import VISIBLE, Frame, Reading
+from flexneedle.types import VISIBLE, Frame, SensorReading
 
 GRID = """\
 environment = "ideal, by the window"
@@ -55,7 +55,7 @@ class Stage:
     def _frame(self, number):
         x, y, z = self.place
         x += 100.0 + self.speed * number / 40
-        reading = Reading((x, y, z), (1.0, 0.0, 0.0, 0.0), 0.02)
+        reading = SensorReading((x, y, z), (1.0, 0.0, 0.0, 0.0), 0.02)
         return Frame(number / 40, number, {"tip": reading, "ref1": reading} | (self.ailment or {}))
 
     def ask(self, stop):
@@ -154,8 +154,8 @@ def test_a_stage_that_never_rests_is_told_and_asked_for_again(grid, out):
 @pytest.mark.parametrize(
     ("ailment", "says"),
     [
-        ({"tip": Reading(None, status="out of volume")}, "tip: out of volume"),
-        ({"ref1": Reading(None, status="missing")}, "ref1: missing"),
+        ({"tip": SensorReading(None, status="out of volume")}, "tip: out of volume"),
+        ({"ref1": SensorReading(None, status="missing")}, "ref1: missing"),
     ],
 )
 def test_a_point_that_cannot_be_measured_ends_a_recording_without_a_person(grid, out, ailment, says):
@@ -168,7 +168,7 @@ def test_a_point_that_cannot_be_measured_ends_a_recording_without_a_person(grid,
 
 def test_a_sensor_that_the_tracker_does_not_have_is_named_before_the_stage_is_moved(grid, out):
     stage = Stage()
-    stage._frame = lambda number: Frame(number / 40, number, {"tip": Reading((0.0, 0.0, 0.0))})
+    stage._frame = lambda number: Frame(number / 40, number, {"tip": SensorReading((0.0, 0.0, 0.0))})
     with pytest.raises(InputError, match=r"sensors\.ref1: the tracker has no such sensor; it has tip$"):
         run(out, grid, stage)
     assert stage.asked == []
@@ -195,7 +195,7 @@ def test_a_tracker_that_falls_silent_for_a_while_is_told_once_and_so_is_its_retu
 def test_a_sensor_that_is_lost_for_a_while_is_waited_for_and_told_once(grid, out):
     """For 1.5 s at the first point; for half a second, at the second, nothing is said."""
     stage = Stage()
-    frame, lost = stage._frame, {"tip": Reading(None, status="missing")}
+    frame, lost = stage._frame, {"tip": SensorReading(None, status="missing")}
 
     def blink(number):
         told = frame(number)
@@ -219,7 +219,7 @@ class Stuck(Stage):
         frame = super()._frame(number)
         x, y, z = frame.readings["ref1"].position
         return Frame(
-            frame.time, number, {**frame.readings, "tip": Reading((self.share * x, self.share * y, z))}
+            frame.time, number, {**frame.readings, "tip": SensorReading((self.share * x, self.share * y, z))}
         )
 
 

@@ -10,7 +10,7 @@ from flexneedle.em.recording.trackers import clock_for, frames_of_run, open_trac
 from flexneedle.errors import InputError
 from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.devices.replay import Replay
-from flexneedle.types import Frame, Judged, Reading, Sample
+from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
 
 RECORDING = "time_s,frame_number,sensor,x_mm,y_mm,z_mm\n0.0,1,tip,1,2,3\n1.0,2,tip,1,2,3\n"
 
@@ -92,22 +92,22 @@ def test_anything_else_is_refused_with_the_forms_that_there_are(spec, says):
 
 def read_run(monkeypatch, *samples):
     """Return the frames of a run with these readings in two periods."""
-    told = [Judged(sample, "ok") for sample in samples]
+    told = [CheckedMeasurement(sample, "ok") for sample in samples]
     periods = [SimpleNamespace(readings=told[:1]), SimpleNamespace(readings=told[1:])]
     monkeypatch.setattr(trackers, "read_trace", lambda _: SimpleNamespace(periods=periods))
     return frames_of_run(Path("run"))
 
 
 def test_a_run_gives_back_what_its_tracker_told_each_frame_once(monkeypatch):
-    frames = [Frame(n / 40, 7 + n, {"tip": Reading((1.0, 2.0, 3.0))}) for n in range(2)]
-    first, second = (Sample(frame.time, 5.0, 6.0, 7.0, frame) for frame in frames)
+    frames = [Frame(n / 40, 7 + n, {"tip": SensorReading((1.0, 2.0, 3.0))}) for n in range(2)]
+    first, second = (Measurement(frame.time, 5.0, 6.0, 7.0, frame) for frame in frames)
     assert read_run(monkeypatch, first, second, second) == tuple(frames)
 
 
 def test_a_run_with_a_tracker_of_the_tip_alone_gives_frames_of_the_tip(monkeypatch):
-    seen, lost = read_run(monkeypatch, Sample(0.1, 5.0, 6.0), Sample(0.2, None, None))
-    assert seen == Frame(0.1, 0, {"tip": Reading((5.0, 6.0, 0.0))})
-    assert lost == Frame(0.2, 1, {"tip": Reading(None, status="missing")})
+    seen, lost = read_run(monkeypatch, Measurement(0.1, 5.0, 6.0), Measurement(0.2, None, None))
+    assert seen == Frame(0.1, 0, {"tip": SensorReading((5.0, 6.0, 0.0))})
+    assert lost == Frame(0.2, 1, {"tip": SensorReading(None, status="missing")})
 
 
 def test_a_run_without_readings_is_refused(monkeypatch, tmp_path):

@@ -7,8 +7,8 @@ from flexneedle.errors import InputError
 from flexneedle.rig.devices.recording import read_frames
 from flexneedle.rig.devices.replay import ENDED, Replay
 from flexneedle.rig.monitor.watch import Watch
-from flexneedle.scenario.sections.monitor import Monitor
-from flexneedle.types import VISIBLE, Frame, Reading, Sample
+from flexneedle.scenario.sections.monitor import MonitorSettings
+from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading
 
 
 class Clock:
@@ -24,7 +24,7 @@ class Clock:
 
 
 def frames(count, indicator=0.02, **readings):
-    told = {name: Reading((1.0, 2.0, 3.0), None, indicator) for name in ("tip", "ref1", "ref2", "ref3")}
+    told = {name: SensorReading((1.0, 2.0, 3.0), None, indicator) for name in ("tip", "ref1", "ref2", "ref3")}
     return [Frame(n / 40, n, told | readings) for n in range(count)]
 
 
@@ -76,10 +76,15 @@ def test_it_stops_when_the_tracker_says_that_there_is_no_more_to_come():
 
 def test_what_is_recorded_can_be_replayed(tmp_path):
     path, clock = tmp_path / "kept.csv", Clock()
-    watch(Replay(frames(60, tip=Reading(None, status="missing")), clock), clock, lambda _: None, record=path)
+    watch(
+        Replay(frames(60, tip=SensorReading(None, status="missing")), clock),
+        clock,
+        lambda _: None,
+        record=path,
+    )
     kept = read_frames(path)
     assert [frame.number for frame in kept] == list(range(60))
-    assert kept[7].readings["tip"] == Reading(None, status="missing")
+    assert kept[7].readings["tip"] == SensorReading(None, status="missing")
     assert kept[7].readings["ref1"].indicator == 0.02
 
 
@@ -92,12 +97,12 @@ def test_a_recording_overwrites_nothing(tmp_path):
 
 
 def verdict(told, settings=None, distorted=False):
-    return judge_field(told, settings or Monitor(), distorted)[0]
+    return judge_field(told, settings or MonitorSettings(), distorted)[0]
 
 
 def test_a_good_field_is_ok_and_a_distorted_one_is_not():
-    assert judge_field(frames(40), Monitor()) == (VISIBLE, False)
-    said, distorted = judge_field(frames(40, indicator=0.06), Monitor())
+    assert judge_field(frames(40), MonitorSettings()) == (VISIBLE, False)
+    said, distorted = judge_field(frames(40, indicator=0.06), MonitorSettings())
     assert "field distorted" in said
     assert distorted
 
@@ -105,16 +110,16 @@ def test_a_good_field_is_ok_and_a_distorted_one_is_not():
 def test_the_field_is_that_of_the_last_second_at_the_references():
     improved = frames(100, indicator=0.06)[:60] + frames(100)[60:]
     assert verdict(improved) == VISIBLE
-    at_the_tip = Reading((1.0, 2.0, 3.0), None, 0.5)
+    at_the_tip = SensorReading((1.0, 2.0, 3.0), None, 0.5)
     assert verdict(frames(40, tip=at_the_tip)) == VISIBLE
 
 
 def test_a_sensor_without_a_position_and_too_few_references_are_told():
-    lost = Reading(None, status="out of volume")
+    lost = SensorReading(None, status="out of volume")
     assert verdict(frames(5, ref2=lost)) == "ref2: out of volume"
-    alone = [Frame(0.0, 1, {"tip": Reading((0.0, 0.0, 0.0), None, 0.02)})]
+    alone = [Frame(0.0, 1, {"tip": SensorReading((0.0, 0.0, 0.0), None, 0.02)})]
     assert "field not known: 0 of 3" in verdict(alone)
-    assert verdict(alone, Monitor(references=0)) == VISIBLE
+    assert verdict(alone, MonitorSettings(references=0)) == VISIBLE
 
 
 def stretch(begin, seconds, **readings):
@@ -124,8 +129,8 @@ def stretch(begin, seconds, **readings):
 
 
 def told(indicator, tip_status=VISIBLE):
-    seen = Reading((1.0, 2.0, 3.0), None, indicator)
-    tip = seen if tip_status == VISIBLE else Reading(None, status=tip_status)
+    seen = SensorReading((1.0, 2.0, 3.0), None, indicator)
+    tip = seen if tip_status == VISIBLE else SensorReading(None, status=tip_status)
     return {"tip": tip, "ref1": seen, "ref2": seen, "ref3": seen}
 
 
@@ -136,12 +141,12 @@ def test_a_field_that_was_distorted_stays_so_as_long_as_a_held_insertion_waits()
     script = [(level, VISIBLE) for level in levels] + [(level, "missing") for level in levels[1:3]]
     script += [(0.052, VISIBLE)]
     seen = [f for k, one in enumerate(script) for f in stretch(1.5 * k, 1.5, **told(*one))]
-    clock, views, monitor = Clock(), [], Watch(Monitor())
+    clock, views, monitor = Clock(), [], Watch(MonitorSettings())
     watch(Replay(seen, clock), clock, views.append)
     assert len(views) == len(seen)
     for frame, view in zip(seen, views, strict=True):
         monitor, _ = monitor.take(
-            Sample(frame.time, 0.0, 0.0, 0.0, frame), (0.0, 0.0), frame.time, 1.0, 1000.0
+            Measurement(frame.time, 0.0, 0.0, 0.0, frame), (0.0, 0.0), frame.time, 1.0, 1000.0
         )
         monitor, held = monitor.look()
         unseen = frame.readings["tip"].status != VISIBLE
@@ -162,7 +167,7 @@ def test_a_recording_is_a_csv(tmp_path):
 
 def sensors(*names, indicator=0.02):
     return [
-        Frame(n / 40, n, {name: Reading((0.0, 0.0, 0.0), None, indicator) for name in names})
+        Frame(n / 40, n, {name: SensorReading((0.0, 0.0, 0.0), None, indicator) for name in names})
         for n in range(40)
     ]
 

@@ -6,12 +6,12 @@ import pytest
 
 from flexneedle.errors import InputError
 from flexneedle.rig.devices.recording import COLUMNS, read_frames, rows_of
-from flexneedle.types import Frame, Reading
+from flexneedle.types import Frame, SensorReading
 
-SEEN = Reading((0.1 + 0.2, -20.0, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
+SEEN = SensorReading((0.1 + 0.2, -20.0, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
 FRAMES = (
-    Frame(0.1, 4, {"tip": SEEN, "ref1": Reading(None, status="out of volume")}),
-    Frame(0.125, 5, {"tip": Reading((1.0, 2.0, 3.0)), "ref1": SEEN}),
+    Frame(0.1, 4, {"tip": SEEN, "ref1": SensorReading(None, status="out of volume")}),
+    Frame(0.125, 5, {"tip": SensorReading((1.0, 2.0, 3.0)), "ref1": SEEN}),
 )
 
 

@@ -4,9 +4,9 @@ import pytest
 
 from flexneedle.errors import InputError
 from flexneedle.rig.devices.replay import ENDED, Replay
-from flexneedle.types import VISIBLE, Frame, Reading
+from flexneedle.types import VISIBLE, Frame, SensorReading
 
-FRAMES = [Frame(100.0 + n / 40, 7 + n, {"tip": Reading((float(n), 0.0, 0.0))}) for n in range(5)]
+FRAMES = [Frame(100.0 + n / 40, 7 + n, {"tip": SensorReading((float(n), 0.0, 0.0))}) for n in range(5)]
 
 
 class Hand:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flexneedle.rig.emulator import codec
-from flexneedle.rig.emulator.motion import Pose
+from flexneedle.rig.emulator.motion import EmulatedPose
 
 
 @pytest.mark.parametrize(
@@ -23,9 +23,9 @@ def test_replies_are_those_that_ndicapi_waits_for(reply, line):
 
 
 def test_a_command_has_a_checksum_after_a_colon_and_none_after_a_space():
-    assert codec.parse(b"INIT:E3A5") == codec.Command("INIT", "")
-    assert codec.parse(b"PENA 0AD") == codec.Command("PENA", "0AD")
-    assert codec.parse(b"BEEP") == codec.Command("BEEP", "")
+    assert codec.parse(b"INIT:E3A5") == codec.Request("INIT", "")
+    assert codec.parse(b"PENA 0AD") == codec.Request("PENA", "0AD")
+    assert codec.parse(b"BEEP") == codec.Request("BEEP", "")
 
 
 @pytest.mark.parametrize("line", [b"INIT:E3A6", b"INIT:", b"INIT:E3", b"INITX:E3A5"])
@@ -52,11 +52,11 @@ def test_a_checksum_over_all_of_a_binary_reply_is_the_same():
 
 
 def test_a_pose_in_text_is_fixed_point_with_signs():
-    pose = Pose((1.5, -20.25, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
+    pose = EmulatedPose((1.5, -20.25, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
     assert codec.transform_text(pose) == "+05000-05000+05000-05000+000150-002025-020000+00239"
 
 
 def test_a_pose_in_binary_is_eight_singles():
-    pose = Pose((1.5, -20.25, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
+    pose = EmulatedPose((1.5, -20.25, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
     values = struct.unpack("<8f", codec.transform_binary(pose))
     np.testing.assert_allclose(values, (0.5, -0.5, 0.5, -0.5, 1.5, -20.25, -200.0, 0.0239), rtol=1e-6)

@@ -6,7 +6,7 @@ from flexneedle.errors import InputError
 from flexneedle.rig.emulator import codec
 from flexneedle.rig.emulator.aurora import fresh
 from flexneedle.rig.emulator.faults import Fault, active, parse_fault
-from flexneedle.rig.emulator.server import Session
+from flexneedle.rig.emulator.server import EmulatorSession
 
 
 def test_a_fault_has_a_kind_a_detail_a_start_and_a_duration():
@@ -48,7 +48,7 @@ def command(text):
 
 def tracking(*specs, seed=0):
     """Return a session that began tracking at 10 s."""
-    session = Session(fresh(1), [parse_fault(spec) for spec in specs], seed, 0.0)
+    session = EmulatorSession(fresh(1), [parse_fault(spec) for spec in specs], seed, 0.0)
     for text in ("INIT:", "PINIT:0A", "PENA:0AD", "TSTART:"):
         due, reply = session.reply(command(text), 10.0)
         assert (due, reply) == (10.0, codec.text("OKAY")), "faults only begin with tracking"

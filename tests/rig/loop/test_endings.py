@@ -13,7 +13,7 @@ from flexneedle.control.methods import DEFAULT, METHODS, adaptive_mpc
 from flexneedle.errors import RunError
 from flexneedle.rig.virtual import Rig
 from flexneedle.simulator.state import State
-from flexneedle.types import Sample
+from flexneedle.types import Measurement
 from insertions import (
     PHANTOM,
     STILL,
@@ -61,7 +61,7 @@ class Stuck(Stage):
         return STILL
 
     def read(self):
-        return (Sample(self.time, -28.5, 0.0),)
+        return (Measurement(self.time, -28.5, 0.0),)
 
 
 def test_a_needle_that_does_not_move_fails_after_four_times_the_planned_periods(plan):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexneedle.types import Frame, Reading
+from flexneedle.types import Frame, SensorReading
 from insertions import PHANTOM, READING, RESTING, Stage, run
 
 UNNAMED = PHANTOM.with_values({"monitor.references": 0})
@@ -16,8 +16,8 @@ def framed(batch, indicator):
     """Readings with what the tracker told: the tip, and a reference with this indicator."""
 
     def frame(sample):
-        reference = Reading((0.0, 50.0, 0.0), indicator=indicator)
-        tip = Reading((sample.x, sample.y, 0.0))
+        reference = SensorReading((0.0, 50.0, 0.0), indicator=indicator)
+        tip = SensorReading((sample.x, sample.y, 0.0))
         return Frame(sample.time, round(sample.time / READING), {"tip": tip, "ref1": reference})
 
     return tuple(replace(sample, frame=frame(sample)) for sample in batch)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from flexneedle.rig.monitor import rules
 from flexneedle.rig.monitor.rules import OK
-from flexneedle.types import Frame, Reading, Sample
+from flexneedle.types import Frame, Measurement, SensorReading
 
 WAYS = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (0.6, 0.8)]
 
@@ -23,22 +23,24 @@ def test_the_first_bad_verdict_counts_and_no_rule_behind_it_is_asked():
     assert rules.first_bad([OK, OK]) == rules.first_bad([]) == OK == "ok"
 
 
-@pytest.mark.parametrize("sample", [Sample(1.0, None, 1.0), Sample(1.0, 30.0, None), Sample(1.0, None, None)])
+@pytest.mark.parametrize(
+    "sample", [Measurement(1.0, None, 1.0), Measurement(1.0, 30.0, None), Measurement(1.0, None, None)]
+)
 def test_a_tip_that_is_not_seen_is_missing(sample):
     assert rules.missing(sample) == "missing: tracker sees no tip"
-    assert rules.missing(Sample(1.0, 30.0, 1.0)) == OK
+    assert rules.missing(Measurement(1.0, 30.0, 1.0)) == OK
 
 
 def test_the_trackers_own_reason_is_told():
     place = (0.0, 0.0, 0.0)
     for told, why in (
-        (Reading(None, status="out of volume"), "out of volume"),
-        (Reading(place, status="out of volume"), "out of volume"),
-        (Reading(None), "no place"),
-        (Reading(place), "no orientation"),
+        (SensorReading(None, status="out of volume"), "out of volume"),
+        (SensorReading(place, status="out of volume"), "out of volume"),
+        (SensorReading(None), "no place"),
+        (SensorReading(place), "no orientation"),
     ):
-        frame = Frame(1.0, 7, {"tip": told, "ref1": Reading(place)})
-        found = rules.missing(Sample(1.0, None, None, frame=frame))
+        frame = Frame(1.0, 7, {"tip": told, "ref1": SensorReading(place)})
+        found = rules.missing(Measurement(1.0, None, None, frame=frame))
         assert found == f"missing: tracker sees no tip ({why})"
 
 
@@ -47,8 +49,12 @@ def test_the_trackers_own_reason_is_told():
 def test_what_is_not_finite_is_not_a_number(bad, which):
     values = [1.0, 30.0, 1.0, 0.0]
     values[which] = bad
-    assert rules.not_a_number(Sample(*values)) == "not a number"
-    assert rules.not_a_number(Sample(1.0, 30.0, 1.0)) == rules.not_a_number(Sample(1.0, None, None)) == OK
+    assert rules.not_a_number(Measurement(*values)) == "not a number"
+    assert (
+        rules.not_a_number(Measurement(1.0, 30.0, 1.0))
+        == rules.not_a_number(Measurement(1.0, None, None))
+        == OK
+    )
 
 
 def test_age_at_the_limit_is_believed_and_beyond_it_not():
@@ -88,10 +94,12 @@ def test_a_tip_out_of_the_plane_on_either_side():
 @pytest.mark.parametrize("way", WAYS)
 def test_a_jump_is_faster_than_any_tip(way):
     """20 mm/s for 0.1 s, and 1 mm for noise: 3 mm."""
-    before = Sample(1.0, 30.0, 1.0)
+    before = Measurement(1.0, 30.0, 1.0)
 
     def after(distance):
-        return rules.jump(Sample(1.1, 30.0 + distance * way[0], 1.0 + distance * way[1]), before, 20.0, 1.0)
+        return rules.jump(
+            Measurement(1.1, 30.0 + distance * way[0], 1.0 + distance * way[1]), before, 20.0, 1.0
+        )
 
     assert after(2.99) == OK
     assert after(3.01) == "jump of 3.01 mm, limit 3.00 mm"
@@ -99,9 +107,9 @@ def test_a_jump_is_faster_than_any_tip(way):
 
 
 def test_a_jump_out_of_the_plane_counts_where_both_readings_know_it():
-    before = Sample(1.0, 30.0, 1.0, 0.0)
-    assert rules.jump(Sample(1.1, 30.0, 1.0, 4.0), before, 20.0, 1.0).startswith("jump of 4.00 mm")
-    assert rules.jump(Sample(1.1, 30.0, 1.0), before, 20.0, 1.0) == OK
+    before = Measurement(1.0, 30.0, 1.0, 0.0)
+    assert rules.jump(Measurement(1.1, 30.0, 1.0, 4.0), before, 20.0, 1.0).startswith("jump of 4.00 mm")
+    assert rules.jump(Measurement(1.1, 30.0, 1.0), before, 20.0, 1.0) == OK
 
 
 def test_a_reading_that_stays_while_the_needle_moves_is_frozen():
@@ -113,11 +121,11 @@ def test_a_reading_that_stays_while_the_needle_moves_is_frozen():
 
 def test_an_indicator_is_one_of_a_sensor_that_is_seen_and_a_number_that_one_can_be():
     place = (0.0, 0.0, 0.0)
-    assert [rules.tells_indicator(Reading(place, indicator=i)) for i in (0.0, 0.02, 9.9)] == [True] * 3
+    assert [rules.tells_indicator(SensorReading(place, indicator=i)) for i in (0.0, 0.02, 9.9)] == [True] * 3
     for indicator in (None, math.nan, math.inf, -1.0):
-        assert not rules.tells_indicator(Reading(place, indicator=indicator))
-    assert not rules.tells_indicator(Reading(None, indicator=0.02))
-    assert not rules.tells_indicator(Reading(place, indicator=0.02, status="out of volume"))
+        assert not rules.tells_indicator(SensorReading(place, indicator=indicator))
+    assert not rules.tells_indicator(SensorReading(None, indicator=0.02))
+    assert not rules.tells_indicator(SensorReading(place, indicator=0.02, status="out of volume"))
 
 
 def test_a_field_that_was_looked_at_for_too_short_is_not_known():
@@ -148,7 +156,7 @@ def test_reference_sensors_that_tell_nothing_leave_the_field_unknown():
     assert rules.unseen_references(told, 1, 1.0, {}) == OK
     unknown = "field not known: 1 of 2 reference sensors seen within 1 s"
     assert rules.unseen_references(told, 2, 1.0, {}) == unknown
-    lost = Reading(None, status="out of volume")
-    newest = {"tip": lost, "ref1": Reading((0.0, 0.0, 0.0)), "ref2": lost}
+    lost = SensorReading(None, status="out of volume")
+    newest = {"tip": lost, "ref1": SensorReading((0.0, 0.0, 0.0)), "ref2": lost}
     assert rules.unseen_references(told, 2, 1.0, newest) == unknown + " (ref2: out of volume)"
     assert rules.unseen_references({}, 0, 1.0, {}) == OK

@@ -7,21 +7,21 @@ import pytest
 
 from flexneedle.rig.monitor.rules import OK
 from flexneedle.rig.monitor.watch import Watch
-from flexneedle.scenario.sections.monitor import Monitor
-from flexneedle.types import Frame, Reading, Sample
+from flexneedle.scenario.sections.monitor import MonitorSettings
+from flexneedle.types import Frame, Measurement, SensorReading
 
 RATE = 40.0
-SETTINGS = Monitor()
+SETTINGS = MonitorSettings()
 MISSED = "missing: tracker sees no tip (out of volume)"
 
 
 def frame(time, indicators=(0.02, 0.02, 0.02), tip=(1.0, 2.0, 3.0)):
     """A frame with one reference sensor for each indicator; None is one that the tracker does not see."""
-    readings = {"tip": Reading(tip, status=OK if tip else "out of volume")}
+    readings = {"tip": SensorReading(tip, status=OK if tip else "out of volume")}
     for k, indicator in enumerate(indicators, 1):
         seen = indicator is not None
         place, status = ((0.0, 0.0, 0.0), OK) if seen else (None, "out of volume")
-        readings[f"ref{k}"] = Reading(place, indicator=indicator, status=status)
+        readings[f"ref{k}"] = SensorReading(place, indicator=indicator, status=status)
     return Frame(time, round(time * RATE), readings)
 
 
@@ -30,7 +30,7 @@ def told(watch, indicators, begin, count):
     verdicts = []
     for k in range(count):
         time = begin + k / RATE
-        sample = Sample(time, 30.0 + 1e-6 * k, 1.0, 0.0, frame(time, indicators))
+        sample = Measurement(time, 30.0 + 1e-6 * k, 1.0, 0.0, frame(time, indicators))
         watch, verdict = watch.take(sample, (30.0, 1.0), time, 0.3, 2.0)
         assert verdict == OK
         watch, field = watch.look()
@@ -88,11 +88,13 @@ def test_an_indicator_that_is_none_hides_no_distortion(code):
 
 
 def test_references_out_of_volume_are_not_seen_whatever_they_tell():
-    ill = Reading((0.0, 0.0, 0.0), indicator=0.01, status="out of volume")
+    ill = SensorReading((0.0, 0.0, 0.0), indicator=0.01, status="out of volume")
     watch = Watch(SETTINGS)
     for k in range(40):
-        told_by = Frame(k / RATE, k, {"tip": Reading((1.0, 2.0, 3.0)), "ref1": ill, "ref2": ill, "ref3": ill})
-        watch, _ = watch.take(Sample(k / RATE, 30.0, 1.0, 0.0, told_by), (30.0, 1.0), k / RATE, 0.3, 2.0)
+        told_by = Frame(
+            k / RATE, k, {"tip": SensorReading((1.0, 2.0, 3.0)), "ref1": ill, "ref2": ill, "ref3": ill}
+        )
+        watch, _ = watch.take(Measurement(k / RATE, 30.0, 1.0, 0.0, told_by), (30.0, 1.0), k / RATE, 0.3, 2.0)
     assert watch.look()[1] == (
         "field not known: 0 of 3 reference sensors seen within 1 s "
         "(ref1: out of volume, ref2: out of volume, ref3: out of volume)"
@@ -104,18 +106,20 @@ def test_no_other_sensor_stands_in_for_a_reference_but_each_may_tell_of_distorti
         """Of a second of frames in which ref3 is seen or not, and a second coil in the needle tells an indicator."""
         watch = Watch(SETTINGS)
         for k in range(40):
-            place = Reading((0.0, 0.0, 0.0), indicator=0.01)
+            place = SensorReading((0.0, 0.0, 0.0), indicator=0.01)
             readings = {
-                "tip": Reading((1.0 + 1e-6 * k, 2.0, 3.0)),
+                "tip": SensorReading((1.0 + 1e-6 * k, 2.0, 3.0)),
                 "ref1": place,
                 "ref2": place,
                 "ref3": ref3,
             }
             told_by = Frame(k / RATE, k, readings | {"tip.2": replace(place, indicator=other)})
-            watch, _ = watch.take(Sample(k / RATE, 30.0, 1.0, 0.0, told_by), (30.0, 1.0), k / RATE, 0.3, 2.0)
+            watch, _ = watch.take(
+                Measurement(k / RATE, 30.0, 1.0, 0.0, told_by), (30.0, 1.0), k / RATE, 0.3, 2.0
+            )
         return watch.look()[1]
 
-    seen, lost = Reading((0.0, 0.0, 0.0), indicator=0.01), Reading(None, status="out of volume")
+    seen, lost = SensorReading((0.0, 0.0, 0.0), indicator=0.01), SensorReading(None, status="out of volume")
     assert verdict(0.01, seen) == OK
     assert verdict(0.01, lost) == (
         "field not known: 2 of 3 reference sensors seen within 1 s "
@@ -137,7 +141,7 @@ def still(places, step, settings=SETTINGS):
     in each."""
     watch = Watch(settings)
     for k, x in enumerate(places):
-        sample = Sample(k / RATE, x, None if x is None else 1.0)
+        sample = Measurement(k / RATE, x, None if x is None else 1.0)
         watch, verdict = watch.take(sample, (30.0 + step * k, 1.0), k / RATE, 0.3, 1e9)
     return verdict
 
@@ -208,7 +212,7 @@ def test_as_many_references_are_needed_as_the_scenario_says():
 
 
 def test_a_tracker_that_tells_only_the_tip_is_not_held_against():
-    watch, verdict = Watch(SETTINGS).take(Sample(0.0, 30.0, 1.0), (30.0, 1.0), 0.0, 0.3, 2.0)
+    watch, verdict = Watch(SETTINGS).take(Measurement(0.0, 30.0, 1.0), (30.0, 1.0), 0.0, 0.3, 2.0)
     assert verdict == OK
     assert watch.look()[1] == OK
 
@@ -216,11 +220,14 @@ def test_a_tracker_that_tells_only_the_tip_is_not_held_against():
 @pytest.mark.parametrize(
     ("sample", "verdict"),
     [
-        (Sample(1.0, float("nan"), 1.0), "not a number"),
-        (Sample(1.0, None, None), "missing: tracker sees no tip"),
-        (Sample(1.0, None, None, frame=frame(1.0, tip=None)), "missing: tracker sees no tip (out of volume)"),
-        (Sample(1.0, 30.0, 1.0, 6.0), "out of plane: 6.00 mm, limit 5 mm"),
-        (Sample(1.0, 33.0, 1.0), "innovation 3.00 mm, limit 2 mm"),
+        (Measurement(1.0, float("nan"), 1.0), "not a number"),
+        (Measurement(1.0, None, None), "missing: tracker sees no tip"),
+        (
+            Measurement(1.0, None, None, frame=frame(1.0, tip=None)),
+            "missing: tracker sees no tip (out of volume)",
+        ),
+        (Measurement(1.0, 30.0, 1.0, 6.0), "out of plane: 6.00 mm, limit 5 mm"),
+        (Measurement(1.0, 33.0, 1.0), "innovation 3.00 mm, limit 2 mm"),
     ],
 )
 def test_each_fault_of_a_reading_is_named(sample, verdict):
@@ -229,31 +236,31 @@ def test_each_fault_of_a_reading_is_named(sample, verdict):
 
 def test_a_frame_told_again_is_not_believed_and_not_remembered():
     watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
-    again = Sample(0.075, 30.0, 1.0, 0.0, frame(2 / RATE))
+    again = Measurement(0.075, 30.0, 1.0, 0.0, frame(2 / RATE))
     after, verdict = watch.take(again, (30.0, 1.0), 0.075, 0.3, 2.0)
     assert verdict == "stale: frame 2 after frame 2"
     assert after is watch
 
 
 def test_an_old_reading_is_stale():
-    assert one(Sample(1.0, 30.0, 1.0), now=1.5) == "stale: 0.500 s old, limit 0.3 s"
+    assert one(Measurement(1.0, 30.0, 1.0), now=1.5) == "stale: 0.500 s old, limit 0.3 s"
 
 
 def test_a_jump_counts_from_the_last_good_reading():
-    watch, _ = Watch(SETTINGS).take(Sample(1.0, 30.0, 1.0), (30.0, 1.0), 1.0, 0.3, 2.0)
-    far = Sample(1.025, 31.9, 1.0)
+    watch, _ = Watch(SETTINGS).take(Measurement(1.0, 30.0, 1.0), (30.0, 1.0), 1.0, 0.3, 2.0)
+    far = Measurement(1.025, 31.9, 1.0)
     watch, verdict = watch.take(far, (30.0, 1.0), 1.025, 0.3, 2.0)
     assert verdict == "jump of 1.90 mm, limit 1.50 mm"
-    assert watch.good == Sample(1.0, 30.0, 1.0)
-    assert one(Sample(1.05, 31.9, 1.0), watch) == OK  # so far it may have come by now
+    assert watch.good == Measurement(1.0, 30.0, 1.0)
+    assert one(Measurement(1.05, 31.9, 1.0), watch) == OK  # so far it may have come by now
     # Near the jump, and still too far from where it was last well seen.
-    assert one(Sample(1.03, 31.8, 1.0), watch) == "jump of 1.80 mm, limit 1.60 mm"
+    assert one(Measurement(1.03, 31.8, 1.0), watch) == "jump of 1.80 mm, limit 1.60 mm"
 
 
 def test_a_frozen_sensor_is_seen_although_the_map_to_the_tip_changes():
     watch = Watch(SETTINGS)
     for k in range(4):
-        sample = Sample(k / RATE, 30.0 + 0.01 * k, 1.0, 0.0, frame(k / RATE))
+        sample = Measurement(k / RATE, 30.0 + 0.01 * k, 1.0, 0.0, frame(k / RATE))
         watch, verdict = watch.take(sample, (30.0 + 0.125 * k, 1.0), sample.time, 0.3, 2.0)
     assert verdict == "frozen: the same in 4 readings while the tip should have moved 0.38 mm"
 
@@ -261,7 +268,7 @@ def test_a_frozen_sensor_is_seen_although_the_map_to_the_tip_changes():
 @pytest.mark.parametrize("time", [1e6, -50.0, float("nan")])
 def test_a_reading_of_another_time_changes_no_judgement_of_the_field(time):
     watch, _ = told(Watch(SETTINGS), (0.2, 0.02, 0.02), 0.0, 40)
-    sample = Sample(time, 30.0, 1.0, 0.0, replace(frame(1.0, (0.01, 0.01, 0.01)), number=1000))
+    sample = Measurement(time, 30.0, 1.0, 0.0, replace(frame(1.0, (0.01, 0.01, 0.01)), number=1000))
     after, verdict = watch.take(sample, (30.0, 1.0), 1.0, 0.3, 2.0)
     assert verdict.startswith(("stale", "not a number"))
     assert after is watch
@@ -272,7 +279,7 @@ def test_the_last_good_reading_counts_until_it_is_old_and_only_of_frames():
     watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
     assert watch.last_good(0.35, 0.3) == watch.good
     assert watch.last_good(0.36, 0.3) is None
-    bare, _ = Watch(SETTINGS).take(Sample(0.0, 30.0, 1.0), (30.0, 1.0), 0.0, 0.3, 2.0)
+    bare, _ = Watch(SETTINGS).take(Measurement(0.0, 30.0, 1.0), (30.0, 1.0), 0.0, 0.3, 2.0)
     assert bare.last_good(0.0, 0.3) is None
 
 
@@ -281,14 +288,14 @@ def test_a_tip_lost_in_a_few_frames_is_not_held_against_the_tracker():
     last = watch.good
 
     def lost(time, seen_by=watch):
-        return seen_by.only_missed(Sample(time, None, None, None, frame(time, tip=None)), MISSED)
+        return seen_by.only_missed(Measurement(time, None, None, None, frame(time, tip=None)), MISSED)
 
     assert lost(last.time + 0.1) == last
     assert lost(last.time + 0.125) is None
     assert lost(last.time + 0.1, Watch(SETTINGS)) is None  # never seen
-    assert watch.only_missed(Sample(last.time + 0.025, None, None), MISSED) is None  # no frame
+    assert watch.only_missed(Measurement(last.time + 0.025, None, None), MISSED) is None  # no frame
     assert watch.only_missed(last, OK) is None  # not lost
-    again = Sample(last.time, None, None, None, frame(last.time, tip=None))
+    again = Measurement(last.time, None, None, None, frame(last.time, tip=None))
     for verdict in ("stale: frame 2 after frame 2", "stale: 0.450 s old, limit 0.3 s", "not a number"):
         assert watch.only_missed(again, verdict) is None  # it tells nothing of the tip
     off = replace(watch, settings=SETTINGS.model_copy(update={"enabled": False}))
@@ -297,9 +304,9 @@ def test_a_tip_lost_in_a_few_frames_is_not_held_against_the_tracker():
 
 def test_switched_off_it_still_refuses_what_no_loop_can_use():
     off = Watch(SETTINGS.model_copy(update={"enabled": False}))
-    assert one(Sample(1.0, 30.0, 1.0, 60.0), off) == OK
-    assert one(Sample(1.0, None, None), off).startswith("missing")
-    assert one(Sample(1.0, 33.0, 1.0), off).startswith("innovation")
+    assert one(Measurement(1.0, 30.0, 1.0, 60.0), off) == OK
+    assert one(Measurement(1.0, None, None), off).startswith("missing")
+    assert one(Measurement(1.0, 33.0, 1.0), off).startswith("innovation")
     assert told(off, (5.0, 5.0, 5.0), 0.0, 80)[1][-1] == OK
 
 

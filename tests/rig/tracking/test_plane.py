@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
-from rooms import Watch, environment
 from scipy.spatial.transform import Rotation
 
 from flexneedle.rig.tracking.field.poses import tip_sensor_pose
@@ -13,7 +12,8 @@ from flexneedle.rig.tracking.field.room import Room
 from flexneedle.rig.tracking.field.tracker import FieldTracker
 from flexneedle.rig.tracking.plane import InPlane, tip_in_plane
 from flexneedle.rig.tracking.registration import Rigid, identity
-from flexneedle.types import Frame, Reading
+from flexneedle.types import Frame, SensorReading
+from rooms import Watch, environment
 
 ANGLES = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3)
 PLACES = st.lists(st.floats(-300.0, 300.0), min_size=3, max_size=3)
@@ -48,7 +48,7 @@ def test_to_the_tracker_and_back_is_where_the_tip_is(angles, shift, tip, turn, o
 def test_the_tip_lies_ahead_of_its_sensor():
     """A needle along y: half a turn of a quarter about −x takes z there."""
     half = np.sqrt(0.5)
-    reading = Reading((1.0, 2.0, 3.0), (half, -half, 0.0, 0.0))
+    reading = SensorReading((1.0, 2.0, 3.0), (half, -half, 0.0, 0.0))
     sample = tip_in_plane(frame(tip=reading), identity(), 5.0)
     assert (sample.x, sample.y, sample.z) == pytest.approx((1.0, 7.0, 3.0))
 
@@ -57,10 +57,10 @@ def test_the_tip_lies_ahead_of_its_sensor():
     "readings",
     [
         {},
-        {"ref1": Reading((0.0, 0.0, 0.0))},
-        {"tip": Reading(None, status="missing")},
-        {"tip": Reading(None)},
-        {"tip": Reading((1.0, 2.0, 3.0), status="out of volume")},
+        {"ref1": SensorReading((0.0, 0.0, 0.0))},
+        {"tip": SensorReading(None, status="missing")},
+        {"tip": SensorReading(None)},
+        {"tip": SensorReading((1.0, 2.0, 3.0), status="out of volume")},
     ],
 )
 def test_a_tip_that_is_not_seen_has_no_coordinates_but_its_frame(readings):
@@ -70,6 +70,6 @@ def test_a_tip_that_is_not_seen_has_no_coordinates_but_its_frame(readings):
 
 
 def test_without_an_orientation_only_a_sensor_at_the_very_tip_tells_where_it_is():
-    reading = frame(tip=Reading((1.0, 2.0, 3.0)))
+    reading = frame(tip=SensorReading((1.0, 2.0, 3.0)))
     assert tip_in_plane(reading, identity(), 5.0).x is None
     assert tip_in_plane(reading, identity()).x == pytest.approx(1.0)

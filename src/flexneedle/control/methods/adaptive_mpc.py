@@ -21,7 +21,7 @@ from flexneedle.control.forecast import probability_beyond
 from flexneedle.control.guide import guide_may_move
 from flexneedle.control.interface import Decision, Method
 from flexneedle.control.outlook import UNCORRECTED, Outlook
-from flexneedle.control.path import Ahead, Path, of_plan, proposals
+from flexneedle.control.path import Ahead, GuidePath, of_plan, proposals
 from flexneedle.estimation.estimate import Estimate, Floats
 from flexneedle.estimation.identification import Identification, Identified
 from flexneedle.estimation.prior import Priors
@@ -85,8 +85,8 @@ class Memory:
     blur: standard deviation of the predicted miss (mm), had none been predicted.
     """
 
-    path: Path
-    rolled: Path
+    path: GuidePath
+    rolled: GuidePath
     bevel: int
     scale: float
     outlook: Outlook | None = None

@@ -5,7 +5,7 @@ import numpy as np
 from flexneedle.control import bang_bang
 from flexneedle.control.interface import Decision, Method, travel_left
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
 
 
@@ -24,7 +24,7 @@ def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generat
 METHOD = Method(
     "bevel-only",
     "bang-bang steering by the bevel, without guide motion",
-    Beliefs(),
+    StateCorrection(),
     begin=lambda _task: None,
     decide=decide,
     settings=BevelOnly,

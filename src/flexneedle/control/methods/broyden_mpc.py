@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from flexneedle.control.interface import Decision, Method, travel_left
 from flexneedle.control.mpc import planned_base
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive, Section, count
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 Floats = NDArray[np.float64]
 _LEAST_INSERTION_MM = (
@@ -47,7 +47,7 @@ class BroydenMpc(Section):
 
 
 @dataclass(frozen=True, eq=False)
-class Learnt:
+class JacobianEstimate:
     """Jacobian (2, 2) from (insertion, guide) to the tip (x, y); the last (tip x, insertion, guide) as commanded.
 
     seen: tip (x, y) and inputs (insertion, guide), each (2,), of the newest update; None before a reading.
@@ -58,14 +58,14 @@ class Learnt:
     seen: tuple[Floats, Floats] | None = None
 
 
-def begin(task: Task) -> Learnt:
+def begin(task: Task) -> JacobianEstimate:
     """Start with a tip that continues straight, and follows the guide laterally."""
-    return Learnt(np.diag([1.0, task.settings.guide_effect]))
+    return JacobianEstimate(np.diag([1.0, task.settings.guide_effect]))
 
 
 def decide(
-    task: Task, estimated: Learnt, estimate: Estimate, _rng: np.random.Generator
-) -> tuple[Decision, Learnt]:
+    task: Task, estimated: JacobianEstimate, estimate: Estimate, _rng: np.random.Generator
+) -> tuple[Decision, JacobianEstimate]:
     """Learn from a new reading, predict the tip to now, and take the first of the best steps of the guide."""
     scenario, state = task.scenario, estimate.state
     settings, setup = task.settings, scenario.setup
@@ -87,28 +87,28 @@ def decide(
     return Decision((advance, db_y, db_theta, float(moves[0]), -1), why, cost), estimated
 
 
-def remember(estimated: Learnt, x: float, inputs: Floats) -> Learnt:
+def remember(estimated: JacobianEstimate, x: float, inputs: Floats) -> JacobianEstimate:
     """Note that the tip is at depth x (mm) with these inputs, by which later readings are placed."""
     insertion, guide = inputs.tolist()
     history = (*estimated.history, (x, insertion, guide))[-_KEPT:]
-    return Learnt(estimated.jacobian, history, estimated.seen)
+    return JacobianEstimate(estimated.jacobian, history, estimated.seen)
 
 
-def inputs_at(estimated: Learnt, x: float) -> Floats:
+def inputs_at(estimated: JacobianEstimate, x: float) -> Floats:
     """Inputs (2,) when the tip was at depth x (mm), within what is remembered."""
     depth, *inputs = np.array(estimated.history).T
     return np.array([np.interp(x, depth, values) for values in inputs])
 
 
-def learn(estimated: Learnt, tip: Floats, inputs: Floats, gain: float) -> Learnt:
+def learn(estimated: JacobianEstimate, tip: Floats, inputs: Floats, gain: float) -> JacobianEstimate:
     """Update by a reading of the tip, once the needle went far enough on since the last."""
     if estimated.seen is None:
-        return Learnt(estimated.jacobian, estimated.history, (tip, inputs))
+        return JacobianEstimate(estimated.jacobian, estimated.history, (tip, inputs))
     last_tip, last_inputs = estimated.seen
     if inputs[0] - last_inputs[0] < _LEAST_INSERTION_MM:
         return estimated
     jacobian = broyden(estimated.jacobian, inputs - last_inputs, tip - last_tip, gain)
-    return Learnt(jacobian, estimated.history, (tip, inputs))
+    return JacobianEstimate(jacobian, estimated.history, (tip, inputs))
 
 
 def broyden(jacobian: Floats, moved: Floats, seen: Floats, gain: float) -> Floats:
@@ -119,7 +119,7 @@ def broyden(jacobian: Floats, moved: Floats, seen: Floats, gain: float) -> Float
 def guide_moves(
     settings: BroydenMpc,
     setup: Setup,
-    plan: PlanRecord,
+    plan: Plan,
     jacobian: Floats,
     tip: Floats,
     ahead: Floats,
@@ -141,7 +141,7 @@ def guide_moves(
     return moves, float(np.sum((matrix @ moves - right) ** 2))
 
 
-def _path(plan: PlanRecord) -> tuple[Floats, Floats]:
+def _path(plan: Plan) -> tuple[Floats, Floats]:
     """Depth and lateral place of the planned path, led to the target at its end."""
     x, y = (np.append(plan.tips[:-1, k], plan.target[k]) for k in (0, 1))
     return x, y
@@ -178,7 +178,7 @@ def bounded_least_squares(matrix: Floats, right: Floats, lower: Floats, upper: F
 METHOD = Method(
     "broyden-mpc",
     "guide by linear MPC with a Jacobian estimated from readings (Broyden), no model",
-    Beliefs(),
+    StateCorrection(),
     begin=begin,
     decide=decide,
     settings=BroydenMpc,

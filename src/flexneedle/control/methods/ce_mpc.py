@@ -10,7 +10,7 @@ import numpy as np
 from flexneedle.control import bang_bang, mpc
 from flexneedle.control.interface import Decision, Method
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
 
 
@@ -24,7 +24,7 @@ def decide(task: Task, memory: None, estimate: Estimate, rng: np.random.Generato
 METHOD = Method(
     "ce-mpc",
     "the paper's: the measured tip is released in the prediction",
-    Beliefs(fits_start=False, learns_load=False),
+    StateCorrection(fits_start=False, learns_load=False),
     begin=lambda _task: None,
     decide=decide,
     settings=mpc.CeMpc,

@@ -4,7 +4,7 @@ import numpy as np
 
 from flexneedle.control.interface import Decision, Method
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.control import Limits
 
@@ -29,7 +29,7 @@ def arrived(task: Task, done: int, _estimate: Estimate) -> bool:
 METHOD = Method(
     "open-loop",
     "the plan replayed, without feedback",
-    Beliefs(),
+    StateCorrection(),
     begin=lambda _task: 0,
     decide=decide,
     arrived=arrived,

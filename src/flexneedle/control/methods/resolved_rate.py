@@ -18,13 +18,13 @@ from flexneedle.control import bang_bang
 from flexneedle.control.interface import Decision, Method, travel_left
 from flexneedle.control.mpc import planned_base
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.estimation.observer import Beliefs
+from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import PlanRecord
+from flexneedle.types import Plan
 
 Floats = NDArray[np.float64]
 _DISTURBANCE_MM = 0.05  # of the guide: above rounding, small against the 10 mm in which the tissue stiffens
@@ -67,7 +67,7 @@ def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generat
     return Decision(command, why), memory
 
 
-def nominal(setup: Setup, plan: PlanRecord, state: State, way: float, margin: float, *, flip: bool) -> Floats:
+def nominal(setup: Setup, plan: Plan, state: State, way: float, margin: float, *, flip: bool) -> Floats:
     """Controls (n, 5) that insert by `way` (mm) as planned, the guide `margin` (mm) inside its limits."""
     count = max(1, math.ceil(way / setup.max_advance_mm - 1e-9))
     ends = np.minimum(setup.max_advance_mm * np.arange(1, count + 1), way)
@@ -94,7 +94,7 @@ def sensitivity(
     return end, float(more[1] - less[1]) / (2.0 * disturbance)
 
 
-def planned_y(plan: PlanRecord, x: float) -> float:
+def planned_y(plan: Plan, x: float) -> float:
     """Lateral place (mm) of the planned path at depth x, led to the target at its end."""
     depth, lateral = plan.tips[:-1, 0], plan.tips[:-1, 1]
     return float(np.interp(x, np.append(depth, plan.target[0]), np.append(lateral, plan.target[1])))
@@ -108,7 +108,7 @@ def damped_inverse(jacobian: float, damping: float) -> float:
 METHOD = Method(
     "resolved-rate",
     "guide by the damped inverse of the model's Jacobian, bevel by the rule",
-    Beliefs(),
+    StateCorrection(),
     begin=lambda _task: None,
     decide=decide,
     settings=ResolvedRate,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from flexneedle.em.recording.watch import View
-    from flexneedle.types import Frame, Reading
+    from flexneedle.types import Frame, SensorReading
 
 
 _LINE_EVERY_S = 1.0
@@ -83,7 +83,7 @@ def _print_json(view: View) -> None:
     print(json.dumps(told, allow_nan=False), flush=True)
 
 
-def _values(reading: Reading) -> dict[str, Any]:
+def _values(reading: SensorReading) -> dict[str, Any]:
     return {
         "position_mm": reading.position,
         "quaternion": reading.orientation,

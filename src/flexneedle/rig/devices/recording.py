@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
-from flexneedle.types import VISIBLE, Frame, Reading
+from flexneedle.types import VISIBLE, Frame, SensorReading
 
 COLUMNS = (
     *("time_s", "frame_number", "sensor", "status", "x_mm", "y_mm", "z_mm"),
@@ -82,7 +82,7 @@ def _check_columns(path: Path, columns: Iterable[str]) -> None:
 
 
 def _frame(path: Path, rows: list[tuple[int, Mapping[str, Any]]]) -> Frame:
-    readings: dict[str, Reading] = {}
+    readings: dict[str, SensorReading] = {}
     stamps = []
     for line, row in rows:
         try:
@@ -111,7 +111,7 @@ def _known(row: Mapping[str, Any], column: str) -> float:
     return number
 
 
-def _reading(row: Mapping[str, Any]) -> Reading:
+def _reading(row: Mapping[str, Any]) -> SensorReading:
     place = [_number(row, name) for name in _PLACE]
     turn = [_number(row, name) for name in _TURN]
     indicator = _number(row, "indicator")
@@ -124,8 +124,8 @@ def _reading(row: Mapping[str, Any]) -> Reading:
             status, position = (told if told and told != VISIBLE else "missing"), None
     match turn:
         case [float(w), float(i), float(j), float(k)]:
-            return Reading(position, (w, i, j, k), indicator, status)
-    return Reading(position, None, indicator, status)
+            return SensorReading(position, (w, i, j, k), indicator, status)
+    return SensorReading(position, None, indicator, status)
 
 
 def _number(row: Mapping[str, Any], column: str) -> float | None:

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from flexneedle.rig.emulator import codec
-from flexneedle.rig.emulator.codec import Command
-from flexneedle.rig.emulator.motion import SENSORS, Pose
+from flexneedle.rig.emulator.codec import Request
+from flexneedle.rig.emulator.motion import SENSORS, EmulatedPose
 
 FIRMWARE = "AURORA Rev 008"
 """Freeze tag of the firmware. Clients choose between BX and TX by it."""
@@ -43,7 +43,7 @@ class Port:
 
 
 @dataclass(frozen=True)
-class Aurora:
+class AuroraState:
     """State of the device: mode, port handles, firmware, and whether it knows BX (old firmware does not)."""
 
     ports: Mapping[int, Port]
@@ -58,7 +58,7 @@ class Seen:
     of what ails the whole system."""
 
     number: int
-    poses: Mapping[str, Pose]
+    poses: Mapping[str, EmulatedPose]
     ailments: Mapping[str, str] = field(default_factory=dict)
     system: int = 0
 
@@ -67,13 +67,13 @@ class _Refusal(Exception):
     """A reply ERROR with a code."""
 
 
-def fresh(sensors: int = len(SENSORS), firmware: str = FIRMWARE, *, knows_bx: bool = True) -> Aurora:
+def fresh(sensors: int = len(SENSORS), firmware: str = FIRMWARE, *, knows_bx: bool = True) -> AuroraState:
     """Return the device as it is after power-on with so many sensors plugged in."""
     ports = {_FIRST_HANDLE + n: Port(n + 1, name) for n, name in enumerate(SENSORS[:sensors])}
-    return Aurora(ports, firmware=firmware, knows_bx=knows_bx)
+    return AuroraState(ports, firmware=firmware, knows_bx=knows_bx)
 
 
-def answer(aurora: Aurora, line: bytes, seen: Seen) -> tuple[Aurora, bytes]:
+def answer(aurora: AuroraState, line: bytes, seen: Seen) -> tuple[AuroraState, bytes]:
     """Return the state after a command (a line without its end) and the whole reply."""
     command = codec.parse(line)
     try:
@@ -84,7 +84,7 @@ def answer(aurora: Aurora, line: bytes, seen: Seen) -> tuple[Aurora, bytes]:
         return aurora, codec.text(f"ERROR{refusal}")
 
 
-def _obey(aurora: Aurora, command: Command, seen: Seen) -> tuple[Aurora, bytes]:
+def _obey(aurora: AuroraState, command: Request, seen: Seen) -> tuple[AuroraState, bytes]:
     if command.name in _ANYWHERE:
         return _ANYWHERE[command.name](aurora, command.arguments)
     known = command.name in _SET_UP or command.name in ("TX", "TSTOP") or _is_bx(aurora, command.name)
@@ -101,7 +101,7 @@ def _obey(aurora: Aurora, command: Command, seen: Seen) -> tuple[Aurora, bytes]:
     return aurora, (_tx if command.name == "TX" else _bx)(aurora, _options(command.arguments), seen)
 
 
-def _is_bx(aurora: Aurora, name: str) -> bool:
+def _is_bx(aurora: AuroraState, name: str) -> bool:
     return name == "BX" and aurora.knows_bx
 
 
@@ -126,29 +126,29 @@ def _hexadecimal(digits: str, length: int) -> int:
 # Commands in any mode
 
 
-def _init(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+def _init(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     """Enter set-up with all sensors to be initialised again."""
     ports = {handle: Port(port.number, port.sensor) for handle, port in aurora.ports.items()}
     return replace(aurora, mode=_SETUP, ports=ports), codec.text("OKAY")
 
 
-def _reset(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+def _reset(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     """A pseudo-terminal carries no serial break, so the command alone resets."""
     ports = {handle: Port(port.number, port.sensor) for handle, port in aurora.ports.items()}
     return replace(aurora, mode=_OFF, ports=ports), codec.text("RESET")
 
 
-def _okay(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+def _okay(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     return aurora, codec.text("OKAY")
 
 
-def _beep(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+def _beep(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     if arguments not in list("123456789"):
         raise _Refusal("23")
     return aurora, codec.text("1")
 
 
-def _comm(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+def _comm(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     """A pseudo-terminal has no speed: what is asked for is checked and granted."""
     if len(arguments) < 5:
         raise _Refusal("03")
@@ -158,23 +158,23 @@ def _comm(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
     return aurora, codec.text("OKAY")
 
 
-def _version(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+def _version(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     lines = ("AURORA Control Firmware", "NDI S/N: EMULATOR", f"Freeze Tag: {aurora.firmware}", "Emulated")
     return aurora, codec.text("\n".join(lines) + "\n")
 
 
-def _revision(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+def _revision(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     return aurora, codec.text("D.001.007")
 
 
-def _information(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+def _information(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     values = {"Features.Firmware.Version": aurora.firmware, "Features.Hardware.Model": "Aurora emulator"}
     if arguments not in values:
         raise _Refusal("34")
     return aurora, codec.text(f"{arguments}={values[arguments]}")
 
 
-def _features(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+def _features(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     """Only the number of ports is told (option 02)."""
     if _hexadecimal(arguments, 2) != 0x02:
         raise _Refusal("23")
@@ -184,14 +184,14 @@ def _features(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
 # Commands in set-up
 
 
-def _port(aurora: Aurora, arguments: str) -> tuple[int, Port]:
+def _port(aurora: AuroraState, arguments: str) -> tuple[int, Port]:
     handle = _hexadecimal(arguments, 2)
     if handle not in aurora.ports:
         raise _Refusal("08")
     return handle, aurora.ports[handle]
 
 
-def _with(aurora: Aurora, handle: int, port: Port) -> tuple[Aurora, bytes]:
+def _with(aurora: AuroraState, handle: int, port: Port) -> tuple[AuroraState, bytes]:
     return replace(aurora, ports={**aurora.ports, handle: port}), codec.text("OKAY")
 
 
@@ -204,7 +204,7 @@ _LISTED: dict[int, Callable[[Port], bool]] = {
 }
 
 
-def _search(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+def _search(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     option = _hexadecimal(arguments, 2) if arguments else 0
     if option not in _LISTED:
         raise _Refusal("23")
@@ -213,32 +213,32 @@ def _search(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
     return aurora, codec.text(f"{len(found):02X}{listed}")
 
 
-def _request(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+def _request(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     handle = max(aurora.ports, default=_FIRST_HANDLE - 1) + 1
     port = Port(0, None)
     return replace(aurora, ports={**aurora.ports, handle: port}), codec.text(f"{handle:02X}")
 
 
-def _free(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+def _free(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     freed, _ = _port(aurora, arguments)
     ports = {handle: port for handle, port in aurora.ports.items() if handle != freed}
     return replace(aurora, ports=ports), codec.text("OKAY")
 
 
-def _write(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+def _write(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     """Take the description of a tool and forget it: the emulated ones have their own."""
     _port(aurora, arguments)
     return aurora, codec.text("OKAY")
 
 
-def _initialize(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+def _initialize(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     handle, port = _port(aurora, arguments)
     if port.sensor is None:
         raise _Refusal("0D")
     return _with(aurora, handle, replace(port, initialized=True))
 
 
-def _enable(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+def _enable(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     handle, port = _port(aurora, arguments)
     if not port.initialized:
         raise _Refusal("0E")
@@ -247,12 +247,12 @@ def _enable(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
     return _with(aurora, handle, replace(port, enabled=True))
 
 
-def _disable(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+def _disable(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     handle, port = _port(aurora, arguments)
     return _with(aurora, handle, replace(port, enabled=False))
 
 
-def _describe(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
+def _describe(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
     """PHINF: the parts that the options ask for, in the order of their bits."""
     _, port = _port(aurora, arguments)
     options = _hexadecimal(arguments[2:], 4) if len(arguments) > 2 else 0x0001
@@ -270,11 +270,11 @@ def _describe(aurora: Aurora, arguments: str) -> tuple[Aurora, bytes]:
     return aurora, codec.text("".join(part for bit, part in parts.items() if options & bit))
 
 
-def _start(aurora: Aurora, _arguments: str) -> tuple[Aurora, bytes]:
+def _start(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     return replace(aurora, mode=_TRACKING), codec.text("OKAY")
 
 
-_Handler = Callable[[Aurora, str], tuple[Aurora, bytes]]
+_Handler = Callable[[AuroraState, str], tuple[AuroraState, bytes]]
 _ANYWHERE: dict[str, _Handler] = {
     "INIT": _init,
     "RESET": _reset,
@@ -304,7 +304,7 @@ _SET_UP: dict[str, _Handler] = {
 # Readings
 
 
-def _tx(aurora: Aurora, options: int, seen: Seen) -> bytes:
+def _tx(aurora: AuroraState, options: int, seen: Seen) -> bytes:
     rows = [(handle, *_reading(port, options, seen)) for handle, port in _reported(aurora)]
     words = {_MISSING: "MISSING", _DISABLED: "DISABLED"}
     told = "".join(
@@ -314,7 +314,7 @@ def _tx(aurora: Aurora, options: int, seen: Seen) -> bytes:
     return codec.text(f"{len(rows):02X}{told}{seen.system:04X}")
 
 
-def _bx(aurora: Aurora, options: int, seen: Seen) -> bytes:
+def _bx(aurora: AuroraState, options: int, seen: Seen) -> bytes:
     body = bytearray([len(_reported(aurora))])
     for handle, port in _reported(aurora):
         kind, bits, pose = _reading(port, options, seen)
@@ -326,11 +326,11 @@ def _bx(aurora: Aurora, options: int, seen: Seen) -> bytes:
     return codec.binary(bytes(body) + seen.system.to_bytes(2, "little"))
 
 
-def _reported(aurora: Aurora) -> list[tuple[int, Port]]:
+def _reported(aurora: AuroraState) -> list[tuple[int, Port]]:
     return [(handle, port) for handle, port in aurora.ports.items() if port.initialized]
 
 
-def _reading(port: Port, options: int, seen: Seen) -> tuple[int, int, Pose | None]:
+def _reading(port: Port, options: int, seen: Seen) -> tuple[int, int, EmulatedPose | None]:
     """Return handle status, port status and pose, None where none is told."""
     ailment = seen.ailments.get(port.sensor or "")
     bits = port.status | _AILING_BITS.get(ailment or "", 0)

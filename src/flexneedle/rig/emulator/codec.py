@@ -7,7 +7,7 @@ A command is ASCII, `NAME:argumentsCRC\\r`, or `NAME arguments\\r` without a che
 import struct
 from dataclasses import dataclass
 
-from flexneedle.rig.emulator.motion import Pose
+from flexneedle.rig.emulator.motion import EmulatedPose
 
 _BINARY_START = 0xA5C4
 _POLYNOMIAL = 0xA001  # x^16 + x^15 + x^2 + 1, lowest bit first
@@ -24,7 +24,7 @@ _TABLE = tuple(map(_divided, range(256)))  # a byte at a time: a reply has some 
 
 
 @dataclass(frozen=True)
-class Command:
+class Request:
     """A command as it came in; intact is False where its checksum is wrong."""
 
     name: str
@@ -40,15 +40,15 @@ def crc16(data: bytes) -> int:
     return crc
 
 
-def parse(line: bytes) -> Command:
+def parse(line: bytes) -> Request:
     """Return the command in a line without its `\\r`; bytes that are no ASCII become characters of no command."""
     name = line[: _name_length(line)].decode("ascii", "replace")
     rest = line[len(name) :]
     if not rest.startswith(b":"):
-        return Command(name, rest[1:].decode("ascii", "replace"))
+        return Request(name, rest[1:].decode("ascii", "replace"))
     body, checksum = line[:-_CRC_DIGITS], line[-_CRC_DIGITS:]
     intact = len(rest) > _CRC_DIGITS and checksum.upper() == b"%04X" % crc16(body)
-    return Command(name, body[len(name) + 1 :].decode("ascii", "replace"), intact)
+    return Request(name, body[len(name) + 1 :].decode("ascii", "replace"), intact)
 
 
 def _name_length(line: bytes) -> int:
@@ -67,13 +67,13 @@ def binary(body: bytes) -> bytes:
     return header + struct.pack("<H", crc16(header)) + body + struct.pack("<H", crc16(body))
 
 
-def transform_text(pose: Pose) -> str:
+def transform_text(pose: EmulatedPose) -> str:
     """Return a pose as `TX` writes it: quaternion and indicator to 1e-4, position to 0.01 mm."""
     turns = "".join(f"{round(part * 10_000):+06d}" for part in pose.orientation)
     places = "".join(f"{round(part * 100):+07d}" for part in pose.position)
     return f"{turns}{places}{round(pose.indicator * 10_000):+06d}"
 
 
-def transform_binary(pose: Pose) -> bytes:
+def transform_binary(pose: EmulatedPose) -> bytes:
     """Return a pose as `BX` writes it: eight single-precision numbers."""
     return struct.pack("<8f", *pose.orientation, *pose.position, pose.indicator)

@@ -27,7 +27,7 @@ _INDICATOR, _INDICATOR_SPREAD = 0.024, 0.006
 
 
 @dataclass(frozen=True)
-class Pose:
+class EmulatedPose:
     """A sensor in one frame: position (mm) and unit quaternion in the tracker's frame, indicator."""
 
     position: Point
@@ -36,12 +36,12 @@ class Pose:
 
 
 @lru_cache(maxsize=64)  # a frame is asked for several times
-def pose(sensor: str, number: int, seed: int, rest: Point | None = None) -> Pose:
+def pose(sensor: str, number: int, seed: int, rest: Point | None = None) -> EmulatedPose:
     """Return a sensor's pose in a frame: the tip on its arc or at `rest` (mm), the others at rest, all with jitter."""
     noise = np.random.default_rng((seed, SENSORS.index(sensor), number)).standard_normal(4)
     place, turn = _at_rest(sensor, rest) or _on_the_arc(number)
     x, y, z = (float(c + n * _JITTER_MM / sqrt(3)) for c, n in zip(place, noise[:3], strict=True))
-    return Pose((x, y, z), turn, float(abs(_INDICATOR + _INDICATOR_SPREAD * noise[3])))
+    return EmulatedPose((x, y, z), turn, float(abs(_INDICATOR + _INDICATOR_SPREAD * noise[3])))
 
 
 def _at_rest(sensor: str, rest: Point | None) -> tuple[Point, Quaternion] | None:

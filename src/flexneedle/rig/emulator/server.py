@@ -16,7 +16,7 @@ import numpy as np
 
 from flexneedle.errors import InputError
 from flexneedle.rig.emulator import codec
-from flexneedle.rig.emulator.aurora import Aurora, Seen, answer
+from flexneedle.rig.emulator.aurora import AuroraState, Seen, answer
 from flexneedle.rig.emulator.faults import Fault, active
 from flexneedle.rig.emulator.motion import RATE_HZ, SENSORS, pose
 from flexneedle.rig.emulator.orders import Orders, parse_place
@@ -29,13 +29,13 @@ _LONGEST_LINE = 4096
 
 
 @dataclass
-class Session:
+class EmulatorSession:
     """The device and its faults over time. Times are seconds on the device's clock, first of all that of power-on.
 
     rest: where the tip rests (mm, the tracker's frame), None while it moves along its arc.
     """
 
-    device: Aurora
+    device: AuroraState
     faults: Sequence[Fault]
     seed: int
     power_on: float
@@ -166,7 +166,7 @@ def device_time(before: float, served: float, now: float) -> float:
     return max(now - _MOST_BEHIND_S, min(now, stepped))
 
 
-def serve(session: Session, serial: Serial, orders: Orders, say: Callable[[str], None]) -> NoReturn:
+def serve(session: EmulatorSession, serial: Serial, orders: Orders, say: Callable[[str], None]) -> NoReturn:
     """Answer until interrupted. say: told when the cable is pulled or plugged in, and where the tip rests now."""
     heard, due = b"", list[tuple[float, bytes]]()
     now = served = monotonic()
@@ -188,7 +188,7 @@ def serve(session: Session, serial: Serial, orders: Orders, say: Callable[[str],
             serial.write(due.pop(0)[1])
 
 
-def obey(session: Session, order: str) -> str:
+def obey(session: EmulatorSession, order: str) -> str:
     """Rest the tip where a line says; return where it is, or what is wrong with the line."""
     try:
         session.rest = parse_place(order)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 
 from flexneedle.rig.tracking.table import TIP
-from flexneedle.types import VISIBLE, Frame, Reading, Sample, is_reference
+from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading, is_reference
 
 Place = tuple[float, ...]
 
@@ -26,7 +26,7 @@ def first_bad(verdicts: Iterable[str]) -> str:
     return next((verdict for verdict in verdicts if verdict != OK), OK)
 
 
-def missing(sample: Sample) -> str:
+def missing(sample: Measurement) -> str:
     """A reading in which the tracker does not see the tip; says why if the tracker does."""
     if sample.x is not None and sample.y is not None:
         return OK
@@ -37,7 +37,7 @@ def missing(sample: Sample) -> str:
     return f"{MISSING}: tracker sees no tip ({why})"
 
 
-def not_a_number(sample: Sample) -> str:
+def not_a_number(sample: Measurement) -> str:
     """Time or place is not finite."""
     values = (sample.time, sample.x, sample.y, sample.z)
     return OK if all(math.isfinite(value) for value in values if value is not None) else "not a number"
@@ -70,7 +70,7 @@ def out_of_plane(z: float | None, limit: float) -> str:
     return OK if z is None or abs(z) <= limit else f"out of plane: {z:.2f} mm, limit {limit:g} mm"
 
 
-def jump(sample: Sample, before: Sample | None, speed: float, margin: float) -> str:
+def jump(sample: Measurement, before: Measurement | None, speed: float, margin: float) -> str:
     """A tip that moved faster than `speed` (mm/s) since the last good reading, with `margin` (mm) for noise."""
     if before is None:
         return OK
@@ -90,7 +90,7 @@ def frozen(count: int, first: tuple[float, float], now: tuple[float, float], tra
     return f"frozen: the same in {count} readings while the tip should have moved {travel:.2f} mm"
 
 
-def tells_indicator(reading: Reading) -> bool:
+def tells_indicator(reading: SensorReading) -> bool:
     """Whether a reference sensor is seen and its indicator a number that one can be; a code such as −1 is none."""
     indicator = reading.indicator
     seen = reading.status == VISIBLE and reading.position is not None
@@ -105,7 +105,7 @@ def too_short(span: float, least: float, needed: int) -> str:
 
 
 def unseen_references(
-    indicators: Mapping[str, Sequence[float]], needed: int, window: float, newest: Mapping[str, Reading]
+    indicators: Mapping[str, Sequence[float]], needed: int, window: float, newest: Mapping[str, SensorReading]
 ) -> str:
     """Fewer than `needed` reference sensors told an indicator within the window (s).
 
@@ -152,7 +152,7 @@ def _worst(indicators: Mapping[str, Sequence[float]]) -> tuple[str, float]:
     return max(medians.items(), key=lambda item: item[1], default=("", 0.0))
 
 
-def _shared(one: Sample, other: Sample) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _shared(one: Measurement, other: Measurement) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Places of two readings in the coordinates that both know."""
     pairs = ((one.x, other.x), (one.y, other.y), (one.z, other.z))
     known = [(a, b) for a, b in pairs if a is not None and b is not None]

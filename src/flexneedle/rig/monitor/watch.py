@@ -8,11 +8,11 @@ from statistics import median
 from flexneedle.rig.monitor import rules
 from flexneedle.rig.monitor.rules import OK
 from flexneedle.rig.tracking.table import TIP
-from flexneedle.scenario.sections.monitor import Monitor
-from flexneedle.types import Frame, Sample
+from flexneedle.scenario.sections.monitor import MonitorSettings
+from flexneedle.types import Frame, Measurement
 
 
-def field_verdict(frames: Sequence[Frame], settings: Monitor, distorted: bool = False) -> str:
+def field_verdict(frames: Sequence[Frame], settings: MonitorSettings, distorted: bool = False) -> str:
     """Judge the field by the sensors of frames, oldest first: by all but the tip, and enough of them references.
 
     The frames of the last window count, and a sensor that told an indicator in half of them: a median over a few
@@ -59,7 +59,7 @@ def _indicators(frames: Sequence[Frame]) -> dict[str, list[float]]:
 
 @dataclass(frozen=True)
 class _Seen:
-    sample: Sample
+    sample: Measurement
     predicted: tuple[float, float]
 
 
@@ -72,15 +72,15 @@ class Watch:
     known good.
     """
 
-    settings: Monitor
+    settings: MonitorSettings
     recent: tuple[_Seen, ...] = ()
     still: tuple[_Seen, int] | None = None
-    good: Sample | None = None
+    good: Measurement | None = None
     field: str = OK
     distorted: bool = False
 
     def take(
-        self, sample: Sample, predicted: tuple[float, float], now: float, oldest: float, furthest: float
+        self, sample: Measurement, predicted: tuple[float, float], now: float, oldest: float, furthest: float
     ) -> "tuple[Watch, str]":
         """Take in a reading; return what is wrong with it, or OK. One of another time is not remembered.
 
@@ -108,14 +108,14 @@ class Watch:
         """Whether the tracker told anything, good or not, that is not older than `oldest` (s)."""
         return bool(self.recent) and now - self.recent[-1].sample.time <= oldest + 1e-9
 
-    def last_good(self, now: float, oldest: float) -> Sample | None:
+    def last_good(self, now: float, oldest: float) -> Measurement | None:
         """Return the last good reading, if it is not older than `oldest` (s) and of a tracker that tells frames."""
         good = self.good
         if not self.settings.enabled or good is None or good.frame is None or now - good.time > oldest + 1e-9:
             return None
         return good
 
-    def only_missed(self, newest: Sample, verdict: str) -> Sample | None:
+    def only_missed(self, newest: Measurement, verdict: str) -> Measurement | None:
         """Return the last good reading if the tip was lost in the newest frame, but not for long; None otherwise.
 
         verdict: on that frame; one that is stale itself, or dated nowhere, tells nothing of the tip. Only of a tracker
@@ -150,7 +150,7 @@ class Watch:
     def _frames(self) -> list[Frame]:
         return [seen.sample.frame for seen in self.recent if seen.sample.frame is not None]
 
-    def _faults(self, sample: Sample, predicted: tuple[float, float], furthest: float) -> Iterator[str]:
+    def _faults(self, sample: Measurement, predicted: tuple[float, float], furthest: float) -> Iterator[str]:
         settings = self.settings
         yield rules.missing(sample)
         if sample.x is not None and sample.y is not None:
@@ -170,7 +170,7 @@ class Watch:
         first, count = self.still
         return (first, count + 1) if self._place(first.sample) == place else (newest, 1)
 
-    def _place(self, sample: Sample) -> rules.Place | None:
+    def _place(self, sample: Measurement) -> rules.Place | None:
         """What the tracker itself said of the tip: a map to the stage or an offset makes no frozen sensor move."""
         told = None if sample.frame is None else sample.frame.readings.get(TIP)
         if told is not None:

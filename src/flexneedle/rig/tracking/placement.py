@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from flexneedle.rig.tracking.field.poses import Pose, reference_poses
+from flexneedle.rig.tracking.field.poses import SensorPose, reference_poses
 from flexneedle.rig.tracking.field.room import Room
 from flexneedle.rig.tracking.field.sensors import Floats, noiseless, noisy
 from flexneedle.types import Point
@@ -17,7 +17,7 @@ _READINGS = 40
 
 def placed_references(
     room: Room, center: Point, limit: float, rng: np.random.Generator, plate_distance: float | None = None
-) -> Mapping[str, Pose]:
+) -> Mapping[str, SensorPose]:
     """Return poses of the three references near those of the environment, each where it tells less than `limit`.
 
     The paper keeps all indicators below the threshold as the experiment begins (section IV-B); a reference that does
@@ -25,7 +25,7 @@ def placed_references(
     in `Room`.
     """
 
-    def told(name: str, pose: Pose) -> float:
+    def told(name: str, pose: SensorPose) -> float:
         place = np.array([pose.position]) - np.array(center)
         return _indicator(room, name, place, np.array([pose.orientation]), rng, plate_distance)
 
@@ -33,7 +33,9 @@ def placed_references(
     return {name: _clean(partial(told, name), pose, limit, rng) for name, pose in poses.items()}
 
 
-def _clean(told: Callable[[Pose], float], first: Pose, limit: float, rng: np.random.Generator) -> Pose:
+def _clean(
+    told: Callable[[SensorPose], float], first: SensorPose, limit: float, rng: np.random.Generator
+) -> SensorPose:
     best, least = first, told(first)
     for _ in range(1, _TRIES):
         if least < limit:
@@ -41,7 +43,7 @@ def _clean(told: Callable[[Pose], float], first: Pose, limit: float, rng: np.ran
         way = rng.normal(0.0, 1.0, 3)
         way *= _FURTHEST_MM * rng.random() ** (1 / 3) / np.linalg.norm(way)
         x, y, z = (np.array(first.position) + way).tolist()
-        pose = Pose((x, y, z), first.orientation)
+        pose = SensorPose((x, y, z), first.orientation)
         if (value := told(pose)) < least:
             best, least = pose, value
     return best

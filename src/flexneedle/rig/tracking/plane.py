@@ -6,24 +6,24 @@ from flexneedle.rig.ports import Tracker
 from flexneedle.rig.tracking.quaternion import z_axis
 from flexneedle.rig.tracking.registration import Rigid
 from flexneedle.rig.tracking.table import TIP
-from flexneedle.types import VISIBLE, Frame, Sample
+from flexneedle.types import VISIBLE, Frame, Measurement
 
 
-def tip_in_plane(frame: Frame, to_stage: Rigid, tip_offset: float = 0.0) -> Sample:
+def tip_in_plane(frame: Frame, to_stage: Rigid, tip_offset: float = 0.0) -> Measurement:
     """Return the tip in the stage's frame: its sensor, mapped, and `tip_offset` mm further along the measured z axis.
 
     Without a tip that is seen there are no coordinates; nor without an orientation, unless the offset is zero.
     """
     reading = frame.readings.get(TIP)
     if reading is None or reading.status != VISIBLE or reading.position is None:
-        return Sample(frame.time, None, None, None, frame)
+        return Measurement(frame.time, None, None, None, frame)
     place = np.array(reading.position)
     if tip_offset != 0.0:
         if reading.orientation is None:
-            return Sample(frame.time, None, None, None, frame)
+            return Measurement(frame.time, None, None, None, frame)
         place = place + tip_offset * z_axis(np.array(reading.orientation))
     x, y, z = to_stage.apply(place).tolist()
-    return Sample(frame.time, x, y, z, frame)
+    return Measurement(frame.time, x, y, z, frame)
 
 
 class InPlane:
@@ -32,7 +32,7 @@ class InPlane:
     def __init__(self, tracker: Tracker, to_stage: Rigid, tip_offset: float = 0.0) -> None:
         self._tracker, self._to_stage, self._tip_offset = tracker, to_stage, tip_offset
 
-    def read(self) -> tuple[Sample, ...]:
+    def read(self) -> tuple[Measurement, ...]:
         """Return the tip in each frame since the last call, oldest first."""
         frames = self._tracker.read()
         return tuple(tip_in_plane(frame, self._to_stage, self._tip_offset) for frame in frames)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from flexneedle.rig.ports import Clock
-from flexneedle.types import VISIBLE, Sample
+from flexneedle.types import VISIBLE, Measurement
 
 
 class NoisyTracker:
@@ -37,7 +37,7 @@ class NoisyTracker:
         self._first = -math.ceil(delay / period - 1e-6)  # there at the start; number k is taken at k periods
         self._taken = self._first - 1  # the last reading
 
-    def read(self) -> tuple[Sample, ...]:
+    def read(self) -> tuple[Measurement, ...]:
         """Return the readings that arrived since the last call, oldest first."""
         due = math.floor((self._clock.now() - self._delay) / self._period + 1e-6)
         samples = tuple(self._sample(k) for k in range(self._taken + 1, due + 1))
@@ -49,11 +49,11 @@ class NoisyTracker:
         """VISIBLE: it never falls silent."""
         return VISIBLE
 
-    def _sample(self, number: int) -> Sample:
+    def _sample(self, number: int) -> Measurement:
         time, is_first = number * self._period, number == self._first
         x, y = self._tip_at(time)
         rng = self._rng_first if is_first else self._rng if time > 0.0 else self._rng_before
         noise = rng.normal(0.0, self._jitter, 2)
         if rng.random() < self._missing and not is_first:
-            return Sample(time, None, None)
-        return Sample(time, x + self._bias[0] + float(noise[0]), y + self._bias[1] + float(noise[1]))
+            return Measurement(time, None, None)
+        return Measurement(time, x + self._bias[0] + float(noise[0]), y + self._bias[1] + float(noise[1]))

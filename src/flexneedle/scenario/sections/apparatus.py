@@ -65,7 +65,7 @@ class Setup(Section):
         return 1e-3 * self.max_base_turn_step_mrad
 
 
-class Tracker(Section):
+class TrackerSettings(Section):
     """Section `tracker`: what measures the tip."""
 
     rate_hz: Positive = 40.0

@@ -7,7 +7,7 @@ from pydantic import Field
 from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, count
 
 
-class Monitor(Section):
+class MonitorSettings(Section):
     """Section `monitor`: what the tracker may say before the needle is held (paper section IV-B, and beyond)."""
 
     enabled: bool = True

@@ -33,7 +33,7 @@ def _cross(a: list[float], b: list[float]) -> tuple[float, float, float]:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-Turn = Annotated[tuple[float, float, float, float], Field(strict=False), AfterValidator(_unit)]
+UnitQuaternion = Annotated[tuple[float, float, float, float], Field(strict=False), AfterValidator(_unit)]
 
 
 class Registration(Section):
@@ -42,7 +42,7 @@ class Registration(Section):
     `flexneedle em register` writes it.
     """
 
-    rotation: Turn = (1.0, 0.0, 0.0, 0.0)
+    rotation: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
     """Unit quaternion w, x, y, z that turns the tracker's axes into the stage's."""
     translation_mm: Vector = (0.0, 0.0, 0.0)
     """Where the tracker's origin lies in the stage's frame."""

@@ -37,7 +37,7 @@ def elite_count(samples: int, fraction: float) -> int:
     return ceil(samples * fraction - 1e-9)
 
 
-class Plan(Section):
+class PlanSettings(Section):
     """Section `plan`: the cross-entropy method and the cost of a plan."""
 
     samples: int = count(128, least=2, most=100_000)
@@ -84,7 +84,7 @@ class Plan(Section):
         return 1e-3 * self.base_turn_sigma_mrad
 
 
-class Control(Section):
+class ControlSettings(Section):
     """Section `control`: what all controllers share. The tables below it are each a controller's own.
 
     They are kept as they are given: the controllers check them (`flexneedle.control.tables`).
@@ -135,7 +135,7 @@ class Control(Section):
         return 1e-3 * self.start_angle_sd_mrad
 
 
-class Phantom(Section):
+class PhantomSettings(Section):
     """Section `phantom`: how the virtual phantom differs from what the controller assumes.
 
     The plant `model` has no initial bend, guide clearance, friction or variation of stiffness; `exact` has all.

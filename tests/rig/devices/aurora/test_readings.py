@@ -3,14 +3,16 @@
 import pytest
 
 from flexneedle.rig.devices.aurora.readings import NAMES, reading, readings, sensor_name
-from flexneedle.types import VISIBLE, Reading
+from flexneedle.types import VISIBLE, SensorReading
 
 POSE = (0.5, -0.5, 0.5, -0.5, 10.0, -20.0, -200.0, 0.024)
 SEEN, DISABLED, MISSING = 0, 1, 2
 
 
 def test_a_seen_sensor_has_position_orientation_and_indicator():
-    assert reading(SEEN, 0x31, POSE) == Reading((10.0, -20.0, -200.0), (0.5, -0.5, 0.5, -0.5), 0.024, VISIBLE)
+    assert reading(SEEN, 0x31, POSE) == SensorReading(
+        (10.0, -20.0, -200.0), (0.5, -0.5, 0.5, -0.5), 0.024, VISIBLE
+    )
 
 
 def test_a_rounded_quaternion_is_made_unit():
@@ -39,7 +41,7 @@ def test_a_rounded_quaternion_is_made_unit():
     ],
 )
 def test_anything_that_ails_a_sensor_takes_its_position_and_says_so(gone, bits, status):
-    assert reading(gone, bits, POSE) == Reading(None, status=status)
+    assert reading(gone, bits, POSE) == SensorReading(None, status=status)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +55,7 @@ def test_anything_that_ails_a_sensor_takes_its_position_and_says_so(gone, bits, 
     ],
 )
 def test_numbers_that_are_no_pose_make_no_position(pose):
-    assert reading(SEEN, 0x31, pose) == Reading(None, status="bad transform")
+    assert reading(SEEN, 0x31, pose) == SensorReading(None, status="bad transform")
 
 
 def test_a_sensor_of_an_older_frame_than_the_others_is_stale():

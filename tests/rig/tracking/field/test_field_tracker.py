@@ -5,14 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
-from rooms import Watch, environment, shipped
 from scipy.spatial.transform import Rotation
 
-from flexneedle.rig.tracking.field.poses import Pose, reference_poses, tip_sensor_pose
+from flexneedle.rig.tracking.field.poses import SensorPose, reference_poses, tip_sensor_pose
 from flexneedle.rig.tracking.field.room import REFERENCES, Room
 from flexneedle.rig.tracking.field.tracker import MISSING, FieldTracker
 from flexneedle.rig.tracking.registration import Rigid
 from flexneedle.types import VISIBLE
+from rooms import Watch, environment, shipped
 
 PERIOD = 0.025
 TURNED = Rigid(Rotation.from_euler("xyz", [0.3, -1.2, 2.0]).as_matrix(), np.array([30.0, -200.0, 7.0]))
@@ -145,7 +145,7 @@ def test_the_roll_of_the_tip_is_not_known():
     half = np.sqrt(0.5)
     rolled = (0.5, 0.5, 0.5, 0.5)  # a quarter turn about its own axis more
     plain, turned = (
-        frames(3, poses=lambda _, q=q: {"tip": Pose((0.0, 0.0, 0.0), q)})[0].readings["tip"].orientation
+        frames(3, poses=lambda _, q=q: {"tip": SensorPose((0.0, 0.0, 0.0), q)})[0].readings["tip"].orientation
         for q in ((half, 0.0, half, 0.0), rolled)
     )
     assert plain == pytest.approx(turned)
@@ -153,7 +153,7 @@ def test_the_roll_of_the_tip_is_not_known():
 
 def test_the_middle_of_the_room_lies_where_it_is_put():
     room = Room(environment(tip={"bias_mm": 1.0}), 2)
-    here = {"tip": Pose((23.0, 4.0, 5.0))}
+    here = {"tip": SensorPose((23.0, 4.0, 5.0))}
     (reading,) = (f.readings["tip"] for f in frames(1, room, lambda _: here, center=(20.0, 1.0, 0.0)))
     expected = np.array([23.0, 4.0, 5.0]) + room.error("tip", np.array([[3.0, 3.0, 5.0]]))[0]
     assert reading.position == pytest.approx(tuple(expected))
@@ -185,6 +185,6 @@ def test_a_sensor_that_stands_still_is_read_off_as_if_it_had_just_come():
     """What is kept of the last frame is its own."""
     room = Room(environment(tip={"bias_mm": 1.0}), 2)
     places = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (0.0, 0.0, 0.0)]
-    seen = frames(4, room, lambda time: {"tip": Pose(places[round(time / PERIOD) - 1])})
+    seen = frames(4, room, lambda time: {"tip": SensorPose(places[round(time / PERIOD) - 1])})
     told = [frame.readings["tip"].position for frame in seen]
     assert told[0] == told[1] == told[3] != told[2]

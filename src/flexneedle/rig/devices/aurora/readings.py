@@ -5,13 +5,13 @@ from math import hypot, isfinite
 from typing import Any
 
 from flexneedle.rig.devices.aurora.library import DISABLED
-from flexneedle.types import VISIBLE, Reading
+from flexneedle.types import VISIBLE, SensorReading
 
 NAMES = ("tip", "ref1", "ref2", "ref3")
 """Sensors at the ports 1 to 4, unless said otherwise."""
 
 _SEEN, _MISSING = 0, 2
-_STALE = Reading(None, status="stale")
+_STALE = SensorReading(None, status="stale")
 _BITS = {
     0x0040: "out of volume",
     0x0100: "broken coil",
@@ -38,7 +38,9 @@ def sensor_name(port: str, channel: str, names: Sequence[str]) -> str:
     return name if channel == "00" else f"{name}.{int(channel, 16) + 1}"
 
 
-def readings(found: Mapping[str, Sequence[Any]], number: int, names: Mapping[str, str]) -> dict[str, Reading]:
+def readings(
+    found: Mapping[str, Sequence[Any]], number: int, names: Mapping[str, str]
+) -> dict[str, SensorReading]:
     """Return the readings of a frame by name. found: as the link tells it; names: by port handle."""
     return {
         names[handle]: _STALE if gone == _SEEN and frame != number else reading(gone, status, pose)
@@ -46,7 +48,7 @@ def readings(found: Mapping[str, Sequence[Any]], number: int, names: Mapping[str
     }
 
 
-def reading(gone: int, status: int, pose: Sequence[float]) -> Reading:
+def reading(gone: int, status: int, pose: Sequence[float]) -> SensorReading:
     """Return the reading in a frame: gone and status as ndicapi says them, pose q0 qx qy qz, x y z (mm), indicator.
 
     Only a sensor that is wholly inside of the volume has a position.
@@ -55,11 +57,11 @@ def reading(gone: int, status: int, pose: Sequence[float]) -> Reading:
     if ill == VISIBLE and not _is_sound(pose):
         ill = "bad transform"
     if ill != VISIBLE:
-        return Reading(None, status=ill)
+        return SensorReading(None, status=ill)
     length = hypot(*pose[:4])
     w, qx, qy, qz = (part / length for part in pose[:4])
     x, y, z = pose[4:7]
-    return Reading((x, y, z), (w, qx, qy, qz), pose[7])
+    return SensorReading((x, y, z), (w, qx, qy, qz), pose[7])
 
 
 def _why_not(gone: int, status: int) -> str:

@@ -14,14 +14,14 @@ UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 """The sensor's axes are the stage's."""
 
 
-class Pose(NamedTuple):
+class SensorPose(NamedTuple):
     """Place (mm) and orientation of a sensor in the frame of the stage; its z axis is the needle's."""
 
     position: Point
     orientation: Quaternion = UPRIGHT
 
 
-def tip_sensor_pose(tip: Sequence[float], direction: Sequence[float], offset: float = 0.0) -> Pose:
+def tip_sensor_pose(tip: Sequence[float], direction: Sequence[float], offset: float = 0.0) -> SensorPose:
     """Return the pose of the sensor `offset` mm behind the `tip` (x, y, z) mm of a needle that points in `direction`.
 
     direction: x, y, z of any length but zero.
@@ -30,11 +30,11 @@ def tip_sensor_pose(tip: Sequence[float], direction: Sequence[float], offset: fl
     axis = axis / np.linalg.norm(axis)
     x, y, z = (place - offset * axis).tolist()
     w, i, j, k = along(axis).tolist()
-    return Pose((x, y, z), (w, i, j, k))
+    return SensorPose((x, y, z), (w, i, j, k))
 
 
-def reference_poses(environment: Environment, center: Point) -> Mapping[str, Pose]:
+def reference_poses(environment: Environment, center: Point) -> Mapping[str, SensorPose]:
     """Return the poses of the three references around a workspace whose middle lies at `center`, mm, upright."""
     sensor = environment.reference
     places = zip(REFERENCES, (sensor.ref1_mm, sensor.ref2_mm, sensor.ref3_mm), strict=True)
-    return {name: Pose((x + center[0], y + center[1], z + center[2])) for name, (x, y, z) in places}
+    return {name: SensorPose((x + center[0], y + center[1], z + center[2])) for name, (x, y, z) in places}

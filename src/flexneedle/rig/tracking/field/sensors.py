@@ -32,7 +32,7 @@ class Noiseless:
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
+class SensorReadings:
     """n readings: positions (n, 3), mm; orientations (n, 4); indicators (n,), None for a sensor of one coil."""
 
     positions: Floats
@@ -56,7 +56,7 @@ def noiseless(
     return Noiseless(coils, _tilted(room.environment, off, turns))
 
 
-def noisy(environment: Environment, seen: Noiseless, rng: np.random.Generator) -> Readings:
+def noisy(environment: Environment, seen: Noiseless, rng: np.random.Generator) -> SensorReadings:
     """Return readings with white noise drawn for each: nine normal numbers a reading, six for one coil."""
     count, coils = seen.coils.shape[:2]
     jitter = environment.tip.jitter_mm if coils == 1 else environment.reference.jitter_mm
@@ -66,7 +66,7 @@ def noisy(environment: Environment, seen: Noiseless, rng: np.random.Generator) -
     # Two of the three parts of a turn move the axis.
     turn = _PER_MILLI * environment.tilt_jitter_mrad / sqrt(2.0) * noise[:, coils]
     spacing = environment.reference.spacing_mm
-    return Readings(
+    return SensorReadings(
         places.mean(axis=1),
         product(from_vector(turn), seen.turns),
         None if coils == 1 else indicator(places, spacing),

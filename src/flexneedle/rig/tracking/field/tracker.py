@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from flexneedle.rig.ports import Clock
-from flexneedle.rig.tracking.field.poses import Pose
+from flexneedle.rig.tracking.field.poses import SensorPose
 from flexneedle.rig.tracking.field.room import SENSORS, Floats, Room
-from flexneedle.rig.tracking.field.sensors import Noiseless, Readings, noiseless, noisy
+from flexneedle.rig.tracking.field.sensors import Noiseless, SensorReadings, noiseless, noisy
 from flexneedle.rig.tracking.quaternion import along, from_matrix, product, z_axis
 from flexneedle.rig.tracking.registration import Rigid, identity
 from flexneedle.rig.tracking.table import TIP
-from flexneedle.types import VISIBLE, Frame, Point, Quaternion, Reading
+from flexneedle.types import VISIBLE, Frame, Point, Quaternion, SensorReading
 
 MISSING = "missing"
 """Status of a reading without a position."""
@@ -32,7 +32,7 @@ class FieldTracker:
     def __init__(
         self,
         room: Room,
-        poses_at: Callable[[float], Mapping[str, Pose]],
+        poses_at: Callable[[float], Mapping[str, SensorPose]],
         clock: Clock,
         period: float,
         rng: np.random.Generator,
@@ -58,7 +58,7 @@ class FieldTracker:
             (delay + ahead) / period - 1e-6
         )  # the last frame; number k is taken at k periods
         self._first = self._taken + 1
-        self._still: dict[str, tuple[tuple[Pose, float | None], Noiseless]] = {}
+        self._still: dict[str, tuple[tuple[SensorPose, float | None], Noiseless]] = {}
 
     def read(self) -> tuple[Frame, ...]:
         """Return the frames that arrived since the last call, oldest first."""
@@ -81,13 +81,15 @@ class FieldTracker:
         }
         return Frame(time, number - self._first, readings)
 
-    def _reading(self, name: str, pose: Pose, plate: float | None, rng: np.random.Generator) -> Reading:
+    def _reading(
+        self, name: str, pose: SensorPose, plate: float | None, rng: np.random.Generator
+    ) -> SensorReading:
         seen = noisy(self._room.environment, self._noiseless(name, pose, plate), rng)
         if rng.random() < self._missing:
-            return Reading(None, status=MISSING)
+            return SensorReading(None, status=MISSING)
         return self._told(name, seen)
 
-    def _noiseless(self, name: str, pose: Pose, plate: float | None) -> Noiseless:
+    def _noiseless(self, name: str, pose: SensorPose, plate: float | None) -> Noiseless:
         """As it was in the last frame, if the sensor stands still: references do."""
         last, seen = self._still.get(name, (None, None))
         if seen is None or last != (pose, plate):
@@ -96,13 +98,13 @@ class FieldTracker:
             self._still[name] = (pose, plate), seen
         return seen
 
-    def _told(self, name: str, seen: Readings) -> Reading:
+    def _told(self, name: str, seen: SensorReadings) -> SensorReading:
         place = self._to_tracker.apply(seen.positions[0] + self._center)
         turn = product(self._turn_to_tracker, seen.turns[0])
         if name == TIP:
             turn = along(z_axis(turn))
         indicator = None if seen.indicators is None else float(seen.indicators[0])
-        return Reading(_point(place), _quaternion(turn), indicator)
+        return SensorReading(_point(place), _quaternion(turn), indicator)
 
 
 def _point(values: Floats) -> Point:
