@@ -9,8 +9,8 @@ class InputError(FlexneedleError):
     """What the user gave cannot be used (exit status 2)."""
 
 
-class ScenarioError(InputError):
-    """A scenario cannot be read or breaks a rule. Each argument is one problem in one line."""
+class FileError(InputError):
+    """A file of settings cannot be read or breaks a rule. Each argument is one problem in one line."""
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -19,6 +19,10 @@ class ScenarioError(InputError):
 
     def __str__(self) -> str:
         return "\n".join(self.args)
+
+
+class ScenarioError(FileError):
+    """A scenario cannot be read or breaks a rule."""
 
 
 class CommandError(InputError, ValueError):

@@ -112,7 +112,7 @@ def test_schema_describes_every_key_with_a_unit_or_a_meaning(capsys):
         ("description" in field or "$ref" in field) for s in sections for field in s["properties"].values()
     ]
     assert all(described)
-    tables = schema["$defs"]["Control"]["properties"]
+    tables = schema["$defs"]["ControlSettings"]["properties"]
     assert {"ce_mpc", "bevel_only", "load_gain"} <= set(tables)
 
 
@@ -146,7 +146,7 @@ def test_a_process_ends_without_a_traceback():
     done = run_process("scenario", "check", "/nowhere.toml")
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr == "flexneedle: /nowhere.toml: no such file, and no such preset (presets: phantom)\n"
+    assert done.stderr == "flexneedle: /nowhere.toml: no such file, and no such preset (choices: phantom)\n"
 
 
 @pytest.mark.parametrize("argv", [["scenario", "schema"], ["--help"]])

@@ -110,7 +110,7 @@ def test_a_folder_is_used_again_only_to_resume(capsys):
             ["my.toml", "--workers", "2", "--scheduler", "x"],
             "--workers is for this machine: leave it out with",
         ),
-        (["no.toml"], "no.toml: no such file, and no such study (studies: controllers, gauges, "),
+        (["no.toml"], "no.toml: no such file, and no such study (choices: controllers, gauges, "),
     ],
 )
 def test_bad_input_is_one_line(capsys, argv, line):

@@ -5,7 +5,7 @@ import pytest
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.sections.environment import environment_names
+from flexneedle.scenario.sections.environment import ENVIRONMENTS
 
 PLATE = "tracker.environment.plate.distance_mm"
 
@@ -17,7 +17,7 @@ def phantom(**values):
 
 
 def test_two_environments_are_shipped():
-    assert environment_names() == ["ideal", "noisy"]
+    assert ENVIRONMENTS.names() == ["ideal", "noisy"]
     assert phantom(environment="ideal").tracker.environment.plate is None
     assert phantom(environment="noisy").tracker.environment.plate is not None
 

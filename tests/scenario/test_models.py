@@ -14,14 +14,14 @@ from flexneedle.control.methods import checked
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.model import Scenario, check_target
-from flexneedle.scenario.preset import preset_names
+from flexneedle.scenario.preset import PRESETS
 from flexneedle.scenario.sections.needle import GAUGES
 
 PHANTOM = load_scenario("phantom")
 
 
 def test_the_preset_is_the_two_layer_phantom():
-    assert preset_names() == ["phantom"]
+    assert PRESETS.names() == ["phantom"]
     assert PHANTOM.name == "Two-layer tissue phantom"
     assert [layer.shear_modulus_kpa for layer in PHANTOM.tissue] == [1.82, 3.63]
     assert PHANTOM.setup.guide_to_skin_mm == 41.0

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 from flexneedle.control.methods import METHODS
 from flexneedle.scenario.files import load_scenario
 from flexneedle.study.grid import load_study
-from flexneedle.study.spec import study_names
+from flexneedle.study.spec import STUDIES
 
 DOCS_FOLDER = Path(__file__).parents[2] / "docs"
 DOCS = (DOCS_FOLDER / "studies.md").read_text()
@@ -47,7 +47,7 @@ def test_every_shipped_study_is_told():
             "worlds",
         )
     ]
-    assert len(study_names()) == 11
+    assert len(STUDIES.names()) == 11
 
 
 def test_every_column_is_told(quick, uninterrupted):

@@ -10,7 +10,7 @@ from flexneedle.control.methods import METHODS, checked
 from flexneedle.errors import InputError, ScenarioWarning
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.study.grid import load_study
-from flexneedle.study.spec import LARGEST_SEED, study_names
+from flexneedle.study.spec import LARGEST_SEED, STUDIES
 
 PHANTOM = checked(load_scenario("phantom"))
 CONTROLLERS = tuple(METHODS)[:2]
@@ -237,13 +237,13 @@ def test_a_setting_that_breaks_a_rule_is_named_with_its_place_in_the_grid(study)
 
 
 def test_an_unknown_study_is_refused_with_the_names_of_those_that_there_are():
-    with pytest.raises(InputError, match=r"^nope: no such file, and no such study \(studies: controllers, "):
+    with pytest.raises(InputError, match=r"^nope: no such file, and no such study \(choices: controllers, "):
         load_study("nope")
 
 
 def test_the_studies_of_the_package_can_be_carried_out():
     """Loading checks every scenario of the grid against all rules, targets within the stroke included."""
-    sizes = {name: len(load_study(name)) for name in study_names()}
+    sizes = {name: len(load_study(name)) for name in STUDIES.names()}
     assert sizes == {
         "phantom": 150,
         "phantom-published": 150,
@@ -361,7 +361,7 @@ def test_the_gauges_are_solid_needles_of_growing_number():
 
 
 def test_study_files_of_the_package_say_what_they_are_for():
-    for name in study_names():
+    for name in STUDIES.names():
         text = (Path(load_study.__code__.co_filename).parent / "studies" / f"{name}.toml").read_text()
         assert text.startswith("# ")
         assert f'name = "{name}"' in text

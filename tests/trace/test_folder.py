@@ -47,7 +47,7 @@ def test_runs_in_the_same_second_get_their_own_folders():
 
 @pytest.mark.usefixtures("in_tmp")
 @pytest.mark.parametrize(
-    ("name", "expected"), [("my case/../x", "my-case-..-x"), ("…", "scenario"), ("針", "針")]
+    ("name", "expected"), [("my case/../x", "my-case-..-x"), ("…", "unnamed"), ("針", "針")]
 )
 def test_a_name_becomes_a_single_folder(name, expected):
     path = claim(name=name).path

@@ -41,9 +41,9 @@ def _add_controller(parser: argparse.ArgumentParser) -> None:
 
 def _list(_args: argparse.Namespace) -> int:
     from flexneedle.scenario.files import load_scenario
-    from flexneedle.scenario.preset import preset_names
+    from flexneedle.scenario.preset import PRESETS
 
-    for name in preset_names():
+    for name in PRESETS.names():
         print(f"{name:12} {load_scenario(name).name}")
     return 0
 

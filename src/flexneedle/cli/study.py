@@ -56,10 +56,10 @@ def _workers(text: str) -> int:
 def _study(args: argparse.Namespace) -> int:
     from flexneedle.console.progress import Progress
     from flexneedle.errors import InputError, RunError
-    from flexneedle.study.folder import free_folder
     from flexneedle.study.grid import load_study
     from flexneedle.study.pools import check_address
     from flexneedle.study.runner import run_study
+    from flexneedle.trace.files import new_folder
 
     if args.resume and args.out is None:
         raise InputError("--resume needs the folder of the study: give it with --out DIR")
@@ -68,7 +68,7 @@ def _study(args: argparse.Namespace) -> int:
     if args.scheduler is not None:
         check_address(args.scheduler)
     study = load_study(args.study, None if args.worlds is None else tuple(args.worlds))
-    folder = args.out or free_folder(study)
+    folder = args.out or new_folder("study", study.name)
     compile_first()
     begun = time.monotonic()
     try:

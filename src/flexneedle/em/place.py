@@ -1,12 +1,10 @@
 """The folder that the results of a tracker's evaluation go to."""
 
-import re
 from collections.abc import Iterable
-from datetime import UTC, datetime
-from itertools import count
 from pathlib import Path
 
 from flexneedle.errors import InputError
+from flexneedle.trace.files import new_folder
 
 
 def claim(out: Path | None, name: str, results: Iterable[str]) -> Path:
@@ -14,7 +12,7 @@ def claim(out: Path | None, name: str, results: Iterable[str]) -> Path:
 
     Raises InputError if `out` holds one of the files `results` already, or cannot be made.
     """
-    path = out if out is not None else _free(name)
+    path = out if out is not None else new_folder("em", name)
     for result in results:
         if (path / result).exists():
             raise InputError(f"{path}: holds {result} already: give another folder with --out")
@@ -25,10 +23,3 @@ def claim(out: Path | None, name: str, results: Iterable[str]) -> Path:
     except OSError as error:
         raise InputError(f"{path}: cannot be made: {error.strerror}") from None
     return path
-
-
-def _free(name: str) -> Path:
-    plain_name = re.sub(r"[^\w.-]+", "-", name).strip("-.") or "table"
-    opening = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-em-{plain_name[:60]}"
-    names = (opening if number == 1 else f"{opening}-{number}" for number in count(1))
-    return next(path for path in map(Path("runs").joinpath, names) if not path.exists())

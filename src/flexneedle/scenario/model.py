@@ -20,7 +20,7 @@ from flexneedle.scenario.rules import (
     target_problems,
 )
 from flexneedle.scenario.sections.apparatus import Setup, TrackerSettings
-from flexneedle.scenario.sections.environment import environment_names, expanded
+from flexneedle.scenario.sections.environment import ENVIRONMENTS, expanded
 from flexneedle.scenario.sections.fields import Section, Title
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.scenario.sections.needle import Needle
@@ -128,7 +128,7 @@ class Scenario(Section):
 
 def _expanded(key: str, value: Any) -> Any:
     """Return the table of an environment's name, so that later changes can go into it; an unknown name as it is."""
-    known = key == _ENVIRONMENT and value in environment_names()
+    known = key == _ENVIRONMENT and value in ENVIRONMENTS.names()
     return expanded(value) if known else value
 
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.preset import WORLD, preset_values
+from flexneedle.scenario.preset import PRESETS, WORLD
 from flexneedle.scenario.problems import printable
 from flexneedle.scenario.sections.needle import GAUGES
 
@@ -118,7 +118,7 @@ def _real(number: int) -> Scenario:
     lateral = _rounded(rng.uniform(-0.11, 0.11) * depth)
     tissue = _tissue(rng, depth)
     setup, length = _setup(rng, depth)
-    base = Scenario.from_values(preset_values("phantom")).values()
+    base = Scenario.from_values(PRESETS.shipped("phantom")).values()
     layer = base["tissue"][0]
     values: dict[str, Any] = {
         "name": f"World {number}",

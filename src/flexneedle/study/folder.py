@@ -4,10 +4,7 @@
 """
 
 import json
-import re
 from collections.abc import Mapping
-from datetime import UTC, datetime
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +20,6 @@ from flexneedle.trace.plain import to_text
 JOURNAL_FILE, PLANS_FOLDER = "journal.jsonl", "plans"
 _FORMAT = 1
 _SOURCE = "versions.source"
-
-
-def free_folder(study: Study) -> Path:
-    """Return a folder that is not there yet, below `runs/`, named by date and study."""
-    plain_name = re.sub(r"[^\w.-]+", "-", study.name).strip("-.") or "study"
-    opening = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-study-{plain_name[:60]}"
-    names = (opening if number == 1 else f"{opening}-{number}" for number in count(1))
-    return next(path for path in map(Path("runs").joinpath, names) if not path.exists())
 
 
 def open_folder(path: Path, study: Study, resume: bool, command: str = "") -> Journal:

@@ -12,7 +12,7 @@ from typing import Any, Self
 from flexneedle.errors import InputError
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.study.rows import RESULTS, TIMES
-from flexneedle.trace.shield import uninterrupted
+from flexneedle.trace.files import uninterrupted
 
 _LARGEST = {int: 2**63 - 1, float: sys.float_info.max}  # of a column
 

@@ -13,12 +13,13 @@ from typing import Any
 from flexneedle.errors import InputError, RunError
 from flexneedle.rig.kernels import compile_kernels
 from flexneedle.study import pools
-from flexneedle.study.folder import PLANS_FOLDER, free_folder, open_folder
+from flexneedle.study.folder import PLANS_FOLDER, open_folder
 from flexneedle.study.grid import GridPoint, Study, load_study
 from flexneedle.study.journal import Journal
 from flexneedle.study.plans import Plans, plan_key, truth_key
 from flexneedle.study.rows import Done, Job, Planned, carry_out, make_plan
 from flexneedle.study.tables import write_tables
+from flexneedle.trace.files import new_folder
 from flexneedle.trace.folder import versions
 
 _Left = dict[str, list[tuple[GridPoint, tuple[tuple[int, int], ...]]]]
@@ -61,7 +62,7 @@ def run_study(
     study = load_study(source)
     if workers is not None and not (workers >= 1 and scheduler is None):
         raise InputError(f"workers = {workers}: must be at least 1, and left out with a scheduler")
-    folder = free_folder(study) if out is None else Path(out)
+    folder = new_folder("study", study.name) if out is None else Path(out)
     chunk = 1 if scheduler is None else math.ceil(len(study) / _CLUSTER_JOBS)
     # The pool first: a scheduler that does not answer leaves no folder behind.
     with (

@@ -1,21 +1,20 @@
 """Study files: what is varied, read from TOML, every problem in one line."""
 
-import tomllib
 from collections import Counter
 from collections.abc import Hashable, Iterator, Mapping
 from importlib.resources import files
-from os import fspath
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from flexneedle.errors import InputError
 from flexneedle.scenario.dotted import flatten
 from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.library import Library, label
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.preset import preset_names
-from flexneedle.scenario.problems import Problem, describe, printable, refuse
+from flexneedle.scenario.preset import PRESETS
+from flexneedle.scenario.problems import Problem, refuse
 from flexneedle.scenario.renamed import current_key
 from flexneedle.scenario.sections.fields import Section, Title, count
 from flexneedle.scenario.worlds import LARGEST_WORLD
@@ -25,9 +24,7 @@ WORLD, WORLD_CASE = "world", "world_case"
 NAMED = ("controller", "plant", "strategy", WORLD_CASE)
 _TARGET = "target"
 _TARGET_KEYS = ("target.depth_mm", "target.lateral_mm")
-_SHIPPED = files("flexneedle.study") / "studies"
-_SUFFIX = ".toml"
-_LARGEST_FILE = 1_000_000
+STUDIES = Library("a study file", "study", files(__package__) / "studies")
 _MOST_VALUES = 100_000
 LARGEST_SEED = 2**62
 """A first seed and all that follow it fit into the 64 bits of a column."""
@@ -108,29 +105,18 @@ class StudyFile(Section):
         return self
 
 
-def study_names() -> list[str]:
-    """Return the names of the studies that come with the package."""
-    return sorted(
-        entry.name.removesuffix(_SUFFIX) for entry in _SHIPPED.iterdir() if entry.name.endswith(_SUFFIX)
-    )
-
-
 def read_study(source: str | Path) -> tuple[StudyFile, Path, str]:
     """Return the study of a shipped name or of a TOML file, the folder of the file, and its label in messages.
 
-    Raises InputError with one line for each problem: file, key, value, rule.
+    Raises FileError with one line for each problem: file, key, value, rule.
     """
-    if isinstance(source, str) and source in study_names():
-        data, home = (_SHIPPED / (source + _SUFFIX)).read_bytes(), Path()
-    else:
-        data, home = _read(Path(source)), Path(source).parent
-    label = printable(fspath(source))
-    return _parsed(data, label), home, label
+    shipped = isinstance(source, str) and source in STUDIES.names()
+    return STUDIES.load(source, StudyFile), Path() if shipped else Path(source).parent, label(source)
 
 
 def base_of(file: StudyFile, home: Path) -> Scenario:
     """Return the base scenario of a study whose file lies in the folder `home`. Raises ScenarioError."""
-    return load_scenario(file.scenario if file.scenario in preset_names() else home / file.scenario)
+    return load_scenario(file.scenario if file.scenario in PRESETS.names() else home / file.scenario)
 
 
 def of_worlds(file: StudyFile, first: int, count: int) -> StudyFile:
@@ -156,35 +142,6 @@ def settings_of(values: Mapping[str, Any]) -> dict[str, Any]:
 def _keys_of(key: str) -> tuple[str, ...]:
     """Return the keys that an axis sets."""
     return _TARGET_KEYS if key == _TARGET else (key,)
-
-
-def _read(path: Path) -> bytes:
-    label = printable(fspath(path)) or '""'
-    try:
-        with path.open("rb") as file:
-            data = file.read(_LARGEST_FILE + 1)
-    except FileNotFoundError:
-        names = ", ".join(study_names())
-        raise InputError(f"{label}: no such file, and no such study (studies: {names})") from None
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{label}: cannot be read: {reason}") from None
-    if len(data) > _LARGEST_FILE:
-        raise InputError(f"{label}: larger than {_LARGEST_FILE} bytes, not a study file")
-    return data
-
-
-def _parsed(data: bytes, label: str) -> StudyFile:
-    try:
-        values = tomllib.loads(data.decode("utf-8-sig"))
-    except RecursionError:
-        raise InputError(f"{label}: not TOML: nested too deeply") from None
-    except ValueError as error:  # UnicodeDecodeError is one
-        raise InputError(f"{label}: not TOML: {printable(str(error))}") from None
-    try:
-        return StudyFile.model_validate(values)
-    except ValidationError as error:
-        raise InputError("\n".join(f"{label}: {line}" for line in describe(error, StudyFile))) from None
 
 
 def _value_problems(key: str, values: Any) -> Iterator[Problem]:

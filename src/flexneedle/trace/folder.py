@@ -7,22 +7,19 @@ wall-clock times, is the same for the same seed.
 
 import hashlib
 import json
-import os
 import platform
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
-from itertools import count
 from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError, ScenarioError
 from flexneedle.scenario.model import Scenario
+from flexneedle.trace.files import new_folder, replace_file
 from flexneedle.trace.plain import plan_from_values, plan_values, to_text
-from flexneedle.trace.shield import uninterrupted
 from flexneedle.types import Plan
 
 RUN_FILE, TRACE_FILE, STUDY_FILE = "run.json", "trace.mcap", "study.json"
@@ -68,7 +65,7 @@ class Folder:
         Raises InputError if the folder holds a run or a study already or cannot be made.
         """
         now = datetime.now(UTC)
-        path = _make(out) if out is not None else _make_new(Path("runs"), f"{now:%Y%m%dT%H%M%SZ}", name, seed)
+        path = _make(new_folder(name, str(seed), now=now) if out is None else out)
         values = {
             "format": _FORMAT,
             "kind": kind,
@@ -87,8 +84,7 @@ class Folder:
         """Write `run.json`; readers see the old text or the new one, whole."""
         plans = {name: plan_values(plan) for name, plan in self.plans.items()}
         text = to_text({**self.values, "timing": self.timing, "plans": plans})
-        with uninterrupted():
-            _replace(self.path / RUN_FILE, text)
+        replace_file(self.path / RUN_FILE, text.encode())
 
     def end(self, status: str, reason: str = "") -> None:
         """Set how the run ended, and write."""
@@ -164,30 +160,3 @@ def _make(path: Path) -> Path:
     except OSError as error:
         raise InputError(f"{path}: cannot be made: {error.strerror}") from None
     return path
-
-
-def _make_new(below: Path, date: str, name: str, seed: int) -> Path:
-    """Make a folder that was not there; a second run in the same second gets a number."""
-    plain_name = re.sub(r"[^\w.-]+", "-", name).strip("-.") or "scenario"
-    opening = f"{date}-{plain_name[:60]}-{seed}"
-    for number in count(1):
-        path = below / (opening if number == 1 else f"{opening}-{number}")
-        try:
-            path.mkdir(parents=True)
-        except FileExistsError:
-            if not below.is_dir():
-                raise InputError(f"{below}: is no folder: give another with --out") from None
-            continue
-        except OSError as error:
-            raise InputError(f"{path}: cannot be made: {error.strerror}") from None
-        return _make(path)
-    raise InputError(f"{below / opening}: no free name")
-
-
-def _replace(path: Path, text: str) -> None:
-    draft = path.with_name(path.name + ".tmp")
-    with draft.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    draft.replace(path)

@@ -12,8 +12,8 @@ from typing import Any, Self
 
 from mcap.writer import CompressionType, Writer
 
+from flexneedle.trace.files import uninterrupted
 from flexneedle.trace.messages import STORE
-from flexneedle.trace.shield import uninterrupted
 from flexneedle.trace.topics import LATCHED, TOPICS, Spoken, period_messages, plan_message
 from flexneedle.types import Period, Plan
 

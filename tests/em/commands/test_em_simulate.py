@@ -60,7 +60,7 @@ def test_what_is_wrong_with_a_file_is_said_in_one_line(tmp_path, capsys, content
 
 def test_an_unknown_name_tells_the_names_there_are(tmp_path, capsys):
     assert simulate("--environment", "nosy", "--out", tmp_path / "out.csv") == 2
-    told = "nosy: no such file, and no such environment (environments: ideal, noisy)"
+    told = "nosy: no such file, and no such environment (choices: ideal, noisy)"
     assert told in capsys.readouterr().err
 
 

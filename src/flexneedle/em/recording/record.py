@@ -19,7 +19,7 @@ from flexneedle.em.recording.steps import Visit, disagreement
 from flexneedle.errors import InputError, RunError
 from flexneedle.rig.ports import Clock, Tracker
 from flexneedle.rig.tracking.table import COLUMNS
-from flexneedle.trace.shield import uninterrupted
+from flexneedle.trace.files import uninterrupted
 from flexneedle.types import VISIBLE, Frame, Point, SensorReading
 
 EXTRA = ("time_s", "frame_number", "repeat")

@@ -3,18 +3,20 @@
 Places are in the frame of the environment: origin in the middle of the workspace, axes parallel to the stage's.
 """
 
-import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
+from flexneedle.errors import ScenarioError
+from flexneedle.scenario.library import Library
 from flexneedle.scenario.sections.fields import LARGEST, Fraction, NonNegative, Positive, Section, Title
 
 NONE = "none"
-_SHIPPED = files(__package__) / "environments"
-_SUFFIX = ".toml"
+ENVIRONMENTS = Library(
+    "an environment file", "environment", files(__package__) / "environments", ScenarioError
+)
 _LARGEST_SEED = 2**62
 
 Coordinate = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
@@ -107,18 +109,6 @@ class Environment(Section):
     """Left out, there is none."""
 
 
-def environment_names() -> list[str]:
-    """Return the names of the environments that come with the package."""
-    return sorted(
-        entry.name.removesuffix(_SUFFIX) for entry in _SHIPPED.iterdir() if entry.name.endswith(_SUFFIX)
-    )
-
-
-def environment_data(name: str) -> bytes:
-    """Return the TOML file of a shipped environment."""
-    return (_SHIPPED / (name + _SUFFIX)).read_bytes()
-
-
 def expanded(value: Any) -> Any:
     """Return the table of a shipped environment's name, None for "none"; anything else as it is.
 
@@ -128,7 +118,7 @@ def expanded(value: Any) -> Any:
         return value
     if value == NONE:
         return None
-    names = environment_names()
+    names = ENVIRONMENTS.names()
     if value not in names:
         raise ValueError(f"must be one of {', '.join((NONE, *names))}, or a table")
-    return tomllib.loads(environment_data(value).decode())
+    return ENVIRONMENTS.shipped(value)

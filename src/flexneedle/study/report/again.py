@@ -11,7 +11,7 @@ from flexneedle.errors import ScenarioError
 from flexneedle.rig.parts import is_own
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.preset import preset_names
+from flexneedle.scenario.preset import PRESETS
 from flexneedle.scenario.worlds import world_name
 from flexneedle.study.report.rows import Rows
 
@@ -25,7 +25,7 @@ def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
     A row whose settings make no scenario of this version has "".
     """
     sources: dict[str, str] = {
-        _target_left_out(checked(load_scenario(name))): name for name in preset_names()
+        _target_left_out(checked(load_scenario(name))): name for name in PRESETS.names()
     }
     numbers = count(1)
     found = {}

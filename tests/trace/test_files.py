@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from flexneedle.trace.shield import uninterrupted
+from flexneedle.trace.files import uninterrupted
 
 
 def test_an_interrupt_comes_after_the_block():

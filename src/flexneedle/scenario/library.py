@@ -1,0 +1,97 @@
+"""TOML files of one kind: those of the package by name, a user's by path."""
+
+import tomllib
+from dataclasses import dataclass
+from importlib.resources.abc import Traversable
+from os import fspath
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from flexneedle.errors import FileError
+from flexneedle.scenario.problems import describe, printable
+
+_SUFFIX = ".toml"
+# Such a file has a few kB; the bound keeps an endless one such as /dev/zero from filling the memory.
+_LARGEST_FILE = 1_000_000
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class Library:
+    """A kind of TOML file.
+
+    kind: of file, such as "a scenario file"; noun: what one of the package is called, such as "preset"; folder:
+    where those are, None if there are none; error: what is raised, with one line for each problem.
+    """
+
+    kind: str
+    noun: str = ""
+    folder: Traversable | None = None
+    error: type[FileError] = FileError
+
+    def names(self) -> list[str]:
+        """Names of the files that come with the package."""
+        if self.folder is None:
+            return []
+        names = (entry.name for entry in self.folder.iterdir())
+        return sorted(name.removesuffix(_SUFFIX) for name in names if name.endswith(_SUFFIX))
+
+    def shipped(self, name: str) -> dict[str, Any]:
+        """Nested tables of a file that comes with the package."""
+        if self.folder is None:
+            raise KeyError(name)
+        return tomllib.loads((self.folder / (name + _SUFFIX)).read_text(encoding="utf-8"))
+
+    def read(self, source: str | Path) -> dict[str, Any]:
+        """Nested tables of the file of a name or at a path. A name of the package comes before a file of that name.
+
+        Raises `error`: file, what is wrong.
+        """
+        if isinstance(source, str) and source in self.names():
+            return self.shipped(source)
+        return self._parsed(self._bytes(source), label(source))
+
+    def load(self, source: str | Path, model: type[Model]) -> Model:
+        """The checked contents of a file. Raises `error` with one line for each problem: file, key, value, rule."""
+        values = self.read(source)
+        try:
+            return model.model_validate(values)
+        except ValidationError as error:
+            opening = label(source)
+            raise self.error(*(f"{opening}: {line}" for line in describe(error, model))) from None
+
+    def _bytes(self, source: str | Path) -> bytes:
+        opening = label(source)
+        try:
+            with Path(source).open("rb") as file:
+                data = file.read(_LARGEST_FILE + 1)
+        except FileNotFoundError:
+            known = f", and no such {self.noun} (choices: {', '.join(self.names())})" if self.noun else ""
+            raise self.error(f"{opening}: no such file{known}") from None
+        except IsADirectoryError:
+            raise self.error(f"{opening}: is a directory, not {self.kind}") from None
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise self.error(f"{opening}: cannot be read: {reason}") from None
+        if len(data) > _LARGEST_FILE:
+            raise self.error(f"{opening}: larger than {_LARGEST_FILE} bytes, not {self.kind}")
+        return data
+
+    def _parsed(self, data: bytes, opening: str) -> dict[str, Any]:
+        try:
+            return tomllib.loads(data.decode("utf-8-sig"))
+        except UnicodeDecodeError as error:
+            line = data.count(b"\n", 0, error.start) + 1
+            raise self.error(f"{opening}: not UTF-8 (at line {line}): save the file as UTF-8") from None
+        except RecursionError:
+            raise self.error(f"{opening}: not TOML: nested too deeply") from None
+        except ValueError as error:
+            raise self.error(f"{opening}: not TOML: {printable(str(error))}") from None
+
+
+def label(source: str | Path) -> str:
+    """A name or path as it opens a message."""
+    return printable(fspath(source)) or '""'
