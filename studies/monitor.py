@@ -129,7 +129,7 @@ def carried_out(drawn: Approach, plate: bool, monitor: bool) -> Told:
         tips,
         np.array([period.estimate[:2] for period in periods]),
         off,
-        np.array([period.verdict.startswith("field") for period in periods]),
+        np.array([str(period.verdict).startswith("field") for period in periods]),
         done.outcome,
     )
 

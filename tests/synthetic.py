@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from flexneedle.types import Insertion, Measurement, Period, Plan
+from flexneedle.types import Insertion, Measurement, Period, Plan, Verdict, VerdictKind
 
 START, LENGTH, GUIDE_X, STEP = -28.5, 150.0, -41.0, 1.0
 TURN_AT = 45  # the step that turns the bevel
@@ -71,7 +71,7 @@ def make_periods(plan, miss=0.06, seed=0):
             index=k, time=0.2 * (k + 1), command=command,
             applied=(command[0], 0.0, 0.0, round(command[3], 2), flip),
             sample=Measurement(0.2 * (k + 1) - 0.025, true[0] + noise[0], true[1] + noise[1]),
-            verdict="ok", innovation=(noise[0], noise[1]), estimate=estimate,
+            verdict=Verdict(), innovation=(noise[0], noise[1]), estimate=estimate,
             shape=plan.shapes[k + 1] + [0.0, off, 0.0], base=(tip[0] - LENGTH, 0.0, 0.0),
             guide=plan.guide[k + 1] + 0.3 * np.sin(0.2 * k), bevel=side,
             strain_energy=plan.strain_energy[k + 1] * 1.1, tip_load=0.01 * off,
@@ -94,7 +94,7 @@ def blind(period):
     return replace(
         period,
         sample=sample,
-        verdict="missing",
+        verdict=Verdict(VerdictKind.MISSING),
         innovation=(0.0, 0.0),
         true_tip=None,
         true_strain_energy=None,

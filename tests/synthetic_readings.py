@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from flexneedle.trace.columns import verdict_of
 from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -29,7 +30,9 @@ def with_readings(period, indicator=lambda _: 0.03, verdict="ok"):
         for number, time in zip(numbers, times, strict=True)
     ]
     told = tuple(
-        CheckedMeasurement(Measurement(frame.time, period.sample.x, period.sample.y, 0.0, frame), verdict)
+        CheckedMeasurement(
+            Measurement(frame.time, period.sample.x, period.sample.y, 0.0, frame), verdict_of(verdict)
+        )
         for frame in frames
     )
     return replace(period, readings=told)
@@ -37,4 +40,4 @@ def with_readings(period, indicator=lambda _: 0.03, verdict="ok"):
 
 def held(period, reason="field distorted: ref2 0.0812, limit 0.0547 (median over 1 s)"):
     """Return the period as one in which the needle was held."""
-    return replace(period, decision="held", verdict=reason)
+    return replace(period, decision="held", verdict=verdict_of(reason))

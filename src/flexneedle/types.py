@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from itertools import pairwise
 from typing import Any
 
@@ -140,12 +141,47 @@ class Plan:
         return int(np.count_nonzero(self.controls[:, 4] > 0.0))
 
 
+class VerdictKind(StrEnum):
+    """What a check of a measurement, or of the field that it was taken in, found."""
+
+    OK = "ok"
+    MISSING = "missing"
+    NOT_A_NUMBER = "not a number"
+    STALE = "stale"
+    INNOVATION = "innovation"
+    OUT_OF_PLANE = "out of plane"
+    JUMP = "jump"
+    FROZEN = "frozen"
+    FIELD_UNKNOWN = "field not known"
+    FIELD_DISTORTED = "field distorted"
+    FIELD_IN_DOUBT = "field in doubt"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a check found, and why: the value and its limit. Only one of kind OK has no reason."""
+
+    kind: VerdictKind = VerdictKind.OK
+    reason: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is wrong."""
+        return self.kind is VerdictKind.OK
+
+    def __str__(self) -> str:
+        return f"{self.kind}: {self.reason}" if self.reason else str(self.kind)
+
+
+OK = Verdict()
+
+
 @dataclass(frozen=True)
 class CheckedMeasurement:
     """A reading of the tracker, and "ok" or why it was rejected."""
 
     sample: Measurement
-    verdict: str
+    verdict: Verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +193,7 @@ class Period:
     command: Command
     applied: Command
     sample: Measurement
-    verdict: str  # "ok", or why the sample was not used
+    verdict: Verdict  # on the sample
     innovation: tuple[float, float]  # sample minus prediction (mm); 0, 0 without a usable sample
     estimate: Pose
     shape: Floats  # (n, 3) nodes of the estimated needle
@@ -209,7 +245,7 @@ class Insertion:
     @property
     def residual_mm(self) -> float:
         """The same by the tracker's last good sample, as the paper reports it; NaN without one."""
-        good = [period.sample for period in self.periods if period.verdict == "ok"]
+        good = [period.sample for period in self.periods if period.verdict.ok]
         return _distance((good[-1].x, good[-1].y) if good else None, self.target)
 
     @property

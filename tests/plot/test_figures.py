@@ -16,6 +16,7 @@ from flexneedle.plot.plans import plan_figure
 from flexneedle.plot.style import save
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
+from flexneedle.trace.columns import verdict_of
 from flexneedle.types import CheckedMeasurement, Insertion, Measurement
 from synthetic import GUIDE_X, blind, make_insertion, make_plan
 from synthetic_readings import frame_of, held, with_readings
@@ -306,7 +307,7 @@ def told(insertion, frames, verdicts=()):
     """Return the insertion with these frames as the readings of its first period."""
     verdicts = verdicts or ["ok"] * len(frames)
     readings = tuple(
-        CheckedMeasurement(Measurement(frame.time, 0.0, 0.0, 0.0, frame), verdict)
+        CheckedMeasurement(Measurement(frame.time, 0.0, 0.0, 0.0, frame), verdict_of(verdict))
         for frame, verdict in zip(frames, verdicts, strict=True)
     )
     return replace(insertion, periods=(replace(insertion.periods[0], readings=readings),))

@@ -14,6 +14,7 @@ from flexneedle.study.grid import load_study
 from flexneedle.study.journal import Journal
 from flexneedle.study.plans import Plans, plan_key
 from flexneedle.study.rows import RESULTS, Job, carry_out, make_plan
+from flexneedle.types import Verdict, VerdictKind
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +104,10 @@ def test_a_planner_that_fails_is_told_in_each_row(point, monkeypatch):
 def test_what_is_not_a_number_is_not_known(point, plan, monkeypatch):
     def insert(*args, **options):
         insertion = flexneedle.insert(*args, **options)
-        return replace(insertion, periods=tuple(replace(p, verdict="missing") for p in insertion.periods))
+        return replace(
+            insertion,
+            periods=tuple(replace(p, verdict=Verdict(VerdictKind.MISSING)) for p in insertion.periods),
+        )
 
     monkeypatch.setattr(rows, "insert", insert)
     row = only_row(Job(point, plan, "", ((0, 11),)))

@@ -16,11 +16,11 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from flexneedle.errors import InputError
-from flexneedle.trace.columns import COLUMNS, to_row
+from flexneedle.trace.columns import COLUMNS, to_row, verdict_of
 from flexneedle.trace.reader import read_trace
 from flexneedle.trace.topics import TOPICS
 from flexneedle.trace.writer import TraceWriter
-from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
+from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading, Verdict, VerdictKind
 from synthetic import blind, make_periods, make_plan
 
 PLAN = make_plan()
@@ -98,7 +98,7 @@ def test_a_blind_period_comes_back(tmp_path):
     assert to_row(again) == to_row(period)
     assert (again.sample.x, again.true_tip, again.true_strain_energy) == (None, None, None)
     assert again.true_stretch is None
-    assert (again.verdict, again.sample.time) == ("missing", period.sample.time)
+    assert (str(again.verdict), again.sample.time) == ("missing", period.sample.time)
 
 
 def test_the_smallest_stretch_of_the_true_tissue_is_a_column(trace_file):
@@ -131,15 +131,34 @@ def test_the_smallest_stretch_of_the_true_tissue_is_a_column(trace_file):
     ],
 )
 def test_readings_come_back_to_the_last_bit_with_their_verdicts(tmp_path, sample):
-    told = (CheckedMeasurement(sample, "ok"), CheckedMeasurement(sample, "frozen: the same in 4 readings"))
+    frozen = Verdict(VerdictKind.FROZEN, "the same in 4 readings")
+    told = (CheckedMeasurement(sample, Verdict()), CheckedMeasurement(sample, frozen))
     period = replace(PERIODS[3], readings=told, sample=sample)
     (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
     assert again.readings == told
     assert (again.sample.x, again.sample.z) == (sample.x, sample.z)
 
 
+@pytest.mark.parametrize(
+    ("text", "kind", "shown"),
+    [
+        ("innovation 2.91 mm, limit 2.4 mm", VerdictKind.INNOVATION, "innovation: 2.91 mm, limit 2.4 mm"),
+        ("ok", VerdictKind.OK, "ok"),
+        ("field distorted: ref1 0.09", VerdictKind.FIELD_DISTORTED, "field distorted: ref1 0.09"),
+    ],
+)
+def test_a_verdict_is_read_from_its_text_that_of_earlier_versions_too(text, kind, shown):
+    assert verdict_of(text).kind is kind
+    assert str(verdict_of(text)) == shown
+
+
+def test_a_text_that_is_no_verdict_is_refused():
+    with pytest.raises(ValueError, match="must begin with one of ok, missing, "):
+        verdict_of("fine")
+
+
 def test_a_period_has_its_own_readings_and_not_those_of_the_one_before(tmp_path):
-    told = replace(PERIODS[3], readings=(CheckedMeasurement(Measurement(0.1, 1.0, 2.0), "ok"),))
+    told = replace(PERIODS[3], readings=(CheckedMeasurement(Measurement(0.1, 1.0, 2.0), Verdict()),))
     first, second = read_trace(write(tmp_path / "trace.mcap", [told, PERIODS[4]])).periods
     assert (len(first.readings), len(second.readings)) == (1, 0)
 

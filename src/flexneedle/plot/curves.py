@@ -9,12 +9,13 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.types import Frame, Insertion, Plan
+from flexneedle.types import Frame, Insertion, Plan, VerdictKind
 
 Floats = NDArray[np.float64]
 
 _TIP = "tip"  # the sensor in the needle; all others of a frame are references
-_NOT_REMEMBERED = ("stale", "not a number")  # verdicts on readings that the monitor leaves out of its window
+# Verdicts on readings that the monitor leaves out of its window.
+_NOT_REMEMBERED = (VerdictKind.STALE, VerdictKind.NOT_A_NUMBER)
 
 
 @dataclass(frozen=True)
@@ -56,12 +57,12 @@ def true_path(insertion: Insertion) -> Floats:
 
 def good_samples(insertion: Insertion) -> Floats:
     """Return x, y (k, 2) of the readings that were used."""
-    return _points((p.sample.x, p.sample.y) for p in insertion.periods if p.verdict == "ok")
+    return _points((p.sample.x, p.sample.y) for p in insertion.periods if p.verdict.ok)
 
 
 def refused_samples(insertion: Insertion) -> Floats:
     """Return x, y (k, 2) of the readings that were there, but were not used."""
-    refused = (p.sample for p in insertion.periods if p.verdict != "ok")
+    refused = (p.sample for p in insertion.periods if not p.verdict.ok)
     return _points((sample.x, sample.y) for sample in refused if sample.x is not None)
 
 
@@ -120,7 +121,7 @@ def worst_indicator(insertion: Insertion, window: float) -> Floats:
 def _frames(insertion: Insertion) -> Iterator[Frame]:
     for period in insertion.periods:
         for judged in period.readings:
-            if judged.sample.frame is not None and not judged.verdict.startswith(_NOT_REMEMBERED):
+            if judged.sample.frame is not None and judged.verdict.kind not in _NOT_REMEMBERED:
                 yield judged.sample.frame
 
 

@@ -18,7 +18,6 @@ from flexneedle.errors import InputError, RunError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
 from flexneedle.rig.measuring import Observation, look_around, see
-from flexneedle.rig.monitor.rules import OK
 from flexneedle.rig.monitor.watch import Watch
 from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
@@ -158,7 +157,7 @@ def _periods(
         moved = sight.estimate.move(applied, begun, rig.clock.now())
         sight = see(scenario, moved, sight.watch, begun, rig.clock.now(), rig.tracker)
         clocks.append(time.perf_counter())
-        now, good = rig.clock.now(), sight.verdict == OK
+        now, good = rig.clock.now(), sight.verdict.ok
         held = _held(held, sight, now)
         if arrived_at is None and good and chosen.arrived(task, memory, sight.estimate):
             arrived_at = now
@@ -223,7 +222,7 @@ def _held(held: _Held | None, sight: Observation, now: float) -> _Held | None:
     """The hold after a verdict. Each of the two causes has a clock and a limit of its own; a clock stops while the
     needle is held for the other cause, and only a good verdict sets it back: alternating causes do not hold forever.
     """
-    if sight.verdict == OK:
+    if sight.verdict.ok:
         return None
     if held is None:
         return _Held(now, sight.field)

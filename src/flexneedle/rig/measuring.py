@@ -5,11 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.rig.monitor.rules import OK
 from flexneedle.rig.monitor.watch import Watch
 from flexneedle.rig.ports import TipTracker
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import VISIBLE, CheckedMeasurement, Measurement
+from flexneedle.types import OK, VISIBLE, CheckedMeasurement, Measurement, Verdict, VerdictKind
 
 _SURE = 3.0  # standard deviations by which a prediction may be off besides the limit
 _NO_SAMPLE = Measurement(0.0, None, None)
@@ -27,12 +26,12 @@ class Observation:
     watch: Watch
     readings: tuple[CheckedMeasurement, ...] = ()
     sample: Measurement = _NO_SAMPLE
-    verdict: str = OK
+    verdict: Verdict = OK
     field: bool = False
 
     def saw_after(self, time: float) -> bool:
         """Whether a good reading was taken after `time` (s)."""
-        return any(one.verdict == OK and one.sample.time > time - 1e-6 for one in self.readings)
+        return any(one.verdict.ok and one.sample.time > time - 1e-6 for one in self.readings)
 
     def limit(self, scenario: Scenario) -> float:
         """For how long (s) the needle may be held for such a verdict."""
@@ -52,11 +51,11 @@ def look_around(
     watch, readings = _judged(scenario, estimate, watch, samples, ages, now)
     watch, field = watch.look()
     newest = readings[-1]
-    verdict = field if field != OK else newest.verdict
+    verdict = newest.verdict if field.ok else field
     if verdict == newest.verdict and watch.only_missed(newest.sample, newest.verdict) is not None:
         verdict = OK
-    judged = _refused(readings, field) if field != OK else readings
-    return Observation(estimate, watch, judged, newest.sample, verdict, field != OK)
+    judged = _refused(readings, field) if not field.ok else readings
+    return Observation(estimate, watch, judged, newest.sample, verdict, not field.ok)
 
 
 def see(
@@ -76,16 +75,16 @@ def see(
     watch, readings = _judged(scenario, predicted, watch, samples, ages, now)
     newest = readings[-1]
     watch, field = watch.look()
-    if field != OK:
+    if not field.ok:
         return Observation(
             predicted.unseen(), watch, _refused(readings, field), newest.sample, field, field=True
         )
-    if (doubt := watch.doubt()) != OK:
+    if not (doubt := watch.doubt()).ok:
         readings = _refused(readings, doubt)
-    good = [reading.sample for reading in readings if reading.verdict == OK]
+    good = [reading.sample for reading in readings if reading.verdict.ok]
     corrected = predicted.observe(good)
     estimate = corrected if good else corrected.unseen()
-    if newest.verdict == OK:
+    if newest.verdict.ok:
         return Observation(estimate, watch, readings, newest.sample)
     if (before := watch.only_missed(newest.sample, newest.verdict)) is not None:
         return Observation(estimate, watch, readings, before)
@@ -99,17 +98,17 @@ def _without_news(
 
     status: of the tracker, which may know why it is silent.
     """
-    if watch.field != OK and watch.heard(now, stale_after):
+    if not watch.field.ok and watch.heard(now, stale_after):
         return Observation(predicted.unseen(), watch, verdict=watch.field, field=True)
     if (before := watch.last_good(now, stale_after)) is not None:
         return Observation(predicted.unseen(), watch, sample=before)
     why = "" if status == VISIBLE else f" ({status})"
-    return Observation(predicted.unseen(), watch, verdict=f"missing: no reading{why}")
+    return Observation(predicted.unseen(), watch, verdict=Verdict(VerdictKind.MISSING, f"no reading{why}"))
 
 
-def _refused(readings: Sequence[CheckedMeasurement], field: str) -> tuple[CheckedMeasurement, ...]:
+def _refused(readings: Sequence[CheckedMeasurement], field: Verdict) -> tuple[CheckedMeasurement, ...]:
     """The readings of a period in a field that is not good: none counts, also where nothing else is wrong with it."""
-    return tuple(replace(one, verdict=field) if one.verdict == OK else one for one in readings)
+    return tuple(replace(one, verdict=field) if one.verdict.ok else one for one in readings)
 
 
 def _judged(

@@ -6,9 +6,17 @@ Names end in their unit; numbers are exact (`repr`), so that a period comes back
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from flexneedle.types import CheckedMeasurement, Floats, Measurement, Period
+from flexneedle.types import CheckedMeasurement, Floats, Measurement, Period, Verdict, VerdictKind
 
 _Scalar = Callable[[str], Any]
+
+
+def verdict_of(text: object) -> Verdict:
+    """Return the verdict of a text that begins with its kind. Raises ValueError for another."""
+    found = next((kind for kind in VerdictKind if str(text).startswith(kind)), None)
+    if found is None:
+        raise ValueError(f"{text}: must begin with one of {', '.join(VerdictKind)}")
+    return Verdict(found, str(text).removeprefix(found).lstrip(": "))
 
 
 def _flag(value: object) -> bool:
@@ -31,7 +39,7 @@ _FIELDS: dict[str, tuple[tuple[str, _Scalar], ...]] = {
     "command": _command("command"),
     "applied": _command("applied"),
     "sample": tuple((f"sample_{part}", float) for part in ("time_s", "x_mm", "y_mm", "z_mm")),
-    "verdict": (("verdict", str),),
+    "verdict": (("verdict", verdict_of),),
     "innovation": (("innovation_x_mm", float), ("innovation_y_mm", float)),
     "estimate": _pose("estimate"),
     "base": _pose("base"),
@@ -78,7 +86,7 @@ def _cells(field: str, value: Any) -> Iterator[tuple[str, str]]:
     columns = _FIELDS[field]
     parts = value if isinstance(value, tuple) else (value,) * len(columns)
     for (name, kind), part in zip(columns, parts, strict=True):
-        yield name, "" if part is None else part if kind is str else repr(kind(part))
+        yield name, "" if part is None else str(part) if kind in (str, verdict_of) else repr(kind(part))
 
 
 def _value(field: str, row: Mapping[str, str]) -> Any:

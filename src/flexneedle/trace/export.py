@@ -30,7 +30,7 @@ def write_readings(file: IO[str], periods: Sequence[Period]) -> None:
     writer.writeheader()
     for period in periods:
         for judged in period.readings:
-            told = {"period": str(period.index), "verdict": judged.verdict}
+            told = {"period": str(period.index), "verdict": str(judged.verdict)}
             writer.writerow(told | to_values(judged))
 
 

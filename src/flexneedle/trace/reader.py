@@ -13,7 +13,7 @@ from mcap.records import Attachment, Channel, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader
 
 from flexneedle.errors import InputError
-from flexneedle.trace.columns import from_row
+from flexneedle.trace.columns import from_row, verdict_of
 from flexneedle.trace.messages import STORE, DiagnosticArray, DiagnosticStatus, points_of
 from flexneedle.trace.messages import Path as PathMessage
 from flexneedle.trace.readings import from_values
@@ -91,7 +91,9 @@ class _Collector:
             self._durations = {name[:-2]: float(value) for name, value in _pairs(message.status[0])}
         elif isinstance(message, DiagnosticArray) and topic == READINGS:
             told = message.status
-            self._readings = tuple(from_values(dict(_pairs(status)), status.message) for status in told)
+            self._readings = tuple(
+                from_values(dict(_pairs(status)), verdict_of(status.message)) for status in told
+            )
         elif isinstance(message, DiagnosticArray):
             row = dict(_pairs(message.status[0]))
             self.periods.append(from_row(row, self._shape, self._durations, self._readings))

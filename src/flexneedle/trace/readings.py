@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 
-from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
+from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading, Verdict
 
 _PLACE, _TURN = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
 
@@ -19,7 +19,7 @@ def to_values(judged: CheckedMeasurement) -> dict[str, str]:
     return values
 
 
-def from_values(values: Mapping[str, str], verdict: str) -> CheckedMeasurement:
+def from_values(values: Mapping[str, str], verdict: Verdict) -> CheckedMeasurement:
     """Return the reading of such a status; raises KeyError or ValueError where it is none."""
     x, y, z = (_number(values, key) for key in _PLACE)
     return CheckedMeasurement(Measurement(float(values["time_s"]), x, y, z, _frame(values)), verdict)

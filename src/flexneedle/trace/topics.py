@@ -101,9 +101,9 @@ def _tissue(period: Period) -> Iterator[tuple[str, Message]]:
 
 
 def _status(period: Period) -> Iterator[tuple[str, Message]]:
-    told = [Judgement(one.verdict, one.verdict == "ok", to_values(one)) for one in period.readings]
+    told = [Judgement(str(one.verdict), one.verdict.ok, to_values(one)) for one in period.readings]
     yield READINGS, judgements(period.time, "reading", told)
     durations = {f"{name}_s": repr(float(seconds)) for name, seconds in period.durations.items()}
     yield TIMING, diagnostics(period.time, "timing", durations)
-    good = period.verdict == "ok"
+    good = period.verdict.ok
     yield STATUS, diagnostics(period.time, "control", to_row(period), text=period.decision, good=good)

@@ -227,7 +227,7 @@ def test_a_short_replay_shows_the_first_frame_each_turn_of_the_verdict_and_the_l
     lines = out.splitlines()
     assert status == 0
     assert [line.split("frame ")[1].split()[0] for line in lines] == ["0", "20", "25", "30", "59"]
-    assert lines[0].endswith("verdict: field not known: looked at for 0.00 s, 0.5 s needed")
+    assert lines[0].endswith("verdict: field not known: observed for 0.00 s, 0.5 s needed")
     assert lines[1].endswith("frame 20  tip 1.00 2.00 3.00 mm I 0.0200  ref1 I 0.0200  verdict: ok")
     assert "tip missing" in lines[2]
     status, out, _ = run(capsys, "em", "watch", "--tracker", f"replay:{path}@9", "--references", "3")

@@ -42,7 +42,7 @@ def test_each_frame_is_shown_once_with_its_verdict():
     assert watch(Replay(frames(60), clock), clock, views.append) == 60
     assert [view.frame.number for view in views if view.is_new] == list(range(60))
     verdicts = [view.verdict for view in views if view.is_new]
-    assert all(verdict.startswith("field not known: looked at for") for verdict in verdicts[:20])
+    assert all(verdict.startswith("field not known: observed for") for verdict in verdicts[:20])
     assert set(verdicts[20:]) == {VISIBLE}
 
 
@@ -150,7 +150,7 @@ def test_a_field_that_was_distorted_stays_so_as_long_as_a_held_insertion_waits()
         )
         monitor, held = monitor.look()
         unseen = frame.readings["tip"].status != VISIBLE
-        assert view.verdict == ("tip: missing" if unseen else held), frame.number
+        assert view.verdict == ("tip: missing" if unseen else str(held)), frame.number
     last = [views[60 * (k + 1) - 1].verdict for k in range(len(script))]
     assert [said.split(":")[0] for said in last] == [
         *("ok", "field distorted", "field distorted", "field not known", "field distorted", "ok", "ok"),

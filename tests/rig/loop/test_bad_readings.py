@@ -38,7 +38,7 @@ FAULTS = {
     "missing: tracker sees no tip": blind,
     "not a number": garbled,
     "stale: 0.500 s old": old,
-    "innovation 3": jumping,
+    "innovation: 3": jumping,
 }
 
 
@@ -57,10 +57,10 @@ def between(first, last, fault):
 def test_bad_readings_hold_the_needle_until_good_ones_return(plan, verdict, fault, begin):
     tank = Tank(plan.bevel, spoil=between(begin, begin + 0.6, fault))
     done = run(plan, tank.rig())
-    bad = [period for period in done.periods if period.verdict != "ok"]
+    bad = [period for period in done.periods if str(period.verdict) != "ok"]
     first = bad[0].index
     assert [period.index for period in bad] == list(range(first, first + len(bad)))  # one spell
-    assert all(period.verdict[:11] == verdict[:11] for period in bad)
+    assert all(str(period.verdict)[:11] == verdict[:11] for period in bad)
     assert begin < bad[0].time < begin + 0.25
     assert begin + 0.55 < bad[-1].time < begin + 0.65
     # The period in which it was noticed had moved; then nothing moves, nor is anything assimilated.
@@ -76,7 +76,7 @@ def test_bad_readings_hold_the_needle_until_good_ones_return(plan, verdict, faul
         assert period.tip_load == bad[0].tip_load
     # With the first good reading it goes on, and arrives.
     resumed = done.periods[held[-1].index + 1]
-    assert held[-1].verdict == "ok"
+    assert str(held[-1].verdict) == "ok"
     assert resumed.command[0] > 0.0
     assert done.outcome == "done"
     assert done.true_error_mm < 1.0
@@ -87,7 +87,7 @@ def test_bad_readings_hold_the_needle_until_good_ones_return(plan, verdict, faul
 def test_after_the_hold_limit_the_run_ends_with_its_record(plan, verdict, fault):
     tank = Tank(plan.bevel, spoil=between(3.01, math.inf, fault))
     done = run(plan, tank.rig())
-    bad = [period for period in done.periods if period.verdict != "ok"]
+    bad = [period for period in done.periods if str(period.verdict) != "ok"]
     assert done.outcome == "held"
     assert done.reason.startswith("held for 1.0")
     assert verdict in done.reason
@@ -97,14 +97,14 @@ def test_after_the_hold_limit_the_run_ends_with_its_record(plan, verdict, fault)
     assert bad[-1].time - bad[0].time == pytest.approx(1.0, abs=1e-6)
     assert len(bad) == 41  # of 25 ms each after the first
     assert tank.moves[-1][0] < bad[0].time
-    assert done.periods[0].verdict == "ok"
+    assert str(done.periods[0].verdict) == "ok"
 
 
 @pytest.mark.parametrize("limit", [0.1, 0.5, 12.0])  # 12 s are more readings than periods of a run
 def test_hold_limit_is_the_scenarios(plan, limit):
     scenario = PHANTOM.with_values({"control.hold_limit_s": limit})
     done = run(plan, Tank(plan.bevel, spoil=between(1.0, math.inf, lost)).rig(), scenario)
-    bad = [period.time for period in done.periods if period.verdict != "ok"]
+    bad = [period.time for period in done.periods if str(period.verdict) != "ok"]
     assert bad[-1] - bad[0] == pytest.approx(limit, abs=READING)
 
 
@@ -121,11 +121,11 @@ def test_limits_of_age_and_innovation_are_the_scenarios(plan):
 
     def verdicts(scenario):
         done = run(plan, Tank(plan.bevel, spoil=between(8.0, 8.4, offset)).rig(), scenario)
-        return {period.verdict.split()[0] for period in done.periods}
+        return {str(period.verdict).split(":")[0] for period in done.periods}
 
     assert verdicts(PHANTOM) == {"ok"}
     assert verdicts(PHANTOM.with_values({"control.innovation_limit_mm": 0.3})) == {"ok", "innovation"}
-    assert verdicts(PHANTOM.with_values({"control.stale_after_s": 0.03})) == {"ok", "stale:"}
+    assert verdicts(PHANTOM.with_values({"control.stale_after_s": 0.03})) == {"ok", "stale"}
 
 
 @pytest.mark.parametrize("fault", [blind, garbled, jumping])
@@ -141,7 +141,7 @@ def test_a_bad_last_reading_holds_although_earlier_ones_were_good(plan, real):
     _, tank = real
     done = run(plan, Stage(loop(spoilt_tape(tank.tape, -1, garbled)), tank.applied).rig())
     assert done.outcome == "held"
-    assert done.periods[0].verdict == "not a number"
+    assert str(done.periods[0].verdict) == "not a number"
 
 
 def test_a_bad_reading_at_the_target_depth_does_not_count_as_arrival(plan, real):
@@ -150,7 +150,7 @@ def test_a_bad_reading_at_the_target_depth_does_not_count_as_arrival(plan, real)
     *way, last = tank.tape
     again = (replace(last[-1], time=last[-1].time + READING),)
     held = run(plan, Stage([*way, (garbled(last[-1]),), again], tank.applied).rig())
-    assert [period.verdict for period in held.periods[-2:]] == ["not a number", "ok"]
+    assert [str(period.verdict) for period in held.periods[-2:]] == ["not a number", "ok"]
     assert len(held.periods) == len(done.periods) + 1
     assert held.outcome == "done"
     assert held.periods[-1].command == STILL

@@ -45,7 +45,7 @@ def test_record_is_complete_for_every_period(plan, real):
     assert [period.applied for period in moving(done)] == tank.applied
     for period, batch in zip(done.periods, tank.tape, strict=True):
         assert period.sample == batch[-1]
-        assert period.verdict == "ok"
+        assert str(period.verdict) == "ok"
         np.testing.assert_allclose(
             period.applied, period.command, atol=0.01
         )  # but for the motors' resolution

@@ -6,21 +6,37 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexneedle.rig.monitor import rules
-from flexneedle.rig.monitor.rules import OK
-from flexneedle.types import Frame, Measurement, SensorReading
+from flexneedle.rig.monitor import rules as judged
+from flexneedle.types import Frame, Measurement, SensorReading, Verdict, VerdictKind
 
+OK = "ok"
+
+
+class Texts:
+    """The rules, whose verdicts come as text."""
+
+    def __getattr__(self, name):
+        rule = getattr(judged, name)
+
+        def text(*given, **named):
+            found = rule(*given, **named)
+            return str(found) if isinstance(found, Verdict) else found
+
+        return text
+
+
+rules = Texts()
 WAYS = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (0.6, 0.8)]
 
 
 def test_the_first_bad_verdict_counts_and_no_rule_behind_it_is_asked():
     def verdicts():
-        yield OK
-        yield "bad"
+        yield Verdict()
+        yield Verdict(VerdictKind.STALE, "bad")
         raise AssertionError
 
-    assert rules.first_bad(verdicts()) == "bad"
-    assert rules.first_bad([OK, OK]) == rules.first_bad([]) == OK == "ok"
+    assert rules.first_bad(verdicts()) == "stale: bad"
+    assert rules.first_bad([Verdict(), Verdict()]) == rules.first_bad([]) == OK
 
 
 @pytest.mark.parametrize(
@@ -79,7 +95,7 @@ def test_innovation_is_the_distance_and_its_limit_is_still_believed(way):
         return rules.innovation((30.0 + distance * way[0], 1.0 + distance * way[1]), (30.0, 1.0), 2.0)
 
     assert at(2.0 - 1e-12) == OK
-    assert at(5.0) == "innovation 5.00 mm, limit 2 mm"
+    assert at(5.0) == "innovation: 5.00 mm, limit 2 mm"
     assert at(2.0 + 1e-6).startswith("innovation")
 
 
@@ -102,13 +118,13 @@ def test_a_jump_is_faster_than_any_tip(way):
         )
 
     assert after(2.99) == OK
-    assert after(3.01) == "jump of 3.01 mm, limit 3.00 mm"
+    assert after(3.01) == "jump: 3.01 mm, limit 3.00 mm"
     assert rules.jump(before, None, 20.0, 1.0) == OK
 
 
 def test_a_jump_out_of_the_plane_counts_where_both_readings_know_it():
     before = Measurement(1.0, 30.0, 1.0, 0.0)
-    assert rules.jump(Measurement(1.1, 30.0, 1.0, 4.0), before, 20.0, 1.0).startswith("jump of 4.00 mm")
+    assert rules.jump(Measurement(1.1, 30.0, 1.0, 4.0), before, 20.0, 1.0).startswith("jump: 4.00 mm")
     assert rules.jump(Measurement(1.1, 30.0, 1.0), before, 20.0, 1.0) == OK
 
 
@@ -129,7 +145,7 @@ def test_an_indicator_is_one_of_a_sensor_that_is_seen_and_a_number_that_one_can_
 
 
 def test_a_field_that_was_looked_at_for_too_short_is_not_known():
-    assert rules.too_short(0.475, 0.5, 3) == "field not known: looked at for 0.47 s, 0.5 s needed"
+    assert rules.too_short(0.475, 0.5, 3) == "field not known: observed for 0.47 s, 0.5 s needed"
     assert rules.too_short(0.5, 0.5, 3) == rules.too_short(0.0, 0.5, 0) == OK
 
 

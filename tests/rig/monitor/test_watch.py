@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import pytest
 
-from flexneedle.rig.monitor.rules import OK
 from flexneedle.rig.monitor.watch import Watch
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import Frame, Measurement, SensorReading
+from flexneedle.types import Frame, Measurement, SensorReading, Verdict, VerdictKind
 
 RATE = 40.0
 SETTINGS = MonitorSettings()
-MISSED = "missing: tracker sees no tip (out of volume)"
+OK = "ok"
+MISSED = Verdict(VerdictKind.MISSING, "tracker sees no tip (out of volume)")
 
 
 def frame(time, indicators=(0.02, 0.02, 0.02), tip=(1.0, 2.0, 3.0)):
@@ -26,27 +26,27 @@ def frame(time, indicators=(0.02, 0.02, 0.02), tip=(1.0, 2.0, 3.0)):
 
 
 def told(watch, indicators, begin, count):
-    """The watch after `count` readings at rest, and its verdict on the field after each."""
+    """The watch after `count` readings at rest, and its verdict on the field after each, as text."""
     verdicts = []
     for k in range(count):
         time = begin + k / RATE
         sample = Measurement(time, 30.0 + 1e-6 * k, 1.0, 0.0, frame(time, indicators))
         watch, verdict = watch.take(sample, (30.0, 1.0), time, 0.3, 2.0)
-        assert verdict == OK
+        assert verdict.ok
         watch, field = watch.look()
-        verdicts.append(field)
+        verdicts.append(str(field))
     return watch, verdicts
 
 
 def one(sample, watch=None, now=None, predicted=(30.0, 1.0)):
     watch = watch or Watch(SETTINGS)
-    return watch.take(sample, predicted, sample.time if now is None else now, 0.3, 2.0)[1]
+    return str(watch.take(sample, predicted, sample.time if now is None else now, 0.3, 2.0)[1])
 
 
 def test_a_clean_field_lets_the_needle_move_once_half_a_window_of_it_was_seen():
     _, verdicts = told(Watch(SETTINGS), (0.02, 0.03, 0.054), 0.0, 100)
-    assert verdicts[0] == "field not known: looked at for 0.00 s, 0.5 s needed"
-    assert verdicts[19] == "field not known: looked at for 0.47 s, 0.5 s needed"
+    assert verdicts[0] == "field not known: observed for 0.00 s, 0.5 s needed"
+    assert verdicts[19] == "field not known: observed for 0.47 s, 0.5 s needed"
     assert set(verdicts[20:]) == {OK}
 
 
@@ -54,7 +54,7 @@ def test_a_gap_between_frames_is_no_time_that_was_looked_at():
     """0.35 s of frames, 0.65 s of none: as each new frame comes, one of before is a second old."""
     watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 15)
     _, verdicts = told(watch, (0.02, 0.02, 0.02), 1.0, 24)
-    assert verdicts[1] == "field not known: looked at for 0.35 s, 0.5 s needed"
+    assert verdicts[1] == "field not known: observed for 0.35 s, 0.5 s needed"
     known = [verdict == OK for verdict in verdicts]
     assert known == [False] * 20 + [True] * 4
 
@@ -65,7 +65,7 @@ def test_after_silence_in_a_distorted_field_one_clean_frame_is_not_enough():
     _, verdicts = told(watch, (0.052, 0.02, 0.02), 2.5, 30)
     assert verdicts[-1] == "field distorted: ref1 0.0520, to fall below 0.0492 (median over 1 s)"
     _, verdicts = told(watch, (0.02, 0.02, 0.02), 2.5, 30)
-    assert all(verdict.startswith("field not known: looked at for") for verdict in verdicts[:20])
+    assert all(verdict.startswith("field not known: observed for") for verdict in verdicts[:20])
     assert verdicts[-1] == OK
 
 
@@ -95,7 +95,7 @@ def test_references_out_of_volume_are_not_seen_whatever_they_tell():
             k / RATE, k, {"tip": SensorReading((1.0, 2.0, 3.0)), "ref1": ill, "ref2": ill, "ref3": ill}
         )
         watch, _ = watch.take(Measurement(k / RATE, 30.0, 1.0, 0.0, told_by), (30.0, 1.0), k / RATE, 0.3, 2.0)
-    assert watch.look()[1] == (
+    assert str(watch.look()[1]) == (
         "field not known: 0 of 3 reference sensors seen within 1 s "
         "(ref1: out of volume, ref2: out of volume, ref3: out of volume)"
     )
@@ -117,7 +117,7 @@ def test_no_other_sensor_stands_in_for_a_reference_but_each_may_tell_of_distorti
             watch, _ = watch.take(
                 Measurement(k / RATE, 30.0, 1.0, 0.0, told_by), (30.0, 1.0), k / RATE, 0.3, 2.0
             )
-        return watch.look()[1]
+        return str(watch.look()[1])
 
     seen, lost = SensorReading((0.0, 0.0, 0.0), indicator=0.01), SensorReading(None, status="out of volume")
     assert verdict(0.01, seen) == OK
@@ -143,7 +143,7 @@ def still(places, step, settings=SETTINGS):
     for k, x in enumerate(places):
         sample = Measurement(k / RATE, x, None if x is None else 1.0)
         watch, verdict = watch.take(sample, (30.0 + step * k, 1.0), k / RATE, 0.3, 1e9)
-    return verdict
+    return str(verdict)
 
 
 @pytest.mark.parametrize(
@@ -213,8 +213,8 @@ def test_as_many_references_are_needed_as_the_scenario_says():
 
 def test_a_tracker_that_tells_only_the_tip_is_not_held_against():
     watch, verdict = Watch(SETTINGS).take(Measurement(0.0, 30.0, 1.0), (30.0, 1.0), 0.0, 0.3, 2.0)
-    assert verdict == OK
-    assert watch.look()[1] == OK
+    assert verdict.ok
+    assert watch.look()[1].ok
 
 
 @pytest.mark.parametrize(
@@ -227,7 +227,7 @@ def test_a_tracker_that_tells_only_the_tip_is_not_held_against():
             "missing: tracker sees no tip (out of volume)",
         ),
         (Measurement(1.0, 30.0, 1.0, 6.0), "out of plane: 6.00 mm, limit 5 mm"),
-        (Measurement(1.0, 33.0, 1.0), "innovation 3.00 mm, limit 2 mm"),
+        (Measurement(1.0, 33.0, 1.0), "innovation: 3.00 mm, limit 2 mm"),
     ],
 )
 def test_each_fault_of_a_reading_is_named(sample, verdict):
@@ -238,7 +238,7 @@ def test_a_frame_told_again_is_not_believed_and_not_remembered():
     watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
     again = Measurement(0.075, 30.0, 1.0, 0.0, frame(2 / RATE))
     after, verdict = watch.take(again, (30.0, 1.0), 0.075, 0.3, 2.0)
-    assert verdict == "stale: frame 2 after frame 2"
+    assert str(verdict) == "stale: frame 2 after frame 2"
     assert after is watch
 
 
@@ -250,11 +250,11 @@ def test_a_jump_counts_from_the_last_good_reading():
     watch, _ = Watch(SETTINGS).take(Measurement(1.0, 30.0, 1.0), (30.0, 1.0), 1.0, 0.3, 2.0)
     far = Measurement(1.025, 31.9, 1.0)
     watch, verdict = watch.take(far, (30.0, 1.0), 1.025, 0.3, 2.0)
-    assert verdict == "jump of 1.90 mm, limit 1.50 mm"
+    assert str(verdict) == "jump: 1.90 mm, limit 1.50 mm"
     assert watch.good == Measurement(1.0, 30.0, 1.0)
     assert one(Measurement(1.05, 31.9, 1.0), watch) == OK  # so far it may have come by now
     # Near the jump, and still too far from where it was last well seen.
-    assert one(Measurement(1.03, 31.8, 1.0), watch) == "jump of 1.80 mm, limit 1.60 mm"
+    assert one(Measurement(1.03, 31.8, 1.0), watch) == "jump: 1.80 mm, limit 1.60 mm"
 
 
 def test_a_frozen_sensor_is_seen_although_the_map_to_the_tip_changes():
@@ -262,7 +262,7 @@ def test_a_frozen_sensor_is_seen_although_the_map_to_the_tip_changes():
     for k in range(4):
         sample = Measurement(k / RATE, 30.0 + 0.01 * k, 1.0, 0.0, frame(k / RATE))
         watch, verdict = watch.take(sample, (30.0 + 0.125 * k, 1.0), sample.time, 0.3, 2.0)
-    assert verdict == "frozen: the same in 4 readings while the tip should have moved 0.38 mm"
+    assert str(verdict) == "frozen: the same in 4 readings while the tip should have moved 0.38 mm"
 
 
 @pytest.mark.parametrize("time", [1e6, -50.0, float("nan")])
@@ -270,9 +270,9 @@ def test_a_reading_of_another_time_changes_no_judgement_of_the_field(time):
     watch, _ = told(Watch(SETTINGS), (0.2, 0.02, 0.02), 0.0, 40)
     sample = Measurement(time, 30.0, 1.0, 0.0, replace(frame(1.0, (0.01, 0.01, 0.01)), number=1000))
     after, verdict = watch.take(sample, (30.0, 1.0), 1.0, 0.3, 2.0)
-    assert verdict.startswith(("stale", "not a number"))
+    assert str(verdict).startswith(("stale", "not a number"))
     assert after is watch
-    assert after.look()[1].startswith("field distorted")
+    assert str(after.look()[1]).startswith("field distorted")
 
 
 def test_the_last_good_reading_counts_until_it_is_old_and_only_of_frames():
@@ -294,10 +294,10 @@ def test_a_tip_lost_in_a_few_frames_is_not_held_against_the_tracker():
     assert lost(last.time + 0.125) is None
     assert lost(last.time + 0.1, Watch(SETTINGS)) is None  # never seen
     assert watch.only_missed(Measurement(last.time + 0.025, None, None), MISSED) is None  # no frame
-    assert watch.only_missed(last, OK) is None  # not lost
+    assert watch.only_missed(last, Verdict()) is None  # not lost
     again = Measurement(last.time, None, None, None, frame(last.time, tip=None))
-    for verdict in ("stale: frame 2 after frame 2", "stale: 0.450 s old, limit 0.3 s", "not a number"):
-        assert watch.only_missed(again, verdict) is None  # it tells nothing of the tip
+    for kind in (VerdictKind.STALE, VerdictKind.NOT_A_NUMBER):
+        assert watch.only_missed(again, Verdict(kind, "of this kind")) is None  # it tells nothing of the tip
     off = replace(watch, settings=SETTINGS.model_copy(update={"enabled": False}))
     assert lost(last.time + 0.025, off) is None
 

@@ -87,7 +87,7 @@ def judge_field(
     """
     field = field_verdict(frames, settings, distorted)
     ill = "; ".join(f"{name}: {r.status}" for name, r in frames[-1].readings.items() if r.status != VISIBLE)
-    return ill or field, is_distorted(field, distorted)
+    return ill or str(field), is_distorted(field, distorted)
 
 
 def field_judge(references: int | None = None) -> Judge:

@@ -9,77 +9,86 @@ from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 
 from flexneedle.rig.tracking.table import TIP
-from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading, is_reference
+from flexneedle.types import (
+    OK,
+    VISIBLE,
+    Frame,
+    Measurement,
+    SensorReading,
+    Verdict,
+    VerdictKind,
+    is_reference,
+)
 
 Place = tuple[float, ...]
 
 
-OK = "ok"
-MISSING = "missing"
-"""How a verdict begins that there is no tip to judge."""
-DISTORTED = "field distorted"
-"""How a verdict begins that a reference sensor's indicator is above the limit."""
-
-
-def first_bad(verdicts: Iterable[str]) -> str:
+def first_bad(verdicts: Iterable[Verdict]) -> Verdict:
     """Return the first verdict that is not OK, or OK; the rest of a generator is not looked at."""
-    return next((verdict for verdict in verdicts if verdict != OK), OK)
+    return next((verdict for verdict in verdicts if not verdict.ok), OK)
 
 
-def missing(sample: Measurement) -> str:
+def missing(sample: Measurement) -> Verdict:
     """A reading in which the tracker does not see the tip; says why if the tracker does."""
     if sample.x is not None and sample.y is not None:
         return OK
     told = None if sample.frame is None else sample.frame.readings.get(TIP)
     if told is None:
-        return f"{MISSING}: tracker sees no tip"
+        return Verdict(VerdictKind.MISSING, "tracker sees no tip")
     why = told.status if told.status != VISIBLE else "no place" if told.position is None else "no orientation"
-    return f"{MISSING}: tracker sees no tip ({why})"
+    return Verdict(VerdictKind.MISSING, f"tracker sees no tip ({why})")
 
 
-def not_a_number(sample: Measurement) -> str:
+def not_a_number(sample: Measurement) -> Verdict:
     """Time or place is not finite."""
     values = (sample.time, sample.x, sample.y, sample.z)
-    return OK if all(math.isfinite(value) for value in values if value is not None) else "not a number"
+    finite = all(math.isfinite(value) for value in values if value is not None)
+    return OK if finite else Verdict(VerdictKind.NOT_A_NUMBER)
 
 
-def stale(time: float, now: float, limit: float) -> str:
+def stale(time: float, now: float, limit: float) -> Verdict:
     """A reading older than `limit`, or dated so far ahead (s)."""
     if now - time > limit:
-        return f"stale: {now - time:.3f} s old, limit {limit:g} s"
+        return Verdict(VerdictKind.STALE, f"{now - time:.3f} s old, limit {limit:g} s")
     if time > now + limit:
-        return f"stale: dated {time - now:.3f} s ahead"
+        return Verdict(VerdictKind.STALE, f"dated {time - now:.3f} s ahead")
     return OK
 
 
-def repeated(frame: Frame | None, before: Frame | None) -> str:
+def repeated(frame: Frame | None, before: Frame | None) -> Verdict:
     """A frame that was told before, or one that comes after a later one, whatever its time stamp says."""
     if frame is None or before is None or frame.number > before.number:
         return OK
-    return f"stale: frame {frame.number} after frame {before.number}"
+    return Verdict(VerdictKind.STALE, f"frame {frame.number} after frame {before.number}")
 
 
-def innovation(place: tuple[float, float], predicted: tuple[float, float], limit: float) -> str:
+def innovation(place: tuple[float, float], predicted: tuple[float, float], limit: float) -> Verdict:
     """A tip further from the model's than `limit` (mm)."""
     distance = math.hypot(place[0] - predicted[0], place[1] - predicted[1])
-    return OK if distance <= limit else f"innovation {distance:.2f} mm, limit {limit:g} mm"
+    if distance <= limit:
+        return OK
+    return Verdict(VerdictKind.INNOVATION, f"{distance:.2f} mm, limit {limit:g} mm")
 
 
-def out_of_plane(z: float | None, limit: float) -> str:
+def out_of_plane(z: float | None, limit: float) -> Verdict:
     """A tip further than `limit` (mm) from the plane of the insertion; OK where the tracker does not know."""
-    return OK if z is None or abs(z) <= limit else f"out of plane: {z:.2f} mm, limit {limit:g} mm"
+    if z is None or abs(z) <= limit:
+        return OK
+    return Verdict(VerdictKind.OUT_OF_PLANE, f"{z:.2f} mm, limit {limit:g} mm")
 
 
-def jump(sample: Measurement, before: Measurement | None, speed: float, margin: float) -> str:
+def jump(sample: Measurement, before: Measurement | None, speed: float, margin: float) -> Verdict:
     """A tip that moved faster than `speed` (mm/s) since the last good reading, with `margin` (mm) for noise."""
     if before is None:
         return OK
     moved = math.dist(*_shared(sample, before))
     limit = speed * abs(sample.time - before.time) + margin
-    return OK if moved <= limit else f"jump of {moved:.2f} mm, limit {limit:.2f} mm"
+    if moved <= limit:
+        return OK
+    return Verdict(VerdictKind.JUMP, f"{moved:.2f} mm, limit {limit:.2f} mm")
 
 
-def frozen(count: int, first: tuple[float, float], now: tuple[float, float], travel_limit: float) -> str:
+def frozen(count: int, first: tuple[float, float], now: tuple[float, float], travel_limit: float) -> Verdict:
     """A reading the same to the last digit, `count` times, while the model's tip travelled over `travel_limit` (mm).
 
     first, now: the model's tip (mm) at the first of these readings and at the newest.
@@ -87,7 +96,8 @@ def frozen(count: int, first: tuple[float, float], now: tuple[float, float], tra
     travel = math.dist(first, now)
     if travel <= travel_limit:
         return OK
-    return f"frozen: the same in {count} readings while the tip should have moved {travel:.2f} mm"
+    reason = f"the same in {count} readings while the tip should have moved {travel:.2f} mm"
+    return Verdict(VerdictKind.FROZEN, reason)
 
 
 def tells_indicator(reading: SensorReading) -> bool:
@@ -97,16 +107,16 @@ def tells_indicator(reading: SensorReading) -> bool:
     return seen and indicator is not None and 0.0 <= indicator < math.inf
 
 
-def too_short(span: float, least: float, needed: int) -> str:
+def too_short(span: float, least: float, needed: int) -> Verdict:
     """Reference sensors, if any are `needed`, were looked at for less than `least` (s)."""
     if needed == 0 or span >= least - 1e-9:
         return OK
-    return f"field not known: looked at for {span:.2f} s, {least:g} s needed"
+    return Verdict(VerdictKind.FIELD_UNKNOWN, f"observed for {span:.2f} s, {least:g} s needed")
 
 
 def unseen_references(
     indicators: Mapping[str, Sequence[float]], needed: int, window: float, newest: Mapping[str, SensorReading]
-) -> str:
+) -> Verdict:
     """Fewer than `needed` reference sensors told an indicator within the window (s).
 
     newest: what the tracker last said of its sensors, by name; it may say what ails them. No other sensor stands in
@@ -119,14 +129,14 @@ def unseen_references(
     ill = [f"{name}: {newest[name].status}" for name in others if newest[name].status != VISIBLE]
     nameless = [name for name in others if not is_reference(name)]
     why = [*ill, *([f"no reference by its name: {', '.join(nameless)}"] if nameless else [])]
-    return f"field not known: {told} of {needed} reference sensors seen within {window:g} s" + (
-        f" ({', '.join(why)})" if why else ""
-    )
+    detail = f" ({', '.join(why)})" if why else ""
+    seen = f"{told} of {needed} reference sensors seen within {window:g} s{detail}"
+    return Verdict(VerdictKind.FIELD_UNKNOWN, seen)
 
 
 def distortion(
     indicators: Mapping[str, Sequence[float]], limit: float, window: float, held: bool = False
-) -> str:
+) -> Verdict:
     """The median indicator of a sensor over the window (s) is above the limit; names the worst one.
 
     held: whether it was above before, so that the limit is the lower one, for going on.
@@ -135,15 +145,17 @@ def distortion(
     if value <= limit:
         return OK
     rule = "to fall below" if held else "limit"
-    return f"{DISTORTED}: {name} {value:.4f}, {rule} {limit:.4f} (median over {window:g} s)"
+    reason = f"{name} {value:.4f}, {rule} {limit:.4f} (median over {window:g} s)"
+    return Verdict(VerdictKind.FIELD_DISTORTED, reason)
 
 
-def doubtful(indicators: Mapping[str, Sequence[float]], limit: float, window: float) -> str:
+def doubtful(indicators: Mapping[str, Sequence[float]], limit: float, window: float) -> Verdict:
     """The same over a window (s) too short to hold the needle for: what is measured now is better not learnt from."""
     name, value = _worst(indicators)
     if value <= limit:
         return OK
-    return f"field in doubt: {name} {value:.4f}, limit {limit:.4f} (median over {window:g} s)"
+    reason = f"{name} {value:.4f}, limit {limit:.4f} (median over {window:g} s)"
+    return Verdict(VerdictKind.FIELD_IN_DOUBT, reason)
 
 
 def _worst(indicators: Mapping[str, Sequence[float]]) -> tuple[str, float]:

@@ -6,13 +6,12 @@ from itertools import pairwise
 from statistics import median
 
 from flexneedle.rig.monitor import rules
-from flexneedle.rig.monitor.rules import OK
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import Frame, Measurement
+from flexneedle.types import OK, Frame, Measurement, Verdict, VerdictKind
 
 
-def field_verdict(frames: Sequence[Frame], settings: MonitorSettings, distorted: bool = False) -> str:
+def field_verdict(frames: Sequence[Frame], settings: MonitorSettings, distorted: bool = False) -> Verdict:
     """Judge the field by the sensors of frames, oldest first: by all but the tip, and enough of them references.
 
     The frames of the last window count, and a sensor that told an indicator in half of them: a median over a few
@@ -31,9 +30,9 @@ def field_verdict(frames: Sequence[Frame], settings: MonitorSettings, distorted:
     )
 
 
-def is_distorted(verdict: str, before: bool) -> bool:
+def is_distorted(verdict: Verdict, before: bool) -> bool:
     """Whether the field is to be held for distorted after a verdict: once it was, until it is known to be good."""
-    return verdict.startswith(rules.DISTORTED) or (before and verdict != OK)
+    return verdict.kind is VerdictKind.FIELD_DISTORTED or (before and not verdict.ok)
 
 
 def _looked_at(frames: Sequence[Frame]) -> float:
@@ -76,12 +75,12 @@ class Watch:
     recent: tuple[_Seen, ...] = ()
     still: tuple[_Seen, int] | None = None
     good: Measurement | None = None
-    field: str = OK
+    field: Verdict = OK
     distorted: bool = False
 
     def take(
         self, sample: Measurement, predicted: tuple[float, float], now: float, oldest: float, furthest: float
-    ) -> "tuple[Watch, str]":
+    ) -> "tuple[Watch, Verdict]":
         """Take in a reading; return what is wrong with it, or OK. One of another time is not remembered.
 
         predicted: the model's tip (mm) at its time; now (s); oldest: age (s), furthest: distance (mm) from the
@@ -95,14 +94,14 @@ class Watch:
                 rules.stale(sample.time, now, oldest),
             )
         )
-        if verdict != OK:
+        if not verdict.ok:
             return self, verdict
         since = sample.time - self.settings.indicator_window_s + 1e-9
         kept = tuple(seen for seen in self.recent if seen.sample.time > since)
         seen = _Seen(sample, predicted)
         watch = replace(self, recent=(*kept, seen), still=self._still(seen))
         verdict = rules.first_bad(watch._faults(sample, predicted, furthest))
-        return (replace(watch, good=sample) if verdict == OK else watch), verdict
+        return (replace(watch, good=sample) if verdict.ok else watch), verdict
 
     def heard(self, now: float, oldest: float) -> bool:
         """Whether the tracker told anything, good or not, that is not older than `oldest` (s)."""
@@ -115,17 +114,17 @@ class Watch:
             return None
         return good
 
-    def only_missed(self, newest: Measurement, verdict: str) -> Measurement | None:
+    def only_missed(self, newest: Measurement, verdict: Verdict) -> Measurement | None:
         """Return the last good reading if the tip was lost in the newest frame, but not for long; None otherwise.
 
         verdict: on that frame; one that is stale itself, or dated nowhere, tells nothing of the tip. Only of a tracker
         that tells frames: it is known to be alive, and to look.
         """
-        if newest.frame is None or not verdict.startswith(rules.MISSING):
+        if newest.frame is None or verdict.kind is not VerdictKind.MISSING:
             return None
         return self.last_good(newest.time, self.settings.lost_after_s)
 
-    def look(self) -> "tuple[Watch, str]":
+    def look(self) -> "tuple[Watch, Verdict]":
         """Judge the field by the reference sensors; return why the needle may not move, or OK.
 
         A tracker that tells nothing but the tip is not held against: there is nothing to judge.
@@ -136,7 +135,7 @@ class Watch:
         verdict = field_verdict(frames, self.settings, self.distorted)
         return replace(self, field=verdict, distorted=is_distorted(verdict, self.distorted)), verdict
 
-    def doubt(self) -> str:
+    def doubt(self) -> Verdict:
         """Return why what is measured now is not to be learnt from, although the field holds no needle yet, or OK.
 
         The median over a second needs half of one to tell that a plate came near; the readings of that time are bent.
@@ -150,7 +149,9 @@ class Watch:
     def _frames(self) -> list[Frame]:
         return [seen.sample.frame for seen in self.recent if seen.sample.frame is not None]
 
-    def _faults(self, sample: Measurement, predicted: tuple[float, float], furthest: float) -> Iterator[str]:
+    def _faults(
+        self, sample: Measurement, predicted: tuple[float, float], furthest: float
+    ) -> Iterator[Verdict]:
         settings = self.settings
         yield rules.missing(sample)
         if sample.x is not None and sample.y is not None:
