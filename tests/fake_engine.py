@@ -10,7 +10,7 @@ import numpy as np
 
 from flexneedle.control.methods import METHODS
 from flexneedle.errors import RunError
-from flexneedle.types import Insertion
+from flexneedle.types import Insertion, Outcome
 from synthetic import make_periods, make_plan
 
 
@@ -48,7 +48,7 @@ def insert(
         if stop is not None and len(periods) == stop[0]:
             stop[1]()
     reason = "" if outcome == "done" else "no sample for 1.00 s"
-    return Insertion(plan, seed, tuple(periods), outcome, reason, controller, phantom)
+    return Insertion(plan, seed, tuple(periods), Outcome(outcome), reason, controller, phantom)
 
 
 def install(setattr_, **options):

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from flexneedle.types import Insertion, Measurement, Period, Plan, Verdict, VerdictKind
+from flexneedle.types import Action, Insertion, Measurement, Outcome, Period, Plan, Verdict, VerdictKind
 
 START, LENGTH, GUIDE_X, STEP = -28.5, 150.0, -41.0, 1.0
 TURN_AT = 45  # the step that turns the bevel
@@ -75,7 +75,8 @@ def make_periods(plan, miss=0.06, seed=0):
             shape=plan.shapes[k + 1] + [0.0, off, 0.0], base=(tip[0] - LENGTH, 0.0, 0.0),
             guide=plan.guide[k + 1] + 0.3 * np.sin(0.2 * k), bevel=side,
             strain_energy=plan.strain_energy[k + 1] * 1.1, tip_load=0.01 * off,
-            path=tuple(tip), cost=1.5 - inside, spread=0.05, decision="nearer path" if flip < 0 else "turn",
+            path=tuple(tip), cost=1.5 - inside, spread=0.05,
+            action=Action.MOVE, decision="nearer path" if flip < 0 else "turn",
             true_tip=true, true_strain_energy=plan.strain_energy[k + 1] * 1.25,
             true_stretch=float(1.0 - 0.17 * inside**2),
             durations={"observe": 0.001, "decide": 0.004, "total": 0.0051 + 1e-5 * k},
@@ -85,7 +86,7 @@ def make_periods(plan, miss=0.06, seed=0):
 def make_insertion(plan=None, miss=0.06, seed=0, outcome="done", reason="", periods=None):
     """Return an insertion along the plan; `periods` keeps only so many."""
     plan = plan or make_plan(seed=seed)
-    return Insertion(plan, seed, tuple(make_periods(plan, miss, seed))[:periods], outcome, reason)
+    return Insertion(plan, seed, tuple(make_periods(plan, miss, seed))[:periods], Outcome(outcome), reason)
 
 
 def blind(period):

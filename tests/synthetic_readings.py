@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from flexneedle.trace.columns import verdict_of
-from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
+from flexneedle.types import Action, CheckedMeasurement, Frame, Measurement, SensorReading
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 FRAMES = 8  # in a period of 0.2 s
@@ -40,4 +40,4 @@ def with_readings(period, indicator=lambda _: 0.03, verdict="ok"):
 
 def held(period, reason="field distorted: ref2 0.0812, limit 0.0547 (median over 1 s)"):
     """Return the period as one in which the needle was held."""
-    return replace(period, decision="held", verdict=verdict_of(reason))
+    return replace(period, action=Action.HOLD, decision="held", verdict=verdict_of(reason))

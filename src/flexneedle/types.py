@@ -176,6 +176,24 @@ class Verdict:
 OK = Verdict()
 
 
+class Action(StrEnum):
+    """What the needle did in a control period."""
+
+    MEASURE = "measure"  # it waited for the first readings
+    MOVE = "move"
+    REST = "rest"  # it waited for readings of where it is
+    HOLD = "hold"  # it was held: by the verdict on its readings, or since no path leads to the target
+
+
+class Outcome(StrEnum):
+    """How an insertion ended."""
+
+    DONE = "done"
+    HELD = "held"  # bad readings, or no path to the target
+    FAILED = "failed"
+    INTERRUPTED = "interrupted"
+
+
 @dataclass(frozen=True)
 class CheckedMeasurement:
     """A reading of the tracker, and "ok" or why it was rejected."""
@@ -205,7 +223,8 @@ class Period:
     path: Pose  # planned pose at the estimated tip's depth
     cost: float  # of the chosen command, as predicted
     spread: float  # standard deviation left in the first guide step (mm)
-    decision: str  # why the bevel was turned or kept, or why the period was held
+    action: Action
+    decision: str  # why the bevel was rolled or kept, or why the needle was held
     true_tip: Pose | None
     true_strain_energy: float | None
     durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
@@ -221,12 +240,12 @@ class Period:
 
 @dataclass(frozen=True, eq=False)
 class Insertion:
-    """A whole insertion. outcome: "done", "held" (bad readings, no path to the target), "failed" or "interrupted"."""
+    """A whole insertion."""
 
     plan: Plan
     seed: int
     periods: tuple[Period, ...]
-    outcome: str
+    outcome: Outcome
     reason: str  # one line; "" when done within 1 mm of the target, or where that is not known
     controller: str = ""  # its name
     phantom: str = ""  # formulation of the virtual phantom, "" on a rig
@@ -263,18 +282,18 @@ class Insertion:
         """For how long (s) the needle was held."""
         ends = [0.0, *(period.time for period in self.periods)]
         spans = zip(self.periods, pairwise(ends), strict=True)
-        return sum((end - begin for period, (begin, end) in spans if period.decision.startswith("held")), 0.0)
+        return sum((end - begin for period, (begin, end) in spans if period.action is Action.HOLD), 0.0)
 
     @property
     def reached(self) -> bool:
         """Whether the insertion was done and ended within 1 mm of the target."""
-        return self.outcome == "done" and self.true_error_mm <= 1.0
+        return self.outcome is Outcome.DONE and self.true_error_mm <= 1.0
 
     @property
     def summary(self) -> str:
         """One line: how the insertion ended."""
         error = self.true_error_mm
-        if self.outcome != "done":
+        if self.outcome is not Outcome.DONE:
             after = f"{self.outcome} after {len(self.periods)} periods"
             return f"{after}: {self.reason}" if self.reason else after
         if np.isnan(error):

@@ -17,7 +17,7 @@ from flexneedle.plot.style import save
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.trace.columns import verdict_of
-from flexneedle.types import CheckedMeasurement, Insertion, Measurement
+from flexneedle.types import CheckedMeasurement, Insertion, Measurement, Outcome
 from synthetic import GUIDE_X, blind, make_insertion, make_plan
 from synthetic_readings import frame_of, held, with_readings
 
@@ -162,7 +162,9 @@ def test_an_unfinished_insertion_is_drawn_as_far_as_it_went(periods):
 
 
 def test_an_insertion_without_truth_or_samples_is_drawn(insertion):
-    unseen = Insertion(insertion.plan, 0, tuple(map(blind, insertion.periods)), "held", "held for 1.00 s")
+    unseen = Insertion(
+        insertion.plan, 0, tuple(map(blind, insertion.periods)), Outcome("held"), "held for 1.00 s"
+    )
     figure = insertion_figure(PHANTOM, unseen)
     figure.canvas.draw()
     assert "held after 69 periods: held for 1.00 s" in texts(figure)
@@ -242,7 +244,9 @@ def test_a_panel_without_a_line_says_why(insertion):
     error = insertion_figure(PHANTOM, held_from_the_start(insertion)).axes[1]
     # Readings were there, but the periods' own verdicts are against them.
     assert error.get_title(loc="right") == "the tip hardly moved; no data: by tracker"
-    unseen = Insertion(insertion.plan, 0, tuple(map(blind, insertion.periods)), "held", "held for 1.00 s")
+    unseen = Insertion(
+        insertion.plan, 0, tuple(map(blind, insertion.periods)), Outcome("held"), "held for 1.00 s"
+    )
     error, motion, energy, *_ = insertion_figure(PHANTOM, unseen).axes[1:]
     assert error.get_title(loc="right") == "no data: by tracker, true"
     assert (motion.get_title(loc="right"), energy.get_title(loc="right")) == ("", "")

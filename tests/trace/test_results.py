@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flexneedle.trace.results import insertion_result, insertion_timing
-from flexneedle.types import Insertion
+from flexneedle.types import Insertion, Outcome
 from synthetic import blind, make_insertion, make_plan
 
 PLAN = make_plan()
@@ -46,18 +46,18 @@ def test_how_an_insertion_ended_is_one_line():
         make_insertion(outcome="held", reason="no sample", periods=3).summary
         == "held after 3 periods: no sample"
     )
-    unseen = Insertion(PLAN, 0, tuple(map(blind, make_insertion().periods)), "done", "")
+    unseen = Insertion(PLAN, 0, tuple(map(blind, make_insertion().periods)), Outcome("done"), "")
     assert unseen.summary == "done: the true tip is not known"
 
 
 def test_what_is_not_known_is_null():
-    unseen = Insertion(PLAN, 0, tuple(map(blind, make_insertion().periods)), "done", "")
+    unseen = Insertion(PLAN, 0, tuple(map(blind, make_insertion().periods)), Outcome("done"), "")
     result = insertion_result(unseen)
     unknown = {name for name, value in result.items() if value is None}
     errors = {"true_error_mm", "residual_mm"}
     assert unknown == {"phantom", "tip_true_mm", "tip_measured_mm", "strain_energy_mj", "warning"} | errors
     assert result["reached"] is False
-    empty = Insertion(PLAN, 0, (), "failed", "")
+    empty = Insertion(PLAN, 0, (), Outcome("failed"), "")
     assert insertion_result(empty)["steps"] == 0
     assert insertion_timing(empty)["period_ms"] == {"p50": None, "p99": None, "max": None}
 

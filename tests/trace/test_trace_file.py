@@ -164,7 +164,17 @@ def test_a_period_has_its_own_readings_and_not_those_of_the_one_before(tmp_path)
 
 
 def test_columns_carry_units():
-    bare = {"index", "verdict", "bevel", "cost", "decision", "converged", "command_flip", "applied_flip"}
+    bare = {
+        "index",
+        "verdict",
+        "bevel",
+        "cost",
+        "action",
+        "decision",
+        "converged",
+        "command_flip",
+        "applied_flip",
+    }
     bare |= {"warning"}
     bare |= {"true_stretch"}  # a ratio
     units = {"mm", "rad", "s", "mj", "n"}

@@ -73,6 +73,7 @@ def _insert(args: argparse.Namespace) -> int:
     from flexneedle.rig.parts import own_controllers
     from flexneedle.runs.recording import check_choices, record_insertion
     from flexneedle.trace.folder import Folder
+    from flexneedle.types import Outcome
 
     if args.list:
         return _list()
@@ -94,7 +95,7 @@ def _insert(args: argparse.Namespace) -> int:
             on_iteration=show.iteration,
             on_period=show.period,
         )
-        if insertion.outcome == "done":
+        if insertion.outcome is Outcome.DONE:
             progress.finish("Inserting")
     return _report(scenario, insertion, args.json, folder.path)
 
@@ -142,8 +143,9 @@ class _InsertProgress:
 
 def _report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:
     from flexneedle.trace.results import insertion_result, insertion_timing
+    from flexneedle.types import Outcome
 
-    if insertion.outcome == "interrupted":
+    if insertion.outcome is Outcome.INTERRUPTED:
         print(f"flexneedle: interrupted: the record is in {folder}", file=sys.stderr)
         return 130
     if as_json:

@@ -9,7 +9,7 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.types import Frame, Insertion, Plan, VerdictKind
+from flexneedle.types import Action, Frame, Insertion, Plan, VerdictKind
 
 Floats = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ def held_spans(insertion: Insertion) -> list[tuple[float, float]]:
     ends = [0.0, *(period.time for period in insertion.periods)]
     spans: list[tuple[float, float]] = []
     for period, (begin, end) in zip(insertion.periods, pairwise(ends), strict=True):
-        if period.decision != "held":
+        if period.action is not Action.HOLD:
             continue
         if spans and spans[-1][1] == begin:
             spans[-1] = (spans[-1][0], end)

@@ -24,7 +24,7 @@ from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
 from flexneedle.rig.virtual import Rig, Seeds, virtual_rig
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Command, Insertion, Period, Plan
+from flexneedle.types import Action, Command, Insertion, Outcome, Period, Plan
 
 _TOO_MANY = 4  # times the planned periods: the loop is not getting there
 _STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
@@ -95,14 +95,14 @@ def run(
     scenario = used(scenario, chosen)
     task = tables.task(chosen, Simulator(scenario, threads), plan)
     periods: list[Period] = []
-    ending = ("failed", "not at the target depth after four times the planned periods")
+    ending = (Outcome.FAILED, "not at the target depth after four times the planned periods")
     for period, so_far in _periods(task, chosen, rig, rng, force=force):
         periods.append(period)
         ending = so_far or ending
         if on_period is not None:
             on_period(period)
     insertion = Insertion(plan, seed, tuple(periods), *ending, name)
-    if insertion.outcome == "done":
+    if insertion.outcome is Outcome.DONE:
         line = missed(insertion.true_error_mm, math.dist(periods[-1].estimate[:2], plan.target))
         return replace(insertion, reason="; ".join(filter(None, (insertion.reason, line))))
     return insertion
@@ -110,7 +110,7 @@ def run(
 
 def _periods(
     task: Task, chosen: Method, rig: Rig, rng: np.random.Generator, *, force: bool
-) -> Iterator[tuple[Period, tuple[str, str] | None]]:
+) -> Iterator[tuple[Period, tuple[Outcome, str] | None]]:
     """Yield each period, and how the insertion ended with it: (outcome, reason), None while it goes on.
 
     After the last move the needle rests until the tracker has measured it at rest: readings come late.
@@ -124,8 +124,8 @@ def _periods(
         held is not None or sight.sample.frame is not None
     ):  # a tip alone that is where it should be is no news
         clocks = [start, start, start, time.perf_counter()]
-        looks = Decision(_STILL, "looks before it moves")
-        yield _record(next(indices), rig.clock.now(), task.plan, rig, looks, _STILL, sight, clocks), None
+        step = _Step(Action.MEASURE, Decision(_STILL, "measures before it moves"))
+        yield _record(next(indices), rig.clock.now(), task.plan, rig, step, _STILL, sight, clocks), None
     arrived_at: float | None = None
     lost = _Lost()
     moves = in_a_row = 0
@@ -133,26 +133,21 @@ def _periods(
         if moves == _TOO_MANY * len(task.plan.controls):
             return
         clocks = [time.perf_counter()]
-        begun, wait = rig.clock.now(), scenario.tracker.period
+        begun, reading = rig.clock.now(), scenario.tracker.period
         decides = held is None and arrived_at is None
         if held is not None:
-            decision = Decision(_STILL, "held")
+            step = _Step(Action.HOLD, Decision(_STILL, "held"), reading)
         elif arrived_at is not None:
-            decision, wait = (
-                Decision(_STILL, "at rest for the last reading"),
-                max(wait, begun - sight.sample.time),
-            )
+            late = begun - sight.sample.time
+            step = _Step(Action.REST, Decision(_STILL, "at rest for the last reading"), max(reading, late))
         else:
             decision, memory = _decided(chosen, task, memory, sight.estimate, rng)
             in_a_row = likely_misses(decision, in_a_row)
             lost = lost.after("" if force else hopeless(decision, scenario.control))
-            if lost.why:
-                decision = replace(decision, command=_STILL, why=f"held: {lost.why}")
-            else:
-                moves, wait = moves + 1, decision.rest
-                decision = replace(decision, command=_STILL) if decision.rest > 0.0 else decision
+            step = _step(decision, lost.why, reading)
+            moves += not lost.why
         clocks.append(time.perf_counter())
-        applied = _carry_out(scenario, rig, decision.command, wait)
+        applied = _carry_out(scenario, rig, step.decision.command, step.wait)
         clocks.append(time.perf_counter())
         moved = sight.estimate.move(applied, begun, rig.clock.now())
         sight = see(scenario, moved, sight.watch, begun, rig.clock.now(), rig.tracker)
@@ -165,8 +160,8 @@ def _periods(
         ending = _ending(task, sight, None if held is None else held.lasted(sight.field), seen)
         lost = lost.lasting(now - begun) if decides else lost
         ending = ending or lost.ending(scenario.control.hold_limit_s)
-        period = _record(index, now, task.plan, rig, decision, applied, sight, clocks)
-        yield replace(period, warning=warning(decision, in_a_row)), ending
+        period = _record(index, now, task.plan, rig, step, applied, sight, clocks)
+        yield replace(period, warning=warning(step.decision, in_a_row)), ending
         if ending is not None:
             return
 
@@ -179,6 +174,25 @@ def _decided(
         case (Decision(), _):
             return answer
     raise InputError(f"controller {chosen.name}: decide must return a Decision and the memory after it")
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What a period does: its action, the decision behind it, and for how long it waits instead of a move (s)."""
+
+    action: Action
+    decision: Decision
+    wait: float = 0.0
+
+
+def _step(decision: Decision, lost: str, reading: float) -> _Step:
+    """What follows from a decision. lost: why no path leads to the target, or empty; reading: the tracker's period, s."""
+    still = replace(decision, command=_STILL)
+    if lost:
+        return _Step(Action.HOLD, replace(still, why=f"held: {lost}"), reading)
+    if decision.rest > 0.0:
+        return _Step(Action.REST, still, decision.rest)
+    return _Step(Action.MOVE, decision)
 
 
 @dataclass(frozen=True)
@@ -213,9 +227,9 @@ class _Lost:
         """After a period that was held, or that was not."""
         return _Lost(self.why, self.lasted + seconds) if self.why else self
 
-    def ending(self, limit: float) -> tuple[str, str] | None:
+    def ending(self, limit: float) -> tuple[Outcome, str] | None:
         """How the insertion ends, if it has lasted for `limit` (s)."""
-        return ("held", self.why) if self.why and self.lasted > limit - 1e-9 else None
+        return (Outcome.HELD, self.why) if self.why and self.lasted > limit - 1e-9 else None
 
 
 def _held(held: _Held | None, sight: Observation, now: float) -> _Held | None:
@@ -245,19 +259,19 @@ def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> C
     return rig.driver.apply(command, max(1, readings) * reading)
 
 
-def _ending(task: Task, sight: Observation, held: float | None, seen: bool) -> tuple[str, str] | None:
+def _ending(task: Task, sight: Observation, held: float | None, seen: bool) -> tuple[Outcome, str] | None:
     """How the insertion ends after this period, if it does; held: for how long it has been (s), None if it is not."""
     estimate, limit = sight.estimate, sight.limit(task.scenario)
     if not estimate.state.converged:
-        return "failed", f"the model did not converge: residual {estimate.state.residual:.3g} mm"
+        return Outcome.FAILED, f"the model did not converge: residual {estimate.state.residual:.3g} mm"
     if held is not None and held > limit - 1e-9:
-        return "held", f"held for {held:.2f} s (limit {limit:g} s): {sight.verdict}"
+        return Outcome.HELD, f"held for {held:.2f} s (limit {limit:g} s): {sight.verdict}"
     if not seen:
         return None
     short = task.plan.target[0] - float(estimate.tip[0])
     if short > task.scenario.control.depth_tolerance_mm and at_depth(task, None, estimate):
-        return "done", f"the stroke ends {short:.2f} mm before the target depth"
-    return "done", ""
+        return Outcome.DONE, f"the stroke ends {short:.2f} mm before the target depth"
+    return Outcome.DONE, ""
 
 
 def _record(
@@ -265,7 +279,7 @@ def _record(
     now: float,
     plan: Plan,
     rig: Rig,
-    decision: Decision,
+    step: _Step,
     applied: Command,
     sight: Observation,
     clocks: list[float],
@@ -275,7 +289,7 @@ def _record(
     return Period(
         index=index,
         time=now,
-        command=decision.command,
+        command=step.decision.command,
         applied=applied,
         sample=sight.sample,
         verdict=sight.verdict,
@@ -289,11 +303,12 @@ def _record(
         strain_energy=state.strain_energy,
         tip_load=state.tip_load,
         path=_pose([np.interp(state.tip[0], plan.tips[:, 0], plan.tips[:, k]) for k in range(3)]),
-        cost=decision.cost,
-        spread=decision.spread,
-        decision=decision.why,
-        miss=decision.miss,
-        miss_sd=decision.miss_sd,
+        cost=step.decision.cost,
+        spread=step.decision.spread,
+        action=step.action,
+        decision=step.decision.why,
+        miss=step.decision.miss,
+        miss_sd=step.decision.miss_sd,
         true_tip=None if truth is None else _pose(truth.tip),
         true_strain_energy=None if truth is None else truth.strain_energy,
         true_stretch=None if truth is None else truth.least_stretch,

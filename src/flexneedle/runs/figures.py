@@ -7,7 +7,7 @@ from flexneedle.plot.insertion import insertion_figure
 from flexneedle.plot.plans import plan_figure
 from flexneedle.plot.style import save
 from flexneedle.trace.folder import TRACE_FILE, RunFile, read_run
-from flexneedle.types import Insertion
+from flexneedle.types import Insertion, Outcome
 from flexneedle.trace.reader import read_trace
 
 
@@ -44,7 +44,7 @@ def load_insertion(folder: Path) -> tuple[Insertion, str]:
 def _insertion(run: RunFile) -> tuple[Insertion, str]:
     trace = read_trace(run.folder / TRACE_FILE)
     killed = run.status == "running"
-    outcome, reason = ("interrupted", _UNFINISHED) if killed else (run.status, run.reason)
+    outcome, reason = (Outcome.INTERRUPTED, _UNFINISHED) if killed else (Outcome(run.status), run.reason)
     plan = next(iter(run.plans.values()))
     how = (outcome, reason, run.controller, run.phantom)
     return Insertion(plan, run.seed, trace.periods, *how), trace.note

@@ -14,7 +14,7 @@ from flexneedle.trace.folder import TRACE_FILE, Folder, versions
 from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
 from flexneedle.trace.results import insertion_result, insertion_timing, plan_result, plan_timing
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Insertion, Period, Plan
+from flexneedle.types import Insertion, Outcome, Period, Plan
 from flexneedle.trace.writer import TraceWriter
 
 
@@ -127,7 +127,7 @@ def _insert(
         try:
             return insert(scenario, plan, choices.seed, on_period=keep, **options)
         except KeyboardInterrupt:
-            ending = "interrupted", "stopped by the user", choices.controller, choices.phantom
+            ending = Outcome.INTERRUPTED, "stopped by the user", choices.controller, choices.phantom
             return Insertion(plan, choices.seed, tuple(periods), *ending)
 
 

@@ -6,7 +6,7 @@ Names end in their unit; numbers are exact (`repr`), so that a period comes back
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from flexneedle.types import CheckedMeasurement, Floats, Measurement, Period, Verdict, VerdictKind
+from flexneedle.types import Action, CheckedMeasurement, Floats, Measurement, Period, Verdict, VerdictKind
 
 _Scalar = Callable[[str], Any]
 
@@ -32,6 +32,8 @@ def _pose(name: str) -> tuple[tuple[str, _Scalar], ...]:
     return tuple((f"{name}_{part}", float) for part in ("x_mm", "y_mm", "theta_rad"))
 
 
+_TEXTS = (str, verdict_of, Action)
+
 # Field of Period: its columns, each with what reads it back. A field of several columns is a tuple.
 _FIELDS: dict[str, tuple[tuple[str, _Scalar], ...]] = {
     "index": (("index", int),),
@@ -50,6 +52,7 @@ _FIELDS: dict[str, tuple[tuple[str, _Scalar], ...]] = {
     "path": _pose("path"),
     "cost": (("cost", float),),
     "spread": (("spread_mm", float),),
+    "action": (("action", Action),),
     "decision": (("decision", str),),
     "miss": (("miss_mm", float),),
     "miss_sd": (("miss_sd_mm", float),),
@@ -86,7 +89,7 @@ def _cells(field: str, value: Any) -> Iterator[tuple[str, str]]:
     columns = _FIELDS[field]
     parts = value if isinstance(value, tuple) else (value,) * len(columns)
     for (name, kind), part in zip(columns, parts, strict=True):
-        yield name, "" if part is None else str(part) if kind in (str, verdict_of) else repr(kind(part))
+        yield name, "" if part is None else str(part) if kind in _TEXTS else repr(kind(part))
 
 
 def _value(field: str, row: Mapping[str, str]) -> Any:

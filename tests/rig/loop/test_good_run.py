@@ -18,7 +18,7 @@ from flexneedle.errors import InputError
 from flexneedle.rig import loop as insertion
 from flexneedle.rig.phantom.plants import PLANTS
 from flexneedle.rig.virtual import Rig
-from flexneedle.types import Insertion
+from flexneedle.types import Insertion, Outcome
 from insertions import (
     PHANTOM,
     READING,
@@ -141,7 +141,7 @@ def test_phantom_tracker_and_search_have_random_streams_of_their_own(plan, monke
 
     def no_run(_scenario, plan, _rig, rng, *_args, **_options):
         drawn.append(rng.random())
-        return Insertion(plan, 0, (), "done", "")
+        return Insertion(plan, 0, (), Outcome("done"), "")
 
     monkeypatch.setattr(insertion, "virtual_rig", virtual_rig)
     monkeypatch.setattr(insertion, "run", no_run)
