@@ -33,13 +33,13 @@ def search(cost, settings=FREE, mean=(0.0, 0.0), sigma=(2.0, 2.0), seed=0, progr
     return ce.minimize(cost, ce.start(mean, sigma), settings, np.random.default_rng(seed), progress)
 
 
-def after(costs, samples, *, elite=2, smoothing=0.25, belief=None):
-    """The belief after one iteration with these costs and samples (N, 2)."""
-    belief = belief or ce.start(
+def after(costs, samples, *, elite=2, smoothing=0.25, search_state=None):
+    """The search_state after one iteration with these costs and samples (N, 2)."""
+    search_state = search_state or ce.start(
         np.array([1.0, -1.0]), np.array([2.0, 3.0]), np.array([[1, 1 / 6], [1 / 6, 1]])
     )
     settings = replace(FREE, samples=len(costs), elite=elite, smoothing=smoothing, tolerance=0.0)
-    return ce.tell(belief, settings, np.array(samples, dtype=float), np.array(costs, dtype=float))
+    return ce.tell(search_state, settings, np.array(samples, dtype=float), np.array(costs, dtype=float))
 
 
 @pytest.mark.parametrize(("cost", "least"), [(quadratic, LEAST), (two_wells, [3.0, 0.0])])
@@ -59,18 +59,18 @@ def test_a_minimum_outside_the_bounds_ends_at_the_bound():
 
 def test_update_against_numbers_by_hand():
     """Elite (0, 0), (2, 4): mean (1, 2), covariance ½ Σ c cᵀ = ((1, 2), (2, 4)); a quarter of the old is kept."""
-    belief = after([7.0, 1.0, 5.0, 2.0, 6.0], [(9, 9), (0, 0), (8, -8), (2, 4), (-9, 3)])
-    np.testing.assert_allclose(belief.mean, [0.75 * 1 + 0.25 * 1, 0.75 * 2 - 0.25 * 1], rtol=1e-14)
+    search_state = after([7.0, 1.0, 5.0, 2.0, 6.0], [(9, 9), (0, 0), (8, -8), (2, 4), (-9, 3)])
+    np.testing.assert_allclose(search_state.mean, [0.75 * 1 + 0.25 * 1, 0.75 * 2 - 0.25 * 1], rtol=1e-14)
     floor = [4e-6, 9e-6]  # a thousandth of the first standard deviation, squared
     expected = [[0.75 * 1 + 0.25 * 4 + floor[0], 0.75 * 2 + 0.25 * 1], [1.75, 0.75 * 4 + 0.25 * 9 + floor[1]]]
-    np.testing.assert_allclose(belief.covariance, expected, rtol=1e-12)
-    np.testing.assert_array_equal(belief.best, [0.0, 0.0])
-    assert belief.best_cost == 1.0
+    np.testing.assert_allclose(search_state.covariance, expected, rtol=1e-12)
+    np.testing.assert_array_equal(search_state.best, [0.0, 0.0])
+    assert search_state.best_cost == 1.0
 
 
 def test_smoothing_takes_the_old_moments_of_the_last_iteration():
     once = after([1.0, 2.0, 3.0], [(0, 0), (2, 4), (9, 9)])
-    twice = after([1.0, 2.0, 3.0], [(0, 0), (2, 4), (9, 9)], belief=once)
+    twice = after([1.0, 2.0, 3.0], [(0, 0), (2, 4), (9, 9)], search_state=once)
     np.testing.assert_allclose(twice.mean, 0.75 * np.array([1, 2]) + 0.25 * once.mean, rtol=1e-14)
     floor = np.diag([4e-6, 9e-6])
     expected = 0.75 * np.array([[1, 2], [2, 4]]) + 0.25 * once.covariance + floor
@@ -78,48 +78,48 @@ def test_smoothing_takes_the_old_moments_of_the_last_iteration():
 
 
 def test_without_smoothing_the_elite_alone_counts():
-    belief = after([1.0, 2.0, 3.0], [(0, 0), (2, 4), (9, 9)], smoothing=0.0)
-    np.testing.assert_allclose(belief.mean, [1.0, 2.0])
-    np.testing.assert_allclose(belief.covariance, [[1 + 4e-6, 2], [2, 4 + 9e-6]], rtol=1e-12)
+    search_state = after([1.0, 2.0, 3.0], [(0, 0), (2, 4), (9, 9)], smoothing=0.0)
+    np.testing.assert_allclose(search_state.mean, [1.0, 2.0])
+    np.testing.assert_allclose(search_state.covariance, [[1 + 4e-6, 2], [2, 4 + 9e-6]], rtol=1e-12)
 
 
 @pytest.mark.parametrize(("elite", "mean"), [(1, 1.0), (2, 1.5), (3, 2.0), (5, 3.0)])
 def test_elite_are_the_samples_of_least_cost(elite, mean):
     """Samples 1 to 5 cost as much as they are; handed over in disorder."""
     values = [4.0, 1.0, 5.0, 3.0, 2.0]
-    belief = after(values, [(v, 0) for v in values], elite=elite, smoothing=0.0)
-    assert belief.mean[0] == pytest.approx(mean)
-    assert belief.history[-1]["cost_quantiles"][1] == float(elite)
+    search_state = after(values, [(v, 0) for v in values], elite=elite, smoothing=0.0)
+    assert search_state.mean[0] == pytest.approx(mean)
+    assert search_state.history[-1]["cost_quantiles"][1] == float(elite)
 
 
 def test_ties_at_the_quantile_leave_the_size_of_the_elite_the_first_drawn_win():
-    belief = after([2.0, 1.0, 2.0, 2.0], [(10, 0), (0, 0), (20, 0), (30, 0)], elite=2, smoothing=0.0)
-    assert belief.mean[0] == pytest.approx(5.0)
+    search_state = after([2.0, 1.0, 2.0, 2.0], [(10, 0), (0, 0), (20, 0), (30, 0)], elite=2, smoothing=0.0)
+    assert search_state.mean[0] == pytest.approx(5.0)
 
 
 def test_full_covariance_learns_the_correlation_of_a_valley():
-    belief = ce.start(np.zeros(2), np.full(2, 2.0))
+    search_state = ce.start(np.zeros(2), np.full(2, 2.0))
     rng = np.random.default_rng(1)
     for _ in range(3):
-        samples = ce.ask(belief, FREE, rng)
-        belief = ce.tell(belief, FREE, samples, quadratic(samples))
-    c = belief.covariance
+        samples = ce.ask(search_state, FREE, rng)
+        search_state = ce.tell(search_state, FREE, samples, quadratic(samples))
+    c = search_state.covariance
     assert c[0, 1] / math.sqrt(c[0, 0] * c[1, 1]) < -0.5
 
 
 def test_samples_have_the_mean_and_covariance_of_the_belief():
     covariance = np.array([[4.0, 1.5], [1.5, 1.0]])
-    belief = ce.start(np.array([1.0, -1.0]), np.array([2.0, 1.0]), np.array([[1.0, 0.75], [0.75, 1.0]]))
+    search_state = ce.start(np.array([1.0, -1.0]), np.array([2.0, 1.0]), np.array([[1.0, 0.75], [0.75, 1.0]]))
     wide = replace(FREE, samples=20_000, lower=np.full(2, -1e3), upper=np.full(2, 1e3))
-    samples = ce.ask(belief, wide, np.random.default_rng(0))
+    samples = ce.ask(search_state, wide, np.random.default_rng(0))
     np.testing.assert_allclose(samples.mean(axis=0), [1.0, -1.0], atol=0.05)
     np.testing.assert_allclose(np.cov(samples.T), covariance, rtol=0.05)
 
 
 def test_first_sample_is_the_mean_and_later_the_second_the_best_so_far():
-    belief = after([3.0, 1.0, 2.0], [(5, 5), (7, -7), (1, 1)])
-    samples = ce.ask(belief, FREE, np.random.default_rng(0))
-    np.testing.assert_array_equal(samples[0], belief.mean)
+    search_state = after([3.0, 1.0, 2.0], [(5, 5), (7, -7), (1, 1)])
+    samples = ce.ask(search_state, FREE, np.random.default_rng(0))
+    np.testing.assert_array_equal(samples[0], search_state.mean)
     np.testing.assert_array_equal(samples[1], [7.0, -7.0])
     fresh = ce.start(np.array([1.0, -1.0]), np.array([2.0, 3.0]))
     assert (ce.ask(fresh, FREE, np.random.default_rng(0))[1] != fresh.mean).all()
@@ -169,38 +169,38 @@ def test_best_so_far_is_never_worse_than_any_sample_seen(seed, failing):
         sampled.extend(z)
         return value
 
-    belief = ce.start(np.zeros(2), np.full(2, 2.0))
+    search_state = ce.start(np.zeros(2), np.full(2, 2.0))
     small = replace(FREE, samples=8, elite=2)
     for _ in range(6):
-        samples = ce.ask(belief, small, rng)
-        belief = ce.tell(belief, small, samples, cost(samples))
+        samples = ce.ask(search_state, small, rng)
+        search_state = ce.tell(search_state, small, samples, cost(samples))
         finite = [value for value in told if np.isfinite(value)]
-        assert belief.best_cost == min(finite, default=np.inf)
-        assert belief.history[-1]["best"] == belief.best_cost
-        assert np.isfinite(belief.mean).all()
-        assert np.isfinite(belief.covariance).all()
+        assert search_state.best_cost == min(finite, default=np.inf)
+        assert search_state.history[-1]["best"] == search_state.best_cost
+        assert np.isfinite(search_state.mean).all()
+        assert np.isfinite(search_state.covariance).all()
         if finite:
-            assert any(np.array_equal(belief.best, z) for z in sampled)
+            assert any(np.array_equal(search_state.best, z) for z in sampled)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_failed_samples_are_no_elite(bad):
-    belief = after([bad, 1.0, 2.0, bad], [(9, 9), (0, 0), (2, 4), (9, 9)], elite=3, smoothing=0.0)
-    np.testing.assert_allclose(belief.mean, [1.0, 2.0])
-    np.testing.assert_allclose(belief.covariance, [[1 + 4e-6, 2], [2, 4 + 9e-6]], rtol=1e-12)
-    assert not belief.converged
+    search_state = after([bad, 1.0, 2.0, bad], [(9, 9), (0, 0), (2, 4), (9, 9)], elite=3, smoothing=0.0)
+    np.testing.assert_allclose(search_state.mean, [1.0, 2.0])
+    np.testing.assert_allclose(search_state.covariance, [[1 + 4e-6, 2], [2, 4 + 9e-6]], rtol=1e-12)
+    assert not search_state.converged
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_with_only_failed_samples_the_belief_stays(bad):
     begin = ce.start(np.array([1.0, -1.0]), np.array([2.0, 3.0]))
-    belief = after([bad] * 4, [(9, 9)] * 4, belief=begin)
-    np.testing.assert_array_equal(belief.mean, begin.mean)
-    np.testing.assert_array_equal(belief.covariance, begin.covariance)
-    np.testing.assert_array_equal(belief.best, begin.mean)
-    assert belief.best_cost == np.inf
-    assert not belief.converged
-    assert belief.iterations == 1
+    search_state = after([bad] * 4, [(9, 9)] * 4, search_state=begin)
+    np.testing.assert_array_equal(search_state.mean, begin.mean)
+    np.testing.assert_array_equal(search_state.covariance, begin.covariance)
+    np.testing.assert_array_equal(search_state.best, begin.mean)
+    assert search_state.best_cost == np.inf
+    assert not search_state.converged
+    assert search_state.iterations == 1
 
 
 def test_a_minimum_where_most_samples_fail_is_found():
@@ -224,7 +224,7 @@ def test_an_iteration_with_fewer_good_samples_than_the_elite_sets_no_scale():
     """The first iteration whose elite is finite does: a spread of 1 at first, then a tenth of it."""
     settings = replace(FREE, samples=4, elite=2, tolerance=0.1)
     samples = np.arange(8.0).reshape(4, 2)
-    belief, converged = ce.start(np.zeros(2), np.ones(2)), []
+    search_state, converged = ce.start(np.zeros(2), np.ones(2)), []
     for costs in (
         [1.0, *[np.inf] * 3],
         [np.inf] * 4,
@@ -232,21 +232,21 @@ def test_an_iteration_with_fewer_good_samples_than_the_elite_sets_no_scale():
         [0.0, 0.11, 9.0, 9.0],
         [0.0, 0.09, 9.0, 9.0],
     ):
-        belief = ce.tell(belief, settings, samples, np.array(costs))
-        converged.append(belief.converged)
+        search_state = ce.tell(search_state, settings, samples, np.array(costs))
+        converged.append(search_state.converged)
     assert converged == [False, False, False, False, True]
 
 
 def stalling(usual, falls):
     """Whether each iteration has converged whose best cost falls so much, elites spread by 10, tolerance a tenth."""
     settings = replace(FREE, samples=4, elite=2, tolerance=0.1, usual=usual)
-    belief, converged, best = ce.start(np.zeros(2), np.ones(2)), [], 0.0
+    search_state, converged, best = ce.start(np.zeros(2), np.ones(2)), [], 0.0
     for fall in falls:
         best -= fall
-        belief = ce.tell(
-            belief, settings, np.arange(8.0).reshape(4, 2), best + np.array([0.0, 10.0, 11.0, 12.0])
+        search_state = ce.tell(
+            search_state, settings, np.arange(8.0).reshape(4, 2), best + np.array([0.0, 10.0, 11.0, 12.0])
         )
-        converged.append(belief.converged)
+        converged.append(search_state.converged)
     return converged
 
 
@@ -288,14 +288,14 @@ def test_search_stops_at_convergence_or_at_the_maximum_of_iterations():
 
 
 def test_history_has_mean_quantiles_and_spread_of_each_iteration():
-    belief = after([7.0, 1.0, 5.0, 2.0, 6.0], [(9, 9), (0, 0), (8, -8), (2, 4), (-9, 3)])
-    (entry,) = belief.history
+    search_state = after([7.0, 1.0, 5.0, 2.0, 6.0], [(9, 9), (0, 0), (8, -8), (2, 4), (-9, 3)])
+    (entry,) = search_state.history
     assert entry["cost_mean"] == pytest.approx(21.0 / 5)
     assert entry["best"] == 1.0
     assert entry["cost_quantiles"] == (1.0, 2.0, 5.0, 7.0)  # least, ρ, median, greatest
-    np.testing.assert_allclose(entry["spread"], np.sqrt(np.diag(belief.covariance)))
-    np.testing.assert_array_equal(entry["mean"], belief.mean)
-    later = after([3.0, 4.0, 5.0], [(0, 0), (1, 1), (2, 2)], belief=belief)
+    np.testing.assert_allclose(entry["spread"], np.sqrt(np.diag(search_state.covariance)))
+    np.testing.assert_array_equal(entry["mean"], search_state.mean)
+    later = after([3.0, 4.0, 5.0], [(0, 0), (1, 1), (2, 2)], search_state=search_state)
     assert [e["best"] for e in later.history] == [1.0, 1.0]
     np.testing.assert_array_equal(later.best, [0.0, 0.0])
 

@@ -57,7 +57,7 @@ def search(rollout=rigid, variables=VARIABLES, settings=SEARCH, seed=0, **option
 def test_what_is_found_is_told_with_its_terms_and_rollout():
     found = search()
     np.testing.assert_array_equal(found.outcome.controls, controls(found.z[None]))
-    assert found.cost == sum(found.terms.values()) == found.belief.best_cost
+    assert found.cost == sum(found.terms.values()) == found.search_state.best_cost
     assert found.terms["miss"] == pytest.approx(abs(found.z.sum() - 1.5))
     assert list(found.terms) == ["miss", "guide"]
 
@@ -72,8 +72,8 @@ def test_it_is_cross_entropy_on_the_cost_and_nothing_else():
         np.random.default_rng(0),
     )
     found = search()
-    assert found.belief.mean.tobytes() == by_hand.mean.tobytes()
-    assert found.belief.history == by_hand.history
+    assert found.search_state.mean.tobytes() == by_hand.mean.tobytes()
+    assert found.search_state.history == by_hand.history
 
 
 def test_a_correlation_is_that_of_the_first_samples():

@@ -193,7 +193,7 @@ def test_search_meets_the_target_of_a_rigid_needle():
     found = optimise(rigid, PROBLEM, SEARCH, np.random.default_rng(0))
     end = rigid(found.controls[None], found.bevel).tips[0, -1]
     np.testing.assert_allclose(end[:2], [8.0, 2.0], atol=0.01)
-    assert sum(found.terms.values()) == pytest.approx(found.belief.best_cost)
+    assert sum(found.terms.values()) == pytest.approx(found.search_state.best_cost)
 
 
 def bevel_only(sign):
@@ -256,4 +256,4 @@ def test_progress_and_same_seed_same_bytes():
     again = optimise(rigid, PROBLEM, short, np.random.default_rng(3))
     assert [call["iteration"] for call in calls] == [1, 2, 3, 4, 5]
     assert one.controls.tobytes() == again.controls.tobytes()
-    assert one.belief.history == again.belief.history
+    assert one.search_state.history == again.search_state.history

@@ -43,7 +43,6 @@ def test_inner_units_are_mm_newton_megapascal_radian_second():
     assert PHANTOM.needle.youngs_modulus == 200e3
     assert PHANTOM.tissue[0].shear_modulus == pytest.approx(1.82e-3)
     assert PHANTOM.setup.max_base_turn_step == pytest.approx(5e-3)
-    assert PHANTOM.plan.elite_count == 16
     assert BevelRule(curvature_per_m=0.7).curvature == pytest.approx(7e-4)
     assert PHANTOM.tracker.period == 0.025
     assert PHANTOM.phantom.start_angle_sd == pytest.approx(3e-3)

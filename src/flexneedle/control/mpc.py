@@ -4,24 +4,21 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.control.bang_bang import BevelRule
 from flexneedle.control.guide import most_guide_step
 from flexneedle.control.interface import travel_left
 from flexneedle.planning import terms
-from flexneedle.planning.cross_entropy import Search
+from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import Variables, best
 from flexneedle.planning.terms import Outcome, Term
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, count
-from flexneedle.scenario.sections.settings import elite_count
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Plan
+from flexneedle.types import Floats, Plan
 
-Floats = NDArray[np.float64]
 _LEAST_ADVANCE = 0.5  # of the longest step: standing still is no way to reduce the cost
 
 
@@ -73,7 +70,7 @@ def choose(
     variables = _variables(scenario, state, base, travel, nominal, guide, flip=flip)
     search = Search(
         samples=control.samples,
-        elite=max(2, elite_count(control.samples, scenario.plan.elite_fraction)),
+        elite=elite_count(control.samples, scenario.plan.elite_fraction),
         iterations=control.iterations,
         smoothing=scenario.plan.smoothing,
         tolerance=scenario.plan.tolerance,
@@ -83,7 +80,7 @@ def choose(
         return Outcome(controls, *simulator.rollout(state, controls))
 
     found = best(variables, rollout, _cost_terms(control, reference, nominal[:, 3]), search, rng)
-    spread = float(np.sqrt(found.belief.covariance[steps, steps]))
+    spread = float(np.sqrt(found.search_state.covariance[steps, steps]))
     db_x, db_y, db_theta, dg_y = found.outcome.controls[0, 0, :4].tolist()
     return Choice((db_x, db_y, db_theta, dg_y), found.cost, spread)
 

@@ -14,12 +14,11 @@ later readings show cannot be corrected either.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.estimation.identification import Identified
 from flexneedle.estimation.prior import RUN_OUT
+from flexneedle.types import Floats
 
-Floats = NDArray[np.float64]
 UNCORRECTED = 5.0
 """Control steps before the target in which a correction takes no effect."""
 _UNEXPLAINED = 1.0  # standard deviations of the mean of a control step's readings

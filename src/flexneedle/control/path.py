@@ -15,9 +15,8 @@ from flexneedle.control.interface import travel_left
 from flexneedle.control.mpc import planned_base
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, Plan
+from flexneedle.types import Command, Floats, Plan
 
-Floats = NDArray[np.float64]
 KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
 """Where the guide is corrected, as shares of the path from now to the target."""
 LEAST_SLOTS = 4

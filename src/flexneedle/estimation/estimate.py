@@ -7,13 +7,10 @@ from statistics import fmean
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, Measurement
-
-Floats = NDArray[np.float64]
+from flexneedle.types import Command, Floats, Measurement
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Floats, Move, along, assigned
+from flexneedle.estimation.estimate import Move, along, assigned
 from flexneedle.estimation.prior import (
     BASE_TURN,
     BASE_Y,
@@ -43,7 +43,7 @@ from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, Measurement
+from flexneedle.types import Command, Floats, Measurement
 
 _MOVES_A_STRETCH = 8  # in tissue; one stretch in air
 _RECENT = 12  # moves whose residuals are low-passed

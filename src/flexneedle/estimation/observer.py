@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Floats, Move, along, assigned, place
+from flexneedle.estimation.estimate import Move, along, assigned, place
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, Measurement
+from flexneedle.types import Command, Floats, Measurement
 
 _DRIFT = 0.5  # of the path that the bevel bends: how far a model may be off it
 

@@ -8,15 +8,14 @@ layers, ln of a further factor on the modulus in cells along the depth, correlat
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive, Section
 from flexneedle.scenario.sections.tissue import MOST_BEVEL
+from flexneedle.types import Floats
 
-Floats = NDArray[np.float64]
 BASE_Y, BASE_TURN, BEND, RUN_OUT, BEVEL, CLEARANCE, MODULUS = range(7)
 LEAST_SD = 1e-6
 """Of a parameter without a standard deviation: it is known."""

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.estimation.estimate import Floats, Move
+from flexneedle.estimation.estimate import Move
+from flexneedle.types import Floats
 
 
 @dataclass(frozen=True, eq=False)

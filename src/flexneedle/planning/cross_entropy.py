@@ -1,23 +1,29 @@
 """The cross-entropy method with a full Gaussian (paper section III; Kobilarov 2012), ask and tell on arrays.
 
-    belief = start(mean, sigma)
-    while not belief.done(settings):
-        samples = ask(belief, settings, rng)
-        belief = tell(belief, settings, samples, cost(samples))
+    search_state = start(mean, sigma)
+    while not search_state.done(settings):
+        samples = ask(search_state, settings, rng)
+        search_state = tell(search_state, settings, samples, cost(samples))
 
 A coordinate whose sigma is 0 stays at its mean: its covariance entries are zero.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from math import ceil
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from flexneedle.types import Floats
+
 _PATIENCE = 10  # iterations
 _FLOOR = 1e-3  # standard deviation that regularisation keeps, relative to the initial one
+
+
+def elite_count(samples: int, fraction: float) -> int:
+    """Elite samples of N: ⌈ρN⌉ (paper section III), and two at least, for a covariance."""
+    return max(2, ceil(samples * fraction - 1e-9))  # the slack is for rounding of the product
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,7 @@ class Settings(Search):
 class SearchState:
     """Gaussian over d coordinates after some iterations, the best sample so far, and how it came about.
 
-    history: a dict per iteration with mean and spread (standard deviation) of the belief, each (d,), cost_mean of
+    history: a dict per iteration with mean and spread (standard deviation) of the Gaussian, each (d,), cost_mean of
     the samples, best (cost so far) and cost_quantiles (least, ρ, median, greatest).
     """
 
@@ -77,54 +83,56 @@ def start(mean: Floats, sigma: Floats, correlation: Floats | None = None) -> Sea
     return SearchState(mean, correlation * np.outer(sigma, sigma), sigma, mean)
 
 
-def ask(belief: SearchState, settings: Settings, rng: np.random.Generator) -> Floats:
+def ask(search_state: SearchState, settings: Settings, rng: np.random.Generator) -> Floats:
     """Draw samples (N, d) within the bounds; the first is the mean, the second the best so far."""
-    noise = rng.standard_normal((settings.samples, belief.mean.size))
-    free = belief.initial_sigma > 0.0
-    factor = np.zeros_like(belief.covariance)
-    factor[np.ix_(free, free)] = np.linalg.cholesky(belief.covariance[np.ix_(free, free)])
-    samples = belief.mean + noise @ factor.T
-    samples[0] = belief.mean
-    if belief.iterations > 0:
-        samples[1] = belief.best
+    noise = rng.standard_normal((settings.samples, search_state.mean.size))
+    free = search_state.initial_sigma > 0.0
+    factor = np.zeros_like(search_state.covariance)
+    factor[np.ix_(free, free)] = np.linalg.cholesky(search_state.covariance[np.ix_(free, free)])
+    samples = search_state.mean + noise @ factor.T
+    samples[0] = search_state.mean
+    if search_state.iterations > 0:
+        samples[1] = search_state.best
     return np.clip(samples, settings.lower, settings.upper)
 
 
-def tell(belief: SearchState, settings: Settings, samples: Floats, costs: Floats) -> SearchState:
+def tell(search_state: SearchState, settings: Settings, samples: Floats, costs: Floats) -> SearchState:
     """Refit to the elite: the ⌈ρN⌉ samples of least cost, ties in the order drawn (paper eq. 6 and 7).
 
-    A cost of infinity marks a failed sample; with no finite cost at all the belief stays as it is.
+    A cost of infinity marks a failed sample; with no finite cost at all the Gaussian stays as it is.
     """
     costs = np.where(np.isfinite(costs), costs, np.inf)
     order = np.argsort(costs, kind="stable")
     elite = order[: settings.elite][np.isfinite(costs[order[: settings.elite]])]
     if elite.size == 0:
-        return _with(belief, belief.mean, belief.covariance, samples[order[0]], costs, settings)
+        return _with(
+            search_state, search_state.mean, search_state.covariance, samples[order[0]], costs, settings
+        )
     keep = settings.smoothing
-    mean = (1.0 - keep) * samples[elite].mean(axis=0) + keep * belief.mean
+    mean = (1.0 - keep) * samples[elite].mean(axis=0) + keep * search_state.mean
     centred = samples[elite] - samples[elite].mean(axis=0)
-    covariance = (1.0 - keep) * centred.T @ centred / elite.size + keep * belief.covariance
-    covariance += np.diag((_FLOOR * belief.initial_sigma) ** 2)
-    return _with(belief, mean, covariance, samples[order[0]], costs, settings)
+    covariance = (1.0 - keep) * centred.T @ centred / elite.size + keep * search_state.covariance
+    covariance += np.diag((_FLOOR * search_state.initial_sigma) ** 2)
+    return _with(search_state, mean, covariance, samples[order[0]], costs, settings)
 
 
 def minimize(
     cost: Callable[[Floats], Floats],
-    belief: SearchState,
+    search_state: SearchState,
     settings: Settings,
     rng: np.random.Generator,
     progress: Callable[[dict[str, Any]], None] | None = None,
     first: Floats | None = None,
 ) -> SearchState:
     """Ask and tell until done. `cost` maps samples (N, d) to costs (N,); `first` (n, d): of iteration 1."""
-    while not belief.done(settings):
-        samples = ask(belief, settings, rng) if first is None or belief.iterations > 0 else first
-        belief = tell(belief, settings, samples, cost(samples))
+    while not search_state.done(settings):
+        samples = ask(search_state, settings, rng) if first is None or search_state.iterations > 0 else first
+        search_state = tell(search_state, settings, samples, cost(samples))
         if progress is not None:
-            done = belief.iterations
+            done = search_state.iterations
             usual = max(done, settings.usual or settings.iterations)
-            progress({"iteration": done, "iterations": usual, **belief.history[-1]})
-    return belief
+            progress({"iteration": done, "iterations": usual, **search_state.history[-1]})
+    return search_state
 
 
 def _elite_spread(entry: dict[str, Any]) -> float:
@@ -147,12 +155,17 @@ def _converged(history: Sequence[dict[str, Any]], settings: Settings) -> bool:
 
 
 def _with(
-    belief: SearchState, mean: Floats, covariance: Floats, winner: Floats, costs: Floats, settings: Settings
+    search_state: SearchState,
+    mean: Floats,
+    covariance: Floats,
+    winner: Floats,
+    costs: Floats,
+    settings: Settings,
 ) -> SearchState:
     """Append an iteration to the history and keep the better of `winner` and the best so far."""
     ordered = np.sort(costs)
-    better = bool(ordered[0] < belief.best_cost)
-    best_cost = min(float(ordered[0]), belief.best_cost)
+    better = bool(ordered[0] < search_state.best_cost)
+    best_cost = min(float(ordered[0]), search_state.best_cost)
     entry = {
         "mean": tuple(mean.tolist()),
         "cost_mean": float(np.mean(costs)),
@@ -160,7 +173,7 @@ def _with(
         "cost_quantiles": tuple(float(ordered[k]) for k in (0, settings.elite - 1, costs.size // 2, -1)),
         "spread": tuple(np.sqrt(np.diag(covariance)).tolist()),
     }
-    best, history = winner if better else belief.best, (*belief.history, entry)
+    best, history = winner if better else search_state.best, (*search_state.history, entry)
     return SearchState(
-        mean, covariance, belief.initial_sigma, best, best_cost, _converged(history, settings), history
+        mean, covariance, search_state.initial_sigma, best, best_cost, _converged(history, settings), history
     )

@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.planning import cross_entropy as ce
 from flexneedle.planning.terms import Outcome, RolloutFunction, Term, charges, cost
-
-Floats = NDArray[np.float64]
+from flexneedle.types import Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +41,7 @@ class Found:
     cost: float
     terms: dict[str, float]
     outcome: Outcome
-    belief: ce.SearchState
+    search_state: ce.SearchState
 
 
 def best(
@@ -62,14 +60,14 @@ def best(
     kept: what is found is never worse than an incumbent among them.
     """
     settings = ce.Settings(**vars(search), lower=variables.lower, upper=variables.upper)
-    belief = ce.start(variables.mean, variables.sigma, variables.correlation)
+    search_state = ce.start(variables.mean, variables.sigma, variables.correlation)
 
     def evaluate(z: Floats) -> Floats:
         return cost(terms, rollout(variables.controls(z)))
 
-    opening = ce.ask(belief, settings, rng) if first is None else first
+    opening = ce.ask(search_state, settings, rng) if first is None else first
     opening = np.clip(opening, settings.lower, settings.upper)
-    belief = ce.minimize(evaluate, belief, settings, rng, progress, opening)
-    outcome = rollout(variables.controls(belief.best[None]))
+    search_state = ce.minimize(evaluate, search_state, settings, rng, progress, opening)
+    outcome = rollout(variables.controls(search_state.best[None]))
     charged = {name: float(value[0]) for name, value in charges(terms, outcome).items()}
-    return Found(belief.best, belief.best_cost, charged, outcome, belief)
+    return Found(search_state.best, search_state.best_cost, charged, outcome, search_state)

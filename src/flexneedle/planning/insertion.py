@@ -18,8 +18,7 @@ from flexneedle.planning import terms
 from flexneedle.planning.cross_entropy import Search, SearchState
 from flexneedle.planning.horizon import Found, Variables, best
 from flexneedle.planning.terms import RolloutFunction, Term
-
-Floats = NDArray[np.float64]
+from flexneedle.types import Floats
 
 ADVANCE, BASE_Y, BASE_TURN, GUIDE, BEVEL, SHARE = range(6)
 COORDINATES = 6
@@ -60,7 +59,7 @@ class Solution:
     bevel: int
     cost: float
     terms: dict[str, float]
-    belief: SearchState
+    search_state: SearchState
 
 
 def optimise(
@@ -85,7 +84,7 @@ def solution(found: Found) -> Solution:
     moving = controls[:, 0] > 0.0
     controls, facing = controls[moving], facing[moving]
     controls[:, 4] = np.where(np.diff(facing, prepend=facing[0]) != 0.0, 1.0, -1.0)
-    return Solution(controls, int(facing[0]), found.cost, found.terms, found.belief)
+    return Solution(controls, int(facing[0]), found.cost, found.terms, found.search_state)
 
 
 def _variables(problem: PlanProblem) -> Variables:

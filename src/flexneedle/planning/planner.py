@@ -6,21 +6,19 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
-from flexneedle.planning.cross_entropy import Search
+from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.insertion import BASE_Y, GUIDE, PlanProblem, Solution, optimise
 from flexneedle.planning.steering import reach, steer
 from flexneedle.planning.terms import Outcome
 from flexneedle.scenario.model import Scenario, check_target
-from flexneedle.scenario.sections.settings import PlanSettings, elite_count
-from flexneedle.simulator.control import Control
+from flexneedle.scenario.sections.settings import PlanSettings
+from flexneedle.simulator.control import Control, Limits
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Plan
+from flexneedle.types import Floats, Plan
 
-Floats = NDArray[np.float64]
 STRATEGIES = ("manipulation", "steering")
 _DEPTH_TOLERANCE_MM = 1e-6
 _SHARE_SIGMA = 0.1  # of the logarithm of a primitive's share of the travel
@@ -69,9 +67,9 @@ def plan(
         shapes=np.array([state.nodes for state in states]),
         cost=solution.cost,
         terms=solution.terms,
-        iterations=solution.belief.iterations,
-        converged=solution.belief.converged,
-        history=solution.belief.history,
+        iterations=solution.search_state.iterations,
+        converged=solution.search_state.converged,
+        history=solution.search_state.history,
         limit=_binding_limit(simulator, problem, controls, states),
         seconds=time.perf_counter() - begun,
     )
@@ -110,7 +108,7 @@ def _rollout(simulator: Simulator) -> Callable[[Floats], Outcome]:
 def _settings(plan: PlanSettings, samples: int) -> Search:
     return Search(
         samples=samples,
-        elite=max(2, elite_count(samples, plan.elite_fraction)),
+        elite=elite_count(samples, plan.elite_fraction),
         iterations=max(plan.iterations, plan.max_iterations),
         smoothing=plan.smoothing,
         tolerance=plan.tolerance,
@@ -124,7 +122,7 @@ def _bevel_alone(problem: PlanProblem) -> bool:
 
 def _problem(scenario: Scenario, goal: tuple[float, float], strategy: str) -> PlanProblem:
     setup, plan = scenario.setup, scenario.plan
-    guide_step = setup.max_guide_step_mm if setup.has_guide else 0.0
+    limits = Limits.of(scenario)
     sigma = np.array(
         [
             plan.advance_sigma_mm,
@@ -144,8 +142,8 @@ def _problem(scenario: Scenario, goal: tuple[float, float], strategy: str) -> Pl
         travel=setup.tip_to_skin_mm + goal[0],
         air=setup.tip_to_skin_mm,
         primitives=plan.primitives,
-        step=np.array([setup.max_advance_mm, setup.max_base_step_mm, setup.max_base_turn_step, guide_step]),
-        reach=np.array([setup.stroke_mm, setup.max_base_travel_mm, np.inf, setup.max_guide_travel_mm]),
+        step=limits.step,
+        reach=limits.travel[:, 1],
         sigma=sigma,
         accuracy_weight=plan.accuracy_weight_per_mm,
         energy_weight=plan.energy_weight_per_mj,

@@ -11,14 +11,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.horizon import Found, Variables, best
 from flexneedle.planning.insertion import PlanProblem, Solution, cost_terms, solution
 from flexneedle.planning.terms import RolloutFunction
-
-Floats = NDArray[np.float64]
+from flexneedle.types import Floats
 
 MOST_ROLLS = 4
 _USUAL_SEARCHES = 5  # one roll and two, from either side, and the last
@@ -103,7 +101,7 @@ def _counted(progress: OnIteration | None, search: Search, found: list[Found]) -
     if progress is None:
         return None
     before, usual = (
-        sum(one.belief.iterations for one in found),
+        sum(one.search_state.iterations for one in found),
         _USUAL_SEARCHES * (search.usual or search.iterations),
     )
     least = min((one.cost for one in found), default=np.inf)

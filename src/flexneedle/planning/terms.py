@@ -25,7 +25,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from flexneedle.types import Floats
+
 PlanarPoint = tuple[float, float]
 
 

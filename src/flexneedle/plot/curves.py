@@ -7,11 +7,8 @@ from itertools import pairwise
 from statistics import median
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flexneedle.types import Action, Frame, Insertion, Plan, VerdictKind
-
-Floats = NDArray[np.float64]
+from flexneedle.types import Action, Floats, Frame, Insertion, Plan, VerdictKind
 
 _TIP = "tip"  # the sensor in the needle; all others of a frame are references
 # Verdicts on readings that the monitor leaves out of its window.

@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from flexneedle.plot import curves, scene
-from flexneedle.plot.curves import Floats
 from flexneedle.plot.panels import Line, draw_panel, draw_timeline
 from flexneedle.plot.style import (
     BAD,
@@ -31,7 +30,7 @@ from flexneedle.plot.style import (
     styled,
 )
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Insertion
+from flexneedle.types import Floats, Insertion
 
 # Places in inches from the top left.
 _LEFT, _RIGHT, _HEAD = 0.62, 0.15, 0.72

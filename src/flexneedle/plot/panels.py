@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
-from flexneedle.plot.curves import Floats
 from flexneedle.plot.scene import tint_layers
 from flexneedle.plot.style import BAD, QUIET
 from flexneedle.scenario.model import Scenario
+from flexneedle.types import Floats
 
 _GAP = 0.17  # least distance of two names, as a share of the panel's height
 _SEEN = 0.008  # least extent of a line that is seen as one, as a share of the panel's width

@@ -24,7 +24,7 @@ from flexneedle.plot.style import (
     styled,
 )
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Plan
+from flexneedle.types import Floats, Plan
 
 # Places in inches from the top left.
 _LEFT, _RIGHT, _HEAD, _BETWEEN = 0.62, 0.15, 0.66, 0.75
@@ -131,7 +131,7 @@ def _energy(plans: Sequence[Plan]) -> list[Line]:
     return _lines(plans, [plan.strain_energy for plan in plans])
 
 
-def _lines(plans: Sequence[Plan], values: Sequence[curves.Floats]) -> list[Line]:
+def _lines(plans: Sequence[Plan], values: Sequence[Floats]) -> list[Line]:
     return [
         Line(plan.strategy, plan.tips[:, 0], value, color)
         for plan, value, color in zip(plans, values, STRATEGIES, strict=False)

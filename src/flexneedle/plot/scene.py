@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
-from flexneedle.plot.curves import Floats, Turn
+from flexneedle.plot.curves import Turn
 from flexneedle.plot.style import GUIDE, NEEDLE, QUIET, TARGET
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.tissue import Layer
-from flexneedle.types import Plan
+from flexneedle.types import Floats, Plan
 
 _AIR = "#ffffff"
 _TISSUES = ("#fbeee3", "#f3dcc8", "#e9c9ad", "#deb592")  # soft to stiff

@@ -186,7 +186,7 @@ class _Step:
 
 
 def _step(decision: Decision, lost: str, reading: float) -> _Step:
-    """What follows from a decision. lost: why no path leads to the target, or empty; reading: the tracker's period, s."""
+    """What follows from a decision; lost: why no path leads to the target, or ""; reading: the tracker's period (s)."""
     still = replace(decision, command=_STILL)
     if lost:
         return _Step(Action.HOLD, replace(still, why=f"held: {lost}"), reading)

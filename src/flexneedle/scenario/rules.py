@@ -69,7 +69,7 @@ def target_problems(setup: Setup, target: Target) -> Iterator[Problem]:
 
 def plan_problems(plan: PlanSettings) -> Iterator[Problem]:
     """A covariance needs two elite samples."""
-    if plan.elite_count < 2:
+    if plan.samples * plan.elite_fraction <= 1.0 + 1e-9:
         rule = f"must leave at least 2 elite samples of plan.samples ({plan.samples})"
         yield Problem("plan.elite_fraction", plan.elite_fraction, rule)
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import CommandError
 from flexneedle.scenario.model import Scenario
+from flexneedle.types import Floats
 
-Floats = NDArray[np.float64]
 COLUMNS = ("db_x", "db_y", "db_theta", "dg_y", "flip")
 _SLACK = 1e-9  # rounding of sums of steps, mm or rad
 

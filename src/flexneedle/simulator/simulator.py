@@ -18,8 +18,8 @@ from flexneedle.mechanics.ogden import displaced_energy
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.control import Control, Limits
 from flexneedle.simulator.state import State, load_arrays, mechanics_difference, mesh_of, solved
+from flexneedle.types import Floats
 
-Floats = NDArray[np.float64]
 _STEPS_WORTH_A_THREAD = 200
 _CHUNKS_A_THREAD = 4
 _CLOSEST_POINTS_MM = 0.1

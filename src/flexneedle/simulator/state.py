@@ -15,8 +15,8 @@ from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.model import CONTACT, Model, Nodes
 from flexneedle.mechanics.shape import beam_energy, equal_arc_nodes
 from flexneedle.scenario.model import Scenario
+from flexneedle.types import Floats
 
-Floats = NDArray[np.float64]
 _MECHANICS = ("needle.", "setup.", "tissue", "contact.")  # the keys that a state depends on
 _Array = TypeVar("_Array", bound=NDArray[Any])
 _WORK_ROWS = (nd.Y, nd.TURN, nd.SHEAR, nd.MOMENT, nd.FORCE, nd.ENERGY)

@@ -22,7 +22,7 @@ from flexneedle.control.guide import guide_may_move
 from flexneedle.control.interface import Decision, Method
 from flexneedle.control.outlook import UNCORRECTED, Outlook
 from flexneedle.control.path import Ahead, GuidePath, of_plan, proposals
-from flexneedle.estimation.estimate import Estimate, Floats
+from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.identification import Identification, Identified
 from flexneedle.estimation.prior import Priors
 from flexneedle.estimation.task import Task
@@ -31,7 +31,7 @@ from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.horizon import Found, Variables, best
 from flexneedle.planning.terms import Outcome, Term
 from flexneedle.scenario.sections.fields import NonNegative, count
-from flexneedle.types import Command
+from flexneedle.types import Command, Floats
 
 _ELITE = 8  # one in so many samples
 _LEAST_ELITE = 3
@@ -122,7 +122,7 @@ def decide(
     depths = ", ".join(f"{roll:.1f}" for roll in rolled.rolls)
     rolls = f"rolls at {depths} mm" if depths else "no roll"
     why = f"{rolls}; predicted miss {miss:+.3f} ± {sd:.3f} mm"
-    spread = float(np.sqrt(found.belief.covariance[0, 0]))
+    spread = float(np.sqrt(found.search_state.covariance[0, 0]))
     after = Memory(
         path,
         rolled,

@@ -11,7 +11,6 @@ hand, and the tip is to follow the planned path where theirs has the target stra
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.control.interface import Decision, Method, travel_left
 from flexneedle.control.mpc import planned_base
@@ -20,9 +19,8 @@ from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive, Section, count
-from flexneedle.types import Plan
+from flexneedle.types import Floats, Plan
 
-Floats = NDArray[np.float64]
 _LEAST_INSERTION_MM = (
     0.5  # between two updates: a shorter one shows more of the tracker's noise than of the needle
 )

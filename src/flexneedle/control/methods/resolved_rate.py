@@ -12,7 +12,6 @@ advance needs no Jacobian: the tip's depth follows the base one to one.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.control import bang_bang
 from flexneedle.control.interface import Decision, Method, travel_left
@@ -24,9 +23,8 @@ from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Plan
+from flexneedle.types import Floats, Plan
 
-Floats = NDArray[np.float64]
 _DISTURBANCE_MM = 0.05  # of the guide: above rounding, small against the 10 mm in which the tissue stiffens
 
 

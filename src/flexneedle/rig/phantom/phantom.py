@@ -4,14 +4,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.rig.phantom.draw import Truth
 from flexneedle.rig.phantom.plants import PlantFactory, plant
 from flexneedle.simulator.control import Control, Limits
-from flexneedle.types import Command
+from flexneedle.types import Command, Floats
 
-Floats = NDArray[np.float64]
 _WHOLE = 1e-8  # of a motor step: rounding of a place that stands on one
 
 

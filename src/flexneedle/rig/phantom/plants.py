@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
 from flexneedle.mechanics.ogden import law_scales
@@ -13,8 +12,8 @@ from flexneedle.rig.phantom import rod as rd
 from flexneedle.rig.phantom.draw import Truth
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import Floats
 
-Floats = NDArray[np.float64]
 _GUIDE_STIFFNESS = 1e3  # N/mm; a needle pushes on its guide with about a newton
 
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from flexneedle.rig.tracking.field.poses import SensorPose, reference_poses
 from flexneedle.rig.tracking.field.room import Room
-from flexneedle.rig.tracking.field.sensors import Floats, noiseless, noisy
-from flexneedle.types import Point
+from flexneedle.rig.tracking.field.sensors import noiseless, noisy
+from flexneedle.types import Floats, Point
 
 _TRIES = 40
 _FURTHEST_MM = 30.0  # moved away from the needle for a clean place, a reference would speak for another field

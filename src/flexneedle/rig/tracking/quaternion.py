@@ -1,10 +1,8 @@
 """Unit quaternions w, x, y, z, one (4,) or many (n, 4)."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-
+from flexneedle.types import Floats
 
 _PRODUCT = np.array(
     [

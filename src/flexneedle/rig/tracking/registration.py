@@ -8,14 +8,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
 from flexneedle.scenario.sections.registration import Registration
-from flexneedle.types import Point
-
-Floats = NDArray[np.float64]
-
+from flexneedle.types import Floats, Point
 
 _FLAT = 1e-6  # second spread over the first, below which points lie on a line
 _LEAST = 3

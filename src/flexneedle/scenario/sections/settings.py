@@ -1,6 +1,5 @@
 """The task and the settings of planner, controller and virtual phantom."""
 
-from math import ceil
 from typing import Annotated, Any, Self
 
 from pydantic import ConfigDict, Field, model_validator
@@ -30,11 +29,6 @@ class Target(Section):
     def position(self) -> tuple[float, float]:
         """(x, y), mm."""
         return self.depth_mm, self.lateral_mm
-
-
-def elite_count(samples: int, fraction: float) -> int:
-    """⌈ρN⌉, the slack for rounding of the product."""
-    return ceil(samples * fraction - 1e-9)
 
 
 class PlanSettings(Section):
@@ -72,11 +66,6 @@ class PlanSettings(Section):
     """R, cost of the guide's travel in a step."""
     flip_weight: NonNegative = 0.3
     """R of a turn of the bevel."""
-
-    @property
-    def elite_count(self) -> int:
-        """Number of elite samples, ⌈ρN⌉ (paper section III)."""
-        return elite_count(self.samples, self.elite_fraction)
 
     @property
     def base_turn_sigma(self) -> float:

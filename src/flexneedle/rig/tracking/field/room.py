@@ -10,12 +10,11 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.scenario.sections.environment import Environment, Plate
+from flexneedle.types import Floats
 
-Floats = NDArray[np.float64]
 Rng = np.random.Generator
 Envelope = Callable[[Floats, float | None], Floats]
 

@@ -9,15 +9,12 @@ from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.rig.tracking.field.room import Room
 from flexneedle.rig.tracking.quaternion import from_vector, product, z_axis
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.scenario.sections.environment import Environment
-
-Floats = NDArray[np.float64]
-
+from flexneedle.types import Floats
 
 LARGEST_INDICATOR = 9.9
 _PER_MILLI = 1e-3

@@ -7,12 +7,12 @@ import numpy as np
 
 from flexneedle.rig.ports import Clock
 from flexneedle.rig.tracking.field.poses import SensorPose
-from flexneedle.rig.tracking.field.room import SENSORS, Floats, Room
+from flexneedle.rig.tracking.field.room import SENSORS, Room
 from flexneedle.rig.tracking.field.sensors import Noiseless, SensorReadings, noiseless, noisy
 from flexneedle.rig.tracking.quaternion import along, from_matrix, product, z_axis
 from flexneedle.rig.tracking.registration import Rigid, identity
 from flexneedle.rig.tracking.table import TIP
-from flexneedle.types import VISIBLE, Frame, Point, Quaternion, SensorReading
+from flexneedle.types import VISIBLE, Floats, Frame, Point, Quaternion, SensorReading
 
 MISSING = "missing"
 """Status of a reading without a position."""
