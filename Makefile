@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow bench robustness validation accuracy controllers studies tracker steering worlds tuning lint clean
+.PHONY: help setup demo test test-all slow bench robustness validation accuracy controllers studies tracker steering worlds tuning lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -8,7 +8,7 @@ STAMP := .venv/.installed
 FITS := -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
 
 help:  ## show this list
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
 
 setup: $(STAMP)  ## install the package with its tools into .venv (PYTHON=… chooses the interpreter)
 
@@ -31,8 +31,11 @@ $(STAMP): pyproject.toml
 demo: setup  ## plan and steer one insertion on the phantom
 	@$(BIN)/flexneedle insert phantom --seed 0
 
-test: setup  ## run the tests
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+test: setup  ## run the tests but the long ones, on all cores
+	$(BIN)/python -m pytest -n auto $(PYTEST_ARGS)
+
+test-all: setup  ## run all tests but the slow ones: statistics over many draws, studies in several processes
+	$(BIN)/python -m pytest -n auto -m "not slow" $(PYTEST_ARGS)
 
 bench: setup  ## measure speed: mechanics, control periods, ten million rows of tracker data, 60 s of an emulated tracker
 	$(BIN)/python benchmarks/bench.py

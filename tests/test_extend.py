@@ -77,6 +77,7 @@ def test_each_example_is_some_thirty_lines():
     assert all(20 < len(code.splitlines()) < 42 for code in MODULES.values())
 
 
+@pytest.mark.long
 def test_the_parts_are_carried_out_and_recorded_under_their_names(lab):
     options = [word for key, name in PARTS.items() for word in (f"--{key}", name)]
     done = command(lab, "insert", "quick.toml", "--force", "--json", "--out", "one", *options)
@@ -97,6 +98,7 @@ def test_a_scenario_with_the_table_is_checked_with_the_controller(lab):
     assert (fine.returncode, fine.stderr) == (0, "")
 
 
+@pytest.mark.long
 def test_the_table_of_a_controller_that_is_not_used_is_warned_of_once(lab):
     for argv in (["plan"], ["insert", "--force", "--controller", "open-loop", "--phantom", "model"]):
         done = command(lab, *argv, "quick.toml", "--out", f"other-{argv[0]}")
@@ -122,6 +124,7 @@ def test_objects_are_carried_out_as_their_names_are(lab, imported, monkeypatch):
     assert other.periods[-1].guide != by_object.periods[-1].guide
 
 
+@pytest.mark.long
 def test_a_study_takes_them_by_name_in_its_workers(lab):
     done = command(lab, "study", "own.toml", "--workers", "2", "--out", "study", "--json")
     assert done.returncode == 0, done.stderr
@@ -148,6 +151,7 @@ def test_a_study_takes_them_by_name_in_its_workers(lab):
     assert report.returncode == 0, report.stderr
 
 
+@pytest.mark.long
 def test_a_study_is_not_resumed_with_an_edited_module(lab, tmp_path):
     for file in lab.glob("*.*"):
         (tmp_path / file.name).write_bytes(file.read_bytes())

@@ -439,6 +439,7 @@ def test_a_target_above_the_first_contact_point_is_decided_on_too(quick_plan):
 # ---- whole insertions
 
 
+@pytest.mark.long
 def test_a_whole_insertion_into_another_tissue_ends_at_the_target(quick_plan):
     """Stiffer tissue, a weaker bevel and a bent needle, where the plan alone misses by far more, in the mean of a few
     searches: a stiff deep layer shows late, and the path that is left then depends on the path before.
@@ -508,6 +509,7 @@ def test_deciding_changes_nothing_of_belief_plan_and_memory(quick_plan, along):
         np.testing.assert_array_equal(kept, there)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [31, 68])
 def test_a_soft_needle_is_steered_where_its_tip_bends_off_below_the_skin(number):
     """There the tip moves by millimetres within a step, and a reading is not on the chord of its move."""

@@ -51,6 +51,7 @@ def test_they_are_there_under_their_names():
         method("pid")
 
 
+@pytest.mark.long
 @given(
     name=st.sampled_from((*FIELD, "ce-mpc")), base=st.floats(-0.6, 0.6), stretch=st.floats(-3.0, 3.0),
     step=st.floats(0.01, 0.5), reach=st.floats(0.02, 15.0), advance=st.floats(0.3, 2.0),

@@ -142,6 +142,7 @@ def test_the_reach_of_the_bevel_is_where_the_two_insertions_without_a_roll_end()
     assert constant.tip_mm[1] == pytest.approx(greatest, abs=0.005)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("number", "share"), [(3, -0.9), (17, 0.05), (31, 0.6), (37, -0.9)])
 def test_every_target_within_reach_is_steered_to_on_any_needle(number, share):
     """With and without a guide; `make steering` has a hundred."""
@@ -171,6 +172,7 @@ def test_a_search_that_still_improves_goes_on_as_long_as_the_scenario_allows():
     assert later.history[:4] == first.history
 
 
+@pytest.mark.long
 def test_mirrored_target_costs_about_the_same():
     best = [min(planned((40.0, side), seed=seed).cost for seed in (1, 2)) for side in (5.0, -5.0)]
     assert best[0] == pytest.approx(best[1], rel=0.3)

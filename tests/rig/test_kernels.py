@@ -38,6 +38,7 @@ assert signatures() == before, (signatures(), before)
 """
 
 
+@pytest.mark.long
 def test_no_plan_and_no_insertion_compiles_anything_more():
     command = [sys.executable, "-c", EVERYTHING]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -5,6 +5,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import flexneedle
 from emulated import emulated, read_until, until
@@ -35,6 +36,7 @@ class Motors:
         return command
 
 
+@pytest.mark.long
 def test_frames_move_the_needle_and_silence_holds_it():
     scenario = flexneedle.load_scenario("phantom").with_values(ANYWHERE)
     plan = flexneedle.plan(scenario, (40.0, 5.0), seed=0)

@@ -46,6 +46,7 @@ def worker(address):
     return process("worker", address, "--nthreads", "1", "--no-nanny", "--death-timeout", "60")
 
 
+@pytest.mark.long
 def test_a_killed_worker_loses_no_row_and_repeats_none(quick, uninterrupted, tmp_path):
     told = []
     with scheduler() as address, worker(address) as first, worker(address) as second:

@@ -61,6 +61,7 @@ def test_a_study_of_which_nothing_is_done_says_why(capsys, quick, tmp_path, monk
     assert (status, err.splitlines()[-1]) == (1, told)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
 def test_a_study_of_which_something_is_done_does_not(capsys, quick, tmp_path, monkeypatch):
     insert = rows.insert
@@ -121,6 +122,7 @@ def test_a_study_without_plans_to_make_has_planned(monkeypatch):
     assert told(monkeypatch, [(0, 0, 1050, 0.0)])[0] == [("Planning", 1, 1, "0 of 0 plans")]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
 def test_a_cluster_without_workers_is_told(capsys, quick, tmp_path, monkeypatch):
     def cluster(_address, on_no_workers):

@@ -241,6 +241,7 @@ def test_an_unknown_study_is_refused_with_the_names_of_those_that_there_are():
         load_study("nope")
 
 
+@pytest.mark.long
 def test_the_studies_of_the_package_can_be_carried_out():
     """Loading checks every scenario of the grid against all rules, targets within the stroke included."""
     sizes = {name: len(load_study(name)) for name in STUDIES.names()}

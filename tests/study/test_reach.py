@@ -82,6 +82,7 @@ def test_a_stroke_that_ends_before_the_target_is_out_of_reach():
     assert reach(scenario, seed, "model") >= missing[seed]
 
 
+@pytest.mark.long
 def test_with_a_guide_the_reach_is_what_a_long_search_leaves():
     """Next to nothing on the way, metres where the guide's travel does not lead."""
     assert reach(GUIDED, 0, "model") < 0.01
@@ -102,6 +103,7 @@ def test_a_plant_that_does_not_converge_has_no_reach(monkeypatch):
     assert math.isnan(reach(FREE, 0, "model"))
 
 
+@pytest.mark.long
 def test_a_guide_that_steering_leaves_where_it_is_does_not_widen_the_reach():
     """A target that guide and bevel reach and the bevel alone does not."""
     low, high = sorted(end(GUIDED, bevel)[1] for bevel in (-1, 1))

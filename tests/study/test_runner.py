@@ -101,10 +101,12 @@ def test_one_plan_is_made_for_each_target_and_used_by_all_cases_and_plants(unint
     assert len(made) == 2
 
 
+@pytest.mark.long
 def test_one_worker_leaves_the_same_bytes_as_two(quick, uninterrupted, tmp_path):
     assert tables(run_study(quick, tmp_path / "one", workers=1)) == tables(uninterrupted)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
 def test_a_study_that_is_killed_goes_on_and_ends_with_the_same_bytes(quick, uninterrupted, tmp_path):
     """The workers end with the parent: else `stop` would wait for them in vain. Threads end with the same bytes."""
@@ -120,6 +122,7 @@ def test_a_study_that_is_killed_goes_on_and_ends_with_the_same_bytes(quick, unin
     assert tables(out) == tables(uninterrupted)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
 def test_ctrl_c_keeps_the_finished_rows_and_says_how_to_go_on(quick, uninterrupted, tmp_path):
     out = tmp_path / "stopped"
@@ -138,6 +141,7 @@ def test_ctrl_c_keeps_the_finished_rows_and_says_how_to_go_on(quick, uninterrupt
     assert tables(out) == tables(uninterrupted)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
 def test_a_finished_study_is_not_done_again(quick, tmp_path, monkeypatch):
     out = run_study(quick, tmp_path / "again")
@@ -165,6 +169,7 @@ def test_plans_are_made_once_also_by_a_study_that_goes_on(quick, tmp_path, monke
     assert sorted(point.scenario.target.depth_mm for point in made) == [8.0, 10.0]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
 def test_a_study_tells_how_far_it_is(quick, tmp_path):
     message = []
@@ -227,6 +232,7 @@ class Dying(Executor):
         return future
 
 
+@pytest.mark.long
 def test_a_lost_worker_ends_the_study_with_its_rows_kept(quick, uninterrupted, tmp_path, monkeypatch):
     @contextmanager
     def dying(_workers):
@@ -315,6 +321,7 @@ def test_a_name_that_is_too_long_for_a_folder_is_refused(quick, tmp_path):
         run_study(quick, tmp_path / ("a" * 300))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
 def test_a_study_that_was_killed_before_it_began_is_begun(quick, uninterrupted, tmp_path):
     (tmp_path / "journal.jsonl").touch()

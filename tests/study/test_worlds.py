@@ -117,6 +117,7 @@ def test_a_study_of_worlds_that_cannot_be_is_refused(load, text, worlds, message
     assert message in str(caught.value)
 
 
+@pytest.mark.long
 def test_the_shipped_study_has_two_hundred_worlds_that_nothing_was_chosen_on():
     study = load_study("worlds")
     numbers = {point.world for point in study.points}

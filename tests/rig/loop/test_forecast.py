@@ -154,6 +154,7 @@ def test_a_target_that_guide_and_bevel_cannot_reach_is_held_and_forced(plan):
     assert not forced.reached
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_with_a_perfect_model_it_ends_at_the_target(number):
     """Worlds whose plant is the model, with the tracker's noise, and no warning."""

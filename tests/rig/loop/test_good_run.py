@@ -91,6 +91,7 @@ def test_speed_is_that_of_the_scenario_rounded_up_to_whole_readings(real):
         assert duration / READING == pytest.approx(round(duration / READING))
 
 
+@pytest.mark.long
 def test_phantoms_of_other_seeds_are_reached(plan, inserted):
     """With all that a rig has, as shipped; a period more is the rest for the last reading, or one that was missing."""
     done = [inserted(seed) for seed in range(2001, 2005)]

@@ -30,6 +30,7 @@ AHEAD, BACK = 0.25, -0.25
 START = 114  # steps of 0.25 mm to the skin
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("layers", [1, 2])
 def test_it_meets_the_controllers_model_at_small_angles(layers):
     """Two formulations, one limit: what is between the tips falls with the cube of the angle."""

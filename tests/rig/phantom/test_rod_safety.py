@@ -63,6 +63,7 @@ def wander(scenario, seed, periods):
     return steps, lost
 
 
+@pytest.mark.long
 def test_ten_thousand_random_steps_of_extreme_phantoms_converge():
     """Tissue 0.3 to 2.5 times, bevel 0 to 2 times, twice and more of all that a rig has; guide and base anywhere."""
     counts = np.array([wander(EXTREME, seed, 80) for seed in range(52)]).sum(axis=0)

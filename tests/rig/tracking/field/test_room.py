@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
-from rooms import environment
 
 from flexneedle.rig.tracking.field.room import SENSORS, Room, grid
+from rooms import environment
 
 GRID = grid(100.0)
 EVEN = 1e6  # a length over which a field is the same all over the workspace
@@ -47,6 +47,7 @@ def test_every_room_has_the_size_of_its_environment(seed, size, length, shared, 
         assert rms(room.error(sensor, GRID) - distortion) == pytest.approx(bias, rel=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("length", [30.0, 80.0])
 def test_errors_stay_alike_over_the_length_and_no_further(length):
     """Correlation over a distance r in many rooms: e^(−r²/2ℓ²)."""
