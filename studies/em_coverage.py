@@ -11,16 +11,18 @@ was planted. The smooth field makes the errors alone: its two columns are empty 
 
 import argparse
 import sys
+import tempfile
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 from scipy import stats
 
 from flexneedle.em.evaluation.accuracy import accuracy
-from flexneedle.em.evaluation.cells import collect
-from flexneedle.em.evaluation.reading import Batch
+from flexneedle.em.evaluation.evaluate import Options, read_table
 from flexneedle.em.evaluation.separation import separation
 
 GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -95,22 +97,20 @@ def throughout(error: np.ndarray) -> dict[str, float]:
     }
 
 
-def batch(
+def rows(
     rng: np.random.Generator, planted: Planted, environment: str, error: np.ndarray, level: np.ndarray
-) -> Batch:
+) -> pa.Table:
     """Rows with errors (n, 3) and mean indicators (n,) of the grid points, and the planted jitter."""
     place = np.repeat(np.arange(POINTS), SAMPLES)
     noise = rng.normal(0.0, planted.jitter / np.sqrt(3), (len(place), 3))
     measured = (GRID + error)[place] + noise
-    own = {"sensor": "reference", "environment": environment}
-    names = {"point_id": place.astype(str), **{name: [value] * len(place) for name, value in own.items()}}
-    labels = {name: pa.array(values).dictionary_encode() for name, values in names.items()}
-    numbers = {f"true_{axis}_mm": GRID[place, k].copy() for k, axis in enumerate("xyz")}
-    numbers |= {f"{axis}_mm": measured[:, k].copy() for k, axis in enumerate("xyz")}
-    return Batch(len(place), labels, {**numbers, "indicator": level[place]})
+    columns = {"point_id": place, "indicator": level[place]}
+    columns |= {"sensor": ["reference"] * len(place), "environment": [environment] * len(place)}
+    columns |= {f"true_{axis}_mm": GRID[place, k] for k, axis in enumerate("xyz")}
+    return pa.table(columns | {f"{axis}_mm": measured[:, k] for k, axis in enumerate("xyz")})
 
 
-def batches(rng: np.random.Generator, planted: Planted, smooth: bool) -> tuple[list[Batch], dict[str, float]]:
+def table_of(rng: np.random.Generator, planted: Planted, smooth: bool) -> tuple[pa.Table, dict[str, float]]:
     """Both environments of a data set, and what the errors in `ideal` come to in the whole volume."""
     towards = rng.normal(size=3)
     error = planted.bias * towards / np.linalg.norm(towards) + planted.spread * field(rng, smooth)
@@ -122,13 +122,16 @@ def batches(rng: np.random.Generator, planted: Planted, smooth: bool) -> tuple[l
     length = planted.slope * noisy + planted.intercept + np.maximum(scatter, -planted.slope * noisy)
     along = rng.normal(size=(POINTS, 3))
     along *= (length / np.linalg.norm(along, axis=1))[:, None]
-    both = batch(rng, planted, "ideal", error[:POINTS], ideal), batch(rng, planted, "noisy", along, noisy)
-    return list(both), throughout(error[POINTS:])
+    both = rows(rng, planted, "ideal", error[:POINTS], ideal), rows(rng, planted, "noisy", along, noisy)
+    return pa.concat_tables(both), throughout(error[POINTS:])
 
 
-def judged(tables: list[Batch]) -> dict[str, tuple[float, tuple[float, float]]]:
+def judged(table: pa.Table) -> dict[str, tuple[float, tuple[float, float]]]:
     """Estimate and interval of everything that was planted."""
-    ideal, noisy = collect(tables, bin_mm=50.0)[0]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "table.parquet"
+        pq.write_table(table, path)
+        ideal, noisy = read_table(path, Options())[0]
     found, said = accuracy(ideal), separation("reference", ideal, noisy)
     parts = ((found, ("rmse", "p95", "mean", "sd", "jitter")), (said.noisy, ("slope", "intercept")))
     return {
@@ -149,8 +152,8 @@ def study(
     for own in np.random.SeedSequence(seed).spawn(sets):
         rng = np.random.default_rng(own)
         planted = Planted.draw(rng)
-        tables, volume = batches(rng, planted, smooth)
-        done.append((planted.values(), judged(tables), volume))
+        table, volume = table_of(rng, planted, smooth)
+        done.append((planted.values(), judged(table), volume))
     return done
 
 

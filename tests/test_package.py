@@ -8,7 +8,7 @@ import pytest
 
 import flexneedle
 
-HEAVY = {"numba", "numpy", "matplotlib", "pydantic", "rosbags", "mcap"}
+HEAVY = {"numba", "numpy", "scipy", "duckdb", "matplotlib", "pydantic", "rosbags", "mcap"}
 
 
 def modules_after(*arguments: str) -> set[str]:
@@ -27,7 +27,9 @@ def test_import_loads_nothing_heavy():
     assert not modules_after("import flexneedle") & HEAVY
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["scenario", "--help"]])
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["--version"], ["scenario", "--help"], ["em", "evaluate", "--help"]]
+)
 def test_help_loads_nothing_heavy(arguments):
     assert not modules_after("from flexneedle.cli.main import main; sys.exit(main())", *arguments) & HEAVY
 

@@ -111,9 +111,9 @@ def test_without_point_ids_each_row_is_a_point(tmp_path):
             [*rows()[:5], ("p9", 1, 2, 3, 4, "", 6, "ref1")],
             "row 6: x_mm, y_mm, z_mm: all three must be there, or none",
         ),
-        ([*rows(), ("p0", 1, 2, 3, 4, 5, 6, "ref1")], "point p0 has several places on the stage"),
+        ([*rows(), ("p0", 1, 2, 3, 4, 5, 6, "ref1")], "point p0 has several positions on the stage"),
         ([*rows(), *rows(sensor="tip")], "choose one with --sensor: ref1, tip"),
-        ([(*row[:4], "", "", "", "ref1") for row in rows()], "no reading has a place"),
+        ([(*row[:4], "", "", "", "ref1") for row in rows()], "no reading has a position"),
         ([(*row[:4], *(1e-3 * v for v in row[4:7]), "ref1") for row in rows()], "both must be in mm"),
         (
             [(row[0], *(1e-3 * v for v in row[1:7]), "ref1") for row in rows()],
@@ -168,7 +168,7 @@ def test_the_command_writes_a_table_for_scenarios_a_picture_and_tells_the_errors
     scenario = load_registration(out, PHANTOM)
     assert scenario.tracker.registration == found.registration
     assert main(command) == 2
-    assert capsys.readouterr().err == f"flexneedle: {out}: is there already: name another with --out\n"
+    assert capsys.readouterr().err == f"flexneedle: {out}: exists: name another file with --out\n"
 
 
 @pytest.mark.parametrize(

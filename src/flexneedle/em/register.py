@@ -1,7 +1,6 @@
-"""`flexneedle em register`: pairs of points in, the tracker's place in the stage's frame out."""
+"""`flexneedle em register`: the rigid map from the tracker's frame to the stage's, from pairs of points."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,12 +9,10 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from flexneedle.em.evaluation.cells import MILLIMETRES_IN, SAME_MM
-from flexneedle.em.evaluation.checks import check_true, seen_rows
-from flexneedle.em.evaluation.columns import column_map
-from flexneedle.em.evaluation.moments import Moments
-from flexneedle.em.evaluation.reading import LABELS, read_batches
 from flexneedle.em.plot.registration import registration_figure
+from flexneedle.em.table.columns import column_map
+from flexneedle.em.table.rules import POSITIONS, SAME_MM, TRUE_POSITIONS, refuse_broken
+from flexneedle.em.table.source import LABELS, Table, open_table
 from flexneedle.errors import InputError
 from flexneedle.plot.style import save
 from flexneedle.rig.tracking.quaternion import from_matrix
@@ -42,9 +39,9 @@ _HEAD = """\
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """n fiducials: names; where they are, stage (n, 3), and where the tracker sees them, tracker (n, 3), mm.
+    """n fiducials: names; their positions in the frames of the stage, (n, 3), and of the tracker, (n, 3), mm.
 
-    samples (n,): of how many readings a place is the mean; missing: readings without a place, left out.
+    samples (n,): of how many readings a position is the mean; missing: readings without a position, left out.
     """
 
     names: tuple[str, ...]
@@ -59,7 +56,7 @@ class Registered:
     """A registration and its errors (mm).
 
     residuals (n,): of each fiducial; left_out (n,): of each by a registration from all others; fiducial: RMS
-    residual (FRE); localisation: RMS error of a fiducial that it speaks for (FLE); targets (k, 3) with the
+    residual (FRE); localisation: RMS error of a fiducial estimated from it (FLE); targets (k, 3) with the
     expected RMS error there (TRE), target (k,).
     """
 
@@ -115,22 +112,12 @@ def read_pairs(
     columns: as for `em evaluate`; sensor, environment: which, where the table has several; unit: "mm" or "m", of all
     coordinates. Raises InputError.
     """
-    theirs = column_map(columns)
-    chosen = {"sensor": sensor, "environment": environment}
-    try:
-        with closing(read_batches(data, theirs, _NUMBERS, LABELS)) as batches:
-            rows = [_rows(batch) for batch in batches]
-        if not rows:
-            raise InputError("has no rows")
-        labels = {name: np.concatenate([part[0][name] for part in rows]) for name in LABELS}
-        numbers = np.concatenate([part[1] for part in rows]) * MILLIMETRES_IN[unit]
-        return _pairs(labels, numbers, _kept(labels, chosen))
-    except InputError as error:
-        raise InputError(f"{data}: {error}") from None
+    with open_table(data, column_map(columns), _NUMBERS, LABELS, unit=unit) as table:
+        return _pairs(table, {"sensor": sensor, "environment": environment})
 
 
 def register(pairs: Pairs, targets: Sequence[Point] = ()) -> Registered:
-    """Return the registration of the pairs; without targets its error is told at the middle of the fiducials.
+    """Return the registration of the pairs; without targets with its expected error at the middle of the fiducials.
 
     Raises InputError for pairs that no rigid body can have.
     """
@@ -147,10 +134,10 @@ def register(pairs: Pairs, targets: Sequence[Point] = ()) -> Registered:
 def write_registration(registered: Registered, path: Path) -> None:
     """Write a TOML file, a table for a scenario and the errors, and its picture beside it, `.png` and `.svg`.
 
-    Raises InputError if the file is there already.
+    Raises InputError if the file exists.
     """
     if path.exists():
-        raise InputError(f"{path}: is there already: name another with --out")
+        raise InputError(f"{path}: exists: name another file with --out")
     if not path.parent.is_dir():
         raise InputError(f"{path}: no such folder: {path.parent}")
     _draw(registered, path)
@@ -162,7 +149,7 @@ def write_registration(registered: Registered, path: Path) -> None:
         with path.open("x", encoding="utf-8") as file:
             file.write(_HEAD + tomli_w.dumps(values))
     except FileExistsError:
-        raise InputError(f"{path}: is there already: name another with --out") from None
+        raise InputError(f"{path}: exists: name another file with --out") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 
@@ -178,48 +165,48 @@ def _draw(registered: Registered, path: Path) -> None:
     save(figure, path.parent, path.stem)
 
 
-def _rows(batch: Any) -> tuple[dict[str, NDArray[Any]], Floats]:
-    texts = {
-        name: np.array(batch.labels[name].to_pylist() if name in batch.labels else [None] * batch.rows)
-        for name in LABELS
-    }
-    return texts, np.column_stack([batch.numbers[name] for name in _NUMBERS])
+_POINTS = """
+    WITH named AS (SELECT row_number() OVER () AS row, * FROM samples)
+    SELECT CASE WHEN point_id = '' THEN 'row ' || row ELSE point_id END AS name, count(x_mm) AS n,
+        count(*) - count(x_mm) AS missing, favg(x_mm) AS x, favg(y_mm) AS y, favg(z_mm) AS z,
+        first(true_x_mm ORDER BY row) FILTER (x_mm IS NOT NULL) AS true_x,
+        first(true_y_mm ORDER BY row) FILTER (x_mm IS NOT NULL) AS true_y,
+        first(true_z_mm ORDER BY row) FILTER (x_mm IS NOT NULL) AS true_z,
+        greatest(max(true_x_mm) FILTER (x_mm IS NOT NULL) - min(true_x_mm) FILTER (x_mm IS NOT NULL),
+                 max(true_y_mm) FILTER (x_mm IS NOT NULL) - min(true_y_mm) FILTER (x_mm IS NOT NULL),
+                 max(true_z_mm) FILTER (x_mm IS NOT NULL) - min(true_z_mm) FILTER (x_mm IS NOT NULL)) AS moved
+    FROM named WHERE {chosen} GROUP BY name ORDER BY min(row) FILTER (x_mm IS NOT NULL)
+"""
 
 
-def _kept(labels: Mapping[str, NDArray[Any]], chosen: Mapping[str, str | None]) -> NDArray[np.bool_]:
-    kept = np.ones(len(labels["sensor"]), dtype=bool)
-    for name, wanted in chosen.items():
-        there = sorted({str(value) for value in labels[name] if value is not None})
-        if wanted is None and len(there) > 1:
-            raise InputError(f"holds several: choose one with --{name}: {', '.join(there)}")
-        if wanted is not None:
-            if wanted not in there:
-                raise InputError(f"--{name} {wanted}: there is {', '.join(there) or 'no such column'}")
-            kept &= labels[name] == wanted
-    return kept
+def _pairs(table: Table, wanted: Mapping[str, str | None]) -> Pairs:
+    own = {name: value for name, value in wanted.items() if value is not None}
+    for name, value in wanted.items():
+        _check_label(table, name, value)
+    chosen = " AND ".join(["true", *(f"{name} = ${name}" for name in own)])
+    refuse_broken(table, POSITIONS, chosen, **own)
+    refuse_broken(table, TRUE_POSITIONS, f"{chosen} AND x_mm IS NOT NULL", **own)
+    found = table.arrays(_POINTS.format(chosen=chosen), **own)
+    known = found["n"] > 0
+    if not known.any():
+        raise InputError("no reading has a position")
+    points = {name: column[known] for name, column in found.items()}
+    if (moved := points["moved"] > SAME_MM).any():
+        name = points["name"][int(moved.argmax())]
+        raise InputError(f"point {name} has several positions on the stage: one point, one position")
+    stage, tracker = (
+        np.column_stack([points[f"{kind}{axis}"] for axis in "xyz"]).astype(float) for kind in ("true_", "")
+    )
+    return Pairs(tuple(points["name"].tolist()), stage, tracker, points["n"], int(found["missing"].sum()))
 
 
-def _pairs(labels: Mapping[str, NDArray[Any]], numbers: Floats, kept: NDArray[np.bool_]) -> Pairs:
-    stage, tracker = numbers[:, :3].T, numbers[:, 3:].T
-    # Rows that were not chosen pass for unseen ones: whatever they hold is of no concern.
-    own = seen_rows(list(np.where(kept, tracker, np.nan)), 1)
-    seen = kept if own is None else own
-    if not seen.any():
-        raise InputError("no reading has a place")
-    check_true(list(np.where(seen, stage, 0.0)), 1)
-    ids = [str(name) if name is not None else f"row {k + 1}" for k, name in enumerate(labels["point_id"])]
-    names = [name for name, there in zip(ids, seen.tolist(), strict=True) if there]
-    order = {name: k for k, name in enumerate(dict.fromkeys(names))}
-    point = np.array([order[name] for name in names], dtype=np.int64)
-    places, readings = Moments(3), Moments(3)
-    places.add(point, stage[:, seen], len(order))
-    readings.add(point, tracker[:, seen], len(order))
-    apart = np.abs(stage[:, seen].T - places.pivot[point]).max(axis=1) > SAME_MM
-    if apart.any():
-        raise InputError(
-            f"point {names[int(apart.argmax())]} has several places on the stage: one point, one place"
-        )
-    return Pairs(tuple(order), places.pivot, readings.mean, readings.count, int((kept & ~seen).sum()))
+def _check_label(table: Table, name: str, wanted: str | None) -> None:
+    query = f"SELECT DISTINCT {name} AS label FROM samples WHERE {name} <> '' ORDER BY label"
+    there = table.arrays(query)["label"].tolist() if name in table.columns else []
+    if wanted is None and len(there) > 1:
+        raise InputError(f"holds several: choose one with --{name}: {', '.join(there)}")
+    if wanted is not None and wanted not in there:
+        raise InputError(f"--{name} {wanted}: there is {', '.join(there) or 'no such column'}")
 
 
 def _left_out(pairs: Pairs) -> Floats:

@@ -80,7 +80,7 @@ def check_new(path: Path) -> None:
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: must end in {' or '.join(SUFFIXES)}")
     if path.exists():
-        raise InputError(f"{path}: is there already: name another with --out")
+        raise InputError(f"{path}: exists: name another file with --out")
     if not path.parent.is_dir():
         raise InputError(f"{path}: no folder {path.parent}")
 

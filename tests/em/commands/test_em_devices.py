@@ -86,10 +86,10 @@ def test_a_recording_asks_at_each_point_and_says_where_it_wrote(capsys, tmp_path
         assert "\nflexneedle: no more input on stdin" in err, "on a line of its own"
         status, printed, err = run(capsys, "em", "record", *arguments, "--dwell", "0")
     assert (status, printed) == (0, f"{out}\n")
-    assert "goes on after 1 recorded points" in err
+    assert "continues after 1 recorded points" in err
     assert "point 2 of 2" in err
     status, printed, err = run(capsys, "em", "record", *arguments)
-    assert (status, printed, err) == (0, f"{out}\n", f"{out}: is complete already: 2 points\n")
+    assert (status, printed, err) == (0, f"{out}\n", f"{out}: is complete: 2 points\n")
 
 
 def test_a_tracker_that_is_not_there_is_bad_input(capsys, tmp_path):
@@ -186,7 +186,7 @@ def test_without_a_terminal_what_does_not_fit_the_stage_is_refused_unless_forced
     assert "and the stage 50.0 mm: they may differ by 10.0 mm (--force records all the same)\n" in err
     status, err, rows = record_moving(capsys, tmp_path, monkeypatch, io.StringIO(), "--dwell", "0", "--force")
     assert (status, rows) == (0, 8)
-    assert "recorded all the same" in err
+    assert "recorded (--force)" in err
 
 
 def test_an_end_of_input_at_a_terminal_ends_the_line_of_the_question(capsys, tmp_path, monkeypatch):

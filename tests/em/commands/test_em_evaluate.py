@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -83,6 +84,14 @@ def test_without_a_folder_one_is_made_below_runs_and_none_is_written_over(
     assert "holds evaluation.json already" in err
 
 
+@pytest.mark.parametrize("command", ["evaluate", "check", "register"])
+def test_without_duckdb_the_extra_is_named_in_one_line(capsys, table, command, monkeypatch):
+    monkeypatch.setitem(sys.modules, "duckdb", None)
+    status, out, err = run(capsys, "em", command, table)
+    assert (status, out) == (2, "")
+    assert err == "flexneedle: tables of measurements need duckdb: pip install 'flexneedle[em]'\n"
+
+
 def test_a_table_that_cannot_be_used_is_one_line_and_status_2(capsys, tmp_path):
     path = write_csv(tmp_path / "t.csv", [{"a": 1.0}])
     status, out, err = run(capsys, "em", "evaluate", path, "--out", tmp_path / "out")
@@ -91,19 +100,19 @@ def test_a_table_that_cannot_be_used_is_one_line_and_status_2(capsys, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def powered(path, mean, environment="on", points=27):
+def powered(mean, environment="on", points=27, sensor="reference"):
     values = mean * np.linspace(0.5, 1.5, points)
-    rows = rows_of(GRID[:points], GRID[:points, None], "reference", environment, values.tolist())
-    return write_csv(path, rows)
+    return rows_of(GRID[:points], GRID[:points, None], sensor, environment, values.tolist())
 
 
-def test_check_compares_two_tables_and_its_status_says_whether_power_is_too_much(capsys, tmp_path):
-    off = powered(tmp_path / "off.csv", 0.02, "off")
-    status, out, _ = run(capsys, "em", "check", off, powered(tmp_path / "on.csv", 0.04))
+def test_check_compares_two_environments_and_its_status_is_1_where_power_is_too_much(capsys, tmp_path):
+    table = write_csv(tmp_path / "t.csv", powered(0.02, "off") + powered(0.04))
+    status, out, _ = run(capsys, "em", "check", table)
     assert status == 0
     assert "power adds 0.0200 (95 % interval" in out
     assert "mean 0.0400 with power on, not above the threshold of 0.0547 (" in out
-    status, out, _ = run(capsys, "em", "check", off, powered(tmp_path / "on.csv", 0.06), "--json")
+    table = write_csv(tmp_path / "t.csv", powered(0.02, "off") + powered(0.06))
+    status, out, _ = run(capsys, "em", "check", table, "--json")
     values = json.loads(out)
     assert (status, values["above"], values["paper_powered"]) == (1, True, 0.04)
     assert values["results"][0]["difference"] == pytest.approx(0.04)
@@ -113,10 +122,22 @@ def test_check_compares_two_tables_and_its_status_says_whether_power_is_too_much
     assert values["results"][0]["points_above"] == 16
 
 
-def test_check_finds_both_environments_in_one_table_by_name(capsys, tmp_path):
-    both = powered(tmp_path / "both.csv", 0.02, "quiet")
-    text = both.read_text() + powered(tmp_path / "on.csv", 0.03).read_text().split("\n", 1)[1]
-    both.write_text(text)
+def test_the_interval_of_the_difference_is_that_of_the_same_points_drawn_again(capsys, tmp_path):
+    rng = np.random.default_rng(1)
+    off, on = rng.uniform(0.01, 0.03, 27), rng.uniform(0.02, 0.05, 27)
+    rows = [
+        row
+        for name, values in (("off", off), ("on", on))
+        for row in rows_of(GRID, GRID[:, None], "reference", name, values.tolist())
+    ]
+    _, out, _ = run(capsys, "em", "check", write_csv(tmp_path / "t.csv", rows), "--json")
+    chosen = np.random.default_rng(0).integers(0, 27, (2000, 27))
+    ends = np.quantile((on - off)[chosen].mean(axis=1), (0.025, 0.975))
+    assert json.loads(out)["results"][0]["difference_interval"] == pytest.approx(ends, abs=1e-12)
+
+
+def test_check_finds_both_environments_by_name(capsys, tmp_path):
+    both = write_csv(tmp_path / "both.csv", powered(0.02, "quiet") + powered(0.03))
     status, out, _ = run(capsys, "em", "check", both, "--off", "quiet", "--threshold", "0.025")
     assert status == 1
     assert "above the threshold of 0.025" in out
@@ -126,23 +147,27 @@ def test_check_finds_both_environments_in_one_table_by_name(capsys, tmp_path):
     assert "no environment 'off': choose one by --off or --on: on, quiet" in err
 
 
-def test_check_with_few_or_other_points_says_so(capsys, tmp_path):
-    few = [powered(tmp_path / f"{n}.csv", 0.02, points=n) for n in (4, 20, 27)]
-    assert "too few grid points for an interval" in run(capsys, "em", "check", few[0], few[0])[1]
-    told = "reference: grid points: 20 in power off, 27 in power on, 20 of them in all: different places are compared"
-    assert run(capsys, "em", "check", few[1], few[2])[2] == f"note: {told}\n"
-    values = json.loads(run(capsys, "em", "check", few[1], few[2], "--json")[1])
+def test_check_with_few_or_other_points_prints_so(capsys, tmp_path):
+    few = write_csv(tmp_path / "few.csv", powered(0.02, "off", 4) + powered(0.02, "on", 4))
+    assert "too few grid points for an interval" in run(capsys, "em", "check", few)[1]
+    other = write_csv(tmp_path / "other.csv", powered(0.02, "off", 20) + powered(0.02, "on", 27))
+    note = "reference: grid points: 20 in power off, 27 in power on, 20 of them in all: different places are compared"
+    assert run(capsys, "em", "check", other)[2] == f"note: {note}\n"
+    values = json.loads(run(capsys, "em", "check", other, "--json")[1])
     assert values["results"][0]["paired"] is False
     low, high = values["results"][0]["difference_interval"]
     assert low < 0.0 < high
 
 
-def test_check_names_a_sensor_that_was_there_once_only(capsys, tmp_path):
-    off, on = powered(tmp_path / "off.csv", 0.02), powered(tmp_path / "on.csv", 0.02)
-    on.write_text(on.read_text() + on.read_text().split("\n", 1)[1].replace("reference", "ref2"))
-    status, _, err = run(capsys, "em", "check", off, on)
+def test_check_names_a_sensor_that_only_one_environment_has(capsys, tmp_path):
+    rows = powered(0.02, "off") + powered(0.02) + powered(0.02, sensor="ref2")
+    table = write_csv(tmp_path / "t.csv", rows)
+    status, _, err = run(capsys, "em", "check", table)
     assert (status, err) == (0, "note: ref2: no indicator in power off, only in power on\n")
-    assert json.loads(run(capsys, "em", "check", off, on, "--json")[1])["notes"] == [err[6:-1]]
+    assert json.loads(run(capsys, "em", "check", table, "--json")[1])["notes"] == [err[6:-1]]
+    status, _, err = run(capsys, "em", "check", write_csv(tmp_path / "t.csv", rows[:27] + rows[54:]))
+    assert status == 2
+    assert "no sensor has an indicator both with power off (reference) and on (ref2)" in err
 
 
 def test_environments_keep_their_own_names_in_tables(capsys, table, tmp_path):

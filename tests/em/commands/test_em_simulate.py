@@ -78,7 +78,7 @@ def test_a_table_that_is_there_is_not_written_over(tmp_path, capsys):
     out = tmp_path / "precious.csv"
     out.write_text("mine")
     assert simulate(*FEW, "--out", out) == 2
-    assert capsys.readouterr().err == f"flexneedle: {out}: is there already: name another with --out\n"
+    assert capsys.readouterr().err == f"flexneedle: {out}: exists: name another file with --out\n"
     assert out.read_text() == "mine"
 
 

@@ -28,11 +28,11 @@ def bins(rmse):
     ],
 )
 def test_the_nearest_bin_is_not_where_a_limit_begins(smallest, exceeded, told):
-    assert Distances(50.0, 0.5, smallest, exceeded, bins([0.4] * 4)).told == told
+    assert Distances(50.0, 0.5, smallest, exceeded, bins([0.4] * 4)).kept == told
 
 
 def test_without_a_limit_none_is_kept():
-    assert Distances(50.0, None, None, (), bins([0.4])).told == "no limit"
+    assert Distances(50.0, None, None, (), bins([0.4])).kept == "no limit"
 
 
 def test_the_rmse_of_a_bin_is_held_against_the_limit_not_its_largest_error(tmp_path):

@@ -13,9 +13,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from em_tables import GRID, plain, random_rows, rows_of, write_csv
-from flexneedle.em.evaluation import reading
-from flexneedle.em.evaluation.columns import column_map
 from flexneedle.em.evaluation.evaluate import Options, evaluate
+from flexneedle.em.table.columns import column_map
 from flexneedle.errors import InputError
 
 LAWS = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -92,16 +91,6 @@ def test_the_order_of_rows_does_not_matter(tmp_path, random):
     random.shuffle(rows)
     after = only(write_csv(tmp_path / "t.csv", rows))
     assert_same(after, before)
-
-
-@LAWS
-@given(block=st.integers(min_value=800, max_value=9000))
-def test_the_size_of_batches_does_not_matter(tmp_path, block):
-    path = write_csv(tmp_path / "t.csv", random_rows(seed=6, samples=4))
-    before = only(path)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reading, "_BLOCK", block)
-        assert_same(only(path), before)
 
 
 @LAWS
@@ -217,7 +206,7 @@ def test_distances_are_binned_and_the_smallest_within_the_limit_is_found(tmp_pat
         610.0,
         pytest.approx((700.0,)),
     )
-    assert evaluation.results[0].distances.told == "from 610 mm, not at 700 mm"
+    assert evaluation.results[0].distances.kept == "from 610 mm, not at 700 mm"
     assert only(tmp_path / "t.csv", limit_mm=0.1)["distance"]["smallest_mm"] is None
     wide = only(tmp_path / "t.csv", bin_mm=1000.0)
     assert len(wide["distance"]["bins"]) == 1

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from flexneedle.em.evaluation.indicator import line
-from flexneedle.em.evaluation.intervals import intervals, quantile_interval
+from flexneedle.em.evaluation.intervals import bootstrap, quantile_interval
 
 
 def test_the_interval_of_a_root_mean_square_covers_nine_times_of_ten():
@@ -13,7 +13,7 @@ def test_the_interval_of_a_root_mean_square_covers_nine_times_of_ten():
     covered = 0
     for _ in range(60):
         squares = (rng.normal(0.0, 0.5, (125, 3)) ** 2).sum(axis=1)
-        low, high = intervals({"": lambda chosen, s=squares: np.sqrt(s[chosen].mean(axis=1))}, 125)[""]
+        low, high = bootstrap(lambda s, axis: np.sqrt(s.mean(axis=axis)), squares)
         covered += low <= np.sqrt(3 * 0.25) <= high
     assert 52 <= covered <= 60
 
@@ -31,9 +31,8 @@ def test_the_interval_of_a_slope_covers_where_the_scatter_grows_with_the_indicat
 
 def test_few_points_have_no_interval_and_the_same_seed_gives_the_same():
     values = np.arange(30.0)
-    mean = {"mean": lambda chosen: values[chosen].mean(axis=1)}
-    assert intervals(mean, 9) == {"mean": None}
-    assert intervals(mean, 30) == intervals(mean, 30) != intervals(mean, 30, seed=1)
+    assert bootstrap(np.mean, values[:9]) is None
+    assert bootstrap(np.mean, values) == bootstrap(np.mean, values)
 
 
 @pytest.mark.parametrize("count", [72, 100, 125, 1000])

@@ -91,7 +91,7 @@ def test_what_is_recorded_can_be_replayed(tmp_path):
 def test_a_recording_overwrites_nothing(tmp_path):
     (tmp_path / "kept.csv").write_text("mine")
     clock = Clock()
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="exists"):
         watch(Replay(frames(1), clock), clock, lambda _: None, record=tmp_path / "kept.csv")
     assert (tmp_path / "kept.csv").read_text() == "mine"
 

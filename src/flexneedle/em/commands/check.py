@@ -6,14 +6,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flexneedle.console.common import print_json
-from flexneedle.em.commands.evaluate import add_table_arguments, positive, table_options
+from flexneedle.console.common import described, print_json
+from flexneedle.em.commands.arguments import add_columns, add_labels, positive
 from flexneedle.em.commands.tables import number, print_notes, print_rows, span
 
 if TYPE_CHECKING:
-    from flexneedle.em.evaluation.check import Check
-    from flexneedle.em.evaluation.power import Power
-
+    from flexneedle.em.evaluation.check import Check, Power
 
 _THRESHOLD = 0.0547  # paper, section IV-B
 
@@ -23,29 +21,42 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = commands.add_parser(
         "check",
         help="compare the indicator with the rig's power off and on",
-        description="Compare the indicator of distortion with the rig's power off and on. The exit status is 1 if the "
-        "mean indicator of any sensor is above the threshold with power on.",
+        **described(
+            "Compare the indicator of distortion in two environments of a table, with the rig's power off and on. "
+            "The exit status is 1 if the mean indicator of any sensor is above the threshold with power on.",
+            "flexneedle em check power.csv",
+            "flexneedle em check power.csv --off quiet --on driven --threshold 0.04",
+        ),
     )
     parser.add_argument(
-        "off", metavar="OFF", type=Path, help="table with power off, or with both environments"
+        "data", metavar="DATA", type=Path, help="table with both environments, CSV or Parquet"
     )
-    parser.add_argument("on", metavar="ON", type=Path, nargs="?", help="table with power on")
-    for name in ("off", "on"):
-        told = f"environment with power {name} ({name}, or the only one of its table)"
-        parser.add_argument(f"--{name}", dest=f"{name}_name", metavar="NAME", help=told)
+    for power in ("off", "on"):
+        parser.add_argument(
+            f"--{power}",
+            default=power,
+            metavar="NAME",
+            help=f"environment with power {power} (default: {power})",
+        )
     parser.add_argument(
-        "--threshold", type=positive, default=_THRESHOLD, metavar="I", help=f"of the indicator ({_THRESHOLD})"
+        "--threshold",
+        type=positive,
+        default=_THRESHOLD,
+        metavar="I",
+        help="of the indicator (default: %(default)s)",
     )
-    add_table_arguments(parser)
+    add_columns(parser)
+    add_labels(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.set_defaults(handler=_check)
 
 
 def _check(args: argparse.Namespace) -> int:
     from flexneedle.em.evaluation.check import check
+    from flexneedle.em.evaluation.evaluate import Options
 
-    names = args.off_name, args.on_name
-    found = check(args.off, args.on, names, args.threshold, table_options(args))
+    options = Options(tuple(args.columns), unit=args.unit, sensor=args.sensor, environment=args.environment)
+    found = check(args.data, args.off, args.on, args.threshold, options)
     if args.json:
         print_json(found.values())
     else:
@@ -64,7 +75,6 @@ def _print(found: Check) -> None:
 
 
 def _rows(sensor: Power) -> list[tuple[str, ...]]:
-    both = (("off", sensor.off), ("on", sensor.on))
     return [
         (
             f"{sensor.sensor}, power {name}",
@@ -73,7 +83,7 @@ def _rows(sensor: Power) -> list[tuple[str, ...]]:
             f"{level.n_samples}",
             f"{100.0 * level.samples_above:.2f} %",
         )
-        for name, level in both
+        for name, level in (("off", sensor.off), ("on", sensor.on))
     ]
 
 

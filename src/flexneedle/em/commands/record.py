@@ -9,41 +9,46 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flexneedle.em.commands.seconds import wait_seconds
+from flexneedle.console.common import described
+from flexneedle.em.commands.arguments import within
 
 if TYPE_CHECKING:
     from flexneedle.em.recording.grid import Grid, Stop
     from flexneedle.em.recording.record import Guide
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle em`."""
-    parser = subparsers.add_parser(
+    parser = commands.add_parser(
         "record",
         help="measure a tracker on a grid; writes the table that evaluate reads",
-        description="Asks for the stage to be moved to each point of the grid and records the tracker there. "
-        "Stopped at any time, it goes on at the next point when started again with the same --out.",
+        **described(
+            "Ask for the stage to be moved to each point of the grid and record the tracker there. Stopped at any "
+            "time, the recording continues at the next point when it is started again with the same --out.",
+            "flexneedle em record --tracker aurora:/dev/ttyUSB0 --grid cube --out ideal.csv",
+            "flexneedle em record --tracker aurora:/dev/ttyUSB0 --grid mine.toml --out noisy.csv --dwell 5",
+        ),
     )
     parser.add_argument("--tracker", required=True, metavar="SPEC", help="such as aurora:/dev/ttyUSB0")
     parser.add_argument(
         "--grid",
         required=True,
         metavar="GRID",
-        help="file or name of the grid; cube comes along as an example",
+        help="file or name of the grid; cube is shipped as an example",
     )
     parser.add_argument(
-        "--out", required=True, type=Path, metavar="FILE", help="table to write or to go on with (CSV)"
+        "--out", required=True, type=Path, metavar="FILE", help="table to write or to continue (CSV)"
     )
     parser.add_argument(
         "--dwell",
-        type=wait_seconds,
+        type=within(0),
         metavar="S",
-        help="don't ask: give the stage so many seconds to reach each point by itself",
+        help="seconds that a stage which moves by itself needs to reach each point (default: ask a person)",
     )
     parser.add_argument(
         "--force",
         action="store_true",
-        help="record also where a sensor moved otherwise than the stage, by more than 5 mm and 20 %% of its way",
+        help="record also where a sensor did not move as the stage did: by more than 5 mm and 20 %% of the distance",
     )
     parser.set_defaults(handler=_record)
 
@@ -57,25 +62,25 @@ def _record(args: argparse.Namespace) -> int:
     with open_session(args.out, grid) as session:
         if session.left:
             if session.done:
-                _say(f"{args.out}: goes on after {session.done} recorded points")
+                _print(f"{args.out}: continues after {session.done} recorded points")
             with open_tracker(args.tracker, clock) as tracker:
                 record(session, tracker, clock, grid, _guide(grid, args.dwell, args.force, clock.wait))
         else:
-            _say(f"{args.out}: is complete already: {session.done} points")
+            _print(f"{args.out}: is complete: {session.done} points")
     print(args.out)
     return 0
 
 
 def _guide(grid: Grid, dwell: float | None, force: bool, wait: Callable[[float], None]) -> Guide:
-    """Return the guide: a person who presses Enter, or time. Only who sits at a terminal is asked what to keep."""
+    """Return the guide: a person who presses Enter, or time. Only at a terminal is a person asked what to keep."""
     from flexneedle.em.recording.record import Guide
 
     def give_time(stop: Stop) -> None:
-        _say(_where(grid, stop))
+        _print(_where(grid, stop))
         wait(dwell or 0.0)
 
     by_itself = dwell is not None
-    guide = Guide(give_time if by_itself else lambda stop: _ask(grid, stop), _say, insists=not by_itself)
+    guide = Guide(give_time if by_itself else lambda stop: _ask(grid, stop), _print, insists=not by_itself)
     if force:
         return replace(guide, keeps=_force)
     return replace(guide, keeps=_keeps) if not by_itself and sys.stdin.isatty() else guide
@@ -92,12 +97,12 @@ def _ask(grid: Grid, stop: Stop) -> None:
 
 
 def _keeps(doubt: str) -> bool:
-    _say(doubt)
+    _print(doubt)
     return _answer("Enter measures this point again, k keeps it:") == "k"
 
 
 def _force(doubt: str) -> bool:
-    _say(f"{doubt}; recorded all the same")
+    _print(f"{doubt}; recorded (--force)")
     return True
 
 
@@ -114,9 +119,11 @@ def _answer(question: str) -> str:
         if echoes and not line.endswith("\n"):
             print(file=sys.stderr)
     if not line:
-        raise RunError("no more input on stdin: go on with the same --out, or use --dwell without a person")
+        raise RunError(
+            "no more input on stdin: continue with the same --out, or use --dwell without a person"
+        )
     return line.strip()
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     print(line, file=sys.stderr, flush=True)

@@ -1,22 +1,29 @@
-"""`flexneedle em register`: find how the tracker's frame lies in the stage's."""
+"""`flexneedle em register`: the rigid map from the tracker's frame to the stage's."""
 
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flexneedle.console.common import print_json, print_table
+from flexneedle.console.common import described, print_json, print_table
+from flexneedle.em.commands.arguments import add_columns, finite
 
 if TYPE_CHECKING:
     from flexneedle.em.register import Registered
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle em`."""
-    parser = subparsers.add_parser(
-        "register", help="register the tracker's frame to the stage's from pairs of points"
+    parser = commands.add_parser(
+        "register",
+        help="register the tracker's frame to the stage's from pairs of points",
+        **described(
+            "Fit the rigid map from the tracker's frame to the stage's to pairs of points, with its expected errors. "
+            "Writes a table for a scenario and a picture (docs/tracking/register.md).",
+            "flexneedle em register pairs.csv --target 40 5 0",
+            "flexneedle em register table.csv --sensor ref1 --environment ideal --out rig.toml",
+        ),
     )
     parser.add_argument(
         "data",
@@ -31,32 +38,23 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--target",
         nargs=3,
-        type=_finite,
+        type=finite,
         action="append",
         default=[],
         metavar=("X", "Y", "Z"),
-        help="where on the stage the expected error is wanted, mm; may be repeated (the middle of the points)",
+        help="point of the stage (mm) for the expected error; may be repeated (default: the middle of the points)",
     )
+    add_columns(parser)
+    parser.add_argument("--unit", choices=("mm", "m"), default="mm", help="of all coordinates (default: mm)")
     parser.add_argument(
-        "--columns",
-        action="append",
-        default=[],
-        metavar="THEIRS=OURS",
-        help="a column of another name, or a TOML file of such; may be repeated",
-    )
-    parser.add_argument("--unit", choices=("mm", "m"), default="mm", help="of all coordinates (mm)")
-    parser.add_argument(
-        "--out", type=Path, default=Path("registration.toml"), metavar="FILE", help="(registration.toml)"
+        "--out",
+        type=Path,
+        default=Path("registration.toml"),
+        metavar="FILE",
+        help="a new file; its picture is written beside it (default: registration.toml)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.set_defaults(handler=_register)
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text}: must be a finite number")
-    return value
 
 
 def _register(args: argparse.Namespace) -> int:
@@ -76,10 +74,10 @@ def _table(registered: Registered, path: Path) -> None:
     values = registered.values()
     rows = [
         ("points", str(values["points"])),
-        ("  readings, without a place", f"{values['samples']}, {values['missing']}"),
+        ("  readings, missing", f"{values['samples']}, {values['missing']}"),
         ("residual (FRE), RMS", f"{values['fre_mm']:.3f} mm"),
         ("  largest", f"{values['max_residual_mm']:.3f} mm, point {values['worst_point']}"),
-        ("  each by the others, RMS", f"{values['left_out_rms_mm']:.3f} mm"),
+        ("  leave-one-out, RMS", f"{values['left_out_rms_mm']:.3f} mm"),
         ("error of a point (FLE), RMS", f"{values['fle_mm']:.3f} mm"),
     ]
     for target in values["tre"]:

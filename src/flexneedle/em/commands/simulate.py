@@ -3,63 +3,65 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 
-from flexneedle.console.common import seed
+from flexneedle.console.common import described, seed
+from flexneedle.em.commands.arguments import within
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle em`."""
-    parser = subparsers.add_parser(
+    parser = commands.add_parser(
         "simulate",
-        help="measure a simulated tracker on a grid, as `em evaluate` reads it",
-        description="Measure the tip's and a reference sensor of a simulated tracker on a grid over the workspace: "
-        "the paper's experiment. Writes the table that `flexneedle em evaluate` reads.",
+        help="measure a simulated tracker on a grid; writes the table that evaluate reads",
+        **described(
+            "Measure the tip's and a reference sensor of a simulated tracker on a grid over the workspace: "
+            "the paper's experiment. Writes the table that `flexneedle em evaluate` reads.",
+            "flexneedle em simulate",
+            "flexneedle em simulate --environment mine.toml --samples 20 --seed 1 --out mine.parquet",
+        ),
     )
     parser.add_argument(
         "--environment",
         nargs="+",
         default=["ideal", "noisy"],
         metavar="ENVIRONMENT",
-        help="shipped names or paths of TOML files (ideal noisy)",
+        help="shipped names or paths of TOML files (default: ideal noisy)",
     )
     parser.add_argument(
-        "--seed", type=seed, default=0, metavar="N", help="of the measurement: same seed, same file (0)"
+        "--seed",
+        type=seed,
+        default=0,
+        metavar="N",
+        help="of the measurement: same seed, same file (default: 0)",
     )
     parser.add_argument(
         "--field-seed",
         type=seed,
         metavar="N",
-        help="another room with errors of the same sizes (that of the environment)",
+        help="another room with errors of the same sizes (default: the environment's own)",
     )
-    parser.add_argument(
-        "--points", type=_count(2, 100), default=5, metavar="N", help="points on an edge of the grid (5)"
+    counts = (
+        ("points", 2, 100, 5, "points on an edge of the grid"),
+        ("samples", 1, 100_000, 100, "samples at a point"),
+        ("repeats", 1, 1000, 5, "times through the grid"),
     )
-    parser.add_argument(
-        "--samples", type=_count(1, 100_000), default=100, metavar="N", help="samples at a point (100)"
-    )
-    parser.add_argument(
-        "--repeats", type=_count(1, 1000), default=5, metavar="N", help="times through the grid (5)"
-    )
+    for name, least, most, default, what in counts:
+        parser.add_argument(
+            f"--{name}",
+            type=within(least, most, int),
+            default=default,
+            metavar="N",
+            help=f"{what} (default: {default})",
+        )
     parser.add_argument(
         "--out",
         type=Path,
         default=Path("measurements.csv"),
         metavar="FILE",
-        help="the table, CSV or Parquet by its suffix, a new file (measurements.csv)",
+        help="the table, CSV or Parquet by its suffix, a new file (default: measurements.csv)",
     )
     parser.set_defaults(handler=_simulate)
-
-
-def _count(least: int, most: int) -> Callable[[str], int]:
-    def count(text: str) -> int:
-        value = int(text)
-        if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"{value}: must be from {least} to {most}")
-        return value
-
-    return count
 
 
 def _simulate(args: argparse.Namespace) -> int:

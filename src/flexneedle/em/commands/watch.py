@@ -1,4 +1,4 @@
-"""`flexneedle em watch`: what a tracker says now, and whether to trust it."""
+"""`flexneedle em watch`: live readings of a tracker, and whether to trust them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexneedle.em.commands.seconds import some_seconds
+from flexneedle.console.common import described
+from flexneedle.em.commands.arguments import positive
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -29,20 +30,26 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "watch",
         help="show live values and verdicts of a tracker",
-        description="A live table in a terminal, a line a second and at each turn of the verdict elsewhere, until "
-        "Ctrl-C or the end of a replay.",
+        **described(
+            "Show a live table in a terminal, elsewhere a line a second and at each change of the verdict, until "
+            "Ctrl-C or the end of a replay.",
+            "flexneedle em watch --tracker aurora:/dev/ttyUSB0 --record frames.csv",
+            "flexneedle em watch --tracker replay:frames.csv@4 --json",
+        ),
     )
     parser.add_argument(
         "--tracker", required=True, metavar="SPEC", help="such as aurora:/dev/ttyUSB0 or replay:FILE@2"
     )
     parser.add_argument("--record", type=Path, metavar="FILE", help="keep all frames in a new CSV")
-    parser.add_argument("--seconds", type=some_seconds, default=inf, metavar="S", help="stop after so long")
+    parser.add_argument(
+        "--seconds", type=positive, default=inf, metavar="S", help="stop after S seconds (default: never)"
+    )
     parser.add_argument(
         "--references",
         type=int,
         choices=range(7),
         metavar="N",
-        help="reference sensors without which the field is not known (those that the tracker has, 3 at most)",
+        help="reference sensors without which the field is not known (default: those of the tracker, 3 at most)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object a frame, a line each")
     parser.set_defaults(handler=_watch)
@@ -59,7 +66,7 @@ def _watch(args: argparse.Namespace) -> int:
             judge = field_judge(args.references)
             watch(tracker, clock, _shower(stack, args.json), args.seconds, judge, args.record)
     except KeyboardInterrupt:
-        print(file=sys.stderr)  # it is how a watch ends
+        print(file=sys.stderr)  # the usual end of a watch
     return 0
 
 
@@ -75,12 +82,12 @@ def _shower(stack: ExitStack, as_json: bool) -> Callable[[View], None]:
 
 
 def _print_json(view: View) -> None:
-    told: dict[str, Any] = {"time_s": view.time, "frame_number": None, "status": view.status}
-    told |= {"verdict": view.verdict, "sensors": {}}
+    values: dict[str, Any] = {"time_s": view.time, "frame_number": None, "status": view.status}
+    values |= {"verdict": view.verdict, "sensors": {}}
     if view.frame is not None and view.is_new:
-        told |= {"time_s": view.frame.time, "frame_number": view.frame.number}
-        told["sensors"] = {name: _values(reading) for name, reading in view.frame.readings.items()}
-    print(json.dumps(told, allow_nan=False), flush=True)
+        values |= {"time_s": view.frame.time, "frame_number": view.frame.number}
+        values["sensors"] = {name: _values(reading) for name, reading in view.frame.readings.items()}
+    print(json.dumps(values, allow_nan=False), flush=True)
 
 
 def _values(reading: SensorReading) -> dict[str, Any]:
@@ -93,7 +100,7 @@ def _values(reading: SensorReading) -> dict[str, Any]:
 
 
 class _Lines:
-    """Prints a view a second, each at which the verdict turns from good to bad or back, and in the end the last."""
+    """Prints a view a second, each at which the verdict changes from good to bad or back, and the last one."""
 
     def __init__(self) -> None:
         self._due = -inf
@@ -101,9 +108,9 @@ class _Lines:
         self._printed: View | None = None
 
     def show(self, view: View) -> None:
-        """Print a view, or not yet."""
+        """Print a view, if it is due."""
         self._last = view
-        if view.time >= self._due or self._turned(view):
+        if view.time >= self._due or self._changed(view):
             self._due = view.time + _LINE_EVERY_S
             self._print(view)
 
@@ -112,7 +119,7 @@ class _Lines:
         if self._last is not None and self._last is not self._printed:
             self._print(self._last)
 
-    def _turned(self, view: View) -> bool:
+    def _changed(self, view: View) -> bool:
         from flexneedle.types import VISIBLE
 
         before = self._printed
@@ -131,7 +138,7 @@ def _line(view: View) -> str:
 
 
 def _cells(frame: Frame) -> Iterator[str]:
-    """Place and indicator of the tip, or of the first sensor; of the others, which stand around it, the indicator."""
+    """Position and indicator of the tip, or of the first sensor; of the others the indicator."""
     from flexneedle.rig.tracking.table import TIP
 
     first = TIP if TIP in frame.readings else next(iter(frame.readings), "")
@@ -162,6 +169,6 @@ def _table(view: View) -> Table:
         place = (
             ("", "", "") if reading.position is None else tuple(f"{part:.2f}" for part in reading.position)
         )
-        told = "" if reading.indicator is None else f"{reading.indicator:.4f}"
-        table.add_row(*map(Text, (name, *place, told, reading.status)))
+        indicator = "" if reading.indicator is None else f"{reading.indicator:.4f}"
+        table.add_row(*map(Text, (name, *place, indicator, reading.status)))
     return table

@@ -11,8 +11,15 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.em.evaluation.grid import Grid, Places
-from flexneedle.em.evaluation.intervals import CONFIDENCE, Interval, intervals, quantile_interval
+from flexneedle.em.evaluation.intervals import (
+    CONFIDENCE,
+    Interval,
+    bootstrap,
+    deviation,
+    mean,
+    quantile_interval,
+)
+from flexneedle.em.table.grid import Grid, Places
 from flexneedle.errors import InputError
 from flexneedle.rig.tracking.registration import Rigid, fiducial_error, fit_rigid
 
@@ -64,8 +71,7 @@ class Registration:
 
 def error_vectors(places: Places) -> Floats:
     """Return mean measured minus true position (n, 3), mm; NaN where there is no sample."""
-    vectors: Floats = places.position.mean - places.true.mean
-    return vectors
+    return places.position - places.true
 
 
 def errors(places: Places) -> Floats:
@@ -81,22 +87,21 @@ def root_mean_square(values: Floats) -> float:
 
 def jitter(places: Places) -> float:
     """Return the jitter over all samples (mm), NaN if no place has two."""
-    count = places.position.count
-    if count.max(initial=0) < 2:
+    if places.count.max(initial=0) < 2:
         return nan
-    return float(np.sqrt(np.nansum(places.position.scatter) / count.sum()))
+    return float(np.sqrt(np.nansum(places.scatter) / places.count.sum()))
 
 
 def accuracy(grid: Grid) -> Accuracy:
     """Return the errors of a grid. Raises InputError if no point of it has a sample."""
-    seen = grid.points[grid.seen]
-    if not len(seen):
+    measured = grid.measured()
+    if not len(measured):
         raise InputError(f"sensor {grid.sensor!r}, environment {grid.environment!r}: all samples are missing")
-    error, count = errors(seen), seen.position.count
-    bias = error_vectors(seen).mean(axis=0).tolist()
+    error, count = errors(measured), measured.count
+    bias = error_vectors(measured).mean(axis=0).tolist()
     return Accuracy(
-        n_points=len(seen),
-        n_unseen=len(grid.points) - len(seen),
+        n_points=len(measured),
+        n_unseen=len(grid.points) - len(measured),
         n_samples=int(count.sum()),
         n_missing=int(grid.points.missing.sum()),
         n_single=int((count == 1).sum()),
@@ -105,30 +110,35 @@ def accuracy(grid: Grid) -> Accuracy:
         rmse_mm=root_mean_square(error),
         p95_mm=float(np.quantile(error, P95)),
         max_mm=float(error.max()),
-        jitter_mm=jitter(seen),
+        jitter_mm=jitter(measured),
         mean_mm=float(error.mean()),
         sd_mm=float(error.std(ddof=1)) if len(error) > 1 else nan,
         bias_mm=(bias[0], bias[1], bias[2]),
-        max_at=np.array(grid.names, dtype=object)[grid.seen][int(error.argmax())],
+        max_at=grid.name_of(error.argmax()),
         beyond_max=1.0 - (1.0 - CONFIDENCE) ** (1.0 / len(error)),
-        intervals=_intervals(error, seen),
+        intervals=_intervals(error, measured),
     )
 
 
-def _intervals(error: Floats, seen: Places) -> dict[str, Interval]:
-    squares, scatter, count = error**2, seen.position.scatter.sum(axis=1), seen.position.count
-    found = intervals(
-        {
-            "rmse_mm": lambda chosen: np.sqrt(squares[chosen].mean(axis=1)),
-            "jitter_mm": lambda chosen: np.sqrt(scatter[chosen].sum(axis=1) / count[chosen].sum(axis=1)),
-            "mean_mm": lambda chosen: error[chosen].mean(axis=1),
-            "sd_mm": lambda chosen: error[chosen].std(axis=1, ddof=1),
-        },
-        len(error),
-    )
-    if count.max() < 2:
-        found["jitter_mm"] = None
-    return {**found, "p95_mm": quantile_interval(error, P95)}
+def _intervals(error: Floats, measured: Places) -> dict[str, Interval]:
+    scatter, count = measured.scatter.sum(axis=1), measured.count.astype(float)
+    return {
+        "rmse_mm": bootstrap(_rms, error),
+        "jitter_mm": bootstrap(_pooled, scatter, count) if count.max() > 1 else None,
+        "mean_mm": bootstrap(mean, error),
+        "sd_mm": bootstrap(deviation, error),
+        "p95_mm": quantile_interval(error, P95),
+    }
+
+
+def _rms(error: Floats, axis: int) -> Floats:
+    squares: Floats = (error**2).mean(axis=axis)
+    return np.sqrt(squares)
+
+
+def _pooled(scatter: Floats, count: Floats, axis: int) -> Floats:
+    squares: Floats = scatter.sum(axis=axis) / count.sum(axis=axis)
+    return np.sqrt(squares)
 
 
 def register(grid: Grid) -> tuple[Grid, Registration]:
@@ -136,21 +146,20 @@ def register(grid: Grid) -> tuple[Grid, Registration]:
 
     Raises InputError if there are fewer than three points, or all on a line.
     """
-    seen = grid.points[grid.seen]
+    measured = grid.measured()
     try:
-        rigid = fit_rigid(seen.position.mean, seen.true.mean)
+        rigid = fit_rigid(measured.position, measured.true)
     except InputError as error:
         raise InputError(
             f"--register: sensor {grid.sensor!r}, environment {grid.environment!r}: {error}"
         ) from None
-    residual = fiducial_error(rigid, seen.position.mean, seen.true.mean)
-    return grid.registered(rigid), _registration(rigid, residual, len(seen))
+    residual = fiducial_error(rigid, measured.position, measured.true)
+    return grid.registered(rigid), _registration(rigid, residual, len(measured))
 
 
 def _registration(rigid: Rigid, residual: float, points: int) -> Registration:
-    # From the sine as well: the cosine alone loses small angles.
-    turn = rigid.rotation - rigid.rotation.T
-    sine = float(np.linalg.norm((turn[2, 1], turn[0, 2], turn[1, 0]))) / 2.0
-    angle = np.degrees(np.arctan2(sine, (np.trace(rigid.rotation) - 1.0) / 2.0))
+    from scipy.spatial.transform import Rotation
+
+    angle = np.degrees(Rotation.from_matrix(rigid.rotation).magnitude())
     rows = tuple(tuple(row) for row in rigid.rotation.tolist())
     return Registration(rows, tuple(rigid.translation.tolist()), float(angle), residual, points)

@@ -1,16 +1,58 @@
-"""`flexneedle em check`: the indicator with the rig's power off and on."""
+"""`flexneedle em check`: whether the rig's own power distorts the field (paper, section IV-B).
+
+The indicator with power off and on, from two environments of one table.
+"""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from flexneedle.em.evaluation import published
-from flexneedle.em.evaluation.evaluate import Options, read_grids
-from flexneedle.em.evaluation.grid import Grid
+from flexneedle.em.evaluation.accuracy import P95
+from flexneedle.em.evaluation.evaluate import Options, read_table
+from flexneedle.em.evaluation.indicator import means
+from flexneedle.em.evaluation.intervals import Interval, bootstrap
 from flexneedle.em.evaluation.notes import differing_points, lacking_sensors
-from flexneedle.em.evaluation.power import Power, compare
+from flexneedle.em.table.grid import Grid
 from flexneedle.errors import InputError
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Level:
+    """The indicator with power off or on: means at grid points, the largest single sample, and samples above."""
+
+    n_points: int
+    n_samples: int
+    mean: float
+    p95: float
+    max: float
+    samples_max: float
+    samples_above: float
+
+
+@dataclass(frozen=True)
+class Power:
+    """A sensor with power off and on. difference: mean on minus mean off; its interval is over grid points.
+
+    paired: over the same points both times, so that only what changed counts. above: the mean with power on exceeds the
+    threshold; points_above: at how many grid points it does.
+    """
+
+    sensor: str
+    threshold: float
+    off: Level
+    on: Level
+    difference: float
+    difference_interval: Interval
+    paired: bool
+    above: bool
+    points_above: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,44 +82,71 @@ class Check:
         }
 
 
-def check(
-    off: Path, on: Path | None, names: tuple[str | None, str | None], threshold: float, options: Options
-) -> Check:
-    """Return the comparison of two tables, or of two environments of the table `off`.
+def check(data: Path, off: str, on: str, threshold: float, options: Options) -> Check:
+    """Return the comparison of the environments `off` and `on` of a table.
 
-    names: of the environments with power off and on; None: the only one of its table, or "off" and "on" if there is
-    one table. Raises InputError for a table that cannot be used, or where no sensor has an indicator both times.
+    Raises InputError for a table that cannot be used, or where no sensor has an indicator both times.
     """
-    grids = read_grids(off, options)[0]
-    if on is None:
-        chosen = (_of(off, grids, names[0] or "off"), _of(off, grids, names[1] or "on"))
-    else:
-        chosen = (_of(off, grids, names[0]), _of(on, read_grids(on, options)[0], names[1]))
-    before, after = ({grid.sensor: grid for grid in own if grid.indicators.count} for own in chosen)
+    grids, _ = read_table(data, options)
+    before, after = (_of(data, grids, name) for name in (off, on))
     both = [name for name in before if name in after]
     if not both:
         raise InputError(
-            f"{on or off}: no sensor has an indicator both with power off ({_listed(before)}) "
-            f"and on ({_listed(after)})"
+            f"{data}: no sensor has an indicator both with power off ({', '.join(before) or 'none'}) "
+            f"and on ({', '.join(after) or 'none'})"
         )
     powered = [
         replace(grid, environment=f"power {power}")
         for power, own in (("off", before), ("on", after))
         for grid in own.values()
     ]
-    told = [*lacking_sensors(powered, "no indicator in"), *differing_points(powered)]
-    return Check([compare(before[name], after[name], threshold) for name in both], told)
+    odd = [*lacking_sensors(powered, "no indicator in"), *differing_points(powered)]
+    return Check([compare(before[name], after[name], threshold) for name in both], odd)
 
 
-def _of(path: Path, grids: Sequence[Grid], environment: str | None) -> list[Grid]:
+def compare(off: Grid, on: Grid, threshold: float) -> Power:
+    """Return the comparison of a sensor's grids, both with an indicator."""
+    low, high = means(off)[0], means(on)[0]
+    paired = _names(off) == _names(on)
+    return Power(
+        sensor=on.sensor,
+        threshold=threshold,
+        off=_level(off, threshold),
+        on=_level(on, threshold),
+        difference=float(high.mean() - low.mean()),
+        difference_interval=bootstrap(_difference, low, high, paired=paired),
+        paired=paired,
+        above=bool(high.mean() > threshold),
+        points_above=int((high > threshold).sum()),
+    )
+
+
+def _of(data: Path, grids: Sequence[Grid], environment: str) -> dict[str, Grid]:
     there = list(dict.fromkeys(grid.environment for grid in grids))
-    if environment is None and len(there) == 1:
-        return list(grids)
     if environment not in there:
-        asked = "holds several environments" if environment is None else f"no environment {environment!r}"
-        raise InputError(f"{path}: {asked}: choose one by --off or --on: {', '.join(there)}")
-    return [grid for grid in grids if grid.environment == environment]
+        raise InputError(
+            f"{data}: no environment {environment!r}: choose one by --off or --on: {', '.join(there)}"
+        )
+    return {grid.sensor: grid for grid in grids if grid.environment == environment and grid.levels.count}
 
 
-def _listed(grids: dict[str, Grid]) -> str:
-    return ", ".join(grids) or "none"
+def _names(grid: Grid) -> list[str]:
+    return [grid.names[number] for number in np.flatnonzero(grid.points.indicators)]
+
+
+def _difference(low: Floats, high: Floats, axis: int) -> Floats:
+    difference: Floats = high.mean(axis=axis) - low.mean(axis=axis)
+    return difference
+
+
+def _level(grid: Grid, threshold: float) -> Level:
+    values = means(grid)[0]
+    return Level(
+        n_points=len(values),
+        n_samples=grid.levels.count,
+        mean=float(values.mean()),
+        p95=float(np.quantile(values, P95)),
+        max=float(values.max()),
+        samples_max=grid.levels.most,
+        samples_above=grid.levels.above(threshold),
+    )

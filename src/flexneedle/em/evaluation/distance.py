@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexneedle.em.evaluation.accuracy import P95, errors, jitter, root_mean_square
-from flexneedle.em.evaluation.grid import Grid
+from flexneedle.em.table.grid import Grid
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Distances:
     bins: tuple[Stretch, ...]
 
     @property
-    def told(self) -> str:
+    def kept(self) -> str:
         """Where the limit is kept, in words: in the nearest bin, that it begins there is not known."""
         if self.limit_mm is None:
             return "no limit"
@@ -58,7 +57,7 @@ class Distances:
 
 def distances(grid: Grid, bin_mm: float, limit_mm: float | None) -> Distances | None:
     """Return the errors by distance, None if the table has no distances."""
-    cells = grid.cells[(grid.cells.position.count > 0) & (grid.cells.bins >= 0)]
+    cells = grid.cells[(grid.cells.count > 0) & (grid.cells.bins >= 0)]
     if not len(cells):
         return None
     found = tuple(_stretch(grid, int(number), bin_mm) for number in np.unique(cells.bins))
@@ -71,12 +70,12 @@ def distances(grid: Grid, bin_mm: float, limit_mm: float | None) -> Distances | 
 
 
 def _stretch(grid: Grid, number: int, bin_mm: float) -> Stretch:
-    cells = grid.cells[(grid.cells.bins == number) & (grid.cells.position.count > 0)]
-    error, count = errors(cells), cells.position.count
+    cells = grid.cells[(grid.cells.bins == number) & (grid.cells.count > 0)]
+    error, count = errors(cells), cells.count
     return Stretch(
         from_mm=number * bin_mm,
         to_mm=(number + 1) * bin_mm,
-        distance_mm=_mean(cells.distance.mean[:, 0], count),
+        distance_mm=float(np.average(cells.distance, weights=count)),
         n_points=len(cells),
         n_samples=int(count.sum()),
         rmse_mm=root_mean_square(error),
@@ -84,7 +83,3 @@ def _stretch(grid: Grid, number: int, bin_mm: float) -> Stretch:
         max_mm=float(error.max()),
         jitter_mm=jitter(cells),
     )
-
-
-def _mean(values: NDArray[np.float64], count: NDArray[np.int64]) -> float:
-    return float(values @ count / count.sum())

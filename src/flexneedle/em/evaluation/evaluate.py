@@ -1,25 +1,24 @@
 """`flexneedle em evaluate`: a table of measurements in, errors, indicator and figures out."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from flexneedle.em.evaluation import published
 from flexneedle.em.evaluation.accuracy import Accuracy, Registration, accuracy, register
-from flexneedle.em.evaluation.cells import collect
-from flexneedle.em.evaluation.columns import column_map
 from flexneedle.em.evaluation.distance import Distances, distances
-from flexneedle.em.evaluation.grid import Grid
 from flexneedle.em.evaluation.indicator import Summary, summary
 from flexneedle.em.evaluation.notes import notes
 from flexneedle.em.evaluation.orientation import Orientation, orientation
 from flexneedle.em.evaluation.points import POINTS_FILE, points_text
-from flexneedle.em.evaluation.reading import labelled, read_batches
 from flexneedle.em.evaluation.repeatability import Repeatability, Spacing, repeatability, spacing
 from flexneedle.em.evaluation.separation import Separation, separation
 from flexneedle.em.evaluation.units import refuse_metres
+from flexneedle.em.table.columns import column_map
+from flexneedle.em.table.grid import Grid
+from flexneedle.em.table.grids import read_grids
+from flexneedle.em.table.source import open_table
 from flexneedle.errors import InputError
 from flexneedle.rig.tracking.table import OPTIONAL, REFERENCE, REQUIRED
 from flexneedle.trace.files import replace_file
@@ -69,11 +68,6 @@ class Result:
     orientation: Orientation | None
     distances: Distances | None
 
-    @property
-    def title(self) -> str:
-        """Sensor and environment."""
-        return f"{self.grid.sensor}, {self.grid.environment}"
-
     def values(self) -> dict[str, Any]:
         """Return the result as plain values; lengths in mm, full precision."""
         kind = published.kind(self.grid.sensor) or ""
@@ -119,10 +113,12 @@ class Evaluation:
 
 def evaluate(data: Path, options: Options) -> Evaluation:
     """Return the evaluation of a table, read once. Raises InputError for one that cannot be used."""
-    grids, rows = read_grids(data, options)
-    with _about(data):
+    grids, rows = read_table(data, options)
+    try:
         _check_names(grids, options)
         results = [_result(grid, options) for grid in grids]
+    except InputError as error:
+        raise InputError(f"{data}: {error}") from None
     judged = [result.grid for result in results]
     separations = [
         found
@@ -133,15 +129,15 @@ def evaluate(data: Path, options: Options) -> Evaluation:
     return Evaluation(data, options, rows, results, separations, odd)
 
 
-def read_grids(data: Path, options: Options) -> tuple[list[Grid], int]:
+def read_table(data: Path, options: Options) -> tuple[list[Grid], int]:
     """Return the grids of a table, and how many rows it has. Raises InputError for one that cannot be used."""
     theirs = column_map(options.columns)
     given = {"sensor": options.sensor, "environment": options.environment}
     names = {column: name for column, name in given.items() if name is not None}
     optional = (*OPTIONAL, "indicator", *names)
     required = [column for column in REQUIRED if column not in optional]
-    with _about(data), closing(read_batches(data, theirs, required, optional)) as batches:
-        grids, rows = collect(labelled(batches, names), options.bin_mm, options.unit or "mm")
+    with open_table(data, theirs, required, optional, names, options.unit or "mm") as table:
+        grids, rows = read_grids(table, options.bin_mm)
         if options.unit is None:
             refuse_metres(grids)
     return grids, rows
@@ -163,15 +159,6 @@ def _check_names(grids: Sequence[Grid], options: Options) -> None:
         name = getattr(options, option)
         if name is not None and name not in there:
             raise InputError(f"--{option}: no environment {name!r}: there is {', '.join(there)}")
-
-
-@contextmanager
-def _about(data: Path) -> Iterator[None]:
-    """Name the file in errors about it."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{data}: {error}") from None
 
 
 def _result(grid: Grid, options: Options) -> Result:

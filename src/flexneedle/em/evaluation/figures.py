@@ -6,13 +6,13 @@ import numpy as np
 
 from flexneedle.em.evaluation.accuracy import error_vectors
 from flexneedle.em.evaluation.evaluate import Evaluation, Result
-from flexneedle.em.evaluation.grid import Grid
 from flexneedle.em.evaluation.indicator import Line, means
 from flexneedle.em.evaluation.separation import Separation
 from flexneedle.em.plot.distance import DistanceLine, distance_figure
 from flexneedle.em.plot.field import FieldRow, field_figure
 from flexneedle.em.plot.indicator import IndicatorPanel, Shown, indicator_figure
 from flexneedle.em.plot.roc import RocLine, roc_figure
+from flexneedle.em.table.grid import Grid
 from flexneedle.plot.style import save, signed
 
 MOST_PANELS = 3
@@ -38,8 +38,8 @@ def draw_evaluation(evaluation: Evaluation, folder: Path) -> list[Path]:
 
 
 def _field(result: Result) -> FieldRow:
-    seen = result.grid.points[result.grid.seen]
-    return FieldRow(result.title, seen.true.mean, error_vectors(seen))
+    measured = result.grid.measured()
+    return FieldRow(result.grid.title, measured.true, error_vectors(measured))
 
 
 def _indicator(evaluation: Evaluation, found: Separation) -> IndicatorPanel:
@@ -96,5 +96,5 @@ def _distance(result: Result) -> DistanceLine:
     if found is None:
         raise ValueError("there are no distances")
     distance, rmse = (np.array([getattr(b, name) for b in found.bins]) for name in ("distance_mm", "rmse_mm"))
-    note = found.told if found.limit_mm is None else f"within {found.limit_mm:g} mm {found.told}"
-    return DistanceLine(result.title, distance, rmse, found.limit_mm, note)
+    note = found.kept if found.limit_mm is None else f"within {found.limit_mm:g} mm {found.kept}"
+    return DistanceLine(result.grid.title, distance, rmse, found.limit_mm, note)

@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.em.evaluation.accuracy import P95, errors
-from flexneedle.em.evaluation.grid import Grid
-from flexneedle.em.evaluation.intervals import Interval, intervals, quantile_interval
+from flexneedle.em.evaluation.intervals import Interval, bootstrap, deviation, mean, quantile_interval
+from flexneedle.em.table.grid import Grid
 
 Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -65,8 +64,8 @@ class Line:
 
 def means(grid: Grid) -> tuple[Floats, Floats]:
     """Return mean indicator and error (mm) (n,) of the grid points that have both."""
-    known = grid.seen & (grid.points.indicator.count > 0)
-    return grid.points.indicator.mean[known, 0], errors(grid.points[known])
+    known = grid.points[grid.points.indicators > 0]
+    return known.indicator, errors(known)
 
 
 def summary(grid: Grid) -> Summary | None:
@@ -81,63 +80,49 @@ def summary(grid: Grid) -> Summary | None:
         max=float(values.max()),
         min=float(values.min()),
         p95=float(np.quantile(values, P95)),
-        intervals={**_intervals(values), "p95": quantile_interval(values, P95)},
+        intervals={
+            "mean": bootstrap(mean, values),
+            "sd": bootstrap(deviation, values),
+            "p95": quantile_interval(values, P95),
+        },
         samples=_singles(grid),
     )
 
 
-def _intervals(values: Floats) -> dict[str, Interval]:
-    return intervals(
-        {
-            "mean": lambda chosen: values[chosen].mean(axis=1),
-            "sd": lambda chosen: values[chosen].std(axis=1, ddof=1),
-        },
-        len(values),
-    )
-
-
 def _singles(grid: Grid) -> Singles:
-    sums = grid.points.indicator
-    known = sums.count > 0
-    mean = float(sums.mean[known, 0] @ sums.count[known] / sums.count.sum())
-    low, high = grid.indicator_range
-    return Singles(int(sums.count.sum()), mean, high, low, grid.indicators.quantile(P95))
+    known, levels = grid.points[grid.points.indicators > 0], grid.levels
+    average = float(np.average(known.indicator, weights=known.indicators))
+    return Singles(levels.count, average, levels.most, levels.least, levels.quantile(P95))
 
 
 def constant(error: Floats) -> Constant:
     """Return the constant fit to errors (n,), n at least 1."""
-    found = intervals(
-        {
-            "mean_mm": lambda chosen: error[chosen].mean(axis=1),
-            "sd_mm": lambda chosen: error[chosen].std(axis=1, ddof=1),
-        },
-        len(error),
-    )
-    return Constant(
-        len(error), float(error.mean()), float(error.std(ddof=1)) if len(error) > 1 else nan, found
-    )
+    spread = float(error.std(ddof=1)) if len(error) > 1 else nan
+    found = {"mean_mm": bootstrap(mean, error), "sd_mm": bootstrap(deviation, error)}
+    return Constant(len(error), float(error.mean()), spread, found)
 
 
 def line(indicator: Floats, error: Floats) -> Line:
     """Return the least-squares line through errors (n,) over the indicator (n,), with pairs drawn again."""
-    slope, intercept = (float(value[0]) for value in _fit(indicator[None], error[None]))
-    rest = error - slope * indicator - intercept
-    free = len(error) - 2
-    found = intervals(
-        {
-            "slope_mm": lambda chosen: _fit(indicator[chosen], error[chosen])[0],
-            "intercept_mm": lambda chosen: _fit(indicator[chosen], error[chosen])[1],
-        },
-        len(error) if np.isfinite(slope) else 0,
-    )
+    slope, intercept = float(_slope(indicator, error)), float(_intercept(indicator, error))
+    rest, free = error - slope * indicator - intercept, len(error) - 2
+    known = np.isfinite(slope)
+    found = {
+        "slope_mm": bootstrap(_slope, indicator, error) if known else None,
+        "intercept_mm": bootstrap(_intercept, indicator, error) if known else None,
+    }
     scatter = float(np.sqrt(rest @ rest / free)) if free > 0 else nan
     return Line(len(error), slope, intercept, scatter, found)
 
 
-def _fit(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return slope and intercept (b,) of each row of x and y (b, n)."""
-    middle, height = x.mean(axis=1, keepdims=True), y.mean(axis=1, keepdims=True)
-    spread = ((x - middle) ** 2).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slope = ((x - middle) * (y - height)).sum(axis=1) / np.where(np.ptp(x, axis=1) > 0.0, spread, nan)
-    return slope, height[:, 0] - slope * middle[:, 0]
+def _slope(x: Floats, y: Floats, axis: int = -1) -> Floats:
+    """Return the slope (…) of the line through y over x (…, n), NaN where all x are the same."""
+    off = x - x.mean(axis=axis, keepdims=True)
+    spread = np.where(np.ptp(x, axis=axis) > 0.0, (off**2).sum(axis=axis), nan)
+    slope: Floats = (off * (y - y.mean(axis=axis, keepdims=True))).sum(axis=axis) / spread
+    return slope
+
+
+def _intercept(x: Floats, y: Floats, axis: int = -1) -> Floats:
+    intercept: Floats = y.mean(axis=axis) - _slope(x, y, axis) * x.mean(axis=axis)
+    return intercept

@@ -5,15 +5,14 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from flexneedle.em.evaluation.accuracy import errors, register, root_mean_square
-from flexneedle.em.evaluation.cells import SAME_MM
-from flexneedle.em.evaluation.grid import Grid
+from flexneedle.em.table.grid import Grid
+from flexneedle.em.table.rules import SAME_MM
 from flexneedle.errors import InputError
 from flexneedle.rig.tracking.registration import misfit
 
 _OWN_FRAME = 5.0
 """A rigid fit that leaves less than a fifth of the RMSE: the tracker has most likely a frame of its own."""
 _FEW = 6  # grid points; of fewer a rigid fit, with its six numbers, leaves little in any case
-_LISTED = 6
 
 
 def notes(grids: Sequence[Grid], pair: tuple[str, str], hinted: bool) -> list[str]:
@@ -21,9 +20,8 @@ def notes(grids: Sequence[Grid], pair: tuple[str, str], hinted: bool) -> list[st
 
     pair: the environments that the indicator is to tell apart; hinted: say where a rigid fit is missing.
     """
-    told = ((grid, "; ".join(_odd(grid))) for grid in grids)
     return [
-        *(f"{_title(grid)}: {odd}" for grid, odd in told if odd),
+        *(f"{grid.title}: {odd}" for grid in grids if (odd := "; ".join(_odd(grid)))),
         *lacking_sensors(grids),
         *differing_points(grids),
         *misfits(grids),
@@ -45,19 +43,15 @@ def lacking_sensors(grids: Sequence[Grid], absent: str = "not in") -> Iterator[s
 def differing_points(grids: Sequence[Grid]) -> Iterator[str]:
     """Yield a line for each sensor that was not measured at the same grid points in all environments."""
     for sensor in dict.fromkeys(grid.sensor for grid in grids):
-        own = {grid.environment: _seen_names(grid) for grid in grids if grid.sensor == sensor}
+        own = {grid.environment: _measured_names(grid) for grid in grids if grid.sensor == sensor}
         shared = set.intersection(*own.values())
         if any(names != shared for names in own.values()):
             counts = ", ".join(f"{len(names)} in {name}" for name, names in own.items())
             yield f"{sensor}: grid points: {counts}, {len(shared)} of them in all: different places are compared"
 
 
-def _title(grid: Grid) -> str:
-    return f"{grid.sensor}, {grid.environment}"
-
-
-def _seen_names(grid: Grid) -> set[str]:
-    return {name for name, seen in zip(grid.names, grid.seen.tolist(), strict=True) if seen}
+def _measured_names(grid: Grid) -> set[str]:
+    return {name for name, known in zip(grid.names, grid.known.tolist(), strict=True) if known}
 
 
 def _points(count: int) -> str:
@@ -65,15 +59,15 @@ def _points(count: int) -> str:
 
 
 def _odd(grid: Grid) -> Iterator[str]:
-    count, missing = grid.points.position.count, int(grid.points.missing.sum())
-    single, unseen, known = int((count == 1).sum()), int((count == 0).sum()), count[count > 0]
-    places = np.unique(np.round(grid.points.true.mean / SAME_MM), axis=0)
+    count, missing = grid.points.count, int(grid.points.missing.sum())
+    single, lacking, known = int((count == 1).sum()), int((count == 0).sum()), count[count > 0]
+    places = np.unique(np.round(grid.points.true / SAME_MM), axis=0)
     if len(places) < len(count):
         yield f"{len(count) - len(places)} of {_points(len(count))} under a second point_id (counted as points)"
     if missing:
         yield f"{missing} of {missing + int(count.sum())} samples have no position (left out)"
-    if unseen:
-        yield f"no sample at {unseen} of {_points(len(count))} (left out)"
+    if lacking:
+        yield f"no sample at {lacking} of {_points(len(count))} (left out)"
     if len(known) and single == len(known):
         yield "one sample at each grid point (jitter and repeatability are not known)"
     elif single:
@@ -81,16 +75,16 @@ def _odd(grid: Grid) -> Iterator[str]:
     if len(known) and known.min() != known.max():
         weights = "points weigh alike in the errors, samples in the jitter"
         yield f"{known.min()} to {known.max()} samples a grid point ({weights})"
-    if np.bincount(grid.cells.point[grid.cells.position.count > 0]).max(initial=0) > 1:
+    if (grid.cells.count > 0).sum() > len(known):
         yield "points were measured at several distances (pooled in all figures but those by distance)"
 
 
 def misfits(grids: Sequence[Grid]) -> Iterator[str]:
     """Yield a line for each grid that was registered although no rotation takes it to the stage's."""
     for grid in grids:
-        seen = grid.points[grid.seen]
-        if grid.rigid is not None and (told := misfit(seen.position.mean, seen.true.mean)) is not None:
-            yield f"{_title(grid)}: {told}"
+        measured = grid.measured()
+        if grid.rigid is not None and (wrong := misfit(measured.position, measured.true)) is not None:
+            yield f"{grid.title}: {wrong}"
 
 
 def _own_frame(grids: Sequence[Grid]) -> Iterator[str]:
@@ -99,26 +93,26 @@ def _own_frame(grids: Sequence[Grid]) -> Iterator[str]:
         grid, as_it_is, left = max(fits, key=lambda fit: fit[1])
         others = f", and {len(fits) - 1} more" if len(fits) > 1 else ""
         yield (
-            f"the RMSE of {as_it_is:.3g} mm would be {left:.2g} mm after a rigid fit ({_title(grid)}{others}): "
+            f"the RMSE of {as_it_is:.3g} mm would be {left:.2g} mm after a rigid fit ({grid.title}{others}): "
             "if the tracker has a frame of its own, add --register"
         )
 
 
 def _fit(grid: Grid) -> tuple[float, float] | None:
     """Return the RMSE as it is and after a rigid fit (mm), if that leaves a small part of it."""
-    seen = grid.points[grid.seen]
-    if len(seen) < _FEW:
+    measured = grid.measured()
+    if len(measured) < _FEW:
         return None
     try:
         left = register(grid)[1].residual_mm
     except InputError:  # points on a line: nothing can be said
         return None
-    as_it_is = root_mean_square(errors(seen))
+    as_it_is = root_mean_square(errors(measured))
     return (as_it_is, left) if as_it_is > _OWN_FRAME * left else None
 
 
 def _lacking(grids: Sequence[Grid], pair: tuple[str, str]) -> Iterator[str]:
-    there = list(dict.fromkeys(grid.environment for grid in grids if grid.points.indicator.count.any()))
+    there = list(dict.fromkeys(grid.environment for grid in grids if grid.points.indicators.any()))
     lacking = [name for name in pair if name not in there]
     if len(there) > 1 and lacking:
         yield (

@@ -11,9 +11,7 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.em.evaluation.grid import Grid
-
-_UPPER = np.triu_indices(4)
+from flexneedle.em.table.grid import Grid
 
 Floats = NDArray[np.float64]
 
@@ -35,34 +33,26 @@ class Orientation:
 
 def orientation(grid: Grid) -> Orientation | None:
     """Return the jitter of the orientation, None if the table has none."""
-    sums = grid.points.orientation
-    there = sums.count > 0
+    there = grid.points.turns > 0
     if not there.any():
         return None
-    count, matrices = sums.count[there], _matrices(sums.mean[there])
+    count, products = grid.points.turns[there], grid.points.products[there]
     if count.max() < 2:
         return Orientation(int(count.sum()), nan, nan, "", nan)
-    squares = np.linalg.eigvalsh(matrices)[:, :3].sum(axis=1).clip(0.0, 1.0)  # 1 − λ, without cancelling
+    squares = np.linalg.eigvalsh(products)[:, :3].sum(axis=1).clip(0.0, 1.0)  # 1 − λ, without cancelling
     worst = int(squares.argmax())
     return Orientation(
         n_samples=int(count.sum()),
         jitter_deg=_angle(float(squares @ count / count.sum())),
         worst_deg=_angle(float(squares[worst])),
-        worst_at=str(np.array(grid.names, dtype=object)[there][worst]),
-        axis_jitter_deg=_angle(float(_off_axis(matrices) @ count / count.sum())),
+        worst_at=grid.names[int(np.flatnonzero(there)[worst])],
+        axis_jitter_deg=_angle(float(_off_axis(products) @ count / count.sum())),
     )
 
 
 def _angle(square: float) -> float:
     """From the mean of sin²(φ/2) to the angle in degrees."""
     return float(np.degrees(2.0 * np.arcsin(np.sqrt(square))))
-
-
-def _matrices(products: Floats) -> Floats:
-    matrices = np.zeros((len(products), 4, 4))
-    matrices[:, _UPPER[0], _UPPER[1]] = products
-    matrices[:, _UPPER[1], _UPPER[0]] = products
-    return matrices
 
 
 def _off_axis(a: Floats) -> Floats:

@@ -2,13 +2,13 @@
 
 import csv
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from math import isfinite
 
 import numpy as np
 
 from flexneedle.em.evaluation.accuracy import error_vectors, errors
-from flexneedle.em.evaluation.grid import Grid
+from flexneedle.em.table.grid import Grid
 
 POINTS_FILE = "points.csv"
 _COLUMNS = (
@@ -30,20 +30,16 @@ def points_text(grids: Iterable[Grid]) -> str:
     return text.getvalue()
 
 
-def _rows(grid: Grid) -> Iterator[Sequence[str]]:
+def _rows(grid: Grid) -> Iterator[list[str]]:
     points = grid.points
-    count = points.position.count
-    with np.errstate(invalid="ignore"):
-        jitter = np.sqrt(points.position.scatter.sum(axis=1) / np.where(count > 1, count, np.nan))
-    places = np.column_stack([points.true.mean, points.position.mean, error_vectors(points), errors(points)])
-    others = np.column_stack([jitter, points.indicator.mean[:, 0]])
-    counts = zip(count.tolist(), points.missing.tolist(), strict=True)
-    for name, place, (seen, missing), other in zip(
-        grid.names, places.tolist(), counts, others.tolist(), strict=True
-    ):
-        numbers = map(_field, place), (str(seen), str(missing)), map(_field, other)
-        yield (grid.sensor, grid.environment, name, *(field for part in numbers for field in part))
-
-
-def _field(value: float) -> str:
-    return repr(value) if isfinite(value) else ""
+    several = np.where(points.count > 1, points.count, np.nan)
+    jitter = np.sqrt(points.scatter.sum(axis=1) / several)
+    columns = [
+        *np.hstack([points.true, points.position, error_vectors(points)]).T.tolist(),
+        *(
+            column.tolist()
+            for column in (errors(points), points.count, points.missing, jitter, points.indicator)
+        ),
+    ]
+    for name, *values in zip(grid.names, *columns, strict=True):
+        yield [grid.sensor, grid.environment, name, *(repr(v) if isfinite(v) else "" for v in values)]

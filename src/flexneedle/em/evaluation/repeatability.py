@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.em.evaluation.accuracy import P95, root_mean_square
-from flexneedle.em.evaluation.grid import Grid
+from flexneedle.em.table.grid import Grid
 
 MOST_PAIRS = 1_000_000
 """Up to so many pairs of grid points all are compared (1414 points); of more, as many drawn with a fixed seed."""
@@ -57,33 +57,32 @@ class Spacing:
 
 def repeatability(grid: Grid) -> Repeatability:
     """Return the repeatability of single points of a grid."""
-    position = grid.points.position
-    several = position.count > 1
+    measured = grid.measured()
+    several = measured.count > 1
     if not several.any():
         return Repeatability((nan, nan, nan), nan, nan, nan, "")
-    scatter, freedom = position.scatter[several], position.count[several] - 1
+    scatter, freedom = measured.scatter[several], measured.count[several] - 1
     axes = np.sqrt(scatter.sum(axis=0) / freedom.sum())
     own = np.sqrt(scatter.sum(axis=1) / freedom)
-    names = np.array(grid.names, dtype=object)[several]
     worst = int(own.argmax())
     return Repeatability(
         tuple(axes.tolist()),
         float(np.linalg.norm(axes)),
         float(np.median(own)),
         float(own[worst]),
-        str(names[worst]),
+        grid.name_of(np.flatnonzero(several)[worst]),
     )
 
 
 def spacing(grid: Grid, seed: int = 0) -> Spacing:
     """Return the relative distance errors of a grid."""
-    seen = grid.points[grid.seen]
-    count = len(seen)
+    measured = grid.measured()
+    count = len(measured)
     first, second = _pairs(count, seed)
     if not len(first):
         return Spacing(0, False, *(nan,) * 5, nan, 0, nan)
-    true = np.linalg.norm(seen.true.mean[first] - seen.true.mean[second], axis=1)
-    off = np.linalg.norm(seen.position.mean[first] - seen.position.mean[second], axis=1) - true
+    true = np.linalg.norm(measured.true[first] - measured.true[second], axis=1)
+    off = np.linalg.norm(measured.position[first] - measured.position[second], axis=1) - true
     apart = float(true[true > 0.0].min(initial=np.inf))
     near = (true > 0.0) & (true <= apart * (1.0 + _SAME_SPACING))
     return Spacing(

@@ -7,16 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.em.evaluation.accuracy import P95
-from flexneedle.em.evaluation.grid import Grid
 from flexneedle.em.evaluation.indicator import Constant, Line, constant, line, means
-from flexneedle.em.evaluation.intervals import (
-    LEAST_POINTS,
-    RESAMPLES,
-    SEED,
-    Interval,
-    ends,
-    quantile_interval,
-)
+from flexneedle.em.evaluation.intervals import Interval, bootstrap, quantile_interval
+from flexneedle.em.table.grid import Grid
 
 _MOST_FOR_AREA = 2000
 
@@ -81,10 +74,10 @@ def separation(sensor: str, ideal: Grid | None, noisy: Grid | None) -> Separatio
         line(high, high_error) if len(high) else None,
         threshold,
         quantile_interval(low, P95),
-        ideal.indicators.quantile(P95) if ideal and len(low) else None,
+        ideal.levels.quantile(P95) if ideal and len(low) else None,
         (_above(ideal, threshold), _above(noisy, threshold)),
         _confusion(low, high, threshold) if both and threshold is not None else None,
-        area(low, high) if both else None,
+        float(area(low, high)) if both else None,
         _area_interval(low, high) if both else None,
         false_alarms,
         detected,
@@ -107,12 +100,16 @@ def roc(low: Floats, high: Floats) -> tuple[Floats, Floats]:
     return false_alarms[kept], detected[kept]
 
 
-def area(low: Floats, high: Floats) -> float:
-    """Return the area under the ROC: the share of pairs with `high` above `low`, ties half (Mann and Whitney 1947)."""
-    ordered = np.sort(low)
-    below = np.searchsorted(ordered, high, side="left")
-    up_to = np.searchsorted(ordered, high, side="right")
-    return float((below + up_to).sum() / (2.0 * len(low) * len(high)))
+def area(low: Floats, high: Floats, axis: int = -1) -> Floats:
+    """Return the area (…) under the ROC of values (…, n) and (…, m): the share of pairs with `high` above `low`.
+
+    Ties count half (Mann and Whitney 1947).
+    """
+    from scipy import stats
+
+    pairs = low.shape[axis] * high.shape[axis]
+    won: Floats = stats.mannwhitneyu(high, low, axis=axis, method="asymptotic").statistic / pairs
+    return won
 
 
 def _confusion(low: Floats, high: Floats, threshold: float) -> Confusion:
@@ -125,20 +122,15 @@ def _area_interval(low: Floats, high: Floats) -> Interval:
 
     With perfect separation every sample drawn again is perfect, too, which says nothing.
     """
-    least, most = sorted((len(low), len(high)))
-    if least < LEAST_POINTS or most > _MOST_FOR_AREA or area(low, high) in (0.0, 1.0):
+    if max(len(low), len(high)) > _MOST_FOR_AREA or area(low, high) in (0.0, 1.0):
         return None
-    wins = (high[None, :] > low[:, None]) + 0.5 * (high[None, :] == low[:, None])
-    rng = np.random.default_rng(SEED)
-    first, second = (rng.multinomial(len(v), np.full(len(v), 1.0 / len(v)), RESAMPLES) for v in (low, high))
-    areas = np.einsum("bi,bi->b", first @ wins, second) / (len(low) * len(high))
-    return ends(areas)
+    return bootstrap(area, low, high, paired=False)
 
 
 def _above(grid: Grid | None, threshold: float | None) -> float | None:
-    if grid is None or threshold is None or not grid.indicators.count:
+    if grid is None or threshold is None or not grid.levels.count:
         return None
-    return grid.indicators.above(threshold)
+    return grid.levels.above(threshold)
 
 
 def _share(one: int, other: int) -> float:

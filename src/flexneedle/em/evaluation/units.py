@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.em.evaluation.accuracy import jitter
-from flexneedle.em.evaluation.grid import Grid, Places
+from flexneedle.em.table.grid import Grid, Places
 from flexneedle.errors import InputError
 
 _ALIKE = 0.3  # RMS difference over size: a tracker may be off by this, noise about one place is off by more
@@ -23,21 +23,21 @@ _HINT = "--unit m reads all lengths as metres, --unit mm as they are"
 def refuse_metres(grids: list[Grid]) -> None:
     """Raise InputError if the lengths of a grid seem to be in metres."""
     for grid in grids:
-        if grid.seen.any() and (reason := _reason(grid.points[grid.seen])):
+        if grid.known.any() and (reason := _reason(grid.measured())):
             raise InputError(f"sensor {grid.sensor!r}, environment {grid.environment!r}: {reason}. {_HINT}")
 
 
-def _reason(seen: Places) -> str:
-    true, position = seen.true.mean, seen.position.mean
-    wide, measured = _extent(true), _extent(position)
-    told = f"the true positions span {wide:.3g}, the measured ones {measured:.3g}"
+def _reason(measured: Places) -> str:
+    true, position = measured.true, measured.position
+    wide, reach = _extent(true), _extent(position)
+    spans = f"the true positions span {wide:.3g}, the measured ones {reach:.3g}"
     if _alike(1000.0 * position, true):
-        return f"x_mm, y_mm, z_mm look like metres: {told}"
+        return f"x_mm, y_mm, z_mm look like metres: {spans}"
     if _alike(1000.0 * true, position):
-        return f"true_x_mm, true_y_mm, true_z_mm look like metres: {told}"
-    tiny = 0.0 < wide < _GRID_MM and measured < _GRID_MM and not jitter(seen) >= _JITTER_MM  # NaN: not known
+        return f"true_x_mm, true_y_mm, true_z_mm look like metres: {spans}"
+    tiny = 0.0 < wide < _GRID_MM and reach < _GRID_MM and not jitter(measured) >= _JITTER_MM  # NaN: not known
     if tiny and float(np.abs(_aligned(position) - _aligned(true)).max()) < _ERROR_MM:
-        return f"true and measured positions look like metres: {told}"
+        return f"true and measured positions look like metres: {spans}"
     return ""
 
 

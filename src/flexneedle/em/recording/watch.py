@@ -111,7 +111,7 @@ def _recorder(files: ExitStack, path: Path | None) -> Callable[[Frame], None]:
     try:
         file = files.enter_context(path.open("x", newline="", encoding="utf-8"))
     except FileExistsError:
-        raise InputError(f"{path}: is there already: give another file") from None
+        raise InputError(f"{path}: exists: give another file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
