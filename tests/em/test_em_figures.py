@@ -71,10 +71,11 @@ def test_nearly_all_arrows_end_inside_their_panel_and_none_is_drawn_beyond_it(sh
 def test_planes_stand_two_side_by_side():
     plane = GRID[GRID[:, 2] == 0.0]
     one, two, three = (field_figure([field_row(plane)] * k) for k in (1, 2, 3))
-    assert two.get_figheight() <= one.get_figheight() < three.get_figheight() < 2 * two.get_figheight()
-    left, right = (ax.get_position() for ax in two.axes[::2])
-    assert left.y0 == right.y0
-    assert left.x1 < 0.5 < right.x0
+    assert two.get_figheight() <= one.get_figheight() < three.get_figheight() <= 2 * two.get_figheight()
+    two.draw_without_rendering()
+    left, right = (ax.get_window_extent() for ax in two.axes[::2])
+    assert left.y0 == pytest.approx(right.y0)
+    assert left.x1 < two.bbox.width / 2 < right.x0
 
 
 def test_more_sensors_than_there_is_room_for_are_counted():
@@ -184,8 +185,10 @@ def test_legends_stay_inside_of_the_figure_and_off_the_lines_however_many_and_lo
     distance = distance_figure([DistanceLine(name, *values, 0.7, note) for name in names])
     for figure in (roc, distance):
         figure.draw_without_rendering()
-        for ax in figure.axes:
-            box = ax.get_legend().get_window_extent()
+        legends = [legend for part in (figure, *figure.subfigs) for legend in part.legends]
+        assert legends
+        for legend in legends:
+            box = legend.get_window_extent()
             assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
             assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
             assert not any(box.overlaps(other.get_window_extent()) for other in figure.axes)

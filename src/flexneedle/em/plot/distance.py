@@ -1,20 +1,18 @@
-"""RMSE over the distance from sensor to field generator, with the limit that it is to keep."""
+"""RMSE over the distance from sensor to field generator, with the limit on it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from textwrap import fill
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from flexneedle.plot.layout import look, short
-from flexneedle.plot.style import WIDTH, axes, new_figure, styled
+from flexneedle.plot.style import new_figure, styled
 
-_LEFT, _RIGHT, _TOP, _FOOT, _HIGH = 0.6, 2.95, 0.3, 0.5, 3.0  # inches
-_NOTE, _NAME = 30, 30  # characters in a line beside the panel
-_ROW = 0.145  # inches of a line beside the panel
+_LINE = 30  # characters in a line of the legend
+_HIGH, _ROW = 3.8, 0.16  # inches: of the figure, and of a line of the legend
 
 Floats = NDArray[np.float64]
 
@@ -32,23 +30,20 @@ class DistanceLine:
 
 def distance_figure(lines: Sequence[DistanceLine]) -> Figure:
     """Return the figure with a line for each sensor and environment, and its limit dashed in the same colour."""
+    labels = [f"{short(line.name, _LINE)}\n{fill(line.note, _LINE)}" for line in lines]
+    limits = dict.fromkeys(line.limit for line in lines if line.limit is not None)
+    rows = sum(label.count("\n") + 2 for label in labels) + 2 * len(limits)
     with styled():
-        labels = [f"{short(line.name, _NAME)}\n{fill(line.note, _NOTE)}" for line in lines]
-        rows = sum(label.count("\n") + 2 for label in labels)
-        high = max(_HIGH, _ROW * rows - _FOOT)  # the legend may be as long as the figure
-        figure = new_figure(_TOP + high + _FOOT)
-        ax = axes(figure, _LEFT, _TOP, WIDTH - _LEFT - _RIGHT, high)
+        figure = new_figure(max(_HIGH, _ROW * rows))
+        figure.set_layout_engine("constrained")
+        ax = figure.subplots()
         for number, (line, label) in enumerate(zip(lines, labels, strict=True)):
             own = look(number)
             ax.plot(line.distance, line.rmse, color=own.color, marker=own.marker, markersize=4.5, label=label)
-        for limit in dict.fromkeys(line.limit for line in lines if line.limit is not None):
-            number = next(k for k, line in enumerate(lines) if line.limit == limit)
-            ax.axhline(limit, color=look(number).color, linewidth=0.9, linestyle=(0, (4, 2)), zorder=1)
-            beside: dict[str, Any] = {"transform": ax.get_yaxis_transform(), "va": "center", "fontsize": 8}
-            ax.text(1.01, limit, f"limit {limit:g}", color=look(number).color, **beside)
+        for limit in limits:
+            color = look(next(k for k, line in enumerate(lines) if line.limit == limit)).color
+            ax.axhline(limit, color=color, lw=0.9, ls=(0, (4, 2)), zorder=1, label=f"limit {limit:g} mm")
         ax.set_ylim(bottom=0.0)
-        ax.set_title("RMSE by distance")
-        ax.set_xlabel("distance from the field generator (mm)")
-        ax.set_ylabel("RMSE (mm)")
-        ax.legend(loc="upper left", bbox_to_anchor=(1.12, 1.02), labelspacing=0.9)
+        ax.set(title="RMSE by distance", xlabel="distance from the field generator (mm)", ylabel="RMSE (mm)")
+        figure.legend(loc="outside right upper", labelspacing=0.9)
     return figure

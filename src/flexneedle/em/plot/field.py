@@ -2,25 +2,28 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import ceil
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from flexneedle.plot.layout import short
-from flexneedle.plot.style import QUIET, WIDTH, axes, new_figure, signed, styled
+from flexneedle.plot.style import QUIET, WIDTH, new_figure, signed, styled
 
 MOST_ROWS, MOST_SLICES = 6, 5
 MOST_ARROWS = 400
-"""In a slice; of more, every k-th is drawn, and that is said."""
-_LEFT, _RIGHT, _GAP, _TITLE, _FOOT = 0.6, 1.0, 0.14, 0.68, 0.42  # inches
+"""In a slice; of more, every k-th is drawn, and a note is added."""
 _COLORS = "viridis_r"
+_AROUND, _WIDEST = 0.95, 3.0  # inches: of titles and labels of a row, of a slice
 
 Floats = NDArray[np.float64]
+Numbers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,88 +41,51 @@ def field_figure(rows: Sequence[FieldRow]) -> Figure:
     layers = [_slices(row.true[:, 2]) for row in shown]
     columns = max(map(len, layers))
     across = 2 if columns == 1 and len(shown) > 1 else 1  # planes, two side by side
-    share = WIDTH / across
-    width = min((share - _LEFT - _RIGHT - (columns - 1) * _GAP) / columns, 3.0)
+    down = ceil(len(shown) / across)
     with styled():
-        figure = new_figure(-(-len(shown) // across) * (width + _TITLE) + _FOOT)
-        for number, (row, slices) in enumerate(zip(shown, layers, strict=True)):
-            down, right = divmod(number, across)
-            top, left = _TITLE + down * (width + _TITLE), _LEFT + right * share
-            made = [axes(figure, left + k * (width + _GAP), top, width, width) for k in range(len(slices))]
-            _draw_row(made, row, slices)
-            side = axes(figure, left + len(slices) * (width + _GAP), top, 0.1, width)
-            _draw_scale(figure, side, row)
-            below = shown[number + across] if number + across < len(shown) else None
-            _label_x(made, below is None or _frame(below.true) != _frame(row.true), below is None)
+        figure = new_figure(down * (_AROUND + min((WIDTH / across - 1.6) / columns, _WIDEST)))
+        figure.set_layout_engine("constrained")
+        parts = figure.subfigures(down, across, squeeze=False).ravel()
+        for part, row, slices in zip(parts, shown, layers, strict=False):
+            _draw_row(part, row, slices)
         if len(rows) > MOST_ROWS:
-            figure.text(
-                0.99, 0.005, f"{len(rows) - MOST_ROWS} more not shown", ha="right", color=QUIET, fontsize=8
-            )
+            figure.supxlabel(f"{len(rows) - MOST_ROWS} more not shown", color=QUIET, fontsize=8)
     return figure
 
 
-def _label_x(made: Sequence[Axes], numbers: bool, name: bool) -> None:
-    for ax in made:
-        ax.tick_params(labelbottom=numbers)
-        if name:
-            ax.set_xlabel("x (mm)", labelpad=1.0)
-
-
-def _draw_row(made: Sequence[Axes], row: FieldRow, slices: Sequence[NDArray[np.int64]]) -> None:
+def _draw_row(part: SubFigure, row: FieldRow, slices: Sequence[Numbers]) -> None:
     length = np.linalg.norm(row.error, axis=1)
+    norm = Normalize(0.0, float(length.max()) or 1.0)
     factor = _factor(row, max(map(len, slices)))
+    made = part.subplots(1, len(slices), sharex=True, sharey=True, squeeze=False)[0]
     left, right, bottom, top = _frame(row.true)
     for ax, chosen in zip(made, slices, strict=True):
-        _draw_slice(ax, row, chosen, length, factor)
-        ax.set_xlim(left, right)
-        ax.set_ylim(bottom, top)
-        ax.set_aspect("equal", adjustable="box")
-        ax.tick_params(labelleft=ax is made[0])
+        _draw_slice(ax, row, chosen, factor, norm)
+        ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
         ax.locator_params(nbins=4)
-        ax.text(0.0, 1.02, _level(row.true[chosen, 2]), transform=ax.transAxes, color=QUIET, fontsize=8)
+        ax.set_title(_level(row.true[chosen, 2]), color=QUIET, fontsize=8, fontweight="normal")
     made[0].set_ylabel("y (mm)")
-    thinned = max(map(len, slices)) > MOST_ARROWS
-    told = f"arrows {factor:g} times as long as the errors in x, y" + (
-        ", not every one drawn" if thinned else ""
-    )
-    wide = len(made) > 2  # else one above the other
-    how: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points"}
-    made[0].annotate(short(row.title, 60), (0, 1), (0, 19 if wide else 31), weight="bold", **how)
-    place, side = (made[-1], 1) if wide else (made[0], 0)
-    place.annotate(told, (side, 1), (0, 19), color=QUIET, ha="right" if wide else "left", fontsize=7.5, **how)
+    bar = part.colorbar(ScalarMappable(norm, _COLORS), ax=made, ticks=MaxNLocator(4), pad=0.01, aspect=15)
+    bar.set_label("error, x, y, z (mm)", fontsize=8)
+    thinned = ", not every one drawn" if max(map(len, slices)) > MOST_ARROWS else ""
+    part.suptitle(short(row.title, 60), x=0.01, ha="left", weight="bold", fontsize=8.5)
+    note = f"x (mm); arrows {factor:g} times as long as the errors in x, y{thinned}"
+    part.supxlabel(note, color=QUIET, fontsize=8)
 
 
-def _draw_slice(ax: Axes, row: FieldRow, chosen: NDArray[np.int64], length: Floats, factor: float) -> None:
-    chosen = chosen[:: -(-len(chosen) // MOST_ARROWS) or 1]
+def _draw_slice(ax: Axes, row: FieldRow, chosen: Numbers, factor: float, norm: Normalize) -> None:
+    chosen = chosen[:: ceil(len(chosen) / MOST_ARROWS)]
     x, y, _ = row.true[chosen].T
     u, v, _ = factor * row.error[chosen].T
-    how: dict[str, Any] = {"cmap": _COLORS, "norm": Normalize(0.0, float(length.max()) or 1.0)}
+    length = np.linalg.norm(row.error[chosen], axis=1)
+    colors: dict[str, Any] = {"cmap": _COLORS, "norm": norm}
     ax.quiver(
-        x,
-        y,
-        u,
-        v,
-        length[chosen],
-        angles="xy",
-        scale_units="xy",
-        scale=1.0,
-        width=0.012,
-        zorder=3,
-        **how,
-    )
-    ax.scatter(x, y, c=length[chosen], s=9, linewidths=0.0, zorder=2, **how)
+        x, y, u, v, length, angles="xy", scale_units="xy", scale=1.0, width=0.012, zorder=3, **colors
+    )  # fmt: skip
+    ax.scatter(x, y, c=length, s=9, linewidths=0.0, zorder=2, **colors)
 
 
-def _draw_scale(figure: Figure, ax: Axes, row: FieldRow) -> None:
-    most = float(np.linalg.norm(row.error, axis=1).max()) or 1.0
-    mapped = matplotlib.cm.ScalarMappable(Normalize(0.0, most), _COLORS)
-    bar = figure.colorbar(mapped, cax=ax)
-    bar.set_label("error, x, y, z (mm)", fontsize=8)
-    bar.locator = matplotlib.ticker.MaxNLocator(4)
-    bar.update_ticks()
-
-
-def _slices(height: Floats) -> list[NDArray[np.int64]]:
+def _slices(height: Floats) -> list[Numbers]:
     """Return the points at each height z, or in five slabs of equal depth where there are more heights than that."""
     levels = np.unique(np.round(height, 2))
     if len(levels) <= MOST_SLICES:
@@ -138,7 +104,7 @@ def _level(height: Floats) -> str:
 
 
 def _factor(row: FieldRow, in_slice: int) -> float:
-    """Return how much longer to draw: 1, 2 or 5 times a power of ten.
+    """Return the factor on the arrows' length: 1, 2 or 5 times a power of ten.
 
     The 95th percentile is at most as long as a grid step, and at least 95 % of the arrows end inside the frame; the
     others are cut at its edge.
@@ -153,7 +119,7 @@ def _factor(row: FieldRow, in_slice: int) -> float:
 
 
 def _room(row: FieldRow) -> Floats:
-    """Return by how much each arrow (n,) could be lengthened before it leaves the frame."""
+    """Return the factor (n,) at which each arrow reaches the edge of the frame."""
     left, right, bottom, top = _frame(row.true)
     place, error = row.true[:, :2], row.error[:, :2]
     ends = np.where(error > 0.0, np.array([right, top]), np.array([left, bottom]))

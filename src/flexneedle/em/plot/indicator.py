@@ -11,12 +11,12 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from flexneedle.plot.layout import short
-from flexneedle.plot.style import ESTIMATE, INK, QUIET, TARGET, TRUE, WIDTH, axes, new_figure, styled
+from flexneedle.plot.style import ESTIMATE, INK, QUIET, TARGET, TRUE, new_figure, styled
 
 FAR, CUT = 2.0, 1.2
-"""An environment whose largest indicator is beyond FAR times its 95th percentile is shown to CUT times that; how many
-points lie beyond is said. All others are shown whole."""
-_LEFT, _RIGHT, _TOP, _FOOT, _GAP, _HIGH = 0.6, 0.25, 0.42, 0.5, 0.62, 3.4  # inches
+"""An environment whose largest indicator is beyond FAR times its 95th percentile is shown to CUT times that, with the
+number of points beyond. All others are shown whole."""
+_HIGH = 4.3  # inches
 _LOOKS = ((ESTIMATE, "o"), (TRUE, "^"))
 
 Floats = NDArray[np.float64]
@@ -29,7 +29,7 @@ class Shown:
     name: str
     indicator: Floats
     error: Floats
-    told: str
+    fit: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,17 +45,16 @@ class IndicatorPanel:
 
 
 def indicator_figure(panels: Sequence[IndicatorPanel], more: int = 0) -> Figure:
-    """Return the figure with a panel for each sensor, side by side; more: how many others there are, which it says."""
+    """Return the figure with a panel for each sensor, side by side; more: number of others, which are not shown."""
     with styled():
-        figure = new_figure(_TOP + _HIGH + _FOOT)
-        width = (WIDTH - _LEFT - _RIGHT - (len(panels) - 1) * _GAP) / len(panels)
-        for number, panel in enumerate(panels):
-            ax = axes(figure, _LEFT + number * (width + _GAP), _TOP, width, _HIGH)
+        figure = new_figure(_HIGH)
+        figure.set_layout_engine("constrained")
+        for ax, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
             _draw(ax, panel)
         figure.axes[0].set_ylabel("error of the mean position (mm)")
         if more:
-            told = f"{more} more sensor{'s' if more > 1 else ''} not shown"
-            figure.text(0.99, 0.005, told, ha="right", color=QUIET, fontsize=8)
+            plural = "s" if more > 1 else ""
+            figure.supxlabel(f"{more} more sensor{plural} not shown", color=QUIET, fontsize=8)
     return figure
 
 
@@ -94,7 +93,7 @@ def _scatter(ax: Axes, shown: Shown, color: str, marker: str, widest: float) -> 
     how: dict[str, Any] = {"color": color, "marker": marker, "linewidths": 0.0}
     x, y, size = shown.indicator[inside], shown.error[inside], 4 if many else 13
     ax.scatter(x, y, size, alpha=0.55, rasterized=many, zorder=3, **how)
-    label, beyond = f"{short(shown.name, 40)}: {shown.told}", len(shown.indicator) - len(x)
+    label, beyond = f"{short(shown.name, 40)}: {shown.fit}", len(shown.indicator) - len(x)
     if beyond:
         points = "point" if beyond == 1 else "points"
         label += f"\n({beyond} {points} beyond, up to I = {float(shown.indicator.max()):.3g}, not shown)"

@@ -1,4 +1,4 @@
-"""The picture of a registration: its fiducials with what is left of their error, and the error to be expected."""
+"""The picture of a registration: its fiducials with their residuals, and the expected error."""
 
 from collections.abc import Callable
 
@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from flexneedle.plot.style import ESTIMATE, INK, QUIET, WIDTH, axes, new_figure, styled
+from flexneedle.plot.style import ESTIMATE, INK, QUIET, new_figure, styled
 
 Floats = NDArray[np.float64]
 
-_HEIGHT, _LEFT, _GAP, _BAR = 3.9, 0.62, 0.75, 0.15  # inches
+_HEIGHT = 3.9  # inches
 _ARROW = 0.15  # longest residual, as a share of the panel
 _VIEWS = ((0, 1, "x (mm)", "y (mm)"), (0, 2, "x (mm)", "z (mm)"))
 
@@ -21,30 +21,25 @@ _VIEWS = ((0, 1, "x (mm)", "y (mm)"), (0, 2, "x (mm)", "z (mm)"))
 def registration_figure(
     stage: Floats, mapped: Floats, targets: Floats, expected: Callable[[Floats], Floats]
 ) -> Figure:
-    """Draw fiducials (n, 3), arrows to where the registration puts them, mapped (n, 3), and targets (k, 3); mm.
+    """Draw fiducials (n, 3), arrows to their mapped positions (n, 3), and targets (k, 3); mm.
 
     expected: RMS target registration error (mm) at points (m, 3); shown as levels in the planes through the middle.
     """
     with styled():
         figure = new_figure(_HEIGHT)
-        width = (WIDTH - _LEFT - _GAP - 1.25) / 2
+        figure.set_layout_engine("constrained")
         low, high = _extent(np.vstack([stage, targets]))
         longest = float(np.linalg.norm(mapped - stage, axis=1).max())
         scale = _round(_ARROW * float((high - low).max()) / longest) if longest > 0.0 else 1.0
         levels = _levels(expected, low, high, stage.mean(axis=0))
-        for number, view in enumerate(_VIEWS):
-            ax = axes(figure, _LEFT + number * (width + _GAP), 0.45, width, _HEIGHT - 1.25)
+        panels = figure.subplots(1, len(_VIEWS))
+        for ax, view in zip(panels, _VIEWS, strict=True):
             shown = _view(ax, view, stage, mapped, targets, scale, (low, high))
             filled = _field(ax, view, expected, (low, high), stage.mean(axis=0), levels)
             ax.set_title(shown)
-        bar = figure.colorbar(filled, cax=axes(figure, WIDTH - 0.9, 0.45, _BAR, _HEIGHT - 1.25))
-        bar.set_label("expected error, TRE (mm)")
-        figure.text(
-            _LEFT / WIDTH,
-            0.05 / _HEIGHT,
-            f"○ fiducial   → residual, {scale:g} times as long   × target",
-            color=QUIET,
-        )
+        figure.colorbar(filled, ax=panels, label="expected error, TRE (mm)")
+        note = f"○ fiducial   → residual, {scale:g} times as long   × target"
+        figure.supxlabel(note, color=QUIET, fontsize=8)
     return figure
 
 

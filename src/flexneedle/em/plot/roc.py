@@ -1,4 +1,4 @@
-"""What a threshold of the indicator tells apart: detected distortion over false alarms, and both over the threshold."""
+"""How a threshold of the indicator separates environments: detection over false alarms, both over the threshold."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,11 +11,10 @@ from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
 from flexneedle.plot.layout import look, short
-from flexneedle.plot.style import QUIET, WIDTH, axes, new_figure, styled
+from flexneedle.plot.style import QUIET, new_figure, styled
 
-_SIDE, _LEFT, _RIGHT, _GAP, _TOP, _FOOT = 3.4, 0.75, 0.2, 0.85, 0.3, 0.55  # inches
-_ENTRY = 0.185  # inches of a legend
 _NAME = 24  # characters
+_HIGH, _ROW = 4.4, 0.17  # inches: of the figure, and of a line of the legends below
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +24,7 @@ class RocLine:
     """A sensor: shares (k,) of grid points above each threshold in an ideal and a noisy environment, and their values.
 
     environments: the names of these two.
-    chosen: these shares (false alarms, detected) at the threshold in use, told in words by `note`.
+    chosen: these shares (false alarms, detected) at the threshold in use, in words in `note`.
     """
 
     sensor: str
@@ -40,11 +39,15 @@ class RocLine:
 
 def roc_figure(lines: Sequence[RocLine]) -> Figure:
     """Return the figure: the ROC of each sensor, and beside it the shares above each threshold; legends below."""
+    rows = max(sum(line.note.count("\n") + 1 for line in lines), 2 * len(lines))
     with styled():
-        figure = new_figure(_TOP + _SIDE + _FOOT + _ENTRY * (2 * len(lines) + 0.5))
-        _draw_roc(axes(figure, _LEFT, _TOP, _SIDE, _SIDE), lines)
-        left = _LEFT + _SIDE + _GAP
-        _draw_shares(axes(figure, left, _TOP, WIDTH - left - _RIGHT, _SIDE), lines)
+        figure = new_figure(_HIGH + _ROW * rows)
+        figure.set_layout_engine("constrained")
+        for part, draw in zip(
+            figure.subfigures(1, 2, squeeze=False)[0], (_draw_roc, _draw_shares), strict=True
+        ):
+            draw(part.subplots(), lines)
+            part.legend(loc="outside lower left", fontsize=7.5)
     return figure
 
 
@@ -52,26 +55,15 @@ def _draw_roc(ax: Axes, lines: Sequence[RocLine]) -> None:
     ax.plot([0, 1], [0, 1], color=QUIET, linewidth=0.8, linestyle=(0, (1, 2)), zorder=1)
     for number, line in enumerate(lines):
         own = look(number)
-        ax.plot(
-            line.false_alarms,
-            line.detected,
-            color=own.color,
-            linestyle=_dashes(number),
-            zorder=3,
-            clip_on=False,
-        )
-        mark: dict[str, Any] = {
-            "color": own.color,
-            "markersize": 7,
-            "markeredgecolor": "white",
-            "clip_on": False,
-        }
-        ax.plot(*line.chosen, own.marker, label=f"{short(line.sensor, _NAME)}: {line.note}", zorder=4, **mark)
+        dashes: Any = (0, (6, 1.5 * number)) if number else "-"
+        common: dict[str, Any] = {"color": own.color, "clip_on": False, "in_layout": False}
+        ax.plot(line.false_alarms, line.detected, linestyle=dashes, zorder=3, **common)
+        label = f"{short(line.sensor, _NAME)}: {line.note}"
+        ax.plot(*line.chosen, own.marker, ms=7, mec="white", zorder=4, label=label, **common)
     ideal, noisy = (short(name, 30) for name in lines[0].environments)
-    _share_axis(ax, "y", f"detected: grid points above ({noisy})")
-    _share_axis(ax, "x", f"false alarms: grid points above ({ideal})")
+    _set_share(ax, "y", f"detected: grid points above ({noisy})")
+    _set_share(ax, "x", f"false alarms: grid points above ({ideal})")
     ax.set_title("Each threshold of the indicator")
-    _legend_below(ax)
 
 
 def _draw_shares(ax: Axes, lines: Sequence[RocLine]) -> None:
@@ -84,28 +76,10 @@ def _draw_shares(ax: Axes, lines: Sequence[RocLine]) -> None:
             ax.step(ends, above, where="post", color=color, linestyle=style, label=label, zorder=3)
         ax.axvline(line.threshold, color=color, linewidth=0.9, linestyle=(0, (4, 2)), zorder=1)
     ax.set_xlim(left=0.0)
-    ax.set_xlabel("threshold of the indicator (dashed: in use)")
-    _share_axis(ax, "y", "grid points above")
-    ax.set_title("Above the threshold")
-    _legend_below(ax)
+    ax.set(title="Above the threshold", xlabel="threshold of the indicator (dashed: in use)")
+    _set_share(ax, "y", "grid points above")
 
 
-def _legend_below(ax: Axes) -> None:
-    """Below the axis, however many lines there are: inside they would hide what they name."""
-    ax.legend(
-        loc="upper left",
-        bbox_to_anchor=(-0.02, -_FOOT / _SIDE),
-        borderaxespad=0.0,
-        borderpad=0.0,
-        fontsize=7.5,
-    )
-
-
-def _share_axis(ax: Axes, name: str, label: str) -> None:
-    getattr(ax, f"set_{name}lim")(0.0, 1.0)
-    getattr(ax, f"set_{name}label")(label)
+def _set_share(ax: Axes, name: str, label: str) -> None:
+    ax.set(**{f"{name}lim": (0.0, 1.0), f"{name}label": label})
     getattr(ax, f"{name}axis").set_major_formatter(PercentFormatter(1.0, symbol=" %"))
-
-
-def _dashes(number: int) -> Any:
-    return (0, (6, 1.5 * number)) if number else "-"
