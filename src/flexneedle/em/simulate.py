@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
 from flexneedle.rig.tracking.field.room import REFERENCES, Room, grid
-from flexneedle.rig.tracking.field.sensors import Noiseless, SensorReadings, noiseless, noisy
+from flexneedle.rig.tracking.field.sensors import Noiseless, Readings, noiseless, noisy
 from flexneedle.rig.tracking.quaternion import along, z_axis
 from flexneedle.rig.tracking.table import COLUMNS, REFERENCE, TIP
 from flexneedle.scenario.sections.environment import Environment
@@ -29,7 +29,7 @@ _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Experiment:
-    """A cube of points³ over the workspace, gone through `repeats` times with so many `samples` a point.
+    """A cube of points³ over the workspace, visited `repeats` times with `samples` a point each time.
 
     seed: of the measurement; field_seed: which room, None for each environment's own.
     """
@@ -44,13 +44,13 @@ class Experiment:
 def measure(environments: Sequence[Environment], experiment: Experiment) -> pa.Table:
     """Return the table of both sensors in all environments: columns `COLUMNS`, in the order of the measurement.
 
-    The tip's sensor points along x, the reference stands upright. An environment's rows depend on it and on the
-    experiment alone. Raises InputError if two environments have one name, or for more rows than memory is for.
+    The tip's sensor points along x, the reference along z. An environment's rows depend on it and on the
+    experiment alone. Raises InputError if two environments have one name, or for more rows than `_MOST_SAMPLES`.
     """
     names = [environment.name for environment in environments]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise InputError(f"two environments have the name {twice}: a table tells them apart by it")
+        raise InputError(f"two environments have the name {twice}: a table needs different ones")
     rows = 2 * len(names) * experiment.points**3 * experiment.samples * experiment.repeats
     if rows > _MOST_SAMPLES:
         raise InputError(f"{rows} samples: must be at most {_MOST_SAMPLES}")
@@ -76,7 +76,7 @@ def write_measurements(table: pa.Table, path: Path) -> None:
 
 
 def check_new(path: Path) -> None:
-    """Raise InputError for a file that is neither CSV nor Parquet by its name, is there, or has no folder."""
+    """Raise InputError for a file that is neither CSV nor Parquet by its name, exists, or has no folder."""
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: must end in {' or '.join(SUFFIXES)}")
     if path.exists():
@@ -90,19 +90,19 @@ def _measured(environment: Environment, sensor: str, experiment: Experiment) -> 
     chosen = environment.field_seed if experiment.field_seed is None else experiment.field_seed
     room = Room(environment, chosen)
     places = grid(environment.workspace_mm, experiment.points)
-    # Grid points in order, so many samples each, and all that again and again.
+    # Grid points in order, all samples of each, and the whole grid again in each repeat.
     order = np.tile(np.repeat(np.arange(len(places)), experiment.samples), experiment.repeats)
     is_tip = sensor == TIP
-    turns = np.tile(_ALONG_X if is_tip else _UPRIGHT, (len(places), 1))
-    still = noiseless(room, TIP if is_tip else REFERENCES[0], places, turns)
+    orientations = np.tile(_ALONG_X if is_tip else _UPRIGHT, (len(places), 1))
+    still = noiseless(room, TIP if is_tip else REFERENCES[0], places, orientations)
     rng = np.random.default_rng([experiment.seed, int(is_tip), *environment.name.encode()])
-    seen = noisy(environment, Noiseless(still.coils[order], still.turns[order]), rng)
+    readings = noisy(environment, Noiseless(still.coils[order], still.turns[order]), rng)
     missing = rng.random(len(order)) < environment.missing_fraction
     away = np.linalg.norm(places - np.array(environment.generator_mm), axis=-1)
     columns = {
         "point_id": order,
         **_named(("true_x_mm", "true_y_mm", "true_z_mm"), places[order]),
-        **_told(seen, missing, is_tip),
+        **_reported(readings, missing, is_tip),
         "sensor": [sensor] * len(order),
         "environment": [environment.name] * len(order),
         "distance_mm": away[order],
@@ -110,16 +110,16 @@ def _measured(environment: Environment, sensor: str, experiment: Experiment) -> 
     return pa.table({name: pa.array(columns[name]) for name in COLUMNS}, _SCHEMA)
 
 
-def _told(seen: SensorReadings, missing: NDArray[np.bool_], is_tip: bool) -> dict[str, pa.Array]:
-    """What the tracker says in each sample, null in those that it misses."""
+def _reported(readings: Readings, missing: NDArray[np.bool_], is_tip: bool) -> dict[str, pa.Array]:
+    """What the tracker reports in each sample, null in missing ones."""
     # The roll of one coil is not known.
-    turns = along(z_axis(seen.turns)) if is_tip else seen.turns
+    turns = along(z_axis(readings.turns)) if is_tip else readings.turns
     nothing = np.zeros(len(missing))
-    columns = _named(("x_mm", "y_mm", "z_mm"), seen.positions) | _named(("qw", "qx", "qy", "qz"), turns)
-    told = {name: pa.array(values, mask=missing) for name, values in columns.items()}
-    if seen.indicators is None:
-        return told | {"indicator": pa.array(nothing, mask=np.ones(len(missing), dtype=bool))}
-    return told | {"indicator": pa.array(seen.indicators, mask=missing)}
+    values = _named(("x_mm", "y_mm", "z_mm"), readings.positions) | _named(("qw", "qx", "qy", "qz"), turns)
+    columns = {name: pa.array(column, mask=missing) for name, column in values.items()}
+    if readings.indicators is None:
+        return columns | {"indicator": pa.array(nothing, mask=np.ones(len(missing), dtype=bool))}
+    return columns | {"indicator": pa.array(readings.indicators, mask=missing)}
 
 
 def _named(names: Sequence[str], values: Floats) -> dict[str, Floats]:

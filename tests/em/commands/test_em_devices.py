@@ -183,7 +183,7 @@ def test_without_a_terminal_what_does_not_fit_the_stage_is_refused_unless_forced
 ):
     status, err, rows = record_moving(capsys, tmp_path, monkeypatch, io.StringIO("\n" * 9))
     assert (status, rows) == (1, 4)
-    assert "and the stage 50.0 mm: they may differ by 10.0 mm (--force records all the same)\n" in err
+    assert "and the stage 50.0 mm: they may differ by 10.0 mm (use --force to record it)\n" in err
     status, err, rows = record_moving(capsys, tmp_path, monkeypatch, io.StringIO(), "--dwell", "0", "--force")
     assert (status, rows) == (0, 8)
     assert "recorded (--force)" in err

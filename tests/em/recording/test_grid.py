@@ -65,7 +65,7 @@ def test_the_shipped_example_is_the_papers_grid():
         ),
         (
             LATTICE.replace("[grid]", '[sensors]\nref1 = "reference"\nref2 = "reference"\n[grid]'),
-            'sensors.ref2 = "reference": is the name of ref1 already',
+            'sensors.ref2 = "reference": is the name of ref1, too',
         ),
         (LATTICE.replace("[grid]", "samples = 1\n[grid]"), "samples = 1: must be at least 2"),
     ],
@@ -77,5 +77,5 @@ def test_what_is_wrong_with_a_file_is_said_by_key_and_rule(read, text, says):
 
 
 def test_a_file_that_is_not_there_is_named_with_the_shipped_ones():
-    with pytest.raises(InputError, match=r"nothing\.toml: No such file.*; grids that come along: cube"):
+    with pytest.raises(InputError, match=r"nothing\.toml: No such file.*; shipped grids: cube"):
         read_grid("nothing.toml")

@@ -145,7 +145,8 @@ def test_a_stage_that_never_rests_is_told_and_asked_for_again(grid, out):
         record(session, stage, stage, grid, Guide(stage.ask, say))
     (said,) = stage.said
     assert said == (
-        "no 6 good samples within 2 s: tip moves: 0.50 mm from the first to the last third, limit 0.2 mm; once more"
+        "no 6 good samples within 2 s: tip moves: 0.50 mm from the first to the last third, limit 0.2 mm; "
+        "measured again"
     )
     assert stage.asked == [(1, 1), *ALL]
     assert_whole(out)
@@ -188,7 +189,7 @@ def test_a_tracker_that_falls_silent_for_a_while_is_told_once_and_so_is_its_retu
     stage.read = lambda: () if 3.1 < stage.time < 4.6 else read()
     stage.status = "unplugged"
     run(out, grid, stage)
-    assert stage.said == ["no frames: unplugged", "frames come again"]
+    assert stage.said == ["no frames: unplugged", "frames arrive again"]
     assert_whole(out)
 
 
@@ -229,7 +230,7 @@ def test_a_sensor_that_stays_while_the_stage_moves_ends_the_recording(grid, out,
         run(out, grid, Stuck(), insists=insists)
     assert str(refusal.value) == (
         "tip moved 0.0 mm from point 1 to point 2 and the stage 10.0 mm: they may differ by 5.0 mm "
-        "(--force records all the same)"
+        "(use --force to record it)"
     )
     assert_whole(out, stops=ALL[:1])
 

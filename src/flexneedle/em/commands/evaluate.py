@@ -32,7 +32,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--ideal", metavar="NAME", help="environment that sets the threshold (default: ideal)"
     )
-    parser.add_argument("--noisy", metavar="NAME", help="environment to tell from it (default: noisy)")
+    parser.add_argument("--noisy", metavar="NAME", help="environment to separate from it (default: noisy)")
     parser.add_argument(
         "--bin-mm",
         type=positive,

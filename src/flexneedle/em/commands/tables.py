@@ -1,4 +1,4 @@
-"""How results of an evaluation look in a terminal."""
+"""Tables and numbers in a terminal."""
 
 from __future__ import annotations
 

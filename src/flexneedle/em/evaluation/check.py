@@ -100,8 +100,8 @@ def check(data: Path, off: str, on: str, threshold: float, options: Options) -> 
         for power, own in (("off", before), ("on", after))
         for grid in own.values()
     ]
-    odd = [*lacking_sensors(powered, "no indicator in"), *differing_points(powered)]
-    return Check([compare(before[name], after[name], threshold) for name in both], odd)
+    notes = [*lacking_sensors(powered, "no indicator in"), *differing_points(powered)]
+    return Check([compare(before[name], after[name], threshold) for name in both], notes)
 
 
 def compare(off: Grid, on: Grid, threshold: float) -> Power:

@@ -42,7 +42,7 @@ class Distances:
 
     @property
     def kept(self) -> str:
-        """Where the limit is kept, in words: in the nearest bin, that it begins there is not known."""
+        """Where the limit is kept, in words; in the nearest bin it may be kept nearer, too."""
         if self.limit_mm is None:
             return "no limit"
         if self.smallest_mm is None:

@@ -31,11 +31,11 @@ _FORMAT = 1
 
 @dataclass(frozen=True)
 class Options:
-    """How a table is read and judged.
+    """How a table is read and evaluated.
 
     columns: pairs "theirs=ours" or paths of TOML files with such; unit: "mm", "m", or None for millimetres that are
     refused where they look like metres; limit_mm: RMSE for the smallest distance (None: the maker's, where the sensor
-    is one of the paper's); ideal, noisy: names of the environments that the indicator is to tell apart (None: the
+    is one of the paper's); ideal, noisy: names of the environments that the indicator is to separate (None: the
     paper's, where there are such); sensor, environment: of all rows, for a table without such a column.
     """
 
@@ -51,7 +51,7 @@ class Options:
 
     @property
     def pair(self) -> tuple[str, str]:
-        """Names of the environments that the indicator is to tell apart."""
+        """Names of the environments that the indicator is to separate."""
         return self.ideal or published.IDEAL, self.noisy or published.NOISY
 
 
@@ -88,7 +88,7 @@ class Result:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What a table came to. `notes`: how odd data was treated, a line each."""
+    """The evaluation of a table. `notes`: how unusual data was treated, a line each."""
 
     data: Path
     options: Options
@@ -119,14 +119,14 @@ def evaluate(data: Path, options: Options) -> Evaluation:
         results = [_result(grid, options) for grid in grids]
     except InputError as error:
         raise InputError(f"{data}: {error}") from None
-    judged = [result.grid for result in results]
+    registered = [result.grid for result in results]
     separations = [
         found
-        for sensor in dict.fromkeys(grid.sensor for grid in judged)
-        if (found := separation(sensor, *_environments(judged, sensor, options))) is not None
+        for sensor in dict.fromkeys(grid.sensor for grid in registered)
+        if (found := separation(sensor, *_environments(registered, sensor, options))) is not None
     ]
-    odd = notes(judged, options.pair, hinted=not options.register)
-    return Evaluation(data, options, rows, results, separations, odd)
+    remarks = notes(registered, options.pair, hinted=not options.register)
+    return Evaluation(data, options, rows, results, separations, remarks)
 
 
 def read_table(data: Path, options: Options) -> tuple[list[Grid], int]:

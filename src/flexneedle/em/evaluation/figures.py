@@ -49,14 +49,14 @@ def _indicator(evaluation: Evaluation, found: Separation) -> IndicatorPanel:
     return IndicatorPanel(
         found.sensor,
         _shown(ideal, f"{flat.mean_mm:.3f} ± {flat.sd_mm:.3f} mm") if ideal and flat else None,
-        _shown(noisy, _line_told(line)) if noisy and line else None,
+        _shown(noisy, _line_text(line)) if noisy and line else None,
         (flat.mean_mm, flat.sd_mm) if flat else None,
         (line.slope_mm, line.intercept_mm) if line else None,
         found.threshold,
     )
 
 
-def _line_told(line: Line) -> str:
+def _line_text(line: Line) -> str:
     sign = "+" if line.intercept_mm >= 0.0 else "−"
     return f"{signed(line.slope_mm, '.3f')} I {sign} {abs(line.intercept_mm):.3f} mm"
 
@@ -65,8 +65,8 @@ def _is_of(result: Result, found: Separation) -> bool:
     return result.grid.sensor == found.sensor and result.summary is not None
 
 
-def _shown(grid: Grid, told: str) -> Shown:
-    return Shown(grid.environment, *means(grid), told)
+def _shown(grid: Grid, fit: str) -> Shown:
+    return Shown(grid.environment, *means(grid), fit)
 
 
 def _roc(evaluation: Evaluation, found: Separation) -> RocLine:
@@ -77,8 +77,8 @@ def _roc(evaluation: Evaluation, found: Separation) -> RocLine:
     names = evaluation.options.pair
     values = [means(own[name])[0] for name in names]
     chosen = confusion.false_alarms, confusion.detected
-    told = f"{100.0 * chosen[1]:.1f} % detected,\n{100.0 * chosen[0]:.1f} % false alarms"
-    note = f"area {found.auc:.4f}\nat {threshold:.4f}: {told}"
+    shares = f"{100.0 * chosen[1]:.1f} % detected,\n{100.0 * chosen[0]:.1f} % false alarms"
+    note = f"area {found.auc:.4f}\nat {threshold:.4f}: {shares}"
     return RocLine(
         found.sensor,
         names,

@@ -1,4 +1,4 @@
-"""The indicator 𝓘 of field distortion: its summary (paper, Table II), and what it says about the error."""
+"""The indicator 𝓘 of field distortion: its summary (paper, Table II), and the error over it."""
 
 from dataclasses import dataclass
 from math import nan

@@ -1,4 +1,4 @@
-"""What is odd about a table of measurements, and how it was treated."""
+"""Notes on unusual data in a table of measurements, and on how it was treated."""
 
 from collections.abc import Iterator, Sequence
 
@@ -16,9 +16,9 @@ _FEW = 6  # grid points; of fewer a rigid fit, with its six numbers, leaves litt
 
 
 def notes(grids: Sequence[Grid], pair: tuple[str, str], hinted: bool) -> list[str]:
-    """Return a line for each oddity of the grids.
+    """Return a line for each unusual property of the grids.
 
-    pair: the environments that the indicator is to tell apart; hinted: say where a rigid fit is missing.
+    pair: the environments that the indicator is to separate; hinted: add a note where a rigid fit is missing.
     """
     return [
         *(f"{grid.title}: {odd}" for grid in grids if (odd := "; ".join(_odd(grid)))),
@@ -31,7 +31,7 @@ def notes(grids: Sequence[Grid], pair: tuple[str, str], hinted: bool) -> list[st
 
 
 def lacking_sensors(grids: Sequence[Grid], absent: str = "not in") -> Iterator[str]:
-    """Yield a line for each sensor that is not in all environments, which `absent` tells in words."""
+    """Yield a line for each sensor that is not in all environments, described by `absent`."""
     everywhere = list(dict.fromkeys(grid.environment for grid in grids))
     for sensor in dict.fromkeys(grid.sensor for grid in grids):
         own = [grid.environment for grid in grids if grid.sensor == sensor]
@@ -105,7 +105,7 @@ def _fit(grid: Grid) -> tuple[float, float] | None:
         return None
     try:
         left = register(grid)[1].residual_mm
-    except InputError:  # points on a line: nothing can be said
+    except InputError:  # points on a line: no fit to compare with
         return None
     as_it_is = root_mean_square(errors(measured))
     return (as_it_is, left) if as_it_is > _OWN_FRAME * left else None
@@ -117,5 +117,5 @@ def _lacking(grids: Sequence[Grid], pair: tuple[str, str]) -> Iterator[str]:
     if len(there) > 1 and lacking:
         yield (
             f"no indicator in an environment called {' or '.join(lacking)} (there is {', '.join(there)}): "
-            "--ideal and --noisy name the two that it is to tell apart"
+            "--ideal and --noisy name the two that it is to separate"
         )

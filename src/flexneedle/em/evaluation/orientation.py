@@ -1,4 +1,4 @@
-"""Jitter of the orientation, from summed products of unit quaternions: q and −q are the same turn, and so add alike.
+"""Jitter of the orientation, from summed products of unit quaternions: q and −q are the same rotation and add alike.
 
 The mean of quaternions q_j is the eigenvector m of A = Σ q_j q_jᵀ / n with the largest eigenvalue λ (Markley, Cheng,
 Crassidis and Oshman 2007). The angle φ_j between q_j and m has cos(φ_j / 2) = |q_j · m|, so that 1 − λ is the mean of
@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 class Orientation:
     """RMS angle (degrees) of single samples from the mean orientation at their grid point, over all samples.
 
-    axis_jitter_deg: of the sensor's z axis alone, which is the needle's: a 5-DOF sensor knows no turn about it.
+    axis_jitter_deg: of the sensor's z axis alone, the needle's, about which a 5-DOF sensor measures no rotation.
     NaN if no point has two samples.
     """
 

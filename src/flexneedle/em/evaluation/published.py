@@ -1,4 +1,4 @@
-"""What others say about the paper's tracker, to hold against what is measured.
+"""Published figures of the paper's tracker, to compare with what is measured.
 
 OFFICIAL: the maker's figures (NDI 2013) as the paper quotes them in Table I; MEASURED: the paper's own, Tables I and
 II. Where text and tables of the paper differ (0.17 and 0.25 mm against 0.65 and 0.61 mm), these are the tables'.

@@ -1,8 +1,8 @@
-"""How well a tracker finds the same point again, and the distance between two points.
+"""Repeatability of single points, and errors of the distance between two points.
 
 These are what ASTM F2554 calls the repeatability of the coordinates of a single point and the relative point-to-point
 accuracy (linear). Neither needs the frames of tracker and stage to be registered. The figures are computed from a
-grid of means; they are not that standard's whole procedure, which turns the tool and changes the operator, too.
+grid of means; the standard's whole procedure has several orientations of the tool and several operators, too.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from flexneedle.em.evaluation.accuracy import P95, root_mean_square
 from flexneedle.em.table.grid import Grid
 
 MOST_PAIRS = 1_000_000
-"""Up to so many pairs of grid points all are compared (1414 points); of more, as many drawn with a fixed seed."""
+"""Up to this number of pairs of grid points all are compared (1414 points); of more, this number, with a fixed seed."""
 _SAME_SPACING = 0.01  # pairs up to 1 % farther apart than the closest are neighbours
 
 Floats = NDArray[np.float64]

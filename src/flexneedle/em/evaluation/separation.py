@@ -1,4 +1,4 @@
-"""How well a threshold of the indicator tells two environments apart."""
+"""How well a threshold of the indicator separates two environments."""
 
 from dataclasses import dataclass
 from math import nan
@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Confusion:
-    """How many grid points lie above a threshold and how many do not, in either environment."""
+    """How many grid points are above a threshold and how many do not, in either environment."""
 
     ideal_below: int
     ideal_above: int
@@ -38,9 +38,9 @@ class Confusion:
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """What the indicator of a sensor says, from the mean values at grid points; None where an environment is lacking.
+    """The analysis of a sensor's indicator, from the mean values at grid points; None where an environment is lacking.
 
-    threshold: 95th percentile in `ideal`. samples_threshold: the same of single samples, which is what a monitor sees;
+    threshold: 95th percentile in `ideal`. samples_threshold: the same of single samples, which a monitor has;
     samples_above: share of single samples above `threshold` in `ideal` and `noisy`. auc: how often a point of `noisy`
     has the higher indicator of two, ties half. false_alarms, detected (k,): the ROC, from (0, 0) to (1, 1).
     """
@@ -118,9 +118,9 @@ def _confusion(low: Floats, high: Floats, threshold: float) -> Confusion:
 
 
 def _area_interval(low: Floats, high: Floats) -> Interval:
-    """Draw both environments again, each for itself; None if they are told apart perfectly, few, or very many.
+    """Draw both environments again, each for itself; None if they are separated perfectly, few, or very many.
 
-    With perfect separation every sample drawn again is perfect, too, which says nothing.
+    With perfect separation every sample drawn again is perfect, too.
     """
     if max(len(low), len(high)) > _MOST_FOR_AREA or area(low, high) in (0.0, 1.0):
         return None

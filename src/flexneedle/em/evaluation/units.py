@@ -1,6 +1,6 @@
-"""Metres where millimetres were meant: a result a thousand times too good, or absurd, is not given out unasked.
+"""Metres in place of millimetres: refused, since the errors would be a thousand times too small, or absurd.
 
-One of the two, true or measured, in metres: its points then lie a thousand times nearer to their middle than those of
+One of the two, true or measured, in metres: its points are then a thousand times nearer to their middle than those of
 the other, one by one and but for the errors. Those of a sensor that is stuck may be as near, but not in the grid's
 shape.
 
@@ -47,7 +47,7 @@ def _extent(points: NDArray[np.float64]) -> float:
 
 
 def _alike(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    """Whether two sets of points (n, 3) lie alike about their middles; frames do not matter."""
+    """Whether two sets of points (n, 3) are arranged alike about their middles, in any frames."""
     size = _aligned(other)
     return float(np.linalg.norm(_aligned(one) - size)) < _ALIKE * float(np.linalg.norm(size))
 

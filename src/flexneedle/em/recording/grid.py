@@ -46,20 +46,20 @@ class Rest(Section):
     """Table `rest`: when the stage counts as at rest, and for how long a point is tried."""
 
     drift_mm: Positive = 0.2
-    """The means of the first and the last third of a point's samples may be so far apart."""
+    """The means of the first and the last third of a point's samples may differ by this distance."""
     timeout_s: Positive = 30.0
     """Longest wait for the samples of a point."""
 
 
 class GridFile(Section):
-    """A grid as its file says it."""
+    """A grid as in its file."""
 
     environment: Title
     """Goes into the column `environment`."""
     samples: int = count(100, least=2, most=_MOST)
     """Of each sensor at each point, in each repeat."""
     repeats: int = count(5, least=1, most=_MOST)
-    """How often the whole grid is gone through."""
+    """Number of visits of the whole grid."""
     sensors: dict[str, Title] = Field(default_factory=lambda: {TIP: TIP})
     """Sensors on the stage: the tracker's name, and the name in the column `sensor` (tip, reference)."""
     grid: Lattice | None = None
@@ -84,12 +84,12 @@ class GridFile(Section):
 
 
 def _shared_names(sensors: dict[str, str]) -> list[Problem]:
-    """Two sensors of one name in the table would be taken for one."""
-    first = {told: name for name, told in reversed(sensors.items())}
+    """Two sensors of one name in the table could not be distinguished."""
+    first = {own: name for name, own in reversed(sensors.items())}
     return [
-        Problem(f"sensors.{name}", told, f"is the name of {first[told]} already: give each sensor its own")
-        for name, told in sensors.items()
-        if first[told] != name
+        Problem(f"sensors.{name}", own, f"is the name of {first[own]}, too: give each sensor its own")
+        for name, own in sensors.items()
+        if first[own] != name
     ]
 
 
@@ -104,7 +104,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid to go through. sensors: name in the table by name in the tracker's frames."""
+    """A grid to visit. sensors: name in the table by name in the tracker's frames."""
 
     file: GridFile
     points: tuple[Point, ...]
@@ -117,7 +117,7 @@ class Grid:
 
 
 def grid_names() -> list[str]:
-    """Return the names of the grids that come with the package."""
+    """Return the names of the shipped grids."""
     return sorted(e.name.removesuffix(_SUFFIX) for e in _SHIPPED.iterdir() if e.name.endswith(_SUFFIX))
 
 
@@ -128,7 +128,7 @@ def read_grid(source: str) -> Grid:
         text = (_SHIPPED / f"{source}{_SUFFIX}" if shipped else Path(source)).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "no text"
-        raise InputError(f"{source}: {reason}; grids that come along: {', '.join(grid_names())}") from None
+        raise InputError(f"{source}: {reason}; shipped grids: {', '.join(grid_names())}") from None
     try:
         file = GridFile.model_validate(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:

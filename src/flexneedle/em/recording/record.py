@@ -1,4 +1,4 @@
-"""Recording a tracker on a grid: point by point onto the disk, and on from there after any interruption."""
+"""Recording a tracker on a grid: point by point onto the disk, continued there after any interruption."""
 
 import csv
 import fcntl
@@ -19,31 +19,31 @@ from flexneedle.em.recording.steps import Visit, disagreement
 from flexneedle.errors import InputError, RunError
 from flexneedle.rig.ports import Clock, Tracker
 from flexneedle.rig.tracking.table import COLUMNS
-from flexneedle.trace.files import uninterrupted
-from flexneedle.types import VISIBLE, Frame, Point, SensorReading
+from flexneedle.trace.shield import uninterrupted
+from flexneedle.types import VISIBLE, Frame, Point, Reading
 
 EXTRA = ("time_s", "frame_number", "repeat")
-"""Columns beside those of a table of measurements. Times go on over interruptions."""
+"""Columns beside those of a table of measurements. Times continue over interruptions."""
 _HEADER = (*COLUMNS, *EXTRA)
 _FIRST_LINE = ",".join(_HEADER).encode() + b"\n"
 _PAUSE_S = 0.01
-_SILENT_S = 1.0  # so long without a frame, or a good one, and it is said
+_SILENT_S = 1.0  # without a frame, or a good one, until it is reported
 
 
 def _refuse(doubt: str) -> bool:
-    raise RunError(f"{doubt} (--force records all the same)")
+    raise RunError(f"{doubt} (use --force to record it)")
 
 
 @dataclass(frozen=True)
 class Guide:
-    """Who moves the stage. ask: to move it to a stop, returns when it is there; say: tells how it goes.
+    """Who moves the stage. ask: moves it to a stop, returns when it is there; report: prints a line.
 
-    insists: whether a point that failed is asked for again, or ends the recording. keeps: told that a sensor moved
-    otherwise than the stage; returns whether the point is kept, or measured again, or raises RunError.
+    insists: whether a point that failed is asked for again, or ends the recording. keeps: of a sensor that did not move
+    as the stage did, returns whether the point is kept, or measured again, or raises RunError.
     """
 
     ask: Callable[[Stop], None]
-    say: Callable[[str], None]
+    report: Callable[[str], None]
     insists: bool = True
     keeps: Callable[[str], bool] = _refuse
 
@@ -76,7 +76,7 @@ def open_session(path: Path, grid: Grid) -> Iterator[Session]:
     """Open a table, new or begun, with the stops that are left.
 
     Rows of a stop that are not all there are dropped with the first that are added (at once if no stop is left): it
-    is measured again. Until then the table stays as it was, and a new one without rows is taken away in the end.
+    is measured again. Until then the table stays as it was, and a new one without rows is removed in the end.
     Raises InputError if the table is another grid's, is damaged, or is being written.
     """
     if path.suffix == ".parquet":
@@ -102,11 +102,11 @@ def open_session(path: Path, grid: Grid) -> Iterator[Session]:
 def record(session: Session, tracker: Tracker, clock: Clock, grid: Grid, guide: Guide) -> int:
     """Measure the stops that are left and return their number.
 
-    Raises InputError if the tracker lacks a sensor of the grid, RunError if it tells nothing, or if a point cannot be
+    Raises InputError if the tracker lacks a sensor of the grid, RunError if it reports nothing, or if a point cannot be
     measured and the guide does not insist.
     """
     if session.left:
-        _check_sensors(tracker, clock, grid, guide.say)
+        _check_sensors(tracker, clock, grid, guide.report)
     start, before = session.last_time, session.last
     for stop in session.left:
         frames, before = _measure(tracker, clock, grid, guide, stop, before)
@@ -114,9 +114,9 @@ def record(session: Session, tracker: Tracker, clock: Clock, grid: Grid, guide: 
     return len(session.left)
 
 
-def _check_sensors(tracker: Tracker, clock: Clock, grid: Grid, say: Callable[[str], None]) -> None:
-    """Before the stage is moved for nothing: look for the grid's sensors in the first frame."""
-    frames = next(filter(None, _arriving(tracker, clock, grid.file.rest.timeout_s, say)), ())
+def _check_sensors(tracker: Tracker, clock: Clock, grid: Grid, report: Callable[[str], None]) -> None:
+    """Before the stage is moved: check that the first frame has the grid's sensors."""
+    frames = next(filter(None, _arriving(tracker, clock, grid.file.rest.timeout_s, report)), ())
     if not frames:
         raise RunError(f"no frames within {grid.file.rest.timeout_s:g} s: {tracker.status}")
     there = frames[-1].readings
@@ -126,19 +126,19 @@ def _check_sensors(tracker: Tracker, clock: Clock, grid: Grid, say: Callable[[st
 
 
 def _arriving(
-    tracker: Tracker, clock: Clock, seconds: float, say: Callable[[str], None]
+    tracker: Tracker, clock: Clock, seconds: float, report: Callable[[str], None]
 ) -> Iterator[tuple[Frame, ...]]:
-    """Give what the tracker tells, again and again for so long; say when nothing comes, and when it does again."""
-    began = heard = clock.now()
+    """Yield new frames for a number of seconds; report when none arrive, and when they do again."""
+    began = last = clock.now()
     while (now := clock.now()) - began <= seconds:
         frames = tracker.read()
-        if frames and heard == inf:
-            say("frames come again")
+        if frames and last == inf:
+            report("frames arrive again")
         if frames:
-            heard = now
-        elif now - heard > _SILENT_S:
-            say(f"no frames: {tracker.status}")
-            heard = inf  # it is said
+            last = now
+        elif now - last > _SILENT_S:
+            report(f"no frames: {tracker.status}")
+            last = inf  # reported
         yield frames
         clock.wait(_PAUSE_S)
 
@@ -149,7 +149,7 @@ def _measure(
     guide.ask(stop)
     while True:
         clock.wait(grid.file.settle_s)
-        frames, complaint = _samples(tracker, clock, grid, guide.say)
+        frames, complaint = _samples(tracker, clock, grid, guide.report)
         if not complaint:
             visit = _visit(grid, stop, frames)
             doubt = "" if before is None else disagreement(before, visit)
@@ -158,31 +158,31 @@ def _measure(
             continue
         if not guide.insists:
             raise RunError(f"point {stop.point_id}, repeat {stop.repeat}: {complaint}")
-        guide.say(f"{complaint}; once more")
+        guide.report(f"{complaint}; measured again")
         guide.ask(stop)
 
 
 def _samples(
-    tracker: Tracker, clock: Clock, grid: Grid, say: Callable[[str], None]
+    tracker: Tracker, clock: Clock, grid: Grid, report: Callable[[str], None]
 ) -> tuple[list[Frame], str]:
-    """Return the frames of a point at rest, taken from now on, or what is wrong; say what is waited for.
+    """Return the frames of a point at rest, taken from now on, or what is wrong; report what is waited for.
 
-    While the stage drifts the oldest frames are let go for new ones.
+    While the stage drifts the oldest frames are dropped for new ones.
     """
     began, wanted, sensors = clock.now(), grid.file.samples, tuple(grid.file.sensors)
     good: list[Frame] = []
-    complaint, said, well = "no frames", "", began
-    for frames in _arriving(tracker, clock, grid.file.rest.timeout_s, say):
+    complaint, reported, good_at = "no frames", "", began
+    for frames in _arriving(tracker, clock, grid.file.rest.timeout_s, report):
         for frame in frames:
             if frame.time < began:
                 continue
-            ill = _ill(frame, sensors)
-            complaint, well = ill or complaint, well if ill else frame.time
-            if ill != said and frame.time - well > _SILENT_S:
-                say(f"waiting: {ill}")
-                said = ill
-            good = good if ill else [*good, frame][-wanted:]
-            if not ill and len(good) == wanted:
+            fault = _faults(frame, sensors)
+            complaint, good_at = fault or complaint, good_at if fault else frame.time
+            if fault != reported and frame.time - good_at > _SILENT_S:
+                report(f"waiting: {fault}")
+                reported = fault
+            good = good if fault else [*good, frame][-wanted:]
+            if not fault and len(good) == wanted:
                 complaint = _drifting(good, sensors, grid.file.rest.drift_mm)
                 if not complaint:
                     return good, ""
@@ -190,8 +190,8 @@ def _samples(
     return [], f"no {wanted} good samples within {grid.file.rest.timeout_s:g} s: {complaint}"
 
 
-def _ill(frame: Frame, sensors: Sequence[str]) -> str:
-    absent = SensorReading(None, status="no such sensor")
+def _faults(frame: Frame, sensors: Sequence[str]) -> str:
+    absent = Reading(None, status="no such sensor")
     found = {name: frame.readings.get(name, absent) for name in sensors}
     return "; ".join(
         f"{name}: {reading.status}" for name, reading in found.items() if reading.position is None
@@ -214,7 +214,7 @@ def _places(frames: Sequence[Frame], name: str) -> NDArray[np.float64]:
 
 
 def _visit(grid: Grid, stop: Stop, frames: Sequence[Frame]) -> Visit:
-    return Visit(stop, {told: _mean(_places(frames, name)) for name, told in grid.file.sensors.items()})
+    return Visit(stop, {sensor: _mean(_places(frames, name)) for name, sensor in grid.file.sensors.items()})
 
 
 def _mean(places: NDArray[np.float64]) -> Point:
@@ -224,22 +224,22 @@ def _mean(places: NDArray[np.float64]) -> Point:
 
 def _rows(grid: Grid, stop: Stop, frame: Frame, start: float) -> list[dict[str, Any]]:
     return [
-        _row(stop, frame.readings[name], told, grid.file.environment)
+        _row(stop, frame.readings[name], sensor, grid.file.environment)
         | {"time_s": start + frame.time, "frame_number": frame.number, "repeat": stop.repeat}
-        for name, told in grid.file.sensors.items()
+        for name, sensor in grid.file.sensors.items()
     ]
 
 
-def _row(stop: Stop, reading: SensorReading, sensor: str, environment: str) -> dict[str, Any]:
+def _row(stop: Stop, reading: Reading, sensor: str, environment: str) -> dict[str, Any]:
     if reading.position is None:
         raise RunError(f"{sensor}: no position")
-    turn = reading.orientation or (None,) * 4
+    quaternion = reading.orientation or (None,) * 4
     return (
         {"point_id": stop.point_id, "sensor": sensor, "environment": environment}
         | dict(zip(("true_x_mm", "true_y_mm", "true_z_mm"), stop.place, strict=True))
         | dict(zip(("x_mm", "y_mm", "z_mm"), reading.position, strict=True))
-        | dict(zip(("qw", "qx", "qy", "qz"), turn, strict=True))
-        # The field generator stands at the origin of an Aurora's frame.
+        | dict(zip(("qw", "qx", "qy", "qz"), quaternion, strict=True))
+        # The field generator is at the origin of an Aurora's frame.
         | {"indicator": reading.indicator, "distance_mm": hypot(*reading.position)}
     )
 
@@ -250,7 +250,7 @@ def _text(rows: Sequence[Mapping[str, Any]]) -> bytes:
     return text.getvalue().encode()
 
 
-# Going on where a table ends
+# Continuing a table
 
 
 def _resumed(path: Path, file: BinaryIO, grid: Grid) -> Session:
@@ -259,10 +259,10 @@ def _resumed(path: Path, file: BinaryIO, grid: Grid) -> Session:
     stops = list(grid.stops())
     if not data.startswith(_FIRST_LINE):
         if not _FIRST_LINE.startswith(data):
-            raise InputError(f"{path}: is no table of `em record`: give another file with --out")
+            raise InputError(f"{path}: is no table of `em record`: name another file with --out")
         return Session(file, 0, stops, 0, 0.0, None)  # new, or cut in its first line
     lines = data[len(_FIRST_LINE) :].splitlines(keepends=True)
-    whole = lines if not lines or lines[-1].endswith(b"\n") else lines[:-1]  # the last one may be torn
+    whole = lines if not lines or lines[-1].endswith(b"\n") else lines[:-1]  # the last one may be cut
     size = grid.file.samples * len(grid.file.sensors)
     done = len(whole) // size
     _check_rows(path, whole, stops, grid)
@@ -289,7 +289,7 @@ def _check_rows(path: Path, lines: Sequence[bytes], stops: Sequence[Stop], grid:
     for number, line in enumerate(lines):
         stop = stops[number // size] if number // size < len(stops) else None
         if not _belongs(line, stop, grid):
-            raise InputError(f"{path}: line {number + 2}: is not of this grid: give another file with --out")
+            raise InputError(f"{path}: line {number + 2}: is not of this grid: name another file with --out")
 
 
 def _belongs(line: bytes, stop: Stop | None, grid: Grid) -> bool:

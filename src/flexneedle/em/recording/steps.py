@@ -1,4 +1,4 @@
-"""Whether the sensors on a stage moved as far as the stage did: no common frame is needed to see that they did not."""
+"""Whether the sensors on a stage moved as far as the stage did, which needs no common frame."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from flexneedle.em.recording.grid import Stop
 from flexneedle.types import Point
 
 _LEAST_MM, _SHARE = 5.0, 0.2
-"""Distances may differ by so much, or by this share of the stage's; twice the worst error of a tracker that works."""
+"""Distances may differ by 5 mm, or by this share of the stage's: twice the worst error of a working tracker."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Visit:
 
 
 def disagreement(before: Visit, after: Visit) -> str:
-    """Return which sensor went another distance than the stage between two stops; "" if none did."""
+    """Return which sensor did not move as far as the stage between two stops; "" if none did."""
     stage = dist(before.stop.place, after.stop.place)
     limit = max(_LEAST_MM, _SHARE * stage)
     for name, place in after.means.items():

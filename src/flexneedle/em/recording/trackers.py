@@ -14,18 +14,18 @@ from flexneedle.rig.ports import Clock, Tracker
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.trace.folder import TRACE_FILE
 from flexneedle.trace.reader import read_trace
-from flexneedle.types import Frame, Measurement, SensorReading
+from flexneedle.types import Frame, Reading, Sample
 
 FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE[@SPEED] (a recording, or the folder of a run)"
-"""How trackers are written."""
+"""Forms of a tracker on the command line."""
 
 
 def open_tracker(spec: str, clock: Clock) -> AbstractContextManager[Tracker]:
-    """Return the tracker that `spec` names, at work; leaving the context puts it to rest.
+    """Return the tracker that `spec` names, started; leaving the context stops it.
 
     `aurora:/dev/ttyUSB0` has the sensors tip, ref1, ref2, ref3 at the ports 1 to 4; `aurora:/dev/ttyUSB0=ref1,tip`
-    names those of ports 1 and 2. `replay:FILE` plays a recording, or what a run in a
-    folder was told; how fast is the clock's matter (`clock_for`).
+    names those of ports 1 and 2. `replay:FILE` plays a recording, or the readings of a run in a
+    folder; its speed is the clock's (`clock_for`).
     Raises InputError for anything else, RunError if no tracker answers.
     """
     kind, _, rest = spec.partition(":")
@@ -61,35 +61,33 @@ def _file_and_speed(rest: str) -> tuple[str, float]:
     is none."""
     if "@" not in rest or Path(rest).exists():
         return rest, 1.0
-    file, _, told = rest.rpartition("@")
+    file, _, text = rest.rpartition("@")
     try:
-        speed = float(told)
+        speed = float(text)
     except ValueError:
-        raise InputError(f"tracker replay:{rest}: {told} is no speed, and there is no file {rest}") from None
+        raise InputError(f"tracker replay:{rest}: {text} is no speed, and there is no file {rest}") from None
     if not (isfinite(speed) and speed > 0.0):
         raise InputError(f"tracker replay:{rest}: the speed must be above 0")
     return file, speed
 
 
 def frames_of_run(folder: Path) -> tuple[Frame, ...]:
-    """Return what the tracker told in a recorded insertion, in its own frame; each frame once.
+    """Return the tracker's readings of a recorded insertion, in its own frame; each frame once.
 
-    A tracker that told of the tip alone gives frames of the tip, in the frame of the stage, with z = 0 where it told
-    none. Raises InputError if there is no trace of readings.
+    A tracker of the tip alone gives frames of the tip, in the frame of the stage, with z = 0 where it has none. Raises
+    InputError if there is no trace of readings.
     """
     periods = read_trace(folder / TRACE_FILE).periods
-    told = [judged.sample for period in periods for judged in period.readings]
-    frames = {frame.number: frame for frame in (_frame(n, sample) for n, sample in enumerate(told))}
+    samples = [judged.sample for period in periods for judged in period.readings]
+    frames = {frame.number: frame for frame in (_frame(n, sample) for n, sample in enumerate(samples))}
     if not frames:
         raise InputError(f"{folder}: the run has no readings of a tracker")
     return tuple(frames.values())
 
 
-def _frame(number: int, sample: Measurement) -> Frame:
+def _frame(number: int, sample: Sample) -> Frame:
     if sample.frame is not None:
         return sample.frame
-    seen = sample.x is not None and sample.y is not None
+    known = sample.x is not None and sample.y is not None
     place = (sample.x or 0.0, sample.y or 0.0, sample.z or 0.0)
-    return Frame(
-        sample.time, number, {TIP: SensorReading(place) if seen else SensorReading(None, status="missing")}
-    )
+    return Frame(sample.time, number, {TIP: Reading(place) if known else Reading(None, status="missing")})

@@ -13,12 +13,12 @@ from flexneedle.rig.devices.recording import COLUMNS, rows_of
 from flexneedle.rig.devices.replay import ENDED
 from flexneedle.rig.monitor.watch import field_verdict, is_distorted
 from flexneedle.rig.ports import Clock, Tracker
-from flexneedle.scenario.sections.monitor import MonitorSettings
+from flexneedle.scenario.sections.monitor import Monitor
 from flexneedle.types import VISIBLE, Frame, is_reference
 
 Judge = Callable[[Sequence[Frame], bool], tuple[str, bool]]
-"""Says of the frames of the last seconds, oldest first, whether they are to be trusted: "ok" or why not. It is told
-whether the field was distorted so far, and says whether it is now."""
+"""From the frames of the last seconds, oldest first, and whether the field was distorted before, to the verdict
+("ok" or the reason) and whether the field is distorted now."""
 
 _PAUSE_S = 0.01
 _HISTORY = 400  # frames: 10 s
@@ -43,9 +43,9 @@ def watch(
     judge: Judge | None = None,
     record: Path | None = None,
 ) -> int:
-    """Show each new frame, and the state now and then where none comes, for so long or until a replay ends.
+    """Show each new frame, and the state every half second where none arrives, for `seconds` or until a replay ends.
 
-    judge: `field_judge()`, if left out. record: a CSV of all frames, which must not be there yet. Returns the number
+    judge: `field_judge()`, if left out. record: a CSV of all frames, which must not exist yet. Returns the number
     of frames. Raises InputError if the file cannot be written.
     """
     chosen = judge if judge is not None else field_judge()
@@ -77,23 +77,21 @@ def _without_new(now: float, history: Sequence[Frame], status: str) -> View:
     return View(now, last, False, status, "no new frames" if status == VISIBLE else status)
 
 
-def judge_field(
-    frames: Sequence[Frame], settings: MonitorSettings, distorted: bool = False
-) -> tuple[str, bool]:
+def judge_field(frames: Sequence[Frame], settings: Monitor, distorted: bool = False) -> tuple[str, bool]:
     """Return the first thing that is wrong: sensors without a position, then the field by the monitor's rules.
 
     And whether the field is distorted: as the monitor holds an insertion, until the field is known to be good again.
-    distorted: whether it was so far.
+    distorted: whether it was before.
     """
     field = field_verdict(frames, settings, distorted)
-    ill = "; ".join(f"{name}: {r.status}" for name, r in frames[-1].readings.items() if r.status != VISIBLE)
-    return ill or str(field), is_distorted(field, distorted)
+    fault = "; ".join(f"{name}: {r.status}" for name, r in frames[-1].readings.items() if r.status != VISIBLE)
+    return fault or field, is_distorted(field, distorted)
 
 
 def field_judge(references: int | None = None) -> Judge:
-    """Return `judge_field` by the default monitor with so many references; without a number, with those that the
-    tracker has: one at least, and no more than an insertion asks for."""
-    default = MonitorSettings()
+    """Return `judge_field` by the default monitor with this number of references; without a number, with those that the
+    tracker has: one at least, and no more than an insertion needs."""
+    default = Monitor()
 
     def judge(frames: Sequence[Frame], distorted: bool) -> tuple[str, bool]:
         there = sum(map(is_reference, frames[-1].readings))

@@ -1,4 +1,4 @@
-"""What a table comes to: for each sensor and environment, the moments of the samples at each grid point."""
+"""A table by grid points: for each sensor and environment, the moments of the samples at each grid point."""
 
 from dataclasses import dataclass, replace
 from typing import Any
