@@ -267,6 +267,9 @@ def test_a_csv_file_cut_in_a_field_before_the_last_is_refused(tmp_path, rows):
 
 
 def test_of_many_broken_rows_the_first_is_named(tmp_path, rows):
+    some = [dict(row) for row in rows]
+    some[4]["z_mm"], some[8]["true_x_mm"] = "?", "!"
+    assert "row 5: z_mm: '?' is no number" in refusal(write_csv(tmp_path / "t.csv", some))
     many = [dict(row) for row in rows * 400]
     for row in many[20_000:]:
         row["y_mm"] = "?"

@@ -34,3 +34,22 @@ def test_any_mean_orientation_and_any_small_scatter_are_measured(tmp_path):
     assert found["axis_jitter_deg"] == pytest.approx(np.degrees(np.sqrt(np.mean(np.square(axis)))), rel=1e-4)
     worst = int(found["worst_at"])
     assert worst == np.argmax([np.mean(np.square(own)) for own in whole])
+
+
+def test_quaternions_that_are_rounded_to_a_percent_are_scaled_to_length_1(tmp_path):
+    rng = np.random.default_rng(2)
+    turns = [Rotation.from_rotvec(rng.normal(0.0, 0.003, (20, 3))) for _ in GRID]
+    path = table(tmp_path / "t.csv", turns)
+    before = evaluate(path, Options()).values()["results"][0]["orientation"]
+    header, *lines = path.read_text().splitlines()
+    names = header.split(",")
+    scaled = []
+    for k, line in enumerate(lines):
+        fields = line.split(",")
+        for name in ("qw", "qx", "qy", "qz"):
+            fields[names.index(name)] = repr(float(fields[names.index(name)]) * (1.004, 0.996)[k % 2])
+        scaled.append(",".join(fields))
+    path.write_text("\n".join([header, *scaled]) + "\n")
+    after = evaluate(path, Options()).values()["results"][0]["orientation"]
+    assert after["jitter_deg"] == pytest.approx(before["jitter_deg"], rel=1e-9)
+    assert after["axis_jitter_deg"] == pytest.approx(before["axis_jitter_deg"], rel=1e-9)

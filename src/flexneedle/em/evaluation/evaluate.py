@@ -10,9 +10,15 @@ from flexneedle.em.evaluation.accuracy import Accuracy, Registration, accuracy, 
 from flexneedle.em.evaluation.distance import Distances, distances
 from flexneedle.em.evaluation.indicator import Summary, summary
 from flexneedle.em.evaluation.notes import notes
-from flexneedle.em.evaluation.orientation import Orientation, orientation
 from flexneedle.em.evaluation.points import POINTS_FILE, points_text
-from flexneedle.em.evaluation.repeatability import Repeatability, Spacing, repeatability, spacing
+from flexneedle.em.evaluation.repeatability import (
+    Orientation,
+    Repeatability,
+    Spacing,
+    orientation,
+    repeatability,
+    spacing,
+)
 from flexneedle.em.evaluation.separation import Separation, separation
 from flexneedle.em.evaluation.units import refuse_metres
 from flexneedle.em.table.columns import column_map
