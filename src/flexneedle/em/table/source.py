@@ -3,6 +3,8 @@
 The first bytes decide which of the two a file is, not its name. No row is kept: each query reads the file again.
 """
 
+import os
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -26,7 +28,7 @@ MILLIMETRES_IN = {"mm": 1.0, "m": 1000.0}
 
 _LENGTHS = tuple(name for name in COLUMNS if name.endswith("_mm"))
 _MAGIC = b"PAR1"
-_MEMORY = "600MB"
+_MOST_THREADS = 4  # each holds 32 MB of a CSV
 _NULLS = [
     "",
     " ",
@@ -89,7 +91,7 @@ def open_table(
     except ImportError:
         raise InputError("tables of measurements need duckdb: pip install 'flexneedle[em]'") from None
     try:
-        with connect(config={"memory_limit": _MEMORY}) as connection:
+        with connect(config=_settings()) as connection:
             yield _table(connection, path, theirs, tuple(required), tuple(optional), names or {}, unit)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
@@ -97,6 +99,11 @@ def open_table(
         raise InputError(f"{path}: cannot be read: {str(error).splitlines()[0]}") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def _settings() -> dict[str, str]:
+    threads = min(os.cpu_count() or 1, _MOST_THREADS)
+    return {"threads": str(threads), "temp_directory": tempfile.gettempdir()}
 
 
 def _table(
