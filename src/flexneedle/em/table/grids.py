@@ -1,7 +1,8 @@
 """From the rows of a table to its grids: two aggregations by DuckDB, each in one pass over the file.
 
 Lengths are counted in whole steps of 2⁻⁴⁰ mm, whose sums in 128 bits are exact: order of rows and number of threads
-change no digit, and nothing cancels far from the origin. The sums of squares hold 10⁶ samples of a grid point at 10 m.
+change no digit, and nothing cancels far from the origin. The sums of squares
+hold 10⁶ samples of a grid point at 10 m.
 """
 
 from itertools import combinations_with_replacement

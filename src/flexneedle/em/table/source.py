@@ -101,7 +101,7 @@ def open_table(
         raise InputError(f"{path}: {error}") from None
 
 
-def _settings() -> dict[str, str]:
+def _settings() -> dict[str, str | bool | int | float | list[str]]:
     threads = min(os.cpu_count() or 1, _MOST_THREADS)
     return {"threads": str(threads), "temp_directory": tempfile.gettempdir()}
 
