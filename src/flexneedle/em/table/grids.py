@@ -1,8 +1,8 @@
 """From the rows of a table to its grids: two aggregations by DuckDB, each in one pass over the file.
 
 Lengths are counted in whole steps of 2⁻⁴⁰ mm, whose sums in 128 bits are exact: order of rows and number of threads
-change no digit, and nothing cancels far from the origin. The sums of squares
-hold 10⁶ samples of a grid point at 10 m.
+change no digit, and nothing cancels far from the origin. The sums of squares hold
+10⁶ samples of a grid point 10 m away.
 """
 
 from itertools import combinations_with_replacement
@@ -114,8 +114,10 @@ def _cells_query(table: Table, rules: tuple[Rule, ...]) -> str:
                 count(indicator) AS n_indicator, count(norm) AS n_turns, count(rule) AS n_broken
             FROM checked GROUP BY GROUPING SETS ({sets})
         )
-        SELECT *, {_MOMENTS} FROM sums ORDER BY pooled, bin, CASE
-            WHEN bool_and(regexp_full_match(point_id, '-?[0-9]+')) OVER () THEN try_cast(point_id AS HUGEINT) END, point_id
+        SELECT *, {_MOMENTS} FROM sums
+        ORDER BY pooled, bin,
+            CASE WHEN bool_and(regexp_full_match(point_id, '-?[0-9]+')) OVER () THEN try_cast(point_id AS HUGEINT) END,
+            point_id
     """
 
 
