@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
 from flexneedle.rig.tracking.field.room import REFERENCES, Room, grid
-from flexneedle.rig.tracking.field.sensors import Noiseless, Readings, noiseless, noisy
+from flexneedle.rig.tracking.field.sensors import Noiseless, SensorReadings, noiseless, noisy
 from flexneedle.rig.tracking.quaternion import along, z_axis
 from flexneedle.rig.tracking.table import COLUMNS, REFERENCE, TIP
 from flexneedle.scenario.sections.environment import Environment
@@ -110,7 +110,7 @@ def _measured(environment: Environment, sensor: str, experiment: Experiment) -> 
     return pa.table({name: pa.array(columns[name]) for name in COLUMNS}, _SCHEMA)
 
 
-def _reported(readings: Readings, missing: NDArray[np.bool_], is_tip: bool) -> dict[str, pa.Array]:
+def _reported(readings: SensorReadings, missing: NDArray[np.bool_], is_tip: bool) -> dict[str, pa.Array]:
     """What the tracker reports in each sample, null in missing ones."""
     # The roll of one coil is not known.
     turns = along(z_axis(readings.turns)) if is_tip else readings.turns

@@ -2,7 +2,7 @@
 
 import pytest
 
-from flexneedle.em.recording.grid import Stop, grid_names, read_grid
+from flexneedle.em.recording.grid import GRIDS, Stop, read_grid
 from flexneedle.errors import InputError
 
 LATTICE = """\
@@ -42,7 +42,7 @@ def test_points_can_be_listed(read):
 
 
 def test_the_shipped_example_is_the_papers_grid():
-    assert grid_names() == ["cube"]
+    assert GRIDS.names() == ["cube"]
     grid = read_grid("cube")
     assert len(grid.points) == 125
     assert (grid.points[0], grid.points[-1]) == ((0, 0, 0), (100, 100, 100))
@@ -56,7 +56,7 @@ def test_the_shipped_example_is_the_papers_grid():
         ('environment = "x"', "give either the table grid or the list points_mm"),
         (LATTICE + "[rest]\ndrift = 1.0", "rest.drift = 1.0: unknown key; did you mean drift_mm"),
         (LATTICE.replace("[1, 2, 2]", "[0, 2, 2]"), "must be at least 1 each"),
-        (LATTICE.replace("[1, 2, 2]", "[1, 2, 2"), "no TOML"),
+        (LATTICE.replace("[1, 2, 2]", "[1, 2, 2"), "not TOML"),
         (LATTICE.replace("10.0", "-10.0"), "must be above 0"),
         (LATTICE.replace("[grid]", "[sensors]\n[grid]"), "must name at least one sensor"),
         (
@@ -77,5 +77,5 @@ def test_what_is_wrong_with_a_file_is_said_by_key_and_rule(read, text, says):
 
 
 def test_a_file_that_is_not_there_is_named_with_the_shipped_ones():
-    with pytest.raises(InputError, match=r"nothing\.toml: No such file.*; shipped grids: cube"):
+    with pytest.raises(InputError, match=r"nothing\.toml: no such file, and no such grid \(choices: cube\)"):
         read_grid("nothing.toml")

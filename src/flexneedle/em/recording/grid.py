@@ -1,23 +1,20 @@
 """The grid that a tracker is measured on: a TOML file, every problem in one line."""
 
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.resources import files
 from itertools import product
-from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from flexneedle.errors import InputError
 from flexneedle.rig.tracking.table import TIP
-from flexneedle.scenario.problems import Problem, describe, refuse
+from flexneedle.scenario.library import Library
+from flexneedle.scenario.problems import Problem, refuse
 from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, Title, count
 from flexneedle.types import Point
 
-_SHIPPED = files(__package__) / "grids"
-_SUFFIX = ".toml"
+GRIDS = Library("a grid file", "grid", files(__package__) / "grids")
 _MOST = 100_000
 
 _Vector = Annotated[tuple[float, float, float], Field(strict=False)]
@@ -116,25 +113,9 @@ class Grid:
                 yield Stop(repeat, number, place)
 
 
-def grid_names() -> list[str]:
-    """Return the names of the shipped grids."""
-    return sorted(e.name.removesuffix(_SUFFIX) for e in _SHIPPED.iterdir() if e.name.endswith(_SUFFIX))
-
-
 def read_grid(source: str) -> Grid:
-    """Return the grid of a shipped name or of a TOML file. Raises InputError: file, key, value, rule."""
-    try:
-        shipped = source in grid_names()
-        text = (_SHIPPED / f"{source}{_SUFFIX}" if shipped else Path(source)).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "no text"
-        raise InputError(f"{source}: {reason}; shipped grids: {', '.join(grid_names())}") from None
-    try:
-        file = GridFile.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{source}: no TOML: {error}") from None
-    except ValidationError as error:
-        raise InputError("\n".join(f"{source}: {line}" for line in describe(error, GridFile))) from None
+    """Return the grid of a shipped name or of a TOML file. Raises FileError: file, key, value, rule."""
+    file = GRIDS.load(source, GridFile)
     return Grid(file, file.points_mm or _lattice_points(file.grid or Lattice()))
 
 

@@ -19,8 +19,8 @@ from flexneedle.em.recording.steps import Visit, disagreement
 from flexneedle.errors import InputError, RunError
 from flexneedle.rig.ports import Clock, Tracker
 from flexneedle.rig.tracking.table import COLUMNS
-from flexneedle.trace.shield import uninterrupted
-from flexneedle.types import VISIBLE, Frame, Point, Reading
+from flexneedle.trace.files import uninterrupted
+from flexneedle.types import VISIBLE, Frame, Point, SensorReading
 
 EXTRA = ("time_s", "frame_number", "repeat")
 """Columns beside those of a table of measurements. Times continue over interruptions."""
@@ -191,7 +191,7 @@ def _samples(
 
 
 def _faults(frame: Frame, sensors: Sequence[str]) -> str:
-    absent = Reading(None, status="no such sensor")
+    absent = SensorReading(None, status="no such sensor")
     found = {name: frame.readings.get(name, absent) for name in sensors}
     return "; ".join(
         f"{name}: {reading.status}" for name, reading in found.items() if reading.position is None
@@ -230,7 +230,7 @@ def _rows(grid: Grid, stop: Stop, frame: Frame, start: float) -> list[dict[str, 
     ]
 
 
-def _row(stop: Stop, reading: Reading, sensor: str, environment: str) -> dict[str, Any]:
+def _row(stop: Stop, reading: SensorReading, sensor: str, environment: str) -> dict[str, Any]:
     if reading.position is None:
         raise RunError(f"{sensor}: no position")
     quaternion = reading.orientation or (None,) * 4

@@ -14,7 +14,7 @@ from flexneedle.rig.ports import Clock, Tracker
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.trace.folder import TRACE_FILE
 from flexneedle.trace.reader import read_trace
-from flexneedle.types import Frame, Reading, Sample
+from flexneedle.types import Frame, Measurement, SensorReading
 
 FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE[@SPEED] (a recording, or the folder of a run)"
 """Forms of a tracker on the command line."""
@@ -85,9 +85,11 @@ def frames_of_run(folder: Path) -> tuple[Frame, ...]:
     return tuple(frames.values())
 
 
-def _frame(number: int, sample: Sample) -> Frame:
+def _frame(number: int, sample: Measurement) -> Frame:
     if sample.frame is not None:
         return sample.frame
     known = sample.x is not None and sample.y is not None
     place = (sample.x or 0.0, sample.y or 0.0, sample.z or 0.0)
-    return Frame(sample.time, number, {TIP: Reading(place) if known else Reading(None, status="missing")})
+    return Frame(
+        sample.time, number, {TIP: SensorReading(place) if known else SensorReading(None, status="missing")}
+    )

@@ -13,7 +13,7 @@ from flexneedle.rig.devices.recording import COLUMNS, rows_of
 from flexneedle.rig.devices.replay import ENDED
 from flexneedle.rig.monitor.watch import field_verdict, is_distorted
 from flexneedle.rig.ports import Clock, Tracker
-from flexneedle.scenario.sections.monitor import Monitor
+from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import VISIBLE, Frame, is_reference
 
 Judge = Callable[[Sequence[Frame], bool], tuple[str, bool]]
@@ -77,7 +77,9 @@ def _without_new(now: float, history: Sequence[Frame], status: str) -> View:
     return View(now, last, False, status, "no new frames" if status == VISIBLE else status)
 
 
-def judge_field(frames: Sequence[Frame], settings: Monitor, distorted: bool = False) -> tuple[str, bool]:
+def judge_field(
+    frames: Sequence[Frame], settings: MonitorSettings, distorted: bool = False
+) -> tuple[str, bool]:
     """Return the first thing that is wrong: sensors without a position, then the field by the monitor's rules.
 
     And whether the field is distorted: as the monitor holds an insertion, until the field is known to be good again.
@@ -85,13 +87,13 @@ def judge_field(frames: Sequence[Frame], settings: Monitor, distorted: bool = Fa
     """
     field = field_verdict(frames, settings, distorted)
     fault = "; ".join(f"{name}: {r.status}" for name, r in frames[-1].readings.items() if r.status != VISIBLE)
-    return fault or field, is_distorted(field, distorted)
+    return fault or str(field), is_distorted(field, distorted)
 
 
 def field_judge(references: int | None = None) -> Judge:
     """Return `judge_field` by the default monitor with this number of references; without a number, with those that the
     tracker has: one at least, and no more than an insertion needs."""
-    default = Monitor()
+    default = MonitorSettings()
 
     def judge(frames: Sequence[Frame], distorted: bool) -> tuple[str, bool]:
         there = sum(map(is_reference, frames[-1].readings))

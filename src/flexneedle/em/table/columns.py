@@ -1,12 +1,13 @@
 """Which column of a table is which: the names of flexneedle, or what others call them."""
 
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from flexneedle.errors import InputError
 from flexneedle.rig.tracking.table import COLUMNS
+from flexneedle.scenario.library import Library
 
+_MAPS = Library("a column map")
 _HINT = "--columns THEIRS=OURS"
 
 
@@ -70,12 +71,9 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def _from_file(path: Path) -> list[tuple[str, str]]:
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{_HINT}: {path}: neither a pair nor a file: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: no TOML: {error}") from None
+    if not path.is_file():
+        raise InputError(f"{_HINT}: {path}: neither a pair nor a file")
+    values = _MAPS.read(path)
     wrong = [their for their, our in values.items() if not isinstance(our, str)]
     if wrong:
         raise InputError(f'{path}: {wrong[0]}: must be a line such as {wrong[0]} = "x_mm"')

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
-from rooms import environment
 
 from flexneedle.rig.tracking.field.room import Room, grid
 from flexneedle.rig.tracking.field.sensors import LARGEST_INDICATOR, indicator, noiseless, noisy
 from flexneedle.rig.tracking.quaternion import along, z_axis
+from rooms import environment
 
 GRID = grid(100.0)
 UPRIGHT = np.tile([1.0, 0.0, 0.0, 0.0], (125, 1))
