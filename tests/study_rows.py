@@ -102,22 +102,22 @@ def columns_of(rows):
     return {key: [row.get(key) for row in rows] for key in dict.fromkeys(key for row in rows for key in row)}
 
 
-def write_study(folder, rows, about=None, timing=True):
-    """Write the folder of a study, and return it."""
+def asked(rows, **more):
+    """Return the study of `study.json` for rows of any controllers, cases and targets; `more`: such as its axes."""
+    targets = dict.fromkeys((row["target_depth_mm"], row["target_lateral_mm"]) for row in rows)
+    axes = {"controller": list(dict.fromkeys(row["controller"] for row in rows)), "target": list(targets)}
+    cases = {row["case"]: {} for row in rows if row["case"]}
+    study = {"name": "mine", "title": "Mine", "cases": cases, "axes": axes, "insertions": len(rows)}
+    return study | more | {"axes": axes | more.get("axes", {})}
+
+
+def write_study(folder, rows, about=None, timing=True, **more):
+    """Write the folder of a study, and return it. about: `study.json`; without it that of `asked(rows, **more)`."""
     folder.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.table(columns_of(rows)), folder / "runs.parquet")
     if timing:
-        times = [
-            {
-                "index": r["index"],
-                "plan": r["plan"],
-                "plan_s": 0.5,
-                "control_s": 0.4,
-                "plant_s": 0.2,
-                "total_s": 0.62,
-            }
-            for r in rows
-        ]
+        parts = {"plan_s": 0.5, "control_s": 0.4, "plant_s": 0.2, "total_s": 0.62}
+        times = [{"index": row["index"], "plan": row["plan"]} | parts for row in rows]
         pq.write_table(pa.Table.from_pylist(times), folder / "timing.parquet")
-    (folder / "study.json").write_text(json.dumps(about or {}))
+    (folder / "study.json").write_text(json.dumps(about or {"study": asked(rows, **more)}))
     return folder

@@ -13,7 +13,7 @@ from study_rows import OURS, make_rows, unfinished, write_study
 def study(tmp_path):
     rows = make_rows((OURS, "open-loop"), targets=((25.0, 0.0), (40.0, 5.0)), repeats=6)
     rows[2] = unfinished(rows[2], "refused", "plan misses the target")
-    return write_study(tmp_path / "study", rows, {"title": "Mine"})
+    return write_study(tmp_path / "study", rows)
 
 
 def run(capsys, *argv):
@@ -34,8 +34,10 @@ def test_json_has_all_statistics_at_full_precision(capsys, study, tmp_path):
     values = json.loads(out)
     assert status == 0
     assert list(values) == [
-        *("study", "report", "figures", "insertions", "planned", "finished", "statistics"),
+        *("study", "report", "figures", "insertions", "planned", "finished", "missing", "outcomes"),
         *(
+            "statistics",
+            "whole",
             "groups",
             "controllers",
             "controllers_by_depth",
@@ -50,8 +52,9 @@ def test_json_has_all_statistics_at_full_precision(capsys, study, tmp_path):
         "Mine",
         24,
         23,
-        None,
+        24,
     )
+    assert (values["missing"], values["outcomes"]) == (0, {"done": 23, "refused": 1})
     assert values["report"] == str(tmp_path / "here" / "report.html")
     assert all(Path(path).is_file() for path in values["figures"])
     mean = values["groups"][0]["estimates"]["mean_mm"]

@@ -14,7 +14,6 @@ import pytest
 
 from flexneedle.errors import InputError
 from flexneedle.scenario.files import load_scenario
-from flexneedle.study.report.findings import planned_insertions
 from flexneedle.study.report.report import write_report
 from study_rows import BASE, OURS, make_rows, unfinished, write_study
 
@@ -30,7 +29,7 @@ ABOUT = {
         "title": "My study",
         "cases": {},
         "axes": {"controller": list(BOTH), "target": [list(target) for target in TARGETS]},
-        "repeats": 4,
+        "insertions": 24,
     },
 }
 
@@ -154,7 +153,12 @@ def test_a_large_drawing_stands_in_the_page_as_png(drawn_on, rows, monkeypatch):
     ],
 )
 def test_figures_are_those_that_the_rows_support(drawn_on, options, expected):
-    assert names(drawn_on(make_rows(**{"targets": TARGETS, "repeats": 3} | options))[0]) == expected
+    rows = make_rows(**{"targets": TARGETS, "repeats": 3} | options)
+    report, _ = drawn_on(rows, axes=options.get("axes", {}))
+    assert [drawn.name for drawn in report.figures] == expected
+    assert sorted(path.name for path in report.page.parent.glob("*.png")) == sorted(
+        f"{n}.png" for n in expected
+    )
 
 
 def test_cases_of_one_controller_are_drawn_apart_everywhere(drawn_on):
@@ -174,7 +178,8 @@ def test_cases_of_one_controller_are_drawn_apart_everywhere(drawn_on):
 
 def test_what_has_no_panel_of_its_own_is_said_to_be_taken_together(drawn_on):
     axes = {"contact.spacing_mm": [0.5, 1.0], "needle.gauge": ["18G", "21G"]}
-    drawn = {one.name: one for one in drawn_on(make_rows(axes=axes, targets=TARGETS, repeats=3))[0].figures}
+    rows = make_rows(axes=axes, targets=TARGETS, repeats=3)
+    drawn = {one.name: one for one in drawn_on(rows, axes=axes)[0].figures}
     for name in ("errors-by-depth", "energy"):
         assert "contact.spacing_mm" not in drawn[name].caption
         assert "all levels of needle gauge together" in drawn[name].caption
@@ -183,7 +188,7 @@ def test_what_has_no_panel_of_its_own_is_said_to_be_taken_together(drawn_on):
 def test_a_study_of_which_nothing_finished_is_reported(drawn_on, rows):
     report, page = drawn_on([unfinished(row, "refused", "plan misses") for row in rows])
     assert names(report) == []
-    assert "24 insertions, 0 finished; 24 did not" in page.text
+    assert "finished 0 of 24 refused 24 of 24 within 1 mm of the target 0 of 24" in page.text
     assert "24 of 24 insertions did not finish." in page.text
 
 
@@ -252,7 +257,7 @@ def test_what_the_insertions_took_stands_beside_the_plans(report_on):
     rows[1] |= {"unconverged_periods": 5}
     report, page = report_on(rows)
     head = page.text[: page.text.index("Figures")]
-    assert "bevel turns 3.00 plan's 1.00" in head
+    assert "bevel rolls 3.00 plan's 1.00" in head
     assert "tissue energy / plan's 1.20 1.20 to 1.20" in head
     assert "periods / plan's 1.11 largest 1.20" in head
     assert "periods not converged 7 in 2 insertions" in head
@@ -318,26 +323,61 @@ def test_what_did_not_finish_is_counted_and_listed(report_on, rows):
     assert "3 of 24 insertions did not finish." in page.text
     assert "held 2 held for 1.03 s 0 flexneedle insert" in page.text
     assert "error 1 ZeroDivisionError: x 7 flexneedle insert" in page.text
-    assert "1 insertion has periods whose solve did not converge" in page.text
-    assert report.values()["finished"] == 21
+    assert "insertions 24 of 24, 0 missing finished 21 of 24 held 2 of 24 error 1 of 24" in page.text
+    values = report.values()
+    assert (values["finished"], values["outcomes"]) == (21, {"done": 21, "held": 2, "error": 1})
+
+
+def test_periods_that_did_not_converge_are_counted_of_all_insertions(report_on, rows):
+    rows = [row | {"controller": OURS} for row in rows]
+    rows[7] = unfinished(rows[7]) | {"unconverged_periods": 2}
     rows[9]["unconverged_periods"] = 1
-    assert "2 insertions have periods whose solve did not converge" in report_on(rows)[1].text
-    assert "1 insertion, 1 finished." in report_on(rows[9:10])[1].text
+    assert "periods not converged 3 in 2 insertions" in report_on(rows)[1].text
+    assert "periods not converged 1 in 1 insertion " in report_on(rows[9:10])[1].text
+
+
+def test_the_headline_is_of_the_whole_study_with_what_failed_and_missed(report_on):
+    """Not of the first of its settings: here that alone has no failure and no miss."""
+    axes = {"contact.spacing_mm": [0.5, 1.0]}
+    rows = make_rows(axes=axes, targets=TARGETS, repeats=5)
+    for row in rows:
+        row["true_error_mm"] = 0.1 if row["contact.spacing_mm"] == 0.5 else 0.5
+    rows[20]["true_error_mm"] = 1.5
+    rows[21] = unfinished(rows[21], "failed", "the needle broke")
+    rows[22] = unfinished(rows[22], "held", "held for 1.03 s")
+    report, page = report_on(rows[:28], axes=axes, insertions=30)
+    assert (
+        "insertions 28 of 30, 2 missing finished 26 of 28 failed 1 of 28 held 1 of 28 "
+        "within 1 mm of the target 25 of 30" in page.text
+    )
+    assert f"{OURS}: 26 insertions finished of 28, all settings together" in page.text
+    errors = [0.1] * 15 + [0.5] * 10 + [1.5]
+    assert f"mean true error {sum(errors) / 26:.3f} mm" in page.text
+    (whole,) = report.values()["whole"]
+    assert (whole["count"], whole["finished"], whole["missed"], whole["largest_mm"]) == (28, 26, 1, 1.5)
+    assert whole["estimates"]["mean_mm"]["value"] == pytest.approx(sum(errors) / 26)
+
+
+def test_the_headline_has_a_row_for_each_controller(report_on):
+    axes = {"contact.spacing_mm": [0.5, 1.0]}
+    rows = make_rows(BOTH, axes=axes, targets=TARGETS, repeats=4)
+    values = report_on(rows, axes=axes)[0].values()
+    assert [group["levels"] for group in values["whole"]] == [{"controller": name} for name in BOTH]
+    assert [group["count"] for group in values["whole"]] == [24, 24]
+    assert [group["count"] for group in values["groups"]] == [12] * 4
 
 
 def test_an_incomplete_study_is_said_to_be_first_of_all(report_on, rows):
     _, page = report_on(rows[:17], ABOUT)
-    alarm = "This study is not complete: 17 of 24 insertions are in."
+    alarm = "This study is not complete: 17 of 24 insertions are in, 7 are missing."
     assert alarm in page.text
     assert page.text.index(alarm) < page.text.index("mean true error")
     assert "not complete" not in report_on(rows, ABOUT)[1].text
 
 
-def test_planned_insertions_are_repeats_times_cases_times_axes():
-    assert planned_insertions(ABOUT) == 4 * 2 * 3
-    with_cases = {"study": ABOUT["study"] | {"cases": {"a": {}, "b": {}}, "repeats": 10}}
-    assert planned_insertions(with_cases) == 120
-    assert planned_insertions({}) is None
+def test_a_study_asks_for_as_many_insertions_as_it_names(report_on, rows):
+    assert report_on(rows[:17], ABOUT)[0].values()["planned"] == 24
+    assert report_on(rows[:17], insertions=100)[0].values()["missing"] == 83
 
 
 def test_the_worst_can_be_run_again(report_on):
@@ -380,7 +420,7 @@ def test_settings_of_another_version_make_no_command(report_on, rows):
 
 
 def test_text_from_data_is_only_text(drawn_on, rows):
-    about = {"command": EVIL, "study": {"name": EVIL, "title": EVIL}}
+    about = {"command": EVIL, "study": ABOUT["study"] | {"name": EVIL, "title": EVIL}}
     evil = [row | {"controller": EVIL, "case": EVIL, "version_numpy": EVIL} for row in rows[:12]]
     evil[3] = unfinished(evil[3], EVIL, EVIL)
     report, page = drawn_on([*evil, *rows[12:]], about)
@@ -462,9 +502,12 @@ def no_object(folder, rows):
     (write_study(folder, rows) / "study.json").write_text("[1]")
 
 
-def only_begun(folder, _rows):
-    folder.mkdir()
-    (folder / "study.json").write_text("{}")
+def only_begun(folder, rows):
+    (write_study(folder, rows) / "runs.parquet").unlink()
+
+
+def without_study(folder, rows):
+    (write_study(folder, rows) / "study.json").unlink()
 
 
 def with_column(name, values):
@@ -491,12 +534,13 @@ def without_rows(folder, rows):
     ("spoil", "message"),
     [
         (lambda *_: None, "no such folder: give the folder that"),
-        (lambda folder, _: folder.mkdir(), "holds no study: there is no runs.parquet"),
-        (only_begun, "the study was killed, or still goes on"),
+        (lambda folder, _: folder.mkdir(), "holds no study: there is no study.json"),
+        (without_study, "holds no study: there is no study.json"),
+        (only_begun, "the study was killed or is still running"),
         (damaged, "runs.parquet: damaged, or no Parquet file"),
-        (without_rows, "holds no insertion"),
+        (without_rows, "has no insertion"),
         (lacking, "not the rows of a study: lacks the columns outcome"),
-        (twice, "damaged: index 3 stands more than once"),
+        (twice, "damaged: index 3 occurs more than once"),
         (no_json, "study.json: damaged"),
         (no_object, "must hold one JSON object"),
         (with_column("index", "a"), "runs.parquet: .* index of row 1 is 'a': must be a whole number"),
@@ -512,14 +556,15 @@ def without_rows(folder, rows):
         (with_column("outcome", None), "outcome of row 1 is None: must be text"),
         (with_column("outcome", [b"a\nb"] * 24), "runs.parquet: .* outcome is binary: columns must be of"),
         (with_column("mine.own", {"a": 1}), "runs.parquet: .* mine.own is struct<.*>: columns must be of"),
-        (with_study(cases=3), "study.json: damaged: cases is 3: must be an object"),
-        (with_study(cases=["a"]), r"cases is \['a'\]: must be an object"),
-        (with_study(cases={"a": 3}), "cases is {'a': 3}: must be an object with an object of settings"),
-        (with_study(axes=[1, 2]), r"study.json: damaged: axes is \[1, 2\]: must be an object"),
-        (with_study(axes={"target": 3}), "axes is {'target': 3}: must be an object with a list of values"),
-        (with_study(repeats="x"), "repeats is 'x': must be a whole number, at least 1"),
-        (with_study(repeats=0), "repeats is 0: must be a whole number, at least 1"),
-        (lambda folder, rows: write_study(folder, rows, {"study": 3}), "study is 3: must be an object"),
+        (with_study(cases=3), "study.json: damaged: study.cases = 3: .* dictionary"),
+        (with_study(cases=["a"]), r'study.cases = \["a"\]: .* dictionary'),
+        (with_study(cases={"a": 3}), "study.cases.a = 3: .* dictionary"),
+        (with_study(axes=[1, 2]), r"study.json: damaged: study.axes = \[1, 2\]: .* dictionary"),
+        (with_study(axes={"target": 3}), "study.axes.target = 3: .* list"),
+        (with_study(insertions="x"), 'study.insertions = "x": must be a whole number'),
+        (with_study(insertions=0), "study.insertions = 0: must be at least 1"),
+        (lambda folder, rows: write_study(folder, rows, {"study": {}}), "study.name: missing"),
+        (lambda folder, rows: write_study(folder, rows, {"study": 3}), "study = 3: "),
     ],
 )
 def test_what_cannot_be_reported_is_said_in_one_line(tmp_path, rows, spoil, message):

@@ -1,4 +1,4 @@
-"""What a report finds in rows: what varies, groups, paired differences, endings, the worst."""
+"""What a report finds in rows: groups, paired differences, endings, the worst."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from flexneedle.study.report.design import column_label, design_of
+from flexneedle.study.report.design import design_of
 from flexneedle.study.report.reading import read_study
 from flexneedle.study.report.summary import (
     case_differences,
@@ -17,159 +17,23 @@ from flexneedle.study.report.summary import (
 )
 from study_rows import BASE, OURS, make_rows, unfinished, write_study
 
-FIRST = [OURS]
 TARGETS = ((25.0, 0.0), (40.0, 5.0))
 
 
 @pytest.fixture
 def read(tmp_path):
-    """Return a function from rows (dicts) to the rows of a report, through the files of a study."""
-    return lambda rows: read_study(write_study(tmp_path / "study", rows)).rows
+    """Return a function from rows (dicts) and what their study asks for to its record, through its files."""
+    return lambda rows, **more: read_study(write_study(tmp_path / "study", rows, **more))
+
+
+def designed(study):
+    return design_of(study.rows, study.asked)
 
 
 def doubled(*names):
     """Return cases: the base, and each entry of [phantom] doubled."""
     cases = {f"{name} doubled": {f"phantom.{name}": 2 * BASE[f"phantom.{name}"]} for name in names}
     return {"as shipped": {}} | cases
-
-
-def described(design):
-    return {factor.key: factor.names for factor in design.factors}
-
-
-def test_a_study_of_one_setting_varies_nothing(read):
-    design = design_of(read(make_rows(targets=TARGETS, repeats=2)), FIRST)
-    assert described(design) == {"controller": (OURS,)}
-
-
-def test_the_default_controller_comes_first(read):
-    rows = make_rows(("ce-mpc", "open-loop", OURS), targets=TARGETS, repeats=2)
-    assert design_of(read(rows), FIRST).controller.names == (OURS, "ce-mpc", "open-loop")
-
-
-def test_a_number_that_varies_is_an_axis_in_ascending_order(read):
-    rows = make_rows(axes={"contact.spacing_mm": [2.0, 0.5, 1.0]}, targets=TARGETS, repeats=1)
-    (axis,) = design_of(read(rows), FIRST).axes
-    assert (axis.key, axis.label, axis.names) == (
-        "contact.spacing_mm",
-        "contact: spacing (mm)",
-        ("0.5", "1", "2"),
-    )
-    assert_allclose(axis.places, [0.5, 1.0, 2.0])
-    assert axis.codes.tolist() == [2, 2, 0, 0, 1, 1]
-
-
-def test_settings_that_change_together_are_one_axis(read):
-    pairs = [(g, g - 12.5) for g in (20.0, 41.0, 80.0)]
-    rows = make_rows(axes={"setup.guide_to_skin_mm+setup.tip_to_skin_mm": pairs}, targets=TARGETS, repeats=1)
-    (axis,) = design_of(read(rows), FIRST).axes
-    assert (axis.key, axis.names, axis.along) == (
-        "setup.guide_to_skin_mm", ("20", "41", "80"), ("setup.tip_to_skin_mm",),
-    )  # fmt: skip
-    assert axis.level(0) == "G = 20 mm"
-
-
-def test_the_study_says_which_of_them_it_meant(read):
-    pairs = [(g, g - 12.5) for g in (20.0, 41.0)]
-    rows = make_rows(axes={"setup.guide_to_skin_mm+setup.tip_to_skin_mm": pairs}, targets=TARGETS, repeats=1)
-    (axis,) = design_of(read(rows), FIRST, ["setup.tip_to_skin_mm"]).axes
-    assert axis.key == "setup.tip_to_skin_mm"
-
-
-def test_gauges_are_ordered_from_thick_to_thin(read):
-    rows = make_rows(axes={"needle.gauge": ["25G", "18G", "21G"]}, targets=TARGETS, repeats=1)
-    (axis,) = design_of(read(rows), FIRST).axes
-    assert axis.names == ("18G", "21G", "25G")
-    assert not axis.numeric
-
-
-def test_a_gauge_says_more_than_what_changes_with_it(read):
-    pairs = [(140.0, "18G"), (150.0, "21G")]
-    rows = make_rows(axes={"needle.length_mm+needle.gauge": pairs}, targets=TARGETS, repeats=1)
-    (axis,) = design_of(read(rows), FIRST).axes
-    assert (axis.key, axis.along) == ("needle.gauge", ("needle.length_mm",))
-
-
-def test_two_axes_stay_two(read):
-    rows = make_rows(
-        axes={"contact.spacing_mm": [0.5, 1.0], "tracker.jitter_mm": [0.0, 0.07, 0.14]},
-        targets=TARGETS,
-        repeats=1,
-    )
-    assert [axis.key for axis in design_of(read(rows), FIRST).axes] == [
-        "contact.spacing_mm",
-        "tracker.jitter_mm",
-    ]
-
-
-def test_cases_that_change_one_thing_each_are_cases(read):
-    rows = make_rows(cases=doubled("run_out_mm", "initial_bend_mm"), targets=TARGETS, repeats=1)
-    design = design_of(read(rows), FIRST)
-    assert described(design) == {
-        "controller": (OURS,),
-        "case": ("as shipped", "run_out_mm doubled", "initial_bend_mm doubled"),
-    }
-
-
-def test_the_base_case_is_first_wherever_it_stands(read):
-    rows = make_rows(cases=doubled("run_out_mm", "initial_bend_mm"), targets=TARGETS, repeats=1)
-    design = design_of(read(rows), FIRST, base="initial_bend_mm doubled")
-    assert design.cases.names[0] == "initial_bend_mm doubled"
-
-
-def test_cases_named_by_a_number_are_points_of_an_axis(read):
-    """As in the study `mismatch`: a case scales many values of the phantom at once."""
-    cases = {
-        f"s = {scale:g}": {
-            "phantom.start_offset_sd_mm": 0.5 * scale,
-            "phantom.start_angle_sd_mrad": 3.0 * scale,
-            "phantom.bevel_factor": [1 - 0.5 * scale, 1 + 0.5 * scale],
-        }
-        for scale in (1.0, 0.0, 2.0, 0.5)
-    }
-    design = design_of(read(make_rows(cases=cases, targets=TARGETS, repeats=1)), FIRST)
-    (axis,) = design.axes
-    assert (axis.label, axis.names) == ("s, scale of the phantom's mismatch", ("0", "0.5", "1", "2"))
-    assert axis.level(1) == "s = 0.5"
-    assert len(axis.along) == 3
-    assert not design.cases.varies
-
-
-def test_cases_that_set_one_number_are_points_of_its_axis(read):
-    cases = {name: {"setup.guide_to_skin_mm": g} for name, g in (("near", 20.0), ("far", 80.0))}
-    (axis,) = design_of(read(make_rows(cases=cases, targets=TARGETS, repeats=1)), FIRST).axes
-    assert (axis.key, axis.names) == ("setup.guide_to_skin_mm", ("20", "80"))
-
-
-def test_many_values_are_put_into_bins_of_equal_count(read):
-    values = [0.01 * k for k in range(100)]
-    rows = make_rows(axes={"tracker.jitter_mm": values}, targets=TARGETS[:1], repeats=1)
-    (axis,) = design_of(read(rows), FIRST).axes
-    assert np.bincount(axis.codes).tolist() == [10] * 10
-    assert_allclose(axis.places, 0.045 + 0.1 * np.arange(10))
-    assert len(np.unique(axis.exact)) == 100
-
-
-def test_lists_and_missing_values_are_levels_too(read):
-    rows = make_rows(axes={"phantom.bevel_factor": [[0.5, 1.5], [0.0, 2.0]]}, targets=TARGETS, repeats=1)
-    for row in rows[:2]:
-        row["tissue.2.alpha"] = 8.0
-    axes = design_of(read(rows), FIRST).axes
-    assert axes[0].names == ("0.5 to 1.5", "0 to 2")
-
-
-@pytest.mark.parametrize(
-    ("key", "label"),
-    [
-        ("tissue.0.shear_modulus_kpa", "tissue 0: shear modulus (kPa)"),
-        ("phantom.friction_mn_per_mm", "phantom: friction (mN/mm)"),
-        ("setup.insertion_speed_mm_s", "setup: insertion speed (mm/s)"),
-        ("phantom.delay_periods", "phantom: delay periods"),
-        ("needle.gauge", "needle gauge"),
-    ],
-)
-def test_labels_have_units(key, label):
-    assert column_label(key) == label
 
 
 def test_a_group_holds_what_a_hand_would_compute(read):
@@ -185,7 +49,7 @@ def test_a_group_holds_what_a_hand_would_compute(read):
         }
     rows[0]["periods"], rows[1]["unconverged_periods"] = 75, 3
     found = read(rows)
-    (group,) = groups_of(found, design_of(found, FIRST))
+    (group,) = groups_of(found.rows, designed(found).factors)
     value = {name: estimate.value for name, estimate in group.estimates.items()}
     assert (group.name, group.count, group.finished, group.known, group.missed) == (OURS, 5, 5, 5, 1)
     assert (group.unconverged, group.largest_mm, group.largest_period_ratio) == (1, 2.0, 1.5)
@@ -205,7 +69,7 @@ def test_unfinished_insertions_count_but_enter_no_mean(read):
     rows.append(unfinished({**rows[0], "index": 4, "seed": 99, "repeat": 4}, "error", "ValueError: x"))
     rows[3]["unconverged_periods"] = 7
     found = read(rows)
-    (group,) = groups_of(found, design_of(found, FIRST))
+    (group,) = groups_of(found.rows, designed(found).factors)
     assert (group.count, group.finished, group.missed, group.unconverged) == (5, 3, 0, 1)
     assert group.estimates["mean_mm"].value == pytest.approx(0.2)
     assert group.largest_mm == 0.3
@@ -216,14 +80,15 @@ def test_a_finished_insertion_of_unknown_error_is_counted_as_such(read):
     rows[0]["true_error_mm"] = None
     rows[1]["true_error_mm"] = float("nan")
     found = read(rows)
-    (group,) = groups_of(found, design_of(found, FIRST))
+    (group,) = groups_of(found.rows, designed(found).factors)
     assert (group.finished, group.known) == (3, 1)
 
 
 def test_groups_are_every_level_of_every_factor(read):
-    rows = make_rows((OURS, "open-loop"), axes={"contact.spacing_mm": [1.0, 0.5]}, targets=TARGETS, repeats=2)
-    found = read(rows)
-    groups = groups_of(found, design_of(found, FIRST))
+    axes = {"contact.spacing_mm": [1.0, 0.5]}
+    rows = make_rows((OURS, "open-loop"), axes=axes, targets=TARGETS, repeats=2)
+    found = read(rows, axes=axes)
+    groups = groups_of(found.rows, designed(found).factors)
     assert [group.levels for group in groups] == [
         {"controller": name, "contact.spacing_mm": spacing}
         for name in (OURS, "open-loop")
@@ -232,9 +97,9 @@ def test_groups_are_every_level_of_every_factor(read):
     assert sum(group.count for group in groups) == len(rows)
 
 
-def compared(rows, read):
-    found = read(rows)
-    return controller_differences(found, design_of(found, FIRST))
+def compared(rows, read, **more):
+    found = read(rows, **more)
+    return controller_differences(found.rows, designed(found))
 
 
 def test_controllers_are_compared_pair_by_pair(read):
@@ -280,12 +145,12 @@ def test_too_few_pairs_give_no_verdict(read):
 
 def test_pairs_never_cross_settings(read):
     """Errors that depend on the axis alone, the same for both controllers, differ in no pair."""
-    values = [0.01 * k for k in range(30)]  # so many that they are put into bins
-    rows = make_rows(("open-loop", OURS), axes={"tracker.jitter_mm": values}, targets=TARGETS, repeats=5)
+    axes = {"tracker.jitter_mm": [0.01 * k for k in range(30)]}
+    rows = make_rows(("open-loop", OURS), axes=axes, targets=TARGETS, repeats=5)
     shuffled = np.random.default_rng(0).permutation(len(rows)).tolist()
     for row, index in zip(rows, shuffled, strict=True):
         row |= {"true_error_mm": 0.1 + row["tracker.jitter_mm"], "index": index}
-    (found,) = compared(rows, read)
+    (found,) = compared(rows, read, axes=axes)
     assert (found.pairs, found.mean_mm.low, found.mean_mm.high) == (300, 0.0, 0.0)
 
 
@@ -295,7 +160,7 @@ def test_cases_are_compared_with_the_base_for_each_controller(read):
         more = {"as shipped": 0.0, "run_out_mm doubled": 0.02, "initial_bend_mm doubled": -0.01}[row["case"]]
         row["true_error_mm"] += more * (3 if row["controller"] == "open-loop" else 1)
     found = read(rows)
-    differences = case_differences(found, design_of(found, FIRST))
+    differences = case_differences(found.rows, designed(found))
     assert [(d.controller, d.name, d.pairs, d.verdict) for d in differences] == [
         (controller, case, 30, verdict)
         for controller in (OURS, "open-loop")
@@ -311,7 +176,7 @@ def test_endings_differ_in_more_than_numbers(read):
         rows[k] = unfinished(rows[k], "held", f"held for {seconds} s (limit 1 s)")
     rows[5] = unfinished(rows[5], "error", "ValueError: x")
     rows[8]["reason"] = "missed the target by 1.20 mm"
-    found = endings(read(rows))
+    found = endings(read(rows).rows)
     assert [(kind.outcome, kind.count, kind.first, kind.reason) for kind in found] == [
         ("held", 3, 1, "held for 1.03 s (limit 1 s)"),
         ("error", 1, 5, "ValueError: x"),
@@ -324,7 +189,7 @@ def test_the_worst_are_the_largest_errors_finished_or_not(read):
     for row, error in zip(rows, (0.1, 0.5, 0.3, None, 0.5, 0.2), strict=True):
         row["true_error_mm"] = error
     rows[4] = unfinished(rows[4])
-    assert worst(read(rows), 4) == [1, 4, 2, 5]
+    assert worst(read(rows).rows, 4) == [1, 4, 2, 5]
 
 
 @settings(deadline=None, max_examples=25)
@@ -339,8 +204,8 @@ def test_nothing_is_dropped_whatever_the_outcomes(tmp_path_factory, data):
         row if outcome == "done" else unfinished(row, outcome, "why")
         for row, outcome in zip(rows, outcomes, strict=True)
     ]
-    found = read_study(write_study(tmp_path_factory.mktemp("study"), rows)).rows
-    groups = groups_of(found, design_of(found, FIRST))
+    found = read_study(write_study(tmp_path_factory.mktemp("study"), rows))
+    groups = groups_of(found.rows, designed(found).factors)
     assert sum(group.count for group in groups) == 8
     assert sum(group.finished for group in groups) == outcomes.count("done")
-    assert sum(kind.count for kind in endings(found)) == 8 - outcomes.count("done")
+    assert sum(kind.count for kind in endings(found.rows)) == 8 - outcomes.count("done")

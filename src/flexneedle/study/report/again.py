@@ -16,6 +16,7 @@ from flexneedle.scenario.worlds import world_name
 from flexneedle.study.report.rows import Rows
 
 _SECTIONS = frozenset(Scenario.model_fields)
+_OPTIONS = {"--controller": "controller", "--phantom": "plant", "--strategy": "strategy"}
 
 
 def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
@@ -24,19 +25,17 @@ def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
     Scenarios that are neither presets nor worlds are written there.
     A row whose settings make no scenario of this version has "".
     """
-    sources: dict[str, str] = {
-        _target_left_out(checked(load_scenario(name))): name for name in PRESETS.names()
-    }
+    sources = {_without_target(checked(load_scenario(name))): name for name in PRESETS.names()}
     numbers = count(1)
     found = {}
     for row in dict.fromkeys(listed):
-        scenario = scenario_of(rows, row)
+        scenario = _scenario_of(rows, row)
         if scenario is None:
             found[row] = ""
             continue
-        key = _target_left_out(scenario)
+        key = _without_target(scenario)
         if name := _world_of(rows, row):
-            sources.setdefault(_target_left_out(checked(load_scenario(name))), name)
+            sources.setdefault(_without_target(checked(load_scenario(name))), name)
         if key not in sources:
             sources[key] = f"scenario-{next(numbers)}.toml"
             (folder / sources[key]).write_text(dump_scenario(scenario), encoding="utf-8", newline="\n")
@@ -44,17 +43,13 @@ def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
     return found
 
 
-def scenario_of(rows: Rows, row: int) -> Scenario | None:
+def _scenario_of(rows: Rows, row: int) -> Scenario | None:
     """Return the scenario of a row, or None if its settings make none of this version."""
-    settings = {
-        name: value
-        for name in rows.columns
-        if "." in name and name.split(".")[0] in _SECTIONS
-        for value in (rows.value(name, row),)
-        if value is not None
-    }
+    keys = [name for name in rows.names if "." in name and name.split(".")[0] in _SECTIONS]
+    settings = {key: rows.value(key, row) for key in keys}
+    known = {key: value for key, value in settings.items() if value is not None}
     try:
-        return Scenario.from_record({"name": "Scenario of a study", **_nested(settings)})
+        return Scenario.from_record({"name": "Scenario of a study", **_nested(known)})
     except (ScenarioError, TypeError):
         return None
 
@@ -72,8 +67,7 @@ def _command(rows: Rows, row: int, source: str) -> str:
     plan_seed = rows.value("plan_seed", row)
     if plan_seed is not None and plan_seed != rows.value("seed", row):
         words += ["--plan-seed", _number(plan_seed)]
-    options = {"--controller": "controller", "--phantom": "plant", "--strategy": "strategy"}
-    for option, name in options.items():
+    for option, name in _OPTIONS.items():
         value = rows.value(name, row)
         words += [option, str(value)] if value is not None else []
     tracker = rows.value("tracker", row)
@@ -81,31 +75,21 @@ def _command(rows: Rows, row: int, source: str) -> str:
     return shlex.join(words)
 
 
-def _target_left_out(scenario: Scenario) -> str:
+def _without_target(scenario: Scenario) -> str:
     values = scenario.values()
     return repr({name: value for name, value in values.items() if name not in ("name", "target")})
 
 
-def _nested(settings: dict[str, Any]) -> dict[str, Any]:
+def _nested(settings: dict[str, Any]) -> Any:
     """Return values by dotted key as nested tables; tables whose keys are 0, 1, … are lists."""
-    nested: dict[str, Any] = {}
+    tables: dict[str, dict[str, Any]] = {}
     for key, value in settings.items():
-        *way, last = key.split(".")
-        table = nested
-        for part in way:
-            table = table.setdefault(part, {})
-        table[last] = list(value) if isinstance(value, tuple) else value
-    made: dict[str, Any] = _lists(nested)
-    return made
-
-
-def _lists(value: Any) -> Any:
-    if not isinstance(value, dict):
-        return value
-    inner = {key: _lists(item) for key, item in value.items()}
-    if inner and all(key.isdigit() for key in inner):
-        return [inner[key] for key in sorted(inner, key=int)]
-    return inner
+        head, dot, rest = key.partition(".")
+        tables.setdefault(head, {})[rest if dot else ""] = list(value) if isinstance(value, tuple) else value
+    nested = {head: inner[""] if "" in inner else _nested(inner) for head, inner in tables.items()}
+    if nested and all(key.isdigit() for key in nested):
+        return [nested[key] for key in sorted(nested, key=int)]
+    return nested
 
 
 def _number(value: Any) -> str:

@@ -1,53 +1,43 @@
-"""What a study varied, found in its rows: controllers, cases, axes. Names of studies play no part."""
+"""What a study varies: controllers, cases and axes, as `study.json` states them, with the level of each row."""
 
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from math import nan
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.scenario.sections.needle import GAUGES
+from flexneedle.study.report.reading import Asked
 from flexneedle.study.report.rows import Codes, Floats, Rows
 
-_GAUGE = "needle.gauge"
-_GUIDE = "setup.guide_to_skin_mm"
-_ENVIRONMENT = "tracker.environment."
-_WHICH = _ENVIRONMENT + "name"
-_WORLD = "world"
-_MOST_LEVELS, _BINS = 20, 10
+_SAMPLED = frozenset({"controller", "seed", "plan_seed", "world"})
+"""Axes that are no factors: the controller is one in every study, the others are what insertions are sampled over."""
 _UNITS = {
     "per_mm": "1/mm", "per_m": "1/m", "per_mj": "1/mJ", "mn_per_mm": "mN/mm", "mm_s": "mm/s",
     "mm": "mm", "mrad": "mrad", "kpa": "kPa", "gpa": "GPa", "hz": "Hz", "mj": "mJ", "s": "s",
 }  # fmt: skip
+_LABELS = {"needle.gauge": "needle gauge", "tracker.environment": "environment of the tracker"}
 _NUMBERED = re.compile(r"([^\d.+-]*)([-+]?(?:\d+\.?\d*|\.\d+))([^\d.]*)")
 
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """Something that has a level in each row.
+    """Something that has a level in each of n rows.
 
-    key: column; label: for an axis, with its unit; names: of the levels, in order; places (k,): where they lie on an
-    axis, in its unit, NaN unless `numeric`; codes (n,): the level of each row; exact (n,): the same, finer where
-    many values were put together in bins; along: other columns that change with it.
+    key: column, or axis of the study; label: with its unit; names: of the k levels, in order; titles: the same where
+    they stand alone, such as "G = 20 mm"; places (k,): of the levels on an axis; codes (n,): level of each row;
+    along: settings that change with it.
     """
 
     key: str
     label: str
     names: tuple[str, ...]
+    titles: tuple[str, ...]
     places: Floats
     codes: Codes
-    exact: Codes
-    numeric: bool = False
     along: tuple[str, ...] = ()
-
-    def level(self, number: int) -> str:
-        """Return the name of a level as it stands alone, such as "G = 20 mm"."""
-        if not self.numeric:
-            return self.names[number]
-        words, _, unit = self.label.rstrip(")").partition(" (")
-        return f"{words.split(',')[0]} = {self.names[number]} {unit}".rstrip()
 
     @property
     def varies(self) -> bool:
@@ -57,202 +47,113 @@ class Factor:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """The factors of a study. `cases` has more than one level only where cases are no points of an axis."""
+    """The factors of a study. `cases` varies only where cases are no points of an axis."""
 
     controller: Factor
     cases: Factor
     axes: tuple[Factor, ...]
-    others: tuple[Factor, ...]
+    guide: Factor
 
     @property
     def factors(self) -> tuple[Factor, ...]:
         """Controller first, then all else that varies."""
-        rest = (self.cases, *self.axes, *self.others)
+        rest = (self.cases, *self.axes, self.guide)
         return (self.controller, *(factor for factor in rest if factor.varies))
 
+    def besides(self, *compared: Factor) -> tuple[Factor, ...]:
+        """Return all factors but those that are compared."""
+        return tuple(factor for factor in self.factors if factor not in compared)
 
-def design_of(
-    rows: Rows, controllers: Sequence[str], declared: Iterable[str] = (), base: str | None = None
-) -> Design:
-    """Return what varies in rows.
 
-    controllers: names in the order wanted, the default first; declared: columns that the study names as its axes,
-    preferred where several columns change together; base: the case that the others are held against, by default
-    the first.
-    """
-    cases = _by_name(rows, "case", "case", () if base is None else (base,))
-    varying = [key for key in rows.columns if _is_setting(key) and len(rows.codes(key)[1]) > 1]
-    by_case = [key for key in varying if cases.varies and _follows(rows.codes(key)[0], cases.codes)]
-    free = [key for key in varying if key not in by_case and not _said_by_name(rows, key, varying)]
-    free = [key for key in free if not _said_by_world(rows, key, cases)]
-    axes = [_axis(rows, keys, set(declared)) for keys in _changing_together(rows, free)]
-    as_axis = _case_axis(rows, cases, by_case, set(declared))
+def design_of(rows: Rows, asked: Asked) -> Design:
+    """Return what a study varies, of the levels that its rows have. The default controller and the base case, the
+    first that sets nothing, are the first levels."""
+    base = [name for name, settings in asked.cases.items() if not settings][:1]
+    cases = _factor("case", rows.text("case"), first=base)
+    keys = [key for key in asked.axes if key not in _SAMPLED and not key.startswith("target")]
+    axes = [_factor(key, _column(rows, key)) for key in keys]
+    case_axis = _case_axis(cases, asked.cases)
+    if case_axis is not None:
+        axes, cases = [case_axis, *axes], _factor("case", [""] * len(rows))
     return Design(
-        _by_name(rows, "controller", "controller", controllers),
-        cases if as_axis is None else _single(cases),
-        tuple(axes) if as_axis is None else (as_axis, *axes),
-        (*(_by_name(rows, key, key) for key in _unsaid(rows, cases)), *_guides(rows)),
+        _factor("controller", rows.text("controller"), first=controllers_in_order()),
+        cases,
+        tuple(axis for axis in axes if axis.varies),
+        _factor("guide", _guides(rows), first=["with a guide"]),
     )
+
+
+def controllers_in_order() -> list[str]:
+    """Return the controllers, the default first."""
+    return sorted(METHODS, key=lambda name: name != DEFAULT)
 
 
 def column_label(key: str) -> str:
-    """Return a column's name as a reader would write it, unit in brackets."""
-    if key == _GAUGE:
-        return "needle gauge"
-    if key == _GUIDE:
-        return "G, distance from guide to skin (mm)"
-    if key == _WHICH:
-        return "environment of the tracker"
+    """Return a key as a reader would write it, unit in brackets."""
     *way, last = key.split(".")
     unit = next((end for end in sorted(_UNITS, key=len, reverse=True) if last.endswith("_" + end)), "")
     words = last.removesuffix("_" + unit).replace("_", " ") if unit else last.replace("_", " ")
-    where = f"{' '.join(way)}: " if way else ""
-    return f"{where}{words} ({_UNITS[unit]})" if unit else f"{where}{words}"
+    label = f"{' '.join(way)}: {words}" if way else words
+    return _LABELS.get(key) or (f"{label} ({_UNITS[unit]})" if unit else label)
 
 
-def _is_setting(key: str) -> bool:
-    return "." in key and not key.startswith("target.")
+def _column(rows: Rows, key: str) -> list[Any]:
+    """Return the value (n,) of an axis: that of its column; of a table its name, or else all that it holds."""
+    below = [name for name in rows.names if name.startswith(f"{key}.")]
+    if f"{key}.name" in below:
+        return rows.values(f"{key}.name")
+    return list(zip(*map(rows.values, below), strict=True)) if below else rows.values(key)
 
 
-def _said_by_name(rows: Rows, key: str, varying: Sequence[str]) -> bool:
-    """Whether a setting of the tracker's environment is no more than what the environment's name has said."""
+def _guides(rows: Rows) -> list[str]:
+    """Return whether each world (n,) has a guide; "" in other studies."""
+    guides = np.isnan(rows.number("setup.guide_to_skin_mm"))
+    of_worlds = not np.isnan(rows.number("world")).all()
     return (
-        key.startswith(_ENVIRONMENT)
-        and key != _WHICH
-        and _WHICH in varying
-        and _follows(rows.codes(key)[0], rows.codes(_WHICH)[0])
+        ["no guide" if without else "with a guide" for without in guides] if of_worlds else [""] * len(rows)
     )
 
 
-def _said_by_world(rows: Rows, key: str, cases: Factor) -> bool:
-    """Whether a setting is no more than what the number of the world, and the case, have said."""
-    worlds = rows.codes(_WORLD)[0]
-    return _follows(rows.codes(key)[0], worlds * len(cases.names) + cases.codes)
+def _factor(key: str, values: Sequence[Any], first: Sequence[Any] = ()) -> Factor:
+    """Return the factor of values (n,): numbers ascending, gauges by size, else `first`, then as they appear."""
+    levels, label = list(dict.fromkeys(values)), column_label(key)
+    numeric = all(isinstance(level, int | float) and not isinstance(level, bool) for level in levels)
+    first = [*first, *GAUGES]
+    ordered = sorted(levels) if numeric else sorted(levels, key=lambda k: _rank(k, first))
+    number = {level: k for k, level in enumerate(ordered)}
+    names = tuple(map(_name, ordered))
+    words, _, unit = label.rstrip(")").partition(" (")
+    titles = tuple(f"{words} = {name} {unit}".rstrip() for name in names) if numeric else names
+    places = np.array(ordered if numeric else range(len(ordered)), dtype=float)
+    return Factor(
+        key, label, names, titles, places, np.array([number[value] for value in values], dtype=np.int64)
+    )
 
 
-def _unsaid(rows: Rows, cases: Factor) -> list[str]:
-    """Return plant, tracker and strategy, but for what the case of a world says."""
-    keys = ["plant", "tracker", "strategy"]
-    return [k for k in keys if _guides(rows) == () or not _follows(rows.codes(k)[0], cases.codes)]
-
-
-def _guides(rows: Rows) -> tuple[Factor, ...]:
-    """Return the factor of worlds with a guide and without; none in other studies."""
-    if rows.codes(_WORLD)[1] == [None]:
-        return ()
-    without = np.isnan(rows.number(_GUIDE))
-    codes = without.astype(np.int64)
-    names = ("with a guide", "no guide")
-    used = [names[k] for k in np.unique(codes).tolist()]
-    dense = np.unique(codes, return_inverse=True)[1].astype(np.int64)
-    return (Factor("guide", "guide", tuple(used), np.full(len(used), nan), dense, dense),)
-
-
-def _follows(codes: Codes, leader: Codes) -> bool:
-    """Whether a level of `leader` fixes the level."""
-    return len(np.unique(np.stack([leader, codes]), axis=1).T) == len(np.unique(leader))
-
-
-def _changing_together(rows: Rows, keys: Sequence[str]) -> list[list[str]]:
-    """Return the keys in groups that split the rows the same way."""
-    groups: dict[bytes, list[str]] = {}
-    for key in keys:
-        groups.setdefault(rows.codes(key)[0].tobytes(), []).append(key)
-    return list(groups.values())
-
-
-def _axis(rows: Rows, keys: Sequence[str], declared: set[str]) -> Factor:
-    """Return the axis of keys that change together, along the one that says most."""
-    key = min(keys, key=lambda key: (key not in declared, key != _GAUGE, not _is_numeric(rows, key)))
-    return _along(rows, key, tuple(other for other in keys if other != key))
-
-
-def _along(rows: Rows, key: str, along: tuple[str, ...]) -> Factor:
-    codes, levels = rows.codes(key)
-    if _is_numeric(rows, key):
-        return _on_a_scale(key, column_label(key), codes, np.array(levels, dtype=float), along)
-    gauges = list(GAUGES)
-    ordered = sorted(levels, key=gauges.index) if set(levels) <= set(gauges) else levels
-    return _named(key, column_label(key), codes, [levels.index(level) for level in ordered], levels, along)
-
-
-def _case_axis(rows: Rows, cases: Factor, keys: Sequence[str], declared: set[str]) -> Factor | None:
-    """Return the axis that the cases are points of, if they are."""
-    own = [key for key in keys if _follows(cases.codes, rows.codes(key)[0])]
-    if _GAUGE in own or (1 <= len(own) <= 2 and _is_numeric(rows, own[0])):
-        return _axis(rows, own, declared)
-    numbers = _numbers_in(cases.names)
-    if len(own) > 0 and numbers is not None:
-        words, values = numbers
-        of_phantom = all(key.startswith("phantom.") for key in own)
-        label = f"{words}, scale of the phantom's mismatch" if of_phantom and len(words) <= 2 else words
-        return _on_a_scale("case", label, cases.codes, values, tuple(own))
-    return None
-
-
-def _numbers_in(names: Sequence[str]) -> tuple[str, Floats] | None:
-    """Return what names say around their number, and the numbers, if they differ in nothing else."""
-    found = [_NUMBERED.fullmatch(name) for name in names]
-    matches = [match for match in found if match is not None]
-    around = {(match[1], match[3]) for match in matches}
-    if len(matches) < len(names) or len(around) != 1:
-        return None
-    words = " ".join(part.strip(" =_-:×") for part in around.pop()).strip()
-    return words or "case", np.array([float(match[2]) for match in matches])
-
-
-def _on_a_scale(key: str, label: str, codes: Codes, values: Floats, along: tuple[str, ...]) -> Factor:
-    """Return the factor of a number; many values are put into bins of about as many rows each."""
-    order = np.argsort(values, kind="stable")
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    exact, ordered = rank[codes], values[order]
-    if len(values) <= _MOST_LEVELS:
-        names = tuple(f"{value:.6g}" for value in ordered.tolist())
-        return Factor(key, label, names, ordered, exact, exact, True, along)
-    inner = np.quantile(ordered[exact], np.linspace(0, 1, _BINS + 1)[1:-1])
-    bins = np.unique(np.searchsorted(np.unique(inner), ordered[exact], side="right"), return_inverse=True)[1]
-    held = [ordered[exact][bins == k] for k in range(int(bins.max()) + 1)]
-    names = tuple(f"{values.min():.3g} to {values.max():.3g}" for values in held)
-    return Factor(key, label, names, np.array([np.median(v) for v in held]), bins, exact, True, along)
-
-
-def _named(
-    key: str,
-    label: str,
-    codes: Codes,
-    order: Sequence[int],
-    levels: Sequence[Any],
-    along: tuple[str, ...] = (),
-) -> Factor:
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[list(order)] = np.arange(len(order))
-    without = "none" if key == _WHICH else _name(None)
-    names = tuple(without if levels[k] is None else _name(levels[k]) for k in order)
-    return Factor(key, label, names, np.full(len(names), nan), rank[codes], rank[codes], False, along)
-
-
-def _by_name(rows: Rows, key: str, label: str, first: Sequence[str] = ()) -> Factor:
-    """Return a factor of names, those in `first` before the others."""
-    codes, levels = rows.codes(key)
-    places = {name: k for k, name in enumerate(first)}
-    order = sorted(range(len(levels)), key=lambda k: places.get(levels[k], len(places)))
-    return _named(key, label, codes, order, levels)
-
-
-def _single(factor: Factor) -> Factor:
-    none = np.zeros(len(factor.codes), dtype=np.int64)
-    return Factor(factor.key, factor.label, ("",), np.full(1, nan), none, none)
-
-
-def _is_numeric(rows: Rows, key: str) -> bool:
-    levels = rows.codes(key)[1]
-    return all(isinstance(level, int | float) and not isinstance(level, bool) for level in levels)
+def _rank(level: Any, first: Sequence[Any]) -> int:
+    return first.index(level) if level in first else len(first)
 
 
 def _name(level: Any) -> str:
-    if level is None:
-        return "not set"
     if isinstance(level, tuple):
-        return " to ".join(_name(item) for item in level)
-    return f"{level:g}" if isinstance(level, float) else str(level)
+        return " to ".join(map(_name, level))
+    if isinstance(level, float):
+        return f"{level:.6g}"
+    return "none" if level is None else str(level)
+
+
+def _case_axis(cases: Factor, settings: Mapping[str, Mapping[str, Any]]) -> Factor | None:
+    """Return the axis that cases are points of, if their names differ in nothing but a number."""
+    found = [match for match in map(_NUMBERED.fullmatch, cases.names) if match]
+    around = {(match[1], match[3]) for match in found}
+    if not cases.varies or len(found) < len(cases.names) or len(around) > 1:
+        return None
+    numbers = [float(match[2]) for match in found]
+    own = [settings.get(name, {}) for name in cases.names]
+    key = next((key for key in own[0] if [case.get(key) for case in own] == numbers), "case")
+    words, unit = (part.strip(" =_-:×") for part in around.pop())
+    label = column_label(key) if key != "case" else f"{words} ({unit})" if unit else words or key
+    axis = _factor(key, [numbers[code] for code in cases.codes])
+    order = np.argsort(numbers, kind="stable").tolist()
+    titles = tuple(cases.names[k] for k in order)
+    return replace(axis, label=label, titles=titles, along=tuple(name for name in own[0] if name != key))

@@ -21,10 +21,11 @@ from flexneedle.study.plot.distributions import (
 from flexneedle.study.plot.energy import EnergyPanel, energy_figure
 from flexneedle.study.plot.sweeps import Sweep, sweep_figure
 from flexneedle.study.plot.targeting import TargetPanel, targeting_figure
-from flexneedle.study.report.design import Design, Factor
+from flexneedle.study.report.design import Design, Factor, controllers_in_order
+from flexneedle.study.report.findings import Findings
 from flexneedle.study.report.rows import Codes, Flags, Floats, Rows
 from flexneedle.study.report.statistics import Estimate
-from flexneedle.study.report.summary import Difference, depth_levels, finished
+from flexneedle.study.report.summary import Difference, depths, finished
 from flexneedle.study.report.worlds import failures, has_worlds
 
 _MOST_ROWS = 40  # levels of names that are still an axis
@@ -72,18 +73,12 @@ class _Facts:
         return list(enumerate(self.design.controller.names))[:MOST_PANELS]
 
 
-def draw_figures(
-    rows: Rows,
-    design: Design,
-    looks: Sequence[int],
-    against: Sequence[Difference],
-    cases: Sequence[Difference],
-    folder: Path,
-) -> list[Drawn]:
-    """Draw every figure that the rows support into a folder, PNG and SVG each, and return them in reading order.
-
-    looks: number of the look of each controller; against, cases: paired differences of controllers and of cases.
-    """
+def draw_figures(found: Findings, folder: Path) -> list[Drawn]:
+    """Draw every figure that the rows support into a folder, PNG and SVG each, and return them in reading order."""
+    rows, design, against, cases = found.study.rows, found.design, found.against, found.cases
+    names = design.controller.names
+    order = [*controllers_in_order(), *sorted(set(names) - set(controllers_in_order()))]
+    looks = [order.index(name) for name in names]
     error, done = rows.number("true_error_mm"), finished(rows)
     facts = _Facts(rows, design, [look(k) for k in looks], error, done, done & ~np.isnan(error))
     drawn = []
@@ -103,9 +98,9 @@ def _sheets(facts: _Facts, against: Sequence[Difference], cases: Sequence[Differ
         return
     if facts.design.controller.varies:
         yield _by_controller(facts)
-    depth = depth_levels(facts.rows)
-    if len(depth[1]) > 1 or not facts.design.controller.varies:
-        yield _by_depth(facts, *depth)
+    depth = depths(facts.rows)
+    if depth.varies or not facts.design.controller.varies:
+        yield _by_depth(facts, depth.codes, depth.names)
     for number, axis in enumerate(facts.design.axes):
         if len(axis.names) <= _MOST_ROWS:
             yield _along(facts, axis, number)
@@ -175,7 +170,7 @@ def _panels(facts: _Facts) -> list[tuple[str, Flags, Look]]:
     if factor is None:
         return [(name, facts.of(k), facts.looks[k]) for k, name in facts.controllers]
     return [
-        (factor.level(k), np.asarray(factor.codes == k), facts.looks[0]) for k in range(len(factor.names))
+        (factor.titles[k], np.asarray(factor.codes == k), facts.looks[0]) for k in range(len(factor.names))
     ]
 
 
@@ -229,7 +224,7 @@ def _depth_rows(facts: _Facts, own: Flags, look: Look, codes: Codes, names: Sequ
 
 
 def _along(facts: _Facts, axis: Factor, number: int) -> _Sheet:
-    places = axis.places if axis.numeric else np.arange(len(axis.names), dtype=float)
+    places = axis.places
     levels = range(len(axis.names))
     sweeps = []
     for k, name in facts.controllers:

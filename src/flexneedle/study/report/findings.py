@@ -1,15 +1,16 @@
-"""What a study comes to, as a whole: all that the page and the summary say."""
+"""All that a report states about a study."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from math import prod
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.study.report.design import Design, design_of
 from flexneedle.study.report.predictions import Predictions, predictions_of
-from flexneedle.study.report.reading import StudyRecord, asked
+from flexneedle.study.report.reading import StudyRecord
+from flexneedle.study.report.statistics import CONFIDENCE, RESAMPLES, SEED
 from flexneedle.study.report.summary import (
+    DONE,
     Difference,
     Ending,
     Group,
@@ -27,15 +28,17 @@ _MOST_KINDS = 20  # of endings that are listed
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What a study comes to. planned: insertions that it asks for, None if it does not say.
+    """What is found in a study.
 
-    worst: rows with the largest errors, in worlds those of the first controller; worlds: empty in other studies;
-    predictions: of the controllers that predict.
+    outcomes: insertions by outcome, "done" first; whole: a group for each controller, over all its insertions;
+    groups: one for each setting; worst: rows with the largest errors, in worlds those of the first controller;
+    worlds: empty in other studies; predictions: of the controllers that predict.
     """
 
     study: StudyRecord
-    planned: int | None
     design: Design
+    outcomes: Mapping[str, int]
+    whole: Sequence[Group]
     groups: Sequence[Group]
     against: Sequence[Difference]
     against_by_depth: Mapping[str, Sequence[Difference]]
@@ -46,55 +49,71 @@ class Findings:
     predictions: Sequence[Predictions]
 
     @property
+    def planned(self) -> int:
+        """How many insertions the study asks for."""
+        return self.study.asked.insertions
+
+    @property
     def finished(self) -> int:
         """How many insertions finished."""
-        return sum(group.finished for group in self.groups)
+        return self.outcomes[DONE]
+
+    @property
+    def missing(self) -> int:
+        """How many insertions of the study have no row yet."""
+        return max(0, self.planned - len(self.study.rows))
+
+    @property
+    def hits(self) -> int:
+        """How many insertions finished within 1 mm of their target."""
+        return sum(group.known - group.missed for group in self.whole)
+
+    def values(self) -> dict[str, Any]:
+        """Return all statistics as plain values, at full precision; NaN is for the border to make null."""
+        return {
+            "insertions": len(self.study.rows),
+            "planned": self.planned,
+            "finished": self.finished,
+            "missing": self.missing,
+            "outcomes": dict(self.outcomes),
+            "statistics": {
+                "over": "finished insertions",
+                "quantiles": "linear interpolation between order statistics",
+                "intervals": "percentile bootstrap, drawn by seed",
+                "confidence": CONFIDENCE,
+                "resamples": RESAMPLES,
+                "seed": SEED,
+            },
+            "whole": list(map(asdict, self.whole)),
+            "groups": list(map(asdict, self.groups)),
+            "controllers": list(map(asdict, self.against)),
+            "controllers_by_depth": {
+                depth: list(map(asdict, found)) for depth, found in self.against_by_depth.items()
+            },
+            "cases": list(map(asdict, self.cases)),
+            "worlds": list(map(asdict, self.worlds)),
+            "predictions": list(map(asdict, self.predictions)),
+            "endings": list(map(asdict, self.endings)),
+        }
 
 
 def findings_of(study: StudyRecord) -> Findings:
-    """Return what a study comes to."""
-    rows, wanted = study.rows, asked(study.about)
-    design = design_of(rows, controllers_in_order(), wanted.get("axes", ()), _base_case(wanted))
+    """Return what is found in a study."""
+    rows = study.rows
+    design = design_of(rows, study.asked)
+    groups = groups_of(rows, design.factors)
+    alone = len(design.factors) == 1
     return Findings(
         study,
-        planned_insertions(study.about),
         design,
-        groups_of(rows, design),
-        controller_differences(rows, design) if design.controller.varies else [],
+        {DONE: 0} | Counter(rows.text("outcome")),
+        groups if alone else groups_of(rows, [design.controller]),
+        groups,
+        controller_differences(rows, design),
         differences_by_depth(rows, design) if design.controller.varies else {},
-        case_differences(rows, design) if design.cases.varies else [],
+        case_differences(rows, design),
         endings(rows)[:_MOST_KINDS],
         worst(rows, among=design.controller.codes == 0 if has_worlds(rows) else None),
         world_groups(rows, design),
         predictions_of(rows, design),
     )
-
-
-def planned_insertions(about: Mapping[str, Any]) -> int | None:
-    """Return how many insertions a study asks for: those that it names, or repeats × cases × values of each axis.
-
-    None if it does not say.
-    """
-    wanted = asked(about)
-    if isinstance(named := wanted.get("insertions"), int):
-        return named
-    if "repeats" not in wanted or "axes" not in wanted:
-        return None
-    repeats: int = wanted["repeats"]
-    return repeats * max(1, len(wanted.get("cases", ()))) * prod(map(len, wanted["axes"].values()))
-
-
-def title_of(about: Mapping[str, Any]) -> str:
-    """Return the title of a study, or its name."""
-    wanted = asked(about)
-    return str(wanted.get("title") or wanted.get("name") or "Study")
-
-
-def _base_case(wanted: Mapping[str, Any]) -> str | None:
-    """Return the first case that sets nothing."""
-    return next((name for name, settings in wanted.get("cases", {}).items() if not settings), None)
-
-
-def controllers_in_order() -> list[str]:
-    """Return the controllers, the default first."""
-    return sorted(METHODS, key=lambda name: name != DEFAULT)

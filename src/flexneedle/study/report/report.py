@@ -1,18 +1,16 @@
-"""`report`: from the folder of a study to one HTML file, its figures, and a summary at full precision."""
+"""`report`: from the folder of a study to one HTML file, its figures, and statistics at full precision."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flexneedle.control.methods import METHODS
 from flexneedle.errors import InputError
 from flexneedle.study.report.again import commands
 from flexneedle.study.report.figures import Drawn, draw_figures
-from flexneedle.study.report.findings import Findings, controllers_in_order, findings_of, title_of
+from flexneedle.study.report.findings import Findings, findings_of
 from flexneedle.study.report.page import page_text
 from flexneedle.study.report.reading import read_study, read_tuning
-from flexneedle.study.report.statistics import CONFIDENCE, RESAMPLES, SEED
 
 REPORT_FILE = "report.html"
 
@@ -28,37 +26,16 @@ class Report:
 
     def values(self) -> dict[str, Any]:
         """Return all statistics as plain values, at full precision; NaN is for the border to make null."""
-        found = self.findings
-        rows = found.study.rows
+        rows = self.findings.study.rows
         return {
-            "study": title_of(found.study.about),
+            "study": self.findings.study.asked.title,
             "report": str(self.page),
             "figures": [str(path) for drawn in self.figures for path in (drawn.png, drawn.svg)],
-            "insertions": len(rows),
-            "planned": found.planned,
-            "finished": found.finished,
-            "statistics": {
-                "over": "finished insertions",
-                "quantiles": "linear interpolation between order statistics",
-                "intervals": "percentile bootstrap, drawn by seed",
-                "confidence": CONFIDENCE,
-                "resamples": RESAMPLES,
-                "seed": SEED,
-            },
-            "groups": [asdict(group) for group in found.groups],
-            "controllers": [asdict(difference) for difference in found.against],
-            "controllers_by_depth": {
-                depth: [asdict(difference) for difference in differences]
-                for depth, differences in found.against_by_depth.items()
-            },
-            "cases": [asdict(difference) for difference in found.cases],
-            "worlds": [asdict(group) for group in found.worlds],
-            "predictions": [asdict(group) for group in found.predictions],
-            "endings": [asdict(ending) for ending in found.endings],
+            **self.findings.values(),
             "worst": [
-                {"index": rows.value("index", row), "true_error_mm": rows.value("true_error_mm", row)}
-                | {"outcome": rows.value("outcome", row), "command": self.again[row]}
-                for row in found.worst
+                {name: rows.value(name, row) for name in ("index", "true_error_mm", "outcome")}
+                | {"command": self.again[row]}
+                for row in self.findings.worst
             ],
         }
 
@@ -78,16 +55,9 @@ def write_report(folder: Path, out: Path | None = None, tuning: Path | None = No
         place.mkdir(parents=True, exist_ok=True)
         listed = [*findings.worst, *(ending.first for ending in findings.endings)]
         again = commands(findings.study.rows, listed, place)
-        figures = _figures(findings, place)
+        figures = draw_figures(findings, place)
         page = place / REPORT_FILE
         page.write_text(page_text(findings, figures, again, tuned), encoding="utf-8", newline="\n")
     except OSError as error:
         raise InputError(f"{place}: cannot be written: {error.strerror}") from None
     return Report(page, figures, findings, again)
-
-
-def _figures(findings: Findings, place: Path) -> list[Drawn]:
-    names = findings.design.controller.names
-    order = [*controllers_in_order(), *sorted(set(names) - set(METHODS))]
-    looks = [order.index(name) for name in names]
-    return draw_figures(findings.study.rows, findings.design, looks, findings.against, findings.cases, place)

@@ -1,32 +1,32 @@
-"""What the rows of a study come to: groups, paired differences, what did not finish, the worst."""
+"""Statistics of the rows of a study: groups, paired differences, how insertions ended, the worst."""
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import count
 from math import isnan, nan
 
 import numpy as np
 
-from flexneedle.study.report.design import Design
+from flexneedle.study.report.design import Design, Factor
 from flexneedle.study.report.rows import Codes, Flags, Floats, Rows
 from flexneedle.study.report.statistics import Estimate, beyond_largest, estimates, mean, quantile, ratio, sd
 
 DONE = "done"
-_MOST_DEPTHS, _DEPTH_BANDS = 8, 5
 HIT_MM = 1.0  # radius of the paper's target circles
+_MOST_DEPTHS, _DEPTH_BANDS = 8, 5
 _NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
 @dataclass(frozen=True)
 class Group:
-    """The insertions that share a level of every factor.
+    """Insertions that share levels of factors.
 
-    name: its levels as one line; levels: name of the level by factor; count, finished: insertions; known: finished
+    name: their levels as one line; levels: name of the level by factor; count, finished: insertions; known: finished
     ones whose true error is known; missed: of those, ended more than 1 mm from the target; unconverged: insertions
     with a period that did not converge, finished or not, and how many such periods; seeds: different ones;
     largest_mm: of the true errors; largest_period_ratio: of the periods over the plan's;
-    beyond_largest: share of all insertions that may lie beyond it, with 95 % confidence; estimates: by name, over
+    beyond_largest: share of all insertions that may be beyond it, with 95 % confidence; estimates: by name, over
     the finished.
     """
 
@@ -42,7 +42,7 @@ class Group:
     largest_mm: float
     largest_period_ratio: float
     beyond_largest: float
-    estimates: dict[str, Estimate] = field(default_factory=dict)
+    estimates: dict[str, Estimate]
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Difference:
     """Mean paired difference (mm) of true errors, `name` minus `against`, in insertions alike in all else.
 
     pairs: both finished; left_out: pairs of which one did not; verdict: "better" if the interval of the difference
-    lies below 0, "worse" if above, else "not separable"; None without an interval.
+    is below 0, "worse" if above, else "not separable"; None without an interval.
     """
 
     name: str
@@ -77,20 +77,17 @@ def finished(rows: Rows) -> Flags:
     return np.array([outcome == DONE for outcome in rows.text("outcome")], dtype=bool)
 
 
-def groups_of(rows: Rows, design: Design) -> list[Group]:
-    """Return the groups of a design in the order of its factors."""
-    done = finished(rows)
-    factors = {factor.key: factor for factor in design.factors}
-    groups = []
-    for levels, members in members_of(design):
-        at = (factors[key].level(factors[key].names.index(name)) for key, name in levels.items())
-        groups.append(_group(rows, members, done, ", ".join(at), levels))
-    return groups
+def groups_of(rows: Rows, factors: Sequence[Factor]) -> list[Group]:
+    """Return a group for each combination of levels that occurs, in the order of the factors."""
+    done, title = finished(rows), {f.key: dict(zip(f.names, f.titles, strict=True)) for f in factors}
+    return [
+        _group(rows, members, done, ", ".join(title[key][name] for key, name in levels.items()), levels)
+        for levels, members in members_of(factors)
+    ]
 
 
-def members_of(design: Design) -> Iterator[tuple[dict[str, str], Codes]]:
+def members_of(factors: Sequence[Factor]) -> Iterator[tuple[dict[str, str], Codes]]:
     """Yield the levels of every factor, by its key, and the rows that share them, in the order of the factors."""
-    factors = design.factors
     combined = np.stack([factor.codes for factor in factors], axis=1)
     levels, codes = np.unique(combined, axis=0, return_inverse=True)
     for number, chosen in enumerate(levels.tolist()):
@@ -102,9 +99,9 @@ def _group(rows: Rows, members: Codes, done: Flags, name: str, levels: dict[str,
     ended = members[done[members]]
     error = rows.number("true_error_mm")[ended]
     known = error[~np.isnan(error)]
-    seeds = seed_codes(rows)[ended]
+    seeds = rows.codes("seed")[ended]
     unconverged = np.nan_to_num(rows.number("unconverged_periods")[members])
-    ratios = _quotient(rows.number("periods")[ended], rows.number("planned_periods")[ended])
+    ratios = quotient(rows.number("periods")[ended], rows.number("planned_periods")[ended])
     return Group(
         name=name,
         levels=levels,
@@ -123,80 +120,72 @@ def _group(rows: Rows, members: Codes, done: Flags, name: str, levels: dict[str,
 
 
 def _estimates(rows: Rows, ended: Codes, seeds: Codes) -> dict[str, Estimate]:
-    names = (
-        *("true_error_mm", "residual_mm", "flips", "planned_flips", "strain_energy_mj"),
-        *("planned_strain_energy_mj", "periods", "planned_periods"),
-    )
-    column = {name: rows.number(name)[ended] for name in names}
-    error = column["true_error_mm"]
+    def column(name: str) -> Floats:
+        return rows.number(name)[ended]
+
+    error = column("true_error_mm")
+    energy, planned_energy = column("strain_energy_mj"), column("planned_strain_energy_mj")
     statistics = {
         "mean_mm": mean(error),
         "sd_mm": sd(error),
         "median_mm": quantile(error, 0.5),
         "p95_mm": quantile(error, 0.95),
-        "residual_mm": mean(column["residual_mm"]),
-        "flips": mean(column["flips"]),
-        "planned_flips": mean(column["planned_flips"]),
-        "energy_mj": mean(column["strain_energy_mj"]),
-        "planned_energy_mj": mean(column["planned_strain_energy_mj"]),
-        "energy_ratio": ratio(column["strain_energy_mj"], column["planned_strain_energy_mj"]),
-        "period_ratio": ratio(column["periods"], column["planned_periods"]),
+        "residual_mm": mean(column("residual_mm")),
+        "flips": mean(column("flips")),
+        "planned_flips": mean(column("planned_flips")),
+        "energy_mj": mean(energy),
+        "planned_energy_mj": mean(planned_energy),
+        "energy_ratio": ratio(energy, planned_energy),
+        "period_ratio": ratio(column("periods"), column("planned_periods")),
     }
     return estimates(statistics, _dense(seeds))
 
 
-def controller_differences(rows: Rows, design: Design) -> list[Difference]:
-    """Return the first controller against each other one, in insertions of the same seed, target and settings."""
-    everywhere = np.ones(len(rows), dtype=bool)
-    return _against_first(rows, design, everywhere)
+def controller_differences(rows: Rows, design: Design, among: Flags | None = None) -> list[Difference]:
+    """Return the first controller minus each other one, in insertions of the same seed, target and settings.
+
+    among (n,): which rows are compared (default: all).
+    """
+    chosen = np.ones(len(rows), dtype=bool) if among is None else among
+    keys, controller = pair_keys(rows, design.besides(design.controller)), design.controller
+    ours, *others = (chosen & (controller.codes == k) for k in range(len(controller.names)))
+    return [
+        _difference(rows, keys, (ours, theirs), (controller.names[0], name, ""))
+        for theirs, name in zip(others, controller.names[1:], strict=True)
+    ]
 
 
 def differences_by_depth(rows: Rows, design: Design) -> dict[str, list[Difference]]:
     """Return the same at each depth of the target, by the name of the depth."""
-    codes, names = depth_levels(rows)
-    return {name: _against_first(rows, design, codes == k) for k, name in enumerate(names)}
-
-
-def depth_levels(rows: Rows) -> tuple[Codes, list[str]]:
-    """Return the depth of each row's target as a level, and the names; many depths are put into bands."""
-    depth = rows.number("target_depth_mm")
-    levels, codes = np.unique(depth, return_inverse=True)
-    if len(levels) <= _MOST_DEPTHS:
-        return codes, [f"{level:g}" for level in levels.tolist()]
-    edges = np.linspace(levels[0], levels[-1], _DEPTH_BANDS + 1)
-    band = np.searchsorted(edges[1:-1], depth, side="right")
-    used, dense = np.unique(band, return_inverse=True)
-    return dense, [f"{edges[k]:.3g} to {edges[k + 1]:.3g}" for k in used.tolist()]
-
-
-def _against_first(rows: Rows, design: Design, among: Flags) -> list[Difference]:
-    ours, *others = range(len(design.controller.names))
-    keys = pair_keys(rows, [factor.exact for factor in (design.cases, *design.axes, *design.others)])
-    codes, names = design.controller.codes, design.controller.names
-    return [
-        _difference(
-            rows, keys, (among & (codes == ours), among & (codes == other)), (names[ours], names[other], "")
-        )
-        for other in others
-    ]
+    depth = depths(rows)
+    return {
+        name: controller_differences(rows, design, depth.codes == k) for k, name in enumerate(depth.names)
+    }
 
 
 def case_differences(rows: Rows, design: Design) -> list[Difference]:
-    """Return each case against the base case, the first, for each controller."""
-    factors = (design.controller, *design.axes, *design.others)
-    keys = pair_keys(rows, [factor.exact for factor in factors])
-    cases, controller = design.cases, design.controller
+    """Return each case minus the base case, the first, for each controller."""
+    keys, cases = pair_keys(rows, design.besides(design.cases)), design.cases
     return [
-        _difference(
-            rows,
-            keys,
-            ((cases.codes == case) & own, (cases.codes == 0) & own),
-            (cases.names[case], cases.names[0], name),
-        )
-        for number, name in enumerate(controller.names)
-        for own in (controller.codes == number,)
+        _difference(rows, keys, ((cases.codes == case) & own, (cases.codes == 0) & own), names)
+        for number, name in enumerate(design.controller.names)
+        for own in (design.controller.codes == number,)
         for case in range(1, len(cases.names))
+        for names in ((cases.names[case], cases.names[0], name),)
     ]
+
+
+def depths(rows: Rows) -> Factor:
+    """Return the depth of each row's target as a factor; many depths are put into bands."""
+    depth = rows.number("target_depth_mm")
+    levels, codes = np.unique(depth, return_inverse=True)
+    names = [f"{level:g}" for level in levels.tolist()]
+    if len(levels) > _MOST_DEPTHS:
+        edges = np.linspace(levels[0], levels[-1], _DEPTH_BANDS + 1)
+        used, codes = np.unique(np.searchsorted(edges[1:-1], depth, side="right"), return_inverse=True)
+        names = [f"{edges[k]:.3g} to {edges[k + 1]:.3g}" for k in used.tolist()]
+    places = np.arange(len(names), dtype=float)
+    return Factor("depth", "depth of the target (mm)", tuple(names), tuple(names), places, codes)
 
 
 def endings(rows: Rows) -> list[Ending]:
@@ -233,7 +222,7 @@ def _difference(
     known = (done & ~np.isnan(error))[both].all(axis=1)
     pairs = both[known]
     difference = error[pairs[:, 0]] - error[pairs[:, 1]]
-    found = estimates({"mean": mean(difference)}, _dense(seed_codes(rows)[pairs[:, 0]]))["mean"]
+    found = estimates({"mean": mean(difference)}, _dense(rows.codes("seed")[pairs[:, 0]]))["mean"]
     name, against, controller = names
     return Difference(name, against, controller, len(pairs), int((~known).sum()), found, _verdict(found))
 
@@ -246,10 +235,10 @@ def _verdict(difference: Estimate) -> str | None:
     return "worse" if difference.low > 0.0 else "not separable"
 
 
-def pair_keys(rows: Rows, factors: Sequence[Codes]) -> Codes:
+def pair_keys(rows: Rows, factors: Sequence[Factor]) -> Codes:
     """Return a number (n,) for each row, the same for rows alike in seed, target, repeat and factors."""
     names = ("seed", "plan_seed", "target_depth_mm", "target_lateral_mm", "repeat")
-    columns = np.stack([*(rows.codes(name)[0] for name in names), *factors], axis=1)
+    columns = np.stack([*map(rows.codes, names), *(factor.codes for factor in factors)], axis=1)
     return np.unique(columns, axis=0, return_inverse=True)[1].ravel()
 
 
@@ -262,16 +251,12 @@ def _by_key(keys: Codes, members: Codes) -> dict[tuple[int, int], int]:
     }
 
 
-def seed_codes(rows: Rows) -> Codes:
-    """Return a number (n,) for each row, the same for the same seed."""
-    return rows.codes("seed")[0]
-
-
 def _dense(codes: Codes) -> Codes:
     return np.unique(codes, return_inverse=True)[1].astype(np.int64)
 
 
-def _quotient(over: Floats, under: Floats) -> Floats:
+def quotient(over: Floats, under: Floats) -> Floats:
+    """Return `over / under` (n,), NaN where `under` is not positive or not known."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(under > 0, over / under, nan)
 
