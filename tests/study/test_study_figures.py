@@ -1,5 +1,6 @@
 """Figures of studies hold what they must: judged by their artists, not by their pixels."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import matplotlib
@@ -10,19 +11,15 @@ from matplotlib.colors import to_hex
 from matplotlib.text import Text
 from numpy.testing import assert_allclose
 
-from flexneedle.plot.layout import look
+from flexneedle.plot.layout import Panel, look
 from flexneedle.plot.style import save
-from flexneedle.study.plot.comparison import DifferencePanel, DifferenceRow, difference_figure
-from flexneedle.study.plot.cumulative import SharePanel, ShareRow, share_figure
-from flexneedle.study.plot.distributions import (
-    ErrorPanel,
-    ErrorRow,
-    error_rows_figure,
-    errors_by_level_figure,
-)
-from flexneedle.study.plot.energy import EnergyPanel, energy_figure
-from flexneedle.study.plot.sweeps import Sweep, sweep_figure
-from flexneedle.study.plot.targeting import TargetPanel, targeting_figure
+from flexneedle.study.plot.comparison import DifferenceRow, difference_figure
+from flexneedle.study.plot.distributions import error_figure
+from flexneedle.study.plot.energy import energy_figure
+from flexneedle.study.plot.samples import Sample
+from flexneedle.study.plot.shares import share_figure
+from flexneedle.study.plot.sweeps import sweep_figure
+from flexneedle.study.plot.targeting import Tips, targeting_figure
 
 TARGETS = np.array([(depth, aside) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for aside in (-5.0, 0.0, 5.0)])
 NAMES = ("adaptive-mpc", "open-loop", "bevel-only", "resolved-rate", "broyden-mpc", "ce-mpc", "another one")
@@ -39,34 +36,46 @@ def target_panel(number=0, spread=0.1, repeats=10, targets=TARGETS, unfinished=(
     done = ~np.isin(np.arange(len(there)), unfinished)
     alarm = f"{len(unfinished)} not finished" if unfinished else ""
     note = "mean 0.06, 95 % 0.13, max 0.16 mm"
-    return TargetPanel(NAMES[number], note, alarm, look(number), there, tips, done)
+    return Panel(NAMES[number], note, look(number).color, Tips(there, tips, done), alarm)
 
 
-def error_rows(count=150):
+def samples(count=150):
     return [
-        ErrorRow(name, look(k), lognormal(0.05 * (k + 1), count, k), count + (k == 2))
+        Sample(name, look(k), lognormal(0.05 * (k + 1), count, k), count + (k == 2))
         for k, name in enumerate(NAMES)
     ]
 
 
+def by_controller(rows):
+    return error_figure([Panel("", "", "#000000", rows)], "")
+
+
 def error_panels(number=7, count=30):
     levels = ("all", "25", "30", "35", "40", "45")
+    note, alarm = "mean 0.06, 95 % 0.13, max 0.16 mm", "2 not finished"
     return [
-        ErrorPanel(
-            NAMES[k], "mean 0.06, 95 % 0.13, max 0.16 mm", "2 not finished",
-            [ErrorRow(name, look(k), lognormal(0.05 * (k + 1), count, k), count) for name in levels],
+        Panel(
+            NAMES[k],
+            note,
+            look(k).color,
+            [Sample(name, look(k), lognormal(0.05 * (k + 1), count, k), count) for name in levels],
+            alarm,
         )
         for k in range(number)
-    ]  # fmt: skip
+    ]
 
 
-def sweeps(number, levels=5, missing=0):
+def sweeps(number, names=("0", "0.5", "1", "1.5", "2"), missing=0):
     return [
-        Sweep(
+        Panel(
             NAMES[k],
-            look(k),
-            [lognormal(0.05 * (k + 1) * (m + 1), 40, m) for m in range(levels)],
-            [40 + missing] * levels,
+            f"n = {40 * len(names)}",
+            look(k).color,
+            [
+                Sample(name, look(k), lognormal(0.05 * (k + 1) * (m + 1), 40, m), 40 + missing)
+                for m, name in enumerate(names)
+            ],
+            f"{missing * len(names)} not finished" if missing else "",
         )
         for k in range(number)
     ]
@@ -74,12 +83,11 @@ def sweeps(number, levels=5, missing=0):
 
 def energy_panels(number, count=150):
     return [
-        EnergyPanel(
+        Panel(
             NAMES[k],
             "medians 1.70 mJ, 0.060 mm",
-            look(k),
-            lognormal(1.7, count, k),
-            lognormal(0.1, count, 50 + k),
+            look(k).color,
+            np.stack([lognormal(1.7, count, k), lognormal(0.1, count, 50 + k)], axis=1),
         )
         for k in range(number)
     ]
@@ -88,28 +96,32 @@ def energy_panels(number, count=150):
 def difference_panels(number, rows=12):
     rng = np.random.default_rng(0)
     return [
-        DifferencePanel(
-            NAMES[k], "base case: mean 0.060 mm", look(k).color,
+        Panel(
+            NAMES[k],
+            "base case: mean 0.060 mm",
+            look(k).color,
             [
                 DifferenceRow(f"phantom entry {row} doubled", look(k), m, m - 0.02, m + 0.02)
                 for row, m in enumerate(rng.normal(0.0, 0.05, rows).tolist())
             ],
         )
         for k in range(number)
-    ]  # fmt: skip
+    ]
 
 
 def share_panels(number, controllers=7, count=150):
     return [
-        SharePanel(
-            ("perfect", "real", "structure")[k], f"{count} worlds",
+        Panel(
+            ("perfect", "real", "structure")[k],
+            f"{count} worlds",
+            "#000000",
             [
-                ShareRow(NAMES[j], look(j), lognormal(0.05 * (j + 1), count, j), count + j)
+                Sample(NAMES[j], look(j), lognormal(0.05 * (j + 1), count, j), count + j)
                 for j in range(controllers)
             ],
         )
         for k in range(number)
-    ]  # fmt: skip
+    ]
 
 
 def far_apart():
@@ -122,28 +134,26 @@ def far_apart():
         (0.1, 0.2, 0.3),
     )
     rows = [DifferenceRow(f"other {k}", look(k), m, low, high) for k, (low, m, high) in enumerate(ends)]
-    return DifferencePanel("default", "left of zero: smaller errors", "#000000", rows)
+    return Panel("default", "left of zero: smaller errors", "#000000", rows)
 
 
 PLACES = np.array([0.0, 0.5, 1.0, 1.5, 2.0])
-LEVELS = ("0", "0.5", "1", "1.5", "2")
+CLOSE = [f"{x:.3f}" for x in np.linspace(0, 1, 20)]
 FIGURES = {
     "targeting, one": lambda: targeting_figure([target_panel(unfinished=(3,))]),
     "targeting, all": lambda: targeting_figure(
         [target_panel(k, 0.2 * k, unfinished=(3, 9)) for k in range(7)]
     ),
     "targeting, one target": lambda: targeting_figure([target_panel(targets=TARGETS[:1])]),
-    "errors": lambda: error_rows_figure(error_rows()),
-    "errors, one": lambda: error_rows_figure(error_rows()[:1]),
-    "depths, one": lambda: errors_by_level_figure(error_panels(1), "depth of the target (mm)"),
-    "depths, two": lambda: errors_by_level_figure(error_panels(2), "depth of the target (mm)"),
-    "depths, all": lambda: errors_by_level_figure(error_panels(), "depth of the target (mm)"),
-    "sweep, one": lambda: sweep_figure(sweeps(1, missing=1), "G (mm)", PLACES, LEVELS),
-    "sweep, three": lambda: sweep_figure(sweeps(3), "mismatch", PLACES, LEVELS),
-    "sweep, all": lambda: sweep_figure(sweeps(7, missing=2), "mismatch", PLACES, LEVELS),
-    "sweep, close": lambda: sweep_figure(
-        sweeps(1, 20, 40), "mismatch", np.linspace(0, 1, 20), [f"{x:.3f}" for x in np.linspace(0, 1, 20)]
-    ),
+    "errors": lambda: by_controller(samples()),
+    "errors, one": lambda: by_controller(samples()[:1]),
+    "depths, one": lambda: error_figure(error_panels(1), "depth of the target (mm)"),
+    "depths, two": lambda: error_figure(error_panels(2), "depth of the target (mm)"),
+    "depths, all": lambda: error_figure(error_panels(), "depth of the target (mm)"),
+    "sweep, one": lambda: sweep_figure(sweeps(1, missing=1), "G (mm)", PLACES),
+    "sweep, three": lambda: sweep_figure(sweeps(3), "mismatch", PLACES),
+    "sweep, all": lambda: sweep_figure(sweeps(7, missing=2), "mismatch", PLACES),
+    "sweep, close": lambda: sweep_figure(sweeps(1, CLOSE, 40), "mismatch", np.linspace(0, 1, 20)),
     "energy, one": lambda: energy_figure(energy_panels(1)),
     "energy, all": lambda: energy_figure(energy_panels(7)),
     "shares, one": lambda: share_figure(share_panels(1)),
@@ -188,6 +198,9 @@ def dots(ax, label):
     return [found for found in ax.collections if found.get_label() == label]
 
 
+TIP = "true tip at the end"
+
+
 @pytest.mark.parametrize("name", FIGURES)
 def test_no_labels_overlap(name):
     assert overlapping(FIGURES[name]()) == []
@@ -207,6 +220,7 @@ def test_the_same_data_give_the_same_bytes(tmp_path, name):
 
 def test_circles_have_a_radius_of_1_mm_to_scale():
     figure = targeting_figure([target_panel(k) for k in range(3)])
+    shown_texts(figure)
     for ax in figure.axes:
         (circles,) = (found for found in ax.collections if isinstance(found, PatchCollection))
         boxes = [path.get_extents() for path in circles.get_paths()]
@@ -220,15 +234,15 @@ def test_circles_have_a_radius_of_1_mm_to_scale():
 def test_every_finished_tip_is_a_dot_and_every_other_a_cross():
     panel = target_panel(unfinished=(0, 7))
     ax = targeting_figure([panel]).axes[0]
-    (tips,) = dots(ax, "true tip")
-    assert_allclose(tips.get_offsets(), panel.tips[panel.done])
-    (crosses,) = lines(ax, "not finished")
-    assert_allclose(crosses.get_xydata(), panel.tips[[0, 7]])
+    (tips,) = dots(ax, TIP)
+    assert_allclose(tips.get_offsets(), panel.content.tips[panel.content.done])
+    (crosses,) = lines(ax, "tip of an insertion not finished")
+    assert_allclose(crosses.get_xydata(), panel.content.tips[[0, 7]])
 
 
 def test_tips_far_outside_are_counted():
     panel = target_panel()
-    panel.tips[:2] += 30.0
+    panel.content.tips[:2] += 30.0
     figure = targeting_figure([panel, target_panel(1)])
     assert texts(figure).count("2 tips outside") == 1
     assert figure.axes[0].get_xlim()[1] == pytest.approx(45.0 + 6.0)
@@ -237,8 +251,8 @@ def test_tips_far_outside_are_counted():
 def test_the_close_up_shows_where_tips_ended_from_their_targets():
     panel = target_panel()
     close = targeting_figure([panel]).axes[1]
-    assert_allclose(dots(close, "true tip")[0].get_offsets(), panel.tips - panel.targets)
-    farthest = np.hypot(*(panel.tips - panel.targets).T).max()
+    assert_allclose(dots(close, TIP)[0].get_offsets(), panel.content.tips - panel.content.targets)
+    farthest = np.hypot(*(panel.content.tips - panel.content.targets).T).max()
     assert close.get_xlim()[1] == pytest.approx(1.15 * farthest)
 
 
@@ -249,31 +263,31 @@ def test_targets_that_are_many_are_laid_on_one_another():
     ax = targeting_figure([panel]).axes[0]
     (circles,) = (found for found in ax.collections if isinstance(found, PatchCollection))
     assert len(circles.get_paths()) == 1
-    assert_allclose(dots(ax, "true tip")[0].get_offsets(), panel.tips - panel.targets)
+    assert_allclose(dots(ax, TIP)[0].get_offsets(), panel.content.tips - panel.content.targets)
 
 
 def test_unknown_tips_are_left_out():
     panel = target_panel(unfinished=(0,))
-    panel.tips[0] = np.nan
-    drawn = [dot.get_offsets() for ax in targeting_figure([panel]).axes for dot in dots(ax, "true tip")]
+    panel.content.tips[0] = np.nan
+    drawn = [dot.get_offsets() for ax in targeting_figure([panel]).axes for dot in dots(ax, TIP)]
     places = np.concatenate([np.ma.filled(offsets, np.nan) for offsets in drawn])
     assert len(places) > 0
-    assert np.isfinite(places).all(axis=1).sum() == len(drawn) * (len(panel.tips) - 1)
+    assert np.isfinite(places).all(axis=1).sum() == len(drawn) * (len(panel.content.tips) - 1)
 
 
 def test_rows_show_quartiles_median_mean_and_95_percent():
-    row = error_rows()[3]
-    ax = error_rows_figure([row]).axes[0]
+    row = samples()[3]
+    ax = by_controller([row]).axes[0]
     errors = row.errors
-    assert_allclose(sorted(dots(ax, "errors")[0].get_offsets()[:, 0]), np.sort(errors))
-    assert_allclose(lines(ax, "quartiles")[0].get_xdata(), np.quantile(errors, (0.25, 0.75)))
+    assert_allclose(sorted(dots(ax, "an insertion")[0].get_offsets()[:, 0]), np.sort(errors))
+    assert_allclose(lines(ax, "middle half")[0].get_xdata(), np.quantile(errors, (0.25, 0.75)))
     assert_allclose(lines(ax, "median")[0].get_xdata(), [np.median(errors)])
     assert_allclose(lines(ax, "mean")[0].get_xdata(), [errors.mean()])
     assert_allclose(lines(ax, "95 %")[0].get_xdata(), [np.quantile(errors, 0.95)] * 2)
 
 
 def test_rows_say_how_many_did_not_finish():
-    found = texts(error_rows_figure(error_rows()))
+    found = texts(by_controller(samples()))
     assert found.count("n = 150") == 6
     assert "n = 151\n1 not finished" in found
 
@@ -285,9 +299,9 @@ def test_a_controller_has_one_colour_in_all_figures():
         energy_figure(energy_panels(2)),
     )
     for figure in figures:
-        label = "true tip" if figure is figures[0] else "own"
+        label = TIP if figure is figures[0] else "an insertion"
         assert to_hex(dots(figure.axes[1], label)[0].get_facecolor()[0]) == color
-    _, median = lines(sweep_figure(sweeps(2), "x", PLACES, LEVELS).axes[0], "median")
+    _, median = lines(sweep_figure(sweeps(2), "x", PLACES).axes[0], "median")
     assert median.get_color() == look(1).color
 
 
@@ -297,13 +311,14 @@ def test_looks_differ_for_any_number_of_controllers():
 
 def test_sweeps_show_median_quartiles_and_mean_at_each_level():
     (sweep,) = sweeps(1)
-    ax = sweep_figure([sweep], "G (mm)", PLACES, LEVELS).axes[0]
+    errors = [row.errors for row in sweep.content]
+    ax = sweep_figure([sweep], "G (mm)", PLACES).axes[0]
     assert_allclose(
-        lines(ax, "median")[0].get_xydata(), np.column_stack([PLACES, list(map(np.median, sweep.errors))])
+        lines(ax, "median")[0].get_xydata(), np.column_stack([PLACES, list(map(np.median, errors))])
     )
-    assert_allclose(lines(ax, "mean")[0].get_ydata(), [errors.mean() for errors in sweep.errors])
+    assert_allclose(lines(ax, "mean")[0].get_ydata(), [own.mean() for own in errors])
     (band,) = (found for found in ax.collections if isinstance(found, PolyCollection))
-    low, high = (np.quantile(sweep.errors[4], q) for q in (0.25, 0.75))
+    low, high = (np.quantile(errors[4], q) for q in (0.25, 0.75))
     at_end = band.get_paths()[0].vertices
     at_end = at_end[at_end[:, 0] == 2.0][:, 1]
     assert_allclose([at_end.min(), at_end.max()], [low, high])
@@ -312,16 +327,17 @@ def test_sweeps_show_median_quartiles_and_mean_at_each_level():
 
 def test_a_level_without_a_finished_insertion_leaves_a_gap():
     (sweep,) = sweeps(1)
-    empty = Sweep(sweep.name, sweep.look, [*sweep.errors[:4], np.empty(0)], sweep.counts)
-    ax = sweep_figure([empty], "G (mm)", PLACES, LEVELS).axes[0]
+    last = replace(sweep.content[4], errors=np.empty(0))
+    empty = replace(sweep, content=[*sweep.content[:4], last])
+    ax = sweep_figure([empty], "G (mm)", PLACES).axes[0]
     assert np.isnan(lines(ax, "median")[0].get_ydata()[4])
     assert {"not finished:", "40"} <= set(texts(ax.figure))
 
 
 def test_a_share_is_that_of_the_insertions_that_end_nearer():
     """Steps at the errors; short of 100 % by what did not finish."""
-    row = ShareRow("a", look(0), np.array([0.4, 0.1, 0.2]), 4)
-    (ax,) = share_figure([SharePanel("real", "4 worlds", [row])]).axes
+    row = Sample("a", look(0), np.array([0.4, 0.1, 0.2]), 4)
+    (ax,) = share_figure([Panel("real", "4 worlds", "#000000", [row])]).axes
     (line,) = lines(ax, "a")
     assert_allclose(line.get_xdata()[:3], [0.1, 0.2, 0.4])
     assert_allclose(line.get_ydata(), [25.0, 50.0, 75.0, 75.0])
@@ -329,9 +345,12 @@ def test_a_share_is_that_of_the_insertions_that_end_nearer():
 
 
 def test_where_nothing_finished_the_share_is_zero():
-    row = ShareRow("a", look(0), np.empty(0), 4)
-    (ax,) = share_figure([SharePanel("real", "4 worlds", [row])]).axes
+    row = Sample("a", look(0), np.empty(0), 4)
+    (ax,) = share_figure([Panel("real", "4 worlds", "#000000", [row])]).axes
     assert lines(ax, "a")[0].get_ydata().tolist() == [0.0]
+
+
+SURE, UNSURE = "mean with 95 % interval", "not separable from no difference"
 
 
 def test_differences_that_hold_zero_are_hollow():
@@ -341,8 +360,8 @@ def test_differences_that_hold_zero_are_hollow():
         DifferenceRow("not", look(0), 0.1, -0.05, 0.25),
         DifferenceRow("no interval", look(0), 0.1, np.nan, np.nan),
     ]
-    ax = difference_figure([DifferencePanel("a", "b", "#000000", rows)], "x (mm)").axes[0]
-    faces = [line.get_markerfacecolor() for line in lines(ax, "mean")]
+    ax = difference_figure([Panel("a", "b", "#000000", rows)], "x (mm)").axes[0]
+    faces = [line.get_markerfacecolor() for line in ax.get_lines() if line.get_label() in (SURE, UNSURE)]
     assert faces == [look(0).color, look(0).color, "white", "white"]
     ends = [line.get_xdata().tolist() for line in lines(ax, "interval")]
     assert ends == [[row.low, row.high] for row in rows[:3]]
@@ -367,9 +386,9 @@ def test_differences_of_one_size_have_an_even_scale():
 
 
 def test_an_error_of_nothing_is_still_drawn():
-    row = ErrorRow("perfect", look(0), np.array([0.0, 0.1]), 2)
-    ax = error_rows_figure([row]).axes[0]
-    assert dots(ax, "errors")[0].get_offsets()[:, 0].min() == pytest.approx(1e-3)
+    row = Sample("perfect", look(0), np.array([0.0, 0.1]), 2)
+    ax = by_controller([row]).axes[0]
+    assert dots(ax, "an insertion")[0].get_offsets()[:, 0].min() == pytest.approx(1e-3)
 
 
 def test_ten_thousand_dots_make_a_small_drawing(tmp_path):
@@ -380,8 +399,38 @@ def test_ten_thousand_dots_make_a_small_drawing(tmp_path):
 
 def test_names_are_no_mathematics_and_never_too_long():
     name = "$5_phantom$ " + "long " * 30
-    panel = target_panel()
-    named = TargetPanel(name, panel.note, "", panel.look, panel.targets, panel.tips, panel.done)
+    named = replace(target_panel(), title=name)
     figure = targeting_figure([named] * 3)
     assert overlapping(figure) == []
     assert any(text.startswith("$5_phantom$ long") and "…" in text for text in texts(figure))
+
+
+def legend_names(figure):
+    return [text.get_text() for found in figure.legends for text in found.get_texts()]
+
+
+def test_legends_name_what_is_drawn_and_nothing_else():
+    assert legend_names(targeting_figure([target_panel()])) == ["target, circle of 1 mm radius", TIP]
+    assert legend_names(targeting_figure([target_panel(unfinished=(3,))])) == [
+        *("target, circle of 1 mm radius", TIP, "tip of an insertion not finished"),
+    ]
+    row = Sample("near", look(0), lognormal(0.01), 150)
+    assert "1 mm" not in legend_names(by_controller([row]))
+    assert "1 mm" in legend_names(by_controller([replace(row, errors=lognormal(0.5))]))
+    assert legend_names(by_controller([replace(row, errors=np.empty(0))])) == ["1 mm"]
+    assert "of the other panels" in legend_names(energy_figure(energy_panels(2)))
+    assert "of the other panels" not in legend_names(energy_figure(energy_panels(1)))
+    assert legend_names(difference_figure(difference_panels(1, 1), "x"))[-1] in (SURE, UNSURE)
+    assert len(legend_names(difference_figure(difference_panels(1, 1), "x"))) == 1
+
+
+def test_one_millimetre_is_drawn_only_where_the_scale_reaches_it():
+    (near,), (far,) = (by_controller([Sample("a", look(0), lognormal(m), 150)]).axes for m in (0.01, 0.5))
+    assert lines(near, "1 mm") == []
+    assert lines(far, "1 mm")[0].get_xdata() == [1.0, 1.0]
+
+
+def test_panels_below_and_left_have_the_labels_of_their_axes():
+    axes = error_figure(error_panels(5), "depth of the target (mm)").axes
+    assert [bool(ax.get_xlabel()) for ax in axes] == [False, False, True, True, True]
+    assert [bool(ax.get_ylabel()) for ax in axes] == [True, False, False, True, False]

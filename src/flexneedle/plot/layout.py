@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import ceil, floor, log10
 from textwrap import shorten
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,20 +13,22 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from flexneedle.plot.style import BAD, QUIET, WIDTH, axes, new_figure
+from flexneedle.plot.style import BAD, QUIET, TARGET, WIDTH, new_figure
 
 Floats = NDArray[np.float64]
+Content = TypeVar("Content")
 
 MOST_PANELS = 9
-OVERLAID = 3  # so many controllers in one panel; more get a panel each
+OVERLAID = 3  # controllers in one panel; more get a panel each
 MANY = 1500  # dots; more are small and drawn as an image inside the SVG
 FAINT = "#c9cbd0"
+LIMIT: Any = {"color": TARGET, "linewidth": 1.0, "linestyle": (0, (4, 2)), "label": "1 mm"}
 
 # Okabe and Ito's colours without their yellow, which is too light for lines on white, with a marker each.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#4d535c")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
-_LEFT, _RIGHT, _GAP, _TITLE, _FOOT, _LEGEND = 0.62, 0.15, 0.3, 0.5, 0.45, 0.3  # inches
+_LEGEND = 0.45  # inches
 
 
 @dataclass(frozen=True)
@@ -38,22 +40,14 @@ class Look:
 
 
 @dataclass(frozen=True, eq=False)
-class Panels:
-    """A figure with panels of one size, row by row."""
+class Panel(Generic[Content]):
+    """What one panel of a figure shows. Above it are title and note, at the right what must not be overlooked."""
 
-    figure: Figure
-    axes: list[Axes]
-    columns: int
-
-    @property
-    def lowest(self) -> list[Axes]:
-        """The panels with none below."""
-        return self.axes[-self.columns :] if self.columns else []
-
-    @property
-    def leftmost(self) -> list[Axes]:
-        """The panels with none to their left."""
-        return self.axes[:: self.columns]
+    title: str
+    note: str
+    color: str
+    content: Content
+    alarm: str = ""
 
 
 def look(number: int) -> Look:
@@ -62,49 +56,69 @@ def look(number: int) -> Look:
     return Look(_COLORS[number % len(_COLORS)], _MARKERS[(number + again) % len(_MARKERS)])
 
 
-def panel_width(count: int, left: float = _LEFT) -> float:
-    """Return the width (inches) of each of `count` panels; `left`: what labels take."""
-    columns = _columns(count)
-    return (WIDTH - left - _RIGHT - (columns - 1) * _GAP) / columns
+def columns_of(count: int) -> int:
+    """Return in how many columns `count` panels are laid out."""
+    return {1: 1, 2: 2, 4: 2}.get(count, 3)
 
 
-def panels(count: int, ratio: float, left: float = _LEFT, title: float = _TITLE) -> Panels:
-    """Return `count` empty panels, their height `ratio` times their width, with room for a legend.
+def ticks_of(count: int) -> int:
+    """Return how many ticks there is room for along each of `count` panels."""
+    return {1: 9, 2: 7}.get(columns_of(count), 5)
 
-    left, title: inches for the labels of a row's first panel, and above each panel.
+
+def sheet(
+    height: float, rows: int = 1, columns: int = 1, widths: Sequence[float] | None = None
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure with axes row by row, `height` inches for each row, and room for a legend.
+
+    widths: of the columns, relative to each other (default: equal).
     """
-    columns, width = _columns(count), panel_width(count, left)
-    height = ratio * width
-    figure = new_figure(ceil(count / columns) * (height + title) + _FOOT + _LEGEND)
-    places = [divmod(k, columns) for k in range(count)]
-    made = [
-        axes(figure, left + j * (width + _GAP), title - 0.06 + i * (height + title), width, height)
-        for i, j in places
-    ]
-    return Panels(figure, made, columns)
+    figure = new_figure(rows * height + _LEGEND)
+    figure.set_layout_engine("compressed", w_pad=0.1, h_pad=0.08)  # axes of equal scale leave no gaps
+    return figure, list(figure.subplots(rows, columns, squeeze=False, width_ratios=widths).flat)
 
 
-def head(ax: Axes, title: str, note: str, color: str, alarm: str = "") -> None:
-    """Write title and note above a panel, and at the right what must not be overlooked."""
-    height, width = (float(size) / float(ax.figure.dpi) for size in (ax.bbox.height, ax.bbox.width))
-    most = int((width - 0.06 * len(alarm)) / 0.085)
-    above: dict[str, Any] = {"transform": ax.transAxes}
-    ax.text(0, 1 + 0.19 / height, short(title, most), color=color, weight="bold", **above)
-    ax.text(1, 1 + 0.19 / height, alarm, color=BAD, ha="right", **above)
-    ax.text(0, 1 + 0.05 / height, note, color=QUIET, fontsize=7.5, **above)
+def panels(
+    shown: Sequence[Panel[Any]], height: float, xlabel: str, ylabel: str = ""
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure with empty axes for panels, labelled at the outer ones; `height`: inches for each row."""
+    columns = columns_of(len(shown))
+    figure, made = sheet(height, ceil(len(shown) / columns), columns)
+    for ax in made[len(shown) :]:
+        ax.remove()
+    for k, (ax, panel) in enumerate(zip(made, shown, strict=False)):
+        head(ax, panel, columns)
+        first, lowest = k % columns == 0, k >= len(shown) - columns
+        ax.tick_params(labelleft=first, labelbottom=lowest)
+        ax.set_ylabel(ylabel if first else "")
+        ax.set_xlabel(xlabel if lowest else "")
+    return figure, made[: len(shown)]
 
 
-def legend(figure: Figure, handles: Sequence[Line2D]) -> None:
-    """Name the marks in one row at the foot of the figure."""
+def head(ax: Axes, panel: Panel[Any], columns: int) -> None:
+    """Write title, note and alarm above a panel, one of `columns` side by side."""
+    most = int((WIDTH / columns - 0.7 - 0.06 * len(panel.alarm)) / 0.085)
+    pad = 15.0 if panel.note else 4.0
+    ax.set_title(short(panel.title, most), loc="left", color=panel.color, pad=pad)
+    ax.set_title(panel.alarm, loc="right", color=BAD, weight="normal", pad=pad)
+    ax.annotate(panel.note, (0, 1), (0, 4), "axes fraction", "offset points", color=QUIET, fontsize=7.5)
+
+
+def legend(figure: Figure, handles: Sequence[Line2D], named: Sequence[Line2D] = ()) -> None:
+    """Name the marks in one row at the foot of the figure: of `handles` those whose label an artist has."""
+    drawn = {artist.get_label() for ax in figure.axes for artist in ax.get_children()}
+    shown = [*named, *(handle for handle in handles if handle.get_label() in drawn)]
     figure.legend(
-        handles=handles,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 0.05 / float(figure.get_figheight())),
-        ncols=len(handles),
-        columnspacing=1.6,
-        handlelength=1.8,
-        borderaxespad=0,
+        handles=shown, loc="outside lower center", ncols=len(shown) or 1, columnspacing=1.6, handlelength=1.8
     )
+
+
+def limit_line(ax: Axes, vertical: bool) -> None:
+    """Draw the limit of 1 mm into a panel if its scale reaches there."""
+    low, high = ax.get_xlim() if vertical else ax.get_ylim()
+    draw = ax.axvline if vertical else ax.axhline
+    if low < 1.0 < high:
+        draw(1.0, **LIMIT, zorder=1)
 
 
 def decades(axis: Axis, values: Iterable[Floats], most: int) -> None:
@@ -121,10 +135,6 @@ def decades(axis: Axis, values: Iterable[Floats], most: int) -> None:
     bounds[name](low, high)
     axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
     axis.set_ticks([], minor=True)
-
-
-def _columns(count: int) -> int:
-    return {1: 1, 2: 2, 4: 2}.get(count, 3)
 
 
 def _ticks(low: float, high: float, most: int) -> list[float]:

@@ -193,5 +193,10 @@ def test_the_page_has_the_table_and_the_figure(report):
     assert "within reach + 0.5 mm" in text
     assert report.figures[0].name == "shares"
     assert "targeting" not in {drawn.name for drawn in report.figures}
-    assert "perfect: adaptive-mpc median 0.500 mm" in report.figures[0].alt
+    assert "perfect: 7 worlds; structure: 4 worlds" in report.figures[0].alt
+    row = re.search(
+        rf'{DEFAULT}</th><th scope="row">perfect</th><th scope="row">with a guide</th>(.*?)</tr>', text, re.S
+    )
+    cells = re.findall(r"<td>(.*?)</td>", row[1])
+    assert cells[:4] == ["4", "3", "1", "0.500"]
     assert report.values()["worlds"][0]["levels"]["controller"] == DEFAULT

@@ -1,1 +1,1 @@
-"""Figures of studies. They take arrays and names."""
+"""Figures of studies. They take panels of arrays and names."""

@@ -9,11 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flexneedle.plot.layout import FAINT, Look, Panels, head, legend, panel_width, panels, short
+from flexneedle.plot.layout import FAINT, Look, Panel, legend, panels, short, ticks_of
 from flexneedle.plot.style import INK, QUIET, signed, styled
 
-_ROW = 0.3  # inches
-_WIDE = 10.0  # times what lies evenly around zero: from there on, decades
+_WIDE = 10.0  # times the even part around zero: from there on, decades
+_SURE, _UNSURE = "mean with 95 % interval", "not separable from no difference"
 
 
 @dataclass(frozen=True)
@@ -27,78 +27,59 @@ class DifferenceRow:
     high: float
 
 
-@dataclass(frozen=True, eq=False)
-class DifferencePanel:
-    """Rows under one title."""
-
-    title: str
-    note: str
-    color: str
-    rows: Sequence[DifferenceRow]
-
-
-def difference_figure(shown: Sequence[DifferencePanel], label: str) -> Figure:
+def difference_figure(shown: Sequence[Panel[Sequence[DifferenceRow]]], label: str) -> Figure:
     """Return the figure: a panel each, their rows in the same order, on one scale called `label`."""
+    most = max(len(panel.content) for panel in shown)
     with styled():
-        widest = max(len(short(row.name, 34)) for panel in shown for row in panel.rows)
-        left = max(0.75, 0.3 + 0.062 * widest)
-        most = max(len(panel.rows) for panel in shown)
-        made = panels(len(shown), (_ROW * most + 0.15) / panel_width(len(shown), left), left)
-        for ax, panel in zip(made.axes, shown, strict=True):
-            _draw(ax, panel)
-            head(ax, panel.title, panel.note, panel.color)
-        _share(made, shown, label)
-        legend(made.figure, _handles())
-    return made.figure
+        figure, axes = panels(shown, 0.3 * most + 0.8, label)
+        for ax, panel in zip(axes, shown, strict=True):
+            _draw(ax, panel.content)
+            _scale(ax, [row for other in shown for row in other.content], ticks_of(len(shown)))
+        legend(figure, _handles())
+    return figure
 
 
-def _draw(ax: Axes, panel: DifferencePanel) -> None:
+def _draw(ax: Axes, rows: Sequence[DifferenceRow]) -> None:
     ax.axvline(0.0, color=INK, linewidth=0.8, zorder=1, label="no difference")
-    ax.set_ylim(len(panel.rows) - 0.4, -0.6)
-    ax.set_yticks(range(len(panel.rows)), [short(row.name, 34) for row in panel.rows])
+    ax.set_ylim(len(rows) - 0.4, -0.6)
+    ax.set_yticks(range(len(rows)), [short(row.name, 34) for row in rows])
     ax.tick_params(axis="y", length=0)
     ax.grid(axis="x", color=FAINT, linewidth=0.4)
     ax.set_axisbelow(True)
-    for level, row in enumerate(panel.rows):
-        sure = row.low > 0.0 or row.high < 0.0
-        face = row.look.color if sure else "white"
+    for level, row in enumerate(rows):
         if isnan(row.mean):
-            _say(ax, level, "nothing to compare")
-        if not isnan(row.low):
-            ax.plot(
-                [row.low, row.high],
-                [level, level],
-                color=row.look.color,
-                linewidth=2.0,
-                zorder=3,
-                label="interval",
-            )
-        mark: dict[str, Any] = {"markersize": 6, "markeredgewidth": 1.4, "markeredgecolor": row.look.color}
-        ax.plot([row.mean], [level], row.look.marker, zorder=4, label="mean", markerfacecolor=face, **mark)
+            _write(ax, level, "nothing to compare")
+        else:
+            _draw_row(ax, level, row)
 
 
-def _say(ax: Axes, level: int, words: str) -> None:
+def _draw_row(ax: Axes, level: int, row: DifferenceRow) -> None:
+    sure = row.low > 0.0 or row.high < 0.0
+    if not isnan(row.low):
+        ends = [row.low, row.high], [level, level]
+        ax.plot(*ends, color=row.look.color, linewidth=2.0, zorder=3, label="interval")
+    mark: dict[str, Any] = {"markersize": 6, "markeredgewidth": 1.4, "markeredgecolor": row.look.color}
+    mark |= {"markerfacecolor": row.look.color if sure else "white", "zorder": 4}
+    ax.plot([row.mean], [level], row.look.marker, label=_SURE if sure else _UNSURE, **mark)
+
+
+def _write(ax: Axes, level: int, words: str) -> None:
     ground = {"facecolor": "white", "linewidth": 0.0, "pad": 1.0}  # over the line at zero
     placed: dict[str, Any] = {"transform": ax.get_yaxis_transform(), "va": "center", "bbox": ground}
     ax.text(0.01, level, words, color=QUIET, fontsize=8, **placed)
 
 
-def _share(made: Panels, shown: Sequence[DifferencePanel], label: str) -> None:
-    rows = [row for panel in shown for row in panel.rows]
+def _scale(ax: Axes, rows: Sequence[DifferenceRow], ticks: int) -> None:
     known = [v for row in rows for v in (row.mean, row.low, row.high) if not isnan(v)] or [0.0]
     low, high = min(0.0, *known), max(0.0, *known)
     even = _even(rows)
-    for ax in made.axes:
-        if max(high, -low) > _WIDE * even:
-            _over_decades(ax, low, high, even, 9 if made.columns == 1 else 5)
-        else:
-            pad = 0.06 * (high - low) or 0.05
-            ax.set_xlim(low - pad, high + pad)
-            ax.locator_params(axis="x", nbins=9 if made.columns == 1 else 5)
-        ax.xaxis.set_major_formatter(lambda value, _: signed(round(value, 9)))
-        ax.tick_params(labelleft=ax in made.leftmost, labelbottom=ax in made.lowest)
-    for ax in made.lowest:
-        ax.set_xlabel(label, labelpad=1.0)
+    if max(high, -low) > _WIDE * even:
+        _over_decades(ax, low, high, even, ticks)
+    else:
+        pad = 0.06 * (high - low) or 0.05
+        ax.set_xlim(low - pad, high + pad)
+        ax.locator_params(axis="x", nbins=ticks)
+    ax.xaxis.set_major_formatter(lambda value, _: signed(round(value, 9)))
 
 
 def _even(rows: Sequence[DifferenceRow]) -> float:
@@ -123,8 +104,6 @@ def _over_decades(ax: Axes, low: float, high: float, even: float, most: int) -> 
 def _handles() -> list[Line2D]:
     full: dict[str, Any] = {"color": QUIET, "marker": "o", "markersize": 6, "markeredgewidth": 1.4}
     return [
-        Line2D([], [], linewidth=2.0, label="mean with 95 % interval", **full),
-        Line2D(
-            [], [], linewidth=2.0, markerfacecolor="white", label="not separable from no difference", **full
-        ),
+        Line2D([], [], linewidth=2.0, label=_SURE, **full),
+        Line2D([], [], linewidth=2.0, markerfacecolor="white", label=_UNSURE, **full),
     ]

@@ -1,7 +1,6 @@
 """The true error along an axis of a study: median with the middle half, and mean, for each controller."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -10,90 +9,78 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flexneedle.plot.layout import FAINT, OVERLAID, Floats, Look, Panels, decades, head, legend, panels, short
-from flexneedle.plot.style import BAD, INK, styled
+from flexneedle.plot.layout import (
+    FAINT,
+    OVERLAID,
+    Floats,
+    Panel,
+    columns_of,
+    decades,
+    legend,
+    panels,
+    short,
+)
+from flexneedle.plot.style import BAD, INK, WIDTH, styled
+from flexneedle.study.plot.samples import Sample
 
 _FIRST, _THIRD = partial(np.quantile, q=0.25), partial(np.quantile, q=0.75)
 _WIDE = 20.0  # times between the smallest and the largest median or mean: from there on, decades
+Sweep = Panel[Sequence[Sample]]
+"""A controller with the samples at its m levels."""
 
 
-@dataclass(frozen=True, eq=False)
-class Sweep:
-    """True errors of one controller along an axis: for each of its m levels an array (mm) of the finished ones.
-
-    counts (m,): insertions in all.
-    """
-
-    name: str
-    look: Look
-    errors: Sequence[Floats]
-    counts: Sequence[int]
-
-
-def sweep_figure(sweeps: Sequence[Sweep], label: str, places: Floats, names: Sequence[str]) -> Figure:
-    """Return the figure along an axis with levels at `places` (m,) called `names`."""
-    groups = [list(sweeps)] if len(sweeps) <= OVERLAID else [[sweep] for sweep in sweeps]
+def sweep_figure(sweeps: Sequence[Sweep], label: str, places: Floats) -> Figure:
+    """Return the figure along an axis with levels at `places` (m,); few controllers are in one panel."""
+    overlaid = len(sweeps) <= OVERLAID
+    shown = [Panel("", "", INK, ())] if overlaid else list(sweeps)
     with styled():
-        made = panels(len(groups), 0.42, title=0.36) if len(groups) == 1 else panels(len(groups), 0.7)
-        for ax, group in zip(made.axes, groups, strict=True):
-            for other in sweeps if len(groups) > 1 else ():
-                ax.plot(places, _each(other, np.median), color=FAINT, linewidth=1.0, zorder=1, label="others")
-            for sweep in group:
+        figure, axes = panels(shown, 4.0 if overlaid else 2.7, short(label, 60), "true error (mm)")
+        for k, ax in enumerate(axes):
+            for other in () if overlaid else sweeps:
+                line: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1}
+                ax.plot(places, _each(other, np.median), label="medians of the others", **line)
+            for sweep in sweeps if overlaid else sweeps[k : k + 1]:
                 _draw(ax, sweep, places)
-            if len(groups) > 1:
-                head(
-                    ax,
-                    group[0].name,
-                    f"n = {sum(group[0].counts)}",
-                    group[0].look.color,
-                    _unfinished(group[0]),
-                )
-        _scale(made, sweeps, places, names, label)
-        if len(groups) == 1:
-            _say_unfinished(made.axes[0], sweeps, places)
-        legend(made.figure, _handles(sweeps if len(groups) == 1 else ()))
-    return made.figure
+            _scale(ax, sweeps)
+            _name_levels(ax, places, [row.name for row in sweeps[0].content], columns_of(len(axes)))
+        if overlaid:
+            _count_unfinished(axes[0], sweeps, places)
+        legend(figure, _handles(), [_named(sweep) for sweep in sweeps] if overlaid else ())
+    return figure
 
 
 def _draw(ax: Axes, sweep: Sweep, places: Floats) -> None:
-    color, marker = sweep.look.color, sweep.look.marker
+    color, marker = sweep.color, sweep.content[0].look.marker
     low, high = _each(sweep, _FIRST), _each(sweep, _THIRD)
-    ax.fill_between(places, low, high, color=color, alpha=0.16, linewidth=0.0, zorder=2)
+    ax.fill_between(places, low, high, color=color, alpha=0.16, linewidth=0.0, zorder=2, label="middle half")
     middle, average = _each(sweep, np.median), _each(sweep, np.mean)
     ax.plot(places, middle, color=color, marker=marker, markersize=5, zorder=4, label="median")
     ax.plot(places, average, color=color, linestyle=(0, (4, 2)), linewidth=1.2, zorder=3, label="mean")
 
 
 def _each(sweep: Sweep, statistic: Callable[[Floats], object]) -> Floats:
-    return np.array([statistic(errors) if len(errors) else np.nan for errors in sweep.errors], dtype=float)
+    samples = (row.errors for row in sweep.content)
+    return np.array([statistic(errors) if len(errors) else np.nan for errors in samples], dtype=float)
 
 
-def _scale(made: Panels, sweeps: Sequence[Sweep], places: Floats, names: Sequence[str], label: str) -> None:
+def _scale(ax: Axes, sweeps: Sequence[Sweep]) -> None:
     shown = [_each(sweep, statistic) for sweep in sweeps for statistic in (np.median, np.mean)]
     band = [_each(sweep, statistic) for sweep in sweeps for statistic in (_FIRST, _THIRD)]
     values = np.concatenate(shown)
     values = values[values > 0.0]
-    pad = 0.05 * (float(places.max() - places.min()) or 1.0)
-    for ax in made.axes:
-        if len(values) and values.max() > _WIDE * values.min():
-            decades(ax.yaxis, [*shown, *band], 6)
-        else:
-            ax.set_ylim(0.0, 1.08 * float(np.nanmax(np.concatenate([*shown, *band, np.array([1e-6])]))))
-        ax.set_xlim(places.min() - pad, places.max() + pad)
-        _name_levels(ax, places, names)
-        ax.grid(axis="y", color=FAINT, linewidth=0.4)
-        ax.set_axisbelow(True)
-        ax.tick_params(labelleft=ax in made.leftmost, labelbottom=ax in made.lowest)
-    for ax in made.lowest:
-        ax.set_xlabel(short(label, 60), labelpad=1.0)
-    for ax in made.leftmost:
-        ax.set_ylabel("true error (mm)")
+    if len(values) and values.max() > _WIDE * values.min():
+        decades(ax.yaxis, [*shown, *band], 6)
+    else:
+        ax.set_ylim(0.0, 1.08 * float(np.nanmax(np.concatenate([*shown, *band, np.array([1e-6])]))))
+    ax.grid(axis="y", color=FAINT, linewidth=0.4)
+    ax.set_axisbelow(True)
 
 
-def _name_levels(ax: Axes, places: Floats, names: Sequence[str]) -> None:
+def _name_levels(ax: Axes, places: Floats, names: Sequence[str], columns: int) -> None:
     """Put a tick at each level that has room for its name."""
-    low, high = ax.get_xlim()
-    inches = float(ax.bbox.width) / float(ax.figure.dpi) / (high - low)
+    span = float(places.max() - places.min()) or 1.0
+    ax.set_xlim(places.min() - 0.05 * span, places.max() + 0.05 * span)
+    inches = (WIDTH / columns - 0.6) / (1.1 * span)
     kept: list[int] = []
     for k, place in enumerate(places.tolist()):
         room = 0.07 * (len(names[k]) + len(names[kept[-1]])) / 2 + 0.08 if kept else 0.0
@@ -102,34 +89,26 @@ def _name_levels(ax: Axes, places: Floats, names: Sequence[str]) -> None:
     ax.set_xticks([float(places[k]) for k in kept], [names[k] for k in kept])
 
 
-def _unfinished(sweep: Sweep) -> str:
-    missing = sum(sweep.counts) - sum(map(len, sweep.errors))
-    return f"{missing} not finished" if missing else ""
-
-
-def _say_unfinished(ax: Axes, sweeps: Sequence[Sweep], places: Floats) -> None:
+def _count_unfinished(ax: Axes, sweeps: Sequence[Sweep], places: Floats) -> None:
     """Write above each level how many did not finish, where any did not."""
-    missing = [sum(s.counts[k] - len(s.errors[k]) for s in sweeps) for k in range(len(places))]
-    if not any(missing):
-        return
-    inch = float(ax.figure.dpi) / float(ax.bbox.height)
-    look: dict[str, Any] = {"color": BAD, "fontsize": 7.5}
-    ax.text(0.0, 1.0 + 0.16 * inch, "not finished:", transform=ax.transAxes, **look)
+    missing = [sum(row.missing for row in level) for level in zip(*(s.content for s in sweeps), strict=True)]
+    look: dict[str, Any] = {"textcoords": "offset points", "color": BAD, "fontsize": 7.5}
+    if any(missing):
+        ax.annotate("not finished:", (0, 1), (0, 14), "axes fraction", **look)
     for place, count in zip(places.tolist(), missing, strict=True):
         if count:
-            above = ax.get_xaxis_transform()
-            ax.text(place, 1.0 + 0.02 * inch, str(count), transform=above, ha="center", **look)
+            ax.annotate(str(count), (place, 1), (0, 3), ax.get_xaxis_transform(), ha="center", **look)
 
 
-def _handles(named: Sequence[Sweep]) -> list[Line2D]:
-    names = [
-        Line2D([], [], color=s.look.color, marker=s.look.marker, markersize=5, label=short(s.name, 30))
-        for s in named
-    ]
+def _named(sweep: Sweep) -> Line2D:
+    look = sweep.content[0].look
+    return Line2D([], [], color=look.color, marker=look.marker, markersize=5, label=short(sweep.title, 30))
+
+
+def _handles() -> list[Line2D]:
     return [
-        *names,
         Line2D([], [], color=INK, label="median"),
         Line2D([], [], color=INK, alpha=0.16, linewidth=6.0, label="middle half"),
         Line2D([], [], color=INK, linestyle=(0, (4, 2)), linewidth=1.2, label="mean"),
-        *([] if named else [Line2D([], [], color=FAINT, linewidth=1.0, label="medians of the others")]),
+        Line2D([], [], color=FAINT, linewidth=1.0, label="medians of the others"),
     ]

@@ -14,53 +14,52 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
-from flexneedle.plot.layout import FAINT, Floats, Look, Panels, head, legend, panels, scattered
-from flexneedle.plot.style import BAD, QUIET, TARGET, WIDTH, axes, new_figure, styled
+from flexneedle.plot.layout import FAINT, Floats, Panel, columns_of, head, legend, panels, scattered, sheet
+from flexneedle.plot.style import BAD, QUIET, TARGET, WIDTH, styled
 
-_MOST_TARGETS = 40  # more, and they are laid on one another
+_MOST_TARGETS = 40  # more, and they are drawn in one place
 _MARGIN, _FAR = 2.0, 6.0  # mm around the targets that are always, and that are at most shown
-_LEFT, _RIGHT, _BETWEEN, _TOP, _FOOT = 0.62, 0.15, 0.75, 0.44, 0.75  # inches
+_CIRCLE, _TIP, _CROSS = (
+    "target, circle of 1 mm radius",
+    "true tip at the end",
+    "tip of an insertion not finished",
+)
+_LATERAL = "lateral (mm)"
 
 
 @dataclass(frozen=True, eq=False)
-class TargetPanel:
-    """Targets and true tips (n, 2) of n insertions, mm, NaN where unknown; done (n,): whether they finished.
+class Tips:
+    """Targets and true tips (n, 2) of n insertions, mm, NaN where unknown; done (n,): whether they finished."""
 
-    note, alarm: what stands above the panel at the left, and in a warning colour at the right.
-    """
-
-    title: str
-    note: str
-    alarm: str
-    look: Look
     targets: Floats
     tips: Floats
     done: NDArray[np.bool_]
 
+    @property
+    def on_one(self) -> "Tips":
+        """The same with all targets at the origin."""
+        return replace(self, targets=np.zeros_like(self.targets), tips=self.tips - self.targets)
 
-def targeting_figure(shown: Sequence[TargetPanel]) -> Figure:
+
+def targeting_figure(shown: Sequence[Panel[Tips]]) -> Figure:
     """Return the figure: a panel each, all to the same scale; beside a single one all targets magnified."""
-    targets = np.unique(np.concatenate([panel.targets for panel in shown]), axis=0)
-    together = len(targets) > _MOST_TARGETS
-    if together:
-        shown = [_on_one(panel) for panel in shown]
-        targets = np.zeros((1, 2))
-    low, high = _window(targets, [panel.tips for panel in shown])
-    width, height = (high - low).tolist()
+    targets = np.unique(np.concatenate([panel.content.targets for panel in shown]), axis=0)
+    xlabel = "depth (mm)"
+    if len(targets) > _MOST_TARGETS:
+        shown = [replace(panel, content=panel.content.on_one) for panel in shown]
+        targets, xlabel = np.zeros((1, 2)), "depth beyond the target (mm)"
+    low, high = _window(targets, [panel.content.tips for panel in shown])
+    ratio = float(high[1] - low[1]) / float(high[0] - low[0])
     with styled():
         if len(shown) == 1:
-            made = _with_close_up(_on_one(shown[0]), height / width)
+            figure, axes = _with_close_up(shown[0], ratio, xlabel)
         else:
-            made = panels(len(shown), height / width)
-        for ax, panel in zip(made.axes, shown, strict=True):
+            height = ratio * (WIDTH / columns_of(len(shown)) - 0.3) + 0.75
+            figure, axes = panels(shown, height, xlabel, _LATERAL)
+        for ax, panel in zip(axes, shown, strict=True):
             _draw_map(ax, panel, low, high)
-        _label(made, together)
-        legend(made.figure, _handles(any(not panel.done.all() for panel in shown)))
-    return made.figure
-
-
-def _on_one(panel: TargetPanel) -> TargetPanel:
-    return replace(panel, targets=np.zeros_like(panel.targets), tips=panel.tips - panel.targets)
+        legend(figure, _handles())
+    return figure
 
 
 def _window(targets: Floats, tips: Sequence[Floats]) -> tuple[Floats, Floats]:
@@ -72,70 +71,56 @@ def _window(targets: Floats, tips: Sequence[Floats]) -> tuple[Floats, Floats]:
     return low - below, high + above
 
 
-def _with_close_up(panel: TargetPanel, ratio: float) -> Panels:
+def _with_close_up(panel: Panel[Tips], ratio: float, xlabel: str) -> tuple[Figure, list[Axes]]:
     """Return a figure with an empty map, and beside it the tips around their targets, all in one place."""
-    width = (WIDTH - _LEFT - _RIGHT - _BETWEEN) / (1.0 + ratio)
-    height = ratio * width
-    figure = new_figure(_TOP + height + _FOOT)
-    made = Panels(figure, [axes(figure, _LEFT, _TOP, width, height)], 1)
-    ax = axes(figure, WIDTH - _RIGHT - height, _TOP, height, height)
-    _draw_close_up(ax, panel)
-    _frame(ax)
-    return made
+    height = ratio * (WIDTH - 1.2) / (1.0 + ratio) + 0.8
+    figure, (ax, close) = sheet(height, columns=2, widths=(1.0, ratio))
+    head(ax, panel, 2)
+    ax.set_xlabel(xlabel)
+    ax.set_ylabel(_LATERAL)
+    _draw_close_up(close, panel.content.on_one, panel.color)
+    return figure, [ax]
 
 
-def _draw_close_up(ax: Axes, panel: TargetPanel) -> None:
-    known = _known(panel.tips[panel.done])
+def _draw_close_up(ax: Axes, tips: Tips, color: str) -> None:
+    known = _known(tips.tips[tips.done])
     farthest = float(np.hypot(*known.T).max()) if len(known) else 1.0
     half = min(max(1.15 * farthest, 0.02), _FAR)
-    corner = np.full(2, half)
-    ax.set_aspect("equal")
-    ax.set_xlim(-half, half)
-    ax.set_ylim(-half, half)
-    for radius in _rings(half):
-        edge = (
-            {"edgecolor": TARGET, "linewidth": 1.2}
-            if radius == 1.0
-            else {"edgecolor": FAINT, "linewidth": 0.9}
-        )
-        ax.add_patch(Circle((0.0, 0.0), radius, facecolor="none", zorder=1, **edge))
-    _draw_tips(ax, panel)
-    _count_outside(ax, panel.tips, -corner, corner)
-    rings = " and ".join(f"{radius:g}" for radius in _rings(half))
-    head(ax, "all targets, magnified", f"rings of {rings} mm radius", QUIET)
-    ax.locator_params(nbins=5)
-    ax.set_xlabel("too deep (mm)", labelpad=1.0)
-
-
-def _rings(half: float) -> list[float]:
-    """Return the radii of one or two rings that fit into half a window."""
     sizes = [float(f"{digit}e{k}") for k in range(-3, 2) for digit in (1, 2, 5)]
-    return [radius for radius in sizes if radius <= 0.95 * half][-2:]
+    rings = [radius for radius in sizes if radius <= 0.95 * half][-2:]
+    for radius in rings:
+        edge: dict[str, Any] = {"edgecolor": TARGET if radius == 1.0 else FAINT, "linewidth": 1.0}
+        ax.add_patch(Circle((0.0, 0.0), radius, facecolor="none", zorder=1, **edge))
+    note = f"rings of {' and '.join(f'{radius:g}' for radius in rings)} mm radius"
+    head(ax, Panel("all targets, magnified", note, QUIET, None), 3)
+    _draw_tips(ax, tips, color, np.full(2, -half), np.full(2, half))
+    ax.locator_params(nbins=5)
+    ax.set_xlabel("depth beyond the target (mm)")
 
 
-def _draw_map(ax: Axes, panel: TargetPanel, low: Floats, high: Floats) -> None:
+def _draw_map(ax: Axes, panel: Panel[Tips], low: Floats, high: Floats) -> None:
+    targets = np.unique(panel.content.targets, axis=0)
+    circles = PatchCollection([Circle((x, y), 1.0) for x, y in targets.tolist()], zorder=2, label=_CIRCLE)
+    circles.set(facecolor="none", edgecolor=TARGET, linewidth=1.0)
+    ax.add_collection(circles)
+    ax.plot(*targets.T, "+", color=TARGET, markersize=5, markeredgewidth=0.7, zorder=2, label="target")
+    _draw_tips(ax, panel.content, panel.color, low, high)
+    for axis, (first, last) in ((ax.xaxis, ax.get_xlim()), (ax.yaxis, ax.get_ylim())):
+        axis.set_major_locator(MultipleLocator(5.0 if last - first > 10.0 else 1.0))
+
+
+def _draw_tips(ax: Axes, tips: Tips, color: str, low: Floats, high: Floats) -> None:
+    """Draw tips to scale inside a window, and count those outside."""
+    style = scattered(len(tips.tips))
+    ax.scatter(*tips.tips[tips.done].T, color=color, zorder=3, label=_TIP, **style)
+    if not tips.done.all():
+        ax.plot(*tips.tips[~tips.done].T, "x", color=BAD, markersize=4, zorder=4, label=_CROSS)
     ax.set_xlim(low[0], high[0])
     ax.set_ylim(low[1], high[1])
     ax.set_aspect("equal")
-    head(ax, panel.title, panel.note, panel.look.color, panel.alarm)
-    targets = np.unique(panel.targets, axis=0)
-    circles = PatchCollection([Circle((x, y), 1.0) for x, y in targets.tolist()], zorder=2)
-    circles.set(facecolor="none", edgecolor=TARGET, linewidth=1.0)
-    circles.set_gid("targets")
-    ax.add_collection(circles)
-    ax.plot(*targets.T, "+", color=TARGET, markersize=5, markeredgewidth=0.7, zorder=2, label="target")
-    _draw_tips(ax, panel)
-    _count_outside(ax, panel.tips, low, high)
-
-
-def _draw_tips(ax: Axes, panel: TargetPanel) -> None:
-    tips, style = panel.tips, scattered(len(panel.tips))
-    ax.scatter(*tips[panel.done].T, color=panel.look.color, zorder=3, label="true tip", **style)
-    ax.plot(*tips[~panel.done].T, "x", color=BAD, markersize=4, zorder=4, label="not finished")
-
-
-def _count_outside(ax: Axes, tips: Floats, low: Floats, high: Floats) -> None:
-    known = _known(tips)
+    for side in ("top", "right"):
+        ax.spines[side].set(visible=True, color=QUIET)
+    known = _known(tips.tips)
     outside = int(((known < low) | (known > high)).any(axis=1).sum())
     if outside:
         text = f"{outside} tip{'s' if outside > 1 else ''} outside"
@@ -148,38 +133,11 @@ def _known(points: Floats) -> Floats:
     return points[~np.isnan(points).any(axis=1)]
 
 
-def _label(made: Panels, together: bool) -> None:
-    depth = "too deep (mm)" if together else "depth (mm)"
-    for ax in made.axes:
-        ax.tick_params(labelleft=ax in made.leftmost, labelbottom=ax in made.lowest)
-        _frame(ax)
-        for axis in (ax.xaxis, ax.yaxis):
-            low, high = axis.get_view_interval()
-            axis.set_major_locator(MultipleLocator(5.0 if high - low > 10.0 else 1.0))
-    for ax in made.lowest:
-        ax.set_xlabel(depth, labelpad=1.0)
-    for ax in made.leftmost:
-        ax.set_ylabel("aside (mm)")
-
-
-def _frame(ax: Axes) -> None:
-    for side in ("top", "right"):
-        ax.spines[side].set_visible(True)
-        ax.spines[side].set_color(QUIET)
-
-
-def _handles(unfinished: bool) -> list[Line2D]:
-    circle: dict[str, Any] = {
-        "marker": "o",
-        "markersize": 9,
-        "markerfacecolor": "none",
-        "markeredgecolor": TARGET,
-    }
-    handles = [
-        Line2D([], [], linestyle="none", label="target, circle of 1 mm radius", **circle),
-        Line2D([], [], linestyle="none", color=QUIET, marker="o", markersize=3, label="true tip at the end"),
+def _handles() -> list[Line2D]:
+    mark: dict[str, Any] = {"linestyle": "none"}
+    circle: dict[str, Any] = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": TARGET}
+    return [
+        Line2D([], [], marker="o", label=_CIRCLE, **circle, **mark),
+        Line2D([], [], color=QUIET, marker="o", markersize=3, label=_TIP, **mark),
+        Line2D([], [], color=BAD, marker="x", markersize=4, label=_CROSS, **mark),
     ]
-    if unfinished:
-        cross: dict[str, Any] = {"marker": "x", "markersize": 4, "color": BAD}
-        handles.append(Line2D([], [], linestyle="none", label="tip of an insertion not finished", **cross))
-    return handles
