@@ -86,7 +86,7 @@ def test_help_says_which_studies_can_be_reported(capsys):
         cli.main(["report", "--help"])
     message = " ".join(capsys.readouterr().out.split())
     assert "complete or interrupted (Ctrl-C)" in message
-    assert "after kill -9, give `flexneedle study` with --resume first" in message
+    assert "after kill -9, run `flexneedle study` with --resume first" in message
 
 
 def test_no_study_is_bad_input(capsys, tmp_path):

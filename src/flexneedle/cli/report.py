@@ -14,16 +14,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "report",
         help="write a report on a study: a page and its figures",
         description="Write a report on a study: a page and its figures. The study may be complete or interrupted "
-        "(Ctrl-C). One that still runs, or was killed (kill -9), may have no tables yet: after kill -9, give "
+        "(Ctrl-C). One that is running, or was killed (kill -9), may have no tables yet: after kill -9, run "
         "`flexneedle study` with --resume first.",
     )
     parser.add_argument("study", metavar="STUDY_DIR", type=Path, help="folder of the study")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report (STUDY_DIR/report)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report (default: STUDY_DIR/report)")
     parser.add_argument(
         "--tuning",
         type=Path,
         metavar="DIR",
-        help="records of the controllers' tuning to show (those of the package)",
+        help="records of the controllers' tuning to show (default: those of the package)",
     )
     parser.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
     parser.set_defaults(handler=_report)

@@ -1,32 +1,32 @@
 """The folder of a study, read for its report."""
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from flexneedle.errors import InputError
-from flexneedle.scenario.problems import describe, printable
-from flexneedle.study.report.checking import column_problems
+from flexneedle.scenario.problems import describe
 from flexneedle.study.report.rows import Rows
 from flexneedle.study.tables import RUNS_FILE, TIMING_FILE
 from flexneedle.trace.folder import STUDY_FILE
 
 _SHIPPED = files("flexneedle.study") / "tuning"
+_STRICT = ConfigDict(strict=True, frozen=True)
+Record = TypeVar("Record", bound=BaseModel)
 
 
 class Asked(BaseModel):
     """The study of `study.json` as the runner wrote it: what it varies and how many insertions it asks for."""
 
-    model_config = ConfigDict(strict=True, frozen=True)
+    model_config = _STRICT
     name: str
     title: str
     cases: dict[str, dict[str, Any]]
@@ -37,7 +37,7 @@ class Asked(BaseModel):
 class About(BaseModel):
     """`study.json`: the study, and the command that began it."""
 
-    model_config = ConfigDict(strict=True, frozen=True)
+    model_config = _STRICT
     study: Asked
     command: str = ""
 
@@ -57,19 +57,39 @@ class StudyRecord:
         return self.about.study
 
 
-@dataclass(frozen=True)
-class Tuning:
+class Row(BaseModel):
+    """What a report needs in each row of `runs.parquet`."""
+
+    model_config = _STRICT
+    index: int
+    controller: str
+    target_depth_mm: FiniteFloat
+    target_lateral_mm: FiniteFloat
+    seed: int
+    true_error_mm: FiniteFloat | None
+    outcome: str
+
+
+class Trial(BaseModel):
+    """Settings that tuning tried: mean score."""
+
+    model_config = _STRICT
+    score_mm: float
+
+
+class Tuning(BaseModel):
     """What tuning chose for a controller.
 
-    budget: insertions; seeds: first and last of its phantoms; note: what else went into it, or "".
+    budget_insertions: of all trials, the best first; phantom_seeds: first and last; note: what else went into it.
     """
 
+    model_config = _STRICT
     method: str
-    chosen: Mapping[str, Any]
-    budget: int
-    seeds: tuple[int, int]
-    note: str
-    score_mm: float
+    chosen: dict[str, Any]
+    budget_insertions: int
+    phantom_seeds: list[int] = Field(min_length=2, max_length=2)
+    note: str = ""
+    trials: list[Trial] = Field(min_length=1)
 
 
 def read_study(folder: Path) -> StudyRecord:
@@ -82,7 +102,7 @@ def read_study(folder: Path) -> StudyRecord:
         hint = "the study was killed or is still running; --resume completes it and writes its tables"
         raise InputError(f"{folder}: {hint}: there is no {RUNS_FILE}")
     rows, timing = _checked(folder / RUNS_FILE), folder / TIMING_FILE
-    about = _read_about(folder / STUDY_FILE)
+    about = _read(About, folder / STUDY_FILE, "damaged")
     return StudyRecord(folder, about, rows, _read_table(timing) if timing.exists() else None)
 
 
@@ -95,32 +115,33 @@ def read_tuning(folder: Path | None = None) -> list[Tuning]:
     found = [item for item in place.iterdir() if item.name.endswith(".json")] if place.is_dir() else []
     if not found:
         raise InputError(f"{place}: holds no records of tuning: there is no .json file")
-    return [_tuning(item, _read_json(item)) for item in sorted(found, key=lambda item: item.name)]
+    return [_read(Tuning, item, "no record of tuning") for item in sorted(found, key=lambda item: item.name)]
 
 
-def _tuning(path: Traversable, values: Mapping[str, Any]) -> Tuning:
+def _read(model: type[Record], path: Traversable, problem: str) -> Record:
+    """Return what a JSON file holds as a model. Raises InputError, with the problem, if it is none."""
     try:
-        first, last = values["phantom_seeds"]
-        score = float(values["trials"][0]["score_mm"])
-        chosen, note = dict(values["chosen"]), str(values.get("note", ""))
-        budget = int(values["budget_insertions"])
-        return Tuning(str(values["method"]), chosen, budget, (first, last), note, score)
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: no record of tuning: {type(error).__name__} {error}") from None
-
-
-def _read_about(path: Path) -> About:
-    try:
-        return About.model_validate(_read_json(path))
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(values, dict):
+            raise ValueError("must hold one JSON object")
+        return model.model_validate(values)
     except ValidationError as error:
-        raise InputError(f"{path}: damaged: {describe(error, About)[0]}") from None
+        raise InputError(f"{path}: {problem}: {describe(error, model)[0]}") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: {problem}: {error}") from None
 
 
 def _checked(path: Path) -> Rows:
     rows = _read_table(path)
-    problem = next(column_problems(rows), None)
-    if problem is not None:
-        raise InputError(f"{path}: not the rows of a study: {problem}")
+    missing = [name for name in Row.model_fields if name not in rows.names]
+    if missing:
+        raise InputError(f"{path}: not the rows of a study: lacks the columns {', '.join(missing)}")
+    for number, values in enumerate(zip(*map(rows.values, Row.model_fields), strict=True), 1):
+        try:
+            Row.model_validate(dict(zip(Row.model_fields, values, strict=True)))
+        except ValidationError as error:
+            problem = describe(error, Row)[0]
+            raise InputError(f"{path}: not the rows of a study: row {number}: {problem}") from None
     if len(rows) == 0:
         raise InputError(f"{path}: has no insertion: there is nothing to report")
     index, times = np.unique(rows.number("index"), return_counts=True)
@@ -131,32 +152,7 @@ def _checked(path: Path) -> Rows:
 
 def _read_table(path: Path) -> Rows:
     try:
-        table = pq.read_table(path)
+        return Rows(pq.read_table(path))
     except (pa.ArrowException, OSError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: damaged, or no Parquet file: {first}") from None
-    for column in table.schema:
-        if not _is_known(column.type):
-            rule = "columns must be of numbers, text, booleans, or lists of those"
-            raise InputError(
-                f"{path}: not a table of a study: {printable(column.name)} is {column.type}: {rule}"
-            )
-    return Rows(table)
-
-
-def _is_known(kind: Any) -> bool:
-    """Whether values of a column can be compared and written as text."""
-    of = pa.types
-    kind = kind.value_type if of.is_list(kind) or of.is_dictionary(kind) else kind
-    known = (of.is_null, of.is_boolean, of.is_integer, of.is_floating, of.is_string, of.is_large_string)
-    return any(is_of(kind) for is_of in known)
-
-
-def _read_json(path: Traversable) -> Mapping[str, Any]:
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: damaged: {error}") from None
-    if not isinstance(values, dict):
-        raise InputError(f"{path}: damaged: must hold one JSON object")
-    return values

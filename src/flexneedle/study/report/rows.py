@@ -34,7 +34,7 @@ class Rows:
         return np.array(self.table.column(name).cast(pa.float64()).to_numpy())
 
     def values(self, name: str) -> list[Any]:
-        """Return a column as Python values, None where it is unknown; a list is a tuple."""
+        """Return a column as numbers, text, or tuples of them; None where it is unknown."""
         if name not in self.names:
             return [None] * len(self)
         return [_plain(value) for value in self.table.column(name).to_pylist()]
@@ -55,5 +55,7 @@ class Rows:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, list):
-        return tuple(value)
-    return None if value != value else value
+        return tuple(map(_plain, value))
+    if value is None or value != value:
+        return None
+    return value if isinstance(value, int | float | str) else str(value)
