@@ -18,7 +18,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "`flexneedle study` with --resume first.",
     )
     parser.add_argument("study", metavar="STUDY_DIR", type=Path, help="folder of the study")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the report (default: STUDY_DIR/report)")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder of the report (default: STUDY_DIR/report)"
+    )
     parser.add_argument(
         "--tuning",
         type=Path,

@@ -148,7 +148,7 @@ def _ticks(low: float, high: float, most: int) -> list[float]:
 
 
 def scattered(count: int, alpha: float = 0.75) -> dict[str, Any]:
-    """Return how dots are drawn so that `count` of them can be told apart."""
+    """Return how dots are drawn so that `count` of them can be distinguished."""
     if count > MANY:
         return {"s": 2.0, "alpha": 0.25, "linewidths": 0.0, "rasterized": True}
     return {"s": 9.0 if count <= 300 else 5.0, "alpha": alpha if count <= 300 else 0.55, "linewidths": 0.0}

@@ -26,8 +26,8 @@ _NUMBERED = re.compile(r"([^\d.+-]*)([-+]?(?:\d+\.?\d*|\.\d+))([^\d.]*)")
 class Factor:
     """Something that has a level in each of n rows.
 
-    key: column, or axis of the study; label: with its unit; names: of the k levels, in order; titles: the same where
-    they stand alone, such as "G = 20 mm"; places (k,): of the levels on an axis; codes (n,): level of each row;
+    key: column, or axis of the study; label: with its unit; names: of the k levels, in order; titles: the same with
+    what they are levels of, such as "G = 20 mm"; places (k,): of the levels on an axis; codes (n,): level of each row;
     along: settings that change with it.
     """
 

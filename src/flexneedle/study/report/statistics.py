@@ -1,6 +1,6 @@
 """Statistics of many insertions, with percentile bootstrap intervals.
 
-Insertions with the same seed meet the same virtual phantom, so what is drawn again is the seed with all its
+Insertions with the same seed have the same virtual phantom, so what is resampled is the seed with all its
 insertions, not the insertion (a cluster bootstrap: Davison and Hinkley 1997, section 3.8). Where every insertion
 has a seed of its own, that is the ordinary bootstrap. Quantiles are those of linear interpolation between the order
 statistics: the value at rank (n − 1) q, counted from 0 (Hyndman and Fan 1996, definition 7; NumPy's default).
