@@ -1,6 +1,6 @@
 """What crosses rooms: frozen records of commands, measurements, plans and insertions. Units are mm, N, mJ, rad, s."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import pairwise
@@ -54,6 +54,13 @@ class Frame:
     time: float
     number: int
     readings: Mapping[str, SensorReading]
+
+    def __repr__(self) -> str:
+        sensors = ", ".join(
+            name if reading.status == VISIBLE else f"{name} {reading.status}"
+            for name, reading in self.readings.items()
+        )
+        return f"<Frame {self.number}, {self.time:.3f} s: {sensors or 'no sensor'}>"
 
 
 @dataclass(frozen=True)
@@ -139,6 +146,11 @@ class Plan:
     def flips(self) -> int:
         """Bevel turns while inserting; the bevel at the start is set before and costs none."""
         return int(np.count_nonzero(self.controls[:, 4] > 0.0))
+
+    def __repr__(self) -> str:
+        to = f"{self.strategy} to {_mm(self.target)} in {len(self.controls)} steps"
+        ends = f"ends {self.error_mm:.3f} mm off, {self.strain_energy_mj:.3g} mJ"
+        return f"<Plan {to}, {ends}, flips {self.flips}, seed {self.seed}>"
 
 
 class VerdictKind(StrEnum):
@@ -237,6 +249,11 @@ class Period:
         CheckedMeasurement, ...
     ] = ()  # all that came in the period, oldest first; `sample` is the newest
 
+    def __repr__(self) -> str:
+        at = f"{self.time:.2f} s: {self.action}, estimated tip {_mm(self.estimate)}"
+        true = "" if self.true_tip is None else f", true tip {_mm(self.true_tip)}"
+        return f"<Period {self.index} at {at}{true}, measurement {self.verdict}>"
+
 
 @dataclass(frozen=True, eq=False)
 class Insertion:
@@ -301,6 +318,14 @@ class Insertion:
         if self.reached:
             return f"reached: the tip ended {error:.3f} mm from the target"
         return f"MISSED: the tip ended {error:.3f} mm from the target, more than 1 mm"
+
+    def __repr__(self) -> str:
+        to = f"to {_mm(self.target)}, {len(self.periods)} periods, seed {self.seed}"
+        return f"<Insertion {to}{self.controller and f', {self.controller}'}; {self.summary}>"
+
+
+def _mm(place: Sequence[float]) -> str:
+    return f"({place[0]:.4g}, {place[1]:.4g}) mm"
 
 
 def _distance(point: Any, target: tuple[float, float]) -> float:

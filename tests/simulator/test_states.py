@@ -2,12 +2,16 @@
 
 import copy
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from flexneedle import Control, Simulator, load_scenario
 from flexneedle.errors import CommandError, StateError
+from flexneedle.mechanics import needle as nd
 from reference.cases import insert_to, repeat
 
 PHANTOM = load_scenario("phantom")
@@ -45,6 +49,34 @@ def test_states_compare_by_value(state):
     assert SIMULATOR.step(state, ON) == SIMULATOR.step(state, ON)
     assert state != 3
     assert state.with_estimate() == state
+
+
+BITS = st.integers(0, 2**64 - 1)
+TROUBLE = [0.0, -0.0, np.nan, -np.nan, np.inf, -np.inf, 5e-324, 1.0]
+NUMBERS = st.sampled_from(TROUBLE) | BITS.map(lambda bits: float(np.uint64(bits).view(np.float64)))
+
+
+@given(place=st.integers(0, nd.STATE_SIZE - 1), one=NUMBERS, other=NUMBERS)
+def test_states_are_equal_just_where_their_bits_are_and_then_hash_equally(place, one, other):
+    """−0 and NaN included: equality is an equivalence, and equal states find each other in a set."""
+    start = SIMULATOR.start()
+
+    def changed(value):
+        scalars = start.scalars.copy()
+        scalars[place] = value
+        return replace(start, scalars=scalars)
+
+    a, b = changed(one), changed(other)
+    assert a == changed(one)
+    assert hash(a) == hash(changed(one))
+    assert (a == b) is (b == a) is (a.scalars.tobytes() == b.scalars.tobytes())
+    assert len({a, b}) == 2 - (a == b)
+
+
+def test_states_of_other_scenarios_differ(state):
+    """Whatever their arrays are."""
+    assert state != replace(state, scenario=PHANTOM.with_values({"plan.samples": 77}))
+    assert hash(state) == hash(replace(state, scenario=load_scenario("phantom")))
 
 
 def test_saved_state_loads_equal(state, tmp_path):

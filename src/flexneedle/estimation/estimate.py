@@ -88,6 +88,13 @@ class Estimate(Protocol):
         ...
 
 
+def described(estimate: Estimate) -> str:
+    """Return one line about an estimate, for its `repr`."""
+    x, y, slope = estimate.tip
+    where = f"tip ({x:.3f}, {y:.3f}) mm ± {estimate.tip_sd:.3f} mm, slope {1e3 * slope:.2f} mrad"
+    return f"<{type(estimate).__name__} {where}>"
+
+
 def assigned(moves: tuple[Move, ...], samples: Sequence[Measurement]) -> tuple[Move, ...]:
     """Give each sample to the move in which it was taken; one of before to the first, one of after to the last."""
     ends = np.array([done.ended for done in moves[:-1]])

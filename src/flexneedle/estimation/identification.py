@@ -22,7 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Move, along, assigned
+from flexneedle.estimation.estimate import Move, along, assigned, described
 from flexneedle.estimation.prior import (
     BASE_TURN,
     BASE_Y,
@@ -122,6 +122,9 @@ class Identified:
     residual: float = 0.0
     innovation: tuple[float, float] = (0.0, 0.0)
     measured: tuple[float, float] | None = None
+
+    def __repr__(self) -> str:
+        return described(self)
 
     @property
     def tip(self) -> Floats:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Move, along, assigned, place
+from flexneedle.estimation.estimate import Move, along, assigned, described, place
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
@@ -64,6 +64,9 @@ class Corrected:
     moves: tuple[Move, ...] = ()
     innovation: tuple[float, float] = (0.0, 0.0)
     measured: tuple[float, float] | None = None
+
+    def __repr__(self) -> str:
+        return described(self)
 
     @property
     def tip(self) -> Floats:

@@ -23,3 +23,6 @@ class Task:
     def scenario(self) -> Scenario:
         """The scenario of model and settings."""
         return self.simulator.scenario
+
+    def __repr__(self) -> str:
+        return f"<Task {self.plan!r} in {self.scenario!r}>"

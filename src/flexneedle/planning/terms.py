@@ -51,6 +51,10 @@ class Outcome:
         inside: NDArray[np.bool_] = (self.tips[:, :, 0] > 0.0) & (self.controls[:, :, 0] > 0.0)
         return inside
 
+    def __repr__(self) -> str:
+        sequences, steps = self.energy.shape
+        return f"<Outcome {sequences} sequences of {steps} steps, {np.mean(self.converged):.0%} converged>"
+
 
 RolloutFunction = Callable[[Floats], Outcome]
 """Carries out controls (N, m, 5)."""

@@ -112,6 +112,15 @@ class Scenario(Section):
             (key_path(split_key(key)) for key in mine | theirs if mine.get(key) != theirs.get(key)), None
         )
 
+    def __repr__(self) -> str:
+        layers = f"{len(self.tissue)} layer{'s' if len(self.tissue) > 1 else ''}"
+        guide = f"guide at {self.setup.guide_to_skin_mm:g} mm" if self.setup.has_guide else "no guide"
+        depth, lateral = self.target.position
+        needle = f"needle {self.needle.outer_diameter:g} mm"
+        return f"<Scenario {self.name!r}: {needle}, {layers}, {guide}, target ({depth:g}, {lateral:g}) mm>"
+
+    __str__ = __repr__
+
     @property
     def start_base_x(self) -> float:
         """x of the base clamp at the start, mm."""

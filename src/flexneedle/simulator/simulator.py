@@ -34,6 +34,11 @@ class Rollout(NamedTuple):
     strain_energy: Floats
     converged: NDArray[np.bool_]
 
+    def __repr__(self) -> str:
+        sequences, steps = self.strain_energy.shape
+        share = f"{np.mean(self.converged):.0%} of the steps converged"
+        return f"<Rollout {sequences} sequences of {steps} steps, {share}>"
+
 
 class Assimilation(NamedTuple):
     """The state that meets a measurement, and the axial innovation: measured x less the model's (mm)."""
@@ -55,6 +60,9 @@ class Simulator:
         self.threads = threads or _cores()
         self._model = constants or _build_model(scenario)
         self._limits = Limits.of(scenario)
+
+    def __repr__(self) -> str:
+        return f"<Simulator of {self.scenario!r}, threads {self.threads}>"
 
     def compile(self) -> None:
         """Compile the kernels, or load them from the cache, instead of waiting for it in the first call of each."""

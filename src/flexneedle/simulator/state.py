@@ -35,6 +35,10 @@ class Contacts(NamedTuple):
     stretch: Floats
     active: NDArray[np.bool_]
 
+    def __repr__(self) -> str:
+        least = f", least stretch {self.stretch.min():.4f}" if len(self.x) else ""
+        return f"<Contacts {len(self.x)} points, {np.count_nonzero(self.active)} active{least}>"
+
 
 class Reactions(NamedTuple):
     """What holds the needle: lateral forces (N) and the clamp's moment (N·mm) on it, 0 where nothing does."""
@@ -204,16 +208,23 @@ class State:
         first, second, third = (np.concatenate([[base], inner, [tip]]) for base, inner, tip in rows)
         return first, second, third
 
+    def _bytes(self) -> tuple[bytes, ...]:
+        return tuple(array.tobytes() for array in self._arrays().values())
+
     def __eq__(self, other: object) -> bool:
+        """Whether scenario and arrays are the same, to the bit: 0 is not −0, and NaN equals the same NaN."""
         if not isinstance(other, State):
             return NotImplemented
-        mine, theirs = self._arrays(), other._arrays()
-        return self.scenario == other.scenario and all(
-            np.array_equal(mine[name], theirs[name]) for name in mine
-        )
+        return self._bytes() == other._bytes() and self.scenario == other.scenario
 
     def __hash__(self) -> int:
-        return hash(self.scalars.tobytes())
+        return hash(self._bytes())
+
+    def __repr__(self) -> str:
+        x, y, slope = self.tip
+        ended = "converged" if self.converged else "NOT converged"
+        where = f"tip ({x:.3f}, {y:.3f}) mm, slope {1e3 * slope:.2f} mrad, guide {self.guide:.3f} mm"
+        return f"<State {where}, bevel {self.bevel:+d}, {self.strain_energy:.4g} mJ in the tissue, {ended}>"
 
 
 def mechanics_difference(one: Scenario, other: Scenario) -> str | None:

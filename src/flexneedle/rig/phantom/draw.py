@@ -30,6 +30,11 @@ class Truth:
     variation: tuple[float, ...] = (1.0,)
     cell_mm: float = 0.25
 
+    def __repr__(self) -> str:
+        base = f"base {self.base_y:.3f} mm, {1e3 * self.base_turn:.2f} mrad"
+        off = f"bend {self.bend:.3f} mm, run-out {self.run_out:.3f} mm"
+        return f"<Truth {base}, {off}, {self.scenario!r}>"
+
 
 def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
     """Draw a phantom: tissue, bevel, start, needle and tracker; finer contacts than the scenario's.

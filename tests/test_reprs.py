@@ -1,0 +1,87 @@
+"""Every record that a user meets prints as one short line with units, never as its arrays."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.estimation.identification import Identification
+from flexneedle.estimation.observer import StateCorrection
+from flexneedle.planning.terms import Outcome
+from flexneedle.rig.phantom.draw import draw
+from flexneedle.types import Frame, SensorReading
+from synthetic import make_insertion, make_plan
+from tasks import begun_with, task_of
+
+LONGEST = 300  # characters
+SCENARIO = flexneedle.load_scenario("phantom")
+SIMULATOR = flexneedle.Simulator(SCENARIO, threads=2)
+STATE = SIMULATOR.step(SIMULATOR.start(), flexneedle.Control(db_x=1.0, dg_y=0.1))
+INSERTION = make_insertion()
+ROLLOUT = SIMULATOR.rollout(STATE, [[flexneedle.Control(db_x=1.0).row()] * 3] * 2)
+READINGS = {"tip": SensorReading((1.0, 2.0, 3.0)), "ref1": SensorReading(None, status="missing")}
+RECORDS = {
+    "plan": INSERTION.plan,
+    "insertion": INSERTION,
+    "insertion that was held": make_insertion(outcome="held", reason="no sample for 1.00 s", periods=3),
+    "insertion without a period": replace(INSERTION, periods=()),
+    "period": INSERTION.periods[10],
+    "frame": Frame(0.3, 12, READINGS),
+    "scenario": SCENARIO,
+    "simulator": SIMULATOR,
+    "state": STATE,
+    "start": SIMULATOR.start(),
+    "contacts": STATE.contacts,
+    "rollout": ROLLOUT,
+    "assimilation": SIMULATOR.assimilate(STATE, STATE.tip[:2]),
+    "outcome": Outcome(np.zeros((2, 3, 5)), *ROLLOUT),
+    "task": task_of(SIMULATOR, make_plan()),
+    "estimate": StateCorrection().begin(begun_with(SIMULATOR)),
+    "identification": Identification().begin(begun_with(SIMULATOR)),
+    "truth": draw(SCENARIO, np.random.default_rng(0)),
+}
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_a_record_prints_as_one_short_line(name):
+    for text in (repr(RECORDS[name]), str(RECORDS[name])):
+        assert "\n" not in text
+        assert "array(" not in text
+        assert len(text) <= LONGEST, text
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("plan", "<Plan manipulation to (40, 5) mm in 69 steps, ends 0.010 mm off, 0.8 mJ, flips 1, seed 0>"),
+        (
+            "insertion",
+            "<Insertion to (40, 5) mm, 69 periods, seed 0; reached: the tip ended 0.070 mm from the target>",
+        ),
+        (
+            "insertion that was held",
+            "<Insertion to (40, 5) mm, 3 periods, seed 0; held after 3 periods: no sample for 1.00 s>",
+        ),
+        ("frame", "<Frame 12, 0.300 s: tip, ref1 missing>"),
+        (
+            "scenario",
+            "<Scenario 'Two-layer tissue phantom': needle 0.819 mm, 2 layers, guide at 41 mm, target (40, 5) mm>",
+        ),
+        (
+            "start",
+            "<State tip (-28.500, 0.000) mm, slope 0.00 mrad, guide 0.000 mm, bevel +1, 0 mJ in the tissue, "
+            "converged>",
+        ),
+        ("rollout", "<Rollout 2 sequences of 3 steps, 100% of the steps converged>"),
+        ("outcome", "<Outcome 2 sequences of 3 steps, 100% converged>"),
+    ],
+)
+def test_the_line_has_what_matters_with_its_unit(name, line):
+    assert repr(RECORDS[name]) == line
+
+
+def test_a_period_names_time_action_tip_and_verdict():
+    form = r"<Period 10 at 2\.20 s: move, estimated tip \(.*\) mm, true tip \(.*\) mm, measurement ok>"
+    assert re.fullmatch(form, repr(RECORDS["period"]))
