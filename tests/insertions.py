@@ -80,6 +80,11 @@ def run(plan, rig, scenario=PHANTOM, seed=5, **options):
     return insertion.run(scenario, plan, rig, np.random.default_rng(seed), **options)
 
 
+def of_any_scenario(plan):
+    """The plan without the scenario that it was made for: it is carried out in any."""
+    return replace(plan, scenario=None)
+
+
 class Enough(Exception):
     """No need to carry out the rest."""
 

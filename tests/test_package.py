@@ -52,3 +52,13 @@ def test_an_unknown_name_is_an_attribute_error():
 
 def test_the_version_is_that_of_the_distribution():
     assert flexneedle.__version__ == version("flexneedle")
+
+
+def test_every_public_name_is_there():
+    assert [name for name in flexneedle.__all__ if getattr(flexneedle, name, None) is None] == []
+
+
+def test_the_import_loads_no_room_of_the_package():
+    script = "import flexneedle; print(*(name for name in sys.modules if name.startswith('flexneedle')))"
+    done = subprocess.run([sys.executable, "-c", f"import sys; {script}"], capture_output=True, text=True)
+    assert done.stdout.split() == ["flexneedle"]

@@ -20,17 +20,23 @@ if TYPE_CHECKING:
     from flexneedle.estimation.estimate import Estimate
     from flexneedle.estimation.task import Task
     from flexneedle.planning.planner import plan
-    from flexneedle.rig.loop import insert
+    from flexneedle.plot.record import plot
+    from flexneedle.rig.loop import insert, run
     from flexneedle.rig.phantom.draw import Truth
     from flexneedle.rig.phantom.plants import Plant
     from flexneedle.rig.ports import TipTracker
+    from flexneedle.rig.virtual import Rig
+    from flexneedle.runs.frame import to_dataframe
+    from flexneedle.runs.reading import load
+    from flexneedle.runs.saving import save
     from flexneedle.scenario.files import load_scenario
     from flexneedle.scenario.model import Scenario
     from flexneedle.scenario.sections.fields import Section
     from flexneedle.simulator.control import Control
     from flexneedle.simulator.simulator import Simulator
     from flexneedle.simulator.state import State
-    from flexneedle.types import Measurement, Plan
+    from flexneedle.study.runner import run_study
+    from flexneedle.types import Insertion, Measurement, Plan
 
 __version__ = "0.1.0"
 
@@ -41,10 +47,12 @@ __all__ = [
     "Estimate",
     "FlexneedleError",
     "InputError",
+    "Insertion",
     "Measurement",
     "Method",
     "Plan",
     "Plant",
+    "Rig",
     "RunError",
     "Scenario",
     "ScenarioError",
@@ -58,8 +66,14 @@ __all__ = [
     "Truth",
     "__version__",
     "insert",
+    "load",
     "load_scenario",
     "plan",
+    "plot",
+    "run",
+    "run_study",
+    "save",
+    "to_dataframe",
     "travel_left",
 ]
 
@@ -72,23 +86,31 @@ _HOMES = {
     "estimation.estimate": ("Estimate",),
     "estimation.task": ("Task",),
     "planning.planner": ("plan",),
-    "rig.loop": ("insert",),
+    "rig.loop": ("insert", "run"),
     "rig.phantom.draw": ("Truth",),
     "rig.phantom.plants": ("Plant",),
     "rig.ports": ("TipTracker",),
+    "rig.virtual": ("Rig",),
+    "runs.frame": ("to_dataframe",),
+    "runs.reading": ("load",),
+    "runs.saving": ("save",),
     "scenario.files": ("load_scenario",),
     "scenario.model": ("Scenario",),
     "scenario.sections.fields": ("Section",),
     "simulator.control": ("Control",),
     "simulator.simulator": ("Simulator",),
     "simulator.state": ("State",),
-    "types": ("Measurement",),
+    "study.runner": ("run_study",),
+    "types": ("Insertion", "Measurement", "Plan"),
 }
+_ROOM = "plot"  # the public name that is a room: it can be called
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name from its home on first use (PEP 562)."""
+    if name == _ROOM:
+        return import_module(f".{name}", __name__)
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f".{_HOME_OF[name]}", __name__), name)

@@ -4,10 +4,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from flexneedle.arguments import refusal
+
+if TYPE_CHECKING:
+    from flexneedle.scenario.model import Scenario
 
 Floats = NDArray[np.float64]
 Pose = tuple[float, float, float]
@@ -20,6 +25,9 @@ Point = tuple[float, float, float]
 """x, y, z (mm)."""
 Quaternion = tuple[float, float, float, float]
 """Unit quaternion w, x, y, z: turns the sensor's frame into the tracker's. The sensor's z axis is the needle's."""
+
+_MAKE_ONE = "make one with flexneedle.plan or flexneedle.insert"
+_GIVE_ONE = "give one with dataclasses.replace(record, scenario=scenario)"
 
 VISIBLE = "ok"
 """Status of a sensor that the tracker sees, and of a tracker that sends frames."""
@@ -83,7 +91,8 @@ class Plan:
 
     controls (m, 5): columns db_x, db_y, db_theta, dg_y, flip; tips (m + 1, 3): planned tip poses, the start first;
     strain_energy (m + 1,): weighted tissue energy (mJ); guide (m + 1,): guide position (mm); shapes (m + 1, n, 3):
-    nodes of the needle; terms: cost by name; history: one dict per iteration of the planner.
+    nodes of the needle; terms: cost by name; history: one dict per iteration of the planner; scenario: what it was made
+    for, None where that is not known.
     """
 
     strategy: str
@@ -102,6 +111,7 @@ class Plan:
     history: tuple[dict[str, Any], ...]
     limit: str  # which limit binds if the target is out of reach, else ""
     seconds: float = field(default=0.0, compare=False)  # wall clock
+    scenario: "Scenario | None" = None
 
     @property
     def tip_mm(self) -> tuple[float, float]:
@@ -266,6 +276,8 @@ class Insertion:
     reason: str  # one line; "" when done within 1 mm of the target, or where that is not known
     controller: str = ""  # its name
     phantom: str = ""  # formulation of the virtual phantom, "" on a rig
+    tracker: str = ""  # its name, "" on a rig
+    scenario: "Scenario | None" = None  # in which it was carried out
 
     @property
     def target(self) -> tuple[float, float]:
@@ -322,6 +334,16 @@ class Insertion:
     def __repr__(self) -> str:
         to = f"to {_mm(self.target)}, {len(self.periods)} periods, seed {self.seed}"
         return f"<Insertion {to}{self.controller and f', {self.controller}'}; {self.summary}>"
+
+
+def scenario_of(record: Plan | Insertion) -> "Scenario":
+    """Return the scenario of a plan or an insertion. Raises InputError if it carries none, and for anything else."""
+    if not isinstance(record, Plan | Insertion):
+        raise refusal("record", record, "must be a Plan or an Insertion", _MAKE_ONE)
+    scenario = record.scenario or (record.plan.scenario if isinstance(record, Insertion) else None)
+    if scenario is None:
+        raise refusal("scenario", None, f"must be known: {record!r} has none", _GIVE_ONE)
+    return scenario
 
 
 def _mm(place: Sequence[float]) -> str:

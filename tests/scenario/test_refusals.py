@@ -461,7 +461,7 @@ def test_a_byte_order_mark_and_windows_line_ends_are_accepted(minimal_text, scen
         ("a\nb", "a\\nb: no such file"),
         ("a/" * 5000, "a/a/"),
         ("/dev/zero", "/dev/zero: larger than 1000000 bytes"),
-        (None, "a scenario is a preset name, a path or a Scenario, not NoneType"),
+        (None, "scenario = None: must be a preset name, a path or a Scenario"),
     ],
 )
 def test_a_source_that_cannot_be_read_is_refused(source, message):

@@ -328,10 +328,24 @@ def test_a_study_that_was_killed_before_it_began_is_begun(quick, uninterrupted, 
     assert tables(run_study(quick, tmp_path, resume=True)) == tables(uninterrupted)
 
 
-@pytest.mark.parametrize("options", [{"workers": 0}, {"workers": 1, "scheduler": "tcp://host:1"}])
-def test_workers_are_at_least_one_and_of_this_machine(quick, tmp_path, options):
-    with pytest.raises(InputError, match="must be at least 1, and left out with a scheduler"):
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ({"workers": 0}, "workers = 0: must be a whole number, at least 1; leave it out for one per core"),
+        (
+            {"workers": 1.5},
+            "workers = 1.5: must be a whole number, at least 1; leave it out for one per core",
+        ),
+        (
+            {"workers": 1, "scheduler": "tcp://host:1"},
+            "workers = 1: is for this machine: leave it out with a scheduler",
+        ),
+    ],
+)
+def test_workers_are_at_least_one_and_of_this_machine(quick, tmp_path, options, line):
+    with pytest.raises(InputError) as caught:
         run_study(quick, tmp_path / "a", **options)
+    assert str(caught.value) == line
 
 
 def test_the_summary_agrees_with_the_table(quick, uninterrupted):

@@ -6,7 +6,7 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -156,8 +156,18 @@ def test_plans_come_back_to_the_last_bit(tmp_path):
     folder.write()
     again = read_run(tmp_path).plans["manipulation"]
     for field in fields(plan):
-        if field.name != "seconds":
+        if field.name not in ("seconds", "scenario"):
             np.testing.assert_array_equal(getattr(again, field.name), getattr(plan, field.name))
+
+
+def test_a_plan_comes_back_with_the_scenario_of_its_run(tmp_path):
+    """Also one that an earlier version wrote: plans never held their scenario themselves."""
+    folder = claim(tmp_path)
+    folder.plans["manipulation"] = replace(make_plan(), scenario=load_scenario("phantom"))
+    folder.write()
+    assert "scenario" not in json.loads((tmp_path / "run.json").read_text())["plans"]["manipulation"]
+    run = read_run(tmp_path)
+    assert run.plans["manipulation"].scenario == run.scenario == load_scenario("phantom")
 
 
 def test_a_plan_without_steps_comes_back():

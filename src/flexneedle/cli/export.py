@@ -47,7 +47,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _export(args: argparse.Namespace) -> int:
-    from flexneedle.runs.figures import load_insertion
+    from flexneedle.runs.reading import load_insertion
     from flexneedle.trace.export import write_csv, write_readings
 
     if args.csv is not None:

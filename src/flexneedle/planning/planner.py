@@ -3,15 +3,18 @@
 import math
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from flexneedle.arguments import pair, whole
 from flexneedle.errors import InputError
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.insertion import BASE_Y, GUIDE, PlanProblem, Solution, optimise
 from flexneedle.planning.steering import reach, steer
 from flexneedle.planning.terms import Outcome
+from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario, check_target
 from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.simulator.control import Control, Limits
@@ -19,6 +22,7 @@ from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
 from flexneedle.types import Floats, Plan
 
+_TARGET = "depth and lateral offset in mm"
 STRATEGIES = ("manipulation", "steering")
 _DEPTH_TOLERANCE_MM = 1e-6
 _SHARE_SIGMA = 0.1  # of the logarithm of a primitive's share of the travel
@@ -28,7 +32,7 @@ _AT_LIMIT = 0.999  # share of a limit that counts as reached
 
 
 def plan(
-    scenario: Scenario,
+    scenario: str | Path | Scenario,
     target: tuple[float, float] | None = None,
     strategy: str = "manipulation",
     seed: int = 0,
@@ -38,14 +42,16 @@ def plan(
 ) -> Plan:
     """Plan an insertion to `target` (x, y) in mm (default: the scenario's), best found by cross-entropy.
 
+    scenario: also by its name or path, as for `load_scenario`;
     strategy: "manipulation" moves guide and bevel; "steering" moves only the bevel (paper section III-A, but on the
     needle itself, not on a softer one). `progress` gets a dict after each iteration. `threads` is for rollouts
     (default: all cores) and changes no result. Same seed, same plan.
-    Raises ScenarioError for a target that the scenario excludes and InputError for an unknown strategy.
+    Raises ScenarioError for a target that the scenario excludes, InputError for another argument that cannot be used.
     """
+    scenario, seed = load_scenario(scenario), whole("seed", seed, 0)
     if strategy not in STRATEGIES:
         raise InputError(f"strategy = {strategy!r}: must be one of {', '.join(STRATEGIES)}")
-    goal = scenario.target.position if target is None else (float(target[0]), float(target[1]))
+    goal = scenario.target.position if target is None else pair("target", target, _TARGET)
     check_target(scenario, *goal)
     begun = time.perf_counter()
     simulator = Simulator(scenario, threads)
@@ -72,6 +78,7 @@ def plan(
         history=solution.search_state.history,
         limit=_binding_limit(simulator, problem, controls, states),
         seconds=time.perf_counter() - begun,
+        scenario=scenario,
     )
 
 

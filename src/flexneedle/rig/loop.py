@@ -5,10 +5,12 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from flexneedle.arguments import instance, whole
 from flexneedle.control import tables
 from flexneedle.control.forecast import hopeless, likely_misses, missed, warning
 from flexneedle.control.guide import check_guide
@@ -17,11 +19,13 @@ from flexneedle.control.methods import DEFAULT, used
 from flexneedle.errors import InputError, RunError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
+from flexneedle.planning.origin import check_origin
 from flexneedle.rig.measuring import Observation, look_around, see
 from flexneedle.rig.monitor.watch import Watch
 from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
 from flexneedle.rig.virtual import Rig, Seeds, virtual_rig
+from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Action, Command, Insertion, Outcome, Period, Plan
@@ -31,7 +35,7 @@ _STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
 
 
 def insert(
-    scenario: Scenario,
+    scenario: str | Path | Scenario,
     plan: Plan,
     seed: int = 0,
     *,
@@ -44,19 +48,23 @@ def insert(
 ) -> Insertion:
     """Carry out `plan` in closed loop against the virtual phantom that `seed` draws; returns the whole record.
 
+    scenario: also by its name or path, as for `load_scenario`; the one that the plan was made for, or one that differs
+    in no more than controller, tracker, monitor and phantom.
     controller: one of `control.methods.METHODS`; phantom: "exact" or "model", the formulation of the plant; tracker:
     "scenario", the one that is described there. Each may be an object of your own, too, or its name `module:NAME`
     (docs/extend.md).
     `threads` is for rollouts (default: all cores) and changes no result. `on_period` gets each control period as
-    it ends. Raises InputError for an unknown name or an object that is none, and for a controller that needs the guide
-    where it may not move, ScenarioError for a setting that the controllers refuse, RunError if the plan misses its
-    target by more than 1 mm, unless `force` or the controller predicts the miss itself, as the default does. Same seed,
-    same record, but for wall-clock durations.
+    it ends. Raises InputError for an unknown name or an object that is none, for a plan of another scenario, and for a
+    controller that needs the guide where it may not move, ScenarioError for a setting that the controllers refuse,
+    RunError if the plan misses its target by more than 1 mm, unless `force` or the controller predicts the miss itself,
+    as the default does. Same seed, same record, but for wall-clock durations.
     """
+    scenario, plan, seed = load_scenario(scenario), _planned(plan), whole("seed", seed, 0)
     phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
     plant_name, plant = plant_of(phantom)
+    tracker_name, own_tracker = tracker_of(tracker)
     seeds = Seeds(phantom_seed, tracker_seed, room_seed)
-    rig = virtual_rig(scenario, plan.bevel, seeds, plant, tracker=tracker_of(tracker)[1])
+    rig = virtual_rig(scenario, plan.bevel, seeds, plant, tracker=own_tracker)
     rng = np.random.default_rng(control_seed)
     insertion = run(
         scenario,
@@ -69,11 +77,11 @@ def insert(
         threads=threads,
         on_period=on_period,
     )
-    return replace(insertion, phantom=plant_name)
+    return replace(insertion, phantom=plant_name, tracker=tracker_name)
 
 
 def run(
-    scenario: Scenario,
+    scenario: str | Path | Scenario,
     plan: Plan,
     rig: Rig,
     rng: np.random.Generator,
@@ -84,7 +92,14 @@ def run(
     threads: int | None = None,
     on_period: Callable[[Period], None] | None = None,
 ) -> Insertion:
-    """Carry out `plan` on any rig; as `insert`."""
+    """Carry out `plan` on any rig; as `insert`.
+
+    rng: for the controller; seed: for the record alone.
+    """
+    scenario, plan, seed = load_scenario(scenario), _planned(plan), whole("seed", seed, 0)
+    rig = instance("rig", rig, Rig, "Rig(clock, driver, tracker), of what flexneedle.rig.ports describes")
+    rng = instance("rng", rng, np.random.Generator, "such as numpy.random.default_rng(0)")
+    check_origin(plan, scenario)
     name, chosen = controller_of(controller)
     check_guide(chosen, scenario.setup, plan.strategy)
     if not (plan.reached or force or chosen.predicts):
@@ -101,11 +116,15 @@ def run(
         ending = so_far or ending
         if on_period is not None:
             on_period(period)
-    insertion = Insertion(plan, seed, tuple(periods), *ending, name)
+    insertion = Insertion(plan, seed, tuple(periods), *ending, name, scenario=scenario)
     if insertion.outcome is Outcome.DONE:
         line = missed(insertion.true_error_mm, math.dist(periods[-1].estimate[:2], plan.target))
         return replace(insertion, reason="; ".join(filter(None, (insertion.reason, line))))
     return insertion
+
+
+def _planned(plan: object) -> Plan:
+    return instance("plan", plan, Plan, "make one with flexneedle.plan(scenario)")
 
 
 def _periods(

@@ -10,12 +10,11 @@ from flexneedle.control.guide import check_guide
 from flexneedle.control.methods import DEFAULT
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT
 from flexneedle.runs.figures import draw_run
-from flexneedle.trace.folder import TRACE_FILE, Folder, versions
+from flexneedle.runs.saving import finish_insertion, finish_plans, keep_plan, open_trace
+from flexneedle.trace.folder import Folder
 from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
-from flexneedle.trace.results import insertion_result, insertion_timing, plan_result, plan_timing
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Insertion, Outcome, Period, Plan
-from flexneedle.trace.writer import TraceWriter
 
 
 OnIteration = Callable[[str, dict[str, Any]], None]
@@ -57,10 +56,7 @@ def record_plans(
     with _marked(folder):
         for strategy in strategies:
             _plan(folder, scenario, strategy, seed, on_iteration)
-        results = {name: plan_result(plan) for name, plan in folder.plans.items()}
-        folder.values["result"] = results
-        folder.end("done")
-        draw_run(folder.path)
+        finish_plans(folder)
     return folder.plans
 
 
@@ -88,22 +84,15 @@ def record_insertion(
         plan_seed = choices.seed if choices.plan_seed is None else choices.plan_seed
         plan = _plan(folder, scenario, choices.strategy, plan_seed, on_iteration)
         insertion = _insert(folder, scenario, plan, choices, on_period)
-        folder.values["result"] = insertion_result(insertion)
-        folder.timing |= insertion_timing(insertion)
-        folder.end(insertion.outcome, insertion.reason)
-        draw_run(folder.path)
+        finish_insertion(folder, insertion)
     return insertion
 
 
-def _plan(
-    folder: Folder, scenario: Scenario, strategy: str, seed: int, on_iteration: OnIteration
-) -> Plan:
+def _plan(folder: Folder, scenario: Scenario, strategy: str, seed: int, on_iteration: OnIteration) -> Plan:
     from flexneedle.planning.planner import plan
 
     made = plan(scenario, strategy=strategy, seed=seed, progress=partial(on_iteration, strategy))
-    folder.plans[strategy] = made
-    folder.timing[strategy] = plan_timing(made)
-    folder.write()
+    keep_plan(folder, made)
     return made
 
 
@@ -113,10 +102,7 @@ def _insert(
     from flexneedle.rig.loop import insert
 
     periods: list[Period] = []
-    about = {"seed": str(choices.seed), "scenario": scenario.name, "strategy": plan.strategy}
-    about |= {**choices.parts, **versions()}
-    path = folder.path / TRACE_FILE
-    with TraceWriter(path, plan, about=about, scenario=scenario.values()) as trace:
+    with open_trace(folder, scenario, plan, choices.seed, choices.parts) as trace:
 
         def keep(period: Period) -> None:
             trace.add(period)
@@ -127,8 +113,9 @@ def _insert(
         try:
             return insert(scenario, plan, choices.seed, on_period=keep, **options)
         except KeyboardInterrupt:
-            ending = Outcome.INTERRUPTED, "stopped by the user", choices.controller, choices.phantom
-            return Insertion(plan, choices.seed, tuple(periods), *ending)
+            ending = Outcome.INTERRUPTED, "stopped by the user"
+            parts = choices.controller, choices.phantom, choices.tracker
+            return Insertion(plan, choices.seed, tuple(periods), *ending, *parts, scenario)
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """The scenario: everything that plan and insertion depend on, but for the seed."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from itertools import chain
 from typing import Annotated, Any, Self
 
@@ -105,9 +105,12 @@ class Scenario(Section):
         """Return all values by dotted key (`tissue.0.alpha`), in the order of the schema."""
         return flatten(self.values())
 
-    def first_difference(self, other: "Scenario") -> str | None:
-        """Return the first key whose value differs, as `tissue[0].alpha`, or None if all are equal."""
-        mine, theirs = self.flat(), other.flat()
+    def first_difference(self, other: "Scenario", sections: Collection[str] | None = None) -> str | None:
+        """Return the first key whose value differs, as `tissue[0].alpha`, or None if all are equal.
+
+        sections: those that are compared (default: all).
+        """
+        mine, theirs = (flatten(_part(each.values(), sections)) for each in (self, other))
         return next(
             (key_path(split_key(key)) for key in mine | theirs if mine.get(key) != theirs.get(key)), None
         )
@@ -133,6 +136,10 @@ class Scenario(Section):
         for layer in self.tissue[:-1]:
             tops.append(tops[-1] + (layer.thickness_mm or 0.0))
         return tuple(tops)
+
+
+def _part(values: Mapping[str, Any], sections: Collection[str] | None) -> Mapping[str, Any]:
+    return values if sections is None else {name: values[name] for name in sections}
 
 
 def _expanded(key: str, value: Any) -> Any:

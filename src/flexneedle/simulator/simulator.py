@@ -11,10 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flexneedle.arguments import whole
 from flexneedle.errors import CommandError, StateError
 from flexneedle.mechanics import insertion, model
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.ogden import displaced_energy
+from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.control import Control, Limits
 from flexneedle.simulator.state import State, load_arrays, mechanics_difference, mesh_of, solved
@@ -25,6 +27,7 @@ _CHUNKS_A_THREAD = 4
 _CLOSEST_POINTS_MM = 0.1
 _AHEAD_TOLERANCE_MM = 1e-4  # of rollouts without limits
 _ASIDE_MM = 1.0
+_ALL_CORES = "leave it out for one per core"
 
 
 class Rollout(NamedTuple):
@@ -50,16 +53,21 @@ class Assimilation(NamedTuple):
 class Simulator:
     """The needle of a scenario in its tissue (DESIGN of the model: docs/theory.md).
 
-    `threads` is for rollouts (default: all cores that the process may use); results do not depend on it.
+    scenario: also by its name or path, as for `load_scenario`. `threads` is for rollouts (default: all cores that the
+    process may use); results do not depend on it. Raises ScenarioError or InputError for what cannot be used.
     """
 
     def __init__(
-        self, scenario: Scenario, threads: int | None = None, *, constants: model.Model | None = None
+        self,
+        scenario: str | Path | Scenario,
+        threads: int | None = None,
+        *,
+        constants: model.Model | None = None,
     ) -> None:
-        self.scenario = scenario
-        self.threads = threads or _cores()
-        self._model = constants or _build_model(scenario)
-        self._limits = Limits.of(scenario)
+        self.scenario = load_scenario(scenario)
+        self.threads = _cores() if threads is None else whole("threads", threads, 1, _ALL_CORES)
+        self._model = constants or _build_model(self.scenario)
+        self._limits = Limits.of(self.scenario)
 
     def __repr__(self) -> str:
         return f"<Simulator of {self.scenario!r}, threads {self.threads}>"

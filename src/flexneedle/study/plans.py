@@ -6,28 +6,27 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
+from flexneedle.planning.origin import SEEN_BY_THE_PLANNER
 from flexneedle.study.grid import GridPoint
 from flexneedle.study.rows import Planned
 from flexneedle.trace.files import replace_file
 from flexneedle.trace.plain import plan_from_values, to_text
 from flexneedle.types import Plan
 
-_MECHANICS = ("needle", "setup", "tissue", "contact", "target")
-
 
 def plan_key(point: GridPoint) -> str:
     """Return the name of a point's plan: a digest of all that the planner sees."""
-    return _digest(point, ("plan",), point.strategy, point.plan_seed)
+    return _digest(point, (), point.strategy, point.plan_seed)
 
 
 def truth_key(point: GridPoint) -> str:
     """Return a digest of all that the reach of a point's phantoms depends on, but for the seed."""
-    return _digest(point, ("plan", "phantom"), point.plant, point.strategy)
+    return _digest(point, ("phantom",), point.plant, point.strategy)
 
 
 def _digest(point: GridPoint, sections: tuple[str, ...], *settings: object) -> str:
     values = point.scenario.values()
-    seen = [{name: values[name] for name in (*_MECHANICS, *sections)}, *settings]
+    seen = [{name: values[name] for name in (*SEEN_BY_THE_PLANNER, *sections)}, *settings]
     return hashlib.sha256(json.dumps(seen, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+from flexneedle.arguments import whole
 from flexneedle.errors import InputError, RunError
 from flexneedle.rig.kernels import compile_kernels
 from flexneedle.study import pools
@@ -60,8 +61,10 @@ def run_study(
     from this process in versions; KeyboardInterrupt, after the tables are written, if the user stops it.
     """
     study = load_study(source)
-    if workers is not None and not (workers >= 1 and scheduler is None):
-        raise InputError(f"workers = {workers}: must be at least 1, and left out with a scheduler")
+    if workers is not None and scheduler is not None:
+        raise InputError(f"workers = {workers}: is for this machine: leave it out with a scheduler")
+    if workers is not None:
+        workers = whole("workers", workers, 1, "leave it out for one per core")
     folder = new_folder("study", study.name) if out is None else Path(out)
     chunk = 1 if scheduler is None else math.ceil(len(study) / _CLUSTER_JOBS)
     # The pool first: a scheduler that does not answer leaves no folder behind.

@@ -3,6 +3,7 @@
 Names end in their unit; numbers are exact (`repr`), so that a period comes back from its row to the last bit.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -69,7 +70,12 @@ COLUMNS: tuple[str, ...] = tuple(name for columns in _FIELDS.values() for name, 
 
 def to_row(period: Period) -> dict[str, str]:
     """Return the scalars of a period as text by column; what is missing is empty."""
-    return dict(cell for field in _FIELDS for cell in _cells(field, getattr(period, field)))
+    return {name: "" if value is None else _text(value) for name, value in _cells(period)}
+
+
+def to_values(period: Period) -> dict[str, Any]:
+    """Return the scalars of a period as numbers, flags and text by column; a number that is not known is NaN."""
+    return {name: math.nan if value is None else value for name, value in _cells(period)}
 
 
 def from_row(
@@ -83,13 +89,19 @@ def from_row(
     return Period(shape=shape, durations=durations, readings=readings, **values)
 
 
-def _cells(field: str, value: Any) -> Iterator[tuple[str, str]]:
-    if isinstance(value, Measurement):
-        value = (value.time, value.x, value.y, value.z)
-    columns = _FIELDS[field]
-    parts = value if isinstance(value, tuple) else (value,) * len(columns)
-    for (name, kind), part in zip(columns, parts, strict=True):
-        yield name, "" if part is None else str(part) if kind in _TEXTS else repr(kind(part))
+def _cells(period: Period) -> Iterator[tuple[str, Any]]:
+    """Each column and its value, None where it is missing."""
+    for field, columns in _FIELDS.items():
+        value = getattr(period, field)
+        if isinstance(value, Measurement):
+            value = (value.time, value.x, value.y, value.z)
+        parts = value if isinstance(value, tuple) else (value,) * len(columns)
+        for (name, kind), part in zip(columns, parts, strict=True):
+            yield name, None if part is None else str(part) if kind in _TEXTS else kind(part)
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else repr(value)
 
 
 def _value(field: str, row: Mapping[str, str]) -> Any:

@@ -9,7 +9,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -33,7 +33,7 @@ _FORMAT = 1
 class RunFile:
     """`run.json`, read back. status: "running" (or killed), "done", "held", "failed" or "interrupted".
 
-    controller, phantom: of an insertion, "" where they are not recorded.
+    controller, phantom, tracker: of an insertion, "" where they are not recorded.
     """
 
     folder: Path
@@ -47,6 +47,7 @@ class RunFile:
     timing: Mapping[str, Any]
     controller: str
     phantom: str
+    tracker: str
 
 
 @dataclass(eq=False)
@@ -137,10 +138,12 @@ def _checked(path: Path, values: Any) -> RunFile:
     if not isinstance(values, dict) or values.get("format") != _FORMAT:
         raise InputError(f"{path}: not a run of this version of flexneedle: format must be {_FORMAT}")
     try:
-        plans = {name: plan_from_values(plan) for name, plan in values["plans"].items()}
+        read = {name: plan_from_values(plan) for name, plan in values["plans"].items()}
         named = {name: values[name] for name in ("kind", "status", "reason", "seed", "result", "timing")}
-        named |= {name: values.get(name, "") for name in ("controller", "phantom")}
-        return RunFile(path.parent, scenario=Scenario.from_record(values["scenario"]), plans=plans, **named)
+        named |= {name: values.get(name, "") for name in ("controller", "phantom", "tracker")}
+        scenario = Scenario.from_record(values["scenario"])
+        plans = {name: replace(plan, scenario=scenario) for name, plan in read.items()}
+        return RunFile(path.parent, scenario=scenario, plans=plans, **named)
     except ScenarioError as error:
         raise InputError(f"{path}: damaged: {error.problems[0]}") from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:

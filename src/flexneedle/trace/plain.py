@@ -14,7 +14,7 @@ import numpy as np
 from flexneedle.types import Plan
 
 _ARRAYS = ("controls", "tips", "strain_energy", "guide", "shapes")
-_WALL_CLOCK = "seconds"
+_KEPT_ELSEWHERE = ("seconds", "scenario")
 
 
 def plain(value: Any) -> Any:
@@ -31,8 +31,8 @@ def plain(value: Any) -> Any:
 
 
 def plan_values(plan: Plan) -> dict[str, Any]:
-    """Return a plan as plain values, without the time that it took; arrays (mm, rad, mJ) come last."""
-    names = [field.name for field in fields(plan) if field.name != _WALL_CLOCK]
+    """Return a plan as plain values, without its scenario and the time that it took; arrays (mm, rad, mJ) come last."""
+    names = [field.name for field in fields(plan) if field.name not in _KEPT_ELSEWHERE]
     ordered = [name for name in names if name not in _ARRAYS] + list(_ARRAYS)
     return {name: plain(getattr(plan, name)) for name in ordered}
 

@@ -21,6 +21,7 @@ from insertions import (
     Tank,
     first_periods,
     moving,
+    of_any_scenario,
     run,
 )
 
@@ -116,7 +117,7 @@ def test_a_plant_that_does_not_converge_is_said_in_its_periods(plan):
 def test_the_end_of_the_stroke_ends_the_run_and_is_said(plan):
     short = PHANTOM.with_values({"setup.stroke_mm": 60.0, "target.depth_mm": 20.0})
     tank = Tank(plan.bevel, scenario=short)
-    done = run(plan, tank.rig(), short)
+    done = run(of_any_scenario(plan), tank.rig(), short)
     assert sum(command[0] for _, command in tank.moves) == pytest.approx(60.0, abs=0.01)
     left = plan.target[0] - done.periods[-1].estimate[0]
     assert done.reason.startswith(

@@ -16,7 +16,7 @@ from flexneedle.trace.export import write_csv
 from flexneedle.trace.reader import read_trace
 from flexneedle.trace.results import insertion_result
 from flexneedle.trace.writer import TraceWriter
-from insertions import PHANTOM, STILL, Tank, moving, run
+from insertions import PHANTOM, STILL, Tank, moving, of_any_scenario, run
 
 SECONDS = PHANTOM.control.hold_limit_s
 HELD = "held: no path to the target found"
@@ -143,11 +143,11 @@ def test_a_target_that_guide_and_bevel_cannot_reach_is_held_and_forced(plan):
         {"setup.max_guide_travel_mm": 0.1, "needle.bevel.offset_mm": 0.5, "target.lateral_mm": 0.0}
     )
     tank = Tank(plan.bevel, scenario=narrow)
-    done = run(plan, tank.rig(), narrow)
+    done = run(of_any_scenario(plan), tank.rig(), narrow)
     assert done.outcome == "held"
     assert done.reason.startswith("no path to the target found: predicted miss -")
     assert done.periods[-1].estimate[0] < 0.0  # it is known before the needle enters
-    forced = run(plan, Tank(plan.bevel, scenario=narrow).rig(), narrow, force=True)
+    forced = run(of_any_scenario(plan), Tank(plan.bevel, scenario=narrow).rig(), narrow, force=True)
     assert forced.outcome == "done"
     assert forced.warning
     assert forced.true_error_mm > narrow.control.miss_limit_mm

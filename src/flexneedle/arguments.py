@@ -1,0 +1,51 @@
+"""What callers give: one line, with value, rule and remedy, for what cannot be used."""
+
+import reprlib
+from operator import index
+from typing import Any, TypeVar
+
+from flexneedle.errors import InputError
+
+_Kind = TypeVar("_Kind")
+_LONGEST = 60  # characters of a value
+
+
+def whole(name: str, value: Any, least: int, remedy: str = "") -> int:
+    """Return a whole number. Raises InputError for anything else, and for one below `least`."""
+    try:
+        number = least - 1 if isinstance(value, bool) else index(value)
+    except TypeError:
+        number = least - 1
+    if number < least:
+        raise refusal(name, value, f"must be a whole number, at least {least}", remedy)
+    return number
+
+
+def pair(name: str, value: Any, parts: str) -> tuple[float, float]:
+    """Return two numbers, which `parts` describes. Raises InputError for anything else."""
+    try:
+        numbers = [] if isinstance(value, str) else [float(part) for part in value]
+    except (TypeError, ValueError):
+        numbers = []
+    if len(numbers) != 2:
+        raise refusal(name, value, f"must be two numbers, {parts}")
+    return numbers[0], numbers[1]
+
+
+def instance(name: str, value: Any, kind: type[_Kind], remedy: str) -> _Kind:
+    """Return a value of this class. Raises InputError, with the remedy, for another."""
+    if not isinstance(value, kind):
+        rule = f"must be {'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
+        raise refusal(name, value, rule, remedy)
+    return value
+
+
+def shown(value: object) -> str:
+    """Return a value of any kind as a few words in one line."""
+    text = " ".join(reprlib.repr(value).split())
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+
+
+def refusal(name: str, value: object, rule: str, remedy: str = "") -> InputError:
+    """Return the error of a value that breaks a rule."""
+    return InputError(f"{name} = {shown(value)}: {rule}{remedy and f'; {remedy}'}")

@@ -1,0 +1,32 @@
+"""The scenario that a plan was made for, and whether a plan may be carried out in another."""
+
+from flexneedle.errors import InputError
+from flexneedle.scenario.dotted import split_key
+from flexneedle.scenario.model import Scenario
+from flexneedle.types import Plan
+
+SEEN_BY_THE_PLANNER = ("needle", "setup", "tissue", "contact", "target", "plan")
+"""Sections of a scenario that a plan depends on. It may be carried out with any other controller, tracker, monitor or
+phantom."""
+
+
+def check_origin(plan: Plan, scenario: Scenario) -> None:
+    """Raise InputError, with the first key that differs, if a plan was made for another scenario.
+
+    Its target may have been given to the planner in place of the scenario's: it only has to be the plan's or the same
+    in both. A plan that does not carry its scenario, as those of earlier versions, is taken as it is.
+    """
+    made = plan.scenario
+    if made is None:
+        return
+    own_target = plan.target == scenario.target.position
+    sections = [name for name in SEEN_BY_THE_PLANNER if not (own_target and name == "target")]
+    if (key := made.first_difference(scenario, sections)) is not None:
+        was, now = (_shown(each, key) for each in (made, scenario))
+        rule = "make a plan for this scenario, or use the scenario of the plan (plan.scenario)"
+        raise InputError(f"{key} = {now}: the plan was made with {was}: {rule}")
+
+
+def _shown(scenario: Scenario, key: str) -> str:
+    value = scenario.flat().get(".".join(map(str, split_key(key))))
+    return "none" if value is None else str(value)

@@ -1,0 +1,53 @@
+"""Read a run back from its folder: an insertion, finished or not, or plans."""
+
+import warnings
+from pathlib import Path
+
+from flexneedle.errors import InputError, RunError
+from flexneedle.trace.folder import TRACE_FILE, RunFile, read_run
+from flexneedle.trace.reader import read_trace
+from flexneedle.types import Insertion, Outcome, Plan
+
+_UNFINISHED = "the run was killed, or still goes on"
+
+
+def load(run_dir: str | Path) -> Insertion | Plan | dict[str, Plan]:
+    """Return what a folder of `flexneedle insert`, `flexneedle plan` or `flexneedle.save` holds.
+
+    An insertion, as far as it went; a plan, or several by strategy. Warns (RuntimeWarning) of a trace that is not whole.
+    Raises InputError if the folder holds no run or a damaged one, RunError if the run ended before it had a plan.
+    """
+    run = _planned(read_run(Path(run_dir)))
+    if run.kind == "insertion":
+        insertion, note = insertion_of(run)
+        if note:
+            warnings.warn(note, RuntimeWarning, stacklevel=2)
+        return insertion
+    return next(iter(run.plans.values())) if len(run.plans) == 1 else run.plans
+
+
+def load_insertion(folder: Path) -> tuple[Insertion, str]:
+    """Return the insertion of a folder, as far as it went, and a line about an unfinished trace or "".
+
+    Raises InputError if the folder holds none, RunError if it ended before it had a plan.
+    """
+    run = read_run(folder)
+    if run.kind != "insertion":
+        raise InputError(f"{folder}: holds a {run.kind}, not an insertion")
+    return insertion_of(_planned(run))
+
+
+def insertion_of(run: RunFile) -> tuple[Insertion, str]:
+    """Return the insertion of a run that has a plan, and a line about an unfinished trace or ""."""
+    trace = read_trace(run.folder / TRACE_FILE)
+    killed = run.status == "running"
+    outcome, reason = (Outcome.INTERRUPTED, _UNFINISHED) if killed else (Outcome(run.status), run.reason)
+    plan = next(iter(run.plans.values()))
+    how = (outcome, reason, run.controller, run.phantom, run.tracker, run.scenario)
+    return Insertion(plan, run.seed, trace.periods, *how), trace.note
+
+
+def _planned(run: RunFile) -> RunFile:
+    if not run.plans:
+        raise RunError(f"{run.folder}: the run ended before it had a plan")
+    return run

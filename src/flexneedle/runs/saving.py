@@ -1,0 +1,65 @@
+"""What the folder of a run holds of plans and of an insertion, and a record written there at once."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from flexneedle.control.methods import used
+from flexneedle.runs.figures import draw_run
+from flexneedle.scenario.model import Scenario
+from flexneedle.trace.folder import TRACE_FILE, Folder, versions
+from flexneedle.trace.results import insertion_result, insertion_timing, plan_result, plan_timing
+from flexneedle.trace.writer import TraceWriter
+from flexneedle.types import Insertion, Plan, scenario_of
+
+
+def save(record: Plan | Insertion, folder: str | Path) -> Path:
+    """Write a plan or an insertion into a folder, as the commands do, and return the folder.
+
+    The folder is made; `load`, `flexneedle view` and `flexneedle export` read it. Raises InputError for a folder that
+    holds a run already or cannot be made, and for a record that does not carry its scenario.
+    """
+    scenario = scenario_of(record)
+    if isinstance(record, Plan):
+        claimed = Folder.claim(Path(folder), "", "plan", used(scenario), record.seed)
+        keep_plan(claimed, record)
+        finish_plans(claimed)
+    else:
+        claimed = Folder.claim(Path(folder), "", "insertion", scenario, record.seed)
+        parts = {name: getattr(record, name) for name in ("controller", "phantom", "tracker")}
+        claimed.values |= parts
+        keep_plan(claimed, record.plan)
+        with open_trace(claimed, scenario, record.plan, record.seed, parts) as trace:
+            for period in record.periods:
+                trace.add(period)
+        finish_insertion(claimed, record)
+    return claimed.path
+
+
+def keep_plan(folder: Folder, plan: Plan) -> None:
+    """Write a plan, and the time that it took, into `run.json`."""
+    folder.plans[plan.strategy] = plan
+    folder.timing[plan.strategy] = plan_timing(plan)
+    folder.write()
+
+
+def finish_plans(folder: Folder) -> None:
+    """Mark that all plans are made, and draw them."""
+    folder.values["result"] = {name: plan_result(plan) for name, plan in folder.plans.items()}
+    folder.end("done")
+    draw_run(folder.path)
+
+
+def open_trace(
+    folder: Folder, scenario: Scenario, plan: Plan, seed: int, parts: Mapping[str, str]
+) -> TraceWriter:
+    """Return the writer of `trace.mcap`; parts: names of controller, phantom and tracker."""
+    about = {"seed": str(seed), "scenario": scenario.name, "strategy": plan.strategy, **parts, **versions()}
+    return TraceWriter(folder.path / TRACE_FILE, plan, about=about, scenario=scenario.values())
+
+
+def finish_insertion(folder: Folder, insertion: Insertion) -> None:
+    """Write how an insertion ended into `run.json`, and draw it."""
+    folder.values["result"] = insertion_result(insertion)
+    folder.timing |= insertion_timing(insertion)
+    folder.end(insertion.outcome, insertion.reason)
+    draw_run(folder.path)

@@ -1,0 +1,199 @@
+"""What a user gets in Python: figures, tables, run folders, as the commands make them."""
+
+import builtins
+import json
+import subprocess
+import sys
+from dataclasses import fields, replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+import flexneedle
+from flexneedle.cli import main as cli
+from flexneedle.errors import InputError, RunError
+from flexneedle.plot.insertion import insertion_figure
+from flexneedle.plot.plans import plan_figure
+from flexneedle.trace.columns import COLUMNS
+from synthetic import blind, make_insertion, make_plan
+
+PHANTOM = flexneedle.load_scenario("phantom")
+PLAN = replace(make_plan(), scenario=PHANTOM)
+INSERTION = replace(make_insertion(PLAN), scenario=PHANTOM, controller="ce-mpc", phantom="exact")
+
+
+@pytest.fixture(scope="module")
+def carried_out():
+    """A real plan and its insertion, by the name of the scenario."""
+    plan = flexneedle.plan("phantom", seed=0)
+    return plan, flexneedle.insert("phantom", plan, seed=3)
+
+
+def same(one, other):
+    """Whether two records agree, but for wall-clock times."""
+    for field in fields(one):
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if field.name in ("durations", "seconds"):
+            continue
+        if field.name == "shape":  # in a trace its angles are quaternions
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+        elif isinstance(a, np.ndarray):
+            np.testing.assert_array_equal(a, b, err_msg=field.name)
+        elif field.name == "periods":
+            assert len(a) == len(b)
+            all(same(mine, theirs) for mine, theirs in zip(a, b, strict=True))
+        elif field.name == "plan":
+            same(a, b)
+        elif field.name == "history":
+            np.testing.assert_equal([dict(each) for each in a], [dict(each) for each in b])
+        else:
+            np.testing.assert_equal(a, b, err_msg=field.name)
+    return True
+
+
+def drawn(figure, path):
+    """The picture of a figure as bytes."""
+    figure.savefig(path, format="png", metadata={"Software": None})
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("record", "expected"),
+    [
+        (PLAN, lambda: plan_figure(PHANTOM, [PLAN])),
+        (INSERTION, lambda: insertion_figure(PHANTOM, INSERTION)),
+        (replace(INSERTION, scenario=None), lambda: insertion_figure(PHANTOM, INSERTION)),
+        (replace(INSERTION, periods=()), lambda: plan_figure(PHANTOM, [PLAN])),
+    ],
+    ids=["plan", "insertion", "its plan's scenario", "no period"],
+)
+def test_plot_returns_the_figure_that_the_commands_draw(record, expected, tmp_path):
+    figure = flexneedle.plot(record)
+    assert isinstance(figure, Figure)
+    assert drawn(figure, tmp_path / "a.png") == drawn(expected(), tmp_path / "b.png")
+
+
+@pytest.mark.parametrize(
+    "first", ["import flexneedle.plot.style", "from flexneedle.plot import style", "pass"]
+)
+def test_plot_can_be_called_whatever_was_imported_first(first):
+    code = f"{first}; import flexneedle; flexneedle.plot(3)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    line = "record = 3: must be a Plan or an Insertion; make one with flexneedle.plan or flexneedle.insert"
+    assert done.stderr.splitlines()[-1] == f"flexneedle.errors.InputError: {line}"
+
+
+def test_a_dataframe_has_the_rows_and_columns_of_the_exported_table(tmp_path, capsys):
+    half = replace(INSERTION, periods=(*INSERTION.periods[:-1], blind(INSERTION.periods[-1])))
+    flexneedle.save(half, tmp_path / "run")
+    assert cli.main(["export", str(tmp_path / "run"), "--csv", str(tmp_path / "periods.csv")]) == 0
+    capsys.readouterr()
+    frame = flexneedle.to_dataframe(half)
+    assert tuple(frame.columns) == COLUMNS
+    assert len(frame) == len(half.periods)
+    texts = {"verdict": str, "action": str, "decision": str, "warning": str}
+    missing = {name: ["", "nan"] for name in COLUMNS if name not in texts}
+    exported = pd.read_csv(tmp_path / "periods.csv", dtype=texts, keep_default_na=False, na_values=missing)
+    pd.testing.assert_frame_equal(frame, exported, check_dtype=False, check_exact=True)
+    assert np.isnan(frame["true_x_mm"].iloc[-1])
+    assert frame["true_x_mm"].dtype == frame["sample_z_mm"].dtype == float
+    assert frame["converged"].dtype == bool
+
+
+def test_a_dataframe_of_no_period_has_the_columns():
+    assert tuple(flexneedle.to_dataframe(replace(INSERTION, periods=())).columns) == COLUMNS
+
+
+def test_without_pandas_one_line_names_the_remedy(monkeypatch):
+    imported = builtins.__import__
+
+    def without(name, *more, **options):
+        if name == "pandas":
+            raise ModuleNotFoundError("No module named 'pandas'", name="pandas")
+        return imported(name, *more, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(InputError) as caught:
+        flexneedle.to_dataframe(INSERTION)
+    assert str(caught.value) == "to_dataframe needs pandas, which is not installed: pip install pandas"
+
+
+def test_what_is_saved_loads_the_same(carried_out, tmp_path):
+    """The scenario of a plan with the settings that the controllers add."""
+    plan = replace(carried_out[0], scenario=carried_out[1].scenario)
+    insertion = replace(carried_out[1], plan=plan)
+    assert same(flexneedle.load(flexneedle.save(insertion, tmp_path / "insertion")), insertion)
+    assert same(flexneedle.load(str(flexneedle.save(carried_out[0], str(tmp_path / "plan")))), plan)
+
+
+def test_a_saved_record_is_the_folder_that_the_command_writes(carried_out, tmp_path, monkeypatch, capsys):
+    """Same seeds, same files, but for wall-clock times."""
+    plan, insertion = carried_out
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["insert", "--seed", "3", "--plan-seed", "0", "--out", "insert"]) == 0
+    assert cli.main(["plan", "--out", "plan"]) == 0
+    capsys.readouterr()
+    for command, record in (("insert", insertion), ("plan", plan)):
+        ours, theirs = flexneedle.save(record, f"our-{command}"), tmp_path / command
+        assert sorted(p.name for p in ours.iterdir()) == sorted(p.name for p in theirs.iterdir())
+        mine, other = (json.loads((folder / "run.json").read_text()) for folder in (ours, theirs))
+        assert mine.pop("timing").keys() == other.pop("timing").keys()
+        assert json.dumps(mine) == json.dumps(other)
+        for picture in ours.glob("*.png"):
+            assert picture.read_bytes() == (theirs / picture.name).read_bytes()
+
+
+def test_a_folder_of_both_strategies_loads_as_plans_by_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    cli.main(["plan", "--strategy", "both", "--out", "both"])
+    capsys.readouterr()
+    plans = flexneedle.load("both")
+    assert list(plans) == ["manipulation", "steering"]
+    assert all(plan.strategy == name and plan.scenario is not None for name, plan in plans.items())
+
+
+def test_a_record_made_by_hand_has_no_scenario_and_is_refused_with_the_remedy(tmp_path):
+    bare = replace(PLAN, scenario=None)
+    for use in (flexneedle.plot, lambda record: flexneedle.save(record, tmp_path / "a")):
+        with pytest.raises(
+            InputError, match=r"give one with dataclasses\.replace\(record, scenario=scenario\)$"
+        ):
+            use(bare)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "use",
+    [flexneedle.to_dataframe, lambda record: flexneedle.save(record, "a"), flexneedle.plot],
+    ids=["to_dataframe", "save", "plot"],
+)
+def test_what_is_no_record_is_refused_in_one_line(use, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as caught:
+        use([1, 2])
+    assert str(caught.value).partition(": must be a")[0] in ("record = [1, 2]", "insertion = [1, 2]")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_holds_no_run_is_a_line(tmp_path):
+    with pytest.raises(InputError, match=r"holds no run: there is no run\.json"):
+        flexneedle.load(tmp_path)
+    with pytest.raises(InputError, match="holds a run already"):
+        flexneedle.save(PLAN, flexneedle.save(PLAN, tmp_path / "a"))
+
+
+def test_a_run_without_a_plan_is_a_line(tmp_path):
+    path = flexneedle.save(PLAN, tmp_path / "a") / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"plans": {}}))
+    with pytest.raises(RunError, match="the run ended before it had a plan"):
+        flexneedle.load(tmp_path / "a")
+
+
+def test_a_torn_trace_is_loaded_with_a_warning(tmp_path):
+    trace = flexneedle.save(INSERTION, tmp_path / "a") / "trace.mcap"
+    trace.write_bytes(trace.read_bytes()[: trace.stat().st_size // 2])
+    with pytest.warns(RuntimeWarning, match="not finished: reading stopped at the end of"):
+        torn = flexneedle.load(tmp_path / "a")
+    assert 0 < len(torn.periods) < len(INSERTION.periods)

@@ -1,0 +1,97 @@
+"""What cannot be used is one line with value, rule and remedy, at every door of the package."""
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.arguments import pair, whole
+from flexneedle.errors import FlexneedleError, InputError
+from flexneedle.scenario.files import dump_scenario
+from synthetic import make_plan
+
+PLAN = make_plan()
+SCENARIO = "must be a preset name, a path or a Scenario"
+WHOLE = "must be a whole number, at least"
+CORES = "leave it out for one per core"
+TARGET = "must be two numbers, depth and lateral offset in mm"
+MAKE = "make one with flexneedle.plan(scenario)"
+
+
+@pytest.mark.parametrize(
+    ("call", "line"),
+    [
+        (lambda: flexneedle.plan(3), f"scenario = 3: {SCENARIO}"),
+        (lambda: flexneedle.insert(None, PLAN), f"scenario = None: {SCENARIO}"),
+        (lambda: flexneedle.Simulator(2.5), f"scenario = 2.5: {SCENARIO}"),
+        (lambda: flexneedle.plan("phantom", target="a"), f"target = 'a': {TARGET}"),
+        (lambda: flexneedle.plan("phantom", target="12"), f"target = '12': {TARGET}"),
+        (lambda: flexneedle.plan("phantom", target=40.0), f"target = 40.0: {TARGET}"),
+        (lambda: flexneedle.plan("phantom", target=(40.0,)), f"target = (40.0,): {TARGET}"),
+        (lambda: flexneedle.plan("phantom", target=(1, None)), f"target = (1, None): {TARGET}"),
+        (lambda: flexneedle.plan("phantom", seed=-1), f"seed = -1: {WHOLE} 0"),
+        (lambda: flexneedle.plan("phantom", seed=1.5), f"seed = 1.5: {WHOLE} 0"),
+        (lambda: flexneedle.plan("phantom", seed=True), f"seed = True: {WHOLE} 0"),
+        (lambda: flexneedle.insert("phantom", PLAN, seed="3"), f"seed = '3': {WHOLE} 0"),
+        (lambda: flexneedle.plan("phantom", threads=0), f"threads = 0: {WHOLE} 1; {CORES}"),
+        (lambda: flexneedle.Simulator("phantom", threads=0.5), f"threads = 0.5: {WHOLE} 1; {CORES}"),
+        (lambda: flexneedle.insert("phantom", PLAN, threads=-2), f"threads = -2: {WHOLE} 1; {CORES}"),
+        (lambda: flexneedle.insert("phantom", "x"), f"plan = 'x': must be a Plan; {MAKE}"),
+        (
+            lambda: flexneedle.run("phantom", PLAN, "arm", np.random.default_rng(0)),
+            "rig = 'arm': must be a Rig; Rig(clock, driver, tracker), of what flexneedle.rig.ports describes",
+        ),
+    ],
+)
+def test_a_wrong_argument_is_one_line(call, line):
+    with pytest.raises(InputError) as caught:
+        call()
+    assert str(caught.value) == line
+
+
+def test_a_seed_in_place_of_a_generator_is_refused(quick_plan):
+    rig = flexneedle.Rig(None, None, None)
+    with pytest.raises(
+        InputError, match=r"^rng = 3: must be a Generator; such as numpy\.random\.default_rng\(0\)$"
+    ):
+        flexneedle.run("phantom", quick_plan, rig, 3)
+
+
+@pytest.mark.parametrize("value", [np.arange(3000.0), "x" * 900, [[1] * 99] * 99, {"a": "b\nc"}, object()])
+def test_whatever_is_given_the_line_is_one_and_short(value):
+    with pytest.raises(FlexneedleError) as caught:
+        flexneedle.insert("phantom", value)
+    (line,) = str(caught.value).splitlines()
+    assert len(line) < 200
+
+
+def test_numbers_of_numpy_are_numbers():
+    assert whole("seed", np.int64(3), 0) == 3
+    assert pair("target", np.array([40.0, 5.0]), "x and y") == (40.0, 5.0)
+
+
+def test_scenarios_by_name_and_by_path_are_the_scenario(quick_plan, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(dump_scenario(flexneedle.load_scenario("phantom")))
+    for source in ("phantom", str(path), path):
+        again = flexneedle.plan(source, (40.0, 5.0), seed=1, threads=1)
+        assert again.controls.tobytes() == quick_plan.controls.tobytes()
+        assert flexneedle.Simulator(source).scenario == flexneedle.load_scenario("phantom")
+    one, other = (
+        flexneedle.insert(source, quick_plan, 1, controller="open-loop", phantom="model", threads=1)
+        for source in ("phantom", flexneedle.load_scenario("phantom"))
+    )
+    assert [period.true_tip for period in one.periods] == [period.true_tip for period in other.periods]
+
+
+def test_run_carries_out_a_plan_on_any_rig(quick_plan):
+    """On the virtual phantom's it does what `insert` does."""
+    from flexneedle.rig.virtual import Seeds, virtual_rig
+
+    phantom, tracker, control, room = np.random.SeedSequence(4).spawn(4)
+    scenario = flexneedle.load_scenario("phantom")
+    rig = virtual_rig(scenario, quick_plan.bevel, Seeds(phantom, tracker, room))
+    assert isinstance(rig, flexneedle.Rig)
+    done = flexneedle.run(scenario, quick_plan, rig, np.random.default_rng(control), controller="open-loop")
+    same = flexneedle.insert(scenario, quick_plan, 4, controller="open-loop")
+    assert [period.true_tip for period in done.periods] == [period.true_tip for period in same.periods]
+    assert (done.phantom, done.tracker, same.phantom, same.tracker) == ("", "", "exact", "scenario")
