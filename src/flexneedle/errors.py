@@ -50,3 +50,8 @@ class RunError(FlexneedleError):
 
 class ScenarioWarning(UserWarning):
     """A scenario has a key that still works, or is not used, and should be changed. The message is one line."""
+
+
+def one_line(error: FlexneedleError) -> str:
+    """Return the message of an error in one line, also where it has several problems."""
+    return "; ".join(str(error).splitlines())

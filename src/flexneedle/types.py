@@ -210,6 +210,7 @@ class Action(StrEnum):
 class Outcome(StrEnum):
     """How an insertion ended."""
 
+    REFUSED = "refused"  # before the needle moved
     DONE = "done"
     HELD = "held"  # bad readings, or no path to the target
     FAILED = "failed"

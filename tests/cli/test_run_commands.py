@@ -211,10 +211,71 @@ def test_a_held_insertion_fails_with_its_reason(engine, capsys, in_tmp):
 def test_an_unreachable_plan_is_refused_and_recorded(engine, capsys, in_tmp):
     engine(plan_miss=2.5)
     status, out, err = run(capsys, "insert", "--json", "--out", "here", "--controller", "open-loop")
-    assert (status, out) == (1, "")
-    assert err.splitlines()[-1].startswith("flexneedle: plan misses the target by 2.51 mm, bound by setup.")
+    result, stored = json.loads(out), json.loads((in_tmp / "here/run.json").read_text())
+    assert (status, list(result)) == (1, INSERT_KEYS)
+    assert err.splitlines()[-1] == f"flexneedle: {result['reason']}"
+    assert result["reason"].startswith("plan misses the target by 2.51 mm, bound by setup.")
+    assert (result["outcome"], result["reached"], result["steps"]) == ("refused", False, 0)
+    assert (result["planned_error_mm"], result["planned_flips"]) == (pytest.approx(2.51), 1)
+    assert (result["run_dir"], result["timing"]["plan_seconds"]) == ("here", 0.71)
     assert names(in_tmp / "here") == ["plan.png", "plan.svg", "run.json", "trace.mcap"]
-    assert json.loads((in_tmp / "here/run.json").read_text())["status"] == "failed"
+    assert stored["status"] == "failed"
+    assert stored["result"] == {key: result[key] for key in INSERT_KEYS if key not in ("run_dir", "timing")}
+
+
+@pytest.mark.parametrize(
+    ("argv", "reason"),
+    [
+        (
+            ["--strategy", "steering", "--controller", "resolved-rate"],
+            "controller = 'resolved-rate': steers with the guide, and strategy = 'steering' does not move it: "
+            "use 'manipulation'",
+        ),
+        (
+            ["case.toml", "--controller", "broyden-mpc"],
+            "controller = 'broyden-mpc': steers with the guide: give setup.guide_to_skin_mm",
+        ),
+    ],
+)
+def test_a_refusal_before_the_plan_prints_the_same_keys(argv, reason, capsys, in_tmp, minimal_text):
+    (in_tmp / "case.toml").write_text(minimal_text)
+    status, out, err = run(capsys, "insert", "--json", "--seed", "4", *argv)
+    result = json.loads(out)
+    assert (status, list(result), err) == (2, INSERT_KEYS, f"flexneedle: {reason}\n")
+    assert (result["outcome"], result["reason"], result["reached"]) == ("refused", reason, False)
+    assert (result["controller"], result["target_mm"], result["seed"]) == (argv[-1], [40.0, 5.0], 4)
+    assert (result["run_dir"], result["planned_error_mm"]) == (None, None)
+    assert result["timing"] == {"plan_seconds": None, "period_ms": {"p50": None, "p99": None, "max": None}}
+    assert names(in_tmp) == ["case.toml"]
+
+
+def test_a_held_insertion_prints_its_object(engine, capsys):
+    engine(outcome="held")
+    status, out, _ = run(capsys, "insert", "--json")
+    result = json.loads(out)
+    assert (status, list(result)) == (1, INSERT_KEYS)
+    assert (result["outcome"], result["reason"], result["steps"]) == ("held", "no sample for 1.00 s", 69)
+
+
+def test_a_failure_on_the_way_prints_what_was_done(engine, capsys):
+    def fail():
+        raise RunError("the driver is gone")
+
+    engine(stop=(20, fail))
+    status, out, err = run(capsys, "insert", "--json")
+    result = json.loads(out)
+    assert (status, list(result)) == (1, INSERT_KEYS)
+    assert (result["outcome"], result["reason"], result["steps"]) == ("failed", "the driver is gone", 20)
+    assert result["timing"]["period_ms"]["max"] == pytest.approx(5.1 + 0.01 * 19)
+    assert err.splitlines()[-1] == "flexneedle: the driver is gone"
+
+
+def test_bad_input_prints_no_object(engine, capsys):
+    engine()
+    run(capsys, "insert", "--out", "here")
+    for argv in (["nowhere.toml"], ["--controller", "pid"], ["--out", "here"]):
+        status, out, _ = run(capsys, "insert", "--json", *argv)
+        assert (status, out) == (2, "")
 
 
 def test_force_inserts_all_the_same(engine, capsys):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +18,13 @@ from flexneedle.console.common import (
     run_name,
     seed,
 )
+from flexneedle.errors import FlexneedleError, one_line
 
 if TYPE_CHECKING:
     from flexneedle.console.progress import Progress
     from flexneedle.runs.recording import Choices
     from flexneedle.scenario.model import Scenario
+    from flexneedle.trace.folder import Folder
     from flexneedle.types import Insertion, Period
 
 
@@ -69,11 +73,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _insert(args: argparse.Namespace) -> int:
-    from flexneedle.console.progress import Progress
     from flexneedle.rig.parts import own_controllers
-    from flexneedle.runs.recording import check_choices, record_insertion
+    from flexneedle.runs.recording import check_choices
     from flexneedle.trace.folder import Folder
-    from flexneedle.types import Outcome
 
     if args.list:
         return _list()
@@ -83,21 +85,54 @@ def _insert(args: argparse.Namespace) -> int:
         from flexneedle.scenario.files import load_registration
 
         scenario = load_registration(args.registration, scenario)
-    check_choices(scenario, choices)
+    with _refusal_printed(args, scenario, choices):
+        check_choices(scenario, choices)
     compile_first()
     folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
+    with _refusal_printed(args, scenario, choices, folder):
+        insertion = _carried_out(folder, scenario, choices)
+    return _report(scenario, insertion, args.json, folder.path)
+
+
+def _carried_out(folder: Folder, scenario: Scenario, choices: Choices) -> Insertion:
+    from flexneedle.console.progress import Progress
+    from flexneedle.runs.recording import record_insertion
+    from flexneedle.types import Outcome
+
     with Progress() as progress:
         show = _InsertProgress(progress, scenario)
         insertion = record_insertion(
-            folder,
-            scenario,
-            choices,
-            on_iteration=show.iteration,
-            on_period=show.period,
+            folder, scenario, choices, on_iteration=show.iteration, on_period=show.period
         )
         if insertion.outcome is Outcome.DONE:
             progress.finish("Inserting")
-    return _report(scenario, insertion, args.json, folder.path)
+    return insertion
+
+
+@contextmanager
+def _refusal_printed(
+    args: argparse.Namespace, scenario: Scenario, choices: Choices, folder: Folder | None = None
+) -> Iterator[None]:
+    """With --json, print the object of an insertion that is refused or fails; the error is passed on."""
+    try:
+        yield
+    except FlexneedleError as error:
+        if args.json:
+            print_json(_refusal(folder, scenario, choices, one_line(error)))
+        raise
+
+
+def _refusal(folder: Folder | None, scenario: Scenario, choices: Choices, reason: str) -> dict[str, Any]:
+    """The object of an insertion that ended with an error: as it is recorded, or without a plan."""
+    from flexneedle.trace.results import NO_TIMING, refused_result
+
+    run_dir = None if folder is None else str(folder.path)
+    if folder is not None and folder.values["result"] is not None:
+        timing = {key: folder.timing[key] for key in NO_TIMING}
+        return {**folder.values["result"], "run_dir": run_dir, "timing": timing}
+    names = {"controller": choices.controller, "phantom": choices.phantom}
+    result = refused_result(target=scenario.target.position, reason=reason, seed=choices.seed, **names)
+    return {**result, "run_dir": run_dir, "timing": NO_TIMING}
 
 
 def _choices(args: argparse.Namespace) -> Choices:

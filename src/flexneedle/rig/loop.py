@@ -105,7 +105,7 @@ def run(
     if not (plan.reached or force or chosen.predicts):
         raise RunError(
             f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), bound by {plan.limit}; "
-            "use --force to insert it anyway"
+            "use --force (force=True) to insert anyway"
         )
     scenario = used(scenario, chosen)
     task = tables.task(chosen, Simulator(scenario, threads), plan)

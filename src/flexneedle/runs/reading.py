@@ -14,7 +14,7 @@ _UNFINISHED = "the run was killed, or still goes on"
 def load(run_dir: str | Path) -> Insertion | Plan | dict[str, Plan]:
     """Return what a folder of `flexneedle insert`, `flexneedle plan` or `flexneedle.save` holds.
 
-    An insertion, as far as it went; a plan, or several by strategy. Warns (RuntimeWarning) of a trace that is not whole.
+    An insertion, as far as it went; a plan, or several by strategy. Warns (RuntimeWarning) of an unfinished trace.
     Raises InputError if the folder holds no run or a damaged one, RunError if the run ended before it had a plan.
     """
     run = _planned(read_run(Path(run_dir)))

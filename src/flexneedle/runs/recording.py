@@ -8,14 +8,14 @@ from typing import Any
 
 from flexneedle.control.guide import check_guide
 from flexneedle.control.methods import DEFAULT
+from flexneedle.errors import FlexneedleError, one_line
+from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT
 from flexneedle.runs.figures import draw_run
-from flexneedle.runs.saving import finish_insertion, finish_plans, keep_plan, open_trace
-from flexneedle.trace.folder import Folder
-from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
+from flexneedle.runs.saving import finish_insertion, finish_plans, keep_plan, note_result, open_trace
 from flexneedle.scenario.model import Scenario
+from flexneedle.trace.folder import Folder
 from flexneedle.types import Insertion, Outcome, Period, Plan
-
 
 OnIteration = Callable[[str, dict[str, Any]], None]
 """Hears of each iteration of the planner: the strategy, and what `plan` tells."""
@@ -76,7 +76,8 @@ def record_insertion(
     """Plan, carry out, and leave `run.json`, `trace.mcap` and `insertion.png`, `.svg` in the folder.
 
     An insertion that is interrupted (Ctrl-C) comes back with its periods and the outcome "interrupted". An
-    error, or an interruption of the planning, is marked in `run.json` and passed on.
+    error, or an interruption of the planning, is marked in `run.json` and passed on; where there was a plan, the result
+    is there, too, with the outcome "refused", or "failed" once the needle has moved.
     """
     folder.values |= choices.parts
     with _marked(folder):
@@ -102,6 +103,11 @@ def _insert(
     from flexneedle.rig.loop import insert
 
     periods: list[Period] = []
+
+    def ended(outcome: Outcome, reason: str) -> Insertion:
+        parts = choices.controller, choices.phantom, choices.tracker
+        return Insertion(plan, choices.seed, tuple(periods), outcome, reason, *parts, scenario)
+
     with open_trace(folder, scenario, plan, choices.seed, choices.parts) as trace:
 
         def keep(period: Period) -> None:
@@ -113,9 +119,11 @@ def _insert(
         try:
             return insert(scenario, plan, choices.seed, on_period=keep, **options)
         except KeyboardInterrupt:
-            ending = Outcome.INTERRUPTED, "stopped by the user"
-            parts = choices.controller, choices.phantom, choices.tracker
-            return Insertion(plan, choices.seed, tuple(periods), *ending, *parts, scenario)
+            return ended(Outcome.INTERRUPTED, "stopped by the user")
+        except FlexneedleError as error:
+            outcome = Outcome.FAILED if periods else Outcome.REFUSED
+            note_result(folder, ended(outcome, one_line(error)))
+            raise
 
 
 @contextmanager

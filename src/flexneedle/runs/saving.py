@@ -57,9 +57,14 @@ def open_trace(
     return TraceWriter(folder.path / TRACE_FILE, plan, about=about, scenario=scenario.values())
 
 
-def finish_insertion(folder: Folder, insertion: Insertion) -> None:
-    """Write how an insertion ended into `run.json`, and draw it."""
+def note_result(folder: Folder, insertion: Insertion) -> None:
+    """Have result and times of an insertion in what is written next into `run.json`."""
     folder.values["result"] = insertion_result(insertion)
     folder.timing |= insertion_timing(insertion)
+
+
+def finish_insertion(folder: Folder, insertion: Insertion) -> None:
+    """Write how an insertion ended into `run.json`, and draw it."""
+    note_result(folder, insertion)
     folder.end(insertion.outcome, insertion.reason)
     draw_run(folder.path)

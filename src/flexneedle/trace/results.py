@@ -5,7 +5,17 @@ from typing import Any
 import numpy as np
 
 from flexneedle.trace.plain import plain
-from flexneedle.types import Insertion, Plan
+from flexneedle.types import Insertion, Outcome, Plan
+
+RESULT_KEYS = (
+    *("controller", "phantom", "target_mm", "tip_true_mm", "tip_measured_mm", "true_error_mm", "residual_mm"),
+    *("planned_error_mm", "reached", "outcome", "reason", "warning", "flips", "planned_flips"),
+    *("strain_energy_mj", "planned_strain_energy_mj", "steps", "held_s", "converged", "seed"),
+)
+"""Keys of the result of an insertion, in order."""
+_OF_PERIODS = ("p50", "p99", "max")
+NO_TIMING = {"plan_seconds": None, "period_ms": dict.fromkeys(_OF_PERIODS)}
+"""Times of an insertion that was refused before it had a plan."""
 
 
 def plan_result(plan: Plan) -> dict[str, Any]:
@@ -62,6 +72,25 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
     return result
 
 
+def refused_result(*, target: tuple[float, float], reason: str, seed: int, **parts: str) -> dict[str, Any]:
+    """Return the result of an insertion that was refused before it had a plan: the keys of `insertion_result`.
+
+    parts: names of controller and phantom; target in mm.
+    """
+    known: dict[str, Any] = {
+        **parts,
+        "target_mm": list(target),
+        "reached": False,
+        "outcome": str(Outcome.REFUSED),
+        "reason": reason,
+        "flips": 0,
+        "steps": 0,
+        "held_s": 0.0,
+        "seed": seed,
+    }
+    return {key: known.get(key) for key in RESULT_KEYS}
+
+
 def insertion_timing(insertion: Insertion) -> dict[str, Any]:
     """Return the wall-clock times of plan (s) and periods (ms)."""
     totals = [period.durations["total"] for period in insertion.periods if "total" in period.durations]
@@ -70,7 +99,7 @@ def insertion_timing(insertion: Insertion) -> dict[str, Any]:
     )
     return {
         **plan_timing(insertion.plan),
-        "period_ms": dict(zip(("p50", "p99", "max"), milliseconds, strict=True)),
+        "period_ms": dict(zip(_OF_PERIODS, milliseconds, strict=True)),
     }
 
 
