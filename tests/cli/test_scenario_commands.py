@@ -164,3 +164,30 @@ def test_a_name_that_is_no_text_is_no_failure(minimal_text, tmp_path):
     done = run_process("scenario", "check", path)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.endswith("\\udcff.toml: ok, Minimal\n")
+
+
+def test_check_warns_of_values_that_are_hardly_meant(capsys, minimal_text, scenario_file):
+    text = minimal_text.replace("shear_modulus_kpa = 2.0", "shear_modulus_kpa = 6000.0\nthickness_mm = 9.0")
+    path = scenario_file(text)
+    status, out, err = run(capsys, "scenario", "check", str(path))
+    assert (status, out) == (0, f"{path}: ok, Minimal\n")
+    assert [line.partition(" (")[0].partition(": the")[0] for line in err] == [
+        f"flexneedle: {path}: tissue[0].shear_modulus_kpa = 6000: about 10 times above the usual 0.6 to 210",
+        f"flexneedle: {path}: tissue[0].thickness_mm = 9: has no effect",
+    ]
+    assert run(capsys, "scenario", "check", "--strict", str(path)) == (2, "", err)
+
+
+def test_strict_refuses_an_old_key_too_and_nothing_else(capsys, minimal_text, scenario_file):
+    path = scenario_file(minimal_text)
+    assert run(capsys, "scenario", "check", "--strict", str(path))[0] == 0
+    path = scenario_file(minimal_text + "\n[control]\nhorizon = 9\n")
+    line = f"flexneedle: {path}: control.horizon is now control.ce_mpc.horizon: rename it"
+    assert run(capsys, "scenario", "check", "--strict", str(path)) == (2, "", [line])
+
+
+def test_check_names_the_way_to_have_no_guide(capsys, minimal_text, scenario_file):
+    path = scenario_file(minimal_text.replace("[setup]", "[setup]\nmax_guide_travel_mm = 0"))
+    rule = "must be above 0; to go without a guide leave out setup.guide_to_skin_mm"
+    line = f"flexneedle: {path}: setup.max_guide_travel_mm = 0: {rule}"
+    assert run(capsys, "scenario", "check", str(path)) == (2, "", [line])

@@ -280,7 +280,9 @@ def test_a_broken_rule_is_told_in_one_line(key, value, rule):
 @pytest.mark.parametrize("key", POSITIVE)
 @pytest.mark.parametrize("value", [0, -1.0])
 def test_zero_and_less_is_refused(key, value):
-    assert problems(changed(key, value)) == [f"{key} = {value}: {ABOVE_ZERO}"]
+    no_guide = value == 0 and key in ("setup.max_guide_step_mm", "setup.max_guide_travel_mm")
+    remedy = "; to go without a guide leave out setup.guide_to_skin_mm" if no_guide else ""
+    assert problems(changed(key, value)) == [f"{key} = {value}: {ABOVE_ZERO}{remedy}"]
 
 
 @pytest.mark.parametrize("key", NOT_NEGATIVE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import warnings
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     check = actions.add_parser("check", help="check a scenario: one line for each problem, exit status 2")
     check.add_argument("scenario", metavar="SCENARIO", help="path, preset name or world:NUMBER")
     _add_controller(check)
+    check.add_argument("--strict", action="store_true", help="exit status 2 for a warning, too")
     check.set_defaults(handler=_check)
 
     actions.add_parser("schema", help="print the JSON schema of scenario files").set_defaults(handler=_schema)
@@ -56,7 +58,19 @@ def _show(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
-    print(f"{args.scenario}: ok, {_checked(args).name}")
+    from flexneedle.errors import ScenarioWarning
+    from flexneedle.scenario.plausible import doubts
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ScenarioWarning)
+        scenario = _checked(args)
+        for line in doubts(scenario):
+            warnings.warn(f"{args.scenario}: {line}", ScenarioWarning, stacklevel=1)
+    for warning in caught:
+        warnings.warn(warning.message, warning.category, stacklevel=1)
+    if caught and args.strict:
+        return 2
+    print(f"{args.scenario}: ok, {scenario.name}")
     return 0
 
 

@@ -10,6 +10,15 @@ from flexneedle.scenario.sections.fields import NonNegative, Positive, Section
 from flexneedle.scenario.sections.registration import Registration
 
 
+def _moves(value: object) -> object:
+    if isinstance(value, int | float) and value == 0:
+        raise ValueError("must be above 0; to go without a guide leave out setup.guide_to_skin_mm")
+    return value
+
+
+GuideTravel = Annotated[Positive, BeforeValidator(_moves)]
+
+
 class Setup(Section):
     """Section `setup`: where things stand at the start, and how far and fast the actuators go."""
 
@@ -21,9 +30,9 @@ class Setup(Section):
     """Greatest travel of the base along the insertion axis."""
     max_advance_mm: Positive = 1.0
     """Greatest travel along the insertion axis in a control step, either way."""
-    max_guide_step_mm: Positive = 0.5
+    max_guide_step_mm: GuideTravel = 0.5
     """Greatest lateral travel of the guide in a control step."""
-    max_guide_travel_mm: Positive = 15.0
+    max_guide_travel_mm: GuideTravel = 15.0
     """Greatest lateral distance of the guide from the axis."""
     max_base_step_mm: Positive = 0.5
     """Greatest lateral travel of the base in a control step."""

@@ -1,0 +1,91 @@
+"""Values that a scenario may have and that no needle or tissue has: warned of, with the usual range and its source."""
+
+import pytest
+
+from flexneedle.errors import ScenarioError
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.plausible import USUAL, doubts
+from flexneedle.scenario.sections.needle import GAUGES
+from flexneedle.scenario.worlds import world
+
+PHANTOM = load_scenario("phantom")
+WITHOUT_A_GUIDE = "must be above 0; to go without a guide leave out setup.guide_to_skin_mm"
+
+
+@pytest.mark.parametrize(
+    ("values", "line"),
+    [
+        ({"target.depth_mm": 0.07}, "target.depth_mm = 0.07: about 100 times below the usual 4 to 200 ("),
+        (
+            {"needle.outer_diameter_mm": 22.0},
+            "needle.outer_diameter_mm = 22: about 10 times above the usual 0.18 to 3.4 (",
+        ),
+        (
+            {"tissue.1.shear_modulus_kpa": 6000.0},
+            "tissue[1].shear_modulus_kpa = 6000: about 10 times above the usual 0.6 to 210 (",
+        ),
+        (
+            {"needle.youngs_modulus_gpa": 200000.0},
+            "needle.youngs_modulus_gpa = 200000: about 1,000 times above the usual 3 to 210 (",
+        ),
+        (
+            {"needle.youngs_modulus_gpa": 2000.0},
+            "needle.youngs_modulus_gpa = 2000: about 10 times above the usual 3 to 210 (",
+        ),
+        (
+            {"needle.youngs_modulus_gpa": 0.2},
+            "needle.youngs_modulus_gpa = 0.2: about 10 times below the usual 3 to 210 (",
+        ),
+        (
+            {"tissue.0.shear_modulus_kpa": 0.002},
+            "tissue[0].shear_modulus_kpa = 0.002: about 100 times below the usual 0.6 to 210 (",
+        ),
+        (
+            {"setup.insertion_speed_mm_s": 5000.0},
+            "setup.insertion_speed_mm_s = 5000: about 10 times above the usual 1 to 280 (",
+        ),
+        (
+            {"tissue.1.thickness_mm": 20.0},
+            "tissue[1].thickness_mm = 20: has no effect: the last layer has no end; leave it out, or add the layer",
+        ),
+    ],
+)
+def test_a_value_that_is_hardly_meant_is_one_line(values, line):
+    (found,) = doubts(PHANTOM.with_values(values))
+    assert found.startswith(line)
+    assert found.isprintable()
+
+
+def test_every_value_that_is_off_has_its_line():
+    off = {"target.depth_mm": 0.07, "needle.youngs_modulus_gpa": 2e5, "tissue.1.thickness_mm": 3.0}
+    assert len(doubts(PHANTOM.with_values(off))) == 3
+
+
+@pytest.mark.parametrize(("value", "orders"), [(210.0, 0), (600.0, 0), (700.0, 1), (6000.0, 1), (7000.0, 2)])
+def test_a_doubt_begins_half_an_order_of_magnitude_beyond_the_range(value, orders):
+    """√10 times 210 GPa is 664 GPa."""
+    lines = doubts(PHANTOM.with_values({"needle.youngs_modulus_gpa": value}))
+    assert [f"about {10**orders:,} times above" in line for line in lines] == [True] * (orders > 0)
+
+
+def test_what_comes_with_the_package_is_beyond_doubt():
+    for scenario in (PHANTOM, *map(world, range(60))):
+        assert doubts(scenario) == []
+    for gauge in GAUGES:
+        named = {"needle.outer_diameter_mm": None, "needle.inner_diameter_mm": None, "needle.gauge": gauge}
+        assert doubts(PHANTOM.with_values(named)) == []
+
+
+def test_every_range_names_its_source_and_a_key_of_scenarios():
+    tube = PHANTOM.with_values({"needle.inner_diameter_mm": 0.5})
+    keys = {key.replace("tissue.0", "tissue.*") for key in tube.flat()}
+    assert set(USUAL) <= keys
+    assert all(usual.low < usual.high and usual.source for usual in USUAL.values())
+
+
+@pytest.mark.parametrize("key", ["setup.max_guide_travel_mm", "setup.max_guide_step_mm"])
+@pytest.mark.parametrize("zero", [0, 0.0])
+def test_a_guide_that_cannot_move_is_refused_with_the_way_to_have_none(key, zero):
+    with pytest.raises(ScenarioError) as caught:
+        PHANTOM.with_values({key: zero})
+    assert str(caught.value) == f"{key} = {zero}: {WITHOUT_A_GUIDE}"
