@@ -178,7 +178,7 @@ def test_an_insertion_that_fails_is_recorded_with_its_controller(engine, capsys,
 def test_the_first_compilation_is_announced(engine, capsys, monkeypatch):
     engine()
     monkeypatch.setattr("flexneedle.rig.kernels.all_compiled", lambda: False)
-    assert "Compiling the mechanics, this once …" in run(capsys, "plan")[2]
+    assert "Compiling kernels (first run only) …" in run(capsys, "plan")[2]
     monkeypatch.setattr("flexneedle.rig.kernels.all_compiled", lambda: True)
     assert "Compiling" not in run(capsys, "plan")[2]
 

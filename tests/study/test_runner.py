@@ -129,7 +129,7 @@ def test_ctrl_c_keeps_the_finished_rows_and_says_how_to_go_on(quick, uninterrupt
     stopped = stop("SIGINT", 4, "study", quick, "--workers", 1, "--out", out)
     assert stopped.returncode == 130
     again = f"flexneedle study {quick} --workers 1 --out {out} --resume"
-    assert stopped.stderr.splitlines()[-1] == f"flexneedle: interrupted; go on with: {again}"
+    assert stopped.stderr.splitlines()[-1] == f"flexneedle: interrupted; resume with: {again}"
     assert "Traceback" not in stopped.stderr
     kept = runs(out)
     assert 4 <= len(kept) < SIZE

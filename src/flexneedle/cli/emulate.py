@@ -7,34 +7,55 @@ import signal
 import sys
 from pathlib import Path
 
-from flexneedle.console.common import seed
+from flexneedle.console.common import HelpFormatter, examples, seed
+
+_EXAMPLES = examples(
+    "flexneedle emulate aurora --link /tmp/aurora",
+    "flexneedle emulate aurora --still --sensors 2 --seed 3",
+)
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser("emulate", help="emulate a device, to try without hardware")
+    parser = subparsers.add_parser(
+        "emulate",
+        help="emulate a device, to try without hardware",
+        epilog=_EXAMPLES,
+        formatter_class=HelpFormatter,
+    )
     devices = parser.add_subparsers(title="devices", metavar="DEVICE", required=True)
     aurora = devices.add_parser(
         "aurora",
         help="an NDI Aurora on a pseudo-terminal",
         description="Print the path of the emulated device and answer there until interrupted (Ctrl-C). "
-        "The tip moves along an arc; a line X Y Z on stdin (mm, the tracker's frame) lets it rest there.",
+        "The tip moves along an arc; a line X Y Z on stdin (mm, in the tracker's frame) makes it rest there.",
+        epilog=_EXAMPLES,
+        formatter_class=HelpFormatter,
     )
     aurora.add_argument(
-        "--link", type=Path, metavar="PATH", help="path of the device (one in a new folder under /tmp)"
+        "--link",
+        type=Path,
+        metavar="PATH",
+        help="path of the device (default: one in a new folder under /tmp)",
     )
     aurora.add_argument(
         "--fault",
         action="append",
         default=[],
         metavar="KIND[=DETAIL]@SECONDS[:DURATION]",
-        help="what goes wrong, in seconds since tracking began; may be given again. See docs/tracking/aurora.md",
+        help="fault, in seconds since tracking began; may be given several times. See docs/tracking/aurora.md",
     )
     aurora.add_argument("--still", action="store_true", help="the tip rests from the start")
-    aurora.add_argument("--sensors", type=int, choices=range(1, 5), default=4, help="sensors plugged in (4)")
-    aurora.add_argument("--firmware", metavar="TEXT", help="freeze tag that it shows in VER (AURORA Rev 008)")
-    aurora.add_argument("--no-bx", action="store_true", help="know no binary readings, as old firmware")
-    aurora.add_argument("--seed", type=seed, default=0, metavar="N", help="of jitter and garbled bytes (0)")
+    aurora.add_argument(
+        "--sensors", type=int, choices=range(1, 5), default=4, help="sensors plugged in (default: 4)"
+    )
+    aurora.add_argument(
+        "--firmware", metavar="TEXT", help="freeze tag in the reply to VER (default: AURORA Rev 008)"
+    )
+    aurora.add_argument("--no-bx", action="store_true", help="no binary readings (BX), as with old firmware")
+    aurora.add_argument(
+        "--seed", type=seed, default=0, metavar="N", help="seed of jitter and garbled bytes (default: 0)"
+    )
     aurora.set_defaults(handler=_emulate_aurora)
 
 

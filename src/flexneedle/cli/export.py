@@ -6,20 +6,24 @@ import argparse
 import sys
 from pathlib import Path
 
+from flexneedle.console.common import HelpFormatter, examples
 from flexneedle.errors import InputError
 
 _PERIODS, _READINGS, _STDOUT = "periods.csv", "readings.csv", "-"
 _MORE = """
+--csv: one row a control period, the columns of flexneedle.to_dataframe.
 --readings: one row a reading of the tracker, the units in the header.
   time_s, period, frame_number    when it was taken, in which control period it
                                   came, the tracker's own count of frames
-  verdict                         ok, or why it was not believed
+  verdict                         ok, or why it was not used
   x_mm, y_mm, z_mm                tip of the needle, in the frame of the stage
   NAME.x_mm, NAME.y_mm, NAME.z_mm, NAME.qw, NAME.qx, NAME.qy, NAME.qz,
   NAME.indicator, NAME.status     each sensor (tip, ref1, ...) as the tracker
-                                  told it, in the tracker's frame
-What is not known is empty. A tracker that tells no frames has no sensors.
+                                  reports it, in the tracker's frame
+What is not known is empty. A tracker without frames has no sensors.
+
 """
+_EXAMPLES = examples("flexneedle export runs/mine --csv", "flexneedle export runs/mine --readings - | head")
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -27,8 +31,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "export",
         help="export the control periods or the tracker's readings of a run",
-        epilog=_MORE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_MORE + _EXAMPLES,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run")
     what = parser.add_mutually_exclusive_group(required=True)
@@ -41,7 +45,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             nargs="?",
             const="",
             metavar="FILE",
-            help=f"{rows} as CSV, units in the header; {_STDOUT} is stdout (RUN/{default})",
+            help=f"{rows} as CSV, units in the header; {_STDOUT} is stdout (default: RUN/{default})",
         )
     parser.set_defaults(handler=_export)
 

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flexneedle.console.common import (
+    HelpFormatter,
     add_run_arguments,
     chosen_scenario,
     compile_first,
+    examples,
     print_json,
     print_table,
     run_name,
@@ -31,7 +33,13 @@ if TYPE_CHECKING:
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle`."""
     parser = subparsers.add_parser(
-        "insert", help="plan an insertion and carry it out in closed loop on the virtual phantom"
+        "insert",
+        help="plan an insertion and carry it out in closed loop on the virtual phantom",
+        epilog=examples(
+            "flexneedle insert phantom --target 35 -5 --seed 3",
+            "flexneedle insert world:100012 --controller ce-mpc --phantom model --json",
+        ),
+        formatter_class=HelpFormatter,
     )
     add_run_arguments(parser)
     parser.add_argument(
@@ -41,7 +49,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="how to plan: manipulation moves guide and bevel, steering only the bevel (default: manipulation)",
     )
     parser.add_argument(
-        "--plan-seed", type=seed, metavar="N", help="seed of the plan (that of the insertion, --seed)"
+        "--plan-seed",
+        type=seed,
+        metavar="N",
+        help="seed of the plan (default: that of the insertion, --seed)",
     )
     parser.add_argument(
         "--controller",
@@ -51,8 +62,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--phantom",
         metavar="KIND",
-        help="what is steered: exact, a finer formulation of its own with a rig's imperfections, or model, the "
-        "controller's own kind of model with other parameters; module:NAME for one of your own (default: exact)",
+        help="plant: exact, a finer formulation of its own with a rig's imperfections, or model, the controller's "
+        "formulation with other parameters; module:NAME for one of your own (default: exact)",
     )
     parser.add_argument(
         "--tracker",
@@ -60,14 +71,17 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="what measures the tip: scenario, its tracker, or module:NAME for one of your own (default: scenario)",
     )
     parser.add_argument(
-        "--registration", type=Path, metavar="FILE", help="where the tracker stands, as em register found it"
+        "--registration",
+        type=Path,
+        metavar="FILE",
+        help="registration of the tracker to the stage, a file of em register",
     )
-    parser.add_argument("--list", action="store_true", help="list the controllers, and do nothing else")
+    parser.add_argument("--list", action="store_true", help="list the controllers and exit")
     parser.add_argument(
         "--force",
         action="store_true",
-        help="insert even if the plan misses the target by more than 1 mm, and go on where the controller predicts a "
-        "miss beyond control.miss_limit_mm",
+        help="insert even if the plan misses the target by more than 1 mm, and continue where the controller predicts "
+        "a miss beyond control.miss_limit_mm",
     )
     parser.set_defaults(handler=_insert)
 
@@ -153,7 +167,7 @@ def _list() -> int:
 
 
 class _InsertProgress:
-    """Turns what planner and loop tell into progress."""
+    """Shows the planner's iterations and the loop's periods as progress."""
 
     def __init__(self, progress: Progress, scenario: Scenario) -> None:
         self._progress = progress
@@ -206,7 +220,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         *_registration(scenario, insertion),
         ("energy in the true tissue", _number(result["strain_energy_mj"], "mJ")),
         ("  as planned", _number(result["planned_strain_energy_mj"], "mJ")),
-        ("bevel turns", str(insertion.flips)),
+        ("bevel flips", str(insertion.flips)),
         ("  as planned", str(insertion.plan.flips)),
         ("control periods", str(result["steps"])),
         *([("held", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),

@@ -7,9 +7,11 @@ from math import degrees, isnan
 from typing import TYPE_CHECKING, Any
 
 from flexneedle.console.common import (
+    HelpFormatter,
     add_run_arguments,
     chosen_scenario,
     compile_first,
+    examples,
     print_json,
     print_table,
     run_name,
@@ -26,13 +28,21 @@ _STRATEGIES = ("manipulation", "steering")
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser("plan", help="plan an insertion and draw the plan")
+    parser = subparsers.add_parser(
+        "plan",
+        help="plan an insertion and draw the plan",
+        epilog=examples(
+            "flexneedle plan phantom --target 40 1.5 --strategy both",
+            "flexneedle plan mine.toml --seed 3 --json",
+        ),
+        formatter_class=HelpFormatter,
+    )
     add_run_arguments(parser)
     parser.add_argument(
         "--strategy",
         choices=(*_STRATEGIES, "both"),
         default="manipulation",
-        help="manipulation moves guide and bevel, steering only the bevel (manipulation)",
+        help="manipulation moves guide and bevel, steering only the bevel (default: manipulation)",
     )
     parser.set_defaults(handler=_plan)
 
@@ -72,14 +82,13 @@ def _report(plans: dict[str, Plan], as_json: bool, folder: Path) -> None:
 
 
 def _rows(plan: Plan) -> dict[str, str]:
-
     angle = plan.entry_angle
     depth, lateral = plan.target
     return {
         "target, depth and lateral offset": f"{depth:g}, {lateral:g} mm",
         "distance from the target": f"{plan.error_mm:.3f} mm",
         "angle of entry": "none" if isnan(angle) else f"{degrees(angle):+.2f}°",
-        "bevel turns": str(plan.flips),
+        "bevel flips": str(plan.flips),
         "energy stored in the tissue": f"{plan.strain_energy[-1]:.3f} mJ",
         "cost": f"{plan.cost:.3f}",
         **{f"  {name}": f"{value:.3f}" for name, value in plan.terms.items()},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from flexneedle.console.common import print_json
+from flexneedle.console.common import HelpFormatter, examples, print_json
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -28,6 +28,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="records of the controllers' tuning to show (default: those of the package)",
     )
     parser.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
+    parser.epilog = examples(
+        "flexneedle report runs/accuracy", "flexneedle report runs/mine --out mine --json"
+    )
+    parser.formatter_class = HelpFormatter
     parser.set_defaults(handler=_report)
 
 

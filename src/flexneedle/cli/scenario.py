@@ -6,29 +6,75 @@ import argparse
 import warnings
 from typing import TYPE_CHECKING
 
+from flexneedle.console.common import HelpFormatter, examples
+
 if TYPE_CHECKING:
     from flexneedle.scenario.model import Scenario
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser("scenario", help="list, show and check scenarios")
+    parser = subparsers.add_parser(
+        "scenario",
+        help="list, show and check scenarios",
+        epilog=examples(
+            "flexneedle scenario show phantom > mine.toml",
+            "flexneedle scenario check mine.toml",
+        ),
+        formatter_class=HelpFormatter,
+    )
     actions = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    actions.add_parser("list", help="list the presets").set_defaults(handler=_list)
+    every = actions.add_parser(
+        "list",
+        help="list the presets",
+        epilog=examples(
+            "flexneedle scenario list",
+            "flexneedle scenario list | grep -i tissue",
+        ),
+        formatter_class=HelpFormatter,
+    )
+    every.set_defaults(handler=_list)
 
-    show = actions.add_parser("show", help="print a scenario with all its defaults, as TOML")
+    show = actions.add_parser(
+        "show",
+        help="print a scenario with all its defaults, as TOML",
+        epilog=examples(
+            "flexneedle scenario show phantom > mine.toml",
+            "flexneedle scenario show world:100012:perfect",
+        ),
+        formatter_class=HelpFormatter,
+    )
     show.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path")
     _add_controller(show)
     show.set_defaults(handler=_show)
 
-    check = actions.add_parser("check", help="check a scenario: one line for each problem, exit status 2")
+    check = actions.add_parser(
+        "check",
+        help="check a scenario: one line for each problem, exit status 2",
+        description="Check a scenario. One line on stderr for each problem, exit status 2; one for each value that is "
+        "an order of magnitude off those of needles and tissues, is not used or has another name now, exit status 0.",
+        epilog=examples(
+            "flexneedle scenario check mine.toml --strict",
+            "flexneedle scenario check mine.toml --controller follow_path:METHOD",
+        ),
+        formatter_class=HelpFormatter,
+    )
     check.add_argument("scenario", metavar="SCENARIO", help="path, preset name or world:NUMBER")
     _add_controller(check)
     check.add_argument("--strict", action="store_true", help="exit status 2 for a warning, too")
     check.set_defaults(handler=_check)
 
-    actions.add_parser("schema", help="print the JSON schema of scenario files").set_defaults(handler=_schema)
+    schema = actions.add_parser(
+        "schema",
+        help="print the JSON schema of scenario files",
+        epilog=examples(
+            "flexneedle scenario schema > scenario.schema.json",
+            "flexneedle scenario schema | python -m json.tool | less",
+        ),
+        formatter_class=HelpFormatter,
+    )
+    schema.set_defaults(handler=_schema)
 
 
 def _add_controller(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexneedle.console.common import compile_first, print_json
+from flexneedle.console.common import HelpFormatter, compile_first, examples, print_json
 
 if TYPE_CHECKING:
     from flexneedle.console.progress import Progress
@@ -24,24 +24,30 @@ _STAGES = ("Planning", "Inserting")
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser("study", help="carry out many insertions and keep them in tables")
+    parser = subparsers.add_parser(
+        "study",
+        help="carry out many insertions and keep them in tables",
+        epilog=examples(
+            "flexneedle study phantom --out runs/accuracy",
+            "flexneedle study mine.toml --workers 4 --out runs/mine --resume",
+        ),
+        formatter_class=HelpFormatter,
+    )
     parser.add_argument("study", metavar="STUDY", help="name of a shipped study, or path of a TOML file")
     parser.add_argument(
         "--worlds",
         nargs=2,
         type=int,
         metavar=("FROM", "COUNT"),
-        help="first number and count of worlds, for a study of worlds (as in its file)",
+        help="first number and count of worlds, for a study of worlds (default: those of its file)",
     )
     parser.add_argument(
-        "--workers", type=_workers, metavar="N", help="processes on this machine (one a usable core)"
+        "--workers", type=_workers, metavar="N", help="processes on this machine (default: one per core)"
     )
     parser.add_argument("--scheduler", metavar="ADDRESS", help="run on the Dask cluster of this scheduler")
+    parser.add_argument("--resume", action="store_true", help="resume the study in --out")
     parser.add_argument(
-        "--resume", action="store_true", help="go on with the study that --out holds, where it ended"
-    )
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder of the study (runs/<date>-study-<name>)"
+        "--out", type=Path, metavar="DIR", help="folder of the study (default: runs/<date>-study-<name>)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.set_defaults(handler=_study)
@@ -85,7 +91,7 @@ def _study(args: argparse.Namespace) -> int:
                 command=_command(args, folder),
             )
     except KeyboardInterrupt:
-        print(f"flexneedle: interrupted; go on with: {_command(args, folder, '--resume')}", file=sys.stderr)
+        print(f"flexneedle: interrupted; resume with: {_command(args, folder, '--resume')}", file=sys.stderr)
         return 130
     except RunError as error:
         raise RunError(f"{error}: {_command(args, folder, '--resume')}") from error

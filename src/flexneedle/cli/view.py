@@ -5,10 +5,20 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from flexneedle.console.common import HelpFormatter, examples
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser("view", help="draw the figures of a run again, finished or not")
+    parser = subparsers.add_parser(
+        "view",
+        help="draw the figures of a run again, finished or not",
+        epilog=examples(
+            "flexneedle view runs/20260101T120000Z-phantom-0",
+            "flexneedle view runs/mine",
+        ),
+        formatter_class=HelpFormatter,
+    )
     parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run")
     parser.set_defaults(handler=_view)
 

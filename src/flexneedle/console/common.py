@@ -13,6 +13,20 @@ if TYPE_CHECKING:
     from flexneedle.scenario.model import Scenario
 
 
+class HelpFormatter(argparse.HelpFormatter):
+    """Wraps a text of one line, and keeps the lines of one that has several, such as `examples`."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        if "\n" not in text:
+            return super()._fill_text(text, width, indent)
+        return "".join(indent + line for line in text.strip("\n").splitlines(keepends=True))
+
+
+def examples(*lines: str) -> str:
+    """Return the end of a command's help: command lines that can be pasted."""
+    return "\n".join(["examples:", *(f"  {line}" for line in lines)])
+
+
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what `plan` and `insert` have in common."""
     parser.add_argument(
@@ -20,24 +34,26 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SCENARIO",
         nargs="?",
         default="phantom",
-        help="preset name, world:NUMBER or path (phantom)",
+        help="preset name, world:NUMBER or path (default: phantom)",
     )
     parser.add_argument(
         "--target",
         nargs=2,
         type=float,
         metavar=("X", "Y"),
-        help="depth and lateral place of the target in mm (as in the scenario)",
+        help="depth and lateral offset of the target in mm (default: those of the scenario)",
     )
-    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="same seed, same result (0)")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder of the run (runs/<date>-<scenario>-<seed>)"
+        "--seed", type=seed, default=0, metavar="N", help="same seed, same result (default: 0)"
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder of the run (default: runs/<date>-<scenario>-<seed>)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
 
 
 def seed(text: str) -> int:
-    """Return a seed as it was given; argparse says what is wrong with another."""
+    """Return the seed of an argument. Raises what argparse prints."""
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"{value}: must be at least 0")
@@ -57,13 +73,13 @@ def chosen_scenario(args: argparse.Namespace, *own: Method) -> Scenario:
 
 
 def compile_first() -> None:
-    """Compile the kernels; the first time this takes a while, and that is said."""
+    """Compile the kernels; the first time takes a while, which is announced."""
     from flexneedle.console.progress import Progress
     from flexneedle.rig.kernels import all_compiled, compile_kernels
 
     with Progress() as progress:
         if not all_compiled():
-            progress.begin("Compiling the mechanics, this once")
+            progress.begin("Compiling kernels (first run only)")
         compile_kernels()
 
 
@@ -80,7 +96,7 @@ def print_json(values: Mapping[str, Any]) -> None:
 
 
 def print_table(title: str, rows: Iterable[Sequence[str]], folder: Path, heads: Sequence[str] = ()) -> None:
-    """Print a short table on stdout, and below it where the record lies; heads name the columns of values."""
+    """Print a short table on stdout, and below it the folder of the record; heads name the columns of values."""
     from rich import box
     from rich.console import Console
     from rich.table import Table

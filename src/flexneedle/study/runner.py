@@ -214,5 +214,5 @@ def _lost_workers_told() -> Iterator[None]:
     except Exception as error:
         message = " ".join(f"{type(error).__name__} {error}".split())
         raise RunError(
-            f"workers were lost ({message}); finished rows are kept, go on with --resume"
+            f"workers were lost ({message}); finished rows are kept, resume with --resume"
         ) from error

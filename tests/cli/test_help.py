@@ -1,0 +1,57 @@
+"""`--help` of every command ends with two examples, which the parser takes."""
+
+import argparse
+import shlex
+
+import pytest
+
+from flexneedle.cli.main import build_parser
+
+OTHERS = ("em",)  # their own tests
+
+
+def commands(parser, path=()):
+    """Every parser below one, by its words."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, below in action.choices.items():
+                yield (*path, name), below
+                yield from commands(below, (*path, name))
+
+
+PARSERS = {" ".join(path): parser for path, parser in commands(build_parser()) if path[0] not in OTHERS}
+
+
+def examples_of(parser):
+    before, found, after = parser.format_help().rpartition("\nexamples:\n")
+    assert found, "no examples"
+    return after.splitlines()
+
+
+def test_the_commands_are_all_there():
+    assert {"plan", "insert", "study", "report", "view", "export", "emulate", "emulate aurora"} < set(PARSERS)
+    assert {f"scenario {name}" for name in ("list", "show", "check", "schema")} < set(PARSERS)
+
+
+@pytest.mark.parametrize("name", PARSERS)
+def test_the_help_ends_with_two_examples(name):
+    lines = examples_of(PARSERS[name])
+    assert len(lines) == 2
+    assert all(line.startswith(f"  flexneedle {name} ") or line == f"  flexneedle {name}" for line in lines)
+
+
+@pytest.mark.parametrize("name", PARSERS)
+def test_the_examples_are_taken(name, capsys):
+    for line in examples_of(PARSERS[name]):
+        words = shlex.split(line.split(" | ")[0].split(" > ")[0].split(" $(")[0])
+        given = words[1:] if "$(" not in line else [*words[1:], "phantom"]
+        assert callable(build_parser().parse_args(given).handler), capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", PARSERS)
+def test_the_help_fits_and_names_defaults_as_such(name, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    text = PARSERS[name].format_help()
+    assert max(map(len, text.splitlines())) <= 100
+    words = " ".join(text.split())
+    assert not any(word in words for word in ("tells", "told", "believed", "stands", "goes on"))
