@@ -73,7 +73,7 @@ def command(lab, *argv):
 
 
 def test_each_example_is_some_thirty_lines():
-    assert list(MODULES) == ["follow_path", "unicycle", "camera"]
+    assert list(MODULES) == ["follow_path", "unicycle", "camera", "bench"]
     assert all(20 < len(code.splitlines()) < 42 for code in MODULES.values())
 
 
@@ -122,6 +122,31 @@ def test_objects_are_carried_out_as_their_names_are(lab, imported, monkeypatch):
     stiff = scenario.with_values({"control.follow_path.gain": 2.0})
     other = flexneedle.insert(stiff, plan, 3, force=True, **own)
     assert other.periods[-1].guide != by_object.periods[-1].guide
+
+
+def test_the_example_of_objects_runs_as_printed(lab, imported, monkeypatch):
+    monkeypatch.chdir(lab)
+    (lab / "mine.toml").write_bytes((lab / "quick.toml").read_bytes())
+    (example,) = [
+        code for code in re.findall(r"```python\n(.*?)```", DOCS, re.DOTALL) if code.startswith("import")
+    ]
+    names = {}
+    exec(compile(example, "extend.md", "exec"), names)
+    own = {key: imported(name) for key, name in PARTS.items()}
+    same = flexneedle.insert("quick.toml", names["plan"], 3, force=True, **own)
+    loaded = flexneedle.load("runs/mine")
+    assert [p.true_tip for p in loaded.periods] == [p.true_tip for p in same.periods]
+    assert (loaded.controller, loaded.phantom, loaded.tracker) == ("follow-path", "Unicycle", "Camera")
+
+
+def test_a_plan_is_carried_out_on_the_bench(lab, imported, monkeypatch):
+    monkeypatch.chdir(lab)
+    scenario = flexneedle.load_scenario("quick.toml").with_values({"control.follow_path": None})
+    plan = flexneedle.plan(scenario, seed=0)
+    done = imported("bench:insert")(scenario, plan)
+    assert (done.outcome, done.phantom) == ("done", "")
+    assert done.periods[-1].sample.x == pytest.approx(plan.target[0], abs=0.05)
+    assert done.periods[-1].true_tip is None
 
 
 @pytest.mark.long

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import flexneedle
+from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.planning.terms import Outcome
@@ -40,6 +41,7 @@ RECORDS = {
     "task": task_of(SIMULATOR, make_plan()),
     "estimate": StateCorrection().begin(begun_with(SIMULATOR)),
     "identification": Identification().begin(begun_with(SIMULATOR)),
+    "controller": METHODS[DEFAULT],
     "truth": draw(SCENARIO, np.random.default_rng(0)),
 }
 

@@ -130,6 +130,9 @@ class Method:
             raise InputError(f"controller {self.name}: observer must have a begin(task)")
         _check_settings(self.name, self.settings)
 
+    def __repr__(self) -> str:
+        return f"<Method {self.name}: {self.summary}>"
+
     @property
     def table(self) -> str:
         """Name of its table below `control`."""

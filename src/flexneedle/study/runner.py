@@ -40,7 +40,7 @@ class Advance:
 
 def run_study(
     source: str | Path | Study,
-    out: Path | None = None,
+    out: str | Path | None = None,
     *,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -51,7 +51,7 @@ def run_study(
 ) -> Path:
     """Carry out a study, a shipped name or a TOML file, and return its folder (default: a new one in `runs/`).
 
-    It runs on `workers` processes (default: one a usable core), or on the Dask cluster whose `scheduler` is at
+    It runs on `workers` processes (default: one per core), or on the Dask cluster whose `scheduler` is at
     an address; `on_no_workers` is called if that has no workers yet, for which the study then waits. `resume`
     goes on with the study that `out` holds. Whatever ends it early, the finished rows are kept; `runs.parquet`
     is the same, to the bit, for any number of workers and interruptions. `command` is for the record. A script
