@@ -7,8 +7,6 @@ import pytest
 
 from flexneedle.cli.main import build_parser
 
-OTHERS = ("em",)  # their own tests
-
 
 def commands(parser, path=()):
     """Every parser below one, by its words."""
@@ -19,7 +17,7 @@ def commands(parser, path=()):
                 yield from commands(below, (*path, name))
 
 
-PARSERS = {" ".join(path): parser for path, parser in commands(build_parser()) if path[0] not in OTHERS}
+PARSERS = {" ".join(path): parser for path, parser in commands(build_parser())}
 
 
 def examples_of(parser):

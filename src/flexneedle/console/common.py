@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -112,10 +111,6 @@ def print_table(title: str, rows: Iterable[Sequence[str]], folder: Path, heads: 
     console.print(Text(f"\nRecord and figures: {folder}"))
 
 
-def described(text: str, *examples: str) -> dict[str, Any]:
+def described(text: str, *lines: str) -> dict[str, Any]:
     """Return what argparse needs for a command's description and the examples at the end of its help."""
-    return {
-        "description": fill(text, 80),
-        "epilog": "examples:\n" + "\n".join(f"  {example}" for example in examples),
-        "formatter_class": argparse.RawDescriptionHelpFormatter,
-    }
+    return {"description": text, "epilog": examples(*lines), "formatter_class": HelpFormatter}

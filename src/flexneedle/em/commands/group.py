@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from flexneedle.console.common import HelpFormatter, examples
 from flexneedle.em.commands import check, evaluate, record, register, simulate, watch
 
 _COMMANDS: tuple[Any, ...] = (evaluate, check, simulate, register, record, watch)
@@ -12,7 +13,12 @@ _COMMANDS: tuple[Any, ...] = (evaluate, check, simulate, register, record, watch
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command and its own commands to the parser of `flexneedle`."""
-    parser = subparsers.add_parser("em", help="evaluate, simulate or record an electromagnetic tracker")
+    parser = subparsers.add_parser(
+        "em",
+        help="evaluate, simulate or record an electromagnetic tracker",
+        epilog=examples("flexneedle em simulate", "flexneedle em evaluate measurements.csv"),
+        formatter_class=HelpFormatter,
+    )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in _COMMANDS:
         command.add_parser(commands)
