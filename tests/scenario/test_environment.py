@@ -67,7 +67,7 @@ def test_every_leaf_fits_into_a_column_of_a_study():
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "told"),
+    ("key", "value", "message"),
     [
         (
             "environment",
@@ -90,9 +90,9 @@ def test_every_leaf_fits_into_a_column_of_a_study():
         ("workspace_center_mm", [0.0, float("nan"), 0.0], "must be a finite number"),
     ],
 )
-def test_what_is_wrong_is_one_line_with_the_key(key, value, told):
+def test_what_is_wrong_is_one_line_with_the_key(key, value, message):
     with pytest.raises(ScenarioError) as caught:
         phantom(**{key: value})
     (line,) = caught.value.problems
     assert line.startswith(f"tracker.{key}")
-    assert told in line
+    assert message in line

@@ -1,4 +1,4 @@
-"""What a valid scenario says: values, defaults, inner units, copies, text."""
+"""Valid scenarios: values, defaults, inner units, copies, text."""
 
 import math
 import pickle
@@ -117,19 +117,19 @@ def test_changes_may_replace_all_layers():
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"needle.bevel.offset_mm": -1.0}, "needle.bevel.offset_mm = -1.0: must be at least 0"),
         ({"tissue.2.alpha": 1.0}, "tissue.2.alpha: no such key, the list has items 0 to 1"),
         ({"tissue.alpha": 1.0}, "tissue.alpha: no such key, the list has items 0 to 1"),
-        ({"name.first": "a"}, "name.first: no such key, it lies in a single value"),
+        ({"name.first": "a"}, "name.first: no such key, the value above it is not a table"),
         ({"needle.colour": "red"}, 'needle.colour = "red": unknown key'),
     ],
 )
-def test_a_change_is_checked(change, told):
+def test_a_change_is_checked(change, message):
     with pytest.raises(ScenarioError) as caught:
         PHANTOM.with_values(change)
-    assert str(caught.value).startswith(told)
+    assert str(caught.value).startswith(message)
 
 
 def test_flat_values_round_trip_through_changes():
@@ -187,7 +187,7 @@ def test_a_target_within_reach_passes(target):
 
 
 @pytest.mark.parametrize(
-    ("target", "told"),
+    ("target", "message"),
     [
         ((0, 0), "target.depth_mm = 0.0: must be above 0"),
         ((math.nan, 0), "target.depth_mm = nan: must be above 0"),
@@ -199,10 +199,10 @@ def test_a_target_within_reach_passes(target):
         ((40, math.inf), "target.lateral_mm = inf: must be at most 15 in size"),
     ],
 )
-def test_a_target_out_of_reach_is_refused(target, told):
+def test_a_target_out_of_reach_is_refused(target, message):
     with pytest.raises(ScenarioError) as caught:
         check_target(PHANTOM, *target)
-    assert str(caught.value).startswith(told)
+    assert str(caught.value).startswith(message)
 
 
 def test_without_a_guide_a_target_lies_as_far_aside_as_the_base_travels():

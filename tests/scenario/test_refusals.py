@@ -336,7 +336,7 @@ def test_a_layer_has_no_hidden_mechanics(key):
 
 def test_a_thickness_is_missing_only_in_the_last_layer():
     (line,) = problems(changed("tissue[0].thickness_mm", None))
-    assert line == "tissue[0].thickness_mm: missing: only the last layer goes on without a thickness"
+    assert line == "tissue[0].thickness_mm: missing: every layer but the last needs a thickness"
 
 
 def test_a_range_misses_its_high_end():

@@ -150,7 +150,7 @@ def test_names_of_worlds_are_short_and_the_real_one_needs_no_case():
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [
         ("world:", "world:: must be world:NUMBER or world:NUMBER:CASE, cases: perfect, real, structure"),
         ("world:-1", "world:-1: must be world:NUMBER"),
@@ -161,8 +161,8 @@ def test_names_of_worlds_are_short_and_the_real_one_needs_no_case():
         ("world:7:ideal", "world_case = 'ideal': must be one of perfect, real, structure"),
     ],
 )
-def test_a_name_of_no_world_is_refused_in_one_line(name, told):
+def test_a_name_of_no_world_is_refused_in_one_line(name, message):
     with pytest.raises(ScenarioError) as caught:
         load_scenario(name)
     (line,) = caught.value.problems
-    assert line.startswith(told)
+    assert line.startswith(message)

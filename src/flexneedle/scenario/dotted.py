@@ -29,10 +29,10 @@ def _leaves(key: str, value: Any) -> list[tuple[str, Any]]:
 
 
 def set_value(values: dict[str, Any], key: str, value: Any) -> None:
-    """Set a value in nested tables in place; None takes the key out. Missing tables on the way are made."""
-    *way, last = split_key(key)
+    """Set a value in nested tables in place; None removes the key. Missing intermediate tables are created."""
+    *parents, last = split_key(key)
     table: Any = values
-    for part in way:
+    for part in parents:
         table = table.setdefault(part, {}) if isinstance(table, dict) else _item(table, part, key)
     if isinstance(table, dict):
         table[last] = value
@@ -45,7 +45,7 @@ def set_value(values: dict[str, Any], key: str, value: Any) -> None:
 
 def _item(table: Any, part: str | int, key: str) -> Any:
     if not isinstance(table, list):
-        raise ScenarioError(f"{key}: no such key, it lies in a single value")
+        raise ScenarioError(f"{key}: no such key, the value above it is not a table")
     if not isinstance(part, int) or part >= len(table):
         raise ScenarioError(f"{key}: no such key, the list has items 0 to {len(table) - 1}")
     return table[part]

@@ -1,4 +1,4 @@
-"""Scenario files: reading by name or path, writing; those of environments and registrations, too."""
+"""Reading scenario files by name or path, and writing them; also files of environments and registrations."""
 
 from pathlib import Path
 
@@ -20,8 +20,8 @@ _REGISTRATIONS = Library("a registration file", error=ScenarioError)
 def load_scenario(source: str | Path | Scenario) -> Scenario:
     """Return the scenario of a preset's name, of a world's (`world:100012`) or of a TOML file.
 
-    A scenario is returned as it is. A text that is the name of a preset means the preset, also where a file has that
-    name, and one that begins with `world:` a world.
+    A scenario is returned unchanged. The name of a preset means the preset, even if a file of that name exists; a name
+    that begins with `world:` is a world.
     Raises ScenarioError with one line for each problem: file, key, value, rule.
     """
     if isinstance(source, Scenario):

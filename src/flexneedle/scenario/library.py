@@ -13,7 +13,7 @@ from flexneedle.errors import FileError
 from flexneedle.scenario.problems import describe, printable
 
 _SUFFIX = ".toml"
-# Such a file has a few kB; the bound keeps an endless one such as /dev/zero from filling the memory.
+# Such a file has a few kB; the limit keeps an endless one such as /dev/zero from filling the memory.
 _LARGEST_FILE = 1_000_000
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -23,8 +23,8 @@ Model = TypeVar("Model", bound=BaseModel)
 class Library:
     """A kind of TOML file.
 
-    kind: of file, such as "a scenario file"; noun: what one of the package is called, such as "preset"; folder:
-    where those are, None if there are none; error: what is raised, with one line for each problem.
+    kind: of file, such as "a scenario file"; noun: name for one that comes with the package, such as "preset"; folder:
+    of those, None if there are none; error: type raised, with one line for each problem.
     """
 
     kind: str

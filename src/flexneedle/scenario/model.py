@@ -1,4 +1,4 @@
-"""The scenario: everything that plan and insertion depend on, but for the seed."""
+"""The scenario: everything that plan and insertion depend on, except the seed."""
 
 import warnings
 from collections.abc import Collection, Mapping
@@ -70,7 +70,7 @@ class Scenario(Section):
     def from_values(cls, values: Mapping[str, Any], source: str = "") -> Self:
         """Return the scenario of nested tables, or raise ScenarioError, whose lines open with `source`.
 
-        Warns (ScenarioWarning) of a key that has another name now.
+        Warns (ScenarioWarning) of a key that has been renamed.
         """
         try:
             return cls.model_validate(dict(current_values(values, source)))
@@ -80,17 +80,17 @@ class Scenario(Section):
 
     @classmethod
     def from_record(cls, values: Mapping[str, Any], source: str = "") -> Self:
-        """Return the scenario of a record, as `from_values`; nobody edits a record, so it warns of nothing."""
+        """Return the scenario of a record, as `from_values`, without warnings: a record is not edited."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ScenarioWarning)
             return cls.from_values(values, source)
 
     def values(self) -> dict[str, Any]:
-        """Return nested tables, with all defaults, without the keys that are left out."""
+        """Return nested tables, with all defaults, without the keys that are not set."""
         return self.model_dump(mode="json", exclude_none=True)
 
     def with_values(self, changes: Mapping[str, Any]) -> Self:
-        """Return a copy with values replaced by dotted key (`tissue.0.alpha`); None leaves a key out.
+        """Return a copy with values replaced by dotted key (`tissue.0.alpha`); None removes a key.
 
         Raises ScenarioError if a key is unknown or the copy breaks a rule.
         """
@@ -143,13 +143,13 @@ def _part(values: Mapping[str, Any], sections: Collection[str] | None) -> Mappin
 
 
 def _expanded(key: str, value: Any) -> Any:
-    """Return the table of an environment's name, so that later changes can go into it; an unknown name as it is."""
+    """Return the table of an environment's name, so that later changes apply to it; an unknown name unchanged."""
     known = key == _ENVIRONMENT and value in ENVIRONMENTS.names()
     return expanded(value) if known else value
 
 
 def check_target(scenario: Scenario, depth: float, lateral: float) -> None:
-    """Raise ScenarioError if a target (x, y), mm, cannot be reached by stroke or sideways travel."""
+    """Raise ScenarioError if a target (x, y), mm, is beyond the stroke or the lateral travel."""
     target = Target.model_construct(depth_mm=float(depth), lateral_mm=float(lateral))
     problems = [to_line(problem) for problem in target_problems(scenario.setup, target)]
     if problems:

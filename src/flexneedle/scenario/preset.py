@@ -1,4 +1,4 @@
-"""The scenarios that come with the package, and the prefix of the names of drawn ones."""
+"""The scenarios that come with the package, and the prefix of the names of random worlds."""
 
 from importlib.resources import files
 
@@ -6,6 +6,6 @@ from flexneedle.errors import ScenarioError
 from flexneedle.scenario.library import Library
 
 WORLD = "world:"
-"""Prefix of the name of a world's scenario; then its number and, unless it is `real`, a colon and the case."""
+"""Prefix of the name of a world's scenario; the number follows and, unless it is `real`, a colon and the case."""
 
 PRESETS = Library("a scenario file", "preset", files(__package__) / "presets", ScenarioError)

@@ -1,4 +1,4 @@
-"""From what is wrong with a scenario to one line each: key, value, rule."""
+"""Problems of a scenario as one line each: key, value, rule."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,7 +15,7 @@ _LONGEST_VALUE = 60
 
 
 class Problem(NamedTuple):
-    """A broken rule. `key` is dotted, relative to the section that checks; value None is a key left out."""
+    """A broken rule. `key` is dotted, relative to the section that checks; value None is a key that is not set."""
 
     key: str
     value: object
@@ -38,9 +38,9 @@ def describe(error: ValidationError, model: type[BaseModel]) -> list[str]:
     """Return one line `key = value: rule` for each problem, in the order of the schema."""
     details = error.errors(include_url=False)
     inner = {detail["loc"][:depth] for detail in details for depth in range(len(detail["loc"]))}
-    # pydantic calls a list too short when its items are refused: the items have said enough.
-    told = [d for d in details if not (d["type"] == "too_short" and d["loc"] in inner)]
-    return [line for detail in told for line in _lines(detail, model)]
+    # pydantic also reports a list as too short when its items are refused: only the items are reported.
+    reported = [d for d in details if not (d["type"] == "too_short" and d["loc"] in inner)]
+    return [line for detail in reported for line in _lines(detail, model)]
 
 
 def printable(text: str) -> str:
@@ -80,7 +80,7 @@ def _line(loc: Sequence[str | int], value: object, rule: str) -> str:
 
 
 def _shown(value: object) -> str:
-    """Return a value about as TOML writes it, in one short line."""
+    """Return a value in one short line, much as TOML writes it."""
     if isinstance(value, Mapping):
         text = "{…}"
     elif isinstance(value, bool | str):

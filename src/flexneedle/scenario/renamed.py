@@ -1,4 +1,4 @@
-"""Keys of older scenarios: one with another name now means the new one, one that nothing reads is left out; each with a
+"""Keys of older scenarios: a renamed one is read under its new name, one without a setting is ignored; each with a
 warning."""
 
 import copy
@@ -35,12 +35,12 @@ def current_key(key: str, source: str = "") -> str:
 
 
 def given_twice(key: str, value: Any) -> str:
-    """Return what is wrong with an old key where the new one is given, too."""
+    """Return the message about an old key where the new one is given, too."""
     return f"{key} = {value}: the key is {_RENAMED[key]} now, which is given, too: remove one of the two"
 
 
 def current_values(values: Mapping[str, Any], source: str = "") -> Mapping[str, Any]:
-    """Return nested tables under the present names, without what nothing reads, with a warning for each old key.
+    """Return nested tables under the present names, without the ignored keys, with a warning for each old key.
 
     Raises ScenarioError if both an old key and its new one are given.
     """

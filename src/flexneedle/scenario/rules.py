@@ -1,4 +1,4 @@
-"""Rules between sections: geometry, layers, the target, and grids that would never end."""
+"""Rules between sections: geometry, layers, the target, and grids too fine to run."""
 
 from collections.abc import Iterator, Sequence
 from math import isfinite
@@ -35,14 +35,14 @@ def geometry_problems(needle: Needle, setup: Setup) -> Iterator[Problem]:
 
 
 def layer_problems(tissue: Sequence[Layer], bevel: Bevel) -> Iterator[Problem]:
-    """At least one layer, a thickness for each but the last, a bevel that no layer is too thin for."""
+    """At least one layer, a thickness for each but the last, a bevel offset that every layer can hold."""
     if not tissue:
         yield Problem("tissue", None, "needs at least one layer: add a [[tissue]]")
         return
     for i, layer in enumerate(tissue[:-1]):
         if layer.thickness_mm is None:
             yield Problem(
-                f"tissue.{i}.thickness_mm", None, "missing: only the last layer goes on without a thickness"
+                f"tissue.{i}.thickness_mm", None, "missing: every layer but the last needs a thickness"
             )
     shortest = min(range(len(tissue)), key=lambda i: tissue[i].compression_length_mm)
     limit = LARGEST_BEVEL * tissue[shortest].compression_length_mm
@@ -52,7 +52,7 @@ def layer_problems(tissue: Sequence[Layer], bevel: Bevel) -> Iterator[Problem]:
 
 
 def target_problems(setup: Setup, target: Target) -> Iterator[Problem]:
-    """Return what keeps a target out of reach: not in the tissue, beyond the stroke or the lateral travel."""
+    """Return why a target is out of reach: not in the tissue, beyond the stroke or the lateral travel."""
     depth, lateral = target.depth_mm, target.lateral_mm
     if not (isfinite(depth) and depth > 0):
         yield Problem("target.depth_mm", depth, "must be above 0, the skin")
@@ -77,7 +77,7 @@ def plan_problems(plan: PlanSettings) -> Iterator[Problem]:
 def grid_problems(
     setup: Setup, contact: Contact, phantom: PhantomSettings, tracker: TrackerSettings
 ) -> Iterator[Problem]:
-    """No spacing or step so small that a run would hang."""
+    """No spacing or step so small that a run would not end."""
     smallest = setup.stroke_mm / _MOST_GRID_POINTS
     grids = {
         "setup.max_advance_mm": setup.max_advance_mm,
@@ -95,7 +95,7 @@ def grid_problems(
 
 
 def monitor_problems(monitor: MonitorSettings, tracker: TrackerSettings) -> Iterator[Problem]:
-    """Two frames in the window, or the field would never be known and the needle never move."""
+    """Two frames in the window, or the field would never be known and the needle would never move."""
     least = _FRAMES_IN_A_WINDOW * tracker.period
     judged = monitor.enabled and monitor.references > 0 and tracker.environment is not None
     if judged and monitor.indicator_window_s < least:

@@ -13,8 +13,8 @@
 | stroke, needle length | 5 to 20 mm more than the target takes; 10 to 40 mm of needle left before the base stops |
 
 Everything else is as in the preset `phantom`. Numbers 0 to 999 are for choosing settings, 100,000 and up for reports.
-A world has three cases, which differ in `[phantom]` alone: `perfect` has no mismatch, `real` the preset's, `structure`
-(with a guide only) one kind of structural mismatch more, `structural` below.
+A world has three cases, which differ only in `[phantom]`: `perfect` has no mismatch, `real` the preset's, `structure`
+(with a guide only) one kind of structural mismatch in addition, see `structural`.
 """
 
 import re
@@ -34,7 +34,7 @@ LARGEST_WORLD = 10**9
 PERFECT, REAL, STRUCTURE = "perfect", "real", "structure"
 CASES = (PERFECT, REAL, STRUCTURE)
 
-_STREAM = 0x776F726C64  # keeps worlds apart from what else is seeded by a small number
+_STREAM = 0x776F726C64  # separates worlds from other streams that are seeded by a small number
 _STRUCTURE_STREAM = _STREAM + 1
 _STEEL_GAUGES = tuple(list(GAUGES)[1:9])  # 18G to 25G
 _THINNEST_LAYER_MM = 4.0
@@ -58,7 +58,7 @@ _NO_MISMATCH: dict[str, Any] = {
 def world(number: int, case: str = REAL) -> Scenario:
     """Return the scenario of a world in one of the `CASES`.
 
-    Raises ScenarioError for a number that is none of a world's, an unknown case, and `structure` without a guide.
+    Raises ScenarioError for a number out of range, an unknown case, and `structure` without a guide.
     """
     if not 0 <= number <= LARGEST_WORLD:
         raise ScenarioError(f"world = {number}: must be a whole number from 0 to {LARGEST_WORLD}")
@@ -89,10 +89,11 @@ def named_world(name: str) -> Scenario:
 
 
 def structural(number: int, scenario: Scenario) -> dict[str, Any]:
-    """Return the structural mismatch of a world with a guide, by dotted key: one kind, each as likely, uniform.
+    """Return the structural mismatch of a world with a guide, by dotted key: one of five kinds, all equally likely.
 
-    α 3 to 20; compression length × 0.7 to 1.5; bevel length × 0.5 to 2; a hidden layer of 1 to 4 mm, three to six
-    times as stiff, anywhere before the target; guide up to 3 mm from its place, at most half of the way to the tip.
+    Uniform values: α 3 to 20; compression length × 0.7 to 1.5; bevel length × 0.5 to 2; a hidden layer of 1 to 4 mm,
+    three to six times as stiff, anywhere before the target; guide shifted by up to 3 mm, at most half of the distance
+    to the tip.
     """
     rng = np.random.default_rng([_STRUCTURE_STREAM, number])
     thickness = _rounded(rng.uniform(1.0, 4.0))
@@ -133,7 +134,7 @@ def _real(number: int) -> Scenario:
 
 
 def _rounded(value: float) -> float:
-    """Three digits after the point: a value that can be read, and written to a file without loss."""
+    """Three decimals: short, and written to a file without loss."""
     return round(float(value), 3)
 
 

@@ -1,1 +1,1 @@
-"""The sections of a scenario file, a model each."""
+"""The sections of a scenario file, one model for each."""

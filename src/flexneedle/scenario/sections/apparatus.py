@@ -1,4 +1,4 @@
-"""What holds, moves and measures the needle."""
+"""The setup that holds and moves the needle, and the tracker that measures it."""
 
 from math import sqrt
 from typing import Annotated
@@ -20,28 +20,28 @@ GuideTravel = Annotated[Positive, BeforeValidator(_moves)]
 
 
 class Setup(Section):
-    """Section `setup`: where things stand at the start, and how far and fast the actuators go."""
+    """Section `setup`: positions at the start, travel and speed of the actuators."""
 
     guide_to_skin_mm: Positive | None = None
-    """G; left out, there is no guide."""
+    """G, distance from the guide to the skin. Not set: there is no guide."""
     tip_to_skin_mm: Positive
-    """Gap between tip and skin at the start."""
+    """Distance from the tip to the skin at the start."""
     stroke_mm: Positive
-    """Greatest travel of the base along the insertion axis."""
+    """Largest travel of the base along the insertion axis."""
     max_advance_mm: Positive = 1.0
-    """Greatest travel along the insertion axis in a control step, either way."""
+    """Largest travel of the base along the insertion axis in a control step, forwards or backwards."""
     max_guide_step_mm: GuideTravel = 0.5
-    """Greatest lateral travel of the guide in a control step."""
+    """Largest lateral travel of the guide in a control step."""
     max_guide_travel_mm: GuideTravel = 15.0
-    """Greatest lateral distance of the guide from the axis."""
+    """Largest lateral distance of the guide from the insertion axis."""
     max_base_step_mm: Positive = 0.5
-    """Greatest lateral travel of the base in a control step."""
+    """Largest lateral travel of the base in a control step."""
     max_base_travel_mm: Positive = 15.0
-    """Greatest lateral distance of the base from the axis."""
+    """Largest lateral distance of the base from the insertion axis."""
     max_base_turn_step_mrad: Positive = 5.0
-    """Greatest turn of the base in a control step."""
+    """Largest rotation of the base in a control step."""
     insertion_speed_mm_s: Positive = 5.0
-    """Speed along the insertion axis; a step of 1 mm at 5 mm/s lasts 200 ms."""
+    """Insertion speed; a step of 1 mm at 5 mm/s lasts 200 ms."""
 
     @property
     def has_guide(self) -> bool:
@@ -60,38 +60,38 @@ class Setup(Section):
 
     @property
     def max_depth(self) -> float:
-        """Depth that a straight needle reaches at full stroke, mm; negative if it stays before the skin."""
+        """Depth that a straight needle reaches at full stroke, mm; negative if it does not reach the skin."""
         return self.stroke_mm - self.tip_to_skin_mm
 
     @property
     def max_lateral(self) -> float:
-        """How far aside a target may lie, mm: as far as the guide travels, or the base without one."""
+        """Largest lateral offset of a target, mm: the lateral travel of the guide, or of the base without a guide."""
         return self.max_guide_travel_mm if self.has_guide else self.max_base_travel_mm
 
     @property
     def max_base_turn_step(self) -> float:
-        """Greatest turn of the base in a control step, rad."""
+        """Largest rotation of the base in a control step, rad."""
         return 1e-3 * self.max_base_turn_step_mrad
 
 
 class TrackerSettings(Section):
-    """Section `tracker`: what measures the tip."""
+    """Section `tracker`: the device that measures the tip."""
 
     rate_hz: Positive = 40.0
-    """Readings a second."""
+    """Readings per second."""
     jitter_mm: NonNegative = 0.07
-    """RMS length of the 3D deviation vector; in an environment, that has its own."""
+    """RMS length of the 3D deviation of a reading from the mean. With `environment`, its sensors' values apply."""
     tip_offset_mm: NonNegative = 0.0
-    """Calibrated distance from the sensor to the tip of the needle, along the needle."""
+    """Calibrated distance from the sensor to the needle's tip, along the needle."""
     workspace_center_mm: Vector = (20.0, 0.0, 0.0)
-    """Where the middle of the environment's workspace lies in the frame of the insertion."""
+    """Center x, y, z of the environment's workspace in the frame of the insertion."""
     field_seed: AnySeed | None = None
-    """Which room of the environment; left out, each insertion draws its own from its seed."""
+    """Seed of the environment's error field. Not set: each insertion draws a field of its own from its seed."""
     environment: Annotated[Environment | None, BeforeValidator(expanded)] = None
-    """The name of a shipped environment, or a table of one's own; "none" or left out, there is white noise alone."""
+    """Name of a shipped environment, or a table with the values of your own. "none" or not set: white noise only."""
 
     registration: Registration | None = None
-    """How the tracker's frame lies in the insertion's; left out, they are one."""
+    """Rigid map from the tracker's frame to the frame of the insertion. Not set: the two frames are the same."""
 
     @property
     def period(self) -> float:

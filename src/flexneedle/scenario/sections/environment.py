@@ -1,6 +1,6 @@
-"""What an electromagnetic tracker stands in: errors of its field, a metal plate, and its sensors.
+"""The environment of an electromagnetic tracker: errors of its field, a metal plate, and its sensors.
 
-Places are in the frame of the environment: origin in the middle of the workspace, axes parallel to the stage's.
+Positions are in the frame of the environment: origin in the center of the workspace, axes parallel to the stage's.
 """
 
 from collections.abc import Mapping
@@ -32,87 +32,89 @@ def _a_direction(vector: tuple[float, float, float]) -> tuple[float, float, floa
 
 
 class TipSensor(Section):
-    """The 5-DOF sensor at the tip: one coil."""
+    """Section `tracker.environment.tip`: the 5-DOF sensor at the tip, one coil."""
 
     bias_mm: NonNegative = 0.65
-    """RMS length of the error over the workspace, without a plate."""
+    """RMS length of the position error over the workspace, without a plate."""
     jitter_mm: NonNegative = 0.07
-    """RMS length of the deviation of a sample from the mean."""
+    """RMS length of the deviation of a sample from the mean at one position."""
 
 
 class ReferenceSensor(Section):
-    """A 6-DOF sensor: two coils one behind the other along its z axis, and the mean of the two as its place."""
+    """Section `tracker.environment.reference`: a 6-DOF sensor, the mean of two coils along its z axis."""
 
     bias_mm: NonNegative = 0.61
-    """RMS length of the error over the workspace, without a plate."""
+    """RMS length of the position error over the workspace, without a plate."""
     jitter_mm: NonNegative = 0.08
-    """RMS length of the deviation of a sample from the mean."""
+    """RMS length of the deviation of a sample from the mean at one position."""
     spacing_mm: Positive = 12.0
-    """Distance of the coils by design, to which the indicator compares the measured one."""
+    """Nominal distance of the two coils, with which the indicator compares the measured one."""
     coils_mm: NonNegative = 0.5
-    """RMS length by which the errors of the two coils differ at one place: they lie askew in the sensor."""
+    """RMS length of the difference between the errors of the two coils at one position (they are mounted askew)."""
     ref1_mm: Vector = (0.0, 50.0, 0.0)
-    """Where the first of the three references of an insertion stands."""
+    """Position x, y, z of the first of the three reference sensors of an insertion."""
     ref2_mm: Vector = (0.0, -50.0, 0.0)
-    """Where the second one stands."""
+    """Position x, y, z of the second reference sensor."""
     ref3_mm: Vector = (50.0, 0.0, 0.0)
-    """Where the third one stands."""
+    """Position x, y, z of the third reference sensor."""
 
 
 class Plate(Section):
-    """A metal plate. Sizes are RMS lengths over the workspace while the plate is 100 mm from its middle."""
+    """Section `tracker.environment.plate`: a metal plate. Distortions are RMS lengths over the workspace with the plate
+    100 mm from its center.
+    """
 
     distance_mm: Annotated[float, Field(ge=0, le=LARGEST)] = 100.0
-    """From the plate to the middle of the workspace."""
+    """Distance from the plate to the center of the workspace."""
     normal: Annotated[Vector, AfterValidator(_a_direction)] = (0.0, 0.0, 1.0)
-    """Direction from the plate to the workspace, of any length."""
+    """Direction x, y, z from the plate to the workspace; its length does not matter."""
     decay_mm: Positive = 40.0
     """Distance over which the distortion falls to 1/e."""
     tip_mm: NonNegative = 0.0
-    """Distortion of the tip sensor."""
+    """RMS distortion of the tip sensor's position."""
     reference_mm: NonNegative = 0.0
-    """Distortion of a reference sensor."""
+    """RMS distortion of a reference sensor's position."""
     coils_mm: NonNegative = 0.0
-    """Difference of the distortion of a reference sensor's two coils."""
+    """RMS difference between the distortions of a reference sensor's two coils."""
     coils_decay_mm: Positive = 60.0
     """Distance over which that difference falls to 1/e."""
     coils_pull: Fraction = 0.8
-    """Share of its square that is along the normal, and but for the decay the same everywhere."""
+    """Share of the squared difference that is along `normal` and, apart from the decay, uniform over the workspace."""
 
 
 class Environment(Section):
-    """Section `tracker.environment`: how a tracker errs; a `field_seed` makes one room of it."""
+    """Section `tracker.environment`: statistics of a tracker's errors, from which a `field_seed` draws one field."""
 
     name: Title
-    """In tables."""
+    """Name in tables."""
     field_seed: AnySeed = 0
-    """The room that `flexneedle em simulate` measures."""
+    """Seed of the error field that `flexneedle em simulate` measures."""
     workspace_mm: Positive = 100.0
-    """Edge of the cube over which sizes are meant."""
+    """Edge of the cubic workspace, over which the RMS lengths of the errors are taken."""
     length_mm: Positive = 60.0
-    """Distance over which errors stay alike: their correlation is e^(-r²/2ℓ²)."""
+    """Correlation length ℓ of the errors: positions at a distance r have the correlation e^(-r²/2ℓ²)."""
     shared: Fraction = 0.5
-    """Share of the squared error that all sensors have in common at one place."""
+    """Share of the squared error that is common to all sensors at one position."""
     generator_mm: Annotated[Vector, AfterValidator(_a_direction)] = (0.0, 700.0, 0.0)
-    """Where the field generator stands."""
+    """Position x, y, z of the field generator."""
     growth: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Power of the distance to the field generator with which the error without a plate grows."""
+    """Exponent with which the error without a plate grows over the distance to the field generator; 0: uniform."""
     tilt_mrad_per_mm: NonNegative = 8.0
-    """How far a sensor's axis is turned, for each mm that its place is off."""
+    """Rotation error of a sensor's axis for each mm of its position error."""
     tilt_jitter_mrad: NonNegative = 3.0
-    """RMS angle of the deviation of a sample's orientation from the mean."""
+    """RMS angle of the deviation of a sample's orientation from the mean at one position."""
     missing_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Share of the samples of `flexneedle em simulate` without a position; insertions have `[phantom]`'s."""
+    """Share of samples without a position in `flexneedle em simulate`; insertions use `phantom.missing_fraction`."""
     tip: TipSensor = TipSensor()
     reference: ReferenceSensor = ReferenceSensor()
     plate: Plate | None = None
-    """Left out, there is none."""
+    """Metal plate. Not set: there is none."""
 
 
 def expanded(value: Any) -> Any:
-    """Return the table of a shipped environment's name, None for "none"; anything else as it is.
+    """Return the table of a shipped environment's name, None for "none"; a table or None unchanged.
 
-    Raises ValueError for what is neither.
+    Raises ValueError for anything else.
     """
     if value is None or isinstance(value, Mapping | Environment):
         return value

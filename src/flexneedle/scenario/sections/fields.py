@@ -1,7 +1,7 @@
-"""What all sections of a scenario share: the base class and the kinds of numbers.
+"""Base class of all sections of a scenario, and the types of their numbers.
 
-Every quantity is bounded on both sides (1e-6 to 1e6 in its border unit), far outside of anything a needle
-meets, so that no product of valid settings overflows or vanishes.
+Every quantity is bounded on both sides (1e-6 to 1e6 in its unit in the file), far outside the range of any
+needle, so that no product of valid settings overflows or vanishes.
 """
 
 from typing import Annotated
@@ -52,6 +52,6 @@ NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], Field(strict=False
 
 
 def count(default: int, *, least: int, most: int) -> int:
-    """Return the field of a whole number between `least` and `most`: more would only hang the machine."""
+    """Return the field of a whole number from `least` to `most`, beyond which a run would not end."""
     field: int = Field(default=default, ge=least, le=most)
     return field

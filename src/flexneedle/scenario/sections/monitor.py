@@ -1,4 +1,4 @@
-"""When the tracker is not to be trusted."""
+"""Limits of the tracker's readings and of its field."""
 
 from typing import Annotated
 
@@ -8,29 +8,29 @@ from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, 
 
 
 class MonitorSettings(Section):
-    """Section `monitor`: what the tracker may say before the needle is held (paper section IV-B, and beyond)."""
+    """Section `monitor`: limits beyond which the needle is held (the first of them from paper section IV-B)."""
 
     enabled: bool = True
-    """Whether anything below is looked at; readings that are missing, stale or far from the prediction never count."""
+    """Whether the checks below are made. Missing, stale or improbable readings are rejected in any case."""
     indicator_limit: Positive = 0.0547
-    """Threshold of a reference sensor's indicator: above it the field is distorted (paper)."""
+    """Limit of a reference's indicator (relative error of its coils' distance); above it the field is distorted."""
     indicator_window_s: Positive = 1.0
-    """The median over so long is held against the threshold: single readings pass it now and then in a clean field."""
+    """Time over which the median of the indicator is compared with its limit; single clean readings may exceed it."""
     doubt_window_s: Positive = 0.2
-    """While the median over so short a time is above the threshold, no reading corrects the model."""
+    """Shorter time for the same median: while that is above the limit, no reading corrects the model."""
     resume_fraction: Annotated[float, Field(gt=0, le=1)] = 0.9
-    """Once held, all indicators have to fall below this share of the threshold."""
+    """Share of the limit below which all indicators must fall before a held needle continues."""
     abort_after_s: Positive = 10.0
-    """The insertion is given up after so long in a distorted field."""
+    """Time in a distorted field after which the insertion ends."""
     references: int = count(3, least=0, most=100)
-    """Reference sensors that have to be seen within the window; 0 goes without."""
+    """Number of reference sensors that must be measured within `indicator_window_s`; 0: none is required."""
     lost_after_s: NonNegative = 0.1
-    """A tracker that tells frames may lose the tip for so long; others are held at the first reading without one."""
+    """Time without the tip after which the needle is held, with a tracker that sends frames; with others it is 0."""
     speed_limit_mm_s: Positive = 20.0
-    """No tip moves faster: a reading further from the last one is a jump,"""
+    """Largest speed of the tip: a reading further from the last one is a jump and is rejected."""
     jump_margin_mm: NonNegative = 1.0
-    """with so much room for noise."""
+    """Allowance for noise, added to the distance that `speed_limit_mm_s` permits."""
     frozen_travel_mm: Positive = 0.3
-    """A reading that stays the same to the last digit while the needle travels further is frozen."""
+    """Travel of the needle after which readings that repeat to the last digit are frozen and are rejected."""
     out_of_plane_limit_mm: Positive = 5.0
-    """Greatest distance of a measured tip from the plane of the insertion."""
+    """Largest distance of a measured tip from the plane of the insertion."""

@@ -1,4 +1,4 @@
-"""The needle: a steel tube or rod with a bevel at its tip."""
+"""The needle: a tube or rod with a bevel at its tip."""
 
 from math import pi
 from typing import Literal, get_args
@@ -29,10 +29,10 @@ the Birmingham wire gauge, rounded to 0.001 mm."""
 
 
 class Bevel(Section):
-    """The bevel as a pre-compressed spring at the tip."""
+    """Section `needle.bevel`: the bevel as a pre-compressed spring at the tip."""
 
     offset_mm: NonNegative = 4.0
-    """b, pre-compression of the tip spring; 0 is a symmetric tip."""
+    """b, pre-compression of the tip spring; 0: symmetric tip."""
     length_mm: Positive = 3.0
     """l_b, length behind the tip over which the spring acts."""
 
@@ -41,19 +41,19 @@ class Needle(Section):
     """Section `needle`. The cross-section is given by `gauge` or by diameters."""
 
     gauge: Gauge | None = None
-    """Regular-wall needle of this gauge, instead of diameters."""
+    """Gauge of a regular-wall needle, in place of the diameters."""
     stylet: bool = False
-    """A stylet fills the tube: it bends like a solid rod."""
+    """Whether a stylet fills the tube, which then bends like a solid rod."""
     outer_diameter_mm: Positive | None = None
-    """Outer diameter, if no gauge is given."""
+    """Outer diameter, required without `gauge`."""
     inner_diameter_mm: NonNegative | None = None
-    """Inner diameter, if no gauge is given; left out or 0 is a solid needle."""
+    """Inner diameter, without `gauge`. Not set or 0: solid needle."""
     length_mm: Positive = 150.0
     """Length from the base clamp to the tip."""
     youngs_modulus_gpa: Positive = 200.0
-    """E."""
+    """E, Young's modulus of the needle."""
     nodes: int = count(61, least=2, most=10_000)
-    """n, nodes of the needle state X, at equal arc lengths."""
+    """n, number of nodes of the needle state X, at equal arc lengths."""
     bevel: Bevel = Bevel()
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Where the tracker stands: the rigid map from its frame to the stage's, as a registration found it."""
+"""The registration of the tracker: the rigid map from its frame to the stage's, found from fiducials."""
 
 from math import hypot
 from typing import Annotated
@@ -37,20 +37,20 @@ UnitQuaternion = Annotated[tuple[float, float, float, float], Field(strict=False
 
 
 class Registration(Section):
-    """Section `tracker.registration`: tracker to stage, and from how many points it was found how well.
+    """Section `tracker.registration`: map from the tracker's to the stage's frame, its fiducials and their error.
 
     `flexneedle em register` writes it.
     """
 
     rotation: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
-    """Unit quaternion w, x, y, z that turns the tracker's axes into the stage's."""
+    """Unit quaternion w, x, y, z that rotates vectors from the tracker's frame to the stage's."""
     translation_mm: Vector = (0.0, 0.0, 0.0)
-    """Where the tracker's origin lies in the stage's frame."""
+    """Position x, y, z of the tracker's origin in the stage's frame."""
     localisation_mm: NonNegative = 0.0
-    """RMS error with which a fiducial was measured, as the residual tells."""
+    """RMS error of a measured fiducial, estimated from the residual of the fit."""
     fiducials_mm: Annotated[
         tuple[Vector, ...],
         Field(strict=False, min_length=3, max_length=100_000),
         AfterValidator(_not_on_a_line),
     ]
-    """Where the fiducials are in the stage's frame."""
+    """Positions x, y, z of the fiducials in the stage's frame."""

@@ -1,4 +1,4 @@
-"""The task and the settings of planner, controller and virtual phantom."""
+"""The target and the settings of planner, controllers and virtual phantom."""
 
 from typing import Annotated, Any, Self
 
@@ -18,12 +18,12 @@ from flexneedle.scenario.sections.structure import Structure
 
 
 class Target(Section):
-    """Section `target`: where the tip is to arrive."""
+    """Section `target`: the position that the tip is to reach."""
 
     depth_mm: float = 40.0
-    """x of the target."""
+    """x of the target: depth below the skin."""
     lateral_mm: float = 5.0
-    """y of the target."""
+    """y of the target: lateral offset from the insertion axis."""
 
     @property
     def position(self) -> tuple[float, float]:
@@ -35,76 +35,76 @@ class PlanSettings(Section):
     """Section `plan`: the cross-entropy method and the cost of a plan."""
 
     samples: int = count(128, least=2, most=100_000)
-    """N, control sequences in an iteration."""
+    """N, number of control sequences in an iteration."""
     iterations: int = count(25, least=1, most=10_000)
-    """Usual number of iterations: after these, the search ends once ten more hardly lower the cost."""
+    """Usual number of iterations; after these, the search ends once the cost has hardly fallen in ten iterations."""
     max_iterations: int = count(200, least=1, most=10_000)
-    """Greatest number of iterations, if `iterations` is not greater."""
+    """Largest number of iterations; if `iterations` is larger, that applies."""
     elite_fraction: Annotated[float, Field(gt=0, le=1)] = 0.125
-    """ρ, share of the samples from which mean and covariance are fitted."""
+    """ρ, share of the samples (the elite) to which mean and covariance are fitted."""
     smoothing: Annotated[float, Field(ge=0, lt=1)] = 0.4
-    """Share of the old mean and covariance that is kept in an iteration."""
+    """Share of the previous mean and covariance that is kept in an iteration."""
     primitives: int = count(6, least=1, most=1_000)
-    """Pieces of a control sequence, each constant over several steps."""
+    """Number of primitives of a control sequence, each constant over its share of the travel."""
     tolerance: Positive = 1e-3
-    """Spread of the elite's costs, relative to the first iteration, at which the search has converged."""
+    """Spread of the elite's costs, relative to that of the first iteration, at which the search has converged."""
     advance_sigma_mm: NonNegative = 0.03
-    """First standard deviation of the advance of a step; 0 keeps it fixed."""
+    """Initial standard deviation of the advance of a step; 0: fixed."""
     guide_sigma_mm: NonNegative = 0.06
-    """First standard deviation of the guide's travel in a step; 0 keeps it fixed."""
+    """Initial standard deviation of the guide's lateral travel in a step; 0: fixed."""
     base_sigma_mm: NonNegative = 0.0
-    """First standard deviation of the base's lateral travel in a step; 0 keeps it fixed."""
+    """Initial standard deviation of the base's lateral travel in a step; 0: fixed."""
     base_turn_sigma_mrad: NonNegative = 0.0
-    """First standard deviation of the base's turn in a step; 0 keeps it fixed."""
+    """Initial standard deviation of the base's rotation in a step; 0: fixed."""
     accuracy_weight_per_mm: NonNegative = 20.0
-    """γ₁, cost of the distance between tip and target."""
+    """γ₁, weight of the distance between tip and target at the end."""
     energy_weight_per_mj: NonNegative = 5.0
-    """γ₂, cost of the strain energy W."""
+    """γ₂, weight of the tissue's strain energy W at the end."""
     deflection_weight: NonNegative = 0.002
-    """Q, cost of the needle's deflection in a step."""
+    """Q, weight of the needle's mean square deflection (mm²), summed over the steps."""
     guide_weight: NonNegative = 1.0
-    """R, cost of the guide's travel in a step."""
+    """R, weight of the guide's squared travel (mm²), summed over the steps."""
     flip_weight: NonNegative = 0.3
-    """R of a turn of the bevel."""
+    """R of the flip input, cost of a roll of the bevel."""
 
     @property
     def base_turn_sigma(self) -> float:
-        """First standard deviation of the base's turn in a step, rad."""
+        """Initial standard deviation of the base's rotation in a step, rad."""
         return 1e-3 * self.base_turn_sigma_mrad
 
 
 class ControlSettings(Section):
-    """Section `control`: what all controllers share. The tables below it are each a controller's own.
+    """Section `control`: settings of all controllers. Each table below it has the settings of one controller.
 
-    They are kept as they are given: the controllers check them (`flexneedle.control.tables`).
+    The tables are kept unchecked here; the controllers check them (`flexneedle.control.tables`).
     """
 
     model_config = ConfigDict(extra="allow")
 
     load_gain: Fraction = 0.3
-    """Share of a new tip load that is estimated in a period."""
+    """Gain of the low-pass filter on the estimated tip load, per period. Not used by `adaptive-mpc`."""
     depth_tolerance_mm: Positive = 0.01
-    """The insertion ends this close to the target depth."""
+    """Tolerance of the target depth at which the insertion ends."""
     start_offset_sd_mm: NonNegative = 0.5
-    """What the controller expects of the base clamp's lateral position: its standard deviation."""
+    """Prior of the base clamp's lateral position at the start: standard deviation."""
     start_angle_sd_mrad: NonNegative = 3.0
-    """What the controller expects of the base clamp's slope: its standard deviation."""
+    """Prior of the base clamp's slope at the start: standard deviation."""
     innovation_limit_mm: Positive = 2.0
-    """A reading further from its prediction than this plus three standard deviations is not used."""
+    """Innovation gate: a reading further from its prediction than this plus three standard deviations is rejected."""
     start_axial_sd_mm: NonNegative = 1.0
-    """What the controller expects of the tip's position along the axis at the start: its standard deviation."""
+    """Prior of the tip's position along the axis at the start: standard deviation."""
     miss_limit_mm: Positive = 2.0
-    """The needle is held where no path is found that ends within this lateral distance of the target."""
+    """Largest predicted lateral miss at the target: the needle is held if no path with a smaller one is found."""
     miss_confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95
-    """The needle is held if the predicted miss exceeds its limit with at least this probability."""
+    """Probability of a miss beyond `miss_limit_mm` from which the needle is held."""
     hold_limit_s: Positive = 1.0
-    """The insertion ends after this time without a usable reading, or without a path to the target."""
+    """Time without a usable reading, or without a path to the target, after which the insertion ends."""
     stale_after_s: Positive = 0.3
-    """A reading older than this is not used."""
+    """Age above which a reading is rejected as stale."""
 
     @model_validator(mode="after")
     def _check_tables(self) -> Self:
-        """Refuse what is neither a key nor a table."""
+        """Refuse an entry that is neither a known key nor a table."""
         valid = [*type(self).model_fields, "the controllers' tables"]
         refuse(
             Problem(key, value, unknown_key(key, valid))
@@ -120,57 +120,57 @@ class ControlSettings(Section):
 
     @property
     def start_angle_sd(self) -> float:
-        """Expected standard deviation of the base clamp's slope, rad."""
+        """Standard deviation of the prior of the base clamp's slope, rad."""
         return 1e-3 * self.start_angle_sd_mrad
 
 
 class PhantomSettings(Section):
-    """Section `phantom`: how the virtual phantom differs from what the controller assumes.
+    """Section `phantom`: differences of the virtual phantom from the controller's model, drawn for each insertion.
 
-    The plant `model` has no initial bend, guide clearance, friction or variation of stiffness; `exact` has all.
+    The plant `model` has no initial bend, guide clearance, friction or stiffness variation; `exact` has all.
     """
 
     shear_modulus_factor: PositiveRange = (0.6, 1.6)
-    """Range of the factor on μ, uniform, each layer on its own."""
+    """Range [low, high] of the factor on each layer's μ, drawn uniformly and independently."""
     shear_modulus_variation: Annotated[float, Field(ge=0, le=1)] = 0.2
-    """Standard deviation of μ along the depth, relative to the layer's."""
+    """Standard deviation of μ along the depth, relative to the μ of the layer."""
     variation_length_mm: Positive = 10.0
-    """Depth over which that variation is correlated."""
+    """Correlation length of the variation of μ along the depth."""
     layer_shift_sd_mm: NonNegative = 1.5
     """Standard deviation of the depth of each layer boundary."""
     bevel_factor: NonNegativeRange = (0.5, 1.5)
-    """Range of the factor on the bevel offset, uniform, as far as b stays below 0.7 h."""
+    """Range [low, high] of the factor on the bevel offset b, drawn uniformly; b is kept below 0.7 h."""
     start_offset_sd_mm: NonNegative = 0.5
-    """Standard deviation of the base clamp's lateral position."""
+    """Standard deviation of the base clamp's lateral position at the start."""
     start_angle_sd_mrad: NonNegative = 3.0
-    """Standard deviation of the base clamp's slope."""
+    """Standard deviation of the base clamp's slope at the start."""
     start_axial_sd_mm: NonNegative = 1.0
-    """Standard deviation of the position of base and tip along the axis at the start (needle length, clamp, skin), at
-    most half of the distance to the skin, to the guide, and of what the base has left at full stroke."""
+    """Standard deviation of the position of base and tip along the axis at the start, from errors of needle length, clamp
+    and skin; the error is at most half of the distance to the skin, to the guide, and of that left at full stroke."""
     youngs_modulus_variation: Annotated[float, Field(ge=0, lt=1)] = 0.05
-    """Largest deviation of the needle's modulus, uniform to either side, relative to the scenario's."""
+    """Largest deviation of the needle's Young's modulus, relative to the scenario's, drawn uniformly to either side."""
     initial_bend_mm: NonNegative = 0.5
-    """How far the tip of the free needle is off the straight; the bend turns with the bevel, its side is drawn."""
+    """Lateral offset of the free needle's tip by its natural bend, which rolls with the bevel; its side is drawn."""
     run_out_mm: NonNegative = 0.2
-    """How far the tip moves laterally when the bevel rolls; its side is drawn."""
+    """Lateral motion of the tip when the bevel rolls; its side is drawn."""
     guide_clearance_mm: NonNegative = 0.05
-    """Play of the needle in the guide, to either side."""
+    """Clearance of the needle in the guide, to either side."""
     friction_mn_per_mm: NonNegative = 5.0
-    """Axial friction of tissue on the needle, for each mm in it."""
+    """Axial friction of the tissue on each mm of the inserted needle."""
     motor_resolution_mm: NonNegative = 0.01
-    """Base and guide stand on multiples of this; 0 is a perfect motor."""
+    """Resolution of the motors: base and guide are at multiples of it; 0: exact."""
     delay_periods: NonNegative = 1.0
-    """Age of a reading when it arrives, in control periods at full step and speed."""
+    """Age of a reading on arrival, in control periods of a full step at insertion speed."""
     missing_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.01
-    """Share of the tracker's readings in which it sees no tip."""
+    """Share of the tracker's readings without a tip position."""
     tracker_bias_mm: NonNegative = 0.0
-    """Constant error of the tracker in the plane; its direction is drawn."""
+    """Constant error of the tracker in the plane of the insertion; its direction is drawn."""
     contact_spacing_mm: Positive = 0.5
-    """Depth between the phantom's contact points."""
+    """Spacing of the phantom's contact points along the cut channel."""
     element_mm: Positive = 0.5
-    """Length of an element of the needle in the plant `exact`."""
+    """Length of a needle element in the plant `exact`."""
     step_mm: Positive = 0.25
-    """Greatest travel in one step of the phantom's own simulation."""
+    """Largest travel in one step of the phantom's own simulation."""
     structure: Structure = Structure()
 
     @property

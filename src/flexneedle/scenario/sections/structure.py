@@ -1,4 +1,4 @@
-"""Mismatch of structure: what a phantom may have and no parameter of a controller's model describes."""
+"""Structural mismatch: differences of a phantom that no parameter of a controller's model describes."""
 
 from collections.abc import Iterator
 from typing import Annotated
@@ -18,26 +18,26 @@ class HiddenLayer(Section):
     """Section `phantom.structure.hidden_layer`: a layer of another modulus that the scenario does not have."""
 
     top_mm: NonNegative
-    """Depth at which it begins."""
+    """Depth of the hidden layer's upper boundary."""
     thickness_mm: Positive
-    """Thickness; layer boundaries may lie in it."""
+    """Thickness of the hidden layer; it may cross layer boundaries."""
     modulus_factor: Positive
-    """Factor on μ of the tissue that it is in."""
+    """Factor on the μ of the tissue that it replaces."""
 
 
 class Structure(Section):
-    """Section `phantom.structure`: left out, the phantom has the scenario's structure."""
+    """Section `phantom.structure`: differences of the phantom that no parameter of the model describes."""
 
     alpha: Alpha | None = None
-    """α of the phantom's Ogden law, in all layers."""
+    """α of the phantom's Ogden law, in all layers. Not set: that of each layer."""
     compression_length_factor: Positive = 1.0
-    """Factor on h of all layers."""
+    """Factor on the compression length h of all layers."""
     bevel_length_factor: Positive = 1.0
-    """Factor on the length of the bevel."""
+    """Factor on the length ℓ_b of the bevel."""
     guide_shift_mm: Annotated[float, Field(ge=-LARGEST, le=LARGEST)] = 0.0
-    """Distance of the guide along the axis from its position in the scenario, positive towards the skin."""
+    """Shift of the guide along the insertion axis from its position in the scenario, positive towards the skin."""
     hidden_layer: HiddenLayer | None = None
-    """Left out, there is none."""
+    """A layer that the scenario does not have. Not set: there is none."""
 
 
 def structure_problems(needle: Needle, setup: Setup, structure: Structure) -> Iterator[Problem]:

@@ -1,4 +1,4 @@
-"""The tissue: layers from the skin down, and the contact points that the needle leaves in them."""
+"""The tissue: layers from the skin down, and the contact points between them and the needle."""
 
 from typing import Annotated
 
@@ -7,12 +7,12 @@ from pydantic import AfterValidator
 from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, Title
 
 LARGEST_BEVEL = 0.7
-"""Bevel offset over compression length that a scenario stays below: the stretch 1 − b/h of a bevel that is held
-sideways is then above the floor stretch 0.3 of the law."""
+"""Upper bound of bevel offset over compression length in a scenario: the stretch 1 − b/h of a bevel that is held
+laterally is then above the floor stretch 0.3 of the law."""
 MOST_BEVEL = 0.699
-"""The most of it that is drawn or fitted."""
+"""Largest value of the same ratio that is drawn or fitted."""
 
-# Between them the law's 0.3^(−α/2 − 1), at the floor stretch, and 2μ/α² stay clear of overflow and rounding.
+# Between these bounds 0.3^(−α/2 − 1), the law at its floor stretch, and 2μ/α² neither overflow nor lose digits.
 _ALPHA_SMALLEST, _ALPHA_LARGEST = 0.01, 100.0
 
 
@@ -33,17 +33,17 @@ class Layer(Section):
     name: Title = "tissue"
     """Name in tables and figures."""
     thickness_mm: Positive | None = None
-    """Thickness. The last layer goes on: it needs none, and one that is given is not used."""
+    """Thickness, required for every layer but the last, which has no lower end: a thickness given for it is ignored."""
     shear_modulus_kpa: Positive
-    """μ of the Ogden law."""
+    """μ, shear modulus of the Ogden law."""
     alpha: Alpha
-    """α of the Ogden law."""
+    """α, exponent of the Ogden law."""
     compression_length_mm: Positive
-    """h, over which a displacement u of the needle compresses the tissue: stretch 1 − |u|/h."""
+    """h, length of tissue that a lateral displacement u of the needle compresses: stretch 1 − |u|/h."""
     engaged_width_mm: Positive
-    """w, width of the tissue that the needle takes along."""
+    """w, width of the tissue that the needle displaces."""
     energy_weight: NonNegative = 1.0
-    """w_c, weight of this layer in the strain energy W of a plan."""
+    """w_c, weight of this layer in the strain energy W."""
 
     @property
     def shear_modulus(self) -> float:
@@ -52,7 +52,7 @@ class Layer(Section):
 
 
 class Contact(Section):
-    """Section `contact`."""
+    """Section `contact`: the contact points of the controller's model."""
 
     spacing_mm: Positive = 1.0
-    """Δ, depth between contact points."""
+    """Δ, spacing of the contact points along the depth."""
