@@ -1,4 +1,4 @@
-"""What crosses rooms: frozen records of commands, measurements, plans and insertions. Units are mm, N, mJ, rad, s."""
+"""Frozen records that all rooms share: commands, measurements, plans and insertions. Units are mm, N, mJ, rad, s."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,27 +18,27 @@ Floats = NDArray[np.float64]
 Pose = tuple[float, float, float]
 """x (mm), y (mm), slope angle (rad)."""
 Command = tuple[float, float, float, float, int]
-"""db_x, db_y (mm), db_theta (rad), dg_y (mm), flip (−1, or +1 to turn the bevel)."""
+"""db_x, db_y (mm), db_theta (rad), dg_y (mm), flip (−1, or +1 to roll the bevel by half a turn)."""
 
 
 Point = tuple[float, float, float]
 """x, y, z (mm)."""
 Quaternion = tuple[float, float, float, float]
-"""Unit quaternion w, x, y, z: turns the sensor's frame into the tracker's. The sensor's z axis is the needle's."""
+"""Unit quaternion w, x, y, z: rotation from the sensor's to the tracker's frame. The sensor's z axis is the needle's."""
 
 _MAKE_ONE = "make one with flexneedle.plan or flexneedle.insert"
 _GIVE_ONE = "give one with dataclasses.replace(record, scenario=scenario)"
 
 VISIBLE = "ok"
-"""Status of a sensor that the tracker sees, and of a tracker that sends frames."""
+"""Status of a sensor that the tracker measures, and of a tracker that sends frames."""
 
 
 @dataclass(frozen=True)
 class SensorReading:
-    """One sensor in one frame of a tracker, in the tracker's frame; what it does not know is None.
+    """One sensor in one frame of a tracker, in the tracker's coordinates; values that are not known are None.
 
-    indicator: how far the two coils of a 6-DOF sensor disagree (paper, section IV-B); 5-DOF sensors may have one, too.
-    status: VISIBLE, or in a few words why there is no position.
+    indicator: disagreement of the two coils of a 6-DOF sensor (paper, section IV-B); 5-DOF sensors may have one, too.
+    status: VISIBLE, or the reason in a few words why there is no position.
     """
 
     position: Point | None
@@ -48,15 +48,15 @@ class SensorReading:
 
 
 def is_reference(sensor: str) -> bool:
-    """Whether a sensor is one that stands still around the workspace, by its name: ref1, ref2, reference, …"""
+    """Whether a sensor is a fixed reference beside the workspace, by its name: ref1, ref2, reference, …"""
     return sensor.lower().startswith("ref")
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What a tracker saw at one time (s, on the clock of the run): readings by name of the sensor, such as "tip".
+    """All sensors at one time (s, on the clock of the run): readings by name of the sensor, such as "tip".
 
-    number: the tracker's own count of frames; it goes on while frames are lost.
+    number: the tracker's own count of frames, lost ones included.
     """
 
     time: float
@@ -73,9 +73,9 @@ class Frame:
 
 @dataclass(frozen=True)
 class Measurement:
-    """The tip in one frame: time it was taken (s); x, y in the plane and z out of it (mm), None where it was not seen.
+    """The tip in one frame: time of measurement (s); x, y in the plane and z out of it (mm), None if not measured.
 
-    frame: what the tracker said, for those who judge it; None if there is no more than the tip.
+    frame: all sensors of the tracker, for the monitor; None if there is only the tip.
     """
 
     time: float
@@ -115,7 +115,7 @@ class Plan:
 
     @property
     def tip_mm(self) -> tuple[float, float]:
-        """Place of the tip at the end."""
+        """Position of the tip at the end."""
         return float(self.tips[-1, 0]), float(self.tips[-1, 1])
 
     @property
@@ -135,7 +135,7 @@ class Plan:
 
     @property
     def entry_angle(self) -> float:
-        """Slope angle (rad) of the planned tip as it meets the skin; NaN if it never does."""
+        """Slope angle (rad) of the planned tip at the skin; NaN if it does not reach the skin."""
         depth, angle = self.tips[:, 0], self.tips[:, 2]
         inside = np.flatnonzero(depth >= 0.0)
         if len(inside) == 0:
@@ -146,7 +146,7 @@ class Plan:
 
     @property
     def summary(self) -> str:
-        """One line: how near the plan comes, and which limit binds if that is not near enough."""
+        """One line: distance of the plan's end from the target, and the limit that binds if it misses."""
         binding = f", limited by {self.limit}" if self.limit else ""
         if self.reached:
             return f"reaches the target to {self.error_mm:.3f} mm{binding}"
@@ -154,7 +154,7 @@ class Plan:
 
     @property
     def flips(self) -> int:
-        """Bevel turns while inserting; the bevel at the start is set before and costs none."""
+        """Bevel rolls during the insertion; the side at the start is set beforehand and is not counted."""
         return int(np.count_nonzero(self.controls[:, 4] > 0.0))
 
     def __repr__(self) -> str:
@@ -164,7 +164,7 @@ class Plan:
 
 
 class VerdictKind(StrEnum):
-    """What a check of a measurement, or of the field that it was taken in, found."""
+    """Result of a check of a measurement, or of the field in which it was taken."""
 
     OK = "ok"
     MISSING = "missing"
@@ -181,14 +181,14 @@ class VerdictKind(StrEnum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a check found, and why: the value and its limit. Only one of kind OK has no reason."""
+    """Result of a check, and its reason: the value and its limit. Only one of kind OK has no reason."""
 
     kind: VerdictKind = VerdictKind.OK
     reason: str = ""
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether the check passed."""
         return self.kind is VerdictKind.OK
 
     def __str__(self) -> str:
@@ -199,12 +199,12 @@ OK = Verdict()
 
 
 class Action(StrEnum):
-    """What the needle did in a control period."""
+    """Action of the needle in a control period."""
 
-    MEASURE = "measure"  # it waited for the first readings
+    MEASURE = "measure"  # waited for the first readings
     MOVE = "move"
-    REST = "rest"  # it waited for readings of where it is
-    HOLD = "hold"  # it was held: by the verdict on its readings, or since no path leads to the target
+    REST = "rest"  # waited at rest for late readings
+    HOLD = "hold"  # held: readings rejected, or no path to the target
 
 
 class Outcome(StrEnum):
@@ -219,7 +219,7 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class CheckedMeasurement:
-    """A reading of the tracker, and "ok" or why it was rejected."""
+    """A reading of the tracker and its verdict: "ok", or why it was rejected."""
 
     sample: Measurement
     verdict: Verdict
@@ -227,7 +227,7 @@ class CheckedMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class Period:
-    """One control period. `true_*` is the virtual phantom's, None on a rig; the controller never sees it."""
+    """One control period. `true_*` is the virtual phantom's, unknown to the controller; None on a rig."""
 
     index: int
     time: float  # end of the period (s), simulated or of the rig
@@ -242,23 +242,23 @@ class Period:
     guide: float
     bevel: int
     strain_energy: float  # of the estimate (mJ)
-    tip_load: float  # what the observer adds at the tip (N)
+    tip_load: float  # lateral force that the observer adds at the tip (N)
     path: Pose  # planned pose at the estimated tip's depth
     cost: float  # of the chosen command, as predicted
     spread: float  # standard deviation left in the first guide step (mm)
     action: Action
-    decision: str  # why the bevel was rolled or kept, or why the needle was held
+    decision: str  # reason why the bevel was rolled or kept, or the needle held
     true_tip: Pose | None
     true_strain_energy: float | None
     durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
-    converged: bool = True  # the model's solve of this period, and all of the virtual phantom's so far
-    true_stretch: float | None = None  # smallest stretch λ of the true tissue so far
+    converged: bool = True  # the model's solve of this period, and all of the virtual phantom's up to it
+    true_stretch: float | None = None  # smallest stretch λ that the true tissue has reached
     miss: float = float("nan")  # lateral, predicted at the target (mm), NaN: not predicted
     miss_sd: float = float("nan")  # its standard deviation (mm)
-    warning: str = ""  # that the insertion is likely to miss
+    warning: str = ""  # of a likely miss
     readings: tuple[
         CheckedMeasurement, ...
-    ] = ()  # all that came in the period, oldest first; `sample` is the newest
+    ] = ()  # all that arrived in the period, oldest first; `sample` is the newest
 
     def __repr__(self) -> str:
         at = f"{self.time:.2f} s: {self.action}, estimated tip {_mm(self.estimate)}"
@@ -293,23 +293,23 @@ class Insertion:
 
     @property
     def residual_mm(self) -> float:
-        """The same by the tracker's last good sample, as the paper reports it; NaN without one."""
+        """The same distance from the tracker's last good sample, as the paper reports it; NaN without one."""
         good = [period.sample for period in self.periods if period.verdict.ok]
         return _distance((good[-1].x, good[-1].y) if good else None, self.target)
 
     @property
     def flips(self) -> int:
-        """Bevel turns as applied."""
+        """Bevel rolls as applied."""
         return sum(period.applied[4] > 0 for period in self.periods)
 
     @property
     def warning(self) -> str:
-        """The first warning on the way, empty without one."""
+        """The first warning of the insertion, empty without one."""
         return next((period.warning for period in self.periods if period.warning), "")
 
     @property
     def held_s(self) -> float:
-        """For how long (s) the needle was held."""
+        """Total time (s) for which the needle was held."""
         ends = [0.0, *(period.time for period in self.periods)]
         spans = zip(self.periods, pairwise(ends), strict=True)
         return sum((end - begin for period, (begin, end) in spans if period.action is Action.HOLD), 0.0)

@@ -1,4 +1,4 @@
-"""Simulators with learnt constants: a bent needle in closed form, other tissue, and insertions carried out again."""
+"""Simulators with estimated constants: a bent needle in closed form, other tissue, and insertions carried out again."""
 
 import pickle
 
@@ -17,15 +17,15 @@ STIFFNESS = PHANTOM.needle.bending_stiffness
 LENGTH = PHANTOM.needle.length_mm
 
 
-def learnt(stiffness=(1.0, 1.0), shift=None, **others):
-    """What is believed of the tissue, no boundary displaced if nothing is said about it."""
+def adaptation(stiffness=(1.0, 1.0), shift=None, **others):
+    """Estimated constants of the tissue, by default without a displaced boundary."""
     still = np.zeros(len(stiffness) - 1)
     return Adaptation(still if shift is None else np.array(shift), np.array(stiffness), **others)
 
 
 def bent(scenario, bend, bevel=1):
     """The needle at the start, with its natural bend."""
-    simulator = Simulator(scenario, threads=1).adapted(learnt(bend=bend))
+    simulator = Simulator(scenario, threads=1).adapted(adaptation(bend=bend))
     return simulator, simulator.step(simulator.start(bevel), Control())
 
 
@@ -34,7 +34,7 @@ def bent(scenario, bend, bevel=1):
 
 @pytest.mark.parametrize("bend", [0.5, -1.2])
 @pytest.mark.parametrize("bevel", [1, -1])
-def test_a_free_needle_is_an_arc_that_turns_with_the_bevel(bend, bevel):
+def test_a_free_needle_is_an_arc_that_rolls_with_the_bevel(bend, bevel):
     """y = ½κx², κ = 2w/L², in every node, unstrained; shortened by ½∫y'² = κ²L³/6."""
     _, state = bent(BARE, bend, bevel)
     kappa = bevel * 2.0 * bend / LENGTH**2
@@ -48,10 +48,10 @@ def test_a_free_needle_is_an_arc_that_turns_with_the_bevel(bend, bevel):
     assert state.converged
 
 
-def test_a_turn_of_the_bevel_mirrors_the_free_needle():
+def test_a_roll_of_the_bevel_mirrors_the_free_needle():
     simulator, state = bent(BARE, 0.7)
-    turned = simulator.step(state, Control(flip=True))
-    np.testing.assert_allclose(turned.nodes, state.nodes * [1.0, -1.0, -1.0], atol=1e-10)
+    rolled = simulator.step(state, Control(flip=True))
+    np.testing.assert_allclose(rolled.nodes, state.nodes * [1.0, -1.0, -1.0], atol=1e-10)
 
 
 def test_bend_and_end_load_of_a_cantilever_add_up():
@@ -94,7 +94,7 @@ def test_a_bent_end_in_tissue_is_the_beam_on_springs_with_an_end_moment():
         simulator = Simulator(scenario, threads=1)
         state = simulator.step(simulator.start(), Control(db_x=depth + 1.0))
         length = scenario.needle.length_mm
-        state = simulator.adapted(learnt((1.0,), bend=0.5 * kappa * length**2)).step(state, Control())
+        state = simulator.adapted(adaptation((1.0,), bend=0.5 * kappa * length**2)).step(state, Control())
         errors.append(
             [
                 state.tip[1] / (2.0 * EI * kappa * beta**2 / FOUNDATION) - 1.0,
@@ -107,8 +107,8 @@ def test_a_bent_end_in_tissue_is_the_beam_on_springs_with_an_end_moment():
 
 
 def test_bevel_and_bend_mirror_together():
-    """Through the skin and into tissue, with guide motion and a turn."""
-    here = Simulator(PHANTOM, threads=1).adapted(learnt((1.3, 0.8), (1.6,), bevel=1.4, bend=0.6))
+    """Through the skin and into tissue, with guide motion and a roll."""
+    here = Simulator(PHANTOM, threads=1).adapted(adaptation((1.3, 0.8), (1.6,), bevel=1.4, bend=0.6))
     states = {}
     for side in (1, -1):
         state = here.start(side)
@@ -130,7 +130,7 @@ def test_factors_on_modulus_and_bevel_are_those_of_another_scenario():
             "needle.bevel.offset_mm": 4.0 * 0.4,
         }
     )  # fmt: skip
-    adapted = Simulator(PHANTOM, threads=1).adapted(learnt((1.7, 0.6), bevel=0.4))
+    adapted = Simulator(PHANTOM, threads=1).adapted(adaptation((1.7, 0.6), bevel=0.4))
     expected = Simulator(other, threads=1)
     one, two = insert_to(adapted, 27.0), insert_to(expected, 27.0)
     for control in (Control(db_x=1.0, dg_y=0.3, flip=True), Control(db_x=0.4, dg_y=-0.2)):
@@ -150,8 +150,8 @@ def agree(one, two, atol=1e-9):
     assert one.strain_energy == pytest.approx(two.strain_energy, rel=1e-7)
 
 
-def turned(state, simulator):
-    """A few steps on, with a turn and guide motion."""
+def rolled(state, simulator):
+    """A few steps on, with a roll and guide motion."""
     for control in (Control(db_x=1.0, dg_y=0.3, flip=True), Control(db_x=0.4, dg_y=-0.2), Control(db_x=1.0)):
         state = simulator.step(state, control)
     return state
@@ -159,30 +159,30 @@ def turned(state, simulator):
 
 @pytest.mark.parametrize("shift", [3.0, -2.0])
 def test_a_displaced_boundary_is_that_of_another_scenario(shift):
-    """By whole intervals, so that the contact points of both stand at the same places."""
+    """By whole intervals, so that the contact points of both are at the same depths."""
     other = Simulator(PHANTOM.with_values({"tissue.0.thickness_mm": 20.0 + shift}), threads=1)
-    adapted = Simulator(PHANTOM, threads=1).adapted(learnt(shift=(shift,)))
-    agree(turned(insert_to(adapted, 27.0), adapted), turned(insert_to(other, 27.0), other))
+    adapted = Simulator(PHANTOM, threads=1).adapted(adaptation(shift=(shift,)))
+    agree(rolled(insert_to(adapted, 27.0), adapted), rolled(insert_to(other, 27.0), other))
 
 
 def test_a_boundary_displaced_by_part_of_an_interval_is_nearly_that_of_another_scenario():
     """There the interval is divided: a hundredth of what the shift does."""
     other = Simulator(PHANTOM.with_values({"tissue.0.thickness_mm": 21.4}), threads=1)
     simulator = Simulator(PHANTOM, threads=1)
-    adapted = simulator.adapted(learnt(shift=(1.4,)))
-    ends = [turned(insert_to(one, 35.0), one).tip[1] for one in (adapted, other, simulator)]
+    adapted = simulator.adapted(adaptation(shift=(1.4,)))
+    ends = [rolled(insert_to(one, 35.0), one).tip[1] for one in (adapted, other, simulator)]
     assert abs(ends[2] - ends[1]) > 5e-3
     assert abs(ends[0] - ends[1]) < 0.02 * abs(ends[2] - ends[1])
 
 
 def test_a_boundary_past_the_skin_leaves_the_layer_below_alone():
-    adapted = Simulator(PHANTOM, threads=1).adapted(learnt((5.0, 1.0), (-30.0,)))
+    adapted = Simulator(PHANTOM, threads=1).adapted(adaptation((5.0, 1.0), (-30.0,)))
     other = Simulator(PHANTOM.with_values({"tissue.0.shear_modulus_kpa": 3.63}), threads=1)
-    agree(turned(insert_to(adapted, 27.0), adapted), turned(insert_to(other, 27.0), other))
+    agree(rolled(insert_to(adapted, 27.0), adapted), rolled(insert_to(other, 27.0), other))
 
 
 def test_cells_along_the_depth_are_the_layers_of_another_scenario():
-    factors = (1.5, 0.6, 1.2, 0.4, 1.7, 0.9, 1.3, 0.8, 1.1)  # of 4 mm each, the last goes on
+    factors = (1.5, 0.6, 1.2, 0.4, 1.7, 0.9, 1.3, 0.8, 1.1)  # of 4 mm each, the last without a lower end
     layers = PHANTOM.values()["tissue"]
     cells = [
         {**layers[k >= 5], "name": str(k), "thickness_mm": 4.0,
@@ -190,16 +190,16 @@ def test_cells_along_the_depth_are_the_layers_of_another_scenario():
         for k, factor in enumerate(factors)
     ]  # fmt: skip
     other = Simulator(PHANTOM.with_values({"tissue": cells}), threads=1)
-    adapted = Simulator(PHANTOM, threads=1).adapted(learnt(cell=4.0, variation=np.array(factors)))
-    agree(turned(insert_to(adapted, 37.0), adapted), turned(insert_to(other, 37.0), other))
+    adapted = Simulator(PHANTOM, threads=1).adapted(adaptation(cell=4.0, variation=np.array(factors)))
+    agree(rolled(insert_to(adapted, 37.0), adapted), rolled(insert_to(other, 37.0), other))
 
 
 @pytest.mark.parametrize("cell", [1.0, 2.5, 7.0])
 def test_factors_of_one_and_no_bend_are_the_simulator_itself(cell):
     """Through the boundary, to 1e-12."""
     simulator = Simulator(PHANTOM, threads=1)
-    same = simulator.adapted(learnt(cell=cell, variation=np.ones(30)))
-    one, two = (turned(insert_to(by, 22.0), by) for by in (simulator, same))
+    same = simulator.adapted(adaptation(cell=cell, variation=np.ones(30)))
+    one, two = (rolled(insert_to(by, 22.0), by) for by in (simulator, same))
     np.testing.assert_allclose(one.nodes, two.nodes, atol=1e-12, rtol=1e-12)
     np.testing.assert_allclose(one.scalars, two.scalars, atol=1e-11, rtol=1e-12)
     assert one.strain_energy == pytest.approx(two.strain_energy, rel=1e-12)
@@ -208,7 +208,7 @@ def test_factors_of_one_and_no_bend_are_the_simulator_itself(cell):
 def test_adapting_leaves_the_simulator_as_it_was():
     simulator = Simulator(PHANTOM, threads=2)
     before = insert_to(simulator, 12.0)
-    assert simulator.adapted(learnt((3.0, 3.0), (1.0,), bevel=0.0, bend=2.0)).threads == 2
+    assert simulator.adapted(adaptation((3.0, 3.0), (1.0,), bevel=0.0, bend=2.0)).threads == 2
     assert insert_to(simulator, 12.0) == before
 
 
@@ -228,8 +228,10 @@ def test_a_replay_is_repeated_steps_bit_for_bit(bend):
     """From the start and from the midst."""
     simulator, rows = Simulator(PHANTOM, threads=1), rows_of(80)
     assert (rows[:, 4] > 0).sum() > 3
-    believed = learnt((1.2, 0.7), (1.3,), cell=2.5, variation=np.linspace(0.5, 1.5, 12), bevel=1.4, bend=bend)
-    adapted = simulator.adapted(believed)
+    estimated = adaptation(
+        (1.2, 0.7), (1.3,), cell=2.5, variation=np.linspace(0.5, 1.5, 12), bevel=1.4, bend=bend
+    )
+    adapted = simulator.adapted(estimated)
     state = simulator.start().with_estimate(base_y=0.3, base_turn=-1e-3)
     for first, last in ((0, 50), (50, 80)):
         after, tips = adapted.replay(state, rows[first:last])
@@ -263,7 +265,7 @@ def test_a_replay_takes_steps_longer_than_a_command():
 
 def test_a_pickled_simulator_keeps_what_it_learnt():
     """And its threads, after they were used."""
-    simulator = Simulator(PHANTOM, threads=2).adapted(learnt((1.5, 0.5), (2.2,), bevel=1.3, bend=0.4))
+    simulator = Simulator(PHANTOM, threads=2).adapted(adaptation((1.5, 0.5), (2.2,), bevel=1.3, bend=0.4))
     state = insert_to(simulator, 10.0)
     rows = np.tile(rows_of(30), (16, 1, 1))
     tips = simulator.rollout(state, rows).tips

@@ -18,12 +18,12 @@ def state():
     return repeat(SIMULATOR, insert_to(SIMULATOR, 20.0), Control(db_x=1.0, dg_y=0.1), 10)[-1]
 
 
-@pytest.mark.parametrize("aside", [-0.5, 0.0, 1e-3, 0.8])
-def test_tip_is_held_where_it_was_measured(state, aside):
+@pytest.mark.parametrize("offset", [-0.5, 0.0, 1e-3, 0.8])
+def test_tip_is_held_where_it_was_measured(state, offset):
     """y exactly; x is rigid, and what it lacks is returned."""
     x, y = state.tip[:2]
-    held, innovation = SIMULATOR.assimilate(state, (x + 0.25, y + aside))
-    assert held.tip[1] == y + aside
+    held, innovation = SIMULATOR.assimilate(state, (x + 0.25, y + offset))
+    assert held.tip[1] == y + offset
     assert innovation == x + 0.25 - held.tip[0]
     assert held.converged
 
@@ -37,16 +37,16 @@ def test_measurement_that_agrees_changes_nothing(state):
 
 
 def test_reaction_is_the_load_that_the_model_lacks(state):
-    """Believed as a tip load, the needle stays where it was held without being held."""
+    """With the reaction as a tip load, the needle stays where it was held without being held."""
     x, y, _ = state.tip
     held, slide = SIMULATOR.assimilate(state, (x, y + 0.4))
     assert held.reactions.tip_force > 1e-3
     assert state.reactions.tip_force == 0.0
-    believed = held.with_estimate(tip_load=held.reactions.tip_force)
-    again, innovation = SIMULATOR.assimilate(believed, (x, y + 0.4))
+    loaded = held.with_estimate(tip_load=held.reactions.tip_force)
+    again, innovation = SIMULATOR.assimilate(loaded, (x, y + 0.4))
     assert again.reactions.tip_force == pytest.approx(0.0, abs=1e-8)
     assert innovation == pytest.approx(slide, abs=1e-5)
-    assert SIMULATOR.step(believed, Control()).tip[1] == pytest.approx(y + 0.4, abs=2e-3)
+    assert SIMULATOR.step(loaded, Control()).tip[1] == pytest.approx(y + 0.4, abs=2e-3)
     assert SIMULATOR.step(held, Control()).tip[1] < y + 0.3
 
 
@@ -60,7 +60,7 @@ def test_channel_follows_the_measurement(state):
 
 @pytest.mark.parametrize("x", [-80.0, -20.0, 3.2, 10.5, 25.0])
 def test_measured_points_lie_on_the_mesh(state, x):
-    """Contacts next to a point that is held aside follow it; one far aside pulls the needle."""
+    """Contacts next to a laterally displaced point follow it; one far from it pulls the needle."""
     curve = CubicHermiteSpline(*state.nodes.T)
     y = float(curve(x)) + 0.3
     held = SIMULATOR.assimilate(state, state.tip[:2], [(x, y)]).state

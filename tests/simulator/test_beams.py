@@ -75,7 +75,7 @@ def test_without_tissue_effect_the_needle_is_a_free_beam():
 
 
 def test_endless_beam_on_springs_converges_at_fourth_order():
-    """A needle held aside in the middle of 40/β of tissue: shape, and the load that the springs take."""
+    """A needle held at a lateral offset in the middle of 40/β of tissue: shape, and the load that the springs take."""
     depth, y0, beta = 400.0, 1e-3, 1 / LENGTH_MM
     shape, load = [], []
     for spacing in (8.0, 4.0, 2.0, 1.0):

@@ -19,7 +19,7 @@ def straight_push(scenario, depth, step):
 
 
 def push_rows(scenario, depth, step, flip_at=None):
-    """Controls (1, m, 5) of that insertion; the bevel turns with the step that starts at `flip_at`."""
+    """Controls (1, m, 5) of that insertion; the bevel rolls with the step that starts at `flip_at`."""
     way = depth + scenario.setup.tip_to_skin_mm
     ends = np.append(np.arange(way, 1e-9, -step), 0.0)[::-1]
     rows = np.zeros((1, ends.size - 1, 5))
@@ -57,14 +57,14 @@ def test_steady_curvature_is_proportional_to_the_offset_at_small_strain():
 @pytest.mark.parametrize(("flip_at", "expected"), [(None, 2.004), (15.0, -1.354)])
 def test_bevel_effect_at_45_mm_is_independent_of_step_and_spacing(flip_at, expected):
     """Within 0.01 mm for steps of 0.1 to 1 mm and spacings of 0.5 to 2 mm; the figures are pinned."""
-    aside = []
+    lateral = []
     for spacing in SPACINGS_MM:
         simulator = Simulator(PHANTOM.with_values({"contact.spacing_mm": spacing}))
         for step in STEPS_MM:
             rows = push_rows(PHANTOM, 45.0, step, flip_at)
-            aside.append(simulator.rollout(simulator.start(), rows).tips[0, -1, 1])
-    assert np.ptp(aside) < 0.01
-    assert aside[0] == pytest.approx(expected, abs=0.005)
+            lateral.append(simulator.rollout(simulator.start(), rows).tips[0, -1, 1])
+    assert np.ptp(lateral) < 0.01
+    assert lateral[0] == pytest.approx(expected, abs=0.005)
 
 
 @pytest.mark.parametrize("depth", [44.0, 44.5, 45.5])
@@ -81,9 +81,9 @@ def test_flip_without_insertion_changes_nothing_but_the_bevel():
     """In tissue at rest, when pulling back, and twice before a push."""
     simulator = Simulator(PHANTOM)
     state = insert_to(simulator, 20.0)
-    turned = simulator.step(state, Control(flip=True))
-    assert turned.bevel == -state.bevel == -1
-    np.testing.assert_allclose(turned.nodes, state.nodes, atol=1e-6)
+    rolled = simulator.step(state, Control(flip=True))
+    assert rolled.bevel == -state.bevel == -1
+    np.testing.assert_allclose(rolled.nodes, state.nodes, atol=1e-6)
     back = Control(db_x=-0.5)
     still, flipped = simulator.step(state, back), simulator.step(state, Control(db_x=-0.5, flip=True))
     assert flipped.bevel == -still.bevel
@@ -95,14 +95,14 @@ def test_flip_without_insertion_changes_nothing_but_the_bevel():
 
 
 def test_flip_bends_the_path_to_the_other_side():
-    """Only with insertion, and from the tangent where it was turned."""
+    """Only with insertion, and from the tangent where it was rolled."""
     simulator = Simulator(PHANTOM)
     state = insert_to(simulator, 20.0)
     on = repeat(simulator, state, Control(db_x=1.0), 15)[-1]
     first = simulator.step(state, Control(db_x=1.0, flip=True))
-    turned = repeat(simulator, first, Control(db_x=1.0), 14)[-1]
-    assert turned.tip[2] < state.tip[2] < on.tip[2]
-    assert turned.tip[1] < on.tip[1] - 0.3
+    rolled = repeat(simulator, first, Control(db_x=1.0), 14)[-1]
+    assert rolled.tip[2] < state.tip[2] < on.tip[2]
+    assert rolled.tip[1] < on.tip[1] - 0.3
 
 
 def test_symmetric_tip_goes_straight():
@@ -117,12 +117,12 @@ def test_symmetric_tip_goes_straight():
 def test_bevel_effect_scales_with_the_tissue_at_small_strain():
     """A softer tissue deflects the tip less, to first order in proportion where the needle is much stiffer."""
 
-    def aside(factor):
+    def lateral(factor):
         values = {f"tissue.{i}.shear_modulus_kpa": 1e-3 * factor for i in (0, 1)}
         return straight_push(PHANTOM.with_values(values), 30.0, 1.0)[-1, 1]
 
-    assert aside(2.0) == pytest.approx(2 * aside(1.0), rel=2e-3)
-    assert aside(1.0) > 1e-5
+    assert lateral(2.0) == pytest.approx(2 * lateral(1.0), rel=2e-3)
+    assert lateral(1.0) > 1e-5
 
 
 def test_step_across_the_skin_starts_the_spring_on_the_tips_own_line():

@@ -75,12 +75,12 @@ def test_from_wall_to_wall_the_needle_follows_late():
 def test_a_flip_takes_a_bent_needle_from_one_wall_to_the_other():
     simulator = loose(0.05, bend=1.0)
     state = simulator.step(simulator.start(), Control())
-    turned = simulator.step(state, Control(flip=True))
+    rolled = simulator.step(state, Control(flip=True))
     assert state.converged
-    assert turned.converged
+    assert rolled.converged
     assert off_centre(state) == pytest.approx(0.05)
-    assert off_centre(turned) == pytest.approx(-0.05)
-    assert turned.reactions.guide_force == pytest.approx(-state.reactions.guide_force, rel=1e-9)
+    assert off_centre(rolled) == pytest.approx(-0.05)
+    assert rolled.reactions.guide_force == pytest.approx(-state.reactions.guide_force, rel=1e-9)
 
 
 @settings(deadline=None, derandomize=True, max_examples=40)

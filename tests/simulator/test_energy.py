@@ -1,6 +1,6 @@
 """Work and energy: what base, guide, held tip and the slide along the channel do is what is stored.
 
-The needle slides while it bends (equation 5), through a guide that stands still, and that slide does work on
+The needle slides while it bends (equation 5), through a guide at rest, and that slide does work on
 whatever the tip leaves or meets: the spring that fades, the points that lose weight, a held tip that is on a
 slope. It is a 200th of the work for a millimetre or two of lateral motion. It vanishes where the tip is out of
 the bevel's spring and past the growth of the last point, and is counted by `axial_force` where it is not.
@@ -26,7 +26,7 @@ MOVES = {  # base y, base turn, guide y, held tip y: mm and rad in all
 
 
 def withdrawn(by):
-    """A bent needle, the bevel turned on the way, then drawn back without cutting by `by` mm."""
+    """A bent needle, the bevel rolled on the way, then drawn back without cutting by `by` mm."""
     state = insert_to(SIMULATOR, 17.0)
     state = SIMULATOR.step(state, Control(db_x=1.0, flip=True))
     state = repeat(SIMULATOR, state, Control(db_x=1.0, dg_y=0.02), 12)[-1]
@@ -109,7 +109,7 @@ def test_work_with_the_bevels_spring_is_the_energy_stored(name):
 
 
 def test_work_of_drawing_back_is_the_energy_released():
-    """An axial move, through points that lose weight and a spring that fades, with the base moving aside."""
+    """An axial move, through points that lose weight and a spring that fades, with the base moving laterally."""
     errors = []
     for steps in (100, 400):
         lateral, axial, stored = travel(withdrawn(0.4), (2.0, -0.016, -1.4, 0.0), advance=-2.0, steps=steps)
@@ -143,7 +143,7 @@ def test_forces_and_moments_on_the_needle_balance():
     assert turning == pytest.approx(0.0, abs=1e-4)
 
 
-def test_energy_scale_is_that_of_all_tissue_above_a_depth_moved_aside_by_a_millimetre():
+def test_energy_scale_is_that_of_all_tissue_above_a_depth_displaced_by_a_millimetre():
     """20 mm of the first layer and 10 of the second, the density of each from the law; weighted by layer."""
     phantom = load_scenario("phantom").with_values({"tissue.1.energy_weight": 3.0})
     stretch = 1.0 - 1.0 / 20.0

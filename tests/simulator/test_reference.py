@@ -54,7 +54,7 @@ class Pair:
         self.pose = self.reference.hold(self.pose, y, points)
         return innovation
 
-    def believe(self, **corrections):
+    def correct(self, **corrections):
         """Base and load corrected in both."""
         self.state = self.state.with_estimate(**corrections)
         base, load = self.pose.base.copy(), corrections.get("tip_load", self.pose.load)
@@ -84,7 +84,7 @@ def test_a_thousand_random_insertions_agree(hundred):
 
 
 def test_straight_insertion_agrees():
-    """To full depth of the phantom, with a turn of the bevel."""
+    """To full depth of the phantom, with a roll of the bevel."""
     pair = Pair()
     pair.step(48, db_x=1.0)
     pair.step(flip=True)
@@ -93,7 +93,7 @@ def test_straight_insertion_agrees():
 
 
 def test_exit_from_the_skin_and_new_entry_agree():
-    """Half out, on, all out, aside, in again."""
+    """Half out, on, all out, lateral, in again."""
     pair = Pair()
     pair.step(36, db_x=1.0, dg_y=0.05)
     pair.step(4, db_x=-1.0)
@@ -160,13 +160,13 @@ def test_points_measured_among_fresh_cuts_agree():
     assert not found
 
 
-def test_believed_load_and_base_agree():
+def test_corrected_load_and_base_agree():
     """What an observer corrects acts from the next step on."""
     pair = Pair()
     pair.step(20, db_x=1.0)
-    pair.believe(base_y=0.4, base_turn=-3e-3)
+    pair.correct(base_y=0.4, base_turn=-3e-3)
     pair.step(25, db_x=1.0)
-    pair.believe(tip_load=0.004)
+    pair.correct(tip_load=0.004)
     pair.step(8, db_x=1.0)
     assert pair.state.tip_load == 0.004
     assert not pair.too_far()

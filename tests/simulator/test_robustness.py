@@ -1,4 +1,4 @@
-"""A sample of the robustness study, and that the study sees what it looks for."""
+"""A sample of the robustness study, and that the study detects what it tests for."""
 
 import importlib.util
 import json

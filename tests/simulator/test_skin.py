@@ -81,7 +81,7 @@ def test_the_state_is_continuous_in_the_command(before, flip):
 
 
 def test_a_step_below_the_skin_is_that_of_its_parts():
-    """One command of 1 mm from a part's end: the same as four of a quarter, the bevel turned before the first."""
+    """One command of 1 mm from a part's end: the same as four of a quarter, the bevel rolled before the first."""
     simulator = Simulator(PHANTOM, threads=1)
     state = at(simulator, simulator.replay(simulator.start(), [[28.0, 0.0, 0.0, 0.3, -1.0]])[0], 0.5)
     assert state.tip[0] == pytest.approx(0.5, abs=1e-6)

@@ -43,7 +43,7 @@ def test_copies_are_equal_and_go_on_the_same(state, duplicate):
 
 
 def test_states_compare_by_value(state):
-    """A step makes a difference, and so does a belief; other things are not states."""
+    """A step makes a difference, and so does a correction; other things are not states."""
     assert state != SIMULATOR.step(state, Control(db_x=0.1))
     assert state != state.with_estimate(tip_load=1e-3)
     assert SIMULATOR.step(state, ON) == SIMULATOR.step(state, ON)
@@ -225,7 +225,7 @@ def test_travel_is_limited(name, step, travel):
     """To the stroke and the guide's and base's range, in single steps and in a rollout."""
     times = round(travel / abs(step))
     end = repeat(SIMULATOR, SIMULATOR.start(), Control(**{name: step}), times)[-1]
-    with pytest.raises(CommandError, match=rf"{name} = .*in all must be at (most|least) -?{travel:g} mm"):
+    with pytest.raises(CommandError, match=rf"{name} = .*sum of the steps must be at (most|least) -?{travel:g} mm"):
         SIMULATOR.step(end, Control(**{name: step / 100}))
     rows = np.repeat([[Control(**{name: step}).row()]], times + 1, axis=1)
     SIMULATOR.rollout(SIMULATOR.start(), rows[:, :-1])

@@ -16,7 +16,7 @@ _SLACK = 1e-9  # rounding of sums of steps, mm or rad
 
 @dataclass(frozen=True)
 class Control:
-    """One step of base (mm, mm, rad) and guide (mm); `flip` turns the bevel over before the step."""
+    """One step of base (mm, mm, rad) and guide (mm); `flip` rolls the bevel by half a turn before the step."""
 
     db_x: float = 0.0
     db_y: float = 0.0
@@ -55,7 +55,7 @@ class Limits:
     def check(self, moved: Floats, controls: Floats) -> None:
         """Raise CommandError for the first value in `controls` (…, m, 5) that breaks a limit.
 
-        `moved` (4,) is how far each input has gone so far.
+        `moved` (4,) is the sum of the steps of each input before them.
         """
         if not np.isfinite(controls).all():
             self._refuse(controls, ~np.isfinite(controls), "must be a finite number")
@@ -66,9 +66,9 @@ class Limits:
             self._refuse(steps, bad, "must be at most", self.step)
         travel = moved + np.cumsum(steps, axis=-2)
         if (bad := travel > self.travel[:, 1] + _SLACK).any():
-            self._refuse(travel, bad, "steps in all must be at most", self.travel[:, 1])
+            self._refuse(travel, bad, "sum of the steps must be at most", self.travel[:, 1])
         if (bad := travel < self.travel[:, 0] - _SLACK).any():
-            self._refuse(travel, bad, "steps in all must be at least", self.travel[:, 0])
+            self._refuse(travel, bad, "sum of the steps must be at least", self.travel[:, 0])
 
     def _refuse(self, values: Floats, bad: NDArray[np.bool_], rule: str, limit: Floats | None = None) -> None:
         index = tuple(np.argwhere(bad)[0])

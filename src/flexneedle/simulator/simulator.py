@@ -26,7 +26,7 @@ _STEPS_WORTH_A_THREAD = 200
 _CHUNKS_A_THREAD = 4
 _CLOSEST_POINTS_MM = 0.1
 _AHEAD_TOLERANCE_MM = 1e-4  # of rollouts without limits
-_ASIDE_MM = 1.0
+_LATERAL_MM = 1.0
 _ALL_CORES = "leave it out for one per core"
 
 
@@ -51,7 +51,7 @@ class Assimilation(NamedTuple):
 
 
 class Simulator:
-    """The needle of a scenario in its tissue (DESIGN of the model: docs/theory.md).
+    """The needle of a scenario in its tissue (the equations: docs/theory.md).
 
     scenario: also by its name or path, as for `load_scenario`. `threads` is for rollouts (default: all cores that the
     process may use); results do not depend on it. Raises ScenarioError or InputError for what cannot be used.
@@ -73,7 +73,7 @@ class Simulator:
         return f"<Simulator of {self.scenario!r}, threads {self.threads}>"
 
     def compile(self) -> None:
-        """Compile the kernels, or load them from the cache, instead of waiting for it in the first call of each."""
+        """Compile the kernels, or load them from the cache, ahead of the first call of each."""
         state = self.step(self.start(), Control())
         self.rollout(state, np.array([[Control().row()]]))
 
@@ -108,9 +108,9 @@ class Simulator:
         mesh = mesh_of(self._model.nodes, w, count)
         return solved(self.scenario, self._model, s, rest, u, mesh), tips
 
-    def adapted(self, learnt: model.Adaptation) -> "Simulator":
-        """Return this simulator with what an observer has learnt, for states of the same scenario."""
-        return Simulator(self.scenario, self.threads, constants=model.adapted(self._model, learnt))
+    def adapted(self, adaptation: model.Adaptation) -> "Simulator":
+        """Return this simulator with the constants that an observer has estimated, for states of the same scenario."""
+        return Simulator(self.scenario, self.threads, constants=model.adapted(self._model, adaptation))
 
     def check(self, state: State, control: Control) -> None:
         """Raise CommandError, with value and limit, if `control` may not be applied to `state`."""
@@ -121,7 +121,7 @@ class Simulator:
         """Run each of N sequences from `state`; controls (N, m, 5): db_x, db_y, db_theta, dg_y, flip (−1 or +1).
 
         Equal to repeated `step`, bit by bit; CommandError if any value is out of range. Without `limits` a step
-        may be longer than a command, and each is solved to 1e-4 mm only: to look far ahead with little work.
+        may be longer than a command, and each is solved only to 1e-4 mm: for long predictions with little work.
         """
         return Rollout(*self._rollout(state, controls, deflection=False, limits=limits)[:3])
 
@@ -135,9 +135,9 @@ class Simulator:
     ) -> Assimilation:
         """Hold the tip at its measured y, and the needle at further measured (x, y), as essential conditions.
 
-        The last step is solved again, so a contact that it cut lies on the measured path. Axial motion is
+        The last step is solved again, so a contact that it cut is on the measured path. Axial motion is
         rigid: x is not corrected, its innovation is returned. The next step releases the conditions;
-        `state.reactions.tip_force` is what the tip needed beyond `state.tip_load` (N).
+        `state.reactions.tip_force` is the force (N) on the tip beyond `state.tip_load`.
         """
         self._own(state)
         measured = np.array([_point(tip), *map(_point, points)])
@@ -151,12 +151,13 @@ class Simulator:
         return Assimilation(after, float(measured[0, 0] - after.tip[0]))
 
     def energy_scale(self, depth: float) -> float:
-        """Strain energy (mJ) of all tissue down to `depth` (mm) moved aside by 1 mm, weighted by layer: what a plan's
-        energy is compared with.
+        """Strain energy (mJ) of all tissue down to `depth` (mm) displaced laterally by 1 mm, weighted by layer.
+
+        It is the scale of a plan's energy.
         """
         nodes = self._model.nodes
         above = nodes.x < depth
-        stored = displaced_energy(nodes.alpha, nodes.height, nodes.weight * nodes.energy, _ASIDE_MM)
+        stored = displaced_energy(nodes.alpha, nodes.height, nodes.weight * nodes.energy, _LATERAL_MM)
         return float(stored[above & (nodes.kind == model.CONTACT)].sum())
 
     def load(self, path: str | Path) -> State:
@@ -182,7 +183,7 @@ class Simulator:
             others = np.append(fixed, np.delete(x, k))
             if not low < value < high or np.abs(others - value).min() < _CLOSEST_POINTS_MM:
                 rule = (
-                    f"must lie between base and tip ({low:g} to {high:g} mm), "
+                    f"must be between base and tip ({low:g} to {high:g} mm), "
                     f"{_CLOSEST_POINTS_MM} mm or more from them, the guide and other points"
                 )
                 raise CommandError("measured point x", float(value), high, rule)
@@ -243,14 +244,14 @@ def _restored(scenario: Scenario, threads: int, constants: model.Model) -> Simul
 
 
 def _point(values: Sequence[float]) -> tuple[float, float]:
-    """Return (x, y) of a measured point, and nothing else that it could be taken for."""
+    """Return (x, y) of a measured point; CommandError for any other number of coordinates."""
     if len(values) != 2:
         raise CommandError("coordinates of a measured point", len(values), 2, "must be 2, x and y in mm")
     return float(values[0]), float(values[1])
 
 
 def _cores() -> int:
-    """How many cores the process may use, where the system tells."""
+    """Number of cores that the process may use; of all cores where the system does not report that."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

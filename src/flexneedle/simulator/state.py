@@ -26,7 +26,7 @@ _X, _Y, _TURN, _SHEAR, _MOMENT, _FORCE, _ENERGY, _WEIGHTED = range(8)  # rows of
 class Contacts(NamedTuple):
     """Contact points of the cut channel, each (k,), by depth: x, rest_y, y (mm), stretch λ, whether active.
 
-    A point ahead of a tip that was pulled back is not active: it is at rest, y = rest_y and stretch 1.
+    A point ahead of a tip that was pulled back is not active: it is undisplaced, y = rest_y and stretch 1.
     """
 
     x: Floats
@@ -41,7 +41,7 @@ class Contacts(NamedTuple):
 
 
 class Reactions(NamedTuple):
-    """What holds the needle: lateral forces (N) and the clamp's moment (N·mm) on it, 0 where nothing does."""
+    """Reactions on the needle: lateral forces (N) and the clamp's moment (N·mm), 0 where nothing holds it."""
 
     base_force: float
     base_moment: float
@@ -53,7 +53,7 @@ class Reactions(NamedTuple):
 class State:
     """The insertion at one instant. Arrays are read-only; angles in rad, lengths in mm, energies in mJ.
 
-    `scalars` (STATE_SIZE,), `rest` (k,) and `compression` (k,) are what the next step starts from;
+    `scalars` (STATE_SIZE,), `rest` (k,) and `compression` (k,) are the input of the next step;
     `mesh` (8, j) is the solution at the nodes behind the tip, measured points included: x, y, θ, shear, moment,
     force on the needle, stored energy, the same times w_c.
     """
@@ -79,7 +79,7 @@ class State:
 
     @property
     def travel(self) -> Floats:
-        """How far base x, y (mm), base θ (rad) and guide (mm) were commanded since the start, shape (4,)."""
+        """Sum of the commands since the start: base x, y (mm), base θ (rad) and guide (mm), shape (4,)."""
         s = self.scalars
         travel: Floats = s[[nd.BASE_X, nd.BASE_Y, nd.BASE_TURN, nd.GUIDE_Y]]
         travel[:3] -= self.scenario.start_base_x + s[nd.CLAMP_X], s[nd.CLAMP_Y], s[nd.CLAMP_TURN]
@@ -97,7 +97,7 @@ class State:
 
     @property
     def tip_load(self) -> float:
-        """Extra lateral force at the tip (N), what an observer believes the model lacks."""
+        """Additional lateral force at the tip (N), estimated by an observer."""
         return float(self.scalars[nd.TIP_LOAD])
 
     @property
@@ -171,9 +171,9 @@ class State:
         base_turn: float | None = None,
         tip_load: float | None = None,
     ) -> "State":
-        """Return the state with what an observer corrected (mm, rad, N); the next solve takes it up.
+        """Return the state with an observer's corrections (mm, rad, N), which take effect in the next solve.
 
-        A base that stands elsewhere than commanded has not used up its travel.
+        A corrected base position does not count as travel.
         """
         scalars = self.scalars.copy()
         if base_x is not None:
@@ -237,7 +237,7 @@ def mechanics_difference(one: Scenario, other: Scenario) -> str | None:
 
 
 def load_arrays(path: str | Path, scenario: Scenario) -> dict[str, Floats]:
-    """Read what `State.save` wrote; StateError if it is no state or of another scenario, with the differing key."""
+    """Read a file of `State.save`; StateError if it is not one, or of another scenario, with the differing key."""
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}

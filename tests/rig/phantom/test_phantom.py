@@ -151,7 +151,7 @@ def test_a_clamp_that_is_off_by_more_than_the_base_may_travel_is_drawn_all_the_s
     ("command", "told"),
     [
         ((2.0, 0.0, 0.0, 0.0, -1), r"db_x = 2: must be at most 1 mm"),
-        ((-0.5, 0.0, 0.0, 0.0, -1), r"db_x = -0.5: steps in all must be at least 0 mm"),
+        ((-0.5, 0.0, 0.0, 0.0, -1), r"db_x = -0.5: sum of the steps must be at least 0 mm"),
         ((0.0, 0.0, 0.0, 0.6, -1), r"dg_y = 0.6: must be at most 0.5 mm"),
         ((1.0, 0.0, math.nan, 0.0, -1), r"db_theta = nan: must be a finite number"),
     ],

@@ -145,7 +145,7 @@ class PhantomSettings(Section):
     start_angle_sd_mrad: NonNegative = 3.0
     """Standard deviation of the base clamp's slope at the start."""
     start_axial_sd_mm: NonNegative = 1.0
-    """Standard deviation of the position of base and tip along the axis at the start, from errors of needle length, clamp
+    """Standard deviation of the position of base and tip along the axis at the start, from errors of length, clamp
     and skin; the error is at most half of the distance to the skin, to the guide, and of that left at full stroke."""
     youngs_modulus_variation: Annotated[float, Field(ge=0, lt=1)] = 0.05
     """Largest deviation of the needle's Young's modulus, relative to the scenario's, drawn uniformly to either side."""
