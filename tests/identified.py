@@ -22,7 +22,7 @@ QUIET = PHANTOM.with_values(
     }
 )  # fmt: skip
 TIGHT = QUIET.with_values({f"control.adaptive_mpc.clearance{key}_mm": 0.0 for key in ("", "_sd")})
-TURNS = (20, 40, 52)  # moves that turn the bevel, the first in air
+ROLLS = (20, 40, 52)  # moves that roll the bevel, the first in air
 LAYERS = len(PHANTOM.tissue)
 SHIFT = MODULUS + LAYERS
 CELLS = SHIFT + LAYERS - 1
@@ -36,7 +36,7 @@ WAVES = tuple(
 def commands(count):
     """Advance by 1 mm a move; the guide goes here and there."""
     guide = 0.12 * np.sin(0.35 * np.arange(count)) + 0.05
-    return [(1.0, 0.0, 0.0, float(guide[k]), 1 if k in TURNS else -1) for k in range(count)]
+    return [(1.0, 0.0, 0.0, float(guide[k]), 1 if k in ROLLS else -1) for k in range(count)]
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Needle:
             Adaptation(*tissue, self.bevel, self.bend, self.clearance)
         )
 
-    def seen(self, state):
+    def measured(self, state):
         """Tip (x, y) as a tracker measures it."""
         return np.add(state.tip[:2], [0.0, self.run_out * state.bevel])
 
@@ -91,9 +91,9 @@ NEEDLES = {
 
 
 def readings(needle, before, after, start, count, noise, rng):
-    """Of an even move of one second; a bevel turns before its move, and the run-out with it."""
+    """Of an even move of one second; a bevel rolls before its move, and the run-out with it."""
     parts = (np.arange(count) + 1) / count
-    out = needle.seen(after) - after.tip[:2]
+    out = needle.measured(after) - after.tip[:2]
     first, last = before.tip[:2] + out, after.tip[:2] + out
     points = [first + part * (last - first) + rng.normal(0.0, noise, 2) for part in parts]
     return [
@@ -129,7 +129,7 @@ def ahead(estimate, needle, states, scenario=QUIET, steps=8):
         truth = own.step(truth, Control.from_row(row))
         naive = nominal.step(naive, Control.from_row(row))
         estimate = estimate.move(row, 100.0 + k, 101.0 + k)
-    goal = needle.seen(truth)[1]
+    goal = needle.measured(truth)[1]
     return abs(estimate.tip[1] - goal), abs(naive.tip[1] - goal)
 
 
@@ -142,8 +142,8 @@ def off_the_prior(count=55, needle="all"):
     return off_prior, off_prior._readings
 
 
-def learnt_of(parameters):
-    """What the parameters say of tissue and needle."""
+def adaptation_of(parameters):
+    """The model's constants for these parameters."""
     tissue = parameters[SHIFT:CELLS], np.exp(parameters[MODULUS:SHIFT]), 2.5, np.exp(parameters[CELLS:])
     return Adaptation(*tissue, *parameters[[BEVEL, BEND, CLEARANCE]].tolist())
 
@@ -151,7 +151,7 @@ def learnt_of(parameters):
 def stepped(parameters, rows, axial=0.0):
     """States of a needle with these parameters, the start first, moved one step after another."""
     nominal = Simulator(QUIET, 1)
-    simulator = nominal.adapted(learnt_of(parameters))
+    simulator = nominal.adapted(adaptation_of(parameters))
     start = nominal.start()
     base_x = float(start.base[0]) + axial
     state = start.with_estimate(base_x=base_x, base_y=parameters[BASE_Y], base_turn=parameters[BASE_TURN])
@@ -161,10 +161,10 @@ def stepped(parameters, rows, axial=0.0):
     return states
 
 
-def predicted(parameters, rows, seen, axial=0.0):
+def predicted(parameters, rows, means, axial=0.0):
     """Readings of such a needle: at even moves, and on the bevel's side of its axis."""
     states = stepped(parameters, rows, axial)
     y = np.array([state.tip[1] for state in states])
     side = np.array([state.bevel for state in states])
-    ends = y[seen.index + 1]
-    return y[seen.index] + seen.part * (ends - y[seen.index]) + parameters[RUN_OUT] * side[seen.index + 1]
+    ends = y[means.index + 1]
+    return y[means.index] + means.part * (ends - y[means.index]) + parameters[RUN_OUT] * side[means.index + 1]

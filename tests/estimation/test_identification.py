@@ -59,7 +59,7 @@ def test_readings_of_the_scenarios_own_needle_leave_the_prior_mean():
 def test_it_predicts_a_needle_with_other_constants(needle):
     """8 mm on, without a reading; what varies along the depth is known only as far as it is correlated."""
     estimate, states = followed(needle, 70)
-    x, y = needle.seen(states[-1])
+    x, y = needle.measured(states[-1])
     varied = len(needle.variation) > 1
     assert estimate.tip[0] == pytest.approx(x, abs=0.03)
     assert estimate.tip[1] == pytest.approx(y, abs=0.03 if varied else 1e-3)
@@ -74,14 +74,14 @@ def test_it_predicts_a_needle_with_other_constants(needle):
 def test_with_every_derivative_of_now_it_follows_the_tip_closely(name):
     """What is left of the tip's distance otherwise is due to derivatives of a few periods ago."""
     estimate, states = followed(NEEDLES[name], 70)
-    assert estimate.tip[1] == pytest.approx(NEEDLES[name].seen(states[-1])[1], abs=5e-3)
+    assert estimate.tip[1] == pytest.approx(NEEDLES[name].measured(states[-1])[1], abs=5e-3)
 
 
 def test_at_rest_the_tip_is_found_too_with_derivatives_that_are_renewed_alternately():
     """A few periods of readings, no moves."""
     needle = NEEDLES["all"]
     estimate, states = followed(needle, 70)
-    x, y = needle.seen(states[-1]).tolist()
+    x, y = needle.measured(states[-1]).tolist()
     for k in range(8):
         estimate = estimate.move(STILL, 70.0 + k, 71.0 + k).observe([Measurement(71.0 + k, x, y)])
     assert estimate.tip[1] == pytest.approx(y, abs=5e-3)
@@ -147,12 +147,12 @@ def test_in_air_the_wall_that_the_needle_bears_on_is_found():
         base_y, base_turn = rng.normal(0.0, 0.5), rng.normal(0.0, 3e-3)
         needle = Needle(base_y, base_turn, rng.choice([-0.5, 0.5]), rng.choice([-0.1, 0.1]))
         estimate, states = followed(needle, 27, rows=rows)
-        off.append(abs(estimate.tip[1] - needle.seen(states[-1])[1]))
+        off.append(abs(estimate.tip[1] - needle.measured(states[-1])[1]))
     assert max(off) < 5e-3, off
 
 
 def test_a_base_offset_alone_is_told_by_its_lever():
-    """In air the tip goes y = b (1 − lever): what base y and turn do to it together is found, not each."""
+    """In air the tip goes y = b (1 − lever): the effect of base y and base θ together is identified, not each."""
     needle = Needle(base_y=0.5)
     estimate, states = followed(needle, 20)
     np.testing.assert_allclose(estimate.tip, states[-1].tip, atol=2e-3)
@@ -186,7 +186,7 @@ def test_a_tracker_without_jitter_is_trusted_but_for_what_no_parameter_explains(
     estimate, states = followed(NEEDLES["all"], 66, scenario=scenario)
     np.testing.assert_array_equal(estimate.variance(estimate._readings), unexplained(scenario, OWN) ** 2)
     assert estimate.tip[1] == pytest.approx(
-        NEEDLES["all"].seen(states[-1])[1], abs=unexplained(scenario, OWN)
+        NEEDLES["all"].measured(states[-1])[1], abs=unexplained(scenario, OWN)
     )
 
 
@@ -233,7 +233,7 @@ def test_an_error_along_the_axis_is_recovered(base_x):
     needle = Needle(base_x=base_x, base_y=0.2, modulus=(1.3, 0.8))
     estimate, states = followed(needle, 66)
     assert estimate.axial == pytest.approx(base_x, abs=0.01)
-    np.testing.assert_allclose(estimate.tip[:2], needle.seen(states[-1]), atol=0.01)
+    np.testing.assert_allclose(estimate.tip[:2], needle.measured(states[-1]), atol=0.01)
     np.testing.assert_allclose(estimate.state.travel[0], 66.0)
 
 
@@ -272,7 +272,7 @@ def test_idle_periods_are_one_move_and_cost_no_simulation(monkeypatch):
     resting = estimate.move(STILL, 30.0, 31.0)
     assert len(resting.moves) == 31
     np.testing.assert_allclose(resting.tip, estimate.tip, atol=1e-6)
-    resting = resting.observe([Measurement(31.0, *needle.seen(states[-1]).tolist())])
+    resting = resting.observe([Measurement(31.0, *needle.measured(states[-1]).tolist())])
 
     def none(*_):
         raise AssertionError("nothing moves")
@@ -286,7 +286,7 @@ def test_idle_periods_are_one_move_and_cost_no_simulation(monkeypatch):
     assert longer.state is resting.state
     assert (len(longer.moves), longer.tips.shape) == (31, resting.tips.shape)
     assert (longer.moves[-1].begun, longer.moves[-1].ended) == (30.0, 51.0)
-    seen = longer.observe([Measurement(50.0, *needle.seen(states[-1]).tolist())])
-    assert len(seen.moves[-1].samples) == 2
-    assert seen.tip_at(40.5) == pytest.approx(tuple(seen.tip[:2]), abs=1e-6)
-    assert len(seen.move((1.0, 0.0, 0.0, 0.0, -1), 51.0, 52.0).moves) == 32
+    updated = longer.observe([Measurement(50.0, *needle.measured(states[-1]).tolist())])
+    assert len(updated.moves[-1].samples) == 2
+    assert updated.tip_at(40.5) == pytest.approx(tuple(updated.tip[:2]), abs=1e-6)
+    assert len(updated.move((1.0, 0.0, 0.0, 0.0, -1), 51.0, 52.0).moves) == 32

@@ -31,24 +31,26 @@ from tasks import begun_with
 # ---- its derivatives
 
 
-def finely(belief):
+def finely(estimate):
     """The same with all its derivatives simulated now, on a grid so fine that nothing is lost between its points."""
-    grid = np.arange(belief.grid[0], belief.grid[-1], 0.05)
-    size = belief.parameters.size
-    return replace(belief, grid=grid, curves=np.zeros((size, grid.size)))._differentiated(range(size))
+    grid = np.arange(estimate.grid[0], estimate.grid[-1], 0.05)
+    size = estimate.parameters.size
+    return replace(estimate, grid=grid, curves=np.zeros((size, grid.size)))._differentiated(range(size))
 
 
 def test_derivatives_agree_with_central_differences():
     """Of the readings, by every parameter, at parameters off the prior; closely with small steps."""
-    belief, seen = off_the_prior()
-    fine = replace(belief, prior=replace(belief.prior, steps=1e-3 * belief.prior.steps))
-    jacobian, close = idn._jacobian(finely(belief), seen), idn._jacobian(finely(fine), seen)
-    assert jacobian.shape == (seen.y.size, belief.parameters.size)
+    estimate, readings = off_the_prior()
+    fine = replace(estimate, prior=replace(estimate.prior, steps=1e-3 * estimate.prior.steps))
+    jacobian, close = idn._jacobian(finely(estimate), readings), idn._jacobian(finely(fine), readings)
+    assert jacobian.shape == (readings.y.size, estimate.parameters.size)
     for k in range(CELLS + 12):
-        step = np.zeros(belief.parameters.size)
-        step[k] = 1e-3 * belief.prior.steps[k]
+        step = np.zeros(estimate.parameters.size)
+        step[k] = 1e-3 * estimate.prior.steps[k]
         rows = commands(55)
-        ends = (predicted(belief.parameters + s * step, rows, seen, belief.axial) for s in (1.0, -1.0))
+        ends = (
+            predicted(estimate.parameters + s * step, rows, readings, estimate.axial) for s in (1.0, -1.0)
+        )
         central = np.subtract(*ends) / (2.0 * step[k])
         scale = np.abs(central).max()
         np.testing.assert_allclose(close[:, k], central, atol=6e-3 * scale + 1e-7)
@@ -56,7 +58,7 @@ def test_derivatives_agree_with_central_differences():
         # of the clearance, across where the needle leaves a wall.
         off = 0.25 if SHIFT <= k < CELLS or k == CLEARANCE else 0.03
         assert np.linalg.norm(jacobian[:, k] - central) <= off * np.linalg.norm(central) + 1e-6
-    deepest = belief.tips[:, 0].max()
+    deepest = estimate.tips[:, 0].max()
     np.testing.assert_array_equal(jacobian[:, CELLS + int(deepest // 2.5) + 1 :], 0.0)
 
 
@@ -101,57 +103,57 @@ def test_no_derivative_is_older_than_a_round():
 
 def test_derivatives_from_the_stops_are_those_from_the_start():
     """What is not simulated again does not depend on the parameter."""
-    belief, seen = off_the_prior(66)
-    assert len(belief.stops) > 4
-    whole = replace(belief, stops=belief.stops[:1])
-    again = replace(whole, prior=replace(belief.prior, begins=np.full_like(belief.prior.begins, -np.inf)))
-    jacobian = idn._jacobian(finely(belief), seen)
-    np.testing.assert_allclose(jacobian, idn._jacobian(finely(whole), seen), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(jacobian, idn._jacobian(finely(again), seen), rtol=1e-6, atol=1e-6)
+    estimate, readings = off_the_prior(66)
+    assert len(estimate.stops) > 4
+    whole = replace(estimate, stops=estimate.stops[:1])
+    again = replace(whole, prior=replace(estimate.prior, begins=np.full_like(estimate.prior.begins, -np.inf)))
+    jacobian = idn._jacobian(finely(estimate), readings)
+    np.testing.assert_allclose(jacobian, idn._jacobian(finely(whole), readings), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(jacobian, idn._jacobian(finely(again), readings), rtol=1e-6, atol=1e-6)
     assert np.abs(jacobian[:, CELLS + 12]).max() > 1e-4
 
 
 def test_the_stops_are_states_of_the_way():
     """Bit for bit those of stepping, at the start, before the move into the tissue, and every eight moves in it."""
-    belief, _ = off_the_prior(60)
-    states = stepped(belief.parameters, commands(60), belief.axial)
-    assert [first for first, _ in belief.stops] == [0, 28, 36, 44, 52]
-    for first, state in belief.stops:
+    estimate, _ = off_the_prior(60)
+    states = stepped(estimate.parameters, commands(60), estimate.axial)
+    assert [first for first, _ in estimate.stops] == [0, 28, 36, 44, 52]
+    for first, state in estimate.stops:
         assert state == states[first]
-    np.testing.assert_array_equal(belief.tips, [state.tip for state in states])
+    np.testing.assert_array_equal(estimate.tips, [state.tip for state in states])
 
 
 def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
     """Least squares of readings and prior stacked, each over its standard deviation."""
-    belief, seen = off_the_prior(45, "bend")
-    y = belief.tips[:, 1]
+    estimate, readings = off_the_prior(45, "bend")
+    y = estimate.tips[:, 1]
     bends = np.abs(np.diff(np.concatenate([y[:1], y, y[-1:]]), n=2))
-    chord = 0.25 * np.maximum(bends[seen.index], bends[seen.index + 1])
+    chord = 0.25 * np.maximum(bends[readings.index], bends[readings.index + 1])
     assert chord.max() > 0.01
-    jitter = QUIET.tracker.jitter_per_axis / np.sqrt(seen.count)
-    sd = np.sqrt(jitter**2 + unexplained(QUIET, belief.settings) ** 2 + chord**2)
-    prior = np.linalg.cholesky(belief.prior.precision).T
-    jacobian = idn._jacobian(belief, seen)
+    jitter = QUIET.tracker.jitter_per_axis / np.sqrt(readings.count)
+    sd = np.sqrt(jitter**2 + unexplained(QUIET, estimate.settings) ** 2 + chord**2)
+    prior = np.linalg.cholesky(estimate.prior.precision).T
+    jacobian = idn._jacobian(estimate, readings)
     matrix = np.concatenate([jacobian / sd[:, None], prior])
-    missing = seen.y - predicted(belief.parameters, commands(45), seen, belief.axial)
-    right = np.concatenate([missing / sd, prior @ (belief.prior.mean - belief.parameters)])
+    missing = readings.y - predicted(estimate.parameters, commands(45), readings, estimate.axial)
+    right = np.concatenate([missing / sd, prior @ (estimate.prior.mean - estimate.parameters)])
     step = np.linalg.lstsq(matrix, right, rcond=None)[0]
     assert (np.abs(step) > 1e-4).sum() > 10
-    found = idn._improved(belief, seen).parameters
-    np.testing.assert_allclose(found, belief.parameters + step, rtol=1e-6, atol=1e-8)
+    found = idn._improved(estimate, readings).parameters
+    np.testing.assert_allclose(found, estimate.parameters + step, rtol=1e-6, atol=1e-8)
 
 
-def misfit(belief, readings, before):
+def misfit(estimate, readings, before):
     """What the fit makes least: squares over variances, halved; the variances are those of the estimate `before`."""
-    variance = belief.variance(readings) + readings.bent(before.tips[:, 1]) ** 2
-    off = belief.parameters - belief.prior.mean
-    rows, p = np.array([done.applied for done in belief.moves]), belief.parameters
-    y = belief.tips[:, 1]
+    variance = estimate.variance(readings) + readings.bent(before.tips[:, 1]) ** 2
+    off = estimate.parameters - estimate.prior.mean
+    rows, p = np.array([done.applied for done in estimate.moves]), estimate.parameters
+    y = estimate.tips[:, 1]
     y = y[readings.index] + readings.part * (y[readings.index + 1] - y[readings.index])
-    first = belief.stops[0][1].bevel
+    first = estimate.stops[0][1].bevel
     sides = first * np.cumprod(np.where(rows[:, 4] > 0.0, -1.0, 1.0))[readings.index]
     left = readings.y - y - p[RUN_OUT] * sides
-    return 0.5 * (left**2 / variance).sum() + 0.5 * off @ belief.prior.precision @ off
+    return 0.5 * (left**2 / variance).sum() + 0.5 * off @ estimate.prior.precision @ off
 
 
 KNOWN = {"control.start_axial_sd_mm": 0.0}
@@ -164,16 +166,16 @@ def test_a_step_never_fits_worse(monkeypatch):
     """
     costs, tried, improved, with_ = [], [], idn._improved, idn.Identified._with
 
-    def spied(belief, seen):
+    def spied(estimate, readings):
         tried.append(0)
-        fitted = improved(belief, seen)
-        if len(belief.moves) > 1:
-            costs.append((misfit(belief, seen, belief), misfit(fitted, seen, belief)))
+        fitted = improved(estimate, readings)
+        if len(estimate.moves) > 1:
+            costs.append((misfit(estimate, readings, estimate), misfit(fitted, readings, estimate)))
         return fitted
 
-    def counted(belief, parameters):
+    def counted(estimate, parameters):
         tried[-1] += 1
-        return with_(belief, parameters)
+        return with_(estimate, parameters)
 
     monkeypatch.setattr(idn, "_improved", spied)
     monkeypatch.setattr(idn.Identified, "_with", counted)
@@ -195,19 +197,19 @@ def test_a_step_never_fits_worse(monkeypatch):
 @pytest.mark.parametrize("factor", [-1.0, 1e-3])
 def test_a_wrong_step_is_not_taken(monkeypatch, factor):
     """A Jacobian that leads to a step the other way, or far too far: no parameter moves for the worse."""
-    belief, seen = off_the_prior(45)
+    estimate, readings = off_the_prior(45)
     jacobian = idn._jacobian
     monkeypatch.setattr(idn, "_jacobian", lambda *args: factor * jacobian(*args))
-    fitted = idn._improved(belief, seen)
-    assert misfit(fitted, seen, belief) <= misfit(belief, seen, belief) * (1.0 + 1e-12)
+    fitted = idn._improved(estimate, readings)
+    assert misfit(fitted, readings, estimate) <= misfit(estimate, readings, estimate) * (1.0 + 1e-12)
 
 
-def spoilt(belief):
-    return replace(belief, tips=np.full_like(belief.tips, np.nan))
+def spoilt(estimate):
+    return replace(estimate, tips=np.full_like(estimate.tips, np.nan))
 
 
 def test_a_trial_step_that_ends_in_nan_is_refused(monkeypatch):
-    belief, seen = off_the_prior(45)
+    estimate, readings = off_the_prior(45)
     with_, tried = idn.Identified._with, []
 
     def failing(self, parameters):
@@ -216,66 +218,68 @@ def test_a_trial_step_that_ends_in_nan_is_refused(monkeypatch):
         return spoilt(other) if len(tried) <= 2 else other
 
     monkeypatch.setattr(idn.Identified, "_with", failing)
-    fitted = idn._improved(belief, seen)
+    fitted = idn._improved(estimate, readings)
     assert len(tried) >= 3
     assert np.isfinite(fitted.tips).all()
-    assert misfit(fitted, seen, belief) <= misfit(belief, seen, belief)
+    assert misfit(fitted, readings, estimate) <= misfit(estimate, readings, estimate)
 
 
 def test_if_no_trial_step_can_be_had_the_parameters_stay(monkeypatch):
-    belief, seen = off_the_prior(45)
+    estimate, readings = off_the_prior(45)
     with_ = idn.Identified._with
 
     def failing(self, parameters):
         other = with_(self, parameters)
-        return other if np.array_equal(parameters, belief.parameters) else spoilt(other)
+        return other if np.array_equal(parameters, estimate.parameters) else spoilt(other)
 
     monkeypatch.setattr(idn.Identified, "_with", failing)
-    fitted = idn._improved(belief, seen)
-    np.testing.assert_array_equal(fitted.parameters, belief.parameters)
-    np.testing.assert_array_equal(fitted.tips, belief.tips)
+    fitted = idn._improved(estimate, readings)
+    np.testing.assert_array_equal(fitted.parameters, estimate.parameters)
+    np.testing.assert_array_equal(fitted.tips, estimate.tips)
 
 
 def test_a_trial_step_that_does_not_converge_is_refused(monkeypatch):
-    belief, seen = off_the_prior(45)
+    estimate, readings = off_the_prior(45)
     with_ = idn.Identified._with
 
     def failing(self, parameters):
         other = with_(self, parameters)
-        if np.array_equal(parameters, belief.parameters):
+        if np.array_equal(parameters, estimate.parameters):
             return other
         scalars = other.state.scalars.copy()
         scalars[nd.CONVERGED] = 0.0
         return replace(other, state=replace(other.state, scalars=scalars))
 
     monkeypatch.setattr(idn.Identified, "_with", failing)
-    assert idn._improved(belief, seen).state.converged
+    assert idn._improved(estimate, readings).state.converged
 
 
 def test_a_jacobian_that_is_not_finite_leaves_the_parameters(monkeypatch):
-    belief, seen = off_the_prior(45)
-    monkeypatch.setattr(idn, "_jacobian", lambda *_: np.full((seen.y.size, belief.parameters.size), np.nan))
-    np.testing.assert_array_equal(idn._improved(belief, seen).parameters, belief.parameters)
+    estimate, readings = off_the_prior(45)
+    monkeypatch.setattr(
+        idn, "_jacobian", lambda *_: np.full((readings.y.size, estimate.parameters.size), np.nan)
+    )
+    np.testing.assert_array_equal(idn._improved(estimate, readings).parameters, estimate.parameters)
 
 
 def test_readings_of_a_move_are_averaged_at_their_mean_time():
     estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
     for k in range(2):
         estimate = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 2.0 * k, 2.0 * k + 2.0)
-    seen = [Measurement(2.5, -27.3, 0.1), Measurement(3.5, -26.7, 0.3)]
-    means = estimate.observe(seen)._readings
+    readings = [Measurement(2.5, -27.3, 0.1), Measurement(3.5, -26.7, 0.3)]
+    means = estimate.observe(readings)._readings
     assert (means.index.tolist(), means.count.tolist()) == ([1], [2.0])
     assert (means.part[0], means.x[0], means.y[0]) == pytest.approx((0.5, -27.0, 0.2))
     np.testing.assert_allclose(means.between(np.array([0.0, 10.0, 20.0])), [15.0])
 
 
 @pytest.mark.parametrize("first", [1, -1])
-def test_a_reading_is_on_the_side_to_which_the_bevel_turned_before_its_move(first):
+def test_a_reading_is_on_the_side_to_which_the_bevel_rolled_before_its_move(first):
     estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), first))
     for k, flip in enumerate((-1, 1, -1, 1, -1)):
         estimate = estimate.move((1.0, 0.0, 0.0, 0.0, flip), float(k), k + 1.0)
-    seen = [Measurement(k + 0.5, -28.0 + k, 0.0) for k in (0, 1, 3, 4)]
-    means = estimate.observe(seen)._readings
+    readings = [Measurement(k + 0.5, -28.0 + k, 0.0) for k in (0, 1, 3, 4)]
+    means = estimate.observe(readings)._readings
     np.testing.assert_array_equal(means.index, [0, 1, 3, 4])
     np.testing.assert_array_equal(means.sides, np.multiply(first, [1, -1, 1, 1]))
 

@@ -29,9 +29,9 @@ from identified import (
     SHIFT,
     TIGHT,
     Needle,
+    adaptation_of,
     commands,
     followed,
-    learnt_of,
     readings,
     stepped,
 )
@@ -73,11 +73,11 @@ def test_mirrored_readings_give_the_mirrored_estimate():
         here = here.move(row, k, k + 1.0).observe(batch)
         there = there.move(away, k, k + 1.0).observe([replace(s, y=-s.y) for s in batch])
     np.testing.assert_allclose(there.tip, here.tip * [1.0, -1.0, -1.0], atol=1e-6)
-    turned = np.where(np.isin(np.arange(here.parameters.size), (BASE_Y, BASE_TURN)), -1.0, 1.0)
-    np.testing.assert_allclose(there.parameters, turned * here.parameters, atol=1e-4)
+    mirrored = np.where(np.isin(np.arange(here.parameters.size), (BASE_Y, BASE_TURN)), -1.0, 1.0)
+    np.testing.assert_allclose(there.parameters, mirrored * here.parameters, atol=1e-4)
 
 
-def test_a_turn_of_the_bevel_turns_bend_and_run_out_over():
+def test_a_roll_of_the_bevel_mirrors_bend_and_run_out():
     """In air: an estimated bend of the free needle and a run-out show on the other side."""
     scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
     simulator = Simulator(scenario, 1)
@@ -88,28 +88,28 @@ def test_a_turn_of_the_bevel_turns_bend_and_run_out_over():
     state = adapted.step(simulator.start(), Control())
     bent = replace(estimate, simulator=adapted, state=state, parameters=parameters)
     assert bent.tip[1] == pytest.approx(0.7, abs=1e-4)  # the bend shortens the needle a little
-    turned = bent.move((0.1, 0.0, 0.0, 0.0, 1), 0.0, 1.0)
-    np.testing.assert_allclose(turned.tip[1:], -bent.tip[1:], atol=1e-9)
+    mirrored = bent.move((0.1, 0.0, 0.0, 0.0, 1), 0.0, 1.0)
+    np.testing.assert_allclose(mirrored.tip[1:], -bent.tip[1:], atol=1e-9)
     assert bent.off_axis(-1) == pytest.approx(-bent.off_axis(1))
     left = replace(bent, residual=0.03)
     assert (left.off_axis(1), left.off_axis(-1)) == pytest.approx((0.13, -0.07))
 
 
-def test_a_bevel_turns_before_its_move_and_so_does_the_run_out():
-    """A needle that is known, run-out included, is still known after readings in the midst of a turn's move."""
+def test_a_bevel_rolls_before_its_move_and_so_does_the_run_out():
+    """A needle that is known, run-out included, is still known after readings in the middle of the move of a roll."""
     needle = replace(NEEDLES["run-out"], clearance=0.0)
     estimate, _ = followed(needle, 20, scenario=TIGHT)
     assert commands(21)[20][4] == 1
     before, after = needle.inserted(TIGHT, commands(21))[20:22]
     moved = estimate.move(commands(21)[20], 20.0, 21.0)
-    assert moved.tip[1] == pytest.approx(needle.seen(after)[1], abs=2e-3)
+    assert moved.tip[1] == pytest.approx(needle.measured(after)[1], abs=2e-3)
     corrected = moved.observe(readings(needle, before, after, 20, 4, 0.0, np.random.default_rng(0)))
-    assert corrected.tip[1] == pytest.approx(needle.seen(after)[1], abs=2e-3)
+    assert corrected.tip[1] == pytest.approx(needle.measured(after)[1], abs=2e-3)
     assert corrected.parameters[RUN_OUT] == pytest.approx(-0.15, abs=0.01)
 
 
 def test_where_the_tip_was_is_on_the_side_of_the_bevel_then():
-    """A turn is made as its move begins."""
+    """A roll is made as its move begins."""
     needle = NEEDLES["run-out"]
     estimate, states = followed(needle, 24)
     out = float(estimate.parameters[RUN_OUT])
@@ -129,7 +129,7 @@ def test_late_readings_lead_to_the_same_estimate(late):
     in_time, _ = followed(needle, 50)
     behind, states = followed(needle, 50, late=late)
     np.testing.assert_allclose(behind.tip[1:], in_time.tip[1:], atol=unexplained(QUIET, OWN))
-    assert behind.tip[1] == pytest.approx(needle.seen(states[-1])[1], abs=0.01)
+    assert behind.tip[1] == pytest.approx(needle.measured(states[-1])[1], abs=0.01)
     assert len(behind.moves) == 50
 
 
@@ -139,7 +139,7 @@ def test_the_belief_now_is_the_fitted_insertion_carried_out_again():
     states = stepped(estimate.parameters, commands(45), estimate.axial)
     assert states[-1] == estimate.state
     np.testing.assert_array_equal(estimate.tips, [state.tip for state in states])
-    now = Simulator(QUIET, 1).adapted(learnt_of(estimate.parameters))
+    now = Simulator(QUIET, 1).adapted(adaptation_of(estimate.parameters))
     forward = Control(db_x=1.0)
     assert estimate.simulator.step(states[-1], forward) == now.step(states[-1], forward)
 
@@ -150,12 +150,12 @@ def test_innovation_and_measured_tip_are_those_of_the_newest_reading():
     estimate, _ = followed(needle, 45)
     moved = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 45.0, 46.0)
     x, y = np.add(moved.tip[:2], [0.01, 0.002])
-    seen = moved.observe([Measurement(46.0, float(x), float(y))])
-    assert seen.measured == pytest.approx((x, y), abs=1e-9)
-    assert seen.innovation[0] == pytest.approx(0.01, abs=2e-3)
-    assert abs(seen.innovation[1]) < 0.002
-    assert seen.tip_at(46.0) == pytest.approx(tuple(seen.tip[:2]), abs=1e-12)
-    assert seen.unseen().innovation == (0.0, 0.0)
+    updated = moved.observe([Measurement(46.0, float(x), float(y))])
+    assert updated.measured == pytest.approx((x, y), abs=1e-9)
+    assert updated.innovation[0] == pytest.approx(0.01, abs=2e-3)
+    assert abs(updated.innovation[1]) < 0.002
+    assert updated.tip_at(46.0) == pytest.approx(tuple(updated.tip[:2]), abs=1e-12)
+    assert updated.without_reading().innovation == (0.0, 0.0)
 
 
 def test_in_air_nothing_is_left_over():
@@ -166,7 +166,7 @@ def test_in_air_nothing_is_left_over():
 def test_without_readings_or_moves_the_estimate_stays():
     estimate, _ = followed(NEEDLES["bend"], 30)
     moved = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 30.0, 31.0)
-    for kept in (moved.observe([]), moved.unseen()):
+    for kept in (moved.observe([]), moved.without_reading()):
         assert kept.state is moved.state
         assert kept.parameters is moved.parameters
         assert kept.innovation == (0.0, 0.0)

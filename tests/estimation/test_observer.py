@@ -1,4 +1,4 @@
-"""The observer: what it learns from readings, in air and in tissue, late or in time; its prediction has no offset."""
+"""The observer: its estimates in air and in tissue, from late readings or in time; its prediction has no offset."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -26,9 +26,9 @@ def start_with(scenario, **corrections):
     return simulator.step(simulator.start().with_estimate(**corrections), Control())
 
 
-def begun(simulator, state=None, bevel=1, **beliefs):
+def begun(simulator, state=None, bevel=1, **correction):
     """The estimate at the start, or at a state."""
-    estimate = StateCorrection(**beliefs).begin(begun_with(simulator, bevel))
+    estimate = StateCorrection(**correction).begin(begun_with(simulator, bevel))
     return estimate if state is None else replace(estimate, state=state, past=state, tips=state.tip[None])
 
 
@@ -53,13 +53,13 @@ def follow(truth, estimate, plant, steps, *, noise=0.0, force=0.0, guide=0.0):
     """Advance plant and estimate together; the estimates, and the innovations of each period."""
     rng = np.random.default_rng(0)
     command = (*AHEAD[:3], guide, AHEAD[4])
-    seen = []
+    innovations = []
     for k in range(steps):
         before, truth = truth, plant.step(truth.with_estimate(tip_load=force), Control.from_row(command))
         readings = [replace(s, y=s.y + rng.normal(0.0, noise)) for s in samples_between(before, truth, k)]
         estimate = estimate.move(command, k, k + 1.0).observe(readings)
-        seen.append(estimate.innovation)
-    return truth, estimate, np.array(seen)
+        innovations.append(estimate.innovation)
+    return truth, estimate, np.array(innovations)
 
 
 def test_it_begins_with_a_straight_start_with_the_prior_of_the_scenario():
@@ -135,33 +135,33 @@ def test_in_tissue_the_prediction_has_no_offset_under_a_constant_disturbance(loa
     """A force on the tip that the model lacks: its prediction errs at first and no more at the end."""
     simulator = Simulator(QUIET)
     state = in_tissue(simulator)
-    _, estimate, seen = follow(state, begun(simulator, state), simulator, 30, force=load)
-    assert abs(seen[0, 1]) > 5e-3
-    assert np.abs(seen[-5:, 1]).max() < 0.05 * abs(seen[0, 1])
+    _, estimate, innovations = follow(state, begun(simulator, state), simulator, 30, force=load)
+    assert abs(innovations[0, 1]) > 5e-3
+    assert np.abs(innovations[-5:, 1]).max() < 0.05 * abs(innovations[0, 1])
     assert estimate.state.tip_load == pytest.approx(load, rel=0.25)
 
 
-@pytest.mark.parametrize(("gain", "learns"), [(0.0, True), (0.3, False)])
-def test_without_learning_the_load_the_offset_stays(gain, learns):
+@pytest.mark.parametrize(("gain", "estimates"), [(0.0, True), (0.3, False)])
+def test_without_estimating_the_load_the_offset_stays(gain, estimates):
     """As in the paper: the measured tip is released in the prediction."""
     simulator = Simulator(QUIET.with_values({"control.load_gain": gain}))
     state = in_tissue(simulator)
-    begin = begun(simulator, state, learns_load=learns)
-    _, estimate, seen = follow(state, begin, simulator, 30, force=0.003)
+    begin = begun(simulator, state, estimates_load=estimates)
+    _, estimate, innovations = follow(state, begin, simulator, 30, force=0.003)
     assert estimate.state.tip_load == 0.0
-    assert np.abs(seen[-5:, 1]).min() > 0.3 * abs(seen[0, 1])
+    assert np.abs(innovations[-5:, 1]).min() > 0.3 * abs(innovations[0, 1])
 
 
 def test_stiffer_tissue_than_estimated_leaves_next_to_no_offset():
-    """A disturbance that grows slowly as the needle goes in: a twentieth of what not learning leaves."""
+    """A disturbance that grows slowly as the needle goes in: a twentieth of what is left without estimating it."""
     left = []
     for gain in (PHANTOM.control.load_gain, 0.0):
         soft, stiff = (
             QUIET.with_values({f"tissue.{k}.shear_modulus_kpa": mu for k in (0, 1)}) for mu in (2.0, 6.0)
         )
         simulator, plant = Simulator(soft.with_values({"control.load_gain": gain})), Simulator(stiff)
-        *_, seen = follow(plant.start(), begun(simulator), plant, 65, guide=0.02)
-        left.append(np.abs(seen[-10:, 1]).max())
+        *_, innovations = follow(plant.start(), begun(simulator), plant, 65, guide=0.02)
+        left.append(np.abs(innovations[-10:, 1]).max())
     assert left[0] < 0.2 * left[1]
 
 
@@ -207,11 +207,11 @@ def test_the_next_reading_is_as_uncertain_as_the_path_since_the_last_one_is_long
     """From the skin by drift x², from a reading at s by drift (x² − s²), each beside what the start leaves."""
     simulator = Simulator(PHANTOM)
     estimate = replace(begun(simulator, in_tissue(simulator)), drift=0.01)
-    seen = estimate.move(AHEAD, 0.0, 1.0).observe(
+    updated = estimate.move(AHEAD, 0.0, 1.0).observe(
         [Measurement(1.0, float(estimate.tip[0]) + 1.0, float(estimate.tip[1]))]
     )
-    later = seen.move(AHEAD, 1.0, 2.0)
-    for one, since in [(estimate, 0.0), (later, seen.measured[0])]:
+    later = updated.move(AHEAD, 1.0, 2.0)
+    for one, since in [(estimate, 0.0), (later, updated.measured[0])]:
         depth, start = float(one.tip[0]), replace(one, drift=0.0).tip_sd
         assert depth > since + 0.5
         assert one.tip_sd == pytest.approx(np.hypot(start, 0.01 * (depth**2 - since**2)))
@@ -286,16 +286,16 @@ def test_more_readings_are_trusted_more():
 
 def test_an_empty_reading_is_refused():
     moved = begun(Simulator(PHANTOM)).move(AHEAD, 0.0, 1.0)
-    with pytest.raises(ValueError, match="not sorted out"):
+    with pytest.raises(ValueError, match="not removed"):
         moved.observe([Measurement(1.0, None, None)])
-    with pytest.raises(ValueError, match="not sorted out"):
+    with pytest.raises(ValueError, match="not removed"):
         place(Measurement(1.0, 3.0, None))
 
 
 def test_without_fitting_the_start_the_measured_tip_is_held_in_air_too():
     """As in the paper; the base is estimated where it was commanded."""
     simulator = Simulator(PHANTOM)
-    predicted = begun(simulator, fits_start=False, learns_load=False).move(AHEAD, 0.0, 1.0)
+    predicted = begun(simulator, fits_start=False, estimates_load=False).move(AHEAD, 0.0, 1.0)
     x, y = predicted.tip[:2] + np.array([0.0, 0.5])
     corrected = predicted.observe([Measurement(1.0, x, y)])
     assert corrected.tip[1] == pytest.approx(0.5, abs=1e-9)
@@ -303,8 +303,8 @@ def test_without_fitting_the_start_the_measured_tip_is_held_in_air_too():
     assert corrected.move(AHEAD, 1.0, 2.0).tip[1] == pytest.approx(0.0, abs=1e-9)  # released
 
 
-@pytest.mark.parametrize(("name", "learns"), [("ce-mpc", False), ("resolved-rate", True)])
-def test_the_papers_controller_releases_the_measured_tip_and_learns_nothing(name, learns):
+@pytest.mark.parametrize(("name", "estimates"), [("ce-mpc", False), ("resolved-rate", True)])
+def test_the_papers_controller_releases_the_measured_tip_and_estimates_nothing(name, estimates):
     """In air no base offset, in tissue no load; the others keep both."""
     simulator = Simulator(PHANTOM)
     begin = METHODS[name].observer.begin(begun_with(simulator, 1, name))
@@ -312,17 +312,17 @@ def test_the_papers_controller_releases_the_measured_tip_and_learns_nothing(name
         state = in_tissue(simulator, steps)
         moved = replace(begin, state=state, past=state, tips=state.tip[None]).move(AHEAD, 0.0, 1.0)
         x, y = np.add(moved.tip[:2], [0.0, 0.3])
-        seen = moved.observe([Measurement(1.0, float(x), float(y))]).state
-        assert bool(seen.base[1] != 0.0 or seen.tip_load != 0.0) is learns
+        updated = moved.observe([Measurement(1.0, float(x), float(y))]).state
+        assert bool(updated.base[1] != 0.0 or updated.tip_load != 0.0) is estimates
 
 
 def test_unseen_keeps_the_belief_and_has_no_innovation():
     simulator = Simulator(PHANTOM)
     moved = begun(simulator, in_tissue(simulator)).move(AHEAD, 0.0, 1.0)
-    seen = moved.observe([Measurement(1.0, *(moved.tip[:2] + 0.1))])
-    assert seen.innovation != (0.0, 0.0)
-    assert seen.unseen().innovation == (0.0, 0.0)
-    assert seen.unseen().state is seen.state
+    updated = moved.observe([Measurement(1.0, *(moved.tip[:2] + 0.1))])
+    assert updated.innovation != (0.0, 0.0)
+    assert updated.without_reading().innovation == (0.0, 0.0)
+    assert updated.without_reading().state is updated.state
 
 
 # ---- late readings
@@ -418,9 +418,9 @@ def test_a_reading_belongs_to_the_move_in_which_it_was_taken():
     simulator = Simulator(PHANTOM)
     estimate = begun(simulator).move(AHEAD, 0.0, 1.0).move(AHEAD, 1.0, 2.0).move(AHEAD, 2.0, 3.0)
     at = {time: Measurement(time, -27.0, 0.01) for time in (-0.5, 0.4, 1.0)}
-    seen = estimate.observe([at[-0.5], at[0.4]])
-    assert [done.samples for done in seen.moves] == [(at[-0.5], at[0.4]), (), ()]
-    assert [done.ended for done in seen.observe([at[1.0]]).moves] == [2.0, 3.0]  # the first move is closed
+    updated = estimate.observe([at[-0.5], at[0.4]])
+    assert [done.samples for done in updated.moves] == [(at[-0.5], at[0.4]), (), ()]
+    assert [done.ended for done in updated.observe([at[1.0]]).moves] == [2.0, 3.0]  # the first move is closed
     late = Measurement(7.0, -25.5, 0.0)
     assert estimate.observe([late]).moves == ()
 
@@ -429,12 +429,12 @@ def test_without_readings_nothing_is_corrected_and_moves_stay_open():
     simulator = Simulator(PHANTOM)
     estimate = begun(simulator, in_tissue(simulator))
     moved = estimate.move(AHEAD, 0.0, 1.0).move(AHEAD, 1.0, 2.0)
-    seen = moved.observe([])
-    assert seen.state == moved.state
-    assert seen.past is estimate.past
-    assert len(seen.moves) == 2
-    np.testing.assert_array_equal(seen.tips, moved.tips)
-    assert seen.measured is None
+    updated = moved.observe([])
+    assert updated.state == moved.state
+    assert updated.past is estimate.past
+    assert len(updated.moves) == 2
+    np.testing.assert_array_equal(updated.tips, moved.tips)
+    assert updated.measured is None
 
 
 def test_observing_leaves_the_old_belief_as_it_was():

@@ -32,7 +32,7 @@ class Belief:
     def observe(self, samples):
         return Belief(len(samples))
 
-    def unseen(self):
+    def without_reading(self):
         return Belief(None)
 
 

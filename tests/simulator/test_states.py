@@ -225,7 +225,9 @@ def test_travel_is_limited(name, step, travel):
     """To the stroke and the guide's and base's range, in single steps and in a rollout."""
     times = round(travel / abs(step))
     end = repeat(SIMULATOR, SIMULATOR.start(), Control(**{name: step}), times)[-1]
-    with pytest.raises(CommandError, match=rf"{name} = .*sum of the steps must be at (most|least) -?{travel:g} mm"):
+    with pytest.raises(
+        CommandError, match=rf"{name} = .*sum of the steps must be at (most|least) -?{travel:g} mm"
+    ):
         SIMULATOR.step(end, Control(**{name: step / 100}))
     rows = np.repeat([[Control(**{name: step}).row()]], times + 1, axis=1)
     SIMULATOR.rollout(SIMULATOR.start(), rows[:, :-1])

@@ -1,1 +1,1 @@
-"""Observers: the estimated needle, corrected by readings that come late."""
+"""Observers: the estimated needle, corrected by delayed readings."""

@@ -1,4 +1,4 @@
-"""What every observer offers: the estimated needle, corrected by readings that come late."""
+"""Interface of all observers: the estimated needle, corrected by delayed readings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from flexneedle.types import Command, Floats, Measurement
 
 @dataclass(frozen=True)
 class Move:
-    """What the driver did from `begun` to `ended` (s), and the good readings taken meanwhile."""
+    """A motion from `begun` to `ended` (s) as applied by the driver, and the good readings taken during it."""
 
     begun: float
     ended: float
@@ -24,7 +24,7 @@ class Move:
 
     @cached_property
     def mean(self) -> tuple[float, float, float, float] | None:
-        """Of its readings: the share of the move done, x, y (mm), and their number; None without any."""
+        """Means over its readings: share of the move done, x, y (mm); and their number. None without any."""
         if not self.samples:
             return None
         part = [self.part(sample.time) for sample in self.samples]
@@ -39,31 +39,31 @@ class Move:
 
 
 class Estimate(Protocol):
-    """A frozen estimate of the insertion now."""
+    """A frozen estimate of the present state of the insertion."""
 
     @property
     def simulator(self) -> Simulator:
-        """The model that predicts, with the estimated constants."""
+        """The model of the prediction, with the estimated constants."""
         ...
 
     @property
     def state(self) -> State:
-        """State of that model now."""
+        """Present state of that model."""
         ...
 
     @property
     def tip(self) -> Floats:
-        """Pose (3,) of the tip now, as a tracker without errors would measure it."""
+        """Present pose (3,) of the tip, as a tracker without errors would measure it."""
         ...
 
     @property
     def innovation(self) -> tuple[float, float]:
-        """The last reading less its prediction (mm)."""
+        """The last reading minus its prediction (mm)."""
         ...
 
     @property
     def measured(self) -> tuple[float, float] | None:
-        """Tip (x, y) measured at the end of the last move of which there is a reading (mm), None before the first."""
+        """Tip (x, y) measured at the end of the last move with a reading (mm), None before the first."""
         ...
 
     @property
@@ -72,19 +72,19 @@ class Estimate(Protocol):
         ...
 
     def tip_at(self, time: float) -> tuple[float, float]:
-        """Estimated position of the tip (mm) at `time`, each move taken as even."""
+        """Estimated position of the tip (mm) at `time`, with constant velocity in each move."""
         ...
 
     def move(self, applied: Command, begun: float, ended: float) -> "Estimate":
-        """The estimate after the driver moved so, from `begun` to `ended` (s)."""
+        """The estimate after a motion `applied` by the driver from `begun` to `ended` (s)."""
         ...
 
     def observe(self, samples: Sequence[Measurement]) -> "Estimate":
         """The estimate corrected by good readings, the newest last."""
         ...
 
-    def unseen(self) -> "Estimate":
-        """The estimate of a period without a good reading: no innovation."""
+    def without_reading(self) -> "Estimate":
+        """The estimate of a period without a good reading: innovation 0."""
         ...
 
 
@@ -96,7 +96,7 @@ def described(estimate: Estimate) -> str:
 
 
 def assigned(moves: tuple[Move, ...], samples: Sequence[Measurement]) -> tuple[Move, ...]:
-    """Give each sample to the move in which it was taken; one of before to the first, one of after to the last."""
+    """Assign each sample to the move in which it was taken; earlier ones to the first move, later ones to the last."""
     ends = np.array([done.ended for done in moves[:-1]])
     owner = np.searchsorted(ends, [sample.time - 1e-9 for sample in samples])
     return tuple(
@@ -108,7 +108,7 @@ def assigned(moves: tuple[Move, ...], samples: Sequence[Measurement]) -> tuple[M
 
 
 def along(moves: tuple[Move, ...], tips: Floats, time: float) -> tuple[float, float]:
-    """Position (mm) at `time` on the path through tips (k + 1, 3), those before and after each of k moves."""
+    """Position (mm) at `time` on the path through tips (k + 1, 3), before and after each of k moves."""
     if not moves:
         return float(tips[-1, 0]), float(tips[-1, 1])
     times = [moves[0].begun, *(done.ended for done in moves)]
@@ -116,7 +116,7 @@ def along(moves: tuple[Move, ...], tips: Floats, time: float) -> tuple[float, fl
 
 
 def place(sample: Measurement) -> tuple[float, float]:
-    """Tip (mm) as a good sample has it. Raises ValueError for an empty sample."""
+    """Measured tip (mm) of a good sample. Raises ValueError for an empty sample."""
     if sample.x is None or sample.y is None:
-        raise ValueError("an empty sample was not sorted out")
+        raise ValueError("an empty sample was not removed")
     return sample.x, sample.y

@@ -1,18 +1,18 @@
-"""An observer that corrects the model: start, needle and tissue are fitted to all readings of the insertion.
+"""An observer that corrects the model: parameters of start, needle and tissue are fitted to all readings.
 
-Maximum a posteriori by Gauss–Newton, one step a period: the insertion is simulated again with other constants, which
-costs a millisecond, and the lateral readings choose among them. Parameters, with normal priors from the scenario:
+Maximum a posteriori by Gauss–Newton, one step a period: the insertion is simulated again with other parameters, which
+takes a millisecond, and compared with the lateral readings. Parameters, with normal priors from the scenario:
 
-    base y (mm), base turn (rad), natural bend of the needle (mm), run-out (mm), factor on the bevel offset,
+    base y (mm), base θ (rad), natural bend of the needle (mm), run-out (mm), factor on the bevel offset,
     clearance of the needle in the guide (mm),
     ln of the factor on each layer's modulus, shift (mm) of each boundary between layers,
     ln of a further factor on the modulus in cells along the depth, correlated over a length.
 
-So what is ahead of the tip is estimated as far as it is correlated with what was passed. The start along the axis is a
-shift of all axial readings, fitted apart from the rest. What the fit leaves is low-passed and carried on as a constant.
+So tissue ahead of the tip is estimated as far as it is correlated with that behind it. The start along the axis is a
+shift of all axial readings, fitted separately. The residuals of the fit are low-passed and added as a constant.
 
 The derivative of the lateral position with respect to a parameter is kept as a curve over the depth of the tip, a few
-steps ahead of it too. Each period a few of the curves are simulated anew, alternately: none is older than `_ROUND`
+steps ahead of it too. A few of the curves are simulated again each period, so that none is older than `_ROUND`
 periods.
 """
 
@@ -45,22 +45,22 @@ from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
 from flexneedle.types import Command, Floats, Measurement
 
-_MOVES_A_STRETCH = 8  # in tissue; one stretch in air
+_MOVES_A_SEGMENT = 8  # in tissue; in air there is one segment
 _RECENT = 12  # moves whose residuals are low-passed
-_SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a Gauss–Newton step: the first that fits no worse
+_SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a Gauss–Newton step: the first that does not raise the cost
 _REST = np.array([[0.0, 0.0, 0.0, 0.0, -1.0]])
-_ROUND = 8  # periods in which all curves of derivatives are simulated once,
-_LEADING = (BASE_Y, BASE_TURN, BEND, BEVEL, CLEARANCE)  # but these are in
+_ROUND = 8  # periods in which each curve of derivatives is simulated once;
+_LEADING = (BASE_Y, BASE_TURN, BEND, BEVEL, CLEARANCE)  # these are once in
 _LEADING_ROUND = 2  # periods
 _STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
 
 
 @dataclass(frozen=True)
 class Identification:
-    """This observer has no choices but the settings of `adaptive-mpc`."""
+    """The observer of `adaptive-mpc`, whose settings it uses."""
 
     def begin(self, task: Task) -> "Identified":
-        """Start from the scenario's values. Raises ScenarioError for cells so short that a fit would never end."""
+        """The estimate before the first reading: the prior's means. Raises ScenarioError for too short cells."""
         simulator, scenario, settings = task.simulator, task.scenario, task.settings
         check_cells(scenario, settings)
         state, prior = simulator.start(task.plan.bevel), Prior.of(scenario, settings, task.plan.target[0])
@@ -87,7 +87,7 @@ class Identification:
 
 @dataclass(frozen=True, eq=False)
 class Perturbed:
-    """The needle now if one parameter were `step` larger: its model and state."""
+    """The present needle with one parameter larger by `step`: its model and state."""
 
     parameter: int
     step: float
@@ -97,10 +97,10 @@ class Perturbed:
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """The estimate. nominal: the scenario's model, and the prior about it; simulator: the model with parameters (K,);
-    state: of it now; tips (m + 1, 3): of it at the ends of the m moves, the start first; stops: its state before some
+    """The estimate. nominal: the scenario's model, to which the prior refers; simulator: that with the parameters (K,);
+    state: its present state; tips (m + 1, 3): at the ends of the m moves, the start first; stops: its state before some
     of the moves; grid (g,), curves (K, g): derivatives of the tip's lateral position over its depth (mm);
-    precision (K, K): inverse covariance of the parameters; axial: start error along the axis (mm).
+    precision (K, K): inverse covariance of the parameters; axial: start error along the axis (mm); period: its number.
     """
 
     nominal: Simulator
@@ -116,7 +116,7 @@ class Identified:
     precision: Floats
     axial: float = 0.0
     axial_variance: float = 0.0
-    turn: int = 0
+    period: int = 0
     perturbed: tuple[Perturbed, ...] = ()
     moves: tuple[Move, ...] = ()
     residual: float = 0.0
@@ -128,33 +128,33 @@ class Identified:
 
     @property
     def tip(self) -> Floats:
-        """Tip pose (3,) as it is measured: the model's, and its distance from the needle's axis."""
+        """Tip pose (3,) as measured: that of the model plus the tip's offset from the needle's axis."""
         tip = self.state.tip
         tip[1] += self.off_axis(self.state.bevel)
         return tip
 
     @property
     def run_out(self) -> float:
-        """Lateral distance (mm) of the measured tip from the needle's axis, with the bevel up."""
+        """Lateral offset (mm) of the measured tip from the needle's axis, with the bevel on the side +1."""
         return float(self.parameters[RUN_OUT])
 
     def off_axis(self, bevel: float) -> float:
-        """Lateral distance (mm) of the measured tip from the model's with the bevel on that side."""
+        """Lateral offset (mm) of the measured tip from the model's, with the bevel on the side `bevel`."""
         return self.run_out * bevel + self.residual
 
     def tip_at(self, time: float) -> tuple[float, float]:
         """Estimated position of the tip (mm) at `time`."""
         x, y = along(self.moves, self.tips, time)
-        turned_since = sum(done.applied[4] > 0.0 for done in self.moves if done.begun >= time)
-        return x, y + self.off_axis(self.state.bevel * (-1) ** turned_since)
+        rolls_since = sum(done.applied[4] > 0.0 for done in self.moves if done.begun >= time)
+        return x, y + self.off_axis(self.state.bevel * (-1) ** rolls_since)
 
-    def unseen(self) -> "Identified":
-        """The same without an innovation."""
+    def without_reading(self) -> "Identified":
+        """The estimate of a period without a good reading: innovation 0."""
         return replace(self, innovation=(0.0, 0.0))
 
     def move(self, applied: Command, begun: float, ended: float) -> "Identified":
         """Move the estimated needle as the driver did, from `begun` to `ended` (s)."""
-        if applied == _STILL and self.moves and self.moves[-1].applied == _STILL:  # one rest, however long
+        if applied == _STILL and self.moves and self.moves[-1].applied == _STILL:  # one move, however long
             last = replace(self.moves[-1], ended=ended)
             return replace(self, moves=(*self.moves[:-1], last), perturbed=())
         state = self.simulator.step(self.state, Control.from_row(applied))
@@ -164,16 +164,16 @@ class Identified:
         )
 
     def observe(self, samples: Sequence[Measurement]) -> "Identified":
-        """Fit the parameters to all readings so far, one Gauss–Newton step, and simulate with them to now."""
+        """Fit the parameters to all readings by one Gauss–Newton step, and simulate the insertion with them."""
         if not samples or not self.moves:
-            return self.unseen()
-        seen = replace(self, moves=assigned(self.moves, samples))
-        readings = seen._readings
-        without = readings.ahead(seen.tips[:, 0]) + seen.axial
+            return self.without_reading()
+        extended = replace(self, moves=assigned(self.moves, samples))
+        readings = extended._readings
+        without = readings.ahead(extended.tips[:, 0]) + extended.axial
         prior_sd = max(self.nominal.scenario.control.start_axial_sd_mm, LEAST_SD)
-        axial, axial_variance = shared(without, seen.variance(readings), prior_sd)
-        seen = replace(seen, axial=axial, axial_variance=axial_variance)
-        fitted = _improved(seen, readings)._differentiated()
+        axial, axial_variance = shared(without, extended.variance(readings), prior_sd)
+        extended = replace(extended, axial=axial, axial_variance=axial_variance)
+        fitted = _improved(extended, readings)._differentiated()
         left, ahead = fitted.left(readings), readings.ahead(fitted.tips[:, 0])
         newest = int(readings.index[-1]) + 1
         x, y = fitted.tips[newest, :2] + (ahead[-1], left[-1] + fitted.run_out * readings.sides[-1])
@@ -195,20 +195,20 @@ class Identified:
         return MoveMeans.of(self.moves, self.state.bevel)
 
     def variance(self, readings: MoveMeans) -> Floats:
-        """Of the means of readings (r,), mm²: their jitter and what no parameter explains."""
+        """Variances (r,) of the means of readings, mm²: jitter and model error."""
         scenario = self.nominal.scenario
         return readings.variance(scenario.tracker.jitter_per_axis, unexplained(scenario, self.settings))
 
     def left(self, readings: MoveMeans) -> Floats:
-        """The lateral readings (r,) less those of the model, mm."""
+        """Lateral residuals (r,), mm: readings minus those of the model."""
         return readings.left(self.tips[:, 1], self.run_out)
 
     def _with(self, parameters: Floats) -> "Identified":
-        """The estimate with these parameters: the insertion simulated again, in stretches."""
+        """The estimate with these parameters: the insertion simulated again, in segments."""
         simulator = _adapted(self.nominal, self.settings, parameters)
         state = _started(self, simulator, parameters)
         inside = int(np.argmax(np.append(self.tips[1:, 0], np.inf) > 0.0))
-        ends = [*range(min(inside, len(self.rows)), len(self.rows), _MOVES_A_STRETCH), len(self.rows)]
+        ends = [*range(min(inside, len(self.rows)), len(self.rows), _MOVES_A_SEGMENT), len(self.rows)]
         stops, parts, first = [], [state.tip[None]], 0
         for last in ends:
             stops.append((first, state))
@@ -227,7 +227,7 @@ class Identified:
 
     @cached_property
     def covariance(self) -> Floats:
-        """Of the parameters (K, K), as the readings so far leave it."""
+        """Posterior covariance (K, K) of the parameters."""
         inverse: Floats = np.linalg.inv(self.precision).astype(np.float64)
         return inverse
 
@@ -251,7 +251,7 @@ class Identified:
 
     @property
     def roll_sd(self) -> float:
-        """Standard deviation (mm) of how far the tip goes to the side if the bevel rolls now."""
+        """Standard deviation (mm) of the tip's lateral motion if the bevel rolls now."""
         slope = np.zeros(self.parameters.size)
         slope[BEND] = 2.0 * self._slopes(self.state.tip[:1])[0, BEND]
         slope[RUN_OUT] = 2.0
@@ -267,7 +267,7 @@ class Identified:
         return slopes
 
     def _differentiated(self, which: Sequence[int] | None = None) -> "Identified":
-        """Simulate the curves whose turn it is anew, and a few steps ahead."""
+        """Simulate the curves that are due again, with a few steps ahead."""
         ahead = np.tile([[self.nominal.scenario.setup.max_advance_mm, 0.0, 0.0, 0.0, -1.0]], (_ROUND, 1))
         base = np.concatenate([self.tips, self.simulator.replay(self.state, ahead)[1]])
         depth = np.maximum.accumulate(base[:, 0])
@@ -284,11 +284,11 @@ class Identified:
             member, tips = _perturbed(self, parameters, k, ahead)
             members.append(member)
             curves[k] = np.interp(self.grid, depth, (tips[:, 1] - base[:, 1]) / self.prior.steps[k])
-        return replace(self, curves=curves, perturbed=tuple(members), turn=self.turn + 1)
+        return replace(self, curves=curves, perturbed=tuple(members), period=self.period + 1)
 
     @property
     def reading_variance(self) -> float:
-        """Of the mean of the readings of a control step (mm²)."""
+        """Variance of the mean of the readings of a control step (mm²)."""
         scenario = self.nominal.scenario
         step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
         count = max(1.0, step / scenario.tracker.period)
@@ -297,15 +297,15 @@ class Identified:
     def _due(self) -> Iterator[int]:
         """The parameters whose curves are simulated this period."""
         for place, k in enumerate(_LEADING):
-            if place % _LEADING_ROUND == self.turn % _LEADING_ROUND:
+            if place % _LEADING_ROUND == self.period % _LEADING_ROUND:
                 yield k
         for k in range(MODULUS, self.parameters.size):
-            if k % _ROUND == self.turn % _ROUND:
+            if k % _ROUND == self.period % _ROUND:
                 yield k
 
 
 def _adapted(nominal: Simulator, settings: Priors, parameters: Floats) -> Simulator:
-    """The model with these constants."""
+    """The model with these parameters."""
     layers = len(nominal.scenario.tissue)
     shift = MODULUS + layers
     variation = shift + layers - 1
@@ -333,26 +333,26 @@ def _started(estimate: Identified, simulator: Simulator, parameters: Floats) -> 
     return simulator.replay(moved, _REST)[0]
 
 
-def _improved(belief: Identified, readings: MoveMeans) -> Identified:
-    """One Gauss–Newton step to the maximum a posteriori, as long as it fits no worse, within the bounds."""
-    prior = belief.prior
-    jacobian = _jacobian(belief, readings)
-    variance = belief.variance(readings) + readings.bent(belief.tips[:, 1]) ** 2
+def _improved(estimate: Identified, readings: MoveMeans) -> Identified:
+    """One Gauss–Newton step to the maximum a posteriori within the bounds, shortened until the cost does not rise."""
+    prior = estimate.prior
+    jacobian = _jacobian(estimate, readings)
+    variance = estimate.variance(readings) + readings.bent(estimate.tips[:, 1]) ** 2
     weighted = jacobian.T / variance
-    gradient = weighted @ belief.left(readings) - prior.precision @ (belief.parameters - prior.mean)
+    gradient = weighted @ estimate.left(readings) - prior.precision @ (estimate.parameters - prior.mean)
     precision = weighted @ jacobian + prior.precision
-    belief = replace(belief, precision=precision)
+    estimate = replace(estimate, precision=precision)
     step = np.linalg.solve(precision, gradient)
     if not np.isfinite(step).all():
-        return belief._with(belief.parameters)
-    goal = np.clip(belief.parameters + step, *prior.bounds)
+        return estimate._with(estimate.parameters)
+    goal = np.clip(estimate.parameters + step, *prior.bounds)
 
     def cost(other: Identified) -> float:
         return float(0.5 * (other.left(readings) ** 2 / variance).sum()) + prior.cost(other.parameters)
 
-    most, fitted = cost(belief), belief
+    most, fitted = cost(estimate), estimate
     for share in _SHARES:
-        fitted = belief._with(belief.parameters + share * (goal - belief.parameters))
+        fitted = estimate._with(estimate.parameters + share * (goal - estimate.parameters))
         if fitted.state.converged and cost(fitted) <= most:
             break
     return fitted
@@ -368,7 +368,7 @@ def _jacobian(estimate: Identified, readings: MoveMeans) -> Floats:
 def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) -> tuple[Perturbed, Floats]:
     """The needle with another value of parameter k, and its tips (m + 1 + a, 3), the a steps `ahead` included.
 
-    What was before the parameter matters is not simulated again.
+    Moves before the parameter has an effect are not simulated again.
     """
     simulator, begins = (
         _adapted(estimate.nominal, estimate.settings, parameters),
@@ -388,7 +388,7 @@ def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) 
 
 
 def _low_passed(settings: Priors, left: Floats) -> float:
-    """The residuals (r,) of the last moves, each less than the one after it."""
+    """Low-pass of the residuals (r,) of the last moves, later ones with more weight."""
     level, gain = 0.0, settings.residual_gain
     for value in left[-_RECENT:].tolist():
         level += gain * (value - level)

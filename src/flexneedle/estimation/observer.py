@@ -1,10 +1,10 @@
-"""An observer that corrects the state: the model follows the tracker, so that its prediction has no offset.
+"""An observer that corrects the state of the model to the readings, so that its prediction has no offset.
 
 Readings come late. Each belongs to the move in which it was taken; the estimate is corrected there, and the moves
 since are predicted again (a fixed-lag filter).
 
-The start error along the axis is fitted to all readings (a scalar Kalman filter): axial motion is rigid.
-In air the free end is short and stiff, and noise reads as force: there the start offset and angle of the base
+The start error along the axis is estimated from all readings (a scalar Kalman filter): axial motion is rigid.
+In air the free end is short and stiff, so that noise would act as a force: there the start offset and angle of the base
 are fitted (recursive least squares with a prior). In tissue the measured tip is an essential condition, and the
 force that it needs, low-passed, stays as a tip load in the prediction.
 """
@@ -21,21 +21,21 @@ from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
 from flexneedle.types import Command, Floats, Measurement
 
-_DRIFT = 0.5  # of the path that the bevel bends: how far a model may be off it
+_DRIFT = 0.5  # of the path that the bevel bends: standard deviation of a model's error
 
 
 @dataclass(frozen=True)
 class StateCorrection:
-    """What this observer may estimate: where the clamp holds the base, in air; a tip load, in tissue.
+    """Quantities that this observer estimates: in air the pose of the base clamp, in tissue a tip load.
 
-    Without the load the measured tip is released again in the prediction, as in the paper.
+    Without the load the prediction releases the measured tip, as in the paper.
     """
 
     fits_start: bool = True
-    learns_load: bool = True
+    estimates_load: bool = True
 
     def begin(self, task: Task) -> "Corrected":
-        """Begin with a straight start and the prior of the scenario."""
+        """The estimate before the first reading: a straight needle, and the scenario's prior."""
         simulator, control = task.simulator, task.scenario.control
         prior = np.diag([control.start_offset_sd_mm**2, control.start_angle_sd**2])
         state = simulator.start(task.plan.bevel)
@@ -46,15 +46,15 @@ class StateCorrection:
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """An `Estimate`. `state` is that of now.
+    """An `Estimate`; `state` is the present one.
 
-    past: the state before the first of `moves`, those of which readings may still come; tips (k + 1, 3): estimated
-    tip pose at their ends, the start first; covariance (2, 2) of base y (mm) and turn (rad), and axial, the variance of
+    past: the state before the first of `moves`, those whose readings may still arrive; tips (k + 1, 3): estimated
+    tip pose at their ends, the start first; covariance (2, 2) of base y (mm) and θ (rad), and axial, the variance of
     the start along the axis (mm²), before `moves`; drift: standard deviation of the path's curvature (1/mm).
     """
 
     simulator: Simulator
-    beliefs: StateCorrection
+    correction: StateCorrection
     state: State
     past: State
     covariance: Floats
@@ -77,19 +77,22 @@ class Corrected:
     def tip_sd(self) -> float:
         """Standard deviation (mm) of the predicted distance of the next reading of the tip.
 
-        A path that leaves the model's by drift · x² since the skin does so by drift · (x² − s²) since a reading at s.
+        A path that leaves the model's by drift · x² below the skin leaves it by drift · (x² − s²) after a reading at s.
         """
         arm = np.array([1.0, self.simulator.scenario.needle.length_mm])
-        depth, seen = max(0.0, float(self.state.tip[0])), max(0.0, self.measured[0] if self.measured else 0.0)
-        off_path = self.drift * max(0.0, depth**2 - seen**2)
+        depth, measured = (
+            max(0.0, float(self.state.tip[0])),
+            max(0.0, self.measured[0] if self.measured else 0.0),
+        )
+        off_path = self.drift * max(0.0, depth**2 - measured**2)
         return float(np.sqrt(arm @ self.covariance @ arm + self.axial + off_path**2))
 
     def tip_at(self, time: float) -> tuple[float, float]:
         """Estimated position of the tip (mm) at `time`."""
         return along(self.moves, self.tips, time)
 
-    def unseen(self) -> "Corrected":
-        """The same without an innovation."""
+    def without_reading(self) -> "Corrected":
+        """The estimate of a period without a good reading: innovation 0."""
         return replace(self, innovation=(0.0, 0.0))
 
     def move(self, applied: Command, begun: float, ended: float) -> "Corrected":
@@ -99,7 +102,7 @@ class Corrected:
         return replace(self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)))
 
     def observe(self, samples: Sequence[Measurement]) -> "Corrected":
-        """Correct by good samples (newest last); a move is closed once a reading of its end is in."""
+        """Correct by good samples (newest last); a move is closed once a reading of its end has arrived."""
         moves = assigned(self.moves, samples)
         newest = max((sample.time for sample in samples), default=-np.inf)
         at = replace(self, state=self.past, moves=moves)
@@ -124,18 +127,20 @@ def _followed(at: Corrected, done: Move) -> Corrected:
     before, predicted = at.tip, at.simulator.step(at.state, Control.from_row(done.applied))
     if not done.samples:
         return replace(at, state=predicted)
-    seen = np.mean([_innovation(before, predicted.tip, done, sample) for sample in done.samples], axis=0)
-    measured = predicted.tip[:2] + seen
+    innovation = np.mean(
+        [_innovation(before, predicted.tip, done, sample) for sample in done.samples], axis=0
+    )
+    measured = predicted.tip[:2] + innovation
     noise = float(at.simulator.scenario.tracker.jitter_per_axis / np.sqrt(len(done.samples)))
-    at, predicted = _moved_along(at, done, float(seen[0]), noise)
+    at, predicted = _moved_along(at, done, float(innovation[0]), noise)
     at = replace(
         at,
-        innovation=(float(seen[0]), float(seen[1])),
+        innovation=(float(innovation[0]), float(innovation[1])),
         measured=(float(measured[0]), float(measured[1])),
     )
     if predicted.tip[0] > 0.0:
         return replace(at, state=_held(at, predicted, measured))
-    if not at.beliefs.fits_start:
+    if not at.correction.fits_start:
         return replace(at, state=at.simulator.assimilate(predicted, measured.tolist()).state)
     return _fit_start(at, predicted, float(measured[1] - predicted.tip[1]), noise)
 
@@ -149,7 +154,7 @@ def _innovation(before: Floats, after: Floats, done: Move, sample: Measurement) 
 def _moved_along(at: Corrected, done: Move, off: float, noise: float) -> tuple[Corrected, State]:
     """One step of a Kalman filter on the start along the axis, and the move predicted again with it.
 
-    As one step with the correction: what it cuts is still free to follow the measured tip.
+    In one step with the correction: its cut can still follow the measured tip.
     """
     gain = at.axial / (at.axial + noise**2 + 1e-12)
     moved = at.state.with_estimate(base_x=float(at.state.base[0]) + gain * off)
@@ -167,15 +172,15 @@ def _bevel_reach(simulator: Simulator, depth: float) -> float:
     return abs(float(simulator.rollout(simulator.start(), controls).tips[0, -1, 1]))
 
 
-def _fit_start(at: Corrected, predicted: State, seen: float, noise: float) -> Corrected:
-    """One step of recursive least squares on base y and turn; linear, since nothing but the guide touches."""
+def _fit_start(at: Corrected, predicted: State, innovation: float, noise: float) -> Corrected:
+    """One step of recursive least squares on base y and θ; linear, since only the guide touches the needle."""
     simulator = at.simulator
     sensitivity = np.array(
         [_tip_shift(simulator, predicted, 1.0, 0.0), _tip_shift(simulator, predicted, 0.0, 1e-3) / 1e-3]
     )
     spread = at.covariance @ sensitivity
     gain = spread / (sensitivity @ spread + noise**2 + 1e-12)
-    base_y, base_turn = predicted.base[1:] + gain * seen
+    base_y, base_turn = predicted.base[1:] + gain * innovation
     corrected = simulator.step(
         predicted.with_estimate(base_y=float(base_y), base_turn=float(base_turn)), Control()
     )
@@ -190,9 +195,9 @@ def _tip_shift(simulator: Simulator, state: State, base_y: float, base_turn: flo
 
 
 def _held(at: Corrected, predicted: State, measured: Floats) -> State:
-    """The state with its tip where it was measured, and the load that this takes, low-passed, if it is estimated."""
+    """The state with the tip held at its measured position and, if it is estimated, the low-passed load of that."""
     held = at.simulator.assimilate(predicted, measured.tolist()).state
-    if not at.beliefs.learns_load:
+    if not at.correction.estimates_load:
         return held
     gain = at.simulator.scenario.control.load_gain
     return held.with_estimate(tip_load=held.tip_load + gain * held.reactions.tip_force)

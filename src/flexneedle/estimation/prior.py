@@ -1,4 +1,4 @@
-"""The prior of what `adaptive-mpc` identifies: normal, from the scenario and the settings, with bounds from the law.
+"""Prior of the parameters that `adaptive-mpc` identifies: normal, from scenario and settings, with the law's bounds.
 
 Parameters in order: base y (mm), base turn (rad), natural bend of the needle (mm), run-out (mm), factor on the bevel
 offset, clearance in the guide (mm), ln of the factor on each layer's modulus, shift (mm) of each boundary between
@@ -18,19 +18,19 @@ from flexneedle.types import Floats
 
 BASE_Y, BASE_TURN, BEND, RUN_OUT, BEVEL, CLEARANCE, MODULUS = range(7)
 LEAST_SD = 1e-6
-"""Of a parameter without a standard deviation: it is known."""
+"""Standard deviation of a parameter that is known (given as 0)."""
 _STEPS = (0.05, 3e-4, 0.05, 0.05, 0.05, 0.02)  # for differences: mm, rad, mm, mm, 1, mm
 _LOG_STEP = 0.05
 _SHIFT_STEP = 0.2  # mm
-_WIDEST = 4.0  # standard deviations that a parameter may leave its prior
+_WIDEST = 4.0  # standard deviations by which a parameter may deviate from its prior
 _MOST_CELLS = 200
 
 
 class Priors(Section):
-    """Settings of the observer, keys of the section of the controller that has it."""
+    """Settings of the observer, keys in the section of its controller."""
 
     bend_sd_mm: NonNegative = 0.5
-    """Prior of the natural bend of the needle, over its length: standard deviation."""
+    """Prior of the natural bend of the needle (lateral offset of its tip): standard deviation."""
     run_out_sd_mm: NonNegative = 0.1
     """Prior of the distance of the measured tip from the needle's axis: standard deviation."""
     clearance_mm: NonNegative = 0.05
@@ -46,21 +46,21 @@ class Priors(Section):
     variation_sd: NonNegative = 0.2
     """Prior of the logarithm of the modulus along the depth, about that of its layer: standard deviation."""
     variation_length_mm: Positive = 10.0
-    """Length over which the variation of the modulus along the depth is correlated."""
+    """Correlation length of the variation of the modulus along the depth."""
     cell_mm: Positive = 2.5
-    """Length of the cells in which the modulus is taken as constant."""
+    """Length along the depth of the cells in which the modulus is constant."""
     model_sd: NonNegative = 0.01
-    """Standard deviation of a reading's mean that no parameter explains, relative to the bevel offset."""
+    """Model error: standard deviation of the mean of a move's readings, relative to the bevel offset."""
     least_model_sd_mm: Positive = 0.0126
-    """Least standard deviation of a reading's mean that no parameter explains."""
+    """Lower bound of the same standard deviation."""
     residual_gain: Fraction = 0.4
-    """Gain of the low-pass over what the fit leaves."""
+    """Gain of the low-pass filter on the residuals of the fit, per move."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
     """Normal prior of the parameters: mean (K,), precision (K, K), bounds (2, K); steps for differences (K,); the depth
-    of the tip (mm) from which each matters to it (K,).
+    of the tip (mm) from which each has an effect on it (K,).
     """
 
     mean: Floats
@@ -71,7 +71,7 @@ class Prior:
 
     @staticmethod
     def of(scenario: Scenario, settings: Priors, depth: float) -> "Prior":
-        """The scenario's."""
+        """The prior of a scenario."""
         control = scenario.control
         layers, cells = len(scenario.tissue), _cells(depth, settings)
         single = (
@@ -102,13 +102,13 @@ class Prior:
         return Prior(mean, precision, bounds, steps, begins)
 
     def cost(self, parameters: Floats) -> float:
-        """Minus the logarithm of the density, but for a constant."""
+        """Negative logarithm of the density, up to a constant."""
         off = parameters - self.mean
         return float(0.5 * off @ self.precision @ off)
 
 
 def unexplained(scenario: Scenario, settings: Priors) -> float:
-    """Standard deviation (mm) of the mean of a move's readings that no parameter explains."""
+    """Model error: standard deviation (mm) of the mean of a move's readings that no parameter explains."""
     return max(settings.least_model_sd_mm, settings.model_sd * scenario.needle.bevel.offset_mm)
 
 
@@ -123,7 +123,7 @@ def _uncorrelating(size: int, distance: float) -> Floats:
 
 
 def _cells(depth: float, settings: Priors) -> int:
-    """Cells from the skin to the target's depth (mm); the last one goes on."""
+    """Number of cells from the skin to the target's depth (mm); the last one has no lower end."""
     return max(2, int(np.ceil(depth / settings.cell_mm)))
 
 

@@ -1,4 +1,4 @@
-"""What a controller is to carry out."""
+"""The task of a controller."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,9 +10,9 @@ from flexneedle.types import Plan
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A plan, the model as the scenario has it, and the controller's own settings.
+    """A plan, the scenario's model, and the controller's own settings.
 
-    settings: of the class that the `Method` names, checked; None for a controller without any.
+    settings: checked, of the class `Method.settings`; None for a controller without any.
     """
 
     simulator: Simulator

@@ -77,18 +77,18 @@ def see(
     watch, field = watch.look()
     if not field.ok:
         return Observation(
-            predicted.unseen(), watch, _refused(readings, field), newest.sample, field, field=True
+            predicted.without_reading(), watch, _refused(readings, field), newest.sample, field, field=True
         )
     if not (doubt := watch.doubt()).ok:
         readings = _refused(readings, doubt)
     good = [reading.sample for reading in readings if reading.verdict.ok]
     corrected = predicted.observe(good)
-    estimate = corrected if good else corrected.unseen()
+    estimate = corrected if good else corrected.without_reading()
     if newest.verdict.ok:
         return Observation(estimate, watch, readings, newest.sample)
     if (before := watch.only_missed(newest.sample, newest.verdict)) is not None:
         return Observation(estimate, watch, readings, before)
-    return Observation(corrected.unseen(), watch, readings, newest.sample, newest.verdict)
+    return Observation(corrected.without_reading(), watch, readings, newest.sample, newest.verdict)
 
 
 def _without_news(
@@ -99,11 +99,13 @@ def _without_news(
     status: of the tracker, which may know why it is silent.
     """
     if not watch.field.ok and watch.heard(now, stale_after):
-        return Observation(predicted.unseen(), watch, verdict=watch.field, field=True)
+        return Observation(predicted.without_reading(), watch, verdict=watch.field, field=True)
     if (before := watch.last_good(now, stale_after)) is not None:
-        return Observation(predicted.unseen(), watch, sample=before)
+        return Observation(predicted.without_reading(), watch, sample=before)
     why = "" if status == VISIBLE else f" ({status})"
-    return Observation(predicted.unseen(), watch, verdict=Verdict(VerdictKind.MISSING, f"no reading{why}"))
+    return Observation(
+        predicted.without_reading(), watch, verdict=Verdict(VerdictKind.MISSING, f"no reading{why}")
+    )
 
 
 def _refused(readings: Sequence[CheckedMeasurement], field: Verdict) -> tuple[CheckedMeasurement, ...]:

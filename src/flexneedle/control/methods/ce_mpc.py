@@ -24,7 +24,7 @@ def decide(task: Task, memory: None, estimate: Estimate, rng: np.random.Generato
 METHOD = Method(
     "ce-mpc",
     "the paper's: the measured tip is released in the prediction",
-    StateCorrection(fits_start=False, learns_load=False),
+    StateCorrection(fits_start=False, estimates_load=False),
     begin=lambda _task: None,
     decide=decide,
     settings=mpc.CeMpc,
