@@ -24,7 +24,7 @@ Command = tuple[float, float, float, float, int]
 Point = tuple[float, float, float]
 """x, y, z (mm)."""
 Quaternion = tuple[float, float, float, float]
-"""Unit quaternion w, x, y, z: rotation from the sensor's to the tracker's frame. The sensor's z axis is the needle's."""
+"""Unit quaternion w, x, y, z from the sensor's to the tracker's frame; the sensor's z axis is the needle's."""
 
 _MAKE_ONE = "make one with flexneedle.plan or flexneedle.insert"
 _GIVE_ONE = "give one with dataclasses.replace(record, scenario=scenario)"

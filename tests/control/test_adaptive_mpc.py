@@ -53,7 +53,7 @@ def estimate_of(state, scenario=PHANTOM, **fields):
 
 
 def decided(plan, estimate, seed=0, path=None):
-    """Decision and memory after it, with a path in hand that is the plan's unless another is given."""
+    """Decision and memory after it, with a current path that is the plan's unless another is given."""
     task = task_of(estimate.nominal, plan)
     begun, path = ADAPTIVE.begin(task), path or after(of_plan(plan), estimate.state.tip[0])
     memory = replace(begun, path=path, bevel=estimate.state.bevel)
@@ -71,8 +71,8 @@ def decide(plan, estimate, seed=0):
 
 def aimed(plan, state, offset, ahead=20.0):
     """The plan with a target so far ahead of a tip, and off its line (mm)."""
-    x, y, turn = state.tip
-    return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(turn) + offset)))
+    x, y, theta = state.tip
+    return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(theta) + offset)))
 
 
 def carried_out(plan, scenario, plant=None, steps=100, seed=0):
@@ -101,13 +101,13 @@ def test_it_is_the_default():
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-@pytest.mark.parametrize("turned", [False, True])
-def test_without_a_guide_it_rolls_the_bevel_to_a_target_on_either_side(quick_plan, side, turned):
+@pytest.mark.parametrize("rolled", [False, True])
+def test_without_a_guide_it_rolls_the_bevel_to_a_target_on_either_side(quick_plan, side, rolled):
     """To where the bevel alone goes, rolled now or not; a roll is in the path where there is no other path."""
     simulator = Simulator(ROLLING, threads=1)
     state = simulator.start()
     for k in range(35):
-        state = simulator.step(state, Control(db_x=1.0, flip=turned and k == 0))
+        state = simulator.step(state, Control(db_x=1.0, flip=rolled and k == 0))
     flips = (1.0, -1.0)
     ends = [
         simulator.replay(state, [[1.0, 0.0, 0.0, 0.0, flip if k == 0 else -1.0] for k in range(30)])[0].tip
@@ -127,7 +127,9 @@ def test_off_the_plan_it_finds_a_path_that_ends_nearer_the_target(quick_plan, al
     """With a base clamp that is off, where the plan's guide would miss."""
     estimate = estimate_of(along(quick_plan, 20, base_y=offset), ACCURATE)
     ahead = adaptive_mpc.Ahead.of(task_of(estimate.nominal, quick_plan), estimate.state, of_plan(quick_plan))
-    kept = adaptive_mpc._seen(estimate, ahead.controls(ahead.in_hand[None])[0]).tips[0, -1, 1] - 5.0
+    kept = (
+        adaptive_mpc._measured_rollout(estimate, ahead.controls(ahead.current[None])[0]).tips[0, -1, 1] - 5.0
+    )
     assert abs(kept) > 0.3
     assert abs(decide(quick_plan, estimate).miss) < 0.3 * abs(kept)
 
@@ -179,7 +181,7 @@ def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
     task = task_of(estimate.nominal, quick_plan)
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
     ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
-    outcome = adaptive_mpc._seen(estimate, ahead.controls(ahead.in_hand[None])[0])
+    outcome = adaptive_mpc._measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
     (term,) = (term for term in adaptive_mpc._terms(task, estimate, memory, ahead) if term.name == "miss")
     past = float(terms.past(outcome, quick_plan.target)[0])
     assert abs(past) > 1e-3
@@ -196,7 +198,7 @@ def test_near_the_target_what_is_above_its_standard_deviation_is_urgent_and_what
     task = task_of(estimate.nominal, quick_plan)
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
     ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
-    outcome = adaptive_mpc._seen(estimate, ahead.controls(ahead.in_hand[None])[0])
+    outcome = adaptive_mpc._measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
     off = terms.past(outcome, quick_plan.target)[0]
     tips = np.repeat(outcome.tips, 3, axis=0)
     tips[:, -1, 1] += np.array([0.01, 0.3, 30.0]) - off
@@ -248,7 +250,7 @@ def test_it_rests_four_two_and_one_steps_before_the_target(quick_plan):
 
 
 def test_it_rests_once_after_a_step_that_the_fit_does_not_explain(quick_plan, along):
-    """Four standard deviations off, to either side; in air, and where the needle has just rested, it goes on."""
+    """Four standard deviations off, to either side; in air, and where the needle has just rested, it moves."""
 
     def rest(state, sd, command=(1.0, 0.0, 0.0, 0.0, -1)):
         estimate = estimate_of(state)
@@ -265,16 +267,16 @@ def test_it_rests_once_after_a_step_that_the_fit_does_not_explain(quick_plan, al
 
 
 def test_what_is_in_hand_is_never_given_up_for_something_worse(quick_plan, along):
-    """The cost that is found is at most that of the path in hand, of any roll and guide."""
+    """The cost that is found is at most that of the current path, of any roll and guide."""
     estimate = estimate_of(along(quick_plan, 40), QUICK)
     task = task_of(estimate.nominal, quick_plan)
     for rolls in ((), (20.0,), (15.0, 18.0)):
         path = replace(of_plan(quick_plan), rolls=rolls)
         ahead = adaptive_mpc.Ahead.of(task, estimate.state, path)
-        kept = ahead.controls(ahead.in_hand[None])[0]
+        kept = ahead.controls(ahead.current[None])[0]
         listed = adaptive_mpc._terms(task, estimate, ADAPTIVE.begin(task), ahead)
-        in_hand = float(cost(listed, adaptive_mpc._seen(estimate, kept))[0])
-        assert decided(quick_plan, estimate, path=path)[0].cost <= in_hand + 1e-9
+        current = float(cost(listed, adaptive_mpc._measured_rollout(estimate, kept))[0])
+        assert decided(quick_plan, estimate, path=path)[0].cost <= current + 1e-9
 
 
 @pytest.mark.parametrize("carried_out", [False, True])
@@ -288,17 +290,17 @@ def test_a_roll_stays_in_hand_until_the_needle_has_rolled(quick_plan, along, car
     )
     if carried_out:
         estimate = replace(estimate, state=estimate.simulator.step(estimate.state, Control(flip=True)))
-    seen = []
+    rolls = []
     search = adaptive_mpc._search
 
     def spied(task, fitted, ahead, *rest):
-        seen.append(ahead.path.rolls)
+        rolls.append(ahead.path.rolls)
         return search(task, fitted, ahead, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(adaptive_mpc, "_search", spied)
         ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))
-    assert seen[0] == (() if carried_out else (x,))
+    assert rolls[0] == (() if carried_out else (x,))
 
 
 def test_the_miss_is_that_of_the_path_that_is_found(quick_plan, along):
@@ -332,11 +334,11 @@ def test_a_roll_takes_the_run_out_to_the_other_side(quick_plan, along):
     parameters[RUN_OUT] = 0.5
     controls = np.zeros((1, 4, 5))
     controls[..., 0], controls[..., 4] = 1.0, (-1.0, 1.0, -1.0, -1.0)
-    plain = adaptive_mpc._seen(estimate, controls).tips
-    seen = adaptive_mpc._seen(replace(estimate, parameters=parameters), controls).tips
+    plain = adaptive_mpc._measured_rollout(estimate, controls).tips
+    tips = adaptive_mpc._measured_rollout(replace(estimate, parameters=parameters), controls).tips
     side = estimate.state.bevel * np.array([1.0, -1.0, -1.0, -1.0])
-    np.testing.assert_allclose(seen[0, :, 1] - plain[0, :, 1], 0.5 * side, atol=1e-12)
-    np.testing.assert_array_equal(seen[0, :, [0, 2]], plain[0, :, [0, 2]])
+    np.testing.assert_allclose(tips[0, :, 1] - plain[0, :, 1], 0.5 * side, atol=1e-12)
+    np.testing.assert_array_equal(tips[0, :, [0, 2]], plain[0, :, [0, 2]])
 
 
 def test_the_fitted_model_is_the_one_that_predicts(quick_plan, along):
@@ -518,17 +520,17 @@ def test_a_soft_needle_is_steered_where_its_tip_bends_off_below_the_skin(number)
     assert flexneedle.insert(scenario, plan, seed=number, phantom="model").true_error_mm < 0.2
 
 
-def test_where_no_path_converges_it_stands_still_and_says_so(quick_plan, along, monkeypatch):
-    """What was in hand stays in hand, and nothing is predicted."""
+def test_where_no_path_converges_it_rests_and_reports_it(quick_plan, along, monkeypatch):
+    """The current path is kept, and nothing is predicted."""
     estimate = estimate_of(along(quick_plan, 20), QUICK)
     task = task_of(estimate.nominal, quick_plan)
-    memory, seen = ADAPTIVE.begin(task), adaptive_mpc._seen
+    memory, rollout = ADAPTIVE.begin(task), adaptive_mpc._measured_rollout
 
     def lost(fitted, controls):
-        outcome = seen(fitted, controls)
+        outcome = rollout(fitted, controls)
         return replace(outcome, converged=np.zeros_like(outcome.converged))
 
-    monkeypatch.setattr(adaptive_mpc, "_seen", lost)
+    monkeypatch.setattr(adaptive_mpc, "_measured_rollout", lost)
     decision, after = ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))
     assert decision.command == (0.0, 0.0, 0.0, 0.0, -1)
     assert decision.why == "no path converges on the fitted model"

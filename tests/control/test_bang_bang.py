@@ -12,7 +12,7 @@ from flexneedle.control.bang_bang import closest_approach, wants_flip
 
 POSES = {
     "straight ahead": ((0.0, 0.0, 0.0), (40.0, 0.0)),
-    "aside": ((0.0, 0.0, 0.0), (40.0, 5.0)),
+    "lateral": ((0.0, 0.0, 0.0), (40.0, 5.0)),
     "on the way": ((12.0, 1.5, 0.1), (40.0, 5.0)),
     "turned away": ((20.0, -2.0, -0.3), (45.0, 5.0)),
     "close": ((39.0, 4.8, 0.05), (40.0, 5.0)),
@@ -24,9 +24,9 @@ POSES = {
 def followed(pose, curvature, target, step=1e-3):
     """Least distance to the target of paper eq. 14, x += u cos θ, y += u sin θ, θ += κ u, in small steps u."""
     reach = 2.0 * math.dist(pose[:2], target) + 1.0
-    turn = pose[2] + curvature * step * (np.arange(int(reach / step)) + 0.5)
-    x = pose[0] + step * np.concatenate([[0.0], np.cumsum(np.cos(turn))])
-    y = pose[1] + step * np.concatenate([[0.0], np.cumsum(np.sin(turn))])
+    theta = pose[2] + curvature * step * (np.arange(int(reach / step)) + 0.5)
+    x = pose[0] + step * np.concatenate([[0.0], np.cumsum(np.cos(theta))])
+    y = pose[1] + step * np.concatenate([[0.0], np.cumsum(np.sin(theta))])
     return float(np.hypot(x - target[0], y - target[1]).min())
 
 
@@ -38,7 +38,7 @@ def test_closest_approach_is_that_of_the_path_in_small_steps(pose, target, curva
 
 
 def test_closest_approach_to_a_circle_by_hand():
-    """A radius of 100 round (0, 100): the target at (60, 20) lies exactly on it, (60, 30) inside by 100 − √8500."""
+    """A radius of 100 round (0, 100): the target at (60, 20) is exactly on it, (60, 30) inside by 100 − √8500."""
     start = np.zeros(3)
     assert closest_approach(start, 0.01, (60.0, 20.0)) == pytest.approx(0.0, abs=1e-12)
     assert closest_approach(start, 0.01, (60.0, 30.0)) == pytest.approx(100.0 - math.sqrt(8500.0))
@@ -47,18 +47,18 @@ def test_closest_approach_to_a_circle_by_hand():
 @pytest.mark.parametrize("curvature", [-0.01, 0.0, 0.01])
 def test_a_target_behind_is_as_near_as_it_is_now(curvature):
     assert closest_approach(np.array([40.0, 5.0, 0.0]), curvature, (37.0, 1.0)) == pytest.approx(5.0)
-    turned = np.array([0.0, 0.0, math.pi])
-    assert closest_approach(turned, curvature, (3.0, 4.0)) == pytest.approx(5.0)
+    backwards = np.array([0.0, 0.0, math.pi])
+    assert closest_approach(backwards, curvature, (3.0, 4.0)) == pytest.approx(5.0)
 
 
 @given(
-    x=st.floats(-10, 60), y=st.floats(-10, 10), turn=st.floats(-0.5, 0.5),
-    aside=st.floats(-15, 15), bevel=st.sampled_from([-1, 1]), curvature=st.floats(0, 0.02),
+    x=st.floats(-10, 60), y=st.floats(-10, 10), theta=st.floats(-0.5, 0.5),
+    lateral=st.floats(-15, 15), bevel=st.sampled_from([-1, 1]), curvature=st.floats(0, 0.02),
 )  # fmt: skip
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=200)
-def test_mirrored_pose_target_and_bevel_give_the_same_answer(x, y, turn, aside, bevel, curvature):
-    here = wants_flip(np.array([x, y, turn]), bevel, curvature, (40.0, aside), 0.3, 0.01)
-    mirrored = wants_flip(np.array([x, -y, -turn]), -bevel, curvature, (40.0, -aside), 0.3, 0.01)
+def test_mirrored_pose_target_and_bevel_give_the_same_answer(x, y, theta, lateral, bevel, curvature):
+    here = wants_flip(np.array([x, y, theta]), bevel, curvature, (40.0, lateral), 0.3, 0.01)
+    mirrored = wants_flip(np.array([x, -y, -theta]), -bevel, curvature, (40.0, -lateral), 0.3, 0.01)
     assert here == mirrored
 
 
@@ -67,7 +67,7 @@ def flips(bevel, target, *, band=0.0, noise=0.0, curvature=0.001, pose=(0.0, 0.0
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_bevel_turns_towards_the_target_and_stays_there(side):
+def test_bevel_rolls_towards_the_target_and_stays_there(side):
     assert flips(-1, (40.0, 3.0)) is True
     assert flips(1, (40.0, 3.0)) is False
     assert flips(1, (40.0, -3.0)) is True
@@ -78,8 +78,8 @@ def test_bevel_turns_towards_the_target_and_stays_there(side):
 
 
 def test_dead_band_is_a_share_of_the_separation_of_the_paths():
-    """κ = 1/m, 40 mm ahead: the paths pass 0.8 mm aside each, 1.6 mm apart. With the target at −y the other
-    path is nearer by 2y, until it lies beyond it: 1.2 mm of advantage at −0.6 mm are 0.75 of the separation."""
+    """κ = 1/m, 40 mm ahead: the paths pass 0.8 mm lateral each, 1.6 mm apart. With the target at −y the other
+    path is nearer by 2y, until it is beyond it: 1.2 mm of advantage at −0.6 mm are 0.75 of the separation."""
     assert flips(1, (40.0, -0.6), band=0.70) is True
     assert flips(1, (40.0, -0.6), band=0.80) is False
     assert flips(1, (40.0, -5.0), band=0.95) is True
@@ -95,7 +95,7 @@ def test_noise_of_the_tracker_is_needed_in_any_case():
     assert flips(1, (40.0, -0.6), band=0.45, noise=0.3) is False
 
 
-def test_a_target_far_off_the_line_turns_the_bevel_however_near_it_is():
+def test_a_target_far_off_the_line_rolls_the_bevel_however_near_it_is():
     """The two paths part by 0.025 mm over the last 5 mm; a gain of that size can't be asked for."""
     assert flips(1, (5.0, -0.3), band=0.8, noise=0.12) is True
     assert flips(1, (5.0, -0.1), band=0.8, noise=0.12) is False
@@ -111,6 +111,6 @@ def test_reason_gives_both_misses():
     """±0.8 mm at 40 mm and a target 0.6 mm to the other side."""
     flip, why = wants_flip(np.zeros(3), 1, 0.001, (40.0, -0.6), 0.0, 0.0)
     assert flip
-    assert why == "bevel turned: keeping misses by 1.399 mm, turning by 0.200 mm"
+    assert why == "bevel rolled: predicted miss 1.399 mm if kept, 0.200 mm if rolled"
     _, why = wants_flip(np.zeros(3), -1, 0.001, (40.0, -0.6), 0.0, 0.0)
-    assert why == "bevel kept: keeping misses by 0.200 mm, turning by 1.399 mm"
+    assert why == "bevel kept: predicted miss 0.200 mm if kept, 1.399 mm if rolled"

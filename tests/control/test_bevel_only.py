@@ -1,4 +1,4 @@
-"""Bevel alone: full advance, no motion aside, the bevel towards the target by its own settings."""
+"""Bevel alone: full advance, no lateral motion, the bevel towards the target by its own settings."""
 
 from dataclasses import replace
 
@@ -24,10 +24,10 @@ def command(plan, estimate, **settings):
     return decision.command
 
 
-def aimed(plan, state, aside, ahead=20.0):
-    """The plan with a target so far ahead of a tip, and aside of its line (mm)."""
-    x, y, turn = state.tip
-    return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(turn) + aside)))
+def aimed(plan, state, lateral, ahead=20.0):
+    """The plan with a target at these distances ahead of a tip and lateral of its line (mm)."""
+    x, y, theta = state.tip
+    return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(theta) + lateral)))
 
 
 def test_it_advances_at_full_step_and_moves_nothing_aside(quick_plan, estimated, along):
@@ -41,11 +41,11 @@ def test_the_last_advance_ends_at_the_target_depth(quick_plan, estimated, along,
     assert command(aimed(quick_plan, state, 0.0, ahead=left), estimated(state))[0] == pytest.approx(left)
 
 
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("rolled", [False, True])
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_the_bevel_turns_to_the_target_in_tissue_and_stays_in_air(quick_plan, estimated, along, side, turned):
+def test_the_bevel_rolls_to_the_target_in_tissue_and_stays_in_air(quick_plan, estimated, along, side, rolled):
     for steps, in_air in ((50, False), (5, True)):
-        state = Simulator(PHANTOM).step(along(quick_plan, steps), Control(flip=turned))
+        state = Simulator(PHANTOM).step(along(quick_plan, steps), Control(flip=rolled))
         right_way = state.bevel == side
         given = command(aimed(quick_plan, state, 2.0 * side), estimated(state))
         assert given[4] == (-1 if right_way or in_air else 1)
@@ -65,7 +65,7 @@ def test_curvature_and_dead_band_are_its_own(quick_plan, estimated, along):
 
 
 def test_the_rule_hears_of_three_standard_deviations_of_a_reading(quick_plan, estimated, along, monkeypatch):
-    heard, rule = [], bang_bang.wants_flip
-    monkeypatch.setattr(bang_bang, "wants_flip", lambda *args: heard.append(args[2:]) or rule(*args))
+    calls, rule = [], bang_bang.wants_flip
+    monkeypatch.setattr(bang_bang, "wants_flip", lambda *args: calls.append(args[2:]) or rule(*args))
     command(quick_plan, estimated(along(quick_plan, 50)), curvature_per_m=2.0, flip_dead_band=0.25)
-    assert heard == [(pytest.approx(2e-3), quick_plan.target, 0.25, pytest.approx(3 * 0.07 / 3**0.5))]
+    assert calls == [(pytest.approx(2e-3), quick_plan.target, 0.25, pytest.approx(3 * 0.07 / 3**0.5))]

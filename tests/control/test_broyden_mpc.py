@@ -29,26 +29,26 @@ MOVE = VECTOR.filter(lambda move: np.abs(move).max() > 0.05)
 # ---- Broyden's update
 
 
-@given(jacobian=MATRIX, moved=MOVE, seen=VECTOR)
+@given(jacobian=MATRIX, moved=MOVE, measured=VECTOR)
 @hypothesis_settings(derandomize=True)
-def test_the_full_update_meets_the_secant_equation(jacobian, moved, seen):
-    np.testing.assert_allclose(bm.broyden(jacobian, moved, seen, 1.0) @ moved, seen, atol=1e-9)
+def test_the_full_update_meets_the_secant_equation(jacobian, moved, measured):
+    np.testing.assert_allclose(bm.broyden(jacobian, moved, measured, 1.0) @ moved, measured, atol=1e-9)
 
 
-@given(jacobian=MATRIX, moved=MOVE, seen=VECTOR, gain=st.floats(0, 1))
+@given(jacobian=MATRIX, moved=MOVE, measured=VECTOR, gain=st.floats(0, 1))
 @hypothesis_settings(derandomize=True)
-def test_the_update_changes_nothing_across_the_move_and_is_of_rank_one(jacobian, moved, seen, gain):
-    updated = bm.broyden(jacobian, moved, seen, gain)
+def test_the_update_changes_nothing_across_the_move_and_is_of_rank_one(jacobian, moved, measured, gain):
+    updated = bm.broyden(jacobian, moved, measured, gain)
     across = np.array([-moved[1], moved[0]])
     np.testing.assert_allclose(updated @ across, jacobian @ across, atol=1e-9)
     assert np.linalg.matrix_rank(updated - jacobian, tol=1e-9) <= 1
 
 
-@given(jacobian=MATRIX, moved=MOVE, seen=VECTOR, other=MATRIX)
+@given(jacobian=MATRIX, moved=MOVE, measured=VECTOR, other=MATRIX)
 @hypothesis_settings(derandomize=True)
-def test_no_other_matrix_that_meets_the_equation_is_nearer(jacobian, moved, seen, other):
-    nearest = bm.broyden(jacobian, moved, seen, 1.0)
-    meets = other + np.outer(seen - other @ moved, moved) / (moved @ moved)
+def test_no_other_matrix_that_meets_the_equation_is_nearer(jacobian, moved, measured, other):
+    nearest = bm.broyden(jacobian, moved, measured, 1.0)
+    meets = other + np.outer(measured - other @ moved, moved) / (moved @ moved)
     assert np.linalg.norm(nearest - jacobian) <= np.linalg.norm(meets - jacobian) + 1e-9
 
 
@@ -111,7 +111,7 @@ def moves(plan, jacobian, tip, guide=0.0, steps=4, **settings):
 
 
 def straight(plan, lateral):
-    """The plan with a path that lies at one lateral place."""
+    """The plan with a path at one lateral position."""
     tips = plan.tips * [1.0, 0.0, 0.0] + [0.0, lateral, 0.0]
     return replace(plan, tips=tips, target=(plan.target[0], lateral))
 
@@ -128,7 +128,7 @@ def test_free_of_limits_and_weight_the_prediction_meets_the_path_at_every_step(q
 
 
 def test_the_cost_of_guide_steps_by_hand(quick_plan):
-    """One step to a path 0.2 mm aside, effect 1, weight 1: half of it."""
+    """One step to a path with a lateral offset of 0.2 mm, effect 1, weight 1: half of it."""
     found, cost = moves(straight(quick_plan, 0.2), np.eye(2), (10.0, 0.0), steps=1, guide_weight=1.0)
     assert found[0] == pytest.approx(0.1)
     assert cost == pytest.approx(0.02)
@@ -152,32 +152,32 @@ def linear_run(plan, slope, effect, *, delay=1, steps=30, noise=0.0, guide_effec
         {"control.broyden_mpc.guide_weight": 0.0, "control.broyden_mpc.guide_effect": guide_effect}
     )
     task = task_of(Simulator(scenario, threads=1), plan, "broyden-mpc")
-    learnt, inputs, tips = BROYDEN.begin(task), [np.zeros(2)], [np.array([-28.5, 0.0])]
+    memory, inputs, tips = BROYDEN.begin(task), [np.zeros(2)], [np.array([-28.5, 0.0])]
     rng = np.random.default_rng(1)
     for k in range(steps):
         insertion, guide = inputs[-1]
-        seen = tips[k - delay] + rng.normal(0.0, noise, 2) if k >= delay else None
+        measured = tips[k - delay] + rng.normal(0.0, noise, 2) if k >= delay else None
         state = SimpleNamespace(
             travel=np.array([insertion, 0.0, 0.0, guide]), guide=guide, tip=np.array([*tips[-1], 0.0]),
             base=np.array([scenario.start_base_x + insertion, 0.0, 0.0]),
         )  # fmt: skip
-        estimate = SimpleNamespace(state=state, measured=None if seen is None else tuple(seen))
-        decision, learnt = BROYDEN.decide(task, learnt, estimate, RNG)
+        estimate = SimpleNamespace(state=state, measured=None if measured is None else tuple(measured))
+        decision, memory = BROYDEN.decide(task, memory, estimate, RNG)
         assert decision.command[1:3] == (0.0, 0.0)
         assert decision.command[4] == -1
         inputs.append(inputs[-1] + np.array(decision.command)[[0, 3]])
         tips.append(np.array([-28.5 + inputs[-1][0], slope * inputs[-1][0] + effect * inputs[-1][1]]))
-    return np.array(tips), np.array(inputs), learnt
+    return np.array(tips), np.array(inputs), memory
 
 
 @pytest.mark.parametrize("delay", [1, 2])
 @pytest.mark.parametrize(("slope", "effect"), [(0.05, 1.0), (-0.03, 1.0), (0.03, 0.8)])
 def test_a_linear_needle_is_learnt_and_kept_on_its_path(quick_plan, slope, effect, delay):
     """Readings are held against the inputs of when they were taken: a late one costs no accuracy."""
-    tips, _, learnt = linear_run(straight(quick_plan, 0.0), slope, effect, delay=delay)
+    tips, _, memory = linear_run(straight(quick_plan, 0.0), slope, effect, delay=delay)
     assert np.abs(tips[:3, 1]).max() > 0.02
     np.testing.assert_allclose(tips[20:, 1], 0.0, atol=5e-3)
-    direction = learnt.jacobian @ [1.0, -slope / effect]
+    direction = memory.jacobian @ [1.0, -slope / effect]
     np.testing.assert_allclose(direction, [1.0, 0.0], atol=2e-3)  # what it needs to know of the Jacobian
 
 
@@ -186,7 +186,7 @@ def test_a_linear_needle_is_learnt_and_kept_on_its_path(quick_plan, slope, effec
 def test_with_another_effect_of_the_guide_than_first_estimated_it_swings_and_settles(
     quick_plan, effect, delay
 ):
-    """Small guide steps tell little of the guide's effect, so the first Jacobian is forgotten slowly."""
+    """Small guide steps show little of the guide's effect, so the first Jacobian is forgotten slowly."""
     tips, _, _ = linear_run(straight(quick_plan, 0.0), -0.03, effect, delay=delay, steps=60)
     assert np.abs(tips[50:, 1]).max() < 0.04
 
@@ -203,41 +203,41 @@ def test_noise_of_the_tracker_does_not_upset_it(quick_plan):
 
 
 def test_before_the_first_reading_it_goes_straight_on(quick_plan):
-    _, inputs, learnt = linear_run(straight(quick_plan, 2.0), 0.0, 1.0, steps=3, delay=3)
+    _, inputs, memory = linear_run(straight(quick_plan, 2.0), 0.0, 1.0, steps=3, delay=3)
     np.testing.assert_array_equal(inputs[:, 1], 0.0)
-    np.testing.assert_array_equal(learnt.jacobian, np.eye(2))
-    assert learnt.seen is None
+    np.testing.assert_array_equal(memory.jacobian, np.eye(2))
+    assert memory.last_update is None
 
 
 def test_an_old_reading_is_not_learnt_from_again():
-    learnt = bm.JacobianEstimate(
+    memory = bm.JacobianEstimate(
         np.eye(2), ((0.0, 28.5, 0.0),), (np.array([0.0, 0.0]), np.array([28.5, 0.0]))
     )
-    assert bm.learn(learnt, np.array([0.02, 0.05]), np.array([28.52, 0.0]), 0.65) is learnt
-    further = bm.learn(learnt, np.array([1.0, 0.05]), np.array([29.5, 0.0]), 0.65)
+    assert bm.updated(memory, np.array([0.02, 0.05]), np.array([28.52, 0.0]), 0.65) is memory
+    further = bm.updated(memory, np.array([1.0, 0.05]), np.array([29.5, 0.0]), 0.65)
     assert further.jacobian[1, 0] == pytest.approx(0.65 * 0.05)
 
 
 def test_inputs_are_those_of_when_the_tip_was_there():
-    learnt = bm.JacobianEstimate(np.eye(2), ((1.0, 10.0, 0.2), (2.0, 11.0, 0.6), (2.5, 11.5, 0.6)))
-    np.testing.assert_allclose(bm.inputs_at(learnt, 1.25), [10.25, 0.3])
-    np.testing.assert_allclose(bm.inputs_at(learnt, 9.0), [11.5, 0.6])
+    memory = bm.JacobianEstimate(np.eye(2), ((1.0, 10.0, 0.2), (2.0, 11.0, 0.6), (2.5, 11.5, 0.6)))
+    np.testing.assert_allclose(bm.inputs_at(memory, 1.25), [10.25, 0.3])
+    np.testing.assert_allclose(bm.inputs_at(memory, 9.0), [11.5, 0.6])
     for k in range(20):
-        learnt = bm.remember(learnt, 3.0 + k, np.zeros(2))
-    assert len(learnt.history) == 8
+        memory = bm.remember(memory, 3.0 + k, np.zeros(2))
+    assert len(memory.history) == 8
 
 
 def test_memory_is_a_value_that_deciding_leaves_alone(quick_plan, along, estimated):
     task = task_of(Simulator(PHANTOM, threads=1), quick_plan, "broyden-mpc")
     state = along(quick_plan, 30)
-    seen = (state.tip[:2] - [2.0, 0.1], np.array([state.travel[0] - 2.0, state.guide]))
-    learnt = bm.JacobianEstimate(np.array([[1.0, 0.0], [0.1, 0.9]]), (), seen)
-    before = learnt.jacobian.copy(), learnt.seen[0].copy(), learnt.seen[1].copy()
+    last_update = (state.tip[:2] - [2.0, 0.1], np.array([state.travel[0] - 2.0, state.guide]))
+    memory = bm.JacobianEstimate(np.array([[1.0, 0.0], [0.1, 0.9]]), (), last_update)
+    before = memory.jacobian.copy(), memory.last_update[0].copy(), memory.last_update[1].copy()
     estimate = estimated(state, measured=tuple(state.tip[:2].tolist()))
-    one, after = BROYDEN.decide(task, learnt, estimate, RNG)
-    again, _ = BROYDEN.decide(task, learnt, estimate, RNG)
+    one, after = BROYDEN.decide(task, memory, estimate, RNG)
+    again, _ = BROYDEN.decide(task, memory, estimate, RNG)
     assert one == again
-    for kept, now in zip(before, (learnt.jacobian, *learnt.seen), strict=True):
+    for kept, now in zip(before, (memory.jacobian, *memory.last_update), strict=True):
         np.testing.assert_array_equal(kept, now)
-    assert learnt.history == ()
-    assert not np.array_equal(after.jacobian, learnt.jacobian)
+    assert memory.history == ()
+    assert not np.array_equal(after.jacobian, memory.jacobian)

@@ -41,7 +41,7 @@ def test_only_controllers_of_the_guide_are_refused_without_one(name):
         check_guide(METHODS[name], BARE.setup, "manipulation")
         check_guide(METHODS[name], PHANTOM.setup, "steering")
         return
-    with pytest.raises(InputError, match=rf"'{name}': steers with the guide: give setup\.guide_to_skin_mm"):
+    with pytest.raises(InputError, match=rf"'{name}': needs a guide that moves: set setup\.guide_to_skin_mm"):
         check_guide(METHODS[name], BARE.setup, "manipulation")
     with pytest.raises(InputError, match=rf"'{name}': .* strategy = 'steering' does not move it"):
         check_guide(METHODS[name], PHANTOM.setup, "steering")
@@ -57,11 +57,11 @@ def test_the_refusal_comes_before_the_plan(tmp_path):
     folder = Folder.claim(tmp_path / "run", "run", "insertion", PHANTOM, 0)
     choices = Choices(0, "steering", controller="resolved-rate")
 
-    def heard(*_):
+    def never(*_):
         raise AssertionError("planned")
 
-    with pytest.raises(InputError, match="steers with the guide"):
-        record_insertion(folder, PHANTOM, choices, on_iteration=heard, on_period=heard)
+    with pytest.raises(InputError, match="needs a guide that moves"):
+        record_insertion(folder, PHANTOM, choices, on_iteration=never, on_period=never)
 
 
 def test_ce_mpc_leaves_the_guide_where_it_is(steered, along):

@@ -25,14 +25,14 @@ WITHOUT_GUIDE = ("open-loop", "bevel-only")
 
 
 def drive(name, plan, scenario, estimated, readings, *, steps, plant=None):
-    """Commands of a controller whose belief is the plant itself and whose readings are a step late, plus `readings`."""
+    """Commands of a controller whose model is the plant itself and whose readings are a step late, plus `readings`."""
     task = task_of(Simulator(scenario, threads=1), plan, name)
     chosen, simulator = METHODS[name], Simulator(plant or scenario, threads=1)
     memory, rng = chosen.begin(task), np.random.default_rng(0)
     state, last, commands = simulator.start(plan.bevel), None, []
     for off in readings[:steps]:
-        seen = None if last is None else tuple((last + np.array([0.0, off])).tolist())
-        estimate = estimated(replace(state, scenario=scenario), measured=seen, innovation=(0.0, off))
+        measured = None if last is None else tuple((last + np.array([0.0, off])).tolist())
+        estimate = estimated(replace(state, scenario=scenario), measured=measured, innovation=(0.0, off))
         decision, memory = chosen.decide(task, memory, estimate, rng)
         commands.append(decision.command)
         last, state = state.tip[:2], simulator.step(state, Control.from_row(decision.command))
@@ -100,7 +100,7 @@ def test_towards_a_path_far_aside_the_guide_goes_to_the_end_of_its_reach_and_no_
 
 @pytest.mark.parametrize("name", ["open-loop", "ce-mpc", "resolved-rate", "broyden-mpc"])
 def test_planned_motion_of_the_base_is_followed(quick_plan, estimated, name):
-    """To where the plan has it at the tip's depth; the other methods look at nothing but guide or bevel."""
+    """To where the plan has it at the tip's depth; the other methods steer with guide or bevel alone."""
     moving = quick_plan.controls.copy()
     moving[:60, 1:3] = 0.02, 1e-4
     plan = replace(quick_plan, controls=moving)
@@ -202,5 +202,5 @@ def test_without_a_guide_they_work_or_say_what_they_need(name):
         done = flexneedle.insert(bare, plan, 5000, controller=name, force=True, threads=1)
         assert done.outcome == "done"
         return
-    with pytest.raises(InputError, match=f"controller = '{name}': steers with the guide"):
+    with pytest.raises(InputError, match=f"controller = '{name}': needs a guide that moves"):
         flexneedle.insert(bare, plan, 5000, controller=name, force=True, threads=1)

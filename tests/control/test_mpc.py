@@ -75,7 +75,7 @@ def test_the_deviation_shrinks_over_the_next_periods(plan, along):
 
 
 def test_guide_stays_within_its_reach(plan):
-    """A plan far aside, and a guide that may hardly move: it goes to its end and no further."""
+    """A plan with a large lateral offset, and a guide that may hardly move: it goes to its end and no further."""
     scenario = PHANTOM.with_values({"setup.max_guide_travel_mm": 0.3, "target.lateral_mm": 0.3})
     away = replace(plan, tips=plan.tips + np.array([0.0, 6.0, 0.0]))
     simulator, state, rng = Simulator(scenario), Simulator(scenario).start(), np.random.default_rng(0)
@@ -169,7 +169,7 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
 
 
 @pytest.mark.parametrize("flip", [True, False])
-def test_rollouts_turn_the_bevel_only_in_the_first_step_and_if_told(plan, flip, along):
+def test_rollouts_roll_the_bevel_only_in_the_first_step_and_if_asked(plan, flip, along):
     state = along(plan, 40)
     controls = mpc._controls(PHANTOM, state, np.tile([0.9, 0.1], (3, 8)), np.zeros((8, 2)), 30.0, flip=flip)
     assert (controls[:, 0, 4] == (1.0 if flip else -1.0)).all()
@@ -177,7 +177,7 @@ def test_rollouts_turn_the_bevel_only_in_the_first_step_and_if_told(plan, flip, 
 
 
 def test_in_air_the_bevel_stays(plan, along, estimated):
-    """Even where the rule would turn it."""
+    """Even where the rule would roll it."""
     state = along(plan, 5)
     away = replace(plan, target=(40.0, -5.0))
     decision = decide(away, estimated(state))
@@ -185,23 +185,23 @@ def test_in_air_the_bevel_stays(plan, along, estimated):
     assert decision.why == "in air"
 
 
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("rolled", [False, True])
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_in_tissue_the_bevel_turns_to_the_target(plan, side, turned, along, estimated):
-    """The target lies to one side of the tip's own line, further than either path bends."""
-    state = Simulator(PHANTOM).step(along(plan, 50), Control(flip=turned))
-    x, y, turn = state.tip
-    away = replace(plan, target=(float(x) + 30.0, float(y + 30.0 * np.tan(turn) + 2.0 * side)))
+def test_in_tissue_the_bevel_rolls_to_the_target(plan, side, rolled, along, estimated):
+    """The target is to one side of the tip's own line, further than either path bends."""
+    state = Simulator(PHANTOM).step(along(plan, 50), Control(flip=rolled))
+    x, y, theta = state.tip
+    away = replace(plan, target=(float(x) + 30.0, float(y + 30.0 * np.tan(theta) + 2.0 * side)))
     decision = decide(away, estimated(state))
     assert decision.command[4] == (-1 if side == state.bevel else 1)
-    assert decision.why.startswith("bevel kept" if side == state.bevel else "bevel turned")
+    assert decision.why.startswith("bevel kept" if side == state.bevel else "bevel rolled")
 
 
 def test_the_rollouts_know_of_the_turn(plan, along):
     """A predicted cost of its own: the bevel that the rule chose acts on the steps that are searched."""
     state, scenario = along(plan, 50), PHANTOM.with_values({"control.ce_mpc.energy_weight_per_mj": 0.0})
-    kept, turned = (choose(plan, state, scenario, flip=flip) for flip in (False, True))
-    assert kept.cost != turned.cost
+    kept, rolled = (choose(plan, state, scenario, flip=flip) for flip in (False, True))
+    assert kept.cost != rolled.cost
 
 
 def test_command_has_the_five_inputs_and_leaves_the_base_alone(plan, along, estimated):
@@ -261,8 +261,8 @@ def test_controls_carry_the_base_steps_while_the_needle_advances(plan, along):
 
 
 def test_the_bevel_rule_hears_of_three_standard_deviations_of_a_reading(plan, monkeypatch, along, estimated):
-    heard = []
+    noises = []
     rule = bang_bang.wants_flip
-    monkeypatch.setattr(bang_bang, "wants_flip", lambda *args: heard.append(args[-1]) or rule(*args))
+    monkeypatch.setattr(bang_bang, "wants_flip", lambda *args: noises.append(args[-1]) or rule(*args))
     decide(plan, estimated(along(plan, 40)))
-    assert heard == [pytest.approx(3 * PHANTOM.tracker.jitter_mm / 3**0.5)]
+    assert noises == [pytest.approx(3 * PHANTOM.tracker.jitter_mm / 3**0.5)]

@@ -54,17 +54,17 @@ def test_a_perfect_motor_gets_the_planned_steps(quick_plan, estimated):
     np.testing.assert_allclose(commands, quick_plan.controls, atol=1e-9)
 
 
-def test_bevel_turns_where_planned(quick_plan, estimated):
-    turns = quick_plan.controls.copy()
-    turns[[12, 40], 4] = 1.0
-    commands, _ = replayed(replace(quick_plan, controls=turns), estimated)
+def test_bevel_rolls_where_planned(quick_plan, estimated):
+    rolls = quick_plan.controls.copy()
+    rolls[[12, 40], 4] = 1.0
+    commands, _ = replayed(replace(quick_plan, controls=rolls), estimated)
     assert [k for k, command in enumerate(commands) if command[4] > 0] == [12, 40]
 
 
 def test_base_steps_are_replayed_too(quick_plan, estimated):
-    turned = quick_plan.controls.copy()
-    turned[:10, 1:3] = 0.1, 2e-4
-    commands, _ = replayed(replace(quick_plan, controls=turned), estimated)
+    lateral = quick_plan.controls.copy()
+    lateral[:10, 1:3] = 0.1, 2e-4
+    commands, _ = replayed(replace(quick_plan, controls=lateral), estimated)
     np.testing.assert_allclose(np.sum(commands, axis=0)[1:3], [1.0, 2e-3], atol=1e-12)
 
 
@@ -85,7 +85,7 @@ def test_it_has_arrived_once_the_steps_are_used_up_and_not_before(quick_plan, es
 
 
 def test_steps_and_reach_of_a_smaller_setup_are_kept(quick_plan, estimated):
-    """A plan of a larger setup: slower and less far aside, without an exception."""
+    """A plan of a larger setup: slower and with less lateral travel, without an exception."""
     tight = {"setup.max_guide_step_mm": 0.02, "setup.max_guide_travel_mm": 0.4, "target.lateral_mm": 0.0}
     commands, places = replayed(quick_plan, estimated, PHANTOM.with_values(tight))
     assert max(abs(command[3]) for command in commands) <= 0.02

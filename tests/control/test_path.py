@@ -1,4 +1,4 @@
-"""The path in hand, what may replace it, and its first step: within the limits, and nothing in hand is lost."""
+"""The current path, what may replace it, and its first step: within the limits, and the current path is never lost."""
 
 from dataclasses import replace
 
@@ -45,27 +45,27 @@ def started(x, guide=0.0, simulator=None):
 
 def test_it_begins_as_the_plans(quick_plan):
     """The guide at every depth, the bevel rolled where the plan rolls it."""
-    turning = quick_plan.controls.copy()
-    turning[:, 4] = -1.0
-    turning[[12, 40, 60], 4] = 1.0
-    path = of_plan(replace(quick_plan, controls=turning))
+    controls = quick_plan.controls.copy()
+    controls[:, 4] = -1.0
+    controls[[12, 40, 60], 4] = 1.0
+    path = of_plan(replace(quick_plan, controls=controls))
     np.testing.assert_array_equal(np.interp(quick_plan.tips[:, 0], path.depth, path.guide), quick_plan.guide)
     assert path.rolls == tuple(quick_plan.tips[[12, 40, 60], 0])
 
 
 def test_no_roll_of_the_plan_is_lost(quick_plan):
     """However many there are: all are in the path, in the sample that corrects nothing, and in its controls."""
-    turning = quick_plan.controls.copy()
-    turning[:, 4] = -1.0
-    turning[35:70:5, 4] = 1.0
-    plan = replace(quick_plan, controls=turning)
+    controls = quick_plan.controls.copy()
+    controls[:, 4] = -1.0
+    controls[35:70:5, 4] = 1.0
+    plan = replace(quick_plan, controls=controls)
     path = of_plan(plan)
     assert path.rolls == tuple(quick_plan.tips[35:70:5, 0])
     ahead = ahead_of(plan, started(0.0), path)
-    controls, depth = ahead.controls(ahead.in_hand[None])
+    controls, depth = ahead.controls(ahead.current[None])
     assert tuple(depth[0, :-1][controls[0, :, 4] > 0.0]) == path.rolls
     z = proposals(ahead, 24, np.random.default_rng(0))
-    np.testing.assert_array_equal(z[0], ahead.in_hand)
+    np.testing.assert_array_equal(z[0], ahead.current)
 
 
 def test_depths_ascend_where_a_plan_stands_still(quick_plan):
@@ -87,28 +87,28 @@ def test_the_sample_that_corrects_nothing_is_the_path_in_hand(quick_plan, along,
     x = float(state.tip[0])
     path = replace(of_plan(quick_plan), rolls=(x + 0.35 * (40.0 - x), x + 0.7 * (40.0 - x)))
     ahead = ahead_of(quick_plan, state, path)
-    controls, depth = ahead.controls(ahead.in_hand[None])
+    controls, depth = ahead.controls(ahead.current[None])
     guide = state.guide + np.cumsum(controls[0, :, 3])
     np.testing.assert_allclose(guide, np.interp(depth[0, 1:], path.depth, path.guide), atol=2e-3)
-    kept = ahead.corrected(ahead.in_hand)
+    kept = ahead.corrected(ahead.current)
     assert kept.rolls == pytest.approx(path.rolls)
     again = ahead_of(quick_plan, state, kept)
-    np.testing.assert_allclose(again.controls(again.in_hand[None])[0], controls, atol=1e-12)
+    np.testing.assert_allclose(again.controls(again.current[None])[0], controls, atol=1e-12)
 
 
 def test_what_is_found_is_the_path_in_hand_of_the_next_period(quick_plan, along):
-    """Any sample, made the path in hand, is the sample that corrects nothing."""
+    """Any sample, made the current path, is the sample that corrects nothing."""
     state = along(quick_plan, 30)
     ahead = ahead_of(quick_plan, state)
     for z in proposals(ahead, 48, np.random.default_rng(2)):
         after = ahead_of(quick_plan, state, ahead.corrected(z))
         np.testing.assert_allclose(
-            after.controls(after.in_hand[None])[0][:, :, [0, 3]].sum(axis=1),
+            after.controls(after.current[None])[0][:, :, [0, 3]].sum(axis=1),
             ahead.controls(z[None])[0][:, :, [0, 3]].sum(axis=1), atol=1e-9,
         )  # fmt: skip
         flips = [
             np.flatnonzero(each.controls(one[None])[0][0, :, 4] > 0.0)
-            for each, one in ((after, after.in_hand), (ahead, z))
+            for each, one in ((after, after.current), (ahead, z))
         ]
         np.testing.assert_array_equal(*flips)
 
@@ -124,7 +124,7 @@ def test_what_is_found_is_the_path_in_hand_of_the_next_period(quick_plan, along)
 )
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
 def test_every_sample_within_the_bounds_keeps_every_limit(quick_plan, seed, x, guide, offset):
-    """Wherever the path in hand has the guide, in or out of reach."""
+    """Wherever the current path has the guide, in or out of reach."""
     state = started(x, guide * REACH)
     path = level(x + 3.0, 35.0, guide=offset)
     ahead = ahead_of(quick_plan, state, path)
@@ -152,7 +152,7 @@ def test_the_end_is_continuous_in_the_depth_of_a_roll(quick_plan, guide):
     state = started(12.0, guide)
     ahead = ahead_of(quick_plan, state, level(guide=guide))
     depths = np.arange(12.6, 39.0, 0.02)
-    z = np.tile(ahead.in_hand, (depths.size, 1))
+    z = np.tile(ahead.current, (depths.size, 1))
     z[:, KNOTS.size] = depths
     ends = simulator.rollout(state, ahead.controls(z)[0], limits=False).tips[:, -1, 1]
     assert np.ptp(ends) > 1.0
@@ -161,7 +161,7 @@ def test_the_end_is_continuous_in_the_depth_of_a_roll(quick_plan, guide):
 
 def test_a_roll_is_made_at_its_own_depth(quick_plan):
     ahead = ahead_of(quick_plan, started(10.0), level())
-    z = ahead.in_hand[None].repeat(3, axis=0)
+    z = ahead.current[None].repeat(3, axis=0)
     z[:, KNOTS.size] = 11.0, 17.3, 30.01
     controls, depth = ahead.controls(z)
     rolls = [depth[k, :-1][controls[k, :, 4] > 0.0].tolist() for k in range(3)]
@@ -172,7 +172,7 @@ def test_two_rolls_at_one_place_cancel(quick_plan):
     """Those before and after them do not."""
     for rolls, left in [((20.0, 20.0), ()), ((10.0, 20.0, 20.0, 30.0), (10.0, 30.0)), ((20.0,) * 3, (20.0,))]:
         ahead = ahead_of(quick_plan, started(9.0), level(*rolls))
-        assert ahead.corrected(ahead.in_hand).rolls == left
+        assert ahead.corrected(ahead.current).rolls == left
 
 
 @given(rolls=st.lists(st.floats(9.2, 30.0), max_size=4))
@@ -182,11 +182,11 @@ def test_rolls_that_are_near_each_other_are_all_made(quick_plan, rolls):
     rolls = tuple(sorted(rolls))
     assume((np.diff(rolls) > 0.051).all())
     ahead = ahead_of(quick_plan, started(9.0), level(*rolls))
-    depth = ahead.controls(ahead.in_hand[None])[1]
+    depth = ahead.controls(ahead.current[None])[1]
     assert (np.diff(depth) >= 0.0).all()
     assert depth[0, -1] == ahead.depth[-1]
-    assert ahead.corrected(ahead.in_hand).rolls == pytest.approx(rolls, abs=0.5)
-    assert ahead.corrected(ahead.in_hand).rolls[1:] == rolls[1:]
+    assert ahead.corrected(ahead.current).rolls == pytest.approx(rolls, abs=0.5)
+    assert ahead.corrected(ahead.current).rolls[1:] == rolls[1:]
 
 
 def test_a_guide_that_may_not_move_is_not_moved(quick_plan):
@@ -208,7 +208,7 @@ def test_base_motion_of_the_plan_is_followed(quick_plan):
     state = simulator.replay(state, [[0.0, 0.6, 30e-4, 0.0, -1.0]])[0]
     ahead = ahead_of(plan, state)
     assert ahead.first(ahead.path)[0][1:3] == pytest.approx((0.02, 1e-4), rel=0.02)
-    controls, _ = ahead.controls(ahead.in_hand[None])
+    controls, _ = ahead.controls(ahead.current[None])
     total = controls[0, :, 1:3].sum(axis=0)
     np.testing.assert_allclose(total, [30 * 0.02, 30 * 1e-4], rtol=1e-6)
 
@@ -224,9 +224,9 @@ def test_proposals_are_around_the_path_in_hand_which_is_the_first(quick_plan, ro
     z = proposals(ahead, 96, np.random.default_rng(1))
     lower, upper = ahead.bounds
     assert z.shape == (96, KNOTS.size + ahead.slots)
-    np.testing.assert_array_equal(z[0], ahead.in_hand)
+    np.testing.assert_array_equal(z[0], ahead.current)
     assert ((z >= lower) & (z <= upper)).all()
-    moved = np.abs(z - ahead.in_hand) > 0.0
+    moved = np.abs(z - ahead.current) > 0.0
     guide, bevel = moved[:, : KNOTS.size].any(axis=1), moved[:, KNOTS.size :].any(axis=1)
     if scenario is PHANTOM:
         assert (guide & ~bevel).any()
@@ -320,5 +320,5 @@ def test_the_stroke_ends_the_advance(quick_plan):
 def test_a_guide_far_from_its_path_comes_back_as_fast_as_it_may(quick_plan, wanted):
     ahead = ahead_of(quick_plan, started(10.0), level(guide=wanted))
     assert ahead.first(ahead.path)[0][3] == pytest.approx(np.sign(wanted) * STEP)
-    controls, _ = ahead.controls(ahead.in_hand[None])
+    controls, _ = ahead.controls(ahead.current[None])
     assert np.abs(np.cumsum(controls[0, :, 3])).max() == pytest.approx(min(abs(wanted), REACH))

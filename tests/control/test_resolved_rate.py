@@ -94,13 +94,15 @@ def test_off_the_plan_the_guide_step_is_the_damped_inverse_of_the_deviation_ahea
 
 
 def test_what_the_newest_reading_was_off_is_taken_to_stay(quick_plan, along, estimated):
-    """A tip seen 0.01 mm aside of the prediction shifts the step by as much of the guide as moves it back."""
+    """A tip measured 0.01 mm lateral of the prediction shifts the step by the motion of the guide that moves it back."""
     state, settings = along(quick_plan, 45), {"gain": 0.5, "damping": 0.1, "lookahead_mm": 3.0}
     plain = decide(quick_plan, estimated(state), **settings).command[3]
-    seen = decide(quick_plan, estimated(state, innovation=(0.4, 0.01)), **settings).command[3]
+    shifted = decide(quick_plan, estimated(state, innovation=(0.4, 0.01)), **settings).command[3]
     rows = resolved_rate.nominal(PHANTOM.setup, quick_plan, state, 3.0, 0.05, flip=False)
     _, jacobian = resolved_rate.sensitivity(Simulator(PHANTOM, threads=1), state, rows, 0.05)
-    assert plain - seen == pytest.approx(0.5 * resolved_rate.damped_inverse(jacobian, 0.1) * 0.01, rel=1e-6)
+    assert plain - shifted == pytest.approx(
+        0.5 * resolved_rate.damped_inverse(jacobian, 0.1) * 0.01, rel=1e-6
+    )
 
 
 def test_without_gain_the_plan_is_all_there_is(quick_plan, along, estimated):

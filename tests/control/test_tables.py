@@ -137,7 +137,7 @@ class ByName:
         ({"settings": dict}, "controller my-pid: settings must be a class made from flexneedle.Section"),
         ({"settings": Gains()}, "controller my-pid: settings must be a class made from flexneedle.Section"),
         ({"settings": NoDefault}, "controller my-pid: settings must have a valid default for each key: gain"),
-        ({"settings": NotInToml}, "controller my-pid: settings must be what a TOML file holds.*: gains"),
+        ({"settings": NotInToml}, "controller my-pid: settings must be of a TOML type.*: gains"),
     ],
 )
 def test_a_method_that_cannot_work_is_refused_when_it_is_made(change, message):

@@ -39,7 +39,7 @@ def after(costs, samples, *, elite=2, smoothing=0.25, search_state=None):
         np.array([1.0, -1.0]), np.array([2.0, 3.0]), np.array([[1, 1 / 6], [1 / 6, 1]])
     )
     settings = replace(FREE, samples=len(costs), elite=elite, smoothing=smoothing, tolerance=0.0)
-    return ce.tell(search_state, settings, np.array(samples, dtype=float), np.array(costs, dtype=float))
+    return ce.update(search_state, settings, np.array(samples, dtype=float), np.array(costs, dtype=float))
 
 
 @pytest.mark.parametrize(("cost", "least"), [(quadratic, LEAST), (two_wells, [3.0, 0.0])])
@@ -101,8 +101,8 @@ def test_full_covariance_learns_the_correlation_of_a_valley():
     search_state = ce.start(np.zeros(2), np.full(2, 2.0))
     rng = np.random.default_rng(1)
     for _ in range(3):
-        samples = ce.ask(search_state, FREE, rng)
-        search_state = ce.tell(search_state, FREE, samples, quadratic(samples))
+        samples = ce.sample(search_state, FREE, rng)
+        search_state = ce.update(search_state, FREE, samples, quadratic(samples))
     c = search_state.covariance
     assert c[0, 1] / math.sqrt(c[0, 0] * c[1, 1]) < -0.5
 
@@ -111,44 +111,44 @@ def test_samples_have_the_mean_and_covariance_of_the_belief():
     covariance = np.array([[4.0, 1.5], [1.5, 1.0]])
     search_state = ce.start(np.array([1.0, -1.0]), np.array([2.0, 1.0]), np.array([[1.0, 0.75], [0.75, 1.0]]))
     wide = replace(FREE, samples=20_000, lower=np.full(2, -1e3), upper=np.full(2, 1e3))
-    samples = ce.ask(search_state, wide, np.random.default_rng(0))
+    samples = ce.sample(search_state, wide, np.random.default_rng(0))
     np.testing.assert_allclose(samples.mean(axis=0), [1.0, -1.0], atol=0.05)
     np.testing.assert_allclose(np.cov(samples.T), covariance, rtol=0.05)
 
 
 def test_first_sample_is_the_mean_and_later_the_second_the_best_so_far():
     search_state = after([3.0, 1.0, 2.0], [(5, 5), (7, -7), (1, 1)])
-    samples = ce.ask(search_state, FREE, np.random.default_rng(0))
+    samples = ce.sample(search_state, FREE, np.random.default_rng(0))
     np.testing.assert_array_equal(samples[0], search_state.mean)
     np.testing.assert_array_equal(samples[1], [7.0, -7.0])
     fresh = ce.start(np.array([1.0, -1.0]), np.array([2.0, 3.0]))
-    assert (ce.ask(fresh, FREE, np.random.default_rng(0))[1] != fresh.mean).all()
+    assert (ce.sample(fresh, FREE, np.random.default_rng(0))[1] != fresh.mean).all()
 
 
 def test_every_sample_keeps_its_bounds():
     tight = replace(FREE, lower=np.array([-0.5, 0.2]), upper=np.array([0.1, 0.3]), iterations=5)
-    seen = []
+    evaluated = []
 
     def cost(z):
-        seen.append(z.copy())
+        evaluated.append(z.copy())
         return quadratic(z)
 
     search(cost, tight, mean=(0.0, 0.9))
-    samples = np.concatenate(seen)
+    samples = np.concatenate(evaluated)
     assert (samples >= tight.lower).all()
     assert (samples <= tight.upper).all()
     assert (samples == tight.lower).any()
 
 
 def test_a_coordinate_without_sigma_stays_at_its_mean():
-    seen = []
+    evaluated = []
 
     def cost(z):
-        seen.append(z.copy())
+        evaluated.append(z.copy())
         return quadratic(z)
 
     found = search(cost, mean=(0.0, 1.0), sigma=(2.0, 0.0))
-    np.testing.assert_allclose(np.concatenate(seen)[:, 1], 1.0, rtol=1e-12)
+    np.testing.assert_allclose(np.concatenate(evaluated)[:, 1], 1.0, rtol=1e-12)
     assert not found.covariance[1].any()
     assert not found.covariance[:, 1].any()
     assert found.best[0] == pytest.approx(LEAST[0] - 0.9 * (1.0 - LEAST[1]), abs=1e-3)  # least on that line
@@ -159,22 +159,22 @@ def test_a_coordinate_without_sigma_stays_at_its_mean():
 def test_best_so_far_is_never_worse_than_any_sample_seen(seed, failing):
     """With a share of samples that fail, too."""
     rng = np.random.default_rng(seed)
-    told: list[float] = []
+    costs: list[float] = []
     sampled: list[np.ndarray] = []
 
     def cost(z):
         value = np.sin(5.0 * z[:, 0]) + 0.1 * np.sum(z**2, axis=1)
         value[rng.random(len(z)) < failing] = rng.choice([np.nan, np.inf, -np.inf])
-        told.extend(value)
+        costs.extend(value)
         sampled.extend(z)
         return value
 
     search_state = ce.start(np.zeros(2), np.full(2, 2.0))
     small = replace(FREE, samples=8, elite=2)
     for _ in range(6):
-        samples = ce.ask(search_state, small, rng)
-        search_state = ce.tell(search_state, small, samples, cost(samples))
-        finite = [value for value in told if np.isfinite(value)]
+        samples = ce.sample(search_state, small, rng)
+        search_state = ce.update(search_state, small, samples, cost(samples))
+        finite = [value for value in costs if np.isfinite(value)]
         assert search_state.best_cost == min(finite, default=np.inf)
         assert search_state.history[-1]["best"] == search_state.best_cost
         assert np.isfinite(search_state.mean).all()
@@ -213,9 +213,9 @@ def test_converged_once_the_elite_costs_spread_by_a_share_of_the_first_iteration
     """A spread of 4 at first and a tolerance of a tenth: 0.4 will do, whatever the level of the costs."""
     settings = ce.Settings(3, 2, 9, 0.0, 0.1, np.full(1, -9.0), np.full(1, 9.0))
     samples = np.array([[1.0], [2.0], [3.0]])
-    first = ce.tell(ce.start(np.zeros(1), np.ones(1)), settings, samples, np.array([2.0, 5.0, -2.0]))
+    first = ce.update(ce.start(np.zeros(1), np.ones(1)), settings, samples, np.array([2.0, 5.0, -2.0]))
     assert not first.converged
-    second = ce.tell(first, settings, samples, np.array([-7.0 + 4.0 * spread, 5.0, -7.0]))
+    second = ce.update(first, settings, samples, np.array([-7.0 + 4.0 * spread, 5.0, -7.0]))
     assert second.converged is converged
     assert second.done(settings) is converged
 
@@ -232,7 +232,7 @@ def test_an_iteration_with_fewer_good_samples_than_the_elite_sets_no_scale():
         [0.0, 0.11, 9.0, 9.0],
         [0.0, 0.09, 9.0, 9.0],
     ):
-        search_state = ce.tell(search_state, settings, samples, np.array(costs))
+        search_state = ce.update(search_state, settings, samples, np.array(costs))
         converged.append(search_state.converged)
     assert converged == [False, False, False, False, True]
 
@@ -243,7 +243,7 @@ def stalling(usual, falls):
     search_state, converged, best = ce.start(np.zeros(2), np.ones(2)), [], 0.0
     for fall in falls:
         best -= fall
-        search_state = ce.tell(
+        search_state = ce.update(
             search_state, settings, np.arange(8.0).reshape(4, 2), best + np.array([0.0, 10.0, 11.0, 12.0])
         )
         converged.append(search_state.converged)
@@ -252,7 +252,7 @@ def stalling(usual, falls):
 
 @pytest.mark.parametrize(("usual", "first"), [(3, 11), (15, 15), (None, None)])
 def test_from_the_usual_number_on_ten_iterations_that_hardly_gain_are_enough(usual, first):
-    """Ten falls of 0.0999 are less than a tenth of the spread of 10; eleven iterations are needed to see them."""
+    """Ten falls of 0.0999 are less than a tenth of the spread of 10; eleven iterations are needed to detect them."""
     expected = [first is not None and k + 1 >= first for k in range(20)]
     assert stalling(usual, [0.0999] * 20) == expected
 
@@ -263,18 +263,18 @@ def test_while_the_best_cost_falls_the_search_goes_on():
 
 def test_samples_of_the_first_iteration_can_be_given():
     given = np.array([[3.0, 3.0], [1.5, -2.0], [0.0, 1.0]])
-    told = []
+    evaluated = []
 
     def cost(z):
-        told.append(z.copy())
+        evaluated.append(z.copy())
         return quadratic(z)
 
     settings = replace(FREE, elite=2, iterations=2)
     found = ce.minimize(
         cost, ce.start(np.zeros(2), np.ones(2)), settings, np.random.default_rng(0), first=given
     )
-    np.testing.assert_array_equal(told[0], given)
-    assert [len(z) for z in told] == [3, 60]
+    np.testing.assert_array_equal(evaluated[0], given)
+    assert [len(z) for z in evaluated] == [3, 60]
     assert found.best_cost == 0.0
 
 
@@ -319,6 +319,6 @@ def test_same_seed_same_bytes_other_seed_others():
 def test_tell_leaves_samples_and_costs_as_they_were():
     samples, costs = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), np.array([np.nan, 1.0, 2.0])
     kept = samples.copy(), costs.copy()
-    ce.tell(ce.start(np.zeros(2), np.ones(2)), replace(FREE, samples=3, elite=2), samples, costs)
+    ce.update(ce.start(np.zeros(2), np.ones(2)), replace(FREE, samples=3, elite=2), samples, costs)
     np.testing.assert_array_equal(samples, kept[0])
     np.testing.assert_array_equal(costs, kept[1])

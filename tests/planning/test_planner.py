@@ -13,8 +13,8 @@ from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 
 PHANTOM = flexneedle.load_scenario("phantom")
-TARGETS = [(depth, aside) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for aside in (-5.0, 0.0, 5.0)]
-ASIDE = (40.0, 5.0)
+TARGETS = [(depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0)]
+LATERAL = (40.0, 5.0)
 COARSE = {
     "plan.samples": 32,
     "plan.iterations": 4,
@@ -27,7 +27,7 @@ def planned(target, strategy="manipulation", seed=1):
     return flexneedle.plan(PHANTOM, target, strategy, seed)
 
 
-def coarse(changes=None, target=ASIDE, **options):
+def coarse(changes=None, target=LATERAL, **options):
     """A quick plan under a changed scenario."""
     return flexneedle.plan(PHANTOM.with_values({**COARSE, **(changes or {})}), target, **options)
 
@@ -54,13 +54,13 @@ def test_each_target_of_the_paper_is_reached(target):
 
 
 def test_record_is_what_the_simulator_does_with_its_controls():
-    plan = planned(ASIDE)
+    plan = planned(LATERAL)
     states = states_of(plan)
     np.testing.assert_array_equal(plan.tips, [state.tip for state in states])
     np.testing.assert_array_equal(plan.guide, [state.guide for state in states])
     np.testing.assert_array_equal(plan.strain_energy, [state.strain_energy for state in states])
     np.testing.assert_array_equal(plan.shapes[-1], states[-1].nodes)
-    assert (plan.target, plan.strategy, plan.seed) == (ASIDE, "manipulation", 1)
+    assert (plan.target, plan.strategy, plan.seed) == (LATERAL, "manipulation", 1)
     assert plan.iterations == len(plan.history)
     assert plan.cost == pytest.approx(sum(plan.terms.values()))
     assert plan.seconds > 0.0
@@ -68,7 +68,7 @@ def test_record_is_what_the_simulator_does_with_its_controls():
 
 def test_cost_is_that_of_the_plan_to_the_last_step():
     """Recomputed from the record; only the last, shortened step may differ a little."""
-    plan, settings = planned(ASIDE), PHANTOM.plan
+    plan, settings = planned(LATERAL), PHANTOM.plan
     inside = plan.tips[1:, 0] > 0.0
     guide = settings.guide_weight * (plan.controls[inside, 3] ** 2).sum()
     assert plan.terms["guide"] == pytest.approx(guide, rel=0.02)
@@ -107,7 +107,7 @@ def test_same_seed_same_bytes_whatever_the_threads(monkeypatch):
 
 def test_manipulation_enters_at_an_angle_towards_the_target():
     """Slope at the skin, and of the side of the target; straight ahead it enters straight."""
-    assert planned(ASIDE).entry_angle > 0.01
+    assert planned(LATERAL).entry_angle > 0.01
     assert planned((40.0, -5.0)).entry_angle < -0.01
     assert abs(planned((40.0, 0.0)).entry_angle) < 0.012
 
@@ -179,7 +179,7 @@ def test_mirrored_target_costs_about_the_same():
 
 
 def test_mirrored_controls_mirror_the_plan():
-    plan = planned(ASIDE)
+    plan = planned(LATERAL)
     mirrored = plan.controls * [1, -1, -1, -1, 1]
     tips = Simulator(PHANTOM).rollout(Simulator(PHANTOM).start(-plan.bevel), mirrored[None]).tips[0]
     np.testing.assert_allclose(tips, plan.tips[1:] * [1, -1, -1], atol=1e-9)
@@ -213,7 +213,7 @@ def test_out_of_reach_is_said_with_the_limit(target, strategy, changes, limit):
 
 
 def test_guide_travel_is_named_when_it_binds():
-    """Turns cost too much, so the bevel pulls to one side, and the guide can do next to nothing about it."""
+    """Rolls cost too much, so the bevel pulls to one side, and the guide can do next to nothing about it."""
     held = {"setup.max_guide_travel_mm": 0.05, "target.lateral_mm": 0.0, "plan.flip_weight": 1e5}
     plan = coarse(held, (60.0, 0.0))
     assert not plan.reached
@@ -221,7 +221,7 @@ def test_guide_travel_is_named_when_it_binds():
 
 
 def test_stroke_is_named_when_it_binds():
-    """A straight needle would just get there; 28 mm aside costs 3 mm more than that."""
+    """A straight needle would just get there; 28 mm lateral costs 3 mm more than that."""
     plan = coarse(
         {"setup.max_guide_travel_mm": 30.0, "plan.iterations": 8, "plan.max_iterations": 8}, (81.5, 28.0)
     )
@@ -238,7 +238,7 @@ def test_a_target_near_the_full_stroke_is_planned_within_it(depth):
 
 def test_unknown_strategy_names_the_choices():
     with pytest.raises(InputError, match="strategy = 'push': must be one of manipulation, steering"):
-        flexneedle.plan(PHANTOM, ASIDE, "push")
+        flexneedle.plan(PHANTOM, LATERAL, "push")
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ def sampled():
 
 
 def test_equal_shares_and_full_steps():
-    """12 mm in three primitives of four steps; the direction turns at the second and again at the third."""
+    """12 mm in three primitives of four steps; the bevel rolls at the second and again at the third."""
     z = primitives((1, 0, 0, 0.1, 2.0, 0), (1, 0.02, 0, 0, -0.1, 0), (1, 0, 0.001, -0.2, 0.1, 0))
     controls, wanted = schedule(PROBLEM, z)
     expected = np.zeros((12, 5))
@@ -100,8 +100,8 @@ def test_any_sample_keeps_travel_limits_and_turns(z):
     assert (np.abs(controls[:, :, :4]) <= PROBLEM.step + 1e-12).all()
     travel = np.abs(np.cumsum(controls[:, :, :4], axis=1))
     assert (travel <= PROBLEM.reach + 1e-12).all()
-    turns = (np.diff(wanted, axis=1, prepend=1.0) != 0.0).sum(axis=1)
-    np.testing.assert_array_equal((controls[:, :, 4] == 1.0).sum(axis=1), turns)
+    rolls = (np.diff(wanted, axis=1, prepend=1.0) != 0.0).sum(axis=1)
+    np.testing.assert_array_equal((controls[:, :, 4] == 1.0).sum(axis=1), rolls)
     assert set(np.unique(controls[:, :, 4])) <= {-1.0, 1.0}
     facing = np.cumprod(np.where(controls[:, :, 4] > 0.0, -1.0, 1.0), axis=1)
     np.testing.assert_array_equal(facing[:, 0], wanted[:, 0])
@@ -203,7 +203,7 @@ def bevel_only(sign):
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_bevel_at_the_start_is_told_and_no_turn_is_left_in_the_first_step(sign):
-    """Straight away to one side: 8 mm at 0.1 a mm, without a turn while inserting."""
+    """Straight away to one side: 8 mm at 0.1 a mm, without a roll while inserting."""
     found = optimise(rigid, bevel_only(sign), SEARCH, np.random.default_rng(0))
     assert found.bevel == sign
     assert (found.controls[:, 4] == -1.0).all()
@@ -221,32 +221,32 @@ def test_inputs_that_are_not_free_stay_still():
 def test_bounds_of_the_search_keep_the_steps():
     """No step above the longest, none of a primitive below half of it but by rounding up the count."""
     wild = replace(PROBLEM, sigma=np.array([5.0, 5.0, 1.0, 5.0, 9.0, 9.0]))
-    seen = []
+    evaluated = []
 
     def rollout(controls):
-        seen.append(controls)
+        evaluated.append(controls)
         return rigid(controls)
 
     optimise(rollout, wild, replace(SEARCH, iterations=4), np.random.default_rng(0))
-    for controls in seen:
+    for controls in evaluated:
         assert (np.abs(controls[:, :, :4]) <= PROBLEM.step + 1e-12).all()
         assert controls.shape[1] <= 2 * 12 + 3
-    shares = [controls[:, :, 0].sum(axis=1) for controls in seen]
+    shares = [controls[:, :, 0].sum(axis=1) for controls in evaluated]
     np.testing.assert_allclose(np.concatenate(shares), 12.0)
 
 
 def test_neighbouring_primitives_want_the_same_bevel_more_often_than_not():
     """ε is correlated at first: 0.8 between neighbours, so they differ in 1 of 5, not of 2, and ε are unit."""
-    turned = []
+    rolls = []
 
     def rollout(controls):
-        turned.append((controls[:, 1:, 4] > 0.0).sum(axis=1))
+        rolls.append((controls[:, 1:, 4] > 0.0).sum(axis=1))
         return rigid(controls)
 
     many = replace(SEARCH, samples=4000, iterations=1, elite=100)
     optimise(rollout, replace(PROBLEM, primitives=6), many, np.random.default_rng(0))
     expected = 5 * np.arccos(0.8) / np.pi
-    assert turned[0].mean() == pytest.approx(expected, abs=0.06)
+    assert rolls[0].mean() == pytest.approx(expected, abs=0.06)
 
 
 def test_progress_and_same_seed_same_bytes():

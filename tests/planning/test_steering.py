@@ -34,10 +34,10 @@ def kinematic(controls, start=1.0, charge=lambda y: 0.0 * y):
     facing = start * np.cumprod(-controls[:, :, 4], axis=1)
     x = np.cumsum(advance, axis=1) - 8.0
     inside = np.maximum(x, 0.0) - np.maximum(x - advance, 0.0)
-    turned = np.cumsum(BEND * facing * inside, axis=1)
-    before = turned - BEND * facing * inside
+    bent = np.cumsum(BEND * facing * inside, axis=1)
+    before = bent - BEND * facing * inside
     y = np.cumsum(before * inside + 0.5 * BEND * facing * inside**2, axis=1)
-    tips = np.stack([x, y, np.arctan(turned)], axis=2)
+    tips = np.stack([x, y, np.arctan(bent)], axis=2)
     return Outcome(controls, tips, charge(y), np.ones(x.shape, dtype=bool), 0.0 * y)
 
 

@@ -1,1 +1,1 @@
-"""Closed-loop control of an insertion (paper section III-B): a controller a file in `methods`."""
+"""Closed-loop control of an insertion (paper section III-B): one file in `methods` for each controller."""

@@ -1,4 +1,4 @@
-"""The bang-bang rule for the bevel: two kinematic paths, the nearer to the target wins (paper eq. 14 and 15)."""
+"""The bang-bang rule for the bevel: of two kinematic paths the one nearer to the target (paper eq. 14 and 15)."""
 
 import math
 
@@ -9,7 +9,7 @@ from flexneedle.estimation.task import Task
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Section
 from flexneedle.types import Floats
 
-_SURE = 3.0  # standard deviations of a reading: no bevel turn for less
+_NOISE_SDS = 3.0  # standard deviations of a reading, added to the dead band
 
 
 def closest_approach(pose: Floats, curvature: float, target: tuple[float, float]) -> float:
@@ -17,43 +17,43 @@ def closest_approach(pose: Floats, curvature: float, target: tuple[float, float]
 
     The path of paper eq. 14 with steps u → 0: a line for curvature 0, else a circle.
     """
-    x, y, turn = (float(value) for value in pose)
+    x, y, theta = (float(value) for value in pose)
     ahead = target[0] - x, target[1] - y
-    along = math.cos(turn) * ahead[0] + math.sin(turn) * ahead[1]
-    aside = math.cos(turn) * ahead[1] - math.sin(turn) * ahead[0]
+    along = math.cos(theta) * ahead[0] + math.sin(theta) * ahead[1]
+    lateral = math.cos(theta) * ahead[1] - math.sin(theta) * ahead[0]
     if along <= 0.0:
         return math.hypot(*ahead)
-    # |‖t − c‖ − R| with c at R = 1/κ aside, written so that κ → 0 stays exact.
-    bend = curvature * (along**2 + aside**2) - 2.0 * aside
+    # |‖t − c‖ − R| with the center c at the lateral distance R = 1/κ, rearranged so that κ → 0 stays exact.
+    bend = curvature * (along**2 + lateral**2) - 2.0 * lateral
     return abs(bend) / (1.0 + math.sqrt(max(0.0, 1.0 + curvature * bend)))
 
 
 def wants_flip(
     pose: Floats, bevel: int, curvature: float, target: tuple[float, float], dead_band: float, noise: float
 ) -> tuple[bool, str]:
-    """Whether to turn the bevel over, and why.
+    """Whether to roll the bevel by half a turn, and the reason.
 
-    The bevel is turned if the other path passes nearer and the present one misses by more than half of the paths'
+    The bevel is rolled if the other path passes nearer and the present one misses by more than half of the paths'
     separation at the target, ½κs², enlarged by the share `dead_band`, plus `noise` (mm): a band that shrinks towards
-    the target, where the paths hardly part, but not below what the tracker resolves.
+    the target, where the two paths are close together, but not below the resolution of the tracker.
     """
     keep = closest_approach(pose, bevel * curvature, target)
-    turn = closest_approach(pose, -bevel * curvature, target)
+    roll = closest_approach(pose, -bevel * curvature, target)
     half = 0.5 * curvature * float(np.sum(np.square(np.subtract(target, pose[:2]))))
-    flip = turn < keep and keep > (1.0 + dead_band) * half + noise
+    flip = roll < keep and keep > (1.0 + dead_band) * half + noise
     return (
         flip,
-        f"bevel {'turned' if flip else 'kept'}: keeping misses by {keep:.3f} mm, turning by {turn:.3f} mm",
+        f"bevel {'rolled' if flip else 'kept'}: predicted miss {keep:.3f} mm if kept, {roll:.3f} mm if rolled",
     )
 
 
 class BevelRule(Section):
-    """A controller's settings of the rule."""
+    """Settings of the bang-bang rule, in the table of each controller that uses it."""
 
     curvature_per_m: NonNegative = 0.646
-    """κ of the two paths of the bang-bang rule."""
+    """κ, curvature of the two paths of the bang-bang rule."""
     flip_dead_band: Fraction = 0.875
-    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
+    """Dead band of the rule: a miss below half of the two paths' separation times 1 + this does not roll the bevel."""
 
     @property
     def curvature(self) -> float:
@@ -62,7 +62,7 @@ class BevelRule(Section):
 
 
 def decide(task: Task, estimate: Estimate, rule: BevelRule) -> tuple[bool, str]:
-    """`wants_flip` towards the plan's target, from the estimated tip. In air the bevel has no effect and stays."""
+    """`wants_flip` to the plan's target, from the estimated tip. In air the bevel has no effect and is kept."""
     if estimate.tip[0] <= 0.0:
         return False, "in air"
     return wants_flip(
@@ -71,5 +71,5 @@ def decide(task: Task, estimate: Estimate, rule: BevelRule) -> tuple[bool, str]:
         rule.curvature,
         task.plan.target,
         rule.flip_dead_band,
-        _SURE * task.scenario.tracker.jitter_per_axis,
+        _NOISE_SDS * task.scenario.tracker.jitter_per_axis,
     )

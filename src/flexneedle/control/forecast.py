@@ -1,13 +1,13 @@
-"""What follows from the miss that a decision predicts at the target: a warning, or a hold."""
+"""Consequences of the miss that a decision predicts at the target: a warning, or a hold."""
 
 import math
 
 from flexneedle.control.interface import Decision
 from flexneedle.scenario.sections.settings import ControlSettings
 
-_RADIUS_MM = 1.0  # of the paper's target circles: an insertion that ends beyond has missed
-_LIKELY = 0.5  # probability of that from which a decision counts towards a warning
-_IN_A_ROW = 3  # such decisions make one: a single prediction, right after the skin say, may be off
+_RADIUS_MM = 1.0  # radius of the paper's target circles: an insertion that ends outside has missed
+_LIKELY = 0.5  # probability of a miss from which a decision counts towards a warning
+_IN_A_ROW = 3  # such decisions make one: a single prediction, right after the skin for example, may be wrong
 
 
 def probability_beyond(limit: float, miss: float, sd: float) -> float:
@@ -24,7 +24,7 @@ def probability_beyond(limit: float, miss: float, sd: float) -> float:
 
 
 def hopeless(decision: Decision, control: ControlSettings) -> str:
-    """Why the needle is to be held: no path was found, or none that ends within the limit; empty if one may."""
+    """Reason to hold the needle: no path was found, or none that ends within the limit; empty if one may."""
     if decision.cost == math.inf:
         return decision.why
     limit = control.miss_limit_mm
@@ -39,20 +39,20 @@ def hopeless(decision: Decision, control: ControlSettings) -> str:
 
 
 def likely_misses(decision: Decision, before: int) -> int:
-    """How many decisions in a row, with this one, predict a miss of more than 1 mm; `before` it there were so many."""
+    """Number of successive decisions that predict a miss of more than 1 mm, this one included; `before`: without it."""
     probability = probability_beyond(_RADIUS_MM, decision.miss, decision.miss_sd)
     return before + 1 if probability >= _LIKELY else 0
 
 
 def warning(decision: Decision, in_a_row: int) -> str:
-    """A line if so many decisions in a row predict a miss of more than 1 mm; empty otherwise or without one."""
+    """A warning once `in_a_row` successive decisions that predict a miss of more than 1 mm are enough; else empty."""
     if in_a_row < _IN_A_ROW or math.isnan(decision.miss):
         return ""
     return f"predicted miss {decision.miss:+.2f} ± {decision.miss_sd:.2f} mm: likely beyond {_RADIUS_MM:g} mm"
 
 
 def missed(true: float, estimated: float) -> str:
-    """A line if an insertion ended more than 1 mm from its target; distances in mm, the true one NaN if unknown."""
+    """A line if an insertion ended more than 1 mm from its target, else empty; distances in mm, true NaN if unknown."""
     if not math.isnan(true):
         return f"missed the target by {true:.2f} mm" if true > _RADIUS_MM else ""
     return f"the estimated tip ended {estimated:.2f} mm from the target" if estimated > _RADIUS_MM else ""

@@ -1,10 +1,10 @@
-"""Whether a controller may move the guide: there is one, and the plan does not leave it where it is."""
+"""Whether a controller may move the guide: there is one, and the plan's strategy moves it."""
 
 from flexneedle.control.interface import Method
 from flexneedle.errors import InputError
 from flexneedle.scenario.sections.apparatus import Setup
 
-_STILL = "steering"  # the strategy in which the bevel alone steers
+_STILL = "steering"  # the strategy with the bevel as the only input
 
 
 def guide_may_move(setup: Setup, strategy: str) -> bool:
@@ -13,7 +13,7 @@ def guide_may_move(setup: Setup, strategy: str) -> bool:
 
 
 def most_guide_step(setup: Setup, strategy: str) -> float:
-    """Greatest lateral travel (mm) of the guide in a control step; 0 if it may not move."""
+    """Largest lateral travel (mm) of the guide in a control step; 0 if it may not move."""
     return setup.max_guide_step_mm if guide_may_move(setup, strategy) else 0.0
 
 
@@ -21,7 +21,7 @@ def check_guide(method: Method, setup: Setup, strategy: str) -> None:
     """Raise InputError if a controller needs the guide and may not move it."""
     if not method.needs_guide or guide_may_move(setup, strategy):
         return
-    name = f"controller = {method.name!r}: steers with the guide"
+    name = f"controller = {method.name!r}: needs a guide that moves"
     if not setup.has_guide:
-        raise InputError(f"{name}: give setup.guide_to_skin_mm")
-    raise InputError(f"{name}, and strategy = {strategy!r} does not move it: use 'manipulation'")
+        raise InputError(f"{name}: set setup.guide_to_skin_mm")
+    raise InputError(f"{name}, strategy = {strategy!r} does not move it: use 'manipulation'")

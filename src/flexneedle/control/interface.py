@@ -1,4 +1,4 @@
-"""What every controller gets and gives; a method is a `begin` and a `decide`, in one file of `methods`."""
+"""Interface of all controllers: a method is a `begin` and a `decide`, in one file of `methods`."""
 
 import math
 import re
@@ -26,13 +26,13 @@ _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
 @dataclass(frozen=True)
 class Decision:
-    """A command, why, its predicted cost, and the standard deviation left in the guide step (mm; NaN: none).
+    """A command, its reason, its predicted cost, and the standard deviation left in the guide step (mm; NaN: none).
 
-    An infinite cost says that nothing was found that can be carried out: the loop holds, with `why` as the reason.
+    An infinite cost means that no feasible command was found: the loop holds the needle, with `why` as the reason.
 
-    miss, miss_sd: lateral miss predicted at the target, past it in +y or −y, and its standard deviation once the loop
-    has gone on correcting (mm; NaN: not predicted). The loop warns and holds by them. rest: for how long (s) the needle
-    rests, instead of the command, so that late readings come in.
+    miss, miss_sd: lateral miss predicted at the target, positive in +y, and its standard deviation with the corrections
+    to come (mm; NaN: not predicted). The loop warns and holds by them. rest: time (s) for which the needle rests,
+    in place of the command, so that late readings arrive.
     Raises InputError for a command that is not five finite numbers, a negative miss_sd, or a rest that is negative or
     not finite.
     """
@@ -56,7 +56,7 @@ class Decision:
 
 
 def _plain_command(command: Any) -> Command:
-    """The command as plain numbers, of whatever kind they are."""
+    """The command as plain numbers, whatever their types."""
     try:
         x, y, turn, guide, flip = map(float, command)
     except (TypeError, ValueError):
@@ -71,7 +71,9 @@ def _plain_command(command: Any) -> Command:
 
 def travel_left(scenario: Scenario, plan: Plan, state: State) -> float:
     """Advance (mm) to the target depth, or to the end of the stroke if that comes first."""
-    stroke_left = scenario.setup.stroke_mm - float(state.travel[0])  # as commanded, wherever the base began
+    stroke_left = scenario.setup.stroke_mm - float(
+        state.travel[0]
+    )  # commanded travel, without the start error
     return max(0.0, min(plan.target[0] - float(state.tip[0]), stroke_left))
 
 
@@ -81,7 +83,7 @@ def at_depth(task: Task, _memory: Any, estimate: Estimate) -> bool:
 
 
 class Observer(Protocol):
-    """Makes the estimate that a controller decides on."""
+    """Provides the estimate on which a controller decides."""
 
     def begin(self, task: Task) -> Estimate:
         """The estimate before the first reading."""
@@ -94,15 +96,15 @@ def _nothing(_task: Task) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """A controller. Memory is a frozen value of its own kind: what it carries from one period to the next.
+    """A controller. Memory is a frozen value of the controller's own type, carried from one period to the next.
 
-    name: as in `--controller`, small letters, digits and hyphens; summary: one line for lists; observer: what makes
-    the estimate of the readings (default: the model, corrected by them);
-    decide: the next command and the memory after it; begin: memory at the start (default: None); arrived: whether it
-    is done (default: at the target depth);
-    settings: class of its settings, a default for each, which the scenario has in the table `control.<table>`;
+    name: as in `--controller`, lower-case letters, digits and hyphens; summary: one line for lists; observer: provides
+    the estimate from the readings (default: the model, corrected by them);
+    decide: returns the next command and the memory after it; begin: returns the memory at the start (default: None);
+    arrived: whether the insertion is done (default: at the target depth);
+    settings: class of its settings, with a default for each, in the scenario's table `control.<table>`;
     needs_guide: whether it is refused where the guide may not move;
-    predicts: whether its decisions predict the miss. The loop holds by that, so a plan that misses is not refused.
+    predicts: whether its decisions predict the miss, by which the loop then holds: a plan that misses is accepted.
 
     Raises InputError for a name or settings that cannot be used.
     """
@@ -153,7 +155,7 @@ def _check_settings(name: str, settings: Any) -> None:
     try:
         settings.model_validate(default.model_dump(mode="json", exclude_none=True))
     except ValidationError as error:
-        rule = "must be what a TOML file holds, numbers, texts, true, false or lists of them"
+        rule = "must be of a TOML type: numbers, texts, true, false or lists of them"
         raise InputError(f"controller {name}: settings {rule}: {_keys(error)}") from None
 
 

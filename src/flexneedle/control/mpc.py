@@ -19,28 +19,28 @@ from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
 from flexneedle.types import Floats, Plan
 
-_LEAST_ADVANCE = 0.5  # of the longest step: standing still is no way to reduce the cost
+_LEAST_ADVANCE = 0.5  # of the longest step, so that the cost is not reduced by not advancing
 
 
 class CeMpc(BevelRule):
-    """Section `control.ce_mpc`: the search of `ce-mpc`, and its bang-bang rule."""
+    """Section `control.ce_mpc`: the search of `ce-mpc`, and its bang-bang rule for the bevel."""
 
     samples: int = count(21, least=2, most=100_000)
-    """Control sequences in an iteration of a period."""
+    """Number of control sequences in an iteration."""
     iterations: int = count(4, least=1, most=1_000)
-    """Iterations of a period."""
+    """Iterations of the search in a control period."""
     horizon: int = count(7, least=1, most=1_000)
-    """Steps that a period looks ahead."""
+    """Prediction horizon, in control steps."""
     orientation_weight_mm: NonNegative = 11.8
-    """Cost of an angle off the planned path, as a distance: 1 rad weighs as much as this."""
+    """Weight of the angle to the planned path, as the distance that is equivalent to 1 rad."""
     curvature_per_m: NonNegative = 0.232
-    """κ of the two paths of the bang-bang rule."""
+    """κ, curvature of the two paths of the bang-bang rule."""
     flip_dead_band: Fraction = 0.875
-    """Share of half of the two paths' separation that the tip may be off its line before the bevel is turned."""
+    """Dead band of the rule: a miss below half of the two paths' separation times 1 + this does not roll the bevel."""
     guide_weight: NonNegative = 0.075
-    """Cost of a squared millimetre that a guide step departs from the plan's."""
+    """Weight of the squared difference (mm²) between a guide step and the plan's."""
     energy_weight_per_mj: NonNegative = 2.74
-    """Cost of the tissue's strain energy after each step of the horizon, in mm² a mJ."""
+    """Weight of the tissue's strain energy after each step of the horizon, in mm² per mJ."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ def choose(
 
 
 def _window(plan: Plan, x: float, steps: int) -> tuple[Floats, Floats]:
-    """Planned tip poses (steps, 3) after each step from where the plan is at x, and its controls (steps, 5)."""
+    """Planned tip poses (steps, 3) after each step from the plan's tip at depth x, and its controls (steps, 5)."""
     last = len(plan.tips) - 1
     at = float(np.interp(x, plan.tips[:, 0], np.arange(last + 1)))
     index = np.minimum(at + np.arange(1, steps + 1), last)
@@ -97,9 +97,9 @@ def _window(plan: Plan, x: float, steps: int) -> tuple[Floats, Floats]:
 
 
 def planned_base(setup: Setup, plan: Plan, state: State, depth: Floats) -> Floats:
-    """Steps (n, 2) of base y (mm) and turn (rad) to where the plan has the base with its tip at `depth` (n,), mm.
+    """Steps (n, 2) of base y (mm) and θ (rad) to the planned base poses with the tip at `depth` (n,), mm.
 
-    A base that lags behind catches up as fast as its limits allow.
+    A base that lags behind the plan moves as fast as its limits allow.
     """
     limit = np.array([setup.max_base_step_mm, setup.max_base_turn_step])
     moved = np.concatenate([np.zeros((1, 2)), np.cumsum(plan.controls[:, 1:3], axis=0)])
@@ -148,7 +148,7 @@ def _cost_terms(control: CeMpc, reference: Floats, nominal: Floats) -> tuple[Ter
 
 
 def _controls(scenario: Scenario, state: State, z: Floats, base: Floats, travel: float, flip: bool) -> Floats:
-    """Controls (N, steps, 5) of z and the base's steps: the advance ends with the travel, the guide in its reach."""
+    """Controls (N, steps, 5) of z and the base's steps: advance limited to the travel, the guide to its reach."""
     n, steps = len(z), z.shape[1] // 2
     reach = scenario.setup.max_guide_travel_mm
     moved = np.minimum(np.cumsum(z[:, :steps], axis=1), travel)

@@ -1,14 +1,14 @@
-"""What the controller expects of the end: how uncertain the miss is that its model predicts.
+"""Uncertainty of the miss at the target that a controller's model predicts.
 
-The estimate's parameters are normal, with the covariance P that the readings leave. Readings to come narrow them to P',
-and the path is corrected meanwhile, until the tip is so near the target that a correction takes no effect. With c, the
-derivative of the tip's lateral position at the target, the variance of the miss is
+The estimate's parameters are normal, with the posterior covariance P. Readings to come reduce it to P',
+and the path is corrected by them, until the tip is so near the target that a correction takes no effect. With c, the
+derivative of the tip's lateral position at the target with respect to the parameters, the variance of the miss is
 
     c P' c + σ² + (κ l)² + min(m², c P c)
 
-σ is what no parameter explains of a reading, κ l of a path of length l that is left. The last term is for a miss m that
-is predicted although a path without one was searched for: where the needle is at the limit of what it can do, what
-later readings show cannot be corrected either.
+σ is the model error of a reading, κ l that of the remaining path of length l. The last term is for a miss m that
+is predicted although the search minimises it: at the limits of the needle, errors that later
+readings reveal cannot be corrected either.
 """
 
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ _DRIFT = 0.0008  # mm per mm of path
 class Outlook:
     """Derivatives (K, g) of the tip's lateral position ahead with respect to the parameters, over the depth grid (g,).
 
-    A few of them are simulated anew each period, along the path in hand (`Identified.perturbed`).
+    A few of them are simulated again each period, along the current path (`Identified.perturbed`).
     """
 
     grid: Floats
@@ -37,13 +37,13 @@ class Outlook:
 
     @staticmethod
     def of(estimate: Identified) -> "Outlook":
-        """Before the first path: as far ahead as the estimate itself needs them."""
+        """The derivatives before the first path: those of the estimate itself, a few steps ahead."""
         return Outlook(estimate.grid, estimate.curves)
 
     def renewed(self, estimate: Identified, controls: Floats, tips: Floats) -> "Outlook":
-        """With the derivatives of the parameters that the estimate has just perturbed, along controls (m, 5).
+        """Derivatives renewed for the parameters that the estimate has just perturbed, along controls (m, 5).
 
-        tips (m, 3): as these controls lead them, by the tracker.
+        tips (m, 3): measured tips predicted for these controls.
         """
         curves = self.curves.copy()
         side = estimate.state.bevel * np.cumprod(-np.sign(controls[:, 4]))
@@ -56,7 +56,7 @@ class Outlook:
         return replace(self, curves=curves)
 
     def sd(self, estimate: Identified, target: float, miss: float) -> float:
-        """Standard deviation (mm) of the miss at the depth `target` (mm), where `miss` is predicted (mm)."""
+        """Standard deviation (mm) of the miss at the depth `target` (mm), if `miss` (mm) is predicted."""
         step = estimate.nominal.scenario.setup.max_advance_mm
         end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
         to_come = (self.grid > estimate.state.tip[0]) & (self.grid <= target - UNCORRECTED * step)
@@ -67,6 +67,6 @@ class Outlook:
         return float(np.sqrt(float(known) + min(miss**2, self.sd_now(estimate, target) ** 2)))
 
     def sd_now(self, estimate: Identified, target: float) -> float:
-        """Standard deviation (mm) of the tip's lateral position at the depth `target` (mm), if nothing is corrected."""
+        """Standard deviation (mm) of the tip's lateral position at the depth `target` (mm) without corrections."""
         end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
         return float(np.sqrt(end @ np.linalg.solve(estimate.precision, end)))

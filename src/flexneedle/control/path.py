@@ -1,8 +1,8 @@
-"""The path in hand: the guide over absolute depth and the depths at which the bevel rolls, and what may replace it.
+"""The current path: the guide over absolute depth and the depths at which the bevel rolls, and its corrections.
 
 A sample corrects the path: lateral corrections of the guide at a few knots between now and the target, and the depths
-of the rolls, `LEAST_SLOTS` or as many as the path has. Sample 0 corrects nothing, so what is in hand is lost only to
-something better on the same model.
+of the rolls, `LEAST_SLOTS` or as many as the path has. Sample 0 corrects nothing, so the path is only replaced by
+a better one on the same model.
 """
 
 from dataclasses import dataclass, replace
@@ -18,13 +18,16 @@ from flexneedle.simulator.state import State
 from flexneedle.types import Command, Floats, Plan
 
 KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
-"""Where the guide is corrected, as shares of the path from now to the target."""
+"""Positions of the corrections of the guide, as shares of the path from the tip to the target."""
 LEAST_SLOTS = 4
-"""Rolls that a search may make, or as many as the path in hand has."""
-_FINE, _COARSE = 2, 2.0  # control steps of the rollout at first; length of its later steps, in control steps
-_DUE = 0.05  # of a control step: a roll this near is made now
+"""Number of rolls in a search, or that of the current path if it is larger."""
+_FINE, _COARSE = (
+    2,
+    2.0,
+)  # first steps of the rollout, of one control step; length of its later steps, in control steps
+_DUE = 0.05  # of a control step: a roll this near is made at once
 _STEEPEST = 0.03  # slope of the largest correction of the guide, mm per mm of the path left
-_SHARE_OF_A_STEP = 0.5  # of the guide's limit in a control step: what matters next to the target
+_SHARE_OF_A_STEP = 0.5  # of the guide's limit in a control step, added to it: largest next to the target
 _FURTHEST = 0.3  # largest move of a roll, of the path left
 _DECADES = 2.0  # over which the scales of the samples spread
 
@@ -47,9 +50,9 @@ def of_plan(plan: Plan) -> GuidePath:
 
 @dataclass(frozen=True, eq=False)
 class Ahead:
-    """The path from now to the target in m steps: depth (m + 1,) of their ends, base (m, 2) of each; mm, rad.
+    """The path from the tip to the target in m steps: depth (m + 1,) of their ends, base (m, 2) of each; mm, rad.
 
-    state: the estimated needle now; path: in hand; step, reach: the guide's limits (mm) a control step and in all;
+    state: the estimated needle; path: the current one; step, reach: the guide's limits (mm), per control step, in all;
     advance: longest control step (mm).
     """
 
@@ -98,14 +101,14 @@ class Ahead:
 
     @property
     def bounds(self) -> tuple[Floats, Floats]:
-        """Of a sample, (d,) each."""
+        """Bounds of a sample, (d,) each."""
         wide = 2.0 * self.reach if self.step > 0.0 else 0.0
         lower = [np.full(KNOTS.size, -wide), np.full(self.slots, self.depth[0])]
         upper = [np.full(KNOTS.size, wide), np.full(self.slots, self.unused)]
         return np.concatenate(lower), np.concatenate(upper)
 
     @property
-    def in_hand(self) -> Floats:
+    def current(self) -> Floats:
         """The sample (d,) that corrects nothing."""
         rolls = np.full(self.slots, self.unused)
         rolls[: len(self.path.rolls)] = np.maximum(self.path.rolls, self.depth[0])
@@ -113,15 +116,15 @@ class Ahead:
 
     @property
     def constant(self) -> Floats:
-        """Samples (4, d) that roll now or not, and after the first step or not (the last index), and never again."""
-        z = np.tile(self.in_hand, (4, 1))
+        """Samples (4, d) that roll before the first step or not, and after it or not (last index), and never again."""
+        z = np.tile(self.current, (4, 1))
         z[:, KNOTS.size :] = self.unused
         z[2:, KNOTS.size] = self.depth[0]
         z[1::2, KNOTS.size + 1] = self.depth[1]
         return z
 
     def controls(self, z: Floats) -> tuple[Floats, Floats]:
-        """Controls (N, m, 5) of samples z (N, d), and the depths (N, m + 1) of the tip before and after each step."""
+        """Controls (N, m, 5) of samples z (N, d), and the tip's depths (N, m + 1) before and after each step."""
         depth, roll = self._grid(z[:, KNOTS.size :])
         guide = self._guide(z[:, : KNOTS.size], depth)
         controls = np.zeros((*depth[:, 1:].shape, 5))
@@ -134,8 +137,8 @@ class Ahead:
     def _grid(self, rolls: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Depths (N, m + 1) with a boundary at each roll (N, s), and whether the bevel rolls before each step (N, m).
 
-        So the cost is continuous in the depth of a roll. Each has a boundary of its own, the nearest or the next one
-        that is free, as long as there is one before the last step; two rolls at one place cancel.
+        So the cost is continuous in the depth of a roll. Each roll has its own boundary, the nearest or the next one
+        that is free, if there is one before the last step; two rolls at one depth cancel.
         """
         n, m = len(rolls), self.depth.size - 1
         depth, rolled = np.tile(self.depth, (n, 1)), np.zeros((n, m + 1), dtype=bool)
@@ -152,7 +155,7 @@ class Ahead:
         return depth, rolled[:, :m]
 
     def _guide(self, corrections: Floats, depth: Floats) -> Floats:
-        """Guide positions (N, m + 1) within the limits, of corrections (N, k) at the knots."""
+        """Guide positions (N, m + 1) within the limits, for corrections (N, k) at the knots."""
         share = (depth - self.depth[0]) / max(self.left, 1e-9)
         knots = np.append(0.0, KNOTS)
         padded = np.concatenate([np.zeros((len(corrections), 1)), corrections], axis=1)
@@ -170,15 +173,15 @@ class Ahead:
         return guide
 
     def corrected(self, z: Floats) -> GuidePath:
-        """The path (in place of the one in hand) that a sample (d,) makes."""
+        """The path with the corrections of a sample (d,)."""
         controls, depth = self.controls(z[None])
         guide = self.state.guide + np.append(0.0, np.cumsum(controls[0, :, 3]))
         return GuidePath(depth[0], guide, tuple(depth[0, :-1][controls[0, :, 4] > 0.0].tolist()))
 
     def first(self, path: GuidePath) -> tuple[Command, GuidePath]:
-        """The command of this period, and what is left of a path after it.
+        """The command of this period, and the rest of a path after it.
 
-        A roll that is due is made at once; before one that is near the advance ends where it is due.
+        A roll that is due is made at once; the advance ends at the depth of the next one.
         """
         x = float(self.depth[0])
         due = x + _DUE * self.advance
@@ -194,7 +197,7 @@ class Ahead:
 
 
 def _without_twins(rolls: Floats, near: float) -> Floats:
-    """Ascending rolls (N, s), those infinite that another one within `near` (mm) undoes."""
+    """Ascending rolls (N, s); pairs within `near` (mm), which cancel, are infinite."""
     left = rolls.copy()
     for k in range(left.shape[1] - 1):
         twins = np.isfinite(left[:, k]) & (left[:, k + 1] - left[:, k] <= near)
@@ -203,12 +206,12 @@ def _without_twins(rolls: Floats, near: float) -> Floats:
 
 
 def proposals(ahead: Ahead, count: int, rng: np.random.Generator) -> Floats:
-    """Samples (count, d) around the path in hand, which is the first; of scales over two decades.
+    """Samples (count, d) around the current path, which is the first, with scales over two decades.
 
-    With a guide a quarter moves it alone, a quarter the rolls alone, a sixth puts in a pair of rolls, the rest moves
-    all; without one three quarters move rolls, a half puts in a pair.
+    With a guide a quarter changes it alone, a quarter the rolls alone, a sixth adds a pair of rolls, the rest changes
+    all; without one three quarters change the rolls, a half adds a pair.
     """
-    z = np.tile(ahead.in_hand, (count, 1))
+    z = np.tile(ahead.current, (count, 1))
     k = KNOTS.size
     kind = np.arange(count) % 12
     scale = 10.0 ** rng.uniform(-_DECADES, 0.0, (count, 2))
@@ -224,5 +227,5 @@ def proposals(ahead: Ahead, count: int, rng: np.random.Generator) -> Floats:
         middle = rng.uniform(ahead.depth[0], ahead.depth[-1], pair.size)
         half = 0.5 * ahead.left * 10.0 ** rng.uniform(-1.5, 0.0, pair.size)
         z[pair, -2], z[pair, -1] = middle - half, middle + half
-    z[0] = ahead.in_hand
+    z[0] = ahead.current
     return np.clip(z, *ahead.bounds)

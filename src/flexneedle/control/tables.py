@@ -1,6 +1,6 @@
-"""The controllers' tables of a scenario: checked by the controllers that own them, and filled with their defaults.
+"""The controllers' tables of a scenario: checked by their controllers, and completed with the defaults.
 
-A scenario keeps the tables below `control` as they are given, since it knows no controller.
+A scenario keeps the tables below `control` unchecked, since it has no access to the controllers.
 """
 
 from collections.abc import Iterable
@@ -22,7 +22,7 @@ from flexneedle.types import Plan
 
 @cache
 def typed_scenario(methods: tuple[Method, ...]) -> type[Scenario]:
-    """Return the class of scenarios whose tables of these controllers are of the controllers' own classes.
+    """Return the class of scenarios in which the tables of these controllers have the controllers' settings classes.
 
     Raises InputError if two of them would share a table.
     """
@@ -41,7 +41,7 @@ def typed_scenario(methods: tuple[Method, ...]) -> type[Scenario]:
 
 
 def completed(scenario: Scenario, methods: Iterable[Method], source: str = "") -> Scenario:
-    """Return the scenario with all settings of these controllers, those of other tables as they are.
+    """Return the scenario with all settings of these controllers, other tables unchanged.
 
     Raises ScenarioError with one line for each problem, which opens with `source`.
     """
@@ -49,7 +49,7 @@ def completed(scenario: Scenario, methods: Iterable[Method], source: str = "") -
 
 
 def task(method: Method, simulator: Simulator, plan: Plan) -> Task:
-    """Return what `method` is to carry out, with its settings of the simulator's scenario. Raises ScenarioError."""
+    """Return the task of `method`, with its settings from the simulator's scenario. Raises ScenarioError."""
     control = _typed(simulator.scenario, (method,), "").control
     return Task(simulator, plan, getattr(control, method.table) if method.settings else None)
 

@@ -1,9 +1,9 @@
-"""The cross-entropy method with a full Gaussian (paper section III; Kobilarov 2012), ask and tell on arrays.
+"""The cross-entropy method with a full Gaussian (paper section III; Kobilarov 2012), on arrays.
 
     search_state = start(mean, sigma)
     while not search_state.done(settings):
-        samples = ask(search_state, settings, rng)
-        search_state = tell(search_state, settings, samples, cost(samples))
+        samples = sample(search_state, settings, rng)
+        search_state = update(search_state, settings, samples, cost(samples))
 
 A coordinate whose sigma is 0 stays at its mean: its covariance entries are zero.
 """
@@ -22,16 +22,16 @@ _FLOOR = 1e-3  # standard deviation that regularisation keeps, relative to the i
 
 
 def elite_count(samples: int, fraction: float) -> int:
-    """Elite samples of N: ⌈ρN⌉ (paper section III), and two at least, for a covariance."""
+    """Number of elite samples of N: ⌈ρN⌉ (paper section III), at least two, for a covariance."""
     return max(2, ceil(samples * fraction - 1e-9))  # the slack is for rounding of the product
 
 
 @dataclass(frozen=True)
 class Search:
-    """N samples, the elite ρN of them, most iterations; smoothing β keeps that share of the old moments.
+    """N samples, the elite ρN of them, most iterations; smoothing β: share of the old moments that is kept.
 
-    tolerance: spread of the elite costs, relative to the first finite one, at which the method has converged. usual:
-    from this iteration on it has converged, too, once ten iterations lowered the best cost by no more than that.
+    tolerance: spread of the elite costs, relative to the first finite one, at which the search has converged. usual:
+    from this iteration on it has also converged once ten iterations lowered the best cost by no more than that.
     """
 
     samples: int
@@ -44,7 +44,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Settings(Search):
-    """A search within bounds: lower, upper (d,), enforced on the samples."""
+    """A search within bounds lower, upper (d,), to which the samples are clipped."""
 
     lower: Floats
     upper: Floats
@@ -52,10 +52,10 @@ class Settings(Search):
 
 @dataclass(frozen=True)
 class SearchState:
-    """Gaussian over d coordinates after some iterations, the best sample so far, and how it came about.
+    """Gaussian over d coordinates after some iterations, the best sample, and the history.
 
     history: a dict per iteration with mean and spread (standard deviation) of the Gaussian, each (d,), cost_mean of
-    the samples, best (cost so far) and cost_quantiles (least, ρ, median, greatest).
+    the samples, best (cost up to then) and cost_quantiles (least, ρ, median, greatest).
     """
 
     mean: Floats
@@ -68,23 +68,23 @@ class SearchState:
 
     @property
     def iterations(self) -> int:
-        """Iterations done."""
+        """Number of iterations done."""
         return len(self.history)
 
     def done(self, settings: Settings) -> bool:
-        """Whether to stop."""
+        """Whether the search has ended."""
         return self.converged or self.iterations >= settings.iterations
 
 
 def start(mean: Floats, sigma: Floats, correlation: Floats | None = None) -> SearchState:
-    """Begin with standard deviations `sigma` (d,) and a `correlation` (d, d), by default none."""
+    """Initial Gaussian with standard deviations `sigma` (d,) and a `correlation` (d, d) (default: none)."""
     mean, sigma = np.asarray(mean, dtype=float), np.asarray(sigma, dtype=float)
     correlation = np.eye(mean.size) if correlation is None else correlation
     return SearchState(mean, correlation * np.outer(sigma, sigma), sigma, mean)
 
 
-def ask(search_state: SearchState, settings: Settings, rng: np.random.Generator) -> Floats:
-    """Draw samples (N, d) within the bounds; the first is the mean, the second the best so far."""
+def sample(search_state: SearchState, settings: Settings, rng: np.random.Generator) -> Floats:
+    """Draw samples (N, d) within the bounds; the first is the mean, the second the best sample of all iterations."""
     noise = rng.standard_normal((settings.samples, search_state.mean.size))
     free = search_state.initial_sigma > 0.0
     factor = np.zeros_like(search_state.covariance)
@@ -96,10 +96,10 @@ def ask(search_state: SearchState, settings: Settings, rng: np.random.Generator)
     return np.clip(samples, settings.lower, settings.upper)
 
 
-def tell(search_state: SearchState, settings: Settings, samples: Floats, costs: Floats) -> SearchState:
+def update(search_state: SearchState, settings: Settings, samples: Floats, costs: Floats) -> SearchState:
     """Refit to the elite: the ⌈ρN⌉ samples of least cost, ties in the order drawn (paper eq. 6 and 7).
 
-    A cost of infinity marks a failed sample; with no finite cost at all the Gaussian stays as it is.
+    A cost of infinity marks a failed sample; without any finite cost the Gaussian does not change.
     """
     costs = np.where(np.isfinite(costs), costs, np.inf)
     order = np.argsort(costs, kind="stable")
@@ -124,10 +124,12 @@ def minimize(
     progress: Callable[[dict[str, Any]], None] | None = None,
     first: Floats | None = None,
 ) -> SearchState:
-    """Ask and tell until done. `cost` maps samples (N, d) to costs (N,); `first` (n, d): of iteration 1."""
+    """Sample and update until done. `cost` maps samples (N, d) to costs (N,); `first` (n, d): those of iteration 1."""
     while not search_state.done(settings):
-        samples = ask(search_state, settings, rng) if first is None or search_state.iterations > 0 else first
-        search_state = tell(search_state, settings, samples, cost(samples))
+        samples = (
+            sample(search_state, settings, rng) if first is None or search_state.iterations > 0 else first
+        )
+        search_state = update(search_state, settings, samples, cost(samples))
         if progress is not None:
             done = search_state.iterations
             usual = max(done, settings.usual or settings.iterations)
@@ -142,7 +144,7 @@ def _elite_spread(entry: dict[str, Any]) -> float:
 
 
 def _converged(history: Sequence[dict[str, Any]], settings: Settings) -> bool:
-    """Whether the elite's costs hardly differ any more, or the best has hardly fallen for a while."""
+    """Whether the spread of the elite's costs is within tolerance, or the best cost fell by less in ten iterations."""
     spreads = [_elite_spread(entry) for entry in history]
     little = settings.tolerance * next((spread for spread in spreads if np.isfinite(spread)), np.inf)
     if not np.isfinite(little):
@@ -162,7 +164,7 @@ def _with(
     costs: Floats,
     settings: Settings,
 ) -> SearchState:
-    """Append an iteration to the history and keep the better of `winner` and the best so far."""
+    """Append an iteration to the history and keep the better of `winner` and the present best."""
     ordered = np.sort(costs)
     better = bool(ordered[0] < search_state.best_cost)
     best_cost = min(float(ordered[0]), search_state.best_cost)

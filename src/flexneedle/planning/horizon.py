@@ -2,8 +2,8 @@
 
     found = best(variables, rollout, terms, search, rng)
 
-Cross-entropy draws samples z (N, d) of the variables within their bounds, `variables.controls` turns them into
-controls, `rollout` carries these out, and the terms charge for what came of it.
+Cross-entropy draws samples z (N, d) of the variables within their bounds, `variables.controls` maps them to
+controls, `rollout` simulates these, and the terms are evaluated on the outcome.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,9 +19,9 @@ from flexneedle.types import Floats
 
 @dataclass(frozen=True, eq=False)
 class Variables:
-    """What is searched: d coordinates that describe a sequence of controls.
+    """Variables of a search: d coordinates that describe a sequence of controls.
 
-    lower, upper, mean, sigma (d,): bounds, and the first mean and standard deviation; a coordinate of sigma 0 stays.
+    lower, upper, mean, sigma (d,): bounds, initial mean and standard deviation; a coordinate with sigma 0 is fixed.
     controls: z (N, d) → (N, m, 5). correlation (d, d): of the first samples (default: none).
     """
 
@@ -56,8 +56,8 @@ def best(
 ) -> Found:
     """Search for the sample of least cost; infinite if none converged, z being the mean then.
 
-    first (n, d): samples of the first iteration in place of the Gaussian's, at least an elite. The best sample is
-    kept: what is found is never worse than an incumbent among them.
+    first (n, d): samples of the first iteration in place of the Gaussian's, at least as many as the elite. The best
+    sample is kept: the result is never worse than an incumbent among them.
     """
     settings = ce.Settings(**vars(search), lower=variables.lower, upper=variables.upper)
     search_state = ce.start(variables.mean, variables.sigma, variables.correlation)
@@ -65,7 +65,7 @@ def best(
     def evaluate(z: Floats) -> Floats:
         return cost(terms, rollout(variables.controls(z)))
 
-    opening = ce.ask(search_state, settings, rng) if first is None else first
+    opening = ce.sample(search_state, settings, rng) if first is None else first
     opening = np.clip(opening, settings.lower, settings.upper)
     search_state = ce.minimize(evaluate, search_state, settings, rng, progress, opening)
     outcome = rollout(variables.controls(search_state.best[None]))

@@ -1,4 +1,4 @@
-"""Insertion plans: a few control primitives, their cost, the best of them (paper section III-A).
+"""Insertion plans: a few control primitives, their cost, and the search for the best (paper section III-A).
 
 A primitive covers its share of the travel with equal steps. Its six coordinates are the longest step of base x
 (mm), the step of base y (mm), base θ (rad) and guide (mm), ε, whose sign is the wanted bevel direction, and the
@@ -30,7 +30,7 @@ _BEVEL_CORRELATION = 0.8  # of ε of neighbouring primitives at first: few flips
 
 @dataclass(frozen=True)
 class PlanProblem:
-    """What to reach and with what: mm, rad.
+    """Target, limits and weights of a plan: mm, rad.
 
     travel: insertion from the start to the target depth, of which `air` comes before the skin; step (4,) and reach
     (4,): largest step of base x, y, θ, guide and largest sum of steps; sigma (6,): first standard deviation of each
@@ -78,7 +78,7 @@ def optimise(
 
 
 def solution(found: Found) -> Solution:
-    """What was found, without steps that do not advance, and with the bevel set before the first."""
+    """The solution: without steps that do not advance, the bevel set before the first."""
     controls = found.outcome.controls[0]
     facing = np.cumprod(-controls[:, 4])
     moving = controls[:, 0] > 0.0
@@ -123,7 +123,7 @@ def _correlation(primitives: int) -> Floats:
 def schedule(problem: PlanProblem, z: Floats) -> tuple[Floats, Floats]:
     """Primitives z (N, 6 P) to controls (N, m, 5), padded with zero steps, and bevel directions (N, P).
 
-    The sum of lateral steps is kept within reach here, before any rollout.
+    The sum of lateral steps is limited to the reach here, before any rollout.
     """
     primitives = z.reshape(len(z), problem.primitives, COORDINATES)
     share = np.exp(primitives[:, :, SHARE])
@@ -141,8 +141,8 @@ def schedule(problem: PlanProblem, z: Floats) -> tuple[Floats, Floats]:
     controls = np.full((len(z), index.size, 5), -1.0)
     controls[:, :, :4] = steps[rows, owner]
     first = np.concatenate([np.zeros((len(z), 1), dtype=int), ends[:, :-1]], axis=1)
-    turns = wanted != np.concatenate([np.ones((len(z), 1)), wanted[:, :-1]], axis=1)
-    controls[rows, first, 4] = np.where(turns, 1.0, -1.0)
+    rolls = wanted != np.concatenate([np.ones((len(z), 1)), wanted[:, :-1]], axis=1)
+    controls[rows, first, 4] = np.where(rolls, 1.0, -1.0)
     return controls, wanted
 
 

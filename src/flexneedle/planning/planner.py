@@ -26,7 +26,7 @@ _TARGET = "depth and lateral offset in mm"
 STRATEGIES = ("manipulation", "steering")
 _DEPTH_TOLERANCE_MM = 1e-6
 _SHARE_SIGMA = 0.1  # of the logarithm of a primitive's share of the travel
-_SHARE_OF_A_SEARCH = 4  # of plan.samples goes into each number of rolls and side, which have few coordinates
+_SHARE_OF_A_SEARCH = 4  # plan.samples over this for each number of rolls and side, which have few coordinates
 _LEAST_SAMPLES = 8
 _AT_LIMIT = 0.999  # share of a limit that counts as reached
 
@@ -94,7 +94,7 @@ def _search(
     rng: np.random.Generator,
     progress: Callable[[dict[str, Any]], None] | None,
 ) -> Solution:
-    """The best primitives, or, where nothing but the bevel is free, the best rolls."""
+    """The best primitives, or the best rolls where only the bevel is free."""
     plan, rollout = simulator.scenario.plan, _rollout(simulator)
     if _bevel_alone(problem):
         search = _settings(plan, max(_LEAST_SAMPLES, plan.samples // _SHARE_OF_A_SEARCH))
@@ -182,9 +182,9 @@ def _end_at_depth(simulator: Simulator, controls: Floats, bevel: int, depth: flo
 
 
 def _binding_limit(simulator: Simulator, problem: PlanProblem, controls: Floats, states: list[State]) -> str:
-    """Name the key that keeps the plan from its target; empty if it gets there.
+    """Name the key of the limit that keeps the plan from its target; empty if it reaches it.
 
-    A target out of the bevel's reach is named however near the plan comes to it.
+    A target out of the bevel's reach is named even if the plan ends within 1 mm of it.
     """
     scenario, end = simulator.scenario, states[-1].tip
     setup, near = scenario.setup, math.dist(end[:2], problem.target) <= 1.0

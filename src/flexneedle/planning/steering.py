@@ -1,9 +1,9 @@
-"""Insertion plans in which the bevel alone steers: its side at the start, and the depths of a few rolls.
+"""Insertion plans with the bevel as the only input: its side at the start, and the depths of a few rolls.
 
-Where the tip ends is a continuous function of the depth of a roll. A roll at the skin is an insertion with the other
+The end of the tip is a continuous function of the depth of a roll. A roll at the skin is an insertion with the other
 side, a roll at the target one without a roll; so by the intermediate value theorem one roll reaches every target
 between the ends of the two insertions without any, and no sequence of rolls is needed to find it. More rolls can only
-make the way there cheaper.
+lower the cost.
 """
 
 from collections.abc import Callable
@@ -32,10 +32,10 @@ def steer(
     rng: np.random.Generator,
     progress: OnIteration | None = None,
 ) -> Solution:
-    """Search the depths of 0 to 4 rolls from either side at the start, until one more roll is no gain.
+    """Search the depths of 0 to 4 rolls with either side at the start, until one more roll does not lower the cost.
 
-    The cheapest of all is searched once more, with the travel that it needs to end at the target's depth: a bent needle
-    ends before it. `rollout` starts with bevel +1 in air; `search` is that of each number of rolls and side.
+    The best of all is searched once more with the travel that it needs to end at the target's depth: a bent needle
+    ends short of it. `rollout` starts with bevel +1 in air; `search` is that of each number of rolls and side.
     """
     found: list[tuple[float, Found]] = []
     for rolls in range(MOST_ROLLS + 1):
@@ -71,8 +71,8 @@ def rolled(problem: PlanProblem, z: Floats, side: float) -> Floats:
     """Controls (N, m, 5) of an insertion that starts with the bevel to `side` and rolls it at shares z (N, k) of the
     target's depth, in any order.
 
-    Its steps are even but where a roll divides one: so no roll moves the others' steps, whose length has an effect of
-    its own near the skin, and where the tip ends is continuous in z.
+    Its steps are even except where a roll divides one: so no roll changes the other steps, whose length has an effect
+    near the skin, and the end of the tip is continuous in z.
     """
     n = len(z)
     even = np.linspace(0.0, problem.travel, int(np.ceil(problem.travel / problem.step[0] - 1e-9)) + 1)

@@ -1,4 +1,4 @@
-"""The terms of a cost, a function each: what rollouts did → (N,). A cost is a weighted sum of some of them.
+"""The terms of a cost, one function each: outcome of rollouts → (N,). A cost is a weighted sum of some of them.
 
 | term | unit | its weight's unit, for a cost in mm |
 |---|---|---|
@@ -32,7 +32,7 @@ PlanarPoint = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """N sequences of m steps and what they led to.
+    """N sequences of m steps and their outcomes.
 
     controls (N, m, 5): db_x, db_y, db_theta, dg_y (mm, rad), flip (−1 or +1); tips (N, m, 3): after each step, mm and
     rad; energy (N, m): strain energy of the tissue, mJ; converged (N, m); deflection (N, m): mean square of the
@@ -47,7 +47,7 @@ class Outcome:
 
     @property
     def inside(self) -> NDArray[np.bool_]:
-        """(N, m): steps that advance and end with the tip in the tissue; the others do nothing to it."""
+        """(N, m): steps that advance and end with the tip in the tissue."""
         inside: NDArray[np.bool_] = (self.tips[:, :, 0] > 0.0) & (self.controls[:, :, 0] > 0.0)
         return inside
 
@@ -57,7 +57,7 @@ class Outcome:
 
 
 RolloutFunction = Callable[[Floats], Outcome]
-"""Carries out controls (N, m, 5)."""
+"""Simulates controls (N, m, 5)."""
 
 
 @dataclass(frozen=True)
@@ -81,24 +81,24 @@ def cost(terms: Sequence[Term], outcome: Outcome) -> Floats:
 
 
 def past(outcome: Outcome, target: PlanarPoint) -> Floats:
-    """How far (mm) past the target in +y the tip is at its depth, to which its own line is followed from the end."""
+    """Signed lateral miss (mm, + in +y) at the target's depth, to which the tip's line is extended from the end."""
     end = outcome.tips[:, -1]
     distance: Floats = end[:, 1] + np.tan(end[:, 2]) * (target[0] - end[:, 0]) - target[1]
     return distance
 
 
 def miss(outcome: Outcome, target: PlanarPoint, blur: float = 0.0) -> Floats:
-    """Lateral distance (mm) from the target at its depth, as `past` has it.
+    """Lateral distance (mm) from the target at its depth, the size of `past`.
 
-    blur (mm): of a distance d that is known no better than this, √(d² + blur²) − blur counts.
+    blur (mm): uncertainty of the distance d, of which √(d² + blur²) − blur is charged.
     """
     blurred: Floats = np.hypot(past(outcome, target), blur) - blur
     return blurred
 
 
 def large_miss(outcome: Outcome, target: PlanarPoint, blur: float, sd: float) -> Floats:
-    """A share of the `miss` (mm) that is near 0 for a distance d far below its standard deviation (mm) and near 1 far
-    above it: d² / (d² + sd²).
+    """The share d² / (d² + sd²) of the `miss` (mm): near 0 for a distance d far below its standard deviation sd (mm),
+    near 1 far above it.
     """
     square = past(outcome, target) ** 2
     least = np.finfo(float).tiny
@@ -119,7 +119,7 @@ def energy_of_steps(outcome: Outcome) -> Floats:
 
 
 def guide_slope(outcome: Outcome) -> Floats:
-    """Mean square of the guide's motion for that of the base, over the travel: ∫(dg/db_x)² db_x / ∫db_x."""
+    """Mean square slope of the guide's path over the travel of the base: ∫(dg/db_x)² db_x / ∫db_x."""
     advance = outcome.controls[:, :, 0]
     squares = np.divide(
         outcome.controls[:, :, 3] ** 2, advance, out=np.zeros_like(advance), where=advance > 0.0
@@ -129,13 +129,13 @@ def guide_slope(outcome: Outcome) -> Floats:
 
 
 def rolls(outcome: Outcome, first: int = 0) -> Floats:
-    """Half-turns of the bevel, from step `first` on."""
+    """Number of rolls of the bevel from step `first` on."""
     count: Floats = (outcome.controls[:, first:, 4] > 0.0).sum(axis=1).astype(float)
     return count
 
 
 def late_rolls(outcome: Outcome, depth: float, length: float) -> Floats:
-    """Half-turns of the bevel, each as e^(−d/length) with d the distance (mm) that is left to the depth (mm) then."""
+    """Sum over the rolls of the bevel of e^(−d/length), d the distance (mm) of the tip from the depth (mm) then."""
     before = outcome.tips[:, :, 0] - outcome.controls[:, :, 0]
     near = np.exp(np.minimum(0.0, before - depth) / length)
     sum_: Floats = (near * (outcome.controls[:, :, 4] > 0.0)).sum(axis=1)
@@ -154,7 +154,7 @@ def distance_from_line(outcome: Outcome, start: PlanarPoint, target: PlanarPoint
 
 
 def out_of_reach(outcome: Outcome, expected: Floats) -> Floats:
-    """How far (mm) the target is expected to be out of the bevel's reach after the first step.
+    """Expected distance (mm) of the target from the bevel's reach after the first step.
 
     expected (2,): with the bevel as it is, and with the bevel rolled before that step.
     """
@@ -177,7 +177,7 @@ def guide_motion(outcome: Outcome) -> Floats:
 def deviation(outcome: Outcome, reference: Floats, orientation: float) -> Floats:
     """Squared SE(2) deviation (mm²) from poses (m, 3), summed over the steps (paper eq. 13).
 
-    orientation: the distance (mm) that 1 rad weighs as much as.
+    orientation: weight of the angle, as the distance (mm) that is equivalent to 1 rad.
     """
     off = outcome.tips - reference
     off[:, :, 2] *= orientation

@@ -1,4 +1,4 @@
-"""The controllers by name, the default first. A further one is a file here with a METHOD."""
+"""The controllers by name, the default first. A new controller is a file here with a METHOD."""
 
 import warnings
 from importlib import import_module
@@ -33,8 +33,7 @@ def method(name: str) -> Method:
 def checked(scenario: Scenario, *own: Method, source: str = "") -> Scenario:
     """Return the scenario with all settings of the controllers here and of others (`own`).
 
-    Raises ScenarioError with one line for each problem, which opens with `source`; a table that belongs to none of them
-    is one.
+    Raises ScenarioError with one line for each problem, which opens with `source`; a table of no controller is one.
     """
     known = _with(own)
     if lines := unowned(scenario, known, source):
@@ -43,9 +42,9 @@ def checked(scenario: Scenario, *own: Method, source: str = "") -> Scenario:
 
 
 def used(scenario: Scenario, *own: Method, source: str = "") -> Scenario:
-    """Return the scenario as `checked` does, for one use: a table may belong to a controller that is not in use.
+    """Return the scenario as `checked` does, but accept the table of a controller that is not in use.
 
-    Of such a table it warns (ScenarioWarning), in the same words whatever the source: it is printed once.
+    It warns (ScenarioWarning) of such a table, in the same words whatever the source, so that it is printed once.
     """
     known = _with(own)
     for line in unowned(scenario, known):

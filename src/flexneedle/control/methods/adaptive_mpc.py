@@ -1,12 +1,12 @@
-"""`adaptive-mpc`, the default: one search to the target, every period, on a model that is fitted to the readings.
+"""`adaptive-mpc`, the default: each period, one search to the target on a model that is fitted to the readings.
 
-Start, needle, guide and tissue are identified (`control.identification`). The path in hand, the guide over depth and
-the depths at which the bevel rolls, begins as the plan's (`control.path`). Cross-entropy searches for a better one
-among its corrections, guide and rolls together, each carried out on the fitted model from now to the target. The cost
-is a length: the miss, and what tissue energy, the guide's slope, rolls and the distance from the line to the target are
-worth against it, each relative to a scale of the scenario's own, so that one setting serves every needle.
+Start, needle, guide and tissue are identified (`estimation.identification`). The current path, the guide over depth and
+the depths at which the bevel rolls, is first the plan's (`control.path`). Cross-entropy searches for a better one
+among its corrections, guide and rolls together, each simulated on the fitted model from the tip to the target. The cost
+is a length: the miss plus weighted tissue energy, guide slope, rolls and distance from the line to the target,
+each relative to a scale of the scenario, so that one setting serves every needle.
 
-What is predicted of the end, the miss and its standard deviation, goes with each decision (`control.outlook`).
+Each decision comes with the predicted miss and its standard deviation (`control.outlook`).
 """
 
 import math
@@ -33,13 +33,13 @@ from flexneedle.planning.terms import Outcome, Term
 from flexneedle.scenario.sections.fields import NonNegative, count
 from flexneedle.types import Command, Floats
 
-_ELITE = 8  # one in so many samples
+_ELITE = 8  # samples for each elite one
 _LEAST_ELITE = 3
 _SMOOTHING = 0.3
 _TOLERANCE = 1e-6
 _RESTS = (4.0, 2.0, 1.0)  # control steps before the target at which the needle rests
 _STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
-_SURPRISE = 4.0  # standard deviations of a reading, left by the fit, from which the needle rests
+_SURPRISE = 4.0  # residual of the fit, in standard deviations of a reading, from which the needle rests
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
@@ -47,42 +47,42 @@ class AdaptiveMpc(Priors):
     """Section `control.adaptive_mpc`. The cost of a path is in mm; its weights hold for any needle and tissue."""
 
     samples: int = count(24, least=12, most=100_000)
-    """Paths in an iteration of a period."""
+    """Number of paths in an iteration of the search."""
     iterations: int = count(2, least=1, most=1_000)
-    """Iterations of a period."""
+    """Iterations of the search in a control period."""
     effort: int = count(3, least=1, most=1_000)
-    """Factor on the samples in the first period, and where no path was found that ends near the target."""
+    """Factor on `samples` in the first period, and in a search again if none ends within `control.miss_limit_mm`."""
     urgency: float = Field(default=1.5, ge=0.0, le=10.0)
-    """A predicted miss above its standard deviation costs more near the target: 1 / (share of the path left) to this
-    power; the share counts as at least five control steps. 0: the same everywhere."""
+    """Exponent u of the factor r^(−u) on a predicted miss above its standard deviation; r is the share of the path that
+    is left, at least five control steps. 0: no factor."""
     energy_weight_mm: NonNegative = 0.7
-    """Cost of the energy that the tissue down to the target has where it is displaced by 1 mm."""
+    """Weight of the tissue energy, in units of the energy of all tissue down to the target displaced by 1 mm."""
     unguided_energy_weight_mm: NonNegative = 1.0
-    """Cost of that energy where the guide may not move."""
+    """`energy_weight_mm` where the guide may not move."""
     line_weight: NonNegative = 0.4
-    """Cost of the mean distance of the tip from the line to the target, by the share of the path that is left."""
+    """Weight of the mean distance of the tip from the line to the target, times the share of the path that is left."""
     unguided_line_weight: NonNegative = 0.0
-    """Cost of that distance where the guide may not move."""
+    """`line_weight` where the guide may not move."""
     slope_weight_mm: NonNegative = 0.5
-    """Cost of a mean squared slope of 1 of the guide's path, by the share of the path that is left."""
+    """Weight of the mean square slope of the guide's path, times the share of the path that is left."""
     roll_weight_mm: NonNegative = 0.03
     """Cost of a roll of the bevel."""
     reach_weight: NonNegative = 1.0
-    """Cost of how far the target is expected to be out of the bevel's reach, with the guide as it is."""
+    """Weight of the expected distance of the target from the bevel's reach, with the guide fixed."""
     unguided_reach_weight: NonNegative = 30.0
-    """Cost of that where the guide may not move."""
+    """`reach_weight` where the guide may not move."""
     late_roll_weight: NonNegative = 1.0
-    """Cost of how far a roll just before the target may move the tip, in its standard deviations."""
+    """Weight of the standard deviation of the tip's motion in a roll just before the target."""
 
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """What is carried from period to period: the path in hand, and the derivatives of what is ahead.
+    """The memory from period to period: the current path, and the derivatives ahead of the tip.
 
-    path: as decided; rolled: the same without the roll that the command makes; bevel: side of the bevel before it.
-    Which of the two is in hand shows in the next estimate: a needle that is held, or rests, does not roll.
-    scale: energy (mJ) of the tissue down to the target where it is displaced by 1 mm; rests: made so far;
-    blur: standard deviation of the predicted miss (mm), had none been predicted.
+    path: as decided; rolled: the same after the roll of the command; bevel: side of the bevel before the command.
+    The next estimate shows which of the two is current: a needle that is held or rests does not roll.
+    scale: energy (mJ) of the tissue down to the target displaced by 1 mm; rests: number of rests already made;
+    blur: standard deviation (mm) of a predicted miss of 0.
     """
 
     path: GuidePath
@@ -95,7 +95,7 @@ class Memory:
 
 
 def begin(task: Task) -> Memory:
-    """The plan's path."""
+    """The memory at the start: the plan's path."""
     path, scale = of_plan(task.plan), task.simulator.energy_scale(task.plan.target[0])
     return Memory(path, path, task.plan.bevel, scale)
 
@@ -106,8 +106,8 @@ def decide(
     """The first step of the best path found."""
     fitted = cast(Identified, estimate)  # METHOD below names its observer
     settings = task.settings
-    in_hand = memory.path if fitted.state.bevel == memory.bevel else memory.rolled
-    ahead = Ahead.of(task, fitted.state, in_hand)
+    current = memory.path if fitted.state.bevel == memory.bevel else memory.rolled
+    ahead = Ahead.of(task, fitted.state, current)
     found = _search(task, fitted, ahead, memory, 1 if memory.outlook else settings.effort, rng)
     if not math.isfinite(found.cost):
         return Decision(_STILL, "no path converges on the fitted model", found.cost), memory
@@ -136,10 +136,10 @@ def decide(
 
 
 def _rest(task: Task, memory: Memory, fitted: Identified, left: float) -> tuple[float, int]:
-    """For how long (s) to rest now, and how often the needle has rested before the target.
+    """Time (s) to rest in this period, and number of rests before the target.
 
-    A reading comes late: at rest it catches up, and what it shows can still be corrected. So the needle rests at a few
-    distances from the target (`left`, mm), and after a step in the tissue whose readings the fit does not explain.
+    Readings are late: at rest they arrive, and the error that they show can still be corrected. So it rests at a
+    few distances from the target (`left`, mm), and after a step in the tissue whose readings the fit does not explain.
     """
     setup = task.scenario.setup
     step = setup.max_advance_mm
@@ -151,7 +151,7 @@ def _rest(task: Task, memory: Memory, fitted: Identified, left: float) -> tuple[
 
 
 def _surprised(fitted: Identified) -> bool:
-    """Whether the readings of a step in the tissue are far from what the fit to them explains."""
+    """Whether the residual of the fit to the readings of a step in the tissue is improbably large."""
     stepped = bool(fitted.moves) and fitted.moves[-1].applied[0] > 0.0
     off = abs(fitted.innovation[1]) / math.sqrt(fitted.reading_variance)
     return stepped and float(fitted.state.tip[0]) > 0.0 and off > _SURPRISE
@@ -160,20 +160,20 @@ def _surprised(fitted: Identified) -> bool:
 def _search(
     task: Task, fitted: Identified, ahead: Ahead, memory: Memory, effort: int, rng: np.random.Generator
 ) -> Found:
-    """The best correction of the path in hand, itself among the samples."""
+    """The best correction of the current path, which is itself among the samples."""
     settings = task.settings
     samples = effort * settings.samples
     first = proposals(ahead, samples, rng)
     lower, upper = ahead.bounds
-    variables = Variables(lower, upper, ahead.in_hand, first.std(axis=0), lambda z: ahead.controls(z)[0])
+    variables = Variables(lower, upper, ahead.current, first.std(axis=0), lambda z: ahead.controls(z)[0])
     elite = max(_LEAST_ELITE, samples // _ELITE)
     search = Search(samples, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
     charged = _terms(task, fitted, memory, ahead)
-    return best(variables, partial(_seen, fitted), charged, search, rng, first=first)
+    return best(variables, partial(_measured_rollout, fitted), charged, search, rng, first=first)
 
 
-def _seen(fitted: Identified, controls: Floats) -> Outcome:
-    """Controls (N, m, 5) on the fitted model, with the tips as a tracker without errors would see them."""
+def _measured_rollout(fitted: Identified, controls: Floats) -> Outcome:
+    """Outcome of controls (N, m, 5) on the fitted model; tips as a tracker without errors would measure them."""
     tips, energy, converged = fitted.simulator.rollout(fitted.state, controls, limits=False)
     side = fitted.state.bevel * np.cumprod(-np.sign(controls[:, :, 4]), axis=1)
     tips[:, :, 1] += fitted.run_out * side + fitted.residual
@@ -209,14 +209,14 @@ def _terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tupl
 
 
 def _out_of_reach(task: Task, fitted: Identified, ahead: Ahead, memory: Memory) -> Floats:
-    """How far the target is expected to be out of the bevel's reach after the first step, (2,) mm: the bevel as it is,
-    or rolled before it. The reach is the interval between the ends with the bevel on either side from the second step
-    on; its bounds are normal values.
+    """Expected distance (2,), mm, of the target from the bevel's reach after the first step, with the bevel as it is or
+    rolled before the step. The reach is the interval between the ends with the bevel on either side from the second
+    step on; its bounds are normally distributed.
 
-    With the bevel alone, reach that is given away does not come back; with a guide, the bevel is what still moves the
-    tip when the guide is far behind it.
+    With the bevel alone, lost reach cannot be regained; with a guide, the bevel still moves the tip when the guide is
+    far behind it.
     """
-    outcome = _seen(fitted, ahead.controls(ahead.constant)[0])
+    outcome = _measured_rollout(fitted, ahead.controls(ahead.constant)[0])
     if not outcome.converged.all():
         return np.zeros(2)
     past = terms.past(outcome, task.plan.target).reshape(2, 2)
@@ -235,7 +235,7 @@ def _above_zero(mean: Floats, sd: Floats) -> Floats:
 
 
 def _forecast(task: Task, memory: Memory, fitted: Identified, found: Found) -> tuple[Outlook, float, float]:
-    """Derivatives ahead, the miss that is predicted (mm, past the target in +y), and its standard deviation (mm)."""
+    """Derivatives ahead of the tip, the predicted miss (mm, positive in +y) and its standard deviation (mm)."""
     miss = float(terms.past(found.outcome, task.plan.target)[0])
     before = memory.outlook or Outlook.of(fitted)
     outlook = before.renewed(fitted, found.outcome.controls[0], found.outcome.tips[0])

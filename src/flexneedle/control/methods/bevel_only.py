@@ -1,4 +1,4 @@
-"""`bevel-only`: bang-bang steering by the bevel (paper eq. 14 and 15); neither guide nor base moves aside."""
+"""`bevel-only`: bang-bang steering by the bevel (paper eq. 14 and 15), without lateral motion of guide or base."""
 
 import numpy as np
 
@@ -10,11 +10,11 @@ from flexneedle.estimation.task import Task
 
 
 class BevelOnly(bang_bang.BevelRule):
-    """Section `control.bevel_only`: the bevel alone steers."""
+    """Section `control.bevel_only`: bang-bang rule of the bevel, the only input that steers."""
 
 
 def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generator) -> tuple[Decision, None]:
-    """Advance as far as a step goes, with the bevel towards the target."""
+    """Advance by the largest step, with the bevel towards the target."""
     scenario = task.scenario
     advance = min(scenario.setup.max_advance_mm, travel_left(scenario, task.plan, estimate.state))
     flip, why = bang_bang.decide(task, estimate, task.settings)

@@ -1,11 +1,11 @@
-"""`broyden-mpc`: no model of needle or tissue: a Jacobian estimated from readings, and linear MPC of the guide.
+"""`broyden-mpc`: a Jacobian estimated from readings, and linear MPC of the guide; no model of needle or tissue.
 
 Bernardes et al., Data-driven adaptive needle insertion assist for transperineal prostate interventions (Phys. Med.
-Biol. 2023, doi:10.1088/1361-6560/accefa): the Jacobian from inputs (insertion, place of the guide) to the measured
-tip takes 0.65 of Broyden's rank-one update after each step; the guide's places over four steps, within 6 mm of the
-axis, are those that bring the predicted tip nearest to where it should be; the first is carried out. The bevel is
-never turned. Two things are fitted to this package: an MPC step is a control step and not 10 mm of insertion by
-hand, and the tip is to follow the planned path where theirs has the target straight ahead.
+Biol. 2023, doi:10.1088/1361-6560/accefa): the Jacobian from inputs (insertion, guide position) to the measured
+tip takes 0.65 of Broyden's rank-one update after each step; the guide positions of four steps, within 6 mm of the
+axis, minimise the distance of the predicted tip from its reference; the first is applied. The bevel is
+never rolled. Two things differ here: an MPC step is a control step and not 10 mm of insertion by
+hand, and the reference is the planned path where theirs is a target straight ahead.
 """
 
 from dataclasses import dataclass
@@ -21,50 +21,48 @@ from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive, Section, count
 from flexneedle.types import Floats, Plan
 
-_LEAST_INSERTION_MM = (
-    0.5  # between two updates: a shorter one shows more of the tracker's noise than of the needle
-)
-_RIDGE = 1e-9  # mm² for a squared millimetre of the guide: one answer where the guide has no effect
-_RELEASE = 1e-12  # slope of the cost that counts as rounding
-_KEPT = 8  # control steps: readings are younger
+_LEAST_INSERTION_MM = 0.5  # between two updates: in a shorter one the tracker's noise dominates
+_RIDGE = 1e-9  # mm² per squared millimetre of the guide: a unique solution where the guide has no effect
+_RELEASE = 1e-12  # gradient of the cost that counts as rounding
+_KEPT = 8  # control steps; readings are not older
 
 
 class BroydenMpc(Section):
     """Section `control.broyden_mpc`: a Jacobian estimated from readings, and linear MPC of the guide."""
 
     update_gain: Fraction = 0.65
-    """Share of Broyden's update of the Jacobian that is made; 1 repeats the newest motion exactly."""
+    """Share of Broyden's update of the Jacobian; 1: the Jacobian reproduces the newest motion exactly."""
     horizon: int = count(4, least=1, most=20)
-    """Steps that the linear MPC looks ahead."""
+    """Prediction horizon of the linear MPC, in control steps."""
     max_guide_travel_mm: Positive = 6.0
-    """Greatest lateral distance of the guide from the axis, if that of the setup is not smaller."""
+    """Largest lateral distance of the guide from the insertion axis; not beyond `setup.max_guide_travel_mm`."""
     guide_weight: NonNegative = 0.000316
-    """Cost of a squared millimetre of a guide step, in mm² of the tip."""
+    """Weight of the squared guide steps (mm²) against the squared deviation of the tip (mm²)."""
     guide_effect: NonNegative = 0.982
-    """The first Jacobian's lateral motion of the tip for that of the guide; for advance it is a straight line."""
+    """Initial Jacobian: lateral motion of the tip per that of the guide; without that it moves straight."""
 
 
 @dataclass(frozen=True, eq=False)
 class JacobianEstimate:
     """Jacobian (2, 2) from (insertion, guide) to the tip (x, y); the last (tip x, insertion, guide) as commanded.
 
-    seen: tip (x, y) and inputs (insertion, guide), each (2,), of the newest update; None before a reading.
+    last_update: tip (x, y) and inputs (insertion, guide), each (2,), of the newest update; None before a reading.
     """
 
     jacobian: Floats
     history: tuple[tuple[float, float, float], ...] = ()
-    seen: tuple[Floats, Floats] | None = None
+    last_update: tuple[Floats, Floats] | None = None
 
 
 def begin(task: Task) -> JacobianEstimate:
-    """Start with a tip that continues straight, and follows the guide laterally."""
+    """The initial Jacobian: a tip that continues straight and follows the guide laterally."""
     return JacobianEstimate(np.diag([1.0, task.settings.guide_effect]))
 
 
 def decide(
     task: Task, estimated: JacobianEstimate, estimate: Estimate, _rng: np.random.Generator
 ) -> tuple[Decision, JacobianEstimate]:
-    """Learn from a new reading, predict the tip to now, and take the first of the best steps of the guide."""
+    """Update the Jacobian by a new reading, predict the present tip, and take the first of the best guide steps."""
     scenario, state = task.scenario, estimate.state
     settings, setup = task.settings, scenario.setup
     inputs = np.array([state.travel[0], state.guide])
@@ -76,7 +74,7 @@ def decide(
         return Decision((advance, db_y, db_theta, 0.0, -1), "no reading yet"), estimated
     tip = np.array(estimate.measured)
     then = inputs_at(estimated, float(tip[0]))
-    estimated = learn(estimated, tip, then, settings.update_gain)
+    estimated = updated(estimated, tip, then, settings.update_gain)
     tip = tip + estimated.jacobian @ (inputs - then)
     ahead = np.minimum(setup.max_advance_mm * np.arange(1, settings.horizon + 1), left)
     moves, cost = guide_moves(settings, setup, task.plan, estimated.jacobian, tip, ahead, state.guide)
@@ -86,32 +84,32 @@ def decide(
 
 
 def remember(estimated: JacobianEstimate, x: float, inputs: Floats) -> JacobianEstimate:
-    """Note that the tip is at depth x (mm) with these inputs, by which later readings are placed."""
+    """Record the inputs with the tip at depth x (mm), to which later readings are assigned."""
     insertion, guide = inputs.tolist()
     history = (*estimated.history, (x, insertion, guide))[-_KEPT:]
-    return JacobianEstimate(estimated.jacobian, history, estimated.seen)
+    return JacobianEstimate(estimated.jacobian, history, estimated.last_update)
 
 
 def inputs_at(estimated: JacobianEstimate, x: float) -> Floats:
-    """Inputs (2,) when the tip was at depth x (mm), within what is remembered."""
+    """Inputs (2,) with the tip at depth x (mm), within the recorded range."""
     depth, *inputs = np.array(estimated.history).T
     return np.array([np.interp(x, depth, values) for values in inputs])
 
 
-def learn(estimated: JacobianEstimate, tip: Floats, inputs: Floats, gain: float) -> JacobianEstimate:
-    """Update by a reading of the tip, once the needle went far enough on since the last."""
-    if estimated.seen is None:
+def updated(estimated: JacobianEstimate, tip: Floats, inputs: Floats, gain: float) -> JacobianEstimate:
+    """The estimate updated by a reading of the tip, if the insertion since the last update is long enough."""
+    if estimated.last_update is None:
         return JacobianEstimate(estimated.jacobian, estimated.history, (tip, inputs))
-    last_tip, last_inputs = estimated.seen
+    last_tip, last_inputs = estimated.last_update
     if inputs[0] - last_inputs[0] < _LEAST_INSERTION_MM:
         return estimated
     jacobian = broyden(estimated.jacobian, inputs - last_inputs, tip - last_tip, gain)
     return JacobianEstimate(jacobian, estimated.history, (tip, inputs))
 
 
-def broyden(jacobian: Floats, moved: Floats, seen: Floats, gain: float) -> Floats:
-    """The nearest matrix that maps `moved` to `seen` (Broyden 1965), or a share `gain` of the way to it."""
-    return jacobian + gain * np.outer(seen - jacobian @ moved, moved) / (moved @ moved)
+def broyden(jacobian: Floats, moved: Floats, measured: Floats, gain: float) -> Floats:
+    """The nearest matrix that maps `moved` to `measured` (Broyden 1965), or the share `gain` of that change."""
+    return jacobian + gain * np.outer(measured - jacobian @ moved, moved) / (moved @ moved)
 
 
 def guide_moves(
@@ -123,7 +121,7 @@ def guide_moves(
     ahead: Floats,
     guide: float,
 ) -> tuple[Floats, float]:
-    """Places of the guide (mm, from now) after each of n steps that end `ahead` (n,) of the tip, and their cost.
+    """Guide positions (mm, relative to the present one) after n steps that end `ahead` (n,) of the tip, and their cost.
 
     Cost: squared distance (mm²) of tip and planned path, and `guide_weight` times the squared guide steps.
     """
@@ -140,7 +138,7 @@ def guide_moves(
 
 
 def _path(plan: Plan) -> tuple[Floats, Floats]:
-    """Depth and lateral place of the planned path, led to the target at its end."""
+    """Depth and lateral position of the planned path, with the target as its end."""
     x, y = (np.append(plan.tips[:-1, k], plan.target[k]) for k in (0, 1))
     return x, y
 
@@ -148,7 +146,7 @@ def _path(plan: Plan) -> tuple[Floats, Floats]:
 def bounded_least_squares(matrix: Floats, right: Floats, lower: Floats, upper: Floats) -> Floats:
     """Least ‖A z − b‖² for lower ≤ 0 ≤ upper, exact: the primal active-set method from z = 0.
 
-    A singular A gets the answer nearest to 0, by a ridge.
+    For a singular A the solution nearest to 0, by a ridge.
     """
     hessian = matrix.T @ matrix + _RIDGE * np.eye(len(lower))
     slope = matrix.T @ right

@@ -1,8 +1,8 @@
 """`ce-mpc`: the paper's controller: bang-bang bevel, cross-entropy MPC of advance and guide (eq. 13 to 15).
 
-The measured tip is an essential condition of the solve that takes it in, and released in the prediction. The rule has
-the error threshold that the paper proposes against needless turns; the cost of eq. 13 has small further terms for
-the guide's departure from the plan and for tissue energy, which the settings can leave out.
+The measured tip is an essential condition of the solve that assimilates it, and is released in the prediction. The rule
+has the error threshold that the paper proposes against needless rolls; the cost of eq. 13 has small further terms for
+the guide's departure from the plan and for tissue energy; a weight of 0 omits them.
 """
 
 import numpy as np

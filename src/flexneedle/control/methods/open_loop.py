@@ -1,4 +1,4 @@
-"""`open-loop`: the plan as it stands, whatever the tracker measures."""
+"""`open-loop`: the plan replayed, whatever the tracker measures."""
 
 import numpy as np
 
@@ -10,13 +10,13 @@ from flexneedle.simulator.control import Limits
 
 
 def decide(task: Task, done: int, estimate: Estimate, _rng: np.random.Generator) -> tuple[Decision, int]:
-    """Go to where base and guide are after `done` + 1 planned steps.
+    """Move base and guide to their positions after `done` + 1 planned steps.
 
-    Places are replayed, not steps: what a motor of finite resolution left out of a step is made good in the next.
+    Positions are replayed, not steps: the rounding of a step by the motors is corrected in the next.
     """
     limits, controls = Limits.of(task.scenario), task.plan.controls
-    place = np.clip(controls[: done + 1, :4].sum(axis=0), *limits.travel.T)
-    db_x, db_y, db_theta, dg_y = np.clip(place - estimate.state.travel, -limits.step, limits.step).tolist()
+    goal = np.clip(controls[: done + 1, :4].sum(axis=0), *limits.travel.T)
+    db_x, db_y, db_theta, dg_y = np.clip(goal - estimate.state.travel, -limits.step, limits.step).tolist()
     command = (db_x, db_y, db_theta, dg_y, 1 if controls[done, 4] > 0.0 else -1)
     return Decision(command, f"planned step {done + 1}"), done + 1
 
