@@ -94,7 +94,7 @@ def test_off_the_plan_the_guide_step_is_the_damped_inverse_of_the_deviation_ahea
 
 
 def test_what_the_newest_reading_was_off_is_taken_to_stay(quick_plan, along, estimated):
-    """A tip measured 0.01 mm lateral of the prediction shifts the step by the motion of the guide that moves it back."""
+    """A tip measured 0.01 mm lateral of its prediction shifts the step by the guide motion that moves it back."""
     state, settings = along(quick_plan, 45), {"gain": 0.5, "damping": 0.1, "lookahead_mm": 3.0}
     plain = decide(quick_plan, estimated(state), **settings).command[3]
     shifted = decide(quick_plan, estimated(state, innovation=(0.4, 0.01)), **settings).command[3]

@@ -43,7 +43,7 @@ def lines(ax, label):
     return [line for line in ax.get_lines() if line.get_label() == label]
 
 
-def unseen_ticks(figure):
+def invisible_ticks(figure):
     """Return the labels of ticks beyond the ends of their axes, which are not drawn."""
     sides = [axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)]
     ticks = [(tick, sorted(axis.get_view_interval())) for axis in sides for tick in axis.get_major_ticks()]
@@ -54,8 +54,10 @@ def overlapping(figure):
     """Return pairs of visible texts whose boxes overlap, and texts that leave the figure."""
     renderer = figure.canvas.get_renderer()
     figure.draw(renderer)
-    unseen = unseen_ticks(figure)
-    shown = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and t not in unseen]
+    unmeasured = invisible_ticks(figure)
+    shown = [
+        t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and t not in unmeasured
+    ]
     boxes = [(text.get_text(), Text.get_window_extent(text, renderer)) for text in shown]  # without arrows
     cut = [name for name, box in boxes if not (figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1)]
     cut += [name for name, box in boxes if not (figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1)]
@@ -91,7 +93,7 @@ def test_needle_is_as_thick_as_it_is(figure, insertion):
     assert len(lines(scene, "needle before")) == 4
 
 
-def test_the_guide_stands_open_where_it_ended(figure, insertion):
+def test_the_guide_is_drawn_open_where_it_ended(figure, insertion):
     jaws = [p for p in figure.axes[0].patches if isinstance(p, Rectangle) and p.get_gid() == "guide"]
     upper, lower = sorted(jaws, key=lambda jaw: -jaw.get_y())
     assert lower.get_x() < GUIDE_X < lower.get_x() + lower.get_width()
@@ -115,13 +117,13 @@ def test_paths_are_those_of_plan_and_record(figure, insertion):
         np.testing.assert_array_equal(line.get_xydata(), path)
 
 
-def test_turns_of_the_bevel_show_side_and_place(figure, insertion):
+def test_rolls_of_the_bevel_show_side_and_position(figure, insertion):
     scene, plan = figure.axes[0], insertion.plan
-    (planned,) = lines(scene, "bevel turn, planned")
+    (planned,) = lines(scene, "bevel roll, planned")
     assert planned.get_marker() == "v"  # from +1, at the start, to −1
     assert planned.get_markerfacecolor() == "none"
     assert planned.get_xdata()[0] == plan.tips[45, 0]
-    applied = lines(scene, "bevel turn, applied")
+    applied = lines(scene, "bevel roll, applied")
     assert [line.get_marker() for line in applied] == ["v", "^", "v"]
     assert applied[0].get_xdata()[0] == insertion.periods[40].estimate[0]
     assert applied[0].get_ydata()[0] < insertion.periods[40].estimate[1]
@@ -134,7 +136,7 @@ def test_panels_show_error_motion_and_energy_over_depth(figure, insertion):
     (true,) = lines(error, "true")
     lateral = [p.true_tip[1] - q[1] for p, q in zip(insertion.periods, insertion.plan.tips[1:], strict=True)]
     np.testing.assert_allclose(true.get_ydata(), lateral, atol=1e-12)
-    assert lines(error, "by tracker")
+    assert lines(error, "tracker")
     (applied,) = lines(motion, "applied")
     np.testing.assert_array_equal(applied.get_ydata(), [period.guide for period in insertion.periods])
     (planned,) = lines(energy, "planned")
@@ -143,11 +145,11 @@ def test_panels_show_error_motion_and_energy_over_depth(figure, insertion):
     assert stored.get_ydata()[-1] == insertion.periods[-1].true_strain_energy
 
 
-def test_a_reached_target_is_said(figure):
+def test_a_reached_target_is_reported(figure):
     assert "reached: the tip ended 0.070 mm from the target" in texts(figure)
 
 
-def test_a_miss_is_said_plainly():
+def test_a_miss_is_reported_plainly():
     figure = insertion_figure(PHANTOM, make_insertion(miss=1.4))
     assert "MISSED: the tip ended 1.410 mm from the target, more than 1 mm" in texts(figure)
     assert lines(figure.axes[-1], "miss")
@@ -162,10 +164,10 @@ def test_an_unfinished_insertion_is_drawn_as_far_as_it_went(periods):
 
 
 def test_an_insertion_without_truth_or_samples_is_drawn(insertion):
-    unseen = Insertion(
+    unmeasured = Insertion(
         insertion.plan, 0, tuple(map(blind, insertion.periods)), Outcome("held"), "held for 1.00 s"
     )
-    figure = insertion_figure(PHANTOM, unseen)
+    figure = insertion_figure(PHANTOM, unmeasured)
     figure.canvas.draw()
     assert "held after 69 periods: held for 1.00 s" in texts(figure)
 
@@ -186,12 +188,12 @@ def watched(insertion, indicator=steep, hold=lambda time: 4.7 < time < 8.7):
 
 
 def held_from_the_start(insertion, reason=DISTORTED, periods=20):
-    """Return an insertion that was given up where it began; no reading was used."""
+    """Return an insertion that ended where it began; no reading was used."""
     first = held(insertion.periods[0], reason)
     still = [replace(first, index=k, time=0.2 * (k + 1)) for k in range(periods)]
-    stood = tuple(with_readings(period, steep, verdict=reason) for period in still)
+    legend = tuple(with_readings(period, steep, verdict=reason) for period in still)
     reason = f"held for 10.00 s (limit 10 s): {reason}"
-    return replace(insertion, periods=stood, outcome="held", reason=reason)
+    return replace(insertion, periods=legend, outcome="held", reason=reason)
 
 
 CASES = {
@@ -200,10 +202,10 @@ CASES = {
     "interrupted": lambda: make_insertion(periods=40, outcome="interrupted"),
     "after one period": lambda: make_insertion(periods=1, outcome="interrupted", reason="stopped"),
     "held from the start": lambda: held_from_the_start(make_insertion()),
-    "given up for a frozen sensor": lambda: held_from_the_start(make_insertion(), FROZEN),
+    "ended for a frozen sensor": lambda: held_from_the_start(make_insertion(), FROZEN),
     "failed with a long reason": lambda: make_insertion(outcome="failed", reason="the driver is gone " * 20),
     "held on the way": lambda: watched(make_insertion()),
-    "held on the way, many turns": lambda: watched(make_insertion(miss=1.4)),
+    "held on the way, many rolls": lambda: watched(make_insertion(miss=1.4)),
 }
 
 
@@ -218,16 +220,16 @@ def test_no_labels_overlap_in_a_scenario_with_a_long_name(insertion):
     assert overlapping(insertion_figure(named, far)) == []
 
 
-def said(figure):
+def verdict_line(figure):
     """Return the line under the title, as one line."""
     (verdict,) = (text for text in figure.texts if text.get_gid() == "verdict")
     return verdict.get_text().replace("\n", " ")
 
 
 @pytest.mark.parametrize("reason", [DISTORTED, FROZEN])
-def test_the_reason_of_a_hold_is_told_in_full(insertion, reason):
+def test_the_reason_of_a_hold_is_given_in_full(insertion, reason):
     figure = insertion_figure(PHANTOM, held_from_the_start(insertion, reason))
-    assert said(figure) == f"held after 20 periods: held for 10.00 s (limit 10 s): {reason}"
+    assert verdict_line(figure) == f"held after 20 periods: held for 10.00 s (limit 10 s): {reason}"
 
 
 def test_a_line_that_went_nowhere_is_a_dot_with_its_name_beside_it(insertion):
@@ -240,27 +242,36 @@ def test_a_line_that_went_nowhere_is_a_dot_with_its_name_beside_it(insertion):
     assert [text.get_text() for text in motion.texts] == ["planned", "applied"]
 
 
-def test_a_panel_without_a_line_says_why(insertion):
+def test_a_panel_without_a_line_gives_the_reason(insertion):
     error = insertion_figure(PHANTOM, held_from_the_start(insertion)).axes[1]
     # Readings were there, but the periods' own verdicts are against them.
-    assert error.get_title(loc="right") == "the tip hardly moved; no data: by tracker"
-    unseen = Insertion(
+    assert error.get_title(loc="right") == "the tip hardly moved; no data: tracker"
+    unmeasured = Insertion(
         insertion.plan, 0, tuple(map(blind, insertion.periods)), Outcome("held"), "held for 1.00 s"
     )
-    error, motion, energy, *_ = insertion_figure(PHANTOM, unseen).axes[1:]
-    assert error.get_title(loc="right") == "no data: by tracker, true"
+    error, motion, energy, *_ = insertion_figure(PHANTOM, unmeasured).axes[1:]
+    assert error.get_title(loc="right") == "no data: tracker, true"
     assert (motion.get_title(loc="right"), energy.get_title(loc="right")) == ("", "")
     assert [text.get_text() for text in energy.texts] == ["planned"]
 
 
-def test_the_legend_names_only_paths_that_are_seen(figure, insertion):
+def test_the_legend_names_only_what_is_drawn(figure, insertion):
     def named(figure):
         return [text.get_text() for text in figure.legends[0].get_texts()]
 
-    assert {"true path", "estimated path", "tracker"} <= set(named(figure))
-    stood = named(insertion_figure(PHANTOM, held_from_the_start(insertion)))
-    assert not {"true path", "estimated path", "tracker"} & set(stood)
-    assert "tracker, refused" in stood
+    assert {"estimated needle", "true path", "estimated path", "tracker"} <= set(named(figure))
+    assert named(figure)[-2:] == ["bevel roll, planned", "applied"]
+    legend = named(insertion_figure(PHANTOM, held_from_the_start(insertion)))
+    assert not {"true path", "estimated path", "tracker"} & set(legend)
+    assert "tracker, rejected" in legend
+    unrolled = insertion.plan.controls.copy()
+    unrolled[:, 4] = -1.0
+    plan = replace(insertion.plan, controls=unrolled)
+    assert named(insertion_figure(PHANTOM, replace(insertion, plan=plan)))[-1] == "bevel roll, applied"
+    still = tuple(replace(p, applied=(*p.applied[:4], -1)) for p in insertion.periods)
+    assert named(insertion_figure(PHANTOM, replace(insertion, periods=still)))[-1] == "bevel roll, planned"
+    neither = replace(insertion, plan=plan, periods=still)
+    assert not any("bevel" in name or name == "applied" for name in named(insertion_figure(PHANTOM, neither)))
 
 
 def test_the_worst_reference_is_shown_over_time_with_limit_and_holds(insertion):
@@ -273,7 +284,7 @@ def test_the_worst_reference_is_shown_over_time_with_limit_and_holds(insertion):
     )
     (limit,) = lines(ax, "limit 0.0547")
     np.testing.assert_array_equal(limit.get_ydata(), [0.0547, 0.0547])
-    (lower,) = lines(ax, "goes on below 0.0492")
+    (lower,) = lines(ax, "resumes below 0.0492")
     np.testing.assert_allclose(lower.get_ydata(), 0.9 * 0.0547)
     (shade,) = (patch for patch in ax.patches if patch.get_label() == "held")
     assert (shade.get_x(), shade.get_x() + shade.get_width()) == pytest.approx((4.6, 8.6))
@@ -286,28 +297,28 @@ def test_without_a_hold_nothing_is_shaded(insertion):
     ax = insertion_figure(PHANTOM, watched(insertion, hold=lambda _: False)).axes[4]
     assert not [patch for patch in ax.patches if patch.get_label() == "held"]
     assert ax.get_title(loc="left") == "Largest indicator of the references (median over 1 s)"
-    assert not lines(ax, "goes on below 0.0492")
+    assert not lines(ax, "resumes below 0.0492")
 
 
-def test_a_limit_that_nobody_watches_is_called_so(insertion):
+def test_a_limit_without_the_monitor_is_named_so(insertion):
     ax = insertion_figure(PHANTOM.with_values({"monitor.enabled": False}), watched(insertion)).axes[4]
-    assert lines(ax, "limit, not watched")
-    assert not lines(ax, "goes on below 0.0492")
+    assert lines(ax, "limit, monitor off")
+    assert not lines(ax, "resumes below 0.0492")
 
 
 def test_without_indicators_of_references_there_is_no_such_panel(figure, insertion):
     assert len(figure.axes) == 5  # scene, three panels, close-up
     assert len(insertion_figure(PHANTOM, watched(insertion)).axes) == 6
-    unseen = watched(insertion, indicator=lambda _: None)
+    unmeasured = watched(insertion, indicator=lambda _: None)
     bare = [
         replace(judged, sample=replace(judged.sample, frame=frame_of(k, judged.sample.time, {"ref1": None})))
-        for k, judged in enumerate(unseen.periods[0].readings)
+        for k, judged in enumerate(unmeasured.periods[0].readings)
     ]
     alone = replace(insertion, periods=tuple(replace(p, readings=tuple(bare)) for p in insertion.periods))
     assert len(insertion_figure(PHANTOM, alone).axes) == 5
 
 
-def told(insertion, frames, verdicts=()):
+def with_frames(insertion, frames, verdicts=()):
     """Return the insertion with these frames as the readings of its first period."""
     verdicts = verdicts or ["ok"] * len(frames)
     readings = tuple(
@@ -320,7 +331,7 @@ def told(insertion, frames, verdicts=()):
 def test_the_median_of_each_reference_counts_not_that_of_all(insertion):
     values = [(0.01, 0.02), (0.03, 0.90), (0.09, 0.04), (0.05, 0.06)]
     frames = [frame_of(k, 0.3 * k, {"a": a, "b": b}) for k, (a, b) in enumerate(values)]
-    found = worst_indicator(told(insertion, frames), window=0.9)
+    found = worst_indicator(with_frames(insertion, frames), window=0.9)
     # By hand; the last window is open at its beginning, as the monitor's is: 0.0 s is out of it.
     np.testing.assert_allclose(found, [[0.0, 0.02], [0.3, 0.46], [0.6, 0.04], [0.9, 0.06]])
 
@@ -328,19 +339,19 @@ def test_the_median_of_each_reference_counts_not_that_of_all(insertion):
 def test_readings_that_the_monitor_forgets_do_not_count(insertion):
     frames = [frame_of(k, 0.1 * k, {"a": value}) for k, value in enumerate((0.01, 0.5, 0.6, 0.02))]
     verdicts = ["ok", "stale: frame 1 after frame 1", "not a number", "innovation 2.31 mm, limit 2 mm"]
-    found = worst_indicator(told(insertion, frames, verdicts), window=1.0)
+    found = worst_indicator(with_frames(insertion, frames, verdicts), window=1.0)
     np.testing.assert_allclose(found, [[0.0, 0.01], [0.3, 0.015]])
 
 
-def test_where_no_reference_was_seen_for_a_window_the_curve_has_a_gap(insertion):
+def test_where_no_reference_was_measured_for_a_window_the_curve_has_a_gap(insertion):
     frames = [frame_of(k, float(k), {"a": value}) for k, value in enumerate((0.01, None, 0.02))]
-    found = worst_indicator(told(insertion, frames), window=0.5)
+    found = worst_indicator(with_frames(insertion, frames), window=0.5)
     np.testing.assert_array_equal(found[:, 1], [0.01, np.nan, 0.02])
 
 
 def test_the_indicator_of_the_tip_is_no_reference(insertion):
     frame = frame_of(0, 0.0, {"tip": 0.5, "a": 0.01})
-    np.testing.assert_array_equal(worst_indicator(told(insertion, [frame]), 1.0), [[0.0, 0.01]])
+    np.testing.assert_array_equal(worst_indicator(with_frames(insertion, [frame]), 1.0), [[0.0, 0.01]])
 
 
 def test_holds_are_spans_of_whole_periods(insertion):
@@ -368,9 +379,9 @@ def test_a_long_reason_of_a_miss_stays_within_the_figure():
 def test_without_a_guide_the_base_is_shown(minimal_text, scenario_file, insertion):
     scenario = load_scenario(scenario_file(minimal_text))
     figure = insertion_figure(scenario, insertion)
-    assert "Base aside (mm)" in texts(figure)
+    assert "Base, lateral (mm)" in texts(figure)
     assert not lines(figure.axes[0], "guide travel")
-    assert "Base aside (mm)" in texts(plan_figure(scenario, [insertion.plan]))
+    assert "Base, lateral (mm)" in texts(plan_figure(scenario, [insertion.plan]))
 
 
 def test_names_are_no_mathematics_and_never_too_long(tmp_path, insertion):
@@ -381,7 +392,7 @@ def test_names_are_no_mathematics_and_never_too_long(tmp_path, insertion):
     assert any(text.startswith("$5_phantom$ 針 long") and "…" in text for text in texts(figure))
 
 
-def test_both_plans_stand_in_one_figure_with_terms_and_angles():
+def test_both_plans_are_in_one_figure_with_terms_and_angles():
     plans = [make_plan(), make_plan("steering")]
     figure = plan_figure(PHANTOM, plans)
     found = texts(figure)

@@ -1,4 +1,4 @@
-"""What the figures show, as arrays: paths, turns of the bevel, errors, guide and energy over depth, the field."""
+"""Data of the figures as arrays: paths, rolls of the bevel, errors, guide and energy over depth, the field."""
 
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
@@ -11,32 +11,32 @@ import numpy as np
 from flexneedle.types import Action, Floats, Frame, Insertion, Plan, VerdictKind
 
 _TIP = "tip"  # the sensor in the needle; all others of a frame are references
-# Verdicts on readings that the monitor leaves out of its window.
-_NOT_REMEMBERED = (VerdictKind.STALE, VerdictKind.NOT_A_NUMBER)
+# Verdicts of readings that the monitor excludes from its window.
+_EXCLUDED = (VerdictKind.STALE, VerdictKind.NOT_A_NUMBER)
 
 
 @dataclass(frozen=True)
-class Turn:
-    """A turn of the bevel at a tip position (mm), to the side +1 (+y) or −1."""
+class Roll:
+    """A roll of the bevel at a tip position (mm), to the side +1 (+y) or −1."""
 
     x: float
     y: float
     side: int
 
 
-def planned_turns(plan: Plan) -> list[Turn]:
-    """Return the turns of a plan, each where the tip stands as the bevel turns."""
+def planned_rolls(plan: Plan) -> list[Roll]:
+    """Return the rolls of a plan, each at the tip position before its step."""
     steps = np.flatnonzero(plan.controls[:, 4] > 0.0)
     sides = plan.bevel * (-1) ** np.arange(1, len(steps) + 1)
-    places = plan.tips[steps, :2].tolist()
-    return [Turn(x, y, int(side)) for (x, y), side in zip(places, sides, strict=True)]
+    positions = plan.tips[steps, :2].tolist()
+    return [Roll(x, y, int(side)) for (x, y), side in zip(positions, sides, strict=True)]
 
 
-def applied_turns(insertion: Insertion) -> list[Turn]:
-    """Return the turns as applied, each where the tip was estimated as the bevel turned."""
+def applied_rolls(insertion: Insertion) -> list[Roll]:
+    """Return the rolls as applied, each at the estimated tip position before its period."""
     before = [insertion.plan.tips[0].tolist(), *(period.estimate for period in insertion.periods)]
     return [
-        Turn(float(tip[0]), float(tip[1]), period.bevel)
+        Roll(float(tip[0]), float(tip[1]), period.bevel)
         for tip, period in zip(before, insertion.periods, strict=False)
         if period.applied[4] > 0
     ]
@@ -57,14 +57,14 @@ def good_samples(insertion: Insertion) -> Floats:
     return _points((p.sample.x, p.sample.y) for p in insertion.periods if p.verdict.ok)
 
 
-def refused_samples(insertion: Insertion) -> Floats:
-    """Return x, y (k, 2) of the readings that were there, but were not used."""
-    refused = (p.sample for p in insertion.periods if not p.verdict.ok)
-    return _points((sample.x, sample.y) for sample in refused if sample.x is not None)
+def rejected_samples(insertion: Insertion) -> Floats:
+    """Return x, y (k, 2) of the readings that were rejected."""
+    rejected = (p.sample for p in insertion.periods if not p.verdict.ok)
+    return _points((sample.x, sample.y) for sample in rejected if sample.x is not None)
 
 
 def lateral_error(plan: Plan, points: Floats) -> Floats:
-    """Return how far aside (mm, signed) of the planned path points (k, 2) lie, at their own depth."""
+    """Return the lateral deviation (k,), mm, signed, of points (k, 2) from the planned path at their depth."""
     order = np.argsort(plan.tips[:, 0], kind="stable")
     planned = np.interp(points[:, 0], plan.tips[order, 0], plan.tips[order, 1])
     return np.asarray(points[:, 1] - planned)
@@ -79,8 +79,8 @@ def true_energy(insertion: Insertion) -> Floats:
     )
 
 
-def shapes_on_the_way(tips: Floats, shapes: list[Floats], count: int = 4) -> list[Floats]:
-    """Return up to `count` shapes at equal distances of the tip from start to end, without the last."""
+def intermediate_shapes(tips: Floats, shapes: list[Floats], count: int = 4) -> list[Floats]:
+    """Return up to `count` shapes at equal distances of the tip from start to end, without the last one."""
     depth = tips[:, 0]
     wanted = np.linspace(depth[0], depth[-1], count + 1)[:-1]
     chosen = dict.fromkeys(int(np.argmin(np.abs(depth - x))) for x in wanted)
@@ -88,7 +88,7 @@ def shapes_on_the_way(tips: Floats, shapes: list[Floats], count: int = 4) -> lis
 
 
 def held_spans(insertion: Insertion) -> list[tuple[float, float]]:
-    """Return begin and end (s) of the times at which the needle was held, each as long as it lasted."""
+    """Return begin and end (s) of each time span in which the needle was held."""
     ends = [0.0, *(period.time for period in insertion.periods)]
     spans: list[tuple[float, float]] = []
     for period, (begin, end) in zip(insertion.periods, pairwise(ends), strict=True):
@@ -104,8 +104,8 @@ def held_spans(insertion: Insertion) -> list[tuple[float, float]]:
 def worst_indicator(insertion: Insertion, window: float) -> Floats:
     """Return time (s) of each reading and the largest median indicator of a reference then (k, 2).
 
-    The median of a sensor is over the window (s) before, as the monitor takes it. NaN where no reference told one
-    within it; no row at all if none ever did.
+    The median of a sensor is over the preceding window (s), as in the monitor. NaN where no reference has an indicator
+    within it; no rows if none has any.
     """
     frames = list(_frames(insertion))
     if not any(_indicators(frame) for frame in frames):
@@ -117,9 +117,9 @@ def worst_indicator(insertion: Insertion, window: float) -> Floats:
 
 def _frames(insertion: Insertion) -> Iterator[Frame]:
     for period in insertion.periods:
-        for judged in period.readings:
-            if judged.sample.frame is not None and judged.verdict.kind not in _NOT_REMEMBERED:
-                yield judged.sample.frame
+        for checked in period.readings:
+            if checked.sample.frame is not None and checked.verdict.kind not in _EXCLUDED:
+                yield checked.sample.frame
 
 
 def _indicators(frame: Frame) -> dict[str, float]:

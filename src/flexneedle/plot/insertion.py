@@ -1,6 +1,6 @@
-"""The figure of an insertion: the scene to scale, below it what happened over depth; the end magnified.
+"""The figure of an insertion: the scene to scale, panels over depth below it, and the end magnified.
 
-Where a tracker told of the field, a panel over time shows that, and when the needle was held.
+With a tracker that measures its field, a panel over time shows the indicators and the times of holds.
 """
 
 from textwrap import shorten, wrap
@@ -32,7 +32,7 @@ from flexneedle.plot.style import (
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats, Insertion
 
-# Places in inches from the top left.
+# Positions in inches from the top left.
 _LEFT, _RIGHT, _HEAD = 0.62, 0.15, 0.72
 _PANEL_WIDTH, _PANEL_HEIGHT, _PANEL_GAP = 4.55, 0.88, 0.3
 _CLOSE_UP = 2.6
@@ -42,7 +42,7 @@ _FAR = 6.0  # mm; further from the target, the close-up shows the tip instead
 
 
 def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
-    """Return the figure of an insertion that has at least one period, finished or not."""
+    """Return the figure of an insertion with at least one period, finished or not."""
     plan = insertion.plan
     known = [
         plan.tips,
@@ -71,10 +71,10 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
 
 
 def _title(scenario: Scenario, insertion: Insertion) -> list[str]:
-    depth, aside = insertion.target
+    depth, lateral = insertion.target
     name = shorten(scenario.name, 60, placeholder=" …")
     return wrap(
-        f"{name}: target {signed(depth)} mm deep, {signed(aside)} mm aside (seed {insertion.seed})",
+        f"{name}: target {signed(depth)} mm deep, {signed(lateral)} mm lateral (seed {insertion.seed})",
         _CHARACTERS,
     )
 
@@ -84,22 +84,22 @@ def _head(figure: Figure, title: list[str], ended: list[str], insertion: Inserti
     left, second = 0.12 / WIDTH, 0.36 + (len(title) - 1) * _TITLE_LINE
     figure.text(left, 1 - 0.1 / height, "\n".join(title), fontsize=11, weight="bold", va="top")
     color = TARGET if insertion.reached else BAD
-    said: dict[str, Any] = {"fontsize": 10, "color": color, "weight": "bold", "va": "top", "gid": "verdict"}
-    figure.text(left, 1 - second / height, "\n".join(ended), **said)
-    place = (1 - _RIGHT / WIDTH, 1 - (second + 0.01) / height)
-    figure.text(*place, _counts(insertion), color=INK, va="top", ha="right")
+    style: dict[str, Any] = {"fontsize": 10, "color": color, "weight": "bold", "va": "top", "gid": "verdict"}
+    figure.text(left, 1 - second / height, "\n".join(ended), **style)
+    position = (1 - _RIGHT / WIDTH, 1 - (second + 0.01) / height)
+    figure.text(*position, _counts(insertion), color=INK, va="top", ha="right")
 
 
 def _counts(insertion: Insertion) -> str:
     plan = insertion.plan
-    return f"bevel turns: {insertion.flips} (planned {plan.flips})"
+    return f"bevel rolls: {insertion.flips} (planned {plan.flips})"
 
 
 def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, window: scene.View) -> None:
     plan, last = insertion.plan, insertion.periods[-1]
     scene.draw_tissue(ax, scenario, window)
     shapes = [period.shape for period in insertion.periods]
-    before = curves.shapes_on_the_way(curves.estimated_path(insertion), shapes)
+    before = curves.intermediate_shapes(curves.estimated_path(insertion), shapes)
     scene.draw_needle(ax, last.shape, before, scenario.needle.outer_diameter)
     if scenario.setup.guide_x is not None:
         travel = np.array([0.0, *(period.guide for period in insertion.periods)])
@@ -108,16 +108,16 @@ def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, window: scene.Vie
     scene.draw_target(ax, plan.target)
     scene.name_target(ax, plan.target)
     scene.name_bevel(ax, plan)
-    scene.draw_turns(ax, curves.planned_turns(plan), PLAN, solid=False, label="bevel turn, planned")
-    scene.draw_turns(ax, curves.applied_turns(insertion), ESTIMATE, solid=True, label="bevel turn, applied")
+    scene.draw_rolls(ax, curves.planned_rolls(plan), PLAN, solid=False, label="bevel roll, planned")
+    scene.draw_rolls(ax, curves.applied_rolls(insertion), ESTIMATE, solid=True, label="bevel roll, applied")
 
 
 def _paths(ax: Axes, insertion: Insertion, scale: float = 1.0) -> None:
     plan = insertion.plan
-    samples, refused = curves.good_samples(insertion), curves.refused_samples(insertion)
+    samples, rejected = curves.good_samples(insertion), curves.rejected_samples(insertion)
     dots: dict[str, Any] = {"color": MEASURED, "markersize": 2.6 * scale**2, "markeredgewidth": 0.0}
     ax.plot(*samples.T, ".", zorder=3, label="tracker", **dots)
-    ax.plot(*refused.T, "x", color=QUIET, markersize=3.5 * scale, zorder=3, label="tracker, refused")
+    ax.plot(*rejected.T, "x", color=QUIET, markersize=3.5 * scale, zorder=3, label="tracker, rejected")
     ax.plot(*plan.tips[:, :2].T, "--", color=PLAN, linewidth=1.1 * scale, zorder=5, label="planned")
     ax.plot(*curves.true_path(insertion).T, color=TRUE, linewidth=1.3 * scale, zorder=4, label="true")
     estimated = curves.estimated_path(insertion)
@@ -125,7 +125,7 @@ def _paths(ax: Axes, insertion: Insertion, scale: float = 1.0) -> None:
 
 
 def _legend(figure: Figure, top: float, insertion: Insertion) -> None:
-    """Name the lines and marks of the scene in one row below it."""
+    """Legend of the lines and marks of the scene, in one row below it."""
     handles = _handles(insertion)
     figure.legend(
         handles=handles,
@@ -139,27 +139,29 @@ def _legend(figure: Figure, top: float, insertion: Insertion) -> None:
 
 
 def _handles(insertion: Insertion) -> list[Line2D]:
-    planned, applied = scene.turn_style(PLAN, solid=False), scene.turn_style(ESTIMATE, solid=True)
+    planned, applied = scene.roll_style(PLAN, solid=False), scene.roll_style(ESTIMATE, solid=True)
     true, estimated = curves.true_path(insertion), curves.estimated_path(insertion)
-    good, refused = curves.good_samples(insertion), curves.refused_samples(insertion)
-    name = "refused" if len(good) else "tracker, refused"
-    seen: tuple[tuple[bool, dict[str, Any]], ...] = (
+    good, rejected = curves.good_samples(insertion), curves.rejected_samples(insertion)
+    rolls_planned, rolls_applied = curves.planned_rolls(insertion.plan), curves.applied_rolls(insertion)
+    name = "rejected" if len(good) else "tracker, rejected"
+    roll = "applied" if rolls_planned else "bevel roll, applied"
+    entries: tuple[tuple[bool, dict[str, Any]], ...] = (
         (_travels(true), {"color": TRUE, "linewidth": 1.3, "label": "true path"}),
         (_travels(estimated), {"color": ESTIMATE, "ls": ":", "linewidth": 1.6, "label": "estimated path"}),
         (len(good) > 0, {"color": MEASURED, "marker": ".", "ls": "none", "label": "tracker"}),
-        (len(refused) > 0, {"color": QUIET, "marker": "x", "markersize": 4, "ls": "none", "label": name}),
+        (len(rejected) > 0, {"color": QUIET, "marker": "x", "markersize": 4, "ls": "none", "label": name}),
+        (len(rolls_planned) > 0, {"marker": "^", "label": "bevel roll, planned", **planned}),
+        (len(rolls_applied) > 0, {"marker": "^", "label": roll, **applied}),
     )
     return [
-        Line2D([], [], color=NEEDLE, alpha=0.75, linewidth=4.0, label="needle"),
+        Line2D([], [], color=NEEDLE, alpha=0.75, linewidth=4.0, label="estimated needle"),
         Line2D([], [], color=PLAN, linestyle="--", linewidth=1.1, label="planned path"),
-        *(Line2D([], [], **how) for shown, how in seen if shown),
-        Line2D([], [], marker="^", label="bevel turn, planned", **planned),
-        Line2D([], [], marker="^", label="applied", **applied),
+        *(Line2D([], [], **how) for drawn, how in entries if drawn),
     ]
 
 
 def _travels(path: Floats) -> bool:
-    """Whether a path (k, 2) can be seen as one, not only as a point."""
+    """Whether a path (k, 2) is long enough to be visible as a line."""
     return len(path) > 0 and bool(np.ptp(path, axis=0).max() > 0.5)
 
 
@@ -168,7 +170,7 @@ def _panels(figure: Figure, scenario: Scenario, insertion: Insertion, top: float
     plan = insertion.plan
     span = (float(plan.tips[0, 0]), max(float(plan.tips[:, 0].max()), plan.target[0]))
     contents = (
-        ("Off the planned path (mm)", _error_lines(insertion), 0.4),
+        ("Lateral deviation from the planned path (mm)", _error_lines(insertion), 0.4),
         _motion(scenario, insertion),
         ("Energy stored in the tissue (mJ)", _energy_lines(insertion), 0.01),
     )
@@ -183,19 +185,19 @@ def _error_lines(insertion: Insertion) -> list[Line]:
     plan = insertion.plan
     samples, truth = curves.good_samples(insertion), curves.true_path(insertion)
     return [
-        Line("by tracker", samples[:, 0], curves.lateral_error(plan, samples), MEASURED, marker="o"),
+        Line("tracker", samples[:, 0], curves.lateral_error(plan, samples), MEASURED, marker="o"),
         Line("true", truth[:, 0], curves.lateral_error(plan, truth), TRUE),
     ]
 
 
 def _motion(scenario: Scenario, insertion: Insertion) -> tuple[str, list[Line], float]:
-    """Guide over depth, or the base aside where there is no guide."""
+    """Lateral position of the guide over depth, or of the base where there is no guide."""
     plan, depth = insertion.plan, curves.estimated_path(insertion)[:, 0]
     if scenario.setup.has_guide:
-        title, planned = "Guide aside (mm)", plan.guide
+        title, planned = "Guide, lateral (mm)", plan.guide
         applied = np.array([period.guide for period in insertion.periods])
     else:
-        title, planned = "Base aside (mm)", np.cumsum([0.0, *plan.controls[:, 1]])
+        title, planned = "Base, lateral (mm)", np.cumsum([0.0, *plan.controls[:, 1]])
         applied = np.array([period.base[1] for period in insertion.periods])
     lines = [Line("planned", plan.tips[:, 0], planned, PLAN, "--"), Line("applied", depth, applied, ESTIMATE)]
     return title, lines, 0.4
@@ -210,24 +212,24 @@ def _energy_lines(insertion: Insertion) -> list[Line]:
 
 
 def _field(ax: Axes, scenario: Scenario, insertion: Insertion, field: Floats) -> None:
-    """Draw the largest indicator of the references over time, the monitor's limits, and when the needle was held."""
+    """Draw the largest indicator of the references over time, the monitor's limits, and the times of holds."""
     monitor, held = scenario.monitor, curves.held_spans(insertion)
     span = (min(0.0, float(field[0, 0])), max(insertion.periods[-1].time, float(field[-1, 0])))
     shaded = f"; shaded: needle held, {insertion.held_s:.2f} s" if held else ""
     title = f"Largest indicator of the references (median over {monitor.indicator_window_s:g} s{shaded})"
     limits = [(f"limit {monitor.indicator_limit:g}", monitor.indicator_limit, "--")]
     if not monitor.enabled:
-        limits = [("limit, not watched", monitor.indicator_limit, "--")]
+        limits = [("limit, monitor off", monitor.indicator_limit, "--")]
     elif held and monitor.resume_fraction < 1.0:
         lower = monitor.indicator_limit * monitor.resume_fraction
-        limits.append((f"goes on below {lower:.4f}", lower, ":"))
+        limits.append((f"resumes below {lower:.4f}", lower, ":"))
     lines = [Line(name, np.array(span), np.full(2, y), BAD, style) for name, y, style in limits]
     draw_timeline(ax, title, [Line("references", field[:, 0], field[:, 1], MEASURED), *lines], span, held)
     ax.set_xlabel("time (s)", labelpad=1.0)
 
 
 def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion) -> None:
-    """Magnify the end: around the target, or around the tip where it is still far away."""
+    """Magnify the end: around the target, or around the tip where that is far from the target."""
     tip = _last_tip(insertion)
     distance = float(np.hypot(*(tip - insertion.target)))
     near = distance <= _FAR
@@ -255,11 +257,11 @@ def _last_tip(insertion: Insertion) -> Floats:
 
 
 def _errors(insertion: Insertion) -> list[str]:
-    values = (("true error", insertion.true_error_mm), ("by the tracker", insertion.residual_mm))
+    values = (("true error", insertion.true_error_mm), ("tracker residual", insertion.residual_mm))
     return [f"{name} {value:.3f} mm" for name, value in values if not np.isnan(value)]
 
 
 def _method(insertion: Insertion) -> list[str]:
-    """Say who steered, and what, as far as it is known."""
+    """Controller and phantom, as far as they are known."""
     phantom = f"{insertion.phantom} phantom" if insertion.phantom else ""
     return [", ".join(filter(None, (insertion.controller, phantom)))]

@@ -1,4 +1,4 @@
-"""Panels over the depth of the tip, or over time: lines with their names at their ends."""
+"""Panels over the depth of the tip or over time: lines with their names at their ends."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats
 
 _GAP = 0.17  # least distance of two names, as a share of the panel's height
-_SEEN = 0.008  # least extent of a line that is seen as one, as a share of the panel's width
+_VISIBLE = 0.008  # least extent of a visible line, as a share of the panel's width
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class Line:
 def draw_panel(
     ax: Axes, scenario: Scenario, title: str, lines: Sequence[Line], span: tuple[float, float], least: float
 ) -> None:
-    """Draw lines over depth `span`; the y axis shows at least `least` in all.
+    """Draw lines over depth `span`; the y axis spans at least `least`.
 
-    A line that stayed in one place is a dot with its name beside it; a panel without any line says so.
+    A line without extent is a dot with its name beside it; a panel without lines gives the reason.
     """
     ax.set_title(title)
     ax.set_xlim(*span)
@@ -74,18 +74,18 @@ def draw_timeline(
 
 
 def _why_empty(lines: Sequence[Line]) -> str:
-    """Say why a panel shows no line: the tip stayed about where it was, or there is no data."""
+    """Reason why a panel shows no line: the tip hardly moved, or there is no data."""
     unknown = [line.name for line in lines if not len(line.x)]
     still = ["the tip hardly moved"] if len(unknown) < len(lines) else []
     return "; ".join(still + ([f"no data: {', '.join(unknown)}"] if unknown else []))
 
 
 def _is_dot(line: Line, width: float) -> bool:
-    return not line.marker and bool(np.ptp(line.x) < _SEEN * width)
+    return not line.marker and bool(np.ptp(line.x) < _VISIBLE * width)
 
 
 def _draw_dot(ax: Axes, line: Line) -> None:
-    """Draw the end of a line as a dot, and its name where there is more room: above it or below."""
+    """Draw the end of a line as a dot, with its name above or below it, where there is more room."""
     end = (float(line.x[-1]), float(line.y[-1]))
     how: dict[str, Any] = {"color": line.color, "markersize": 3.5, "markeredgewidth": 0.0, "clip_on": False}
     ax.plot(*end, "o", zorder=3.5, label=line.name, **how)
@@ -111,7 +111,7 @@ def _set_height(ax: Axes, lines: Sequence[Line], least: float) -> None:
 
 
 def _name_lines(ax: Axes, lines: Sequence[Line]) -> None:
-    """Write the name of each line at the right of the panel, level with its end as far as there is room."""
+    """Write the name of each line at the right of the panel, at the height of its end as far as there is room."""
     low, high = ax.get_ylim()
     ends = [(float(line.y[-1]) - low) / (high - low) for line in lines]
     for line, level in zip(lines, spread_out(ends, _GAP), strict=True):
@@ -119,10 +119,10 @@ def _name_lines(ax: Axes, lines: Sequence[Line]) -> None:
 
 
 def spread_out(levels: Sequence[float], gap: float) -> list[float]:
-    """Return levels moved as little as it takes to keep `gap` between neighbours; the order stays."""
+    """Return the levels nearest to these with `gap` between neighbours, in the same order."""
     order = np.argsort(levels, kind="stable")
     step = gap * np.arange(len(order))
-    # With the gaps taken off, levels need only rise: the least-squares fit that rises pools its violators.
+    # Less the gaps, the levels need only not fall: isotonic least squares.
     pooled = _rising(np.asarray(levels, dtype=float)[order] - step) + step
     moved = np.empty(len(order))
     moved[order] = pooled
@@ -130,7 +130,7 @@ def spread_out(levels: Sequence[float], gap: float) -> list[float]:
 
 
 def _rising(values: Floats) -> Floats:
-    """Return the least-squares fit (k,) to values that nowhere falls (pool adjacent violators)."""
+    """Return the non-decreasing least-squares fit (k,) to values (pool adjacent violators)."""
     blocks: list[tuple[float, int]] = []
     for value in values.tolist():
         blocks.append((value, 1))

@@ -1,4 +1,4 @@
-"""The figure of plans: each to scale, below them guide, energy and cost (as the paper's Fig. 2)."""
+"""The figure of plans: each to scale, below them guide, energy and cost (as in the paper's Fig. 2)."""
 
 from collections.abc import Sequence
 from math import cos, degrees, isnan, sin
@@ -26,7 +26,7 @@ from flexneedle.plot.style import (
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats, Plan
 
-# Places in inches from the top left.
+# Positions in inches from the top left.
 _LEFT, _RIGHT, _HEAD, _BETWEEN = 0.62, 0.15, 0.66, 0.75
 _PANEL_WIDTH, _PANEL_HEIGHT, _PANEL_GAP = 4.2, 0.9, 0.3
 _BARS_WIDTH = 2.0
@@ -56,16 +56,16 @@ def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
 
 
 def _head(figure: Figure, scenario: Scenario, plan: Plan) -> None:
-    depth, aside = plan.target
+    depth, lateral = plan.target
     name = shorten(scenario.name, 60, placeholder=" …")
-    title = f"{name}: plan to {signed(depth)} mm deep, {signed(aside)} mm aside (seed {plan.seed})"
+    title = f"{name}: plan to {signed(depth)} mm deep, {signed(lateral)} mm lateral (seed {plan.seed})"
     height = float(figure.get_figheight())
     figure.text(0.12 / WIDTH, 1 - 0.1 / height, title, fontsize=11, weight="bold", va="top")
 
 
 def _scene(ax: Axes, scenario: Scenario, plan: Plan, window: scene.View, color: str) -> None:
     scene.draw_tissue(ax, scenario, window)
-    before = curves.shapes_on_the_way(plan.tips, list(plan.shapes))
+    before = curves.intermediate_shapes(plan.tips, list(plan.shapes))
     scene.draw_needle(ax, plan.shapes[-1], before, scenario.needle.outer_diameter)
     if scenario.setup.guide_x is not None:
         scene.draw_guide(ax, scenario.setup.guide_x, plan.guide, float(plan.guide[-1]))
@@ -73,7 +73,7 @@ def _scene(ax: Axes, scenario: Scenario, plan: Plan, window: scene.View, color: 
     scene.draw_target(ax, plan.target)
     scene.name_target(ax, plan.target)
     scene.name_bevel(ax, plan)
-    scene.draw_turns(ax, curves.planned_turns(plan), PLAN, solid=False, label="bevel turn, planned")
+    scene.draw_rolls(ax, curves.planned_rolls(plan), PLAN, solid=False, label="bevel roll, planned")
     _entry(ax, plan)
     ax.set_title(
         fill(f"{plan.strategy}: {plan.summary} (cost {plan.cost:.2f})", _TITLE_CHARACTERS),
@@ -83,7 +83,7 @@ def _scene(ax: Axes, scenario: Scenario, plan: Plan, window: scene.View, color: 
 
 
 def _entry(ax: Axes, plan: Plan) -> None:
-    """Show the direction in which the tip enters, and its angle."""
+    """Draw the direction of the tip at the skin, with its angle."""
     angle = plan.entry_angle
     if isnan(angle):
         return
@@ -120,10 +120,10 @@ def _panels(figure: Figure, scenario: Scenario, plans: Sequence[Plan], top: floa
 
 
 def _motion(scenario: Scenario, plans: Sequence[Plan]) -> tuple[str, list[Line]]:
-    """Guide over depth, or the base aside where there is no guide."""
+    """Lateral position of the guide over depth, or of the base where there is no guide."""
     guided = scenario.setup.has_guide
     values = [plan.guide if guided else np.cumsum([0.0, *plan.controls[:, 1]]) for plan in plans]
-    title = "Guide aside (mm)" if guided else "Base aside (mm)"
+    title = "Guide, lateral (mm)" if guided else "Base, lateral (mm)"
     return title, _lines(plans, values)
 
 
@@ -139,7 +139,7 @@ def _lines(plans: Sequence[Plan], values: Sequence[Floats]) -> list[Line]:
 
 
 def _cost(ax: Axes, plans: Sequence[Plan]) -> None:
-    """Draw the terms of the cost as bars, a colour for each plan, the value at the end."""
+    """Draw the terms of the cost as bars, one colour for each plan, with the values at their ends."""
     names = list(dict.fromkeys(name for plan in plans for name in plan.terms))
     thick = 0.76 / len(plans)
     rows = np.arange(len(names))

@@ -1,4 +1,4 @@
-"""The scene to scale: tissue, guide, needle, target, turns of the bevel."""
+"""The scene to scale: tissue, guide, needle, target, rolls of the bevel."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
-from flexneedle.plot.curves import Turn
+from flexneedle.plot.curves import Roll
 from flexneedle.plot.style import GUIDE, NEEDLE, QUIET, TARGET
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.tissue import Layer
@@ -39,8 +39,8 @@ def view_of(scenario: Scenario, depth: float, paths: Iterable[Floats]) -> View:
     """Return the window on guide (or start), tissue down to `depth` and paths (k, ≥ 2), y in column 1."""
     guide_x = scenario.setup.guide_x
     left = min(scenario.setup.start_tip_x - 8.0, 0.0 if guide_x is None else guide_x - 6.0)
-    aside = np.concatenate([path[:, 1] for path in paths] or [np.zeros(1)])
-    low, high = min(0.0, float(aside.min())) - 5.0, max(0.0, float(aside.max())) + 4.0
+    lateral = np.concatenate([path[:, 1] for path in paths] or [np.zeros(1)])
+    low, high = min(0.0, float(lateral.min())) - 5.0, max(0.0, float(lateral.max())) + 4.0
     right = depth + 11.0
     missing = max(0.0, 0.18 * (right - left) - (high - low)) / 2
     return View(left, right, low - missing, high + missing)
@@ -52,7 +52,7 @@ def draw_tissue(ax: Axes, scenario: Scenario, view: View) -> None:
     ax.set_ylim(view.low, view.high)
     ax.set_aspect("equal")
     ax.set_xlabel("depth (mm)", labelpad=1.0)
-    ax.set_ylabel("aside (mm)")
+    ax.set_ylabel("lateral (mm)")
     tint_layers(ax, scenario, view.right)
     ax.axvline(0.0, color="#8c5a36", linewidth=1.6, zorder=1, label="skin")
     foot = view.low + 0.5
@@ -81,7 +81,7 @@ def _layers(scenario: Scenario, right: float) -> list[tuple[Layer, float, float]
 
 
 def _name_layer(ax: Axes, layer: Layer, top: float, inches: float, foot: float) -> None:
-    """Write name and μ of a layer as far as they fit."""
+    """Write the name and μ of a layer as far as they fit."""
     modulus = f"μ {layer.shear_modulus_kpa:g} kPa"
     one, two = f"{layer.name}, {modulus}", f"{layer.name}\n{modulus}"
     for text in (one, two, modulus):
@@ -91,7 +91,7 @@ def _name_layer(ax: Axes, layer: Layer, top: float, inches: float, foot: float) 
 
 
 def draw_guide(ax: Axes, x: float, travel: Floats, y: float) -> None:
-    """Draw the guide at its last place y, and its travel (k,) (mm)."""
+    """Draw the guide at its last position y, and its travel (k,) (mm)."""
     for low in (y + _OPENING, y - _OPENING - _BLOCK):
         jaw = Rectangle((x - _WIDE, low), 2 * _WIDE, _BLOCK, facecolor=GUIDE, edgecolor="none", zorder=4)
         jaw.set_gid("guide")
@@ -104,7 +104,7 @@ def draw_guide(ax: Axes, x: float, travel: Floats, y: float) -> None:
 
 
 def draw_needle(ax: Axes, shape: Floats, before: Sequence[Floats], diameter: float) -> None:
-    """Draw the needle (n, 3) to scale, and faded where it was before."""
+    """Draw the needle (n, 3) to scale, and faded its earlier shapes."""
     width = diameter * _points_per_mm(ax)
     faded: dict[str, Any] = {"color": NEEDLE, "alpha": 0.45, "linewidth": 0.4 * width, "zorder": 2}
     for old in before:
@@ -119,7 +119,7 @@ def _points_per_mm(ax: Axes) -> float:
 
 
 def draw_target(ax: Axes, target: tuple[float, float]) -> None:
-    """Draw the target with the circle of 1 mm that counts as reached."""
+    """Draw the target with the circle of 1 mm within which it counts as reached."""
     circle = Circle(target, 1.0, facecolor="none", edgecolor=TARGET, linewidth=1.4, zorder=6)
     circle.set_gid("target")
     ax.add_patch(circle)
@@ -128,30 +128,30 @@ def draw_target(ax: Axes, target: tuple[float, float]) -> None:
 
 
 def name_target(ax: Axes, target: tuple[float, float]) -> None:
-    """Write beside the target what its circle means."""
+    """Write the meaning of the circle beside the target."""
     x, y = target
     ax.text(x + 1.6, y, "target,\n1 mm circle", color=TARGET, fontsize=8, va="center", linespacing=1.15)
 
 
 def name_bevel(ax: Axes, plan: Plan) -> None:
-    """Write below the start of the tip which side the bevel faces before it turns."""
+    """Show below the start of the tip the side of the bevel at the start."""
     x, foot = float(plan.tips[0, 0]), ax.get_ylim()[0] + 0.5
     marker = "^" if plan.bevel > 0 else "v"
     ax.plot(x, foot + 0.6, marker=marker, markersize=5, color=QUIET, label="bevel at the start")
     ax.text(x + 1.0, foot, "bevel at the start", color=QUIET, fontsize=8)
 
 
-def draw_turns(ax: Axes, turns: Sequence[Turn], color: str, *, solid: bool, label: str) -> None:
-    """Mark turns of the bevel beside the path, on the side to which the bevel turns and pointing there."""
-    how = turn_style(color, solid=solid)
-    for turn in turns:
-        shape = "^" if turn.side > 0 else "v"
-        ax.plot(turn.x, turn.y + 1.5 * turn.side, marker=shape, zorder=7 + solid, label=label, **how)
+def draw_rolls(ax: Axes, rolls: Sequence[Roll], color: str, *, solid: bool, label: str) -> None:
+    """Mark rolls of the bevel beside the path, on the side to which the bevel rolls and pointing there."""
+    how = roll_style(color, solid=solid)
+    for roll in rolls:
+        shape = "^" if roll.side > 0 else "v"
+        ax.plot(roll.x, roll.y + 1.5 * roll.side, marker=shape, zorder=7 + solid, label=label, **how)
 
 
-def turn_style(color: str, *, solid: bool) -> dict[str, Any]:
-    """Return how a turn is drawn: small and solid, or large and hollow, so that both are seen."""
-    look: dict[str, Any] = {"linestyle": "none", "markeredgecolor": color}
+def roll_style(color: str, *, solid: bool) -> dict[str, Any]:
+    """Return the style of a roll's mark: small and solid, or large and hollow, so that both are visible."""
+    common: dict[str, Any] = {"linestyle": "none", "markeredgecolor": color}
     if solid:
-        return {**look, "markersize": 5.5, "markerfacecolor": color, "markeredgewidth": 0.0}
-    return {**look, "markersize": 9.0, "markerfacecolor": "none", "markeredgewidth": 1.1}
+        return {**common, "markersize": 5.5, "markerfacecolor": color, "markeredgewidth": 0.0}
+    return {**common, "markersize": 9.0, "markerfacecolor": "none", "markeredgewidth": 1.1}

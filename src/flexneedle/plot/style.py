@@ -1,4 +1,4 @@
-"""How all figures look and are saved: the same bytes for the same data, whatever the user's settings."""
+"""Style and saving of all figures: the same bytes for the same data, whatever the user's settings."""
 
 import warnings
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 WIDTH = 9.0  # inches; shown 900 pixels wide, a point is 1.4 pixels
 
-# Okabe and Ito's colours, told apart by the colour-blind, with another line style or marker each.
+# Okabe and Ito's colours, which the colour-blind can distinguish, each with its own line style or marker.
 INK, QUIET = "#222222", "#6b6b6b"
 PLAN, ESTIMATE, TRUE, MEASURED, TARGET, BAD = "#222222", "#0072B2", "#D55E00", "#A8437F", "#00734f", "#B03A00"
 NEEDLE, GUIDE = "#8a8f98", "#4d535c"
@@ -57,7 +57,7 @@ def signed(value: float, form: str = "g") -> str:
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """Use the style of the house inside the block, not the user's matplotlibrc."""
+    """Use this module's style inside the block, not the user's matplotlibrc."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_SETTINGS)
