@@ -228,12 +228,12 @@ def test_an_unreachable_plan_is_refused_and_recorded(engine, capsys, in_tmp):
     [
         (
             ["--strategy", "steering", "--controller", "resolved-rate"],
-            "controller = 'resolved-rate': steers with the guide, and strategy = 'steering' does not move it: "
+            "controller = 'resolved-rate': needs a guide that moves, strategy = 'steering' does not move it: "
             "use 'manipulation'",
         ),
         (
             ["case.toml", "--controller", "broyden-mpc"],
-            "controller = 'broyden-mpc': steers with the guide: give setup.guide_to_skin_mm",
+            "controller = 'broyden-mpc': needs a guide that moves: set setup.guide_to_skin_mm",
         ),
     ],
 )

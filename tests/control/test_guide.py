@@ -18,11 +18,13 @@ BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
 GUIDE_CONTROLLERS = ("resolved-rate", "broyden-mpc")
 
 
+QUICK = PHANTOM.with_values({"plan.samples": 32, "plan.iterations": 4, "plan.max_iterations": 4})
+
+
 @pytest.fixture(scope="module")
 def steered():
     """A plan in which the bevel alone steers."""
-    quick = PHANTOM.with_values({"plan.samples": 32, "plan.iterations": 4, "plan.max_iterations": 4})
-    return flexneedle.plan(quick, (30.0, 0.5), "steering", threads=1)
+    return flexneedle.plan(QUICK, (30.0, 0.5), "steering", threads=1)
 
 
 @pytest.mark.parametrize(
@@ -50,7 +52,7 @@ def test_only_controllers_of_the_guide_are_refused_without_one(name):
 @pytest.mark.parametrize("name", GUIDE_CONTROLLERS)
 def test_a_steering_plan_is_refused_before_anything_moves(name, steered):
     with pytest.raises(InputError, match="does not move it: use 'manipulation'"):
-        flexneedle.insert(PHANTOM, steered, controller=name, threads=1)
+        flexneedle.insert(QUICK, steered, controller=name, threads=1)
 
 
 def test_the_refusal_comes_before_the_plan(tmp_path):
@@ -76,6 +78,6 @@ def test_ce_mpc_leaves_the_guide_where_it_is(steered, along):
 
 @pytest.mark.parametrize("name", ["ce-mpc", "bevel-only", "open-loop"])
 def test_a_steering_plan_is_carried_out_with_the_guide_still(name, steered):
-    done = flexneedle.insert(PHANTOM, steered, 5000, controller=name, threads=1)
+    done = flexneedle.insert(QUICK, steered, 5000, controller=name, threads=1)
     assert done.outcome == "done"
     assert {period.applied[3] for period in done.periods} == {0.0}

@@ -170,7 +170,7 @@ def _panels(figure: Figure, scenario: Scenario, insertion: Insertion, top: float
     plan = insertion.plan
     span = (float(plan.tips[0, 0]), max(float(plan.tips[:, 0].max()), plan.target[0]))
     contents = (
-        ("Lateral deviation from the planned path (mm)", _error_lines(insertion), 0.4),
+        ("Deviation from the plan (mm)", _error_lines(insertion), 0.4),
         _motion(scenario, insertion),
         ("Energy stored in the tissue (mJ)", _energy_lines(insertion), 0.01),
     )
