@@ -26,8 +26,8 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from flexneedle import Scenario, load_scenario
+from flexneedle.figures import style
 from flexneedle.planning.planner import plan as make_plan
-from flexneedle.plot import style
 from flexneedle.rig.loop import run as carry_out
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT
 from flexneedle.rig.virtual import Seeds, virtual_rig, virtual_room

@@ -18,7 +18,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
-from flexneedle.plot import style  # noqa: E402
+from flexneedle.figures import style  # noqa: E402
 from reference import closed_forms, elastica  # noqa: E402
 from reference import validation as problems  # noqa: E402
 from reference.cases import EI, FOUNDATION  # noqa: E402

@@ -27,8 +27,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from flexneedle.errors import InputError
+from flexneedle.figures import style
 from flexneedle.planning.planner import plan as make_plan
-from flexneedle.plot import style
 from flexneedle.rig.loop import run as carry_out
 from flexneedle.rig.phantom.draw import draw
 from flexneedle.rig.virtual import Seeds, virtual_rig

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     )
     from flexneedle.estimation.estimate import Estimate
     from flexneedle.estimation.task import Task
+    from flexneedle.figures.record import plot
     from flexneedle.planning.planner import plan
-    from flexneedle.plot.record import plot
     from flexneedle.rig.loop import insert, run
     from flexneedle.rig.phantom.draw import Truth
     from flexneedle.rig.phantom.plants import Plant
@@ -85,6 +85,7 @@ _HOMES = {
     ),
     "estimation.estimate": ("Estimate",),
     "estimation.task": ("Task",),
+    "figures.record": ("plot",),
     "planning.planner": ("plan",),
     "rig.loop": ("insert", "run"),
     "rig.phantom.draw": ("Truth",),
@@ -103,14 +104,11 @@ _HOMES = {
     "study.runner": ("run_study",),
     "types": ("Insertion", "Measurement", "Plan"),
 }
-_ROOM = "plot"  # the public name that is a room: it can be called
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name from its home on first use (PEP 562)."""
-    if name == _ROOM:
-        return import_module(f".{name}", __name__)
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f".{_HOME_OF[name]}", __name__), name)

@@ -7,10 +7,10 @@ from matplotlib.quiver import Quiver
 from matplotlib.text import Text
 from numpy.testing import assert_allclose
 
-from flexneedle.em.plot.distance import DistanceLine, distance_figure
-from flexneedle.em.plot.field import FieldRow, field_figure
-from flexneedle.em.plot.indicator import IndicatorPanel, Shown, indicator_figure
-from flexneedle.em.plot.roc import RocLine, roc_figure
+from flexneedle.em.figures.distance import DistanceLine, distance_figure
+from flexneedle.em.figures.field import FieldRow, field_figure
+from flexneedle.em.figures.indicator import IndicatorPanel, Shown, indicator_figure
+from flexneedle.em.figures.roc import RocLine, roc_figure
 
 GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 

@@ -11,15 +11,15 @@ from matplotlib.colors import to_hex
 from matplotlib.text import Text
 from numpy.testing import assert_allclose
 
-from flexneedle.plot.layout import Panel, look
-from flexneedle.plot.style import save
-from flexneedle.study.plot.comparison import DifferenceRow, difference_figure
-from flexneedle.study.plot.distributions import error_figure
-from flexneedle.study.plot.energy import energy_figure
-from flexneedle.study.plot.samples import Sample
-from flexneedle.study.plot.shares import share_figure
-from flexneedle.study.plot.sweeps import sweep_figure
-from flexneedle.study.plot.targeting import Tips, targeting_figure
+from flexneedle.figures.layout import Panel, look
+from flexneedle.figures.style import save
+from flexneedle.study.figures.comparison import DifferenceRow, difference_figure
+from flexneedle.study.figures.distributions import error_figure
+from flexneedle.study.figures.energy import energy_figure
+from flexneedle.study.figures.samples import Sample
+from flexneedle.study.figures.shares import share_figure
+from flexneedle.study.figures.sweeps import sweep_figure
+from flexneedle.study.figures.targeting import Tips, targeting_figure
 
 TARGETS = np.array([(depth, aside) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for aside in (-5.0, 0.0, 5.0)])
 NAMES = ("adaptive-mpc", "open-loop", "bevel-only", "resolved-rate", "broyden-mpc", "ce-mpc", "another one")

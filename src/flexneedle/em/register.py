@@ -9,12 +9,12 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from flexneedle.em.plot.registration import registration_figure
+from flexneedle.em.figures.registration import registration_figure
 from flexneedle.em.table.columns import column_map
 from flexneedle.em.table.rules import POSITIONS, SAME_MM, TRUE_POSITIONS, refuse_broken
 from flexneedle.em.table.source import LABELS, Table, open_table
 from flexneedle.errors import InputError
-from flexneedle.plot.style import save
+from flexneedle.figures.style import save
 from flexneedle.rig.tracking.quaternion import from_matrix
 from flexneedle.rig.tracking.registration import (
     Rigid,

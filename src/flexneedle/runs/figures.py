@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from flexneedle.errors import RunError
-from flexneedle.plot.insertion import insertion_figure
-from flexneedle.plot.plans import plan_figure
-from flexneedle.plot.style import save
+from flexneedle.figures.insertion import insertion_figure
+from flexneedle.figures.plans import plan_figure
+from flexneedle.figures.style import save
 from flexneedle.runs.reading import insertion_of
 from flexneedle.trace.folder import TRACE_FILE, read_run
 

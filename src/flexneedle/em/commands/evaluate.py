@@ -56,8 +56,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def _evaluate(args: argparse.Namespace) -> int:
     from flexneedle.em.commands.results import print_evaluation
     from flexneedle.em.evaluation.evaluate import RESULT_FILES, Options, evaluate, write_evaluation
+    from flexneedle.em.figures.evaluation import draw_evaluation
     from flexneedle.em.place import claim
-    from flexneedle.em.plot.evaluation import draw_evaluation
 
     names = ("register", "unit", "bin_mm", "limit_mm", "ideal", "noisy", "sensor", "environment")
     options = Options(tuple(args.columns), **{name: getattr(args, name) for name in names})

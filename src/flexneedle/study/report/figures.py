@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from flexneedle.plot.layout import MOST_PANELS, Floats, Look, Panel, look
-from flexneedle.plot.style import INK, save
-from flexneedle.study.plot.comparison import DifferenceRow, difference_figure
-from flexneedle.study.plot.distributions import error_figure
-from flexneedle.study.plot.energy import energy_figure
-from flexneedle.study.plot.samples import Sample
-from flexneedle.study.plot.shares import share_figure
-from flexneedle.study.plot.sweeps import sweep_figure
-from flexneedle.study.plot.targeting import Tips, targeting_figure
+from flexneedle.figures.layout import MOST_PANELS, Floats, Look, Panel, look
+from flexneedle.figures.style import INK, save
+from flexneedle.study.figures.comparison import DifferenceRow, difference_figure
+from flexneedle.study.figures.distributions import error_figure
+from flexneedle.study.figures.energy import energy_figure
+from flexneedle.study.figures.samples import Sample
+from flexneedle.study.figures.shares import share_figure
+from flexneedle.study.figures.sweeps import sweep_figure
+from flexneedle.study.figures.targeting import Tips, targeting_figure
 from flexneedle.study.report.design import Factor, controllers_in_order
 from flexneedle.study.report.findings import Findings
 from flexneedle.study.report.rows import Flags

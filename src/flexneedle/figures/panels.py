@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
-from flexneedle.plot.scene import tint_layers
-from flexneedle.plot.style import BAD, QUIET
+from flexneedle.figures.scene import tint_layers
+from flexneedle.figures.style import BAD, QUIET
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats
 

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
-from flexneedle.plot.layout import look, short
-from flexneedle.plot.style import QUIET, new_figure, styled
+from flexneedle.figures.layout import look, short
+from flexneedle.figures.style import QUIET, new_figure, styled
 
 _NAME = 24  # characters
 _HIGH, _ROW = 4.4, 0.17  # inches: of the figure, and of a line of the legends below

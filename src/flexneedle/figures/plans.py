@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flexneedle.plot import curves, scene
-from flexneedle.plot.panels import Line, draw_panel
-from flexneedle.plot.style import (
+from flexneedle.figures import curves, scene
+from flexneedle.figures.panels import Line, draw_panel
+from flexneedle.figures.style import (
     BAD,
     INK,
     PLAN,

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flexneedle.plot.layout import FAINT, Look, Panel, legend, panels, short, ticks_of
-from flexneedle.plot.style import INK, QUIET, signed, styled
+from flexneedle.figures.layout import FAINT, Look, Panel, legend, panels, short, ticks_of
+from flexneedle.figures.style import INK, QUIET, signed, styled
 
 _WIDE = 10.0  # times the even part around zero: from there on, decades
 _SURE, _UNSURE = "mean with 95 % interval", "not separable from no difference"

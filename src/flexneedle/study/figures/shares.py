@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flexneedle.plot.layout import FAINT, LIMIT, Panel, decades, legend, limit_line, panels, ticks_of
-from flexneedle.plot.style import styled
-from flexneedle.study.plot.samples import Sample
+from flexneedle.figures.layout import FAINT, LIMIT, Panel, decades, legend, limit_line, panels, ticks_of
+from flexneedle.figures.style import styled
+from flexneedle.study.figures.samples import Sample
 
 
 def share_figure(shown: Sequence[Panel[Sequence[Sample]]]) -> Figure:

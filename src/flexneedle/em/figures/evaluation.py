@@ -8,12 +8,12 @@ from flexneedle.em.evaluation.accuracy import error_vectors
 from flexneedle.em.evaluation.evaluate import Evaluation, Result
 from flexneedle.em.evaluation.indicator import Line, means
 from flexneedle.em.evaluation.separation import Separation
-from flexneedle.em.plot.distance import DistanceLine, distance_figure
-from flexneedle.em.plot.field import FieldRow, field_figure
-from flexneedle.em.plot.indicator import IndicatorPanel, Shown, indicator_figure
-from flexneedle.em.plot.roc import RocLine, roc_figure
+from flexneedle.em.figures.distance import DistanceLine, distance_figure
+from flexneedle.em.figures.field import FieldRow, field_figure
+from flexneedle.em.figures.indicator import IndicatorPanel, Shown, indicator_figure
+from flexneedle.em.figures.roc import RocLine, roc_figure
 from flexneedle.em.table.grid import Grid
-from flexneedle.plot.style import save, signed
+from flexneedle.figures.style import save, signed
 
 MOST_PANELS = 3
 

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from flexneedle.plot.layout import short
-from flexneedle.plot.style import QUIET, WIDTH, new_figure, signed, styled
+from flexneedle.figures.layout import short
+from flexneedle.figures.style import QUIET, WIDTH, new_figure, signed, styled
 
 MOST_ROWS, MOST_SLICES = 6, 5
 MOST_ARROWS = 400

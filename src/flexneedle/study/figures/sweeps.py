@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flexneedle.plot.layout import (
+from flexneedle.figures.layout import (
     FAINT,
     OVERLAID,
     Floats,
@@ -20,8 +20,8 @@ from flexneedle.plot.layout import (
     panels,
     short,
 )
-from flexneedle.plot.style import BAD, INK, WIDTH, styled
-from flexneedle.study.plot.samples import Sample
+from flexneedle.figures.style import BAD, INK, WIDTH, styled
+from flexneedle.study.figures.samples import Sample
 
 _FIRST, _THIRD = partial(np.quantile, q=0.25), partial(np.quantile, q=0.75)
 _WIDE = 20.0  # times between the smallest and the largest median or mean: from there on, decades

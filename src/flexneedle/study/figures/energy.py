@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flexneedle.plot.layout import (
+from flexneedle.figures.layout import (
     FAINT,
     LIMIT,
     Floats,
@@ -20,7 +20,7 @@ from flexneedle.plot.layout import (
     scattered,
     ticks_of,
 )
-from flexneedle.plot.style import INK, QUIET, styled
+from flexneedle.figures.style import INK, QUIET, styled
 
 
 def energy_figure(shown: Sequence[Panel[Floats]]) -> Figure:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from flexneedle.plot.style import BAD, QUIET, TARGET, WIDTH, new_figure
+from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, new_figure
 
 Floats = NDArray[np.float64]
 Content = TypeVar("Content")

@@ -2,8 +2,8 @@
 
 from matplotlib.figure import Figure
 
-from flexneedle.plot.insertion import insertion_figure
-from flexneedle.plot.plans import plan_figure
+from flexneedle.figures.insertion import insertion_figure
+from flexneedle.figures.plans import plan_figure
 from flexneedle.types import Insertion, Plan, scenario_of
 
 

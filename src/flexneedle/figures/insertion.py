@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flexneedle.plot import curves, scene
-from flexneedle.plot.panels import Line, draw_panel, draw_timeline
-from flexneedle.plot.style import (
+from flexneedle.figures import curves, scene
+from flexneedle.figures.panels import Line, draw_panel, draw_timeline
+from flexneedle.figures.style import (
     BAD,
     ESTIMATE,
     INK,

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from flexneedle.plot.layout import short
-from flexneedle.plot.style import ESTIMATE, INK, QUIET, TARGET, TRUE, new_figure, styled
+from flexneedle.figures.layout import short
+from flexneedle.figures.style import ESTIMATE, INK, QUIET, TARGET, TRUE, new_figure, styled
 
 FAR, CUT = 2.0, 1.2
 """An environment whose largest indicator is beyond FAR times its 95th percentile is shown to CUT times that, with the

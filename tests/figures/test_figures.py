@@ -9,11 +9,11 @@ import pytest
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.text import Text
 
-from flexneedle.plot.curves import held_spans, worst_indicator
-from flexneedle.plot.insertion import insertion_figure
-from flexneedle.plot.panels import spread_out
-from flexneedle.plot.plans import plan_figure
-from flexneedle.plot.style import save
+from flexneedle.figures.curves import held_spans, worst_indicator
+from flexneedle.figures.insertion import insertion_figure
+from flexneedle.figures.panels import spread_out
+from flexneedle.figures.plans import plan_figure
+from flexneedle.figures.style import save
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.trace.columns import verdict_of

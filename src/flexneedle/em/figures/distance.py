@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from flexneedle.plot.layout import look, short
-from flexneedle.plot.style import new_figure, styled
+from flexneedle.figures.layout import look, short
+from flexneedle.figures.style import new_figure, styled
 
 _LINE = 30  # characters in a line of the legend
 _HIGH, _ROW = 3.8, 0.16  # inches: of the figure, and of a line of the legend

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flexneedle.plot.layout import (
+from flexneedle.figures.layout import (
     LIMIT,
     Panel,
     decades,
@@ -19,8 +19,8 @@ from flexneedle.plot.layout import (
     short,
     ticks_of,
 )
-from flexneedle.plot.style import INK, QUIET, styled
-from flexneedle.study.plot.samples import LEAST, Sample
+from flexneedle.figures.style import INK, QUIET, styled
+from flexneedle.study.figures.samples import LEAST, Sample
 
 _GOLDEN = 0.6180339887
 _HIGH = 0.28  # half of what the dots of a row spread over

@@ -14,8 +14,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
-from flexneedle.plot.layout import FAINT, Floats, Panel, columns_of, head, legend, panels, scattered, sheet
-from flexneedle.plot.style import BAD, QUIET, TARGET, WIDTH, styled
+from flexneedle.figures.layout import FAINT, Floats, Panel, columns_of, head, legend, panels, scattered, sheet
+from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, styled
 
 _MOST_TARGETS = 40  # more, and they are drawn in one place
 _MARGIN, _FAR = 2.0, 6.0  # mm around the targets that are always, and that are at most shown

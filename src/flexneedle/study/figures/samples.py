@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexneedle.plot.layout import Floats, Look
+from flexneedle.figures.layout import Floats, Look
 
 LEAST = 1e-3  # mm; smaller errors are drawn here
 

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
-from flexneedle.plot.curves import Roll
-from flexneedle.plot.style import GUIDE, NEEDLE, QUIET, TARGET
+from flexneedle.figures.curves import Roll
+from flexneedle.figures.style import GUIDE, NEEDLE, QUIET, TARGET
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.tissue import Layer
 from flexneedle.types import Floats, Plan

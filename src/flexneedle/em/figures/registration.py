@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from flexneedle.plot.style import ESTIMATE, INK, QUIET, new_figure, styled
+from flexneedle.figures.style import ESTIMATE, INK, QUIET, new_figure, styled
 
 Floats = NDArray[np.float64]
 

@@ -1,0 +1,1 @@
+"""Figures of plans and insertions, as pure functions of records."""

@@ -1,0 +1,1 @@
+"""Run folders: plan and insert with a record on disk, and draw it again."""
