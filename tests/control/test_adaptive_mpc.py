@@ -181,13 +181,13 @@ def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
     task = task_of(estimate.nominal, quick_plan)
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
     ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
-    outcome = adaptive_mpc._measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
+    trajectories = adaptive_mpc._measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
     (term,) = (term for term in adaptive_mpc._terms(task, estimate, memory, ahead) if term.name == "miss")
-    past = float(terms.past(outcome, quick_plan.target)[0])
+    past = float(terms.past(trajectories, quick_plan.target)[0])
     assert abs(past) > 1e-3
     blur = 0.3 * ahead.left / 40.0
     assert blur < 0.25
-    assert term.value(outcome)[0] == pytest.approx(np.hypot(past, blur) - blur)
+    assert term.value(trajectories)[0] == pytest.approx(np.hypot(past, blur) - blur)
 
 
 def test_near_the_target_what_is_above_its_standard_deviation_is_urgent_and_what_is_below_is_not(
@@ -198,11 +198,13 @@ def test_near_the_target_what_is_above_its_standard_deviation_is_urgent_and_what
     task = task_of(estimate.nominal, quick_plan)
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
     ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
-    outcome = adaptive_mpc._measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
-    off = terms.past(outcome, quick_plan.target)[0]
-    tips = np.repeat(outcome.tips, 3, axis=0)
+    trajectories = adaptive_mpc._measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
+    off = terms.past(trajectories, quick_plan.target)[0]
+    tips = np.repeat(trajectories.tips, 3, axis=0)
     tips[:, -1, 1] += np.array([0.01, 0.3, 30.0]) - off
-    charged = charges(adaptive_mpc._terms(task, estimate, memory, ahead)[:2], replace(outcome, tips=tips))
+    charged = charges(
+        adaptive_mpc._terms(task, estimate, memory, ahead)[:2], replace(trajectories, tips=tips)
+    )
     share = charged["large miss"] / charged["miss"] / (max(ahead.left, 5.0) / 40.0) ** -1.5
     full = 1.0 - (max(ahead.left, 5.0) / 40.0) ** 1.5
     assert ahead.left < 12.0
@@ -527,8 +529,8 @@ def test_where_no_path_converges_it_rests_and_reports_it(quick_plan, along, monk
     memory, rollout = ADAPTIVE.begin(task), adaptive_mpc._measured_rollout
 
     def lost(fitted, controls):
-        outcome = rollout(fitted, controls)
-        return replace(outcome, converged=np.zeros_like(outcome.converged))
+        trajectories = rollout(fitted, controls)
+        return replace(trajectories, converged=np.zeros_like(trajectories.converged))
 
     monkeypatch.setattr(adaptive_mpc, "_measured_rollout", lost)
     decision, after = ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))

@@ -10,7 +10,7 @@ from flexneedle.control import bang_bang, mpc
 from flexneedle.control.interface import at_depth
 from flexneedle.control.methods import METHODS
 from flexneedle.estimation.task import Task
-from flexneedle.planning.terms import Outcome, cost
+from flexneedle.planning.terms import Trajectories, cost
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 from tasks import task_of
@@ -163,8 +163,8 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
     reference, nominal = mpc._window(plan, float(state.tip[0]), 1)
     grid = np.stack(np.meshgrid(np.linspace(0.5, 1, 41), np.linspace(-0.5, 0.5, 81)), axis=-1).reshape(-1, 2)
     controls = mpc._controls(scenario, state, grid, np.zeros((1, 2)), 40.0, flip=False)
-    outcome = Outcome(controls, *simulator.rollout(state, controls))
-    best = cost(mpc._cost_terms(mpc.CeMpc(horizon=1), reference, nominal[:, 3]), outcome).min()
+    trajectories = Trajectories(controls, *simulator.rollout(state, controls))
+    best = cost(mpc._cost_terms(mpc.CeMpc(horizon=1), reference, nominal[:, 3]), trajectories).min()
     assert choice.cost <= best + 0.002
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from flexneedle.planning import cross_entropy as ce
 from flexneedle.planning import horizon, terms
-from flexneedle.planning.terms import Outcome, Term
+from flexneedle.planning.terms import Term, Trajectories
 
 SEARCH = ce.Search(samples=16, elite=4, iterations=3, smoothing=0.2, tolerance=1e-9)
 TARGET = (4.0, 1.5)
@@ -27,7 +27,7 @@ VARIABLES = horizon.Variables(
     np.full(4, -1.0), np.full(4, 1.0), np.zeros(4), np.array([0.3, 0.3, 0.3, 0.0]), controls
 )
 TERMS = (
-    Term("miss", 1.0, lambda outcome: terms.miss(outcome, TARGET)),
+    Term("miss", 1.0, lambda trajectories: terms.miss(trajectories, TARGET)),
     Term("guide", 0.1, terms.guide_motion),
 )
 
@@ -36,7 +36,7 @@ def rigid(rows, failed=lambda tips: np.zeros(tips.shape[:2], dtype=bool)):
     """A tip that goes where the guide goes."""
     moved = np.cumsum(rows, axis=1)
     tips = np.stack([moved[:, :, 0], moved[:, :, 3], np.zeros(moved.shape[:2])], axis=2)
-    return Outcome(rows, tips, np.zeros(tips.shape[:2]), ~failed(tips))
+    return Trajectories(rows, tips, np.zeros(tips.shape[:2]), ~failed(tips))
 
 
 class Taped:
@@ -56,7 +56,7 @@ def search(rollout=rigid, variables=VARIABLES, settings=SEARCH, seed=0, **option
 
 def test_what_is_found_is_told_with_its_terms_and_rollout():
     found = search()
-    np.testing.assert_array_equal(found.outcome.controls, controls(found.z[None]))
+    np.testing.assert_array_equal(found.trajectories.controls, controls(found.z[None]))
     assert found.cost == sum(found.terms.values()) == found.search_state.best_cost
     assert found.terms["miss"] == pytest.approx(abs(found.z.sum() - 1.5))
     assert list(found.terms) == ["miss", "guide"]

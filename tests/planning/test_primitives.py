@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 from flexneedle.planning import insertion
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.insertion import PlanProblem, optimise, schedule
-from flexneedle.planning.terms import Outcome, charges
+from flexneedle.planning.terms import Trajectories, charges
 
 PROBLEM = PlanProblem(
     target=(8.0, 2.0), travel=12.0, air=4.0, primitives=3,
@@ -128,8 +128,10 @@ def made_up(n):
 
 def terms(z, change=lambda *arrays: arrays, problem=PROBLEM):
     controls, _ = schedule(problem, z)
-    outcome = Outcome(controls, *change(*made_up(len(controls))))
-    return {name: float(value[0]) for name, value in charges(insertion.cost_terms(problem), outcome).items()}
+    trajectories = Trajectories(controls, *change(*made_up(len(controls))))
+    return {
+        name: float(value[0]) for name, value in charges(insertion.cost_terms(problem), trajectories).items()
+    }
 
 
 GUIDED = primitives((1, 0, 0, 0.1, 1, 0), (1, 0, 0, -0.2, -1, 0), (1, 0, 0, 0.05, 1, 0))
@@ -172,10 +174,10 @@ def test_padding_of_a_shorter_sample_is_not_charged():
 
     controls, _ = schedule(PROBLEM, z)
     n, m = controls.shape[:2]
-    outcome = Outcome(
+    trajectories = Trajectories(
         controls, np.ones((n, m, 3)), np.zeros((n, m)), np.ones((n, m), dtype=bool), np.ones((n, m))
     )
-    found = charges(insertion.cost_terms(PROBLEM), outcome)
+    found = charges(insertion.cost_terms(PROBLEM), trajectories)
     np.testing.assert_allclose(found["deflection"], [0.002 * 12, 0.002 * 24])
 
 
@@ -186,7 +188,7 @@ def rigid(controls, bevel=1.0):
     bent = 0.1 * np.cumsum(facing * controls[:, :, 0] * (x > 0.0), axis=1)
     tips = np.stack([x, np.cumsum(controls[:, :, 3], axis=1) + bent, np.zeros_like(x)], axis=2)
     zero = np.zeros_like(x)
-    return Outcome(controls, tips, zero, np.ones(x.shape, dtype=bool), zero)
+    return Trajectories(controls, tips, zero, np.ones(x.shape, dtype=bool), zero)
 
 
 def test_search_meets_the_target_of_a_rigid_needle():

@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 from flexneedle.planning import steering
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.insertion import PlanProblem
-from flexneedle.planning.terms import Outcome
+from flexneedle.planning.terms import Trajectories
 
 SEARCH = Search(samples=16, elite=4, iterations=60, smoothing=0.2, tolerance=1e-6)
 BEND = 0.01  # curvature of the tip's path, 1/mm
@@ -38,7 +38,7 @@ def kinematic(controls, start=1.0, charge=lambda y: 0.0 * y):
     before = bent - BEND * facing * inside
     y = np.cumsum(before * inside + 0.5 * BEND * facing * inside**2, axis=1)
     tips = np.stack([x, y, np.arctan(bent)], axis=2)
-    return Outcome(controls, tips, charge(y), np.ones(x.shape, dtype=bool), 0.0 * y)
+    return Trajectories(controls, tips, charge(y), np.ones(x.shape, dtype=bool), 0.0 * y)
 
 
 def end(z, side, p=None):

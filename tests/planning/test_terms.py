@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flexneedle.planning import terms
-from flexneedle.planning.terms import Outcome, Term
+from flexneedle.planning.terms import Term, Trajectories
 
 # Two sequences of three steps. The first one's first step ends in air; the second one's last is padding.
 ADVANCE = np.array([[1.0, 2.0, 2.0], [1.0, 0.5, 0.0]])
@@ -17,7 +17,7 @@ X = np.array([[-0.5, 1.5, 3.5], [0.5, 1.0, 1.0]])
 Y = np.array([[0.0, 0.2, 0.5], [1.0, -1.0, -1.0]])
 TURN = np.array([[0.0, 0.1, 0.2], [0.0, 0.0, -0.3]])
 CONTROLS = np.stack([ADVANCE, 0 * X, 0 * X, GUIDE, FLIP], axis=2)
-OUTCOME = Outcome(
+TRAJECTORIES = Trajectories(
     CONTROLS,
     np.stack([X, Y, TURN], axis=2),
     np.array([[0.0, 1.0, 4.0], [2.0, 3.0, 3.0]]),
@@ -45,52 +45,52 @@ OUTCOME = Outcome(
     ],
 )
 def test_term_against_numbers_by_hand(term, expected):
-    np.testing.assert_allclose(term(OUTCOME), expected, rtol=1e-14)
+    np.testing.assert_allclose(term(TRAJECTORIES), expected, rtol=1e-14)
 
 
 def test_distance_from_the_line_is_a_mean_over_the_advance_in_tissue():
     """From (0, 0) with slope −1/4: at 1.5 and 3.5 by 0.575 and 1.375, two mm each; at 0.5 and 1 by 1.125 and 0.75."""
-    found = terms.distance_from_line(OUTCOME, (0.0, 0.0), (4.0, -1.0))
+    found = terms.distance_from_line(TRAJECTORIES, (0.0, 0.0), (4.0, -1.0))
     np.testing.assert_allclose(found, [(0.575 + 1.375) / 2, (1.125 * 1.0 + 0.75 * 0.5) / 1.5], rtol=1e-14)
 
 
 def test_distance_from_the_line_knows_where_the_line_starts():
-    found = terms.distance_from_line(OUTCOME, (1.5, 0.2), (3.5, 0.5))
+    found = terms.distance_from_line(TRAJECTORIES, (1.5, 0.2), (3.5, 0.5))
     assert found[0] == pytest.approx(0.0, abs=1e-15)
 
 
 def test_distance_from_a_line_without_length_is_that_from_its_height():
-    found = terms.distance_from_line(OUTCOME, (3.5, 0.2), (3.5, 0.5))
+    found = terms.distance_from_line(TRAJECTORIES, (3.5, 0.2), (3.5, 0.5))
     assert found[0] == pytest.approx((0.0 + 0.3) / 2)
 
 
 def test_in_air_and_without_an_advance_nothing_is_divided_by_zero():
-    still = replace(OUTCOME, controls=np.zeros_like(CONTROLS))
+    still = replace(TRAJECTORIES, controls=np.zeros_like(CONTROLS))
     np.testing.assert_array_equal(terms.guide_slope(still), [0.0, 0.0])
     np.testing.assert_array_equal(terms.distance_from_line(still, (0.0, 0.0), (4.0, 1.0)), [0.0, 0.0])
 
 
 def test_deviation_weighs_an_angle_as_a_distance_and_changes_no_tips():
-    before = OUTCOME.tips.copy()
-    off = OUTCOME.tips - 0.25
+    before = TRAJECTORIES.tips.copy()
+    off = TRAJECTORIES.tips - 0.25
     expected = (off[:, :, 0] ** 2 + off[:, :, 1] ** 2 + 9.0 * off[:, :, 2] ** 2).sum(axis=1)
-    np.testing.assert_allclose(terms.deviation(OUTCOME, np.full((3, 3), 0.25), 3.0), expected)
-    np.testing.assert_array_equal(OUTCOME.tips, before)
+    np.testing.assert_allclose(terms.deviation(TRAJECTORIES, np.full((3, 3), 0.25), 3.0), expected)
+    np.testing.assert_array_equal(TRAJECTORIES.tips, before)
 
 
 def test_a_slope_does_not_depend_on_the_length_of_the_steps():
     """Halving every step leaves the guide's slope, where the paper's sum of squares halves."""
-    halved = replace(OUTCOME, controls=np.repeat(CONTROLS, 2, axis=1) * [0.5, 1, 1, 0.5, 1])
-    np.testing.assert_allclose(terms.guide_slope(halved), terms.guide_slope(OUTCOME))
+    halved = replace(TRAJECTORIES, controls=np.repeat(CONTROLS, 2, axis=1) * [0.5, 1, 1, 0.5, 1])
+    np.testing.assert_allclose(terms.guide_slope(halved), terms.guide_slope(TRAJECTORIES))
 
 
 def test_cost_is_the_weighted_sum_and_infinite_where_the_model_failed():
     listed = (Term("energy", 2.0, terms.energy_at_end), Term("rolls", 0.5, terms.rolls))
-    charged = terms.charges(listed, OUTCOME)
+    charged = terms.charges(listed, TRAJECTORIES)
     np.testing.assert_allclose(charged["energy"], [8.0, 6.0])
     np.testing.assert_allclose(charged["rolls"], [1.0, 0.5])
-    np.testing.assert_allclose(terms.cost(listed, OUTCOME), [9.0, 6.5])
-    failed = replace(OUTCOME, converged=np.array([[True, True, True], [True, False, True]]))
+    np.testing.assert_allclose(terms.cost(listed, TRAJECTORIES), [9.0, 6.5])
+    failed = replace(TRAJECTORIES, converged=np.array([[True, True, True], [True, False, True]]))
     assert terms.cost(listed, failed).tolist() == [9.0, np.inf]
 
 
@@ -99,9 +99,9 @@ def test_a_late_roll_costs_more_the_nearer_the_target_and_one_at_it_one():
     controls[:, :, 0], controls[:, :, 4] = 5.0, -1.0
     controls[0, 0, 4] = controls[1, 1, 4] = 1.0  # the third rolls nothing
     tips[:, :, 0] = 35.0, 40.0
-    late = terms.late_rolls(replace(OUTCOME, controls=controls, tips=tips), depth=40.0, length=5.0)
+    late = terms.late_rolls(replace(TRAJECTORIES, controls=controls, tips=tips), depth=40.0, length=5.0)
     np.testing.assert_allclose(late, [np.exp(-2.0), np.exp(-1.0), 0.0])
-    at_target = terms.late_rolls(replace(OUTCOME, controls=controls, tips=tips), depth=35.0, length=5.0)
+    at_target = terms.late_rolls(replace(TRAJECTORIES, controls=controls, tips=tips), depth=35.0, length=5.0)
     assert at_target[1] == 1.0
 
 
@@ -110,7 +110,7 @@ def test_a_miss_counts_as_far_as_it_is_known(blur):
     """As its square where it is far below what is known, in full, less that, where it is far above; on either side."""
     tips = np.zeros((4, 1, 3))
     tips[:, 0, 0], tips[:, 0, 1] = 40.0, (1e-3, -1e-3, 100.0, -100.0)
-    miss = terms.miss(replace(OUTCOME, tips=tips), (40.0, 0.0), blur)
+    miss = terms.miss(replace(TRAJECTORIES, tips=tips), (40.0, 0.0), blur)
     near = 1e-3 if blur == 0.0 else 0.5e-6 / blur
     np.testing.assert_allclose(miss[:2], near, rtol=0.01)
     np.testing.assert_allclose(miss[2:], 100.0 - blur, rtol=2e-3)
@@ -121,10 +121,12 @@ def test_a_large_miss_is_one_beyond_its_standard_deviation(blur):
     """Nothing of one that is far below it counts, half of one that equals it, all of one that is far above."""
     tips = np.zeros((4, 1, 3))
     tips[:, 0, 0], tips[:, 0, 1] = 40.0, (1e-4, 0.1, -0.1, 100.0)
-    outcome = replace(OUTCOME, tips=tips)
-    share = terms.large_miss(outcome, (40.0, 0.0), blur, 0.1) / terms.miss(outcome, (40.0, 0.0), blur)
+    trajectories = replace(TRAJECTORIES, tips=tips)
+    share = terms.large_miss(trajectories, (40.0, 0.0), blur, 0.1) / terms.miss(
+        trajectories, (40.0, 0.0), blur
+    )
     np.testing.assert_allclose(share, [1e-6, 0.5, 0.5, 1.0], rtol=1e-5)
     assert (
-        terms.large_miss(replace(OUTCOME, tips=0.0 * tips + (40.0, 0.0, 0.0)), (40.0, 0.0), blur, 0.0)[0]
+        terms.large_miss(replace(TRAJECTORIES, tips=0.0 * tips + (40.0, 0.0, 0.0)), (40.0, 0.0), blur, 0.0)[0]
         == 0.0
     )

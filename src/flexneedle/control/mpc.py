@@ -11,7 +11,7 @@ from flexneedle.control.interface import travel_left
 from flexneedle.planning import terms
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import Variables, best
-from flexneedle.planning.terms import Outcome, Term
+from flexneedle.planning.terms import Term, Trajectories
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, count
@@ -76,12 +76,12 @@ def choose(
         tolerance=scenario.plan.tolerance,
     )
 
-    def rollout(controls: Floats) -> Outcome:
-        return Outcome(controls, *simulator.rollout(state, controls))
+    def rollout(controls: Floats) -> Trajectories:
+        return Trajectories(controls, *simulator.rollout(state, controls))
 
     found = best(variables, rollout, _cost_terms(control, reference, nominal[:, 3]), search, rng)
     spread = float(np.sqrt(found.search_state.covariance[steps, steps]))
-    db_x, db_y, db_theta, dg_y = found.outcome.controls[0, 0, :4].tolist()
+    db_x, db_y, db_theta, dg_y = found.trajectories.controls[0, 0, :4].tolist()
     return Choice((db_x, db_y, db_theta, dg_y), found.cost, spread)
 
 

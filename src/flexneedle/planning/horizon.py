@@ -3,7 +3,7 @@
     found = best(variables, rollout, terms, search, rng)
 
 Cross-entropy draws samples z (N, d) of the variables within their bounds, `variables.controls` maps them to
-controls, `rollout` simulates these, and the terms are evaluated on the outcome.
+controls, `rollout` simulates these, and the terms are evaluated on the trajectories.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from flexneedle.planning import cross_entropy as ce
-from flexneedle.planning.terms import Outcome, RolloutFunction, Term, charges, cost
+from flexneedle.planning.terms import RolloutFunction, Term, Trajectories, charges, cost
 from flexneedle.types import Floats
 
 
@@ -40,7 +40,7 @@ class Found:
     z: Floats
     cost: float
     terms: dict[str, float]
-    outcome: Outcome
+    trajectories: Trajectories
     search_state: ce.SearchState
 
 
@@ -68,6 +68,6 @@ def best(
     opening = ce.sample(search_state, settings, rng) if first is None else first
     opening = np.clip(opening, settings.lower, settings.upper)
     search_state = ce.minimize(evaluate, search_state, settings, rng, progress, opening)
-    outcome = rollout(variables.controls(search_state.best[None]))
-    charged = {name: float(value[0]) for name, value in charges(terms, outcome).items()}
-    return Found(search_state.best, search_state.best_cost, charged, outcome, search_state)
+    trajectories = rollout(variables.controls(search_state.best[None]))
+    charged = {name: float(value[0]) for name, value in charges(terms, trajectories).items()}
+    return Found(search_state.best, search_state.best_cost, charged, trajectories, search_state)

@@ -79,7 +79,7 @@ def optimise(
 
 def solution(found: Found) -> Solution:
     """The solution: without steps that do not advance, the bevel set before the first."""
-    controls = found.outcome.controls[0]
+    controls = found.trajectories.controls[0]
     facing = np.cumprod(-controls[:, 4])
     moving = controls[:, 0] > 0.0
     controls, facing = controls[moving], facing[moving]

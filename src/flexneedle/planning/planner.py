@@ -13,7 +13,7 @@ from flexneedle.errors import InputError
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.insertion import BASE_Y, GUIDE, PlanProblem, Solution, optimise
 from flexneedle.planning.steering import reach, steer
-from flexneedle.planning.terms import Outcome
+from flexneedle.planning.terms import Trajectories
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario, check_target
 from flexneedle.scenario.sections.settings import PlanSettings
@@ -102,12 +102,12 @@ def _search(
     return optimise(rollout, problem, _settings(plan, plan.samples), rng, progress)
 
 
-def _rollout(simulator: Simulator) -> Callable[[Floats], Outcome]:
+def _rollout(simulator: Simulator) -> Callable[[Floats], Trajectories]:
     start = simulator.start()
 
-    def rollout(controls: Floats) -> Outcome:
+    def rollout(controls: Floats) -> Trajectories:
         result, deflection = simulator.rollout_with_deflection(start, controls)
-        return Outcome(controls, *result, deflection)
+        return Trajectories(controls, *result, deflection)
 
     return rollout
 

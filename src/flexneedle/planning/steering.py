@@ -54,7 +54,7 @@ def steer(
         if rolls > 0 and min(one.cost for _, one in found) == before:
             break
     side, one = min(found, key=lambda pair: pair[1].cost)
-    short = max(0.0, problem.target[0] - float(one.outcome.tips[0, -1, 0]))
+    short = max(0.0, problem.target[0] - float(one.trajectories.tips[0, -1, 0]))
     longer = replace(problem, travel=min(problem.travel + short, float(problem.reach[0])))
     shown = _counted(progress, search, [one for _, one in found])
     variables = _variables(longer, side, np.sort(one.z), _NARROW)

@@ -1,4 +1,4 @@
-"""The terms of a cost, one function each: outcome of rollouts → (N,). A cost is a weighted sum of some of them.
+"""The terms of a cost, one function each: rollouts → (N,). A cost is a weighted sum of some of them.
 
 | term | unit | its weight's unit, for a cost in mm |
 |---|---|---|
@@ -31,8 +31,8 @@ PlanarPoint = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
-    """N sequences of m steps and their outcomes.
+class Trajectories:
+    """N sequences of m steps and where they lead.
 
     controls (N, m, 5): db_x, db_y, db_theta, dg_y (mm, rad), flip (−1 or +1); tips (N, m, 3): after each step, mm and
     rad; energy (N, m): strain energy of the tissue, mJ; converged (N, m); deflection (N, m): mean square of the
@@ -53,139 +53,141 @@ class Outcome:
 
     def __repr__(self) -> str:
         sequences, steps = self.energy.shape
-        return f"<Outcome {sequences} sequences of {steps} steps, {np.mean(self.converged):.0%} converged>"
+        return (
+            f"<Trajectories {sequences} sequences of {steps} steps, {np.mean(self.converged):.0%} converged>"
+        )
 
 
-RolloutFunction = Callable[[Floats], Outcome]
+RolloutFunction = Callable[[Floats], Trajectories]
 """Simulates controls (N, m, 5)."""
 
 
 @dataclass(frozen=True)
 class Term:
-    """A term of a cost: `weight` times `value` of an outcome, which is (N,)."""
+    """A term of a cost: `weight` times `value` of rollouts, which is (N,)."""
 
     name: str
     weight: float
-    value: Callable[[Outcome], Floats]
+    value: Callable[[Trajectories], Floats]
 
 
-def charges(terms: Sequence[Term], outcome: Outcome) -> dict[str, Floats]:
+def charges(terms: Sequence[Term], trajectories: Trajectories) -> dict[str, Floats]:
     """The weighted terms (N,) by name."""
-    return {term.name: term.weight * term.value(outcome) for term in terms}
+    return {term.name: term.weight * term.value(trajectories) for term in terms}
 
 
-def cost(terms: Sequence[Term], outcome: Outcome) -> Floats:
+def cost(terms: Sequence[Term], trajectories: Trajectories) -> Floats:
     """The sum (N,) of the weighted terms; infinite where the model did not converge."""
-    total: Floats = np.sum(list(charges(terms, outcome).values()), axis=0)
-    return np.where(outcome.converged.all(axis=1), total, np.inf)
+    total: Floats = np.sum(list(charges(terms, trajectories).values()), axis=0)
+    return np.where(trajectories.converged.all(axis=1), total, np.inf)
 
 
-def past(outcome: Outcome, target: PlanarPoint) -> Floats:
+def past(trajectories: Trajectories, target: PlanarPoint) -> Floats:
     """Signed lateral miss (mm, + in +y) at the target's depth, to which the tip's line is extended from the end."""
-    end = outcome.tips[:, -1]
+    end = trajectories.tips[:, -1]
     distance: Floats = end[:, 1] + np.tan(end[:, 2]) * (target[0] - end[:, 0]) - target[1]
     return distance
 
 
-def miss(outcome: Outcome, target: PlanarPoint, blur: float = 0.0) -> Floats:
+def miss(trajectories: Trajectories, target: PlanarPoint, blur: float = 0.0) -> Floats:
     """Lateral distance (mm) from the target at its depth, the size of `past`.
 
     blur (mm): uncertainty of the distance d, of which √(d² + blur²) − blur is charged.
     """
-    blurred: Floats = np.hypot(past(outcome, target), blur) - blur
+    blurred: Floats = np.hypot(past(trajectories, target), blur) - blur
     return blurred
 
 
-def large_miss(outcome: Outcome, target: PlanarPoint, blur: float, sd: float) -> Floats:
+def large_miss(trajectories: Trajectories, target: PlanarPoint, blur: float, sd: float) -> Floats:
     """The share d² / (d² + sd²) of the `miss` (mm): near 0 for a distance d far below its standard deviation sd (mm),
     near 1 far above it.
     """
-    square = past(outcome, target) ** 2
+    square = past(trajectories, target) ** 2
     least = np.finfo(float).tiny
     share = square / np.maximum(square + sd**2, least)
-    large: Floats = share * miss(outcome, target, blur)
+    large: Floats = share * miss(trajectories, target, blur)
     return large
 
 
-def energy_at_end(outcome: Outcome) -> Floats:
+def energy_at_end(trajectories: Trajectories) -> Floats:
     """Strain energy of the tissue after the last step (mJ)."""
-    return outcome.energy[:, -1]
+    return trajectories.energy[:, -1]
 
 
-def energy_of_steps(outcome: Outcome) -> Floats:
+def energy_of_steps(trajectories: Trajectories) -> Floats:
     """Strain energy of the tissue, summed over the steps (mJ)."""
-    total: Floats = outcome.energy.sum(axis=1)
+    total: Floats = trajectories.energy.sum(axis=1)
     return total
 
 
-def guide_slope(outcome: Outcome) -> Floats:
+def guide_slope(trajectories: Trajectories) -> Floats:
     """Mean square slope of the guide's path over the travel of the base: ∫(dg/db_x)² db_x / ∫db_x."""
-    advance = outcome.controls[:, :, 0]
+    advance = trajectories.controls[:, :, 0]
     squares = np.divide(
-        outcome.controls[:, :, 3] ** 2, advance, out=np.zeros_like(advance), where=advance > 0.0
+        trajectories.controls[:, :, 3] ** 2, advance, out=np.zeros_like(advance), where=advance > 0.0
     )
     slope: Floats = squares.sum(axis=1) / np.maximum(advance.sum(axis=1), np.finfo(float).tiny)
     return slope
 
 
-def rolls(outcome: Outcome, first: int = 0) -> Floats:
+def rolls(trajectories: Trajectories, first: int = 0) -> Floats:
     """Number of rolls of the bevel from step `first` on."""
-    count: Floats = (outcome.controls[:, first:, 4] > 0.0).sum(axis=1).astype(float)
+    count: Floats = (trajectories.controls[:, first:, 4] > 0.0).sum(axis=1).astype(float)
     return count
 
 
-def late_rolls(outcome: Outcome, depth: float, length: float) -> Floats:
+def late_rolls(trajectories: Trajectories, depth: float, length: float) -> Floats:
     """Sum over the rolls of the bevel of e^(−d/length), d the distance (mm) of the tip from the depth (mm) then."""
-    before = outcome.tips[:, :, 0] - outcome.controls[:, :, 0]
+    before = trajectories.tips[:, :, 0] - trajectories.controls[:, :, 0]
     near = np.exp(np.minimum(0.0, before - depth) / length)
-    sum_: Floats = (near * (outcome.controls[:, :, 4] > 0.0)).sum(axis=1)
+    sum_: Floats = (near * (trajectories.controls[:, :, 4] > 0.0)).sum(axis=1)
     return sum_
 
 
-def distance_from_line(outcome: Outcome, start: PlanarPoint, target: PlanarPoint) -> Floats:
+def distance_from_line(trajectories: Trajectories, start: PlanarPoint, target: PlanarPoint) -> Floats:
     """Mean lateral distance (mm) of the tip from the line between two points, over the advance in the tissue."""
-    x, y = outcome.tips[:, :, 0], outcome.tips[:, :, 1]
+    x, y = trajectories.tips[:, :, 0], trajectories.tips[:, :, 1]
     length = target[0] - start[0]
     slope = (target[1] - start[1]) / length if length != 0.0 else 0.0
     away = np.abs(y - start[1] - slope * (x - start[0]))
-    share = np.where(outcome.inside, outcome.controls[:, :, 0], 0.0)
+    share = np.where(trajectories.inside, trajectories.controls[:, :, 0], 0.0)
     mean: Floats = (away * share).sum(axis=1) / np.maximum(share.sum(axis=1), np.finfo(float).tiny)
     return mean
 
 
-def out_of_reach(outcome: Outcome, expected: Floats) -> Floats:
+def out_of_reach(trajectories: Trajectories, expected: Floats) -> Floats:
     """Expected distance (mm) of the target from the bevel's reach after the first step.
 
     expected (2,): with the bevel as it is, and with the bevel rolled before that step.
     """
-    value: Floats = expected[(outcome.controls[:, 0, 4] > 0.0).astype(int)]
+    value: Floats = expected[(trajectories.controls[:, 0, 4] > 0.0).astype(int)]
     return value
 
 
-def deflection(outcome: Outcome) -> Floats:
+def deflection(trajectories: Trajectories) -> Floats:
     """Mean square deflection of the needle (mm²), summed over the steps in the tissue (paper eq. 10)."""
-    total: Floats = (outcome.deflection * outcome.inside).sum(axis=1)
+    total: Floats = (trajectories.deflection * trajectories.inside).sum(axis=1)
     return total
 
 
-def guide_motion(outcome: Outcome) -> Floats:
+def guide_motion(trajectories: Trajectories) -> Floats:
     """Squared guide steps (mm²), summed over the steps in the tissue (paper eq. 10)."""
-    total: Floats = ((outcome.controls[:, :, 3] ** 2) * outcome.inside).sum(axis=1)
+    total: Floats = ((trajectories.controls[:, :, 3] ** 2) * trajectories.inside).sum(axis=1)
     return total
 
 
-def deviation(outcome: Outcome, reference: Floats, orientation: float) -> Floats:
+def deviation(trajectories: Trajectories, reference: Floats, orientation: float) -> Floats:
     """Squared SE(2) deviation (mm²) from poses (m, 3), summed over the steps (paper eq. 13).
 
     orientation: weight of the angle, as the distance (mm) that is equivalent to 1 rad.
     """
-    off = outcome.tips - reference
+    off = trajectories.tips - reference
     off[:, :, 2] *= orientation
     total: Floats = (off**2).sum(axis=(1, 2))
     return total
 
 
-def guide_departure(outcome: Outcome, nominal: Floats) -> Floats:
+def guide_departure(trajectories: Trajectories, nominal: Floats) -> Floats:
     """Squared differences (mm²) of the guide steps from `nominal` (m,), summed over the steps."""
-    total: Floats = ((outcome.controls[:, :, 3] - nominal) ** 2).sum(axis=1)
+    total: Floats = ((trajectories.controls[:, :, 3] - nominal) ** 2).sum(axis=1)
     return total

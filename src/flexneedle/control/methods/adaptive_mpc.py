@@ -29,7 +29,7 @@ from flexneedle.estimation.task import Task
 from flexneedle.planning import terms
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.horizon import Found, Variables, best
-from flexneedle.planning.terms import Outcome, Term
+from flexneedle.planning.terms import Term, Trajectories
 from flexneedle.scenario.sections.fields import NonNegative, count
 from flexneedle.types import Command, Floats
 
@@ -172,12 +172,12 @@ def _search(
     return best(variables, partial(_measured_rollout, fitted), charged, search, rng, first=first)
 
 
-def _measured_rollout(fitted: Identified, controls: Floats) -> Outcome:
-    """Outcome of controls (N, m, 5) on the fitted model; tips as a tracker without errors would measure them."""
+def _measured_rollout(fitted: Identified, controls: Floats) -> Trajectories:
+    """Trajectories of controls (N, m, 5) on the fitted model; tips as a tracker without errors would measure them."""
     tips, energy, converged = fitted.simulator.rollout(fitted.state, controls, limits=False)
     side = fitted.state.bevel * np.cumprod(-np.sign(controls[:, :, 4]), axis=1)
     tips[:, :, 1] += fitted.run_out * side + fitted.residual
-    return Outcome(controls, tips, energy, converged)
+    return Trajectories(controls, tips, energy, converged)
 
 
 def _terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tuple[Term, ...]:
@@ -216,10 +216,10 @@ def _out_of_reach(task: Task, fitted: Identified, ahead: Ahead, memory: Memory) 
     With the bevel alone, lost reach cannot be regained; with a guide, the bevel still moves the tip when the guide is
     far behind it.
     """
-    outcome = _measured_rollout(fitted, ahead.controls(ahead.constant)[0])
-    if not outcome.converged.all():
+    trajectories = _measured_rollout(fitted, ahead.controls(ahead.constant)[0])
+    if not trajectories.converged.all():
         return np.zeros(2)
-    past = terms.past(outcome, task.plan.target).reshape(2, 2)
+    past = terms.past(trajectories, task.plan.target).reshape(2, 2)
     low, high = past.min(axis=1), past.max(axis=1)
     middle = (memory.outlook or Outlook.of(fitted)).sd_now(fitted, task.plan.target[0])
     sd = np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
@@ -236,9 +236,9 @@ def _above_zero(mean: Floats, sd: Floats) -> Floats:
 
 def _forecast(task: Task, memory: Memory, fitted: Identified, found: Found) -> tuple[Outlook, float, float]:
     """Derivatives ahead of the tip, the predicted miss (mm, positive in +y) and its standard deviation (mm)."""
-    miss = float(terms.past(found.outcome, task.plan.target)[0])
+    miss = float(terms.past(found.trajectories, task.plan.target)[0])
     before = memory.outlook or Outlook.of(fitted)
-    outlook = before.renewed(fitted, found.outcome.controls[0], found.outcome.tips[0])
+    outlook = before.renewed(fitted, found.trajectories.controls[0], found.trajectories.tips[0])
     return outlook, miss, outlook.sd(fitted, task.plan.target[0], miss)
 
 
