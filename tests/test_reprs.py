@@ -10,7 +10,7 @@ import flexneedle
 from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.observer import StateCorrection
-from flexneedle.planning.terms import Outcome
+from flexneedle.planning.terms import Trajectories
 from flexneedle.rig.phantom.draw import draw
 from flexneedle.types import Frame, SensorReading
 from synthetic import make_insertion, make_plan
@@ -37,7 +37,7 @@ RECORDS = {
     "contacts": STATE.contacts,
     "rollout": ROLLOUT,
     "assimilation": SIMULATOR.assimilate(STATE, STATE.tip[:2]),
-    "outcome": Outcome(np.zeros((2, 3, 5)), *ROLLOUT),
+    "trajectories": Trajectories(np.zeros((2, 3, 5)), *ROLLOUT),
     "task": task_of(SIMULATOR, make_plan()),
     "estimate": StateCorrection().begin(begun_with(SIMULATOR)),
     "identification": Identification().begin(begun_with(SIMULATOR)),
@@ -76,8 +76,8 @@ def test_a_record_prints_as_one_short_line(name):
             "<State tip (-28.500, 0.000) mm, slope 0.00 mrad, guide 0.000 mm, bevel +1, 0 mJ in the tissue, "
             "converged>",
         ),
-        ("rollout", "<Rollout 2 sequences of 3 steps, 100% of the steps converged>"),
-        ("outcome", "<Outcome 2 sequences of 3 steps, 100% converged>"),
+        ("rollout", "<Rollout of 2 sequences of 3 steps, 100% of the steps converged>"),
+        ("trajectories", "<Trajectories of 2 sequences of 3 steps, 100% converged>"),
     ],
 )
 def test_the_line_has_what_matters_with_its_unit(name, line):

@@ -11,7 +11,7 @@ from flexneedle.rig.phantom.draw import draw
 from flexneedle.rig.phantom.plants import ModelPlant
 from flexneedle.scenario.worlds import world
 from flexneedle.study.reach import reach, straight_end
-from flexneedle.types import Insertion, Trajectories
+from flexneedle.types import Insertion, Outcome
 
 COARSE = {"phantom.step_mm": 1.0, "phantom.element_mm": 1.0, "phantom.contact_spacing_mm": 1.0}
 FREE = world(15, "perfect").with_values(COARSE)
@@ -61,8 +61,7 @@ def test_the_reach_is_that_of_the_phantom_which_the_insertion_of_the_seed_meets(
     monkeypatch.setattr("flexneedle.study.reach.draw", recorded)
     monkeypatch.setattr("flexneedle.rig.virtual.draw", recorded)
     monkeypatch.setattr(
-        "flexneedle.rig.loop.run",
-        lambda _scenario, plan, *_, **__: Insertion(plan, 5, (), Trajectories.DONE, ""),
+        "flexneedle.rig.loop.run", lambda _scenario, plan, *_, **__: Insertion(plan, 5, (), Outcome.DONE, "")
     )
     scenario = world(15).with_values(COARSE)
     reach(scenario, 5)

@@ -53,9 +53,8 @@ class Trajectories:
 
     def __repr__(self) -> str:
         sequences, steps = self.energy.shape
-        return (
-            f"<Trajectories {sequences} sequences of {steps} steps, {np.mean(self.converged):.0%} converged>"
-        )
+        share = f"{np.mean(self.converged):.0%} converged"
+        return f"<Trajectories of {sequences} sequences of {steps} steps, {share}>"
 
 
 RolloutFunction = Callable[[Floats], Trajectories]

@@ -40,7 +40,7 @@ class Rollout(NamedTuple):
     def __repr__(self) -> str:
         sequences, steps = self.strain_energy.shape
         share = f"{np.mean(self.converged):.0%} of the steps converged"
-        return f"<Rollout {sequences} sequences of {steps} steps, {share}>"
+        return f"<Rollout of {sequences} sequences of {steps} steps, {share}>"
 
 
 class Assimilation(NamedTuple):
