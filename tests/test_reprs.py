@@ -10,6 +10,7 @@ import flexneedle
 from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.observer import StateCorrection
+from flexneedle.mechanics import needle as nd
 from flexneedle.planning.terms import Trajectories
 from flexneedle.rig.phantom.draw import draw
 from flexneedle.types import Frame, SensorReading
@@ -82,6 +83,12 @@ def test_a_record_prints_as_one_short_line(name):
 )
 def test_the_line_has_what_matters_with_its_unit(name, line):
     assert repr(RECORDS[name]) == line
+
+
+def test_a_state_gives_the_slope_in_mrad():
+    scalars = STATE.scalars.copy()
+    scalars[nd.TIP_TURN] = 2e-3
+    assert "slope 2.00 mrad" in repr(replace(STATE, scalars=scalars))
 
 
 def test_a_period_names_time_action_tip_and_verdict():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import CubicHermiteSpline
 
 from flexneedle import Control, Simulator, load_scenario
 from flexneedle.mechanics import needle as nd
@@ -156,6 +157,22 @@ def test_a_needle_without_a_guide_has_no_clearance():
     none = bare.adapted(Adaptation(np.zeros(1), np.ones(2)))
     rows = np.tile([1.0, 0.0, 0.0, 0.0, -1.0], (60, 1))
     np.testing.assert_array_equal(wide.replay(bare.start(), rows)[1], none.replay(bare.start(), rows)[1])
+
+
+@pytest.mark.parametrize("base_y", [0.0, 0.4])
+def test_a_needle_that_touches_no_wall_bends_as_without_a_guide(base_y):
+    """Its lateral position in the guide is on the cubic between the neighbouring nodes of a needle without a guide."""
+    bare = Simulator(PHANTOM.with_values({"setup.guide_to_skin_mm": None}), threads=1)
+    free = loaded(5.0, 25, 0.0, base_y)[-1]
+    other = bare.step(bare.start().with_estimate(base_y=base_y), Control())
+    other = repeat(bare, other, Control(db_x=1.0), int(25 - PHANTOM.setup.start_tip_x))[-1]
+    np.testing.assert_allclose(free.tip, other.tip, atol=1e-9)
+    x, y, slope = other.mesh[:3]
+    shape = CubicHermiteSpline(
+        np.append(other.base[0], x), np.append(other.base[1], y), np.append(other.base[2], slope)
+    )
+    assert abs(off_centre(free)) > 0.01
+    assert off_centre(free) == pytest.approx(float(shape(GUIDE_X)), abs=1e-9)
 
 
 def test_rollouts_converge_and_equal_steps():

@@ -51,6 +51,15 @@ def test_states_compare_by_value(state):
     assert state.with_estimate() == state
 
 
+def test_a_correction_replaces_the_one_before():
+    """Position and slope of the base, and the origin of its travel: only the last correction counts."""
+    start = SIMULATOR.start()
+    last = {"base_x": -170.0, "base_y": 0.2, "base_turn": 1e-3}
+    twice = start.with_estimate(base_x=-171.0, base_y=-0.5, base_turn=-2e-3).with_estimate(**last)
+    np.testing.assert_allclose(twice.scalars, start.with_estimate(**last).scalars, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(twice.travel, 0.0, atol=1e-12)
+
+
 BITS = st.integers(0, 2**64 - 1)
 TROUBLE = [0.0, -0.0, np.nan, -np.nan, np.inf, -np.inf, 5e-324, 1.0]
 NUMBERS = st.sampled_from(TROUBLE) | BITS.map(lambda bits: float(np.uint64(bits).view(np.float64)))
