@@ -96,6 +96,18 @@ def test_the_sample_that_corrects_nothing_is_the_path_in_hand(quick_plan, along,
     np.testing.assert_allclose(again.controls(again.current[None])[0], controls, atol=1e-12)
 
 
+def test_corrections_of_the_guide_are_linear_between_the_knots(quick_plan):
+    """From none at the tip on; small enough that no limit is met."""
+    state = started(-10.0)
+    corrections = 0.4 * np.cos(np.arange(1.0, KNOTS.size + 1))
+    ahead = ahead_of(quick_plan, state, level())
+    z = np.concatenate([corrections, np.full(ahead.slots, ahead.unused)])
+    controls, depth = ahead.controls(z[None])
+    share = (depth[0] - depth[0, 0]) / (40.0 - depth[0, 0])
+    expected = np.interp(share, np.append(0.0, KNOTS), np.append(0.0, corrections))
+    np.testing.assert_allclose(np.cumsum(controls[0, :, 3]), expected[1:], atol=1e-12)
+
+
 def test_what_is_found_is_the_path_in_hand_of_the_next_period(quick_plan, along):
     """Any sample, made the current path, is the sample that corrects nothing."""
     state = along(quick_plan, 30)
