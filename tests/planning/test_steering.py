@@ -125,6 +125,7 @@ def test_progress_counts_through_all_searches_and_the_best_never_rises():
     assert [call["iteration"] for call in calls] == list(range(1, len(calls) + 1))
     assert (np.diff([call["best"] for call in calls]) <= 0.0).all()
     assert all(call["iteration"] <= call["iterations"] for call in calls)
+    assert calls[0]["iterations"] == 5 * SEARCH.iterations  # of the five searches that a plan usually takes
 
 
 def test_same_seed_same_bytes():
