@@ -3,6 +3,7 @@
 With a tracker that measures its field, a panel over time shows the indicators and the times of holds.
 """
 
+from collections.abc import Sequence
 from textwrap import shorten, wrap
 from typing import Any
 
@@ -12,32 +13,25 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from flexneedle.figures import curves, scene
-from flexneedle.figures.panels import Line, draw_panel, draw_timeline
+from flexneedle.figures.panels import Line, draw_panels, draw_timeline
 from flexneedle.figures.style import (
     BAD,
     ESTIMATE,
-    INK,
     MEASURED,
-    NEEDLE,
     PLAN,
     QUIET,
     TARGET,
     TRUE,
-    WIDTH,
-    axes,
-    new_figure,
     signed,
+    stacked,
     styled,
 )
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats, Insertion
 
-# Positions in inches from the top left.
-_LEFT, _RIGHT, _HEAD = 0.62, 0.15, 0.72
-_PANEL_WIDTH, _PANEL_HEIGHT, _PANEL_GAP = 4.55, 0.88, 0.3
-_CLOSE_UP = 2.6
-_FIELD_BELOW, _FIELD_WIDTH, _FIELD_HEIGHT = 0.72, 6.9, 1.0
-_CHARACTERS, _TITLE_LINE, _VERDICT_LINE = 88, 0.21, 0.19  # of a line of the head; heights in inches
+# Heights in inches: of labels and legend of the scene, of a line of its title, of the parts below.
+_LABELS, _LINE, _PANELS, _FIELD = 0.7, 0.18, 3.7, 1.5
+_CHARACTERS = 84  # of a line of the verdict
 _FAR = 6.0  # mm; further from the target, the close-up shows the tip instead
 
 
@@ -51,48 +45,30 @@ def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
         np.array([[*plan.target]]),
     ]
     window = scene.view_of(scenario, max(plan.target[0], float(known[1][:, 0].max())), known)
-    width = WIDTH - _LEFT - _RIGHT
-    title, ended = _title(scenario, insertion), wrap(insertion.summary, _CHARACTERS)
-    head = _HEAD + (len(title) - 1) * _TITLE_LINE + (len(ended) - 1) * _VERDICT_LINE
-    below = head + width * window.ratio + 0.98
     field = curves.worst_indicator(insertion, scenario.monitor.indicator_window_s)
-    foot = below + 3 * _PANEL_HEIGHT + 2 * _PANEL_GAP
+    verdict = wrap(insertion.summary, _CHARACTERS)
+    heights = [_LABELS + _LINE * len(verdict) + scene.AXES * window.ratio, _PANELS]
+    heights += [_FIELD] if len(field) else []
     with styled():
-        figure = new_figure(foot + (_FIELD_BELOW + _FIELD_HEIGHT if len(field) else 0.0) + 0.45)
-        _head(figure, title, ended, insertion)
-        _scene(axes(figure, _LEFT, head, width, width * window.ratio), scenario, insertion, window)
-        _legend(figure, below - 0.5, insertion)
-        _panels(figure, scenario, insertion, below)
-        if len(field):
-            ax = axes(figure, _LEFT, foot + _FIELD_BELOW, _FIELD_WIDTH, _FIELD_HEIGHT)
-            _field(ax, scenario, insertion, field)
-        _close_up(axes(figure, WIDTH - _RIGHT - _CLOSE_UP, below, _CLOSE_UP, _CLOSE_UP), scenario, insertion)
+        figure, (above, below, *last) = stacked(_title(scenario, insertion), heights)
+        ax = above.subplots()
+        color = TARGET if insertion.reached else BAD
+        ax.set_title("\n".join(verdict), fontsize=10, color=color, gid="verdict")
+        _scene(ax, scenario, insertion, window)
+        above.legend(handles=_handles(insertion), loc="outside lower center", ncols=8, columnspacing=1.3)
+        below.suptitle(_facts(insertion), fontsize=8.5, x=0.012, ha="left")
+        grid = below.add_gridspec(3, 2, width_ratios=(1.9, 1.0))
+        _panels([below.add_subplot(grid[k, 0]) for k in range(3)], scenario, insertion)
+        for part in last:
+            _field(part.subplots(), scenario, insertion, field)
+        _close_up(below.add_subplot(grid[:, 1]), scenario, insertion)
     return figure
 
 
-def _title(scenario: Scenario, insertion: Insertion) -> list[str]:
+def _title(scenario: Scenario, insertion: Insertion) -> str:
     depth, lateral = insertion.target
     name = shorten(scenario.name, 60, placeholder=" …")
-    return wrap(
-        f"{name}: target {signed(depth)} mm deep, {signed(lateral)} mm lateral (seed {insertion.seed})",
-        _CHARACTERS,
-    )
-
-
-def _head(figure: Figure, title: list[str], ended: list[str], insertion: Insertion) -> None:
-    height = float(figure.get_figheight())
-    left, second = 0.12 / WIDTH, 0.36 + (len(title) - 1) * _TITLE_LINE
-    figure.text(left, 1 - 0.1 / height, "\n".join(title), fontsize=11, weight="bold", va="top")
-    color = TARGET if insertion.reached else BAD
-    style: dict[str, Any] = {"fontsize": 10, "color": color, "weight": "bold", "va": "top", "gid": "verdict"}
-    figure.text(left, 1 - second / height, "\n".join(ended), **style)
-    position = (1 - _RIGHT / WIDTH, 1 - (second + 0.01) / height)
-    figure.text(*position, _counts(insertion), color=INK, va="top", ha="right")
-
-
-def _counts(insertion: Insertion) -> str:
-    plan = insertion.plan
-    return f"bevel rolls: {insertion.flips} (planned {plan.flips})"
+    return f"{name}: target {signed(depth)} mm deep, {signed(lateral)} mm lateral (seed {insertion.seed})"
 
 
 def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, window: scene.View) -> None:
@@ -124,20 +100,6 @@ def _paths(ax: Axes, insertion: Insertion, scale: float = 1.0) -> None:
     ax.plot(*estimated.T, ":", color=ESTIMATE, linewidth=1.5 * scale, zorder=4.5, label="estimated")
 
 
-def _legend(figure: Figure, top: float, insertion: Insertion) -> None:
-    """Legend of the lines and marks of the scene, in one row below it."""
-    handles = _handles(insertion)
-    figure.legend(
-        handles=handles,
-        loc="upper center",
-        bbox_to_anchor=(0.5, 1 - top / float(figure.get_figheight())),
-        ncols=len(handles),
-        columnspacing=1.3,
-        handlelength=1.8,
-        borderaxespad=0,
-    )
-
-
 def _handles(insertion: Insertion) -> list[Line2D]:
     planned, applied = scene.roll_style(PLAN, solid=False), scene.roll_style(ESTIMATE, solid=True)
     true, estimated = curves.true_path(insertion), curves.estimated_path(insertion)
@@ -154,7 +116,7 @@ def _handles(insertion: Insertion) -> list[Line2D]:
         (len(rolls_applied) > 0, {"marker": "^", "label": roll, **applied}),
     )
     return [
-        Line2D([], [], color=NEEDLE, alpha=0.75, linewidth=4.0, label="estimated needle"),
+        scene.needle_handle("estimated needle"),
         Line2D([], [], color=PLAN, linestyle="--", linewidth=1.1, label="planned path"),
         *(Line2D([], [], **how) for drawn, how in entries if drawn),
     ]
@@ -165,8 +127,8 @@ def _travels(path: Floats) -> bool:
     return len(path) > 0 and bool(np.ptp(path, axis=0).max() > 0.5)
 
 
-def _panels(figure: Figure, scenario: Scenario, insertion: Insertion, top: float) -> None:
-    """Draw the three panels over depth, the lowest with the axis."""
+def _panels(panels: Sequence[Axes], scenario: Scenario, insertion: Insertion) -> None:
+    """Draw the panels over depth, the lowest with the axis."""
     plan = insertion.plan
     span = (float(plan.tips[0, 0]), max(float(plan.tips[:, 0].max()), plan.target[0]))
     contents = (
@@ -174,11 +136,7 @@ def _panels(figure: Figure, scenario: Scenario, insertion: Insertion, top: float
         _motion(scenario, insertion),
         ("Energy stored in the tissue (mJ)", _energy_lines(insertion), 0.01),
     )
-    for k, (title, lines, least) in enumerate(contents):
-        ax = axes(figure, _LEFT, top + k * (_PANEL_HEIGHT + _PANEL_GAP), _PANEL_WIDTH, _PANEL_HEIGHT)
-        draw_panel(ax, scenario, title, lines, span, least)
-        ax.tick_params(labelbottom=k == len(contents) - 1)
-    ax.set_xlabel("depth of the tip (mm)", labelpad=1.0)
+    draw_panels(panels, scenario, contents, span)
 
 
 def _error_lines(insertion: Insertion) -> list[Line]:
@@ -247,7 +205,7 @@ def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion) -> None:
     for side in ("top", "right"):
         ax.spines[side].set_visible(True)
     ax.locator_params(nbins=5)
-    ax.set_xlabel("\n".join((*_errors(insertion), *_method(insertion))), labelpad=3.0)
+    ax.set_anchor("N")
 
 
 def _last_tip(insertion: Insertion) -> Floats:
@@ -256,12 +214,10 @@ def _last_tip(insertion: Insertion) -> Floats:
     return end
 
 
-def _errors(insertion: Insertion) -> list[str]:
+def _facts(insertion: Insertion) -> str:
+    """Errors, rolls, controller and phantom, as far as they are known, in one line."""
     values = (("true error", insertion.true_error_mm), ("tracker residual", insertion.residual_mm))
-    return [f"{name} {value:.3f} mm" for name, value in values if not np.isnan(value)]
-
-
-def _method(insertion: Insertion) -> list[str]:
-    """Controller and phantom, as far as they are known."""
+    errors = [f"{name} {value:.3f} mm" for name, value in values if not np.isnan(value)]
+    rolls = f"bevel rolls {insertion.flips} (planned {insertion.plan.flips})"
     phantom = f"{insertion.phantom} phantom" if insertion.phantom else ""
-    return [", ".join(filter(None, (insertion.controller, phantom)))]
+    return "   ".join(filter(None, (*errors, rolls, insertion.controller, phantom)))

@@ -29,6 +29,19 @@ class Line:
     marker: str = ""
 
 
+def draw_panels(
+    panels: Sequence[Axes],
+    scenario: Scenario,
+    contents: Sequence[tuple[str, Sequence[Line], float]],
+    span: tuple[float, float],
+) -> None:
+    """Draw panels one above the other over depth `span`: title, lines, and the least extent of the y axis of each."""
+    for ax, (title, lines, least) in zip(panels, contents, strict=True):
+        draw_panel(ax, scenario, title, lines, span, least)
+        ax.tick_params(labelbottom=ax is panels[-1])
+    panels[-1].set_xlabel("depth of the tip (mm)", labelpad=1.0)
+
+
 def draw_panel(
     ax: Axes, scenario: Scenario, title: str, lines: Sequence[Line], span: tuple[float, float], least: float
 ) -> None:
@@ -120,21 +133,14 @@ def _name_lines(ax: Axes, lines: Sequence[Line]) -> None:
 
 def spread_out(levels: Sequence[float], gap: float) -> list[float]:
     """Return the levels nearest to these with `gap` between neighbours, in the same order."""
+    from scipy.optimize import isotonic_regression
+
+    if len(levels) == 0:
+        return []
     order = np.argsort(levels, kind="stable")
     step = gap * np.arange(len(order))
-    # Less the gaps, the levels need only not fall: isotonic least squares.
-    pooled = _rising(np.asarray(levels, dtype=float)[order] - step) + step
+    # Less the gaps, the levels need only not fall.
+    pooled = isotonic_regression(np.asarray(levels, dtype=float)[order] - step).x + step
     moved = np.empty(len(order))
     moved[order] = pooled
     return [float(level) for level in moved]
-
-
-def _rising(values: Floats) -> Floats:
-    """Return the non-decreasing least-squares fit (k,) to values (pool adjacent violators)."""
-    blocks: list[tuple[float, int]] = []
-    for value in values.tolist():
-        blocks.append((value, 1))
-        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
-            (a, m), (b, n) = blocks[-2:]
-            blocks[-2:] = [((a * m + b * n) / (m + n), m + n)]
-    return np.concatenate([np.full(n, value) for value, n in blocks] or [np.empty(0)])

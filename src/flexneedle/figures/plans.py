@@ -2,14 +2,16 @@
 
 from collections.abc import Sequence
 from math import cos, degrees, isnan, sin
-from textwrap import fill, shorten
+from textwrap import shorten, wrap
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from flexneedle.figures import curves, scene
-from flexneedle.figures.panels import Line, draw_panel
+from flexneedle.figures.panels import Line, draw_panels
 from flexneedle.figures.style import (
     BAD,
     INK,
@@ -17,50 +19,37 @@ from flexneedle.figures.style import (
     QUIET,
     STRATEGIES,
     TARGET,
-    WIDTH,
-    axes,
-    new_figure,
     signed,
+    stacked,
     styled,
 )
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats, Plan
 
-# Positions in inches from the top left.
-_LEFT, _RIGHT, _HEAD, _BETWEEN = 0.62, 0.15, 0.66, 0.75
-_PANEL_WIDTH, _PANEL_HEIGHT, _PANEL_GAP = 4.2, 0.9, 0.3
-_BARS_WIDTH = 2.0
-_TITLE_CHARACTERS = 95
+# Heights in inches: of labels and legend of a scene, of a line of its title, of the panels.
+_LABELS, _LINE, _PANELS = 0.7, 0.18, 2.8
+_CHARACTERS = 95  # of a line of a title
 
 
 def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
     """Return the figure of one or more plans to the same target."""
-    target = plans[0].target
-    paths = [plan.tips for plan in plans]
-    window = scene.view_of(scenario, target[0], [*paths, np.array([[*target]])])
-    width = WIDTH - _LEFT - _RIGHT
-    each = width * window.ratio + _BETWEEN
-    below = _HEAD + len(plans) * each + 0.1
+    depth, lateral = plans[0].target
+    window = scene.view_of(scenario, depth, [*(plan.tips for plan in plans), np.array([[depth, lateral]])])
+    ends = [wrap(f"{plan.strategy}: {plan.summary} (cost {plan.cost:.2f})", _CHARACTERS) for plan in plans]
+    heights = [_LABELS + _LINE * len(end) + scene.AXES * window.ratio for end in ends]
     with styled():
-        figure = new_figure(below + 2 * _PANEL_HEIGHT + _PANEL_GAP + 0.5)
-        _head(figure, scenario, plans[0])
-        for k, plan in enumerate(plans):
-            ax = axes(figure, _LEFT, _HEAD + k * each, width, width * window.ratio)
-            _scene(ax, scenario, plan, window, STRATEGIES[k])
-        _panels(figure, scenario, plans, below)
-        _cost(
-            axes(figure, WIDTH - _RIGHT - _BARS_WIDTH, below, _BARS_WIDTH, 2 * _PANEL_HEIGHT + _PANEL_GAP),
-            plans,
-        )
+        name = shorten(scenario.name, 60, placeholder=" …")
+        goal = f"plan to {signed(depth)} mm deep, {signed(lateral)} mm lateral"
+        figure, (*scenes, below) = stacked(f"{name}: {goal} (seed {plans[0].seed})", [*heights, _PANELS])
+        for part, plan, end, color in zip(scenes, plans, ends, STRATEGIES, strict=False):
+            ax = part.subplots()
+            ax.set_title("\n".join(end), color=TARGET if plan.reached else BAD, fontsize=9.5)
+            _scene(ax, scenario, plan, window, color)
+            part.legend(handles=_handles(plan, color), loc="outside lower center", ncols=3)
+        grid = below.add_gridspec(2, 2, width_ratios=(2.1, 1.0))
+        _panels([below.add_subplot(grid[k, 0]) for k in range(2)], scenario, plans)
+        _cost(below.add_subplot(grid[:, 1]), plans)
     return figure
-
-
-def _head(figure: Figure, scenario: Scenario, plan: Plan) -> None:
-    depth, lateral = plan.target
-    name = shorten(scenario.name, 60, placeholder=" …")
-    title = f"{name}: plan to {signed(depth)} mm deep, {signed(lateral)} mm lateral (seed {plan.seed})"
-    height = float(figure.get_figheight())
-    figure.text(0.12 / WIDTH, 1 - 0.1 / height, title, fontsize=11, weight="bold", va="top")
 
 
 def _scene(ax: Axes, scenario: Scenario, plan: Plan, window: scene.View, color: str) -> None:
@@ -75,11 +64,16 @@ def _scene(ax: Axes, scenario: Scenario, plan: Plan, window: scene.View, color: 
     scene.name_bevel(ax, plan)
     scene.draw_rolls(ax, curves.planned_rolls(plan), PLAN, solid=False, label="bevel roll, planned")
     _entry(ax, plan)
-    ax.set_title(
-        fill(f"{plan.strategy}: {plan.summary} (cost {plan.cost:.2f})", _TITLE_CHARACTERS),
-        color=TARGET if plan.reached else BAD,
-        fontsize=9.5,
-    )
+
+
+def _handles(plan: Plan, color: str) -> list[Line2D]:
+    handles = [
+        scene.needle_handle("planned needle"),
+        Line2D([], [], ls="--", color=color, label="planned path"),
+    ]
+    roll: dict[str, Any] = {"marker": "^", "label": "bevel roll, planned"}
+    rolls = [Line2D([], [], **roll, **scene.roll_style(PLAN, solid=False))]
+    return handles + rolls if curves.planned_rolls(plan) else handles
 
 
 def _entry(ax: Axes, plan: Plan) -> None:
@@ -109,14 +103,10 @@ def _entry(ax: Axes, plan: Plan) -> None:
     )
 
 
-def _panels(figure: Figure, scenario: Scenario, plans: Sequence[Plan], top: float) -> None:
+def _panels(panels: Sequence[Axes], scenario: Scenario, plans: Sequence[Plan]) -> None:
     span = (float(plans[0].tips[0, 0]), max(float(plan.tips[:, 0].max()) for plan in plans))
-    contents = ((*_motion(scenario, plans), 0.4), ("Energy stored in the tissue (mJ)", _energy(plans), 0.01))
-    for k, (title, lines, least) in enumerate(contents):
-        ax = axes(figure, _LEFT, top + k * (_PANEL_HEIGHT + _PANEL_GAP), _PANEL_WIDTH, _PANEL_HEIGHT)
-        draw_panel(ax, scenario, title, lines, span, least)
-        ax.tick_params(labelbottom=k == len(contents) - 1)
-    ax.set_xlabel("depth of the tip (mm)", labelpad=1.0)
+    energy = ("Energy stored in the tissue (mJ)", _energy(plans), 0.01)
+    draw_panels(panels, scenario, ((*_motion(scenario, plans), 0.4), energy), span)
 
 
 def _motion(scenario: Scenario, plans: Sequence[Plan]) -> tuple[str, list[Line]]:

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Polygon, Rectangle
 
 from flexneedle.figures.curves import Roll
 from flexneedle.figures.style import GUIDE, NEEDLE, QUIET, TARGET
@@ -18,6 +19,7 @@ _AIR = "#ffffff"
 _TISSUES = ("#fbeee3", "#f3dcc8", "#e9c9ad", "#deb592")  # soft to stiff
 _OPENING, _BLOCK, _WIDE = 0.7, 2.2, 1.1  # half opening, length and half width of the guide's jaws (mm)
 _CHARACTER = 0.062  # width of a character of 8 points (inches)
+AXES = 8.2  # width of the axes of a scene, about (inches)
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ def draw_tissue(ax: Axes, scenario: Scenario, view: View) -> None:
     """Set up axes to scale with air, skin and named layers."""
     ax.set_xlim(view.left, view.right)
     ax.set_ylim(view.low, view.high)
-    ax.set_aspect("equal")
+    ax.set_aspect("equal", anchor="N")
     ax.set_xlabel("depth (mm)", labelpad=1.0)
     ax.set_ylabel("lateral (mm)")
     tint_layers(ax, scenario, view.right)
@@ -58,7 +60,7 @@ def draw_tissue(ax: Axes, scenario: Scenario, view: View) -> None:
     foot = view.low + 0.5
     ax.text(view.left + 1.0, foot, "air", color=QUIET, fontsize=8)
     ax.text(-0.7, view.high - 0.4, "skin", color="#8c5a36", fontsize=8, ha="right", va="top")
-    inches = _points_per_mm(ax) / 72.0
+    inches = AXES / (view.right - view.left)
     for layer, top, bottom in _layers(scenario, view.right):
         _name_layer(ax, layer, top, (bottom - top) * inches, foot)
 
@@ -105,17 +107,24 @@ def draw_guide(ax: Axes, x: float, travel: Floats, y: float) -> None:
 
 def draw_needle(ax: Axes, shape: Floats, before: Sequence[Floats], diameter: float) -> None:
     """Draw the needle (n, 3) to scale, and faded its earlier shapes."""
-    width = diameter * _points_per_mm(ax)
-    faded: dict[str, Any] = {"color": NEEDLE, "alpha": 0.45, "linewidth": 0.4 * width, "zorder": 2}
+    faded: dict[str, Any] = {"facecolor": NEEDLE, "edgecolor": "none", "alpha": 0.45, "zorder": 2}
     for old in before:
-        ax.plot(old[:, 0], old[:, 1], label="needle before", **faded)
-        ax.plot(*old[-1, :2], marker="o", markersize=0.9 * width, markeredgewidth=0.0, **faded)
-    ax.plot(shape[:, 0], shape[:, 1], color=NEEDLE, alpha=0.75, linewidth=width, zorder=2.5, label="needle")
+        ax.add_patch(Polygon(outline(old, 0.4 * diameter), label="needle before", **faded))
+        ax.add_patch(Circle((old[-1, 0], old[-1, 1]), 0.45 * diameter, **faded))
+    drawn: dict[str, Any] = {**faded, "alpha": 0.75, "zorder": 2.5}
+    ax.add_patch(Polygon(outline(shape, diameter), label="needle", **drawn))
 
 
-def _points_per_mm(ax: Axes) -> float:
-    left, right = ax.get_xlim()
-    return 72.0 * float(ax.bbox.width) / float(ax.figure.dpi) / (right - left)
+def needle_handle(name: str) -> Line2D:
+    """Return the entry of the needle in a legend."""
+    return Line2D([], [], color=NEEDLE, alpha=0.75, linewidth=4.0, label=name)
+
+
+def outline(shape: Floats, width: float) -> Floats:
+    """Return the outline (2n, 2) of a needle of shape (n, 3): x, y (mm), slope (rad)."""
+    across = 0.5 * width * np.column_stack([-np.sin(shape[:, 2]), np.cos(shape[:, 2])])
+    edges: Floats = np.concatenate([shape[:, :2] + across, (shape[:, :2] - across)[::-1]])
+    return edges
 
 
 def draw_target(ax: Axes, target: tuple[float, float]) -> None:

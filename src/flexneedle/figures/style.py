@@ -1,16 +1,17 @@
 """Style and saving of all figures: the same bytes for the same data, whatever the user's settings."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import matplotlib
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
+_CHARACTERS = 88  # of a line of a title
 WIDTH = 9.0  # inches; shown 900 pixels wide, a point is 1.4 pixels
 
 # Okabe and Ito's colours, which the colour-blind can distinguish, each with its own line style or marker.
@@ -55,6 +56,14 @@ def signed(value: float, form: str = "g") -> str:
     return f"{value:{form}}".replace("-", "−")
 
 
+def stacked(title: str, heights: Sequence[float]) -> tuple[Figure, list[SubFigure]]:
+    """Return a figure with a title and parts of these heights (inches) below one another."""
+    lines = wrap(title, _CHARACTERS)
+    figure = new_figure(sum(heights) + 0.1 + 0.2 * len(lines))
+    figure.suptitle("\n".join(lines), x=0.012, ha="left", fontsize=11, weight="bold")
+    return figure, list(figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0])
+
+
 @contextmanager
 def styled() -> Iterator[None]:
     """Use this module's style inside the block, not the user's matplotlibrc."""
@@ -65,19 +74,10 @@ def styled() -> Iterator[None]:
 
 
 def new_figure(height: float) -> Figure:
-    """Return an empty figure of this height (inches)."""
-    figure = Figure(figsize=(WIDTH, height))
+    """Return an empty figure of this height (inches), whose layout makes room for every text."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
-
-
-def axes(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
-    """Add axes to a figure, placed in inches from its top left corner."""
-    total = float(figure.get_figheight())
-    added: Axes = figure.add_axes(
-        (left / WIDTH, (total - top - height) / total, width / WIDTH, height / total)
-    )
-    return added
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
