@@ -10,11 +10,12 @@ from matplotlib.legend import Legend
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.text import Text
 
+from flexneedle.figures import scene
 from flexneedle.figures.curves import held_spans, worst_indicator
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.panels import spread_out
 from flexneedle.figures.plans import plan_figure
-from flexneedle.figures.style import save
+from flexneedle.figures.style import new_figure, save, styled
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.trace.columns import verdict_of
@@ -219,6 +220,16 @@ CASES = {
 @pytest.mark.parametrize("make", CASES.values(), ids=CASES)
 def test_no_labels_overlap_or_are_cut(make):
     assert overlapping(insertion_figure(PHANTOM, make())) == []
+
+
+def test_the_bevels_name_is_off_those_of_the_layers_where_the_tip_starts_near_the_skin():
+    plan = make_plan()
+    with styled():
+        figure = new_figure(3.0)
+        ax = figure.subplots()
+        scene.draw_tissue(ax, PHANTOM, scene.view_of(PHANTOM, 40.0, [plan.tips]))
+        scene.name_bevel(ax, replace(plan, tips=plan.tips[plan.tips[:, 0] > -3.0]))
+    assert overlapping(figure) == []
 
 
 def test_no_labels_overlap_in_a_scenario_with_a_long_name(insertion):

@@ -143,8 +143,8 @@ def name_target(ax: Axes, target: tuple[float, float]) -> None:
 
 
 def name_bevel(ax: Axes, plan: Plan) -> None:
-    """Show below the start of the tip the side of the bevel at the start."""
-    x, foot = float(plan.tips[0, 0]), ax.get_ylim()[0] + 0.5
+    """Show below the start of the tip the side of the bevel at the start, above the names of the layers."""
+    x, foot = float(plan.tips[0, 0]), ax.get_ylim()[0] + 2.4
     marker = "^" if plan.bevel > 0 else "v"
     ax.plot(x, foot + 0.6, marker=marker, markersize=5, color=QUIET, label="bevel at the start")
     ax.text(x + 1.0, foot, "bevel at the start", color=QUIET, fontsize=8)
