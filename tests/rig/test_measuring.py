@@ -188,6 +188,27 @@ def test_a_newest_frame_without_the_tip_keeps_the_good_readings_of_the_period():
     assert (str(alone.verdict), alone.estimate.heard, alone.sample.time) == (OK, None, 1.0)
 
 
+class Refitted(Belief):
+    """A needle at rest whose first correction shifts the tip by 1 mm."""
+
+    tip_sd = 1.0
+
+    def tip_at(self, _time):
+        return TIP[0] + (1.0 if self.heard else 0.0), TIP[1]
+
+    def observe(self, samples):
+        return Refitted(self.heard + len(samples))
+
+
+def test_a_refit_of_a_needle_at_rest_does_not_make_a_tracker_without_noise_a_frozen_one():
+    estimate, watch = Refitted(), Watch(SCENARIO.monitor)
+    for k in range(8):
+        sight = see(SCENARIO, estimate, watch, k / RATE - 0.2, k / RATE, Eye(Measurement(k / RATE, *TIP)))
+        assert str(sight.verdict) == OK
+        estimate, watch = sight.estimate, sight.watch
+    assert estimate.heard == 8
+
+
 def test_a_broken_last_reading_is_the_verdict_and_earlier_good_ones_are_not_told_as_seen():
     watch = before(1.0, *second()).watch
     jumped = replace(sample(1.05), y=TIP[1] + 3.0)

@@ -125,6 +125,6 @@ def _judged(
     readings = []
     limit = scenario.control.innovation_limit_mm + _SURE * predicted.tip_sd
     for sample, age in zip(samples, ages, strict=True):
-        watch, verdict = watch.take(sample, predicted.tip_at(sample.time), now, age, limit)
+        watch, verdict = watch.take(sample, predicted.tip_at, now, age, limit)
         readings.append(CheckedMeasurement(sample, verdict))
     return watch, tuple(readings)

@@ -146,7 +146,7 @@ def test_a_field_that_was_distorted_stays_so_as_long_as_a_held_insertion_waits()
     assert len(views) == len(seen)
     for frame, view in zip(seen, views, strict=True):
         monitor, _ = monitor.take(
-            Measurement(frame.time, 0.0, 0.0, 0.0, frame), (0.0, 0.0), frame.time, 1.0, 1000.0
+            Measurement(frame.time, 0.0, 0.0, 0.0, frame), lambda _: (0.0, 0.0), frame.time, 1.0, 1000.0
         )
         monitor, held = monitor.look()
         unseen = frame.readings["tip"].status != VISIBLE

@@ -154,3 +154,18 @@ def test_a_bad_reading_at_the_target_depth_does_not_count_as_arrival(plan, real)
     assert len(held.periods) == len(done.periods) + 1
     assert held.outcome == "done"
     assert held.periods[-1].command == STILL
+
+
+@pytest.mark.parametrize("begin", [2.0, 8.0])  # in air, in tissue
+def test_a_frozen_sensor_holds_the_driven_needle_within_a_period(plan, begin):
+    frozen_at = []
+
+    def spoil(batch):
+        frozen_at.extend(sample for sample in batch if sample.time >= begin)
+        return tuple(replace(s, x=frozen_at[0].x, y=frozen_at[0].y) if s.time >= begin else s for s in batch)
+
+    done = run(plan, Tank(plan.bevel, spoil=spoil).rig())
+    first = next(period for period in done.periods if str(period.verdict) != "ok")
+    assert done.outcome == "held"
+    assert str(first.verdict).startswith("frozen: the same in")
+    assert begin < first.time < begin + 0.4

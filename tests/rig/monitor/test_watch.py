@@ -25,22 +25,31 @@ def frame(time, indicators=(0.02, 0.02, 0.02), tip=(1.0, 2.0, 3.0)):
     return Frame(time, round(time * RATE), readings)
 
 
+def at_rest(_time):
+    return 30.0, 1.0
+
+
+def driven(speed):
+    """The predicted tip (mm) of a needle that is inserted at `speed` (mm/s) from time 0 on."""
+    return lambda time: (30.0 + speed * time, 1.0)
+
+
 def told(watch, indicators, begin, count):
     """The watch after `count` readings at rest, and its verdict on the field after each, as text."""
     verdicts = []
     for k in range(count):
         time = begin + k / RATE
         sample = Measurement(time, 30.0 + 1e-6 * k, 1.0, 0.0, frame(time, indicators))
-        watch, verdict = watch.take(sample, (30.0, 1.0), time, 0.3, 2.0)
+        watch, verdict = watch.take(sample, at_rest, time, 0.3, 2.0)
         assert verdict.ok
         watch, field = watch.look()
         verdicts.append(str(field))
     return watch, verdicts
 
 
-def one(sample, watch=None, now=None, predicted=(30.0, 1.0)):
+def one(sample, watch=None, now=None):
     watch = watch or Watch(SETTINGS)
-    return str(watch.take(sample, predicted, sample.time if now is None else now, 0.3, 2.0)[1])
+    return str(watch.take(sample, at_rest, sample.time if now is None else now, 0.3, 2.0)[1])
 
 
 def test_a_clean_field_lets_the_needle_move_once_half_a_window_of_it_was_seen():
@@ -94,7 +103,7 @@ def test_references_out_of_volume_are_not_seen_whatever_they_tell():
         told_by = Frame(
             k / RATE, k, {"tip": SensorReading((1.0, 2.0, 3.0)), "ref1": ill, "ref2": ill, "ref3": ill}
         )
-        watch, _ = watch.take(Measurement(k / RATE, 30.0, 1.0, 0.0, told_by), (30.0, 1.0), k / RATE, 0.3, 2.0)
+        watch, _ = watch.take(Measurement(k / RATE, 30.0, 1.0, 0.0, told_by), at_rest, k / RATE, 0.3, 2.0)
     assert str(watch.look()[1]) == (
         "field not known: 0 of 3 reference sensors seen within 1 s "
         "(ref1: out of volume, ref2: out of volume, ref3: out of volume)"
@@ -114,9 +123,7 @@ def test_no_other_sensor_stands_in_for_a_reference_but_each_may_tell_of_distorti
                 "ref3": ref3,
             }
             told_by = Frame(k / RATE, k, readings | {"tip.2": replace(place, indicator=other)})
-            watch, _ = watch.take(
-                Measurement(k / RATE, 30.0, 1.0, 0.0, told_by), (30.0, 1.0), k / RATE, 0.3, 2.0
-            )
+            watch, _ = watch.take(Measurement(k / RATE, 30.0, 1.0, 0.0, told_by), at_rest, k / RATE, 0.3, 2.0)
         return str(watch.look()[1])
 
     seen, lost = SensorReading((0.0, 0.0, 0.0), indicator=0.01), SensorReading(None, status="out of volume")
@@ -142,7 +149,7 @@ def still(places, step, settings=SETTINGS):
     watch = Watch(settings)
     for k, x in enumerate(places):
         sample = Measurement(k / RATE, x, None if x is None else 1.0)
-        watch, verdict = watch.take(sample, (30.0 + step * k, 1.0), k / RATE, 0.3, 1e9)
+        watch, verdict = watch.take(sample, driven(step * RATE), k / RATE, 0.3, 1e9)
     return str(verdict)
 
 
@@ -212,7 +219,7 @@ def test_as_many_references_are_needed_as_the_scenario_says():
 
 
 def test_a_tracker_that_tells_only_the_tip_is_not_held_against():
-    watch, verdict = Watch(SETTINGS).take(Measurement(0.0, 30.0, 1.0), (30.0, 1.0), 0.0, 0.3, 2.0)
+    watch, verdict = Watch(SETTINGS).take(Measurement(0.0, 30.0, 1.0), at_rest, 0.0, 0.3, 2.0)
     assert verdict.ok
     assert watch.look()[1].ok
 
@@ -237,7 +244,7 @@ def test_each_fault_of_a_reading_is_named(sample, verdict):
 def test_a_frame_told_again_is_not_believed_and_not_remembered():
     watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
     again = Measurement(0.075, 30.0, 1.0, 0.0, frame(2 / RATE))
-    after, verdict = watch.take(again, (30.0, 1.0), 0.075, 0.3, 2.0)
+    after, verdict = watch.take(again, at_rest, 0.075, 0.3, 2.0)
     assert str(verdict) == "stale: frame 2 after frame 2"
     assert after is watch
 
@@ -247,9 +254,9 @@ def test_an_old_reading_is_stale():
 
 
 def test_a_jump_counts_from_the_last_good_reading():
-    watch, _ = Watch(SETTINGS).take(Measurement(1.0, 30.0, 1.0), (30.0, 1.0), 1.0, 0.3, 2.0)
+    watch, _ = Watch(SETTINGS).take(Measurement(1.0, 30.0, 1.0), at_rest, 1.0, 0.3, 2.0)
     far = Measurement(1.025, 31.9, 1.0)
-    watch, verdict = watch.take(far, (30.0, 1.0), 1.025, 0.3, 2.0)
+    watch, verdict = watch.take(far, at_rest, 1.025, 0.3, 2.0)
     assert str(verdict) == "jump: 1.90 mm, limit 1.50 mm"
     assert watch.good == Measurement(1.0, 30.0, 1.0)
     assert one(Measurement(1.05, 31.9, 1.0), watch) == OK  # so far it may have come by now
@@ -261,15 +268,41 @@ def test_a_frozen_sensor_is_seen_although_the_map_to_the_tip_changes():
     watch = Watch(SETTINGS)
     for k in range(4):
         sample = Measurement(k / RATE, 30.0 + 0.01 * k, 1.0, 0.0, frame(k / RATE))
-        watch, verdict = watch.take(sample, (30.0 + 0.125 * k, 1.0), sample.time, 0.3, 2.0)
+        watch, verdict = watch.take(sample, driven(0.125 * RATE), sample.time, 0.3, 2.0)
     assert str(verdict) == "frozen: the same in 4 readings while the tip should have moved 0.38 mm"
+
+
+def watched(estimates):
+    """The verdict on the last of identical readings, one for each predicted tip (a function of time)."""
+    watch = Watch(SETTINGS)
+    for k, tip_at in enumerate(estimates):
+        sample = Measurement(k / RATE, 30.0, 1.0)
+        watch, verdict = watch.take(sample, tip_at, sample.time, 0.3, 1e9)
+    return str(verdict)
+
+
+@pytest.mark.parametrize("shift", [1.0, -1.0])
+def test_a_correction_of_the_estimate_of_a_needle_at_rest_is_no_motion(shift):
+    assert watched([at_rest] * 4 + [lambda _: (30.0 + shift, 1.0)] * 4) == OK
+
+
+def test_corrections_do_not_hide_the_motion_of_a_driven_needle():
+    """3.9 mm/s: 0.0975 mm between two readings, after each of which the estimate is corrected to the reading."""
+
+    def after(k):
+        return lambda time: (30.0 + 3.9 * (time - k / RATE), 1.0)
+
+    assert watched(after(k) for k in range(4)) == OK
+    assert watched(after(k) for k in range(5)) == (
+        "frozen: the same in 5 readings while the tip should have moved 0.39 mm"
+    )
 
 
 @pytest.mark.parametrize("time", [1e6, -50.0, float("nan")])
 def test_a_reading_of_another_time_changes_no_judgement_of_the_field(time):
     watch, _ = told(Watch(SETTINGS), (0.2, 0.02, 0.02), 0.0, 40)
     sample = Measurement(time, 30.0, 1.0, 0.0, replace(frame(1.0, (0.01, 0.01, 0.01)), number=1000))
-    after, verdict = watch.take(sample, (30.0, 1.0), 1.0, 0.3, 2.0)
+    after, verdict = watch.take(sample, at_rest, 1.0, 0.3, 2.0)
     assert str(verdict).startswith(("stale", "not a number"))
     assert after is watch
     assert str(after.look()[1]).startswith("field distorted")
@@ -279,7 +312,7 @@ def test_the_last_good_reading_counts_until_it_is_old_and_only_of_frames():
     watch, _ = told(Watch(SETTINGS), (0.02, 0.02, 0.02), 0.0, 3)
     assert watch.last_good(0.35, 0.3) == watch.good
     assert watch.last_good(0.36, 0.3) is None
-    bare, _ = Watch(SETTINGS).take(Measurement(0.0, 30.0, 1.0), (30.0, 1.0), 0.0, 0.3, 2.0)
+    bare, _ = Watch(SETTINGS).take(Measurement(0.0, 30.0, 1.0), at_rest, 0.0, 0.3, 2.0)
     assert bare.last_good(0.0, 0.3) is None
 
 

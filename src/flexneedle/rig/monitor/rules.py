@@ -88,12 +88,8 @@ def jump(sample: Measurement, before: Measurement | None, speed: float, margin: 
     return Verdict(VerdictKind.JUMP, f"{moved:.2f} mm, limit {limit:.2f} mm")
 
 
-def frozen(count: int, first: tuple[float, float], now: tuple[float, float], travel_limit: float) -> Verdict:
-    """A reading the same to the last digit, `count` times, while the model's tip travelled over `travel_limit` (mm).
-
-    first, now: the model's tip (mm) at the first of these readings and at the newest.
-    """
-    travel = math.dist(first, now)
+def frozen(count: int, travel: float, travel_limit: float) -> Verdict:
+    """`count` identical readings while the predicted tip travelled by `travel`, more than `travel_limit` (mm)."""
     if travel <= travel_limit:
         return OK
     reason = f"the same in {count} readings while the tip should have moved {travel:.2f} mm"

@@ -1,6 +1,7 @@
 """The watch over the tracker: what it remembers of past readings, and whether it lets the needle move."""
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from statistics import median
@@ -56,37 +57,51 @@ def _indicators(frames: Sequence[Frame]) -> dict[str, list[float]]:
     return {name: values for name, values in told.items() if 2 * len(values) >= len(frames)}
 
 
+TipAt = Callable[[float], tuple[float, float]]
+"""Predicted position of the tip (mm) at a time (s)."""
+
+
 @dataclass(frozen=True)
-class _Seen:
-    sample: Measurement
-    predicted: tuple[float, float]
+class _Repeats:
+    """Successive readings with the same position: their number, the time of the newest (s), and the predicted travel of
+    the tip since the first (mm)."""
+
+    position: rules.Place
+    time: float
+    count: int = 1
+    travel: float = 0.0
+
+    def then(self, time: float, tip_at: TipAt) -> "_Repeats":
+        """One more reading. Both ends of its travel are of one estimate: a correction of that is no motion."""
+        travel = self.travel + math.dist(tip_at(self.time), tip_at(time))
+        return _Repeats(self.position, time, self.count + 1, travel)
 
 
 @dataclass(frozen=True)
 class Watch:
     """What the monitor remembers. Frozen: `take` and `look` return the next one.
 
-    recent: readings within the window; still: the first and the number of those at the newest one's place;
+    recent: readings within the window; repeats: the newest ones with the same position;
     good: the last one without fault; field: the last verdict on the field; distorted: whether it was since it was last
     known good.
     """
 
     settings: MonitorSettings
-    recent: tuple[_Seen, ...] = ()
-    still: tuple[_Seen, int] | None = None
+    recent: tuple[Measurement, ...] = ()
+    repeats: _Repeats | None = None
     good: Measurement | None = None
     field: Verdict = OK
     distorted: bool = False
 
     def take(
-        self, sample: Measurement, predicted: tuple[float, float], now: float, oldest: float, furthest: float
+        self, sample: Measurement, tip_at: TipAt, now: float, oldest: float, furthest: float
     ) -> "tuple[Watch, Verdict]":
         """Take in a reading; return what is wrong with it, or OK. One of another time is not remembered.
 
-        predicted: the model's tip (mm) at its time; now (s); oldest: age (s), furthest: distance (mm) from the
+        tip_at: of the present estimate; now (s); oldest: age (s), furthest: distance (mm) from the
         prediction beyond which no reading is believed.
         """
-        before = self.recent[-1].sample.frame if self.recent else None
+        before = self.recent[-1].frame if self.recent else None
         verdict = rules.first_bad(
             (
                 rules.not_a_number(sample),
@@ -97,15 +112,14 @@ class Watch:
         if not verdict.ok:
             return self, verdict
         since = sample.time - self.settings.indicator_window_s + 1e-9
-        kept = tuple(seen for seen in self.recent if seen.sample.time > since)
-        seen = _Seen(sample, predicted)
-        watch = replace(self, recent=(*kept, seen), still=self._still(seen))
-        verdict = rules.first_bad(watch._faults(sample, predicted, furthest))
+        kept = tuple(one for one in self.recent if one.time > since)
+        watch = replace(self, recent=(*kept, sample), repeats=self._repeated(sample, tip_at))
+        verdict = rules.first_bad(watch._faults(sample, tip_at(sample.time), furthest))
         return (replace(watch, good=sample) if verdict.ok else watch), verdict
 
     def heard(self, now: float, oldest: float) -> bool:
         """Whether the tracker told anything, good or not, that is not older than `oldest` (s)."""
-        return bool(self.recent) and now - self.recent[-1].sample.time <= oldest + 1e-9
+        return bool(self.recent) and now - self.recent[-1].time <= oldest + 1e-9
 
     def last_good(self, now: float, oldest: float) -> Measurement | None:
         """Return the last good reading, if it is not older than `oldest` (s) and of a tracker that tells frames."""
@@ -147,7 +161,7 @@ class Watch:
         return rules.doubtful(_indicators(_within(frames, window)), settings.indicator_limit, window)
 
     def _frames(self) -> list[Frame]:
-        return [seen.sample.frame for seen in self.recent if seen.sample.frame is not None]
+        return [sample.frame for sample in self.recent if sample.frame is not None]
 
     def _faults(
         self, sample: Measurement, predicted: tuple[float, float], furthest: float
@@ -159,17 +173,17 @@ class Watch:
         if settings.enabled:
             yield rules.out_of_plane(sample.z, settings.out_of_plane_limit_mm)
             yield rules.jump(sample, self.good, settings.speed_limit_mm_s, settings.jump_margin_mm)
-            if self.still is not None:
-                first, count = self.still
-                yield rules.frozen(count, first.predicted, predicted, settings.frozen_travel_mm)
+            if self.repeats is not None:
+                yield rules.frozen(self.repeats.count, self.repeats.travel, settings.frozen_travel_mm)
 
-    def _still(self, newest: _Seen) -> tuple[_Seen, int] | None:
-        """Return the first and the number of readings at the newest one's place, those without a tip left out."""
-        place = self._place(newest.sample)
-        if place is None or self.still is None:
-            return self.still if place is None else (newest, 1)
-        first, count = self.still
-        return (first, count + 1) if self._place(first.sample) == place else (newest, 1)
+    def _repeated(self, newest: Measurement, tip_at: TipAt) -> _Repeats | None:
+        """Return the readings with the newest one's position; a reading without a tip changes nothing."""
+        position = self._place(newest)
+        if position is None:
+            return self.repeats
+        if self.repeats is None or self.repeats.position != position:
+            return _Repeats(position, newest.time)
+        return self.repeats.then(newest.time, tip_at)
 
     def _place(self, sample: Measurement) -> rules.Place | None:
         """What the tracker itself said of the tip: a map to the stage or an offset makes no frozen sensor move."""
