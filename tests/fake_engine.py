@@ -40,7 +40,7 @@ def insert(
     """Insert as `flexneedle.insert` does; stop: after so many periods, call that."""
     del tracker  # nothing is measured
     if not (plan.reached or force or METHODS[controller].predicts):
-        raise RunError(f"plan misses the target by {plan.error_mm:.2f} mm, bound by {plan.limit}")
+        raise RunError(f"plan misses the target by {plan.error_mm:.2f} mm, limited by {plan.limit}")
     periods = []
     for period in make_periods(plan, miss, seed):
         periods.append(period)

@@ -18,7 +18,7 @@ from flexneedle.types import VISIBLE, Measurement
 PHANTOM = flexneedle.load_scenario("phantom")
 STILL = (0.0, 0.0, 0.0, 0.0, -1)
 READING = PHANTOM.tracker.period
-HELD, RESTING = "held", "at rest for the last reading"
+HELD, RESTING = "held", "waiting for the last reading"
 
 
 class Tank:

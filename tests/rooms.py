@@ -30,7 +30,7 @@ def shipped(name: str) -> Environment:
     return found
 
 
-class Watch:
+class ManualClock:
     """A clock that a test sets."""
 
     def __init__(self) -> None:

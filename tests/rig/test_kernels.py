@@ -1,4 +1,4 @@
-"""The kernels: compiled before anything is timed, and none later."""
+"""The kernels are compiled ahead of their first call, and never later."""
 
 import subprocess
 import sys
@@ -39,14 +39,14 @@ assert signatures() == before, (signatures(), before)
 
 
 @pytest.mark.long
-def test_no_plan_and_no_insertion_compiles_anything_more():
+def test_plans_and_insertions_compile_no_further_kernel():
     command = [sys.executable, "-c", EVERYTHING]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("missing", [mechanics, phantom])
-def test_all_is_compiled_only_with_model_and_phantoms(monkeypatch, missing):
+def test_all_compiled_needs_the_kernels_of_model_and_phantoms(monkeypatch, missing):
     monkeypatch.setattr(kernels, "compiled", lambda home: str(home) not in str(missing.__file__))
     assert not kernels.all_compiled()
     monkeypatch.setattr(kernels, "compiled", lambda _home: True)

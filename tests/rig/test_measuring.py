@@ -1,4 +1,4 @@
-"""What is made of the readings of a period: before the needle moves, between two frames, with the tip lost."""
+"""Observations: before the needle moves, between two frames, with the tip lost, in a field in doubt."""
 
 import math
 from dataclasses import replace
@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 import flexneedle
-from flexneedle.rig.measuring import look_around, see
-from flexneedle.rig.monitor.watch import Watch
+from flexneedle.rig.measuring import observe, observe_before_start
+from flexneedle.rig.monitor.monitor import Monitor
 from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading
 
 OK = "ok"
@@ -18,11 +18,11 @@ RATE = 40.0
 STALE_AFTER = SCENARIO.control.stale_after_s
 
 
-class Belief:
-    """A tip at rest. heard: how many readings it was corrected by, None for a period without any."""
+class AtRest:
+    """An estimate of a tip at rest. used: number of readings of the last correction, None for a period without any."""
 
-    def __init__(self, heard=0):
-        self.heard = heard
+    def __init__(self, used=0):
+        self.used = used
 
     tip_sd = 0.0
 
@@ -30,14 +30,14 @@ class Belief:
         return TIP
 
     def observe(self, samples):
-        return Belief(len(samples))
+        return AtRest(len(samples))
 
     def without_reading(self):
-        return Belief(None)
+        return AtRest(None)
 
 
-class Eye:
-    """A tracker that tells these samples."""
+class Recorded:
+    """A tracker that returns these samples."""
 
     def __init__(self, *samples, status=VISIBLE):
         self.samples, self.status = samples, status
@@ -46,188 +46,194 @@ class Eye:
         return self.samples
 
 
-def sample(time, *, seen=True, indicator=0.02):
+def sample(time, *, measured=True, indicator=0.02):
     references = {f"ref{k}": SensorReading((0.0, 0.0, 0.0), indicator=indicator) for k in (1, 2, 3)}
-    tip = SensorReading((*TIP, time)) if seen else SensorReading(None, status="out of volume")
-    x, y, z = (*TIP, 0.0) if seen else (None, None, None)
+    tip = SensorReading((*TIP, time)) if measured else SensorReading(None, status="out of volume")
+    x, y, z = (*TIP, 0.0) if measured else (None, None, None)
     return Measurement(time, x, y, z, Frame(time, round(time * RATE), {"tip": tip, **references}))
 
 
 def second(end=1.0, **kind):
-    """The samples of a second up to `end`."""
+    """The samples of the second before `end`."""
     return [sample(end - k / RATE, **kind) for k in range(40, -1, -1)]
 
 
-def before(now, *samples, watch=None):
-    return look_around(SCENARIO, Belief(), watch or Watch(SCENARIO.monitor), now, Eye(*samples))
+def before(now, *samples):
+    return observe_before_start(SCENARIO, AtRest(), Monitor(SCENARIO.monitor), now, Recorded(*samples))
 
 
-def during(watch, now, *samples, status=VISIBLE):
-    return see(SCENARIO, Belief(), watch, now - 0.2, now, Eye(*samples, status=status))
+def during(monitor, now, *samples, status=VISIBLE):
+    return observe(SCENARIO, AtRest(), monitor, now - 0.2, now, Recorded(*samples, status=status))
 
 
-def test_before_the_needle_moves_all_that_was_told_counts_however_long_ago():
-    """The readings of a second have a limit of age of 0.3 s only from there on that the tracker could tell them."""
-    sight = before(1.0 + 0.9 * STALE_AFTER, *second())
-    assert str(sight.verdict) == OK
-    assert {str(reading.verdict) for reading in sight.readings} == {OK}
+def test_before_the_start_all_readings_count_whatever_their_age():
+    """Readings of a whole second: the age limit of 0.3 s applies only to the newest."""
+    observation = before(1.0 + 0.9 * STALE_AFTER, *second())
+    assert str(observation.verdict) == OK
+    assert {str(reading.verdict) for reading in observation.readings} == {OK}
 
 
-@pytest.mark.parametrize(("lost", "verdict"), [(3, OK), (6, "missing: tracker sees no tip (out of volume)")])
-def test_before_the_needle_moves_the_tip_may_be_lost_for_a_tenth_of_a_second(lost, verdict):
+@pytest.mark.parametrize(("lost", "verdict"), [(3, OK), (6, "missing: tip not measured (out of volume)")])
+def test_before_the_start_the_tip_may_be_missing_for_a_tenth_of_a_second(lost, verdict):
     samples = second()
-    samples[-lost:] = [sample(one.time, seen=False) for one in samples[-lost:]]
-    sight = before(1.0, *samples)
-    assert str(sight.verdict) == verdict
-    assert not sight.field
+    samples[-lost:] = [sample(one.time, measured=False) for one in samples[-lost:]]
+    observation = before(1.0, *samples)
+    assert str(observation.verdict) == verdict
+    assert not observation.field
 
 
-def test_before_the_needle_moves_a_lost_tip_does_not_hide_the_field():
+def test_before_the_start_a_missing_tip_does_not_hide_a_distorted_field():
     samples = second(indicator=0.2)
-    samples[-1] = sample(1.0, seen=False, indicator=0.2)
-    sight = before(1.0, *samples)
-    assert str(sight.verdict).startswith("field distorted")
-    assert sight.field
+    samples[-1] = sample(1.0, measured=False, indicator=0.2)
+    observation = before(1.0, *samples)
+    assert str(observation.verdict).startswith("field distorted")
+    assert observation.field
 
 
-def test_before_the_needle_moves_the_newest_frame_is_of_now():
-    """Frames of a minute ago, each as good as can be, of a tracker that went silent."""
-    sight = before(61.0, *second())
-    assert str(sight.verdict) == "stale: 60.000 s old, limit 0.3 s"
-    blind = [*second()[:-1], sample(1.0, seen=False)]
+def test_before_the_start_the_newest_frame_must_not_be_stale():
+    """Good frames of a minute ago, of a tracker that stopped."""
+    observation = before(61.0, *second())
+    assert str(observation.verdict) == "stale: 60.000 s old, limit 0.3 s"
+    blind = [*second()[:-1], sample(1.0, measured=False)]
     assert str(before(61.0, *blind).verdict) == "stale: 60.000 s old, limit 0.3 s"
     undated = [replace(sample(0.0), time=math.nan), *second()]
     assert str(before(61.0, *undated).verdict) == "stale: 60.000 s old, limit 0.3 s"
 
 
-def test_an_old_frame_told_again_without_the_tip_is_not_taken_for_one_that_lost_it():
-    watch = before(1.0, *second()).watch
-    for again in (sample(1.0, seen=False), replace(sample(1.025, seen=False), time=math.nan)):
-        sight = during(watch, 1.05, again)
-        assert str(sight.verdict) in ("stale: frame 40 after frame 40", "not a number")
-        assert sight.estimate.heard is None
+def test_a_repeated_frame_without_the_tip_is_no_dropout():
+    monitor = before(1.0, *second()).monitor
+    for again in (sample(1.0, measured=False), replace(sample(1.025, measured=False), time=math.nan)):
+        observation = during(monitor, 1.05, again)
+        assert str(observation.verdict) in ("stale: frame 40 after frame 40", "not a number")
+        assert observation.estimate.used is None
 
 
-def test_between_two_frames_a_good_field_is_as_it_was_and_nothing_is_learnt():
-    watch = before(1.0, *second()).watch
-    sight = during(watch, 1.0 + 0.9 * STALE_AFTER)
-    assert (str(sight.verdict), sight.estimate.heard) == (OK, None)
+def test_between_two_frames_a_good_field_stays_good_and_the_estimate_is_not_corrected():
+    monitor = before(1.0, *second()).monitor
+    observation = during(monitor, 1.0 + 0.9 * STALE_AFTER)
+    assert (str(observation.verdict), observation.estimate.used) == (OK, None)
 
 
-def test_between_two_frames_a_distorted_field_is_as_it_was_and_nothing_is_learnt():
-    watch = before(1.0, *second(indicator=0.2)).watch
-    sight = during(watch, 1.0 + 0.9 * STALE_AFTER)
-    assert str(sight.verdict).startswith("field distorted")
-    assert (sight.field, sight.estimate.heard) == (True, None)
+def test_between_two_frames_a_distorted_field_stays_distorted_and_the_estimate_is_not_corrected():
+    monitor = before(1.0, *second(indicator=0.2)).monitor
+    observation = during(monitor, 1.0 + 0.9 * STALE_AFTER)
+    assert str(observation.verdict).startswith("field distorted")
+    assert (observation.field, observation.estimate.used) == (True, None)
 
 
-def test_after_the_age_limit_silence_is_silence_whatever_the_field_was():
+def test_after_the_age_limit_no_reading_is_the_verdict_whatever_the_field():
     for indicator in (0.02, 0.2):
-        watch = before(1.0, *second(indicator=indicator)).watch
-        sight = during(watch, 1.0 + 1.1 * STALE_AFTER, status="no reply")
-        assert str(sight.verdict) == "missing: no reading (no reply)"
-        assert (sight.field, sight.estimate.heard) == (False, None)
+        monitor = before(1.0, *second(indicator=indicator)).monitor
+        observation = during(monitor, 1.0 + 1.1 * STALE_AFTER, status="no reply")
+        assert str(observation.verdict) == "missing: no reading (no reply)"
+        assert (observation.field, observation.estimate.used) == (False, None)
 
 
-def periods(watch, *indicators):
-    """What is made of control periods of 0.2 s from second 1 on, in each of which the references tell this."""
-    sights = []
+def periods(monitor, *indicators):
+    """Observations of control periods of 0.2 s from second 1 on, with these indicators of the references."""
+    observations = []
     for k, indicator in enumerate(indicators, 1):
         now = 1.0 + 0.2 * k
-        told = (sample(now - n / RATE, indicator=indicator) for n in range(7, -1, -1))
-        sights.append(during(sights[-1].watch if sights else watch, now, *told))
-    return sights
+        samples = (sample(now - n / RATE, indicator=indicator) for n in range(7, -1, -1))
+        observations.append(during(observations[-1].monitor if observations else monitor, now, *samples))
+    return observations
 
 
-def test_in_a_distorted_field_no_reading_corrects_the_belief():
-    """It is in doubt for half a second before the median over a second says so."""
-    sights = periods(before(1.0, *second()).watch, 0.2, 0.2, 0.2, 0.2)
-    assert [str(sight.verdict).split(":")[0] for sight in sights] == [
+def test_in_a_distorted_field_no_reading_corrects_the_estimate():
+    """It is in doubt for half a second until the median over a second is above the limit."""
+    observations = periods(before(1.0, *second()).monitor, 0.2, 0.2, 0.2, 0.2)
+    assert [str(observation.verdict).split(":")[0] for observation in observations] == [
         "ok",
         "ok",
         "field distorted",
         "field distorted",
     ]
-    for sight in sights:
-        assert sight.estimate.heard is None
-        assert not sight.saw_after(0.0)
-        (told,) = {str(reading.verdict) for reading in sight.readings}
+    for observation in observations:
+        assert observation.estimate.used is None
+        assert not observation.has_good_reading_after(0.0)
+        (verdict,) = {str(reading.verdict) for reading in observation.readings}
         in_doubt = "field in doubt: ref1 0.2000, limit 0.0547 (median over 0.2 s)"
-        assert told == (in_doubt if sight.verdict.ok else str(sight.verdict))
+        assert verdict == (in_doubt if observation.verdict.ok else str(observation.verdict))
 
 
-def test_a_field_in_doubt_for_a_moment_holds_nothing_and_is_believed_again():
-    sights = periods(before(1.0, *second()).watch, 0.02, 0.2, 0.02)
-    assert [(str(sight.verdict), sight.estimate.heard) for sight in sights] == [(OK, 8), (OK, None), (OK, 8)]
-    assert [sight.saw_after(1.0) for sight in sights] == [True, False, True]
+def test_a_field_in_doubt_for_one_period_does_not_hold_the_needle():
+    observations = periods(before(1.0, *second()).monitor, 0.02, 0.2, 0.02)
+    assert [(str(observation.verdict), observation.estimate.used) for observation in observations] == [
+        (OK, 8),
+        (OK, None),
+        (OK, 8),
+    ]
+    assert [observation.has_good_reading_after(1.0) for observation in observations] == [True, False, True]
 
 
-def test_a_monitor_that_is_switched_off_has_no_doubts():
+def test_a_disabled_monitor_does_not_check_the_field():
     off = SCENARIO.with_values({"monitor.enabled": False}).monitor
-    assert periods(Watch(off), 0.2)[0].estimate.heard == 8
+    assert periods(Monitor(off), 0.2)[0].estimate.used == 8
 
 
-def test_readings_on_their_way_while_the_needle_moved_may_be_older_than_the_newest():
-    """A move of 0.2 s: of two readings as old as that and the limit together the newest is stale, the other is not."""
-    watch = before(1.0, *second()).watch
+def test_readings_in_transit_during_the_move_may_be_older_than_the_newest():
+    """A move of 0.2 s: its duration is added to the age limit of all readings but the newest."""
+    monitor = before(1.0, *second()).monitor
     age = STALE_AFTER + 0.1
-    sight = during(watch, 1.2 + age, sample(1.1), sample(1.2))
-    assert [str(reading.verdict) for reading in sight.readings] == [
+    observation = during(monitor, 1.2 + age, sample(1.1), sample(1.2))
+    assert [str(reading.verdict) for reading in observation.readings] == [
         OK,
         f"stale: {age:.3f} s old, limit 0.3 s",
     ]
-    assert sight.estimate.heard is None
+    assert observation.estimate.used is None
 
 
-def test_a_newest_frame_without_the_tip_keeps_the_good_readings_of_the_period():
-    watch = before(1.0, *second()).watch
-    good, blind = [sample(1.0 + k / RATE) for k in (1, 2)], sample(1.0 + 3 / RATE, seen=False)
-    sight = during(watch, blind.time, *good, blind)
-    assert (str(sight.verdict), sight.estimate.heard, sight.sample) == (OK, 2, good[-1])
-    alone = during(watch, 1.0 + 1 / RATE, sample(1.0 + 1 / RATE, seen=False))
-    assert (str(alone.verdict), alone.estimate.heard, alone.sample.time) == (OK, None, 1.0)
+def test_good_readings_of_a_period_are_used_although_the_newest_has_no_tip():
+    monitor = before(1.0, *second()).monitor
+    good, blind = [sample(1.0 + k / RATE) for k in (1, 2)], sample(1.0 + 3 / RATE, measured=False)
+    observation = during(monitor, blind.time, *good, blind)
+    assert (str(observation.verdict), observation.estimate.used, observation.sample) == (OK, 2, good[-1])
+    alone = during(monitor, 1.0 + 1 / RATE, sample(1.0 + 1 / RATE, measured=False))
+    assert (str(alone.verdict), alone.estimate.used, alone.sample.time) == (OK, None, 1.0)
 
 
-class Refitted(Belief):
+class Refitted(AtRest):
     """A needle at rest whose first correction shifts the tip by 1 mm."""
 
     tip_sd = 1.0
 
     def tip_at(self, _time):
-        return TIP[0] + (1.0 if self.heard else 0.0), TIP[1]
+        return TIP[0] + (1.0 if self.used else 0.0), TIP[1]
 
     def observe(self, samples):
-        return Refitted(self.heard + len(samples))
+        return Refitted(self.used + len(samples))
 
 
-def test_a_refit_of_a_needle_at_rest_does_not_make_a_tracker_without_noise_a_frozen_one():
-    estimate, watch = Refitted(), Watch(SCENARIO.monitor)
+def test_a_correction_of_the_estimate_at_rest_does_not_make_a_noise_free_tracker_frozen():
+    estimate, monitor = Refitted(), Monitor(SCENARIO.monitor)
     for k in range(8):
-        sight = see(SCENARIO, estimate, watch, k / RATE - 0.2, k / RATE, Eye(Measurement(k / RATE, *TIP)))
-        assert str(sight.verdict) == OK
-        estimate, watch = sight.estimate, sight.watch
-    assert estimate.heard == 8
+        observation = observe(
+            SCENARIO, estimate, monitor, k / RATE - 0.2, k / RATE, Recorded(Measurement(k / RATE, *TIP))
+        )
+        assert str(observation.verdict) == OK
+        estimate, monitor = observation.estimate, observation.monitor
+    assert estimate.used == 8
 
 
-def test_a_broken_last_reading_is_the_verdict_and_earlier_good_ones_are_not_told_as_seen():
-    watch = before(1.0, *second()).watch
+def test_a_bad_last_reading_is_the_verdict_and_the_innovation_is_0():
+    monitor = before(1.0, *second()).monitor
     jumped = replace(sample(1.05), y=TIP[1] + 3.0)
-    sight = during(watch, 1.05, sample(1.025), jumped)
-    assert str(sight.verdict).startswith("innovation: 3.00 mm")
-    assert sight.estimate.heard is None
+    observation = during(monitor, 1.05, sample(1.025), jumped)
+    assert str(observation.verdict).startswith("innovation: 3.00 mm")
+    assert observation.estimate.used is None
 
 
-class Unsure(Belief):
-    """A tip whose prediction is off by half a millimetre."""
+class Uncertain(AtRest):
+    """A prediction with a standard deviation of 0.5 mm."""
 
     tip_sd = 0.5
 
 
-def test_the_limit_of_the_innovation_widens_with_the_uncertainty_of_the_prediction():
-    """By three standard deviations: at the start a rig may be off by more than the limit."""
+def test_the_limit_of_the_innovation_grows_with_the_uncertainty_of_the_prediction():
+    """By three standard deviations: the start error of a rig may exceed the limit."""
     limit = SCENARIO.control.innovation_limit_mm
-    for estimate, most in ((Belief(), limit), (Unsure(), limit + 1.5)):
+    for estimate, most in ((AtRest(), limit), (Uncertain(), limit + 1.5)):
         for off, verdict in ((most - 0.01, OK), (most + 0.01, "innovation")):
             one = Measurement(1.0, TIP[0], TIP[1] + off)
-            sight = see(SCENARIO, estimate, Watch(SCENARIO.monitor), 0.8, 1.0, Eye(one))
-            assert str(sight.readings[0].verdict).split(":")[0] == verdict
+            observation = observe(SCENARIO, estimate, Monitor(SCENARIO.monitor), 0.8, 1.0, Recorded(one))
+            assert str(observation.readings[0].verdict).split(":")[0] == verdict

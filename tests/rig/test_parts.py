@@ -1,4 +1,4 @@
-"""Parts of a user's own: what is none is refused in one line."""
+"""Parts of your own: an unsuitable one is rejected with one line."""
 
 import sys
 from dataclasses import replace
@@ -39,7 +39,7 @@ class Half:
     name = "half"
     decide = staticmethod(decide)
 
-FINE = Method("fine", "goes on", decide=decide)
+FINE = Method("fine", "inserts straight", decide=decide)
 SAME = Method("ce-mpc", "has the name of another", decide=decide)
 NUMBER = 3
 """
@@ -47,7 +47,7 @@ NUMBER = 3
 
 @pytest.fixture
 def lab(tmp_path, monkeypatch):
-    """The current directory, with modules of one's own."""
+    """The current directory, with modules that define parts."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     before = set(sys.modules)
@@ -67,7 +67,7 @@ def lab(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("lab")
-def test_registered_parts_and_objects_are_found_under_their_names():
+def test_parts_are_found_by_name_module_and_object():
     for name, method in METHODS.items():
         assert controller_of(name) == controller_of(method) == (name, method)
     for name, factory in PLANTS.items():
@@ -79,21 +79,25 @@ def test_registered_parts_and_objects_are_found_under_their_names():
 
 
 @pytest.mark.parametrize(
-    ("option", "given", "told"),
+    ("option", "given", "message"),
     [
         ("controller", "lab_parts", "must be one of adaptive-mpc, "),
         ("controller", "lab_parts:", "must be module:NAME, such as mycontroller:METHOD"),
         ("controller", ":FINE", "must be module:NAME"),
         ("controller", "lab-parts:FINE", "must be module:NAME"),
-        ("controller", "lab_there:FINE", "there is no module lab_there, neither in "),
-        ("controller", "lab_parts.sub:FINE", "there is no module lab_parts.sub, neither in "),
-        ("controller", "lab_parts:FIEN", "lab_parts has no FIEN; it has Decision, Method, Phantom, decide,"),
+        ("controller", "lab_there:FINE", "no module lab_there in "),
+        ("controller", "lab_parts.sub:FINE", "no module lab_parts.sub in "),
+        (
+            "controller",
+            "lab_parts:FIEN",
+            "lab_parts has no FIEN; public names: Decision, Method, Phantom, decide,",
+        ),
         (
             "controller",
             "lab_parts:NUMBER",
-            "is an int, not a flexneedle.Method: it lacks name, summary, decide",
+            "is an int, not a flexneedle.Method, missing: name, summary, decide",
         ),
-        ("controller", "lab_parts:Half", "is the class Half, not a flexneedle.Method: it lacks summary"),
+        ("controller", "lab_parts:Half", "is the class Half, not a flexneedle.Method, missing: summary"),
         ("controller", "lab_syntax:METHOD", "lab_syntax cannot be imported: SyntaxError: "),
         ("controller", "lab_needs:METHOD", "lab_needs cannot be imported: it needs the module no_such_thing"),
         ("controller", "lab_exits:METHOD", "lab_exits cannot be imported: SystemExit: 3"),
@@ -105,53 +109,53 @@ def test_registered_parts_and_objects_are_found_under_their_names():
         ("tracker", "lab_parts:one", "must be a function of (scenario, phantom, rng): too many"),
     ],
 )
-def test_what_is_no_part_is_one_line(lab, capsys, option, given, told):
+def test_an_unsuitable_part_is_an_error_of_one_line(lab, capsys, option, given, message):
     assert cli.main(["insert", f"--{option}", given]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"flexneedle: {option} = {given!r}: {told}")
+    assert line.startswith(f"flexneedle: {option} = {given!r}: {message}")
     assert not (lab / "runs").exists()
 
 
 @pytest.mark.usefixtures("lab")
-def test_a_controller_with_the_name_of_another_is_refused(capsys):
+def test_two_controllers_with_the_same_name_are_rejected(capsys):
     assert cli.main(["insert", "--controller", "lab_parts:SAME"]) == 2
     assert "two controllers are called ce-mpc: give one of them another name" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("given", [3, None, {"controller": 1}])
-def test_an_object_that_is_no_controller_is_refused(given):
+def test_an_object_that_is_not_a_controller_is_rejected(given):
     with pytest.raises(
-        InputError, match=r"^controller = \w+: is an? \w+, not a flexneedle.Method: it lacks name"
+        InputError, match=r"^controller = \w+: is an? \w+, not a flexneedle.Method, missing: name"
     ):
         flexneedle.insert(PHANTOM, make_plan(), controller=given)
 
 
-def test_a_factory_that_makes_no_plant_is_refused():
+def test_a_factory_that_returns_no_plant_is_rejected():
     with pytest.raises(
-        InputError, match="phantom = <lambda>: makes a dict, no plant: it lacks step, tip, bevel,"
+        InputError, match="phantom = <lambda>: dict is not a plant, missing: step, tip, bevel,"
     ):
         Phantom(Truth(PHANTOM), 1, lambda _truth, _bevel: {})
 
 
-def test_a_plant_whose_tip_is_no_pose_is_refused():
+def test_a_plant_whose_tip_is_not_a_pose_is_rejected():
     class Flat:
         step = bevel = strain_energy = least_stretch = converged = 0
 
         def __init__(self, _truth, _bevel):
             self.tip = (0.0, 0.0)
 
-    with pytest.raises(InputError, match="phantom = Flat: its tip must be three numbers"):
+    with pytest.raises(InputError, match="phantom = Flat: tip must be three numbers"):
         Phantom(Truth(PHANTOM), 1, Flat)
 
 
-def test_a_factory_that_makes_no_tracker_is_refused():
+def test_a_factory_that_returns_no_tracker_is_rejected():
     seeds = Seeds(*(np.random.SeedSequence(k) for k in range(3)))
-    with pytest.raises(InputError, match="tracker: makes a object, no tracker: it lacks read, status"):
+    with pytest.raises(InputError, match="tracker: object is not a tracker, missing: read, status"):
         virtual_rig(PHANTOM, 1, seeds, "model", tracker=lambda *_: object())
 
 
 @pytest.mark.parametrize("answer", [None, (1, 2), (1.0, 0.0, 0.0, 0.0, -1)])
-def test_a_decision_that_is_none_is_refused(answer):
+def test_a_return_value_that_is_not_a_decision_is_rejected(answer):
     own = replace(METHODS["open-loop"], name="odd", decide=lambda *_: answer)
     with pytest.raises(
         InputError, match="controller odd: decide must return a Decision and the memory after it"

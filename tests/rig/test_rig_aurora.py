@@ -1,4 +1,4 @@
-"""The closed loop on a real clock, with an Aurora that is emulated in a process of its own and falls silent."""
+"""The closed loop in real time with an emulated Aurora in a separate process, which stops replying."""
 
 import re
 from importlib.resources import files
@@ -16,7 +16,7 @@ from flexneedle.rig.tracking.plane import InPlane
 from flexneedle.rig.virtual import Rig, to_stage
 
 STILL = (0.0, 0.0, 0.0, 0.0, -1)
-# The emulated tip moves on its own: all that asks for a needle's place is out of the way here.
+# The emulated tip does not follow the needle: all checks of its position are disabled.
 ANYWHERE = {
     "control.innovation_limit_mm": 1e4,
     "monitor.speed_limit_mm_s": 1e4,
@@ -26,7 +26,7 @@ ANYWHERE = {
 
 
 class Motors:
-    """A driver that takes its time and does what it is told."""
+    """A driver that executes each command exactly within its duration."""
 
     def __init__(self, clock):
         self.clock = clock
@@ -37,7 +37,7 @@ class Motors:
 
 
 @pytest.mark.long
-def test_frames_move_the_needle_and_silence_holds_it():
+def test_the_needle_moves_while_frames_arrive_and_is_held_without_replies():
     scenario = flexneedle.load_scenario("phantom").with_values(ANYWHERE)
     plan = flexneedle.plan(scenario, (40.0, 5.0), seed=0)
     clock = WallClock()
@@ -47,7 +47,7 @@ def test_frames_move_the_needle_and_silence_holds_it():
         tip = InPlane(tracker, to_stage(None))
         rig = Rig(
             clock, Motors(clock), tip
-        )  # its tip does not go where the motors do: forced, or it is given up
+        )  # force: the tip does not follow the motors, so that a miss is predicted
         done = run(scenario, plan, rig, np.random.default_rng(0), force=True)
     assert done.outcome == "held"
     assert re.search(
@@ -55,9 +55,9 @@ def test_frames_move_the_needle_and_silence_holds_it():
     )
     good = [period for period in done.periods if str(period.verdict) == "ok"]
     moved = [period for period in good if period.applied != STILL]
-    seen = [period for period in moved if period.readings]
-    assert seen
-    assert set(seen[-1].readings[-1].sample.frame.readings) == {"tip", "ref1", "ref2", "ref3"}
+    measured = [period for period in moved if period.readings]
+    assert measured
+    assert set(measured[-1].readings[-1].sample.frame.readings) == {"tip", "ref1", "ref2", "ref3"}
     last = done.periods[-1].time
     assert all(period.applied == STILL for period in done.periods if period.time > last - 0.35)
     numbers = [one.sample.frame.number for period in done.periods for one in period.readings]
@@ -72,7 +72,7 @@ fiducials_mm = [[0.0, 0.0, 0.0], [80.0, 0.0, 0.0], [0.0, 80.0, 0.0]]
 """
 
 
-def test_the_example_in_the_docs_sees_the_tip_in_the_stages_frame(tmp_path, monkeypatch):
+def test_the_example_in_the_docs_measures_the_tip_in_the_stages_frame(tmp_path, monkeypatch):
     page = (Path(__file__).parents[2] / "docs/tracking/register.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     preset = files("flexneedle.scenario").joinpath("presets/phantom.toml").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Insertions with a simulated electromagnetic tracker: its room, its monitor, its sensor behind the tip."""
+"""Insertions with a simulated electromagnetic tracker: room, monitor, sensor behind the tip."""
 
 from dataclasses import replace
 from functools import cache
@@ -28,7 +28,7 @@ def plan():
 
 @pytest.fixture(scope="module")
 def inserted(plan):
-    """Return the insertion in an environment with a plate that moves; each carried out once."""
+    """Return the insertion in an environment, with an optional moving plate; each is executed once."""
 
     @cache
     def insert(environment, enabled=True, seed=3, plate_at=None):
@@ -46,21 +46,21 @@ def inserted(plan):
 
 
 def passing(time):
-    """A plate that lies near from the 4th to the 7th second."""
+    """A plate that is near from 4 s to 7 s."""
     return 50.0 if 4.0 <= time < 7.0 else 1000.0
 
 
-def test_in_a_clean_field_nothing_is_held(inserted):
+def test_in_a_clean_field_there_is_no_hold(inserted):
     done = inserted("ideal")
     assert done.outcome == "done"
     assert done.held_s == 0.0
     assert done.true_error_mm < 2.0
-    told = done.periods[-1].readings[-1].sample
-    assert set(told.frame.readings) == {"tip", "ref1", "ref2", "ref3"}
-    assert 0.0 < abs(told.z) < 3.0
+    last = done.periods[-1].readings[-1].sample
+    assert set(last.frame.readings) == {"tip", "ref1", "ref2", "ref3"}
+    assert 0.0 < abs(last.z) < 3.0
 
 
-def test_over_metal_the_needle_is_held_and_the_insertion_given_up(inserted):
+def test_over_metal_the_needle_is_held_and_the_insertion_aborted(inserted):
     held = inserted("noisy")
     assert held.outcome == "held"
     assert held.reason.startswith("held for 10.00 s (limit 10 s): field distorted: ref")
@@ -68,25 +68,25 @@ def test_over_metal_the_needle_is_held_and_the_insertion_given_up(inserted):
     assert held.true_error_mm > 20.0  # before the skin
 
 
-def test_without_the_monitor_it_goes_on_over_metal(inserted):
+def test_without_the_monitor_the_insertion_over_metal_is_done(inserted):
     assert inserted("noisy", enabled=False).outcome == "done"
 
 
-def test_a_plate_that_comes_and_goes_holds_the_needle_as_long_as_it_is_there(inserted):
+def test_a_passing_plate_holds_the_needle_while_it_is_near(inserted):
     done = inserted("ideal", plate_at=passing)
     field = [period for period in done.periods if str(period.verdict).startswith("field distorted")]
-    assert 4.3 < field[0].time < 5.1  # half a second of readings, which come 0.2 s late
+    assert 4.3 < field[0].time < 5.1  # half a second of readings, which are delayed by 0.2 s
     assert 7.3 < field[-1].time < 8.1
     held = [period for period in done.periods if field[0].time < period.time <= field[-1].time]
     assert {period.decision for period in held} == {"held"}
     assert {period.applied for period in held} == {(0.0, 0.0, 0.0, 0.0, -1)}
-    assert {period.innovation for period in held} == {(0.0, 0.0)}  # nothing is learnt from a distorted field
+    assert {period.innovation for period in held} == {(0.0, 0.0)}  # no correction in a distorted field
     assert done.outcome == "done"
     assert done.held_s == pytest.approx(field[-1].time - field[0].time, abs=0.1)
 
 
 class Interrupted:
-    """A tracker that tells nothing in the calls, or nothing of the tip, within a span (s)."""
+    """A tracker that returns no frames, or no tip, within a span (s)."""
 
     status = "unplugged"
 
@@ -116,7 +116,7 @@ def interrupted(plan, span, calls, **values):
     return run(scenario, plan, rig, np.random.default_rng(control))
 
 
-def test_a_call_between_two_frames_ends_no_hold_and_aborts_nothing(plan):
+def test_a_call_between_two_frames_does_not_change_a_hold(plan):
     done = interrupted(plan, (6.0, 6.06), calls=True)
     silent = [period for period in done.periods if not period.readings]
     assert silent
@@ -124,8 +124,8 @@ def test_a_call_between_two_frames_ends_no_hold_and_aborts_nothing(plan):
     assert done.outcome == "done"
 
 
-def test_a_hold_for_a_reading_has_a_clock_of_its_own_after_a_hold_for_the_field(plan):
-    """The tip is lost while the field clears, for 0.7 s: less than the second that a reading is waited for."""
+def test_holds_for_readings_and_for_the_field_have_separate_clocks(plan):
+    """The tip is missing for 0.7 s after the field is good again: less than the hold limit of 1 s."""
     done = interrupted(plan, (7.0, 8.3), calls=False)
     verdicts = [str(period.verdict).split(":")[0] for period in done.periods if period.decision == "held"]
     assert {"field distorted", "missing"} <= set(verdicts)
@@ -135,14 +135,14 @@ def test_a_hold_for_a_reading_has_a_clock_of_its_own_after_a_hold_for_the_field(
     assert "(limit 1 s): missing" in lost.reason
 
 
-def test_silence_of_the_tracker_holds_once_its_last_reading_is_stale(plan):
+def test_without_frames_the_needle_is_held_once_the_last_reading_is_stale(plan):
     done = interrupted(plan, (2.0, 2.6), calls=True, **{"phantom.delay_periods": 0.0})
     silent = [period for period in done.periods if not period.readings]
     assert {str(period.verdict) for period in silent} == {"ok", "missing: no reading (unplugged)"}
     assert done.outcome == "done"
 
 
-def test_nothing_moves_before_the_field_was_judged(inserted):
+def test_nothing_moves_before_the_field_was_checked(inserted):
     for environment, verdict in (("ideal", "ok"), ("noisy", "field distorted")):
         first = inserted(environment).periods[0]
         assert first.time == 0.0
@@ -151,7 +151,7 @@ def test_nothing_moves_before_the_field_was_judged(inserted):
         assert str(first.verdict).startswith(verdict)
     held = inserted("noisy")
     verdicts = {str(one.verdict).split(":")[0] for period in held.periods for one in period.readings}
-    assert verdicts == {"field distorted", "missing"}  # none is told to be good
+    assert verdicts == {"field distorted", "missing"}  # none is good
     assert {period.applied for period in held.periods} == {(0.0, 0.0, 0.0, 0.0, -1)}
     assert held.periods[-1].true_tip == held.periods[0].true_tip
 
@@ -160,7 +160,7 @@ def test_without_a_plate_the_same_run_is_not_held(inserted):
     assert inserted("ideal", plate_at=lambda _: 1000.0).held_s == 0.0
 
 
-def test_each_insertion_has_a_room_of_its_own_unless_one_is_chosen():
+def test_each_insertion_has_another_room_unless_one_is_set():
     def errors(**values):
         scenario = PHANTOM.with_values({"tracker.environment": "ideal", **values})
         rooms = [virtual_room(scenario, np.random.SeedSequence(seed))[0] for seed in (1, 2)]
@@ -185,7 +185,7 @@ def rig_of(**values):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_bias_of_the_scenario_is_in_an_environment_too(seed):
+def test_the_bias_of_the_scenario_also_applies_in_an_environment(seed):
     scenario = PHANTOM.with_values(
         {
             "tracker.environment": STILL,
@@ -197,12 +197,12 @@ def test_the_bias_of_the_scenario_is_in_an_environment_too(seed):
     rig = virtual_rig(scenario, 1, Seeds(*map(np.random.SeedSequence, (seed, 2, 3))), "model")
     rig.driver.apply((1.0, 0.0, 0.0, 0.2, -1), 0.2)
     sample = rig.tracker.read()[-1]
-    off = np.array((sample.x, sample.y)) - rig.truth().tip[:2]
-    assert np.hypot(*off) == pytest.approx(0.3)
+    error = np.array((sample.x, sample.y)) - rig.truth().tip[:2]
+    assert np.hypot(*error) == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("offset", [0.0, 8.0])
-def test_a_sensor_behind_the_tip_tells_where_the_tip_is(offset):
+def test_the_tip_is_measured_by_a_sensor_behind_it(offset):
     rig = rig_of(**{"tracker.tip_offset_mm": offset})
     for _ in range(30):
         rig.driver.apply((1.0, 0.0, 0.0, 0.2, -1), 0.2)
@@ -213,19 +213,19 @@ def test_a_sensor_behind_the_tip_tells_where_the_tip_is(offset):
 
 
 def clean_indicators(room, poses):
-    """What the references tell without noise."""
+    """Indicators of the references without noise."""
     spacing = room.environment.reference.spacing_mm
-    seen = [
+    exact = [
         noiseless(room, name, np.array([pose.position]), np.array([pose.orientation]))
         for name, pose in poses.items()
     ]
-    return np.array([indicator(one.coils, spacing)[0] for one in seen])
+    return np.array([indicator(one.coils, spacing)[0] for one in exact])
 
 
-def test_references_are_put_where_the_field_is_clean():
-    """At their first places some are above three quarters of the threshold; then hardly any is, but for noise."""
+def test_references_are_placed_where_the_field_is_clean():
+    """At the default positions some are above three quarters of the limit; after the placement hardly any."""
     limit = 0.75 * PHANTOM.monitor.indicator_limit
-    above = moved = dirty_still = 0
+    above = moved = remaining = 0
     for seed in range(60):
         room, rng = Room(shipped("ideal"), seed), np.random.default_rng(seed)
         first = reference_poses(room.environment, (0.0, 0.0, 0.0))
@@ -233,15 +233,15 @@ def test_references_are_put_where_the_field_is_clean():
         dirty = clean_indicators(room, first) > limit
         above += dirty.any()
         moved += placed != first
-        dirty_still += clean_indicators(room, placed).max() > 1.1 * limit
-        apart = [np.subtract(placed[name].position, first[name].position) for name in first]
-        assert np.linalg.norm(apart, axis=1).max() <= 30.0
+        remaining += clean_indicators(room, placed).max() > 1.1 * limit
+        shifts = [np.subtract(placed[name].position, first[name].position) for name in first]
+        assert np.linalg.norm(shifts, axis=1).max() <= 30.0
     assert 5 < above < 40
     assert abs(moved - above) < 6
-    assert dirty_still <= 1
+    assert remaining <= 1
 
 
-def test_references_are_placed_about_the_workspace_wherever_it_is():
+def test_references_are_placed_relative_to_the_center_of_the_workspace():
     room, limit = Room(shipped("noisy"), 3), 0.04
     centers = ((0.0, 0.0, 0.0), (20.0, -5.0, 7.0))
     here, there = (placed_references(room, c, limit, np.random.default_rng(0)) for c in centers)
@@ -251,14 +251,14 @@ def test_references_are_placed_about_the_workspace_wherever_it_is():
 
 
 class Bench:
-    """A clock that adds up, a driver that moves nothing, and a tracker that tells what `told_at(time)` says: readings
-    by sensor at 40 Hz since a second before the start, None for no frame."""
+    """A clock that adds up, a driver that moves nothing, and a tracker with the readings by sensor of
+    `readings_at(time)` at 40 Hz, from a second before the start; None: no frame."""
 
-    def __init__(self, told_at, status="unplugged"):
-        self.time, self.told_at, self.status, self.number = 0.0, told_at, status, -40
+    def __init__(self, readings_at, status="unplugged"):
+        self.time, self.readings_at, self.status, self.number = 0.0, readings_at, status, -40
 
     def now(self):
-        assert self.time < 60.0, "nobody ends it"
+        assert self.time < 60.0, "the insertion does not end"
         return self.time
 
     def wait(self, seconds):
@@ -271,12 +271,12 @@ class Bench:
     def read(self):
         numbers = range(self.number, round(self.time * 40) + 1)
         self.number = numbers.stop
-        told = [(number, self.told_at(number / 40)) for number in numbers]
-        return tuple(Frame(n / 40, n + 40, readings) for n, readings in told if readings is not None)
+        found = [(number, self.readings_at(number / 40)) for number in numbers]
+        return tuple(Frame(n / 40, n + 40, readings) for n, readings in found if readings is not None)
 
 
-def on_bench(plan, told_at, status="unplugged", **values):
-    bench = Bench(told_at, status)
+def on_bench(plan, readings_at, status="unplugged", **values):
+    bench = Bench(readings_at, status)
     rig = Rig(bench, bench, InPlane(bench, to_stage(None)))
     return run(PHANTOM.with_values(values), plan, rig, np.random.default_rng(0))
 
@@ -289,41 +289,41 @@ def references(indicator):
     return {name: SensorReading((0.0, 50.0, 0.0), indicator=indicator) for name in ("ref1", "ref2", "ref3")}
 
 
-def test_causes_that_take_turns_hold_nothing_forever(plan):
-    """The tip is never seen, a reference only for half a second in 0.8 s: 1 s of one cause is soon over."""
+def test_alternating_causes_do_not_hold_the_needle_forever(plan):
+    """The tip is never measured, a reference only for 0.5 s of each 0.8 s: one cause reaches its limit of 1 s."""
 
-    def told_at(time):
+    def readings_at(time):
         return {"tip": LOST, **references(0.02)} | ({"ref2": LOST} if time % 0.8 >= 0.5 else {})
 
-    done = on_bench(plan, told_at, **{"monitor.indicator_window_s": 0.1})
+    done = on_bench(plan, readings_at, **{"monitor.indicator_window_s": 0.1})
     causes = {str(period.verdict).split(":")[0] for period in done.periods}
     assert causes == {"missing", "field not known"}
     assert done.outcome == "held"
-    assert "(limit 1 s): missing: tracker sees no tip (out of volume)" in done.reason
+    assert "(limit 1 s): missing: tip not measured (out of volume)" in done.reason
     assert done.periods[-1].time < 2.0
 
 
-def test_time_held_for_a_reading_is_no_time_held_for_the_field(plan):
-    """The field is bent but from 6 to 8 s, the median follows in half a second; until then nobody sees the tip."""
+def test_time_held_for_readings_does_not_count_as_time_held_for_the_field(plan):
+    """The field is distorted except from 6 s to 8 s, and the tip is missing from 6 s to 8.6 s."""
 
-    def told_at(time):
-        seen = {"tip": LOST if 6.0 <= time < 8.6 else AT_START}
-        return seen | references(0.02 if 6.0 <= time < 8.0 else 0.2)
+    def readings_at(time):
+        tip = {"tip": LOST if 6.0 <= time < 8.6 else AT_START}
+        return tip | references(0.02 if 6.0 <= time < 8.0 else 0.2)
 
-    done = on_bench(plan, told_at, **{"control.hold_limit_s": 5.0})
+    done = on_bench(plan, readings_at, **{"control.hold_limit_s": 5.0})
     kinds = [str(period.verdict).split(":")[0] for period in done.periods]
     assert list(dict.fromkeys(kinds)) == ["field distorted", "missing"]
     assert done.reason.startswith("held for 10.0")
-    assert done.periods[-1].time == pytest.approx(12.0, abs=0.1)  # of which 2 s are not the field's
+    assert done.periods[-1].time == pytest.approx(12.0, abs=0.1)  # of which 2 s are not held for the field
 
 
-def test_nothing_moves_before_the_tracker_told_anything(plan):
-    """As a real one that is still connecting, in a field that turns out to be distorted."""
+def test_nothing_moves_before_the_first_frame(plan):
+    """As with a real tracker that is still connecting, in a distorted field."""
 
-    def told_at(time):
+    def readings_at(time):
         return {"tip": AT_START, **references(0.2)} if time > 0.1 else None
 
-    done = on_bench(plan, told_at, status="connecting")
+    done = on_bench(plan, readings_at, status="connecting")
     assert str(done.periods[0].verdict) == "missing: no reading (connecting)"
     assert {period.applied for period in done.periods} == {(0.0, 0.0, 0.0, 0.0, -1)}
     assert done.reason.startswith("held for 10.0")
@@ -331,11 +331,11 @@ def test_nothing_moves_before_the_tracker_told_anything(plan):
     assert kinds == ["missing", "field not known", "field distorted"]
 
 
-def test_a_tracker_that_falls_silent_in_a_distorted_field_is_said_to_be_silent(plan):
-    def told_at(time):
+def test_a_tracker_that_stops_in_a_distorted_field_is_reported_as_missing(plan):
+    def readings_at(time):
         return {"tip": AT_START, **references(0.2)} if time < 0.5 else None
 
-    done = on_bench(plan, told_at)
+    done = on_bench(plan, readings_at)
     assert done.outcome == "held"
     assert done.reason.endswith("(limit 1 s): missing: no reading (unplugged)")
     assert 1.5 < done.periods[-1].time < 2.0

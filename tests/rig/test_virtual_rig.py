@@ -1,4 +1,4 @@
-"""The virtual rig: a phantom and a tracker of their seeds behind the ports."""
+"""The virtual rig: a phantom and a tracker, each with its seed, with the ports of a rig."""
 
 import math
 
@@ -14,59 +14,59 @@ def rig_of(seed=4, phantom="exact", **values):
     return virtual_rig(scenario, 1, Seeds(*map(np.random.SeedSequence, (seed, 5, 6))), phantom)
 
 
-def test_virtual_rig_is_a_phantom_of_its_seed_behind_the_ports():
+def test_the_virtual_rig_depends_on_its_seed():
     rig, again, other = rig_of(), rig_of(), rig_of(seed=3)
     for one in (rig, again, other):
         one.driver.apply((1.0, 0.0, 0.0, 0.0, -1), 0.2)
     assert str(rig.truth()) == str(again.truth()) != str(other.truth())
     at_rest = rig.tracker.read()
     assert at_rest == again.tracker.read()
-    assert len(at_rest) == 9  # the first was there at the start
+    assert len(at_rest) == 9  # the first was available at the start
     tip = rig.truth().tip[:2]
     rig.driver.apply((1.0, 0.0, 0.0, 0.0, -1), 0.2)
     samples = rig.tracker.read()
     assert len(samples) == 8
-    off = np.array([(s.x, s.y) for s in samples])[-1] - tip  # of a period ago
-    assert 0.0 < np.abs(off).max() < 0.2
+    error = np.array([(s.x, s.y) for s in samples])[-1] - tip  # of the previous period
+    assert 0.0 < np.abs(error).max() < 0.2
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_rigs_tracker_has_the_bias_of_the_scenario(seed):
-    """0.3 mm in one direction, to all readings alike; the truth is told without it."""
+    """0.3 mm in one direction, the same for all readings; the recorded truth is without it."""
     quiet = {"phantom__tracker_bias_mm": 0.3, "tracker__jitter_mm": 0.0, "phantom__missing_fraction": 0.0}
     rig = rig_of(seed, **quiet)
     for _ in range(3):
         rig.clock.wait(0.5)
-    off = np.array([(s.x, s.y) for s in rig.tracker.read()]) - rig.truth().tip[:2]
-    np.testing.assert_allclose(np.hypot(*off.T), 0.3)
-    assert np.ptp(off, axis=0).max() < 1e-9
+    error = np.array([(s.x, s.y) for s in rig.tracker.read()]) - rig.truth().tip[:2]
+    np.testing.assert_allclose(np.hypot(*error.T), 0.3)
+    assert np.ptp(error, axis=0).max() < 1e-9
     other = rig_of(seed + 10, **quiet)
     other.clock.wait(0.5)
-    elsewhere = np.array([(s.x, s.y) for s in other.tracker.read()])[-1] - other.truth().tip[:2]
-    assert np.abs(elsewhere - off[-1]).max() > 0.01
+    other_error = np.array([(s.x, s.y) for s in other.tracker.read()])[-1] - other.truth().tip[:2]
+    assert np.abs(other_error - error[-1]).max() > 0.01
 
 
-def test_the_rigs_tracker_misses_the_share_of_the_scenario():
-    """One in a hundred as shipped, within four standard deviations."""
+def test_the_share_of_missing_readings_is_that_of_the_scenario():
+    """1 % by default, within four standard deviations."""
     rig = rig_of()
     rig.clock.wait(250.0)
     missing = sum(sample.x is None for sample in rig.tracker.read())
     assert abs(missing - 100) < 4.0 * math.sqrt(99.0)
 
 
-def test_the_plant_is_the_one_that_was_asked_for():
+def test_the_plant_is_the_chosen_one():
     tips = {}
     for name in ("exact", "model"):
         rig = rig_of(phantom=name)
         for _ in range(35):
             rig.driver.apply((1.0, 0.0, 0.0, 0.1, -1), 0.2)
         tips[name] = rig.truth().tip
-    apart = np.hypot(*(tips["exact"] - tips["model"])[:2])
-    assert 1e-3 < apart < 2.0  # a bend of 0.5 mm and the like lie between them
+    distance = np.hypot(*(tips["exact"] - tips["model"])[:2])
+    assert 1e-3 < distance < 2.0  # due to imperfections such as an initial bend of 0.5 mm
 
 
-def test_references_are_placed_with_a_moving_plate_where_it_begins():
-    """400 mm away it disturbs none; where it ends, 30 mm below the needle, a lab would have looked for other places."""
+def test_references_are_placed_with_the_start_position_of_a_moving_plate():
+    """At 400 mm it disturbs no reference; at its final position, 30 mm below the needle, they would be moved."""
     scenario = PHANTOM.with_values({"tracker.environment": "noisy"})
     seeds = Seeds(*map(np.random.SeedSequence, (4, 5, 6)))
 
@@ -76,24 +76,24 @@ def test_references_are_placed_with_a_moving_plate_where_it_begins():
     frame = virtual_rig(scenario, 1, seeds, plate_distance_at=distance_at).tracker.read()[0].frame
     (_, far), (_, near) = (virtual_room(scenario, seeds.room, distance_at(time)) for time in (0.0, 1.0))
     for name, pose in far.items():
-        read = np.array(frame.readings[name].position)
-        assert math.dist(read, pose.position) < 3.0  # what the room adds
+        measured = np.array(frame.readings[name].position)
+        assert math.dist(measured, pose.position) < 3.0  # the error of the room
     assert max(math.dist(far[name].position, near[name].position) for name in far) > 10.0
 
 
-def test_the_rigs_sensor_points_along_the_needle():
-    """Its z axis; the guide is moved aside, so that the needle lies askew."""
+def test_the_z_axis_of_the_tip_sensor_is_along_the_needle():
+    """With a lateral guide motion, so that the needle is inclined."""
     rig = rig_of(tracker__environment="ideal", tracker__tip_offset_mm=8.0)
     for _ in range(30):
         rig.driver.apply((1.0, 0.0, 0.0, 0.3, -1), 0.2)
-    turn = rig.truth().tip[2]
+    theta = rig.truth().tip[2]
     w, x, y, z = rig.tracker.read()[-1].frame.readings["tip"].orientation
     axis = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z)
-    assert abs(turn) > 0.05
-    np.testing.assert_allclose(axis, (math.cos(turn), math.sin(turn), 0.0), atol=0.02)
+    assert abs(theta) > 0.05
+    np.testing.assert_allclose(axis, (math.cos(theta), math.sin(theta), 0.0), atol=0.02)
 
 
-def test_references_are_placed_where_they_tell_three_quarters_of_the_threshold_at_most(monkeypatch):
+def test_references_are_placed_with_indicators_below_three_quarters_of_the_limit(monkeypatch):
     limits = []
     monkeypatch.setattr(
         "flexneedle.rig.virtual.placed_references", lambda *given: limits.append(given[2]) or {}

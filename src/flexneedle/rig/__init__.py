@@ -1,1 +1,1 @@
-"""The rig: its ports, the closed loop on it, the monitor, virtual rigs, devices and their emulators."""
+"""The rig: ports, closed loop, monitor, virtual rigs, devices and their emulators."""

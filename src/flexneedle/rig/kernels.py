@@ -1,4 +1,4 @@
-"""The compiled kernels of the whole closed loop: those of the model and those of the virtual phantoms."""
+"""Compiled kernels of the closed loop: those of the model and of the virtual phantoms."""
 
 from pathlib import Path
 
@@ -14,15 +14,15 @@ from flexneedle.simulator.simulator import Simulator
 
 
 def all_compiled() -> bool:
-    """Whether the kernels of model and phantoms lie in the cache, so that a start takes no compilation."""
+    """Whether the kernels of model and phantoms are in the cache, so that no compilation is needed."""
     return all(compiled(Path(str(part.__file__)).parent) for part in (mechanics, phantom))
 
 
 def compile_kernels() -> None:
-    """Compile all kernels, or load them from the cache, instead of waiting for it in the first call of each."""
+    """Compile all kernels, or load them from the cache, ahead of their first call."""
     scenario = load_scenario("phantom")  # kernels are the same for every scenario
-    simulator, still = Simulator(scenario, threads=1), Control().row()
+    simulator, at_rest = Simulator(scenario, threads=1), Control().row()
     simulator.compile()
-    simulator.replay(simulator.start(), still[None])
+    simulator.replay(simulator.start(), at_rest[None])
     for kind in PLANTS:
         Phantom(Truth(scenario), 1, kind).apply((0.0, 0.0, 0.0, 0.0, -1), 0.0)

@@ -1,4 +1,4 @@
-"""Carry out an insertion: the closed loop against a driver and a tracker, by default the virtual phantom's."""
+"""Closed-loop insertion with a driver and a tracker, by default those of the virtual phantom."""
 
 import itertools
 import math
@@ -20,8 +20,8 @@ from flexneedle.errors import InputError, RunError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
 from flexneedle.planning.origin import check_origin
-from flexneedle.rig.measuring import Observation, look_around, see
-from flexneedle.rig.monitor.watch import Watch
+from flexneedle.rig.measuring import Observation, observe, observe_before_start
+from flexneedle.rig.monitor.monitor import Monitor
 from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
 from flexneedle.rig.virtual import Rig, Seeds, virtual_rig
@@ -30,8 +30,8 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Action, Command, Insertion, Outcome, Period, Plan
 
-_TOO_MANY = 4  # times the planned periods: the loop is not getting there
-_STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
+_MOST_MOVES = 4  # times the planned steps; then the insertion fails
+_AT_REST: Command = (0.0, 0.0, 0.0, 0.0, -1)
 
 
 def insert(
@@ -46,18 +46,22 @@ def insert(
     threads: int | None = None,
     on_period: Callable[[Period], None] | None = None,
 ) -> Insertion:
-    """Carry out `plan` in closed loop against the virtual phantom that `seed` draws; returns the whole record.
+    """Execute `plan` in closed loop in the virtual phantom drawn with `seed`; return the complete record.
 
-    scenario: also by its name or path, as for `load_scenario`; the one that the plan was made for, or one that differs
-    in no more than controller, tracker, monitor and phantom.
+    scenario: a scenario, or its name or path as for `load_scenario`. It must be the plan's own, or differ from it only
+    in controller, tracker, monitor and phantom.
     controller: one of `control.methods.METHODS`; phantom: "exact" or "model", the formulation of the plant; tracker:
-    "scenario", the one that is described there. Each may be an object of your own, too, or its name `module:NAME`
+    "scenario", the one that the scenario describes. Each may also be an object of your own or its name `module:NAME`
     (docs/extend.md).
-    `threads` is for rollouts (default: all cores) and changes no result. `on_period` gets each control period as
-    it ends. Raises InputError for an unknown name or an object that is none, for a plan of another scenario, and for a
-    controller that needs the guide where it may not move, ScenarioError for a setting that the controllers refuse,
-    RunError if the plan misses its target by more than 1 mm, unless `force` or the controller predicts the miss itself,
-    as the default does. Same seed, same record, but for wall-clock durations.
+    threads: for rollouts (default: all cores), without effect on the result. on_period: called with each control
+    period when it ends.
+
+    The record is the same for the same seed, except for wall-clock durations.
+
+    Raises InputError for an unknown name, an unsuitable object, a plan of another scenario, or a controller that needs
+    the guide where it may not move; ScenarioError for a setting that the controllers reject; RunError if the plan
+    misses its target by more than 1 mm, unless `force` is set or the controller predicts the miss itself, as the
+    default one does.
     """
     scenario, plan, seed = load_scenario(scenario), _planned(plan), whole("seed", seed, 0)
     phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
@@ -92,28 +96,25 @@ def run(
     threads: int | None = None,
     on_period: Callable[[Period], None] | None = None,
 ) -> Insertion:
-    """Carry out `plan` on any rig; as `insert`.
-
-    rng: for the controller; seed: for the record alone.
-    """
+    """As `insert`, on any rig. rng: randomness of the controller; seed: only recorded."""
     scenario, plan, seed = load_scenario(scenario), _planned(plan), whole("seed", seed, 0)
-    rig = instance("rig", rig, Rig, "Rig(clock, driver, tracker), of what flexneedle.rig.ports describes")
+    rig = instance("rig", rig, Rig, "Rig(clock, driver, tracker), parts as in flexneedle.rig.ports")
     rng = instance("rng", rng, np.random.Generator, "such as numpy.random.default_rng(0)")
     check_origin(plan, scenario)
     name, chosen = controller_of(controller)
     check_guide(chosen, scenario.setup, plan.strategy)
     if not (plan.reached or force or chosen.predicts):
         raise RunError(
-            f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), bound by {plan.limit}; "
+            f"plan misses the target by {plan.error_mm:.2f} mm (limit 1 mm), limited by {plan.limit}; "
             "use --force (force=True) to insert anyway"
         )
     scenario = used(scenario, chosen)
     task = tables.task(chosen, Simulator(scenario, threads), plan)
     periods: list[Period] = []
-    ending = (Outcome.FAILED, "not at the target depth after four times the planned periods")
-    for period, so_far in _periods(task, chosen, rig, rng, force=force):
+    ending = (Outcome.FAILED, f"target depth not reached within {_MOST_MOVES} times the planned steps")
+    for period, ended in _periods(task, chosen, rig, rng, force=force):
         periods.append(period)
-        ending = so_far or ending
+        ending = ended or ending
         if on_period is not None:
             on_period(period)
     insertion = Insertion(plan, seed, tuple(periods), *ending, name, scenario=scenario)
@@ -130,56 +131,61 @@ def _planned(plan: object) -> Plan:
 def _periods(
     task: Task, chosen: Method, rig: Rig, rng: np.random.Generator, *, force: bool
 ) -> Iterator[tuple[Period, tuple[Outcome, str] | None]]:
-    """Yield each period, and how the insertion ended with it: (outcome, reason), None while it goes on.
+    """Yield each period with (outcome, reason) of the insertion, None while it continues.
 
-    After the last move the needle rests until the tracker has measured it at rest: readings come late.
+    After the last move the needle rests until the tracker has measured it at rest, since readings are delayed.
     """
     scenario, memory = task.scenario, chosen.begin(task)
-    belief = chosen.observer.begin(task)
+    estimate, monitor = chosen.observer.begin(task), Monitor(scenario.monitor)
     start = time.perf_counter()
-    sight = look_around(scenario, belief, Watch(scenario.monitor), rig.clock.now(), rig.tracker)
-    held, indices = _held(None, sight, rig.clock.now()), itertools.count()
+    observation = observe_before_start(scenario, estimate, monitor, rig.clock.now(), rig.tracker)
+    hold, indices = _hold(None, observation, rig.clock.now()), itertools.count()
     if (
-        held is not None or sight.sample.frame is not None
-    ):  # a tip alone that is where it should be is no news
+        hold is not None or observation.sample.frame is not None
+    ):  # a good reading of a tip alone is not recorded
         clocks = [start, start, start, time.perf_counter()]
-        step = _Step(Action.MEASURE, Decision(_STILL, "measures before it moves"))
-        yield _record(next(indices), rig.clock.now(), task.plan, rig, step, _STILL, sight, clocks), None
+        step = _Step(Action.MEASURE, Decision(_AT_REST, "measurement before the first motion"))
+        yield (
+            _record(next(indices), rig.clock.now(), task.plan, rig, step, _AT_REST, observation, clocks),
+            None,
+        )
     arrived_at: float | None = None
-    lost = _Lost()
+    no_path = _NoPath()
     moves = in_a_row = 0
     for index in indices:
-        if moves == _TOO_MANY * len(task.plan.controls):
+        if moves == _MOST_MOVES * len(task.plan.controls):
             return
         clocks = [time.perf_counter()]
         begun, reading = rig.clock.now(), scenario.tracker.period
-        decides = held is None and arrived_at is None
-        if held is not None:
-            step = _Step(Action.HOLD, Decision(_STILL, "held"), reading)
+        decides = hold is None and arrived_at is None
+        if hold is not None:
+            step = _Step(Action.HOLD, Decision(_AT_REST, "held"), reading)
         elif arrived_at is not None:
-            late = begun - sight.sample.time
-            step = _Step(Action.REST, Decision(_STILL, "at rest for the last reading"), max(reading, late))
+            delay = begun - observation.sample.time
+            step = _Step(Action.REST, Decision(_AT_REST, "waiting for the last reading"), max(reading, delay))
         else:
-            decision, memory = _decided(chosen, task, memory, sight.estimate, rng)
+            decision, memory = _decided(chosen, task, memory, observation.estimate, rng)
             in_a_row = likely_misses(decision, in_a_row)
-            lost = lost.after("" if force else hopeless(decision, scenario.control))
-            step = _step(decision, lost.why, reading)
-            moves += not lost.why
+            no_path = no_path.after("" if force else hopeless(decision, scenario.control))
+            step = _step(decision, no_path.reason, reading)
+            moves += not no_path.reason
         clocks.append(time.perf_counter())
         applied = _carry_out(scenario, rig, step.decision.command, step.wait)
         clocks.append(time.perf_counter())
-        moved = sight.estimate.move(applied, begun, rig.clock.now())
-        sight = see(scenario, moved, sight.watch, begun, rig.clock.now(), rig.tracker)
+        predicted = observation.estimate.move(applied, begun, rig.clock.now())
+        observation = observe(scenario, predicted, observation.monitor, begun, rig.clock.now(), rig.tracker)
         clocks.append(time.perf_counter())
-        now, good = rig.clock.now(), sight.verdict.ok
-        held = _held(held, sight, now)
-        if arrived_at is None and good and chosen.arrived(task, memory, sight.estimate):
+        now, good = rig.clock.now(), observation.verdict.ok
+        hold = _hold(hold, observation, now)
+        if arrived_at is None and good and chosen.arrived(task, memory, observation.estimate):
             arrived_at = now
-        seen = arrived_at is not None and good and sight.saw_after(arrived_at)
-        ending = _ending(task, sight, None if held is None else held.lasted(sight.field), seen)
-        lost = lost.lasting(now - begun) if decides else lost
-        ending = ending or lost.ending(scenario.control.hold_limit_s)
-        period = _record(index, now, task.plan, rig, step, applied, sight, clocks)
+        measured = arrived_at is not None and good and observation.has_good_reading_after(arrived_at)
+        ending = _ending(
+            task, observation, None if hold is None else hold.duration(observation.field), measured
+        )
+        no_path = no_path.extended(now - begun) if decides else no_path
+        ending = ending or no_path.ending(scenario.control.hold_limit_s)
+        period = _record(index, now, task.plan, rig, step, applied, observation, clocks)
         yield replace(period, warning=warning(step.decision, in_a_row)), ending
         if ending is not None:
             return
@@ -188,7 +194,7 @@ def _periods(
 def _decided(
     chosen: Method, task: Task, memory: Any, estimate: Estimate, rng: np.random.Generator
 ) -> tuple[Decision, Any]:
-    """What the controller decides. Raises InputError if that is nothing to carry out."""
+    """The controller's decision and its memory. Raises InputError if `decide` returns anything else."""
     match answer := chosen.decide(task, memory, estimate, rng):
         case (Decision(), _):
             return answer
@@ -197,79 +203,81 @@ def _decided(
 
 @dataclass(frozen=True)
 class _Step:
-    """What a period does: its action, the decision behind it, and for how long it waits instead of a move (s)."""
+    """Action of a period, its decision, and the time (s) to wait in place of a move; 0: a move."""
 
     action: Action
     decision: Decision
     wait: float = 0.0
 
 
-def _step(decision: Decision, lost: str, reading: float) -> _Step:
-    """What follows from a decision; lost: why no path leads to the target, or ""; reading: the tracker's period (s)."""
-    still = replace(decision, command=_STILL)
-    if lost:
-        return _Step(Action.HOLD, replace(still, why=f"held: {lost}"), reading)
+def _step(decision: Decision, no_path: str, reading: float) -> _Step:
+    """The step for a decision; no_path: reason why no path reaches the target, or ""; reading: tracker period (s)."""
+    at_rest = replace(decision, command=_AT_REST)
+    if no_path:
+        return _Step(Action.HOLD, replace(at_rest, why=f"held: {no_path}"), reading)
     if decision.rest > 0.0:
-        return _Step(Action.REST, still, decision.rest)
+        return _Step(Action.REST, at_rest, decision.rest)
     return _Step(Action.MOVE, decision)
 
 
 @dataclass(frozen=True)
-class _Held:
-    """A needle that is held: for how long (s) for the field and for readings, and for which of them since `at`."""
+class _Hold:
+    """A hold of the needle: its time (s) on account of the field and of readings, and its present cause since `at`."""
 
     at: float
     field: bool
     for_field: float = 0.0
     for_readings: float = 0.0
 
-    def lasted(self, field: bool) -> float:
-        """For how long it has been held for one of the two causes (s)."""
+    def duration(self, field: bool) -> float:
+        """Time (s) held on account of the field or of readings."""
         return self.for_field if field else self.for_readings
 
 
 @dataclass(frozen=True)
-class _Lost:
-    """Why no path leads to the target, empty if one does, and for how long (s) the needle has been held for that.
+class _NoPath:
+    """Reason why no path reaches the target, empty if one does, and the time (s) held for it.
 
-    The clock stands while the needle is held for the tracker; a decision that finds a path sets it back.
+    The time does not run while the needle is held on account of the tracker; a decision with a path resets it.
     """
 
-    why: str = ""
-    lasted: float = 0.0
+    reason: str = ""
+    duration: float = 0.0
 
-    def after(self, why: str) -> "_Lost":
+    def after(self, reason: str) -> "_NoPath":
         """After a decision."""
-        return _Lost(why, self.lasted) if why else _Lost()
+        return _NoPath(reason, self.duration) if reason else _NoPath()
 
-    def lasting(self, seconds: float) -> "_Lost":
-        """After a period that was held, or that was not."""
-        return _Lost(self.why, self.lasted + seconds) if self.why else self
+    def extended(self, seconds: float) -> "_NoPath":
+        """After a period of this length."""
+        return _NoPath(self.reason, self.duration + seconds) if self.reason else self
 
     def ending(self, limit: float) -> tuple[Outcome, str] | None:
-        """How the insertion ends, if it has lasted for `limit` (s)."""
-        return (Outcome.HELD, self.why) if self.why and self.lasted > limit - 1e-9 else None
+        """Outcome and reason once the hold has lasted for `limit` (s)."""
+        return (Outcome.HELD, self.reason) if self.reason and self.duration > limit - 1e-9 else None
 
 
-def _held(held: _Held | None, sight: Observation, now: float) -> _Held | None:
-    """The hold after a verdict. Each of the two causes has a clock and a limit of its own; a clock stops while the
-    needle is held for the other cause, and only a good verdict sets it back: alternating causes do not hold forever.
+def _hold(hold: _Hold | None, observation: Observation, now: float) -> _Hold | None:
+    """The hold after a verdict; None: not held.
+
+    Each of the two causes has its own clock and limit. A clock stops while the needle is held for the other cause, and
+    only a good verdict resets it, so that alternating causes cannot hold the needle forever.
     """
-    if sight.verdict.ok:
+    if observation.verdict.ok:
         return None
-    if held is None:
-        return _Held(now, sight.field)
-    passed = now - held.at
-    return _Held(
+    if hold is None:
+        return _Hold(now, observation.field)
+    passed = now - hold.at
+    return _Hold(
         now,
-        sight.field,
-        held.for_field + (passed if held.field else 0.0),
-        held.for_readings + (0.0 if held.field else passed),
+        observation.field,
+        hold.for_field + (passed if hold.field else 0.0),
+        hold.for_readings + (0.0 if hold.field else passed),
     )
 
 
 def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> Command:
-    """Move, for as long as the speed asks, rounded up to whole readings of the tracker; or wait so long (s)."""
+    """Move, within the time at insertion speed, rounded up to whole tracker periods; or wait for `wait` (s)."""
     if wait > 0.0:
         rig.clock.wait(wait)
         return command
@@ -278,18 +286,22 @@ def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> C
     return rig.driver.apply(command, max(1, readings) * reading)
 
 
-def _ending(task: Task, sight: Observation, held: float | None, seen: bool) -> tuple[Outcome, str] | None:
-    """How the insertion ends after this period, if it does; held: for how long it has been (s), None if it is not."""
-    estimate, limit = sight.estimate, sight.limit(task.scenario)
+def _ending(
+    task: Task, observation: Observation, held: float | None, measured: bool
+) -> tuple[Outcome, str] | None:
+    """Outcome and reason if the insertion ends with this period. held: duration of the hold (s), None: not held;
+    measured: whether the needle was measured at rest after its arrival.
+    """
+    estimate, limit = observation.estimate, observation.hold_limit(task.scenario)
     if not estimate.state.converged:
         return Outcome.FAILED, f"the model did not converge: residual {estimate.state.residual:.3g} mm"
     if held is not None and held > limit - 1e-9:
-        return Outcome.HELD, f"held for {held:.2f} s (limit {limit:g} s): {sight.verdict}"
-    if not seen:
+        return Outcome.HELD, f"held for {held:.2f} s (limit {limit:g} s): {observation.verdict}"
+    if not measured:
         return None
     short = task.plan.target[0] - float(estimate.tip[0])
     if short > task.scenario.control.depth_tolerance_mm and at_depth(task, None, estimate):
-        return Outcome.DONE, f"the stroke ends {short:.2f} mm before the target depth"
+        return Outcome.DONE, f"stroke ends {short:.2f} mm before the target depth"
     return Outcome.DONE, ""
 
 
@@ -300,19 +312,19 @@ def _record(
     rig: Rig,
     step: _Step,
     applied: Command,
-    sight: Observation,
+    observation: Observation,
     clocks: list[float],
 ) -> Period:
-    estimate = sight.estimate
+    estimate = observation.estimate
     state, truth = estimate.state, None if rig.truth is None else rig.truth()
     return Period(
         index=index,
         time=now,
         command=step.decision.command,
         applied=applied,
-        sample=sight.sample,
-        verdict=sight.verdict,
-        readings=sight.readings,
+        sample=observation.sample,
+        verdict=observation.verdict,
+        readings=observation.readings,
         innovation=estimate.innovation,
         estimate=_pose(estimate.tip),
         shape=state.nodes,
@@ -342,5 +354,5 @@ def _record(
 
 
 def _pose(values: Iterable[float]) -> tuple[float, float, float]:
-    x, y, turn = (float(value) for value in values)
-    return x, y, turn
+    x, y, theta = (float(value) for value in values)
+    return x, y, theta

@@ -1,6 +1,7 @@
-"""The controller, the plant and the tracker of an insertion: by name, `module:NAME`, or an object of the user's own.
+"""Controller, plant and tracker of an insertion: by name, by `module:NAME`, or as an object of your own.
 
-`module:NAME` is NAME of a Python module that can be imported; the current directory counts, as with `python -m`.
+`module:NAME` is the attribute NAME of an importable Python module; the current directory is searched, as with
+`python -m`.
 """
 
 import hashlib
@@ -23,10 +24,10 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import printable
 
 TrackerFactory = Callable[[Scenario, Phantom, np.random.Generator], TipTracker]
-"""Makes a tracker of the tip: for a scenario, the needle in the tank (tip_at, pose_at, now) and its own randomness."""
+"""Makes a tracker of the tip, from a scenario, the phantom (tip_at, pose_at, now) and a random generator."""
 
 SCENARIO_TRACKER = "scenario"
-"""Name of the tracker that the scenario describes."""
+"""Name of the tracker described by the scenario."""
 
 _OWN = "module:NAME of your own"
 _DIGITS = 12
@@ -38,43 +39,46 @@ def is_own(given: object) -> bool:
 
 
 def controller_of(given: str | Method) -> tuple[str, Method]:
-    """Return a controller and the name under which it is recorded. Raises InputError if it is none."""
+    """Return a controller and its name in the record. Raises InputError if it is no controller."""
     if isinstance(given, Method):
         return given.name, given
     if _is_listed(given, METHODS):
         return given, METHODS[given]
-    found = _own("controller", given, METHODS)
+    found = _resolved("controller", given, METHODS)
     if not isinstance(found, Method):
-        lacks = _lacks(found, ("name", "summary", "decide"))
-        raise InputError(f"controller = {_shown(given)}: is {_a(found)}, not a flexneedle.Method{lacks}")
+        missing = _without(found, ("name", "summary", "decide"))
+        raise InputError(f"controller = {_shown(given)}: is {_a(found)}, not a flexneedle.Method{missing}")
     return _name(given), found
 
 
 def plant_of(given: str | PlantFactory) -> tuple[str, PlantFactory]:
-    """Return what makes a plant and the name under which it is recorded. Raises InputError if it makes none."""
+    """Return the name of a plant in the record, and its factory. Raises InputError if it is no factory."""
     if _is_listed(given, PLANTS):
         return given, PLANTS[given]
-    found = _own("phantom", given, PLANTS)
+    found = _resolved("phantom", given, PLANTS)
     _check_call("phantom", given, found, ("truth", "bevel"))
     return _name(given), found
 
 
 def tracker_of(given: str | TrackerFactory) -> tuple[str, TrackerFactory | None]:
-    """Return what makes a tracker, None for that of the scenario, and its name. Raises InputError if it makes none."""
+    """Return the name of a tracker in the record, and its factory, None for the scenario's own.
+
+    Raises InputError if it is no factory.
+    """
     if _is_listed(given, (SCENARIO_TRACKER,)):
         return given, None
-    found = _own("tracker", given, (SCENARIO_TRACKER,))
+    found = _resolved("tracker", given, (SCENARIO_TRACKER,))
     _check_call("tracker", given, found, ("scenario", "phantom", "rng"))
     return _name(given), found
 
 
 def own_controllers(given: Iterable[object]) -> tuple[Method, ...]:
-    """Return the controllers that are given as `module:NAME`, each once. Raises InputError for one that is none."""
+    """Return the controllers given as `module:NAME`, without duplicates. Raises InputError for an unsuitable object."""
     return tuple(dict.fromkeys(controller_of(str(name))[1] for name in given if is_own(name)))
 
 
 def digests(given: Iterable[object]) -> dict[str, str]:
-    """Return a digest of the source of each module in `module:NAME`, by that name, "" where there is no source."""
+    """Return a digest of the module's source for each `module:NAME`, by that name; "" without a source."""
     names = sorted({str(name) for name in given if is_own(name)})
     return {name: _digest(sys.modules.get(name.partition(":")[0])) for name in names}
 
@@ -88,8 +92,8 @@ def _is_listed(given: object, names: Iterable[str]) -> TypeGuard[str]:
     return isinstance(given, str) and given in names
 
 
-def _own(kind: str, given: object, names: Iterable[str]) -> Any:
-    """The object itself, or what `module:NAME` names."""
+def _resolved(kind: str, given: object, names: Iterable[str]) -> Any:
+    """The object itself, or the one named by `module:NAME`."""
     if not isinstance(given, str):
         return given
     module, colon, name = given.partition(":")
@@ -99,8 +103,8 @@ def _own(kind: str, given: object, names: Iterable[str]) -> Any:
         raise InputError(f"{kind} = {_shown(given)}: must be module:NAME, such as mycontroller:METHOD")
     found = _module(kind, given, module)
     if not hasattr(found, name):
-        public = ", ".join(key for key in vars(found) if not key.startswith("_")) or "nothing"
-        raise InputError(f"{kind} = {_shown(given)}: {module} has no {name}; it has {public}")
+        public = ", ".join(key for key in vars(found) if not key.startswith("_")) or "none"
+        raise InputError(f"{kind} = {_shown(given)}: {module} has no {name}; public names: {public}")
     return getattr(found, name)
 
 
@@ -115,17 +119,17 @@ def _module(kind: str, given: str, name: str) -> Any:
     except ModuleNotFoundError as error:
         missing = str(error.name)
         if name == missing or name.startswith(f"{missing}."):
-            rule = f"there is no module {missing}, neither in {here} nor installed"
+            rule = f"no module {missing} in {here} or installed"
         else:
             rule = f"{name} cannot be imported: it needs the module {missing}"
         raise InputError(f"{kind} = {_shown(given)}: {printable(rule)}") from None
     except (Exception, SystemExit) as error:
-        told = printable(f"{type(error).__name__}: {' '.join(str(error).split())}")
-        raise InputError(f"{kind} = {_shown(given)}: {name} cannot be imported: {told}") from error
+        problem = printable(f"{type(error).__name__}: {' '.join(str(error).split())}")
+        raise InputError(f"{kind} = {_shown(given)}: {name} cannot be imported: {problem}") from error
 
 
 def _check_call(kind: str, given: object, found: object, arguments: tuple[str, ...]) -> None:
-    """Raise InputError unless `found` can be called with so many arguments."""
+    """Raise InputError unless `found` can be called with these arguments."""
     wanted = f"a function of ({', '.join(arguments)})"
     if not callable(found):
         raise InputError(f"{kind} = {_shown(given)}: is {_a(found)}, not {wanted}")
@@ -133,13 +137,13 @@ def _check_call(kind: str, given: object, found: object, arguments: tuple[str, .
         inspect.signature(found).bind(*arguments)
     except TypeError as error:
         raise InputError(f"{kind} = {_shown(given)}: must be {wanted}: {error}") from None
-    except ValueError:  # a built-in that does not say what it takes
+    except ValueError:  # a built-in without a signature
         return
 
 
-def _lacks(found: object, parts: Iterable[str]) -> str:
+def _without(found: object, parts: Iterable[str]) -> str:
     missing = [part for part in parts if not hasattr(found, part)]
-    return f": it lacks {', '.join(missing)}" if missing else ""
+    return f", missing: {', '.join(missing)}" if missing else ""
 
 
 def _name(given: object) -> str:

@@ -1,4 +1,4 @@
-"""What the closed loop needs of the world: a clock, a driver that moves the needle, a tracker of its tip."""
+"""Ports of the closed loop: a clock, a driver that moves the needle, a tracker of its tip."""
 
 from typing import Protocol
 
@@ -13,39 +13,39 @@ class Clock(Protocol):
         ...
 
     def wait(self, seconds: float) -> None:
-        """Let `seconds` pass."""
+        """Wait for `seconds`."""
         ...
 
 
 class Driver(Protocol):
-    """Moves base and guide and turns the bevel."""
+    """Moves base and guide and rolls the bevel."""
 
     def apply(self, command: Command, duration: float) -> Command:
-        """Carry out `command` within `duration` seconds; return it as it was applied."""
+        """Execute `command` within `duration` seconds; return the command as applied."""
         ...
 
 
 class Tracker(Protocol):
-    """Sees sensors: a device, a recording or a simulation."""
+    """Measures sensors: a device, a recording or a simulation."""
 
     def read(self) -> tuple[Frame, ...]:
-        """The frames since the last call, oldest first; empty if there was none. Never waits for the next."""
+        """The frames since the last call, oldest first; may be empty. Does not wait for the next frame."""
         ...
 
     @property
     def status(self) -> str:
-        """VISIBLE while frames come, or in a few words why none do."""
+        """VISIBLE while frames arrive, else the reason in a few words."""
         ...
 
 
 class TipTracker(Protocol):
-    """Sees the tip of the needle, in the frame of the stage."""
+    """Measures the tip of the needle in the frame of the stage."""
 
     def read(self) -> tuple[Measurement, ...]:
-        """The readings since the last call, oldest first; empty if there was none."""
+        """The readings since the last call, oldest first; may be empty."""
         ...
 
     @property
     def status(self) -> str:
-        """VISIBLE while readings come, or in a few words why none do."""
+        """VISIBLE while readings arrive, else the reason in a few words."""
         ...

@@ -1,4 +1,4 @@
-"""What the closed loop moves and sees: a rig, and the virtual one that a scenario and its seeds make."""
+"""A rig: clock, driver and tracker of the closed loop; and the virtual one of a scenario and its seeds."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -24,12 +24,12 @@ from flexneedle.rig.tracking.table import TIP
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.registration import Registration
 
-_PLACED = 0.75  # of the threshold: below it a lab leaves a reference where it is
+_CLEAN = 0.75  # of the indicator's limit: a reference below it is not moved
 
 
 @dataclass(frozen=True)
 class Rig:
-    """What the closed loop moves and sees; `truth` is for the record alone, None on hardware."""
+    """Ports of the closed loop; `truth` is only recorded, None on hardware."""
 
     clock: Clock
     driver: Driver
@@ -39,7 +39,7 @@ class Rig:
 
 @dataclass(frozen=True)
 class Seeds:
-    """Where the randomness of a virtual rig comes from: what stands in the tank, the noise, the tracker's room."""
+    """Seeds of a virtual rig: of the phantom, the tracker's noise, and the tracker's room."""
 
     phantom: np.random.SeedSequence
     tracker: np.random.SeedSequence
@@ -55,11 +55,11 @@ def virtual_rig(
     tracker: TrackerFactory | None = None,
     plate_distance_at: Callable[[float], float] | None = None,
 ) -> Rig:
-    """Return a virtual phantom behind the same ports as a rig.
+    """Return a virtual phantom with the ports of a rig.
 
-    tracker: makes the tracker; left out, it is the one that the scenario describes. Raises InputError if it makes none.
-    plate_distance_at(time): how far a metal plate is from the middle of the tracker's workspace (mm), for one that
-    moves; left out, it is the environment's.
+    tracker: factory of the tracker (default: the tracker described by the scenario). plate_distance_at(time): distance
+    (mm) of a moving metal plate from the center of the tracker's workspace (default: the environment's).
+    Raises InputError if the factory returns no tracker.
     """
     truth = draw(scenario, np.random.default_rng(seeds.phantom))
     tank = Phantom(truth, bevel, phantom)
@@ -80,18 +80,18 @@ def virtual_rig(
 
 def _made(factory: TrackerFactory, scenario: Scenario, tank: Phantom, rng: np.random.Generator) -> TipTracker:
     made = factory(scenario, tank, rng)
-    if lacks := [part for part in ("read", "status") if not hasattr(made, part)]:
-        raise InputError(f"tracker: makes a {type(made).__name__}, no tracker: it lacks {', '.join(lacks)}")
+    if missing := [part for part in ("read", "status") if not hasattr(made, part)]:
+        raise InputError(f"tracker: {type(made).__name__} is not a tracker, missing: {', '.join(missing)}")
     return made
 
 
 def virtual_room(
     scenario: Scenario, seed: np.random.SeedSequence, plate_distance: float | None = None
 ) -> tuple[Room, Mapping[str, SensorPose]] | None:
-    """Return the room that a virtual rig of this seed stands in, and its reference sensors in the stage's frame.
+    """Return the tracker's room in a virtual rig of this seed, and the reference sensors in the stage's frame.
 
-    None for a scenario without an environment. plate_distance: where the plate is (mm) while a lab places the
-    references; left out, as in the environment.
+    None for a scenario without an environment. plate_distance: distance (mm) of the plate while the references are
+    placed (default: the environment's).
     """
     settings = scenario.tracker
     if settings.environment is None:
@@ -99,12 +99,12 @@ def virtual_room(
     rng = np.random.default_rng(seed)
     drawn = int(rng.integers(2**62))
     room = Room(settings.environment, drawn if settings.field_seed is None else settings.field_seed)
-    limit = _PLACED * scenario.monitor.indicator_limit
+    limit = _CLEAN * scenario.monitor.indicator_limit
     return room, placed_references(room, settings.workspace_center_mm, limit, rng, plate_distance)
 
 
 def to_stage(registration: Registration | None) -> Rigid:
-    """Return the map from the tracker's frame to the stage's; without a registration they are one."""
+    """Return the map from the tracker's frame to the stage's; the identity without a registration."""
     if registration is None:
         return identity()
     return Rigid(to_matrix(np.array(registration.rotation)), np.array(registration.translation_mm))
@@ -112,7 +112,7 @@ def to_stage(registration: Registration | None) -> Rigid:
 
 @dataclass(frozen=True)
 class _Errors:
-    """Constant errors: bias (x, y) in mm, and the map by which the registration is off."""
+    """Constant errors: bias (x, y) in mm, and the registration error as a map."""
 
     bias: tuple[float, float]
     registration: Rigid
@@ -121,7 +121,7 @@ class _Errors:
 def _noisy_tracker(
     scenario: Scenario, tank: Phantom, errors: _Errors, rng: np.random.Generator
 ) -> NoisyTracker:
-    """The tracker with white noise alone."""
+    """The tracker with white noise only."""
 
     def tip_at(time: float) -> tuple[float, float]:
         x, y = tank.tip_at(time)
@@ -150,15 +150,15 @@ def _field_tracker(
     rng: np.random.Generator,
     plate_distance_at: Callable[[float], float] | None,
 ) -> InPlane:
-    """The tracker in its environment: in such a room, with such references."""
+    """The tracker in its environment; around: room and references."""
     (room, references), settings = around, scenario.tracker
     center, offset = settings.workspace_center_mm, settings.tip_offset_mm
     registered = to_stage(settings.registration)
 
     def poses_at(time: float) -> Mapping[str, SensorPose]:
-        x, y, turn = tank.pose_at(time)
+        x, y, theta = tank.pose_at(time)
         tip = x + errors.bias[0], y + errors.bias[1], 0.0
-        return {TIP: tip_sensor_pose(tip, (math.cos(turn), math.sin(turn), 0.0), offset), **references}
+        return {TIP: tip_sensor_pose(tip, (math.cos(theta), math.sin(theta), 0.0), offset), **references}
 
     tracker = FieldTracker(
         room,
@@ -168,7 +168,7 @@ def _field_tracker(
         rng,
         center=center,
         delay=_delay(scenario),
-        ahead=scenario.monitor.indicator_window_s,  # it runs before the needle does
+        ahead=scenario.monitor.indicator_window_s,  # so that the field is known at the start
         missing=scenario.phantom.missing_fraction,
         to_tracker=registered.inverse().after(errors.registration),
         plate_distance_at=plate_distance_at,
@@ -177,13 +177,13 @@ def _field_tracker(
 
 
 def _delay(scenario: Scenario) -> float:
-    """Age of a reading when it arrives (s): so many control periods at full step and speed."""
+    """Age (s) of a reading on arrival: `delay_periods` control periods at full step and speed."""
     step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
     return scenario.phantom.delay_periods * step
 
 
 def _registration_error(registration: Registration | None, seed: np.random.SeedSequence) -> Rigid:
-    """By how much a registration from such fiducials, measured so well, is off the truth."""
+    """Error of a registration, drawn from its fiducials and their localisation error."""
     if registration is None or registration.localisation_mm == 0.0:
         return identity()
     rng = np.random.default_rng(seed).spawn(1)[0]

@@ -1,4 +1,4 @@
-"""docs/tracking/aurora.md says what there is."""
+"""docs/tracking/aurora.md agrees with the code."""
 
 import csv
 import json
@@ -26,28 +26,28 @@ COMMANDS = [
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_its_commands_can_be_given(command):
+def test_its_commands_are_valid(command):
     args = build_parser().parse_args(shlex.split(command))
     assert callable(args.handler)
     assert all(parse_fault(fault).kind in KINDS for fault in getattr(args, "fault", []))
 
 
 def test_its_table_has_every_fault():
-    told = re.findall(
+    listed = re.findall(
         r"`([a-z-]+)`", "".join(line.split("|")[1] for line in PAGE.splitlines() if "|" in line)
     )
-    assert set(KINDS) <= set(told)
+    assert set(KINDS) <= set(listed)
 
 
 def test_its_table_has_every_status():
     pose = (1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 0.02)
-    cases = [(gone, 1 << bit | 1) for gone in (0, 1, 2) for bit in range(16)] + [(0, 0)]
-    statuses = {reading(gone, bits, pose).status for gone, bits in cases}
+    cases = [(kind, 1 << bit | 1) for kind in (0, 1, 2) for bit in range(16)] + [(0, 0)]
+    statuses = {reading(kind, bits, pose).status for kind, bits in cases}
     statuses |= {"stale", reading(0, 1, (0.0,) * 8).status}
     assert [status for status in sorted(statuses) if f"`{status}`" not in PAGE] == []
 
 
-def test_its_grid_is_the_one_that_comes_along():
+def test_its_grid_is_the_included_one():
     (grid,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     assert grid == (files("flexneedle.em.recording") / "grids" / "cube.toml").read_text()
 
@@ -69,8 +69,8 @@ def test_its_session_without_hardware_ends_with_an_evaluation(tmp_path):
     assert len(rows) == 8 * 10
     for row in rows:
         x, y, z = (float(row[f"true_{axis}_mm"]) for axis in "xyz")
-        told = [float(row[f"{axis}_mm"]) for axis in "xyz"]
-        assert told == pytest.approx((y, z, x - 250.0), abs=0.5), "where the tip was told to rest"
+        measured = [float(row[f"{axis}_mm"]) for axis in "xyz"]
+        assert measured == pytest.approx((y, z, x - 250.0), abs=0.5), "resting position of the tip"
     result = json.loads((tmp_path / "try-aurora" / "result" / "evaluation.json").read_text())
     (tip,) = result["results"]
     assert (tip["n_points"], tip["n_samples"]) == (8, 80)

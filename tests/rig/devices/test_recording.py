@@ -1,4 +1,4 @@
-"""Frames to rows and back."""
+"""Conversion of frames to rows and back."""
 
 import csv
 
@@ -8,10 +8,10 @@ from flexneedle.errors import InputError
 from flexneedle.rig.devices.recording import COLUMNS, read_frames, rows_of
 from flexneedle.types import Frame, SensorReading
 
-SEEN = SensorReading((0.1 + 0.2, -20.0, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
+MEASURED = SensorReading((0.1 + 0.2, -20.0, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
 FRAMES = (
-    Frame(0.1, 4, {"tip": SEEN, "ref1": SensorReading(None, status="out of volume")}),
-    Frame(0.125, 5, {"tip": SensorReading((1.0, 2.0, 3.0)), "ref1": SEEN}),
+    Frame(0.1, 4, {"tip": MEASURED, "ref1": SensorReading(None, status="out of volume")}),
+    Frame(0.125, 5, {"tip": SensorReading((1.0, 2.0, 3.0)), "ref1": MEASURED}),
 )
 
 
@@ -40,52 +40,52 @@ ROWS = [row for frame in FRAMES for row in rows_of(frame)]
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_frames_come_back_to_the_last_digit(table, suffix):
+def test_frames_are_restored_to_the_last_digit(table, suffix):
     assert read_frames(table(ROWS, suffix)) == FRAMES
 
 
-def test_a_table_of_measurements_has_no_status_and_can_be_read_too(table):
+def test_a_table_of_measurements_without_status_can_be_read(table):
     columns = ("sensor", "x_mm", "y_mm", "z_mm", "time_s", "frame_number", "point_id")
     frames = read_frames(table([{"point_id": 1, **row} for row in ROWS], columns=columns))
-    assert frames[0].readings["tip"].position == SEEN.position
+    assert frames[0].readings["tip"].position == MEASURED.position
     assert frames[0].readings["ref1"].status == "missing"
 
 
-def test_a_position_of_a_sensor_that_was_not_well_is_not_taken(table):
+def test_a_position_with_a_bad_status_is_not_used(table):
     (frame,) = read_frames(table([{**ROWS[0], "status": "out of volume"}]))
     assert frame.readings["tip"].position is None
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"x_mm": "nan"}, "line 3: x_mm = nan: must be finite"),
         ({"x_mm": "0,5"}, "line 3: x_mm = 0,5: must be a number, with a decimal point"),
         ({"time_s": ""}, "line 3: time_s is empty"),
-        ({"sensor": ""}, "line 3: a sensor has no name"),
-        ({"sensor": "tip"}, "line 3: frame 4 has the sensor tip already: each once in a frame"),
-        ({"time_s": 0.01}, "frame 4: time_s goes back"),
+        ({"sensor": ""}, "line 3: sensor is empty"),
+        ({"sensor": "tip"}, "line 3: duplicate sensor tip in frame 4"),
+        ({"time_s": 0.01}, "frame 4: time_s must not decrease"),
     ],
 )
-def test_a_damaged_recording_is_refused_in_one_line(table, change, says):
+def test_a_damaged_recording_is_rejected_in_one_line(table, change, message):
     rows = [ROWS[0], {**ROWS[1], **change}, *ROWS[2:]]
-    with pytest.raises(InputError, match=says) as refusal:
+    with pytest.raises(InputError, match=message) as refusal:
         read_frames(table(rows))
     assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_rows_that_are_there_twice_are_refused(table, suffix):
-    """The same row again, and another one of the same sensor in the same frame, wherever it stands in the frame."""
+def test_duplicate_rows_are_rejected(table, suffix):
+    """An identical row, and another one of the same sensor in the same frame."""
     for again in (ROWS[0], {**ROWS[0], "x_mm": 9.0}):
-        with pytest.raises(InputError, match="line 4: frame 4 has the sensor tip already"):
+        with pytest.raises(InputError, match="line 4: duplicate sensor tip in frame 4"):
             read_frames(table([*ROWS[:2], again, *ROWS[2:]], suffix))
 
 
-def test_what_is_no_recording_is_refused(table, tmp_path):
+def test_a_file_that_is_not_a_recording_is_rejected(table, tmp_path):
     with pytest.raises(InputError, match="no column frame_number"):
         read_frames(table(ROWS, columns=("time_s", "sensor", "x_mm", "y_mm", "z_mm")))
-    with pytest.raises(InputError, match="holds no frames"):
+    with pytest.raises(InputError, match="contains no frames"):
         read_frames(table([]))
     for name in ("nothing.csv", "nothing.parquet"):
         with pytest.raises(InputError) as refusal:

@@ -1,4 +1,4 @@
-"""A recording once more, on any clock."""
+"""Replay of a recording on any clock."""
 
 import pytest
 
@@ -9,8 +9,8 @@ from flexneedle.types import VISIBLE, Frame, SensorReading
 FRAMES = [Frame(100.0 + n / 40, 7 + n, {"tip": SensorReading((float(n), 0.0, 0.0))}) for n in range(5)]
 
 
-class Hand:
-    """A clock that is set by hand."""
+class ManualClock:
+    """A clock that is set by the test."""
 
     def __init__(self, time=0.0):
         self.time = time
@@ -22,8 +22,8 @@ class Hand:
         self.time += seconds
 
 
-def test_frames_come_when_their_time_has_come_and_only_once():
-    clock = Hand(3.0)
+def test_frames_arrive_at_their_time_and_only_once():
+    clock = ManualClock(3.0)
     replay = Replay(FRAMES, clock)
     assert [f.number for f in replay.read()] == [7]
     assert replay.read() == ()
@@ -38,8 +38,8 @@ def test_frames_come_when_their_time_has_come_and_only_once():
     assert replay.read() == ()
 
 
-def test_its_status_tells_the_end():
-    clock = Hand()
+def test_its_status_reports_the_end():
+    clock = ManualClock()
     with Replay(FRAMES, clock) as replay:
         assert replay.status == VISIBLE
         clock.time = 1.0
@@ -47,6 +47,6 @@ def test_its_status_tells_the_end():
         assert replay.status == ENDED == "the recording has ended"
 
 
-def test_nothing_cannot_be_replayed():
+def test_a_replay_without_frames_is_rejected():
     with pytest.raises(InputError, match="at least one frame"):
-        Replay([], Hand())
+        Replay([], ManualClock())

@@ -1,4 +1,4 @@
-"""The device's clock: real time, that stands while the emulator's process is kept waiting."""
+"""The device's clock: real time that stops while the emulator's process is not scheduled."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,8 @@ from flexneedle.rig.emulator.server import device_time
 PERIOD_S = 1 / 40
 
 
-def lived(waits):
-    """Return real time and the device's (n,) after each wait (s) of a process that starts at 100 s."""
+def clocks(waits):
+    """Return real time and the device's time (n,) after each wait (s) of a process that starts at 100 s."""
     real, times, device = 100.0, [], 100.0
     for wait in waits:
         real, served = real + wait, real
@@ -20,13 +20,13 @@ def lived(waits):
     return np.array(times).T
 
 
-def test_served_in_time_it_is_real_time():
-    real, device = lived([0.005, 0.001, 0.009, 0.0] * 50)
+def test_without_pauses_it_is_real_time():
+    real, device = clocks([0.005, 0.001, 0.009, 0.0] * 50)
     np.testing.assert_array_equal(device, real)
 
 
-def test_it_stands_while_it_waits_and_catches_up_by_a_tenth():
-    real, device = lived([0.06] + [0.005] * 200)
+def test_after_a_pause_it_catches_up_at_ten_percent():
+    real, device = clocks([0.06] + [0.005] * 200)
     behind = real - device
     assert behind[0] == pytest.approx(0.06 - 0.011)
     assert behind[20] == pytest.approx(behind[0] - 20 * 0.0005)
@@ -34,15 +34,15 @@ def test_it_stands_while_it_waits_and_catches_up_by_a_tenth():
 
 
 @given(st.lists(st.floats(0.0, 0.4), max_size=80))
-def test_it_never_goes_back_runs_ahead_or_passes_half_a_frame_at_once(waits):
-    real, device = lived([0.005, *waits])
+def test_it_never_decreases_is_never_ahead_and_never_jumps_by_half_a_frame(waits):
+    real, device = clocks([0.005, *waits])
     assert (np.diff(device) >= 0.0).all()
     assert (device <= real).all()
     assert (real - device <= 0.2 + 1e-9).all()
-    leaps = np.diff(device) > PERIOD_S / 2
-    assert (real - device)[1:][leaps] == pytest.approx(0.2)  # it leaps only from too far behind
+    jumps = np.diff(device) > PERIOD_S / 2
+    assert (real - device)[1:][jumps] == pytest.approx(0.2)  # it jumps only if it is too far behind
 
 
-def test_one_that_was_stopped_leaps():
-    real, device = lived([0.005, 60.0])
+def test_after_a_long_stop_it_jumps():
+    real, device = clocks([0.005, 60.0])
     assert device[-1] == pytest.approx(real[-1] - 0.2)

@@ -1,4 +1,4 @@
-"""The wire format, against replies and checksums that NDI's own clients expect."""
+"""The wire format, compared with replies and checksums expected by NDI's clients."""
 
 import struct
 
@@ -18,7 +18,7 @@ def test_checksums_are_those_that_ndicapi_sends(command, checksum):
 
 
 @pytest.mark.parametrize(("reply", "line"), [("OKAY", b"OKAYA896\r"), ("RESET", b"RESETBE6F\r")])
-def test_replies_are_those_that_ndicapi_waits_for(reply, line):
+def test_replies_are_those_expected_by_ndicapi(reply, line):
     assert codec.text(reply) == line
 
 
@@ -29,11 +29,11 @@ def test_a_command_has_a_checksum_after_a_colon_and_none_after_a_space():
 
 
 @pytest.mark.parametrize("line", [b"INIT:E3A6", b"INIT:", b"INIT:E3", b"INITX:E3A5"])
-def test_a_wrong_checksum_is_noticed(line):
+def test_a_wrong_checksum_is_detected(line):
     assert not codec.parse(line).intact
 
 
-def test_bytes_that_are_no_text_make_no_command_and_no_failure():
+def test_bytes_outside_ascii_are_no_command_and_no_failure():
     assert codec.parse(b"\xff\xfe\x00").name not in ("INIT", "BX")
 
 
@@ -46,7 +46,7 @@ def test_a_binary_reply_has_two_checksums_lowest_byte_first():
 
 
 def test_a_checksum_over_all_of_a_binary_reply_is_the_same():
-    """ndicapi takes header and body together: a header with its checksum leaves nothing behind."""
+    """ndicapi computes the checksum of header and body together: that of a header with its checksum is 0."""
     reply = codec.binary(b"abc")
     assert codec.crc16(reply[:-2]) == codec.crc16(b"abc")
 

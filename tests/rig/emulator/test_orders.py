@@ -1,4 +1,4 @@
-"""Lines that tell the emulated tip where to rest."""
+"""Commands for the resting position of the emulated tip."""
 
 import os
 
@@ -10,68 +10,68 @@ from flexneedle.errors import InputError
 from flexneedle.rig.devices.aurora.tracker import Aurora
 from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.emulator import orders
-from flexneedle.rig.emulator.orders import Orders, parse_place
+from flexneedle.rig.emulator.orders import Orders, parse_position
 
 
-def test_a_place_is_three_numbers_in_mm():
-    assert parse_place(" 10  -20.5 -2e2\r") == (10.0, -20.5, -200.0)
+def test_a_position_is_three_numbers_in_mm():
+    assert parse_position(" 10  -20.5 -2e2\r") == (10.0, -20.5, -200.0)
 
 
 @pytest.mark.parametrize(
     "line", ["", "1 2", "1 2 3 4", "1, 2, 3", "a b c", "nan 0 0", "0 inf 0", "0 0 -1000.1"]
 )
-def test_what_is_no_place_is_refused_in_one_line(line):
+def test_an_invalid_position_is_rejected_in_one_line(line):
     with pytest.raises(InputError, match=r"must be (three numbers|within 1000 mm)") as refusal:
-        parse_place(line)
+        parse_position(line)
     assert "\n" not in str(refusal.value)
 
 
-def test_lines_are_given_when_they_are_whole_until_the_stream_ends():
+def test_complete_lines_are_returned_until_the_stream_ends():
     source, sink = os.pipe()
-    told = Orders(source)
-    assert told.read([]) == [], "nothing there is not waited for"
+    commands = Orders(source)
+    assert commands.read([]) == [], "no waiting without data"
     os.write(sink, b"1 2 3\n4 5")
-    assert told.read(told.sources) == ["1 2 3"]
+    assert commands.read(commands.sources) == ["1 2 3"]
     os.write(sink, b" 6\n\n7")
-    assert told.read(told.sources) == ["4 5 6"]
+    assert commands.read(commands.sources) == ["4 5 6"]
     os.close(sink)
-    assert told.read(told.sources) == []
-    assert told.sources == []
+    assert commands.read(commands.sources) == []
+    assert commands.sources == []
     os.close(source)
 
 
 def test_a_stream_that_cannot_be_read_has_ended():
     source, sink = os.pipe()
-    told = Orders(sink)
-    assert told.read([sink]) == []
-    assert told.sources == []
+    commands = Orders(sink)
+    assert commands.read([sink]) == []
+    assert commands.sources == []
     os.close(source)
     os.close(sink)
     assert Orders(None).sources == []
 
 
-def test_a_terminal_is_left_alone_in_the_background(monkeypatch):
+def test_a_terminal_is_not_read_in_the_background(monkeypatch):
     device, host = os.openpty()
-    told = Orders(host)
-    assert told.sources == [host]
+    commands = Orders(host)
+    assert commands.sources == [host]
     monkeypatch.setattr(orders.os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
-    assert told.sources == []
+    assert commands.sources == []
     monkeypatch.setattr(orders.os, "tcgetpgrp", lambda _: os.getpgrp())
-    assert told.sources == [host]
+    assert commands.sources == [host]
     os.close(device)
     os.close(host)
 
 
-def test_the_tip_rests_from_the_start_or_where_it_is_told_and_the_references_stay():
+def test_the_tip_rests_from_the_start_or_at_a_given_position():
     def last(frames, name):
         return np.mean([frame.readings[name].position for frame in frames[-20:]], axis=0)
 
-    with emulator("--still", "--sensors", "2") as (path, tell), Aurora(path, WallClock()) as aurora:
-        at_first, _ = read_until(aurora, lambda frames: len(frames) >= 20)
-        assert tell("30 -40 -250") == "the tip rests at 30 -40 -250 mm"
-        assert tell("30 -40").startswith("'30 -40': must be three numbers")
+    with emulator("--still", "--sensors", "2") as (path, send), Aurora(path, WallClock()) as aurora:
+        before, _ = read_until(aurora, lambda frames: len(frames) >= 20)
+        assert send("30 -40 -250") == "the tip rests at 30 -40 -250 mm"
+        assert send("30 -40").startswith("'30 -40': must be three numbers")
         aurora.read()
-        told, _ = read_until(aurora, lambda frames: len(frames) >= 30)
-    np.testing.assert_allclose(last(at_first, "tip"), (0, 0, -200), atol=0.1)
-    np.testing.assert_allclose(last(told, "tip"), (30, -40, -250), atol=0.1)
-    np.testing.assert_allclose(last(told, "ref1"), last(at_first, "ref1"), atol=0.1)
+        moved, _ = read_until(aurora, lambda frames: len(frames) >= 30)
+    np.testing.assert_allclose(last(before, "tip"), (0, 0, -200), atol=0.1)
+    np.testing.assert_allclose(last(moved, "tip"), (30, -40, -250), atol=0.1)
+    np.testing.assert_allclose(last(moved, "ref1"), last(before, "ref1"), atol=0.1)

@@ -1,4 +1,4 @@
-"""Clients that others wrote find, set up and read the emulator: ndicapi's Python module, scikit-surgerynditracker."""
+"""Independent clients find, set up and read the emulator: ndicapi's Python module, scikit-surgerynditracker."""
 
 import numpy as np
 import pytest
@@ -22,25 +22,25 @@ def opened(path):
     return device, [bytes([handle]) for handle in handles]
 
 
-@pytest.mark.parametrize("letters", ["BX", "TX"])
-def test_ndicapi_reads_poses_and_frame_numbers(letters):
-    """Two sensors: with more of them ndicapi 3.7.6 cannot make a str of a binary reply."""
-    frame = getattr(ndicapy, f"ndiGet{letters}Frame")
-    transform = getattr(ndicapy, f"ndiGet{letters}Transform")
+@pytest.mark.parametrize("command", ["BX", "TX"])
+def test_ndicapi_reads_poses_and_frame_numbers(command):
+    """Two sensors: with more, ndicapi 3.7.6 cannot decode a binary reply to a str."""
+    frame = getattr(ndicapy, f"ndiGet{command}Frame")
+    transform = getattr(ndicapy, f"ndiGet{command}Transform")
     with emulated("--sensors", "2") as path:
         device, handles = opened(path)
-        ndicapy.ndiCommand(device, f"{letters}:0801")
-        told = [(frame(device, handle), transform(device, handle)) for handle in handles]
+        ndicapy.ndiCommand(device, f"{command}:0801")
+        read = [(frame(device, handle), transform(device, handle)) for handle in handles]
         ndicapy.ndiCommand(device, "TSTOP:")
         ndicapy.ndiClose(device)
-    for name, (number, values) in zip(SENSORS, told, strict=False):
+    for name, (number, values) in zip(SENSORS, read, strict=False):
         true = pose(name, number, 0)
         np.testing.assert_allclose(values[4:7], true.position, atol=0.0051)
         np.testing.assert_allclose(values[:4], true.orientation, atol=5.1e-5)
         np.testing.assert_allclose(values[7], true.indicator, atol=5.1e-5)
 
 
-def test_ndicapi_is_told_of_missing_sensors_and_of_errors():
+def test_ndicapi_reads_missing_sensors_and_errors():
     with emulated("--sensors", "1", "--fault", "missing@0") as path:
         device, (handle,) = opened(path)
         ndicapy.ndiCommand(device, "BX:0801")
@@ -64,7 +64,7 @@ def test_scikit_surgerynditracker_tracks(firmware, sensors):
         tracker.stop_tracking()
         tracker.close()
     assert ports == [10, 11, 12, 13][:sensors]
-    for name, number, told, indicator in zip(SENSORS, numbers, poses, quality, strict=False):
+    for name, number, measured, indicator in zip(SENSORS, numbers, poses, quality, strict=False):
         true = pose(name, int(number), 0)
-        np.testing.assert_allclose(told[0], (*true.orientation, *true.position), atol=0.0051)
+        np.testing.assert_allclose(measured[0], (*true.orientation, *true.position), atol=0.0051)
         np.testing.assert_allclose(indicator, true.indicator, atol=5.1e-5)

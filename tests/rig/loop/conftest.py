@@ -1,4 +1,4 @@
-"""Insertions that several tests look at, each carried out once."""
+"""Insertions shared by several tests, each executed once."""
 
 from functools import cache
 
@@ -24,35 +24,35 @@ def plan():
 
 @pytest.fixture(scope="session")
 def real(plan):
-    """An insertion against a phantom, and what its tracker said, at once."""
+    """An insertion with a phantom and undelayed readings, and the record of its tracker."""
     tank = Tank(plan.bevel)
     return run(plan, tank.rig()), tank
 
 
 @pytest.fixture(scope="session")
 def late(plan):
-    """The same with readings that come a control period late."""
+    """The same with readings delayed by a control period."""
     tank = Tank(plan.bevel, delay=0.2)
     return run(plan, tank.rig()), tank
 
 
 @pytest.fixture(scope="session")
 def replayed(plan, real):
-    """What `real` was, without its phantom: only readings, and what the driver said that it did."""
+    """A replay of `real` without its phantom: only readings and applied commands."""
     tank = real[1]
     return run(plan, Stage(tank.tape, tank.applied).rig())
 
 
 @pytest.fixture(scope="session")
 def thinned(plan, real):
-    """The same where one reading of every batch is left out."""
+    """A replay of `real` without one reading of every batch."""
     tank = real[1]
     return run(plan, Stage(loop(spoilt_tape(tank.tape, 1, lost)), tank.applied).rig())
 
 
 @pytest.fixture(scope="session")
 def inserted(plan):
-    """Return the insertion of a seed in the virtual rig, each kind of it carried out once."""
+    """Return the insertion of a seed in the virtual rig; each variant is executed once."""
 
     @cache
     def insert(seed, phantom="exact", controller="adaptive-mpc", threads=None, **values):

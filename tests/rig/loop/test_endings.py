@@ -1,4 +1,4 @@
-"""How an insertion ends but at its target, and drivers that do not carry out the command."""
+"""Endings of an insertion away from its target, and drivers that do not execute the command exactly."""
 
 import itertools
 import math
@@ -32,9 +32,11 @@ def missing_by(plan, miss):
     return replace(plan, tips=tips, limit="setup.max_guide_step_mm = 0.5")
 
 
-def test_a_plan_that_misses_by_more_than_a_millimetre_is_refused_unless_forced(plan):
+def test_a_plan_that_misses_by_more_than_a_millimetre_is_rejected_unless_forced(plan):
     tank = Tank(plan.bevel)
-    with pytest.raises(RunError, match=r"misses the target by 1\.01 mm .*bound by setup\.max_guide_step_mm"):
+    with pytest.raises(
+        RunError, match=r"misses the target by 1\.01 mm .*limited by setup\.max_guide_step_mm"
+    ):
         run(missing_by(plan, 1.01), tank.rig(), controller="open-loop")
     assert tank.moves == []
     with pytest.raises(RunError):
@@ -45,14 +47,14 @@ def test_a_plan_that_misses_by_more_than_a_millimetre_is_refused_unless_forced(p
 
 
 def test_a_controller_that_predicts_the_miss_is_held_by_that_and_not_by_the_plan(plan):
-    """The plan's miss is no evidence on the phantom's needle; the insertion finds whether it can be reached."""
+    """The miss of the plan does not apply to the phantom's needle; the insertion itself predicts the miss."""
     assert METHODS[DEFAULT].predicts
     assert not any(method.predicts for name, method in METHODS.items() if name != DEFAULT)
     assert first_periods(1, missing_by(plan, 1.01), Tank(plan.bevel).rig())
 
 
 class Stuck(Stage):
-    """A driver that doesn't move, and a tracker that measures that."""
+    """A driver that does not move, with a tracker that measures the needle at rest."""
 
     def __init__(self):
         super().__init__([])
@@ -69,7 +71,7 @@ def test_a_needle_that_does_not_move_fails_after_four_times_the_planned_periods(
     short = replace(plan, controls=plan.controls[:5], tips=plan.tips[:6], guide=plan.guide[:6])
     done = run(short, Stuck().rig(), force=True)
     assert done.outcome == "failed"
-    assert "four times the planned periods" in done.reason
+    assert "within 4 times the planned steps" in done.reason
     assert len(done.periods) == 20
     assert {period.applied for period in done.periods} == {STILL}
     assert done.periods[0].command[0] > 0.0
@@ -84,11 +86,11 @@ def test_a_model_that_does_not_converge_ends_the_run(plan, monkeypatch):
     assert not done.periods[0].converged
 
 
-def test_where_no_path_converges_the_needle_is_held_for_that(plan, monkeypatch):
-    seen, calls = adaptive_mpc._measured_rollout, itertools.count()
+def test_the_needle_is_held_if_no_path_converges(plan, monkeypatch):
+    rollout, calls = adaptive_mpc._measured_rollout, itertools.count()
 
     def lost(fitted, controls):
-        outcome = seen(fitted, controls)
+        outcome = rollout(fitted, controls)
         kept = next(calls) < 20
         return outcome if kept else replace(outcome, converged=np.zeros_like(outcome.converged))
 
@@ -99,8 +101,8 @@ def test_where_no_path_converges_the_needle_is_held_for_that(plan, monkeypatch):
     assert done.periods[-1].decision == "held: no path converges on the fitted model"
 
 
-def test_a_plant_that_does_not_converge_is_said_in_its_periods(plan):
-    """It ends nothing, since a controller knows nothing of it; but no period of it passes as good."""
+def test_a_plant_that_does_not_converge_is_recorded_in_its_periods(plan):
+    """It does not end the insertion, since the controller has no access to it; but its periods are not converged."""
     tank = Tank(plan.bevel)
     lost_after = 1.0
 
@@ -114,15 +116,13 @@ def test_a_plant_that_does_not_converge_is_said_in_its_periods(plan):
     assert {period.converged for period in done.periods} == {True, False}
 
 
-def test_the_end_of_the_stroke_ends_the_run_and_is_said(plan):
+def test_the_end_of_the_stroke_ends_the_run_with_a_reason(plan):
     short = PHANTOM.with_values({"setup.stroke_mm": 60.0, "target.depth_mm": 20.0})
     tank = Tank(plan.bevel, scenario=short)
     done = run(of_any_scenario(plan), tank.rig(), short)
     assert sum(command[0] for _, command in tank.moves) == pytest.approx(60.0, abs=0.01)
     left = plan.target[0] - done.periods[-1].estimate[0]
-    assert done.reason.startswith(
-        f"the stroke ends {left:.2f} mm before the target depth; missed the target by "
-    )
+    assert done.reason.startswith(f"stroke ends {left:.2f} mm before the target depth; missed the target by ")
     assert not done.reached
 
 
@@ -134,7 +134,7 @@ class Rounding(Tank):
         return super().apply(rounded, duration)
 
 
-def test_the_command_as_applied_is_recorded_and_believed(plan):
+def test_the_command_as_applied_is_recorded_and_used_by_the_estimate(plan):
     known = PHANTOM.with_values({"phantom.start_axial_sd_mm": 0.0, "control.start_axial_sd_mm": 0.0})
     tank = Rounding(plan.bevel, scenario=known)
     done = run(plan, tank.rig(), known)

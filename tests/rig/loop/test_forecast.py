@@ -1,4 +1,4 @@
-"""What the loop does with the miss that a decision predicts: it warns, holds, gives up with the reason; or force."""
+"""Response of the loop to a predicted miss: warning, hold, abort with the reason; or continuation with force."""
 
 import csv
 import io
@@ -23,28 +23,28 @@ HELD = "held: no path to the target found"
 
 
 def predicting(misses, sd=0.1):
-    """A controller that goes straight on and predicts these misses (mm), the last one for good."""
+    """A controller that inserts straight and predicts these misses (mm), the last one from then on."""
 
     def decide(_task, memory, _estimate, _rng):
         miss = misses[min(memory, len(misses) - 1)]
-        return Decision((1.0, 0.0, 0.0, 0.0, -1), "straight on", miss=miss, miss_sd=sd), memory + 1
+        return Decision((1.0, 0.0, 0.0, 0.0, -1), "straight", miss=miss, miss_sd=sd), memory + 1
 
-    return Method("straight-on", "goes straight on", decide=decide, begin=lambda _task: 0)
+    return Method("straight-on", "inserts straight", decide=decide, begin=lambda _task: 0)
 
 
 def in_air(plan):
-    """The plan with a target in air: quick, and nothing bends."""
+    """The plan with a target in air: fast, without bending."""
     return replace(plan, target=(-20.0, 0.0))
 
 
 def inserted(plan, misses, sd=0.1, *, force=True, scenario=PHANTOM):
-    """An insertion with such a controller; whole plans need no force."""
+    """An insertion with such a controller."""
     tank = Tank(plan.bevel, scenario=scenario)
     return run(plan, tank.rig(), scenario, controller=predicting(misses, sd), force=force), tank
 
 
-def test_without_a_path_the_needle_is_held_and_given_up_with_the_reason(plan):
-    """It does not move from the first such decision on; the reason has the miss, the limit and the remedy."""
+def test_without_a_path_the_needle_is_held_and_the_insertion_aborted_with_the_reason(plan):
+    """It does not move from the first such decision on; the reason gives the miss, the limit and the remedy."""
     done, tank = inserted(plan, [0.0] * 5 + [3.0], force=False)
     assert done.outcome == "held"
     assert done.reason.startswith("no path to the target found: predicted miss +3.00 ± 0.10 mm is beyond")
@@ -60,15 +60,15 @@ def test_without_a_path_the_needle_is_held_and_given_up_with_the_reason(plan):
     assert done.held_s == pytest.approx(done.periods[-1].time - before)
 
 
-def test_how_long_it_is_held_is_the_scenarios(plan):
+def test_the_duration_of_the_hold_is_that_of_the_scenario(plan):
     patient = PHANTOM.with_values({"control.hold_limit_s": 2.5})
     done, _ = inserted(plan, [3.0], force=False, scenario=patient)
     assert done.periods[-1].time == pytest.approx(2.5, abs=2.0 * PHANTOM.tracker.period)
     assert done.outcome == "held"
 
 
-def test_with_a_path_again_it_goes_on(plan):
-    """Held for less than the limit; the next doubt has the whole limit again."""
+def test_a_hold_ends_when_a_path_is_found_again(plan):
+    """Held for less than the limit; the next hold has the whole limit again."""
     misses = [0.0] * 3 + [3.0] * 10 + [0.0] * 3 + [3.0]
     done, tank = inserted(plan, misses, force=False)
     assert len(tank.moves) == 6
@@ -77,7 +77,7 @@ def test_with_a_path_again_it_goes_on(plan):
     assert done.periods[-1].time - last == pytest.approx(SECONDS, abs=2.0 * PHANTOM.tracker.period)
 
 
-def test_force_goes_on_and_warns(plan):
+def test_force_continues_with_a_warning(plan):
     done, tank = inserted(in_air(plan), [3.0], force=True)
     assert done.outcome == "done"
     assert len(tank.moves) >= 8
@@ -87,7 +87,7 @@ def test_force_goes_on_and_warns(plan):
 
 
 @pytest.mark.parametrize(("miss", "sd", "warned"), [(1.5, 0.1, True), (-1.1, 0.5, True), (0.5, 0.1, False)])
-def test_a_likely_miss_is_warned_of_and_not_held(plan, miss, sd, warned):
+def test_a_likely_miss_gives_a_warning_and_no_hold(plan, miss, sd, warned):
     done, _ = inserted(in_air(plan), [miss], sd)
     assert done.outcome == "done"
     assert bool(done.warning) is warned
@@ -95,23 +95,23 @@ def test_a_likely_miss_is_warned_of_and_not_held(plan, miss, sd, warned):
     assert set(recorded) == {(miss, sd)}
 
 
-def test_a_controller_that_predicts_nothing_is_neither_held_nor_warned_of(plan):
+def test_a_controller_without_predictions_gets_neither_hold_nor_warning(plan):
     done, _ = inserted(in_air(plan), [np.nan], np.nan)
     assert done.outcome == "done"
     assert done.warning == ""
     assert all(np.isnan(period.miss) for period in done.periods)
 
 
-def test_a_miss_that_nothing_predicted_is_the_reason_and_no_warning(plan):
-    """So that a study can count the misses that came without a warning on the way."""
-    aside = replace(in_air(plan), target=(-20.0, 3.0))
-    done, _ = inserted(aside, [0.0])
+def test_a_miss_that_was_not_predicted_is_reported_in_the_reason_without_a_warning(plan):
+    """So that a study can count the misses without a warning."""
+    lateral = replace(in_air(plan), target=(-20.0, 3.0))
+    done, _ = inserted(lateral, [0.0])
     assert done.outcome == "done"
     assert done.reason.startswith("missed the target by 3.")
     assert done.warning == ""
 
 
-def test_the_hold_and_the_warning_are_in_all_records_and_read_back(plan, tmp_path):
+def test_hold_and_warning_are_in_trace_csv_and_json(plan, tmp_path):
     """Trace, CSV and JSON."""
     done, _ = inserted(plan, [0.2, 1.5, 3.0], force=False)
     warned = [bool(period.warning) for period in done.periods]
@@ -137,8 +137,8 @@ def test_the_hold_and_the_warning_are_in_all_records_and_read_back(plan, tmp_pat
     assert (result["reason"], result["warning"]) == (done.reason, done.warning)
 
 
-def test_a_target_that_guide_and_bevel_cannot_reach_is_held_and_forced(plan):
-    """The plan's guide goes further than that of this rig, and the bevel is too weak to make up for it."""
+def test_an_unreachable_target_is_held_unless_forced(plan):
+    """The plan needs a larger guide motion than this rig permits, and the bevel is too weak to compensate."""
     narrow = PHANTOM.with_values(
         {"setup.max_guide_travel_mm": 0.1, "needle.bevel.offset_mm": 0.5, "target.lateral_mm": 0.0}
     )
@@ -168,8 +168,8 @@ def test_with_a_perfect_model_it_ends_at_the_target(number):
 
 @pytest.mark.parametrize("controller", ["adaptive-mpc", "resolved-rate", "ce-mpc"])
 @pytest.mark.parametrize("gap", [-2.0, 2.0])
-def test_the_depth_is_right_wherever_along_the_axis_the_needle_starts(plan, controller, gap):
-    """The scenario's tip is 2 mm further from the skin than the plant's, or nearer."""
+def test_the_depth_is_reached_with_an_axial_start_error(plan, controller, gap):
+    """The scenario's tip is 2 mm further from the skin than the plant's, or 2 mm nearer."""
     nothing = {
         key: value
         for key, value in world(1, "perfect").flat().items()

@@ -1,4 +1,4 @@
-"""The closed loop where nothing fails: its record, its randomness, and no other access to the phantom."""
+"""The closed loop without faults: its record, its random streams, and its access to the phantom."""
 
 import dataclasses
 import math
@@ -48,7 +48,7 @@ def test_record_is_complete_for_every_period(plan, real):
         assert str(period.verdict) == "ok"
         np.testing.assert_allclose(
             period.applied, period.command, atol=0.01
-        )  # but for the motors' resolution
+        )  # except for the motors' resolution
         assert period.shape.shape == (61, 3)
         assert period.decision
         assert math.isfinite(period.cost)
@@ -64,7 +64,7 @@ def test_record_is_complete_for_every_period(plan, real):
         assert period.converged
 
 
-def test_record_has_the_truth_at_its_end(plan, real):
+def test_the_record_ends_with_the_true_state(plan, real):
     done, tank = real
     condition = tank.phantom.condition()
     x, y = condition.tip[:2]
@@ -80,11 +80,11 @@ def test_record_has_the_truth_at_its_end(plan, real):
     assert done.periods[-2].estimate[0] < plan.target[0] - PHANTOM.control.depth_tolerance_mm
 
 
-def test_speed_is_that_of_the_scenario_rounded_up_to_whole_readings(real):
+def test_the_duration_of_a_move_is_rounded_up_to_whole_tracker_periods(real):
     done, _ = real
     times = [0.0, *(period.time for period in done.periods)]
     for period, duration in zip(done.periods, np.diff(times), strict=True):
-        if period.command == STILL:  # a rest, for late readings
+        if period.command == STILL:  # a rest, for delayed readings
             continue
         needed = period.command[0] / PHANTOM.setup.insertion_speed_mm_s
         assert needed - 1e-6 <= duration < needed + READING
@@ -93,7 +93,7 @@ def test_speed_is_that_of_the_scenario_rounded_up_to_whole_readings(real):
 
 @pytest.mark.long
 def test_phantoms_of_other_seeds_are_reached(plan, inserted):
-    """With all that a rig has, as shipped; a period more is the rest for the last reading, or one that was missing."""
+    """With all default imperfections; extra periods are the rest for the last reading, or holds for missing ones."""
     done = [inserted(seed) for seed in range(2001, 2005)]
     assert all(one.reached for one in done)
     assert np.mean([one.true_error_mm for one in done]) < 0.4
@@ -102,15 +102,15 @@ def test_phantoms_of_other_seeds_are_reached(plan, inserted):
 
 
 @pytest.mark.parametrize("phantom", ["exact", "model"])
-def test_same_seed_same_record_whatever_the_threads(inserted, phantom):
-    """To the last bit, in both plants."""
+def test_the_record_depends_on_the_seed_and_not_on_the_threads(inserted, phantom):
+    """To the last bit, with both plants."""
     one, again = (inserted(2001, phantom, threads=threads) for threads in (None, 1))
     assert list(map(facts, one.periods)) == list(map(facts, again.periods))
     assert (one.seed, one.phantom, one.controller) == (2001, phantom, "adaptive-mpc")
     assert (one.outcome, one.reason) == (again.outcome, again.reason) == ("done", "")
 
 
-def test_another_seed_is_another_phantom_tracker_and_search(inserted):
+def test_another_seed_changes_phantom_tracker_and_search(inserted):
     one, other = inserted(2001), inserted(2002)
     assert one.true_error_mm != other.true_error_mm
     assert one.periods[0].true_tip != other.periods[0].true_tip
@@ -118,22 +118,22 @@ def test_another_seed_is_another_phantom_tracker_and_search(inserted):
     assert one.periods[0].spread != other.periods[0].spread
 
 
-def test_the_other_plant_has_the_same_start_and_another_needle(inserted):
-    """Same draw, same noise; what only the exact one has is missing in the other."""
+def test_both_plants_have_the_same_start(inserted):
+    """Same draw, same noise; some imperfections exist only in the exact plant."""
     exact, model = inserted(2001), inserted(2001, "model")
     assert exact.periods[0].true_tip[1] == pytest.approx(model.periods[0].true_tip[1], abs=0.5)
     assert exact.periods[-1].true_tip != model.periods[-1].true_tip
     assert model.true_error_mm < 1.0
 
 
-def test_unknown_names_of_plant_and_controller_are_refused_with_the_choices(plan):
+def test_unknown_names_of_plant_and_controller_are_rejected_with_the_choices(plan):
     with pytest.raises(InputError, match="phantom = 'gel': must be one of exact, model"):
         flexneedle.insert(PHANTOM, plan, 0, phantom="gel")
     with pytest.raises(InputError, match="controller = 'pid': must be one of adaptive-mpc, "):
         flexneedle.insert(PHANTOM, plan, 0, controller="pid")
 
 
-def test_phantom_tracker_and_search_have_random_streams_of_their_own(plan, monkeypatch):
+def test_phantom_tracker_and_search_have_independent_random_streams(plan, monkeypatch):
     drawn, plants = [], []
 
     def virtual_rig(_scenario, _bevel, seeds, phantom, **_options):
@@ -172,19 +172,19 @@ def test_on_period_gets_each_period_as_it_ends(plan):
 
 
 def test_replayed_readings_without_any_phantom_give_the_same_commands(real, replayed):
-    """All that the controller learns are the readings and what was applied: they alone make the same record."""
+    """The controller has access only to the readings and the applied commands: these give the same record."""
     assert list(map(believed, replayed.periods)) == list(map(believed, real[0].periods))
     assert replayed.outcome == "done"
 
 
-def test_late_readings_replayed_give_the_same_commands(plan, late):
+def test_replayed_delayed_readings_give_the_same_commands(plan, late):
     done, tank = late
     replayed = run(plan, Stage(tank.tape, tank.applied).rig())
     assert list(map(believed, replayed.periods)) == list(map(believed, done.periods))
     assert replayed.outcome == "done"
 
 
-def test_replayed_readings_before_another_phantom_give_the_same_commands(plan, real):
+def test_replayed_readings_with_another_phantom_give_the_same_commands(plan, real):
     done, tank = real
     other, stage = Tank(plan.bevel, seed=2777), Stage(tank.tape)
     swapped = run(plan, Rig(other.phantom, other, stage, other.phantom.condition))
@@ -193,7 +193,7 @@ def test_replayed_readings_before_another_phantom_give_the_same_commands(plan, r
 
 
 def test_other_readings_give_other_commands(plan, real):
-    """The replay would notice a change: one reading off by 1.5 mm alters the commands that follow."""
+    """The replay is sensitive: an error of 1.5 mm in one reading changes the commands that follow."""
     done, tank = real
     at = 40
     changed = [replace(tank.tape[at][-1], y=tank.tape[at][-1].y + 1.5)]

@@ -1,4 +1,4 @@
-"""The closed loop with readings that come late or not at all."""
+"""The closed loop with delayed and missing readings."""
 
 from dataclasses import replace
 
@@ -19,8 +19,8 @@ from insertions import (
 )
 
 
-def test_after_the_last_move_it_rests_until_that_is_seen(plan, late):
-    """The readings of the last move come a period later; the record ends with one of the needle at rest."""
+def test_after_the_last_move_it_rests_until_a_reading_at_rest_arrives(plan, late):
+    """The readings of the last move arrive a period later; the record ends with a reading at rest."""
     done, tank = late
     assert (done.outcome, done.reason) == ("done", "")
     rests = [period for period in done.periods if period.decision == RESTING]
@@ -44,8 +44,8 @@ def test_without_a_delay_there_is_no_rest(real):
     assert RESTING not in {period.decision for period in real[0].periods}
 
 
-def test_late_readings_are_used_for_the_time_at_which_they_were_taken(late, real):
-    """Innovations are as small as those of readings at once: a needle that moves 1 mm a period is not 1 mm off."""
+def test_delayed_readings_are_used_at_their_time_of_measurement(late, real):
+    """Innovations are as small as without a delay, although the needle moves by 1 mm per period."""
     for done, tank in (late, real):
         off = np.array([period.innovation for period in done.periods[20:]])
         assert np.sqrt((off**2).mean(axis=0)).max() < 0.15
@@ -55,8 +55,8 @@ def test_late_readings_are_used_for_the_time_at_which_they_were_taken(late, real
         )
 
 
-def test_no_reading_of_a_batch_is_lost_for_having_been_on_its_way(plan, late):
-    """The eldest are 0.375 s old when they are read, 0.3 s the limit: they came while the needle moved, and count."""
+def test_readings_in_transit_during_a_move_are_not_stale(plan, late):
+    """The oldest are 0.375 s old when they are read, with a limit of 0.3 s: they arrived during the move, and count."""
     done, tank = late
 
     def estimates(tape, scenario=PHANTOM):
@@ -70,8 +70,8 @@ def test_no_reading_of_a_batch_is_lost_for_having_been_on_its_way(plan, late):
     assert estimates([batch[-1:] for batch in tank.tape]) != real
 
 
-def test_a_bad_reading_of_the_needle_at_rest_holds_until_a_good_one(plan, late):
-    """It has arrived all the same: no further move."""
+def test_a_bad_reading_at_rest_holds_the_needle_until_a_good_one(plan, late):
+    """It has arrived nevertheless: no further move."""
     done, tank = late
     tape, rests = list(tank.tape), sum(period.decision == RESTING for period in done.periods)
     spoilt = tuple(map(blind, tape[-1]))
@@ -80,14 +80,14 @@ def test_a_bad_reading_of_the_needle_at_rest_holds_until_a_good_one(plan, late):
     assert held.outcome == "done"
     assert len(held.periods) == len(done.periods) + 1
     assert [period.decision for period in held.periods[-rests - 1 :]] == [*[RESTING] * rests, HELD]
-    assert [str(period.verdict) for period in held.periods[-2:]] == ["missing: tracker sees no tip", "ok"]
+    assert [str(period.verdict) for period in held.periods[-2:]] == ["missing: tip not measured", "ok"]
 
 
 def test_missing_readings_hold_the_needle_for_one_reading_each(plan, inserted):
-    """A fifth of all, as the scenario says: whenever the newest sees no tip; the rest of the loop is as ever."""
+    """20 %, as in the scenario: the needle is held whenever the newest reading has no tip."""
     done = inserted(2001, phantom__missing_fraction=0.2)
     assert done.outcome == "done"
-    blind = [period.index for period in done.periods if str(period.verdict) == "missing: tracker sees no tip"]
+    blind = [period.index for period in done.periods if str(period.verdict) == "missing: tip not measured"]
     assert len(blind) > 5
     for index in blind:
         after = done.periods[index + 1]
@@ -100,7 +100,7 @@ def test_missing_readings_hold_the_needle_for_one_reading_each(plan, inserted):
 
 
 def test_a_delay_beyond_the_age_limit_holds_from_the_start(inserted):
-    """As the scenario says it: no reading younger than 0.3 s, none believed, nothing hidden, and nothing moves."""
+    """All readings are older than the limit of 0.3 s and rejected, and nothing moves."""
     done = inserted(2001, phantom__delay_periods=1.75)
     assert done.outcome == "held"
     assert "stale: 0.350 s old, limit 0.3 s" in done.reason

@@ -1,4 +1,4 @@
-"""What stands in the tank: drawn by a seed alone, each entry as `[phantom]` says, whatever the other entries are."""
+"""The true phantom: drawn with a seed, each key of `[phantom]` independent of the others."""
 
 import hashlib
 import json
@@ -33,7 +33,7 @@ LAYERED = PHANTOM.with_values(
         + [{"shear_modulus_kpa": 4.0, "alpha": 8.0, "compression_length_mm": 20.0, "engaged_width_mm": 5.0}]
     }
 )
-DOUBLED = {  # entries of [phantom]: twice as much as shipped, and what of the truth may change
+DOUBLED = {  # keys of [phantom]: twice the default, and the values of the true phantom that may change
     "shear_modulus_factor": ([1.2, 3.2], {"layers"}),
     "shear_modulus_variation": (0.4, {"variation"}),
     "variation_length_mm": (20.0, {"variation"}),
@@ -69,12 +69,12 @@ def factors(truth, scenario=PHANTOM):
 
 
 def axial_error(truth, scenario=PHANTOM):
-    """How much further along the axis base and tip start than the scenario says (mm)."""
+    """Axial start error (mm) of base and tip, relative to the scenario."""
     return scenario.setup.tip_to_skin_mm - truth.scenario.setup.tip_to_skin_mm
 
 
 def entries(truth):
-    """What was drawn, by name."""
+    """The drawn values by name."""
     return {
         "layers": factors(truth),
         "boundaries": truth.scenario.layer_tops,
@@ -90,14 +90,14 @@ def entries(truth):
 
 @pytest.fixture(scope="module")
 def many():
-    """A thousand phantoms and more, with a tracker bias of 0.3 mm."""
+    """More than a thousand phantoms, with a tracker bias of 0.3 mm."""
     biased = PHANTOM.with_values({"phantom.tracker_bias_mm": 0.3})
     return [drawn(seed, biased) for seed in range(MANY)]
 
 
 @given(seed=st.integers(0, 2**63))
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=50)
-def test_a_draw_is_within_its_ranges_and_changes_nothing_else(seed):
+def test_a_draw_is_within_its_ranges_and_leaves_other_values_unchanged(seed):
     truth = drawn(seed)
     found = entries(truth)
     assert all(0.6 <= factor <= 1.6 for factor in found["layers"])
@@ -105,7 +105,7 @@ def test_a_draw_is_within_its_ranges_and_changes_nothing_else(seed):
     assert abs(found["bend"]) == 0.5
     assert (
         abs(found["run_out"]) == 0.1
-    )  # to either side of the axis: the tip moves by 0.2 when the bevel turns
+    )  # on either side of the axis: the tip moves by 0.2 when the bevel rolls
     assert found["bias"] == (0.0, 0.0)
     assert 0.95 <= found["modulus"] <= 1.05
     changed = {key for key, value in truth.scenario.flat().items() if PHANTOM.flat()[key] != value}
@@ -116,7 +116,7 @@ def test_a_draw_is_within_its_ranges_and_changes_nothing_else(seed):
 
 
 def test_factors_are_uniform(many):
-    """Each layer, the bevel and the modulus (× 10) on its own; mean, sd and the ends of the range."""
+    """Each layer, the bevel and the modulus (× 10), independently; mean, sd and range."""
     found = np.array([[*factors(truth), entries(truth)["bevel"]] for truth in many])
     modulus = np.array([entries(truth)["modulus"] for truth in many])
     found = np.column_stack([found, 10.0 * modulus])
@@ -128,7 +128,7 @@ def test_factors_are_uniform(many):
 
 
 def test_start_and_layer_boundary_are_normal(many):
-    """Means, standard deviations, and 68 in a hundred within one of them; each on its own."""
+    """Means, standard deviations, and 68 % within one of them; independent of each other."""
     found = np.array(
         [
             (truth.base_y, truth.base_turn, axial_error(truth), truth.scenario.layer_tops[1] - 20.0)
@@ -142,7 +142,7 @@ def test_start_and_layer_boundary_are_normal(many):
     assert np.abs(np.corrcoef(found.T) - np.eye(4)).max() < 0.1
 
 
-def test_sides_are_drawn_evenly_and_on_their_own(many):
+def test_signs_are_drawn_evenly_and_independently(many):
     sides = np.sign([(truth.bend, truth.run_out, truth.base_y) for truth in many])
     np.testing.assert_allclose(sides.mean(axis=0), 0.0, atol=0.1)
     assert np.abs(np.corrcoef(sides.T) - np.eye(3)).max() < 0.1
@@ -154,20 +154,18 @@ def test_the_trackers_bias_has_its_length_and_any_direction(many):
     np.testing.assert_allclose(bias.mean(axis=0), 0.0, atol=0.03)
 
 
-def test_stiffness_varies_along_the_depth_as_it_says(many):
-    """Log-normal with mean 1 and sd 0.2, correlated over 10 mm: by e⁻¹ there, by e⁻² at twice that."""
+def test_the_variation_of_stiffness_has_its_size_and_correlation(many):
+    """Log-normal with mean 1 and sd 0.2; correlation e⁻¹ over 10 mm, e⁻² over 20 mm."""
     cell = many[0].cell_mm
     assert cell == 0.25
     factor = np.array([truth.variation for truth in many])
     assert factor.shape[1] * cell >= PHANTOM.setup.max_depth
     assert factor.mean() == pytest.approx(1.0, abs=0.01)
     assert factor.std() == pytest.approx(0.2, rel=0.05)
-    np.testing.assert_allclose(factor.mean(axis=0), 1.0, atol=0.03)  # at every depth, the skin too
+    np.testing.assert_allclose(factor.mean(axis=0), 1.0, atol=0.03)  # at every depth, also at the skin
     np.testing.assert_allclose(factor.std(axis=0), 0.2, rtol=0.15)
     level = np.log(factor)
-    assert (
-        abs(((level - level.mean()) ** 3).mean() / level.std() ** 3) < 0.05
-    )  # of the logarithm: none is askew
+    assert abs(((level - level.mean()) ** 3).mean() / level.std() ** 3) < 0.05  # of the logarithm: not skewed
     for lag, expected in ((1.0, math.exp(-0.1)), (10.0, math.exp(-1.0)), (20.0, math.exp(-2.0))):
         k = round(lag / cell)
         assert np.corrcoef(level[:, :-k].ravel(), level[:, k:].ravel())[0, 1] == pytest.approx(
@@ -177,7 +175,7 @@ def test_stiffness_varies_along_the_depth_as_it_says(many):
     assert abs(np.corrcoef(of_layer, level.mean(axis=1))[0, 1]) < 0.1
 
 
-def test_a_draw_depends_on_the_seed_alone():
+def test_a_draw_depends_only_on_the_seed():
     assert drawn(7) == drawn(7)
     assert drawn(7) != drawn(8)
     rng = np.random.default_rng(7)
@@ -185,13 +183,13 @@ def test_a_draw_depends_on_the_seed_alone():
     assert draw(PHANTOM, rng) != drawn(7)
 
 
-def test_every_entry_of_the_scenario_is_looked_at():
+def test_every_key_of_the_phantom_is_tested():
     assert {*DOUBLED, "contact_spacing_mm", "structure"} == set(PHANTOM.values()["phantom"])
 
 
 @pytest.mark.parametrize("key", DOUBLED)
-def test_doubling_one_entry_leaves_all_other_draws_as_they_are(key):
-    """So that one imperfection can be judged alone, pair by pair."""
+def test_doubling_one_key_does_not_change_the_other_draws(key):
+    """So that each imperfection can be compared in pairs."""
     value, touched = DOUBLED[key]
     changed = PHANTOM.with_values({f"phantom.{key}": value})
     for seed in range(5):
@@ -200,7 +198,7 @@ def test_doubling_one_entry_leaves_all_other_draws_as_they_are(key):
 
 
 @pytest.mark.parametrize("key", ["start_offset_sd_mm", "initial_bend_mm", "run_out_mm", "tracker_bias_mm"])
-def test_what_is_doubled_is_drawn_twice_as_large(key):
+def test_a_doubled_key_doubles_its_draw(key):
     name = {"start_offset_sd_mm": "base_y", "initial_bend_mm": "bend", "run_out_mm": "run_out"}.get(
         key, "bias"
     )
@@ -211,14 +209,14 @@ def test_what_is_doubled_is_drawn_twice_as_large(key):
 @pytest.mark.parametrize(
     "key", [key for key in DOUBLED if key in ("layer_shift_sd_mm", "shear_modulus_variation")]
 )
-def test_leaving_one_out_leaves_all_other_draws_as_they_are(key):
+def test_a_key_set_to_zero_does_not_change_the_other_draws(key):
     without = entries(drawn(4, PHANTOM.with_values({f"phantom.{key}": 0.0})))
     shipped = entries(drawn(4))
     assert {name for name in without if without[name] != shipped[name]} == DOUBLED[key][1]
 
 
-def test_a_truth_without_spread_is_the_scenario_itself():
-    """But for the spacing of its contacts."""
+def test_without_imperfections_the_true_scenario_is_the_scenario():
+    """Except for the spacing of its contacts."""
     expected = IDEAL.with_values({"contact.spacing_mm": IDEAL.phantom.contact_spacing_mm})
     for seed in range(3):
         truth = drawn(seed, IDEAL)
@@ -229,7 +227,7 @@ def test_a_truth_without_spread_is_the_scenario_itself():
 
 @pytest.mark.parametrize("shift", [1.5, 8.0, 100.0])
 def test_no_layer_vanishes(shift):
-    """However far boundaries are displaced, even past each other: a tenth of a millimetre is left."""
+    """For any displacement of the boundaries, even past each other: at least 0.1 mm remains."""
     scenario = LAYERED.with_values({"phantom.layer_shift_sd_mm": shift})
     thinnest = []
     for seed in range(60):
@@ -239,8 +237,8 @@ def test_no_layer_vanishes(shift):
     assert min(thinnest) == pytest.approx(0.1)
 
 
-def test_boundaries_are_displaced_each_on_its_own():
-    """About where the scenario has them, where they have room."""
+def test_boundaries_are_displaced_independently():
+    """Around the scenario's boundaries, if the layers are thick enough."""
     roomy = LAYERED.with_values({f"tissue.{k}.thickness_mm": 15.0 for k in range(3)})
     shift = np.array([drawn(seed, roomy).scenario.layer_tops[1:] for seed in range(500)]) - [15.0, 30.0, 45.0]
     np.testing.assert_allclose(shift.mean(axis=0), 0.0, atol=0.2)
@@ -248,8 +246,8 @@ def test_boundaries_are_displaced_each_on_its_own():
     assert np.abs(np.corrcoef(shift.T) - np.eye(3)).max() < 0.15
 
 
-def test_a_strong_bevel_is_drawn_within_the_rules():
-    """12 mm × 1.5 would break b < 0.7 h = 14: drawn from the part of the range that doesn't, evenly."""
+def test_a_strong_bevel_is_drawn_within_its_limit():
+    """12 mm × 1.5 would violate b < 0.7 h = 14 mm: drawn uniformly from the valid part of the range."""
     strong = PHANTOM.with_values({"needle.bevel.offset_mm": 12.0})
     offsets = [drawn(seed, strong).scenario.needle.bevel.offset_mm for seed in range(300)]
     assert 0.5 * 12.0 <= min(offsets) < 6.2
@@ -259,14 +257,14 @@ def test_a_strong_bevel_is_drawn_within_the_rules():
     assert drawn(0, symmetric).scenario.needle.bevel.offset_mm == 0.0
 
 
-def test_a_draw_knows_the_tissue_down_to_the_end_of_the_stroke_and_before_the_skin_none():
+def test_the_variation_covers_the_tissue_down_to_the_end_of_the_stroke():
     short = PHANTOM.with_values({"setup.stroke_mm": 60.0, "target.depth_mm": 25.0})
     truth = drawn(0, short)
     assert len(truth.variation) * truth.cell_mm == pytest.approx(31.5 + 8 * 0.25)
 
 
 def rounded(value):
-    """To 12 digits: the last ones of exp and log differ from processor to processor."""
+    """To 12 digits: the last digits of exp and log differ between processors."""
     if isinstance(value, float):
         return float(f"{value:.12g}")
     if isinstance(value, dict):
@@ -275,7 +273,7 @@ def rounded(value):
 
 
 def digest(truth):
-    """Of all that was drawn."""
+    """Of all drawn values."""
     values = truth.scenario.values()
     values = {name: values[name] for name in ("needle", "setup", "tissue", "contact", "target")}
     rest = [getattr(truth, field.name) for field in fields(truth)][1:]
@@ -290,8 +288,8 @@ def digest(truth):
         (world(15), ["f0d773d2e4f25312", "cc3203a4f0060a10", "105f39294b7cf02f"]),
     ],
 )
-def test_without_axial_error_and_modulus_variation_phantoms_are_those_published(scenario, digests):
-    """As drawn before these two were entries of `[phantom]`: with a guide, and without (world 15)."""
+def test_without_axial_error_and_modulus_variation_phantoms_are_the_published_ones(scenario, digests):
+    """As drawn before these two keys existed: with a guide, and without (world 15)."""
     before = scenario.with_values({"phantom.start_axial_sd_mm": 0.0, "phantom.youngs_modulus_variation": 0.0})
     assert [digest(drawn(seed, before)) for seed in (0, 7, 100000)] == digests
 
@@ -306,15 +304,15 @@ def test_without_axial_error_and_modulus_variation_phantoms_are_those_published(
     ],
     ids=["close to the skin", "close to the guide", "base close to the guide", "no guide"],
 )
-def test_a_start_error_leaves_half_of_the_way_to_skin_guide_and_stop(changes, low, high):
-    """However large its deviation: the truth is a scenario that both plants can begin with."""
+def test_a_start_error_is_at_most_half_of_the_distance_to_skin_guide_and_stop(changes, low, high):
+    """For any standard deviation the true scenario is valid for both plants."""
     scenario = PHANTOM.with_values({"phantom.start_axial_sd_mm": 50.0, **changes})
     errors = [axial_error(drawn(seed, scenario), scenario) for seed in range(60)]
     assert min(errors) == pytest.approx(low)
     assert max(errors) == pytest.approx(high)
 
 
-def test_a_target_beyond_the_stroke_of_a_needle_that_starts_further_back_is_the_deepest_within_it():
+def test_a_target_beyond_the_stroke_is_set_to_the_largest_depth_in_reach():
     scenario = PHANTOM.with_values({"target.depth_mm": PHANTOM.setup.max_depth})
     for seed in range(20):
         truth = drawn(seed, scenario).scenario

@@ -1,4 +1,4 @@
-"""The virtual phantom behind its ports: commands, time, motors, and each entry of `[phantom]` alone, in both plants."""
+"""The virtual phantom: commands, time, motors, and each key of `[phantom]` alone, with both plants."""
 
 import math
 
@@ -24,17 +24,20 @@ STRAIGHT = (1.0, 0.0, 0.0, 0.0, -1)
 STILL = (0.0, 0.0, 0.0, 0.0, -1)
 TURN = (0.0, 0.0, 0.0, 0.0, 1)
 SKIN = 29  # steps of 1 mm until the tip is in the tissue
-COARSE = {"phantom.element_mm": 5.0, "phantom.contact_spacing_mm": 2.0}  # where the mechanics do not matter
+COARSE = {
+    "phantom.element_mm": 5.0,
+    "phantom.contact_spacing_mm": 2.0,
+}  # for tests that do not depend on the mechanics
 both_plants = pytest.mark.parametrize("kind", PLANTS)
 
 
 def tank(scenario=IDEAL, kind="exact", bevel=1, **truth):
-    """A phantom of this truth; without imperfections unless they are named."""
+    """A phantom with only these imperfections."""
     return Phantom(Truth(scenario, cell_mm=0.5 * scenario.phantom.contact_spacing_mm, **truth), bevel, kind)
 
 
 def alone(seed=0, kind="exact", bevel=1, **values):
-    """The phantom that a seed draws where these are the only imperfections."""
+    """The phantom of a seed with only these imperfections."""
     scenario = IDEAL.with_values({f"phantom.{key}": value for key, value in values.items()})
     return Phantom(draw(scenario, np.random.default_rng(seed)), bevel, kind)
 
@@ -55,8 +58,8 @@ def tip(phantom):
 
 
 @both_plants
-def test_the_needle_starts_where_the_clamp_really_holds_it(kind):
-    """Just as the controller's model with that base, but for the mesh."""
+def test_the_needle_starts_at_the_true_pose_of_the_clamp(kind):
+    """As the controller's model with this base, except for the mesh."""
     phantom = tank(kind=kind, bevel=-1, base_y=0.4, base_turn=-0.002)
     simulator = Simulator(IDEAL)
     expected = simulator.step(simulator.start(-1).with_estimate(base_y=0.4, base_turn=-0.002), Control())
@@ -68,8 +71,8 @@ def test_the_needle_starts_where_the_clamp_really_holds_it(kind):
 
 
 @both_plants
-def test_a_command_is_carried_out_in_finer_steps(kind):
-    """1 mm in steps of 0.25: four equal parts, and the bevel turns once."""
+def test_a_command_is_executed_in_finer_steps(kind):
+    """1 mm in steps of 0.25 mm: four equal parts, and one roll of the bevel."""
     phantom = tank(kind=kind)
     by_hand = plant(kind, Truth(IDEAL), 1)
     for _ in range(32):
@@ -92,7 +95,7 @@ def test_parts_are_no_longer_than_the_step_of_the_phantom(advance, parts):
 
 
 @both_plants
-def test_all_inputs_of_a_command_arrive(kind):
+def test_all_inputs_of_a_command_are_executed(kind):
     phantom = driven(tank(kind=kind, base_y=0.1, base_turn=0.001), (0.9, 0.2, 0.002, 0.3, 1))
     inside = phantom._plant
     base = inside._s[[rd.BASE_X, rd.BASE_Y, rd.BASE_TURN]] if kind == "exact" else inside._state.base
@@ -102,14 +105,14 @@ def test_all_inputs_of_a_command_arrive(kind):
     assert inside.bevel == -1
 
 
-def test_time_passes_by_commands_and_waits():
+def test_time_advances_by_commands_and_waits():
     phantom = driven(tank(), AHEAD)
     phantom.wait(0.025)
     assert phantom.now() == pytest.approx(0.225)
 
 
-def test_tip_is_told_at_any_time_so_far():
-    """Within the last command, within those before it, and at rest before the start."""
+def test_the_tip_is_known_at_any_past_time():
+    """Within the last command, within earlier ones, and at rest before the start."""
     phantom = tank()
     tips = [tip(phantom)[:2]]
     for _ in range(3):
@@ -126,7 +129,7 @@ def test_tip_is_told_at_any_time_so_far():
     np.testing.assert_array_equal(phantom.tip_at(0.7), tips[3])
 
 
-def test_while_it_waits_the_tip_stays():
+def test_the_tip_does_not_move_during_a_wait():
     phantom = driven(tank(), AHEAD)
     before = phantom.condition()
     phantom.wait(0.5)
@@ -139,7 +142,7 @@ def test_while_it_waits_the_tip_stays():
 
 
 @both_plants
-def test_a_clamp_that_is_off_by_more_than_the_base_may_travel_is_drawn_all_the_same(kind):
+def test_a_clamp_offset_beyond_the_travel_of_the_base_is_valid(kind):
     tight = IDEAL.with_values({"setup.max_base_travel_mm": 0.1})
     moved = driven(tank(tight, kind, base_y=0.4, base_turn=0.001), AHEAD)
     free = driven(tank(IDEAL, kind, base_y=0.4, base_turn=0.001), AHEAD)
@@ -148,7 +151,7 @@ def test_a_clamp_that_is_off_by_more_than_the_base_may_travel_is_drawn_all_the_s
 
 @both_plants
 @pytest.mark.parametrize(
-    ("command", "told"),
+    ("command", "message"),
     [
         ((2.0, 0.0, 0.0, 0.0, -1), r"db_x = 2: must be at most 1 mm"),
         ((-0.5, 0.0, 0.0, 0.0, -1), r"db_x = -0.5: sum of the steps must be at least 0 mm"),
@@ -156,10 +159,10 @@ def test_a_clamp_that_is_off_by_more_than_the_base_may_travel_is_drawn_all_the_s
         ((1.0, 0.0, math.nan, 0.0, -1), r"db_theta = nan: must be a finite number"),
     ],
 )
-def test_a_command_beyond_a_limit_is_refused_before_anything_moves(kind, command, told):
+def test_a_command_beyond_a_limit_is_rejected_before_anything_moves(kind, command, message):
     phantom = Phantom(draw(PHANTOM, np.random.default_rng(3)), 1, kind)
     before = tip(phantom)
-    with pytest.raises(CommandError, match=told):
+    with pytest.raises(CommandError, match=message):
         phantom.apply(command, 0.4)
     assert phantom.now() == 0.0
     np.testing.assert_array_equal(tip(phantom), before)
@@ -176,7 +179,7 @@ def test_there_are_two_plants_and_the_exact_one_is_the_default():
 
 
 def rough(grid, scenario=IDEAL):
-    """A phantom with motors of this resolution whose needle is quick to compute."""
+    """A phantom with motors of this resolution and a coarse mesh."""
     return tank(scenario.with_values({**COARSE, "phantom.motor_resolution_mm": grid}))
 
 
@@ -189,8 +192,8 @@ def rough(grid, scenario=IDEAL):
     ),
 )
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=20)
-def test_motors_stand_on_their_steps_and_rounding_never_adds_up(grid, rows):
-    """After any commands each sum is within half a step of what was asked; what is returned is what was done."""
+def test_motors_are_on_whole_steps_and_rounding_does_not_accumulate(grid, rows):
+    """After any commands each sum is within half a step of the requested one; the applied command is returned."""
     phantom = rough(grid)
     asked, done = np.zeros(4), np.zeros(4)
     for row in rows:
@@ -200,13 +203,13 @@ def test_motors_stand_on_their_steps_and_rounding_never_adds_up(grid, rows):
         lengths = done[[0, 1, 3]]
         np.testing.assert_allclose(lengths / grid, np.rint(lengths / grid), atol=1e-6)
         assert np.abs(asked - done)[[0, 1, 3]].max() <= 0.5 * grid + 1e-9
-        assert applied[2] == row[2]  # a turn of the base is not rounded
+        assert applied[2] == row[2]  # the rotation of the base is not rounded
     s = phantom._plant._s[[rd.BASE_X, rd.BASE_Y, rd.BASE_TURN, rd.GUIDE_Y]]
     np.testing.assert_allclose(s - [IDEAL.start_base_x, 0.0, 0.0, 0.0], done, atol=1e-9)
 
 
-def test_steps_far_below_the_resolution_add_up():
-    """A thousand guide steps of 3 µm are 3 mm, and none of them goes astray on the way."""
+def test_steps_far_below_the_resolution_accumulate():
+    """A thousand guide steps of 3 µm are 3 mm, with the rounded sum at each step."""
     phantom, stood = rough(0.01), 0.0
     for k in range(1000):
         _, _, _, moved, _ = phantom.apply((0.0, 0.0, 0.0, 0.003, -1), 0.2)
@@ -216,23 +219,23 @@ def test_steps_far_below_the_resolution_add_up():
     assert stood == pytest.approx(3.0)
 
 
-def test_a_perfect_motor_does_what_it_is_told():
+def test_a_motor_with_resolution_0_applies_the_command_exactly():
     phantom = rough(0.0)
     assert phantom.apply((0.123456, 0.01234, 0.001, -0.098765, 1), 0.2) == (
         0.123456, 0.01234, 0.001, -0.098765, 1,
     )  # fmt: skip
 
 
-def test_a_motor_that_is_not_asked_to_move_stands_still():
-    """Even if it owes half a step, here since 0.255 mm is more than it goes at once."""
+def test_a_motor_without_a_command_does_not_move():
+    """Even with a remainder of half a step, here since 0.255 mm is above the largest step."""
     phantom = rough(0.01, IDEAL.with_values({"setup.max_guide_step_mm": 0.255}))
     assert phantom.apply((0.0, 0.0, 0.0, 0.255, -1), 0.2)[3] == pytest.approx(0.25)
     for _ in range(5):
         assert phantom.apply(STILL, 0.2) == STILL
 
 
-def test_rounding_passes_no_limit_of_the_setup():
-    """The controller's model takes what was applied, and refuses steps beyond its limits: 0.256 is rounded down."""
+def test_rounding_does_not_exceed_a_limit_of_the_setup():
+    """The controller's model uses the applied command and rejects steps beyond its limits: 0.256 is rounded down."""
     scenario = IDEAL.with_values(
         {
             "setup.max_advance_mm": 0.256,
@@ -253,33 +256,33 @@ def test_rounding_passes_no_limit_of_the_setup():
         applied = phantom.apply(row, 0.2)
         asked += (row[0], row[3])
         state = model.step(state, Control.from_row(applied))
-    assert state.travel[0] == pytest.approx(29.5)  # 0.25 a step: its fastest
+    assert state.travel[0] == pytest.approx(29.5)  # 0.25 per step, the largest
     assert state.travel[3] == pytest.approx(1.22, abs=0.011)
 
 
-# ---- each entry of `[phantom]` alone: an effect of the size that it states
+# ---- each key of `[phantom]` alone: the size of its effect
 
 
 def free(scenario=IDEAL):
-    """The same needle held by its clamp alone."""
+    """The same needle, held only by its clamp."""
     return scenario.with_values({"setup.guide_to_skin_mm": None})
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_initial_bend_is_how_far_the_free_tip_is_off_the_straight(seed):
-    """0.5 mm over its 150, to the side that was drawn; it turns over with the bevel."""
+def test_the_initial_bend_is_the_deflection_of_the_free_tip(seed):
+    """0.5 mm over 150 mm, to the drawn side; it is mirrored when the bevel rolls."""
     scenario = free().with_values({"phantom.initial_bend_mm": 0.5})
     phantom = Phantom(draw(scenario, np.random.default_rng(seed)), 1)
     off = tip(phantom)[1]
     assert abs(off) == pytest.approx(0.5, rel=1e-4)
     assert tip(driven(phantom, TURN))[1] == pytest.approx(-off)
-    assert tip(phantom)[2] == pytest.approx(-2.0 * off / 150.0, rel=5e-3)  # that of an arc
+    assert tip(phantom)[2] == pytest.approx(-2.0 * off / 150.0, rel=5e-3)  # slope of an arc
 
 
 @both_plants
 @pytest.mark.parametrize("seed", range(3))
-def test_the_tip_moves_by_the_run_out_when_the_bevel_turns(kind, seed):
-    """0.2 mm, across the tip, at once; and back when it turns back."""
+def test_the_tip_moves_by_the_run_out_when_the_bevel_rolls(kind, seed):
+    """0.2 mm, normal to the tip, at once; and back with the next roll."""
     phantom = alone(seed, kind, run_out_mm=0.2)
     here = tip(phantom)
     there = tip(driven(phantom, TURN))
@@ -289,8 +292,8 @@ def test_the_tip_moves_by_the_run_out_when_the_bevel_turns(kind, seed):
 
 
 @both_plants
-def test_the_run_out_stands_across_the_needle(kind):
-    """A base turned by 0.1 rad turns its direction, too."""
+def test_the_run_out_is_normal_to_the_needle(kind):
+    """A rotation of the base by 0.1 rad also rotates its direction."""
     plain, off = (
         driven(tank(free(), kind, run_out=run_out), (0.0, 0.0, 5e-3, 0.0, -1), times=20)
         for run_out in (0.0, 0.1)
@@ -300,8 +303,8 @@ def test_the_run_out_stands_across_the_needle(kind):
     assert tip(off)[2] == tip(plain)[2]
 
 
-def test_within_its_clearance_the_guide_moves_nothing():
-    """Then the needle stays 0.05 mm behind it, on both sides; a guide without play takes it along at once."""
+def test_within_its_clearance_the_guide_does_not_move_the_needle():
+    """Beyond it the needle is 0.05 mm behind the guide, on both sides; a guide without clearance moves it at once."""
     reach = tip(driven(tank(), (0.0, 0.0, 0.0, 0.1, -1)))[1]
     assert reach > 0.1
     for side in (1.0, -1.0):
@@ -312,7 +315,7 @@ def test_within_its_clearance_the_guide_moves_nothing():
 
 
 @pytest.mark.parametrize("friction", [5.0, 10.0])
-def test_friction_is_borne_by_the_base_for_each_millimetre_inserted(friction):
+def test_the_friction_at_the_base_is_proportional_to_the_inserted_length(friction):
     blunt = IDEAL.with_values({"needle.bevel.offset_mm": 0.0, "phantom.friction_mn_per_mm": friction})
     phantom = driven(tank(blunt), STRAIGHT, times=SKIN + 19)
     depth = tip(phantom)[0]
@@ -320,8 +323,8 @@ def test_friction_is_borne_by_the_base_for_each_millimetre_inserted(friction):
     assert phantom._plant._s[rd.BASE_FORCE_X] == pytest.approx(1e-3 * friction * depth)
 
 
-def test_friction_bows_a_bent_needle_further_out():
-    """An axial force on a needle that is off the straight: it deflects more with twice the friction."""
+def test_friction_increases_the_deflection_of_a_bent_needle():
+    """An axial force on a bent needle: twice the friction gives a larger deflection."""
     tips = [
         tip(driven(tank(IDEAL.with_values({"phantom.friction_mn_per_mm": friction})), AHEAD, times=40))[1]
         for friction in (0.0, 5.0, 10.0)
@@ -331,8 +334,8 @@ def test_friction_bows_a_bent_needle_further_out():
     assert twice == pytest.approx(2.0 * once, rel=0.1)
 
 
-def test_layer_boundaries_lie_where_they_were_drawn():
-    """Displaced by 1.5 mm (sd) about 20: the cells' stiffness steps there, to within one of them."""
+def test_layer_boundaries_are_at_their_drawn_depths():
+    """Displaced by 1.5 mm (sd) around 20 mm: the stiffness of the cells changes there, within one cell."""
     steps = []
     for seed in range(150):
         phantom = alone(seed, layer_shift_sd_mm=1.5, element_mm=30.0)
@@ -347,8 +350,8 @@ def test_layer_boundaries_lie_where_they_were_drawn():
     assert np.std(steps) == pytest.approx(1.5, rel=0.2)
 
 
-def test_stiffness_varies_along_the_depth_by_its_share_and_over_its_length():
-    """20 % (sd) with a correlation of 1/e at 10 mm, in the cells that the needle meets; half as far, more alike."""
+def test_stiffness_varies_along_the_depth_with_its_size_and_correlation():
+    """20 % (sd) with a correlation of 1/e over 10 mm in the cells along the needle; higher over 5 mm."""
     for length in (10.0, 5.0):
         cells = []
         for seed in range(200):
@@ -366,8 +369,8 @@ def test_stiffness_varies_along_the_depth_by_its_share_and_over_its_length():
 
 
 @both_plants
-def test_factors_of_tissue_and_bevel_are_those_of_another_scenario(kind):
-    """1.5 times the modulus of both layers and half the bevel: as if the scenario had been so."""
+def test_factors_of_tissue_and_bevel_equal_a_changed_scenario(kind):
+    """1.5 times the modulus of both layers and half the bevel, compared with a scenario with these values."""
     phantom = alone(0, kind, shear_modulus_factor=[1.5, 1.5], bevel_factor=[0.5, 0.5])
     values = {f"tissue.{k}.shear_modulus_kpa": 1.5 * (1.82, 3.63)[k] for k in (0, 1)}
     spacing = {"contact.spacing_mm": IDEAL.phantom.contact_spacing_mm}
@@ -380,7 +383,7 @@ def test_factors_of_tissue_and_bevel_are_those_of_another_scenario(kind):
 @both_plants
 @pytest.mark.parametrize("seed", range(3))
 def test_start_offset_and_slope_move_the_clamp(kind, seed):
-    """Of a free needle: the tip by the offset, and by 150 mm times the slope."""
+    """The tip of a free needle moves by the offset, and by 150 mm times the slope."""
     rng = np.random.default_rng(seed)
     offset = draw(free().with_values({"phantom.start_offset_sd_mm": 0.5}), rng)
     slope = draw(free().with_values({"phantom.start_angle_sd_mrad": 3.0}), rng)
@@ -393,7 +396,7 @@ def test_start_offset_and_slope_move_the_clamp(kind, seed):
 
 @both_plants
 @pytest.mark.parametrize("seed", range(3))
-def test_an_axial_start_error_moves_base_and_tip_and_leaves_the_stroke_as_it_is(kind, seed):
+def test_an_axial_start_error_moves_base_and_tip_and_keeps_the_stroke(kind, seed):
     scenario = IDEAL.with_values({**COARSE, "phantom.start_axial_sd_mm": 3.0})
     truth = draw(scenario, np.random.default_rng(seed))
     error = scenario.setup.tip_to_skin_mm - truth.scenario.setup.tip_to_skin_mm
@@ -402,14 +405,14 @@ def test_an_axial_start_error_moves_base_and_tip_and_leaves_the_stroke_as_it_is(
     assert truth.scenario.start_base_x == pytest.approx(scenario.start_base_x + error)
     np.testing.assert_allclose(tip(phantom), [scenario.setup.start_tip_x + error, 0.0, 0.0], atol=1e-9)
     driven(phantom, STRAIGHT, times=110)
-    assert tip(phantom)[0] == pytest.approx(scenario.setup.max_depth + error, abs=0.5)  # but for its bend
+    assert tip(phantom)[0] == pytest.approx(scenario.setup.max_depth + error, abs=0.5)  # except for its bend
     assert phantom.condition().converged
     with pytest.raises(CommandError):
         driven(phantom, STRAIGHT)
 
 
 @both_plants
-def test_a_modulus_of_the_needle_is_that_of_another_scenario(kind):
+def test_a_modulus_factor_of_the_needle_equals_a_changed_scenario(kind):
     truth = draw(IDEAL.with_values({"phantom.youngs_modulus_variation": 0.3}), np.random.default_rng(0))
     modulus = truth.scenario.needle.youngs_modulus_gpa
     assert abs(modulus - 200.0) > 1.0
@@ -421,7 +424,7 @@ def test_a_modulus_of_the_needle_is_that_of_another_scenario(kind):
 
 
 def rough_truth(**changes):
-    """A drawn phantom with all that is shipped, but for motors, and with these changes."""
+    """A drawn phantom with all default imperfections except motors, and these changes."""
     scenario = PHANTOM.with_values({"phantom.motor_resolution_mm": 0.0, **changes})
     return draw(scenario, np.random.default_rng(11))
 
@@ -437,7 +440,7 @@ def rough_truth(**changes):
         "run_out_mm",
     ],
 )
-def test_the_model_plant_lacks_what_it_says_and_the_exact_one_has_all(key):
+def test_the_model_plant_lacks_its_documented_imperfections_and_the_exact_one_has_all(key):
     only_exact = {"initial_bend_mm", "guide_clearance_mm", "friction_mn_per_mm", "shear_modulus_variation"}
     for kind in PLANTS:
         ends = [
@@ -447,12 +450,12 @@ def test_the_model_plant_lacks_what_it_says_and_the_exact_one_has_all(key):
         assert (ends[0] == ends[1]) == (kind == "model" and key in only_exact)
 
 
-# ---- both plants alike
+# ---- both plants
 
 
 @pytest.fixture(scope="module")
 def swung():
-    """Both plants without imperfections on the same way to 45 mm: the guide out and back, the bevel turned at 15."""
+    """Both plants without imperfections with the same commands to 45 mm: the guide out and back, a roll at 15 mm."""
     commands = [
         (1.0, 0.0, 0.0, round(-0.25 * math.cos(math.pi * k / 40), 3), 1 if k == 44 else -1) for k in range(73)
     ]
@@ -464,7 +467,7 @@ def swung():
 
 
 def test_without_imperfections_both_plants_agree(swung):
-    """Within 0.02 mm all the way at 0.044 rad; tissue energy and stretch within a hundredth."""
+    """Within 0.02 mm in each step at 0.044 rad; tissue energy and stretch within 1 %."""
     exact, model = (np.array([condition.tip for condition in swung[kind]]) for kind in ("exact", "model"))
     apart = np.hypot(*(exact - model)[:, :2].T)
     assert 0.0 < apart.max() < 0.02
@@ -477,8 +480,8 @@ def test_without_imperfections_both_plants_agree(swung):
 
 
 @both_plants
-def test_the_stretch_of_the_record_is_the_smallest_so_far(swung, kind):
-    """Relaxed tissue was compressed all the same."""
+def test_the_recorded_stretch_is_the_smallest_since_the_start(swung, kind):
+    """Also after the tissue relaxes."""
     told = [condition.least_stretch for condition in swung[kind]]
     assert all(np.diff(told) <= 0.0)
     assert told[0] == 1.0
@@ -490,29 +493,29 @@ def test_the_stretch_of_the_record_is_the_smallest_so_far(swung, kind):
 
 
 @both_plants
-def test_they_converge_all_the_way(swung, kind):
+def test_they_converge_in_every_step(swung, kind):
     assert all(condition.converged for condition in swung[kind])
 
 
-# ---- what finds no equilibrium is not hidden
+# ---- failed steps are reported
 
 
-def test_one_lost_step_within_a_command_is_reported_and_stays_so():
+def test_one_failed_step_within_a_command_is_reported_permanently():
     phantom = driven(tank(), AHEAD, times=3)
     assert phantom.condition().converged
-    phantom._plant._s[rd.LOAD_X] = -100.0  # many times what the needle bears
+    phantom._plant._s[rd.LOAD_X] = -100.0  # many times the buckling load
     driven(phantom, (0.25, 0.0, 0.0, 0.0, -1))
     phantom._plant._s[rd.LOAD_X] = 0.0
     driven(phantom, AHEAD)
     assert not phantom.condition().converged
 
 
-def test_a_lost_start_is_reported():
-    """Clamped at an angle that is no number."""
+def test_a_failed_start_is_reported():
+    """Clamped at an angle that is not a number."""
     assert not tank(base_turn=math.nan).condition().converged
 
 
-def test_the_model_plant_reports_it_too(monkeypatch):
+def test_the_model_plant_reports_a_failed_step(monkeypatch):
     phantom = driven(tank(kind="model"), AHEAD)
     state = type(phantom._plant._state)
     with monkeypatch.context() as patched:
@@ -523,8 +526,8 @@ def test_the_model_plant_reports_it_too(monkeypatch):
 
 
 @pytest.mark.parametrize(("room", "whole"), [(5, False), (40, True)])
-def test_tissue_that_finds_no_room_in_the_channel_is_reported(room, whole):
-    """Ten millimetres take twenty points: with fewer the needle would go on without tissue."""
+def test_a_full_channel_is_reported(room, whole):
+    """10 mm need twenty points: with fewer the tissue would be incomplete."""
     bench = Bench(length=60.0, segments=30, base=(-60.0, 0.0, 0.0))
     bench.channel = np.zeros((rd.CHANNEL_ROWS, room))
     for _ in range(10):

@@ -20,8 +20,8 @@ def turned(angle):
 
 
 @pytest.mark.parametrize(("load", "published"), LOADS.items())
-def test_the_elastica_reference_meets_the_table(load, published):
-    """And a collocation of EI θ″ = −P cos θ to nine digits."""
+def test_the_elastica_reference_agrees_with_the_published_table(load, published):
+    """And with a collocation of EI θ″ = −P cos θ to nine digits."""
     x, y, turn = elastica.cantilever(load)
     assert y == pytest.approx(published, abs=5e-5)
 
@@ -39,38 +39,38 @@ def test_the_elastica_reference_meets_the_table(load, published):
 
 @pytest.mark.parametrize("load", LOADS)
 def test_a_cantilever_bends_as_the_elastica_and_converges_at_second_order(load):
-    """Tip x, y and θ under a dead load, by the square of the segment's length."""
+    """Tip x, y and θ under a dead load; the error is quadratic in the segment length."""
     errors = np.array([cantilever_error(load, segments) for segments in SEGMENTS])
     assert np.abs(errors[-1]).max() < 3e-5
     for error in errors.T:
         assert order(1.0 / np.array(SEGMENTS), error) == pytest.approx(2.0, abs=0.02)
 
 
-def test_the_tip_deflects_as_tables_have_it():
-    """0.3017 L, 0.4935 L, 0.7138 L, by themselves."""
+def test_the_tip_deflection_agrees_with_published_values():
+    """0.3017 L, 0.4935 L, 0.7138 L."""
     for load, published in LOADS.items():
         bench = Bench(length=100.0, segments=256).loaded(y=load * 1000.0 / 100.0**2)
         assert bench.tip[1] / 100.0 == pytest.approx(published, abs=1e-4)
 
 
-def test_length_is_kept_exactly():
+def test_the_length_is_exact():
     bench = Bench(segments=40).loaded(y=0.7, x=-0.2)
     lengths = np.hypot(*np.diff(bench.nodes, axis=0).T)
     np.testing.assert_allclose(lengths, 2.5, rtol=1e-12)
 
 
 def test_the_clamp_holds_the_load_and_its_moment():
-    """Base force and moment in balance with the load at the tip as it is bent, not as it was."""
+    """Base force and moment balance the load at the deflected tip."""
     load = np.array([-0.1, 0.4])
     bench = Bench(segments=64).loaded(*load)
     x, y, _ = bench.tip
     np.testing.assert_allclose(bench.s[[rd.BASE_FORCE_X, rd.BASE_FORCE_Y]], -load, atol=1e-12)
-    # The first hinge stands for the half segment that the clamp holds, so its moment is that at the base.
+    # The first hinge represents the half segment at the clamp, so that its moment is that at the base.
     assert bench.s[rd.BASE_MOMENT] == pytest.approx(-(x * load[1] - y * load[0]), rel=1e-9)
 
 
 def test_energy_is_the_work_of_the_load():
-    """∫ P dy by the trapezoid rule, closer with its square."""
+    """∫ P dy by the trapezoid rule, with a quadratic error."""
     gap = []
     for parts in (10, 20, 40):
         bench, done, last = Bench(segments=32), 0.0, 0.0
@@ -86,7 +86,7 @@ def test_energy_is_the_work_of_the_load():
 
 
 def test_a_straight_column_buckles_at_eulers_load():
-    """π²EI/4L²: 3 % below it is stable, 3 % above it isn't, and says so; the limit itself to a ten-thousandth."""
+    """π²EI/4L²: stable 3 % below, reported as unstable 3 % above; the limit itself within 1e-4."""
     euler = elastica.buckling_load(100.0, 1000.0)
     assert Bench(segments=64).loaded(x=-0.97 * euler).converged
     assert not Bench(segments=64).loaded(x=-1.03 * euler).converged
@@ -95,14 +95,14 @@ def test_a_straight_column_buckles_at_eulers_load():
 
 
 def test_a_bent_column_bows_out_above_eulers_load():
-    """To the side to which it is bent, and as far as the elastica: P/P_E = (2K(k)/π)², k = sin θ_t/2."""
+    """To the side of its bend, by the deflection of the elastica: P/P_E = (2K(k)/π)², k = sin θ_t/2."""
     euler = elastica.buckling_load(100.0, 1000.0)
     below = Bench(segments=64, curvature=1e-6).loaded(x=-0.97 * euler)
     assert below.converged
     assert 0.0 < below.tip[1] < 0.5
     for side in (1, -1):
         above = Bench(segments=64, curvature=1e-6, bevel=side)
-        for _ in range(5):  # it snaps over half its length: more than one solve takes
+        for _ in range(5):  # the deflection exceeds half its length: more than one solve is needed
             above.loaded(x=-1.03 * euler)
         assert above.converged
         k = np.sin(0.5 * above.tip[2])
@@ -111,8 +111,8 @@ def test_a_bent_column_bows_out_above_eulers_load():
 
 
 @pytest.mark.parametrize("angle", [0.3, 1.0, -2.0])
-def test_a_turned_base_turns_all_of_a_free_needle(angle):
-    """Rigidly, bend and all, in steps or at once as far as an iteration goes."""
+def test_a_rotated_base_rotates_a_free_needle_rigidly(angle):
+    """Including its bend, in steps or at once."""
     straight = Bench(segments=50, curvature=2e-3).step()
     bench = Bench(segments=50, curvature=2e-3).step()
     for _ in range(20):
@@ -124,7 +124,7 @@ def test_a_turned_base_turns_all_of_a_free_needle(angle):
     np.testing.assert_allclose(bench.s[[rd.BASE_FORCE_X, rd.BASE_FORCE_Y, rd.BASE_MOMENT]], 0.0, atol=1e-9)
 
 
-def test_base_and_load_turned_together_give_the_same_needle():
+def test_base_and_load_rotated_together_give_the_same_needle():
     load = np.array([-0.1, 0.3])
     one = Bench(segments=40).loaded(*load)
     angle = 0.8
@@ -133,7 +133,7 @@ def test_base_and_load_turned_together_give_the_same_needle():
     assert other.s[rd.BASE_MOMENT] == pytest.approx(one.s[rd.BASE_MOMENT], rel=1e-10)
 
 
-def test_a_moved_base_carries_a_free_needle():
+def test_a_translated_base_translates_a_free_needle():
     one = Bench(segments=40, curvature=1e-3).step()
     other = Bench(segments=40, curvature=1e-3).step().step(db_x=1.0, db_y=-0.7)
     np.testing.assert_allclose(other.nodes, one.nodes, atol=1e-12)
@@ -141,8 +141,8 @@ def test_a_moved_base_carries_a_free_needle():
 
 
 @pytest.mark.parametrize("bevel", [1, -1])
-def test_natural_curvature_is_an_arc_that_turns_with_the_bevel(bevel):
-    """Each segment has the slope of the arc at its middle; the nodes follow it by the square of the length."""
+def test_natural_curvature_is_an_arc_that_rolls_with_the_bevel(bevel):
+    """Each segment has the slope of the arc at its middle; the error of the nodes is quadratic in its length."""
     errors = []
     for segments in (20, 40, 80):
         bench = Bench(segments=segments, curvature=0.01, bevel=bevel).step()
@@ -154,7 +154,7 @@ def test_natural_curvature_is_an_arc_that_turns_with_the_bevel(bevel):
     assert order([4.0, 2.0, 1.0], errors) == pytest.approx(2.0, abs=0.01)
 
 
-def test_turning_the_bevel_over_turns_the_bend_over():
+def test_rolling_the_bevel_mirrors_the_bend():
     bench = Bench(segments=40, curvature=1e-3).step()
     before = bench.nodes
     bench.step(flip=1.0)
@@ -163,7 +163,7 @@ def test_turning_the_bevel_over_turns_the_bend_over():
 
 
 def guided(**constants):
-    """A needle whose guide stands 40 mm before its base."""
+    """A needle with a guide 40 mm in front of its base."""
     return Bench(**{**GUIDED, **constants}).step()
 
 
@@ -176,7 +176,7 @@ def test_guide_moves_the_needle_as_a_beam():
 
 
 def test_guide_is_a_spring_beyond_its_clearance():
-    """No force within ±c; beyond, the needle stays c behind but for what its stiffness gives."""
+    """No force within ±c; beyond, the needle is c behind, except for the compliance of the guide."""
     bench = guided(clearance=0.5)
     for there in (0.49, -0.98, 0.98):
         bench.step(dg_y=there)
@@ -187,13 +187,13 @@ def test_guide_is_a_spring_beyond_its_clearance():
     at_guide = np.interp(40.0, *bench.nodes.T)
     assert bench.s[rd.GUIDE_FORCE] > 0.0
     assert at_guide == pytest.approx(1.0 - bench.s[rd.GUIDE_FORCE] / 1e3, abs=1e-9)
-    bench.step(dg_y=-3.0)  # to −1.5: the other wall
+    bench.step(dg_y=-3.0)  # to −1.5: the opposite wall
     assert bench.s[rd.GUIDE_FORCE] < 0.0
     assert np.interp(40.0, *bench.nodes.T) == pytest.approx(-1.0, abs=1e-3)
 
 
 def test_the_needle_slides_through_its_guide_without_friction():
-    """The guide's force stands on the needle's own line: what it does along x is −slope times what it does along y."""
+    """The guide's force is normal to the needle: its x component is −slope times its y component."""
     bench = guided(guide_stiffness=1e3)
     for _ in range(12):
         bench.step(dg_y=1.0)
@@ -209,7 +209,7 @@ def test_the_needle_slides_through_its_guide_without_friction():
 
 def test_without_a_guide_or_before_it_there_is_no_force():
     assert Bench(segments=40).step(dg_y=3.0).s[rd.GUIDE_FORCE] == 0.0
-    behind = Bench(segments=40, guide_x=-900.0).step(dg_y=1e-3)  # the tip stands on the plane of the guide
+    behind = Bench(segments=40, guide_x=-900.0).step(dg_y=1e-3)  # the tip is in the plane of the guide
     assert behind.s[rd.TIP_X] == -900.0
     assert behind.s[rd.GUIDE_FORCE] == 0.0
     assert behind.step(db_x=0.01).converged

@@ -1,4 +1,4 @@
-"""Insertions of the exact plant: against the controller's model, against closed forms, and what it leaves behind."""
+"""Insertions of the exact plant: compared with the controller's model and closed forms; the channel."""
 
 import math
 from itertools import pairwise
@@ -32,22 +32,22 @@ START = 114  # steps of 0.25 mm to the skin
 
 @pytest.mark.long
 @pytest.mark.parametrize("layers", [1, 2])
-def test_it_meets_the_controllers_model_at_small_angles(layers):
-    """Two formulations, one limit: what is between the tips falls with the cube of the angle."""
+def test_it_agrees_with_the_controllers_model_at_small_angles(layers):
+    """Two formulations with the same limit: the distance of the tips is cubic in the angle."""
     meshes = {2.0: SMALL, 1.0: SMALL, 0.5: FINE, 0.25: FINE}
     gaps = [model_gap(scale, layers, **mesh) for scale, mesh in meshes.items()]
     for larger, smaller in pairwise(gaps):
         assert smaller.aside < larger.aside / 4.0
     last = gaps[-2:]
     assert order([gap.angle for gap in last], [gap.aside for gap in last]) == pytest.approx(3.0, abs=0.4)
-    assert gaps[0].aside > 0.1  # at 0.15 rad the linear beam is a tenth of a millimetre and more off
+    assert gaps[0].aside > 0.1  # at 0.15 rad the error of the linear beam is above 0.1 mm
     assert gaps[-1].aside < 1e-4
     assert abs(gaps[-1].energy) < 2e-4
 
 
 @pytest.mark.parametrize("layers", [1, 2])
-def test_what_stays_between_them_shrinks_with_the_mesh(layers):
-    """At a hundredth of a radian: 0.3 µm for each mm of deflection on the shipped mesh, less on a finer one."""
+def test_the_difference_decreases_with_the_mesh(layers):
+    """At 0.01 rad: 0.3 µm per mm of deflection on the default mesh, less on a finer one."""
     coarse, fine = model_gap(0.25, layers, **SHIPPED), model_gap(0.25, layers, **SMALL)
     assert coarse.aside < 5e-4
     assert fine.aside < coarse.aside / 3.0
@@ -67,7 +67,7 @@ def test_a_second_solver_finds_the_same_insertion():
 
 
 def test_a_second_solver_finds_the_same_friction():
-    """Its direction is that of the needle before a step: an error that halves with the step."""
+    """Its direction is that of the needle before a step: an error linear in the step."""
     rubbed = ROUGH.with_values({"phantom.friction_mn_per_mm": 50.0})
     ends = [shot(rubbed, push(parts))[-1] for parts in (1, 2)]
     gaps = [abs(stepped(rubbed, push(k), 0.25)[-1, 1] - end[1]) for k, end in zip((1, 2), ends, strict=True)]
@@ -77,8 +77,8 @@ def test_a_second_solver_finds_the_same_friction():
 
 
 @pytest.mark.parametrize("bevel_length", [1.0, 3.0])
-def test_steady_curvature_meets_its_closed_form_and_closer_when_refined(bevel_length):
-    """docs/theory.md eq. 10, several 1/β deep at small strain."""
+def test_steady_curvature_converges_to_its_closed_form(bevel_length):
+    """docs/theory.md eq. 10, at a depth of several 1/β and small strain."""
     error = [curvature_error(resolution, bevel_length) for resolution in (1.0, 0.5, 0.25)]
     assert abs(error[0]) < 0.012
     assert abs(error[1]) < 0.004
@@ -87,13 +87,13 @@ def test_steady_curvature_meets_its_closed_form_and_closer_when_refined(bevel_le
 
 
 def test_steady_curvature_is_proportional_to_the_offset_at_small_strain():
-    """And not there at all without one."""
+    """And zero without an offset."""
     assert path_curvature(1.0, 3.0, bevel=0.0) == 0.0
     assert path_curvature(1.0, 3.0, bevel=0.02) == pytest.approx(2.0 * path_curvature(1.0, 3.0), rel=2e-3)
 
 
 def test_an_insertion_converges_at_second_order_in_the_segment():
-    """Against sixteen times as many; 2 µm and less on the shipped mesh of 0.5 mm would be luck: 0.1 mm it isn't."""
+    """Compared with sixteen times as many segments; on the default mesh of 0.5 mm the error is below 0.1 mm."""
     counts = np.array([75, 150, 300, 600])
     tips = np.array([inserted_tip(element=150.0 / n)[:2] for n in counts])
     errors = np.hypot(*(tips - inserted_tip(element=150.0 / 2400)[:2]).T)
@@ -102,21 +102,21 @@ def test_an_insertion_converges_at_second_order_in_the_segment():
 
 
 def test_an_insertion_does_not_depend_on_its_step():
-    """Half a millimetre or a sixteenth: within a thousandth, and closer."""
+    """Steps of 1/2 mm to 1/16 mm: within 0.1 %, with decreasing differences."""
     tips = np.array([inserted_tip(step=step)[:2] for step in (0.5, 0.25, 0.125, 0.0625)])
     apart = np.hypot(*(tips[:-1] - tips[-1]).T)
     assert (apart < [1e-3, 3e-4, 1e-4]).all()
     assert (np.diff(apart) < 0.0).all()
 
 
-def test_contact_spacing_hardly_matters():
+def test_contact_spacing_has_a_small_effect():
     tips = np.array([inserted_tip(spacing=spacing, cell=0.125)[:2] for spacing in (1.0, 0.5, 0.25, 0.125)])
     apart = np.hypot(*(tips[:-1] - tips[-1]).T)
     assert (apart < [5e-3, 2e-3, 1e-3]).all()
 
 
 def test_the_spring_enters_the_skin_fully_compressed():
-    """docs/theory.md section 4, q = 0: the bevel turns the tip by its whole offset from the first cut on."""
+    """docs/theory.md section 4, q = 0: the bevel deflects the tip with its full offset from the first cut on."""
     needle = move(plant(), AHEAD, times=START + 1)
     assert needle.tip[0] == pytest.approx(0.25, abs=1e-3)
     ratio = 0.25 / 3.0
@@ -140,8 +140,8 @@ def test_a_step_across_the_skin_may_be_long_or_short():
     np.testing.assert_allclose([tip[1] for tip in deeper[1:]], deeper[-1][1], atol=1e-3)
 
 
-def test_the_channel_lies_on_the_way_of_the_tip():
-    """A point wherever another 0.5 mm of needle have cut their way in; its layer is that of its depth."""
+def test_the_channel_is_on_the_path_of_the_tip():
+    """A point for every 0.5 mm of cut, with the layer at its depth."""
     needle, way, cut = plant(), [], []
     for row in commands(1.5, 44.5, AHEAD):
         needle.step(row)
@@ -159,7 +159,7 @@ def test_the_channel_lies_on_the_way_of_the_tip():
     assert force[deep][0] / force[~deep][0] == pytest.approx(3.63 / 1.82)
 
 
-def test_a_slanted_needle_cuts_along_its_own_line_from_the_skin_on():
+def test_an_inclined_needle_cuts_along_its_axis_from_the_skin_on():
     """In one step through the skin: points every 0.5 mm along the needle, the first 0.25 mm behind its entry."""
     turn = 0.2
     bench = Bench(length=60.0, segments=30, base=(-60.0, 0.0, turn)).step().step(db_x=3.0)
@@ -172,8 +172,8 @@ def test_a_slanted_needle_cuts_along_its_own_line_from_the_skin_on():
     assert bench.s[rd.CUT] == pytest.approx(depth / math.cos(turn), rel=1e-12)
 
 
-def test_flip_without_insertion_changes_nothing_but_the_bevel():
-    """At rest, when pulling back, and twice before a push; a needle without a bend of its own."""
+def test_a_flip_without_insertion_changes_only_the_bevel():
+    """At rest, during retraction, and twice before a push; for a straight needle."""
     needle = move(plant(), AHEAD, times=START + 80)
     tip = needle.tip
     np.testing.assert_allclose(move(needle, flip=True).tip, tip, atol=1e-9)
@@ -195,7 +195,7 @@ def test_flip_bends_the_path_to_the_other_side():
     assert turned.tip[1] < on.tip[1] - 0.3
 
 
-def test_pulled_back_the_needle_follows_its_channel_and_pushed_again_it_is_where_it_was():
+def test_a_retracted_needle_follows_its_channel_and_returns_to_the_same_position():
     needle = plant()
     for row in commands(1.0, 30.0, AHEAD):
         needle.step(row)
@@ -207,8 +207,8 @@ def test_pulled_back_the_needle_follows_its_channel_and_pushed_again_it_is_where
     np.testing.assert_allclose(needle.tip, before, atol=1e-3)
 
 
-def test_the_bevels_spring_fades_out_as_the_tip_is_pulled_back():
-    """Over its length: 3 mm behind the front it is gone, and its part of the energy with it."""
+def test_the_bevels_spring_vanishes_as_the_tip_is_retracted():
+    """Over its length: 3 mm behind the front its force and energy are zero."""
     needle = move(plant(), AHEAD, times=START + 120)
     parts = []
     for _ in range(16):
@@ -221,7 +221,7 @@ def test_the_bevels_spring_fades_out_as_the_tip_is_pulled_back():
 
 
 def test_out_of_the_skin_the_channel_is_closed():
-    """The next entry cuts a new one where the tip is."""
+    """The next entry cuts a new channel at the tip."""
     needle = move(plant(), AHEAD, times=START + 40)
     move(needle, BACK, times=44)
     assert needle.tip[0] < 0.0
@@ -235,17 +235,17 @@ def test_out_of_the_skin_the_channel_is_closed():
 
 
 def test_softer_tissue_deflects_the_needle_in_proportion():
-    """At small strain, where the needle is much stiffer."""
+    """At small strain, for a needle much stiffer than the tissue."""
 
-    def aside(factor):
+    def deflection(factor):
         values = {f"tissue.{k}.shear_modulus_kpa": 1e-3 * factor for k in (0, 1)}
         return move(plant(IDEAL.with_values(values)), AHEAD, times=START + 120).tip[1]
 
-    assert aside(2.0) == pytest.approx(2.0 * aside(1.0), rel=2e-3)
-    assert aside(1.0) > 1e-5
+    assert deflection(2.0) == pytest.approx(2.0 * deflection(1.0), rel=2e-3)
+    assert deflection(1.0) > 1e-5
 
 
-def test_stiffness_varies_with_the_depth_as_the_truth_has_it():
+def test_stiffness_varies_with_the_depth_as_in_the_true_phantom():
     """A factor on μ for each cell: of contact points and of the bevel's spring."""
     variation = tuple(1.0 + 0.5 * (k % 2) for k in range(400))  # 0.25 mm each
     needle = move(plant(IDEAL, variation=variation, cell=0.25), AHEAD, times=START + 60)
@@ -264,7 +264,7 @@ def test_stiffness_varies_with_the_depth_as_the_truth_has_it():
 
 
 def test_strain_energy_is_weighted_by_layer_and_counts_contact_points():
-    """Without a bevel all energy outside the needle is in them; a weight of 3 on both layers triples what is told."""
+    """Without a bevel all energy outside the needle is in them; a weight of 3 on both layers triples the result."""
     weights = {f"tissue.{k}.energy_weight": 3.0 for k in (0, 1)}
     blunt = scaled(0.0, 2, 0.5, 0.5).with_values({"needle.bevel.length_mm": 1e-6})
     one, three = (plant(scenario) for scenario in (blunt, blunt.with_values(weights)))

@@ -1,4 +1,4 @@
-"""The exact rod finds its equilibrium under what scenario and commands allow, and says so where it doesn't."""
+"""The exact rod converges for all valid scenarios and commands, and reports failures."""
 
 import ast
 import math
@@ -40,7 +40,7 @@ def within(phantom, row):
 
 
 def wander(scenario, seed, periods):
-    """(steps, those that found no equilibrium) of random commands in all five inputs on a drawn phantom."""
+    """(steps, failed steps) of random commands in all five inputs on a drawn phantom."""
     rng = np.random.default_rng(seed)
     phantom = Phantom(draw(scenario, rng), 1)
     inner, steps, lost = phantom._plant, 0, 0
@@ -65,7 +65,7 @@ def wander(scenario, seed, periods):
 
 @pytest.mark.long
 def test_ten_thousand_random_steps_of_extreme_phantoms_converge():
-    """Tissue 0.3 to 2.5 times, bevel 0 to 2 times, twice and more of all that a rig has; guide and base anywhere."""
+    """Tissue × 0.3 to 2.5, bevel × 0 to 2, at least twice the default imperfections; any position of guide and base."""
     counts = np.array([wander(EXTREME, seed, 80) for seed in range(52)]).sum(axis=0)
     assert counts[0] > 10_000
     assert counts[1] == 0
@@ -80,8 +80,8 @@ def test_random_scenarios_converge():
     assert counts[1] == 0
 
 
-def test_an_equilibrium_that_is_none_is_reported_and_stays_so():
-    """A straight column under three times Euler's load stands, but not for long."""
+def test_a_failed_equilibrium_is_reported_permanently():
+    """A straight column under three times Euler's load is an unstable equilibrium."""
     bench = Bench(segments=32).loaded(x=-3.0 * math.pi**2 * 1000.0 / (4.0 * 100.0**2))
     assert not bench.converged
     needle = plant()
@@ -91,14 +91,14 @@ def test_an_equilibrium_that_is_none_is_reported_and_stays_so():
     needle._s[rd.LOAD_X] = 0.0
     needle.step(np.array([0.0, 0.0, 0.0, 0.0, -1.0]))
     assert needle._s[rd.CONVERGED] == 1.0
-    assert not needle.converged  # a plant remembers
+    assert not needle.converged  # permanently
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300])
 @pytest.mark.parametrize("where", ["angle", "base", "guide", "load", "contact"])
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_what_is_not_a_number_is_reported_and_ends(where, bad):
-    """No loop, no crash; a rod that is lost says that it is."""
+def test_invalid_numbers_are_reported_and_the_solve_ends(where, bad):
+    """No endless loop, no crash; the failure is reported."""
     needle = move(plant(), 0.25, times=140)
     places = {"base": rd.BASE_Y, "guide": rd.GUIDE_Y, "load": rd.LOAD_Y}
     if where == "angle":
@@ -114,17 +114,17 @@ def test_what_is_not_a_number_is_reported_and_ends(where, bad):
         assert not needle.converged
 
 
-def test_a_channel_without_room_ends_the_cut_not_the_program():
+def test_a_full_channel_ends_the_cut_and_not_the_program():
     bench = Bench(length=60.0, segments=30, base=(-60.0, 0.0, 0.0))
     bench.channel = np.zeros((rd.CHANNEL_ROWS, 5))
     for _ in range(10):
         bench.step(db_x=1.0)
     assert bench.count == 5
-    assert not bench.converged  # tissue without its points
+    assert not bench.converged  # incomplete tissue
 
 
-def test_a_needle_deeper_than_the_known_tissue_meets_the_last_of_it():
-    """Cells end 2 mm behind the stroke; a contact point beyond takes the last."""
+def test_beyond_the_last_cell_the_tissue_is_that_of_the_last_cell():
+    """Cells end 2 mm beyond the stroke; a contact point beyond uses the last cell."""
     needle = plant()
     depth = needle.rod.alpha.size * needle.rod.cell
     assert depth >= IDEAL.setup.max_depth + 2.0
@@ -135,7 +135,7 @@ def test_a_needle_deeper_than_the_known_tissue_meets_the_last_of_it():
 
 
 def imports(path):
-    """(module, name) of all that a file imports from."""
+    """(module, name) of all imports of a file."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     plain = [
         (alias.name, "") for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names
@@ -150,7 +150,7 @@ def imports(path):
 
 
 def test_the_rod_shares_no_solver_with_the_controllers_model():
-    """Of all the package it imports the two decorators that compile."""
+    """From the package it imports only the two decorators for compilation."""
     path = Path(flexneedle.rig.phantom.__file__).with_name("rod.py")
     ours = {pair for pair in imports(path) if pair[0].startswith("flexneedle")}
     assert ours == {("flexneedle.mechanics.compile", "inner"), ("flexneedle.mechanics.compile", "kernel")}
@@ -162,7 +162,7 @@ def test_the_rod_shares_no_solver_with_the_controllers_model():
     }
 
 
-def test_the_exact_plant_takes_from_mechanics_only_the_scales_of_the_law():
+def test_the_exact_plant_imports_from_mechanics_only_the_scales_of_the_law():
     path = Path(flexneedle.rig.phantom.__file__).with_name("plants.py")
     ours = {pair for pair in imports(path) if pair[0].startswith("flexneedle.mechanics")}
     assert ours == {("flexneedle.mechanics.ogden", "law_scales")}

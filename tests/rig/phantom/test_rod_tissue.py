@@ -1,4 +1,4 @@
-"""The exact rod in tissue: its law, its derivatives, forces across the needle, friction, the channel."""
+"""The exact rod in tissue: law, derivatives, forces normal to the needle, friction, channel."""
 
 import math
 
@@ -35,7 +35,7 @@ AHEAD, BACK = 0.25, -0.25
 )
 @settings(deadline=None, derandomize=True, max_examples=300)
 def test_the_law_agrees_with_the_controllers(alpha, height, share, modulus, volume):
-    """Written anew, to round-off, beyond the floor stretch, too; there force on the needle, here its opposite."""
+    """Independent code agrees to round-off, also beyond the floor stretch; with opposite sign of the force."""
     force, energy = ogden.law_scales(*map(np.array, (modulus, alpha, height, volume)))
     u = share * height
     f, k, stored, stretch = PLAIN._law(alpha, height, float(force), float(energy), u)
@@ -61,7 +61,7 @@ def test_force_and_stiffness_are_the_derivatives_of_the_energy(u):
 
 
 def crooked(seed, *, guide=True, channel=True):
-    """A rod bent by up to a radian in a channel that is up to 6 mm off, its guide 3 mm off, the tip drawn back."""
+    """A rod bent by up to 1 rad, with channel offsets up to 6 mm, a guide offset of 3 mm, and a retracted tip."""
     rng = np.random.default_rng(seed)
     bench = Bench(
         length=60.0,
@@ -80,7 +80,7 @@ def crooked(seed, *, guide=True, channel=True):
     bench.theta[:] = 0.2 + np.cumsum(rng.normal(0.0, 0.15, SEGMENTS))
     bench.s[[rd.GUIDE_Y, rd.CURVED]] = 2.0, 1.0
     bench.s[[rd.LOAD_X, rd.LOAD_Y]] = 0.3, -0.2
-    PLAIN._place(bench.rod, bench.s, bench.work, bench.theta)
+    PLAIN._update_nodes(bench.rod, bench.s, bench.work, bench.theta)
     nodes, tip = bench.work[[rd.X, rd.Y]].T, bench.s[[rd.TIP_X, rd.TIP_Y, rd.TIP_TURN]]
     if channel:
         x = np.linspace(0.3, tip[0] - 1.0, POINTS)
@@ -96,8 +96,8 @@ def crooked(seed, *, guide=True, channel=True):
 
 
 def assembled(bench, theta):
-    """Energy (mJ) less the work of the load, and its gradient in the angles, by the chain rule over the nodes."""
-    PLAIN._place(bench.rod, bench.s, bench.work, theta)
+    """Energy (mJ) minus the work of the load, and its gradient in the angles by the chain rule over the nodes."""
+    PLAIN._update_nodes(bench.rod, bench.s, bench.work, theta)
     tip = tuple(bench.s[[rd.TIP_X, rd.TIP_Y, rd.TIP_TURN]])
     PLAIN._assemble(bench.rod, bench.s, bench.work, theta, bench.channel, bench.count, tip)
     w, s = bench.work, bench.s
@@ -109,7 +109,7 @@ def assembled(bench, theta):
 
 
 def differences(function, theta, step=1e-6):
-    """Central differences of a function of the angles, a row each."""
+    """Central differences of a function of the angles, one row per angle."""
     shifts = step * np.eye(theta.size)
     return np.array([(function(theta + e) - function(theta - e)) / (2 * step) for e in shifts])
 
@@ -128,7 +128,7 @@ def test_forces_are_the_gradient_of_the_energy(seed):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_sweep_solves_newtons_equations_with_all_second_derivatives(seed):
-    """Its step, −H⁻¹g with the Hessian by differences of the gradient, although no matrix is ever formed."""
+    """Its step is −H⁻¹g, with the Hessian from differences of the gradient."""
     bench = crooked(seed)
     theta = bench.theta.copy()
     hessian = differences(lambda angles: assembled(bench, angles)[1], theta)
@@ -143,22 +143,22 @@ def test_a_sweep_solves_newtons_equations_with_all_second_derivatives(seed):
     assert largest == pytest.approx(np.hypot(*np.cumsum(arms * step, axis=1)).max(), rel=1e-9)
 
 
-def test_without_its_geometric_part_the_hessian_leads_downhill():
-    """Pushed to three times Euler's load a straight rod has a falling direction that Newton would take uphill."""
+def test_without_its_geometric_part_the_hessian_gives_a_descent_direction():
+    """At three times Euler's load the full Hessian of a straight rod is indefinite."""
     bench = Bench(length=100.0, segments=SEGMENTS, curvature=1e-3)
     bench.s[rd.LOAD_X] = -3.0 * np.pi**2 * 1000.0 / (4.0 * 100.0**2)
     tip = (-900.0, 0.0, 0.0)
     for curved in (1.0, 0.0):
         bench.s[rd.CURVED] = curved
-        PLAIN._place(bench.rod, bench.s, bench.work, bench.theta)
+        PLAIN._update_nodes(bench.rod, bench.s, bench.work, bench.theta)
         PLAIN._assemble(bench.rod, bench.s, bench.work, bench.theta, bench.channel, 0, tip)
         assert PLAIN._sweep(bench.rod, bench.s, bench.work, bench.theta) == (curved == 0.0)
     PLAIN._newton_step(bench.work, SEGMENTS)
     assert PLAIN._slope(bench.work, SEGMENTS) < 0.0
 
 
-def test_tissue_and_guide_push_across_the_needle_alone():
-    """On each segment the force has no part along it."""
+def test_forces_of_tissue_and_guide_are_normal_to_the_needle():
+    """On each segment the force has no tangential component."""
     bench = crooked(1)
     bench.s[[rd.LOAD_X, rd.LOAD_Y]] = 0.0
     assembled(bench, bench.theta)
@@ -167,8 +167,8 @@ def test_tissue_and_guide_push_across_the_needle_alone():
     np.testing.assert_allclose(x * np.cos(bench.theta) + y * np.sin(bench.theta), 0.0, atol=1e-12)
 
 
-def test_the_bevels_force_stands_across_the_tip():
-    """Law of the length that lies in the tissue, ρ = b from the tip on the way in; nothing 5 mm behind the front."""
+def test_the_bevels_force_is_normal_to_the_tip():
+    """Law of the length in the tissue, ρ = b at the tip during insertion; zero 5 mm behind the front."""
     bench = crooked(2, guide=False, channel=False)
     bench.s[[rd.LOAD_X, rd.LOAD_Y, rd.CUT]] = 0.0
     turn = bench.s[rd.TIP_TURN]
@@ -198,8 +198,8 @@ def test_the_bevels_force_stands_across_the_tip():
 
 
 @pytest.mark.parametrize("name", MOVES)
-def test_work_of_base_and_guide_is_the_energy_stored(name):
-    """Without cutting; by the square of the step, down to segments that change under a contact point."""
+def test_the_work_of_base_and_guide_is_the_stored_energy(name):
+    """Without cutting; the error is quadratic in the step, except where the segment of a contact point changes."""
     gaps = []
     for steps in (10, 20, 40):
         done, stored = energy_balance(name, steps)
@@ -210,8 +210,8 @@ def test_work_of_base_and_guide_is_the_energy_stored(name):
     assert abs(gaps[2]) < abs(gaps[1]) / 2.5
 
 
-def test_energy_is_a_function_of_where_base_and_guide_are():
-    """There and back again without cutting: the same needle."""
+def test_energy_is_a_function_of_the_positions_of_base_and_guide():
+    """After a closed loop of motions without cutting the needle is the same."""
     needle = bent(3.75)
     before, energy = needle.nodes, needle._s[rd.ENERGY]
     for sign in (1.0, -1.0):
@@ -221,7 +221,7 @@ def test_energy_is_a_function_of_where_base_and_guide_are():
 
 
 def test_a_push_with_friction_stores_and_dissipates_the_work_of_the_base():
-    """3 mm along the channel, inside length changing from 23 to 26 mm, to a thousandth of what is dissipated."""
+    """3 mm along the channel, with an inserted length of 23 to 26 mm; within 0.1 % of the dissipated energy."""
     done, stored, lost = friction_balance(20)
     assert lost == pytest.approx(0.372, abs=0.001)
     assert stored > 0.01
@@ -229,7 +229,7 @@ def test_a_push_with_friction_stores_and_dissipates_the_work_of_the_base():
 
 
 def test_work_on_an_insertion_is_stored_or_dissipated():
-    """Cutting, guide motion and a flip: what is missing falls with the step, to two ten-thousandths of the work."""
+    """With cutting, guide motion and a flip: the difference decreases with the step, to 2e-4 of the work."""
     gaps = [abs(insertion_balance(step, friction=0.0).gap) for step in (0.5, 0.25, 0.125, 0.0625)]
     assert (np.diff(np.log2(gaps)) < -0.75).all()
     assert gaps[-1] < 3e-4
@@ -239,8 +239,8 @@ def test_work_on_an_insertion_is_stored_or_dissipated():
     assert min(rubbed.needle, rubbed.tissue) > 0.01
 
 
-def test_friction_is_5_mn_a_millimetre_against_the_last_slide():
-    """On a straight needle the base bears 5 mN for each mm inserted: pushing, resting, pulling."""
+def test_friction_is_5_mn_per_mm_opposite_to_the_last_sliding_direction():
+    """For a straight needle the base force is 5 mN per mm inserted: pushing, resting, pulling."""
     needle = plant(IDEAL.with_values({"needle.bevel.offset_mm": 0.0, "phantom.friction_mn_per_mm": 5.0}))
     move(needle, AHEAD, times=114)
     assert needle._s[rd.BASE_FORCE_X] == 0.0
@@ -249,15 +249,15 @@ def test_friction_is_5_mn_a_millimetre_against_the_last_slide():
         assert needle._s[rd.BASE_FORCE_X] == pytest.approx(5e-3 * needle.tip[0], rel=1e-12)
         assert needle._s[rd.BASE_FORCE_Y] == 0.0
     assert needle.tip[0] == pytest.approx(40.0)
-    assert move(needle)._s[rd.BASE_FORCE_X] == pytest.approx(5e-3 * 40.0)  # at rest it stays as it was
+    assert move(needle)._s[rd.BASE_FORCE_X] == pytest.approx(5e-3 * 40.0)  # constant at rest
     move(needle, BACK)
     assert needle._s[rd.BASE_FORCE_X] == pytest.approx(-5e-3 * 39.75)
     move(needle, BACK, times=159)
-    assert needle._s[rd.BASE_FORCE_X] == pytest.approx(0.0, abs=1e-12)  # the tip stands in the skin
+    assert needle._s[rd.BASE_FORCE_X] == pytest.approx(0.0, abs=1e-12)  # the tip is at the skin
 
 
 def test_friction_follows_the_bent_needle():
-    """Its direction is that of each segment, on the part of it that is in the tissue."""
+    """Its direction is that of each segment, on the part inside the tissue."""
     needle = bent(8.0, friction=5.0)
     move(needle, 0.01)
     fx, fy = needle._work[[rd.FX, rd.FY], :-1]
@@ -274,8 +274,8 @@ def test_friction_follows_the_bent_needle():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_mirror_image_of_commands_gives_the_mirror_image(seed):
-    """Base, guide, bevel, start, bend and run of random commands turned about the axis: to the last bit."""
+def test_mirrored_commands_give_the_mirrored_needle(seed):
+    """Base, guide, bevel, start, bend and random commands mirrored at the axis: to the last bit."""
     rng = np.random.default_rng(seed)
     changes = {
         "phantom.friction_mn_per_mm": 5.0,
@@ -299,8 +299,8 @@ def test_the_mirror_image_of_commands_gives_the_mirror_image(seed):
     assert (other.strain_energy, other.least_stretch) == (one.strain_energy, one.least_stretch)
 
 
-def test_a_symmetric_tip_goes_straight():
-    """b = 0, nothing off the axis: not by a bit, through both layers, without stored energy."""
+def test_a_symmetric_tip_has_a_straight_path():
+    """b = 0 without lateral offsets: exactly straight through both layers, without stored energy."""
     needle = move(plant(IDEAL.with_values({"needle.bevel.offset_mm": 0.0})), AHEAD, times=294)
     assert not needle.nodes[:, 1].any()
     assert needle.tip[0] == pytest.approx(45.0, abs=1e-12)

@@ -1,4 +1,4 @@
-"""Mismatch of structure: what `[phantom.structure]` changes in the truth, and that it changes nothing else."""
+"""Structural mismatch: the effects of `[phantom.structure]` on the true phantom, and no others."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ KINDS = [
 
 
 @pytest.mark.parametrize(("structure", "expected"), KINDS)
-def test_a_kind_changes_what_it_says_and_nothing_else_that_is_drawn(structure, expected):
+def test_a_structural_change_does_not_change_other_draws(structure, expected):
     for seed in range(3):
         plain, changed = truth_of(PHANTOM, seed), truth_of(structured(**structure), seed)
         before, after = plain.scenario.flat(), changed.scenario.flat()
@@ -70,7 +70,7 @@ def test_a_hidden_layer_multiplies_the_modulus_inside_and_nowhere_else(top, thic
     assert np.abs(np.subtract.outer(found.layer_tops, plain.layer_tops)).min(axis=0).max() < 1e-9
 
 
-def test_a_hidden_layer_across_a_boundary_is_stiffer_on_either_side():
+def test_a_hidden_layer_across_a_boundary_is_stiffer_on_both_sides():
     truth = truth_of(structured(IDEAL, hidden_layer=HIDDEN)).scenario
     assert truth.layer_tops == pytest.approx((0.0, 18.0, 20.0, 22.0))
     assert [layer.shear_modulus_kpa for layer in truth.tissue] == [1.82, 5 * 1.82, 5 * 3.63, 3.63]
@@ -78,7 +78,7 @@ def test_a_hidden_layer_across_a_boundary_is_stiffer_on_either_side():
 
 @pytest.mark.parametrize("kind", PLANTS)
 @pytest.mark.parametrize("structure", [structure for structure, _ in KINDS] + [{"hidden_layer": HIDDEN}])
-def test_each_kind_moves_the_tip_of_both_plants(kind, structure):
+def test_each_structural_change_moves_the_tip_of_both_plants(kind, structure):
     ends = []
     for scenario in (IDEAL, structured(IDEAL, **structure)):
         phantom = Phantom(truth_of(scenario.with_values(COARSE)), 1, kind)
@@ -90,20 +90,20 @@ def test_each_kind_moves_the_tip_of_both_plants(kind, structure):
 
 
 def test_shorter_compression_lengths_bound_the_bevel_that_is_drawn():
-    """b < 0.7 h of the phantom: with h = 7 mm at most 4.9 mm where the range goes to 6."""
+    """b < 0.7 h of the phantom: with h = 7 mm at most 4.9 mm, in a range up to 6 mm."""
     scenario = structured(compression_length_factor=0.35)
     offsets = [truth_of(scenario, seed).scenario.needle.bevel.offset_mm for seed in range(100)]
     assert 4.7 < max(offsets) < 4.9
 
 
-def test_the_start_error_leaves_half_of_the_way_to_the_shifted_guide():
+def test_the_start_error_is_at_most_half_of_the_distance_to_the_shifted_guide():
     scenario = structured(guide_shift_mm=11.5).with_values({"phantom.start_axial_sd_mm": 50.0})
     gaps = [truth_of(scenario, seed).scenario.setup.tip_to_skin_mm for seed in range(30)]
     assert max(gaps) == pytest.approx(28.5 + 0.5)
 
 
 @pytest.mark.parametrize(
-    ("values", "told"),
+    ("values", "message"),
     [
         (
             {"guide_shift_mm": 12.5},
@@ -127,10 +127,10 @@ def test_the_start_error_leaves_half_of_the_way_to_the_shifted_guide():
         ),
     ],
 )
-def test_a_structure_that_cannot_be_is_refused(values, told):
+def test_an_invalid_structure_is_rejected(values, message):
     with pytest.raises(ScenarioError) as caught:
         structured(**values)
-    assert caught.value.problems[0].startswith(told)
+    assert caught.value.problems[0].startswith(message)
 
 
 def test_a_shift_needs_a_guide():

@@ -1,4 +1,4 @@
-"""docs/validation.md says what studies/validation.py computes, and the script writes the same bytes every time."""
+"""docs/validation.md agrees with studies/validation.py, whose output is reproducible."""
 
 import importlib.util
 import re
@@ -28,7 +28,7 @@ def script():
 
 @pytest.fixture(scope="module")
 def made_up():
-    """Results of the right kinds that took no time."""
+    """Synthetic results."""
     angles = 0.05 * np.array(problems.SCALES)
     gaps = [problems.Gap(float(a), float(a**3), float(a**3), -1e-3) for a in angles]
     balance = problems.Balance(4.0, 0.25, -0.05, needle=0.15, tissue=0.05, spring=0.0, friction=3.999)
@@ -52,12 +52,12 @@ def made_up():
 
 
 def numbers(text):
-    """All in a text, in order."""
+    """All numbers in a text, in order."""
     return [float(found.replace("−", "-")) for found in NUMBER.findall(text)]
 
 
 def assert_same(found, page):
-    """Word for word, and figures to two digits as another processor may have them; nothing below 1e-7 counts."""
+    """Same words, and numbers to two digits, since they depend on the processor; none below 1e-7 is compared."""
     assert NUMBER.sub("#", found) == NUMBER.sub("#", page)
     np.testing.assert_allclose(numbers(found), numbers(page), rtol=0.06, atol=1e-7)
 
@@ -96,7 +96,7 @@ def test_the_page_is_what_the_script_writes(script):
 
 
 def test_the_summary_has_the_deflections_of_the_issue(script, made_up):
-    """Published figures beside what was found, which is no constant."""
+    """Published values beside the computed ones."""
     lines = script.summary(made_up).splitlines()[2:5]
     assert [line.split("|")[2].strip() for line in lines] == ["0.3017", "0.4935", "0.7138"]
     off = made_up.cantilever[1.0][-1, 1]
@@ -104,7 +104,7 @@ def test_the_summary_has_the_deflections_of_the_issue(script, made_up):
 
 
 def test_same_results_same_bytes(script, made_up, tmp_path):
-    """Of page and pictures."""
+    """For page and pictures."""
     one, other = (script.write(made_up, tmp_path / name) for name in ("one", "other"))
     assert [path.name for path in one] == [
         "validation.md",
@@ -123,7 +123,7 @@ def test_same_results_same_bytes(script, made_up, tmp_path):
         assert (ROOT / "docs" / image).is_file()
 
 
-def test_orders_and_small_numbers_read_well(script):
+def test_orders_and_small_numbers_are_readable(script):
     assert script.power([1.0, 2.0, 4.0], [3.0, 12.0, 48.0]) == "2.00"
     assert [script.small(value) for value in (0.0123, -0.5, 1.234e-5, -6e-12)] == [
         "0.012",

@@ -1,4 +1,4 @@
-"""From a tracker's frame to the tip in the plane: maps cancel, the offset goes along the measured axis."""
+"""Map from a tracker's frame to the tip in the plane, with an offset along the measured axis."""
 
 import numpy as np
 import pytest
@@ -13,40 +13,40 @@ from flexneedle.rig.tracking.field.tracker import FieldTracker
 from flexneedle.rig.tracking.plane import InPlane, tip_in_plane
 from flexneedle.rig.tracking.registration import Rigid, identity
 from flexneedle.types import Frame, SensorReading
-from rooms import Watch, environment
+from rooms import ManualClock, environment
 
 ANGLES = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3)
-PLACES = st.lists(st.floats(-300.0, 300.0), min_size=3, max_size=3)
+POSITIONS = st.lists(st.floats(-300.0, 300.0), min_size=3, max_size=3)
 
 
 def frame(**readings):
     return Frame(1.5, 7, readings)
 
 
-@given(angles=ANGLES, shift=PLACES, tip=PLACES, turn=st.floats(-1.0, 1.0), offset=st.floats(0.0, 20.0))
+@given(angles=ANGLES, shift=POSITIONS, tip=POSITIONS, angle=st.floats(-1.0, 1.0), offset=st.floats(0.0, 20.0))
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
-def test_to_the_tracker_and_back_is_where_the_tip_is(angles, shift, tip, turn, offset):
-    there = Rigid(Rotation.from_euler("xyz", angles).as_matrix(), np.array(shift))
-    watch = Watch()
-    direction = (np.cos(turn), np.sin(turn), 0.0)
-    eye = FieldTracker(
+def test_the_maps_to_the_tracker_and_back_cancel(angles, shift, tip, angle, offset):
+    to_tracker = Rigid(Rotation.from_euler("xyz", angles).as_matrix(), np.array(shift))
+    clock = ManualClock()
+    direction = (np.cos(angle), np.sin(angle), 0.0)
+    tracker = FieldTracker(
         Room(environment(), 0),
         lambda _: {"tip": tip_sensor_pose(tip, direction, offset)},
-        watch,
+        clock,
         0.025,
         np.random.default_rng(0),
-        to_tracker=there,
+        to_tracker=to_tracker,
     )
-    watch.wait(0.05)
-    samples = InPlane(eye, there.inverse(), offset).read()
+    clock.wait(0.05)
+    samples = InPlane(tracker, to_tracker.inverse(), offset).read()
     assert len(samples) == 2
     for sample in samples:
         assert (sample.x, sample.y, sample.z) == pytest.approx(tuple(tip), abs=1e-9)
         assert sample.time == sample.frame.time
 
 
-def test_the_tip_lies_ahead_of_its_sensor():
-    """A needle along y: half a turn of a quarter about −x takes z there."""
+def test_the_tip_is_ahead_of_its_sensor():
+    """A needle along y: a quarter turn of z about −x."""
     half = np.sqrt(0.5)
     reading = SensorReading((1.0, 2.0, 3.0), (half, -half, 0.0, 0.0))
     sample = tip_in_plane(frame(tip=reading), identity(), 5.0)
@@ -63,13 +63,13 @@ def test_the_tip_lies_ahead_of_its_sensor():
         {"tip": SensorReading((1.0, 2.0, 3.0), status="out of volume")},
     ],
 )
-def test_a_tip_that_is_not_seen_has_no_coordinates_but_its_frame(readings):
+def test_a_missing_tip_has_no_coordinates_but_its_frame(readings):
     sample = tip_in_plane(frame(**readings), identity())
     assert (sample.time, sample.x, sample.y, sample.z) == (1.5, None, None, None)
     assert sample.frame == frame(**readings)
 
 
-def test_without_an_orientation_only_a_sensor_at_the_very_tip_tells_where_it_is():
+def test_without_an_orientation_the_tip_is_measured_only_with_offset_0():
     reading = frame(tip=SensorReading((1.0, 2.0, 3.0)))
     assert tip_in_plane(reading, identity(), 5.0).x is None
     assert tip_in_plane(reading, identity()).x == pytest.approx(1.0)

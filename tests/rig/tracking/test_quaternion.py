@@ -1,4 +1,4 @@
-"""Turns: against rotation matrices, and there and back."""
+"""Rotations by quaternions, compared with rotation matrices."""
 
 import numpy as np
 import pytest
@@ -12,48 +12,48 @@ from flexneedle.rig.tracking.quaternion import along, from_matrix, from_vector, 
 VECTORS = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3).map(np.array)
 
 
-def matrix(turn):
-    return Rotation.from_quat(turn, scalar_first=True).as_matrix()
+def matrix(quaternion):
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
 
 
 @given(vector=VECTORS)
 @hypothesis_settings(deadline=None, derandomize=True)
-def test_a_turn_about_a_vector_is_the_matrix_of_it(vector):
-    turn = from_vector(vector[None])[0]
-    np.testing.assert_allclose(matrix(turn), Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(z_axis(turn), matrix(turn)[:, 2], atol=1e-12)
+def test_a_rotation_vector_gives_its_matrix(vector):
+    quaternion = from_vector(vector[None])[0]
+    np.testing.assert_allclose(matrix(quaternion), Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(z_axis(quaternion), matrix(quaternion)[:, 2], atol=1e-12)
 
 
 @given(first=VECTORS, second=VECTORS)
 @hypothesis_settings(deadline=None, derandomize=True)
-def test_a_product_turns_by_the_second_first(first, second):
-    turns = from_vector(np.stack([first, second]))
-    both = product(turns[0], turns[1])
-    np.testing.assert_allclose(matrix(both), matrix(turns[0]) @ matrix(turns[1]), atol=1e-12)
-    np.testing.assert_allclose(product(turns, turns[::-1])[0], both, atol=1e-15)
+def test_a_product_rotates_by_the_second_first(first, second):
+    rotations = from_vector(np.stack([first, second]))
+    both = product(rotations[0], rotations[1])
+    np.testing.assert_allclose(matrix(both), matrix(rotations[0]) @ matrix(rotations[1]), atol=1e-12)
+    np.testing.assert_allclose(product(rotations, rotations[::-1])[0], both, atol=1e-15)
 
 
 @given(vector=VECTORS)
 @hypothesis_settings(deadline=None, derandomize=True)
-def test_a_matrix_gives_its_turn_back(vector):
+def test_a_matrix_gives_its_quaternion(vector):
     rotation = Rotation.from_rotvec(vector).as_matrix()
-    turn = from_matrix(rotation)
-    assert turn[0] >= 0.0
-    np.testing.assert_allclose(matrix(turn), rotation, atol=1e-12)
+    quaternion = from_matrix(rotation)
+    assert quaternion[0] >= 0.0
+    np.testing.assert_allclose(matrix(quaternion), rotation, atol=1e-12)
 
 
 @given(vector=VECTORS)
 @hypothesis_settings(deadline=None, derandomize=True)
-def test_the_shortest_turn_to_a_direction_gets_there_without_a_roll(vector):
+def test_the_shortest_rotation_to_a_direction_has_no_roll(vector):
     direction = from_vector(vector[None])[0, 1:] + [0.0, 0.0, 1e-3]
     direction = direction / np.linalg.norm(direction)
-    turn = along(direction)
-    np.testing.assert_allclose(np.linalg.norm(turn), 1.0, atol=1e-12)
-    np.testing.assert_allclose(z_axis(turn), direction, atol=1e-9)
-    assert turn[3] == 0.0
+    quaternion = along(direction)
+    np.testing.assert_allclose(np.linalg.norm(quaternion), 1.0, atol=1e-12)
+    np.testing.assert_allclose(z_axis(quaternion), direction, atol=1e-9)
+    assert quaternion[3] == 0.0
 
 
-def test_half_a_turn_where_no_turn_is_shortest():
+def test_the_rotation_to_the_opposite_direction_is_half_a_turn():
     both = along(np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))
     np.testing.assert_allclose(both, [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]], atol=1e-15)
     np.testing.assert_allclose(z_axis(both)[0], [0.0, 0.0, -1.0], atol=1e-15)

@@ -1,4 +1,4 @@
-"""The simulated tracker: its rate, its noise, its delay, what it misses, and nothing twice."""
+"""The simulated tracker: rate, noise, delay, missing readings; each reading once."""
 
 import numpy as np
 import pytest
@@ -13,8 +13,8 @@ from flexneedle.rig.virtual import Seeds, virtual_rig
 PERIOD = 0.025
 
 
-class Watch:
-    """A clock that a test sets."""
+class ManualClock:
+    """A clock that is set by the test."""
 
     def __init__(self):
         self.time = 0.0
@@ -27,73 +27,73 @@ class Watch:
 
 
 def moving(time):
-    """A tip that goes on at 1 mm/s and aside at −1 mm/s, and stood still before the start."""
+    """A tip that moves at 1 mm/s along x and −1 mm/s along y, and is at rest before the start."""
     return 10.0 + max(time, 0.0), -max(time, 0.0)
 
 
-def fresh(watch, tip_at=moving, period=PERIOD, jitter=0.0, seed=0, **faults):
-    return NoisyTracker(tip_at, watch, period, jitter, np.random.default_rng(seed), **faults)
+def fresh(clock, tip_at=moving, period=PERIOD, jitter=0.0, seed=0, **faults):
+    return NoisyTracker(tip_at, clock, period, jitter, np.random.default_rng(seed), **faults)
 
 
-def tracker(watch, *arguments, **settings):
-    """One whose first reading, which is there at the start, was taken."""
-    eye = fresh(watch, *arguments, **settings)
-    (first,) = eye.read()
+def tracker(clock, *arguments, **settings):
+    """A tracker after its first reading, which is available at the start."""
+    device = fresh(clock, *arguments, **settings)
+    (first,) = device.read()
     assert first.time <= 0.0
-    return eye
+    return device
 
 
 def readings(count, seed=0, jitter=0.1, **faults):
-    """The first `count` readings after the start, by number: what was taken before it is left out."""
-    watch = Watch()
-    eye = tracker(watch, jitter=jitter, seed=seed, **faults)
-    watch.wait(PERIOD * count + faults.get("delay", 0.0))
-    return [sample for sample in eye.read() if sample.time > 0.0]
+    """The first `count` readings after the start."""
+    clock = ManualClock()
+    device = tracker(clock, jitter=jitter, seed=seed, **faults)
+    clock.wait(PERIOD * count + faults.get("delay", 0.0))
+    return [sample for sample in device.read() if sample.time > 0.0]
 
 
-def test_reads_at_its_rate_at_the_time_of_each_reading():
-    watch = Watch()
-    eye = tracker(watch)
-    watch.wait(0.1)
-    samples = eye.read()
+def test_readings_have_the_rate_and_the_position_at_their_time():
+    clock = ManualClock()
+    device = tracker(clock)
+    clock.wait(0.1)
+    samples = device.read()
     assert [sample.time for sample in samples] == pytest.approx([0.025, 0.05, 0.075, 0.1])
     assert [sample.x for sample in samples] == pytest.approx([10.025, 10.05, 10.075, 10.1])
     assert [sample.y for sample in samples] == pytest.approx([-0.025, -0.05, -0.075, -0.1])
 
 
-def test_nothing_is_read_twice_nor_before_its_time():
-    watch = Watch()
-    eye = tracker(watch)
-    assert eye.read() == ()
-    watch.wait(0.06)
-    assert len(eye.read()) == 2
-    assert eye.read() == ()
-    watch.wait(0.01)
-    assert eye.read() == ()
-    watch.wait(0.01)
-    (one,) = eye.read()
+def test_no_reading_is_returned_twice_or_early():
+    clock = ManualClock()
+    device = tracker(clock)
+    assert device.read() == ()
+    clock.wait(0.06)
+    assert len(device.read()) == 2
+    assert device.read() == ()
+    clock.wait(0.01)
+    assert device.read() == ()
+    clock.wait(0.01)
+    (one,) = device.read()
     assert one.time == pytest.approx(0.075)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.2, 0.21])
 def test_no_reading_is_lost_to_rounding(delay):
-    """A thousand waits of 0.1 s add up to a little less than 100 s."""
-    watch = Watch()
-    eye = tracker(watch, delay=delay)
+    """The sum of a thousand waits of 0.1 s is slightly less than 100 s."""
+    clock = ManualClock()
+    device = tracker(clock, delay=delay)
     times = []
     for _ in range(1000):
-        watch.wait(0.1)
-        batch = eye.read()
+        clock.wait(0.1)
+        batch = device.read()
         assert len(batch) == 4
         times.extend(sample.time for sample in batch)
-    late = np.ceil(delay / PERIOD - 1e-6)
-    np.testing.assert_allclose(times, PERIOD * (np.arange(1, 4001) - late), atol=1e-9)
+    periods = np.ceil(delay / PERIOD - 1e-6)
+    np.testing.assert_allclose(times, PERIOD * (np.arange(1, 4001) - periods), atol=1e-9)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.025, 0.2, 0.21])
-def test_one_reading_of_the_needle_at_rest_is_there_at_the_start_and_never_missing(delay):
+def test_one_reading_at_rest_is_available_at_the_start_and_never_missing(delay):
     for seed in range(20):
-        (first,) = fresh(Watch(), jitter=0.1, seed=seed, delay=delay, missing=0.9).read()
+        (first,) = fresh(ManualClock(), jitter=0.1, seed=seed, delay=delay, missing=0.9).read()
         assert -PERIOD < first.time + delay <= 1e-9
         assert 0.0 < np.hypot(first.x - 10.0, first.y) < 0.6
 
@@ -102,53 +102,53 @@ def test_one_reading_of_the_needle_at_rest_is_there_at_the_start_and_never_missi
 
 
 @pytest.mark.parametrize("delay", [0.025, 0.2, 0.4])
-def test_a_delayed_reading_is_the_truth_of_so_long_ago_and_says_so(delay):
-    watch = Watch()
-    eye = tracker(watch, delay=delay)
+def test_a_delayed_reading_has_the_position_and_time_of_measurement(delay):
+    clock = ManualClock()
+    device = tracker(clock, delay=delay)
     for _ in range(30):
-        watch.wait(PERIOD)
-        (sample,) = eye.read()
-        assert sample.time == pytest.approx(watch.now() - delay)
-        assert (sample.x, sample.y) == pytest.approx(moving(watch.now() - delay))
+        clock.wait(PERIOD)
+        (sample,) = device.read()
+        assert sample.time == pytest.approx(clock.now() - delay)
+        assert (sample.x, sample.y) == pytest.approx(moving(clock.now() - delay))
 
 
-def test_before_the_first_move_is_seen_readings_tell_the_start():
-    """A rig's tracker runs before the insertion does: eight readings of the needle at rest, dated before the start."""
-    watch = Watch()
-    eye = tracker(watch, delay=0.2)
-    assert eye.read() == ()
-    watch.wait(0.2)
-    samples = eye.read()
+def test_before_the_first_delayed_reading_of_a_move_readings_are_at_rest():
+    """A rig's tracker runs before the insertion: eight readings at rest have times before the start."""
+    clock = ManualClock()
+    device = tracker(clock, delay=0.2)
+    assert device.read() == ()
+    clock.wait(0.2)
+    samples = device.read()
     assert [sample.time for sample in samples] == pytest.approx(PERIOD * np.arange(-7, 1))
     assert {(sample.x, sample.y) for sample in samples} == {(10.0, 0.0)}
-    watch.wait(PERIOD)
-    assert eye.read()[0].x == pytest.approx(10.0 + PERIOD)
+    clock.wait(PERIOD)
+    assert device.read()[0].x == pytest.approx(10.0 + PERIOD)
 
 
-def test_a_delay_between_two_readings_waits_for_the_next():
-    watch = Watch()
-    eye = tracker(watch, delay=0.03)
-    watch.wait(0.05)
-    assert eye.read()[-1].time == pytest.approx(0.0)
-    watch.wait(0.0049)
-    assert eye.read() == ()
-    watch.wait(0.0002)
-    assert [sample.time for sample in eye.read()] == pytest.approx([0.025])
+def test_a_delay_that_is_not_a_multiple_of_the_period_is_exact():
+    clock = ManualClock()
+    device = tracker(clock, delay=0.03)
+    clock.wait(0.05)
+    assert device.read()[-1].time == pytest.approx(0.0)
+    clock.wait(0.0049)
+    assert device.read() == ()
+    clock.wait(0.0002)
+    assert [sample.time for sample in device.read()] == pytest.approx([0.025])
 
 
 @given(waits=st.lists(st.floats(0.0, 0.7), min_size=1, max_size=30), delay=st.floats(0.0, 0.5))
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=100)
-def test_each_reading_is_told_once_in_order_whenever_one_asks(waits, delay):
-    watch = Watch()
-    eye = tracker(watch, delay=delay)
-    told = []
+def test_each_reading_is_returned_once_and_in_order(waits, delay):
+    clock = ManualClock()
+    device = tracker(clock, delay=delay)
+    numbers = []
     for seconds in waits:
-        watch.wait(seconds)
-        told.extend(round(sample.time / PERIOD) for sample in eye.read())
+        clock.wait(seconds)
+        numbers.extend(round(sample.time / PERIOD) for sample in device.read())
     first = 1 - int(np.ceil(delay / PERIOD - 1e-6))
-    assert told == list(range(first, first + len(told)))
-    due = (watch.now() - delay) / PERIOD
-    assert due - 1.0 - 1e-5 <= first + len(told) - 1 <= due + 1e-5
+    assert numbers == list(range(first, first + len(numbers)))
+    due = (clock.now() - delay) / PERIOD
+    assert due - 1.0 - 1e-5 <= first + len(numbers) - 1 <= due + 1e-5
 
 
 def test_the_rigs_delay_is_a_control_period_at_full_step_and_speed():
@@ -194,23 +194,23 @@ def test_none_is_missing_without_a_share():
     assert all(sample.x is not None for sample in readings(5000))
 
 
-def test_what_is_missing_changes_no_other_reading():
-    """So that one imperfection can be judged alone, pair by pair."""
+def test_missing_readings_do_not_change_other_readings():
+    """So that each imperfection can be compared in pairs."""
     all_of_them, some = readings(3000), readings(3000, missing=0.3)
-    seen = [(one, other) for one, other in zip(all_of_them, some, strict=True) if other.x is not None]
-    assert 1800 < len(seen) < 2400
-    assert all(one == other for one, other in seen)
+    measured = [(one, other) for one, other in zip(all_of_them, some, strict=True) if other.x is not None]
+    assert 1800 < len(measured) < 2400
+    assert all(one == other for one, other in measured)
 
 
-def test_a_delay_changes_no_readings_noise():
-    """However many readings from before the start it brings along."""
-    still = {"tip_at": lambda _: (0.0, 0.0), "jitter": 0.1, "missing": 0.1}
+def test_a_delay_does_not_change_the_noise():
+    """For any number of readings before the start."""
+    at_rest = {"tip_at": lambda _: (0.0, 0.0), "jitter": 0.1, "missing": 0.1}
     noise = []
     for delay in (0.0, 0.2, 0.4):
-        watch = Watch()
-        eye = tracker(watch, delay=delay, **still)
-        watch.wait(3.0 + delay)
-        noise.append([(s.x, s.y) for s in eye.read() if s.time > 0.0])
+        clock = ManualClock()
+        device = tracker(clock, delay=delay, **at_rest)
+        clock.wait(3.0 + delay)
+        noise.append([(s.x, s.y) for s in device.read() if s.time > 0.0])
         assert len(noise[-1]) == 120
     assert noise[0] == noise[1] == noise[2]
 
@@ -219,30 +219,30 @@ def test_a_delay_changes_no_readings_noise():
 
 
 def test_a_bias_is_added_once_to_every_reading():
-    """To each axis its own, whatever the delay; noise as without."""
+    """Different on each axis, independent of the delay, with the same noise."""
     plain, biased = readings(200, delay=0.2), readings(200, delay=0.2, bias=(0.3, -0.1))
-    off = np.array([(two.x - one.x, two.y - one.y) for one, two in zip(plain, biased, strict=True)])
-    np.testing.assert_allclose(off, [[0.3, -0.1]] * 200, atol=1e-12)
+    differences = np.array([(two.x - one.x, two.y - one.y) for one, two in zip(plain, biased, strict=True)])
+    np.testing.assert_allclose(differences, [[0.3, -0.1]] * 200, atol=1e-12)
 
 
 def test_noise_is_white_with_the_jitter_on_each_axis():
-    watch = Watch()
+    clock = ManualClock()
     jitter = load_scenario("phantom").tracker.jitter_per_axis
     assert jitter == pytest.approx(0.07 / np.sqrt(3))
-    eye = tracker(watch, lambda _: (10.0, -3.0), jitter=jitter)
-    watch.wait(PERIOD * 20_000)
-    noise = np.array([(sample.x - 10.0, sample.y + 3.0) for sample in eye.read()])
+    device = tracker(clock, lambda _: (10.0, -3.0), jitter=jitter)
+    clock.wait(PERIOD * 20_000)
+    noise = np.array([(sample.x - 10.0, sample.y + 3.0) for sample in device.read()])
     np.testing.assert_allclose(noise.std(axis=0), jitter, rtol=0.02)
     np.testing.assert_allclose(noise.mean(axis=0), 0.0, atol=4 * jitter / np.sqrt(20_000))
     others = [np.corrcoef(noise.T)[0, 1], *(np.corrcoef(noise[1:, k], noise[:-1, k])[0, 1] for k in (0, 1))]
     assert np.abs(others).max() < 0.03
 
 
-def test_readings_from_before_the_start_are_as_noisy():
-    watch = Watch()
-    eye = tracker(watch, jitter=0.1, delay=200.0)
-    watch.wait(200.0)
-    noise = np.array([(sample.x - 10.0, sample.y) for sample in eye.read()])
+def test_readings_before_the_start_have_the_same_noise():
+    clock = ManualClock()
+    device = tracker(clock, jitter=0.1, delay=200.0)
+    clock.wait(200.0)
+    noise = np.array([(sample.x - 10.0, sample.y) for sample in device.read()])
     assert noise.shape == (8000, 2)
     np.testing.assert_allclose(noise.std(axis=0), 0.1, rtol=0.04)
 

@@ -1,1 +1,1 @@
-"""Devices behind the ports of a rig."""
+"""Devices with the ports of a rig."""

@@ -1,10 +1,10 @@
-"""Time that passes by itself."""
+"""Real time."""
 
 from time import monotonic, sleep
 
 
 class WallClock:
-    """The port `Clock` in real time, from when it was made; `speed` times as fast, for recordings that are replayed."""
+    """The port `Clock` in real time from its construction; `speed` times as fast for the replay of recordings."""
 
     def __init__(self, speed: float = 1.0) -> None:
         self._start, self._speed = monotonic(), speed
@@ -14,5 +14,5 @@ class WallClock:
         return (monotonic() - self._start) * self._speed
 
     def wait(self, seconds: float) -> None:
-        """Let `seconds` pass."""
+        """Wait for `seconds`."""
         sleep(max(0.0, seconds / self._speed))

@@ -1,12 +1,14 @@
-"""Being served in time by a busy machine."""
+"""Real-time priority of a process."""
 
 import os
 from contextlib import suppress
 
 
-def come_first() -> None:
-    """Let this process run as soon as it has something to do, where the system has that and allows it (Linux, root or
-    an rtprio limit). For one that needs little and mostly waits: ahead of all others, it could stop the machine."""
+def set_realtime_priority() -> None:
+    """Give this process real-time priority where the system permits it (Linux, as root or with an rtprio limit).
+
+    Only for a process that mostly waits: it runs ahead of all others and could block the machine.
+    """
     if hasattr(os, "sched_setscheduler"):
         with suppress(PermissionError):
             os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))

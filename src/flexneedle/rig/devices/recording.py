@@ -1,4 +1,4 @@
-"""A tracker's frames as a table: a row for each sensor in each frame, in CSV or Parquet."""
+"""A tracker's frames as a table, one row per sensor and frame, in CSV or Parquet."""
 
 import csv
 from collections.abc import Iterable, Iterator, Mapping
@@ -14,19 +14,19 @@ COLUMNS = (
     *("time_s", "frame_number", "sensor", "status", "x_mm", "y_mm", "z_mm"),
     *("qw", "qx", "qy", "qz", "indicator"),
 )
-"""Columns of a recording. The last nine are empty where nothing was known. A table of measurements can be read as a
-recording, too, if it has times and frame numbers: `status` may be left out."""
+"""Columns of a recording. The last eight are empty where a value is not known. A table of measurements with times and
+frame numbers can be read as a recording, too: `status` is optional."""
 
 _REQUIRED = ("time_s", "frame_number", "sensor", "x_mm", "y_mm", "z_mm")
-_PLACE, _TURN = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
+_POSITION, _ORIENTATION = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
 
 
 def rows_of(frame: Frame) -> list[dict[str, Any]]:
-    """Return the rows of a frame, with all digits; None where nothing is known."""
+    """Return the rows of a frame, with all digits; None for values that are not known."""
     return [
         {"time_s": frame.time, "frame_number": frame.number, "sensor": name, "status": reading.status}
-        | dict(zip(_PLACE, reading.position or (None,) * 3, strict=True))
-        | dict(zip(_TURN, reading.orientation or (None,) * 4, strict=True))
+        | dict(zip(_POSITION, reading.position or (None,) * 3, strict=True))
+        | dict(zip(_ORIENTATION, reading.orientation or (None,) * 4, strict=True))
         | {"indicator": reading.indicator}
         for name, reading in frame.readings.items()
     ]
@@ -38,10 +38,10 @@ def read_frames(path: Path) -> tuple[Frame, ...]:
     together = groupby(enumerate(rows, 2), key=lambda row: (row[1].get("time_s"), row[1].get("frame_number")))
     frames = tuple(_frame(path, [*group]) for _, group in together)
     if not frames:
-        raise InputError(f"{path}: holds no frames")
-    back = next((n for n in range(1, len(frames)) if frames[n].time < frames[n - 1].time), None)
-    if back is not None:
-        raise InputError(f"{path}: frame {frames[back].number}: time_s goes back")
+        raise InputError(f"{path}: contains no frames")
+    backwards = next((n for n in range(1, len(frames)) if frames[n].time < frames[n - 1].time), None)
+    if backwards is not None:
+        raise InputError(f"{path}: frame {frames[backwards].number}: time_s must not decrease")
     return frames
 
 
@@ -71,14 +71,16 @@ def _parquet_rows(path: Path) -> Iterator[Mapping[str, Any]]:
 def _unreadable(path: Path, error: Exception) -> InputError:
     reason = (
         error.strerror if isinstance(error, OSError) and error.strerror else error
-    )  # not the path once more
+    )  # without a repeated path
     return InputError(f"{path}: cannot be read: {reason}")
 
 
 def _check_columns(path: Path, columns: Iterable[str]) -> None:
     missing = [name for name in _REQUIRED if name not in set(columns)]
     if missing:
-        raise InputError(f"{path}: no column {', '.join(missing)}; a recording has {', '.join(COLUMNS)}")
+        raise InputError(
+            f"{path}: no column {', '.join(missing)}; columns of a recording: {', '.join(COLUMNS)}"
+        )
 
 
 def _frame(path: Path, rows: list[tuple[int, Mapping[str, Any]]]) -> Frame:
@@ -95,12 +97,12 @@ def _frame(path: Path, rows: list[tuple[int, Mapping[str, Any]]]) -> Frame:
 
 
 def _new_sensor(row: Mapping[str, Any], known: Iterable[str]) -> str:
-    """Return the name of a row's sensor. Raises ValueError if there is none, or it is known in this frame."""
+    """Return the name of a row's sensor. Raises ValueError if it is empty or a duplicate in this frame."""
     name = str(row["sensor"] or "")
     if not name:
-        raise ValueError("a sensor has no name")
+        raise ValueError("sensor is empty")
     if name in known:
-        raise ValueError(f"frame {row['frame_number']} has the sensor {name} already: each once in a frame")
+        raise ValueError(f"duplicate sensor {name} in frame {row['frame_number']}")
     return name
 
 
@@ -112,24 +114,24 @@ def _known(row: Mapping[str, Any], column: str) -> float:
 
 
 def _reading(row: Mapping[str, Any]) -> SensorReading:
-    place = [_number(row, name) for name in _PLACE]
-    turn = [_number(row, name) for name in _TURN]
+    position_cells = [_number(row, name) for name in _POSITION]
+    orientation_cells = [_number(row, name) for name in _ORIENTATION]
     indicator = _number(row, "indicator")
-    match place:
+    match position_cells:
         case [float(x), float(y), float(z)]:
             status = row.get("status") or VISIBLE
             position = (x, y, z) if status == VISIBLE else None
         case _:
-            told = row.get("status")
-            status, position = (told if told and told != VISIBLE else "missing"), None
-    match turn:
+            status = row.get("status")
+            status, position = (status if status and status != VISIBLE else "missing"), None
+    match orientation_cells:
         case [float(w), float(i), float(j), float(k)]:
             return SensorReading(position, (w, i, j, k), indicator, status)
     return SensorReading(position, None, indicator, status)
 
 
 def _number(row: Mapping[str, Any], column: str) -> float | None:
-    """Return a number, or None for an empty cell or a column that is not there. Raises ValueError."""
+    """Return a number, or None for an empty cell or a missing column. Raises ValueError."""
     value = row.get(column)
     if value is None or value == "":
         return None

@@ -1,4 +1,4 @@
-"""`Replay`: frames that were recorded, once more, behind the port `Tracker`."""
+"""`Replay`: a recording with the port `Tracker`."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,15 +9,14 @@ from flexneedle.rig.ports import Clock
 from flexneedle.types import VISIBLE, Frame
 
 ENDED = "the recording has ended"
-"""The status of a replay after its last frame: there is no more to come."""
+"""Status of a replay after its last frame."""
 
 
 class Replay:
-    """Plays frames on a clock from now on: what was recorded after t seconds comes after t seconds.
+    """Replays frames on a clock, starting now: a frame recorded after t seconds arrives after t seconds.
 
-    frames: oldest first. The times told are those of the clock, the numbers those of the recording. At another speed
-    it is the clock that runs faster, so that ages and windows stay those of the recording.
-    Raises InputError if there are no frames.
+    frames: oldest first. Times are those of the clock, numbers those of the recording. For another speed use a faster
+    clock, so that ages and windows remain those of the recording. Raises InputError if there are no frames.
     """
 
     def __init__(self, frames: Sequence[Frame], clock: Clock) -> None:
@@ -33,7 +32,7 @@ class Replay:
         pass
 
     def read(self) -> tuple[Frame, ...]:
-        """The frames since the last call, oldest first; empty if there was none."""
+        """The frames since the last call, oldest first; may be empty."""
         now, first = self._clock.now(), self._next
         while not self.ended and self._due(self._frames[self._next]) <= now:
             self._next += 1
@@ -46,7 +45,7 @@ class Replay:
 
     @property
     def status(self) -> str:
-        """VISIBLE while there is more to come, then ENDED."""
+        """VISIBLE until the last frame was read, then ENDED."""
         return ENDED if self.ended else VISIBLE
 
     def _due(self, frame: Frame) -> float:

@@ -1,1 +1,1 @@
-"""Emulators of devices, on their own protocols."""
+"""Emulators of devices with their native protocols."""

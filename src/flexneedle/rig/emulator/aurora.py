@@ -1,8 +1,8 @@
-"""The emulated Aurora: what it answers to a command in a state. Pure: nothing is opened, sent or timed here.
+"""The emulated Aurora: its reply to a command in a state. Pure functions, without I/O or time.
 
-It has one wired port a sensor, with the port handles 0A, 0B, …; knows the commands that clients need to find,
-set up, start and read sensors; and keeps to the modes of the real one: nothing before INIT, no set-up while it
-tracks, no reading before. Names and numbers are those of NDI's Combined API.
+It has one wired port per sensor, with the port handles 0A, 0B, …, and supports the commands to find, set up, start and
+read sensors, with the modes of a real Aurora: only INIT first, no set-up while tracking, no readings before tracking.
+Names and numbers are those of NDI's Combined API.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,7 +13,7 @@ from flexneedle.rig.emulator.codec import Request
 from flexneedle.rig.emulator.motion import SENSORS, EmulatedPose
 
 FIRMWARE = "AURORA Rev 008"
-"""Freeze tag of the firmware. Clients choose between BX and TX by it."""
+"""Freeze tag of the firmware, by which clients choose BX or TX."""
 
 _FIRST_HANDLE = 0x0A
 _OCCUPIED, _INITIALIZED, _ENABLED = 0x01, 0x10, 0x20
@@ -25,7 +25,7 @@ _OFF, _SETUP, _TRACKING = "off", "setup", "tracking"
 
 @dataclass(frozen=True)
 class Port:
-    """A port handle; sensor is None for a handle that was asked for (PHRQ) and has nothing plugged in."""
+    """A port handle; sensor is None for a requested handle (PHRQ) with nothing plugged in."""
 
     number: int
     sensor: str | None
@@ -34,7 +34,7 @@ class Port:
 
     @property
     def status(self) -> int:
-        """Its bits in PHSR, PHINF, TX and BX."""
+        """Status bits in PHSR, PHINF, TX and BX."""
         return (
             (_OCCUPIED if self.sensor else 0)
             | (_INITIALIZED if self.initialized else 0)
@@ -44,51 +44,50 @@ class Port:
 
 @dataclass(frozen=True)
 class AuroraState:
-    """State of the device: mode, port handles, firmware, and whether it knows BX (old firmware does not)."""
+    """State of the device: mode, port handles, firmware, and whether it supports BX (old firmware does not)."""
 
     ports: Mapping[int, Port]
     mode: str = _OFF
     firmware: str = FIRMWARE
-    knows_bx: bool = True
+    has_bx: bool = True
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What there is to read now: the frame's number, the poses by sensor, what ails a sensor, if anything, and the bits
-    of what ails the whole system."""
+class Snapshot:
+    """Values for a reading: frame number, poses by sensor, faults by sensor, and bits of the system status."""
 
     number: int
     poses: Mapping[str, EmulatedPose]
-    ailments: Mapping[str, str] = field(default_factory=dict)
+    faults: Mapping[str, str] = field(default_factory=dict)
     system: int = 0
 
 
 class _Refusal(Exception):
-    """A reply ERROR with a code."""
+    """An error reply with a code."""
 
 
-def fresh(sensors: int = len(SENSORS), firmware: str = FIRMWARE, *, knows_bx: bool = True) -> AuroraState:
-    """Return the device as it is after power-on with so many sensors plugged in."""
+def fresh(sensors: int = len(SENSORS), firmware: str = FIRMWARE, *, has_bx: bool = True) -> AuroraState:
+    """Return the device after power-on, with this number of sensors plugged in."""
     ports = {_FIRST_HANDLE + n: Port(n + 1, name) for n, name in enumerate(SENSORS[:sensors])}
-    return AuroraState(ports, firmware=firmware, knows_bx=knows_bx)
+    return AuroraState(ports, firmware=firmware, has_bx=has_bx)
 
 
-def answer(aurora: AuroraState, line: bytes, seen: Seen) -> tuple[AuroraState, bytes]:
-    """Return the state after a command (a line without its end) and the whole reply."""
+def reply(aurora: AuroraState, line: bytes, snapshot: Snapshot) -> tuple[AuroraState, bytes]:
+    """Return the state after a command (a line without its end) and the complete reply."""
     command = codec.parse(line)
     try:
         if not command.intact:
             raise _Refusal("04")
-        return _obey(aurora, command, seen)
+        return _execute(aurora, command, snapshot)
     except _Refusal as refusal:
         return aurora, codec.text(f"ERROR{refusal}")
 
 
-def _obey(aurora: AuroraState, command: Request, seen: Seen) -> tuple[AuroraState, bytes]:
+def _execute(aurora: AuroraState, command: Request, snapshot: Snapshot) -> tuple[AuroraState, bytes]:
     if command.name in _ANYWHERE:
         return _ANYWHERE[command.name](aurora, command.arguments)
-    known = command.name in _SET_UP or command.name in ("TX", "TSTOP") or _is_bx(aurora, command.name)
-    if not known:
+    supported = command.name in _SET_UP or command.name in ("TX", "TSTOP") or _is_bx(aurora, command.name)
+    if not supported:
         raise _Refusal("01")
     if aurora.mode == _OFF:
         raise _Refusal("10")
@@ -98,11 +97,11 @@ def _obey(aurora: AuroraState, command: Request, seen: Seen) -> tuple[AuroraStat
         return _SET_UP[command.name](aurora, command.arguments)
     if command.name == "TSTOP":
         return replace(aurora, mode=_SETUP), codec.text("OKAY")
-    return aurora, (_tx if command.name == "TX" else _bx)(aurora, _options(command.arguments), seen)
+    return aurora, (_tx if command.name == "TX" else _bx)(aurora, _options(command.arguments), snapshot)
 
 
 def _is_bx(aurora: AuroraState, name: str) -> bool:
-    return name == "BX" and aurora.knows_bx
+    return name == "BX" and aurora.has_bx
 
 
 def _options(arguments: str) -> int:
@@ -127,13 +126,13 @@ def _hexadecimal(digits: str, length: int) -> int:
 
 
 def _init(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
-    """Enter set-up with all sensors to be initialised again."""
+    """Enter set-up with all sensors uninitialised."""
     ports = {handle: Port(port.number, port.sensor) for handle, port in aurora.ports.items()}
     return replace(aurora, mode=_SETUP, ports=ports), codec.text("OKAY")
 
 
 def _reset(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
-    """A pseudo-terminal carries no serial break, so the command alone resets."""
+    """Reset by command: a pseudo-terminal has no serial break."""
     ports = {handle: Port(port.number, port.sensor) for handle, port in aurora.ports.items()}
     return replace(aurora, mode=_OFF, ports=ports), codec.text("RESET")
 
@@ -149,10 +148,10 @@ def _beep(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
 
 
 def _comm(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
-    """A pseudo-terminal has no speed: what is asked for is checked and granted."""
+    """Check the requested settings; a pseudo-terminal has no baud rate."""
     if len(arguments) < 5:
         raise _Refusal("03")
-    allowed = ("01234567A", "01", "012", "01", "01")  # speed, data bits, parity, stop bits, handshake
+    allowed = ("01234567A", "01", "012", "01", "01")  # baud rate, data bits, parity, stop bits, handshake
     if any(digit not in choices for digit, choices in zip(arguments, allowed, strict=False)):
         raise _Refusal("23")
     return aurora, codec.text("OKAY")
@@ -175,7 +174,7 @@ def _information(aurora: AuroraState, arguments: str) -> tuple[AuroraState, byte
 
 
 def _features(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
-    """Only the number of ports is told (option 02)."""
+    """Only the number of ports (option 02) is supported."""
     if _hexadecimal(arguments, 2) != 0x02:
         raise _Refusal("23")
     return aurora, codec.text(f"{sum(port.sensor is not None for port in aurora.ports.values()):X}")
@@ -226,7 +225,7 @@ def _free(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
 
 
 def _write(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
-    """Take the description of a tool and forget it: the emulated ones have their own."""
+    """Accept and ignore a tool definition: emulated sensors have their own."""
     _port(aurora, arguments)
     return aurora, codec.text("OKAY")
 
@@ -253,7 +252,7 @@ def _disable(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
 
 
 def _describe(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
-    """PHINF: the parts that the options ask for, in the order of their bits."""
+    """PHINF: the requested parts in the order of their bits."""
     _, port = _port(aurora, arguments)
     options = _hexadecimal(arguments[2:], 4) if len(arguments) > 2 else 0x0001
     if port.sensor is None:
@@ -304,42 +303,42 @@ _SET_UP: dict[str, _Handler] = {
 # Readings
 
 
-def _tx(aurora: AuroraState, options: int, seen: Seen) -> bytes:
-    rows = [(handle, *_reading(port, options, seen)) for handle, port in _reported(aurora)]
+def _tx(aurora: AuroraState, options: int, snapshot: Snapshot) -> bytes:
+    rows = [(handle, *_reading(port, options, snapshot)) for handle, port in _reported(aurora)]
     words = {_MISSING: "MISSING", _DISABLED: "DISABLED"}
-    told = "".join(
-        f"{handle:02X}{words[kind] if pose is None else codec.transform_text(pose)}{bits:08X}{seen.number:08X}\n"
+    readings = "".join(
+        f"{handle:02X}{words[kind] if pose is None else codec.transform_text(pose)}{bits:08X}{snapshot.number:08X}\n"
         for handle, kind, bits, pose in rows
     )
-    return codec.text(f"{len(rows):02X}{told}{seen.system:04X}")
+    return codec.text(f"{len(rows):02X}{readings}{snapshot.system:04X}")
 
 
-def _bx(aurora: AuroraState, options: int, seen: Seen) -> bytes:
+def _bx(aurora: AuroraState, options: int, snapshot: Snapshot) -> bytes:
     body = bytearray([len(_reported(aurora))])
     for handle, port in _reported(aurora):
-        kind, bits, pose = _reading(port, options, seen)
+        kind, bits, pose = _reading(port, options, snapshot)
         body += bytes((handle, kind))
         if kind == _DISABLED:
-            continue  # it has no more to tell
+            continue  # no further data
         body += b"" if pose is None else codec.transform_binary(pose)
-        body += bits.to_bytes(4, "little") + seen.number.to_bytes(4, "little")
-    return codec.binary(bytes(body) + seen.system.to_bytes(2, "little"))
+        body += bits.to_bytes(4, "little") + snapshot.number.to_bytes(4, "little")
+    return codec.binary(bytes(body) + snapshot.system.to_bytes(2, "little"))
 
 
 def _reported(aurora: AuroraState) -> list[tuple[int, Port]]:
     return [(handle, port) for handle, port in aurora.ports.items() if port.initialized]
 
 
-def _reading(port: Port, options: int, seen: Seen) -> tuple[int, int, EmulatedPose | None]:
-    """Return handle status, port status and pose, None where none is told."""
-    ailment = seen.ailments.get(port.sensor or "")
-    bits = port.status | _AILING_BITS.get(ailment or "", 0)
-    if not port.enabled or ailment == "disabled":
+def _reading(port: Port, options: int, snapshot: Snapshot) -> tuple[int, int, EmulatedPose | None]:
+    """Return handle status, port status and pose, None if there is none."""
+    fault = snapshot.faults.get(port.sensor or "")
+    bits = port.status | _FAULT_BITS.get(fault or "", 0)
+    if not port.enabled or fault == "disabled":
         return _DISABLED, bits & ~_ENABLED, None
-    hidden = ailment == "out-of-volume" and not options & _ALSO_OUT_OF_VOLUME
-    if ailment in ("missing", "broken") or hidden:
+    hidden = fault == "out-of-volume" and not options & _ALSO_OUT_OF_VOLUME
+    if fault in ("missing", "broken") or hidden:
         return _MISSING, bits, None
-    return _VALID, bits, seen.poses[port.sensor or ""]
+    return _VALID, bits, snapshot.poses[port.sensor or ""]
 
 
-_AILING_BITS = {"out-of-volume": _OUT_OF_VOLUME, "partly-out": _PARTLY_OUT, "broken": _BROKEN}
+_FAULT_BITS = {"out-of-volume": _OUT_OF_VOLUME, "partly-out": _PARTLY_OUT, "broken": _BROKEN}

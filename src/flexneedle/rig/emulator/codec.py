@@ -1,7 +1,7 @@
-"""How NDI's serial protocol writes commands, replies and checksums (Combined API); no state, no device.
+"""Commands, replies and checksums of NDI's serial protocol (Combined API); without state or device.
 
 A command is ASCII, `NAME:argumentsCRC\\r`, or `NAME arguments\\r` without a checksum. A reply is text, checksum and
-`\\r`, or binary behind a header of its own (`BX`). ndicapi's sources are where the layouts were looked up.
+`\\r`, or binary with a header (`BX`). The layouts are from ndicapi's sources.
 """
 
 import struct
@@ -20,12 +20,12 @@ def _divided(byte: int) -> int:
     return byte
 
 
-_TABLE = tuple(map(_divided, range(256)))  # a byte at a time: a reply has some 200
+_TABLE = tuple(map(_divided, range(256)))  # per byte: a reply has about 200
 
 
 @dataclass(frozen=True)
 class Request:
-    """A command as it came in; intact is False where its checksum is wrong."""
+    """A received command; intact is False if its checksum is wrong."""
 
     name: str
     arguments: str
@@ -41,7 +41,7 @@ def crc16(data: bytes) -> int:
 
 
 def parse(line: bytes) -> Request:
-    """Return the command in a line without its `\\r`; bytes that are no ASCII become characters of no command."""
+    """Return the command in a line without its `\\r`; bytes outside ASCII are replaced."""
     name = line[: _name_length(line)].decode("ascii", "replace")
     rest = line[len(name) :]
     if not rest.startswith(b":"):
@@ -56,24 +56,24 @@ def _name_length(line: bytes) -> int:
 
 
 def text(reply: str) -> bytes:
-    """Return a reply in text with its checksum and end."""
+    """Return a text reply with checksum and end."""
     body = reply.encode("ascii")
     return body + b"%04X\r" % crc16(body)
 
 
 def binary(body: bytes) -> bytes:
-    """Return a binary reply: start, length and their checksum, then body and its checksum, lowest byte first."""
+    """Return a binary reply: start, length and their checksum, then body and its checksum, little endian."""
     header = struct.pack("<HH", _BINARY_START, len(body))
     return header + struct.pack("<H", crc16(header)) + body + struct.pack("<H", crc16(body))
 
 
 def transform_text(pose: EmulatedPose) -> str:
-    """Return a pose as `TX` writes it: quaternion and indicator to 1e-4, position to 0.01 mm."""
-    turns = "".join(f"{round(part * 10_000):+06d}" for part in pose.orientation)
-    places = "".join(f"{round(part * 100):+07d}" for part in pose.position)
-    return f"{turns}{places}{round(pose.indicator * 10_000):+06d}"
+    """Return a pose in the format of `TX`: quaternion and indicator to 1e-4, position to 0.01 mm."""
+    orientation = "".join(f"{round(part * 10_000):+06d}" for part in pose.orientation)
+    position = "".join(f"{round(part * 100):+07d}" for part in pose.position)
+    return f"{orientation}{position}{round(pose.indicator * 10_000):+06d}"
 
 
 def transform_binary(pose: EmulatedPose) -> bytes:
-    """Return a pose as `BX` writes it: eight single-precision numbers."""
+    """Return a pose in the format of `BX`: eight single-precision numbers."""
     return struct.pack("<8f", *pose.orientation, *pose.position, pose.indicator)

@@ -1,4 +1,4 @@
-"""What goes wrong with the emulated tracker, and when: `KIND[=DETAIL]@SECONDS[:DURATION]`."""
+"""Faults of the emulated tracker and their times: `KIND[=DETAIL]@SECONDS[:DURATION]`."""
 
 import re
 from collections.abc import Iterable
@@ -9,21 +9,21 @@ from flexneedle.errors import InputError
 from flexneedle.rig.emulator.motion import SENSORS
 
 KINDS = {
-    "missing": "a sensor is not seen (tip, or missing=SENSOR)",
-    "out-of-volume": "a sensor is outside of the volume (tip, or out-of-volume=SENSOR)",
-    "partly-out": "a sensor is partly outside of the volume (tip, or partly-out=SENSOR)",
+    "missing": "a sensor is not measured (tip, or missing=SENSOR)",
+    "out-of-volume": "a sensor is outside the volume (tip, or out-of-volume=SENSOR)",
+    "partly-out": "a sensor is partly outside the volume (tip, or partly-out=SENSOR)",
     "broken": "a coil of a sensor is broken (tip, or broken=SENSOR)",
-    "disabled": "a sensor is switched off (tip, or disabled=SENSOR)",
-    "error": "every command is answered with an error (0D, or error=CODE in hexadecimal)",
+    "disabled": "a sensor is disabled (tip, or disabled=SENSOR)",
+    "error": "every command returns an error (0D, or error=CODE in hexadecimal)",
     "system": "the field generator is disconnected (20, or system=BITS of the system status in hexadecimal)",
     "garbled": "a byte of each reply is wrong",
     "cut": "the second half of each reply is lost",
     "silence": "no reply",
-    "delay": "replies come late (0.2, or delay=SECONDS)",
-    "frozen": "the frame number stands still",
+    "delay": "replies are delayed (0.2, or delay=SECONDS)",
+    "frozen": "the frame number does not increase",
     "unplug": "the cable is pulled, and plugged in again after the duration",
 }
-"""Each kind of fault, and what its detail is."""
+"""Description of each kind of fault and its detail."""
 
 _OF_A_SENSOR = ("missing", "out-of-volume", "partly-out", "broken", "disabled")
 _DEFAULTS = dict.fromkeys(_OF_A_SENSOR, SENSORS[0]) | {"error": "0D", "system": "20", "delay": "0.2"}
@@ -41,7 +41,7 @@ class Fault:
 
 
 def parse_fault(spec: str) -> Fault:
-    """Return the fault that a user wrote. Raises InputError."""
+    """Return the fault of an option value. Raises InputError."""
     form = _FORM.fullmatch(spec)
     if form is None:
         raise InputError(
@@ -64,7 +64,7 @@ def _check_detail(spec: str, kind: str, detail: str) -> None:
         raise InputError(f"--fault {spec}: must be two hexadecimal digits, such as {_DEFAULTS[kind]}")
     if kind == "delay":
         if not _seconds(spec, detail) > 0.0:
-            raise InputError(f"--fault {spec}: replies can only come later, such as delay=0.2")
+            raise InputError(f"--fault {spec}: the delay must be above 0 s, such as delay=0.2")
     elif detail and kind not in _DEFAULTS:
         raise InputError(f"--fault {spec}: {kind} takes no detail")
 
@@ -73,9 +73,9 @@ def _seconds(spec: str, text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise InputError(f"--fault {spec}: {text} is no number of seconds") from None
+        raise InputError(f"--fault {spec}: {text} is not a number of seconds") from None
 
 
 def active(faults: Iterable[Fault], time: float) -> tuple[Fault, ...]:
-    """Return the faults that are on at a time (s since tracking first began)."""
+    """Return the faults that are active at a time (s since tracking first began)."""
     return tuple(fault for fault in faults if fault.start <= time < fault.end)

@@ -1,4 +1,4 @@
-"""Where the emulated tip is told to rest: lines `X Y Z` on a stream, in mm in the tracker's frame."""
+"""Commands to rest the emulated tip at a position: lines `X Y Z` on a stream, in mm in the tracker's frame."""
 
 import os
 from collections.abc import Container
@@ -12,42 +12,42 @@ _LONGEST_LINE = 4096
 
 
 class Orders:
-    """Lines of a stream (its descriptor, or None for none), taken as they come until it ends.
+    """Lines of a stream (its descriptor, or None for none), read as they arrive until it ends.
 
-    A terminal is read in its foreground alone: a process in the background that reads there is stopped.
+    A terminal is read only in the foreground: a background process that reads it would be stopped.
     """
 
     def __init__(self, source: int | None) -> None:
-        self._source, self._heard = source, b""
+        self._source, self._received = source, b""
 
     @property
     def sources(self) -> list[int]:
-        """What to wait for: the descriptor, or nothing."""
+        """The descriptor to wait for, or none."""
         return [] if self._source is None or _in_background(self._source) else [self._source]
 
     def read(self, ready: Container[int]) -> list[str]:
-        """Return the lines that are whole now; ready: descriptors that something can be read from."""
+        """Return the complete lines received; ready: descriptors with data to read."""
         if self._source is None or self._source not in ready:
             return []
         try:
             data = os.read(self._source, _LONGEST_LINE)
-        except OSError:  # such as one that nohup opened for writing alone
+        except OSError:  # such as one opened by nohup for writing only
             data = b""
         if not data:
             self._source = None
-        *lines, self._heard = (self._heard + data)[-_LONGEST_LINE:].split(b"\n")
+        *lines, self._received = (self._received + data)[-_LONGEST_LINE:].split(b"\n")
         return [line.decode("utf-8", "replace") for line in lines if line.strip()]
 
 
 def _in_background(source: int) -> bool:
     try:
         return os.isatty(source) and os.tcgetpgrp(source) != os.getpgrp()
-    except OSError:  # a terminal that does not control this process, and stops nobody
+    except OSError:  # not the controlling terminal: reading it does not stop the process
         return False
 
 
-def parse_place(line: str) -> Point:
-    """Return the place (mm) in a line. Raises InputError."""
+def parse_position(line: str) -> Point:
+    """Return the position (mm) in a line. Raises InputError."""
     try:
         x, y, z = map(float, line.split())
     except ValueError:

@@ -1,4 +1,4 @@
-"""The emulated Aurora on a pseudo-terminal: bytes in, bytes out, the cable and the clock. Runs until interrupted."""
+"""The emulated Aurora on a pseudo-terminal, with its cable and clock. Runs until interrupted."""
 
 import os
 import pty
@@ -15,24 +15,24 @@ from typing import NoReturn, Self
 import numpy as np
 
 from flexneedle.errors import InputError
-from flexneedle.rig.emulator import codec
-from flexneedle.rig.emulator.aurora import AuroraState, Seen, answer
+from flexneedle.rig.emulator import aurora, codec
+from flexneedle.rig.emulator.aurora import AuroraState, Snapshot
 from flexneedle.rig.emulator.faults import Fault, active
 from flexneedle.rig.emulator.motion import RATE_HZ, SENSORS, pose
-from flexneedle.rig.emulator.orders import Orders, parse_place
+from flexneedle.rig.emulator.orders import Orders, parse_position
 from flexneedle.types import Point
 
-_TICK_S = 0.005  # the longest that the loop sleeps
+_TICK_S = 0.005  # longest sleep of the loop
 _LONGEST_STEP_S = 2 * _TICK_S
-_CATCHING_UP, _MOST_BEHIND_S = 1.1, 0.2
+_CATCH_UP_RATE, _MOST_BEHIND_S = 1.1, 0.2
 _LONGEST_LINE = 4096
 
 
 @dataclass
 class EmulatorSession:
-    """The device and its faults over time. Times are seconds on the device's clock, first of all that of power-on.
+    """The device and its faults over time. Times are in seconds on the device's clock, `power_on` the first.
 
-    rest: where the tip rests (mm, the tracker's frame), None while it moves along its arc.
+    rest: resting position of the tip (mm, the tracker's frame), None while it moves on its circle.
     """
 
     device: AuroraState
@@ -46,51 +46,53 @@ class EmulatorSession:
         self._random = np.random.default_rng((self.seed, 1))
 
     def faults_at(self, now: float) -> dict[str, Fault]:
-        """Return the faults that are on, by kind; there are none before tracking first begins."""
+        """Return the active faults by kind; none before tracking first begins."""
         if self.tracked_since is None:
             return {}
         return {fault.kind: fault for fault in active(self.faults, now - self.tracked_since)}
 
     def reply(self, line: bytes, now: float) -> tuple[float, bytes]:
-        """Return when to answer a command, and with what (b"" is silence)."""
+        """Return time and data of the reply to a command (b"": no reply)."""
         faults = self.faults_at(now)
         if "silence" in faults:
             return now, b""
         if "error" in faults:
             return now, codec.text(f"ERROR{faults['error'].detail}")
-        self.device, whole = answer(self.device, line, self._seen(now, faults))
+        self.device, complete = aurora.reply(self.device, line, self._snapshot(now, faults))
         if self.device.mode == "tracking" and self.tracked_since is None:
             self.tracked_since = now
-        late = float(faults["delay"].detail) if "delay" in faults else 0.0
-        return now + late, self._damaged(whole, faults)
+        delay = float(faults["delay"].detail) if "delay" in faults else 0.0
+        return now + delay, self._damaged(complete, faults)
 
-    def _seen(self, now: float, faults: dict[str, Fault]) -> Seen:
+    def _snapshot(self, now: float, faults: dict[str, Fault]) -> Snapshot:
         if "frozen" in faults and self.tracked_since is not None:
             now = self.tracked_since + faults["frozen"].start
         number = int((now - self.power_on) * RATE_HZ) & 0xFFFF_FFFF
-        on = () if self.tracked_since is None else active(self.faults, now - self.tracked_since)
-        ailments = {fault.detail: fault.kind for fault in on if fault.detail in SENSORS}
+        present = () if self.tracked_since is None else active(self.faults, now - self.tracked_since)
+        by_sensor = {fault.detail: fault.kind for fault in present if fault.detail in SENSORS}
         poses = {name: pose(name, number, self.seed, self.rest) for name in SENSORS}
-        return Seen(number, poses, ailments, int(faults["system"].detail, 16) if "system" in faults else 0)
+        return Snapshot(
+            number, poses, by_sensor, int(faults["system"].detail, 16) if "system" in faults else 0
+        )
 
-    def _damaged(self, whole: bytes, faults: dict[str, Fault]) -> bytes:
+    def _damaged(self, complete: bytes, faults: dict[str, Fault]) -> bytes:
         if "cut" in faults:
-            return whole[: len(whole) // 2]
+            return complete[: len(complete) // 2]
         if "garbled" not in faults:
-            return whole
-        at, flipped = self._random.integers(len(whole)), self._random.integers(1, 256)
-        return whole[:at] + bytes([whole[at] ^ int(flipped)]) + whole[at + 1 :]
+            return complete
+        at, flipped = self._random.integers(len(complete)), self._random.integers(1, 256)
+        return complete[:at] + bytes([complete[at] ^ int(flipped)]) + complete[at + 1 :]
 
 
 def _is_left_over(link: Path) -> bool:
-    """Whether it is a link to a terminal that is gone, as an emulator that was killed leaves it."""
+    """Whether it is a link to a terminal that no longer exists, left by an emulator that was killed."""
     return link.is_symlink() and not link.exists() and link.readlink().parent == Path("/dev/pts")
 
 
 class Serial:
-    """A pseudo-terminal and a link to it. Plugged in and out; the link's path stays the same. Use it as a context.
+    """A pseudo-terminal and a symbolic link to it, which can be plugged in and out. Use it as a context manager.
 
-    link: its path, or None for one in a new folder. Raises InputError if something else is there.
+    link: path of the link, or None for one in a new folder. Raises InputError if the path exists.
     """
 
     def __init__(self, link: Path | None) -> None:
@@ -100,9 +102,9 @@ class Serial:
             link = Path(self._folder.name) / "aurora"
         self.link = link
         if os.path.lexists(self.link) and not _is_left_over(self.link):
-            raise InputError(f"{self.link}: is there already: name another, or take it away")
+            raise InputError(f"{self.link}: already exists: choose another path, or remove it")
         self.ends: tuple[int, int] | None = None
-        """Descriptors of the device's end and of the host's; the latter stays open, or the former would fail."""
+        """Descriptors of the device's end and of the host's, which must stay open: the former would fail otherwise."""
 
     def __enter__(self) -> Self:
         self.plug()
@@ -114,7 +116,7 @@ class Serial:
             self._folder.cleanup()
 
     def plug(self) -> None:
-        """Make the pseudo-terminal and the link. Raises InputError if the link cannot be made."""
+        """Create the pseudo-terminal and the link. Raises InputError if the link cannot be created."""
         device, host = pty.openpty()
         self.ends = device, host
         tty.setraw(host)  # no echo, no line editing, before the first host opens it
@@ -124,12 +126,12 @@ class Serial:
                 self.link.unlink()
             self.link.symlink_to(os.ttyname(host))
         except OSError as error:
-            raise InputError(f"{self.link}: the link cannot be made: {error.strerror}") from None
+            raise InputError(f"{self.link}: the link cannot be created: {error.strerror}") from None
 
     def unplug(self) -> None:
-        """Hang up on the host and take the link away."""
+        """Close the terminal and remove the link."""
         if self.ends is not None:
-            # Another's link, made since, stays.
+            # A newer link of another process is kept.
             if self.link.is_symlink() and self.link.readlink() == Path(os.ttyname(self.ends[1])):
                 self.link.unlink()
             for end in self.ends:
@@ -138,60 +140,61 @@ class Serial:
 
     @property
     def sources(self) -> list[int]:
-        """What to wait for: the device's end, or nothing."""
+        """The device's end to wait for, or none."""
         return [] if self.ends is None else [self.ends[0]]
 
     def read(self) -> bytes:
-        """Return what the host has written, without waiting for it."""
+        """Return the data that the host has written, without waiting."""
         with suppress(BlockingIOError):
             return b"".join(os.read(source, _LONGEST_LINE) for source in self.sources)
         return b""
 
     def write(self, data: bytes) -> None:
-        """Send to the host; what it does not take is lost, as on a wire."""
+        """Send to the host; data that it does not accept are lost, as on a wire."""
         if self.ends is not None and data:
             with suppress(BlockingIOError):
                 os.write(self.ends[0], data)
 
 
 def device_time(before: float, served: float, now: float) -> float:
-    """Return the device's time (s) at `now`, from that `before`, when it was last `served`.
+    """Return the device's time (s) at `now`; before: that of the last call, at `served` (s).
 
-    It is real time, but does not leap where the machine kept this process waiting: it stands, as the device does
-    whose part the process plays, and then runs a tenth faster until it has caught up. Else a machine that takes the
-    processor away for a frame's length (virtual machines do, for tens of ms) would lose frames that no line loses.
-    After more than 0.2 s it leaps, so that its frames do not look stale: then the process was stopped.
+    It follows real time, but does not jump when the process was not scheduled: it stops meanwhile and then runs 10 %
+    faster until it has caught up. Otherwise a pause of the process by a frame period (virtual machines have pauses of
+    tens of ms) would lose frames that a real device does not lose. After more than 0.2 s it jumps, so that frames are
+    not stale: the process was stopped.
     """
-    stepped = before + _CATCHING_UP * min(now - served, _LONGEST_STEP_S)
+    stepped = before + _CATCH_UP_RATE * min(now - served, _LONGEST_STEP_S)
     return max(now - _MOST_BEHIND_S, min(now, stepped))
 
 
 def serve(session: EmulatorSession, serial: Serial, orders: Orders, say: Callable[[str], None]) -> NoReturn:
-    """Answer until interrupted. say: told when the cable is pulled or plugged in, and where the tip rests now."""
-    heard, due = b"", list[tuple[float, bytes]]()
+    """Reply to commands until interrupted. say: called with a line when the cable is unplugged or plugged in, and when
+    the tip is moved to a resting position."""
+    received, due = b"", list[tuple[float, bytes]]()
     now = served = monotonic()
     while True:
-        pulled = "unplug" in session.faults_at(now)
-        if pulled != (serial.ends is None):
-            (serial.unplug if pulled else serial.plug)()
-            heard, due = b"", []
-            say("unplugged" if pulled else f"plugged in again: {serial.link}")
+        unplugged = "unplug" in session.faults_at(now)
+        if unplugged != (serial.ends is None):
+            (serial.unplug if unplugged else serial.plug)()
+            received, due = b"", []
+            say("unplugged" if unplugged else f"plugged in again: {serial.link}")
         idle = max(0.0, min([_TICK_S, *(time - now for time, _ in due)]))
         ready, _, _ = select.select([*serial.sources, *orders.sources], [], [], idle)
         now, served = device_time(now, served, real := monotonic()), real
         for order in orders.read(ready):
-            say(obey(session, order))
-        heard += serial.read()
-        *lines, heard = heard[-_LONGEST_LINE:].split(b"\r")
+            say(execute(session, order))
+        received += serial.read()
+        *lines, received = received[-_LONGEST_LINE:].split(b"\r")
         due += [session.reply(line, now) for line in lines]
         while due and due[0][0] <= now:
             serial.write(due.pop(0)[1])
 
 
-def obey(session: EmulatorSession, order: str) -> str:
-    """Rest the tip where a line says; return where it is, or what is wrong with the line."""
+def execute(session: EmulatorSession, order: str) -> str:
+    """Rest the tip at the position in a line; return a message with the position or the error."""
     try:
-        session.rest = parse_place(order)
+        session.rest = parse_position(order)
     except InputError as error:
         return str(error)
     return "the tip rests at {:g} {:g} {:g} mm".format(*session.rest)

@@ -1,1 +1,1 @@
-"""The monitor of the tracker: rules, and what it remembers of past readings."""
+"""The monitor of the tracker: its rules and its state."""

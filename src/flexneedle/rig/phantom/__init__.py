@@ -1,1 +1,1 @@
-"""The virtual phantom: a needle in tissue that is not the model of the controller."""
+"""The virtual phantom: a needle in tissue, with another model than the controller's."""

@@ -1,4 +1,4 @@
-"""What really stands in the tank: drawn by a seed, as `[phantom]` says."""
+"""The true phantom, drawn with a seed from the ranges of `[phantom]`."""
 
 import math
 from dataclasses import dataclass
@@ -10,15 +10,15 @@ from flexneedle.rig.phantom.structure import guide_to_skin, structure_values, wi
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.tissue import MOST_BEVEL
 
-_THINNEST_MM = 0.1  # layer that displaced boundaries leave
+_THINNEST_MM = 0.1  # least thickness of a layer between displaced boundaries
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Its scenario; where the clamp holds the base (mm, rad); and what no scenario has, with its sign (mm).
+    """The true scenario, pose of the clamped base (mm, rad), and imperfections with their sign (mm).
 
-    bend: tip of the free needle off the straight, for bevel +1; run_out: tip off the needle's axis, for bevel +1;
-    bias (x, y) of the tracker; variation: factor on μ in cells of `cell_mm` from the skin down.
+    bend: tip deflection of the free needle, for bevel +1; run_out: offset of the tip from the needle's axis, for
+    bevel +1; bias (x, y) of the tracker; variation: factor on μ in cells of `cell_mm` from the skin down.
     """
 
     scenario: Scenario
@@ -37,9 +37,9 @@ class Truth:
 
 
 def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
-    """Draw a phantom: tissue, bevel, start, needle and tracker; finer contacts than the scenario's.
+    """Draw a phantom: tissue, bevel, start, needle and tracker; with finer contacts than the scenario's.
 
-    A new entry is drawn last: it leaves the phantoms of a seed as they were without it.
+    New quantities are drawn last, so that they do not change the other draws of a seed.
     """
     settings = scenario.phantom
     factors = rng.uniform(*settings.shear_modulus_factor, len(scenario.tissue))
@@ -70,7 +70,7 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
 
 
 def _bevel_factor(scenario: Scenario, rng: np.random.Generator) -> float:
-    """Draw the factor on the bevel offset, from the part of its range that keeps the bevel's rule."""
+    """Draw the factor on the bevel offset, from the part of its range that is valid for a bevel."""
     low, high = scenario.phantom.bevel_factor
     offset = scenario.needle.bevel.offset_mm
     least = min(layer.compression_length_mm for layer in scenario.tissue)
@@ -80,7 +80,7 @@ def _bevel_factor(scenario: Scenario, rng: np.random.Generator) -> float:
 
 
 def _displaced(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
-    """Thicknesses (mm) with each boundary displaced on its own; no layer vanishes."""
+    """Thicknesses (mm) after an independent displacement of each boundary; no layer vanishes."""
     tops = np.array(scenario.layer_tops[1:])
     bottoms = tops + rng.normal(0.0, scenario.phantom.layer_shift_sd_mm, tops.size)
     values, top = {}, 0.0
@@ -104,9 +104,9 @@ def _variation(scenario: Scenario, cell: float, rng: np.random.Generator) -> tup
 
 
 def _start(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
-    """Draw the gap from tip to skin (mm): base and tip start further along the axis than in the scenario, or less far.
+    """Draw the gap from tip to skin (mm): an axial start error of base and tip.
 
-    A target that is then beyond the stroke becomes the deepest one within it, as the truth is a valid scenario, too.
+    A target that is then beyond the stroke is set to the largest depth in reach, so that the true scenario is valid.
     """
     setup = scenario.setup
     low, high = _start_range(scenario)
@@ -117,8 +117,8 @@ def _start(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
 
 
 def _start_range(scenario: Scenario) -> tuple[float, float]:
-    """Range of the error along the axis (mm): half of the distance to the skin, to the guide, and of what the base
-    has left at full stroke. A tip in the tissue or behind the guide is seen, and corrected before an insertion begins.
+    """Range of the axial start error (mm): half of the distances to skin and guide, and of the base's margin at full
+    stroke. An operator would notice a tip in the tissue or behind the guide, and correct it before the insertion.
     """
     setup = scenario.setup
     gap, guide = setup.tip_to_skin_mm, guide_to_skin(scenario)

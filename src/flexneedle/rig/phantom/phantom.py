@@ -1,4 +1,4 @@
-"""A virtual phantom behind the ports of a rig: a `Driver` and a `Clock`, and the truth for the record."""
+"""A virtual phantom with the ports of a rig: a `Driver` and a `Clock`, and the true state for the record."""
 
 import math
 from typing import NamedTuple
@@ -10,11 +10,11 @@ from flexneedle.rig.phantom.plants import PlantFactory, plant
 from flexneedle.simulator.control import Control, Limits
 from flexneedle.types import Command, Floats
 
-_WHOLE = 1e-8  # of a motor step: rounding of a place that stands on one
+_WHOLE = 1e-8  # of a motor step: tolerance for a position on a whole step
 
 
 class Condition(NamedTuple):
-    """How the needle in the tank is: tip pose (mm, rad), tissue strain energy (mJ), smallest stretch λ, convergence."""
+    """True state: tip pose (mm, rad), tissue strain energy (mJ), smallest stretch λ since the start, convergence."""
 
     tip: Floats
     strain_energy: float
@@ -23,20 +23,20 @@ class Condition(NamedTuple):
 
 
 class Phantom:
-    """The needle in the tank. Moves on command; the time that a command takes passes on its own clock."""
+    """The true needle. It moves on command; its clock advances by the duration of each command."""
 
     def __init__(self, truth: Truth, bevel: int, kind: str | PlantFactory = "exact") -> None:
         self._plant = plant(kind, truth, bevel)
         self._truth = truth
         self._limits = Limits.of(truth.scenario)
         self._moved = np.zeros(4)
-        self._owed = np.zeros(4)  # what rounding to motor steps has left undone so far
+        self._remainder = np.zeros(4)  # of all commands after rounding to motor steps
         self._time = 0.0
         self._least_stretch = 1.0
         self._path = [(0.0, *self._tip())]  # time, x, y, slope
 
     def condition(self) -> Condition:
-        """The truth, for the record; no controller gets it. The stretch is the smallest so far."""
+        """The true state, for the record only; not available to controllers."""
         return Condition(self._tip(), self._plant.strain_energy, self._least_stretch, self._plant.converged)
 
     def now(self) -> float:
@@ -44,15 +44,15 @@ class Phantom:
         return self._time
 
     def wait(self, seconds: float) -> None:
-        """Let time pass with everything at rest."""
+        """Wait with the needle at rest."""
         self._time += seconds
         self._path.append((self._time, *self._tip()))
 
     def apply(self, command: Command, duration: float) -> Command:
-        """Carry out `command` evenly within `duration` s, in steps no longer than `phantom.step_mm`.
+        """Execute `command` at constant velocity within `duration` s, in steps of at most `phantom.step_mm`.
 
-        Motors go to the multiple of their resolution that is nearest to the sum of all commands, so that no rounding
-        adds up; the command is returned as it was applied. Raises CommandError if it breaks a limit of the setup.
+        Motors move to the multiple of their resolution nearest to the sum of all commands, so that rounding errors do
+        not accumulate. Returns the command as applied. Raises CommandError if it exceeds a limit of the setup.
         """
         self._limits.check(self._moved, Control.from_row(command).row()[None])
         row = self._rounded(command)
@@ -67,7 +67,7 @@ class Phantom:
         return db_x, db_y, db_theta, dg_y, command[4]
 
     def tip_at(self, time: float) -> tuple[float, float]:
-        """Return the true tip (x, y) in mm at a time, for a tracker to measure; at rest before the start."""
+        """Return the true tip (x, y) in mm at a time, for a simulated tracker; at rest before the start."""
         return self.pose_at(time)[:2]
 
     def pose_at(self, time: float) -> tuple[float, float, float]:
@@ -79,22 +79,22 @@ class Phantom:
         return self._path[0][1:]
 
     def _rounded(self, command: Command) -> Floats:
-        """The command in whole motor steps, within the limits; a turn of the base is not rounded."""
+        """The command in whole motor steps, within the limits; the rotation of the base is not rounded."""
         row = np.array(command, dtype=float)
         grid = self._truth.scenario.phantom.motor_resolution_mm
         if grid > 0.0:
             lengths = [0, 1, 3]
-            stands, asked = self._moved[lengths], row[lengths] + self._owed[lengths]
+            position, requested = self._moved[lengths], row[lengths] + self._remainder[lengths]
             step, travel = self._limits.step[lengths], self._limits.travel[lengths]
-            lowest = np.ceil(np.maximum(stands - step, travel[:, 0]) / grid - _WHOLE)
-            highest = np.floor(np.minimum(stands + step, travel[:, 1]) / grid + _WHOLE)
-            place = grid * np.clip(np.rint((stands + asked) / grid), lowest, highest)
-            row[lengths] = np.where(row[lengths] == 0.0, 0.0, place - stands)
-            self._owed[lengths] = np.clip(asked - row[lengths], -0.5 * grid, 0.5 * grid)
+            lowest = np.ceil(np.maximum(position - step, travel[:, 0]) / grid - _WHOLE)
+            highest = np.floor(np.minimum(position + step, travel[:, 1]) / grid + _WHOLE)
+            goal = grid * np.clip(np.rint((position + requested) / grid), lowest, highest)
+            row[lengths] = np.where(row[lengths] == 0.0, 0.0, goal - position)
+            self._remainder[lengths] = np.clip(requested - row[lengths], -0.5 * grid, 0.5 * grid)
         return row
 
     def _tip(self) -> Floats:
-        """The pose of the tip, which is off the needle's axis by the run-out."""
-        x, y, turn = self._plant.tip
-        off = self._truth.run_out * self._plant.bevel
-        return np.array([x - off * math.sin(turn), y + off * math.cos(turn), turn])
+        """The pose of the tip, which is offset from the needle's axis by the run-out."""
+        x, y, theta = self._plant.tip
+        offset = self._truth.run_out * self._plant.bevel
+        return np.array([x - offset * math.sin(theta), y + offset * math.cos(theta), theta])

@@ -1,4 +1,4 @@
-"""The needle in the tank, in two formulations: the geometrically exact rod, and the controller's own kind of model."""
+"""The true needle, in two formulations: the geometrically exact rod, and the controller's type of model."""
 
 import math
 from collections.abc import Callable
@@ -14,19 +14,19 @@ from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Floats
 
-_GUIDE_STIFFNESS = 1e3  # N/mm; a needle pushes on its guide with about a newton
+_GUIDE_STIFFNESS = 1e3  # N/mm; the force of a needle on its guide is about 1 N
 
 
 class Plant(Protocol):
     """A needle that moves on command (db_x, db_y, db_theta, dg_y, flip)."""
 
     def step(self, row: Floats) -> None:
-        """Move, and cut."""
+        """Move the needle and cut the tissue."""
         ...
 
     @property
     def tip(self) -> Floats:
-        """Pose of the needle's end x, y, θ (mm, rad)."""
+        """Pose x, y, θ (mm, rad) of the end of the needle's axis."""
         ...
 
     @property
@@ -41,19 +41,19 @@ class Plant(Protocol):
 
     @property
     def least_stretch(self) -> float:
-        """Smallest stretch λ of the tissue now; 1 is unloaded."""
+        """Smallest present stretch λ of the tissue; 1 is unloaded."""
         ...
 
     @property
     def converged(self) -> bool:
-        """Whether all steps so far found their equilibrium."""
+        """Whether all steps converged to an equilibrium."""
         ...
 
 
 class ModelPlant:
-    """The controller's kind of model with the truth's parameters and a finer mesh.
+    """The controller's type of model with the true parameters and a finer mesh.
 
-    It has no initial bend, guide clearance, friction or variation of stiffness along the depth.
+    Without initial bend, guide clearance, friction, and variation of stiffness along the depth.
     """
 
     def __init__(self, truth: Truth, bevel: int) -> None:
@@ -63,13 +63,13 @@ class ModelPlant:
         self._converged = self._state.converged
 
     def step(self, row: Floats) -> None:
-        """Move, and cut."""
+        """Move the needle and cut the tissue."""
         self._state = self._simulator.step(self._state, Control.from_row(row.tolist()))
         self._converged &= self._state.converged
 
     @property
     def tip(self) -> Floats:
-        """Pose of the needle's end x, y, θ (mm, rad)."""
+        """Pose x, y, θ (mm, rad) of the end of the needle's axis."""
         return self._state.tip
 
     @property
@@ -84,18 +84,18 @@ class ModelPlant:
 
     @property
     def least_stretch(self) -> float:
-        """Smallest stretch λ of the tissue now; 1 is unloaded."""
+        """Smallest present stretch λ of the tissue; 1 is unloaded."""
         contacts = self._state.contacts
         return float(contacts.stretch[contacts.active].min(initial=1.0))
 
     @property
     def converged(self) -> bool:
-        """Whether all steps so far found their equilibrium."""
+        """Whether all steps converged to an equilibrium."""
         return self._converged
 
 
 class ExactPlant:
-    """The geometrically exact rod (`phantom.rod`), with all that `[phantom]` has."""
+    """The geometrically exact rod (`phantom.rod`), with all imperfections of `[phantom]`."""
 
     def __init__(self, truth: Truth, bevel: int) -> None:
         scenario = truth.scenario
@@ -103,7 +103,7 @@ class ExactPlant:
         self.rod = build_rod(truth, segments)
         self._theta = np.full(segments, truth.base_turn)
         self._work = np.zeros((rd.WORK_ROWS, segments + 1))
-        # The path of a needle is longer than its depth; no insertion along x takes more than twice as much.
+        # The path of a needle is longer than its depth, by less than a factor of 2 for insertions along x.
         points = math.ceil(2.0 * max(scenario.setup.max_depth, 1.0) / self.rod.spacing) + 8
         self._channel = np.zeros((rd.CHANNEL_ROWS, points))
         self._count = 0
@@ -119,13 +119,13 @@ class ExactPlant:
         self.step(np.array([0.0, 0.0, 0.0, 0.0, -1.0]))
 
     def step(self, row: Floats) -> None:
-        """Move, and cut."""
+        """Move the needle and cut the tissue."""
         self._count = rd.step(self.rod, self._s, self._theta, self._channel, self._count, self._work, row)
         self._converged &= bool(self._s[rd.CONVERGED] > 0.0)
 
     @property
     def tip(self) -> Floats:
-        """Pose of the needle's end x, y, θ (mm, rad)."""
+        """Pose x, y, θ (mm, rad) of the end of the needle's axis."""
         tip: Floats = self._s[[rd.TIP_X, rd.TIP_Y, rd.TIP_TURN]]
         return tip
 
@@ -141,12 +141,12 @@ class ExactPlant:
 
     @property
     def least_stretch(self) -> float:
-        """Smallest stretch λ of the tissue now; 1 is unloaded."""
+        """Smallest present stretch λ of the tissue; 1 is unloaded."""
         return float(self._s[rd.LEAST_STRETCH])
 
     @property
     def converged(self) -> bool:
-        """Whether all steps so far found their equilibrium."""
+        """Whether all steps converged to an equilibrium."""
         return self._converged
 
     @property
@@ -156,7 +156,7 @@ class ExactPlant:
 
 
 def build_rod(truth: Truth, segments: int) -> rd.Rod:
-    """The constants of the truth's needle with so many segments, and of its tissue in cells."""
+    """The constants of the true needle with this number of segments, and of the true tissue in cells."""
     scenario, settings = truth.scenario, truth.scenario.phantom
     needle, cell = scenario.needle, truth.cell_mm
     cells = math.ceil(max(scenario.setup.max_depth, 0.0) / cell) + 8
@@ -199,7 +199,7 @@ def build_rod(truth: Truth, segments: int) -> rd.Rod:
 
 
 PlantFactory = Callable[[Truth, int], Plant]
-"""Makes a plant at the start: for what is true of the tank, and the direction of the bevel, −1 or +1."""
+"""Makes a plant in its start state, from the true phantom and the direction of the bevel, −1 or +1."""
 
 PLANTS: dict[str, PlantFactory] = {"exact": ExactPlant, "model": ModelPlant}
 DEFAULT_PLANT = "exact"
@@ -207,9 +207,9 @@ _PARTS = ("step", "tip", "bevel", "strain_energy", "least_stretch", "converged")
 
 
 def plant(kind: str | PlantFactory, truth: Truth, bevel: int) -> Plant:
-    """Return the plant of a name, or what a factory makes, at the start.
+    """Return the plant of a name or a factory in its start state.
 
-    Raises InputError for an unknown name, with the choices, or if the factory makes no plant.
+    Raises InputError for an unknown name, or if the factory returns no plant.
     """
     if not isinstance(kind, str):
         return _made(kind, truth, bevel)
@@ -220,10 +220,10 @@ def plant(kind: str | PlantFactory, truth: Truth, bevel: int) -> Plant:
 
 def _made(factory: PlantFactory, truth: Truth, bevel: int) -> Plant:
     made, name = factory(truth, bevel), getattr(factory, "__name__", type(factory).__name__)
-    if lacks := [part for part in _PARTS if not hasattr(made, part)]:
+    if missing := [part for part in _PARTS if not hasattr(made, part)]:
         raise InputError(
-            f"phantom = {name}: makes a {type(made).__name__}, no plant: it lacks {', '.join(lacks)}"
+            f"phantom = {name}: {type(made).__name__} is not a plant, missing: {', '.join(missing)}"
         )
     if np.shape(made.tip) != (3,):
-        raise InputError(f"phantom = {name}: its tip must be three numbers, x, y (mm) and slope (rad)")
+        raise InputError(f"phantom = {name}: tip must be three numbers x, y (mm), slope (rad)")
     return made

@@ -2,13 +2,13 @@
 
 The needle is a chain of N rigid segments of length h with angles θ_i, hinged by rotational springs: the discrete
 elastica, second order in h. Nodes follow as p_{i+1} = p_i + h τ(θ_i), so the length is kept exactly and the mesh
-travels with the needle. Equilibrium is the minimum of
+moves with the needle. Equilibrium is the minimum of
 
     E(θ) = Σ ½ B_i (θ_i − θ_{i−1} − κ₀ ℓ_i)² + Σ_i φ_i(p_i, θ_i) + φ_N(p_N)
 
 found by Newton's method. A segment is a stage of an optimal control problem with state (p_i, θ_{i−1}) and control
-θ_i, so that a Newton step is one Riccati sweep from the tip to the base and one pass back, O(N), with true second
-derivatives.
+θ_i, so that a Newton step with exact second derivatives is one Riccati sweep from the tip to the base and one pass
+back, O(N).
 """
 
 import math
@@ -22,31 +22,31 @@ from flexneedle.mechanics.compile import inner, kernel
 Floats = NDArray[np.float64]
 
 # Scalars of a rod: base and guide, direction of the bevel, normal offset of the bevel's rest point from the tip,
-# length and pose of the front of the channel, tip pose, end load, results; CURVED is 1 if the Hessian has all
-# second derivatives, 0 for those of Gauss and Newton, which are never negative.
+# length and pose of the front of the channel, tip pose, end load, results; CURVED is 1 for the full Hessian, 0 for its
+# positive semidefinite Gauss-Newton part.
 BASE_X, BASE_Y, BASE_TURN, GUIDE_Y, BEVEL, OFFSET, CUT, FRONT_X, FRONT_Y, FRONT_TURN = range(10)
 TIP_X, TIP_Y, TIP_TURN, LOAD_X, LOAD_Y, SLIDE = range(10, 16)
 ITERATIONS, RESIDUAL, CONVERGED, ENERGY, STRAIN_ENERGY, LEAST_STRETCH = range(16, 22)
 BASE_FORCE_X, BASE_FORCE_Y, BASE_MOMENT, GUIDE_FORCE, CURVED = range(22, 27)
 SIZE = 27
 
-# Rows of the channel, one column a point: place, its distance along the path, its segment, its law.
+# Rows of the channel, one column per point: position, distance along the path, segment, constants of its law.
 C_X, C_Y, C_CUT, C_SEGMENT, C_HEIGHT, C_ALPHA, C_FORCE, C_ENERGY, C_WEIGHT = range(9)
 CHANNEL_ROWS = 9
 
-# Rows of the work array, one column a segment (the last one the tip): node, gradient, Hessian, gains,
+# Rows of the work array, one column per segment (the last one the tip): node, gradient, Hessian, gains,
 # friction, Newton step, bending moment before it.
 X, Y, GX, GY, GT, HXX, HXY, HYY, HXT, HYT, HTT, K0, K1, K2, K3, FX, FY, TRIAL, MOMENT = range(19)
 WORK_ROWS = 19
 
 TOLERANCE_MM = 1e-9
-ACCEPTED_MM = 1e-6  # where a point grows in or the tip crosses the skin, a solve may stall short of it
+ACCEPTED_MM = 1e-6  # a solve may stall above TOLERANCE_MM where a point is added or the tip crosses the skin
 MAX_ITERATIONS = 60
 FLOOR_STRETCH = 0.3
-_LONGEST_MM = 2.0  # greatest move of a node in an iteration
-_SMALL_MM = 1e-8  # below it a Newton step is not doubted
-_HALVINGS = 16  # from the longest to a small one
-_STEADY = 0.1  # of a segment: how far a foot point may lie outside before its segment changes
+_LONGEST_MM = 2.0  # largest displacement of a node in an iteration
+_SMALL_MM = 1e-8  # a Newton step below it is accepted without a line search
+_HALVINGS = 16  # of a Newton step, from _LONGEST_MM to _SMALL_MM
+_STEADY = 0.1  # of a segment: distance of a foot point outside of its segment before the segment changes
 
 
 class Rod(NamedTuple):
@@ -97,7 +97,7 @@ def _law(
 
 
 @inner
-def _place(rod: Rod, s: Floats, w: Floats, theta: Floats) -> None:
+def _update_nodes(rod: Rod, s: Floats, w: Floats, theta: Floats) -> None:
     """Nodes from angles; the tip into the scalars."""
     n = theta.size
     w[X, 0], w[Y, 0] = s[BASE_X], s[BASE_Y]
@@ -140,7 +140,7 @@ def _add_guide(rod: Rod, s: Floats, w: Floats, theta: Floats) -> float:
 
 @inner
 def _foot(rod: Rod, w: Floats, theta: Floats, x: float, y: float, first: int) -> tuple[int, float]:
-    """Segment under a channel point, and how far along it (mm); looked for from `first`."""
+    """Segment nearest to a channel point, and the distance along it (mm); the search starts at `first`."""
     i = min(max(first, 0), theta.size - 1)
     low, high = -_STEADY * rod.segment, (1.0 + _STEADY) * rod.segment
     along = (x - w[X, i]) * math.cos(theta[i]) + (y - w[Y, i]) * math.sin(theta[i])
@@ -192,8 +192,8 @@ def _add_channel(rod: Rod, s: Floats, w: Floats, theta: Floats, channel: Floats,
 
 @inner
 def _cut_length(s: Floats) -> float:
-    """How far the tip is past the front of the channel, along its direction (mm); negative if pulled back."""
-    if s[CUT] <= 0.0:  # nothing cut yet: the skin is the front
+    """Distance (mm) of the tip past the front of the channel, in its direction; negative after retraction."""
+    if s[CUT] <= 0.0:  # no channel yet: the front is at the skin
         return float(s[TIP_X] / math.cos(s[TIP_TURN]))
     dx, dy = s[TIP_X] - s[FRONT_X], s[TIP_Y] - s[FRONT_Y]
     return float(dx * math.cos(s[FRONT_TURN]) + dy * math.sin(s[FRONT_TURN]))
@@ -216,13 +216,13 @@ def _new_offset(rod: Rod, s: Floats, before: tuple[float, float, float]) -> tupl
 
 @inner
 def _add_bevel(rod: Rod, s: Floats, w: Floats, n: int, before: tuple[float, float, float]) -> float:
-    """The bevel's spring, across the tip, in the tissue that it lies in. Returns its energy (mJ)."""
-    if not s[TIP_X] > 0.0:  # nor if it is lost
+    """The bevel's spring, normal to the tip, in the tissue around it. Returns its energy (mJ)."""
+    if not s[TIP_X] > 0.0:  # NaN included
         return 0.0
     offset, g = _new_offset(rod, s, before)
-    turn = s[TIP_TURN]
-    nx, ny, per_x = -math.sin(turn), math.cos(turn), 1.0 / math.cos(turn)
-    front = s[TIP_X] - min(0.0, _cut_length(s)) * math.cos(turn)
+    angle = s[TIP_TURN]
+    nx, ny, per_x = -math.sin(angle), math.cos(angle), 1.0 / math.cos(angle)
+    front = s[TIP_X] - min(0.0, _cut_length(s)) * math.cos(angle)
     top, bottom = max(0.0, front - rod.bevel_length / per_x), s[TIP_X]
     force, stiffness, stored = 0.0, 0.0, 0.0
     first = int(top / rod.cell)
@@ -266,23 +266,23 @@ def _assemble(
     last = s[BASE_TURN]
     for i in range(n):
         length = 0.5 * rod.segment if i == 0 else rod.segment  # half a segment from the clamp
-        turn = theta[i] - last - s[BEVEL] * rod.curvature * length
-        w[MOMENT, i] = rod.stiffness / length * turn
-        total += 0.5 * w[MOMENT, i] * turn
+        bending = theta[i] - last - s[BEVEL] * rod.curvature * length
+        w[MOMENT, i] = rod.stiffness / length * bending
+        total += 0.5 * w[MOMENT, i] * bending
         last = theta[i]
     s[ENERGY] = total
 
 
 @inner
 def _sweep(rod: Rod, s: Floats, w: Floats, theta: Floats) -> bool:
-    """Riccati sweep from the tip to the base: the gains of a Newton step, and what holds the base.
+    """Riccati sweep from the tip to the base: the gains of a Newton step, and the reactions at the base.
 
     Returns False if the Hessian is not positive definite, where a Newton step may lead uphill.
     """
     n = theta.size
     pxx, pxy, pyy, pxt, pyt, ptt = w[HXX, n], w[HXY, n], w[HYY, n], 0.0, 0.0, 0.0
     qx, qy, qt = w[GX, n], w[GY, n], 0.0
-    ax, ay = w[GX, n], w[GY, n]  # force on the rest of the needle, to be held at this node
+    ax, ay = w[GX, n], w[GY, n]  # resultant force on the needle from here to the tip
     for i in range(n - 1, -1, -1):
         b = rod.stiffness / (0.5 * rod.segment if i == 0 else rod.segment)
         c, d = w[X, i + 1] - w[X, i], w[Y, i + 1] - w[Y, i]
@@ -315,7 +315,7 @@ def _sweep(rod: Rod, s: Floats, w: Floats, theta: Floats) -> bool:
 
 @inner
 def _newton_step(w: Floats, n: int) -> float:
-    """Steps of the angles into TRIAL; returns the greatest move of a node (mm)."""
+    """Steps of the angles into TRIAL; returns the largest displacement of a node (mm)."""
     dx, dy, last, largest = 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         change = w[K0, i] + w[K1, i] * dx + w[K2, i] * dy + w[K3, i] * last
@@ -329,7 +329,7 @@ def _newton_step(w: Floats, n: int) -> float:
 
 @inner
 def _slope(w: Floats, n: int) -> float:
-    """Work of what is out of balance at these angles, along the step in TRIAL (mJ); negative while it leads on."""
+    """Work (mJ) of the unbalanced forces along the step in TRIAL; negative for a descent direction."""
     dx, dy, last, total = 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         change = w[TRIAL, i]
@@ -341,8 +341,8 @@ def _slope(w: Floats, n: int) -> float:
 
 
 @inner
-def _lay_friction(rod: Rod, s: Floats, w: Floats, theta: Floats) -> None:
-    """Friction against the last slide, on the part of each segment that is in the tissue."""
+def _set_friction(rod: Rod, s: Floats, w: Floats, theta: Floats) -> None:
+    """Friction opposite to the last sliding direction, on the part of each segment inside the tissue."""
     for i in range(theta.size):
         left, right = w[X, i], w[X, i + 1]
         inside = 0.0
@@ -354,31 +354,31 @@ def _lay_friction(rod: Rod, s: Floats, w: Floats, theta: Floats) -> None:
 
 @inner
 def _solve(rod: Rod, s: Floats, w: Floats, theta: Floats, channel: Floats, count: int) -> None:
-    """Equilibrium for base, guide, bevel and loads in `s`, in place."""
+    """Solve for equilibrium with base, guide, bevel and loads in `s`, in place."""
     n = theta.size
     before = (s[TIP_X], s[TIP_Y], s[TIP_TURN])
-    _place(rod, s, w, theta)
-    _lay_friction(rod, s, w, theta)
+    _update_nodes(rod, s, w, theta)
+    _set_friction(rod, s, w, theta)
     s[CURVED] = 1.0
     _assemble(rod, s, w, theta, channel, count, before)
     largest = np.inf
     iteration = 0
     while iteration < MAX_ITERATIONS and largest > TOLERANCE_MM:
         iteration += 1
-        if not _sweep(rod, s, w, theta):  # about to buckle, or a guess far off
+        if not _sweep(rod, s, w, theta):  # near buckling, or a poor initial guess
             s[CURVED] = 0.0
             _assemble(rod, s, w, theta, channel, count, before)
             _sweep(rod, s, w, theta)
             s[CURVED] = 1.0
         largest = _newton_step(w, n)
         share = min(1.0, _LONGEST_MM / max(largest, 1e-300))
-        # The forces are judged, not an energy: bevel and friction have none.
+        # Line search on the residual, since bevel and friction have no energy.
         enough = -0.5 * _slope(w, n)
         done = 0.0
         for _ in range(_HALVINGS):
             for i in range(n):
                 theta[i] += (share - done) * w[TRIAL, i]
-            _place(rod, s, w, theta)
+            _update_nodes(rod, s, w, theta)
             _assemble(rod, s, w, theta, channel, count, before)
             if share * largest < _SMALL_MM or _slope(w, n) <= enough:
                 break
@@ -394,7 +394,7 @@ def _solve(rod: Rod, s: Floats, w: Floats, theta: Floats, channel: Floats, count
 
 @inner
 def _extend(rod: Rod, s: Floats, channel: Floats, count: int, segments: int) -> int:
-    """Leave the channel as the tip cut it, its points every `spacing` along the path; returns their number."""
+    """Extend the channel along the tip's path with a point every `spacing`; returns the number of points."""
     cut = _cut_length(s)
     if s[TIP_X] <= 0.0:
         s[CUT], s[OFFSET] = 0.0, 0.0
@@ -416,7 +416,7 @@ def _extend(rod: Rod, s: Floats, channel: Floats, count: int, segments: int) -> 
         channel[C_ENERGY, count] = rod.energy[c] * rod.spacing
         channel[C_WEIGHT, count] = rod.weight[c]
         count += 1
-    if (count + 0.5) * rod.spacing < s[CUT] + cut:  # tissue without its points is no equilibrium
+    if (count + 0.5) * rod.spacing < s[CUT] + cut:  # no room for more points: the tissue is incomplete
         s[CONVERGED] = 0.0
     s[CUT] += cut
     s[FRONT_X], s[FRONT_Y], s[FRONT_TURN] = s[TIP_X], s[TIP_Y], s[TIP_TURN]
@@ -425,7 +425,7 @@ def _extend(rod: Rod, s: Floats, channel: Floats, count: int, segments: int) -> 
 
 @kernel
 def step(rod: Rod, s: Floats, theta: Floats, channel: Floats, count: int, w: Floats, command: Floats) -> int:
-    """Move base and guide by (db_x, db_y, db_theta, dg_y, flip), find the equilibrium, cut; all in place.
+    """Move base and guide by (db_x, db_y, db_theta, dg_y, flip), solve for equilibrium, cut; all in place.
 
     s (SIZE,), theta (N,), channel (CHANNEL_ROWS, M) of which `count` columns hold points, w (WORK_ROWS, N + 1).
     Returns the new count.

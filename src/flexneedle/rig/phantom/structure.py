@@ -1,4 +1,4 @@
-"""The structure of a phantom where `[phantom.structure]` says that it is not the scenario's."""
+"""Structural differences between phantom and scenario, as set by `[phantom.structure]`."""
 
 import math
 from collections.abc import Iterator
@@ -7,7 +7,7 @@ from typing import Any
 
 from flexneedle.scenario.model import Scenario
 
-_THINNEST_MM = 1e-3  # piece of a layer
+_THINNEST_MM = 1e-3  # least thickness of a piece of a layer
 
 
 def guide_to_skin(scenario: Scenario) -> float | None:
@@ -19,7 +19,7 @@ def guide_to_skin(scenario: Scenario) -> float | None:
 def structure_values(scenario: Scenario) -> dict[str, Any]:
     """Return α, compression lengths, bevel length and guide of the phantom, by dotted key.
 
-    They replace `phantom.structure`, which is none of a truth's own.
+    They replace `phantom.structure`, which is empty in a true scenario.
     """
     structure = scenario.phantom.structure
     values: dict[str, Any] = {
@@ -35,7 +35,7 @@ def structure_values(scenario: Scenario) -> dict[str, Any]:
 
 
 def with_hidden_layer(truth: Scenario, scenario: Scenario) -> Scenario:
-    """Return the truth with the hidden layer of the scenario, if that has one; layers that it cuts become several."""
+    """Return the true scenario with the hidden layer of the scenario, if any; layers that it intersects are split."""
     hidden = scenario.phantom.structure.hidden_layer
     if hidden is None:
         return truth
@@ -51,10 +51,10 @@ def with_hidden_layer(truth: Scenario, scenario: Scenario) -> Scenario:
 
 
 def _extents(scenario: Scenario) -> Iterator[tuple[float, float]]:
-    """First and last depth (mm) of each layer; the last one goes on."""
+    """First and last depth (mm) of each layer; the last layer is unbounded."""
     return pairwise((*scenario.layer_tops, math.inf))
 
 
 def _edges(first: float, last: float, cuts: tuple[float, ...]) -> list[float]:
-    """Depths (mm) at which a layer begins, is cut, and ends."""
+    """Depths (mm) at which a layer begins, is split, and ends."""
     return [first, *(cut for cut in cuts if first + _THINNEST_MM < cut < last - _THINNEST_MM), last]

@@ -1,1 +1,1 @@
-"""Simulated trackers, and the map from a tracker's frame to the stage's."""
+"""Simulated trackers and registration of a tracker's frame to the stage's."""

@@ -1,4 +1,4 @@
-"""Where a lab puts its reference sensors: around the workspace, and where the field is clean."""
+"""Placement of the reference sensors: around the workspace, at positions with a low indicator."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -11,40 +11,40 @@ from flexneedle.rig.tracking.field.sensors import noiseless, noisy
 from flexneedle.types import Floats, Point
 
 _TRIES = 40
-_FURTHEST_MM = 30.0  # moved away from the needle for a clean place, a reference would speak for another field
+_FURTHEST_MM = 30.0  # further away a reference would not represent the field at the needle
 _READINGS = 40
 
 
 def placed_references(
     room: Room, center: Point, limit: float, rng: np.random.Generator, plate_distance: float | None = None
 ) -> Mapping[str, SensorPose]:
-    """Return poses of the three references near those of the environment, each where it tells less than `limit`.
+    """Return poses of the three references near those of the environment, each with an indicator below `limit`.
 
-    The paper keeps all indicators below the threshold as the experiment begins (section IV-B); a reference that does
-    not is moved, by 30 mm at most. Where no place of forty is clean, the best of them stays. plate_distance (mm): as
-    in `Room`.
+    In the paper all indicators are below the threshold at the start of the experiment (section IV-B). A reference above
+    it is moved by at most 30 mm; the best of forty positions is used if none is below the limit. plate_distance (mm):
+    as in `Room`.
     """
 
-    def told(name: str, pose: SensorPose) -> float:
-        place = np.array([pose.position]) - np.array(center)
-        return _indicator(room, name, place, np.array([pose.orientation]), rng, plate_distance)
+    def indicator(name: str, pose: SensorPose) -> float:
+        position = np.array([pose.position]) - np.array(center)
+        return _indicator(room, name, position, np.array([pose.orientation]), rng, plate_distance)
 
     poses = reference_poses(room.environment, center)
-    return {name: _clean(partial(told, name), pose, limit, rng) for name, pose in poses.items()}
+    return {name: _clean(partial(indicator, name), pose, limit, rng) for name, pose in poses.items()}
 
 
 def _clean(
-    told: Callable[[SensorPose], float], first: SensorPose, limit: float, rng: np.random.Generator
+    indicator: Callable[[SensorPose], float], first: SensorPose, limit: float, rng: np.random.Generator
 ) -> SensorPose:
-    best, least = first, told(first)
+    best, least = first, indicator(first)
     for _ in range(1, _TRIES):
         if least < limit:
             break
-        way = rng.normal(0.0, 1.0, 3)
-        way *= _FURTHEST_MM * rng.random() ** (1 / 3) / np.linalg.norm(way)
-        x, y, z = (np.array(first.position) + way).tolist()
+        shift = rng.normal(0.0, 1.0, 3)
+        shift *= _FURTHEST_MM * rng.random() ** (1 / 3) / np.linalg.norm(shift)
+        x, y, z = (np.array(first.position) + shift).tolist()
         pose = SensorPose((x, y, z), first.orientation)
-        if (value := told(pose)) < least:
+        if (value := indicator(pose)) < least:
             best, least = pose, value
     return best
 
@@ -52,14 +52,15 @@ def _clean(
 def _indicator(
     room: Room,
     name: str,
-    place: Floats,
-    turn: Floats,
+    position: Floats,
+    orientation: Floats,
     rng: np.random.Generator,
     plate_distance: float | None,
 ) -> float:
-    """Median indicator of a second at rest."""
-    places, turns = (values.repeat(_READINGS, 0) for values in (place, turn))
-    told = noisy(room.environment, noiseless(room, name, places, turns, plate_distance), rng).indicators
-    if told is None:
-        raise ValueError(f"{name} has no indicator: it is not a reference")
-    return float(np.median(told))
+    """Median indicator over a second at rest."""
+    positions, orientations = (values.repeat(_READINGS, 0) for values in (position, orientation))
+    exact = noiseless(room, name, positions, orientations, plate_distance)
+    indicators = noisy(room.environment, exact, rng).indicators
+    if indicators is None:
+        raise ValueError(f"{name} has no indicator: must be a reference")
+    return float(np.median(indicators))

@@ -1,4 +1,4 @@
-"""From a tracker's frames to the tip of the needle in the plane of the insertion."""
+"""Map from a tracker's frames to the tip of the needle in the plane of the insertion."""
 
 import numpy as np
 
@@ -10,24 +10,24 @@ from flexneedle.types import VISIBLE, Frame, Measurement
 
 
 def tip_in_plane(frame: Frame, to_stage: Rigid, tip_offset: float = 0.0) -> Measurement:
-    """Return the tip in the stage's frame: its sensor, mapped, and `tip_offset` mm further along the measured z axis.
+    """Return the tip in the stage's frame: the sensor's position plus `tip_offset` mm along the measured z axis.
 
-    Without a tip that is seen there are no coordinates; nor without an orientation, unless the offset is zero.
+    No coordinates if the tip sensor is not measured, or has no orientation and the offset is not 0.
     """
     reading = frame.readings.get(TIP)
     if reading is None or reading.status != VISIBLE or reading.position is None:
         return Measurement(frame.time, None, None, None, frame)
-    place = np.array(reading.position)
+    position = np.array(reading.position)
     if tip_offset != 0.0:
         if reading.orientation is None:
             return Measurement(frame.time, None, None, None, frame)
-        place = place + tip_offset * z_axis(np.array(reading.orientation))
-    x, y, z = to_stage.apply(place).tolist()
+        position = position + tip_offset * z_axis(np.array(reading.orientation))
+    x, y, z = to_stage.apply(position).tolist()
     return Measurement(frame.time, x, y, z, frame)
 
 
 class InPlane:
-    """A `TipTracker` of a tracker's frames; to_stage: rigid map from the tracker's frame to the stage's."""
+    """A `TipTracker` that reads the frames of a tracker; to_stage: map from the tracker's frame to the stage's."""
 
     def __init__(self, tracker: Tracker, to_stage: Rigid, tip_offset: float = 0.0) -> None:
         self._tracker, self._to_stage, self._tip_offset = tracker, to_stage, tip_offset
@@ -39,5 +39,5 @@ class InPlane:
 
     @property
     def status(self) -> str:
-        """As the tracker says it."""
+        """The tracker's status."""
         return self._tracker.status

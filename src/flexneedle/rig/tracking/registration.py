@@ -1,7 +1,7 @@
-"""Rigid registration of a tracker's frame to the stage's from pairs of points, and how far it can be trusted.
+"""Rigid registration of a tracker's frame to the stage's from pairs of points, and its expected errors.
 
 The least-squares fit without scale is that of Kabsch (Acta Cryst. A32, 1976); the expected errors are those of
-Fitzpatrick, West and Maurer (IEEE Trans. Med. Imaging 17, 1998), for localisation errors alike in all directions.
+Fitzpatrick, West and Maurer (IEEE Trans. Med. Imaging 17, 1998), for isotropic localisation errors.
 """
 
 import math
@@ -13,12 +13,12 @@ from flexneedle.errors import InputError
 from flexneedle.scenario.sections.registration import Registration
 from flexneedle.types import Floats, Point
 
-_FLAT = 1e-6  # second spread over the first, below which points lie on a line
+_COLLINEAR = 1e-6  # second singular value over the first, below which points are collinear
 _LEAST = 3
-_SIZES = 3.0  # times that two clouds of the same body may differ in size, with any error worth a registration
-_SMALLEST = 0.5  # mm: clouds below are in metres, or of no use
-_LOOSE = 0.1  # residual over size from which on nothing was registered
-_MIRRORED = 0.3  # residual of a mirrored fit over that of the best rotation
+_SIZE_RATIO = 3.0  # largest ratio of the sizes of both sets of points
+_SMALLEST = 0.5  # mm: smaller sets of points are in metres, or useless
+_LOOSE = 0.1  # residual over size above which the fit is rejected
+_MIRRORED = 0.3  # residual of a mirrored fit over that of the best rotation, below which a frame is mirrored
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,65 +34,65 @@ class Rigid:
         return mapped
 
     def inverse(self) -> "Rigid":
-        """The map back."""
+        """The inverse map."""
         return Rigid(self.rotation.T, -self.rotation.T @ self.translation)
 
     def after(self, first: "Rigid") -> "Rigid":
-        """This map after `first`."""
+        """The composition: `first`, then this map."""
         return Rigid(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
 
 
 def identity() -> Rigid:
-    """The map that changes nothing."""
+    """The identity map."""
     return Rigid(np.eye(3), np.zeros(3))
 
 
 def fit_rigid(moving: Floats, fixed: Floats) -> Rigid:
-    """Return the rigid map that takes `moving` (n, 3) nearest to `fixed` (n, 3) in the sense of least squares.
+    """Return the rigid map from `moving` (n, 3) to `fixed` (n, 3) with the least sum of squared distances.
 
-    Raises InputError for fewer than three pairs, for points on a line, and where numbers are not finite.
+    Raises InputError for fewer than three pairs, collinear points, or numbers that are not finite.
     """
     moving, fixed = np.asarray(moving, dtype=float), np.asarray(fixed, dtype=float)
     _check(moving, fixed)
-    middle, aim = moving.mean(axis=0), fixed.mean(axis=0)
-    left, _, right = np.linalg.svd((moving - middle).T @ (fixed - aim))
-    # A reflection may fit better than any rotation; the least costly axis is turned back.
+    center, target = moving.mean(axis=0), fixed.mean(axis=0)
+    left, _, right = np.linalg.svd((moving - center).T @ (fixed - target))
+    # A reflection may fit better than any rotation; then the axis with the least cost is flipped.
     mirrored = np.linalg.det(left @ right) < 0.0
     rotation = right.T @ np.diag([1.0, 1.0, -1.0 if mirrored else 1.0]) @ left.T
-    return Rigid(rotation, aim - rotation @ middle)
+    return Rigid(rotation, target - rotation @ center)
 
 
-def refuse_nonsense(moving: Floats, fixed: Floats) -> None:
-    """Raise InputError where pairs (n, 3) cannot be of one rigid body: other units, a mirrored frame, no fit at all."""
-    size, aim = _radius(moving), _radius(fixed)
-    if aim < _SMALLEST:
+def check_pairs(moving: Floats, fixed: Floats) -> None:
+    """Raise InputError for pairs (n, 3) not of one rigid body: different units, a mirrored frame, a poor fit."""
+    moving_size, fixed_size = _radius(moving), _radius(fixed)
+    if fixed_size < _SMALLEST:
         raise InputError(
-            f"the stage's points lie {aim:.3g} mm about their middle (RMS), at least {_SMALLEST:g} mm are needed: "
-            "are they in metres?"
+            f"the stage's points are within {fixed_size:.3g} mm (RMS) of their center, at least {_SMALLEST:g} mm "
+            "are needed: are they in metres?"
         )
-    if not 1.0 / _SIZES < aim / size < _SIZES:
+    if not 1.0 / _SIZE_RATIO < fixed_size / moving_size < _SIZE_RATIO:
         raise InputError(
-            f"the tracker's points lie {size:.3g} mm about their middle, the stage's {aim:.3g} mm (RMS): "
-            "both must be in mm, and the sensor must have moved with the stage"
+            f"the tracker's points are within {moving_size:.3g} mm (RMS) of their center, the stage's within "
+            f"{fixed_size:.3g} mm: both must be in mm, and the sensor must have moved with the stage"
         )
-    if (complaint := misfit(moving, fixed)) is not None:
-        raise InputError(complaint)
+    if (problem := misfit(moving, fixed)) is not None:
+        raise InputError(problem)
 
 
 def misfit(moving: Floats, fixed: Floats) -> str | None:
-    """Say in one line what is wrong where no rotation takes pairs (n, 3) to each other: a mirrored frame, or no fit."""
-    aim = _radius(fixed)
+    """Return one line on why no rotation fits pairs (n, 3): a mirrored frame, or a large residual. None if one fits."""
+    size = _radius(fixed)
     error = fiducial_error(fit_rigid(moving, fixed), moving, fixed)
     mirror = moving * np.array([1.0, 1.0, -1.0])
     mirrored = fiducial_error(fit_rigid(mirror, fixed), mirror, fixed)
-    if mirrored < _MIRRORED * error and error > _LOOSE * aim:
+    if mirrored < _MIRRORED * error and error > _LOOSE * size:
         return (
             f"a mirrored frame fits far better (residual {mirrored:.3g} mm, not {error:.3g} mm): "
             "one of the two frames is left-handed, or an axis has the wrong sign"
         )
-    if error > _LOOSE * aim:
+    if error > _LOOSE * size:
         return (
-            f"the fit leaves {error:.3g} mm (RMS) of points that lie {aim:.3g} mm about their middle: "
+            f"the fit has a residual of {error:.3g} mm (RMS) for points within {size:.3g} mm of their center: "
             "are points swapped, axes exchanged, or did the sensor not move?"
         )
     return None
@@ -108,9 +108,9 @@ def fiducial_error(rigid: Rigid, moving: Floats, fixed: Floats) -> float:
 
 
 def localisation_error(fiducial: float, count: int) -> float:
-    """Return the RMS localisation error (mm) of a point that a residual of `count` points speaks for.
+    """Return the RMS localisation error (mm) of a point, estimated from the residual of `count` points.
 
-    ⟨FRE²⟩ = (1 − 2/n) ⟨FLE²⟩: six of the 3n numbers are used up by the fit.
+    ⟨FRE²⟩ = (1 − 2/n) ⟨FLE²⟩: the fit removes six of 3n degrees of freedom.
     """
     return fiducial / math.sqrt(1.0 - 2.0 / count)
 
@@ -118,15 +118,15 @@ def localisation_error(fiducial: float, count: int) -> float:
 def target_error(fixed: Floats, localisation: float, targets: Floats) -> Floats:
     """Return the expected RMS target registration error (mm) at `targets` (k, 3), shape (k,).
 
-    fixed (n, 3): where the fiducials are, localisation: their RMS localisation error (mm).
+    fixed (n, 3): positions of the fiducials, localisation: their RMS localisation error (mm).
     ⟨TRE²⟩ = ⟨FLE²⟩/n · (1 + ⅓ Σ d²/f²) with the distances d of the target and f (RMS) of the fiducials from each
     principal axis of the fiducials.
     """
-    middle = fixed.mean(axis=0)
-    axes = np.linalg.svd(fixed - middle)[2]
-    own = _off_axes(fixed - middle, axes).mean(axis=0)
-    there = _off_axes(np.atleast_2d(targets) - middle, axes)
-    error: Floats = localisation * np.sqrt((1.0 + np.sum(there / own, axis=1) / 3.0) / len(fixed))
+    center = fixed.mean(axis=0)
+    axes = np.linalg.svd(fixed - center)[2]
+    fiducials = _off_axes(fixed - center, axes).mean(axis=0)
+    distances = _off_axes(np.atleast_2d(targets) - center, axes)
+    error: Floats = localisation * np.sqrt((1.0 + np.sum(distances / fiducials, axis=1) / 3.0) / len(fixed))
     return error
 
 
@@ -152,5 +152,5 @@ def _check(moving: Floats, fixed: Floats) -> None:
         raise InputError("points must be finite numbers")
     for name, points in (("tracker", moving), ("stage", fixed)):
         spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        if spread[1] <= _FLAT * spread[0]:
-            raise InputError(f"the {name}'s points lie on a line: a registration needs three that do not")
+        if spread[1] <= _COLLINEAR * spread[0]:
+            raise InputError(f"the {name}'s points are collinear: a registration needs three that are not")

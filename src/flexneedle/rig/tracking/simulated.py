@@ -12,9 +12,8 @@ from flexneedle.types import VISIBLE, Measurement
 class NoisyTracker:
     """Reads `tip_at(time)` → (x, y) in mm every `period` s with white noise of `jitter` mm on each axis.
 
-    A reading arrives `delay` s after it was taken, with the time at which it was taken; `bias` (x, y) in mm is
-    added to all, and a share `missing` of them sees no tip, but the first, which is there at the start: nobody begins
-    without. A `TipTracker`; all it shows of what it measures are such samples.
+    A reading arrives `delay` s after it was taken and has the time of measurement; `bias` (x, y) in mm is added to all.
+    A share `missing` of them has no tip, except the first, which is available at the start. A `TipTracker`.
     """
 
     def __init__(
@@ -31,10 +30,12 @@ class NoisyTracker:
     ) -> None:
         self._tip_at, self._clock = tip_at, clock
         self._period, self._jitter = period, jitter
-        # Noise is drawn by reading: a longer delay, with more readings from before the start, changes no later one.
+        # Readings before the start have their own generator, so that the delay does not change the noise of later ones.
         self._rng, self._rng_before, self._rng_first = rng.spawn(3)
         self._delay, self._missing, self._bias = delay, missing, bias
-        self._first = -math.ceil(delay / period - 1e-6)  # there at the start; number k is taken at k periods
+        self._first = -math.ceil(
+            delay / period - 1e-6
+        )  # available at the start; number k is taken at k periods
         self._taken = self._first - 1  # the last reading
 
     def read(self) -> tuple[Measurement, ...]:
@@ -46,7 +47,7 @@ class NoisyTracker:
 
     @property
     def status(self) -> str:
-        """VISIBLE: it never falls silent."""
+        """VISIBLE: it never stops."""
         return VISIBLE
 
     def _sample(self, number: int) -> Measurement:

@@ -1,6 +1,6 @@
-"""The table of repeated measurements that a tracker is judged by: one row a sample, a grid point many rows.
+"""Table of repeated measurements for the evaluation of a tracker: one row per sample, many samples per grid point.
 
-`flexneedle em simulate` and `em record` write it, `em evaluate` reads it.
+Written by `flexneedle em simulate` and `em record`, read by `em evaluate`.
 """
 
 REQUIRED = (
@@ -15,11 +15,11 @@ REQUIRED = (
     "sensor",
     "environment",
 )
-"""Columns that every table has: the grid point and where the stage put the sensor, what the tracker said, of which
-sensor and in which environment. The indicator may be empty, or left out, where a sensor has none."""
+"""Required columns: grid point and true position of the sensor (from the stage), measured position and indicator, name
+of the sensor and of the environment. The indicator may be empty or omitted for sensors without one."""
 
 OPTIONAL = ("qw", "qx", "qy", "qz", "distance_mm")
-"""Columns that a table may have: orientation as a unit quaternion, distance from sensor to field generator."""
+"""Optional columns: orientation as a unit quaternion, distance from sensor to field generator."""
 
 COLUMNS = REQUIRED + OPTIONAL
 

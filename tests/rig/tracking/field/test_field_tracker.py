@@ -1,4 +1,4 @@
-"""The simulated electromagnetic tracker: rate, delay, what it misses, its frame, and its plate."""
+"""The simulated electromagnetic tracker: rate, delay, missing readings, frame, and plate."""
 
 import numpy as np
 import pytest
@@ -12,28 +12,28 @@ from flexneedle.rig.tracking.field.room import REFERENCES, Room
 from flexneedle.rig.tracking.field.tracker import MISSING, FieldTracker
 from flexneedle.rig.tracking.registration import Rigid
 from flexneedle.types import VISIBLE
-from rooms import Watch, environment, shipped
+from rooms import ManualClock, environment, shipped
 
 PERIOD = 0.025
-TURNED = Rigid(Rotation.from_euler("xyz", [0.3, -1.2, 2.0]).as_matrix(), np.array([30.0, -200.0, 7.0]))
+TO_TRACKER = Rigid(Rotation.from_euler("xyz", [0.3, -1.2, 2.0]).as_matrix(), np.array([30.0, -200.0, 7.0]))
 
 
 def moving(time):
-    """A needle that points along x and goes on at 1 mm/s; it stood still before the start."""
+    """A needle along x that moves at 1 mm/s from the start on."""
     return {"tip": tip_sensor_pose((10.0 + max(time, 0.0), 2.0, 0.5), (1.0, 0.0, 0.0))}
 
 
-def tracker(watch, room=None, poses=moving, seed=0, **options):
+def tracker(clock, room=None, poses=moving, seed=0, **options):
     room = room or Room(environment(), 1)
-    return FieldTracker(room, poses, watch, PERIOD, np.random.default_rng(seed), **options)
+    return FieldTracker(room, poses, clock, PERIOD, np.random.default_rng(seed), **options)
 
 
 def frames(count, room=None, poses=moving, seed=0, **options):
     """The first frames after the start."""
-    watch = Watch()
-    eye = tracker(watch, room, poses, seed, **options)
-    watch.wait(PERIOD * count + options.get("delay", 0.0))
-    return [frame for frame in eye.read() if frame.time > 0.0]
+    clock = ManualClock()
+    device = tracker(clock, room, poses, seed, **options)
+    clock.wait(PERIOD * count + options.get("delay", 0.0))
+    return [frame for frame in device.read() if frame.time > 0.0]
 
 
 def with_references(tracker):
@@ -41,7 +41,7 @@ def with_references(tracker):
     return lambda time: {**moving(time), **fixed}
 
 
-def test_without_an_error_it_tells_where_the_sensor_was():
+def test_without_errors_a_reading_is_the_true_pose():
     for frame in frames(5):
         reading = frame.readings["tip"]
         assert reading.position == pytest.approx((10.0 + frame.time, 2.0, 0.5))
@@ -51,28 +51,28 @@ def test_without_an_error_it_tells_where_the_sensor_was():
 
 @given(waits=st.lists(st.floats(0.0, 0.3), min_size=1, max_size=15), delay=st.floats(0.0, 0.3))
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=40)
-def test_each_frame_is_told_once_in_order_at_its_time_whenever_one_asks(waits, delay):
-    watch = Watch()
-    eye = tracker(watch, delay=delay)
-    told = []
+def test_each_frame_is_returned_once_and_in_order(waits, delay):
+    clock = ManualClock()
+    device = tracker(clock, delay=delay)
+    received = []
     for seconds in waits:
-        watch.wait(seconds)
-        told.extend(eye.read())
+        clock.wait(seconds)
+        received.extend(device.read())
     first = 1 - int(np.ceil(delay / PERIOD - 1e-6))
-    times = [frame.time for frame in told]
-    np.testing.assert_allclose(times, PERIOD * np.arange(first, first + len(told)), atol=1e-12)
-    assert [frame.number for frame in told] == list(range(len(told)))
-    due = (watch.now() - delay) / PERIOD
-    assert due - 1.0 - 1e-5 <= first + len(told) - 1 <= due + 1e-5
+    times = [frame.time for frame in received]
+    np.testing.assert_allclose(times, PERIOD * np.arange(first, first + len(received)), atol=1e-12)
+    assert [frame.number for frame in received] == list(range(len(received)))
+    due = (clock.now() - delay) / PERIOD
+    assert due - 1.0 - 1e-5 <= first + len(received) - 1 <= due + 1e-5
 
 
-def test_frames_from_before_the_start_tell_the_start():
-    watch = Watch()
-    eye = tracker(watch, delay=0.1)
-    watch.wait(0.1)
-    early = eye.read()
-    assert [frame.time for frame in early] == pytest.approx([-0.075, -0.05, -0.025, 0.0])
-    assert {frame.readings["tip"].position[0] for frame in early} == {10.0}
+def test_frames_before_the_start_have_the_start_pose():
+    clock = ManualClock()
+    device = tracker(clock, delay=0.1)
+    clock.wait(0.1)
+    first_frames = device.read()
+    assert [frame.time for frame in first_frames] == pytest.approx([-0.075, -0.05, -0.025, 0.0])
+    assert {frame.readings["tip"].position[0] for frame in first_frames} == {10.0}
 
 
 def test_same_seed_same_frames_and_another_seed_others():
@@ -82,7 +82,7 @@ def test_same_seed_same_frames_and_another_seed_others():
     assert frames(20, room, poses, seed=3) != frames(20, room, poses, seed=4)
 
 
-def test_neither_a_delay_nor_a_miss_nor_another_sensor_changes_the_noise_of_a_reading():
+def test_delay_missing_readings_and_other_sensors_do_not_change_the_noise():
     room = Room(shipped("ideal"), 4)
 
     def tips(poses=moving, **options):
@@ -92,12 +92,12 @@ def test_neither_a_delay_nor_a_miss_nor_another_sensor_changes_the_noise_of_a_re
     assert tips(delay=0.31) == plain
     assert tips(with_references(room.environment)) == plain
     some = tips(missing=0.3)
-    seen = [(one, two) for one, two in zip(plain, some, strict=True) if two.status == VISIBLE]
-    assert 240 < len(seen) < 320
-    assert all(one == two for one, two in seen)
+    measured = [(one, two) for one, two in zip(plain, some, strict=True) if two.status == VISIBLE]
+    assert 240 < len(measured) < 320
+    assert all(one == two for one, two in measured)
 
 
-def test_the_share_of_missing_readings_is_binomial_each_sensor_on_its_own():
+def test_missing_readings_are_binomial_and_independent_between_sensors():
     room = Room(environment(), 1)
     count = 4000
     poses = reference_poses(room.environment, (0.0, 0.0, 0.0))
@@ -129,21 +129,23 @@ def test_no_share_none_missing():
 def test_the_map_to_the_trackers_frame_turns_places_and_axes():
     room = Room(shipped("noisy"), 2)
     poses = with_references(room.environment)
-    for here, there in zip(frames(5, room, poses), frames(5, room, poses, to_tracker=TURNED), strict=True):
+    for here, there in zip(
+        frames(5, room, poses), frames(5, room, poses, to_tracker=TO_TRACKER), strict=True
+    ):
         for name, reading in here.readings.items():
             told = there.readings[name]
-            np.testing.assert_allclose(told.position, TURNED.apply(np.array(reading.position)))
+            np.testing.assert_allclose(told.position, TO_TRACKER.apply(np.array(reading.position)))
             axes = Rotation.from_quat([reading.orientation, told.orientation], scalar_first=True).as_matrix()
-            np.testing.assert_allclose(axes[1, :, 2], TURNED.rotation @ axes[0, :, 2], atol=1e-12)
+            np.testing.assert_allclose(axes[1, :, 2], TO_TRACKER.rotation @ axes[0, :, 2], atol=1e-12)
             assert told.indicator == reading.indicator
             if name != "tip":
-                np.testing.assert_allclose(axes[1], TURNED.rotation @ axes[0], atol=1e-12)
+                np.testing.assert_allclose(axes[1], TO_TRACKER.rotation @ axes[0], atol=1e-12)
 
 
-def test_the_roll_of_the_tip_is_not_known():
-    """Two poses that differ in nothing else read the same."""
+def test_the_roll_of_the_tip_is_not_measured():
+    """Two poses that differ only in the roll have the same reading."""
     half = np.sqrt(0.5)
-    rolled = (0.5, 0.5, 0.5, 0.5)  # a quarter turn about its own axis more
+    rolled = (0.5, 0.5, 0.5, 0.5)  # rolled by a quarter turn
     plain, turned = (
         frames(3, poses=lambda _, q=q: {"tip": SensorPose((0.0, 0.0, 0.0), q)})[0].readings["tip"].orientation
         for q in ((half, 0.0, half, 0.0), rolled)
@@ -151,7 +153,7 @@ def test_the_roll_of_the_tip_is_not_known():
     assert plain == pytest.approx(turned)
 
 
-def test_the_middle_of_the_room_lies_where_it_is_put():
+def test_the_center_of_the_room_is_at_its_position():
     room = Room(environment(tip={"bias_mm": 1.0}), 2)
     here = {"tip": SensorPose((23.0, 4.0, 5.0))}
     (reading,) = (f.readings["tip"] for f in frames(1, room, lambda _: here, center=(20.0, 1.0, 0.0)))
@@ -159,13 +161,13 @@ def test_the_middle_of_the_room_lies_where_it_is_put():
     assert reading.position == pytest.approx(tuple(expected))
 
 
-def test_references_stand_around_the_middle():
+def test_references_are_around_the_center():
     poses = reference_poses(environment(reference={"ref1_mm": [1, 2, 3]}), (20.0, 10.0, 0.0))
     assert tuple(poses) == REFERENCES
     assert poses["ref1"].position == (21.0, 12.0, 3.0)
 
 
-def test_the_sensor_lies_behind_the_tip():
+def test_the_sensor_is_behind_the_tip():
     pose = tip_sensor_pose((10.0, 0.0, 0.0), (3.0, 4.0, 0.0), 5.0)
     assert pose.position == pytest.approx((7.0, -4.0, 0.0))
 
@@ -173,18 +175,18 @@ def test_the_sensor_lies_behind_the_tip():
 # ---- the plate
 
 
-def test_a_plate_that_comes_nearer_shows_in_every_frame():
+def test_an_approaching_plate_raises_the_indicators():
     room = Room(shipped("noisy"), 2)
     poses = reference_poses(room.environment, (0.0, 0.0, 0.0))
-    seen = frames(200, room, lambda _: poses, plate_distance_at=lambda time: 250.0 - 30.0 * time)
-    values = np.array([[frame.readings[name].indicator for name in REFERENCES] for frame in seen])
+    found = frames(200, room, lambda _: poses, plate_distance_at=lambda time: 250.0 - 30.0 * time)
+    values = np.array([[frame.readings[name].indicator for name in REFERENCES] for frame in found])
     assert (values[-20:].mean(axis=0) > 3.0 * values[:20].mean(axis=0)).all()
 
 
-def test_a_sensor_that_stands_still_is_read_off_as_if_it_had_just_come():
-    """What is kept of the last frame is its own."""
+def test_the_stored_reading_of_a_sensor_at_rest_is_correct():
+    """It is that of the sensor's present pose."""
     room = Room(environment(tip={"bias_mm": 1.0}), 2)
-    places = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (0.0, 0.0, 0.0)]
-    seen = frames(4, room, lambda time: {"tip": SensorPose(places[round(time / PERIOD) - 1])})
-    told = [frame.readings["tip"].position for frame in seen]
-    assert told[0] == told[1] == told[3] != told[2]
+    positions = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (0.0, 0.0, 0.0)]
+    found = frames(4, room, lambda time: {"tip": SensorPose(positions[round(time / PERIOD) - 1])})
+    measured = [frame.readings["tip"].position for frame in found]
+    assert measured[0] == measured[1] == measured[3] != measured[2]

@@ -1,4 +1,4 @@
-"""Rooms: how large their fields are, how smooth, and how a plate distorts them."""
+"""Rooms: size and smoothness of their error fields, and distortion by a plate."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from flexneedle.rig.tracking.field.room import SENSORS, Room, grid
 from rooms import environment
 
 GRID = grid(100.0)
-EVEN = 1e6  # a length over which a field is the same all over the workspace
+EVEN = 1e6  # a correlation length for which a field is constant over the workspace
 ABOVE = {"normal": [0.0, 0.0, 2.0], "distance_mm": 100.0}
 
 
@@ -49,25 +49,27 @@ def test_every_room_has_the_size_of_its_environment(seed, size, length, shared, 
 
 @pytest.mark.long
 @pytest.mark.parametrize("length", [30.0, 80.0])
-def test_errors_stay_alike_over_the_length_and_no_further(length):
+def test_errors_are_correlated_over_the_length(length):
     """Correlation over a distance r in many rooms: e^(−r²/2ℓ²)."""
     tracker = environment(tip={"bias_mm": 1.0}, length_mm=length, workspace_mm=2000.0)
     steps = np.array([0.0, 0.5, 1.0, 2.0, 4.0]) * length
     points = np.stack([steps, 0.6 * steps, 0.0 * steps], axis=-1)
     values = np.array([Room(tracker, seed).error("tip", points) for seed in range(1500)])
     against_first = np.einsum("kni,ki->n", values, values[:, 0])
-    apart = 1.36 * steps**2
-    np.testing.assert_allclose(against_first / against_first[0], np.exp(-0.5 * apart / length**2), atol=0.06)
+    squared = 1.36 * steps**2
+    np.testing.assert_allclose(
+        against_first / against_first[0], np.exp(-0.5 * squared / length**2), atol=0.06
+    )
 
 
 def test_errors_are_smooth():
-    """A tenth of a millimetre apart, a field of 1 mm and 60 mm changes by thousandths."""
+    """Over 0.1 mm a field of 1 mm with a correlation length of 60 mm changes by about 0.001 mm."""
     room = Room(environment(tip={"bias_mm": 1.0}, length_mm=60.0), 3)
-    there = room.error("tip", GRID + np.array([0.1, 0.0, 0.0]))
-    assert 0.0 < np.abs(there - room.error("tip", GRID)).max() < 0.01
+    shifted = room.error("tip", GRID + np.array([0.1, 0.0, 0.0]))
+    assert 0.0 < np.abs(shifted - room.error("tip", GRID)).max() < 0.01
 
 
-def test_sensors_share_what_the_environment_says():
+def test_sensors_share_the_environments_part_of_the_error():
     for shared in (0.0, 0.5, 1.0):
         tracker = environment(tip={"bias_mm": 1.0}, reference={"bias_mm": 1.0}, shared=shared)
         product = [
@@ -87,7 +89,7 @@ def test_errors_grow_with_the_distance_to_the_generator():
 # ---- the plate
 
 
-def test_a_plates_distortion_falls_by_e_over_its_decay_length():
+def test_a_plates_distortion_decreases_by_e_over_its_decay_length():
     room = Room(environment(plate=ABOVE | {"tip_mm": 1.0, "decay_mm": 40.0}), 2)
     at_100, at_140 = (room.distortion("tip", GRID, distance) for distance in (100.0, 140.0))
     np.testing.assert_allclose(at_100 / at_140, np.e, rtol=1e-9)
@@ -96,7 +98,7 @@ def test_a_plates_distortion_falls_by_e_over_its_decay_length():
 
 
 def test_the_distance_of_a_point_is_along_the_normal():
-    """e^(50/40) more for a point 50 mm nearer to the plate, and as much for one beside."""
+    """e^(50/40) times as large for a point 50 mm nearer to the plate; equal for a point beside."""
     plate = {"normal": [3.0, 0.0, 4.0], "tip_mm": 1.0, "decay_mm": 40.0, "distance_mm": 120.0}
     room = Room(environment(plate=plate, length_mm=EVEN), 2)
     normal = np.array([0.6, 0.0, 0.8])
@@ -105,7 +107,7 @@ def test_the_distance_of_a_point_is_along_the_normal():
     np.testing.assert_allclose(beside, middle, rtol=1e-2)
 
 
-def test_behind_the_plate_it_is_as_at_the_plate():
+def test_behind_the_plate_the_distortion_is_that_at_the_plate():
     plate = ABOVE | {"tip_mm": 1.0, "decay_mm": 40.0}
     room = Room(environment(plate=plate, length_mm=EVEN), 2)
     at, behind = room.distortion("tip", np.array([[0.0, 0.0, -30.0], [0.0, 0.0, -45.0]]), 30.0)
@@ -132,7 +134,7 @@ LENGTHS = st.sampled_from([1e-6, 1.0, 1e6])
 
 @given(length=LENGTHS, edge=LENGTHS, decay=LENGTHS, away=LENGTHS, power=st.sampled_from([0.0, 10.0]))
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
-def test_whatever_an_environment_may_say_its_errors_are_numbers(length, edge, decay, away, power):
+def test_errors_are_finite_for_extreme_environments(length, edge, decay, away, power):
     plate = {"tip_mm": 1e6, "reference_mm": 1e-6, "coils_mm": 1.0, "decay_mm": decay, "coils_decay_mm": decay}
     tracker = environment(
         tip={"bias_mm": 1e6}, length_mm=length, workspace_mm=edge, plate=plate | {"distance_mm": 0.0},
@@ -154,7 +156,7 @@ def test_same_seed_same_room():
     assert np.abs(one - other).max() > 0.1
 
 
-def test_a_plate_changes_nothing_of_the_room_without_it():
+def test_a_plate_does_not_change_the_other_errors_of_the_room():
     bare, plated = (
         Room(environment(tip={"bias_mm": 1.0}, **more), 5)
         for more in ({}, {"plate": ABOVE | {"tip_mm": 3.0}})

@@ -1,1 +1,1 @@
-"""NDI Aurora, behind the port `Tracker`."""
+"""NDI Aurora with the port `Tracker`."""

@@ -1,8 +1,8 @@
-"""The functions of ndicapi's C library that the link needs, by ctypes.
+"""Functions of ndicapi's C library for the link, by ctypes.
 
-Not through ndicapi's own Python module: it makes a str of each reply, so that a sound binary reply about three
-sensors or more raises UnicodeDecodeError, and one with a wrong checksum ends the process (ndicapi 3.7.6).
-docs/decisions has the measurements.
+ndicapi's own Python module is not used: it decodes each reply to a str, so that a valid binary reply about three
+sensors or more raises UnicodeDecodeError, and a reply with a wrong checksum ends the process (ndicapi 3.7.6; see
+docs/decisions).
 """
 
 import ctypes
@@ -17,9 +17,9 @@ from time import monotonic
 from flexneedle.errors import InputError
 
 DISABLED = 1
-"""What ndicapi says of a sensor that is not enabled, instead of its transform."""
+"""ndicapi's result for the transform of a sensor that is not enabled."""
 TIMEOUT, CHECKSUM, LOST = 0x103, 0x100, (0x104, 0x105)
-"""Codes of ndicapi: no reply in time, a wrong checksum, the line gave way in writing or reading."""
+"""Error codes of ndicapi: timeout, wrong checksum, write or read error of the line."""
 INSTALL = "reading an Aurora needs ndicapi: pip install 'flexneedle[aurora]'"
 
 _CHARS, _INT, _POINTER = ctypes.c_char_p, ctypes.c_int, ctypes.c_void_p
@@ -28,7 +28,7 @@ _ERROR = re.compile(rb"ERROR([0-9A-F]{2})")
 _HANDLES = re.compile(rb"([0-9A-F]{2})((?:[0-9A-F]{5})*)")
 _LOCATION = re.compile(rb".{10}([0-9]{2})([0-9A-F]{2})")
 _REVISION = re.compile(rb"(?:[A-Z]\.[0-9]{3}\.[0-9]{3}|ERROR[0-9A-F]{2})[0-9A-F]{4}\r")
-_QUIET_S, _ASK_AGAIN_S = 0.02, 0.2
+_QUIET_S, _RETRY_S = 0.02, 0.2
 _FUNCTIONS = {
     "ndiOpenSerial": (_POINTER, _CHARS),
     "ndiCloseSerial": (None, _POINTER),
@@ -50,7 +50,7 @@ _FUNCTIONS = {
 
 
 def library_path() -> str:
-    """Return the file of ndicapi's library. Raises InputError if it is not installed."""
+    """Return the path of ndicapi's library. Raises InputError if it is not installed."""
     found = find_spec("ndicapy")
     if found is None or found.origin is None:
         raise InputError(INSTALL)
@@ -64,51 +64,51 @@ class Device:
         self._c = _library()
         self._device = self._c.ndiOpenSerial(path.encode())
         if not self._device:
-            raise OSError(_why_not_opened(path))
+            raise OSError(_open_problem(path))
         self._reply = b""
 
     def close(self) -> None:
         """Close the line."""
         self._c.ndiCloseSerial(self._device)
 
-    def wait_at_most(self, seconds: float) -> None:
-        """Set how long a command waits for its reply (tenths of a second)."""
+    def set_timeout(self, seconds: float) -> None:
+        """Set the timeout (s) of replies, in steps of 0.1 s."""
         self._c.ndiSerialTimeout(self._c.ndiGetDeviceHandle(self._device), round(seconds * 1000))
 
-    def speed(self, baud: int) -> None:
-        """Set the speed of this end of the line."""
+    def set_baud_rate(self, baud: int) -> None:
+        """Set the baud rate of this end of the line."""
         self._c.ndiSerialComm(self._c.ndiGetDeviceHandle(self._device), baud, b"8N1", 0)
 
     def command(self, text: str | None) -> int:
-        """Send a command, or a serial break (None); return 0 or the code of what went wrong."""
+        """Send a command, or a serial break (None); return 0 or an error code."""
         self._reply = self._c.ndiCommand(self._device, None if text is None else text.encode()) or b""
         code = int(self._c.ndiGetError(self._device))
-        # ndicapi looks for a binary checksum at the end of every reply to BX, also of an error in text.
+        # ndicapi expects a binary checksum at the end of every reply to BX, also of an error in text.
         error = _ERROR.match(self._reply) if code == CHECKSUM else None
         return code if error is None else int(error[1], 16)
 
-    def in_step(self, seconds: float) -> bool:
-        """Let replies that are still on their way pass, for so long at most; return whether there are no more.
+    def synchronised(self, seconds: float) -> bool:
+        """Discard delayed replies, within `seconds`; return whether replies match commands again.
 
-        A reply that comes after its command timed out would be taken for that of the next, and be as old as that is
-        late. So a question is asked whose answer is like no reading, APIREV, and again where the answer is lost; what
-        comes before it is of before, and what was asked twice is answered within the time that the first answer took.
-        A line that gives way has no more replies to wait for, and is not in step.
+        A reply that arrives after its command timed out would be taken for the reply to the next command, and its
+        reading for a new one. Therefore APIREV is sent, whose reply differs from a reading, and sent again if the reply
+        is lost. Data before its reply belong to earlier commands; replies to repeated APIREV arrive within the latency
+        of the first. False for a broken line.
         """
         port = self._c.ndiGetDeviceHandle(self._device)
-        heard, begun, latency = b"", monotonic(), inf
-        ask_at = begun
+        received, begun, latency = b"", monotonic(), inf
+        send_at = begun
         try:
             while (now := monotonic()) < begun + seconds:
-                if latency == inf and now >= ask_at:
+                if latency == inf and now >= send_at:
                     os.write(port, b"APIREV \r")
-                    ask_at = now + _ASK_AGAIN_S
-                pause = max(0.0, ask_at - now) if latency == inf else max(_QUIET_S, latency)
+                    send_at = now + _RETRY_S
+                pause = max(0.0, send_at - now) if latency == inf else max(_QUIET_S, latency)
                 if select.select([port], [], [], pause)[0]:
                     if not (data := os.read(port, 4096)):
                         return False
-                    heard = (heard + data)[-256:]
-                    if latency == inf and _REVISION.search(heard):
+                    received = (received + data)[-256:]
+                    if latency == inf and _REVISION.search(received):
                         latency = monotonic() - begun
                 elif latency < inf:
                     return True
@@ -117,49 +117,49 @@ class Device:
         return False
 
     def explain(self, code: int) -> str:
-        """Return a code in words."""
+        """Return the description of an error code."""
         return str(self._c.ndiErrorString(code).decode("ascii", "replace"))
 
-    def found(self) -> list[int]:
-        """Return the port handles in the last reply, to PHSR. Raises ValueError if it is no such reply.
+    def port_handles(self) -> list[int]:
+        """Return the port handles in the last reply, to PHSR. Raises ValueError if it has another form.
 
-        Read here and not by ndicapi, as the location: where a reply is short it goes on with that of before.
+        Parsed here, as the location: ndicapi completes a short reply with data of the previous one.
         """
         form = _HANDLES.fullmatch(self._reply)
         handles = [] if form is None else [int(form[2][k : k + 2], 16) for k in range(0, len(form[2]), 5)]
         if form is None or len(set(handles)) != int(form[1], 16):
-            raise ValueError(f"no list of port handles: {self._reply.decode('ascii', 'replace')!r}")
+            raise ValueError(f"not a list of port handles: {self._reply.decode('ascii', 'replace')!r}")
         return handles
 
     def location(self) -> tuple[str, str]:
-        """Return port and channel in the last reply, to PHINF. Raises ValueError if it is no such reply."""
+        """Return port and channel in the last reply, to PHINF. Raises ValueError if it has another form."""
         form = _LOCATION.fullmatch(self._reply)
         if form is None:
-            raise ValueError(f"no location of a port: {self._reply.decode('ascii', 'replace')!r}")
+            raise ValueError(f"not a port location: {self._reply.decode('ascii', 'replace')!r}")
         return form[1].decode(), form[2].decode()
 
-    def reading(self, letters: str, handle: int) -> tuple[int, int, int, tuple[float, ...]]:
-        """Return frame number, what kind of nothing is known (0: something is), port status and pose.
+    def reading(self, command: str, handle: int) -> tuple[int, int, int, tuple[float, ...]]:
+        """Return frame number, kind (0: measured; else ndicapi's reason for none), port status and pose.
 
-        letters: "BX" or "TX", of which the last reply is read. The pose is q0, qx, qy, qz, x, y, z (mm), indicator.
+        command: "BX" or "TX", the command of the last reply. The pose is q0, qx, qy, qz, x, y, z (mm), indicator.
         """
-        number = ctypes.c_float if letters == "BX" else ctypes.c_double
+        number = ctypes.c_float if command == "BX" else ctypes.c_double
         pose = (number * _POSE)()
-        gone = getattr(self._c, f"ndiGet{letters}Transform")(self._device, handle, pose)
-        status = getattr(self._c, f"ndiGet{letters}PortStatus")(self._device, handle)
-        frame = getattr(self._c, f"ndiGet{letters}Frame")(self._device, handle)
-        # ndicapi joins signed bytes: with bit 7 set all above it are set as well and mean nothing.
-        status &= 0xFF if letters == "BX" and status & 0x80 else 0xFFFF
-        return int(frame) & 0xFFFF_FFFF, int(gone), int(status), tuple(pose)
+        kind = getattr(self._c, f"ndiGet{command}Transform")(self._device, handle, pose)
+        status = getattr(self._c, f"ndiGet{command}PortStatus")(self._device, handle)
+        frame = getattr(self._c, f"ndiGet{command}Frame")(self._device, handle)
+        # ndicapi joins signed bytes: if bit 7 is set, all higher bits are set as well and have no meaning.
+        status &= 0xFF if command == "BX" and status & 0x80 else 0xFFFF
+        return int(frame) & 0xFFFF_FFFF, int(kind), int(status), tuple(pose)
 
-    def system_status(self, letters: str) -> int:
-        """Return the bits (0 to 6) that the last reply to BX or TX ends with: what ails the whole tracker."""
-        return int(getattr(self._c, f"ndiGet{letters}SystemStatus")(self._device)) & 0x7F
+    def system_status(self, command: str) -> int:
+        """Return the system status (bits 0 to 6) at the end of the last reply to BX or TX."""
+        return int(getattr(self._c, f"ndiGet{command}SystemStatus")(self._device)) & 0x7F
 
 
-def _why_not_opened(path: str) -> str:
+def _open_problem(path: str) -> str:
     if not Path(path).exists():
-        return "the port is gone: is the cable plugged in?"
+        return "the port does not exist: is the cable plugged in?"
     try:
         port = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError as error:
@@ -168,7 +168,7 @@ def _why_not_opened(path: str) -> str:
         is_serial = os.isatty(port)
     finally:
         os.close(port)
-    return "the port cannot be opened (is another program using it?)" if is_serial else "it is no serial port"
+    return "the port cannot be opened (is another program using it?)" if is_serial else "not a serial port"
 
 
 def _library() -> ctypes.CDLL:

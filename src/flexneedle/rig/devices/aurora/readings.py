@@ -1,4 +1,4 @@
-"""From what the tracker's line says of a sensor to a reading, or to why there is none. Pure."""
+"""Conversion of the link's values of a sensor to a reading, or to the reason why there is none. Pure functions."""
 
 from collections.abc import Mapping, Sequence
 from math import hypot, isfinite
@@ -8,9 +8,9 @@ from flexneedle.rig.devices.aurora.library import DISABLED
 from flexneedle.types import VISIBLE, SensorReading
 
 NAMES = ("tip", "ref1", "ref2", "ref3")
-"""Sensors at the ports 1 to 4, unless said otherwise."""
+"""Sensors at the ports 1 to 4 (default)."""
 
-_SEEN, _MISSING = 0, 2
+_MEASURED, _MISSING = 0, 2
 _STALE = SensorReading(None, status="stale")
 _BITS = {
     0x0040: "out of volume",
@@ -28,9 +28,9 @@ _UNIT_WITHIN = 1e-2  # TX rounds to 1e-4
 
 
 def sensor_name(port: str, channel: str, names: Sequence[str]) -> str:
-    """Return the name of the sensor at a port ("01") and channel ("00"), as PHINF tells them.
+    """Return the name of the sensor at a port ("01") and channel ("00") from PHINF.
 
-    A port has the same name whichever others are in use, so that no sensor is ever taken for another. The second
+    The name depends only on the port, not on the other ports in use, so that sensors are never mixed up. The second
     sensor of a split port is NAME.2, and a port beyond the names is portN.
     """
     known = port.isdigit() and 1 <= int(port) <= len(names)
@@ -41,39 +41,40 @@ def sensor_name(port: str, channel: str, names: Sequence[str]) -> str:
 def readings(
     found: Mapping[str, Sequence[Any]], number: int, names: Mapping[str, str]
 ) -> dict[str, SensorReading]:
-    """Return the readings of a frame by name. found: as the link tells it; names: by port handle."""
+    """Return the readings of a frame by name. found: values from the link; names: by port handle."""
     return {
-        names[handle]: _STALE if gone == _SEEN and frame != number else reading(gone, status, pose)
-        for handle, (gone, status, frame, pose) in found.items()
+        names[handle]: _STALE if kind == _MEASURED and frame != number else reading(kind, status, pose)
+        for handle, (kind, status, frame, pose) in found.items()
     }
 
 
-def reading(gone: int, status: int, pose: Sequence[float]) -> SensorReading:
-    """Return the reading in a frame: gone and status as ndicapi says them, pose q0 qx qy qz, x y z (mm), indicator.
+def reading(kind: int, status: int, pose: Sequence[float]) -> SensorReading:
+    """Return a sensor's reading: kind and port status from ndicapi, pose q0 qx qy qz, x y z (mm), indicator.
 
-    Only a sensor that is wholly inside of the volume has a position.
+    Only a sensor completely inside the volume has a position.
     """
-    ill = _why_not(gone, status)
-    if ill == VISIBLE and not _is_sound(pose):
-        ill = "bad transform"
-    if ill != VISIBLE:
-        return SensorReading(None, status=ill)
+    fault = _fault(kind, status)
+    if fault == VISIBLE and not _is_valid(pose):
+        fault = "bad transform"
+    if fault != VISIBLE:
+        return SensorReading(None, status=fault)
     length = hypot(*pose[:4])
     w, qx, qy, qz = (part / length for part in pose[:4])
     x, y, z = pose[4:7]
     return SensorReading((x, y, z), (w, qx, qy, qz), pose[7])
 
 
-def _why_not(gone: int, status: int) -> str:
-    if gone == DISABLED:  # ndicapi does not read its port status then
+def _fault(kind: int, status: int) -> str:
+    """Return VISIBLE or the reason why a sensor has no position."""
+    if kind == DISABLED:  # without a port status in ndicapi
         return "disabled"
     if not status & _OCCUPIED:
         return "unplugged"
-    said = next((words for bit, words in _BITS.items() if status & bit), None)
-    return said or ("missing" if gone == _MISSING else VISIBLE)
+    fault = next((words for bit, words in _BITS.items() if status & bit), None)
+    return fault or ("missing" if kind == _MISSING else VISIBLE)
 
 
-def _is_sound(pose: Sequence[float]) -> bool:
+def _is_valid(pose: Sequence[float]) -> bool:
     return (
         all(map(isfinite, pose))
         and abs(hypot(*pose[:4]) - 1) < _UNIT_WITHIN

@@ -1,4 +1,4 @@
-"""`Aurora`: the port `Tracker` over a link process that is started again for as long as it takes."""
+"""`Aurora`: the port `Tracker` of an NDI Aurora, over a link process that is restarted when it ends."""
 
 import json
 import os
@@ -23,12 +23,12 @@ from flexneedle.rig.ports import Clock
 from flexneedle.types import VISIBLE, Frame
 
 RATE_HZ = 40.0
-"""Frames a second of an Aurora."""
+"""Frame rate of an Aurora."""
 
-_QUEUE = 4000  # frames: 100 s for one who does not read
+_QUEUE = 4000  # frames: 100 s without a call of `read`
 _LATE_S = 0.15  # six frames
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.25, 5.0  # before connecting again
-_CONNECT_S, _SILENT_S = 45.0, 3.0  # a link that says nothing for so long hangs
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.25, 5.0  # before a reconnection
+_CONNECT_S, _SILENT_S = 45.0, 3.0  # a link without messages for longer is killed
 _STOP_S = 2.0
 _PORTS = ("ttyUSB*", "ttyACM*", "cu.usb*")
 _BREAK_EVERY = 3
@@ -36,23 +36,23 @@ _BREAK_EVERY = 3
 
 @dataclass(frozen=True)
 class Counts:
-    """What happened so far: frames told, frame numbers that never came, frames that nobody read in time,
-    connections after the first, and failed readings by kind ("garbled", "no reply", "error", "system", "unplugged";
-    "crash" for a link that ended otherwise)."""
+    """Counts since the start: frames received, frame numbers missed, frames dropped before they were read, connections
+    after the first, and errors by kind ("garbled", "no reply", "error", "system", "unplugged"; "crash": the link ended
+    without a reason)."""
 
     frames: int
     missed: int
     dropped: int
     reconnections: int
-    troubles: Mapping[str, int]
+    errors: Mapping[str, int]
 
 
 class Aurora:
-    """An NDI Aurora at a serial port, tracking; `read` returns its frames and never waits. Use it as a context.
+    """An NDI Aurora at a serial port; `read` returns its frames without waiting. Use it as a context manager.
 
     clock: of the run, in real time. names: of the sensors at ports 1, 2, ….
-    Whatever happens to the line later is told by `status` and ends by itself or not; frames go on when it does.
-    Raises InputError if there is no such port or ndicapi is not installed, RunError if no tracker answers there.
+    After a failure of the line `status` gives the reason, and the link reconnects until frames arrive again.
+    Raises InputError if there is no such port or ndicapi is not installed, RunError if no tracker replies there.
     """
 
     def __init__(self, path: str, clock: Clock, names: Sequence[str] = NAMES) -> None:
@@ -65,9 +65,9 @@ class Aurora:
         self._timeline = Timeline(RATE_HZ)
         self._named: dict[str, str] = {}
         self._lock = Lock()
-        self._told = self._missed = self._dropped = 0
+        self._received = self._missed = self._dropped = 0
         self._reconnections = -1
-        self._troubles: Counter[str] = Counter()
+        self._errors: Counter[str] = Counter()
         self._last: tuple[int, float] | None = None
         self._reason = "connecting"
         self._first, self._stop = Event(), Event()
@@ -75,7 +75,7 @@ class Aurora:
         self._thread.start()
         try:
             self._await_first()
-        except BaseException:  # Ctrl-C as well: nothing is to go on holding the port
+        except BaseException:  # also on Ctrl-C: the port must be released
             self.close()
             raise
 
@@ -91,7 +91,7 @@ class Aurora:
         self._thread.join()
 
     def read(self) -> tuple[Frame, ...]:
-        """The frames since the last call, oldest first; empty if there was none."""
+        """The frames since the last call, oldest first; may be empty."""
         with self._lock:
             frames = tuple(self._frames)
             self._frames.clear()
@@ -99,7 +99,7 @@ class Aurora:
 
     @property
     def status(self) -> str:
-        """VISIBLE while frames come, or in a few words why none do."""
+        """VISIBLE while frames arrive, else the reason in a few words."""
         with self._lock:
             last, reason = self._last, self._reason
         if reason != VISIBLE:
@@ -109,12 +109,12 @@ class Aurora:
 
     @property
     def counts(self) -> Counts:
-        """What happened so far."""
+        """Counts since the start."""
         with self._lock:
-            again = max(0, self._reconnections)
-            return Counts(self._told, self._missed, self._dropped, again, dict(self._troubles))
+            reconnections = max(0, self._reconnections)
+            return Counts(self._received, self._missed, self._dropped, reconnections, dict(self._errors))
 
-    # The thread: one link after the other
+    # The thread: runs one link after another
 
     def _await_first(self) -> None:
         self._first.wait()
@@ -125,12 +125,15 @@ class Aurora:
         pause, attempt = _FIRST_WAIT_S, 0
         try:
             while not self._stop.is_set():
-                # A break resets the tracker and may take seconds: first, and then only where nothing else helped.
+                # A serial break resets the tracker and may take seconds: at the first attempt, then at every third.
                 try:
                     tracked = self._connect_once(attempt % _BREAK_EVERY == 0)
-                except (OSError, ValueError) as error:  # no process to be had, or it tells nonsense
+                except (
+                    OSError,
+                    ValueError,
+                ) as error:  # the process cannot be started, or its output is invalid
                     tracked = False
-                    self._crashed(f"the link cannot be run: {error}")
+                    self._crashed(f"the link failed: {error}")
                 if not self._first.is_set():
                     return
                 pause, attempt = (
@@ -142,84 +145,88 @@ class Aurora:
             self._first.set()
 
     def _connect_once(self, may_break: bool) -> bool:
-        """Read one link to its end; return whether it ever was ready."""
+        """Run one link to its end; return whether it was ready at any time."""
         before = self._reconnections
         command = [sys.executable, "-m", f"{__package__}.link", self._path, *(["break"] if may_break else [])]
-        # A session of its own: Ctrl-C in the terminal is for the run, which then stops the link in good order.
+        # In a separate session, so that Ctrl-C reaches only the run, which then stops the link.
         with tempfile.TemporaryFile() as errors:
             link = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, start_new_session=True)
             with link:
                 self._listen(link)
                 _stop(link)
-            self._judge_end(link.returncode, errors)
+            self._record_end(link.returncode, errors)
         return self._reconnections > before
 
     def _listen(self, link: subprocess.Popen[bytes]) -> None:
-        """Take the link's messages until it ends, hangs, or is no longer wanted."""
-        out, heard = _descriptor(link), b""
-        heard_at, limit = monotonic(), _CONNECT_S
+        """Process the link's messages until it ends, hangs, or is stopped."""
+        out, received = _descriptor(link), b""
+        received_at, limit = monotonic(), _CONNECT_S
         while not self._stop.is_set():
             if select.select([out], [], [], 0.1)[0]:
                 data = os.read(out, 65536)
                 if not data:
                     return
-                *lines, heard = (heard + data).split(b"\n")
+                *lines, received = (received + data).split(b"\n")
                 for line in lines:
-                    self._take(json.loads(line))
-                heard_at, limit = monotonic(), _SILENT_S
-            elif monotonic() - heard_at > limit:
-                self._set_reason("no reply: the link hung")
+                    self._process(json.loads(line))
+                received_at, limit = monotonic(), _SILENT_S
+            elif monotonic() - received_at > limit:
+                self._set_reason("no reply: the link does not respond")
                 return
 
-    def _take(self, message: list[Any]) -> None:
+    def _process(self, message: list[Any]) -> None:
         match message:
-            case ["frame", number, asked, found]:
-                self._take_frame(number, asked, found)
+            case ["frame", number, requested, found]:
+                self._add_frame(number, requested, found)
             case ["ready", ports]:
                 named = {h: sensor_name(port, channel, self._names) for h, (port, channel) in ports.items()}
                 with self._lock:
                     self._named, self._reconnections = named, self._reconnections + 1
                     self._timeline = Timeline(RATE_HZ)
                 self._first.set()
-            case ["trouble", kind, words]:
+            case ["error", kind, description]:
                 with self._lock:
-                    self._troubles[kind] += 1
-                    self._reason = words
-            case ["end", words]:
-                self._set_reason(words)
+                    self._errors[kind] += 1
+                    self._reason = description
+            case ["end", reason]:
+                self._set_reason(reason)
 
-    def _take_frame(self, device_number: int, asked: float, found: Mapping[str, Sequence[Any]]) -> None:
-        number = self._numbering.count(device_number, asked)
-        time = self._timeline.stamp(number, asked) + self._offset
+    def _add_frame(self, device_number: int, requested: float, found: Mapping[str, Sequence[Any]]) -> None:
+        number = self._numbering.count(device_number, requested)
+        time = self._timeline.stamp(number, requested) + self._offset
         frame = Frame(time, number, readings(found, device_number, self._named))
         with self._lock:
             self._missed += 0 if self._last is None else number - self._last[0] - 1
             self._dropped += len(self._frames) == _QUEUE
-            self._told += 1
-            self._last, self._reason = (number, asked), VISIBLE
+            self._received += 1
+            self._last, self._reason = (number, requested), VISIBLE
             self._frames.append(frame)
 
-    def _judge_end(self, code: int, errors: IO[bytes]) -> None:
-        """Say why a link ended that did not say so itself: it crashed or was killed."""
+    def _record_end(self, code: int, errors: IO[bytes]) -> None:
+        """Record the reason why a link ended if it sent none: a crash, or it was killed."""
         if self._stop.is_set() or code == 0:
             return
         errors.seek(0)
-        said = errors.read().decode(errors="replace").strip().splitlines()
-        hung = "no reply: the link hung" if code == -signal.SIGKILL else f"the link ended with status {code}"
-        self._crashed(said[-1] if said else hung)
+        lines = errors.read().decode(errors="replace").strip().splitlines()
+        problem = (
+            "no reply: the link does not respond"
+            if code == -signal.SIGKILL
+            else f"the link ended with exit code {code}"
+        )
+        self._crashed(lines[-1] if lines else problem)
 
-    def _crashed(self, words: str) -> None:
+    def _crashed(self, reason: str) -> None:
         with self._lock:
-            self._troubles["crash"] += 1
-            self._reason = words
+            self._errors["crash"] += 1
+            self._reason = reason
 
-    def _set_reason(self, words: str) -> None:
+    def _set_reason(self, reason: str) -> None:
         with self._lock:
-            self._reason = words
+            self._reason = reason
 
 
 def _check_port(path: str) -> None:
-    """Raise InputError, with the ports that there are, if a port cannot be opened."""
+    """Raise InputError, with a list of the ports found, if a port cannot be opened."""
     found = (
         ", ".join(sorted(str(port) for pattern in _PORTS for port in Path("/dev").glob(pattern))) or "none"
     )
@@ -227,7 +234,7 @@ def _check_port(path: str) -> None:
         raise InputError(f"{path}: no such port; serial ports found: {found}")
     if not os.access(path, os.R_OK | os.W_OK):
         raise InputError(
-            f"{path}: no permission; on Linux join the group of the port (dialout) and log in again"
+            f"{path}: no permission; on Linux add your user to the group of the port (dialout) and log in again"
         )
 
 
@@ -238,7 +245,7 @@ def _descriptor(link: subprocess.Popen[bytes]) -> int:
 
 
 def _stop(link: subprocess.Popen[bytes]) -> None:
-    """Let a link put the tracker to rest; end it if it does not."""
+    """Ask a link to stop the tracker and end; kill it after a timeout."""
     link.terminate()
     try:
         link.wait(_STOP_S)

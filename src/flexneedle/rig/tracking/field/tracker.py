@@ -1,4 +1,4 @@
-"""A simulated electromagnetic tracker behind the port of a real one."""
+"""A simulated electromagnetic tracker with the port of a real one."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -21,12 +21,12 @@ MISSING = "missing"
 class FieldTracker:
     """Reads the sensors of `poses_at(time)`, by name, poses in the stage's frame, every `period` s. A `Tracker`.
 
-    room: its errors, whose middle lies at `center` (mm) in the stage's frame. A frame arrives `delay` s after it was
-    taken, with the time at which it was taken; the first one was taken `delay` and `ahead` s before the start. Each
-    sensor on its own sees nothing in a share `missing` of them.
-    to_tracker maps the stage's frame to that in which readings are told. plate_distance_at(time): how far the plate
-    is from the middle, mm; left out, as in the environment. The roll of the tip sensor, which has one coil, is not
-    known: its orientation is the shortest turn to its axis.
+    room: errors of the sensors; its center is at `center` (mm) in the stage's frame. A frame arrives `delay` s after it
+    was taken and has the time of measurement; the first one was taken `delay` + `ahead` s before the start. Each sensor
+    is missing in a share `missing` of the frames, independently of the others.
+    to_tracker: map from the stage's frame to the tracker's. plate_distance_at(time): distance (mm) of the plate from
+    the center (default: the environment's). The roll of the tip sensor, which has one coil, is not measured: its
+    orientation is the shortest rotation of the z axis to its axis.
     """
 
     def __init__(
@@ -48,9 +48,9 @@ class FieldTracker:
         self._period, self._delay, self._missing = period, delay, missing
         self._center, self._plate_distance_at = np.array(center), plate_distance_at
         self._to_tracker = identity() if to_tracker is None else to_tracker
-        self._turn_to_tracker = from_matrix(self._to_tracker.rotation)
-        # Noise is drawn by sensor and reading: neither a longer delay, with more readings from before the start, nor
-        # another sensor changes it.
+        self._rotation_to_tracker = from_matrix(self._to_tracker.rotation)
+        # Each sensor has two generators, for readings before the start and for later ones: neither the delay nor
+        # another sensor changes the noise of later ones.
         after, before = rng.spawn(2)
         self._rngs = dict(zip(SENSORS, after.spawn(len(SENSORS)), strict=True))
         self._rngs_before = dict(zip(SENSORS, before.spawn(len(SENSORS)), strict=True))
@@ -58,7 +58,7 @@ class FieldTracker:
             (delay + ahead) / period - 1e-6
         )  # the last frame; number k is taken at k periods
         self._first = self._taken + 1
-        self._still: dict[str, tuple[tuple[SensorPose, float | None], Noiseless]] = {}
+        self._at_rest: dict[str, tuple[tuple[SensorPose, float | None], Noiseless]] = {}
 
     def read(self) -> tuple[Frame, ...]:
         """Return the frames that arrived since the last call, oldest first."""
@@ -69,7 +69,7 @@ class FieldTracker:
 
     @property
     def status(self) -> str:
-        """VISIBLE: it never falls silent."""
+        """VISIBLE: it never stops."""
         return VISIBLE
 
     def _frame(self, number: int) -> Frame:
@@ -84,27 +84,27 @@ class FieldTracker:
     def _reading(
         self, name: str, pose: SensorPose, plate: float | None, rng: np.random.Generator
     ) -> SensorReading:
-        seen = noisy(self._room.environment, self._noiseless(name, pose, plate), rng)
+        readings = noisy(self._room.environment, self._noiseless(name, pose, plate), rng)
         if rng.random() < self._missing:
             return SensorReading(None, status=MISSING)
-        return self._told(name, seen)
+        return self._in_tracker_frame(name, readings)
 
     def _noiseless(self, name: str, pose: SensorPose, plate: float | None) -> Noiseless:
-        """As it was in the last frame, if the sensor stands still: references do."""
-        last, seen = self._still.get(name, (None, None))
-        if seen is None or last != (pose, plate):
-            place = np.array([pose.position]) - self._center
-            seen = noiseless(self._room, name, place, np.array([pose.orientation]), plate)
-            self._still[name] = (pose, plate), seen
-        return seen
+        """The reading without noise; that of the previous frame for a sensor at rest, such as a reference."""
+        last, exact = self._at_rest.get(name, (None, None))
+        if exact is None or last != (pose, plate):
+            position = np.array([pose.position]) - self._center
+            exact = noiseless(self._room, name, position, np.array([pose.orientation]), plate)
+            self._at_rest[name] = (pose, plate), exact
+        return exact
 
-    def _told(self, name: str, seen: SensorReadings) -> SensorReading:
-        place = self._to_tracker.apply(seen.positions[0] + self._center)
-        turn = product(self._turn_to_tracker, seen.turns[0])
+    def _in_tracker_frame(self, name: str, readings: SensorReadings) -> SensorReading:
+        position = self._to_tracker.apply(readings.positions[0] + self._center)
+        orientation = product(self._rotation_to_tracker, readings.orientations[0])
         if name == TIP:
-            turn = along(z_axis(turn))
-        indicator = None if seen.indicators is None else float(seen.indicators[0])
-        return SensorReading(_point(place), _quaternion(turn), indicator)
+            orientation = along(z_axis(orientation))
+        indicator = None if readings.indicators is None else float(readings.indicators[0])
+        return SensorReading(_point(position), _quaternion(orientation), indicator)
 
 
 def _point(values: Floats) -> Point:
