@@ -214,7 +214,7 @@ def test_an_unreachable_plan_is_refused_and_recorded(engine, capsys, in_tmp):
     result, stored = json.loads(out), json.loads((in_tmp / "here/run.json").read_text())
     assert (status, list(result)) == (1, INSERT_KEYS)
     assert err.splitlines()[-1] == f"flexneedle: {result['reason']}"
-    assert result["reason"].startswith("plan misses the target by 2.51 mm, bound by setup.")
+    assert result["reason"].startswith("plan misses the target by 2.51 mm, limited by setup.")
     assert (result["outcome"], result["reached"], result["steps"]) == ("refused", False, 0)
     assert (result["planned_error_mm"], result["planned_flips"]) == (pytest.approx(2.51), 1)
     assert (result["run_dir"], result["timing"]["plan_seconds"]) == ("here", 0.71)
@@ -327,7 +327,7 @@ def test_a_killed_run_can_be_viewed_and_exported(in_tmp, capsys):
     status, out, err = run(capsys, "export", "here", "--csv", "-")
     assert status == 0
     assert len(list(csv.DictReader(out.splitlines()))) == 12
-    assert "not finished: reading stopped at the end of 12 whole periods" in err
+    assert "incomplete: 12 complete periods read" in err
 
 
 def test_view_draws_the_same_figures_again(engine, capsys, in_tmp):
@@ -355,7 +355,7 @@ def test_a_folder_that_holds_a_run_is_refused(engine, capsys, in_tmp, command):
     before = {path.name: path.read_bytes() for path in (in_tmp / "here").iterdir()}
     status, out, err = run(capsys, command, "--out", "here")
     assert (status, out) == (2, "")
-    assert err == "flexneedle: here: holds a run already (run.json): give another folder with --out\n"
+    assert err == "flexneedle: here: already contains a run (run.json): choose another folder with --out\n"
     assert {path.name: path.read_bytes() for path in (in_tmp / "here").iterdir()} == before
 
 

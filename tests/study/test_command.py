@@ -46,7 +46,9 @@ def test_no_run_is_written_into_the_folder_of_a_study(capsys, uninterrupted, tmp
     shutil.copy(uninterrupted / "study.json", tmp_path)
     status, out, err = run(capsys, command, "phantom", "--out", tmp_path)
     assert (status, out) == (2, "")
-    assert err.splitlines()[-1].endswith("holds a study already (study.json): give another folder with --out")
+    assert err.splitlines()[-1].endswith(
+        "already contains a study (study.json): choose another folder with --out"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["study.json"]
 
 

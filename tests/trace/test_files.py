@@ -1,4 +1,4 @@
-"""Ctrl-C waits until a record is whole."""
+"""Ctrl-C is delayed until a record is complete."""
 
 import signal
 
@@ -7,7 +7,7 @@ import pytest
 from flexneedle.trace.files import uninterrupted
 
 
-def test_an_interrupt_comes_after_the_block():
+def test_an_interrupt_is_raised_after_the_block():
     done = []
 
     def interrupted_block():

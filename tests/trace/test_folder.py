@@ -1,4 +1,4 @@
-"""The folder of a run: claimed once, never torn, read back with clear errors."""
+"""The folder of a run: created once, always complete, with clear errors."""
 
 import itertools
 import json
@@ -55,7 +55,7 @@ def test_a_name_becomes_a_single_folder(name, expected):
     assert path.name.endswith(f"Z-{expected}-7")
 
 
-def test_a_claimed_run_is_running_until_it_ends(tmp_path):
+def test_a_new_run_is_running_until_it_ends(tmp_path):
     folder = claim(tmp_path / "a" / "b")
     assert read_run(folder.path).status == "running"
     folder.end("held", "no sample")
@@ -65,18 +65,18 @@ def test_a_claimed_run_is_running_until_it_ends(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["run.json", "trace.mcap"])
-def test_a_folder_that_holds_a_run_is_refused(tmp_path, name):
+def test_a_folder_that_contains_a_run_is_rejected(tmp_path, name):
     (tmp_path / name).write_text("precious")
-    with pytest.raises(InputError, match="holds a run already") as caught:
+    with pytest.raises(InputError, match="already contains a run") as caught:
         claim(tmp_path)
     assert "\n" not in str(caught.value)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "precious")]
 
 
-def test_a_folder_that_holds_a_study_is_refused(tmp_path):
+def test_a_folder_that_contains_a_study_is_rejected(tmp_path):
     (tmp_path / "study.json").write_text("precious")
     with pytest.raises(
-        InputError, match=r"holds a study already \(study\.json\): give another folder with --out$"
+        InputError, match=r"already contains a study \(study\.json\): choose another folder with --out$"
     ):
         claim(tmp_path)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("study.json", "precious")]
@@ -88,23 +88,23 @@ def test_a_folder_with_other_files_is_used(tmp_path):
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
+def test_a_folder_that_cannot_be_created_is_rejected(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="file: is there already, and no empty folder"):
+    with pytest.raises(InputError, match="file: already exists and is not an empty folder"):
         claim(tmp_path / "file")
-    with pytest.raises(InputError, match="cannot be made: Not a directory"):
+    with pytest.raises(InputError, match="cannot be created: Not a directory"):
         claim(tmp_path / "file" / "below")
-    with pytest.raises(InputError, match="cannot be made: File name too long"):
+    with pytest.raises(InputError, match="cannot be created: File name too long"):
         claim(tmp_path / ("a" * 300))
 
 
-def test_without_a_place_for_runs_there_is_a_clear_error(in_tmp):
+def test_a_file_called_runs_is_a_clear_error(in_tmp):
     (in_tmp / "runs").write_text("")
     with pytest.raises(InputError, match="runs"):
         claim()
 
 
-def test_run_json_is_whole_at_any_time(tmp_path, monkeypatch):
+def test_run_json_is_complete_at_any_time(tmp_path, monkeypatch):
     folder = claim(tmp_path)
     before = (tmp_path / "run.json").read_bytes()
 
@@ -118,7 +118,7 @@ def test_run_json_is_whole_at_any_time(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("", "damaged"),
         ("{", "damaged"),
@@ -129,9 +129,9 @@ def test_run_json_is_whole_at_any_time(tmp_path, monkeypatch):
         ('{"format": 1, "plans": 3}', "damaged: AttributeError"),
     ],
 )
-def test_a_damaged_run_is_one_clear_line(tmp_path, text, told):
+def test_a_damaged_run_is_one_clear_line(tmp_path, text, message):
     (tmp_path / "run.json").write_text(text)
-    with pytest.raises(InputError, match=re.escape(told)) as caught:
+    with pytest.raises(InputError, match=re.escape(message)) as caught:
         read_run(tmp_path)
     assert str(caught.value).startswith(f"{tmp_path}/run.json: ")
     assert "\n" not in str(caught.value)
@@ -145,12 +145,12 @@ def test_a_damaged_scenario_is_named(tmp_path):
         read_run(tmp_path)
 
 
-def test_a_folder_without_a_run_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"holds no run: there is no run\.json"):
+def test_a_folder_without_a_run_is_rejected(tmp_path):
+    with pytest.raises(InputError, match=r"contains no run: run\.json is missing"):
         read_run(tmp_path)
 
 
-def test_plans_come_back_to_the_last_bit(tmp_path):
+def test_plans_are_restored_to_the_last_bit(tmp_path):
     folder = claim(tmp_path)
     plan = folder.plans["manipulation"] = make_plan()
     folder.write()
@@ -160,8 +160,8 @@ def test_plans_come_back_to_the_last_bit(tmp_path):
             np.testing.assert_array_equal(getattr(again, field.name), getattr(plan, field.name))
 
 
-def test_a_plan_comes_back_with_the_scenario_of_its_run(tmp_path):
-    """Also one that an earlier version wrote: plans never held their scenario themselves."""
+def test_a_plan_is_restored_with_the_scenario_of_its_run(tmp_path):
+    """Also one of an earlier version: plans are stored without their scenario."""
     folder = claim(tmp_path)
     folder.plans["manipulation"] = replace(make_plan(), scenario=load_scenario("phantom"))
     folder.write()
@@ -170,14 +170,14 @@ def test_a_plan_comes_back_with_the_scenario_of_its_run(tmp_path):
     assert run.plans["manipulation"].scenario == run.scenario == load_scenario("phantom")
 
 
-def test_a_plan_without_steps_comes_back():
+def test_a_plan_without_steps_is_restored():
     values = plan_values(make_plan())
     again = plan_from_values({**values, "controls": []})
     assert again.controls.shape == (0, 5)
     assert again.flips == 0
 
 
-def test_text_is_json_with_a_row_a_line():
+def test_text_is_json_with_one_row_per_line():
     values = {"a": np.arange(4.0).reshape(2, 2), "b": [], "c": {}, "d": {"e": float("nan"), "f": (1, "µ")}}
     text = to_text(values)
     assert json.loads(text) == plain(values)
@@ -189,7 +189,7 @@ def test_text_is_json_with_a_row_a_line():
 
 @pytest.fixture
 def package(tmp_path):
-    """Return a function that makes a copy of a small package and returns the digest of its sources."""
+    """Return a function that creates a small package and returns the digest of its sources."""
     copies = itertools.count()
 
     def digest(**changed):
@@ -206,12 +206,12 @@ def package(tmp_path):
     return digest
 
 
-def test_the_same_sources_have_the_same_digest_wherever_they_lie(package):
+def test_the_digest_does_not_depend_on_the_folder(package):
     assert package() == package()
     assert re.fullmatch(r"[0-9a-f]{12}", package())
 
 
-def test_what_python_and_the_system_leave_beside_the_sources_does_not_count(package):
+def test_files_beside_the_sources_do_not_change_the_digest(package):
     assert package() == package(a_pyc=b"4", a_nbi=b"5", b__readme_md=b"6")
 
 
@@ -230,7 +230,7 @@ def test_any_change_of_a_source_changes_the_digest(package, changed):
     assert package(**changed) != package()
 
 
-def test_versions_have_the_digest_of_this_package_and_of_what_writes_tables():
+def test_versions_have_the_digest_of_this_package_and_pyarrow():
     found = versions()
     assert found["source"] == folder_module._source.__wrapped__(Path(flexneedle.__file__).parent)
     assert set(found) == {"flexneedle", "python", "numpy", "numba", "pyarrow", "source"}

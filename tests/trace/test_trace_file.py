@@ -1,4 +1,4 @@
-"""`trace.mcap`: what goes in comes out, for us and for others, and a kill loses nothing."""
+"""`trace.mcap`: periods are restored exactly, by this package and by others, also after a kill."""
 
 import signal
 import subprocess
@@ -51,19 +51,19 @@ def write(path, periods=PERIODS):
 
 
 def messages(path):
-    """Return all messages but the wall-clock ones, by the stock reader."""
+    """Return all messages except the wall-clock ones, read with mcap."""
     with path.open("rb") as file:
         found = make_reader(file).iter_messages(log_time_order=False)
         return [(c.topic, m.log_time, m.data) for _, c, m in found if c.topic != "/timing"]
 
 
 def until_the_end(records):
-    """Yield what comes before the file ends too early."""
+    """Yield the records before the truncated end of the file."""
     try:
         yield from records
     except EndOfFile:
         return
-    pytest.fail("the file ends as if it were finished")
+    pytest.fail("the file ends like a complete one")
 
 
 @pytest.fixture(scope="module")
@@ -80,19 +80,19 @@ def killed_file(tmp_path_factory):
     return path
 
 
-def test_periods_come_back_to_the_last_bit_of_every_scalar(trace_file):
+def test_periods_are_restored_to_the_last_bit_of_every_scalar(trace_file):
     trace = read_trace(trace_file)
     assert [to_row(p) for p in trace.periods] == [to_row(p) for p in PERIODS]
     assert [p.durations for p in trace.periods] == [p.durations for p in PERIODS]
     assert (trace.about, trace.scenario, trace.note) == (ABOUT, SCENARIO, "")
 
 
-def test_shapes_come_back(trace_file):
+def test_shapes_are_restored(trace_file):
     for again, period in zip(read_trace(trace_file).periods, PERIODS, strict=True):
         np.testing.assert_allclose(again.shape, period.shape, rtol=1e-14, atol=1e-14)
 
 
-def test_a_blind_period_comes_back(tmp_path):
+def test_a_period_without_a_tip_is_restored(tmp_path):
     period = blind(PERIODS[3])
     (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
     assert to_row(again) == to_row(period)
@@ -130,12 +130,12 @@ def test_the_smallest_stretch_of_the_true_tissue_is_a_column(trace_file):
         ),
     ],
 )
-def test_readings_come_back_to_the_last_bit_with_their_verdicts(tmp_path, sample):
-    frozen = Verdict(VerdictKind.FROZEN, "the same in 4 readings")
-    told = (CheckedMeasurement(sample, Verdict()), CheckedMeasurement(sample, frozen))
-    period = replace(PERIODS[3], readings=told, sample=sample)
+def test_readings_are_restored_to_the_last_bit_with_their_verdicts(tmp_path, sample):
+    frozen = Verdict(VerdictKind.FROZEN, "4 identical readings")
+    checked = (CheckedMeasurement(sample, Verdict()), CheckedMeasurement(sample, frozen))
+    period = replace(PERIODS[3], readings=checked, sample=sample)
     (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
-    assert again.readings == told
+    assert again.readings == checked
     assert (again.sample.x, again.sample.z) == (sample.x, sample.z)
 
 
@@ -147,19 +147,19 @@ def test_readings_come_back_to_the_last_bit_with_their_verdicts(tmp_path, sample
         ("field distorted: ref1 0.09", VerdictKind.FIELD_DISTORTED, "field distorted: ref1 0.09"),
     ],
 )
-def test_a_verdict_is_read_from_its_text_that_of_earlier_versions_too(text, kind, shown):
+def test_a_verdict_is_read_from_its_text_also_from_that_of_earlier_versions(text, kind, shown):
     assert verdict_of(text).kind is kind
     assert str(verdict_of(text)) == shown
 
 
-def test_a_text_that_is_no_verdict_is_refused():
+def test_a_text_that_is_not_a_verdict_is_rejected():
     with pytest.raises(ValueError, match="must begin with one of ok, missing, "):
         verdict_of("fine")
 
 
-def test_a_period_has_its_own_readings_and_not_those_of_the_one_before(tmp_path):
-    told = replace(PERIODS[3], readings=(CheckedMeasurement(Measurement(0.1, 1.0, 2.0), Verdict()),))
-    first, second = read_trace(write(tmp_path / "trace.mcap", [told, PERIODS[4]])).periods
+def test_a_period_does_not_have_the_readings_of_the_previous_one(tmp_path):
+    with_reading = replace(PERIODS[3], readings=(CheckedMeasurement(Measurement(0.1, 1.0, 2.0), Verdict()),))
+    first, second = read_trace(write(tmp_path / "trace.mcap", [with_reading, PERIODS[4]])).periods
     assert (len(first.readings), len(second.readings)) == (1, 0)
 
 
@@ -181,28 +181,28 @@ def test_columns_carry_units():
     assert {name for name in COLUMNS if name.rsplit("_", 1)[-1] not in units} == bare
 
 
-def test_every_topic_is_heard_each_period(trace_file):
+def test_every_topic_has_a_message_each_period(trace_file):
     with trace_file.open("rb") as file:
-        heard = Counter(channel.topic for _, channel, _ in make_reader(file).iter_messages())
-    assert heard == {topic: 1 if topic == "/plan/path" else len(PERIODS) for topic in TOPICS}
+        found = Counter(channel.topic for _, channel, _ in make_reader(file).iter_messages())
+    assert found == {topic: 1 if topic == "/plan/path" else len(PERIODS) for topic in TOPICS}
 
 
 def test_rosbags_reads_types_units_and_frame(trace_file):
     with AnyReader([trace_file], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-        heard = {
+        found = {
             c.topic: (time, reader.deserialize(raw, c.msgtype)) for c, time, raw in reader.messages()
         }  # the last one of each topic
     last = PERIODS[-1]
-    time, estimate = heard["/tip/estimate"]
+    time, estimate = found["/tip/estimate"]
     assert time == round(last.time * 1e9)
     assert estimate.header.frame_id == "skin"
     assert estimate.pose.position.y == pytest.approx(last.estimate[1] * 1e-3, rel=1e-15)
     assert 2 * estimate.pose.orientation.z == pytest.approx(last.estimate[2], rel=1e-3)
-    assert heard["/tissue/true_strain_energy"][1].data == last.true_strain_energy * 1e-3
-    command = heard["/command"][1]
+    assert found["/tissue/true_strain_energy"][1].data == last.true_strain_energy * 1e-3
+    command = found["/command"][1]
     assert dict(zip(command.name, command.position, strict=True))["base_x"] == last.command[0] * 1e-3
-    assert len(heard["/needle/shape"][1].poses) == len(last.shape)
-    measured = heard["/tip/measured"][1].header.stamp
+    assert len(found["/needle/shape"][1].poses) == len(last.shape)
+    measured = found["/tip/measured"][1].header.stamp
     assert measured.sec + measured.nanosec * 1e-9 == pytest.approx(last.sample.time)
 
 
@@ -213,7 +213,7 @@ def test_the_plan_is_latched(trace_file):
     assert latched == {"/plan/path"}
 
 
-def test_content_but_for_timing_is_the_same_for_the_same_run(trace_file, tmp_path):
+def test_content_except_for_timing_is_the_same_for_the_same_run(trace_file, tmp_path):
     slower = [p.__class__(**{**vars(p), "durations": {"total": 1.0}}) for p in PERIODS]
     assert messages(trace_file) == messages(write(tmp_path / "again.mcap", slower))
 
@@ -221,24 +221,24 @@ def test_content_but_for_timing_is_the_same_for_the_same_run(trace_file, tmp_pat
 def test_a_killed_writer_leaves_all_its_periods(killed_file):
     trace = read_trace(killed_file)
     assert [to_row(p) for p in trace.periods] == [to_row(p) for p in PERIODS]
-    assert "not finished: reading stopped at the end of 12 whole periods" in trace.note
+    assert "incomplete: 12 complete periods read" in trace.note
 
 
-def test_a_killed_writer_leaves_a_file_for_the_stock_reader(killed_file):
+def test_a_killed_writer_leaves_a_file_for_the_mcap_reader(killed_file):
     with killed_file.open("rb") as file:
         found = NonSeekingReader(file).iter_messages(log_time_order=False)
         topics = [channel.topic for _, channel, _ in until_the_end(found)]
     assert topics.count("/control/status") == 12
 
 
-def test_a_killed_writer_ends_at_a_record(killed_file):
+def test_the_file_of_a_killed_writer_ends_with_a_complete_record(killed_file):
     size = killed_file.stat().st_size
     with killed_file.open("rb") as file:
         positions = [file.tell() for _ in until_the_end(StreamReader(file, emit_chunks=True).records)]
     assert positions[-1] == size
 
 
-def test_a_torn_tail_costs_only_the_torn_period(trace_file, tmp_path):
+def test_a_truncated_file_loses_only_the_truncated_periods(trace_file, tmp_path):
     torn = tmp_path / "torn.mcap"
     data = trace_file.read_bytes()
     counts = []
@@ -252,14 +252,14 @@ def test_a_torn_tail_costs_only_the_torn_period(trace_file, tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"no trace at all", b"\x89MCAP0\r\n"])
-def test_a_file_that_is_no_trace_is_refused(content, tmp_path):
+def test_a_file_that_is_not_a_trace_is_rejected(content, tmp_path):
     path = tmp_path / "trace.mcap"
     path.write_bytes(content)
     with pytest.raises(InputError, match="not a trace of flexneedle"):
         read_trace(path)
 
 
-def test_a_missing_trace_is_refused(tmp_path):
+def test_a_missing_trace_is_rejected(tmp_path):
     with pytest.raises(InputError, match=r"trace\.mcap: cannot be read: No such file"):
         read_trace(tmp_path / "trace.mcap")
 

@@ -1,6 +1,6 @@
-"""A control period as one row of named scalars: the columns of the CSV, the keys of `/control/status`.
+"""A control period as one row of named scalars: the columns of the CSV and the keys of `/control/status`.
 
-Names end in their unit; numbers are exact (`repr`), so that a period comes back from its row to the last bit.
+Names end in their unit; numbers are exact (`repr`), so that a period is restored from its row to the last bit.
 """
 
 import math
@@ -13,7 +13,7 @@ _Scalar = Callable[[str], Any]
 
 
 def verdict_of(text: object) -> Verdict:
-    """Return the verdict of a text that begins with its kind. Raises ValueError for another."""
+    """Return the verdict of a text that begins with its kind. Raises ValueError for other texts."""
     found = next((kind for kind in VerdictKind if str(text).startswith(kind)), None)
     if found is None:
         raise ValueError(f"{text}: must begin with one of {', '.join(VerdictKind)}")
@@ -35,7 +35,7 @@ def _pose(name: str) -> tuple[tuple[str, _Scalar], ...]:
 
 _TEXTS = (str, verdict_of, Action)
 
-# Field of Period: its columns, each with what reads it back. A field of several columns is a tuple.
+# Columns of each field of Period, with their parsers. A field of several columns is a tuple.
 _FIELDS: dict[str, tuple[tuple[str, _Scalar], ...]] = {
     "index": (("index", int),),
     "time": (("time_s", float),),
@@ -69,12 +69,12 @@ COLUMNS: tuple[str, ...] = tuple(name for columns in _FIELDS.values() for name, 
 
 
 def to_row(period: Period) -> dict[str, str]:
-    """Return the scalars of a period as text by column; what is missing is empty."""
+    """Return the scalars of a period as text by column; missing values are empty."""
     return {name: "" if value is None else _text(value) for name, value in _cells(period)}
 
 
 def to_values(period: Period) -> dict[str, Any]:
-    """Return the scalars of a period as numbers, flags and text by column; a number that is not known is NaN."""
+    """Return the scalars of a period as numbers, flags and text by column; missing numbers are NaN."""
     return {name: math.nan if value is None else value for name, value in _cells(period)}
 
 
@@ -84,13 +84,13 @@ def from_row(
     durations: dict[str, float],
     readings: tuple[CheckedMeasurement, ...] = (),
 ) -> Period:
-    """Return the period of a row with what no row holds; raises KeyError or ValueError for other rows."""
+    """Return the period of a row and of the values not in it; raises KeyError or ValueError for other rows."""
     values = {field: _value(field, row) for field in _FIELDS}
     return Period(shape=shape, durations=durations, readings=readings, **values)
 
 
 def _cells(period: Period) -> Iterator[tuple[str, Any]]:
-    """Each column and its value, None where it is missing."""
+    """Each column and its value, None if missing."""
     for field, columns in _FIELDS.items():
         value = getattr(period, field)
         if isinstance(value, Measurement):

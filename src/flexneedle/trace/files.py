@@ -1,4 +1,4 @@
-"""Files that are whole at any moment, since Ctrl-C waits until a record is written, and new folders for them."""
+"""Files that are complete at any time, since Ctrl-C is delayed until a record is written; and new folders."""
 
 import os
 import re
@@ -19,7 +19,7 @@ _LONGEST_NAME = 60
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Put off SIGINT until the block is done; it then does what it would have done."""
+    """Delay SIGINT until the end of the block, then handle it as before."""
     before = signal.getsignal(signal.SIGINT)
     if current_thread() is not main_thread() or not callable(before):
         yield  # no KeyboardInterrupt can arise here
@@ -35,7 +35,7 @@ def uninterrupted() -> Iterator[None]:
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Write a file; readers see the old one or the new one, whole."""
+    """Replace a file in one step: readers get the old or the new one, never a part."""
     draft = path.with_name(path.name + ".tmp")
     with uninterrupted():
         with draft.open("wb") as file:
@@ -46,9 +46,9 @@ def replace_file(path: Path, data: bytes) -> None:
 
 
 def new_folder(*parts: str, now: datetime | None = None) -> Path:
-    """Make a folder `runs/<date>-<part>-<part>` and return it; a second one in the same second gets a number.
+    """Create and return a folder `runs/<date>-<part>-<part>`; further ones in the same second get a number.
 
-    now: by default this moment. Raises InputError if it cannot be made.
+    now: time in the name (default: the present). Raises InputError if it cannot be created.
     """
     plain = (re.sub(r"[^\w.-]+", "-", part).strip("-.")[:_LONGEST_NAME] or "unnamed" for part in parts)
     opening = "-".join((f"{now or datetime.now(UTC):%Y%m%dT%H%M%SZ}", *plain))
@@ -58,9 +58,9 @@ def new_folder(*parts: str, now: datetime | None = None) -> Path:
             path.mkdir(parents=True)
         except FileExistsError:
             if not _RUNS.is_dir():
-                raise InputError(f"{_RUNS}: is not a folder: give another with --out") from None
+                raise InputError(f"{_RUNS}: is not a folder: choose another folder with --out") from None
             continue
         except OSError as error:
-            raise InputError(f"{path}: cannot be made: {error.strerror}") from None
+            raise InputError(f"{path}: cannot be created: {error.strerror}") from None
         return path
-    raise InputError(f"{_RUNS / opening}: no free name")
+    raise InputError(f"{_RUNS / opening}: no unused name")

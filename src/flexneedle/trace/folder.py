@@ -1,8 +1,8 @@
-"""The folder of a run: claimed once, `run.json` always whole, read back with clear errors.
+"""The folder of a run: created once, with a `run.json` that is always complete.
 
 `run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing and
-plans; that of an insertion also controller, phantom and tracker. All but `timing`, which holds the date and the
-wall-clock times, is the same for the same seed.
+plans; that of an insertion also controller, phantom and tracker. All except `timing`, the date and the wall-clock
+times, is the same for the same seed.
 """
 
 import hashlib
@@ -31,9 +31,9 @@ _FORMAT = 1
 
 @dataclass(frozen=True, eq=False)
 class RunFile:
-    """`run.json`, read back. status: "running" (or killed), "done", "held", "failed" or "interrupted".
+    """Contents of `run.json`. status: "running" (or killed), "done", "held", "failed" or "interrupted".
 
-    controller, phantom, tracker: of an insertion, "" where they are not recorded.
+    controller, phantom, tracker: of an insertion, "" if not recorded.
     """
 
     folder: Path
@@ -52,7 +52,7 @@ class RunFile:
 
 @dataclass(eq=False)
 class Folder:
-    """A claimed folder and what its `run.json` is to say; `write` says it."""
+    """A folder of a run and the values of its `run.json`, written by `write`."""
 
     path: Path
     values: dict[str, Any]
@@ -61,9 +61,9 @@ class Folder:
 
     @classmethod
     def claim(cls, out: Path | None, name: str, kind: str, scenario: Scenario, seed: int) -> "Folder":
-        """Make the folder `out`, or one below `runs/` named by date, `name` and seed, and mark it as running.
+        """Create the folder `out`, or one in `runs/` named by date, `name` and seed, with the status "running".
 
-        Raises InputError if the folder holds a run or a study already or cannot be made.
+        Raises InputError if the folder already contains a run or a study, or cannot be created.
         """
         now = datetime.now(UTC)
         path = _make(new_folder(name, str(seed), now=now) if out is None else out)
@@ -82,21 +82,21 @@ class Folder:
         return folder
 
     def write(self) -> None:
-        """Write `run.json`; readers see the old text or the new one, whole."""
+        """Write `run.json` in one step: readers get the old or the new text, never a part."""
         plans = {name: plan_values(plan) for name, plan in self.plans.items()}
         text = to_text({**self.values, "timing": self.timing, "plans": plans})
         replace_file(self.path / RUN_FILE, text.encode())
 
     def end(self, status: str, reason: str = "") -> None:
-        """Set how the run ended, and write."""
+        """Set the final status, and write."""
         self.values |= {"status": status, "reason": reason}
         self.write()
 
 
 def versions() -> dict[str, str]:
-    """Return the versions on which the numbers of a run, and the bytes of a table, depend.
+    """Return the versions on which the numbers of a run and the bytes of a table depend.
 
-    source: a digest of the code and data of this package, which tells an edited copy from the release.
+    source: digest of the code and data of this package, by which an edited copy differs from the release.
     """
     return {
         "flexneedle": version("flexneedle"),
@@ -110,7 +110,7 @@ def versions() -> dict[str, str]:
 
 @cache
 def _source(package: Path) -> str:
-    """Return a digest of the sources below a folder, wherever it lies: relative path and bytes of each."""
+    """Return a digest of the sources in a folder: of the relative path and the bytes of each."""
     digest = hashlib.sha256()
     found = (path for path in package.rglob("*") if path.suffix in _SOURCES and path.is_file())
     paths = {path.relative_to(package).as_posix(): path for path in found}
@@ -121,12 +121,12 @@ def _source(package: Path) -> str:
 
 
 def read_run(folder: Path) -> RunFile:
-    """Return what `run.json` of a folder says. Raises InputError if there is none or it is damaged."""
+    """Return the contents of `run.json` in a folder. Raises InputError if it is missing or damaged."""
     path = folder / RUN_FILE
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise InputError(f"{folder}: holds no run: there is no {RUN_FILE}") from None
+        raise InputError(f"{folder}: contains no run: {RUN_FILE} is missing") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
@@ -152,14 +152,16 @@ def _checked(path: Path, values: Any) -> RunFile:
 
 def _make(path: Path) -> Path:
     try:
-        held = next((name for name in (RUN_FILE, TRACE_FILE, STUDY_FILE) if (path / name).exists()), None)
-        if held is not None:
-            kind = "study" if held == STUDY_FILE else "run"
-            raise InputError(f"{path}: holds a {kind} already ({held}): give another folder with --out")
+        found = next((name for name in (RUN_FILE, TRACE_FILE, STUDY_FILE) if (path / name).exists()), None)
+        if found is not None:
+            kind = "study" if found == STUDY_FILE else "run"
+            raise InputError(f"{path}: already contains a {kind} ({found}): choose another folder with --out")
         path.mkdir(parents=True, exist_ok=True)
-        (path / RUN_FILE).touch(exist_ok=False)  # of two runs at the same moment, one gets the folder
+        (path / RUN_FILE).touch(exist_ok=False)  # of two simultaneous runs one gets the folder
     except FileExistsError:
-        raise InputError(f"{path}: is there already, and no empty folder: give another with --out") from None
+        raise InputError(
+            f"{path}: already exists and is not an empty folder: choose another folder with --out"
+        ) from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be made: {error.strerror}") from None
+        raise InputError(f"{path}: cannot be created: {error.strerror}") from None
     return path

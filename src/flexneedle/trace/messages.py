@@ -1,7 +1,7 @@
 """ROS 2 messages of a run: standard types, SI units (m, rad, s, J, N), planar poses in the frame `skin`.
 
-The frame `skin` has its origin where the axis of insertion meets the skin, x into the tissue, y aside, z by
-the right hand. Time is that of the run and starts at 0.
+The frame `skin` has its origin at the intersection of the insertion axis with the skin, x into the tissue, y lateral,
+z by the right-hand rule. Time is that of the run and starts at 0.
 """
 
 from collections.abc import Iterable, Mapping
@@ -35,8 +35,8 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 @dataclass(frozen=True)
-class Judgement:
-    """A text, whether it is a good one, and values by key."""
+class Check:
+    """Result of a check: a text, whether it is good, and values by key."""
 
     text: str
     good: bool
@@ -57,9 +57,9 @@ def pose(time: float, at: Pose) -> PoseStamped:
 
 
 def path(time: float, poses: Floats) -> Path:
-    """Return poses (n, 3) (mm, mm, rad), stamped with one time (s)."""
+    """Return poses (n, 3) (mm, mm, rad), all with the same time (s)."""
     header = _header(time)
-    return Path(header, [_pose_stamped(header, (x, y, turn)) for x, y, turn in poses.tolist()])
+    return Path(header, [_pose_stamped(header, (x, y, theta)) for x, y, theta in poses.tolist()])
 
 
 def points_of(message: Path) -> Floats:
@@ -75,7 +75,7 @@ def joints(time: float, values: Iterable[float]) -> JointState:
 
 
 def number(value: float) -> Float64:
-    """Return a bare number; its time is that of the log."""
+    """Return a number; its time is that of the log."""
     return Float64(float(value))
 
 
@@ -88,18 +88,18 @@ def diagnostics(
     time: float, name: str, values: Mapping[str, str], *, text: str = "", good: bool = True
 ) -> DiagnosticArray:
     """Return one status with its values by key; level OK, or WARN if it is not good."""
-    return judgements(time, name, [Judgement(text, good, values)])
+    return statuses(time, name, [Check(text, good, values)])
 
 
-def judgements(time: float, name: str, told: Iterable[Judgement]) -> DiagnosticArray:
-    """Return a status for each judgement, all of one name."""
-    return DiagnosticArray(_header(time), [_status(name, one) for one in told])
+def statuses(time: float, name: str, checks: Iterable[Check]) -> DiagnosticArray:
+    """Return a status for each check, all with the same name."""
+    return DiagnosticArray(_header(time), [_status(name, one) for one in checks])
 
 
-def _status(name: str, told: Judgement) -> DiagnosticStatus:
-    level = DiagnosticStatus.OK if told.good else DiagnosticStatus.WARN
-    pairs = [KeyValue(key, value) for key, value in told.values.items()]
-    return DiagnosticStatus(level, name, told.text, "", pairs)
+def _status(name: str, check: Check) -> DiagnosticStatus:
+    level = DiagnosticStatus.OK if check.good else DiagnosticStatus.WARN
+    pairs = [KeyValue(key, value) for key, value in check.values.items()]
+    return DiagnosticStatus(level, name, check.text, "", pairs)
 
 
 def _header(time: float) -> Header:
@@ -108,8 +108,8 @@ def _header(time: float) -> Header:
 
 
 def _pose_stamped(header: Header, at: Pose) -> PoseStamped:
-    x, y, turn = at
-    quaternion = Quaternion(0.0, 0.0, sin(turn / 2), cos(turn / 2))
+    x, y, theta = at
+    quaternion = Quaternion(0.0, 0.0, sin(theta / 2), cos(theta / 2))
     return PoseStamped(header, PoseMessage(Point(x * 1e-3, y * 1e-3, 0.0), quaternion))
 
 

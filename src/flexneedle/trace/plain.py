@@ -1,6 +1,6 @@
-"""Records as plain JSON values and back, and JSON as text that a person can read.
+"""Conversion of records to plain JSON values and back, and readable JSON text.
 
-Numbers keep all their digits. JSON has no NaN and no infinity: they become null.
+Numbers keep all digits. NaN and infinity, which JSON does not have, become null.
 """
 
 import json
@@ -14,11 +14,11 @@ import numpy as np
 from flexneedle.types import Plan
 
 _ARRAYS = ("controls", "tips", "strain_energy", "guide", "shapes")
-_KEPT_ELSEWHERE = ("seconds", "scenario")
+_STORED_ELSEWHERE = ("seconds", "scenario")
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON knows it: dicts, lists, text, numbers, booleans, null."""
+    """Return a value in JSON types: dicts, lists, text, numbers, booleans, null."""
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
     if isinstance(value, Mapping):
@@ -31,14 +31,14 @@ def plain(value: Any) -> Any:
 
 
 def plan_values(plan: Plan) -> dict[str, Any]:
-    """Return a plan as plain values, without its scenario and the time that it took; arrays (mm, rad, mJ) come last."""
-    names = [field.name for field in fields(plan) if field.name not in _KEPT_ELSEWHERE]
+    """Return a plan as plain values, without its scenario and wall-clock time; arrays (mm, rad, mJ) come last."""
+    names = [field.name for field in fields(plan) if field.name not in _STORED_ELSEWHERE]
     ordered = [name for name in names if name not in _ARRAYS] + list(_ARRAYS)
     return {name: plain(getattr(plan, name)) for name in ordered}
 
 
 def plan_from_values(values: Mapping[str, Any]) -> Plan:
-    """Return the plan of `plan_values`; raises KeyError, TypeError or ValueError if it is not one."""
+    """Return the plan of `plan_values`; raises KeyError, TypeError or ValueError for other values."""
     given = {**values, **{name: np.array(values[name], dtype=float) for name in _ARRAYS}}
     given["controls"] = given["controls"].reshape(-1, 5)
     x, y = values["target"]
@@ -46,7 +46,7 @@ def plan_from_values(values: Mapping[str, Any]) -> Plan:
 
 
 def to_text(values: Mapping[str, Any]) -> str:
-    """Return JSON with a line for each key, and for each row of an array."""
+    """Return JSON with one line per key and per row of an array."""
     return "".join(_lines(plain(values), "")) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""Reading `trace.mcap` back, finished or not."""
+"""Reader of `trace.mcap`, also of an incomplete one."""
 
 import json
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ from flexneedle.types import CheckedMeasurement, Floats, Period
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """What a trace holds. `note` is one line about a missing or damaged end, "" for a whole file."""
+    """Contents of a trace. note: one line on a missing or damaged end, "" for a complete file."""
 
     periods: tuple[Period, ...]
     about: dict[str, str]
@@ -32,9 +32,9 @@ class Trace:
 
 
 def read_trace(path: Path) -> Trace:
-    """Return what can be read of a trace, up to its last whole period.
+    """Return the contents of a trace up to its last complete period.
 
-    Raises InputError if there is no such file or if it is no trace.
+    Raises InputError if the file cannot be read or is not a trace.
     """
     collector = _Collector()
     try:
@@ -48,18 +48,17 @@ def read_trace(path: Path) -> Trace:
 
 
 def _collect(file: Any, collector: "_Collector") -> str:
-    """Feed all whole records to the collector; return what is wrong with the rest."""
+    """Add all complete records to the collector; return the reason why the rest cannot be read, or ""."""
     try:
         for record in StreamReader(file, validate_crcs=True).records:
-            collector.take(record)
+            collector.add(record)
     except (McapError, CRCValidationError, StructError, KeyError, ValueError) as error:
-        ending = f"at the end of {len(collector.periods)} whole periods"
-        return f"not finished: reading stopped {ending} ({type(error).__name__})"
+        return f"incomplete: {len(collector.periods)} complete periods read ({type(error).__name__})"
     return ""
 
 
 class _Collector:
-    """Puts the records of a file together to periods."""
+    """Assembles periods from the records of a file."""
 
     def __init__(self) -> None:
         self.periods: list[Period] = []
@@ -70,10 +69,10 @@ class _Collector:
         self._durations: dict[str, float] = {}
         self._readings: tuple[CheckedMeasurement, ...] = ()
 
-    def take(self, record: McapRecord) -> None:
-        """Take one record of the file."""
+    def add(self, record: McapRecord) -> None:
+        """Add one record of the file."""
         if isinstance(record, Message):
-            self._hear(self._topics[record.channel_id], record.data)
+            self._add_message(self._topics[record.channel_id], record.data)
         elif isinstance(record, Channel):
             self._topics[record.id] = record.topic
         elif isinstance(record, Metadata) and record.name == "flexneedle":
@@ -81,7 +80,7 @@ class _Collector:
         elif isinstance(record, Attachment) and record.name == "scenario.json":
             self.scenario = json.loads(record.data)
 
-    def _hear(self, topic: str, data: bytes) -> None:
+    def _add_message(self, topic: str, data: bytes) -> None:
         if topic not in (SHAPE, READINGS, TIMING, STATUS):
             return
         message = STORE.deserialize_cdr(data, TOPICS[topic])
@@ -90,9 +89,8 @@ class _Collector:
         elif isinstance(message, DiagnosticArray) and topic == TIMING:
             self._durations = {name[:-2]: float(value) for name, value in _pairs(message.status[0])}
         elif isinstance(message, DiagnosticArray) and topic == READINGS:
-            told = message.status
             self._readings = tuple(
-                from_values(dict(_pairs(status)), verdict_of(status.message)) for status in told
+                from_values(dict(_pairs(status)), verdict_of(status.message)) for status in message.status
             )
         elif isinstance(message, DiagnosticArray):
             row = dict(_pairs(message.status[0]))

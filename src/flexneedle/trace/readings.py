@@ -1,17 +1,17 @@
-"""A judged reading of the tracker as text by key, exact, and back: one status of `/tracker/readings`."""
+"""Conversion of a checked reading to exact text by key and back: one status of `/tracker/readings`."""
 
 from collections.abc import Iterator, Mapping
 
 from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading, Verdict
 
-_PLACE, _TURN = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
+_POSITION, _ORIENTATION = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
 
 
-def to_values(judged: CheckedMeasurement) -> dict[str, str]:
-    """Return what the reading says of the tip, then of each sensor of its frame; what is not known is left out."""
-    sample, frame = judged.sample, judged.sample.frame
+def to_values(checked: CheckedMeasurement) -> dict[str, str]:
+    """Return the values of the tip, then of each sensor of the frame; missing values are omitted."""
+    sample, frame = checked.sample, checked.sample.frame
     values = {"time_s": repr(float(sample.time))}
-    values |= _numbers(_PLACE, (sample.x, sample.y, sample.z))
+    values |= _numbers(_POSITION, (sample.x, sample.y, sample.z))
     if frame is not None:
         values |= {"frame_time_s": repr(float(frame.time)), "frame_number": str(frame.number)}
         for name, reading in frame.readings.items():
@@ -20,8 +20,8 @@ def to_values(judged: CheckedMeasurement) -> dict[str, str]:
 
 
 def from_values(values: Mapping[str, str], verdict: Verdict) -> CheckedMeasurement:
-    """Return the reading of such a status; raises KeyError or ValueError where it is none."""
-    x, y, z = (_number(values, key) for key in _PLACE)
+    """Return the reading of such a status; raises KeyError or ValueError for other values."""
+    x, y, z = (_number(values, key) for key in _POSITION)
     return CheckedMeasurement(Measurement(float(values["time_s"]), x, y, z, _frame(values)), verdict)
 
 
@@ -34,8 +34,8 @@ def _frame(values: Mapping[str, str]) -> Frame | None:
 
 
 def _reading(values: Mapping[str, str], name: str) -> SensorReading:
-    x, y, z = (_number(values, f"{name}.{key}") for key in _PLACE)
-    w, i, j, k = (_number(values, f"{name}.{key}") for key in _TURN)
+    x, y, z = (_number(values, f"{name}.{key}") for key in _POSITION)
+    w, i, j, k = (_number(values, f"{name}.{key}") for key in _ORIENTATION)
     return SensorReading(
         None if x is None or y is None or z is None else (x, y, z),
         None if w is None or i is None or j is None or k is None else (w, i, j, k),
@@ -46,8 +46,8 @@ def _reading(values: Mapping[str, str], name: str) -> SensorReading:
 
 def _sensor(reading: SensorReading) -> Iterator[tuple[str, str]]:
     yield "status", reading.status
-    yield from _numbers(_PLACE, reading.position or ()).items()
-    yield from _numbers(_TURN, reading.orientation or ()).items()
+    yield from _numbers(_POSITION, reading.position or ()).items()
+    yield from _numbers(_ORIENTATION, reading.orientation or ()).items()
     yield from _numbers(("indicator",), (reading.indicator,)).items()
 
 

@@ -1,4 +1,4 @@
-"""What a plan and an insertion came to, as plain values: the objects of `--json` and of `run.json`."""
+"""Results of a plan and of an insertion as plain values: the objects of `--json` and of `run.json`."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ RESULT_KEYS = (
 """Keys of the result of an insertion, in order."""
 _OF_PERIODS = ("p50", "p99", "max")
 NO_TIMING = {"plan_seconds": None, "period_ms": dict.fromkeys(_OF_PERIODS)}
-"""Times of an insertion that was refused before it had a plan."""
+"""Times of an insertion that was rejected before planning."""
 
 
 def plan_result(plan: Plan) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def plan_timing(plan: Plan) -> dict[str, Any]:
 
 
 def insertion_result(insertion: Insertion) -> dict[str, Any]:
-    """Return the result of an insertion; what is not known is None."""
+    """Return the result of an insertion; missing values are None."""
     plan, last = insertion.plan, insertion.periods[-1] if insertion.periods else None
     result: dict[str, Any] = plain(
         {
@@ -73,7 +73,7 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
 
 
 def refused_result(*, target: tuple[float, float], reason: str, seed: int, **parts: str) -> dict[str, Any]:
-    """Return the result of an insertion that was refused before it had a plan: the keys of `insertion_result`.
+    """Return the result of an insertion that was rejected before planning: the keys of `insertion_result`.
 
     parts: names of controller and phantom; target in mm.
     """

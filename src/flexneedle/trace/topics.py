@@ -1,4 +1,4 @@
-"""Which topics a run has, with their types, and what a plan or a period says on each."""
+"""Topics of a run with their message types, and the messages of a plan and of a period."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -6,15 +6,15 @@ from math import isfinite
 
 from flexneedle.trace.columns import to_row
 from flexneedle.trace.messages import (
-    Judgement,
+    Check,
     Message,
     diagnostics,
     joints,
-    judgements,
     nanoseconds,
     number,
     path,
     pose,
+    statuses,
     vector,
 )
 from flexneedle.trace.readings import to_values
@@ -27,50 +27,50 @@ _POSE, _PATH, _JOINTS = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path", "s
 _NUMBER, _STATUS = "std_msgs/msg/Float64", "diagnostic_msgs/msg/DiagnosticArray"
 
 TOPICS: dict[str, str] = {
-    PLAN: _PATH,  # planned poses of the tip; once, at the start
-    SHAPE: _PATH,  # nodes of the needle as estimated
-    "/tip/measured": _POSE,  # the tracker's reading, at the time that it was taken; it sees no angle
+    PLAN: _PATH,  # planned poses of the tip, once at the start
+    SHAPE: _PATH,  # estimated nodes of the needle
+    "/tip/measured": _POSE,  # the tracker's reading at its time of measurement; without an angle
     "/tip/estimate": _POSE,
     "/tip/path": _POSE,  # planned pose at the estimated depth
-    "/tip/true": _POSE,  # of the virtual phantom; the controller never sees it
-    "/command": _JOINTS,  # what the period moves: increments; bevel +1 turns it over, −1 leaves it
-    "/command/applied": _JOINTS,  # the same as the actuators carried it out
-    "/joint_states": _JOINTS,  # where base and guide stand after it; bevel ±1 is its side
+    "/tip/true": _POSE,  # of the virtual phantom; not available to the controller
+    "/command": _JOINTS,  # increments of the period; bevel +1: half-turn, −1: none
+    "/command/applied": _JOINTS,  # the same as applied by the actuators
+    "/joint_states": _JOINTS,  # positions of base and guide after it; bevel ±1: its direction
     "/control/cost": _NUMBER,
     "/control/spread": _NUMBER,  # m
     "/control/tip_load": _NUMBER,  # N
     "/control/innovation": "geometry_msgs/msg/Vector3Stamped",  # m
     "/tissue/strain_energy": _NUMBER,  # J, of the estimate
     "/tissue/true_strain_energy": _NUMBER,  # J, of the virtual phantom
-    READINGS: _STATUS,  # a status for each reading of the period: what the tracker said, and whether it was believed
+    READINGS: _STATUS,  # a status for each reading of the period: the reported values and the verdict
     TIMING: _STATUS,  # wall-clock durations of the period, s
-    STATUS: _STATUS,  # every scalar of the period, exact, in the columns of the CSV; ends the period
+    STATUS: _STATUS,  # all scalars of the period, exact, in the columns of the CSV; last message of the period
 }
 """Message type by topic. Units are SI, poses are in the frame `skin`."""
 
 LATCHED = (PLAN,)
-"""Topics whose one message later subscribers want, too."""
+"""Topics with a single message that is also delivered to later subscribers."""
 
 
 @dataclass(frozen=True)
-class Spoken:
-    """One message on its topic, at a time (ns since the start of the run)."""
+class TopicMessage:
+    """A message with its topic and time (ns since the start of the run)."""
 
     topic: str
     time: int
     message: Message
 
 
-def plan_message(tips: Floats) -> Spoken:
-    """Return the planned poses of the tip (m + 1, 3) as said once at time 0."""
-    return Spoken(PLAN, 0, path(0.0, tips))
+def plan_message(tips: Floats) -> TopicMessage:
+    """Return the message of the planned tip poses (m + 1, 3) at time 0."""
+    return TopicMessage(PLAN, 0, path(0.0, tips))
 
 
-def period_messages(period: Period) -> Iterator[Spoken]:
-    """Yield what a period says; `/control/status` comes last and closes it."""
+def period_messages(period: Period) -> Iterator[TopicMessage]:
+    """Yield the messages of a period; `/control/status` is the last."""
     now = nanoseconds(period.time)
     for topic, message in (*_tip(period), *_control(period), *_tissue(period), *_status(period)):
-        yield Spoken(topic, now, message)
+        yield TopicMessage(topic, now, message)
 
 
 def _tip(period: Period) -> Iterator[tuple[str, Message]]:
@@ -101,8 +101,8 @@ def _tissue(period: Period) -> Iterator[tuple[str, Message]]:
 
 
 def _status(period: Period) -> Iterator[tuple[str, Message]]:
-    told = [Judgement(str(one.verdict), one.verdict.ok, to_values(one)) for one in period.readings]
-    yield READINGS, judgements(period.time, "reading", told)
+    checks = [Check(str(one.verdict), one.verdict.ok, to_values(one)) for one in period.readings]
+    yield READINGS, statuses(period.time, "reading", checks)
     durations = {f"{name}_s": repr(float(seconds)) for name, seconds in period.durations.items()}
     yield TIMING, diagnostics(period.time, "timing", durations)
     good = period.verdict.ok

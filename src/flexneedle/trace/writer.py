@@ -1,7 +1,7 @@
-"""`trace.mcap`: a run as standard ROS 2 messages, whole up to the last period whatever happens.
+"""`trace.mcap`: a run as standard ROS 2 messages, complete up to the last period even if the process is killed.
 
-Each period is one chunk (uncompressed), written in one go when the period ends: a process that is killed
-leaves a file that ends at a record.
+Each period is one chunk (uncompressed), written at once when the period ends, so that the file ends with a complete
+record.
 """
 
 import json
@@ -14,11 +14,11 @@ from mcap.writer import CompressionType, Writer
 
 from flexneedle.trace.files import uninterrupted
 from flexneedle.trace.messages import STORE
-from flexneedle.trace.topics import LATCHED, TOPICS, Spoken, period_messages, plan_message
+from flexneedle.trace.topics import LATCHED, TOPICS, TopicMessage, period_messages, plan_message
 from flexneedle.types import Period, Plan
 
-# A period takes about 10 kB; a chunk or a buffer that fills up inside one would tear it.
-_ROOM = 1 << 24
+# A period has about 10 kB; a chunk or buffer that fills up within a period would split it.
+_CHUNK_SIZE = 1 << 24
 _LATCHED_QOS = """\
 - history: 3
   depth: 1
@@ -33,31 +33,31 @@ _LATCHED_QOS = """\
 
 
 class TraceWriter:
-    """Writes a run to a new file. Use it as a context, or call `close`.
+    """Writes a run to a new file. Use it as a context manager, or call `close`.
 
     about: metadata `flexneedle` of the file, such as seed and versions; scenario: nested values, attached as
-    `scenario.json`. Raises FileExistsError if the file is there already.
+    `scenario.json`. Raises FileExistsError if the file exists.
     """
 
     def __init__(
         self, path: Path, plan: Plan, *, about: Mapping[str, str], scenario: Mapping[str, Any]
     ) -> None:
-        self._file = path.open("xb", buffering=_ROOM)
-        self._writer = Writer(self._file, chunk_size=_ROOM, compression=CompressionType.NONE)
+        self._file = path.open("xb", buffering=_CHUNK_SIZE)
+        self._writer = Writer(self._file, chunk_size=_CHUNK_SIZE, compression=CompressionType.NONE)
         self._writer.start(profile="ros2", library="flexneedle")
         self._writer.add_metadata("flexneedle", dict(about))
         text = json.dumps(scenario, indent=1, ensure_ascii=False, allow_nan=False)
         self._writer.add_attachment(0, 0, "scenario.json", "application/json", text.encode())
         self._channels = self._register()
         self._count = 0
-        self._say([plan_message(plan.tips)])
+        self._write([plan_message(plan.tips)])
 
     def add(self, period: Period) -> None:
-        """Write a period through to the file."""
-        self._say(list(period_messages(period)))
+        """Write a period to the file."""
+        self._write(list(period_messages(period)))
 
     def close(self) -> None:
-        """Write the index and close the file; without it the file is readable, but has no index."""
+        """Write the index and close the file; without an index the file is readable as well."""
         if self._file.closed:
             return
         with uninterrupted():
@@ -72,17 +72,17 @@ class TraceWriter:
     ) -> None:
         self.close()
 
-    def _say(self, spoken: Iterable[Spoken]) -> None:
-        """Write messages as one chunk, and hand it to the operating system."""
+    def _write(self, messages: Iterable[TopicMessage]) -> None:
+        """Write messages as one chunk and flush it."""
         with uninterrupted():
-            for said in spoken:
-                data = bytes(STORE.serialize_cdr(said.message, TOPICS[said.topic]))
-                self._writer.add_message(self._channels[said.topic], said.time, data, said.time, self._count)
+            for one in messages:
+                data = bytes(STORE.serialize_cdr(one.message, TOPICS[one.topic]))
+                self._writer.add_message(self._channels[one.topic], one.time, data, one.time, self._count)
             self._writer.flush()  # type: ignore[no-untyped-call]
             self._count += 1
 
     def _register(self) -> dict[str, int]:
-        """Announce types and topics; return the channel of each topic."""
+        """Register types and topics; return the channel of each topic."""
         schemas = {kind: self._schema(kind) for kind in dict.fromkeys(TOPICS.values())}
         return {topic: self._channel(topic, schemas[kind]) for topic, kind in TOPICS.items()}
 
