@@ -263,18 +263,25 @@ def print_tables(runs: Runs) -> None:
     print("\n| | n | mean | median | 95 % | max |\n|---|---:|---:|---:|---:|---:|")
     print(row("time from the plate's start to the hold, s", [hold.after_begin for hold in holds]))
     print(row("time from 0.5 mm of distortion to the hold, s", [hold.after_distortion for hold in holds]))
-    print(row("true tip at the hold off the run without a plate, mm", [hold.moved for hold in holds]))
-    print(row("true tip at the hold off the believed one, mm", [hold.unknown for hold in holds]))
+    print(
+        row(
+            "distance of the true tip at the hold from the run without a plate, mm",
+            [hold.moved for hold in holds],
+        )
+    )
+    print(row("error of the estimated tip at the hold, mm", [hold.unknown for hold in holds]))
     print(row("the same at that time without a plate, mm", runs.unaware()))
     ends = [apart(one, other, math.inf) for one, other in zip(runs.free, runs.clean, strict=True)]
-    print(row("without the monitor, true tip at the end off that without a plate, mm", ends))
+    print(
+        row("without the monitor, distance of the true tip at the end from the run without a plate, mm", ends)
+    )
     near = sum(np.nanmax([hold.moved, hold.unknown]) <= LIMIT_MM for hold in holds)
     good = near + sum(off <= LIMIT_MM for off in free)
     print(
         f"\n{near / len(holds):.1%} of the holds: the true tip is then at most {LIMIT_MM:g} mm off by both measures. "
         f"{good / len(runs.kept):.1%} of all runs: that, or nothing is held and the reading never off by more."
     )
-    print("\n| threshold | held without a plate | references not placed | distorted, not held within 1 s |")
+    print("\n| limit | held without a plate | references not placed | distorted, not held within 1 s |")
     print("|---:|---:|---:|---:|")
     for limit, *shares in list(zip(THRESHOLDS, *curve(runs), strict=True))[::5]:
         print(f"| {limit:.3f} | " + " | ".join(f"{share:.1%}" for share in shares) + " |")
@@ -291,8 +298,8 @@ def draw_figure(runs: Runs, folder: Path) -> None:
         times.set_title("From the plate's start to the hold (s)")
         plain_ticks(times, [30, 50, 100, 200, 400])
         for values, name, color, line in (
-            ([hold.moved for hold in holds], "off the run without a plate", style.TRUE, "-"),
-            ([hold.unknown for hold in holds], "off the believed tip", style.ESTIMATE, "--"),
+            ([hold.moved for hold in holds], "from the run without a plate", style.TRUE, "-"),
+            ([hold.unknown for hold in holds], "error of the estimated tip", style.ESTIMATE, "--"),
         ):
             ordered = np.sort(values)
             errors.step(
@@ -308,7 +315,7 @@ def draw_figure(runs: Runs, folder: Path) -> None:
         choice.plot(THRESHOLDS, anywhere, color=style.ESTIMATE, ls=":", label="references not placed")
         choice.plot(THRESHOLDS, missed, color=style.TRUE, ls="--", label="distorted, not held")
         choice.axvline(load_scenario("phantom").monitor.indicator_limit, color=style.QUIET, lw=0.8)
-        choice.set(xscale="log", xlabel="threshold of the indicator", title="Share of runs", ylim=(0, 1.02))
+        choice.set(xscale="log", xlabel="limit of the indicator", title="Share of runs", ylim=(0, 1.02))
         plain_ticks(choice, [0.02, 0.05, 0.1, 0.2, 0.5, 1.0])
         choice.legend(loc="upper center", bbox_to_anchor=(0.45, -0.17))
         style.save(figure, folder, "monitor")
