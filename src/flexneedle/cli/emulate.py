@@ -62,7 +62,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _emulate_aurora(args: argparse.Namespace) -> int:
     from time import monotonic
 
-    from flexneedle.rig.devices.priority import come_first
+    from flexneedle.rig.devices.priority import set_realtime_priority
     from flexneedle.rig.emulator.aurora import FIRMWARE, fresh
     from flexneedle.rig.emulator.faults import parse_fault
     from flexneedle.rig.emulator.motion import CENTRE
@@ -70,10 +70,10 @@ def _emulate_aurora(args: argparse.Namespace) -> int:
     from flexneedle.rig.emulator.server import EmulatorSession, Serial, serve
 
     faults = [parse_fault(spec) for spec in args.fault]
-    device = fresh(args.sensors, args.firmware or FIRMWARE, knows_bx=not args.no_bx)
+    device = fresh(args.sensors, args.firmware or FIRMWARE, has_bx=not args.no_bx)
     with Serial(args.link) as serial:
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the link goes then, too
-        come_first()  # a real one does not wait for this machine's other work
+        set_realtime_priority()  # a real one does not wait for this machine's other work
         try:
             print(serial.link, flush=True)
             session = EmulatorSession(

@@ -18,10 +18,10 @@ from flexneedle.figures.style import save
 from flexneedle.rig.tracking.quaternion import from_matrix
 from flexneedle.rig.tracking.registration import (
     Rigid,
+    check_pairs,
     fiducial_error,
     fit_rigid,
     localisation_error,
-    refuse_nonsense,
     target_error,
 )
 from flexneedle.rig.tracking.table import REQUIRED
@@ -122,7 +122,7 @@ def register(pairs: Pairs, targets: Sequence[Point] = ()) -> Registered:
     Raises InputError for pairs that no rigid body can have.
     """
     rigid = fit_rigid(pairs.tracker, pairs.stage)
-    refuse_nonsense(pairs.tracker, pairs.stage)
+    check_pairs(pairs.tracker, pairs.stage)
     residuals = np.linalg.norm(rigid.apply(pairs.tracker) - pairs.stage, axis=1)
     fiducial = fiducial_error(rigid, pairs.tracker, pairs.stage)
     localisation = localisation_error(fiducial, len(pairs.names))

@@ -96,7 +96,7 @@ def _measured(environment: Environment, sensor: str, experiment: Experiment) -> 
     orientations = np.tile(_ALONG_X if is_tip else _UPRIGHT, (len(places), 1))
     still = noiseless(room, TIP if is_tip else REFERENCES[0], places, orientations)
     rng = np.random.default_rng([experiment.seed, int(is_tip), *environment.name.encode()])
-    readings = noisy(environment, Noiseless(still.coils[order], still.turns[order]), rng)
+    readings = noisy(environment, Noiseless(still.coils[order], still.orientations[order]), rng)
     missing = rng.random(len(order)) < environment.missing_fraction
     away = np.linalg.norm(places - np.array(environment.generator_mm), axis=-1)
     columns = {
@@ -113,7 +113,7 @@ def _measured(environment: Environment, sensor: str, experiment: Experiment) -> 
 def _reported(readings: SensorReadings, missing: NDArray[np.bool_], is_tip: bool) -> dict[str, pa.Array]:
     """What the tracker reports in each sample, null in missing ones."""
     # The roll of one coil is not known.
-    turns = along(z_axis(readings.turns)) if is_tip else readings.turns
+    turns = along(z_axis(readings.orientations)) if is_tip else readings.orientations
     nothing = np.zeros(len(missing))
     values = _named(("x_mm", "y_mm", "z_mm"), readings.positions) | _named(("qw", "qx", "qy", "qz"), turns)
     columns = {name: pa.array(column, mask=missing) for name, column in values.items()}

@@ -41,20 +41,20 @@ def test_the_emulator_replaces_no_file(capsys, tmp_path):
     (tmp_path / "mine").write_text("mine")
     status, _, err = run(capsys, "emulate", "aurora", "--link", str(tmp_path / "mine"))
     assert (status, (tmp_path / "mine").read_text()) == (2, "mine")
-    assert "is there already: name another, or take it away" in err
+    assert "already exists: choose another path, or remove it" in err
 
 
 def test_the_emulator_takes_no_link_but_one_that_a_killed_emulator_left(tmp_path):
     target, link = tmp_path / "kept.txt", tmp_path / "dev"
     target.write_text("mine")
     link.symlink_to(target)
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="already exists"):
         Serial(link)
     assert link.readlink() == target
     link.unlink()
     link.symlink_to("/dev/pts/999999")
     with Serial(link) as serial:
-        with pytest.raises(InputError, match="is there already"):
+        with pytest.raises(InputError, match="already exists"):
             Serial(link)
         assert serial.link.exists()
     assert not link.is_symlink()

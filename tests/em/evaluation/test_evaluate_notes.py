@@ -70,7 +70,7 @@ def test_the_frame_is_told_from_five_times_the_residual_on(tmp_path, times, said
     ("change", "says"),
     [
         (lambda p: p * (1, 1, -1), "a mirrored frame fits far better"),
-        (lambda p: p[:, [0, 2, 1]] * (1, 1, 2.0), "the fit leaves"),
+        (lambda p: p[:, [0, 2, 1]] * (1, 1, 2.0), "the fit has a residual of"),
     ],
 )
 def test_a_rigid_fit_that_does_not_fit_is_told(tmp_path, change, says):

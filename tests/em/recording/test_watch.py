@@ -6,7 +6,7 @@ from flexneedle.em.recording.watch import field_judge, judge_field, watch
 from flexneedle.errors import InputError
 from flexneedle.rig.devices.recording import read_frames
 from flexneedle.rig.devices.replay import ENDED, Replay
-from flexneedle.rig.monitor.watch import Watch
+from flexneedle.rig.monitor.monitor import Monitor
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading
 
@@ -141,14 +141,14 @@ def test_a_field_that_was_distorted_stays_so_as_long_as_a_held_insertion_waits()
     script = [(level, VISIBLE) for level in levels] + [(level, "missing") for level in levels[1:3]]
     script += [(0.052, VISIBLE)]
     seen = [f for k, one in enumerate(script) for f in stretch(1.5 * k, 1.5, **told(*one))]
-    clock, views, monitor = Clock(), [], Watch(MonitorSettings())
+    clock, views, monitor = Clock(), [], Monitor(MonitorSettings())
     watch(Replay(seen, clock), clock, views.append)
     assert len(views) == len(seen)
     for frame, view in zip(seen, views, strict=True):
-        monitor, _ = monitor.take(
+        monitor, _ = monitor.check(
             Measurement(frame.time, 0.0, 0.0, 0.0, frame), lambda _: (0.0, 0.0), frame.time, 1.0, 1000.0
         )
-        monitor, held = monitor.look()
+        monitor, held = monitor.check_field()
         unseen = frame.readings["tip"].status != VISIBLE
         assert view.verdict == ("tip: missing" if unseen else str(held)), frame.number
     last = [views[60 * (k + 1) - 1].verdict for k in range(len(script))]

@@ -11,7 +11,7 @@ from pathlib import Path
 from flexneedle.errors import InputError
 from flexneedle.rig.devices.recording import COLUMNS, rows_of
 from flexneedle.rig.devices.replay import ENDED
-from flexneedle.rig.monitor.watch import field_verdict, is_distorted
+from flexneedle.rig.monitor.monitor import field_verdict, is_distorted
 from flexneedle.rig.ports import Clock, Tracker
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import VISIBLE, Frame, is_reference
