@@ -1,4 +1,4 @@
-"""Insertions for tests: phantoms behind trackers that are changed and taped, and tapes without a phantom."""
+"""Insertions for tests: phantoms with modified and recorded trackers, and replays without a phantom."""
 
 import dataclasses
 import itertools
@@ -22,7 +22,7 @@ HELD, RESTING = "held", "waiting for the last reading"
 
 
 class Tank:
-    """A phantom whose driver calls are counted, behind a tracker whose batches are changed and taped."""
+    """A phantom with recorded driver calls, and a tracker with modified and recorded batches."""
 
     status = VISIBLE
 
@@ -31,14 +31,14 @@ class Tank:
         self.spoil, self.tape, self.moves, self.applied = spoil, [], [], []
         noise = np.random.default_rng(seed + 1)
         jitter = scenario.tracker.jitter_per_axis
-        self.eye = NoisyTracker(
+        self.tracker = NoisyTracker(
             self.phantom.tip_at, self.phantom, scenario.tracker.period, jitter, noise, delay=delay
         )
 
     def read(self):
         if self.phantom.now() == 0.0:
-            return self.eye.read()  # it looks before the needle moves
-        self.tape.append(self.spoil(self.eye.read()))
+            return self.tracker.read()  # the first reading, before the first motion
+        self.tape.append(self.spoil(self.tracker.read()))
         return self.tape[-1]
 
     def apply(self, command, duration):
@@ -51,7 +51,7 @@ class Tank:
 
 
 class Stage:
-    """No phantom: a clock that adds up, a driver and a tracker that play tapes; off tape commands are carried out."""
+    """No phantom: a clock, and a driver and a tracker that replay recordings; then commands are applied exactly."""
 
     status = VISIBLE
 
@@ -81,47 +81,47 @@ def run(plan, rig, scenario=PHANTOM, seed=5, **options):
 
 
 def of_any_scenario(plan):
-    """The plan without the scenario that it was made for: it is carried out in any."""
+    """The plan without its scenario, so that it is valid for any."""
     return replace(plan, scenario=None)
 
 
 class Enough(Exception):
-    """No need to carry out the rest."""
+    """The remaining periods are not needed."""
 
 
 def first_periods(count, plan, rig, scenario=PHANTOM, **options):
-    """The first periods of an insertion that is then broken off."""
-    seen = []
+    """The first periods of an insertion, which is then interrupted."""
+    periods = []
 
     def watch(period):
-        seen.append(period)
-        if len(seen) == count:
+        periods.append(period)
+        if len(periods) == count:
             raise Enough
 
     with pytest.raises(Enough):
         run(plan, rig, scenario, on_period=watch, **options)
-    return seen
+    return periods
 
 
 def facts(period):
-    """All of a period but its wall-clock durations, as values that compare."""
+    """All values of a period except wall-clock durations, in comparable form."""
     names = [field.name for field in dataclasses.fields(period) if field.name != "durations"]
     values = {name: getattr(period, name) for name in names}
     return {k: repr(v) if not isinstance(v, np.ndarray) else v.tobytes() for k, v in values.items()}
 
 
 def acted(period):
-    """All of a period but the readings that it was made of."""
+    """All values of a period except its readings."""
     return {name: value for name, value in facts(period).items() if name != "readings"}
 
 
-def believed(period):
-    """What the controller did and believed, without the truth."""
+def commanded_and_estimated(period):
+    """Commands and estimates of a period, without the true state."""
     return {name: value for name, value in facts(period).items() if not name.startswith("true_")}
 
 
 def moving(done):
-    """The periods in which the driver was asked to move: not those of a rest or a hold."""
+    """The periods with a motion: without rests and holds."""
     return [period for period in done.periods if period.command != STILL]
 
 
@@ -134,7 +134,7 @@ def blind(sample):
 
 
 def spoilt_tape(tape, which, fault):
-    """One reading of every batch with several is spoilt or left out."""
+    """The tape with one reading of every batch modified or removed."""
     changed = []
     for batch in tape:
         readings = list(batch)
@@ -146,7 +146,7 @@ def spoilt_tape(tape, which, fault):
 
 
 def loop(tape):
-    """The tape, and its last batch as often as asked for."""
+    """The tape, then its last batch repeatedly."""
     yield from tape
     while True:
         yield tape[-1]

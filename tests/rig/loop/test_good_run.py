@@ -25,7 +25,7 @@ from insertions import (
     STILL,
     Stage,
     Tank,
-    believed,
+    commanded_and_estimated,
     facts,
     loop,
     moving,
@@ -154,18 +154,18 @@ def test_phantom_tracker_and_search_have_independent_random_streams(plan, monkey
 
 
 def test_on_period_gets_each_period_as_it_ends(plan):
-    seen = []
+    periods = []
     tank = Tank(plan.bevel)
     part = replace(plan, target=(-20.0, 0.0))
 
     def watch(period):
-        seen.append(period)
-        moved = [one for one in seen if one.command != STILL]
+        periods.append(period)
+        moved = [one for one in periods if one.command != STILL]
         assert len(tank.moves) == len(moved)  # before the next one moves
 
     done = run(part, tank.rig(), on_period=watch, force=True)
-    assert done.periods == tuple(seen)
-    assert len(seen) > 5
+    assert done.periods == tuple(periods)
+    assert len(periods) > 5
 
 
 # ---- no other access to the phantom
@@ -173,14 +173,18 @@ def test_on_period_gets_each_period_as_it_ends(plan):
 
 def test_replayed_readings_without_any_phantom_give_the_same_commands(real, replayed):
     """The controller has access only to the readings and the applied commands: these give the same record."""
-    assert list(map(believed, replayed.periods)) == list(map(believed, real[0].periods))
+    assert list(map(commanded_and_estimated, replayed.periods)) == list(
+        map(commanded_and_estimated, real[0].periods)
+    )
     assert replayed.outcome == "done"
 
 
 def test_replayed_delayed_readings_give_the_same_commands(plan, late):
     done, tank = late
     replayed = run(plan, Stage(tank.tape, tank.applied).rig())
-    assert list(map(believed, replayed.periods)) == list(map(believed, done.periods))
+    assert list(map(commanded_and_estimated, replayed.periods)) == list(
+        map(commanded_and_estimated, done.periods)
+    )
     assert replayed.outcome == "done"
 
 
@@ -188,7 +192,9 @@ def test_replayed_readings_with_another_phantom_give_the_same_commands(plan, rea
     done, tank = real
     other, stage = Tank(plan.bevel, seed=2777), Stage(tank.tape)
     swapped = run(plan, Rig(other.phantom, other, stage, other.phantom.condition))
-    assert list(map(believed, swapped.periods)) == list(map(believed, done.periods))
+    assert list(map(commanded_and_estimated, swapped.periods)) == list(
+        map(commanded_and_estimated, done.periods)
+    )
     assert swapped.periods[-1].true_tip != done.periods[-1].true_tip
 
 

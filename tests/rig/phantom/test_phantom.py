@@ -88,10 +88,10 @@ def test_a_command_is_executed_in_finer_steps(kind):
 )
 def test_parts_are_no_longer_than_the_step_of_the_phantom(advance, parts):
     phantom = driven(tank(), STRAIGHT)
-    seen, step = [], phantom._plant.step
-    phantom._plant.step = lambda row: seen.append(row[0]) or step(row)
+    advances, step = [], phantom._plant.step
+    phantom._plant.step = lambda row: advances.append(row[0]) or step(row)
     driven(phantom, (advance, 0.0, 0.0, 0.0, -1))
-    np.testing.assert_allclose(seen, [advance / parts] * parts)
+    np.testing.assert_allclose(advances, [advance / parts] * parts)
 
 
 @both_plants
@@ -482,9 +482,9 @@ def test_without_imperfections_both_plants_agree(swung):
 @both_plants
 def test_the_recorded_stretch_is_the_smallest_since_the_start(swung, kind):
     """Also after the tissue relaxes."""
-    told = [condition.least_stretch for condition in swung[kind]]
-    assert all(np.diff(told) <= 0.0)
-    assert told[0] == 1.0
+    stretches = [condition.least_stretch for condition in swung[kind]]
+    assert all(np.diff(stretches) <= 0.0)
+    assert stretches[0] == 1.0
     phantom = driven(tank(kind=kind), AHEAD, times=45)
     compressed = phantom.condition().least_stretch
     driven(phantom, (-1.0, 0.0, 0.0, -0.1, -1), times=44)

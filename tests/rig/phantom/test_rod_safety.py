@@ -56,8 +56,12 @@ def wander(scenario, seed, periods):
     inner.step = counted
     for _ in range(periods):
         ahead = rng.uniform(0.0, 1.0) * (1.0 if rng.random() < forward else -1.0)
-        aside, turn, guide = rng.uniform(-0.2, 0.2), rng.uniform(-2e-3, 2e-3), drift + rng.normal(0.0, 0.2)
-        row = within(phantom, np.array([ahead, aside, turn, guide]))
+        lateral, rotation, guide = (
+            rng.uniform(-0.2, 0.2),
+            rng.uniform(-2e-3, 2e-3),
+            drift + rng.normal(0.0, 0.2),
+        )
+        row = within(phantom, np.array([ahead, lateral, rotation, guide]))
         phantom.apply((*row.tolist(), 1 if rng.random() < 0.1 else -1), 0.2)
     assert phantom.condition().converged == (lost == 0)
     return steps, lost

@@ -287,10 +287,10 @@ def test_mirrored_commands_give_the_mirrored_needle(seed):
     other = plant(rough, bevel=-1, base_y=-0.4, base_turn=-0.003, bend=0.5)
     for _ in range(240):
         ahead = rng.choice([0.25, 0.25, 0.25, 0.1, -0.25])
-        aside, turn, guide = rng.normal(0.0, [0.02, 2e-4, 0.05])
+        lateral, rotation, guide = rng.normal(0.0, [0.02, 2e-4, 0.05])
         flip = rng.choice([1.0, -1.0], p=[0.05, 0.95])
-        one.step(np.array([ahead, aside, turn, guide, flip]))
-        other.step(np.array([ahead, -aside, -turn, -guide, flip]))
+        one.step(np.array([ahead, lateral, rotation, guide, flip]))
+        other.step(np.array([ahead, -lateral, -rotation, -guide, flip]))
     assert one.converged
     assert one.tip[0] > 10.0
     assert abs(one.tip[1]) > 0.1

@@ -152,7 +152,7 @@ def test_each_reading_is_returned_once_and_in_order(waits, delay):
 
 
 def test_the_rigs_delay_is_a_control_period_at_full_step_and_speed():
-    """As the scenario says: 1 mm at 5 mm/s; what is read after a command is the end of the command before."""
+    """1 mm at 5 mm/s: the reading after a command is that of the end of the previous command."""
     for periods in (0.0, 1.0, 2.0):
         scenario = load_scenario("phantom").with_values(
             {"phantom.delay_periods": periods, "phantom.missing_fraction": 0.0, "tracker.jitter_mm": 0.0}
@@ -163,8 +163,8 @@ def test_the_rigs_delay_is_a_control_period_at_full_step_and_speed():
             rig.driver.apply((1.0, 0.0, 0.0, 0.2, -1), 0.2)
             tips.append(rig.truth().tip[:2])
             last = rig.tracker.read()[-1]
-            seen = max(0, len(tips) - 1 - int(periods))
-            np.testing.assert_allclose((last.x, last.y), tips[seen], atol=1e-9)
+            index = max(0, len(tips) - 1 - int(periods))
+            np.testing.assert_allclose((last.x, last.y), tips[index], atol=1e-9)
             assert last.time == pytest.approx(rig.clock.now() - 0.2 * periods)
 
 

@@ -133,11 +133,13 @@ def test_the_map_to_the_trackers_frame_turns_places_and_axes():
         frames(5, room, poses), frames(5, room, poses, to_tracker=TO_TRACKER), strict=True
     ):
         for name, reading in here.readings.items():
-            told = there.readings[name]
-            np.testing.assert_allclose(told.position, TO_TRACKER.apply(np.array(reading.position)))
-            axes = Rotation.from_quat([reading.orientation, told.orientation], scalar_first=True).as_matrix()
+            mapped = there.readings[name]
+            np.testing.assert_allclose(mapped.position, TO_TRACKER.apply(np.array(reading.position)))
+            axes = Rotation.from_quat(
+                [reading.orientation, mapped.orientation], scalar_first=True
+            ).as_matrix()
             np.testing.assert_allclose(axes[1, :, 2], TO_TRACKER.rotation @ axes[0, :, 2], atol=1e-12)
-            assert told.indicator == reading.indicator
+            assert mapped.indicator == reading.indicator
             if name != "tip":
                 np.testing.assert_allclose(axes[1], TO_TRACKER.rotation @ axes[0], atol=1e-12)
 
