@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from flexneedle.em.figures.distance import DistanceLine, distance_figure
 from flexneedle.em.figures.field import FieldRow, field_figure
-from flexneedle.em.figures.indicator import IndicatorPanel, Shown, indicator_figure
+from flexneedle.em.figures.indicator import IndicatorPanel, PlottedPoints, indicator_figure
 from flexneedle.em.figures.roc import RocLine, roc_figure
 
 GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -86,8 +86,10 @@ def test_more_sensors_than_there_is_room_for_are_counted():
 
 
 def panel(**changes):
-    ideal = Shown("ideal", np.linspace(0.01, 0.06, 20), np.full(20, 0.5), "0.500 ± 0.100 mm")
-    noisy = Shown("noisy", np.linspace(0.1, 0.5, 40), np.linspace(1.0, 5.0, 40), "10.000 I + 0.000 mm")
+    ideal = PlottedPoints("ideal", np.linspace(0.01, 0.06, 20), np.full(20, 0.5), "0.500 ± 0.100 mm")
+    noisy = PlottedPoints(
+        "noisy", np.linspace(0.1, 0.5, 40), np.linspace(1.0, 5.0, 40), "10.000 I + 0.000 mm"
+    )
     values = {
         "ideal": ideal,
         "noisy": noisy,
@@ -112,7 +114,7 @@ def test_all_indicators_are_shown():
 
 def test_a_few_indicators_far_out_are_counted_instead():
     indicator, error = np.append(np.linspace(0.1, 0.5, 40), 6.0), np.append(np.full(40, 2.0), 90.0)
-    figure = indicator_figure([panel(noisy=Shown("noisy", indicator, error, "a line"))])
+    figure = indicator_figure([panel(noisy=PlottedPoints("noisy", indicator, error, "a line"))])
     assert [len(one) for one in shown_points(figure)] == [20, 40]
     assert "(1 point beyond, up to I = 6, not shown)" in words(figure)
     (ax,) = figure.axes

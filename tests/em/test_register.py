@@ -41,7 +41,7 @@ def test_exact_pairs_give_the_map_and_no_error(tmp_path):
     found = register(read_pairs(table(tmp_path, rows(repeats=3))))
     np.testing.assert_allclose(found.rigid.rotation, TRUE.rotation, atol=1e-12)
     np.testing.assert_allclose(found.rigid.translation, TRUE.translation, atol=1e-9)
-    assert found.fiducial < 1e-9
+    assert found.fre < 1e-9
     assert found.pairs.samples.tolist() == [3] * 8
     again = to_stage(found.registration)
     np.testing.assert_allclose(again.apply(STAGE), TRUE.apply(STAGE), atol=1e-9)
@@ -50,8 +50,8 @@ def test_exact_pairs_give_the_map_and_no_error(tmp_path):
 def test_errors_are_told_as_planted(tmp_path):
     """The RMS localisation error of fifty registrations is the planted one; leaving one out shows more than the fit."""
     found = [register(read_pairs(table(tmp_path, rows(0.3, seed=seed)))) for seed in range(50)]
-    assert np.sqrt(np.mean([one.localisation**2 for one in found])) == pytest.approx(0.3, rel=0.1)
-    assert all(np.all(one.left_out >= one.residuals) for one in found)
+    assert np.sqrt(np.mean([one.fle**2 for one in found])) == pytest.approx(0.3, rel=0.1)
+    assert all(np.all(one.leave_one_out >= one.residuals) for one in found)
 
 
 def test_rows_of_a_point_are_averaged_and_unseen_ones_left_out(tmp_path):
@@ -62,7 +62,7 @@ def test_rows_of_a_point_are_averaged_and_unseen_ones_left_out(tmp_path):
         for k, row in enumerate(data)
     ]
     found = register(read_pairs(table(tmp_path, data)))
-    assert found.fiducial < 1e-9
+    assert found.fre < 1e-9
     assert found.pairs.missing == 3
 
 
@@ -80,7 +80,7 @@ def test_what_other_sensors_and_unseen_rows_hold_is_of_no_concern(tmp_path):
 def test_metres_are_read_where_that_is_said(tmp_path):
     data = [(row[0], *(1e-3 * value for value in row[1:7]), row[7]) for row in rows(0.3)]
     told = register(read_pairs(table(tmp_path, data), unit="m"))
-    np.testing.assert_allclose(told.fiducial, register(read_pairs(table(tmp_path, rows(0.3)))).fiducial)
+    np.testing.assert_allclose(told.fre, register(read_pairs(table(tmp_path, rows(0.3)))).fre)
 
 
 def test_a_target_that_is_no_place_is_refused_and_nothing_is_written(tmp_path, capsys):
@@ -161,8 +161,8 @@ def test_the_command_writes_a_table_for_scenarios_a_picture_and_tells_the_errors
     assert main([*command, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     found = register(read_pairs(data, sensor="ref1"), [(40.0, 5.0, 0.0)])
-    assert told["fre_mm"] == found.fiducial
-    assert told["tre"] == [{"target_mm": [40.0, 5.0, 0.0], "tre_mm": found.target[0]}]
+    assert told["fre_mm"] == found.fre
+    assert told["tre"] == [{"target_mm": [40.0, 5.0, 0.0], "tre_mm": found.tre[0]}]
     assert {path.name for path in tmp_path.glob("rig.*")} == {"rig.toml", "rig.png", "rig.svg"}
     assert tomllib.loads(out.read_text())["result"]["points"] == 8
     scenario = load_registration(out, PHANTOM)
@@ -234,5 +234,5 @@ def test_an_insertion_has_the_error_of_its_registration(tmp_path, environment):
             for seed in range(60)
         ]
     )
-    expected = found.target[0] * np.sqrt(2.0 / 3.0)  # two of three coordinates, about alike
+    expected = found.tre[0] * np.sqrt(2.0 / 3.0)  # two of three coordinates, about alike
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) == pytest.approx(expected, rel=0.35)

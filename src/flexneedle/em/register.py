@@ -1,4 +1,4 @@
-"""`flexneedle em register`: the rigid map from the tracker's frame to the stage's, from pairs of points."""
+"""`flexneedle em register`: the rigid transform from the tracker's frame to the stage's, from pairs of points."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flexneedle.em.figures.registration import registration_figure
 from flexneedle.em.table.columns import column_map
-from flexneedle.em.table.rules import POSITIONS, SAME_MM, TRUE_POSITIONS, refuse_broken
+from flexneedle.em.table.rules import POSITIONS, SAME_POSITION_MM, TRUE_POSITIONS, refuse_violations
 from flexneedle.em.table.source import LABELS, Table, open_table
 from flexneedle.errors import InputError
 from flexneedle.figures.style import save
@@ -32,16 +32,16 @@ Point = tuple[float, float, float]
 
 _NUMBERS = REQUIRED[1:7]
 _HEAD = """\
-# The tracker's frame in the stage's, by flexneedle em register. Paste the first table into a scenario, or give this
-# file to flexneedle insert --registration.
+# Registration of the tracker's frame to the stage's, by flexneedle em register. Paste the first table into a scenario,
+# or pass this file to flexneedle insert --registration.
 """
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
-    """n fiducials: names; their positions in the frames of the stage, (n, 3), and of the tracker, (n, 3), mm.
+class PointPairs:
+    """n fiducials: names, and positions (n, 3) in the frames of stage and tracker (mm).
 
-    samples (n,): of how many readings a position is the mean; missing: readings without a position, left out.
+    samples (n,): number of averaged readings; missing: number of readings without a position, which are ignored.
     """
 
     names: tuple[str, ...]
@@ -52,30 +52,29 @@ class Pairs:
 
 
 @dataclass(frozen=True, eq=False)
-class Registered:
+class RegistrationResult:
     """A registration and its errors (mm).
 
-    residuals (n,): of each fiducial; left_out (n,): of each by a registration from all others; fiducial: RMS
-    residual (FRE); localisation: RMS error of a fiducial estimated from it (FLE); targets (k, 3) with the
-    expected RMS error there (TRE), target (k,).
+    residuals (n,): of each fiducial; leave_one_out (n,): of each fiducial with a registration from all others; fre: RMS
+    residual; fle: estimated RMS localisation error of a fiducial; tre (k,): expected RMS error at the targets (k, 3).
     """
 
-    pairs: Pairs
+    pairs: PointPairs
     rigid: Rigid
     residuals: Floats
-    left_out: Floats
-    fiducial: float
-    localisation: float
+    leave_one_out: Floats
+    fre: float
+    fle: float
     targets: Floats
-    target: Floats
+    tre: Floats
 
     @property
     def registration(self) -> Registration:
-        """What a scenario takes."""
+        """The registration as scenario settings."""
         return Registration(
             rotation=tuple(from_matrix(self.rigid.rotation).tolist()),
             translation_mm=tuple(self.rigid.translation.tolist()),
-            localisation_mm=self.localisation,
+            localisation_mm=self.fle,
             fiducials_mm=tuple(map(tuple, self.pairs.stage.tolist())),
         )
 
@@ -88,14 +87,14 @@ class Registered:
             "missing": self.pairs.missing,
             "rotation": from_matrix(self.rigid.rotation).tolist(),
             "translation_mm": self.rigid.translation.tolist(),
-            "fre_mm": self.fiducial,
-            "fle_mm": self.localisation,
+            "fre_mm": self.fre,
+            "fle_mm": self.fle,
             "max_residual_mm": float(self.residuals.max()),
             "worst_point": names[int(self.residuals.argmax())],
-            "left_out_rms_mm": float(np.sqrt(np.mean(self.left_out**2))),
+            "left_out_rms_mm": float(np.sqrt(np.mean(self.leave_one_out**2))),
             "tre": [
-                {"target_mm": place, "tre_mm": error}
-                for place, error in zip(self.targets.tolist(), self.target.tolist(), strict=True)
+                {"target_mm": target, "tre_mm": error}
+                for target, error in zip(self.targets.tolist(), self.tre.tolist(), strict=True)
             ],
         }
 
@@ -106,40 +105,40 @@ def read_pairs(
     sensor: str | None = None,
     environment: str | None = None,
     unit: str = "mm",
-) -> Pairs:
-    """Return the fiducials of a table: each row one, or rows of one `point_id` taken together.
+) -> PointPairs:
+    """Return the fiducials of a table: the mean of the rows of each `point_id`, or each row without such a column.
 
-    columns: as for `em evaluate`; sensor, environment: which, where the table has several; unit: "mm" or "m", of all
+    columns: as for `em evaluate`; sensor, environment: required if the table has several; unit: "mm" or "m", of all
     coordinates. Raises InputError.
     """
     with open_table(data, column_map(columns), _NUMBERS, LABELS, unit=unit) as table:
         return _pairs(table, {"sensor": sensor, "environment": environment})
 
 
-def register(pairs: Pairs, targets: Sequence[Point] = ()) -> Registered:
-    """Return the registration of the pairs; without targets with its expected error at the middle of the fiducials.
+def register(pairs: PointPairs, targets: Sequence[Point] = ()) -> RegistrationResult:
+    """Return the registration of the pairs and its expected error at targets (default: centroid of the fiducials).
 
-    Raises InputError for pairs that no rigid body can have.
+    Raises InputError for pairs that no rigid transform can map.
     """
     rigid = fit_rigid(pairs.tracker, pairs.stage)
     check_pairs(pairs.tracker, pairs.stage)
     residuals = np.linalg.norm(rigid.apply(pairs.tracker) - pairs.stage, axis=1)
-    fiducial = fiducial_error(rigid, pairs.tracker, pairs.stage)
-    localisation = localisation_error(fiducial, len(pairs.names))
-    places = np.array(targets, dtype=float) if targets else pairs.stage.mean(axis=0, keepdims=True)
-    expected = target_error(pairs.stage, localisation, places)
-    return Registered(pairs, rigid, residuals, _left_out(pairs), fiducial, localisation, places, expected)
+    fre = fiducial_error(rigid, pairs.tracker, pairs.stage)
+    fle = localisation_error(fre, len(pairs.names))
+    points = np.array(targets, dtype=float) if targets else pairs.stage.mean(axis=0, keepdims=True)
+    tre = target_error(pairs.stage, fle, points)
+    return RegistrationResult(pairs, rigid, residuals, _leave_one_out(pairs), fre, fle, points, tre)
 
 
-def write_registration(registered: Registered, path: Path) -> None:
-    """Write a TOML file, a table for a scenario and the errors, and its picture beside it, `.png` and `.svg`.
+def write_registration(registered: RegistrationResult, path: Path) -> None:
+    """Write a TOML file with a table for a scenario and the errors, and its figure as `.png` and `.svg`.
 
     Raises InputError if the file exists.
     """
     if path.exists():
-        raise InputError(f"{path}: exists: name another file with --out")
+        raise InputError(f"{path}: already exists: choose another file with --out")
     if not path.parent.is_dir():
-        raise InputError(f"{path}: no such folder: {path.parent}")
+        raise InputError(f"{path}: the folder {path.parent} does not exist")
     _draw(registered, path)
     values = {
         "tracker": {"registration": registered.registration.model_dump(mode="json")},
@@ -149,18 +148,18 @@ def write_registration(registered: Registered, path: Path) -> None:
         with path.open("x", encoding="utf-8") as file:
             file.write(_HEAD + tomli_w.dumps(values))
     except FileExistsError:
-        raise InputError(f"{path}: exists: name another file with --out") from None
+        raise InputError(f"{path}: already exists: choose another file with --out") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def _draw(registered: Registered, path: Path) -> None:
-    stage, error = registered.pairs.stage, registered.localisation
+def _draw(registered: RegistrationResult, path: Path) -> None:
+    stage, fle = registered.pairs.stage, registered.fle
     figure = registration_figure(
         stage,
         registered.rigid.apply(registered.pairs.tracker),
         registered.targets,
-        lambda points: target_error(stage, error, points),
+        lambda points: target_error(stage, fle, points),
     )
     save(figure, path.parent, path.stem)
 
@@ -179,38 +178,43 @@ _POINTS = """
 """
 
 
-def _pairs(table: Table, wanted: Mapping[str, str | None]) -> Pairs:
-    own = {name: value for name, value in wanted.items() if value is not None}
-    for name, value in wanted.items():
+def _pairs(table: Table, labels: Mapping[str, str | None]) -> PointPairs:
+    given = {name: value for name, value in labels.items() if value is not None}
+    for name, value in labels.items():
         _check_label(table, name, value)
-    chosen = " AND ".join(["true", *(f"{name} = ${name}" for name in own)])
-    refuse_broken(table, POSITIONS, chosen, **own)
-    refuse_broken(table, TRUE_POSITIONS, f"{chosen} AND x_mm IS NOT NULL", **own)
-    found = table.arrays(_POINTS.format(chosen=chosen), **own)
+    chosen = " AND ".join(["true", *(f"{name} = ${name}" for name in given)])
+    refuse_violations(table, POSITIONS, chosen, **given)
+    refuse_violations(table, TRUE_POSITIONS, f"{chosen} AND x_mm IS NOT NULL", **given)
+    found = table.arrays(_POINTS.format(chosen=chosen), **given)
     known = found["n"] > 0
     if not known.any():
         raise InputError("no reading has a position")
     points = {name: column[known] for name, column in found.items()}
-    if (moved := points["moved"] > SAME_MM).any():
+    if (moved := points["moved"] > SAME_POSITION_MM).any():
         name = points["name"][int(moved.argmax())]
-        raise InputError(f"point {name} has several positions on the stage: one point, one position")
+        raise InputError(
+            f"point {name} has several positions in the stage's frame: each position needs its own point_id"
+        )
     stage, tracker = (
         np.column_stack([points[f"{kind}{axis}"] for axis in "xyz"]).astype(float) for kind in ("true_", "")
     )
-    return Pairs(tuple(points["name"].tolist()), stage, tracker, points["n"], int(found["missing"].sum()))
+    return PointPairs(
+        tuple(points["name"].tolist()), stage, tracker, points["n"], int(found["missing"].sum())
+    )
 
 
-def _check_label(table: Table, name: str, wanted: str | None) -> None:
+def _check_label(table: Table, name: str, label: str | None) -> None:
     query = f"SELECT DISTINCT {name} AS label FROM samples WHERE {name} <> '' ORDER BY label"
-    there = table.arrays(query)["label"].tolist() if name in table.columns else []
-    if wanted is None and len(there) > 1:
-        raise InputError(f"holds several: choose one with --{name}: {', '.join(there)}")
-    if wanted is not None and wanted not in there:
-        raise InputError(f"--{name} {wanted}: there is {', '.join(there) or 'no such column'}")
+    present = table.arrays(query)["label"].tolist() if name in table.columns else []
+    if label is None and len(present) > 1:
+        raise InputError(f"has several values of {name}: choose one with --{name}: {', '.join(present)}")
+    if label is not None and label not in present:
+        choices = f"choose from {', '.join(present)}" if present else f"the table has no column {name}"
+        raise InputError(f"--{name} {label}: {choices}")
 
 
-def _left_out(pairs: Pairs) -> Floats:
-    """Distance of each fiducial by a registration from all others; NaN where those are too few or on a line."""
+def _leave_one_out(pairs: PointPairs) -> Floats:
+    """Residual of each fiducial (mm) with a registration from all others; NaN if those are too few or collinear."""
     errors = np.full(len(pairs.names), np.nan)
     for k in range(len(errors)):
         others = np.arange(len(errors)) != k

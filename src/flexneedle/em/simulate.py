@@ -1,4 +1,4 @@
-"""`flexneedle em simulate`: the paper's measurement of a tracker (section IV-B), in a simulated environment."""
+"""`flexneedle em simulate`: the paper's experiment with a tracker (section IV-B), in a simulated environment."""
 
 import io
 from collections.abc import Sequence
@@ -29,9 +29,9 @@ _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Experiment:
-    """A cube of points³ over the workspace, visited `repeats` times with `samples` a point each time.
+    """A cubic grid of points³ over the workspace, measured `repeats` times with `samples` per point.
 
-    seed: of the measurement; field_seed: which room, None for each environment's own.
+    seed: of the noise; field_seed: of the field errors, None for each environment's own.
     """
 
     seed: int = 0
@@ -42,15 +42,15 @@ class Experiment:
 
 
 def measure(environments: Sequence[Environment], experiment: Experiment) -> pa.Table:
-    """Return the table of both sensors in all environments: columns `COLUMNS`, in the order of the measurement.
+    """Return the table of both sensors in all environments, with the columns `COLUMNS`.
 
-    The tip's sensor points along x, the reference along z. An environment's rows depend on it and on the
-    experiment alone. Raises InputError if two environments have one name, or for more rows than `_MOST_SAMPLES`.
+    The tip sensor points along x, the reference along z. The rows of an environment depend only on it and on the
+    experiment. Raises InputError if two environments have the same name, or for more rows than `_MOST_SAMPLES`.
     """
     names = [environment.name for environment in environments]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"two environments have the name {twice}: a table needs different ones")
+    duplicate = next((name for name in names if names.count(name) > 1), None)
+    if duplicate is not None:
+        raise InputError(f"two environments have the name {duplicate}: names must differ")
     rows = 2 * len(names) * experiment.points**3 * experiment.samples * experiment.repeats
     if rows > _MOST_SAMPLES:
         raise InputError(f"{rows} samples: must be at most {_MOST_SAMPLES}")
@@ -62,7 +62,7 @@ def measure(environments: Sequence[Environment], experiment: Experiment) -> pa.T
 
 
 def write_measurements(table: pa.Table, path: Path) -> None:
-    """Write a table to a new file of one of the `SUFFIXES`, whole or not at all. Raises InputError; see `check_new`."""
+    """Write a table to a new file with one of the `SUFFIXES`, atomically. Raises InputError; see `check_new`."""
     check_new(path)
     sink = io.BytesIO()
     if path.suffix == ".csv":
@@ -76,49 +76,52 @@ def write_measurements(table: pa.Table, path: Path) -> None:
 
 
 def check_new(path: Path) -> None:
-    """Raise InputError for a file that is neither CSV nor Parquet by its name, exists, or has no folder."""
+    """Raise InputError if the suffix is neither CSV nor Parquet, the file exists, or its folder does not."""
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: must end in {' or '.join(SUFFIXES)}")
     if path.exists():
-        raise InputError(f"{path}: exists: name another file with --out")
+        raise InputError(f"{path}: already exists: choose another file with --out")
     if not path.parent.is_dir():
-        raise InputError(f"{path}: no folder {path.parent}")
+        raise InputError(f"{path}: the folder {path.parent} does not exist")
 
 
 def _measured(environment: Environment, sensor: str, experiment: Experiment) -> pa.Table:
-    """The rows of one sensor in one environment."""
-    chosen = environment.field_seed if experiment.field_seed is None else experiment.field_seed
-    room = Room(environment, chosen)
-    places = grid(environment.workspace_mm, experiment.points)
-    # Grid points in order, all samples of each, and the whole grid again in each repeat.
-    order = np.tile(np.repeat(np.arange(len(places)), experiment.samples), experiment.repeats)
+    """Return the rows of one sensor in one environment."""
+    seed = environment.field_seed if experiment.field_seed is None else experiment.field_seed
+    room = Room(environment, seed)
+    positions = grid(environment.workspace_mm, experiment.points)
+    # Each repeat visits the grid points in order and takes all samples of a point at once.
+    order = np.tile(np.repeat(np.arange(len(positions)), experiment.samples), experiment.repeats)
     is_tip = sensor == TIP
-    orientations = np.tile(_ALONG_X if is_tip else _UPRIGHT, (len(places), 1))
-    still = noiseless(room, TIP if is_tip else REFERENCES[0], places, orientations)
+    orientations = np.tile(_ALONG_X if is_tip else _UPRIGHT, (len(positions), 1))
+    exact = noiseless(room, TIP if is_tip else REFERENCES[0], positions, orientations)
     rng = np.random.default_rng([experiment.seed, int(is_tip), *environment.name.encode()])
-    readings = noisy(environment, Noiseless(still.coils[order], still.orientations[order]), rng)
+    readings = noisy(environment, Noiseless(exact.coils[order], exact.orientations[order]), rng)
     missing = rng.random(len(order)) < environment.missing_fraction
-    away = np.linalg.norm(places - np.array(environment.generator_mm), axis=-1)
+    distance = np.linalg.norm(positions - np.array(environment.generator_mm), axis=-1)
     columns = {
         "point_id": order,
-        **_named(("true_x_mm", "true_y_mm", "true_z_mm"), places[order]),
+        **_named(("true_x_mm", "true_y_mm", "true_z_mm"), positions[order]),
         **_reported(readings, missing, is_tip),
         "sensor": [sensor] * len(order),
         "environment": [environment.name] * len(order),
-        "distance_mm": away[order],
+        "distance_mm": distance[order],
     }
     return pa.table({name: pa.array(columns[name]) for name in COLUMNS}, _SCHEMA)
 
 
 def _reported(readings: SensorReadings, missing: NDArray[np.bool_], is_tip: bool) -> dict[str, pa.Array]:
-    """What the tracker reports in each sample, null in missing ones."""
-    # The roll of one coil is not known.
-    turns = along(z_axis(readings.orientations)) if is_tip else readings.orientations
-    nothing = np.zeros(len(missing))
-    values = _named(("x_mm", "y_mm", "z_mm"), readings.positions) | _named(("qw", "qx", "qy", "qz"), turns)
+    """Return the reported values of each sample, null for missing samples."""
+    # A single coil does not measure roll.
+    orientations = along(z_axis(readings.orientations)) if is_tip else readings.orientations
+    values = _named(("x_mm", "y_mm", "z_mm"), readings.positions) | _named(
+        ("qw", "qx", "qy", "qz"), orientations
+    )
     columns = {name: pa.array(column, mask=missing) for name, column in values.items()}
     if readings.indicators is None:
-        return columns | {"indicator": pa.array(nothing, mask=np.ones(len(missing), dtype=bool))}
+        return columns | {
+            "indicator": pa.array(np.zeros(len(missing)), mask=np.ones(len(missing), dtype=bool))
+        }
     return columns | {"indicator": pa.array(readings.indicators, mask=missing)}
 
 

@@ -5,14 +5,14 @@ import math
 import pytest
 
 from em_tables import rows_of, write_csv
-from flexneedle.em.evaluation.distance import Distances, Stretch
+from flexneedle.em.evaluation.distance import DistanceBin, DistanceErrors
 from flexneedle.em.evaluation.evaluate import Options, evaluate
 
 
 def bins(rmse):
     """Stretches of 50 mm from 600 mm on."""
     return tuple(
-        Stretch(600.0 + 50 * k, 650.0 + 50 * k, 625.0 + 50 * k, 9, 90, value, value, value, 0.1)
+        DistanceBin(600.0 + 50 * k, 650.0 + 50 * k, 625.0 + 50 * k, 9, 90, value, value, value, 0.1)
         for k, value in enumerate(rmse)
     )
 
@@ -28,11 +28,11 @@ def bins(rmse):
     ],
 )
 def test_the_nearest_bin_is_not_where_a_limit_begins(smallest, exceeded, told):
-    assert Distances(50.0, 0.5, smallest, exceeded, bins([0.4] * 4)).kept == told
+    assert DistanceErrors(50.0, 0.5, smallest, exceeded, bins([0.4] * 4)).limit_met == told
 
 
 def test_without_a_limit_none_is_kept():
-    assert Distances(50.0, None, None, (), bins([0.4])).kept == "no limit"
+    assert DistanceErrors(50.0, None, None, (), bins([0.4])).limit_met == "no limit"
 
 
 def test_the_rmse_of_a_bin_is_held_against_the_limit_not_its_largest_error(tmp_path):

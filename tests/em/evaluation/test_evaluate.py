@@ -206,7 +206,7 @@ def test_distances_are_binned_and_the_smallest_within_the_limit_is_found(tmp_pat
         610.0,
         pytest.approx((700.0,)),
     )
-    assert evaluation.results[0].distances.kept == "from 610 mm, not at 700 mm"
+    assert evaluation.results[0].distances.limit_met == "from 610 mm, not at 700 mm"
     assert only(tmp_path / "t.csv", limit_mm=0.1)["distance"]["smallest_mm"] is None
     wide = only(tmp_path / "t.csv", bin_mm=1000.0)
     assert len(wide["distance"]["bins"]) == 1

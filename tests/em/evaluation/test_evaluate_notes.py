@@ -56,7 +56,7 @@ def test_a_place_with_a_second_id_is_told(tmp_path):
 
 @pytest.mark.parametrize(("times", "said"), [(4.5, False), (5.5, True)])
 def test_the_frame_is_told_from_five_times_the_residual_on(tmp_path, times, said):
-    """Places 1 % too far from the middle: a fit leaves that, and takes out a shift that makes `times` of it."""
+    """Positions 1 % too far from the centroid; a fit removes an offset and leaves a residual of 1 / `times` of the RMSE."""
     middle = GRID.mean(axis=0)
     left = 0.01 * np.sqrt(((GRID - middle) ** 2).sum(axis=1).mean())
     shift = np.array([0.0, 0.0, left * np.sqrt(times**2 - 1.0)])

@@ -46,13 +46,13 @@ def test_the_check_of_the_power_and_the_monitor_have_the_papers_threshold():
 
 @pytest.mark.parametrize("name", ["ref", "ref1", "Ref12", "reference", "reference2", " REFERENCE "])
 def test_a_reference_is_called_so(name):
-    assert published.kind(name) == "reference"
+    assert published.paper_sensor(name) == "reference"
 
 
 @pytest.mark.parametrize("name", ["1", "0", "", "reflector", "ref1b", "xref", "tip2", "coil 7"])
 def test_no_other_name_is_one_of_the_papers_sensors(name):
-    assert published.kind(name) is None
-    assert published.kind("Tip") == "tip"
+    assert published.paper_sensor(name) is None
+    assert published.paper_sensor("Tip") == "tip"
 
 
 def test_nothing_of_the_paper_stands_beside_a_sensor_called_1(tmp_path):

@@ -13,7 +13,7 @@ import pytest
 from emulated import DEADLINE_S, emulated, until
 from flexneedle.em.recording import record as recording
 from flexneedle.em.recording.grid import read_grid
-from flexneedle.em.recording.record import EXTRA, Guide, open_session, record
+from flexneedle.em.recording.record import EXTRA, Operator, open_session, record
 from flexneedle.errors import InputError, RunError
 from flexneedle.rig.tracking.table import COLUMNS
 from flexneedle.types import VISIBLE, Frame, SensorReading
@@ -60,11 +60,11 @@ class Stage:
 
     def ask(self, stop):
         self.asked.append((stop.repeat, stop.point_id))
-        self.place = np.array(stop.place)
+        self.place = np.array(stop.position)
         self.time += 3.0
 
     def guide(self, **settings):
-        return Guide(self.ask, self.said.append, **settings)
+        return Operator(self.ask, self.said.append, **settings)
 
 
 @pytest.fixture
@@ -142,7 +142,7 @@ def test_a_stage_that_never_rests_is_told_and_asked_for_again(grid, out):
         stage.speed = 0.0
 
     with open_session(out, grid) as session:
-        record(session, stage, stage, grid, Guide(stage.ask, say))
+        record(session, stage, stage, grid, Operator(stage.ask, say))
     (said,) = stage.said
     assert said == (
         "no 6 good samples within 2 s: tip moves: 0.50 mm from the first to the last third, limit 0.2 mm; "
@@ -163,7 +163,7 @@ def test_a_point_that_cannot_be_measured_ends_a_recording_without_a_person(grid,
     stage = Stage()
     stage.ailment = ailment
     with pytest.raises(RunError, match=f"point 1, repeat 1: no 6 good samples within 2 s: {says}"):
-        run(out, grid, stage, insists=False)
+        run(out, grid, stage, retries=False)
     assert not out.exists(), "nothing was measured"
 
 
@@ -224,10 +224,10 @@ class Stuck(Stage):
         )
 
 
-@pytest.mark.parametrize("insists", [True, False])
-def test_a_sensor_that_stays_while_the_stage_moves_ends_the_recording(grid, out, insists):
+@pytest.mark.parametrize("retries", [True, False])
+def test_a_sensor_that_stays_while_the_stage_moves_ends_the_recording(grid, out, retries):
     with pytest.raises(RunError) as refusal:
-        run(out, grid, Stuck(), insists=insists)
+        run(out, grid, Stuck(), retries=retries)
     assert str(refusal.value) == (
         "tip moved 0.0 mm from point 1 to point 2 and the stage 10.0 mm: they may differ by 5.0 mm "
         "(use --force to record it)"
@@ -263,14 +263,14 @@ def assert_agrees(tmp_path, out, share, spacing, agrees):
 
 def test_who_knows_better_keeps_the_point(grid, out):
     stage, doubts = Stuck(), []
-    run(out, grid, stage, keeps=lambda doubt: not doubts.append(doubt))
+    run(out, grid, stage, accepts=lambda mismatch: not doubts.append(mismatch))
     assert_whole(out)
     assert len(doubts) == 5
     assert stage.asked == ALL
 
 
 def test_who_does_not_keep_it_measures_it_again(grid, out):
-    """The stage was not moved to the second point when it was asked to, and is once the doubt is told."""
+    """The stage was not moved to the second point when it was asked to, and is once the mismatch is told."""
     stage, doubts = Stage(), []
 
     def forget_the_second(stop):
@@ -278,15 +278,15 @@ def test_who_does_not_keep_it_measures_it_again(grid, out):
         stage.ask(stop)
         stage.place = place if len(stage.asked) == 2 else stage.place
 
-    def mend(doubt):
-        doubts.append(doubt)
+    def mend(mismatch):
+        doubts.append(mismatch)
         if len(doubts) > 1:
             raise KeyboardInterrupt
         stage.place = np.array([10.0, 0.0, 0.0])
         return False
 
     with open_session(out, grid) as session:
-        record(session, stage, stage, grid, Guide(forget_the_second, print, keeps=mend))
+        record(session, stage, stage, grid, Operator(forget_the_second, print, accepts=mend))
     assert stage.asked == ALL
     assert_whole(out)
     assert {row["x_mm"] for row in rows_of(out) if row["point_id"] == "2"} == {"110.0"}
@@ -301,7 +301,7 @@ def test_the_last_point_before_an_interruption_counts_too(grid, out):
         stage.ask(stop)
 
     with open_session(out, grid) as session, pytest.raises(KeyboardInterrupt):
-        record(session, stage, stage, grid, Guide(ask_once, print))
+        record(session, stage, stage, grid, Operator(ask_once, print))
     again = Stage()
     again.ask = lambda _: None  # it stays where it was
     with pytest.raises(RunError, match=r"tip moved 0\.0 mm from point 1 to point 2 and the stage 10\.0 mm"):

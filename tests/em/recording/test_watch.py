@@ -2,7 +2,7 @@
 
 import pytest
 
-from flexneedle.em.recording.watch import field_judge, judge_field, watch
+from flexneedle.em.recording.watch import check_field, field_checker, watch
 from flexneedle.errors import InputError
 from flexneedle.rig.devices.recording import read_frames
 from flexneedle.rig.devices.replay import ENDED, Replay
@@ -38,33 +38,36 @@ class Silent:
 
 
 def test_each_frame_is_shown_once_with_its_verdict():
-    clock, views = Clock(), []
-    assert watch(Replay(frames(60), clock), clock, views.append) == 60
-    assert [view.frame.number for view in views if view.is_new] == list(range(60))
-    verdicts = [view.verdict for view in views if view.is_new]
+    clock, snapshots = Clock(), []
+    assert watch(Replay(frames(60), clock), clock, snapshots.append) == 60
+    assert [snapshot.frame.number for snapshot in snapshots if snapshot.is_new] == list(range(60))
+    verdicts = [snapshot.verdict for snapshot in snapshots if snapshot.is_new]
     assert all(verdict.startswith("field not known: observed for") for verdict in verdicts[:20])
     assert set(verdicts[20:]) == {VISIBLE}
 
 
 def test_a_judge_of_ones_own_sees_the_history():
-    clock, views = Clock(), []
+    clock, snapshots = Clock(), []
     watch(
-        Replay(frames(500), clock), clock, views.append, judge=lambda history, _: (str(len(history)), False)
+        Replay(frames(500), clock),
+        clock,
+        snapshots.append,
+        check=lambda history, _: (str(len(history)), False),
     )
-    assert [view.verdict for view in views[:3]] == ["1", "2", "3"]
-    assert views[-1].verdict == "400"
+    assert [snapshot.verdict for snapshot in snapshots[:3]] == ["1", "2", "3"]
+    assert snapshots[-1].verdict == "400"
 
 
 def test_it_stops_after_its_time():
-    clock, views = Clock(), []
-    assert watch(Replay(frames(60), clock), clock, views.append, seconds=0.5) == 20
+    clock, snapshots = Clock(), []
+    assert watch(Replay(frames(60), clock), clock, snapshots.append, seconds=0.5) == 20
 
 
 def test_where_nothing_comes_it_says_so_now_and_then():
-    clock, views = Clock(), []
-    assert watch(Silent(), clock, views.append, seconds=3.0) == 0
-    assert 4 <= len(views) <= 6
-    assert {(view.frame, view.verdict) for view in views} == {(None, "no reply")}
+    clock, snapshots = Clock(), []
+    assert watch(Silent(), clock, snapshots.append, seconds=3.0) == 0
+    assert 4 <= len(snapshots) <= 6
+    assert {(snapshot.frame, snapshot.verdict) for snapshot in snapshots} == {(None, "no reply")}
 
 
 def test_it_stops_when_the_tracker_says_that_there_is_no_more_to_come():
@@ -97,12 +100,12 @@ def test_a_recording_overwrites_nothing(tmp_path):
 
 
 def verdict(told, settings=None, distorted=False):
-    return judge_field(told, settings or MonitorSettings(), distorted)[0]
+    return check_field(told, settings or MonitorSettings(), distorted)[0]
 
 
 def test_a_good_field_is_ok_and_a_distorted_one_is_not():
-    assert judge_field(frames(40), MonitorSettings()) == (VISIBLE, False)
-    said, distorted = judge_field(frames(40, indicator=0.06), MonitorSettings())
+    assert check_field(frames(40), MonitorSettings()) == (VISIBLE, False)
+    said, distorted = check_field(frames(40, indicator=0.06), MonitorSettings())
     assert "field distorted" in said
     assert distorted
 
@@ -141,17 +144,17 @@ def test_a_field_that_was_distorted_stays_so_as_long_as_a_held_insertion_waits()
     script = [(level, VISIBLE) for level in levels] + [(level, "missing") for level in levels[1:3]]
     script += [(0.052, VISIBLE)]
     seen = [f for k, one in enumerate(script) for f in stretch(1.5 * k, 1.5, **told(*one))]
-    clock, views, monitor = Clock(), [], Monitor(MonitorSettings())
-    watch(Replay(seen, clock), clock, views.append)
-    assert len(views) == len(seen)
-    for frame, view in zip(seen, views, strict=True):
+    clock, snapshots, monitor = Clock(), [], Monitor(MonitorSettings())
+    watch(Replay(seen, clock), clock, snapshots.append)
+    assert len(snapshots) == len(seen)
+    for frame, snapshot in zip(seen, snapshots, strict=True):
         monitor, _ = monitor.check(
             Measurement(frame.time, 0.0, 0.0, 0.0, frame), lambda _: (0.0, 0.0), frame.time, 1.0, 1000.0
         )
         monitor, held = monitor.check_field()
         unseen = frame.readings["tip"].status != VISIBLE
-        assert view.verdict == ("tip: missing" if unseen else str(held)), frame.number
-    last = [views[60 * (k + 1) - 1].verdict for k in range(len(script))]
+        assert snapshot.verdict == ("tip: missing" if unseen else str(held)), frame.number
+    last = [snapshots[60 * (k + 1) - 1].verdict for k in range(len(script))]
     assert [said.split(":")[0] for said in last] == [
         *("ok", "field distorted", "field distorted", "field not known", "field distorted", "ok", "ok"),
         *("tip", "tip", "field distorted"),
@@ -174,7 +177,7 @@ def sensors(*names, indicator=0.02):
 
 def test_without_a_number_the_field_is_judged_by_the_references_that_there_are():
     def judge(frames):
-        return field_judge()(frames, False)[0]
+        return field_checker()(frames, False)[0]
 
     assert judge(sensors("tip", "ref1")) == VISIBLE
     assert "field distorted" in judge(sensors("tip", "ref1", indicator=0.06))
@@ -184,5 +187,5 @@ def test_without_a_number_the_field_is_judged_by_the_references_that_there_are()
 
 
 def test_the_number_of_references_can_be_asked_for():
-    assert "field not known: 1 of 2" in field_judge(2)(sensors("tip", "ref1"), False)[0]
-    assert field_judge(0)(sensors("tip"), False) == (VISIBLE, False)
+    assert "field not known: 1 of 2" in field_checker(2)(sensors("tip", "ref1"), False)[0]
+    assert field_checker(0)(sensors("tip"), False) == (VISIBLE, False)

@@ -110,8 +110,8 @@ def test_a_share_above_a_limit_is_that_of_the_levels_beyond_it(tmp_path):
     values = [0.01, 0.01, 0.01, 0.0101, 0.0101, 0.0102]
     rows = rows_of(GRID[:6], GRID[:6, None], indicator=values)
     (grid,), _ = read_table(write_csv(tmp_path / "t.csv", rows), Options())
-    shares = [grid.levels.above(limit) for limit in (0.0099, 0.01, 0.0101, 0.0102, 9.95)]
+    shares = [grid.histogram.above(limit) for limit in (0.0099, 0.01, 0.0101, 0.0102, 9.95)]
     assert shares == pytest.approx([1.0, 3 / 6, 1 / 6, 0.0, 0.0])
-    assert (grid.levels.count, grid.levels.least, grid.levels.most) == (6, 0.01, 0.0102)
+    assert (grid.histogram.count, grid.histogram.minimum, grid.histogram.maximum) == (6, 0.01, 0.0102)
     for share in (0.0, 0.3, 0.5, 0.95, 1.0):
-        assert grid.levels.quantile(share) == pytest.approx(np.quantile(values, share), abs=0.5001e-4)
+        assert grid.histogram.quantile(share) == pytest.approx(np.quantile(values, share), abs=0.5001e-4)

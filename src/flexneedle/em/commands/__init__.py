@@ -1,1 +1,1 @@
-"""Commands of `flexneedle em`: read arguments, call, print."""
+"""Commands of `flexneedle em`: parse arguments, call the library, print."""

@@ -1,4 +1,4 @@
-"""Arguments that several commands of `flexneedle em` share; argparse prints what is wrong with a value."""
+"""Arguments shared by the commands of `flexneedle em`; argparse prints the reason why a value is invalid."""
 
 from __future__ import annotations
 
@@ -7,17 +7,19 @@ from collections.abc import Callable
 from math import inf, isfinite
 
 
-def within(least: float, most: float = inf, kind: type[float] | type[int] = float) -> Callable[[str], float]:
-    """Return the type of a finite number from `least` to `most`."""
-    rule = f"must be at least {least:g}" if most == inf else f"must be from {least:g} to {most:g}"
+def within(
+    minimum: float, maximum: float = inf, kind: type[float] | type[int] = float
+) -> Callable[[str], float]:
+    """Return the argparse type of a finite number from `minimum` to `maximum`."""
+    rule = f"must be at least {minimum:g}" if maximum == inf else f"must be from {minimum:g} to {maximum:g}"
 
     def number(text: str) -> float:
         value = kind(text)
-        if not (isfinite(value) and least <= value <= most):
+        if not (isfinite(value) and minimum <= value <= maximum):
             raise argparse.ArgumentTypeError(f"{text}: {rule}")
         return value
 
-    number.__name__ = kind.__name__  # argparse names the type of a text that is no number by it
+    number.__name__ = kind.__name__  # the name that argparse prints for a value that is not a number
     return number
 
 
@@ -25,7 +27,7 @@ def positive(text: str) -> float:
     """Return a finite number above 0."""
     value = float(text)
     if not (isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text}: must be a number above 0")
+        raise argparse.ArgumentTypeError(f"{text}: must be a finite number above 0")
     return value
 
 
@@ -38,35 +40,35 @@ def finite(text: str) -> float:
 
 
 def name(text: str) -> str:
-    """Return a name without blanks around it."""
+    """Return a name without leading and trailing blanks."""
     if not text.strip():
-        raise argparse.ArgumentTypeError("must be a name")
+        raise argparse.ArgumentTypeError("must not be blank")
     return text.strip()
 
 
 def add_columns(parser: argparse.ArgumentParser) -> None:
-    """Add the names of the columns of a table."""
+    """Add the option that maps the columns of a table."""
     parser.add_argument(
         "--columns",
         action="append",
         default=[],
-        metavar="THEIRS=OURS",
-        help='a column of another name, such as --columns X=x_mm, or a TOML file of lines such as X = "x_mm"; '
-        "may be given several times",
+        metavar="NAME=COLUMN",
+        help="column of another name in the table, such as --columns X=x_mm, or a TOML file with lines such as "
+        'X = "x_mm"; may be repeated',
     )
 
 
 def add_labels(parser: argparse.ArgumentParser) -> None:
-    """Add the unit of a table, and the sensor and environment of one without such columns."""
+    """Add the unit of a table, and the sensor and environment of a table that lacks these columns."""
     parser.add_argument(
         "--unit",
         choices=("mm", "m"),
-        help="of all lengths (default: mm; lengths that look like metres are refused)",
+        help="unit of all lengths (default: mm, with a check that the lengths are not in metres)",
     )
     for column in ("sensor", "environment"):
         parser.add_argument(
             f"--{column}",
             type=name,
             metavar="NAME",
-            help=f"of all rows, for a table without a column {column}",
+            help=f"{column} of all rows, for a table without a column {column}",
         )

@@ -1,4 +1,4 @@
-"""`flexneedle em check`: whether the rig's own power distorts the tracker's field."""
+"""`flexneedle em check`: does the rig's own power distort the tracker's field?"""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flexneedle.em.commands.arguments import add_columns, add_labels, positive
 from flexneedle.em.commands.tables import number, print_notes, print_rows, span
 
 if TYPE_CHECKING:
-    from flexneedle.em.evaluation.check import Check, Power
+    from flexneedle.em.evaluation.check import PowerCheck, PowerComparison
 
 _THRESHOLD = 0.0547  # paper, section IV-B
 
@@ -22,28 +22,28 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "check",
         help="compare the indicator with the rig's power off and on",
         **described(
-            "Compare the indicator of distortion in two environments of a table, with the rig's power off and on. "
-            "The exit status is 1 if the mean indicator of any sensor is above the threshold with power on.",
+            "Compare the distortion indicator of two environments in one table: power of the rig off and on. "
+            "The exit status is 1 if the mean indicator of any sensor exceeds the threshold with power on.",
             "flexneedle em check power.csv",
             "flexneedle em check power.csv --off quiet --on driven --threshold 0.04",
         ),
     )
     parser.add_argument(
-        "data", metavar="DATA", type=Path, help="table with both environments, CSV or Parquet"
+        "data", metavar="DATA", type=Path, help="table with both environments (CSV or Parquet)"
     )
     for power in ("off", "on"):
         parser.add_argument(
             f"--{power}",
             default=power,
             metavar="NAME",
-            help=f"environment with power {power} (default: {power})",
+            help=f"environment measured with power {power} (default: {power})",
         )
     parser.add_argument(
         "--threshold",
         type=positive,
         default=_THRESHOLD,
         metavar="I",
-        help="of the indicator (default: %(default)s)",
+        help="threshold of the mean indicator (default: %(default)s)",
     )
     add_columns(parser)
     add_labels(parser)
@@ -64,17 +64,17 @@ def _check(args: argparse.Namespace) -> int:
     return 1 if found.above else 0
 
 
-def _print(found: Check) -> None:
+def _print(found: PowerCheck) -> None:
     rows = [row for sensor in found.sensors for row in _rows(sensor)]
     rows.append((" paper, power on", number(found.paper, ".4f"), *[""] * 5))
     heads = ("indicator", "mean", "95 %", "max", "points", "samples", "samples above")
-    print_rows("Indicator with power off and on, means at grid points", heads, rows)
+    print_rows("Indicator with power off and on (means at grid points)", heads, rows)
     for sensor in found.sensors:
         print(_verdict(sensor))
     print_notes(found.notes)
 
 
-def _rows(sensor: Power) -> list[tuple[str, ...]]:
+def _rows(sensor: PowerComparison) -> list[tuple[str, ...]]:
     return [
         (
             f"{sensor.sensor}, power {name}",
@@ -87,11 +87,14 @@ def _rows(sensor: Power) -> list[tuple[str, ...]]:
     ]
 
 
-def _verdict(sensor: Power) -> str:
-    ends, on = sensor.difference_interval, sensor.on
-    sure = f"95 % interval {span(ends, '.4f')}" if ends else "too few grid points for an interval"
+def _verdict(sensor: PowerComparison) -> str:
+    interval, on = sensor.difference_interval, sensor.on
+    certainty = (
+        f"95 % interval {span(interval, '.4f')}" if interval else "too few grid points for an interval"
+    )
     side = "above" if sensor.above else "not above"
     return (
-        f"{sensor.sensor}: power adds {number(sensor.difference, '.4f')} ({sure}); mean {on.mean:.4f} with power on, "
-        f"{side} the threshold of {sensor.threshold:g} ({sensor.points_above} of {on.n_points} points are above)"
+        f"{sensor.sensor}: power adds {number(sensor.difference, '.4f')} ({certainty}); mean {on.mean:.4f} "
+        f"with power on, {side} the threshold of {sensor.threshold:g} "
+        f"({sensor.points_above} of {on.n_points} grid points above)"
     )

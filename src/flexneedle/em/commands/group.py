@@ -1,4 +1,4 @@
-"""`flexneedle em`: evaluate an electromagnetic tracker, simulate one, record a real one."""
+"""`flexneedle em`: evaluate, simulate and record electromagnetic trackers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _COMMANDS: tuple[Any, ...] = (evaluate, check, simulate, register, record, watch
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command and its own commands to the parser of `flexneedle`."""
+    """Add the command and its subcommands to the parser of `flexneedle`."""
     parser = subparsers.add_parser(
         "em",
         help="evaluate, simulate or record an electromagnetic tracker",

@@ -1,4 +1,4 @@
-"""`flexneedle em record`: measure a tracker on a grid, point by point."""
+"""`flexneedle em record`: record a tracker at the points of a grid."""
 
 from __future__ import annotations
 
@@ -13,42 +13,44 @@ from flexneedle.console.common import described
 from flexneedle.em.commands.arguments import within
 
 if TYPE_CHECKING:
-    from flexneedle.em.recording.grid import Grid, Stop
-    from flexneedle.em.recording.record import Guide
+    from flexneedle.em.recording.grid import StageGrid, Stop
+    from flexneedle.em.recording.record import Operator
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `flexneedle em`."""
     parser = commands.add_parser(
         "record",
-        help="measure a tracker on a grid; writes the table that evaluate reads",
+        help="record a tracker at the points of a grid; writes a table for evaluate",
         **described(
-            "Ask for the stage to be moved to each point of the grid and record the tracker there. Stopped at any "
-            "time, the recording continues at the next point when it is started again with the same --out.",
+            "Prompt for the stage to be moved to each point of the grid and record the tracker there. After an "
+            "interruption, run the command again with the same --out to resume at the next point.",
             "flexneedle em record --tracker aurora:/dev/ttyUSB0 --grid cube --out ideal.csv",
             "flexneedle em record --tracker aurora:/dev/ttyUSB0 --grid mine.toml --out noisy.csv --dwell 5",
         ),
     )
-    parser.add_argument("--tracker", required=True, metavar="SPEC", help="such as aurora:/dev/ttyUSB0")
+    parser.add_argument(
+        "--tracker", required=True, metavar="SPEC", help="tracker, such as aurora:/dev/ttyUSB0"
+    )
     parser.add_argument(
         "--grid",
         required=True,
         metavar="GRID",
-        help="file or name of the grid; cube is shipped as an example",
+        help="TOML file or name of the grid (example: cube)",
     )
     parser.add_argument(
-        "--out", required=True, type=Path, metavar="FILE", help="table to write or to continue (CSV)"
+        "--out", required=True, type=Path, metavar="FILE", help="CSV table to write or resume"
     )
     parser.add_argument(
         "--dwell",
         type=within(0),
         metavar="S",
-        help="seconds that a stage which moves by itself needs to reach each point (default: ask a person)",
+        help="for a motorised stage: wait S seconds for it to reach each point (default: prompt for Enter)",
     )
     parser.add_argument(
         "--force",
         action="store_true",
-        help="record also where a sensor did not move as the stage did: by more than 5 mm and 20 %% of the distance",
+        help="record points even if sensor and stage moved by different distances (by more than 5 mm and 20 %%)",
     )
     parser.set_defaults(handler=_record)
 
@@ -60,54 +62,56 @@ def _record(args: argparse.Namespace) -> int:
 
     grid, clock = read_grid(args.grid), clock_for(args.tracker)
     with open_session(args.out, grid) as session:
-        if session.left:
+        if session.remaining:
             if session.done:
-                _print(f"{args.out}: continues after {session.done} recorded points")
+                _print(f"{args.out}: resuming after {session.done} recorded points")
             with open_tracker(args.tracker, clock) as tracker:
-                record(session, tracker, clock, grid, _guide(grid, args.dwell, args.force, clock.wait))
+                record(session, tracker, clock, grid, _operator(grid, args.dwell, args.force, clock.wait))
         else:
-            _print(f"{args.out}: is complete: {session.done} points")
+            _print(f"{args.out}: complete, {session.done} points")
     print(args.out)
     return 0
 
 
-def _guide(grid: Grid, dwell: float | None, force: bool, wait: Callable[[float], None]) -> Guide:
-    """Return the guide: a person who presses Enter, or time. Only at a terminal is a person asked what to keep."""
-    from flexneedle.em.recording.record import Guide
+def _operator(grid: StageGrid, dwell: float | None, force: bool, wait: Callable[[float], None]) -> Operator:
+    """Return the operator: a person who presses Enter, or a wait. Mismatches are confirmed only at a terminal."""
+    from flexneedle.em.recording.record import Operator
 
-    def give_time(stop: Stop) -> None:
-        _print(_where(grid, stop))
+    def announce(stop: Stop) -> None:
+        _print(_target(grid, stop))
         wait(dwell or 0.0)
 
-    by_itself = dwell is not None
-    guide = Guide(give_time if by_itself else lambda stop: _ask(grid, stop), _print, insists=not by_itself)
+    motorised = dwell is not None
+    operator = Operator(
+        announce if motorised else lambda stop: _ask(grid, stop), _print, retries=not motorised
+    )
     if force:
-        return replace(guide, keeps=_force)
-    return replace(guide, keeps=_keeps) if not by_itself and sys.stdin.isatty() else guide
+        return replace(operator, accepts=_force)
+    return replace(operator, accepts=_confirm) if not motorised and sys.stdin.isatty() else operator
 
 
-def _where(grid: Grid, stop: Stop) -> str:
-    x, y, z = stop.place
-    of = f"point {stop.point_id} of {len(grid.points)}, repeat {stop.repeat} of {grid.file.repeats}"
-    return f"{of}: stage at {x:g}, {y:g}, {z:g} mm"
+def _target(grid: StageGrid, stop: Stop) -> str:
+    x, y, z = stop.position
+    progress = f"point {stop.point_id} of {len(grid.points)}, repeat {stop.repeat} of {grid.file.repeats}"
+    return f"{progress}: move the stage to {x:g}, {y:g}, {z:g} mm"
 
 
-def _ask(grid: Grid, stop: Stop) -> None:
-    _answer(f"{_where(grid, stop)}? Enter:")
+def _ask(grid: StageGrid, stop: Stop) -> None:
+    _answer(f"{_target(grid, stop)}; press Enter when there:")
 
 
-def _keeps(doubt: str) -> bool:
-    _print(doubt)
-    return _answer("Enter measures this point again, k keeps it:") == "k"
+def _confirm(mismatch: str) -> bool:
+    _print(mismatch)
+    return _answer("press Enter to measure this point again, k to keep it:") == "k"
 
 
-def _force(doubt: str) -> bool:
-    _print(f"{doubt}; recorded (--force)")
+def _force(mismatch: str) -> bool:
+    _print(f"{mismatch}; recorded (--force)")
     return True
 
 
 def _answer(question: str) -> str:
-    """Return what is typed in a line. Whatever is written next begins a line of its own. Raises RunError."""
+    """Return the line typed as the answer, and leave the terminal at the start of a line. Raises RunError."""
     from flexneedle.errors import RunError
 
     echoes = sys.stdin.isatty()
@@ -120,7 +124,7 @@ def _answer(question: str) -> str:
             print(file=sys.stderr)
     if not line:
         raise RunError(
-            "no more input on stdin: continue with the same --out, or use --dwell without a person"
+            "end of input on stdin: resume with the same --out, or use --dwell for a motorised stage"
         )
     return line.strip()
 

@@ -1,4 +1,4 @@
-"""`flexneedle em register`: the rigid map from the tracker's frame to the stage's."""
+"""`flexneedle em register`: the rigid transform from the tracker's frame to the stage's."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from flexneedle.console.common import described, print_json, print_table
 from flexneedle.em.commands.arguments import add_columns, finite
 
 if TYPE_CHECKING:
-    from flexneedle.em.register import Registered
+    from flexneedle.em.register import RegistrationResult
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -19,8 +19,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "register",
         help="register the tracker's frame to the stage's from pairs of points",
         **described(
-            "Fit the rigid map from the tracker's frame to the stage's to pairs of points, with its expected errors. "
-            "Writes a table for a scenario and a picture (docs/tracking/register.md).",
+            "Fit the rigid transform from the tracker's frame to the stage's to pairs of points, with its expected "
+            "errors. Writes a table for a scenario and a figure (docs/tracking/register.md).",
             "flexneedle em register pairs.csv --target 40 5 0",
             "flexneedle em register table.csv --sensor ref1 --environment ideal --out rig.toml",
         ),
@@ -29,12 +29,10 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "data",
         type=Path,
         metavar="PAIRS",
-        help="CSV or Parquet with true_x_mm, …, x_mm, …; rows of one point_id are one point",
+        help="CSV or Parquet with true_x_mm, …, x_mm, …; rows with the same point_id are averaged",
     )
-    parser.add_argument("--sensor", metavar="NAME", help="which sensor, where the table has several")
-    parser.add_argument(
-        "--environment", metavar="NAME", help="which environment, where the table has several"
-    )
+    parser.add_argument("--sensor", metavar="NAME", help="sensor to use, if the table has several")
+    parser.add_argument("--environment", metavar="NAME", help="environment to use, if the table has several")
     parser.add_argument(
         "--target",
         nargs=3,
@@ -42,16 +40,19 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         action="append",
         default=[],
         metavar=("X", "Y", "Z"),
-        help="point of the stage (mm) for the expected error; may be repeated (default: the middle of the points)",
+        help="point in the stage's frame (mm) at which to report the expected error; may be repeated "
+        "(default: the centroid of the points)",
     )
     add_columns(parser)
-    parser.add_argument("--unit", choices=("mm", "m"), default="mm", help="of all coordinates (default: mm)")
+    parser.add_argument(
+        "--unit", choices=("mm", "m"), default="mm", help="unit of all coordinates (default: mm)"
+    )
     parser.add_argument(
         "--out",
         type=Path,
         default=Path("registration.toml"),
         metavar="FILE",
-        help="a new file; its picture is written beside it (default: registration.toml)",
+        help="new file; its figure is written to the same folder (default: registration.toml)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.set_defaults(handler=_register)
@@ -70,7 +71,7 @@ def _register(args: argparse.Namespace) -> int:
     return 0
 
 
-def _table(registered: Registered, path: Path) -> None:
+def _table(registered: RegistrationResult, path: Path) -> None:
     values = registered.values()
     rows = [
         ("points", str(values["points"])),
@@ -78,7 +79,7 @@ def _table(registered: Registered, path: Path) -> None:
         ("residual (FRE), RMS", f"{values['fre_mm']:.3f} mm"),
         ("  largest", f"{values['max_residual_mm']:.3f} mm, point {values['worst_point']}"),
         ("  leave-one-out, RMS", f"{values['left_out_rms_mm']:.3f} mm"),
-        ("error of a point (FLE), RMS", f"{values['fle_mm']:.3f} mm"),
+        ("error of a fiducial (FLE), RMS", f"{values['fle_mm']:.3f} mm"),
     ]
     for target in values["tre"]:
         x, y, z = target["target_mm"]

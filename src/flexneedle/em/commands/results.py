@@ -1,4 +1,4 @@
-"""The results of an evaluation as tables in a terminal."""
+"""Tables of an evaluation for the terminal."""
 
 from __future__ import annotations
 
@@ -8,39 +8,39 @@ from pathlib import Path
 from flexneedle.em.commands.tables import number, print_notes, print_rows, span
 from flexneedle.em.evaluation import published
 from flexneedle.em.evaluation.evaluate import Evaluation, Result
-from flexneedle.em.evaluation.indicator import Singles, Summary
+from flexneedle.em.evaluation.indicator import SingleSamples, Summary
 from flexneedle.em.evaluation.separation import Separation
 from flexneedle.rig.tracking.table import REFERENCE
 
-_SIDE_BY_SIDE = 4
+_PER_TABLE = 4
 _ERRORS = ("rmse_mm", "p95_mm", "max_mm", "jitter_mm")
 _INDICATOR = ("mean", "sd", "max", "min", "p95")
 
 
 def print_evaluation(evaluation: Evaluation, folder: Path) -> None:
-    """Print tables, notes, and the folder of record and figures."""
+    """Print the tables, the notes and the output folder."""
     _print_tables(evaluation)
     print_notes(evaluation.notes)
-    print(f"Record and figures: {folder}")
+    print(f"Results and figures: {folder}")
 
 
 def _print_tables(evaluation: Evaluation) -> None:
-    frame = ", after a rigid fit of each sensor and environment" if evaluation.options.register else ""
+    frame = " after rigid registration of each sensor and environment" if evaluation.options.register else ""
     heads = ("", "rmse", "95 %", "max", "jitter", "points", "samples")
     results = evaluation.results
     print_rows(f"Errors (mm){frame}", heads, [row for result in results for row in _error_rows(result)])
     shown = [row for result in results for row in _indicator_rows(result)]
     if shown:
         print_rows(
-            "Indicator, means at grid points", ("", "mean", "sd", "max", "min", "95 %", "points"), shown
+            "Indicator (means at grid points)", ("", "mean", "sd", "max", "min", "95 %", "points"), shown
         )
     pair = evaluation.options.pair
     fits = [row for found in evaluation.separations for row in _separation_rows(found, *pair)]
     if fits:
-        print_rows("Indicator and error", ("", "", "95 % interval", "paper"), fits)
-    for start in range(0, len(results), _SIDE_BY_SIDE):
-        some = results[start : start + _SIDE_BY_SIDE]
-        print_rows("Further (mm)", ("", *(result.grid.title for result in some)), _further(some))
+        print_rows("Error by indicator", ("", "", "95 % interval", "paper"), fits)
+    for start in range(0, len(results), _PER_TABLE):
+        some = results[start : start + _PER_TABLE]
+        print_rows("Details (mm)", ("", *(result.grid.title for result in some)), _details(some))
 
 
 def _error_rows(result: Result) -> Iterator[tuple[str, ...]]:
@@ -48,9 +48,9 @@ def _error_rows(result: Result) -> Iterator[tuple[str, ...]]:
     counts = f"{found.n_points}", f"{found.n_samples}"
     yield (result.grid.title, *(number(values[key]) for key in _ERRORS), *counts)
     if any(found.intervals.values()):
-        ends = (span(found.intervals.get(key)) for key in _ERRORS)
-        yield (" 95 % interval", *ends, "", "")
-    for name, key in (("paper", "paper"), ("maker", "official")):
+        intervals = (span(found.intervals.get(key)) for key in _ERRORS)
+        yield (" 95 % interval", *intervals, "", "")
+    for name, key in (("paper", "paper"), ("manufacturer", "official")):
         if values[key]:
             yield (f" {name}", *(number(values[key].get(k), ".2f") for k in _ERRORS), "", "")
 
@@ -62,18 +62,18 @@ def _indicator_rows(result: Result) -> Iterator[tuple[str, ...]]:
     yield (result.grid.title, *_levels(found), f"{found.n_points}")
     yield (" single samples", *_levels(found.samples), f"{found.samples.n_samples}")
     paper = published.INDICATOR.get(result.grid.environment)
-    if paper and published.kind(result.grid.sensor) == REFERENCE:
+    if paper and published.paper_sensor(result.grid.sensor) == REFERENCE:
         yield (" paper", *(number(paper.get(key), ".4f") for key in _INDICATOR), "")
 
 
-def _levels(found: Summary | Singles) -> list[str]:
+def _levels(found: Summary | SingleSamples) -> list[str]:
     return [number(getattr(found, key, None), ".4f") for key in _INDICATOR]
 
 
 def _separation_rows(found: Separation, ideal: str, noisy: str) -> Iterator[tuple[str, ...]]:
-    """The rows, with the paper's values for its own sensor in its own environments."""
-    of_paper = published.kind(found.sensor) == REFERENCE
-    of_paper &= (ideal, noisy) == (published.IDEAL, published.NOISY)
+    """Rows with the paper's values where sensor and environments are those of the paper."""
+    as_in_paper = published.paper_sensor(found.sensor) == REFERENCE
+    as_in_paper &= (ideal, noisy) == (published.IDEAL, published.NOISY)
     fits = published.FITS
     papers = {
         f"{ideal}: error (mm)": f"{fits['mean_mm']} ± {fits['sd_mm']}",
@@ -83,23 +83,23 @@ def _separation_rows(found: Separation, ideal: str, noisy: str) -> Iterator[tupl
     }
     for row in _found_rows(found, ideal, noisy):
         quantity = row[0].removeprefix(found.sensor).lstrip(", :")
-        yield (*row, papers.get(quantity, "") if of_paper else "")
+        yield (*row, papers.get(quantity, "") if as_in_paper else "")
 
 
 def _found_rows(found: Separation, ideal: str, noisy: str) -> Iterator[tuple[str, str, str]]:
     name = found.sensor
     if found.ideal:
-        flat, ends = found.ideal, found.ideal.intervals
+        constant, intervals = found.ideal, found.ideal.intervals
         yield (
             f"{name}, {ideal}: error (mm)",
-            f"{number(flat.mean_mm)} ± {number(flat.sd_mm)}",
-            span(ends["mean_mm"]),
+            f"{number(constant.mean_mm)} ± {number(constant.sd_mm)}",
+            span(intervals["mean_mm"]),
         )
     if found.noisy:
-        line, ends = found.noisy, found.noisy.intervals
-        yield f"{name}, {noisy}: slope (mm)", number(line.slope_mm), span(ends["slope_mm"])
-        yield f"{name}, {noisy}: intercept (mm)", number(line.intercept_mm), span(ends["intercept_mm"])
-        yield f"{name}, {noisy}: scatter about the line (mm)", number(line.scatter_mm), ""
+        line, intervals = found.noisy, found.noisy.intervals
+        yield f"{name}, {noisy}: slope (mm)", number(line.slope_mm), span(intervals["slope_mm"])
+        yield f"{name}, {noisy}: intercept (mm)", number(line.intercept_mm), span(intervals["intercept_mm"])
+        yield f"{name}, {noisy}: residual sd of the line (mm)", number(line.scatter_mm), ""
     if found.threshold is not None:
         yield f"{name}: threshold", number(found.threshold, ".4f"), span(found.threshold_interval, ".4f")
         yield f"{name}: threshold of single samples", number(found.samples_threshold, ".4f"), ""
@@ -110,28 +110,30 @@ def _found_rows(found: Separation, ideal: str, noisy: str) -> Iterator[tuple[str
         yield f"{name}: area under the ROC", number(found.auc, ".4f"), span(found.auc_interval, ".4f")
 
 
-def _further(results: list[Result]) -> Iterator[tuple[str, ...]]:
+def _details(results: list[Result]) -> Iterator[tuple[str, ...]]:
     def row(name: str, text: Callable[[Result], str]) -> tuple[str, ...]:
         return (name, *map(text, results))
 
     yield row("mean error ± sd", lambda r: f"{number(r.accuracy.mean_mm)} ± {number(r.accuracy.sd_mm)}")
-    yield row("distance error, rms", lambda r: number(r.spacing.rms_mm))
-    yield row(" 95 %, max", lambda r: f"{number(r.spacing.p95_mm)}, {number(r.spacing.max_mm)}")
-    yield row(" rms, closest neighbours", lambda r: number(r.spacing.neighbours_rms_mm))
+    yield row("distance error, rms", lambda r: number(r.relative_distance.rms_mm))
+    yield row(
+        " 95 %, max", lambda r: f"{number(r.relative_distance.p95_mm)}, {number(r.relative_distance.max_mm)}"
+    )
+    yield row(" rms, closest neighbours", lambda r: number(r.relative_distance.neighbours_rms_mm))
     yield row("repeatability, sd", lambda r: number(r.repeatability.sd_mm))
-    yield row(" of the worst point", lambda r: number(r.repeatability.worst_mm))
+    yield row(" at the worst point", lambda r: number(r.repeatability.worst_mm))
     if any(r.orientation for r in results):
-        yield row("orientation jitter (°)", lambda r: _part(r.orientation, "jitter_deg"))
-        yield row(" of the sensor's axis (°)", lambda r: _part(r.orientation, "axis_jitter_deg"))
+        yield row("orientation jitter, rms (°)", lambda r: _part(r.orientation, "jitter_deg"))
+        yield row(" of the sensor axis (°)", lambda r: _part(r.orientation, "axis_jitter_deg"))
     if any(r.distances for r in results):
-        yield row("limit on the rmse at a distance", lambda r: _part(r.distances, "limit_mm", "g"))
-        yield row(" is kept", lambda r: r.distances.kept if r.distances else "–")
+        yield row("limit of the rmse", lambda r: _part(r.distances, "limit_mm", "g"))
+        yield row(" met", lambda r: r.distances.limit_met if r.distances else "–")
     if any(r.registration for r in results):
-        yield row("rigid fit, residual", lambda r: _part(r.registration, "residual_mm"))
-        yield row(" angle (°)", lambda r: _part(r.registration, "angle_deg"))
+        yield row("registration residual, rms", lambda r: _part(r.registration, "residual_mm"))
+        yield row(" rotation angle (°)", lambda r: _part(r.registration, "angle_deg"))
         for k, axis in enumerate("xyz"):
             shifts = [r.registration.translation_mm[k] if r.registration else None for r in results]
-            yield (f" shift {axis}", *map(number, shifts))
+            yield (f" translation {axis}", *map(number, shifts))
 
 
 def _part(found: object, name: str, form: str = ".3f") -> str:

@@ -1,4 +1,4 @@
-"""`flexneedle em simulate`: measure a simulated tracker on a grid."""
+"""`flexneedle em simulate`: record a simulated tracker at the points of a grid."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add the command to the parser of `flexneedle em`."""
     parser = commands.add_parser(
         "simulate",
-        help="measure a simulated tracker on a grid; writes the table that evaluate reads",
+        help="record a simulated tracker at the points of a grid; writes a table for evaluate",
         **described(
-            "Measure the tip's and a reference sensor of a simulated tracker on a grid over the workspace: "
-            "the paper's experiment. Writes the table that `flexneedle em evaluate` reads.",
+            "Record the tip sensor and a reference sensor of a simulated tracker on a grid over the workspace: "
+            "the paper's experiment. Writes a table for `flexneedle em evaluate`.",
             "flexneedle em simulate",
             "flexneedle em simulate --environment mine.toml --samples 20 --seed 1 --out mine.parquet",
         ),
@@ -26,40 +26,40 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         nargs="+",
         default=["ideal", "noisy"],
         metavar="ENVIRONMENT",
-        help="shipped names or paths of TOML files (default: ideal noisy)",
+        help="names of shipped environments or paths of TOML files (default: ideal noisy)",
     )
     parser.add_argument(
         "--seed",
         type=seed,
         default=0,
         metavar="N",
-        help="of the measurement: same seed, same file (default: 0)",
+        help="seed of the noise: same seed, same file (default: 0)",
     )
     parser.add_argument(
         "--field-seed",
         type=seed,
         metavar="N",
-        help="another room with errors of the same sizes (default: the environment's own)",
+        help="seed of the field errors (default: that of the environment)",
     )
     counts = (
-        ("points", 2, 100, 5, "points on an edge of the grid"),
-        ("samples", 1, 100_000, 100, "samples at a point"),
-        ("repeats", 1, 1000, 5, "times through the grid"),
+        ("points", 2, 100, 5, "grid points per edge"),
+        ("samples", 1, 100_000, 100, "samples per point and repeat"),
+        ("repeats", 1, 1000, 5, "repeats of the grid"),
     )
-    for name, least, most, default, what in counts:
+    for name, minimum, maximum, default, meaning in counts:
         parser.add_argument(
             f"--{name}",
-            type=within(least, most, int),
+            type=within(minimum, maximum, int),
             default=default,
             metavar="N",
-            help=f"{what} (default: {default})",
+            help=f"{meaning} (default: {default})",
         )
     parser.add_argument(
         "--out",
         type=Path,
         default=Path("measurements.csv"),
         metavar="FILE",
-        help="the table, CSV or Parquet by its suffix, a new file (default: measurements.csv)",
+        help="new file, CSV or Parquet by its suffix (default: measurements.csv)",
     )
     parser.set_defaults(handler=_simulate)
 

@@ -1,4 +1,4 @@
-"""Tables and numbers in a terminal."""
+"""Tables and numbers for the terminal."""
 
 from __future__ import annotations
 
@@ -10,39 +10,36 @@ _WIDEST = 200
 
 
 def number(value: float | None, form: str = ".3f") -> str:
-    """Return a number as text, – where it is not known."""
+    """Return a number as text, – if it is unknown."""
     return "–" if value is None or not isfinite(value) else f"{value:{form}}".replace("-", "−")
 
 
-def span(ends: tuple[float, float] | None, form: str = ".3f") -> str:
-    """Return an interval as text, nothing where there is none."""
-    if ends is None:
+def span(interval: tuple[float, float] | None, form: str = ".3f") -> str:
+    """Return an interval as text, empty if there is none."""
+    if interval is None:
         return ""
-    return (
-        f"{number(ends[0], form)}–{number(ends[1], form)}"
-        if isfinite(ends[1])
-        else f"from {number(ends[0], form)}"
-    )
+    low, high = interval
+    return f"{number(low, form)}–{number(high, form)}" if isfinite(high) else f"from {number(low, form)}"
 
 
 def print_notes(notes: Iterable[str]) -> None:
-    """Print what a reader of results must know about the data, on stderr, after what is on stdout already."""
+    """Print notes on the data to stderr, after all earlier output on stdout."""
     sys.stdout.flush()
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
 
 
 def print_rows(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table; the first column is of names, a name with a leading space belongs to the one above."""
+    """Print a table whose first column holds names; a name with a leading space belongs to the row above."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(soft_wrap=True, highlight=False, width=_WIDEST)  # numbers are not to be cut in two
+    console = Console(soft_wrap=True, highlight=False, width=_WIDEST)  # wrapping would split numbers
     table = Table(box=box.SIMPLE, show_header=any(heads), show_edge=False)
-    for place, head in enumerate(heads):
-        table.add_column(head, justify="right" if place else "left", no_wrap=True)
+    for index, head in enumerate(heads):
+        table.add_column(head, justify="right" if index else "left", no_wrap=True)
     for row in rows:
         style = "dim" if row[0].startswith(" ") else ""
         table.add_row(*(Text(cell, style=style) for cell in row))

@@ -1,4 +1,4 @@
-"""`flexneedle em watch`: live readings of a tracker, and whether to trust them."""
+"""`flexneedle em watch`: live readings of a tracker with the verdict on its field."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
-    from flexneedle.em.recording.watch import View
+    from flexneedle.em.recording.watch import Snapshot
     from flexneedle.types import Frame, SensorReading
 
 
@@ -29,18 +29,21 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the command to the parser of `flexneedle em`."""
     parser = subparsers.add_parser(
         "watch",
-        help="show live values and verdicts of a tracker",
+        help="show live readings and verdicts of a tracker",
         **described(
-            "Show a live table in a terminal, elsewhere a line a second and at each change of the verdict, until "
-            "Ctrl-C or the end of a replay.",
+            "Show a live table at a terminal; otherwise print one line per second and at each change of the "
+            "verdict. Ends with Ctrl-C or at the end of a replay.",
             "flexneedle em watch --tracker aurora:/dev/ttyUSB0 --record frames.csv",
             "flexneedle em watch --tracker replay:frames.csv@4 --json",
         ),
     )
     parser.add_argument(
-        "--tracker", required=True, metavar="SPEC", help="such as aurora:/dev/ttyUSB0 or replay:FILE@2"
+        "--tracker",
+        required=True,
+        metavar="SPEC",
+        help="tracker, such as aurora:/dev/ttyUSB0 or replay:FILE@2",
     )
-    parser.add_argument("--record", type=Path, metavar="FILE", help="keep all frames in a new CSV")
+    parser.add_argument("--record", type=Path, metavar="FILE", help="save all frames to a new CSV file")
     parser.add_argument(
         "--seconds", type=positive, default=inf, metavar="S", help="stop after S seconds (default: never)"
     )
@@ -49,29 +52,29 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         type=int,
         choices=range(7),
         metavar="N",
-        help="reference sensors without which the field is not known (default: those of the tracker, 3 at most)",
+        help="number of reference sensors needed to judge the field (default: those of the tracker, at most 3)",
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object a frame, a line each")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per frame and line")
     parser.set_defaults(handler=_watch)
 
 
 def _watch(args: argparse.Namespace) -> int:
     from flexneedle.em.recording.trackers import clock_for, open_tracker
-    from flexneedle.em.recording.watch import field_judge, watch
+    from flexneedle.em.recording.watch import field_checker, watch
 
     clock = clock_for(args.tracker)
     try:
         with ExitStack() as stack:
             tracker = stack.enter_context(open_tracker(args.tracker, clock))
-            judge = field_judge(args.references)
-            watch(tracker, clock, _shower(stack, args.json), args.seconds, judge, args.record)
+            check = field_checker(args.references)
+            watch(tracker, clock, _display(stack, args.json), args.seconds, check, args.record)
     except KeyboardInterrupt:
-        print(file=sys.stderr)  # the usual end of a watch
+        print(file=sys.stderr)  # the usual way to stop
     return 0
 
 
-def _shower(stack: ExitStack, as_json: bool) -> Callable[[View], None]:
-    """Return what shows a view: JSON, a live table, or a line now and then."""
+def _display(stack: ExitStack, as_json: bool) -> Callable[[Snapshot], None]:
+    """Return the function that shows a snapshot: as JSON, in a live table, or as a line."""
     if as_json:
         return _print_json
     if sys.stdout.isatty():
@@ -81,12 +84,12 @@ def _shower(stack: ExitStack, as_json: bool) -> Callable[[View], None]:
     return lines.show
 
 
-def _print_json(view: View) -> None:
-    values: dict[str, Any] = {"time_s": view.time, "frame_number": None, "status": view.status}
-    values |= {"verdict": view.verdict, "sensors": {}}
-    if view.frame is not None and view.is_new:
-        values |= {"time_s": view.frame.time, "frame_number": view.frame.number}
-        values["sensors"] = {name: _values(reading) for name, reading in view.frame.readings.items()}
+def _print_json(snapshot: Snapshot) -> None:
+    values: dict[str, Any] = {"time_s": snapshot.time, "frame_number": None, "status": snapshot.status}
+    values |= {"verdict": snapshot.verdict, "sensors": {}}
+    if snapshot.frame is not None and snapshot.is_new:
+        values |= {"time_s": snapshot.frame.time, "frame_number": snapshot.frame.number}
+        values["sensors"] = {name: _values(reading) for name, reading in snapshot.frame.readings.items()}
     print(json.dumps(values, allow_nan=False), flush=True)
 
 
@@ -100,45 +103,45 @@ def _values(reading: SensorReading) -> dict[str, Any]:
 
 
 class _Lines:
-    """Prints a view a second, each at which the verdict changes from good to bad or back, and the last one."""
+    """Prints one snapshot per second, each change of the verdict between good and bad, and the last snapshot."""
 
     def __init__(self) -> None:
         self._due = -inf
-        self._last: View | None = None
-        self._printed: View | None = None
+        self._last: Snapshot | None = None
+        self._printed: Snapshot | None = None
 
-    def show(self, view: View) -> None:
-        """Print a view, if it is due."""
-        self._last = view
-        if view.time >= self._due or self._changed(view):
-            self._due = view.time + _LINE_EVERY_S
-            self._print(view)
+    def show(self, snapshot: Snapshot) -> None:
+        """Print a snapshot if it is due."""
+        self._last = snapshot
+        if snapshot.time >= self._due or self._changed(snapshot):
+            self._due = snapshot.time + _LINE_EVERY_S
+            self._print(snapshot)
 
     def finish(self) -> None:
-        """Print the last view, if it was not."""
+        """Print the last snapshot if it has not been printed."""
         if self._last is not None and self._last is not self._printed:
             self._print(self._last)
 
-    def _changed(self, view: View) -> bool:
+    def _changed(self, snapshot: Snapshot) -> bool:
         from flexneedle.types import VISIBLE
 
         before = self._printed
-        return before is not None and (view.verdict == VISIBLE) != (before.verdict == VISIBLE)
+        return before is not None and (snapshot.verdict == VISIBLE) != (before.verdict == VISIBLE)
 
-    def _print(self, view: View) -> None:
-        self._printed = view
-        print(_line(view), flush=True)
+    def _print(self, snapshot: Snapshot) -> None:
+        self._printed = snapshot
+        print(_line(snapshot), flush=True)
 
 
-def _line(view: View) -> str:
-    if view.frame is None or not view.is_new:
-        return f"{view.time:8.2f} s  verdict: {view.verdict}"
-    time, sensors = view.frame.time, "  ".join(_cells(view.frame))
-    return f"{time:8.2f} s  frame {view.frame.number}  {sensors}  verdict: {view.verdict}"
+def _line(snapshot: Snapshot) -> str:
+    if snapshot.frame is None or not snapshot.is_new:
+        return f"{snapshot.time:8.2f} s  verdict: {snapshot.verdict}"
+    time, sensors = snapshot.frame.time, "  ".join(_cells(snapshot.frame))
+    return f"{time:8.2f} s  frame {snapshot.frame.number}  {sensors}  verdict: {snapshot.verdict}"
 
 
 def _cells(frame: Frame) -> Iterator[str]:
-    """Position and indicator of the tip, or of the first sensor; of the others the indicator."""
+    """Position and indicator of the tip (without a tip: of the first sensor), and the indicators of all others."""
     from flexneedle.rig.tracking.table import TIP
 
     first = TIP if TIP in frame.readings else next(iter(frame.readings), "")
@@ -146,29 +149,33 @@ def _cells(frame: Frame) -> Iterator[str]:
         if reading.position is None:
             yield f"{name} {reading.status}"
             continue
-        place = " {:.2f} {:.2f} {:.2f} mm".format(*reading.position) if name == first else ""
-        yield f"{name}{place}" + ("" if reading.indicator is None else f" I {reading.indicator:.4f}")
+        position = " {:.2f} {:.2f} {:.2f} mm".format(*reading.position) if name == first else ""
+        yield f"{name}{position}" + ("" if reading.indicator is None else f" I {reading.indicator:.4f}")
 
 
-def _live_table(stack: ExitStack) -> Callable[[View], None]:
+def _live_table(stack: ExitStack) -> Callable[[Snapshot], None]:
     from rich.live import Live
 
     live = stack.enter_context(Live(auto_refresh=True, refresh_per_second=10))
-    return lambda view: live.update(_table(view))
+    return lambda snapshot: live.update(_table(snapshot))
 
 
-def _table(view: View) -> Table:
+def _table(snapshot: Snapshot) -> Table:
     from rich.table import Table
     from rich.text import Text
 
-    number = "none yet" if view.frame is None else str(view.frame.number)
-    table = Table(title=f"{view.time:.1f} s, frame {number}", caption=Text(f"verdict: {view.verdict}"))
+    number = "none yet" if snapshot.frame is None else str(snapshot.frame.number)
+    table = Table(
+        title=f"{snapshot.time:.1f} s, frame {number}", caption=Text(f"verdict: {snapshot.verdict}")
+    )
     for head in ("sensor", "x mm", "y mm", "z mm", "indicator", "status"):
         table.add_column(head, justify="left" if head in ("sensor", "status") else "right")
-    for name, reading in view.frame.readings.items() if view.frame is not None and view.is_new else ():
-        place = (
+    for name, reading in (
+        snapshot.frame.readings.items() if snapshot.frame is not None and snapshot.is_new else ()
+    ):
+        position = (
             ("", "", "") if reading.position is None else tuple(f"{part:.2f}" for part in reading.position)
         )
         indicator = "" if reading.indicator is None else f"{reading.indicator:.4f}"
-        table.add_row(*map(Text, (name, *place, indicator, reading.status)))
+        table.add_row(*map(Text, (name, *position, indicator, reading.status)))
     return table

@@ -1,1 +1,1 @@
-"""What a table of repeated measurements reveals about a tracker."""
+"""Evaluation of a tracker from a table of repeated measurements."""

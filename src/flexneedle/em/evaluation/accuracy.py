@@ -1,8 +1,8 @@
-"""Errors of a grid as in the paper, section IV-B (eqs. eq:mean_pos, eq:measurement_error, eq:em_rmse, eq:em_std).
+"""Errors on a grid as defined in the paper, section IV-B (eq:mean_pos, eq:measurement_error, eq:em_rmse, eq:em_std).
 
-err_i = ‖P̄_i − P_i‖ with the mean P̄_i of the samples at grid point i, rmse = √(Σ err_i² / N) over the N points, each
-of the same weight, jitter = √(Σ_i Σ_j ‖P̄_i − P̃_ij‖² / Σ_i M_i) over all samples: with M at each point that is the
-paper's. A point with one sample adds nothing to the sum of squares; if all points have one, the jitter is unknown.
+err_i = ‖P̄_i − P_i‖ with the mean P̄_i of the samples at grid point i, rmse = √(Σ err_i² / N) over the N points with
+equal weights, jitter = √(Σ_i Σ_j ‖P̄_i − P̃_ij‖² / Σ_i M_i) over all samples, which is the paper's for M samples at each
+point. A point with one sample adds nothing to the sum of squares; if all points have one, the jitter is unknown.
 """
 
 from dataclasses import dataclass
@@ -19,24 +19,25 @@ from flexneedle.em.evaluation.intervals import (
     mean,
     quantile_interval,
 )
-from flexneedle.em.table.grid import Grid, Places
+from flexneedle.em.table.grid import Grid, Moments
 from flexneedle.errors import InputError
 from flexneedle.rig.tracking.registration import Rigid, fiducial_error, fit_rigid
 
 P95 = 0.95
-"""Quantiles: linear interpolation between ranks, (n − 1) q counted from 0 (Hyndman and Fan 1996, type 7)."""
+"""Quantiles interpolate linearly at rank (n − 1) q, counted from 0 (Hyndman and Fan 1996, type 7)."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Errors of one sensor in one environment (mm), and what they were computed from.
+    """Errors of one sensor in one environment (mm), with the numbers of points and samples.
 
-    n_points: with a sample; n_unseen: without; n_single: with one, which adds an error, but no scatter. sd_mm: of the
-    errors, n − 1. bias_mm: mean error vector. beyond_max: with 95 % confidence no more than this share of the volume
-    has errors beyond `max_mm` (Wilks 1941); a maximum has no useful bootstrap interval. intervals: 95 %, by bootstrap;
-    that of p95_mm from order statistics. jitter_mm: NaN, without an interval, if no point has two samples.
+    n_points: grid points with samples; n_unseen: without; n_single: with one sample, which adds an error but no
+    scatter. sd_mm: standard deviation of the errors (n − 1). bias_mm: mean error vector. beyond_max: upper 95 %
+    confidence limit of the share of the volume with errors above `max_mm` (Wilks 1941), since a maximum has no useful
+    bootstrap interval. intervals: 95 %, bootstrap, but from order statistics for p95_mm. jitter_mm: NaN and without an
+    interval if no point has two samples.
     """
 
     n_points: int
@@ -59,8 +60,8 @@ class Accuracy:
 
 
 @dataclass(frozen=True)
-class Registration:
-    """The rigid map from tracker to stage, p → R p + t: rows of R, t (mm); RMS of what is left (mm)."""
+class RigidFit:
+    """The rigid transform from tracker to stage, p → R p + t: rows of R, t (mm), RMS residual (mm)."""
 
     rotation: tuple[tuple[float, ...], ...]
     translation_mm: tuple[float, ...]
@@ -69,31 +70,31 @@ class Registration:
     n_points: int
 
 
-def error_vectors(places: Places) -> Floats:
-    """Return mean measured minus true position (n, 3), mm; NaN where there is no sample."""
-    return places.position - places.true
+def error_vectors(moments: Moments) -> Floats:
+    """Return mean measured minus true position (n, 3), mm; NaN without samples."""
+    return moments.position - moments.true
 
 
-def errors(places: Places) -> Floats:
+def errors(moments: Moments) -> Floats:
     """Return err_i (n,), mm."""
-    lengths: Floats = np.linalg.norm(error_vectors(places), axis=1)
+    lengths: Floats = np.linalg.norm(error_vectors(moments), axis=1)
     return lengths
 
 
 def root_mean_square(values: Floats) -> float:
-    """Return √(Σ v² / n) of values (n,), NaN without any."""
+    """Return √(Σ v² / n) of values (n,), NaN if there are none."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else nan
 
 
-def jitter(places: Places) -> float:
-    """Return the jitter over all samples (mm), NaN if no place has two."""
-    if places.count.max(initial=0) < 2:
+def jitter(moments: Moments) -> float:
+    """Return the jitter over all samples (mm), NaN if no point has two."""
+    if moments.count.max(initial=0) < 2:
         return nan
-    return float(np.sqrt(np.nansum(places.scatter) / places.count.sum()))
+    return float(np.sqrt(np.nansum(moments.scatter) / moments.count.sum()))
 
 
 def accuracy(grid: Grid) -> Accuracy:
-    """Return the errors of a grid. Raises InputError if no point of it has a sample."""
+    """Return the errors of a grid. Raises InputError if no grid point has a sample."""
     measured = grid.measured()
     if not len(measured):
         raise InputError(f"sensor {grid.sensor!r}, environment {grid.environment!r}: all samples are missing")
@@ -120,7 +121,7 @@ def accuracy(grid: Grid) -> Accuracy:
     )
 
 
-def _intervals(error: Floats, measured: Places) -> dict[str, Interval]:
+def _intervals(error: Floats, measured: Moments) -> dict[str, Interval]:
     scatter, count = measured.scatter.sum(axis=1), measured.count.astype(float)
     return {
         "rmse_mm": bootstrap(_rms, error),
@@ -141,10 +142,10 @@ def _pooled(scatter: Floats, count: Floats, axis: int) -> Floats:
     return np.sqrt(squares)
 
 
-def register(grid: Grid) -> tuple[Grid, Registration]:
-    """Return the grid after a rigid least-squares fit of its mean positions to the true ones, and the fit.
+def register_grid(grid: Grid) -> tuple[Grid, RigidFit]:
+    """Return the grid after a rigid least-squares fit of its mean to its true positions, and the fit.
 
-    Raises InputError if there are fewer than three points, or all on a line.
+    Raises InputError for fewer than three points or collinear points.
     """
     measured = grid.measured()
     try:
@@ -154,12 +155,12 @@ def register(grid: Grid) -> tuple[Grid, Registration]:
             f"--register: sensor {grid.sensor!r}, environment {grid.environment!r}: {error}"
         ) from None
     residual = fiducial_error(rigid, measured.position, measured.true)
-    return grid.registered(rigid), _registration(rigid, residual, len(measured))
+    return grid.registered(rigid), _rigid_fit(rigid, residual, len(measured))
 
 
-def _registration(rigid: Rigid, residual: float, points: int) -> Registration:
+def _rigid_fit(rigid: Rigid, residual: float, points: int) -> RigidFit:
     from scipy.spatial.transform import Rotation
 
     angle = np.degrees(Rotation.from_matrix(rigid.rotation).magnitude())
     rows = tuple(tuple(row) for row in rigid.rotation.tolist())
-    return Registration(rows, tuple(rigid.translation.tolist()), float(angle), residual, points)
+    return RigidFit(rows, tuple(rigid.translation.tolist()), float(angle), residual, points)

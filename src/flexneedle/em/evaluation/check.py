@@ -1,6 +1,6 @@
-"""`flexneedle em check`: whether the rig's own power distorts the field (paper, section IV-B).
+"""`flexneedle em check`: does the rig's own power distort the field (paper, section IV-B)?
 
-The indicator with power off and on, from two environments of one table.
+Compares the indicator with power off and on, from two environments of one table.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from flexneedle.em.evaluation.accuracy import P95
 from flexneedle.em.evaluation.evaluate import Options, read_table
 from flexneedle.em.evaluation.indicator import means
 from flexneedle.em.evaluation.intervals import Interval, bootstrap
-from flexneedle.em.evaluation.notes import differing_points, lacking_sensors
+from flexneedle.em.evaluation.notes import differing_points, missing_sensors
 from flexneedle.em.table.grid import Grid
 from flexneedle.errors import InputError
 
@@ -25,7 +25,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Level:
-    """The indicator with power off or on: means at grid points, the largest single sample, and samples above."""
+    """The indicator with power off or on: over means at grid points, and of single samples.
+
+    samples_max: largest single sample; samples_above: share of single samples above the threshold.
+    """
 
     n_points: int
     n_samples: int
@@ -37,11 +40,11 @@ class Level:
 
 
 @dataclass(frozen=True)
-class Power:
-    """A sensor with power off and on. difference: mean on minus mean off; its interval is over grid points.
+class PowerComparison:
+    """Indicator of one sensor with power off and on. difference: mean on minus mean off, with a bootstrap interval.
 
-    paired: over the same points both times, so that only what changed counts. above: the mean with power on exceeds the
-    threshold; points_above: at how many grid points it does.
+    paired: both were measured at the same grid points, which are then resampled in pairs. above: the mean with power on
+    exceeds the threshold; points_above: number of grid points where it does.
     """
 
     sensor: str
@@ -56,10 +59,10 @@ class Power:
 
 
 @dataclass(frozen=True, eq=False)
-class Check:
-    """What the power of the rig does to each sensor with an indicator both times; notes: what cannot be compared."""
+class PowerCheck:
+    """Comparison of each sensor with an indicator in both environments; notes: what could not be compared."""
 
-    sensors: list[Power]
+    sensors: list[PowerComparison]
     notes: list[str]
 
     @property
@@ -73,7 +76,7 @@ class Check:
         return published.POWERED
 
     def values(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """Return the result as plain values."""
         return {
             "above": self.above,
             "paper_powered": self.paper,
@@ -82,13 +85,13 @@ class Check:
         }
 
 
-def check(data: Path, off: str, on: str, threshold: float, options: Options) -> Check:
+def check(data: Path, off: str, on: str, threshold: float, options: Options) -> PowerCheck:
     """Return the comparison of the environments `off` and `on` of a table.
 
-    Raises InputError for a table that cannot be used, or where no sensor has an indicator both times.
+    Raises InputError for an invalid table, or if no sensor has an indicator in both environments.
     """
     grids, _ = read_table(data, options)
-    before, after = (_of(data, grids, name) for name in (off, on))
+    before, after = (_grids_of(data, grids, name) for name in (off, on))
     both = [name for name in before if name in after]
     if not both:
         raise InputError(
@@ -100,15 +103,15 @@ def check(data: Path, off: str, on: str, threshold: float, options: Options) -> 
         for power, own in (("off", before), ("on", after))
         for grid in own.values()
     ]
-    notes = [*lacking_sensors(powered, "no indicator in"), *differing_points(powered)]
-    return Check([compare(before[name], after[name], threshold) for name in both], notes)
+    notes = [*missing_sensors(powered, "no indicator in"), *differing_points(powered)]
+    return PowerCheck([compare(before[name], after[name], threshold) for name in both], notes)
 
 
-def compare(off: Grid, on: Grid, threshold: float) -> Power:
-    """Return the comparison of a sensor's grids, both with an indicator."""
+def compare(off: Grid, on: Grid, threshold: float) -> PowerComparison:
+    """Return the comparison of two grids of one sensor, both with an indicator."""
     low, high = means(off)[0], means(on)[0]
     paired = _names(off) == _names(on)
-    return Power(
+    return PowerComparison(
         sensor=on.sensor,
         threshold=threshold,
         off=_level(off, threshold),
@@ -121,13 +124,13 @@ def compare(off: Grid, on: Grid, threshold: float) -> Power:
     )
 
 
-def _of(data: Path, grids: Sequence[Grid], environment: str) -> dict[str, Grid]:
-    there = list(dict.fromkeys(grid.environment for grid in grids))
-    if environment not in there:
+def _grids_of(data: Path, grids: Sequence[Grid], environment: str) -> dict[str, Grid]:
+    present = list(dict.fromkeys(grid.environment for grid in grids))
+    if environment not in present:
         raise InputError(
-            f"{data}: no environment {environment!r}: choose one by --off or --on: {', '.join(there)}"
+            f"{data}: no environment {environment!r}: choose with --off and --on from {', '.join(present)}"
         )
-    return {grid.sensor: grid for grid in grids if grid.environment == environment and grid.levels.count}
+    return {grid.sensor: grid for grid in grids if grid.environment == environment and grid.histogram.count}
 
 
 def _names(grid: Grid) -> list[str]:
@@ -143,10 +146,10 @@ def _level(grid: Grid, threshold: float) -> Level:
     values = means(grid)[0]
     return Level(
         n_points=len(values),
-        n_samples=grid.levels.count,
+        n_samples=grid.histogram.count,
         mean=float(values.mean()),
         p95=float(np.quantile(values, P95)),
         max=float(values.max()),
-        samples_max=grid.levels.most,
-        samples_above=grid.levels.above(threshold),
+        samples_max=grid.histogram.maximum,
+        samples_above=grid.histogram.above(threshold),
     )

@@ -1,4 +1,4 @@
-"""Error over the distance from sensor to field generator, and from how near the tracker keeps a limit."""
+"""Error over the distance from sensor to field generator, and where it meets a limit."""
 
 from dataclasses import dataclass
 
@@ -9,10 +9,10 @@ from flexneedle.em.table.grid import Grid
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """A bin of distances, from_mm to to_mm (not included): the mean distance of its samples and their errors (mm).
+class DistanceBin:
+    """Errors (mm) in the bin from_mm ≤ distance < to_mm. distance_mm: mean distance of its samples.
 
-    A grid point that was measured at several distances has a mean position, and an error, in each bin.
+    A grid point measured at several distances has a mean position and an error in each bin.
     """
 
     from_mm: float
@@ -27,52 +27,52 @@ class Stretch:
 
 
 @dataclass(frozen=True)
-class Distances:
-    """Errors by distance, nearest first, and the smallest distance whose RMSE is at most `limit_mm`.
+class DistanceErrors:
+    """Errors by distance, nearest bin first, and the nearest bin whose RMSE is at most `limit_mm`.
 
-    smallest_mm: the mean distance in that bin, None if no bin meets the limit, or there is none. exceeded_mm: distances
-    beyond it whose RMSE is over the limit again.
+    smallest_mm: mean distance of that bin, None without a limit or if no bin meets it. exceeded_mm: distances of
+    farther bins whose RMSE exceeds the limit.
     """
 
     bin_mm: float
     limit_mm: float | None
     smallest_mm: float | None
     exceeded_mm: tuple[float, ...]
-    bins: tuple[Stretch, ...]
+    bins: tuple[DistanceBin, ...]
 
     @property
-    def kept(self) -> str:
-        """Where the limit is kept, in words; in the nearest bin it may be kept nearer, too."""
+    def limit_met(self) -> str:
+        """Description of the distances at which the limit is met; nearer ones than the nearest bin are unknown."""
         if self.limit_mm is None:
             return "no limit"
         if self.smallest_mm is None:
             return "nowhere"
         nearest = self.smallest_mm == self.bins[0].distance_mm
         if not self.exceeded_mm:
-            return "everywhere measured" if nearest else f"from {self.smallest_mm:.0f} mm"
+            return "at all measured distances" if nearest else f"from {self.smallest_mm:.0f} mm"
         within = (b.distance_mm for b in self.bins if b.distance_mm < self.exceeded_mm[0])
         start = f"up to {max(within):.0f} mm" if nearest else f"from {self.smallest_mm:.0f} mm"
         return f"{start}, not at {', '.join(f'{distance:.0f}' for distance in self.exceeded_mm)} mm"
 
 
-def distances(grid: Grid, bin_mm: float, limit_mm: float | None) -> Distances | None:
+def distances(grid: Grid, bin_mm: float, limit_mm: float | None) -> DistanceErrors | None:
     """Return the errors by distance, None if the table has no distances."""
     cells = grid.cells[(grid.cells.count > 0) & (grid.cells.bins >= 0)]
     if not len(cells):
         return None
-    found = tuple(_stretch(grid, int(number), bin_mm) for number in np.unique(cells.bins))
+    found = tuple(_bin(grid, int(number), bin_mm) for number in np.unique(cells.bins))
     if limit_mm is None:
-        return Distances(bin_mm, None, None, (), found)
-    meets = [stretch.distance_mm for stretch in found if stretch.rmse_mm <= limit_mm]
+        return DistanceErrors(bin_mm, None, None, (), found)
+    meets = [one.distance_mm for one in found if one.rmse_mm <= limit_mm]
     smallest = meets[0] if meets else None
-    beyond = (s.distance_mm for s in found if smallest is not None and s.distance_mm > smallest)
-    return Distances(bin_mm, limit_mm, smallest, tuple(d for d in beyond if d not in meets), found)
+    beyond = (one.distance_mm for one in found if smallest is not None and one.distance_mm > smallest)
+    return DistanceErrors(bin_mm, limit_mm, smallest, tuple(d for d in beyond if d not in meets), found)
 
 
-def _stretch(grid: Grid, number: int, bin_mm: float) -> Stretch:
+def _bin(grid: Grid, number: int, bin_mm: float) -> DistanceBin:
     cells = grid.cells[(grid.cells.bins == number) & (grid.cells.count > 0)]
     error, count = errors(cells), cells.count
-    return Stretch(
+    return DistanceBin(
         from_mm=number * bin_mm,
         to_mm=(number + 1) * bin_mm,
         distance_mm=float(np.average(cells.distance, weights=count)),

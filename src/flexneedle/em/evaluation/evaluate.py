@@ -1,4 +1,4 @@
-"""`flexneedle em evaluate`: a table of measurements in, errors, indicator and figures out."""
+"""`flexneedle em evaluate`: errors and indicator of a table of measurements, and the files of results."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -6,18 +6,18 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.em.evaluation import published
-from flexneedle.em.evaluation.accuracy import Accuracy, Registration, accuracy, register
-from flexneedle.em.evaluation.distance import Distances, distances
+from flexneedle.em.evaluation.accuracy import Accuracy, RigidFit, accuracy, register_grid
+from flexneedle.em.evaluation.distance import DistanceErrors, distances
 from flexneedle.em.evaluation.indicator import Summary, summary
 from flexneedle.em.evaluation.notes import notes
 from flexneedle.em.evaluation.points import POINTS_FILE, points_text
 from flexneedle.em.evaluation.repeatability import (
     Orientation,
+    RelativeDistance,
     Repeatability,
-    Spacing,
     orientation,
+    relative_distance,
     repeatability,
-    spacing,
 )
 from flexneedle.em.evaluation.separation import Separation, separation
 from flexneedle.em.evaluation.units import refuse_metres
@@ -37,12 +37,12 @@ _FORMAT = 1
 
 @dataclass(frozen=True)
 class Options:
-    """How a table is read and evaluated.
+    """Options of reading and evaluating a table.
 
-    columns: pairs "theirs=ours" or paths of TOML files with such; unit: "mm", "m", or None for millimetres that are
-    refused where they look like metres; limit_mm: RMSE for the smallest distance (None: the maker's, where the sensor
-    is one of the paper's); ideal, noisy: names of the environments that the indicator is to separate (None: the
-    paper's, where there are such); sensor, environment: of all rows, for a table without such a column.
+    columns: pairs "NAME=COLUMN" or paths of TOML files with such pairs; unit: "mm", "m", or None for millimetres with a
+    check that they are not metres; limit_mm: limit of the RMSE over distance (None: the manufacturer's RMSE for the
+    paper's sensors); ideal, noisy: names of the environments to be separated by the indicator (None: the paper's);
+    sensor, environment: of all rows, for a table without such a column.
     """
 
     columns: tuple[str, ...] = ()
@@ -57,34 +57,34 @@ class Options:
 
     @property
     def pair(self) -> tuple[str, str]:
-        """Names of the environments that the indicator is to separate."""
+        """Names of the environments to be separated by the indicator."""
         return self.ideal or published.IDEAL, self.noisy or published.NOISY
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """One sensor in one environment."""
+    """Results of one sensor in one environment."""
 
     grid: Grid
     accuracy: Accuracy
-    registration: Registration | None
+    registration: RigidFit | None
     summary: Summary | None
-    spacing: Spacing
+    relative_distance: RelativeDistance
     repeatability: Repeatability
     orientation: Orientation | None
-    distances: Distances | None
+    distances: DistanceErrors | None
 
     def values(self) -> dict[str, Any]:
         """Return the result as plain values; lengths in mm, full precision."""
-        kind = published.kind(self.grid.sensor) or ""
+        sensor = published.paper_sensor(self.grid.sensor) or ""
         return {
             "sensor": self.grid.sensor,
             "environment": self.grid.environment,
             **asdict(self.accuracy),
-            "official": published.OFFICIAL.get(kind),
-            "paper": published.MEASURED.get((kind, self.grid.environment)),
+            "official": published.OFFICIAL.get(sensor),
+            "paper": published.MEASURED.get((sensor, self.grid.environment)),
             "registration": _values(self.registration),
-            "relative_distance": asdict(self.spacing),
+            "relative_distance": asdict(self.relative_distance),
             "repeatability": asdict(self.repeatability),
             "orientation": _values(self.orientation),
             "distance": _values(self.distances),
@@ -94,7 +94,7 @@ class Result:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The evaluation of a table. `notes`: how unusual data was treated, a line each."""
+    """The evaluation of a table. notes: one line on each unusual property of the data."""
 
     data: Path
     options: Options
@@ -104,7 +104,7 @@ class Evaluation:
     notes: list[str]
 
     def values(self) -> dict[str, Any]:
-        """Return all of it as plain values, without the figures."""
+        """Return the evaluation as plain values, without the figures."""
         return {
             "format": _FORMAT,
             "data": str(self.data),
@@ -118,7 +118,7 @@ class Evaluation:
 
 
 def evaluate(data: Path, options: Options) -> Evaluation:
-    """Return the evaluation of a table, read once. Raises InputError for one that cannot be used."""
+    """Return the evaluation of a table. Raises InputError for an invalid table."""
     grids, rows = read_table(data, options)
     try:
         _check_names(grids, options)
@@ -131,18 +131,18 @@ def evaluate(data: Path, options: Options) -> Evaluation:
         for sensor in dict.fromkeys(grid.sensor for grid in registered)
         if (found := separation(sensor, *_environments(registered, sensor, options))) is not None
     ]
-    remarks = notes(registered, options.pair, hinted=not options.register)
-    return Evaluation(data, options, rows, results, separations, remarks)
+    found_notes = notes(registered, options.pair, suggest_registration=not options.register)
+    return Evaluation(data, options, rows, results, separations, found_notes)
 
 
 def read_table(data: Path, options: Options) -> tuple[list[Grid], int]:
-    """Return the grids of a table, and how many rows it has. Raises InputError for one that cannot be used."""
-    theirs = column_map(options.columns)
-    given = {"sensor": options.sensor, "environment": options.environment}
-    names = {column: name for column, name in given.items() if name is not None}
+    """Return the grids of a table and its number of rows. Raises InputError for an invalid table."""
+    mapping = column_map(options.columns)
+    labels = {"sensor": options.sensor, "environment": options.environment}
+    names = {column: name for column, name in labels.items() if name is not None}
     optional = (*OPTIONAL, "indicator", *names)
     required = [column for column in REQUIRED if column not in optional]
-    with open_table(data, theirs, required, optional, names, options.unit or "mm") as table:
+    with open_table(data, mapping, required, optional, names, options.unit or "mm") as table:
         grids, rows = read_grids(table, options.bin_mm)
         if options.unit is None:
             refuse_metres(grids)
@@ -160,23 +160,23 @@ def write_evaluation(evaluation: Evaluation, folder: Path, figures: Iterable[Pat
 
 
 def _check_names(grids: Sequence[Grid], options: Options) -> None:
-    there = list(dict.fromkeys(grid.environment for grid in grids))
+    present = list(dict.fromkeys(grid.environment for grid in grids))
     for option in ("ideal", "noisy"):
         name = getattr(options, option)
-        if name is not None and name not in there:
-            raise InputError(f"--{option}: no environment {name!r}: there is {', '.join(there)}")
+        if name is not None and name not in present:
+            raise InputError(f"--{option}: no environment {name!r}: choose from {', '.join(present)}")
 
 
 def _result(grid: Grid, options: Options) -> Result:
-    grid, registration = register(grid) if options.register else (grid, None)
-    official = published.OFFICIAL.get(published.kind(grid.sensor) or "", {})
+    grid, registration = register_grid(grid) if options.register else (grid, None)
+    official = published.OFFICIAL.get(published.paper_sensor(grid.sensor) or "", {})
     limit = options.limit_mm if options.limit_mm is not None else official.get("rmse_mm")
     return Result(
         grid,
         accuracy(grid),
         registration,
         summary(grid),
-        spacing(grid),
+        relative_distance(grid),
         repeatability(grid),
         orientation(grid),
         distances(grid, options.bin_mm, limit),
@@ -212,6 +212,6 @@ def _separation_values(found: Separation, options: Options) -> dict[str, Any]:
         "auc_interval": found.auc_interval,
         "roc": {"false_alarms": found.false_alarms, "detected": found.detected},
         "paper": {"threshold": published.THRESHOLD, **published.FITS, "indicator": published.INDICATOR}
-        if published.kind(found.sensor) == REFERENCE
+        if published.paper_sensor(found.sensor) == REFERENCE
         else None,
     }

@@ -1,4 +1,4 @@
-"""The indicator 𝓘 of field distortion: its summary (paper, Table II), and the error over it."""
+"""The indicator 𝓘 of field distortion: its summary (paper, Table II), and the error as a function of it."""
 
 from dataclasses import dataclass
 from math import nan
@@ -14,8 +14,8 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Singles:
-    """Single samples of the indicator: exact but for p95, which is that of bins 0.0001 wide."""
+class SingleSamples:
+    """Statistics of single samples of the indicator; p95 is taken from a histogram with bins of 0.0001."""
 
     n_samples: int
     mean: float
@@ -26,7 +26,7 @@ class Singles:
 
 @dataclass(frozen=True)
 class Summary:
-    """The mean indicator at each grid point, over grid points (sd with n − 1), and over `singles` samples."""
+    """Statistics of the mean indicator at grid points (sd with n − 1); samples: those of single samples."""
 
     n_points: int
     mean: float
@@ -35,12 +35,12 @@ class Summary:
     min: float
     p95: float
     intervals: dict[str, Interval]
-    samples: Singles
+    samples: SingleSamples
 
 
 @dataclass(frozen=True)
-class Constant:
-    """err = mean ± sd (mm, n − 1), as in the paper's `ideal`."""
+class ConstantFit:
+    """Constant fit err = mean ± sd (mm, n − 1), as for the paper's `ideal`."""
 
     n_points: int
     mean_mm: float
@@ -49,10 +49,11 @@ class Constant:
 
 
 @dataclass(frozen=True)
-class Line:
-    """err = slope · 𝓘 + intercept (mm), as in the paper's `noisy`: least squares; scatter_mm: about it (n − 2).
+class LineFit:
+    """Least-squares line err = slope · 𝓘 + intercept (mm), as for the paper's `noisy`.
 
-    NaN if there are fewer than three points or the indicator is the same at all.
+    scatter_mm: standard deviation of the residuals (n − 2), NaN for fewer than three points. Slope and intercept are
+    NaN if the indicator is the same at all points.
     """
 
     n_points: int
@@ -63,7 +64,7 @@ class Line:
 
 
 def means(grid: Grid) -> tuple[Floats, Floats]:
-    """Return mean indicator and error (mm) (n,) of the grid points that have both."""
+    """Return mean indicator and error (mm) (n,) of the grid points with an indicator."""
     known = grid.points[grid.points.indicators > 0]
     return known.indicator, errors(known)
 
@@ -85,41 +86,43 @@ def summary(grid: Grid) -> Summary | None:
             "sd": bootstrap(deviation, values),
             "p95": quantile_interval(values, P95),
         },
-        samples=_singles(grid),
+        samples=_single_samples(grid),
     )
 
 
-def _singles(grid: Grid) -> Singles:
-    known, levels = grid.points[grid.points.indicators > 0], grid.levels
+def _single_samples(grid: Grid) -> SingleSamples:
+    known, histogram = grid.points[grid.points.indicators > 0], grid.histogram
     average = float(np.average(known.indicator, weights=known.indicators))
-    return Singles(levels.count, average, levels.most, levels.least, levels.quantile(P95))
+    return SingleSamples(
+        histogram.count, average, histogram.maximum, histogram.minimum, histogram.quantile(P95)
+    )
 
 
-def constant(error: Floats) -> Constant:
-    """Return the constant fit to errors (n,), n at least 1."""
+def constant(error: Floats) -> ConstantFit:
+    """Return the constant fit to errors (n,), n ≥ 1."""
     spread = float(error.std(ddof=1)) if len(error) > 1 else nan
     found = {"mean_mm": bootstrap(mean, error), "sd_mm": bootstrap(deviation, error)}
-    return Constant(len(error), float(error.mean()), spread, found)
+    return ConstantFit(len(error), float(error.mean()), spread, found)
 
 
-def line(indicator: Floats, error: Floats) -> Line:
-    """Return the least-squares line through errors (n,) over the indicator (n,), with pairs drawn again."""
+def line(indicator: Floats, error: Floats) -> LineFit:
+    """Return the least-squares line through errors (n,) over the indicator (n,); pairs are resampled."""
     slope, intercept = float(_slope(indicator, error)), float(_intercept(indicator, error))
-    rest, free = error - slope * indicator - intercept, len(error) - 2
+    residual, freedom = error - slope * indicator - intercept, len(error) - 2
     known = np.isfinite(slope)
     found = {
         "slope_mm": bootstrap(_slope, indicator, error) if known else None,
         "intercept_mm": bootstrap(_intercept, indicator, error) if known else None,
     }
-    scatter = float(np.sqrt(rest @ rest / free)) if free > 0 else nan
-    return Line(len(error), slope, intercept, scatter, found)
+    scatter = float(np.sqrt(residual @ residual / freedom)) if freedom > 0 else nan
+    return LineFit(len(error), slope, intercept, scatter, found)
 
 
 def _slope(x: Floats, y: Floats, axis: int = -1) -> Floats:
-    """Return the slope (…) of the line through y over x (…, n), NaN where all x are the same."""
-    off = x - x.mean(axis=axis, keepdims=True)
-    spread = np.where(np.ptp(x, axis=axis) > 0.0, (off**2).sum(axis=axis), nan)
-    slope: Floats = (off * (y - y.mean(axis=axis, keepdims=True))).sum(axis=axis) / spread
+    """Return the slope (…) of the line through y over x (…, n), NaN if all x are equal."""
+    centred = x - x.mean(axis=axis, keepdims=True)
+    spread = np.where(np.ptp(x, axis=axis) > 0.0, (centred**2).sum(axis=axis), nan)
+    slope: Floats = (centred * (y - y.mean(axis=axis, keepdims=True))).sum(axis=axis) / spread
     return slope
 
 

@@ -1,8 +1,8 @@
-"""95 % intervals over grid points: what other grid points of the same kind would have given.
+"""95 % confidence intervals over grid points.
 
-Grid points are drawn again, with all their samples, since samples at one point share its error. The interval takes
-the points for independent draws from the volume. Errors of a smooth field are alike at neighbours, so it is too
-narrow where the field changes little from point to point; and it covers neither another day nor another room.
+Grid points are resampled with all their samples, since samples at one point share its error. The intervals assume that
+the points are independent draws from the volume. The errors of a smooth field are correlated at neighbouring points, so
+an interval is too narrow if the field changes little from point to point. It covers no other day and no other room.
 """
 
 from collections.abc import Callable
@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 CONFIDENCE, RESAMPLES, SEED = 0.95, 2000, 0
 LEAST_POINTS = 10
-"""With fewer there is no interval: that of a few would be far too narrow."""
+"""Fewest points for an interval; with fewer it would be far too narrow."""
 _CHUNK = 4_000_000  # numbers held in memory at once
 
 Floats = NDArray[np.float64]
 Interval = tuple[float, float] | None
 Statistic = Callable[..., Floats]
-"""From samples (…, n) and the keyword axis=-1 to the value of the statistic of each (…)."""
+"""Function of samples (…, n) and the keyword axis=-1 that returns the statistic (…)."""
 
 
 def mean(values: Floats, axis: int = -1) -> Floats:
@@ -35,14 +35,14 @@ def deviation(values: Floats, axis: int = -1) -> Floats:
 def bootstrap(statistic: Statistic, *samples: Floats, paired: bool = True) -> Interval:
     """Return the percentile interval of a statistic of samples (n,), None for fewer than ten points.
 
-    paired: the same points are drawn of each sample; otherwise each is drawn for itself.
+    paired: the same points are drawn from all samples; otherwise each sample is resampled independently.
     """
     from scipy import stats
 
     if min(map(len, samples)) < LEAST_POINTS:
         return None
     with np.errstate(divide="ignore", invalid="ignore"):
-        drawn = stats.bootstrap(
+        resampled = stats.bootstrap(
             samples,
             statistic,
             n_resamples=RESAMPLES,
@@ -54,16 +54,16 @@ def bootstrap(statistic: Statistic, *samples: Floats, paired: bool = True) -> In
             rng=np.random.default_rng(SEED),
         ).bootstrap_distribution
     tail = (1.0 - CONFIDENCE) / 2.0
-    low, high = np.nanquantile(drawn, (tail, 1.0 - tail)).tolist()
+    low, high = np.nanquantile(resampled, (tail, 1.0 - tail)).tolist()
     return low, high
 
 
 def quantile_interval(values: Floats, share: float) -> Interval:
-    """Return an interval of the quantile at `share` of what values (n,) were drawn from, None if they are too few.
+    """Return the interval of the quantile at `share` from values (n,), None for fewer than ten.
 
-    It ends at order statistics, and so holds for any distribution (Conover 1999, section 3.2): a bootstrap of a far
-    quantile is too narrow. The upper end is infinite where even the largest value may be below the quantile, which
-    for 95 % is so with fewer than 72 points.
+    Its ends are order statistics, valid for any distribution (Conover 1999, section 3.2); a bootstrap of an extreme
+    quantile is too narrow. The upper end is infinite if the quantile may exceed the largest value, which for 95 % is
+    the case with fewer than 72 points.
     """
     from scipy import stats
 

@@ -1,53 +1,53 @@
-"""Notes on unusual data in a table of measurements, and on how it was treated."""
+"""Notes on unusual data in a table of measurements and its treatment."""
 
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from flexneedle.em.evaluation.accuracy import errors, register, root_mean_square
+from flexneedle.em.evaluation.accuracy import errors, register_grid, root_mean_square
 from flexneedle.em.table.grid import Grid
-from flexneedle.em.table.rules import SAME_MM
+from flexneedle.em.table.rules import SAME_POSITION_MM
 from flexneedle.errors import InputError
 from flexneedle.rig.tracking.registration import misfit
 
-_OWN_FRAME = 5.0
-"""A rigid fit that leaves less than a fifth of the RMSE: the tracker has most likely a frame of its own."""
-_FEW = 6  # grid points; of fewer a rigid fit, with its six numbers, leaves little in any case
+_UNREGISTERED = 5.0
+"""If a rigid fit lowers the RMSE by more than this factor, tracker and stage most likely have different frames."""
+_FEWEST_POINTS = 6  # a rigid fit with its six parameters always fits fewer points well
 
 
-def notes(grids: Sequence[Grid], pair: tuple[str, str], hinted: bool) -> list[str]:
+def notes(grids: Sequence[Grid], pair: tuple[str, str], suggest_registration: bool) -> list[str]:
     """Return a line for each unusual property of the grids.
 
-    pair: the environments that the indicator is to separate; hinted: add a note where a rigid fit is missing.
+    pair: environments to be separated by the indicator; suggest_registration: add a note if --register seems needed.
     """
     return [
-        *(f"{grid.title}: {odd}" for grid in grids if (odd := "; ".join(_odd(grid)))),
-        *lacking_sensors(grids),
+        *(f"{grid.title}: {unusual}" for grid in grids if (unusual := "; ".join(_unusual(grid)))),
+        *missing_sensors(grids),
         *differing_points(grids),
         *misfits(grids),
-        *(_own_frame(grids) if hinted else ()),
-        *_lacking(grids, pair),
+        *(_unregistered(grids) if suggest_registration else ()),
+        *_missing_environments(grids, pair),
     ]
 
 
-def lacking_sensors(grids: Sequence[Grid], absent: str = "not in") -> Iterator[str]:
-    """Yield a line for each sensor that is not in all environments, described by `absent`."""
-    everywhere = list(dict.fromkeys(grid.environment for grid in grids))
+def missing_sensors(grids: Sequence[Grid], absent: str = "not in") -> Iterator[str]:
+    """Yield a line, with the words `absent`, for each sensor that is missing in an environment."""
+    environments = list(dict.fromkeys(grid.environment for grid in grids))
     for sensor in dict.fromkeys(grid.sensor for grid in grids):
         own = [grid.environment for grid in grids if grid.sensor == sensor]
-        lacking = [name for name in everywhere if name not in own]
-        if lacking:
-            yield f"{sensor}: {absent} {', '.join(lacking)}, only in {', '.join(own)}"
+        missing = [name for name in environments if name not in own]
+        if missing:
+            yield f"{sensor}: {absent} {', '.join(missing)}, only in {', '.join(own)}"
 
 
 def differing_points(grids: Sequence[Grid]) -> Iterator[str]:
-    """Yield a line for each sensor that was not measured at the same grid points in all environments."""
+    """Yield a line for each sensor whose grid points differ between environments."""
     for sensor in dict.fromkeys(grid.sensor for grid in grids):
         own = {grid.environment: _measured_names(grid) for grid in grids if grid.sensor == sensor}
         shared = set.intersection(*own.values())
         if any(names != shared for names in own.values()):
             counts = ", ".join(f"{len(names)} in {name}" for name, names in own.items())
-            yield f"{sensor}: grid points: {counts}, {len(shared)} of them in all: different places are compared"
+            yield f"{sensor}: grid points: {counts}, {len(shared)} in common: the compared positions differ"
 
 
 def _measured_names(grid: Grid) -> set[str]:
@@ -58,64 +58,65 @@ def _points(count: int) -> str:
     return f"{count} grid point{'s' if count != 1 else ''}"
 
 
-def _odd(grid: Grid) -> Iterator[str]:
+def _unusual(grid: Grid) -> Iterator[str]:
     count, missing = grid.points.count, int(grid.points.missing.sum())
-    single, lacking, known = int((count == 1).sum()), int((count == 0).sum()), count[count > 0]
-    places = np.unique(np.round(grid.points.true / SAME_MM), axis=0)
-    if len(places) < len(count):
-        yield f"{len(count) - len(places)} of {_points(len(count))} under a second point_id (counted as points)"
+    single, empty, known = int((count == 1).sum()), int((count == 0).sum()), count[count > 0]
+    distinct = np.unique(np.round(grid.points.true / SAME_POSITION_MM), axis=0)
+    if len(distinct) < len(count):
+        repeated = len(count) - len(distinct)
+        yield f"{repeated} of {_points(len(count))} repeat a position under another point_id (counted as points)"
     if missing:
         yield f"{missing} of {missing + int(count.sum())} samples have no position (left out)"
-    if lacking:
-        yield f"no sample at {lacking} of {_points(len(count))} (left out)"
+    if empty:
+        yield f"no sample at {empty} of {_points(len(count))} (left out)"
     if len(known) and single == len(known):
-        yield "one sample at each grid point (jitter and repeatability are not known)"
+        yield "one sample at each grid point (jitter and repeatability are unknown)"
     elif single:
-        yield f"one sample at {_points(single)} (an error each, nothing for the jitter)"
+        yield f"one sample at {_points(single)} (used for the errors, not for the jitter)"
     if len(known) and known.min() != known.max():
-        weights = "points weigh alike in the errors, samples in the jitter"
-        yield f"{known.min()} to {known.max()} samples a grid point ({weights})"
+        weights = "errors weight points equally, jitter weights samples equally"
+        yield f"{known.min()} to {known.max()} samples per grid point ({weights})"
     if (grid.cells.count > 0).sum() > len(known):
-        yield "points were measured at several distances (pooled in all figures but those by distance)"
+        yield "points were measured at several distances (pooled except in the errors by distance)"
 
 
 def misfits(grids: Sequence[Grid]) -> Iterator[str]:
-    """Yield a line for each grid that was registered although no rotation takes it to the stage's."""
+    """Yield a line for each registered grid that no rigid transform maps to the stage's."""
     for grid in grids:
         measured = grid.measured()
         if grid.rigid is not None and (wrong := misfit(measured.position, measured.true)) is not None:
             yield f"{grid.title}: {wrong}"
 
 
-def _own_frame(grids: Sequence[Grid]) -> Iterator[str]:
+def _unregistered(grids: Sequence[Grid]) -> Iterator[str]:
     fits = [(grid, *fit) for grid in grids if (fit := _fit(grid)) is not None]
     if fits:
-        grid, as_it_is, left = max(fits, key=lambda fit: fit[1])
+        grid, raw, residual = max(fits, key=lambda fit: fit[1])
         others = f", and {len(fits) - 1} more" if len(fits) > 1 else ""
         yield (
-            f"the RMSE of {as_it_is:.3g} mm would be {left:.2g} mm after a rigid fit ({grid.title}{others}): "
-            "if the tracker has a frame of its own, add --register"
+            f"a rigid fit would reduce the RMSE from {raw:.3g} mm to {residual:.2g} mm ({grid.title}{others}): "
+            "if tracker and stage have different frames, add --register"
         )
 
 
 def _fit(grid: Grid) -> tuple[float, float] | None:
-    """Return the RMSE as it is and after a rigid fit (mm), if that leaves a small part of it."""
+    """Return the RMSE before and after a rigid fit (mm), None if the fit does not reduce it much."""
     measured = grid.measured()
-    if len(measured) < _FEW:
+    if len(measured) < _FEWEST_POINTS:
         return None
     try:
-        left = register(grid)[1].residual_mm
-    except InputError:  # points on a line: no fit to compare with
+        residual = register_grid(grid)[1].residual_mm
+    except InputError:  # collinear points: no fit to compare with
         return None
-    as_it_is = root_mean_square(errors(measured))
-    return (as_it_is, left) if as_it_is > _OWN_FRAME * left else None
+    raw = root_mean_square(errors(measured))
+    return (raw, residual) if raw > _UNREGISTERED * residual else None
 
 
-def _lacking(grids: Sequence[Grid], pair: tuple[str, str]) -> Iterator[str]:
-    there = list(dict.fromkeys(grid.environment for grid in grids if grid.points.indicators.any()))
-    lacking = [name for name in pair if name not in there]
-    if len(there) > 1 and lacking:
+def _missing_environments(grids: Sequence[Grid], pair: tuple[str, str]) -> Iterator[str]:
+    present = list(dict.fromkeys(grid.environment for grid in grids if grid.points.indicators.any()))
+    missing = [name for name in pair if name not in present]
+    if len(present) > 1 and missing:
         yield (
-            f"no indicator in an environment called {' or '.join(lacking)} (there is {', '.join(there)}): "
-            "--ideal and --noisy name the two that it is to separate"
+            f"no indicator in an environment named {' or '.join(missing)} (found: {', '.join(present)}): "
+            "use --ideal and --noisy to name the two environments to compare"
         )

@@ -1,4 +1,4 @@
-"""What an evaluation knows of each grid point, as a table of its own."""
+"""The table of results at each grid point."""
 
 import csv
 import io
@@ -21,7 +21,7 @@ _COLUMNS = (
 
 
 def points_text(grids: Iterable[Grid]) -> str:
-    """Return CSV with a row for each grid point of each grid, all digits; empty where something is not known."""
+    """Return CSV with one row per grid point, with all digits; unknown values are empty."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_COLUMNS)

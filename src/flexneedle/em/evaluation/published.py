@@ -1,7 +1,7 @@
-"""Published figures of the paper's tracker, to compare with what is measured.
+"""Published values of the paper's tracker, for comparison with measurements.
 
-OFFICIAL: the maker's figures (NDI 2013) as the paper quotes them in Table I; MEASURED: the paper's own, Tables I and
-II. Where text and tables of the paper differ (0.17 and 0.25 mm against 0.65 and 0.61 mm), these are the tables'.
+OFFICIAL: the manufacturer's values (NDI 2013) as quoted in Table I of the paper; MEASURED: the paper's own, Tables I
+and II. Text and tables of the paper differ (0.17 and 0.25 mm against 0.65 and 0.61 mm): these are the tables' values.
 """
 
 import re
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from flexneedle.rig.tracking.table import REFERENCE, TIP
 
 IDEAL, NOISY = "ideal", "noisy"
-"""The paper's environments: nothing near but the stage, and a metal plate underneath."""
+"""The paper's environments: with nothing but the stage nearby, and above a metal plate."""
 
 Figures = Mapping[str, float]
 
@@ -31,15 +31,15 @@ INDICATOR: Mapping[str, Figures] = {
     NOISY: {"mean": 0.1944, "sd": 0.1049, "max": 0.4784, "min": 0.0684},
 }
 FITS: Figures = {"mean_mm": 0.575, "sd_mm": 0.211, "slope_mm": 9.591, "intercept_mm": 0.051}
-"""err = mean ± sd in `ideal`, err = slope · 𝓘 + intercept in `noisy`, of the reference sensor."""
+"""Fits of the reference sensor: err = mean ± sd in `ideal`, err = slope · 𝓘 + intercept in `noisy`."""
 POWERED = 0.04
 """The indicator with the needle driver's power on."""
-_A_REFERENCE = re.compile(rf"(ref|{REFERENCE})\d*")
+_REFERENCE = re.compile(rf"(ref|{REFERENCE})\d*")
 
 
-def kind(sensor: str) -> str | None:
-    """Return which of the paper's sensors one of this name is: the tip, a reference (ref, ref1, …), or None."""
+def paper_sensor(sensor: str) -> str | None:
+    """Return the paper's sensor that the name stands for: the tip, a reference (ref, ref1, …), or None."""
     name = sensor.strip().lower()
     if name == TIP:
         return TIP
-    return REFERENCE if _A_REFERENCE.fullmatch(name) else None
+    return REFERENCE if _REFERENCE.fullmatch(name) else None

@@ -1,13 +1,13 @@
 """Repeatability of single points in position and orientation, and errors of the distance between two points.
 
-These are what ASTM F2554 calls the repeatability of the coordinates of a single point and the relative point-to-point
-accuracy (linear). Neither needs the frames of tracker and stage to be registered. The figures are computed from a
-grid of means; the standard's whole procedure has several orientations of the tool and several operators, too.
+ASTM F2554 calls these the repeatability of the coordinates of a single point and the relative point-to-point accuracy
+(linear). Neither needs a registration of tracker and stage. The values are computed from the means at grid points; the
+standard also asks for several orientations of the tool and several operators.
 
-The jitter of the orientation is from mean products of unit quaternions: q and −q are the same rotation and add alike.
-The mean of quaternions q_j is the eigenvector m of A = Σ q_j q_jᵀ / n with the largest eigenvalue λ (Markley, Cheng,
-Crassidis and Oshman 2007). The angle φ_j between q_j and m has cos(φ_j / 2) = |q_j · m|, so that 1 − λ is the mean of
-sin²(φ_j / 2): 2 arcsin √(1 − λ) is the RMS angle, but for terms of fourth order.
+The orientation jitter is computed from mean products of unit quaternions, in which q and −q, the same rotation, are
+equal. The mean of quaternions q_j is the eigenvector m of A = Σ q_j q_jᵀ / n with the largest eigenvalue λ (Markley,
+Cheng, Crassidis and Oshman 2007). The angle φ_j between q_j and m has cos(φ_j / 2) = |q_j · m|, so that 1 − λ is
+the mean of sin²(φ_j / 2): 2 arcsin √(1 − λ) is the RMS angle up to terms of fourth order.
 """
 
 from dataclasses import dataclass
@@ -20,18 +20,18 @@ from flexneedle.em.evaluation.accuracy import P95, root_mean_square
 from flexneedle.em.table.grid import Grid
 
 MOST_PAIRS = 1_000_000
-"""Up to this number of pairs of grid points all are compared (1414 points); of more, this number, with a fixed seed."""
-_SAME_SPACING = 0.01  # pairs up to 1 % farther apart than the closest are neighbours
+"""Largest number of compared pairs of grid points (all pairs of 1414 points); of more, a sample with a fixed seed."""
+_SAME_SPACING = 0.01  # neighbours: pairs up to 1 % farther apart than the closest
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Repeatability:
-    """Standard deviation of single samples about the mean at their grid point (mm), with n − 1 at each point.
+    """Standard deviation (mm) of single samples about the mean at their grid point, n − 1 at each point.
 
-    axis_sd_mm: along the tracker's x, y, z; sd_mm: length of these three. median_mm, worst_mm: of the points' own.
-    NaN if no point has two samples.
+    axis_sd_mm: pooled, along the tracker's x, y, z; sd_mm: norm of these three. median_mm, worst_mm: over the values of
+    single grid points. NaN if no point has two samples.
     """
 
     axis_sd_mm: tuple[float, ...]
@@ -42,10 +42,10 @@ class Repeatability:
 
 
 @dataclass(frozen=True)
-class Spacing:
-    """Measured minus true distance (mm) between grid points: over all pairs, and over the closest neighbours.
+class RelativeDistance:
+    """Measured minus true distance (mm) between grid points, over all pairs and over the closest neighbours.
 
-    sampled: the pairs are a drawn part of all. NaN with fewer than two points.
+    sampled: a random sample of the pairs was used. NaN for fewer than two points.
     """
 
     n_pairs: int
@@ -62,10 +62,10 @@ class Spacing:
 
 @dataclass(frozen=True)
 class Orientation:
-    """RMS angle (degrees) of single samples from the mean orientation at their grid point, over all samples.
+    """RMS angle (degrees) between single samples and the mean orientation at their grid point, over all samples.
 
-    axis_jitter_deg: of the sensor's z axis alone, the needle's, about which a 5-DOF sensor measures no rotation.
-    NaN if no point has two samples.
+    axis_jitter_deg: of the direction of the sensor's z axis, the needle's axis; a 5-DOF sensor does not measure the
+    roll about it. NaN if no point has two samples.
     """
 
     n_samples: int
@@ -83,39 +83,39 @@ def repeatability(grid: Grid) -> Repeatability:
         return Repeatability((nan, nan, nan), nan, nan, nan, "")
     scatter, freedom = measured.scatter[several], measured.count[several] - 1
     axes = np.sqrt(scatter.sum(axis=0) / freedom.sum())
-    own = np.sqrt(scatter.sum(axis=1) / freedom)
-    worst = int(own.argmax())
+    deviation = np.sqrt(scatter.sum(axis=1) / freedom)
+    worst = int(deviation.argmax())
     return Repeatability(
         tuple(axes.tolist()),
         float(np.linalg.norm(axes)),
-        float(np.median(own)),
-        float(own[worst]),
+        float(np.median(deviation)),
+        float(deviation[worst]),
         grid.name_of(np.flatnonzero(several)[worst]),
     )
 
 
-def spacing(grid: Grid, seed: int = 0) -> Spacing:
-    """Return the relative distance errors of a grid."""
+def relative_distance(grid: Grid, seed: int = 0) -> RelativeDistance:
+    """Return the errors of the distances between grid points."""
     measured = grid.measured()
     count = len(measured)
     first, second = _pairs(count, seed)
     if not len(first):
-        return Spacing(0, False, *(nan,) * 5, nan, 0, nan)
+        return RelativeDistance(0, False, *(nan,) * 5, nan, 0, nan)
     true = np.linalg.norm(measured.true[first] - measured.true[second], axis=1)
-    off = np.linalg.norm(measured.position[first] - measured.position[second], axis=1) - true
-    apart = float(true[true > 0.0].min(initial=np.inf))
-    near = (true > 0.0) & (true <= apart * (1.0 + _SAME_SPACING))
-    return Spacing(
-        n_pairs=len(off),
-        sampled=len(off) < count * (count - 1) // 2,
-        mean_mm=float(off.mean()),
-        sd_mm=float(off.std(ddof=1)) if len(off) > 1 else nan,
-        rms_mm=root_mean_square(off),
-        p95_mm=float(np.quantile(np.abs(off), P95)),
-        max_mm=float(np.abs(off).max()),
-        neighbours_apart_mm=apart,
-        neighbours=int(near.sum()),
-        neighbours_rms_mm=root_mean_square(off[near]),
+    error = np.linalg.norm(measured.position[first] - measured.position[second], axis=1) - true
+    closest = float(true[true > 0.0].min(initial=np.inf))
+    neighbours = (true > 0.0) & (true <= closest * (1.0 + _SAME_SPACING))
+    return RelativeDistance(
+        n_pairs=len(error),
+        sampled=len(error) < count * (count - 1) // 2,
+        mean_mm=float(error.mean()),
+        sd_mm=float(error.std(ddof=1)) if len(error) > 1 else nan,
+        rms_mm=root_mean_square(error),
+        p95_mm=float(np.quantile(np.abs(error), P95)),
+        max_mm=float(np.abs(error).max()),
+        neighbours_apart_mm=closest,
+        neighbours=int(neighbours.sum()),
+        neighbours_rms_mm=root_mean_square(error[neighbours]),
     )
 
 
@@ -129,34 +129,34 @@ def _pairs(count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 def orientation(grid: Grid) -> Orientation | None:
-    """Return the jitter of the orientation, None if the table has none."""
-    there = grid.points.turns > 0
-    if not there.any():
+    """Return the orientation jitter, None if the table has no orientations."""
+    known = grid.points.orientations > 0
+    if not known.any():
         return None
-    count, products = grid.points.turns[there], grid.points.products[there]
+    count, products = grid.points.orientations[known], grid.points.products[known]
     if count.max() < 2:
         return Orientation(int(count.sum()), nan, nan, "", nan)
-    squares = np.linalg.eigvalsh(products)[:, :3].sum(axis=1).clip(0.0, 1.0)  # 1 − λ, without cancelling
+    squares = np.linalg.eigvalsh(products)[:, :3].sum(axis=1).clip(0.0, 1.0)  # 1 − λ, without cancellation
     worst = int(squares.argmax())
     return Orientation(
         n_samples=int(count.sum()),
         jitter_deg=_angle(float(squares @ count / count.sum())),
         worst_deg=_angle(float(squares[worst])),
-        worst_at=grid.names[int(np.flatnonzero(there)[worst])],
+        worst_at=grid.names[int(np.flatnonzero(known)[worst])],
         axis_jitter_deg=_angle(float(_off_axis(products) @ count / count.sum())),
     )
 
 
 def _angle(square: float) -> float:
-    """From the mean of sin²(φ/2) to the angle in degrees."""
+    """Return the angle φ (degrees) from the mean of sin²(φ/2)."""
     return float(np.degrees(2.0 * np.arcsin(np.sqrt(square))))
 
 
 def _off_axis(a: Floats) -> Floats:
-    """Return the mean of sin²(φ/2) of the angles of the z axes from their mean direction, from A (n, 4, 4).
+    """Return the mean of sin²(φ/2) of the angles φ between z axes and their mean direction, from A (n, 4, 4).
 
     The z axis of q is (2(xz + wy), 2(yz − wx), 1 − 2(x² + y²)), linear in the products; the mean of n unit vectors
-    has the length ⟨cos φ⟩ along its own direction.
+    has the length ⟨cos φ⟩.
     """
     w, x, y, z = range(4)
     axis = np.stack(

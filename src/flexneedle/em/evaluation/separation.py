@@ -1,4 +1,4 @@
-"""How well a threshold of the indicator separates two environments."""
+"""Separation of two environments by a threshold of the indicator."""
 
 from dataclasses import dataclass
 from math import nan
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.em.evaluation.accuracy import P95
-from flexneedle.em.evaluation.indicator import Constant, Line, constant, line, means
+from flexneedle.em.evaluation.indicator import ConstantFit, LineFit, constant, line, means
 from flexneedle.em.evaluation.intervals import Interval, bootstrap, quantile_interval
 from flexneedle.em.table.grid import Grid
 
@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Confusion:
-    """How many grid points are above a threshold and how many do not, in either environment."""
+    """Numbers of grid points above and not above a threshold in both environments."""
 
     ideal_below: int
     ideal_above: int
@@ -27,27 +27,27 @@ class Confusion:
 
     @property
     def false_alarms(self) -> float:
-        """Share of `ideal` above the threshold."""
+        """Share of the points of `ideal` above the threshold."""
         return _share(self.ideal_above, self.ideal_below)
 
     @property
     def detected(self) -> float:
-        """Share of `noisy` above the threshold."""
+        """Share of the points of `noisy` above the threshold."""
         return _share(self.noisy_above, self.noisy_below)
 
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """The analysis of a sensor's indicator, from the mean values at grid points; None where an environment is lacking.
+    """Analysis of a sensor's mean indicator at grid points; None for what needs a missing environment.
 
-    threshold: 95th percentile in `ideal`. samples_threshold: the same of single samples, which a monitor has;
-    samples_above: share of single samples above `threshold` in `ideal` and `noisy`. auc: how often a point of `noisy`
-    has the higher indicator of two, ties half. false_alarms, detected (k,): the ROC, from (0, 0) to (1, 1).
+    threshold: 95th percentile in `ideal`. samples_threshold: the same for single samples, which a monitor has;
+    samples_above: share of single samples above `threshold` in `ideal` and `noisy`. auc: area under the ROC curve.
+    false_alarms, detected (k,): the ROC curve, from (0, 0) to (1, 1).
     """
 
     sensor: str
-    ideal: Constant | None
-    noisy: Line | None
+    ideal: ConstantFit | None
+    noisy: LineFit | None
     threshold: float | None
     threshold_interval: Interval
     samples_threshold: float | None
@@ -60,7 +60,7 @@ class Separation:
 
 
 def separation(sensor: str, ideal: Grid | None, noisy: Grid | None) -> Separation | None:
-    """Return the analysis of a sensor's indicator in one or two environments, None if it has none in either."""
+    """Return the analysis of a sensor's indicator in one or two environments, None without any indicator."""
     low, low_error = means(ideal) if ideal else (np.empty(0), np.empty(0))
     high, high_error = means(noisy) if noisy else (np.empty(0), np.empty(0))
     if not len(low) and not len(high):
@@ -74,7 +74,7 @@ def separation(sensor: str, ideal: Grid | None, noisy: Grid | None) -> Separatio
         line(high, high_error) if len(high) else None,
         threshold,
         quantile_interval(low, P95),
-        ideal.levels.quantile(P95) if ideal and len(low) else None,
+        ideal.histogram.quantile(P95) if ideal and len(low) else None,
         (_above(ideal, threshold), _above(noisy, threshold)),
         _confusion(low, high, threshold) if both and threshold is not None else None,
         float(area(low, high)) if both else None,
@@ -87,7 +87,7 @@ def separation(sensor: str, ideal: Grid | None, noisy: Grid | None) -> Separatio
 def roc(low: Floats, high: Floats) -> tuple[Floats, Floats]:
     """Return the shares (k,) of `low` and of `high` above each threshold, from (0, 0) to (1, 1).
 
-    Points on the straight line between their neighbours are left out.
+    Points on a straight line between their neighbours are omitted.
     """
     levels = np.concatenate([np.unique(np.concatenate([low, high]))[::-1], [-np.inf]])
     shares = (
@@ -101,9 +101,8 @@ def roc(low: Floats, high: Floats) -> tuple[Floats, Floats]:
 
 
 def area(low: Floats, high: Floats, axis: int = -1) -> Floats:
-    """Return the area (…) under the ROC of values (…, n) and (…, m): the share of pairs with `high` above `low`.
-
-    Ties count half (Mann and Whitney 1947).
+    """Return the area (…) under the ROC of values (…, n) and (…, m): the share of pairs with `high` above `low`, ties
+    counted half (Mann and Whitney 1947).
     """
     from scipy import stats
 
@@ -118,9 +117,9 @@ def _confusion(low: Floats, high: Floats, threshold: float) -> Confusion:
 
 
 def _area_interval(low: Floats, high: Floats) -> Interval:
-    """Draw both environments again, each for itself; None if they are separated perfectly, few, or very many.
+    """Return the interval of the area; None for perfect separation, and for few or very many points.
 
-    With perfect separation every sample drawn again is perfect, too.
+    With perfect separation each resample is perfect, too.
     """
     if max(len(low), len(high)) > _MOST_FOR_AREA or area(low, high) in (0.0, 1.0):
         return None
@@ -128,9 +127,9 @@ def _area_interval(low: Floats, high: Floats) -> Interval:
 
 
 def _above(grid: Grid | None, threshold: float | None) -> float | None:
-    if grid is None or threshold is None or not grid.levels.count:
+    if grid is None or threshold is None or not grid.histogram.count:
         return None
-    return grid.levels.above(threshold)
+    return grid.histogram.above(threshold)
 
 
 def _share(one: int, other: int) -> float:

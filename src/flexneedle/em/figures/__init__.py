@@ -1,1 +1,1 @@
-"""Figures of evaluations and registrations. They take arrays and names."""
+"""Figures of evaluations and registrations, from arrays and names."""

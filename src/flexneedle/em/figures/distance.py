@@ -1,4 +1,4 @@
-"""RMSE over the distance from sensor to field generator, with the limit on it."""
+"""RMSE over the distance from sensor to field generator, with its limit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from flexneedle.figures.layout import look, short
 from flexneedle.figures.style import new_figure, styled
 
-_LINE = 30  # characters in a line of the legend
-_HIGH, _ROW = 3.8, 0.16  # inches: of the figure, and of a line of the legend
+_LINE = 30  # characters per line of the legend
+_HIGH, _ROW = 3.8, 0.16  # inches: least height of the figure; height of a line of the legend
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class DistanceLine:
-    """A sensor in an environment: distance and RMSE (k,) of each bin (mm), the limit of the RMSE, the verdict."""
+    """A sensor in an environment: distance and RMSE (k,) of the bins, limit of the RMSE (mm); note for the legend."""
 
     name: str
     distance: Floats
@@ -29,7 +29,7 @@ class DistanceLine:
 
 
 def distance_figure(lines: Sequence[DistanceLine]) -> Figure:
-    """Return the figure with a line for each sensor and environment, and its limit dashed in the same colour."""
+    """Return the figure with a line for each sensor and environment; its limit is dashed in the same colour."""
     labels = [f"{short(line.name, _LINE)}\n{fill(line.note, _LINE)}" for line in lines]
     limits = dict.fromkeys(line.limit for line in lines if line.limit is not None)
     rows = sum(label.count("\n") + 2 for label in labels) + 2 * len(limits)

@@ -1,4 +1,4 @@
-"""The figures of an evaluation: as many as its data supports."""
+"""The figures of an evaluation."""
 
 from pathlib import Path
 
@@ -6,11 +6,11 @@ import numpy as np
 
 from flexneedle.em.evaluation.accuracy import error_vectors
 from flexneedle.em.evaluation.evaluate import Evaluation, Result
-from flexneedle.em.evaluation.indicator import Line, means
+from flexneedle.em.evaluation.indicator import LineFit, means
 from flexneedle.em.evaluation.separation import Separation
 from flexneedle.em.figures.distance import DistanceLine, distance_figure
 from flexneedle.em.figures.field import FieldRow, field_figure
-from flexneedle.em.figures.indicator import IndicatorPanel, Shown, indicator_figure
+from flexneedle.em.figures.indicator import IndicatorPanel, PlottedPoints, indicator_figure
 from flexneedle.em.figures.roc import RocLine, roc_figure
 from flexneedle.em.table.grid import Grid
 from flexneedle.figures.style import save, signed
@@ -19,7 +19,7 @@ MOST_PANELS = 3
 
 
 def draw_evaluation(evaluation: Evaluation, folder: Path) -> list[Path]:
-    """Draw `field`, `indicator`, `roc` and `distance` as PNG and SVG, without those that have no data."""
+    """Draw `field`, `indicator`, `roc` and `distance` as PNG and SVG, omitting those without data."""
     paths = save(field_figure([_field(result) for result in evaluation.results]), folder, "field")
     panels = [_indicator(evaluation, found) for found in evaluation.separations[:MOST_PANELS]]
     if panels:
@@ -29,12 +29,12 @@ def draw_evaluation(evaluation: Evaluation, folder: Path) -> list[Path]:
     lines = [_roc(evaluation, found) for found in evaluation.separations if found.confusion]
     if lines:
         paths += save(roc_figure(lines), folder, "roc")
-    far = [
+    binned = [
         _distance(result)
         for result in evaluation.results
         if result.distances and len(result.distances.bins) > 1
     ]
-    return paths + (save(distance_figure(far), folder, "distance") if far else [])
+    return paths + (save(distance_figure(binned), folder, "distance") if binned else [])
 
 
 def _field(result: Result) -> FieldRow:
@@ -45,18 +45,18 @@ def _field(result: Result) -> FieldRow:
 def _indicator(evaluation: Evaluation, found: Separation) -> IndicatorPanel:
     own = {result.grid.environment: result.grid for result in evaluation.results if _is_of(result, found)}
     ideal, noisy = (own.get(name) for name in evaluation.options.pair)
-    flat, line = found.ideal, found.noisy
+    constant, line = found.ideal, found.noisy
     return IndicatorPanel(
         found.sensor,
-        _shown(ideal, f"{flat.mean_mm:.3f} ± {flat.sd_mm:.3f} mm") if ideal and flat else None,
-        _shown(noisy, _line_text(line)) if noisy and line else None,
-        (flat.mean_mm, flat.sd_mm) if flat else None,
+        _points(ideal, f"{constant.mean_mm:.3f} ± {constant.sd_mm:.3f} mm") if ideal and constant else None,
+        _points(noisy, _line_text(line)) if noisy and line else None,
+        (constant.mean_mm, constant.sd_mm) if constant else None,
         (line.slope_mm, line.intercept_mm) if line else None,
         found.threshold,
     )
 
 
-def _line_text(line: Line) -> str:
+def _line_text(line: LineFit) -> str:
     sign = "+" if line.intercept_mm >= 0.0 else "−"
     return f"{signed(line.slope_mm, '.3f')} I {sign} {abs(line.intercept_mm):.3f} mm"
 
@@ -65,14 +65,14 @@ def _is_of(result: Result, found: Separation) -> bool:
     return result.grid.sensor == found.sensor and result.summary is not None
 
 
-def _shown(grid: Grid, fit: str) -> Shown:
-    return Shown(grid.environment, *means(grid), fit)
+def _points(grid: Grid, fit: str) -> PlottedPoints:
+    return PlottedPoints(grid.environment, *means(grid), fit)
 
 
 def _roc(evaluation: Evaluation, found: Separation) -> RocLine:
     confusion, threshold = found.confusion, found.threshold
     if confusion is None or threshold is None:
-        raise ValueError("a ROC needs both environments")
+        raise ValueError("a ROC curve needs both environments")
     own = {result.grid.environment: result.grid for result in evaluation.results if _is_of(result, found)}
     names = evaluation.options.pair
     values = [means(own[name])[0] for name in names]
@@ -94,7 +94,7 @@ def _roc(evaluation: Evaluation, found: Separation) -> RocLine:
 def _distance(result: Result) -> DistanceLine:
     found = result.distances
     if found is None:
-        raise ValueError("there are no distances")
+        raise ValueError("the result has no distances")
     distance, rmse = (np.array([getattr(b, name) for b in found.bins]) for name in ("distance_mm", "rmse_mm"))
-    note = found.kept if found.limit_mm is None else f"within {found.limit_mm:g} mm {found.kept}"
+    note = found.limit_met if found.limit_mm is None else f"within {found.limit_mm:g} mm {found.limit_met}"
     return DistanceLine(result.grid.title, distance, rmse, found.limit_mm, note)

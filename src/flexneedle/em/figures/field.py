@@ -1,4 +1,4 @@
-"""The error field: slices of the volume, an arrow from each grid point along its error."""
+"""The error field: slices of the volume with an arrow at each grid point along its error."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ from flexneedle.figures.style import QUIET, WIDTH, new_figure, signed, styled
 
 MOST_ROWS, MOST_SLICES = 6, 5
 MOST_ARROWS = 400
-"""In a slice; of more, every k-th is drawn, and a note is added."""
+"""Most arrows per slice; of more, every k-th is drawn, with a note."""
 _COLORS = "viridis_r"
-_AROUND, _WIDEST = 0.95, 3.0  # inches: of titles and labels of a row, of a slice
+_AROUND, _WIDEST = 0.95, 3.0  # inches: height of titles and labels of a row; largest width of a slice
 
 Floats = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -36,11 +36,11 @@ class FieldRow:
 
 
 def field_figure(rows: Sequence[FieldRow]) -> Figure:
-    """Return the figure: a row of slices (x, y at heights z) for each of up to six sensors and environments."""
+    """Return the figure: a row of slices (x, y at constant z) for each of up to six sensors and environments."""
     shown = rows[:MOST_ROWS]
     layers = [_slices(row.true[:, 2]) for row in shown]
     columns = max(map(len, layers))
-    across = 2 if columns == 1 and len(shown) > 1 else 1  # planes, two side by side
+    across = 2 if columns == 1 and len(shown) > 1 else 1  # two single slices side by side
     down = ceil(len(shown) / across)
     with styled():
         figure = new_figure(down * (_AROUND + min((WIDTH / across - 1.6) / columns, _WIDEST)))
@@ -66,10 +66,10 @@ def _draw_row(part: SubFigure, row: FieldRow, slices: Sequence[Numbers]) -> None
         ax.set_title(_level(row.true[chosen, 2]), color=QUIET, fontsize=8, fontweight="normal")
     made[0].set_ylabel("y (mm)")
     bar = part.colorbar(ScalarMappable(norm, _COLORS), ax=made, ticks=MaxNLocator(4), pad=0.01, aspect=15)
-    bar.set_label("error, x, y, z (mm)", fontsize=8)
-    thinned = ", not every one drawn" if max(map(len, slices)) > MOST_ARROWS else ""
+    bar.set_label("3D error (mm)", fontsize=8)
+    thinned = ", not all drawn" if max(map(len, slices)) > MOST_ARROWS else ""
     part.suptitle(short(row.title, 60), x=0.01, ha="left", weight="bold", fontsize=8.5)
-    note = f"x (mm); arrows {factor:g} times as long as the errors in x, y{thinned}"
+    note = f"x (mm); arrows: errors in x, y × {factor:g}{thinned}"
     part.supxlabel(note, color=QUIET, fontsize=8)
 
 
@@ -86,7 +86,7 @@ def _draw_slice(ax: Axes, row: FieldRow, chosen: Numbers, factor: float, norm: N
 
 
 def _slices(height: Floats) -> list[Numbers]:
-    """Return the points at each height z, or in five slabs of equal depth where there are more heights than that."""
+    """Return the points at each height z, or in five slabs of equal thickness if there are more heights."""
     levels = np.unique(np.round(height, 2))
     if len(levels) <= MOST_SLICES:
         near = np.argmin(np.abs(height[:, None] - levels), axis=1)
@@ -104,10 +104,10 @@ def _level(height: Floats) -> str:
 
 
 def _factor(row: FieldRow, in_slice: int) -> float:
-    """Return the factor on the arrows' length: 1, 2 or 5 times a power of ten.
+    """Return the scale of the arrows: 1, 2 or 5 times a power of ten.
 
-    The 95th percentile is at most as long as a grid step, and at least 95 % of the arrows end inside the frame; the
-    others are cut at its edge.
+    The 95th percentile of their length is at most one grid step, and at least 95 % of the arrows end inside the frame;
+    the others are clipped at its edge.
     """
     step = float(np.ptp(row.true[:, :2], axis=0).max()) / max(1.0, np.sqrt(in_slice) - 1.0)
     typical = float(np.quantile(np.linalg.norm(row.error, axis=1), 0.95))
@@ -119,12 +119,12 @@ def _factor(row: FieldRow, in_slice: int) -> float:
 
 
 def _room(row: FieldRow) -> Floats:
-    """Return the factor (n,) at which each arrow reaches the edge of the frame."""
+    """Return the scale (n,) at which each arrow reaches the edge of the frame."""
     left, right, bottom, top = _frame(row.true)
-    place, error = row.true[:, :2], row.error[:, :2]
+    position, error = row.true[:, :2], row.error[:, :2]
     ends = np.where(error > 0.0, np.array([right, top]), np.array([left, bottom]))
     with np.errstate(divide="ignore", invalid="ignore"):
-        times = np.where(error != 0.0, (ends - place) / error, np.inf)
+        times = np.where(error != 0.0, (ends - position) / error, np.inf)
     room: Floats = times.min(axis=1)
     return room
 

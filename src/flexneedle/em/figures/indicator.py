@@ -1,4 +1,4 @@
-"""Error over the indicator of distortion, as the paper's figure of indicator values."""
+"""Error over the distortion indicator, like the paper's figure of indicator values."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,17 +14,17 @@ from flexneedle.figures.layout import short
 from flexneedle.figures.style import ESTIMATE, INK, QUIET, TARGET, TRUE, new_figure, styled
 
 FAR, CUT = 2.0, 1.2
-"""An environment whose largest indicator is beyond FAR times its 95th percentile is shown to CUT times that, with the
-number of points beyond. All others are shown whole."""
+"""If the largest indicator exceeds FAR times the 95th percentile, the axis ends at CUT times that percentile and a
+note gives the number of points beyond it."""
 _HIGH = 4.3  # inches
-_LOOKS = ((ESTIMATE, "o"), (TRUE, "^"))
+_STYLES = ((ESTIMATE, "o"), (TRUE, "^"))
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """Mean indicator and error (mm) (n,) at the grid points of one environment, and its fit in words."""
+class PlottedPoints:
+    """Mean indicator and error (mm) (n,) at the grid points of one environment, and the label of its fit."""
 
     name: str
     indicator: Floats
@@ -34,18 +34,18 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class IndicatorPanel:
-    """A sensor: up to two environments, the constant fit (mean, sd), the line (slope, intercept), the threshold."""
+    """One sensor: points of up to two environments, constant fit (mean, sd), line (slope, intercept), threshold."""
 
     sensor: str
-    ideal: Shown | None
-    noisy: Shown | None
+    ideal: PlottedPoints | None
+    noisy: PlottedPoints | None
     constant: tuple[float, float] | None
     line: tuple[float, float] | None
     threshold: float | None
 
 
 def indicator_figure(panels: Sequence[IndicatorPanel], more: int = 0) -> Figure:
-    """Return the figure with a panel for each sensor, side by side; more: number of others, which are not shown."""
+    """Return the figure with a panel for each sensor, side by side; more: number of sensors not shown."""
     with styled():
         figure = new_figure(_HIGH)
         figure.set_layout_engine("constrained")
@@ -59,7 +59,7 @@ def indicator_figure(panels: Sequence[IndicatorPanel], more: int = 0) -> Figure:
 
 
 def _draw(ax: Axes, panel: IndicatorPanel) -> None:
-    pairs = zip((panel.ideal, panel.noisy), _LOOKS, strict=True)
+    pairs = zip((panel.ideal, panel.noisy), _STYLES, strict=True)
     widest = _widest(panel)
     handles = [_scatter(ax, shown, color, marker, widest) for shown, (color, marker) in pairs if shown]
     ax.set_xlim(0.0, widest)
@@ -71,24 +71,24 @@ def _draw(ax: Axes, panel: IndicatorPanel) -> None:
     if panel.threshold is not None:
         _draw_threshold(ax, panel.threshold)
     ax.set_title(panel.sensor, pad=16.0)
-    ax.set_xlabel("indicator I, mean at a grid point")
+    ax.set_xlabel("mean indicator I at a grid point")
     legend = ax.legend(handles=handles, loc="upper left", borderaxespad=0.2, frameon=True, framealpha=0.92)
     legend.get_frame().set(edgecolor="none", facecolor="white")
     legend.set_zorder(5)
 
 
 def _widest(panel: IndicatorPanel) -> float:
-    """Return the largest indicator shown."""
+    """Return the upper limit of the indicator axis."""
     reach = [_reach(shown.indicator) for shown in (panel.ideal, panel.noisy) if shown]
     return 1.04 * max([*reach, panel.threshold or 0.0]) or 1.0
 
 
 def _reach(values: Floats) -> float:
-    most, usual = float(values.max()), float(np.quantile(values, 0.95))
-    return CUT * usual if usual > 0.0 and most > FAR * usual else most
+    largest, typical = float(values.max()), float(np.quantile(values, 0.95))
+    return CUT * typical if typical > 0.0 and largest > FAR * typical else largest
 
 
-def _scatter(ax: Axes, shown: Shown, color: str, marker: str, widest: float) -> Line2D:
+def _scatter(ax: Axes, shown: PlottedPoints, color: str, marker: str, widest: float) -> Line2D:
     many, inside = len(shown.indicator) > 1500, shown.indicator <= widest
     how: dict[str, Any] = {"color": color, "marker": marker, "linewidths": 0.0}
     x, y, size = shown.indicator[inside], shown.error[inside], 4 if many else 13
@@ -96,7 +96,7 @@ def _scatter(ax: Axes, shown: Shown, color: str, marker: str, widest: float) -> 
     label, beyond = f"{short(shown.name, 40)}: {shown.fit}", len(shown.indicator) - len(x)
     if beyond:
         points = "point" if beyond == 1 else "points"
-        label += f"\n({beyond} {points} beyond, up to I = {float(shown.indicator.max()):.3g}, not shown)"
+        label += f"\n({beyond} {points} not shown, up to I = {float(shown.indicator.max()):.3g})"
     return Line2D([], [], color=color, marker=marker, markersize=4.5, linestyle="none", label=label)
 
 

@@ -1,4 +1,4 @@
-"""The picture of a registration: its fiducials with their residuals, and the expected error."""
+"""The figure of a registration: fiducials with their residuals, and the expected error."""
 
 from collections.abc import Callable
 
@@ -14,16 +14,16 @@ from flexneedle.figures.style import ESTIMATE, INK, QUIET, new_figure, styled
 Floats = NDArray[np.float64]
 
 _HEIGHT = 3.9  # inches
-_ARROW = 0.15  # longest residual, as a share of the panel
+_ARROW = 0.15  # length of the longest residual, as a share of the panel
 _VIEWS = ((0, 1, "x (mm)", "y (mm)"), (0, 2, "x (mm)", "z (mm)"))
 
 
 def registration_figure(
     stage: Floats, mapped: Floats, targets: Floats, expected: Callable[[Floats], Floats]
 ) -> Figure:
-    """Draw fiducials (n, 3), arrows to their mapped positions (n, 3), and targets (k, 3); mm.
+    """Draw fiducials (n, 3), arrows along their residuals to the positions `mapped` (n, 3), and targets (k, 3); mm.
 
-    expected: RMS target registration error (mm) at points (m, 3); shown as levels in the planes through the middle.
+    expected: RMS target registration error (mm) at points (m, 3), drawn as contours in planes through the centroid.
     """
     with styled():
         figure = new_figure(_HEIGHT)
@@ -37,8 +37,8 @@ def registration_figure(
             shown = _view(ax, view, stage, mapped, targets, scale, (low, high))
             filled = _field(ax, view, expected, (low, high), stage.mean(axis=0), levels)
             ax.set_title(shown)
-        figure.colorbar(filled, ax=panels, label="expected error, TRE (mm)")
-        note = f"○ fiducial   → residual, {scale:g} times as long   × target"
+        figure.colorbar(filled, ax=panels, label="expected error (TRE, mm)")
+        note = f"○ fiducial   → residual × {scale:g}   × target"
         figure.supxlabel(note, color=QUIET, fontsize=8)
     return figure
 
@@ -95,6 +95,6 @@ def _extent(points: Floats) -> tuple[Floats, Floats]:
 
 
 def _round(factor: float) -> float:
-    """The nearest lower 1, 2 or 5 times a power of ten, at least 1."""
+    """Return the largest 1, 2 or 5 times a power of ten that is at most `factor`; at least 1."""
     power = 10.0 ** np.floor(np.log10(factor))
     return max(1.0, float(power * max(digit for digit in (1, 2, 5) if digit * power <= factor)))

@@ -1,4 +1,4 @@
-"""How a threshold of the indicator separates environments: detection over false alarms, both over the threshold."""
+"""Separation of environments by a threshold of the indicator: the ROC curve, and shares over the threshold."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,17 +14,17 @@ from flexneedle.figures.layout import look, short
 from flexneedle.figures.style import QUIET, new_figure, styled
 
 _NAME = 24  # characters
-_HIGH, _ROW = 4.4, 0.17  # inches: of the figure, and of a line of the legends below
+_HIGH, _ROW = 4.4, 0.17  # inches: height of the axes with their labels; height of a line of the legends
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class RocLine:
-    """A sensor: shares (k,) of grid points above each threshold in an ideal and a noisy environment, and their values.
+    """One sensor: its ROC curve (k,) and the mean indicators at grid points of the ideal and the noisy environment.
 
-    environments: the names of these two.
-    chosen: these shares (false alarms, detected) at the threshold in use, in words in `note`.
+    environments: names of the two; values: their mean indicators; chosen: (false alarms, detected) at `threshold`;
+    note: for the legend.
     """
 
     sensor: str
@@ -38,7 +38,7 @@ class RocLine:
 
 
 def roc_figure(lines: Sequence[RocLine]) -> Figure:
-    """Return the figure: the ROC of each sensor, and beside it the shares above each threshold; legends below."""
+    """Return the figure: ROC curves on the left, shares above the threshold on the right, legends below."""
     rows = max(sum(line.note.count("\n") + 1 for line in lines), 2 * len(lines))
     with styled():
         figure = new_figure(_HIGH + _ROW * rows)
@@ -61,9 +61,9 @@ def _draw_roc(ax: Axes, lines: Sequence[RocLine]) -> None:
         label = f"{short(line.sensor, _NAME)}: {line.note}"
         ax.plot(*line.chosen, own.marker, ms=7, mec="white", zorder=4, label=label, **common)
     ideal, noisy = (short(name, 30) for name in lines[0].environments)
-    _set_share(ax, "y", f"detected: grid points above ({noisy})")
-    _set_share(ax, "x", f"false alarms: grid points above ({ideal})")
-    ax.set_title("Each threshold of the indicator")
+    _set_share(ax, "y", f"detected: points above ({noisy})")
+    _set_share(ax, "x", f"false alarms: points above ({ideal})")
+    ax.set_title("ROC curve of the indicator")
 
 
 def _draw_shares(ax: Axes, lines: Sequence[RocLine]) -> None:
@@ -76,7 +76,7 @@ def _draw_shares(ax: Axes, lines: Sequence[RocLine]) -> None:
             ax.step(ends, above, where="post", color=color, linestyle=style, label=label, zorder=3)
         ax.axvline(line.threshold, color=color, linewidth=0.9, linestyle=(0, (4, 2)), zorder=1)
     ax.set_xlim(left=0.0)
-    ax.set(title="Above the threshold", xlabel="threshold of the indicator (dashed: in use)")
+    ax.set(title="Grid points above a threshold", xlabel="threshold of the indicator (dashed: in use)")
     _set_share(ax, "y", "grid points above")
 
 

@@ -1,1 +1,1 @@
-"""Recording a tracker on a grid of points, and watching one."""
+"""Recording a tracker at the points of a grid, and watching its live readings."""

@@ -1,4 +1,4 @@
-"""Recording a tracker on a grid: point by point onto the disk, continued there after any interruption."""
+"""Recording a tracker on a grid: each point is synced to disk, and an interrupted recording can be resumed."""
 
 import csv
 import fcntl
@@ -14,8 +14,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.em.recording.grid import Grid, Stop
-from flexneedle.em.recording.steps import Visit, disagreement
+from flexneedle.em.recording.grid import StageGrid, Stop
+from flexneedle.em.recording.steps import Visit, motion_mismatch
 from flexneedle.errors import InputError, RunError
 from flexneedle.rig.ports import Clock, Tracker
 from flexneedle.rig.tracking.table import COLUMNS
@@ -23,45 +23,48 @@ from flexneedle.trace.files import uninterrupted
 from flexneedle.types import VISIBLE, Frame, Point, SensorReading
 
 EXTRA = ("time_s", "frame_number", "repeat")
-"""Columns beside those of a table of measurements. Times continue over interruptions."""
+"""Columns in addition to those of a table of measurements. Times continue over interruptions."""
 _HEADER = (*COLUMNS, *EXTRA)
 _FIRST_LINE = ",".join(_HEADER).encode() + b"\n"
 _PAUSE_S = 0.01
-_SILENT_S = 1.0  # without a frame, or a good one, until it is reported
+_SILENT_S = 1.0  # time without a (good) frame after which it is reported
 
 
-def _refuse(doubt: str) -> bool:
-    raise RunError(f"{doubt} (use --force to record it)")
+def _refuse(mismatch: str) -> bool:
+    raise RunError(f"{mismatch} (use --force to record the point anyway)")
 
 
 @dataclass(frozen=True)
-class Guide:
-    """Who moves the stage. ask: moves it to a stop, returns when it is there; report: prints a line.
+class Operator:
+    """Moves the stage. move: moves it to a stop and returns when it has arrived; report: prints a line.
 
-    insists: whether a point that failed is asked for again, or ends the recording. keeps: of a sensor that did not move
-    as the stage did, returns whether the point is kept, or measured again, or raises RunError.
+    retries: a failed point is measured again instead of ending the recording. accepts: called with a message if a
+    sensor did not move as the stage did; True keeps the point, False measures it again; may raise RunError.
     """
 
-    ask: Callable[[Stop], None]
+    move: Callable[[Stop], None]
     report: Callable[[str], None]
-    insists: bool = True
-    keeps: Callable[[str], bool] = _refuse
+    retries: bool = True
+    accepts: Callable[[str], bool] = _refuse
 
 
 @dataclass
 class Session:
-    """An open table, locked, and the stops that it has no rows of yet. size: of what is kept of it, bytes; it is
-    written from there. last_time: the last time in it, s; last: its last stop, if it has any."""
+    """An open, locked table and its remaining stops.
+
+    size: number of valid bytes, after which rows are appended; done: number of recorded stops; last_time: last time in
+    the table (s); last: its last stop, if any.
+    """
 
     file: BinaryIO
     size: int
-    left: Sequence[Stop]
+    remaining: Sequence[Stop]
     done: int
     last_time: float
     last: Visit | None
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Add the rows of a stop, and return when they are on the disk."""
+        """Append the rows of a stop and sync them to disk."""
         data = _text(rows) if self.size else _FIRST_LINE + _text(rows)
         with uninterrupted():
             self.file.truncate(self.size)
@@ -72,15 +75,15 @@ class Session:
 
 
 @contextmanager
-def open_session(path: Path, grid: Grid) -> Iterator[Session]:
-    """Open a table, new or begun, with the stops that are left.
+def open_session(path: Path, grid: StageGrid) -> Iterator[Session]:
+    """Open a new or partial table with the remaining stops.
 
-    Rows of a stop that are not all there are dropped with the first that are added (at once if no stop is left): it
-    is measured again. Until then the table stays as it was, and a new one without rows is removed in the end.
-    Raises InputError if the table is another grid's, is damaged, or is being written.
+    The rows of an incomplete stop are dropped when new rows are appended (at once if no stop remains), and the stop is
+    measured again. Until then the file is unchanged. A new file without rows is removed at the end.
+    Raises InputError if the table belongs to another grid, is damaged or locked.
     """
     if path.suffix == ".parquet":
-        raise InputError(f"{path}: a CSV is written: give a name that ends in .csv")
+        raise InputError(f"{path}: the output is CSV: use a name that ends in .csv")
     try:
         new = not path.exists()
         file = path.open("a+b")
@@ -90,8 +93,8 @@ def open_session(path: Path, grid: Grid) -> Iterator[Session]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise InputError(f"{path}: another process is writing it") from None
-        session = _resumed(path, file, grid)
+            raise InputError(f"{path}: another process is writing this file") from None
+        session = _resume(path, file, grid)
         try:
             yield session
         finally:
@@ -99,41 +102,41 @@ def open_session(path: Path, grid: Grid) -> Iterator[Session]:
                 path.unlink(missing_ok=True)
 
 
-def record(session: Session, tracker: Tracker, clock: Clock, grid: Grid, guide: Guide) -> int:
-    """Measure the stops that are left and return their number.
+def record(session: Session, tracker: Tracker, clock: Clock, grid: StageGrid, operator: Operator) -> int:
+    """Measure the remaining stops and return their number.
 
-    Raises InputError if the tracker lacks a sensor of the grid, RunError if it reports nothing, or if a point cannot be
-    measured and the guide does not insist.
+    Raises InputError if the tracker lacks a sensor of the grid; RunError if it sends no frames, or if a point cannot be
+    measured and the operator does not retry.
     """
-    if session.left:
-        _check_sensors(tracker, clock, grid, guide.report)
+    if session.remaining:
+        _check_sensors(tracker, clock, grid, operator.report)
     start, before = session.last_time, session.last
-    for stop in session.left:
-        frames, before = _measure(tracker, clock, grid, guide, stop, before)
+    for stop in session.remaining:
+        frames, before = _measure(tracker, clock, grid, operator, stop, before)
         session.add([row for frame in frames for row in _rows(grid, stop, frame, start)])
-    return len(session.left)
+    return len(session.remaining)
 
 
-def _check_sensors(tracker: Tracker, clock: Clock, grid: Grid, report: Callable[[str], None]) -> None:
-    """Before the stage is moved: check that the first frame has the grid's sensors."""
-    frames = next(filter(None, _arriving(tracker, clock, grid.file.rest.timeout_s, report)), ())
+def _check_sensors(tracker: Tracker, clock: Clock, grid: StageGrid, report: Callable[[str], None]) -> None:
+    """Check, before the stage is moved, that the first frame has the grid's sensors."""
+    frames = next(filter(None, _new_frames(tracker, clock, grid.file.rest.timeout_s, report)), ())
     if not frames:
         raise RunError(f"no frames within {grid.file.rest.timeout_s:g} s: {tracker.status}")
-    there = frames[-1].readings
+    present = frames[-1].readings
     for name in grid.file.sensors:
-        if name not in there:
-            raise InputError(f"sensors.{name}: the tracker has no such sensor; it has {', '.join(there)}")
+        if name not in present:
+            raise InputError(f"sensors.{name}: the tracker has no such sensor; it has {', '.join(present)}")
 
 
-def _arriving(
+def _new_frames(
     tracker: Tracker, clock: Clock, seconds: float, report: Callable[[str], None]
 ) -> Iterator[tuple[Frame, ...]]:
-    """Yield new frames for a number of seconds; report when none arrive, and when they do again."""
+    """Yield new frames for a number of seconds; report when they stop and when they resume."""
     began = last = clock.now()
     while (now := clock.now()) - began <= seconds:
         frames = tracker.read()
         if frames and last == inf:
-            report("frames arrive again")
+            report("frames resumed")
         if frames:
             last = now
         elif now - last > _SILENT_S:
@@ -144,50 +147,50 @@ def _arriving(
 
 
 def _measure(
-    tracker: Tracker, clock: Clock, grid: Grid, guide: Guide, stop: Stop, before: Visit | None
+    tracker: Tracker, clock: Clock, grid: StageGrid, operator: Operator, stop: Stop, before: Visit | None
 ) -> tuple[list[Frame], Visit]:
-    guide.ask(stop)
+    operator.move(stop)
     while True:
         clock.wait(grid.file.settle_s)
-        frames, complaint = _samples(tracker, clock, grid, guide.report)
-        if not complaint:
+        frames, fault = _samples(tracker, clock, grid, operator.report)
+        if not fault:
             visit = _visit(grid, stop, frames)
-            doubt = "" if before is None else disagreement(before, visit)
-            if not doubt or guide.keeps(doubt):
+            mismatch = "" if before is None else motion_mismatch(before, visit)
+            if not mismatch or operator.accepts(mismatch):
                 return frames, visit
             continue
-        if not guide.insists:
-            raise RunError(f"point {stop.point_id}, repeat {stop.repeat}: {complaint}")
-        guide.report(f"{complaint}; measured again")
-        guide.ask(stop)
+        if not operator.retries:
+            raise RunError(f"point {stop.point_id}, repeat {stop.repeat}: {fault}")
+        operator.report(f"{fault}; retrying")
+        operator.move(stop)
 
 
 def _samples(
-    tracker: Tracker, clock: Clock, grid: Grid, report: Callable[[str], None]
+    tracker: Tracker, clock: Clock, grid: StageGrid, report: Callable[[str], None]
 ) -> tuple[list[Frame], str]:
-    """Return the frames of a point at rest, taken from now on, or what is wrong; report what is waited for.
+    """Return the new frames of a point at rest, and "" or the fault that prevents them; report the cause of a wait.
 
-    While the stage drifts the oldest frames are dropped for new ones.
+    While the stage drifts, new frames replace the oldest ones.
     """
     began, wanted, sensors = clock.now(), grid.file.samples, tuple(grid.file.sensors)
     good: list[Frame] = []
-    complaint, reported, good_at = "no frames", "", began
-    for frames in _arriving(tracker, clock, grid.file.rest.timeout_s, report):
+    last_fault, reported, good_at = "no frames", "", began
+    for frames in _new_frames(tracker, clock, grid.file.rest.timeout_s, report):
         for frame in frames:
             if frame.time < began:
                 continue
             fault = _faults(frame, sensors)
-            complaint, good_at = fault or complaint, good_at if fault else frame.time
+            last_fault, good_at = fault or last_fault, good_at if fault else frame.time
             if fault != reported and frame.time - good_at > _SILENT_S:
                 report(f"waiting: {fault}")
                 reported = fault
             good = good if fault else [*good, frame][-wanted:]
             if not fault and len(good) == wanted:
-                complaint = _drifting(good, sensors, grid.file.rest.drift_mm)
-                if not complaint:
+                last_fault = _drift(good, sensors, grid.file.rest.drift_mm)
+                if not last_fault:
                     return good, ""
-        complaint = complaint if tracker.status == VISIBLE else tracker.status
-    return [], f"no {wanted} good samples within {grid.file.rest.timeout_s:g} s: {complaint}"
+        last_fault = last_fault if tracker.status == VISIBLE else tracker.status
+    return [], f"no {wanted} good samples within {grid.file.rest.timeout_s:g} s: {last_fault}"
 
 
 def _faults(frame: Frame, sensors: Sequence[str]) -> str:
@@ -198,31 +201,33 @@ def _faults(frame: Frame, sensors: Sequence[str]) -> str:
     )
 
 
-def _drifting(frames: Sequence[Frame], sensors: Sequence[str], limit: float) -> str:
-    """Return which sensor moves, by the means of the first and the last third of its samples; "" if none does."""
+def _drift(frames: Sequence[Frame], sensors: Sequence[str], limit: float) -> str:
+    """Return a message on the first sensor whose first and last third of samples differ in their means; "" if none."""
     third = max(1, len(frames) // 3)
     for name in sensors:
-        places = _places(frames, name)
-        drift = dist(places[:third].mean(axis=0), places[-third:].mean(axis=0))
+        positions = _positions(frames, name)
+        drift = dist(positions[:third].mean(axis=0), positions[-third:].mean(axis=0))
         if drift > limit:
-            return f"{name} moves: {drift:.2f} mm from the first to the last third, limit {limit:g} mm"
+            return f"{name} drifts by {drift:.2f} mm from the first to the last third of samples, limit {limit:g} mm"
     return ""
 
 
-def _places(frames: Sequence[Frame], name: str) -> NDArray[np.float64]:
+def _positions(frames: Sequence[Frame], name: str) -> NDArray[np.float64]:
     return np.array([frame.readings[name].position for frame in frames], dtype=float)
 
 
-def _visit(grid: Grid, stop: Stop, frames: Sequence[Frame]) -> Visit:
-    return Visit(stop, {sensor: _mean(_places(frames, name)) for name, sensor in grid.file.sensors.items()})
+def _visit(grid: StageGrid, stop: Stop, frames: Sequence[Frame]) -> Visit:
+    return Visit(
+        stop, {sensor: _mean(_positions(frames, name)) for name, sensor in grid.file.sensors.items()}
+    )
 
 
-def _mean(places: NDArray[np.float64]) -> Point:
-    x, y, z = map(float, places.mean(axis=0))
+def _mean(positions: NDArray[np.float64]) -> Point:
+    x, y, z = map(float, positions.mean(axis=0))
     return x, y, z
 
 
-def _rows(grid: Grid, stop: Stop, frame: Frame, start: float) -> list[dict[str, Any]]:
+def _rows(grid: StageGrid, stop: Stop, frame: Frame, start: float) -> list[dict[str, Any]]:
     return [
         _row(stop, frame.readings[name], sensor, grid.file.environment)
         | {"time_s": start + frame.time, "frame_number": frame.number, "repeat": stop.repeat}
@@ -236,7 +241,7 @@ def _row(stop: Stop, reading: SensorReading, sensor: str, environment: str) -> d
     quaternion = reading.orientation or (None,) * 4
     return (
         {"point_id": stop.point_id, "sensor": sensor, "environment": environment}
-        | dict(zip(("true_x_mm", "true_y_mm", "true_z_mm"), stop.place, strict=True))
+        | dict(zip(("true_x_mm", "true_y_mm", "true_z_mm"), stop.position, strict=True))
         | dict(zip(("x_mm", "y_mm", "z_mm"), reading.position, strict=True))
         | dict(zip(("qw", "qx", "qy", "qz"), quaternion, strict=True))
         # The field generator is at the origin of an Aurora's frame.
@@ -253,67 +258,73 @@ def _text(rows: Sequence[Mapping[str, Any]]) -> bytes:
 # Continuing a table
 
 
-def _resumed(path: Path, file: BinaryIO, grid: Grid) -> Session:
+def _resume(path: Path, file: BinaryIO, grid: StageGrid) -> Session:
     file.seek(0)
     data = file.read()
     stops = list(grid.stops())
     if not data.startswith(_FIRST_LINE):
         if not _FIRST_LINE.startswith(data):
-            raise InputError(f"{path}: is no table of `em record`: name another file with --out")
-        return Session(file, 0, stops, 0, 0.0, None)  # new, or cut in its first line
+            raise InputError(f"{path}: is not a table of `em record`: choose another file with --out")
+        return Session(file, 0, stops, 0, 0.0, None)  # new, or truncated in its first line
     lines = data[len(_FIRST_LINE) :].splitlines(keepends=True)
-    whole = lines if not lines or lines[-1].endswith(b"\n") else lines[:-1]  # the last one may be cut
+    complete = (
+        lines if not lines or lines[-1].endswith(b"\n") else lines[:-1]
+    )  # the last one may be truncated
     size = grid.file.samples * len(grid.file.sensors)
-    done = len(whole) // size
-    _check_rows(path, whole, stops, grid)
-    kept = len(_FIRST_LINE) + sum(map(len, whole[: done * size]))
+    done = len(complete) // size
+    _check_rows(path, complete, stops, grid)
+    kept = len(_FIRST_LINE) + sum(map(len, complete[: done * size]))
     if done == len(stops):
-        file.truncate(kept)  # nothing will be added
+        file.truncate(kept)  # nothing will be appended
     if not done:
         return Session(file, kept, stops, 0, 0.0, None)
-    rows = [_cells(line) for line in whole[(done - 1) * size : done * size]]
-    return Session(file, kept, stops[done:], done, float(rows[-1]["time_s"]), _visited(stops[done - 1], rows))
+    rows = [_fields(line) for line in complete[(done - 1) * size : done * size]]
+    return Session(
+        file, kept, stops[done:], done, float(rows[-1]["time_s"]), _last_visit(stops[done - 1], rows)
+    )
 
 
-def _visited(stop: Stop, rows: Sequence[Mapping[str, str]]) -> Visit:
+def _last_visit(stop: Stop, rows: Sequence[Mapping[str, str]]) -> Visit:
     names = {row["sensor"] for row in rows}
-    return Visit(stop, {n: _mean(np.array([_place(r) for r in rows if r["sensor"] == n])) for n in names})
+    return Visit(stop, {n: _mean(np.array([_position(r) for r in rows if r["sensor"] == n])) for n in names})
 
 
-def _place(row: Mapping[str, str]) -> Point:
+def _position(row: Mapping[str, str]) -> Point:
     return float(row["x_mm"]), float(row["y_mm"]), float(row["z_mm"])
 
 
-def _check_rows(path: Path, lines: Sequence[bytes], stops: Sequence[Stop], grid: Grid) -> None:
+def _check_rows(path: Path, lines: Sequence[bytes], stops: Sequence[Stop], grid: StageGrid) -> None:
     size = grid.file.samples * len(grid.file.sensors)
     for number, line in enumerate(lines):
         stop = stops[number // size] if number // size < len(stops) else None
-        if not _belongs(line, stop, grid):
-            raise InputError(f"{path}: line {number + 2}: is not of this grid: name another file with --out")
+        if not _matches(line, stop, grid):
+            raise InputError(
+                f"{path}: line {number + 2}: does not match the grid: choose another file with --out"
+            )
 
 
-def _belongs(line: bytes, stop: Stop | None, grid: Grid) -> bool:
-    cells = _cells(line)
-    if stop is None or len(cells) != len(_HEADER):
+def _matches(line: bytes, stop: Stop | None, grid: StageGrid) -> bool:
+    fields = _fields(line)
+    if stop is None or len(fields) != len(_HEADER):
         return False
     try:
-        place = tuple(float(cells[f"true_{axis}_mm"]) for axis in "xyz")
-        same = (int(cells["repeat"]), int(cells["point_id"]), place) == (
+        position = tuple(float(fields[f"true_{axis}_mm"]) for axis in "xyz")
+        same = (int(fields["repeat"]), int(fields["point_id"]), position) == (
             stop.repeat,
             stop.point_id,
-            stop.place,
+            stop.position,
         )
-        float(cells["time_s"])
-        _place(cells)
+        float(fields["time_s"])
+        _position(fields)
     except ValueError:
         return False
     return (
         same
-        and cells["environment"] == grid.file.environment
-        and cells["sensor"] in grid.file.sensors.values()
+        and fields["environment"] == grid.file.environment
+        and fields["sensor"] in grid.file.sensors.values()
     )
 
 
-def _cells(line: bytes) -> dict[str, str]:
-    cells = next(csv.reader([line.decode("utf-8", "replace")]), [])
-    return dict(zip(_HEADER, cells, strict=False))
+def _fields(line: bytes) -> dict[str, str]:
+    values = next(csv.reader([line.decode("utf-8", "replace")]), [])
+    return dict(zip(_HEADER, values, strict=False))

@@ -1,4 +1,4 @@
-"""From what a user writes to the tracker that it names."""
+"""Trackers named on the command line."""
 
 from contextlib import AbstractContextManager
 from math import isfinite
@@ -16,17 +16,16 @@ from flexneedle.trace.folder import TRACE_FILE
 from flexneedle.trace.reader import read_trace
 from flexneedle.types import Frame, Measurement, SensorReading
 
-FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE[@SPEED] (a recording, or the folder of a run)"
-"""Forms of a tracker on the command line."""
+FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE[@SPEED] (a recording or a run folder)"
+"""Syntax of a tracker on the command line."""
 
 
 def open_tracker(spec: str, clock: Clock) -> AbstractContextManager[Tracker]:
-    """Return the tracker that `spec` names, started; leaving the context stops it.
+    """Return the tracker given by `spec`, started; leaving the context stops it.
 
-    `aurora:/dev/ttyUSB0` has the sensors tip, ref1, ref2, ref3 at the ports 1 to 4; `aurora:/dev/ttyUSB0=ref1,tip`
-    names those of ports 1 and 2. `replay:FILE` plays a recording, or the readings of a run in a
-    folder; its speed is the clock's (`clock_for`).
-    Raises InputError for anything else, RunError if no tracker answers.
+    `aurora:/dev/ttyUSB0` has the sensors tip, ref1, ref2, ref3 at ports 1 to 4; `aurora:/dev/ttyUSB0=ref1,tip` names
+    those at ports 1 and 2. `replay:FILE` plays back a recording or the readings in a run folder, at the speed of the
+    clock (`clock_for`). Raises InputError for any other `spec`, RunError if the tracker does not respond.
     """
     kind, _, rest = spec.partition(":")
     if not rest or kind not in ("aurora", "replay"):
@@ -35,9 +34,9 @@ def open_tracker(spec: str, clock: Clock) -> AbstractContextManager[Tracker]:
 
 
 def clock_for(spec: str) -> WallClock:
-    """Return the clock on which the tracker that `spec` names is to be read: at `replay:FILE@2` it runs twice as fast.
+    """Return the clock for the tracker given by `spec`; for `replay:FILE@2` it runs at twice the speed.
 
-    Raises InputError as `open_tracker`.
+    Raises InputError for an invalid speed.
     """
     kind, _, rest = spec.partition(":")
     return WallClock(_file_and_speed(rest)[1] if kind == "replay" else 1.0)
@@ -47,7 +46,9 @@ def _aurora(rest: str, clock: Clock) -> Aurora:
     port, _, names = rest.partition("=")
     chosen = tuple(names.split(",")) if names else NAMES
     if not all(name.isidentifier() for name in chosen) or len({*chosen}) < len(chosen):
-        raise InputError(f"tracker aurora:{rest}: the names must be words, each once, such as tip,ref1")
+        raise InputError(
+            f"tracker aurora:{rest}: sensor names must be different identifiers, such as tip,ref1"
+        )
     return Aurora(port, clock, chosen)
 
 
@@ -57,31 +58,35 @@ def _replay(rest: str, clock: Clock) -> Replay:
 
 
 def _file_and_speed(rest: str) -> tuple[str, float]:
-    """Return the parts of FILE@SPEED; a file that is there may have an @ in its name. Raises InputError if the speed
-    is none."""
+    """Return file and speed of FILE@SPEED; the name of an existing file may contain @.
+
+    Raises InputError for an invalid speed.
+    """
     if "@" not in rest or Path(rest).exists():
         return rest, 1.0
     file, _, text = rest.rpartition("@")
     try:
         speed = float(text)
     except ValueError:
-        raise InputError(f"tracker replay:{rest}: {text} is no speed, and there is no file {rest}") from None
+        raise InputError(
+            f"tracker replay:{rest}: {text} is not a speed, and the file {rest} does not exist"
+        ) from None
     if not (isfinite(speed) and speed > 0.0):
-        raise InputError(f"tracker replay:{rest}: the speed must be above 0")
+        raise InputError(f"tracker replay:{rest}: the speed must be finite and above 0")
     return file, speed
 
 
 def frames_of_run(folder: Path) -> tuple[Frame, ...]:
-    """Return the tracker's readings of a recorded insertion, in its own frame; each frame once.
+    """Return the tracker's frames of a recorded insertion, each once, in the tracker's frame of reference.
 
-    A tracker of the tip alone gives frames of the tip, in the frame of the stage, with z = 0 where it has none. Raises
-    InputError if there is no trace of readings.
+    Measurements without frames (a tracker of the tip alone) become frames with the sensor tip, in the stage's frame and
+    with z = 0 if unknown. Raises InputError if the run has no readings.
     """
     periods = read_trace(folder / TRACE_FILE).periods
     samples = [judged.sample for period in periods for judged in period.readings]
     frames = {frame.number: frame for frame in (_frame(n, sample) for n, sample in enumerate(samples))}
     if not frames:
-        raise InputError(f"{folder}: the run has no readings of a tracker")
+        raise InputError(f"{folder}: the run has no tracker readings")
     return tuple(frames.values())
 
 
@@ -89,7 +94,9 @@ def _frame(number: int, sample: Measurement) -> Frame:
     if sample.frame is not None:
         return sample.frame
     known = sample.x is not None and sample.y is not None
-    place = (sample.x or 0.0, sample.y or 0.0, sample.z or 0.0)
+    position = (sample.x or 0.0, sample.y or 0.0, sample.z or 0.0)
     return Frame(
-        sample.time, number, {TIP: SensorReading(place) if known else SensorReading(None, status="missing")}
+        sample.time,
+        number,
+        {TIP: SensorReading(position) if known else SensorReading(None, status="missing")},
     )

@@ -1,4 +1,4 @@
-"""Watching a tracker live: its frames, what they are judged as, and a recording of them."""
+"""Live readings of a tracker: its frames, the verdict on each, and a recording of them."""
 
 import csv
 from collections import deque
@@ -16,17 +16,17 @@ from flexneedle.rig.ports import Clock, Tracker
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import VISIBLE, Frame, is_reference
 
-Judge = Callable[[Sequence[Frame], bool], tuple[str, bool]]
-"""From the frames of the last seconds, oldest first, and whether the field was distorted before, to the verdict
-("ok" or the reason) and whether the field is distorted now."""
+FieldCheck = Callable[[Sequence[Frame], bool], tuple[str, bool]]
+"""Function of the frames of the last seconds, oldest first, and whether the field was distorted before; returns the
+verdict ("ok" or the reason) and whether the field is distorted now."""
 
 _PAUSE_S = 0.01
 _HISTORY = 400  # frames: 10 s
 
 
 @dataclass(frozen=True)
-class View:
-    """What there is to show: the newest frame (None before the first), new or not; how the tracker is; the verdict."""
+class Snapshot:
+    """The newest frame (None before the first), whether it is new, the status of the tracker, and the verdict."""
 
     time: float
     frame: Frame | None
@@ -38,28 +38,28 @@ class View:
 def watch(
     tracker: Tracker,
     clock: Clock,
-    show: Callable[[View], None],
+    show: Callable[[Snapshot], None],
     seconds: float = inf,
-    judge: Judge | None = None,
+    check: FieldCheck | None = None,
     record: Path | None = None,
 ) -> int:
-    """Show each new frame, and the state every half second where none arrives, for `seconds` or until a replay ends.
+    """Show each new frame, or the status every half second without one, for `seconds` or until a replay ends.
 
-    judge: `field_judge()`, if left out. record: a CSV of all frames, which must not exist yet. Returns the number
-    of frames. Raises InputError if the file cannot be written.
+    check: verdict on the field (default: `field_checker()`). record: new CSV file for all frames. Returns the number of
+    frames. Raises InputError if the file cannot be written.
     """
-    chosen = judge if judge is not None else field_judge()
+    chosen = check if check is not None else field_checker()
     history: deque[Frame] = deque(maxlen=_HISTORY)
     start, count, shown_at, distorted = clock.now(), 0, -inf, False
     with ExitStack() as files:
-        keep = _recorder(files, record)
+        write = _recorder(files, record)
         while (now := clock.now()) - start < seconds:
             frames = tracker.read()
             for frame in frames:
                 history.append(frame)
-                keep(frame)
+                write(frame)
                 verdict, distorted = chosen(history, distorted)
-                show(View(now, frame, True, tracker.status, verdict))
+                show(Snapshot(now, frame, True, tracker.status, verdict))
             count += len(frames)
             if frames:
                 shown_at = now
@@ -72,46 +72,48 @@ def watch(
     return count
 
 
-def _without_new(now: float, history: Sequence[Frame], status: str) -> View:
+def _without_new(now: float, history: Sequence[Frame], status: str) -> Snapshot:
     last = history[-1] if history else None
-    return View(now, last, False, status, "no new frames" if status == VISIBLE else status)
+    return Snapshot(now, last, False, status, "no new frames" if status == VISIBLE else status)
 
 
-def judge_field(
+def check_field(
     frames: Sequence[Frame], settings: MonitorSettings, distorted: bool = False
 ) -> tuple[str, bool]:
-    """Return the first thing that is wrong: sensors without a position, then the field by the monitor's rules.
+    """Return the verdict, and whether the field is distorted.
 
-    And whether the field is distorted: as the monitor holds an insertion, until the field is known to be good again.
-    distorted: whether it was before.
+    The verdict names sensors without a position, else the state of the field by the rules of the monitor. As in the
+    monitor, a distorted field remains distorted until it is known to be good. distorted: the state before.
     """
     field = field_verdict(frames, settings, distorted)
     fault = "; ".join(f"{name}: {r.status}" for name, r in frames[-1].readings.items() if r.status != VISIBLE)
     return fault or str(field), is_distorted(field, distorted)
 
 
-def field_judge(references: int | None = None) -> Judge:
-    """Return `judge_field` by the default monitor with this number of references; without a number, with those that the
-    tracker has: one at least, and no more than an insertion needs."""
+def field_checker(references: int | None = None) -> FieldCheck:
+    """Return `check_field` with the settings of the default monitor and this number of references.
+
+    references: None for the number that the tracker has, at least one and at most what an insertion needs.
+    """
     default = MonitorSettings()
 
-    def judge(frames: Sequence[Frame], distorted: bool) -> tuple[str, bool]:
-        there = sum(map(is_reference, frames[-1].readings))
-        wanted = max(1, min(default.references, there)) if references is None else references
-        return judge_field(frames, default.model_copy(update={"references": wanted}), distorted)
+    def check(frames: Sequence[Frame], distorted: bool) -> tuple[str, bool]:
+        present = sum(map(is_reference, frames[-1].readings))
+        needed = max(1, min(default.references, present)) if references is None else references
+        return check_field(frames, default.model_copy(update={"references": needed}), distorted)
 
-    return judge
+    return check
 
 
 def _recorder(files: ExitStack, path: Path | None) -> Callable[[Frame], None]:
     if path is None:
         return lambda _: None
     if path.suffix == ".parquet":
-        raise InputError(f"{path}: a CSV is written: give a name that ends in .csv")
+        raise InputError(f"{path}: the output is CSV: use a name that ends in .csv")
     try:
         file = files.enter_context(path.open("x", newline="", encoding="utf-8"))
     except FileExistsError:
-        raise InputError(f"{path}: exists: give another file") from None
+        raise InputError(f"{path}: already exists: choose another file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")

@@ -1,4 +1,4 @@
-"""Which column of a table is which: the names of flexneedle, or what others call them."""
+"""Columns of a table: the names of flexneedle, or other names mapped to them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -8,80 +8,80 @@ from flexneedle.rig.tracking.table import COLUMNS
 from flexneedle.scenario.library import Library
 
 _MAPS = Library("a column map")
-_HINT = "--columns THEIRS=OURS"
+_OPTION = "--columns NAME=COLUMN"
 
 
 def column_map(given: Iterable[str]) -> dict[str, str]:
-    """Return their names by ours, from pairs "theirs=ours" and paths of TOML files that hold such pairs.
+    """Return the names in the table by column, from pairs "NAME=COLUMN" and paths of TOML files with such pairs.
 
-    Raises InputError for what is neither, and for a column of ours that is unknown or given twice.
+    Raises InputError for invalid pairs and files, and for a column that is unknown or given twice.
     """
-    theirs: dict[str, str] = {}
+    names: dict[str, str] = {}
     for text in given:
-        for their, our in [_pair(text)] if "=" in text else _from_file(Path(text)):
-            if our not in COLUMNS:
-                raise InputError(f"{_HINT}: no column {our!r}: one of {', '.join(COLUMNS)}")
-            if our in theirs:
-                raise InputError(f"{_HINT}: {our} is both {theirs[our]!r} and {their!r}")
-            theirs[our] = their
-    return theirs
+        for name, column in [_pair(text)] if "=" in text else _from_file(Path(text)):
+            if column not in COLUMNS:
+                raise InputError(f"{_OPTION}: unknown COLUMN {column!r}: choose from {', '.join(COLUMNS)}")
+            if column in names:
+                raise InputError(f"{_OPTION}: {column} is given twice, as {names[column]!r} and {name!r}")
+            names[column] = name
+    return names
 
 
 def chosen_columns(
     header: Sequence[str],
-    theirs: Mapping[str, str],
+    mapping: Mapping[str, str],
     required: Iterable[str],
     optional: Iterable[str],
 ) -> dict[str, str]:
-    """Return the columns of a table to read, their names by ours; all others are ignored.
+    """Return the columns to read with their names in the header; all others are ignored.
 
-    Raises InputError if one of `required`, or one that `theirs` names, is not in the header, or is there twice.
+    mapping: names in the header by column, see `column_map`. Raises InputError if a column that is required or mapped
+    is not in the header, or occurs twice.
     """
-    wanted = {our: theirs.get(our, our) for our in (*required, *optional)}
-    asked = {*required, *theirs}
-    missing = [_told(our, their) for our, their in wanted.items() if our in asked and their not in header]
+    names = {column: mapping.get(column, column) for column in (*required, *optional)}
+    needed = {*required, *mapping}
+    missing = [
+        _described(column, name) for column, name in names.items() if column in needed and name not in header
+    ]
     if missing:
         raise InputError(
-            f"no column {', '.join(missing)}; there are {_listed(header)}. A column of another name: {_HINT}"
-            + _constant(missing)
+            f"no column {', '.join(missing)} (found: {_listed(header)}): map other names with {_OPTION}"
+            + _label_options(missing)
         )
-    found = {our: their for our, their in wanted.items() if their in header}
-    twice = [their for their in found.values() if header.count(their) > 1]
-    if twice:
-        raise InputError(f"two columns are called {twice[0]!r}")
-    for their in found.values():
-        shared = [our for our, other in found.items() if other == their]
+    found = {column: name for column, name in names.items() if name in header}
+    duplicates = [name for name in found.values() if header.count(name) > 1]
+    if duplicates:
+        raise InputError(f"two columns have the name {duplicates[0]!r}: names must differ")
+    for name in found.values():
+        shared = [column for column, other in found.items() if other == name]
         if len(shared) > 1:
-            raise InputError(
-                f"{_HINT}: the column {their!r} would be {' and '.join(shared)}: which is the other?"
-            )
+            raise InputError(f"{_OPTION}: {name!r} would be both {' and '.join(shared)}: map both columns")
     return found
 
 
-def _constant(missing: Iterable[str]) -> str:
-    options = [f"--{name} NAME" for name in ("sensor", "environment") if name in missing]
-    return (
-        f"; a table of one {' and '.join(o[2:-5] for o in options)}: {' '.join(options)}" if options else ""
-    )
+def _label_options(missing: Iterable[str]) -> str:
+    labels = [name for name in ("sensor", "environment") if name in missing]
+    options = " ".join(f"--{name} NAME" for name in labels)
+    return f"; for a table of one {' and '.join(labels)}, use {options}" if labels else ""
 
 
 def _pair(text: str) -> tuple[str, str]:
-    their, _, our = text.rpartition("=")
-    return their.strip(), our.strip()
+    name, _, column = text.rpartition("=")
+    return name.strip(), column.strip()
 
 
 def _from_file(path: Path) -> list[tuple[str, str]]:
     if not path.is_file():
-        raise InputError(f"{_HINT}: {path}: neither a pair nor a file")
+        raise InputError(f"{_OPTION}: {path}: must be a pair NAME=COLUMN or an existing file")
     values = _MAPS.read(path)
-    wrong = [their for their, our in values.items() if not isinstance(our, str)]
-    if wrong:
-        raise InputError(f'{path}: {wrong[0]}: must be a line such as {wrong[0]} = "x_mm"')
+    invalid = [name for name, column in values.items() if not isinstance(column, str)]
+    if invalid:
+        raise InputError(f'{path}: {invalid[0]}: must be a line such as {invalid[0]} = "x_mm"')
     return list(values.items())
 
 
-def _told(our: str, their: str) -> str:
-    return our if our == their else f"{their!r} (for {our})"
+def _described(column: str, name: str) -> str:
+    return column if column == name else f"{name!r} (for {column})"
 
 
 def _listed(header: Sequence[str], most: int = 20) -> str:

@@ -1,8 +1,8 @@
-"""From the rows of a table to its grids: two aggregations by DuckDB, each in one pass over the file.
+"""Grids of a table: two aggregations by DuckDB, each in one pass over the file.
 
-Lengths are counted in whole steps of 2⁻⁴⁰ mm, whose sums in 128 bits are exact: order of rows and number of threads
-change no digit, and nothing cancels far from the origin. The sums of squares hold
-10⁶ samples of a grid point 10 m away.
+Lengths are rounded to multiples of 2⁻⁴⁰ mm, whose sums in 128-bit integers are exact: the result does not depend on the
+order of rows or the number of threads, and no digits cancel far from the origin. The sums of squares do not overflow
+for 10⁶ samples of a grid point at 10 m.
 """
 
 from itertools import combinations_with_replacement
@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.em.table.grid import LEVEL, Floats, Grid, Levels, Places
+from flexneedle.em.table.grid import BIN_WIDTH, Floats, Grid, Histogram, Moments
 from flexneedle.em.table.rules import (
     DISTANCES,
     EMPTY_LABELS,
     INDICATORS,
+    ORIENTATIONS,
     POSITIONS,
-    SAME_MM,
+    SAME_POSITION_MM,
     TRUE_POSITIONS,
-    TURNS,
     Rule,
-    broken,
-    refuse_broken,
+    first_violation,
     refuse_moved,
+    refuse_violations,
 )
 from flexneedle.em.table.source import Table
 from flexneedle.errors import InputError
@@ -33,7 +33,7 @@ _AXES = ("x", "y", "z")
 _PAIRS = list(combinations_with_replacement("wxyz", 2))
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _ORDER = (TIP, REFERENCE, "ideal", "noisy")
-_STEPS, _FINE = 2**40, 2**56  # in a millimetre; in 1, of the indicator and of products of unit quaternions
+_STEPS, _FINE = 2**40, 2**56  # per mm; per unit of the indicator and of products of unit quaternions
 _KEY = "sensor, environment, point_id"
 
 _POSITIONS = ", ".join(
@@ -41,61 +41,61 @@ _POSITIONS = ", ".join(
     f"min(true_{a}_mm) AS low_{a}, max(true_{a}_mm) AS high_{a}"
     for a in _AXES
 )
-# About m, the whole part of the mean: exact, and no number is larger than the sums themselves.
+# Scatter about the integer part of the mean: exact, and no number is larger than the sums themselves.
 _MOMENTS = ", ".join(
     f"s_{a} / n / {_STEPS} AS mean_{a}, (low_{a} + high_{a}) / 2 AS true_{a}, high_{a} - low_{a} AS moved_{a}, "
     f"(q_{a} - (s_{a} // n) * s_{a} - (s_{a} // n) * (s_{a} % n)) / {float(_STEPS) ** 2} AS scatter_{a}"
     for a in _AXES
 )
-_TURNS = ", ".join(f"avg_fine(q{a} * q{b} / norm) AS p_{a}{b}" for a, b in _PAIRS)
-_NO_TURNS = ", ".join(f"NULL::DOUBLE AS p_{a}{b}" for a, b in _PAIRS)
+_ORIENTATIONS = ", ".join(f"avg_fine(q{a} * q{b} / norm) AS p_{a}{b}" for a, b in _PAIRS)
+_NO_ORIENTATIONS = ", ".join(f"NULL::DOUBLE AS p_{a}{b}" for a, b in _PAIRS)
 _MACROS = (
     f"whole(v) AS try_cast(v * {_STEPS} AS BIGINT)",
     f"avg_whole(v) AS sum(whole(v)) / count(v) / {_STEPS}",
     f"avg_fine(v) AS sum(try_cast(v * {_FINE} AS HUGEINT)) / count(v) / {_FINE}",
 )
-_LEVELS = f"""
-    SELECT sensor, environment, round(indicator / {LEVEL}) * {LEVEL} AS level, count(*) AS n,
-        min(indicator) AS least, max(indicator) AS most
-    FROM samples WHERE indicator IS NOT NULL AND x_mm IS NOT NULL GROUP BY ALL ORDER BY level
+_HISTOGRAM = f"""
+    SELECT sensor, environment, round(indicator / {BIN_WIDTH}) * {BIN_WIDTH} AS value, count(*) AS n,
+        min(indicator) AS minimum, max(indicator) AS maximum
+    FROM samples WHERE indicator IS NOT NULL AND x_mm IS NOT NULL GROUP BY ALL ORDER BY value
 """
 Columns = dict[str, NDArray[Any]]
 
 
 def read_grids(table: Table, bin_mm: float) -> tuple[list[Grid], int]:
-    """Return a grid for each sensor and environment, and how many rows there were.
+    """Return a grid for each sensor and environment, and the number of rows.
 
-    bin_mm: width of the bins of distance. Raises InputError for rows that break a rule, or if there is none.
+    bin_mm: width of the distance bins. Raises InputError for rows that violate a rule, or if there are no rows.
     """
     if 0 < len(table.columns.intersection(_QUATERNION)) < len(_QUATERNION):
-        raise InputError("qw, qx, qy, qz: all four columns must be there, or none")
+        raise InputError("qw, qx, qy, qz: the table must have all four columns or none")
     for macro in _MACROS:
         table.connection.execute(f"CREATE TEMP MACRO {macro}")
     rules = _rules(table)
     cells = table.arrays(_cells_query(table, rules), bin_mm=bin_mm)
     if not len(cells["n"]):
-        raise InputError("there are no rows")
-    if cells["n_broken"].any():
-        refuse_broken(table, rules)
+        raise InputError("has no rows")
+    if cells["n_invalid"].any():
+        refuse_violations(table, rules)
     _refuse_moved(table, cells)
-    levels = table.arrays(_LEVELS) if cells["n_indicator"].any() else None
+    bins = table.arrays(_HISTOGRAM) if cells["n_indicator"].any() else None
     pairs = sorted({*zip(cells["sensor"], cells["environment"], strict=True)}, key=lambda p: [*map(_rank, p)])
     rows = int(cells["n_rows"][cells["pooled"] == 1].sum())
-    return [_grid(cells, levels, sensor, environment) for sensor, environment in pairs], rows
+    return [_grid(cells, bins, sensor, environment) for sensor, environment in pairs], rows
 
 
 def _rules(table: Table) -> tuple[Rule, ...]:
-    own = {"indicator": INDICATORS, "distance_mm": DISTANCES, "qw": TURNS}
-    others = (rule for column, rules in own.items() if column in table.columns for rule in rules)
+    optional = {"indicator": INDICATORS, "distance_mm": DISTANCES, "qw": ORIENTATIONS}
+    others = (rule for column, rules in optional.items() if column in table.columns for rule in rules)
     return (*EMPTY_LABELS, *TRUE_POSITIONS, *POSITIONS, *others)
 
 
 def _cells_query(table: Table, rules: tuple[Rule, ...]) -> str:
-    """SQL for what each grid point (pooled = 1) and each of its bins of distance (pooled = 0) holds.
+    """Return the SQL for the sums by grid point (pooled = 1) and by grid point and distance bin (pooled = 0).
 
-    Indicator, distance and orientation are those of samples that have a position.
+    Indicator, distance and orientation of samples without a position are ignored.
     """
-    turns = _TURNS if "qw" in table.columns else _NO_TURNS
+    orientations = _ORIENTATIONS if "qw" in table.columns else _NO_ORIENTATIONS
     sets = f"({_KEY})" + (f", ({_KEY}, bin)" if "distance_mm" in table.columns else "")
     bins = (
         "bin, grouping(bin) AS pooled,"
@@ -105,13 +105,13 @@ def _cells_query(table: Table, rules: tuple[Rule, ...]) -> str:
     return f"""
         WITH checked AS (
             SELECT * REPLACE (if(x_mm IS NULL, NULL, indicator) AS indicator),
-                floor(distance_mm / $bin_mm + 1e-9) AS bin, {broken(rules)} AS rule,
+                floor(distance_mm / $bin_mm + 1e-9) AS bin, {first_violation(rules)} AS rule,
                 if(x_mm IS NULL, NULL, qw * qw + qx * qx + qy * qy + qz * qz) AS norm
             FROM samples
         ), sums AS (
-            SELECT {_KEY}, {bins} count(*) AS n_rows, count(x_mm) AS n, {_POSITIONS}, {turns},
+            SELECT {_KEY}, {bins} count(*) AS n_rows, count(x_mm) AS n, {_POSITIONS}, {orientations},
                 avg_whole(if(x_mm IS NULL, NULL, distance_mm)) AS distance, avg_fine(indicator) AS indicator,
-                count(indicator) AS n_indicator, count(norm) AS n_turns, count(rule) AS n_broken
+                count(indicator) AS n_indicator, count(norm) AS n_orientation, count(rule) AS n_invalid
             FROM checked GROUP BY GROUPING SETS ({sets})
         )
         SELECT *, {_MOMENTS} FROM sums
@@ -123,27 +123,27 @@ def _cells_query(table: Table, rules: tuple[Rule, ...]) -> str:
 
 def _refuse_moved(table: Table, cells: Columns) -> None:
     moved = np.max([cells[f"moved_{a}"] for a in _AXES], axis=0)
-    if moved.max() > SAME_MM:
+    if moved.max() > SAME_POSITION_MM:
         worst = int(moved.argmax())
         refuse_moved(table, *(str(cells[name][worst]) for name in ("sensor", "environment", "point_id")))
 
 
-def _grid(cells: Columns, levels: Columns | None, sensor: str, environment: str) -> Grid:
+def _grid(cells: Columns, bins: Columns | None, sensor: str, environment: str) -> Grid:
     own = (cells["sensor"] == sensor) & (cells["environment"] == environment)
     pooled = own & (cells["pooled"] == 1)
     names = tuple(cells["point_id"][pooled].tolist())
-    singles = _levels(levels, sensor, environment)
+    histogram = _histogram(bins, sensor, environment)
     return Grid(
         sensor,
         environment,
         names,
-        _places(cells, pooled),
-        _places(cells, own & (cells["pooled"] == 0)),
-        singles,
+        _moments(cells, pooled),
+        _moments(cells, own & (cells["pooled"] == 0)),
+        histogram,
     )
 
 
-def _places(cells: Columns, chosen: NDArray[np.bool_]) -> Places:
+def _moments(cells: Columns, chosen: NDArray[np.bool_]) -> Moments:
     def axes(name: str) -> Floats:
         return np.stack([cells[f"{name}_{a}"][chosen] for a in _AXES], axis=1).astype(float)
 
@@ -152,7 +152,7 @@ def _places(cells: Columns, chosen: NDArray[np.bool_]) -> Places:
     for a, b in _PAIRS:
         i, j = "wxyz".index(a), "wxyz".index(b)
         products[:, i, j] = products[:, j, i] = own[f"p_{a}{b}"]
-    return Places(
+    return Moments(
         bins=own["bin"],
         count=own["n"],
         missing=own["n_rows"] - own["n"],
@@ -162,17 +162,17 @@ def _places(cells: Columns, chosen: NDArray[np.bool_]) -> Places:
         distance=own["distance"],
         indicators=own["n_indicator"],
         indicator=own["indicator"],
-        turns=own["n_turns"],
+        orientations=own["n_orientation"],
         products=products,
     )
 
 
-def _levels(levels: Columns | None, sensor: str, environment: str) -> Levels:
-    if levels is None:
-        return Levels(np.empty(0), np.empty(0, dtype=np.int64), np.inf, -np.inf)
-    own = (levels["sensor"] == sensor) & (levels["environment"] == environment)
-    value, count, least, most = (levels[name][own] for name in ("level", "n", "least", "most"))
-    return Levels(value, count, float(least.min(initial=np.inf)), float(most.max(initial=-np.inf)))
+def _histogram(bins: Columns | None, sensor: str, environment: str) -> Histogram:
+    if bins is None:
+        return Histogram(np.empty(0), np.empty(0, dtype=np.int64), np.inf, -np.inf)
+    own = (bins["sensor"] == sensor) & (bins["environment"] == environment)
+    value, count, low, high = (bins[name][own] for name in ("value", "n", "minimum", "maximum"))
+    return Histogram(value, count, float(low.min(initial=np.inf)), float(high.max(initial=-np.inf)))
 
 
 def _rank(name: str) -> tuple[int, str]:

@@ -1,6 +1,6 @@
-"""A table of measurements, CSV or Parquet, as a view of DuckDB with our names of its columns.
+"""A table of measurements, CSV or Parquet, as a DuckDB view with the column names of flexneedle.
 
-The first bytes decide which of the two a file is, not its name. No row is kept: each query reads the file again.
+The first bytes of the file, not its name, decide its format. No rows are held in memory: each query reads the file.
 """
 
 import os
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
 LABELS = ("point_id", "sensor", "environment")
-"""Columns of names; numbers are taken as text, 1 and "1" are the same. All other columns are of numbers."""
+"""Columns of text; numbers in them are converted, so that 1 and "1" are the same. All other columns hold numbers."""
 MILLIMETRES_IN = {"mm": 1.0, "m": 1000.0}
 
 _LENGTHS = tuple(name for name in COLUMNS if name.endswith("_mm"))
 _MAGIC = b"PAR1"
-_MOST_THREADS = 4  # each holds 32 MB of a CSV
+_MOST_THREADS = 4  # each buffers 32 MB of a CSV file
 _NULLS = [
     "",
     " ",
@@ -46,16 +46,16 @@ _NULLS = [
     "MISSING",
 ]
 _MOST_REJECTED = 10_000
-_NO_NUMBERS = ("VARCHAR", "BOOLEAN", "BLOB", "DATE", "TIME", "STRUCT", "MAP", "UUID")
+_NOT_NUMERIC = ("VARCHAR", "BOOLEAN", "BLOB", "DATE", "TIME", "STRUCT", "MAP", "UUID")
 _Choose = Callable[[list[str]], dict[str, str]]
 
 
 @dataclass(frozen=True)
 class Table:
-    """An open table. Its view `samples` has a row for each row of the file and all of our columns.
+    """An open table. Its view `samples` has all columns of flexneedle and a row for each row of the file.
 
-    Labels are text without blanks around it, '' where there is none; numbers are DOUBLE, lengths in mm, NULL where
-    there is none (NaN, too) or where the table lacks the column. columns: those that the table has.
+    Labels are text without surrounding blanks, '' if empty. Numbers are DOUBLE with lengths in mm; they are NULL if
+    empty or NaN, or if the table lacks the column. columns: the columns that the table has.
     """
 
     connection: "DuckDBPyConnection"
@@ -63,9 +63,9 @@ class Table:
     refuse: Callable[[], None]
 
     def arrays(self, query: str, **values: Any) -> dict[str, NDArray[Any]]:
-        """Return the columns (r,) of a query's rows; a number that is NULL is NaN.
+        """Return the columns (r,) of the result of a query, with NaN for NULL.
 
-        Raises InputError for a row of the file that cannot be read.
+        Raises InputError for an unreadable row of the file.
         """
         found = self.connection.execute(query, values or None).fetchnumpy()
         self.refuse()
@@ -75,16 +75,16 @@ class Table:
 @contextmanager
 def open_table(
     path: Path,
-    theirs: Mapping[str, str],
+    mapping: Mapping[str, str],
     required: Iterable[str],
     optional: Iterable[str],
-    names: Mapping[str, str] | None = None,
+    labels: Mapping[str, str] | None = None,
     unit: str = "mm",
 ) -> Iterator[Table]:
-    """Open a table; `theirs`: see `column_map`; names: a label of all rows by column, for a table without such.
+    """Open a table. mapping: see `column_map`; labels: value for all rows by column, for columns that the table lacks.
 
-    Raises InputError, which begins with the path, if the file cannot be read, lacks a column, or has a label that
-    `names` gives; and for any other InputError inside the block.
+    Raises InputError if the file cannot be read, lacks a column, or has a column given in `labels`. The message of
+    every InputError raised inside the context is prefixed with the path.
     """
     try:
         from duckdb import DataError, InvalidInputException, OperationalError, connect
@@ -92,13 +92,19 @@ def open_table(
         raise InputError("tables of measurements need duckdb: pip install 'flexneedle[em]'") from None
     try:
         with connect(config=_settings()) as connection:
-            yield _table(connection, path, theirs, tuple(required), tuple(optional), names or {}, unit)
+            yield _table(connection, path, mapping, tuple(required), tuple(optional), labels or {}, unit)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except (DataError, InvalidInputException, OperationalError) as error:
-        raise InputError(f"{path}: cannot be read: {str(error).splitlines()[0]}") from None
+        raise InputError(f"{path}: cannot be read: {_reason(str(error))}") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def _reason(message: str) -> str:
+    if "state machine reached an invalid state" in message:
+        return "mixed line ends (LF and CRLF): save the file with one kind"
+    return message.splitlines()[0]
 
 
 def _settings() -> dict[str, str | bool | int | float | list[str]]:
@@ -109,10 +115,10 @@ def _settings() -> dict[str, str | bool | int | float | list[str]]:
 def _table(
     connection: "DuckDBPyConnection",
     path: Path,
-    theirs: Mapping[str, str],
+    mapping: Mapping[str, str],
     required: tuple[str, ...],
     optional: tuple[str, ...],
-    names: Mapping[str, str],
+    labels: Mapping[str, str],
     unit: str,
 ) -> Table:
     with path.open("rb") as file:
@@ -121,41 +127,41 @@ def _table(
         raise InputError("is empty")
     opened = _parquet if start == _MAGIC else _csv
     chosen, columns, refuse = opened(
-        connection, path, lambda h: chosen_columns(h, theirs, required, optional)
+        connection, path, lambda header: chosen_columns(header, mapping, required, optional)
     )
-    twice = [name for name in names if name in chosen]
-    if twice:
-        raise InputError(f"has a column {twice[0]}: --{twice[0]} is for a table without")
+    given = [name for name in labels if name in chosen]
+    if given:
+        raise InputError(f"has a column {given[0]}: --{given[0]} is only for a table without it")
     scale = MILLIMETRES_IN[unit]
-    constants = {name: f"{_text(value)}::VARCHAR" for name, value in names.items()}
-    made = ", ".join(
-        f"{constants.get(our) or _expression(our, columns.get(our), scale)} AS {our}" for our in COLUMNS
+    constants = {name: f"{_text(value)}::VARCHAR" for name, value in labels.items()}
+    expressions = ", ".join(
+        f"{constants.get(name) or _expression(name, columns.get(name), scale)} AS {name}" for name in COLUMNS
     )
-    connection.execute(f"CREATE TEMP VIEW samples AS SELECT {made} FROM file")
+    connection.execute(f"CREATE TEMP VIEW samples AS SELECT {expressions} FROM file")
     return Table(connection, frozenset(chosen), refuse)
 
 
-def _expression(our: str, column: str | None, scale: float) -> str:
-    if our in LABELS:
+def _expression(name: str, column: str | None, scale: float) -> str:
+    if name in LABELS:
         return "''" if column is None else f"trim(coalesce({column}::VARCHAR, ''))"
     if column is None:
         return "NULL::DOUBLE"
-    factor = scale if our in _LENGTHS else 1.0
+    factor = scale if name in _LENGTHS else 1.0
     number = f"{column}::DOUBLE" if factor == 1.0 else f"({column}::DOUBLE * {factor})"
     return f"CASE WHEN isnan({column}::DOUBLE) THEN NULL ELSE {number} END"
 
 
 def _csv(connection: "DuckDBPyConnection", path: Path, choose: _Choose) -> Any:
-    """Make the view `file` and return chosen names, columns in SQL by our name, and the check for rejected rows."""
+    """Create the view `file`; return the chosen columns, their SQL, and a function that raises for rejected rows."""
     from flexneedle.em.table.text import read_layout, refuse_rejected
 
     layout = read_layout(path)
     chosen = choose(layout.header)
-    columns = {our: f"c{layout.header.index(their)}" for our, their in chosen.items()}
-    numbers = {column for our, column in columns.items() if our not in LABELS}
-    kinds = {f"c{k}": "DOUBLE" if f"c{k}" in numbers else "VARCHAR" for k in range(len(layout.header))}
+    columns = {name: f"c{layout.header.index(header)}" for name, header in chosen.items()}
+    numbers = {column for name, column in columns.items() if name not in LABELS}
+    types = {f"c{k}": "DOUBLE" if f"c{k}" in numbers else "VARCHAR" for k in range(len(layout.header))}
     connection.execute(
-        f"CREATE TEMP VIEW file AS SELECT * FROM read_csv({_text(escape(str(path)))}, columns={kinds}, "
+        f"CREATE TEMP VIEW file AS SELECT * FROM read_csv({_text(escape(str(path)))}, columns={types}, "
         f"auto_detect=false, header=true, delim={_text(layout.delimiter)}, quote='\"', escape='\"', "
         f"nullstr={_NULLS}, store_rejects=true, rejects_limit={_MOST_REJECTED})"
     )
@@ -163,25 +169,25 @@ def _csv(connection: "DuckDBPyConnection", path: Path, choose: _Choose) -> Any:
 
 
 def _parquet(connection: "DuckDBPyConnection", path: Path, choose: _Choose) -> Any:
-    """As `_csv`."""
+    """Like `_csv`."""
     from duckdb import InvalidInputException
 
     source = f"read_parquet({_text(escape(str(path)))}, binary_as_string=true)"
     try:
         connection.execute(f"CREATE TEMP VIEW file AS SELECT * FROM {source}")
     except InvalidInputException:
-        raise InputError("a Parquet file that was cut off, or is damaged") from None
-    kinds = {name: str(kind) for name, kind, *_ in connection.execute("DESCRIBE file").fetchall()}
-    chosen = choose(list(kinds))
-    for our, their in chosen.items():
-        if our not in LABELS and kinds[their].startswith(_NO_NUMBERS):
-            raise InputError(f"{our}: must be a column of numbers, not of {kinds[their]}")
-    columns = {our: '"' + their.replace('"', '""') + '"' for our, their in chosen.items()}
+        raise InputError("is a truncated or damaged Parquet file") from None
+    types = {name: str(kind) for name, kind, *_ in connection.execute("DESCRIBE file").fetchall()}
+    chosen = choose(list(types))
+    for name, header in chosen.items():
+        if name not in LABELS and types[header].startswith(_NOT_NUMERIC):
+            raise InputError(f"{name}: must be a column of numbers, not of {types[header]}")
+    columns = {name: '"' + header.replace('"', '""') + '"' for name, header in chosen.items()}
     return chosen, columns, lambda: None
 
 
 def _text(value: str) -> str:
-    """Return a literal of SQL."""
+    """Return an SQL literal."""
     return "'" + value.replace("'", "''") + "'"
 
 
