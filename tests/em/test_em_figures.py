@@ -35,7 +35,7 @@ def test_each_height_is_a_slice_and_each_grid_point_an_arrow_along_its_error():
     chosen = GRID[:, 2] == 25.0
     factor = (drawn[1].U / row.error[chosen, 0])[0]
     assert_allclose(np.stack([drawn[1].U, drawn[1].V], axis=1), factor * row.error[chosen, :2])
-    assert f"arrows {round(factor)} times as long" in words(figure)
+    assert f"arrows: errors in x, y × {round(factor)}" in words(figure)
     assert_allclose(drawn[1].get_array(), np.linalg.norm(row.error[chosen], axis=1))
     assert "z = 25 mm" in words(figure)
 
@@ -116,7 +116,7 @@ def test_a_few_indicators_far_out_are_counted_instead():
     indicator, error = np.append(np.linspace(0.1, 0.5, 40), 6.0), np.append(np.full(40, 2.0), 90.0)
     figure = indicator_figure([panel(noisy=PlottedPoints("noisy", indicator, error, "a line"))])
     assert [len(one) for one in shown_points(figure)] == [20, 40]
-    assert "(1 point beyond, up to I = 6, not shown)" in words(figure)
+    assert "(1 point not shown, up to I = 6)" in words(figure)
     (ax,) = figure.axes
     assert 0.5 < ax.get_xlim()[1] < 0.7
     assert ax.get_ylim()[1] < 5.0

@@ -109,10 +109,10 @@ def test_without_point_ids_each_row_is_a_point(tmp_path):
         (rows()[:2], "2 pairs of points"),
         (
             [*rows()[:5], ("p9", 1, 2, 3, 4, "", 6, "ref1")],
-            "row 6: x_mm, y_mm, z_mm: all three must be there, or none",
+            "row 6: x_mm, y_mm, z_mm: must all have values, or all be empty",
         ),
-        ([*rows(), ("p0", 1, 2, 3, 4, 5, 6, "ref1")], "point p0 has several positions on the stage"),
-        ([*rows(), *rows(sensor="tip")], "choose one with --sensor: ref1, tip"),
+        ([*rows(), ("p0", 1, 2, 3, 4, 5, 6, "ref1")], "point p0 has several positions in the stage's frame"),
+        ([*rows(), *rows(sensor="tip")], "has several values of sensor: choose one with --sensor: ref1, tip"),
         ([(*row[:4], "", "", "", "ref1") for row in rows()], "no reading has a position"),
         ([(*row[:4], *(1e-3 * v for v in row[4:7]), "ref1") for row in rows()], "both must be in mm"),
         (
@@ -130,7 +130,7 @@ def test_without_point_ids_each_row_is_a_point(tmp_path):
         ),
         (
             [*rows()[1:], (*rows()[0][:4], -3.697314e28, -3.697314e28, -3.697314e28, "ref1")],
-            "row 8: x_mm, y_mm, z_mm: must be finite and at most 1e+06 mm (a code for a missing place?)",
+            "row 8: x_mm, y_mm, z_mm: must be finite and at most 1e+06 mm (a code for a missing position?)",
         ),
     ],
     ids=[
@@ -168,7 +168,7 @@ def test_the_command_writes_a_table_for_scenarios_a_picture_and_tells_the_errors
     scenario = load_registration(out, PHANTOM)
     assert scenario.tracker.registration == found.registration
     assert main(command) == 2
-    assert capsys.readouterr().err == f"flexneedle: {out}: exists: name another file with --out\n"
+    assert capsys.readouterr().err == f"flexneedle: {out}: already exists: choose another file with --out\n"
 
 
 @pytest.mark.parametrize(

@@ -82,14 +82,14 @@ def test_a_recording_asks_at_each_point_and_says_where_it_wrote(capsys, tmp_path
         monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
         status, _, err = run(capsys, "em", "record", *arguments)
         assert status == 1
-        assert "point 1 of 2, repeat 1 of 1: stage at 0, 0, 0 mm? Enter:\n" in err
-        assert "\nflexneedle: no more input on stdin" in err, "on a line of its own"
+        assert "point 1 of 2, repeat 1 of 1: move the stage to 0, 0, 0 mm; press Enter when there:\n" in err
+        assert "\nflexneedle: end of input on stdin" in err, "on a line of its own"
         status, printed, err = run(capsys, "em", "record", *arguments, "--dwell", "0")
     assert (status, printed) == (0, f"{out}\n")
-    assert "continues after 1 recorded points" in err
+    assert "resuming after 1 recorded points" in err
     assert "point 2 of 2" in err
     status, printed, err = run(capsys, "em", "record", *arguments)
-    assert (status, printed, err) == (0, f"{out}\n", f"{out}: is complete: 2 points\n")
+    assert (status, printed, err) == (0, f"{out}\n", f"{out}: complete, 2 points\n")
 
 
 def test_a_tracker_that_is_not_there_is_bad_input(capsys, tmp_path):
@@ -174,8 +174,8 @@ def test_at_a_terminal_one_is_asked_whether_to_keep_what_does_not_fit_the_stage(
 ):
     status, err, rows = record_moving(capsys, tmp_path, monkeypatch, Terminal("\n\n\nk\n"))
     assert (status, rows) == (0, 8)
-    assert err.count("and the stage 50.0 mm: they may differ by 10.0 mm\n") == 2
-    assert err.count("Enter measures this point again, k keeps it: ") == 2
+    assert err.count("the stage 50.0 mm: the difference must be at most 10.0 mm\n") == 2
+    assert err.count("press Enter to measure this point again, k to keep it: ") == 2
 
 
 def test_without_a_terminal_what_does_not_fit_the_stage_is_refused_unless_forced(
@@ -183,7 +183,10 @@ def test_without_a_terminal_what_does_not_fit_the_stage_is_refused_unless_forced
 ):
     status, err, rows = record_moving(capsys, tmp_path, monkeypatch, io.StringIO("\n" * 9))
     assert (status, rows) == (1, 4)
-    assert "and the stage 50.0 mm: they may differ by 10.0 mm (use --force to record it)\n" in err
+    assert (
+        "the stage 50.0 mm: the difference must be at most 10.0 mm (use --force to record the point anyway)\n"
+        in err
+    )
     status, err, rows = record_moving(capsys, tmp_path, monkeypatch, io.StringIO(), "--dwell", "0", "--force")
     assert (status, rows) == (0, 8)
     assert "recorded (--force)" in err
@@ -192,7 +195,7 @@ def test_without_a_terminal_what_does_not_fit_the_stage_is_refused_unless_forced
 def test_an_end_of_input_at_a_terminal_ends_the_line_of_the_question(capsys, tmp_path, monkeypatch):
     status, err, _ = record_moving(capsys, tmp_path, monkeypatch, Terminal())
     assert status == 1
-    assert "Enter: \nflexneedle: no more input on stdin" in err
+    assert "press Enter when there: \nflexneedle: end of input on stdin" in err
 
 
 @pytest.mark.parametrize(

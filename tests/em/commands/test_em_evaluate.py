@@ -36,13 +36,13 @@ def test_tables_are_printed_beside_the_papers_and_the_makers_values(capsys, tabl
         "tip, ideal",
         " paper",
         "0.65",
-        " maker",
+        " manufacturer",
         "0.48",
         "threshold",
         "area under the ROC",
-        "rigid fit",
+        "registration residual",
         "reference, noisy: slope (mm)",
-        " is kept",
+        " met",
     ):
         assert told in out
     assert str(tmp_path / "out") in out
@@ -81,7 +81,7 @@ def test_without_a_folder_one_is_made_below_runs_and_none_is_written_over(
     assert folder.name.endswith("-em-mine")
     status, _, err = run(capsys, "em", "evaluate", table, "--out", folder)
     assert (status, err.count("\n")) == (2, 1)
-    assert "holds evaluation.json already" in err
+    assert "already contains evaluation.json" in err
 
 
 @pytest.mark.parametrize("command", ["evaluate", "check", "register"])
@@ -144,14 +144,16 @@ def test_check_finds_both_environments_by_name(capsys, tmp_path):
     assert re.search(r"paper, power on +0\.0400", out)
     status, _, err = run(capsys, "em", "check", both)
     assert status == 2
-    assert "no environment 'off': choose one by --off or --on: on, quiet" in err
+    assert "no environment 'off': choose with --off and --on from on, quiet" in err
 
 
 def test_check_with_few_or_other_points_prints_so(capsys, tmp_path):
     few = write_csv(tmp_path / "few.csv", powered(0.02, "off", 4) + powered(0.02, "on", 4))
     assert "too few grid points for an interval" in run(capsys, "em", "check", few)[1]
     other = write_csv(tmp_path / "other.csv", powered(0.02, "off", 20) + powered(0.02, "on", 27))
-    note = "reference: grid points: 20 in power off, 27 in power on, 20 of them in all: different places are compared"
+    note = (
+        "reference: grid points: 20 in power off, 27 in power on, 20 in common: the compared positions differ"
+    )
     assert run(capsys, "em", "check", other)[2] == f"note: {note}\n"
     values = json.loads(run(capsys, "em", "check", other, "--json")[1])
     assert values["results"][0]["paired"] is False
@@ -193,7 +195,7 @@ def test_environments_keep_their_own_names_in_tables(capsys, table, tmp_path):
 def test_a_misspelt_environment_ends_it_before_a_folder_is_made(capsys, table, tmp_path):
     status, _, err = run(capsys, "em", "evaluate", table, "--ideal", "idael", "--out", tmp_path / "out")
     assert (status, err.count("\n")) == (2, 1)
-    assert "--ideal: no environment 'idael': there is ideal, noisy" in err
+    assert "--ideal: no environment 'idael': choose from ideal, noisy" in err
     assert not (tmp_path / "out").exists()
 
 
@@ -201,7 +203,7 @@ def test_a_table_of_points_is_not_written_over(capsys, table, tmp_path):
     (tmp_path / "points.csv").write_text("mine")
     status, _, err = run(capsys, "em", "evaluate", table, "--out", tmp_path)
     assert status == 2
-    assert "holds points.csv already" in err
+    assert "already contains points.csv" in err
     assert (tmp_path / "points.csv").read_text() == "mine"
 
 

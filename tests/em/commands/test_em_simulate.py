@@ -78,14 +78,14 @@ def test_a_table_that_is_there_is_not_written_over(tmp_path, capsys):
     out = tmp_path / "precious.csv"
     out.write_text("mine")
     assert simulate(*FEW, "--out", out) == 2
-    assert capsys.readouterr().err == f"flexneedle: {out}: exists: name another file with --out\n"
+    assert capsys.readouterr().err == f"flexneedle: {out}: already exists: choose another file with --out\n"
     assert out.read_text() == "mine"
 
 
 def test_a_folder_that_is_not_there_is_bad_input(tmp_path, capsys):
     out = tmp_path / "nodir" / "foo.csv"
     assert simulate(*FEW, "--out", out) == 2
-    assert capsys.readouterr().err == f"flexneedle: {out}: no folder {out.parent}\n"
+    assert capsys.readouterr().err == f"flexneedle: {out}: the folder {out.parent} does not exist\n"
 
 
 @pytest.mark.parametrize(("option", "value"), [("--points", "1"), ("--samples", "0"), ("--seed", "-1")])

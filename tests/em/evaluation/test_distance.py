@@ -21,7 +21,7 @@ def bins(rmse):
     ("smallest", "exceeded", "told"),
     [
         (None, (), "nowhere"),
-        (625.0, (), "everywhere measured"),
+        (625.0, (), "at all measured distances"),
         (675.0, (), "from 675 mm"),
         (625.0, (725.0,), "up to 675 mm, not at 725 mm"),
         (675.0, (725.0, 775.0), "from 675 mm, not at 725, 775 mm"),

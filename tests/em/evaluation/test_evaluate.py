@@ -59,7 +59,7 @@ def test_samples_that_are_not_as_many_at_each_point_weigh_alike_in_the_jitter_on
     assert found["rmse_mm"] == pytest.approx(math.sqrt((1 + 4) / 2))
     assert found["jitter_mm"] == pytest.approx(math.sqrt(2 / 4))
     assert (found["n_single"], found["samples_least"], found["samples_most"]) == (1, 1, 3)
-    assert any("one sample at 1 grid point (an error each" in note for note in evaluation.notes)
+    assert any("one sample at 1 grid point (used for the errors" in note for note in evaluation.notes)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1000.0, -2500.0])

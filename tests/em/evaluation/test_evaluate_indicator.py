@@ -44,7 +44,7 @@ def test_other_names_of_the_environments_are_an_option(tmp_path):
     evaluation = evaluate(path, Options())
     (found,) = evaluation.values()["indicator"] or [None]
     assert found is None
-    assert any("--ideal and --noisy name the two" in note for note in evaluation.notes)
+    assert any("use --ideal and --noisy to name the two" in note for note in evaluation.notes)
     (found,) = evaluate(path, Options(ideal="clear", noisy="plate")).values()["indicator"]
     assert found["noisy"]["slope_mm"] == pytest.approx(9.0)
 

@@ -26,7 +26,7 @@ def test_a_tracker_with_a_frame_of_its_own_is_told_to_be_registered(tmp_path):
     fit = evaluate(tmp_path / "t.csv", Options(register=True)).results
     assert "add --register" in told
     assert ", and 1 more)" in told
-    assert any(f"would be {result.accuracy.rmse_mm:.2g} mm after a rigid fit" in told for result in fit)
+    assert any(f"to {result.accuracy.rmse_mm:.2g} mm (" in told for result in fit)
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_a_place_with_a_second_id_is_told(tmp_path):
     for row in rows[3:6]:
         row["point_id"] = "first again"
     assert notes(tmp_path, rows)[0].startswith(
-        "tip, ideal: 1 of 28 grid points under a second point_id (counted as"
+        "tip, ideal: 1 of 28 grid points repeat a position under another point_id (counted as"
     )
 
 
@@ -63,7 +63,7 @@ def test_the_frame_is_told_from_five_times_the_residual_on(tmp_path, times, said
     places = np.repeat((middle + 1.01 * (GRID - middle) + shift)[:, None], 2, axis=1)
     told = notes(tmp_path, rows_of(GRID, places))
     assert len(told) == said
-    assert all(f"the RMSE of {times * left:.3g} mm would be {left:.2g} mm after" in note for note in told)
+    assert all(f"reduce the RMSE from {times * left:.3g} mm to {left:.2g} mm" in note for note in told)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_a_rigid_fit_that_does_not_fit_is_told(tmp_path, change, says):
 def test_grid_points_that_only_one_environment_has_are_counted(tmp_path):
     some = [row for row in random_rows(1, environment="noisy") if row["point_id"] < 21]
     assert notes(tmp_path, random_rows(0) + some) == [
-        "tip: grid points: 27 in ideal, 21 in noisy, 21 of them in all: different places are compared"
+        "tip: grid points: 27 in ideal, 21 in noisy, 21 in common: the compared positions differ"
     ]
     assert notes(tmp_path, random_rows(0) + random_rows(1, environment="noisy")) == []
 
@@ -93,7 +93,7 @@ def test_grid_points_that_only_one_environment_has_are_counted(tmp_path):
 def test_as_many_points_with_other_names_are_other_points(tmp_path):
     other = [{**row, "point_id": row["point_id"] + 5} for row in random_rows(1, environment="noisy")]
     (told,) = notes(tmp_path, random_rows(0) + other)
-    assert "27 in ideal, 27 in noisy, 22 of them in all" in told
+    assert "27 in ideal, 27 in noisy, 22 in common" in told
 
 
 def test_a_sensor_that_an_environment_lacks_is_named(tmp_path):
@@ -111,5 +111,5 @@ def test_a_single_environment_of_any_name_is_nothing_to_talk_about(tmp_path):
 
 @pytest.mark.parametrize("option", ["ideal", "noisy"])
 def test_an_environment_that_was_asked_for_and_is_not_there_is_refused(tmp_path, option):
-    with pytest.raises(InputError, match=f"--{option}: no environment 'lab emty': there is lab empty"):
+    with pytest.raises(InputError, match=f"--{option}: no environment 'lab emty': choose from lab empty"):
         notes(tmp_path, random_rows(0, environment="lab empty"), **{option: "lab emty"})

@@ -35,7 +35,7 @@ def test_missing_columns_are_named_with_the_way_to_map_them(tmp_path, rows):
     without = [{k: v for k, v in row.items() if k not in ("x_mm", "sensor")} for row in rows]
     told = refusal(write_csv(tmp_path / "t.csv", without))
     assert "no column x_mm, sensor" in told
-    assert "--columns THEIRS=OURS" in told
+    assert "--columns NAME=COLUMN" in told
 
 
 def test_columns_of_other_names_are_mapped_and_all_others_ignored(tmp_path, rows):
@@ -53,10 +53,10 @@ def test_columns_of_other_names_are_mapped_and_all_others_ignored(tmp_path, rows
 @pytest.mark.parametrize(
     ("columns", "expected"),
     [
-        (("X=x",), "no column 'x': one of point_id, true_x_mm"),
-        (("X=x_mm", "Y=x_mm"), "x_mm is both 'X' and 'Y'"),
-        (("nowhere.toml",), "neither a pair nor a file"),
-        (("x_mm=y_mm",), "the column 'x_mm' would be x_mm and y_mm"),
+        (("X=x",), "unknown COLUMN 'x': choose from point_id, true_x_mm"),
+        (("X=x_mm", "Y=x_mm"), "x_mm is given twice, as 'X' and 'Y'"),
+        (("nowhere.toml",), "must be a pair NAME=COLUMN or an existing file"),
+        (("x_mm=y_mm",), "'x_mm' would be both x_mm and y_mm"),
     ],
 )
 def test_a_mapping_that_makes_no_sense_is_refused(tmp_path, rows, columns, expected):
@@ -70,7 +70,7 @@ def test_a_field_that_is_no_number_is_named_by_row_and_by_both_names_wherever_it
     ]
     named[20]["X"] = "12 mm"
     told = refusal(write_csv(tmp_path / "t.csv", named, delimiter=";"), columns=("X=x_mm",))
-    assert "row 21: 'X' (for x_mm): '12 mm' is no number" in told
+    assert "row 21: 'X' (for x_mm): '12 mm' is not a number" in told
 
 
 def test_an_empty_field_between_blanks_is_empty(tmp_path, rows):
@@ -91,8 +91,8 @@ def test_a_table_of_one_sensor_needs_no_names_and_no_indicator(tmp_path, rows, s
     path = tmp_path / f"t.{suffix}"
     write_csv(path, bare) if suffix == "csv" else pq.write_table(pa.Table.from_pylist(bare), path)
     told = refusal(path)
-    assert "no column sensor, environment;" in told
-    assert "a table of one sensor and environment: --sensor NAME --environment NAME" in told
+    assert "no column sensor, environment (found: " in told
+    assert "for a table of one sensor and environment, use --sensor NAME --environment NAME" in told
     found = one(path, sensor="tip", environment="ideal")
     assert (found["sensor"], found["environment"], found["indicator"]) == ("tip", "ideal", None)
     assert found["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
@@ -100,7 +100,7 @@ def test_a_table_of_one_sensor_needs_no_names_and_no_indicator(tmp_path, rows, s
 
 def test_a_name_for_all_rows_is_refused_where_the_table_has_names(tmp_path, rows):
     told = refusal(write_csv(tmp_path / "t.csv", rows), sensor="coil")
-    assert "has a column sensor: --sensor is for a table without" in told
+    assert "has a column sensor: --sensor is only for a table without it" in told
 
 
 def test_the_true_place_of_a_point_without_a_sample_is_held_against_the_others(tmp_path, rows):
@@ -111,21 +111,21 @@ def test_the_true_place_of_a_point_without_a_sample_is_held_against_the_others(t
 @pytest.mark.parametrize("names", [("x_mm", "y_mm", "z_mm"), ("true_x_mm", "true_y_mm", "true_z_mm")])
 def test_one_frame_in_metres_is_refused_and_named(tmp_path, rows, names):
     path = write_csv(tmp_path / "t.csv", in_metres(rows, names))
-    assert f"{', '.join(names)} look like metres" in refusal(path)
+    assert f"{', '.join(names)} seem to be in metres" in refusal(path)
     assert one(path, unit="mm")["n_points"] == len(GRID)
 
 
 def test_both_frames_in_metres_are_refused_and_read_when_it_is_said(tmp_path, rows):
     both = ("x_mm", "y_mm", "z_mm", "true_x_mm", "true_y_mm", "true_z_mm")
     path = write_csv(tmp_path / "t.csv", in_metres(rows, both))
-    assert "look like metres" in refusal(path)
+    assert "seem to be in metres" in refusal(path)
     assert one(path, unit="m")["jitter_mm"] == pytest.approx(plain(rows)["jitter_mm"])
     assert one(path, unit="m")["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
 
 
 def test_a_poor_tracker_in_metres_is_refused_too(tmp_path):
     poor = in_metres(random_rows(seed=0, bias=3.0), ("x_mm", "y_mm", "z_mm"))  # errors of 5 mm in 50
-    assert "x_mm, y_mm, z_mm look like metres" in refusal(write_csv(tmp_path / "t.csv", poor))
+    assert "x_mm, y_mm, z_mm seem to be in metres" in refusal(write_csv(tmp_path / "t.csv", poor))
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.02, 0.03, 0.05])
@@ -168,7 +168,7 @@ def test_one_sample_at_each_point_tells_nothing_about_the_jitter(tmp_path, rows,
     )
     assert errors.split()[-3:] == ["–", "27", "27"]  # jitter, points, samples
     assert interval.split()[-2] == "from"  # the 95 %: beyond there is nothing for maximum and jitter
-    assert "one sample at each grid point (jitter and repeatability are not known)" in told.err
+    assert "one sample at each grid point (jitter and repeatability are unknown)" in told.err
 
 
 def test_two_samples_at_a_single_point_are_enough_for_a_jitter(tmp_path, rows):
@@ -202,17 +202,17 @@ def test_a_sensor_that_was_never_seen_is_refused(tmp_path, rows):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"x_mm": None}, "row 8: x_mm, y_mm, z_mm: all three must be there, or none"),
+        ({"x_mm": None}, "row 8: x_mm, y_mm, z_mm: must all have values, or all be empty"),
         ({"z_mm": float("inf")}, "row 8: x_mm, y_mm, z_mm: must be finite"),
         ({"y_mm": -3.697314e28}, "row 8: x_mm, y_mm, z_mm: must be finite and at most 1e+06 mm"),
-        ({"true_y_mm": None}, "row 8: true_x_mm, true_y_mm, true_z_mm: must be there"),
+        ({"true_y_mm": None}, "row 8: true_x_mm, true_y_mm, true_z_mm: must all have values"),
         ({"true_y_mm": 7.5}, "row 8: the true position of a point_id changes by more than 0.001 mm"),
         ({"indicator": -1.0}, "row 8: indicator: must be from 0 to 1e+06, or empty"),
         ({"indicator": float("inf")}, "row 8: indicator: must be from 0 to 1e+06"),
         ({"sensor": ""}, "row 8: sensor is empty"),
         ({"point_id": ""}, "row 8: point_id is empty"),
-        ({"x_mm": "1,5"}, "row 8: x_mm: '1,5' is no number: write a decimal point, not a comma"),
-        ({"z_mm": "abc"}, "row 8: z_mm: 'abc' is no number"),
+        ({"x_mm": "1,5"}, "row 8: x_mm: '1,5' is not a number: use a decimal point, not a comma"),
+        ({"z_mm": "abc"}, "row 8: z_mm: 'abc' is not a number"),
     ],
 )
 def test_a_row_that_breaks_a_rule_is_named(tmp_path, rows, change, expected):
@@ -222,14 +222,16 @@ def test_a_row_that_breaks_a_rule_is_named(tmp_path, rows, change, expected):
 
 @pytest.mark.parametrize(
     ("quaternion", "expected"),
-    [((1.0, None, 0.0, 0.0), "all four must be there"), ((0.9, 0.0, 0.0, 0.0), "must be a unit quaternion")],
+    [((1.0, None, 0.0, 0.0), "must all have values"), ((0.9, 0.0, 0.0, 0.0), "must be a unit quaternion")],
 )
 def test_orientations_must_be_whole_unit_quaternions(tmp_path, rows, quaternion, expected):
     rows = [{**row, "qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0} for row in rows]
     rows[4] |= dict(zip(("qw", "qx", "qy", "qz"), quaternion, strict=True))
     assert f"row 5: qw, qx, qy, qz: {expected}" in refusal(write_csv(tmp_path / "t.csv", rows))
     some = [{k: v for k, v in row.items() if k != "qz"} for row in rows]
-    assert "qw, qx, qy, qz: all four columns" in refusal(write_csv(tmp_path / "some.csv", some))
+    assert "qw, qx, qy, qz: the table must have all four columns" in refusal(
+        write_csv(tmp_path / "some.csv", some)
+    )
 
 
 def test_equal_rows_are_samples_like_all_others(tmp_path, rows):
@@ -244,7 +246,7 @@ def test_equal_rows_are_samples_like_all_others(tmp_path, rows):
     [
         ("", "is empty"),
         ("point_id,x_mm\n", "has no rows"),
-        ("\n\n", "must name the columns"),
+        ("\n\n", "must contain the column names"),
         ("\0\1\2\n3", "neither"),
     ],
 )
@@ -269,11 +271,11 @@ def test_a_csv_file_cut_in_a_field_before_the_last_is_refused(tmp_path, rows):
 def test_of_many_broken_rows_the_first_is_named(tmp_path, rows):
     some = [dict(row) for row in rows]
     some[4]["z_mm"], some[8]["true_x_mm"] = "?", "!"
-    assert "row 5: z_mm: '?' is no number" in refusal(write_csv(tmp_path / "t.csv", some))
+    assert "row 5: z_mm: '?' is not a number" in refusal(write_csv(tmp_path / "t.csv", some))
     many = [dict(row) for row in rows * 400]
     for row in many[20_000:]:
         row["y_mm"] = "?"
-    assert "row 20001: y_mm: '?' is no number" in refusal(write_csv(tmp_path / "t.csv", many))
+    assert "row 20001: y_mm: '?' is not a number" in refusal(write_csv(tmp_path / "t.csv", many))
     for row in many[20_000:]:
         row["y_mm"] = 1e9
     assert "row 20001: x_mm, y_mm, z_mm: must be finite" in refusal(write_csv(tmp_path / "t.csv", many))
@@ -314,7 +316,7 @@ def test_a_parquet_file_that_was_cut_is_refused(tmp_path, rows):
     whole = path.read_bytes()
     for part in (10, len(whole) // 2, len(whole) - 3):
         path.write_bytes(whole[:part])
-        assert "a Parquet file that was cut off, or is damaged" in refusal(path)
+        assert "is a truncated or damaged Parquet file" in refusal(path)
 
 
 def test_a_parquet_column_of_text_is_no_column_of_numbers(tmp_path, rows):
@@ -358,7 +360,7 @@ def test_a_parquet_table_may_have_whole_numbers_categories_and_no_indicator_at_a
 def test_metres_are_refused_also_where_nothing_jitters(tmp_path, rows):
     """One sample a point, or samples that a tracker rounds: the jitter is 0, not just small."""
     both = ("true_x_mm", "true_y_mm", "true_z_mm", "x_mm", "y_mm", "z_mm")
-    assert "look like metres" in refusal(write_csv(tmp_path / "t.csv", in_metres(single(rows), both)))
+    assert "seem to be in metres" in refusal(write_csv(tmp_path / "t.csv", in_metres(single(rows), both)))
 
 
 @pytest.mark.parametrize("names", [("--1",), ("²",), ("-",)])

@@ -65,7 +65,7 @@ def test_the_shipped_example_is_the_papers_grid():
         ),
         (
             LATTICE.replace("[grid]", '[sensors]\nref1 = "reference"\nref2 = "reference"\n[grid]'),
-            'sensors.ref2 = "reference": is the name of ref1, too',
+            'sensors.ref2 = "reference": is already the name of ref1',
         ),
         (LATTICE.replace("[grid]", "samples = 1\n[grid]"), "samples = 1: must be at least 2"),
     ],

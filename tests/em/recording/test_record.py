@@ -145,8 +145,8 @@ def test_a_stage_that_never_rests_is_told_and_asked_for_again(grid, out):
         record(session, stage, stage, grid, Operator(stage.ask, say))
     (said,) = stage.said
     assert said == (
-        "no 6 good samples within 2 s: tip moves: 0.50 mm from the first to the last third, limit 0.2 mm; "
-        "measured again"
+        "no 6 good samples within 2 s: tip drifts by 0.50 mm from the first to the last third of samples, limit 0.2 mm; "
+        "retrying"
     )
     assert stage.asked == [(1, 1), *ALL]
     assert_whole(out)
@@ -189,7 +189,7 @@ def test_a_tracker_that_falls_silent_for_a_while_is_told_once_and_so_is_its_retu
     stage.read = lambda: () if 3.1 < stage.time < 4.6 else read()
     stage.status = "unplugged"
     run(out, grid, stage)
-    assert stage.said == ["no frames: unplugged", "frames arrive again"]
+    assert stage.said == ["no frames: unplugged", "frames resumed"]
     assert_whole(out)
 
 
@@ -229,8 +229,8 @@ def test_a_sensor_that_stays_while_the_stage_moves_ends_the_recording(grid, out,
     with pytest.raises(RunError) as refusal:
         run(out, grid, Stuck(), retries=retries)
     assert str(refusal.value) == (
-        "tip moved 0.0 mm from point 1 to point 2 and the stage 10.0 mm: they may differ by 5.0 mm "
-        "(use --force to record it)"
+        "tip moved 0.0 mm from point 1 to point 2, the stage 10.0 mm: the difference must be at most 5.0 mm "
+        "(use --force to record the point anyway)"
     )
     assert_whole(out, stops=ALL[:1])
 
@@ -257,7 +257,7 @@ def assert_agrees(tmp_path, out, share, spacing, agrees):
     if agrees:
         assert run(out, grid, Stuck(share)) == 2
     else:
-        with pytest.raises(RunError, match="and the stage"):
+        with pytest.raises(RunError, match="the difference must be at most"):
             run(out, grid, Stuck(share))
 
 
@@ -304,12 +304,12 @@ def test_the_last_point_before_an_interruption_counts_too(grid, out):
         record(session, stage, stage, grid, Operator(ask_once, print))
     again = Stage()
     again.ask = lambda _: None  # it stays where it was
-    with pytest.raises(RunError, match=r"tip moved 0\.0 mm from point 1 to point 2 and the stage 10\.0 mm"):
+    with pytest.raises(RunError, match=r"tip moved 0\.0 mm from point 1 to point 2, the stage 10\.0 mm"):
         run(out, grid, again)
 
 
 def test_a_table_is_a_csv(grid, tmp_path):
-    with pytest.raises(InputError, match=r"table\.parquet: a CSV is written"):
+    with pytest.raises(InputError, match=r"table\.parquet: the output is CSV"):
         run(tmp_path / "table.parquet", grid, Stage())
     assert not (tmp_path / "table.parquet").exists()
 
@@ -392,14 +392,14 @@ def test_a_table_of_another_grid_is_left_alone(grid, out, tmp_path, old, new):
     run(out, grid, Stage())
     before = out.read_bytes()
     (tmp_path / "other.toml").write_text(GRID.replace(old, new))
-    with pytest.raises(InputError, match=r"line \d+: is not of this grid"):
+    with pytest.raises(InputError, match=r"line \d+: does not match the grid"):
         run(out, read_grid(str(tmp_path / "other.toml")), Stage())
     assert out.read_bytes() == before
 
 
 def test_a_file_that_is_no_such_table_is_left_alone(grid, out):
     out.write_text("my notes\n")
-    with pytest.raises(InputError, match="is no table of `em record`"):
+    with pytest.raises(InputError, match="is not a table of `em record`"):
         run(out, grid, Stage())
     assert out.read_text() == "my notes\n"
 
@@ -408,12 +408,12 @@ def test_a_damaged_line_is_found(grid, out):
     run(out, grid, Stage())
     lines = out.read_text().splitlines(keepends=True)
     out.write_text("".join([*lines[:3], lines[3].replace("1", "x", 1), *lines[4:]]))
-    with pytest.raises(InputError, match="line 4: is not of this grid"):
+    with pytest.raises(InputError, match="line 4: does not match the grid"):
         run(out, grid, Stage())
 
 
 def test_two_recordings_do_not_share_a_table(grid, out):
-    with open_session(out, grid), pytest.raises(InputError, match="another process is writing it"):
+    with open_session(out, grid), pytest.raises(InputError, match="another process is writing this file"):
         run(out, grid, Stage())
 
 

@@ -94,7 +94,7 @@ def test_what_is_recorded_can_be_replayed(tmp_path):
 def test_a_recording_overwrites_nothing(tmp_path):
     (tmp_path / "kept.csv").write_text("mine")
     clock = Clock()
-    with pytest.raises(InputError, match="exists"):
+    with pytest.raises(InputError, match="already exists"):
         watch(Replay(frames(1), clock), clock, lambda _: None, record=tmp_path / "kept.csv")
     assert (tmp_path / "kept.csv").read_text() == "mine"
 
@@ -163,7 +163,7 @@ def test_a_field_that_was_distorted_stays_so_as_long_as_a_held_insertion_waits()
 
 def test_a_recording_is_a_csv(tmp_path):
     clock = Clock()
-    with pytest.raises(InputError, match="a CSV is written"):
+    with pytest.raises(InputError, match="the output is CSV"):
         watch(Replay(frames(1), clock), clock, lambda _: None, record=tmp_path / "kept.parquet")
     assert not (tmp_path / "kept.parquet").exists()
 
