@@ -1,4 +1,4 @@
-"""Figures of an evaluation hold what they must: judged by their artists, not by their pixels."""
+"""Figures of an evaluation show their data; checked by their artists, not their pixels."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_each_height_is_a_slice_and_each_grid_point_an_arrow_along_its_error():
     assert "z = 25 mm" in words(figure)
 
 
-def test_a_cloud_of_points_is_cut_into_five_slabs_that_hold_them_all():
+def test_scattered_points_are_divided_into_five_slabs():
     true = np.random.default_rng(1).uniform(-50, 50, (300, 3))
     drawn = [one[0] for one in arrows(field_figure([field_row(true)])) if one]
     assert len(drawn) == 5
@@ -53,7 +53,7 @@ def test_a_plane_a_pair_and_a_single_point_can_be_drawn(true):
     assert sum(len(one[0].U) for one in arrows(figure) if one) == 2 * len(true)
 
 
-@pytest.mark.parametrize("shift", [0.0, 240.0])  # of 240, a tenth would be a grid step
+@pytest.mark.parametrize("shift", [0.0, 240.0])  # with 240 mm, one tenth would be about a grid step
 def test_nearly_all_arrows_end_inside_their_panel_and_none_is_drawn_beyond_it(shift):
     row = field_row()
     row = FieldRow(row.title, row.true, row.error + np.array([shift, 0.0, 0.0]))
@@ -65,10 +65,10 @@ def test_nearly_all_arrows_end_inside_their_panel_and_none_is_drawn_beyond_it(sh
     assert inside.mean() >= 0.95
     assert all(one.get_clip_on() for _, one in drawn)
     lengths = np.concatenate([np.hypot(one.U, one.V) for _, one in drawn])
-    assert np.quantile(lengths, 0.95) > 3.0  # mm: seen at all
+    assert np.quantile(lengths, 0.95) > 3.0  # mm: long enough to be visible
 
 
-def test_planes_stand_two_side_by_side():
+def test_single_slices_are_drawn_in_pairs():
     plane = GRID[GRID[:, 2] == 0.0]
     one, two, three = (field_figure([field_row(plane)] * k) for k in (1, 2, 3))
     assert two.get_figheight() <= one.get_figheight() < three.get_figheight() <= 2 * two.get_figheight()
@@ -78,7 +78,7 @@ def test_planes_stand_two_side_by_side():
     assert left.x1 < two.bbox.width / 2 < right.x0
 
 
-def test_more_sensors_than_there_is_room_for_are_counted():
+def test_rows_beyond_the_sixth_are_counted():
     figure = field_figure([field_row(title=f"coil {k}") for k in range(8)])
     assert "2 more not shown" in words(figure)
     assert "coil 5" in words(figure)
@@ -122,7 +122,7 @@ def test_a_few_indicators_far_out_are_counted_instead():
     assert ax.get_ylim()[1] < 5.0
 
 
-def test_sensors_that_are_left_out_are_counted():
+def test_omitted_sensors_are_counted():
     assert "5 more sensors not shown" in words(indicator_figure([panel()] * 3, 5))
     assert "1 more sensor not shown" in words(indicator_figure([panel()] * 3, 1))
 
@@ -141,11 +141,11 @@ def test_a_threshold_beyond_all_indicators_is_shown():
         {"constant": (0.5, np.nan)},
     ],
 )
-def test_an_environment_or_a_fit_may_be_lacking(changes):
+def test_an_environment_or_a_fit_may_be_missing(changes):
     assert "reference" in words(indicator_figure([panel(**changes), panel()]))
 
 
-def test_the_limit_and_the_verdict_stand_beside_the_rmse_by_distance():
+def test_the_figure_of_distances_shows_rmse_limit_and_note():
     far, rmse = np.array([500.0, 600.0, 700.0]), np.array([1.2, 0.8, 0.5])
     lines = [DistanceLine("tip, ideal", far, rmse, 0.7, "within 0.7 mm from 700 mm")]
     figure = distance_figure([*lines, DistanceLine("coil, ideal", far, 2 * rmse, None, "no limit")])
@@ -163,17 +163,17 @@ def test_the_roc_marks_the_threshold_in_use():
     marked = [line.get_xydata()[0] for line in figure.axes[0].lines if len(line.get_xydata()) == 1]
     assert_allclose(marked, [(0.05, 0.95)])
     assert "area 0.9500" in words(figure)
-    for told in (
+    for text in (
         "points above (lab)",
         "points above (with table)",
         "reference, lab",
         "reference, with table",
     ):
-        assert told in words(figure)
+        assert text in words(figure)
 
 
 @pytest.mark.parametrize("count", [1, 7])
-def test_legends_stay_inside_of_the_figure_and_off_the_lines_however_many_and_long_the_names(count):
+def test_legends_stay_inside_the_figure_and_off_the_axes(count):
     names = [f"sensor number {k} of the six-degree kind on the left arm of the stand" for k in range(count)]
     pair = "the laboratory after all the metal had been carried out", "the same with its table"
     values = np.linspace(0.0, 1.0, 9), np.linspace(0.5, 2.0, 9)

@@ -1,4 +1,4 @@
-"""`em register`: pairs in, map and errors out; what cannot be registered is refused in one line."""
+"""`em register`: rigid transform and errors from pairs of points; invalid pairs are refused in one line."""
 
 import json
 import tomllib
@@ -29,15 +29,15 @@ def table(tmp_path, rows, head=HEAD, name="pairs.csv"):
 
 def rows(error=0.0, repeats=1, seed=0, sensor="ref1"):
     rng = np.random.default_rng(seed)
-    seen = TRUE.inverse().apply(STAGE) + rng.normal(0.0, error / np.sqrt(3.0), STAGE.shape)
+    measured = TRUE.inverse().apply(STAGE) + rng.normal(0.0, error / np.sqrt(3.0), STAGE.shape)
     return [
-        (f"p{k}", *STAGE[k], *seen[k], sensor)
+        (f"p{k}", *STAGE[k], *measured[k], sensor)
         for _ in range(repeats)
         for k in rng.permutation(len(STAGE)).tolist()
     ]
 
 
-def test_exact_pairs_give_the_map_and_no_error(tmp_path):
+def test_exact_pairs_give_the_exact_transform(tmp_path):
     found = register(read_pairs(table(tmp_path, rows(repeats=3))))
     np.testing.assert_allclose(found.rigid.rotation, TRUE.rotation, atol=1e-12)
     np.testing.assert_allclose(found.rigid.translation, TRUE.translation, atol=1e-9)
@@ -47,14 +47,14 @@ def test_exact_pairs_give_the_map_and_no_error(tmp_path):
     np.testing.assert_allclose(again.apply(STAGE), TRUE.apply(STAGE), atol=1e-9)
 
 
-def test_errors_are_told_as_planted(tmp_path):
-    """The RMS localisation error of fifty registrations is the planted one; leaving one out shows more than the fit."""
+def test_the_estimated_errors_are_the_planted_ones(tmp_path):
+    """The RMS localisation error of 50 registrations is the planted one; leave-one-out errors exceed the residuals."""
     found = [register(read_pairs(table(tmp_path, rows(0.3, seed=seed)))) for seed in range(50)]
     assert np.sqrt(np.mean([one.fle**2 for one in found])) == pytest.approx(0.3, rel=0.1)
     assert all(np.all(one.leave_one_out >= one.residuals) for one in found)
 
 
-def test_rows_of_a_point_are_averaged_and_unseen_ones_left_out(tmp_path):
+def test_rows_of_a_point_are_averaged_and_missing_ones_ignored(tmp_path):
     data = rows(repeats=2)
     data += [(*row[:4], "", "", "", "ref1") for row in data[:3]]
     data = [
@@ -66,7 +66,7 @@ def test_rows_of_a_point_are_averaged_and_unseen_ones_left_out(tmp_path):
     assert found.pairs.missing == 3
 
 
-def test_what_other_sensors_and_unseen_rows_hold_is_of_no_concern(tmp_path):
+def test_rows_of_other_sensors_and_missing_samples_are_not_checked(tmp_path):
     code = -3.697314e28
     others = [("p0", 1, 2, 3, code, code, code, "tip"), ("p1", "", 2, 3, 4, 5, 6, "tip")]
     data = [*others, *rows(0.3), ("p2", "", "", "", "", "", "", "ref1")]
@@ -77,13 +77,13 @@ def test_what_other_sensors_and_unseen_rows_hold_is_of_no_concern(tmp_path):
     assert (found.names, found.missing) == (alone.names, 1)
 
 
-def test_metres_are_read_where_that_is_said(tmp_path):
+def test_metres_are_read_with_unit_m(tmp_path):
     data = [(row[0], *(1e-3 * value for value in row[1:7]), row[7]) for row in rows(0.3)]
-    told = register(read_pairs(table(tmp_path, data), unit="m"))
-    np.testing.assert_allclose(told.fre, register(read_pairs(table(tmp_path, rows(0.3)))).fre)
+    in_metres = register(read_pairs(table(tmp_path, data), unit="m"))
+    np.testing.assert_allclose(in_metres.fre, register(read_pairs(table(tmp_path, rows(0.3)))).fre)
 
 
-def test_a_target_that_is_no_place_is_refused_and_nothing_is_written(tmp_path, capsys):
+def test_a_target_with_nan_is_refused_before_writing(tmp_path, capsys):
     out = tmp_path / "r.toml"
     with pytest.raises(SystemExit):
         main(["em", "register", str(table(tmp_path, rows())), "--target", "nan", "0", "0", "--out", str(out)])
@@ -91,7 +91,7 @@ def test_a_target_that_is_no_place_is_refused_and_nothing_is_written(tmp_path, c
     assert not list(tmp_path.glob("r.*"))
 
 
-def test_a_row_without_an_id_is_no_other_point(tmp_path):
+def test_a_row_without_an_id_is_its_own_point(tmp_path):
     data = [("1", *rows()[0][1:]), ("", *rows()[1][1:]), *rows()[2:]]
     data[1], data[0] = data[0], data[1]
     assert len(read_pairs(table(tmp_path, data)).names) == 8
@@ -103,7 +103,7 @@ def test_without_point_ids_each_row_is_a_point(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("data", "words"),
+    ("data", "message"),
     [
         ([], "has no rows"),
         (rows()[:2], "2 pairs of points"),
@@ -137,10 +137,10 @@ def test_without_point_ids_each_row_is_a_point(tmp_path):
         *(
             "empty",
             "two",
-            "half a place",
-            "two places",
+            "incomplete position",
+            "two positions",
             "two sensors",
-            "unseen",
+            "missing",
             "metres",
             "both in metres",
             "mirrored",
@@ -149,20 +149,20 @@ def test_without_point_ids_each_row_is_a_point(tmp_path):
         *("not moved", "code"),
     ],
 )
-def test_what_cannot_be_registered_is_refused(tmp_path, data, words, capsys):
+def test_what_cannot_be_registered_is_refused(tmp_path, data, message, capsys):
     assert main(["em", "register", str(table(tmp_path, data)), "--out", str(tmp_path / "r.toml")]) == 2
-    assert words in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "r.toml").exists()
 
 
-def test_the_command_writes_a_table_for_scenarios_a_picture_and_tells_the_errors(tmp_path, capsys):
+def test_the_command_writes_a_scenario_table_and_a_figure_and_reports_errors(tmp_path, capsys):
     data, out = table(tmp_path, [*rows(0.3), *rows(sensor="tip")]), tmp_path / "rig.toml"
     command = ["em", "register", str(data), "--sensor", "ref1", "--target", "40", "5", "0", "--out", str(out)]
     assert main([*command, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
     found = register(read_pairs(data, sensor="ref1"), [(40.0, 5.0, 0.0)])
-    assert told["fre_mm"] == found.fre
-    assert told["tre"] == [{"target_mm": [40.0, 5.0, 0.0], "tre_mm": found.tre[0]}]
+    assert printed["fre_mm"] == found.fre
+    assert printed["tre"] == [{"target_mm": [40.0, 5.0, 0.0], "tre_mm": found.tre[0]}]
     assert {path.name for path in tmp_path.glob("rig.*")} == {"rig.toml", "rig.png", "rig.svg"}
     assert tomllib.loads(out.read_text())["result"]["points"] == 8
     scenario = load_registration(out, PHANTOM)
@@ -172,7 +172,7 @@ def test_the_command_writes_a_table_for_scenarios_a_picture_and_tells_the_errors
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
         ("a = [", "not TOML"),
         ("a = 1", r"has no table \[tracker.registration\]"),
@@ -180,10 +180,10 @@ def test_the_command_writes_a_table_for_scenarios_a_picture_and_tells_the_errors
         ("[tracker.registration]\nrotation = [1, 1, 0, 0]\n", "must be a unit quaternion"),
     ],
 )
-def test_a_file_without_a_registration_is_refused(tmp_path, text, words):
+def test_a_file_without_a_registration_is_refused(tmp_path, text, message):
     path = tmp_path / "r.toml"
     path.write_text(text)
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=message):
         load_registration(path, PHANTOM)
     with pytest.raises(InputError, match="no such file"):
         load_registration(tmp_path / "none.toml", PHANTOM)
@@ -197,7 +197,7 @@ def test_a_file_without_a_registration_is_refused(tmp_path, text, words):
         ([[1.0, 1.0, 1.0]] * 3, "must not lie on a line"),
     ],
 )
-def test_a_scenario_refuses_fiducials_that_fix_nothing(points, rule):
+def test_a_scenario_refuses_degenerate_fiducials(points, rule):
     with pytest.raises(InputError, match=rule):
         PHANTOM.with_values({"tracker.registration.fiducials_mm": points})
 
@@ -212,7 +212,7 @@ def rig_of(seed, **values):
 
 
 def off(rig):
-    """How far the tracker is off at rest (mm), in the plane."""
+    """In-plane error (mm) of the tracker at rest."""
     rig.clock.wait(0.5)
     sample = rig.tracker.read()[-1]
     return np.array([sample.x, sample.y]) - rig.truth().tip[:2]
@@ -220,7 +220,7 @@ def off(rig):
 
 @pytest.mark.parametrize("environment", ["none", "ideal"])
 def test_an_insertion_has_the_error_of_its_registration(tmp_path, environment):
-    """Exact pairs change nothing; others put the tracker off by what is expected, each insertion on its own."""
+    """Exact pairs change nothing; others add the expected error, drawn for each insertion."""
     found = register(read_pairs(table(tmp_path, rows(3.0))), [(-28.5, 0.0, 0.0)])
     registration = found.registration.model_dump(mode="json")
     world = {"tracker.environment": environment, "tracker.field_seed": 1}
@@ -234,5 +234,5 @@ def test_an_insertion_has_the_error_of_its_registration(tmp_path, environment):
             for seed in range(60)
         ]
     )
-    expected = found.tre[0] * np.sqrt(2.0 / 3.0)  # two of three coordinates, about alike
+    expected = found.tre[0] * np.sqrt(2.0 / 3.0)  # two of three coordinates, with about equal errors
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) == pytest.approx(expected, rel=0.35)

@@ -1,4 +1,4 @@
-"""The paper's experiment in a simulated environment: its table, and what is the same from seed to seed."""
+"""The paper's experiment in a simulated environment: its table, and the effect of the seeds."""
 
 import numpy as np
 import pyarrow.compute
@@ -38,36 +38,36 @@ def test_a_tracker_without_errors_measures_the_grid():
     table = measure([environment()], SMALL)
     for sensor in ("tip", "reference"):
         for axis in "xyz":
-            true, told = column(table, f"true_{axis}_mm", sensor), column(table, f"{axis}_mm", sensor)
-            np.testing.assert_allclose(told, true, atol=1e-12)
+            true, measured = column(table, f"true_{axis}_mm", sensor), column(table, f"{axis}_mm", sensor)
+            np.testing.assert_allclose(measured, true, atol=1e-12)
     assert column(table, "indicator", "reference").tolist() == pytest.approx([0.0] * (ROWS // 2))
     assert (
         set(column(table, "indicator", "tip")) == {None} or np.isnan(column(table, "indicator", "tip")).all()
     )
 
 
-def test_the_grid_is_gone_through_repeatedly_with_all_samples_of_a_point_at_once():
+def test_each_repeat_visits_the_grid_and_takes_all_samples_of_a_point_at_once():
     ids = column(measure([environment()], SMALL), "point_id")
     np.testing.assert_array_equal(ids, np.tile(np.repeat(np.arange(8), 3), 4))
 
 
-def test_the_tips_sensor_points_along_x_and_the_reference_stands_upright():
+def test_the_tip_sensor_points_along_x_and_the_reference_along_z():
     table = measure([environment()], SMALL)
     for sensor, axis in (("tip", [1.0, 0.0, 0.0]), ("reference", [0.0, 0.0, 1.0])):
-        turns = np.stack([column(table, name, sensor) for name in ("qw", "qx", "qy", "qz")], axis=1)
-        told = Rotation.from_quat(turns, scalar_first=True).apply([0.0, 0.0, 1.0])
-        np.testing.assert_allclose(told, np.tile(axis, (len(told), 1)), atol=1e-12)
+        quaternions = np.stack([column(table, name, sensor) for name in ("qw", "qx", "qy", "qz")], axis=1)
+        measured = Rotation.from_quat(quaternions, scalar_first=True).apply([0.0, 0.0, 1.0])
+        np.testing.assert_allclose(measured, np.tile(axis, (len(measured), 1)), atol=1e-12)
 
 
 def test_the_distance_is_that_to_the_field_generator():
     table = measure([environment(generator_mm=[0.0, 700.0, 0.0])], SMALL)
-    places = np.stack([column(table, f"true_{axis}_mm") for axis in "xyz"], axis=1)
-    assert set(places[:, 1]) == {-50.0, 50.0}
-    away = np.linalg.norm(places - (0.0, 700.0, 0.0), axis=1)
-    np.testing.assert_allclose(column(table, "distance_mm"), away)
+    positions = np.stack([column(table, f"true_{axis}_mm") for axis in "xyz"], axis=1)
+    assert set(positions[:, 1]) == {-50.0, 50.0}
+    distance = np.linalg.norm(positions - (0.0, 700.0, 0.0), axis=1)
+    np.testing.assert_allclose(column(table, "distance_mm"), distance)
 
 
-def test_a_missing_sample_has_neither_place_nor_indicator_nor_orientation():
+def test_a_missing_sample_has_no_position_indicator_or_orientation():
     table = measure([environment(missing_fraction=0.3)], Experiment(points=3, samples=50))
     lost = table.filter(pyarrow.compute.is_null(table["x_mm"]))
     assert lost.num_rows == pytest.approx(0.3 * table.num_rows, rel=0.05)
@@ -75,14 +75,14 @@ def test_a_missing_sample_has_neither_place_nor_indicator_nor_orientation():
         assert lost[name].null_count == lost.num_rows
     for name in ("point_id", "true_x_mm", "distance_mm", "sensor"):
         assert lost[name].null_count == 0
-    seen = table.filter(pyarrow.compute.is_valid(table["x_mm"]))
-    assert seen["qw"].null_count == 0
+    present = table.filter(pyarrow.compute.is_valid(table["x_mm"]))
+    assert present["qw"].null_count == 0
 
 
 # ---- seeds
 
 
-def test_the_seed_draws_the_measurement_and_the_field_seed_the_room():
+def test_the_seed_draws_the_noise_and_the_field_seed_the_field_errors():
     clear = environment(tip={"bias_mm": 1.0, "jitter_mm": 0.1})
 
     def bias(**seeds):
@@ -103,13 +103,13 @@ def test_an_environments_rows_do_not_depend_on_what_else_is_measured():
     assert not np.allclose(*(column(table, "y_mm")[:5] for table in (both, alone)))
 
 
-def test_two_environments_have_noise_of_their_own():
+def test_two_environments_have_independent_noise():
     twins = [environment(name=name, tip={"jitter_mm": 0.1}) for name in ("one", "other")]
     one, other = np.split(column(measure(twins, SMALL), "x_mm"), 2)
     assert (one != other).all()
 
 
-def test_two_sensors_have_noise_of_their_own():
+def test_two_sensors_have_independent_noise():
     both = environment(tip={"jitter_mm": 0.1}, reference={"jitter_mm": 0.1}, tilt_jitter_mrad=0.0)
     table = measure([both], Experiment(points=2, samples=500))
     off = [column(table, "x_mm", name) - column(table, "true_x_mm", name) for name in ("tip", "reference")]
@@ -127,7 +127,7 @@ def test_same_seed_same_bytes(tmp_path, suffix):
     assert one == same != other
 
 
-def test_both_kinds_of_file_hold_the_same(tmp_path):
+def test_csv_and_parquet_hold_the_same_table(tmp_path):
     table = measure([load_environment("noisy")], Experiment(points=2, samples=30))
     text, columns = tmp_path / "a.csv", tmp_path / "a.parquet"
     write_measurements(table, text)
@@ -142,16 +142,16 @@ def test_both_kinds_of_file_hold_the_same(tmp_path):
 # ---- what is refused
 
 
-def test_two_environments_of_one_name_are_refused():
+def test_two_environments_with_the_same_name_are_refused():
     with pytest.raises(InputError, match="two environments have the name ideal"):
         measure([load_environment("ideal")] * 2, SMALL)
 
 
-def test_more_than_memory_is_for_is_refused():
+def test_too_many_samples_are_refused():
     with pytest.raises(InputError, match="200000000 samples: must be at most"):
         measure([load_environment("ideal")], Experiment(points=10, samples=100_000, repeats=1))
 
 
-def test_another_kind_of_file_is_refused(tmp_path):
+def test_an_unknown_suffix_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"must end in \.csv or \.parquet"):
         write_measurements(measure([environment()], SMALL), tmp_path / "a.xlsx")

@@ -29,7 +29,7 @@ def run(capsys, *argv):
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_the_emulator_has_the_path_that_was_asked_for_until_it_ends(tmp_path, end):
+def test_the_emulator_provides_the_requested_path_until_it_ends(tmp_path, end):
     link = tmp_path / "tracker"
     with emulated("--link", str(link), end=end) as path:
         assert path == str(link)
@@ -44,7 +44,7 @@ def test_the_emulator_replaces_no_file(capsys, tmp_path):
     assert "already exists: choose another path, or remove it" in err
 
 
-def test_the_emulator_takes_no_link_but_one_that_a_killed_emulator_left(tmp_path):
+def test_the_emulator_replaces_only_the_link_of_a_killed_emulator(tmp_path):
     target, link = tmp_path / "kept.txt", tmp_path / "dev"
     target.write_text("mine")
     link.symlink_to(target)
@@ -68,13 +68,13 @@ def test_an_emulator_that_ends_leaves_the_link_of_another(tmp_path):
     assert link.readlink().name == "null"
 
 
-def test_a_fault_that_makes_no_sense_is_bad_input(capsys):
+def test_an_unknown_fault_is_bad_input(capsys):
     status, _, err = run(capsys, "emulate", "aurora", "--fault", "mising@1")
     assert status == 2
     assert err.startswith("flexneedle: --fault mising@1: unknown kind; kinds: missing, ")
 
 
-def test_a_recording_asks_at_each_point_and_says_where_it_wrote(capsys, tmp_path, monkeypatch):
+def test_a_recording_prompts_at_each_point_and_prints_its_file(capsys, tmp_path, monkeypatch):
     (tmp_path / "grid.toml").write_text(GRID)
     out = str(tmp_path / "table.csv")
     with emulated("--sensors", "1", "--still") as path:
@@ -83,7 +83,7 @@ def test_a_recording_asks_at_each_point_and_says_where_it_wrote(capsys, tmp_path
         status, _, err = run(capsys, "em", "record", *arguments)
         assert status == 1
         assert "point 1 of 2, repeat 1 of 1: move the stage to 0, 0, 0 mm; press Enter when there:\n" in err
-        assert "\nflexneedle: end of input on stdin" in err, "on a line of its own"
+        assert "\nflexneedle: end of input on stdin" in err, "on a separate line"
         status, printed, err = run(capsys, "em", "record", *arguments, "--dwell", "0")
     assert (status, printed) == (0, f"{out}\n")
     assert "resuming after 1 recorded points" in err
@@ -92,13 +92,13 @@ def test_a_recording_asks_at_each_point_and_says_where_it_wrote(capsys, tmp_path
     assert (status, printed, err) == (0, f"{out}\n", f"{out}: complete, 2 points\n")
 
 
-def test_a_tracker_that_is_not_there_is_bad_input(capsys, tmp_path):
+def test_a_missing_tracker_is_bad_input(capsys, tmp_path):
     status, out, err = run(capsys, "em", "watch", "--tracker", f"aurora:{tmp_path}/nothing")
     assert (status, out) == (2, "")
     assert "no such port; serial ports found: " in err
 
 
-def test_without_a_tracker_a_recording_leaves_nothing_behind_and_a_begun_one_as_it_was(capsys, tmp_path):
+def test_without_a_tracker_no_file_is_created_or_changed(capsys, tmp_path):
     (tmp_path / "grid.toml").write_text(GRID)
     out = tmp_path / "table.csv"
     arguments = ("em", "record", "--grid", str(tmp_path / "grid.toml"), "--out", str(out), "--dwell", "0")
@@ -110,13 +110,13 @@ def test_without_a_tracker_a_recording_leaves_nothing_behind_and_a_begun_one_as_
     with emulated("--sensors", "1", "--still") as path:
         assert run(capsys, *arguments, "--tracker", f"aurora:{path}")[0] == 0
     lines = out.read_text().splitlines(keepends=True)
-    begun = "".join(lines[:7]) + lines[7][:9]  # one stop and a torn part of the next
+    begun = "".join(lines[:7]) + lines[7][:9]  # one stop and a truncated part of the next
     out.write_text(begun)
     assert run(capsys, *arguments, *nowhere)[0] == 2
     assert out.read_text() == begun
 
 
-def test_a_watch_prints_json_lines_and_keeps_what_it_saw(capsys, tmp_path):
+def test_a_watch_prints_json_lines_and_saves_the_frames(capsys, tmp_path):
     kept = tmp_path / "kept.csv"
     with emulated("--fault", "missing@0") as path:
         status, out, _ = run(
@@ -149,7 +149,7 @@ def test_a_watch_prints_json_lines_and_keeps_what_it_saw(capsys, tmp_path):
 
 
 class Terminal(io.StringIO):
-    """What is typed at a terminal."""
+    """Standard input of a terminal."""
 
     def isatty(self):
         return True
@@ -159,7 +159,7 @@ MOVING = GRID.replace("[1, 0, 0]", "[50, 0, 0]")
 
 
 def record_moving(capsys, tmp_path, monkeypatch, typed, *more):
-    """Record a tip that rests while the stage goes 50 mm."""
+    """Record a tip that rests while the stage moves by 50 mm."""
     (tmp_path / "grid.toml").write_text(MOVING)
     monkeypatch.setattr("sys.stdin", typed)
     with emulated("--sensors", "1", "--still") as path:
@@ -169,18 +169,14 @@ def record_moving(capsys, tmp_path, monkeypatch, typed, *more):
     return status, err, out.read_text().count("\n") - 1 if out.exists() else 0
 
 
-def test_at_a_terminal_one_is_asked_whether_to_keep_what_does_not_fit_the_stage(
-    capsys, tmp_path, monkeypatch
-):
+def test_at_a_terminal_a_mismatch_must_be_confirmed(capsys, tmp_path, monkeypatch):
     status, err, rows = record_moving(capsys, tmp_path, monkeypatch, Terminal("\n\n\nk\n"))
     assert (status, rows) == (0, 8)
     assert err.count("the stage 50.0 mm: the difference must be at most 10.0 mm\n") == 2
     assert err.count("press Enter to measure this point again, k to keep it: ") == 2
 
 
-def test_without_a_terminal_what_does_not_fit_the_stage_is_refused_unless_forced(
-    capsys, tmp_path, monkeypatch
-):
+def test_without_a_terminal_a_mismatch_is_refused_unless_forced(capsys, tmp_path, monkeypatch):
     status, err, rows = record_moving(capsys, tmp_path, monkeypatch, io.StringIO("\n" * 9))
     assert (status, rows) == (1, 4)
     assert (
@@ -192,7 +188,7 @@ def test_without_a_terminal_what_does_not_fit_the_stage_is_refused_unless_forced
     assert "recorded (--force)" in err
 
 
-def test_an_end_of_input_at_a_terminal_ends_the_line_of_the_question(capsys, tmp_path, monkeypatch):
+def test_an_end_of_input_at_a_terminal_ends_the_line_of_the_prompt(capsys, tmp_path, monkeypatch):
     status, err, _ = record_moving(capsys, tmp_path, monkeypatch, Terminal())
     assert status == 1
     assert "press Enter when there: \nflexneedle: end of input on stdin" in err
@@ -201,7 +197,7 @@ def test_an_end_of_input_at_a_terminal_ends_the_line_of_the_question(capsys, tmp
 @pytest.mark.parametrize(
     ("option", "value"), [("--dwell", "-1"), ("--dwell", "inf"), ("--seconds", "-1"), ("--seconds", "nan")]
 )
-def test_times_that_are_none_are_refused(capsys, option, value):
+def test_invalid_times_are_refused(capsys, option, value):
     command = ("record", "--grid", "cube", "--out", "x.csv") if option == "--dwell" else ("watch",)
     with pytest.raises(SystemExit) as refusal:
         run(capsys, "em", *command, "--tracker", "aurora:x", option, value)
@@ -209,17 +205,17 @@ def test_times_that_are_none_are_refused(capsys, option, value):
     assert f"argument {option}: {value}: must be " in capsys.readouterr().err
 
 
-def test_a_recording_that_is_not_there_is_named_once(capsys):
+def test_a_missing_recording_is_named_once(capsys):
     status, out, err = run(capsys, "em", "watch", "--tracker", "replay:nothere.csv")
     assert (status, out) == (2, "")
     assert err == "flexneedle: nothere.csv: cannot be read: No such file or directory\n"
 
 
-def test_a_short_replay_shows_the_first_frame_each_turn_of_the_verdict_and_the_last(capsys, tmp_path):
+def test_a_short_replay_shows_the_first_frame_each_change_of_the_verdict_and_the_last(capsys, tmp_path):
     rows = [
-        f"{n / 40},{n},{name},{status},{place},0.02"
+        f"{n / 40},{n},{name},{status},{position},0.02"
         for n in range(60)
-        for name, status, place in (
+        for name, status, position in (
             ("tip", *(("missing", ",,") if 25 <= n < 30 else ("ok", "1,2,3"))),
             ("ref1", "ok", "4,5,6"),
         )

@@ -1,4 +1,4 @@
-"""`flexneedle em evaluate` and `em check`: what they print, write and return."""
+"""`flexneedle em evaluate` and `em check`: output, files and exit status."""
 
 import json
 import re
@@ -29,10 +29,10 @@ def run(capsys, *argv):
     return status, captured.out, captured.err
 
 
-def test_tables_are_printed_beside_the_papers_and_the_makers_values(capsys, table, tmp_path):
+def test_tables_show_the_papers_and_the_manufacturers_values(capsys, table, tmp_path):
     status, out, err = run(capsys, "em", "evaluate", table, "--out", tmp_path / "out", "--register")
     assert (status, err) == (0, "note: tip: not in noisy, only in ideal\n")
-    for told in (
+    for text in (
         "tip, ideal",
         " paper",
         "0.65",
@@ -44,7 +44,7 @@ def test_tables_are_printed_beside_the_papers_and_the_makers_values(capsys, tabl
         "reference, noisy: slope (mm)",
         " met",
     ):
-        assert told in out
+        assert text in out
     assert str(tmp_path / "out") in out
 
 
@@ -68,13 +68,11 @@ def test_the_same_table_gives_the_same_bytes(capsys, table, tmp_path):
     for name in ("one", "two"):
         run(capsys, "em", "evaluate", table, "--out", tmp_path / name)
     for path in (tmp_path / "one").iterdir():
-        if path.name != "evaluation.json":  # which names its folder
+        if path.name != "evaluation.json":  # contains the name of its folder
             assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
 
 
-def test_without_a_folder_one_is_made_below_runs_and_none_is_written_over(
-    capsys, table, tmp_path, monkeypatch
-):
+def test_the_default_folder_is_new_and_results_are_not_overwritten(capsys, table, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run(capsys, "em", "evaluate", table)
     (folder,) = (tmp_path / "runs").iterdir()
@@ -92,7 +90,7 @@ def test_without_duckdb_the_extra_is_named_in_one_line(capsys, table, command, m
     assert err == "flexneedle: tables of measurements need duckdb: pip install 'flexneedle[em]'\n"
 
 
-def test_a_table_that_cannot_be_used_is_one_line_and_status_2(capsys, tmp_path):
+def test_an_invalid_table_gives_one_line_and_status_2(capsys, tmp_path):
     path = write_csv(tmp_path / "t.csv", [{"a": 1.0}])
     status, out, err = run(capsys, "em", "evaluate", path, "--out", tmp_path / "out")
     assert (status, out, err.count("\n")) == (2, "", 1)
@@ -105,7 +103,7 @@ def powered(mean, environment="on", points=27, sensor="reference"):
     return rows_of(GRID[:points], GRID[:points, None], sensor, environment, values.tolist())
 
 
-def test_check_compares_two_environments_and_its_status_is_1_where_power_is_too_much(capsys, tmp_path):
+def test_check_compares_two_environments_with_status_1_above_the_threshold(capsys, tmp_path):
     table = write_csv(tmp_path / "t.csv", powered(0.02, "off") + powered(0.04))
     status, out, _ = run(capsys, "em", "check", table)
     assert status == 0
@@ -118,11 +116,11 @@ def test_check_compares_two_environments_and_its_status_is_1_where_power_is_too_
     assert values["results"][0]["difference"] == pytest.approx(0.04)
     assert values["results"][0]["paired"] is True
     low, high = values["results"][0]["difference_interval"]
-    assert 0.03 < low <= 0.04 + 1e-12 <= high + 2e-12 < 0.05  # with power on it is more
+    assert 0.03 < low <= 0.04 + 1e-12 <= high + 2e-12 < 0.05  # higher with power on
     assert values["results"][0]["points_above"] == 16
 
 
-def test_the_interval_of_the_difference_is_that_of_the_same_points_drawn_again(capsys, tmp_path):
+def test_the_interval_of_the_difference_resamples_points_in_pairs(capsys, tmp_path):
     rng = np.random.default_rng(1)
     off, on = rng.uniform(0.01, 0.03, 27), rng.uniform(0.02, 0.05, 27)
     rows = [
@@ -147,7 +145,7 @@ def test_check_finds_both_environments_by_name(capsys, tmp_path):
     assert "no environment 'off': choose with --off and --on from on, quiet" in err
 
 
-def test_check_with_few_or_other_points_prints_so(capsys, tmp_path):
+def test_check_reports_few_and_differing_points(capsys, tmp_path):
     few = write_csv(tmp_path / "few.csv", powered(0.02, "off", 4) + powered(0.02, "on", 4))
     assert "too few grid points for an interval" in run(capsys, "em", "check", few)[1]
     other = write_csv(tmp_path / "other.csv", powered(0.02, "off", 20) + powered(0.02, "on", 27))
@@ -161,7 +159,7 @@ def test_check_with_few_or_other_points_prints_so(capsys, tmp_path):
     assert low < 0.0 < high
 
 
-def test_check_names_a_sensor_that_only_one_environment_has(capsys, tmp_path):
+def test_check_names_a_sensor_missing_in_one_environment(capsys, tmp_path):
     rows = powered(0.02, "off") + powered(0.02) + powered(0.02, sensor="ref2")
     table = write_csv(tmp_path / "t.csv", rows)
     status, _, err = run(capsys, "em", "check", table)
@@ -172,7 +170,7 @@ def test_check_names_a_sensor_that_only_one_environment_has(capsys, tmp_path):
     assert "no sensor has an indicator both with power off (reference) and on (ref2)" in err
 
 
-def test_environments_keep_their_own_names_in_tables(capsys, table, tmp_path):
+def test_tables_show_the_names_of_the_environments(capsys, table, tmp_path):
     table.write_text(table.read_text().replace(",ideal", ",lab empty").replace(",noisy", ",with table"))
     argv = (
         "em",
@@ -186,20 +184,20 @@ def test_environments_keep_their_own_names_in_tables(capsys, table, tmp_path):
         tmp_path / "out",
     )
     _, out, _ = run(capsys, *argv)
-    for told in ("reference, lab empty: error", "reference, with table: slope", "lab empty: points below"):
-        assert told in out
+    for text in ("reference, lab empty: error", "reference, with table: slope", "lab empty: points below"):
+        assert text in out
     assert " ideal" not in out
     assert " noisy" not in out
 
 
-def test_a_misspelt_environment_ends_it_before_a_folder_is_made(capsys, table, tmp_path):
+def test_a_misspelt_environment_is_refused_before_a_folder_is_made(capsys, table, tmp_path):
     status, _, err = run(capsys, "em", "evaluate", table, "--ideal", "idael", "--out", tmp_path / "out")
     assert (status, err.count("\n")) == (2, 1)
     assert "--ideal: no environment 'idael': choose from ideal, noisy" in err
     assert not (tmp_path / "out").exists()
 
 
-def test_a_table_of_points_is_not_written_over(capsys, table, tmp_path):
+def test_a_table_of_points_is_not_overwritten(capsys, table, tmp_path):
     (tmp_path / "points.csv").write_text("mine")
     status, _, err = run(capsys, "em", "evaluate", table, "--out", tmp_path)
     assert status == 2
@@ -207,7 +205,7 @@ def test_a_table_of_points_is_not_written_over(capsys, table, tmp_path):
     assert (tmp_path / "points.csv").read_text() == "mine"
 
 
-def test_a_table_without_names_gets_them_from_options(capsys, tmp_path):
+def test_a_table_without_labels_gets_them_from_options(capsys, tmp_path):
     rows = [{k: v for k, v in row.items() if k not in ("sensor", "environment")} for row in random_rows(1)]
     path = write_csv(tmp_path / "t.csv", rows)
     argv = ("em", "evaluate", path, "--sensor", "coil", "--environment", "lab", "--out", tmp_path / "out")
@@ -219,7 +217,7 @@ def test_a_table_without_names_gets_them_from_options(capsys, tmp_path):
 
 
 @pytest.mark.parametrize("command", ["evaluate", "check"])
-def test_an_unknown_option_brings_the_usage_of_its_command(capsys, command):
+def test_an_unknown_option_prints_the_usage_of_its_command(capsys, command):
     with pytest.raises(SystemExit) as ended:
         run(capsys, "em", command, "t.csv", "--registr")
     assert ended.value.code == 2

@@ -22,7 +22,7 @@ def simulate(*arguments):
     return main(["em", "simulate", *map(str, arguments)])
 
 
-def test_without_arguments_but_a_size_both_environments_go_into_a_csv(tmp_path, monkeypatch, capsys):
+def test_by_default_both_environments_are_written_to_a_csv(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert simulate(*FEW) == 0
     assert capsys.readouterr().out == "measurements.csv\n"
@@ -31,7 +31,7 @@ def test_without_arguments_but_a_size_both_environments_go_into_a_csv(tmp_path, 
     assert set(table["environment"].to_pylist()) == {"ideal", "noisy"}
 
 
-def test_an_environment_of_ones_own_goes_into_the_table_by_its_name(tmp_path):
+def test_a_custom_environment_appears_by_its_name(tmp_path):
     mine = tmp_path / "mine.toml"
     mine.write_text('name = "operating room"\nlength_mm = 80\n[plate]\nreference_mm = 2\n')
     out = tmp_path / "out.parquet"
@@ -40,7 +40,7 @@ def test_an_environment_of_ones_own_goes_into_the_table_by_its_name(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         ("length_mm = 80\n", "mine.toml: name: missing"),
         ('name = "a"\nlenght_mm = 80\n', "unknown key; did you mean length_mm?"),
@@ -48,20 +48,20 @@ def test_an_environment_of_ones_own_goes_into_the_table_by_its_name(tmp_path):
         ("name = \n", "mine.toml: not TOML"),
     ],
 )
-def test_what_is_wrong_with_a_file_is_said_in_one_line(tmp_path, capsys, content, told):
+def test_an_invalid_environment_file_gives_one_line(tmp_path, capsys, content, message):
     mine = tmp_path / "mine.toml"
     mine.write_text(content)
     assert simulate(*FEW, "--environment", mine, "--out", tmp_path / "out.csv") == 2
     complaint = capsys.readouterr().err
-    assert told in complaint
+    assert message in complaint
     assert complaint.count("\n") == 1
     assert not (tmp_path / "out.csv").exists()
 
 
-def test_an_unknown_name_tells_the_names_there_are(tmp_path, capsys):
+def test_an_unknown_environment_is_refused_with_the_choices(tmp_path, capsys):
     assert simulate("--environment", "nosy", "--out", tmp_path / "out.csv") == 2
-    told = "nosy: no such file, and no such environment (choices: ideal, noisy)"
-    assert told in capsys.readouterr().err
+    message = "nosy: no such file, and no such environment (choices: ideal, noisy)"
+    assert message in capsys.readouterr().err
 
 
 def test_a_folder_is_no_environment(tmp_path, capsys):
@@ -74,7 +74,7 @@ def test_the_suffix_is_checked_before_the_work(tmp_path, capsys):
     assert "must end in .csv or .parquet" in capsys.readouterr().err
 
 
-def test_a_table_that_is_there_is_not_written_over(tmp_path, capsys):
+def test_an_existing_table_is_not_overwritten(tmp_path, capsys):
     out = tmp_path / "precious.csv"
     out.write_text("mine")
     assert simulate(*FEW, "--out", out) == 2
@@ -82,28 +82,28 @@ def test_a_table_that_is_there_is_not_written_over(tmp_path, capsys):
     assert out.read_text() == "mine"
 
 
-def test_a_folder_that_is_not_there_is_bad_input(tmp_path, capsys):
+def test_a_missing_folder_is_bad_input(tmp_path, capsys):
     out = tmp_path / "nodir" / "foo.csv"
     assert simulate(*FEW, "--out", out) == 2
     assert capsys.readouterr().err == f"flexneedle: {out}: the folder {out.parent} does not exist\n"
 
 
 @pytest.mark.parametrize(("option", "value"), [("--points", "1"), ("--samples", "0"), ("--seed", "-1")])
-def test_counts_have_bounds(option, value, capsys):
+def test_counts_out_of_bounds_are_refused(option, value, capsys):
     with pytest.raises(SystemExit) as ended:
         simulate(option, value)
     assert ended.value.code == 2
     assert "must be" in capsys.readouterr().err
 
 
-# ---- the page that explains it
+# ---- the documentation page
 
 
 def examples():
     return re.findall(r"```toml\n(.*?)```", DOCS.read_text(), re.DOTALL)
 
 
-def test_the_environment_on_the_page_can_be_simulated(tmp_path):
+def test_the_documented_environment_can_be_simulated(tmp_path):
     _, room = examples()
     (tmp_path / "room.toml").write_text(room)
     out = tmp_path / "out.csv"
@@ -111,8 +111,8 @@ def test_the_environment_on_the_page_can_be_simulated(tmp_path):
     assert "operating room" in out.read_text()
 
 
-def test_the_indicator_sees_the_plate_on_the_page(tmp_path):
-    """It sees along the axis of the coils alone: beside them it would say nothing."""
+def test_the_indicator_detects_the_documented_plate(tmp_path):
+    """The coils of the indicator are sensitive only along their axis; the plate is not beside them."""
     (tmp_path / "room.toml").write_text(examples()[1])
     arguments = ("--points", 4, "--samples", 10, "--repeats", 1, "--out", tmp_path / "out.csv")
     assert simulate(*arguments, "--environment", tmp_path / "room.toml", "ideal") == 0
@@ -120,7 +120,7 @@ def test_the_indicator_sees_the_plate_on_the_page(tmp_path):
     assert found.auc > 0.9
 
 
-def test_the_scenario_on_the_page_is_one():
+def test_the_documented_scenario_is_valid():
     values = tomllib.loads(examples()[0])["tracker"]
     scenario = load_scenario("phantom").with_values({f"tracker.{key}": values[key] for key in values})
     assert scenario.tracker.tip_offset_mm == 6.0
@@ -128,13 +128,13 @@ def test_the_scenario_on_the_page_is_one():
 
 
 def test_the_page_lists_every_setting_with_its_default():
-    """All keys of the tables, by name; defaults are those of an environment with nothing but a name and a plate."""
+    """All keys of the tables, by name; defaults are those of an environment with only a name and a plate."""
     page = DOCS.read_text()
     settings = page.split("## Settings")[1].split("\n## ")[0]
     flat = load_scenario("phantom").with_values({"tracker.environment": {"name": "a", "plate": {}}}).flat()
     opening = "tracker.environment."
     keys = [key.removeprefix(opening) for key in flat if key.startswith(opening)]
     assert len(keys) > 20
-    told = set(re.findall(r"`([a-z0-9_.]+)`", settings))
-    assert [key for key in keys if key not in told and key.split(".")[-1] not in told] == []
+    message = set(re.findall(r"`([a-z0-9_.]+)`", settings))
+    assert [key for key in keys if key not in message and key.split(".")[-1] not in message] == []
     assert Environment(name="a").length_mm == 60.0

@@ -1,4 +1,4 @@
-"""Intervals of the errors, and what lies beyond the largest one, by formulas of their own."""
+"""Intervals of the errors, and the share of the volume beyond the largest one, by independent formulas."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def found(tmp_path, rows):
     return evaluate(write_csv(tmp_path / "t.csv", rows), Options()).values()["results"][0]
 
 
-def test_intervals_are_quantiles_of_points_drawn_again(found, rows):
+def test_intervals_are_quantiles_of_resampled_points(found, rows):
     x, true = (
         np.array([[row[f"{name}{axis}_mm"] for axis in "xyz"] for row in rows]).reshape(27, 5, 3)
         for name in ("", "true_")
@@ -35,6 +35,6 @@ def test_intervals_are_quantiles_of_points_drawn_again(found, rows):
         assert found["intervals"][name] == pytest.approx(np.quantile(values, (0.025, 0.975)), abs=1e-9), name
 
 
-def test_a_share_that_errs_beyond_the_largest_error_would_have_been_seen_in_95_of_100_grids(found):
-    """27 points all miss a share s of the volume with the chance (1 - s)^27."""
+def test_a_share_beyond_the_largest_error_is_detected_in_95_of_100_grids(found):
+    """27 independent points all miss a share s of the volume with probability (1 - s)^27."""
     assert (1.0 - found["beyond_max"]) ** 27 == pytest.approx(0.05)

@@ -1,4 +1,4 @@
-"""Where a limit is kept, in words."""
+"""Errors by distance, and the distances at which a limit is met."""
 
 import math
 
@@ -10,7 +10,7 @@ from flexneedle.em.evaluation.evaluate import Options, evaluate
 
 
 def bins(rmse):
-    """Stretches of 50 mm from 600 mm on."""
+    """Bins of 50 mm from 600 mm."""
     return tuple(
         DistanceBin(600.0 + 50 * k, 650.0 + 50 * k, 625.0 + 50 * k, 9, 90, value, value, value, 0.1)
         for k, value in enumerate(rmse)
@@ -18,7 +18,7 @@ def bins(rmse):
 
 
 @pytest.mark.parametrize(
-    ("smallest", "exceeded", "told"),
+    ("smallest", "exceeded", "text"),
     [
         (None, (), "nowhere"),
         (625.0, (), "at all measured distances"),
@@ -27,17 +27,17 @@ def bins(rmse):
         (675.0, (725.0, 775.0), "from 675 mm, not at 725, 775 mm"),
     ],
 )
-def test_the_nearest_bin_is_not_where_a_limit_begins(smallest, exceeded, told):
-    assert DistanceErrors(50.0, 0.5, smallest, exceeded, bins([0.4] * 4)).limit_met == told
+def test_distances_nearer_than_the_nearest_bin_are_not_claimed(smallest, exceeded, text):
+    assert DistanceErrors(50.0, 0.5, smallest, exceeded, bins([0.4] * 4)).limit_met == text
 
 
-def test_without_a_limit_none_is_kept():
+def test_without_a_limit_there_is_no_distance():
     assert DistanceErrors(50.0, None, None, (), bins([0.4])).limit_met == "no limit"
 
 
-def test_the_rmse_of_a_bin_is_held_against_the_limit_not_its_largest_error(tmp_path):
-    """At 610 mm errors of 3 mm, at 710 mm of 0.2 and 0.9 mm, whose RMS is 0.65 mm: 0.7 mm is kept from there on."""
-    places = [(0, 610.0, 3.0), (1, 610.0, 3.0), (2, 710.0, 0.2), (3, 710.0, 0.9)]
+def test_the_rmse_of_a_bin_is_compared_with_the_limit_not_its_largest_error(tmp_path):
+    """At 610 mm errors of 3 mm, at 710 mm of 0.2 and 0.9 mm, whose RMS is 0.65 mm: 0.7 mm is met from there."""
+    points = [(0, 610.0, 3.0), (1, 610.0, 3.0), (2, 710.0, 0.2), (3, 710.0, 0.9)]
     rows = [
         {
             "point_id": point,
@@ -52,7 +52,7 @@ def test_the_rmse_of_a_bin_is_held_against_the_limit_not_its_largest_error(tmp_p
             "environment": "lab",
             "distance_mm": distance,
         }
-        for point, distance, error in places
+        for point, distance, error in points
         for _ in range(2)
     ]
     found = evaluate(write_csv(tmp_path / "t.csv", rows), Options(limit_mm=0.7)).values()["results"][0]
@@ -61,7 +61,7 @@ def test_the_rmse_of_a_bin_is_held_against_the_limit_not_its_largest_error(tmp_p
 
 
 def test_errors_of_a_bin_are_those_of_its_points(tmp_path):
-    """Errors of 1 to 5 mm at five points, two samples 0.1 mm about each mean; a sixth point is farther away."""
+    """Errors of 1 to 5 mm at five points, two samples 0.1 mm off each mean; a sixth point is farther away."""
     true = [(25.0 * k, 0.0, 0.0) for k in range(6)]
     samples = [[(x, k + 1.0, 0.1), (x, k + 1.0, -0.1)] for k, (x, _, _) in enumerate(true)]
     rows = rows_of(true, samples, "coil")

@@ -1,4 +1,4 @@
-"""`em evaluate` against answers worked out by hand, a second implementation, and laws that any evaluation obeys."""
+"""`em evaluate` against values computed by hand, a second implementation, and invariances."""
 
 import math
 from pathlib import Path
@@ -52,7 +52,7 @@ def test_the_papers_equations_on_a_table_worked_out_by_hand(tmp_path):
     assert found["official"] == {"rmse_mm": 0.70, "p95_mm": 1.40}
 
 
-def test_samples_that_are_not_as_many_at_each_point_weigh_alike_in_the_jitter_only(tmp_path):
+def test_points_weigh_equally_in_the_errors_and_samples_in_the_jitter(tmp_path):
     rows = rows_of([(0, 0, 0), (10, 0, 0)], [[(1, 0, 0)], [(12, 1, 0), (12, -1, 0), (12, 0, 0)]])
     evaluation = evaluate(write_csv(tmp_path / "t.csv", rows), Options())
     found = evaluation.values()["results"][0]
@@ -71,7 +71,7 @@ def test_a_second_implementation_agrees_far_from_the_origin(tmp_path, offset):
         assert found[name] == pytest.approx(value, abs=1e-11), name
 
 
-def test_parquet_and_csv_say_the_same_whatever_the_type_of_the_ids(tmp_path):
+def test_parquet_and_csv_give_the_same_result_for_any_type_of_point_id(tmp_path):
     rows = random_rows(seed=1)
     table = pa.Table.from_pylist(rows)
     as_csv = results(write_csv(tmp_path / "t.csv", rows))
@@ -95,13 +95,13 @@ def test_the_order_of_rows_does_not_matter(tmp_path, random):
 
 @LAWS
 @given(
-    turn=st.tuples(*[st.floats(-1.5, 1.5)] * 3),
+    rotation=st.tuples(*[st.floats(-1.5, 1.5)] * 3),
     shift=st.tuples(*[st.floats(-800, 800)] * 3),
 )
-def test_after_registration_a_rigid_motion_of_the_tracker_does_not_matter(tmp_path, turn, shift):
+def test_after_registration_a_rigid_motion_of_the_tracker_does_not_matter(tmp_path, rotation, shift):
     rows = random_rows(seed=7, samples=4)
     before = only(write_csv(tmp_path / "t.csv", rows), register=True)
-    moved = [{**row, **rigid(row, turn, shift)} for row in rows]
+    moved = [{**row, **rigid(row, rotation, shift)} for row in rows]
     after = only(write_csv(tmp_path / "t.csv", moved), register=True)
     for name in ("rmse_mm", "p95_mm", "max_mm", "jitter_mm"):
         assert after[name] == pytest.approx(before[name], abs=1e-9)
@@ -110,7 +110,7 @@ def test_after_registration_a_rigid_motion_of_the_tracker_does_not_matter(tmp_pa
 
 @LAWS
 @given(shift=st.tuples(*[st.floats(-2000, 2000)] * 3))
-def test_where_the_tracker_stands_does_not_change_jitter_or_distances(tmp_path, shift):
+def test_a_translation_of_the_tracker_does_not_change_jitter_or_relative_distances(tmp_path, shift):
     rows = random_rows(seed=8, samples=4)
     before = only(write_csv(tmp_path / "t.csv", rows))
     after = only(write_csv(tmp_path / "t.csv", [{**row, **rigid(row, (0, 0, 0), shift)} for row in rows]))
@@ -128,19 +128,19 @@ def assert_same(one, other):
     assert one["max_at"] == other["max_at"]
 
 
-def rigid(row, turn, shift):
-    x = Rotation.from_rotvec(turn).apply([row[f"{axis}_mm"] for axis in "xyz"]) + shift
+def rigid(row, rotation, shift):
+    x = Rotation.from_rotvec(rotation).apply([row[f"{axis}_mm"] for axis in "xyz"]) + shift
     return dict(zip(("x_mm", "y_mm", "z_mm"), map(float, x), strict=True))
 
 
-def test_a_registration_takes_out_what_is_rigid_and_says_how_much(tmp_path):
-    turned = Rotation.from_euler("z", 3, degrees=True).apply(GRID) + np.array([1.0, 2.0, 3.0])
-    samples = turned[:, None]
+def test_a_registration_removes_a_rigid_transform_and_reports_it(tmp_path):
+    rotated = Rotation.from_euler("z", 3, degrees=True).apply(GRID) + np.array([1.0, 2.0, 3.0])
+    samples = rotated[:, None]
     found = only(write_csv(tmp_path / "t.csv", rows_of(GRID, samples)), register=True)
     assert found["rmse_mm"] < 1e-12
     assert found["registration"]["angle_deg"] == pytest.approx(3.0, rel=1e-10)
     rotation, translation = (np.array(found["registration"][key]) for key in ("rotation", "translation_mm"))
-    assert_allclose(turned @ rotation.T + translation, GRID, atol=1e-10)
+    assert_allclose(rotated @ rotation.T + translation, GRID, atol=1e-10)
 
 
 def test_points_on_a_line_cannot_be_registered(tmp_path):
@@ -151,7 +151,7 @@ def test_points_on_a_line_cannot_be_registered(tmp_path):
         evaluate(path, Options(register=True))
 
 
-def test_sensors_and_environments_are_judged_apart_in_the_papers_order(tmp_path):
+def test_sensors_and_environments_are_evaluated_separately_in_the_papers_order(tmp_path):
     rows = [
         *random_rows(1, sensor="reference", environment="noisy", bias=2.0),
         *random_rows(2, sensor="coil 7", environment="ideal"),
@@ -173,13 +173,13 @@ def test_sensors_and_environments_are_judged_apart_in_the_papers_order(tmp_path)
 
 
 def test_errors_over_distance_are_those_after_registration(tmp_path):
-    turn = Rotation.from_euler("xyz", (10, 20, 30), degrees=True)
+    rotation = Rotation.from_euler("xyz", (10, 20, 30), degrees=True)
     rows = []
     for row in random_rows(0):
-        place = turn.apply([row[f"{axis}_mm"] for axis in "xyz"]) + 300.0
+        position = rotation.apply([row[f"{axis}_mm"] for axis in "xyz"]) + 300.0
         rows.append(
             {**row, "distance_mm": 612.0}
-            | dict(zip(("x_mm", "y_mm", "z_mm"), map(float, place), strict=True))
+            | dict(zip(("x_mm", "y_mm", "z_mm"), map(float, position), strict=True))
         )
     (found,) = evaluate(write_csv(tmp_path / "t.csv", rows), Options(register=True)).values()["results"]
     (bin_,) = found["distance"]["bins"]
@@ -215,20 +215,20 @@ def test_distances_are_binned_and_the_smallest_within_the_limit_is_found(tmp_pat
     assert wide["jitter_mm"] == pytest.approx(np.sqrt(np.var(list(error.values())) + 0.01**2))
 
 
-def test_orientation_jitter_is_the_rms_angle_and_does_not_see_the_sign(tmp_path):
+def test_orientation_jitter_is_the_rms_angle_for_either_sign_of_the_quaternion(tmp_path):
     angle = np.radians([0.5, -0.5, 0.5, -0.5])
     rows = rows_of(GRID, [[p] * 4 for p in GRID])
     for k, row in enumerate(rows):
         sign = (-1.0) ** (k % 3)
-        turned = np.cos(angle[k % 4] / 2), 0.0, np.sin(angle[k % 4] / 2), 0.0
-        row |= {name: sign * float(q) for name, q in zip(("qw", "qx", "qy", "qz"), turned, strict=True)}
+        rotated = np.cos(angle[k % 4] / 2), 0.0, np.sin(angle[k % 4] / 2), 0.0
+        row |= {name: sign * float(q) for name, q in zip(("qw", "qx", "qy", "qz"), rotated, strict=True)}
     found = only(write_csv(tmp_path / "t.csv", rows))["orientation"]
     assert found["jitter_deg"] == pytest.approx(0.5, rel=1e-9)
     assert found["axis_jitter_deg"] == pytest.approx(0.5, rel=1e-6)
     assert found["n_samples"] == len(rows)
 
 
-def test_a_turn_about_the_sensors_axis_is_no_jitter_of_the_axis(tmp_path):
+def test_a_roll_about_the_sensor_axis_is_no_jitter_of_the_axis(tmp_path):
     rows = rows_of(GRID, [[p] * 2 for p in GRID])
     for k, row in enumerate(rows):
         half = (-1.0) ** k * np.radians(5.0)
@@ -238,18 +238,19 @@ def test_a_turn_about_the_sensors_axis_is_no_jitter_of_the_axis(tmp_path):
     assert found["axis_jitter_deg"] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_tracker_that_measures_too_long_errs_in_proportion_to_the_distance(tmp_path):
+def test_a_scale_error_gives_distance_errors_in_proportion_to_the_distance(tmp_path):
     found = only(write_csv(tmp_path / "t.csv", rows_of(GRID, [[1.01 * p + 300.0] for p in GRID])))
-    apart = np.linalg.norm(GRID[:, None] - GRID[None], axis=2)[np.triu_indices(27, 1)]
+    distance = np.linalg.norm(GRID[:, None] - GRID[None], axis=2)[np.triu_indices(27, 1)]
     assert found["relative_distance"]["n_pairs"] == 351
-    assert found["relative_distance"]["mean_mm"] == pytest.approx(0.01 * apart.mean())  # too long is positive
-    assert found["relative_distance"]["rms_mm"] == pytest.approx(0.01 * np.sqrt((apart**2).mean()))
+    # A distance measured too long is a positive error.
+    assert found["relative_distance"]["mean_mm"] == pytest.approx(0.01 * distance.mean())
+    assert found["relative_distance"]["rms_mm"] == pytest.approx(0.01 * np.sqrt((distance**2).mean()))
     assert found["relative_distance"]["max_mm"] == pytest.approx(0.01 * np.sqrt(3) * 50)
     assert found["relative_distance"]["neighbours"] == 54
     assert found["relative_distance"]["neighbours_rms_mm"] == pytest.approx(0.25)
 
 
-def test_repeatability_has_n_minus_one_and_the_axes_apart(tmp_path):
+def test_repeatability_uses_n_minus_one_and_separates_the_axes(tmp_path):
     found = only(write_csv(tmp_path / "t.csv", BY_HAND))["repeatability"]
     assert found["axis_sd_mm"] == pytest.approx(
         (1.0, 2.0, 0.0)
@@ -258,7 +259,7 @@ def test_repeatability_has_n_minus_one_and_the_axes_apart(tmp_path):
     assert (found["worst_mm"], found["worst_at"]) == (pytest.approx(math.sqrt(8.0)), "1")
 
 
-def test_the_documented_mapping_file_is_one(tmp_path):
+def test_the_documented_mapping_file_is_valid(tmp_path):
     text = (Path(__file__).parents[3] / "docs/tracking/evaluate.md").read_text(encoding="utf-8")
     mapping = tmp_path / "map.toml"
     mapping.write_text(text.split("```toml\n")[1].split("```")[0])

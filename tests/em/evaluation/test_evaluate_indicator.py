@@ -1,4 +1,4 @@
-"""What the indicator says: fits, threshold, confusion and ROC against answers worked out by hand."""
+"""The indicator: fits, threshold, confusion table and ROC against values computed by hand."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def test_fits_threshold_and_confusion_are_those_that_were_planted(tmp_path):
     assert found["paper"]["threshold"] == 0.0547
 
 
-def test_other_names_of_the_environments_are_an_option(tmp_path):
+def test_the_environments_can_have_other_names(tmp_path):
     path = planted(tmp_path / "t.csv", names=("clear", "plate"))
     evaluation = evaluate(path, Options())
     (found,) = evaluation.values()["indicator"] or [None]
@@ -49,7 +49,7 @@ def test_other_names_of_the_environments_are_an_option(tmp_path):
     assert found["noisy"]["slope_mm"] == pytest.approx(9.0)
 
 
-def test_one_environment_gives_a_threshold_but_nothing_to_tell_apart(tmp_path):
+def test_one_environment_gives_a_threshold_but_no_separation(tmp_path):
     rows = rows_of(GRID, [[p + 0.1] for p in GRID], "reference", "ideal", np.linspace(0.01, 0.06, N).tolist())
     (found,) = evaluate(write_csv(tmp_path / "t.csv", rows), Options()).values()["indicator"]
     assert found["threshold"] == pytest.approx(0.0575)
@@ -89,7 +89,7 @@ def test_single_samples_of_shuffled_sensors_and_environments_are_not_mixed_up(tm
         assert samples["max"] == pytest.approx(one["indicator"]["max"])
 
 
-def test_one_sample_a_point_has_the_same_threshold_twice(tmp_path):
+def test_with_one_sample_per_point_both_thresholds_are_equal(tmp_path):
     level = np.linspace(0.01, 0.5, N) ** 2
     (found,) = evaluate(
         table(tmp_path / "t.csv", (level, np.ones(N)), (level, np.ones(N))), Options()
@@ -99,7 +99,7 @@ def test_one_sample_a_point_has_the_same_threshold_twice(tmp_path):
     assert found["samples_above"] == {"ideal": above, "noisy": above}
 
 
-def test_single_samples_may_be_far_beyond_what_a_tracker_reports(tmp_path):
+def test_single_samples_may_have_very_large_indicators(tmp_path):
     level = np.where(np.arange(N) < 10, 0.01, 50.0)
     (found,) = evaluate(
         table(tmp_path / "t.csv", (level, np.ones(N)), (level, np.ones(N))), Options()
@@ -122,7 +122,7 @@ def test_the_area_counts_pairs_and_equals_that_under_the_curve(low, high, expect
 
 
 def test_ties_count_half_in_the_interval_of_the_area_too(tmp_path):
-    level = np.where(np.arange(N) < 20, 0.1, 0.2)  # alike in both, most pairs tie
+    level = np.where(np.arange(N) < 20, 0.1, 0.2)  # the same in both, most pairs tie
     path = table(tmp_path / "t.csv", (level, np.ones(N)), (level, np.ones(N)))
     (found,) = evaluate(path, Options()).values()["indicator"]
     low, high = found["auc_interval"]
@@ -131,7 +131,7 @@ def test_ties_count_half_in_the_interval_of_the_area_too(tmp_path):
     assert low + high == pytest.approx(1.0, abs=0.05)
 
 
-def test_the_interval_of_the_area_is_that_of_points_drawn_again_one_by_one(tmp_path):
+def test_the_interval_of_the_area_agrees_with_a_loop_over_resamples(tmp_path):
     rng = np.random.default_rng(5)
     low, high = rng.normal(0.05, 0.01, N), rng.normal(0.06, 0.01, N)
     path = table(tmp_path / "t.csv", (low, np.ones(N)), (high, np.ones(N)))
@@ -141,7 +141,7 @@ def test_the_interval_of_the_area_is_that_of_points_drawn_again_one_by_one(tmp_p
     assert found["auc_interval"] == pytest.approx(ends, abs=0.1 * np.ptp(ends))
 
 
-def test_a_line_through_equal_indicators_is_not_known():
+def test_a_line_through_equal_indicators_is_nan():
     found = line(np.full(12, 0.1), np.arange(12.0))
     assert np.isnan(found.slope_mm)
     assert found.intervals == {"slope_mm": None, "intercept_mm": None}

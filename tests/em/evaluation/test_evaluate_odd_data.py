@@ -1,4 +1,4 @@
-"""Tables that are damaged, incomplete or of another kind: one clear line, or a stated treatment."""
+"""Damaged, incomplete and unusual tables: refused in one line, or treated as documented."""
 
 import json
 
@@ -21,24 +21,24 @@ def rows():
 def refusal(path, **options):
     with pytest.raises(InputError) as caught:
         evaluate(path, Options(**options))
-    told = str(caught.value)
-    assert "\n" not in told
-    assert str(path) in told
-    return told
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(path) in message
+    return message
 
 
 def one(path, **options):
     return evaluate(path, Options(**options)).values()["results"][0]
 
 
-def test_missing_columns_are_named_with_the_way_to_map_them(tmp_path, rows):
+def test_missing_columns_are_named_with_the_option_that_maps_them(tmp_path, rows):
     without = [{k: v for k, v in row.items() if k not in ("x_mm", "sensor")} for row in rows]
-    told = refusal(write_csv(tmp_path / "t.csv", without))
-    assert "no column x_mm, sensor" in told
-    assert "--columns NAME=COLUMN" in told
+    message = refusal(write_csv(tmp_path / "t.csv", without))
+    assert "no column x_mm, sensor" in message
+    assert "--columns NAME=COLUMN" in message
 
 
-def test_columns_of_other_names_are_mapped_and_all_others_ignored(tmp_path, rows):
+def test_columns_with_other_names_are_mapped_and_all_others_ignored(tmp_path, rows):
     theirs = {"point_id": "Point", "x_mm": "X [mm]", "indicator": "a=b"}
     named = [{theirs.get(key, key): value for key, value in row.items()} | {"note": "é, 'x'"} for row in rows]
     path = write_csv(tmp_path / "t.csv", named)
@@ -59,18 +59,18 @@ def test_columns_of_other_names_are_mapped_and_all_others_ignored(tmp_path, rows
         (("x_mm=y_mm",), "'x_mm' would be both x_mm and y_mm"),
     ],
 )
-def test_a_mapping_that_makes_no_sense_is_refused(tmp_path, rows, columns, expected):
+def test_an_invalid_mapping_is_refused(tmp_path, rows, columns, expected):
     with pytest.raises(InputError, match=expected):
         evaluate(write_csv(tmp_path / "t.csv", rows), Options(columns=columns))
 
 
-def test_a_field_that_is_no_number_is_named_by_row_and_by_both_names_wherever_its_column_is(tmp_path, rows):
+def test_a_field_that_is_not_a_number_is_named_by_row_and_both_column_names(tmp_path, rows):
     named = [
         {"note": "0,0", "X": row["x_mm"], **{k: v for k, v in row.items() if k != "x_mm"}} for row in rows
     ]
     named[20]["X"] = "12 mm"
-    told = refusal(write_csv(tmp_path / "t.csv", named, delimiter=";"), columns=("X=x_mm",))
-    assert "row 21: 'X' (for x_mm): '12 mm' is not a number" in told
+    message = refusal(write_csv(tmp_path / "t.csv", named, delimiter=";"), columns=("X=x_mm",))
+    assert "row 21: 'X' (for x_mm): '12 mm' is not a number" in message
 
 
 def test_an_empty_field_between_blanks_is_empty(tmp_path, rows):
@@ -79,7 +79,7 @@ def test_an_empty_field_between_blanks_is_empty(tmp_path, rows):
     assert one(path)["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
 
 
-def test_two_columns_may_change_their_names(tmp_path, rows):
+def test_two_columns_can_be_swapped(tmp_path, rows):
     swapped = [{**row, "x_mm": row["y_mm"], "y_mm": row["x_mm"]} for row in rows]
     path = write_csv(tmp_path / "t.csv", swapped)
     assert one(path, columns=("x_mm=y_mm", "y_mm=x_mm"))["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
@@ -90,20 +90,20 @@ def test_a_table_of_one_sensor_needs_no_names_and_no_indicator(tmp_path, rows, s
     bare = [{k: v for k, v in row.items() if k not in ("sensor", "environment", "indicator")} for row in rows]
     path = tmp_path / f"t.{suffix}"
     write_csv(path, bare) if suffix == "csv" else pq.write_table(pa.Table.from_pylist(bare), path)
-    told = refusal(path)
-    assert "no column sensor, environment (found: " in told
-    assert "for a table of one sensor and environment, use --sensor NAME --environment NAME" in told
+    message = refusal(path)
+    assert "no column sensor, environment (found: " in message
+    assert "for a table of one sensor and environment, use --sensor NAME --environment NAME" in message
     found = one(path, sensor="tip", environment="ideal")
     assert (found["sensor"], found["environment"], found["indicator"]) == ("tip", "ideal", None)
     assert found["rmse_mm"] == pytest.approx(plain(rows)["rmse_mm"])
 
 
-def test_a_name_for_all_rows_is_refused_where_the_table_has_names(tmp_path, rows):
-    told = refusal(write_csv(tmp_path / "t.csv", rows), sensor="coil")
-    assert "has a column sensor: --sensor is only for a table without it" in told
+def test_a_label_for_all_rows_is_refused_if_the_table_has_the_column(tmp_path, rows):
+    message = refusal(write_csv(tmp_path / "t.csv", rows), sensor="coil")
+    assert "has a column sensor: --sensor is only for a table without it" in message
 
 
-def test_the_true_place_of_a_point_without_a_sample_is_held_against_the_others(tmp_path, rows):
+def test_the_true_position_of_a_missing_sample_is_checked(tmp_path, rows):
     rows[7] |= {"x_mm": None, "y_mm": None, "z_mm": None, "true_x_mm": 99.0}
     assert "row 8: the true position of a point_id changes" in refusal(write_csv(tmp_path / "t.csv", rows))
 
@@ -115,7 +115,7 @@ def test_one_frame_in_metres_is_refused_and_named(tmp_path, rows, names):
     assert one(path, unit="mm")["n_points"] == len(GRID)
 
 
-def test_both_frames_in_metres_are_refused_and_read_when_it_is_said(tmp_path, rows):
+def test_both_frames_in_metres_are_refused_without_unit_m(tmp_path, rows):
     both = ("x_mm", "y_mm", "z_mm", "true_x_mm", "true_y_mm", "true_z_mm")
     path = write_csv(tmp_path / "t.csv", in_metres(rows, both))
     assert "seem to be in metres" in refusal(path)
@@ -130,14 +130,14 @@ def test_a_poor_tracker_in_metres_is_refused_too(tmp_path):
 
 @pytest.mark.parametrize("noise", [0.01, 0.02, 0.03, 0.05])
 def test_a_sensor_that_is_stuck_is_evaluated(tmp_path, noise):
-    """Its readings span a thousandth of the grid, more or less, but not as a grid does."""
+    """Its readings span about a thousandth of the grid, but not in the shape of a grid."""
     rng = np.random.default_rng(0)
     stuck = rows_of(GRID, np.array([7.0, -3.0, 90.0]) + rng.normal(0.0, noise, (27, 1, 3)))
     found = one(write_csv(tmp_path / "t.csv", stuck))
     assert found["max_mm"] == pytest.approx(np.linalg.norm(GRID - (7.0, -3.0, 90.0), axis=1).max(), abs=0.2)
 
 
-def test_a_grid_of_a_tenth_of_a_millimetre_is_just_small(tmp_path):
+def test_a_grid_of_a_tenth_of_a_millimetre_is_accepted(tmp_path):
     tiny = rows_of(GRID / 500.0, [[p / 500.0 + 0.05, p / 500.0 + 0.06] for p in GRID])
     assert one(write_csv(tmp_path / "t.csv", tiny))["max_mm"] == pytest.approx(0.055 * 3**0.5)
 
@@ -150,25 +150,25 @@ def single(rows):
     return list({row["point_id"]: row for row in rows}.values())
 
 
-def test_one_sample_at_each_point_tells_nothing_about_the_jitter(tmp_path, rows, capsys):
-    turned = [{**row, "qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "distance_mm": 700.0} for row in rows]
-    path = write_csv(tmp_path / "t.csv", single(turned))
+def test_one_sample_at_each_point_gives_no_jitter(tmp_path, rows, capsys):
+    oriented = [{**row, "qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "distance_mm": 700.0} for row in rows]
+    path = write_csv(tmp_path / "t.csv", single(oriented))
     assert main(["em", "evaluate", str(path), "--json", "--out", str(tmp_path / "json")]) == 0
-    told = capsys.readouterr()
-    (found,) = json.loads(told.out)["results"]
+    printed = capsys.readouterr()
+    (found,) = json.loads(printed.out)["results"]
     assert found["rmse_mm"] == pytest.approx(plain(single(rows))["rmse_mm"])
     assert (found["jitter_mm"], found["intervals"]["jitter_mm"]) == (None, None)
     assert found["distance"]["bins"][0]["jitter_mm"] is None
-    turns = {found["orientation"][name] for name in ("jitter_deg", "worst_deg", "axis_jitter_deg")}
-    assert turns == {None}
+    jitters = {found["orientation"][name] for name in ("jitter_deg", "worst_deg", "axis_jitter_deg")}
+    assert jitters == {None}
     assert main(["em", "evaluate", str(path), "--out", str(tmp_path / "tables")]) == 0
-    told = capsys.readouterr()
+    printed = capsys.readouterr()
     errors, interval = (
-        next(x for x in told.out.splitlines() if x.strip().startswith(s)) for s in ("tip, i", "95")
+        next(x for x in printed.out.splitlines() if x.strip().startswith(s)) for s in ("tip, i", "95")
     )
     assert errors.split()[-3:] == ["–", "27", "27"]  # jitter, points, samples
-    assert interval.split()[-2] == "from"  # the 95 %: beyond there is nothing for maximum and jitter
-    assert "one sample at each grid point (jitter and repeatability are unknown)" in told.err
+    assert interval.split()[-2] == "from"  # the interval of the 95 %; maximum and jitter have none
+    assert "one sample at each grid point (jitter and repeatability are unknown)" in printed.err
 
 
 def test_two_samples_at_a_single_point_are_enough_for_a_jitter(tmp_path, rows):
@@ -178,7 +178,7 @@ def test_two_samples_at_a_single_point_are_enough_for_a_jitter(tmp_path, rows):
     assert found["intervals"]["jitter_mm"] is not None
 
 
-def test_samples_without_a_position_are_left_out_and_counted(tmp_path, rows):
+def test_samples_without_a_position_are_ignored_and_counted(tmp_path, rows):
     lost = [dict(row) for row in rows]
     for row in lost[:5]:  # all three of the first point, two of the second
         row |= {"x_mm": None, "y_mm": float("nan"), "z_mm": None}
@@ -192,7 +192,7 @@ def test_samples_without_a_position_are_left_out_and_counted(tmp_path, rows):
     assert evaluation.notes[0].startswith(f"tip, ideal: {left_out}; one sample at 1 grid point (")
 
 
-def test_a_sensor_that_was_never_seen_is_refused(tmp_path, rows):
+def test_a_sensor_without_any_position_is_refused(tmp_path, rows):
     lost = [{**row, "x_mm": None, "y_mm": None, "z_mm": None} for row in rows]
     assert "sensor 'tip', environment 'ideal': all samples are missing" in refusal(
         write_csv(tmp_path / "t.csv", lost)
@@ -210,12 +210,18 @@ def test_a_sensor_that_was_never_seen_is_refused(tmp_path, rows):
         ({"indicator": -1.0}, "row 8: indicator: must be from 0 to 1e+06, or empty"),
         ({"indicator": float("inf")}, "row 8: indicator: must be from 0 to 1e+06"),
         ({"sensor": ""}, "row 8: sensor is empty"),
+        (
+            {"environment": "None"},
+            "row 8: environment is empty (in a CSV file, NA, None, null, nan and MISSING are",
+        ),
+        ({"indicator": 1.1e6}, "row 8: indicator: must be from 0 to 1e+06"),
+        ({"x_mm": "1__0"}, "row 8: x_mm: '1__0' is not a number"),
         ({"point_id": ""}, "row 8: point_id is empty"),
         ({"x_mm": "1,5"}, "row 8: x_mm: '1,5' is not a number: use a decimal point, not a comma"),
         ({"z_mm": "abc"}, "row 8: z_mm: 'abc' is not a number"),
     ],
 )
-def test_a_row_that_breaks_a_rule_is_named(tmp_path, rows, change, expected):
+def test_a_row_that_violates_a_rule_is_named(tmp_path, rows, change, expected):
     rows[7] |= change
     assert expected in refusal(write_csv(tmp_path / "t.csv", rows))
 
@@ -234,7 +240,7 @@ def test_orientations_must_be_whole_unit_quaternions(tmp_path, rows, quaternion,
     )
 
 
-def test_equal_rows_are_samples_like_all_others(tmp_path, rows):
+def test_equal_rows_are_separate_samples(tmp_path, rows):
     twice = one(write_csv(tmp_path / "t.csv", [*rows, *rows]))
     assert twice["n_samples"] == 2 * len(rows)
     for name, value in plain(rows).items():
@@ -256,19 +262,19 @@ def test_a_file_without_a_table_is_refused(tmp_path, text, expected):
     assert expected in refusal(path)
 
 
-def test_a_file_that_is_not_there_or_is_a_folder_is_refused(tmp_path):
+def test_a_missing_file_or_a_folder_is_refused(tmp_path):
     assert "cannot be read: No such file" in refusal(tmp_path / "nowhere.csv")
     assert "cannot be read" in refusal(tmp_path)
 
 
-def test_a_csv_file_cut_in_a_field_before_the_last_is_refused(tmp_path, rows):
+def test_a_csv_file_truncated_before_the_last_field_is_refused(tmp_path, rows):
     path = write_csv(tmp_path / "t.csv", rows)
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines[:-1], lines[-1][:30]]))
     assert f"row {len(rows)}: has {lines[-1][:30].count(',') + 1} fields, the header has 10" in refusal(path)
 
 
-def test_of_many_broken_rows_the_first_is_named(tmp_path, rows):
+def test_the_first_of_many_invalid_rows_is_named(tmp_path, rows):
     some = [dict(row) for row in rows]
     some[4]["z_mm"], some[8]["true_x_mm"] = "?", "!"
     assert "row 5: z_mm: '?' is not a number" in refusal(write_csv(tmp_path / "t.csv", some))
@@ -282,7 +288,7 @@ def test_of_many_broken_rows_the_first_is_named(tmp_path, rows):
 
 
 @pytest.mark.parametrize("name", ["a*b.csv", "a[1].csv", "it's.csv", "a?.parquet"])
-def test_a_file_may_be_called_anything(tmp_path, rows, name):
+def test_a_file_may_have_any_name(tmp_path, rows, name):
     for other in ("aXb.csv", "a1.csv", "aX.parquet"):
         (tmp_path / other).write_text("no table")
     path = tmp_path / name
@@ -293,13 +299,13 @@ def test_a_file_may_be_called_anything(tmp_path, rows, name):
     assert one(path)["n_samples"] == len(rows)
 
 
-def test_a_last_line_that_only_lacks_its_line_end_is_used(tmp_path, rows):
+def test_a_last_line_without_a_line_end_is_used(tmp_path, rows):
     path = write_csv(tmp_path / "t.csv", rows)
     path.write_bytes(path.read_bytes()[:-1])
     assert one(path)["n_samples"] == len(rows)
 
 
-def test_a_line_cut_before_others_were_added_is_refused(tmp_path, rows):
+def test_a_truncated_line_followed_by_others_is_refused(tmp_path, rows):
     path = write_csv(tmp_path / "t.csv", rows)
     lines = path.read_text().splitlines()
     lines[40] = lines[40][:30]
@@ -310,7 +316,7 @@ def test_a_line_cut_before_others_were_added_is_refused(tmp_path, rows):
     assert "row 40: has 11 fields, the header has 10" in refusal(path)
 
 
-def test_a_parquet_file_that_was_cut_is_refused(tmp_path, rows):
+def test_a_truncated_parquet_file_is_refused(tmp_path, rows):
     path = tmp_path / "t.parquet"
     pq.write_table(pa.Table.from_pylist(rows), path)
     whole = path.read_bytes()
@@ -319,7 +325,7 @@ def test_a_parquet_file_that_was_cut_is_refused(tmp_path, rows):
         assert "is a truncated or damaged Parquet file" in refusal(path)
 
 
-def test_a_parquet_column_of_text_is_no_column_of_numbers(tmp_path, rows):
+def test_a_parquet_column_of_text_is_refused_for_numbers(tmp_path, rows):
     path = tmp_path / "t.parquet"
     pq.write_table(pa.Table.from_pylist([{**row, "x_mm": "left"} for row in rows]), path)
     assert "x_mm: must be a column of numbers, not of VARCHAR" in refusal(path)
@@ -327,7 +333,7 @@ def test_a_parquet_column_of_text_is_no_column_of_numbers(tmp_path, rows):
     assert "indicator: must be a column of numbers, not of BOOLEAN" in refusal(path)
 
 
-def test_semicolons_tabs_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path, rows):
+def test_semicolons_tabs_a_byte_order_mark_and_crlf_are_read(tmp_path, rows):
     expected = plain(rows)["rmse_mm"]
     for delimiter in (";", "\t"):
         path = write_csv(tmp_path / "t.csv", rows, delimiter=delimiter)
@@ -336,13 +342,30 @@ def test_semicolons_tabs_a_byte_order_mark_and_windows_line_ends_are_read(tmp_pa
     assert one(path)["rmse_mm"] == pytest.approx(expected)
 
 
-def test_names_with_blanks_around_them_are_the_same_names(tmp_path, rows):
+def test_mixed_line_ends_are_refused_with_the_remedy(tmp_path, rows):
+    path = write_csv(tmp_path / "t.csv", rows)
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n", 40))
+    assert "cannot be read: mixed line ends (LF and CRLF): save the file with one kind" in refusal(path)
+
+
+def test_an_underscore_between_digits_is_ignored(tmp_path, rows):
+    """As in Python and TOML: 1_000.5 is 1000.5."""
+    for row in rows:
+        row["y_mm"] = 1000.5 + row["y_mm"] // 1
+    expected = one(write_csv(tmp_path / "t.csv", rows))
+    path = write_csv(tmp_path / "u.csv", rows)
+    path.write_text(path.read_text().replace(",10", ",1_0"))
+    assert ",1_0" in path.read_text()
+    assert one(path) == expected
+
+
+def test_blanks_around_names_are_ignored(tmp_path, rows):
     for number, row in enumerate(rows):
         row["sensor"] = ("tip", " tip", "tip ")[number % 3]
     assert one(write_csv(tmp_path / "t.csv", rows))["n_samples"] == len(rows)
 
 
-def test_a_parquet_table_may_have_whole_numbers_categories_and_no_indicator_at_all(tmp_path, rows):
+def test_a_parquet_table_may_have_integers_categories_and_a_null_indicator(tmp_path, rows):
     table = pa.Table.from_pylist(rows)
     for name, column in (
         ("true_x_mm", table["true_x_mm"].cast(pa.int16())),
@@ -357,8 +380,8 @@ def test_a_parquet_table_may_have_whole_numbers_categories_and_no_indicator_at_a
     assert (found["sensor"], found["environment"], found["indicator"]) == ("tip", "ideal", None)
 
 
-def test_metres_are_refused_also_where_nothing_jitters(tmp_path, rows):
-    """One sample a point, or samples that a tracker rounds: the jitter is 0, not just small."""
+def test_metres_are_refused_without_jitter_too(tmp_path, rows):
+    """With one sample per point, or rounded samples, the jitter is unknown or 0."""
     both = ("true_x_mm", "true_y_mm", "true_z_mm", "x_mm", "y_mm", "z_mm")
     assert "seem to be in metres" in refusal(write_csv(tmp_path / "t.csv", in_metres(single(rows), both)))
 
@@ -373,7 +396,7 @@ def test_point_ids_may_be_any_text(tmp_path, rows, names):
 
 
 def test_an_empty_label_of_a_short_dictionary_is_refused_in_one_line(tmp_path, rows):
-    """128 names and an empty one, numbered by single bytes as a categorical column is."""
+    """128 names and an empty one with indices of a single byte, as in a categorical column."""
     many = [row | {"point_id": str(k)} for k, row in enumerate((rows * 130)[:129])]
     table = pa.Table.from_pylist(many)
     names = pa.array([str(k) for k in range(128)])

@@ -1,4 +1,4 @@
-"""`points.csv`: what was found at each grid point, to the last digit."""
+"""`points.csv`: the results at each grid point, to the last digit."""
 
 import csv
 
@@ -17,7 +17,7 @@ def points(path, rows, **options):
         return list(csv.DictReader(file))
 
 
-def test_each_sensor_environment_and_point_has_a_row_with_what_its_samples_say(tmp_path):
+def test_each_grid_point_of_each_sensor_and_environment_has_a_row(tmp_path):
     rows = random_rows(1, samples=4, sensor="reference", environment="a, b") + random_rows(2, samples=4)
     found = points(tmp_path, rows)
     assert len(found) == 2 * len(GRID)
@@ -38,29 +38,29 @@ def test_each_sensor_environment_and_point_has_a_row_with_what_its_samples_say(t
         assert (row["samples"], row["missing"]) == ("4", "0")
 
 
-def test_the_errors_are_those_that_the_rmse_is_made_of(tmp_path):
+def test_the_rmse_is_that_of_the_errors_in_the_table_of_points(tmp_path):
     rows = random_rows(3, samples=4)
     result = evaluate(write_csv(tmp_path / "t.csv", rows), Options()).results[0]
     errors = np.array([float(row["error_mm"]) for row in points(tmp_path, rows)])
     assert np.sqrt((errors**2).mean()) == result.accuracy.rmse_mm  # all digits
 
 
-def test_a_point_that_was_never_seen_has_its_true_place_and_nothing_else(tmp_path):
+def test_a_point_without_samples_has_only_its_true_position(tmp_path):
     rows = random_rows(1, samples=3)
     for row in rows[3:6]:
         row |= {"x_mm": None, "y_mm": None, "z_mm": None, "indicator": None}
     rows[6]["x_mm"] = rows[6]["y_mm"] = rows[6]["z_mm"] = None
-    first, unseen, partly = points(tmp_path, rows)[:3]
-    assert [float(unseen[f"true_{axis}_mm"]) for axis in "xyz"] == GRID[1].tolist()
-    assert {unseen[key] for key in ("mean_x_mm", "error_z_mm", "error_mm", "jitter_mm", "indicator")} == {""}
-    assert [(row["samples"], row["missing"]) for row in (first, unseen, partly)] == [
+    first, empty, partly = points(tmp_path, rows)[:3]
+    assert [float(empty[f"true_{axis}_mm"]) for axis in "xyz"] == GRID[1].tolist()
+    assert {empty[key] for key in ("mean_x_mm", "error_z_mm", "error_mm", "jitter_mm", "indicator")} == {""}
+    assert [(row["samples"], row["missing"]) for row in (first, empty, partly)] == [
         ("3", "0"),
         ("0", "3"),
         ("2", "1"),
     ]
 
 
-def test_after_registration_places_are_the_stages(tmp_path):
+def test_after_registration_positions_are_in_the_stages_frame(tmp_path):
     rows = random_rows(4, samples=3)
     moved = [{**row, "x_mm": row["x_mm"] + 300.0} for row in rows]
     before, after = points(tmp_path, rows, register=True), points(tmp_path, moved, register=True)

@@ -1,4 +1,4 @@
-"""Bootstrap intervals cover what was planted as often as they say (studies/em_coverage.py has 200 data sets)."""
+"""Bootstrap intervals have their nominal coverage of planted values (studies/em_coverage.py: 200 data sets)."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def test_the_interval_of_a_root_mean_square_covers_nine_times_of_ten():
     assert 52 <= covered <= 60
 
 
-def test_the_interval_of_a_slope_covers_where_the_scatter_grows_with_the_indicator():
+def test_the_interval_of_a_slope_covers_if_the_scatter_grows_with_the_indicator():
     rng = np.random.default_rng(1)
     covered = 0
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""The paper's values and the maker's, written down once more from its Tables I and II and its text; whose they are."""
+"""Values of the paper and the manufacturer, copied again from Tables I and II and the text; names of their sensors."""
 
 import argparse
 
@@ -19,7 +19,7 @@ def levels(*values):
     return dict(zip(("mean", "sd", "max", "min"), values, strict=True))
 
 
-def test_the_makers_and_the_papers_errors_are_those_of_table_1():
+def test_the_manufacturers_and_the_papers_errors_are_those_of_table_1():
     official = {"tip": errors(0.70, 1.40), "reference": errors(0.48, 0.88)}
     measured = {
         ("tip", "ideal"): errors(0.65, 1.10, 1.40, 0.07),
@@ -37,7 +37,7 @@ def test_the_papers_indicator_is_that_of_table_2_and_of_its_text():
     assert (fits, 0.0547, 0.04) == (published.FITS, published.THRESHOLD, published.POWERED)
 
 
-def test_the_check_of_the_power_and_the_monitor_have_the_papers_threshold():
+def test_check_and_monitor_use_the_papers_threshold():
     parser = argparse.ArgumentParser()
     check.add_parser(parser.add_subparsers())
     assert parser.parse_args(["check", "off.csv"]).threshold == published.THRESHOLD
@@ -45,7 +45,7 @@ def test_the_check_of_the_power_and_the_monitor_have_the_papers_threshold():
 
 
 @pytest.mark.parametrize("name", ["ref", "ref1", "Ref12", "reference", "reference2", " REFERENCE "])
-def test_a_reference_is_called_so(name):
+def test_names_of_reference_sensors(name):
     assert published.paper_sensor(name) == "reference"
 
 
@@ -55,7 +55,7 @@ def test_no_other_name_is_one_of_the_papers_sensors(name):
     assert published.paper_sensor("Tip") == "tip"
 
 
-def test_nothing_of_the_paper_stands_beside_a_sensor_called_1(tmp_path):
+def test_a_sensor_named_1_is_not_compared_with_the_paper(tmp_path):
     evaluation = evaluate(write_csv(tmp_path / "t.csv", random_rows(0, sensor="1")), Options())
     (result,), (found,) = (evaluation.values()[key] for key in ("results", "indicator"))
     assert (result["official"], result["paper"], found["paper"]) == (None, None, None)

@@ -1,4 +1,4 @@
-"""Relative distances and repeatability of single points, worked out by hand."""
+"""Relative distances and repeatability of single points, computed by hand."""
 
 import math
 
@@ -10,14 +10,14 @@ from flexneedle.em.evaluation.evaluate import Options, evaluate
 
 @pytest.fixture
 def found(tmp_path):
-    """Points at 0, 10 and 30 mm, seen 1, 2 and 3 mm too near to each other; samples 1, 2 and 6 mm about the mean."""
-    true, seen, off = ((0, 0, 0), (10, 0, 0), (30, 0, 0)), (0, 9, 27), (1, 2, 6)
-    samples = [[(x, y, 0), (x, -y, 0)] for x, y in zip(seen, off, strict=True)]
+    """Points at 0, 10 and 30 mm, distances measured 1, 2 and 3 mm too short; samples 1, 2 and 6 mm off the mean."""
+    true, measured, off = ((0, 0, 0), (10, 0, 0), (30, 0, 0)), (0, 9, 27), (1, 2, 6)
+    samples = [[(x, y, 0), (x, -y, 0)] for x, y in zip(measured, off, strict=True)]
     path = write_csv(tmp_path / "t.csv", rows_of(true, samples))
     return evaluate(path, Options()).values()["results"][0]
 
 
-def test_too_short_a_distance_is_an_error_as_well(found):
+def test_distances_measured_too_short_count_as_errors(found):
     spacing = found["relative_distance"]
     assert (spacing["mean_mm"], spacing["sd_mm"]) == pytest.approx((-2.0, 1.0))  # sd with n - 1
     assert spacing["rms_mm"] == pytest.approx(math.sqrt((1 + 4 + 9) / 3))

@@ -1,4 +1,4 @@
-"""Grids: which points, in which order, and what is wrong with a file."""
+"""Grids: points, their order, and invalid files."""
 
 import pytest
 
@@ -27,7 +27,7 @@ def read(tmp_path):
     return from_text
 
 
-def test_a_lattice_is_gone_through_z_first_and_as_a_whole_before_it_is_repeated(read):
+def test_a_lattice_varies_z_fastest_and_is_completed_before_it_repeats(read):
     grid = read(LATTICE)
     assert grid.points == ((1, 2, 3), (1, 2, 33), (1, 22, 3), (1, 22, 33))
     stops = list(grid.stops())
@@ -50,7 +50,7 @@ def test_the_shipped_example_is_the_papers_grid():
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("", "environment: missing"),
         ('environment = "x"', "give either the table grid or the list points_mm"),
@@ -70,12 +70,12 @@ def test_the_shipped_example_is_the_papers_grid():
         (LATTICE.replace("[grid]", "samples = 1\n[grid]"), "samples = 1: must be at least 2"),
     ],
 )
-def test_what_is_wrong_with_a_file_is_said_by_key_and_rule(read, text, says):
+def test_an_invalid_grid_file_is_refused_with_key_and_rule(read, text, message):
     with pytest.raises(InputError, match=r"grid\.toml: ") as refusal:
         read(text)
-    assert says in str(refusal.value)
+    assert message in str(refusal.value)
 
 
-def test_a_file_that_is_not_there_is_named_with_the_shipped_ones():
+def test_a_missing_grid_file_is_refused_with_the_shipped_names():
     with pytest.raises(InputError, match=r"nothing\.toml: no such file, and no such grid \(choices: cube\)"):
         read_grid("nothing.toml")

@@ -1,4 +1,4 @@
-"""Recording on a grid: right rows, at rest, each point once whatever interrupts it."""
+"""Recording on a grid: correct rows, at rest, each point once in spite of interruptions."""
 
 import csv
 import os
@@ -33,13 +33,13 @@ timeout_s = 2.0
 
 
 class Stage:
-    """A tracker of a stage that is moved by hand, the clock, and the guide: no time passes but by waiting."""
+    """Tracker, clock and operator of a simulated stage; time passes only by waiting."""
 
     def __init__(self):
-        self.time, self.place, self.speed = 0.0, np.zeros(3), 0.0
-        self.asked, self.said = [], []
-        self.ailment, self.status = None, VISIBLE
-        self._told = 0
+        self.time, self.position, self.speed = 0.0, np.zeros(3), 0.0
+        self.moves, self.reports = [], []
+        self.fault, self.status = None, VISIBLE
+        self._sent = 0
 
     def now(self):
         return self.time
@@ -48,23 +48,23 @@ class Stage:
         self.time += seconds
 
     def read(self):
-        numbers = range(self._told + 1, int(self.time * 40) + 1)
-        self._told = max(self._told, int(self.time * 40))
+        numbers = range(self._sent + 1, int(self.time * 40) + 1)
+        self._sent = max(self._sent, int(self.time * 40))
         return tuple(map(self._frame, numbers))
 
     def _frame(self, number):
-        x, y, z = self.place
+        x, y, z = self.position
         x += 100.0 + self.speed * number / 40
         reading = SensorReading((x, y, z), (1.0, 0.0, 0.0, 0.0), 0.02)
-        return Frame(number / 40, number, {"tip": reading, "ref1": reading} | (self.ailment or {}))
+        return Frame(number / 40, number, {"tip": reading, "ref1": reading} | (self.fault or {}))
 
-    def ask(self, stop):
-        self.asked.append((stop.repeat, stop.point_id))
-        self.place = np.array(stop.position)
+    def move(self, stop):
+        self.moves.append((stop.repeat, stop.point_id))
+        self.position = np.array(stop.position)
         self.time += 3.0
 
-    def guide(self, **settings):
-        return Operator(self.ask, self.said.append, **settings)
+    def operator(self, **settings):
+        return Operator(self.move, self.reports.append, **settings)
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def out(tmp_path):
 
 def run(out, grid, stage, **settings):
     with open_session(out, grid) as session:
-        return record(session, stage, stage, grid, stage.guide(**settings))
+        return record(session, stage, stage, grid, stage.operator(**settings))
 
 
 def rows_of(path):
@@ -91,35 +91,35 @@ def rows_of(path):
 ALL = list(product((1, 2), (1, 2, 3)))
 
 
-def assert_whole(path, samples=6, stops=ALL, sensors=("tip", "reference")):
-    """Every stop has all its rows, once, in order."""
+def assert_complete(path, samples=6, stops=ALL, sensors=("tip", "reference")):
+    """Every stop has all its rows once, in order."""
     found = [(int(row["repeat"]), int(row["point_id"]), row["sensor"]) for row in rows_of(path)]
     assert found == [(*stop, name) for stop in stops for _ in range(samples) for name in sensors]
 
 
-def test_each_point_has_its_samples_with_where_the_stage_was(grid, out):
+def test_each_point_has_its_samples_with_the_position_of_the_stage(grid, out):
     stage = Stage()
     assert run(out, grid, stage) == 6
-    assert stage.asked == ALL
-    assert_whole(out)
+    assert stage.moves == ALL
+    assert_complete(out)
     assert tuple(rows_of(out)[0]) == (*COLUMNS, *EXTRA)
     for row in rows_of(out):
         true = np.array([float(row[f"true_{axis}_mm"]) for axis in "xyz"])
-        told = np.array([float(row[f"{axis}_mm"]) for axis in "xyz"])
-        np.testing.assert_array_equal(told - true, (100.0, 0.0, 0.0))
-        assert float(row["distance_mm"]) == pytest.approx(np.linalg.norm(told))
+        measured = np.array([float(row[f"{axis}_mm"]) for axis in "xyz"])
+        np.testing.assert_array_equal(measured - true, (100.0, 0.0, 0.0))
+        assert float(row["distance_mm"]) == pytest.approx(np.linalg.norm(measured))
         assert (row["environment"], row["indicator"], row["qw"]) == ("ideal, by the window", "0.02", "1.0")
 
 
-def test_no_sample_is_from_before_the_stage_was_there(grid, out):
+def test_no_sample_precedes_the_arrival_of_the_stage(grid, out):
     run(out, grid, Stage())
     first = [float(row["time_s"]) for row in rows_of(out)][::12]
     assert (np.diff(first) >= 3.0).all()
     assert first[0] >= 3.0
 
 
-def test_a_moving_stage_is_waited_for(grid, out):
-    """It moves at 5 mm/s for its first second, and the samples are from after that."""
+def test_sampling_waits_for_a_moving_stage(grid, out):
+    """The stage moves at 5 mm/s for the first second; the samples are taken later."""
     stage = Stage()
     wait = stage.wait
 
@@ -129,88 +129,88 @@ def test_a_moving_stage_is_waited_for(grid, out):
 
     stage.wait = wait_and_slow_down
     run(out, grid, stage)
-    assert_whole(out)
+    assert_complete(out)
     assert float(rows_of(out)[0]["time_s"]) > 3.9
 
 
-def test_a_stage_that_never_rests_is_told_and_asked_for_again(grid, out):
+def test_a_drifting_stage_is_reported_and_the_point_retried(grid, out):
     stage = Stage()
     stage.speed = 5.0
 
-    def say(line):
-        stage.said.append(line)
+    def report_and_stop(line):
+        stage.reports.append(line)
         stage.speed = 0.0
 
     with open_session(out, grid) as session:
-        record(session, stage, stage, grid, Operator(stage.ask, say))
-    (said,) = stage.said
-    assert said == (
-        "no 6 good samples within 2 s: tip drifts by 0.50 mm from the first to the last third of samples, limit 0.2 mm; "
-        "retrying"
+        record(session, stage, stage, grid, Operator(stage.move, report_and_stop))
+    (report,) = stage.reports
+    assert report == (
+        "no 6 good samples within 2 s: tip drifts by 0.50 mm from the first to the last third of samples, "
+        "limit 0.2 mm; retrying"
     )
-    assert stage.asked == [(1, 1), *ALL]
-    assert_whole(out)
+    assert stage.moves == [(1, 1), *ALL]
+    assert_complete(out)
 
 
 @pytest.mark.parametrize(
-    ("ailment", "says"),
+    ("fault", "message"),
     [
         ({"tip": SensorReading(None, status="out of volume")}, "tip: out of volume"),
         ({"ref1": SensorReading(None, status="missing")}, "ref1: missing"),
     ],
 )
-def test_a_point_that_cannot_be_measured_ends_a_recording_without_a_person(grid, out, ailment, says):
+def test_a_failed_point_ends_a_recording_without_retries(grid, out, fault, message):
     stage = Stage()
-    stage.ailment = ailment
-    with pytest.raises(RunError, match=f"point 1, repeat 1: no 6 good samples within 2 s: {says}"):
+    stage.fault = fault
+    with pytest.raises(RunError, match=f"point 1, repeat 1: no 6 good samples within 2 s: {message}"):
         run(out, grid, stage, retries=False)
-    assert not out.exists(), "nothing was measured"
+    assert not out.exists(), "no file without rows"
 
 
-def test_a_sensor_that_the_tracker_does_not_have_is_named_before_the_stage_is_moved(grid, out):
+def test_a_sensor_missing_in_the_tracker_is_refused_before_the_stage_moves(grid, out):
     stage = Stage()
     stage._frame = lambda number: Frame(number / 40, number, {"tip": SensorReading((0.0, 0.0, 0.0))})
     with pytest.raises(InputError, match=r"sensors\.ref1: the tracker has no such sensor; it has tip$"):
         run(out, grid, stage)
-    assert stage.asked == []
+    assert stage.moves == []
 
 
-def test_a_silent_tracker_says_why(grid, out):
+def test_a_silent_tracker_is_refused_with_its_status(grid, out):
     stage = Stage()
     stage.read, stage.status = (lambda: ()), "no reply"
     with pytest.raises(RunError, match="no frames within 2 s: no reply"):
         run(out, grid, stage)
-    assert (stage.asked, stage.said) == ([], ["no frames: no reply"])
+    assert (stage.moves, stage.reports) == ([], ["no frames: no reply"])
 
 
-def test_a_tracker_that_falls_silent_for_a_while_is_told_once_and_so_is_its_return(grid, out):
+def test_a_pause_in_the_frames_and_its_end_are_reported_once(grid, out):
     stage = Stage()
     read = stage.read
     stage.read = lambda: () if 3.1 < stage.time < 4.6 else read()
     stage.status = "unplugged"
     run(out, grid, stage)
-    assert stage.said == ["no frames: unplugged", "frames resumed"]
-    assert_whole(out)
+    assert stage.reports == ["no frames: unplugged", "frames resumed"]
+    assert_complete(out)
 
 
-def test_a_sensor_that_is_lost_for_a_while_is_waited_for_and_told_once(grid, out):
-    """For 1.5 s at the first point; for half a second, at the second, nothing is said."""
+def test_a_sensor_missing_for_a_while_is_reported_once(grid, out):
+    """For 1.5 s at the first point; half a second at the second point is not reported."""
     stage = Stage()
     frame, lost = stage._frame, {"tip": SensorReading(None, status="missing")}
 
     def blink(number):
-        told = frame(number)
-        spell = 3.1 < told.time < 4.6 or 7.5 < told.time < 8.3
-        return Frame(told.time, number, told.readings | lost) if spell else told
+        measured = frame(number)
+        is_lost = 3.1 < measured.time < 4.6 or 7.5 < measured.time < 8.3
+        return Frame(measured.time, number, measured.readings | lost) if is_lost else measured
 
     stage._frame = blink
     run(out, grid, stage)
-    assert stage.said == ["waiting: tip: missing"]
-    assert_whole(out)
+    assert stage.reports == ["waiting: tip: missing"]
+    assert_complete(out)
 
 
-class Stuck(Stage):
-    """Its tip takes a share of each way, however far the stage goes; the reference goes all of it."""
+class PartlyStuck(Stage):
+    """The tip moves by a share of the stage's motion, the reference by all of it."""
 
     def __init__(self, share=0.0):
         super().__init__()
@@ -227,18 +227,18 @@ class Stuck(Stage):
 @pytest.mark.parametrize("retries", [True, False])
 def test_a_sensor_that_stays_while_the_stage_moves_ends_the_recording(grid, out, retries):
     with pytest.raises(RunError) as refusal:
-        run(out, grid, Stuck(), retries=retries)
+        run(out, grid, PartlyStuck(), retries=retries)
     assert str(refusal.value) == (
         "tip moved 0.0 mm from point 1 to point 2, the stage 10.0 mm: the difference must be at most 5.0 mm "
         "(use --force to record the point anyway)"
     )
-    assert_whole(out, stops=ALL[:1])
+    assert_complete(out, stops=ALL[:1])
 
 
 @pytest.mark.parametrize(
     ("share", "spacing", "agrees"), [(0.52, 10, True), (0.48, 10, False), (1.48, 10, True)]
 )
-def test_small_ways_may_differ_by_5_mm(tmp_path, out, share, spacing, agrees):
+def test_small_motions_may_differ_by_5_mm(tmp_path, out, share, spacing, agrees):
     assert_agrees(tmp_path, out, share, spacing, agrees)
 
 
@@ -246,7 +246,7 @@ def test_small_ways_may_differ_by_5_mm(tmp_path, out, share, spacing, agrees):
     ("share", "spacing", "agrees"),
     [(0.81, 100, True), (0.79, 100, False), (1.19, 100, True), (1.21, 100, False)],
 )
-def test_long_ways_may_differ_by_20_percent(tmp_path, out, share, spacing, agrees):
+def test_large_motions_may_differ_by_20_percent(tmp_path, out, share, spacing, agrees):
     assert_agrees(tmp_path, out, share, spacing, agrees)
 
 
@@ -255,76 +255,76 @@ def assert_agrees(tmp_path, out, share, spacing, agrees):
     (tmp_path / "two.toml").write_text(text)
     grid = read_grid(str(tmp_path / "two.toml"))
     if agrees:
-        assert run(out, grid, Stuck(share)) == 2
+        assert run(out, grid, PartlyStuck(share)) == 2
     else:
         with pytest.raises(RunError, match="the difference must be at most"):
-            run(out, grid, Stuck(share))
+            run(out, grid, PartlyStuck(share))
 
 
-def test_who_knows_better_keeps_the_point(grid, out):
-    stage, doubts = Stuck(), []
-    run(out, grid, stage, accepts=lambda mismatch: not doubts.append(mismatch))
-    assert_whole(out)
-    assert len(doubts) == 5
-    assert stage.asked == ALL
+def test_an_accepted_mismatch_keeps_the_point(grid, out):
+    stage, mismatches = PartlyStuck(), []
+    run(out, grid, stage, accepts=lambda mismatch: not mismatches.append(mismatch))
+    assert_complete(out)
+    assert len(mismatches) == 5
+    assert stage.moves == ALL
 
 
-def test_who_does_not_keep_it_measures_it_again(grid, out):
-    """The stage was not moved to the second point when it was asked to, and is once the mismatch is told."""
-    stage, doubts = Stage(), []
+def test_a_rejected_mismatch_measures_the_point_again(grid, out):
+    """The stage is moved to the second point only after the second report of a mismatch."""
+    stage, mismatches = Stage(), []
 
     def forget_the_second(stop):
-        place = stage.place
-        stage.ask(stop)
-        stage.place = place if len(stage.asked) == 2 else stage.place
+        position = stage.position
+        stage.move(stop)
+        stage.position = position if len(stage.moves) == 2 else stage.position
 
-    def mend(mismatch):
-        doubts.append(mismatch)
-        if len(doubts) > 1:
+    def correct(mismatch):
+        mismatches.append(mismatch)
+        if len(mismatches) > 1:
             raise KeyboardInterrupt
-        stage.place = np.array([10.0, 0.0, 0.0])
+        stage.position = np.array([10.0, 0.0, 0.0])
         return False
 
     with open_session(out, grid) as session:
-        record(session, stage, stage, grid, Operator(forget_the_second, print, accepts=mend))
-    assert stage.asked == ALL
-    assert_whole(out)
+        record(session, stage, stage, grid, Operator(forget_the_second, print, accepts=correct))
+    assert stage.moves == ALL
+    assert_complete(out)
     assert {row["x_mm"] for row in rows_of(out) if row["point_id"] == "2"} == {"110.0"}
 
 
-def test_the_last_point_before_an_interruption_counts_too(grid, out):
+def test_motion_is_checked_across_an_interruption(grid, out):
     stage = Stage()
 
-    def ask_once(stop):
-        if stage.asked:
+    def move_once(stop):
+        if stage.moves:
             raise KeyboardInterrupt
-        stage.ask(stop)
+        stage.move(stop)
 
     with open_session(out, grid) as session, pytest.raises(KeyboardInterrupt):
-        record(session, stage, stage, grid, Operator(ask_once, print))
+        record(session, stage, stage, grid, Operator(move_once, print))
     again = Stage()
-    again.ask = lambda _: None  # it stays where it was
+    again.move = lambda _: None  # the stage does not move
     with pytest.raises(RunError, match=r"tip moved 0\.0 mm from point 1 to point 2, the stage 10\.0 mm"):
         run(out, grid, again)
 
 
-def test_a_table_is_a_csv(grid, tmp_path):
+def test_a_parquet_suffix_is_refused(grid, tmp_path):
     with pytest.raises(InputError, match=r"table\.parquet: the output is CSV"):
         run(tmp_path / "table.parquet", grid, Stage())
     assert not (tmp_path / "table.parquet").exists()
 
 
 @pytest.mark.parametrize("stopped_after", range(7))
-def test_stopped_at_any_point_it_goes_on_with_the_next(grid, out, stopped_after):
+def test_an_interrupted_recording_resumes_at_the_next_point(grid, out, stopped_after):
     stage = Stage()
-    ask = stage.ask
+    move = stage.move
 
-    def ask_until(stop):
-        if len(stage.asked) == stopped_after:
+    def move_until(stop):
+        if len(stage.moves) == stopped_after:
             raise KeyboardInterrupt
-        ask(stop)
+        move(stop)
 
-    stage.ask = ask_until
+    stage.move = move_until
     if stopped_after < 6:
         with pytest.raises(KeyboardInterrupt):
             run(out, grid, stage)
@@ -332,22 +332,22 @@ def test_stopped_at_any_point_it_goes_on_with_the_next(grid, out, stopped_after)
         run(out, grid, stage)
     again = Stage()
     run(out, grid, again)
-    assert stage.asked + again.asked == ALL
-    assert_whole(out)
-    assert (np.diff([float(row["time_s"]) for row in rows_of(out)]) >= 0).all(), "times go on"
+    assert stage.moves + again.moves == ALL
+    assert_complete(out)
+    assert (np.diff([float(row["time_s"]) for row in rows_of(out)]) >= 0).all(), "times continue"
 
 
 @pytest.mark.parametrize("cut", [1, 20, 200, 400, 1000, 2000, 4000])
-def test_a_table_that_was_cut_anywhere_is_completed(grid, out, cut):
+def test_a_table_truncated_anywhere_is_completed(grid, out, cut):
     run(out, grid, Stage())
     whole = out.stat().st_size
     os.truncate(out, max(0, whole - cut) if cut > 1 else 1)
     run(out, grid, Stage())
-    assert_whole(out)
+    assert_complete(out)
 
 
-def test_a_table_stays_as_it_was_until_there_is_something_to_add(grid, out):
-    """A stop that was torn, and a file without anything: whoever opens them and measures nothing touches nothing."""
+def test_a_table_is_unchanged_until_rows_are_added(grid, out):
+    """Opening a table with a truncated stop, or an empty file, without measuring changes nothing."""
     run(out, grid, Stage())
     os.truncate(out, out.stat().st_size - 1000)
     torn = out.read_bytes()
@@ -355,22 +355,22 @@ def test_a_table_stays_as_it_was_until_there_is_something_to_add(grid, out):
         assert session.done == 5
     assert out.read_bytes() == torn
     run(out, grid, Stage())
-    assert_whole(out)
+    assert_complete(out)
     out.write_bytes(b"")
     with open_session(out, grid):
         pass
-    assert out.read_bytes() == b"", "it is the user's"
+    assert out.read_bytes() == b"", "the file existed before"
 
 
-def test_zeros_that_a_power_cut_left_are_dropped(grid, out):
+def test_zero_bytes_left_by_a_power_cut_are_dropped(grid, out):
     run(out, grid, Stage())
     with out.open("ab") as file:
         file.write(bytes(500))
     run(out, grid, Stage())
-    assert_whole(out)
+    assert_complete(out)
 
 
-def test_a_whole_table_is_left_as_it_is(grid, out):
+def test_a_complete_table_is_unchanged(grid, out):
     run(out, grid, Stage())
     before = out.read_bytes()
     assert run(out, grid, Stage()) == 0
@@ -383,12 +383,12 @@ def test_a_whole_table_is_left_as_it_is(grid, out):
         ("environment = ", "# environment = \nenvironment = 'noisy' #"),
         ("[10, 0, 0]", "[11, 0, 0]"),
         ("samples = 6", "samples = 5"),
-        ("samples = 6", "samples = 60"),  # a stop of which has more rows than the whole table
+        ("samples = 6", "samples = 60"),  # one stop has more rows than the table
         ("repeats = 2", "repeats = 1"),
         ('ref1 = "reference"', 'ref1 = "other"'),
     ],
 )
-def test_a_table_of_another_grid_is_left_alone(grid, out, tmp_path, old, new):
+def test_a_table_of_another_grid_is_refused_and_unchanged(grid, out, tmp_path, old, new):
     run(out, grid, Stage())
     before = out.read_bytes()
     (tmp_path / "other.toml").write_text(GRID.replace(old, new))
@@ -397,14 +397,14 @@ def test_a_table_of_another_grid_is_left_alone(grid, out, tmp_path, old, new):
     assert out.read_bytes() == before
 
 
-def test_a_file_that_is_no_such_table_is_left_alone(grid, out):
+def test_any_other_file_is_refused_and_unchanged(grid, out):
     out.write_text("my notes\n")
     with pytest.raises(InputError, match="is not a table of `em record`"):
         run(out, grid, Stage())
     assert out.read_text() == "my notes\n"
 
 
-def test_a_damaged_line_is_found(grid, out):
+def test_a_damaged_line_is_refused(grid, out):
     run(out, grid, Stage())
     lines = out.read_text().splitlines(keepends=True)
     out.write_text("".join([*lines[:3], lines[3].replace("1", "x", 1), *lines[4:]]))
@@ -412,20 +412,20 @@ def test_a_damaged_line_is_found(grid, out):
         run(out, grid, Stage())
 
 
-def test_two_recordings_do_not_share_a_table(grid, out):
+def test_a_table_is_locked_against_a_second_recording(grid, out):
     with open_session(out, grid), pytest.raises(InputError, match="another process is writing this file"):
         run(out, grid, Stage())
 
 
-def test_each_point_is_on_the_disk_before_the_next_is_asked_for(grid, out, monkeypatch):
+def test_each_point_is_synced_to_disk_before_the_next_move(grid, out, monkeypatch):
     synced = []
     monkeypatch.setattr(recording.os, "fsync", lambda _: synced.append(len(rows_of(out))))
     run(out, grid, Stage())
     assert synced == [12, 24, 36, 48, 60, 72]
 
 
-def test_killed_in_the_middle_it_neither_loses_nor_repeats_a_point(tmp_path, out):
-    """Real processes, a real line, and kill -9."""
+def test_a_killed_recording_loses_and_repeats_no_point(tmp_path, out):
+    """With real processes, a serial line and SIGKILL."""
     count = 16
     points = [[n, 0, 0] for n in range(count)]
     text = f'environment = "ideal"\nsamples = 4\nrepeats = 1\npoints_mm = {points}\n'
@@ -438,4 +438,4 @@ def test_killed_in_the_middle_it_neither_loses_nor_repeats_a_point(tmp_path, out
         process.send_signal(signal.SIGKILL)
         process.wait(DEADLINE_S)
         subprocess.run(command, check=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    assert_whole(out, 4, [(1, n + 1) for n in range(count)], ("tip",))
+    assert_complete(out, 4, [(1, n + 1) for n in range(count)], ("tip",))

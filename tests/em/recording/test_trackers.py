@@ -1,4 +1,4 @@
-"""From what a user writes to a tracker."""
+"""Trackers named on the command line."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReadi
 RECORDING = "time_s,frame_number,sensor,x_mm,y_mm,z_mm\n0.0,1,tip,1,2,3\n1.0,2,tip,1,2,3\n"
 
 
-def test_a_file_is_replayed_as_it_was_recorded(tmp_path):
+def test_a_recording_is_replayed_at_its_own_times(tmp_path):
     class Now:
         time = 0.0
 
@@ -56,7 +56,7 @@ def test_a_faster_replay_has_a_faster_clock(monkeypatch):
 
 
 @pytest.mark.parametrize("speed", ["0", "-1", "nan", "inf"])
-def test_a_speed_that_is_none_is_refused(speed):
+def test_an_invalid_speed_is_refused(speed):
     with pytest.raises(InputError, match="the speed must be finite and above 0"):
         clock_for(f"replay:a.csv@{speed}")
 
@@ -75,7 +75,7 @@ def test_an_aurora_has_a_port_and_names(monkeypatch, spec, port, names):
 
 
 @pytest.mark.parametrize(
-    ("spec", "says"),
+    ("spec", "message"),
     [
         ("polaris:/dev/ttyUSB0", "must be aurora:PORT"),
         ("aurora", "must be aurora:PORT"),
@@ -85,28 +85,28 @@ def test_an_aurora_has_a_port_and_names(monkeypatch, spec, port, names):
         ("aurora:/dev/ttyUSB0=tip,", "must be different identifiers"),
     ],
 )
-def test_anything_else_is_refused_with_the_forms_that_there_are(spec, says):
-    with pytest.raises(InputError, match=says):
+def test_an_invalid_tracker_is_refused_with_the_valid_forms(spec, message):
+    with pytest.raises(InputError, match=message):
         open_tracker(spec, WallClock())
 
 
 def read_run(monkeypatch, *samples):
     """Return the frames of a run with these readings in two periods."""
-    told = [CheckedMeasurement(sample, "ok") for sample in samples]
-    periods = [SimpleNamespace(readings=told[:1]), SimpleNamespace(readings=told[1:])]
+    checked = [CheckedMeasurement(sample, "ok") for sample in samples]
+    periods = [SimpleNamespace(readings=checked[:1]), SimpleNamespace(readings=checked[1:])]
     monkeypatch.setattr(trackers, "read_trace", lambda _: SimpleNamespace(periods=periods))
     return frames_of_run(Path("run"))
 
 
-def test_a_run_gives_back_what_its_tracker_told_each_frame_once(monkeypatch):
+def test_a_run_returns_each_frame_of_its_tracker_once(monkeypatch):
     frames = [Frame(n / 40, 7 + n, {"tip": SensorReading((1.0, 2.0, 3.0))}) for n in range(2)]
     first, second = (Measurement(frame.time, 5.0, 6.0, 7.0, frame) for frame in frames)
     assert read_run(monkeypatch, first, second, second) == tuple(frames)
 
 
 def test_a_run_with_a_tracker_of_the_tip_alone_gives_frames_of_the_tip(monkeypatch):
-    seen, lost = read_run(monkeypatch, Measurement(0.1, 5.0, 6.0), Measurement(0.2, None, None))
-    assert seen == Frame(0.1, 0, {"tip": SensorReading((5.0, 6.0, 0.0))})
+    measured, lost = read_run(monkeypatch, Measurement(0.1, 5.0, 6.0), Measurement(0.2, None, None))
+    assert measured == Frame(0.1, 0, {"tip": SensorReading((5.0, 6.0, 0.0))})
     assert lost == Frame(0.2, 1, {"tip": SensorReading(None, status="missing")})
 
 

@@ -1,4 +1,4 @@
-"""Watching: every frame shown and kept, and a verdict on each."""
+"""Watching: every frame is shown and recorded, with a verdict on each."""
 
 import pytest
 
@@ -12,7 +12,7 @@ from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading
 
 
 class Clock:
-    """Time passes by waiting alone."""
+    """Time passes only by waiting."""
 
     time = 0.0
 
@@ -24,12 +24,14 @@ class Clock:
 
 
 def frames(count, indicator=0.02, **readings):
-    told = {name: SensorReading((1.0, 2.0, 3.0), None, indicator) for name in ("tip", "ref1", "ref2", "ref3")}
-    return [Frame(n / 40, n, told | readings) for n in range(count)]
+    sensors = {
+        name: SensorReading((1.0, 2.0, 3.0), None, indicator) for name in ("tip", "ref1", "ref2", "ref3")
+    }
+    return [Frame(n / 40, n, sensors | readings) for n in range(count)]
 
 
 class Silent:
-    """A tracker that says nothing and why."""
+    """A tracker without frames, with its status."""
 
     status = "no reply"
 
@@ -46,7 +48,7 @@ def test_each_frame_is_shown_once_with_its_verdict():
     assert set(verdicts[20:]) == {VISIBLE}
 
 
-def test_a_judge_of_ones_own_sees_the_history():
+def test_a_custom_check_receives_the_history():
     clock, snapshots = Clock(), []
     watch(
         Replay(frames(500), clock),
@@ -58,19 +60,19 @@ def test_a_judge_of_ones_own_sees_the_history():
     assert snapshots[-1].verdict == "400"
 
 
-def test_it_stops_after_its_time():
+def test_it_stops_after_the_given_seconds():
     clock, snapshots = Clock(), []
     assert watch(Replay(frames(60), clock), clock, snapshots.append, seconds=0.5) == 20
 
 
-def test_where_nothing_comes_it_says_so_now_and_then():
+def test_without_frames_the_status_is_shown_periodically():
     clock, snapshots = Clock(), []
     assert watch(Silent(), clock, snapshots.append, seconds=3.0) == 0
     assert 4 <= len(snapshots) <= 6
     assert {(snapshot.frame, snapshot.verdict) for snapshot in snapshots} == {(None, "no reply")}
 
 
-def test_it_stops_when_the_tracker_says_that_there_is_no_more_to_come():
+def test_it_stops_at_the_end_of_a_replay():
     clock, tracker = Clock(), Silent()
     tracker.status = ENDED
     assert watch(tracker, clock, lambda _: None, seconds=3.0) == 0
@@ -99,25 +101,25 @@ def test_a_recording_overwrites_nothing(tmp_path):
     assert (tmp_path / "kept.csv").read_text() == "mine"
 
 
-def verdict(told, settings=None, distorted=False):
-    return check_field(told, settings or MonitorSettings(), distorted)[0]
+def verdict(history, settings=None, distorted=False):
+    return check_field(history, settings or MonitorSettings(), distorted)[0]
 
 
 def test_a_good_field_is_ok_and_a_distorted_one_is_not():
     assert check_field(frames(40), MonitorSettings()) == (VISIBLE, False)
-    said, distorted = check_field(frames(40, indicator=0.06), MonitorSettings())
-    assert "field distorted" in said
+    found, distorted = check_field(frames(40, indicator=0.06), MonitorSettings())
+    assert "field distorted" in found
     assert distorted
 
 
-def test_the_field_is_that_of_the_last_second_at_the_references():
+def test_the_field_is_judged_from_the_last_second_at_the_references():
     improved = frames(100, indicator=0.06)[:60] + frames(100)[60:]
     assert verdict(improved) == VISIBLE
     at_the_tip = SensorReading((1.0, 2.0, 3.0), None, 0.5)
     assert verdict(frames(40, tip=at_the_tip)) == VISIBLE
 
 
-def test_a_sensor_without_a_position_and_too_few_references_are_told():
+def test_the_verdict_names_a_missing_sensor_and_too_few_references():
     lost = SensorReading(None, status="out of volume")
     assert verdict(frames(5, ref2=lost)) == "ref2: out of volume"
     alone = [Frame(0.0, 1, {"tip": SensorReading((0.0, 0.0, 0.0), None, 0.02)})]
@@ -126,36 +128,38 @@ def test_a_sensor_without_a_position_and_too_few_references_are_told():
 
 
 def stretch(begin, seconds, **readings):
-    """Frames from `begin` (s) on, with these readings of the sensors."""
+    """Frames from time `begin` (s), with these readings of the sensors."""
     first = round(begin * 40)
     return [Frame(n / 40, n, readings) for n in range(first, first + round(seconds * 40))]
 
 
-def told(indicator, tip_status=VISIBLE):
-    seen = SensorReading((1.0, 2.0, 3.0), None, indicator)
-    tip = seen if tip_status == VISIBLE else SensorReading(None, status=tip_status)
-    return {"tip": tip, "ref1": seen, "ref2": seen, "ref3": seen}
+def readings_of(indicator, tip_status=VISIBLE):
+    measured = SensorReading((1.0, 2.0, 3.0), None, indicator)
+    tip = measured if tip_status == VISIBLE else SensorReading(None, status=tip_status)
+    return {"tip": tip, "ref1": measured, "ref2": measured, "ref3": measured}
 
 
-def test_a_field_that_was_distorted_stays_so_as_long_as_a_held_insertion_waits():
-    """Up over the limit, down below it, unknown, still not below the lower limit, good, and between the limits again;
-    the same with the tip unseen, which is what is said then."""
+def test_the_verdict_follows_the_monitor_of_a_held_insertion():
+    """Indicator above the limit, between the limits, unknown, between the limits, good, between the limits again.
+
+    Then some of these with a missing tip, which the verdict names first.
+    """
     levels = (0.02, 0.06, 0.052, None, 0.052, 0.02, 0.052)
     script = [(level, VISIBLE) for level in levels] + [(level, "missing") for level in levels[1:3]]
     script += [(0.052, VISIBLE)]
-    seen = [f for k, one in enumerate(script) for f in stretch(1.5 * k, 1.5, **told(*one))]
+    measured = [f for k, one in enumerate(script) for f in stretch(1.5 * k, 1.5, **readings_of(*one))]
     clock, snapshots, monitor = Clock(), [], Monitor(MonitorSettings())
-    watch(Replay(seen, clock), clock, snapshots.append)
-    assert len(snapshots) == len(seen)
-    for frame, snapshot in zip(seen, snapshots, strict=True):
+    watch(Replay(measured, clock), clock, snapshots.append)
+    assert len(snapshots) == len(measured)
+    for frame, snapshot in zip(measured, snapshots, strict=True):
         monitor, _ = monitor.check(
             Measurement(frame.time, 0.0, 0.0, 0.0, frame), lambda _: (0.0, 0.0), frame.time, 1.0, 1000.0
         )
         monitor, held = monitor.check_field()
-        unseen = frame.readings["tip"].status != VISIBLE
-        assert snapshot.verdict == ("tip: missing" if unseen else str(held)), frame.number
+        is_missing = frame.readings["tip"].status != VISIBLE
+        assert snapshot.verdict == ("tip: missing" if is_missing else str(held)), frame.number
     last = [snapshots[60 * (k + 1) - 1].verdict for k in range(len(script))]
-    assert [said.split(":")[0] for said in last] == [
+    assert [verdict.split(":")[0] for verdict in last] == [
         *("ok", "field distorted", "field distorted", "field not known", "field distorted", "ok", "ok"),
         *("tip", "tip", "field distorted"),
     ]
@@ -175,17 +179,17 @@ def sensors(*names, indicator=0.02):
     ]
 
 
-def test_without_a_number_the_field_is_judged_by_the_references_that_there_are():
-    def judge(frames):
+def test_without_a_number_all_present_references_are_used():
+    def check(frames):
         return field_checker()(frames, False)[0]
 
-    assert judge(sensors("tip", "ref1")) == VISIBLE
-    assert "field distorted" in judge(sensors("tip", "ref1", indicator=0.06))
-    assert "field not known" in judge(sensors("tip")), "nobody saw it"
-    assert judge(sensors("tip", "ref1", "ref2", "ref3", "ref4")) == VISIBLE
-    assert judge(sensors("tip", "tip2", "ref1")) == VISIBLE, "a second sensor in the needle is no reference"
+    assert check(sensors("tip", "ref1")) == VISIBLE
+    assert "field distorted" in check(sensors("tip", "ref1", indicator=0.06))
+    assert "field not known" in check(sensors("tip")), "no reference"
+    assert check(sensors("tip", "ref1", "ref2", "ref3", "ref4")) == VISIBLE
+    assert check(sensors("tip", "tip2", "ref1")) == VISIBLE, "a second sensor in the needle is no reference"
 
 
-def test_the_number_of_references_can_be_asked_for():
+def test_the_number_of_references_can_be_set():
     assert "field not known: 1 of 2" in field_checker(2)(sensors("tip", "ref1"), False)[0]
     assert field_checker(0)(sensors("tip"), False) == (VISIBLE, False)

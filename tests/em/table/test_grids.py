@@ -1,4 +1,4 @@
-"""Moments of grid points against exact fractions: far from the origin, in any order, on any number of threads."""
+"""Moments of grid points against exact fractions: far from the origin, for any order of rows and number of threads."""
 
 from fractions import Fraction
 from math import sqrt
@@ -18,7 +18,7 @@ def written(path, rows, row_group_size=None):
 
 
 def moments(rows):
-    """Mean (mm) and sum of squares about it (mm²) along x, y, z of each grid point, without any rounding."""
+    """Mean (mm) and sum of squares about it (mm²) along x, y, z of each grid point, without rounding."""
     points = {}
     for row in rows:
         points.setdefault(row["point_id"], []).append([Fraction(row[f"{axis}_mm"]) for axis in "xyz"])
@@ -29,10 +29,10 @@ def moments(rows):
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 @pytest.mark.parametrize("offset", [0.0, 1000.0, -4096.1, 1e5])
-def test_the_jitter_is_exact_to_a_billionth_of_a_millimetre_a_metre_away(tmp_path, offset, suffix):
+def test_the_jitter_is_exact_far_from_the_origin(tmp_path, offset, suffix):
     rng = np.random.default_rng(0)
-    places = GRID[:5] + offset
-    rows = rows_of(places, [p + rng.normal(0.0, 0.04, (60, 3)) for p in places])
+    positions = GRID[:5] + offset
+    rows = rows_of(positions, [p + rng.normal(0.0, 0.04, (60, 3)) for p in positions])
     rng.shuffle(rows)
     path = tmp_path / f"t.{suffix}"
     write_csv(path, rows) if suffix == "csv" else written(path, rows)
@@ -49,22 +49,22 @@ def test_the_jitter_is_exact_to_a_billionth_of_a_millimetre_a_metre_away(tmp_pat
     assert result.accuracy.jitter_mm == pytest.approx(jitter, abs=1e-11)
 
 
-def test_the_order_of_a_long_tables_rows_changes_no_digit(tmp_path):
-    """Enough rows for several threads, each of which sums its own."""
+def test_the_order_of_rows_of_a_long_table_changes_no_digit(tmp_path):
+    """With enough rows for several threads."""
     rng = np.random.default_rng(1)
     count = 300_000
-    point, turn = (
+    point, quaternion = (
         rng.integers(0, 27, count),
         np.array([1.0, 0.0, 0.0, 0.0]) + rng.normal(0.0, 0.01, (count, 4)),
     )
-    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     x = GRID[point] + 1000.0 + rng.normal(0.0, 0.04, (count, 3))
     table = pa.table(
         {
             "point_id": point,
             **{f"true_{axis}_mm": GRID[point, k] for k, axis in enumerate("xyz")},
             **{f"{axis}_mm": x[:, k] for k, axis in enumerate("xyz")},
-            **{name: turn[:, k] for k, name in enumerate(("qw", "qx", "qy", "qz"))},
+            **{name: quaternion[:, k] for k, name in enumerate(("qw", "qx", "qy", "qz"))},
             "indicator": rng.gamma(3.0, 0.01, count),
             "distance_mm": np.linalg.norm(x, axis=1),
             "sensor": ["tip"] * count,
@@ -86,14 +86,14 @@ def test_samples_at_several_distances_are_pooled_by_grid_point(tmp_path):
     for k, row in enumerate(rows):
         row["distance_mm"] = (610.0, 640.0, 655.0)[k % 3]
     (grid,), count = read_table(written(tmp_path / "t.parquet", rows), Options())
-    (whole,), _ = read_table(
+    (pooled,), _ = read_table(
         written(tmp_path / "w.parquet", [{**row, "distance_mm": None} for row in rows]), Options()
     )
     assert count == len(rows)
     assert (len(grid.points), len(grid.cells)) == (27, 54)
     assert sorted(set(grid.cells.bins.tolist())) == [12.0, 13.0]
     assert grid.cells.count.tolist() == [4] * 27 + [2] * 27
-    np.testing.assert_array_equal(grid.points.scatter, whole.points.scatter)
+    np.testing.assert_array_equal(grid.points.scatter, pooled.points.scatter)
     np.testing.assert_allclose(grid.cells.distance, [625.0] * 27 + [655.0] * 27, atol=1e-9)
 
 
@@ -106,7 +106,7 @@ def test_grid_points_are_in_the_order_of_their_numbers_or_of_their_names(tmp_pat
     assert names(["b", 10, 9]) == ("10", "9", "b")
 
 
-def test_a_share_above_a_limit_is_that_of_the_levels_beyond_it(tmp_path):
+def test_the_share_above_a_limit_is_that_of_the_bins_above_it(tmp_path):
     values = [0.01, 0.01, 0.01, 0.0101, 0.0101, 0.0102]
     rows = rows_of(GRID[:6], GRID[:6, None], indicator=values)
     (grid,), _ = read_table(write_csv(tmp_path / "t.csv", rows), Options())
