@@ -1,9 +1,9 @@
-"""What the exact plant is held against: writes docs/validation.md and its pictures.
+"""Validation of the exact plant: writes docs/validation.md and its figures.
 
     python studies/validation.py [--out DIR]
 
-The problems are those of the tests (tests/reference/validation.py), which assert what is written down here. Needs scipy
-for the closed forms; about a minute on one core. Same bytes at every run.
+The problems are those of tests/reference/validation.py; the tests assert the values of the document. Takes about a
+minute on one core. Repeated runs write the same bytes.
 """
 
 import argparse
@@ -33,13 +33,13 @@ MARKS = ("o", "s", "^", "D")
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Markdown; the first column is text, the others are numbers."""
+    """Return a Markdown table; the first column is text, the others are numbers."""
     lines = [head, ("---", *["---:"] * (len(head) - 1)), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def small(value: float) -> str:
-    """Two digits, and a power of ten below a thousandth."""
+    """Format with two digits, in exponential notation below 0.001."""
     if abs(value) >= 1e-3:
         return style.signed(value, ".2g")
     mantissa, exponent = f"{value:.1e}".split("e")
@@ -47,12 +47,12 @@ def small(value: float) -> str:
 
 
 def power(sizes: Sequence[float] | np.ndarray, errors: Sequence[float] | np.ndarray) -> str:
-    """The fitted order."""
+    """Return the fitted order as text."""
     return f"{problems.order(sizes, errors):.2f}"
 
 
 def document(found: problems.Found) -> str:
-    """docs/validation.md."""
+    """Return the text of docs/validation.md."""
     parts = [
         "# Validation of the exact plant",
         INTRODUCTION,
@@ -71,26 +71,27 @@ def document(found: problems.Found) -> str:
 
 
 def wrapped(text: str) -> str:
-    """Prose in lines of 120 characters; headings, tables and pictures as they are."""
+    """Wrap prose to lines of 120 characters; headings, tables and images are unchanged."""
     if text.startswith(("#", "|", "!", "*")):
         return text
     return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
 
 
 INTRODUCTION = (
-    "The needle in the virtual phantom (`--phantom exact`, [theory.md](theory.md) section 11) against closed forms, a"
-    " second solver and the controller's model. A script computes every figure here and draws the pictures; the tests"
-    " assert them (`pytest tests/phantom`). That a plant solves its equations says nothing about tissue."
+    "The needle of the virtual phantom (`--phantom exact`, [theory.md](theory.md) section 11) is compared with closed"
+    " forms, a second solver and the controller's model. A script computes every value of this page and draws the"
+    " figures; the tests assert them (`pytest tests/rig/phantom`). The page verifies the solution of the equations; it"
+    " does not validate the tissue model."
 )
 LIMITS = (
-    "The exact plant shares the tissue's law (1), springs across the needle and the rule of the bevel's rest point with"
-    " the controller's model, so no figure here judges those: only an experiment can. What differs are kinematics,"
-    " mesh, place and direction of the tissue's forces, imperfections and the whole solver."
+    "The exact plant and the controller's model share the tissue law (1), the springs normal to the needle and the rule"
+    " of the bevel's rest point, so this page cannot validate those: only an experiment can. They differ in kinematics,"
+    " mesh, position and direction of the tissue forces, imperfections, and the solver."
 )
 
 
 def summary(found: problems.Found) -> str:
-    """What one wants to know first."""
+    """Return the table of the main results."""
     finest = {load: errors[-1] for load, errors in found.cantilever.items()}
     rows = [
         (
@@ -105,26 +106,26 @@ def summary(found: problems.Found) -> str:
     moved = max(abs(done / stored - 1.0) for done, stored in found.moves.values())
     rows += [
         (
-            "its order in the length of a segment",
+            "cantilever: order of convergence in the segment length",
             "2",
             power(1.0 / problems.SEGMENTS, found.cantilever[5.0][:, 1]),
         ),
-        ("buckling load over Euler's", "1", f"{found.buckling:.5f}"),
+        ("buckling load over Euler load", "1", f"{found.buckling:.5f}"),
         (
-            "difference from the controller's model, order in the angle",
+            "difference from the controller's model: order in the slope",
             "3",
             power([gap.angle for gap in last], [gap.aside for gap in last]),
         ),
-        ("steady bevel curvature, relative error", "0", small(worst)),
-        ("work without cutting over stored energy, less 1", "0", small(moved)),
+        ("steady bevel curvature: relative error", "0", small(worst)),
+        ("work over stored energy without cutting, minus 1", "0", small(moved)),
         ("insertion: share of the work neither stored nor dissipated", "0", small(abs(lost(found)))),
-        ("second solver: largest distance of the tips aside (mm)", "0", small(found.second[-1, 1])),
+        ("second solver: largest lateral difference of the tips (mm)", "0", small(found.second[-1, 1])),
     ]
     return table(("check", "expected", "found"), rows)
 
 
 def lost(found: problems.Found) -> float:
-    """Of the work on an insertion with friction and the finest step."""
+    """Return the energy error of an insertion with friction and the finest step."""
     return found.balances[5.0][-1].gap
 
 
@@ -149,13 +150,14 @@ def needle(found: problems.Found) -> list[str]:
     head = ("PL²/EI", "table, y/L", "elastica, y/L", f"plant, {problems.SEGMENTS[-1]} segments")
     return [
         "## The needle alone",
-        "A cantilever under a dead load P across its end, against the elastica by elliptic integrals (Bisshopp and"
-        " Drucker 1945) and the tables' four digits. The discrete rod is of second order.",
+        "A cantilever with a transverse dead load P at its end, compared with the elastica by elliptic integrals"
+        " (Bisshopp and Drucker 1945) and with published tables of four digits. The discrete rod converges with second"
+        " order.",
         table((*head, "error x/L", "error y/L", "error θ (rad)", "orders x, y, θ"), rows),
-        "![Bent cantilevers on the tips of the elastica, and the error over the number of segments]"
+        "![Bent cantilevers with the tips of the elastica, and the error over the number of segments]"
         "(images/validation-needle.png)",
         COMMAND,
-        f"A straight column of 64 segments stands up to {found.buckling:.5f} times Euler's load π²EI/4L².",
+        f"A straight column of 64 segments buckles at {found.buckling:.5f} times the Euler load π²EI/4L².",
     ]
 
 
@@ -174,28 +176,29 @@ def model(found: problems.Found) -> list[str]:
     ]
     last = one[0.125][problems.CUBIC]
     slope = power([gap.angle for gap in last], [gap.aside for gap in last])
-    meshes = [f"apart (mm), segments of {h:g} mm" for h in problems.MESHES]
+    meshes = [f"distance (mm), segments of {h:g} mm" for h in problems.MESHES]
     return [
         "## The controller's model at small angles",
-        "The same insertion to 44.5 mm with guide motion and a flip in both formulations, bevel offset and guide motion"
-        " scaled together: the largest distance of the two tips on the way, by the largest slope of the tip. Contact"
-        " points are as far apart as segments are long, steps half as long. Mirrored commands give the mirror image, so"
-        " what finite rotations change begins with the third power of the angle.",
-        f"Found with the finest mesh and one layer, from {last[-1].angle:.3f} to {last[0].angle:.3f} rad: the power"
-        f" {slope}. At smaller angles the error of the mesh is left, in proportion to the angle; at larger ones higher"
-        " powers follow. With two layers the same, less smoothly: single contact points lie in another layer than the"
-        " model's. The guide does not give here, as the model's (1e5 N/mm in place of the phantom's 1e3).",
+        "The same insertion to 44.5 mm with guide motion and a flip in both formulations, with bevel offset and guide"
+        " motion scaled together: the table gives the largest distance between the two tips and the largest slope of"
+        " the tip. The contact spacing equals the segment length; steps are half as long. Mirrored commands give the"
+        " mirror image, so the effect of finite rotations starts with the third power of the slope.",
+        f"With the finest mesh and one layer, the fitted power from {last[-1].angle:.3f} to {last[0].angle:.3f} rad is"
+        f" {slope}. At smaller slopes the discretisation error remains, in proportion to the slope; at larger ones"
+        " higher powers contribute. Results with two layers are similar but less smooth, since single contact points"
+        " are in a different layer than the model's. The guide is as rigid as the model's here (1e5 N/mm instead of the"
+        " phantom's 1e3).",
         table(
             (
                 "slope (rad), one layer",
                 *meshes,
-                "tissue energy, relative",
-                "slope, two layers",
-                "apart, 0.125 mm",
+                "tissue energy, relative difference",
+                "slope (rad), two layers",
+                "distance (mm), segments of 0.125 mm",
             ),
             rows,
         ),
-        "![Distance of the two formulations over the angle, with the third power](images/validation-model.png)",
+        "![Distance between the two formulations over the slope, with the third power](images/validation-model.png)",
         COMMAND,
     ]
 
@@ -209,14 +212,14 @@ def bevel(found: problems.Found) -> list[str]:
         rows.append((f"{length:g}", f"{expected:.4e}".replace("e-0", "e−"), *shares))
     return [
         "## Steady curvature of the bevel",
-        "Far from skin and base at small strain the path is a circle, κ = F/(EIβ) with the spring's force less what the"
-        " slide takes from it ([theory.md](theory.md) eq. 10). Needle 1/β = 10 mm, 250 mm deep, offset 0.01 mm; the"
-        " curvature over the last 60 mm.",
+        "Far from skin and base and at small strain the path is a circle, κ = F/(EIβ), with the spring force reduced by"
+        " the lateral slide of the tip ([theory.md](theory.md) eq. 10). Needle with 1/β = 10 mm, depth 250 mm, offset"
+        " 0.01 mm; curvature over the last 60 mm.",
         table(
             (
                 "bevel length (mm)",
                 "κ (1/mm)",
-                *(f"error, points and segments of {r:g} mm" for r in problems.RESOLUTIONS),
+                *(f"error, spacing and segments of {r:g} mm" for r in problems.RESOLUTIONS),
             ),
             rows,
         ),
@@ -244,18 +247,18 @@ def energy(found: problems.Found) -> list[str]:
     gaps = [balance.gap for balance in found.balances[0.0]]
     return [
         "## Energy",
-        "Without cutting, nothing is lost: work of base and guide (forces by the trapezoid rule, 40 steps) and the"
-        " change of the stored energy, mJ, of a bent needle 28 mm deep that is moved where it is.",
-        table(("what moves", "work", "stored", "work/stored − 1"), moved),
+        "Without cutting, energy is conserved: work of base and guide (trapezoidal rule, 40 steps) and change of the"
+        " stored energy (mJ) for a bent needle at a depth of 28 mm that is moved without insertion.",
+        table(("motion", "work", "stored", "work/stored − 1"), moved),
         COMMAND,
-        "An insertion to 40 mm with guide motion and a flip: work of base, of guide and of the tissue on the bevel"
-        " (negative where the tip goes against its push), against what is stored in needle, tissue and guide and what"
-        " friction takes along the slide of the needle, mJ. The share of the work that is missing falls with the step,"
-        f" without friction with the power {power(problems.STEPS, gaps)}.",
+        "An insertion to 40 mm with guide motion and a flip: work of base, guide and the tissue on the bevel (negative"
+        " if the tip moves against its force), compared with the energy stored in needle, tissue and guide and the"
+        " energy dissipated by friction (mJ). The relative energy error decreases with the step, without friction with"
+        f" the power {power(problems.STEPS, gaps)}.",
         table(
             (
                 *("step (mm)", "friction (mN/mm)", "base", "guide", "bevel"),
-                *("needle", "tissue and guide", "friction", "missing share"),
+                *("needle", "tissue and guide", "friction", "relative error"),
             ),
             rows,
         ),
@@ -272,15 +275,15 @@ def solver(found: problems.Found) -> list[str]:
     orders = [power(problems.ELEMENTS, column) for column in found.second.T]
     return [
         "## A second solver",
-        "`Shooting` in `tests/reference/rods.py` integrates the continuous rod from the tip to the base, forces in"
-        " balance in place of a minimum of energy, and looks for the tip that brings the far end to the clamp. 48 steps"
-        " in all inputs, drawn back in between, two flips, two layers, varying stiffness, start error, bend and guide"
-        " clearance; largest differences of the tip on the way:",
+        "`Shooting` in `tests/reference/rods.py` integrates the continuous rod from the tip to the base, with"
+        " equilibrium of forces instead of minimal energy, and solves for the tip pose that satisfies the clamp"
+        " condition. The test has 48 steps of all inputs with a retraction, two flips, two layers, varying stiffness,"
+        " start errors, bend and guide clearance. Largest differences of the tip:",
         table(("segment (mm)", "x (mm)", "y (mm)", "θ (rad)"), [*rows, ("order", *orders)]),
-        "θ is of first order since the last segment has the slope half a segment before the tip and the needle's own"
-        f" bend goes on to its end: {small(found.second[2, 2])} rad with segments of 0.5 mm. With ten times the shipped"
-        f" friction the tips are {small(found.rubbed[0])} mm apart, {small(found.rubbed[1])} mm with half the step:"
-        " friction has the direction that the needle had before the step.",
+        "θ converges with first order, since the slope of the last segment is that half a segment before the tip and"
+        f" the natural bend extends to the tip: {small(found.second[2, 2])} rad with segments of 0.5 mm. With ten times"
+        f" the default friction the tips differ by {small(found.rubbed[0])} mm, and by {small(found.rubbed[1])} mm with"
+        " half the step: friction acts along the needle as it was before the step.",
         COMMAND,
     ]
 
@@ -293,7 +296,7 @@ def refinement(found: problems.Found) -> list[str]:
             f"`{key[name]}`",
             f"{size:g}",
             small(error),
-            "shipped" if size == problems.SHIPPED[name] else "",
+            "default" if size == problems.SHIPPED[name] else "",
         )
         for name, errors in found.refined.items()
         for size, error in zip(problems.SIZES[name].tolist(), errors, strict=False)
@@ -301,24 +304,24 @@ def refinement(found: problems.Found) -> list[str]:
     finest = ", ".join(f"{problems.SIZES[name][-1]:g}" for name in problems.SIZES)
     return [
         "## Refinement of an insertion",
-        "The tip after 44.5 mm with guide motion and a flip on the paper's phantom without imperfections: distance from"
-        f" the same with {finest} mm for element, step and spacing. Not smooth, since single channel points change"
-        " their segment or layer or are cut a step later.",
+        "Tip after 44.5 mm with guide motion and a flip in the paper's phantom without imperfections: distance from the"
+        f" result with {finest} mm for element, step and spacing. The errors are not smooth, since single channel"
+        " points change their segment or layer or are cut one step later.",
         table(("key of `[phantom]`", "mm", "distance (mm)", ""), rows),
         f"Orders: element {power(problems.SIZES['element'][:-1], found.refined['element'])}, step"
         f" {power(problems.SIZES['step'][:-1], found.refined['step'])}, spacing"
         f" {power(problems.SIZES['spacing'][:-1], found.refined['spacing'])}.",
-        "![Distance from the finest over element, step and spacing; distance from the second solver over the element]"
+        "![Error over element, step and spacing; difference from the second solver over the element length]"
         "(images/validation-insertion.png)",
         COMMAND,
     ]
 
 
-# --- pictures
+# --- figures
 
 
 def draw(found: problems.Found, folder: Path) -> list[Path]:
-    """The three pictures, PNG and SVG."""
+    """Draw the three figures as PNG and SVG."""
     paths = []
     for name, draw_one in (("needle", draw_needle), ("model", draw_model), ("insertion", draw_insertion)):
         with style.styled():
@@ -329,7 +332,7 @@ def draw(found: problems.Found, folder: Path) -> list[Path]:
 
 
 def logarithmic(figure: Any, left: float, title: str, x: str, y: str) -> Any:
-    """Axes for powers."""
+    """Return axes with logarithmic scales."""
     ax = style.axes(figure, left, 0.3, 3.55, 2.45)
     ax.set_xscale("log")
     ax.set_yscale("log")
@@ -341,7 +344,7 @@ def logarithmic(figure: Any, left: float, title: str, x: str, y: str) -> Any:
 
 
 def guide_line(ax: Any, x: Sequence[float], start: float, slope: float, label: str) -> None:
-    """A power through (x[0], start)."""
+    """Draw a power law through (x[0], start)."""
     ends = np.array([x[0], x[-1]])
     ax.plot(
         ends, start * (ends / ends[0]) ** slope, "--", color=style.QUIET, linewidth=1.0, label=label, zorder=1
@@ -351,14 +354,14 @@ def guide_line(ax: Any, x: Sequence[float], start: float, slope: float, label: s
 def series(
     ax: Any, k: int, x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray, label: str
 ) -> None:
-    """One of several lines."""
+    """Draw one of several lines."""
     ax.plot(x, y, MARKS[k] + "-", color=COLOURS[k], markersize=3.5, linewidth=1.1, label=label)
 
 
 def draw_needle(figure: Any, found: problems.Found) -> None:
-    """Bent cantilevers, and their errors."""
+    """Draw bent cantilevers and their errors."""
     ax = style.axes(figure, 0.6, 0.3, 3.6, 2.45)
-    errors = logarithmic(figure, 5.2, "Error of the tip", "segments", "distance over L")
+    errors = logarithmic(figure, 5.2, "Tip error", "number of segments", "tip error / L")
     for k, (load, nodes) in enumerate(found.shapes.items()):
         ax.plot(*nodes.T, color=COLOURS[k], label=f"PL²/EI = {load:g}")
         ax.plot(*elastica.cantilever(load)[:2], MARKS[k], color=style.INK, markersize=5, fillstyle="none")
@@ -367,7 +370,7 @@ def draw_needle(figure: Any, found: problems.Found) -> None:
     guide_line(errors, problems.SEGMENTS, 2.0 * distance[0], -2.0, "second order")
     errors.set_xticks(problems.SEGMENTS, [str(n) for n in problems.SEGMENTS])
     errors.minorticks_off()
-    ax.set_title("Cantilevers; marks: tips of the elastica")
+    ax.set_title("Cantilevers (markers: elastica)")
     ax.set_xlabel("x/L")
     ax.set_ylabel("y/L")
     ax.set_aspect("equal", adjustable="box")
@@ -376,7 +379,7 @@ def draw_needle(figure: Any, found: problems.Found) -> None:
 
 
 def draw_model(figure: Any, found: problems.Found) -> None:
-    """Distance of the formulations over the angle, one layer and two."""
+    """Draw the distance between the formulations over the slope, for one and two layers."""
     for panel, (layers, title) in enumerate({1: "Exact plant and model, one layer", 2: "Two layers"}.items()):
         ax = logarithmic(figure, 0.7 + 4.5 * panel, title, "largest slope of the tip (rad)", "")
         for k, (h, found_gaps) in enumerate(found.gaps[layers].items()):
@@ -388,22 +391,20 @@ def draw_model(figure: Any, found: problems.Found) -> None:
         ax.set_ylim(1e-6, 1.0)
         ax.set_xticks([0.005, 0.01, 0.02, 0.05, 0.1], ["0.005", "0.01", "0.02", "0.05", "0.1"])
         ax.minorticks_off()
-    figure.axes[0].set_ylabel("largest distance of the tips (mm)")
+    figure.axes[0].set_ylabel("largest distance between the tips (mm)")
     figure.axes[0].legend(loc="upper left")
 
 
 def draw_insertion(figure: Any, found: problems.Found) -> None:
-    """Refinement, and the second solver."""
-    ax = logarithmic(
-        figure, 0.8, "Refinement", "size over the shipped one", "distance of the tip from the finest (mm)"
-    )
+    """Draw the refinement and the comparison with the second solver."""
+    ax = logarithmic(figure, 0.8, "Refinement", "size / default size", "tip error against the finest (mm)")
     for k, (name, errors) in enumerate(found.refined.items()):
         shipped = problems.SHIPPED[name]
-        series(ax, k, problems.SIZES[name][:-1] / shipped, errors, f"{name} (shipped: {shipped:g} mm)")
+        series(ax, k, problems.SIZES[name][:-1] / shipped, errors, f"{name} (default: {shipped:g} mm)")
     first = found.refined["element"][0]
     guide_line(ax, (4.0, 0.25), 2.0 * first, 2.0, "second order")
     ax.set_xticks([0.25, 0.5, 1, 2, 4], ["¼", "½", "1", "2", "4"])
-    other = logarithmic(figure, 5.2, "Second solver", "segment (mm)", "largest difference of the tip")
+    other = logarithmic(figure, 5.2, "Second solver", "segment length (mm)", "largest tip difference")
     for k, name in enumerate(("x (mm)", "y (mm)", "θ (rad)")):
         series(other, k, problems.ELEMENTS, found.second[:, k], name)
     guide_line(other, problems.ELEMENTS, 2.0 * found.second[0, 1], 2.0, "second order")
@@ -414,7 +415,7 @@ def draw_insertion(figure: Any, found: problems.Found) -> None:
 
 
 def write(found: problems.Found, folder: Path) -> list[Path]:
-    """validation.md and images/ in the folder; returns the paths."""
+    """Write validation.md and images/ to the folder and return the paths."""
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
     page = folder / "validation.md"
@@ -423,7 +424,7 @@ def write(found: problems.Found, folder: Path) -> list[Path]:
 
 
 def main() -> None:
-    """Compute, print the summary, write."""
+    """Compute the results, print the summary and write the files."""
     parser = argparse.ArgumentParser(description="Validation of the exact plant.")
     parser.add_argument(
         "--out", type=Path, default=ROOT / "docs", metavar="DIR", help="folder of validation.md"
