@@ -82,7 +82,7 @@ def test_a_recording_prompts_at_each_point_and_prints_its_file(capsys, tmp_path,
         monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
         status, _, err = run(capsys, "em", "record", *arguments)
         assert status == 1
-        assert "point 1 of 2, repeat 1 of 1: move the stage to 0, 0, 0 mm; press Enter when there:\n" in err
+        assert "point 1 of 2, repeat 1 of 1: press Enter with the stage at 0, 0, 0 mm:\n" in err
         assert "\nflexneedle: end of input on stdin" in err, "on a separate line"
         status, printed, err = run(capsys, "em", "record", *arguments, "--dwell", "0")
     assert (status, printed) == (0, f"{out}\n")
@@ -191,7 +191,7 @@ def test_without_a_terminal_a_mismatch_is_refused_unless_forced(capsys, tmp_path
 def test_an_end_of_input_at_a_terminal_ends_the_line_of_the_prompt(capsys, tmp_path, monkeypatch):
     status, err, _ = record_moving(capsys, tmp_path, monkeypatch, Terminal())
     assert status == 1
-    assert "press Enter when there: \nflexneedle: end of input on stdin" in err
+    assert " mm: \nflexneedle: end of input on stdin" in err
 
 
 @pytest.mark.parametrize(

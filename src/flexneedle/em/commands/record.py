@@ -78,7 +78,7 @@ def _operator(grid: StageGrid, dwell: float | None, force: bool, wait: Callable[
     from flexneedle.em.recording.record import Operator
 
     def announce(stop: Stop) -> None:
-        _print(_target(grid, stop))
+        _print(f"{_progress(grid, stop)}: {_target(stop)}")
         wait(dwell or 0.0)
 
     motorised = dwell is not None
@@ -90,14 +90,19 @@ def _operator(grid: StageGrid, dwell: float | None, force: bool, wait: Callable[
     return replace(operator, accepts=_confirm) if not motorised and sys.stdin.isatty() else operator
 
 
-def _target(grid: StageGrid, stop: Stop) -> str:
+def _progress(grid: StageGrid, stop: Stop) -> str:
+    return f"point {stop.point_id} of {len(grid.points)}, repeat {stop.repeat} of {grid.file.repeats}"
+
+
+def _target(stop: Stop) -> str:
     x, y, z = stop.position
-    progress = f"point {stop.point_id} of {len(grid.points)}, repeat {stop.repeat} of {grid.file.repeats}"
-    return f"{progress}: move the stage to {x:g}, {y:g}, {z:g} mm"
+    return (
+        f"stage at {x:g}, {y:g}, {z:g} mm"  # read by scripts that move a stage, see docs/tracking/aurora.md
+    )
 
 
 def _ask(grid: StageGrid, stop: Stop) -> None:
-    _answer(f"{_target(grid, stop)}; press Enter when there:")
+    _answer(f"{_progress(grid, stop)}: press Enter with the {_target(stop)}:")
 
 
 def _confirm(mismatch: str) -> bool:
