@@ -1,0 +1,170 @@
+"""The examples of a Markdown page: its fenced blocks, run in order in one folder, and the outputs that it shows.
+
+A block of `python` is executed, one of `sh` or `bash` is run by the shell; a block of `text` that follows at once is
+what it prints. `title="NAME"` makes a block a file of that name instead. `no-run` keeps a block from being run, and is
+followed by the reason. A comment `<!-- run: COMMAND -->` runs a command that the page does not show.
+
+    python tests/docs/pages.py docs/tutorial.md      # writes the outputs that its examples print into the page
+"""
+
+import contextlib
+import io
+import math
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "decisions" not in p.parts)]
+SHELL = ("sh", "bash")
+
+_BLOCK = re.compile(r"^```(\w+)?([^\n]*)\n(.*?)^```$|^<!-- run: ([^\n]*) -->$", re.MULTILINE | re.DOTALL)
+_TITLE = re.compile(r'title="([^"]+)"')
+_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+_RELATIVE, _ABSOLUTE = 0.01, 0.002
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block: language, code, file name or "", reason why it is not run or "", and what it prints or None.
+
+    span: of the output in the page; line: of the block.
+    """
+
+    language: str
+    code: str
+    line: int
+    title: str = ""
+    skipped: str = ""
+    output: str | None = None
+    span: tuple[int, int] = (0, 0)
+
+    @property
+    def runs(self) -> bool:
+        """Whether the block is executed."""
+        return not self.title and not self.skipped and self.language in ("python", *SHELL)
+
+
+def blocks(page: str) -> list[Block]:
+    """Return the blocks of a page, each with the output that follows it."""
+    found = list(_BLOCK.finditer(page))
+    result = []
+    for match, after in zip(found, [*found[1:], None], strict=True):
+        line = page.count("\n", 0, match.start()) + 1
+        if match[4]:
+            result.append(Block("sh", match[4] + "\n", line))
+            continue
+        info = match[2]
+        title, reason = _TITLE.search(info), info.partition("no-run")[2].strip(" :")
+        shown = after is not None and after[1] == "text" and not page[match.end() : after.start()].strip()
+        result.append(
+            Block(
+                match[1] or "",
+                match[3],
+                line,
+                title=title[1] if title else "",
+                skipped=(reason or "no reason") if "no-run" in info else "",
+                output=after[3] if shown and after else None,
+                span=after.span(3) if shown and after else (0, 0),
+            )
+        )
+    return result
+
+
+def printed(page: list[Block], folder: Path) -> Iterator[tuple[Block, str]]:
+    """Run the blocks of a page in a folder, which is the current one; yield each with what it prints."""
+    names: dict[str, object] = {"__name__": "example"}
+    for block in page:
+        if block.title:
+            (folder / block.title).write_text(block.code, encoding="utf-8")
+    for block in page:
+        if block.runs:
+            yield block, _python(block, names) if block.language == "python" else _shell(block, folder)
+
+
+def _python(block: Block, names: dict[str, object]) -> str:
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        exec(compile("\n" * block.line + block.code, "page", "exec"), names)
+    return out.getvalue()
+
+
+def _shell(block: Block, folder: Path) -> str:
+    paths = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = {**os.environ, "PATH": paths, "COLUMNS": "100"}
+    line = ["bash", "-euo", "pipefail", "-c", block.code]
+    done = subprocess.run(line, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"line {block.line}: exit status {done.returncode}\n{block.code}{done.stderr}")
+    return done.stdout
+
+
+def same(shown: str, real: str) -> str:
+    """Return "" if a page shows what an example prints, else the first line that differs.
+
+    `…` in a line stands for any text, a line of it alone for any lines. Numbers may differ by 1 % or by 0.002, for
+    the last digits differ between processors.
+    """
+    lines = [line.rstrip() for line in real.rstrip("\n").splitlines()]
+    at = 0
+    wanted = shown.rstrip("\n").splitlines()
+    for number, line in enumerate(wanted):
+        if line.strip() == "…":
+            rest = wanted[number + 1 :]
+            at = len(lines) - len(rest)
+            continue
+        if at >= len(lines) or not _same_line(line.rstrip(), lines[at]):
+            return f"shown: {line}\nreal:  {lines[at] if at < len(lines) else '(nothing)'}"
+        at += 1
+    return "" if at == len(lines) else f"not shown: {lines[at]}"
+
+
+def _same_line(shown: str, real: str) -> bool:
+    pattern = _NUMBER.sub("\0", shown)
+    parts = [_literal(part) for part in pattern.split("…")]
+    found = re.fullmatch(".*".join(parts), real)
+    numbers = [float(number) for number in _NUMBER.findall(shown)]
+    return found is not None and all(
+        math.isclose(float(value), number, rel_tol=_RELATIVE, abs_tol=_ABSOLUTE)
+        for value, number in zip(found.groups(), numbers, strict=True)
+    )
+
+
+def _literal(text: str) -> str:
+    return re.sub(" +", " +", re.escape(text).replace(r"\ ", " ")).replace(re.escape("\0"), f"({_NUMBER.pattern})")
+
+
+def rewritten(page: str, folder: Path) -> str:
+    """Return the page with the outputs that its examples print, where they are not the same."""
+    changes = [
+        (block.span, _merged(block.output, real))
+        for block, real in printed(blocks(page), folder)
+        if block.output is not None and same(block.output, real)
+    ]
+    for (start, end), real in reversed(changes):
+        page = page[:start] + real + page[end:]
+    return page
+
+
+def _merged(shown: str, real: str) -> str:
+    """The real output, with the lines of the page that agree with it, `…` in them included."""
+    old, new = shown.splitlines(), [line.rstrip() for line in real.rstrip("\n").splitlines()]
+    pairs = zip(old, new, strict=True) if len(old) == len(new) else (("", line) for line in new)
+    return "".join(f"{kept if _same_line(kept, line) else line}\n" for kept, line in pairs)
+
+
+def main() -> None:
+    """Write the real outputs into the pages that are named."""
+    sys.path.insert(0, "")
+    for path in map(Path.absolute, map(Path, sys.argv[1:])):
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            path.write_text(rewritten(path.read_text(encoding="utf-8"), Path(folder)), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

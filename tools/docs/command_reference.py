@@ -1,0 +1,51 @@
+"""Writes docs/reference/commands.md: the help of every command.
+
+    python tools/docs/command_reference.py
+"""
+
+import argparse
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from flexneedle.cli.main import build_parser
+
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
+INTRODUCTION = """# Commands
+
+Results are written to stdout, progress and messages to stderr. The exit status is 0 when a command is done, 1 when it
+failed or an insertion ended more than 1 mm from its target, 2 for bad input and 130 after Ctrl-C.
+
+This page is generated from the commands (`make docs`).
+"""
+_COLUMNS = "90"
+
+
+def page() -> str:
+    """Return the page, Markdown."""
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = _COLUMNS
+    try:
+        sections = [_section(parser) for parser in parsers(build_parser())]
+    finally:
+        os.environ.pop("COLUMNS")
+        os.environ |= {} if before is None else {"COLUMNS": before}
+    return "\n".join([INTRODUCTION, *sections])
+
+
+def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """Yield a parser and those of its commands, in the order of the help."""
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for inner in action.choices.values():
+                yield from parsers(inner)
+
+
+def _section(parser: argparse.ArgumentParser) -> str:
+    level = "#" * min(3, 1 + len(parser.prog.split()))
+    return f"{level} {parser.prog}\n\n```text\n{parser.format_help().rstrip()}\n```\n"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

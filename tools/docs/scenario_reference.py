@@ -1,0 +1,166 @@
+"""Writes docs/reference/scenario.md from the JSON schema of scenarios and the advice in advice.toml.
+
+    python tools/docs/scenario_reference.py
+"""
+
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from flexneedle.control.methods import METHODS
+from flexneedle.control.tables import typed_scenario
+
+HERE = Path(__file__).parent
+PAGE = HERE.parents[1] / "docs" / "reference" / "scenario.md"
+ADVICE: dict[str, Any] = tomllib.loads((HERE / "advice.toml").read_text(encoding="utf-8"))
+
+# The longest ending that fits counts, so the order matters.
+_UNITS = {
+    "_mn_per_mm": "mN/mm", "_mrad_per_mm": "mrad/mm", "_mm_s": "mm/s", "_per_mm": "1/mm", "_per_mj": "1/mJ",
+    "_per_m": "1/m", "_kpa": "kPa", "_gpa": "GPa", "_mrad": "mrad", "_hz": "Hz", "_mm": "mm", "_s": "s",
+    "_periods": "periods",
+}  # fmt: skip
+_WITHOUT_ENDING = {"plan.deflection_weight": "1/mm²", "plan.guide_weight": "1/mm²"}
+_LARGEST = 1e6
+
+
+class Key(NamedTuple):
+    """A key of a section: dotted name, JSON schema, and whether a scenario must have it."""
+
+    name: str
+    schema: dict[str, Any]
+    required: bool
+
+
+class Table(NamedTuple):
+    """A section: dotted name, what it is, and its keys."""
+
+    name: str
+    about: str
+    keys: tuple[Key, ...]
+
+
+def schema() -> dict[str, Any]:
+    """Return the JSON schema of a scenario with the tables of all controllers, as `flexneedle scenario schema` does."""
+    return typed_scenario(tuple(METHODS.values())).model_json_schema()
+
+
+def tables(root: dict[str, Any]) -> Iterator[Table]:
+    """Yield the sections, each before those inside of it."""
+    yield from _tables("", root, root["$defs"])
+
+
+def unit(name: str) -> str:
+    """Return the unit of a key by its ending."""
+    ending = next((unit for ending, unit in _UNITS.items() if name.endswith(ending)), "–")
+    return _WITHOUT_ENDING.get(name, ending)
+
+
+def page() -> str:
+    """Return the page, Markdown."""
+    sections = "\n".join(_section(table) for table in tables(schema()))
+    return f"{ADVICE['introduction']}\n{sections}".rstrip() + "\n"
+
+
+def _tables(name: str, node: dict[str, Any], known: dict[str, Any]) -> Iterator[Table]:
+    keys, inner = [], []
+    for key, value in node["properties"].items():
+        full = f"{name}.{key}" if name else key
+        found = _table_of(value, known)
+        if found is None:
+            keys.append(Key(full, value, key in node.get("required", [])))
+        else:
+            inner.append((full, found))
+    yield Table(name, node.get("description", ""), tuple(keys))
+    for full, found in inner:
+        yield from _tables(full, found, known)
+
+
+def _table_of(value: dict[str, Any], known: dict[str, Any]) -> dict[str, Any] | None:
+    """The schema of the table that a key holds (a list of tables too), None if it holds a value."""
+    choices = [value, value.get("items", {}), *value.get("anyOf", [])]
+    names = [choice["$ref"].rsplit("/", 1)[1] for choice in choices if "$ref" in choice]
+    return known[names[0]] if names else None
+
+
+def _section(table: Table) -> str:
+    heading = f"[[{table.name}]]" if table.name == "tissue" else f"[{table.name}]"
+    advice = ADVICE["sections"].get(table.name, "")
+    lines = [f"## `{heading}`\n" if table.name else "## Top level\n"]
+    about = _about(table)
+    lines += [f"{text}\n" for text in (about, advice) if text]
+    if table.keys:
+        lines += ["| key | unit | default | allowed | meaning and choice |", "|---|---|---|---|---|"]
+        lines += [_row(key) for key in table.keys]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _about(table: Table) -> str:
+    """The docstring of the section without its opening, which repeats the name."""
+    if not table.name:
+        return ""
+    text = " ".join(table.about.split())
+    if not text.startswith(("Section `", "One `[[")):
+        return text
+    rest = text.split("`", 2)[2].lstrip(":. ")
+    return rest[:1].upper() + rest[1:]
+
+
+def _row(key: Key) -> str:
+    meaning = " ".join(key.schema.get("description", "").split())
+    choice = ADVICE["keys"].get(key.name)
+    text = f"{meaning} *Choose:* {choice}" if choice else meaning
+    short = key.name.rsplit(".", 1)[-1]
+    cells = (f"`{short}`", unit(key.name), _default(key), allowed(key.schema), text)
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def _default(key: Key) -> str:
+    if key.required:
+        return "required"
+    value = key.schema.get("default")
+    return "not set" if value is None else f"`{_toml(value)}`"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return f'"{value}"' if isinstance(value, str) else f"{value:.12g}"
+
+
+def allowed(node: dict[str, Any]) -> str:
+    """Return which values a schema allows, in a few words."""
+    node = next((one for one in node.get("anyOf", [node]) if one.get("type") != "null"), node)
+    match node.get("type"):
+        case "array" if "prefixItems" in node:
+            return f"{len(node['prefixItems'])} numbers, {allowed(node['prefixItems'][0])}"
+        case "array":
+            return f"a list, at least {node.get('minItems', 1)} items"
+        case "boolean":
+            return "`true`, `false`"
+        case "string":
+            return ", ".join(f"`{name}`" for name in node["enum"]) if "enum" in node else "text in one line"
+        case "integer":
+            return f"whole, {_bounds(node)}"
+        case _:
+            return _bounds(node)
+
+
+def _bounds(node: dict[str, Any]) -> str:
+    low, above = node.get("minimum"), node.get("exclusiveMinimum")
+    high, below = node.get("maximum"), node.get("exclusiveMaximum")
+    if high is not None and high >= _LARGEST:
+        high = None
+    least = f"at least {low:g}" if low is not None and low > -_LARGEST else ""
+    least = f"above {above:g}" if above is not None else least
+    most = f"at most {high:,.12g}" if high is not None else ""
+    most = f"below {below:g}" if below is not None else most
+    return ", ".join(filter(None, (least, most))) or "any number"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
