@@ -110,18 +110,18 @@ def same(shown: str, real: str) -> str:
     `…` in a line stands for any text, a line of it alone for any lines. Numbers may differ by 1 % or by 0.002, for
     the last digits differ between processors.
     """
-    lines = [line.rstrip() for line in real.rstrip("\n").splitlines()]
-    at = 0
-    wanted = shown.rstrip("\n").splitlines()
+    wanted, got = (text.rstrip("\n").splitlines() for text in (shown, real))
+    return _difference([line.rstrip() for line in wanted], [line.rstrip() for line in got])
+
+
+def _difference(wanted: list[str], got: list[str]) -> str:
     for number, line in enumerate(wanted):
         if line.strip() == "…":
-            rest = wanted[number + 1 :]
-            at = len(lines) - len(rest)
-            continue
-        if at >= len(lines) or not _same_line(line.rstrip(), lines[at]):
-            return f"shown: {line}\nreal:  {lines[at] if at < len(lines) else '(nothing)'}"
-        at += 1
-    return "" if at == len(lines) else f"not shown: {lines[at]}"
+            rest = [_difference(wanted[number + 1 :], got[k:]) for k in range(number, len(got) + 1)]
+            return "" if "" in rest else rest[-1]
+        if number == len(got) or not _same_line(line, got[number]):
+            return f"shown: {line}\nreal:  {got[number] if number < len(got) else '(nothing)'}"
+    return "" if len(wanted) == len(got) else f"not shown: {got[len(wanted)]}"
 
 
 def _same_line(shown: str, real: str) -> bool:
