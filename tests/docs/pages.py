@@ -1,8 +1,8 @@
 """The examples of a Markdown page: its fenced blocks, run in order in one folder, and the outputs that it shows.
 
 A block of `python` is executed, one of `sh` or `bash` is run by the shell; a block of `text` that follows at once is
-what it prints. `title="NAME"` makes a block a file of that name instead. `no-run` keeps a block from being run, and is
-followed by the reason. A comment `<!-- run: COMMAND -->` runs a command that the page does not show.
+what it prints. `title="NAME"` makes a block a file of that name instead. A comment `<!-- no-run: REASON -->` in the line
+above a block keeps it from being run, and `<!-- run: COMMAND -->` runs a command that the page does not show.
 
     python tests/docs/pages.py docs/tutorial.md      # writes the outputs that its examples print into the page
 """
@@ -16,14 +16,18 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "decisions" not in p.parts)]
 SHELL = ("sh", "bash")
 
-_BLOCK = re.compile(r"^```(\w+)?([^\n]*)\n(.*?)^```$|^<!-- run: ([^\n]*) -->$", re.MULTILINE | re.DOTALL)
+_BLOCK = re.compile(
+    r"(?:^<!-- no-run: (?P<reason>[^\n]+) -->\n)?^```(?P<language>\w*)(?P<info>[^\n]*)\n(?P<code>.*?)^```$"
+    r"|^<!-- run: (?P<command>[^\n]+) -->$",
+    re.MULTILINE | re.DOTALL,
+)
 _TITLE = re.compile(r'title="([^"]+)"')
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _RELATIVE, _ABSOLUTE = 0.01, 0.002
@@ -56,23 +60,14 @@ def blocks(page: str) -> list[Block]:
     result = []
     for match, after in zip(found, [*found[1:], None], strict=True):
         line = page.count("\n", 0, match.start()) + 1
-        if match[4]:
-            result.append(Block("sh", match[4] + "\n", line))
+        if match["command"]:
+            result.append(Block("sh", match["command"] + "\n", line))
             continue
-        info = match[2]
-        title, reason = _TITLE.search(info), info.partition("no-run")[2].strip(" :")
-        shown = after is not None and after[1] == "text" and not page[match.end() : after.start()].strip()
-        result.append(
-            Block(
-                match[1] or "",
-                match[3],
-                line,
-                title=title[1] if title else "",
-                skipped=(reason or "no reason") if "no-run" in info else "",
-                output=after[3] if shown and after else None,
-                span=after.span(3) if shown and after else (0, 0),
-            )
-        )
+        title = _TITLE.search(match["info"])
+        block = Block(match["language"], match["code"], line, title[1] if title else "", match["reason"] or "")
+        if after and after["language"] == "text" and not page[match.end() : after.start()].strip():
+            block = replace(block, output=after["code"], span=after.span("code"))
+        result.append(block)
     return result
 
 

@@ -91,9 +91,10 @@ def _section(table: Table) -> str:
     about = _about(table)
     lines += [f"{text}\n" for text in (about, advice) if text]
     if table.keys:
+        lines.append('<div class="scenario" markdown>\n')
         lines += ["| key | unit | default | allowed | meaning and choice |", "|---|---|---|---|---|"]
         lines += [_row(key) for key in table.keys]
-        lines.append("")
+        lines.append("\n</div>\n")
     return "\n".join(lines)
 
 
