@@ -13,7 +13,7 @@ import flexneedle
 from flexneedle.scenario.files import dump_scenario
 
 DOCS = (Path(__file__).parents[1] / "docs" / "extend.md").read_text(encoding="utf-8")
-MODULES = dict(re.findall(r"^`(\w+)\.py`:\n\n```python\n(.*?)```", DOCS, re.MULTILINE | re.DOTALL))
+MODULES = dict(re.findall(r"^```python title=\"(\w+)\.py\"\n(.*?)```", DOCS, re.MULTILINE | re.DOTALL))
 PARTS = {"controller": "follow_path:METHOD", "phantom": "unicycle:Unicycle", "tracker": "camera:Camera"}
 QUICK = {
     "plan.samples": 16, "plan.iterations": 2, "setup.tip_to_skin_mm": 4.0, "target.depth_mm": 8.0,

@@ -4,7 +4,7 @@ A block of `python` is executed, one of `sh` or `bash` is run by the shell; a bl
 what it prints. `title="NAME"` makes a block a file of that name instead. A comment `<!-- no-run: REASON -->` in the line
 above a block keeps it from being run, and `<!-- run: COMMAND -->` runs a command that the page does not show.
 
-    python tests/docs/pages.py docs/tutorial.md      # writes the outputs that its examples print into the page
+    python tests/markdown_examples.py docs/tutorial.md      # writes the outputs that its examples print into the page
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "decisions" not in p.parts)]
 SHELL = ("sh", "bash")
 

@@ -1,0 +1,147 @@
+"""Every example of README.md and docs/ runs, and prints what the page shows."""
+
+import os
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from flexneedle.cli.main import build_parser
+from markdown_examples import PAGES, ROOT, blocks, printed, same
+
+# Pages that take more than about 5 s.
+LONG = {
+    "README.md", "choose-values.md", "controllers.md", "extend.md", "index.md", "needle-and-tissue.md", "results.md",
+    "studies.md", "targets.md", "tutorial.md",
+}  # fmt: skip
+TEXTS = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in PAGES}
+BLOCKS = {name: blocks(text) for name, text in TEXTS.items()}
+EXAMPLES = [name for name, found in BLOCKS.items() if any(block.runs for block in found)]
+_COMMAND = re.compile(r"^ {4,}(flexneedle .*)$|^(flexneedle .*)$", re.MULTILINE)
+
+
+def marked(name: str) -> object:
+    return pytest.param(name, marks=[pytest.mark.long] if Path(name).name in LONG else [], id=name)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty folder, which is the current one, and from which modules are imported."""
+    before = set(sys.modules)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    yield tmp_path
+    for name in set(sys.modules) - before:
+        if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
+            del sys.modules[name]
+
+
+@pytest.mark.parametrize("name", [marked(name) for name in EXAMPLES])
+def test_examples_run_and_print_what_the_page_shows(name, folder):
+    differences = [
+        f"{name}, line {block.line}\n{difference}"
+        for block, real in printed(BLOCKS[name], folder)
+        if block.output is not None and (difference := same(block.output, real))
+    ]
+    assert not differences, "\n".join(differences)
+
+
+def commands() -> list[tuple[str, str]]:
+    """All command lines of the pages, indented or in a block, without redirections, comments and what is piped."""
+    return [
+        (name, re.split(r" [|>&<]| 2>|\s#", line)[0])
+        for name, text in TEXTS.items()
+        for found in _COMMAND.finditer(text)
+        for line in [found[1] or found[2]]
+        if name != "docs/reference/commands.md"
+    ]
+
+
+def test_every_command_is_one():
+    failures = []
+    for name, line in commands():
+        try:
+            build_parser().parse_args(shlex.split(line.replace("…", "x"))[1:])
+        except SystemExit as error:
+            failures += [f"{name}: {line}"] if error.code else []
+    assert len(commands()) > 60
+    assert failures == []
+
+
+def test_every_make_target_is_one():
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    named = {
+        target
+        for text in TEXTS.values()
+        for target in re.findall(r"(?:^ {4}|`)make ([a-z-]+)", text, re.MULTILINE)
+    }
+    assert len(named) > 8
+    assert named <= targets
+
+
+def test_few_blocks_are_not_run_and_each_has_a_reason():
+    skipped = [(name, b.skipped) for name, found in BLOCKS.items() for b in found if b.skipped]
+    assert {reason for _, reason in skipped} <= {
+        "installs into an environment of yours",
+        "needs an Aurora",
+        "runs until Ctrl-C",
+        "tests/rig/devices/test_docs.py runs it",
+    }
+    assert len(skipped) < 12
+
+
+def test_the_links_of_the_readme_exist():
+    targets = re.findall(r"\]\((?!https?:)([^)#]+)\)", TEXTS["README.md"])
+    assert targets
+    assert [target for target in targets if not (ROOT / target).exists()] == []
+
+
+@pytest.mark.parametrize(
+    ("shown", "real"),
+    [
+        ("error 0.123 mm", "error 0.124 mm"),
+        ("a  b", "a b"),
+        ("time … s", "time 3.2 s"),
+        ("first\n…\nlast", "first\n1\n2\nlast"),
+        ("…\nmiddle\n…", "1\nmiddle\n2\n3"),
+    ],
+)
+def test_outputs_agree_up_to_last_digits_spaces_and_what_is_left_out(shown, real):
+    assert same(shown, real) == ""
+
+
+@pytest.mark.parametrize(
+    ("shown", "real"),
+    [
+        ("error 0.123 mm", "error 0.133 mm"),
+        ("error 12 mm", "error -12 mm"),
+        ("done", "held"),
+        ("first", "first\nsecond"),
+        ("first\nsecond", "first"),
+        ("first\n…\nlast", "first\nlast\nmore"),
+    ],
+)
+def test_outputs_differ_in_a_number_a_word_or_a_line(shown, real):
+    assert same(shown, real) != ""
+
+
+def test_a_block_has_its_file_its_output_or_the_reason_not_to_run():
+    page = (
+        '```python title="a.py"\nx = 1\n```\n\n```sh\necho 1\n```\n\n```text\n1\n```\n'
+        "<!-- no-run: no device -->\n```sh\nread\n```\n\n<!-- run: true -->\n```toml\na = 1\n```\n"
+    )
+    module, shown, text, skipped, hidden, table = blocks(page)
+    assert (module.title, module.runs) == ("a.py", False)
+    assert (shown.output, shown.runs, text.runs) == ("1\n", True, False)
+    assert (skipped.skipped, skipped.runs) == ("no device", False)
+    assert (hidden.code, hidden.runs, table.runs) == ("true\n", True, False)
+
+
+def test_a_command_that_fails_is_an_error(folder):
+    (block,) = blocks("```sh\nfalse\n```\n")
+    with pytest.raises(RuntimeError, match="exit status 1"):
+        list(printed([block], folder))
+    assert os.getcwd() == str(folder)  # noqa: PTH109 - where the page runs

@@ -1,0 +1,114 @@
+"""The generated pages are up to date, and the site builds without a warning and needs no network."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+
+import pytest
+
+import command_reference
+import flexneedle
+import math_fence
+import scenario_reference
+from flexneedle.scenario.files import load_scenario
+from markdown_examples import ROOT
+
+DOCS = ROOT / "docs"
+SITE = tomllib.loads((ROOT / "zensical.toml").read_text(encoding="utf-8"))["project"]
+
+
+def entries(nav: object) -> Iterator[str]:
+    """The pages of a navigation."""
+    for item in nav:
+        for value in item.values():
+            yield from [value] if isinstance(value, str) else entries(value)
+
+
+def test_the_scenario_reference_is_that_of_the_schema():
+    assert scenario_reference.PAGE.read_text(encoding="utf-8") == scenario_reference.page(), "make docs"
+
+
+def test_the_command_reference_is_the_help():
+    assert command_reference.PAGE.read_text(encoding="utf-8") == command_reference.page(), "make docs"
+
+
+def test_advice_is_for_keys_that_exist_and_covers_every_section():
+    tables = list(scenario_reference.tables(scenario_reference.schema()))
+    keys = {key.name for table in tables for key in table.keys}
+    known = keys | {table.name for table in tables}
+    assert set(scenario_reference.ADVICE["keys"]) <= known
+    assert set(scenario_reference.ADVICE["sections"]) == {table.name for table in tables if table.name}
+    written = {re.sub(r"^tissue\.0\.", "tissue.", key) for key in load_scenario("phantom").flat()}
+    assert written <= keys
+
+
+@pytest.mark.parametrize(
+    ("key", "unit"),
+    [
+        ("needle.youngs_modulus_gpa", "GPa"),
+        ("setup.insertion_speed_mm_s", "mm/s"),
+        ("phantom.friction_mn_per_mm", "mN/mm"),
+        ("tracker.environment.tilt_mrad_per_mm", "mrad/mm"),
+        ("control.ce_mpc.curvature_per_m", "1/m"),
+        ("monitor.abort_after_s", "s"),
+        ("tissue.alpha", "–"),
+    ],
+)
+def test_the_unit_of_a_key_is_its_ending(key, unit):
+    assert scenario_reference.unit(key) == unit
+
+
+def test_every_public_name_is_in_the_python_reference():
+    text = (DOCS / "reference" / "api.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^::: flexneedle\.(\w+)$", text, re.MULTILINE)
+    assert sorted(listed) == sorted(set(flexneedle.__all__) - {"__version__"})
+
+
+def test_every_page_is_in_the_navigation():
+    pages = {str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md")}
+    assert sorted(entries(SITE["nav"])) == sorted(pages)
+
+
+def test_a_formula_is_drawn_with_its_number():
+    html = math_fence.svg("a < \\frac{1}{2} \\tag{7}\n", "math", "math")
+    assert html.startswith('<div class="math" role="img" aria-label="a &lt; \\frac{1}{2}"><svg')
+    assert html.endswith('</svg><span class="number">(7)</span></div>')
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The built site, from a copy of what it is made of."""
+    root = tmp_path_factory.mktemp("site")
+    for name in ("docs", "src", "tools"):
+        shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "zensical.toml", root)
+    line = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
+    paths = os.pathsep.join((str(root / "tools/docs"), str(root / "src")))
+    environment = {**os.environ, "PYTHONPATH": paths}
+    done = subprocess.run(line, cwd=root, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return root / "site"
+
+
+@pytest.mark.long
+def test_the_site_builds_strictly_and_loads_nothing_from_elsewhere(site):
+    pages = {path: path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
+    loads = re.compile(r'<(?:script|img|iframe|source)[^>]*\ssrc="https?:|<link[^>]*\shref="https?:[^>]*stylesheet')
+    styles = [path.read_text(encoding="utf-8") for path in site.rglob("*.css")]
+    assert len(pages) > 30
+    assert [path.name for path, text in pages.items() if loads.search(text)] == []
+    assert [text[:80] for text in styles if re.search(r"url\(['\"]?https?:|@import", text)] == []
+    assert [path.name for path, text in pages.items() if "```" in text] == [], "a block that is none"
+
+
+@pytest.mark.long
+def test_formulas_and_signatures_are_on_the_pages(site):
+    theory = (site / "theory.html").read_text(encoding="utf-8")
+    numbers = re.findall(r'<span class="number">\((\d+)\)</span>', theory)
+    assert sorted(map(int, numbers)) == list(range(1, 19))
+    api = (site / "reference" / "api.html").read_text(encoding="utf-8")
+    assert all(f'id="flexneedle.{name}"' in api for name in flexneedle.__all__ if name != "__version__")
