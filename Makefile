@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all slow bench robustness validation accuracy controllers studies tracker steering worlds tuning lint clean
+.PHONY: help setup demo test test-all slow bench robustness validation accuracy controllers studies tracker steering worlds tuning docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -86,6 +86,11 @@ tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedl
 slow: setup  ## the long tests: a thousand insertions against the reference
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
 
+docs: setup  ## build the documentation site into site/; warnings are errors
+	$(BIN)/python tools/docs/scenario_reference.py
+	$(BIN)/python tools/docs/command_reference.py
+	PYTHONPATH=tools/docs $(BIN)/zensical build --strict --clean
+
 lint: setup  ## style, types, layers
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -93,4 +98,4 @@ lint: setup  ## style, types, layers
 	$(BIN)/lint-imports
 
 clean:  ## remove what make and the tools made
-	rm -rf .venv dist build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf .venv dist build site .cache .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

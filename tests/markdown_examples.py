@@ -17,6 +17,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -58,7 +59,7 @@ def blocks(page: str) -> list[Block]:
     """Return the blocks of a page, each with the output that follows it."""
     found = list(_BLOCK.finditer(page))
     result = []
-    for match, after in zip(found, [*found[1:], None], strict=True):
+    for match, after in zip_longest(found, found[1:]):
         line = page.count("\n", 0, match.start()) + 1
         if match["command"]:
             result.append(Block("sh", match["command"] + "\n", line))

@@ -9,17 +9,13 @@ from pathlib import Path
 import pytest
 
 from flexneedle.cli.main import build_parser
-from markdown_examples import PAGES, ROOT, blocks, printed, same
+from markdown_examples import PAGES, ROOT, SHELL, blocks, printed, same
 
 # Pages that take more than about 5 s.
-LONG = {
-    "README.md", "choose-values.md", "controllers.md", "extend.md", "index.md", "needle-and-tissue.md", "results.md",
-    "studies.md", "targets.md", "tutorial.md",
-}  # fmt: skip
+LONG = {"controllers.md", "index.md", "needle-and-tissue.md", "results.md", "studies.md", "targets.md", "tutorial.md"}
 TEXTS = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in PAGES}
 BLOCKS = {name: blocks(text) for name, text in TEXTS.items()}
 EXAMPLES = [name for name, found in BLOCKS.items() if any(block.runs for block in found)]
-_COMMAND = re.compile(r"^ {4,}(flexneedle .*)$|^(flexneedle .*)$", re.MULTILINE)
 
 
 def marked(name: str) -> object:
@@ -51,12 +47,13 @@ def test_examples_run_and_print_what_the_page_shows(name, folder):
 
 def commands() -> list[tuple[str, str]]:
     """All command lines of the pages, indented or in a block, without redirections, comments and what is piped."""
+    shell = [(name, b.code) for name, found in BLOCKS.items() for b in found if b.language in SHELL]
+    indented = [(name, line) for name, text in TEXTS.items() for line in re.findall(r"^ {4}\S.*$", text, re.MULTILINE)]
     return [
-        (name, re.split(r" [|>&<]| 2>|\s#", line)[0])
-        for name, text in TEXTS.items()
-        for found in _COMMAND.finditer(text)
-        for line in [found[1] or found[2]]
-        if name != "docs/reference/commands.md"
+        (name, re.split(r" [|>&<]| 2>|\s#", line.strip())[0])
+        for name, code in (*shell, *indented)
+        for line in code.splitlines()
+        if line.strip().startswith("flexneedle ")
     ]
 
 

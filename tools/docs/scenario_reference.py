@@ -34,10 +34,11 @@ class Key(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A section: dotted name, what it is, and its keys."""
+    """A section: dotted name, what it is, what its key is in the section above, and its keys."""
 
     name: str
     about: str
+    key: str
     keys: tuple[Key, ...]
 
 
@@ -48,7 +49,7 @@ def schema() -> dict[str, Any]:
 
 def tables(root: dict[str, Any]) -> Iterator[Table]:
     """Yield the sections, each before those inside of it."""
-    yield from _tables("", root, root["$defs"])
+    yield from _tables("", "", root, root["$defs"])
 
 
 def unit(name: str) -> str:
@@ -63,18 +64,18 @@ def page() -> str:
     return f"{ADVICE['introduction']}\n{sections}".rstrip() + "\n"
 
 
-def _tables(name: str, node: dict[str, Any], known: dict[str, Any]) -> Iterator[Table]:
+def _tables(name: str, key: str, node: dict[str, Any], known: dict[str, Any]) -> Iterator[Table]:
     keys, inner = [], []
-    for key, value in node["properties"].items():
-        full = f"{name}.{key}" if name else key
+    for short, value in node["properties"].items():
+        full = f"{name}.{short}" if name else short
         found = _table_of(value, known)
         if found is None:
-            keys.append(Key(full, value, key in node.get("required", [])))
+            keys.append(Key(full, value, short in node.get("required", [])))
         else:
-            inner.append((full, found))
-    yield Table(name, node.get("description", ""), tuple(keys))
-    for full, found in inner:
-        yield from _tables(full, found, known)
+            inner.append((full, value.get("description", ""), found))
+    yield Table(name, node.get("description", ""), key, tuple(keys))
+    for full, described, found in inner:
+        yield from _tables(full, described, found, known)
 
 
 def _table_of(value: dict[str, Any], known: dict[str, Any]) -> dict[str, Any] | None:
@@ -88,8 +89,7 @@ def _section(table: Table) -> str:
     heading = f"[[{table.name}]]" if table.name == "tissue" else f"[{table.name}]"
     advice = ADVICE["sections"].get(table.name, "")
     lines = [f"## `{heading}`\n" if table.name else "## Top level\n"]
-    about = _about(table)
-    lines += [f"{text}\n" for text in (about, advice) if text]
+    lines += [f"{' '.join(text.split())}\n" for text in (_about(table), table.key, advice) if text]
     if table.keys:
         lines.append('<div class="scenario" markdown>\n')
         lines += ["| key | unit | default | allowed | meaning and choice |", "|---|---|---|---|---|"]
