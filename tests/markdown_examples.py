@@ -1,8 +1,8 @@
 """The examples of a Markdown page: its fenced blocks, run in order in one folder, and the outputs that it shows.
 
 A block of `python` is executed, one of `sh` or `bash` is run by the shell; a block of `text` that follows at once is
-what it prints. `title="NAME"` makes a block a file of that name instead. A comment `<!-- no-run: REASON -->` in the line
-above a block keeps it from being run, and `<!-- run: COMMAND -->` runs a command that the page does not show.
+what it prints. `title="NAME"` makes a block a file of that name instead. A comment `<!-- no-run: REASON -->` in the
+line above a block keeps it from being run, and `<!-- run: COMMAND -->` runs a command that the page does not show.
 
     python tests/markdown_examples.py docs/tutorial.md      # writes the outputs that its examples print into the page
 """
@@ -65,7 +65,9 @@ def blocks(page: str) -> list[Block]:
             result.append(Block("sh", match["command"] + "\n", line))
             continue
         title = _TITLE.search(match["info"])
-        block = Block(match["language"], match["code"], line, title[1] if title else "", match["reason"] or "")
+        block = Block(
+            match["language"], match["code"], line, title[1] if title else "", match["reason"] or ""
+        )
         if after and after["language"] == "text" and not page[match.end() : after.start()].strip():
             block = replace(block, output=after["code"], span=after.span("code"))
         result.append(block)
@@ -132,7 +134,9 @@ def _same_line(shown: str, real: str) -> bool:
 
 
 def _literal(text: str) -> str:
-    return re.sub(" +", " +", re.escape(text).replace(r"\ ", " ")).replace(re.escape("\0"), f"({_NUMBER.pattern})")
+    return re.sub(" +", " +", re.escape(text).replace(r"\ ", " ")).replace(
+        re.escape("\0"), f"({_NUMBER.pattern})"
+    )
 
 
 def rewritten(page: str, folder: Path) -> str:

@@ -12,7 +12,15 @@ from flexneedle.cli.main import build_parser
 from markdown_examples import PAGES, ROOT, SHELL, blocks, printed, same
 
 # Pages that take more than about 5 s.
-LONG = {"controllers.md", "index.md", "needle-and-tissue.md", "results.md", "studies.md", "targets.md", "tutorial.md"}
+LONG = {
+    "controllers.md",
+    "index.md",
+    "needle-and-tissue.md",
+    "results.md",
+    "studies.md",
+    "targets.md",
+    "tutorial.md",
+}
 TEXTS = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in PAGES}
 BLOCKS = {name: blocks(text) for name, text in TEXTS.items()}
 EXAMPLES = [name for name, found in BLOCKS.items() if any(block.runs for block in found)]
@@ -48,7 +56,9 @@ def test_examples_run_and_print_what_the_page_shows(name, folder):
 def commands() -> list[tuple[str, str]]:
     """All command lines of the pages, indented or in a block, without redirections, comments and what is piped."""
     shell = [(name, b.code) for name, found in BLOCKS.items() for b in found if b.language in SHELL]
-    indented = [(name, line) for name, text in TEXTS.items() for line in re.findall(r"^ {4}\S.*$", text, re.MULTILINE)]
+    indented = [
+        (name, line) for name, text in TEXTS.items() for line in re.findall(r"^ {4}\S.*$", text, re.MULTILINE)
+    ]
     return [
         (name, re.split(r" [|>&<]| 2>|\s#", line.strip())[0])
         for name, code in (*shell, *indented)

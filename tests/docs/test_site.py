@@ -96,7 +96,9 @@ def site(tmp_path_factory):
 @pytest.mark.long
 def test_the_site_builds_strictly_and_loads_nothing_from_elsewhere(site):
     pages = {path: path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
-    loads = re.compile(r'<(?:script|img|iframe|source)[^>]*\ssrc="https?:|<link[^>]*\shref="https?:[^>]*stylesheet')
+    loads = re.compile(
+        r'<(?:script|img|iframe|source)[^>]*\ssrc="https?:|<link[^>]*\shref="https?:[^>]*stylesheet'
+    )
     styles = [path.read_text(encoding="utf-8") for path in site.rglob("*.css")]
     assert len(pages) > 30
     assert [path.name for path, text in pages.items() if loads.search(text)] == []

@@ -1,6 +1,6 @@
 """Writes docs/reference/commands.md: the help of every command.
 
-    python tools/docs/command_reference.py
+python tools/docs/command_reference.py
 """
 
 import argparse

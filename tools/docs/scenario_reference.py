@@ -1,6 +1,6 @@
 """Writes docs/reference/scenario.md from the JSON schema of scenarios and the advice in advice.toml.
 
-    python tools/docs/scenario_reference.py
+python tools/docs/scenario_reference.py
 """
 
 import tomllib
