@@ -13,7 +13,8 @@ from flexneedle.study import rows
 from flexneedle.study.grid import load_study
 from flexneedle.study.journal import Journal
 from flexneedle.study.plans import Plans, plan_key
-from flexneedle.study.rows import RESULTS, Job, carry_out, make_plan
+from flexneedle.study.rows import Job, carry_out, make_plan
+from flexneedle.trace.results import RESULT_COLUMNS
 from flexneedle.types import Verdict, VerdictKind
 
 
@@ -168,7 +169,7 @@ def test_a_file_in_place_of_the_plans_is_named_before_any_plan_is_made(tmp_path)
         Plans(tmp_path / "plans")
 
 
-UNKNOWN = dict.fromkeys(RESULTS) | {"warning": "", "outcome": "held", "reason": ""}
+UNKNOWN = dict.fromkeys(RESULT_COLUMNS) | {"warning": "", "outcome": "held", "reason": ""}
 ROWS = [
     UNKNOWN | {"index": 4, "true_error_mm": 0.1 + 0.2, "tip_x_mm": 5e-324, "total_s": 1.5},
     UNKNOWN | {"index": 1, "tip_y_mm": -0.0, "tip_x_mm": 1e308, "flips": 3, "reason": "µ\n"},

@@ -11,10 +11,11 @@ from flexneedle.scenario.worlds import CASES, world
 from flexneedle.study import rows
 from flexneedle.study.grid import load_study
 from flexneedle.study.plans import Plans, plan_key, truth_key
-from flexneedle.study.rows import RESULTS, Job, carry_out
+from flexneedle.study.rows import Job, carry_out
 from flexneedle.study.runner import _bounding
 from flexneedle.study.summary import is_failure
 from flexneedle.study.tables import write_tables
+from flexneedle.trace.results import RESULT_COLUMNS
 from synthetic import make_insertion
 
 FREE, GUIDED = 15, 3  # worlds without and with a guide
@@ -171,7 +172,7 @@ def test_a_reach_that_fails_is_told_in_the_row_and_the_insertion_stands(load, mo
 def test_the_table_has_the_reach_in_every_row_of_the_same_truth(load, tmp_path):
     """Whichever controller's insertion has found it; unknown where none has yet."""
     study = load()
-    empty = {**dict.fromkeys(RESULTS), "outcome": "done", "reason": ""}
+    empty = {**dict.fromkeys(RESULT_COLUMNS), "outcome": "done", "reason": ""}
     found = {
         index: {**empty, "index": index, "reach_mm": 0.1 * index if index in _bounding_rows(study) else None}
         for index in range(len(study) - 2)

@@ -11,9 +11,11 @@ from typing import Any, Self
 
 from flexneedle.errors import InputError
 from flexneedle.scenario.problems import Problem, to_line
-from flexneedle.study.rows import RESULTS, TIMES
+from flexneedle.study.rows import TIMES
 from flexneedle.trace.files import uninterrupted
+from flexneedle.trace.results import RESULT_COLUMNS
 
+_KINDS = {name: column.kind for name, column in RESULT_COLUMNS.items()} | TIMES
 _LARGEST = {int: 2**63 - 1, float: sys.float_info.max}  # of a column
 
 
@@ -87,11 +89,10 @@ def _fault(row: Any, size: int) -> str | None:
     index = row.get("index")
     if not (isinstance(index, int) and _fits(index, int) and 0 <= index < size):
         return to_line(Problem("index", index, f"must be a whole number from 0 to {size - 1}"))
-    missing = next((name for name in RESULTS if name not in row), None)
+    missing = next((name for name in RESULT_COLUMNS if name not in row), None)
     if missing is not None:
         return f"{missing}: missing"
-    kinds = (RESULTS | TIMES).items()
-    wrong = next((name for name, kind in kinds if not _fits(row.get(name), kind)), None)
+    wrong = next((name for name, kind in _KINDS.items() if not _fits(row.get(name), kind)), None)
     return None if wrong is None else to_line(Problem(wrong, row[wrong], "of a wrong type, or too large"))
 
 

@@ -7,7 +7,6 @@ import time
 import warnings
 from dataclasses import dataclass, field
 from functools import cache
-from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -19,41 +18,9 @@ from flexneedle.study.grid import GridPoint
 from flexneedle.study.reach import reach
 from flexneedle.trace.folder import versions
 from flexneedle.trace.plain import plain, plan_values
+from flexneedle.trace.results import RESULT_COLUMNS, insertion_row, plan_row
 from flexneedle.types import Insertion, Plan
 
-RESULTS = {
-    "true_error_mm": float,
-    "residual_mm": float,
-    "tip_x_mm": float,
-    "tip_y_mm": float,
-    "flips": int,
-    "planned_flips": int,
-    "strain_energy_mj": float,
-    "planned_strain_energy_mj": float,
-    "planned_error_mm": float,
-    "guide_travel_mm": float,
-    "peak_stretch": float,
-    "periods": int,
-    "planned_periods": int,
-    "held_s": float,
-    "unconverged_periods": int,
-    "reach_mm": float,
-    "predicted_quarter_mm": float,
-    "predicted_quarter_sd_mm": float,
-    "predicted_half_mm": float,
-    "predicted_half_sd_mm": float,
-    "predicted_three_quarters_mm": float,
-    "predicted_three_quarters_sd_mm": float,
-    "warning": str,
-    "outcome": str,
-    "reason": str,
-}
-"""What an insertion came to: the columns and their types; null where it is not known.
-
-predicted_…: lateral miss that the controller predicted when the tip was at that part of the target's depth, and its
-standard deviation.
-"""
-_PARTS = {"quarter": 0.25, "half": 0.5, "three_quarters": 0.75}
 TIMES = {"control_s": float, "plant_s": float, "total_s": float}
 """Wall-clock times of an insertion."""
 
@@ -107,10 +74,11 @@ def carry_out(job: Job) -> Done:
 
 def _row(job: Job, seed: int) -> dict[str, Any]:
     begun = time.perf_counter()
-    results = dict.fromkeys(RESULTS) | _planned(job.plan)
+    results: dict[str, Any] = dict.fromkeys(RESULT_COLUMNS)
     results |= {"warning": "", "outcome": "error", "reason": job.refusal}
     times: dict[str, float] = {}
     if job.plan is not None:
+        results |= plan_row(job.plan)
         try:
             insertion = _insertion(job, job.plan, seed)
         except RunError as error:
@@ -118,7 +86,7 @@ def _row(job: Job, seed: int) -> dict[str, Any]:
         except Exception as error:  # noqa: BLE001  one insertion must not end a study; its row says what it was
             results["reason"] = _told(error)
         else:
-            results |= _results(insertion)
+            results |= insertion_row(insertion)
             times = _times(insertion)
     times["total_s"] = time.perf_counter() - begun
     if job.bounded:
@@ -150,51 +118,6 @@ def _insertion(job: Job, made: Plan, seed: int) -> Insertion:
             tracker=point.tracker,
             threads=1,
         )
-
-
-def _planned(made: Plan | None) -> dict[str, Any]:
-    if made is None:
-        return {}
-    return {
-        "planned_flips": made.flips,
-        "planned_strain_energy_mj": made.strain_energy_mj,
-        "planned_error_mm": made.error_mm,
-        "planned_periods": len(made.controls),
-    }
-
-
-def _results(insertion: Insertion) -> dict[str, Any]:
-    periods = insertion.periods
-    last = periods[-1]
-    tip = last.true_tip or (None, None, None)
-    return {
-        "true_error_mm": insertion.true_error_mm,
-        "residual_mm": insertion.residual_mm,
-        "tip_x_mm": tip[0],
-        "tip_y_mm": tip[1],
-        "flips": insertion.flips,
-        "strain_energy_mj": last.true_strain_energy,
-        "guide_travel_mm": sum(abs(period.applied[3]) for period in periods),
-        "peak_stretch": last.true_stretch,
-        "periods": len(periods),
-        "held_s": insertion.held_s,
-        "unconverged_periods": sum(not period.converged for period in periods),
-        **_predictions(insertion),
-        "warning": insertion.warning,
-        "outcome": insertion.outcome,
-        "reason": insertion.reason,
-    }
-
-
-def _predictions(insertion: Insertion) -> dict[str, float | None]:
-    """Miss and standard deviation (mm) of the first decision with the tip at each part of the target's depth."""
-    found: dict[str, float | None] = {}
-    for name, part in _PARTS.items():
-        depth = part * insertion.target[0]
-        first = next((p for p in insertion.periods if p.estimate[0] >= depth and not isnan(p.miss)), None)
-        found[f"predicted_{name}_mm"] = None if first is None else first.miss
-        found[f"predicted_{name}_sd_mm"] = None if first is None else first.miss_sd
-    return found
 
 
 def _times(insertion: Insertion) -> dict[str, float]:

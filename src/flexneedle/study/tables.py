@@ -1,6 +1,6 @@
 """The tables of a study in Parquet: a row an insertion, in the order of the grid, and times in a table apart."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,25 +9,28 @@ import pyarrow.parquet as pq
 
 from flexneedle.study.grid import Study, StudyInsertion
 from flexneedle.study.plans import Plans, plan_key, truth_key
-from flexneedle.study.rows import RESULTS, TIMES
+from flexneedle.study.rows import TIMES
 from flexneedle.trace.files import replace_file
 from flexneedle.trace.folder import versions
+from flexneedle.trace.results import RESULT_COLUMNS
 
 RUNS_FILE, TIMING_FILE = "runs.parquet", "timing.parquet"
 _TYPES = {float: pa.float64(), int: pa.int64(), str: pa.string(), bool: pa.bool_()}
-_ABOUT = {
-    "controller": str,
-    "plant": str,
-    "tracker": str,
-    "strategy": str,
-    "target_depth_mm": float,
-    "target_lateral_mm": float,
-    "seed": int,
-    "plan_seed": int,
-    "repeat": int,
-    "plan": str,
-    "world": int,
-    "world_case": str,
+
+# Columns of the conditions of an insertion, with the key of its plan: type and value.
+_CONDITIONS: dict[str, tuple[type, Callable[[StudyInsertion, str], Any]]] = {
+    "controller": (str, lambda insertion, _: insertion.point.controller),
+    "plant": (str, lambda insertion, _: insertion.point.plant),
+    "tracker": (str, lambda insertion, _: insertion.point.tracker),
+    "strategy": (str, lambda insertion, _: insertion.point.strategy),
+    "target_depth_mm": (float, lambda insertion, _: insertion.point.scenario.target.depth_mm),
+    "target_lateral_mm": (float, lambda insertion, _: insertion.point.scenario.target.lateral_mm),
+    "seed": (int, lambda insertion, _: insertion.seed),
+    "plan_seed": (int, lambda insertion, _: insertion.point.plan_seed),
+    "repeat": (int, lambda insertion, _: insertion.repeat),
+    "plan": (str, lambda _, plan: plan),
+    "world": (int, lambda insertion, _: insertion.point.world),
+    "world_case": (str, lambda insertion, _: insertion.point.world_case),
 }
 _TIMING = {"index": int, "plan": str, "plan_s": float, **TIMES}
 
@@ -67,35 +70,20 @@ def _runs(
 ) -> pa.Table:
     flats = {id(point): point.scenario.flat() for point in study.points}
     settings = [flats[id(insertion.point)] for insertion in insertions]
-    about = [_about(insertion, key) for insertion, key in zip(insertions, of_plan, strict=True)]
+    conditions = [_conditions(insertion, key) for insertion, key in zip(insertions, of_plan, strict=True)]
     used = {f"version_{name}": [value] * len(insertions) for name, value in versions().items()}
     cases = [{"index": insertion.index, "case": insertion.point.case} for insertion in insertions]
     return pa.table(
         _columns(cases, {"index": int, "case": str})
         | _columns(settings, _kinds(list(flats.values())))
-        | _columns(about, _ABOUT)
-        | _columns(results, RESULTS)
+        | _columns(conditions, {name: kind for name, (kind, _) in _CONDITIONS.items()})
+        | _columns(results, {name: column.kind for name, column in RESULT_COLUMNS.items()})
         | {name: pa.array(values, pa.string()) for name, values in used.items()}
     )
 
 
-def _about(insertion: StudyInsertion, key: str) -> dict[str, Any]:
-    point = insertion.point
-    depth, lateral = point.scenario.target.position
-    return {
-        "controller": point.controller,
-        "plant": point.plant,
-        "tracker": point.tracker,
-        "strategy": point.strategy,
-        "target_depth_mm": depth,
-        "target_lateral_mm": lateral,
-        "seed": insertion.seed,
-        "plan_seed": point.plan_seed,
-        "repeat": insertion.repeat,
-        "plan": key,
-        "world": point.world,
-        "world_case": point.world_case,
-    }
+def _conditions(insertion: StudyInsertion, key: str) -> dict[str, Any]:
+    return {name: value(insertion, key) for name, (_, value) in _CONDITIONS.items()}
 
 
 def _columns(rows: Sequence[Mapping[str, Any]], kinds: Mapping[str, Any]) -> dict[str, pa.Array]:

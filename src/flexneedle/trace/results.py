@@ -1,11 +1,15 @@
-"""Results of a plan and of an insertion as plain values: the objects of `--json` and of `run.json`."""
+"""Results of plans and insertions, each defined once: rows of studies, the objects of `--json` and of `run.json`."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from math import isnan
 from typing import Any
 
 import numpy as np
 
 from flexneedle.trace.plain import plain
-from flexneedle.types import Insertion, Outcome, Plan
+from flexneedle.types import Insertion, Outcome, Period, Plan
 
 RESULT_KEYS = (
     *("controller", "phantom", "target_mm", "tip_true_mm", "tip_measured_mm", "true_error_mm", "residual_mm"),
@@ -13,9 +17,98 @@ RESULT_KEYS = (
     *("strain_energy_mj", "planned_strain_energy_mj", "steps", "held_s", "converged", "seed"),
 )
 """Keys of the result of an insertion, in order."""
+DEPTH_FRACTIONS = {"quarter": 0.25, "half": 0.5, "three_quarters": 0.75}
+"""Fractions of the target depth at which the predicted miss is recorded, by name."""
 _OF_PERIODS = ("p50", "p99", "max")
 NO_TIMING = {"plan_seconds": None, "period_ms": dict.fromkeys(_OF_PERIODS)}
-"""Times of an insertion that was rejected before planning."""
+"""Times of an insertion that was refused before it had a plan."""
+
+
+@dataclass(frozen=True)
+class ResultColumn:
+    """A column of results: the type of its values and how they follow from a plan or an insertion.
+
+    A column without a definition is filled in by studies. Unknown values are NaN or None.
+    """
+
+    kind: type
+    of_plan: Callable[[Plan], Any] | None = None
+    of_insertion: Callable[[Insertion], Any] | None = None
+
+
+def _last(insertion: Insertion) -> Period | None:
+    return insertion.periods[-1] if insertion.periods else None
+
+
+def _true_tip(insertion: Insertion, axis: int) -> float | None:
+    last = _last(insertion)
+    return last.true_tip[axis] if last and last.true_tip else None
+
+
+def _true_state(insertion: Insertion, name: str) -> Any:
+    """A `true_…` value of the last period."""
+    return getattr(_last(insertion), name, None)
+
+
+def _predicted(insertion: Insertion, name: str, depth_fraction: float) -> float | None:
+    """`miss` or `miss_sd` (mm) of the first prediction with the estimated tip at this fraction of the target depth."""
+    depth = depth_fraction * insertion.target[0]
+    predictions = (p for p in insertion.periods if p.estimate[0] >= depth and not isnan(p.miss))
+    first = next(predictions, None)
+    return None if first is None else getattr(first, name)
+
+
+def _prediction_columns() -> dict[str, ResultColumn]:
+    return {
+        f"predicted_{name}{suffix}_mm": ResultColumn(
+            float, of_insertion=partial(_predicted, name=field, depth_fraction=fraction)
+        )
+        for name, fraction in DEPTH_FRACTIONS.items()
+        for suffix, field in (("", "miss"), ("_sd", "miss_sd"))
+    }
+
+
+RESULT_COLUMNS: dict[str, ResultColumn] = {
+    "true_error_mm": ResultColumn(float, of_insertion=lambda i: i.true_error_mm),
+    "residual_mm": ResultColumn(float, of_insertion=lambda i: i.residual_mm),
+    "tip_x_mm": ResultColumn(float, of_insertion=partial(_true_tip, axis=0)),
+    "tip_y_mm": ResultColumn(float, of_insertion=partial(_true_tip, axis=1)),
+    "flips": ResultColumn(int, of_insertion=lambda i: i.flips),
+    "planned_flips": ResultColumn(int, of_plan=lambda plan: plan.flips),
+    "strain_energy_mj": ResultColumn(float, of_insertion=partial(_true_state, name="true_strain_energy")),
+    "planned_strain_energy_mj": ResultColumn(float, of_plan=lambda plan: plan.strain_energy_mj),
+    "planned_error_mm": ResultColumn(float, of_plan=lambda plan: plan.error_mm),
+    "guide_travel_mm": ResultColumn(float, of_insertion=lambda i: sum(abs(p.applied[3]) for p in i.periods)),
+    "peak_stretch": ResultColumn(float, of_insertion=partial(_true_state, name="true_stretch")),
+    "periods": ResultColumn(int, of_insertion=lambda i: len(i.periods)),
+    "planned_periods": ResultColumn(int, of_plan=lambda plan: len(plan.controls)),
+    "held_s": ResultColumn(float, of_insertion=lambda i: i.held_s),
+    "unconverged_periods": ResultColumn(
+        int, of_insertion=lambda i: sum(not period.converged for period in i.periods)
+    ),
+    "reach_mm": ResultColumn(float),
+    **_prediction_columns(),
+    "warning": ResultColumn(str, of_insertion=lambda i: i.warning),
+    "outcome": ResultColumn(str, of_insertion=lambda i: i.outcome),
+    "reason": ResultColumn(str, of_insertion=lambda i: i.reason),
+}
+"""Columns of the results of an insertion in the table of a study, in order.
+
+predicted_…: lateral miss predicted by the controller with the tip at that fraction of the target depth, and its
+standard deviation.
+"""
+
+
+def plan_row(plan: Plan) -> dict[str, Any]:
+    """Return the `planned_…` values of RESULT_COLUMNS."""
+    return {name: column.of_plan(plan) for name, column in RESULT_COLUMNS.items() if column.of_plan}
+
+
+def insertion_row(insertion: Insertion) -> dict[str, Any]:
+    """Return the values of RESULT_COLUMNS that follow from an insertion and its plan."""
+    columns = RESULT_COLUMNS.items()
+    values = {name: column.of_insertion(insertion) for name, column in columns if column.of_insertion}
+    return plan_row(insertion.plan) | values
 
 
 def plan_result(plan: Plan) -> dict[str, Any]:
@@ -28,7 +121,7 @@ def plan_result(plan: Plan) -> dict[str, Any]:
             "cost": plan.cost,
             "terms": plan.terms,
             "flips": plan.flips,
-            "strain_energy_mj": plan.strain_energy[-1],
+            "strain_energy_mj": plan.strain_energy_mj,
             "iterations": plan.iterations,
             "converged": bool(plan.converged),
             "seed": plan.seed,
@@ -43,37 +136,27 @@ def plan_timing(plan: Plan) -> dict[str, Any]:
 
 
 def insertion_result(insertion: Insertion) -> dict[str, Any]:
-    """Return the result of an insertion; missing values are None."""
-    plan, last = insertion.plan, insertion.periods[-1] if insertion.periods else None
-    result: dict[str, Any] = plain(
-        {
-            "controller": insertion.controller,
-            "phantom": insertion.phantom or None,
-            "target_mm": insertion.target,
-            "tip_true_mm": last.true_tip[:2] if last and last.true_tip else None,
-            "tip_measured_mm": _measured_tip(insertion),
-            "true_error_mm": insertion.true_error_mm,
-            "residual_mm": insertion.residual_mm,
-            "planned_error_mm": plan.error_mm,
-            "reached": bool(insertion.reached),
-            "outcome": insertion.outcome,
-            "reason": insertion.reason,
-            "warning": insertion.warning or None,
-            "flips": insertion.flips,
-            "planned_flips": plan.flips,
-            "strain_energy_mj": last.true_strain_energy if last else None,
-            "planned_strain_energy_mj": plan.strain_energy[-1],
-            "steps": len(insertion.periods),
-            "held_s": insertion.held_s,
-            "converged": all(period.converged for period in insertion.periods),
-            "seed": insertion.seed,
-        }
-    )
+    """Return the result of an insertion; unknown values are None."""
+    row = insertion_row(insertion)
+    tip = row["tip_x_mm"], row["tip_y_mm"]
+    values = row | {
+        "controller": insertion.controller,
+        "phantom": insertion.phantom or None,
+        "target_mm": insertion.target,
+        "tip_true_mm": None if tip[0] is None else tip,
+        "tip_measured_mm": _measured_tip(insertion),
+        "reached": bool(insertion.reached),
+        "warning": row["warning"] or None,
+        "steps": row["periods"],
+        "converged": row["unconverged_periods"] == 0,
+        "seed": insertion.seed,
+    }
+    result: dict[str, Any] = plain({key: values[key] for key in RESULT_KEYS})
     return result
 
 
 def refused_result(*, target: tuple[float, float], reason: str, seed: int, **parts: str) -> dict[str, Any]:
-    """Return the result of an insertion that was rejected before planning: the keys of `insertion_result`.
+    """Return the result of an insertion that was refused before it had a plan: the keys of `insertion_result`.
 
     parts: names of controller and phantom; target in mm.
     """

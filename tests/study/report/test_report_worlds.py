@@ -13,9 +13,9 @@ from flexneedle.scenario.worlds import world
 from flexneedle.study.grid import load_study
 from flexneedle.study.plans import Plans
 from flexneedle.study.report.report import write_report
-from flexneedle.study.rows import RESULTS
 from flexneedle.study.runner import _bounding
 from flexneedle.study.tables import write_tables
+from flexneedle.trace.results import RESULT_COLUMNS
 
 FREE, GUIDED = (15, 16, 31), (1, 2, 3, 4)
 STUDY = f"""
@@ -55,7 +55,7 @@ def row_of(study, index, bounded):
     point = insertion.point
     error = ERRORS[point.controller][point.world] if point.case == "perfect" else 0.05
     depth, lateral = point.scenario.target.position
-    return dict.fromkeys(RESULTS) | {
+    return dict.fromkeys(RESULT_COLUMNS) | {
         "index": index,
         "true_error_mm": error,
         "tip_x_mm": depth,

@@ -9,8 +9,8 @@ from flexneedle.study.report.design import Design
 from flexneedle.study.report.rows import Flags, Floats, Rows
 from flexneedle.study.report.summary import HIT_MM, finished, members_of
 from flexneedle.study.report.worlds import mean_of
+from flexneedle.trace.results import DEPTH_FRACTIONS
 
-_PLACES = ("quarter", "half", "three_quarters")
 # Standard deviations to either side that contain 95 % of a normal miss.
 _WIDTH = 1.959963984540054
 GOOD_MM = 0.5
@@ -34,7 +34,7 @@ class Predictions:
 def predictions_of(rows: Rows, design: Design) -> list[Predictions]:
     """Return the groups whose controller predicts, in the order of the study's factors."""
     miss = rows.number("tip_y_mm") - rows.number("target_lateral_mm")
-    inside = np.stack([_inside(rows, place, miss) for place in _PLACES])
+    inside = np.stack([_inside(rows, place, miss) for place in DEPTH_FRACTIONS])
     known = finished(rows) & ~np.isnan(inside).all(axis=0) & ~np.isnan(miss)
     error, warned = rows.number("true_error_mm"), np.array([bool(line) for line in rows.text("warning")])
     groups = [(levels, own[known[own]]) for levels, own in members_of(design.factors)]
