@@ -1,13 +1,18 @@
-"""Explain the errors of a study: what was drawn where they are large, and what the worst insertions come from.
+"""Explain the errors of a study: error against phantom parameters, and the causes of the worst insertions.
 
     python studies/worst.py FOLDER [--study STUDY] [--worst N] [--samples N] [--jobs N] [--out DIR]
 
-FOLDER is that of a study (`flexneedle study STUDY --out FOLDER`), STUDY what it was made of, if that is not shipped.
-Prints Markdown tables: the distribution of the true error; the N worst insertions (default: 10) with what their
-phantoms are; and each of these carried out again, with one imperfection left out and all else drawn alike. The worst of
-thousands had bad luck besides, which any change ends: so each is carried out several times (`--samples`, default 5),
-with other samples of the controller's searches. The figure DIR/STUDY.png (default: FOLDER) shows the error over what
-was drawn.
+FOLDER is the folder of a study (`flexneedle study STUDY --out FOLDER`); --study names its file if the study is not
+shipped. Prints Markdown tables: the distribution of the true error; the N worst insertions (default: 10) with the
+parameters of their phantoms; and each of these repeated with one imperfection removed and all others unchanged. The
+worst of thousands also had bad luck, which any change removes: so each is repeated several times (`--samples`, default
+5), with other random samples in the controller's searches. The figure DIR/STUDY.png (default: FOLDER) shows the error
+against the phantom parameters.
+
+Columns of the worst insertions: depth error (true tip minus target along the axis), control error (estimated tip
+minus target, lateral), estimate error (true minus estimated tip, lateral) and largest guide offset, all in mm; minimum
+stretch of the tissue; then the phantom: factors on the moduli (superficial, deep), on the modulus of the last 10 mm
+relative to the tissue above, on the bevel; offset and slope of the base; distance of the boundary above the target.
 """
 
 import argparse
@@ -36,9 +41,9 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.study.grid import Study, StudyInsertion, load_study
 from flexneedle.study.plans import Plans, plan_key
 from flexneedle.trace.folder import STUDY_FILE
-from flexneedle.types import Plan
+from flexneedle.types import Outcome, Plan
 
-LAST_MM = 10.0  # before the target
+LAST_MM = 10.0  # tissue before the target
 NOTHING, OTHER_PLAN = "nothing", "other plans"
 WITHOUT: dict[str, dict[str, Any]] = {
     NOTHING: {},
@@ -50,18 +55,18 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "start": {"phantom.start_offset_sd_mm": 0.0, "phantom.start_angle_sd_mrad": 0.0},
     "bend, run-out": {"phantom.initial_bend_mm": 0.0, "phantom.run_out_mm": 0.0},
     "jitter, delay": {
-        "tracker.jitter_mm": 0.0,
+        "tracker.jitter_mm": 0.001,  # not 0: identical readings count as a frozen sensor, and the needle is held
         "phantom.delay_periods": 0.0,
         "phantom.missing_fraction": 0.0,
     },
 }
-"""What is left out of the phantom, the rest as it was drawn: no draw depends on the size of another."""
+"""Imperfection that is removed, by name; the others keep their drawn values: no draw depends on another's size."""
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """What a phantom is: factors on the moduli and the bevel, base offset (mm) and slope (mrad), how far the
-    boundary lies before the target (mm), mean factor on the modulus just before the target over that above.
+class PhantomParameters:
+    """Drawn parameters of a phantom: factors on the moduli and the bevel, base offset (mm) and slope (mrad), distance
+    (mm) of the layer boundary above the target, mean modulus of the last 10 mm relative to that above.
     """
 
     superficial: float
@@ -70,47 +75,51 @@ class Drawn:
     offset: float
     slope: float
     boundary: float
-    ahead: float
+    last_ratio: float
 
 
-def drawn(scenario: Scenario, seed: int) -> Drawn:
-    """The phantom of an insertion."""
+def parameters_of(scenario: Scenario, seed: int) -> PhantomParameters:
+    """Parameters of the phantom of an insertion."""
     truth = draw(scenario, np.random.default_rng(np.random.SeedSequence(seed).spawn(3)[0]))
     factors = [
         real.shear_modulus_kpa / layer.shear_modulus_kpa
         for real, layer in zip(truth.scenario.tissue, scenario.tissue, strict=True)
     ]
     depth = scenario.target.depth_mm
-    places = truth.cell_mm * (np.arange(len(truth.variation)) + 0.5)
+    depths = truth.cell_mm * (np.arange(len(truth.variation)) + 0.5)
     variation = np.array(truth.variation)
-    last = variation[(places > depth - LAST_MM) & (places < depth)].mean()
-    return Drawn(
+    last = variation[(depths > depth - LAST_MM) & (depths < depth)].mean()
+    return PhantomParameters(
         superficial=factors[0],
         deep=factors[-1],
         bevel=truth.scenario.needle.bevel.offset_mm / scenario.needle.bevel.offset_mm,
         offset=truth.base_y,
         slope=1e3 * truth.base_turn,
         boundary=depth - truth.scenario.layer_tops[-1],
-        ahead=float(last / variation[places < depth - LAST_MM].mean()),
+        last_ratio=float(last / variation[depths < depth - LAST_MM].mean()),
     )
 
 
 @dataclass(frozen=True)
-class Ended:
-    """How an insertion ended, mm: error; tip before (−) or beyond the target; lateral distances of the believed tip
-    from the target and of the true from the believed one; largest place of the guide; smallest stretch.
+class Ending:
+    """End of an insertion, mm: true error; depth error of the true tip (negative: short of the target); lateral error
+    of the estimated tip; lateral error of the estimate; largest guide offset; minimum stretch; whether it was held.
     """
 
     error: float
-    along: float
-    controlled: float
-    believed: float
+    depth_error: float
+    control_error: float
+    estimate_error: float
     guide: float
     stretch: float
+    held: bool
 
 
-def carried_out(insertion: StudyInsertion, plan: Plan, variant: str = NOTHING, sample: int = 0) -> Ended:
-    """Carry it out in a variant of its scenario; sample 0 is the one that it had, others search with other samples."""
+def carried_out(insertion: StudyInsertion, plan: Plan, variant: str = NOTHING, sample: int = 0) -> Ending:
+    """Carry out an insertion in a variant of its scenario.
+
+    Sample 0 repeats its random numbers; other samples use others in the controller's searches.
+    """
     point = insertion.point
     scenario = point.scenario.with_values(WITHOUT[variant])
     if variant == OTHER_PLAN:
@@ -121,25 +130,26 @@ def carried_out(insertion: StudyInsertion, plan: Plan, variant: str = NOTHING, s
     run = carry_out(scenario, plan, rig, rng, controller=point.controller, force=True, threads=1)
     last = run.periods[-1]
     x, y, _ = last.true_tip or (math.nan, math.nan, math.nan)
-    return Ended(
+    return Ending(
         error=run.true_error_mm,
-        along=x - plan.target[0],
-        controlled=last.estimate[1] - plan.target[1],
-        believed=y - last.estimate[1],
+        depth_error=x - plan.target[0],
+        control_error=last.estimate[1] - plan.target[1],
+        estimate_error=y - last.estimate[1],
         guide=max((period.guide for period in run.periods), key=abs),
         stretch=last.true_stretch or math.nan,
+        held=run.outcome is Outcome.HELD,
     )
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Markdown on stdout."""
+    """Print a Markdown table on stdout."""
     for line in (head, ("---:",) * len(head), *rows):
         print(f"| {' | '.join(line)} |")
     print()
 
 
 def print_distribution(depth: np.ndarray, error: np.ndarray) -> None:
-    """The true error in all and by the target's depth."""
+    """True error, overall and by target depth."""
     head = ("depth", "n", "mean", "sd", "median", "95 %", "99 %", "99.9 %", "max", "> 0.5 mm", "> 1 mm")
     groups = [("all", error), *((f"{at:g} mm", error[depth == at]) for at in np.unique(depth))]
     rows = []
@@ -150,41 +160,58 @@ def print_distribution(depth: np.ndarray, error: np.ndarray) -> None:
     print_table(head, rows)
 
 
-def print_worst(insertions: Sequence[StudyInsertion], ends: Sequence[Ended]) -> None:
-    """What the phantoms of the worst are, and where their errors arose."""
-    head = ("index", "target, mm", "seed", "error", "along", "control", "belief", "guide", "stretch")
-    head += ("moduli ×", "ahead ×", "bevel ×", "offset, mm", "slope, mrad", "boundary, mm")
+def print_worst(insertions: Sequence[StudyInsertion], endings: Sequence[Ending]) -> None:
+    """Errors of the worst insertions and the parameters of their phantoms."""
+    head = ("index", "target, mm", "seed", "error", "depth error", "control error", "estimate error")
+    head += ("guide", "stretch", "moduli ×", "last 10 mm ×", "bevel ×", "offset, mm", "slope, mrad")
+    head += ("boundary, mm",)
     rows = []
-    for insertion, end in zip(insertions, ends, strict=True):
+    for insertion, end in zip(insertions, endings, strict=True):
         scenario = insertion.point.scenario
-        truth = drawn(scenario, insertion.seed)
+        truth = parameters_of(scenario, insertion.seed)
         target = f"{scenario.target.depth_mm:g}, {style.signed(scenario.target.lateral_mm)}"
-        parts = (end.along, end.controlled, end.believed)
+        parts = (end.depth_error, end.control_error, end.estimate_error)
         rows.append(
             (
                 *(str(insertion.index), target, str(insertion.seed), f"{end.error:.2f}"),
                 *(style.signed(part, ".2f") for part in parts),
                 *(style.signed(end.guide, ".1f"), f"{end.stretch:.2f}"),
-                *(f"{truth.superficial:.2f}, {truth.deep:.2f}", f"{truth.ahead:.2f}", f"{truth.bevel:.2f}"),
+                *(
+                    f"{truth.superficial:.2f}, {truth.deep:.2f}",
+                    f"{truth.last_ratio:.2f}",
+                    f"{truth.bevel:.2f}",
+                ),
                 *(style.signed(value, ".1f") for value in (truth.offset, truth.slope, truth.boundary)),
             )
         )
     print_table(head, rows)
 
 
-def print_without(insertions: Sequence[StudyInsertion], errors: np.ndarray) -> None:
-    """Means and largest of errors (N, variants, samples)."""
+def print_variants(
+    insertions: Sequence[StudyInsertion], endings: Sequence[Sequence[Sequence[Ending]]]
+) -> None:
+    """Mean and largest true error of each insertion in each variant, over its samples (N, variants, samples).
+
+    Held insertions are counted and left out of mean and maximum.
+    """
     rows = [
-        (str(insertion.index), *(f"{runs.mean():.2f} ({runs.max():.2f})" for runs in line))
-        for insertion, line in zip(insertions, errors, strict=True)
+        (str(insertion.index), *(_mean(runs, largest=True) for runs in line))
+        for insertion, line in zip(insertions, endings, strict=True)
     ]
-    print_table(
-        ("index", *WITHOUT), [*rows, ("mean", *(f"{runs.mean():.2f}" for runs in errors.swapaxes(0, 1)))]
-    )
+    columns = [[run for runs in column for run in runs] for column in zip(*endings, strict=True)]
+    print_table(("index", *WITHOUT), [*rows, ("mean", *map(_mean, columns))])
 
 
-def over(axes: Axes, values: np.ndarray, error: np.ndarray, label: str) -> None:
-    """Median, 95 % and 99 % of the error in twelve groups of equal size."""
+def _mean(runs: Sequence[Ending], largest: bool = False) -> str:
+    """Mean true error (mm) of the insertions that were not held, the largest in brackets, and the number held."""
+    errors = [run.error for run in runs if not run.held]
+    mean = f"{np.mean(errors):.2f}" + (f" ({max(errors):.2f})" if largest else "") if errors else "–"
+    held = len(runs) - len(errors)
+    return f"{mean}, {held} held" if held else mean
+
+
+def plot_quantiles(axes: Axes, values: np.ndarray, error: np.ndarray, label: str) -> None:
+    """Median, 95 % and 99 % quantile of the error in twelve groups of equal size."""
     order = np.argsort(values, kind="stable")
     groups = np.array_split(order, 12)
     middle = [float(np.median(values[group])) for group in groups]
@@ -196,15 +223,15 @@ def over(axes: Axes, values: np.ndarray, error: np.ndarray, label: str) -> None:
 
 
 def draw_figure(study: Study, index: np.ndarray, error: np.ndarray, folder: Path) -> None:
-    """The tail of the distribution, and the error over what was drawn."""
-    truths = [drawn((one := study.insertion(int(k))).point.scenario, one.seed) for k in index]
+    """The tail of the distribution, and the error against the phantom parameters."""
+    truths = [parameters_of((one := study.insertion(int(k))).point.scenario, one.seed) for k in index]
     depth = np.array([study.insertion(int(k)).point.scenario.target.depth_mm for k in index])
     panels = (
         ("factor on the deep modulus", [truth.deep for truth in truths]),
         ("factor on the bevel", [truth.bevel for truth in truths]),
-        ("base offset, mm, either side", [abs(truth.offset) for truth in truths]),
-        ("boundary before the target, mm", [truth.boundary for truth in truths]),
-        (f"modulus, last {LAST_MM:g} mm over above", [truth.ahead for truth in truths]),
+        ("magnitude of the base offset, mm", [abs(truth.offset) for truth in truths]),
+        ("boundary above the target, mm", [truth.boundary for truth in truths]),
+        (f"modulus, last {LAST_MM:g} mm / above", [truth.last_ratio for truth in truths]),
     )
     with style.styled():
         figure = style.new_figure(5.4)
@@ -230,25 +257,25 @@ def draw_figure(study: Study, index: np.ndarray, error: np.ndarray, folder: Path
         tail.legend(loc="lower left")
         for place, (label, values) in zip(places[1:], panels, strict=True):
             axes = style.axes(figure, *place, 2.2, 1.95)
-            over(axes, np.array(values), error, label)
+            plot_quantiles(axes, np.array(values), error, label)
             axes.set_title("True error, mm")
         figure.axes[2].legend(loc="upper left")
         style.save(figure, folder, study.name)
 
 
 def of_folder(folder: Path, source: str | None) -> Study:
-    """The study that a folder holds. Raises InputError if `source` is another."""
+    """Return the study of a folder. Raises InputError if `source` is a different study."""
     stored = json.loads((folder / STUDY_FILE).read_text(encoding="utf-8"))["study"]
     study = load_study(source or stored["name"])
     if json.loads(json.dumps(study.definition)) != stored:
-        raise InputError(f"{folder}: not the study {study.name}: name its file with --study")
+        raise InputError(f"{folder}: not the study {study.name}: give its file with --study")
     return study
 
 
-def again(
+def repeat_in_variants(
     pool: Executor, plans: Plans, worst: Sequence[StudyInsertion], samples: int
-) -> list[list[list[Ended]]]:
-    """Each of the worst in each variant with each sample (N, variants, samples)."""
+) -> list[list[list[Ending]]]:
+    """Endings of the worst insertions in each variant with each sample (N, variants, samples)."""
     calls = [
         [
             [
@@ -263,16 +290,20 @@ def again(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
+    """Print the tables and draw the figure."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--study")
-    parser.add_argument("--worst", type=int, default=10)
-    parser.add_argument("--samples", type=int, default=5)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the study")
+    parser.add_argument("--study", help="file of the study, if it is not shipped")
+    parser.add_argument(
+        "--worst", type=int, default=10, metavar="N", help="worst insertions to repeat (default: 10)"
+    )
+    parser.add_argument(
+        "--samples", type=int, default=5, metavar="N", help="repetitions of each (default: 5)"
+    )
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the figure (default: FOLDER)")
     chosen = parser.parse_args(arguments)
     try:
         study = of_folder(chosen.folder, chosen.study)
@@ -287,12 +318,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     worst = [study.insertion(int(k)) for k in index[order]]
     with ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as pool:
         own = [pool.submit(carried_out, one, plans.plan(plan_key(one.point))) for one in worst]
-        ends = [call.result() for call in own]
-        if not np.array_equal([end.error for end in ends], error[order]):
-            parser.error(f"{chosen.folder}: its insertions come out otherwise now: study it again")
-        print_worst(worst, ends)
-        others = again(pool, plans, worst, chosen.samples)
-    print_without(worst, np.array([[[end.error for end in runs] for runs in line] for line in others]))
+        endings = [call.result() for call in own]
+        if not np.array_equal([end.error for end in endings], error[order]):
+            parser.error(f"{chosen.folder}: not reproduced by this version: repeat the study")
+        print_worst(worst, endings)
+        variants = repeat_in_variants(pool, plans, worst, chosen.samples)
+    print_variants(worst, variants)
     folder = chosen.out or chosen.folder
     folder.mkdir(parents=True, exist_ok=True)
     draw_figure(study, index, error, folder)

@@ -1,9 +1,10 @@
-"""studies/worst.py: what is left out of a phantom changes nothing else, and no study is taken for another."""
+"""studies/worst.py: removing one imperfection changes nothing else, and a folder of another study is refused."""
 
 import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,9 +14,9 @@ from flexneedle.errors import InputError
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import worst
 
-OUT_OF = {
+REMOVED = {
     "moduli": {"superficial", "deep"},
-    "variation": {"ahead"},
+    "variation": {"last_ratio"},
     "boundary": {"boundary"},
     "bevel": {"bevel"},
     "start": {"offset", "slope"},
@@ -23,7 +24,7 @@ OUT_OF = {
 NOMINAL = {
     "superficial": 1.0,
     "deep": 1.0,
-    "ahead": 1.0,
+    "last_ratio": 1.0,
     "boundary": 20.0,
     "bevel": 1.0,
     "offset": 0.0,
@@ -33,22 +34,46 @@ NOMINAL = {
 
 @pytest.mark.parametrize("variant", worst.WITHOUT)
 @pytest.mark.parametrize("seed", [3, 208988])
-def test_leaving_one_thing_out_leaves_all_else_as_it_was_drawn(variant, seed):
+def test_removing_one_imperfection_leaves_the_other_draws_unchanged(variant, seed):
     scenario = flexneedle.load_scenario("phantom")  # the target is 40 mm deep, the boundary 20 mm
-    before = asdict(worst.drawn(scenario, seed))
-    after = asdict(worst.drawn(scenario.with_values(worst.WITHOUT[variant]), seed))
-    gone = OUT_OF.get(variant, set())
+    before = asdict(worst.parameters_of(scenario, seed))
+    after = asdict(worst.parameters_of(scenario.with_values(worst.WITHOUT[variant]), seed))
+    removed = REMOVED.get(variant, set())
     assert all(before[name] != NOMINAL[name] for name in before)
-    assert {name: after[name] for name in gone} == pytest.approx({name: NOMINAL[name] for name in gone})
-    assert {name: after[name] for name in after if name not in gone} == pytest.approx(
-        {name: before[name] for name in before if name not in gone}
+    assert {name: after[name] for name in removed} == pytest.approx({name: NOMINAL[name] for name in removed})
+    assert {name: after[name] for name in after if name not in removed} == pytest.approx(
+        {name: before[name] for name in before if name not in removed}
     )
 
 
-def test_a_folder_is_not_taken_for_another_study(tmp_path):
+def test_a_folder_of_another_study_is_refused(tmp_path):
     stored = json.loads(json.dumps(worst.load_study("mismatch-doubled").definition))
     (tmp_path / "study.json").write_text(json.dumps({"study": stored}))
     assert worst.of_folder(tmp_path, None).first_seed == 200000
     (tmp_path / "study.json").write_text(json.dumps({"study": {**stored, "first_seed": 5}}))
-    with pytest.raises(InputError, match="not the study mismatch-doubled: name its file with --study"):
+    with pytest.raises(InputError, match="not the study mismatch-doubled: give its file with --study"):
         worst.of_folder(tmp_path, None)
+
+
+def ending(error, held=False):
+    return worst.Ending(error, 0.0, error, 0.0, 0.0, 1.0, held)
+
+
+def test_held_insertions_are_counted_and_not_averaged(capsys, monkeypatch):
+    """Errors 0.1 and 0.3 mm average to 0.2 mm; the miss of the held insertion, 18 mm, has no part in it."""
+    monkeypatch.setattr(worst, "WITHOUT", dict.fromkeys(("nothing", "bevel", "start")))
+    insertions = [SimpleNamespace(index=7)]
+    held = [ending(18.0, held=True)] * 2
+    worst.print_variants(insertions, [[[ending(0.1), ending(0.3)], [ending(0.1), *held, ending(0.3)], held]])
+    head, _, row, mean, _ = capsys.readouterr().out.splitlines()
+    assert head == "| index | nothing | bevel | start |"
+    assert row == "| 7 | 0.20 (0.30) | 0.20 (0.30), 2 held | –, 2 held |"
+    assert mean == "| mean | 0.20 | 0.20, 2 held | –, 2 held |"
+
+
+def test_the_tracker_of_every_variant_has_jitter():
+    """Without jitter, identical readings count as a frozen sensor and the needle is held."""
+    scenario = flexneedle.load_scenario("phantom")
+    jitter = [scenario.with_values(changes).tracker.jitter_mm for changes in worst.WITHOUT.values()]
+    assert min(jitter) > 0.0
+    assert jitter[list(worst.WITHOUT).index("jitter, delay")] < 0.1 * scenario.tracker.jitter_mm
