@@ -1,6 +1,6 @@
 """Simulate, plan and steer flexible bevel-tip needles in soft tissue.
 
-Names are imported when they are first used: `import flexneedle` alone stays fast and loads no compiler.
+Names are imported on first use, so that `import flexneedle` is fast and does not load the compiler.
 """
 
 from importlib import import_module

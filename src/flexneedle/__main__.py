@@ -1,4 +1,4 @@
-"""`python -m flexneedle` is the command line."""
+"""`python -m flexneedle` runs the command line."""
 
 import sys
 

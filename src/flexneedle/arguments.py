@@ -1,4 +1,4 @@
-"""What callers give: one line, with value, rule and remedy, for what cannot be used."""
+"""Checks of arguments: one line with value, rule and remedy for an invalid one."""
 
 import reprlib
 from operator import index
@@ -7,11 +7,11 @@ from typing import Any, TypeVar
 from flexneedle.errors import InputError
 
 _Kind = TypeVar("_Kind")
-_LONGEST = 60  # characters of a value
+_LONGEST = 60  # characters of a value in a message
 
 
 def whole(name: str, value: Any, least: int, remedy: str = "") -> int:
-    """Return a whole number. Raises InputError for anything else, and for one below `least`."""
+    """Return an integer. Raises InputError for anything else, and for values below `least`."""
     try:
         number = least - 1 if isinstance(value, bool) else index(value)
     except TypeError:
@@ -22,7 +22,7 @@ def whole(name: str, value: Any, least: int, remedy: str = "") -> int:
 
 
 def pair(name: str, value: Any, parts: str) -> tuple[float, float]:
-    """Return two numbers, which `parts` describes. Raises InputError for anything else."""
+    """Return two numbers; `parts` describes them in the message. Raises InputError for anything else."""
     try:
         numbers = [] if isinstance(value, str) else [float(part) for part in value]
     except (TypeError, ValueError):
@@ -33,7 +33,7 @@ def pair(name: str, value: Any, parts: str) -> tuple[float, float]:
 
 
 def instance(name: str, value: Any, kind: type[_Kind], remedy: str) -> _Kind:
-    """Return a value of this class. Raises InputError, with the remedy, for another."""
+    """Return a value of the class `kind`. Raises InputError, with the remedy, for another."""
     if not isinstance(value, kind):
         rule = f"must be {'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
         raise refusal(name, value, rule, remedy)
@@ -41,11 +41,11 @@ def instance(name: str, value: Any, kind: type[_Kind], remedy: str) -> _Kind:
 
 
 def shown(value: object) -> str:
-    """Return a value of any kind as a few words in one line."""
+    """Return any value as short text in one line."""
     text = " ".join(reprlib.repr(value).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
 def refusal(name: str, value: object, rule: str, remedy: str = "") -> InputError:
-    """Return the error of a value that breaks a rule."""
+    """Return the error for a value that violates a rule."""
     return InputError(f"{name} = {shown(value)}: {rule}{remedy and f'; {remedy}'}")

@@ -1,16 +1,16 @@
-"""The one tree of errors. A message is one line: the value, the rule, the valid choices."""
+"""The errors of the package. A message is one line: the value, the rule, the valid choices."""
 
 
 class FlexneedleError(Exception):
-    """Root of all errors that flexneedle raises on purpose."""
+    """Base class of all errors that flexneedle raises."""
 
 
 class InputError(FlexneedleError):
-    """What the user gave cannot be used (exit status 2)."""
+    """An input of the user is invalid (exit status 2)."""
 
 
 class FileError(InputError):
-    """A file of settings cannot be read or breaks a rule. Each argument is one problem in one line."""
+    """A settings file cannot be read or violates a rule. Each argument is one problem in one line."""
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -22,14 +22,14 @@ class FileError(InputError):
 
 
 class ScenarioError(FileError):
-    """A scenario cannot be read or breaks a rule."""
+    """A scenario cannot be read or violates a rule."""
 
 
 class CommandError(InputError, ValueError):
     """A command to the simulator or a device is out of range.
 
-    `name` is the input (`db_x`), `value` what was asked for, `limit` the bound that it passes (in the unit of
-    the input: mm or rad) and `rule` the sentence that names it, such as "must be at most 1 mm a step".
+    `name` is the input (`db_x`), `value` the command, `limit` the bound that it exceeds (mm or rad, as the input) and
+    `rule` the rule as text, such as "must be at most 1 mm a step".
     """
 
     def __init__(self, name: str, value: float, limit: float, rule: str) -> None:
@@ -45,13 +45,13 @@ class StateError(InputError):
 
 
 class RunError(FlexneedleError):
-    """An insertion or a study could not be carried out (exit status 1)."""
+    """An insertion or a study failed (exit status 1)."""
 
 
 class ScenarioWarning(UserWarning):
-    """A scenario has a key that still works, or is not used, and should be changed. The message is one line."""
+    """A scenario has a deprecated or unused key that should be changed. The message is one line."""
 
 
 def one_line(error: FlexneedleError) -> str:
-    """Return the message of an error in one line, also where it has several problems."""
+    """Return the message of an error in one line, also if it has several problems."""
     return "; ".join(str(error).splitlines())

@@ -1,4 +1,4 @@
-"""Frozen records that all rooms share: commands, measurements, plans and insertions. Units are mm, N, mJ, rad, s."""
+"""Frozen records shared by all layers: commands, measurements, plans and insertions. Units are mm, N, mJ, rad, s."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,10 +35,10 @@ VISIBLE = "ok"
 
 @dataclass(frozen=True)
 class SensorReading:
-    """One sensor in one frame of a tracker, in the tracker's coordinates; values that are not known are None.
+    """One sensor in one frame of a tracker, in the tracker's coordinates; unknown values are None.
 
     indicator: disagreement of the two coils of a 6-DOF sensor (paper, section IV-B); 5-DOF sensors may have one, too.
-    status: VISIBLE, or the reason in a few words why there is no position.
+    status: VISIBLE, or a short reason for the missing position.
     """
 
     position: Point | None
@@ -54,9 +54,9 @@ def is_reference(sensor: str) -> bool:
 
 @dataclass(frozen=True)
 class Frame:
-    """All sensors at one time (s, on the clock of the run): readings by name of the sensor, such as "tip".
+    """All sensors at one time (s, on the clock of the run): readings by sensor name, such as "tip".
 
-    number: the tracker's own count of frames, lost ones included.
+    number: frame number of the tracker, lost frames included.
     """
 
     time: float
@@ -91,8 +91,8 @@ class Plan:
 
     controls (m, 5): columns db_x, db_y, db_theta, dg_y, flip; tips (m + 1, 3): planned tip poses, the start first;
     strain_energy (m + 1,): weighted tissue energy (mJ); guide (m + 1,): guide position (mm); shapes (m + 1, n, 3):
-    nodes of the needle; terms: cost by name; history: one dict per iteration of the planner; scenario: what it was made
-    for, None where that is not known.
+    nodes of the needle; terms: cost by name; history: one dict per iteration of the planner; scenario: that of the
+    plan, None if unknown.
     """
 
     strategy: str
@@ -115,7 +115,7 @@ class Plan:
 
     @property
     def tip_mm(self) -> tuple[float, float]:
-        """Position of the tip at the end."""
+        """Position of the planned tip at the end."""
         return float(self.tips[-1, 0]), float(self.tips[-1, 1])
 
     @property
@@ -181,7 +181,7 @@ class VerdictKind(StrEnum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of a check, and its reason: the value and its limit. Only one of kind OK has no reason."""
+    """Result of a check, and its reason: the value and its limit; no reason for kind OK."""
 
     kind: VerdictKind = VerdictKind.OK
     reason: str = ""
@@ -201,9 +201,9 @@ OK = Verdict()
 class Action(StrEnum):
     """Action of the needle in a control period."""
 
-    MEASURE = "measure"  # waited for the first readings
+    MEASURE = "measure"  # wait for the first readings
     MOVE = "move"
-    REST = "rest"  # waited at rest for late readings
+    REST = "rest"  # wait at rest for late readings
     HOLD = "hold"  # held: readings rejected, or no path to the target
 
 
@@ -219,7 +219,7 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class CheckedMeasurement:
-    """A reading of the tracker and its verdict: "ok", or why it was rejected."""
+    """A tracker reading and its verdict: "ok", or the reason for the rejection."""
 
     sample: Measurement
     verdict: Verdict
@@ -227,14 +227,14 @@ class CheckedMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class Period:
-    """One control period. `true_*` is the virtual phantom's, unknown to the controller; None on a rig."""
+    """One control period. `true_*`: state of the virtual phantom, unknown to the controller; None on a rig."""
 
     index: int
-    time: float  # end of the period (s), simulated or of the rig
+    time: float  # end of the period (s), simulated time or clock of the rig
     command: Command
     applied: Command
     sample: Measurement
-    verdict: Verdict  # on the sample
+    verdict: Verdict  # of the sample
     innovation: tuple[float, float]  # sample minus prediction (mm); 0, 0 without a usable sample
     estimate: Pose
     shape: Floats  # (n, 3) nodes of the estimated needle
@@ -242,23 +242,23 @@ class Period:
     guide: float
     bevel: int
     strain_energy: float  # of the estimate (mJ)
-    tip_load: float  # lateral force that the observer adds at the tip (N)
+    tip_load: float  # lateral force at the tip (N) added by the observer
     path: Pose  # planned pose at the estimated tip's depth
-    cost: float  # of the chosen command, as predicted
-    spread: float  # standard deviation left in the first guide step (mm)
+    cost: float  # predicted cost of the chosen command
+    spread: float  # final standard deviation of the first guide step (mm)
     action: Action
     decision: str  # reason why the bevel was rolled or kept, or the needle held
     true_tip: Pose | None
     true_strain_energy: float | None
     durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
-    converged: bool = True  # the model's solve of this period, and all of the virtual phantom's up to it
-    true_stretch: float | None = None  # smallest stretch λ that the true tissue has reached
-    miss: float = float("nan")  # lateral, predicted at the target (mm), NaN: not predicted
+    converged: bool = True  # solves of the model in this period, and of the virtual phantom up to it
+    true_stretch: float | None = None  # minimum stretch λ of the true tissue so far
+    miss: float = float("nan")  # predicted lateral miss at the target (mm); NaN: not predicted
     miss_sd: float = float("nan")  # its standard deviation (mm)
-    warning: str = ""  # of a likely miss
+    warning: str = ""  # warning of a likely miss, or ""
     readings: tuple[
         CheckedMeasurement, ...
-    ] = ()  # all that arrived in the period, oldest first; `sample` is the newest
+    ] = ()  # all readings of the period, oldest first; `sample` is the newest
 
     def __repr__(self) -> str:
         at = f"{self.time:.2f} s: {self.action}, estimated tip {_mm(self.estimate)}"
@@ -268,17 +268,17 @@ class Period:
 
 @dataclass(frozen=True, eq=False)
 class Insertion:
-    """A whole insertion."""
+    """A complete insertion, from the start to its outcome."""
 
     plan: Plan
     seed: int
     periods: tuple[Period, ...]
     outcome: Outcome
-    reason: str  # one line; "" when done within 1 mm of the target, or where that is not known
-    controller: str = ""  # its name
+    reason: str  # one line; "" if done within 1 mm of the target, or with unknown error
+    controller: str = ""  # name
     phantom: str = ""  # formulation of the virtual phantom, "" on a rig
-    tracker: str = ""  # its name, "" on a rig
-    scenario: "Scenario | None" = None  # in which it was carried out
+    tracker: str = ""  # name, "" on a rig
+    scenario: "Scenario | None" = None  # of the insertion
 
     @property
     def target(self) -> tuple[float, float]:
@@ -287,24 +287,24 @@ class Insertion:
 
     @property
     def true_error_mm(self) -> float:
-        """Planar distance from the true tip to the target at the last period, depth included; NaN if unknown."""
+        """Planar distance (depth and lateral) from the true tip to the target at the last period; NaN if unknown."""
         truth = self.periods[-1].true_tip if self.periods else None
         return _distance(truth, self.target)
 
     @property
     def residual_mm(self) -> float:
-        """The same distance from the tracker's last good sample, as the paper reports it; NaN without one."""
+        """Planar distance from the last accepted reading to the target, as in the paper; NaN without a reading."""
         good = [period.sample for period in self.periods if period.verdict.ok]
         return _distance((good[-1].x, good[-1].y) if good else None, self.target)
 
     @property
     def flips(self) -> int:
-        """Bevel rolls as applied."""
+        """Number of applied bevel rolls."""
         return sum(period.applied[4] > 0 for period in self.periods)
 
     @property
     def warning(self) -> str:
-        """The first warning of the insertion, empty without one."""
+        """The first warning of the insertion, or ""."""
         return next((period.warning for period in self.periods if period.warning), "")
 
     @property
@@ -316,18 +316,18 @@ class Insertion:
 
     @property
     def reached(self) -> bool:
-        """Whether the insertion was done and ended within 1 mm of the target."""
+        """Whether the outcome is done and the true tip ended within 1 mm of the target."""
         return self.outcome is Outcome.DONE and self.true_error_mm <= 1.0
 
     @property
     def summary(self) -> str:
-        """One line: how the insertion ended."""
+        """Outcome of the insertion in one line."""
         error = self.true_error_mm
         if self.outcome is not Outcome.DONE:
             after = f"{self.outcome} after {len(self.periods)} periods"
             return f"{after}: {self.reason}" if self.reason else after
         if np.isnan(error):
-            return "done: the true tip is not known"
+            return "done: true tip unknown"
         if self.reached:
             return f"reached: the tip ended {error:.3f} mm from the target"
         return f"MISSED: the tip ended {error:.3f} mm from the target, more than 1 mm"
@@ -338,7 +338,7 @@ class Insertion:
 
 
 def scenario_of(record: Plan | Insertion) -> "Scenario":
-    """Return the scenario of a plan or an insertion. Raises InputError if it carries none, and for anything else."""
+    """Return the scenario of a plan or an insertion. Raises InputError if it has none, and for other types."""
     if not isinstance(record, Plan | Insertion):
         raise refusal("record", record, "must be a Plan or an Insertion", _MAKE_ONE)
     scenario = record.scenario or (record.plan.scenario if isinstance(record, Insertion) else None)
@@ -347,8 +347,8 @@ def scenario_of(record: Plan | Insertion) -> "Scenario":
     return scenario
 
 
-def _mm(place: Sequence[float]) -> str:
-    return f"({place[0]:.4g}, {place[1]:.4g}) mm"
+def _mm(position: Sequence[float]) -> str:
+    return f"({position[0]:.4g}, {position[1]:.4g}) mm"
 
 
 def _distance(point: Any, target: tuple[float, float]) -> float:

@@ -1,4 +1,4 @@
-"""`--help` of every command ends with two examples, which the parser takes."""
+"""`--help` of every command ends with two examples that the parser accepts."""
 
 import argparse
 import shlex
@@ -9,7 +9,7 @@ from flexneedle.cli.main import build_parser
 
 
 def commands(parser, path=()):
-    """Every parser below one, by its words."""
+    """Yield all subparsers with their command words."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for name, below in action.choices.items():
@@ -26,7 +26,7 @@ def examples_of(parser):
     return after.splitlines()
 
 
-def test_the_commands_are_all_there():
+def test_all_commands_exist():
     assert {"plan", "insert", "study", "report", "view", "export", "emulate", "emulate aurora"} < set(PARSERS)
     assert {f"scenario {name}" for name in ("list", "show", "check", "schema")} < set(PARSERS)
 
@@ -39,14 +39,14 @@ def test_the_help_ends_with_two_examples(name):
 
 
 @pytest.mark.parametrize("name", PARSERS)
-def test_the_examples_are_taken(name, capsys):
+def test_the_examples_are_accepted(name, capsys):
     for line in examples_of(PARSERS[name]):
         words = shlex.split(line.split(" | ")[0].split(" > ")[0])
         assert callable(build_parser().parse_args(words[1:]).handler), capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", PARSERS)
-def test_the_help_fits_and_names_defaults_as_such(name, monkeypatch):
+def test_the_help_fits_and_has_no_banned_words(name, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     text = PARSERS[name].format_help()
     assert max(map(len, text.splitlines())) <= 100

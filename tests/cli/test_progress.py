@@ -8,7 +8,7 @@ from flexneedle.console.progress import Progress
 
 
 class Terminal(io.StringIO):
-    """A stderr that says it is a terminal."""
+    """A stderr that reports to be a terminal."""
 
     def isatty(self):
         return True
@@ -29,7 +29,7 @@ def test_without_a_terminal_there_are_a_few_plain_lines(capsys):
     assert err.splitlines() == ["Planning …", *(f"Planning {k}0%: cost {k}" for k in (2, 4, 6, 8, 10))]
 
 
-def test_without_a_terminal_a_minute_never_passes_without_a_line(capsys, monkeypatch):
+def test_without_a_terminal_there_is_a_line_at_least_every_minute(capsys, monkeypatch):
     now = 0.0
     monkeypatch.setattr(progress_module, "monotonic", lambda: now)
     with Progress() as progress:
@@ -52,12 +52,12 @@ def test_in_a_terminal_there_is_a_bar_with_times(capsys, monkeypatch):
     assert "cost 10" in terminal.getvalue()
 
 
-def test_a_narrow_terminal_shows_every_note_whole(monkeypatch):
+def test_a_narrow_terminal_shows_complete_notes(monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "80")
-    note = "9000 of 10005, 0.56 a second, 12 min 15 s left, 3 not done"
+    note = "9000 of 10005, 0.56 per second, 12 min 15 s left, 3 not finished"
     with Progress() as progress:
         progress.show("Inserting", 9000, 10005, note)
     assert f"{note}\n" in terminal.getvalue()

@@ -1,4 +1,4 @@
-"""`flexneedle report`: where the page is, the statistics as JSON, and errors in one line."""
+"""`flexneedle report`: path of the page, statistics as JSON, errors in one line."""
 
 import json
 from pathlib import Path
@@ -72,7 +72,7 @@ def test_tuning_is_shown_from_a_folder(capsys, study, tmp_path, monkeypatch):
         run(capsys, "report", str(study), *argv)
         return page.read_text(encoding="utf-8").partition("Tuning of the controllers")[2]
 
-    assert shown() == ""  # of the controllers of this study none was tuned with phantoms of its own
+    assert shown() == ""  # no controller of this study has a tuning record
     record = {"method": OURS, "chosen": {}, "budget_insertions": 200, "phantom_seeds": [1000, 1063]}
     Path("elsewhere").mkdir()
     Path("elsewhere/a.json").write_text(json.dumps({**record, "note": "", "trials": [{"score_mm": 0.08}]}))
@@ -81,7 +81,7 @@ def test_tuning_is_shown_from_a_folder(capsys, study, tmp_path, monkeypatch):
     assert "0.080" in there
 
 
-def test_help_says_which_studies_can_be_reported(capsys):
+def test_help_names_the_studies_that_can_be_reported(capsys):
     with pytest.raises(SystemExit):
         cli.main(["report", "--help"])
     message = " ".join(capsys.readouterr().out.split())
@@ -89,7 +89,7 @@ def test_help_says_which_studies_can_be_reported(capsys):
     assert "after kill -9, run `flexneedle study` with --resume first" in message
 
 
-def test_no_study_is_bad_input(capsys, tmp_path):
+def test_a_missing_study_is_bad_input(capsys, tmp_path):
     status, out, err = run(capsys, "report", str(tmp_path / "nowhere"))
     assert (status, out) == (2, "")
     assert err.count("\n") == 1

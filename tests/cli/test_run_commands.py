@@ -1,4 +1,4 @@
-"""`flexneedle plan`, `insert`, `view`, `export`: results, records, endings."""
+"""`flexneedle plan`, `insert`, `view`, `export`: results, records, exit status."""
 
 import csv
 import json
@@ -54,7 +54,7 @@ def in_tmp(tmp_path, monkeypatch):
 
 @pytest.fixture
 def engine(monkeypatch):
-    """Return a function that puts the made-up planner and loop in place."""
+    """Return a function that installs the fake planner and loop."""
     return lambda **options: install(monkeypatch.setattr, **options)
 
 
@@ -70,7 +70,7 @@ def names(folder):
 
 
 def reproducible(folder):
-    """Return what must be the same for the same seed: run.json but for timing, and the figures."""
+    """Return the reproducible part of a run: run.json without timing, and the figures."""
     values = json.loads((folder / "run.json").read_text())
     del values["timing"]
     figures = {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".png", ".svg")}
@@ -78,12 +78,12 @@ def reproducible(folder):
 
 
 def run_process(signal_name, *argv):
-    """Run a command in a process of its own that is hit by a signal in its 12th period."""
+    """Run a command in a separate process that receives a signal in its 12th period."""
     command = [sys.executable, fake_engine.__file__, signal_name, *argv]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def test_insert_leaves_a_record_and_a_table(engine, capsys, in_tmp):
+def test_insert_writes_a_record_and_a_table(engine, capsys, in_tmp):
     engine()
     status, out, err = run(capsys, "insert", "--out", "here")
     assert status == 0
@@ -113,7 +113,7 @@ def test_insert_json_is_one_object_with_all_digits(engine, capsys):
     assert stored["status"] == "done"
 
 
-def test_controller_and_phantom_are_carried_out_and_recorded(engine, capsys, in_tmp):
+def test_controller_and_phantom_are_used_and_recorded(engine, capsys, in_tmp):
     engine()
     status, out, _ = run(capsys, "insert", "--controller", "open-loop", "--phantom", "model", "--out", "a")
     assert status == 0
@@ -127,7 +127,7 @@ def test_controller_and_phantom_are_carried_out_and_recorded(engine, capsys, in_
     assert "open-loop, model phantom" in (in_tmp / "a/insertion.svg").read_text()
 
 
-def test_by_default_the_default_controller_steers_in_the_exact_phantom(engine, capsys):
+def test_the_defaults_are_the_default_controller_and_the_exact_phantom(engine, capsys):
     engine()
     result = json.loads(run(capsys, "insert", "--json")[1])
     assert (result["controller"], result["phantom"]) == (DEFAULT, DEFAULT_PLANT) == (DEFAULT, "exact")
@@ -155,13 +155,13 @@ def test_every_controller_is_listed_with_its_summary(capsys, in_tmp):
         (["--tracker", "eye"], f"tracker = 'eye': must be one of scenario{OWN}"),
     ],
 )
-def test_a_name_that_there_is_not_is_a_line_with_the_choices(capsys, in_tmp, argv, line):
+def test_an_unknown_name_is_one_line_with_the_choices(capsys, in_tmp, argv, line):
     assert run(capsys, "insert", *argv) == (2, "", f"flexneedle: {line}\n")
     assert names(in_tmp) == []
 
 
 @pytest.mark.parametrize(("argv", "seed"), [([], 5), (["--plan-seed", "0"], 0), (["--plan-seed", "8"], 8)])
-def test_the_plan_may_have_a_seed_of_its_own(engine, capsys, in_tmp, argv, seed):
+def test_the_plan_may_have_its_own_seed(engine, capsys, in_tmp, argv, seed):
     engine()
     run(capsys, "insert", "--seed", "5", "--out", "a", *argv)
     stored = json.loads((in_tmp / "a/run.json").read_text())
@@ -183,7 +183,7 @@ def test_the_first_compilation_is_announced(engine, capsys, monkeypatch):
     assert "Compiling" not in run(capsys, "plan")[2]
 
 
-def test_the_target_is_depth_then_aside(engine, capsys):
+def test_the_target_is_depth_then_lateral_offset(engine, capsys):
     engine()
     status, out, _ = run(capsys, "insert", "--json", "--target", "30", "-4.5")
     result = json.loads(out)
@@ -193,7 +193,7 @@ def test_the_target_is_depth_then_aside(engine, capsys):
     assert stored["scenario"]["target"] == {"depth_mm": 30.0, "lateral_mm": -4.5}
 
 
-def test_a_miss_is_said_and_fails(engine, capsys):
+def test_a_miss_is_reported_and_fails(engine, capsys):
     engine(miss=1.4)
     status, out, _ = run(capsys, "insert")
     assert status == 1
@@ -257,7 +257,7 @@ def test_a_held_insertion_prints_its_object(engine, capsys):
     assert (result["outcome"], result["reason"], result["steps"]) == ("held", "no sample for 1.00 s", 69)
 
 
-def test_a_failure_on_the_way_prints_what_was_done(engine, capsys):
+def test_a_failure_during_the_insertion_prints_the_partial_result(engine, capsys):
     def fail():
         raise RunError("the driver is gone")
 
@@ -278,14 +278,14 @@ def test_bad_input_prints_no_object(engine, capsys):
         assert (status, out) == (2, "")
 
 
-def test_force_inserts_all_the_same(engine, capsys):
+def test_force_inserts_despite_a_planned_miss(engine, capsys):
     engine(plan_miss=2.5)
     status, out, _ = run(capsys, "insert", "--json", "--force", "--controller", "open-loop")
     assert status == 1
     assert json.loads(out)["planned_error_mm"] == pytest.approx(2.51)
 
 
-def test_a_failure_on_the_way_keeps_the_periods(engine, capsys, in_tmp):
+def test_a_failure_during_the_insertion_keeps_the_periods(engine, capsys, in_tmp):
     def fail():
         raise RunError("the driver is gone")
 
@@ -301,7 +301,7 @@ def test_a_failure_on_the_way_keeps_the_periods(engine, capsys, in_tmp):
 def test_ctrl_c_keeps_and_marks_the_record(in_tmp):
     done = run_process("SIGINT", "insert", "--json", "--out", "here")
     assert (done.returncode, done.stdout) == (130, "")
-    assert done.stderr.splitlines()[-1] == "flexneedle: interrupted: the record is in here"
+    assert done.stderr.splitlines()[-1] == "flexneedle: interrupted; record: here"
     stored = json.loads((in_tmp / "here/run.json").read_text())
     assert (stored["status"], stored["result"]["steps"]) == ("interrupted", 12)
     assert names(in_tmp / "here") == INSERTION_FILES
@@ -330,7 +330,7 @@ def test_a_killed_run_can_be_viewed_and_exported(in_tmp, capsys):
     assert "incomplete: 12 complete periods read" in err
 
 
-def test_view_draws_the_same_figures_again(engine, capsys, in_tmp):
+def test_view_redraws_the_same_figures(engine, capsys, in_tmp):
     engine()
     run(capsys, "insert", "--out", "here")
     before = reproducible(in_tmp / "here")
@@ -349,7 +349,7 @@ def test_the_same_seed_gives_the_same_bytes(engine, capsys, in_tmp):
 
 
 @pytest.mark.parametrize("command", ["plan", "insert"])
-def test_a_folder_that_holds_a_run_is_refused(engine, capsys, in_tmp, command):
+def test_a_folder_with_a_run_is_refused(engine, capsys, in_tmp, command):
     engine()
     run(capsys, "insert", "--out", "here")
     before = {path.name: path.read_bytes() for path in (in_tmp / "here").iterdir()}
@@ -370,7 +370,7 @@ def test_a_folder_that_holds_a_run_is_refused(engine, capsys, in_tmp, command):
         ["export", "nowhere", "--readings"],
     ],
 )
-def test_bad_input_is_a_line_and_2_and_leaves_nothing(argv, capsys, in_tmp):
+def test_bad_input_is_one_line_with_status_2_and_writes_nothing(argv, capsys, in_tmp):
     status, out, err = run(capsys, *argv)
     assert (status, out) == (2, "")
     assert err.startswith("flexneedle: ")
@@ -389,14 +389,14 @@ def test_bad_input_is_a_line_and_2_and_leaves_nothing(argv, capsys, in_tmp):
         ["export", "x", "--csv", "-", "--readings", "-"],
     ],
 )
-def test_wrong_arguments_end_with_2(argv, capsys):
+def test_wrong_arguments_exit_with_status_2(argv, capsys):
     with pytest.raises(SystemExit) as caught:
         cli.main(argv)
     assert caught.value.code == 2
     assert capsys.readouterr().out == ""
 
 
-def test_plan_leaves_a_record_and_a_figure(engine, capsys, in_tmp):
+def test_plan_writes_a_record_and_a_figure(engine, capsys, in_tmp):
     engine()
     status, out, _ = run(capsys, "plan", "--out", "here")
     assert status == 0
@@ -421,7 +421,7 @@ def test_both_plans_are_one_object_by_strategy(engine, capsys):
     }
 
 
-def test_a_plan_that_misses_says_the_limit_and_fails(engine, capsys):
+def test_a_plan_that_misses_names_the_limit_and_fails(engine, capsys):
     engine(plan_miss=2.5)
     status, out, _ = run(capsys, "plan")
     assert status == 1
@@ -431,7 +431,7 @@ def test_a_plan_that_misses_says_the_limit_and_fails(engine, capsys):
     )
 
 
-def test_export_writes_a_line_a_period_with_units(engine, capsys, in_tmp):
+def test_export_writes_one_line_per_period_with_units(engine, capsys, in_tmp):
     engine()
     run(capsys, "insert", "--out", "here")
     assert run(capsys, "export", "here", "--csv") == (0, "here/periods.csv\n", "")
@@ -447,7 +447,7 @@ def test_export_writes_a_line_a_period_with_units(engine, capsys, in_tmp):
 
 @pytest.fixture
 def watched_engine(engine, monkeypatch):
-    """Put a made-up loop in place that reads a tracker with references; the second of them is lost at first."""
+    """Install a fake loop that reads a tracker with references; the second one is missing at first."""
 
     def make(*options):
         for period in make_periods(*options):
@@ -459,7 +459,7 @@ def watched_engine(engine, monkeypatch):
 
 
 @pytest.mark.usefixtures("watched_engine")
-def test_export_writes_a_line_a_reading_with_all_sensors(capsys, in_tmp):
+def test_export_writes_one_line_per_reading_with_all_sensors(capsys, in_tmp):
     run(capsys, "insert", "--out", "here")
     assert run(capsys, "export", "here", "--readings") == (0, "here/readings.csv\n", "")
     run(capsys, "export", "here", "--readings", "other.csv")
@@ -493,7 +493,7 @@ def test_a_tracker_without_frames_exports_the_tip_alone(engine, capsys):
 
 
 @pytest.mark.parametrize("what", ["--csv", "--readings"])
-def test_export_into_a_folder_that_there_is_not_is_a_line(engine, capsys, what):
+def test_export_to_a_missing_folder_is_one_line(engine, capsys, what):
     engine()
     run(capsys, "insert", "--out", "here")
     message = (2, "", "flexneedle: nodir/foo.csv: cannot be written: No such file or directory\n")
@@ -514,5 +514,5 @@ def test_a_plan_cannot_be_exported(engine, capsys):
     assert run(capsys, "export", "here", "--csv") == (
         2,
         "",
-        "flexneedle: here: holds a plan, not an insertion\n",
+        "flexneedle: here: contains a plan, not an insertion\n",
     )

@@ -1,4 +1,4 @@
-"""`flexneedle scenario …`: what it prints, how it ends."""
+"""`flexneedle scenario …`: output and exit status."""
 
 import json
 import os
@@ -46,7 +46,7 @@ def test_show_prints_the_scenario_with_its_defaults(capsys, minimal_text, scenar
     assert Scenario.from_values(tomllib.loads(out)) == checked(load_scenario(path))
 
 
-def test_show_prints_the_settings_of_every_controller_and_loads_back_equal(capsys, tmp_path):
+def test_show_prints_the_settings_of_every_controller_and_round_trips(capsys, tmp_path):
     out = run(capsys, "scenario", "show", "phantom")[1]
     assert set(tomllib.loads(out)["control"]) >= {
         method.table for method in METHODS.values() if method.settings is not None
@@ -57,7 +57,7 @@ def test_show_prints_the_settings_of_every_controller_and_loads_back_equal(capsy
     assert run(capsys, "scenario", "show", str(path)) == (0, out, [])
 
 
-def test_an_old_key_is_warned_of_in_one_line(capsys, minimal_text, scenario_file):
+def test_a_renamed_key_is_a_warning_in_one_line(capsys, minimal_text, scenario_file):
     path = scenario_file(minimal_text + "\n[control]\nhorizon = 9\n")
     status, out, err = run(capsys, "scenario", "show", str(path))
     assert status == 0
@@ -65,7 +65,7 @@ def test_an_old_key_is_warned_of_in_one_line(capsys, minimal_text, scenario_file
     assert err == [f"flexneedle: {path}: control.horizon is now control.ce_mpc.horizon: rename it"]
 
 
-def test_check_refuses_keys_and_tables_that_no_controller_has(capsys, minimal_text, scenario_file):
+def test_check_rejects_unknown_controller_keys_and_tables(capsys, minimal_text, scenario_file):
     tables = "\n[control.bevel_only]\ncurvature = 0.1\n[control.bevel_olny]\n"
     path = scenario_file(minimal_text + tables)
     for command in ("check", "show"):
@@ -85,12 +85,12 @@ def test_check_refuses_keys_and_tables_that_no_controller_has(capsys, minimal_te
     )
 
 
-def test_check_says_ok(capsys, minimal_text, scenario_file):
+def test_check_prints_ok(capsys, minimal_text, scenario_file):
     path = scenario_file(minimal_text)
     assert run(capsys, "scenario", "check", str(path)) == (0, f"{path}: ok, Minimal\n", [])
 
 
-def test_check_prints_one_line_a_problem(capsys, minimal_text, scenario_file):
+def test_check_prints_one_line_per_problem(capsys, minimal_text, scenario_file):
     path = scenario_file(minimal_text.replace("alpha = 8.0", "alpha = 0").replace("100.0", "-1"))
     assert run(capsys, "scenario", "check", str(path)) == (
         2,
@@ -117,7 +117,7 @@ def test_schema_describes_every_key_with_a_unit_or_a_meaning(capsys):
 
 
 @pytest.mark.parametrize("argv", [["scenario"], ["scenario", "show"], ["nonsense"], []])
-def test_wrong_arguments_end_with_2(argv, capsys):
+def test_wrong_arguments_exit_with_status_2(argv, capsys):
     with pytest.raises(SystemExit) as caught:
         cli.main(argv)
     assert caught.value.code == 2
@@ -125,7 +125,7 @@ def test_wrong_arguments_end_with_2(argv, capsys):
 
 
 @pytest.mark.parametrize(
-    ("raised", "status", "told"),
+    ("raised", "status", "lines"),
     [
         (RunError("no such luck"), 1, ["flexneedle: no such luck"]),
         (flexneedle.CommandError("db_x", 2, 1, "too far"), 2, ["flexneedle: db_x = 2: too far"]),
@@ -134,15 +134,15 @@ def test_wrong_arguments_end_with_2(argv, capsys):
     ],
     ids=["run", "command", "interrupt", "disk"],
 )
-def test_errors_become_a_line_and_a_status(raised, status, told, capsys, monkeypatch):
+def test_errors_are_one_line_and_an_exit_status(raised, status, lines, capsys, monkeypatch):
     def fail(_source):
         raise raised
 
     monkeypatch.setattr("flexneedle.scenario.files.load_scenario", fail)
-    assert run(capsys, "scenario", "show", "phantom") == (status, "", told)
+    assert run(capsys, "scenario", "show", "phantom") == (status, "", lines)
 
 
-def test_a_process_ends_without_a_traceback():
+def test_an_error_prints_no_traceback():
     done = run_process("scenario", "check", "/nowhere.toml")
     assert done.returncode == 2
     assert done.stdout == ""
@@ -150,7 +150,7 @@ def test_a_process_ends_without_a_traceback():
 
 
 @pytest.mark.parametrize("argv", [["scenario", "schema"], ["--help"]])
-def test_a_closed_pipe_is_no_noise(argv):
+def test_a_closed_pipe_prints_no_error(argv):
     reading, writing = os.pipe()
     os.close(reading)
     done = run_process(*argv, stdout=writing)
@@ -158,7 +158,7 @@ def test_a_closed_pipe_is_no_noise(argv):
     assert done.stderr == ""
 
 
-def test_a_name_that_is_no_text_is_no_failure(minimal_text, tmp_path):
+def test_a_path_that_is_not_valid_unicode_is_accepted(minimal_text, tmp_path):
     path = os.fsencode(tmp_path) + b"/\xff.toml"
     Path(os.fsdecode(path)).write_text(minimal_text)
     done = run_process("scenario", "check", path)
@@ -166,7 +166,7 @@ def test_a_name_that_is_no_text_is_no_failure(minimal_text, tmp_path):
     assert done.stdout.endswith("\\udcff.toml: ok, Minimal\n")
 
 
-def test_check_warns_of_values_that_are_hardly_meant(capsys, minimal_text, scenario_file):
+def test_check_warns_of_implausible_values(capsys, minimal_text, scenario_file):
     text = minimal_text.replace("shear_modulus_kpa = 2.0", "shear_modulus_kpa = 6000.0\nthickness_mm = 9.0")
     path = scenario_file(text)
     status, out, err = run(capsys, "scenario", "check", str(path))
@@ -178,7 +178,7 @@ def test_check_warns_of_values_that_are_hardly_meant(capsys, minimal_text, scena
     assert run(capsys, "scenario", "check", "--strict", str(path)) == (2, "", err)
 
 
-def test_strict_refuses_an_old_key_too_and_nothing_else(capsys, minimal_text, scenario_file):
+def test_strict_fails_for_a_renamed_key_and_for_nothing_else(capsys, minimal_text, scenario_file):
     path = scenario_file(minimal_text)
     assert run(capsys, "scenario", "check", "--strict", str(path))[0] == 0
     path = scenario_file(minimal_text + "\n[control]\nhorizon = 9\n")
@@ -186,7 +186,7 @@ def test_strict_refuses_an_old_key_too_and_nothing_else(capsys, minimal_text, sc
     assert run(capsys, "scenario", "check", "--strict", str(path)) == (2, "", [line])
 
 
-def test_check_names_the_way_to_have_no_guide(capsys, minimal_text, scenario_file):
+def test_check_explains_how_to_omit_the_guide(capsys, minimal_text, scenario_file):
     path = scenario_file(minimal_text.replace("[setup]", "[setup]\nmax_guide_travel_mm = 0"))
     rule = "must be above 0; to go without a guide leave out setup.guide_to_skin_mm"
     line = f"flexneedle: {path}: setup.max_guide_travel_mm = 0: {rule}"

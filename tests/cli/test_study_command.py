@@ -1,4 +1,4 @@
-"""`flexneedle study`: results, endings, and what it says on the way."""
+"""`flexneedle study`: results, exit status, progress."""
 
 import json
 import re
@@ -54,7 +54,7 @@ def run(capsys, *argv):
     return status, captured.out, captured.err
 
 
-def test_a_study_leaves_tables_in_a_new_folder_and_prints_one(capsys, in_threads_and_tmp):
+def test_a_study_writes_tables_to_a_new_folder_and_prints_one(capsys, in_threads_and_tmp):
     status, out, err = run(capsys, "my.toml")
     assert status == 0
     (folder,) = (in_threads_and_tmp / "runs").iterdir()
@@ -66,9 +66,9 @@ def test_a_study_leaves_tables_in_a_new_folder_and_prints_one(capsys, in_threads
     assert re.search(r"^ exact +2 of 2 +0\.\d{3} ± 0\.\d{3} ", out, re.MULTILINE)
     assert re.search(r"^ all +4 of 4 ", out, re.MULTILINE)
     assert out.endswith(f"Tables: runs/{folder.name}\n")
-    assert re.search(r"^Inserting 100%: 4 of 4, [\d.]+ a second, 0 s left$", err, re.MULTILINE)
+    assert re.search(r"^Inserting 100%: 4 of 4, [\d.]+ per second, 0 s left$", err, re.MULTILINE)
     assert "Planning 100%: 2 of 2 plans" in err
-    assert f"Two targets: 4 insertions, in runs/{folder.name}\n" in err
+    assert f"Two targets: 4 insertions, folder runs/{folder.name}\n" in err
     assert "\x1b" not in out + err
 
 
@@ -92,12 +92,12 @@ def test_the_record_has_the_command_versions_and_the_whole_study(capsys):
     assert set(record["versions"]) == {"flexneedle", "python", "numpy", "numba", "pyarrow", "source"}
 
 
-def test_a_folder_is_used_again_only_to_resume(capsys):
+def test_an_existing_study_folder_is_used_only_to_resume(capsys):
     assert run(capsys, "my.toml", "--out", "a")[0] == 0
     status, out, err = run(capsys, "my.toml", "--out", "a")
     assert (status, out) == (2, "")
     assert err.splitlines()[-1] == (
-        "flexneedle: a: holds a study already: go on with it by --resume, or give another --out"
+        "flexneedle: a: already contains a study: add --resume to continue it, or set another --out"
     )
     assert run(capsys, "my.toml", "--out", "a", "--resume")[0] == 0
 
@@ -105,10 +105,10 @@ def test_a_folder_is_used_again_only_to_resume(capsys):
 @pytest.mark.parametrize(
     ("argv", "line"),
     [
-        (["my.toml", "--resume"], "--resume needs the folder of the study: give it with --out DIR"),
+        (["my.toml", "--resume"], "--resume needs the folder of the study: add --out DIR"),
         (
             ["my.toml", "--workers", "2", "--scheduler", "x"],
-            "--workers is for this machine: leave it out with",
+            "--workers sets local processes: remove it, or remove --scheduler",
         ),
         (["no.toml"], "no.toml: no such file, and no such study (choices: controllers, gauges, "),
     ],
@@ -131,7 +131,7 @@ def test_some_failures_are_counted_and_all_failures_fail(capsys, monkeypatch):
     monkeypatch.setattr(rows, "insert", some)
     status, out, err = run(capsys, "my.toml", "--out", "some", "--json")
     assert (status, json.loads(out)["outcomes"]) == (0, {"error": 2, "done": 2})
-    assert ", 2 not done" in err
+    assert ", 2 not finished" in err
     monkeypatch.setattr(rows, "insert", None)
     status, out, _ = run(capsys, "my.toml", "--out", "all", "--json")
     assert (status, json.loads(out)["outcomes"]) == (1, {"error": 4})
@@ -140,7 +140,7 @@ def test_some_failures_are_counted_and_all_failures_fail(capsys, monkeypatch):
     assert re.search(r"^ all +0 of 4 +– ± – ", out, re.MULTILINE)
 
 
-def test_the_rate_is_that_of_insertions_alone_and_counts_no_earlier_ones(monkeypatch):
+def test_the_rate_is_that_of_the_insertions_of_this_run(monkeypatch):
     now, notes = 100.0, []
     monkeypatch.setattr(study_command.time, "monotonic", lambda: now)
 
@@ -153,11 +153,11 @@ def test_the_rate_is_that_of_insertions_alone_and_counts_no_earlier_ones(monkeyp
         show.advance(Advance(plans, 2, done, 100, 3))
         now += later
     message = [note for stage, note in notes if stage == "Inserting"]
-    assert message[:3] == [f"{done} of 100, 3 not done" for done in (40, 40, 41)]
-    assert message[3] == "46 of 100, 0.5 a second, 1 min 48 s left, 3 not done"
+    assert message[:3] == [f"{done} of 100, 3 not finished" for done in (40, 40, 41)]
+    assert message[3] == "46 of 100, 0.5 per second, 1 min 48 s left, 3 not finished"
 
 
-def test_unconverged_periods_are_told(capsys, monkeypatch):
+def test_unconverged_periods_are_reported(capsys, monkeypatch):
     insert = rows.insert
 
     def unconverged(*args, **options):
@@ -166,12 +166,14 @@ def test_unconverged_periods_are_told(capsys, monkeypatch):
 
     monkeypatch.setattr(rows, "insert", unconverged)
     _, out, _ = run(capsys, "my.toml", "--out", "a")
-    assert "4 periods did not converge: see unconverged_periods in the table." in out
+    assert "4 periods did not converge: see column unconverged_periods of runs.parquet." in out
 
 
-def test_a_lost_worker_is_one_line_with_the_way_to_go_on(capsys, monkeypatch):
+def test_a_lost_worker_is_one_line_with_the_command_to_resume(capsys, monkeypatch):
     monkeypatch.setattr(rows, "versions", lambda: {"flexneedle": "0"})
     status, out, err = run(capsys, "my.toml", "--out", "a")
     assert (status, out) == (1, "")
-    assert err.splitlines()[-1].startswith("flexneedle: a worker has other versions than this process: ")
+    assert err.splitlines()[-1].startswith(
+        "flexneedle: package versions of a worker differ from this process: "
+    )
     assert err.splitlines()[-1].endswith(": flexneedle study my.toml --out a --resume")

@@ -1,4 +1,4 @@
-"""What a user gets in Python: figures, tables, run folders, as the commands make them."""
+"""The Python interface: figures, tables and run folders, the same as those of the commands."""
 
 import builtins
 import json
@@ -23,14 +23,14 @@ INSERTION = replace(make_insertion(PLAN), scenario=PHANTOM, controller="ce-mpc",
 
 
 @pytest.fixture(scope="module")
-def carried_out():
+def executed():
     """A real plan and its insertion, by the name of the scenario."""
     plan = flexneedle.plan("phantom", seed=0)
     return plan, flexneedle.insert("phantom", plan, seed=3)
 
 
 def same(one, other):
-    """Whether two records agree, but for wall-clock times."""
+    """Whether two records agree, except for wall-clock times."""
     for field in fields(one):
         a, b = getattr(one, field.name), getattr(other, field.name)
         if field.name in ("durations", "seconds"):
@@ -73,7 +73,7 @@ def test_plot_returns_the_figure_that_the_commands_draw(record, expected, tmp_pa
     assert drawn(figure, tmp_path / "a.png") == drawn(expected(), tmp_path / "b.png")
 
 
-def test_plot_refuses_anything_else():
+def test_plot_rejects_other_types():
     with pytest.raises(
         InputError, match="record = 3: must be a Plan or an Insertion; make one with flexneedle"
     ):
@@ -97,35 +97,35 @@ def test_a_dataframe_has_the_rows_and_columns_of_the_exported_table(tmp_path, ca
     assert frame["converged"].dtype == bool
 
 
-def test_a_dataframe_of_no_period_has_the_columns():
+def test_a_dataframe_without_periods_has_the_columns():
     assert tuple(flexneedle.to_dataframe(replace(INSERTION, periods=())).columns) == COLUMNS
 
 
-def test_without_pandas_one_line_names_the_remedy(monkeypatch):
+def test_without_pandas_the_error_names_the_remedy(monkeypatch):
     imported = builtins.__import__
 
-    def without(name, *more, **options):
+    def failing_import(name, *more, **options):
         if name == "pandas":
             raise ModuleNotFoundError("No module named 'pandas'", name="pandas")
         return imported(name, *more, **options)
 
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setattr(builtins, "__import__", failing_import)
     with pytest.raises(InputError) as caught:
         flexneedle.to_dataframe(INSERTION)
     assert str(caught.value) == "to_dataframe needs pandas, which is not installed: pip install pandas"
 
 
-def test_what_is_saved_loads_the_same(carried_out, tmp_path):
-    """The scenario of a plan with the settings that the controllers add."""
-    plan = replace(carried_out[0], scenario=carried_out[1].scenario)
-    insertion = replace(carried_out[1], plan=plan)
+def test_a_saved_record_loads_unchanged(executed, tmp_path):
+    """The loaded scenario of the plan includes the settings of the controllers."""
+    plan = replace(executed[0], scenario=executed[1].scenario)
+    insertion = replace(executed[1], plan=plan)
     assert same(flexneedle.load(flexneedle.save(insertion, tmp_path / "insertion")), insertion)
-    assert same(flexneedle.load(str(flexneedle.save(carried_out[0], str(tmp_path / "plan")))), plan)
+    assert same(flexneedle.load(str(flexneedle.save(executed[0], str(tmp_path / "plan")))), plan)
 
 
-def test_a_saved_record_is_the_folder_that_the_command_writes(carried_out, tmp_path, monkeypatch, capsys):
-    """Same seeds, same files, but for wall-clock times."""
-    plan, insertion = carried_out
+def test_save_writes_the_same_folder_as_the_command(executed, tmp_path, monkeypatch, capsys):
+    """The same seeds give the same files, except for wall-clock times."""
+    plan, insertion = executed
     monkeypatch.chdir(tmp_path)
     assert cli.main(["insert", "--seed", "3", "--plan-seed", "0", "--out", "insert"]) == 0
     assert cli.main(["plan", "--out", "plan"]) == 0
@@ -149,7 +149,7 @@ def test_a_folder_of_both_strategies_loads_as_plans_by_name(tmp_path, monkeypatc
     assert all(plan.strategy == name and plan.scenario is not None for name, plan in plans.items())
 
 
-def test_a_record_made_by_hand_has_no_scenario_and_is_refused_with_the_remedy(tmp_path):
+def test_a_record_without_a_scenario_is_rejected_with_the_remedy(tmp_path):
     bare = replace(PLAN, scenario=None)
     for use in (flexneedle.plot, lambda record: flexneedle.save(record, tmp_path / "a")):
         with pytest.raises(
@@ -164,7 +164,7 @@ def test_a_record_made_by_hand_has_no_scenario_and_is_refused_with_the_remedy(tm
     [flexneedle.to_dataframe, lambda record: flexneedle.save(record, "a"), flexneedle.plot],
     ids=["to_dataframe", "save", "plot"],
 )
-def test_what_is_no_record_is_refused_in_one_line(use, tmp_path, monkeypatch):
+def test_another_type_is_rejected_in_one_line(use, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as caught:
         use([1, 2])
@@ -172,17 +172,17 @@ def test_what_is_no_record_is_refused_in_one_line(use, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_holds_no_run_is_a_line(tmp_path):
+def test_a_folder_without_a_run_is_rejected(tmp_path):
     with pytest.raises(InputError, match=r"contains no run: run\.json is missing"):
         flexneedle.load(tmp_path)
     with pytest.raises(InputError, match="already contains a run"):
         flexneedle.save(PLAN, flexneedle.save(PLAN, tmp_path / "a"))
 
 
-def test_a_run_without_a_plan_is_a_line(tmp_path):
+def test_a_run_without_a_plan_is_rejected(tmp_path):
     path = flexneedle.save(PLAN, tmp_path / "a") / "run.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"plans": {}}))
-    with pytest.raises(RunError, match="the run ended before it had a plan"):
+    with pytest.raises(RunError, match="the run ended before planning finished"):
         flexneedle.load(tmp_path / "a")
 
 

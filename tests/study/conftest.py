@@ -1,4 +1,4 @@
-"""A study that is quick: 2 targets, 2 cases, both plants, 2 repeats; an insertion takes some 50 ms."""
+"""A quick study: 2 targets, 2 cases, both plants, 2 repeats; an insertion takes about 50 ms."""
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -48,13 +48,13 @@ def quick(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def uninterrupted(quick, tmp_path_factory) -> Path:
-    """The folder of the quick study, carried out by two processes without interruption."""
+    """The folder of the quick study, run by two processes without interruption."""
     return run_study(quick, tmp_path_factory.mktemp("whole") / "study", workers=2)
 
 
 @pytest.fixture
 def in_threads(monkeypatch):
-    """Let studies run in threads of this process, where a test can put something else in place."""
+    """Run studies in threads of this process, so that tests can monkeypatch their functions."""
 
     @contextmanager
     def local(workers=None):

@@ -1,4 +1,4 @@
-"""Run the command line after two arguments: a signal, and the count of written rows after which it hits."""
+"""Run the command line; the first two arguments are a signal and the number of written rows before it is sent."""
 
 import os
 import signal
@@ -8,7 +8,7 @@ from flexneedle.study.journal import Journal
 
 
 def main():
-    """Send the signal once so many rows are written: Ctrl-C to all processes, as a terminal does, else to this."""
+    """Send the signal after this number of rows: SIGINT to all processes, as a terminal does, others to this one."""
     from flexneedle.cli.main import main as flexneedle
 
     number, after = signal.Signals[sys.argv[1]], int(sys.argv[2])

@@ -1,4 +1,4 @@
-"""A study on a real Dask scheduler with two workers, one of which is killed in the middle."""
+"""A study on a real Dask scheduler with two workers, one of which is killed during the study."""
 
 import re
 import signal
@@ -19,7 +19,7 @@ distributed = pytest.importorskip("distributed")
 
 @contextmanager
 def process(part, *argv):
-    """Run a part of Dask in a process of its own, with its log on stderr."""
+    """Run a Dask scheduler or worker in a separate process, with its log on stderr."""
     command = [sys.executable, "-m", f"distributed.cli.dask_{part}", *argv, "--no-dashboard"]
     running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
@@ -31,7 +31,7 @@ def process(part, *argv):
 
 @contextmanager
 def scheduler():
-    """Run a scheduler and give its address. After two minutes it is killed, which ends whoever waits for it."""
+    """Run a scheduler and yield its address. It is killed after two minutes, which ends all waiting clients."""
     with process("scheduler", "--host", "127.0.0.1", "--port", "0") as running:
         watchdog = Timer(120, running.kill)
         watchdog.start()
@@ -42,47 +42,47 @@ def scheduler():
 
 
 def worker(address):
-    """Run a worker with one thread, which nothing starts again."""
+    """Run a worker with one thread that is not restarted."""
     return process("worker", address, "--nthreads", "1", "--no-nanny", "--death-timeout", "60")
 
 
 @pytest.mark.long
 def test_a_killed_worker_loses_no_row_and_repeats_none(quick, uninterrupted, tmp_path):
-    told = []
+    counts = []
     with scheduler() as address, worker(address) as first, worker(address) as second:
         with distributed.Client(address, set_as_default=False) as client:
             client.wait_for_workers(2, timeout=30)
 
         def kill_one(advance):
-            told.append(advance.insertions)
+            counts.append(advance.insertions)
             if advance.insertions == 3 and first.poll() is None:
                 first.kill()
 
         out = run_study(quick, tmp_path / "a", scheduler=address, on_advance=kill_one)
         assert first.wait(timeout=30) == -signal.SIGKILL
         assert second.poll() is None
-    assert told[-1] == 16
+    assert counts[-1] == 16
     assert (out / "runs.parquet").read_bytes() == (uninterrupted / "runs.parquet").read_bytes()
     assert len((out / "journal.jsonl").read_text().splitlines()) == 16
     assert len(pq.read_table(out / "timing.parquet")) == 16
 
 
-def test_a_scheduler_that_does_not_answer_leaves_no_folder(quick, tmp_path, monkeypatch):
+def test_a_scheduler_that_does_not_respond_creates_no_folder(quick, tmp_path, monkeypatch):
     monkeypatch.setattr(pools, "_CONNECT_S", 0.2)
-    with pytest.raises(InputError, match=r"^tcp://127\.0\.0\.1:9: no Dask scheduler answers: "):
+    with pytest.raises(InputError, match=r"^tcp://127\.0\.0\.1:9: no Dask scheduler responds: "):
         run_study(quick, tmp_path / "a", scheduler="tcp://127.0.0.1:9")
     assert not (tmp_path / "a").exists()
 
 
-def test_a_scheduler_without_workers_is_told_and_one_with_workers_is_not():
-    told = []
+def test_only_a_scheduler_without_workers_is_reported():
+    calls = []
     with scheduler() as address:
-        with pools.cluster(address, lambda: told.append("none")):
-            assert told == ["none"]
+        with pools.cluster(address, lambda: calls.append("none")):
+            assert calls == ["none"]
         with worker(address), distributed.Client(address, set_as_default=False) as client:
             client.wait_for_workers(1, timeout=30)
-            with pools.cluster(address, lambda: told.append("none")):
-                assert told == ["none"]
+            with pools.cluster(address, lambda: calls.append("none")):
+                assert calls == ["none"]
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_a_scheduler_without_workers_is_told_and_one_with_workers_is_not():
         *("http://localhost:1", "inproc://x", "127.0.0.1:8786", "TCP://host:1", "tcp://user@[::1:1"),
     ],
 )
-def test_what_cannot_be_an_address_is_refused_at_once(quick, tmp_path, address, monkeypatch):
+def test_an_invalid_address_is_rejected_immediately(quick, tmp_path, address, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(
         InputError, match=r"^--scheduler = \".*\": must be protocol://host:port, such as "
@@ -106,7 +106,7 @@ def test_what_cannot_be_an_address_is_refused_at_once(quick, tmp_path, address, 
 @pytest.mark.parametrize(
     "address", ["tcp://127.0.0.1:1", "tls://login-1.cluster:8786", "ws://[::1]:65535", "wss://h_1:80"]
 )
-def test_what_can_be_an_address_is_tried(quick, tmp_path, address, monkeypatch):
+def test_a_valid_address_is_tried(quick, tmp_path, address, monkeypatch):
     def refuses(tried):
         raise InputError(f"tried {tried}")
 
@@ -123,7 +123,7 @@ def test_tls_without_a_certificate_is_one_line(quick, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "message"),
     [
         (OSError(), "OSError"),
         (ImportError("versions\ndiffer"), "versions differ"),
@@ -131,14 +131,14 @@ def test_tls_without_a_certificate_is_one_line(quick, tmp_path):
         (ValueError("a\x1bb"), r"a\x1bb"),
     ],
 )
-def test_whatever_keeps_a_client_from_connecting_is_one_line(quick, tmp_path, monkeypatch, error, told):
+def test_any_connection_error_is_one_line(quick, tmp_path, monkeypatch, error, message):
     def fail(*_args, **_options):
         raise error
 
     monkeypatch.setattr(distributed, "Client", fail)
     with pytest.raises(InputError) as caught:
         run_study(quick, tmp_path / "a", scheduler="tcp://host:1")
-    assert str(caught.value) == f"tcp://host:1: no Dask scheduler answers: {told}"
+    assert str(caught.value) == f"tcp://host:1: no Dask scheduler responds: {message}"
 
 
 def test_without_dask_the_extra_is_named(quick, tmp_path, monkeypatch):

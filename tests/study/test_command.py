@@ -1,4 +1,4 @@
-"""What `flexneedle study` says when something is wrong, and while it plans."""
+"""Messages and progress of `flexneedle study`."""
 
 import shutil
 from dataclasses import replace
@@ -20,14 +20,14 @@ def run(capsys, *argv):
 
 
 @pytest.mark.parametrize("text", ["two", "0", "-1", "1.5", "", "٢"])
-def test_workers_that_are_no_number_are_told_what_they_must_be(capsys, text):
+def test_an_invalid_number_of_workers_is_rejected_with_the_rule(capsys, text):
     with pytest.raises(SystemExit) as caught:
         cli.main(("study", "phantom", f"--workers={text}"))
     assert caught.value.code == 2
     assert f"argument --workers: {text}: must be a whole number, at least 1\n" in capsys.readouterr().err
 
 
-def test_an_address_that_cannot_be_one_is_refused_before_the_study_is_looked_at(capsys):
+def test_an_invalid_address_is_rejected_before_the_study_is_read(capsys):
     status, out, err = run(capsys, "study", "nope", "--scheduler", "foo")
     assert (status, out) == (2, "")
     assert err.startswith('flexneedle: --scheduler = "foo": must be protocol://host:port')
@@ -42,7 +42,7 @@ def test_a_folder_with_too_long_a_name_is_bad_input(capsys, quick):
 
 
 @pytest.mark.parametrize("command", ["insert", "plan"])
-def test_no_run_is_written_into_the_folder_of_a_study(capsys, uninterrupted, tmp_path, command):
+def test_no_run_is_written_to_the_folder_of_a_study(capsys, uninterrupted, tmp_path, command):
     shutil.copy(uninterrupted / "study.json", tmp_path)
     status, out, err = run(capsys, command, "phantom", "--out", tmp_path)
     assert (status, out) == (2, "")
@@ -53,19 +53,19 @@ def test_no_run_is_written_into_the_folder_of_a_study(capsys, uninterrupted, tmp
 
 
 @pytest.mark.usefixtures("in_threads")
-def test_a_study_of_which_nothing_is_done_says_why(capsys, quick, tmp_path, monkeypatch):
+def test_a_study_without_a_finished_insertion_prints_the_first_failure(capsys, quick, tmp_path, monkeypatch):
     def broken(_scenario, _plan, seed, **_options):
         raise ZeroDivisionError(f"seed\n{seed}")
 
     monkeypatch.setattr(rows, "insert", broken)
-    told = "flexneedle: no insertion was done; the first ended so: error: ZeroDivisionError: seed 7"
+    line = "flexneedle: no insertion finished; the first failure: error: ZeroDivisionError: seed 7"
     status, _, err = run(capsys, "study", quick, "--out", tmp_path / "a")
-    assert (status, err.splitlines()[-1]) == (1, told)
+    assert (status, err.splitlines()[-1]) == (1, line)
 
 
 @pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
-def test_a_study_of_which_something_is_done_does_not(capsys, quick, tmp_path, monkeypatch):
+def test_a_study_with_a_finished_insertion_prints_no_failure(capsys, quick, tmp_path, monkeypatch):
     insert = rows.insert
 
     def some(scenario, made, seed, **options):
@@ -78,8 +78,8 @@ def test_a_study_of_which_something_is_done_does_not(capsys, quick, tmp_path, mo
     assert "no insertion" not in err
 
 
-def told(monkeypatch, advances):
-    """Return what is shown: (stage, done, total, note), for (plans, all plans, insertions, seconds until the next)."""
+def progress_of(monkeypatch, advances):
+    """Return (stage, done, total, note) shown for reports (plans, all plans, insertions, seconds until the next)."""
     now, shown = 100.0, []
     monkeypatch.setattr(study_command.time, "monotonic", lambda: now)
 
@@ -96,7 +96,7 @@ def told(monkeypatch, advances):
     ]
 
 
-def test_planning_has_a_rate_and_a_time_left_from_the_plans_that_were_made_now(monkeypatch):
+def test_planning_rate_and_remaining_time_are_from_the_plans_of_this_run(monkeypatch):
     advances = [
         (40, 105, 0, 30.0),
         (41, 105, 0, 20.0),
@@ -104,29 +104,31 @@ def test_planning_has_a_rate_and_a_time_left_from_the_plans_that_were_made_now(m
         (45, 105, 0, 20.0),
         (105, 105, 0, 1.0),
     ]
-    planning, inserting = told(monkeypatch, advances)
+    planning, inserting = progress_of(monkeypatch, advances)
     assert [note for *_, note in planning] == [
         *("40 of 105 plans", "41 of 105 plans"),
-        "42 of 105 plans, 0.05 a second, 21 min 0 s left",
-        "45 of 105 plans, 0.1 a second, 10 min 0 s left",
-        "105 of 105 plans, 1.1 a second, 0 s left",
+        "42 of 105 plans, 0.05 per second, 21 min 0 s left",
+        "45 of 105 plans, 0.1 per second, 10 min 0 s left",
+        "105 of 105 plans, 1.1 per second, 0 s left",
     ]
     assert {note for *_, note in inserting} == {"0 of 1050"}
 
 
-def test_planning_that_is_done_is_told_once(monkeypatch):
-    planning, inserting = told(monkeypatch, [(1, 2, 0, 9.0), (2, 2, 0, 9.0), (2, 2, 1, 9.0), (2, 2, 2, 9.0)])
+def test_completed_planning_is_shown_once(monkeypatch):
+    planning, inserting = progress_of(
+        monkeypatch, [(1, 2, 0, 9.0), (2, 2, 0, 9.0), (2, 2, 1, 9.0), (2, 2, 2, 9.0)]
+    )
     assert [done for _, done, *_ in planning] == [1, 2]
     assert [done for _, done, *_ in inserting] == [0, 0, 1, 2]
 
 
-def test_a_study_without_plans_to_make_has_planned(monkeypatch):
-    assert told(monkeypatch, [(0, 0, 1050, 0.0)])[0] == [("Planning", 1, 1, "0 of 0 plans")]
+def test_a_study_with_all_plans_shows_planning_as_complete(monkeypatch):
+    assert progress_of(monkeypatch, [(0, 0, 1050, 0.0)])[0] == [("Planning", 1, 1, "0 of 0 plans")]
 
 
 @pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
-def test_a_cluster_without_workers_is_told(capsys, quick, tmp_path, monkeypatch):
+def test_a_cluster_without_workers_is_reported(capsys, quick, tmp_path, monkeypatch):
     def cluster(_address, on_no_workers):
         on_no_workers()
         return pools.local(1)
@@ -135,13 +137,13 @@ def test_a_cluster_without_workers_is_told(capsys, quick, tmp_path, monkeypatch)
     monkeypatch.setattr("flexneedle.study.runner._CLUSTER_JOBS", 4)
     status, _, err = run(capsys, "study", quick, "--scheduler", "tcp://host:1", "--out", tmp_path / "a")
     assert status == 0
-    assert "tcp://host:1 has no workers yet: waiting for them\n" in err
+    assert "tcp://host:1: no workers yet, waiting\n" in err
 
 
-def test_a_line_of_its_own_is_told_as_it_is_in_a_terminal_too(monkeypatch, capsys):
-    Progress().say("[red]x")
+def test_a_separate_line_is_printed_unchanged_also_in_a_terminal(monkeypatch, capsys):
+    Progress().print_line("[red]x")
     assert capsys.readouterr().err == "[red]x\n"
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     with Progress() as progress:
-        progress.say("[red]x")
+        progress.print_line("[red]x")
     assert "[red]x\n" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""What docs/studies.md says is so."""
+"""docs/studies.md agrees with the code."""
 
 import re
 import tomllib
@@ -15,7 +15,7 @@ DOCS_FOLDER = Path(__file__).parents[2] / "docs"
 DOCS = (DOCS_FOLDER / "studies.md").read_text()
 
 
-def test_the_example_is_a_study_of_the_size_that_it_seems(tmp_path):
+def test_the_example_study_has_the_expected_size(tmp_path):
     text = re.search(r"```toml\n(.*?)```", DOCS, re.DOTALL)[1]
     path = tmp_path / "friction.toml"
     path.write_text(text)
@@ -30,7 +30,7 @@ def test_the_example_of_structural_mismatch_loads():
     assert scenario.phantom.structure.hidden_layer.top_mm == 12.0
 
 
-def test_every_shipped_study_is_told():
+def test_every_shipped_study_is_documented():
     table = DOCS.split("## The studies that come")[1].split("##")[0]
     assert re.findall(r"^\| `([a-z-]+)`", table, re.MULTILINE) == [
         *(
@@ -50,13 +50,13 @@ def test_every_shipped_study_is_told():
     assert len(STUDIES.names()) == 11
 
 
-def test_every_column_is_told(quick, uninterrupted):
-    told = set(
+def test_every_column_is_documented(quick, uninterrupted):
+    documented = set(
         re.findall(r"`([a-z_]+)`", DOCS.split("## What a study leaves")[1].split("## Interruption")[0])
     )
     scenario = set(load_study(quick).points[0].scenario.flat())
     names = [set(pq.read_schema(uninterrupted / f"{table}.parquet").names) for table in ("runs", "timing")]
-    assert set.union(*names) - scenario <= told
+    assert set.union(*names) - scenario <= documented
 
 
 def test_the_example_that_reads_a_table_runs(uninterrupted, capsys):

@@ -1,4 +1,4 @@
-"""What a study file asks for: the grid, its order, its seeds; and every rule of the file in one line."""
+"""Study files: the grid, its order and seeds; and one line for each violated rule."""
 
 import itertools
 from pathlib import Path
@@ -36,7 +36,7 @@ def insertions(study):
 
 
 def refusal(study, text):
-    """Return the message about a study file, without the opening that names the file."""
+    """Return the message about a study file, without the file name."""
     with pytest.raises(InputError) as caught:
         study(text)
     lines = [line.split("my.toml: ", 1) for line in str(caught.value).splitlines()]
@@ -76,7 +76,7 @@ def test_a_case_sets_its_values_and_nothing_else(study):
     assert rough == base.with_values({"phantom.run_out_mm": 0.4})
 
 
-def test_each_target_and_repeat_has_a_seed_of_its_own_and_the_same_one_at_all_other_settings(study):
+def test_each_target_and_repeat_has_its_own_seed_at_all_other_settings(study):
     seeds = {}
     for insertion in insertions(study(TWO_BY_TWO)):
         key = insertion.point.scenario.target.position, insertion.repeat
@@ -92,19 +92,19 @@ def test_an_axis_of_seeds_gives_all_targets_the_same_seeds(study, values):
     assert [(i.repeat, i.seed) for i in insertions(study(text))] == 2 * list(enumerate(expected))
 
 
-def test_values_hold_throughout_and_axes_and_cases_go_over_them(study):
+def test_values_apply_to_all_points_and_axes_and_cases_override_them(study):
     text = "[values]\nplant = 'model'\nphantom.run_out_mm = 1.0\nplan_seed = 4\n" + TWO_BY_TWO.split("50")[1]
     points = study(text).points
     assert {(point.plant, point.plan_seed) for point in points} == {("model", 4)}
     assert [point.scenario.phantom.run_out_mm for point in points] == [1.0] * 4 + [0.4] * 4
 
 
-def test_all_stands_for_every_controller(study):
+def test_all_means_every_controller(study):
     points = study('[[axes]]\nkey = "controller"\nvalues = "all"').points
     assert [point.controller for point in points] == list(METHODS)
 
 
-def test_keys_of_the_base_can_be_left_out(study):
+def test_keys_of_the_base_can_be_removed(study):
     text = (
         'without = ["needle.outer_diameter_mm", "needle.inner_diameter_mm"]\n[values]\nneedle.gauge = "19G"'
     )
@@ -112,7 +112,7 @@ def test_keys_of_the_base_can_be_left_out(study):
     assert (needle.gauge, needle.outer_diameter_mm, needle.outer_diameter) == ("19G", None, 1.067)
 
 
-def test_old_names_of_keys_mean_the_new_ones_in_values_cases_and_axes(study):
+def test_renamed_keys_are_accepted_in_values_cases_and_axes(study):
     axis = '[[axes]]\nkey = "control.horizon"\nvalues = [3, 4]\n'
     rest = '[values]\ncontrol.samples = 9\n[[cases]]\nname = "a"\nvalues = { control.iterations = 2 }\n'
     with pytest.warns(ScenarioWarning) as caught:
@@ -126,22 +126,22 @@ def test_old_names_of_keys_mean_the_new_ones_in_values_cases_and_axes(study):
     assert [(t["horizon"], t["samples"], t["iterations"]) for t in tables] == [(3, 9, 2), (4, 9, 2)]
     assert [dict(point.varied) for point in points] == [{"control.ce_mpc.horizon": k} for k in (3, 4)]
     twice = axis + '[[cases]]\nname = "a"\nvalues = { control.ce_mpc.horizon = 2 }\n'
-    with pytest.warns(ScenarioWarning), pytest.raises(InputError, match="an axis sets this key too"):
+    with pytest.warns(ScenarioWarning), pytest.raises(InputError, match="also set by an axis"):
         study(twice)
 
 
-def test_a_table_of_no_controller_of_the_study_is_refused(study):
+def test_an_unknown_controller_table_is_rejected(study):
     with pytest.raises(InputError, match=r"control.ce_mcp: unknown table; did you mean ce_mpc\? tables: "):
         study("[values]\ncontrol.ce_mcp.horizon = 3\n")
 
 
-def test_a_scenario_is_found_beside_the_study_file(study, tmp_path):
+def test_a_scenario_path_is_relative_to_the_study_file(study, tmp_path):
     scenario = PHANTOM.with_values({"name": "Beside", "setup.stroke_mm": 100})
     (tmp_path / "beside.toml").write_text(dump_scenario(scenario))
     assert study('scenario = "beside.toml"').points[0].scenario == scenario
 
 
-def test_a_study_that_only_has_a_name_is_one_insertion_of_the_preset(study):
+def test_a_study_with_only_a_name_is_one_insertion_of_the_preset(study):
     (only,) = insertions(study(""))
     assert (only.point.scenario, only.point.case, only.seed, only.point.plan_seed) == (PHANTOM, "", 0, 0)
 
@@ -157,7 +157,7 @@ def test_the_largest_seeds_fit_into_a_table(study):
         assert last.seed > LARGEST_SEED
 
 
-def test_true_is_no_number_that_stands_twice(study):
+def test_true_is_not_a_duplicate_of_one(study):
     assert "twice" not in refusal(study, axis("plan.samples", "[16, 1, true]"))[0]
 
 
@@ -178,14 +178,17 @@ def axis(key, values):
         ("first_seed = true", "first_seed = true: must be a whole number"),
         ("scenario = 'no.toml'", "/no.toml: no such file"),
         ("x = ", "not TOML: "),
-        ("without = ['needle.gauge']", 'without = "needle.gauge": the scenario has no such value'),
+        ("without = ['needle.gauge']", 'without = "needle.gauge": not a key of the scenario'),
         ("[values]\ncontroller = 'pid'", f'controller = "pid": {CHOICES}'),
         ("[values]\nplant = 'real'", 'plant = "real": must be one of exact, model'),
         ("[values]\nstrategy = 'x'", 'strategy = "x": must be one of manipulation, steering'),
         ("[values]\nplan_seed = 1.5", f"plan_seed = 1.5: must be a whole number {SEEDS}"),
         (axis("plan_seed", f"[1, {2**63}]"), f"plan_seed = {2**63}: must be a whole number {SEEDS}"),
-        ("[values]\nseed = 3", "values.seed = 3: seeds are set by first_seed and repeats, or by an axis"),
-        ("[values]\ntarget = 3", "values.target = 3: a target must be two numbers, [depth, lateral] in mm"),
+        (
+            "[values]\nseed = 3",
+            "values.seed = 3: not allowed here: set seeds with first_seed and repeats, or with an axis",
+        ),
+        ("[values]\ntarget = 3", "values.target = 3: must be two numbers, [depth, lateral] in mm"),
         ("[values]\nphantom.runout_mm = 3", "phantom.runout_mm = 3: unknown key; did you mean run_out_mm?"),
         ("[values]\nsetup.stroke_mm = 'a'", 'setup.stroke_mm = "a": must be a number'),
         (axis("setup.stroke_mm", "[100, 140]"), "setup.stroke_mm = 140.0: the base would reach the guide"),
@@ -193,11 +196,11 @@ def axis(key, values):
         (axis("controler", '["ce-mpc"]'), "plan_seed, world_case, as an axis also seed, world"),
         (axis("plan.samples", "[]"), "axes[0].values = []: must be a list of at least one value"),
         (axis("plan.samples", "'all'"), 'axes[0].values = "all": must be a list of at least one value'),
-        (axis("plan.samples", "[8, 9, 8]"), "axes[0].values = [8, 9, 8]: has 8 twice"),
-        (axis("setup.stroke_mm", "[100, 100.0]"), "axes[0].values = [100, 100.0]: has 100 twice"),
-        (axis("target", "[[30, 0], [30.0, -0.0]]"), "[30.0, -0.0]]: has [30, 0] twice"),
+        (axis("plan.samples", "[8, 9, 8]"), "axes[0].values = [8, 9, 8]: contains 8 twice"),
+        (axis("setup.stroke_mm", "[100, 100.0]"), "axes[0].values = [100, 100.0]: contains 100 twice"),
+        (axis("target", "[[30, 0], [30.0, -0.0]]"), "[30.0, -0.0]]: contains [30, 0] twice"),
         (axis("controller", f"['{CONTROLLERS[0]}', 'x']"), f'controller = "x": {CHOICES}'),
-        (axis("target", "[[30, 0], 40]"), "axes[0].values = 40: a target must be two numbers"),
+        (axis("target", "[[30, 0], 40]"), "axes[0].values = 40: must be two numbers"),
         (axis("target", "[[30, 0], [400, 0]]"), "target.depth_mm = 400.0: beyond the stroke"),
         (axis("seed", "[1, -2]"), f"axes[0].values = [1, -2]: must be whole numbers {SEEDS}"),
         (axis("seed", f"[1, {LARGEST_SEED + 1}]"), f"{LARGEST_SEED + 1}]: must be whole numbers {SEEDS}"),
@@ -206,44 +209,46 @@ def axis(key, values):
             f"from a whole number, 0 to {LARGEST_SEED}, count 1",
         ),
         (axis("seed", "{from = 1}"), "axes[0].values = {…}: must be a list, or {from, count}"),
-        ("repeats = 2\n" + axis("seed", "[1]"), "repeats = 2: leave it out: an axis gives the seeds"),
-        (2 * axis("plan.samples", "[16]"), 'axes = "plan.samples": two axes set this key'),
+        ("repeats = 2\n" + axis("seed", "[1]"), "repeats = 2: remove it: an axis sets the seeds"),
+        (2 * axis("plan.samples", "[16]"), 'axes = "plan.samples": set by two axes'),
         (
             axis("target", "[[30, 0]]") + axis("target.depth_mm", "[30]"),
-            'axes = "target.depth_mm": two axes set this key',
+            'axes = "target.depth_mm": set by two axes',
         ),
         (
             axis("plan.samples", "[16]") + "[[cases]]\nname = 'a'\nvalues = {plan.samples = 8}",
-            'cases[0].values = "plan.samples": an axis sets this key too',
+            'cases[0].values = "plan.samples": also set by an axis',
         ),
-        ("[[cases]]\nname = 'a'\n[[cases]]\nname = 'a'", 'cases = "a": two cases have this name'),
-        ("[[cases]]\nname = 'a'\nvalues = {seed = 1}", "cases[0].values.seed = 1: seeds are set by"),
+        ("[[cases]]\nname = 'a'\n[[cases]]\nname = 'a'", 'cases = "a": names must be unique'),
+        (
+            "[[cases]]\nname = 'a'\nvalues = {seed = 1}",
+            "cases[0].values.seed = 1: not allowed here: set seeds with",
+        ),
         ("[[axes]]\nvalues = [1]", "axes[0].key: missing"),
         (
             "repeats = 100_000\n" + axis("plan.samples", str(list(range(16, 28)))),
-            "asks for 1200000 insertions",
+            "insertions = 1200000: must be at most",
         ),
     ],
 )
-def test_a_bad_study_file_is_refused_in_one_line_that_says_what_is_wrong(study, text, line):
-    said = refusal(study, text)
-    assert line in said[0]
-    assert len(said) == 1
+def test_a_bad_study_file_is_rejected_in_one_line_with_the_problem(study, text, line):
+    (message,) = refusal(study, text)
+    assert line in message
 
 
-def test_a_setting_that_breaks_a_rule_is_named_with_its_place_in_the_grid(study):
-    (said,) = refusal(study, axis("plan.samples", "[16, 32]") + axis("setup.stroke_mm", "[100, 140]"))
-    assert said.endswith("(at plan.samples = 16, setup.stroke_mm = 140)")
+def test_an_invalid_setting_is_reported_with_its_grid_point(study):
+    (message,) = refusal(study, axis("plan.samples", "[16, 32]") + axis("setup.stroke_mm", "[100, 140]"))
+    assert message.endswith("(at plan.samples = 16, setup.stroke_mm = 140)")
 
 
-def test_an_unknown_study_is_refused_with_the_names_of_those_that_there_are():
+def test_an_unknown_study_is_rejected_with_the_valid_names():
     with pytest.raises(InputError, match=r"^nope: no such file, and no such study \(choices: controllers, "):
         load_study("nope")
 
 
 @pytest.mark.long
-def test_the_studies_of_the_package_can_be_carried_out():
-    """Loading checks every scenario of the grid against all rules, targets within the stroke included."""
+def test_the_shipped_studies_load():
+    """Loading checks every scenario of the grid against all rules, including targets within the stroke."""
     sizes = {name: len(load_study(name)) for name in STUDIES.names()}
     assert sizes == {
         "phantom": 150,
@@ -260,15 +265,15 @@ def test_the_studies_of_the_package_can_be_carried_out():
     }
 
 
-def test_the_phantom_study_has_the_papers_targets_and_seeds_of_its_own():
+def test_the_phantom_study_has_the_papers_targets_and_its_own_seeds():
     all_of_it = insertions(load_study("phantom"))
     targets = [insertion.point.scenario.target.position for insertion in all_of_it]
     assert targets == [target for target in itertools.product(DEPTHS, LATERALS) for _ in range(10)]
     assert [insertion.seed for insertion in all_of_it] == list(range(100000, 100150))
 
 
-def test_the_published_phantoms_are_those_of_the_phantom_study_without_what_is_new():
-    """Drawn last, the new imperfections change nothing else."""
+def test_the_published_phantoms_are_those_of_the_phantom_study_without_later_imperfections():
+    """The later imperfections are drawn last and change no other draw."""
     old, new = (insertions(load_study(name)) for name in ("phantom-published", "phantom"))
     assert [insertion.seed for insertion in old] == [insertion.seed for insertion in new]
     assert {insertion.point.scenario.phantom.start_axial_sd_mm for insertion in old} == {0.0}
@@ -282,7 +287,7 @@ def test_odd_targets_are_off_the_papers_grid():
     assert {insertion.seed for insertion in all_of_it} == set(range(300000, 300150))
 
 
-def test_the_controllers_meet_the_phantoms_of_the_phantom_study():
+def test_the_controllers_study_has_the_phantoms_of_the_phantom_study():
     seeds = {}
     for insertion in insertions(load_study("controllers")):
         seeds.setdefault(insertion.point.controller, []).append(insertion.seed)
@@ -309,7 +314,7 @@ def test_mismatch_grows_from_none_through_the_preset_to_the_doubled():
         assert (phantom.start_offset_sd_mm, phantom.start_angle_sd_mrad) == (0.5 * s, 3 * s)
 
 
-def test_the_long_study_has_the_doubled_mismatch_and_seeds_of_its_own():
+def test_the_long_study_has_the_doubled_mismatch_and_its_own_seeds():
     study = load_study("mismatch-doubled")
     (phantom,) = {point.scenario.phantom for point in study.points}
     published = {"start_axial_sd_mm": 0.0, "youngs_modulus_variation": 0.0}
@@ -335,7 +340,7 @@ def test_each_imperfection_is_changed_alone():
     assert all(after == 2 * before for before, after in changed.values())
 
 
-def test_no_imperfection_makes_readings_so_late_that_all_are_refused():
+def test_no_imperfection_makes_all_readings_stale():
     study = load_study("imperfections")
     for case in study.definition["cases"]:
         scenario = settings(study, case)
@@ -344,7 +349,7 @@ def test_no_imperfection_makes_readings_so_late_that_all_are_refused():
         assert late + 2 * scenario.tracker.period < scenario.control.stale_after_s
 
 
-def test_the_tip_starts_as_far_ahead_of_the_guide_at_every_distance():
+def test_the_tip_starts_at_the_same_distance_from_the_guide_in_every_case():
     setups = [point.scenario.setup for point in load_study("guide-distance").points]
     assert {setup.guide_to_skin_mm - setup.tip_to_skin_mm for setup in setups} == {12.5}
     assert sorted({setup.guide_to_skin_mm for setup in setups}) == [20, 30, 40, 50, 60, 70, 80]
@@ -361,7 +366,7 @@ def test_the_gauges_are_solid_needles_of_growing_number():
     }
 
 
-def test_study_files_of_the_package_say_what_they_are_for():
+def test_shipped_study_files_begin_with_a_comment():
     for name in STUDIES.names():
         text = (Path(load_study.__code__.co_filename).parent / "studies" / f"{name}.toml").read_text()
         assert text.startswith("# ")

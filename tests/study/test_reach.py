@@ -1,4 +1,4 @@
-"""The reach: what the needle in the tank cannot do better, whoever steers."""
+"""The reach: smallest miss that any controller could achieve."""
 
 import math
 
@@ -31,8 +31,8 @@ def test_without_a_guide_the_ends_are_mirror_images(phantom):
     assert right[1] > 1.0
 
 
-def test_an_end_is_that_of_the_needle_pushed_straight_to_the_depth():
-    """Against the simulator, in steps of the plant: tip at the depth, between two of them."""
+def test_an_end_point_is_that_of_straight_insertion_to_the_depth():
+    """Against the simulator with the steps of the plant, interpolated to the depth."""
     simulator = flexneedle.Simulator(draw(FREE, np.random.default_rng(0)).scenario)
     state = simulator.step(simulator.start(), flexneedle.Control())
     tips = [state.tip]
@@ -51,7 +51,7 @@ def test_without_a_guide_the_reach_is_the_distance_to_the_interval_between_the_e
         assert reach(scenario, 0, "model") == pytest.approx(expected, abs=1e-9)
 
 
-def test_the_reach_is_that_of_the_phantom_which_the_insertion_of_the_seed_meets(monkeypatch):
+def test_the_reach_is_computed_for_the_phantom_of_the_insertion(monkeypatch):
     drawn = []
 
     def recorded(scenario, rng):
@@ -70,7 +70,7 @@ def test_the_reach_is_that_of_the_phantom_which_the_insertion_of_the_seed_meets(
 
 
 def test_a_stroke_that_ends_before_the_target_is_out_of_reach():
-    """Of a needle that starts further back than the scenario says: by at least what is missing."""
+    """A needle that starts further back than in the scenario misses by at least the missing stroke."""
     depth = FREE.setup.max_depth
     scenario = FREE.with_values({"target.depth_mm": depth, "phantom.start_axial_sd_mm": 3.0})
     truths = [
@@ -83,16 +83,16 @@ def test_a_stroke_that_ends_before_the_target_is_out_of_reach():
 
 
 @pytest.mark.long
-def test_with_a_guide_the_reach_is_what_a_long_search_leaves():
-    """Next to nothing on the way, metres where the guide's travel does not lead."""
+def test_with_a_guide_the_reach_is_the_miss_of_a_long_search():
+    """Almost zero with the full travel of the guide, larger with a limited one."""
     assert reach(GUIDED, 0, "model") < 0.01
     tight = {"setup.max_guide_travel_mm": 0.2, "needle.bevel.offset_mm": 0.0, "target.lateral_mm": 0.2}
     bound = GUIDED.with_values({**tight, "setup.max_guide_step_mm": 1e-3})
     assert 0.05 < reach(bound, 0, "model") < 0.2
 
 
-def test_the_reach_is_that_of_a_plant_of_ones_own_too():
-    """As a factory, and as `module:NAME`, which a study has."""
+def test_the_reach_is_computed_for_a_users_own_plant():
+    """As a factory, and as `module:NAME`, as in a study."""
     expected = reach(FREE, 0, "model")
     assert reach(FREE, 0, ModelPlant) == expected
     assert reach(FREE, 0, "flexneedle.rig.phantom.plants:ModelPlant") == expected
@@ -104,8 +104,8 @@ def test_a_plant_that_does_not_converge_has_no_reach(monkeypatch):
 
 
 @pytest.mark.long
-def test_a_guide_that_steering_leaves_where_it_is_does_not_widen_the_reach():
-    """A target that guide and bevel reach and the bevel alone does not."""
+def test_a_guide_that_steering_does_not_move_does_not_improve_the_reach():
+    """A target within reach of guide and bevel but not of the bevel alone."""
     low, high = sorted(end(GUIDED, bevel)[1] for bevel in (-1, 1))
     scenario = GUIDED.with_values({"target.lateral_mm": high + 1.0})
     assert reach(scenario, 0, "model") < 0.1

@@ -1,4 +1,4 @@
-"""What a worker returns: a row for each insertion, whatever became of it; and where rows are kept."""
+"""Results of a worker: one row per insertion, also for a failure; plans and the journal."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from flexneedle.study import rows
 from flexneedle.study.grid import load_study
 from flexneedle.study.journal import Journal
 from flexneedle.study.plans import Plans, plan_key
-from flexneedle.study.rows import Job, carry_out, make_plan
+from flexneedle.study.rows import Job, make_plan, run_job
 from flexneedle.trace.results import RESULT_COLUMNS
 from flexneedle.types import Verdict, VerdictKind
 
@@ -29,11 +29,11 @@ def plan(point):
 
 
 def only_row(job):
-    (row,) = carry_out(job).rows
+    (row,) = run_job(job).rows
     return row
 
 
-def test_a_row_says_what_the_insertion_came_to(point, plan):
+def test_a_row_has_the_results_of_the_insertion(point, plan):
     insertion = flexneedle.insert(
         point.scenario, plan, 11, controller=point.controller, phantom=point.plant, threads=1
     )
@@ -77,21 +77,21 @@ def test_a_plan_that_misses_is_refused_in_a_row_without_results(point, plan):
     assert row["planned_error_mm"] == pytest.approx(1.5, abs=0.1)
 
 
-def test_an_error_in_one_insertion_is_its_row_and_the_others_go_on(point, plan, monkeypatch):
+def test_an_error_in_one_insertion_is_recorded_and_the_others_continue(point, plan, monkeypatch):
     def insert(scenario, made, seed, **options):
         if seed == 11:
             raise ZeroDivisionError("no\nwhere to go")
         return flexneedle.insert(scenario, made, seed, **options)
 
     monkeypatch.setattr(rows, "insert", insert)
-    broken, fine = carry_out(Job(point, plan, "", ((0, 11), (1, 12)))).rows
+    broken, fine = run_job(Job(point, plan, "", ((0, 11), (1, 12)))).rows
     assert (broken["outcome"], broken["reason"]) == ("error", "ZeroDivisionError: no where to go")
     assert broken["true_error_mm"] is None
     assert broken["planned_periods"] == len(plan.controls)
     assert fine["outcome"] == "done"
 
 
-def test_a_planner_that_fails_is_told_in_each_row(point, monkeypatch):
+def test_a_planner_failure_is_recorded_in_each_row(point, monkeypatch):
     def fail(*_args, **_options):
         raise FloatingPointError("overflow")
 
@@ -102,7 +102,7 @@ def test_a_planner_that_fails_is_told_in_each_row(point, monkeypatch):
     assert row["planned_periods"] is None
 
 
-def test_what_is_not_a_number_is_not_known(point, plan, monkeypatch):
+def test_nan_is_null(point, plan, monkeypatch):
     def insert(*args, **options):
         insertion = flexneedle.insert(*args, **options)
         return replace(
@@ -130,17 +130,17 @@ def test_what_is_not_a_number_is_not_known(point, plan, monkeypatch):
         ("contact.spacing_mm", False),
     ],
 )
-def test_a_plan_is_shared_by_all_that_plan_the_same(point, key, same):
+def test_points_with_the_same_planner_inputs_share_a_plan(point, key, same):
     other = replace(point, scenario=point.scenario.with_values({key: 9}), controller="x", plant="y", case="z")
     assert (plan_key(other) == plan_key(point)) is same
 
 
-def test_strategy_and_plan_seed_have_plans_of_their_own(point):
+def test_strategy_and_plan_seed_have_separate_plans(point):
     others = [replace(point, strategy="steering"), replace(point, plan_seed=1)]
     assert len({plan_key(one) for one in (point, *others)}) == 3
 
 
-def test_a_plan_comes_back_from_disk_as_it_was(point, tmp_path):
+def test_a_plan_is_read_from_disk_unchanged(point, tmp_path):
     planned = make_plan(point)
     Plans(tmp_path).keep("a", planned)
     kept = Plans(tmp_path)
@@ -151,21 +151,21 @@ def test_a_plan_comes_back_from_disk_as_it_was(point, tmp_path):
     assert kept.plan("b") is None
 
 
-def test_a_damaged_plan_is_named(tmp_path):
+def test_a_damaged_plan_is_an_error_with_its_path(tmp_path):
     (tmp_path / "a.json").write_text('{"seconds": 1}')
     with pytest.raises(InputError, match=r"a\.json: damaged: KeyError 'plan': remove it to plan again"):
         Plans(tmp_path).plan("a")
 
 
-def test_a_plan_that_is_a_folder_is_named(tmp_path):
+def test_a_folder_in_place_of_a_plan_is_an_error_with_its_path(tmp_path):
     (tmp_path / "a.json").mkdir()
     with pytest.raises(InputError, match=r"a\.json: cannot be read: Is a directory: remove it to plan again"):
         Plans(tmp_path).plan("a")
 
 
-def test_a_file_in_place_of_the_plans_is_named_before_any_plan_is_made(tmp_path):
+def test_a_file_in_place_of_the_plans_folder_is_an_error_before_planning(tmp_path):
     (tmp_path / "plans").touch()
-    with pytest.raises(InputError, match=r"plans: is no folder, which plans need: move it away"):
+    with pytest.raises(InputError, match=r"plans: not a folder, needed for the plans: move it away"):
         Plans(tmp_path / "plans")
 
 
@@ -176,7 +176,7 @@ ROWS = [
 ]
 
 
-def test_rows_come_back_from_the_journal_with_all_their_digits(tmp_path):
+def test_rows_are_read_from_the_journal_with_all_digits(tmp_path):
     with Journal(tmp_path / "j", 5) as journal:
         journal.add(ROWS)
     with Journal(tmp_path / "j", 5) as journal:
@@ -184,7 +184,7 @@ def test_rows_come_back_from_the_journal_with_all_their_digits(tmp_path):
 
 
 @pytest.mark.parametrize("kept", [1, 20, -1])
-def test_a_torn_last_line_is_dropped_and_the_journal_goes_on(tmp_path, kept):
+def test_an_incomplete_last_line_is_dropped_and_the_journal_continues(tmp_path, kept):
     path = tmp_path / "j"
     with Journal(path, 5) as journal:
         journal.add(ROWS)
@@ -215,18 +215,18 @@ def line(**changed):
         (line(index=True), "index = true: must be a whole number from 0 to 4"),
         (line(index=1.0), "index = 1.0: must be a whole number from 0 to 4"),
         (line(index=[1]), "index = [1]: must be a whole number from 0 to 4"),
-        (line(flips="x"), 'flips = "x": of a wrong type, or too large'),
-        (line(flips=2**63), f"flips = {2**63}: of a wrong type, or too large"),
-        (line(flips=1.5), "flips = 1.5: of a wrong type, or too large"),
-        (line(periods=True), "periods = true: of a wrong type, or too large"),
-        (line(tip_x_mm="x"), 'tip_x_mm = "x": of a wrong type, or too large'),
-        (line(tip_x_mm=math.nan), "tip_x_mm = nan: of a wrong type, or too large"),
-        (line(tip_x_mm=10**400), "tip_x_mm = a very large number: of a wrong type, or too large"),
-        (line(outcome=None), "outcome: of a wrong type, or too large"),
-        (line(total_s="x"), 'total_s = "x": of a wrong type, or too large'),
+        (line(flips="x"), 'flips = "x": wrong type, or too large'),
+        (line(flips=2**63), f"flips = {2**63}: wrong type, or too large"),
+        (line(flips=1.5), "flips = 1.5: wrong type, or too large"),
+        (line(periods=True), "periods = true: wrong type, or too large"),
+        (line(tip_x_mm="x"), 'tip_x_mm = "x": wrong type, or too large'),
+        (line(tip_x_mm=math.nan), "tip_x_mm = nan: wrong type, or too large"),
+        (line(tip_x_mm=10**400), "tip_x_mm = a very large number: wrong type, or too large"),
+        (line(outcome=None), "outcome: wrong type, or too large"),
+        (line(total_s="x"), 'total_s = "x": wrong type, or too large'),
     ],
 )
-def test_a_journal_that_was_changed_is_refused_with_the_line_and_left_alone(tmp_path, text, message):
+def test_a_damaged_journal_is_rejected_with_the_line_and_not_modified(tmp_path, text, message):
     path = tmp_path / "j"
     path.write_text(f"{line()}\n{text}\n{line(index=3)}\n")
     before = path.read_bytes()
@@ -239,7 +239,7 @@ def test_a_journal_that_was_changed_is_refused_with_the_line_and_left_alone(tmp_
 def test_only_one_process_writes_a_journal(tmp_path):
     with (
         Journal(tmp_path / "j", 5),
-        pytest.raises(InputError, match="another process is at work on this study"),
+        pytest.raises(InputError, match="another process is writing to this study"),
     ):
         Journal(tmp_path / "j", 5)
     with Journal(tmp_path / "j", 5) as again:

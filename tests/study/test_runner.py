@@ -1,4 +1,4 @@
-"""Studies on real worker processes: the same tables for any number of them and any interruption."""
+"""Studies on real worker processes: identical tables for any number of workers and interruptions."""
 
 import json
 import shutil
@@ -34,7 +34,7 @@ def runs(folder):
 
 
 def stop(signal_name, after, *argv):
-    """Run the command line in a process that a signal hits after so many rows; ends when its workers have, too."""
+    """Run the command line in a process that receives a signal after `after` rows; returns once its workers ended."""
     command = [sys.executable, str(STOPPED), signal_name, str(after), *map(str, argv)]
     return subprocess.run(
         command, capture_output=True, text=True, check=False, timeout=120, start_new_session=True
@@ -46,7 +46,7 @@ def journalled(folder):
     return [json.loads(line)["index"] for line in (folder / "journal.jsonl").read_text().splitlines()]
 
 
-def test_a_study_leaves_a_row_for_each_insertion_in_the_order_of_the_grid(quick, uninterrupted):
+def test_a_study_writes_one_row_per_insertion_in_grid_order(quick, uninterrupted):
     study, table = load_study(quick), runs(uninterrupted)
     assert len(study) == SIZE
     for index, row in enumerate(table):
@@ -63,7 +63,7 @@ def test_a_study_leaves_a_row_for_each_insertion_in_the_order_of_the_grid(quick,
         assert row["outcome"] == "done"
 
 
-def test_a_row_is_what_insert_gives_with_these_settings(quick, uninterrupted):
+def test_a_row_agrees_with_insert_for_its_settings(quick, uninterrupted):
     point = load_study(quick).points[3]
     row = runs(uninterrupted)[7]
     plan = flexneedle.plan(point.scenario, seed=row["plan_seed"])
@@ -74,7 +74,7 @@ def test_a_row_is_what_insert_gives_with_these_settings(quick, uninterrupted):
     assert row["residual_mm"] == insertion.residual_mm
 
 
-def test_the_same_phantom_stands_at_every_setting_of_a_target_and_repeat(uninterrupted):
+def test_a_target_and_repeat_has_the_same_phantom_at_all_settings(uninterrupted):
     table = runs(uninterrupted)
     seeds = {(row["target_depth_mm"], row["repeat"]): set() for row in table}
     for row in table:
@@ -82,7 +82,7 @@ def test_the_same_phantom_stands_at_every_setting_of_a_target_and_repeat(uninter
     assert seeds == {(8.0, 0): {7}, (8.0, 1): {8}, (10.0, 0): {9}, (10.0, 1): {10}}
 
 
-def test_wall_clock_times_are_in_a_table_of_their_own(uninterrupted):
+def test_wall_clock_times_are_in_a_separate_table(uninterrupted):
     timing = pq.read_table(uninterrupted / "timing.parquet").to_pylist()
     assert [row["index"] for row in timing] == list(range(SIZE))
     assert all(row["total_s"] > row["control_s"] + row["plant_s"] > 0.0 < row["plan_s"] for row in timing)
@@ -102,14 +102,14 @@ def test_one_plan_is_made_for_each_target_and_used_by_all_cases_and_plants(unint
 
 
 @pytest.mark.long
-def test_one_worker_leaves_the_same_bytes_as_two(quick, uninterrupted, tmp_path):
+def test_one_worker_writes_the_same_bytes_as_two(quick, uninterrupted, tmp_path):
     assert tables(run_study(quick, tmp_path / "one", workers=1)) == tables(uninterrupted)
 
 
 @pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
-def test_a_study_that_is_killed_goes_on_and_ends_with_the_same_bytes(quick, uninterrupted, tmp_path):
-    """The workers end with the parent: else `stop` would wait for them in vain. Threads end with the same bytes."""
+def test_a_killed_study_resumes_and_ends_with_the_same_bytes(quick, uninterrupted, tmp_path):
+    """The workers exit with the parent, else `stop` would not return. Threads give the same bytes."""
     out = tmp_path / "killed"
     killed = stop("SIGKILL", 5, "study", quick, "--workers", 2, "--out", out)
     assert killed.returncode == -signal.SIGKILL
@@ -124,7 +124,7 @@ def test_a_study_that_is_killed_goes_on_and_ends_with_the_same_bytes(quick, unin
 
 @pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
-def test_ctrl_c_keeps_the_finished_rows_and_says_how_to_go_on(quick, uninterrupted, tmp_path):
+def test_ctrl_c_keeps_the_finished_rows_and_prints_how_to_resume(quick, uninterrupted, tmp_path):
     out = tmp_path / "stopped"
     stopped = stop("SIGINT", 4, "study", quick, "--workers", 1, "--out", out)
     assert stopped.returncode == 130
@@ -143,16 +143,16 @@ def test_ctrl_c_keeps_the_finished_rows_and_says_how_to_go_on(quick, uninterrupt
 
 @pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
-def test_a_finished_study_is_not_done_again(quick, tmp_path, monkeypatch):
+def test_a_finished_study_is_not_repeated(quick, tmp_path, monkeypatch):
     out = run_study(quick, tmp_path / "again")
     first = tables(out)
     (out / "runs.parquet").unlink()
-    monkeypatch.setattr(runner, "carry_out", None)
+    monkeypatch.setattr(runner, "run_job", None)
     assert tables(run_study(quick, out, resume=True)) == first
 
 
 @pytest.mark.usefixtures("in_threads")
-def test_plans_are_made_once_also_by_a_study_that_goes_on(quick, tmp_path, monkeypatch):
+def test_a_resumed_study_does_not_repeat_its_plans(quick, tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(runner, "make_plan", lambda point: made.append(point) or rows.make_plan(point))
 
@@ -171,12 +171,12 @@ def test_plans_are_made_once_also_by_a_study_that_goes_on(quick, tmp_path, monke
 
 @pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
-def test_a_study_tells_how_far_it_is(quick, tmp_path):
-    message = []
-    run_study(quick, tmp_path / "a", on_advance=message.append)
-    assert [(a.plans, a.insertions) for a in (message[0], message[-1])] == [(0, 0), (2, SIZE)]
-    assert [a.insertions for a in message] == sorted(a.insertions for a in message)
-    assert {(a.all_plans, a.all_insertions, a.unfinished) for a in message} == {(2, SIZE, 0)}
+def test_a_study_reports_its_progress(quick, tmp_path):
+    reports = []
+    run_study(quick, tmp_path / "a", on_advance=reports.append)
+    assert [(a.plans, a.insertions) for a in (reports[0], reports[-1])] == [(0, 0), (2, SIZE)]
+    assert [a.insertions for a in reports] == sorted(a.insertions for a in reports)
+    assert {(a.all_plans, a.all_insertions, a.unfinished) for a in reports} == {(2, SIZE, 0)}
 
 
 @pytest.mark.usefixtures("in_threads")
@@ -193,15 +193,15 @@ def test_failures_are_rows_and_the_study_ends(quick, tmp_path, monkeypatch):
 
     monkeypatch.setattr(rows, "plan", plan)
     monkeypatch.setattr(rows, "insert", insert)
-    message = []
-    out = run_study(quick, tmp_path / "a", on_advance=message.append)
+    reports = []
+    out = run_study(quick, tmp_path / "a", on_advance=reports.append)
     table = runs(out)
     assert len(table) == SIZE
     outcomes = {row["seed"]: row["outcome"] for row in table}
     assert outcomes == {7: "error", 8: "error", 9: "done", 10: "refused"}
     assert {row["reason"] for row in table if row["seed"] < 9} == {"no plan: FloatingPointError: overflow"}
     assert all((row["true_error_mm"] is None) == (row["outcome"] != "done") for row in table)
-    assert message[-1].unfinished == 12
+    assert reports[-1].unfinished == 12
     summary = summarise(out, load_study(quick))
     assert summary["outcomes"] == {"error": 8, "done": 4, "refused": 4}
     assert summary["first_failure"] == "error: no plan: FloatingPointError: overflow"
@@ -209,15 +209,17 @@ def test_failures_are_rows_and_the_study_ends(quick, tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("in_threads")
-def test_a_worker_of_other_versions_is_refused(quick, tmp_path, monkeypatch):
+def test_a_worker_with_other_package_versions_is_rejected(quick, tmp_path, monkeypatch):
     monkeypatch.setattr(rows, "versions", lambda: {**versions(), "numpy": "1.0"})
-    with pytest.raises(RunError, match=r"a worker has other versions than this process: .*'numpy': '1.0'"):
+    with pytest.raises(
+        RunError, match=r"package versions of a worker differ from this process: .*'numpy': '1.0'"
+    ):
         run_study(quick, tmp_path / "a")
     assert runs(tmp_path / "a") == []
 
 
 class Dying(Executor):
-    """An executor that carries out the first calls and then loses its workers."""
+    """An executor that executes the first calls and then loses its workers."""
 
     def __init__(self, calls):
         self.left = calls
@@ -249,15 +251,17 @@ def test_a_lost_worker_ends_the_study_with_its_rows_kept(quick, uninterrupted, t
     assert tables(tmp_path / "a") == tables(uninterrupted)
 
 
-def test_a_folder_with_a_study_is_not_written_over(quick, uninterrupted):
-    with pytest.raises(InputError, match="holds a study already: go on with it by --resume, or give another"):
+def test_a_folder_with_a_study_is_not_overwritten(quick, uninterrupted):
+    with pytest.raises(
+        InputError, match="already contains a study: add --resume to continue it, or set another"
+    ):
         run_study(quick, uninterrupted)
 
 
-def test_a_folder_with_something_else_is_not_used(quick, tmp_path):
+def test_a_folder_with_other_files_is_rejected(quick, tmp_path):
     (tmp_path / "thesis.tex").touch()
     for resume in (False, True):
-        with pytest.raises(InputError, match="is there already, and no empty folder"):
+        with pytest.raises(InputError, match="exists and is not an empty folder"):
             run_study(quick, tmp_path, resume=resume)
 
 
@@ -269,7 +273,7 @@ def test_a_folder_with_something_else_is_not_used(quick, tmp_path):
         ("-0.5]", "-0.6]", r"axes.target is \[.*-0.5\]\] in the folder, \[.*-0.6\]\] now"),
     ],
 )
-def test_another_study_does_not_go_on_in_the_folder(quick, uninterrupted, tmp_path, old, new, difference):
+def test_another_study_cannot_resume_in_the_folder(quick, uninterrupted, tmp_path, old, new, difference):
     changed = tmp_path / "changed.toml"
     changed.write_text(quick.read_text().replace(old, new))
     before = tables(uninterrupted)
@@ -278,23 +282,23 @@ def test_another_study_does_not_go_on_in_the_folder(quick, uninterrupted, tmp_pa
     assert tables(uninterrupted) == before
 
 
-def test_other_versions_do_not_go_on_with_a_study(quick, uninterrupted, monkeypatch):
+def test_other_package_versions_cannot_resume_a_study(quick, uninterrupted, monkeypatch):
     monkeypatch.setattr("flexneedle.study.folder.versions", lambda: {**versions(), "numba": "0.1"})
     with pytest.raises(InputError, match=rf"versions.numba is {versions()['numba']} in the folder, 0.1 now"):
         run_study(quick, uninterrupted, resume=True)
 
 
-def test_edited_code_does_not_go_on_with_a_study(quick, uninterrupted, monkeypatch):
+def test_edited_code_cannot_resume_a_study(quick, uninterrupted, monkeypatch):
     monkeypatch.setattr("flexneedle.study.folder.versions", lambda: {**versions(), "source": "0123456789ab"})
     with pytest.raises(InputError) as caught:
         run_study(quick, uninterrupted, resume=True)
     assert str(caught.value) == (
-        f"{uninterrupted}: cannot resume: the code of flexneedle is not that which began the study: "
+        f"{uninterrupted}: cannot resume: the code of flexneedle has changed since the start of the study: "
         f"versions.source is {versions()['source']} in the folder, 0123456789ab now"
     )
 
 
-def test_a_study_of_code_that_is_not_on_record_does_not_go_on(quick, uninterrupted, tmp_path):
+def test_a_study_without_a_recorded_code_version_cannot_resume(quick, uninterrupted, tmp_path):
     record = json.loads((uninterrupted / "study.json").read_text())
     del record["versions"]["source"], record["versions"]["pyarrow"]
     (tmp_path / "study.json").write_text(json.dumps(record))
@@ -304,7 +308,7 @@ def test_a_study_of_code_that_is_not_on_record_does_not_go_on(quick, uninterrupt
         run_study(quick, tmp_path, resume=True)
 
 
-def test_a_row_beyond_the_study_is_refused(quick, uninterrupted, tmp_path):
+def test_an_index_outside_the_study_is_rejected(quick, uninterrupted, tmp_path):
     out = shutil.copytree(uninterrupted, tmp_path / "a")
     text = (out / "journal.jsonl").read_text()
     beyond = json.loads(text.splitlines()[0]) | {"index": SIZE}
@@ -316,14 +320,14 @@ def test_a_row_beyond_the_study_is_refused(quick, uninterrupted, tmp_path):
     assert tables(out) == tables(uninterrupted)
 
 
-def test_a_name_that_is_too_long_for_a_folder_is_refused(quick, tmp_path):
+def test_a_folder_name_that_is_too_long_is_rejected(quick, tmp_path):
     with pytest.raises(InputError, match=r"a: cannot be written: File name too long$"):
         run_study(quick, tmp_path / ("a" * 300))
 
 
 @pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
-def test_a_study_that_was_killed_before_it_began_is_begun(quick, uninterrupted, tmp_path):
+def test_a_study_killed_before_its_start_is_started_by_resume(quick, uninterrupted, tmp_path):
     (tmp_path / "journal.jsonl").touch()
     assert tables(run_study(quick, tmp_path, resume=True)) == tables(uninterrupted)
 
@@ -331,18 +335,18 @@ def test_a_study_that_was_killed_before_it_began_is_begun(quick, uninterrupted, 
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        ({"workers": 0}, "workers = 0: must be a whole number, at least 1; leave it out for one per core"),
+        ({"workers": 0}, "workers = 0: must be a whole number, at least 1; omit it for one per core"),
         (
             {"workers": 1.5},
-            "workers = 1.5: must be a whole number, at least 1; leave it out for one per core",
+            "workers = 1.5: must be a whole number, at least 1; omit it for one per core",
         ),
         (
             {"workers": 1, "scheduler": "tcp://host:1"},
-            "workers = 1: is for this machine: leave it out with a scheduler",
+            "workers = 1: sets local processes: remove it, or remove the scheduler",
         ),
     ],
 )
-def test_workers_are_at_least_one_and_of_this_machine(quick, tmp_path, options, line):
+def test_workers_are_at_least_one_and_local(quick, tmp_path, options, line):
     with pytest.raises(InputError) as caught:
         run_study(quick, tmp_path / "a", **options)
     assert str(caught.value) == line
@@ -371,7 +375,7 @@ def test_the_summary_agrees_with_the_table(quick, uninterrupted):
     assert summary["groups"][-1]["true_error_mm"]["max"] == max(last)
 
 
-def test_the_summary_is_over_what_finished_and_counts_the_rest(quick, uninterrupted, tmp_path):
+def test_the_summary_is_over_finished_insertions_and_counts_the_others(quick, uninterrupted, tmp_path):
     table = pq.read_table(uninterrupted / "runs.parquet")
     changed = table.to_pylist()
     changed[0] |= {

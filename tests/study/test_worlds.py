@@ -1,4 +1,4 @@
-"""Studies of worlds: an axis of numbers, each with a scenario, a target and a phantom of its own, and a reach."""
+"""Studies of worlds: an axis of numbers, each with its own scenario, target, phantom and reach."""
 
 from dataclasses import replace
 
@@ -11,8 +11,8 @@ from flexneedle.scenario.worlds import CASES, world
 from flexneedle.study import rows
 from flexneedle.study.grid import load_study
 from flexneedle.study.plans import Plans, plan_key, truth_key
-from flexneedle.study.rows import Job, carry_out
-from flexneedle.study.runner import _bounding
+from flexneedle.study.rows import Job, run_job
+from flexneedle.study.runner import _reach_points
 from flexneedle.study.summary import is_failure
 from flexneedle.study.tables import write_tables
 from flexneedle.trace.results import RESULT_COLUMNS
@@ -59,8 +59,8 @@ def test_the_scenario_of_a_point_is_that_of_its_world_and_case(load):
         assert "world" not in point.varied
 
 
-def test_what_needs_a_guide_is_left_out_in_worlds_without_one(load):
-    """They are no insertions, and so no failures."""
+def test_insertions_that_need_a_guide_are_omitted_in_worlds_without_one(load):
+    """They are not insertions, and therefore not failures."""
     found = {(point.case, point.world, point.controller) for point in load().points}
     assert found == {
         *((case, GUIDED, name) for case in CASES for name in ("open-loop", "resolved-rate")),
@@ -75,13 +75,13 @@ def test_a_world_has_the_phantom_of_its_number_in_every_case_and_with_every_cont
     assert all(number == seed for number, seed in seeds)
 
 
-def test_repeats_have_phantoms_of_their_own(load):
+def test_repeats_have_their_own_phantoms(load):
     study = load("repeats = 3\nfirst_seed = 7\n" + STUDY)
     seeds = {study.insertion(index).seed for index in range(len(study))}
     assert seeds == {7 + 3 * number + repeat for number in (FREE, GUIDED) for repeat in range(3)}
 
 
-def test_other_worlds_may_be_asked_for(load):
+def test_other_worlds_can_be_requested(load):
     chosen = load(worlds=(100, 4))
     assert {point.world for point in chosen.points} == {100, 101, 102, 103}
     assert chosen.definition["axes"]["world"] == [100, 101, 102, 103]
@@ -96,18 +96,26 @@ FAR = '[[axes]]\nkey = "target"\nvalues = [[10, 50]]'
 @pytest.mark.parametrize(
     ("text", "worlds", "message"),
     [
-        (STUDY, (-1, 4), "worlds = -1, 4: must be a first number, 0 to 1000000000, and a count, 1 to 100000"),
-        (STUDY, (0, 0), "worlds = 0, 0: must be a first number"),
+        (
+            STUDY,
+            (-1, 4),
+            "worlds = -1, 4: must be the first number, 0 to 1000000000, and a count, 1 to 100000",
+        ),
+        (STUDY, (0, 0), "worlds = 0, 0: must be the first number"),
         (STUDY, (10**9, 2), "world = 1000000001: must be a whole number from 0 to 1000000000"),
-        (NAMED, (0, 2), "has no axis of worlds"),
+        (NAMED, (0, 2), "no axis of worlds: --worlds needs one"),
         (FRACTION, None, "values = [1.5]: must be whole numbers from 0 to 1000000000"),
         (
             'scenario = "phantom"' + STUDY,
             None,
-            'scenario = "phantom": leave it out: an axis gives the worlds',
+            'scenario = "phantom": remove it: an axis sets the worlds',
         ),
         (STUDY + FAR, None, "target.lateral_mm"),
-        (NAMED + "values = { world = 3 }", None, "values.world = 3: worlds are set by an axis"),
+        (
+            NAMED + "values = { world = 3 }",
+            None,
+            "values.world = 3: not allowed here: set worlds with an axis",
+        ),
         (NAMED + 'values = { world_case = "real" }', None, "world_case: needs an axis of worlds"),
         (ODD, None, 'world_case = "odd": must be one of perfect, real, structure'),
     ],
@@ -119,7 +127,7 @@ def test_a_study_of_worlds_that_cannot_be_is_refused(load, text, worlds, message
 
 
 @pytest.mark.long
-def test_the_shipped_study_has_two_hundred_worlds_that_nothing_was_chosen_on():
+def test_the_shipped_study_has_two_hundred_worlds_not_used_for_tuning():
     study = load_study("worlds")
     numbers = {point.world for point in study.points}
     assert numbers == set(range(100_000, 100_200))
@@ -130,17 +138,17 @@ def test_the_shipped_study_has_two_hundred_worlds_that_nothing_was_chosen_on():
         assert {point.world for point in points if point.controller == "open-loop"} == worlds
 
 
-def test_the_reach_is_found_once_for_all_controllers_of_a_world_and_case(load):
+def test_the_reach_is_computed_once_for_all_controllers_of_a_world_and_case(load):
     study = load()
-    bounding = [point for point in study.points if id(point) in _bounding(study)]
-    assert [(point.case, point.world) for point in bounding] == [
+    chosen = [point for point in study.points if id(point) in _reach_points(study)]
+    assert [(point.case, point.world) for point in chosen] == [
         *(("perfect", FREE), ("perfect", GUIDED), ("real", FREE), ("real", GUIDED), ("structure", GUIDED))
     ]
     assert len({truth_key(point) for point in study.points}) == 5
     assert len({plan_key(point) for point in study.points}) == 2
 
 
-def test_a_job_finds_the_reach_if_it_is_wanted(load, monkeypatch):
+def test_a_job_computes_the_reach_if_requested(load, monkeypatch):
     point = load().points[0]
     monkeypatch.setattr(
         rows,
@@ -149,13 +157,13 @@ def test_a_job_finds_the_reach_if_it_is_wanted(load, monkeypatch):
             (point.scenario is scenario and strategy == "manipulation") * seed * 0.1
         ),
     )
-    for bounded, expected in ((True, 0.5), (False, None)):
-        (row,) = carry_out(Job(point, None, "no plan", ((0, 5),), bounded)).rows
+    for with_reach, expected in ((True, 0.5), (False, None)):
+        (row,) = run_job(Job(point, None, "no plan", ((0, 5),), with_reach)).rows
         assert row["reach_mm"] == expected
         assert row["outcome"] == "error"
 
 
-def test_a_reach_that_fails_is_told_in_the_row_and_the_insertion_stands(load, monkeypatch):
+def test_a_failed_reach_is_recorded_and_does_not_change_the_outcome(load, monkeypatch):
     done = make_insertion()
 
     def reach(*_args):
@@ -164,17 +172,17 @@ def test_a_reach_that_fails_is_told_in_the_row_and_the_insertion_stands(load, mo
     monkeypatch.setattr(rows, "reach", reach)
     monkeypatch.setattr(rows, "_insertion", lambda *_args: done)
     monkeypatch.setattr(rows, "_times", lambda _insertion: {})
-    (row,) = carry_out(Job(load().points[0], done.plan, "", ((0, 5),), True)).rows
+    (row,) = run_job(Job(load().points[0], done.plan, "", ((0, 5),), True)).rows
     assert (row["outcome"], row["reason"]) == ("done", "no reach: ZeroDivisionError: nowhere")
     assert row["reach_mm"] is None
 
 
 def test_the_table_has_the_reach_in_every_row_of_the_same_truth(load, tmp_path):
-    """Whichever controller's insertion has found it; unknown where none has yet."""
+    """From whichever controller's insertion; unknown if none has computed it yet."""
     study = load()
     empty = {**dict.fromkeys(RESULT_COLUMNS), "outcome": "done", "reason": ""}
     found = {
-        index: {**empty, "index": index, "reach_mm": 0.1 * index if index in _bounding_rows(study) else None}
+        index: {**empty, "index": index, "reach_mm": 0.1 * index if index in _reach_rows(study) else None}
         for index in range(len(study) - 2)
     }
     write_tables(tmp_path, study, found, Plans(tmp_path / "plans"))
@@ -186,15 +194,15 @@ def test_the_table_has_the_reach_in_every_row_of_the_same_truth(load, tmp_path):
     assert {row["world_case"] for row in table} == {"perfect", "real"}
 
 
-def _bounding_rows(study):
-    return [index for index in range(len(study)) if id(study.insertion(index).point) in _bounding(study)]
+def _reach_rows(study):
+    return [index for index in range(len(study)) if id(study.insertion(index).point) in _reach_points(study)]
 
 
 @pytest.mark.parametrize(
     ("outcome", "reach", "failure"),
     [("done", 0.0, False), ("held", 0.3, True), ("refused", 1.2, False), ("failed", None, True)],
 )
-def test_a_refusal_is_a_failure_where_the_target_is_within_reach(outcome, reach, failure):
+def test_an_unfinished_insertion_is_a_failure_if_the_target_is_within_reach(outcome, reach, failure):
     assert is_failure({"outcome": outcome, "reach_mm": reach}) == failure
 
 

@@ -1,1 +1,1 @@
-"""The command line: reads arguments, calls, prints. It knows no physics."""
+"""The command line: parses arguments, calls the package, prints results; no physics."""

@@ -1,4 +1,4 @@
-"""`flexneedle emulate`: a device on a pseudo-terminal, to try and test without the real one."""
+"""`flexneedle emulate`: an emulated device on a pseudo-terminal, for tests without hardware."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the command to the parser of `flexneedle`."""
     parser = subparsers.add_parser(
         "emulate",
-        help="emulate a device, to try without hardware",
+        help="emulate a device, for tests without hardware",
         epilog=_EXAMPLES,
         formatter_class=HelpFormatter,
     )
@@ -27,8 +27,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     aurora = devices.add_parser(
         "aurora",
         help="an NDI Aurora on a pseudo-terminal",
-        description="Print the path of the emulated device and answer there until interrupted (Ctrl-C). "
-        "The tip moves along an arc; a line X Y Z on stdin (mm, in the tracker's frame) makes it rest there.",
+        description="Print the path of the emulated device and serve it until interrupted (Ctrl-C). "
+        "The tip moves along an arc; a line X Y Z on stdin (mm, tracker frame) stops it at that position.",
         epilog=_EXAMPLES,
         formatter_class=HelpFormatter,
     )
@@ -43,18 +43,20 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         action="append",
         default=[],
         metavar="KIND[=DETAIL]@SECONDS[:DURATION]",
-        help="fault, in seconds since tracking began; may be given several times. See docs/tracking/aurora.md",
+        help="inject a fault at SECONDS after the start of tracking; repeatable; see docs/tracking/aurora.md",
     )
-    aurora.add_argument("--still", action="store_true", help="the tip rests from the start")
+    aurora.add_argument("--still", action="store_true", help="start with the tip at rest")
     aurora.add_argument(
-        "--sensors", type=int, choices=range(1, 5), default=4, help="sensors plugged in (default: 4)"
+        "--sensors", type=int, choices=range(1, 5), default=4, help="number of connected sensors (default: 4)"
     )
     aurora.add_argument(
-        "--firmware", metavar="TEXT", help="freeze tag in the reply to VER (default: AURORA Rev 008)"
+        "--firmware", metavar="TEXT", help="firmware tag in the reply to VER (default: AURORA Rev 008)"
     )
-    aurora.add_argument("--no-bx", action="store_true", help="no binary readings (BX), as with old firmware")
     aurora.add_argument(
-        "--seed", type=seed, default=0, metavar="N", help="seed of jitter and garbled bytes (default: 0)"
+        "--no-bx", action="store_true", help="do not support binary readings (BX), as old firmware"
+    )
+    aurora.add_argument(
+        "--seed", type=seed, default=0, metavar="N", help="seed of jitter and corrupted bytes (default: 0)"
     )
     aurora.set_defaults(handler=_emulate_aurora)
 
@@ -72,17 +74,17 @@ def _emulate_aurora(args: argparse.Namespace) -> int:
     faults = [parse_fault(spec) for spec in args.fault]
     device = fresh(args.sensors, args.firmware or FIRMWARE, has_bx=not args.no_bx)
     with Serial(args.link) as serial:
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the link goes then, too
-        set_realtime_priority()  # a real one does not wait for this machine's other work
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the link is removed then too
+        set_realtime_priority()  # a real device does not wait for other processes on this machine
         try:
             print(serial.link, flush=True)
             session = EmulatorSession(
                 device, faults, args.seed, monotonic(), rest=CENTRE if args.still else None
             )
-            serve(session, serial, Orders(None if sys.stdin is None else sys.stdin.fileno()), _say)
+            serve(session, serial, Orders(None if sys.stdin is None else sys.stdin.fileno()), _print_line)
         except KeyboardInterrupt:
             return 0
 
 
-def _say(line: str) -> None:
+def _print_line(line: str) -> None:
     print(line, file=sys.stderr, flush=True)

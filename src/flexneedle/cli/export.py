@@ -1,4 +1,4 @@
-"""`flexneedle export`: the periods of a run, or the tracker's readings, for other programs."""
+"""`flexneedle export`: control periods or tracker readings of a run as CSV."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from flexneedle.console.common import HelpFormatter, examples
 from flexneedle.errors import InputError
 
 _PERIODS, _READINGS, _STDOUT = "periods.csv", "readings.csv", "-"
-_MORE = """
---csv: one row a control period, the columns of flexneedle.to_dataframe.
---readings: one row a reading of the tracker, the units in the header.
-  time_s, period, frame_number    when it was taken, in which control period it
-                                  came, the tracker's own count of frames
-  verdict                         ok, or why it was not used
-  x_mm, y_mm, z_mm                tip of the needle, in the frame of the stage
+_COLUMN_HELP = """
+--csv: one row per control period; columns as in flexneedle.to_dataframe.
+--readings: one row per tracker reading.
+  time_s, period, frame_number    time of measurement, control period of
+                                  arrival, frame number of the tracker
+  verdict                         ok, or the reason for the rejection
+  x_mm, y_mm, z_mm                needle tip in the stage frame
   NAME.x_mm, NAME.y_mm, NAME.z_mm, NAME.qw, NAME.qx, NAME.qy, NAME.qz,
-  NAME.indicator, NAME.status     each sensor (tip, ref1, ...) as the tracker
-                                  reports it, in the tracker's frame
-What is not known is empty. A tracker without frames has no sensors.
+  NAME.indicator, NAME.status     each sensor (tip, ref1, ...) as reported by
+                                  the tracker, in the tracker frame
+Unknown values are empty. A tracker without frames has no sensor columns.
 
 """
 _EXAMPLES = examples("flexneedle export runs/mine --csv", "flexneedle export runs/mine --readings - | head")
@@ -30,22 +30,22 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the command to the parser of `flexneedle`."""
     parser = subparsers.add_parser(
         "export",
-        help="export the control periods or the tracker's readings of a run",
-        epilog=_MORE + _EXAMPLES,
+        help="export the control periods or the tracker readings of a run",
+        epilog=_COLUMN_HELP + _EXAMPLES,
         formatter_class=HelpFormatter,
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run")
     what = parser.add_mutually_exclusive_group(required=True)
     for option, rows, default in (
         ("--csv", "control periods", _PERIODS),
-        ("--readings", "readings of the tracker", _READINGS),
+        ("--readings", "tracker readings", _READINGS),
     ):
         what.add_argument(
             option,
             nargs="?",
             const="",
             metavar="FILE",
-            help=f"{rows} as CSV, units in the header; {_STDOUT} is stdout (default: RUN/{default})",
+            help=f"export {rows} as CSV, units in the header; {_STDOUT}: stdout (default: RUN/{default})",
         )
     parser.set_defaults(handler=_export)
 

@@ -1,4 +1,4 @@
-"""`flexneedle insert`: plan an insertion and carry it out in closed loop."""
+"""`flexneedle insert`: plan an insertion and execute it in closed loop."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the command to the parser of `flexneedle`."""
     parser = subparsers.add_parser(
         "insert",
-        help="plan an insertion and carry it out in closed loop on the virtual phantom",
+        help="plan an insertion and execute it in closed loop on the virtual phantom",
         epilog=examples(
             "flexneedle insert phantom --target 35 -5 --seed 3",
             "flexneedle insert world:100012 --controller ce-mpc --phantom model --json",
@@ -46,42 +46,42 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--strategy",
         choices=("manipulation", "steering"),
         default="manipulation",
-        help="how to plan: manipulation moves guide and bevel, steering only the bevel (default: manipulation)",
+        help="planning strategy: manipulation moves guide and bevel, steering only the bevel (default: manipulation)",
     )
     parser.add_argument(
         "--plan-seed",
         type=seed,
         metavar="N",
-        help="seed of the plan (default: that of the insertion, --seed)",
+        help="seed of the planner (default: --seed)",
     )
     parser.add_argument(
         "--controller",
         metavar="NAME",
-        help="controller: a name (see --list), or module:METHOD for one of your own (default: adaptive-mpc)",
+        help="controller: a name from --list, or module:METHOD for your own (default: adaptive-mpc)",
     )
     parser.add_argument(
         "--phantom",
         metavar="KIND",
-        help="plant: exact, a finer formulation of its own with a rig's imperfections, or model, the controller's "
-        "formulation with other parameters; module:NAME for one of your own (default: exact)",
+        help="plant: exact, a separate finer formulation with the imperfections of a rig; model, the controller's "
+        "formulation with other parameters; or module:NAME for your own (default: exact)",
     )
     parser.add_argument(
         "--tracker",
         metavar="NAME",
-        help="what measures the tip: scenario, its tracker, or module:NAME for one of your own (default: scenario)",
+        help="tracker: scenario for that of the scenario, or module:NAME for your own (default: scenario)",
     )
     parser.add_argument(
         "--registration",
         type=Path,
         metavar="FILE",
-        help="registration of the tracker to the stage, a file of em register",
+        help="registration of the tracker to the stage, written by em register",
     )
     parser.add_argument("--list", action="store_true", help="list the controllers and exit")
     parser.add_argument(
         "--force",
         action="store_true",
-        help="insert even if the plan misses the target by more than 1 mm, and continue where the controller predicts "
-        "a miss beyond control.miss_limit_mm",
+        help="insert even if the plan misses the target by more than 1 mm, and do not hold if the predicted miss "
+        "exceeds control.miss_limit_mm",
     )
     parser.set_defaults(handler=_insert)
 
@@ -104,11 +104,11 @@ def _insert(args: argparse.Namespace) -> int:
     compile_first()
     folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
     with _refusal_printed(args, scenario, choices, folder):
-        insertion = _carried_out(folder, scenario, choices)
+        insertion = _execute(folder, scenario, choices)
     return _report(scenario, insertion, args.json, folder.path)
 
 
-def _carried_out(folder: Folder, scenario: Scenario, choices: Choices) -> Insertion:
+def _execute(folder: Folder, scenario: Scenario, choices: Choices) -> Insertion:
     from flexneedle.console.progress import Progress
     from flexneedle.runs.recording import record_insertion
     from flexneedle.types import Outcome
@@ -127,7 +127,7 @@ def _carried_out(folder: Folder, scenario: Scenario, choices: Choices) -> Insert
 def _refusal_printed(
     args: argparse.Namespace, scenario: Scenario, choices: Choices, folder: Folder | None = None
 ) -> Iterator[None]:
-    """With --json, print the object of an insertion that is refused or fails; the error is passed on."""
+    """With --json, print the object of an insertion that is refused or fails; the error is re-raised."""
     try:
         yield
     except FlexneedleError as error:
@@ -137,7 +137,7 @@ def _refusal_printed(
 
 
 def _refusal(folder: Folder | None, scenario: Scenario, choices: Choices, reason: str) -> dict[str, Any]:
-    """The object of an insertion that ended with an error: as it is recorded, or without a plan."""
+    """The object of an insertion that ended with an error: the recorded result, or one without a plan."""
     from flexneedle.trace.results import NO_TIMING, refused_result
 
     run_dir = None if folder is None else str(folder.path)
@@ -167,7 +167,7 @@ def _list() -> int:
 
 
 class _InsertProgress:
-    """Shows the planner's iterations and the loop's periods as progress."""
+    """Progress of planner iterations and control periods."""
 
     def __init__(self, progress: Progress, scenario: Scenario) -> None:
         self._progress = progress
@@ -185,7 +185,7 @@ class _InsertProgress:
         depth = period.estimate[0]
         if period.warning and not self._warned:
             self._warned = True
-            self._progress.say(f"flexneedle: warning at {depth:.1f} mm: {period.warning}")
+            self._progress.print_line(f"flexneedle: warning at {depth:.1f} mm: {period.warning}")
         done = min(max(depth - self._start, 0.0), self._travel)
         self._progress.show("Inserting", done, self._travel, f"tip at {depth:.1f} mm")
 
@@ -195,7 +195,7 @@ def _report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Pat
     from flexneedle.types import Outcome
 
     if insertion.outcome is Outcome.INTERRUPTED:
-        print(f"flexneedle: interrupted: the record is in {folder}", file=sys.stderr)
+        print(f"flexneedle: interrupted; record: {folder}", file=sys.stderr)
         return 130
     if as_json:
         result, timing = insertion_result(insertion), insertion_timing(insertion)
@@ -213,19 +213,19 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
     rows = [
         ("controller", insertion.controller),
         ("phantom", insertion.phantom),
-        ("target, depth and lateral offset", f"{depth:g}, {lateral:g} mm"),
-        ("true distance from the target", _number(result["true_error_mm"], "mm")),
-        ("  by the tracker", _number(result["residual_mm"], "mm")),
-        ("  as planned", _number(result["planned_error_mm"], "mm")),
+        ("target (depth, lateral offset)", f"{depth:g}, {lateral:g} mm"),
+        ("true tip to target", _number(result["true_error_mm"], "mm")),
+        ("  measured", _number(result["residual_mm"], "mm")),
+        ("  planned", _number(result["planned_error_mm"], "mm")),
         *_registration(scenario, insertion),
-        ("energy in the true tissue", _number(result["strain_energy_mj"], "mJ")),
-        ("  as planned", _number(result["planned_strain_energy_mj"], "mJ")),
+        ("strain energy of the true tissue", _number(result["strain_energy_mj"], "mJ")),
+        ("  planned", _number(result["planned_strain_energy_mj"], "mJ")),
         ("bevel flips", str(insertion.flips)),
-        ("  as planned", str(insertion.plan.flips)),
+        ("  planned", str(insertion.plan.flips)),
         ("control periods", str(result["steps"])),
         *([("held", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
-        ("time of the plan", _number(timing["plan_seconds"], "s")),
-        ("time of a period, median", _number(timing["period_ms"]["p50"], "ms")),
+        ("planning time", _number(timing["plan_seconds"], "s")),
+        ("median period time", _number(timing["period_ms"]["p50"], "ms")),
     ]
     print_table(insertion.summary[:1].upper() + insertion.summary[1:], rows, folder)
 
@@ -236,8 +236,8 @@ def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, s
     if scenario.tracker.registration is None:
         return []
     error = expected_error(scenario.tracker.registration, (*insertion.target, 0.0))
-    return [("  expected error of the registration", _number(error, "mm"))]
+    return [("  expected registration error", _number(error, "mm"))]
 
 
 def _number(value: float | None, unit: str) -> str:
-    return "not known" if value is None else f"{value:.3f} {unit}"
+    return "unknown" if value is None else f"{value:.3f} {unit}"

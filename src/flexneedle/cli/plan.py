@@ -85,13 +85,13 @@ def _rows(plan: Plan) -> dict[str, str]:
     angle = plan.entry_angle
     depth, lateral = plan.target
     return {
-        "target, depth and lateral offset": f"{depth:g}, {lateral:g} mm",
-        "distance from the target": f"{plan.error_mm:.3f} mm",
-        "angle of entry": "none" if isnan(angle) else f"{degrees(angle):+.2f}°",
+        "target (depth, lateral offset)": f"{depth:g}, {lateral:g} mm",
+        "planned tip to target": f"{plan.error_mm:.3f} mm",
+        "entry angle": "none" if isnan(angle) else f"{degrees(angle):+.2f}°",
         "bevel flips": str(plan.flips),
-        "energy stored in the tissue": f"{plan.strain_energy[-1]:.3f} mJ",
+        "strain energy of the tissue": f"{plan.strain_energy[-1]:.3f} mJ",
         "cost": f"{plan.cost:.3f}",
         **{f"  {name}": f"{value:.3f}" for name, value in plan.terms.items()},
         "iterations": f"{plan.iterations}, {'converged' if plan.converged else 'not converged'}",
-        "time": f"{plan.seconds:.2f} s",
+        "planning time": f"{plan.seconds:.2f} s",
     }

@@ -1,4 +1,4 @@
-"""`flexneedle report`: statistics, figures and a page about a study."""
+"""`flexneedle report`: page, figures and statistics of a study."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the command to the parser of `flexneedle`."""
     parser = subparsers.add_parser(
         "report",
-        help="write a report on a study: a page and its figures",
-        description="Write a report on a study: a page and its figures. The study may be complete or interrupted "
-        "(Ctrl-C). One that is running, or was killed (kill -9), may have no tables yet: after kill -9, run "
-        "`flexneedle study` with --resume first.",
+        help="write the report of a study: an HTML page and its figures",
+        description="Write the report of a study: an HTML page and its figures. The study may be complete or "
+        "interrupted (Ctrl-C). A study that is running or was killed (kill -9) may have no tables yet: after kill -9, "
+        "run `flexneedle study` with --resume first.",
     )
     parser.add_argument("study", metavar="STUDY_DIR", type=Path, help="folder of the study")
     parser.add_argument(
@@ -25,7 +25,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--tuning",
         type=Path,
         metavar="DIR",
-        help="records of the controllers' tuning to show (default: those of the package)",
+        help="folder of the tuning records to show (default: those of the package)",
     )
     parser.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
     parser.epilog = examples(

@@ -25,7 +25,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     actions = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    every = actions.add_parser(
+    list_ = actions.add_parser(
         "list",
         help="list the presets",
         epilog=examples(
@@ -34,7 +34,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ),
         formatter_class=HelpFormatter,
     )
-    every.set_defaults(handler=_list)
+    list_.set_defaults(handler=_list)
 
     show = actions.add_parser(
         "show",
@@ -52,8 +52,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     check = actions.add_parser(
         "check",
         help="check a scenario: one line for each problem, exit status 2",
-        description="Check a scenario. One line on stderr for each problem, exit status 2; one for each value that is "
-        "an order of magnitude off those of needles and tissues, is not used or has another name now, exit status 0.",
+        description="Check a scenario. One line on stderr for each problem, exit status 2. A warning, exit status 0, "
+        "for each value that is not used, has been renamed, or is an order of magnitude outside the usual range.",
         epilog=examples(
             "flexneedle scenario check mine.toml --strict",
             "flexneedle scenario check mine.toml --controller follow_path:METHOD",
@@ -62,7 +62,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     check.add_argument("scenario", metavar="SCENARIO", help="path, preset name or world:NUMBER")
     _add_controller(check)
-    check.add_argument("--strict", action="store_true", help="exit status 2 for a warning, too")
+    check.add_argument("--strict", action="store_true", help="exit status 2 for warnings too")
     check.set_defaults(handler=_check)
 
     schema = actions.add_parser(
@@ -83,7 +83,7 @@ def _add_controller(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="module:METHOD",
-        help="a controller of your own whose table the scenario may have; may be given several times",
+        help="your own controller, whose table the scenario may contain; repeatable",
     )
 
 
@@ -121,7 +121,7 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def _checked(args: argparse.Namespace) -> Scenario:
-    """The scenario with all defaults, those of the controllers too."""
+    """Return the scenario with all defaults, including those of the controllers."""
     from flexneedle.control.methods import checked
     from flexneedle.rig.parts import controller_of
     from flexneedle.scenario.files import load_scenario

@@ -1,4 +1,4 @@
-"""`flexneedle study`: many insertions, on all cores or on a cluster, into tables."""
+"""`flexneedle study`: run many insertions on all cores or on a cluster and write tables."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from flexneedle.study.runner import Advance
 
 
-_TABLE_WIDTH = 120  # a row stays a row where it is piped to a file
+_TABLE_WIDTH = 120  # at least, so that rows are not wrapped in a file
 _STAGES = ("Planning", "Inserting")
 
 
@@ -26,25 +26,27 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the command to the parser of `flexneedle`."""
     parser = subparsers.add_parser(
         "study",
-        help="carry out many insertions and keep them in tables",
+        help="run many insertions and write their results to tables",
         epilog=examples(
             "flexneedle study phantom --out runs/accuracy",
             "flexneedle study mine.toml --workers 4 --out runs/mine --resume",
         ),
         formatter_class=HelpFormatter,
     )
-    parser.add_argument("study", metavar="STUDY", help="name of a shipped study, or path of a TOML file")
+    parser.add_argument("study", metavar="STUDY", help="name of a shipped study, or path to a TOML file")
     parser.add_argument(
         "--worlds",
         nargs=2,
         type=int,
         metavar=("FROM", "COUNT"),
-        help="first number and count of worlds, for a study of worlds (default: those of its file)",
+        help="number of the first world and count, for a study of worlds (default: as in the study file)",
     )
     parser.add_argument(
-        "--workers", type=_workers, metavar="N", help="processes on this machine (default: one per core)"
+        "--workers", type=_workers, metavar="N", help="number of local processes (default: one per core)"
     )
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="run on the Dask cluster of this scheduler")
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="run on the Dask cluster at this scheduler address"
+    )
     parser.add_argument("--resume", action="store_true", help="resume the study in --out")
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the study (default: runs/<date>-study-<name>)"
@@ -68,9 +70,9 @@ def _study(args: argparse.Namespace) -> int:
     from flexneedle.trace.files import new_folder
 
     if args.resume and args.out is None:
-        raise InputError("--resume needs the folder of the study: give it with --out DIR")
+        raise InputError("--resume needs the folder of the study: add --out DIR")
     if args.workers is not None and args.scheduler is not None:
-        raise InputError("--workers is for this machine: leave it out with --scheduler")
+        raise InputError("--workers sets local processes: remove it, or remove --scheduler")
     if args.scheduler is not None:
         check_address(args.scheduler)
     study = load_study(args.study, None if args.worlds is None else tuple(args.worlds))
@@ -79,7 +81,7 @@ def _study(args: argparse.Namespace) -> int:
     begun = time.monotonic()
     try:
         with Progress() as progress:
-            progress.say(f"{study.title}: {len(study)} insertions, in {folder}")
+            progress.print_line(f"{study.title}: {len(study)} insertions, folder {folder}")
             run_study(
                 study,
                 folder,
@@ -87,7 +89,7 @@ def _study(args: argparse.Namespace) -> int:
                 scheduler=args.scheduler,
                 resume=args.resume,
                 on_advance=_StudyProgress(progress).advance,
-                on_no_workers=lambda: progress.say(f"{args.scheduler} has no workers yet: waiting for them"),
+                on_no_workers=lambda: progress.print_line(f"{args.scheduler}: no workers yet, waiting"),
                 command=_command(args, folder),
             )
     except KeyboardInterrupt:
@@ -98,22 +100,22 @@ def _study(args: argparse.Namespace) -> int:
     return _report(study, folder, args.json, time.monotonic() - begun)
 
 
-def _command(args: argparse.Namespace, folder: Path, *more: str) -> str:
-    """The command line, as it can be given again."""
+def _command(args: argparse.Namespace, folder: Path, *options: str) -> str:
+    """The command line, with the folder and further options."""
     words = ["flexneedle", "study", args.study]
     words += ["--worlds", *map(str, args.worlds)] if args.worlds is not None else []
     words += ["--workers", str(args.workers)] if args.workers is not None else []
     words += ["--scheduler", args.scheduler] if args.scheduler is not None else []
-    return shlex.join([*words, "--out", str(folder), *more])
+    return shlex.join([*words, "--out", str(folder), *options])
 
 
 class _StudyProgress:
-    """Turns what the runner reports into progress, with rate and time left."""
+    """Shows the progress reports of the runner, with rate and remaining time."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
         self._planning, self._inserting = _Pace(), _Pace()
-        self._planned = False  # reported that no plan is missing
+        self._planned = False  # whether completed planning has been shown
 
     def advance(self, advance: Advance) -> None:
         planning, inserting = _STAGES
@@ -125,21 +127,21 @@ class _StudyProgress:
             self._progress.show(planning, total if self._planned else advance.plans, total, note)
         note = f"{advance.insertions} of {advance.all_insertions}"
         note += self._inserting.left(advance.insertions, advance.all_insertions)
-        note += f", {advance.unfinished} not done" if advance.unfinished else ""
+        note += f", {advance.unfinished} not finished" if advance.unfinished else ""
         self._progress.show(inserting, advance.insertions, advance.all_insertions, note)
 
 
 class _Pace:
-    """How fast a stage goes. It is timed from the first that is in: neither work before nor other stages count."""
+    """Rate of a stage, timed from its first completed item; earlier runs and other stages do not count."""
 
     def __init__(self) -> None:
-        self._before: int | None = None  # done by an earlier run of the study
-        self._first: tuple[float, int] | None = None  # when the first was in, and how many there were then
+        self._before: int | None = None  # completed by an earlier run of the study
+        self._first: tuple[float, int] | None = None  # time and count at the first completion
 
     def left(self, done: int, total: int) -> str:
-        """Return rate and time left as an addition to a note, empty while they are not known."""
+        """Return rate and remaining time to append to a note; empty while unknown."""
         rate = self._rate(time.monotonic(), done)
-        return f", {rate:.2g} a second, {_duration((total - done) / rate)} left" if rate else ""
+        return f", {rate:.2g} per second, {_duration((total - done) / rate)} left" if rate else ""
 
     def _rate(self, now: float, done: int) -> float:
         if self._before is None:
@@ -170,7 +172,7 @@ def _report(study: Study, folder: Path, as_json: bool, seconds: float) -> int:
         return 0
     if summary["first_failure"] is not None:
         message = printable(summary["first_failure"])
-        print(f"flexneedle: no insertion was done; the first ended so: {message}", file=sys.stderr)
+        print(f"flexneedle: no insertion finished; the first failure: {message}", file=sys.stderr)
     return 1
 
 
@@ -183,7 +185,7 @@ def _table(summary: Mapping[str, Any]) -> None:
     console = Console(soft_wrap=True, highlight=False)
     console.width = max(console.width, _TABLE_WIDTH)
     table = Table(box=box.SIMPLE, show_edge=False)
-    heads = ("", "done", "mean ± sd", "median", "95 %", "max", "flips", "energy", "periods")
+    heads = ("", "finished", "mean ± sd", "median", "95 %", "max", "flips", "energy", "periods")
     for number, head in enumerate(heads):
         table.add_column(head, justify="right" if number else "left")
     for name, part in ((_label(group["settings"]), group) for group in summary["groups"]):
@@ -192,14 +194,16 @@ def _table(summary: Mapping[str, Any]) -> None:
     spent, unconverged = summary["time"], summary["unconverged_periods"]
     console.print(Text(summary["title"], style="bold"), table, sep="\n\n")
     console.print(
-        "\nOver the insertions that are done: true error in mm; flips with the plan's; mean tissue energy and most "
-        "periods over the plan's."
+        "\nFinished insertions: true error (mm); mean flips (planned); mean tissue energy and largest number of "
+        "periods, relative to the plan."
     )
     if unconverged:
-        console.print(f"{unconverged} periods did not converge: see unconverged_periods in the table.")
+        console.print(
+            f"{unconverged} periods did not converge: see column unconverged_periods of runs.parquet."
+        )
     console.print(
-        f"Work: {spent['plan_s']:.1f} s plan, {spent['control_s']:.1f} s control, {spent['plant_s']:.1f} s plant, "
-        f"{spent['rest_s']:.1f} s rest; {spent['wall_s']:.1f} s on the clock"
+        f"Time, all workers: planning {spent['plan_s']:.1f} s, control {spent['control_s']:.1f} s, "
+        f"plant {spent['plant_s']:.1f} s, other {spent['rest_s']:.1f} s; wall-clock time {spent['wall_s']:.1f} s"
     )
     console.print(Text(f"Tables: {summary['folder']}"))
 

@@ -1,4 +1,4 @@
-"""`flexneedle view`: draw the figures of a run again."""
+"""`flexneedle view`: redraw the figures of a run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the command to the parser of `flexneedle`."""
     parser = subparsers.add_parser(
         "view",
-        help="draw the figures of a run again, finished or not",
+        help="redraw the figures of a run, finished or not",
         epilog=examples(
             "flexneedle view runs/20260101T120000Z-phantom-0",
             "flexneedle view runs/mine",

@@ -1,1 +1,1 @@
-"""What commands share: arguments, progress, tables and JSON on stdout."""
+"""Shared by commands: arguments, progress, tables and JSON on stdout."""

@@ -1,4 +1,4 @@
-"""Arguments that several commands share, and how results reach stdout."""
+"""Arguments shared by several commands, and output of results on stdout."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class HelpFormatter(argparse.HelpFormatter):
-    """Wraps a text of one line, and keeps the lines of one that has several, such as `examples`."""
+    """Wraps single-line texts and keeps the line breaks of others, such as `examples`."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         if "\n" not in text:
@@ -22,28 +22,32 @@ class HelpFormatter(argparse.HelpFormatter):
 
 
 def examples(*lines: str) -> str:
-    """Return the end of a command's help: command lines that can be pasted."""
+    """Return the end of a command's help: example command lines."""
     return "\n".join(["examples:", *(f"  {line}" for line in lines)])
 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what `plan` and `insert` have in common."""
+    """Add the arguments common to `plan` and `insert`."""
     parser.add_argument(
         "scenario",
         metavar="SCENARIO",
         nargs="?",
         default="phantom",
-        help="preset name, world:NUMBER or path (default: phantom)",
+        help="preset name, world:NUMBER or path of a scenario (default: phantom)",
     )
     parser.add_argument(
         "--target",
         nargs=2,
         type=float,
         metavar=("X", "Y"),
-        help="depth and lateral offset of the target in mm (default: those of the scenario)",
+        help="depth and lateral offset of the target in mm (default: as in the scenario)",
     )
     parser.add_argument(
-        "--seed", type=seed, default=0, metavar="N", help="same seed, same result (default: 0)"
+        "--seed",
+        type=seed,
+        default=0,
+        metavar="N",
+        help="random seed; the same seed gives the same result (default: 0)",
     )
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the run (default: runs/<date>-<scenario>-<seed>)"
@@ -52,7 +56,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def seed(text: str) -> int:
-    """Return the seed of an argument. Raises what argparse prints."""
+    """Return the seed of an argument. Raises ArgumentTypeError for a negative one."""
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"{value}: must be at least 0")
@@ -60,7 +64,7 @@ def seed(text: str) -> int:
 
 
 def chosen_scenario(args: argparse.Namespace, *own: Method) -> Scenario:
-    """Return the scenario with the target that was asked for and all settings of controllers. Raises ScenarioError."""
+    """Return the scenario with the requested target and all controller settings. Raises ScenarioError."""
     from flexneedle.control.methods import used
     from flexneedle.scenario.files import load_scenario
 
@@ -72,7 +76,7 @@ def chosen_scenario(args: argparse.Namespace, *own: Method) -> Scenario:
 
 
 def compile_first() -> None:
-    """Compile the kernels; the first time takes a while, which is announced."""
+    """Compile the kernels, with a progress line if they are not in the cache."""
     from flexneedle.console.progress import Progress
     from flexneedle.rig.kernels import all_compiled, compile_kernels
 
@@ -83,7 +87,7 @@ def compile_first() -> None:
 
 
 def run_name(args: argparse.Namespace) -> str:
-    """Return the name of the scenario in the name of a folder."""
+    """Return the scenario name used in the name of the run folder."""
     return Path(args.scenario).stem
 
 
@@ -95,7 +99,7 @@ def print_json(values: Mapping[str, Any]) -> None:
 
 
 def print_table(title: str, rows: Iterable[Sequence[str]], folder: Path, heads: Sequence[str] = ()) -> None:
-    """Print a short table on stdout, and below it the folder of the record; heads name the columns of values."""
+    """Print a short table and the folder of the record on stdout; heads: names of the value columns."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -112,5 +116,5 @@ def print_table(title: str, rows: Iterable[Sequence[str]], folder: Path, heads: 
 
 
 def described(text: str, *lines: str) -> dict[str, Any]:
-    """Return what argparse needs for a command's description and the examples at the end of its help."""
+    """Return the argparse options for a description and the examples at the end of the help."""
     return {"description": text, "epilog": examples(*lines), "formatter_class": HelpFormatter}

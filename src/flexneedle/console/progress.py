@@ -1,4 +1,4 @@
-"""Progress on stderr: a bar in a terminal, a line now and then elsewhere."""
+"""Progress on stderr: a bar in a terminal, occasional lines otherwise."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 
-_LINES = 5  # of a stage, without a terminal
-_PAUSE_S = 60.0  # the longest without a line
+_LINES = 5  # per stage, without a terminal
+_MAX_SILENCE_S = 60.0  # between two lines, without a terminal
 
 
 class Progress:
-    """Shows how far named stages have come. Use it as a context."""
+    """Progress of named stages. Use as a context manager."""
 
     def __init__(self) -> None:
         self._bars = _bars() if sys.stderr.isatty() else None
         self._tasks: dict[str, TaskID] = {}
-        self._told: dict[str, int] = {}
+        self._printed: dict[str, int] = {}
         self._last = monotonic()
 
     def __enter__(self) -> Self:
@@ -36,43 +36,43 @@ class Progress:
         if self._bars is not None:
             self._bars.stop()
 
-    def say(self, line: str) -> None:
-        """Say a line that belongs to no stage."""
+    def print_line(self, line: str) -> None:
+        """Print a line that belongs to no stage."""
         if self._bars is None:
-            _tell(line)
+            _print_stderr(line)
         else:
             self._bars.console.print(line, markup=False, highlight=False)
 
     def begin(self, stage: str) -> None:
-        """Show a stage of which nothing is done yet."""
+        """Show a stage at its start."""
         if self._bars is None:
-            _tell(f"{stage} …")
+            _print_stderr(f"{stage} …")
         else:
             self._tasks[stage] = self._bars.add_task(stage, total=None, note="")
-        self._told[stage] = 0
+        self._printed[stage] = 0
 
     def show(self, stage: str, done: float, total: float, note: str) -> None:
-        """Show that `done` of `total` is done, with a short note."""
-        if stage not in self._told:
+        """Show that `done` of `total` is complete, with a short note."""
+        if stage not in self._printed:
             self.begin(stage)
         if self._bars is not None:
             self._bars.update(self._tasks[stage], completed=done, total=total, note=note)
-        elif (lines := int(_LINES * done / total + 1e-9)) > self._told[stage] or self._is_long_ago():
-            self._told[stage] = lines
+        elif (lines := int(_LINES * done / total + 1e-9)) > self._printed[stage] or self._is_overdue():
+            self._printed[stage] = lines
             self._last = monotonic()
-            _tell(f"{stage} {done / total:.0%}: {note}")
+            _print_stderr(f"{stage} {done / total:.0%}: {note}")
 
-    def _is_long_ago(self) -> bool:
-        return monotonic() > self._last + _PAUSE_S
+    def _is_overdue(self) -> bool:
+        return monotonic() > self._last + _MAX_SILENCE_S
 
     def finish(self, stage: str) -> None:
-        """Show a stage as done, whatever was left of it."""
+        """Show a stage as complete."""
         if self._bars is not None and stage in self._tasks:
             task = next(task for task in self._bars.tasks if task.id == self._tasks[stage])
             self._bars.update(task.id, total=task.total or 1.0, completed=task.total or 1.0)
 
 
-def _tell(line: str) -> None:
+def _print_stderr(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
@@ -81,7 +81,7 @@ def _bars() -> Bars:
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as Bars
 
-    # In a narrow terminal bar and times make room for the rest.
+    # In a narrow terminal, bar and times are shortened first.
     columns: tuple[Any, ...] = (
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),

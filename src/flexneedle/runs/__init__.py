@@ -1,1 +1,1 @@
-"""Run folders: plan and insert with a record on disk, and draw it again."""
+"""Run folders: plan and insert with a record on disk, read and draw it."""

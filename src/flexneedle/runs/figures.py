@@ -1,4 +1,4 @@
-"""The figures of a run, always drawn from its folder: what `view` draws later is what the run drew."""
+"""The figures of a run, always drawn from its folder, so that `view` reproduces them."""
 
 from pathlib import Path
 
@@ -11,13 +11,13 @@ from flexneedle.trace.folder import TRACE_FILE, read_run
 
 
 def draw_run(folder: Path) -> list[Path]:
-    """Draw `insertion.png` and `.svg`, or `plan.png` and `.svg` where nothing was inserted; return the paths.
+    """Draw `insertion.png` and `.svg`, or `plan.png` and `.svg` if there are no periods; return the paths.
 
-    Raises InputError if the folder holds no run, RunError if there is nothing to draw yet.
+    Raises InputError if the folder contains no run, RunError if there is nothing to draw yet.
     """
     run = read_run(folder)
     if not run.plans:
-        raise RunError(f"{folder}: nothing to draw: the run ended before it had a plan")
+        raise RunError(f"{folder}: nothing to draw: the run ended before planning finished")
     insertion = insertion_of(run)[0] if run.kind == "insertion" and (folder / TRACE_FILE).exists() else None
     if insertion is not None and insertion.periods:
         return save(insertion_figure(run.scenario, insertion), folder, "insertion")

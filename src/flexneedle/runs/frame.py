@@ -12,14 +12,14 @@ if TYPE_CHECKING:
 
 
 def to_dataframe(insertion: Insertion) -> "DataFrame":
-    """Return a pandas DataFrame with a row for each control period, the columns as `flexneedle export --csv` has them.
+    """Return a pandas DataFrame with one row per control period and the columns of `flexneedle export --csv`.
 
-    Units are those in the names; a number that is not known is NaN. Raises InputError for what is no insertion, and
-    where pandas is not installed.
+    Column names end in their unit; unknown numbers are NaN. Raises InputError for another type, or if pandas is not
+    installed.
     """
-    given = instance("insertion", insertion, Insertion, "make one with flexneedle.insert(scenario, plan)")
+    checked = instance("insertion", insertion, Insertion, "make one with flexneedle.insert(scenario, plan)")
     try:
         from pandas import DataFrame
     except ModuleNotFoundError:
         raise InputError("to_dataframe needs pandas, which is not installed: pip install pandas") from None
-    return DataFrame([to_values(period) for period in given.periods], columns=list(COLUMNS))
+    return DataFrame([to_values(period) for period in checked.periods], columns=list(COLUMNS))

@@ -1,4 +1,4 @@
-"""Read a run back from its folder: an insertion, finished or not, or plans."""
+"""Read a run from its folder: an insertion, finished or not, or plans."""
 
 import warnings
 from pathlib import Path
@@ -8,14 +8,14 @@ from flexneedle.trace.folder import TRACE_FILE, RunFile, read_run
 from flexneedle.trace.reader import read_trace
 from flexneedle.types import Insertion, Outcome, Plan
 
-_UNFINISHED = "the run was killed, or still goes on"
+_UNFINISHED = "the run was killed or is still running"
 
 
 def load(run_dir: str | Path) -> Insertion | Plan | dict[str, Plan]:
-    """Return what a folder of `flexneedle insert`, `flexneedle plan` or `flexneedle.save` holds.
+    """Return the record in a folder of `flexneedle insert`, `flexneedle plan` or `flexneedle.save`.
 
-    An insertion, as far as it went; a plan, or several by strategy. Warns (RuntimeWarning) of an unfinished trace.
-    Raises InputError if the folder holds no run or a damaged one, RunError if the run ended before it had a plan.
+    An insertion, complete or partial; a plan, or several by strategy. Warns (RuntimeWarning) of an unfinished trace.
+    Raises InputError if the folder contains no run or is damaged, RunError if the run ended before it had a plan.
     """
     run = _planned(read_run(Path(run_dir)))
     if run.kind == "insertion":
@@ -27,13 +27,13 @@ def load(run_dir: str | Path) -> Insertion | Plan | dict[str, Plan]:
 
 
 def load_insertion(folder: Path) -> tuple[Insertion, str]:
-    """Return the insertion of a folder, as far as it went, and a line about an unfinished trace or "".
+    """Return the insertion of a folder, complete or partial, and a line about an unfinished trace or "".
 
-    Raises InputError if the folder holds none, RunError if it ended before it had a plan.
+    Raises InputError if the folder contains none, RunError if it ended before it had a plan.
     """
     run = read_run(folder)
     if run.kind != "insertion":
-        raise InputError(f"{folder}: holds a {run.kind}, not an insertion")
+        raise InputError(f"{folder}: contains a {run.kind}, not an insertion")
     return insertion_of(_planned(run))
 
 
@@ -43,11 +43,11 @@ def insertion_of(run: RunFile) -> tuple[Insertion, str]:
     killed = run.status == "running"
     outcome, reason = (Outcome.INTERRUPTED, _UNFINISHED) if killed else (Outcome(run.status), run.reason)
     plan = next(iter(run.plans.values()))
-    how = (outcome, reason, run.controller, run.phantom, run.tracker, run.scenario)
-    return Insertion(plan, run.seed, trace.periods, *how), trace.note
+    ending = (outcome, reason, run.controller, run.phantom, run.tracker, run.scenario)
+    return Insertion(plan, run.seed, trace.periods, *ending), trace.note
 
 
 def _planned(run: RunFile) -> RunFile:
     if not run.plans:
-        raise RunError(f"{run.folder}: the run ended before it had a plan")
+        raise RunError(f"{run.folder}: the run ended before planning finished")
     return run

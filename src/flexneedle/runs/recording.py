@@ -1,4 +1,4 @@
-"""Plan and insert with a record on disk: what the commands `plan` and `insert` do."""
+"""Plan and insert with a record on disk: the work of the commands `plan` and `insert`."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,15 +18,17 @@ from flexneedle.trace.folder import Folder
 from flexneedle.types import Insertion, Outcome, Period, Plan
 
 OnIteration = Callable[[str, dict[str, Any]], None]
-"""Hears of each iteration of the planner: the strategy, and what `plan` tells."""
+"""Called after each iteration of the planner with the strategy and the report of the iteration."""
 OnPeriod = Callable[[Period], None]
+"""Called after each control period."""
 
 
 @dataclass(frozen=True)
 class Choices:
-    """How to plan and to insert. plan_seed: of the planner, None for `seed`; force: insert whatever the plan misses.
+    """Options of planning and insertion. plan_seed: seed of the planner, None for `seed`; force: insert even if the
+    plan misses the target.
 
-    controller, phantom, tracker: a name, or module:NAME. Raises InputError, with the choices, for an unknown one.
+    controller, phantom, tracker: a name, or module:NAME. Raises InputError with the valid choices for an unknown name.
     """
 
     seed: int
@@ -42,18 +44,18 @@ class Choices:
 
     @property
     def parts(self) -> dict[str, str]:
-        """What controls, what is controlled, what measures it: by name."""
+        """Names of controller, phantom and tracker."""
         return {"controller": self.controller, "phantom": self.phantom, "tracker": self.tracker}
 
 
 def record_plans(
     folder: Folder, scenario: Scenario, strategies: Sequence[str], seed: int, on_iteration: OnIteration
 ) -> dict[str, Plan]:
-    """Plan with each strategy and leave `run.json` and `plan.png`, `.svg` in the folder.
+    """Plan with each strategy and write `run.json` and `plan.png`, `.svg` to the folder.
 
-    An error or an interruption is marked in `run.json` and passed on.
+    An error or an interruption is recorded in `run.json` and re-raised.
     """
-    with _marked(folder):
+    with _status_recorded(folder):
         for strategy in strategies:
             _plan(folder, scenario, strategy, seed, on_iteration)
         finish_plans(folder)
@@ -61,7 +63,7 @@ def record_plans(
 
 
 def check_choices(scenario: Scenario, choices: Choices) -> None:
-    """Raise InputError for a controller that needs the guide where it may not move."""
+    """Raise InputError for a controller that needs the guide if the guide may not move."""
     check_guide(controller_of(choices.controller)[1], scenario.setup, choices.strategy)
 
 
@@ -73,14 +75,14 @@ def record_insertion(
     on_iteration: OnIteration,
     on_period: OnPeriod,
 ) -> Insertion:
-    """Plan, carry out, and leave `run.json`, `trace.mcap` and `insertion.png`, `.svg` in the folder.
+    """Plan, insert, and write `run.json`, `trace.mcap` and `insertion.png`, `.svg` to the folder.
 
-    An insertion that is interrupted (Ctrl-C) comes back with its periods and the outcome "interrupted". An
-    error, or an interruption of the planning, is marked in `run.json` and passed on; where there was a plan, the result
-    is there, too, with the outcome "refused", or "failed" once the needle has moved.
+    An insertion that is interrupted (Ctrl-C) is returned with its periods and the outcome "interrupted". An
+    error, or an interruption of planning, is recorded in `run.json` and re-raised; if there was a plan, the record
+    includes the result, with the outcome "refused", or "failed" once the needle has moved.
     """
     folder.values |= choices.parts
-    with _marked(folder):
+    with _status_recorded(folder):
         check_choices(scenario, choices)
         plan_seed = choices.seed if choices.plan_seed is None else choices.plan_seed
         plan = _plan(folder, scenario, choices.strategy, plan_seed, on_iteration)
@@ -127,8 +129,8 @@ def _insert(
 
 
 @contextmanager
-def _marked(folder: Folder) -> Iterator[None]:
-    """Mark in the folder how the block ended, if it did not end by itself, and draw what there is."""
+def _status_recorded(folder: Folder) -> Iterator[None]:
+    """If the block raises, record status and reason in the folder and draw the available figures."""
     try:
         yield
     except BaseException as error:

@@ -1,4 +1,4 @@
-"""What the folder of a run holds of plans and of an insertion, and a record written there at once."""
+"""Write plans and insertions to the folder of a run, step by step or at once."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,10 +13,10 @@ from flexneedle.types import Insertion, Plan, scenario_of
 
 
 def save(record: Plan | Insertion, folder: str | Path) -> Path:
-    """Write a plan or an insertion into a folder, as the commands do, and return the folder.
+    """Write a plan or an insertion to a folder, as the commands do, and return the folder.
 
-    The folder is made; `load`, `flexneedle view` and `flexneedle export` read it. Raises InputError for a folder that
-    holds a run already or cannot be made, and for a record that does not carry its scenario.
+    The folder is created; `load`, `flexneedle view` and `flexneedle export` read it. Raises InputError for a folder
+    that already contains a run or cannot be created, and for a record without its scenario.
     """
     scenario = scenario_of(record)
     if isinstance(record, Plan):
@@ -36,14 +36,14 @@ def save(record: Plan | Insertion, folder: str | Path) -> Path:
 
 
 def keep_plan(folder: Folder, plan: Plan) -> None:
-    """Write a plan, and the time that it took, into `run.json`."""
+    """Write a plan and its planning time to `run.json`."""
     folder.plans[plan.strategy] = plan
     folder.timing[plan.strategy] = plan_timing(plan)
     folder.write()
 
 
 def finish_plans(folder: Folder) -> None:
-    """Mark that all plans are made, and draw them."""
+    """Record that all plans are complete, and draw them."""
     folder.values["result"] = {name: plan_result(plan) for name, plan in folder.plans.items()}
     folder.end("done")
     draw_run(folder.path)
@@ -58,13 +58,13 @@ def open_trace(
 
 
 def note_result(folder: Folder, insertion: Insertion) -> None:
-    """Have result and times of an insertion in what is written next into `run.json`."""
+    """Add result and times of an insertion to the next write of `run.json`."""
     folder.values["result"] = insertion_result(insertion)
     folder.timing |= insertion_timing(insertion)
 
 
 def finish_insertion(folder: Folder, insertion: Insertion) -> None:
-    """Write how an insertion ended into `run.json`, and draw it."""
+    """Write the outcome of an insertion to `run.json`, and draw it."""
     note_result(folder, insertion)
     folder.end(insertion.outcome, insertion.reason)
     draw_run(folder.path)

@@ -1,1 +1,1 @@
-"""Studies: many insertions by a grid of conditions, and their report."""
+"""Studies: many insertions over a grid of conditions, and their report."""

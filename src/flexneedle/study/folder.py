@@ -1,6 +1,6 @@
-"""The folder of a study: `study.json`, `journal.jsonl`, `plans/`, and in the end the tables.
+"""The folder of a study: `study.json`, `journal.jsonl`, `plans/`, and the tables, written at the end.
 
-`study.json` says what is studied, with which versions, and the command that began it. It is written once.
+`study.json` contains the definition of the study, the package versions and the first command. It is written once.
 """
 
 import json
@@ -23,11 +23,11 @@ _SOURCE = "versions.source"
 
 
 def open_folder(path: Path, study: Study, resume: bool, command: str = "") -> Journal:
-    """Return the journal of a new study in the folder `path`, or with `resume` of the one that it holds.
+    """Return the journal of a new study in the folder `path`, or with `resume` of the study in it.
 
-    A folder that is empty, or not there, is begun in either case. Raises InputError if the folder holds
-    something else, a study without `resume`, another study, or one of other versions; or if another process
-    is at work on it.
+    An empty or missing folder starts a new study in either case. Raises InputError if the folder contains other
+    files, a study without `resume`, another study, or one of other package versions; or if another process is
+    writing to it.
     """
     try:
         _check(path, study, resume)
@@ -36,7 +36,7 @@ def open_folder(path: Path, study: Study, resume: bool, command: str = "") -> Jo
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     try:
-        _check(path, study, resume)  # again, now that no other process can begin one here
+        _check(path, study, resume)  # again, now that no other process can create one here
         if not (path / STUDY_FILE).exists():
             replace_file(path / STUDY_FILE, to_text({**_identity(study), "command": command}).encode())
     except BaseException:
@@ -53,15 +53,15 @@ def _check(path: Path, study: Study, resume: bool) -> None:
     if (path / STUDY_FILE).exists():
         if not resume:
             raise InputError(
-                f"{path}: holds a study already: go on with it by --resume, or give another --out"
+                f"{path}: already contains a study: add --resume to continue it, or set another --out"
             )
         _check_same(path, study)
     elif path.exists() and not (path.is_dir() and {item.name for item in path.iterdir()} <= {JOURNAL_FILE}):
-        raise InputError(f"{path}: is there already, and no empty folder: give another with --out")
+        raise InputError(f"{path}: exists and is not an empty folder: set another with --out")
 
 
 def _check_same(path: Path, study: Study) -> None:
-    """Raise InputError, with the first difference, unless the folder holds this study of these versions."""
+    """Raise InputError, with the first difference, unless the folder contains this study with these versions."""
     try:
         values = json.loads((path / STUDY_FILE).read_text(encoding="utf-8"))
         stored = {name: values[name] for name in ("format", "versions", "study")}
@@ -72,16 +72,18 @@ def _check_same(path: Path, study: Study) -> None:
         raise InputError(f"{path}: cannot resume: {key}")
 
 
-def _first_difference(stored: Mapping[str, Any], asked: Mapping[str, Any]) -> str | None:
-    there, here = flatten(stored), flatten(json.loads(json.dumps(asked)))
+def _first_difference(stored: Mapping[str, Any], current: Mapping[str, Any]) -> str | None:
+    there, here = flatten(stored), flatten(json.loads(json.dumps(current)))
     for key in there | here:
         if there.get(key) != here.get(key):
             name = key.removeprefix("study.")
-            before, now = (_told(values, key) for values in (there, here))
-            edited = "the code of flexneedle is not that which began the study: " if key == _SOURCE else ""
+            before, now = (_value_text(values, key) for values in (there, here))
+            edited = (
+                "the code of flexneedle has changed since the start of the study: " if key == _SOURCE else ""
+            )
             return printable(f"{edited}{name} is {before} in the folder, {now} now")
     return None
 
 
-def _told(values: Mapping[str, Any], key: str) -> str:
+def _value_text(values: Mapping[str, Any], key: str) -> str:
     return str(values[key]) if key in values else "not recorded"

@@ -1,4 +1,4 @@
-"""The grid of a study: every insertion that it asks for, in a fixed order, each with its scenario and seed."""
+"""The grid of a study: all its insertions in a fixed order, each with scenario and seed."""
 
 import itertools
 import json
@@ -58,16 +58,18 @@ _CHOICES = {
     WORLD_CASE: CASES,
 }
 _OWN = {"controller": controller_of, "plant": plant_of, "tracker": tracker_of}
-_MOST_INSERTIONS = 1_000_000
-_BESIDES = f"; besides: {', '.join(_DEFAULTS)}, {WORLD_CASE}, as an axis also {SEED}, {WORLD}"
+_MAX_INSERTIONS = 1_000_000
+_FURTHER_KEYS = (
+    f"; further keys of a study: {', '.join(_DEFAULTS)}, {WORLD_CASE}, as an axis also {SEED}, {WORLD}"
+)
 
 
 @dataclass(frozen=True)
 class GridPoint:
-    """A point of the grid: everything that its insertions share.
+    """A point of the grid: the settings shared by its insertions.
 
-    varied: what the axes chose, but for target and world; target_number: place of the target among those of the
-    study, or the number of its world; world: that number, None if the scenario is no world; world_case: which case.
+    varied: values of the axes except target and world; target_number: index of the target in the study, or number of
+    the world; world: that number, None if the scenario is not a world; world_case: case of the world.
     """
 
     scenario: Scenario
@@ -85,7 +87,7 @@ class GridPoint:
 
 @dataclass(frozen=True)
 class StudyInsertion:
-    """One insertion of a study: its row, its point, which repeat it is, and the seed of its phantom."""
+    """One insertion of a study: index of its row, grid point, number of the repeat, seed of the phantom."""
 
     index: int
     point: GridPoint
@@ -95,7 +97,7 @@ class StudyInsertion:
 
 @dataclass(frozen=True)
 class Study:
-    """A study, multiplied out. definition: all that it depends on, as plain values; seeds: of an axis, else ()."""
+    """An expanded study. definition: all its settings as plain values; seeds: values of an axis of seeds, else ()."""
 
     definition: Mapping[str, Any]
     points: tuple[GridPoint, ...]
@@ -105,12 +107,12 @@ class Study:
 
     @property
     def name(self) -> str:
-        """Name in the name of the folder."""
+        """Name, used in the name of the folder."""
         return str(self.definition["name"])
 
     @property
     def title(self) -> str:
-        """Title in tables and reports."""
+        """Title of tables and reports."""
         return str(self.definition["title"])
 
     def __len__(self) -> int:
@@ -119,8 +121,8 @@ class Study:
     def insertion(self, index: int) -> StudyInsertion:
         """Return the insertion of a row.
 
-        Without an axis of seeds, every target (or world) and repeat has a phantom of its own, and the same one at
-        every other setting of the study: comparisons are paired.
+        Without an axis of seeds, every target (or world) and repeat has its own phantom, which is the same at all
+        other settings of the study: comparisons are paired.
         """
         number, repeat = divmod(index, self.repeats)
         point = self.points[number]
@@ -129,33 +131,33 @@ class Study:
 
 
 def load_study(source: str | Path | Study, worlds: tuple[int, int] | None = None) -> Study:
-    """Return the study of a shipped name or a TOML file; a study is returned as it is.
+    """Return the study of a shipped name or a TOML file; a Study is returned unchanged.
 
-    worlds: first number and count, instead of those of the file's axis of worlds.
+    worlds: first number and count, in place of those of the axis of worlds.
     Raises InputError with one line for each problem: file, key, value, rule.
     """
     if isinstance(source, Study):
         return source
     file, home, label = read_study(source)
     try:
-        return _multiplied(file if worlds is None else of_worlds(file, *worlds), base_of(file, home))
+        return _expanded(file if worlds is None else of_worlds(file, *worlds), base_of(file, home))
     except InputError as error:
         raise InputError("\n".join(f"{label}: {line}" for line in str(error).splitlines())) from None
 
 
-def _multiplied(file: StudyFile, base: Scenario) -> Study:
-    axes = {axis.key: _values(axis) for axis in file.axes}
+def _expanded(file: StudyFile, base: Scenario) -> Study:
+    axes = {axis.key: _axis_values(axis) for axis in file.axes}
     seeds = tuple(axes.pop(SEED, ()))
     repeats = len(seeds) or file.repeats
-    wanted = math.prod((len(file.cases) or 1, repeats, *map(len, axes.values())))
-    if wanted > _MOST_INSERTIONS:
-        raise InputError(f"asks for {wanted} insertions: must be at most {_MOST_INSERTIONS}")
+    total = math.prod((len(file.cases) or 1, repeats, *map(len, axes.values())))
+    if total > _MAX_INSERTIONS:
+        raise InputError(f"insertions = {total}: must be at most {_MAX_INSERTIONS}")
     fixed = _DEFAULTS | settings_of(file.values)
     cases = {case.name: settings_of(case.values) for case in file.cases}
-    given = {key: _given(key, fixed, cases, axes) for key in _OWN}
-    own = own_controllers(given["controller"])
+    names = {key: _values_of(key, fixed, cases, axes) for key in _OWN}
+    own = own_controllers(names["controller"])
     base = checked(base, *own)
-    _check_left_out(file.without, base)
+    _check_without(file.without, base)
     points = tuple(_points(base, dict.fromkeys(file.without), fixed, cases or {"": {}}, axes, own))
     definition = {
         "name": file.name,
@@ -169,22 +171,22 @@ def _multiplied(file: StudyFile, base: Scenario) -> Study:
         "first_seed": file.first_seed,
         "seeds": list(seeds),
         "insertions": len(points) * repeats,
-        "own": digests(name for names in given.values() for name in names),
+        "own": digests(name for of_key in names.values() for name in of_key),
     }
     return Study(plain(definition), points, repeats, file.first_seed, seeds)
 
 
-def _given(
+def _values_of(
     key: str,
     fixed: Mapping[str, Any],
     cases: Mapping[str, Mapping[str, Any]],
     axes: Mapping[str, list[Any]],
 ) -> list[Any]:
-    """All values that a study gives to a key."""
+    """All values of a key in a study."""
     return [fixed[key], *(case[key] for case in cases.values() if key in case), *axes.get(key, ())]
 
 
-def _values(axis: Axis) -> list[Any]:
+def _axis_values(axis: Axis) -> list[Any]:
     if axis.key in _CHOICES and axis.values == ALL:
         return list(_CHOICES[axis.key])
     if isinstance(axis.values, dict):
@@ -193,10 +195,10 @@ def _values(axis: Axis) -> list[Any]:
     return list(axis.values)
 
 
-def _check_left_out(keys: tuple[str, ...], base: Scenario) -> None:
+def _check_without(keys: tuple[str, ...], base: Scenario) -> None:
     for key in keys:
         if key not in base.flat():
-            raise InputError(f"without = {json.dumps(key)}: the scenario has no such value")
+            raise InputError(f"without = {json.dumps(key)}: not a key of the scenario")
 
 
 def _points(
@@ -207,22 +209,22 @@ def _points(
     axes: Mapping[str, list[Any]],
     own: tuple[Method, ...],
 ) -> Iterator[GridPoint]:
-    """Yield the points: cases vary slowest, then the axes in their order; later settings go over earlier ones."""
+    """Yield the points: cases vary slowest, then the axes in order; later settings override earlier ones."""
     targets: dict[tuple[float, float], int] = {}
-    worlds = cache(world)  # a point each: every controller has the same ones
+    worlds = cache(world)  # the same worlds for every controller
     for case, values in itertools.product(cases, itertools.product(*axes.values())):
         chosen = dict(zip(axes, values, strict=True))
         settings = {**fixed, **cases[case], **settings_of(chosen)}
         named = {"case": case, **chosen} if case else chosen
-        where = printable(", ".join(f"{key} = {value}" for key, value in named.items()))
+        at = printable(", ".join(f"{key} = {value}" for key, value in named.items()))
         run = {key: settings.pop(key) for key in _DEFAULTS}
         number, world_case = settings.pop(WORLD, None), settings.pop(WORLD_CASE, REAL)
         _check_run(run | {WORLD_CASE: world_case})
         if number is not None and _is_skipped(worlds(number), run["controller"], world_case):
             continue
         start = base if number is None else worlds(number, world_case)
-        scenario = _varied(start, {**left_out, **settings}, own, where)
-        _check_guide(run, scenario, where)
+        scenario = _varied(start, {**left_out, **settings}, own, at)
+        _check_guide(run, scenario, at)
         if number is None:
             number, of_world = targets.setdefault(scenario.target.position, len(targets)), {}
         else:
@@ -234,21 +236,21 @@ def _points(
 
 
 def _is_skipped(scenario: Scenario, controller: str, world_case: str) -> bool:
-    """Whether a world without a guide has no such case, or the controller nothing to steer with."""
+    """Whether a world without a guide lacks this case, or the controller needs a guide."""
     return not scenario.setup.has_guide and (
         world_case == STRUCTURE or controller_of(controller)[1].needs_guide
     )
 
 
-def _check_guide(run: Mapping[str, Any], scenario: Scenario, where: str) -> None:
+def _check_guide(run: Mapping[str, Any], scenario: Scenario, at: str) -> None:
     try:
         check_guide(controller_of(run["controller"])[1], scenario.setup, run["strategy"])
     except InputError as error:
-        raise InputError(f"{error}{_at(where)}") from None
+        raise InputError(f"{error}{_suffix(at)}") from None
 
 
-def _at(where: str) -> str:
-    return f" (at {where})" if where else ""
+def _suffix(at: str) -> str:
+    return f" (at {at})" if at else ""
 
 
 def _check_run(run: Mapping[str, Any]) -> None:
@@ -256,17 +258,17 @@ def _check_run(run: Mapping[str, Any]) -> None:
         if key in _OWN and is_own(run[key]):
             _OWN[key](run[key])
         elif run[key] not in choices:
-            more = ", or module:NAME of your own" if key in _OWN else ""
+            more = ", or module:NAME for your own" if key in _OWN else ""
             raise InputError(to_line(Problem(key, run[key], f"must be one of {', '.join(choices)}{more}")))
     if not is_seed(run["plan_seed"]):
         rule = f"must be a whole number from 0 to {LARGEST_SEED}"
         raise InputError(to_line(Problem("plan_seed", run["plan_seed"], rule)))
 
 
-def _varied(base: Scenario, settings: Mapping[str, Any], own: tuple[Method, ...], where: str) -> Scenario:
+def _varied(base: Scenario, settings: Mapping[str, Any], own: tuple[Method, ...], at: str) -> Scenario:
     try:
         return checked(base.with_values(settings), *own)
     except ScenarioError as error:
-        besides = (_BESIDES if "unknown key" in problem else "" for problem in error.problems)
-        lines = (problem + more + _at(where) for problem, more in zip(error.problems, besides, strict=True))
+        further = (_FURTHER_KEYS if "unknown key" in problem else "" for problem in error.problems)
+        lines = (problem + more + _suffix(at) for problem, more in zip(error.problems, further, strict=True))
         raise InputError("\n".join(lines)) from None

@@ -1,4 +1,4 @@
-"""The journal of a study: finished rows, a line each, added and never changed; it outlives any way to end."""
+"""The journal of a study: one line per finished row, append-only, so that it survives any interruption."""
 
 import fcntl
 import json
@@ -16,15 +16,14 @@ from flexneedle.trace.files import uninterrupted
 from flexneedle.trace.results import RESULT_COLUMNS
 
 _KINDS = {name: column.kind for name, column in RESULT_COLUMNS.items()} | TIMES
-_LARGEST = {int: 2**63 - 1, float: sys.float_info.max}  # of a column
+_LARGEST = {int: 2**63 - 1, float: sys.float_info.max}  # in a column
 
 
 class Journal:
-    """An open journal, which no other process can open; `rows` are the finished ones by index.
+    """An open journal, locked against other processes; `rows`: finished rows by index.
 
-    Numbers come back with all their digits. A last line that was torn is dropped: its row is done again.
-    size: rows of the study. Raises InputError if another process writes it, or if it is damaged. Use it as a
-    context.
+    Numbers keep all digits. An incomplete last line is dropped; its row is repeated. size: number of rows of the
+    study. Raises InputError if another process has the journal open, or if it is damaged. Use as a context manager.
     """
 
     def __init__(self, path: Path, size: int) -> None:
@@ -47,7 +46,7 @@ class Journal:
         self._file.close()
 
     def add(self, rows: Iterable[dict[str, Any]]) -> None:
-        """Add rows, and return when they are on the disk."""
+        """Add rows; returns once they are on disk."""
         added = list(rows)
         text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in added)
         with uninterrupted():
@@ -60,7 +59,7 @@ class Journal:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise InputError(f"{self._path.parent}: another process is at work on this study") from None
+            raise InputError(f"{self._path.parent}: another process is writing to this study") from None
 
     def _read(self) -> None:
         self._file.seek(0)
@@ -83,7 +82,7 @@ def _parsed(line: bytes) -> Any:
 
 
 def _fault(row: Any, size: int) -> str | None:
-    """Return what keeps a line's value from being a row of a study of this size, or None if nothing does."""
+    """Return why a value is not a row of a study of this size, or None for a valid row."""
     if not isinstance(row, dict):
         return "not a row in JSON"
     index = row.get("index")
@@ -93,11 +92,11 @@ def _fault(row: Any, size: int) -> str | None:
     if missing is not None:
         return f"{missing}: missing"
     wrong = next((name for name, kind in _KINDS.items() if not _fits(row.get(name), kind)), None)
-    return None if wrong is None else to_line(Problem(wrong, row[wrong], "of a wrong type, or too large"))
+    return None if wrong is None else to_line(Problem(wrong, row[wrong], "wrong type, or too large"))
 
 
 def _fits(value: Any, kind: type) -> bool:
-    """Whether a column of this kind can hold a value; numbers may be unknown."""
+    """Whether a value fits a column of this kind; numbers may be None."""
     if kind is str:
         return isinstance(value, str)
     if value is None:

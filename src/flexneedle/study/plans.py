@@ -1,4 +1,4 @@
-"""The plans of a study: one for all points that plan the same, kept as JSON beside the tables."""
+"""The plans of a study: one for all points with the same planner inputs, stored as JSON beside the tables."""
 
 import hashlib
 import json
@@ -8,53 +8,53 @@ from typing import Any
 from flexneedle.errors import InputError
 from flexneedle.planning.origin import SEEN_BY_THE_PLANNER
 from flexneedle.study.grid import GridPoint
-from flexneedle.study.rows import Planned
+from flexneedle.study.rows import PlanResult
 from flexneedle.trace.files import replace_file
 from flexneedle.trace.plain import plan_from_values, to_text
 from flexneedle.types import Plan
 
 
 def plan_key(point: GridPoint) -> str:
-    """Return the name of a point's plan: a digest of all that the planner sees."""
+    """Return the key of a point's plan: a digest of all planner inputs."""
     return _digest(point, (), point.strategy, point.plan_seed)
 
 
 def truth_key(point: GridPoint) -> str:
-    """Return a digest of all that the reach of a point's phantoms depends on, but for the seed."""
+    """Return a digest of all inputs of the reach of a point's phantoms, except the seed."""
     return _digest(point, ("phantom",), point.plant, point.strategy)
 
 
 def _digest(point: GridPoint, sections: tuple[str, ...], *settings: object) -> str:
     values = point.scenario.values()
-    seen = [{name: values[name] for name in (*SEEN_BY_THE_PLANNER, *sections)}, *settings]
-    return hashlib.sha256(json.dumps(seen, sort_keys=True).encode()).hexdigest()[:16]
+    inputs = [{name: values[name] for name in (*SEEN_BY_THE_PLANNER, *sections)}, *settings]
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:16]
 
 
 class Plans:
-    """Plans by key, in memory and in a folder. A point that has none (`refusals`) is planned again next time.
+    """Plans by key, in memory and in a folder. Points without a plan (`refusals`) are planned again on resume.
 
-    Raises InputError if what has the name of the folder is none.
+    Raises InputError if the path exists and is not a folder.
     """
 
     def __init__(self, folder: Path) -> None:
         if folder.exists() and not folder.is_dir():
-            raise InputError(f"{folder}: is no folder, which plans need: move it away")
+            raise InputError(f"{folder}: not a folder, needed for the plans: move it away")
         self._folder = folder
         self._made: dict[str, tuple[Plan, float]] = {}
         self.refusals: dict[str, str] = {}
 
     def plan(self, key: str) -> Plan | None:
-        """Return the plan of a key, as it stands on disk, or None if there is none (yet)."""
+        """Return the plan of a key as stored on disk, or None if there is none (yet)."""
         made = self._find(key)
         return made[0] if made else None
 
     def seconds(self, key: str) -> float | None:
-        """Return the seconds that a plan took, or None if there is no plan."""
+        """Return the planning time (s), or None if there is no plan."""
         made = self._find(key)
         return made[1] if made else None
 
-    def keep(self, key: str, planned: Planned) -> None:
-        """Keep what planning came to."""
+    def keep(self, key: str, planned: PlanResult) -> None:
+        """Store a plan, or the reason why there is none."""
         if planned.refusal:
             self.refusals[key] = planned.refusal
         else:

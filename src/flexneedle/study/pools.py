@@ -1,4 +1,4 @@
-"""Where a study runs: processes of this machine, or a Dask cluster; both are a `concurrent.futures.Executor`."""
+"""Executors of a study: local processes or a Dask cluster, both as `concurrent.futures.Executor`."""
 
 import multiprocessing
 import os
@@ -19,13 +19,13 @@ _ADDRESS = re.compile(r"(tcp|tls|ws|wss)://(\[[0-9A-Fa-f:.]+\]|[^\s/:@?#\[\]]+):
 
 
 def usable_cores() -> int:
-    """Return how many cores the process may use, where the system tells."""
+    """Return the number of cores available to this process, or of the machine if unknown."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
 def local(workers: int | None = None) -> Iterator[Executor]:
-    """Give a pool of worker processes (default: one for each usable core)."""
+    """Yield a pool of worker processes (default: one per usable core)."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers or usable_cores(), context, set_up) as pool:
         with _without_ctrl_c():
@@ -35,7 +35,7 @@ def local(workers: int | None = None) -> Iterator[Executor]:
 
 @contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Put off Ctrl-C, also in the processes that start meanwhile, until they have set themselves up."""
+    """Defer Ctrl-C, also in the processes that start in the meantime, until they are set up."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -44,7 +44,7 @@ def _without_ctrl_c() -> Iterator[None]:
 
 
 def check_address(address: str) -> None:
-    """Raise InputError unless this can be the address of a Dask scheduler."""
+    """Raise InputError unless this is a valid address of a Dask scheduler."""
     found = _ADDRESS.fullmatch(address)
     if found is None or not 1 <= int(found["port"]) <= _LAST_PORT:
         rule = "must be protocol://host:port, such as tcp://host:8786; protocols: tcp, tls, ws, wss"
@@ -53,11 +53,11 @@ def check_address(address: str) -> None:
 
 @contextmanager
 def cluster(address: str, on_no_workers: Callable[[], None] = lambda: None) -> Iterator[Executor]:
-    """Give the workers of the Dask scheduler at `address` (`tcp://host:8786`).
+    """Yield the workers of the Dask scheduler at `address` (`tcp://host:8786`) as an executor.
 
-    Its tasks are not pure: each is carried out, also where two look the same. `on_no_workers` is called if it has
-    none yet; tasks wait for them. Raises InputError for an address that cannot be one, or if the extra `cluster`
-    is not installed or no scheduler answers.
+    Tasks are submitted as impure, so that equal tasks are all executed. `on_no_workers` is called if there are no
+    workers yet; tasks wait for them. Raises InputError for an invalid address, if the extra `cluster` is not
+    installed, or if no scheduler responds.
     """
     check_address(address)
     with _client(address) as client:
@@ -73,11 +73,11 @@ def _client(address: str) -> Any:
         raise InputError("--scheduler needs Dask: pip install 'flexneedle[cluster]'") from None
     connect, secure = cast("Any", Client), cast("Any", Security)  # not typed
     security = secure()
-    # Asked here, as a client that fails for it takes long to close and says so on stderr.
+    # Checked here: a client that fails for this reason closes slowly and prints to stderr.
     if address.startswith("tls:") and security.get_connection_args("client")["ssl_context"] is None:
         raise InputError(f"{address}: needs a certificate: set distributed.comm.tls in Dask's configuration")
     try:
         return connect(address, timeout=_CONNECT_S, security=security, set_as_default=False)
-    except Exception as error:  # noqa: BLE001  Dask raises what it trips over in the answer of any server
+    except Exception as error:  # noqa: BLE001  Dask raises many types for the response of another server
         message = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(printable(f"{address}: no Dask scheduler answers: {message}")) from None
+        raise InputError(printable(f"{address}: no Dask scheduler responds: {message}")) from None

@@ -1,4 +1,4 @@
-"""How near to its target an insertion could come, whatever the controller (docs/worlds.md)."""
+"""The reach: smallest miss of an insertion that any controller could achieve (docs/worlds.md)."""
 
 import math
 
@@ -21,7 +21,7 @@ _SEARCH = {
     "plan.guide_weight": 0.0,
     "plan.flip_weight": 0.0,
 }
-"""At most 4000 rollouts, 14 times those of the longest decision of the default controller, for the miss alone."""
+"""Search for the smallest miss: up to 4000 rollouts, 14 times the longest decision of the default controller."""
 
 
 def reach(
@@ -30,12 +30,12 @@ def reach(
     phantom: str | PlantFactory = DEFAULT_PLANT,
     strategy: str = "manipulation",
 ) -> float:
-    """Return the miss (mm) that an ideal controller is left with in the insertion of a seed, to about 0.5 mm.
+    """Return the smallest miss (mm) of an ideal controller in the insertion of a seed, to about 0.5 mm.
 
-    strategy: of the plans, "manipulation" or "steering". Where guide or base may move: of the best that a search with
-    up to 4000 rollouts finds on the model with the phantom's true parameters. Where neither may: the distance from the
-    target to the interval between the ends of the plant inserted with its bevel always on one side and on the other; by
-    continuity all between them can be hit. NaN if the plant does not converge.
+    strategy: strategy of the plans, "manipulation" or "steering". If guide or base may move: the miss of the best plan
+    of a search with up to 4000 rollouts on the model with the phantom's true parameters. Otherwise: distance from the
+    target to the interval between the end points of the plant inserted with the bevel on either side; by continuity
+    all points between them can be reached. NaN if the plant does not converge.
     """
     truth = draw(scenario, np.random.default_rng(np.random.SeedSequence(seed).spawn(4)[0]))
     base_moves = scenario.plan.base_sigma_mm > 0.0 or scenario.plan.base_turn_sigma > 0.0
@@ -49,19 +49,19 @@ def reach(
 
 
 def straight_end(truth: Truth, bevel: int, phantom: str | PlantFactory, depth: float) -> tuple[float, float]:
-    """Return the tip (x, y) in mm of a plant inserted to a depth, base and bevel as they are, or at full stroke.
+    """Return the tip (x, y) in mm of a plant inserted to a depth, or to full stroke, without moving base or bevel.
 
     NaN if the plant does not converge.
     """
     setup = truth.scenario.setup
-    tank = Phantom(truth, bevel, phantom)
-    before = after = tank.condition()
+    specimen = Phantom(truth, bevel, phantom)
+    before = after = specimen.condition()
     moved = 0.0
     while after.tip[0] < depth and moved < setup.stroke_mm:
         step = min(setup.max_advance_mm, setup.stroke_mm - moved)
-        tank.apply((step, 0.0, 0.0, 0.0, -1), step / setup.insertion_speed_mm_s)
+        specimen.apply((step, 0.0, 0.0, 0.0, -1), step / setup.insertion_speed_mm_s)
         moved += step
-        before, after = after, tank.condition()
+        before, after = after, specimen.condition()
     if not after.converged:
         return math.nan, math.nan
     x = min(depth, float(after.tip[0]))

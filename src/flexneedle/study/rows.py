@@ -1,4 +1,4 @@
-"""What a worker does: plan, or carry out insertions and return a row for each. A failure is a row, too."""
+"""Jobs of a worker: plan, or run insertions and return a row for each. A failure is a row, too."""
 
 import fcntl
 import os
@@ -27,21 +27,21 @@ TIMES = {"control_s": float, "plant_s": float, "total_s": float}
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """Insertions of one point: (index, seed) of each. Without a plan, `refusal` says why there is none.
+    """Insertions of one point: (index, seed) of each; refusal: reason for a missing plan.
 
-    bounded: whether their reach is wanted; one of all points with the same truth is enough.
+    with_reach: whether to compute their reach; needed for one of all points with the same truth.
     """
 
     point: GridPoint
     plan: Plan | None
     refusal: str
     insertions: tuple[tuple[int, int], ...]
-    bounded: bool = False
+    with_reach: bool = False
 
 
 @dataclass(frozen=True)
-class Planned:
-    """A plan as plain values and the seconds that it took, or why there is none."""
+class PlanResult:
+    """A plan as plain values and its planning time (s), or the reason why there is none."""
 
     values: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
@@ -49,27 +49,27 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Done:
-    """Rows of a job, each with its index, results and times, and the versions of the worker."""
+class JobResult:
+    """Rows of a job, each with index, results and times, and the package versions of the worker."""
 
     rows: list[dict[str, Any]]
     versions: dict[str, str]
 
 
-def make_plan(point: GridPoint) -> Planned:
+def make_plan(point: GridPoint) -> PlanResult:
     """Plan for a point, on one thread."""
-    _ready()
+    _compile_once()
     try:
         made = plan(point.scenario, strategy=point.strategy, seed=point.plan_seed, threads=1)
-    except Exception as error:  # noqa: BLE001  whatever a plan fails with is said in each of its rows
-        return Planned(refusal=f"no plan: {_told(error)}")
-    return Planned(plan_values(made), made.seconds)
+    except Exception as error:  # noqa: BLE001  any failure of a plan is recorded in its rows
+        return PlanResult(refusal=f"no plan: {_error_text(error)}")
+    return PlanResult(plan_values(made), made.seconds)
 
 
-def carry_out(job: Job) -> Done:
-    """Carry out the insertions of a job, on one thread."""
-    _ready()
-    return Done([{"index": index, **_row(job, seed)} for index, seed in job.insertions], versions())
+def run_job(job: Job) -> JobResult:
+    """Run the insertions of a job, on one thread."""
+    _compile_once()
+    return JobResult([{"index": index, **_row(job, seed)} for index, seed in job.insertions], versions())
 
 
 def _row(job: Job, seed: int) -> dict[str, Any]:
@@ -83,13 +83,13 @@ def _row(job: Job, seed: int) -> dict[str, Any]:
             insertion = _insertion(job, job.plan, seed)
         except RunError as error:
             results |= {"outcome": "refused", "reason": str(error)}
-        except Exception as error:  # noqa: BLE001  one insertion must not end a study; its row says what it was
-            results["reason"] = _told(error)
+        except Exception as error:  # noqa: BLE001  recorded in the row: one insertion must not end a study
+            results["reason"] = _error_text(error)
         else:
             results |= insertion_row(insertion)
             times = _times(insertion)
     times["total_s"] = time.perf_counter() - begun
-    if job.bounded:
+    if job.with_reach:
         results["reach_mm"], failed = _reach(job.point, seed)
         results["reason"] = "; ".join(filter(None, (results["reason"], failed)))
     values: dict[str, Any] = plain(results | times)
@@ -97,17 +97,17 @@ def _row(job: Job, seed: int) -> dict[str, Any]:
 
 
 def _reach(point: GridPoint, seed: int) -> tuple[float | None, str]:
-    """The reach (mm), or why there is none: the insertion's own outcome stands."""
+    """The reach (mm), or the reason why it is unknown; the outcome of the insertion is not affected."""
     try:
         return reach(point.scenario, seed, point.plant, point.strategy), ""
-    except Exception as error:  # noqa: BLE001  as in an insertion
-        return None, f"no reach: {_told(error)}"
+    except Exception as error:  # noqa: BLE001  recorded in the row
+        return None, f"no reach: {_error_text(error)}"
 
 
 def _insertion(job: Job, made: Plan, seed: int) -> Insertion:
     point = job.point
     with warnings.catch_warnings():
-        # The study has checked its tables: that of another of its controllers is nothing to warn of.
+        # The study has checked all tables; a table of another of its controllers is not unused.
         warnings.simplefilter("ignore", ScenarioWarning)
         return insert(
             point.scenario,
@@ -128,14 +128,14 @@ def _times(insertion: Insertion) -> dict[str, float]:
     }
 
 
-def _told(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 @cache
-def _ready() -> None:
-    """Compile before the first work of a process; one process of a machine at a time, or the cache suffers."""
-    versions()  # while the source on the disk is what was loaded: it is looked at once
+def _compile_once() -> None:
+    """Compile the kernels once per process; locked, since parallel compilation could corrupt the cache."""
+    versions()  # digest of the source, read now while the files are still those that were imported
     with (Path(tempfile.gettempdir()) / f"flexneedle-{os.getuid()}.lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         compile_kernels()

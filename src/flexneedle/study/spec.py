@@ -1,4 +1,4 @@
-"""Study files: what is varied, read from TOML, every problem in one line."""
+"""Study files in TOML; every problem in one line."""
 
 from collections import Counter
 from collections.abc import Hashable, Iterator, Mapping
@@ -25,14 +25,14 @@ NAMED = ("controller", "plant", "strategy", WORLD_CASE)
 _TARGET = "target"
 _TARGET_KEYS = ("target.depth_mm", "target.lateral_mm")
 STUDIES = Library("a study file", "study", files(__package__) / "studies")
-_MOST_VALUES = 100_000
+_MAX_VALUES = 100_000
 LARGEST_SEED = 2**62
-"""A first seed and all that follow it fit into the 64 bits of a column."""
+"""Largest first seed: all following seeds of a study fit into a 64-bit column."""
 _LARGEST = {SEED: LARGEST_SEED, WORLD: LARGEST_WORLD}
 
 
 def is_seed(value: Any) -> bool:
-    """Whether a value is a whole number from 0 to `LARGEST_SEED`."""
+    """Whether a value is an integer from 0 to `LARGEST_SEED`."""
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= LARGEST_SEED
 
 
@@ -43,13 +43,13 @@ def _seed(value: int) -> int:
 
 
 class Axis(Section):
-    """One `[[axes]]`: a key and the values that it takes, each with each of the other axes'."""
+    """One `[[axes]]`: a key and its values; axes are combined in all ways."""
 
     key: Annotated[str, AfterValidator(current_key)]
     """A key of the scenario, or target, controller, plant, tracker, strategy, plan_seed, seed, world, world_case."""
     values: Any
-    """A list; "all" for every controller, plant, strategy or case of a world; {from, count} for seeds or worlds that
-    follow each other."""
+    """A list; "all" for every controller, plant, strategy or case of a world; {from, count} for consecutive seeds or
+    worlds."""
 
     @model_validator(mode="after")
     def _check_values(self) -> "Axis":
@@ -58,12 +58,12 @@ class Axis(Section):
 
 
 class Case(Section):
-    """One `[[cases]]`: values that are set together, under a name."""
+    """One `[[cases]]`: a named set of values."""
 
     name: Title
-    """In the column `case`."""
+    """Name in the column `case`."""
     values: dict[str, Any] = Field(default_factory=dict)
-    """Values by dotted key; left out, the case is the base."""
+    """Values by dotted key; omitted: the base case."""
 
     @model_validator(mode="after")
     def _check_values(self) -> "Case":
@@ -72,22 +72,22 @@ class Case(Section):
 
 
 class StudyFile(Section):
-    """A study as its file says it; nothing is looked up or multiplied out yet."""
+    """Contents of a study file, before names are looked up and the grid is expanded."""
 
     name: Title
-    """In the name of the folder."""
+    """Name, used in the name of the folder."""
     title: Title = "Study"
-    """In tables and reports."""
+    """Title of tables and reports."""
     scenario: str = "phantom"
-    """The base: a preset's name, or a path from the folder of the study file."""
+    """Base scenario: name of a preset, or path relative to the folder of the study file."""
     without: Annotated[tuple[Annotated[str, AfterValidator(current_key)], ...], Field(strict=False)] = ()
-    """Keys of the base that are left out, such as diameters where a gauge is given."""
+    """Keys of the base to remove, for example diameters if a gauge is set."""
     values: dict[str, Any] = Field(default_factory=dict)
-    """Values by dotted key that hold for the whole study."""
+    """Values by dotted key for the whole study."""
     axes: Annotated[tuple[Axis, ...], Field(strict=False)] = ()
     cases: Annotated[tuple[Case, ...], Field(strict=False)] = ()
-    repeats: int = count(1, least=1, most=_MOST_VALUES)
-    """Insertions at each point of the grid, each with a seed of its own."""
+    repeats: int = count(1, least=1, most=_MAX_VALUES)
+    """Insertions at each point of the grid, each with its own seed."""
     first_seed: Annotated[int, AfterValidator(_seed)] = 0
     """Seed of the first insertion."""
 
@@ -106,7 +106,7 @@ class StudyFile(Section):
 
 
 def read_study(source: str | Path) -> tuple[StudyFile, Path, str]:
-    """Return the study of a shipped name or of a TOML file, the folder of the file, and its label in messages.
+    """Return the study of a shipped name or a TOML file, the folder of the file, and its label in messages.
 
     Raises FileError with one line for each problem: file, key, value, rule.
     """
@@ -115,16 +115,16 @@ def read_study(source: str | Path) -> tuple[StudyFile, Path, str]:
 
 
 def base_of(file: StudyFile, home: Path) -> Scenario:
-    """Return the base scenario of a study whose file lies in the folder `home`. Raises ScenarioError."""
+    """Return the base scenario of a study; home: folder of the study file. Raises ScenarioError."""
     return load_scenario(file.scenario if file.scenario in PRESETS.names() else home / file.scenario)
 
 
 def of_worlds(file: StudyFile, first: int, count: int) -> StudyFile:
-    """Return the study on other worlds. Raises InputError if it has no axis of worlds, or for numbers of none."""
+    """Return the study with other worlds. Raises InputError if it has no axis of worlds, or for invalid numbers."""
     if all(axis.key != WORLD for axis in file.axes):
-        raise InputError("has no axis of worlds")
-    if not (0 <= first <= LARGEST_WORLD and 1 <= count <= _MOST_VALUES):
-        rule = f"must be a first number, 0 to {LARGEST_WORLD}, and a count, 1 to {_MOST_VALUES}"
+        raise InputError("no axis of worlds: --worlds needs one")
+    if not (0 <= first <= LARGEST_WORLD and 1 <= count <= _MAX_VALUES):
+        rule = f"must be the first number, 0 to {LARGEST_WORLD}, and a count, 1 to {_MAX_VALUES}"
         raise InputError(f"worlds = {first}, {count}: {rule}")
     values = {"from": first, "count": count}
     axes = (Axis(key=WORLD, values=values) if axis.key == WORLD else axis for axis in file.axes)
@@ -132,7 +132,7 @@ def of_worlds(file: StudyFile, first: int, count: int) -> StudyFile:
 
 
 def settings_of(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values by dotted key, a target [depth, lateral] as the two keys of the scenario."""
+    """Return values by dotted key; a target [depth, lateral] becomes the two keys of the scenario."""
     flat = {current_key(key): value for key, value in flatten(values).items()}
     if _TARGET in flat:
         flat |= dict(zip(_TARGET_KEYS, flat.pop(_TARGET), strict=True))
@@ -140,7 +140,7 @@ def settings_of(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _keys_of(key: str) -> tuple[str, ...]:
-    """Return the keys that an axis sets."""
+    """Return the scenario keys of an axis."""
     return _TARGET_KEYS if key == _TARGET else (key,)
 
 
@@ -152,7 +152,7 @@ def _value_problems(key: str, values: Any) -> Iterator[Problem]:
     elif not isinstance(values, list) or not values:
         yield Problem("values", values, "must be a list of at least one value")
     elif (twice := _twice(values)) is not None:
-        yield Problem("values", values, f"has {twice!r} twice")
+        yield Problem("values", values, f"contains {twice!r} twice")
     elif key == _TARGET:
         yield from (problem for value in values for problem in _target_problems("values", value))
     elif key in _LARGEST and not all(is_seed(value) and value <= _LARGEST[key] for value in values):
@@ -160,7 +160,7 @@ def _value_problems(key: str, values: Any) -> Iterator[Problem]:
 
 
 def _twice(values: list[Any]) -> Any:
-    """Return a value that stands in a list twice, or None; equal numbers are the same value, 25 and 25.0 too."""
+    """Return a duplicate value of a list, or None; equal numbers are duplicates, also 25 and 25.0."""
     times = Counter(map(_comparable, values))
     return next((value for value in values if times[_comparable(value)] > 1), None)
 
@@ -170,22 +170,22 @@ def _comparable(value: Any) -> Hashable:
         return tuple(map(_comparable, value))
     if isinstance(value, dict):
         return frozenset((key, _comparable(item)) for key, item in value.items())
-    return (bool, value) if isinstance(value, bool) else value  # True is no 1 here
+    return (bool, value) if isinstance(value, bool) else value  # True is not equal to 1 here
 
 
 def _range_problems(values: dict[str, Any], largest: int) -> Iterator[Problem]:
     fine = set(values) == {"from", "count"} and all(map(is_seed, values.values()))
-    if not fine or not 1 <= values["count"] <= _MOST_VALUES or values["from"] > largest:
+    if not fine or not 1 <= values["count"] <= _MAX_VALUES or values["from"] > largest:
         rule = (
             f"must be a list, or {{from, count}}: from a whole number, 0 to {largest}, "
-            f"count 1 to {_MOST_VALUES}"
+            f"count 1 to {_MAX_VALUES}"
         )
         yield Problem("values", values, rule)
 
 
 def _target_problems(key: str, value: Any) -> Iterator[Problem]:
     if not isinstance(value, list) or len(value) != 2:
-        yield Problem(key, value, "a target must be two numbers, [depth, lateral] in mm")
+        yield Problem(key, value, "must be two numbers, [depth, lateral] in mm")
 
 
 def _settings_problems(values: Mapping[str, Any]) -> Iterator[Problem]:
@@ -193,41 +193,41 @@ def _settings_problems(values: Mapping[str, Any]) -> Iterator[Problem]:
     if _TARGET in flat:
         yield from _target_problems(f"values.{_TARGET}", flat[_TARGET])
     if SEED in flat:
-        rule = "seeds are set by first_seed and repeats, or by an axis"
+        rule = "not allowed here: set seeds with first_seed and repeats, or with an axis"
         yield Problem(f"values.{SEED}", flat[SEED], rule)
     if WORLD in flat:
-        yield Problem(f"values.{WORLD}", flat[WORLD], "worlds are set by an axis")
+        yield Problem(f"values.{WORLD}", flat[WORLD], "not allowed here: set worlds with an axis")
 
 
 def _case_problems(study: StudyFile) -> Iterator[Problem]:
     for name, times in Counter(case.name for case in study.cases).items():
         if times > 1:
-            yield Problem("cases", name, "two cases have this name")
+            yield Problem("cases", name, "names must be unique")
 
 
 def _key_problems(study: StudyFile) -> Iterator[Problem]:
-    """No key is set by two axes, or by an axis and a case."""
+    """Keys set by two axes, or by an axis and a case."""
     axes = Counter(key for axis in study.axes for key in _keys_of(axis.key))
     for key, times in axes.items():
         if times > 1:
-            yield Problem("axes", key, "two axes set this key")
+            yield Problem("axes", key, "set by two axes")
     for number, case in enumerate(study.cases):
         for key in settings_of(case.values):
             if key in axes:
-                yield Problem(f"cases.{number}.values", key, "an axis sets this key too")
+                yield Problem(f"cases.{number}.values", key, "also set by an axis")
 
 
 def _seed_problems(study: StudyFile) -> Iterator[Problem]:
     if any(axis.key == SEED for axis in study.axes):
         for key in sorted({"repeats", "first_seed"} & study.model_fields_set):
-            yield Problem(key, getattr(study, key), "leave it out: an axis gives the seeds")
+            yield Problem(key, getattr(study, key), "remove it: an axis sets the seeds")
 
 
 def _world_problems(study: StudyFile) -> Iterator[Problem]:
-    """An axis of worlds gives the scenarios; only worlds have cases."""
+    """An axis of worlds sets the scenarios; only worlds have cases."""
     axes = {axis.key for axis in study.axes}
     if WORLD in axes:
         for key in sorted({"scenario", "without"} & study.model_fields_set):
-            yield Problem(key, getattr(study, key), "leave it out: an axis gives the worlds")
+            yield Problem(key, getattr(study, key), "remove it: an axis sets the worlds")
     elif WORLD_CASE in axes.union(study.values, *(case.values for case in study.cases)):
         yield Problem(WORLD_CASE, None, "needs an axis of worlds")

@@ -1,4 +1,4 @@
-"""What a study came to: numbers from its tables, overall and for each group of settings."""
+"""Summary of a study: statistics of its tables, overall and for each group of settings."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -19,16 +19,16 @@ _Row = Mapping[str, Any]
 
 
 def summarise(folder: Path, study: Study) -> dict[str, Any]:
-    """Return outcomes, errors (mm), bevel turns, energy (mJ), periods and times (s) of a study's folder, plain.
+    """Return outcomes, errors (mm), bevel flips, energy (mJ), periods and times (s) of a study folder as plain values.
 
-    Statistics are over the insertions that finished and whose value is known, as in the report; unconverged
-    periods are those of all; failures are those that did not finish though the target was within 1 mm of the reach
-    (without a known reach, all that did not finish). `first_failure` has outcome and reason of the first that did
-    not finish, or None. Groups are the cases with all that the axes vary, but for targets, worlds and seeds;
-    without any of them there is none.
+    Statistics are over finished insertions with a known value, as in the report; unconverged periods are counted
+    over all insertions; failures are insertions that did not finish although the reach was at most 1 mm (all that
+    did not finish if the reach is unknown). `first_failure`: outcome and reason of the first insertion that did not
+    finish, or None. Groups are the combinations of cases and axis values, except targets, worlds and seeds; a study
+    without any has no groups.
     """
-    wanted = ["index", "outcome", "true_error_mm", "residual_mm", "flips", "planned_flips", _ENERGY]
-    wanted += [
+    columns = ["index", "outcome", "true_error_mm", "residual_mm", "flips", "planned_flips", _ENERGY]
+    columns += [
         _PLANNED_ENERGY,
         "periods",
         "planned_periods",
@@ -37,14 +37,14 @@ def summarise(folder: Path, study: Study) -> dict[str, Any]:
         "reason",
         _LIMIT,
     ]
-    rows = pq.read_table(folder / RUNS_FILE, columns=wanted).to_pylist()
+    rows = pq.read_table(folder / RUNS_FILE, columns=columns).to_pylist()
     result: dict[str, Any] = plain(
         {
             "study": study.name,
             "title": study.title,
             "folder": str(folder),
             "complete": len(rows) == len(study),
-            "first_failure": next((_told(row) for row in rows if row["outcome"] != "done"), None),
+            "first_failure": next((_failure_text(row) for row in rows if row["outcome"] != "done"), None),
             **_statistics(rows),
             "groups": [
                 {"settings": dict(settings), **_statistics(members)}
@@ -57,9 +57,9 @@ def summarise(folder: Path, study: Study) -> dict[str, Any]:
 
 
 def is_failure(row: _Row) -> bool:
-    """Whether an insertion did not finish though its target, as far as is known, was within 1 mm of the reach.
+    """Whether an insertion did not finish although its reach is unknown or at most 1 mm.
 
-    A held one is a failure up to the miss (mm) at which the scenario lets a controller hold.
+    For a held insertion the limit is at least `control.miss_limit_mm`, the miss at which a controller may hold.
     """
     reach, limit = row["reach_mm"], _WITHIN_REACH_MM
     if row["outcome"] == "held":
@@ -67,7 +67,7 @@ def is_failure(row: _Row) -> bool:
     return row["outcome"] != "done" and (reach is None or reach <= limit)
 
 
-def _told(row: _Row) -> str:
+def _failure_text(row: _Row) -> str:
     return f"{row['outcome']}: {row['reason']}" if row["reason"] else str(row["outcome"])
 
 
@@ -128,7 +128,7 @@ def _spread(values: Sequence[float | None]) -> dict[str, Any]:
 
 
 def _times(folder: Path) -> dict[str, float]:
-    """Seconds of work on one core; a plan counts once."""
+    """Times (s) of planning, control, plant and the rest, summed over all workers; a plan counts once."""
     rows = pq.read_table(folder / TIMING_FILE).to_pylist()
     plans = {row["plan"]: row["plan_s"] or 0.0 for row in rows}
     parts = {name: sum(row[f"{name}_s"] or 0.0 for row in rows) for name in ("control", "plant", "total")}

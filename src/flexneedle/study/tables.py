@@ -1,4 +1,4 @@
-"""The tables of a study in Parquet: a row an insertion, in the order of the grid, and times in a table apart."""
+"""The tables of a study in Parquet: one row per insertion, in grid order; times in a separate table."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -36,24 +36,26 @@ _TIMING = {"index": int, "plan": str, "plan_s": float, **TIMES}
 
 
 def write_tables(folder: Path, study: Study, rows: Mapping[int, Mapping[str, Any]], plans: Plans) -> None:
-    """Write `runs.parquet` and `timing.parquet` for the rows (by index) that there are.
+    """Write `runs.parquet` and `timing.parquet` for the finished rows (by index).
 
-    The bytes of `runs.parquet` depend on study and versions alone, not on who did which row when.
+    The bytes of `runs.parquet` depend only on study and versions, not on the assignment of rows to workers.
     """
     insertions = [study.insertion(index) for index in sorted(rows)]
     keys = {id(point): plan_key(point) for point in study.points}
-    of_plan = [keys[id(insertion.point)] for insertion in insertions]
+    plan_keys = [keys[id(insertion.point)] for insertion in insertions]
     results = _with_reach(insertions, [rows[insertion.index] for insertion in insertions])
-    _write(folder / RUNS_FILE, _runs(study, insertions, of_plan, results))
-    seconds = {key: plans.seconds(key) for key in set(of_plan)}
-    timing = [{**row, "plan": key, "plan_s": seconds[key]} for row, key in zip(results, of_plan, strict=True)]
+    _write(folder / RUNS_FILE, _runs(study, insertions, plan_keys, results))
+    seconds = {key: plans.seconds(key) for key in set(plan_keys)}
+    timing = [
+        {**row, "plan": key, "plan_s": seconds[key]} for row, key in zip(results, plan_keys, strict=True)
+    ]
     _write(folder / TIMING_FILE, pa.table(_columns(timing, _TIMING)))
 
 
 def _with_reach(
     insertions: Sequence[StudyInsertion], results: Sequence[Mapping[str, Any]]
 ) -> list[Mapping[str, Any]]:
-    """Return the results with the reach that one of the insertions with the same truth has found."""
+    """Return the results, each with the reach that was computed for the same truth."""
     digests = {id(i.point): "" if i.point.world is None else truth_key(i.point) for i in insertions}
     keys = [(digests[id(insertion.point)], insertion.seed) for insertion in insertions]
     known = {
@@ -65,20 +67,20 @@ def _with_reach(
 def _runs(
     study: Study,
     insertions: Sequence[StudyInsertion],
-    of_plan: Sequence[str],
+    plan_keys: Sequence[str],
     results: Sequence[Mapping[str, Any]],
 ) -> pa.Table:
     flats = {id(point): point.scenario.flat() for point in study.points}
     settings = [flats[id(insertion.point)] for insertion in insertions]
-    conditions = [_conditions(insertion, key) for insertion, key in zip(insertions, of_plan, strict=True)]
-    used = {f"version_{name}": [value] * len(insertions) for name, value in versions().items()}
+    conditions = [_conditions(insertion, key) for insertion, key in zip(insertions, plan_keys, strict=True)]
+    version_columns = {f"version_{name}": [value] * len(insertions) for name, value in versions().items()}
     cases = [{"index": insertion.index, "case": insertion.point.case} for insertion in insertions]
     return pa.table(
         _columns(cases, {"index": int, "case": str})
         | _columns(settings, _kinds(list(flats.values())))
         | _columns(conditions, {name: kind for name, (kind, _) in _CONDITIONS.items()})
         | _columns(results, {name: column.kind for name, column in RESULT_COLUMNS.items()})
-        | {name: pa.array(values, pa.string()) for name, values in used.items()}
+        | {name: pa.array(values, pa.string()) for name, values in version_columns.items()}
     )
 
 
@@ -95,7 +97,7 @@ def _type(kind: Any) -> pa.DataType:
 
 
 def _kinds(flats: Sequence[Mapping[str, Any]]) -> dict[str, type]:
-    """Return the type of each scenario value, in the order of the schema; a value that all leave out has none."""
+    """Return the type of each scenario value, in the order of the schema; values that no scenario has are omitted."""
     return {name: type(value) for flat in flats for name, value in flat.items()}
 
 

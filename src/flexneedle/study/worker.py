@@ -1,4 +1,4 @@
-"""What a worker process does first. Nothing here loads NumPy: its libraries read their settings as they load."""
+"""Setup of a worker process. Does not import NumPy, whose libraries read these settings when they are loaded."""
 
 import multiprocessing
 import os
@@ -9,14 +9,14 @@ _LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VEC
 
 
 def set_up() -> None:
-    """Use one thread, leave Ctrl-C to the parent, and end when the parent does, however it ends."""
+    """Use one thread, leave Ctrl-C to the parent, and exit when the parent exits for any reason."""
     os.environ.update(dict.fromkeys(_LIBRARIES, "1"))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """A killed parent closes no queue, on which its workers would wait for ever."""
+    """A killed parent does not close its queue, and its workers would wait forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
