@@ -57,7 +57,7 @@ def test_a_narrow_terminal_shows_complete_notes(monkeypatch):
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "80")
-    note = "9000 of 10005, 0.56 per second, 12 min 15 s left, 3 not finished"
+    note = "9000 of 10005, 0.56/s, 12 min 15 s left, 3 not finished"
     with Progress() as progress:
         progress.show("Inserting", 9000, 10005, note)
     assert f"{note}\n" in terminal.getvalue()

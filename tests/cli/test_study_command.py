@@ -66,7 +66,7 @@ def test_a_study_writes_tables_to_a_new_folder_and_prints_one(capsys, in_threads
     assert re.search(r"^ exact +2 of 2 +0\.\d{3} ± 0\.\d{3} ", out, re.MULTILINE)
     assert re.search(r"^ all +4 of 4 ", out, re.MULTILINE)
     assert out.endswith(f"Tables: runs/{folder.name}\n")
-    assert re.search(r"^Inserting 100%: 4 of 4, [\d.]+ per second, 0 s left$", err, re.MULTILINE)
+    assert re.search(r"^Inserting 100%: 4 of 4, [\d.]+/s, 0 s left$", err, re.MULTILINE)
     assert "Planning 100%: 2 of 2 plans" in err
     assert f"Two targets: 4 insertions, folder runs/{folder.name}\n" in err
     assert "\x1b" not in out + err
@@ -154,7 +154,7 @@ def test_the_rate_is_that_of_the_insertions_of_this_run(monkeypatch):
         now += later
     message = [note for stage, note in notes if stage == "Inserting"]
     assert message[:3] == [f"{done} of 100, 3 not finished" for done in (40, 40, 41)]
-    assert message[3] == "46 of 100, 0.5 per second, 1 min 48 s left, 3 not finished"
+    assert message[3] == "46 of 100, 0.5/s, 1 min 48 s left, 3 not finished"
 
 
 def test_unconverged_periods_are_reported(capsys, monkeypatch):

@@ -107,9 +107,9 @@ def test_planning_rate_and_remaining_time_are_from_the_plans_of_this_run(monkeyp
     planning, inserting = progress_of(monkeypatch, advances)
     assert [note for *_, note in planning] == [
         *("40 of 105 plans", "41 of 105 plans"),
-        "42 of 105 plans, 0.05 per second, 21 min 0 s left",
-        "45 of 105 plans, 0.1 per second, 10 min 0 s left",
-        "105 of 105 plans, 1.1 per second, 0 s left",
+        "42 of 105 plans, 0.05/s, 21 min 0 s left",
+        "45 of 105 plans, 0.1/s, 10 min 0 s left",
+        "105 of 105 plans, 1.1/s, 0 s left",
     ]
     assert {note for *_, note in inserting} == {"0 of 1050"}
 

@@ -198,7 +198,7 @@ def dots(ax, label):
     return [found for found in ax.collections if found.get_label() == label]
 
 
-TIP = "true tip at the end"
+TIP = "final true tip"
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -236,7 +236,7 @@ def test_every_finished_tip_is_a_dot_and_every_other_a_cross():
     ax = targeting_figure([panel]).axes[0]
     (tips,) = dots(ax, TIP)
     assert_allclose(tips.get_offsets(), panel.content.tips[panel.content.done])
-    (crosses,) = lines(ax, "tip of an insertion not finished")
+    (crosses,) = lines(ax, "final true tip, not finished")
     assert_allclose(crosses.get_xydata(), panel.content.tips[[0, 7]])
 
 
@@ -279,8 +279,8 @@ def test_rows_show_quartiles_median_mean_and_95_percent():
     row = samples()[3]
     ax = by_controller([row]).axes[0]
     errors = row.errors
-    assert_allclose(sorted(dots(ax, "an insertion")[0].get_offsets()[:, 0]), np.sort(errors))
-    assert_allclose(lines(ax, "middle half")[0].get_xdata(), np.quantile(errors, (0.25, 0.75)))
+    assert_allclose(sorted(dots(ax, "one insertion")[0].get_offsets()[:, 0]), np.sort(errors))
+    assert_allclose(lines(ax, "interquartile range")[0].get_xdata(), np.quantile(errors, (0.25, 0.75)))
     assert_allclose(lines(ax, "median")[0].get_xdata(), [np.median(errors)])
     assert_allclose(lines(ax, "mean")[0].get_xdata(), [errors.mean()])
     assert_allclose(lines(ax, "95 %")[0].get_xdata(), [np.quantile(errors, 0.95)] * 2)
@@ -299,7 +299,7 @@ def test_a_controller_has_one_colour_in_all_figures():
         energy_figure(energy_panels(2)),
     )
     for figure in figures:
-        label = TIP if figure is figures[0] else "an insertion"
+        label = TIP if figure is figures[0] else "one insertion"
         assert to_hex(dots(figure.axes[1], label)[0].get_facecolor()[0]) == color
     _, median = lines(sweep_figure(sweeps(2), "x", PLACES).axes[0], "median")
     assert median.get_color() == look(1).color
@@ -388,7 +388,7 @@ def test_differences_of_one_size_have_an_even_scale():
 def test_an_error_of_nothing_is_still_drawn():
     row = Sample("perfect", look(0), np.array([0.0, 0.1]), 2)
     ax = by_controller([row]).axes[0]
-    assert dots(ax, "an insertion")[0].get_offsets()[:, 0].min() == pytest.approx(1e-3)
+    assert dots(ax, "one insertion")[0].get_offsets()[:, 0].min() == pytest.approx(1e-3)
 
 
 def test_ten_thousand_dots_make_a_small_drawing(tmp_path):
@@ -410,16 +410,16 @@ def legend_names(figure):
 
 
 def test_legends_name_what_is_drawn_and_nothing_else():
-    assert legend_names(targeting_figure([target_panel()])) == ["target, circle of 1 mm radius", TIP]
+    assert legend_names(targeting_figure([target_panel()])) == ["target, 1 mm radius", TIP]
     assert legend_names(targeting_figure([target_panel(unfinished=(3,))])) == [
-        *("target, circle of 1 mm radius", TIP, "tip of an insertion not finished"),
+        *("target, 1 mm radius", TIP, "final true tip, not finished"),
     ]
     row = Sample("near", look(0), lognormal(0.01), 150)
     assert "1 mm" not in legend_names(by_controller([row]))
     assert "1 mm" in legend_names(by_controller([replace(row, errors=lognormal(0.5))]))
     assert legend_names(by_controller([replace(row, errors=np.empty(0))])) == ["1 mm"]
-    assert "of the other panels" in legend_names(energy_figure(energy_panels(2)))
-    assert "of the other panels" not in legend_names(energy_figure(energy_panels(1)))
+    assert "other panels" in legend_names(energy_figure(energy_panels(2)))
+    assert "other panels" not in legend_names(energy_figure(energy_panels(1)))
     assert legend_names(difference_figure(difference_panels(1, 1), "x"))[-1] in (SURE, UNSURE)
     assert len(legend_names(difference_figure(difference_panels(1, 1), "x"))) == 1
 

@@ -141,7 +141,7 @@ class _Pace:
     def left(self, done: int, total: int) -> str:
         """Return rate and remaining time to append to a note; empty while unknown."""
         rate = self._rate(time.monotonic(), done)
-        return f", {rate:.2g} per second, {_duration((total - done) / rate)} left" if rate else ""
+        return f", {rate:.2g}/s, {_duration((total - done) / rate)} left" if rate else ""
 
     def _rate(self, now: float, done: int) -> float:
         if self._before is None:

@@ -1,4 +1,4 @@
-"""Reports from the folder of a study: one page that needs nothing else, its figures, and honest words."""
+"""Reports of a study folder: a self-contained page, its figures and its text."""
 
 import base64
 import json
@@ -35,7 +35,7 @@ ABOUT = {
 
 
 class Page(HTMLParser):
-    """A page taken apart: tags with attributes, and the text outside of style."""
+    """A parsed page: tags with attributes, and the text outside of style."""
 
     def __init__(self, path):
         super().__init__()
@@ -76,7 +76,7 @@ def drawn_on(tmp_path):
 
 @pytest.fixture
 def report_on(drawn_on, monkeypatch):
-    """Return the same without figures, which take long."""
+    """Return the same function without figures, which are slow."""
     monkeypatch.setattr("flexneedle.study.report.report.draw_figures", lambda *_: [])
     return drawn_on
 
@@ -88,7 +88,7 @@ def rows():
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
-    """A report that tests only look at, and its page."""
+    """A report for read-only tests, and its page."""
     rows = make_rows(BOTH, targets=TARGETS, repeats=4)
     report = write_report(write_study(tmp_path_factory.mktemp("study"), rows, ABOUT))
     return report, Page(report.page)
@@ -98,7 +98,7 @@ def names(report):
     return [drawn.name for drawn in report.figures]
 
 
-def test_a_page_needs_nothing_but_itself(plain):
+def test_a_page_is_self_contained(plain):
     report, page = plain
     assert page.open == []
     assert not {"script", "link", "iframe", "object", "base"} & {tag for tag, _ in page.tags}
@@ -110,7 +110,7 @@ def test_a_page_needs_nothing_but_itself(plain):
     assert policy.startswith("default-src 'none'")
 
 
-def test_a_page_is_made_for_people(plain):
+def test_a_page_is_accessible(plain):
     _, page = plain
     assert page.all("html") == [{"lang": "en"}]
     assert "My study: report" in page.text
@@ -121,7 +121,7 @@ def test_a_page_is_made_for_people(plain):
 
 
 def rules(page):
-    """Return the rules of a page's style by selector, those of screens of any width."""
+    """Return the style rules of a page by selector, without media queries."""
     style = page.read_text(encoding="utf-8").split("<style>")[1].split("</style>")[0]
     everywhere = re.sub(r"@(media|page)[^{]*\{(?:[^{}]|\{[^{}]*\})*\}", "", style)
     return {
@@ -131,8 +131,8 @@ def rules(page):
     }
 
 
-def test_a_table_or_figure_that_is_too_wide_scrolls_in_its_own_box(plain):
-    """So that the page itself never scrolls sideways, at whatever width."""
+def test_a_wide_table_or_figure_scrolls_in_its_own_box(plain):
+    """The page itself never scrolls sideways, at any width."""
     report, page = plain
     found = rules(report.page)
     assert "overflow-x: auto" in found[".scroll"]
@@ -144,7 +144,7 @@ def test_a_table_or_figure_that_is_too_wide_scrolls_in_its_own_box(plain):
     )
 
 
-def test_intervals_and_commands_break_so_that_no_column_is_out_of_sight(plain):
+def test_intervals_and_commands_wrap(plain):
     found = rules(plain[0].page)
     assert "white-space: normal" in found["td small"]
     assert "white-space: normal" in found["td.words"]
@@ -161,7 +161,7 @@ def test_figures_in_the_page_are_those_in_the_folder(plain):
     assert all(drawn.png.read_bytes().startswith(b"\x89PNG") for drawn in report.figures)
 
 
-def test_a_large_drawing_stands_in_the_page_as_png(drawn_on, rows, monkeypatch):
+def test_a_large_figure_is_embedded_as_png(drawn_on, rows, monkeypatch):
     monkeypatch.setattr("flexneedle.study.report.page._LARGEST_SVG", 1000)
     _, page = drawn_on(rows, ABOUT)
     assert all(image["src"].startswith("data:image/png;base64,") for image in page.all("img"))
@@ -193,8 +193,8 @@ def test_figures_are_those_that_the_rows_support(drawn_on, options, expected):
     )
 
 
-def test_cases_of_one_controller_are_drawn_apart_everywhere(drawn_on):
-    """Cases are there to differ: taken together their errors would be of nothing in particular."""
+def test_cases_of_one_controller_have_separate_panels(drawn_on):
+    """Cases differ on purpose: pooled errors would have no meaning."""
     cases = {"base": {}, "skew": {"phantom.run_out_mm": 1.0}, "bent": {"phantom.initial_bend_mm": 1.0}}
     rows = make_rows(cases=cases, targets=TARGETS, repeats=3)
     for row in rows:
@@ -205,26 +205,26 @@ def test_cases_of_one_controller_are_drawn_apart_everywhere(drawn_on):
         assert "base: " in base
         assert "0.2" in base
         assert "0.7" in bent
-        assert "together" not in drawn[name].caption
+        assert "pooled" not in drawn[name].caption
 
 
-def test_what_has_no_panel_of_its_own_is_said_to_be_taken_together(drawn_on):
+def test_the_caption_names_the_pooled_factors(drawn_on):
     axes = {"contact.spacing_mm": [0.5, 1.0], "needle.gauge": ["18G", "21G"]}
     rows = make_rows(axes=axes, targets=TARGETS, repeats=3)
     drawn = {one.name: one for one in drawn_on(rows, axes=axes)[0].figures}
     for name in ("errors-by-depth", "energy"):
         assert "contact.spacing_mm" not in drawn[name].caption
-        assert "all levels of needle gauge together" in drawn[name].caption
+        assert "pooled over needle gauge" in drawn[name].caption
 
 
-def test_a_study_of_which_nothing_finished_is_reported(drawn_on, rows):
+def test_a_study_without_finished_insertions_is_reported(drawn_on, rows):
     report, page = drawn_on([unfinished(row, "refused", "plan misses") for row in rows])
     assert names(report) == []
     assert "finished 0 of 24 refused 24 of 24 within 1 mm of the target 0 of 24" in page.text
     assert "24 of 24 insertions did not finish." in page.text
 
 
-def test_tips_alone_are_drawn_where_nothing_finished(drawn_on, rows):
+def test_without_finished_insertions_only_the_tips_are_drawn(drawn_on, rows):
     assert names(drawn_on([unfinished(row) for row in rows])[0]) == ["targeting"]
 
 
@@ -244,13 +244,13 @@ def test_numbers_of_the_page_are_those_of_the_summary(plain):
     assert f"{OURS} is better than open-loop in mean true error: −" in page.text
 
 
-def test_a_default_that_is_worse_is_said_to_be(report_on, rows):
+def test_a_default_that_is_worse_is_reported(report_on, rows):
     for row in rows:
         row["true_error_mm"] *= 100.0 if row["controller"] == OURS else 1.0
     assert f"{OURS} is worse than open-loop in mean true error: +" in report_on(rows)[1].text
 
 
-def test_where_the_default_stands_among_the_others_is_said_first(report_on):
+def test_the_headline_compares_the_default_with_the_others(report_on):
     rows = make_rows((OURS, "open-loop", "bevel-only"), targets=TARGETS, repeats=8)
     assert f"{OURS} is better than every other controller in mean true error." in report_on(rows)[1].text
     for row in rows:
@@ -280,7 +280,7 @@ def test_differences_are_given_at_each_depth(report_on):
     assert "+0.200" in page.text
 
 
-def test_what_the_insertions_took_stands_beside_the_plans(report_on):
+def test_effort_is_reported_relative_to_the_plan(report_on):
     rows = make_rows(targets=TARGETS, repeats=4)
     for row in rows:
         row |= {"flips": 3, "planned_flips": 1, "periods": 66, "planned_periods": 60}
@@ -289,14 +289,14 @@ def test_what_the_insertions_took_stands_beside_the_plans(report_on):
     rows[1] |= {"unconverged_periods": 5}
     report, page = report_on(rows)
     head = page.text[: page.text.index("Figures")]
-    assert "bevel rolls 3.00 plan's 1.00" in head
-    assert "tissue energy / plan's 1.20 1.20 to 1.20" in head
-    assert "periods / plan's 1.11 largest 1.20" in head
+    assert "bevel rolls 3.00 planned 1.00" in head
+    assert "tissue energy / planned 1.20 1.20 to 1.20" in head
+    assert "periods / planned 1.11 largest 1.20" in head
     assert "periods not converged 7 in 2 insertions" in head
     assert report.values()["groups"][0]["unconverged_periods"] == 7
 
 
-def test_small_energies_are_not_said_to_be_none(drawn_on):
+def test_small_energies_are_not_rounded_to_zero(drawn_on):
     rows = [row | {"strain_energy_mj": 0.0042} for row in make_rows(targets=TARGETS, repeats=2)]
     report, _ = drawn_on(rows)
     assert "medians 0.0042 mJ" in {drawn.name: drawn for drawn in report.figures}["energy"].alt
@@ -323,19 +323,19 @@ def test_tuning_is_shown_beside_the_settings_of_the_study(report_on, rows, tmp_p
     text = report_on(rows, tuning=tmp_path)[1].text
     gain = BASE["control.load_gain"]
     assert gain == 0.3
-    assert "open-loop 200 5000 to 5049 – 0.200 control.load_gain = 0.3 as chosen" in text
+    assert "open-loop 200 5000 to 5049 – 0.200 control.load_gain = 0.3 used" in text
     ours = f"{OURS} 200 5000 to 5049 seeds 1 to 9 before 0.100 control.load_gain = 0.5"
-    assert f"{ours} not as chosen: control.load_gain" in text
+    assert f"{ours} different: control.load_gain" in text
     assert "no-one" not in text
 
 
-def test_the_tuning_that_the_package_ships_is_shown_in_any_folder(report_on, rows, tmp_path, monkeypatch):
+def test_the_shipped_tuning_is_shown_in_any_folder(report_on, rows, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = report_on([row | {"controller": "ce-mpc"} for row in rows])[1].text
-    told = text.split("Settings chosen by tuning")[1]
-    assert "ce-mpc 200 5000 to 5069 – " in told
-    assert "as chosen" in told
-    assert "resolved-rate" not in told
+    shown = text.split("Settings chosen by tuning")[1]
+    assert "ce-mpc 200 5000 to 5069 – " in shown
+    assert " used " in shown
+    assert "resolved-rate" not in shown
 
 
 def test_columns_of_any_kind_are_shown_as_settings(report_on, rows):
@@ -344,15 +344,15 @@ def test_columns_of_any_kind_are_shown_as_settings(report_on, rows):
 
 
 @pytest.mark.parametrize("content", ["{", "{}", '{"method": "a"}'])
-def test_damaged_records_of_tuning_are_refused(report_on, rows, tmp_path, content):
-    with pytest.raises(InputError, match="holds no records of tuning"):
+def test_damaged_tuning_records_are_rejected(report_on, rows, tmp_path, content):
+    with pytest.raises(InputError, match="contains no tuning records"):
         report_on(rows, tuning=tmp_path)
     (tmp_path / "a.json").write_text(content)
     with pytest.raises(InputError, match=r"a\.json: "):
         report_on(rows, tuning=tmp_path)
 
 
-def test_what_did_not_finish_is_counted_and_listed(report_on, rows):
+def test_unfinished_insertions_are_counted_and_listed(report_on, rows):
     rows[0] = unfinished(rows[0], "held", "held for 1.03 s")
     rows[5] = unfinished(rows[5], "held", "held for 2.00 s")
     rows[7] = unfinished(rows[7], "error", "ZeroDivisionError: x") | {"unconverged_periods": 2}
@@ -373,8 +373,8 @@ def test_periods_that_did_not_converge_are_counted_of_all_insertions(report_on, 
     assert "periods not converged 1 in 1 insertion " in report_on(rows[9:10])[1].text
 
 
-def test_the_headline_is_of_the_whole_study_with_what_failed_and_missed(report_on):
-    """Not of the first of its settings: here that alone has no failure and no miss."""
+def test_the_headline_includes_failures_and_misses_of_all_settings(report_on):
+    """Not only those of the first setting, which has no failure and no miss here."""
     axes = {"contact.spacing_mm": [0.5, 1.0]}
     rows = make_rows(axes=axes, targets=TARGETS, repeats=5)
     for row in rows:
@@ -387,7 +387,7 @@ def test_the_headline_is_of_the_whole_study_with_what_failed_and_missed(report_o
         "insertions 28 of 30, 2 missing finished 26 of 28 failed 1 of 28 held 1 of 28 "
         "within 1 mm of the target 25 of 30" in page.text
     )
-    assert f"{OURS}: 26 insertions finished of 28, all settings together" in page.text
+    assert f"{OURS}: 26 insertions finished of 28, all settings pooled" in page.text
     errors = [0.1] * 15 + [0.5] * 10 + [1.5]
     assert f"mean true error {sum(errors) / 26:.3f} mm" in page.text
     (whole,) = report.values()["whole"]
@@ -404,20 +404,20 @@ def test_the_headline_has_a_row_for_each_controller(report_on):
     assert [group["count"] for group in values["groups"]] == [12] * 4
 
 
-def test_an_incomplete_study_is_said_to_be_first_of_all(report_on, rows):
+def test_an_incomplete_study_is_reported_at_the_top(report_on, rows):
     _, page = report_on(rows[:17], ABOUT)
-    alarm = "This study is not complete: 17 of 24 insertions are in, 7 are missing."
+    alarm = "Incomplete study: 17 of 24 insertions have a result, 7 are missing."
     assert alarm in page.text
     assert page.text.index(alarm) < page.text.index("mean true error")
-    assert "not complete" not in report_on(rows, ABOUT)[1].text
+    assert "Incomplete" not in report_on(rows, ABOUT)[1].text
 
 
-def test_a_study_asks_for_as_many_insertions_as_it_names(report_on, rows):
+def test_the_planned_number_is_that_of_study_json(report_on, rows):
     assert report_on(rows[:17], ABOUT)[0].values()["planned"] == 24
     assert report_on(rows[:17], insertions=100)[0].values()["missing"] == 83
 
 
-def test_the_worst_can_be_run_again(report_on):
+def test_the_worst_have_a_command_to_reproduce_them(report_on):
     rows = make_rows(("open-loop",), targets=TARGETS, repeats=5)
     report, page = report_on(rows)
     worst = report.values()["worst"]
@@ -431,7 +431,7 @@ def test_the_worst_can_be_run_again(report_on):
     assert worst[0]["command"] in page.text
 
 
-def test_other_scenarios_are_written_for_it(report_on):
+def test_other_scenarios_are_written_for_the_commands(report_on):
     cases = {
         "base": {},
         "bent": {"phantom.initial_bend_mm": 5.0},
@@ -450,13 +450,13 @@ def test_other_scenarios_are_written_for_it(report_on):
         assert flat == {key: value for key, value in (BASE | changed).items() if key not in ours}
 
 
-def test_settings_of_another_version_make_no_command(report_on, rows):
+def test_settings_of_another_version_have_no_command(report_on, rows):
     report, page = report_on([row | {"phantom.no_such_key": 1.0} for row in rows])
     assert report.values()["worst"][0]["command"] == ""
-    assert "its settings make no scenario of this version" in page.text
+    assert "settings not valid in this version" in page.text
 
 
-def test_text_from_data_is_only_text(drawn_on, rows):
+def test_text_from_data_is_escaped(drawn_on, rows):
     about = {"command": EVIL, "study": ABOUT["study"] | {"name": EVIL, "title": EVIL}}
     evil = [row | {"controller": EVIL, "case": EVIL, "version_numpy": EVIL} for row in rows[:12]]
     evil[3] = unfinished(evil[3], EVIL, EVIL)
@@ -503,13 +503,13 @@ def test_time_is_divided_and_a_plan_counts_once(report_on, rows, tmp_path):
         "plan 6.0 20 % 3000",
         "control 12.0 40 % 500",
         "plant 6.0 20 % 250",
-        "insertions 6.0 20 % 250",
+        "other 6.0 20 % 250",
     ):
         assert line in text
-    assert "No times are recorded." in report_on(rows, timing=False)[1].text
+    assert "No times recorded." in report_on(rows, timing=False)[1].text
 
 
-def test_a_report_goes_where_it_is_told(tmp_path, rows, report_on):
+def test_a_report_is_written_to_the_given_folder(tmp_path, rows, report_on):
     folder = tmp_path / "study"
     assert report_on(rows)[0].page == folder / "report" / "report.html"
     assert write_report(folder, tmp_path / "a" / "b").page == tmp_path / "a" / "b" / "report.html"
@@ -539,7 +539,7 @@ def no_object(folder, rows):
     (write_study(folder, rows) / "study.json").write_text("[1]")
 
 
-def only_begun(folder, rows):
+def unfinished_study(folder, rows):
     (write_study(folder, rows) / "runs.parquet").unlink()
 
 
@@ -548,7 +548,7 @@ def without_study(folder, rows):
 
 
 def with_column(name, values):
-    """Return what writes a study with another column of that name: a value, or a list of them, a row each."""
+    """Return a function that writes a study with this column: one value, or a list with one per row."""
 
     def write(folder, rows):
         given = values if isinstance(values, list) else [values] * len(rows)
@@ -558,7 +558,7 @@ def with_column(name, values):
 
 
 def with_study(**changed):
-    """Return what writes a study of which study.json says something else."""
+    """Return a function that writes a study with a changed study.json."""
     return lambda folder, rows: write_study(folder, rows, ABOUT | {"study": ABOUT["study"] | changed})
 
 
@@ -570,16 +570,16 @@ def without_rows(folder, rows):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda *_: None, "no such folder: give the folder that"),
-        (lambda folder, _: folder.mkdir(), "holds no study: there is no study.json"),
-        (without_study, "holds no study: there is no study.json"),
-        (only_begun, "the study was killed or is still running"),
-        (damaged, "runs.parquet: damaged, or no Parquet file"),
-        (without_rows, "has no insertion"),
-        (lacking, "not the rows of a study: lacks the columns outcome"),
+        (lambda *_: None, "no such folder: give the folder of"),
+        (lambda folder, _: folder.mkdir(), "contains no study: there is no study.json"),
+        (without_study, "contains no study: there is no study.json"),
+        (unfinished_study, "the study was killed or is still running"),
+        (damaged, "runs.parquet: damaged, or not a Parquet file"),
+        (without_rows, "contains no insertions"),
+        (lacking, "not the rows of a study: missing columns outcome"),
         (twice, "damaged: index 3 occurs more than once"),
         (no_json, "study.json: damaged"),
-        (no_object, "study.json: damaged: must hold one JSON object"),
+        (no_object, "study.json: damaged: must contain one JSON object"),
         (with_column("index", "a"), 'runs.parquet: .* row 1: index = "a": must be a whole number'),
         (with_column("index", [*range(23), None]), "row 24: index: must be a whole number"),
         (with_column("controller", 3), "row 1: controller = 3: must be text"),
@@ -603,7 +603,7 @@ def without_rows(folder, rows):
         (lambda folder, rows: write_study(folder, rows, {"study": 3}), "study = 3: "),
     ],
 )
-def test_what_cannot_be_reported_is_said_in_one_line(tmp_path, rows, spoil, message):
+def test_an_invalid_study_folder_is_rejected_in_one_line(tmp_path, rows, spoil, message):
     folder = tmp_path / "study"
     spoil(folder, rows)
     with pytest.raises(InputError, match=message) as caught:

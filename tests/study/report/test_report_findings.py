@@ -1,4 +1,4 @@
-"""What a report finds in rows: groups, paired differences, endings, the worst."""
+"""Findings in the rows of a study: groups, paired differences, endings, the worst."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from flexneedle.study.report.design import design_of
-from flexneedle.study.report.reading import read_study
+from flexneedle.study.report.reading import read_study_folder
 from flexneedle.study.report.summary import (
     case_differences,
     controller_differences,
@@ -22,12 +22,12 @@ TARGETS = ((25.0, 0.0), (40.0, 5.0))
 
 @pytest.fixture
 def read(tmp_path):
-    """Return a function from rows (dicts) and what their study asks for to its record, through its files."""
-    return lambda rows, **more: read_study(write_study(tmp_path / "study", rows, **more))
+    """Return a function from rows (dicts) and changes of study.json to the study record, through its files."""
+    return lambda rows, **more: read_study_folder(write_study(tmp_path / "study", rows, **more))
 
 
 def designed(study):
-    return design_of(study.rows, study.asked)
+    return design_of(study.rows, study.definition)
 
 
 def doubled(*names):
@@ -36,7 +36,7 @@ def doubled(*names):
     return {"as shipped": {}} | cases
 
 
-def test_a_group_holds_what_a_hand_would_compute(read):
+def test_the_statistics_of_a_group_agree_with_hand_values(read):
     rows = make_rows(targets=TARGETS[:1], repeats=5)
     for row, error in zip(rows, (0.1, 0.2, 0.3, 0.4, 2.0), strict=True):
         row |= {"true_error_mm": error, "strain_energy_mj": 3.0, "planned_strain_energy_mj": 2.0}
@@ -61,7 +61,7 @@ def test_a_group_holds_what_a_hand_would_compute(read):
     assert value == pytest.approx(expected, rel=1e-12)
 
 
-def test_unfinished_insertions_count_but_enter_no_mean(read):
+def test_unfinished_insertions_are_counted_and_not_averaged(read):
     rows = make_rows(targets=TARGETS[:1], repeats=4)
     for row, error in zip(rows, (0.1, 0.2, 0.3, 50.0), strict=True):
         row["true_error_mm"] = error
@@ -75,7 +75,7 @@ def test_unfinished_insertions_count_but_enter_no_mean(read):
     assert group.largest_mm == 0.3
 
 
-def test_a_finished_insertion_of_unknown_error_is_counted_as_such(read):
+def test_a_finished_insertion_with_unknown_error_is_counted(read):
     rows = make_rows(targets=TARGETS[:1], repeats=3)
     rows[0]["true_error_mm"] = None
     rows[1]["true_error_mm"] = float("nan")
@@ -103,7 +103,7 @@ def compared(rows, read, **more):
 
 
 def test_controllers_are_compared_pair_by_pair(read):
-    """The other is 0.05 mm worse in each pair: the difference has no spread, whatever the pairs have."""
+    """The other controller is 0.05 mm worse in each pair: the differences have no spread."""
     rows = make_rows(("open-loop", OURS), targets=TARGETS, repeats=5)
     own = {(row["seed"], row["repeat"]): row["true_error_mm"] for row in rows if row["controller"] == OURS}
     for row in rows:
@@ -122,7 +122,7 @@ def test_a_worse_default_is_called_worse(read):
     assert compared(rows, read)[0].verdict == "worse"
 
 
-def test_controllers_alike_are_not_separable(read):
+def test_equal_controllers_are_not_separable(read):
     rows = make_rows(("ce-mpc", OURS), targets=TARGETS, repeats=10)
     rng = np.random.default_rng(3)
     for row in rows:
@@ -170,7 +170,7 @@ def test_cases_are_compared_with_the_base_for_each_controller(read):
     assert {d.against for d in differences} == {"as shipped"}
 
 
-def test_endings_differ_in_more_than_numbers(read):
+def test_endings_that_differ_only_in_numbers_are_grouped(read):
     rows = make_rows(targets=TARGETS, repeats=5)
     for k, seconds in ((1, 1.03), (4, 1.2), (7, 12.0)):
         rows[k] = unfinished(rows[k], "held", f"held for {seconds} s (limit 1 s)")
@@ -194,7 +194,7 @@ def test_the_worst_are_the_largest_errors_finished_or_not(read):
 
 @settings(deadline=None, max_examples=25)
 @given(st.data())
-def test_nothing_is_dropped_whatever_the_outcomes(tmp_path_factory, data):
+def test_no_insertion_is_dropped_for_any_outcomes(tmp_path_factory, data):
     """Every insertion is in one group, and each that did not finish is in one ending."""
     rows = make_rows((OURS, "open-loop"), targets=TARGETS, repeats=2)
     outcomes = data.draw(
@@ -204,7 +204,7 @@ def test_nothing_is_dropped_whatever_the_outcomes(tmp_path_factory, data):
         row if outcome == "done" else unfinished(row, outcome, "why")
         for row, outcome in zip(rows, outcomes, strict=True)
     ]
-    found = read_study(write_study(tmp_path_factory.mktemp("study"), rows))
+    found = read_study_folder(write_study(tmp_path_factory.mktemp("study"), rows))
     groups = groups_of(found.rows, designed(found).factors)
     assert sum(group.count for group in groups) == 8
     assert sum(group.finished for group in groups) == outcomes.count("done")

@@ -29,11 +29,11 @@ def own(count):
         (ratio(VALUES, np.array([1.0, 2.0, 5.0, 3.0, np.nan])), 1.0),
     ],
 )
-def test_statistics_leave_out_what_is_not_known(statistic, expected):
+def test_statistics_ignore_unknown_values(statistic, expected):
     assert_allclose(statistic(ONCE), [expected], rtol=1e-14)
 
 
-def test_rows_count_as_often_as_they_were_drawn():
+def test_rows_are_weighted_by_their_multiplicity():
     counts = np.array([[2, 0, 7, 1, 1]])  # 3, 3, 2, 6; the NaN never counts
     assert_allclose(mean(VALUES)(counts), [3.5])
     assert_allclose(sd(VALUES)(counts), [np.std([3, 3, 2, 6], ddof=1)])
@@ -56,7 +56,7 @@ def test_quantiles_are_those_of_numpy_on_the_drawn_rows(values, share, seed):
     assert_allclose(quantile(values, share)(counts[None, :]), [expected], rtol=1e-9, atol=1e-9)
 
 
-def test_nothing_known_gives_nothing():
+def test_without_known_values_the_statistics_are_nan():
     nothing = np.full(5, np.nan)
     found = estimates({"mean": mean(nothing), "sd": sd(nothing), "half": quantile(nothing, 0.5)}, own(5), 50)
     assert all(np.isnan([e.value, e.low, e.high]).all() for e in found.values())
@@ -69,21 +69,21 @@ def test_no_rows_and_one_seed_have_no_interval():
     assert np.isnan([one.low, one.high]).all()
 
 
-def test_a_constant_has_an_interval_of_no_width():
+def test_a_constant_has_an_interval_of_zero_width():
     found = estimates({"m": mean(np.full(10, 0.25)), "sd": sd(np.full(10, 0.25))}, own(10))
     assert (found["m"].low, found["m"].value, found["m"].high) == (0.25, 0.25, 0.25)
     assert found["sd"].high == 0.0
 
 
 def test_nine_phantoms_have_no_interval_and_ten_do():
-    """However many insertions each has: a percentile bootstrap of a few is far too narrow."""
+    """For any number of insertions each: a percentile bootstrap of a few clusters is far too narrow."""
     values = np.random.default_rng(0).normal(size=40)
     few, enough = (estimates({"m": mean(values)}, np.arange(40) % phantoms)["m"] for phantoms in (9, 10))
     assert np.isnan([few.low, few.high]).all()
     assert enough.low < few.value == enough.value < enough.high
 
 
-def test_the_interval_of_a_mean_is_as_wide_as_theory_says():
+def test_the_interval_of_a_mean_agrees_with_theory():
     """Standard error of the mean: sd √((n − 1)/n) / √n in a bootstrap; 1.96 of them on each side."""
     values = np.random.default_rng(4).normal(size=400)
     found = estimates({"m": mean(values)}, own(400), resamples=8000)["m"]
@@ -92,7 +92,7 @@ def test_the_interval_of_a_mean_is_as_wide_as_theory_says():
 
 
 def test_rows_of_one_seed_are_drawn_together():
-    """Ten copies of each value tell no more than the values: the interval stays as wide."""
+    """Ten copies of each value add no information: the interval has the same width."""
     values = np.random.default_rng(5).normal(size=40)
     once = estimates({"m": mean(values)}, own(40), 4000)["m"]
     copied = estimates({"m": mean(np.repeat(values, 10))}, np.repeat(own(40), 10), 4000)["m"]
@@ -107,7 +107,7 @@ def test_same_rows_same_interval():
     assert estimates({"m": mean(values)}, own(30)) != estimates({"m": mean(values)}, own(30), seed=1)
 
 
-def test_samples_in_pieces_are_the_same_samples(monkeypatch):
+def test_samples_in_chunks_are_the_same_samples(monkeypatch):
     values = np.random.default_rng(7).normal(size=50)
     whole = estimates({"m": mean(values), "q": quantile(values, 0.95)}, own(50))
     monkeypatch.setattr("flexneedle.study.report.statistics._CHUNK", 1000)
@@ -115,7 +115,7 @@ def test_samples_in_pieces_are_the_same_samples(monkeypatch):
 
 
 @pytest.mark.parametrize(("statistic", "truth"), [(mean, 0.0), (lambda v: quantile(v, 0.5), 0.0), (sd, 1.0)])
-def test_intervals_hold_the_truth_about_as_often_as_they_say(statistic, truth):
+def test_intervals_have_about_the_nominal_coverage(statistic, truth):
     """95 % nominal; percentile intervals of 40 normal values fall a little short, of sd most."""
     rng = np.random.default_rng(8)
     trials = [
@@ -126,7 +126,7 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say(statistic, truth):
     assert 0.87 <= covered <= 0.975
 
 
-def test_what_may_lie_beyond_the_largest():
+def test_the_share_beyond_the_largest_agrees_with_the_textbook():
     """59 values: the textbook number for 95 % of all below the largest, with 95 % confidence."""
     assert beyond_largest(58) > 0.05 > beyond_largest(59)
     assert beyond_largest(1) == pytest.approx(0.95)

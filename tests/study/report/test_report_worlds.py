@@ -1,4 +1,4 @@
-"""Reports on random worlds: errors against open loop and reach, the worst with the commands that repeat them."""
+"""Reports on random worlds: errors relative to open loop and reach, the worst with the commands to reproduce them."""
 
 import json
 import re
@@ -13,7 +13,7 @@ from flexneedle.scenario.worlds import world
 from flexneedle.study.grid import load_study
 from flexneedle.study.plans import Plans
 from flexneedle.study.report.report import write_report
-from flexneedle.study.runner import _bounding
+from flexneedle.study.runner import _reach_points
 from flexneedle.study.tables import write_tables
 from flexneedle.trace.results import RESULT_COLUMNS
 
@@ -71,7 +71,7 @@ def row_of(study, index, bounded):
 
 
 def predicted(point, error):
-    """A standard deviation of 0.1 mm, and predictions that are off by so many of them."""
+    """Predictions with a standard deviation of 0.1 mm and an error of the given number of them."""
     if (point.controller, point.case) != (DEFAULT, "perfect"):
         return {}
     places = zip(("quarter", "half", "three_quarters"), SIGMAS.get(point.world, [None] * 3), strict=True)
@@ -87,7 +87,7 @@ def report(tmp_path_factory):
     folder = tmp_path_factory.mktemp("worlds")
     (folder / "few.toml").write_text(STUDY)
     study = load_study(folder / "few.toml")
-    bounding = _bounding(study)
+    bounding = _reach_points(study)
     rows = {k: row_of(study, k, id(study.insertion(k).point) in bounding) for k in range(len(study))}
     write_tables(folder, study, rows, Plans(folder / "plans"))
     (folder / "study.json").write_text(json.dumps({"study": study.definition}))
@@ -101,7 +101,7 @@ def group(report, controller, case, guide):
 
 
 def test_groups_are_controllers_cases_and_whether_there_is_a_guide(report):
-    """None of the hundred values that differ from world to world, and no plant, which the case has said."""
+    """Not the hundred values that differ between worlds, and not the plant, which follows from the case."""
     assert [list(group.levels.values()) for group in report.findings.worlds] == [
         [controller, case, guide]
         for controller in (DEFAULT, "open-loop")
@@ -123,7 +123,7 @@ def test_errors_are_those_of_the_finished_insertions(report):
     assert_allclose(measured, expected)
 
 
-def test_shares_are_against_open_loop_and_reach_world_by_world(report):
+def test_shares_are_relative_to_open_loop_and_reach_in_each_world(report):
     guided = group(report, DEFAULT, "perfect", "with a guide")
     assert_allclose(guided.within_twice_open_loop, 2 / 3)  # 0.02 ≤ 0.1, 0.5 > 0.4, 1.6 ≤ 3.0
     assert_allclose(guided.within_open_loop, 2 / 3)  # 0.02 ≤ 0.21, 0.5 > 0.4, 1.6 ≤ 1.7
@@ -136,19 +136,19 @@ def test_shares_are_against_open_loop_and_reach_world_by_world(report):
     assert group(report, "open-loop", "perfect", "with a guide").within_open_loop == 1.0
 
 
-def test_what_does_not_finish_is_a_failure_only_within_reach(report):
+def test_an_unfinished_insertion_is_a_failure_only_within_reach(report):
     assert group(report, DEFAULT, "perfect", "with a guide").failures == 1
     assert group(report, DEFAULT, "perfect", "no guide").failures == 0  # world 31 is 3 mm out of reach
     assert group(report, "open-loop", "perfect", "no guide").failures == 0
 
 
 def test_energy_is_a_geometric_mean(report):
-    """2, 4 and 1 times the plan's in worlds 1, 2, 3."""
+    """2, 4 and 1 times the planned energy in worlds 1, 2, 3."""
     assert_allclose(group(report, DEFAULT, "perfect", "with a guide").energy_ratio, 2.0)
 
 
-def test_predictions_are_counted_where_there_are_any(report):
-    """Of the default's perfect case alone; coverage is over the insertions that have a prediction at the place."""
+def test_predictions_are_reported_for_groups_that_have_any(report):
+    """Only the default in the perfect case; coverage is over insertions with a prediction at that depth."""
     guided, free = report.findings.predictions
     assert guided.levels == {"controller": DEFAULT, "case": "perfect", "guide": "with a guide"}
     assert (guided.count, free.count) == (3, 1)
@@ -156,19 +156,19 @@ def test_predictions_are_counted_where_there_are_any(report):
     assert_allclose(free.covered, (np.nan, np.nan, 1.0))
 
 
-def test_warnings_in_vain_and_misses_without_one_are_counted(report):
+def test_false_warnings_and_misses_without_warning_are_counted(report):
     """World 1 ends at 0.02 mm, 2 at 0.5, which is not below 0.5, 3 at 1.6 without a warning, 15 at 0.1 with one."""
     guided, free = report.findings.predictions
     assert (guided.in_vain, guided.unwarned) == (0.0, 1)
     assert (free.in_vain, free.unwarned) == (1.0, 0)
 
 
-def test_the_page_has_the_predictions_and_so_has_the_summary(report):
+def test_page_and_summary_have_the_predictions(report):
     assert "covered at ¼ of the depth" in report.page.read_text(encoding="utf-8")
     assert [group["unwarned"] for group in report.values()["predictions"]] == [1, 0]
 
 
-def test_the_worst_are_those_furthest_beyond_their_reach_of_the_default_controller(report):
+def test_the_worst_have_the_largest_error_beyond_reach_of_the_default_controller(report):
     rows = report.findings.study.rows
     worst = [(rows.value("controller", row), rows.value("world", row)) for row in report.findings.worst]
     assert {name for name, _ in worst} == {DEFAULT}
@@ -176,9 +176,9 @@ def test_the_worst_are_those_furthest_beyond_their_reach_of_the_default_controll
 
 
 def test_a_command_names_the_world_and_its_case(report):
-    """So that a line of the report is all that it takes; no scenario file lies beside the page."""
+    """The command in the report is sufficient; no scenario file is written."""
     rows = report.findings.study.rows
-    for row, command in report.again.items():
+    for row, command in report.commands.items():
         name = re.match(r"flexneedle insert (world:\S+) --target", command)[1]
         number, case = int(rows.value("world", row)), rows.value("case", row)
         assert load_scenario(name) == world(number, case)

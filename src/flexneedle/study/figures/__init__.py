@@ -1,1 +1,1 @@
-"""Figures of studies. They take panels of arrays and names."""
+"""Figures of studies, drawn from panels of arrays and names."""

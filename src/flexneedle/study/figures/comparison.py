@@ -1,4 +1,4 @@
-"""Paired mean differences with their intervals, one row each, against a line at zero."""
+"""Paired mean differences with confidence intervals, one row each, and a line at zero."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from flexneedle.figures.layout import FAINT, Look, Panel, legend, panels, short, ticks_of
 from flexneedle.figures.style import INK, QUIET, signed, styled
 
-_WIDE = 10.0  # times the even part around zero: from there on, decades
+_WIDE = 10.0  # ratio of the largest value to the linear range above which the scale is symlog
 _SURE, _UNSURE = "mean with 95 % interval", "not separable from no difference"
 
 
@@ -28,7 +28,7 @@ class DifferenceRow:
 
 
 def difference_figure(shown: Sequence[Panel[Sequence[DifferenceRow]]], label: str) -> Figure:
-    """Return the figure: a panel each, their rows in the same order, on one scale called `label`."""
+    """Return the figure: one panel each, with rows in the same order, on a common scale with `label`."""
     most = max(len(panel.content) for panel in shown)
     with styled():
         figure, axes = panels(shown, 0.3 * most + 0.8, label)
@@ -48,7 +48,7 @@ def _draw(ax: Axes, rows: Sequence[DifferenceRow]) -> None:
     ax.set_axisbelow(True)
     for level, row in enumerate(rows):
         if isnan(row.mean):
-            _write(ax, level, "nothing to compare")
+            _write(ax, level, "no pairs")
         else:
             _draw_row(ax, level, row)
 
@@ -63,10 +63,10 @@ def _draw_row(ax: Axes, level: int, row: DifferenceRow) -> None:
     ax.plot([row.mean], [level], row.look.marker, label=_SURE if sure else _UNSURE, **mark)
 
 
-def _write(ax: Axes, level: int, words: str) -> None:
-    ground = {"facecolor": "white", "linewidth": 0.0, "pad": 1.0}  # over the line at zero
+def _write(ax: Axes, level: int, text: str) -> None:
+    ground = {"facecolor": "white", "linewidth": 0.0, "pad": 1.0}  # hides the line at zero
     placed: dict[str, Any] = {"transform": ax.get_yaxis_transform(), "va": "center", "bbox": ground}
-    ax.text(0.01, level, words, color=QUIET, fontsize=8, **placed)
+    ax.text(0.01, level, text, color=QUIET, fontsize=8, **placed)
 
 
 def _scale(ax: Axes, rows: Sequence[DifferenceRow], ticks: int) -> None:
@@ -83,7 +83,7 @@ def _scale(ax: Axes, rows: Sequence[DifferenceRow], ticks: int) -> None:
 
 
 def _even(rows: Sequence[DifferenceRow]) -> float:
-    """Return how far around zero the scale must be even: over the intervals that hold zero, or to the nearest end."""
+    """Return the range of the linear scale around zero: largest interval that contains zero, or else nearest end."""
     known = [(abs(row.low), abs(row.high), row.low <= 0.0 <= row.high) for row in rows if not isnan(row.low)]
     holding = [max(low, high) for low, high, holds in known if holds]
     nearest = [min(low, high) for low, high, _ in known]
@@ -91,7 +91,7 @@ def _even(rows: Sequence[DifferenceRow]) -> float:
 
 
 def _over_decades(ax: Axes, low: float, high: float, even: float, most: int) -> None:
-    """Make the scale even within ±`even` around zero, and logarithmic beyond."""
+    """Make the scale linear within ±`even` around zero, and logarithmic beyond."""
     ax.set_xscale("symlog", linthresh=even)
     ax.set_xlim(min(1.3 * low, -1.3 * even), max(1.3 * high, 1.3 * even))
     sizes = [float(f"{digit}e{k}") for k in range(floor(log10(even)) - 1, 4) for digit in (1, 3)]

@@ -1,4 +1,4 @@
-"""Distributions of the true error: a row of dots for each group, with quartiles, mean and 95 %."""
+"""Distributions of the true error: one row of dots per group, with quartiles, mean and 95 %."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,11 +23,11 @@ from flexneedle.figures.style import INK, QUIET, styled
 from flexneedle.study.figures.samples import LEAST, Sample
 
 _GOLDEN = 0.6180339887
-_HIGH = 0.28  # half of what the dots of a row spread over
+_HIGH = 0.28  # half height of the scatter of a row
 
 
 def error_figure(shown: Sequence[Panel[Sequence[Sample]]], label: str) -> Figure:
-    """Return the figure with a panel each and in it a row for each sample, levels of `label`."""
+    """Return the figure: one panel each, one row per sample; label: factor of the rows."""
     single, most = len(shown) == 1, max(len(panel.content) for panel in shown)
     with styled():
         figure, axes = panels(shown, (0.42 if single else 0.31) * most + 0.75, "true error (mm)", label)
@@ -56,19 +56,19 @@ def _draw_row(ax: Axes, level: int, row: Sample) -> None:
     errors = row.drawn
     spread = level + _HIGH * (2.0 * ((np.arange(len(errors)) * _GOLDEN) % 1.0) - 1.0)
     dots = scattered(len(errors), 0.5)
-    ax.scatter(errors, spread, color=row.look.color, zorder=2, label="an insertion", **dots)
+    ax.scatter(errors, spread, color=row.look.color, zorder=2, label="one insertion", **dots)
     first, middle, third, most = np.quantile(errors, (0.25, 0.5, 0.75, 0.95)).tolist()
     thick: dict[str, Any] = {"color": INK, "zorder": 4, "solid_capstyle": "butt"}
     white: dict[str, Any] = {"color": "white", "markeredgecolor": INK, "markersize": 4.5, "zorder": 6}
     dark: dict[str, Any] = {"color": INK, "markeredgecolor": "white", "markersize": 4, "zorder": 5}
-    ax.plot([first, third], [level, level], linewidth=3.0, alpha=0.85, label="middle half", **thick)
+    ax.plot([first, third], [level, level], linewidth=3.0, alpha=0.85, label="interquartile range", **thick)
     ax.plot([middle], [level], "o", label="median", **white)
     ax.plot([max(row.errors.mean(), LEAST)], [level], "D", label="mean", **dark)
     ax.plot([most, most], [level - _HIGH, level + _HIGH], linewidth=1.6, label="95 %", **thick)
 
 
 def _count(ax: Axes, rows: Sequence[Sample]) -> None:
-    """Write at the right of each row how many insertions it has."""
+    """Write the number of insertions to the right of each row."""
     for level, row in enumerate(rows):
         text = f"n = {row.count}" + (f"\n{row.missing} not finished" if row.missing else "")
         placed: dict[str, Any] = {"transform": ax.get_yaxis_transform(), "va": "center", "fontsize": 8}
@@ -79,8 +79,8 @@ def _handles() -> list[Line2D]:
     mark: dict[str, Any] = {"linestyle": "none"}
     white: dict[str, Any] = {"color": "white", "markeredgecolor": INK}
     return [
-        Line2D([], [], color=QUIET, marker="o", markersize=3, label="an insertion", **mark),
-        Line2D([], [], color=INK, linewidth=3.0, alpha=0.85, label="middle half"),
+        Line2D([], [], color=QUIET, marker="o", markersize=3, label="one insertion", **mark),
+        Line2D([], [], color=INK, linewidth=3.0, alpha=0.85, label="interquartile range"),
         Line2D([], [], marker="o", markersize=4.5, label="median", **white, **mark),
         Line2D([], [], color=INK, marker="D", markersize=4, label="mean", **mark),
         Line2D([], [], color=INK, marker="|", markersize=10, markeredgewidth=1.6, label="95 %", **mark),

@@ -1,4 +1,4 @@
-"""Energy stored in the tissue against the true error, an insertion a dot."""
+"""Strain energy of the tissue against the true error, one dot per insertion."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -24,12 +24,12 @@ from flexneedle.figures.style import INK, QUIET, styled
 
 
 def energy_figure(shown: Sequence[Panel[Floats]]) -> Figure:
-    """Return the figure of energies (mJ) and true errors (mm) (n, 2) of finished insertions, a panel each.
+    """Return the figure of energies (mJ) and true errors (mm) (n, 2) of finished insertions, one panel each.
 
-    The other panels are behind each in grey, medians are a cross of lines.
+    Dots of the other panels are grey; lines mark the medians.
     """
     with styled():
-        label = "energy in the tissue at the end (mJ)"
+        label = "final strain energy of the tissue (mJ)"
         figure, axes = panels(shown, 4.6 if len(shown) == 1 else 2.8, label, "true error (mm)")
         for ax, panel in zip(axes, shown, strict=True):
             decades(ax.xaxis, [other.content[:, 0] for other in shown], ticks_of(len(shown)))
@@ -42,9 +42,9 @@ def energy_figure(shown: Sequence[Panel[Floats]]) -> Figure:
 def _draw(ax: Axes, panel: Panel[Floats], others: Sequence[Panel[Floats]]) -> None:
     for other in others:
         dots = {**scattered(len(other.content)), "alpha": 0.5, "rasterized": True}
-        ax.scatter(*other.content.T, color=FAINT, zorder=1, label="of the other panels", **dots)
+        ax.scatter(*other.content.T, color=FAINT, zorder=1, label="other panels", **dots)
     dots = scattered(len(panel.content))
-    ax.scatter(*panel.content.T, color=panel.color, zorder=3, label="an insertion", **dots)
+    ax.scatter(*panel.content.T, color=panel.color, zorder=3, label="one insertion", **dots)
     if len(panel.content):
         energy, error = np.median(panel.content, axis=0).tolist()
         ax.axvline(energy, color=INK, linewidth=0.9, zorder=4, label="medians")
@@ -55,8 +55,8 @@ def _draw(ax: Axes, panel: Panel[Floats], others: Sequence[Panel[Floats]]) -> No
 def _handles() -> list[Line2D]:
     dot: dict[str, Any] = {"marker": "o", "markersize": 3.5, "linestyle": "none"}
     return [
-        Line2D([], [], color=QUIET, label="an insertion", **dot),
-        Line2D([], [], color=FAINT, label="of the other panels", **dot),
+        Line2D([], [], color=QUIET, label="one insertion", **dot),
+        Line2D([], [], color=FAINT, label="other panels", **dot),
         Line2D([], [], color=INK, linewidth=0.9, label="medians"),
         Line2D([], [], **LIMIT),
     ]

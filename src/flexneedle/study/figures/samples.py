@@ -1,4 +1,4 @@
-"""True errors of insertions, as the figures of their distributions take them."""
+"""Samples of true errors for the figures of distributions."""
 
 from dataclasses import dataclass
 
@@ -6,12 +6,12 @@ import numpy as np
 
 from flexneedle.figures.layout import Floats, Look
 
-LEAST = 1e-3  # mm; smaller errors are drawn here
+LEAST = 1e-3  # mm; smaller errors are drawn at this value
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """True errors (k,) (mm) of the finished ones among `count` insertions."""
+    """True errors (k,) (mm) of the finished insertions; count: all insertions."""
 
     name: str
     look: Look
@@ -20,10 +20,10 @@ class Sample:
 
     @property
     def drawn(self) -> Floats:
-        """The errors (k,) where a logarithmic scale shows them."""
+        """The errors (k,), clipped for a logarithmic scale."""
         return np.maximum(self.errors, LEAST)
 
     @property
     def missing(self) -> int:
-        """How many insertions did not finish."""
+        """Number of insertions that did not finish."""
         return self.count - len(self.errors)

@@ -1,4 +1,4 @@
-"""Distributions of the true error: the share of insertions that end nearer, a line for each controller."""
+"""Cumulative distributions of the true error, one line per controller."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from flexneedle.study.figures.samples import Sample
 
 
 def share_figure(shown: Sequence[Panel[Sequence[Sample]]]) -> Figure:
-    """Return the figure: a panel each; a line that does not reach 100 % is short of the insertions not finished."""
+    """Return the figure: one panel each; a line ends below 100 % by the share of unfinished insertions."""
     samples = [sample for panel in shown for sample in panel.content]
     colors = {sample.name: sample.look.color for sample in samples}
     with styled():

@@ -1,4 +1,4 @@
-"""The true error along an axis of a study: median with the middle half, and mean, for each controller."""
+"""The true error along an axis of a study: median, interquartile range and mean for each controller."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -24,13 +24,13 @@ from flexneedle.figures.style import BAD, INK, WIDTH, styled
 from flexneedle.study.figures.samples import Sample
 
 _FIRST, _THIRD = partial(np.quantile, q=0.25), partial(np.quantile, q=0.75)
-_WIDE = 20.0  # times between the smallest and the largest median or mean: from there on, decades
+_WIDE = 20.0  # ratio of the largest to the smallest median or mean above which the scale is logarithmic
 Sweep = Panel[Sequence[Sample]]
-"""A controller with the samples at its m levels."""
+"""A controller with the samples at the m levels."""
 
 
 def sweep_figure(sweeps: Sequence[Sweep], label: str, places: Floats) -> Figure:
-    """Return the figure along an axis with levels at `places` (m,); few controllers are in one panel."""
+    """Return the figure along an axis with levels at `places` (m,); few controllers share one panel."""
     overlaid = len(sweeps) <= OVERLAID
     shown = [Panel("", "", INK, ())] if overlaid else list(sweeps)
     with styled():
@@ -38,7 +38,7 @@ def sweep_figure(sweeps: Sequence[Sweep], label: str, places: Floats) -> Figure:
         for k, ax in enumerate(axes):
             for other in () if overlaid else sweeps:
                 line: dict[str, Any] = {"color": FAINT, "linewidth": 1.0, "zorder": 1}
-                ax.plot(places, _each(other, np.median), label="medians of the others", **line)
+                ax.plot(places, _each(other, np.median), label="medians of other controllers", **line)
             for sweep in sweeps if overlaid else sweeps[k : k + 1]:
                 _draw(ax, sweep, places)
             _scale(ax, sweeps)
@@ -52,7 +52,9 @@ def sweep_figure(sweeps: Sequence[Sweep], label: str, places: Floats) -> Figure:
 def _draw(ax: Axes, sweep: Sweep, places: Floats) -> None:
     color, marker = sweep.color, sweep.content[0].look.marker
     low, high = _each(sweep, _FIRST), _each(sweep, _THIRD)
-    ax.fill_between(places, low, high, color=color, alpha=0.16, linewidth=0.0, zorder=2, label="middle half")
+    ax.fill_between(
+        places, low, high, color=color, alpha=0.16, linewidth=0.0, zorder=2, label="interquartile range"
+    )
     middle, average = _each(sweep, np.median), _each(sweep, np.mean)
     ax.plot(places, middle, color=color, marker=marker, markersize=5, zorder=4, label="median")
     ax.plot(places, average, color=color, linestyle=(0, (4, 2)), linewidth=1.2, zorder=3, label="mean")
@@ -77,7 +79,7 @@ def _scale(ax: Axes, sweeps: Sequence[Sweep]) -> None:
 
 
 def _name_levels(ax: Axes, places: Floats, names: Sequence[str], columns: int) -> None:
-    """Put a tick at each level that has room for its name."""
+    """Set a tick at each level with room for its name."""
     span = float(places.max() - places.min()) or 1.0
     ax.set_xlim(places.min() - 0.05 * span, places.max() + 0.05 * span)
     inches = (WIDTH / columns - 0.6) / (1.1 * span)
@@ -90,7 +92,7 @@ def _name_levels(ax: Axes, places: Floats, names: Sequence[str], columns: int) -
 
 
 def _count_unfinished(ax: Axes, sweeps: Sequence[Sweep], places: Floats) -> None:
-    """Write above each level how many did not finish, where any did not."""
+    """Write the number of unfinished insertions above each level that has any."""
     missing = [sum(row.missing for row in level) for level in zip(*(s.content for s in sweeps), strict=True)]
     look: dict[str, Any] = {"textcoords": "offset points", "color": BAD, "fontsize": 7.5}
     if any(missing):
@@ -108,7 +110,7 @@ def _named(sweep: Sweep) -> Line2D:
 def _handles() -> list[Line2D]:
     return [
         Line2D([], [], color=INK, label="median"),
-        Line2D([], [], color=INK, alpha=0.16, linewidth=6.0, label="middle half"),
+        Line2D([], [], color=INK, alpha=0.16, linewidth=6.0, label="interquartile range"),
         Line2D([], [], color=INK, linestyle=(0, (4, 2)), linewidth=1.2, label="mean"),
-        Line2D([], [], color=FAINT, linewidth=1.0, label="medians of the others"),
+        Line2D([], [], color=FAINT, linewidth=1.0, label="medians of other controllers"),
     ]

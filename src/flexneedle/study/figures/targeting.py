@@ -1,4 +1,4 @@
-"""Where the tips ended: targets with their circles of 1 mm and true tips, as in the paper's figure."""
+"""Final true tips and targets with circles of 1 mm radius, as in the paper's figure."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from flexneedle.figures.layout import FAINT, Floats, Panel, columns_of, head, legend, panels, scattered, sheet
 from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, styled
 
-_MOST_TARGETS = 40  # more, and they are drawn in one place
-_MARGIN, _FAR = 2.0, 6.0  # mm around the targets that are always, and that are at most shown
+_MOST_TARGETS = 40  # above this, all targets are drawn at the origin
+_MARGIN, _FAR = 2.0, 6.0  # smallest and largest margin (mm) around the targets
 _CIRCLE, _TIP, _CROSS = (
-    "target, circle of 1 mm radius",
-    "true tip at the end",
-    "tip of an insertion not finished",
+    "target, 1 mm radius",
+    "final true tip",
+    "final true tip, not finished",
 )
 _LATERAL = "lateral (mm)"
 
@@ -37,12 +37,12 @@ class Tips:
 
     @property
     def on_one(self) -> "Tips":
-        """The same with all targets at the origin."""
+        """The tips relative to their targets, all targets at the origin."""
         return replace(self, targets=np.zeros_like(self.targets), tips=self.tips - self.targets)
 
 
 def targeting_figure(shown: Sequence[Panel[Tips]]) -> Figure:
-    """Return the figure: a panel each, all to the same scale; beside a single one all targets magnified."""
+    """Return the figure: one panel each, on the same scale; a single panel has a magnified view beside it."""
     targets = np.unique(np.concatenate([panel.content.targets for panel in shown]), axis=0)
     xlabel = "depth (mm)"
     if len(targets) > _MOST_TARGETS:
@@ -63,7 +63,7 @@ def targeting_figure(shown: Sequence[Panel[Tips]]) -> Figure:
 
 
 def _window(targets: Floats, tips: Sequence[Floats]) -> tuple[Floats, Floats]:
-    """Return the corners (2,) of what is shown: all targets, and tips that are not too far away."""
+    """Return the corners (2,) of the view: all targets, and the tips within the largest margin."""
     ends = _known(np.concatenate([targets, *tips]))
     low, high = targets.min(axis=0), targets.max(axis=0)
     below = np.clip(low - ends.min(axis=0) + 0.5, _MARGIN, _FAR)
@@ -72,7 +72,7 @@ def _window(targets: Floats, tips: Sequence[Floats]) -> tuple[Floats, Floats]:
 
 
 def _with_close_up(panel: Panel[Tips], ratio: float, xlabel: str) -> tuple[Figure, list[Axes]]:
-    """Return a figure with an empty map, and beside it the tips around their targets, all in one place."""
+    """Return a figure with an empty map and, beside it, the tips relative to their targets."""
     height = ratio * (WIDTH - 1.2) / (1.0 + ratio) + 0.8
     figure, (ax, close) = sheet(height, columns=2, widths=(1.0, ratio))
     head(ax, panel, 2)
@@ -110,7 +110,7 @@ def _draw_map(ax: Axes, panel: Panel[Tips], low: Floats, high: Floats) -> None:
 
 
 def _draw_tips(ax: Axes, tips: Tips, color: str, low: Floats, high: Floats) -> None:
-    """Draw tips to scale inside a window, and count those outside."""
+    """Draw the tips inside a window to scale, and write the number of those outside."""
     style = scattered(len(tips.tips))
     ax.scatter(*tips.tips[tips.done].T, color=color, zorder=3, label=_TIP, **style)
     if not tips.done.all():

@@ -1,4 +1,4 @@
-"""What a study varies: controllers, cases and axes, as `study.json` states them, with the level of each row."""
+"""Factors of a study: controllers, cases and axes of `study.json`, with the level of each row."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -9,35 +9,35 @@ import numpy as np
 
 from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.scenario.sections.needle import GAUGES
-from flexneedle.study.report.reading import Asked
+from flexneedle.study.report.reading import StudyDefinition
 from flexneedle.study.report.rows import Codes, Floats, Rows
 
 _SAMPLED = frozenset({"controller", "seed", "plan_seed", "world"})
-"""Axes that are no factors: the controller is one in every study, the others are what insertions are sampled over."""
+"""Axes that are not factors: the controller is a factor of every study, the others only sample insertions."""
 _UNITS = {
     "per_mm": "1/mm", "per_m": "1/m", "per_mj": "1/mJ", "mn_per_mm": "mN/mm", "mm_s": "mm/s",
     "mm": "mm", "mrad": "mrad", "kpa": "kPa", "gpa": "GPa", "hz": "Hz", "mj": "mJ", "s": "s",
 }  # fmt: skip
-_LABELS = {"needle.gauge": "needle gauge", "tracker.environment": "environment of the tracker"}
+_LABELS = {"needle.gauge": "needle gauge", "tracker.environment": "tracker environment"}
 _NUMBERED = re.compile(r"([^\d.+-]*)([-+]?(?:\d+\.?\d*|\.\d+))([^\d.]*)")
 
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """Something that has a level in each of n rows.
+    """A factor with a level in each of n rows.
 
-    key: column, or axis of the study; label: with its unit; names: of the k levels, in order; titles: the same with
-    what they are levels of, such as "G = 20 mm"; places (k,): of the levels on an axis; codes (n,): level of each row;
-    along: settings that change with it.
+    key: column, or axis of the study; label: with unit; names: of the k levels, in order; titles: names with the
+    factor, such as "G = 20 mm"; positions (k,): of the levels on an axis; codes (n,): level of each row; covaried:
+    other settings that change with the factor.
     """
 
     key: str
     label: str
     names: tuple[str, ...]
     titles: tuple[str, ...]
-    places: Floats
+    positions: Floats
     codes: Codes
-    along: tuple[str, ...] = ()
+    covaried: tuple[str, ...] = ()
 
     @property
     def varies(self) -> bool:
@@ -47,7 +47,7 @@ class Factor:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """The factors of a study. `cases` varies only where cases are no points of an axis."""
+    """The factors of a study. `cases` varies only if the cases are not points of an axis."""
 
     controller: Factor
     cases: Factor
@@ -56,23 +56,25 @@ class Design:
 
     @property
     def factors(self) -> tuple[Factor, ...]:
-        """Controller first, then all else that varies."""
+        """The controller, then all other factors that vary."""
         rest = (self.cases, *self.axes, self.guide)
         return (self.controller, *(factor for factor in rest if factor.varies))
 
     def besides(self, *compared: Factor) -> tuple[Factor, ...]:
-        """Return all factors but those that are compared."""
+        """Return all factors except those that are compared."""
         return tuple(factor for factor in self.factors if factor not in compared)
 
 
-def design_of(rows: Rows, asked: Asked) -> Design:
-    """Return what a study varies, of the levels that its rows have. The default controller and the base case, the
-    first that sets nothing, are the first levels."""
-    base = [name for name, settings in asked.cases.items() if not settings][:1]
+def design_of(rows: Rows, definition: StudyDefinition) -> Design:
+    """Return the factors of a study with the levels in its rows.
+
+    The first levels are the default controller and the base case, which is the first case without settings.
+    """
+    base = [name for name, settings in definition.cases.items() if not settings][:1]
     cases = _factor("case", rows.text("case"), first=base)
-    keys = [key for key in asked.axes if key not in _SAMPLED and not key.startswith("target")]
+    keys = [key for key in definition.axes if key not in _SAMPLED and not key.startswith("target")]
     axes = [_factor(key, _column(rows, key)) for key in keys]
-    case_axis = _case_axis(cases, asked.cases)
+    case_axis = _case_axis(cases, definition.cases)
     if case_axis is not None:
         axes, cases = [case_axis, *axes], _factor("case", [""] * len(rows))
     return Design(
@@ -89,16 +91,16 @@ def controllers_in_order() -> list[str]:
 
 
 def column_label(key: str) -> str:
-    """Return a key as a reader would write it, unit in brackets."""
-    *way, last = key.split(".")
+    """Return a key as words, unit in brackets."""
+    *sections, last = key.split(".")
     unit = next((end for end in sorted(_UNITS, key=len, reverse=True) if last.endswith("_" + end)), "")
     words = last.removesuffix("_" + unit).replace("_", " ") if unit else last.replace("_", " ")
-    label = f"{' '.join(way)}: {words}" if way else words
+    label = f"{' '.join(sections)}: {words}" if sections else words
     return _LABELS.get(key) or (f"{label} ({_UNITS[unit]})" if unit else label)
 
 
 def _column(rows: Rows, key: str) -> list[Any]:
-    """Return the value (n,) of an axis: that of its column; of a table its name, or else all that it holds."""
+    """Return the values (n,) of an axis: its column; for a table its name, or else all its values."""
     below = [name for name in rows.names if name.startswith(f"{key}.")]
     if f"{key}.name" in below:
         return rows.values(f"{key}.name")
@@ -106,7 +108,7 @@ def _column(rows: Rows, key: str) -> list[Any]:
 
 
 def _guides(rows: Rows) -> list[str]:
-    """Return whether each world (n,) has a guide; "" in other studies."""
+    """Return "with a guide" or "no guide" for each world (n,); "" in other studies."""
     guides = np.isnan(rows.number("setup.guide_to_skin_mm"))
     of_worlds = not np.isnan(rows.number("world")).all()
     return (
@@ -115,7 +117,7 @@ def _guides(rows: Rows) -> list[str]:
 
 
 def _factor(key: str, values: Sequence[Any], first: Sequence[Any] = ()) -> Factor:
-    """Return the factor of values (n,): numbers ascending, gauges by size, else `first`, then as they appear."""
+    """Return the factor of values (n,): numbers ascending, gauges by size, otherwise `first`, then as they appear."""
     levels, label = list(dict.fromkeys(values)), column_label(key)
     numeric = all(isinstance(level, int | float) and not isinstance(level, bool) for level in levels)
     first = [*first, *GAUGES]
@@ -124,9 +126,9 @@ def _factor(key: str, values: Sequence[Any], first: Sequence[Any] = ()) -> Facto
     names = tuple(map(_name, ordered))
     words, _, unit = label.rstrip(")").partition(" (")
     titles = tuple(f"{words} = {name} {unit}".rstrip() for name in names) if numeric else names
-    places = np.array(ordered if numeric else range(len(ordered)), dtype=float)
+    positions = np.array(ordered if numeric else range(len(ordered)), dtype=float)
     return Factor(
-        key, label, names, titles, places, np.array([number[value] for value in values], dtype=np.int64)
+        key, label, names, titles, positions, np.array([number[value] for value in values], dtype=np.int64)
     )
 
 
@@ -143,7 +145,7 @@ def _name(level: Any) -> str:
 
 
 def _case_axis(cases: Factor, settings: Mapping[str, Mapping[str, Any]]) -> Factor | None:
-    """Return the axis that cases are points of, if their names differ in nothing but a number."""
+    """Return the cases as an axis if their names differ only in a number, else None."""
     found = [match for match in map(_NUMBERED.fullmatch, cases.names) if match]
     around = {(match[1], match[3]) for match in found}
     if not cases.varies or len(found) < len(cases.names) or len(around) > 1:
@@ -156,4 +158,4 @@ def _case_axis(cases: Factor, settings: Mapping[str, Mapping[str, Any]]) -> Fact
     axis = _factor(key, [numbers[code] for code in cases.codes])
     order = np.argsort(numbers, kind="stable").tolist()
     titles = tuple(cases.names[k] for k in order)
-    return replace(axis, label=label, titles=titles, along=tuple(name for name in own[0] if name != key))
+    return replace(axis, label=label, titles=titles, covaried=tuple(name for name in own[0] if name != key))

@@ -1,4 +1,4 @@
-"""The figures of a report: a table of entries, each with when it applies, its caption, and what draws it."""
+"""The figures of a report: a table of entries, each with condition, caption and drawing function."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,13 +25,13 @@ from flexneedle.study.report.rows import Flags
 from flexneedle.study.report.summary import Difference, depths, finished
 from flexneedle.study.report.worlds import failures
 
-_MOST_LEVELS = 40  # of an axis that is drawn
+_MOST_LEVELS = 40  # of an axis in a figure
 _LOGARITHMIC = "Errors are on a logarithmic scale."
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure on disk: title and caption on the page; alt: the caption with what its panels note."""
+    """A figure on disk with title and caption; alt: caption with the notes of the panels."""
 
     name: str
     title: str
@@ -43,7 +43,7 @@ class Drawn:
 
 @dataclass(frozen=True, eq=False)
 class _Entry:
-    """A figure that a report can have: what goes into its panels, and what draws them."""
+    """A possible figure of a report: contents of its panels and drawing function."""
 
     name: str
     title: str
@@ -55,7 +55,7 @@ class _Entry:
 
 @dataclass(frozen=True, eq=False)
 class _Facts:
-    """What all figures are made from; `known`: rows (n,) that finished and whose true error is known."""
+    """Data of all figures; `known`: finished rows (n,) with a known true error."""
 
     found: Findings
     looks: Sequence[Look]
@@ -73,24 +73,24 @@ class _Facts:
         return list(zip(factor.names, own, self.looks, strict=True))
 
     @property
-    def apart(self) -> Factor:
-        """What has a panel for each level: controllers, of a single one the first other factor of few levels."""
+    def panel_factor(self) -> Factor:
+        """Factor with one panel per level: controllers, or for a single one the first other factor of few levels."""
         controller, *others = self.found.design.factors
         few = [factor for factor in others if len(factor.names) <= MOST_PANELS]
         return controller if controller.varies or not few else few[0]
 
     def pooled(self, *shown: Factor) -> str:
-        """Return over which factors, besides the controller and those shown, the rows are taken together."""
+        """Return as text the factors, besides controller and those shown, whose levels are pooled."""
         labels = [factor.label for factor in self.found.design.besides(self.found.design.controller, *shown)]
-        return f", all levels of {_listed(labels)} together" if labels else ""
+        return f", pooled over {_listed(labels)}" if labels else ""
 
     def sample(self, name: str, own: Flags, look: Look) -> Sample:
         """Return the errors of some of the rows (n,)."""
         return Sample(name, look, self.error[own & self.known], int(own.sum()))
 
     def panels(self, content: Callable[[Flags, Look], Any]) -> list[Panel[Any]]:
-        """Return a panel of `content` for each level of `apart`."""
-        factor = self.apart
+        """Return a panel of `content` for each level of `panel_factor`."""
+        factor = self.panel_factor
         looks = self.looks if factor is self.found.design.controller else [self.looks[0]] * len(factor.names)
         own = [factor.codes == k for k in range(min(len(factor.names), MOST_PANELS))]
         return [
@@ -106,13 +106,13 @@ class _Facts:
         return f"mean {errors.mean():.2f}, 95 % {np.quantile(errors, 0.95):.2f}, max {errors.max():.2f} mm"
 
     def alarm(self, own: Flags) -> str:
-        """Return how many of rows (n,) did not finish, or ""."""
+        """Return the number of rows (n,) that did not finish as text, or ""."""
         missing = int((own & ~self.done).sum())
         return f"{missing} not finished" if missing else ""
 
 
 def draw_figures(found: Findings, folder: Path) -> list[Drawn]:
-    """Draw every figure that the rows support into a folder, PNG and SVG each, and return them in reading order."""
+    """Draw all applicable figures to a folder, PNG and SVG each, and return them in reading order."""
     drawn = []
     for entry in _table(_facts(found)):
         if entry.applies:
@@ -136,17 +136,17 @@ def _facts(found: Findings) -> _Facts:
 def _table(f: _Facts) -> list[_Entry]:
     """Return all figures in reading order."""
     found, any_known, ours = f.found, bool(f.known.any()), f.found.design.controller.names[0]
-    dots, depth = f"Every finished insertion is a dot{f.pooled(f.apart)}.", depths(f.found.study.rows)
+    dots, depth = f"Every finished insertion is a dot{f.pooled(f.panel_factor)}.", depths(f.found.study.rows)
     return [
         _Entry(
             "shares", "True error in worlds", bool(found.worlds) and any_known,
-            "Share of the insertions that end nearer to their target than an error. A line that ends below 100 % is "
-            f"short of failures. {_LOGARITHMIC}",
+            "Cumulative share of insertions by true error. A line that ends below 100 % lacks the failures. "
+            f"{_LOGARITHMIC}",
             partial(_shares, f), share_figure,
         ),
         _Entry(
-            "targeting", "Where the tips ended", not found.worlds and not np.isnan(f.tips).all(),
-            "True tips of all insertions and their targets, each in its circle of 1 mm radius, to scale.",
+            "targeting", "Final tip positions", not found.worlds and not np.isnan(f.tips).all(),
+            "True tips of all insertions, and targets with circles of 1 mm radius, to scale.",
             partial(_tips, f), targeting_figure,
         ),
         _Entry(
@@ -155,7 +155,7 @@ def _table(f: _Facts) -> list[_Entry]:
             partial(_by_controller, f), partial(error_figure, label=""),
         ),
         _Entry(
-            "errors-by-depth", "True error by depth of the target",
+            "errors-by-depth", "True error by target depth",
             any_known and (depth.varies or not found.design.controller.varies), f"{dots} {_LOGARITHMIC}",
             partial(_by_depth, f, depth), partial(error_figure, label=depth.label),
         ),
@@ -163,14 +163,14 @@ def _table(f: _Facts) -> list[_Entry]:
         _Entry(
             "controllers", f"{ours} against the other controllers", _some(found.against),
             f"Mean paired difference of the true error: {ours} minus the other, on the same phantoms and targets. "
-            "Where differences are of very different size, the scale is even around zero and logarithmic beyond.",
+            "If the differences vary widely in size, the scale is linear around zero and logarithmic beyond.",
             partial(_against, f), partial(difference_figure, label="difference of the true error (mm)"),
         ),
         _Entry(
             "cases", f"Cases against the base case, {found.design.cases.names[0]}", _some(found.cases),
             "Mean paired difference of the true error: the case minus the base case, on the same phantoms and targets; "
-            "the largest on top.",
-            partial(_cases, f), partial(difference_figure, label="more error (mm)"),
+            "largest first.",
+            partial(_cases, f), partial(difference_figure, label="increase of the true error (mm)"),
         ),
         _Entry(
             "energy", "Tissue energy against true error", bool((f.known & (f.energy > 0)).any()),
@@ -181,7 +181,7 @@ def _table(f: _Facts) -> list[_Entry]:
 
 def _along(f: _Facts, axis: Factor, number: int) -> _Entry:
     """Return the figure of the true error along an axis."""
-    along = f" With it change {_listed(axis.along)}." if axis.along else ""
+    covaried = f" Also varied along the axis: {_listed(axis.covaried)}." if axis.covaried else ""
 
     def panels() -> list[Panel[Any]]:
         levels = [(name, axis.codes == k) for k, name in enumerate(axis.names)]
@@ -200,9 +200,9 @@ def _along(f: _Facts, axis: Factor, number: int) -> _Entry:
         f"error-along-{number}",
         f"True error against {axis.label}",
         bool(f.known.any()) and len(axis.names) <= _MOST_LEVELS,
-        f"Median, middle half (25 to 75 %) and mean of the finished insertions{f.pooled(axis)}.{along}",
+        f"Median, interquartile range (25 to 75 %) and mean of the finished insertions{f.pooled(axis)}.{covaried}",
         panels,
-        partial(sweep_figure, label=axis.label, places=axis.places),
+        partial(sweep_figure, label=axis.label, places=axis.positions),
     )
 
 

@@ -1,4 +1,4 @@
-"""All that a report states about a study."""
+"""Findings of a report on a study."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -23,16 +23,16 @@ from flexneedle.study.report.summary import (
 )
 from flexneedle.study.report.worlds import WorldGroup, has_worlds, world_groups
 
-_MOST_KINDS = 20  # of endings that are listed
+_MOST_KINDS = 20  # of endings in the list
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What is found in a study.
+    """Findings of a study.
 
-    outcomes: insertions by outcome, "done" first; whole: a group for each controller, over all its insertions;
-    groups: one for each setting; worst: rows with the largest errors, in worlds those of the first controller;
-    worlds: empty in other studies; predictions: of the controllers that predict.
+    outcomes: insertions by outcome, "done" first; whole: one group per controller over all its insertions; groups:
+    one per combination of settings; worst: rows with the largest errors, in worlds those of the first controller;
+    worlds: empty in other studies; predictions: of controllers that predict the miss.
     """
 
     study: StudyRecord
@@ -50,26 +50,26 @@ class Findings:
 
     @property
     def planned(self) -> int:
-        """How many insertions the study asks for."""
-        return self.study.asked.insertions
+        """Number of insertions of the complete study."""
+        return self.study.definition.insertions
 
     @property
     def finished(self) -> int:
-        """How many insertions finished."""
+        """Number of insertions that finished."""
         return self.outcomes[DONE]
 
     @property
     def missing(self) -> int:
-        """How many insertions of the study have no row yet."""
+        """Number of insertions without a row yet."""
         return max(0, self.planned - len(self.study.rows))
 
     @property
     def hits(self) -> int:
-        """How many insertions finished within 1 mm of their target."""
+        """Number of insertions that finished within 1 mm of the target."""
         return sum(group.known - group.missed for group in self.whole)
 
     def values(self) -> dict[str, Any]:
-        """Return all statistics as plain values, at full precision; NaN is for the border to make null."""
+        """Return all statistics as plain values, at full precision; NaN becomes null in JSON."""
         return {
             "insertions": len(self.study.rows),
             "planned": self.planned,
@@ -98,16 +98,16 @@ class Findings:
 
 
 def findings_of(study: StudyRecord) -> Findings:
-    """Return what is found in a study."""
+    """Return the findings of a study."""
     rows = study.rows
-    design = design_of(rows, study.asked)
+    design = design_of(rows, study.definition)
     groups = groups_of(rows, design.factors)
-    alone = len(design.factors) == 1
+    controllers_only = len(design.factors) == 1
     return Findings(
         study,
         design,
         {DONE: 0} | Counter(rows.text("outcome")),
-        groups if alone else groups_of(rows, [design.controller]),
+        groups if controllers_only else groups_of(rows, [design.controller]),
         groups,
         controller_differences(rows, design),
         differences_by_depth(rows, design) if design.controller.varies else {},

@@ -1,4 +1,4 @@
-"""The page of a report: one template, filled in from findings. Everything from data is text, and escaped."""
+"""The page of a report: one template filled with findings. All data are inserted as escaped text."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -12,37 +12,42 @@ from flexneedle.study.report.figures import Drawn
 from flexneedle.study.report.findings import Findings
 from flexneedle.study.report.reading import Tuning
 from flexneedle.study.report.rows import Rows
-from flexneedle.study.report.statistics import Estimate
+from flexneedle.study.report.statistics import IntervalEstimate
 from flexneedle.study.report.times import division
 from flexneedle.trace.folder import STUDY_FILE
 
-_LARGEST_SVG = 1_000_000  # bytes; a larger figure is in the page as PNG
-_HERE = files("flexneedle.study.report")
+_LARGEST_SVG = 1_000_000  # bytes; larger figures are embedded as PNG
+_TEMPLATES = files("flexneedle.study.report")
 
 
 def page_text(
-    findings: Findings, figures: Sequence[Drawn], again: Mapping[int, str], tuning: Sequence[Tuning] = ()
+    findings: Findings, figures: Sequence[Drawn], commands: Mapping[int, str], tuning: Sequence[Tuning] = ()
 ) -> str:
-    """Return the whole page. again: command of each listed row; tuning: records of the controllers' tuning."""
+    """Return the page as HTML. commands: command of each listed row; tuning: tuning records of the controllers."""
     from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"number": number, "signed": signed, "interval": interval, "value": value}
-    environment.globals |= {"used": used, "image": image}
-    template = environment.from_string((_HERE / "report.html.jinja").read_text(encoding="utf-8"))
+    environment.filters |= {
+        "number": number_text,
+        "signed": signed_text,
+        "interval": interval_text,
+        "value": value_text,
+    }
+    environment.globals |= {"tuning_status": tuning_status, "image": image}
+    template = environment.from_string((_TEMPLATES / "report.html.jinja").read_text(encoding="utf-8"))
     study = findings.study
     return template.render(
-        style=Markup((_HERE / "report.css").read_text(encoding="utf-8")),
+        style=Markup((_TEMPLATES / "report.css").read_text(encoding="utf-8")),
         found=findings,
         rows=study.rows,
         factors=findings.design.factors,
         figures=figures,
-        again=again,
+        commands=commands,
         tuning=[tuned for tuned in tuning if tuned.method in findings.design.controller.names],
-        versions=versions(study.rows),
+        versions=package_versions(study.rows),
         settings=settings(study.rows),
         parts=None if study.timing is None else division(study.timing),
         written=datetime.fromtimestamp((study.folder / STUDY_FILE).stat().st_mtime, UTC),
@@ -50,50 +55,50 @@ def page_text(
     )
 
 
-def number(value: float, digits: int = 3, unit: str = "") -> str:
-    """Return a number as text; "–" is what is not known."""
+def number_text(value: float, digits: int = 3, unit: str = "") -> str:
+    """Return a number as text, "–" if unknown."""
     return "–" if isnan(value) else f"{value:.{digits}f}{unit}"
 
 
-def signed(value: float) -> str:
+def signed_text(value: float) -> str:
     """Return a number with its sign as text."""
     return "–" if isnan(value) else f"{value:+.3f}".replace("-", "−")
 
 
-def interval(estimate: Estimate, digits: int = 3, unit: str = "") -> str:
+def interval_text(estimate: IntervalEstimate, digits: int = 3, unit: str = "") -> str:
     """Return the ends of an interval as text."""
     if isnan(estimate.low):
         return "no interval"
     return f"{estimate.low:.{digits}f} to {estimate.high:.{digits}f}{unit}".replace("-", "−")
 
 
-def value(value: Any) -> str:
+def value_text(value: Any) -> str:
     """Return a value of a row or a setting as text."""
     if isinstance(value, list | tuple):
         return ", ".join(f"{item:.10g}" if isinstance(item, float) else str(item) for item in value)
     return "–" if value is None else f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
-def versions(rows: Rows) -> dict[str, str]:
-    """Return the versions of the packages by name; that of the source, a digest, is left out."""
+def package_versions(rows: Rows) -> dict[str, str]:
+    """Return the versions of the packages by name, without the digest of the source."""
     names = [name for name in rows.names if name.startswith("version_") and name != "version_source"]
     return {name.removeprefix("version_"): ", ".join(sorted(set(rows.text(name)))) for name in names}
 
 
 def settings(rows: Rows) -> dict[str, str]:
-    """Return the settings of the scenario, the constant ones with their value."""
+    """Return the settings of the scenario as text: the value, or the number of values."""
     levels = {name: list(dict.fromkeys(rows.values(name))) for name in rows.names if "." in name}
     return {
-        name: value(found[0]) if len(found) == 1 else f"varies: {len(found)} values"
+        name: value_text(found[0]) if len(found) == 1 else f"varies: {len(found)} values"
         for name, found in levels.items()
         if found != [None]
     }
 
 
-def used(rows: Rows, tuned: Tuning) -> str:
-    """Return whether a study has the settings that tuning chose."""
+def tuning_status(rows: Rows, tuned: Tuning) -> str:
+    """Return as text whether a study uses the settings chosen by tuning."""
     other = [key for key, chosen in tuned.chosen.items() if set(rows.values(key)) != {chosen}]
-    return "as chosen" if not other else f"not as chosen: {', '.join(other)}"
+    return "used" if not other else f"different: {', '.join(other)}"
 
 
 def image(drawn: Drawn) -> str:

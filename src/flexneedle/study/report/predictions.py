@@ -1,4 +1,4 @@
-"""How good the predictions of a controller were: the miss with its standard deviation, and the warnings."""
+"""Quality of the predictions of a controller: the miss with its standard deviation, and the warnings."""
 
 from dataclasses import dataclass
 from math import nan
@@ -11,17 +11,18 @@ from flexneedle.study.report.summary import HIT_MM, finished, members_of
 from flexneedle.study.report.worlds import mean_of
 from flexneedle.trace.results import DEPTH_FRACTIONS
 
-# Standard deviations to either side that contain 95 % of a normal miss.
+# A normal miss is within ± this many standard deviations with a probability of 95 %.
 _WIDTH = 1.959963984540054
 GOOD_MM = 0.5
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """Of the finished insertions that share a level of every factor and whose controller predicts: their number;
-    covered: share of the lateral misses within ±1.96 sd of what was predicted at a quarter, half and three quarters of
-    the depth; in_vain: share of those that end within 0.5 mm that had a warning; unwarned: number of those that end
-    above 1 mm without one. NaN is what is not known.
+    """Predictions in the finished insertions with the same level of every factor whose controller predicts the miss.
+
+    count: insertions; covered: share of lateral misses within ±1.96 sd of the prediction at a quarter, half and three
+    quarters of the depth; in_vain: share of false warnings among insertions that end within 0.5 mm; unwarned: number of
+    insertions that end beyond 1 mm without a warning. NaN: unknown.
     """
 
     levels: dict[str, str]
@@ -32,18 +33,18 @@ class Predictions:
 
 
 def predictions_of(rows: Rows, design: Design) -> list[Predictions]:
-    """Return the groups whose controller predicts, in the order of the study's factors."""
+    """Return the groups whose controller predicts the miss, in the order of the factors."""
     miss = rows.number("tip_y_mm") - rows.number("target_lateral_mm")
-    inside = np.stack([_inside(rows, place, miss) for place in DEPTH_FRACTIONS])
+    inside = np.stack([_inside(rows, name, miss) for name in DEPTH_FRACTIONS])
     known = finished(rows) & ~np.isnan(inside).all(axis=0) & ~np.isnan(miss)
     error, warned = rows.number("true_error_mm"), np.array([bool(line) for line in rows.text("warning")])
     groups = [(levels, own[known[own]]) for levels, own in members_of(design.factors)]
     return [_group(levels, inside[:, own], error[own], warned[own]) for levels, own in groups if len(own) > 0]
 
 
-def _inside(rows: Rows, place: str, miss: Floats) -> Floats:
-    """1 where the miss (n,) is within the interval that was predicted at a place, 0 where not, NaN without one."""
-    mean, sd = rows.number(f"predicted_{place}_mm"), rows.number(f"predicted_{place}_sd_mm")
+def _inside(rows: Rows, fraction: str, miss: Floats) -> Floats:
+    """1 where the miss (n,) is within the interval predicted at a fraction of the depth, 0 if not, NaN if unknown."""
+    mean, sd = rows.number(f"predicted_{fraction}_mm"), rows.number(f"predicted_{fraction}_sd_mm")
     within = np.abs(miss - mean) <= _WIDTH * sd
     return np.where(np.isnan(mean) | np.isnan(sd), nan, within)
 

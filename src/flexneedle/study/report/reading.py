@@ -1,4 +1,4 @@
-"""The folder of a study, read for its report."""
+"""Read the folder of a study for its report."""
 
 import json
 from dataclasses import dataclass
@@ -23,8 +23,8 @@ _STRICT = ConfigDict(strict=True, frozen=True)
 Record = TypeVar("Record", bound=BaseModel)
 
 
-class Asked(BaseModel):
-    """The study of `study.json` as the runner wrote it: what it varies and how many insertions it asks for."""
+class StudyDefinition(BaseModel):
+    """The study of `study.json`: cases, axes and number of insertions."""
 
     model_config = _STRICT
     name: str
@@ -34,31 +34,31 @@ class Asked(BaseModel):
     insertions: int = Field(ge=1)
 
 
-class About(BaseModel):
-    """`study.json`: the study, and the command that began it."""
+class StudyJson(BaseModel):
+    """`study.json`: the study and its first command."""
 
     model_config = _STRICT
-    study: Asked
+    study: StudyDefinition
     command: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class StudyRecord:
-    """What a folder holds: `study.json`, the rows ordered by index, and wall-clock times if they are there."""
+    """A study folder: `study.json`, the rows ordered by index, and wall-clock times if available."""
 
     folder: Path
-    about: About
+    header: StudyJson
     rows: Rows
     timing: Rows | None
 
     @property
-    def asked(self) -> Asked:
-        """What the study varies and asks for."""
-        return self.about.study
+    def definition(self) -> StudyDefinition:
+        """Cases, axes and number of insertions."""
+        return self.header.study
 
 
-class Row(BaseModel):
-    """What a report needs in each row of `runs.parquet`."""
+class RequiredColumns(BaseModel):
+    """Columns of `runs.parquet` that a report needs, checked in each row."""
 
     model_config = _STRICT
     index: int
@@ -71,16 +71,16 @@ class Row(BaseModel):
 
 
 class Trial(BaseModel):
-    """Settings that tuning tried: mean score."""
+    """Settings tried in tuning, with their score."""
 
     model_config = _STRICT
     score_mm: float
 
 
 class Tuning(BaseModel):
-    """What tuning chose for a controller.
+    """Tuning record of a controller: chosen settings and all trials, the best first.
 
-    budget_insertions: of all trials, the best first; phantom_seeds: first and last; note: what else went into it.
+    budget_insertions: over all trials; phantom_seeds: first and last; note: remark on the tuning.
     """
 
     model_config = _STRICT
@@ -92,38 +92,38 @@ class Tuning(BaseModel):
     trials: list[Trial] = Field(min_length=1)
 
 
-def read_study(folder: Path) -> StudyRecord:
-    """Return what the folder of a study holds. Raises InputError, in one line, if it cannot be reported on."""
+def read_study_folder(folder: Path) -> StudyRecord:
+    """Return the contents of a study folder. Raises InputError, in one line, if they are incomplete or damaged."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder: give the folder that `flexneedle study` made")
+        raise InputError(f"{folder}: no such folder: give the folder of a `flexneedle study`")
     if not (folder / STUDY_FILE).exists():
-        raise InputError(f"{folder}: holds no study: there is no {STUDY_FILE}")
+        raise InputError(f"{folder}: contains no study: there is no {STUDY_FILE}")
     if not (folder / RUNS_FILE).exists():
         hint = "the study was killed or is still running; --resume completes it and writes its tables"
         raise InputError(f"{folder}: {hint}: there is no {RUNS_FILE}")
     rows, timing = _checked(folder / RUNS_FILE), folder / TIMING_FILE
-    about = _read(About, folder / STUDY_FILE, "damaged")
-    return StudyRecord(folder, about, rows, _read_table(timing) if timing.exists() else None)
+    header = _read(StudyJson, folder / STUDY_FILE, "damaged")
+    return StudyRecord(folder, header, rows, _read_table(timing) if timing.exists() else None)
 
 
 def read_tuning(folder: Path | None = None) -> list[Tuning]:
-    """Return the records of tuning in a folder, a JSON file each; by default those that the package ships.
+    """Return the tuning records of a folder, one JSON file each (default: those of the package).
 
-    Raises InputError if there is none, or a file holds no record.
+    Raises InputError if there is none, or if a file is not a record.
     """
-    place: Traversable = _SHIPPED if folder is None else folder
-    found = [item for item in place.iterdir() if item.name.endswith(".json")] if place.is_dir() else []
+    source: Traversable = _SHIPPED if folder is None else folder
+    found = [item for item in source.iterdir() if item.name.endswith(".json")] if source.is_dir() else []
     if not found:
-        raise InputError(f"{place}: holds no records of tuning: there is no .json file")
-    return [_read(Tuning, item, "no record of tuning") for item in sorted(found, key=lambda item: item.name)]
+        raise InputError(f"{source}: contains no tuning records: there is no .json file")
+    return [_read(Tuning, item, "not a tuning record") for item in sorted(found, key=lambda item: item.name)]
 
 
 def _read(model: type[Record], path: Traversable, problem: str) -> Record:
-    """Return what a JSON file holds as a model. Raises InputError, with the problem, if it is none."""
+    """Return the contents of a JSON file as a model. Raises InputError, with the problem, if they do not fit."""
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(values, dict):
-            raise ValueError("must hold one JSON object")
+            raise ValueError("must contain one JSON object")
         return model.model_validate(values)
     except ValidationError as error:
         raise InputError(f"{path}: {problem}: {describe(error, model)[0]}") from None
@@ -133,17 +133,17 @@ def _read(model: type[Record], path: Traversable, problem: str) -> Record:
 
 def _checked(path: Path) -> Rows:
     rows = _read_table(path)
-    missing = [name for name in Row.model_fields if name not in rows.names]
+    missing = [name for name in RequiredColumns.model_fields if name not in rows.names]
     if missing:
-        raise InputError(f"{path}: not the rows of a study: lacks the columns {', '.join(missing)}")
-    for number, values in enumerate(zip(*map(rows.values, Row.model_fields), strict=True), 1):
+        raise InputError(f"{path}: not the rows of a study: missing columns {', '.join(missing)}")
+    for number, values in enumerate(zip(*map(rows.values, RequiredColumns.model_fields), strict=True), 1):
         try:
-            Row.model_validate(dict(zip(Row.model_fields, values, strict=True)))
+            RequiredColumns.model_validate(dict(zip(RequiredColumns.model_fields, values, strict=True)))
         except ValidationError as error:
-            problem = describe(error, Row)[0]
+            problem = describe(error, RequiredColumns)[0]
             raise InputError(f"{path}: not the rows of a study: row {number}: {problem}") from None
     if len(rows) == 0:
-        raise InputError(f"{path}: has no insertion: there is nothing to report")
+        raise InputError(f"{path}: contains no insertions: nothing to report")
     index, times = np.unique(rows.number("index"), return_counts=True)
     if times.max() > 1:
         raise InputError(f"{path}: damaged: index {index[times.argmax()]:.0f} occurs more than once")
@@ -155,4 +155,4 @@ def _read_table(path: Path) -> Rows:
         return Rows(pq.read_table(path))
     except (pa.ArrowException, OSError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: damaged, or no Parquet file: {first}") from None
+        raise InputError(f"{path}: damaged, or not a Parquet file: {first}") from None

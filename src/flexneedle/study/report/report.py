@@ -1,4 +1,4 @@
-"""`report`: from the folder of a study to one HTML file, its figures, and statistics at full precision."""
+"""Write the report of a study: one HTML page, its figures, and statistics at full precision."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,35 +6,35 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
-from flexneedle.study.report.again import commands
 from flexneedle.study.report.figures import Drawn, draw_figures
 from flexneedle.study.report.findings import Findings, findings_of
 from flexneedle.study.report.page import page_text
-from flexneedle.study.report.reading import read_study, read_tuning
+from flexneedle.study.report.reading import read_study_folder, read_tuning
+from flexneedle.study.report.reproduce import commands
 
 REPORT_FILE = "report.html"
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """A written report: the page, its figures, the findings, and how to run the listed rows again."""
+    """A written report: the page, its figures, the findings, and the commands that reproduce the listed rows."""
 
     page: Path
     figures: Sequence[Drawn]
     findings: Findings
-    again: Mapping[int, str]
+    commands: Mapping[int, str]
 
     def values(self) -> dict[str, Any]:
-        """Return all statistics as plain values, at full precision; NaN is for the border to make null."""
+        """Return all statistics as plain values, at full precision; NaN becomes null in JSON."""
         rows = self.findings.study.rows
         return {
-            "study": self.findings.study.asked.title,
+            "study": self.findings.study.definition.title,
             "report": str(self.page),
             "figures": [str(path) for drawn in self.figures for path in (drawn.png, drawn.svg)],
             **self.findings.values(),
             "worst": [
                 {name: rows.value(name, row) for name in ("index", "true_error_mm", "outcome")}
-                | {"command": self.again[row]}
+                | {"command": self.commands[row]}
                 for row in self.findings.worst
             ],
         }
@@ -43,21 +43,21 @@ class Report:
 def write_report(folder: Path, out: Path | None = None, tuning: Path | None = None) -> Report:
     """Write the report on the study in `folder` to `out` (default: `report` inside it), and return it.
 
-    tuning: a folder with records of the controllers' tuning (`studies/tune.py`), to be shown beside the study's
-    settings; by default those of the package. The same rows give the same files to the byte, but for the page's
-    section on the run: command, date and times. Raises InputError if the folder holds no study, is damaged, or holds
-    no insertion yet; if `tuning` holds no records; or if `out` cannot be written.
+    tuning: folder of tuning records (`studies/tune.py`) to show with the settings of the study (default: those of the
+    package). The same rows give identical files, except for the section on the run in the page: command, date and
+    times. Raises InputError if the folder contains no study, is damaged, or has no insertion yet; if `tuning` contains
+    no records; or if `out` cannot be written.
     """
     tuned = read_tuning(tuning)
-    findings = findings_of(read_study(folder))
-    place = folder / "report" if out is None else out
+    findings = findings_of(read_study_folder(folder))
+    target = folder / "report" if out is None else out
     try:
-        place.mkdir(parents=True, exist_ok=True)
+        target.mkdir(parents=True, exist_ok=True)
         listed = [*findings.worst, *(ending.first for ending in findings.endings)]
-        again = commands(findings.study.rows, listed, place)
-        figures = draw_figures(findings, place)
-        page = place / REPORT_FILE
-        page.write_text(page_text(findings, figures, again, tuned), encoding="utf-8", newline="\n")
+        found_commands = commands(findings.study.rows, listed, target)
+        figures = draw_figures(findings, target)
+        page = target / REPORT_FILE
+        page.write_text(page_text(findings, figures, found_commands, tuned), encoding="utf-8", newline="\n")
     except OSError as error:
-        raise InputError(f"{place}: cannot be written: {error.strerror}") from None
-    return Report(page, figures, findings, again)
+        raise InputError(f"{target}: cannot be written: {error.strerror}") from None
+    return Report(page, figures, findings, found_commands)

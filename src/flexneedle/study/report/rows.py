@@ -1,4 +1,4 @@
-"""Rows of a study, column by column: what the report asks of them."""
+"""Rows of a study by column, for the report."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +14,7 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """n insertions. A column that the table lacks is unknown in every row."""
+    """n insertions. The values of a missing column are unknown."""
 
     table: pa.Table
 
@@ -27,14 +27,14 @@ class Rows:
         return list(self.table.column_names)
 
     def number(self, name: str) -> Floats:
-        """Return a column as floats (n,), NaN where it is unknown or no number."""
+        """Return a column as floats (n,), NaN where unknown or not a number."""
         kind = self.table.schema.field(name).type if name in self.names else pa.null()
         if not (pa.types.is_floating(kind) or pa.types.is_integer(kind)):
             return np.full(len(self), np.nan)
         return np.array(self.table.column(name).cast(pa.float64()).to_numpy())
 
     def values(self, name: str) -> list[Any]:
-        """Return a column as numbers, text, or tuples of them; None where it is unknown."""
+        """Return a column as numbers, text, or tuples of them; None where unknown."""
         if name not in self.names:
             return [None] * len(self)
         return [_plain(value) for value in self.table.column(name).to_pylist()]
@@ -44,11 +44,11 @@ class Rows:
         return _plain(self.table.column(name)[row].as_py()) if name in self.names else None
 
     def text(self, name: str) -> list[str]:
-        """Return a column as text, "" where it is unknown."""
+        """Return a column as text, "" where unknown."""
         return ["" if value is None else str(value) for value in self.values(name)]
 
     def codes(self, name: str) -> Codes:
-        """Return a number (n,) for each row, the same for the same value, in order of first appearance."""
+        """Return an integer code (n,) for each row, equal for equal values, in order of first appearance."""
         known: dict[Any, int] = {}
         return np.array([known.setdefault(value, len(known)) for value in self.values(name)], dtype=np.int64)
 

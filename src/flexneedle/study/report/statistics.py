@@ -1,9 +1,9 @@
 """Statistics of many insertions, with percentile bootstrap intervals.
 
-Insertions with the same seed have the same virtual phantom, so what is resampled is the seed with all its
-insertions, not the insertion (a cluster bootstrap: Davison and Hinkley 1997, section 3.8). Where every insertion
-has a seed of its own, that is the ordinary bootstrap. Quantiles are those of linear interpolation between the order
-statistics: the value at rank (n − 1) q, counted from 0 (Hyndman and Fan 1996, definition 7; NumPy's default).
+Insertions with the same seed have the same virtual phantom, so seeds are resampled with all their insertions (a
+cluster bootstrap: Davison and Hinkley 1997, section 3.8). If every insertion has its own seed, that is the ordinary
+bootstrap. Quantiles are by linear interpolation between the order statistics: the value at rank (n − 1) q, counted
+from 0 (Hyndman and Fan 1996, definition 7; NumPy's default).
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]
 Statistic = Callable[[Counts], Floats]
-"""From how often each row counts, (b, n), to the value of the statistic in each of the b samples, (b,)."""
+"""Maps the multiplicity of each row in b samples, (b, n), to the statistic of each sample, (b,)."""
 
 LEAST_CLUSTERS = 10
 RESAMPLES, CONFIDENCE, SEED = 2000, 0.95, 0
-_CHUNK = 2_000_000  # counts held in memory at once
+_CHUNK = 2_000_000  # multiplicities in memory at once
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """A value with the ends of its interval; NaN is what is not known."""
+class IntervalEstimate:
+    """A value with the ends of its confidence interval; NaN if unknown."""
 
     value: float
     low: float = nan
@@ -33,7 +33,7 @@ class Estimate:
 
 
 def mean(values: Floats) -> Statistic:
-    """Return the mean of values (n,), without those that are NaN."""
+    """Return the mean of values (n,), ignoring NaN."""
     known, filled = _known(values)
 
     def statistic(counts: Counts) -> Floats:
@@ -43,7 +43,7 @@ def mean(values: Floats) -> Statistic:
 
 
 def sd(values: Floats) -> Statistic:
-    """Return the standard deviation of values (n,) with n − 1 in the denominator, without those that are NaN."""
+    """Return the standard deviation of values (n,) with n − 1 in the denominator, ignoring NaN."""
     known, filled = _known(values)
 
     def statistic(counts: Counts) -> Floats:
@@ -56,9 +56,9 @@ def sd(values: Floats) -> Statistic:
 
 
 def quantile(values: Floats, share: float) -> Statistic:
-    """Return the quantile at `share` (0 to 1) of values (n,), without those that are NaN."""
+    """Return the quantile at `share` (0 to 1) of values (n,), ignoring NaN."""
     order = np.argsort(values, kind="stable")[: np.count_nonzero(~np.isnan(values))]
-    ordered = np.append(values[order], nan)  # NaN: the sample holds none that is known
+    ordered = np.append(values[order], nan)  # NaN: the sample has no known value
 
     def statistic(counts: Counts) -> Floats:
         up_to = np.cumsum(counts[:, order], axis=1)
@@ -72,7 +72,7 @@ def quantile(values: Floats, share: float) -> Statistic:
 
 
 def ratio(over: Floats, under: Floats) -> Statistic:
-    """Return the ratio of the means of two columns (n,) over the rows where both are known."""
+    """Return the ratio of the means of two columns (n,) over the rows with both known."""
     both = np.isnan(over) | np.isnan(under)
     one, other = (mean(np.where(both, nan, values)) for values in (over, under))
     return lambda counts: _divide(one(counts), other(counts))
@@ -83,33 +83,35 @@ def estimates(
     clusters: NDArray[np.int64],
     resamples: int = RESAMPLES,
     seed: int = SEED,
-) -> dict[str, Estimate]:
+) -> dict[str, IntervalEstimate]:
     """Return each statistic of n rows with its percentile bootstrap interval.
 
-    clusters (n,): rows with the same number, 0 to c − 1, are drawn together. All statistics see the same samples.
+    clusters (n,): rows with the same number, 0 to c − 1, are drawn together. All statistics use the same samples.
     With fewer than `LEAST_CLUSTERS` there is no interval (NaN): a percentile bootstrap of a few is far too narrow.
     """
     once = np.ones((1, len(clusters)), dtype=np.int64)
     values = {name: float(statistic(once)[0]) for name, statistic in statistics.items()}
     if len(np.unique(clusters)) < LEAST_CLUSTERS:
-        return {name: Estimate(value) for name, value in values.items()}
+        return {name: IntervalEstimate(value) for name, value in values.items()}
     drawn: dict[str, list[Floats]] = {name: [] for name in statistics}
     for counts in _samples(clusters, resamples, np.random.default_rng(seed)):
         for name, statistic in statistics.items():
             drawn[name].append(statistic(counts))
-    return {name: Estimate(values[name], *_ends(np.concatenate(found))) for name, found in drawn.items()}
+    return {
+        name: IntervalEstimate(values[name], *_ends(np.concatenate(found))) for name, found in drawn.items()
+    }
 
 
 def beyond_largest(count: int, confidence: float = CONFIDENCE) -> float:
-    """Return the share of all insertions that may lie beyond the largest of `count` independent ones.
+    """Return an upper bound on the share of all insertions beyond the largest of `count` independent ones.
 
-    With this confidence no more do: 1 − (1 − confidence)^(1/count) (Wilks 1941). NaN without any.
+    It holds with this confidence: 1 − (1 − confidence)^(1/count) (Wilks 1941). NaN for a count of 0.
     """
     return 1.0 - (1.0 - confidence) ** (1.0 / count) if count else nan
 
 
 def _samples(clusters: Counts, resamples: int, rng: np.random.Generator) -> Iterator[Counts]:
-    """Yield how often each row counts in each sample, (b, n), until there were `resamples`."""
+    """Yield the multiplicity of each row in each sample, (b, n), for `resamples` samples in total."""
     number = int(clusters.max()) + 1
     most = max(1, _CHUNK // max(number, len(clusters)))
     for start in range(0, resamples, most):

@@ -1,4 +1,4 @@
-"""Statistics of the rows of a study: groups, paired differences, how insertions ended, the worst."""
+"""Statistics of the rows of a study: groups, paired differences, endings, worst insertions."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -10,7 +10,15 @@ import numpy as np
 
 from flexneedle.study.report.design import Design, Factor
 from flexneedle.study.report.rows import Codes, Flags, Floats, Rows
-from flexneedle.study.report.statistics import Estimate, beyond_largest, estimates, mean, quantile, ratio, sd
+from flexneedle.study.report.statistics import (
+    IntervalEstimate,
+    beyond_largest,
+    estimates,
+    mean,
+    quantile,
+    ratio,
+    sd,
+)
 
 DONE = "done"
 HIT_MM = 1.0  # radius of the paper's target circles
@@ -20,14 +28,14 @@ _NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 @dataclass(frozen=True)
 class Group:
-    """Insertions that share levels of factors.
+    """Insertions with the same levels of the factors.
 
-    name: their levels as one line; levels: name of the level by factor; count, finished: insertions; known: finished
-    ones whose true error is known; missed: of those, ended more than 1 mm from the target; unconverged: insertions
-    with a period that did not converge, finished or not, and how many such periods; seeds: different ones;
-    largest_mm: of the true errors; largest_period_ratio: of the periods over the plan's;
-    beyond_largest: share of all insertions that may be beyond it, with 95 % confidence; estimates: by name, over
-    the finished.
+    name: levels in one line; levels: name of the level by factor; count, finished: insertions; known: finished
+    insertions with a known true error; missed: those that ended more than 1 mm from the target; unconverged: insertions
+    with a period that did not converge, finished or not; unconverged_periods: number of such periods; seeds: number of
+    distinct seeds; largest_mm: largest true error; largest_period_ratio: largest number of periods relative to the
+    plan; beyond_largest: upper bound (95 % confidence) on the share of all insertions beyond largest_mm; estimates: by
+    name, over finished insertions.
     """
 
     name: str
@@ -42,15 +50,15 @@ class Group:
     largest_mm: float
     largest_period_ratio: float
     beyond_largest: float
-    estimates: dict[str, Estimate]
+    estimates: dict[str, IntervalEstimate]
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean paired difference (mm) of true errors, `name` minus `against`, in insertions alike in all else.
+    """Mean paired difference (mm) of true errors, `name` minus `against`, between insertions otherwise identical.
 
-    pairs: both finished; left_out: pairs of which one did not; verdict: "better" if the interval of the difference
-    is below 0, "worse" if above, else "not separable"; None without an interval.
+    pairs: both finished; left_out: pairs with an unfinished insertion; verdict: "better" if the interval of the
+    difference is below 0, "worse" if above, otherwise "not separable"; None without an interval.
     """
 
     name: str
@@ -58,13 +66,13 @@ class Difference:
     controller: str
     pairs: int
     left_out: int
-    mean_mm: Estimate
+    mean_mm: IntervalEstimate
     verdict: str | None
 
 
 @dataclass(frozen=True)
 class Ending:
-    """Endings of one kind: how many, which row is the first of them, and its reason."""
+    """Endings with the same outcome and kind of reason: count, first row, and its reason."""
 
     outcome: str
     count: int
@@ -87,7 +95,7 @@ def groups_of(rows: Rows, factors: Sequence[Factor]) -> list[Group]:
 
 
 def members_of(factors: Sequence[Factor]) -> Iterator[tuple[dict[str, str], Codes]]:
-    """Yield the levels of every factor, by its key, and the rows that share them, in the order of the factors."""
+    """Yield each combination of levels, by key of the factor, with its rows, in the order of the factors."""
     combined = np.stack([factor.codes for factor in factors], axis=1)
     levels, codes = np.unique(combined, axis=0, return_inverse=True)
     for number, chosen in enumerate(levels.tolist()):
@@ -119,7 +127,7 @@ def _group(rows: Rows, members: Codes, done: Flags, name: str, levels: dict[str,
     )
 
 
-def _estimates(rows: Rows, ended: Codes, seeds: Codes) -> dict[str, Estimate]:
+def _estimates(rows: Rows, ended: Codes, seeds: Codes) -> dict[str, IntervalEstimate]:
     def column(name: str) -> Floats:
         return rows.number(name)[ended]
 
@@ -142,9 +150,9 @@ def _estimates(rows: Rows, ended: Codes, seeds: Codes) -> dict[str, Estimate]:
 
 
 def controller_differences(rows: Rows, design: Design, among: Flags | None = None) -> list[Difference]:
-    """Return the first controller minus each other one, in insertions of the same seed, target and settings.
+    """Return the first controller minus each other one, in insertions with the same seed, target and settings.
 
-    among (n,): which rows are compared (default: all).
+    among (n,): rows to compare (default: all).
     """
     chosen = np.ones(len(rows), dtype=bool) if among is None else among
     keys, controller = pair_keys(rows, design.besides(design.controller)), design.controller
@@ -156,7 +164,7 @@ def controller_differences(rows: Rows, design: Design, among: Flags | None = Non
 
 
 def differences_by_depth(rows: Rows, design: Design) -> dict[str, list[Difference]]:
-    """Return the same at each depth of the target, by the name of the depth."""
+    """Return `controller_differences` at each target depth, by the name of the depth."""
     depth = depths(rows)
     return {
         name: controller_differences(rows, design, depth.codes == k) for k, name in enumerate(depth.names)
@@ -176,7 +184,7 @@ def case_differences(rows: Rows, design: Design) -> list[Difference]:
 
 
 def depths(rows: Rows) -> Factor:
-    """Return the depth of each row's target as a factor; many depths are put into bands."""
+    """Return the target depth as a factor; many depths are grouped into bands."""
     depth = rows.number("target_depth_mm")
     levels, codes = np.unique(depth, return_inverse=True)
     names = [f"{level:g}" for level in levels.tolist()]
@@ -184,14 +192,14 @@ def depths(rows: Rows) -> Factor:
         edges = np.linspace(levels[0], levels[-1], _DEPTH_BANDS + 1)
         used, codes = np.unique(np.searchsorted(edges[1:-1], depth, side="right"), return_inverse=True)
         names = [f"{edges[k]:.3g} to {edges[k + 1]:.3g}" for k in used.tolist()]
-    places = np.arange(len(names), dtype=float)
-    return Factor("depth", "depth of the target (mm)", tuple(names), tuple(names), places, codes)
+    positions = np.arange(len(names), dtype=float)
+    return Factor("depth", "target depth (mm)", tuple(names), tuple(names), positions, codes)
 
 
 def endings(rows: Rows) -> list[Ending]:
-    """Return how insertions ended that did not finish, or finished with a remark, the most frequent first.
+    """Return the endings of insertions that did not finish, or finished with a remark, the most frequent first.
 
-    Reasons that differ only in their numbers are one kind.
+    Reasons that differ only in numbers are grouped.
     """
     found: dict[tuple[str, str], list[int]] = {}
     reasons = rows.text("reason")
@@ -203,9 +211,9 @@ def endings(rows: Rows) -> list[Ending]:
 
 
 def worst(rows: Rows, number: int = 10, among: Flags | None = None) -> list[int]:
-    """Return the rows with the largest true errors beyond their reach, finished or not, the largest first.
+    """Return the rows with the largest true error minus reach, finished or not, the largest first.
 
-    A reach that is not known is 0; among (n,): which rows may be among them (default: all).
+    An unknown reach counts as 0; among (n,): rows to consider (default: all).
     """
     excess = rows.number("true_error_mm") - np.nan_to_num(rows.number("reach_mm"))
     excess = excess if among is None else np.where(among, excess, nan)
@@ -227,7 +235,7 @@ def _difference(
     return Difference(name, against, controller, len(pairs), int((~known).sum()), found, _verdict(found))
 
 
-def _verdict(difference: Estimate) -> str | None:
+def _verdict(difference: IntervalEstimate) -> str | None:
     if isnan(difference.low):
         return None
     if difference.high < 0.0:
@@ -236,17 +244,17 @@ def _verdict(difference: Estimate) -> str | None:
 
 
 def pair_keys(rows: Rows, factors: Sequence[Factor]) -> Codes:
-    """Return a number (n,) for each row, the same for rows alike in seed, target, repeat and factors."""
+    """Return an integer key (n,) for each row, equal for rows with the same seed, target, repeat and factors."""
     names = ("seed", "plan_seed", "target_depth_mm", "target_lateral_mm", "repeat")
     columns = np.stack([*map(rows.codes, names), *(factor.codes for factor in factors)], axis=1)
     return np.unique(columns, axis=0, return_inverse=True)[1].ravel()
 
 
 def _by_key(keys: Codes, members: Codes) -> dict[tuple[int, int], int]:
-    """Return rows by key and by how many rows before have it, so that no row pairs twice."""
-    seen: dict[int, count[int]] = {}
+    """Return rows by key and occurrence of the key, so that no row is paired twice."""
+    occurrences: dict[int, count[int]] = {}
     return {
-        (key, next(seen.setdefault(key, count()))): row
+        (key, next(occurrences.setdefault(key, count()))): row
         for key, row in zip(keys[members].tolist(), members.tolist(), strict=True)
     }
 
@@ -256,7 +264,7 @@ def _dense(codes: Codes) -> Codes:
 
 
 def quotient(over: Floats, under: Floats) -> Floats:
-    """Return `over / under` (n,), NaN where `under` is not positive or not known."""
+    """Return `over / under` (n,), NaN where `under` is not positive or unknown."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(under > 0, over / under, nan)
 

@@ -1,4 +1,4 @@
-"""Where the time of a study went."""
+"""Computing time of a study by part."""
 
 from dataclasses import dataclass
 from math import nan
@@ -9,8 +9,8 @@ from flexneedle.study.report.rows import Floats, Rows
 
 
 @dataclass(frozen=True)
-class Part:
-    """A part of the work: seconds of all processes together, share of the whole, median of one (ms)."""
+class TimeShare:
+    """Time of one part of the work: seconds of all processes, share of the total, median of one item (ms)."""
 
     name: str
     seconds: float
@@ -18,18 +18,20 @@ class Part:
     median_ms: float
 
 
-def division(timing: Rows) -> list[Part]:
-    """Return how the time divides into plan, control and plant; a plan counts once, however often it was used."""
+def division(timing: Rows) -> list[TimeShare]:
+    """Return the times of planning, control, plant and the rest; a plan counts once, however often it was used."""
     control, plant, total = (timing.number(name) for name in ("control_s", "plant_s", "total_s"))
     parts = {
         "plan": _plan_seconds(timing),
         "control": control,
         "plant": plant,
-        "rest of the insertions": total - np.nan_to_num(control) - np.nan_to_num(plant),
+        "other": total - np.nan_to_num(control) - np.nan_to_num(plant),
     }
     sums = {name: float(np.nansum(seconds)) for name, seconds in parts.items()}
     whole = sum(sums.values()) or 1.0
-    return [Part(name, sums[name], sums[name] / whole, _median_ms(values)) for name, values in parts.items()]
+    return [
+        TimeShare(name, sums[name], sums[name] / whole, _median_ms(values)) for name, values in parts.items()
+    ]
 
 
 def _plan_seconds(timing: Rows) -> Floats:

@@ -1,4 +1,4 @@
-"""Groups of a study of random worlds: errors against open loop and against the reach (docs/worlds.md)."""
+"""Groups of a study of random worlds: errors relative to open loop and to the reach (docs/worlds.md)."""
 
 from dataclasses import dataclass
 from math import nan
@@ -11,20 +11,20 @@ from flexneedle.study.report.summary import HIT_MM, finished, members_of, pair_k
 from flexneedle.study.summary import is_failure
 
 _OPEN_LOOP = "open-loop"
-LEAST_MM, TWICE = 0.1, 2.0  # an error is small below the greater of LEAST_MM and TWICE that of open loop
+LEAST_MM, TWICE = 0.1, 2.0  # limit of a small error: max(LEAST_MM, TWICE * error of open loop)
 WORSE_MM = 0.2  # than open loop
 BEYOND_REACH_MM = 0.5
 
 
 @dataclass(frozen=True)
 class WorldGroup:
-    """The insertions that share a level of every factor; errors (mm) and shares are over the finished ones.
+    """Insertions with the same level of every factor; errors (mm) and shares are over the finished ones.
 
-    count, finished, failures: insertions; a failure did not finish though its reach is at most
-    1 mm, or was held though it is at most `control.miss_limit_mm`.
-    Shares (0 to 1): above 1 mm; within the greater of 0.1 mm and twice the open loop's error in the same world, and
-    within that error + 0.2 mm, where open loop finished; within the reach + 0.5 mm, where it is known.
-    energy_ratio: geometric mean of the true tissue's energy over the plan's. NaN is what is not known.
+    count, finished, failures: insertions; a failure did not finish although its reach is at most
+    1 mm, or was held although its reach is at most `control.miss_limit_mm`.
+    Shares (0 to 1): above 1 mm; within max(0.1 mm, 2 × error of open loop in the same world), and within that error
+    + 0.2 mm, if open loop finished; within the reach + 0.5 mm, if the reach is known.
+    energy_ratio: geometric mean of the energy of the true tissue relative to the plan. NaN: unknown.
     """
 
     levels: dict[str, str]
@@ -44,12 +44,12 @@ class WorldGroup:
 
 
 def has_worlds(rows: Rows) -> bool:
-    """Whether the scenarios of a study are worlds."""
+    """Whether the study is a study of worlds."""
     return not np.isnan(rows.number("world")).all()
 
 
 def world_groups(rows: Rows, design: Design) -> list[WorldGroup]:
-    """Return the groups of a study of worlds in the order of its factors; of another study none."""
+    """Return the groups of a study of worlds in the order of its factors; none for another study."""
     if not has_worlds(rows):
         return []
     error = np.where(finished(rows), rows.number("true_error_mm"), nan)
@@ -59,7 +59,7 @@ def world_groups(rows: Rows, design: Design) -> list[WorldGroup]:
 
 
 def _group(levels: dict[str, str], columns: Floats, failed: Flags) -> WorldGroup:
-    """Return a group of error, error of open loop, reach and energy ratio (4, n)."""
+    """Return the group of columns (4, n): error, error of open loop, reach, energy ratio."""
     error, open_loop, reach, energy = columns[:, ~np.isnan(columns[0])]
     share = (0.5, 0.95, 0.99, 1.0)
     median, p95, p99, largest = np.quantile(error, share).tolist() if len(error) else [nan] * 4
@@ -82,12 +82,12 @@ def _group(levels: dict[str, str], columns: Floats, failed: Flags) -> WorldGroup
 
 
 def mean_of(values: Floats | Flags) -> float:
-    """Return the mean, NaN of none."""
+    """Return the mean, NaN if there are no values."""
     return float(np.mean(values)) if len(values) else nan
 
 
 def _within(error: Floats, limit: Floats) -> float:
-    """Share of the errors that are within their limit, of those whose limit is known."""
+    """Share of errors within their limit, among those with a known limit."""
     known = ~np.isnan(limit)
     return mean_of(error[known] <= limit[known])
 
@@ -102,7 +102,7 @@ def _open_loop(rows: Rows, design: Design, error: Floats) -> Floats:
 
 
 def failures(rows: Rows) -> Flags:
-    """Return which rows (n,) did not finish though the target, as far as is known, was within 1 mm of the reach."""
+    """Return which rows (n,) are failures, see `is_failure`."""
     names = ("outcome", "reach_mm", "control.miss_limit_mm")
     found = zip(*map(rows.values, names), strict=True)
     return np.array([is_failure(dict(zip(names, row, strict=True))) for row in found], dtype=bool)

@@ -1,4 +1,4 @@
-"""How to run an insertion of a study again: the command, and the scenario file that it needs."""
+"""Reproduce an insertion of a study: its command, and the scenario file that the command needs."""
 
 import shlex
 from collections.abc import Iterable
@@ -20,10 +20,10 @@ _OPTIONS = {"--controller": "controller", "--phantom": "plant", "--strategy": "s
 
 
 def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
-    """Return the command of each listed row, to be given in `folder`.
+    """Return the command of each listed row, to be run in `folder`.
 
-    Scenarios that are neither presets nor worlds are written there.
-    A row whose settings make no scenario of this version has "".
+    Scenarios that are neither presets nor worlds are written to that folder.
+    The command is "" if the settings of the row are not a valid scenario of this version.
     """
     sources = {_without_target(checked(load_scenario(name))): name for name in PRESETS.names()}
     numbers = count(1)
@@ -44,7 +44,7 @@ def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
 
 
 def _scenario_of(rows: Rows, row: int) -> Scenario | None:
-    """Return the scenario of a row, or None if its settings make none of this version."""
+    """Return the scenario of a row, or None if its settings are not valid in this version."""
     keys = [name for name in rows.names if "." in name and name.split(".")[0] in _SECTIONS]
     settings = {key: rows.value(key, row) for key in keys}
     known = {key: value for key, value in settings.items() if value is not None}
@@ -55,7 +55,7 @@ def _scenario_of(rows: Rows, row: int) -> Scenario | None:
 
 
 def _world_of(rows: Rows, row: int) -> str:
-    """Return the name of a row's world, or ""."""
+    """Return the name of the world of a row, or ""."""
     number = rows.value("world", row)
     return "" if number is None else world_name(int(number), rows.value("world_case", row))
 
