@@ -1,9 +1,9 @@
 """Read an emulated Aurora for a minute: python benchmarks/aurora.py [--seconds S] [--json].
 
-Frames that came and frames that were lost at 40 Hz, how long `read()` held the caller up, and how far the times of
-the frames are from an even line; then the same caller with a tracker that falls silent. And what the machine did
-meanwhile: by how much the caller, which only sleeps, woke late at most, and how much processor time the host took away
-(Linux in a virtual machine). Who is stopped for a frame's 25 ms loses it. Exit status 1 if a frame was lost.
+Received and lost frames at 40 Hz, duration of `read()`, and deviation of the frame times from equal intervals; then the
+same with a tracker that stops responding. To judge the machine: largest wake-up delay of the caller, which only sleeps,
+and processor time taken by the host (Linux in a virtual machine). A process that is stopped for the 25 ms of a frame
+loses it. Exit status 1 if a frame was lost.
 """
 
 import argparse
@@ -19,7 +19,7 @@ import psutil
 from flexneedle.rig.devices.aurora.tracker import Aurora
 from flexneedle.rig.devices.clock import WallClock
 
-PERIOD_S = 0.02  # of the caller's loop
+PERIOD_S = 0.02  # of the loop of the caller
 
 
 def main() -> int:
@@ -28,18 +28,18 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
-    sound = measure(args.seconds)
+    normal = measure(args.seconds)
     silent = measure(6.0, "--fault", "silence@1:3")
     if args.json:
-        print(json.dumps({"sound": sound, "silent from 1 to 4 s": silent}))
+        print(json.dumps({"normal operation": normal, "silent from 1 to 4 s": silent}))
     else:
-        for title, result in (("sound line", sound), ("silent from 1 to 4 s", silent)):
+        for title, result in (("normal operation", normal), ("silent from 1 to 4 s", silent)):
             print(title, *(f"  {name}: {value}" for name, value in result.items()), sep="\n")
-    return 1 if sound["frames lost"] else 0
+    return 1 if normal["frames lost"] else 0
 
 
 def measure(seconds: float, *arguments: str) -> dict[str, float]:
-    """Read for so long; return what came and what it cost the caller."""
+    """Read for `seconds`; return counts of frames and delays of the caller."""
     frames, waits, late = [], [], 0.0
     stolen = getattr(psutil.cpu_times(), "steal", 0.0)
     with emulated(*arguments) as path, Aurora(path, clock := WallClock()) as aurora:
@@ -58,25 +58,25 @@ def measure(seconds: float, *arguments: str) -> dict[str, float]:
     return {
         "frames": counts.frames,
         "frames lost": counts.missed,
-        "connections made again": counts.reconnections,
+        "reconnections": counts.reconnections,
         "longest read(), ms": round(1e3 * max(waits), 3),
-        "times off an even line, largest, ms": round(
+        "frame times, largest deviation from equal intervals, ms": round(
             1e3 * float(np.abs(start_times - np.median(start_times)).max()), 3
         ),
-        "caller woke late by, at most, ms": round(1e3 * late, 1),
-        "processor time taken away, s": round(getattr(psutil.cpu_times(), "steal", 0.0) - stolen, 1),
+        "caller, largest wake-up delay, ms": round(1e3 * late, 1),
+        "processor time taken by the host, s": round(getattr(psutil.cpu_times(), "steal", 0.0) - stolen, 1),
     }
 
 
 @contextmanager
 def emulated(*arguments: str):
-    """Run the emulator; give its path."""
+    """Run the emulator; yield its path."""
     command = [sys.executable, "-m", "flexneedle", "emulate", "aurora", *arguments]
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
     try:
         yield process.stdout.readline().strip()
     finally:
-        process.terminate()  # SIGINT is ignored where a shell put this in the background
+        process.terminate()  # SIGINT is ignored in a background process of a shell
         process.wait()
 
 

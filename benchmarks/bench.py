@@ -1,4 +1,4 @@
-"""Measure speed: python benchmarks/bench.py [--json]. Figures and ratios of one run, no thresholds."""
+"""Measure speed: python benchmarks/bench.py [--json]. Times and ratios of one run, no thresholds."""
 
 import argparse
 import json
@@ -41,7 +41,7 @@ print(time.perf_counter() - begun)
 
 
 def seconds(call: Callable[[], Any], times: int = 1) -> float:
-    """Wall-clock time of one call, averaged over `times` in a row."""
+    """Wall-clock time of one call, averaged over `times` successive calls."""
     begun = time.perf_counter()
     for _ in range(times):
         call()
@@ -49,7 +49,7 @@ def seconds(call: Callable[[], Any], times: int = 1) -> float:
 
 
 def insertions(count: int, steps: int = STEPS, depth: float = DEPTH_MM) -> np.ndarray:
-    """Controls (count, steps, 5) of insertions to `depth` with a guide that wanders and a bevel that turns once."""
+    """Controls (count, steps, 5) of insertions to `depth` with random guide motion and one bevel roll."""
     rng = np.random.default_rng(0)
     controls = np.zeros((count, steps, 5))
     controls[:, :, 0] = (SCENARIO.setup.tip_to_skin_mm + depth) / steps
@@ -67,7 +67,7 @@ def after(simulator: Simulator, controls: np.ndarray) -> State:
     return state
 
 
-# ---- a rollout step against one banded solve of its own matrix
+# ---- a rollout step relative to one banded solve of its matrix
 
 
 def elements(x: np.ndarray, stiffness: float) -> np.ndarray:
@@ -81,8 +81,8 @@ def elements(x: np.ndarray, stiffness: float) -> np.ndarray:
 def last_system(state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Upper band (4, n) and right-hand side (n,) of the last Newton iteration, and the state's own y, θ (n,).
 
-    Two unknowns a node, y and θ, from the first node to the tip; the clamped base has none, and the row of
-    the guide's y, which is given, is that of the identity.
+    Two unknowns per node, y and θ, from the first node to the tip; none for the clamped base. The y of the guide is
+    given: its row is that of the identity.
     """
     s, nodes, count = state.scalars, state.model.nodes, state.mesh.shape[1]
     x = np.concatenate([[s[nd.BASE_X]], nodes.x[:count], [s[nd.TIP_X]]])
@@ -123,7 +123,7 @@ def measure_step(repeats: int = 41) -> dict[str, Any]:
     _, solution, info = dpbsv(band, load)
     differs = float(np.abs(solution - known)[::2].max())
     if info != 0 or not differs < 1e-6:
-        raise RuntimeError(f"this isn't the needle's matrix: info {info}, {differs:g} mm off the state")
+        raise RuntimeError(f"matrix does not reproduce the state: info {info}, difference {differs:g} mm")
     pairs = []
     for _ in range(repeats):
         rollout = seconds(lambda: simulator.rollout(start, controls)) / (SEQUENCES * STEPS)
@@ -140,14 +140,14 @@ def measure_step(repeats: int = 41) -> dict[str, Any]:
 
 
 def measure_depth(repeats: int = 15) -> dict[str, Any]:
-    """Time of a step at each depth, four steps of 0.5 mm from there, and how it grows."""
+    """Time of a step at each depth, over four steps of 0.5 mm, and its growth with depth."""
     simulator, controls = Simulator(SCENARIO, threads=1), insertions(128, 4)
     controls[:, :, 0] = 0.5
     states = []
     for depth in DEPTHS_MM:
         travel = SCENARIO.setup.tip_to_skin_mm + depth - 1.0
-        way = insertions(1, int(np.ceil(travel)), depth - 1.0)[0]
-        states.append(after(simulator, way))
+        approach = insertions(1, int(np.ceil(travel)), depth - 1.0)[0]
+        states.append(after(simulator, approach))
     rounds = [
         [seconds(lambda s=s: simulator.rollout(s, controls)) / (128 * 4) for s in states]
         for _ in range(repeats)
@@ -169,7 +169,7 @@ def measure_depth(repeats: int = 15) -> dict[str, Any]:
 
 
 def measure_threads(repeats: int = 15) -> dict[str, Any]:
-    """The same rollouts on one and on two threads, in turn."""
+    """The same rollouts on one and two threads, alternately."""
     controls = insertions(512)
     simulators = [Simulator(SCENARIO, threads=n) for n in (1, 2)]
     pairs = [
@@ -192,7 +192,7 @@ def measure_plan() -> dict[str, Any]:
 
 
 def measure_period() -> dict[str, Any]:
-    """Control periods of three insertions: deciding and observing, without the phantom's own time."""
+    """Control periods of three insertions: deciding and observing, without the phantom."""
     plan = flexneedle.plan(SCENARIO, seed=0)
     done = [flexneedle.insert(SCENARIO, plan, seed=seed) for seed in range(2000, 2003)]
     totals = 1e3 * np.array([period.durations["total"] for one in done for period in one.periods])
@@ -204,7 +204,7 @@ def measure_period() -> dict[str, Any]:
 
 
 def measure_help(repeats: int = 5) -> dict[str, Any]:
-    """`flexneedle --help` as a user waits for it."""
+    """Run time of `flexneedle --help`."""
     command = [sys.executable, "-m", "flexneedle", "--help"]
 
     def call() -> None:
@@ -246,7 +246,7 @@ PARTS = {
 
 
 def rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """What was measured, its figure, a remark."""
+    """Name, value and remark of each measurement."""
     step, depth, start = found["step"], found["depth"], found["start"]
     period, times = found["period"]["period_ms"], dict(zip(DEPTHS_MM, depth["step_us"], strict=True))
     a, b = depth["fit_us"]
@@ -255,26 +255,30 @@ def rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
         (
             "rollout step",
             f"{step['step_us']:.2f} µs",
-            f"{STEPS} steps to {DEPTH_MM:g} mm, one thread, everything in it",
+            f"{STEPS} steps to {DEPTH_MM:g} mm, one thread, all included",
         ),
-        ("one dpbsv", f"{step['dpbsv_us']:.2f} µs", f"its final matrix, {step['unknowns']} unknowns, kd = 3"),
+        (
+            "one dpbsv",
+            f"{step['dpbsv_us']:.2f} µs",
+            f"on the final matrix, {step['unknowns']} unknowns, kd = 3",
+        ),
         (
             "step / dpbsv",
             f"{step['step_over_dpbsv']:.2f}",
-            f"dpbsv gives the state again to {step['dpbsv_differs_from_the_state_mm']:.0e} mm",
+            f"dpbsv reproduces the state to {step['dpbsv_differs_from_the_state_mm']:.0e} mm",
         ),
         *((f"step at {mm} mm", f"{us:.2f} µs", "") for mm, us in times.items()),
-        ("growth with depth", f"d^{depth['exponent']:.2f}", "at most 1 is at most linear"),
-        ("straight fit", f"{a:.2f} + {b:.3f} d µs", f"largest deviation {depth['fit_residual_us']:.2f} µs"),
+        ("growth with depth", f"d^{depth['exponent']:.2f}", "exponent 1: linear"),
+        ("linear fit", f"{a:.2f} + {b:.3f} d µs", f"largest deviation {depth['fit_residual_us']:.2f} µs"),
         (
             "slope deep / shallow",
             f"{depth['slope_deep_over_shallow']:.2f}",
-            "1 is linear, above 1 grows faster",
+            "1: linear, above 1: faster",
         ),
         (
             "2 threads / 1",
             f"{found['threads']['speedup']:.2f} ×",
-            f"{found['threads']['cores']} cores at hand",
+            f"{found['threads']['cores']} cores available",
         ),
         (
             "plan",
@@ -290,7 +294,7 @@ def rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
         (
             "first process",
             f"{start['first_process_s']:.1f} s",
-            f"compiles, {start['cache_files']} cache files",
+            f"with compilation, {start['cache_files']} cache files",
         ),
         (
             "second process",
@@ -302,7 +306,7 @@ def rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
 
 def main() -> None:
     """Measure all and print a table, or one JSON object."""
-    parser = argparse.ArgumentParser(description="Measure the speed of flexneedle on this machine, now.")
+    parser = argparse.ArgumentParser(description="Measure the speed of flexneedle on this machine.")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     chosen = parser.parse_args()
     load = os.getloadavg()[0]
@@ -317,8 +321,8 @@ def main() -> None:
     for what, figure, remark in rows(found):
         print(f"{what:<22}{figure:>20}   {remark}")
     cores = found["load"]["cores"]
-    print(f"\nLoad average before the run {load:.2f} on {cores} cores; this run itself adds 1 to 2.")
-    print("Other work on the machine slows all of this, ratios less than times: measure on an idle one.")
+    print(f"\nLoad average before the run {load:.2f} on {cores} cores; the run itself adds 1 to 2.")
+    print("Other processes slow the measurements, ratios less than times: use an idle machine.")
 
 
 if __name__ == "__main__":

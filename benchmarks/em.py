@@ -1,9 +1,9 @@
 """Time and memory of `flexneedle em evaluate`: python benchmarks/em.py [--rows N] [--times N] [--all-columns] [--json].
 
 Makes a table of N shuffled rows (10 million; 125 grid points, two sensors, two environments; all digits) as CSV and as
-Parquet in a temporary folder (1.5 GB), runs the command on each in a process of its own, figures included, and prints
-wall-clock time, processor time and the largest resident memory. No thresholds; other work on the machine adds to the
-wall clock.
+Parquet in a temporary folder (1.5 GB), runs the command on each in a separate process, including figures, and prints
+wall-clock time, processor time and the largest resident memory. No thresholds; other processes on the machine add to
+the wall-clock time.
 """
 
 import argparse
@@ -27,8 +27,8 @@ GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1)
 
 
 def parts(rows: int, rng: np.random.Generator, all_columns: bool) -> Iterator[pa.Table]:
-    """Yield tables of a million rows in random order, a metre from the origin; all_columns: those that may be left
-    out, too (orientation and distance)."""
+    """Yield tables of a million rows in random order, a metre from the origin; all_columns: including the optional
+    ones (orientation and distance)."""
     bias = rng.normal(0.0, 0.35, (2, 2, *GRID.shape))
     for start in range(0, rows, PART):
         count = min(PART, rows - start)
@@ -73,8 +73,8 @@ def measure(path: Path, out: Path) -> dict[str, float | str]:
     """Run the command on a table and return its time and memory."""
     command = [sys.executable, "-m", "flexneedle", "em", "evaluate", str(path), "--out", str(out), "--json"]
     begun = time.perf_counter()
-    silent = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
-    child = os.posix_spawn(sys.executable, command, os.environ, file_actions=silent)
+    no_output = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+    child = os.posix_spawn(sys.executable, command, os.environ, file_actions=no_output)
     _, status, used = os.wait4(child, 0)
     if status:
         raise RuntimeError(f"{' '.join(command)}: status {os.waitstatus_to_exitcode(status)}")
@@ -88,21 +88,21 @@ def measure(path: Path, out: Path) -> dict[str, float | str]:
 
 
 def main() -> None:
-    """Print a line for each run."""
+    """Print one line per run."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--rows", type=int, default=ROWS)
-    parser.add_argument("--times", type=int, default=2, help="runs of each (2)")
-    parser.add_argument("--all-columns", action="store_true", help="orientations and distances, too")
+    parser.add_argument("--times", type=int, default=2, help="runs of each (default: 2)")
+    parser.add_argument("--all-columns", action="store_true", help="also orientations and distances")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with ProcessPoolExecutor(
             1, get_context("spawn")
-        ) as apart:  # a child's memory counts its parent's at birth
-            paths = apart.submit(write, folder, args.rows, args.all_columns).result()
+        ) as writer:  # the resident memory of a child initially includes that of its parent
+            paths = writer.submit(write, folder, args.rows, args.all_columns).result()
         found = [measure(path, folder / f"{path.name}-{k}") for k in range(args.times) for path in paths]
     if args.json:
         print(json.dumps({"rows": args.rows, "runs": found}))

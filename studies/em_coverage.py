@@ -1,12 +1,12 @@
-"""How often the 95 % intervals of `flexneedle em evaluate` cover what was planted, over random data sets.
+"""Coverage of the 95 % intervals of `flexneedle em evaluate` over random data sets with known parameters.
 
     python studies/em_coverage.py [--sets N] [--seed N]
 
-Each data set is a table of 125 grid points × 20 samples of a reference sensor in two environments, with planted bias,
-jitter, threshold, slope and intercept drawn at random, and goes through the same code as a user's table. Beside it the
-same with a smooth bias field, which breaks what the intervals assume: that grid points are independent draws. About one
-minute on one core. Prints the table of docs/tracking/evaluate.md: coverage, and the median of the estimate over what
-was planted. The smooth field makes the errors alone: its two columns are empty for what it has no part in.
+Each data set is a table of 125 grid points × 20 samples of a reference sensor in two environments, with bias, jitter,
+threshold, slope and intercept drawn at random, and is evaluated by the same code as a user's table. The second part
+uses a smooth bias field, which violates the assumption of the intervals that grid points are independent. One minute
+on one core. Prints the table of docs/tracking/evaluate.md: coverage, and median ratio of estimate to true value. The
+smooth field affects only the errors: its two columns are empty for the other parameters.
 """
 
 import argparse
@@ -28,12 +28,12 @@ from flexneedle.em.evaluation.separation import separation
 GRID = np.stack(np.meshgrid(*[np.arange(5) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 POINTS, SAMPLES = len(GRID), 20
 SMOOTH_MM = 40.0
-ELSEWHERE = np.random.default_rng(1).uniform(0.0, 100.0, (1000, 3))
+VOLUME_POINTS = np.random.default_rng(1).uniform(0.0, 100.0, (1000, 3))
 
 
 @dataclass(frozen=True)
-class Planted:
-    """What a data set is drawn from: mean bias and sd of an axis (mm), jitter (mm), indicator, line."""
+class TrueParameters:
+    """True parameters of a data set: mean bias and sd per axis (mm), jitter (mm), indicator, line."""
 
     bias: float
     spread: float
@@ -45,8 +45,8 @@ class Planted:
     scatter: float
 
     @classmethod
-    def draw(cls, rng: np.random.Generator) -> "Planted":
-        """Values around the paper's."""
+    def draw(cls, rng: np.random.Generator) -> "TrueParameters":
+        """Draw values around those of the paper."""
         return cls(
             *(
                 float(rng.uniform(*ends))
@@ -56,7 +56,7 @@ class Planted:
         )
 
     def values(self) -> dict[str, float]:
-        """The truth of each estimate: of errors by the noncentral χ distribution, three degrees of freedom."""
+        """True value of each estimate; errors: noncentral χ distribution with three degrees of freedom."""
         axis = np.sqrt(self.spread**2 + self.jitter**2 / 3 / SAMPLES)
         law = stats.ncx2(3, self.bias**2 / axis**2)
         errors = axis * np.sqrt(law.ppf((np.arange(20000) + 0.5) / 20000))
@@ -73,21 +73,21 @@ class Planted:
 
 
 @cache
-def smoothness() -> np.ndarray:
-    """Cholesky factor of the covariance of a smooth unit field at the grid points and at ELSEWHERE."""
-    places = np.concatenate([GRID, ELSEWHERE])
-    apart = ((places[:, None] - places[None]) ** 2).sum(axis=2)
-    return np.linalg.cholesky(np.exp(-apart / (2 * SMOOTH_MM**2)) + 1e-6 * np.eye(len(places)))
+def field_factor() -> np.ndarray:
+    """Cholesky factor of the covariance of a smooth unit field at the grid points and VOLUME_POINTS."""
+    points = np.concatenate([GRID, VOLUME_POINTS])
+    squared_distance = ((points[:, None] - points[None]) ** 2).sum(axis=2)
+    return np.linalg.cholesky(np.exp(-squared_distance / (2 * SMOOTH_MM**2)) + 1e-6 * np.eye(len(points)))
 
 
 def field(rng: np.random.Generator, smooth: bool) -> np.ndarray:
-    """Unit normal errors (k, 3) at the grid points and ELSEWHERE: independent, or alike within SMOOTH_MM."""
-    drawn = rng.normal(size=(POINTS + len(ELSEWHERE), 3))
-    return smoothness() @ drawn if smooth else drawn
+    """Unit normal errors (k, 3) at the grid points and VOLUME_POINTS: independent, or correlated over SMOOTH_MM."""
+    drawn = rng.normal(size=(POINTS + len(VOLUME_POINTS), 3))
+    return field_factor() @ drawn if smooth else drawn
 
 
-def throughout(error: np.ndarray) -> dict[str, float]:
-    """What this field's errors (k, 3) come to in the whole volume."""
+def volume_statistics(error: np.ndarray) -> dict[str, float]:
+    """Statistics of the errors (k, 3) of this field in the whole volume."""
     length = np.linalg.norm(error, axis=1)
     return {
         "rmse": float(np.sqrt((length**2).mean())),
@@ -98,11 +98,11 @@ def throughout(error: np.ndarray) -> dict[str, float]:
 
 
 def rows(
-    rng: np.random.Generator, planted: Planted, environment: str, error: np.ndarray, level: np.ndarray
+    rng: np.random.Generator, drawn: TrueParameters, environment: str, error: np.ndarray, level: np.ndarray
 ) -> pa.Table:
-    """Rows with errors (n, 3) and mean indicators (n,) of the grid points, and the planted jitter."""
+    """Rows with errors (n, 3) and mean indicators (n,) of the grid points, and jitter."""
     place = np.repeat(np.arange(POINTS), SAMPLES)
-    noise = rng.normal(0.0, planted.jitter / np.sqrt(3), (len(place), 3))
+    noise = rng.normal(0.0, drawn.jitter / np.sqrt(3), (len(place), 3))
     measured = (GRID + error)[place] + noise
     columns = {"point_id": place, "indicator": level[place]}
     columns |= {"sensor": ["reference"] * len(place), "environment": [environment] * len(place)}
@@ -110,59 +110,59 @@ def rows(
     return pa.table(columns | {f"{axis}_mm": measured[:, k] for k, axis in enumerate("xyz")})
 
 
-def table_of(rng: np.random.Generator, planted: Planted, smooth: bool) -> tuple[pa.Table, dict[str, float]]:
-    """Both environments of a data set, and what the errors in `ideal` come to in the whole volume."""
+def table_of(
+    rng: np.random.Generator, drawn: TrueParameters, smooth: bool
+) -> tuple[pa.Table, dict[str, float]]:
+    """Both environments of a data set, and the statistics of the errors in `ideal` in the whole volume."""
     towards = rng.normal(size=3)
-    error = planted.bias * towards / np.linalg.norm(towards) + planted.spread * field(rng, smooth)
-    ideal = rng.gamma(planted.shape, planted.level / planted.shape, POINTS)
+    error = drawn.bias * towards / np.linalg.norm(towards) + drawn.spread * field(rng, smooth)
+    ideal = rng.gamma(drawn.shape, drawn.level / drawn.shape, POINTS)
     noisy = rng.uniform(0.2, 0.6, POINTS)
-    scatter = (
-        np.clip(rng.normal(size=POINTS), -2.5, 2.5) * planted.scatter * noisy
-    )  # grows with the indicator
-    length = planted.slope * noisy + planted.intercept + np.maximum(scatter, -planted.slope * noisy)
+    scatter = np.clip(rng.normal(size=POINTS), -2.5, 2.5) * drawn.scatter * noisy  # grows with the indicator
+    length = drawn.slope * noisy + drawn.intercept + np.maximum(scatter, -drawn.slope * noisy)
     along = rng.normal(size=(POINTS, 3))
     along *= (length / np.linalg.norm(along, axis=1))[:, None]
-    both = rows(rng, planted, "ideal", error[:POINTS], ideal), rows(rng, planted, "noisy", along, noisy)
-    return pa.concat_tables(both), throughout(error[POINTS:])
+    both = rows(rng, drawn, "ideal", error[:POINTS], ideal), rows(rng, drawn, "noisy", along, noisy)
+    return pa.concat_tables(both), volume_statistics(error[POINTS:])
 
 
-def judged(table: pa.Table) -> dict[str, tuple[float, tuple[float, float]]]:
-    """Estimate and interval of everything that was planted."""
+def evaluated(table: pa.Table) -> dict[str, tuple[float, tuple[float, float]]]:
+    """Estimate and interval of each parameter."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "table.parquet"
         pq.write_table(table, path)
         ideal, noisy = read_table(path, Options())[0]
-    found, said = accuracy(ideal), separation("reference", ideal, noisy)
-    parts = ((found, ("rmse", "p95", "mean", "sd", "jitter")), (said.noisy, ("slope", "intercept")))
+    found, fitted = accuracy(ideal), separation("reference", ideal, noisy)
+    parts = ((found, ("rmse", "p95", "mean", "sd", "jitter")), (fitted.noisy, ("slope", "intercept")))
     return {
         **{
             name: (getattr(part, f"{name}_mm"), part.intervals[f"{name}_mm"])
             for part, names in parts
             for name in names
         },
-        "threshold": (said.threshold, said.threshold_interval),
+        "threshold": (fitted.threshold, fitted.threshold_interval),
     }
 
 
 def study(
     sets: int, seed: int, smooth: bool
 ) -> list[tuple[dict[str, float], dict[str, tuple], dict[str, float]]]:
-    """What was planted, what was found, and what holds in the whole volume, for each data set."""
+    """True values, estimates, and statistics of the whole volume, for each data set."""
     done = []
     for own in np.random.SeedSequence(seed).spawn(sets):
         rng = np.random.default_rng(own)
-        planted = Planted.draw(rng)
-        table, volume = table_of(rng, planted, smooth)
-        done.append((planted.values(), judged(table), volume))
+        drawn = TrueParameters.draw(rng)
+        table, volume = table_of(rng, drawn, smooth)
+        done.append((drawn.values(), evaluated(table), volume))
     return done
 
 
 def coverage(done: list, name: str, truth: int) -> str:
-    """Share of the intervals that cover the truth: what was planted (0), or what holds in the volume (2)."""
-    held = [
+    """Share of intervals that contain the true value: of the distribution (0), or of the volume (2)."""
+    covered = [
         found[name][1][0] <= own[name] <= found[name][1][1] for own, found in ((d[truth], d[1]) for d in done)
     ]
-    return f"{np.mean(held):.3f}"
+    return f"{np.mean(covered):.3f}"
 
 
 def main() -> int:
@@ -170,24 +170,24 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--sets", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--sets", type=int, default=200, metavar="N", help="data sets (default: 200)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
     args = parser.parse_args()
     plain, smooth = (study(args.sets, args.seed, smooth) for smooth in (False, True))
     heads = (
         "independent points",
-        "estimate / planted, median",
+        "estimate / true, median",
         "smooth field: this volume",
         "smooth field: any such field",
     )
     print(f"| | {' | '.join(heads)} |\n|---|---:|---:|---:|---:|")
     shares = []
     for name in plain[0][0]:
-        ratio = np.median([found[name][0] / planted[name] for planted, found, _ in plain])
+        ratio = np.median([found[name][0] / true[name] for true, found, _ in plain])
         shares.append(coverage(plain, name, 0))
-        bent = [coverage(smooth, name, truth) if name in smooth[0][2] else "" for truth in (2, 0)]
+        smooth_shares = [coverage(smooth, name, truth) if name in smooth[0][2] else "" for truth in (2, 0)]
         label = name if name in ("threshold", "slope", "intercept") else f"`{name}_mm`"
-        row = label, shares[-1], f"{ratio:.3f}", *bent
+        row = label, shares[-1], f"{ratio:.3f}", *smooth_shares
         print("|" + "".join(f" {cell} |" if cell else " |" for cell in row))
     return int(min(map(float, shares)) < 0.9)
 

@@ -1,10 +1,10 @@
-"""Measure the simulated environments as the paper measured its tracker, beside its Tables I and II.
+"""Measure the simulated environments as in the paper and compare with its Tables I and II.
 
     python studies/environments.py [--seeds N] [--first N] [--rooms] [--environment ENVIRONMENT ...]
 
-Prints a Markdown table: each figure of the paper, the median and range of N measurements (default: 20) of the
-environments' own rooms, and how far the median is off. With --rooms each measurement is in another room instead, whose
-errors have the same sizes. A figure that the issue's bars don't let pass is marked; the exit status is then 1.
+Prints a Markdown table: each quantity of the paper, median and range of N measurements (default: 20) in the rooms of
+the environments, and the deviation of the median. With --rooms each measurement is in another room with errors of the
+same size. Quantities outside the tolerance are marked; the exit status is then 1.
 """
 
 import argparse
@@ -41,7 +41,7 @@ PAPER = {
 
 
 def statistics(table: pa.Table, environment: str) -> dict[str, float]:
-    """Return the figures of an environment by the names in `PAPER`, as the paper's equations have them."""
+    """Return the quantities of an environment by the names in `PAPER`, by the equations of the paper."""
     of = {sensor: _points(table, sensor, environment) for sensor in (TIP, REFERENCE)}
     found = {}
     for sensor, (error, jitter, _) in of.items():
@@ -62,7 +62,7 @@ def statistics(table: pa.Table, environment: str) -> dict[str, float]:
 
 
 def _points(table: pa.Table, sensor: str, environment: str) -> tuple[Floats, float, Floats]:
-    """Error (mm) and mean indicator of each grid point, and the jitter (mm); without the samples that are missing."""
+    """Error (mm) and mean indicator of each grid point, and the jitter (mm), without missing samples."""
     rows = table.filter(
         pc.and_(pc.equal(table["sensor"], sensor), pc.equal(table["environment"], environment))
     )
@@ -80,13 +80,13 @@ def _points(table: pa.Table, sensor: str, environment: str) -> tuple[Floats, flo
     return np.linalg.norm(bias, axis=0), float(np.sqrt(spread / len(ids))), indicator
 
 
-def bar(name: str) -> float:
-    """How far a median may be off, as a share of the paper's figure."""
+def tolerance(name: str) -> float:
+    """Tolerance of a median, relative to the value of the paper."""
     return WIDE if name.endswith(("max", "min")) else CLOSE
 
 
 def measured(names: Sequence[str], seeds: Sequence[int], other_rooms: bool) -> dict[str, dict[str, Floats]]:
-    """Return the figures of each environment in each measurement."""
+    """Return the quantities of each environment in each measurement."""
     environments = [load_environment(name) for name in names]
     found: dict[str, list[dict[str, float]]] = {environment.name: [] for environment in environments}
     for seed in seeds:
@@ -99,9 +99,9 @@ def measured(names: Sequence[str], seeds: Sequence[int], other_rooms: bool) -> d
 
 
 def report(found: dict[str, dict[str, Floats]]) -> bool:
-    """Print the table; return whether every median is within its bar."""
+    """Print the table; return whether every median is within its tolerance."""
     print(
-        "| environment | figure | paper | median | from | to | off | bar | |\n|---|---|"
+        "| environment | quantity | paper | median | min | max | deviation | tolerance | |\n|---|---|"
         + "---:|" * 6
         + "---|"
     )
@@ -110,21 +110,26 @@ def report(found: dict[str, dict[str, Floats]]) -> bool:
         for name, values in figures.items():
             paper, median = PAPER[environment][name], float(np.median(values))
             off = median / paper - 1.0
-            met = abs(off) <= bar(name)
+            met = abs(off) <= tolerance(name)
             fine &= met
             ends = f"{median:.4g} | {values.min():.4g} | {values.max():.4g}"
-            mark = "" if met else "not met"
-            print(f"| {environment} | {name} | {paper:g} | {ends} | {off:+.1%} | {bar(name):.0%} | {mark} |")
+            mark = "" if met else "exceeded"
+            print(
+                f"| {environment} | {name} | {paper:g} | {ends} | {off:+.1%} | {tolerance(name):.0%} | {mark} |"
+            )
     return fine
 
 
 def main() -> int:
+    """Print the table; status 1 if a quantity is outside its tolerance."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="measurements (20)")
-    parser.add_argument("--first", type=int, default=0, metavar="N", help="first seed (0)")
-    parser.add_argument("--rooms", action="store_true", help="each measurement in another room")
+    parser.add_argument(
+        "--seeds", type=int, default=20, metavar="N", help="number of measurements (default: 20)"
+    )
+    parser.add_argument("--first", type=int, default=0, metavar="N", help="first seed (default: 0)")
+    parser.add_argument("--rooms", action="store_true", help="use another room for each measurement")
     parser.add_argument("--environment", nargs="+", default=[IDEAL, NOISY], metavar="ENVIRONMENT")
     args = parser.parse_args()
     seeds = range(args.first, args.first + args.seeds)

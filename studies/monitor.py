@@ -1,12 +1,12 @@
-"""A metal plate comes near while the needle is inserted: when is it held, and how far off is the tip then?
+"""Response of the monitor to a metal plate that approaches during the insertion: time and tip error at the hold.
 
     python studies/monitor.py [--runs N] [--jobs N] [--out DIR]
 
 Each run draws a target of the paper's fifteen, a phantom, a room of the environment `ideal`, the depth of the tip at
-which the plate of `noisy` begins to come, from 400 mm to 30 mm below the needle, and its speed, 30 to 400 mm/s. It is
-carried out three times with the same random numbers: without the plate, with the plate and without the monitor, with
-both. Prints Markdown tables; the figure is DIR/monitor.png (default: docs/images). The curve of missed and false holds
-over the threshold is read off the runs without the monitor.
+which the plate of `noisy` starts to approach, from 400 mm to 30 mm below the needle, and its speed, 30 to 400 mm/s. It
+is executed three times with the same random numbers: without the plate, with the plate and without the monitor, with
+both. Prints Markdown tables; the figure is DIR/monitor.png (default: docs/images). The rates of missed and false holds
+against the threshold are computed from the runs without the monitor.
 """
 
 import argparse
@@ -45,7 +45,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Approach:
-    """A run: its seed, target (mm), the time (s) at which the plate begins to come, its speed (mm/s)."""
+    """A run: seed, target (mm), start time (s) and speed (mm/s) of the approach of the plate."""
 
     seed: int
     target: tuple[float, float]
@@ -53,20 +53,20 @@ class Approach:
     speed: float
 
     def distance_at(self, time: float) -> float:
-        """How far the plate is from the middle of the workspace (mm)."""
+        """Distance (mm) of the plate from the center of the workspace."""
         return max(NEAR_MM, FAR_MM - self.speed * max(0.0, time - self.begins))
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """A run that was carried out, period by period (n,): time (s), largest median indicator of the references over a
-    second, true and believed tip (n, 2) and the plate's distortion of its reading (mm), whether the field held it.
+class RunRecord:
+    """An executed run by period (n,): time (s), largest median indicator of the references over a second, true and
+    estimated tip (n, 2) and distortion of its reading by the plate (mm), whether it is held for the field.
     """
 
     time: Floats
     indicator: Floats
     tip: Floats
-    believed: Floats
+    estimated: Floats
     distortion: Floats
     held: NDArray[np.bool_]
     outcome: str
@@ -93,12 +93,12 @@ def world(plate: bool, monitor: bool) -> Scenario:
 
 @cache
 def planned(target: tuple[float, float]) -> Plan:
-    """The plan for a target; neither tracker nor monitor matter to it."""
+    """The plan for a target, independent of tracker and monitor."""
     return make_plan(load_scenario("phantom"), target=target, seed=0, threads=1)
 
 
-def carried_out(drawn: Approach, plate: bool, monitor: bool) -> Told:
-    """Carry out a run."""
+def carried_out(drawn: Approach, plate: bool, monitor: bool) -> RunRecord:
+    """Execute a run."""
     scenario = world(plate, monitor)
     depth, lateral = drawn.target
     scenario = scenario.with_values({"target.depth_mm": depth, "target.lateral_mm": lateral})
@@ -123,7 +123,7 @@ def carried_out(drawn: Approach, plate: bool, monitor: bool) -> Told:
                 for place, period in zip(places, periods, strict=True)
             ]
         )
-    return Told(
+    return RunRecord(
         np.array([period.time for period in periods]),
         medians(periods, scenario.monitor.indicator_window_s),
         tips,
@@ -136,104 +136,106 @@ def carried_out(drawn: Approach, plate: bool, monitor: bool) -> Told:
 
 def medians(periods: Sequence[Any], window: float) -> Floats:
     """Largest median indicator of the references over the window, after each period."""
-    seen: list[tuple[float, dict[str, float]]] = []
+    window_values: list[tuple[float, dict[str, float]]] = []
     largest = []
     for period in periods:
         for judged in period.readings:
-            told = judged.sample.frame.readings
-            values = {name: one.indicator for name, one in told.items() if one.indicator is not None}
-            seen.append((judged.sample.time, values))
-        seen = [one for one in seen if one[0] > seen[-1][0] - window + 1e-9]
-        names = {name for _, values in seen for name in values}
-        largest.append(max(median(values[name] for _, values in seen if name in values) for name in names))
+            readings = judged.sample.frame.readings
+            values = {name: one.indicator for name, one in readings.items() if one.indicator is not None}
+            window_values.append((judged.sample.time, values))
+        oldest = window_values[-1][0] - window + 1e-9
+        window_values = [one for one in window_values if one[0] > oldest]
+        names = {name for _, values in window_values for name in values}
+        largest.append(
+            max(median(values[name] for _, values in window_values if name in values) for name in names)
+        )
     return np.array(largest)
 
 
-def unchosen(number: int) -> float:
-    """Largest median indicator of the three references where the environment has them, in the room of run `number`."""
+def unplaced_indicator(number: int) -> float:
+    """Largest median indicator of the three references at their default positions, in the room of run `number`."""
     scenario = world(plate=False, monitor=True).with_values({"monitor.indicator_limit": 9.9})
     phantom, tracker, _, room = np.random.SeedSequence(FIRST_SEED + number).spawn(4)
     rig = virtual_rig(scenario, 1, Seeds(phantom, tracker, room))
     rig.clock.wait(scenario.monitor.indicator_window_s)
     frames = [sample.frame for sample in rig.tracker.read() if sample.frame is not None]
-    told = [[one.indicator for one in frame.readings.values()] for frame in frames]
-    values = np.array([[math.nan if value is None else value for value in line] for line in told])
+    indicators = [[one.indicator for one in frame.readings.values()] for frame in frames]
+    values = np.array([[math.nan if value is None else value for value in line] for line in indicators])
     return float(np.nanmax(np.nanmedian(values[:, 1:], axis=0)))
 
 
 def first(flags: NDArray[np.bool_]) -> int | None:
-    """Index of the first true one."""
+    """Index of the first true flag, or None."""
     return int(flags.argmax()) if flags.any() else None
 
 
-def apart(one: Told, other: Told, time: float) -> float:
-    """Distance (mm) of the true tips of two runs at a time (s); one that has ended stays where it did."""
+def tip_distance(one: RunRecord, other: RunRecord, time: float) -> float:
+    """Distance (mm) of the true tips of two runs at a time (s); after the end of a run its tip is constant."""
     tips = [np.array([np.interp(time, run.time, run.tip[:, k]) for k in (0, 1)]) for run in (one, other)]
     return float(np.hypot(*(tips[0] - tips[1])))
 
 
 @dataclass(frozen=True)
 class Hold:
-    """What a hold came to: s after the plate began to come and after its distortion of the tip's reading passed 0.5 mm
-    (NaN if it never did), mm that the true tip is then off the run without a plate (NaN if that was held itself), and
-    off the believed one.
+    """A hold: delay (s) after the start of the plate and after its distortion of the tip reading exceeds 0.5 mm (NaN if
+    it never does); distance (mm) of the true tip from that of the run without a plate (NaN if that run is held), and
+    from the estimated tip.
     """
 
     after_begin: float
     after_distortion: float
-    moved: float
-    unknown: float
+    deviation: float
+    estimate_error: float
 
 
-def hold_of(drawn: Approach, clean: Told, told: Told) -> Hold | None:
+def hold_of(drawn: Approach, clean: RunRecord, kept: RunRecord) -> Hold | None:
     """The first hold of a run with plate and monitor; None if there was none."""
-    index = first(told.held)
+    index = first(kept.held)
     if index is None:
         return None
-    late = first(told.distortion > 0.5)
+    distorted = first(kept.distortion > 0.5)
     return Hold(
-        float(told.time[index]) - drawn.begins,
-        math.nan if late is None else float(told.time[index] - told.time[late]),
-        math.nan if clean.held.any() else apart(told, clean, float(told.time[index])),
-        float(np.hypot(*(told.tip[index] - told.believed[index]))),
+        float(kept.time[index]) - drawn.begins,
+        math.nan if distorted is None else float(kept.time[index] - kept.time[distorted]),
+        math.nan if clean.held.any() else tip_distance(kept, clean, float(kept.time[index])),
+        float(np.hypot(*(kept.tip[index] - kept.estimated[index]))),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """All runs: as drawn; without the plate; with it, without the monitor; with both; `unchosen` of each room (n,)."""
+    """All runs: parameters; without plate; with plate, without monitor; with both; `unplaced_indicator` (n,)."""
 
     drawn: Sequence[Approach]
-    clean: Sequence[Told]
-    free: Sequence[Told]
-    kept: Sequence[Told]
-    unchosen: Floats
+    clean: Sequence[RunRecord]
+    free: Sequence[RunRecord]
+    kept: Sequence[RunRecord]
+    unplaced: Floats
 
     def holds(self) -> list[tuple[float, Hold]]:
         """The speed of the plate (mm/s) and the hold of each run that was held."""
         found = zip(self.drawn, self.clean, self.kept, strict=True)
-        return [(one.speed, hold) for one, other, told in found if (hold := hold_of(one, other, told))]
+        return [(one.speed, hold) for one, clean, kept in found if (hold := hold_of(one, clean, kept))]
 
-    def unaware(self) -> list[float]:
-        """How far the true tip is off the believed one without a plate, at the times of the holds (mm)."""
+    def clean_estimate_errors(self) -> list[float]:
+        """Distance (mm) of true and estimated tip without a plate, at the times of the holds."""
         pairs = zip(self.clean, self.kept, strict=True)
-        times = [(one, float(told.time[told.held.argmax()])) for one, told in pairs if told.held.any()]
+        times = [(one, float(kept.time[kept.held.argmax()])) for one, kept in pairs if kept.held.any()]
         held = [
             (one, min(int(np.searchsorted(one.time, time - 1e-9)), len(one.tip) - 1)) for one, time in times
         ]
-        return [float(np.hypot(*(one.tip[index] - one.believed[index]))) for one, index in held]
+        return [float(np.hypot(*(one.tip[index] - one.estimated[index]))) for one, index in held]
 
 
 def curve(runs: Runs) -> tuple[Floats, Floats, Floats]:
-    """For each threshold: share of runs without a plate that it holds (false), the same with references that nobody
-    put where the field is clean, and share of distorted runs that it does not hold (missed).
+    """For each threshold: rate of false holds (runs without a plate), the same with references at their default
+    positions, and rate of missed holds (distorted runs).
 
-    Distorted are those with a plate in which the reading of the tip is off by more than 1 mm because of it, a second
-    or more before the end; missed are those of them in which the indicator has not passed the threshold within that
-    second.
+    Distorted: the plate distorts the tip reading by more than 1 mm, at least a second before the end. Missed: the
+    indicator has not exceeded the threshold within that second.
     """
     false = [np.mean([one.indicator.max() > limit for one in runs.clean]) for limit in THRESHOLDS]
-    anywhere = [np.mean(runs.unchosen > limit) for limit in THRESHOLDS]
+    anywhere = [np.mean(runs.unplaced > limit) for limit in THRESHOLDS]
     passed = [(one, first(one.distortion > LIMIT_MM)) for one in runs.free]
     until = [(one, float(one.time[index]) + 1.0) for one, index in passed if index is not None]
     largest = np.array([one.indicator[one.time <= time].max() for one, time in until if one.time[-1] >= time])
@@ -242,44 +244,44 @@ def curve(runs: Runs) -> tuple[Floats, Floats, Floats]:
 
 
 def row(name: str, values: Sequence[float]) -> str:
-    """A line of the table."""
+    """A row of the table."""
     known = np.array(values)[np.isfinite(values)]
     cells = [np.mean(known), *np.percentile(known, (50, 95, 100))]
     return f"| {name} | {len(known)} | " + " | ".join(f"{cell:.2f}" for cell in cells) + " |"
 
 
 def print_tables(runs: Runs) -> None:
-    """Print what the runs came to."""
+    """Print the results of the runs."""
     holds = [hold for _, hold in runs.holds()]
-    never = sum(one.held.any() for one in runs.clean)
+    clean_held = sum(one.held.any() for one in runs.clean)
     early = sum(hold.after_begin < 0.0 for hold in holds)
-    print(f"{len(runs.kept)} runs: {len(holds)} held by the field, {early} of them before the plate came.")
-    print(f"Without a plate {never} are held.")
+    print(
+        f"{len(runs.kept)} runs: {len(holds)} held for the field, {early} of them before the plate approached."
+    )
+    print(f"Without a plate: {clean_held} held.")
     free = [one.distortion.max() for one in runs.kept if not one.held.any()]
     if free:
-        print(
-            f"In the {len(free)} that are not, the plate puts the tip's reading off by at most {max(free):.2f} mm."
-        )
+        print(f"{len(free)} not held: the plate distorts the tip reading by at most {max(free):.2f} mm.")
     print("\n| | n | mean | median | 95 % | max |\n|---|---:|---:|---:|---:|---:|")
     print(row("time from the plate's start to the hold, s", [hold.after_begin for hold in holds]))
     print(row("time from 0.5 mm of distortion to the hold, s", [hold.after_distortion for hold in holds]))
     print(
         row(
             "distance of the true tip at the hold from the run without a plate, mm",
-            [hold.moved for hold in holds],
+            [hold.deviation for hold in holds],
         )
     )
-    print(row("error of the estimated tip at the hold, mm", [hold.unknown for hold in holds]))
-    print(row("the same at that time without a plate, mm", runs.unaware()))
-    ends = [apart(one, other, math.inf) for one, other in zip(runs.free, runs.clean, strict=True)]
+    print(row("error of the estimated tip at the hold, mm", [hold.estimate_error for hold in holds]))
+    print(row("the same at that time without a plate, mm", runs.clean_estimate_errors()))
+    ends = [tip_distance(one, other, math.inf) for one, other in zip(runs.free, runs.clean, strict=True)]
     print(
         row("without the monitor, distance of the true tip at the end from the run without a plate, mm", ends)
     )
-    near = sum(np.nanmax([hold.moved, hold.unknown]) <= LIMIT_MM for hold in holds)
+    near = sum(np.nanmax([hold.deviation, hold.estimate_error]) <= LIMIT_MM for hold in holds)
     good = near + sum(off <= LIMIT_MM for off in free)
     print(
-        f"\n{near / len(holds):.1%} of the holds: the true tip is then at most {LIMIT_MM:g} mm off by both measures. "
-        f"{good / len(runs.kept):.1%} of all runs: that, or nothing is held and the reading never off by more."
+        f"\n{near / len(holds):.1%} of the holds: both errors of the true tip at most {LIMIT_MM:g} mm. "
+        f"{good / len(runs.kept):.1%} of all runs: such a hold, or no hold and distortion at most {LIMIT_MM:g} mm."
     )
     print("\n| limit | held without a plate | references not placed | distorted, not held within 1 s |")
     print("|---:|---:|---:|---:|")
@@ -288,18 +290,18 @@ def print_tables(runs: Runs) -> None:
 
 
 def draw_figure(runs: Runs, folder: Path) -> None:
-    """Time to the hold over the plate's speed, error at the hold, and the choice of the threshold."""
+    """Time to the hold against the speed of the plate, tip error at the hold, choice of the threshold."""
     speeds, holds = zip(*runs.holds(), strict=True)
     with style.styled():
         figure = style.new_figure(3.65)
         times, errors, choice = (style.axes(figure, left, 0.35, 2.25, 2.2) for left in (0.55, 3.6, 6.6))
         times.plot(speeds, [hold.after_begin for hold in holds], ".", color=style.ESTIMATE, ms=4)
         times.set(xscale="log", xlabel="speed of the plate (mm/s)", ylim=(0, None))
-        times.set_title("From the plate's start to the hold (s)")
+        times.set_title("Start of the plate to the hold (s)")
         plain_ticks(times, [30, 50, 100, 200, 400])
         for values, name, color, line in (
-            ([hold.moved for hold in holds], "from the run without a plate", style.TRUE, "-"),
-            ([hold.unknown for hold in holds], "error of the estimated tip", style.ESTIMATE, "--"),
+            ([hold.deviation for hold in holds], "from the run without a plate", style.TRUE, "-"),
+            ([hold.estimate_error for hold in holds], "error of the estimated tip", style.ESTIMATE, "--"),
         ):
             ordered = np.sort(values)
             errors.step(
@@ -307,13 +309,16 @@ def draw_figure(runs: Runs, folder: Path) -> None:
             )
         errors.axvline(LIMIT_MM, color=style.QUIET, lw=0.8)
         errors.set(
-            xlabel="true tip at the hold (mm)", title="Share of holds below", xlim=(0, None), ylim=(0, 1.02)
+            xlabel="deviation of the true tip at the hold (mm)",
+            title="Cumulative share of holds",
+            xlim=(0, None),
+            ylim=(0, 1.02),
         )
         errors.legend(loc="upper center", bbox_to_anchor=(0.45, -0.17))
         false, anywhere, missed = curve(runs)
-        choice.plot(THRESHOLDS, false, color=style.ESTIMATE, label="held without a plate")
-        choice.plot(THRESHOLDS, anywhere, color=style.ESTIMATE, ls=":", label="references not placed")
-        choice.plot(THRESHOLDS, missed, color=style.TRUE, ls="--", label="distorted, not held")
+        choice.plot(THRESHOLDS, false, color=style.ESTIMATE, label="false holds")
+        choice.plot(THRESHOLDS, anywhere, color=style.ESTIMATE, ls=":", label="false, references not placed")
+        choice.plot(THRESHOLDS, missed, color=style.TRUE, ls="--", label="missed holds")
         choice.axvline(load_scenario("phantom").monitor.indicator_limit, color=style.QUIET, lw=0.8)
         choice.set(xscale="log", xlabel="limit of the indicator", title="Share of runs", ylim=(0, 1.02))
         plain_ticks(choice, [0.02, 0.05, 0.1, 0.2, 0.5, 1.0])
@@ -322,19 +327,21 @@ def draw_figure(runs: Runs, folder: Path) -> None:
 
 
 def plain_ticks(ax: Axes, ticks: Sequence[float]) -> None:
-    """Ticks of a logarithmic axis as plain numbers."""
+    """Label the ticks of a logarithmic axis with plain numbers."""
     ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     ax.set_xticks([], minor=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
+    """Print the tables and draw the figure."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--runs", type=int, default=200)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=Path("docs/images"))
+    parser.add_argument("--runs", type=int, default=200, metavar="N", help="number of runs (default: 200)")
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("docs/images"), metavar="DIR", help="folder of the figure"
+    )
     chosen = parser.parse_args(arguments)
     drawn = [approach(load_scenario("phantom"), number) for number in range(chosen.runs)]
     with ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as pool:
@@ -342,9 +349,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             [pool.submit(carried_out, one, plate, monitor) for one in drawn]
             for plate, monitor in ((False, True), (True, False), (True, True))
         ]
-        anywhere = [pool.submit(unchosen, number) for number in range(chosen.runs)]
-        told = [[call.result() for call in line] for line in calls]
-        runs = Runs(drawn, *told, np.array([call.result() for call in anywhere]))
+        unplaced = [pool.submit(unplaced_indicator, number) for number in range(chosen.runs)]
+        records = [[call.result() for call in line] for line in calls]
+        runs = Runs(drawn, *records, np.array([call.result() for call in unplaced]))
     print_tables(runs)
     chosen.out.mkdir(parents=True, exist_ok=True)
     draw_figure(runs, chosen.out)

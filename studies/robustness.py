@@ -1,9 +1,8 @@
 """Random control sequences in random tissue: no exception, no NaN, no unconverged step (`make robustness`).
 
 Every batch is one random scenario and many sequences of all five inputs within its limits, run by
-`Simulator.rollout`. Progress goes to stderr, a JSON summary to stdout; exit status 1 after any failure, 130
-after an interrupt. A batch is drawn from (seed, number of the batch) alone, so a failure is reproduced by
-`--seed S --batch K`.
+`Simulator.rollout`. Progress is printed on stderr, a JSON summary on stdout; exit status 1 after any failure, 130
+after an interrupt. A batch depends only on seed and batch number, so that `--seed S --batch K` reproduces a failure.
 """
 
 import argparse
@@ -25,7 +24,7 @@ SHOWN = 5
 
 @dataclass
 class Tally:
-    """What a run has seen so far; `worst_residual_mm` is over single steps that are run again one by one."""
+    """Counts of a run; `worst_residual_mm` is over sequences that are repeated step by step."""
 
     sequences: int = 0
     steps: int = 0
@@ -40,12 +39,12 @@ class Tally:
 
     @property
     def failed(self) -> bool:
-        """Whether anything went wrong."""
+        """Whether there was any failure."""
         return self.unconverged + self.not_finite + self.exceptions > 0
 
 
 def draw_layer(rng: np.random.Generator) -> dict[str, float]:
-    """μ 0.1 to 100 kPa and α 1 to 30, as the requirement has them; h and w around those of the phantom."""
+    """μ 0.1 to 100 kPa and α 1 to 30, the required ranges; h and w around those of the phantom."""
     return {
         "shear_modulus_kpa": float(10 ** rng.uniform(-1, 2)),
         "alpha": float(rng.uniform(1, 30)),
@@ -90,7 +89,7 @@ def draw_scenario(rng: np.random.Generator) -> Scenario:
 
 
 def draw_controls(scenario: Scenario, count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, STEPS, 5): steps up to the limits, both ways, every input in runs or from step to step."""
+    """(count, STEPS, 5): steps up to the limits in both directions, constant over runs or changing every step."""
     setup = scenario.setup
     shape = (count, STEPS)
     forward = _runs(rng, shape, 0.9)
@@ -102,7 +101,7 @@ def draw_controls(scenario: Scenario, count: int, rng: np.random.Generator) -> n
         (setup.max_guide_step_mm if setup.has_guide else 0.0, setup.max_guide_travel_mm),
     )
     for step, travel in ranges:
-        # From still to bang-bang at the limit, with a direction of its own to each sequence.
+        # From no motion to bang-bang at the limit, with a separate direction for each sequence.
         swing = step * rng.choice([0.0, 0.1, 0.4, 1.0], (count, 1))
         moves = swing * _runs(rng, shape, rng.uniform(0.5, 0.95)) * rng.uniform(0, 1, shape)
         columns.append(_bounded(moves, -travel, travel))
@@ -118,28 +117,28 @@ def _runs(rng: np.random.Generator, shape: tuple[int, int], forward: float) -> n
 
 
 def _bounded(steps: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Steps cut off where their sum would leave low to high."""
-    place, kept = np.zeros(steps.shape[0]), np.empty_like(steps)
+    """Steps clipped so that their sum stays within low and high."""
+    position, kept = np.zeros(steps.shape[0]), np.empty_like(steps)
     for k in range(steps.shape[1]):
-        kept[:, k] = np.clip(place + steps[:, k], low, high) - place
-        place += kept[:, k]
+        kept[:, k] = np.clip(position + steps[:, k], low, high) - position
+        position += kept[:, k]
     return kept
 
 
 def run_batch(seed: int, batch: int, count: int, tally: Tally) -> None:
-    """One scenario, `count` sequences; what goes wrong is counted, never raised."""
+    """One scenario, `count` sequences; failures are counted, not raised."""
     rng = np.random.default_rng((seed, batch))
     scenario = draw_scenario(rng)
     controls = draw_controls(scenario, BATCH, rng)[:count]
     bevel = 1 if rng.random() < 0.5 else -1
-    again = f"--seed {seed} --batch {batch}"
+    options = f"--seed {seed} --batch {batch}"
     try:
         simulator = Simulator(scenario)
         tips, energy, converged = simulator.rollout(simulator.start(bevel), controls)
-        _step_again(simulator, controls[batch % count], bevel, tally)
-    except Exception as error:  # noqa: BLE001 the study is about there being none
+        _repeat_by_step(simulator, controls[batch % count], bevel, tally)
+    except Exception as error:  # noqa: BLE001 the study counts exceptions
         tally.exceptions += 1
-        tally.failures.append(f"{again}  # {type(error).__name__}: {error}")
+        tally.failures.append(f"{options}  # {type(error).__name__}: {error}")
         return
     finite = np.isfinite(tips).all(axis=2) & np.isfinite(energy)
     tally.sequences += count
@@ -148,16 +147,18 @@ def run_batch(seed: int, batch: int, count: int, tally: Tally) -> None:
     tally.not_finite += int((~finite).sum())
     for j, k in np.argwhere(~(finite & converged))[:1]:
         kind = "unconverged" if finite[j, k] else "not finite"
-        tally.failures.append(f"{again}  # sequence {j}, step {k}: {kind}")
+        tally.failures.append(f"{options}  # sequence {j}, step {k}: {kind}")
 
 
-def _step_again(simulator: Simulator, rows: np.ndarray, bevel: int, tally: Tally) -> None:
-    """One sequence step by step, for what a rollout does not report."""
+def _repeat_by_step(simulator: Simulator, rows: np.ndarray, bevel: int, tally: Tally) -> None:
+    """One sequence step by step, for residual and iterations, which a rollout does not report."""
     state = simulator.start(bevel)
     for row in rows:
         state = simulator.step(state, Control.from_row(row))
         tally.most_iterations = max(tally.most_iterations, state.iterations)
-        tally.fallback_steps += state.iterations > 8  # where the equilibrium is uncoupled, theory section 6
+        tally.fallback_steps += (
+            state.iterations > 8
+        )  # fallback to the uncoupled equilibrium, theory section 6
         tally.worst_residual_mm = max(tally.worst_residual_mm, state.residual)
         tally.checked_steps += 1
 

@@ -1,11 +1,11 @@
-"""Steering plans on random worlds: are they what the named needle does, and what an exact needle does?
+"""Accuracy of steering plans on random worlds: planned error, and deviation of the exact plant from the plan.
 
     python studies/steering.py [--worlds FIRST COUNT] [--jobs N] [--out FILE]
 
-Each world keeps its needle, tissue, apparatus and depth; its target is drawn within 90 % of what the bevel alone
-reaches there. The guide stays where it is. The plan is replayed (`open-loop`) on the exact plant without any
-imperfection. The table goes to stdout, a row for each world to FILE as JSON. Worlds below 1000 are for choosing
-settings, those from 100,000 on for reports.
+Each world keeps its needle, tissue, apparatus and depth; its target is drawn within 90 % of the reach of the bevel.
+The guide does not move. The plan is replayed (`open-loop`) on the exact plant without imperfections. The table is
+printed on stdout; FILE gets one row per world as JSON. Worlds below 1000 are for tuning, those from 100,000 on for
+reports.
 """
 
 import argparse
@@ -30,12 +30,12 @@ PLANNED_MM, CLAIMED_MM = 0.1, 0.2
 
 
 def perfect(number: int) -> Scenario:
-    """A world whose plant has no imperfection."""
+    """A world with a plant without imperfections."""
     return world(number, "perfect")
 
 
 def draw_target(scenario: Scenario, number: int) -> tuple[float, float]:
-    """A target at the world's depth, uniform within 90 % of the bevel's reach, and within the apparatus' limit (mm)."""
+    """A target (mm) at the depth of the world, uniform within 90 % of the bevel's reach and the apparatus limit."""
     depth, most = scenario.target.depth_mm, scenario.setup.max_lateral
     least, greatest = bevel_reach(scenario, depth, threads=1)
     middle, half = 0.5 * (least + greatest), 0.5 * SHARE_OF_REACH * (greatest - least)
@@ -64,15 +64,16 @@ def steer(number: int, scenario: Scenario | None = None) -> dict[str, Any]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Markdown: all worlds, those with a guide, those without."""
+    """Markdown table: all worlds, with a guide, without a guide."""
     groups = {
         "all": rows,
         "with a guide": [row for row in rows if row["guide"]],
         "without": [row for row in rows if not row["guide"]],
     }
     head = (
-        f"| worlds | n | planned to {PLANNED_MM} mm | and the exact needle within {CLAIMED_MM} mm of the claim "
-        "| planned error, median, max | from the claim, median, 95 %, max | rolls, mean, max | s a plan, median |"
+        f"| worlds | n | planned error ≤ {PLANNED_MM} mm | and exact plant within {CLAIMED_MM} mm of the plan "
+        "| planned error, median, max | deviation from the plan, median, 95 %, max | rolls, mean, max "
+        "| planning time (s), median |"
     )
     return "\n".join(
         [head, "|---|" + "---:|" * 7, *(line(name, rows) for name, rows in groups.items() if rows)]
@@ -104,19 +105,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--worlds", nargs=2, type=int, default=(100_000, 100), metavar=("FIRST", "COUNT"))
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), metavar="N")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="a row for each world, as JSON")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write one row per world as JSON")
     args = parser.parse_args(argv)
     first, count = args.worlds
     if count < 1 or first < 0 or first < 100 * TRAINING < first + count:
         parser.error(
-            f"worlds = {first} {count}: must be 0 or more, at least one, on one side of {100 * TRAINING}"
+            f"worlds = {first} {count}: must be FIRST >= 0 and COUNT >= 1, all below or all from {100 * TRAINING}"
         )
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
         rows = list(pool.map(steer, range(first, first + count)))
     print(table(rows))
     for row in sorted(rows, key=lambda row: -row["claim_error_mm"])[:5]:
         print(
-            f"world {row['world']}: {row['claim_error_mm']:.3f} mm from the claim, {row['rolls']} rolls",
+            f"world {row['world']}: {row['claim_error_mm']:.3f} mm from the plan, {row['rolls']} rolls",
             file=sys.stderr,
         )
     if args.out is not None:

@@ -1,19 +1,19 @@
-"""Tune a controller with 200 insertions, on phantoms that no evaluation uses.
+"""Tune a controller with 200 insertions, on phantoms that are not used for evaluation.
 
     python studies/tune.py METHOD [--jobs N] [--seed N] [--out DIR]
 
 METHOD is a controller as in `flexneedle insert --controller`; its search space is in SPACES. Five settings, the middle
-of the space and four that cover it evenly, are tried on the same cases: the 15 targets of the paper in turn, each on
-a phantom of its own (exact plant, preset `phantom`). After twenty cases the best two go on, to seventy: single errors
-scatter by as much as their mean, so more settings with fewer cases each would be ranked by chance. The score is the
-mean true error and a quarter of its 95 % quantile (mm); an insertion that is not done counts 5 mm. Making the plans
-is outside the budget. The table goes to stdout, everything to DIR/METHOD.json (default: the records that the package
-ships, src/flexneedle/study/tuning), the same bytes for any number of processes.
+of the space and four that cover it evenly, are tried on the same cases: the 15 targets of the paper, each case on
+its own phantom (exact plant, preset `phantom`). The best two after twenty cases continue to seventy: the standard
+deviation of single errors is about their mean, so more settings with fewer cases each would be ranked by chance. The
+score is the mean true error plus a quarter of its 95 % quantile (mm); an unfinished insertion counts 5 mm. Planning
+is outside the budget. The table is printed on stdout; the record is written to DIR/METHOD.json (default: the shipped
+records, src/flexneedle/study/tuning), with the same bytes for any number of processes.
 
-Every setting of the space is set in each trial, whatever is shipped for it, so that the result can be had again once
-the shipped settings are changed to it. The other settings are the shipped ones. The weights of `adaptive-mpc` are not
-tuned here but chosen on random worlds (docs/decisions/0009-identify-and-search.md). NOTES may hold a remark for a
-record.
+Each trial sets all settings of the space, independent of the shipped values, so that the result can be reproduced after
+the shipped settings have been changed to it. All other settings are the shipped ones. The weights of `adaptive-mpc` are
+not tuned here but chosen on random worlds (docs/decisions/0009-identify-and-search.md). NOTES may contain a remark for
+a record.
 """
 
 import argparse
@@ -35,14 +35,14 @@ from flexneedle.trace.plain import to_text
 from flexneedle.types import Plan
 
 TARGETS = [(depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0)]
-STRIDE = 4  # through the targets: any few cases in a row mix depths and sides
-ROUNDS = ((5, 20), (2, 50))  # settings that are left, and the further cases that each gets
+STRIDE = 4  # through the targets, so that successive cases mix depths and sides
+ROUNDS = ((5, 20), (2, 50))  # (number of settings, further cases of each)
 BUDGET = sum(settings * cases for settings, cases in ROUNDS)
-FIRST_SEED = 5000  # of the phantoms, one a case; evaluations use 100000 and up
+FIRST_SEED = 5000  # of the phantoms, one per case; evaluations use 100000 and above
 FAILED_MM = 5.0
 PLAN_SEED = 0
 SCORE = f"mean + 0.25 * 95 % quantile of the true error (mm); an insertion that is not done counts {FAILED_MM:g} mm"
-# What went into a result beside its budget, by method.
+# Remarks on a result, by method.
 NOTES: dict[str, str] = {}
 RECORDS = Path(__file__).resolve().parents[1] / "src/flexneedle/study/tuning"
 Settings = dict[str, float]
@@ -50,17 +50,17 @@ Settings = dict[str, float]
 
 @dataclass(frozen=True)
 class Range:
-    """Where a setting is looked for: evenly, or evenly in its logarithm; whole numbers only, or not."""
+    """Search range of a setting; log: uniform in the logarithm; whole: integers only."""
 
     low: float
     high: float
     log: bool = True
     whole: bool = False
 
-    def at(self, part: float) -> float:
-        """The value at a part of the way, to three digits, so that what is tried is what is written down."""
+    def at(self, fraction: float) -> float:
+        """The value at a fraction of the range, rounded to three digits as in the record."""
         ratio, width = self.high / self.low if self.log else 1.0, self.high - self.low
-        value = self.low * ratio**part if self.log else self.low + part * width
+        value = self.low * ratio**fraction if self.log else self.low + fraction * width
         return round(value) if self.whole else float(f"{value:.3g}")
 
 
@@ -78,7 +78,7 @@ SPACES: dict[str, dict[str, Range]] = {
         "control.resolved_rate.damping": Range(3e-3, 0.3),
         "control.resolved_rate.lookahead_mm": Range(1.0, 40.0),
     },
-    # The published gain 0.65, horizon 4 and ±6 mm are what the controller is.
+    # The gain 0.65, horizon 4 and ±6 mm are published and define the controller.
     "broyden-mpc": {
         "control.broyden_mpc.guide_weight": Range(1e-4, 1.0),
         "control.broyden_mpc.guide_effect": Range(0.3, 2.0),
@@ -97,14 +97,14 @@ SPACES: dict[str, dict[str, Range]] = {
 
 @dataclass(frozen=True)
 class Trial:
-    """Settings and the true errors (mm) that they led to, case by case."""
+    """Settings and their true errors (mm) by case."""
 
     settings: Settings
     errors: tuple[float, ...] = ()
 
     @property
     def score(self) -> float:
-        """What is to be small; infinite before the first case."""
+        """Score to minimise (mm); infinite before the first case."""
         if not self.errors:
             return math.inf
         return float(np.mean(self.errors) + 0.25 * np.quantile(self.errors, 0.95))
@@ -121,7 +121,7 @@ def candidates(space: dict[str, Range], count: int, rng: np.random.Generator) ->
 
 
 def halve(trials: list[Trial], method: str, plans: list[Plan], executor: Executor) -> list[Trial]:
-    """All trials after the last round: the best first, of those that went furthest."""
+    """All trials after the last round: those of the last round first, each round sorted by score."""
     out: list[Trial] = []
     first = spent = 0
     for settings, cases in ROUNDS:
@@ -151,12 +151,12 @@ def error_of(task: tuple[str, Settings, Plan, int]) -> float:
 
 
 def plan_for(target: tuple[float, float]) -> Plan:
-    """The plan that all settings share."""
+    """The plan for a target, the same for all settings."""
     return flexneedle.plan(flexneedle.load_scenario("phantom"), target, seed=PLAN_SEED, threads=1)
 
 
 def result(method: str, seed: int, trials: list[Trial]) -> dict[str, Any]:
-    """What is written down, best trial first."""
+    """The record, best trial first."""
     return {
         "method": method,
         "chosen": trials[0].settings,
@@ -197,7 +197,7 @@ def table(found: dict[str, Any]) -> str:
 
 
 def counted(errors: Iterable[float], before: int) -> Iterator[float]:
-    """Pass errors on; on a terminal, say how many there were."""
+    """Yield the errors; on a terminal, print their number."""
     for k, error in enumerate(errors, before + 1):
         if sys.stderr.isatty():
             end = "\n" if k == BUDGET else ""
@@ -206,11 +206,13 @@ def counted(errors: Iterable[float], before: int) -> Iterator[float]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Tune, print the table, write the file."""
+    """Tune, print the table, write the record."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("method", choices=sorted(SPACES), metavar="METHOD", help=", ".join(sorted(SPACES)))
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the settings that are tried")
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="seed of the tried settings (default: 0)"
+    )
     parser.add_argument("--out", type=Path, default=RECORDS, metavar="DIR")
     chosen = parser.parse_args(arguments)
     rng = np.random.default_rng(chosen.seed)

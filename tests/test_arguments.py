@@ -1,4 +1,4 @@
-"""What cannot be used is one line with value, rule and remedy, at every door of the package."""
+"""An invalid argument is one line with value, rule and remedy, in all public functions."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_a_wrong_argument_is_one_line(call, line):
     assert str(caught.value) == line
 
 
-def test_a_seed_in_place_of_a_generator_is_refused(quick_plan):
+def test_a_seed_in_place_of_a_generator_is_rejected(quick_plan):
     rig = flexneedle.Rig(None, None, None)
     with pytest.raises(
         InputError, match=r"^rng = 3: must be a Generator; such as numpy\.random\.default_rng\(0\)$"
@@ -57,19 +57,19 @@ def test_a_seed_in_place_of_a_generator_is_refused(quick_plan):
 
 
 @pytest.mark.parametrize("value", [np.arange(3000.0), "x" * 900, [[1] * 99] * 99, {"a": "b\nc"}, object()])
-def test_whatever_is_given_the_line_is_one_and_short(value):
+def test_the_error_for_any_value_is_one_short_line(value):
     with pytest.raises(FlexneedleError) as caught:
         flexneedle.insert("phantom", value)
     (line,) = str(caught.value).splitlines()
     assert len(line) < 200
 
 
-def test_numbers_of_numpy_are_numbers():
+def test_numpy_numbers_are_accepted():
     assert whole("seed", np.int64(3), 0) == 3
     assert pair("target", np.array([40.0, 5.0]), "x and y") == (40.0, 5.0)
 
 
-def test_scenarios_by_name_and_by_path_are_the_scenario(quick_plan, tmp_path):
+def test_a_scenario_may_be_given_by_name_or_path(quick_plan, tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(dump_scenario(flexneedle.load_scenario("phantom")))
     for source in ("phantom", str(path), path):
@@ -83,8 +83,8 @@ def test_scenarios_by_name_and_by_path_are_the_scenario(quick_plan, tmp_path):
     assert [period.true_tip for period in one.periods] == [period.true_tip for period in other.periods]
 
 
-def test_run_carries_out_a_plan_on_any_rig(quick_plan):
-    """On the virtual phantom's it does what `insert` does."""
+def test_run_executes_a_plan_on_any_rig(quick_plan):
+    """On the virtual phantom it gives the same result as `insert`."""
     from flexneedle.rig.virtual import Seeds, virtual_rig
 
     phantom, tracker, control, room = np.random.SeedSequence(4).spawn(4)

@@ -1,4 +1,4 @@
-"""studies/environments.py: the shipped environments meet the paper's Tables I and II; its own arithmetic."""
+"""studies/environments.py: the shipped environments agree with the paper's Tables I and II; hand values."""
 
 import sys
 from pathlib import Path
@@ -15,20 +15,20 @@ CASES = [(name, figure) for name, figures in environments.PAPER.items() for figu
 
 @pytest.fixture(scope="module")
 def found():
-    """Two measurements with seeds of which nothing was chosen."""
+    """Two measurements with seeds that were not used for tuning."""
     return environments.measured(("ideal", "noisy"), (910_001, 910_002), other_rooms=False)
 
 
 @pytest.mark.parametrize(("name", "figure"), CASES)
-def test_the_shipped_environments_meet_the_paper(found, name, figure):
-    """In every measurement, not in the median alone: within 10 %, maxima and minima within 25 %."""
+def test_the_shipped_environments_agree_with_the_paper(found, name, figure):
+    """In every measurement, not only the median: within 10 %, maxima and minima within 25 %."""
     paper = environments.PAPER[name][figure]
     share = 0.25 if figure.endswith(("max", "min")) else 0.10
     np.testing.assert_allclose(found[name][figure], paper, rtol=share)
 
 
 def test_in_noisy_no_indicator_is_below_the_threshold(found):
-    """As the paper says of its Table II."""
+    """As stated in the paper for Table II."""
     assert found["noisy"]["𝓘 min"].min() > 0.0547
 
 
@@ -42,7 +42,7 @@ def test_both_shipped_environments_are_one_room_with_and_without_a_plate():
 
 
 def by_hand(sensor, indicator):
-    """Two points: 3, 4, 0 mm off with 0.1 mm to either side; 0, 0, 2 mm off without jitter, and a missing sample."""
+    """Two points: error (3, 4, 0) mm with ±0.1 mm; error (0, 0, 2) mm without jitter and with a missing sample."""
     x, y, z = [3.1, 2.9, 10.0, 10.0, None], [4.0, 4.0, 0.0, 0.0, None], [0.0, 0.0, 2.0, 2.0, None]
     true = [0.0, 0.0, 10.0, 10.0, 10.0]
     return pa.table(

@@ -1,4 +1,4 @@
-"""Errors: one tree, one line, and they survive a trip between processes."""
+"""Errors: one base class, one line, and pickling between processes."""
 
 import pickle
 
@@ -8,11 +8,11 @@ from flexneedle.errors import CommandError, FlexneedleError, InputError, RunErro
 
 
 @pytest.mark.parametrize("kind", [CommandError, InputError, RunError, ScenarioError, StateError])
-def test_all_errors_have_one_root(kind):
+def test_all_errors_have_one_base_class(kind):
     assert issubclass(kind, FlexneedleError)
 
 
-def test_a_command_error_tells_name_value_and_rule():
+def test_a_command_error_has_name_value_and_rule():
     error = CommandError("db_x", 2.5, 1.0, "must be at most 1 mm a step")
     assert str(error) == "db_x = 2.5: must be at most 1 mm a step"
     assert (error.name, error.value, error.limit) == ("db_x", 2.5, 1.0)

@@ -1,4 +1,4 @@
-"""What docs/extend.md says works, from outside the package: its modules lie in a folder of the user's."""
+"""The examples of docs/extend.md run from a folder outside the package."""
 
 import json
 import re
@@ -42,7 +42,7 @@ values = { plant = "unicycle:Unicycle", tracker = "camera:Camera" }
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
-    """The folder of a lab: the modules of the page, a quick scenario with settings for the controller."""
+    """A folder with the modules of the page and a quick scenario with settings for the controller."""
     folder = tmp_path_factory.mktemp("lab")
     for name, code in MODULES.items():
         (folder / f"{name}.py").write_text(code, encoding="utf-8")
@@ -54,7 +54,7 @@ def lab(tmp_path_factory):
 
 @pytest.fixture
 def imported(lab, monkeypatch):
-    """Return a function that imports a part of the page by `module:NAME`."""
+    """Return a function that imports an object of the page by `module:NAME`."""
     monkeypatch.syspath_prepend(lab)
 
     def part(spec):
@@ -67,18 +67,18 @@ def imported(lab, monkeypatch):
 
 
 def command(lab, *argv):
-    """Run the command in the folder; -P: Python itself does not put that into the path."""
+    """Run the command in the folder; -P: Python does not add the folder to its path."""
     line = [sys.executable, "-P", "-m", "flexneedle", *argv]
     return subprocess.run(line, cwd=lab, capture_output=True, text=True, check=False)
 
 
-def test_each_example_is_some_thirty_lines():
+def test_each_example_has_about_thirty_lines():
     assert list(MODULES) == ["follow_path", "unicycle", "camera", "bench"]
     assert all(20 < len(code.splitlines()) < 42 for code in MODULES.values())
 
 
 @pytest.mark.long
-def test_the_parts_are_carried_out_and_recorded_under_their_names(lab):
+def test_the_parts_are_used_and_recorded_by_name(lab):
     options = [word for key, name in PARTS.items() for word in (f"--{key}", name)]
     done = command(lab, "insert", "quick.toml", "--force", "--json", "--out", "one", *options)
     result, stored = json.loads(done.stdout), json.loads((lab / "one/run.json").read_text())
@@ -99,7 +99,7 @@ def test_a_scenario_with_the_table_is_checked_with_the_controller(lab):
 
 
 @pytest.mark.long
-def test_the_table_of_a_controller_that_is_not_used_is_warned_of_once(lab):
+def test_an_unused_controller_table_is_one_warning(lab):
     for argv in (["plan"], ["insert", "--force", "--controller", "open-loop", "--phantom", "model"]):
         done = command(lab, *argv, "quick.toml", "--out", f"other-{argv[0]}")
         assert done.returncode in (0, 1)
@@ -108,7 +108,7 @@ def test_the_table_of_a_controller_that_is_not_used_is_warned_of_once(lab):
         assert line.endswith("; it is not used")
 
 
-def test_objects_are_carried_out_as_their_names_are(lab, imported, monkeypatch):
+def test_objects_give_the_same_result_as_their_names(lab, imported, monkeypatch):
     monkeypatch.chdir(lab)
     scenario = flexneedle.load_scenario("quick.toml")
     plan = flexneedle.plan(scenario, seed=0)
@@ -139,7 +139,7 @@ def test_the_example_of_objects_runs_as_printed(lab, imported, monkeypatch):
     assert (loaded.controller, loaded.phantom, loaded.tracker) == ("follow-path", "Unicycle", "Camera")
 
 
-def test_a_plan_is_carried_out_on_the_bench(lab, imported, monkeypatch):
+def test_a_plan_is_executed_on_the_bench(lab, imported, monkeypatch):
     monkeypatch.chdir(lab)
     scenario = flexneedle.load_scenario("quick.toml").with_values({"control.follow_path": None})
     plan = flexneedle.plan(scenario, seed=0)
@@ -150,7 +150,7 @@ def test_a_plan_is_carried_out_on_the_bench(lab, imported, monkeypatch):
 
 
 @pytest.mark.long
-def test_a_study_takes_them_by_name_in_its_workers(lab):
+def test_a_study_loads_them_by_name_in_its_workers(lab):
     done = command(lab, "study", "own.toml", "--workers", "2", "--out", "study", "--json")
     assert done.returncode == 0, done.stderr
     rows = pq.read_table(lab / "study/runs.parquet").to_pylist()

@@ -1,4 +1,4 @@
-"""The package: what it exports, and that importing it costs nothing."""
+"""The package: public names and cheap imports."""
 
 import subprocess
 import sys
@@ -12,7 +12,7 @@ HEAVY = {"numba", "numpy", "scipy", "duckdb", "matplotlib", "pydantic", "rosbags
 
 
 def modules_after(*arguments: str) -> set[str]:
-    """Return the names of the top-level modules that a fresh interpreter has loaded after its work."""
+    """Return the names of the top-level modules loaded in a new interpreter."""
     script = (
         "import sys, atexit; atexit.register(lambda: print('\\n' + ' '.join(sys.modules), file=sys.stderr)); "
     )
@@ -54,11 +54,11 @@ def test_the_version_is_that_of_the_distribution():
     assert flexneedle.__version__ == version("flexneedle")
 
 
-def test_every_public_name_is_there():
+def test_every_public_name_exists():
     assert [name for name in flexneedle.__all__ if getattr(flexneedle, name, None) is None] == []
 
 
-def test_the_import_loads_no_room_of_the_package():
+def test_the_import_loads_no_subpackage():
     script = "import flexneedle; print(*(name for name in sys.modules if name.startswith('flexneedle')))"
     done = subprocess.run([sys.executable, "-c", f"import sys; {script}"], capture_output=True, text=True)
     assert done.stdout.split() == ["flexneedle"]

@@ -1,4 +1,4 @@
-"""Every record that a user meets prints as one short line with units, never as its arrays."""
+"""Every public record prints as one short line with units, without its arrays."""
 
 import re
 from dataclasses import replace
@@ -81,7 +81,7 @@ def test_a_record_prints_as_one_short_line(name):
         ("trajectories", "<Trajectories of 2 sequences of 3 steps, 100% converged>"),
     ],
 )
-def test_the_line_has_what_matters_with_its_unit(name, line):
+def test_the_line_has_the_main_values_with_units(name, line):
     assert repr(RECORDS[name]) == line
 
 

@@ -1,4 +1,4 @@
-"""studies/steering.py: its targets are within reach, its plant has no imperfection, and a miss counts."""
+"""studies/steering.py: targets within reach, a plant without imperfections, and both error bounds."""
 
 import sys
 from pathlib import Path
@@ -20,14 +20,14 @@ def test_targets_are_within_the_bevels_reach_at_the_worlds_depth(number):
     assert (depth, lateral) == steering.draw_target(scenario, number)
 
 
-def test_a_world_is_planned_and_replayed_without_an_imperfection():
+def test_a_world_is_planned_and_replayed_without_imperfections():
     row = steering.steer(2)
     assert row["planned_error_mm"] <= steering.PLANNED_MM
     assert row["claim_error_mm"] <= steering.CLAIMED_MM
     assert row["guide_moved_mm"] == 0.0
 
 
-def test_both_bounds_have_to_be_kept():
+def test_both_bounds_must_be_met():
     base = {"rolls": 1, "seconds": 1.0, "guide": True}
     errors = [(0.05, 0.1), (0.2, 0.1), (0.05, 0.3)]
     rows = [{**base, "planned_error_mm": planned, "claim_error_mm": claim} for planned, claim in errors]
@@ -36,7 +36,7 @@ def test_both_bounds_have_to_be_kept():
 
 
 @pytest.mark.parametrize("worlds", [("-1", "5"), ("0", "0"), ("99990", "20")])
-def test_worlds_for_choosing_and_for_reports_are_not_mixed(worlds, capsys):
+def test_worlds_for_tuning_and_for_reports_are_not_mixed(worlds, capsys):
     with pytest.raises(SystemExit) as left:
         steering.main(["--worlds", *worlds])
     assert left.value.code == 2

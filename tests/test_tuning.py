@@ -1,4 +1,4 @@
-"""Tuning: the records that the package ships, its shipped settings, and the search itself, without an insertion."""
+"""Tuning: shipped records and settings, and the search itself, without insertions."""
 
 import importlib.util
 import json
@@ -19,7 +19,7 @@ from flexneedle.trace.plain import to_text
 SCRIPT = Path(__file__).resolve().parents[1] / "studies" / "tune.py"
 SHIPPED = files("flexneedle.study") / "tuning"
 TUNED = sorted(item.name.removesuffix(".json") for item in SHIPPED.iterdir())
-NOT_TUNED = {"open-loop", "adaptive-mpc"}  # nothing to choose; chosen on random worlds
+NOT_TUNED = {"open-loop", "adaptive-mpc"}  # no settings; settings chosen on random worlds
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def record_of(method):
 
 
 @pytest.mark.parametrize("method", TUNED)
-def test_shipped_settings_are_those_that_tuning_chose(method):
+def test_shipped_settings_are_those_chosen_by_tuning(method):
     shipped, chosen = checked(flexneedle.load_scenario("phantom")).flat(), record_of(method)["chosen"]
     assert chosen
     assert {key: shipped[key] for key in chosen} == chosen
@@ -54,8 +54,8 @@ def test_every_controller_with_a_space_has_a_record(tune):
 
 
 @pytest.mark.parametrize("method", TUNED)
-def test_records_are_what_the_script_writes(tune, method):
-    """Budget, seeds, space and note are those of the script as it is; what was found follows from the trials."""
+def test_records_agree_with_the_script(tune, method):
+    """Budget, seeds, space and note are those of the present script; the result follows from the trials."""
     record = record_of(method)
     assert to_text(record) == text_of(method)
     trials = [tune.Trial(trial["settings"], (trial["mean_mm"],)) for trial in record["trials"]]
@@ -70,7 +70,7 @@ def test_records_are_what_the_script_writes(tune, method):
     assert sum(trial["cases"] for trial in record["trials"]) == record["budget_insertions"]
 
 
-def test_nothing_went_into_a_result_beside_its_budget():
+def test_records_have_no_remarks():
     assert {tuned.method: tuned.note for tuned in read_tuning()} == dict.fromkeys(TUNED, "")
 
 
@@ -94,16 +94,16 @@ def test_the_other_candidates_cover_each_range_evenly(tune, seed):
     tried = tune.candidates(space, 5, np.random.default_rng(seed))[1:]
     assert sorted(settings["even"] for settings in tried) == [1.0, 3.0, 5.0, 7.0]
     in_log = sorted(np.log10(settings["log"]) for settings in tried)
-    assert_allclose(in_log, [0.5, 1.5, 2.5, 3.5], atol=1e-3)  # three digits are kept
+    assert_allclose(in_log, [0.5, 1.5, 2.5, 3.5], atol=1e-3)  # rounded to three digits
 
 
-def test_ranges_are_tried_in_values_of_three_digits(tune):
+def test_values_have_three_digits(tune):
     assert tune.Range(0.1, 1.0).at(0.5) == 0.316
     assert tune.Range(2, 16, whole=True).at(0.3) == 4
 
 
 class Race:
-    """Insertions whose error is that of their settings, more in later cases by `drift`; each is kept."""
+    """Fake insertions with an error by setting, plus `drift` in later cases; tasks are recorded."""
 
     def __init__(self, errors, drift=None):
         self.errors, self.drift, self.tasks = errors, drift or {}, []
@@ -117,7 +117,7 @@ class Race:
 
 @pytest.fixture
 def halved(tune, monkeypatch):
-    """Return a function that races five settings, in one thread, and returns all trials."""
+    """Return a function that compares five settings in one thread and returns all trials."""
 
     def run(race):
         monkeypatch.setattr(tune, "error_of", race.error_of)
@@ -128,7 +128,7 @@ def halved(tune, monkeypatch):
     return run
 
 
-def test_the_best_go_on_and_the_best_of_them_is_first(halved):
+def test_the_best_settings_continue_and_the_best_is_first(halved):
     race = Race({"a": 0.5, "b": 0.2, "c": 0.4, "d": 0.1, "e": 0.3})
     trials = halved(race)
     assert [trial.settings["x"] for trial in trials] == ["d", "b", "e", "c", "a"]
@@ -136,12 +136,12 @@ def test_the_best_go_on_and_the_best_of_them_is_first(halved):
     assert_allclose([trial.score for trial in trials], 1.25 * np.array([0.1, 0.2, 0.3, 0.4, 0.5]))
 
 
-def test_the_last_round_decides_between_those_that_went_on(halved):
+def test_the_last_round_decides_between_the_remaining_settings(halved):
     race = Race({"a": 0.5, "b": 0.2, "c": 0.4, "d": 0.1, "e": 0.3}, drift={"d": 1.0})
     assert [trial.settings["x"] for trial in halved(race)][:2] == ["b", "d"]
 
 
-def test_all_settings_meet_the_same_cases_and_no_case_twice(halved):
+def test_all_settings_have_the_same_cases_and_no_case_twice(halved):
     race = Race({"a": 0.5, "b": 0.2, "c": 0.4, "d": 0.1, "e": 0.3})
     halved(race)
     assert len(race.tasks) == len(set(race.tasks)) == 200

@@ -52,7 +52,7 @@ def test_every_shipped_study_is_documented():
 
 def test_every_column_is_documented(quick, uninterrupted):
     documented = set(
-        re.findall(r"`([a-z_]+)`", DOCS.split("## What a study leaves")[1].split("## Interruption")[0])
+        re.findall(r"`([a-z_]+)`", DOCS.split("## Files of a study")[1].split("## Interruption")[0])
     )
     scenario = set(load_study(quick).points[0].scenario.flat())
     names = [set(pq.read_schema(uninterrupted / f"{table}.parquet").names) for table in ("runs", "timing")]
