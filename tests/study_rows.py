@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 from flexneedle.control.methods import DEFAULT, checked
 from flexneedle.scenario.files import load_scenario
 
-TARGETS = tuple((depth, aside) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for aside in (-5.0, 0.0, 5.0))
+TARGETS = tuple((depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0))
 OURS = DEFAULT
 CONTROLLERS = {  # median error in mm
     OURS: 0.06,
@@ -49,14 +49,14 @@ def one_row(index, case, controller, settings, target, own, repeat, factor, seed
     """Return one row; what is random depends on its seed and its controller, part of it on the seed alone."""
     shared = np.random.default_rng((seed, own))
     rng = np.random.default_rng((seed, own, *controller.encode()))
-    depth, aside = target
+    depth, lateral = target
     error = CONTROLLERS.get(controller, 0.1) * factor * np.exp(0.35 * shared.normal() + 0.3 * rng.normal())
     error *= 0.7 + 0.3 * (depth - 20.0) / 15.0
     angle = rng.uniform(0.0, 2 * np.pi)
-    planned = 0.4 + 0.03 * depth + 0.1 * abs(aside)
+    planned = 0.4 + 0.03 * depth + 0.1 * abs(lateral)
     energy = planned * np.exp(0.25 * rng.normal() + 0.15 * np.log1p(error))
     periods = round(depth + 28.5)
-    values = BASE | {"target.depth_mm": depth, "target.lateral_mm": aside} | settings
+    values = BASE | {"target.depth_mm": depth, "target.lateral_mm": lateral} | settings
     return {
         "index": index,
         "case": case,
@@ -65,15 +65,15 @@ def one_row(index, case, controller, settings, target, own, repeat, factor, seed
         "plant": "exact",
         "strategy": "manipulation",
         "target_depth_mm": depth,
-        "target_lateral_mm": aside,
+        "target_lateral_mm": lateral,
         "seed": own,
         "plan_seed": 0,
         "repeat": repeat,
-        "plan": f"plan-{depth:g}-{aside:g}",
+        "plan": f"plan-{depth:g}-{lateral:g}",
         "true_error_mm": float(error),
         "residual_mm": float(error * 0.8 + 0.03),
         "tip_x_mm": depth + float(0.3 * error * np.cos(angle)),
-        "tip_y_mm": aside + float(error * np.sin(angle)),
+        "tip_y_mm": lateral + float(error * np.sin(angle)),
         "flips": int(rng.integers(0, 4)),
         "planned_flips": int(shared.integers(0, 2)),
         "strain_energy_mj": float(energy),

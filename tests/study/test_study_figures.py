@@ -21,7 +21,9 @@ from flexneedle.study.figures.shares import share_figure
 from flexneedle.study.figures.sweeps import sweep_figure
 from flexneedle.study.figures.targeting import Tips, targeting_figure
 
-TARGETS = np.array([(depth, aside) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for aside in (-5.0, 0.0, 5.0)])
+TARGETS = np.array(
+    [(depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0)]
+)
 NAMES = ("adaptive-mpc", "open-loop", "bevel-only", "resolved-rate", "broyden-mpc", "ce-mpc", "another one")
 
 

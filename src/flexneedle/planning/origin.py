@@ -5,7 +5,7 @@ from flexneedle.scenario.dotted import split_key
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Plan
 
-SEEN_BY_THE_PLANNER = ("needle", "setup", "tissue", "contact", "target", "plan")
+PLANNER_INPUTS = ("needle", "setup", "tissue", "contact", "target", "plan")
 """Sections of a scenario that a plan depends on. It may be carried out with any other controller, tracker, monitor or
 phantom."""
 
@@ -20,7 +20,7 @@ def check_origin(plan: Plan, scenario: Scenario) -> None:
     if made is None:
         return
     own_target = plan.target == scenario.target.position
-    sections = [name for name in SEEN_BY_THE_PLANNER if not (own_target and name == "target")]
+    sections = [name for name in PLANNER_INPUTS if not (own_target and name == "target")]
     if (key := made.first_difference(scenario, sections)) is not None:
         was, now = (_shown(each, key) for each in (made, scenario))
         rule = "make a plan for this scenario, or use the scenario of the plan (plan.scenario)"

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
-from flexneedle.planning.origin import SEEN_BY_THE_PLANNER
+from flexneedle.planning.origin import PLANNER_INPUTS
 from flexneedle.study.grid import GridPoint
 from flexneedle.study.rows import PlanResult
 from flexneedle.trace.files import replace_file
@@ -26,7 +26,7 @@ def truth_key(point: GridPoint) -> str:
 
 def _digest(point: GridPoint, sections: tuple[str, ...], *settings: object) -> str:
     values = point.scenario.values()
-    inputs = [{name: values[name] for name in (*SEEN_BY_THE_PLANNER, *sections)}, *settings]
+    inputs = [{name: values[name] for name in (*PLANNER_INPUTS, *sections)}, *settings]
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:16]
 
 
