@@ -21,7 +21,7 @@ DEPTH_FRACTIONS = {"quarter": 0.25, "half": 0.5, "three_quarters": 0.75}
 """Fractions of the target depth at which the predicted miss is recorded, by name."""
 _OF_PERIODS = ("p50", "p99", "max")
 NO_TIMING = {"plan_seconds": None, "period_ms": dict.fromkeys(_OF_PERIODS)}
-"""Times of an insertion that was refused before it had a plan."""
+"""Times of an insertion that was refused before planning."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
 
 
 def refused_result(*, target: tuple[float, float], reason: str, seed: int, **parts: str) -> dict[str, Any]:
-    """Return the result of an insertion that was refused before it had a plan: the keys of `insertion_result`.
+    """Return the result of an insertion that was refused before planning: the keys of `insertion_result`.
 
     parts: names of controller and phantom; target in mm.
     """
