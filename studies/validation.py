@@ -326,21 +326,19 @@ def draw(found: problems.Found, folder: Path) -> list[Path]:
     for name, draw_one in (("needle", draw_needle), ("model", draw_model), ("insertion", draw_insertion)):
         with style.styled():
             figure = style.new_figure(3.3)
-            draw_one(figure, found)
+            draw_one(*figure.subplots(1, 2), found)
             paths += style.save(figure, folder, f"validation-{name}")
     return paths
 
 
-def logarithmic(figure: Any, left: float, title: str, x: str, y: str) -> Any:
-    """Return axes with logarithmic scales."""
-    ax = style.axes(figure, left, 0.3, 3.55, 2.45)
+def set_logarithmic(ax: Any, title: str, x: str, y: str) -> None:
+    """Set logarithmic scales, title and labels."""
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.yaxis.set_major_formatter(lambda value, _: "10" + f"{round(np.log10(value))}".translate(RAISED))
     ax.set_title(title)
     ax.set_xlabel(x)
     ax.set_ylabel(y)
-    return ax
 
 
 def guide_line(ax: Any, x: Sequence[float], start: float, slope: float, label: str) -> None:
@@ -358,10 +356,9 @@ def series(
     ax.plot(x, y, MARKS[k] + "-", color=COLOURS[k], markersize=3.5, linewidth=1.1, label=label)
 
 
-def draw_needle(figure: Any, found: problems.Found) -> None:
+def draw_needle(ax: Any, errors: Any, found: problems.Found) -> None:
     """Draw bent cantilevers and their errors."""
-    ax = style.axes(figure, 0.6, 0.3, 3.6, 2.45)
-    errors = logarithmic(figure, 5.2, "Tip error", "number of segments", "tip error / L")
+    set_logarithmic(errors, "Tip error", "number of segments", "tip error / L")
     for k, (load, nodes) in enumerate(found.shapes.items()):
         ax.plot(*nodes.T, color=COLOURS[k], label=f"PL²/EI = {load:g}")
         ax.plot(*elastica.cantilever(load)[:2], MARKS[k], color=style.INK, markersize=5, fillstyle="none")
@@ -378,10 +375,10 @@ def draw_needle(figure: Any, found: problems.Found) -> None:
     errors.legend(loc="lower left")
 
 
-def draw_model(figure: Any, found: problems.Found) -> None:
+def draw_model(one: Any, two: Any, found: problems.Found) -> None:
     """Draw the distance between the formulations over the slope, for one and two layers."""
-    for panel, (layers, title) in enumerate({1: "Exact plant and model, one layer", 2: "Two layers"}.items()):
-        ax = logarithmic(figure, 0.7 + 4.5 * panel, title, "largest slope of the tip (rad)", "")
+    for ax, layers, title in ((one, 1, "Exact plant and model, one layer"), (two, 2, "Two layers")):
+        set_logarithmic(ax, title, "largest slope of the tip (rad)", "")
         for k, (h, found_gaps) in enumerate(found.gaps[layers].items()):
             angle, aside = np.array([(gap.angle, gap.aside) for gap in found_gaps]).T
             series(ax, k, angle, aside, f"segments of {h:g} mm")
@@ -391,20 +388,20 @@ def draw_model(figure: Any, found: problems.Found) -> None:
         ax.set_ylim(1e-6, 1.0)
         ax.set_xticks([0.005, 0.01, 0.02, 0.05, 0.1], ["0.005", "0.01", "0.02", "0.05", "0.1"])
         ax.minorticks_off()
-    figure.axes[0].set_ylabel("largest distance between the tips (mm)")
-    figure.axes[0].legend(loc="upper left")
+    one.set_ylabel("largest distance between the tips (mm)")
+    one.legend(loc="upper left")
 
 
-def draw_insertion(figure: Any, found: problems.Found) -> None:
+def draw_insertion(ax: Any, other: Any, found: problems.Found) -> None:
     """Draw the refinement and the comparison with the second solver."""
-    ax = logarithmic(figure, 0.8, "Refinement", "size / default size", "tip error against the finest (mm)")
+    set_logarithmic(ax, "Refinement", "size / default size", "tip error against the finest (mm)")
     for k, (name, errors) in enumerate(found.refined.items()):
         shipped = problems.SHIPPED[name]
         series(ax, k, problems.SIZES[name][:-1] / shipped, errors, f"{name} (default: {shipped:g} mm)")
     first = found.refined["element"][0]
     guide_line(ax, (4.0, 0.25), 2.0 * first, 2.0, "second order")
     ax.set_xticks([0.25, 0.5, 1, 2, 4], ["¼", "½", "1", "2", "4"])
-    other = logarithmic(figure, 5.2, "Second solver", "segment length (mm)", "largest tip difference")
+    set_logarithmic(other, "Second solver", "segment length (mm)", "largest tip difference")
     for k, name in enumerate(("x (mm)", "y (mm)", "θ (rad)")):
         series(other, k, problems.ELEMENTS, found.second[:, k], name)
     guide_line(other, problems.ELEMENTS, 2.0 * found.second[0, 1], 2.0, "second order")
