@@ -38,7 +38,7 @@ MAKE = "make one with flexneedle.plan(scenario)"
         (lambda: flexneedle.insert("phantom", "x"), f"plan = 'x': must be a Plan; {MAKE}"),
         (
             lambda: flexneedle.run("phantom", PLAN, "arm", np.random.default_rng(0)),
-            "rig = 'arm': must be a Rig; Rig(clock, driver, tracker), of what flexneedle.rig.ports describes",
+            "rig = 'arm': must be a Rig; Rig(clock, driver, tracker), parts as in flexneedle.rig.ports",
         ),
     ],
 )
