@@ -294,7 +294,7 @@ def draw_figure(runs: Runs, folder: Path) -> None:
     speeds, holds = zip(*runs.holds(), strict=True)
     with style.styled():
         figure = style.new_figure(3.65)
-        times, errors, choice = (style.axes(figure, left, 0.35, 2.25, 2.2) for left in (0.55, 3.6, 6.6))
+        times, errors, choice = figure.subplots(1, 3)
         times.plot(speeds, [hold.after_begin for hold in holds], ".", color=style.ESTIMATE, ms=4)
         times.set(xscale="log", xlabel="speed of the plate (mm/s)", ylim=(0, None))
         times.set_title("Start of the plate to the hold (s)")
@@ -314,7 +314,7 @@ def draw_figure(runs: Runs, folder: Path) -> None:
             xlim=(0, None),
             ylim=(0, 1.02),
         )
-        errors.legend(loc="upper center", bbox_to_anchor=(0.45, -0.17))
+        errors.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2))
         false, anywhere, missed = curve(runs)
         choice.plot(THRESHOLDS, false, color=style.ESTIMATE, label="false holds")
         choice.plot(THRESHOLDS, anywhere, color=style.ESTIMATE, ls=":", label="false, references not placed")
@@ -322,7 +322,7 @@ def draw_figure(runs: Runs, folder: Path) -> None:
         choice.axvline(load_scenario("phantom").monitor.indicator_limit, color=style.QUIET, lw=0.8)
         choice.set(xscale="log", xlabel="limit of the indicator", title="Share of runs", ylim=(0, 1.02))
         plain_ticks(choice, [0.02, 0.05, 0.1, 0.2, 0.5, 1.0])
-        choice.legend(loc="upper center", bbox_to_anchor=(0.45, -0.17))
+        choice.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2))
         style.save(figure, folder, "monitor")
 
 

@@ -235,8 +235,7 @@ def draw_figure(study: Study, index: np.ndarray, error: np.ndarray, folder: Path
     )
     with style.styled():
         figure = style.new_figure(5.4)
-        places = [(left, top) for top in (0.35, 3.0) for left in (0.6, 3.6, 6.6)]
-        tail = style.axes(figure, *places[0], 2.2, 1.95)
+        tail, *others = figure.subplots(2, 3).flat
         for at, colour in zip(
             np.unique(depth), ("#0072B2", "#009E73", "#CC79A7", "#D55E00", "#222222"), strict=False
         ):
@@ -255,8 +254,7 @@ def draw_figure(study: Study, index: np.ndarray, error: np.ndarray, folder: Path
             axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axis.set_minor_formatter(NullFormatter())
         tail.legend(loc="lower left")
-        for place, (label, values) in zip(places[1:], panels, strict=True):
-            axes = style.axes(figure, *place, 2.2, 1.95)
+        for axes, (label, values) in zip(others, panels, strict=True):
             plot_quantiles(axes, np.array(values), error, label)
             axes.set_title("True error, mm")
         figure.axes[2].legend(loc="upper left")

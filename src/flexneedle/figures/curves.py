@@ -70,6 +70,11 @@ def lateral_error(plan: Plan, points: Floats) -> Floats:
     return np.asarray(points[:, 1] - planned)
 
 
+def planned_motion(plan: Plan, guided: bool) -> Floats:
+    """Return the lateral position (k,), mm, of the guide at each tip position, or of the base if there is no guide."""
+    return plan.guide if guided else np.cumsum([0.0, *plan.controls[:, 1]])
+
+
 def true_energy(insertion: Insertion) -> Floats:
     """Return depth of the true tip (mm) and energy of the true tissue (mJ) (k, 2), where they are known."""
     return _points(

@@ -1,16 +1,16 @@
-"""What the figures of studies share: one look for each controller, panels side by side, axes over decades."""
+"""What figures share: titles and legends, one look for each controller, panels side by side, axes over decades."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import ceil, floor, log10
-from textwrap import shorten
+from textwrap import fill, shorten
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, new_figure
@@ -29,6 +29,12 @@ _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#4
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 _LEGEND = 0.45  # inches
+_TITLE, _ROW, _HANDLE = (
+    88,
+    140,
+    7,
+)  # characters of a line of the title, of a row of the legend, of a mark in it
+_COLUMNS = (1.8, 1.0)  # widths of a mosaic's columns, relative to each other
 
 
 @dataclass(frozen=True)
@@ -104,12 +110,34 @@ def head(ax: Axes, panel: Panel[Any], columns: int) -> None:
     ax.annotate(panel.note, (0, 1), (0, 4), "axes fraction", "offset points", color=QUIET, fontsize=7.5)
 
 
-def legend(figure: Figure, handles: Sequence[Line2D], named: Sequence[Line2D] = ()) -> None:
-    """Name the marks in one row at the foot of the figure: of `handles` those whose label an artist has."""
+def mosaic(title: str, height: float, rows: Sequence[tuple[str, str]]) -> tuple[Figure, dict[str, Axes]]:
+    """Return a figure with its title and the axes named in `rows` of two columns; one in both is higher."""
+    figure = new_figure(height)
+    figure.set_layout_engine("constrained", h_pad=0.08, w_pad=0.08)
+    figure.suptitle(fill(title, _TITLE), x=0.01, ha="left", fontsize=11, weight="bold")
+    heights = [2.4 if left == right else 1.0 for left, right in rows]
+    return figure, figure.subplot_mosaic(
+        [list(row) for row in rows], height_ratios=heights, width_ratios=_COLUMNS
+    )
+
+
+def legend_of(figure: Figure, shown: Iterable[Axes]) -> None:
+    """Name at the foot of the figure all that is drawn in some of its axes, each label once."""
+    named: dict[str, Artist] = {}
+    for ax in shown:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            named.setdefault(label, handle)
+    legend(figure, list(named.values()))
+
+
+def legend(figure: Figure, handles: Sequence[Artist], named: Sequence[Artist] = ()) -> None:
+    """Name the marks at the foot of the figure: of `handles` those whose label an artist has."""
     drawn = {artist.get_label() for ax in figure.axes for artist in ax.get_children()}
     shown = [*named, *(handle for handle in handles if handle.get_label() in drawn)]
+    rows = ceil(sum(len(str(handle.get_label())) + _HANDLE for handle in shown) / _ROW)
+    columns = ceil(len(shown) / max(1, rows)) or 1
     figure.legend(
-        handles=shown, loc="outside lower center", ncols=len(shown) or 1, columnspacing=1.6, handlelength=1.8
+        handles=shown, loc="outside lower center", ncols=columns, columnspacing=1.6, handlelength=1.8
     )
 
 

@@ -1,17 +1,18 @@
 """Style and saving of all figures: the same bytes for the same data, whatever the user's settings."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from textwrap import wrap
 from typing import Any
 
 import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
-_CHARACTERS = 88  # of a line of a title
 WIDTH = 9.0  # inches; shown 900 pixels wide, a point is 1.4 pixels
 
 # Okabe and Ito's colours, which the colour-blind can distinguish, each with its own line style or marker.
@@ -56,36 +57,48 @@ def signed(value: float, form: str = "g") -> str:
     return f"{value:{form}}".replace("-", "−")
 
 
-def stacked(title: str, heights: Sequence[float]) -> tuple[Figure, list[SubFigure]]:
-    """Return a figure with a title and parts of these heights (inches) below one another."""
-    lines = wrap(title, _CHARACTERS)
-    figure = new_figure(sum(heights) + 0.1 + 0.2 * len(lines))
-    figure.suptitle("\n".join(lines), x=0.012, ha="left", fontsize=11, weight="bold")
-    return figure, list(figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0])
-
-
 @contextmanager
 def styled() -> Iterator[None]:
     """Use this module's style inside the block, not the user's matplotlibrc."""
-    with matplotlib.rc_context():
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph")  # a name in a script that the font lacks
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_SETTINGS)
         yield
 
 
 def new_figure(height: float) -> Figure:
-    """Return an empty figure of this height (inches), whose layout makes room for every text."""
+    """Return an empty figure of this height (inches), which arranges its parts itself."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def axes(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
+    """Add axes to a figure, placed in inches from its top left corner."""
+    total = float(figure.get_figheight())
+    added: Axes = figure.add_axes(
+        (left / WIDTH, (total - top - height) / total, width / WIDTH, height / total)
+    )
+    return added
+
+
+def settle(figure: Figure) -> None:
+    """Arrange the parts of a figure and keep them there, rounded: the solver's last digits differ between runs."""
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for part in figure.subfigs:
+        part.bbox_relative.p0, part.bbox_relative.p1 = np.round(part.bbox_relative.get_points(), 6)
+    for ax in figure.axes:
+        ax.set_position(Bbox(np.round(ax.get_position(original=True).get_points(), 6)))
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Write `name`.png and `name`.svg into the folder, without date or version; return the paths."""
     paths = [folder / f"{name}.png", folder / f"{name}.svg"]
     plain: tuple[dict[str, Any], ...] = ({"Software": None}, {"Date": None, "Creator": "flexneedle"})
-    with styled(), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph")  # a name in a script that the font lacks
+    with styled():
+        settle(figure)
         for path, metadata in zip(paths, plain, strict=True):
             draft = path.with_name(f".{path.name}")
             figure.savefig(draft, format=path.suffix[1:], dpi=200, metadata=metadata)
