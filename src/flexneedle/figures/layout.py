@@ -29,11 +29,7 @@ _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#4
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 _LEGEND = 0.45  # inches
-_TITLE, _ROW, _HANDLE = (
-    88,
-    140,
-    7,
-)  # characters of a line of the title, of a row of the legend, of a mark in it
+_TITLE, _ROW, _HANDLE = 88, 140, 7  # characters: of a line of the title, a row of the legend, a mark in it
 _COLUMNS = (1.8, 1.0)  # widths of a mosaic's columns, relative to each other
 
 
