@@ -35,7 +35,6 @@ def distance_figure(lines: Sequence[DistanceLine]) -> Figure:
     rows = sum(label.count("\n") + 2 for label in labels) + 2 * len(limits)
     with styled():
         figure = new_figure(max(_HIGH, _ROW * rows))
-        figure.set_layout_engine("constrained")
         ax = figure.subplots()
         for number, (line, label) in enumerate(zip(lines, labels, strict=True)):
             own = look(number)

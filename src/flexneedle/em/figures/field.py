@@ -44,7 +44,6 @@ def field_figure(rows: Sequence[FieldRow]) -> Figure:
     down = ceil(len(shown) / across)
     with styled():
         figure = new_figure(down * (_AROUND + min((WIDTH / across - 1.6) / columns, _WIDEST)))
-        figure.set_layout_engine("constrained")
         parts = figure.subfigures(down, across, squeeze=False).ravel()
         for part, row, slices in zip(parts, shown, layers, strict=False):
             _draw_row(part, row, slices)

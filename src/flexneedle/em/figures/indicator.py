@@ -48,7 +48,6 @@ def indicator_figure(panels: Sequence[IndicatorPanel], more: int = 0) -> Figure:
     """Return the figure with a panel for each sensor, side by side; more: number of sensors not shown."""
     with styled():
         figure = new_figure(_HIGH)
-        figure.set_layout_engine("constrained")
         for ax, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
             _draw(ax, panel)
         figure.axes[0].set_ylabel("error of the mean position (mm)")
@@ -69,8 +68,8 @@ def _draw(ax: Axes, panel: IndicatorPanel) -> None:
     if panel.line and panel.noisy and np.isfinite(panel.line[0]):
         _draw_line(ax, *panel.line, panel.noisy.indicator, widest)
     if panel.threshold is not None:
-        _draw_threshold(ax, panel.threshold)
-    ax.set_title(panel.sensor, pad=16.0)
+        handles.append(_draw_threshold(ax, panel.threshold))
+    ax.set_title(panel.sensor)
     ax.set_xlabel("mean indicator I at a grid point")
     legend = ax.legend(handles=handles, loc="upper left", borderaxespad=0.2, frameon=True, framealpha=0.92)
     legend.get_frame().set(edgecolor="none", facecolor="white")
@@ -121,7 +120,6 @@ def _draw_line(ax: Axes, slope: float, intercept: float, indicator: Floats, wide
     ax.plot(ends, slope * ends + intercept, color=INK, linewidth=1.6, linestyle=(0, (5, 1.5)), zorder=4)
 
 
-def _draw_threshold(ax: Axes, threshold: float) -> None:
-    ax.axvline(threshold, color=TARGET, linewidth=1.2, linestyle=(0, (2, 1.5)), zorder=2)
-    label: dict[str, Any] = {"color": TARGET, "fontsize": 8, "va": "bottom", "ha": "left"}
-    ax.text(threshold, 1.005, f" threshold {threshold:.4f}", transform=ax.get_xaxis_transform(), **label)
+def _draw_threshold(ax: Axes, threshold: float) -> Line2D:
+    dashed: dict[str, Any] = {"color": TARGET, "linewidth": 1.2, "linestyle": (0, (2, 1.5))}
+    return ax.axvline(threshold, zorder=2, label=f"threshold {threshold:.4f}", **dashed)

@@ -27,7 +27,6 @@ def registration_figure(
     """
     with styled():
         figure = new_figure(_HEIGHT)
-        figure.set_layout_engine("constrained")
         low, high = _extent(np.vstack([stage, targets]))
         longest = float(np.linalg.norm(mapped - stage, axis=1).max())
         scale = _round(_ARROW * float((high - low).max()) / longest) if longest > 0.0 else 1.0

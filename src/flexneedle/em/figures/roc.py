@@ -42,12 +42,11 @@ def roc_figure(lines: Sequence[RocLine]) -> Figure:
     rows = max(sum(line.note.count("\n") + 1 for line in lines), 2 * len(lines))
     with styled():
         figure = new_figure(_HIGH + _ROW * rows)
-        figure.set_layout_engine("constrained")
-        for part, draw in zip(
-            figure.subfigures(1, 2, squeeze=False)[0], (_draw_roc, _draw_shares), strict=True
-        ):
-            draw(part.subplots(), lines)
-            part.legend(loc="outside lower left", fontsize=7.5)
+        left, right = figure.subplots(1, 2)
+        _draw_roc(left, lines)
+        _draw_shares(right, lines)
+        for ax, side in ((left, "left"), (right, "right")):
+            figure.legend(*ax.get_legend_handles_labels(), loc=f"outside lower {side}", fontsize=7.5)
     return figure
 
 
