@@ -156,6 +156,7 @@ FIGURES = {
     "sweep, three": lambda: sweep_figure(sweeps(3), "mismatch", PLACES),
     "sweep, all": lambda: sweep_figure(sweeps(7, missing=2), "mismatch", PLACES),
     "sweep, close": lambda: sweep_figure(sweeps(1, CLOSE, 40), "mismatch", np.linspace(0, 1, 20)),
+    "sweep, close, all": lambda: sweep_figure(sweeps(7, CLOSE), "mismatch", np.linspace(0, 1, 20)),
     "energy, one": lambda: energy_figure(energy_panels(1)),
     "energy, all": lambda: energy_figure(energy_panels(7)),
     "shares, one": lambda: share_figure(share_panels(1)),

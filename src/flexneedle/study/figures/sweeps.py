@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -9,21 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flexneedle.figures.layout import (
-    FAINT,
-    OVERLAID,
-    Floats,
-    Panel,
-    columns_of,
-    decades,
-    legend,
-    panels,
-    short,
-)
-from flexneedle.figures.style import BAD, INK, WIDTH, styled
+from flexneedle.figures.layout import FAINT, OVERLAID, Floats, Panel, decades, legend, panels, short
+from flexneedle.figures.style import BAD, INK, styled
 from flexneedle.study.figures.samples import Sample
 
 _FIRST, _THIRD = partial(np.quantile, q=0.25), partial(np.quantile, q=0.75)
+_GAP = 6.0  # pixels between names of levels
 _WIDE = 20.0  # ratio of the largest to the smallest median or mean above which the scale is logarithmic
 Sweep = Panel[Sequence[Sample]]
 """A controller with the samples at the m levels."""
@@ -42,10 +34,13 @@ def sweep_figure(sweeps: Sequence[Sweep], label: str, places: Floats) -> Figure:
             for sweep in sweeps if overlaid else sweeps[k : k + 1]:
                 _draw(ax, sweep, places)
             _scale(ax, sweeps)
-            _name_levels(ax, places, [row.name for row in sweeps[0].content], columns_of(len(axes)))
+            _name_levels(ax, places, [row.name for row in sweeps[0].content])
         if overlaid:
             _count_unfinished(axes[0], sweeps, places)
         legend(figure, _handles(), [_named(sweep) for sweep in sweeps] if overlaid else ())
+        figure.draw_without_rendering()
+        for ax in axes:
+            _thin_names(ax)
     return figure
 
 
@@ -78,17 +73,20 @@ def _scale(ax: Axes, sweeps: Sequence[Sweep]) -> None:
     ax.set_axisbelow(True)
 
 
-def _name_levels(ax: Axes, places: Floats, names: Sequence[str], columns: int) -> None:
-    """Set a tick at each level with room for its name."""
+def _name_levels(ax: Axes, places: Floats, names: Sequence[str]) -> None:
+    """Set a tick with its name at each level."""
     span = float(places.max() - places.min()) or 1.0
     ax.set_xlim(places.min() - 0.05 * span, places.max() + 0.05 * span)
-    inches = (WIDTH / columns - 0.6) / (1.1 * span)
-    kept: list[int] = []
-    for k, place in enumerate(places.tolist()):
-        room = 0.07 * (len(names[k]) + len(names[kept[-1]])) / 2 + 0.08 if kept else 0.0
-        if not kept or (place - float(places[kept[-1]])) * inches > room:
-            kept.append(k)
-    ax.set_xticks([float(places[k]) for k in kept], [names[k] for k in kept])
+    ax.set_xticks(places, names)
+
+
+def _thin_names(ax: Axes) -> None:
+    """Hide each name of a level that would touch the one before. The layout of the figure must be final."""
+    end = -inf
+    for name in ax.get_xticklabels():
+        box = name.get_window_extent()
+        name.set_visible(box.x0 > end)
+        end = box.x1 + _GAP if name.get_visible() else end
 
 
 def _count_unfinished(ax: Axes, sweeps: Sequence[Sweep], places: Floats) -> None:
