@@ -45,8 +45,8 @@ def roc_figure(lines: Sequence[RocLine]) -> Figure:
         left, right = figure.subplots(1, 2)
         _draw_roc(left, lines)
         _draw_shares(right, lines)
-        for ax, side in ((left, "left"), (right, "right")):
-            figure.legend(*ax.get_legend_handles_labels(), loc=f"outside lower {side}", fontsize=7.5)
+        figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", fontsize=7.5)
+        figure.legend(*right.get_legend_handles_labels(), loc="outside lower right", fontsize=7.5)
     return figure
 
 
