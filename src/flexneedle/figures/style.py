@@ -8,7 +8,6 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
@@ -72,15 +71,6 @@ def new_figure(height: float) -> Figure:
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
-
-
-def axes(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
-    """Add axes to a figure, placed in inches from its top left corner."""
-    total = float(figure.get_figheight())
-    added: Axes = figure.add_axes(
-        (left / WIDTH, (total - top - height) / total, width / WIDTH, height / total)
-    )
-    return added
 
 
 def settle(figure: Figure) -> None:
