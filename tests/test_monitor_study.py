@@ -121,6 +121,14 @@ def test_runs_with_different_periods_are_compared_at_the_same_time(study):
     assert runs.clean_estimate_errors() == [pytest.approx(0.3)]
 
 
+def test_the_deviation_from_a_path_is_lateral_and_at_the_same_depth(study):
+    """Half as fast on the same path is no deviation, 0.3 mm beside it is 0.3 mm."""
+    fast, slow = record(study, [0.0] * 10), record(study, [0.0] * 10, step=0.4)
+    beside = record(study, [0.0] * 10, [[k, 0.3] for k in range(10)], step=0.4)
+    assert study.path_deviation(fast, slow, 1.0) == pytest.approx(0.0, abs=1e-12)
+    assert study.path_deviation(fast, beside, 1.0) == pytest.approx(0.3)
+
+
 def test_without_a_clean_run_the_deviation_is_unknown(study):
     kept, drawn = (
         record(study, [0.0] * 10, held=(7,)),
