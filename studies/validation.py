@@ -114,7 +114,7 @@ def summary(found: problems.Found) -> str:
         (
             "difference from the controller's model: order in the slope",
             "3",
-            power([gap.angle for gap in last], [gap.aside for gap in last]),
+            power([gap.angle for gap in last], [gap.lateral for gap in last]),
         ),
         ("steady bevel curvature: relative error", "0", small(worst)),
         ("work over stored energy without cutting, minus 1", "0", small(moved)),
@@ -167,15 +167,15 @@ def model(found: problems.Found) -> list[str]:
     rows = [
         (
             f"{fine.angle:.4f}",
-            *(small(one[h][k].aside) for h in problems.MESHES),
+            *(small(one[h][k].lateral) for h in problems.MESHES),
             small(fine.energy),
             f"{two[k].angle:.4f}",
-            small(two[k].aside),
+            small(two[k].lateral),
         )
         for k, fine in enumerate(one[0.125])
     ]
     last = one[0.125][problems.CUBIC]
-    slope = power([gap.angle for gap in last], [gap.aside for gap in last])
+    slope = power([gap.angle for gap in last], [gap.lateral for gap in last])
     meshes = [f"distance (mm), segments of {h:g} mm" for h in problems.MESHES]
     return [
         "## The controller's model at small angles",
@@ -380,10 +380,10 @@ def draw_model(one: Any, two: Any, found: problems.Found) -> None:
     for ax, layers, title in ((one, 1, "Exact plant and model, one layer"), (two, 2, "Two layers")):
         set_logarithmic(ax, title, "largest slope of the tip (rad)", "")
         for k, (h, found_gaps) in enumerate(found.gaps[layers].items()):
-            angle, aside = np.array([(gap.angle, gap.aside) for gap in found_gaps]).T
-            series(ax, k, angle, aside, f"segments of {h:g} mm")
+            angle, lateral = np.array([(gap.angle, gap.lateral) for gap in found_gaps]).T
+            series(ax, k, angle, lateral, f"segments of {h:g} mm")
         middle = len(problems.SCALES) // 2
-        start = aside[middle] * (angle[0] / angle[middle]) ** 3
+        start = lateral[middle] * (angle[0] / angle[middle]) ** 3
         guide_line(ax, angle, start, 3.0, "third power")
         ax.set_ylim(1e-6, 1.0)
         ax.set_xticks([0.005, 0.01, 0.02, 0.05, 0.1], ["0.005", "0.01", "0.02", "0.05", "0.1"])

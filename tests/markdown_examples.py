@@ -105,7 +105,7 @@ def _shell(block: Block, folder: Path) -> str:
 def same(shown: str, real: str) -> str:
     """Return "" if a page shows what an example prints, else the first line that differs.
 
-    `…` in a line stands for any text, a line of it alone for any lines. Numbers may differ by 1 % or by 0.002, for
+    `…` in a line matches any text, a line of it alone for any lines. Numbers may differ by 1 % or by 0.002, for
     the last digits differ between processors.
     """
     wanted, got = (text.rstrip("\n").splitlines() for text in (shown, real))

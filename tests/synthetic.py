@@ -55,7 +55,7 @@ def make_plan(strategy="manipulation", target=(40.0, 5.0), seed=0):
 
 
 def make_periods(plan, miss=0.06, seed=0):
-    """Yield a period for each step of the plan; the true tip ends `miss` mm further aside than the target."""
+    """Yield a period for each step of the plan; the true tip ends `miss` mm beyond the target, laterally."""
     rng = np.random.default_rng(seed)
     side = plan.bevel
     for k, (before, tip) in enumerate(pairwise(plan.tips)):

@@ -29,13 +29,13 @@ def with_readings(period, indicator=lambda _: 0.03, verdict="ok"):
         frame_of(number, time, {"ref1": 0.01, "ref2": indicator(time), "ref3": 0.02})
         for number, time in zip(numbers, times, strict=True)
     ]
-    told = tuple(
+    readings = tuple(
         CheckedMeasurement(
             Measurement(frame.time, period.sample.x, period.sample.y, 0.0, frame), verdict_of(verdict)
         )
         for frame in frames
     )
-    return replace(period, readings=told)
+    return replace(period, readings=readings)
 
 
 def held(period, reason="field distorted: ref2 0.0812, limit 0.0547 (median over 1 s)"):

@@ -1,4 +1,4 @@
-"""The constants of a needle whose tissue, bevel and bend an observer has learnt."""
+"""The constants of a needle whose tissue, bevel and bend an observer has estimated."""
 
 import numpy as np
 import pytest
@@ -32,54 +32,56 @@ ONES = np.ones(3)
 CELLS = np.array([1.5, 0.7, 1.2, 0.4, 2.0, 0.9])
 
 
-def learnt(shift=(0.0, 0.0), stiffness=(1.0, 1.0, 1.0), cell=1.0, variation=(1.0,), **others):
+def adaptation(shift=(0.0, 0.0), stiffness=(1.0, 1.0, 1.0), cell=1.0, variation=(1.0,), **others):
     return Adaptation(np.array(shift), np.array(stiffness), cell, np.array(variation), **others)
 
 
-def modulus_width(x, believed):
+def modulus_width(x, estimate):
     """Modulus times width at a depth, layer by layer and cell by cell; a boundary pushes those below before it."""
     boundary, layer = 0.0, 0
     for k in range(2):
-        boundary = max(boundary, sum(THICKNESS[: k + 1]) + believed.shift[k])
+        boundary = max(boundary, sum(THICKNESS[: k + 1]) + estimate.shift[k])
         layer = k + 1 if x >= boundary else layer
-    cell = min(int(x // believed.cell), len(believed.variation) - 1)
-    return MU[layer] * WIDTH[layer] * believed.stiffness[layer] * believed.variation[cell]
+    cell = min(int(x // estimate.cell), len(estimate.variation) - 1)
+    return MU[layer] * WIDTH[layer] * estimate.stiffness[layer] * estimate.variation[cell]
 
 
-def along(top, bottom, believed, parts=4000):
+def along(top, bottom, estimate, parts=4000):
     """Its integral over an interval by the rule of the middle, to 1e-3 of the interval's value or so."""
     width = (bottom - top) / parts
-    return sum(modulus_width(top + (k + 0.5) * width, believed) for k in range(parts)) * width
+    return sum(modulus_width(top + (k + 0.5) * width, estimate) for k in range(parts)) * width
 
 
-BELIEFS = {
-    "boundary moved within an interval": learnt(shift=(0.3, 0.0)),
-    "both boundaries": learnt(shift=(-1.4, 2.2), stiffness=(1.0, 1.3, 0.6)),
-    "a boundary past the skin": learnt(shift=(-7.0, 0.6), stiffness=(5.0, 1.3, 0.6)),
-    "both past the skin": learnt(shift=(-7.0, -20.0), stiffness=(5.0, 7.0, 0.6)),
-    "a boundary past the next": learnt(shift=(5.25, 0.0), stiffness=(0.8, 9.0, 0.6)),
-    "cells that divide intervals": learnt(cell=2.4, variation=CELLS),
-    "cells and boundaries": learnt(shift=(0.6, -0.85), stiffness=(2.0, 0.5, 1.5), cell=2.5, variation=CELLS),
-    "cells shorter than an interval": learnt(shift=(0.45, 0.0), cell=0.3, variation=np.tile(CELLS, 8)),
+ESTIMATES = {
+    "boundary moved within an interval": adaptation(shift=(0.3, 0.0)),
+    "both boundaries": adaptation(shift=(-1.4, 2.2), stiffness=(1.0, 1.3, 0.6)),
+    "a boundary past the skin": adaptation(shift=(-7.0, 0.6), stiffness=(5.0, 1.3, 0.6)),
+    "both past the skin": adaptation(shift=(-7.0, -20.0), stiffness=(5.0, 7.0, 0.6)),
+    "a boundary past the next": adaptation(shift=(5.25, 0.0), stiffness=(0.8, 9.0, 0.6)),
+    "cells that divide intervals": adaptation(cell=2.4, variation=CELLS),
+    "cells and boundaries": adaptation(
+        shift=(0.6, -0.85), stiffness=(2.0, 0.5, 1.5), cell=2.5, variation=CELLS
+    ),
+    "cells shorter than an interval": adaptation(shift=(0.45, 0.0), cell=0.3, variation=np.tile(CELLS, 8)),
 }
 
 
-@pytest.mark.parametrize("believed", BELIEFS.values(), ids=BELIEFS)
-def test_a_contact_has_the_tissue_along_its_interval(believed):
+@pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)
+def test_a_contact_has_the_tissue_along_its_interval(estimate):
     """Force scale ∫2μw/α dx, energy scale ∫2μwh/α² dx, whatever divides the interval."""
-    nodes = adapted(MODEL, believed).nodes
+    nodes = adapted(MODEL, estimate).nodes
     for i in np.flatnonzero(CONTACTS):
         top, bottom = NODES.x[i] - NODES.reach[i], NODES.x[i] + NODES.reach[i]
-        expected = along(top, bottom, believed, 1000)
+        expected = along(top, bottom, estimate, 1000)
         assert nodes.force[i] == pytest.approx(2.0 / ALPHA * expected, rel=4e-3)
         assert nodes.energy[i] == pytest.approx(2.0 * HEIGHT / ALPHA**2 * expected, rel=4e-3)
 
 
-@pytest.mark.parametrize("believed", BELIEFS.values(), ids=BELIEFS)
-def test_all_contacts_together_have_all_of_the_tissue(believed):
+@pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)
+def test_all_contacts_together_have_all_of_the_tissue(estimate):
     end = NODES.x[-1] + NODES.reach[-1]
-    expected = 2.0 / ALPHA * along(0.0, end, believed, 38_000)
-    assert adapted(MODEL, believed).nodes.force[CONTACTS].sum() == pytest.approx(expected, rel=2e-4)
+    expected = 2.0 / ALPHA * along(0.0, end, estimate, 38_000)
+    assert adapted(MODEL, estimate).nodes.force[CONTACTS].sum() == pytest.approx(expected, rel=2e-4)
 
 
 def tip_spring(model, depth, u=0.7):
@@ -89,20 +91,20 @@ def tip_spring(model, depth, u=0.7):
     return nd._spring_law(model, s, depth, u)
 
 
-@pytest.mark.parametrize("believed", BELIEFS.values(), ids=BELIEFS)
-def test_the_tip_spring_is_that_of_the_tissue_along_the_bevel(believed):
+@pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)
+def test_the_tip_spring_is_that_of_the_tissue_along_the_bevel(estimate):
     """Its force is linear in ∫μw dx over the bevel's length, in which any number of boundaries may lie."""
-    model = adapted(MODEL, believed)
+    model = adapted(MODEL, estimate)
     one = tip_spring(Model(4000.0, 150.0, 4.0, 3.0, NODES, tissue((30.0, 1.0, np.inf)), 0.25, 3.0), 10.0)
     per_tissue = np.array(one[:3]) / (3.0 * MU[0] * WIDTH[0])
     for depth in (0.4, 2.0, 5.7, 6.2, 7.9, 10.1, 14.0):
-        expected = per_tissue * along(max(0.0, depth - 3.0), depth, believed)
+        expected = per_tissue * along(max(0.0, depth - 3.0), depth, estimate)
         np.testing.assert_allclose(tip_spring(model, depth)[:3], expected, rtol=3e-3)
 
 
-@pytest.mark.parametrize("believed", BELIEFS.values(), ids=BELIEFS)
-def test_no_layer_begins_above_the_skin_or_ends_before_it_begins(believed):
-    end = adapted(MODEL, believed).layers.end
+@pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)
+def test_no_layer_begins_above_the_skin_or_ends_before_it_begins(estimate):
+    end = adapted(MODEL, estimate).layers.end
     assert end[0] >= 0.0
     assert (end[1:] >= end[:-1]).all()
     assert end[-1] == np.inf
@@ -114,7 +116,7 @@ def test_no_shift_and_factors_of_one_are_the_model(cell):
     layers = tissue(alpha=(8.0, -3.0, 5.0), height=(20.0, 10.0, 15.0))
     nodes = contact_nodes(layers, np.array([1.0, 0.5, 0.7]), 1.0, 18.0, -41.0)
     model = MODEL._replace(nodes=nodes, layers=layers)
-    same = adapted(model, learnt(cell=cell, variation=np.ones(9)))
+    same = adapted(model, adaptation(cell=cell, variation=np.ones(9)))
     for name in nodes._fields:
         np.testing.assert_allclose(
             getattr(same.nodes, name), getattr(nodes, name), rtol=1e-12, atol=1e-18, err_msg=name
@@ -126,7 +128,7 @@ def test_no_shift_and_factors_of_one_are_the_model(cell):
 
 def test_modulus_factors_are_those_of_the_points_layers():
     factors = np.array([2.0, 0.5, 3.0])
-    changed = adapted(MODEL, learnt(stiffness=factors))
+    changed = adapted(MODEL, adaptation(stiffness=factors))
     factor = factors[np.searchsorted([6.0, 9.5], NODES.x)]
     np.testing.assert_allclose(changed.nodes.force, factor * NODES.force, rtol=1e-12)
     np.testing.assert_allclose(changed.nodes.energy, factor * NODES.energy, rtol=1e-12)
@@ -136,7 +138,7 @@ def test_modulus_factors_are_those_of_the_points_layers():
 
 
 def test_the_last_cell_goes_on():
-    changed = adapted(MODEL, learnt(cell=2.0, variation=(1.0, 0.25)))
+    changed = adapted(MODEL, adaptation(cell=2.0, variation=(1.0, 0.25)))
     deep = CONTACTS & (NODES.x > 2.0)
     np.testing.assert_allclose(changed.nodes.force[deep], 0.25 * NODES.force[deep], rtol=1e-12)
     assert changed.layers.end[-1] == np.inf
@@ -146,7 +148,7 @@ def test_the_last_cell_goes_on():
 def test_the_law_of_a_contact_is_that_of_the_layer_at_its_middle():
     layers = tissue(alpha=(8.0, 6.0, 5.0), height=(20.0, 10.0, 15.0))
     nodes = contact_nodes(layers, ONES, 1.0, 18.0, None)
-    changed = adapted(MODEL._replace(nodes=nodes, layers=layers), learnt(shift=(1.7, -1.0))).nodes
+    changed = adapted(MODEL._replace(nodes=nodes, layers=layers), adaptation(shift=(1.7, -1.0))).nodes
     layer = np.searchsorted([7.7, 8.5], changed.x, side="right")
     np.testing.assert_array_equal(changed.alpha, np.array([8.0, 6.0, 5.0])[layer])
     np.testing.assert_array_equal(changed.height, np.array([20.0, 10.0, 15.0])[layer])
@@ -155,14 +157,14 @@ def test_the_law_of_a_contact_is_that_of_the_layer_at_its_middle():
 def test_the_guide_is_no_tissue():
     guide = NODES.kind == GUIDE
     assert guide.sum() == 1
-    changed = adapted(MODEL, learnt(shift=(-7.0, 0.0), stiffness=np.full(3, 9.0))).nodes
+    changed = adapted(MODEL, adaptation(shift=(-7.0, 0.0), stiffness=np.full(3, 9.0))).nodes
     for name in NODES._fields:
         np.testing.assert_array_equal(getattr(changed, name)[guide], getattr(NODES, name)[guide])
 
 
 def test_bevel_offset_is_multiplied_and_the_bend_becomes_a_curvature():
     """A free needle of curvature κ = 2w/L² is w off the straight at its tip."""
-    changed = adapted(MODEL, learnt(bevel=1.5, bend=0.45))
+    changed = adapted(MODEL, adaptation(bevel=1.5, bend=0.45))
     assert changed.bevel_offset == 6.0
     assert changed.curvature == pytest.approx(2.0 * 0.45 / 150.0**2, rel=1e-15)
     assert MODEL.curvature == 0.0
@@ -170,12 +172,12 @@ def test_bevel_offset_is_multiplied_and_the_bend_becomes_a_curvature():
 
 def test_nothing_else_changes_and_the_old_constants_stay():
     before = [array.copy() for array in (*NODES, *LAYERS)]
-    believed = learnt((1.0, 1.0), (3.0, 0.1, 1.0), 2.0, CELLS, bevel=0.2, bend=-1.0)
-    known = [array.copy() for array in (believed.shift, believed.stiffness, believed.variation)]
-    changed = adapted(MODEL, believed)
+    estimate = adaptation((1.0, 1.0), (3.0, 0.1, 1.0), 2.0, CELLS, bevel=0.2, bend=-1.0)
+    known = [array.copy() for array in (estimate.shift, estimate.stiffness, estimate.variation)]
+    changed = adapted(MODEL, estimate)
     for kept, now in zip(before, (*NODES, *LAYERS), strict=True):
         np.testing.assert_array_equal(kept, now)
-    for kept, now in zip(known, (believed.shift, believed.stiffness, believed.variation), strict=True):
+    for kept, now in zip(known, (estimate.shift, estimate.stiffness, estimate.variation), strict=True):
         np.testing.assert_array_equal(kept, now)
     for name in ("x", "kind", "reach", "weight"):
         np.testing.assert_array_equal(getattr(changed.nodes, name), getattr(NODES, name))
@@ -200,7 +202,7 @@ def test_a_contact_between_unlike_layers_has_the_stiffness_of_both(unlike):
     """3αF/2h is ∫3μw/h dx in the interval that a displaced boundary divides."""
     layers = tissue(**unlike)
     nodes = contact_nodes(layers, ONES, 1.0, 18.0, None)
-    changed = adapted(MODEL._replace(nodes=nodes, layers=layers), learnt(shift=(0.4, 0.0))).nodes
+    changed = adapted(MODEL._replace(nodes=nodes, layers=layers), adaptation(shift=(0.4, 0.0))).nodes
     i = int(np.flatnonzero(np.isclose(changed.x, 6.5))[0])
     height = unlike.get("height", (HEIGHT,) * 3)
     expected = 3.0 * (0.4 * MU[0] * WIDTH[0] / height[0] + 0.6 * MU[1] * WIDTH[1] / height[1])

@@ -54,7 +54,7 @@ def test_stiffness_of_a_layer_is_exact_at_any_spacing(spacing, thickness):
 
 
 def test_guide_and_measured_points_are_essential_nodes_in_order():
-    """The guide stands before the skin, a measured point among the contacts."""
+    """The guide is before the skin, a measured point among the contacts."""
     grid = insert_essential(nodes(1.0, 3.0, 2.0, guide_x=-41.0), np.array([-5.0, 1.7]))
     assert np.all(np.diff(grid.x) > 0)
     np.testing.assert_array_equal(grid.x[grid.kind != CONTACT], [-41.0, -5.0, 1.7])

@@ -20,7 +20,7 @@ def law(u, alpha=ALPHA, height=HEIGHT, volume=WIDTH * HEIGHT, mu=MU):
 
 
 def energy_written_out(u):
-    """Equation 1 as it stands, above the floor."""
+    """Equation 1 unchanged, above the floor."""
     stretch = 1 - abs(u) / HEIGHT
     volume = WIDTH * HEIGHT
     return volume * 2 * MU / ALPHA**2 * (2 * stretch ** (-ALPHA / 2) + stretch**ALPHA - 3)

@@ -108,7 +108,7 @@ class Gap:
     """How far exact plant and controller's model are apart over an insertion."""
 
     angle: float  # largest of the needle's tip, rad
-    aside: float  # largest distance of the tips, mm
+    lateral: float  # largest distance of the tips, mm
     end: float  # the same at the end
     energy: float  # at the end, relative
 
@@ -189,7 +189,7 @@ def wander(steps: int = 48):
 
 
 def push(parts: int):
-    """14 mm ahead under a guide that moves aside, each step in so many."""
+    """14 mm ahead under a guide that moves laterally, each step in so many."""
     for k in range(30 * parts):
         yield {"db_x": _STEP_MM / parts, "dg_y": 0.12 / parts * np.cos(k / parts / 10.0)}
 

@@ -72,7 +72,7 @@ class Model(NamedTuple):
 def tissue_layers(
     thickness: Floats, shear_modulus: Floats, alpha: Floats, height: Floats, width: Floats
 ) -> Layers:
-    """Layers from arrays (k,) in mm and MPa; the last one goes on, so its thickness is ignored."""
+    """Layers from arrays (k,) in mm and MPa; the last one has no end, so its thickness is ignored."""
     end = np.append(np.cumsum(thickness[:-1]), np.inf)
     force, energy = law_scales(shear_modulus, alpha, height, width * height)
     return Layers(end, alpha, height, force, energy)
@@ -116,11 +116,11 @@ def insert_essential(nodes: Nodes, x: Floats, kind: int = ESSENTIAL) -> Nodes:
 
 
 class Adaptation(NamedTuple):
-    """What an observer has learnt about a model's constants.
+    """What an observer has estimated of a model's constants.
 
     shift (k − 1,): of the ends of all layers but the last (mm); stiffness (k,): factor on the modulus of each layer;
     cell: length (mm) of cells along the depth from the skin; variation (c,): further factor on the modulus in each,
-    the last one goes on; bevel: factor on the bevel offset; bend: distance (mm) of the free needle's tip from the
+    the last one has no end; bevel: factor on the bevel offset; bend: distance (mm) of the free needle's tip from the
     straight, for bevel +1, with which it turns; clearance: of the needle in the guide, to either side (mm).
     """
 
@@ -133,18 +133,18 @@ class Adaptation(NamedTuple):
     clearance: float = 0.0
 
 
-def adapted(model: Model, learnt: Adaptation) -> Model:
+def adapted(model: Model, adaptation: Adaptation) -> Model:
     """The model with other constants, its contact points where they were.
 
     A contact is as stiff as the tissue along its interval; its law is that of the layer at its middle.
     """
     old, nodes = model.layers, model.nodes
-    ends = np.maximum.accumulate(np.maximum(0.0, old.end[:-1] + learnt.shift))
-    cells = learnt.cell * np.arange(1, learnt.variation.size)
+    ends = np.maximum.accumulate(np.maximum(0.0, old.end[:-1] + adaptation.shift))
+    cells = adaptation.cell * np.arange(1, adaptation.variation.size)
     bottoms = np.sort(np.concatenate([ends, cells]))
     tops = np.append(-np.inf, bottoms)
     layer = ends.searchsorted(tops, side="right")
-    factor = learnt.stiffness[layer] * learnt.variation[cells.searchsorted(tops, side="right")]
+    factor = adaptation.stiffness[layer] * adaptation.variation[cells.searchsorted(tops, side="right")]
     scales = old.force[layer] * factor, old.energy[layer] * factor
     at = ends.searchsorted(nodes.x, side="right")
     contact = nodes.kind == CONTACT
@@ -152,7 +152,7 @@ def adapted(model: Model, learnt: Adaptation) -> Model:
     force = _integral(bottoms, scales[0] * law[layer], nodes) / law[at]
     energy = force * (old.energy / old.force)[at]
     return model._replace(
-        bevel_offset=model.bevel_offset * learnt.bevel,
+        bevel_offset=model.bevel_offset * adaptation.bevel,
         nodes=nodes._replace(
             alpha=np.where(contact, old.alpha[at], nodes.alpha),
             height=np.where(contact, old.height[at], nodes.height),
@@ -160,8 +160,8 @@ def adapted(model: Model, learnt: Adaptation) -> Model:
             energy=np.where(contact, energy, nodes.energy),
         ),
         layers=Layers(np.append(bottoms, np.inf), old.alpha[layer], old.height[layer], scales[0], scales[1]),
-        curvature=2.0 * learnt.bend / model.length**2,
-        clearance=learnt.clearance,
+        curvature=2.0 * adaptation.bend / model.length**2,
+        clearance=adaptation.clearance,
     )
 
 

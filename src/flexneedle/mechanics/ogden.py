@@ -6,7 +6,7 @@ With the stretch λ = 1 − |u|/h and t = λ^(−α/2), so that λ^α = t⁻², 
     −W_u = −sign(u) (2μV/αh) (t − t⁻²)/λ          lateral force on the needle
     W_uu = (2μV/αh²) ((α − 1) t⁻² + (α/2 + 1) t)/λ²
 
-Below `FLOOR_STRETCH` the force goes on linearly: W stays convex and C¹, and no input gives a NaN.
+Below `FLOOR_STRETCH` the force is continued linearly: W stays convex and C¹, and no input gives a NaN.
 """
 
 import math
@@ -55,7 +55,7 @@ def law_scales(shear_modulus: Floats, alpha: Floats, height: Floats, volume: Flo
 
 
 def displaced_energy(alpha: Floats, height: Floats, energy: Floats, u: float) -> Floats:
-    """Energy (mJ) that contacts of energy scale `energy` store where they are moved aside by u (mm)."""
+    """Energy (mJ) that contacts of energy scale `energy` store where they are displaced by u (mm)."""
     stretch = np.maximum(1.0 - abs(u) / height, FLOOR_STRETCH)
     stored: Floats = energy * (2.0 * stretch ** (-0.5 * alpha) + stretch**alpha - 3.0)
     return stored

@@ -37,11 +37,11 @@ def test_it_agrees_with_the_controllers_model_at_small_angles(layers):
     meshes = {2.0: SMALL, 1.0: SMALL, 0.5: FINE, 0.25: FINE}
     gaps = [model_gap(scale, layers, **mesh) for scale, mesh in meshes.items()]
     for larger, smaller in pairwise(gaps):
-        assert smaller.aside < larger.aside / 4.0
+        assert smaller.lateral < larger.lateral / 4.0
     last = gaps[-2:]
-    assert order([gap.angle for gap in last], [gap.aside for gap in last]) == pytest.approx(3.0, abs=0.4)
-    assert gaps[0].aside > 0.1  # at 0.15 rad the error of the linear beam is above 0.1 mm
-    assert gaps[-1].aside < 1e-4
+    assert order([gap.angle for gap in last], [gap.lateral for gap in last]) == pytest.approx(3.0, abs=0.4)
+    assert gaps[0].lateral > 0.1  # at 0.15 rad the error of the linear beam is above 0.1 mm
+    assert gaps[-1].lateral < 1e-4
     assert abs(gaps[-1].energy) < 2e-4
 
 
@@ -49,8 +49,8 @@ def test_it_agrees_with_the_controllers_model_at_small_angles(layers):
 def test_the_difference_decreases_with_the_mesh(layers):
     """At 0.01 rad: 0.3 µm per mm of deflection on the default mesh, less on a finer one."""
     coarse, fine = model_gap(0.25, layers, **SHIPPED), model_gap(0.25, layers, **SMALL)
-    assert coarse.aside < 5e-4
-    assert fine.aside < coarse.aside / 3.0
+    assert coarse.lateral < 5e-4
+    assert fine.lateral < coarse.lateral / 3.0
 
 
 def test_a_second_solver_finds_the_same_insertion():

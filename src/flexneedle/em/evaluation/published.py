@@ -38,7 +38,7 @@ _REFERENCE = re.compile(rf"(ref|{REFERENCE})\d*")
 
 
 def paper_sensor(sensor: str) -> str | None:
-    """Return the paper's sensor that the name stands for: the tip, a reference (ref, ref1, …), or None."""
+    """Return the paper's sensor of this name: the tip, a reference (ref, ref1, …), or None."""
     name = sensor.strip().lower()
     if name == TIP:
         return TIP
