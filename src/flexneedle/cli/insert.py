@@ -10,15 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flexneedle.console.common import (
-    HelpFormatter,
     add_run_arguments,
     chosen_scenario,
     compile_first,
-    examples,
     print_json,
     print_table,
     run_name,
     seed,
+    with_examples,
 )
 from flexneedle.errors import FlexneedleError, one_line
 
@@ -35,11 +34,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "insert",
         help="plan an insertion and execute it in closed loop on the virtual phantom",
-        epilog=examples(
+        **with_examples(
             "flexneedle insert phantom --target 35 -5 --seed 3",
             "flexneedle insert world:100012 --controller ce-mpc --phantom model --json",
         ),
-        formatter_class=HelpFormatter,
     )
     add_run_arguments(parser)
     parser.add_argument(

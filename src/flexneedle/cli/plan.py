@@ -7,14 +7,13 @@ from math import degrees, isnan
 from typing import TYPE_CHECKING, Any
 
 from flexneedle.console.common import (
-    HelpFormatter,
     add_run_arguments,
     chosen_scenario,
     compile_first,
-    examples,
     print_json,
     print_table,
     run_name,
+    with_examples,
 )
 
 if TYPE_CHECKING:
@@ -31,11 +30,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "plan",
         help="plan an insertion and draw the plan",
-        epilog=examples(
+        **with_examples(
             "flexneedle plan phantom --target 40 1.5 --strategy both",
             "flexneedle plan mine.toml --seed 3 --json",
         ),
-        formatter_class=HelpFormatter,
     )
     add_run_arguments(parser)
     parser.add_argument(

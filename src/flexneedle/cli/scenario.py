@@ -6,7 +6,7 @@ import argparse
 import warnings
 from typing import TYPE_CHECKING
 
-from flexneedle.console.common import HelpFormatter, examples
+from flexneedle.console.common import with_examples
 
 if TYPE_CHECKING:
     from flexneedle.scenario.model import Scenario
@@ -17,64 +17,70 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "scenario",
         help="list, show and check scenarios",
-        epilog=examples(
+        **with_examples(
             "flexneedle scenario show phantom > mine.toml",
             "flexneedle scenario check mine.toml",
         ),
-        formatter_class=HelpFormatter,
     )
     actions = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    list_ = actions.add_parser(
+    for add in (_add_list, _add_show, _add_check, _add_schema):
+        add(actions)
+
+
+def _add_list(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = actions.add_parser(
         "list",
         help="list the presets",
-        epilog=examples(
+        **with_examples(
             "flexneedle scenario list",
             "flexneedle scenario list | grep -i tissue",
         ),
-        formatter_class=HelpFormatter,
     )
-    list_.set_defaults(handler=_list)
+    parser.set_defaults(handler=_list)
 
-    show = actions.add_parser(
+
+def _add_show(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = actions.add_parser(
         "show",
         help="print a scenario with all its defaults, as TOML",
-        epilog=examples(
+        **with_examples(
             "flexneedle scenario show phantom > mine.toml",
             "flexneedle scenario show world:100012:perfect",
         ),
-        formatter_class=HelpFormatter,
     )
-    show.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path")
-    _add_controller(show)
-    show.set_defaults(handler=_show)
+    parser.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path")
+    _add_controller(parser)
+    parser.set_defaults(handler=_show)
 
-    check = actions.add_parser(
+
+def _add_check(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = actions.add_parser(
         "check",
         help="check a scenario: one line for each problem, exit status 2",
         description="Check a scenario. One line on stderr for each problem, exit status 2. A warning, exit status 0, "
         "for each value that is not used, has been renamed, or is an order of magnitude outside the usual range.",
-        epilog=examples(
+        **with_examples(
             "flexneedle scenario check mine.toml --strict",
             "flexneedle scenario check mine.toml --controller follow_path:METHOD",
         ),
-        formatter_class=HelpFormatter,
     )
-    check.add_argument("scenario", metavar="SCENARIO", help="path, preset name or world:NUMBER")
-    _add_controller(check)
-    check.add_argument("--strict", action="store_true", help="exit status 2 for warnings too")
-    check.set_defaults(handler=_check)
+    parser.add_argument("scenario", metavar="SCENARIO", help="path, preset name or world:NUMBER")
+    _add_controller(parser)
+    parser.add_argument("--strict", action="store_true", help="exit status 2 for warnings too")
+    parser.set_defaults(handler=_check)
 
-    schema = actions.add_parser(
+
+def _add_schema(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = actions.add_parser(
         "schema",
         help="print the JSON schema of scenario files",
-        epilog=examples(
+        **with_examples(
             "flexneedle scenario schema > scenario.schema.json",
             "flexneedle scenario schema | python -m json.tool | less",
         ),
-        formatter_class=HelpFormatter,
     )
-    schema.set_defaults(handler=_schema)
+    parser.set_defaults(handler=_schema)
 
 
 def _add_controller(parser: argparse.ArgumentParser) -> None:

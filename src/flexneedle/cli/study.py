@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexneedle.console.common import HelpFormatter, compile_first, examples, print_json
+from flexneedle.console.common import compile_first, print_json, with_examples
 
 if TYPE_CHECKING:
     from flexneedle.console.progress import Progress
@@ -27,11 +27,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "study",
         help="run many insertions and write their results to tables",
-        epilog=examples(
+        **with_examples(
             "flexneedle study phantom --out runs/accuracy",
             "flexneedle study mine.toml --workers 4 --out runs/mine --resume",
         ),
-        formatter_class=HelpFormatter,
     )
     parser.add_argument("study", metavar="STUDY", help="name of a shipped study, or path to a TOML file")
     parser.add_argument(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from flexneedle.console.common import HelpFormatter, examples
+from flexneedle.console.common import with_examples
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -13,11 +13,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "view",
         help="redraw the figures of a run, finished or not",
-        epilog=examples(
+        **with_examples(
             "flexneedle view runs/20260101T120000Z-phantom-0",
             "flexneedle view runs/mine",
         ),
-        formatter_class=HelpFormatter,
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run")
     parser.set_defaults(handler=_view)

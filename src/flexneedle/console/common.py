@@ -117,4 +117,9 @@ def print_table(title: str, rows: Iterable[Sequence[str]], folder: Path, heads: 
 
 def described(text: str, *lines: str) -> dict[str, Any]:
     """Return the argparse options for a description and the examples at the end of the help."""
-    return {"description": text, "epilog": examples(*lines), "formatter_class": HelpFormatter}
+    return {"description": text, **with_examples(*lines)}
+
+
+def with_examples(*lines: str) -> dict[str, Any]:
+    """Return the argparse options for the examples at the end of the help."""
+    return {"epilog": examples(*lines), "formatter_class": HelpFormatter}

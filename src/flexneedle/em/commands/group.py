@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from flexneedle.console.common import HelpFormatter, examples
+from flexneedle.console.common import with_examples
 from flexneedle.em.commands import check, evaluate, record, register, simulate, watch
 
 _COMMANDS: tuple[Any, ...] = (evaluate, check, simulate, register, record, watch)
@@ -16,8 +16,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "em",
         help="evaluate, simulate or record an electromagnetic tracker",
-        epilog=examples("flexneedle em simulate", "flexneedle em evaluate measurements.csv"),
-        formatter_class=HelpFormatter,
+        **with_examples("flexneedle em simulate", "flexneedle em evaluate measurements.csv"),
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in _COMMANDS:
