@@ -15,7 +15,9 @@ from fake_engine import install
 from flexneedle.cli import main as cli
 from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.errors import RunError
+from flexneedle.figures.style import new_figure
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PLANTS
+from flexneedle.runs import figures
 from flexneedle.trace.columns import COLUMNS
 from flexneedle.trace.reader import read_trace
 from synthetic import make_periods
@@ -52,6 +54,19 @@ def in_tmp(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.fixture(autouse=True)
+def empty_figures(request, monkeypatch):
+    """Save empty figures in tests that are not about figures: drawing takes most of a command's time."""
+    if "real_figures" not in request.fixturenames:
+        for name in ("insertion_figure", "plan_figure"):
+            monkeypatch.setattr(figures, name, lambda *_: new_figure(1.0))
+
+
+@pytest.fixture
+def real_figures():
+    """For tests of what is drawn."""
+
+
 @pytest.fixture
 def engine(monkeypatch):
     """Return a function that installs the fake planner and loop."""
@@ -73,8 +88,8 @@ def reproducible(folder):
     """Return the reproducible part of a run: run.json without timing, and the figures."""
     values = json.loads((folder / "run.json").read_text())
     del values["timing"]
-    figures = {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".png", ".svg")}
-    return json.dumps(values), figures
+    drawn = {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".png", ".svg")}
+    return json.dumps(values), drawn
 
 
 def run_process(signal_name, *argv):
@@ -113,7 +128,7 @@ def test_insert_json_is_one_object_with_all_digits(engine, capsys):
     assert stored["status"] == "done"
 
 
-def test_controller_and_phantom_are_used_and_recorded(engine, capsys, in_tmp):
+def test_controller_and_phantom_are_used_and_recorded(engine, capsys, in_tmp, real_figures):
     engine()
     status, out, _ = run(capsys, "insert", "--controller", "open-loop", "--phantom", "model", "--out", "a")
     assert status == 0
@@ -307,7 +322,7 @@ def test_ctrl_c_keeps_and_marks_the_record(in_tmp):
     assert names(in_tmp / "here") == INSERTION_FILES
 
 
-def test_ctrl_c_while_planning_marks_the_record(engine, capsys, in_tmp, monkeypatch):
+def test_ctrl_c_while_planning_marks_the_record(engine, capsys, in_tmp, monkeypatch, real_figures):
     engine()
 
     def interrupted(*_args, **_kwargs):
@@ -320,7 +335,7 @@ def test_ctrl_c_while_planning_marks_the_record(engine, capsys, in_tmp, monkeypa
     assert run(capsys, "view", "here")[0] == 1
 
 
-def test_a_killed_run_can_be_viewed_and_exported(in_tmp, capsys):
+def test_a_killed_run_can_be_viewed_and_exported(in_tmp, capsys, real_figures):
     assert run_process("SIGKILL", "insert", "--out", "here").returncode == -signal.SIGKILL
     assert names(in_tmp / "here") == ["run.json", "trace.mcap"]
     assert run(capsys, "view", "here")[:2] == (0, "here/insertion.png\nhere/insertion.svg\n")
@@ -330,7 +345,7 @@ def test_a_killed_run_can_be_viewed_and_exported(in_tmp, capsys):
     assert "incomplete: 12 complete periods read" in err
 
 
-def test_view_redraws_the_same_figures(engine, capsys, in_tmp):
+def test_view_redraws_the_same_figures(engine, capsys, in_tmp, real_figures):
     engine()
     run(capsys, "insert", "--out", "here")
     before = reproducible(in_tmp / "here")
@@ -339,7 +354,7 @@ def test_view_redraws_the_same_figures(engine, capsys, in_tmp):
     assert reproducible(in_tmp / "here") == before
 
 
-def test_the_same_seed_gives_the_same_bytes(engine, capsys, in_tmp):
+def test_the_same_seed_gives_the_same_bytes(engine, capsys, in_tmp, real_figures):
     engine()
     for folder in ("first", "second"):
         run(capsys, "insert", "--seed", "5", "--out", folder)
@@ -396,7 +411,7 @@ def test_wrong_arguments_exit_with_status_2(argv, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_plan_writes_a_record_and_a_figure(engine, capsys, in_tmp):
+def test_plan_writes_a_record_and_a_figure(engine, capsys, in_tmp, real_figures):
     engine()
     status, out, _ = run(capsys, "plan", "--out", "here")
     assert status == 0

@@ -255,8 +255,14 @@ SCENARIOS = {
 TARGETS = {"near": (40.0, 5.0), "shallow, lateral": (20.5, -12.375), "deep": (95.125, 12.375)}
 
 
-@pytest.mark.parametrize("target", TARGETS.values(), ids=TARGETS)
-@pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
+CROSSED = [
+    pytest.param(make, target, id=f"{name}-{where}", marks=[] if k % 3 == j else pytest.mark.long)
+    for k, (name, make) in enumerate(SCENARIOS.items())
+    for j, (where, target) in enumerate(TARGETS.items())
+]
+
+
+@pytest.mark.parametrize(("scenario", "target"), CROSSED)
 def test_no_labels_overlap_in_any_scenario(scenario, target):
     scenario, plan = scenario(), make_plan(target=target)
     insertion = make_insertion(plan, miss=1.4)

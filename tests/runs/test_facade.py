@@ -14,7 +14,9 @@ from flexneedle.cli import main as cli
 from flexneedle.errors import InputError, RunError
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.plans import plan_figure
+from flexneedle.runs.figures import draw_run
 from flexneedle.trace.columns import COLUMNS
+from flexneedle.trace.folder import TRACE_FILE
 from synthetic import blind, make_insertion, make_plan
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -192,3 +194,9 @@ def test_a_torn_trace_is_loaded_with_a_warning(tmp_path):
     with pytest.warns(RuntimeWarning, match="incomplete: .* complete periods read"):
         torn = flexneedle.load(tmp_path / "a")
     assert 0 < len(torn.periods) < len(INSERTION.periods)
+
+
+def test_an_insertion_killed_before_its_trace_is_drawn_as_its_plan(tmp_path):
+    folder = flexneedle.save(INSERTION, tmp_path / "run")
+    (folder / TRACE_FILE).unlink()
+    assert [path.name for path in draw_run(folder)] == ["plan.png", "plan.svg"]

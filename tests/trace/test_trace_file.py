@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from flexneedle.errors import InputError
 from flexneedle.trace.columns import COLUMNS, to_row, verdict_of
+from flexneedle.trace.messages import joints
 from flexneedle.trace.reader import read_trace
 from flexneedle.trace.topics import TOPICS
 from flexneedle.trace.writer import TraceWriter
@@ -269,3 +270,9 @@ def test_a_trace_is_never_overwritten(trace_file):
     with pytest.raises(FileExistsError):
         TraceWriter(trace_file, PLAN, about=ABOUT, scenario=SCENARIO)
     assert trace_file.read_bytes() == before
+
+
+def test_joints_are_in_metres_and_radians():
+    message = joints(1.5, (-170.0, 0.25, 2e-3, -1.5, -1))
+    assert message.name == ["base_x", "base_y", "base_theta", "guide_y", "bevel"]
+    np.testing.assert_allclose(message.position, [-0.170, 2.5e-4, 2e-3, -1.5e-3, -1.0], rtol=1e-12)
