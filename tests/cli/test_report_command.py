@@ -64,6 +64,7 @@ def test_json_has_all_statistics_at_full_precision(capsys, study, tmp_path):
     assert values["endings"][0]["reason"] == "plan misses the target"
 
 
+@pytest.mark.long
 def test_tuning_is_shown_from_a_folder(capsys, study, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = study / "report" / "report.html"

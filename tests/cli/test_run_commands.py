@@ -128,7 +128,8 @@ def test_insert_json_is_one_object_with_all_digits(engine, capsys):
     assert stored["status"] == "done"
 
 
-def test_controller_and_phantom_are_used_and_recorded(engine, capsys, in_tmp, real_figures):
+@pytest.mark.usefixtures("real_figures")
+def test_controller_and_phantom_are_used_and_recorded(engine, capsys, in_tmp):
     engine()
     status, out, _ = run(capsys, "insert", "--controller", "open-loop", "--phantom", "model", "--out", "a")
     assert status == 0
@@ -322,7 +323,8 @@ def test_ctrl_c_keeps_and_marks_the_record(in_tmp):
     assert names(in_tmp / "here") == INSERTION_FILES
 
 
-def test_ctrl_c_while_planning_marks_the_record(engine, capsys, in_tmp, monkeypatch, real_figures):
+@pytest.mark.usefixtures("real_figures")
+def test_ctrl_c_while_planning_marks_the_record(engine, capsys, in_tmp, monkeypatch):
     engine()
 
     def interrupted(*_args, **_kwargs):
@@ -335,7 +337,8 @@ def test_ctrl_c_while_planning_marks_the_record(engine, capsys, in_tmp, monkeypa
     assert run(capsys, "view", "here")[0] == 1
 
 
-def test_a_killed_run_can_be_viewed_and_exported(in_tmp, capsys, real_figures):
+@pytest.mark.usefixtures("real_figures")
+def test_a_killed_run_can_be_viewed_and_exported(in_tmp, capsys):
     assert run_process("SIGKILL", "insert", "--out", "here").returncode == -signal.SIGKILL
     assert names(in_tmp / "here") == ["run.json", "trace.mcap"]
     assert run(capsys, "view", "here")[:2] == (0, "here/insertion.png\nhere/insertion.svg\n")
@@ -345,7 +348,8 @@ def test_a_killed_run_can_be_viewed_and_exported(in_tmp, capsys, real_figures):
     assert "incomplete: 12 complete periods read" in err
 
 
-def test_view_redraws_the_same_figures(engine, capsys, in_tmp, real_figures):
+@pytest.mark.usefixtures("real_figures")
+def test_view_redraws_the_same_figures(engine, capsys, in_tmp):
     engine()
     run(capsys, "insert", "--out", "here")
     before = reproducible(in_tmp / "here")
@@ -354,7 +358,8 @@ def test_view_redraws_the_same_figures(engine, capsys, in_tmp, real_figures):
     assert reproducible(in_tmp / "here") == before
 
 
-def test_the_same_seed_gives_the_same_bytes(engine, capsys, in_tmp, real_figures):
+@pytest.mark.usefixtures("real_figures")
+def test_the_same_seed_gives_the_same_bytes(engine, capsys, in_tmp):
     engine()
     for folder in ("first", "second"):
         run(capsys, "insert", "--seed", "5", "--out", folder)
@@ -411,7 +416,8 @@ def test_wrong_arguments_exit_with_status_2(argv, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_plan_writes_a_record_and_a_figure(engine, capsys, in_tmp, real_figures):
+@pytest.mark.usefixtures("real_figures")
+def test_plan_writes_a_record_and_a_figure(engine, capsys, in_tmp):
     engine()
     status, out, _ = run(capsys, "plan", "--out", "here")
     assert status == 0

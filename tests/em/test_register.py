@@ -47,6 +47,7 @@ def test_exact_pairs_give_the_exact_transform(tmp_path):
     np.testing.assert_allclose(again.apply(STAGE), TRUE.apply(STAGE), atol=1e-9)
 
 
+@pytest.mark.long
 def test_the_estimated_errors_are_the_planted_ones(tmp_path):
     """The RMS localisation error of 50 registrations is the planted one; leave-one-out errors exceed the residuals."""
     found = [register(read_pairs(table(tmp_path, rows(0.3, seed=seed)))) for seed in range(50)]

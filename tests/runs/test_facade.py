@@ -125,6 +125,7 @@ def test_a_saved_record_loads_unchanged(executed, tmp_path):
     assert same(flexneedle.load(str(flexneedle.save(executed[0], str(tmp_path / "plan")))), plan)
 
 
+@pytest.mark.long
 def test_save_writes_the_same_folder_as_the_command(executed, tmp_path, monkeypatch, capsys):
     """The same seeds give the same files, except for wall-clock times."""
     plan, insertion = executed

@@ -83,6 +83,7 @@ def test_parquet_and_csv_give_the_same_result_for_any_type_of_point_id(tmp_path)
         assert_same(found, *as_csv.values())
 
 
+@pytest.mark.long
 @LAWS
 @given(st.randoms(use_true_random=False))
 def test_the_order_of_rows_does_not_matter(tmp_path, random):
@@ -108,6 +109,7 @@ def test_after_registration_a_rigid_motion_of_the_tracker_does_not_matter(tmp_pa
     assert after["registration"]["residual_mm"] == pytest.approx(after["rmse_mm"], rel=1e-12)
 
 
+@pytest.mark.long
 @LAWS
 @given(shift=st.tuples(*[st.floats(-2000, 2000)] * 3))
 def test_a_translation_of_the_tracker_does_not_change_jitter_or_relative_distances(tmp_path, shift):

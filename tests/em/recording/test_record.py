@@ -424,6 +424,7 @@ def test_each_point_is_synced_to_disk_before_the_next_move(grid, out, monkeypatc
     assert synced == [12, 24, 36, 48, 60, 72]
 
 
+@pytest.mark.long
 def test_a_killed_recording_loses_and_repeats_no_point(tmp_path, out):
     """With real processes, a serial line and SIGKILL."""
     count = 16

@@ -49,6 +49,7 @@ def test_the_jitter_is_exact_far_from_the_origin(tmp_path, offset, suffix):
     assert result.accuracy.jitter_mm == pytest.approx(jitter, abs=1e-11)
 
 
+@pytest.mark.long
 def test_the_order_of_rows_of_a_long_table_changes_no_digit(tmp_path):
     """With enough rows for several threads."""
     rng = np.random.default_rng(1)

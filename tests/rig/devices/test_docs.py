@@ -52,6 +52,7 @@ def test_its_grid_is_the_included_one():
     assert grid == (files("flexneedle.em.recording") / "grids" / "cube.toml").read_text()
 
 
+@pytest.mark.long
 def test_its_session_without_hardware_ends_with_an_evaluation(tmp_path):
     """Real processes: the emulator, the recording of a small grid, its evaluation."""
     (script,) = re.findall(r"```bash\n(.*?)```", PAGE, re.DOTALL)

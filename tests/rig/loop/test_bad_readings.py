@@ -115,6 +115,7 @@ def test_the_hold_limit_applies_to_each_hold(plan):
     assert done.outcome == "done"
 
 
+@pytest.mark.long
 def test_the_limits_of_age_and_innovation_are_those_of_the_scenario(plan):
     def offset(sample):
         return replace(sample, time=sample.time - 0.05, y=sample.y + 1.2)

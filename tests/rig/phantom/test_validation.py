@@ -103,6 +103,7 @@ def test_the_summary_has_the_deflections_of_the_issue(script, made_up):
     assert numbers(lines[0].split("|")[3])[0] == pytest.approx(0.30172 + off, abs=6e-5)
 
 
+@pytest.mark.long
 def test_same_results_same_bytes(script, made_up, tmp_path):
     """For page and pictures."""
     one, other = (script.write(made_up, tmp_path / name) for name in ("one", "other"))

@@ -154,6 +154,7 @@ def test_a_disabled_sensor_is_reported(firmware):
     assert statuses_of(frames, "ref1") == [VISIBLE]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("fault", "kind", "text"),
     [
@@ -192,7 +193,7 @@ def test_delayed_replies_give_correct_frames():
 @pytest.mark.parametrize(
     ("fault", "text"),
     [
-        ("silence@0.3:1.5", "no reply"),
+        pytest.param("silence@0.3:1.5", "no reply", marks=pytest.mark.long),
         pytest.param("frozen@0.3:1.8", "does not increase", marks=pytest.mark.slow),
         ("unplug@0.3:1", "the port does not exist: is the cable plugged in?"),
         pytest.param("error@0.3:1.2", "error 0D", marks=pytest.mark.slow),
@@ -284,6 +285,7 @@ def test_an_interrupt_while_connecting_leaves_no_process(monkeypatch):
     os.close(host)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("error", [OSError(11, "Resource temporarily unavailable"), ValueError("no JSON")])
 def test_a_link_that_cannot_be_started_is_reported_and_retried(error, monkeypatch):
     connect = Aurora._connect_once
