@@ -27,14 +27,13 @@ from flexneedle.estimation.identification import Identification, Identified
 from flexneedle.estimation.prior import Priors
 from flexneedle.estimation.task import Task
 from flexneedle.planning import terms
-from flexneedle.planning.cross_entropy import Search
+from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import Found, Variables, best
 from flexneedle.planning.terms import Term, Trajectories
 from flexneedle.scenario.sections.fields import NonNegative, count
 from flexneedle.types import Command, Floats
 
-_ELITE = 8  # samples for each elite one
-_LEAST_ELITE = 3
+_ELITE_FRACTION = 0.125
 _SMOOTHING = 0.3
 _TOLERANCE = 1e-6
 _RESTS = (4.0, 2.0, 1.0)  # control steps before the target at which the needle rests
@@ -166,7 +165,7 @@ def _search(
     first = proposals(ahead, samples, rng)
     lower, upper = ahead.bounds
     variables = Variables(lower, upper, ahead.current, first.std(axis=0), lambda z: ahead.controls(z)[0])
-    elite = max(_LEAST_ELITE, samples // _ELITE)
+    elite = elite_count(samples, _ELITE_FRACTION)
     search = Search(samples, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
     charged = _terms(task, fitted, memory, ahead)
     return best(variables, partial(_measured_rollout, fitted), charged, search, rng, first=first)
