@@ -10,6 +10,7 @@ from flexneedle.scenario.files import dump_scenario
 from synthetic import make_plan
 
 PLAN = make_plan()
+SIMULATOR = flexneedle.Simulator("phantom", threads=1)
 SCENARIO = "must be a preset name, a path or a Scenario"
 WHOLE = "must be a whole number, at least"
 CORES = "leave it out for one per core"
@@ -36,6 +37,24 @@ MAKE = "make one with flexneedle.plan(scenario)"
         (lambda: flexneedle.Simulator("phantom", threads=0.5), f"threads = 0.5: {WHOLE} 1; {CORES}"),
         (lambda: flexneedle.insert("phantom", PLAN, threads=-2), f"threads = -2: {WHOLE} 1; {CORES}"),
         (lambda: flexneedle.insert("phantom", "x"), f"plan = 'x': must be a Plan; {MAKE}"),
+        (lambda: flexneedle.plan("phantom", target={1: 2, 3: 4}), f"target = {{1: 2, 3: 4}}: {TARGET}"),
+        (lambda: flexneedle.plan("phantom", target=(True, 5)), f"target = (True, 5): {TARGET}"),
+        (lambda: flexneedle.load(3), "run_dir = 3: must be a path"),
+        (lambda: flexneedle.run_study(3), "source = 3: must be a path"),
+        (lambda: flexneedle.Control(db_x="1"), "db_x = '1': must be a number, in mm or rad"),
+        (lambda: flexneedle.Control(flip=-1), "flip = -1: must be True or False"),
+        (
+            lambda: SIMULATOR.step(None, flexneedle.Control()),
+            "state = None: must be a State; begin with simulator.start()",
+        ),
+        (
+            lambda: SIMULATOR.step(SIMULATOR.start(), (1.0, 0.0)),
+            "control = (1.0, 0.0): must be a Control; make one with flexneedle.Control(db_x=1.0)",
+        ),
+        (
+            lambda: SIMULATOR.scenario.with_values("x"),
+            "changes = 'x': must be values by key; such as {\"target.depth_mm\": 35.0}",
+        ),
         (
             lambda: flexneedle.run("phantom", PLAN, "arm", np.random.default_rng(0)),
             "rig = 'arm': must be a Rig; Rig(clock, driver, tracker), parts as in flexneedle.rig.ports",

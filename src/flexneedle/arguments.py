@@ -1,7 +1,10 @@
 """Checks of arguments: one line with value, rule and remedy for an invalid one."""
 
 import reprlib
+from collections.abc import Mapping
 from operator import index
+from os import PathLike
+from pathlib import Path
 from typing import Any, TypeVar
 
 from flexneedle.errors import InputError
@@ -24,7 +27,8 @@ def whole(name: str, value: Any, least: int, remedy: str = "") -> int:
 def pair(name: str, value: Any, parts: str) -> tuple[float, float]:
     """Return two numbers; `parts` describes them in the message. Raises InputError for anything else."""
     try:
-        numbers = [] if isinstance(value, str) else [float(part) for part in value]
+        given = [] if isinstance(value, str | Mapping) else list(value)
+        numbers = [] if any(isinstance(part, bool | str) for part in given) else list(map(float, given))
     except (TypeError, ValueError):
         numbers = []
     if len(numbers) != 2:
@@ -38,6 +42,13 @@ def instance(name: str, value: Any, kind: type[_Kind], remedy: str) -> _Kind:
         rule = f"must be {'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
         raise refusal(name, value, rule, remedy)
     return value
+
+
+def path(name: str, value: Any) -> Path:
+    """Return the path of a file or folder. Raises InputError for anything but text and paths."""
+    if not isinstance(value, str | PathLike):
+        raise refusal(name, value, "must be a path")
+    return Path(value)
 
 
 def shown(value: object) -> str:

@@ -286,12 +286,9 @@ def test_a_failure_during_the_insertion_prints_the_partial_result(engine, capsys
     assert err.splitlines()[-1] == "flexneedle: the driver is gone"
 
 
-def test_bad_input_prints_no_object(engine, capsys):
-    engine()
-    run(capsys, "insert", "--out", "here")
-    for argv in (["nowhere.toml"], ["--controller", "pid"], ["--out", "here"]):
-        status, out, _ = run(capsys, "insert", "--json", *argv)
-        assert (status, out) == (2, "")
+def test_an_invalid_argument_prints_no_object(capsys):
+    status, out, _ = run(capsys, "insert", "--json", "--controller", "pid")
+    assert (status, out) == (2, "")
 
 
 def test_force_inserts_despite_a_planned_miss(engine, capsys):
@@ -375,7 +372,7 @@ def test_a_folder_with_a_run_is_refused(engine, capsys, in_tmp, command):
     before = {path.name: path.read_bytes() for path in (in_tmp / "here").iterdir()}
     status, out, err = run(capsys, command, "--out", "here")
     assert (status, out) == (2, "")
-    assert err == "flexneedle: here: already contains a run (run.json): choose another folder with --out\n"
+    assert err == "flexneedle: here: already contains a run (run.json): choose another folder\n"
     assert {path.name: path.read_bytes() for path in (in_tmp / "here").iterdir()} == before
 
 
@@ -537,3 +534,29 @@ def test_a_plan_cannot_be_exported(engine, capsys):
         "",
         "flexneedle: here: contains a plan, not an insertion\n",
     )
+
+
+@pytest.mark.parametrize(
+    ("argv", "target", "reason"),
+    [
+        (["nowhere.toml"], None, "nowhere.toml"),
+        (["phantom", "--target", "45", "20"], [45.0, 20.0], "target.lateral_mm = 20"),
+    ],
+)
+def test_a_refused_scenario_prints_the_same_keys(capsys, in_tmp, argv, target, reason):
+    status, out, err = run(capsys, "insert", *argv, "--json")
+    result = json.loads(out)
+    assert (status, list(result), result["outcome"]) == (2, INSERT_KEYS, "refused")
+    assert result["target_mm"] == target
+    assert reason in result["reason"]
+    assert reason in err
+    assert names(in_tmp) == []
+
+
+def test_a_folder_that_is_taken_is_a_refusal(engine, capsys):
+    engine()
+    run(capsys, "insert", "--out", "here")
+    status, out, _ = run(capsys, "insert", "--out", "here", "--json")
+    result = json.loads(out)
+    assert (status, result["outcome"]) == (2, "refused")
+    assert result["reason"].startswith("here: already contains a run (run.json)")

@@ -46,9 +46,7 @@ def test_no_run_is_written_to_the_folder_of_a_study(capsys, uninterrupted, tmp_p
     shutil.copy(uninterrupted / "study.json", tmp_path)
     status, out, err = run(capsys, command, "phantom", "--out", tmp_path)
     assert (status, out) == (2, "")
-    assert err.splitlines()[-1].endswith(
-        "already contains a study (study.json): choose another folder with --out"
-    )
+    assert err.splitlines()[-1].endswith("already contains a study (study.json): choose another folder")
     assert [path.name for path in tmp_path.iterdir()] == ["study.json"]
 
 

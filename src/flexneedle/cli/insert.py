@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,25 +85,29 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _insert(args: argparse.Namespace) -> int:
-    from flexneedle.rig.parts import own_controllers
     from flexneedle.runs.recording import check_choices
     from flexneedle.trace.folder import Folder
 
     if args.list:
         return _list()
     choices = _choices(args)
-    scenario = chosen_scenario(args, *own_controllers([choices.controller]))
-    if args.registration is not None:
-        from flexneedle.scenario.files import load_registration
-
-        scenario = load_registration(args.registration, scenario)
-    with _refusal_printed(args, scenario, choices):
+    with _refusal_printed(args, choices):
+        scenario = _scenario(args, choices)
+    with _refusal_printed(args, choices, scenario):
         check_choices(scenario, choices)
-    compile_first()
-    folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
-    with _refusal_printed(args, scenario, choices, folder):
+        compile_first()
+        folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
+    with _refusal_printed(args, choices, scenario, folder):
         insertion = _execute(folder, scenario, choices)
     return _report(scenario, insertion, args.json, folder.path)
+
+
+def _scenario(args: argparse.Namespace, choices: Choices) -> Scenario:
+    from flexneedle.rig.parts import own_controllers
+    from flexneedle.scenario.files import load_registration
+
+    scenario = chosen_scenario(args, *own_controllers([choices.controller]))
+    return scenario if args.registration is None else load_registration(args.registration, scenario)
 
 
 def _execute(folder: Folder, scenario: Scenario, choices: Choices) -> Insertion:
@@ -123,18 +127,24 @@ def _execute(folder: Folder, scenario: Scenario, choices: Choices) -> Insertion:
 
 @contextmanager
 def _refusal_printed(
-    args: argparse.Namespace, scenario: Scenario, choices: Choices, folder: Folder | None = None
+    args: argparse.Namespace,
+    choices: Choices,
+    scenario: Scenario | None = None,
+    folder: Folder | None = None,
 ) -> Iterator[None]:
     """With --json, print the object of an insertion that is refused or fails; the error is re-raised."""
     try:
         yield
     except FlexneedleError as error:
         if args.json:
-            print_json(_refusal(folder, scenario, choices, one_line(error)))
+            target = args.target if scenario is None else scenario.target.position
+            print_json(_refusal(folder, target, choices, one_line(error)))
         raise
 
 
-def _refusal(folder: Folder | None, scenario: Scenario, choices: Choices, reason: str) -> dict[str, Any]:
+def _refusal(
+    folder: Folder | None, target: Sequence[float] | None, choices: Choices, reason: str
+) -> dict[str, Any]:
     """The object of an insertion that ended with an error: the recorded result, or one without a plan."""
     from flexneedle.trace.results import NO_TIMING, refused_result
 
@@ -143,7 +153,7 @@ def _refusal(folder: Folder | None, scenario: Scenario, choices: Choices, reason
         timing = {key: folder.timing[key] for key in NO_TIMING}
         return {**folder.values["result"], "run_dir": run_dir, "timing": timing}
     names = {"controller": choices.controller, "phantom": choices.phantom}
-    result = refused_result(target=scenario.target.position, reason=reason, seed=choices.seed, **names)
+    result = refused_result(target=target, reason=reason, seed=choices.seed, **names)
     return {**result, "run_dir": run_dir, "timing": NO_TIMING}
 
 

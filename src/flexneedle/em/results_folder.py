@@ -15,7 +15,7 @@ def results_folder(out: Path | None, name: str, results: Iterable[str]) -> Path:
     path = out if out is not None else new_folder("em", name)
     for result in results:
         if (path / result).exists():
-            raise InputError(f"{path}: already contains {result}: choose another folder with --out")
+            raise InputError(f"{path}: already contains {result}: choose another folder")
     try:
         path.mkdir(parents=True, exist_ok=True)
     except FileExistsError:

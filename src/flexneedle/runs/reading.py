@@ -3,6 +3,7 @@
 import warnings
 from pathlib import Path
 
+from flexneedle.arguments import path
 from flexneedle.errors import InputError, RunError
 from flexneedle.trace.folder import TRACE_FILE, RunFile, read_run
 from flexneedle.trace.reader import read_trace
@@ -17,7 +18,7 @@ def load(run_dir: str | Path) -> Insertion | Plan | dict[str, Plan]:
     An insertion, complete or partial; a plan, or several by strategy. Warns (RuntimeWarning) of an unfinished trace.
     Raises InputError if the folder contains no run or is damaged, RunError if the run ended before it had a plan.
     """
-    run = _planned(read_run(Path(run_dir)))
+    run = _planned(read_run(path("run_dir", run_dir)))
     if run.kind == "insertion":
         insertion, note = insertion_of(run)
         if note:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+from flexneedle.arguments import path
 from flexneedle.control.methods import used
 from flexneedle.runs.figures import draw_run
 from flexneedle.scenario.model import Scenario
@@ -18,13 +19,13 @@ def save(record: Plan | Insertion, folder: str | Path) -> Path:
     The folder is created; `load`, `flexneedle view` and `flexneedle export` read it. Raises InputError for a folder
     that already contains a run or cannot be created, and for a record without its scenario.
     """
-    scenario = scenario_of(record)
+    scenario, out = scenario_of(record), path("folder", folder)
     if isinstance(record, Plan):
-        claimed = Folder.claim(Path(folder), "", "plan", used(scenario), record.seed)
+        claimed = Folder.claim(out, "", "plan", used(scenario), record.seed)
         keep_plan(claimed, record)
         finish_plans(claimed)
     else:
-        claimed = Folder.claim(Path(folder), "", "insertion", scenario, record.seed)
+        claimed = Folder.claim(out, "", "insertion", scenario, record.seed)
         parts = {name: getattr(record, name) for name in ("controller", "phantom", "tracker")}
         claimed.values |= parts
         keep_plan(claimed, record.plan)

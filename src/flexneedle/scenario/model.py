@@ -7,6 +7,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from flexneedle.arguments import refusal
 from flexneedle.errors import ScenarioError, ScenarioWarning
 from flexneedle.scenario.dotted import flatten, set_value, split_key
 from flexneedle.scenario.problems import describe, key_path, refuse, to_line
@@ -94,6 +95,8 @@ class Scenario(Section):
 
         Raises ScenarioError if a key is unknown or the copy breaks a rule.
         """
+        if not isinstance(changes, Mapping):
+            raise refusal("changes", changes, "must be values by key", 'such as {"target.depth_mm": 35.0}')
         values, changed = self.values(), {key: current_key(key) for key in changes}
         for key, value in changes.items():
             if changed[key] != key and changed[key] in changes:

@@ -1,7 +1,6 @@
-"""What is allowed in a scenario but hardly meant: values far from those of needles and tissues, and unused ones."""
+"""Valid but implausible values of a scenario: far from those of needles and tissues, or without effect."""
 
 from collections.abc import Iterator
-from math import log10
 from typing import NamedTuple
 
 from flexneedle.scenario.dotted import split_key
@@ -39,19 +38,23 @@ USUAL = {
 }
 """By key; * is any layer. Sources are for the ends of the range."""
 
+_FAR = 10**0.5  # ratio to the nearest usual value from which a value is reported: half an order of magnitude
+
 
 def doubts(scenario: Scenario) -> list[str]:
-    """Return a line for each value that is an order of magnitude off what is usual, and for a value without effect."""
+    """Return a line for each value that is half an order of magnitude and more outside the usual range, or unused."""
     return [*_unusual(scenario), *_unused(scenario)]
 
 
 def _unusual(scenario: Scenario) -> Iterator[str]:
     for key, value in scenario.flat().items():
         usual = USUAL.get(_general(key))
-        if usual is None or value == 0 or (off := _orders_off(value, usual)) == 0:
+        if usual is None or value == 0 or 1.0 / _FAR < (ratio := _ratio(value, usual)) < _FAR:
             continue
-        side = f"about {10 ** abs(off):,} times {'above' if off > 0 else 'below'}"
-        line = f"{side} the usual {usual.low:g} to {usual.high:g} ({usual.source}): check the unit"
+        off = (
+            f"{ratio:.3g} times the largest" if ratio > 1.0 else f"{1.0 / ratio:.3g} times below the smallest"
+        )
+        line = f"{off} usual value, {usual.low:g} to {usual.high:g} ({usual.source}): check the unit"
         yield f"{key_path(split_key(key))} = {value:g}: {line}"
 
 
@@ -68,7 +71,6 @@ def _general(key: str) -> str:
     return ".".join("*" if isinstance(part, int) else part for part in parts)
 
 
-def _orders_off(value: float, usual: Range) -> int:
-    """Orders of magnitude, rounded, by which a value is above (or, negative, below) a range."""
-    nearest = min(max(value, usual.low), usual.high)
-    return round(log10(value / nearest))
+def _ratio(value: float, usual: Range) -> float:
+    """Ratio of a value to the nearest value in a range."""
+    return value / min(max(value, usual.low), usual.high)

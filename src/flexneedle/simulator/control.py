@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.arguments import refusal
 from flexneedle.errors import CommandError
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats
@@ -23,6 +25,14 @@ class Control:
     db_theta: float = 0.0
     dg_y: float = 0.0
     flip: bool = False
+
+    def __post_init__(self) -> None:
+        """Raise InputError for text in place of numbers, and for a flip of −1, which rolls no bevel in a row."""
+        for name in COLUMNS[:-1]:
+            if not isinstance(value := getattr(self, name), Real):
+                raise refusal(name, value, "must be a number, in mm or rad")
+        if not isinstance(self.flip, bool | np.bool_):
+            raise refusal("flip", self.flip, "must be True or False")
 
     @classmethod
     def from_row(cls, row: Sequence[float]) -> "Control":

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flexneedle.arguments import whole
+from flexneedle.arguments import instance, whole
 from flexneedle.errors import CommandError, StateError
 from flexneedle.mechanics import insertion, model
 from flexneedle.mechanics import needle as nd
@@ -89,6 +89,8 @@ class Simulator:
 
     def step(self, state: State, control: Control) -> State:
         """Return the state after one control step; CommandError, with the limit, if it is out of range."""
+        instance("state", state, State, "begin with simulator.start()")
+        instance("control", control, Control, "make one with flexneedle.Control(db_x=1.0)")
         self.check(state, control)
         row = control.row()
         s, rest, u, w = self._work(state)

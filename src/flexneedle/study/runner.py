@@ -10,7 +10,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from flexneedle.arguments import whole
+from flexneedle.arguments import path, whole
 from flexneedle.errors import InputError, RunError
 from flexneedle.rig.kernels import compile_kernels
 from flexneedle.study import pools
@@ -60,12 +60,14 @@ def run_study(
     Raises InputError for an invalid study, folder or scheduler; RunError if a worker dies or has other package
     versions than this process; KeyboardInterrupt, after the tables are written, if the user interrupts it.
     """
+    if not isinstance(source, Study):
+        path("source", source)
     study = load_study(source)
     if workers is not None and scheduler is not None:
         raise InputError(f"workers = {workers}: sets local processes: remove it, or remove the scheduler")
     if workers is not None:
         workers = whole("workers", workers, 1, "omit it for one per core")
-    folder = new_folder("study", study.name) if out is None else Path(out)
+    folder = new_folder("study", study.name) if out is None else path("out", out)
     chunk = 1 if scheduler is None else math.ceil(len(study) / _CLUSTER_JOBS)
     # The pool first, so that no folder is created if the scheduler does not respond.
     with (
@@ -216,5 +218,6 @@ def _worker_loss_reported() -> Iterator[None]:
     except Exception as error:
         message = " ".join(f"{type(error).__name__} {error}".split())
         raise RunError(
-            f"workers were lost ({message}); finished rows are kept; resume with --resume"
+            f"workers were lost ({message}); finished rows are kept; resume with --resume; "
+            "a script needs the guard `if __name__ == '__main__':`"
         ) from error

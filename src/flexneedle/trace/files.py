@@ -58,7 +58,7 @@ def new_folder(*parts: str, now: datetime | None = None) -> Path:
             path.mkdir(parents=True)
         except FileExistsError:
             if not _RUNS.is_dir():
-                raise InputError(f"{_RUNS}: is not a folder: choose another folder with --out") from None
+                raise InputError(f"{_RUNS}: is not a folder: choose another folder") from None
             continue
         except OSError as error:
             raise InputError(f"{path}: cannot be created: {error.strerror}") from None

@@ -155,12 +155,12 @@ def _make(path: Path) -> Path:
         found = next((name for name in (RUN_FILE, TRACE_FILE, STUDY_FILE) if (path / name).exists()), None)
         if found is not None:
             kind = "study" if found == STUDY_FILE else "run"
-            raise InputError(f"{path}: already contains a {kind} ({found}): choose another folder with --out")
+            raise InputError(f"{path}: already contains a {kind} ({found}): choose another folder")
         path.mkdir(parents=True, exist_ok=True)
         (path / RUN_FILE).touch(exist_ok=False)  # of two simultaneous runs one gets the folder
     except FileExistsError:
         raise InputError(
-            f"{path}: already exists and is not an empty folder: choose another folder with --out"
+            f"{path}: already exists and is not an empty folder: choose another folder"
         ) from None
     except OSError as error:
         raise InputError(f"{path}: cannot be created: {error.strerror}") from None

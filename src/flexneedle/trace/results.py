@@ -1,6 +1,6 @@
 """Results of plans and insertions, each defined once: rows of studies, the objects of `--json` and of `run.json`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import isnan
@@ -155,14 +155,14 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
     return result
 
 
-def refused_result(*, target: tuple[float, float], reason: str, seed: int, **parts: str) -> dict[str, Any]:
+def refused_result(*, target: Sequence[float] | None, reason: str, seed: int, **parts: str) -> dict[str, Any]:
     """Return the result of an insertion that was refused before planning: the keys of `insertion_result`.
 
-    parts: names of controller and phantom; target in mm.
+    parts: names of controller and phantom; target in mm, None if it is not known.
     """
     known: dict[str, Any] = {
         **parts,
-        "target_mm": list(target),
+        "target_mm": None if target is None else list(target),
         "reached": False,
         "outcome": str(Outcome.REFUSED),
         "reason": reason,
