@@ -6,7 +6,6 @@ import math
 import re
 import shlex
 import xml.etree.ElementTree as ElementTree
-from html.parser import HTMLParser
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -15,6 +14,7 @@ import pytest
 from flexneedle.errors import InputError
 from flexneedle.scenario.files import load_scenario
 from flexneedle.study.report.report import write_report
+from report_page import Page
 from study_rows import BASE, OURS, make_rows, unfinished, write_study
 
 TARGETS = ((25.0, 0.0), (40.0, 5.0), (45.0, -5.0))
@@ -32,35 +32,6 @@ ABOUT = {
         "insertions": 24,
     },
 }
-
-
-class Page(HTMLParser):
-    """A parsed page: tags with attributes, and the text outside of style."""
-
-    def __init__(self, path):
-        super().__init__()
-        self.tags, self.open, self.words = [], [], []
-        self.feed(path.read_text(encoding="utf-8"))
-        self.close()
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag not in ("meta", "img", "br"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if "style" not in self.open:
-            self.words.append(data)
-
-    def all(self, tag):
-        return [attributes for name, attributes in self.tags if name == tag]
-
-    @property
-    def text(self):
-        return " ".join(" ".join(self.words).split())
 
 
 @pytest.fixture
@@ -118,6 +89,25 @@ def test_a_page_is_accessible(plain):
     assert all(len(image["alt"]) > 40 for image in page.all("img"))
     assert len(page.all("table")) == len(page.all("caption"))
     assert [tag for tag, _ in page.tags if tag in ("h1", "main")] == ["main", "h1"]
+
+
+def test_each_cell_of_a_table_has_its_heading_as_label(report_on):
+    """On a narrow screen, where a row is a card, the label is the only heading."""
+    cases = {"base": {}, "bent": {"phantom.initial_bend_mm": 1.0}}
+    rows = make_rows((*BOTH, "ce-mpc"), cases, targets=TARGETS, repeats=4)
+    rows[0] = unfinished(rows[0])
+    tables = report_on(rows)[1].tables
+    assert len(tables) == 10
+    for table in tables.values():
+        assert len(table.labels) > 0
+        assert all(labels == table.headings for labels in table.labels)
+
+
+def test_a_label_is_the_heading_whatever_its_text(report_on, rows):
+    """The table of differences by depth has the names of the controllers as headings."""
+    tables = report_on([row | {"controller": EVIL} for row in rows[12:]] + rows[:12])[1].tables
+    (found,) = (table for caption, table in tables.items() if caption.startswith("By target depth"))
+    assert found.labels == [["target", EVIL]] * 3
 
 
 def rules(page):

@@ -16,6 +16,7 @@ from flexneedle.study.report.report import write_report
 from flexneedle.study.runner import _reach_points
 from flexneedle.study.tables import write_tables
 from flexneedle.trace.results import RESULT_COLUMNS
+from report_page import Page
 
 FREE, GUIDED = (15, 16, 31), (1, 2, 3, 4)
 STUDY = f"""
@@ -194,9 +195,16 @@ def test_the_page_has_the_table_and_the_figure(report):
     assert report.figures[0].name == "shares"
     assert "targeting" not in {drawn.name for drawn in report.figures}
     assert "perfect: 7 worlds; structure: 4 worlds" in report.figures[0].alt
-    row = re.search(
-        rf'{DEFAULT}</th><th scope="row">perfect</th><th scope="row">with a guide</th>(.*?)</tr>', text, re.S
-    )
-    cells = re.findall(r"<td>(.*?)</td>", row[1])
+    levels = "</th><th [^>]*>".join((DEFAULT, "perfect", "with a guide"))
+    row = re.search(rf"{levels}</th>(.*?)</tr>", text, re.S)
+    cells = re.findall(r"<td [^>]*>(.*?)</td>", row[1])
     assert cells[:4] == ["4", "3", "1", "0.500"]
     assert report.values()["worlds"][0]["levels"]["controller"] == DEFAULT
+
+
+def test_each_cell_of_the_tables_of_worlds_has_its_heading_as_label(report):
+    tables = Page(report.page).tables
+    for start in ("Errors, shares and energy", "Finished insertions. Covered"):
+        (found,) = (table for caption, table in tables.items() if caption.startswith(start))
+        assert len(found.labels) > 0
+        assert all(labels == found.headings for labels in found.labels)

@@ -1,11 +1,13 @@
 """The page of a report: one template filled with findings. All data are inserted as escaped text."""
 
 import base64
+import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.resources import files
+from itertools import cycle
 from math import isnan
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flexneedle.study.report import predictions, statistics, summary, worlds
 from flexneedle.study.report.figures import Drawn
@@ -16,8 +18,13 @@ from flexneedle.study.report.statistics import IntervalEstimate
 from flexneedle.study.report.times import division
 from flexneedle.trace.folder import STUDY_FILE
 
+if TYPE_CHECKING:
+    from markupsafe import Markup
+
 _LARGEST_SVG = 1_000_000  # bytes; larger figures are embedded as PNG
 _TEMPLATES = files("flexneedle.study.report")
+_HEADING = re.compile(r'<th scope="col"[^>]*>(.*?)</th>')
+_CELL = re.compile(r"<t[dh]\b")
 
 
 def page_text(
@@ -35,6 +42,7 @@ def page_text(
         "signed": signed_text,
         "interval": interval_text,
         "value": value_text,
+        "labelled": labelled,
     }
     environment.globals |= {"tuning_status": tuning_status, "image": image}
     template = environment.from_string((_TEMPLATES / "report.html.jinja").read_text(encoding="utf-8"))
@@ -99,6 +107,18 @@ def tuning_status(rows: Rows, tuned: Tuning) -> str:
     """Return as text whether a study uses the settings chosen by tuning."""
     other = [key for key, chosen in tuned.chosen.items() if set(rows.values(key)) != {chosen}]
     return "used" if not other else f"different: {', '.join(other)}"
+
+
+def labelled(table: str) -> "Markup":
+    """Return head and body of a table with the heading of its column as `data-label` of each cell of the body.
+
+    On a narrow screen, where a row is a card, the label is beside the value.
+    """
+    from markupsafe import Markup
+
+    head, end, body = str(table).partition("</thead>")
+    headings = cycle(_HEADING.findall(head))
+    return Markup(head + end + _CELL.sub(lambda cell: f'{cell[0]} data-label="{next(headings)}"', body))
 
 
 def image(drawn: Drawn) -> str:
