@@ -63,10 +63,10 @@ def _workers(text: str) -> int:
 def _study(args: argparse.Namespace) -> int:
     from flexneedle.console.progress import Progress
     from flexneedle.errors import InputError, RunError
+    from flexneedle.files import new_folder
     from flexneedle.study.grid import load_study
     from flexneedle.study.pools import check_address
     from flexneedle.study.runner import run_study
-    from flexneedle.trace.files import new_folder
 
     if args.resume and args.out is None:
         raise InputError("--resume needs the folder of the study: add --out DIR")

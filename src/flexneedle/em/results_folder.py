@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from flexneedle.errors import InputError
-from flexneedle.trace.files import new_folder
+from flexneedle.files import new_folder
 
 
 def results_folder(out: Path | None, name: str, results: Iterable[str]) -> Path:

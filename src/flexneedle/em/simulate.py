@@ -13,12 +13,12 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from flexneedle.errors import InputError
+from flexneedle.files import replace_file
 from flexneedle.rig.tracking.field.room import REFERENCES, Room, grid
 from flexneedle.rig.tracking.field.sensors import Noiseless, SensorReadings, noiseless, noisy
 from flexneedle.rig.tracking.quaternion import along, z_axis
 from flexneedle.rig.tracking.table import COLUMNS, REFERENCE, TIP
 from flexneedle.scenario.sections.environment import Environment
-from flexneedle.trace.files import replace_file
 
 Floats = NDArray[np.float64]
 SUFFIXES = (".csv", ".parquet")

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
+
+from flexneedle.files import replace_file
 
 WIDTH = 9.0  # inches; shown 900 pixels wide, a point is 1.4 pixels
 
@@ -90,7 +93,7 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     with styled():
         settle(figure)
         for path, metadata in zip(paths, plain, strict=True):
-            draft = path.with_name(f".{path.name}")
-            figure.savefig(draft, format=path.suffix[1:], dpi=200, metadata=metadata)
-            draft.replace(path)
+            sink = BytesIO()
+            figure.savefig(sink, format=path.suffix[1:], dpi=200, metadata=metadata)
+            replace_file(path, sink.getvalue())
     return paths

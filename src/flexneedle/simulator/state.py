@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass, replace
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 from zipfile import BadZipFile
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.errors import StateError
+from flexneedle.files import replace_file
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.model import CONTACT, Model, Nodes
 from flexneedle.mechanics.shape import beam_energy, equal_arc_nodes
@@ -191,8 +193,9 @@ class State:
 
     def save(self, path: str | Path) -> None:
         """Write the state to `path` (NumPy npz); load it with `Simulator.load`."""
-        with Path(path).open("wb") as file:
-            np.savez(file, scenario=np.array(json.dumps(self.scenario.values())), **self._arrays())
+        sink = BytesIO()
+        np.savez(sink, scenario=np.array(json.dumps(self.scenario.values())), **self._arrays())
+        replace_file(Path(path), sink.getvalue())
 
     def _arrays(self) -> dict[str, Any]:
         return {

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
+from flexneedle.files import replace_file
 from flexneedle.scenario.dotted import flatten
 from flexneedle.scenario.problems import printable
 from flexneedle.study.grid import Study
 from flexneedle.study.journal import Journal
-from flexneedle.trace.files import replace_file
 from flexneedle.trace.folder import STUDY_FILE, versions
 from flexneedle.trace.plain import to_text
 

@@ -10,9 +10,9 @@ from types import TracebackType
 from typing import Any, Self
 
 from flexneedle.errors import InputError
+from flexneedle.files import uninterrupted
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.study.rows import TIMES
-from flexneedle.trace.files import uninterrupted
 from flexneedle.trace.results import RESULT_COLUMNS
 
 _KINDS = {name: column.kind for name, column in RESULT_COLUMNS.items()} | TIMES

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
+from flexneedle.files import replace_file
 from flexneedle.planning.origin import PLANNER_INPUTS
 from flexneedle.study.grid import GridPoint
 from flexneedle.study.rows import PlanResult
-from flexneedle.trace.files import replace_file
 from flexneedle.trace.plain import plan_from_values, to_text
 from flexneedle.types import Plan
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from flexneedle.arguments import path, whole
 from flexneedle.errors import InputError, RunError
+from flexneedle.files import new_folder
 from flexneedle.rig.kernels import compile_kernels
 from flexneedle.study import pools
 from flexneedle.study.folder import PLANS_FOLDER, open_folder
@@ -20,7 +21,6 @@ from flexneedle.study.journal import Journal
 from flexneedle.study.plans import Plans, plan_key, truth_key
 from flexneedle.study.rows import Job, JobResult, PlanResult, make_plan, run_job
 from flexneedle.study.tables import write_tables
-from flexneedle.trace.files import new_folder
 from flexneedle.trace.folder import versions
 
 _Pending = dict[str, list[tuple[GridPoint, tuple[tuple[int, int], ...]]]]

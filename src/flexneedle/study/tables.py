@@ -7,10 +7,10 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from flexneedle.files import replace_file
 from flexneedle.study.grid import Study, StudyInsertion
 from flexneedle.study.plans import Plans, plan_key, truth_key
 from flexneedle.study.rows import TIMES
-from flexneedle.trace.files import replace_file
 from flexneedle.trace.folder import versions
 from flexneedle.trace.results import RESULT_COLUMNS
 

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError, ScenarioError
+from flexneedle.files import new_folder, replace_file
 from flexneedle.scenario.model import Scenario
-from flexneedle.trace.files import new_folder, replace_file
 from flexneedle.trace.plain import plan_from_values, plan_values, to_text
 from flexneedle.types import Plan
 

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from mcap.writer import CompressionType, Writer
 
-from flexneedle.trace.files import uninterrupted
+from flexneedle.files import uninterrupted
 from flexneedle.trace.messages import STORE
 from flexneedle.trace.topics import LATCHED, TOPICS, TopicMessage, period_messages, plan_message
 from flexneedle.types import Period, Plan

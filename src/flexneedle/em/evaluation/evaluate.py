@@ -26,8 +26,8 @@ from flexneedle.em.table.grid import Grid
 from flexneedle.em.table.grids import read_grids
 from flexneedle.em.table.source import open_table
 from flexneedle.errors import InputError
+from flexneedle.files import replace_file
 from flexneedle.rig.tracking.table import OPTIONAL, REFERENCE, REQUIRED
-from flexneedle.trace.files import replace_file
 from flexneedle.trace.plain import to_text
 
 _RESULT_FILE = "evaluation.json"

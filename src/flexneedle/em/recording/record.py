@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from flexneedle.em.recording.grid import StageGrid, Stop
 from flexneedle.em.recording.steps import Visit, motion_mismatch
 from flexneedle.errors import InputError, RunError
+from flexneedle.files import uninterrupted
 from flexneedle.rig.ports import Clock, Tracker
 from flexneedle.rig.tracking.table import COLUMNS
-from flexneedle.trace.files import uninterrupted
 from flexneedle.types import VISIBLE, Frame, Point, SensorReading
 
 EXTRA = ("time_s", "frame_number", "repeat")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
+from flexneedle.files import replace_file
 from flexneedle.study.report.figures import Drawn, draw_figures
 from flexneedle.study.report.findings import Findings, findings_of
 from flexneedle.study.report.page import page_text
@@ -57,7 +58,7 @@ def write_report(folder: Path, out: Path | None = None, tuning: Path | None = No
         found_commands = commands(findings.study.rows, listed, target)
         figures = draw_figures(findings, target)
         page = target / REPORT_FILE
-        page.write_text(page_text(findings, figures, found_commands, tuned), encoding="utf-8", newline="\n")
+        replace_file(page, page_text(findings, figures, found_commands, tuned).encode())
     except OSError as error:
         raise InputError(f"{target}: cannot be written: {error.strerror}") from None
     return Report(page, figures, findings, found_commands)

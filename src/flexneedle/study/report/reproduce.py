@@ -8,6 +8,7 @@ from typing import Any
 
 from flexneedle.control.methods import checked
 from flexneedle.errors import ScenarioError
+from flexneedle.files import replace_file
 from flexneedle.rig.parts import is_own
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.model import Scenario
@@ -38,7 +39,7 @@ def commands(rows: Rows, listed: Iterable[int], folder: Path) -> dict[int, str]:
             sources.setdefault(_without_target(checked(load_scenario(name))), name)
         if key not in sources:
             sources[key] = f"scenario-{next(numbers)}.toml"
-            (folder / sources[key]).write_text(dump_scenario(scenario), encoding="utf-8", newline="\n")
+            replace_file(folder / sources[key], dump_scenario(scenario).encode())
         found[row] = _command(rows, row, sources[key])
     return found
 

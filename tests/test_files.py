@@ -1,0 +1,61 @@
+"""A file is complete at any time, and Ctrl-C is delayed until a record is complete."""
+
+import os
+import signal
+
+import pytest
+
+import flexneedle
+from flexneedle.figures.style import new_figure, save
+from flexneedle.files import replace_file, uninterrupted
+
+
+def write_bytes(folder):
+    replace_file(folder / "file", b"data")
+
+
+def write_figure(folder):
+    save(new_figure(1.0), folder, "figure")
+
+
+def write_state(folder):
+    flexneedle.Simulator("phantom").start().save(folder / "state.npz")
+
+
+@pytest.mark.parametrize("write", [write_bytes, write_figure, write_state])
+def test_a_file_is_the_old_one_until_the_new_one_is_complete(tmp_path, monkeypatch, write):
+    write(tmp_path)
+    written = {path: path.stat().st_size for path in tmp_path.iterdir()}
+    for path in written:
+        path.write_bytes(b"old")
+
+    def full(_number):
+        raise OSError("No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space left"):
+            write(tmp_path)
+    assert {path.read_bytes() for path in written} == {b"old"}
+    write(tmp_path)
+    assert {path: path.stat().st_size for path in tmp_path.iterdir()} == written
+
+
+def test_an_interrupt_is_raised_after_the_block():
+    done = []
+
+    def interrupted_block():
+        with uninterrupted():
+            signal.raise_signal(signal.SIGINT)
+            done.append("block")
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_block()
+    assert done == ["block"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_without_an_interrupt_nothing_happens():
+    with uninterrupted():
+        pass
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
