@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 
 import flexneedle
 from flexneedle.control.methods import METHODS, checked
-from flexneedle.study.report.reading import read_tuning
+from flexneedle.study.findings.reading import read_tuning
 from flexneedle.trace.plain import to_text
 
 SCRIPT = Path(__file__).resolve().parents[1] / "studies" / "tune.py"

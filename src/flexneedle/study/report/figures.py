@@ -19,11 +19,11 @@ from flexneedle.study.figures.samples import Sample
 from flexneedle.study.figures.shares import share_figure
 from flexneedle.study.figures.sweeps import sweep_figure
 from flexneedle.study.figures.targeting import Tips, targeting_figure
-from flexneedle.study.report.design import Factor, controllers_in_order
-from flexneedle.study.report.findings import Findings
-from flexneedle.study.report.rows import Flags
-from flexneedle.study.report.summary import Difference, depths, finished
-from flexneedle.study.report.worlds import failures
+from flexneedle.study.findings.design import Factor, controllers_in_order
+from flexneedle.study.findings.findings import Findings
+from flexneedle.study.findings.rows import Flags
+from flexneedle.study.findings.summary import Difference, depths, finished
+from flexneedle.study.findings.worlds import failures
 
 _MOST_LEVELS = 40  # of an axis in a figure
 _LOGARITHMIC = "Errors are on a logarithmic scale."

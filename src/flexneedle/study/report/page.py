@@ -9,13 +9,13 @@ from itertools import cycle
 from math import isnan
 from typing import TYPE_CHECKING, Any
 
-from flexneedle.study.report import predictions, statistics, summary, worlds
+from flexneedle.study.findings import predictions, statistics, summary, worlds
+from flexneedle.study.findings.findings import Findings
+from flexneedle.study.findings.reading import Tuning
+from flexneedle.study.findings.rows import Rows
+from flexneedle.study.findings.statistics import IntervalEstimate
+from flexneedle.study.findings.times import division
 from flexneedle.study.report.figures import Drawn
-from flexneedle.study.report.findings import Findings
-from flexneedle.study.report.reading import Tuning
-from flexneedle.study.report.rows import Rows
-from flexneedle.study.report.statistics import IntervalEstimate
-from flexneedle.study.report.times import division
 from flexneedle.trace.folder import STUDY_FILE
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ from typing import Any
 
 from flexneedle.errors import InputError
 from flexneedle.files import replace_file
+from flexneedle.study.findings.findings import Findings, findings_of
+from flexneedle.study.findings.reading import read_study_folder, read_tuning
 from flexneedle.study.report.figures import Drawn, draw_figures
-from flexneedle.study.report.findings import Findings, findings_of
 from flexneedle.study.report.page import page_text
-from flexneedle.study.report.reading import read_study_folder, read_tuning
 from flexneedle.study.report.reproduce import commands
 
 REPORT_FILE = "report.html"

@@ -14,7 +14,7 @@ from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.preset import PRESETS
 from flexneedle.scenario.worlds import world_name
-from flexneedle.study.report.rows import Rows
+from flexneedle.study.findings.rows import Rows
 
 _SECTIONS = frozenset(Scenario.model_fields)
 _OPTIONS = {"--controller": "controller", "--phantom": "plant", "--strategy": "strategy"}

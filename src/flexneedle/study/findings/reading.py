@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from flexneedle.errors import InputError
 from flexneedle.scenario.problems import describe
-from flexneedle.study.report.rows import Rows
+from flexneedle.study.findings.rows import Rows
 from flexneedle.study.tables import RUNS_FILE, TIMING_FILE
 from flexneedle.trace.folder import STUDY_FILE
 

@@ -5,10 +5,10 @@ from math import nan
 
 import numpy as np
 
-from flexneedle.study.report.design import Design
-from flexneedle.study.report.rows import Flags, Floats, Rows
-from flexneedle.study.report.summary import HIT_MM, finished, members_of
-from flexneedle.study.report.worlds import mean_of
+from flexneedle.study.findings.design import Design
+from flexneedle.study.findings.rows import Flags, Floats, Rows
+from flexneedle.study.findings.summary import HIT_MM, finished, members_of
+from flexneedle.study.findings.worlds import mean_of
 from flexneedle.trace.results import DEPTH_FRACTIONS
 
 # A normal miss is within ± this many standard deviations with a probability of 95 %.

@@ -5,7 +5,7 @@ from math import nan
 
 import numpy as np
 
-from flexneedle.study.report.rows import Floats, Rows
+from flexneedle.study.findings.rows import Floats, Rows
 
 
 @dataclass(frozen=True)

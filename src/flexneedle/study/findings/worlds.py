@@ -5,9 +5,9 @@ from math import nan
 
 import numpy as np
 
-from flexneedle.study.report.design import Design
-from flexneedle.study.report.rows import Codes, Flags, Floats, Rows
-from flexneedle.study.report.summary import HIT_MM, finished, members_of, pair_keys, quotient
+from flexneedle.study.findings.design import Design
+from flexneedle.study.findings.rows import Codes, Flags, Floats, Rows
+from flexneedle.study.findings.summary import HIT_MM, finished, members_of, pair_keys, quotient
 from flexneedle.study.summary import is_failure
 
 _OPEN_LOOP = "open-loop"

@@ -8,9 +8,9 @@ from math import isnan, nan
 
 import numpy as np
 
-from flexneedle.study.report.design import Design, Factor
-from flexneedle.study.report.rows import Codes, Flags, Floats, Rows
-from flexneedle.study.report.statistics import (
+from flexneedle.study.findings.design import Design, Factor
+from flexneedle.study.findings.rows import Codes, Flags, Floats, Rows
+from flexneedle.study.findings.statistics import (
     IntervalEstimate,
     beyond_largest,
     estimates,

@@ -9,8 +9,8 @@ import numpy as np
 
 from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.scenario.sections.needle import GAUGES
-from flexneedle.study.report.reading import StudyDefinition
-from flexneedle.study.report.rows import Codes, Floats, Rows
+from flexneedle.study.findings.reading import StudyDefinition
+from flexneedle.study.findings.rows import Codes, Floats, Rows
 
 _SAMPLED = frozenset({"controller", "seed", "plan_seed", "world"})
 """Axes that are not factors: the controller is a factor of every study, the others only sample insertions."""

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from flexneedle.study.report.statistics import beyond_largest, estimates, mean, quantile, ratio, sd
+from flexneedle.study.findings.statistics import beyond_largest, estimates, mean, quantile, ratio, sd
 
 VALUES = np.array([3.0, 1.0, np.nan, 2.0, 6.0])
 ONCE = np.ones((1, 5), dtype=np.int64)
@@ -110,7 +110,7 @@ def test_same_rows_same_interval():
 def test_samples_in_chunks_are_the_same_samples(monkeypatch):
     values = np.random.default_rng(7).normal(size=50)
     whole = estimates({"m": mean(values), "q": quantile(values, 0.95)}, own(50))
-    monkeypatch.setattr("flexneedle.study.report.statistics._CHUNK", 1000)
+    monkeypatch.setattr("flexneedle.study.findings.statistics._CHUNK", 1000)
     assert estimates({"m": mean(values), "q": quantile(values, 0.95)}, own(50)) == whole
 
 

@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from flexneedle.scenario.files import load_scenario
-from flexneedle.study.report.design import column_label, design_of
-from flexneedle.study.report.reading import read_study_folder
+from flexneedle.study.findings.design import column_label, design_of
+from flexneedle.study.findings.reading import read_study_folder
 from study_rows import BASE, OURS, make_rows, write_study
 
 TARGETS = ((25.0, 0.0), (40.0, 5.0))

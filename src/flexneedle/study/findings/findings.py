@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from flexneedle.study.report.design import Design, design_of
-from flexneedle.study.report.predictions import Predictions, predictions_of
-from flexneedle.study.report.reading import StudyRecord
-from flexneedle.study.report.statistics import CONFIDENCE, RESAMPLES, SEED
-from flexneedle.study.report.summary import (
+from flexneedle.study.findings.design import Design, design_of
+from flexneedle.study.findings.predictions import Predictions, predictions_of
+from flexneedle.study.findings.reading import StudyRecord
+from flexneedle.study.findings.statistics import CONFIDENCE, RESAMPLES, SEED
+from flexneedle.study.findings.summary import (
     DONE,
     Difference,
     Ending,
@@ -21,7 +21,7 @@ from flexneedle.study.report.summary import (
     groups_of,
     worst,
 )
-from flexneedle.study.report.worlds import WorldGroup, has_worlds, world_groups
+from flexneedle.study.findings.worlds import WorldGroup, has_worlds, world_groups
 
 _MOST_KINDS = 20  # of endings in the list
 

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from flexneedle.study.report.design import design_of
-from flexneedle.study.report.reading import read_study_folder
-from flexneedle.study.report.summary import (
+from flexneedle.study.findings.design import design_of
+from flexneedle.study.findings.reading import read_study_folder
+from flexneedle.study.findings.summary import (
     case_differences,
     controller_differences,
     endings,

@@ -1,0 +1,1 @@
+"""The findings on a study: its rows, read and checked, and their statistics."""
