@@ -5,18 +5,18 @@ import struct
 import pytest
 
 from flexneedle.rig.emulator import aurora, codec
-from flexneedle.rig.emulator.aurora import Snapshot, fresh
+from flexneedle.rig.emulator.aurora import EmulatedFrame, fresh
 from flexneedle.rig.emulator.motion import SENSORS, pose
 
-SNAPSHOT = Snapshot(7, {name: pose(name, 7, 0) for name in SENSORS})
+FRAME = EmulatedFrame(7, {name: pose(name, 7, 0) for name in SENSORS})
 
 
-def send(device, *commands, snapshot=SNAPSHOT):
+def send(device, *commands, frame=FRAME):
     """Send commands; return the device and the last reply without checksum and end."""
     reply = b""
     for command in commands:
         line = command.encode() + b"%04X" % codec.crc16(command.encode())
-        device, reply = aurora.reply(device, line, snapshot)
+        device, reply = aurora.reply(device, line, frame)
     return device, reply if reply.startswith(b"\xc4\xa5") else reply[:-5].decode()
 
 
@@ -85,7 +85,7 @@ def test_a_sensor_must_be_initialised_before_it_is_enabled():
 
 
 def test_a_command_with_a_wrong_checksum_is_rejected():
-    assert aurora.reply(fresh(), b"INIT:0000", SNAPSHOT)[1] == codec.text("ERROR04")
+    assert aurora.reply(fresh(), b"INIT:0000", FRAME)[1] == codec.text("ERROR04")
 
 
 def test_set_up_commands_are_invalid_while_tracking_until_init():
@@ -103,13 +103,13 @@ def test_old_firmware_does_not_support_bx():
 
 def test_a_reading_in_text_has_pose_status_and_frame_number():
     _, reply = send(set_up(1), "TSTART:", "TX:0001")
-    assert reply == f"010A{codec.transform_text(SNAPSHOT.poses['tip'])}0000003100000007\n0000"
+    assert reply == f"010A{codec.transform_text(FRAME.poses['tip'])}0000003100000007\n0000"
 
 
 def faulty(fault, command):
     """Return the reading of a single sensor with a fault."""
-    snapshot = Snapshot(7, SNAPSHOT.poses, {"tip": fault})
-    return send(set_up(1), "TSTART:", command, snapshot=snapshot)[1]
+    frame = EmulatedFrame(7, FRAME.poses, {"tip": fault})
+    return send(set_up(1), "TSTART:", command, frame=frame)[1]
 
 
 @pytest.mark.parametrize(
@@ -140,5 +140,5 @@ def test_a_binary_reading_omits_missing_values():
 @pytest.mark.parametrize("read", ["TX", "BX"])
 def test_the_system_status_is_at_the_end_of_a_reading(read):
     device, _ = send(set_up(1), "TSTART:")
-    _, reply = send(device, f"{read}:0801", snapshot=Snapshot(7, SNAPSHOT.poses, system=0x21))
+    _, reply = send(device, f"{read}:0801", frame=EmulatedFrame(7, FRAME.poses, system=0x21))
     assert reply.endswith("0021") if read == "TX" else reply[-4:-2] == b"\x21\0"

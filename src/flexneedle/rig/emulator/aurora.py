@@ -53,8 +53,8 @@ class AuroraState:
 
 
 @dataclass(frozen=True)
-class Snapshot:
-    """Values for a reading: frame number, poses by sensor, faults by sensor, and bits of the system status."""
+class EmulatedFrame:
+    """A frame of the emulated tracker: number, poses by sensor, faults by sensor, and bits of the system status."""
 
     number: int
     poses: Mapping[str, EmulatedPose]
@@ -72,18 +72,18 @@ def fresh(sensors: int = len(SENSORS), firmware: str = FIRMWARE, *, has_bx: bool
     return AuroraState(ports, firmware=firmware, has_bx=has_bx)
 
 
-def reply(aurora: AuroraState, line: bytes, snapshot: Snapshot) -> tuple[AuroraState, bytes]:
+def reply(aurora: AuroraState, line: bytes, frame: EmulatedFrame) -> tuple[AuroraState, bytes]:
     """Return the state after a command (a line without its end) and the complete reply."""
     command = codec.parse(line)
     try:
         if not command.intact:
             raise _Refusal("04")
-        return _execute(aurora, command, snapshot)
+        return _execute(aurora, command, frame)
     except _Refusal as refusal:
         return aurora, codec.text(f"ERROR{refusal}")
 
 
-def _execute(aurora: AuroraState, command: Request, snapshot: Snapshot) -> tuple[AuroraState, bytes]:
+def _execute(aurora: AuroraState, command: Request, frame: EmulatedFrame) -> tuple[AuroraState, bytes]:
     if command.name in _ANYWHERE:
         return _ANYWHERE[command.name](aurora, command.arguments)
     supported = command.name in _SET_UP or command.name in ("TX", "TSTOP") or _is_bx(aurora, command.name)
@@ -97,7 +97,7 @@ def _execute(aurora: AuroraState, command: Request, snapshot: Snapshot) -> tuple
         return _SET_UP[command.name](aurora, command.arguments)
     if command.name == "TSTOP":
         return replace(aurora, mode=_SETUP), codec.text("OKAY")
-    return aurora, (_tx if command.name == "TX" else _bx)(aurora, _options(command.arguments), snapshot)
+    return aurora, (_tx if command.name == "TX" else _bx)(aurora, _options(command.arguments), frame)
 
 
 def _is_bx(aurora: AuroraState, name: str) -> bool:
@@ -303,42 +303,42 @@ _SET_UP: dict[str, _Handler] = {
 # Readings
 
 
-def _tx(aurora: AuroraState, options: int, snapshot: Snapshot) -> bytes:
-    rows = [(handle, *_reading(port, options, snapshot)) for handle, port in _reported(aurora)]
+def _tx(aurora: AuroraState, options: int, frame: EmulatedFrame) -> bytes:
+    rows = [(handle, *_reading(port, options, frame)) for handle, port in _reported(aurora)]
     words = {_MISSING: "MISSING", _DISABLED: "DISABLED"}
     readings = "".join(
-        f"{handle:02X}{words[kind] if pose is None else codec.transform_text(pose)}{bits:08X}{snapshot.number:08X}\n"
+        f"{handle:02X}{words[kind] if pose is None else codec.transform_text(pose)}{bits:08X}{frame.number:08X}\n"
         for handle, kind, bits, pose in rows
     )
-    return codec.text(f"{len(rows):02X}{readings}{snapshot.system:04X}")
+    return codec.text(f"{len(rows):02X}{readings}{frame.system:04X}")
 
 
-def _bx(aurora: AuroraState, options: int, snapshot: Snapshot) -> bytes:
+def _bx(aurora: AuroraState, options: int, frame: EmulatedFrame) -> bytes:
     body = bytearray([len(_reported(aurora))])
     for handle, port in _reported(aurora):
-        kind, bits, pose = _reading(port, options, snapshot)
+        kind, bits, pose = _reading(port, options, frame)
         body += bytes((handle, kind))
         if kind == _DISABLED:
             continue  # no further data
         body += b"" if pose is None else codec.transform_binary(pose)
-        body += bits.to_bytes(4, "little") + snapshot.number.to_bytes(4, "little")
-    return codec.binary(bytes(body) + snapshot.system.to_bytes(2, "little"))
+        body += bits.to_bytes(4, "little") + frame.number.to_bytes(4, "little")
+    return codec.binary(bytes(body) + frame.system.to_bytes(2, "little"))
 
 
 def _reported(aurora: AuroraState) -> list[tuple[int, Port]]:
     return [(handle, port) for handle, port in aurora.ports.items() if port.initialized]
 
 
-def _reading(port: Port, options: int, snapshot: Snapshot) -> tuple[int, int, EmulatedPose | None]:
+def _reading(port: Port, options: int, frame: EmulatedFrame) -> tuple[int, int, EmulatedPose | None]:
     """Return handle status, port status and pose, None if there is none."""
-    fault = snapshot.faults.get(port.sensor or "")
+    fault = frame.faults.get(port.sensor or "")
     bits = port.status | _FAULT_BITS.get(fault or "", 0)
     if not port.enabled or fault == "disabled":
         return _DISABLED, bits & ~_ENABLED, None
     hidden = fault == "out-of-volume" and not options & _ALSO_OUT_OF_VOLUME
     if fault in ("missing", "broken") or hidden:
         return _MISSING, bits, None
-    return _VALID, bits, snapshot.poses[port.sensor or ""]
+    return _VALID, bits, frame.poses[port.sensor or ""]
 
 
 _FAULT_BITS = {"out-of-volume": _OUT_OF_VOLUME, "partly-out": _PARTLY_OUT, "broken": _BROKEN}

@@ -16,7 +16,7 @@ import numpy as np
 
 from flexneedle.errors import InputError
 from flexneedle.rig.emulator import aurora, codec
-from flexneedle.rig.emulator.aurora import AuroraState, Snapshot
+from flexneedle.rig.emulator.aurora import AuroraState, EmulatedFrame
 from flexneedle.rig.emulator.faults import Fault, active
 from flexneedle.rig.emulator.motion import RATE_HZ, SENSORS, pose
 from flexneedle.rig.emulator.orders import Orders, parse_position
@@ -58,20 +58,20 @@ class EmulatorSession:
             return now, b""
         if "error" in faults:
             return now, codec.text(f"ERROR{faults['error'].detail}")
-        self.device, complete = aurora.reply(self.device, line, self._snapshot(now, faults))
+        self.device, complete = aurora.reply(self.device, line, self._frame(now, faults))
         if self.device.mode == "tracking" and self.tracked_since is None:
             self.tracked_since = now
         delay = float(faults["delay"].detail) if "delay" in faults else 0.0
         return now + delay, self._damaged(complete, faults)
 
-    def _snapshot(self, now: float, faults: dict[str, Fault]) -> Snapshot:
+    def _frame(self, now: float, faults: dict[str, Fault]) -> EmulatedFrame:
         if "frozen" in faults and self.tracked_since is not None:
             now = self.tracked_since + faults["frozen"].start
         number = int((now - self.power_on) * RATE_HZ) & 0xFFFF_FFFF
         present = () if self.tracked_since is None else active(self.faults, now - self.tracked_since)
         by_sensor = {fault.detail: fault.kind for fault in present if fault.detail in SENSORS}
         poses = {name: pose(name, number, self.seed, self.rest) for name in SENSORS}
-        return Snapshot(
+        return EmulatedFrame(
             number, poses, by_sensor, int(faults["system"].detail, 16) if "system" in faults else 0
         )
 
