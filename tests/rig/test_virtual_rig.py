@@ -30,6 +30,20 @@ def test_the_virtual_rig_depends_on_its_seed():
     assert 0.0 < np.abs(error).max() < 0.2
 
 
+@pytest.mark.parametrize("environment", [None, "noisy"])
+def test_measurements_are_plain_numbers(environment):
+    """So that they print as numbers: before the first motion, in motion and at rest."""
+    rig = rig_of(**{"tracker__environment": environment} if environment else {})
+    samples = [*rig.tracker.read()]
+    rig.driver.apply((1.0, 0.0, 0.0, 0.0, -1), 0.2)
+    rig.clock.wait(0.2)
+    samples += rig.tracker.read()
+    measured = [sample for sample in samples if sample.x is not None]
+    assert {type(value) for sample in measured for value in (sample.time, sample.x, sample.y)} == {float}
+    assert "np." not in repr(samples)
+    assert "np." not in repr([sample.frame.readings for sample in samples if sample.frame])
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_rigs_tracker_has_the_bias_of_the_scenario(seed):
     """0.3 mm in one direction, the same for all readings; the recorded truth is without it."""

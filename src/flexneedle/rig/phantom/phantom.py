@@ -33,7 +33,7 @@ class Phantom:
         self._remainder = np.zeros(4)  # of all commands after rounding to motor steps
         self._time = 0.0
         self._least_stretch = 1.0
-        self._path = [(0.0, *self._tip())]  # time, x, y, slope
+        self._path = [(0.0, *self._tip().tolist())]  # time, x, y, slope
 
     def condition(self) -> Condition:
         """The true state, for the record only; not available to controllers."""
@@ -46,7 +46,7 @@ class Phantom:
     def wait(self, seconds: float) -> None:
         """Wait with the needle at rest."""
         self._time += seconds
-        self._path.append((self._time, *self._tip()))
+        self._path.append((self._time, *self._tip().tolist()))
 
     def apply(self, command: Command, duration: float) -> Command:
         """Execute `command` at constant velocity within `duration` s, in steps of at most `phantom.step_mm`.
@@ -60,7 +60,7 @@ class Phantom:
         for k in range(parts):
             self._plant.step(np.append(row[:4] / parts, row[4] if k == 0 else -1.0))
             self._least_stretch = min(self._least_stretch, self._plant.least_stretch)
-            self._path.append((self._time + duration * (k + 1) / parts, *self._tip()))
+            self._path.append((self._time + duration * (k + 1) / parts, *self._tip().tolist()))
         self._moved += row[:4]
         self._time += duration
         db_x, db_y, db_theta, dg_y = row[:4].tolist()
