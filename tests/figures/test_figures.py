@@ -34,6 +34,15 @@ def figure(insertion):
     return insertion_figure(PHANTOM, insertion)
 
 
+@pytest.fixture(scope="module")
+def saved(insertion, tmp_path_factory):
+    """The saved figures of an insertion and its plan: the folder, and the figure of the insertion."""
+    folder, figure = tmp_path_factory.mktemp("saved"), insertion_figure(PHANTOM, insertion)
+    save(figure, folder, "insertion")
+    save(plan_figure(PHANTOM, [insertion.plan]), folder, "plan")
+    return folder, figure
+
+
 def texts(figure):
     found = (text.get_text().strip() for text in figure.findobj(Text) if text.get_visible())
     return [text for text in found if text]
@@ -63,7 +72,7 @@ def invisible_ticks(figure):
 def overlapping(figure):
     """Return pairs of visible texts whose boxes overlap, and texts that leave the figure."""
     renderer = figure.canvas.get_renderer()
-    figure.draw(renderer)
+    figure.draw_without_rendering()
     unmeasured = invisible_ticks(figure)
     shown = [
         t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and t not in unmeasured
@@ -505,30 +514,24 @@ def test_both_plans_are_in_one_figure_with_terms_and_angles():
     assert [bar.get_width() for bar in cost.containers[1]] == list(plans[1].terms.values())
 
 
-def test_the_same_data_give_the_same_bytes(tmp_path, insertion):
-    first, second = tmp_path / "first", tmp_path / "second"
-    for folder in (first, second):
-        folder.mkdir()
-        save(insertion_figure(PHANTOM, insertion), folder, "insertion")
-        save(plan_figure(PHANTOM, [insertion.plan]), folder, "plan")
-    names = sorted(path.name for path in first.iterdir())
+def test_the_same_data_give_the_same_bytes(tmp_path, saved, insertion):
+    save(insertion_figure(PHANTOM, insertion), tmp_path, "insertion")
+    save(plan_figure(PHANTOM, [insertion.plan]), tmp_path, "plan")
+    names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["insertion.png", "insertion.svg", "plan.png", "plan.svg"]
-    assert all((first / name).read_bytes() == (second / name).read_bytes() for name in names)
+    assert all((saved[0] / name).read_bytes() == (tmp_path / name).read_bytes() for name in names)
 
 
-def test_settings_of_the_user_change_nothing(tmp_path, insertion):
-    save(insertion_figure(PHANTOM, insertion), tmp_path, "plain")
+def test_settings_of_the_user_change_nothing(tmp_path, saved, insertion):
     with matplotlib.rc_context({"font.size": 20.0, "axes.facecolor": "black", "svg.hashsalt": None}):
-        save(insertion_figure(PHANTOM, insertion), tmp_path, "changed")
+        paths = save(insertion_figure(PHANTOM, insertion), tmp_path, "insertion")
         assert matplotlib.rcParams["font.size"] == 20.0
-    assert (tmp_path / "plain.svg").read_bytes() == (tmp_path / "changed.svg").read_bytes()
-    assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "changed.png").read_bytes()
+    assert [path.read_bytes() for path in paths] == [(saved[0] / path.name).read_bytes() for path in paths]
 
 
-def test_what_is_saved_keeps_rounded_positions(tmp_path, insertion):
+def test_what_is_saved_keeps_rounded_positions(saved):
     """The layout solver's last digits differ between runs; they would show in the SVG's identifiers."""
-    figure = insertion_figure(PHANTOM, insertion)
-    save(figure, tmp_path, "insertion")
+    _, figure = saved
     found = np.array([ax.get_position(original=True).get_points() for ax in figure.axes])
     np.testing.assert_array_equal(found, np.round(found, 6))
     assert len(np.unique(found)) > 10

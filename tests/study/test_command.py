@@ -1,6 +1,5 @@
 """Messages and progress of `flexneedle study`."""
 
-import shutil
 from dataclasses import replace
 
 import pytest
@@ -42,8 +41,8 @@ def test_a_folder_with_too_long_a_name_is_bad_input(capsys, quick):
 
 
 @pytest.mark.parametrize("command", ["insert", "plan"])
-def test_no_run_is_written_to_the_folder_of_a_study(capsys, uninterrupted, tmp_path, command):
-    shutil.copy(uninterrupted / "study.json", tmp_path)
+def test_no_run_is_written_to_the_folder_of_a_study(capsys, tmp_path, command):
+    (tmp_path / "study.json").write_text("{}")
     status, out, err = run(capsys, command, "phantom", "--out", tmp_path)
     assert (status, out) == (2, "")
     assert err.splitlines()[-1].endswith("already contains a study (study.json): choose another folder")

@@ -153,19 +153,21 @@ def test_a_finished_study_is_not_repeated(quick, tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("in_threads")
 def test_a_resumed_study_does_not_repeat_its_plans(quick, tmp_path, monkeypatch):
-    made = []
+    """Of two cases with the same two targets; interrupted in the first case."""
+    made, study = [], tmp_path / "one-plant.toml"
+    study.write_text(quick.read_text().replace('values = "all"', 'values = ["model"]'))
     monkeypatch.setattr(runner, "make_plan", lambda point: made.append(point) or rows.make_plan(point))
 
     class StoppedError(Exception):
         pass
 
-    def stop_after_six(advance):
-        if advance.insertions == 6:
+    def stop_after_three(advance):
+        if advance.insertions == 3:
             raise StoppedError
 
     with pytest.raises(StoppedError):
-        run_study(quick, tmp_path / "a", on_advance=stop_after_six)
-    run_study(quick, tmp_path / "a", resume=True)
+        run_study(study, tmp_path / "a", on_advance=stop_after_three)
+    run_study(study, tmp_path / "a", resume=True)
     assert sorted(point.scenario.target.depth_mm for point in made) == [8.0, 10.0]
 
 

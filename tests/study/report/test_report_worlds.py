@@ -16,7 +16,7 @@ from flexneedle.study.report.report import write_report
 from flexneedle.study.runner import _reach_points
 from flexneedle.study.tables import write_tables
 from flexneedle.trace.results import RESULT_COLUMNS
-from report_page import Page
+from report_page import Page, save_nothing
 
 FREE, GUIDED = (15, 16, 31), (1, 2, 3, 4)
 STUDY = f"""
@@ -92,7 +92,9 @@ def report(tmp_path_factory):
     rows = {k: row_of(study, k, id(study.insertion(k).point) in bounding) for k in range(len(study))}
     write_tables(folder, study, rows, Plans(folder / "plans"))
     (folder / "study.json").write_text(json.dumps({"study": study.definition}))
-    return write_report(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("flexneedle.study.report.figures.save", save_nothing)
+        return write_report(folder)
 
 
 def group(report, controller, case, guide):

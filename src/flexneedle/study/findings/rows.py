@@ -1,6 +1,7 @@
 """Rows of a study by column, for the report."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,10 +22,10 @@ class Rows:
     def __len__(self) -> int:
         return int(self.table.num_rows)
 
-    @property
-    def names(self) -> list[str]:
+    @cached_property
+    def names(self) -> tuple[str, ...]:
         """Names of the columns."""
-        return list(self.table.column_names)
+        return tuple(self.table.column_names)
 
     def number(self, name: str) -> Floats:
         """Return a column as floats (n,), NaN where unknown or not a number."""

@@ -4,6 +4,7 @@ import base64
 import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import cache
 from importlib.resources import files
 from itertools import cycle
 from math import isnan
@@ -19,6 +20,7 @@ from flexneedle.study.report.figures import Drawn
 from flexneedle.trace.folder import STUDY_FILE
 
 if TYPE_CHECKING:
+    from jinja2 import Template
     from markupsafe import Markup
 
 _LARGEST_SVG = 1_000_000  # bytes; larger figures are embedded as PNG
@@ -31,23 +33,10 @@ def page_text(
     findings: Findings, figures: Sequence[Drawn], commands: Mapping[int, str], tuning: Sequence[Tuning] = ()
 ) -> str:
     """Return the page as HTML. commands: command of each listed row; tuning: tuning records of the controllers."""
-    from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters |= {
-        "number": number_text,
-        "signed": signed_text,
-        "interval": interval_text,
-        "value": value_text,
-        "labelled": labelled,
-    }
-    environment.globals |= {"tuning_status": tuning_status, "image": image}
-    template = environment.from_string((_TEMPLATES / "report.html.jinja").read_text(encoding="utf-8"))
     study = findings.study
-    return template.render(
+    return _template().render(
         style=Markup((_TEMPLATES / "report.css").read_text(encoding="utf-8")),
         found=findings,
         rows=study.rows,
@@ -61,6 +50,25 @@ def page_text(
         written=datetime.fromtimestamp((study.folder / STUDY_FILE).stat().st_mtime, UTC),
         limits=vars(worlds) | vars(summary) | vars(predictions) | vars(statistics),
     )
+
+
+@cache
+def _template() -> "Template":
+    """Return the compiled template with its filters and functions."""
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {
+        "number": number_text,
+        "signed": signed_text,
+        "interval": interval_text,
+        "value": value_text,
+        "labelled": labelled,
+    }
+    environment.globals |= {"tuning_status": tuning_status, "image": image}
+    return environment.from_string((_TEMPLATES / "report.html.jinja").read_text(encoding="utf-8"))
 
 
 def number_text(value: float, digits: int = 3, unit: str = "") -> str:
