@@ -1,10 +1,13 @@
 """An invalid argument is one line with value, rule and remedy, in all public functions."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import flexneedle
 from flexneedle.arguments import pair, whole
+from flexneedle.control.methods import METHODS
 from flexneedle.errors import FlexneedleError, InputError
 from flexneedle.scenario.files import dump_scenario
 from synthetic import make_plan
@@ -16,6 +19,10 @@ WHOLE = "must be a whole number, at least"
 CORES = "leave it out for one per core"
 TARGET = "must be two numbers, depth and lateral offset in mm"
 MAKE = "make one with flexneedle.plan(scenario)"
+OWN = "module:NAME of your own"
+MISSING = "name: missing\nneedle = 3: must be a table\nsetup: missing\ntissue: missing"
+VALUES = flexneedle.load_scenario("phantom").values()
+BENCH = SimpleNamespace(now=float, wait=float, apply=tuple, read=tuple, status="")
 
 
 @pytest.mark.parametrize(
@@ -59,6 +66,46 @@ MAKE = "make one with flexneedle.plan(scenario)"
             lambda: flexneedle.run("phantom", PLAN, "arm", np.random.default_rng(0)),
             "rig = 'arm': must be a Rig; Rig(clock, driver, tracker), parts as in flexneedle.rig.ports",
         ),
+        (
+            lambda: flexneedle.Rig(1, 2, 3),
+            "clock = 1: must be an object with now, wait; see flexneedle.rig.ports.Clock",
+        ),
+        (
+            lambda: flexneedle.Rig(BENCH, 2, 3),
+            "driver = 2: must be an object with apply; see flexneedle.rig.ports.Driver",
+        ),
+        (
+            lambda: flexneedle.Rig(BENCH, BENCH, SimpleNamespace(read=1)),
+            "tracker = namespace(read=1): must be an object with read, status; "
+            "see flexneedle.rig.ports.TipTracker",
+        ),
+        (
+            lambda: flexneedle.Rig(float, BENCH, BENCH),
+            "clock = <class 'float'>: must be an object with now, wait; see flexneedle.rig.ports.Clock",
+        ),
+        (
+            lambda: flexneedle.Rig(BENCH, BENCH, BENCH, 0.0),
+            "truth = 0.0: must be a function of () that returns a Condition, or None",
+        ),
+        (
+            lambda: flexneedle.insert("phantom", PLAN, tracker=3),
+            f"tracker = 3: must be one of scenario, {OWN}, or a function of (scenario, phantom, rng)",
+        ),
+        (
+            lambda: flexneedle.insert("phantom", PLAN, phantom={"exact": 1}),
+            f"phantom = {{'exact': 1}}: must be one of exact, model, {OWN}, or a function of (truth, bevel)",
+        ),
+        (
+            lambda: flexneedle.insert("phantom", PLAN, controller=3),
+            f"controller = 3: must be one of {', '.join(METHODS)}, {OWN}, or a flexneedle.Method, "
+            "missing: name, summary, decide",
+        ),
+        (lambda: flexneedle.Scenario(needle=3), MISSING),
+        (lambda: flexneedle.Scenario(**{**VALUES, "needle": 3}), "needle = 3: must be a table"),
+        (
+            lambda: flexneedle.Scenario(**{**VALUES, "target": {"depth_mm": "a", "lateral_mm": None}}),
+            'target.depth_mm = "a": must be a number\ntarget.lateral_mm: must be a number',
+        ),
     ],
 )
 def test_a_wrong_argument_is_one_line(call, line):
@@ -67,8 +114,20 @@ def test_a_wrong_argument_is_one_line(call, line):
     assert str(caught.value) == line
 
 
+def test_a_file_in_a_run_folder_is_rejected_with_the_folder(tmp_path):
+    run, stray = tmp_path / "run.json", tmp_path / "other" / "trace.mcap"
+    stray.parent.mkdir()
+    for file in (run, stray):
+        file.write_text("{}")
+    rule = "is a file: must be the folder of a run"
+    for file, line in ((run, f"{run}: {rule}, here {tmp_path}"), (stray, f"{stray}: {rule}")):
+        with pytest.raises(InputError) as caught:
+            flexneedle.load(file)
+        assert str(caught.value) == line
+
+
 def test_a_seed_in_place_of_a_generator_is_rejected(quick_plan):
-    rig = flexneedle.Rig(None, None, None)
+    rig = flexneedle.Rig(BENCH, BENCH, BENCH)
     with pytest.raises(
         InputError, match=r"^rng = 3: must be a Generator; such as numpy\.random\.default_rng\(0\)$"
     ):

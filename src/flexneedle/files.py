@@ -13,7 +13,7 @@ from types import FrameType
 
 from flexneedle.errors import InputError
 
-_RUNS = Path("runs")
+RUNS = Path("runs")
 _LONGEST_NAME = 60
 
 
@@ -53,14 +53,14 @@ def new_folder(*parts: str, now: datetime | None = None) -> Path:
     plain = (re.sub(r"[^\w.-]+", "-", part).strip("-.")[:_LONGEST_NAME] or "unnamed" for part in parts)
     opening = "-".join((f"{now or datetime.now(UTC):%Y%m%dT%H%M%SZ}", *plain))
     for number in count(1):
-        path = _RUNS / (opening if number == 1 else f"{opening}-{number}")
+        path = RUNS / (opening if number == 1 else f"{opening}-{number}")
         try:
             path.mkdir(parents=True)
         except FileExistsError:
-            if not _RUNS.is_dir():
-                raise InputError(f"{_RUNS}: is not a folder: choose another folder") from None
+            if not RUNS.is_dir():
+                raise InputError(f"{RUNS}: is not a folder: choose another folder") from None
             continue
         except OSError as error:
             raise InputError(f"{path}: cannot be created: {error.strerror}") from None
         return path
-    raise InputError(f"{_RUNS / opening}: no unused name")
+    raise InputError(f"{RUNS / opening}: no unused name")

@@ -5,8 +5,9 @@ import pytest
 from flexneedle.errors import ScenarioError
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.plausible import USUAL, doubts
+from flexneedle.scenario.preset import PRESETS
 from flexneedle.scenario.sections.needle import GAUGES
-from flexneedle.scenario.worlds import world
+from flexneedle.scenario.worlds import PERFECT, STRUCTURE, world
 
 PHANTOM = load_scenario("phantom")
 WITHOUT_A_GUIDE = "must be above 0; to go without a guide leave out setup.guide_to_skin_mm"
@@ -48,6 +49,46 @@ WITHOUT_A_GUIDE = "must be above 0; to go without a guide leave out setup.guide_
             "setup.insertion_speed_mm_s = 5000: 17.9 times the largest usual value, 1 to 280 (",
         ),
         (
+            {"tissue.0.alpha": -0.3},
+            "tissue[0].alpha = -0.3: 6.67 times below the smallest usual value, 2 to 40 (in size: ",
+        ),
+        (
+            {"tissue.0.compression_length_mm": 2000.0},
+            "tissue[0].compression_length_mm = 2000: 20 times the largest usual value, 5 to 100 (our estimate",
+        ),
+        (
+            {"tissue.0.engaged_width_mm": 0.0052},
+            "tissue[0].engaged_width_mm = 0.0052: 231 times below the smallest usual value, 1.2 to 70 (our estim",
+        ),
+        (
+            {"tissue.0.thickness_mm": 0.02},
+            "tissue[0].thickness_mm = 0.02: 3.75 times below the smallest usual value, 0.075 to 200 (epidermis ",
+        ),
+        (
+            {"needle.bevel.offset_mm": 0.004},
+            "needle.bevel.offset_mm = 0.004: 250 times below the smallest usual value, 1 to 14 (our estimate",
+        ),
+        (
+            {"needle.bevel.length_mm": 100.0},
+            "needle.bevel.length_mm = 100: 5.26 times the largest usual value, 0.1 to 19 (tubing of 0.18 to 3.4 ",
+        ),
+        (
+            {"setup.max_guide_travel_mm": 15000.0},
+            "setup.max_guide_travel_mm = 15000: 150 times the largest usual value, 1 to 100 (a robot ",
+        ),
+        (
+            {"setup.max_base_travel_mm": 0.015},
+            "setup.max_base_travel_mm = 0.015: 66.7 times below the smallest usual value, 1 to 100 (a robot ",
+        ),
+        (
+            {"tracker.jitter_mm": 0.00007},
+            "tracker.jitter_mm = 7e-05: 143 times below the smallest usual value, 0.01 to 1 (0.07 in the paper",
+        ),
+        (
+            {"phantom.friction_mn_per_mm": 0.005},
+            "phantom.friction_mn_per_mm = 0.005: 1000 times below the smallest usual value, 5 to 86 (measured ",
+        ),
+        (
             {"tissue.1.thickness_mm": 20.0},
             "tissue[1].thickness_mm = 20: has no effect: the last layer has no end; leave it out, or add the layer",
         ),
@@ -72,7 +113,10 @@ def test_a_warning_begins_half_an_order_of_magnitude_beyond_the_range(value, rat
 
 
 def test_what_comes_with_the_package_is_beyond_doubt():
-    for scenario in (PHANTOM, *map(world, range(60))):
+    worlds = [world(number) for number in range(201)]
+    guided = [number for number, each in enumerate(worlds) if each.setup.has_guide]
+    cases = (*(world(n, PERFECT) for n in range(0, 201, 20)), *(world(n, STRUCTURE) for n in guided))
+    for scenario in (*map(load_scenario, PRESETS.names()), *worlds, *cases):
         assert doubts(scenario) == []
     for gauge in GAUGES:
         named = {"needle.outer_diameter_mm": None, "needle.inner_diameter_mm": None, "needle.gauge": gauge}
@@ -80,7 +124,7 @@ def test_what_comes_with_the_package_is_beyond_doubt():
 
 
 def test_every_range_names_its_source_and_a_key_of_scenarios():
-    tube = PHANTOM.with_values({"needle.inner_diameter_mm": 0.5})
+    tube = PHANTOM.with_values({"needle.inner_diameter_mm": 0.5, "phantom.structure.alpha": 3.0})
     keys = {key.replace("tissue.0", "tissue.*") for key in tube.flat()}
     assert set(USUAL) <= keys
     assert all(usual.low < usual.high and usual.source for usual in USUAL.values())

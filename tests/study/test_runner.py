@@ -141,6 +141,44 @@ def test_ctrl_c_keeps_the_finished_rows_and_prints_how_to_resume(quick, uninterr
     assert tables(out) == tables(uninterrupted)
 
 
+UNGUARDED = "from flexneedle import run_study\nrun_study({!r}, workers=1)\n"
+
+
+@pytest.mark.parametrize("kept", [(), ("runs",), ("runs", "runs/other")])
+def test_a_script_without_the_guard_leaves_no_folder(quick, tmp_path, kept):
+    for folder in kept:
+        (tmp_path / folder).mkdir()
+    (tmp_path / "script.py").write_text(UNGUARDED.format(str(quick)))
+    command = [sys.executable, "script.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 1
+    assert "a script needs the guard `if __name__ == '__main__':`" in done.stderr.splitlines()[-1]
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} == {"script.py", *kept}
+
+
+@pytest.mark.usefixtures("in_threads")
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_study_that_fails_before_its_first_plan_leaves_the_folders_as_they_were(
+    quick, tmp_path, monkeypatch, exists
+):
+    monkeypatch.setattr(runner, "make_plan", lambda _: 1 / 0)
+    out = tmp_path / "above" / "study"
+    if exists:
+        out.mkdir(parents=True)
+    with pytest.raises(RunError, match="workers were lost"):
+        run_study(quick, out)
+    assert sorted(tmp_path.rglob("*")) == ([out.parent, out] if exists else [])
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_a_plan_is_kept_when_a_study_fails_before_its_first_row(quick, tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "run_job", lambda _: 1 / 0)
+    with pytest.raises(RunError, match="workers were lost"):
+        run_study(quick, tmp_path / "study")
+    assert list((tmp_path / "study" / "plans").iterdir())
+    assert runs(tmp_path / "study") == []
+
+
 @pytest.mark.long
 @pytest.mark.usefixtures("in_threads")
 def test_a_finished_study_is_not_repeated(quick, tmp_path, monkeypatch):

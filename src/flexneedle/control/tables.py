@@ -8,13 +8,13 @@ from difflib import get_close_matches
 from functools import cache
 from typing import Any
 
-from pydantic import ValidationError, create_model
+from pydantic import create_model
 
 from flexneedle.control.interface import Method
-from flexneedle.errors import InputError, ScenarioError
+from flexneedle.errors import InputError
 from flexneedle.estimation.task import Task
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.problems import describe, key_path
+from flexneedle.scenario.problems import key_path
 from flexneedle.scenario.sections.settings import ControlSettings
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Plan
@@ -69,9 +69,4 @@ def unowned(scenario: Scenario, methods: Iterable[Method], source: str = "") -> 
 
 
 def _typed(scenario: Scenario, methods: tuple[Method, ...], source: str) -> Scenario:
-    model = typed_scenario(methods)
-    try:
-        return model.model_validate(scenario.model_dump(exclude_none=True))
-    except ValidationError as error:
-        opening = f"{source}: " if source else ""
-        raise ScenarioError(*(opening + line for line in describe(error, model))) from None
+    return typed_scenario(methods).from_record(scenario.model_dump(exclude_none=True), source)

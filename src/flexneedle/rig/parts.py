@@ -14,6 +14,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
+from flexneedle.arguments import shown
 from flexneedle.control.interface import Method
 from flexneedle.control.methods import METHODS
 from flexneedle.errors import InputError
@@ -47,7 +48,7 @@ def controller_of(given: str | Method) -> tuple[str, Method]:
     found = _resolved("controller", given, METHODS)
     if not isinstance(found, Method):
         missing = _without(found, ("name", "summary", "decide"))
-        raise InputError(f"controller = {_shown(given)}: is {_a(found)}, not a flexneedle.Method{missing}")
+        raise _unsuitable("controller", given, found, METHODS, f"a flexneedle.Method{missing}")
     return _name(given), found
 
 
@@ -56,7 +57,7 @@ def plant_of(given: str | PlantFactory) -> tuple[str, PlantFactory]:
     if _is_listed(given, PLANTS):
         return given, PLANTS[given]
     found = _resolved("phantom", given, PLANTS)
-    _check_call("phantom", given, found, ("truth", "bevel"))
+    _check_call("phantom", given, found, PLANTS, ("truth", "bevel"))
     return _name(given), found
 
 
@@ -68,7 +69,7 @@ def tracker_of(given: str | TrackerFactory) -> tuple[str, TrackerFactory | None]
     if _is_listed(given, (SCENARIO_TRACKER,)):
         return given, None
     found = _resolved("tracker", given, (SCENARIO_TRACKER,))
-    _check_call("tracker", given, found, ("scenario", "phantom", "rng"))
+    _check_call("tracker", given, found, (SCENARIO_TRACKER,), ("scenario", "phantom", "rng"))
     return _name(given), found
 
 
@@ -128,17 +129,26 @@ def _module(kind: str, given: str, name: str) -> Any:
         raise InputError(f"{kind} = {_shown(given)}: {name} cannot be imported: {problem}") from error
 
 
-def _check_call(kind: str, given: object, found: object, arguments: tuple[str, ...]) -> None:
+def _check_call(
+    kind: str, given: object, found: object, names: Iterable[str], arguments: tuple[str, ...]
+) -> None:
     """Raise InputError unless `found` can be called with these arguments."""
     wanted = f"a function of ({', '.join(arguments)})"
     if not callable(found):
-        raise InputError(f"{kind} = {_shown(given)}: is {_a(found)}, not {wanted}")
+        raise _unsuitable(kind, given, found, names, wanted)
     try:
         inspect.signature(found).bind(*arguments)
     except TypeError as error:
         raise InputError(f"{kind} = {_shown(given)}: must be {wanted}: {error}") from None
     except ValueError:  # a built-in without a signature
         return
+
+
+def _unsuitable(kind: str, given: object, found: object, names: Iterable[str], wanted: str) -> InputError:
+    """The error for a part of the wrong type: an object, or the one that `module:NAME` has been resolved to."""
+    choices = f"must be one of {', '.join(names)}, {_OWN}, or {wanted}"
+    rule = f"is {_a(found)}, not {wanted}" if isinstance(given, str) else choices
+    return InputError(f"{kind} = {_shown(given)}: {rule}")
 
 
 def _without(found: object, parts: Iterable[str]) -> str:
@@ -151,7 +161,9 @@ def _name(given: object) -> str:
 
 
 def _shown(given: object) -> str:
-    return printable(repr(given) if isinstance(given, str) else _name(given))
+    if isinstance(given, str):
+        return printable(repr(given))
+    return printable(getattr(given, "__name__", shown(given)))
 
 
 def _a(found: object) -> str:

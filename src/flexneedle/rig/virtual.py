@@ -1,12 +1,12 @@
 """A rig: clock, driver and tracker of the closed loop; and the virtual one of a scenario and its seeds."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from flexneedle.errors import InputError
+from flexneedle.arguments import refusal
 from flexneedle.rig.parts import TrackerFactory
 from flexneedle.rig.phantom.draw import draw
 from flexneedle.rig.phantom.phantom import Condition, Phantom
@@ -29,12 +29,30 @@ _CLEAN = 0.75  # of the indicator's limit: a reference below it is not moved
 
 @dataclass(frozen=True)
 class Rig:
-    """Ports of the closed loop; `truth` is only recorded, None on hardware."""
+    """Ports of the closed loop; `truth` is only recorded, None on hardware.
+
+    Raises InputError if one has not the functions of its port.
+    """
 
     clock: Clock
     driver: Driver
     tracker: TipTracker
     truth: Callable[[], Condition] | None = None
+
+    def __post_init__(self) -> None:
+        _check_port("clock", self.clock, Clock, ("now", "wait"))
+        _check_port("driver", self.driver, Driver, ("apply",))
+        _check_port("tracker", self.tracker, TipTracker, ("read", "status"))
+        if not (self.truth is None or callable(self.truth)):
+            raise refusal("truth", self.truth, "must be a function of () that returns a Condition, or None")
+
+
+def _check_port(name: str, given: object, port: type, parts: Collection[str]) -> None:
+    """Raise InputError unless an object has the parts of a port; a class has them, but no object that they act on."""
+    missing = [part for part in parts if isinstance(given, type) or not hasattr(given, part)]
+    if missing:
+        wanted = f"must be an object with {', '.join(parts)}"
+        raise refusal(name, given, wanted, f"see flexneedle.rig.ports.{port.__name__}")
 
 
 @dataclass(frozen=True)
@@ -64,7 +82,7 @@ def virtual_rig(
     truth = draw(scenario, np.random.default_rng(seeds.phantom))
     tank = Phantom(truth, bevel, phantom)
     if tracker is not None:
-        own = _made(tracker, scenario, tank, np.random.default_rng(seeds.tracker))
+        own = tracker(scenario, tank, np.random.default_rng(seeds.tracker))
         return Rig(tank, tank, own, tank.condition)
     errors = _Errors(truth.bias, _registration_error(scenario.tracker.registration, seeds.room))
     rng, around = (
@@ -76,13 +94,6 @@ def virtual_rig(
     else:
         described = _field_tracker(scenario, around, tank, errors, rng, plate_distance_at)
     return Rig(tank, tank, described, tank.condition)
-
-
-def _made(factory: TrackerFactory, scenario: Scenario, tank: Phantom, rng: np.random.Generator) -> TipTracker:
-    made = factory(scenario, tank, rng)
-    if missing := [part for part in ("read", "status") if not hasattr(made, part)]:
-        raise InputError(f"tracker: {type(made).__name__} is not a tracker, missing: {', '.join(missing)}")
-    return made
 
 
 def virtual_room(

@@ -35,7 +35,7 @@ _ENVIRONMENT = "tracker.environment"
 class Scenario(Section):
     """A scenario, frozen. Fields keep the names and units of the file.
 
-    Properties without a unit in their name are in mm, N, MPa, rad, s.
+    Properties without a unit in their name are in mm, N, MPa, rad, s. Raises ScenarioError, one line for each problem.
     """
 
     name: Title
@@ -51,6 +51,12 @@ class Scenario(Section):
     tracker: TrackerSettings = TrackerSettings()
     monitor: MonitorSettings = MonitorSettings()
     phantom: PhantomSettings = PhantomSettings()
+
+    def __init__(self, /, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise ScenarioError(*describe(error, type(self))) from None
 
     @model_validator(mode="after")
     def _check_sections_together(self) -> Self:
@@ -73,11 +79,12 @@ class Scenario(Section):
 
         Warns (ScenarioWarning) of a key that has been renamed.
         """
+        current = dict(current_values(values, source))
         try:
-            return cls.model_validate(dict(current_values(values, source)))
-        except ValidationError as error:
+            return cls.model_validate(current)
+        except ScenarioError as error:
             opening = f"{source}: " if source else ""
-            raise ScenarioError(*(opening + line for line in describe(error, cls))) from None
+            raise ScenarioError(*(opening + line for line in error.problems)) from None
 
     @classmethod
     def from_record(cls, values: Mapping[str, Any], source: str = "") -> Self:

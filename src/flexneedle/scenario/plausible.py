@@ -9,7 +9,7 @@ from flexneedle.scenario.problems import key_path
 
 
 class Range(NamedTuple):
-    """What a quantity usually is, in the unit of its key, and who has measured or made it."""
+    """What the size of a quantity usually is, in the unit of its key, and who has measured or made it."""
 
     low: float
     high: float
@@ -17,6 +17,16 @@ class Range(NamedTuple):
 
 
 _STANDARD = "tubing for needles, 34G to 10G, ISO 9626:2016"
+_ROBOT = "doi:10.1109/ROBOT.2008.4543587"
+_TRAVEL = Range(
+    1, 100, f"a robot for prostate needles 100, or 50 to either side ({_ROBOT}); 1 is our estimate"
+)
+_ALPHA = Range(
+    2,
+    40,
+    "in size: neo-Hookean 2, brain -4.7 (doi:10.1016/S0021-9290(01)00234-2), "
+    "skin 40 (Adull Manan et al., SHUSER 2012)",
+)
 USUAL = {
     "needle.outer_diameter_mm": Range(0.18, 3.4, _STANDARD),
     "needle.inner_diameter_mm": Range(0.05, 3.0, f"what walls leave of {_STANDARD}"),
@@ -24,17 +34,52 @@ USUAL = {
     "needle.youngs_modulus_gpa": Range(
         3, 210, "PEEK 3 to 4 (doi:10.1016/j.biomaterials.2007.07.013), nitinol 28 to 83, steel 190 to 210"
     ),
+    "needle.bevel.offset_mm": Range(
+        1,
+        14,
+        "our estimate: 1 to 5 in the random worlds, 14 is the model's limit for the usual compression length",
+    ),
+    "needle.bevel.length_mm": Range(
+        0.1, 19, "tubing of 0.18 to 3.4 ground at 60 to 10 degrees (J Biomech 2014;47:3344)"
+    ),
+    "tissue.*.thickness_mm": Range(
+        0.075,
+        200,
+        "epidermis 0.075 (doi:10.1016/j.burns.2016.11.014); 200, the length of needles, is our estimate",
+    ),
     "tissue.*.shear_modulus_kpa": Range(
         0.6, 210, "stomach 0.64, liver 1.8, gallbladder 85, artery 210 (doi:10.1088/1361-6560/ab5010)"
+    ),
+    "tissue.*.alpha": _ALPHA,
+    "tissue.*.compression_length_mm": Range(
+        5, 100, "our estimate: nothing has been published; 20 in the presets"
+    ),
+    "tissue.*.engaged_width_mm": Range(
+        1.2,
+        70,
+        "our estimate: 0.25 to 0.7 times the compression length, Vesic's stiffness (1961) to about twice it",
     ),
     "target.depth_mm": Range(
         4,
         200,
         "pen needles 4, lumbar puncture 20 to 130 (Am J Emerg Med 2005;23:742), brachytherapy needles 200",
     ),
+    "setup.guide_to_skin_mm": Range(5, 200, "41 in the paper; the ends are our estimate"),
+    "setup.tip_to_skin_mm": Range(1, 200, "28.5 in the paper; the ends are our estimate"),
+    "setup.stroke_mm": Range(
+        10, 200, f"110 in the paper, 150 of a robot ({_ROBOT}); the ends are our estimate"
+    ),
+    "setup.max_guide_travel_mm": _TRAVEL,
+    "setup.max_base_travel_mm": _TRAVEL,
     "setup.insertion_speed_mm_s": Range(
         1, 280, "robots from 1 (Hing et al., ICRA 2006), brachytherapy by hand up to 280"
     ),
+    "tracker.rate_hz": Range(1, 1000, "40 of an NDI Aurora; the ends are our estimate"),
+    "tracker.jitter_mm": Range(0.01, 1, "0.07 in the paper; the ends are our estimate"),
+    "phantom.friction_mn_per_mm": Range(
+        5, 86, "measured in PVC phantoms (Li et al., Procedia Manufacturing 2015;1:866)"
+    ),
+    "phantom.structure.alpha": _ALPHA,
 }
 """By key; * is any layer. Sources are for the ends of the range."""
 
@@ -49,10 +94,12 @@ def doubts(scenario: Scenario) -> list[str]:
 def _unusual(scenario: Scenario) -> Iterator[str]:
     for key, value in scenario.flat().items():
         usual = USUAL.get(_general(key))
-        if usual is None or value == 0 or 1.0 / _FAR < (ratio := _ratio(value, usual)) < _FAR:
+        if usual is None or value == 0 or 1.0 / _FAR < (ratio := _ratio(abs(value), usual)) < _FAR:
             continue
         off = (
-            f"{ratio:.3g} times the largest" if ratio > 1.0 else f"{1.0 / ratio:.3g} times below the smallest"
+            f"{_short(ratio)} times the largest"
+            if ratio > 1.0
+            else f"{_short(1.0 / ratio)} times below the smallest"
         )
         line = f"{off} usual value, {usual.low:g} to {usual.high:g} ({usual.source}): check the unit"
         yield f"{key_path(split_key(key))} = {value:g}: {line}"
@@ -71,6 +118,11 @@ def _general(key: str) -> str:
     return ".".join("*" if isinstance(part, int) else part for part in parts)
 
 
+def _short(ratio: float) -> str:
+    """Three digits, never as 1e+03."""
+    return f"{float(f'{ratio:.3g}'):.0f}" if ratio >= 100.0 else f"{ratio:.3g}"
+
+
 def _ratio(value: float, usual: Range) -> float:
-    """Ratio of a value to the nearest value in a range."""
+    """Ratio of the size of a value to the nearest one in a range."""
     return value / min(max(value, usual.low), usual.high)

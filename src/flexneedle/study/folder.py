@@ -4,12 +4,13 @@
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
-from flexneedle.files import replace_file
+from flexneedle.files import RUNS, new_folder, replace_file
 from flexneedle.scenario.dotted import flatten
 from flexneedle.scenario.problems import printable
 from flexneedle.study.grid import Study
@@ -20,6 +21,37 @@ from flexneedle.trace.plain import to_text
 JOURNAL_FILE, PLANS_FOLDER = "journal.jsonl", "plans"
 _FORMAT = 1
 _SOURCE = "versions.source"
+
+
+@contextmanager
+def study_folder(out: Path | None, name: str) -> Iterator[tuple[Path, bool]]:
+    """Yield the folder `out`, or a new one in `runs/`, and whether it contains no study yet.
+
+    If the block fails, folders that are new and empty are removed.
+    """
+    outer = RUNS if out is None else out
+    missing = [path for path in (outer, *outer.parents) if not _exists(path)]
+    folder = new_folder("study", name) if out is None else out
+    try:
+        yield folder, not _exists(folder / STUDY_FILE)
+    except BaseException:
+        with suppress(OSError):  # until the first that is not empty
+            for path in missing if out else (folder, *missing):
+                path.rmdir()
+        raise
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # such as a name that is too long, which `open_folder` rejects
+        return False
+
+
+def remove_unused(path: Path) -> None:
+    """Remove the files of a study that has neither plans nor rows."""
+    for name in (STUDY_FILE, JOURNAL_FILE):
+        (path / name).unlink()
 
 
 def open_folder(path: Path, study: Study, resume: bool, command: str = "") -> Journal:

@@ -12,10 +12,9 @@ from typing import Any
 
 from flexneedle.arguments import path, whole
 from flexneedle.errors import InputError, RunError
-from flexneedle.files import new_folder
 from flexneedle.rig.kernels import compile_kernels
 from flexneedle.study import pools
-from flexneedle.study.folder import PLANS_FOLDER, open_folder
+from flexneedle.study.folder import PLANS_FOLDER, open_folder, remove_unused, study_folder
 from flexneedle.study.grid import GridPoint, Study, load_study
 from flexneedle.study.journal import Journal
 from flexneedle.study.plans import Plans, plan_key, truth_key
@@ -53,9 +52,10 @@ def run_study(
 
     It runs on `workers` processes (default: one per core), or on the Dask cluster at the address `scheduler`;
     `on_no_workers` is called if the cluster has no workers yet, and the study waits for them. `resume` continues
-    the study in `out`. If the study ends early, the finished rows are kept; `runs.parquet` is identical to the bit
-    for any number of workers and interruptions. `command` is recorded in `study.json`. A script that calls this
-    needs an `if __name__ == "__main__"` guard, since workers import it.
+    the study in `out`. If the study ends early, the finished rows are kept; if it has no plan and no row yet, its files
+    are removed. `runs.parquet` is identical to the bit for any number of workers and interruptions. `command` is
+    recorded in `study.json`. A script that calls this needs an `if __name__ == "__main__"` guard, since workers import
+    it.
 
     Raises InputError for an invalid study, folder or scheduler; RunError if a worker dies or has other package
     versions than this process; KeyboardInterrupt, after the tables are written, if the user interrupts it.
@@ -67,11 +67,13 @@ def run_study(
         raise InputError(f"workers = {workers}: sets local processes: remove it, or remove the scheduler")
     if workers is not None:
         workers = whole("workers", workers, 1, "omit it for one per core")
-    folder = new_folder("study", study.name) if out is None else path("out", out)
+    given = None if out is None else path("out", out)
     chunk = 1 if scheduler is None else math.ceil(len(study) / _CLUSTER_JOBS)
-    # The pool first, so that no folder is created if the scheduler does not respond.
+    # The pool first: no folder is created if the scheduler does not respond, or by a worker that imports an unguarded
+    # script.
     with (
         _pool(workers, scheduler, on_no_workers) as pool,
+        study_folder(given, study.name) as (folder, is_new),
         open_folder(folder, study, resume, command) as journal,
     ):
         engine = _Engine(study, folder, journal, on_advance or (lambda _: None))
@@ -80,7 +82,10 @@ def run_study(
                 compile_kernels()  # before the workers: compiling in many at once is slow and has crashed
                 engine.run(pool, chunk)
         finally:
-            write_tables(folder, study, journal.rows, engine.plans)
+            if is_new and not journal.rows and not (folder / PLANS_FOLDER).exists():
+                remove_unused(folder)
+            else:
+                write_tables(folder, study, journal.rows, engine.plans)
     return folder
 
 

@@ -123,6 +123,8 @@ def _source(package: Path) -> str:
 def read_run(folder: Path) -> RunFile:
     """Return the contents of `run.json` in a folder. Raises InputError if it is missing or damaged."""
     path = folder / RUN_FILE
+    if folder.is_file():
+        raise InputError(f"{folder}: is a file: must be the folder of a run{_folder_of(folder)}")
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -132,6 +134,10 @@ def read_run(folder: Path) -> RunFile:
     except ValueError as error:
         raise InputError(f"{path}: damaged: {error}") from None
     return _checked(path, values)
+
+
+def _folder_of(file: Path) -> str:
+    return f", here {file.parent}" if (file.parent / RUN_FILE).is_file() else ""
 
 
 def _checked(path: Path, values: Any) -> RunFile:
