@@ -1,5 +1,6 @@
 """The generated pages are up to date, and the site builds without a warning and needs no network."""
 
+import html
 import os
 import re
 import shutil
@@ -22,10 +23,9 @@ SITE = tomllib.loads((ROOT / "zensical.toml").read_text(encoding="utf-8"))["proj
 
 
 def entries(nav: object) -> Iterator[str]:
-    """The pages of a navigation."""
+    """The pages of a navigation; a group is a table with its title, a page has none."""
     for item in nav:
-        for value in item.values():
-            yield from [value] if isinstance(value, str) else entries(value)
+        yield from [item] if isinstance(item, str) else entries(*item.values())
 
 
 def test_the_scenario_reference_is_that_of_the_schema():
@@ -36,10 +36,12 @@ def test_the_command_reference_is_the_help():
     assert command_reference.PAGE.read_text(encoding="utf-8") == command_reference.page(), "make docs"
 
 
-def test_advice_is_for_keys_that_exist_and_covers_every_section():
+def test_every_section_and_every_key_has_advice():
     tables = list(scenario_reference.tables(scenario_reference.schema()))
     keys = {key.name for table in tables for key in table.keys}
-    assert set(scenario_reference.ADVICE["keys"]) <= keys
+    advice = scenario_reference.ADVICE["keys"]
+    assert set(advice) == keys
+    assert all(text.endswith(".") and "\n" not in text and len(text) < 200 for text in advice.values())
     assert set(scenario_reference.ADVICE["sections"]) == {table.name for table in tables if table.name}
     written = {re.sub(r"^tissue\.\d\.", "tissue.", key) for key in load_scenario("phantom").flat()}
     assert written <= keys
@@ -72,10 +74,22 @@ def test_every_page_is_in_the_navigation():
     assert sorted(entries(SITE["nav"])) == sorted(pages)
 
 
+@pytest.mark.parametrize("page", tuple(entries(SITE["nav"])))
+def test_a_page_begins_with_its_only_heading_of_the_first_level(page):
+    """The navigation shows it, with the number of a decision."""
+    text = re.sub(
+        r"^```.*?^```", "", (DOCS / page).read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
+    )
+    (heading,) = re.findall(r"^# (.+)$", text, re.MULTILINE)
+    assert text.startswith(f"# {heading}\n")
+    number = re.match(r"decisions/(\d+)", page)
+    assert number is None or heading.startswith(f"{number[1]} ")
+
+
 def test_a_formula_is_drawn_with_its_number():
-    html = math_fence.svg("a < \\frac{1}{2} \\tag{7}\n", "math", "math")
-    assert html.startswith('<div class="math" role="img" aria-label="a &lt; \\frac{1}{2}"><svg')
-    assert html.endswith('</svg><span class="number">(7)</span></div>')
+    drawn = math_fence.svg("a < \\frac{1}{2} \\tag{7}\n", "math", "math")
+    assert drawn.startswith('<div class="math" role="img" aria-label="a &lt; \\frac{1}{2}"><svg')
+    assert drawn.endswith('</svg><span class="number">(7)</span></div>')
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +118,15 @@ def test_the_site_builds_strictly_and_loads_nothing_from_elsewhere(site):
     assert [path.name for path, text in pages.items() if loads.search(text)] == []
     assert [text[:80] for text in styles if re.search(r"url\(['\"]?https?:|@import", text)] == []
     assert [path.name for path, text in pages.items() if "```" in text] == [], "a block that is none"
+
+
+@pytest.mark.long
+def test_the_navigation_shows_the_headings(site):
+    page = html.unescape((site / "index.html").read_text(encoding="utf-8"))
+    links = re.findall(r'class="md-nav__link[^>]*>\s*<span class="md-ellipsis">\s*([^<]*?)\s*<', page)
+    for name in entries(SITE["nav"]):
+        heading = (DOCS / name).read_text(encoding="utf-8").split("\n", 1)[0].removeprefix("# ")
+        assert heading in links
 
 
 @pytest.mark.long

@@ -79,7 +79,7 @@ def test_the_example_in_the_docs_measures_the_tip_in_the_stages_frame(tmp_path, 
     (tmp_path / "mine.toml").write_text(preset + REGISTERED, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     with emulated("--still") as path:
-        names = {"driver": None, "samples": [], "until": until}
+        names = {"driver": Motors(None), "samples": [], "until": until}
         within = "    until(lambda: samples.extend(rig.tracker.read()) or samples)\n"
         exec(code.replace("/dev/ttyUSB0", path) + within, names)
     sample = names["samples"][0]

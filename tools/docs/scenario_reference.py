@@ -111,8 +111,7 @@ def _about(table: Table) -> str:
 
 def _row(key: Key) -> str:
     meaning = " ".join(key.schema.get("description", "").split())
-    choice = ADVICE["keys"].get(key.name)
-    text = f"{meaning} *Choose:* {choice}" if choice else meaning
+    text = f"{meaning} *Choose:* {ADVICE['keys'][key.name]}"
     short = key.name.rsplit(".", 1)[-1]
     cells = (f"`{short}`", unit(key.name), _default(key), allowed(key.schema), text)
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
