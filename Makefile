@@ -46,7 +46,7 @@ bench: setup  ## measure speed: mechanics, control periods, ten million rows of 
 robustness: setup  ## 100,000 random insertions without a failure (long)
 	$(BIN)/python studies/robustness.py
 
-validation: setup  ## hold the exact plant against closed forms and a second solver; writes docs/validation.md
+validation: setup  ## compare the exact plant with closed forms and a second solver; writes docs/validation.md
 	$(BIN)/python studies/validation.py
 
 accuracy: setup  ## the paper's experiment, 150 insertions with the exact plant, and its report (DIR=runs/accuracy)
@@ -64,7 +64,7 @@ studies: setup  ## 15,000 insertions with other plants, guides and needles, and 
 	done
 	$(BIN)/python studies/worst.py runs/mismatch-doubled --out docs/images
 
-tracker: setup  ## the simulated tracker beside the paper's tables, its estimators, its monitor, and insertions with it (long)
+tracker: setup  ## compare the simulated tracker with the paper's tables; its estimators, its monitor, and insertions with it (long)
 	$(BIN)/python studies/environments.py
 	$(BIN)/python studies/em_coverage.py
 	$(BIN)/flexneedle study tracker --resume --out runs/tracker

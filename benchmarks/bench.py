@@ -49,7 +49,7 @@ def seconds(call: Callable[[], Any], times: int = 1) -> float:
 
 
 def insertions(count: int, steps: int = STEPS, depth: float = DEPTH_MM) -> np.ndarray:
-    """Controls (count, steps, 5) of insertions to `depth` with random guide motion and one bevel roll."""
+    """Controls (count, steps, 5) of insertions to `depth` with random guide motion and one bevel flip."""
     rng = np.random.default_rng(0)
     controls = np.zeros((count, steps, 5))
     controls[:, :, 0] = (SCENARIO.setup.tip_to_skin_mm + depth) / steps

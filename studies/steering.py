@@ -56,7 +56,7 @@ def steer(number: int, scenario: Scenario | None = None) -> dict[str, Any]:
         "target_mm": target,
         "planned_error_mm": plan.error_mm,
         "claim_error_mm": float(np.hypot(truth[0] - plan.tip_mm[0], truth[1] - plan.tip_mm[1])),
-        "rolls": plan.flips,
+        "flips": plan.flips,
         "converged": plan.converged,
         "guide_moved_mm": float(np.abs(plan.guide).max()),
         "seconds": plan.seconds,
@@ -72,7 +72,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     }
     head = (
         f"| worlds | n | planned error ≤ {PLANNED_MM} mm | and exact plant within {CLAIMED_MM} mm of the plan "
-        "| planned error, median, max | deviation from the plan, median, 95 %, max | rolls, mean, max "
+        "| planned error, median, max | deviation from the plan, median, 95 %, max | flips, mean, max "
         "| planning time (s), median |"
     )
     return "\n".join(
@@ -82,9 +82,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 def line(name: str, rows: Iterable[dict[str, Any]]) -> str:
     """A row of the table."""
-    planned, claim, rolls, seconds = (
+    planned, claim, flips, seconds = (
         np.array([row[key] for row in rows], dtype=float)
-        for key in ("planned_error_mm", "claim_error_mm", "rolls", "seconds")
+        for key in ("planned_error_mm", "claim_error_mm", "flips", "seconds")
     )
     both = (planned <= PLANNED_MM) & (claim <= CLAIMED_MM)
     cells = [
@@ -94,7 +94,7 @@ def line(name: str, rows: Iterable[dict[str, Any]]) -> str:
         str(int(both.sum())),
         f"{np.median(planned):.4f}, {planned.max():.4f}",
         f"{np.median(claim):.3f}, {np.quantile(claim, 0.95):.3f}, {claim.max():.3f}",
-        f"{rolls.mean():.2f}, {rolls.max():.0f}",
+        f"{flips.mean():.2f}, {flips.max():.0f}",
         f"{np.median(seconds):.2f}",
     ]
     return f"| {' | '.join(cells)} |"
@@ -117,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(table(rows))
     for row in sorted(rows, key=lambda row: -row["claim_error_mm"])[:5]:
         print(
-            f"world {row['world']}: {row['claim_error_mm']:.3f} mm from the plan, {row['rolls']} rolls",
+            f"world {row['world']}: {row['claim_error_mm']:.3f} mm from the plan, {row['flips']} flips",
             file=sys.stderr,
         )
     if args.out is not None:

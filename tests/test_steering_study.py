@@ -28,7 +28,7 @@ def test_a_world_is_planned_and_replayed_without_imperfections():
 
 
 def test_both_bounds_must_be_met():
-    base = {"rolls": 1, "seconds": 1.0, "guide": True}
+    base = {"flips": 1, "seconds": 1.0, "guide": True}
     errors = [(0.05, 0.1), (0.2, 0.1), (0.05, 0.3)]
     rows = [{**base, "planned_error_mm": planned, "claim_error_mm": claim} for planned, claim in errors]
     cells = [cell.strip() for cell in steering.line("all", rows).split("|")[1:-1]]

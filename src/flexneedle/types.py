@@ -154,7 +154,7 @@ class Plan:
 
     @property
     def flips(self) -> int:
-        """Bevel rolls during the insertion; the side at the start is set beforehand and is not counted."""
+        """Number of bevel flips (half-turns) during the insertion; setting the side at the start is not counted."""
         return int(np.count_nonzero(self.controls[:, 4] > 0.0))
 
     def __repr__(self) -> str:
@@ -299,7 +299,7 @@ class Insertion:
 
     @property
     def flips(self) -> int:
-        """Number of applied bevel rolls."""
+        """Number of applied bevel flips (half-turns)."""
         return sum(period.applied[4] > 0 for period in self.periods)
 
     @property

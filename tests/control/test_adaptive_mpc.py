@@ -157,7 +157,7 @@ def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
         "energy": settings.energy_weight_mm / scale,
         "line": settings.line_weight * ahead.left / 40.0,
         "slope": settings.slope_weight_mm * ahead.left / 40.0,
-        "rolls": settings.roll_weight_mm,
+        "flips": settings.roll_weight_mm,
         "late": settings.late_roll_weight * estimate.roll_sd,
         "reach": settings.reach_weight,
     }

@@ -1,4 +1,4 @@
-"""Open loop: places of the plan are replayed, in spite of motors that stop short, and nothing is looked at."""
+"""Open loop: positions of the plan are replayed, in spite of motors that stop short; no reading is used."""
 
 from dataclasses import replace
 

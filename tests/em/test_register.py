@@ -194,8 +194,8 @@ def test_a_file_without_a_registration_is_refused(tmp_path, text, message):
     ("points", "rule"),
     [
         ([[0.0, 0.0, 0.0]], "must have at least 3 entries"),
-        ([[float(k), 2.0 * k, 0.0] for k in range(4)], "must not lie on a line"),
-        ([[1.0, 1.0, 1.0]] * 3, "must not lie on a line"),
+        ([[float(k), 2.0 * k, 0.0] for k in range(4)], "must not be on one line"),
+        ([[1.0, 1.0, 1.0]] * 3, "must not be on one line"),
     ],
 )
 def test_a_scenario_refuses_degenerate_fiducials(points, rule):

@@ -124,6 +124,15 @@ def test_the_guide_is_drawn_open_where_it_ended(figure, insertion):
     assert travel.get_ydata()[0] == min(period.guide for period in insertion.periods)
 
 
+def test_the_guide_travel_is_upright_in_the_figure_and_in_the_legend(figure):
+    (legend,) = figure.legends
+    marks = dict(zip((text.get_text() for text in legend.get_texts()), legend.legend_handles, strict=True))
+    x, y = marks["guide travel"].get_data()
+    assert x[0] == x[1] == pytest.approx(marks["planned path"].get_xdata().mean())
+    assert y[0] < y[1]
+    assert marks["guide travel"].get_markevery() is None
+
+
 def test_paths_are_those_of_plan_and_record(figure, insertion):
     scene = figure.axes[0]
     expected = {
@@ -139,11 +148,11 @@ def test_paths_are_those_of_plan_and_record(figure, insertion):
 
 def test_rolls_of_the_bevel_show_side_and_position(figure, insertion):
     scene, plan = figure.axes[0], insertion.plan
-    (planned,) = lines(scene, "bevel roll, planned")
+    (planned,) = lines(scene, "bevel flip, planned")
     assert planned.get_marker() == "v"  # from +1, at the start, to −1
     assert planned.get_markerfacecolor() == "none"
     assert planned.get_xdata()[0] == plan.tips[45, 0]
-    applied = lines(scene, "bevel roll, applied")
+    applied = lines(scene, "bevel flip, applied")
     assert [line.get_marker() for line in applied] == ["v", "^", "v"]
     assert applied[0].get_xdata()[0] == insertion.periods[40].estimate[0]
     assert applied[0].get_ydata()[0] < insertion.periods[40].estimate[1]
@@ -340,7 +349,7 @@ def without_rolls(insertion, *, planned=True, applied=True):
 
 
 PATHS = ["true path", "estimated path"]
-ROLLS = ["bevel roll, planned", "bevel roll, applied"]
+ROLLS = ["bevel flip, planned", "bevel flip, applied"]
 
 
 @pytest.mark.parametrize(

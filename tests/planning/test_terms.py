@@ -36,8 +36,8 @@ TRAJECTORIES = Trajectories(
         (terms.energy_at_end, [4.0, 3.0]),
         (terms.energy_of_steps, [5.0, 8.0]),
         (terms.guide_slope, [(0.01 + 0.04 / 2 + 0.16 / 2) / 5.0, 0.09 / 1.5]),
-        (terms.rolls, [2.0, 1.0]),
-        (partial(terms.rolls, first=1), [1.0, 1.0]),
+        (terms.flips, [2.0, 1.0]),
+        (partial(terms.flips, first=1), [1.0, 1.0]),
         (partial(terms.out_of_reach, expected=np.array([0.3, 0.7])), [0.7, 0.3]),
         (terms.deflection, [6.0 + 7.0, 8.0 + 9.0]),
         (terms.guide_motion, [0.04 + 0.16, 0.09]),
@@ -85,10 +85,10 @@ def test_a_slope_does_not_depend_on_the_length_of_the_steps():
 
 
 def test_cost_is_the_weighted_sum_and_infinite_where_the_model_failed():
-    listed = (Term("energy", 2.0, terms.energy_at_end), Term("rolls", 0.5, terms.rolls))
+    listed = (Term("energy", 2.0, terms.energy_at_end), Term("flips", 0.5, terms.flips))
     charged = terms.charges(listed, TRAJECTORIES)
     np.testing.assert_allclose(charged["energy"], [8.0, 6.0])
-    np.testing.assert_allclose(charged["rolls"], [1.0, 0.5])
+    np.testing.assert_allclose(charged["flips"], [1.0, 0.5])
     np.testing.assert_allclose(terms.cost(listed, TRAJECTORIES), [9.0, 6.5])
     failed = replace(TRAJECTORIES, converged=np.array([[True, True, True], [True, False, True]]))
     assert terms.cost(listed, failed).tolist() == [9.0, np.inf]

@@ -128,8 +128,8 @@ class Shooting:
     """Section 11 of docs/theory.md the plain way: the continuous rod, integrated from its tip to its base.
 
     Forces in balance take the place of a minimum of energy, Runge and Kutta's rule that of segments, and the pose of
-    the tip is looked for that brings the far end to the clamp. Nothing is shared with `rig.phantom.rod` but what
-    the section says of a step; `points` are those of the channel, [x, y] in the order in which they were cut.
+    the tip is searched for that brings the far end to the clamp. Nothing is shared with `rig.phantom.rod` but what
+    the section states of a step; `points` are those of the channel, [x, y] in the order in which they were cut.
     """
 
     def __init__(self, truth: Truth, bevel=1):

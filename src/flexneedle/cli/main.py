@@ -15,6 +15,7 @@ from typing import Any
 
 from flexneedle import __version__
 from flexneedle.cli import emulate, export, insert, plan, report, scenario, study, view
+from flexneedle.console.common import described
 from flexneedle.errors import FlexneedleError, InputError, ScenarioWarning
 
 _EM = import_module("flexneedle.em.commands.group")  # by name: no other layer imports em
@@ -35,7 +36,11 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser; each command sets `handler`, which maps the arguments to the exit status."""
     parser: argparse.ArgumentParser = _Parser(
         prog="flexneedle",
-        description="Simulate, plan and steer flexible bevel-tip needles in soft tissue. For research only.",
+        **described(
+            "Simulate, plan and steer flexible bevel-tip needles in soft tissue. For research only.",
+            "flexneedle insert phantom --target 35 -5 --seed 3",
+            "flexneedle scenario show phantom > mine.toml",
+        ),
     )
     parser.add_argument("--version", action="version", version=f"flexneedle {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)

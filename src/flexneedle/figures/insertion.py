@@ -60,8 +60,8 @@ def _scene(ax: Axes, scenario: Scenario, insertion: Insertion) -> None:
     scene.draw_needle(ax, last.shape, before, scenario.needle.outer_diameter, "estimated needle")
     _paths(ax, insertion)
     scene.draw_start(ax, plan)
-    scene.draw_rolls(ax, curves.planned_rolls(plan), PLAN, solid=False, label="bevel roll, planned")
-    scene.draw_rolls(ax, curves.applied_rolls(insertion), ESTIMATE, solid=True, label="bevel roll, applied")
+    scene.draw_rolls(ax, curves.planned_rolls(plan), PLAN, solid=False, label="bevel flip, planned")
+    scene.draw_rolls(ax, curves.applied_rolls(insertion), ESTIMATE, solid=True, label="bevel flip, applied")
     scene.draw_target(ax, plan.target)
     if scenario.setup.guide_x is not None:
         travel = np.array([0.0, *(period.guide for period in insertion.periods)])
@@ -166,9 +166,9 @@ def _last_tip(insertion: Insertion) -> Floats:
 
 
 def _facts(insertion: Insertion) -> list[str]:
-    """Errors, bevel rolls, controller and phantom, as far as they are known."""
+    """Errors, bevel flips, controller and phantom, as far as they are known."""
     values = (("true error", insertion.true_error_mm), ("tracker residual", insertion.residual_mm))
     errors = [f"{name} {value:.3f} mm" for name, value in values if not np.isnan(value)]
-    rolls = f"bevel rolls: {insertion.flips} (planned {insertion.plan.flips})"
+    flips = f"bevel flips: {insertion.flips} (planned {insertion.plan.flips})"
     phantom = f"{insertion.phantom} phantom" if insertion.phantom else ""
-    return [*errors, rolls, ", ".join(filter(None, (insertion.controller, phantom)))]
+    return [*errors, flips, ", ".join(filter(None, (insertion.controller, phantom)))]

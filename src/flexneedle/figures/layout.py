@@ -11,6 +11,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerLine2D
 from numpy.typing import NDArray
 
 from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, new_figure
@@ -18,6 +19,8 @@ from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, new_figure
 Floats = NDArray[np.float64]
 Content = TypeVar("Content")
 
+UPRIGHT = "upright"
+"""gid of a line whose mark in the legend is upright."""
 MOST_PANELS = 9
 OVERLAID = 3  # controllers in one panel; more get a panel each
 MANY = 1500  # dots; more are small and drawn as an image inside the SVG
@@ -117,6 +120,18 @@ def mosaic(title: str, height: float, rows: Sequence[tuple[str, str]]) -> tuple[
     )
 
 
+class _Upright(HandlerLine2D):
+    """Draws the mark of a line upright, as the line is in the figure."""
+
+    def create_artists(self, legend: Any, original: Any, *place: Any) -> list[Artist]:
+        xdescent, ydescent, width, height, *_ = place
+        (line,) = super().create_artists(legend, original, *place)
+        middle, above = 0.5 * width - xdescent, 0.25 * height
+        ends = [-ydescent - above, height - ydescent + above]
+        line.set(xdata=[middle, middle], ydata=ends, markevery=None)  # a marker at each end
+        return [line]
+
+
 def legend_of(figure: Figure, shown: Iterable[Axes]) -> None:
     """Name at the foot of the figure all that is drawn in some of its axes, each label once."""
     named: dict[str, Artist] = {}
@@ -133,7 +148,12 @@ def legend(figure: Figure, handles: Sequence[Artist], named: Sequence[Artist] = 
     rows = ceil(sum(len(str(handle.get_label())) + _HANDLE for handle in shown) / _ROW)
     columns = ceil(len(shown) / max(1, rows)) or 1
     figure.legend(
-        handles=shown, loc="outside lower center", ncols=columns, columnspacing=1.6, handlelength=1.8
+        handles=shown,
+        loc="outside lower center",
+        ncols=columns,
+        columnspacing=1.6,
+        handlelength=1.8,
+        handler_map={handle: _Upright() for handle in shown if handle.get_gid() == UPRIGHT},
     )
 
 

@@ -58,7 +58,7 @@ def _draw_plan(ax: Axes, scenario: Scenario, plan: Plan, color: str) -> None:
         label=f"planned path, {plan.strategy}",
     )
     scene.draw_start(ax, plan)
-    scene.draw_rolls(ax, curves.planned_rolls(plan), PLAN, solid=False, label="bevel roll, planned")
+    scene.draw_rolls(ax, curves.planned_rolls(plan), PLAN, solid=False, label="bevel flip, planned")
     scene.draw_target(ax, plan.target)
     if scenario.setup.guide_x is not None:
         scene.draw_guide(ax, scenario.setup.guide_x, plan.guide, float(plan.guide[-1]))

@@ -1,4 +1,4 @@
-"""The scene to scale: tissue, guide, needle, target, bevel rolls. The legend names the artists by their labels."""
+"""The scene to scale: tissue, guide, needle, target, bevel flips. The legend names the artists by their labels."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
 from flexneedle.figures.curves import Roll
+from flexneedle.figures.layout import UPRIGHT
 from flexneedle.figures.style import GUIDE, NEEDLE, QUIET, TARGET
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.tissue import Layer
@@ -83,7 +84,8 @@ def draw_guide(ax: Axes, x: float, travel: Floats, y: float) -> None:
     beside = x - _WIDE - 1.3
     if np.ptp(travel) > 0.0:
         ends = [travel.min(), travel.max()]
-        ax.plot([beside, beside], ends, color=GUIDE, linewidth=1.0, marker="_", label="guide travel")
+        how: dict[str, Any] = {"color": GUIDE, "linewidth": 1.0, "marker": "_", "gid": UPRIGHT}
+        ax.plot([beside, beside], ends, label="guide travel", **how)
     ax.plot([beside], [y], color=GUIDE, marker=">", markersize=4, linestyle="none")
     above: dict[str, Any] = {"xytext": (0, 3), "ha": "center", "va": "bottom"}
     ax.annotate("guide", (x, y + _OPENING + _BLOCK), color=GUIDE, **above, **_SMALL)

@@ -1,6 +1,6 @@
 """How kernels are compiled: Numba, double precision, no fast-math, no GIL, kept on disk.
 
-Numba's own cache looks only at the file of the outermost function, so an edit of a law in another file would
+Numba's own cache checks only the file of the outermost function, so an edit of a law in another file would
 silently run the old law. Here the cache folder is named after the sources of all kernels.
 """
 
@@ -21,7 +21,7 @@ _HERE = Path(__file__).parent
 def _cache_folder(home: Path) -> str:
     """The folder for the exact sources of `home` and here: under NUMBA_CACHE_DIR, beside the code, or the user's."""
     digest = hashlib.sha256()
-    for folder in dict.fromkeys((_HERE, home)):  # in this order, wherever they lie
+    for folder in dict.fromkeys((_HERE, home)):  # in this order, wherever they are
         for source in sorted(folder.glob("*.py")):
             digest.update(source.read_bytes())
     beside = home / "__pycache__"
@@ -32,7 +32,7 @@ def _cache_folder(home: Path) -> str:
 
 
 def compiled(home: Path = _HERE) -> bool:
-    """Whether kernels of the sources in the folder `home` lie in the cache, so that a start takes no compilation."""
+    """Whether kernels of the sources in the folder `home` are in the cache, so that a start needs no compilation."""
     return any(Path(_cache_folder(home)).rglob("*.nbi"))
 
 

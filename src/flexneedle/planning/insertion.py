@@ -106,7 +106,7 @@ def cost_terms(problem: PlanProblem) -> tuple[Term, ...]:
         Term("energy", problem.energy_weight, terms.energy_at_end),
         Term("deflection", problem.deflection_weight, terms.deflection),
         Term("guide", problem.guide_weight, terms.guide_motion),
-        Term("flips", problem.flip_weight, partial(terms.rolls, first=1)),
+        Term("flips", problem.flip_weight, partial(terms.flips, first=1)),
     )
 
 

@@ -6,7 +6,7 @@
 | `large_miss` | mm | 1 |
 | `energy_at_end` | mJ | mm/mJ |
 | `guide_slope` | 1 | mm |
-| `rolls` | 1 | mm |
+| `flips` | 1 | mm |
 | `late_rolls` | 1 | mm |
 | `distance_from_line` | mm | 1 |
 | `out_of_reach` | mm | 1 |
@@ -129,8 +129,8 @@ def guide_slope(trajectories: Trajectories) -> Floats:
     return slope
 
 
-def rolls(trajectories: Trajectories, first: int = 0) -> Floats:
-    """Number of rolls of the bevel from step `first` on."""
+def flips(trajectories: Trajectories, first: int = 0) -> Floats:
+    """Number of flips of the bevel from step `first` on."""
     count: Floats = (trajectories.controls[:, first:, 4] > 0.0).sum(axis=1).astype(float)
     return count
 

@@ -287,7 +287,7 @@ def test_effort_is_reported_relative_to_the_plan(report_on):
     rows[1] |= {"unconverged_periods": 5}
     report, page = report_on(rows)
     head = page.text[: page.text.index("Figures")]
-    assert "bevel rolls 3.00 planned 1.00" in head
+    assert "bevel flips 3.00 planned 1.00" in head
     assert "tissue energy / planned 1.20 1.20 to 1.20" in head
     assert "periods / planned 1.11 largest 1.20" in head
     assert "periods not converged 7 in 2 insertions" in head

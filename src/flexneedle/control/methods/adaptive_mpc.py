@@ -199,7 +199,7 @@ def _terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tupl
         Term("energy", energy / memory.scale if memory.scale > 0.0 else 0.0, terms.energy_at_end),
         Term("line", line * share, partial(terms.distance_from_line, start=start, target=target)),
         Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
-        Term("rolls", settings.roll_weight_mm, terms.rolls),
+        Term("flips", settings.roll_weight_mm, terms.flips),
         Term("late", settings.late_roll_weight * fitted.roll_sd, late),
         Term(
             "reach", reach, partial(terms.out_of_reach, expected=_out_of_reach(task, fitted, ahead, memory))

@@ -25,7 +25,7 @@ def _not_on_a_line(points: tuple[Vector, ...]) -> tuple[Vector, ...]:
     reach = hypot(*longest)
     across = max(hypot(*_cross(longest, arm)) for arm in arms)
     if across <= 1e-6 * reach**2:
-        raise ValueError("must not lie on a line")
+        raise ValueError("must not be on one line")
     return points
 
 
