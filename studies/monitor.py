@@ -140,9 +140,9 @@ def medians(periods: Sequence[Any], window: float) -> Floats:
     largest = []
     for period in periods:
         for judged in period.readings:
-            readings = judged.sample.frame.readings
+            readings = judged.measurement.frame.readings
             values = {name: one.indicator for name, one in readings.items() if one.indicator is not None}
-            window_values.append((judged.sample.time, values))
+            window_values.append((judged.measurement.time, values))
         oldest = window_values[-1][0] - window + 1e-9
         window_values = [one for one in window_values if one[0] > oldest]
         names = {name for _, values in window_values for name in values}

@@ -70,7 +70,7 @@ def make_periods(plan, miss=0.06, seed=0):
         yield Period(
             index=k, time=0.2 * (k + 1), command=command,
             applied=(command[0], 0.0, 0.0, round(command[3], 2), flip),
-            sample=Measurement(0.2 * (k + 1) - 0.025, true[0] + noise[0], true[1] + noise[1]),
+            measurement=Measurement(0.2 * (k + 1) - 0.025, true[0] + noise[0], true[1] + noise[1]),
             verdict=Verdict(), innovation=(noise[0], noise[1]), estimate=estimate,
             shape=plan.shapes[k + 1] + [0.0, off, 0.0], base=(tip[0] - LENGTH, 0.0, 0.0),
             guide=plan.guide[k + 1] + 0.3 * np.sin(0.2 * k), bevel=side,
@@ -91,10 +91,10 @@ def make_insertion(plan=None, miss=0.06, seed=0, outcome="done", reason="", peri
 
 def blind(period):
     """Return the period as it is when the tracker saw nothing and there is no phantom to ask."""
-    sample = Measurement(period.sample.time, None, None)
+    measurement = Measurement(period.measurement.time, None, None)
     return replace(
         period,
-        sample=sample,
+        measurement=measurement,
         verdict=Verdict(VerdictKind.MISSING),
         innovation=(0.0, 0.0),
         true_tip=None,

@@ -31,7 +31,8 @@ def with_readings(period, indicator=lambda _: 0.03, verdict="ok"):
     ]
     readings = tuple(
         CheckedMeasurement(
-            Measurement(frame.time, period.sample.x, period.sample.y, 0.0, frame), verdict_of(verdict)
+            Measurement(frame.time, period.measurement.x, period.measurement.y, 0.0, frame),
+            verdict_of(verdict),
         )
         for frame in frames
     )

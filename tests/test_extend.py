@@ -145,7 +145,7 @@ def test_a_plan_is_executed_on_the_bench(lab, imported, monkeypatch):
     plan = flexneedle.plan(scenario, seed=0)
     done = imported("bench:insert")(scenario, plan)
     assert (done.outcome, done.phantom) == ("done", "")
-    assert done.periods[-1].sample.x == pytest.approx(plan.target[0], abs=0.05)
+    assert done.periods[-1].measurement.x == pytest.approx(plan.target[0], abs=0.05)
     assert done.periods[-1].true_tip is None
 
 

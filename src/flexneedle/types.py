@@ -221,7 +221,7 @@ class Outcome(StrEnum):
 class CheckedMeasurement:
     """A tracker reading and its verdict: "ok", or the reason for the rejection."""
 
-    sample: Measurement
+    measurement: Measurement
     verdict: Verdict
 
 
@@ -233,9 +233,9 @@ class Period:
     time: float  # end of the period (s), simulated time or clock of the rig
     command: Command
     applied: Command
-    sample: Measurement
-    verdict: Verdict  # of the sample
-    innovation: tuple[float, float]  # sample minus prediction (mm); 0, 0 without a usable sample
+    measurement: Measurement  # the newest reading, or the last good one while none arrives
+    verdict: Verdict  # of the measurement, or of the field
+    innovation: tuple[float, float]  # measurement minus prediction (mm); 0, 0 without a usable measurement
     estimate: Pose
     shape: Floats  # (n, 3) nodes of the estimated needle
     base: Pose
@@ -256,9 +256,7 @@ class Period:
     miss: float = float("nan")  # predicted lateral miss at the target (mm); NaN: not predicted
     miss_sd: float = float("nan")  # its standard deviation (mm)
     warning: str = ""  # warning of a likely miss, or ""
-    readings: tuple[
-        CheckedMeasurement, ...
-    ] = ()  # all readings of the period, oldest first; `sample` is the newest
+    readings: tuple[CheckedMeasurement, ...] = ()  # all readings of the period, oldest first
 
     def __repr__(self) -> str:
         at = f"{self.time:.2f} s: {self.action}, estimated tip {_mm(self.estimate)}"
@@ -294,7 +292,7 @@ class Insertion:
     @property
     def residual_mm(self) -> float:
         """Planar distance from the last accepted reading to the target, as in the paper; NaN without a reading."""
-        good = [period.sample for period in self.periods if period.verdict.ok]
+        good = [period.measurement for period in self.periods if period.verdict.ok]
         return _distance((good[-1].x, good[-1].y) if good else None, self.target)
 
     @property

@@ -494,8 +494,8 @@ def test_export_writes_one_line_per_reading_with_all_sensors(capsys, in_tmp):
     assert [int(row["period"]) for row in rows] == [k // 8 for k in range(8 * 69)]
     last = rows[-1]
     period = read_trace(in_tmp / "here/trace.mcap").periods[-1]
-    assert float(last["time_s"]) == period.readings[-1].sample.time
-    assert (float(last["x_mm"]), float(last["y_mm"])) == (period.sample.x, period.sample.y)
+    assert float(last["time_s"]) == period.readings[-1].measurement.time
+    assert (float(last["x_mm"]), float(last["y_mm"])) == (period.measurement.x, period.measurement.y)
     tip = [last[f"tip.{part}"] for part in sensor]
     assert tip == ["1.0", "2.0", "3.0", "1.0", "0.0", "0.0", "0.0", "", "ok"]
     assert float(last["ref2.indicator"]) == 0.1 * float(last["time_s"])

@@ -287,6 +287,6 @@ def test_idle_periods_are_one_move_and_cost_no_simulation(monkeypatch):
     assert (len(longer.moves), longer.tips.shape) == (31, resting.tips.shape)
     assert (longer.moves[-1].begun, longer.moves[-1].ended) == (30.0, 51.0)
     updated = longer.observe([Measurement(50.0, *needle.measured(states[-1]).tolist())])
-    assert len(updated.moves[-1].samples) == 2
+    assert len(updated.moves[-1].measurements) == 2
     assert updated.tip_at(40.5) == pytest.approx(tuple(updated.tip[:2]), abs=1e-6)
     assert len(updated.move((1.0, 0.0, 0.0, 0.0, -1), 51.0, 52.0).moves) == 32

@@ -139,7 +139,7 @@ def test_paths_are_those_of_plan_and_record(figure, insertion):
         "planned path": insertion.plan.tips[:, :2],
         "true path": [period.true_tip[:2] for period in insertion.periods],
         "estimated path": [period.estimate[:2] for period in insertion.periods],
-        "tracker": [(period.sample.x, period.sample.y) for period in insertion.periods],
+        "tracker": [(period.measurement.x, period.measurement.y) for period in insertion.periods],
     }
     for label, path in expected.items():
         (line,) = lines(scene, label)
@@ -430,7 +430,12 @@ def test_without_indicators_of_references_there_is_no_such_panel(figure, inserti
     assert len(insertion_figure(PHANTOM, watched(insertion)).axes) == 6
     unmeasured = watched(insertion, indicator=lambda _: None)
     bare = [
-        replace(judged, sample=replace(judged.sample, frame=frame_of(k, judged.sample.time, {"ref1": None})))
+        replace(
+            judged,
+            measurement=replace(
+                judged.measurement, frame=frame_of(k, judged.measurement.time, {"ref1": None})
+            ),
+        )
         for k, judged in enumerate(unmeasured.periods[0].readings)
     ]
     alone = replace(insertion, periods=tuple(replace(p, readings=tuple(bare)) for p in insertion.periods))

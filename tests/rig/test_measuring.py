@@ -29,24 +29,24 @@ class AtRest:
     def tip_at(self, _time):
         return TIP
 
-    def observe(self, samples):
-        return AtRest(len(samples))
+    def observe(self, measurements):
+        return AtRest(len(measurements))
 
     def without_reading(self):
         return AtRest(None)
 
 
 class Recorded:
-    """A tracker that returns these samples."""
+    """A tracker that returns these measurements."""
 
-    def __init__(self, *samples, status=VISIBLE):
-        self.samples, self.status = samples, status
+    def __init__(self, *measurements, status=VISIBLE):
+        self.measurements, self.status = measurements, status
 
     def read(self):
-        return self.samples
+        return self.measurements
 
 
-def sample(time, *, measured=True, indicator=0.02):
+def measurement(time, *, measured=True, indicator=0.02):
     references = {f"ref{k}": SensorReading((0.0, 0.0, 0.0), indicator=indicator) for k in (1, 2, 3)}
     tip = SensorReading((*TIP, time)) if measured else SensorReading(None, status="out of volume")
     x, y, z = (*TIP, 0.0) if measured else (None, None, None)
@@ -54,16 +54,16 @@ def sample(time, *, measured=True, indicator=0.02):
 
 
 def second(end=1.0, **kind):
-    """The samples of the second before `end`."""
-    return [sample(end - k / RATE, **kind) for k in range(40, -1, -1)]
+    """The measurements of the second before `end`."""
+    return [measurement(end - k / RATE, **kind) for k in range(40, -1, -1)]
 
 
-def before(now, *samples):
-    return observe_before_start(SCENARIO, AtRest(), Monitor(SCENARIO.monitor), now, Recorded(*samples))
+def before(now, *measurements):
+    return observe_before_start(SCENARIO, AtRest(), Monitor(SCENARIO.monitor), now, Recorded(*measurements))
 
 
-def during(monitor, now, *samples, status=VISIBLE):
-    return observe(SCENARIO, AtRest(), monitor, now - 0.2, now, Recorded(*samples, status=status))
+def during(monitor, now, *measurements, status=VISIBLE):
+    return observe(SCENARIO, AtRest(), monitor, now - 0.2, now, Recorded(*measurements, status=status))
 
 
 def test_before_the_start_all_readings_count_whatever_their_age():
@@ -75,17 +75,17 @@ def test_before_the_start_all_readings_count_whatever_their_age():
 
 @pytest.mark.parametrize(("lost", "verdict"), [(3, OK), (6, "missing: tip not measured (out of volume)")])
 def test_before_the_start_the_tip_may_be_missing_for_a_tenth_of_a_second(lost, verdict):
-    samples = second()
-    samples[-lost:] = [sample(one.time, measured=False) for one in samples[-lost:]]
-    observation = before(1.0, *samples)
+    measurements = second()
+    measurements[-lost:] = [measurement(one.time, measured=False) for one in measurements[-lost:]]
+    observation = before(1.0, *measurements)
     assert str(observation.verdict) == verdict
     assert not observation.field
 
 
 def test_before_the_start_a_missing_tip_does_not_hide_a_distorted_field():
-    samples = second(indicator=0.2)
-    samples[-1] = sample(1.0, measured=False, indicator=0.2)
-    observation = before(1.0, *samples)
+    measurements = second(indicator=0.2)
+    measurements[-1] = measurement(1.0, measured=False, indicator=0.2)
+    observation = before(1.0, *measurements)
     assert str(observation.verdict).startswith("field distorted")
     assert observation.field
 
@@ -94,15 +94,18 @@ def test_before_the_start_the_newest_frame_must_not_be_stale():
     """Good frames of a minute ago, of a tracker that stopped."""
     observation = before(61.0, *second())
     assert str(observation.verdict) == "stale: 60.000 s old, limit 0.3 s"
-    blind = [*second()[:-1], sample(1.0, measured=False)]
+    blind = [*second()[:-1], measurement(1.0, measured=False)]
     assert str(before(61.0, *blind).verdict) == "stale: 60.000 s old, limit 0.3 s"
-    undated = [replace(sample(0.0), time=math.nan), *second()]
+    undated = [replace(measurement(0.0), time=math.nan), *second()]
     assert str(before(61.0, *undated).verdict) == "stale: 60.000 s old, limit 0.3 s"
 
 
 def test_a_repeated_frame_without_the_tip_is_no_dropout():
     monitor = before(1.0, *second()).monitor
-    for again in (sample(1.0, measured=False), replace(sample(1.025, measured=False), time=math.nan)):
+    for again in (
+        measurement(1.0, measured=False),
+        replace(measurement(1.025, measured=False), time=math.nan),
+    ):
         observation = during(monitor, 1.05, again)
         assert str(observation.verdict) in ("stale: frame 40 after frame 40", "not a number")
         assert observation.estimate.used is None
@@ -134,8 +137,8 @@ def periods(monitor, *indicators):
     observations = []
     for k, indicator in enumerate(indicators, 1):
         now = 1.0 + 0.2 * k
-        samples = (sample(now - n / RATE, indicator=indicator) for n in range(7, -1, -1))
-        observations.append(during(observations[-1].monitor if observations else monitor, now, *samples))
+        measurements = (measurement(now - n / RATE, indicator=indicator) for n in range(7, -1, -1))
+        observations.append(during(observations[-1].monitor if observations else monitor, now, *measurements))
     return observations
 
 
@@ -175,7 +178,7 @@ def test_readings_in_transit_during_the_move_may_be_older_than_the_newest():
     """A move of 0.2 s: its duration is added to the age limit of all readings but the newest."""
     monitor = before(1.0, *second()).monitor
     age = STALE_AFTER + 0.1
-    observation = during(monitor, 1.2 + age, sample(1.1), sample(1.2))
+    observation = during(monitor, 1.2 + age, measurement(1.1), measurement(1.2))
     assert [str(reading.verdict) for reading in observation.readings] == [
         OK,
         f"stale: {age:.3f} s old, limit 0.3 s",
@@ -185,11 +188,11 @@ def test_readings_in_transit_during_the_move_may_be_older_than_the_newest():
 
 def test_good_readings_of_a_period_are_used_although_the_newest_has_no_tip():
     monitor = before(1.0, *second()).monitor
-    good, blind = [sample(1.0 + k / RATE) for k in (1, 2)], sample(1.0 + 3 / RATE, measured=False)
+    good, blind = [measurement(1.0 + k / RATE) for k in (1, 2)], measurement(1.0 + 3 / RATE, measured=False)
     observation = during(monitor, blind.time, *good, blind)
-    assert (str(observation.verdict), observation.estimate.used, observation.sample) == (OK, 2, good[-1])
-    alone = during(monitor, 1.0 + 1 / RATE, sample(1.0 + 1 / RATE, measured=False))
-    assert (str(alone.verdict), alone.estimate.used, alone.sample.time) == (OK, None, 1.0)
+    assert (str(observation.verdict), observation.estimate.used, observation.measurement) == (OK, 2, good[-1])
+    alone = during(monitor, 1.0 + 1 / RATE, measurement(1.0 + 1 / RATE, measured=False))
+    assert (str(alone.verdict), alone.estimate.used, alone.measurement.time) == (OK, None, 1.0)
 
 
 class Refitted(AtRest):
@@ -200,8 +203,8 @@ class Refitted(AtRest):
     def tip_at(self, _time):
         return TIP[0] + (1.0 if self.used else 0.0), TIP[1]
 
-    def observe(self, samples):
-        return Refitted(self.used + len(samples))
+    def observe(self, measurements):
+        return Refitted(self.used + len(measurements))
 
 
 def test_a_correction_of_the_estimate_at_rest_does_not_make_a_noise_free_tracker_frozen():
@@ -217,8 +220,8 @@ def test_a_correction_of_the_estimate_at_rest_does_not_make_a_noise_free_tracker
 
 def test_a_bad_last_reading_is_the_verdict_and_the_innovation_is_0():
     monitor = before(1.0, *second()).monitor
-    jumped = replace(sample(1.05), y=TIP[1] + 3.0)
-    observation = during(monitor, 1.05, sample(1.025), jumped)
+    jumped = replace(measurement(1.05), y=TIP[1] + 3.0)
+    observation = during(monitor, 1.05, measurement(1.025), jumped)
     assert str(observation.verdict).startswith("innovation: 3.00 mm")
     assert observation.estimate.used is None
 

@@ -57,10 +57,10 @@ def test_the_needle_moves_while_frames_arrive_and_is_held_without_replies():
     moved = [period for period in good if period.applied != STILL]
     measured = [period for period in moved if period.readings]
     assert measured
-    assert set(measured[-1].readings[-1].sample.frame.readings) == {"tip", "ref1", "ref2", "ref3"}
+    assert set(measured[-1].readings[-1].measurement.frame.readings) == {"tip", "ref1", "ref2", "ref3"}
     last = done.periods[-1].time
     assert all(period.applied == STILL for period in done.periods if period.time > last - 0.35)
-    numbers = [one.sample.frame.number for period in done.periods for one in period.readings]
+    numbers = [one.measurement.frame.number for period in done.periods for one in period.readings]
     assert numbers == sorted(set(numbers))
 
 

@@ -55,7 +55,7 @@ def test_in_a_clean_field_there_is_no_hold(inserted):
     assert done.outcome == "done"
     assert done.held_s == 0.0
     assert done.true_error_mm < 2.0
-    last = done.periods[-1].readings[-1].sample
+    last = done.periods[-1].readings[-1].measurement
     assert set(last.frame.readings) == {"tip", "ref1", "ref2", "ref3"}
     assert 0.0 < abs(last.z) < 3.0
 

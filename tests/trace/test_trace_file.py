@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from flexneedle.errors import InputError
-from flexneedle.trace.columns import COLUMNS, to_row, verdict_of
+from flexneedle.trace.columns import COLUMNS, from_row, to_row, verdict_of
 from flexneedle.trace.messages import joints
 from flexneedle.trace.reader import read_trace
 from flexneedle.trace.topics import TOPICS
@@ -97,9 +97,9 @@ def test_a_period_without_a_tip_is_restored(tmp_path):
     period = blind(PERIODS[3])
     (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
     assert to_row(again) == to_row(period)
-    assert (again.sample.x, again.true_tip, again.true_strain_energy) == (None, None, None)
+    assert (again.measurement.x, again.true_tip, again.true_strain_energy) == (None, None, None)
     assert again.true_stretch is None
-    assert (str(again.verdict), again.sample.time) == ("missing", period.sample.time)
+    assert (str(again.verdict), again.measurement.time) == ("missing", period.measurement.time)
 
 
 def test_the_smallest_stretch_of_the_true_tissue_is_a_column(trace_file):
@@ -110,7 +110,7 @@ def test_the_smallest_stretch_of_the_true_tissue_is_a_column(trace_file):
 
 
 @pytest.mark.parametrize(
-    "sample",
+    "measurement",
     [
         Measurement(0.1, 30.1, 1 / 3),
         Measurement(0.1, None, None, None),
@@ -131,31 +131,41 @@ def test_the_smallest_stretch_of_the_true_tissue_is_a_column(trace_file):
         ),
     ],
 )
-def test_readings_are_restored_to_the_last_bit_with_their_verdicts(tmp_path, sample):
+def test_readings_are_restored_to_the_last_bit_with_their_verdicts(tmp_path, measurement):
     frozen = Verdict(VerdictKind.FROZEN, "4 identical readings")
-    checked = (CheckedMeasurement(sample, Verdict()), CheckedMeasurement(sample, frozen))
-    period = replace(PERIODS[3], readings=checked, sample=sample)
+    checked = (CheckedMeasurement(measurement, Verdict()), CheckedMeasurement(measurement, frozen))
+    period = replace(PERIODS[3], readings=checked, measurement=measurement)
     (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
     assert again.readings == checked
-    assert (again.sample.x, again.sample.z) == (sample.x, sample.z)
+    assert (again.measurement.x, again.measurement.z) == (measurement.x, measurement.z)
 
 
-@pytest.mark.parametrize(
-    ("text", "kind", "shown"),
-    [
-        ("innovation 2.91 mm, limit 2.4 mm", VerdictKind.INNOVATION, "innovation: 2.91 mm, limit 2.4 mm"),
-        ("ok", VerdictKind.OK, "ok"),
-        ("field distorted: ref1 0.09", VerdictKind.FIELD_DISTORTED, "field distorted: ref1 0.09"),
-    ],
-)
-def test_a_verdict_is_read_from_its_text_also_from_that_of_earlier_versions(text, kind, shown):
-    assert verdict_of(text).kind is kind
-    assert str(verdict_of(text)) == shown
+@pytest.mark.parametrize("kind", VerdictKind)
+@pytest.mark.parametrize("reason", ["", "2.91 mm, limit 2.4 mm", "ref1: 0.09", ": "])
+def test_a_verdict_is_restored_from_its_text(kind, reason):
+    verdict = Verdict(kind, reason)
+    assert verdict_of(str(verdict)) == verdict
 
 
-def test_a_text_that_is_not_a_verdict_is_rejected():
-    with pytest.raises(ValueError, match="must begin with one of ok, missing, "):
-        verdict_of("fine")
+def test_the_text_of_a_verdict_is_that_of_earlier_traces():
+    assert verdict_of("field distorted: ref1 0.09") == Verdict(VerdictKind.FIELD_DISTORTED, "ref1 0.09")
+    assert verdict_of("ok") == Verdict()
+
+
+@pytest.mark.parametrize("text", ["fine", "", "okay", "missing the tip", "field"])
+def test_a_text_that_is_not_a_verdict_is_rejected(text):
+    with pytest.raises(ValueError, match=f"'{text}' is not a valid VerdictKind"):
+        verdict_of(text)
+
+
+def test_a_row_of_an_earlier_version_is_read():
+    """There the columns of the measurement began with `sample_`."""
+    period = PERIODS[3]
+    earlier = {name.replace("measured_", "sample_"): text for name, text in to_row(period).items()}
+    assert {name for name in earlier if name not in COLUMNS} == {
+        f"sample_{part}" for part in ("time_s", "x_mm", "y_mm", "z_mm")
+    }
+    assert to_row(from_row(earlier, period.shape, period.durations)) == to_row(period)
 
 
 def test_a_period_does_not_have_the_readings_of_the_previous_one(tmp_path):
@@ -204,7 +214,7 @@ def test_rosbags_reads_types_units_and_frame(trace_file):
     assert dict(zip(command.name, command.position, strict=True))["base_x"] == last.command[0] * 1e-3
     assert len(found["/needle/shape"][1].poses) == len(last.shape)
     measured = found["/tip/measured"][1].header.stamp
-    assert measured.sec + measured.nanosec * 1e-9 == pytest.approx(last.sample.time)
+    assert measured.sec + measured.nanosec * 1e-9 == pytest.approx(last.measurement.time)
 
 
 def test_the_plan_is_latched(trace_file):

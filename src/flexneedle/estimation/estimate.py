@@ -20,15 +20,15 @@ class Move:
     begun: float
     ended: float
     applied: Command
-    samples: tuple[Measurement, ...] = ()
+    measurements: tuple[Measurement, ...] = ()
 
     @cached_property
     def mean(self) -> tuple[float, float, float, float] | None:
         """Means over its readings: share of the move done, x, y (mm); and their number. None without any."""
-        if not self.samples:
+        if not self.measurements:
             return None
-        part = [self.part(sample.time) for sample in self.samples]
-        x, y = zip(*map(place, self.samples), strict=True)
+        part = [self.part(one.time) for one in self.measurements]
+        x, y = zip(*map(place, self.measurements), strict=True)
         return fmean(part), fmean(x), fmean(y), float(len(part))
 
     def part(self, time: float) -> float:
@@ -79,7 +79,7 @@ class Estimate(Protocol):
         """The estimate after a motion `applied` by the driver from `begun` to `ended` (s)."""
         ...
 
-    def observe(self, samples: Sequence[Measurement]) -> "Estimate":
+    def observe(self, measurements: Sequence[Measurement]) -> "Estimate":
         """The estimate corrected by good readings, the newest last."""
         ...
 
@@ -95,14 +95,14 @@ def described(estimate: Estimate) -> str:
     return f"<{type(estimate).__name__} {where}>"
 
 
-def assigned(moves: tuple[Move, ...], samples: Sequence[Measurement]) -> tuple[Move, ...]:
-    """Assign each sample to the move in which it was taken; earlier ones to the first move, later ones to the last."""
+def assigned(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> tuple[Move, ...]:
+    """Assign each measurement to the move in which it was taken, earlier ones to the first, later ones to the last."""
     ends = np.array([done.ended for done in moves[:-1]])
-    owner = np.searchsorted(ends, [sample.time - 1e-9 for sample in samples])
+    owner = np.searchsorted(ends, [one.time - 1e-9 for one in measurements])
     return tuple(
         done
-        if not (new := tuple(s for s, k in zip(samples, owner, strict=True) if k == j))
-        else Move(done.begun, done.ended, done.applied, done.samples + new)
+        if not (new := tuple(one for one, k in zip(measurements, owner, strict=True) if k == j))
+        else Move(done.begun, done.ended, done.applied, done.measurements + new)
         for j, done in enumerate(moves)
     )
 
@@ -115,8 +115,8 @@ def along(moves: tuple[Move, ...], tips: Floats, time: float) -> tuple[float, fl
     return float(np.interp(time, times, tips[:, 0])), float(np.interp(time, times, tips[:, 1]))
 
 
-def place(sample: Measurement) -> tuple[float, float]:
-    """Measured tip (mm) of a good sample. Raises ValueError for an empty sample."""
-    if sample.x is None or sample.y is None:
-        raise ValueError("an empty sample was not removed")
-    return sample.x, sample.y
+def place(measurement: Measurement) -> tuple[float, float]:
+    """Measured tip (mm) of a good measurement. Raises ValueError for an empty one."""
+    if measurement.x is None or measurement.y is None:
+        raise ValueError("an empty measurement was not removed")
+    return measurement.x, measurement.y

@@ -163,11 +163,11 @@ class Identified:
             self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)), perturbed=()
         )
 
-    def observe(self, samples: Sequence[Measurement]) -> "Identified":
+    def observe(self, measurements: Sequence[Measurement]) -> "Identified":
         """Fit the parameters to all readings by one Gauss–Newton step, and simulate the insertion with them."""
-        if not samples or not self.moves:
+        if not measurements or not self.moves:
             return self.without_reading()
-        extended = replace(self, moves=assigned(self.moves, samples))
+        extended = replace(self, moves=assigned(self.moves, measurements))
         readings = extended._readings
         without = readings.ahead(extended.tips[:, 0]) + extended.axial
         prior_sd = max(self.nominal.scenario.control.start_axial_sd_mm, LEAST_SD)
@@ -246,7 +246,7 @@ class Identified:
     @property
     def lag(self) -> float:
         """Time (s) from the newest reading to the end of the last move."""
-        times = (sample.time for done in reversed(self.moves) for sample in reversed(done.samples))
+        times = (one.time for done in reversed(self.moves) for one in reversed(done.measurements))
         return self.moves[-1].ended - next(times, 0.0) if self.moves else 0.0
 
     @property

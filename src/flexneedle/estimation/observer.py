@@ -101,10 +101,10 @@ class Corrected:
         tips = np.concatenate([self.tips, state.tip[None]])
         return replace(self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)))
 
-    def observe(self, samples: Sequence[Measurement]) -> "Corrected":
-        """Correct by good samples (newest last); a move is closed once a reading of its end has arrived."""
-        moves = assigned(self.moves, samples)
-        newest = max((sample.time for sample in samples), default=-np.inf)
+    def observe(self, measurements: Sequence[Measurement]) -> "Corrected":
+        """Correct by good measurements (newest last); a move is closed once a reading of its end has arrived."""
+        moves = assigned(self.moves, measurements)
+        newest = max((one.time for one in measurements), default=-np.inf)
         at = replace(self, state=self.past, moves=moves)
         past, closed, tips = at, 0, [at.tip]
         for k, done in enumerate(moves):
@@ -125,13 +125,11 @@ class Corrected:
 def _followed(at: Corrected, done: Move) -> Corrected:
     """The estimate after a move: predicted, and corrected by the mean innovation of its readings."""
     before, predicted = at.tip, at.simulator.step(at.state, Control.from_row(done.applied))
-    if not done.samples:
+    if not done.measurements:
         return replace(at, state=predicted)
-    innovation = np.mean(
-        [_innovation(before, predicted.tip, done, sample) for sample in done.samples], axis=0
-    )
+    innovation = np.mean([_innovation(before, predicted.tip, done, one) for one in done.measurements], axis=0)
     measured = predicted.tip[:2] + innovation
-    noise = float(at.simulator.scenario.tracker.jitter_per_axis / np.sqrt(len(done.samples)))
+    noise = float(at.simulator.scenario.tracker.jitter_per_axis / np.sqrt(len(done.measurements)))
     at, predicted = _moved_along(at, done, float(innovation[0]), noise)
     at = replace(
         at,
@@ -145,10 +143,10 @@ def _followed(at: Corrected, done: Move) -> Corrected:
     return _fit_start(at, predicted, float(measured[1] - predicted.tip[1]), noise)
 
 
-def _innovation(before: Floats, after: Floats, done: Move, sample: Measurement) -> Floats:
+def _innovation(before: Floats, after: Floats, done: Move, measurement: Measurement) -> Floats:
     """Reading (mm) less prediction at its time, the move taken as even, shape (2,)."""
-    expected: Floats = before[:2] + done.part(sample.time) * (after[:2] - before[:2])
-    return np.asarray(place(sample)) - expected
+    expected: Floats = before[:2] + done.part(measurement.time) * (after[:2] - before[:2])
+    return np.asarray(place(measurement)) - expected
 
 
 def _moved_along(at: Corrected, done: Move, off: float, noise: float) -> tuple[Corrected, State]:

@@ -52,15 +52,15 @@ def true_path(insertion: Insertion) -> Floats:
     return _points(period.true_tip[:2] for period in insertion.periods if period.true_tip is not None)
 
 
-def good_samples(insertion: Insertion) -> Floats:
+def good_measurements(insertion: Insertion) -> Floats:
     """Return x, y (k, 2) of the readings that were used."""
-    return _points((p.sample.x, p.sample.y) for p in insertion.periods if p.verdict.ok)
+    return _points((p.measurement.x, p.measurement.y) for p in insertion.periods if p.verdict.ok)
 
 
-def rejected_samples(insertion: Insertion) -> Floats:
+def rejected_measurements(insertion: Insertion) -> Floats:
     """Return x, y (k, 2) of the readings that were rejected."""
-    rejected = (p.sample for p in insertion.periods if not p.verdict.ok)
-    return _points((sample.x, sample.y) for sample in rejected if sample.x is not None)
+    rejected = (p.measurement for p in insertion.periods if not p.verdict.ok)
+    return _points((one.x, one.y) for one in rejected if one.x is not None)
 
 
 def lateral_error(plan: Plan, points: Floats) -> Floats:
@@ -123,8 +123,8 @@ def worst_indicator(insertion: Insertion, window: float) -> Floats:
 def _frames(insertion: Insertion) -> Iterator[Frame]:
     for period in insertion.periods:
         for checked in period.readings:
-            if checked.sample.frame is not None and checked.verdict.kind not in _EXCLUDED:
-                yield checked.sample.frame
+            if checked.measurement.frame is not None and checked.verdict.kind not in _EXCLUDED:
+                yield checked.measurement.frame
 
 
 def _indicators(frame: Frame) -> dict[str, float]:

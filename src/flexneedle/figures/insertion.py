@@ -78,7 +78,7 @@ def _paths(ax: Axes, insertion: Insertion, scale: float = 1.0) -> None:
     )
     _path(ax, true, "true path", color=TRUE, linewidth=1.3 * scale, zorder=4)
     _path(ax, estimated, "estimated path", color=ESTIMATE, linestyle=":", linewidth=1.5 * scale, zorder=4.5)
-    used, rejected = curves.good_samples(insertion), curves.rejected_samples(insertion)
+    used, rejected = curves.good_measurements(insertion), curves.rejected_measurements(insertion)
     if len(used):
         ax.plot(*used.T, "o", color=MEASURED, markersize=2.0 * scale, zorder=3, label="tracker")
     if len(rejected):
@@ -93,9 +93,9 @@ def _path(ax: Axes, points: Floats, label: str, **how: Any) -> None:
 
 def _deviation(insertion: Insertion) -> DepthPanel:
     plan = insertion.plan
-    samples, truth = curves.good_samples(insertion), curves.true_path(insertion)
+    measured, truth = curves.good_measurements(insertion), curves.true_path(insertion)
     lines = [
-        Line("tracker", samples[:, 0], curves.lateral_error(plan, samples), MEASURED, "o"),
+        Line("tracker", measured[:, 0], curves.lateral_error(plan, measured), MEASURED, "o"),
         Line("true", truth[:, 0], curves.lateral_error(plan, truth), TRUE),
     ]
     return DepthPanel("Deviation from the plan (mm)", lines, 0.4)

@@ -141,7 +141,7 @@ def _periods(
     observation = observe_before_start(scenario, estimate, monitor, rig.clock.now(), rig.tracker)
     hold, indices = _hold(None, observation, rig.clock.now()), itertools.count()
     if (
-        hold is not None or observation.sample.frame is not None
+        hold is not None or observation.measurement.frame is not None
     ):  # a good reading of a tip alone is not recorded
         clocks = [start, start, start, time.perf_counter()]
         step = _Step(Action.MEASURE, Decision(_AT_REST, "measurement before the first motion"))
@@ -161,7 +161,7 @@ def _periods(
         if hold is not None:
             step = _Step(Action.HOLD, Decision(_AT_REST, "held"), reading)
         elif arrived_at is not None:
-            delay = begun - observation.sample.time
+            delay = begun - observation.measurement.time
             step = _Step(Action.REST, Decision(_AT_REST, "waiting for the last reading"), max(reading, delay))
         else:
             decision, memory = _decided(chosen, task, memory, observation.estimate, rng)
@@ -322,7 +322,7 @@ def _record(
         time=now,
         command=step.decision.command,
         applied=applied,
-        sample=observation.sample,
+        measurement=observation.measurement,
         verdict=observation.verdict,
         readings=observation.readings,
         innovation=estimate.innovation,

@@ -11,27 +11,27 @@ from flexneedle.scenario.model import Scenario
 from flexneedle.types import OK, VISIBLE, CheckedMeasurement, Measurement, Verdict, VerdictKind
 
 _PREDICTION_SDS = 3.0  # standard deviations of the prediction, added to the limit of the innovation
-_NO_SAMPLE = Measurement(0.0, None, None)
+_NO_MEASUREMENT = Measurement(0.0, None, None)
 
 
 @dataclass(frozen=True)
 class Observation:
     """The estimate after a period, the period's readings with their verdicts, and the verdict on the period.
 
-    sample: the reading to which the verdict refers, an empty one without any; field: whether the verdict is on the
-    field and not on a reading.
+    measurement: the reading to which the verdict refers, an empty one without any; field: whether the verdict is on
+    the field and not on a reading.
     """
 
     estimate: Estimate
     monitor: Monitor
     readings: tuple[CheckedMeasurement, ...] = ()
-    sample: Measurement = _NO_SAMPLE
+    measurement: Measurement = _NO_MEASUREMENT
     verdict: Verdict = OK
     field: bool = False
 
     def has_good_reading_after(self, time: float) -> bool:
         """Whether a good reading was taken after `time` (s)."""
-        return any(one.verdict.ok and one.sample.time > time - 1e-6 for one in self.readings)
+        return any(one.verdict.ok and one.measurement.time > time - 1e-6 for one in self.readings)
 
     def hold_limit(self, scenario: Scenario) -> float:
         """Longest hold (s) for such a verdict."""
@@ -42,23 +42,23 @@ def observe_before_start(
     scenario: Scenario, estimate: Estimate, monitor: Monitor, now: float, tracker: TipTracker
 ) -> Observation:
     """Read the tracker and check readings and field before the first motion. The estimate is not corrected."""
-    samples = tracker.read()
+    measurements = tracker.read()
     stale_after = scenario.control.stale_after_s
-    if not samples:
+    if not measurements:
         return _without_readings(estimate, monitor, now, stale_after, tracker.status)
     # The tracker may have run for long, so that older readings are accepted; the newest one must not be stale.
-    max_ages = [math.inf] * (len(samples) - 1) + [stale_after]
-    monitor, readings = _checked(scenario, estimate, monitor, samples, max_ages, now)
+    max_ages = [math.inf] * (len(measurements) - 1) + [stale_after]
+    monitor, readings = _checked(scenario, estimate, monitor, measurements, max_ages, now)
     monitor, field = monitor.check_field()
     newest = readings[-1]
     verdict = newest.verdict if field.ok else field
     if (
         verdict == newest.verdict
-        and monitor.last_good_before_dropout(newest.sample, newest.verdict) is not None
+        and monitor.last_good_before_dropout(newest.measurement, newest.verdict) is not None
     ):
         verdict = OK
     checked = readings if field.ok else _rejected(readings, field)
-    return Observation(estimate, monitor, checked, newest.sample, verdict, not field.ok)
+    return Observation(estimate, monitor, checked, newest.measurement, verdict, not field.ok)
 
 
 def observe(
@@ -70,27 +70,29 @@ def observe(
     reading is used.
     """
     stale_after = scenario.control.stale_after_s
-    samples = tracker.read()
-    if not samples:
+    measurements = tracker.read()
+    if not measurements:
         return _without_readings(predicted, monitor, now, stale_after, tracker.status)
     # All but the newest were in transit while the needle moved.
-    max_ages = [stale_after + now - begun] * (len(samples) - 1) + [stale_after]
-    monitor, readings = _checked(scenario, predicted, monitor, samples, max_ages, now)
+    max_ages = [stale_after + now - begun] * (len(measurements) - 1) + [stale_after]
+    monitor, readings = _checked(scenario, predicted, monitor, measurements, max_ages, now)
     newest = readings[-1]
     monitor, field = monitor.check_field()
     if not field.ok:
         rejected = _rejected(readings, field)
-        return Observation(predicted.without_reading(), monitor, rejected, newest.sample, field, field=True)
+        return Observation(
+            predicted.without_reading(), monitor, rejected, newest.measurement, field, field=True
+        )
     if not (doubt := monitor.field_in_doubt()).ok:
         readings = _rejected(readings, doubt)
-    good = [reading.sample for reading in readings if reading.verdict.ok]
+    good = [reading.measurement for reading in readings if reading.verdict.ok]
     corrected = predicted.observe(good)
     estimate = corrected if good else corrected.without_reading()
     if newest.verdict.ok:
-        return Observation(estimate, monitor, readings, newest.sample)
-    if (last_good := monitor.last_good_before_dropout(newest.sample, newest.verdict)) is not None:
+        return Observation(estimate, monitor, readings, newest.measurement)
+    if (last_good := monitor.last_good_before_dropout(newest.measurement, newest.verdict)) is not None:
         return Observation(estimate, monitor, readings, last_good)
-    return Observation(corrected.without_reading(), monitor, readings, newest.sample, newest.verdict)
+    return Observation(corrected.without_reading(), monitor, readings, newest.measurement, newest.verdict)
 
 
 def _without_readings(
@@ -103,7 +105,7 @@ def _without_readings(
     if not monitor.field.ok and monitor.has_reading(now, stale_after):
         return Observation(predicted.without_reading(), monitor, verdict=monitor.field, field=True)
     if (last_good := monitor.last_good(now, stale_after)) is not None:
-        return Observation(predicted.without_reading(), monitor, sample=last_good)
+        return Observation(predicted.without_reading(), monitor, measurement=last_good)
     reason = "" if status == VISIBLE else f" ({status})"
     return Observation(
         predicted.without_reading(), monitor, verdict=Verdict(VerdictKind.MISSING, f"no reading{reason}")
@@ -119,14 +121,14 @@ def _checked(
     scenario: Scenario,
     predicted: Estimate,
     monitor: Monitor,
-    samples: Sequence[Measurement],
+    measurements: Sequence[Measurement],
     max_ages: Sequence[float],
     now: float,
 ) -> tuple[Monitor, tuple[CheckedMeasurement, ...]]:
-    """Check samples, oldest first, each with its largest age (s)."""
+    """Check measurements, oldest first, each with its largest age (s)."""
     readings = []
     limit = scenario.control.innovation_limit_mm + _PREDICTION_SDS * predicted.tip_sd
-    for sample, max_age in zip(samples, max_ages, strict=True):
-        monitor, verdict = monitor.check(sample, predicted.tip_at, now, max_age, limit)
-        readings.append(CheckedMeasurement(sample, verdict))
+    for measurement, max_age in zip(measurements, max_ages, strict=True):
+        monitor, verdict = monitor.check(measurement, predicted.tip_at, now, max_age, limit)
+        readings.append(CheckedMeasurement(measurement, verdict))
     return monitor, tuple(readings)

@@ -1,6 +1,8 @@
 """A control period as one row of named scalars: the columns of the CSV and the keys of `/control/status`.
 
 Names end in their unit; numbers are exact (`repr`), so that a period is restored from its row to the last bit.
+
+A verdict is its kind, or `KIND: REASON`, divided at the first ": ", which no kind contains.
 """
 
 import math
@@ -12,12 +14,10 @@ from flexneedle.types import Action, CheckedMeasurement, Floats, Measurement, Pe
 _Scalar = Callable[[str], Any]
 
 
-def verdict_of(text: object) -> Verdict:
-    """Return the verdict of a text that begins with its kind. Raises ValueError for other texts."""
-    found = next((kind for kind in VerdictKind if str(text).startswith(kind)), None)
-    if found is None:
-        raise ValueError(f"{text}: must begin with one of {', '.join(VerdictKind)}")
-    return Verdict(found, str(text).removeprefix(found).lstrip(": "))
+def verdict_of(text: str) -> Verdict:
+    """Return the verdict of its text, `str(verdict)`. Raises ValueError for other texts."""
+    kind, _, reason = text.partition(": ")
+    return Verdict(VerdictKind(kind), reason)
 
 
 def _flag(value: object) -> bool:
@@ -41,7 +41,7 @@ _FIELDS: dict[str, tuple[tuple[str, _Scalar], ...]] = {
     "time": (("time_s", float),),
     "command": _command("command"),
     "applied": _command("applied"),
-    "sample": tuple((f"sample_{part}", float) for part in ("time_s", "x_mm", "y_mm", "z_mm")),
+    "measurement": tuple((f"measured_{part}", float) for part in ("time_s", "x_mm", "y_mm", "z_mm")),
     "verdict": (("verdict", verdict_of),),
     "innovation": (("innovation_x_mm", float), ("innovation_y_mm", float)),
     "estimate": _pose("estimate"),
@@ -67,6 +67,9 @@ _FIELDS: dict[str, tuple[tuple[str, _Scalar], ...]] = {
 COLUMNS: tuple[str, ...] = tuple(name for columns in _FIELDS.values() for name, _ in columns)
 """Names of the columns, in order."""
 
+# Columns by their names in traces of earlier versions.
+_RENAMED = {name.replace("measured_", "sample_"): name for name, _ in _FIELDS["measurement"]}
+
 
 def to_row(period: Period) -> dict[str, str]:
     """Return the scalars of a period as text by column; missing values are empty."""
@@ -85,6 +88,7 @@ def from_row(
     readings: tuple[CheckedMeasurement, ...] = (),
 ) -> Period:
     """Return the period of a row and of the values not in it; raises KeyError or ValueError for other rows."""
+    row = {_RENAMED.get(name, name): text for name, text in row.items()}
     values = {field: _value(field, row) for field in _FIELDS}
     return Period(shape=shape, durations=durations, readings=readings, **values)
 
@@ -106,7 +110,7 @@ def _text(value: Any) -> str:
 
 def _value(field: str, row: Mapping[str, str]) -> Any:
     parts: Any = tuple(kind(row[name]) if row[name] or kind is str else None for name, kind in _FIELDS[field])
-    if field == "sample":
+    if field == "measurement":
         return Measurement(*parts)
     if len(parts) == 1:
         return parts[0]

@@ -36,6 +36,6 @@ def write_readings(file: IO[str], periods: Sequence[Period]) -> None:
 
 def _sensors(periods: Iterable[Period]) -> list[str]:
     """Return the names of all sensors in the order of their first reading."""
-    samples = (checked.sample for period in periods for checked in period.readings)
-    frames = (sample.frame for sample in samples if sample.frame is not None)
+    measurements = (checked.measurement for period in periods for checked in period.readings)
+    frames = (one.frame for one in measurements if one.frame is not None)
     return list(dict.fromkeys(name for frame in frames for name in frame.readings))

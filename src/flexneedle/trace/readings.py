@@ -9,9 +9,9 @@ _POSITION, _ORIENTATION = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
 
 def to_values(checked: CheckedMeasurement) -> dict[str, str]:
     """Return the values of the tip, then of each sensor of the frame; missing values are omitted."""
-    sample, frame = checked.sample, checked.sample.frame
-    values = {"time_s": repr(float(sample.time))}
-    values |= _numbers(_POSITION, (sample.x, sample.y, sample.z))
+    measurement, frame = checked.measurement, checked.measurement.frame
+    values = {"time_s": repr(float(measurement.time))}
+    values |= _numbers(_POSITION, (measurement.x, measurement.y, measurement.z))
     if frame is not None:
         values |= {"frame_time_s": repr(float(frame.time)), "frame_number": str(frame.number)}
         for name, reading in frame.readings.items():

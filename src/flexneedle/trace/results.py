@@ -187,5 +187,5 @@ def insertion_timing(insertion: Insertion) -> dict[str, Any]:
 
 
 def _measured_tip(insertion: Insertion) -> tuple[float | None, float | None] | None:
-    good = [period.sample for period in insertion.periods if period.verdict.ok]
+    good = [period.measurement for period in insertion.periods if period.verdict.ok]
     return (good[-1].x, good[-1].y) if good else None

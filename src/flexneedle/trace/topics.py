@@ -75,9 +75,9 @@ def period_messages(period: Period) -> Iterator[TopicMessage]:
 
 def _tip(period: Period) -> Iterator[tuple[str, Message]]:
     yield SHAPE, path(period.time, period.shape)
-    x, y = period.sample.x, period.sample.y
+    x, y = period.measurement.x, period.measurement.y
     if x is not None and y is not None and isfinite(x) and isfinite(y):
-        yield "/tip/measured", pose(period.sample.time, (x, y, 0.0))
+        yield "/tip/measured", pose(period.measurement.time, (x, y, 0.0))
     yield "/tip/estimate", pose(period.time, period.estimate)
     yield "/tip/path", pose(period.time, period.path)
     if period.true_tip is not None:

@@ -44,7 +44,7 @@ def test_record_is_complete_for_every_period(plan, real):
     assert [period.command for period in moving(done)] == [command for _, command in tank.moves]
     assert [period.applied for period in moving(done)] == tank.applied
     for period, batch in zip(done.periods, tank.tape, strict=True):
-        assert period.sample == batch[-1]
+        assert period.measurement == batch[-1]
         assert str(period.verdict) == "ok"
         np.testing.assert_allclose(
             period.applied, period.command, atol=0.01
@@ -114,7 +114,7 @@ def test_another_seed_changes_phantom_tracker_and_search(inserted):
     one, other = inserted(2001), inserted(2002)
     assert one.true_error_mm != other.true_error_mm
     assert one.periods[0].true_tip != other.periods[0].true_tip
-    assert one.periods[0].sample != other.periods[0].sample
+    assert one.periods[0].measurement != other.periods[0].measurement
     assert one.periods[0].spread != other.periods[0].spread
 
 

@@ -32,11 +32,11 @@ def test_after_the_last_move_it_rests_until_a_reading_at_rest_arrives(plan, late
     assert {(period.command, period.applied) for period in rests} == {(STILL, STILL)}
     assert len(tank.moves) == len(moving(done))
     assert {period.true_tip for period in rests} == {arrival.true_tip}
-    assert done.periods[-1].sample.time > arrival.time - 1e-6
-    assert all(period.sample.time < arrival.time - 1e-6 for period in done.periods[: -len(rests)])
+    assert done.periods[-1].measurement.time > arrival.time - 1e-6
+    assert all(period.measurement.time < arrival.time - 1e-6 for period in done.periods[: -len(rests)])
     assert done.periods[-1].time == pytest.approx(arrival.time + 0.2)
     assert tank.phantom.now() == done.periods[-1].time
-    off = np.subtract((done.periods[-1].sample.x, done.periods[-1].sample.y), arrival.true_tip[:2])
+    off = np.subtract((done.periods[-1].measurement.x, done.periods[-1].measurement.y), arrival.true_tip[:2])
     assert np.abs(off).max() < 4.0 * PHANTOM.tracker.jitter_per_axis
 
 
@@ -114,4 +114,4 @@ def test_the_rest_does_not_depend_on_the_controller(inserted, controller):
     assert (done.outcome, done.controller) == ("done", controller)
     assert done.periods[-1].decision in (RESTING, HELD)
     last = moving(done)[-1]
-    assert done.periods[-1].sample.time > last.time - 1e-6
+    assert done.periods[-1].measurement.time > last.time - 1e-6

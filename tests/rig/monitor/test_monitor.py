@@ -39,17 +39,17 @@ def observed(monitor, indicators, begin, count):
     verdicts = []
     for k in range(count):
         time = begin + k / RATE
-        sample = Measurement(time, 30.0 + 1e-6 * k, 1.0, 0.0, frame(time, indicators))
-        monitor, verdict = monitor.check(sample, at_rest, time, 0.3, 2.0)
+        measurement = Measurement(time, 30.0 + 1e-6 * k, 1.0, 0.0, frame(time, indicators))
+        monitor, verdict = monitor.check(measurement, at_rest, time, 0.3, 2.0)
         assert verdict.ok
         monitor, field = monitor.check_field()
         verdicts.append(str(field))
     return monitor, verdicts
 
 
-def one(sample, monitor=None, now=None):
+def one(measurement, monitor=None, now=None):
     monitor = monitor or Monitor(SETTINGS)
-    return str(monitor.check(sample, at_rest, sample.time if now is None else now, 0.3, 2.0)[1])
+    return str(monitor.check(measurement, at_rest, measurement.time if now is None else now, 0.3, 2.0)[1])
 
 
 def test_a_clean_field_is_accepted_after_half_a_window():
@@ -157,8 +157,8 @@ def verdict_at(positions, step, settings=SETTINGS):
     between two of them."""
     monitor = Monitor(settings)
     for k, x in enumerate(positions):
-        sample = Measurement(k / RATE, x, None if x is None else 1.0)
-        monitor, verdict = monitor.check(sample, driven(step * RATE), k / RATE, 0.3, 1e9)
+        measurement = Measurement(k / RATE, x, None if x is None else 1.0)
+        monitor, verdict = monitor.check(measurement, driven(step * RATE), k / RATE, 0.3, 1e9)
     return str(verdict)
 
 
@@ -236,7 +236,7 @@ def test_a_tracker_that_reports_only_the_tip_is_accepted():
 
 
 @pytest.mark.parametrize(
-    ("sample", "verdict"),
+    ("measurement", "verdict"),
     [
         (Measurement(1.0, float("nan"), 1.0), "not a number"),
         (Measurement(1.0, None, None), "missing: tip not measured"),
@@ -248,8 +248,8 @@ def test_a_tracker_that_reports_only_the_tip_is_accepted():
         (Measurement(1.0, 33.0, 1.0), "innovation: 3.00 mm, limit 2 mm"),
     ],
 )
-def test_each_fault_of_a_reading_is_reported(sample, verdict):
-    assert one(sample) == verdict
+def test_each_fault_of_a_reading_is_reported(measurement, verdict):
+    assert one(measurement) == verdict
 
 
 def test_a_repeated_frame_is_rejected_and_not_stored():
@@ -278,8 +278,8 @@ def test_a_jump_counts_from_the_last_good_reading():
 def test_a_frozen_sensor_is_detected_although_the_map_to_the_tip_changes():
     monitor = Monitor(SETTINGS)
     for k in range(4):
-        sample = Measurement(k / RATE, 30.0 + 0.01 * k, 1.0, 0.0, frame(k / RATE))
-        monitor, verdict = monitor.check(sample, driven(0.125 * RATE), sample.time, 0.3, 2.0)
+        measurement = Measurement(k / RATE, 30.0 + 0.01 * k, 1.0, 0.0, frame(k / RATE))
+        monitor, verdict = monitor.check(measurement, driven(0.125 * RATE), measurement.time, 0.3, 2.0)
     assert str(verdict) == "frozen: 4 identical readings while the tip travelled 0.38 mm"
 
 
@@ -287,8 +287,8 @@ def verdict_on_repeats(estimates):
     """The verdict on the last of identical readings, one for each predicted tip (a function of time)."""
     monitor = Monitor(SETTINGS)
     for k, tip_at in enumerate(estimates):
-        sample = Measurement(k / RATE, 30.0, 1.0)
-        monitor, verdict = monitor.check(sample, tip_at, sample.time, 0.3, 1e9)
+        measurement = Measurement(k / RATE, 30.0, 1.0)
+        monitor, verdict = monitor.check(measurement, tip_at, measurement.time, 0.3, 1e9)
     return str(verdict)
 
 
@@ -312,8 +312,8 @@ def test_corrections_do_not_hide_the_motion_of_a_driven_needle():
 @pytest.mark.parametrize("time", [1e6, -50.0, float("nan")])
 def test_a_reading_with_an_invalid_time_does_not_change_the_verdict_on_the_field(time):
     monitor, _ = observed(Monitor(SETTINGS), (0.2, 0.02, 0.02), 0.0, 40)
-    sample = Measurement(time, 30.0, 1.0, 0.0, replace(frame(1.0, (0.01, 0.01, 0.01)), number=1000))
-    after, verdict = monitor.check(sample, at_rest, 1.0, 0.3, 2.0)
+    measurement = Measurement(time, 30.0, 1.0, 0.0, replace(frame(1.0, (0.01, 0.01, 0.01)), number=1000))
+    after, verdict = monitor.check(measurement, at_rest, 1.0, 0.3, 2.0)
     assert str(verdict).startswith(("stale", "not a number"))
     assert after is monitor
     assert str(after.check_field()[1]).startswith("field distorted")

@@ -40,10 +40,10 @@ def test_the_first_bad_verdict_is_returned_and_later_rules_are_not_evaluated():
 
 
 @pytest.mark.parametrize(
-    "sample", [Measurement(1.0, None, 1.0), Measurement(1.0, 30.0, None), Measurement(1.0, None, None)]
+    "measurement", [Measurement(1.0, None, 1.0), Measurement(1.0, 30.0, None), Measurement(1.0, None, None)]
 )
-def test_a_reading_without_a_tip_is_missing(sample):
-    assert rules.missing(sample) == "missing: tip not measured"
+def test_a_reading_without_a_tip_is_missing(measurement):
+    assert rules.missing(measurement) == "missing: tip not measured"
     assert rules.missing(Measurement(1.0, 30.0, 1.0)) == OK
 
 

@@ -83,20 +83,20 @@ def frames_of_run(folder: Path) -> tuple[Frame, ...]:
     with z = 0 if unknown. Raises InputError if the run has no readings.
     """
     periods = read_trace(folder / TRACE_FILE).periods
-    samples = [judged.sample for period in periods for judged in period.readings]
-    frames = {frame.number: frame for frame in (_frame(n, sample) for n, sample in enumerate(samples))}
+    measurements = [judged.measurement for period in periods for judged in period.readings]
+    frames = {frame.number: frame for frame in (_frame(n, one) for n, one in enumerate(measurements))}
     if not frames:
         raise InputError(f"{folder}: the run has no tracker readings")
     return tuple(frames.values())
 
 
-def _frame(number: int, sample: Measurement) -> Frame:
-    if sample.frame is not None:
-        return sample.frame
-    known = sample.x is not None and sample.y is not None
-    position = (sample.x or 0.0, sample.y or 0.0, sample.z or 0.0)
+def _frame(number: int, measurement: Measurement) -> Frame:
+    if measurement.frame is not None:
+        return measurement.frame
+    known = measurement.x is not None and measurement.y is not None
+    position = (measurement.x or 0.0, measurement.y or 0.0, measurement.z or 0.0)
     return Frame(
-        sample.time,
+        measurement.time,
         number,
         {TIP: SensorReading(position) if known else SensorReading(None, status="missing")},
     )

@@ -93,7 +93,7 @@ class Monitor:
     distorted: bool = False
 
     def check(
-        self, sample: Measurement, tip_at: TipAt, now: float, max_age: float, max_innovation: float
+        self, measurement: Measurement, tip_at: TipAt, now: float, max_age: float, max_innovation: float
     ) -> "tuple[Monitor, Verdict]":
         """Return the state after a reading, and the verdict on it. Readings with an invalid time are not stored.
 
@@ -103,18 +103,18 @@ class Monitor:
         previous = self.recent[-1].frame if self.recent else None
         verdict = rules.first_bad(
             (
-                rules.not_a_number(sample),
-                rules.repeated(sample.frame, previous),
-                rules.stale(sample.time, now, max_age),
+                rules.not_a_number(measurement),
+                rules.repeated(measurement.frame, previous),
+                rules.stale(measurement.time, now, max_age),
             )
         )
         if not verdict.ok:
             return self, verdict
-        since = sample.time - self.settings.indicator_window_s + 1e-9
+        since = measurement.time - self.settings.indicator_window_s + 1e-9
         kept = tuple(one for one in self.recent if one.time > since)
-        monitor = replace(self, recent=(*kept, sample), repeats=self._repeats_with(sample, tip_at))
-        verdict = rules.first_bad(monitor._verdicts(sample, tip_at(sample.time), max_innovation))
-        return (replace(monitor, good=sample) if verdict.ok else monitor), verdict
+        monitor = replace(self, recent=(*kept, measurement), repeats=self._repeats_with(measurement, tip_at))
+        verdict = rules.first_bad(monitor._verdicts(measurement, tip_at(measurement.time), max_innovation))
+        return (replace(monitor, good=measurement) if verdict.ok else monitor), verdict
 
     def check_field(self) -> "tuple[Monitor, Verdict]":
         """Return the state after a check of the field by the reference sensors, and the verdict.
@@ -161,18 +161,18 @@ class Monitor:
         return self.last_good(newest.time, self.settings.lost_after_s)
 
     def _frames(self) -> list[Frame]:
-        return [sample.frame for sample in self.recent if sample.frame is not None]
+        return [one.frame for one in self.recent if one.frame is not None]
 
     def _verdicts(
-        self, sample: Measurement, predicted: tuple[float, float], max_innovation: float
+        self, measurement: Measurement, predicted: tuple[float, float], max_innovation: float
     ) -> Iterator[Verdict]:
         settings = self.settings
-        yield rules.missing(sample)
-        if sample.x is not None and sample.y is not None:
-            yield rules.innovation((sample.x, sample.y), predicted, max_innovation)
+        yield rules.missing(measurement)
+        if measurement.x is not None and measurement.y is not None:
+            yield rules.innovation((measurement.x, measurement.y), predicted, max_innovation)
         if settings.enabled:
-            yield rules.out_of_plane(sample.z, settings.out_of_plane_limit_mm)
-            yield rules.jump(sample, self.good, settings.speed_limit_mm_s, settings.jump_margin_mm)
+            yield rules.out_of_plane(measurement.z, settings.out_of_plane_limit_mm)
+            yield rules.jump(measurement, self.good, settings.speed_limit_mm_s, settings.jump_margin_mm)
             if self.repeats is not None:
                 yield rules.frozen(self.repeats.count, self.repeats.travel, settings.frozen_travel_mm)
 
@@ -186,9 +186,9 @@ class Monitor:
         return self.repeats.extended(newest.time, tip_at)
 
 
-def _reported_position(sample: Measurement) -> rules.Position | None:
+def _reported_position(measurement: Measurement) -> rules.Position | None:
     """Position of the tip as the tracker reported it: a changed map to the stage does not move a frozen sensor."""
-    reading = None if sample.frame is None else sample.frame.readings.get(TIP)
+    reading = None if measurement.frame is None else measurement.frame.readings.get(TIP)
     if reading is not None:
         return reading.position
-    return None if sample.x is None or sample.y is None else (sample.x, sample.y)
+    return None if measurement.x is None or measurement.y is None else (measurement.x, measurement.y)

@@ -27,11 +27,11 @@ def first_bad(verdicts: Iterable[Verdict]) -> Verdict:
     return next((verdict for verdict in verdicts if not verdict.ok), OK)
 
 
-def missing(sample: Measurement) -> Verdict:
+def missing(measurement: Measurement) -> Verdict:
     """A reading without a tip; with the tracker's reason if it gives one."""
-    if sample.x is not None and sample.y is not None:
+    if measurement.x is not None and measurement.y is not None:
         return OK
-    reading = None if sample.frame is None else sample.frame.readings.get(TIP)
+    reading = None if measurement.frame is None else measurement.frame.readings.get(TIP)
     if reading is None:
         return Verdict(VerdictKind.MISSING, "tip not measured")
     if reading.status != VISIBLE:
@@ -41,9 +41,9 @@ def missing(sample: Measurement) -> Verdict:
     return Verdict(VerdictKind.MISSING, f"tip not measured ({reason})")
 
 
-def not_a_number(sample: Measurement) -> Verdict:
+def not_a_number(measurement: Measurement) -> Verdict:
     """The time or a coordinate is not finite."""
-    values = (sample.time, sample.x, sample.y, sample.z)
+    values = (measurement.time, measurement.x, measurement.y, measurement.z)
     finite = all(math.isfinite(value) for value in values if value is not None)
     return OK if finite else Verdict(VerdictKind.NOT_A_NUMBER)
 
@@ -79,12 +79,12 @@ def out_of_plane(z: float | None, limit: float) -> Verdict:
     return Verdict(VerdictKind.OUT_OF_PLANE, f"{z:.2f} mm, limit {limit:g} mm")
 
 
-def jump(sample: Measurement, previous: Measurement | None, speed: float, margin: float) -> Verdict:
+def jump(measurement: Measurement, previous: Measurement | None, speed: float, margin: float) -> Verdict:
     """The tip moved faster than `speed` (mm/s) since the previous good reading; `margin` (mm) allows for noise."""
     if previous is None:
         return OK
-    travel = math.dist(*_common_coordinates(sample, previous))
-    limit = speed * abs(sample.time - previous.time) + margin
+    travel = math.dist(*_common_coordinates(measurement, previous))
+    limit = speed * abs(measurement.time - previous.time) + margin
     if travel <= limit:
         return OK
     return Verdict(VerdictKind.JUMP, f"{travel:.2f} mm, limit {limit:.2f} mm")

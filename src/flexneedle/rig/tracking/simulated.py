@@ -41,16 +41,16 @@ class NoisyTracker:
     def read(self) -> tuple[Measurement, ...]:
         """Return the readings that arrived since the last call, oldest first."""
         due = math.floor((self._clock.now() - self._delay) / self._period + 1e-6)
-        samples = tuple(self._sample(k) for k in range(self._taken + 1, due + 1))
+        measurements = tuple(self._measurement(k) for k in range(self._taken + 1, due + 1))
         self._taken = max(due, self._taken)
-        return samples
+        return measurements
 
     @property
     def status(self) -> str:
         """VISIBLE: it never stops."""
         return VISIBLE
 
-    def _sample(self, number: int) -> Measurement:
+    def _measurement(self, number: int) -> Measurement:
         time, is_first = number * self._period, number == self._first
         x, y = self._tip_at(time)
         rng = self._rng_first if is_first else self._rng if time > 0.0 else self._rng_before
