@@ -24,6 +24,7 @@ from flexneedle.rig.measuring import Observation, observe, observe_before_start
 from flexneedle.rig.monitor.monitor import Monitor
 from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
+from flexneedle.rig.progress import Progress, hold_after
 from flexneedle.rig.virtual import Rig, Seeds, virtual_rig
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
@@ -135,60 +136,88 @@ def _periods(
 
     After the last move the needle rests until the tracker has measured it at rest, since readings are delayed.
     """
-    scenario, memory = task.scenario, chosen.begin(task)
-    estimate, monitor = chosen.observer.begin(task), Monitor(scenario.monitor)
+    memory, estimate, indices = chosen.begin(task), chosen.observer.begin(task), itertools.count()
     start = time.perf_counter()
-    observation = observe_before_start(scenario, estimate, monitor, rig.clock.now(), rig.tracker)
-    hold, indices = _hold(None, observation, rig.clock.now()), itertools.count()
-    if (
-        hold is not None or observation.measurement.frame is not None
-    ):  # a good reading of a tip alone is not recorded
-        clocks = [start, start, start, time.perf_counter()]
-        step = _Step(Action.MEASURE, Decision(_AT_REST, "measurement before the first motion"))
+    progress = _before_start(task.scenario, memory, estimate, rig)
+    if (first := _first_step(progress)) is not None:
+        clocks, observation = [start, start, start, time.perf_counter()], progress.observation
         yield (
-            _record(next(indices), rig.clock.now(), task.plan, rig, step, _AT_REST, observation, clocks),
+            _record(next(indices), rig.clock.now(), task.plan, rig, first, _AT_REST, observation, clocks),
             None,
         )
-    arrived_at: float | None = None
-    no_path = _NoPath()
-    moves = in_a_row = 0
     for index in indices:
-        if moves == _MOST_MOVES * len(task.plan.controls):
+        if progress.moves == _MOST_MOVES * len(task.plan.controls):
             return
-        clocks = [time.perf_counter()]
-        begun, reading = rig.clock.now(), scenario.tracker.period
-        decides = hold is None and arrived_at is None
-        if hold is not None:
-            step = _Step(Action.HOLD, Decision(_AT_REST, "held"), reading)
-        elif arrived_at is not None:
-            delay = begun - observation.measurement.time
-            step = _Step(Action.REST, Decision(_AT_REST, "waiting for the last reading"), max(reading, delay))
-        else:
-            decision, memory = _decided(chosen, task, memory, observation.estimate, rng)
-            in_a_row = likely_misses(decision, in_a_row)
-            no_path = no_path.after("" if force else hopeless(decision, scenario.control))
-            step = _step(decision, no_path.reason, reading)
-            moves += not no_path.reason
+        clocks, begun = [time.perf_counter()], rig.clock.now()
+        step, decided = _next_step(progress, task, chosen, rng, begun, force=force)
         clocks.append(time.perf_counter())
-        applied = _carry_out(scenario, rig, step.decision.command, step.wait)
+        applied = _carry_out(task.scenario, rig, step.decision.command, step.wait)
         clocks.append(time.perf_counter())
-        predicted = observation.estimate.move(applied, begun, rig.clock.now())
-        observation = observe(scenario, predicted, observation.monitor, begun, rig.clock.now(), rig.tracker)
+        observation = _observed(progress.observation, task.scenario, rig, applied, begun)
         clocks.append(time.perf_counter())
-        now, good = rig.clock.now(), observation.verdict.ok
-        hold = _hold(hold, observation, now)
-        if arrived_at is None and good and chosen.arrived(task, memory, observation.estimate):
-            arrived_at = now
-        measured = arrived_at is not None and good and observation.has_good_reading_after(arrived_at)
-        ending = _ending(
-            task, observation, None if hold is None else hold.duration(observation.field), measured
-        )
-        no_path = no_path.extended(now - begun) if decides else no_path
-        ending = ending or no_path.ending(scenario.control.hold_limit_s)
+        now = rig.clock.now()
+        progress = _progress_after(decided, observation, task, chosen, begun, now)
+        ending = _ending(task, progress)
         period = _record(index, now, task.plan, rig, step, applied, observation, clocks)
-        yield replace(period, warning=warning(step.decision, in_a_row)), ending
+        yield replace(period, warning=warning(step.decision, progress.in_a_row)), ending
         if ending is not None:
             return
+
+
+def _before_start(scenario: Scenario, memory: Any, estimate: Estimate, rig: Rig) -> Progress:
+    """The progress after the measurement before the first motion."""
+    monitor = Monitor(scenario.monitor)
+    observation = observe_before_start(scenario, estimate, monitor, rig.clock.now(), rig.tracker)
+    return Progress(observation, memory, hold_after(None, observation, rig.clock.now()))
+
+
+def _first_step(progress: Progress) -> "_Step | None":
+    """The step of the measurement before the first motion; None for a good reading of a tip alone: not recorded."""
+    if progress.hold is None and progress.observation.measurement.frame is None:
+        return None
+    return _Step(Action.MEASURE, Decision(_AT_REST, "measurement before the first motion"))
+
+
+def _next_step(
+    progress: Progress, task: Task, chosen: Method, rng: np.random.Generator, begun: float, *, force: bool
+) -> tuple["_Step", Progress]:
+    """The step of the period that begins at `begun` (s), and the progress with the controller's decision."""
+    reading = task.scenario.tracker.period
+    if progress.hold is not None:
+        return _Step(Action.HOLD, Decision(_AT_REST, "held"), reading), progress
+    if progress.arrived_at is not None:
+        delay = begun - progress.observation.measurement.time
+        waiting = Decision(_AT_REST, "waiting for the last reading")
+        return _Step(Action.REST, waiting, max(reading, delay)), progress
+    decision, memory = _decided(chosen, task, progress.memory, progress.observation.estimate, rng)
+    no_path = progress.no_path.after("" if force else hopeless(decision, task.scenario.control))
+    moves, in_a_row = progress.moves + (not no_path.reason), likely_misses(decision, progress.in_a_row)
+    decided = replace(progress, memory=memory, no_path=no_path, moves=moves, in_a_row=in_a_row)
+    return _step(decision, no_path.reason, reading), decided
+
+
+def _observed(
+    before: Observation, scenario: Scenario, rig: Rig, applied: Command, begun: float
+) -> Observation:
+    """The observation after a motion `applied` by the driver since `begun` (s)."""
+    predicted = before.estimate.move(applied, begun, rig.clock.now())
+    return observe(scenario, predicted, before.monitor, begun, rig.clock.now(), rig.tracker)
+
+
+def _progress_after(
+    decided: Progress, observation: Observation, task: Task, chosen: Method, begun: float, now: float
+) -> Progress:
+    """The progress after a period from `begun` to `now` (s)."""
+    arrived_at, arrived = decided.arrived_at, chosen.arrived
+    if arrived_at is None and observation.verdict.ok and arrived(task, decided.memory, observation.estimate):
+        arrived_at = now
+    return replace(
+        decided,
+        observation=observation,
+        hold=hold_after(decided.hold, observation, now),
+        no_path=decided.no_path.extended(now - begun) if decided.decides else decided.no_path,
+        arrived_at=arrived_at,
+    )
 
 
 def _decided(
@@ -220,62 +249,6 @@ def _step(decision: Decision, no_path: str, reading: float) -> _Step:
     return _Step(Action.MOVE, decision)
 
 
-@dataclass(frozen=True)
-class _Hold:
-    """A hold of the needle: its time (s) on account of the field and of readings, and its present cause since `at`."""
-
-    at: float
-    field: bool
-    for_field: float = 0.0
-    for_readings: float = 0.0
-
-    def duration(self, field: bool) -> float:
-        """Time (s) held on account of the field or of readings."""
-        return self.for_field if field else self.for_readings
-
-
-@dataclass(frozen=True)
-class _NoPath:
-    """Reason why no path reaches the target, empty if one does, and the time (s) held for it.
-
-    The time does not run while the needle is held on account of the tracker; a decision with a path resets it.
-    """
-
-    reason: str = ""
-    duration: float = 0.0
-
-    def after(self, reason: str) -> "_NoPath":
-        """After a decision."""
-        return _NoPath(reason, self.duration) if reason else _NoPath()
-
-    def extended(self, seconds: float) -> "_NoPath":
-        """After a period of this length."""
-        return _NoPath(self.reason, self.duration + seconds) if self.reason else self
-
-    def ending(self, limit: float) -> tuple[Outcome, str] | None:
-        """Outcome and reason once the hold has lasted for `limit` (s)."""
-        return (Outcome.HELD, self.reason) if self.reason and self.duration > limit - 1e-9 else None
-
-
-def _hold(hold: _Hold | None, observation: Observation, now: float) -> _Hold | None:
-    """The hold after a verdict; None: not held.
-
-    Each of the two causes has its own clock and limit. A clock stops while the needle is held for the other cause, and
-    only a good verdict resets it, so that alternating causes cannot hold the needle forever.
-    """
-    if observation.verdict.ok:
-        return None
-    if hold is None:
-        return _Hold(now, observation.field)
-    passed = now - hold.at
-    return _Hold(
-        now,
-        observation.field,
-        hold.for_field + (passed if hold.field else 0.0),
-        hold.for_readings + (0.0 if hold.field else passed),
-    )
-
-
 def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> Command:
     """Move, within the time at insertion speed, rounded up to whole tracker periods; or wait for `wait` (s)."""
     if wait > 0.0:
@@ -286,19 +259,16 @@ def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> C
     return rig.driver.apply(command, max(1, readings) * reading)
 
 
-def _ending(
-    task: Task, observation: Observation, held: float | None, measured: bool
-) -> tuple[Outcome, str] | None:
-    """Outcome and reason if the insertion ends with this period. held: duration of the hold (s), None: not held;
-    measured: whether the needle was measured at rest after its arrival.
-    """
+def _ending(task: Task, progress: Progress) -> tuple[Outcome, str] | None:
+    """Outcome and reason if the insertion ends with this period."""
+    observation, held = progress.observation, progress.held
     estimate, limit = observation.estimate, observation.hold_limit(task.scenario)
     if not estimate.state.converged:
         return Outcome.FAILED, f"the model did not converge: residual {estimate.state.residual:.3g} mm"
     if held is not None and held > limit - 1e-9:
         return Outcome.HELD, f"held for {held:.2f} s (limit {limit:g} s): {observation.verdict}"
-    if not measured:
-        return None
+    if not progress.measured_at_rest:
+        return progress.no_path.ending(task.scenario.control.hold_limit_s)
     short = task.plan.target[0] - float(estimate.tip[0])
     if short > task.scenario.control.depth_tolerance_mm and at_depth(task, None, estimate):
         return Outcome.DONE, f"stroke ends {short:.2f} mm before the target depth"
