@@ -5,6 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from flexneedle.figures.style import new_figure
+from flexneedle.runs import figures
+
 pytest_plugins = ["controllers"]
 
 MINIMAL = """\
@@ -31,6 +34,13 @@ def interrupts():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture
+def empty_figures(monkeypatch):
+    """Save empty figures of plans and insertions: drawing takes most of a command's time."""
+    for name in ("insertion_figure", "plan_figure"):
+        monkeypatch.setattr(figures, name, lambda *_: new_figure(1.0))
 
 
 @pytest.fixture

@@ -125,12 +125,12 @@ def moving(done):
     return [period for period in done.periods if period.command != STILL]
 
 
-def lost(_sample):
+def lost(_measurement):
     return None
 
 
-def blind(sample):
-    return replace(sample, x=None, y=None)
+def blind(measurement):
+    return replace(measurement, x=None, y=None)
 
 
 def spoilt_tape(tape, which, fault):

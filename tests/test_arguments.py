@@ -147,16 +147,17 @@ def test_numpy_numbers_are_accepted():
     assert pair("target", np.array([40.0, 5.0]), "x and y") == (40.0, 5.0)
 
 
-def test_a_scenario_may_be_given_by_name_or_path(quick_plan, tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text(dump_scenario(flexneedle.load_scenario("phantom")))
+def test_a_scenario_may_be_given_by_name_or_path(tmp_path):
+    scenario, path = flexneedle.load_scenario("phantom"), tmp_path / "mine.toml"
+    path.write_text(dump_scenario(scenario))
+    plan = flexneedle.plan(scenario, (5.0, 0.0), seed=1, threads=1)
     for source in ("phantom", str(path), path):
-        again = flexneedle.plan(source, (40.0, 5.0), seed=1, threads=1)
-        assert again.controls.tobytes() == quick_plan.controls.tobytes()
-        assert flexneedle.Simulator(source).scenario == flexneedle.load_scenario("phantom")
+        again = flexneedle.plan(source, (5.0, 0.0), seed=1, threads=1)
+        assert again.controls.tobytes() == plan.controls.tobytes()
+        assert flexneedle.Simulator(source).scenario == scenario
     one, other = (
-        flexneedle.insert(source, quick_plan, 1, controller="open-loop", phantom="model", threads=1)
-        for source in ("phantom", flexneedle.load_scenario("phantom"))
+        flexneedle.insert(source, plan, 1, controller="open-loop", phantom="model", threads=1)
+        for source in ("phantom", scenario)
     )
     assert [period.true_tip for period in one.periods] == [period.true_tip for period in other.periods]
 

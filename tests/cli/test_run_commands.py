@@ -15,9 +15,7 @@ from fake_engine import install
 from flexneedle.cli import main as cli
 from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.errors import RunError
-from flexneedle.figures.style import new_figure
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PLANTS
-from flexneedle.runs import figures
 from flexneedle.trace.columns import COLUMNS
 from flexneedle.trace.reader import read_trace
 from synthetic import make_periods
@@ -55,11 +53,10 @@ def in_tmp(tmp_path, monkeypatch):
 
 
 @pytest.fixture(autouse=True)
-def empty_figures(request, monkeypatch):
-    """Save empty figures in tests that are not about figures: drawing takes most of a command's time."""
+def drawing(request):
+    """Save empty figures in tests that are not about figures."""
     if "real_figures" not in request.fixturenames:
-        for name in ("insertion_figure", "plan_figure"):
-            monkeypatch.setattr(figures, name, lambda *_: new_figure(1.0))
+        request.getfixturevalue("empty_figures")
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ PLATE = shipped("noisy").plate
 
 @pytest.fixture(scope="module")
 def plan():
-    return flexneedle.plan(PHANTOM, (30.0, 0.0), seed=1)
+    return flexneedle.plan(PHANTOM, (15.0, 0.0), seed=1)
 
 
 @pytest.fixture(scope="module")

@@ -23,11 +23,14 @@ PHANTOM = flexneedle.load_scenario("phantom")
 PLAN = replace(make_plan(), scenario=PHANTOM)
 INSERTION = replace(make_insertion(PLAN), scenario=PHANTOM, controller="ce-mpc", phantom="exact")
 
+DEPTH_AND_OFFSET = (15.0, 2.0)
+TARGET = ("--target", *map(str, DEPTH_AND_OFFSET))
+
 
 @pytest.fixture(scope="module")
 def executed():
     """A real plan and its insertion, by the name of the scenario."""
-    plan = flexneedle.plan("phantom", seed=0)
+    plan = flexneedle.plan("phantom", DEPTH_AND_OFFSET, seed=0)
     return plan, flexneedle.insert("phantom", plan, seed=3)
 
 
@@ -82,6 +85,7 @@ def test_plot_rejects_other_types():
         flexneedle.plot(3)
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_a_dataframe_has_the_rows_and_columns_of_the_exported_table(tmp_path, capsys):
     half = replace(INSERTION, periods=(*INSERTION.periods[:-1], blind(INSERTION.periods[-1])))
     flexneedle.save(half, tmp_path / "run")
@@ -95,7 +99,7 @@ def test_a_dataframe_has_the_rows_and_columns_of_the_exported_table(tmp_path, ca
     exported = pd.read_csv(tmp_path / "periods.csv", dtype=texts, keep_default_na=False, na_values=missing)
     pd.testing.assert_frame_equal(frame, exported, check_dtype=False, check_exact=True)
     assert np.isnan(frame["true_x_mm"].iloc[-1])
-    assert frame["true_x_mm"].dtype == frame["sample_z_mm"].dtype == float
+    assert frame["true_x_mm"].dtype == frame["measured_z_mm"].dtype == float
     assert frame["converged"].dtype == bool
 
 
@@ -117,6 +121,7 @@ def test_without_pandas_the_error_names_the_remedy(monkeypatch):
     assert str(caught.value) == "to_dataframe needs pandas, which is not installed: pip install pandas"
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_a_saved_record_loads_unchanged(executed, tmp_path):
     """The loaded scenario of the plan includes the settings of the controllers."""
     plan = replace(executed[0], scenario=executed[1].scenario)
@@ -130,8 +135,8 @@ def test_save_writes_the_same_folder_as_the_command(executed, tmp_path, monkeypa
     """The same seeds give the same files, except for wall-clock times."""
     plan, insertion = executed
     monkeypatch.chdir(tmp_path)
-    assert cli.main(["insert", "--seed", "3", "--plan-seed", "0", "--out", "insert"]) == 0
-    assert cli.main(["plan", "--out", "plan"]) == 0
+    assert cli.main(["insert", *TARGET, "--seed", "3", "--plan-seed", "0", "--out", "insert"]) == 0
+    assert cli.main(["plan", *TARGET, "--out", "plan"]) == 0
     capsys.readouterr()
     for command, record in (("insert", insertion), ("plan", plan)):
         ours, theirs = flexneedle.save(record, f"our-{command}"), tmp_path / command
@@ -143,9 +148,10 @@ def test_save_writes_the_same_folder_as_the_command(executed, tmp_path, monkeypa
             assert picture.read_bytes() == (theirs / picture.name).read_bytes()
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_a_folder_of_both_strategies_loads_as_plans_by_name(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    cli.main(["plan", "--strategy", "both", "--out", "both"])
+    cli.main(["plan", "--target", "10", "0.2", "--strategy", "both", "--out", "both"])
     capsys.readouterr()
     plans = flexneedle.load("both")
     assert list(plans) == ["manipulation", "steering"]
@@ -175,6 +181,7 @@ def test_another_type_is_rejected_in_one_line(use, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_a_folder_without_a_run_is_rejected(tmp_path):
     with pytest.raises(InputError, match=r"contains no run: run\.json is missing"):
         flexneedle.load(tmp_path)
@@ -182,6 +189,7 @@ def test_a_folder_without_a_run_is_rejected(tmp_path):
         flexneedle.save(PLAN, flexneedle.save(PLAN, tmp_path / "a"))
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_a_run_without_a_plan_is_rejected(tmp_path):
     path = flexneedle.save(PLAN, tmp_path / "a") / "run.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"plans": {}}))
@@ -189,6 +197,7 @@ def test_a_run_without_a_plan_is_rejected(tmp_path):
         flexneedle.load(tmp_path / "a")
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_a_torn_trace_is_loaded_with_a_warning(tmp_path):
     trace = flexneedle.save(INSERTION, tmp_path / "a") / "trace.mcap"
     trace.write_bytes(trace.read_bytes()[: trace.stat().st_size // 2])
@@ -197,6 +206,7 @@ def test_a_torn_trace_is_loaded_with_a_warning(tmp_path):
     assert 0 < len(torn.periods) < len(INSERTION.periods)
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_an_insertion_killed_before_its_trace_is_drawn_as_its_plan(tmp_path):
     folder = flexneedle.save(INSERTION, tmp_path / "run")
     (folder / TRACE_FILE).unlink()

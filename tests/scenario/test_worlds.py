@@ -71,6 +71,7 @@ def test_every_world_is_within_its_ranges_and_else_the_preset(number):
     }
 
 
+@pytest.mark.long
 def test_worlds_are_as_varied_as_they_say():
     """Shares of a thousand: steel 70 %, stylet in half of it, guide 80 %, layers evenly."""
     worlds = [world(number) for number in range(1000)]
@@ -127,6 +128,7 @@ def test_a_structural_world_has_one_kind_of_mismatch_more(number):
         assert hidden.top_mm + hidden.thickness_mm <= scenario.target.depth_mm + 1e-3
 
 
+@pytest.mark.long
 def test_each_kind_of_structural_mismatch_is_as_likely():
     guided = [(number, found) for number in range(1000) if (found := world(number)).setup.has_guide]
     kinds = [next(iter(structural(number, found))) for number, found in guided]

@@ -66,7 +66,9 @@ class Pair:
         return too_far(gaps(self.reference, self.state, self.pose), factor=5.0)
 
 
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize(
+    "seed", [*range(8), *(pytest.param(k, marks=pytest.mark.long) for k in range(8, 25))]
+)
 def test_random_insertions_agree(seed):
     """90 random steps each: 1e-9 to 1 mm, retractions, all inputs, flips, layers, with and without guide."""
     assert not too_far(random_insertion(seed, every=15))

@@ -3,6 +3,8 @@
 import json
 import re
 import sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 
 import numpy as np
 import pytest
@@ -11,15 +13,39 @@ from em_tables import GRID, plain, random_rows, rows_of, write_csv
 from flexneedle.cli import main as cli
 
 
-@pytest.fixture
-def table(tmp_path):
+@pytest.fixture(scope="module")
+def rows():
+    """A sensor in a clean field, and another over metal as well, with distances to the field generator."""
     rng = np.random.default_rng(0)
     rows = random_rows(1, samples=5)
     for name, error, level in (("ideal", 0.5, 0.02), ("noisy", 2.0, 0.2)):
         samples = GRID[:, None] + rng.normal(0.0, error, (27, 1, 3)) + rng.normal(0.0, 0.04, (27, 5, 3))
         rows += rows_of(GRID, samples, "reference", name, (level * rng.uniform(0.5, 1.5, 27)).tolist())
-    rows = [{**row, "distance_mm": 700.0 + row["true_x_mm"]} for row in rows]
+    return [{**row, "distance_mm": 700.0 + row["true_x_mm"]} for row in rows]
+
+
+@pytest.fixture
+def table(tmp_path, rows):
     return write_csv(tmp_path / "mine.csv", rows)
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory, rows):
+    """Two evaluations of one table, as tables and as JSON: folder, exit status, stdout and stderr of each."""
+    home = tmp_path_factory.mktemp("evaluated")
+    table = write_csv(home / "mine.csv", rows)
+    results = []
+    for name, options in (("tables", ()), ("objects", ("--json",))):
+        with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
+            status = cli.main(["em", "evaluate", str(table), *options, "--out", str(home / name)])
+        results.append((home / name, status, out.getvalue(), err.getvalue()))
+    return results
+
+
+@pytest.fixture
+def no_figures(monkeypatch):
+    """Draw nothing: figures take most of a command's time."""
+    monkeypatch.setattr("flexneedle.em.figures.evaluation.draw_evaluation", lambda *_: [])
 
 
 def run(capsys, *argv):
@@ -29,8 +55,8 @@ def run(capsys, *argv):
     return status, captured.out, captured.err
 
 
-def test_tables_show_the_papers_and_the_manufacturers_values(capsys, table, tmp_path):
-    status, out, err = run(capsys, "em", "evaluate", table, "--out", tmp_path / "out", "--register")
+def test_tables_show_the_papers_and_the_manufacturers_values(evaluated):
+    folder, status, out, err = evaluated[0]
     assert (status, err) == (0, "note: tip: not in noisy, only in ideal\n")
     for text in (
         "tip, ideal",
@@ -40,19 +66,25 @@ def test_tables_show_the_papers_and_the_manufacturers_values(capsys, table, tmp_
         "0.48",
         "threshold",
         "area under the ROC",
-        "registration residual",
         "reference, noisy: slope (mm)",
         " met",
     ):
         assert text in out
-    assert str(tmp_path / "out") in out
+    assert str(folder) in out
 
 
-def test_json_is_one_object_in_full_precision_and_is_written_as_well(capsys, table, tmp_path):
-    status, out, _ = run(capsys, "em", "evaluate", table, "--json", "--out", tmp_path / "out")
+@pytest.mark.usefixtures("no_figures")
+def test_with_a_registration_its_residual_is_shown(capsys, table, tmp_path):
+    status, out, _ = run(capsys, "em", "evaluate", table, "--register", "--out", tmp_path / "out")
+    assert status == 0
+    assert "registration residual" in out
+
+
+def test_json_is_one_object_in_full_precision_and_is_written_as_well(evaluated):
+    folder, status, out, _ = evaluated[1]
     values = json.loads(out)
     assert status == 0
-    assert json.loads((tmp_path / "out" / "evaluation.json").read_text()) == values
+    assert json.loads((folder / "evaluation.json").read_text()) == values
     tip = values["results"][0]
     assert (tip["sensor"], tip["environment"]) == ("tip", "ideal")
     for name, value in plain(random_rows(1, samples=5)).items():
@@ -64,14 +96,15 @@ def test_json_is_one_object_in_full_precision_and_is_written_as_well(capsys, tab
     ]
 
 
-def test_the_same_table_gives_the_same_bytes(capsys, table, tmp_path):
-    for name in ("one", "two"):
-        run(capsys, "em", "evaluate", table, "--out", tmp_path / name)
-    for path in (tmp_path / "one").iterdir():
+def test_the_same_table_gives_the_same_bytes(evaluated):
+    one, two = (folder for folder, *_ in evaluated)
+    assert sorted(path.name for path in one.iterdir()) == sorted(path.name for path in two.iterdir())
+    for path in one.iterdir():
         if path.name != "evaluation.json":  # contains the name of its folder
-            assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
+            assert path.read_bytes() == (two / path.name).read_bytes(), path.name
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_the_default_folder_is_new_and_results_are_not_overwritten(capsys, table, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run(capsys, "em", "evaluate", table)
@@ -170,6 +203,7 @@ def test_check_names_a_sensor_missing_in_one_environment(capsys, tmp_path):
     assert "no sensor has an indicator both with power off (reference) and on (ref2)" in err
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_tables_show_the_names_of_the_environments(capsys, table, tmp_path):
     table.write_text(table.read_text().replace(",ideal", ",lab empty").replace(",noisy", ",with table"))
     argv = (
@@ -205,6 +239,7 @@ def test_a_table_of_points_is_not_overwritten(capsys, table, tmp_path):
     assert (tmp_path / "points.csv").read_text() == "mine"
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_table_without_labels_gets_them_from_options(capsys, tmp_path):
     rows = [{k: v for k, v in row.items() if k not in ("sensor", "environment")} for row in random_rows(1)]
     path = write_csv(tmp_path / "t.csv", rows)

@@ -19,7 +19,7 @@ from insertions import (
 
 @pytest.fixture(scope="session")
 def plan():
-    return flexneedle.plan(PHANTOM, (40.0, 5.0), seed=1)
+    return flexneedle.plan(PHANTOM, (20.0, 3.0), seed=1)
 
 
 @pytest.fixture(scope="session")

@@ -21,16 +21,16 @@ from insertions import (
 )
 
 
-def garbled(sample):
-    return replace(sample, y=math.nan)
+def garbled(measurement):
+    return replace(measurement, y=math.nan)
 
 
-def old(sample):
-    return replace(sample, time=sample.time - 0.5)
+def old(measurement):
+    return replace(measurement, time=measurement.time - 0.5)
 
 
-def jumping(sample):
-    return replace(sample, y=sample.y + 3.0)
+def jumping(measurement):
+    return replace(measurement, y=measurement.y + 3.0)
 
 
 FAULTS = {
@@ -38,7 +38,7 @@ FAULTS = {
     "missing: tip not measured": blind,
     "not a number": garbled,
     "stale: 0.500 s old": old,
-    "innovation: 3": jumping,
+    "innovation: ": jumping,
 }
 
 
@@ -46,8 +46,10 @@ def between(first, last, fault):
     """Apply a fault to the readings taken within [first, last) s."""
 
     def spoil(batch):
-        spoilt = [fault(sample) if first <= sample.time < last else sample for sample in batch]
-        return tuple(sample for sample in spoilt if sample is not None)
+        spoilt = [
+            fault(measurement) if first <= measurement.time < last else measurement for measurement in batch
+        ]
+        return tuple(measurement for measurement in spoilt if measurement is not None)
 
     return spoil
 
@@ -117,8 +119,8 @@ def test_the_hold_limit_applies_to_each_hold(plan):
 
 @pytest.mark.long
 def test_the_limits_of_age_and_innovation_are_those_of_the_scenario(plan):
-    def offset(sample):
-        return replace(sample, time=sample.time - 0.05, y=sample.y + 1.2)
+    def offset(measurement):
+        return replace(measurement, time=measurement.time - 0.05, y=measurement.y + 1.2)
 
     def verdicts(scenario):
         done = run(plan, Tank(plan.bevel, spoil=between(8.0, 8.4, offset)).rig(), scenario)
@@ -162,7 +164,7 @@ def test_a_frozen_sensor_holds_the_driven_needle_within_a_period(plan, begin):
     frozen_at = []
 
     def spoil(batch):
-        frozen_at.extend(sample for sample in batch if sample.time >= begin)
+        frozen_at.extend(measurement for measurement in batch if measurement.time >= begin)
         return tuple(replace(s, x=frozen_at[0].x, y=frozen_at[0].y) if s.time >= begin else s for s in batch)
 
     done = run(plan, Tank(plan.bevel, spoil=spoil).rig())

@@ -117,10 +117,10 @@ def test_a_plant_that_does_not_converge_is_recorded_in_its_periods(plan):
 
 
 def test_the_end_of_the_stroke_ends_the_run_with_a_reason(plan):
-    short = PHANTOM.with_values({"setup.stroke_mm": 60.0, "target.depth_mm": 20.0})
+    short = PHANTOM.with_values({"setup.stroke_mm": 40.0, "target.depth_mm": 10.0})
     tank = Tank(plan.bevel, scenario=short)
     done = run(of_any_scenario(plan), tank.rig(), short)
-    assert sum(command[0] for _, command in tank.moves) == pytest.approx(60.0, abs=0.01)
+    assert sum(command[0] for _, command in tank.moves) == pytest.approx(40.0, abs=0.01)
     left = plan.target[0] - done.periods[-1].estimate[0]
     assert done.reason.startswith(f"stroke ends {left:.2f} mm before the target depth; missed the target by ")
     assert not done.reached

@@ -68,9 +68,9 @@ def test_the_record_ends_with_the_true_state(plan, real):
     done, tank = real
     condition = tank.phantom.condition()
     x, y = condition.tip[:2]
-    assert done.true_error_mm == pytest.approx(math.hypot(x - 40.0, y - 5.0))
+    assert done.true_error_mm == pytest.approx(math.dist((x, y), plan.target))
     last = tank.tape[-1][-1]
-    assert done.residual_mm == pytest.approx(math.hypot(last.x - 40.0, last.y - 5.0))
+    assert done.residual_mm == pytest.approx(math.dist((last.x, last.y), plan.target))
     assert done.flips == sum(command[4] > 0 for _, command in tank.moves)
     assert done.periods[-1].true_strain_energy == condition.strain_energy
     assert done.periods[-1].true_stretch == condition.least_stretch < 1.0
