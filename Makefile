@@ -32,10 +32,10 @@ demo: setup  ## plan and steer one insertion on the phantom
 	@$(BIN)/flexneedle insert phantom --seed 0
 
 test: setup  ## run the tests but the long ones, on all cores
-	$(BIN)/python -m pytest -n auto $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal $(PYTEST_ARGS)
 
 test-all: setup  ## run all tests but the slow ones: statistics over many draws, studies in several processes
-	$(BIN)/python -m pytest -n auto -m "not slow" $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" $(PYTEST_ARGS)
 
 bench: setup  ## measure speed: mechanics, control periods, ten million rows of tracker data, 60 s of an emulated tracker
 	$(BIN)/python benchmarks/bench.py

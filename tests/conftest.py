@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from flexneedle.figures.style import new_figure
-from flexneedle.runs import figures
+from fake_engine import draw_nothing
 
 pytest_plugins = ["controllers"]
 
@@ -38,9 +37,8 @@ def interrupts():
 
 @pytest.fixture
 def empty_figures(monkeypatch):
-    """Save empty figures of plans and insertions: drawing takes most of a command's time."""
-    for name in ("insertion_figure", "plan_figure"):
-        monkeypatch.setattr(figures, name, lambda *_: new_figure(1.0))
+    """Save empty figures of plans and insertions."""
+    draw_nothing(monkeypatch.setattr)
 
 
 @pytest.fixture

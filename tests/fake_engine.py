@@ -61,11 +61,21 @@ def install(setattr_, **options):
     setattr_(insertion, "insert", partial(insert, **options))
 
 
+def draw_nothing(setattr_):
+    """Put empty figures in the place of those of plans and insertions: drawing takes most of a command's time."""
+    from flexneedle.figures.style import new_figure
+    from flexneedle.runs import figures
+
+    for name in ("insertion_figure", "plan_figure"):
+        setattr_(figures, name, lambda *_: new_figure(1.0))
+
+
 def main():
     """Run the command line after a first argument: the signal (name) that hits in the 12th period."""
     from flexneedle.cli.main import main as flexneedle
 
     number = signal.Signals[sys.argv[1]]
+    draw_nothing(setattr)
     install(setattr, stop=(12, partial(os.kill, os.getpid(), number)))
     sys.exit(flexneedle(sys.argv[2:]))
 

@@ -331,7 +331,6 @@ def test_ctrl_c_while_planning_marks_the_record(engine, capsys, in_tmp, monkeypa
     assert run(capsys, "view", "here")[0] == 1
 
 
-@pytest.mark.usefixtures("real_figures")
 def test_a_killed_run_can_be_viewed_and_exported(in_tmp, capsys):
     assert run_process("SIGKILL", "insert", "--out", "here").returncode == -signal.SIGKILL
     assert names(in_tmp / "here") == ["run.json", "trace.mcap"]
@@ -343,23 +342,16 @@ def test_a_killed_run_can_be_viewed_and_exported(in_tmp, capsys):
 
 
 @pytest.mark.usefixtures("real_figures")
-def test_view_redraws_the_same_figures(engine, capsys, in_tmp):
+def test_the_same_seed_gives_the_same_bytes_and_view_redraws_them(engine, capsys, in_tmp):
     engine()
-    run(capsys, "insert", "--out", "here")
-    before = reproducible(in_tmp / "here")
-    (in_tmp / "here/insertion.png").unlink()
-    assert run(capsys, "view", "here")[0] == 0
-    assert reproducible(in_tmp / "here") == before
-
-
-@pytest.mark.usefixtures("real_figures")
-def test_the_same_seed_gives_the_same_bytes(engine, capsys, in_tmp):
-    engine()
-    for folder in ("first", "second"):
-        run(capsys, "insert", "--seed", "5", "--out", folder)
-    assert reproducible(in_tmp / "first") == reproducible(in_tmp / "second")
-    run(capsys, "insert", "--seed", "6", "--out", "third")
-    assert reproducible(in_tmp / "first") != reproducible(in_tmp / "third")
+    for folder, seed in (("first", "5"), ("second", "5"), ("third", "6")):
+        run(capsys, "insert", "--seed", seed, "--out", folder)
+    first = reproducible(in_tmp / "first")
+    assert first == reproducible(in_tmp / "second")
+    assert first != reproducible(in_tmp / "third")
+    (in_tmp / "first/insertion.png").unlink()
+    assert run(capsys, "view", "first")[0] == 0
+    assert reproducible(in_tmp / "first") == first
 
 
 @pytest.mark.parametrize("command", ["plan", "insert"])
@@ -410,7 +402,6 @@ def test_wrong_arguments_exit_with_status_2(argv, capsys):
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.usefixtures("real_figures")
 def test_plan_writes_a_record_and_a_figure(engine, capsys, in_tmp):
     engine()
     status, out, _ = run(capsys, "plan", "--out", "here")

@@ -94,14 +94,22 @@ def test_the_order_of_rows_does_not_matter(tmp_path, random):
     assert_same(after, before)
 
 
+@pytest.fixture(scope="module")
+def registered(tmp_path_factory):
+    """Rows of a table, and their evaluation after registration."""
+    rows = random_rows(seed=7, samples=4)
+    return rows, only(write_csv(tmp_path_factory.mktemp("registered") / "t.csv", rows), register=True)
+
+
 @LAWS
 @given(
     rotation=st.tuples(*[st.floats(-1.5, 1.5)] * 3),
     shift=st.tuples(*[st.floats(-800, 800)] * 3),
 )
-def test_after_registration_a_rigid_motion_of_the_tracker_does_not_matter(tmp_path, rotation, shift):
-    rows = random_rows(seed=7, samples=4)
-    before = only(write_csv(tmp_path / "t.csv", rows), register=True)
+def test_after_registration_a_rigid_motion_of_the_tracker_does_not_matter(
+    tmp_path, registered, rotation, shift
+):
+    rows, before = registered
     moved = [{**row, **rigid(row, rotation, shift)} for row in rows]
     after = only(write_csv(tmp_path / "t.csv", moved), register=True)
     for name in ("rmse_mm", "p95_mm", "max_mm", "jitter_mm"):

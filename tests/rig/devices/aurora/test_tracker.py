@@ -197,7 +197,11 @@ def test_delayed_replies_give_correct_frames():
         pytest.param("frozen@0.3:1.8", "does not increase", marks=pytest.mark.slow),
         ("unplug@0.3:1", "the port does not exist: is the cable plugged in?"),
         pytest.param("error@0.3:1.2", "error 0D", marks=pytest.mark.slow),
-        ("system@0.3:1.2", "the tracker reports: hardware change: is the field generator connected?"),
+        pytest.param(
+            "system@0.3:1.2",
+            "the tracker reports: hardware change: is the field generator connected?",
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_a_broken_connection_is_reported_and_opened_again(fault, text):
