@@ -136,7 +136,7 @@ def run_batch(seed: int, batch: int, count: int, tally: Tally) -> None:
         simulator = Simulator(scenario)
         tips, energy, converged = simulator.rollout(simulator.start(bevel), controls)
         _repeat_by_step(simulator, controls[batch % count], bevel, tally)
-    except Exception as error:  # noqa: BLE001 the study counts exceptions
+    except Exception as error:  # noqa: BLE001  the study counts exceptions
         tally.exceptions += 1
         tally.failures.append(f"{options}  # {type(error).__name__}: {error}")
         return

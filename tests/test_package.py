@@ -47,7 +47,7 @@ def test_public_names_are_listed():
 
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
-        flexneedle.nonsense  # noqa: B018
+        flexneedle.nonsense  # noqa: B018  access is what raises
 
 
 def test_the_version_is_that_of_the_distribution():

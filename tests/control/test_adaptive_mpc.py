@@ -128,7 +128,7 @@ def test_off_the_plan_it_finds_a_path_that_ends_nearer_the_target(quick_plan, al
     estimate = estimate_of(along(quick_plan, 20, base_y=offset), ACCURATE)
     ahead = adaptive_mpc.Ahead.of(task_of(estimate.nominal, quick_plan), estimate.state, of_plan(quick_plan))
     kept = (
-        adaptive_mpc._measured_rollout(estimate, ahead.controls(ahead.current[None])[0]).tips[0, -1, 1] - 5.0
+        adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0]).tips[0, -1, 1] - 5.0
     )
     assert abs(kept) > 0.3
     assert abs(decide(quick_plan, estimate).miss) < 0.3 * abs(kept)
@@ -143,7 +143,7 @@ def weights(scenario, plan, x, memory=None):
     estimate, task = estimate_of(state, scenario), task_of(simulator, plan)
     memory = memory or ADAPTIVE.begin(task)
     ahead = adaptive_mpc.Ahead.of(task, state, memory.path)
-    listed = adaptive_mpc._terms(task, estimate, memory, ahead)
+    listed = adaptive_mpc.cost_terms(task, estimate, memory, ahead)
     return {term.name: term.weight for term in listed}, task, estimate, ahead
 
 
@@ -181,8 +181,8 @@ def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
     task = task_of(estimate.nominal, quick_plan)
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
     ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
-    trajectories = adaptive_mpc._measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
-    (term,) = (term for term in adaptive_mpc._terms(task, estimate, memory, ahead) if term.name == "miss")
+    trajectories = adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
+    (term,) = (term for term in adaptive_mpc.cost_terms(task, estimate, memory, ahead) if term.name == "miss")
     past = float(terms.past(trajectories, quick_plan.target)[0])
     assert abs(past) > 1e-3
     blur = 0.3 * ahead.left / 40.0
@@ -198,12 +198,12 @@ def test_near_the_target_what_is_above_its_standard_deviation_is_urgent_and_what
     task = task_of(estimate.nominal, quick_plan)
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
     ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
-    trajectories = adaptive_mpc._measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
+    trajectories = adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
     off = terms.past(trajectories, quick_plan.target)[0]
     tips = np.repeat(trajectories.tips, 3, axis=0)
     tips[:, -1, 1] += np.array([0.01, 0.3, 30.0]) - off
     charged = charges(
-        adaptive_mpc._terms(task, estimate, memory, ahead)[:2], replace(trajectories, tips=tips)
+        adaptive_mpc.cost_terms(task, estimate, memory, ahead)[:2], replace(trajectories, tips=tips)
     )
     share = charged["large miss"] / charged["miss"] / (max(ahead.left, 5.0) / 40.0) ** -1.5
     full = 1.0 - (max(ahead.left, 5.0) / 40.0) ** 1.5
@@ -221,7 +221,7 @@ def test_what_is_expected_above_zero_is_the_integral(mean, sd):
     x = np.linspace(0.0, mean + 9.0 * sd, 20001)
     density = np.exp(-0.5 * ((x - mean) / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
     expected = np.trapezoid(x * density, x) if x[-1] > 0.0 else 0.0
-    found = adaptive_mpc._above_zero(np.array([mean]), np.array([sd]))[0]
+    found = adaptive_mpc.above_zero(np.array([mean]), np.array([sd]))[0]
     assert found == pytest.approx(expected, abs=1e-4 * sd)
 
 
@@ -236,7 +236,7 @@ def test_reach_is_not_given_away_by_a_step_with_the_bevel_on_the_wrong_side(quic
     plan = replace(quick_plan, target=(40.0, 0.9 * (greatest if side > 0 else least)), bevel=bevel)
     task = task_of(simulator, plan)
     ahead = adaptive_mpc.Ahead.of(task, state, replace(of_plan(plan), rolls=()))
-    kept, rolled = adaptive_mpc._out_of_reach(task, estimate, ahead, ADAPTIVE.begin(task))
+    kept, rolled = adaptive_mpc.out_of_reach(task, estimate, ahead, ADAPTIVE.begin(task))
     assert min(kept, rolled) >= 0.0
     assert (kept < rolled) == (side == bevel)
 
@@ -276,8 +276,8 @@ def test_what_is_in_hand_is_never_given_up_for_something_worse(quick_plan, along
         path = replace(of_plan(quick_plan), rolls=rolls)
         ahead = adaptive_mpc.Ahead.of(task, estimate.state, path)
         kept = ahead.controls(ahead.current[None])[0]
-        listed = adaptive_mpc._terms(task, estimate, ADAPTIVE.begin(task), ahead)
-        current = float(cost(listed, adaptive_mpc._measured_rollout(estimate, kept))[0])
+        listed = adaptive_mpc.cost_terms(task, estimate, ADAPTIVE.begin(task), ahead)
+        current = float(cost(listed, adaptive_mpc.measured_rollout(estimate, kept))[0])
         assert decided(quick_plan, estimate, path=path)[0].cost <= current + 1e-9
 
 
@@ -293,14 +293,14 @@ def test_a_roll_stays_in_hand_until_the_needle_has_rolled(quick_plan, along, car
     if carried_out:
         estimate = replace(estimate, state=estimate.simulator.step(estimate.state, Control(flip=True)))
     rolls = []
-    search = adaptive_mpc._search
+    search = adaptive_mpc.search_path
 
     def spied(task, fitted, ahead, *rest):
         rolls.append(ahead.path.rolls)
         return search(task, fitted, ahead, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(adaptive_mpc, "_search", spied)
+        patch.setattr(adaptive_mpc, "search_path", spied)
         ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))
     assert rolls[0] == (() if carried_out else (x,))
 
@@ -336,8 +336,8 @@ def test_a_roll_takes_the_run_out_to_the_other_side(quick_plan, along):
     parameters[RUN_OUT] = 0.5
     controls = np.zeros((1, 4, 5))
     controls[..., 0], controls[..., 4] = 1.0, (-1.0, 1.0, -1.0, -1.0)
-    plain = adaptive_mpc._measured_rollout(estimate, controls).tips
-    tips = adaptive_mpc._measured_rollout(replace(estimate, parameters=parameters), controls).tips
+    plain = adaptive_mpc.measured_rollout(estimate, controls).tips
+    tips = adaptive_mpc.measured_rollout(replace(estimate, parameters=parameters), controls).tips
     side = estimate.state.bevel * np.array([1.0, -1.0, -1.0, -1.0])
     np.testing.assert_allclose(tips[0, :, 1] - plain[0, :, 1], 0.5 * side, atol=1e-12)
     np.testing.assert_array_equal(tips[0, :, [0, 2]], plain[0, :, [0, 2]])
@@ -369,13 +369,13 @@ def test_cost_is_a_length_that_no_scale_of_tissue_changes(quick_plan, along):
 
 def test_a_longer_search_is_made_where_no_path_is_found(quick_plan, along, monkeypatch):
     """At the start, and where the miss is likely to be beyond the limit; not otherwise."""
-    efforts, search = [], adaptive_mpc._search
+    efforts, search = [], adaptive_mpc.search_path
 
     def spied(*args):
         efforts.append(args[4])
         return search(*args)
 
-    monkeypatch.setattr(adaptive_mpc, "_search", spied)
+    monkeypatch.setattr(adaptive_mpc, "search_path", spied)
     estimate = estimate_of(along(quick_plan, 55))
     _, memory = decided(quick_plan, estimate)
     task = task_of(estimate.nominal, quick_plan)
@@ -526,13 +526,13 @@ def test_where_no_path_converges_it_rests_and_reports_it(quick_plan, along, monk
     """The current path is kept, and nothing is predicted."""
     estimate = estimate_of(along(quick_plan, 20), QUICK)
     task = task_of(estimate.nominal, quick_plan)
-    memory, rollout = ADAPTIVE.begin(task), adaptive_mpc._measured_rollout
+    memory, rollout = ADAPTIVE.begin(task), adaptive_mpc.measured_rollout
 
     def lost(fitted, controls):
         trajectories = rollout(fitted, controls)
         return replace(trajectories, converged=np.zeros_like(trajectories.converged))
 
-    monkeypatch.setattr(adaptive_mpc, "_measured_rollout", lost)
+    monkeypatch.setattr(adaptive_mpc, "measured_rollout", lost)
     decision, after = ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))
     assert decision.command == (0.0, 0.0, 0.0, 0.0, -1)
     assert decision.why == "no path converges on the fitted model"

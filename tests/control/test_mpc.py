@@ -160,18 +160,18 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
     scenario = PHANTOM.with_values({"control.ce_mpc.horizon": 1})
     state = along(plan, 40, scenario, base_y=1.0)
     simulator, choice = Simulator(scenario), choose(plan, state, scenario)
-    reference, nominal = mpc._window(plan, float(state.tip[0]), 1)
+    reference, nominal = mpc.plan_window(plan, float(state.tip[0]), 1)
     grid = np.stack(np.meshgrid(np.linspace(0.5, 1, 41), np.linspace(-0.5, 0.5, 81)), axis=-1).reshape(-1, 2)
-    controls = mpc._controls(scenario, state, grid, np.zeros((1, 2)), 40.0, flip=False)
+    controls = mpc.controls_of(scenario, state, grid, np.zeros((1, 2)), 40.0, flip=False)
     trajectories = Trajectories(controls, *simulator.rollout(state, controls))
-    best = cost(mpc._cost_terms(mpc.CeMpc(horizon=1), reference, nominal[:, 3]), trajectories).min()
+    best = cost(mpc.cost_terms(mpc.CeMpc(horizon=1), reference, nominal[:, 3]), trajectories).min()
     assert choice.cost <= best + 0.002
 
 
 @pytest.mark.parametrize("flip", [True, False])
 def test_rollouts_roll_the_bevel_only_in_the_first_step_and_if_asked(plan, flip, along):
     state = along(plan, 40)
-    controls = mpc._controls(PHANTOM, state, np.tile([0.9, 0.1], (3, 8)), np.zeros((8, 2)), 30.0, flip=flip)
+    controls = mpc.controls_of(PHANTOM, state, np.tile([0.9, 0.1], (3, 8)), np.zeros((8, 2)), 30.0, flip=flip)
     assert (controls[:, 0, 4] == (1.0 if flip else -1.0)).all()
     assert (controls[:, 1:, 4] == -1.0).all()
 
@@ -255,7 +255,7 @@ def test_without_planned_base_steps_none_is_made(plan, along):
 def test_controls_carry_the_base_steps_while_the_needle_advances(plan, along):
     base = np.array([[0.1, 1e-3]] * 8)
     z = np.tile(np.repeat([0.9, 0.0], 8), (2, 1))
-    controls = mpc._controls(PHANTOM, along(plan, 10), z, base, 2.0, flip=False)
+    controls = mpc.controls_of(PHANTOM, along(plan, 10), z, base, 2.0, flip=False)
     np.testing.assert_allclose(controls[:, :3, 1:3], np.broadcast_to(base[:3], (2, 3, 2)))
     assert (controls[:, 3:, :4] == 0.0).all()
 

@@ -42,7 +42,7 @@ def test_derivatives_agree_with_central_differences():
     """Of the readings, by every parameter, at parameters off the prior; closely with small steps."""
     estimate, readings = off_the_prior()
     fine = replace(estimate, prior=replace(estimate.prior, steps=1e-3 * estimate.prior.steps))
-    jacobian, close = idn._jacobian(finely(estimate), readings), idn._jacobian(finely(fine), readings)
+    jacobian, close = idn.jacobian_of(finely(estimate), readings), idn.jacobian_of(finely(fine), readings)
     assert jacobian.shape == (readings.y.size, estimate.parameters.size)
     for k in range(CELLS + 12):
         step = np.zeros(estimate.parameters.size)
@@ -107,9 +107,9 @@ def test_derivatives_from_the_stops_are_those_from_the_start():
     assert len(estimate.stops) > 4
     whole = replace(estimate, stops=estimate.stops[:1])
     again = replace(whole, prior=replace(estimate.prior, begins=np.full_like(estimate.prior.begins, -np.inf)))
-    jacobian = idn._jacobian(finely(estimate), readings)
-    np.testing.assert_allclose(jacobian, idn._jacobian(finely(whole), readings), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(jacobian, idn._jacobian(finely(again), readings), rtol=1e-6, atol=1e-6)
+    jacobian = idn.jacobian_of(finely(estimate), readings)
+    np.testing.assert_allclose(jacobian, idn.jacobian_of(finely(whole), readings), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(jacobian, idn.jacobian_of(finely(again), readings), rtol=1e-6, atol=1e-6)
     assert np.abs(jacobian[:, CELLS + 12]).max() > 1e-4
 
 
@@ -133,13 +133,13 @@ def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
     jitter = QUIET.tracker.jitter_per_axis / np.sqrt(readings.count)
     sd = np.sqrt(jitter**2 + unexplained(QUIET, estimate.settings) ** 2 + chord**2)
     prior = np.linalg.cholesky(estimate.prior.precision).T
-    jacobian = idn._jacobian(estimate, readings)
+    jacobian = idn.jacobian_of(estimate, readings)
     matrix = np.concatenate([jacobian / sd[:, None], prior])
     missing = readings.y - predicted(estimate.parameters, commands(45), readings, estimate.axial)
     right = np.concatenate([missing / sd, prior @ (estimate.prior.mean - estimate.parameters)])
     step = np.linalg.lstsq(matrix, right, rcond=None)[0]
     assert (np.abs(step) > 1e-4).sum() > 10
-    found = idn._improved(estimate, readings).parameters
+    found = idn.improved(estimate, readings).parameters
     np.testing.assert_allclose(found, estimate.parameters + step, rtol=1e-6, atol=1e-8)
 
 
@@ -164,7 +164,7 @@ def test_a_step_never_fits_worse(monkeypatch):
 
     The first fit is left out: it takes up the clearance, which the start has not.
     """
-    costs, tried, improved, with_ = [], [], idn._improved, idn.Identified._with
+    costs, tried, improved, with_ = [], [], idn.improved, idn.Identified._with
 
     def spied(estimate, readings):
         tried.append(0)
@@ -177,7 +177,7 @@ def test_a_step_never_fits_worse(monkeypatch):
         tried[-1] += 1
         return with_(estimate, parameters)
 
-    monkeypatch.setattr(idn, "_improved", spied)
+    monkeypatch.setattr(idn, "improved", spied)
     monkeypatch.setattr(idn.Identified, "_with", counted)
     for scenario, jump in ((PHANTOM, 1.0), (QUIET, 0.1)):
         estimate, states = (
@@ -198,9 +198,9 @@ def test_a_step_never_fits_worse(monkeypatch):
 def test_a_wrong_step_is_not_taken(monkeypatch, factor):
     """A Jacobian that leads to a step the other way, or far too far: no parameter moves for the worse."""
     estimate, readings = off_the_prior(45)
-    jacobian = idn._jacobian
-    monkeypatch.setattr(idn, "_jacobian", lambda *args: factor * jacobian(*args))
-    fitted = idn._improved(estimate, readings)
+    jacobian = idn.jacobian_of
+    monkeypatch.setattr(idn, "jacobian_of", lambda *args: factor * jacobian(*args))
+    fitted = idn.improved(estimate, readings)
     assert misfit(fitted, readings, estimate) <= misfit(estimate, readings, estimate) * (1.0 + 1e-12)
 
 
@@ -218,7 +218,7 @@ def test_a_trial_step_that_ends_in_nan_is_refused(monkeypatch):
         return spoilt(other) if len(tried) <= 2 else other
 
     monkeypatch.setattr(idn.Identified, "_with", failing)
-    fitted = idn._improved(estimate, readings)
+    fitted = idn.improved(estimate, readings)
     assert len(tried) >= 3
     assert np.isfinite(fitted.tips).all()
     assert misfit(fitted, readings, estimate) <= misfit(estimate, readings, estimate)
@@ -233,7 +233,7 @@ def test_if_no_trial_step_can_be_had_the_parameters_stay(monkeypatch):
         return other if np.array_equal(parameters, estimate.parameters) else spoilt(other)
 
     monkeypatch.setattr(idn.Identified, "_with", failing)
-    fitted = idn._improved(estimate, readings)
+    fitted = idn.improved(estimate, readings)
     np.testing.assert_array_equal(fitted.parameters, estimate.parameters)
     np.testing.assert_array_equal(fitted.tips, estimate.tips)
 
@@ -251,15 +251,15 @@ def test_a_trial_step_that_does_not_converge_is_refused(monkeypatch):
         return replace(other, state=replace(other.state, scalars=scalars))
 
     monkeypatch.setattr(idn.Identified, "_with", failing)
-    assert idn._improved(estimate, readings).state.converged
+    assert idn.improved(estimate, readings).state.converged
 
 
 def test_a_jacobian_that_is_not_finite_leaves_the_parameters(monkeypatch):
     estimate, readings = off_the_prior(45)
     monkeypatch.setattr(
-        idn, "_jacobian", lambda *_: np.full((readings.y.size, estimate.parameters.size), np.nan)
+        idn, "jacobian_of", lambda *_: np.full((readings.y.size, estimate.parameters.size), np.nan)
     )
-    np.testing.assert_array_equal(idn._improved(estimate, readings).parameters, estimate.parameters)
+    np.testing.assert_array_equal(idn.improved(estimate, readings).parameters, estimate.parameters)
 
 
 def test_readings_of_a_move_are_averaged_at_their_mean_time():
@@ -286,10 +286,10 @@ def test_a_reading_is_on_the_side_to_which_the_bevel_rolled_before_its_move(firs
 
 def test_the_low_pass_follows_the_newest_and_forgets():
     gain = OWN.residual_gain
-    assert idn._low_passed(OWN, np.array([1.0])) == pytest.approx(gain)
-    assert idn._low_passed(OWN, np.array([1.0, 0.0])) == pytest.approx(gain * (1.0 - gain))
-    assert idn._low_passed(OWN, np.full(200, 0.3)) == pytest.approx(0.3, rel=0.01)
-    assert idn._low_passed(OWN, np.zeros(0)) == 0.0
+    assert idn.low_passed(OWN, np.array([1.0])) == pytest.approx(gain)
+    assert idn.low_passed(OWN, np.array([1.0, 0.0])) == pytest.approx(gain * (1.0 - gain))
+    assert idn.low_passed(OWN, np.full(200, 0.3)) == pytest.approx(0.3, rel=0.01)
+    assert idn.low_passed(OWN, np.zeros(0)) == 0.0
 
 
 # ---- what is left uncertain

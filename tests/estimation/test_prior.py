@@ -51,7 +51,7 @@ def test_the_prior_is_that_of_the_scenario():
 def test_precision_of_a_chain_is_the_inverse_of_its_correlation(size, distance):
     correlation = np.exp(-distance * np.abs(np.subtract.outer(np.arange(size), np.arange(size))))
     np.testing.assert_allclose(
-        prior_of._uncorrelating(size, distance), np.linalg.inv(correlation), rtol=1e-9, atol=1e-9
+        prior_of.uncorrelating(size, distance), np.linalg.inv(correlation), rtol=1e-9, atol=1e-9
     )
 
 

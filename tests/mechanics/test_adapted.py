@@ -88,7 +88,7 @@ def tip_spring(model, depth, u=0.7):
     """Force, stiffness and energy of the tip spring with the tip at a depth, and the sharpest law and least height."""
     s = np.zeros(nd.STATE_SIZE)
     s[nd.TIP_X] = s[nd.CUT_FRONT] = depth
-    return nd._spring_law(model, s, depth, u)
+    return nd.spring_law(model, s, depth, u)
 
 
 @pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)

@@ -68,16 +68,16 @@ def test_packages_have_folders_of_their_own(package):
     package(2.0).twice(4.0)
     assert not compiling.compiled()
     assert not compiling.compiled(Path(compiling.__file__).parent)
-    assert compiling._cache_folder(package.home) != compiling._cache_folder(compiling._HERE)
+    assert compiling.cache_folder(package.home) != compiling.cache_folder(compiling.HERE)
 
 
 def test_an_edit_of_the_shared_sources_asks_for_all_kernels_anew(package, tmp_path, monkeypatch):
     package(2.0).twice(4.0)
     shared = tmp_path / "shared"
     shared.mkdir()
-    for source in compiling._HERE.glob("*.py"):
+    for source in compiling.HERE.glob("*.py"):
         (shared / source.name).write_bytes(source.read_bytes())
-    monkeypatch.setattr(compiling, "_HERE", shared)
+    monkeypatch.setattr(compiling, "HERE", shared)
     assert compiling.compiled(package.home)  # the same sources elsewhere
     with (shared / "ogden.py").open("a") as file:
         file.write("# another law\n")
@@ -86,7 +86,7 @@ def test_an_edit_of_the_shared_sources_asks_for_all_kernels_anew(package, tmp_pa
 
 def test_without_a_set_folder_the_cache_lies_beside_the_code_or_with_the_user(package, monkeypatch, tmp_path):
     monkeypatch.setattr(config, "CACHE_DIR", "")
-    assert Path(compiling._cache_folder(package.home)).parent == package.home / "__pycache__"
+    assert Path(compiling.cache_folder(package.home)).parent == package.home / "__pycache__"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
     monkeypatch.setattr(compiling.os, "access", lambda *_: False)
-    assert Path(compiling._cache_folder(package.home)).parent == tmp_path / "user" / "flexneedle"
+    assert Path(compiling.cache_folder(package.home)).parent == tmp_path / "user" / "flexneedle"

@@ -68,7 +68,7 @@ def test_a_batch_is_reproduced_by_its_number(study, capsys):
 def broken(how):
     """A rollout with one bad step."""
 
-    def rollout(self, state, controls):  # noqa: ARG001
+    def rollout(self, state, controls):  # noqa: ARG001  the signature of a simulator
         n, m = controls.shape[:2]
         result = Rollout(np.zeros((n, m, 3)), np.zeros((n, m)), np.ones((n, m), dtype=bool))
         if how == "exceptions":

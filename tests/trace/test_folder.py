@@ -199,7 +199,7 @@ def package(tmp_path):
             if data is not None:
                 (home / name).parent.mkdir(parents=True, exist_ok=True)
                 (home / name).write_bytes(data)
-        return folder_module._source(home)
+        return folder_module.source_digest(home)
 
     return digest
 
@@ -230,7 +230,7 @@ def test_any_change_of_a_source_changes_the_digest(package, changed):
 
 def test_versions_have_the_digest_of_this_package_and_pyarrow():
     found = versions()
-    assert found["source"] == folder_module._source.__wrapped__(Path(flexneedle.__file__).parent)
+    assert found["source"] == folder_module.source_digest.__wrapped__(Path(flexneedle.__file__).parent)
     assert set(found) == {"flexneedle", "python", "numpy", "numba", "pyarrow", "source"}
 
 
@@ -245,6 +245,6 @@ def test_versions_load_nothing_heavy():
 
 def test_the_sources_are_read_once():
     versions()
-    misses = folder_module._source.cache_info().misses
+    misses = folder_module.source_digest.cache_info().misses
     versions()
-    assert folder_module._source.cache_info().misses == misses
+    assert folder_module.source_digest.cache_info().misses == misses

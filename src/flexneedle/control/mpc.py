@@ -64,7 +64,7 @@ def choose(
     """Search the next steps of advance and guide for the least deviation from the planned tip poses."""
     scenario = simulator.scenario
     steps, travel = control.horizon, travel_left(scenario, plan, state)
-    reference, nominal = _window(plan, float(state.tip[0]), steps)
+    reference, nominal = plan_window(plan, float(state.tip[0]), steps)
     base = planned_base(scenario.setup, plan, state, reference[:, 0])
     guide = most_guide_step(scenario.setup, plan.strategy)
     variables = _variables(scenario, state, base, travel, nominal, guide, flip=flip)
@@ -79,13 +79,13 @@ def choose(
     def rollout(controls: Floats) -> Trajectories:
         return Trajectories(controls, *simulator.rollout(state, controls))
 
-    found = best(variables, rollout, _cost_terms(control, reference, nominal[:, 3]), search, rng)
+    found = best(variables, rollout, cost_terms(control, reference, nominal[:, 3]), search, rng)
     spread = float(np.sqrt(found.search_state.covariance[steps, steps]))
     db_x, db_y, db_theta, dg_y = found.trajectories.controls[0, 0, :4].tolist()
     return Choice((db_x, db_y, db_theta, dg_y), found.cost, spread)
 
 
-def _window(plan: Plan, x: float, steps: int) -> tuple[Floats, Floats]:
+def plan_window(plan: Plan, x: float, steps: int) -> tuple[Floats, Floats]:
     """Planned tip poses (steps, 3) after each step from the plan's tip at depth x, and its controls (steps, 5)."""
     last = len(plan.tips) - 1
     at = float(np.interp(x, plan.tips[:, 0], np.arange(last + 1)))
@@ -133,11 +133,11 @@ def _variables(
         upper=upper,
         mean=np.clip(np.concatenate([nominal[:, 0], nominal[:, 3]]), lower, upper),
         sigma=np.repeat([scenario.plan.advance_sigma_mm, sigma], steps),
-        controls=lambda z: _controls(scenario, state, z, base, travel, flip),
+        controls=lambda z: controls_of(scenario, state, z, base, travel, flip),
     )
 
 
-def _cost_terms(control: CeMpc, reference: Floats, nominal: Floats) -> tuple[Term, ...]:
+def cost_terms(control: CeMpc, reference: Floats, nominal: Floats) -> tuple[Term, ...]:
     """Deviation from poses (steps, 3), departure from guide steps (steps,), tissue energy (paper eq. 13)."""
     poses = partial(terms.deviation, reference=reference, orientation=control.orientation_weight_mm)
     return (
@@ -147,7 +147,9 @@ def _cost_terms(control: CeMpc, reference: Floats, nominal: Floats) -> tuple[Ter
     )
 
 
-def _controls(scenario: Scenario, state: State, z: Floats, base: Floats, travel: float, flip: bool) -> Floats:
+def controls_of(
+    scenario: Scenario, state: State, z: Floats, base: Floats, travel: float, flip: bool
+) -> Floats:
     """Controls (N, steps, 5) of z and the base's steps: advance limited to the travel, the guide to its reach."""
     n, steps = len(z), z.shape[1] // 2
     reach = scenario.setup.max_guide_travel_mm

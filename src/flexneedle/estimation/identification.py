@@ -173,14 +173,14 @@ class Identified:
         prior_sd = max(self.nominal.scenario.control.start_axial_sd_mm, LEAST_SD)
         axial, axial_variance = shared(without, extended.variance(readings), prior_sd)
         extended = replace(extended, axial=axial, axial_variance=axial_variance)
-        fitted = _improved(extended, readings)._differentiated()
+        fitted = improved(extended, readings)._differentiated()
         left, ahead = fitted.left(readings), readings.ahead(fitted.tips[:, 0])
         newest = int(readings.index[-1]) + 1
         x, y = fitted.tips[newest, :2] + (ahead[-1], left[-1] + fitted.run_out * readings.sides[-1])
         inside = fitted.tips[-1, 0] > 0.0
         return replace(
             fitted,
-            residual=_low_passed(self.settings, left) if inside else 0.0,
+            residual=low_passed(self.settings, left) if inside else 0.0,
             innovation=(float(ahead[-1]), float(left[-1])),
             measured=(float(x), float(y)),
         )
@@ -333,10 +333,10 @@ def _started(estimate: Identified, simulator: Simulator, parameters: Floats) -> 
     return simulator.replay(moved, _REST)[0]
 
 
-def _improved(estimate: Identified, readings: MoveMeans) -> Identified:
+def improved(estimate: Identified, readings: MoveMeans) -> Identified:
     """One Gauss–Newton step to the maximum a posteriori within the bounds, shortened until the cost does not rise."""
     prior = estimate.prior
-    jacobian = _jacobian(estimate, readings)
+    jacobian = jacobian_of(estimate, readings)
     variance = estimate.variance(readings) + readings.bent(estimate.tips[:, 1]) ** 2
     weighted = jacobian.T / variance
     gradient = weighted @ estimate.left(readings) - prior.precision @ (estimate.parameters - prior.mean)
@@ -358,7 +358,7 @@ def _improved(estimate: Identified, readings: MoveMeans) -> Identified:
     return fitted
 
 
-def _jacobian(estimate: Identified, readings: MoveMeans) -> Floats:
+def jacobian_of(estimate: Identified, readings: MoveMeans) -> Floats:
     """Derivative (r, K) of the predicted readings, from the curves."""
     jacobian = estimate._slopes(readings.between(estimate.tips[:, 0]))
     jacobian[:, RUN_OUT] = readings.sides
@@ -387,7 +387,7 @@ def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) 
     return member, np.concatenate([before, tips, later])
 
 
-def _low_passed(settings: Priors, left: Floats) -> float:
+def low_passed(settings: Priors, left: Floats) -> float:
     """Low-pass of the residuals (r,) of the last moves, later ones with more weight."""
     level, gain = 0.0, settings.residual_gain
     for value in left[-_RECENT:].tolist():

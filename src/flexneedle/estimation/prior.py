@@ -88,7 +88,7 @@ class Prior:
         mean = np.where(np.arange(sd.size) == BEVEL, 1.0, 0.0)
         mean[CLEARANCE] = settings.clearance_mm if scenario.setup.has_guide else 0.0
         precision = np.diag(sd**-2.0)
-        precision[-cells:, -cells:] = _uncorrelating(cells, settings.cell_mm / settings.variation_length_mm)
+        precision[-cells:, -cells:] = uncorrelating(cells, settings.cell_mm / settings.variation_length_mm)
         precision[-cells:, -cells:] /= sd[-1] ** 2
         bounds = mean + np.outer((-_WIDEST, _WIDEST), sd)
         bounds[0, CLEARANCE] = 0.0
@@ -112,7 +112,7 @@ def unexplained(scenario: Scenario, settings: Priors) -> float:
     return max(settings.least_model_sd_mm, settings.model_sd * scenario.needle.bevel.offset_mm)
 
 
-def _uncorrelating(size: int, distance: float) -> Floats:
+def uncorrelating(size: int, distance: float) -> Floats:
     """Inverse of the correlation exp(−distance |i − j|): that of a Markov chain, so tridiagonal."""
     share = np.exp(-distance)
     inner = np.full(size, 1.0 + share**2)

@@ -174,7 +174,7 @@ def decades(axis: Axis, values: Iterable[Floats], most: int) -> None:
     ticks = _ticks(low, high, most)
     bounds: Any = {"x": axis.axes.set_xlim, "y": axis.axes.set_ylim}
     scales: Any = {"x": axis.axes.set_xscale, "y": axis.axes.set_yscale}
-    name = axis.axis_name  # type: ignore[attr-defined]
+    name = axis.axis_name  # type: ignore[attr-defined]  # of XAxis and YAxis, not of their base
     scales[name]("log")
     bounds[name](low, high)
     axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])

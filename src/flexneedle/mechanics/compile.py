@@ -15,13 +15,13 @@ from numba.core import config as _numba_config
 _Function = TypeVar("_Function")  # a compiled function is called like the one that it was
 _njit: Any = nb.njit
 _config: Any = _numba_config  # its settings are not declared
-_HERE = Path(__file__).parent
+HERE = Path(__file__).parent
 
 
-def _cache_folder(home: Path) -> str:
+def cache_folder(home: Path) -> str:
     """The folder for the exact sources of `home` and here: under NUMBA_CACHE_DIR, beside the code, or the user's."""
     digest = hashlib.sha256()
-    for folder in dict.fromkeys((_HERE, home)):  # in this order, wherever they are
+    for folder in dict.fromkeys((HERE, home)):  # in this order, wherever they are
         for source in sorted(folder.glob("*.py")):
             digest.update(source.read_bytes())
     beside = home / "__pycache__"
@@ -31,9 +31,9 @@ def _cache_folder(home: Path) -> str:
     return str(base / f"kernels-{digest.hexdigest()[:16]}")
 
 
-def compiled(home: Path = _HERE) -> bool:
+def compiled(home: Path = HERE) -> bool:
     """Whether kernels of the sources in the folder `home` are in the cache, so that a start needs no compilation."""
-    return any(Path(_cache_folder(home)).rglob("*.nbi"))
+    return any(Path(cache_folder(home)).rglob("*.nbi"))
 
 
 def inner(function: _Function) -> _Function:
@@ -49,7 +49,7 @@ def kernel(function: _Function) -> _Function:
     """Compile an entry point, once for each version of the sources."""
     before = _config.CACHE_DIR
     source: Any = function
-    _config.CACHE_DIR = _cache_folder(Path(source.__code__.co_filename).parent)
+    _config.CACHE_DIR = cache_folder(Path(source.__code__.co_filename).parent)
     try:
         compiled: _Function = _njit(cache=True, nogil=True, error_model="numpy")(function)
         return compiled

@@ -134,7 +134,7 @@ def spring_rest(model: Model, s: Floats, tip_x: float) -> tuple[float, float]:
 
 
 @inner
-def _spring_law(model: Model, s: Floats, tip_x: float, u: float) -> tuple[float, ...]:
+def spring_law(model: Model, s: Floats, tip_x: float, u: float) -> tuple[float, ...]:
     """Force (N), stiffness (N/mm) and energy (mJ) of the tip spring over its layers; sharpest α/h and least h."""
     layers = model.layers
     front = max(s[CUT_FRONT], tip_x)
@@ -177,7 +177,7 @@ def _tip(model: Model, s: Floats, tip_x: float, held: float, ahead: tuple[float,
     a1, a2, g1, g2, b11, b12, _ = ahead
     fixed, slope = spring_rest(model, s, tip_x)
     u = s[SPRING_U]
-    force, k, energy, sharpness, height = _spring_law(model, s, tip_x, u)
+    force, k, energy, sharpness, height = spring_law(model, s, tip_x, u)
     if math.isnan(held):
         load = s[TIP_LOAD] + force + k * (u + fixed)
         y = (a1 + b11 * load) / (1.0 - g1 + b11 * k * slope)
@@ -268,8 +268,8 @@ def _overshoot(
     """Slope of the energy along the Newton step at `t`, less the beam's part (never negative) of 1 − t."""
     nodes = model.nodes
     change = new_u - s[SPRING_U]
-    force, k, _, _, _ = _spring_law(model, s, tip_x, s[SPRING_U])
-    slope = (force - k * change - _spring_law(model, s, tip_x, s[SPRING_U] + t * change)[0]) * change
+    force, k, _, _, _ = spring_law(model, s, tip_x, s[SPRING_U])
+    slope = (force - k * change - spring_law(model, s, tip_x, s[SPRING_U] + t * change)[0]) * change
     for i in range(count):
         if nodes.kind[i] == CONTACT:
             change = w[NEW_U, i] - u[i]

@@ -104,12 +104,12 @@ def versions() -> dict[str, str]:
         "numpy": version("numpy"),
         "numba": version("numba"),
         "pyarrow": version("pyarrow"),
-        "source": _source(_PACKAGE),
+        "source": source_digest(_PACKAGE),
     }
 
 
 @cache
-def _source(package: Path) -> str:
+def source_digest(package: Path) -> str:
     """Return a digest of the sources in a folder: of the relative path and the bytes of each."""
     digest = hashlib.sha256()
     found = (path for path in package.rglob("*") if path.suffix in _SOURCES and path.is_file())

@@ -61,7 +61,7 @@ class TraceWriter:
         if self._file.closed:
             return
         with uninterrupted():
-            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates no result
             self._file.close()
 
     def __enter__(self) -> Self:
@@ -78,7 +78,7 @@ class TraceWriter:
             for one in messages:
                 data = bytes(STORE.serialize_cdr(one.message, TOPICS[one.topic]))
                 self._writer.add_message(self._channels[one.topic], one.time, data, one.time, self._count)
-            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._writer.flush()  # type: ignore[no-untyped-call]  # mcap annotates no result
             self._count += 1
 
     def _register(self) -> dict[str, int]:

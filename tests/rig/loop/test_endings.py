@@ -87,14 +87,14 @@ def test_a_model_that_does_not_converge_ends_the_run(plan, monkeypatch):
 
 
 def test_the_needle_is_held_if_no_path_converges(plan, monkeypatch):
-    rollout, calls = adaptive_mpc._measured_rollout, itertools.count()
+    rollout, calls = adaptive_mpc.measured_rollout, itertools.count()
 
     def lost(fitted, controls):
         outcome = rollout(fitted, controls)
         kept = next(calls) < 20
         return outcome if kept else replace(outcome, converged=np.zeros_like(outcome.converged))
 
-    monkeypatch.setattr(adaptive_mpc, "_measured_rollout", lost)
+    monkeypatch.setattr(adaptive_mpc, "measured_rollout", lost)
     done = run(plan, Tank(plan.bevel).rig(), controller=DEFAULT)
     assert (done.outcome, done.reason) == ("held", "no path converges on the fitted model")
     assert {period.applied for period in done.periods[-3:]} == {STILL}

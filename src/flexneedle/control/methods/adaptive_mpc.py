@@ -107,13 +107,13 @@ def decide(
     settings = task.settings
     current = memory.path if fitted.state.bevel == memory.bevel else memory.rolled
     ahead = Ahead.of(task, fitted.state, current)
-    found = _search(task, fitted, ahead, memory, 1 if memory.outlook else settings.effort, rng)
+    found = search_path(task, fitted, ahead, memory, 1 if memory.outlook else settings.effort, rng)
     if not math.isfinite(found.cost):
         return Decision(_STILL, "no path converges on the fitted model", found.cost), memory
     outlook, miss, sd = _forecast(task, memory, fitted, found)
     if probability_beyond(task.scenario.control.miss_limit_mm, miss, sd) > _LOST:
         ahead = Ahead.of(task, fitted.state, ahead.corrected(found.z))
-        found = _search(task, fitted, ahead, memory, settings.effort, rng)
+        found = search_path(task, fitted, ahead, memory, settings.effort, rng)
         outlook, miss, sd = _forecast(task, memory, fitted, found)
     path = ahead.corrected(found.z)
     command, rolled = ahead.first(path)
@@ -156,7 +156,7 @@ def _surprised(fitted: Identified) -> bool:
     return stepped and float(fitted.state.tip[0]) > 0.0 and off > _SURPRISE
 
 
-def _search(
+def search_path(
     task: Task, fitted: Identified, ahead: Ahead, memory: Memory, effort: int, rng: np.random.Generator
 ) -> Found:
     """The best correction of the current path, which is itself among the samples."""
@@ -167,11 +167,11 @@ def _search(
     variables = Variables(lower, upper, ahead.current, first.std(axis=0), lambda z: ahead.controls(z)[0])
     elite = elite_count(samples, _ELITE_FRACTION)
     search = Search(samples, elite, settings.iterations, _SMOOTHING, _TOLERANCE)
-    charged = _terms(task, fitted, memory, ahead)
-    return best(variables, partial(_measured_rollout, fitted), charged, search, rng, first=first)
+    charged = cost_terms(task, fitted, memory, ahead)
+    return best(variables, partial(measured_rollout, fitted), charged, search, rng, first=first)
 
 
-def _measured_rollout(fitted: Identified, controls: Floats) -> Trajectories:
+def measured_rollout(fitted: Identified, controls: Floats) -> Trajectories:
     """Trajectories of controls (N, m, 5) on the fitted model; tips as a tracker without errors would measure them."""
     tips, energy, converged = fitted.simulator.rollout(fitted.state, controls, limits=False)
     side = fitted.state.bevel * np.cumprod(-np.sign(controls[:, :, 4]), axis=1)
@@ -179,7 +179,7 @@ def _measured_rollout(fitted: Identified, controls: Floats) -> Trajectories:
     return Trajectories(controls, tips, energy, converged)
 
 
-def _terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tuple[Term, ...]:
+def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tuple[Term, ...]:
     settings, target = task.settings, task.plan.target
     guided = guide_may_move(task.scenario.setup, task.plan.strategy)
     energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
@@ -201,13 +201,11 @@ def _terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> tupl
         Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
         Term("flips", settings.roll_weight_mm, terms.flips),
         Term("late", settings.late_roll_weight * fitted.roll_sd, late),
-        Term(
-            "reach", reach, partial(terms.out_of_reach, expected=_out_of_reach(task, fitted, ahead, memory))
-        ),
+        Term("reach", reach, partial(terms.out_of_reach, expected=out_of_reach(task, fitted, ahead, memory))),
     )
 
 
-def _out_of_reach(task: Task, fitted: Identified, ahead: Ahead, memory: Memory) -> Floats:
+def out_of_reach(task: Task, fitted: Identified, ahead: Ahead, memory: Memory) -> Floats:
     """Expected distance (2,), mm, of the target from the bevel's reach after the first step, with the bevel as it is or
     rolled before the step. The reach is the interval between the ends with the bevel on either side from the second
     step on; its bounds are normally distributed.
@@ -215,17 +213,17 @@ def _out_of_reach(task: Task, fitted: Identified, ahead: Ahead, memory: Memory) 
     With the bevel alone, lost reach cannot be regained; with a guide, the bevel still moves the tip when the guide is
     far behind it.
     """
-    trajectories = _measured_rollout(fitted, ahead.controls(ahead.constant)[0])
+    trajectories = measured_rollout(fitted, ahead.controls(ahead.constant)[0])
     if not trajectories.converged.all():
         return np.zeros(2)
     past = terms.past(trajectories, task.plan.target).reshape(2, 2)
     low, high = past.min(axis=1), past.max(axis=1)
     middle = (memory.outlook or Outlook.of(fitted)).sd_now(fitted, task.plan.target[0])
     sd = np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
-    return _above_zero(low, sd) + _above_zero(-high, sd)
+    return above_zero(low, sd) + above_zero(-high, sd)
 
 
-def _above_zero(mean: Floats, sd: Floats) -> Floats:
+def above_zero(mean: Floats, sd: Floats) -> Floats:
     """Mean of the part above zero of normal values: ∫₀^∞ x N(mean, sd²) dx."""
     z = mean / np.maximum(sd, np.finfo(float).tiny)
     below = np.array([0.5 * math.erfc(-value / math.sqrt(2.0)) for value in z])

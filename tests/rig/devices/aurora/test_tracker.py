@@ -341,7 +341,7 @@ class FakeDevice:
 
 def test_handles_of_unplugged_sensors_are_freed_before_set_up():
     device = FakeDevice()
-    assert link._set_up(device) == {str(0x0A): ("01", "00")}
+    assert link.set_up(device) == {str(0x0A): ("01", "00")}
     assert device.sent[:3] == ["PHSR:01", "PHF:0B", "PHSR:02"]
     assert [text for text in device.sent if "0B" in text] == ["PHF:0B"]
 
@@ -363,11 +363,11 @@ def test_a_file_that_is_not_a_serial_port_is_rejected_in_one_line(tmp_path):
 def test_the_reason_why_a_port_was_not_opened():
     """A port used by another program, one that does not exist, and one that cannot be opened."""
     device, host = os.openpty()
-    assert "another program" in library._open_problem(os.ttyname(host))
+    assert "another program" in library.open_problem(os.ttyname(host))
     os.close(device)
     os.close(host)
-    assert "does not exist" in library._open_problem("/dev/ttyNothing")
-    assert library._open_problem("/") == "the port cannot be opened: Is a directory"
+    assert "does not exist" in library.open_problem("/dev/ttyNothing")
+    assert library.open_problem("/") == "the port cannot be opened: Is a directory"
 
 
 @pytest.mark.slow

@@ -64,7 +64,7 @@ class Device:
         self._c = _library()
         self._device = self._c.ndiOpenSerial(path.encode())
         if not self._device:
-            raise OSError(_open_problem(path))
+            raise OSError(open_problem(path))
         self._reply = b""
 
     def close(self) -> None:
@@ -157,7 +157,7 @@ class Device:
         return int(getattr(self._c, f"ndiGet{command}SystemStatus")(self._device)) & 0x7F
 
 
-def _open_problem(path: str) -> str:
+def open_problem(path: str) -> str:
     if not Path(path).exists():
         return "the port does not exist: is the cable plugged in?"
     try:

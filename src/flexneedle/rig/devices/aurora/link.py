@@ -100,7 +100,7 @@ def _require(device: Device, command: str | None, problem: str) -> None:
 
 def _read(device: Device) -> None:
     """Enable the sensors and track; restore the tracker's state at the end if it still replies."""
-    ports = _set_up(device)
+    ports = set_up(device)
     _require(device, "TSTART:", "tracking cannot be started")
     replies = True
     try:
@@ -114,7 +114,7 @@ def _read(device: Device) -> None:
             device.command(_TO_SLOW)
 
 
-def _set_up(device: Device) -> dict[str, tuple[str, str]]:
+def set_up(device: Device) -> dict[str, tuple[str, str]]:
     """Initialise and enable every sensor; return port and channel by port handle."""
     for handle in _listed(device, "01"):  # of sensors that were unplugged
         _require(device, f"PHF:{handle:02X}", f"port handle {handle:02X} cannot be freed")
