@@ -3,7 +3,10 @@
 import csv
 
 import numpy as np
+import pytest
 
+from flexneedle.em.evaluation.evaluate import Options, evaluate
+from flexneedle.errors import InputError
 from flexneedle.rig.tracking.table import REQUIRED
 
 GRID = np.stack(np.meshgrid(*[np.arange(3) * 25.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -64,3 +67,16 @@ def plain(rows):
         "mean_mm": float(error.mean()),
         "sd_mm": float(error.std(ddof=1)),
     }
+
+
+def refusal(path, **options):
+    with pytest.raises(InputError) as caught:
+        evaluate(path, Options(**options))
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(path) in message
+    return message
+
+
+def one(path, **options):
+    return evaluate(path, Options(**options)).values()["results"][0]

@@ -1,4 +1,4 @@
-"""`flexneedle plan`, `insert`, `view`, `export`: results, records, exit status."""
+"""`flexneedle insert` and `view`: results, records, exit status."""
 
 import csv
 import json
@@ -11,15 +11,14 @@ from pathlib import Path
 import pytest
 
 import fake_engine
-from fake_engine import install
+from commands import names, run
 from flexneedle.cli import main as cli
 from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.errors import RunError
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PLANTS
-from flexneedle.trace.columns import COLUMNS
 from flexneedle.trace.reader import read_trace
-from synthetic import make_periods
-from synthetic_readings import with_readings
+
+pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
 
 OWN = ", or module:NAME of your own"
 INSERTION_FILES = ["insertion.png", "insertion.svg", "run.json", "trace.mcap"]
@@ -40,45 +39,6 @@ INSERT_KEYS = [
     "held_s",
     *("converged", "seed", "run_dir", "timing"),
 ]
-PLAN_KEYS = [
-    *("tip_mm", "error_mm", "reached", "cost", "terms", "flips", "strain_energy_mj", "iterations"),
-    *("converged", "seed", "timing"),
-]
-
-
-@pytest.fixture(autouse=True)
-def in_tmp(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.fixture(autouse=True)
-def drawing(request):
-    """Save empty figures in tests that are not about figures."""
-    if "real_figures" not in request.fixturenames:
-        request.getfixturevalue("empty_figures")
-
-
-@pytest.fixture
-def real_figures():
-    """For tests of what is drawn."""
-
-
-@pytest.fixture
-def engine(monkeypatch):
-    """Return a function that installs the fake planner and loop."""
-    return lambda **options: install(monkeypatch.setattr, **options)
-
-
-def run(capsys, *argv):
-    """Return exit status, stdout and stderr."""
-    status = cli.main(argv)
-    captured = capsys.readouterr()
-    return status, captured.out, captured.err
-
-
-def names(folder):
-    return sorted(path.name for path in folder.iterdir())
 
 
 def reproducible(folder):
@@ -400,128 +360,6 @@ def test_wrong_arguments_exit_with_status_2(argv, capsys):
         cli.main(argv)
     assert caught.value.code == 2
     assert capsys.readouterr().out == ""
-
-
-def test_plan_writes_a_record_and_a_figure(engine, capsys, in_tmp):
-    engine()
-    status, out, _ = run(capsys, "plan", "--out", "here")
-    assert status == 0
-    assert names(in_tmp / "here") == ["plan.png", "plan.svg", "run.json"]
-    assert out.startswith("Plan (manipulation) reaches the target to 0.010 mm\n")
-    assert run(capsys, "view", "here")[:2] == (0, "here/plan.png\nhere/plan.svg\n")
-
-
-def test_plan_json_is_one_object(engine, capsys):
-    engine()
-    status, out, _ = run(capsys, "plan", "--json")
-    assert status == 0
-    assert list(json.loads(out)) == PLAN_KEYS
-
-
-def test_both_plans_are_one_object_by_strategy(engine, capsys):
-    engine()
-    _, out, _ = run(capsys, "plan", "--strategy", "both", "--json")
-    assert {name: list(result) for name, result in json.loads(out).items()} == {
-        "manipulation": PLAN_KEYS,
-        "steering": PLAN_KEYS,
-    }
-
-
-def test_a_plan_that_misses_names_the_limit_and_fails(engine, capsys):
-    engine(plan_miss=2.5)
-    status, out, _ = run(capsys, "plan")
-    assert status == 1
-    assert (
-        "MISSES the target: best distance 2.510 mm, more than 1 mm, limited by setup.max_guide_travel_mm"
-        in out
-    )
-
-
-def test_export_writes_one_line_per_period_with_units(engine, capsys, in_tmp):
-    engine()
-    run(capsys, "insert", "--out", "here")
-    assert run(capsys, "export", "here", "--csv") == (0, "here/periods.csv\n", "")
-    run(capsys, "export", "here", "--csv", "other.csv")
-    text = (in_tmp / "here/periods.csv").read_text()
-    assert text == (in_tmp / "other.csv").read_text()
-    rows = list(csv.DictReader(text.splitlines()))
-    assert tuple(rows[0]) == COLUMNS
-    assert len(rows) == 69
-    assert float(rows[-1]["true_x_mm"]) == 40.0
-    assert rows[-1]["guide_y_mm"].count(".") == 1
-
-
-@pytest.fixture
-def watched_engine(engine, monkeypatch):
-    """Install a fake loop that reads a tracker with references; the second one is missing at first."""
-
-    def make(*options):
-        for period in make_periods(*options):
-            lost = period.index == 0
-            yield with_readings(period, (lambda _: None) if lost else (lambda time: 0.1 * time))
-
-    monkeypatch.setattr(fake_engine, "make_periods", make)
-    engine()
-
-
-@pytest.mark.usefixtures("watched_engine")
-def test_export_writes_one_line_per_reading_with_all_sensors(capsys, in_tmp):
-    run(capsys, "insert", "--out", "here")
-    assert run(capsys, "export", "here", "--readings") == (0, "here/readings.csv\n", "")
-    run(capsys, "export", "here", "--readings", "other.csv")
-    text = (in_tmp / "here/readings.csv").read_text()
-    assert text == (in_tmp / "other.csv").read_text()
-    assert run(capsys, "export", "here", "--readings", "-") == (0, text, "")
-    rows = list(csv.DictReader(text.splitlines()))
-    sensor = ["x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "indicator", "status"]
-    assert list(rows[0]) == [
-        *("time_s", "period", "frame_number", "verdict", "x_mm", "y_mm", "z_mm"),
-        *(f"{name}.{part}" for name in ("tip", "ref1", "ref2", "ref3") for part in sensor),
-    ]
-    assert [int(row["frame_number"]) for row in rows] == list(range(8 * 69))
-    assert [int(row["period"]) for row in rows] == [k // 8 for k in range(8 * 69)]
-    last = rows[-1]
-    period = read_trace(in_tmp / "here/trace.mcap").periods[-1]
-    assert float(last["time_s"]) == period.readings[-1].measurement.time
-    assert (float(last["x_mm"]), float(last["y_mm"])) == (period.measurement.x, period.measurement.y)
-    tip = [last[f"tip.{part}"] for part in sensor]
-    assert tip == ["1.0", "2.0", "3.0", "1.0", "0.0", "0.0", "0.0", "", "ok"]
-    assert float(last["ref2.indicator"]) == 0.1 * float(last["time_s"])
-    assert last["verdict"] == "ok"
-    assert [rows[0][f"ref2.{part}"] for part in sensor] == [""] * 8 + ["missing"]
-
-
-def test_a_tracker_without_frames_exports_the_tip_alone(engine, capsys):
-    engine()
-    run(capsys, "insert", "--out", "here")
-    status, out, err = run(capsys, "export", "here", "--readings", "-")
-    assert (status, out, err) == (0, "time_s,period,frame_number,verdict,x_mm,y_mm,z_mm\n", "")
-
-
-@pytest.mark.parametrize("what", ["--csv", "--readings"])
-def test_export_to_a_missing_folder_is_one_line(engine, capsys, what):
-    engine()
-    run(capsys, "insert", "--out", "here")
-    message = (2, "", "flexneedle: nodir/foo.csv: cannot be written: No such file or directory\n")
-    assert run(capsys, "export", "here", what, "nodir/foo.csv") == message
-
-
-def test_the_help_of_export_names_the_columns_of_readings(capsys):
-    with pytest.raises(SystemExit):
-        cli.main(["export", "--help"])
-    message = capsys.readouterr().out
-    columns = ("time_s", "period", "frame_number", "verdict", "x_mm", "NAME.qw", "NAME.indicator")
-    assert [name for name in columns if name not in message] == []
-
-
-def test_a_plan_cannot_be_exported(engine, capsys):
-    engine()
-    run(capsys, "plan", "--out", "here")
-    assert run(capsys, "export", "here", "--csv") == (
-        2,
-        "",
-        "flexneedle: here: contains a plan, not an insertion\n",
-    )
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """docs/validation.md agrees with studies/validation.py, whose output is reproducible."""
 
-import importlib.util
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,18 +12,12 @@ import pytest
 from reference import validation as problems
 from reference.rods import Bench
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "studies"))
+import validation as script
+
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = ROOT / "docs" / "validation.md"
 NUMBER = re.compile(r"[+−-]?\d+(?:\.\d+)?(?:e[−-]?\d+)?")
-
-
-@pytest.fixture(scope="module")
-def script():
-    """studies/validation.py as a module."""
-    spec = importlib.util.spec_from_file_location("validation_study", ROOT / "studies" / "validation.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +61,7 @@ def section(text, name):
     return next(part for part in text.split("\n## ") if part.startswith(name))
 
 
-def test_the_page_has_the_cantilevers_that_the_script_computes(script):
+def test_the_page_has_the_cantilevers_that_the_script_computes():
     beams = {load: problems.cantilevers(load) for load in problems.LOADS}
     found = SimpleNamespace(
         cantilever={load: errors for load, (errors, _) in beams.items()},
@@ -79,7 +73,7 @@ def test_the_page_has_the_cantilevers_that_the_script_computes(script):
     )
 
 
-def test_the_page_has_the_energies_that_the_script_computes(script):
+def test_the_page_has_the_energies_that_the_script_computes():
     found = SimpleNamespace(
         moves={name: problems.energy_balance(name, 40) for name in problems.MOVES},
         balances={
@@ -91,11 +85,11 @@ def test_the_page_has_the_energies_that_the_script_computes(script):
 
 
 @pytest.mark.slow
-def test_the_page_is_what_the_script_writes(script):
+def test_the_page_is_what_the_script_writes():
     assert_same(script.document(problems.compute()), PAGE.read_text(encoding="utf-8"))
 
 
-def test_the_summary_has_the_deflections_of_the_issue(script, made_up):
+def test_the_summary_has_the_deflections_of_the_issue(made_up):
     """Published values beside the computed ones."""
     lines = script.summary(made_up).splitlines()[2:5]
     assert [line.split("|")[2].strip() for line in lines] == ["0.3017", "0.4935", "0.7138"]
@@ -104,7 +98,7 @@ def test_the_summary_has_the_deflections_of_the_issue(script, made_up):
 
 
 @pytest.mark.long
-def test_same_results_same_bytes(script, made_up, tmp_path):
+def test_same_results_same_bytes(made_up, tmp_path):
     """For page and pictures."""
     one, other = (script.write(made_up, tmp_path / name) for name in ("one", "other"))
     assert [path.name for path in one] == [
@@ -124,7 +118,7 @@ def test_same_results_same_bytes(script, made_up, tmp_path):
         assert (ROOT / "docs" / image).is_file()
 
 
-def test_orders_and_small_numbers_are_readable(script):
+def test_orders_and_small_numbers_are_readable():
     assert script.power([1.0, 2.0, 4.0], [3.0, 12.0, 48.0]) == "2.00"
     assert [script.small(value) for value in (0.0123, -0.5, 1.234e-5, -6e-12)] == [
         "0.012",

@@ -1,0 +1,51 @@
+"""Estimates and decisions of the default controller."""
+
+from dataclasses import replace
+
+import numpy as np
+
+import flexneedle
+from flexneedle.control.methods import METHODS
+from flexneedle.control.path import of_plan
+from flexneedle.estimation.identification import Identification
+from flexneedle.simulator.simulator import Simulator
+from tasks import begun_with, task_of
+
+PHANTOM = flexneedle.load_scenario("phantom")
+QUICK = PHANTOM.with_values(
+    {
+        f"control.adaptive_mpc.{key}": value
+        for key, value in (("samples", 12), ("iterations", 1), ("effort", 1))
+    }
+)
+BARE = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
+ADAPTIVE = METHODS["adaptive-mpc"]
+
+
+def estimate_of(state, scenario=PHANTOM, **fields):
+    """An estimate that the needle is so."""
+    begun = Identification().begin(begun_with(Simulator(scenario, threads=1), state.bevel))
+    return replace(begun, state=replace(state, scenario=scenario), tips=state.tip[None], **fields)
+
+
+def decided(plan, estimate, seed=0, path=None):
+    """Decision and memory after it, with a current path that is the plan's unless another is given."""
+    task = task_of(estimate.nominal, plan)
+    begun, path = ADAPTIVE.begin(task), path or after(of_plan(plan), estimate.state.tip[0])
+    memory = replace(begun, path=path, bevel=estimate.state.bevel)
+    return ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(seed))
+
+
+def after(path, x):
+    """The path without the rolls that were made."""
+    return replace(path, rolls=tuple(roll for roll in path.rolls if roll > x))
+
+
+def decide(plan, estimate, seed=0):
+    return decided(plan, estimate, seed)[0]
+
+
+def aimed(plan, state, offset, ahead=20.0):
+    """The plan with a target so far ahead of a tip, and off its line (mm)."""
+    x, y, theta = state.tip
+    return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(theta) + offset)))

@@ -1,0 +1,141 @@
+"""What a path costs the default controller: weights, miss and reach."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_of
+from flexneedle.control.methods import adaptive_mpc
+from flexneedle.control.path import of_plan
+from flexneedle.planning import terms
+from flexneedle.planning.planner import bevel_reach
+from flexneedle.planning.terms import charges
+from flexneedle.simulator.control import Control
+from flexneedle.simulator.simulator import Simulator
+from tasks import task_of
+
+
+def weights(scenario, plan, x, memory=None):
+    """Of the terms of the cost at a depth of the tip."""
+    simulator = Simulator(scenario, threads=1)
+    state = simulator.start()
+    while state.tip[0] < x:
+        state = simulator.step(state, Control(db_x=1.0))
+    estimate, task = estimate_of(state, scenario), task_of(simulator, plan)
+    memory = memory or ADAPTIVE.begin(task)
+    ahead = adaptive_mpc.Ahead.of(task, state, memory.path)
+    listed = adaptive_mpc.cost_terms(task, estimate, memory, ahead)
+    return {term.name: term.weight for term in listed}, task, estimate, ahead
+
+
+def test_weights_are_the_settings_over_scales_of_the_scenario(quick_plan):
+    """Energy against that of this tissue displaced, line and slope by the path left, late rolls by what they do."""
+    found, task, estimate, ahead = weights(PHANTOM, quick_plan, 10.0)
+    settings, scale = task.settings, task.simulator.energy_scale(40.0)
+    assert found == {
+        "miss": 1.0,
+        "large miss": (ahead.left / 40.0) ** -settings.urgency - 1.0,
+        "energy": settings.energy_weight_mm / scale,
+        "line": settings.line_weight * ahead.left / 40.0,
+        "slope": settings.slope_weight_mm * ahead.left / 40.0,
+        "flips": settings.roll_weight_mm,
+        "late": settings.late_roll_weight * estimate.roll_sd,
+        "reach": settings.reach_weight,
+    }
+    assert 0.7 < ahead.left / 40.0 < 0.8
+    assert estimate.roll_sd > 0.0
+    bare, task, _, _ = weights(BARE, quick_plan, 10.0)
+    assert bare["energy"] == task.settings.unguided_energy_weight_mm / scale
+    assert bare["line"] == task.settings.unguided_line_weight
+    assert bare["reach"] == task.settings.unguided_reach_weight
+
+
+def test_near_the_target_a_large_miss_gets_no_more_urgent(quick_plan):
+    """As late as a correction takes no effect any more."""
+    late, later = (weights(PHANTOM, quick_plan, x)[0]["large miss"] for x in (36.0, 38.0))
+    assert late == later == pytest.approx((adaptive_mpc.UNCORRECTED / 40.0) ** -1.5 - 1.0)
+
+
+def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
+    """The standard deviation that the last decision predicted, had it predicted no miss, by the path that is left."""
+    estimate = estimate_of(along(quick_plan, 40), QUICK)
+    task = task_of(estimate.nominal, quick_plan)
+    memory = replace(ADAPTIVE.begin(task), blur=0.3)
+    ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
+    trajectories = adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
+    (term,) = (term for term in adaptive_mpc.cost_terms(task, estimate, memory, ahead) if term.name == "miss")
+    past = float(terms.past(trajectories, quick_plan.target)[0])
+    assert abs(past) > 1e-3
+    blur = 0.3 * ahead.left / 40.0
+    assert blur < 0.25
+    assert term.value(trajectories)[0] == pytest.approx(np.hypot(past, blur) - blur)
+
+
+def test_near_the_target_what_is_above_its_standard_deviation_is_urgent_and_what_is_below_is_not(
+    quick_plan, along
+):
+    """Half of a miss that equals the standard deviation, in full, though what blurs it counts by the path left."""
+    estimate = estimate_of(along(quick_plan, 60), QUICK)
+    task = task_of(estimate.nominal, quick_plan)
+    memory = replace(ADAPTIVE.begin(task), blur=0.3)
+    ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
+    trajectories = adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
+    off = terms.past(trajectories, quick_plan.target)[0]
+    tips = np.repeat(trajectories.tips, 3, axis=0)
+    tips[:, -1, 1] += np.array([0.01, 0.3, 30.0]) - off
+    charged = charges(
+        adaptive_mpc.cost_terms(task, estimate, memory, ahead)[:2], replace(trajectories, tips=tips)
+    )
+    share = charged["large miss"] / charged["miss"] / (max(ahead.left, 5.0) / 40.0) ** -1.5
+    full = 1.0 - (max(ahead.left, 5.0) / 40.0) ** 1.5
+    assert ahead.left < 12.0
+    np.testing.assert_allclose(share / full, [0.0011, 0.5, 1.0], rtol=0.01)
+
+
+def test_the_blur_is_the_standard_deviation_that_was_predicted_without_a_miss(quick_plan, along):
+    decision, memory = decided(quick_plan, estimate_of(along(quick_plan, 40), QUICK))
+    assert 0.0 < memory.blur <= decision.miss_sd
+
+
+@given(st.floats(-3.0, 3.0), st.floats(0.01, 2.0))
+def test_what_is_expected_above_zero_is_the_integral(mean, sd):
+    x = np.linspace(0.0, mean + 9.0 * sd, 20001)
+    density = np.exp(-0.5 * ((x - mean) / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
+    expected = np.trapezoid(x * density, x) if x[-1] > 0.0 else 0.0
+    found = adaptive_mpc.above_zero(np.array([mean]), np.array([sd]))[0]
+    assert found == pytest.approx(expected, abs=1e-4 * sd)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("bevel", [1, -1])
+def test_reach_is_not_given_away_by_a_step_with_the_bevel_on_the_wrong_side(quick_plan, side, bevel):
+    """To a target near the end of what the bevel can reach."""
+    simulator = Simulator(BARE, threads=1)
+    state = simulator.replay(simulator.start(bevel), [[31.0, 0.0, 0.0, 0.0, -1.0]])[0]
+    estimate = estimate_of(state, BARE)
+    least, greatest = bevel_reach(BARE, 40.0, threads=1)
+    plan = replace(quick_plan, target=(40.0, 0.9 * (greatest if side > 0 else least)), bevel=bevel)
+    task = task_of(simulator, plan)
+    ahead = adaptive_mpc.Ahead.of(task, state, replace(of_plan(plan), rolls=()))
+    kept, rolled = adaptive_mpc.out_of_reach(task, estimate, ahead, ADAPTIVE.begin(task))
+    assert min(kept, rolled) >= 0.0
+    assert (kept < rolled) == (side == bevel)
+
+
+def test_cost_is_a_length_that_no_scale_of_tissue_changes(quick_plan, along):
+    """Needle and tissue k times as stiff: the same shapes, so the same cost and command."""
+    factor = 3.7
+    stiffer = {f"tissue.{k}.shear_modulus_kpa": factor * PHANTOM.tissue[k].shear_modulus_kpa for k in (0, 1)}
+    scaled = PHANTOM.with_values(
+        stiffer | {"needle.youngs_modulus_gpa": factor * PHANTOM.needle.youngs_modulus_gpa}
+    )
+    here, there = (
+        decide(quick_plan, estimate_of(along(quick_plan, 40, scenario), scenario))
+        for scenario in (PHANTOM, scaled)
+    )
+    assert there.cost == pytest.approx(here.cost, rel=1e-6)
+    assert there.command == pytest.approx(here.command, abs=1e-6)
+    assert there.miss == pytest.approx(here.miss, abs=1e-6)

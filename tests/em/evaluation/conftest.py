@@ -1,0 +1,10 @@
+"""What the tests of tables share."""
+
+import pytest
+
+from em_tables import random_rows
+
+
+@pytest.fixture
+def rows():
+    return random_rows(seed=2, samples=3)

@@ -1,0 +1,201 @@
+"""Each key of `[phantom]` alone: the size of its effect."""
+
+import math
+
+import numpy as np
+import pytest
+
+from flexneedle.errors import CommandError
+from flexneedle.rig.phantom import rod as rd
+from flexneedle.rig.phantom.draw import draw
+from flexneedle.rig.phantom.phantom import Phantom
+from flexneedle.rig.phantom.plants import PLANTS
+from reference.rods import IDEAL
+from tanks import AHEAD, COARSE, PHANTOM, SKIN, STRAIGHT, TURN, alone, both_plants, driven, tank, tip
+
+
+def free(scenario=IDEAL):
+    """The same needle, held only by its clamp."""
+    return scenario.with_values({"setup.guide_to_skin_mm": None})
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_initial_bend_is_the_deflection_of_the_free_tip(seed):
+    """0.5 mm over 150 mm, to the drawn side; it is mirrored when the bevel rolls."""
+    scenario = free().with_values({"phantom.initial_bend_mm": 0.5})
+    phantom = Phantom(draw(scenario, np.random.default_rng(seed)), 1)
+    off = tip(phantom)[1]
+    assert abs(off) == pytest.approx(0.5, rel=1e-4)
+    assert tip(driven(phantom, TURN))[1] == pytest.approx(-off)
+    assert tip(phantom)[2] == pytest.approx(-2.0 * off / 150.0, rel=5e-3)  # slope of an arc
+
+
+@both_plants
+@pytest.mark.parametrize("seed", range(3))
+def test_the_tip_moves_by_the_run_out_when_the_bevel_rolls(kind, seed):
+    """0.2 mm, normal to the tip, at once; and back with the next roll."""
+    phantom = alone(seed, kind, run_out_mm=0.2)
+    here = tip(phantom)
+    there = tip(driven(phantom, TURN))
+    assert abs(there[1] - here[1]) == pytest.approx(0.2)
+    assert abs(here[1]) == pytest.approx(0.1)
+    np.testing.assert_allclose(tip(driven(phantom, TURN)), here, atol=1e-9)
+
+
+@both_plants
+def test_the_run_out_is_normal_to_the_needle(kind):
+    """A rotation of the base by 0.1 rad also rotates its direction."""
+    plain, off = (
+        driven(tank(free(), kind, run_out=run_out), (0.0, 0.0, 5e-3, 0.0, -1), times=20)
+        for run_out in (0.0, 0.1)
+    )
+    expected = 0.1 * np.array([-math.sin(0.1), math.cos(0.1)])
+    np.testing.assert_allclose((tip(off) - tip(plain))[:2], expected, atol=1e-6)
+    assert tip(off)[2] == tip(plain)[2]
+
+
+def test_within_its_clearance_the_guide_does_not_move_the_needle():
+    """Beyond it the needle is 0.05 mm behind the guide, on both sides; a guide without clearance moves it at once."""
+    reach = tip(driven(tank(), (0.0, 0.0, 0.0, 0.1, -1)))[1]
+    assert reach > 0.1
+    for side in (1.0, -1.0):
+        phantom = driven(alone(guide_clearance_mm=0.05), (0.0, 0.0, 0.0, 0.05 * side, -1))
+        assert tip(phantom)[1] == 0.0
+        driven(phantom, (0.0, 0.0, 0.0, 0.1 * side, -1))
+        assert tip(phantom)[1] == pytest.approx(side * reach, rel=1e-6)
+
+
+@pytest.mark.parametrize("friction", [5.0, 10.0])
+def test_the_friction_at_the_base_is_proportional_to_the_inserted_length(friction):
+    blunt = IDEAL.with_values({"needle.bevel.offset_mm": 0.0, "phantom.friction_mn_per_mm": friction})
+    phantom = driven(tank(blunt), STRAIGHT, times=SKIN + 19)
+    depth = tip(phantom)[0]
+    assert depth == pytest.approx(19.5)
+    assert phantom._plant._s[rd.BASE_FORCE_X] == pytest.approx(1e-3 * friction * depth)
+
+
+def test_friction_increases_the_deflection_of_a_bent_needle():
+    """An axial force on a bent needle: twice the friction gives a larger deflection."""
+    tips = [
+        tip(driven(tank(IDEAL.with_values({"phantom.friction_mn_per_mm": friction})), AHEAD, times=40))[1]
+        for friction in (0.0, 5.0, 10.0)
+    ]
+    once, twice = tips[1] - tips[0], tips[2] - tips[0]
+    assert abs(once) > 1e-4
+    assert twice == pytest.approx(2.0 * once, rel=0.1)
+
+
+def test_layer_boundaries_are_at_their_drawn_depths():
+    """Displaced by 1.5 mm (sd) around 20 mm: the stiffness of the cells changes there, within one cell."""
+    steps = []
+    for seed in range(150):
+        phantom = alone(seed, layer_shift_sd_mm=1.5, element_mm=30.0)
+        rod = phantom._plant.rod
+        force = rod.force
+        (jump,) = np.flatnonzero(np.diff(force))
+        assert force[jump + 1] / force[jump] == pytest.approx(3.63 / 1.82)
+        drawn = phantom._truth.scenario.layer_tops[1]
+        assert (jump + 1) * rod.cell == pytest.approx(drawn, abs=0.5 * rod.cell + 1e-9)
+        steps.append(drawn)
+    assert np.mean(steps) == pytest.approx(20.0, abs=4.0 * 1.5 / math.sqrt(150))
+    assert np.std(steps) == pytest.approx(1.5, rel=0.2)
+
+
+def test_stiffness_varies_along_the_depth_with_its_size_and_correlation():
+    """20 % (sd) with a correlation of 1/e over 10 mm in the cells along the needle; higher over 5 mm."""
+    for length in (10.0, 5.0):
+        cells = []
+        for seed in range(200):
+            rod = alone(
+                seed, shear_modulus_variation=0.2, variation_length_mm=length, element_mm=30.0
+            )._plant.rod
+            plain = np.where((np.arange(rod.force.size) + 0.5) * rod.cell < 20.0, 1.82, 3.63)
+            cells.append(rod.force / plain)
+        factor = np.array(cells) / np.mean(cells)
+        assert factor.std() == pytest.approx(0.2, rel=0.08)
+        lag = round(10.0 / 0.25)
+        level = np.log(factor)
+        found = np.corrcoef(level[:, :-lag].ravel(), level[:, lag:].ravel())[0, 1]
+        assert found == pytest.approx(math.exp(-10.0 / length), abs=0.06)
+
+
+@both_plants
+def test_factors_of_tissue_and_bevel_equal_a_changed_scenario(kind):
+    """1.5 times the modulus of both layers and half the bevel, compared with a scenario with these values."""
+    phantom = alone(0, kind, shear_modulus_factor=[1.5, 1.5], bevel_factor=[0.5, 0.5])
+    values = {f"tissue.{k}.shear_modulus_kpa": 1.5 * (1.82, 3.63)[k] for k in (0, 1)}
+    spacing = {"contact.spacing_mm": IDEAL.phantom.contact_spacing_mm}
+    other = tank(IDEAL.with_values(values | spacing | {"needle.bevel.offset_mm": 2.0}), kind)
+    np.testing.assert_allclose(
+        tip(driven(phantom, AHEAD, times=35)), tip(driven(other, AHEAD, times=35)), atol=1e-9
+    )
+
+
+@both_plants
+@pytest.mark.parametrize("seed", range(3))
+def test_start_offset_and_slope_move_the_clamp(kind, seed):
+    """The tip of a free needle moves by the offset, and by 150 mm times the slope."""
+    rng = np.random.default_rng(seed)
+    offset = draw(free().with_values({"phantom.start_offset_sd_mm": 0.5}), rng)
+    slope = draw(free().with_values({"phantom.start_angle_sd_mrad": 3.0}), rng)
+    np.testing.assert_allclose(tip(Phantom(offset, 1, kind))[1:], [offset.base_y, 0.0], atol=1e-9)
+    np.testing.assert_allclose(
+        tip(Phantom(slope, 1, kind))[1:], [150.0 * slope.base_turn, slope.base_turn], rtol=1e-4
+    )
+    assert offset.base_y != 0.0 != slope.base_turn
+
+
+@both_plants
+@pytest.mark.parametrize("seed", range(3))
+def test_an_axial_start_error_moves_base_and_tip_and_keeps_the_stroke(kind, seed):
+    scenario = IDEAL.with_values({**COARSE, "phantom.start_axial_sd_mm": 3.0})
+    truth = draw(scenario, np.random.default_rng(seed))
+    error = scenario.setup.tip_to_skin_mm - truth.scenario.setup.tip_to_skin_mm
+    assert error != 0.0
+    phantom = Phantom(truth, 1, kind)
+    assert truth.scenario.start_base_x == pytest.approx(scenario.start_base_x + error)
+    np.testing.assert_allclose(tip(phantom), [scenario.setup.start_tip_x + error, 0.0, 0.0], atol=1e-9)
+    driven(phantom, STRAIGHT, times=110)
+    assert tip(phantom)[0] == pytest.approx(scenario.setup.max_depth + error, abs=0.5)  # except for its bend
+    assert phantom.condition().converged
+    with pytest.raises(CommandError):
+        driven(phantom, STRAIGHT)
+
+
+@both_plants
+def test_a_modulus_factor_of_the_needle_equals_a_changed_scenario(kind):
+    truth = draw(IDEAL.with_values({"phantom.youngs_modulus_variation": 0.3}), np.random.default_rng(0))
+    modulus = truth.scenario.needle.youngs_modulus_gpa
+    assert abs(modulus - 200.0) > 1.0
+    spacing = {"contact.spacing_mm": IDEAL.phantom.contact_spacing_mm}
+    other = tank(IDEAL.with_values({**spacing, "needle.youngs_modulus_gpa": modulus}), kind)
+    found = tip(driven(Phantom(truth, 1, kind), AHEAD, times=40))
+    np.testing.assert_allclose(found, tip(driven(other, AHEAD, times=40)), atol=1e-9)
+    assert found[1] != tip(driven(tank(kind=kind), AHEAD, times=40))[1]
+
+
+def rough_truth(**changes):
+    """A drawn phantom with all default imperfections except motors, and these changes."""
+    scenario = PHANTOM.with_values({"phantom.motor_resolution_mm": 0.0, **changes})
+    return draw(scenario, np.random.default_rng(11))
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "initial_bend_mm",
+        "guide_clearance_mm",
+        "friction_mn_per_mm",
+        "shear_modulus_variation",
+        "layer_shift_sd_mm",
+        "run_out_mm",
+    ],
+)
+def test_the_model_plant_lacks_its_documented_imperfections_and_the_exact_one_has_all(key):
+    only_exact = {"initial_bend_mm", "guide_clearance_mm", "friction_mn_per_mm", "shear_modulus_variation"}
+    for kind in PLANTS:
+        ends = [
+            tip(driven(Phantom(rough_truth(**{f"phantom.{key}": value}), 1, kind), AHEAD, times=55))[1]
+            for value in (0.0, getattr(PHANTOM.phantom, key))
+        ]
+        assert (ends[0] == ends[1]) == (kind == "model" and key in only_exact)

@@ -1,0 +1,45 @@
+"""Virtual phantoms with chosen imperfections, and commands for them."""
+
+import numpy as np
+import pytest
+
+from flexneedle import load_scenario
+from flexneedle.rig.phantom.draw import Truth, draw
+from flexneedle.rig.phantom.phantom import Phantom
+from flexneedle.rig.phantom.plants import PLANTS
+from reference.rods import IDEAL
+
+PHANTOM = load_scenario("phantom")
+AHEAD = (1.0, 0.0, 0.0, 0.1, -1)
+STRAIGHT = (1.0, 0.0, 0.0, 0.0, -1)
+STILL = (0.0, 0.0, 0.0, 0.0, -1)
+TURN = (0.0, 0.0, 0.0, 0.0, 1)
+SKIN = 29  # steps of 1 mm until the tip is in the tissue
+COARSE = {
+    "phantom.element_mm": 5.0,
+    "phantom.contact_spacing_mm": 2.0,
+}  # for tests that do not depend on the mechanics
+both_plants = pytest.mark.parametrize("kind", PLANTS)
+
+
+def tank(scenario=IDEAL, kind="exact", bevel=1, **truth):
+    """A phantom with only these imperfections."""
+    return Phantom(Truth(scenario, cell_mm=0.5 * scenario.phantom.contact_spacing_mm, **truth), bevel, kind)
+
+
+def alone(seed=0, kind="exact", bevel=1, **values):
+    """The phantom of a seed with only these imperfections."""
+    scenario = IDEAL.with_values({f"phantom.{key}": value for key, value in values.items()})
+    return Phantom(draw(scenario, np.random.default_rng(seed)), bevel, kind)
+
+
+def driven(phantom, *commands, times=1):
+    """The phantom after the commands."""
+    for _ in range(times):
+        for command in commands:
+            phantom.apply(command, 0.2)
+    return phantom
+
+
+def tip(phantom):
+    return phantom.condition().tip
