@@ -462,7 +462,7 @@ def test_the_median_of_each_reference_counts_not_that_of_all(insertion):
 
 def test_readings_that_the_monitor_forgets_do_not_count(insertion):
     frames = [frame_of(k, 0.1 * k, {"a": value}) for k, value in enumerate((0.01, 0.5, 0.6, 0.02))]
-    verdicts = ["ok", "stale: frame 1 after frame 1", "not a number", "innovation 2.31 mm, limit 2 mm"]
+    verdicts = ["ok", "stale: frame 1 after frame 1", "not a number", "innovation: 2.31 mm, limit 2 mm"]
     found = worst_indicator(with_frames(insertion, frames, verdicts), window=1.0)
     np.testing.assert_allclose(found, [[0.0, 0.01], [0.3, 0.015]])
 

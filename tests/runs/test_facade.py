@@ -23,15 +23,15 @@ PHANTOM = flexneedle.load_scenario("phantom")
 PLAN = replace(make_plan(), scenario=PHANTOM)
 INSERTION = replace(make_insertion(PLAN), scenario=PHANTOM, controller="ce-mpc", phantom="exact")
 
-DEPTH_AND_OFFSET = (15.0, 2.0)
-TARGET = ("--target", *map(str, DEPTH_AND_OFFSET))
+TARGET = ("--target", "15", "2")
+SHALLOW = PHANTOM.with_values({"target.depth_mm": 15.0, "target.lateral_mm": 2.0})
 
 
 @pytest.fixture(scope="module")
 def executed():
-    """A real plan and its insertion, by the name of the scenario."""
-    plan = flexneedle.plan("phantom", DEPTH_AND_OFFSET, seed=0)
-    return plan, flexneedle.insert("phantom", plan, seed=3)
+    """A real plan to `TARGET`, and its insertion."""
+    plan = flexneedle.plan(SHALLOW, seed=0)
+    return plan, flexneedle.insert(SHALLOW, plan, seed=3)
 
 
 def same(one, other):

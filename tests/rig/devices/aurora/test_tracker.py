@@ -276,15 +276,20 @@ def test_closing_ends_tracking():
 
 
 def test_an_interrupt_while_connecting_leaves_no_process(monkeypatch):
+    others = set(psutil.Process().children())  # of tests that ran before in this process
+
+    def started():
+        return set(psutil.Process().children()) - others
+
     def stopped(_aurora):
-        until(lambda: psutil.Process().children())
+        until(started)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Aurora, "_await_first", stopped)
     device, host = os.openpty()
     with pytest.raises(KeyboardInterrupt):
         Aurora(os.ttyname(host), WallClock())
-    assert not psutil.Process().children()
+    assert not started()
     os.close(device)
     os.close(host)
 
