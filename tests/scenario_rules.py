@@ -216,7 +216,7 @@ RULES = [
     # unknown keys
     ("needle.lenght_mm", 150.0, "unknown key; did you mean length_mm? valid keys: gauge, stylet,"),
     ("needle.bevel.b", 4.0, "unknown key; valid keys: offset_mm, length_mm"),
-    ("tissue[1].mu", 4.0, "unknown key; valid keys: name, thickness_mm,"),
+    ("tissue[1].mu", 4.0, "unknown key; valid keys: law, name, thickness_mm,"),
     (
         "control.load_gian",
         0.3,

@@ -10,7 +10,6 @@ import flexneedle
 from flexneedle.control.methods import DEFAULT, METHODS
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.observer import StateCorrection
-from flexneedle.mechanics import needle as nd
 from flexneedle.planning.terms import Trajectories
 from flexneedle.rig.phantom.draw import draw
 from flexneedle.types import Frame, SensorReading
@@ -86,9 +85,9 @@ def test_the_line_has_the_main_values_with_units(name, line):
 
 
 def test_a_state_gives_the_slope_in_mrad():
-    scalars = STATE.scalars.copy()
-    scalars[nd.TIP_TURN] = 2e-3
-    assert "slope 2.00 mrad" in repr(replace(STATE, scalars=scalars))
+    solution = STATE.needle.solution
+    sloped = STATE.needle._replace(solution=solution._replace(tip=solution.tip._replace(slope=2e-3)))
+    assert "slope 2.00 mrad" in repr(replace(STATE, needle=sloped))
 
 
 def test_a_period_names_time_action_tip_and_verdict():

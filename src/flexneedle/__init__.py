@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from flexneedle.scenario.files import load_scenario
     from flexneedle.scenario.model import Scenario
     from flexneedle.scenario.sections.fields import Section
+    from flexneedle.scenario.tissue.layer import Layer
     from flexneedle.simulator.control import Control
     from flexneedle.simulator.simulator import Simulator
     from flexneedle.simulator.state import State
@@ -48,6 +49,7 @@ __all__ = [
     "FlexneedleError",
     "InputError",
     "Insertion",
+    "Layer",
     "Measurement",
     "Method",
     "Plan",
@@ -98,6 +100,7 @@ _HOMES = {
     "scenario.files": ("load_scenario",),
     "scenario.model": ("Scenario",),
     "scenario.sections.fields": ("Section",),
+    "scenario.tissue.layer": ("Layer",),
     "simulator.control": ("Control",),
     "simulator.simulator": ("Simulator",),
     "simulator.state": ("State",),

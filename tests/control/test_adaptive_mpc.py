@@ -21,6 +21,7 @@ from flexneedle.scenario.worlds import world
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Measurement
+from reference.cases import numbers
 from tasks import task_of
 
 ACCURATE = PHANTOM.with_values(
@@ -341,7 +342,7 @@ def test_deciding_changes_nothing_of_belief_plan_and_memory(quick_plan, along):
     estimate = estimate_of(along(quick_plan, 45), residual=0.1)
     _, memory = decided(quick_plan, estimate)
     arrays = (
-        estimate.parameters, estimate.tips, estimate.state.scalars, estimate.curves, quick_plan.tips, quick_plan.guide,
+        estimate.parameters, estimate.tips, numbers(estimate.state), estimate.curves, quick_plan.tips, quick_plan.guide,
         memory.path.depth, memory.path.guide, memory.outlook.curves,
     )  # fmt: skip
     before = [array.copy() for array in arrays]

@@ -39,7 +39,9 @@ def disturbed(rows, by):
     return changed
 
 
-@pytest.mark.parametrize("steps", [5, 30, 60])
+@pytest.mark.parametrize(
+    "steps", [5, 35, 60]
+)  # none in which the tip passes the skin: the Jacobian is not smooth there
 @pytest.mark.parametrize("ahead", [1.0, 7.3])
 def test_jacobian_is_the_finite_difference_of_steps(quick_plan, along, steps, ahead):
     state = along(quick_plan, steps)
@@ -126,7 +128,8 @@ def test_nominal_controls_insert_by_the_way_and_leave_room_for_the_disturbance(
     setup = PHANTOM.setup.model_copy(
         update={"max_guide_step_mm": limit, "max_guide_travel_mm": reach, "max_advance_mm": advance}
     )
-    start = replace(state, scalars=np.where(state.scalars == state.guide, 0.0, state.scalars))
+    centred = state.needle._replace(boundary=state.needle.boundary._replace(guide=0.0))
+    start = replace(state, needle=centred)
     rows = resolved_rate.nominal(setup, quick_plan, start, way, low, flip=flip)
     assert rows[:, 0].sum() == pytest.approx(way)
     assert rows[:, 0].min() > 0.0

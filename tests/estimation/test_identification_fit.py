@@ -8,7 +8,6 @@ import pytest
 from flexneedle.estimation import identification as idn
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.prior import BASE_TURN, BASE_Y, BEND, BEVEL, CLEARANCE, RUN_OUT, unexplained
-from flexneedle.mechanics import needle as nd
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Measurement
 from identified import (
@@ -246,9 +245,10 @@ def test_a_trial_step_that_does_not_converge_is_refused(monkeypatch):
         other = with_(self, parameters)
         if np.array_equal(parameters, estimate.parameters):
             return other
-        scalars = other.state.scalars.copy()
-        scalars[nd.CONVERGED] = 0.0
-        return replace(other, state=replace(other.state, scalars=scalars))
+        solution = other.state.needle.solution._replace(converged=False)
+        return replace(
+            other, state=replace(other.state, needle=other.state.needle._replace(solution=solution))
+        )
 
     monkeypatch.setattr(idn.Identified, "_with", failing)
     assert idn.improved(estimate, readings).state.converged

@@ -35,6 +35,7 @@ from identified import (
     readings,
     stepped,
 )
+from reference.cases import numbers
 from tasks import begun_with
 
 
@@ -180,11 +181,11 @@ def test_observing_changes_nothing_of_the_old_belief_and_threads_nothing_of_the_
     many, _ = followed(needle, 45, threads=4)
     np.testing.assert_array_equal(one.parameters, many.parameters)
     assert one.state == many.state
-    before = one.parameters.copy(), one.tips.copy(), one.state.scalars.copy(), one.moves
+    before = one.parameters.copy(), one.tips.copy(), numbers(one.state), one.moves
     moved = one.move((1.0, 0.0, 0.0, 0.1, -1), 45.0, 46.0)
     here, again = (moved.observe([Measurement(46.0, 17.5, 1.0)]) for _ in range(2))
     np.testing.assert_array_equal(here.parameters, again.parameters)
-    after = one.parameters, one.tips, one.state.scalars
+    after = one.parameters, one.tips, numbers(one.state)
     for kept, now in zip(before[:3], after, strict=True):
         np.testing.assert_array_equal(kept, now)
     assert one.moves is before[3]

@@ -9,6 +9,7 @@ from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Measurement
 from observed import AHEAD, PHANTOM, begun, in_tissue, readings_between
+from reference.cases import numbers
 
 GUIDE = (0.3, -0.2, 0.1, 0.25, -0.3, 0.2)
 COMMANDS = [(1.0, 0.0, 0.0, step, 1 if k == 2 else -1) for k, step in enumerate(GUIDE)]
@@ -88,9 +89,9 @@ def test_readings_out_of_order_and_split_over_calls_count_the_same(depth):
     whole = estimate.observe(together)
     shuffled = [together[k] for k in (5, 0, 11, 3, 8, 1, 2, 10, 4, 9, 6, 7)]
     mixed = estimate.observe(shuffled)
-    np.testing.assert_allclose(mixed.state.scalars, whole.state.scalars, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(numbers(mixed.state), numbers(whole.state), rtol=1e-9, atol=1e-12)
     split = estimate.observe(together[:2]).observe(together[2:7]).observe(together[7:])
-    np.testing.assert_allclose(split.state.scalars, whole.state.scalars, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(numbers(split.state), numbers(whole.state), rtol=1e-9, atol=1e-12)
     for other in (mixed, split):
         np.testing.assert_allclose(other.covariance, whole.covariance, rtol=1e-9, atol=1e-12)
     assert split.moves == whole.moves == ()
@@ -123,10 +124,10 @@ def test_without_readings_nothing_is_corrected_and_moves_stay_open():
 def test_observing_leaves_the_old_belief_as_it_was():
     simulator = Simulator(PHANTOM)
     moved = begun(simulator, in_tissue(simulator, 20)).move(AHEAD, 0.0, 1.0)
-    before = moved.tips.copy(), moved.covariance.copy(), moved.state.scalars.copy(), moved.moves
+    before = moved.tips.copy(), moved.covariance.copy(), numbers(moved.state), moved.moves
     one, other = (moved.observe([Measurement(1.0, -7.5, 0.2)]) for _ in range(2))
     assert_same_belief(one, other)
-    now = moved.tips, moved.covariance, moved.state.scalars
+    now = moved.tips, moved.covariance, numbers(moved.state)
     for kept, there in zip(before, now, strict=False):
         np.testing.assert_array_equal(kept, there)
     assert moved.moves == before[3]

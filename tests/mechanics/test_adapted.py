@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from flexneedle.mechanics import needle as nd
+from flexneedle.mechanics.law import tables
 from flexneedle.mechanics.model import (
     CONTACT,
     GUIDE,
@@ -13,20 +14,28 @@ from flexneedle.mechanics.model import (
     contact_nodes,
     tissue_layers,
 )
+from flexneedle.scenario.tissue.ogden import Ogden
 
 THICKNESS = (6.0, 3.5, np.inf)
 MU = np.array([1e-3, 4e-3, 2e-3])
-ALPHA, HEIGHT, WIDTH = 8.0, 20.0, np.array([5.0, 2.0, 4.0])
+HEIGHT, WIDTH = 20.0, np.array([5.0, 2.0, 4.0])
+ALPHAS = (8.0, -3.0, 5.0)
+LAWS = tables(
+    [
+        Ogden(alpha=alpha, shear_modulus_kpa=1.0, compression_length_mm=1.0, engaged_width_mm=1.0)
+        for alpha in ALPHAS
+    ]
+)
 
 
-def tissue(thickness=THICKNESS, alpha=(ALPHA,) * 3, height=(HEIGHT,) * 3):
-    return tissue_layers(np.array(thickness), MU, np.array(alpha), np.array(height), WIDTH)
+def tissue(thickness=THICKNESS, law=(0, 0, 0), height=(HEIGHT,) * 3):
+    return tissue_layers(np.array(thickness), 3.0 * MU, np.array(height), WIDTH, np.array(law))
 
 
 LAYERS = tissue()
 NODES = contact_nodes(LAYERS, np.array([1.0, 0.5, 0.7]), 1.0, 18.0, -41.0)
-CONTACTS = NODES.kind == CONTACT
-MODEL = Model(4000.0, 150.0, 4.0, 3.0, NODES, LAYERS, 0.25, 3.0)
+CONTACTS = NODES["kind"] == CONTACT
+MODEL = Model(4000.0, 150.0, 4.0, 3.0, NODES, LAYERS, LAWS, 0.25, 3.0)
 NO_SHIFT = np.zeros(2)
 ONES = np.ones(3)
 CELLS = np.array([1.5, 0.7, 1.2, 0.4, 2.0, 0.9])
@@ -68,34 +77,30 @@ ESTIMATES = {
 
 @pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)
 def test_a_contact_has_the_tissue_along_its_interval(estimate):
-    """Force scale ∫2μw/α dx, energy scale ∫2μwh/α² dx, whatever divides the interval."""
+    """Stiffness ∫3μw/h dx, whatever divides the interval."""
     nodes = adapted(MODEL, estimate).nodes
-    for i in np.flatnonzero(CONTACTS):
-        top, bottom = NODES.x[i] - NODES.reach[i], NODES.x[i] + NODES.reach[i]
-        expected = along(top, bottom, estimate, 1000)
-        assert nodes.force[i] == pytest.approx(2.0 / ALPHA * expected, rel=4e-3)
-        assert nodes.energy[i] == pytest.approx(2.0 * HEIGHT / ALPHA**2 * expected, rel=4e-3)
+    for node, stiffness in zip(NODES[CONTACTS], nodes["stiffness"][CONTACTS], strict=True):
+        expected = along(node["x"] - node["reach"], node["x"] + node["reach"], estimate, 1000)
+        assert stiffness == pytest.approx(3.0 / HEIGHT * expected, rel=4e-3)
 
 
 @pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)
 def test_all_contacts_together_have_all_of_the_tissue(estimate):
-    end = NODES.x[-1] + NODES.reach[-1]
-    expected = 2.0 / ALPHA * along(0.0, end, estimate, 38_000)
-    assert adapted(MODEL, estimate).nodes.force[CONTACTS].sum() == pytest.approx(expected, rel=2e-4)
+    end = NODES["x"][-1] + NODES["reach"][-1]
+    expected = 3.0 / HEIGHT * along(0.0, end, estimate, 38_000)
+    assert adapted(MODEL, estimate).nodes["stiffness"][CONTACTS].sum() == pytest.approx(expected, rel=2e-4)
 
 
 def tip_spring(model, depth, u=0.7):
-    """Force, stiffness and energy of the tip spring with the tip at a depth, and the sharpest law and least height."""
-    s = np.zeros(nd.STATE_SIZE)
-    s[nd.TIP_X] = s[nd.CUT_FRONT] = depth
-    return nd.spring_law(model, s, depth, u)
+    """Energy and both stiffnesses of the tip spring with the tip at a depth, the sharpest law and least height."""
+    return nd.spring_energy(model, depth, depth, u), *nd.spring_law(model, depth, depth, u)
 
 
 @pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)
 def test_the_tip_spring_is_that_of_the_tissue_along_the_bevel(estimate):
-    """Its force is linear in ∫μw dx over the bevel's length, in which any number of boundaries may lie."""
+    """It is linear in ∫μw dx over the bevel's length, in which any number of boundaries may lie."""
     model = adapted(MODEL, estimate)
-    one = tip_spring(Model(4000.0, 150.0, 4.0, 3.0, NODES, tissue((30.0, 1.0, np.inf)), 0.25, 3.0), 10.0)
+    one = tip_spring(MODEL._replace(layers=tissue((30.0, 1.0, np.inf))), 10.0)
     per_tissue = np.array(one[:3]) / (3.0 * MU[0] * WIDTH[0])
     for depth in (0.4, 2.0, 5.7, 6.2, 7.9, 10.1, 14.0):
         expected = per_tissue * along(max(0.0, depth - 3.0), depth, estimate)
@@ -104,7 +109,7 @@ def test_the_tip_spring_is_that_of_the_tissue_along_the_bevel(estimate):
 
 @pytest.mark.parametrize("estimate", ESTIMATES.values(), ids=ESTIMATES)
 def test_no_layer_begins_above_the_skin_or_ends_before_it_begins(estimate):
-    end = adapted(MODEL, estimate).layers.end
+    end = adapted(MODEL, estimate).layers["end"]
     assert end[0] >= 0.0
     assert (end[1:] >= end[:-1]).all()
     assert end[-1] == np.inf
@@ -113,14 +118,12 @@ def test_no_layer_begins_above_the_skin_or_ends_before_it_begins(estimate):
 @pytest.mark.parametrize("cell", [0.35, 1.0, 2.5, 7.0, 40.0])
 def test_no_shift_and_factors_of_one_are_the_model(cell):
     """Contacts and tip spring, however many cells divide the layers, laws of the layers' own included."""
-    layers = tissue(alpha=(8.0, -3.0, 5.0), height=(20.0, 10.0, 15.0))
+    layers = tissue(law=(0, 1, 2), height=(20.0, 10.0, 15.0))
     nodes = contact_nodes(layers, np.array([1.0, 0.5, 0.7]), 1.0, 18.0, -41.0)
     model = MODEL._replace(nodes=nodes, layers=layers)
     same = adapted(model, adaptation(cell=cell, variation=np.ones(9)))
-    for name in nodes._fields:
-        np.testing.assert_allclose(
-            getattr(same.nodes, name), getattr(nodes, name), rtol=1e-12, atol=1e-18, err_msg=name
-        )
+    for name in nodes.dtype.names:
+        np.testing.assert_allclose(same.nodes[name], nodes[name], rtol=1e-12, atol=1e-18, err_msg=name)
     assert (same.bevel_offset, same.curvature) == (model.bevel_offset, 0.0)
     for depth in (0.3, 2.9, 6.5, 8.0, 9.6, 10.5, 17.0):
         np.testing.assert_allclose(tip_spring(same, depth), tip_spring(model, depth), rtol=1e-12)
@@ -129,37 +132,34 @@ def test_no_shift_and_factors_of_one_are_the_model(cell):
 def test_modulus_factors_are_those_of_the_points_layers():
     factors = np.array([2.0, 0.5, 3.0])
     changed = adapted(MODEL, adaptation(stiffness=factors))
-    factor = factors[np.searchsorted([6.0, 9.5], NODES.x)]
-    np.testing.assert_allclose(changed.nodes.force, factor * NODES.force, rtol=1e-12)
-    np.testing.assert_allclose(changed.nodes.energy, factor * NODES.energy, rtol=1e-12)
-    np.testing.assert_array_equal(changed.layers.end, LAYERS.end)
-    np.testing.assert_array_equal(changed.layers.force, factors * LAYERS.force)
-    np.testing.assert_array_equal(changed.layers.energy, factors * LAYERS.energy)
+    factor = factors[np.searchsorted([6.0, 9.5], NODES["x"])]
+    np.testing.assert_allclose(changed.nodes["stiffness"], factor * NODES["stiffness"], rtol=1e-12)
+    np.testing.assert_array_equal(changed.layers["end"], LAYERS["end"])
+    np.testing.assert_array_equal(changed.layers["stiffness"], factors * LAYERS["stiffness"])
 
 
 def test_the_last_cell_goes_on():
     changed = adapted(MODEL, adaptation(cell=2.0, variation=(1.0, 0.25)))
-    deep = CONTACTS & (NODES.x > 2.0)
-    np.testing.assert_allclose(changed.nodes.force[deep], 0.25 * NODES.force[deep], rtol=1e-12)
-    assert changed.layers.end[-1] == np.inf
-    assert changed.layers.force[-1] == 0.25 * LAYERS.force[-1]
+    deep = CONTACTS & (NODES["x"] > 2.0)
+    np.testing.assert_allclose(changed.nodes["stiffness"][deep], 0.25 * NODES["stiffness"][deep], rtol=1e-12)
+    assert changed.layers["end"][-1] == np.inf
+    assert changed.layers["stiffness"][-1] == 0.25 * LAYERS["stiffness"][-1]
 
 
 def test_the_law_of_a_contact_is_that_of_the_layer_at_its_middle():
-    layers = tissue(alpha=(8.0, 6.0, 5.0), height=(20.0, 10.0, 15.0))
+    layers = tissue(law=(0, 1, 2), height=(20.0, 10.0, 15.0))
     nodes = contact_nodes(layers, ONES, 1.0, 18.0, None)
     changed = adapted(MODEL._replace(nodes=nodes, layers=layers), adaptation(shift=(1.7, -1.0))).nodes
-    layer = np.searchsorted([7.7, 8.5], changed.x, side="right")
-    np.testing.assert_array_equal(changed.alpha, np.array([8.0, 6.0, 5.0])[layer])
-    np.testing.assert_array_equal(changed.height, np.array([20.0, 10.0, 15.0])[layer])
+    layer = np.searchsorted([7.7, 8.5], changed["x"], side="right")
+    np.testing.assert_array_equal(changed["law"], layer)
+    np.testing.assert_array_equal(changed["height"], np.array([20.0, 10.0, 15.0])[layer])
 
 
 def test_the_guide_is_no_tissue():
-    guide = NODES.kind == GUIDE
+    guide = NODES["kind"] == GUIDE
     assert guide.sum() == 1
     changed = adapted(MODEL, adaptation(shift=(-7.0, 0.0), stiffness=np.full(3, 9.0))).nodes
-    for name in NODES._fields:
-        np.testing.assert_array_equal(getattr(changed, name)[guide], getattr(NODES, name)[guide])
+    np.testing.assert_array_equal(changed[guide], NODES[guide])
 
 
 def test_bevel_offset_is_multiplied_and_the_bend_becomes_a_curvature():
@@ -171,39 +171,37 @@ def test_bevel_offset_is_multiplied_and_the_bend_becomes_a_curvature():
 
 
 def test_nothing_else_changes_and_the_old_constants_stay():
-    before = [array.copy() for array in (*NODES, *LAYERS)]
+    before = NODES.copy(), LAYERS.copy()
     estimate = adaptation((1.0, 1.0), (3.0, 0.1, 1.0), 2.0, CELLS, bevel=0.2, bend=-1.0)
     known = [array.copy() for array in (estimate.shift, estimate.stiffness, estimate.variation)]
     changed = adapted(MODEL, estimate)
-    for kept, now in zip(before, (*NODES, *LAYERS), strict=True):
+    for kept, now in zip(before, (NODES, LAYERS), strict=True):
         np.testing.assert_array_equal(kept, now)
     for kept, now in zip(known, (estimate.shift, estimate.stiffness, estimate.variation), strict=True):
         np.testing.assert_array_equal(kept, now)
     for name in ("x", "kind", "reach", "weight"):
-        np.testing.assert_array_equal(getattr(changed.nodes, name), getattr(NODES, name))
+        np.testing.assert_array_equal(changed.nodes[name], NODES[name])
+    np.testing.assert_array_equal(changed.laws, LAWS)
     assert (changed.bending_stiffness, changed.length, changed.bevel_length) == (4000.0, 150.0, 3.0)
 
 
 def test_a_single_layer_has_no_boundary():
-    layers = tissue_layers(*(np.array([value]) for value in (np.inf, MU[0], ALPHA, HEIGHT, WIDTH[0])))
+    layers = tissue_layers(*(np.array([value]) for value in (np.inf, 3.0 * MU[0], HEIGHT, WIDTH[0], 0)))
     nodes = contact_nodes(layers, np.ones(1), 1.0, 8.0, None)
     model = MODEL._replace(nodes=nodes, layers=layers)
     changed = adapted(model, Adaptation(np.zeros(0), np.array([2.0]), 4.0, np.array([1.0, 3.0])))
-    np.testing.assert_allclose(
-        changed.nodes.force, np.where(nodes.x < 4.0, 2.0, 6.0) * nodes.force, rtol=1e-12
-    )
-    np.testing.assert_array_equal(changed.layers.end, [4.0, np.inf])
+    factor = np.where(nodes["x"] < 4.0, 2.0, 6.0)
+    np.testing.assert_allclose(changed.nodes["stiffness"], factor * nodes["stiffness"], rtol=1e-12)
+    np.testing.assert_array_equal(changed.layers["end"], [4.0, np.inf])
 
 
-@pytest.mark.parametrize(
-    "unlike", [{"alpha": (8.0, 2.0, 5.0)}, {"height": (20.0, 10.0, 15.0)}, {"alpha": (8.0, -3.0, 5.0)}]
-)
+@pytest.mark.parametrize("unlike", [{"law": (0, 2, 2)}, {"height": (20.0, 10.0, 15.0)}, {"law": (0, 1, 2)}])
 def test_a_contact_between_unlike_layers_has_the_stiffness_of_both(unlike):
-    """3αF/2h is ∫3μw/h dx in the interval that a displaced boundary divides."""
+    """∫3μw/h dx in the interval that a displaced boundary divides."""
     layers = tissue(**unlike)
     nodes = contact_nodes(layers, ONES, 1.0, 18.0, None)
     changed = adapted(MODEL._replace(nodes=nodes, layers=layers), adaptation(shift=(0.4, 0.0))).nodes
-    i = int(np.flatnonzero(np.isclose(changed.x, 6.5))[0])
+    i = int(np.flatnonzero(np.isclose(changed["x"], 6.5))[0])
     height = unlike.get("height", (HEIGHT,) * 3)
     expected = 3.0 * (0.4 * MU[0] * WIDTH[0] / height[0] + 0.6 * MU[1] * WIDTH[1] / height[1])
-    assert 1.5 * changed.alpha[i] * changed.force[i] / changed.height[i] == pytest.approx(expected, rel=1e-9)
+    assert changed["stiffness"][i] == pytest.approx(expected, rel=1e-9)

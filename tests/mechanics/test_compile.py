@@ -79,7 +79,7 @@ def test_an_edit_of_the_shared_sources_asks_for_all_kernels_anew(package, tmp_pa
         (shared / source.name).write_bytes(source.read_bytes())
     monkeypatch.setattr(compiling, "HERE", shared)
     assert compiling.compiled(package.home)  # the same sources elsewhere
-    with (shared / "ogden.py").open("a") as file:
+    with (shared / "law.py").open("a") as file:
         file.write("# another law\n")
     assert not compiling.compiled(package.home)
 

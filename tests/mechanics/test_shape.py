@@ -12,6 +12,13 @@ def cubic(x):
     return 2e-5 * x**3 - 1e-3 * x**2 + 0.05 * x, 6e-5 * x**2 - 2e-3 * x + 0.05
 
 
+def sampled(x, y, slope, n):
+    """x, y + iz and its slope (n,) at equal arc lengths."""
+    poses = np.full((n, 5), np.nan)
+    equal_arc_nodes(x, y, slope, poses)
+    return poses[:, 0], poses[:, 1] + 1j * poses[:, 2], poses[:, 3] + 1j * poses[:, 4]
+
+
 def arc(end):
     """∫(1 + ½y'²) dx from 0."""
     return quad(lambda x: 1 + cubic(x)[1] ** 2 / 2, 0, end, epsabs=1e-12)[0]
@@ -22,9 +29,32 @@ def arc(end):
 def test_nodes_lie_on_the_curve_at_equal_arc_lengths(n, knots):
     """Also with spans of no length and of a millionth."""
     x = np.array(knots)
-    nodes = equal_arc_nodes(x, *cubic(x), n)
-    np.testing.assert_allclose(nodes[:, 1:], np.stack(cubic(nodes[:, 0]), axis=1), atol=1e-12)
-    np.testing.assert_allclose([arc(end) for end in nodes[:, 0]], np.linspace(0, arc(80.0), n), atol=1e-9)
+    at, *across = sampled(x, *cubic(x), n)
+    np.testing.assert_allclose(across, cubic(at), atol=1e-12)
+    np.testing.assert_allclose([arc(end) for end in at], np.linspace(0, arc(80.0), n), atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, np.pi / 2])
+def test_a_curve_in_a_turned_plane_has_the_same_nodes_turned(angle):
+    """y + iz of a plane at an angle about the axis, and its energy."""
+    x, turn = np.array([0.0, 3.0, 50.0, 80.0]), np.exp(1j * angle)
+    plane, space = (sampled(x, *(by * each for each in cubic(x)), 61) for by in (1.0, turn))
+    np.testing.assert_allclose(space[0], plane[0], atol=1e-12)
+    np.testing.assert_allclose(space[1:], turn * np.array(plane[1:]), atol=1e-12)
+    shear, moment = np.array([0.3, -0.2, 0.1]), np.array([1.5, 0.9, -0.4])
+    flat = beam_energy(x, shear, moment, 400.0)
+    assert beam_energy(x, turn * shear, turn * moment, 400.0) == pytest.approx(flat, rel=1e-12)
+
+
+def test_a_helix_has_the_arc_length_and_energy_of_both_components():
+    """y and z add up in squares: ½∫(y'² + z'²) dx, ½∫(M_y² + M_z²)/EI dx."""
+    x = np.linspace(0.0, 80.0, 321)
+    y, turn = 2.0 * np.exp(0.05j * x), 0.1j * np.exp(0.05j * x)
+    at, _, slope = sampled(x, y, turn, 41)
+    np.testing.assert_allclose(at, np.linspace(0.0, 80.0, 41), atol=1e-6)
+    np.testing.assert_allclose(np.abs(slope), 0.1, atol=1e-6)
+    moment = np.full(320, 3.0 + 4.0j)
+    assert beam_energy(x, 0.0 * moment, moment, 400.0) == pytest.approx(25.0 * 80.0 / 800.0, rel=1e-12)
 
 
 def test_beam_energy_is_half_the_moment_squared_over_stiffness():

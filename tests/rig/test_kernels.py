@@ -11,19 +11,19 @@ from flexneedle.rig import kernels, phantom
 EVERYTHING = """
 import flexneedle
 from flexneedle.control.methods import METHODS
-from flexneedle.mechanics import insertion
+from flexneedle.mechanics import insertion, shape
 from flexneedle.rig.phantom import rod
 from flexneedle.rig.phantom.plants import PLANTS
 from flexneedle.rig.kernels import all_compiled, compile_kernels
 
 def signatures():
-    found = {name: value for part in (insertion, rod) for name, value in vars(part).items()}
+    found = {name: value for part in (insertion, shape, rod) for name, value in vars(part).items()}
     return {name: len(value.signatures) for name, value in found.items() if hasattr(value, "signatures")}
 
 compile_kernels()
 before = signatures()
 assert all_compiled()
-assert all(before[name] == 1 for name in ("settle", "advance", "replay", "rollout", "step")), before
+assert all(before[name] == 1 for name in ("settle", "rollout", "energies", "equal_arc_nodes", "step")), before
 quick = {"samples": 16, "iterations": 2}
 scenario = flexneedle.load_scenario("phantom").with_values({
     **{f"plan.{key}": value for key, value in quick.items()},

@@ -82,7 +82,7 @@ def test_parts_are_found_by_name_module_and_object():
     ("option", "given", "message"),
     [
         ("controller", "lab_parts", "must be one of adaptive-mpc, "),
-        ("controller", "lab_parts:", "must be module:NAME, such as mycontroller:METHOD"),
+        ("controller", "lab_parts:", "must be module:NAME, such as mymodule:MINE"),
         ("controller", ":FINE", "must be module:NAME"),
         ("controller", "lab-parts:FINE", "must be module:NAME"),
         ("controller", "lab_there:FINE", "no module lab_there in "),

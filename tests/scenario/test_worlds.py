@@ -21,6 +21,8 @@ many_worlds = hypothesis_settings(deadline=None, derandomize=True, max_examples=
 
 def digest(number):
     values = world(number).values()
+    for layer in values["tissue"]:
+        assert layer.pop("law") == "ogden"  # a key that is not drawn, and younger than the published numbers
     text = json.dumps({name: values[name] for name in (*DRAWN, "contact")}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -8,14 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
-from flexneedle import Control, Simulator, load_scenario
+from flexneedle import Control, load_scenario
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.model import Adaptation
 from reference.cases import repeat
+from reference.tight import tight
 
 PHANTOM = load_scenario("phantom")
 GUIDE_X = PHANTOM.setup.guide_x
-EXACT = Simulator(PHANTOM, threads=1)
+EXACT = tight(PHANTOM)
 TOLERANCE = 1e-9  # mm
 
 
@@ -26,7 +27,12 @@ def loose(clearance, **others):
 
 def off_centre(state):
     """Lateral position (mm) of the needle in the guide, from the guide's middle."""
-    return float(state.mesh[1][state.mesh[0] == GUIDE_X][0]) - state.guide
+    return float(state.mesh["y"][state.mesh["x"] == GUIDE_X][0]) - state.guide
+
+
+def wall(state):
+    """The wall on which the needle bears: −1 or +1, 0 for none."""
+    return state.needle.solution.last.guide.wall
 
 
 def loaded(clearance, depth, guide, base_y=0.0, base_turn=0.0):
@@ -140,19 +146,24 @@ def test_a_small_clearance_is_nearly_none():
 def test_without_clearance_nothing_of_it_is_left():
     """Bit for bit, whatever wall the needle was on before."""
     bears = loaded(0.1, 10, 1.0)[-1]
-    assert bears.scalars[nd.GUIDE_SIDE] == -1.0
-    scalars = bears.scalars.copy()
-    scalars[nd.GUIDE_SIDE] = 0.0
+    assert wall(bears) == -1.0
+    solution = bears.needle.solution
+    last = solution.last._replace(guide=EXACT.start().needle.solution.last.guide)  # none
+    never = bears.needle._replace(solution=solution._replace(last=last))
+    assert wall(replace(bears, needle=never)) == 0.0
     command = Control(db_x=1.0, dg_y=-0.2)
-    here, there = (EXACT.step(state, command) for state in (bears, replace(bears, scalars=scalars)))
+    here, there = (EXACT.step(state, command) for state in (bears, replace(bears, needle=never)))
     for name in ("rest", "compression", "mesh"):
         np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
-    np.testing.assert_array_equal(here.scalars[: nd.GUIDE_SIDE], there.scalars[: nd.GUIDE_SIDE])
+    for name in ("boundary", "cut", "channel"):
+        assert getattr(here.needle, name) == getattr(there.needle, name)
+    for name in ("tip", "loads", "iterations", "residual"):
+        assert getattr(here.needle.solution, name) == getattr(there.needle.solution, name)
     assert off_centre(here) == 0.0
 
 
 def test_a_needle_without_a_guide_has_no_clearance():
-    bare = Simulator(PHANTOM.with_values({"setup.guide_to_skin_mm": None}), threads=1)
+    bare = tight(PHANTOM.with_values({"setup.guide_to_skin_mm": None}))
     wide = bare.adapted(Adaptation(np.zeros(1), np.ones(2), clearance=0.1))
     none = bare.adapted(Adaptation(np.zeros(1), np.ones(2)))
     rows = np.tile([1.0, 0.0, 0.0, 0.0, -1.0], (60, 1))
@@ -162,12 +173,12 @@ def test_a_needle_without_a_guide_has_no_clearance():
 @pytest.mark.parametrize("base_y", [0.0, 0.4])
 def test_a_needle_that_touches_no_wall_bends_as_without_a_guide(base_y):
     """Its lateral position in the guide is on the cubic between the neighbouring nodes of a needle without a guide."""
-    bare = Simulator(PHANTOM.with_values({"setup.guide_to_skin_mm": None}), threads=1)
+    bare = tight(PHANTOM.with_values({"setup.guide_to_skin_mm": None}))
     free = loaded(5.0, 25, 0.0, base_y)[-1]
     other = bare.step(bare.start().with_estimate(base_y=base_y), Control())
     other = repeat(bare, other, Control(db_x=1.0), int(25 - PHANTOM.setup.start_tip_x))[-1]
     np.testing.assert_allclose(free.tip, other.tip, atol=1e-9)
-    x, y, slope = other.mesh[:3]
+    x, y, slope = (other.mesh[name] for name in ("x", "y", "slope"))
     shape = CubicHermiteSpline(
         np.append(other.base[0], x), np.append(other.base[1], y), np.append(other.base[2], slope)
     )
@@ -190,7 +201,7 @@ def test_rollouts_converge_and_equal_steps():
         state = simulator.start()
         for row, tip in zip(controls[sample], rolled.tips[sample], strict=True):
             state = simulator.step(state, Control.from_row(row))
-            walls.add(float(state.scalars[nd.GUIDE_SIDE]))
+            walls.add(np.sign(wall(state)))
             np.testing.assert_array_equal(state.tip, tip)
             assert state.iterations <= nd.COUPLED_ITERATIONS
     assert walls == {-1.0, 0.0, 1.0}

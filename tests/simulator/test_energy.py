@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from flexneedle import Control, Simulator, load_scenario
-from flexneedle.mechanics import needle as nd
 from reference.cases import insert_to, repeat
+from reference.tight import tight
 
 PHANTOM = load_scenario("phantom").with_values({"setup.max_base_turn_step_mrad": 50.0})
-SIMULATOR = Simulator(PHANTOM)
-X, FORCE, ENERGY = 0, 5, 6  # rows of `State.mesh`
+SIMULATOR = tight(PHANTOM)
 MOVES = {  # base y, base turn, guide y, held tip y: mm and rad in all
     "base": (2.0, 0.0, 0.0, 0.0),
     "turn": (0.0, 0.02, 0.0, 0.0),
@@ -41,12 +40,12 @@ def lateral_forces(state):
 
 def axial_force(state):
     """∂(energy)/∂x_t at a needle whose base and guide stay: growing points, growing spring, a push on a slope."""
-    x, energy, s = state.mesh[X], state.mesh[ENERGY], state.scalars
+    x, energy, front = state.mesh["x"], state.mesh["energy"], state.needle.channel.front
     behind = state.tip[0] - x
     growing = (x > 0.0) & (behind < PHANTOM.contact.spacing_mm / 2)
-    length = state.tip[0] - max(0.0, s[nd.FRONT] - PHANTOM.needle.bevel.length_mm)
-    spring = s[nd.SPRING_ENERGY] / length if length > 0.0 else 0.0
-    return (energy[growing] / behind[growing]).sum() + spring - s[nd.TIP_FORCE] * state.tip[2]
+    length = state.tip[0] - max(0.0, front - PHANTOM.needle.bevel.length_mm)
+    spring = state.spring_energy / length if length > 0.0 else 0.0
+    return (energy[growing] / behind[growing]).sum() + spring - state.needle.solution.loads.tip * state.tip[2]
 
 
 def base_axial_force(state):
@@ -70,7 +69,7 @@ def travel(state, move, advance=0.0, steps=60):
         slide = after.tip[0] - state.tip[0]
         axial += (axial_force(state) + axial_force(after)) * slide / 2
         axial += (base_axial_force(state) + base_axial_force(after)) * advance / steps / 2
-        if not after.tip[0] < after.scalars[nd.FRONT]:
+        if not after.tip[0] < after.needle.channel.front:
             raise ValueError("this move cuts")
         state = after
     return lateral, axial, state.energy - energy
@@ -133,7 +132,7 @@ def test_energy_gradient_is_the_reaction(name):
 def test_forces_and_moments_on_the_needle_balance():
     """Clamp, guide, contacts, tip: the forces add up to nothing where the tip spring is out."""
     state = repeat(SIMULATOR, withdrawn(3.55), Control(db_y=0.2, dg_y=-0.3), 5)[-1]
-    contacts = state.mesh[FORCE][state.mesh[X] > 0.0]
+    contacts = state.mesh["force"][state.mesh["x"] > 0.0]
     reactions, x = state.reactions, state.contacts.x[state.contacts.active]
     total = reactions.base_force + reactions.guide_force + contacts.sum()
     base_x = state.base[0]

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexneedle import Control, Simulator, load_scenario
+from flexneedle import Control, load_scenario
 from reference.comparison import gaps, worst_gaps
 from reference.draws import draw_controls, draw_scenario
 from reference.insertion import Reference, Tissue, ogden
+from reference.tight import tight
 
 PHANTOM = load_scenario("phantom")
 TOLERANCE = 1e-6  # mm, mJ, N
@@ -38,7 +39,7 @@ class Pair:
     """The simulator and the reference side by side."""
 
     def __init__(self, scenario=PHANTOM):
-        self.simulator, self.reference = Simulator(scenario), Reference(scenario)
+        self.simulator, self.reference = tight(scenario), Reference(scenario)
         self.state, self.pose = self.simulator.start(), self.reference.start()
 
     def step(self, times=1, **control):

@@ -29,12 +29,12 @@ def run(study, capsys, *arguments):
 
 
 def test_random_sequences_run_without_failure(study, capsys):
-    """400 sequences in 20 random tissues; steps at the tolerance of the solver."""
+    """400 sequences in 20 random tissues; steps at the tolerance of the solver, 20 nm of slide."""
     status, summary, progress = run(study, capsys, "--sequences", 400, "--seed", 20)
     assert status == 0
     assert summary["passed"]
     assert summary["steps"] == 400 * study.STEPS
-    assert summary["worst_residual_mm"] <= 1e-6
+    assert summary["worst_residual_mm"] <= 2e-5
     assert "batch 20/20" in progress
 
 

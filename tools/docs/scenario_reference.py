@@ -80,7 +80,8 @@ def _tables(name: str, key: str, node: dict[str, Any], known: dict[str, Any]) ->
 
 def _table_of(value: dict[str, Any], known: dict[str, Any]) -> dict[str, Any] | None:
     """The schema of the table that a key holds (a list of tables too), None if it holds a value."""
-    choices = [value, value.get("items", {}), *value.get("anyOf", [])]
+    items = value.get("items", {})
+    choices = [value, items, *items.get("anyOf", []), *value.get("anyOf", [])]
     names = [choice["$ref"].rsplit("/", 1)[1] for choice in choices if "$ref" in choice]
     return known[names[0]] if names else None
 

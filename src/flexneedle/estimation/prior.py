@@ -13,7 +13,6 @@ from flexneedle.errors import ScenarioError
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive, Section
-from flexneedle.scenario.sections.tissue import MOST_BEVEL
 from flexneedle.types import Floats
 
 BASE_Y, BASE_TURN, BEND, RUN_OUT, BEVEL, CLEARANCE, MODULUS = range(7)
@@ -137,6 +136,5 @@ def check_cells(scenario: Scenario, settings: Priors) -> None:
 
 def _largest_bevel(scenario: Scenario) -> float:
     """Largest factor on the bevel offset with which the law stays above its floor stretch."""
-    shortest = min(layer.compression_length_mm for layer in scenario.tissue)
-    offset = scenario.needle.bevel.offset_mm
-    return MOST_BEVEL * shortest / offset if offset > 0.0 else 1.0
+    most, offset = min(layer.most_bevel_mm for layer in scenario.tissue), scenario.needle.bevel.offset_mm
+    return most / offset if offset > 0.0 else 1.0

@@ -11,7 +11,7 @@ from flexneedle.figures.curves import Roll
 from flexneedle.figures.layout import UPRIGHT
 from flexneedle.figures.style import GUIDE, NEEDLE, QUIET, TARGET
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.sections.tissue import Layer
+from flexneedle.scenario.tissue.layer import Layer
 from flexneedle.types import Floats, Plan
 
 _TISSUES = ("#fbeee3", "#f3dcc8", "#e9c9ad", "#deb592")  # soft to stiff

@@ -1,63 +1,117 @@
 """Steps of an insertion: move, solve, cut (docs/theory.md section 6), alone and in batches."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.compile import inner, kernel
+from flexneedle.mechanics.lateral import Lateral, dot, lateral, size, square, times, turned
+from flexneedle.mechanics.law import stored_energy
 from flexneedle.mechanics.model import CONTACT, GUIDE, Floats, Model
+from flexneedle.mechanics.needle import (
+    Boundary,
+    Channel,
+    Cut,
+    Laterals,
+    Needle,
+    Pose,
+    Solution,
+    Work,
+    solve,
+    spring_energy,
+    spring_rest,
+)
+from flexneedle.mechanics.shape import put, sample
 
 Bools = NDArray[np.bool_]
+DB_X, DB_Y, DB_Z, DB_THETA, DB_PSI, DG_Y, DG_Z, ROLL, SPIN = range(9)
+"""Columns of a command: motion of the base along x, y, z (mm) and of its slopes dy/dx, dz/dx (rad), of the guide along
+y, z (mm); roll of the needle before the move and, evenly, during it (rad)."""
+COMMAND_SIZE = 9
+POSE_SIZE = 5
+"""Columns of a pose: x, y, z (mm), slopes θ = dy/dx and ψ = dz/dx (rad)."""
+
+
+class Outputs(NamedTuple):
+    """Arrays that a rollout of N sequences of m steps fills; what is not wanted has size 0.
+
+    tips: poses (N, m, 5); energy: strain energy of the tissue (N, m), mJ; converged (N, m); deflection: mean square of
+    the needle's (N, m), mm²; shapes: poses at n nodes (N, m, n, 5).
+    """
+
+    tips: Floats
+    energy: Floats
+    converged: Bools
+    deflection: Floats
+    shapes: Floats
+
+
 _SAME_PLACE = 1e-3  # of a part: a tip this near the end of a part is there
 
 
-@inner
-def _move(model: Model, s: Floats, rest: Floats, command: Floats) -> None:
-    """Begin a step: remember where the tip is, apply (db_x, db_y, db_theta, dg_y, flip)."""
-    s[nd.CUT_X], s[nd.CUT_Y], s[nd.CUT_TURN] = s[nd.TIP_X], s[nd.TIP_Y], s[nd.TIP_TURN]
-    s[nd.CUT_FRONT], s[nd.CUT_REST] = s[nd.FRONT], s[nd.REST]
-    s[nd.BASE_X] += command[0]
-    s[nd.BASE_Y] += command[1]
-    s[nd.BASE_TURN] += command[2]
-    s[nd.GUIDE_Y] += command[3]
-    if command[4] > 0.0:
-        s[nd.BEVEL] = -s[nd.BEVEL]
-    if rest.size > 0 and model.nodes.kind[0] == GUIDE:
-        rest[0] = s[nd.GUIDE_Y]
+def outputs(n: int, m: int, *, deflection: bool = False, nodes: int = 0) -> Outputs:
+    """Arrays for a rollout, with shapes of this number of nodes."""
+    return Outputs(
+        np.zeros((n, m, POSE_SIZE)),
+        np.zeros((n, m)),
+        np.zeros((n, m), dtype=np.bool_),
+        np.zeros((n, m) if deflection else (0, 0)),
+        np.zeros((n, m, nodes, POSE_SIZE) if nodes else (0, 0, 0, 0)),
+    )
 
 
 @inner
-def _end_cut(model: Model, s: Floats, rest: Floats, w: Floats, count: int, fresh: int) -> None:
-    """Leave the channel and the tip spring as the step cut them; out of the skin the channel is closed."""
-    for i in range(fresh, count):
-        if model.nodes.kind[i] == CONTACT:
-            rest[i] = w[nd.FIXED, i] + w[nd.SHARE, i] * s[nd.TIP_Y]
-    fixed, slope = nd.spring_rest(model, s, s[nd.TIP_X])
-    s[nd.REST] = fixed + (1.0 - slope) * s[nd.TIP_Y]
-    s[nd.FRONT] = max(s[nd.CUT_FRONT], s[nd.TIP_X]) if s[nd.TIP_X] > 0.0 else 0.0
+def _moved(boundary: Boundary, command: Floats, share: float, roll: float) -> Boundary:
+    """The boundary after a share of a command; `roll` (rad) with its spin."""
+    base, like = boundary.base, boundary.guide
+    bevel = boundary.bevel if roll == 0.0 else turned(roll, boundary.bevel)
+    return Boundary(
+        Pose(
+            base.x + share * command[DB_X],
+            base.y + times(share, lateral(like, command[DB_Y], command[DB_Z])),
+            base.slope + times(share, lateral(like, command[DB_THETA], command[DB_PSI])),
+        ),
+        boundary.guide + times(share, lateral(like, command[DG_Y], command[DG_Z])),
+        bevel,
+        boundary.load,
+    )
+
+
+@inner
+def settled(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work, held: Lateral) -> Needle:
+    """Solve where base and guide are and lay the cut; a `held` tip y (mm) is essential, NaN leaves it free.
+
+    Arrays in place, as in `needle.solve`. Out of the skin the channel is closed.
+    """
+    boundary, cut = needle.boundary, needle.cut
+    if rest.size > 0 and model.nodes[0].kind == GUIDE:
+        rest[0] = boundary.guide
+    solution, path, fresh = solve(model, boundary, cut, needle.solution.last, rest, u, w, held)
+    x, y = solution.tip.x, solution.tip.y
+    for i in range(fresh, solution.last.behind):
+        if model.nodes[i].kind == CONTACT:
+            rest[i] = w[i].fixed + times(w[i].share, y)
+    fixed, slope = spring_rest(model, boundary.bevel, cut, path, x)
+    front = max(cut.channel.front, x) if x > 0.0 else 0.0
+    return Needle(boundary, cut, Channel(front, fixed + times(1.0 - slope, y)), solution)
 
 
 @kernel
-def settle(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, held: float) -> int:
-    """Solve where base and guide are and lay the cut; a `held` tip y (mm) is essential, NaN leaves it free.
-
-    Work arrays in place, as in `needle.solve`; returns the number of nodes behind the tip.
-    """
-    count, fresh = nd.solve(model, s, rest, u, w, held)
-    _end_cut(model, s, rest, w, count, fresh)
-    return count
+def settle(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work, held: Lateral) -> Needle:
+    """`settled`, for callers outside of kernels."""
+    return settled(model, needle, rest, u, w, held)
 
 
 @inner
-def _end_of_part(model: Model, s: Floats, advance: float, done: float) -> float:
+def _end_of_part(model: Model, needle: Needle, advance: float, done: float) -> float:
     """Share of a step at which its next part ends, `done` being the share so far.
 
     Down to the zone below the skin parts end where the tip is expected at a multiple of the part's length: the state
     stays a continuous function of the command.
     """
-    x = s[nd.TIP_X]
+    x = needle.solution.tip.x
     if advance <= 0.0 or x >= model.zone or x + (1.0 - done) * advance <= 0.0:
         return 1.0
     goal = max(0.0, model.part * (math.floor(x / model.part + _SAME_PLACE) + 1.0))
@@ -65,97 +119,125 @@ def _end_of_part(model: Model, s: Floats, advance: float, done: float) -> float:
     return end if end < 1.0 else 1.0
 
 
-@kernel
-def advance(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, command: Floats) -> int:
-    """One step (X, C)_{k+1} = f((X, C)_k, U_k) (paper eq. 1); arrays and result as in `settle`."""
-    end = _end_of_part(model, s, command[0], 0.0)
-    if end == 1.0:
-        _move(model, s, rest, command)
-        return settle(model, s, rest, u, w, math.nan)
-    part = command.copy()
-    done, count, converged, residual = 0.0, 0, 1.0, 0.0
+@inner
+def _advanced(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work, command: Floats) -> Needle:
+    """The needle after one step, in its parts."""
+    done, residual, converged, roll = 0.0, 0.0, True, command[ROLL]
     while done < 1.0:
-        part[:4] = (end - done) * command[:4]
-        _move(model, s, rest, part)
-        count = settle(model, s, rest, u, w, math.nan)
-        converged, residual = min(converged, s[nd.CONVERGED]), max(residual, s[nd.RESIDUAL])
-        part[4] = -1.0
-        done = end
-        end = _end_of_part(model, s, command[0], done)
-    s[nd.CONVERGED], s[nd.RESIDUAL] = converged, residual
-    return count
-
-
-@kernel
-def replay(
-    model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, controls: Floats, tips: Floats
-) -> int:
-    """Carry out `controls` (m, 5) one after the other; fills tips (m, 3).
-
-    Other arrays and result as in `settle`.
-    """
-    count = 0
-    for k in range(controls.shape[0]):
-        count = advance(model, s, rest, u, w, controls[k])
-        tips[k, 0], tips[k, 1], tips[k, 2] = s[nd.TIP_X], s[nd.TIP_Y], s[nd.TIP_TURN]
-    return count
+        end = _end_of_part(model, needle, command[DB_X], done)
+        spin = (end - done) * command[SPIN]
+        boundary = _moved(needle.boundary, command, end - done, roll + spin)
+        cut = Cut(needle.solution.tip, needle.channel, spin)
+        needle = settled(
+            model,
+            Needle(boundary, cut, needle.channel, needle.solution),
+            rest,
+            u,
+            w,
+            times(math.nan, boundary.guide),
+        )
+        residual, converged = max(residual, needle.solution.residual), converged and needle.solution.converged
+        roll, done = 0.0, end
+    last = needle.solution
+    solution = Solution(last.tip, last.last, last.loads, last.iterations, residual, converged)
+    return Needle(needle.boundary, needle.cut, needle.channel, solution)
 
 
 @inner
-def _strain_energy(model: Model, w: Floats, count: int) -> float:
-    """Tissue strain energy Σ w_c W (mJ) of the contacts after a solve (paper eq. 12)."""
+def _contact_energy(model: Model, i: int, u: Lateral, tip_x: float) -> float:
+    """Energy (mJ) that contact point i stores, without its weight."""
+    node = model.nodes[i]
+    ramp = min(1.0, (tip_x - node.x) / node.reach)
+    stored = stored_energy(model.laws[node.law], size(u) / node.height)
+    return float(ramp * node.stiffness * node.height * node.height * stored)
+
+
+@inner
+def _strain_energy(model: Model, needle: Needle, u: Laterals) -> float:
+    """Tissue strain energy Σ w_c W (mJ) of the contacts (paper eq. 12)."""
     total = 0.0
-    for i in range(count):
-        if model.nodes.kind[i] == CONTACT:
-            total += model.nodes.weight[i] * w[nd.ENERGY, i]
+    for i in range(needle.solution.last.behind):
+        if model.nodes[i].kind == CONTACT:
+            total += model.nodes[i].weight * _contact_energy(model, i, u[i], needle.solution.tip.x)
     return total
 
 
+@kernel
+def energies(model: Model, needle: Needle, u: Laterals, stored: Floats) -> float:
+    """Fill the energy (mJ) of each node behind the tip, (behind,), without its weight; return the tip spring's."""
+    tip_x = needle.solution.tip.x
+    for i in range(stored.size):
+        stored[i] = _contact_energy(model, i, u[i], tip_x) if model.nodes[i].kind == CONTACT else 0.0
+    return spring_energy(model, needle.cut.channel.front, tip_x, needle.solution.last.spring)
+
+
 @inner
-def _mean_square_deflection(model: Model, s: Floats, w: Floats, count: int) -> float:
+def _mean_square_deflection(model: Model, needle: Needle, w: Work) -> float:
     """∫y² dx over the length of the needle (mm²), exact for cubics (the consistent mass matrix of a beam)."""
-    x, y, turn = s[nd.TIP_X], s[nd.TIP_Y], s[nd.TIP_TURN]
+    (x, y, turn), base = needle.solution.tip, needle.boundary.base
     total = 0.0
-    for i in range(count - 1, -2, -1):
-        x0, y0, turn0 = s[nd.BASE_X], s[nd.BASE_Y], s[nd.BASE_TURN]
+    for i in range(needle.solution.last.behind - 1, -2, -1):
+        x0, y0, turn0 = base.x, base.y, base.slope
         if i >= 0:
-            x0, y0, turn0 = model.nodes.x[i], w[nd.Y, i], w[nd.TURN, i]
+            x0, y0, turn0 = model.nodes[i].x, w[i].y, w[i].slope
         length = x - x0
-        square = (156.0 * (y0 * y0 + y * y) + 108.0 * y0 * y) / 420.0
-        mixed = (44.0 * (y0 * turn0 - y * turn) + 26.0 * (turn0 * y - y0 * turn)) / 420.0
-        turns = (4.0 * (turn0 * turn0 + turn * turn) - 6.0 * turn0 * turn) / 420.0
-        total += length * (square + length * (mixed + length * turns))
+        squares = (156.0 * (square(y0) + square(y)) + 108.0 * dot(y0, y)) / 420.0
+        mixed = (44.0 * (dot(y0, turn0) - dot(y, turn)) + 26.0 * (dot(turn0, y) - dot(y0, turn))) / 420.0
+        turns = (4.0 * (square(turn0) + square(turn)) - 6.0 * dot(turn0, turn)) / 420.0
+        total += length * (squares + length * (mixed + length * turns))
         x, y, turn = x0, y0, turn0
     return total / model.length
+
+
+@inner
+def _shape(
+    model: Model, needle: Needle, w: Work, x: Floats, y: Laterals, slope: Laterals, out: Floats
+) -> None:
+    """Fill poses (n, 5) along the needle, after a solve; x, y, slope (k + 2,) are scratch."""
+    base, tip, count = needle.boundary.base, needle.solution.tip, needle.solution.last.behind
+    x[0], y[0], slope[0] = base.x, base.y, base.slope
+    for i in range(count):
+        x[i + 1], y[i + 1], slope[i + 1] = model.nodes[i].x, w[i].y, w[i].slope
+    x[count + 1], y[count + 1], slope[count + 1] = tip.x, tip.y, tip.slope
+    sample(x, y, slope, count + 2, out)
 
 
 @kernel
 def rollout(
     model: Model,
-    s0: Floats,
-    rest0: Floats,
-    u0: Floats,
-    controls: Floats,
+    start: Needle,
+    rest0: Laterals,
+    u0: Laterals,
+    rest: Laterals,
+    u: Laterals,
+    w: Work,
+    commands: Floats,
     first: int,
     last: int,
-    tips: Floats,
-    energy: Floats,
-    converged: Bools,
-    deflection: Floats,
-) -> None:
-    """Run samples first to last − 1 of `controls` (N, m, 5) from one state.
+    out: Outputs,
+) -> Needle:
+    """Run samples first to last − 1 of `commands` (N, m, 9) from one state (paper eq. 1).
 
-    Fills tips (N, m, 3), energy (N, m), converged (N, m), and deflection (N, m) unless its size is 0.
+    Fills `out`. Returns the needle after the last sample, of which `rest`, `u` and `w` are left, arrays as in
+    `needle.solve`.
     """
-    n = rest0.size
-    w = np.zeros((nd.WORK_ROWS, n))
-    s, rest, u = np.empty(nd.STATE_SIZE), np.empty(n), np.empty(n)
+    needle = start
+    x, y, slope = (
+        np.empty(rest0.size + 2),
+        np.empty(rest0.size + 2, rest0.dtype),
+        np.empty(rest0.size + 2, rest0.dtype),
+    )
     for j in range(first, last):
-        s[:], rest[:], u[:] = s0, rest0, u0
-        for k in range(controls.shape[1]):
-            count = advance(model, s, rest, u, w, controls[j, k])
-            tips[j, k, 0], tips[j, k, 1], tips[j, k, 2] = s[nd.TIP_X], s[nd.TIP_Y], s[nd.TIP_TURN]
-            energy[j, k] = _strain_energy(model, w, count)
-            converged[j, k] = s[nd.CONVERGED] > 0.0
-            if deflection.size > 0:
-                deflection[j, k] = _mean_square_deflection(model, s, w, count)
+        needle = start
+        rest[:], u[:] = rest0, u0
+        for k in range(commands.shape[1]):
+            needle = _advanced(model, needle, rest, u, w, commands[j, k])
+            tip = needle.solution.tip
+            put(out.tips[j, k], tip.x, tip.y, tip.slope)
+            out.energy[j, k] = _strain_energy(model, needle, u)
+            out.converged[j, k] = needle.solution.converged
+            if out.deflection.size > 0:
+                out.deflection[j, k] = _mean_square_deflection(model, needle, w)
+            if out.shapes.size > 0:
+                _shape(model, needle, w, x, y, slope, out.shapes[j, k])
+    return needle

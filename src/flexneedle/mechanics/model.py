@@ -5,55 +5,49 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.mechanics.ogden import law_scales
-
 Floats = NDArray[np.float64]
 
-CONTACT, ESSENTIAL, GUIDE = (
-    0,
-    1,
-    2,
-)  # kinds of node: a tissue spring, a prescribed lateral position, the guide's
+CONTACT, ESSENTIAL, GUIDE = range(3)
+"""Kinds of node: a tissue spring, a prescribed lateral position, the guide's."""
 # Edges of the intervals of the contact points just below the skin, in spacings. There the free needle is held by little
 # but its tip: with even intervals and steps a thin one ends up to 0.3 mm off, with these 0.04 mm (decision 0014).
 _SKIN_EDGES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5)
 SKIN_ZONE = 3.0  # spacings from the skin in which a step is carried out in parts,
 SKIN_PART = 0.25  # of this length, in spacings
 
+Nodes = NDArray[Any]
+"""What can load the needle, by increasing x: the guide, then the contact points; an array (n,) of `NODE`."""
+NODE = np.dtype(
+    [
+        ("x", np.float64),  # position (mm)
+        ("reach", np.float64),  # length over which a contact grows in behind the tip (mm)
+        ("height", np.float64),  # compression length (mm)
+        ("stiffness", np.float64),  # initial stiffness (N/mm)
+        ("weight", np.float64),  # layer weight w_c
+        ("law", np.int64),  # index of its table
+        ("kind", np.int64),  # CONTACT, ESSENTIAL or GUIDE
+    ]
+)
 
-class Nodes(NamedTuple):
-    """What can load the needle, by increasing x: the guide, then the contact points (each array (n,)).
-
-    x: position (mm); kind: CONTACT, ESSENTIAL or GUIDE; reach: length over which a contact grows in behind
-    the tip (mm); alpha, height, force, energy: its law (`ogden`); weight: layer weight w_c.
-    """
-
-    x: Floats
-    kind: NDArray[np.int8]
-    reach: Floats
-    alpha: Floats
-    height: Floats
-    force: Floats
-    energy: Floats
-    weight: Floats
-
-
-class Layers(NamedTuple):
-    """Tissue layers for the tip spring: depth of each layer's end (mm), its law for 1 mm of needle length."""
-
-    end: Floats
-    alpha: Floats
-    height: Floats
-    force: Floats
-    energy: Floats
+Layers = NDArray[Any]
+"""Tissue layers from the skin down, for the tip spring; an array (l,) of `LAYER`."""
+LAYER = np.dtype(
+    [
+        ("end", np.float64),  # depth (mm)
+        ("height", np.float64),  # compression length (mm)
+        ("stiffness", np.float64),  # initial stiffness of 1 mm of needle (N/mm)
+        ("law", np.int64),  # index of its table
+    ]
+)
 
 
 class Model(NamedTuple):
     """A needle in layered tissue: bending stiffness (N·mm²), length (mm), bevel offset and length (mm).
 
-    curvature: of the free needle (1/mm), for bevel +1; it turns with the bevel. part, zone: length (mm) of the parts
-    of a step down to the depth `zone` (mm); clearance: of the needle in the guide, to either side (mm);
-    tolerance: estimated distance from equilibrium at which a solve ends (mm).
+    laws: tables of `law`; curvature: of the free needle (1/mm) towards the bevel's direction, with which it turns;
+    part, zone: length (mm) of the parts of a step down to the depth `zone` (mm); clearance: of the needle in the guide,
+    to either side (mm); tolerance: estimated distance from equilibrium at which a solve ends (mm); slide: distance (mm)
+    of the tip from the place for which it was solved, up to which it is moved there along its own line.
     """
 
     bending_stiffness: float
@@ -62,20 +56,32 @@ class Model(NamedTuple):
     bevel_length: float
     nodes: Nodes
     layers: Layers
+    laws: Floats
     part: float
     zone: float
     curvature: float = 0.0
     clearance: float = 0.0
     tolerance: float = 1e-7
+    slide: float = 2e-5
+
+
+def records(dtype: np.dtype[Any], /, **columns: Any) -> NDArray[Any]:
+    """An array of records (k,) from its columns."""
+    array = np.zeros(np.broadcast_shapes(*(np.shape(column) for column in columns.values())), dtype)
+    for name, column in columns.items():
+        array[name] = column
+    return array
 
 
 def tissue_layers(
-    thickness: Floats, shear_modulus: Floats, alpha: Floats, height: Floats, width: Floats
+    thickness: Floats, modulus: Floats, height: Floats, width: Floats, law: NDArray[Any]
 ) -> Layers:
-    """Layers from arrays (k,) in mm and MPa; the last one has no end, so its thickness is ignored."""
+    """Layers from arrays (k,) in mm and MPa; the last one has no end, so its thickness is ignored.
+
+    modulus: initial modulus of compression; law: index of each layer's table.
+    """
     end = np.append(np.cumsum(thickness[:-1]), np.inf)
-    force, energy = law_scales(shear_modulus, alpha, height, width * height)
-    return Layers(end, alpha, height, force, energy)
+    return records(LAYER, end=end, height=height, stiffness=modulus * width / height, law=law)
 
 
 def contact_nodes(
@@ -90,29 +96,28 @@ def contact_nodes(
         np.concatenate([_SKIN_EDGES, np.arange(SKIN_ZONE, max(np.ceil(depth / spacing), SKIN_ZONE) + 1.5)])
         * spacing
     )
-    ends = layers.end[layers.end < grid[-1]]
+    ends = layers["end"][layers["end"] < grid[-1]]
     edges = np.union1d(grid, ends[np.abs(ends[:, None] - grid).min(axis=1, initial=np.inf) > 1e-6 * spacing])
     x, length = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
-    layer = np.searchsorted(layers.end, x, side="right")
-    contacts = Nodes(
-        x,
-        np.full(x.size, CONTACT, dtype=np.int8),
-        0.5 * length,
-        layers.alpha[layer],
-        layers.height[layer],
-        layers.force[layer] * length,
-        layers.energy[layer] * length,
-        weight[layer],
+    at = layers["end"].searchsorted(x, side="right")
+    layer = layers[at]
+    contacts = records(
+        NODE,
+        x=x,
+        reach=0.5 * length,
+        height=layer["height"],
+        stiffness=layer["stiffness"] * length,
+        weight=weight[at],
+        law=layer["law"],
+        kind=CONTACT,
     )
     return contacts if guide_x is None else insert_essential(contacts, np.array([guide_x]), GUIDE)
 
 
 def insert_essential(nodes: Nodes, x: Floats, kind: int = ESSENTIAL) -> Nodes:
     """`nodes` with essential nodes of a kind added at `x` (mm), in order of x."""
-    place = np.searchsorted(nodes.x, x)
-    values: tuple[Any, ...] = (x, kind, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
-    arrays: tuple[Any, ...] = nodes
-    return Nodes(*(np.insert(array, place, value) for array, value in zip(arrays, values, strict=True)))
+    added = records(NODE, x=x, reach=1.0, height=1.0, kind=kind)
+    return np.insert(nodes, nodes["x"].searchsorted(x), added)
 
 
 class Adaptation(NamedTuple):
@@ -121,7 +126,8 @@ class Adaptation(NamedTuple):
     shift (k − 1,): of the ends of all layers but the last (mm); stiffness (k,): factor on the modulus of each layer;
     cell: length (mm) of cells along the depth from the skin; variation (c,): further factor on the modulus in each,
     the last one has no end; bevel: factor on the bevel offset; bend: distance (mm) of the free needle's tip from the
-    straight, for bevel +1, with which it turns; clearance: of the needle in the guide, to either side (mm).
+    straight, towards the bevel's direction, with which it turns; clearance: of the needle in the guide, to either side
+    (mm).
     """
 
     shift: Floats
@@ -139,27 +145,22 @@ def adapted(model: Model, adaptation: Adaptation) -> Model:
     A contact is as stiff as the tissue along its interval; its law is that of the layer at its middle.
     """
     old, nodes = model.layers, model.nodes
-    ends = np.maximum.accumulate(np.maximum(0.0, old.end[:-1] + adaptation.shift))
+    ends = np.maximum.accumulate(np.maximum(0.0, old["end"][:-1] + adaptation.shift))
     cells = adaptation.cell * np.arange(1, adaptation.variation.size)
     bottoms = np.sort(np.concatenate([ends, cells]))
     tops = np.append(-np.inf, bottoms)
-    layer = ends.searchsorted(tops, side="right")
-    factor = adaptation.stiffness[layer] * adaptation.variation[cells.searchsorted(tops, side="right")]
-    scales = old.force[layer] * factor, old.energy[layer] * factor
-    at = ends.searchsorted(nodes.x, side="right")
-    contact = nodes.kind == CONTACT
-    law = old.alpha / old.height  # a force scale times this is a stiffness, which adds up whatever the laws
-    force = _integral(bottoms, scales[0] * law[layer], nodes) / law[at]
-    energy = force * (old.energy / old.force)[at]
+    layers = old[ends.searchsorted(tops, side="right")]
+    factor = adaptation.stiffness[ends.searchsorted(tops, side="right")]
+    layers["stiffness"] *= factor * adaptation.variation[cells.searchsorted(tops, side="right")]
+    layers["end"] = np.append(bottoms, np.inf)
+    at, contact = old[ends.searchsorted(nodes["x"], side="right")], nodes["kind"] == CONTACT
+    changed = nodes.copy()
+    changed["stiffness"][contact] = _integral(bottoms, layers["stiffness"], nodes)[contact]
+    changed["height"][contact], changed["law"][contact] = at["height"][contact], at["law"][contact]
     return model._replace(
         bevel_offset=model.bevel_offset * adaptation.bevel,
-        nodes=nodes._replace(
-            alpha=np.where(contact, old.alpha[at], nodes.alpha),
-            height=np.where(contact, old.height[at], nodes.height),
-            force=np.where(contact, force, nodes.force),
-            energy=np.where(contact, energy, nodes.energy),
-        ),
-        layers=Layers(np.append(bottoms, np.inf), old.alpha[layer], old.height[layer], scales[0], scales[1]),
+        nodes=changed,
+        layers=layers,
         curvature=2.0 * adaptation.bend / model.length**2,
         clearance=adaptation.clearance,
     )
@@ -175,4 +176,4 @@ def _integral(bottoms: Floats, density: Floats, nodes: Nodes) -> Floats:
         total: Floats = before[inside] + density[inside] * (x - tops[inside])
         return total
 
-    return up_to(nodes.x + nodes.reach) - up_to(nodes.x - nodes.reach)
+    return up_to(nodes["x"] + nodes["reach"]) - up_to(nodes["x"] - nodes["reach"])

@@ -8,73 +8,232 @@ A span adds its own flexibility and a spring is a rank-one update, as in a Kalma
 gives forces and positions. Nothing divides by a length, so nodes may be as close as they like, where the
 usual stiffness matrix loses digits with the third power of the length.
 
+Lateral quantities are real in the plane and complex in space (`lateral`). The beam is equally flexible in all
+directions, and an iteration takes each contact as equally stiff, so B is one real matrix for both axes.
+
 A contact that the running step cuts rests on the path of the tip, whose end is unknown: rest =
 cut_y + share (y_tip − cut_y). So a is carried as a + y_tip g, and y_tip found at the tip.
 """
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexneedle.mechanics.compile import inner
-from flexneedle.mechanics.model import CONTACT, GUIDE, Floats, Model
-from flexneedle.mechanics.ogden import FLOOR_STRETCH, contact_law
+from flexneedle.mechanics.lateral import (
+    Lateral,
+    dot,
+    inexact,
+    lateral,
+    one_stiffness,
+    size,
+    square,
+    steady,
+    stretched,
+    times,
+    turned,
+)
+from flexneedle.mechanics.law import response, stored_energy
+from flexneedle.mechanics.model import CONTACT, GUIDE, Model
 
-# Scalars of a state: pose of base and guide, tip pose and tip spring now,
-# tip pose and tip spring where the last step began to cut.
-BASE_X, BASE_Y, BASE_TURN, GUIDE_Y, BEVEL, SHORTENING, TIP_LOAD, TIP_X, TIP_Y, TIP_TURN = range(10)
-FRONT, REST, SPRING_U, CUT_X, CUT_Y, CUT_TURN, CUT_FRONT, CUT_REST = range(10, 18)
-TIP_FORCE, TIP_REACTION, SPRING_ENERGY, BASE_SHEAR, BASE_MOMENT = range(18, 23)
-COUPLING, PATH_Y, ITERATIONS, RESIDUAL, CONVERGED = range(23, 28)
-CLAMP_Y, CLAMP_TURN, CLAMP_X = range(28, 31)  # the part of base y, turn and x that no command moved
-GUIDE_SIDE = 31  # the wall of a guide with clearance that the needle bears on: 1 upper, −1 lower, 0 none
-STATE_SIZE = 32
-
-# Rows of the work array, one column a node. A1, G1, B11, B12 are those before an essential node, all else after.
-A1, A2, G1, G2, B11, B12, B22, STIFFNESS, FORCE, ENERGY, SHARE, FIXED = range(12)
-NEW_U, Y, TURN, SHEAR, MOMENT = range(12, 17)
-WORK_ROWS = 17
+Laterals = NDArray[Any]
+Work = NDArray[Any]
 
 COUPLED_ITERATIONS = 15
 MAX_ITERATIONS = 100
 
 
+class Pose(NamedTuple):
+    """Position x along the axis and y across it (mm), and slope dy/dx."""
+
+    x: float
+    y: Lateral
+    slope: Lateral
+
+
+class Boundary(NamedTuple):
+    """What is imposed on the needle: pose of the base, the guide (mm), the bevel's direction, a tip load (N).
+
+    The bevel is ±1 in the plane and a unit number in space.
+    """
+
+    base: Pose
+    guide: Lateral
+    bevel: Lateral
+    load: Lateral
+
+
+class Channel(NamedTuple):
+    """The end of the cut: its deepest point `front` and the rest position of the tip spring (mm)."""
+
+    front: float
+    rest: Lateral
+
+
+class Cut(NamedTuple):
+    """Where the running step began to cut: tip, channel, and by how much the bevel turns in the step (rad)."""
+
+    tip: Pose
+    channel: Channel
+    spin: float
+
+
+class Bearing(NamedTuple):
+    """A needle in a guide with clearance: wall, the unit vector to that on which it bears, 0 for none.
+
+    give: displacement of the needle there per force (mm/N); y, force: of the iteration before, from the guide's middle.
+    """
+
+    wall: Lateral
+    give: float
+    y: Lateral
+    force: Lateral
+
+
+class Iterate(NamedTuple):
+    """Where an iteration begins: compression of the tip spring, shortening (mm), and the needle in its guide.
+
+    behind: number of nodes behind the tip.
+    """
+
+    spring: Lateral
+    shortening: float
+    guide: Bearing
+    behind: int
+
+
+class Loads(NamedTuple):
+    """Lateral force on the tip (N), reaction of a held tip, shear and moment (N·mm) of the needle at the base."""
+
+    tip: Lateral
+    reaction: Lateral
+    shear: Lateral
+    moment: Lateral
+
+
+class Solution(NamedTuple):
+    """Equilibrium, and how it was found; residual: estimated distance from it (mm)."""
+
+    tip: Pose
+    last: Iterate
+    loads: Loads
+    iterations: int
+    residual: float
+    converged: bool
+
+
+class Needle(NamedTuple):
+    """State of a needle besides the rest positions and compressions of its contacts; the input of the next step."""
+
+    boundary: Boundary
+    cut: Cut
+    channel: Channel
+    solution: Solution
+
+
+def start(base: Pose, tip: Pose, bevel: Lateral) -> Needle:
+    """The straight needle in air, before a solve."""
+    none = 0.0 * bevel
+    channel = Channel(0.0, none)
+    solution = Solution(
+        tip,
+        Iterate(none, 0.0, Bearing(none, 0.0, none, none), 0),
+        Loads(none, none, none, none),
+        0,
+        0.0,
+        True,
+    )
+    return Needle(Boundary(base, none, bevel, none), Cut(tip, channel, 0.0), channel, solution)
+
+
+class Path(NamedTuple):
+    """End of the path that is being cut: coupled (1) to the unknown y of the tip, or (0) at a given one."""
+
+    coupling: float
+    y: Lateral
+
+
+class Tip(NamedTuple):
+    """Result of an iteration at the tip; `left` and `fraction` as of `_judge`."""
+
+    y: Lateral
+    slope: Lateral
+    force: Lateral
+    spring: Lateral
+    reaction: Lateral
+    left: float
+    fraction: float
+
+
+def work_array(rest: Laterals) -> Work:
+    """The solver's array (n,) for rest positions (n,), by node: left of it (a, g, B), of it, and the solution at it.
+
+    a1, g1, b11, b12 are those before an essential node, all else after.
+    """
+    real, across = np.dtype(np.float64), rest.dtype
+    reals = [
+        (name, real)
+        for name in ("g1", "g2", "b11", "b12", "b22", "stiffness", "share", "sharpness", "turning")
+    ]
+    laterals = [
+        (name, across) for name in ("a1", "a2", "fixed", "force", "new_u", "y", "slope", "shear", "moment")
+    ]
+    return np.zeros(rest.size, np.dtype([*reals, *laterals]))
+
+
 @inner
-def _prescribed(model: Model, s: Floats, rest: Floats, i: int) -> float:
+def _prescribed(model: Model, wall: Lateral, rest: Lateral, kind: int) -> Lateral:
     """Lateral position (mm) of an essential node; NaN at a guide with clearance that the needle does not touch."""
-    if model.nodes.kind[i] != GUIDE or model.clearance <= 0.0:
-        return float(rest[i])
-    return float(rest[i] + s[GUIDE_SIDE] * model.clearance) if s[GUIDE_SIDE] != 0.0 else math.nan
+    if kind == GUIDE and model.clearance > 0.0:
+        rest = rest + times(model.clearance, wall) if size(wall) > 0.0 else times(math.nan, rest)
+    return rest
 
 
 @inner
-def _contact(model: Model, u: Floats, i: int, behind: float) -> tuple[float, float, float]:
-    """Force (N), stiffness (N/mm) and energy (mJ) of a contact so far (mm) behind the tip, over which it grows in."""
-    nodes = model.nodes
-    force, k, energy = contact_law(nodes.alpha[i], nodes.height[i], nodes.force[i], nodes.energy[i], u[i])
-    if behind < nodes.reach[i]:
-        ramp = behind / nodes.reach[i]
-        force, k, energy = force * ramp, k * ramp, energy * ramp
-    return force, k, energy
+def _contact(model: Model, i: int, u: Lateral, behind: float, radial_weight: float) -> tuple[Any, ...]:
+    """Force (N) of a contact so far (mm) behind the tip, over which it grows in; its stiffness (N/mm) in an iteration,
+    by the weight of `one_stiffness`; its sharpness (1/mm); the part of a change for which the stiffness is not exact.
+    """
+    node = model.nodes[i]
+    law = response(model.laws[node.law], size(u) / node.height)
+    scale = node.stiffness
+    if behind < node.reach:
+        scale *= behind / node.reach
+    k = scale * one_stiffness(u, law.tangent, law.secant, radial_weight)
+    turning = inexact(u, law.tangent, law.secant, radial_weight)
+    return times(-scale * law.secant, u), k, law.sharpness / node.height, turning
 
 
 @inner
 def _sweep_out(
-    model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, tip_x: float, count: int, fresh: int
-) -> tuple[float, ...]:
-    """From the base to the tip: fill `w`, return (a1, a2, g1, g2, b11, b12, b22) just left of the tip spring."""
+    model: Model,
+    boundary: Boundary,
+    cut: Cut,
+    wall: Lateral,
+    path: Path,
+    rest: Laterals,
+    u: Laterals,
+    w: Work,
+    tip_x: float,
+    count: int,
+    fresh: int,
+    radial_weight: float,
+) -> tuple[Any, ...]:
+    """From the base to the tip: fill `w`, return (a1, a2, g1, g2, b11, b12) just left of the tip spring."""
     nodes = model.nodes
     flexibility = 1.0 / model.bending_stiffness
-    x, a1, a2 = s[BASE_X], s[BASE_Y], s[BASE_TURN]
+    x, a1, a2 = boundary.base.x, boundary.base.y, boundary.base.slope
     g1, g2, b11, b12, b22 = 0.0, 0.0, 0.0, 0.0, 0.0
-    bend = s[BEVEL] * model.curvature
-    per_length = 1.0 / (tip_x - s[CUT_X]) if fresh < count else 0.0
-    path_y = (1.0 - s[COUPLING]) * s[PATH_Y]
+    bend = times(model.curvature, boundary.bevel)
+    per_length = 1.0 / (tip_x - cut.tip.x) if fresh < count else 0.0
+    path_y = times(1.0 - path.coupling, path.y)
     for i in range(count + 1):
-        length = (nodes.x[i] if i < count else tip_x) - x
+        length = (nodes[i].x if i < count else tip_x) - x
         x += length
-        a1 += length * (a2 + 0.5 * length * bend)
-        a2 += length * bend
+        a1 += times(length, a2 + times(0.5 * length, bend))
+        a2 += times(length, bend)
         g1 += length * g2
         turn = length * flexibility
         b11 += length * (2.0 * b12 + length * (b22 + turn * (1.0 / 3.0)))
@@ -82,216 +241,270 @@ def _sweep_out(
         b22 += turn
         if i == count:
             break
-        if nodes.kind[i] != CONTACT:
-            w[A1, i], w[G1, i], w[B11, i], w[B12, i] = a1, g1, b11, b12
-            w[FIXED, i] = _prescribed(model, s, rest, i)
-            if not math.isnan(w[FIXED, i]):
+        node, out = nodes[i], w[i]
+        if node.kind != CONTACT:
+            out.a1, out.g1, out.b11, out.b12 = a1, g1, b11, b12
+            fixed = _prescribed(model, wall, rest[i], node.kind)
+            out.fixed = fixed
+            if not math.isnan(fixed.real):
                 gain = b12 / b11
-                a2 += gain * (w[FIXED, i] - a1)
+                a2 += times(gain, fixed - a1)
                 g2 -= gain * g1
                 b22 -= gain * b12
-                a1, g1, b11, b12 = w[FIXED, i], 0.0, 0.0, 0.0
+                a1, g1, b11, b12 = fixed, 0.0, 0.0, 0.0
         else:
-            force, k, energy = _contact(model, u, i, tip_x - x)
+            force, k, out.sharpness, out.turning = _contact(model, i, u[i], tip_x - x, radial_weight)
             share, fixed = 0.0, rest[i]
             if i >= fresh:
-                share = (x - s[CUT_X]) * per_length
-                fixed = s[CUT_Y] + share * (path_y - s[CUT_Y])
-                share *= s[COUPLING]
+                share = (x - cut.tip.x) * per_length
+                fixed = cut.tip.y + times(share, path_y - cut.tip.y)
+                share *= path.coupling
             inverse = 1.0 / (1.0 + k * b11)
-            push = (force + k * (u[i] + fixed - a1)) * inverse
+            push = times(inverse, force + times(k, u[i] + fixed - a1))
             push_g = k * (share - g1) * inverse
-            a1 += b11 * push
-            a2 += b12 * push
+            a1 += times(b11, push)
+            a2 += times(b12, push)
             g1 += b11 * push_g
             g2 += b12 * push_g
             b22 -= k * inverse * b12 * b12
             b11 *= inverse
             b12 *= inverse
-            w[A1, i], w[G1, i], w[B11, i], w[B12, i] = a1, g1, b11, b12
-            w[STIFFNESS, i], w[FORCE, i], w[ENERGY, i] = k, force, energy
-            w[SHARE, i], w[FIXED, i] = share, fixed
-        w[A2, i], w[G2, i], w[B22, i] = a2, g2, b22
-    return a1, a2, g1, g2, b11, b12, b22
+            out.a1, out.g1, out.b11, out.b12 = a1, g1, b11, b12
+            out.stiffness, out.force, out.share, out.fixed = k, force, share, fixed
+        out.a2, out.g2, out.b22 = a2, g2, b22
+    return a1, a2, g1, g2, b11, b12
 
 
 @inner
-def spring_rest(model: Model, s: Floats, tip_x: float) -> tuple[float, float]:
+def spring_rest(model: Model, bevel: Lateral, cut: Cut, path: Path, tip_x: float) -> tuple[Lateral, float]:
     """(fixed, slope): the tip spring rests at fixed + (1 − slope) y_tip; docs/theory.md eq. 8."""
-    cut = tip_x - s[CUT_FRONT]
-    if cut <= 0.0:
-        return s[CUT_REST], 1.0
-    offset = s[BEVEL] * model.bevel_offset
-    y_front = s[CUT_Y] + s[CUT_TURN] * (s[CUT_FRONT] - s[CUT_X])
-    lag = 0.0 if s[CUT_FRONT] <= 0.0 else s[CUT_REST] - y_front - offset
-    ratio = cut / model.bevel_length
+    length = tip_x - cut.channel.front
+    if length <= 0.0:
+        return cut.channel.rest, 1.0
+    rate = cut.spin / (tip_x - cut.tip.x) if tip_x > cut.tip.x else 0.0
+    goal = times(model.bevel_offset, steady(bevel, rate, model.bevel_length))
+    front_y = cut.tip.y + times(cut.channel.front - cut.tip.x, cut.tip.slope)
+    line = front_y + times(length, cut.tip.slope)
+    lag = times(0.0, goal)
+    if cut.channel.front > 0.0:
+        before = goal if cut.spin == 0.0 else turned(-rate * length, goal)
+        lag = cut.channel.rest - front_y - before
+    ratio = length / model.bevel_length
     slope = -math.expm1(-ratio) / ratio
-    line = y_front + s[CUT_TURN] * cut
-    fixed = line + offset + lag * math.exp(-ratio) - (1.0 - slope) * line
-    if s[COUPLING] == 0.0:
-        return fixed + (1.0 - slope) * s[PATH_Y], 1.0
+    fixed = line + goal + times(math.exp(-ratio), lag) - times(1.0 - slope, line)
+    if path.coupling == 0.0:
+        return fixed + times(1.0 - slope, path.y), 1.0
     return fixed, slope
 
 
 @inner
-def spring_law(model: Model, s: Floats, tip_x: float, u: float) -> tuple[float, ...]:
-    """Force (N), stiffness (N/mm) and energy (mJ) of the tip spring over its layers; sharpest α/h and least h."""
+def spring_law(model: Model, front: float, tip_x: float, u: Lateral) -> tuple[float, ...]:
+    """Secant and tangent stiffness (N/mm) of the tip spring over its layers; its sharpness (1/mm), and what of the
+    compression is left to the limit of the first law to reach it (mm)."""
     layers = model.layers
-    front = max(s[CUT_FRONT], tip_x)
-    start, stop = max(0.0, front - model.bevel_length), tip_x
-    force, k, energy, sharpness, height = 0.0, 0.0, 0.0, 0.0, np.inf
+    start, stop = max(0.0, max(front, tip_x) - model.bevel_length), tip_x
+    amount = size(u)
+    secant, tangent, sharpness, height = 0.0, 0.0, 0.0, math.inf
     top = 0.0
-    for j in range(layers.end.size):
-        part = min(stop, layers.end[j]) - max(start, top)
-        top = layers.end[j]
+    for j in range(layers.size):
+        layer = layers[j]
+        part = min(stop, layer.end) - max(start, top)
+        top = layer.end
         if part > 0.0:
-            f, kk, e = contact_law(
-                layers.alpha[j], layers.height[j], layers.force[j] * part, layers.energy[j] * part, u
-            )
-            force, k, energy = force + f, k + kk, energy + e
-            sharpness = max(sharpness, (abs(layers.alpha[j]) + 2.0) / layers.height[j])
-            height = min(height, layers.height[j])
-    return force, k, energy, sharpness, height
+            law = response(model.laws[layer.law], amount / layer.height)
+            secant += layer.stiffness * part * law.secant
+            tangent += layer.stiffness * part * law.tangent
+            sharpness = max(sharpness, law.sharpness / layer.height)
+            height = min(height, layer.height)
+    return secant, tangent, sharpness, height
 
 
 @inner
-def _judge(height: float, sharpness: float, u: float, new_u: float) -> tuple[float, float]:
-    """(error, fraction): what is left after this Newton step (mm), and how much of the step may be taken.
+def spring_energy(model: Model, front: float, tip_x: float, u: Lateral) -> float:
+    """Energy (mJ) that the tip spring stores in its layers."""
+    layers = model.layers
+    start, stop = max(0.0, max(front, tip_x) - model.bevel_length), tip_x
+    total, top = 0.0, 0.0
+    for j in range(layers.size):
+        layer = layers[j]
+        part = min(stop, layer.end) - max(start, top)
+        top = layer.end
+        if part > 0.0:
+            stored = stored_energy(model.laws[layer.law], size(u) / layer.height)
+            total += layer.stiffness * part * layer.height * layer.height * stored
+    return total
 
-    Newton converges quadratically, so about |Δu|² W_uuu/2W_uu is left; a step may use half the remaining stretch.
+
+@inner
+def _judge(
+    height: float, sharpness: float, turning: float, u: Lateral, new_u: Lateral
+) -> tuple[float, float]:
+    """(left, fraction): what is left after this step (mm), and how much of the step may be taken.
+
+    Newton's method converges quadratically, so about |Δu|² W‴/2W″ is left, and in space the part of Δu for which the
+    stiffness is not exact; a step may use half the stretch that is left.
     """
-    change = abs(new_u - u)
-    stretch = 1.0 - abs(u) / height
-    if stretch <= FLOOR_STRETCH:
+    change = size(new_u - u)
+    if sharpness == math.inf:
         return change, 1.0
-    error = min(change, sharpness * change * change / stretch)
-    limit = 0.5 * (height + abs(u))
-    if abs(new_u) <= limit:
-        return error, 1.0
-    return change, (math.copysign(limit, new_u) - u) / (new_u - u)
+    left = min(change, change * (change * sharpness + turning))
+    limit = 0.5 * (height + size(u))
+    if square(new_u) <= limit * limit:
+        return left, 1.0
+    along = dot(u, new_u - u)
+    reach = math.sqrt(along * along + change * change * (limit * limit - square(u))) - along
+    return change, reach / (change * change)
 
 
 @inner
-def _tip(model: Model, s: Floats, tip_x: float, held: float, ahead: tuple[float, ...]) -> tuple[float, ...]:
-    """Solve the tip: y, turn, total lateral force, spring u and energy, (error, fraction), reaction if held."""
-    a1, a2, g1, g2, b11, b12, _ = ahead
-    fixed, slope = spring_rest(model, s, tip_x)
-    u = s[SPRING_U]
-    force, k, energy, sharpness, height = spring_law(model, s, tip_x, u)
-    if math.isnan(held):
-        load = s[TIP_LOAD] + force + k * (u + fixed)
-        y = (a1 + b11 * load) / (1.0 - g1 + b11 * k * slope)
-        total = load - k * slope * y
-        reaction = 0.0
+def _tip(
+    model: Model,
+    boundary: Boundary,
+    cut: Cut,
+    u: Lateral,
+    path: Path,
+    tip_x: float,
+    held: Lateral,
+    ahead: tuple[Any, ...],
+) -> Tip:
+    """Solve the tip, `ahead` from the base; a `held` y (mm) is an essential condition, NaN leaves it free.
+
+    The two stiffnesses of the tip spring, along its compression and across it, are both exact.
+    """
+    a1, a2, g1, g2, b11, b12 = ahead
+    fixed, slope = spring_rest(model, boundary.bevel, cut, path, tip_x)
+    secant, tangent, sharpness, height = spring_law(model, cut.channel.front, tip_x, u)
+    amount = size(u)
+    along = times(1.0 / amount, u) if amount > 0.0 else times(1.0, lateral(u, 1.0, 0.0))
+    at_zero = boundary.load - times(secant, u) + stretched(along, u + fixed, tangent, secant)
+    if math.isnan(held.real):
+        free = 1.0 - g1
+        y = stretched(
+            along,
+            a1 + times(b11, at_zero),
+            1.0 / (free + b11 * tangent * slope),
+            1.0 / (free + b11 * secant * slope),
+        )
+        total = at_zero - stretched(along, y, tangent * slope, secant * slope)
+        reaction = times(0.0, y)
     else:
         y = held
-        total = (y - a1 - y * g1) / b11
-        reaction = total - s[TIP_LOAD] - force + k * (slope * y - fixed - u)
-    new_u = slope * y - fixed
-    change = new_u - u
-    stored = energy - (force - 0.5 * k * change) * change
-    error, fraction = _judge(height, sharpness, u, new_u) if k > 0.0 else (0.0, 1.0)
-    return y, a2 + y * g2 + b12 * total, total, new_u, stored, error, fraction, reaction
+        total = times(1.0 / b11, y - a1 - times(g1, y))
+        reaction = total - at_zero + stretched(along, y, tangent * slope, secant * slope)
+    new_u = times(slope, y) - fixed
+    left, fraction = _judge(height, sharpness, 0.0, u, new_u) if secant > 0.0 else (0.0, 1.0)
+    return Tip(y, a2 + times(g2, y) + times(b12, total), total, new_u, reaction, left, fraction)
 
 
 @inner
-def _sweep_back(model: Model, s: Floats, u: Floats, w: Floats, tip: tuple[float, ...], count: int) -> float:
-    """From the tip to the base: positions, loads and new compressions into `w`, the shortening ½∫y'² (mm) returned."""
+def _sweep_back(
+    model: Model, boundary: Boundary, u: Laterals, w: Work, tip_x: float, tip: Tip, count: int
+) -> tuple[Lateral, Lateral, float, float, float]:
+    """From the tip to the base: positions, loads and new compressions into `w`.
+
+    Returns shear and moment at the base, the shortening ½∫|y'|² (mm), and the worst (left, fraction) of `_judge`.
+    """
     nodes = model.nodes
     flexibility = 1.0 / model.bending_stiffness
-    bend = s[BEVEL] * model.curvature
-    x, y, turn, shear = tip
-    y_tip = y
-    moment = 0.0
+    bend = times(model.curvature, boundary.bevel)
+    x, y, turn, shear = tip_x, tip.y, tip.slope, tip.force
+    moment = times(0.0, shear)
+    left, fraction = tip.left, tip.fraction
     shortening = 0.0
     for i in range(count - 1, -2, -1):
-        length = x - (nodes.x[i] if i >= 0 else s[BASE_X])
+        length = x - (nodes[i].x if i >= 0 else boundary.base.x)
         x -= length
-        middle = turn - (0.5 * moment + 0.125 * shear * length) * length * flexibility - 0.5 * length * bend
-        moment += shear * length
+        middle = (
+            turn
+            - times(0.5 * length * flexibility, moment)
+            - times(0.125 * length * length * flexibility, shear)
+            - times(0.5 * length, bend)
+        )
+        moment += times(length, shear)
         right = turn
         if i < 0:
-            turn = s[BASE_TURN]
-        elif nodes.kind[i] != CONTACT and math.isnan(w[FIXED, i]):
-            y = w[A1, i] + y_tip * w[G1, i] + w[B11, i] * shear + w[B12, i] * moment
-            turn = w[A2, i] + y_tip * w[G2, i] + w[B12, i] * shear + w[B22, i] * moment
-            w[SHEAR, i], w[MOMENT, i], w[Y, i], w[TURN, i], w[FORCE, i] = shear, moment, y, turn, 0.0
-        elif nodes.kind[i] != CONTACT:
-            y = w[FIXED, i]
-            turn = w[A2, i] + y_tip * w[G2, i] + w[B22, i] * moment
-            w[SHEAR, i], w[MOMENT, i], w[Y, i], w[TURN, i] = shear, moment, y, turn
-            free = w[A1, i] + y_tip * w[G1, i] + w[B11, i] * shear + w[B12, i] * moment
-            w[FORCE, i] = (y - free) / w[B11, i]
-            shear += w[FORCE, i]
+            turn = boundary.base.slope
         else:
-            y = w[A1, i] + y_tip * w[G1, i] + w[B11, i] * shear + w[B12, i] * moment
-            turn = w[A2, i] + y_tip * w[G2, i] + w[B12, i] * shear + w[B22, i] * moment
-            compression = y - w[FIXED, i] - w[SHARE, i] * y_tip
-            w[SHEAR, i], w[MOMENT, i], w[Y, i], w[TURN, i] = shear, moment, y, turn
-            w[NEW_U, i] = compression
-            shear += w[FORCE, i] - w[STIFFNESS, i] * (compression - u[i])
+            out = w[i]
+            y = out.a1 + times(out.g1, tip.y) + times(out.b11, shear) + times(out.b12, moment)
+            fixed = nodes[i].kind != CONTACT and not math.isnan(out.fixed.real)
+            if fixed:
+                free, y = y, out.fixed
+                turn = out.a2 + times(out.g2, tip.y) + times(out.b22, moment)
+                out.force = times(1.0 / out.b11, y - free)
+            else:
+                turn = out.a2 + times(out.g2, tip.y) + times(out.b12, shear) + times(out.b22, moment)
+            out.shear, out.moment, out.y, out.slope = shear, moment, y, turn
+            if fixed:
+                shear += out.force
+            elif nodes[i].kind != CONTACT:
+                out.force = times(0.0, y)
+            else:
+                new_u = y - out.fixed - times(out.share, tip.y)
+                out.new_u = new_u
+                shear += out.force - times(out.stiffness, new_u - u[i])
+                rest, part = _judge(nodes[i].height, out.sharpness, out.turning, u[i], new_u)
+                left, fraction = max(left, rest), min(fraction, part)
         shortening += length * (
-            turn * turn + 4.0 * middle * middle + right * right + middle * (turn + right) - 0.5 * turn * right
+            square(turn)
+            + 4.0 * square(middle)
+            + square(right)
+            + dot(middle, turn + right)
+            - 0.5 * dot(turn, right)
         )
-    s[BASE_SHEAR], s[BASE_MOMENT] = shear, moment
-    return shortening / 15.0
-
-
-@inner
-def _limit(
-    model: Model, u: Floats, w: Floats, count: int, error: float, fraction: float
-) -> tuple[float, float]:
-    """(error, fraction) of `_judge`, the worst over all contacts."""
-    nodes = model.nodes
-    for i in range(count):
-        if nodes.kind[i] == CONTACT:
-            sharpness = (abs(nodes.alpha[i]) + 2.0) / nodes.height[i]
-            left, part = _judge(nodes.height[i], sharpness, u[i], w[NEW_U, i])
-            error, fraction = max(error, left), min(fraction, part)
-    return error, fraction
-
-
-@inner
-def _move_by(model: Model, u: Floats, w: Floats, count: int, fraction: float) -> None:
-    """Take `fraction` of the Newton step; the energies follow to third order in the full step."""
-    for i in range(count):
-        if model.nodes.kind[i] == CONTACT:
-            change = w[NEW_U, i] - u[i]
-            w[ENERGY, i] -= (w[FORCE, i] - 0.5 * w[STIFFNESS, i] * change) * change
-            u[i] += fraction * change
+    return shear, moment, shortening / 15.0, left, fraction
 
 
 @inner
 def _overshoot(
-    model: Model, s: Floats, u: Floats, w: Floats, count: int, tip_x: float, new_u: float, t: float
+    model: Model,
+    front: float,
+    spring: Lateral,
+    u: Laterals,
+    w: Work,
+    count: int,
+    tip_x: float,
+    new_spring: Lateral,
+    t: float,
 ) -> float:
-    """Slope of the energy along the Newton step at `t`, less the beam's part (never negative) of 1 − t."""
+    """Slope of the energy along an iteration's step at `t`, less the beam's part (never negative) of 1 − t."""
     nodes = model.nodes
-    change = new_u - s[SPRING_U]
-    force, k, _, _, _ = spring_law(model, s, tip_x, s[SPRING_U])
-    slope = (force - k * change - spring_law(model, s, tip_x, s[SPRING_U] + t * change)[0]) * change
+    change = new_spring - spring
+    here = spring + times(t, change)
+    secant, tangent, _, _ = spring_law(model, front, tip_x, spring)
+    amount = size(spring)
+    along = times(1.0 / amount, spring) if amount > 0.0 else times(1.0, lateral(spring, 1.0, 0.0))
+    linear = times(secant, spring) + stretched(along, change, tangent, secant)
+    slope = dot(times(spring_law(model, front, tip_x, here)[0], here) - linear, change)
     for i in range(count):
-        if nodes.kind[i] == CONTACT:
-            change = w[NEW_U, i] - u[i]
-            ramp = min(1.0, (tip_x - nodes.x[i]) / nodes.reach[i])
-            force, _, _ = contact_law(
-                nodes.alpha[i], nodes.height[i], nodes.force[i], nodes.energy[i], u[i] + t * change
-            )
-            slope += (w[FORCE, i] - w[STIFFNESS, i] * change - ramp * force) * change
+        node, out = nodes[i], w[i]
+        if node.kind == CONTACT:
+            change = out.new_u - u[i]
+            here = u[i] + times(t, change)
+            law = response(model.laws[node.law], size(here) / node.height)
+            scale = node.stiffness * min(1.0, (tip_x - node.x) / node.reach)
+            slope += dot(out.force - times(out.stiffness, change) + times(scale * law.secant, here), change)
     return float(slope)
 
 
 @inner
 def _line_search(
-    model: Model, s: Floats, u: Floats, w: Floats, count: int, tip_x: float, new_u: float
+    model: Model,
+    front: float,
+    spring: Lateral,
+    u: Laterals,
+    w: Work,
+    count: int,
+    tip_x: float,
+    new_spring: Lateral,
 ) -> float:
-    """The fraction of a Newton step at which the convex energy still falls: no cycle can form."""
-    if _overshoot(model, s, u, w, count, tip_x, new_u, 1.0) <= 0.0:
+    """The fraction of an iteration's step at which the convex energy still falls: no cycle can form."""
+    if _overshoot(model, front, spring, u, w, count, tip_x, new_spring, 1.0) <= 0.0:
         return 1.0
     low, high = 0.0, 1.0
     for _ in range(20):
         middle = 0.5 * (low + high)
-        if _overshoot(model, s, u, w, count, tip_x, new_u, middle) > 0.0:
+        if _overshoot(model, front, spring, u, w, count, tip_x, new_spring, middle) > 0.0:
             high = middle
         else:
             low = middle
@@ -299,99 +512,141 @@ def _line_search(
 
 
 @inner
-def _count_below(x: Floats, value: float) -> int:
-    """How many of the sorted `x` are below `value`."""
-    low, high = 0, x.size
-    while low < high:
-        middle = (low + high) // 2
-        if x[middle] < value:
-            low = middle + 1
-        else:
-            high = middle
-    return low
+def _behind(model: Model, tip_x: float, near: int) -> int:
+    """Number of nodes behind `tip_x`, counted from a number `near` it."""
+    nodes, count = model.nodes, min(near, model.nodes.size)
+    while count < nodes.size and nodes[count].x < tip_x:
+        count += 1
+    while count > 0 and nodes[count - 1].x >= tip_x:
+        count -= 1
+    return count
+
+
+@inner
+def _guess(model: Model, boundary: Boundary, cut: Cut, last: Iterate, u: Laterals) -> tuple[Lateral, Lateral]:
+    """First guess of the y of the tip, on its own line, and of the tip spring; contacts to be cut are unstrained."""
+    tip_x = boundary.base.x + model.length - last.shortening
+    y = cut.tip.y + times(tip_x - cut.tip.x, cut.tip.slope)
+    front = cut.channel.front
+    for i in range(_behind(model, front, last.behind), _behind(model, tip_x + 1.0, last.behind)):
+        u[i] = times(0.0, y)
+    fixed, slope = spring_rest(model, boundary.bevel, cut, Path(1.0, y), tip_x)
+    return y, times(slope, y) - fixed
+
+
+@inner
+def _bearing(model: Model, boundary: Boundary, w: Work, count: int, last: Bearing) -> tuple[bool, Bearing]:
+    """Whether the needle bears on its guide as was assumed, and what to assume next.
+
+    A wall only pushes, and between the walls nothing does: one inequality of a convex problem, so that few changes do.
+    In space the wall is a circle, which pushes towards its middle: the needle bears on the point nearest to where it
+    would be without the wall, as far as its displacement per force is known from the last change.
+    """
+    if count == 0 or model.nodes[0].kind != GUIDE or model.clearance <= 0.0:
+        return True, last
+    y, force, bears = w[0].y - boundary.guide, w[0].force, size(last.wall) > 0.0
+    give, moved = last.give, size(y - last.y)
+    if moved > model.slide:  # not at the first look in a solve, where the last y is NaN
+        give = min(moved / size(force - last.force), w[0].b11)
+    free = y - times(give, force)
+    distance = size(free)
+    pulls = dot(force, last.wall) > 0.0
+    if distance <= model.clearance or (pulls and dot(free, last.wall) <= 0.0):
+        return not bears, Bearing(times(0.0, y), give, y, force)
+    wall = free / distance
+    agrees = bears and model.clearance * size(wall - last.wall) <= model.slide
+    return agrees, Bearing(wall, give, y, force)
 
 
 @inner
 def _iterate(
-    model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, held: float
-) -> tuple[int, int, float, float]:
-    """One Newton iteration, in place; returns (nodes behind the tip, first one being cut, error, change of x)."""
-    x = model.nodes.x
-    coupled = s[COUPLING] > 0.0
-    tip_x = s[BASE_X] + model.length - s[SHORTENING]
-    count = _count_below(x, tip_x)
+    model: Model,
+    boundary: Boundary,
+    cut: Cut,
+    at: Iterate,
+    path: Path,
+    rest: Laterals,
+    u: Laterals,
+    w: Work,
+    held: Lateral,
+    radial_weight: float,
+) -> tuple[Pose, Iterate, Loads, int, float]:
+    """One iteration, in place; returns tip, where the next begins, loads, first node being cut, what is left (mm)."""
+    nodes = model.nodes
+    tip_x = boundary.base.x + model.length - at.shortening
+    count = _behind(model, tip_x, at.behind)
     fresh = count
-    while fresh > 0 and x[fresh - 1] > s[CUT_FRONT]:
+    while fresh > 0 and nodes[fresh - 1].x > cut.channel.front:
         fresh -= 1
-    ahead = _sweep_out(model, s, rest, u, w, tip_x, count, fresh)
-    y, turn, force, new_u, stored, error, fraction, reaction = _tip(model, s, tip_x, held, ahead)
-    shortening = _sweep_back(model, s, u, w, (tip_x, y, turn, force), count)
-    error, fraction = _limit(model, u, w, count, error, fraction)
-    if not coupled and error > model.tolerance:
-        fraction = min(fraction, _line_search(model, s, u, w, count, tip_x, new_u))
-    _move_by(model, u, w, count, fraction)
-    s[SPRING_U] += fraction * (new_u - s[SPRING_U])
-    s[TIP_X], s[TIP_Y], s[TIP_TURN], s[TIP_FORCE] = tip_x, y, turn, force
-    s[TIP_REACTION], s[SPRING_ENERGY] = reaction, stored
-    slide = 0.0
-    if coupled:
-        slide = abs(shortening - s[SHORTENING])
-        s[SHORTENING] = shortening
-    elif error <= model.tolerance:
-        s[SHORTENING] = shortening
-    return count, fresh, error if fraction == 1.0 else math.inf, slide
+    ahead = _sweep_out(
+        model, boundary, cut, at.guide.wall, path, rest, u, w, tip_x, count, fresh, radial_weight
+    )
+    tip = _tip(model, boundary, cut, at.spring, path, tip_x, held, ahead)
+    shear, moment, shortening, left, fraction = _sweep_back(model, boundary, u, w, tip_x, tip, count)
+    if path.coupling == 0.0 and left > model.tolerance:
+        front, spring = cut.channel.front, at.spring
+        fraction = min(fraction, _line_search(model, front, spring, u, w, count, tip_x, tip.spring))
+    for i in range(count):
+        if nodes[i].kind == CONTACT:
+            u[i] = w[i].new_u if fraction == 1.0 else u[i] + times(fraction, w[i].new_u - u[i])
+    spring = tip.spring if fraction == 1.0 else at.spring + times(fraction, tip.spring - at.spring)
+    return (
+        Pose(tip_x, tip.y, tip.slope),
+        Iterate(spring, shortening, at.guide, count),
+        Loads(tip.force, tip.reaction, shear, moment),
+        fresh,
+        left if fraction == 1.0 else math.inf,
+    )
 
 
 @inner
-def _guide_agrees(model: Model, s: Floats, rest: Floats, w: Floats, count: int) -> bool:
-    """Whether the needle bears on the wall of the guide that it was taken to bear on; else that is changed.
-
-    A wall only pushes, and between the walls nothing does: one inequality of a convex problem, so that few changes do.
-    """
-    if count == 0 or model.nodes.kind[0] != GUIDE or model.clearance <= 0.0:
-        return True
-    side, off = s[GUIDE_SIDE], w[Y, 0] - rest[0]
-    if side != 0.0:
-        s[GUIDE_SIDE] = 0.0 if w[FORCE, 0] * side > 0.0 else side
-    elif abs(off) > model.clearance:
-        s[GUIDE_SIDE] = math.copysign(1.0, off)
-    return bool(s[GUIDE_SIDE] == side)
-
-
-@inner
-def guess(model: Model, s: Floats, u: Floats) -> None:
-    """First guess: contacts to be cut are unstrained, the tip follows its own line."""
-    tip_x = s[BASE_X] + model.length - s[SHORTENING]
-    s[PATH_Y] = s[CUT_Y] + s[CUT_TURN] * (tip_x - s[CUT_X])
-    for i in range(_count_below(model.nodes.x, s[CUT_FRONT]), _count_below(model.nodes.x, tip_x + 1.0)):
-        u[i] = 0.0
-    fixed, slope = spring_rest(model, s, tip_x)
-    s[SPRING_U] = slope * s[PATH_Y] - fixed
-
-
-@inner
-def solve(model: Model, s: Floats, rest: Floats, u: Floats, w: Floats, held: float) -> tuple[int, int]:
-    """Find the equilibrium for the base and guide in `s`; a `held` tip (mm, NaN if free) is an essential condition.
+def solve(
+    model: Model,
+    boundary: Boundary,
+    cut: Cut,
+    last: Iterate,
+    rest: Laterals,
+    u: Laterals,
+    w: Work,
+    held: Lateral,
+) -> tuple[Solution, Path, int]:
+    """Find the equilibrium; a `held` tip (mm, NaN if free) is an essential condition.
 
     The shortening and the end of the path being cut are found with it. Where that does not converge, both are
     taken from the start of the step: what is left is the minimum of a convex energy, found with a line search.
 
-    Work arrays: `s` (STATE_SIZE,), `rest` and `u` (n,) are updated in place, `w` (WORK_ROWS, n) is filled.
-    Returns (nodes behind the tip, index of the first being cut); s[RESIDUAL] estimates the error left (mm).
+    `rest` and `u` (n,) are lateral arrays, updated in place; `w` is a `work_array`. Returns also the path that was cut
+    and the index of the first node on it.
     """
-    start = s[SHORTENING]
-    s[COUPLING] = 1.0
-    guess(model, s, u)
+    y, spring = _guess(model, boundary, cut, last, u)
+    unknown = times(math.nan, y)
+    guide = Bearing(last.guide.wall, last.guide.give, unknown, unknown)
+    at = Iterate(spring, last.shortening, guide, last.behind)
+    path = Path(1.0, y)
     for iteration in range(1, MAX_ITERATIONS + 1):
         if iteration == COUPLED_ITERATIONS + 1:
-            s[COUPLING], s[SHORTENING] = 0.0, start
-            guess(model, s, u)
-        count, fresh, error, slide = _iterate(model, s, rest, u, w, held)
-        agrees = error <= model.tolerance and slide <= model.tolerance
-        agrees = agrees and _guide_agrees(model, s, rest, w, count)
-        if agrees:
+            y, spring = _guess(model, boundary, cut, last, u)
+            at = Iterate(spring, last.shortening, at.guide, last.behind)
+            path = Path(0.0, y)
+        radial_weight = 0.5 if path.coupling > 0.0 else float(iteration % 2)
+        tip, new, loads, fresh, left = _iterate(
+            model, boundary, cut, at, path, rest, u, w, held, radial_weight
+        )
+        slide = at.shortening - new.shortening if path.coupling > 0.0 else 0.0
+        found = left <= model.tolerance and abs(slide) <= model.slide
+        agrees, guide = _bearing(model, boundary, w, new.behind, new.guide)
+        if found and agrees:
+            at = Iterate(new.spring, new.shortening, guide, new.behind)
             break
-    s[ITERATIONS], s[RESIDUAL] = iteration, max(error, slide)
-    finite = math.isfinite(s[TIP_Y]) and math.isfinite(s[SHORTENING])
-    s[CONVERGED] = 1.0 if finite and agrees else 0.0
-    return count, fresh
+        # On the circle the needle moves on from a solution: before it, the displacement per force is not known.
+        if not found and size(guide.wall) > 0.0 and size(new.guide.wall) > 0.0:
+            guide = new.guide
+        at = Iterate(new.spring, new.shortening if path.coupling > 0.0 else at.shortening, guide, new.behind)
+    on = times(slide, tip.slope) if math.isnan(held.real) else times(0.0, tip.slope)
+    tip = Pose(tip.x + slide, tip.y + on, tip.slope)
+    finite = math.isfinite(size(tip.y)) and math.isfinite(tip.x)
+    return (
+        Solution(tip, at, loads, iteration, max(left, abs(slide)), finite and found and agrees),
+        path,
+        fresh,
+    )

@@ -1,44 +1,82 @@
 """The needle's curve between the nodes of a solution: cubic elements, exact for unloaded spans."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from flexneedle.mechanics.compile import inner, kernel
+from flexneedle.mechanics.lateral import Lateral, dot, square, times
+
 Floats = NDArray[np.float64]
+Laterals = NDArray[Any]
+
+_NEWTON = 4  # iterations; the integrand of the arc length is within a percent or so of 1
 
 
-def beam_energy(x: Floats, shear: Floats, moment: Floats, stiffness: float) -> float:
-    """½∫M²/EI dx (mJ) over elements between `x` (k + 1,); shear and moment (k,) at their left ends."""
+def beam_energy(x: Floats, shear: Laterals, moment: Laterals, stiffness: float) -> float:
+    """½∫|M|²/EI dx (mJ) over elements between `x` (k + 1,); shear and moment (k,) at their left ends."""
     length = np.diff(x)
-    squares = moment**2 * length - moment * shear * length**2 + shear**2 * length**3 / 3.0
+    mixed = (moment * shear.conj()).real
+    squares = np.abs(moment) ** 2 * length - mixed * length**2 + np.abs(shear) ** 2 * length**3 / 3.0
     return float(squares.sum() / (2.0 * stiffness))
 
 
-def equal_arc_nodes(x: Floats, y: Floats, turn: Floats, n: int) -> Floats:
-    """(n, 3) of x, y, θ at equal arc lengths ∫(1 + ½y'²) dx of the Hermite cubics through x, y, θ (k,)."""
-    length = np.diff(x)
-    keep = length > 0.0
-    length = length[keep]
-    x0, y0, t0 = x[:-1][keep], y[:-1][keep], turn[:-1][keep]
-    rise, t1 = (y[1:] - y[:-1])[keep], turn[1:][keep]
-    # y' = t0 + a r + b r² at r = (x − x0)/length
-    a, b = 6.0 * rise / length - 4.0 * t0 - 2.0 * t1, 3.0 * (t0 + t1) - 6.0 * rise / length
-    arcs = np.concatenate([[0.0], np.cumsum(_arc(length, t0, a, b, np.ones_like(length)))])
-    goal = np.linspace(0.0, arcs[-1], n)
-    k = np.clip(np.searchsorted(arcs, goal, side="right") - 1, 0, length.size - 1)
-    length, t0, a, b = length[k], t0[k], a[k], b[k]
-    r = (goal - arcs[k]) / length
-    for _ in range(4):  # Newton; the integrand is within a percent or so of 1
-        slope = t0 + r * (a + r * b)
-        r -= (_arc(length, t0, a, b, r) - (goal - arcs[k])) / (length * (1.0 + 0.5 * slope**2))
-    nodes = np.stack(
-        [x0[k] + length * r, y0[k] + length * r * (t0 + r * (a / 2.0 + r * b / 3.0)), t0 + r * (a + r * b)],
-        axis=1,
+@inner
+def put(row: Floats, x: float, y: Lateral, slope: Lateral) -> None:
+    """Fill a pose (5,): x, y, z (mm), θ = dy/dx, ψ = dz/dx."""
+    row[0], row[1], row[2], row[3], row[4] = x, y.real, y.imag, slope.real, slope.imag
+
+
+@inner
+def _cubic(x: Floats, y: Laterals, slope: Laterals, k: int) -> tuple[float, Lateral, Lateral, Lateral]:
+    """Length of element k, and y' = t + a r + b r² at r = (x − x_k)/length."""
+    length = x[k + 1] - x[k]
+    rise = times(6.0 / length, y[k + 1] - y[k])
+    return (
+        length,
+        slope[k],
+        rise - times(4.0, slope[k]) - times(2.0, slope[k + 1]),
+        times(3.0, slope[k] + slope[k + 1]) - rise,
     )
-    nodes[0], nodes[-1] = (x[0], y[0], turn[0]), (x[-1], y[-1], turn[-1])
-    return nodes
 
 
-def _arc(length: Floats, t0: Floats, a: Floats, b: Floats, r: Floats) -> Floats:
-    """Arc length from the left end to r of a cubic with slope t0 + a r + b r²."""
-    squares = t0**2 + r * (t0 * a + r * ((a**2 + 2.0 * t0 * b) / 3.0 + r * (a * b / 2.0 + r * b**2 / 5.0)))
-    return length * r * (1.0 + 0.5 * squares)
+@inner
+def _arc(length: float, t: Lateral, a: Lateral, b: Lateral, r: float) -> float:
+    """Arc length ∫(1 + ½|y'|²) dx from the left end of an element to r."""
+    second = (square(a) + 2.0 * dot(t, b)) / 3.0
+    mean = square(t) + r * (dot(t, a) + r * (second + r * (0.5 * dot(a, b) + r * square(b) / 5.0)))
+    return float(length * r * (1.0 + 0.5 * mean))
+
+
+@inner
+def sample(x: Floats, y: Laterals, slope: Laterals, count: int, out: Floats) -> None:
+    """Fill poses (n, 5) at equal arc lengths of the Hermite cubics through the first `count` of x, y, slope (k,)."""
+    total = 0.0
+    for k in range(count - 1):
+        if x[k + 1] > x[k]:
+            total += _arc(*_cubic(x, y, slope, k), 1.0)
+    n, k, before = out.shape[0], 0, 0.0
+    for i in range(1, n - 1):
+        goal = total * i / (n - 1)
+        while k < count - 2:
+            here = _arc(*_cubic(x, y, slope, k), 1.0) if x[k + 1] > x[k] else 0.0
+            if before + here > goal:
+                break
+            before += here
+            k += 1
+        length, t, a, b = _cubic(x, y, slope, k)
+        r = (goal - before) / length
+        for _ in range(_NEWTON):
+            at = t + times(r, a + times(r, b))
+            r -= (_arc(length, t, a, b, r) - (goal - before)) / (length * (1.0 + 0.5 * square(at)))
+        rise = t + times(r, times(0.5, a) + times(r / 3.0, b))
+        put(out[i], x[k] + length * r, y[k] + times(length * r, rise), t + times(r, a + times(r, b)))
+    put(out[0], x[0], y[0], slope[0])
+    put(out[n - 1], x[count - 1], y[count - 1], slope[count - 1])
+
+
+@kernel
+def equal_arc_nodes(x: Floats, y: Laterals, slope: Laterals, out: Floats) -> None:
+    """Fill poses (n, 5) at equal arc lengths ∫(1 + ½|y'|²) dx of the Hermite cubics through x, y, slope (k,)."""
+    sample(x, y, slope, x.size, out)

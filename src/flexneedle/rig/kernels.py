@@ -9,7 +9,6 @@ from flexneedle.rig.phantom.draw import Truth
 from flexneedle.rig.phantom.phantom import Phantom
 from flexneedle.rig.phantom.plants import PLANTS
 from flexneedle.scenario.files import load_scenario
-from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 
 
@@ -21,8 +20,6 @@ def all_compiled() -> bool:
 def compile_kernels() -> None:
     """Compile all kernels, or load them from the cache, ahead of their first call."""
     scenario = load_scenario("phantom")  # kernels are the same for every scenario
-    simulator, at_rest = Simulator(scenario, threads=1), Control().row()
-    simulator.compile()
-    simulator.replay(simulator.start(), at_rest[None])
+    Simulator(scenario, threads=1).compile()
     for kind in PLANTS:
         Phantom(Truth(scenario), 1, kind).apply((0.0, 0.0, 0.0, 0.0, -1), 0.0)

@@ -8,7 +8,6 @@ import hashlib
 import inspect
 import sys
 from collections.abc import Callable, Iterable
-from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -22,6 +21,7 @@ from flexneedle.rig.phantom.phantom import Phantom
 from flexneedle.rig.phantom.plants import PLANTS, PlantFactory
 from flexneedle.rig.ports import TipTracker
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.own import OWN, is_own, resolved
 from flexneedle.scenario.problems import printable
 
 TrackerFactory = Callable[[Scenario, Phantom, np.random.Generator], TipTracker]
@@ -30,13 +30,7 @@ TrackerFactory = Callable[[Scenario, Phantom, np.random.Generator], TipTracker]
 SCENARIO_TRACKER = "scenario"
 """Name of the tracker described by the scenario."""
 
-_OWN = "module:NAME of your own"
 _DIGITS = 12
-
-
-def is_own(given: object) -> bool:
-    """Whether a part is given as `module:NAME`."""
-    return isinstance(given, str) and ":" in given
 
 
 def controller_of(given: str | Method) -> tuple[str, Method]:
@@ -97,36 +91,10 @@ def _resolved(kind: str, given: object, names: Iterable[str]) -> Any:
     """The object itself, or the one named by `module:NAME`."""
     if not isinstance(given, str):
         return given
-    module, colon, name = given.partition(":")
-    if not colon:
-        raise InputError(f"{kind} = {_shown(given)}: must be one of {', '.join(names)}, or {_OWN}")
-    if not all(part.isidentifier() for part in (*module.split("."), name)):
-        raise InputError(f"{kind} = {_shown(given)}: must be module:NAME, such as mycontroller:METHOD")
-    found = _module(kind, given, module)
-    if not hasattr(found, name):
-        public = ", ".join(key for key in vars(found) if not key.startswith("_")) or "none"
-        raise InputError(f"{kind} = {_shown(given)}: {module} has no {name}; public names: {public}")
-    return getattr(found, name)
-
-
-def _module(kind: str, given: str, name: str) -> Any:
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.insert(0, here)
     try:
-        return import_module(name)
+        return resolved(given, names)
     except InputError as error:
         raise InputError(f"{kind} = {_shown(given)}: {error}") from error
-    except ModuleNotFoundError as error:
-        missing = str(error.name)
-        if name == missing or name.startswith(f"{missing}."):
-            rule = f"no module {missing} in {here} or installed"
-        else:
-            rule = f"{name} cannot be imported: it needs the module {missing}"
-        raise InputError(f"{kind} = {_shown(given)}: {printable(rule)}") from None
-    except (Exception, SystemExit) as error:
-        problem = printable(f"{type(error).__name__}: {' '.join(str(error).split())}")
-        raise InputError(f"{kind} = {_shown(given)}: {name} cannot be imported: {problem}") from error
 
 
 def _check_call(
@@ -146,7 +114,7 @@ def _check_call(
 
 def _unsuitable(kind: str, given: object, found: object, names: Iterable[str], wanted: str) -> InputError:
     """The error for a part of the wrong type: an object, or the one that `module:NAME` has been resolved to."""
-    choices = f"must be one of {', '.join(names)}, {_OWN}, or {wanted}"
+    choices = f"must be one of {', '.join(names)}, {OWN}, or {wanted}"
     rule = f"is {_a(found)}, not {wanted}" if isinstance(given, str) else choices
     return InputError(f"{kind} = {_shown(given)}: {rule}")
 

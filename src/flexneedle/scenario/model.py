@@ -27,7 +27,8 @@ from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.scenario.sections.needle import Needle
 from flexneedle.scenario.sections.settings import ControlSettings, PhantomSettings, PlanSettings, Target
 from flexneedle.scenario.sections.structure import structure_problems
-from flexneedle.scenario.sections.tissue import Contact, Layer
+from flexneedle.scenario.tissue.laws import AnyLayer
+from flexneedle.scenario.tissue.layer import Contact
 
 _ENVIRONMENT = "tracker.environment"
 
@@ -42,7 +43,7 @@ class Scenario(Section):
     """Title in tables and figures."""
     needle: Needle
     setup: Setup
-    tissue: Annotated[tuple[Layer, ...], Field(strict=False, max_length=1_000)]
+    tissue: Annotated[tuple[AnyLayer, ...], Field(strict=False, max_length=1_000)]
     """Layers from the skin down."""
     contact: Contact = Contact()
     target: Target = Target()

@@ -15,9 +15,9 @@ _LONGEST_VALUE = 60
 
 
 class Problem(NamedTuple):
-    """A broken rule. `key` is dotted, relative to the section that checks; value None is a key that is not set."""
+    """A broken rule. `key` is dotted or a path, relative to the section that checks; value None: a key not set."""
 
-    key: str
+    key: str | tuple[str | int, ...]
     value: object
     rule: str
 
@@ -31,16 +31,21 @@ def refuse(problems: Iterable[Problem]) -> None:
 
 def to_line(problem: Problem, *, above: Sequence[str | int] = ()) -> str:
     """Return a problem as `key = value: rule`; `above` is the path of the section that found it."""
-    return _line([*above, *split_key(problem.key)], problem.value, problem.rule)
+    return _line([*above, *_path(problem.key)], problem.value, problem.rule)
 
 
 def describe(error: ValidationError, model: type[BaseModel]) -> list[str]:
     """Return one line `key = value: rule` for each problem, in the order of the schema."""
+    return [to_line(problem) for problem in problems_of(error, model)]
+
+
+def problems_of(error: ValidationError, model: type[BaseModel]) -> list[Problem]:
+    """Return the problems of a section, in the order of the schema."""
     details = error.errors(include_url=False)
     inner = {detail["loc"][:depth] for detail in details for depth in range(len(detail["loc"]))}
     # pydantic also reports a list as too short when its items are refused: only the items are reported.
     reported = [d for d in details if not (d["type"] == "too_short" and d["loc"] in inner)]
-    return [line for detail in reported for line in _lines(detail, model)]
+    return [problem for detail in reported for problem in _problems(detail, model)]
 
 
 def printable(text: str) -> str:
@@ -63,15 +68,20 @@ def _is_bare(key: str) -> bool:
     return key.isascii() and key.replace("-", "").isidentifier()
 
 
-def _lines(detail: ErrorDetails, model: type[BaseModel]) -> list[str]:
+def _problems(detail: ErrorDetails, model: type[BaseModel]) -> list[Problem]:
     loc = detail["loc"]
     if detail["type"] == _BROKEN:
-        return [to_line(problem, above=loc) for problem in detail["ctx"]["problems"]]
+        found: list[Problem] = detail["ctx"]["problems"]
+        return [each._replace(key=(*loc, *_path(each.key))) for each in found]
     if detail["type"] == "missing":
-        return [_line(loc, None, "missing")]
+        return [Problem(loc, None, "missing")]
     if detail["type"] == "extra_forbidden":
-        return [_line(loc, detail["input"], _unknown(loc, model))]
-    return [_line(loc, detail["input"], _rule(detail))]
+        return [Problem(loc, detail["input"], _unknown(loc, model))]
+    return [Problem(loc, detail["input"], _rule(detail))]
+
+
+def _path(key: str | tuple[str | int, ...]) -> Sequence[str | int]:
+    return split_key(key) if isinstance(key, str) else key
 
 
 def _line(loc: Sequence[str | int], value: object, rule: str) -> str:

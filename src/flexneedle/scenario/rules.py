@@ -8,7 +8,7 @@ from flexneedle.scenario.sections.apparatus import Setup, TrackerSettings
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.scenario.sections.needle import Bevel, Needle
 from flexneedle.scenario.sections.settings import PhantomSettings, PlanSettings, Target
-from flexneedle.scenario.sections.tissue import LARGEST_BEVEL, Contact, Layer
+from flexneedle.scenario.tissue.layer import Contact, Layer
 
 _MOST_GRID_POINTS = 20_000
 _MOST_READINGS_A_STEP = 10_000
@@ -44,10 +44,10 @@ def layer_problems(tissue: Sequence[Layer], bevel: Bevel) -> Iterator[Problem]:
             yield Problem(
                 f"tissue.{i}.thickness_mm", None, "missing: every layer but the last needs a thickness"
             )
-    shortest = min(range(len(tissue)), key=lambda i: tissue[i].compression_length_mm)
-    limit = LARGEST_BEVEL * tissue[shortest].compression_length_mm
+    least = min(range(len(tissue)), key=lambda i: tissue[i].largest_bevel_mm)
+    limit = tissue[least].largest_bevel_mm
     if bevel.offset_mm >= limit:
-        rule = f"must be below {limit:g}, {LARGEST_BEVEL:g} times tissue[{shortest}].compression_length_mm"
+        rule = f"must be below {limit:g}, {tissue[least].limit:g} times tissue[{least}].compression_length_mm"
         yield Problem("needle.bevel.offset_mm", bevel.offset_mm, rule)
 
 

@@ -4,6 +4,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,13 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from flexneedle.arguments import instance, whole
 from flexneedle.errors import CommandError, StateError
-from flexneedle.mechanics import insertion, model
+from flexneedle.mechanics import insertion, law, model
 from flexneedle.mechanics import needle as nd
-from flexneedle.mechanics.ogden import displaced_energy
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.control import Control, Limits
-from flexneedle.simulator.state import State, load_arrays, mechanics_difference, mesh_of, solved
+from flexneedle.simulator.state import State, load_state, mechanics_difference, solved
 from flexneedle.types import Floats
 
 _STEPS_WORTH_A_THREAD = 200
@@ -74,28 +75,27 @@ class Simulator:
 
     def compile(self) -> None:
         """Compile the kernels, or load them from the cache, ahead of the first call of each."""
-        state = self.step(self.start(), Control())
-        self.rollout(state, np.array([[Control().row()]]))
+        _ = self.step(self.start(), Control()).nodes
 
     def start(self, bevel: int = 1) -> State:
         """Return the straight needle in air, `setup.tip_to_skin_mm` before the skin, bevel −1 or +1."""
         if bevel not in (-1, 1):
             raise CommandError("bevel", bevel, 1.0, "must be −1 or +1")
-        s = np.zeros(nd.STATE_SIZE)
-        s[nd.BASE_X], s[nd.BEVEL] = self.scenario.start_base_x, bevel
-        s[nd.TIP_X] = self.scenario.setup.start_tip_x
-        n = self._model.nodes.x.size
-        return self._settled(s, np.zeros(n), np.zeros(n), math.nan)
+        rest = np.zeros(self._model.nodes.size)
+        base, tip = (
+            nd.Pose(x, 0.0, 0.0) for x in (self.scenario.start_base_x, self.scenario.setup.start_tip_x)
+        )
+        needle = nd.start(base, tip, float(bevel))
+        mesh = np.zeros(0)
+        state = State(self.scenario, self._model, needle, nd.Pose(0.0, 0.0, 0.0), rest, rest, mesh, 0.0)
+        return self._settled(state, self._model, math.nan)
 
     def step(self, state: State, control: Control) -> State:
         """Return the state after one control step; CommandError, with the limit, if it is out of range."""
         instance("state", state, State, "begin with simulator.start()")
         instance("control", control, Control, "make one with flexneedle.Control(db_x=1.0)")
         self.check(state, control)
-        row = control.row()
-        s, rest, u, w = self._work(state)
-        count = insertion.advance(self._model, s, rest, u, w, row)
-        return solved(self.scenario, self._model, s, rest, u, mesh_of(self._model.nodes, w, count))
+        return self._carried_out(state, control.row()[None])[0]
 
     def replay(self, state: State, controls: ArrayLike) -> tuple[State, Floats]:
         """Carry out controls (m, 5), m ≥ 1, as repeated `step` does, but without limits.
@@ -103,12 +103,13 @@ class Simulator:
         Returns the state at the end and the tips (m, 3).
         """
         self._own(state)
-        rows = np.array(controls, dtype=float, order="C")
-        s, rest, u, w = self._work(state)
-        tips = np.empty((len(rows), 3))
-        count = insertion.replay(self._model, s, rest, u, w, rows, tips)
-        mesh = mesh_of(self._model.nodes, w, count)
-        return solved(self.scenario, self._model, s, rest, u, mesh), tips
+        return self._carried_out(state, np.array(controls, dtype=float))
+
+    def _carried_out(self, state: State, controls: Floats) -> tuple[State, Floats]:
+        out, work = insertion.outputs(1, len(controls)), self._work(state)
+        start = state.needle, state.rest, state.compression
+        needle = insertion.rollout(self._model, *start, *work, _commands(controls[None]), 0, 1, out)
+        return solved(state, self._model, needle, *work), _planar(out.tips[0])
 
     def adapted(self, adaptation: model.Adaptation) -> "Simulator":
         """Return this simulator with the constants that an observer has estimated, for states of the same scenario."""
@@ -157,29 +158,28 @@ class Simulator:
 
         It is the scale of a plan's energy.
         """
-        nodes = self._model.nodes
-        above = nodes.x < depth
-        stored = displaced_energy(nodes.alpha, nodes.height, nodes.weight * nodes.energy, _LATERAL_MM)
-        return float(stored[above & (nodes.kind == model.CONTACT)].sum())
+        nodes, total = self._model.nodes, 0.0
+        for k, tissue in enumerate(laws_of(self.scenario.tissue)[0]):
+            of = nodes[(nodes["x"] < depth) & (nodes["kind"] == model.CONTACT) & (nodes["law"] == k)]
+            stored = tissue.energy(np.minimum(_LATERAL_MM / of["height"], tissue.limit))
+            total += float((of["weight"] * of["stiffness"] * of["height"] ** 2 * stored).sum())
+        return total
 
     def load(self, path: str | Path) -> State:
         """Read a state that `State.save` wrote; StateError with the differing key under another scenario."""
-        return State(self.scenario, self._model, **load_arrays(path, self.scenario))
+        return load_state(path, self.start())
 
     def _assimilated(self, state: State, tip_y: float, x: Floats, y: Floats) -> State:
-        s, rest, u, _ = self._work(state)
-        place = np.searchsorted(self._model.nodes.x, x)
+        place = self._model.nodes["x"].searchsorted(x)
         merged = self._model._replace(nodes=model.insert_essential(self._model.nodes, x))
-        rest, u = np.insert(rest, place, y), np.insert(u, place, 0.0)
-        w = np.zeros((nd.WORK_ROWS, rest.size))
-        count = insertion.settle(merged, s, rest, u, w, tip_y)
-        added = place + np.arange(x.size)
-        rest, u = np.delete(rest, added), np.delete(u, added)
-        return solved(self.scenario, self._model, s, rest, u, mesh_of(merged.nodes, w, count))
+        more = replace(
+            state, rest=np.insert(state.rest, place, y), compression=np.insert(state.compression, place, 0.0)
+        )
+        return self._settled(more, merged, tip_y)
 
     def _check_points(self, state: State, x: Floats) -> None:
         guide = [self.scenario.setup.guide_x] if self.scenario.setup.guide_x is not None else []
-        low, high = float(state.scalars[nd.BASE_X]), float(state.scalars[nd.TIP_X])
+        low, high = float(state.base[0]), float(state.tip[0])
         fixed = np.array([low, *guide, high])
         for k, value in enumerate(x):
             others = np.append(fixed, np.delete(x, k))
@@ -190,29 +190,27 @@ class Simulator:
                 )
                 raise CommandError("measured point x", float(value), high, rule)
 
-    def _settled(self, s: Floats, rest: Floats, u: Floats, held: float) -> State:
-        w = np.zeros((nd.WORK_ROWS, rest.size))
-        s[[nd.CUT_X, nd.CUT_Y, nd.CUT_TURN]] = s[[nd.TIP_X, nd.TIP_Y, nd.TIP_TURN]]
-        count = insertion.settle(self._model, s, rest, u, w, held)
-        return solved(self.scenario, self._model, s, rest, u, mesh_of(self._model.nodes, w, count))
+    def _settled(self, state: State, merged: model.Model, held: float) -> State:
+        work = self._work(state)
+        return solved(state, merged, insertion.settle(merged, state.needle, *work, held), *work)
 
     def _rollout(
         self, state: State, controls: ArrayLike, *, deflection: bool, limits: bool = True
     ) -> tuple[Any, ...]:
         self._own(state)
-        u = np.array(controls, dtype=float, order="C")  # a copy: the kernel is compiled for writable arrays
+        u = np.array(controls, dtype=float)
         if u.ndim != 3 or u.shape[2] != 5:
             raise CommandError("controls", float(u.ndim), 3.0, f"must have shape (N, m, 5), not {u.shape}")
         if limits:
             self._limits.check(state.travel, u)
         n, m = u.shape[:2]
-        out = np.zeros((n, m, 3)), np.zeros((n, m)), np.zeros((n, m), dtype=np.bool_)
-        spread = np.zeros((n, m) if deflection else (0, 0))
-        start = state.scalars, state.rest, state.compression
-        constants = self._model if limits else self._model._replace(tolerance=_AHEAD_TOLERANCE_MM)
+        out, commands = insertion.outputs(n, m, deflection=deflection), _commands(u)
+        start = state.needle, state.rest, state.compression
+        loose = self._model._replace(tolerance=_AHEAD_TOLERANCE_MM, slide=_AHEAD_TOLERANCE_MM)
+        constants = self._model if limits else loose
 
         def run(first: int, last: int) -> None:
-            insertion.rollout(constants, *start, u, first, last, *out, spread)
+            insertion.rollout(constants, *start, *self._work(state), commands, first, last, out)
 
         threads = min(self.threads, n * m // _STEPS_WORTH_A_THREAD)
         if threads <= 1:
@@ -220,7 +218,7 @@ class Simulator:
         else:
             edges = np.unique(np.linspace(0, n, threads * _CHUNKS_A_THREAD + 1).astype(int))
             list(self._pool.map(run, edges[:-1], edges[1:]))
-        return *out, spread
+        return _planar(out.tips), out.energy, out.converged, out.deflection
 
     def _own(self, state: State) -> None:
         if state.scenario is self.scenario:
@@ -229,9 +227,9 @@ class Simulator:
             theirs, mine = state.scenario.flat().get(key), self.scenario.flat().get(key)
             raise StateError(f"state of another scenario: {key} was {theirs}, is {mine}")
 
-    def _work(self, state: State) -> tuple[Floats, Floats, Floats, Floats]:
-        w = np.zeros((nd.WORK_ROWS, state.rest.size))
-        return state.scalars.copy(), state.rest.copy(), state.compression.copy(), w
+    def _work(self, state: State) -> tuple[nd.Laterals, nd.Laterals, nd.Work]:
+        """Copies of rest positions and compressions, and a work array."""
+        return state.rest.copy(), state.compression.copy(), nd.work_array(state.rest)
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
@@ -259,12 +257,13 @@ def _cores() -> int:
 
 def _build_model(scenario: Scenario) -> model.Model:
     tissue, needle = scenario.tissue, scenario.needle
+    laws, place = laws_of(tissue)
     layers = model.tissue_layers(
         np.array([layer.thickness_mm or np.inf for layer in tissue]),
-        np.array([layer.shear_modulus for layer in tissue]),
-        np.array([layer.alpha for layer in tissue]),
+        np.array([layer.modulus for layer in tissue]),
         np.array([layer.compression_length_mm for layer in tissue]),
         np.array([layer.engaged_width_mm for layer in tissue]),
+        np.array(place),
     )
     weight = np.array([layer.energy_weight for layer in tissue])
     depth = max(scenario.setup.max_depth, 0.0)
@@ -277,6 +276,21 @@ def _build_model(scenario: Scenario) -> model.Model:
         bevel.length_mm,
         nodes,
         layers,
+        law.tables(laws),
         part=model.SKIN_PART * spacing,
         zone=model.SKIN_ZONE * spacing,
     )
+
+
+def _commands(controls: Floats) -> Floats:
+    """Commands (…, 9) of the kernels for controls (…, 5)."""
+    rows = np.zeros((*controls.shape[:-1], insertion.COMMAND_SIZE))
+    rows[..., [insertion.DB_X, insertion.DB_Y, insertion.DB_THETA, insertion.DG_Y]] = controls[..., :4]
+    rows[..., insertion.ROLL] = np.where(controls[..., 4] > 0.0, math.pi, 0.0)
+    return rows
+
+
+def _planar(tips: Floats) -> Floats:
+    """x, y, θ (…, 3) of poses in space."""
+    planar: Floats = tips[..., [0, 1, 3]]
+    return planar

@@ -1,6 +1,7 @@
 """The state (X, C) of an insertion: a frozen value that can be compared, pickled, saved and loaded."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from io import BytesIO
@@ -13,16 +14,19 @@ from numpy.typing import NDArray
 
 from flexneedle.errors import StateError
 from flexneedle.files import replace_file
+from flexneedle.mechanics import insertion
 from flexneedle.mechanics import needle as nd
-from flexneedle.mechanics.model import CONTACT, Model, Nodes
+from flexneedle.mechanics.model import CONTACT, ESSENTIAL, Model
+from flexneedle.mechanics.needle import Laterals
 from flexneedle.mechanics.shape import beam_energy, equal_arc_nodes
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats
 
 _MECHANICS = ("needle.", "setup.", "tissue", "contact.")  # the keys that a state depends on
 _Array = TypeVar("_Array", bound=NDArray[Any])
-_WORK_ROWS = (nd.Y, nd.TURN, nd.SHEAR, nd.MOMENT, nd.FORCE, nd.ENERGY)
-_X, _Y, _TURN, _SHEAR, _MOMENT, _FORCE, _ENERGY, _WEIGHTED = range(8)  # rows of a mesh
+_Record = TypeVar("_Record", bound=tuple[Any, ...])
+_ACROSS = ("y", "slope", "shear", "moment", "force")
+_ENERGIES = ("energy", "weighted")
 
 
 class Contacts(NamedTuple):
@@ -55,85 +59,86 @@ class Reactions(NamedTuple):
 class State:
     """The insertion at one instant. Arrays are read-only; angles in rad, lengths in mm, energies in mJ.
 
-    `scalars` (STATE_SIZE,), `rest` (k,) and `compression` (k,) are the input of the next step;
-    `mesh` (8, j) is the solution at the nodes behind the tip, measured points included: x, y, θ, shear, moment,
-    force on the needle, stored energy, the same times w_c.
+    needle, `rest` (k,) and `compression` (k,) are the input of the next step. clamp: part of the base pose that no
+    command moved. `mesh` (j,) is the solution at the nodes behind the tip, measured points included: x; y, slope,
+    shear, moment and force on the needle; stored energy, the same times w_c. spring_energy: of the tip spring.
     """
 
     scenario: Scenario
     model: Model
-    scalars: Floats
-    rest: Floats
-    compression: Floats
-    mesh: Floats
+    needle: nd.Needle
+    clamp: nd.Pose
+    rest: Laterals
+    compression: Laterals
+    mesh: NDArray[Any]
+    spring_energy: float
 
     @property
     def tip(self) -> Floats:
         """Tip pose x, y, θ, shape (3,)."""
-        tip: Floats = self.scalars[[nd.TIP_X, nd.TIP_Y, nd.TIP_TURN]]
-        return tip
+        return np.array(self.needle.solution.tip)
 
     @property
     def base(self) -> Floats:
         """Pose of the base clamp x, y, θ, shape (3,)."""
-        base: Floats = self.scalars[[nd.BASE_X, nd.BASE_Y, nd.BASE_TURN]]
-        return base
+        return np.array(self.needle.boundary.base)
 
     @property
     def travel(self) -> Floats:
         """Sum of the commands since the start: base x, y (mm), base θ (rad) and guide (mm), shape (4,)."""
-        s = self.scalars
-        travel: Floats = s[[nd.BASE_X, nd.BASE_Y, nd.BASE_TURN, nd.GUIDE_Y]]
-        travel[:3] -= self.scenario.start_base_x + s[nd.CLAMP_X], s[nd.CLAMP_Y], s[nd.CLAMP_TURN]
-        return travel
+        base, clamp = self.needle.boundary.base, self.clamp
+        x = base.x - (self.scenario.start_base_x + clamp.x)
+        return np.array([x, base.y - clamp.y, base.slope - clamp.slope, self.guide])
 
     @property
     def guide(self) -> float:
         """Lateral position of the guide (mm); 0 without a guide."""
-        return float(self.scalars[nd.GUIDE_Y])
+        return float(self.needle.boundary.guide.real)
 
     @property
     def bevel(self) -> int:
         """Bevel direction bvl, −1 or +1; +1 bends the path towards +y."""
-        return int(self.scalars[nd.BEVEL])
+        return int(self.needle.boundary.bevel.real)
 
     @property
     def tip_load(self) -> float:
         """Additional lateral force at the tip (N), estimated by an observer."""
-        return float(self.scalars[nd.TIP_LOAD])
+        return float(self.needle.boundary.load.real)
 
     @property
     def converged(self) -> bool:
         """Whether the last solve reached its tolerance."""
-        return bool(self.scalars[nd.CONVERGED] > 0.0)
+        return self.needle.solution.converged
 
     @property
     def iterations(self) -> int:
         """Newton iterations of the last solve."""
-        return int(self.scalars[nd.ITERATIONS])
+        return self.needle.solution.iterations
 
     @property
     def residual(self) -> float:
         """Estimated distance of the last solve from equilibrium (mm)."""
-        return float(self.scalars[nd.RESIDUAL])
+        return self.needle.solution.residual
 
     @cached_property
     def nodes(self) -> Floats:
         """Needle state X: (n, 3) of x, y, θ at n equal arc lengths from base to tip."""
-        return _frozen(equal_arc_nodes(*self._curve(), self.scenario.needle.nodes))
+        nodes = np.empty((self.scenario.needle.nodes, insertion.POSE_SIZE))
+        equal_arc_nodes(*self._curve(), nodes)
+        return _frozen(nodes[:, [0, 1, 3]])
 
     @cached_property
     def contacts(self) -> Contacts:
         """The cut channel."""
         nodes = self.model.nodes
-        formed = (nodes.kind == CONTACT) & (nodes.x < self.scalars[nd.FRONT])
-        active = nodes.x < self.scalars[nd.TIP_X]
+        formed = (nodes["kind"] == CONTACT) & (nodes["x"] < self.needle.channel.front)
+        active = nodes["x"] < self.needle.solution.tip.x
         compression = np.where(active, self.compression, 0.0)
         columns = (
-            nodes.x,
+            nodes["x"],
             self.rest,
             self.rest + compression,
-            1.0 - np.abs(compression) / nodes.height,
+            1.0 - np.abs(compression) / nodes["height"],
             active,
         )
         return Contacts(*(_frozen(column[formed]) for column in columns))
@@ -142,28 +147,24 @@ class State:
     def strain_energy(self) -> float:
         """Tissue strain energy Σ w_c W of the contacts (mJ), weighted by layer (paper eq. 12)."""
         # Summed in order, as the rollout kernel does, so that both agree to the last bit.
-        return float(np.cumsum(np.append(0.0, self.mesh[_WEIGHTED]))[-1])
+        return float(np.cumsum(np.append(0.0, self.mesh["weighted"]))[-1])
 
     @cached_property
     def energy(self) -> float:
         """Stored energy of beam, contacts and tip spring (mJ), unweighted."""
         x, _, _ = self._curve()
-        shear = np.append(self.scalars[nd.BASE_SHEAR], self.mesh[_SHEAR])
-        moment = np.append(self.scalars[nd.BASE_MOMENT], self.mesh[_MOMENT])
+        loads = self.needle.solution.loads
+        shear = np.append(loads.shear, self.mesh["shear"])
+        moment = np.append(loads.moment, self.mesh["moment"])
         beam = beam_energy(x, shear, moment, self.model.bending_stiffness)
-        return float(beam + self.mesh[_ENERGY].sum() + self.scalars[nd.SPRING_ENERGY])
+        return float(beam + self.mesh["energy"].sum() + self.spring_energy)
 
     @property
     def reactions(self) -> Reactions:
         """Forces of clamp, guide and held tip on the needle."""
-        s = self.scalars
-        guide = self.mesh[_FORCE][self.mesh[_X] == self.scenario.setup.guide_x]
-        return Reactions(
-            -float(s[nd.BASE_SHEAR]),
-            -float(s[nd.BASE_MOMENT]),
-            float(guide.sum()),
-            float(s[nd.TIP_REACTION]),
-        )
+        loads = self.needle.solution.loads
+        guide = self.mesh["force"][self.mesh["x"] == self.scenario.setup.guide_x]
+        return Reactions(-loads.shear.real, -loads.moment.real, float(guide.sum()), loads.reaction.real)
 
     def with_estimate(
         self,
@@ -177,19 +178,19 @@ class State:
 
         A corrected base position does not count as travel.
         """
-        scalars = self.scalars.copy()
-        if base_x is not None:
-            scalars[nd.CLAMP_X] += base_x - scalars[nd.BASE_X]
-            scalars[nd.BASE_X] = base_x
-        if base_y is not None:
-            scalars[nd.CLAMP_Y] += base_y - scalars[nd.BASE_Y]
-            scalars[nd.BASE_Y] = base_y
-        if base_turn is not None:
-            scalars[nd.CLAMP_TURN] += base_turn - scalars[nd.BASE_TURN]
-            scalars[nd.BASE_TURN] = base_turn
-        if tip_load is not None:
-            scalars[nd.TIP_LOAD] = tip_load
-        return replace(self, scalars=_frozen(scalars))
+        boundary, clamp = self.needle.boundary, self.clamp
+        old = boundary.base
+        base = nd.Pose(
+            old.x if base_x is None else base_x,
+            old.y if base_y is None else base_y,
+            old.slope if base_turn is None else base_turn,
+        )
+        moved = nd.Pose(
+            clamp.x + (base.x - old.x), clamp.y + (base.y - old.y), clamp.slope + (base.slope - old.slope)
+        )
+        load = boundary.load if tip_load is None else tip_load
+        needle = self.needle._replace(boundary=boundary._replace(base=base, load=load))
+        return replace(self, needle=needle, clamp=moved)
 
     def save(self, path: str | Path) -> None:
         """Write the state to `path` (NumPy npz); load it with `Simulator.load`."""
@@ -199,15 +200,18 @@ class State:
 
     def _arrays(self) -> dict[str, Any]:
         return {
-            "scalars": self.scalars,
+            "needle": np.array(_flat(self.needle)),
+            "clamp": np.array(self.clamp),
             "rest": self.rest,
             "compression": self.compression,
             "mesh": self.mesh,
+            "spring_energy": np.array(self.spring_energy),
         }
 
-    def _curve(self) -> tuple[Floats, Floats, Floats]:
-        """x, y, θ of base, nodes and tip."""
-        rows = zip(self.base, self.mesh[: _TURN + 1], self.tip, strict=True)
+    def _curve(self) -> tuple[Floats, Laterals, Laterals]:
+        """x, y, slope of base, nodes and tip."""
+        ends = self.needle.boundary.base, self.needle.solution.tip
+        rows = zip(ends[0], (self.mesh[name] for name in ("x", "y", "slope")), ends[1], strict=True)
         first, second, third = (np.concatenate([[base], inner, [tip]]) for base, inner, tip in rows)
         return first, second, third
 
@@ -239,36 +243,70 @@ def mechanics_difference(one: Scenario, other: Scenario) -> str | None:
     return None
 
 
-def load_arrays(path: str | Path, scenario: Scenario) -> dict[str, Floats]:
-    """Read a file of `State.save`; StateError if it is not one, or of another scenario, with the differing key."""
+def load_state(path: str | Path, start: State) -> State:
+    """Read a file of `State.save`, for the scenario and model of `start`.
+
+    StateError if it is not one, or of another scenario, with the differing key.
+    """
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         saved = Scenario.from_record(json.loads(str(arrays.pop("scenario"))), source=str(path))
     except (OSError, ValueError, KeyError, AttributeError, EOFError, BadZipFile) as error:
         raise StateError(f"{path}: not a saved state ({error})") from error
-    if (key := mechanics_difference(saved, scenario)) is not None:
-        mine, theirs = scenario.flat().get(key), saved.flat().get(key)
+    if (key := mechanics_difference(saved, start.scenario)) is not None:
+        mine, theirs = start.scenario.flat().get(key), saved.flat().get(key)
         raise StateError(f"{path}: saved under another scenario: {key} was {theirs}, is {mine}")
-    if set(arrays) != {"scalars", "rest", "compression", "mesh"} or arrays["scalars"].shape != (
-        nd.STATE_SIZE,
-    ):
+    known = {name: (array.dtype, array.ndim) for name, array in start._arrays().items()}
+    if {name: (array.dtype, array.ndim) for name, array in arrays.items()} != known:
         raise StateError(f"{path}: saved by another version of flexneedle")
-    return {name: _frozen(array) for name, array in arrays.items()}
+    needle = _filled(start.needle, iter(arrays.pop("needle").tolist()))
+    clamp, energy = nd.Pose(*arrays.pop("clamp").tolist()), float(arrays.pop("spring_energy"))
+    parts = {name: _frozen(array) for name, array in arrays.items()}
+    return replace(start, needle=needle, clamp=clamp, spring_energy=energy, **parts)
 
 
-def solved(scenario: Scenario, model: Model, s: Floats, rest: Floats, u: Floats, mesh: Floats) -> State:
-    """Freeze the work arrays of a solve and its `mesh_of` into a state."""
-    return State(scenario, model, _frozen(s), _frozen(rest), _frozen(u), _frozen(mesh))
+def _flat(record: tuple[Any, ...]) -> list[Any]:
+    """All numbers of nested records."""
+    return [number for part in record for number in (_flat(part) if isinstance(part, tuple) else [part])]
 
 
-def mesh_of(nodes: Nodes, w: Floats, count: int) -> Floats:
-    """Collect the solution at the `count` nodes behind the tip, (8, count), from the work array of a solve."""
-    mesh = np.concatenate([nodes.x[None, :count], w[list(_WORK_ROWS), :count], np.zeros((1, count))])
-    tissue = nodes.kind[:count] == CONTACT
-    mesh[_ENERGY] = np.where(tissue, mesh[_ENERGY], 0.0)
-    mesh[_WEIGHTED] = nodes.weight[:count] * mesh[_ENERGY]
-    return mesh
+def _filled(like: _Record, numbers: Iterator[Any]) -> _Record:
+    """Records as `like`, of these numbers."""
+    parts = (
+        _filled(part, numbers) if isinstance(part, tuple) else _typed(part, next(numbers)) for part in like
+    )
+    return type(like)(*parts)
+
+
+def _typed(like: Any, number: Any) -> Any:
+    return type(like)(number) if isinstance(like, complex) else type(like)(number.real)
+
+
+def solved(start: State, model: Model, needle: nd.Needle, rest: Laterals, u: Laterals, w: nd.Work) -> State:
+    """Freeze a solve of `model` into a state of `start`'s scenario. `model` may have more essential nodes than it."""
+    count = needle.solution.last.behind
+    stored = np.zeros(count)
+    spring = insertion.energies(model, needle, u, stored)
+    across, nodes = rest.dtype, model.nodes[:count]
+    names = [
+        ("x", stored.dtype),
+        *((name, across) for name in _ACROSS),
+        *((name, stored.dtype) for name in _ENERGIES),
+    ]
+    mesh = np.zeros(count, names)
+    for name in _ACROSS:
+        mesh[name] = w[name][:count]
+    mesh["x"], mesh["energy"], mesh["weighted"] = nodes["x"], stored, nodes["weight"] * stored
+    own = np.flatnonzero(model.nodes["kind"] != ESSENTIAL)
+    return replace(
+        start,
+        needle=needle,
+        rest=_frozen(rest[own]),
+        compression=_frozen(u[own]),
+        mesh=_frozen(mesh),
+        spring_energy=spring,
+    )
 
 
 def _frozen(array: _Array) -> _Array:

@@ -18,13 +18,13 @@ from flexneedle.rig.parts import (
     SCENARIO_TRACKER,
     controller_of,
     digests,
-    is_own,
     own_controllers,
     plant_of,
     tracker_of,
 )
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PLANTS
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.own import is_own
 from flexneedle.scenario.problems import Problem, printable, to_line
 from flexneedle.scenario.worlds import CASES, REAL, STRUCTURE, world
 from flexneedle.study.spec import (

@@ -91,9 +91,9 @@ def test_layer_boundaries_are_at_their_drawn_depths():
     for seed in range(150):
         phantom = alone(seed, layer_shift_sd_mm=1.5, element_mm=30.0)
         rod = phantom._plant.rod
-        force = rod.force
-        (jump,) = np.flatnonzero(np.diff(force))
-        assert force[jump + 1] / force[jump] == pytest.approx(3.63 / 1.82)
+        k = rod.foundation
+        (jump,) = np.flatnonzero(np.diff(k))
+        assert k[jump + 1] / k[jump] == pytest.approx(3.63 / 1.82)
         drawn = phantom._truth.scenario.layer_tops[1]
         assert (jump + 1) * rod.cell == pytest.approx(drawn, abs=0.5 * rod.cell + 1e-9)
         steps.append(drawn)
@@ -109,8 +109,8 @@ def test_stiffness_varies_along_the_depth_with_its_size_and_correlation():
             rod = alone(
                 seed, shear_modulus_variation=0.2, variation_length_mm=length, element_mm=30.0
             )._plant.rod
-            plain = np.where((np.arange(rod.force.size) + 0.5) * rod.cell < 20.0, 1.82, 3.63)
-            cells.append(rod.force / plain)
+            plain = np.where((np.arange(rod.law.size) + 0.5) * rod.cell < 20.0, 1.82, 3.63)
+            cells.append(rod.foundation / plain)
         factor = np.array(cells) / np.mean(cells)
         assert factor.std() == pytest.approx(0.2, rel=0.08)
         lag = round(10.0 / 0.25)

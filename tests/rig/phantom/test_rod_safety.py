@@ -130,12 +130,12 @@ def test_a_full_channel_ends_the_cut_and_not_the_program():
 def test_beyond_the_last_cell_the_tissue_is_that_of_the_last_cell():
     """Cells end 2 mm beyond the stroke; a contact point beyond uses the last cell."""
     needle = plant()
-    depth = needle.rod.alpha.size * needle.rod.cell
+    depth = needle.rod.law.size * needle.rod.cell
     assert depth >= IDEAL.setup.max_depth + 2.0
     needle._s[rd.BASE_X] += depth + 27.0
     move(needle, 0.25, times=20)
     assert needle.tip[0] > depth
-    assert needle._channel[rd.C_FORCE, needle._count - 1] > 0.0
+    assert needle._channel[rd.C_STIFFNESS, needle._count - 1] > 0.0
 
 
 def imports(path):
@@ -154,11 +154,16 @@ def imports(path):
 
 
 def test_the_rod_shares_no_solver_with_the_controllers_model():
-    """From the package it imports only the two decorators for compilation."""
+    """From the package it imports only the two decorators for compilation, and the tables of the tissue's laws."""
     path = Path(flexneedle.rig.phantom.__file__).with_name("rod.py")
     ours = {pair for pair in imports(path) if pair[0].startswith("flexneedle")}
-    assert ours == {("flexneedle.mechanics.compile", "inner"), ("flexneedle.mechanics.compile", "kernel")}
-    assert {module for module, _ in imports(path)} - {"flexneedle.mechanics.compile"} == {
+    assert ours == {
+        ("flexneedle.mechanics.compile", "inner"),
+        ("flexneedle.mechanics.compile", "kernel"),
+        ("flexneedle.mechanics.law", "response"),
+        ("flexneedle.mechanics.law", "stored_energy"),
+    }
+    assert {module for module, _ in imports(path)} - {module for module, _ in ours} == {
         "math",
         "typing",
         "numpy",
@@ -166,7 +171,7 @@ def test_the_rod_shares_no_solver_with_the_controllers_model():
     }
 
 
-def test_the_exact_plant_imports_from_mechanics_only_the_scales_of_the_law():
+def test_the_exact_plant_imports_from_mechanics_only_the_tables_of_the_laws():
     path = Path(flexneedle.rig.phantom.__file__).with_name("plants.py")
     ours = {pair for pair in imports(path) if pair[0].startswith("flexneedle.mechanics")}
-    assert ours == {("flexneedle.mechanics.ogden", "law_scales")}
+    assert ours == {("flexneedle.mechanics.law", "tables")}

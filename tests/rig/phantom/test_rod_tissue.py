@@ -7,18 +7,26 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexneedle.mechanics import ogden
+from flexneedle.mechanics.law import tables
 from flexneedle.rig.phantom import rod as rd
+from flexneedle.scenario.tissue.ogden import Ogden
+from reference.insertion import Tissue, ogden
 from reference.rods import IDEAL, Bench, move, plant, uncompiled
 from reference.validation import MOVES, bent, energy_balance, friction_balance, insertion_balance
 
 PLAIN = uncompiled(rd)
-LAW = uncompiled(ogden)
+
+
+def ogden_layer(alpha):
+    """A layer of this law; stiffness and size are those of a test."""
+    return Ogden(alpha=alpha, shear_modulus_kpa=1.0, compression_length_mm=20.0, engaged_width_mm=1.0)
+
+
 TISSUE = {
-    "alpha": np.array([6.0, 8.74, -5.0]),
+    "laws": tables([ogden_layer(alpha) for alpha in (6.0, 8.74, -5.0, 8.0)]),
+    "law": np.array([0, 1, 2]),
     "height": np.array([20.0, 15.0, 25.0]),
-    "force": np.array([1.5, 2.7, -0.9]),
-    "energy": np.array([5.0, 4.63, 4.5]),
+    "foundation": np.array([0.675, 2.36, 0.27]),
     "weight": np.array([1.0, 2.0, 0.5]),
     "cell": 14.0,
 }
@@ -34,24 +42,22 @@ AHEAD, BACK = 0.25, -0.25
     volume=st.floats(0.1, 200.0),
 )
 @settings(deadline=None, derandomize=True, max_examples=300)
-def test_the_law_agrees_with_the_controllers(alpha, height, share, modulus, volume):
-    """Independent code agrees to round-off, also beyond the floor stretch; with opposite sign of the force."""
-    force, energy = ogden.law_scales(*map(np.array, (modulus, alpha, height, volume)))
-    u = share * height
-    f, k, stored, stretch = PLAIN._law(alpha, height, float(force), float(energy), u)
-    theirs = LAW.contact_law(alpha, height, float(force), float(energy), u)
-    scale = abs(theirs[1]) * height
-    np.testing.assert_allclose(
-        [-f, k * height], [theirs[0], theirs[1] * height], rtol=1e-9, atol=1e-13 * scale
-    )
-    # 2λ^(−α/2) + λ^α − 3 cancels near 1.
-    assert stored == pytest.approx(theirs[2], rel=1e-9, abs=1e-13 * (scale * height + abs(float(energy))))
+def test_the_law_is_that_of_the_equations(alpha, height, share, modulus, volume):
+    """Written out as in equations 1 to 3, also beyond the floor stretch; the stiffness as far as a table has it."""
+    u, table = share * height, tables([ogden_layer(alpha)])[0]
+    f, k, stored, stretch = PLAIN._law(table, height, 3.0 * modulus * volume / height**2, u)
+    point = Tissue(*(np.array([value]) for value in (modulus, alpha, height, volume)))
+    energy, force, stiffness = (float(values[0]) for values in ogden(point, np.array([u])))
+    size = modulus * volume / alpha**2  # 2λ^(−α/2) + λ^α − 3 cancels near 1
+    assert f == pytest.approx(-force, rel=1e-9, abs=1e-13 * size / height)
+    assert k == pytest.approx(stiffness, rel=1e-7 if alpha < -18.0 else 1e-8)
+    assert stored == pytest.approx(energy, rel=1e-9, abs=1e-13 * size)
     assert stretch == 1.0 - abs(u) / height
 
 
 @pytest.mark.parametrize("u", [-19.0, -15.0, -8.0, -1e-3, 1e-3, 3.0, 13.9, 14.1, 25.0])
 def test_force_and_stiffness_are_the_derivatives_of_the_energy(u):
-    law = (8.74, 20.0, 0.8, 0.8 * 20.0 / 8.74)
+    law = tables([ogden_layer(8.74)])[0], 20.0, 1.5 * 8.74 * 0.8 / 20.0
     (_, _, above, _), (_, _, below, _) = PLAIN._law(*law, u + 1e-5), PLAIN._law(*law, u - 1e-5)
     f, k, _, _ = PLAIN._law(*law, u)
     assert f == pytest.approx((above - below) / 2e-5, rel=1e-6)
@@ -87,7 +93,7 @@ def crooked(seed, *, guide=True, channel=True):
         bench.count = POINTS
         bench.channel[rd.C_X, :POINTS] = x
         bench.channel[rd.C_Y, :POINTS] = np.interp(x, *nodes.T) + rng.normal(0.0, 3.0, POINTS)
-        law = {rd.C_HEIGHT: 20.0, rd.C_ALPHA: 8.0, rd.C_FORCE: 0.8, rd.C_ENERGY: 2.0, rd.C_WEIGHT: 1.0}
+        law = {rd.C_LAW: 3, rd.C_HEIGHT: 20.0, rd.C_STIFFNESS: 0.48, rd.C_WEIGHT: 1.0}
         for row, value in law.items():
             bench.channel[row, :POINTS] = value
     # The front is 5 mm ahead: no bevel here, whose force has no energy.
@@ -181,13 +187,8 @@ def test_the_bevels_force_is_normal_to_the_tip():
     expected = 0.0
     for above, below in zip([top, *cuts], [*cuts, depth], strict=True):
         c, length = int(0.5 * (above + below) / 14.0), (below - above) / np.cos(turn)
-        f, *_ = PLAIN._law(
-            TISSUE["alpha"][c],
-            TISSUE["height"][c],
-            TISSUE["force"][c] * length,
-            TISSUE["energy"][c] * length,
-            -2.0,
-        )
+        table = TISSUE["laws"][TISSUE["law"][c]]
+        f, *_ = PLAIN._law(table, TISSUE["height"][c], TISSUE["foundation"][c] * length, -2.0)
         expected += f
     np.testing.assert_allclose(push, expected * np.array([-np.sin(turn), np.cos(turn)]), rtol=1e-9)
     assert expected < 0.0  # gradient: the tissue pushes the tip towards +y

@@ -8,7 +8,6 @@ import numpy as np
 
 from flexneedle.rig.phantom.structure import guide_to_skin, structure_values, with_hidden_layer
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.sections.tissue import MOST_BEVEL
 
 _THINNEST_MM = 0.1  # least thickness of a layer between displaced boundaries
 
@@ -73,9 +72,9 @@ def _bevel_factor(scenario: Scenario, rng: np.random.Generator) -> float:
     """Draw the factor on the bevel offset, from the part of its range that is valid for a bevel."""
     low, high = scenario.phantom.bevel_factor
     offset = scenario.needle.bevel.offset_mm
-    least = min(layer.compression_length_mm for layer in scenario.tissue)
-    least *= scenario.phantom.structure.compression_length_factor
-    most = min(high, MOST_BEVEL * least / offset) if offset > 0.0 else high
+    held = min(layer.most_bevel_mm for layer in scenario.tissue)
+    held *= scenario.phantom.structure.compression_length_factor
+    most = min(high, held / offset) if offset > 0.0 else high
     return float(rng.uniform(min(low, most), most))
 
 

@@ -7,9 +7,10 @@ from typing import Protocol
 import numpy as np
 
 from flexneedle.errors import InputError
-from flexneedle.mechanics.ogden import law_scales
+from flexneedle.mechanics.law import tables
 from flexneedle.rig.phantom import rod as rd
 from flexneedle.rig.phantom.draw import Truth
+from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Floats
@@ -166,17 +167,11 @@ def build_rod(truth: Truth, segments: int) -> rd.Rod:
     factor[known:] = truth.variation[-1]
     middle = (np.arange(cells) + 0.5) * cell
     which = np.searchsorted(np.array(scenario.layer_tops[1:]), middle, side="right")
-    modulus, alpha, height, width, weight = (
+    laws, place = laws_of(scenario.tissue)
+    modulus, height, width, weight = (
         np.array([getattr(layer, name) for layer in scenario.tissue])[which]
-        for name in (
-            "shear_modulus",
-            "alpha",
-            "compression_length_mm",
-            "engaged_width_mm",
-            "energy_weight",
-        )
+        for name in ("modulus", "compression_length_mm", "engaged_width_mm", "energy_weight")
     )
-    force, energy = law_scales(modulus * factor, alpha, height, width * height)
     guide = scenario.setup.guide_x
     return rd.Rod(
         stiffness=needle.bending_stiffness,
@@ -190,10 +185,10 @@ def build_rod(truth: Truth, segments: int) -> rd.Rod:
         friction=settings.friction,
         spacing=settings.contact_spacing_mm,
         cell=cell,
-        alpha=alpha,
+        laws=tables(laws),
+        law=np.array(place)[which],
         height=height,
-        force=force,
-        energy=energy,
+        foundation=modulus * factor * width / height,
         weight=weight,
     )
 

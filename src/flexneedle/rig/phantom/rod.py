@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.mechanics.compile import inner, kernel
+from flexneedle.mechanics.law import response, stored_energy
 
 Floats = NDArray[np.float64]
 
@@ -31,8 +32,8 @@ BASE_FORCE_X, BASE_FORCE_Y, BASE_MOMENT, GUIDE_FORCE, CURVED = range(22, 27)
 SIZE = 27
 
 # Rows of the channel, one column per point: position, distance along the path, segment, constants of its law.
-C_X, C_Y, C_CUT, C_SEGMENT, C_HEIGHT, C_ALPHA, C_FORCE, C_ENERGY, C_WEIGHT = range(9)
-CHANNEL_ROWS = 9
+C_X, C_Y, C_CUT, C_SEGMENT, C_LAW, C_HEIGHT, C_STIFFNESS, C_WEIGHT = range(8)
+CHANNEL_ROWS = 8
 
 # Rows of the work array, one column per segment (the last one the tip): node, gradient, Hessian, gains,
 # friction, Newton step, bending moment before it.
@@ -42,7 +43,6 @@ WORK_ROWS = 19
 TOLERANCE_MM = 1e-9
 ACCEPTED_MM = 1e-6  # a solve may stall above TOLERANCE_MM where a point is added or the tip crosses the skin
 MAX_ITERATIONS = 60
-FLOOR_STRETCH = 0.3
 _LONGEST_MM = 2.0  # largest displacement of a node in an iteration
 _SMALL_MM = 1e-8  # a Newton step below it is accepted without a line search
 _HALVINGS = 16  # of a Newton step, from _LONGEST_MM to _SMALL_MM
@@ -52,8 +52,8 @@ _STEADY = 0.1  # of a segment: distance of a foot point outside of its segment b
 class Rod(NamedTuple):
     """Constants: bending stiffness (N·mm²), segment length (mm), natural curvature (1/mm, for bevel +1), bevel
     offset and length (mm), guide plane (mm, NaN: none), its clearance (mm) and stiffness (N/mm), friction (N/mm),
-    spacing of channel points (mm); tissue by depth in cells of `cell` mm: alpha, height (mm), force (N) and
-    energy (mJ) scales for 1 mm of needle, and layer weight.
+    spacing of channel points (mm); laws: tables of `mechanics.law`; tissue by depth in cells of `cell` mm: index of its
+    law, height (mm), initial stiffness (N/mm) of 1 mm of needle, and layer weight.
     """
 
     stiffness: float
@@ -67,33 +67,20 @@ class Rod(NamedTuple):
     friction: float
     spacing: float
     cell: float
-    alpha: Floats
+    laws: Floats
+    law: NDArray[np.int64]
     height: Floats
-    force: Floats
-    energy: Floats
+    foundation: Floats
     weight: Floats
 
 
 @inner
-def _law(
-    alpha: float, height: float, force: float, energy: float, u: float
-) -> tuple[float, float, float, float]:
-    """dW/du (N), d²W/du² (N/mm), W (mJ) and stretch of a one-term Ogden column displaced by u (mm)."""
-    stretch = 1.0 - abs(u) / height
-    beyond = 0.0
-    lam = stretch
-    if lam < FLOOR_STRETCH:
-        beyond = (FLOOR_STRETCH - lam) * height
-        lam = FLOOR_STRETCH
-    slope = force * (lam ** (-0.5 * alpha - 1.0) - lam ** (alpha - 1.0))
-    k = (
-        force
-        / height
-        * ((0.5 * alpha + 1.0) * lam ** (-0.5 * alpha - 2.0) + (alpha - 1.0) * lam ** (alpha - 2.0))
-    )
-    stored = energy * (2.0 * lam ** (-0.5 * alpha) + lam**alpha - 3.0) + (slope + 0.5 * k * beyond) * beyond
-    slope += k * beyond
-    return (slope if u >= 0.0 else -slope), k, stored, stretch
+def _law(table: Floats, height: float, stiffness: float, u: float) -> tuple[float, float, float, float]:
+    """dW/du (N), d²W/du² (N/mm), W (mJ) and stretch of tissue displaced by u (mm)."""
+    e = abs(u) / height
+    law = response(table, e)
+    stored = stiffness * height * height * stored_energy(table, e)
+    return stiffness * law.secant * u, stiffness * law.tangent, stored, 1.0 - e
 
 
 @inner
@@ -168,9 +155,8 @@ def _add_channel(rod: Rod, s: Floats, w: Floats, theta: Floats, channel: Floats,
         channel[C_SEGMENT, j] = i
         nx, ny = -math.sin(theta[i]), math.cos(theta[i])
         u = (w[X, i] - x) * nx + (w[Y, i] - y) * ny
-        f, k, stored, stretch = _law(
-            channel[C_ALPHA, j], channel[C_HEIGHT, j], channel[C_FORCE, j], channel[C_ENERGY, j], u
-        )
+        table = rod.laws[int(channel[C_LAW, j])]
+        f, k, stored, stretch = _law(table, channel[C_HEIGHT, j], channel[C_STIFFNESS, j], u)
         ramp = min(1.0, behind / (0.5 * rod.spacing))
         f, k, stored = f * ramp, k * ramp, stored * ramp
         w[GX, i] += f * nx
@@ -226,12 +212,10 @@ def _add_bevel(rod: Rod, s: Floats, w: Floats, n: int, before: tuple[float, floa
     top, bottom = max(0.0, front - rod.bevel_length / per_x), s[TIP_X]
     force, stiffness, stored = 0.0, 0.0, 0.0
     first = int(top / rod.cell)
-    for c in range(first, min(int(bottom / rod.cell), rod.alpha.size - 1) + 1):
+    for c in range(first, min(int(bottom / rod.cell), rod.law.size - 1) + 1):
         length = (min(bottom, (c + 1) * rod.cell) - max(top, c * rod.cell)) * per_x
         if length > 0.0:
-            f, k, e, _ = _law(
-                rod.alpha[c], rod.height[c], rod.force[c] * length, rod.energy[c] * length, -offset
-            )
+            f, k, e, _ = _law(rod.laws[rod.law[c]], rod.height[c], rod.foundation[c] * length, -offset)
             force, stiffness, stored = force + f, stiffness + k, stored + e
     w[GX, n] += force * nx
     w[GY, n] += force * ny
@@ -406,14 +390,13 @@ def _extend(rod: Rod, s: Floats, channel: Floats, count: int, segments: int) -> 
     while (count + 0.5) * rod.spacing < s[CUT] + cut and count < channel.shape[1]:
         share = ((count + 0.5) * rod.spacing - s[CUT]) / cut
         x = s[FRONT_X] + share * (s[TIP_X] - s[FRONT_X])
-        c = min(int(x / rod.cell), rod.alpha.size - 1)
+        c = min(int(x / rod.cell), rod.law.size - 1)
         channel[C_X, count] = x
         channel[C_Y, count] = s[FRONT_Y] + share * (s[TIP_Y] - s[FRONT_Y])
         channel[C_CUT, count] = (count + 0.5) * rod.spacing
         channel[C_SEGMENT, count] = segments - 1
-        channel[C_HEIGHT, count], channel[C_ALPHA, count] = rod.height[c], rod.alpha[c]
-        channel[C_FORCE, count] = rod.force[c] * rod.spacing
-        channel[C_ENERGY, count] = rod.energy[c] * rod.spacing
+        channel[C_LAW, count], channel[C_HEIGHT, count] = rod.law[c], rod.height[c]
+        channel[C_STIFFNESS, count] = rod.foundation[c] * rod.spacing
         channel[C_WEIGHT, count] = rod.weight[c]
         count += 1
     if (count + 0.5) * rod.spacing < s[CUT] + cut:  # no room for more points: the tissue is incomplete

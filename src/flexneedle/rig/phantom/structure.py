@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import Any
 
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.tissue.ogden import Ogden
 
 _THINNEST_MM = 1e-3  # least thickness of a piece of a layer
 
@@ -30,7 +31,8 @@ def structure_values(scenario: Scenario) -> dict[str, Any]:
     for k, layer in enumerate(scenario.tissue):
         length = structure.compression_length_factor * layer.compression_length_mm
         values[f"tissue.{k}.compression_length_mm"] = length
-        values[f"tissue.{k}.alpha"] = layer.alpha if structure.alpha is None else structure.alpha
+        if structure.alpha is not None and isinstance(layer, Ogden):
+            values[f"tissue.{k}.alpha"] = structure.alpha
     return values
 
 

@@ -9,7 +9,7 @@ from flexneedle.scenario.problems import Problem
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.scenario.sections.fields import LARGEST, NonNegative, Positive, Section
 from flexneedle.scenario.sections.needle import Needle
-from flexneedle.scenario.sections.tissue import Alpha
+from flexneedle.scenario.tissue.ogden import Alpha
 
 _SECTION = "phantom.structure."
 

@@ -9,9 +9,9 @@ from typing import Any
 from flexneedle.control.methods import checked
 from flexneedle.errors import ScenarioError
 from flexneedle.files import replace_file
-from flexneedle.rig.parts import is_own
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.own import is_own
 from flexneedle.scenario.preset import PRESETS
 from flexneedle.scenario.worlds import world_name
 from flexneedle.study.findings.rows import Rows

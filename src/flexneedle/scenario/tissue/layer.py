@@ -1,0 +1,96 @@
+"""A layer of tissue: what all laws have in common, and the contact points between tissue and needle."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, Title
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+_BEVEL_MARGIN = 0.001
+
+
+class Layer(Section):
+    """One `[[tissue]]`. A law is a subclass, alone in a file of this folder: its parameters and three functions.
+
+    A lateral displacement u of the needle compresses tissue of length h radially by e = |u|/h. A law gives energy,
+    force and stiffness over e, divided by k h², k h and k, where k is the stiffness at e = 0: that of 1 mm of needle
+    is `modulus` w/h. So for small e the energy is e²/2, the force, its derivative, e, and the stiffness 1.
+    The stiffness must be positive up to `limit`, beyond which the force continues linearly.
+    """
+
+    limit: ClassVar[float]
+    """Relative compression e, below 1, up to which the law is valid."""
+
+    law: str
+    """Law of radial compression, by the name of its file."""
+    name: Title = "tissue"
+    """Name in tables and figures."""
+    thickness_mm: Positive | None = None
+    """Thickness, required for every layer but the last, which has no lower end: a thickness given for it is ignored."""
+    shear_modulus_kpa: Positive
+    """μ, shear modulus at small strain."""
+    compression_length_mm: Positive
+    """h, length of tissue that a lateral displacement u of the needle compresses: stretch 1 − |u|/h."""
+    engaged_width_mm: Positive
+    """w, width of the tissue that the needle displaces."""
+    energy_weight: NonNegative = 1.0
+    """w_c, weight of this layer in the strain energy W."""
+
+    @property
+    def shear_modulus(self) -> float:
+        """μ, MPa."""
+        return 1e-3 * self.shear_modulus_kpa
+
+    @property
+    def modulus(self) -> float:
+        """Initial modulus of the compression (MPa): 3μ, of incompressible tissue that is free to the sides."""
+        return 3.0 * self.shear_modulus
+
+    @property
+    def largest_bevel_mm(self) -> float:
+        """Upper bound of a scenario's bevel offset: a bevel that is held laterally is still within the law's limit."""
+        return self.limit * self.compression_length_mm
+
+    @property
+    def most_bevel_mm(self) -> float:
+        """Largest bevel offset that is drawn or fitted."""
+        return (self.limit - _BEVEL_MARGIN) * self.compression_length_mm
+
+    @abstractmethod
+    def energy(self, e: "Floats") -> "Floats":
+        """Energy at relative compressions e in [0, limit], over k h²."""
+
+    @abstractmethod
+    def force(self, e: "Floats") -> "Floats":
+        """Force, over k h."""
+
+    @abstractmethod
+    def stiffness(self, e: "Floats") -> "Floats":
+        """Stiffness, over k."""
+
+
+def laws_of(tissue: Sequence[Layer]) -> tuple[list[Layer], list[int]]:
+    """Return one layer of each law with its parameters, and for each layer the index of its law."""
+    keys = [_law_key(layer) for layer in tissue]
+    laws = dict(zip(keys, tissue, strict=True))
+    place = {key: k for k, key in enumerate(laws)}
+    return list(laws.values()), [place[key] for key in keys]
+
+
+def _law_key(layer: Layer) -> tuple[Any, ...]:
+    """Equal for layers of the same law and parameters, whatever their stiffness and size."""
+    own = {*type(layer).model_fields} - {*Layer.model_fields}
+    return type(layer), *(getattr(layer, name) for name in sorted(own))
+
+
+class Contact(Section):
+    """Section `contact`: the contact points of the controller's model."""
+
+    spacing_mm: Positive = 1.0
+    """Δ, spacing of the contact points along the depth."""

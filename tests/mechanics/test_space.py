@@ -1,0 +1,393 @@
+"""The needle in space: that of the plane where everything is in one, whichever plane; rolls, spins, work and energy."""
+
+import cmath
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from flexneedle import load_scenario
+from flexneedle.mechanics import lateral as lt
+from flexneedle.mechanics import needle as nd
+from reference.cases import long_beam, numbers
+from reference.draws import draw_controls, draw_scenario
+from reference.space import Imposed, carried_out, commands, forces, lateral, slopes, start, turned_commands
+
+PHANTOM = load_scenario("phantom")
+seeds = st.integers(0, 10**6)
+angles = st.floats(-math.pi, math.pi)
+GUIDE_X = PHANTOM.setup.guide_x
+
+
+def drawn(seed, steps=60):
+    """A random scenario, and random commands in one plane with flips."""
+    rng = np.random.default_rng(seed)
+    scenario = draw_scenario(rng)
+    rows = draw_controls(scenario, steps, rng)
+    roll = np.where(rows[:, 4] > 0.0, math.pi, 0.0)
+    return scenario, commands(
+        steps, rows[:, 0], base=rows[:, 1], slope=rows[:, 2], guide=rows[:, 3], roll=roll
+    )
+
+
+def random_in_space(seed, steps=60):
+    """A random scenario, imposed conditions and commands, nothing of it in one plane."""
+    scenario, rows = drawn(seed, steps)
+    rng = np.random.default_rng((seed, 1))
+    bevel, base, slope, guide, load = np.exp(1j * rng.uniform(-np.pi, np.pi, 5)) * [1.0, 0.3, 2e-3, 0.4, 2e-3]
+    if not scenario.setup.has_guide:
+        guide, base = 0.0, 0.2 * base
+    other = drawn(seed + 1, steps)[1] if scenario.setup.has_guide else rows
+    for y, z in ((1, 2), (3, 4), (5, 6)):
+        rows[:, z] = other[::-1, y] if scenario.setup.has_guide else 0.5 * rows[::-1, y]
+    rows[:, 7] = rng.choice([0.0, 0.0, 1.0], steps) * rng.uniform(-4.0, 4.0, steps)
+    rows[:, 8] = rng.choice([0.0, 0.0, 1.0], steps) * rng.uniform(-9.0, 9.0, steps)
+    if not scenario.setup.has_guide:
+        rows[:, 5:7] = 0.0
+    return scenario, Imposed(bevel, base, slope, guide, load), rows
+
+
+# ---- lateral numbers
+
+
+@given(z=st.complex_numbers(max_magnitude=1e3), quarters=st.integers(-9, 9))
+def test_a_turn_by_whole_quarters_is_exact(z, quarters):
+    """To the last bit, wherever the angle as a float is not exactly a quarter."""
+    expected = z * (1.0, 1j, -1.0, -1j)[quarters % 4]
+    assert lt.turned(quarters * 0.5 * math.pi, z) == expected
+
+
+@given(z=st.complex_numbers(max_magnitude=1e3), angle=st.floats(-50.0, 50.0))
+def test_a_turn_is_a_multiplication_by_a_unit_number(z, angle):
+    assert lt.turned(angle, z) == pytest.approx(z * cmath.exp(1j * angle), abs=1e-11)
+
+
+@given(
+    direction=angles, z=st.complex_numbers(max_magnitude=1e3), radial=st.floats(0.0, 9.0), across=st.floats(0.0, 9.0)
+)  # fmt: skip
+def test_a_stretch_has_two_factors(direction, z, radial, across):
+    """The matrix radial·nnᵀ + across·(1 − nnᵀ)."""
+    n = np.array([math.cos(direction), math.sin(direction)])
+    matrix = radial * np.outer(n, n) + across * (np.eye(2) - np.outer(n, n))
+    found = lt.stretched(complex(*n), z, radial, across)
+    np.testing.assert_allclose([found.real, found.imag], matrix @ [z.real, z.imag], atol=1e-9)
+    assert lt.stretched(1.0, 2.5, radial, across) == radial * 2.5
+
+
+@given(a=st.complex_numbers(max_magnitude=1e3), b=st.complex_numbers(max_magnitude=1e3))
+def test_products_and_sizes_are_those_of_vectors(a, b):
+    assert lt.dot(a, b) == pytest.approx((a * b.conjugate()).real, rel=1e-12, abs=1e-9)
+    assert lt.square(a) == lt.dot(a, a)
+    assert lt.size(a) == pytest.approx(abs(a), rel=1e-12, abs=1e-150)
+    assert (lt.size(-3.0), lt.square(-3.0), lt.dot(-3.0, 2.0)) == (3.0, 9.0, -6.0)
+
+
+@pytest.mark.parametrize("spin", [0.0, 0.4, -2.0, 12.0])
+def test_the_spring_of_a_spinning_bevel_solves_its_equation(spin):
+    """ℓ q′ = b e^{iφ} − q along a step of 2.3 mm, with the bevel turning evenly and ending at its direction."""
+    model = start(PHANTOM).model
+    length, offset, step = model.bevel_length, model.bevel_offset, 2.3
+    bevel, q0 = cmath.exp(0.7j), 0.3 - 1.1j
+    tip, channel = nd.Pose(10.0, 0j, 0j), nd.Channel(10.0, q0)
+    cut = nd.Cut(tip, channel, spin)
+    found, slope = nd.spring_rest(model, bevel, cut, nd.Path(1.0, 0j), 10.0 + step)
+
+    def rate(x, q):
+        return (offset * bevel * np.exp(1j * spin * (x / step - 1.0)) - q) / length
+
+    expected = solve_ivp(rate, (0.0, step), [q0], rtol=1e-11, atol=1e-12).y[0, -1]
+    assert found == pytest.approx(expected, abs=1e-9)
+    assert slope == pytest.approx(length / step * (1.0 - math.exp(-step / length)))
+
+
+# ---- one plane, and any other
+
+
+@settings(deadline=None, derandomize=True, max_examples=12)
+@given(seed=seeds)
+def test_in_one_plane_it_is_the_needle_of_the_plane(seed):
+    """Random insertions, to 1e-9 mm, and out of that plane exactly nothing."""
+    scenario, rows = drawn(seed)
+    imposed = Imposed(1.0, 0.2, 1e-3, 0.1 if scenario.setup.has_guide else 0.0, 1e-3)
+    (plane, tips), (space, there) = (
+        carried_out(start(scenario, imposed, across), rows) for across in (float, complex)
+    )
+    np.testing.assert_allclose(there, tips, atol=1e-9)
+    assert not there[:, [2, 4]].any()
+    assert not space.rest.imag.any()
+    np.testing.assert_allclose(space.rest.real, plane.rest, atol=1e-9)
+    assert space.energy == pytest.approx(plane.energy, rel=1e-7, abs=1e-12)
+    assert space.strain_energy == pytest.approx(plane.strain_energy, rel=1e-7, abs=1e-12)
+    assert space.converged
+
+
+@settings(deadline=None, derandomize=True, max_examples=12)
+@given(seed=seeds, angle=angles)
+def test_turning_all_inputs_turns_the_needle(seed, angle):
+    """Base, guide, bevel, load and every command, in random insertions with rolls and spins."""
+    scenario, imposed, rows = random_in_space(seed)
+    turn = cmath.exp(1j * angle)
+    one, tips = carried_out(start(scenario, imposed), rows)
+    other, there = carried_out(start(scenario, imposed.turned(angle)), turned_commands(rows, angle))
+    assert one.converged
+    assert np.abs(tips[:, 2]).max() > 1e-4
+    np.testing.assert_allclose(there[:, 0], tips[:, 0], atol=1e-9)
+    np.testing.assert_allclose(lateral(there), turn * lateral(tips), atol=1e-9)
+    np.testing.assert_allclose(slopes(there), turn * slopes(tips), atol=1e-10)
+    np.testing.assert_allclose(other.rest, turn * one.rest, atol=1e-9)
+    assert other.energy == pytest.approx(one.energy, rel=1e-7)
+
+
+@settings(deadline=None, derandomize=True, max_examples=8)
+@given(seed=seeds)
+def test_mirrored_inputs_mirror_the_needle(seed):
+    """z → −z with rolls and spins the other way: to the last bit."""
+    scenario, imposed, rows = random_in_space(seed)
+    mirrored = rows.copy()
+    mirrored[:, [2, 4, 6, 7, 8]] *= -1.0
+    _, tips = carried_out(start(scenario, imposed), rows)
+    _, there = carried_out(start(scenario, Imposed(*np.conj(imposed))), mirrored)
+    np.testing.assert_allclose(there * [1, 1, -1, 1, -1], tips, atol=1e-10)
+
+
+@settings(deadline=None, derandomize=True, max_examples=6)
+@given(angle=angles, bend=st.floats(-1.0, 1.0))
+def test_a_bent_needle_with_clearance_turns_as_well(angle, bend):
+    """Natural bend and the circle of the guide."""
+    constants = {"curvature": 2.0 * bend / 150.0**2, "clearance": 0.08}
+    rows = commands(50, 1.0, guide=0.06 * np.exp(0.3j * np.arange(50)), spin=0.05)
+    tips = []
+    for by in (0.0, angle):
+        state = start(PHANTOM, Imposed(bevel=1j, base=0.2).turned(by), **constants)
+        tips.append(carried_out(state, turned_commands(rows, by))[1])
+    np.testing.assert_allclose(lateral(tips[1]), cmath.exp(1j * angle) * lateral(tips[0]), atol=1e-6)
+
+
+# ---- rolls and spins
+
+
+def test_a_roll_by_half_a_turn_is_the_flip():
+    """To the last bit: π, −π, 3π, or the bevel's direction reversed by hand, as in the plane."""
+    before, _ = carried_out(start(PHANTOM), commands(48, 1.0, guide=0.03))
+    boundary = before.needle.boundary
+    reversed_ = before.needle._replace(boundary=boundary._replace(bevel=-boundary.bevel))
+    by_hand = type(before)(
+        before.scenario,
+        before.model,
+        reversed_,
+        before.clamp,
+        before.rest,
+        before.compression,
+        before.mesh,
+        0.0,
+    )
+    on = commands(20, 1.0)
+    _, expected = carried_out(by_hand, on)
+    plane = start(PHANTOM, across=float)
+    flat = np.vstack([commands(48, 1.0, guide=0.03), on])
+    flat[48, 7] = math.pi
+    _, planar = carried_out(plane, flat)
+    for half in (math.pi, -math.pi, 3 * math.pi):
+        rolled = on.copy()
+        rolled[0, 7] = half
+        after, tips = carried_out(before, rolled)
+        assert after.needle.boundary.bevel == -1.0
+        np.testing.assert_array_equal(tips, expected)
+        assert not tips[:, [2, 4]].any()
+        np.testing.assert_allclose(tips, planar[48:], atol=1e-9)
+
+
+def test_four_quarter_rolls_are_none():
+    state, _ = carried_out(start(PHANTOM), commands(45, 1.0))
+    rolled, _ = carried_out(state, commands(4, roll=0.5 * math.pi))
+    still, _ = carried_out(state, commands(4))
+    np.testing.assert_array_equal(numbers(rolled), numbers(still))
+
+
+def test_a_quarter_roll_bends_the_path_out_of_the_plane():
+    """Towards +z, by as much as the bevel bends it from a straight needle's path in its plane."""
+    on = commands(15, 1.0)
+    on[0, 7] = 0.5 * math.pi
+    state, _ = carried_out(start(PHANTOM), commands(45, 1.0))
+    _, tips = carried_out(state, on)
+    assert (np.diff(tips[:, 4]) > 0.0).all()
+    assert tips[-1, 2] > 0.1
+
+
+def pushed(steps, depth=45.0, turns=0.0, scenario=PHANTOM):
+    """Tips of an insertion to a depth (mm) in even steps, with an even spin of some turns from the start."""
+    way = depth - scenario.setup.start_tip_x
+    rows = commands(steps, way / steps, spin=2.0 * math.pi * turns / steps)
+    return carried_out(start(scenario), rows)[1]
+
+
+@pytest.mark.parametrize("turns", [0.5, 3.0, -7.0])
+def test_a_spin_does_not_depend_on_the_steps(turns):
+    """The same total spin in 37, 148 and 592 steps: the tip to 5 µm."""
+    ends = [lateral(pushed(steps, turns=turns))[-1] for steps in (37, 148, 592)]
+    assert np.abs(np.subtract(ends, ends[-1])).max() < 5e-3
+    assert abs(ends[-1]) > 5e-3
+
+
+def test_a_fast_spin_goes_straight_in_inverse_proportion_to_its_speed():
+    """The spring's rest at b/(1 + iωℓ) is the nearer to the axis, the faster the bevel turns."""
+    still, *spun = (abs(lateral(pushed(148, turns=turns))[-1]) for turns in (0.0, 60.0, 120.0, 240.0))
+    assert spun[0] < 0.02 * still
+    np.testing.assert_allclose(np.divide(spun[:-1], spun[1:]), 2.0, rtol=0.02)
+
+
+@pytest.mark.parametrize("spinning", [1, 2, 3])
+def test_a_duty_cycle_bends_the_path_in_proportion(spinning):
+    """Of four steps of ¼ mm some turn three times: the share of the others is left, half of it for half a cycle.
+
+    The spring's rest is linear in the bevel's direction, and whole turns have no mean; a small bevel, so that the
+    tissue is linear too. The mean over the four phases of a cycle at which the insertion may end.
+    """
+    small = PHANTOM.with_values({"needle.bevel.offset_mm": 0.04})
+    begun = carried_out(start(small), commands(40, 1.0))[0]
+    count = 4 * 34
+
+    def end(turning):
+        rows = commands(count, 0.25, spin=np.where(turning, 6.0 * math.pi, 0.0))
+        return lateral(carried_out(begun, rows)[1])[-1]
+
+    cycle = np.arange(count)
+    still, spun = end(cycle < 0), end(cycle >= 0)
+    shares = [(end((cycle + phase) % 4 < spinning) - spun) / (still - spun) for phase in range(4)]
+    assert np.mean(shares) == pytest.approx(1.0 - spinning / 4, abs=1e-3)
+
+
+@pytest.mark.parametrize("rate", [2 * math.pi / 60.0, -2 * math.pi / 40.0])
+def test_a_steady_spin_is_a_helix(rate):
+    """Its curvature turns at the rate of the spin, and keeps its size; 1/β is 10 mm."""
+    depth, step = 250.0, 1.0
+    scenario = long_beam(depth, spacing=1.0, bevel=0.01, bevel_length=3.0)
+    turns = rate * (depth - scenario.setup.start_tip_x) / (2 * math.pi)
+    tips = pushed(int(depth - scenario.setup.start_tip_x), depth, turns, scenario)
+    deep = tips[:, 0] > 150.0
+    x, y = tips[deep, 0], lateral(tips[deep])
+    curvature = np.diff(y, 2) / step**2
+    phase = np.unwrap(np.angle(curvature))
+    slope, offset = np.polyfit(x[1:-1], phase, 1)
+    assert slope == pytest.approx(rate, rel=2e-3)
+    np.testing.assert_allclose(phase, slope * x[1:-1] + offset, atol=0.05)
+    np.testing.assert_allclose(np.abs(curvature), np.abs(curvature).mean(), rtol=0.05)
+
+
+# ---- the guide's clearance
+
+
+@settings(deadline=None, derandomize=True, max_examples=10)
+@given(seed=seeds, clearance=st.floats(1e-2, 0.4))
+def test_the_circle_of_a_guide_pushes_towards_its_middle(seed, clearance):
+    """No needle is beyond it, and none that does not touch it is pushed; a push has no part along the circle."""
+    rng = np.random.default_rng(seed)
+    way = np.cumsum(rng.normal(0.0, 0.1, (2, 40)), axis=1)
+    rows = commands(40, 1.0, guide=rng.normal(0.0, 0.08, 40) + 1j * rng.normal(0.0, 0.08, 40), spin=way[0])
+    state = start(PHANTOM, Imposed(base=0.3j, slope=1e-3), clearance=clearance)
+    touched = set()
+    for row in rows:
+        state, _ = carried_out(state, row[None])
+        place = state.mesh["y"][state.mesh["x"] == GUIDE_X][0] - state.needle.boundary.guide
+        force = forces(state)[2]
+        assert state.converged
+        assert abs(place) <= clearance + 1e-9
+        touches = abs(place) > clearance - 1e-9
+        touched.add(touches)
+        if touches:
+            assert (force * np.conj(place)).real <= 1e-9
+            assert abs((force * np.conj(place)).imag) <= 1e-6 * abs(force)
+        else:
+            assert force == 0.0
+    assert True in touched
+
+
+# ---- work and energy
+
+
+def withdrawn():
+    """A needle bent out of every plane, then drawn back: its tip is out of the bevel's spring and past whole points."""
+    rows = commands(58, 1.0, guide=0.02 - 0.03j)
+    rows[45, 7] = 1.1
+    state, _ = carried_out(start(PHANTOM), rows)
+    return carried_out(state, commands(10, -0.33))[0]
+
+
+MOVES = {
+    "base": (1.4 - 1.2j, 0.0, 0.0),
+    "slope": (0.0, 0.012j + 0.008, 0.0),
+    "guide": (0.0, 0.0, -1.2 + 1.5j),
+    "all": (1.0j, -0.01, 1.1 - 0.9j),
+}
+
+
+@pytest.mark.parametrize("name", MOVES)
+def test_work_of_base_and_guide_is_the_energy_stored(name):
+    """Trapezoid rule, y and z of all that moves; the slide of a tip without a spring costs nothing."""
+    state, steps = withdrawn(), 60
+    move = np.array(MOVES[name]) / steps
+    energy, work = state.energy, 0.0
+    row = commands(1, base=move[0], slope=move[1], guide=move[2])
+    for _ in range(steps):
+        before = forces(state)
+        state, _ = carried_out(state, row)
+        work += (0.5 * (before + forces(state)) * np.conj(move)).real.sum()
+    assert state.tip[0] < state.needle.channel.front
+    assert abs(state.energy - energy) > 5e-3
+    assert work == pytest.approx(state.energy - energy, rel=1e-5)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.8, 2.1])
+@pytest.mark.parametrize("index", [0, 1, 2])
+def test_the_gradient_of_the_energy_is_the_reaction(index, angle):
+    """Central differences in any direction across the axis."""
+    state, _ = carried_out(withdrawn(), commands(5, base=0.1, slope=1e-3j, guide=-0.1 + 0.2j))
+    h, along = (0.01, 1e-4, 0.01)[index], cmath.exp(1j * angle)
+    name = ("base", "slope", "guide")[index]
+    up, down = (carried_out(state, commands(1, **{name: side * h * along}))[0].energy for side in (1, -1))
+    expected = (forces(state)[index] * along.conjugate()).real
+    assert (up - down) / (2 * h) == pytest.approx(expected, rel=1e-4, abs=1e-7)
+    assert abs(expected) > 1e-6
+
+
+def test_forces_and_moments_balance_on_both_axes():
+    state, _ = carried_out(withdrawn(), commands(5, base=0.2j, guide=-0.3 + 0.1j))
+    tissue = state.mesh[state.mesh["x"] > 0.0]
+    base, moment, guide = forces(state)
+    arms = tissue["x"] - state.needle.boundary.base.x
+    assert np.abs(tissue["force"].imag).max() > 1e-4
+    assert abs(base + guide + tissue["force"].sum()) < 1e-9
+    assert abs(moment + guide * (GUIDE_X - state.needle.boundary.base.x) + tissue["force"] @ arms) < 1e-7
+
+
+def test_a_contact_pushes_against_its_compression():
+    """Force along −u, of the size of the law of |u|: tissue is the same in all directions."""
+    state, _ = carried_out(withdrawn(), commands(5, guide=0.4 - 0.2j))
+    behind = state.mesh["x"] > 0.0
+    u, force = state.compression[: behind.size][behind], state.mesh["force"][behind]
+    law, nodes = state.scenario.tissue[0], state.model.nodes[: behind.size][behind]
+    assert (nodes["law"] == 0).all()
+    whole = state.needle.solution.tip.x - nodes["x"] > nodes["reach"]
+    e = np.abs(u) / nodes["height"]
+    expected = -nodes["stiffness"] * nodes["height"] * law.force(e) * u / np.abs(u)
+    np.testing.assert_allclose(force[whole], expected[whole], rtol=1e-7, atol=1e-12)
+
+
+@pytest.mark.parametrize("alpha", [-47.0, 80.0])
+@pytest.mark.parametrize("modulus_kpa", [2.0, 100.0])
+def test_steep_laws_converge_in_every_direction(alpha, modulus_kpa):
+    """A bevel of 13 mm that spins, with the guide going round: to the usual tolerance, and turned with all inputs."""
+    layer = {"alpha": alpha, "shear_modulus_kpa": modulus_kpa}
+    steep = {f"tissue.{i}.{key}": value for i in (0, 1) for key, value in layer.items()}
+    scenario = PHANTOM.with_values({"needle.bevel.offset_mm": 13.0, **steep})
+    rows, ends = commands(70, 1.0, guide=0.2 * np.exp(0.4j * np.arange(70)), spin=0.3), []
+    for angle in (0.0, 1.3):
+        state = start(scenario, Imposed().turned(angle), slide=2e-5, tolerance=1e-7)
+        for row in turned_commands(rows, angle):
+            state, tips = carried_out(state, row[None])
+            assert state.converged
+        ends.append(lateral(tips)[-1])
+    assert ends[1] == pytest.approx(ends[0] * cmath.exp(1.3j), abs=1e-5)
