@@ -90,6 +90,7 @@ def test_the_parts_are_used_and_recorded_by_name(lab):
     assert again.returncode == 0, again.stderr
 
 
+@pytest.mark.long
 def test_a_scenario_with_the_table_is_checked_with_the_controller(lab):
     refused = command(lab, "scenario", "check", "quick.toml")
     assert refused.returncode == 2

@@ -144,7 +144,10 @@ def test_ctrl_c_keeps_the_finished_rows_and_prints_how_to_resume(quick, uninterr
 UNGUARDED = "from flexneedle import run_study\nrun_study({!r}, workers=1)\n"
 
 
-@pytest.mark.parametrize("kept", [(), ("runs",), ("runs", "runs/other")])
+@pytest.mark.parametrize(
+    "kept",
+    [(), *(pytest.param(kept, marks=pytest.mark.long) for kept in (("runs",), ("runs", "runs/other")))],
+)
 def test_a_script_without_the_guard_leaves_no_folder(quick, tmp_path, kept):
     for folder in kept:
         (tmp_path / folder).mkdir()

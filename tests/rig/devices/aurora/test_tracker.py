@@ -227,7 +227,7 @@ def test_a_permanent_fault_is_reported_permanently():
     ("kill", "text"),
     [
         pytest.param(signal.SIGKILL, "the link", marks=pytest.mark.slow),
-        (signal.SIGSTOP, "the link does not respond"),
+        pytest.param(signal.SIGSTOP, "the link does not respond", marks=pytest.mark.long),
     ],
 )
 def test_a_link_that_crashes_or_hangs_is_replaced(kill, text, monkeypatch):
