@@ -1,6 +1,7 @@
 """The cache of compiled kernels: a folder for the sources of each package that has some."""
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import pytest
@@ -28,8 +29,9 @@ def cache(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def package(tmp_path, cache):
+def package(tmp_path, cache, monkeypatch):
     """Write kernels into a folder of their own, and import them. Their cache is empty at first."""
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # Python would take a second edit in a second for the first
     home = tmp_path / "kernels"
     home.mkdir()
     assert cache.exists()
