@@ -31,7 +31,8 @@ def cache(tmp_path, monkeypatch):
 @pytest.fixture
 def package(tmp_path, cache, monkeypatch):
     """Write kernels into a folder of their own, and import them. Their cache is empty at first."""
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # Python would take a second edit in a second for the first
+    # Of two edits in a second, Python would take the bytecode of the first.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     home = tmp_path / "kernels"
     home.mkdir()
     assert cache.exists()
