@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all slow bench robustness validation accuracy controllers studies tracker steering worlds tuning docs lint clean
+.PHONY: help setup demo test test-all slow bench robustness validation accuracy controllers studies tracker steering worlds space worlds-space tuning docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -37,14 +37,19 @@ test: setup  ## run the tests but the long ones, on all cores
 test-all: setup  ## run all tests but the slow ones: statistics over many draws, studies in several processes
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" $(PYTEST_ARGS)
 
-bench: setup  ## measure speed: mechanics, control periods, ten million rows of tracker data, 60 s of an emulated tracker
+bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker
 	$(BIN)/python benchmarks/bench.py
+	$(BIN)/python benchmarks/plant.py
 	$(BIN)/python benchmarks/periods.py
 	$(BIN)/python benchmarks/em.py
 	$(BIN)/python benchmarks/aurora.py
 
-robustness: setup  ## 100,000 random insertions without a failure (long)
+robustness: setup  ## 100,000 random insertions of the model in the plane and in space, as it ships and adapted, and 2,000 of the exact plant (long)
 	$(BIN)/python studies/robustness.py
+	$(BIN)/python studies/robustness.py --space
+	$(BIN)/python studies/robustness.py --adapted
+	$(BIN)/python studies/robustness.py --space --adapted
+	$(BIN)/python studies/plant_robustness.py
 
 validation: setup  ## compare the exact plant with closed forms and a second solver; writes docs/validation.md
 	$(BIN)/python studies/validation.py
@@ -78,12 +83,20 @@ worlds: setup  ## 200 random worlds in three cases with four controllers, and th
 	$(BIN)/flexneedle study worlds --resume --out $(or $(DIR),runs/worlds)
 	$(BIN)/flexneedle report $(or $(DIR),runs/worlds)
 
+space: setup  ## insertions in space with three drivers and four controllers, and the report (DIR=runs/space; hours)
+	$(BIN)/flexneedle study space --resume --out $(or $(DIR),runs/space)
+	$(BIN)/flexneedle report $(or $(DIR),runs/space)
+
+worlds-space: setup  ## 200 random worlds in space, each with every driver, and the report (DIR=runs/worlds-space; hours)
+	$(BIN)/flexneedle study worlds-space --resume --out $(or $(DIR),runs/worlds-space)
+	$(BIN)/flexneedle report $(or $(DIR),runs/worlds-space)
+
 tuning: setup  ## tune each controller with 200 insertions; writes src/flexneedle/study/tuning (long)
 	for method in ce-mpc bevel-only resolved-rate broyden-mpc; do \
 	  $(BIN)/python studies/tune.py $$method || exit 1; \
 	done
 
-slow: setup  ## the long tests: a thousand insertions against the reference
+slow: setup  ## the long tests: a thousand insertions each in the plane and in space against the reference
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
 
 docs: setup  ## build the documentation site into site/; warnings are errors

@@ -20,9 +20,9 @@ from flexneedle.mechanics import insertion
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.law import response
 from flexneedle.mechanics.model import CONTACT
-from flexneedle.simulator.control import Control
-from flexneedle.simulator.simulator import Simulator, _commands
+from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
+from flexneedle.types import DB_X, ROLL, Control
 
 SCENARIO = flexneedle.load_scenario("phantom")
 DEPTH_MM, STEPS, SEQUENCES = 45.0, 74, 64
@@ -35,7 +35,7 @@ from flexneedle.rig.kernels import compile_kernels
 compile_kernels()
 simulator = flexneedle.Simulator(flexneedle.load_scenario("phantom"), threads=1)
 state = simulator.step(simulator.start(), flexneedle.Control(db_x=1.0))
-simulator.rollout(state, [[[1.0, 0.0, 0.0, 0.0, -1.0]]])
+simulator.rollout(state, [[flexneedle.Control(db_x=1.0)]])
 simulator.assimilate(state, (state.tip[0], 0.1))
 print(time.perf_counter() - begun)
 """
@@ -50,21 +50,20 @@ def seconds(call: Callable[[], Any], times: int = 1) -> float:
 
 
 def insertions(count: int, steps: int = STEPS, depth: float = DEPTH_MM) -> np.ndarray:
-    """Controls (count, steps, 5) of insertions to `depth` with random guide motion and one bevel flip."""
+    """Controls (count, steps, 9) of insertions to `depth` with random guide motion and one bevel flip."""
     rng = np.random.default_rng(0)
-    controls = np.zeros((count, steps, 5))
-    controls[:, :, 0] = (SCENARIO.setup.tip_to_skin_mm + depth) / steps
-    controls[:, :, 3] = np.repeat(rng.normal(0.0, 0.05, (count, 6)), steps // 6 + 1, axis=1)[:, :steps]
-    controls[:, :, 4] = -1.0
-    controls[np.arange(count), rng.integers(steps // 2, steps, count), 4] = 1.0
+    guide = np.repeat(rng.normal(0.0, 0.05, (count, 6)), steps // 6 + 1, axis=1)[:, :steps]
+    advance = (SCENARIO.setup.tip_to_skin_mm + depth) / steps
+    controls = flexneedle.controls(count, steps, db_x=advance, dg_y=guide)
+    controls[np.arange(count), rng.integers(steps // 2, steps, count), ROLL] = np.pi
     return controls
 
 
 def after(simulator: Simulator, controls: np.ndarray) -> State:
-    """The state after a sequence (m, 5)."""
+    """The state after a sequence (m, 9)."""
     state = simulator.start()
     for row in controls:
-        state = simulator.step(state, Control.from_row(row.tolist()))
+        state = simulator.step(state, Control.of(row.tolist()))
     return state
 
 
@@ -118,18 +117,18 @@ def last_system(state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def in_space(simulator: Simulator, controls: np.ndarray) -> Callable[[], insertion.Outputs]:
-    """The same rollout of planar controls (N, m, 5) from the start, by the kernels of space: complex arrays."""
+    """The same rollout of planar controls (N, m, 9) from the start, by the kernels of space: complex arrays."""
     model, setup = simulator._model, SCENARIO.setup
     base, tip = (nd.Pose(x, 0j, 0j) for x in (SCENARIO.start_base_x, setup.start_tip_x))
     rest = np.zeros(model.nodes.size, complex)
     work = rest.copy(), rest.copy(), nd.work_array(rest)
     needle = insertion.settle(model, nd.start(base, tip, 1.0 + 0j), *work, complex(np.nan))
-    start, commands = (needle, rest, rest.copy()), _commands(controls)
+    start = needle, rest, rest.copy()
     count, steps = controls.shape[:2]
 
     def call() -> insertion.Outputs:
         out = insertion.outputs(count, steps)
-        insertion.rollout(model, *start, *work, commands, 0, count, out)
+        insertion.rollout(model, *start, *work, controls, 0, count, out)
         return out
 
     return call
@@ -147,7 +146,7 @@ def measure_step(repeats: int = 41) -> dict[str, Any]:
     if info != 0 or not differs < 1e-6:
         raise RuntimeError(f"matrix does not reproduce the state: info {info}, difference {differs:g} mm")
     space = in_space(simulator, controls)
-    apart = float(np.abs(space().tips[..., [0, 1, 3]] - simulator.rollout(start, controls).tips).max())
+    apart = float(np.abs(space().tips - simulator.rollout(start, controls).tips).max())
     if not apart < 1e-4:
         raise RuntimeError(f"kernels of plane and space differ by {apart:g} mm")
     rounds = []
@@ -172,7 +171,7 @@ def measure_step(repeats: int = 41) -> dict[str, Any]:
 def measure_depth(repeats: int = 15) -> dict[str, Any]:
     """Time of a step at each depth, over four steps of 0.5 mm, and its growth with depth."""
     simulator, controls = Simulator(SCENARIO, threads=1), insertions(128, 4)
-    controls[:, :, 0] = 0.5
+    controls[:, :, DB_X] = 0.5
     states = []
     for depth in DEPTHS_MM:
         travel = SCENARIO.setup.tip_to_skin_mm + depth - 1.0

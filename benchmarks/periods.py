@@ -22,7 +22,7 @@ def periods_of(number: int, threads: int | None) -> np.ndarray:
     scenario = world(number)
     plan = flexneedle.plan(scenario, seed=number, threads=threads)
     insertion = flexneedle.insert(scenario, plan, seed=number, force=True, threads=threads)
-    decided = [period.durations for period in insertion.periods if np.isfinite(period.miss)]
+    decided = [period.durations for period in insertion.periods if np.isfinite(period.miss[0])]
     return 1e3 * np.array([[spent["decide"], spent["observe"]] for spent in decided]).reshape(-1, 2)
 
 

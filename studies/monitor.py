@@ -106,7 +106,7 @@ def carried_out(drawn: Approach, plate: bool, monitor: bool) -> RunRecord:
     phantom, tracker, control, room = np.random.SeedSequence(drawn.seed).spawn(4)
     rig = virtual_rig(
         scenario,
-        plan.bevel,
+        plan.roll,
         Seeds(phantom, tracker, room),
         DEFAULT_PLANT,
         plate_distance_at=drawn.distance_at if plate else None,

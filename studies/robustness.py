@@ -1,8 +1,10 @@
 """Random control sequences in random tissue: no exception, no NaN, no unconverged step (`make robustness`).
 
-Every batch is one random scenario and many sequences of all five inputs within its limits, run by
-`Simulator.rollout`. Progress is printed on stderr, a JSON summary on stdout; exit status 1 after any failure, 130
-after an interrupt. A batch depends only on seed and batch number, so that `--seed S --batch K` reproduces a failure.
+Every batch is one random scenario and many sequences of all inputs within its limits, run by `Simulator.rollout`: in
+the plane, or with `--space` in two lateral axes with rolls to any angle and spins. With `--adapted` most needles have a
+bend, a clearance in their guide, or both, as an observer may estimate them. Progress is printed on stderr, a JSON
+summary on stdout; exit status 1 after any failure, 130 after an interrupt. A batch depends only on seed, batch number
+and these options, which reproduce a failure.
 """
 
 import argparse
@@ -15,7 +17,9 @@ import numpy as np
 
 import flexneedle
 from flexneedle import Control, Scenario, Simulator
+from flexneedle.mechanics.model import Adaptation
 from flexneedle.scenario.sections.needle import GAUGES
+from flexneedle.types import DB_PSI, DB_THETA, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN
 
 STEPS = 80
 BATCH = 20
@@ -89,7 +93,7 @@ def draw_scenario(rng: np.random.Generator) -> Scenario:
 
 
 def draw_controls(scenario: Scenario, count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, STEPS, 5): steps up to the limits in both directions, constant over runs or changing every step."""
+    """(count, STEPS, 9): steps up to the limits in both directions, constant over runs or changing every step."""
     setup = scenario.setup
     shape = (count, STEPS)
     forward = _runs(rng, shape, 0.9)
@@ -105,8 +109,30 @@ def draw_controls(scenario: Scenario, count: int, rng: np.random.Generator) -> n
         swing = step * rng.choice([0.0, 0.1, 0.4, 1.0], (count, 1))
         moves = swing * _runs(rng, shape, rng.uniform(0.5, 0.95)) * rng.uniform(0, 1, shape)
         columns.append(_bounded(moves, -travel, travel))
-    columns.append(np.where(rng.random(shape) < rng.choice([0.02, 0.2], (count, 1)), 1.0, -1.0))
-    return np.stack(columns, axis=2)
+    advance, base, turn, guide = columns
+    roll = np.where(rng.random(shape) < rng.choice([0.02, 0.2], (count, 1)), np.pi, 0.0)
+    return flexneedle.controls(*shape, db_x=advance, db_y=base, db_theta=turn, dg_y=guide, roll=roll)
+
+
+def draw_controls_in_space(scenario: Scenario, count: int, rng: np.random.Generator) -> np.ndarray:
+    """(count, STEPS, 9): as in the plane along y and z, rolls by half turns or to any angle, spins in some."""
+    rows, across = (draw_controls(scenario, count, rng) for _ in range(2))
+    rows[..., [DB_Z, DB_PSI, DG_Z]] = across[..., [DB_Y, DB_THETA, DG_Y]]
+    free, angles = rng.random((count, 1)) < 0.5, rng.uniform(-4.0, 4.0, rows.shape[:2])
+    rows[..., ROLL] = np.where(free & (rows[..., ROLL] > 0.0), angles, rows[..., ROLL])
+    spins = rng.choice([0.0, 0.0, 0.1, 1.0, 6.0], (count, 1))
+    rows[..., SPIN] = spins * rng.uniform(-1.0, 1.0, rows.shape[:2])
+    return rows
+
+
+def bent(simulator: Simulator, rng: np.random.Generator) -> Simulator:
+    """The simulator of a needle with a bend (mm) in half of the cases, and in half with a clearance in its guide."""
+    layers, axes = len(simulator.scenario.tissue), simulator.scenario.setup.axes
+    y, z = rng.uniform(-2.0, 2.0, 2).tolist()
+    bend = float(rng.choice([0.0, 1.0])) * (y if axes == 1 else complex(y, z))
+    clearance = float(rng.choice([0.0, rng.uniform(0.0, 0.2)]))
+    fitted = Adaptation(np.zeros(layers - 1), np.ones(layers), bend=bend, clearance=clearance)
+    return simulator.adapted(fitted)
 
 
 def _runs(rng: np.random.Generator, shape: tuple[int, int], forward: float) -> np.ndarray:
@@ -125,17 +151,21 @@ def _bounded(steps: np.ndarray, low: float, high: float) -> np.ndarray:
     return kept
 
 
-def run_batch(seed: int, batch: int, count: int, tally: Tally) -> None:
+def run_batch(
+    seed: int, batch: int, count: int, tally: Tally, *, space: bool = False, adapted: bool = False
+) -> None:
     """One scenario, `count` sequences; failures are counted, not raised."""
     rng = np.random.default_rng((seed, batch))
     scenario = draw_scenario(rng)
-    controls = draw_controls(scenario, BATCH, rng)[:count]
-    bevel = 1 if rng.random() < 0.5 else -1
-    options = f"--seed {seed} --batch {batch}"
+    controls = (draw_controls_in_space if space else draw_controls)(scenario, BATCH, rng)[:count]
+    roll = 0.0 if rng.random() < 0.5 else np.pi
+    kind = ("--space " if space else "") + ("--adapted " if adapted else "")
+    options = f"{kind}--seed {seed} --batch {batch}"
     try:
-        simulator = Simulator(scenario)
-        tips, energy, converged = simulator.rollout(simulator.start(bevel), controls)
-        _repeat_by_step(simulator, controls[batch % count], bevel, tally)
+        simulator = Simulator(scenario.with_values({"setup.axes": 2}) if space else scenario)
+        simulator = bent(simulator, rng) if adapted else simulator
+        tips, energy, converged, *_ = simulator.rollout(simulator.start(roll), controls)
+        _repeat_by_step(simulator, controls[batch % count], roll, tally)
     except Exception as error:  # noqa: BLE001  the study counts exceptions
         tally.exceptions += 1
         tally.failures.append(f"{options}  # {type(error).__name__}: {error}")
@@ -150,11 +180,11 @@ def run_batch(seed: int, batch: int, count: int, tally: Tally) -> None:
         tally.failures.append(f"{options}  # sequence {j}, step {k}: {kind}")
 
 
-def _repeat_by_step(simulator: Simulator, rows: np.ndarray, bevel: int, tally: Tally) -> None:
+def _repeat_by_step(simulator: Simulator, rows: np.ndarray, roll: float, tally: Tally) -> None:
     """One sequence step by step, for residual and iterations, which a rollout does not report."""
-    state = simulator.start(bevel)
+    state = simulator.start(roll)
     for row in rows:
-        state = simulator.step(state, Control.from_row(row))
+        state = simulator.step(state, Control.of(row))
         tally.most_iterations = max(tally.most_iterations, state.iterations)
         tally.fallback_steps += (
             state.iterations > 8
@@ -179,6 +209,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the study; 0 if nothing failed, 1 otherwise, 130 if interrupted."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--sequences", type=int, default=100_000)
+    parser.add_argument("--space", action="store_true", help="two lateral axes (default: in the plane)")
+    parser.add_argument("--adapted", action="store_true", help="with bends and clearances (default: without)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--batch", type=int, help="only this batch, to reproduce a failure")
     options = parser.parse_args(arguments)
@@ -190,7 +222,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         for done, batch in enumerate(batches):
             left = options.sequences - done * BATCH
-            run_batch(options.seed, batch, min(BATCH, left), tally)
+            count, kind = min(BATCH, left), {"space": options.space, "adapted": options.adapted}
+            run_batch(options.seed, batch, count, tally, **kind)
             _progress(tally, len(batches), done + 1, start)
     except KeyboardInterrupt:
         interrupted = True

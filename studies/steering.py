@@ -10,6 +10,7 @@ reports.
 
 import argparse
 import json
+import math
 import os
 import sys
 from collections.abc import Iterable, Sequence
@@ -55,7 +56,7 @@ def steer(number: int, scenario: Scenario | None = None) -> dict[str, Any]:
         "guide": scenario.setup.has_guide,
         "target_mm": target,
         "planned_error_mm": plan.error_mm,
-        "claim_error_mm": float(np.hypot(truth[0] - plan.tip_mm[0], truth[1] - plan.tip_mm[1])),
+        "claim_error_mm": math.dist(truth.point, plan.tip_mm),
         "flips": plan.flips,
         "converged": plan.converged,
         "guide_moved_mm": float(np.abs(plan.guide).max()),

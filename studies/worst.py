@@ -125,17 +125,17 @@ def carried_out(insertion: StudyInsertion, plan: Plan, variant: str = NOTHING, s
     if variant == OTHER_PLAN:
         plan = make_plan(scenario, strategy=point.strategy, seed=point.plan_seed + sample, threads=1)
     phantom, tracker, control, room = np.random.SeedSequence(insertion.seed).spawn(4)
-    rig = virtual_rig(scenario, plan.bevel, Seeds(phantom, tracker, room), point.plant)
+    rig = virtual_rig(scenario, plan.roll, Seeds(phantom, tracker, room), point.plant)
     rng = np.random.default_rng(control if sample == 0 else control.spawn(sample)[-1])
     run = carry_out(scenario, plan, rig, rng, controller=point.controller, force=True, threads=1)
     last = run.periods[-1]
-    x, y, _ = last.true_tip or (math.nan, math.nan, math.nan)
+    x, y = last.true_tip[:2] if last.true_tip else (math.nan, math.nan)
     return Ending(
         error=run.true_error_mm,
         depth_error=x - plan.target[0],
         control_error=last.estimate[1] - plan.target[1],
         estimate_error=y - last.estimate[1],
-        guide=max((period.guide for period in run.periods), key=abs),
+        guide=max((period.guide[0] for period in run.periods), key=abs),
         stretch=last.true_stretch or math.nan,
         held=run.outcome is Outcome.HELD,
     )

@@ -24,7 +24,7 @@ ADAPTIVE = METHODS["adaptive-mpc"]
 
 def estimate_of(state, scenario=PHANTOM, **fields):
     """An estimate that the needle is so."""
-    begun = Identification().begin(begun_with(Simulator(scenario, threads=1), state.bevel))
+    begun = Identification().begin(begun_with(Simulator(scenario, threads=1), state.roll))
     return replace(begun, state=replace(state, scenario=scenario), tips=state.tip[None], **fields)
 
 
@@ -32,13 +32,23 @@ def decided(plan, estimate, seed=0, path=None):
     """Decision and memory after it, with a current path that is the plan's unless another is given."""
     task = task_of(estimate.nominal, plan)
     begun, path = ADAPTIVE.begin(task), path or after(of_plan(plan), estimate.state.tip[0])
-    memory = replace(begun, path=path, bevel=estimate.state.bevel)
+    memory = replace(begun, path=path, roll=estimate.state.roll)
     return ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(seed))
+
+
+def rolls_at(*depths):
+    """Rolls (k, 2) of a path, by half a turn at each of these depths (mm)."""
+    return np.column_stack([np.array(depths, dtype=float), np.pi * np.arange(1, len(depths) + 1)])
+
+
+def unrolled(path):
+    """The path without a roll."""
+    return replace(path, rolls=rolls_at())
 
 
 def after(path, x):
     """The path without the rolls that were made."""
-    return replace(path, rolls=tuple(roll for roll in path.rolls if roll > x))
+    return replace(path, rolls=path.rolls[path.rolls[:, 0] > x])
 
 
 def decide(plan, estimate, seed=0):
@@ -47,5 +57,5 @@ def decide(plan, estimate, seed=0):
 
 def aimed(plan, state, offset, ahead=20.0):
     """The plan with a target so far ahead of a tip, and off its line (mm)."""
-    x, y, theta = state.tip
-    return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(theta) + offset)))
+    x, y, _, theta, _ = state.tip
+    return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(theta) + offset), 0.0))

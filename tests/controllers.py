@@ -1,5 +1,6 @@
 """What the tests of the controllers share: a plan that is made quickly, its mirror image, estimates by hand."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,8 +8,9 @@ import pytest
 import flexneedle
 from flexneedle.estimation.identification import Identified
 from flexneedle.estimation.observer import StateCorrection
-from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import DB_THETA, DB_Y, DG_Y, Control
+from reference.cases import MIRROR
 from tasks import begun_with
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -22,17 +24,19 @@ def quick_plan():
 
 @pytest.fixture(scope="session")
 def mirrored():
-    """The mirror image of a plan: every lateral place, angle and the bevel with the other sign."""
+    """The mirror image of a plan: every y and slope dy/dx with the other sign, and the bevel on the other side."""
 
     def mirror(plan):
+        controls = plan.controls.copy()
+        controls[:, [DB_Y, DB_THETA, DG_Y]] *= -1.0
         return replace(
             plan,
-            target=(plan.target[0], -plan.target[1]),
-            bevel=-plan.bevel,
-            controls=plan.controls * [1.0, -1.0, -1.0, -1.0, 1.0],
-            tips=plan.tips * [1.0, -1.0, -1.0],
-            guide=-plan.guide,
-            shapes=plan.shapes * [1.0, -1.0, -1.0],
+            target=(plan.target[0], -plan.target[1], plan.target[2]),
+            roll=math.pi - plan.roll,
+            controls=controls,
+            tips=plan.tips * MIRROR,
+            guide=plan.guide * [-1.0, 1.0],
+            shapes=plan.shapes * MIRROR,
         )
 
     return mirror
@@ -44,9 +48,9 @@ def along():
 
     def go(plan, steps, scenario=PHANTOM, **corrections):
         simulator = Simulator(scenario, threads=1)
-        state = simulator.start(plan.bevel)
+        state = simulator.start(plan.roll)
         for row in plan.controls[:steps]:
-            state = simulator.step(state, Control.from_row(row.tolist()))
+            state = simulator.step(state, Control.of(row.tolist()))
         if corrections:
             state = simulator.step(state.with_estimate(**corrections), Control())
         return state
@@ -60,7 +64,7 @@ def estimated():
 
     def estimate(state, **fields):
         return replace(
-            StateCorrection().begin(begun_with(Simulator(state.scenario, threads=1), 1)),
+            StateCorrection().begin(begun_with(Simulator(state.scenario, threads=1))),
             state=state,
             **fields,
         )

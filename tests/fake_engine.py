@@ -20,7 +20,7 @@ def plan(scenario, target=None, strategy="manipulation", seed=0, progress=None, 
     for iteration in range(1, 6):
         progress({"iteration": iteration, "iterations": 5, "best": 9.0, "cost_mean": 9.0})
     limit = "setup.max_guide_travel_mm = 15" if miss > 1.0 else ""
-    return replace(made, tips=made.tips + np.array([0.0, miss, 0.0]), limit=limit)
+    return replace(made, tips=made.tips + np.array([0.0, miss, 0.0, 0.0, 0.0]), limit=limit)
 
 
 def insert(

@@ -7,11 +7,11 @@ import numpy as np
 import flexneedle
 from flexneedle.control.methods.adaptive_mpc import AdaptiveMpc
 from flexneedle.estimation.identification import Identification
-from flexneedle.estimation.prior import BASE_TURN, BASE_Y, BEND, BEVEL, CLEARANCE, MODULUS, RUN_OUT
+from flexneedle.estimation.prior import Slots
+from flexneedle.estimation.sensors import POSITION, SENSORS
 from flexneedle.mechanics.model import Adaptation
-from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Measurement
+from flexneedle.types import Control, Measurement
 from tasks import begun_with
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -24,10 +24,13 @@ QUIET = PHANTOM.with_values(
 TIGHT = QUIET.with_values({f"control.adaptive_mpc.clearance{key}_mm": 0.0 for key in ("", "_sd")})
 ROLLS = (20, 40, 52)  # moves that roll the bevel, the first in air
 LAYERS = len(PHANTOM.tissue)
+SLOTS = Slots.of(QUIET)
+BASE, SLOPE, BEND, RUN_OUT = (part.start for part in (SLOTS.base, SLOTS.slope, SLOTS.bend, SLOTS.run_out))
+BEVEL, CLEARANCE, MODULUS = SLOTS.bevel, SLOTS.clearance, SLOTS.modulus
 SHIFT = MODULUS + LAYERS
 CELLS = SHIFT + LAYERS - 1
-STILL = (0.0, 0.0, 0.0, 0.0, -1)
 OWN = AdaptiveMpc()
+unexplained = SENSORS[POSITION].unexplained
 WAVES = tuple(
     (1.0 + 0.5 * np.sin(0.45 * np.arange(15))).tolist()
 )  # factors on the modulus in cells of 2.5 mm
@@ -36,7 +39,7 @@ WAVES = tuple(
 def commands(count):
     """Advance by 1 mm a move; the guide goes here and there."""
     guide = 0.12 * np.sin(0.35 * np.arange(count)) + 0.05
-    return [(1.0, 0.0, 0.0, float(guide[k]), 1 if k in ROLLS else -1) for k in range(count)]
+    return [Control(db_x=1.0, dg_y=float(guide[k]), flip=k in ROLLS) for k in range(count)]
 
 
 @dataclass(frozen=True)
@@ -59,10 +62,10 @@ class Needle:
         simulator = self.simulator(scenario)
         start = Simulator(scenario, 1).start()
         base_x = float(start.base[0]) + self.base_x
-        state = start.with_estimate(base_x=base_x, base_y=self.base_y, base_turn=self.base_turn)
+        state = start.with_estimate(base_x=base_x, base=(self.base_y,), slope=(self.base_turn,))
         states = [simulator.step(state, Control())]
         for row in rows:
-            states.append(simulator.step(states[-1], Control.from_row(row)))
+            states.append(simulator.step(states[-1], row))
         return states
 
     def simulator(self, scenario):
@@ -74,7 +77,7 @@ class Needle:
 
     def measured(self, state):
         """Tip (x, y) as a tracker measures it."""
-        return np.add(state.tip[:2], [0.0, self.run_out * state.bevel])
+        return np.add(state.tip[:2], [0.0, self.run_out * state.bevel.real])
 
 
 NEEDLES = {
@@ -105,7 +108,7 @@ def followed(needle, count, *, scenario=QUIET, noise=0.0, late=0, threads=1, per
     """The estimate after some moves, the readings coming a number of moves late; the needle's states."""
     rows, rng = rows or commands(count), np.random.default_rng(2)
     states = needle.inserted(scenario, rows)
-    estimate = Identification().begin(begun_with(Simulator(scenario, threads), 1))
+    estimate = Identification().begin(begun_with(Simulator(scenario, threads)))
     batches = [readings(needle, states[k], states[k + 1], k, per_move, noise, rng) for k in range(len(rows))]
     for k, row in enumerate(rows):
         estimate = estimate.move(row, k, k + 1.0)
@@ -122,12 +125,12 @@ def ahead(estimate, needle, states, scenario=QUIET, steps=8):
     nominal, own = plain.simulator(scenario), needle.simulator(scenario)
     naive = nominal.start()
     for row in commands(len(states) - 1):
-        naive = nominal.step(naive, Control.from_row(row))
+        naive = nominal.step(naive, row)
     truth = states[-1]
     for k in range(steps):
-        row = (1.0, 0.0, 0.0, 0.1, -1)
-        truth = own.step(truth, Control.from_row(row))
-        naive = nominal.step(naive, Control.from_row(row))
+        row = Control(db_x=1.0, dg_y=0.1)
+        truth = own.step(truth, row)
+        naive = nominal.step(naive, row)
         estimate = estimate.move(row, 100.0 + k, 101.0 + k)
     goal = needle.measured(truth)[1]
     return abs(estimate.tip[1] - goal), abs(naive.tip[1] - goal)
@@ -139,7 +142,7 @@ def off_the_prior(count=55, needle="all"):
     sd = np.sqrt(1.0 / np.diag(estimate.prior.precision))
     off = np.random.default_rng(3).normal(0.0, 0.2, sd.size) * sd
     off_prior = estimate._with(estimate.parameters + off)._differentiated(range(sd.size))
-    return off_prior, off_prior._readings
+    return off_prior, off_prior._readings[0]
 
 
 def adaptation_of(parameters):
@@ -154,10 +157,10 @@ def stepped(parameters, rows, axial=0.0):
     simulator = nominal.adapted(adaptation_of(parameters))
     start = nominal.start()
     base_x = float(start.base[0]) + axial
-    state = start.with_estimate(base_x=base_x, base_y=parameters[BASE_Y], base_turn=parameters[BASE_TURN])
+    state = start.with_estimate(base_x=base_x, base=(parameters[BASE],), slope=(parameters[SLOPE],))
     states = [simulator.step(state, Control())]
     for row in rows:
-        states.append(simulator.step(states[-1], Control.from_row(row)))
+        states.append(simulator.step(states[-1], row))
     return states
 
 
@@ -165,6 +168,6 @@ def predicted(parameters, rows, means, axial=0.0):
     """Readings of such a needle: at even moves, and on the bevel's side of its axis."""
     states = stepped(parameters, rows, axial)
     y = np.array([state.tip[1] for state in states])
-    side = np.array([state.bevel for state in states])
+    side = np.array([state.bevel.real for state in states])
     ends = y[means.index + 1]
     return y[means.index] + means.part * (ends - y[means.index]) + parameters[RUN_OUT] * side[means.index + 1]

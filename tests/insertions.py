@@ -13,10 +13,9 @@ from flexneedle.rig.phantom.draw import draw
 from flexneedle.rig.phantom.phantom import Phantom
 from flexneedle.rig.tracking.simulated import NoisyTracker
 from flexneedle.rig.virtual import Rig
-from flexneedle.types import VISIBLE, Measurement
+from flexneedle.types import STILL, VISIBLE, Measurement
 
 PHANTOM = flexneedle.load_scenario("phantom")
-STILL = (0.0, 0.0, 0.0, 0.0, -1)
 READING = PHANTOM.tracker.period
 HELD, RESTING = "held", "waiting for the last reading"
 
@@ -26,8 +25,8 @@ class Tank:
 
     status = VISIBLE
 
-    def __init__(self, bevel, seed=2000, spoil=lambda batch: batch, scenario=PHANTOM, delay=0.0):
-        self.phantom = Phantom(draw(scenario, np.random.default_rng(seed)), bevel)
+    def __init__(self, roll, seed=2000, spoil=lambda batch: batch, scenario=PHANTOM, delay=0.0):
+        self.phantom = Phantom(draw(scenario, np.random.default_rng(seed)), roll)
         self.spoil, self.tape, self.moves, self.applied = spoil, [], [], []
         noise = np.random.default_rng(seed + 1)
         jitter = scenario.tracker.jitter_per_axis

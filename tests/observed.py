@@ -6,14 +6,13 @@ import numpy as np
 
 import flexneedle
 from flexneedle.estimation.observer import StateCorrection
-from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Measurement
+from flexneedle.types import Control, Measurement
 from tasks import begun_with
 
 PHANTOM = flexneedle.load_scenario("phantom")
 QUIET = PHANTOM.with_values({"tracker.jitter_mm": 1e-3})
-AHEAD = (1.0, 0.0, 0.0, 0.0, -1)
+AHEAD = Control(db_x=1.0)
 
 
 def start_with(scenario, **corrections):
@@ -22,9 +21,9 @@ def start_with(scenario, **corrections):
     return simulator.step(simulator.start().with_estimate(**corrections), Control())
 
 
-def begun(simulator, state=None, bevel=1, **correction):
+def begun(simulator, state=None, roll=0.0, **correction):
     """The estimate at the start, or at a state."""
-    estimate = StateCorrection(**correction).begin(begun_with(simulator, bevel))
+    estimate = StateCorrection(**correction).begin(begun_with(simulator, roll))
     return estimate if state is None else replace(estimate, state=state, past=state, tips=state.tip[None])
 
 
@@ -48,10 +47,10 @@ def readings_between(before, after, start=0.0, count=4):
 def follow(truth, estimate, plant, steps, *, noise=0.0, force=0.0, guide=0.0):
     """Advance plant and estimate together; the estimates, and the innovations of each period."""
     rng = np.random.default_rng(0)
-    command = (*AHEAD[:3], guide, AHEAD[4])
+    command = AHEAD._replace(dg_y=guide)
     innovations = []
     for k in range(steps):
-        before, truth = truth, plant.step(truth.with_estimate(tip_load=force), Control.from_row(command))
+        before, truth = truth, plant.step(truth.with_estimate(tip_load=(force,)), command)
         readings = [replace(s, y=s.y + rng.normal(0.0, noise)) for s in readings_between(before, truth, k)]
         estimate = estimate.move(command, k, k + 1.0).observe(readings)
         innovations.append(estimate.innovation)

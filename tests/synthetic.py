@@ -5,28 +5,51 @@ from itertools import pairwise
 
 import numpy as np
 
-from flexneedle.types import Action, Insertion, Measurement, Outcome, Period, Plan, Verdict, VerdictKind
+from flexneedle import controls as controls_of
+from flexneedle.types import (
+    DG_Y,
+    ROLL,
+    THETA,
+    Action,
+    Control,
+    Insertion,
+    Measurement,
+    Outcome,
+    Period,
+    Plan,
+    Pose,
+    Verdict,
+    VerdictKind,
+    X,
+    Y,
+)
 
 START, LENGTH, GUIDE_X, STEP = -28.5, 150.0, -41.0, 1.0
 TURN_AT = 45  # the step that turns the bevel
 
 
 def tip_path(depth, target=(40.0, 5.0), entry=-2.0):
-    """Poses (m, 3) of the tip at depths (m,): from the axis over `entry` at the skin to the target."""
+    """Poses (m, 5) of the tip at depths (m,): from the axis over `entry` at the skin to the target."""
     known = (START, -18.0, 0.0, target[0] / 2, target[0])
     curve = np.polynomial.Polynomial.fit(known, (0.0, 0.1 * entry, entry, 0.2 * entry, target[1]), 4)
-    return np.column_stack([depth, curve(depth), np.arctan(curve.deriv()(depth))])
+    return _poses(depth, curve)
 
 
 def needle_shape(path, base, guide, nodes=61):
-    """Nodes (n, 3) from the base over the guide along the path of the tip (m, 3) to its last pose."""
+    """Nodes (n, 5) from the base over the guide along the path of the tip (m, 5) to its last pose."""
     tip = path[-1]
     x = np.linspace(base, tip[0], nodes)
     known_x = np.concatenate([[base], [GUIDE_X], path[path[:, 0] > -5.0, 0] if tip[0] > 0 else [tip[0]]])
     known_y = np.concatenate([[0.0], [guide], path[path[:, 0] > -5.0, 1] if tip[0] > 0 else [tip[1]]])
     smooth = np.polynomial.Polynomial.fit(known_x, known_y, min(5, len(known_x) - 1))
-    y = smooth(x)
-    return np.column_stack([x, y, np.arctan(smooth.deriv()(x))])
+    return _poses(x, smooth)
+
+
+def _poses(x, curve):
+    """Poses (n, 5) along a curve y(x)."""
+    rows = np.zeros((len(x), 5))
+    rows[:, X], rows[:, Y], rows[:, THETA] = x, curve(x), np.arctan(curve.deriv()(x))
+    return rows
 
 
 def make_plan(strategy="manipulation", target=(40.0, 5.0), seed=0):
@@ -37,9 +60,8 @@ def make_plan(strategy="manipulation", target=(40.0, 5.0), seed=0):
     guide = (-3.0 if strategy == "manipulation" else 0.0) * np.sin(np.linspace(0.0, 2.4, len(depth)))
     inside = np.clip(depth, 0.0, None) / target[0]
     energy = (0.8 if strategy == "manipulation" else 2.1) * inside**2
-    controls = np.zeros((len(depth) - 1, 5))
-    controls[:, 0], controls[:, 3], controls[:, 4] = np.diff(depth), np.diff(guide), -1.0
-    controls[TURN_AT, 4] = 1.0
+    controls = controls_of(len(depth) - 1, db_x=np.diff(depth), dg_y=np.diff(guide))
+    controls[TURN_AT, ROLL] = np.pi
     shapes = np.stack(
         [
             needle_shape(tips[: k + 1], d - LENGTH, g)
@@ -49,7 +71,8 @@ def make_plan(strategy="manipulation", target=(40.0, 5.0), seed=0):
     terms = {"accuracy": 0.2, "energy": 5 * energy[-1], "deflection": 1.9, "control": 1.2, "flips": 0.3}
     history = tuple({"iteration": k, "best": 9.0 / k, "quantile": 10.0 / k} for k in range(1, 13))
     return Plan(
-        strategy, target, seed, 1, controls, tips, energy, guide, shapes, sum(terms.values()), terms,
+        strategy, (*target, 0.0)[:3], seed, 0.0, controls, tips, energy, np.column_stack([guide, 0.0 * guide]), shapes,
+        sum(terms.values()), terms,
         12, True, history, "", 0.71,
     )  # fmt: skip
 
@@ -57,28 +80,30 @@ def make_plan(strategy="manipulation", target=(40.0, 5.0), seed=0):
 def make_periods(plan, miss=0.06, seed=0):
     """Yield a period for each step of the plan; the true tip ends `miss` mm beyond the target, laterally."""
     rng = np.random.default_rng(seed)
-    side = plan.bevel
+    roll = plan.roll
     for k, (before, tip) in enumerate(pairwise(plan.tips)):
         inside = max(0.0, tip[0]) / plan.target[0]
         off = 0.5 * np.cos(3 * inside) * (1 - inside) + miss * inside
-        flip = 1 if k in (TURN_AT - 4, TURN_AT + 8, TURN_AT + 20) else -1
-        side = -side if flip > 0 else side
-        true = (tip[0], tip[1] + off, tip[2] + 0.002)
+        flip = k in (TURN_AT - 4, TURN_AT + 8, TURN_AT + 20)
+        roll = np.pi - roll if flip else roll
+        x, y, _, theta, _ = tip.tolist()
+        true = Pose(x, y + off, 0.0, theta + 0.002, 0.0)
         noise = rng.normal(0.0, 0.04, 2)
-        estimate = (tip[0], tip[1] + off + 0.5 * noise[0], tip[2])
-        command = (tip[0] - before[0], 0.0, 0.0, plan.controls[k, 3] + 0.01, flip)
+        estimate = Pose(x, y + off + 0.5 * noise[0], 0.0, theta, 0.0)
+        command = Control(db_x=x - before[0], dg_y=plan.controls[k, DG_Y] + 0.01, flip=flip)
         yield Period(
             index=k, time=0.2 * (k + 1), command=command,
-            applied=(command[0], 0.0, 0.0, round(command[3], 2), flip),
-            measurement=Measurement(0.2 * (k + 1) - 0.025, true[0] + noise[0], true[1] + noise[1]),
-            verdict=Verdict(), innovation=(noise[0], noise[1]), estimate=estimate,
-            shape=plan.shapes[k + 1] + [0.0, off, 0.0], base=(tip[0] - LENGTH, 0.0, 0.0),
-            guide=plan.guide[k + 1] + 0.3 * np.sin(0.2 * k), bevel=side,
-            strain_energy=plan.strain_energy[k + 1] * 1.1, tip_load=0.01 * off,
-            path=tuple(tip), cost=1.5 - inside, spread=0.05,
-            action=Action.MOVE, decision="nearer path" if flip < 0 else "turn",
+            applied=command._replace(dg_y=round(command.dg_y, 2)),
+            measurement=Measurement(0.2 * (k + 1) - 0.025, true.x + noise[0], true.y + noise[1]),
+            verdict=Verdict(), innovation=(noise[0], noise[1], 0.0), estimate=estimate,
+            shape=plan.shapes[k + 1] + [0.0, off, 0.0, 0.0, 0.0], base=Pose(x - LENGTH, 0.0, 0.0, 0.0, 0.0),
+            guide=(plan.guide[k + 1, 0] + 0.3 * np.sin(0.2 * k), 0.0), roll=roll,
+            strain_energy=plan.strain_energy[k + 1] * 1.1, tip_load=(0.01 * off, 0.0),
+            path=Pose.of(tip), cost=1.5 - inside, spread=0.05,
+            action=Action.MOVE, decision="turn" if flip else "nearer path",
             true_tip=true, true_strain_energy=plan.strain_energy[k + 1] * 1.25,
             true_stretch=float(1.0 - 0.17 * inside**2),
+            true_shape=plan.shapes[k + 1, :, :3] + [0.0, off, 0.0],
             durations={"observe": 0.001, "decide": 0.004, "total": 0.0051 + 1e-5 * k},
         )  # fmt: skip
 
@@ -96,8 +121,9 @@ def blind(period):
         period,
         measurement=measurement,
         verdict=Verdict(VerdictKind.MISSING),
-        innovation=(0.0, 0.0),
+        innovation=(0.0, 0.0, 0.0),
         true_tip=None,
         true_strain_energy=None,
         true_stretch=None,
+        true_shape=None,
     )

@@ -3,17 +3,16 @@
 import numpy as np
 import pytest
 
-from flexneedle import load_scenario
+from flexneedle import Control, load_scenario
 from flexneedle.rig.phantom.draw import Truth, draw
 from flexneedle.rig.phantom.phantom import Phantom
 from flexneedle.rig.phantom.plants import PLANTS
 from reference.rods import IDEAL
 
 PHANTOM = load_scenario("phantom")
-AHEAD = (1.0, 0.0, 0.0, 0.1, -1)
-STRAIGHT = (1.0, 0.0, 0.0, 0.0, -1)
-STILL = (0.0, 0.0, 0.0, 0.0, -1)
-TURN = (0.0, 0.0, 0.0, 0.0, 1)
+AHEAD = Control(db_x=1.0, dg_y=0.1)
+STRAIGHT = Control(db_x=1.0)
+TURN = Control(flip=True)
 SKIN = 29  # steps of 1 mm until the tip is in the tissue
 COARSE = {
     "phantom.element_mm": 5.0,
@@ -22,15 +21,15 @@ COARSE = {
 both_plants = pytest.mark.parametrize("kind", PLANTS)
 
 
-def tank(scenario=IDEAL, kind="exact", bevel=1, **truth):
+def tank(scenario=IDEAL, kind="exact", roll=0.0, **truth):
     """A phantom with only these imperfections."""
-    return Phantom(Truth(scenario, cell_mm=0.5 * scenario.phantom.contact_spacing_mm, **truth), bevel, kind)
+    return Phantom(Truth(scenario, cell_mm=0.5 * scenario.phantom.contact_spacing_mm, **truth), roll, kind)
 
 
-def alone(seed=0, kind="exact", bevel=1, **values):
+def alone(seed=0, kind="exact", roll=0.0, **values):
     """The phantom of a seed with only these imperfections."""
     scenario = IDEAL.with_values({f"phantom.{key}": value for key, value in values.items()})
-    return Phantom(draw(scenario, np.random.default_rng(seed)), bevel, kind)
+    return Phantom(draw(scenario, np.random.default_rng(seed)), roll, kind)
 
 
 def driven(phantom, *commands, times=1):

@@ -11,7 +11,14 @@ def task_of(simulator, plan, controller=DEFAULT):
     return tables.task(METHODS[controller], simulator, plan)
 
 
-def begun_with(simulator, bevel=1, controller=DEFAULT):
-    """A task whose plan has no more than the bevel's side and a target: enough for an observer."""
+def begun_with(simulator, roll=0.0, controller=DEFAULT):
+    """A task whose plan has no more than the needle's roll and a target: enough for an observer."""
     target = simulator.scenario.target.position
-    return task_of(simulator, SimpleNamespace(bevel=bevel, target=target), controller)
+    return task_of(simulator, SimpleNamespace(roll=roll, target=target), controller)
+
+
+def stretched(rows, factor, *columns):
+    """Poses or controls with these columns times a factor."""
+    rows = rows.copy()
+    rows[..., list(columns)] *= factor
+    return rows

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.arguments import pair, whole
+from flexneedle.arguments import point, whole
 from flexneedle.control.methods import METHODS
 from flexneedle.errors import FlexneedleError, InputError
 from flexneedle.scenario.files import dump_scenario
@@ -17,7 +17,7 @@ SIMULATOR = flexneedle.Simulator("phantom", threads=1)
 SCENARIO = "must be a preset name, a path or a Scenario"
 WHOLE = "must be a whole number, at least"
 CORES = "leave it out for one per core"
-TARGET = "must be two numbers, depth and lateral offset in mm"
+TARGET = "must be two or three numbers, depth and lateral offsets in mm"
 MAKE = "make one with flexneedle.plan(scenario)"
 OWN = "module:NAME of your own"
 MISSING = "name: missing\nneedle = 3: must be a table\nsetup: missing\ntissue: missing"
@@ -93,7 +93,7 @@ BENCH = SimpleNamespace(now=float, wait=float, apply=tuple, read=tuple, status="
         ),
         (
             lambda: flexneedle.insert("phantom", PLAN, phantom={"exact": 1}),
-            f"phantom = {{'exact': 1}}: must be one of exact, model, {OWN}, or a function of (truth, bevel)",
+            f"phantom = {{'exact': 1}}: must be one of exact, model, {OWN}, or a function of (truth, roll)",
         ),
         (
             lambda: flexneedle.insert("phantom", PLAN, controller=3),
@@ -144,7 +144,8 @@ def test_the_error_for_any_value_is_one_short_line(value):
 
 def test_numpy_numbers_are_accepted():
     assert whole("seed", np.int64(3), 0) == 3
-    assert pair("target", np.array([40.0, 5.0]), "x and y") == (40.0, 5.0)
+    assert point("target", np.array([40.0, 5.0]), "x, y and z") == (40.0, 5.0, 0.0)
+    assert point("target", np.array([40.0, 5.0, -2.0]), "x, y and z") == (40.0, 5.0, -2.0)
 
 
 def test_a_scenario_may_be_given_by_name_or_path(tmp_path):
@@ -168,7 +169,7 @@ def test_run_executes_a_plan_on_any_rig(quick_plan):
 
     phantom, tracker, control, room = np.random.SeedSequence(4).spawn(4)
     scenario = flexneedle.load_scenario("phantom")
-    rig = virtual_rig(scenario, quick_plan.bevel, Seeds(phantom, tracker, room))
+    rig = virtual_rig(scenario, quick_plan.roll, Seeds(phantom, tracker, room))
     assert isinstance(rig, flexneedle.Rig)
     done = flexneedle.run(scenario, quick_plan, rig, np.random.default_rng(control), controller="open-loop")
     same = flexneedle.insert(scenario, quick_plan, 4, controller="open-loop")

@@ -21,7 +21,7 @@ SCENARIO = flexneedle.load_scenario("phantom")
 SIMULATOR = flexneedle.Simulator(SCENARIO, threads=2)
 STATE = SIMULATOR.step(SIMULATOR.start(), flexneedle.Control(db_x=1.0, dg_y=0.1))
 INSERTION = make_insertion()
-ROLLOUT = SIMULATOR.rollout(STATE, [[flexneedle.Control(db_x=1.0).row()] * 3] * 2)
+ROLLOUT = SIMULATOR.rollout(STATE, [[flexneedle.Control(db_x=1.0)] * 3] * 2)
 READINGS = {"tip": SensorReading((1.0, 2.0, 3.0)), "ref1": SensorReading(None, status="missing")}
 RECORDS = {
     "plan": INSERTION.plan,
@@ -37,7 +37,7 @@ RECORDS = {
     "contacts": STATE.contacts,
     "rollout": ROLLOUT,
     "assimilation": SIMULATOR.assimilate(STATE, STATE.tip[:2]),
-    "trajectories": Trajectories(np.zeros((2, 3, 5)), *ROLLOUT),
+    "trajectories": Trajectories(np.zeros((2, 3, 9)), *ROLLOUT[:3]),
     "task": task_of(SIMULATOR, make_plan()),
     "estimate": StateCorrection().begin(begun_with(SIMULATOR)),
     "identification": Identification().begin(begun_with(SIMULATOR)),
@@ -73,7 +73,7 @@ def test_a_record_prints_as_one_short_line(name):
         ),
         (
             "start",
-            "<State tip (-28.500, 0.000) mm, slope 0.00 mrad, guide 0.000 mm, bevel +1, 0 mJ in the tissue, "
+            "<State tip (-28.500, 0.000) mm, slope 0.00 mrad, guide 0.000 mm, roll 0°, 0 mJ in the tissue, "
             "converged>",
         ),
         ("rollout", "<Rollout of 2 sequences of 3 steps, 100% of the steps converged>"),

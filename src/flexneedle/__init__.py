@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from flexneedle.scenario.model import Scenario
     from flexneedle.scenario.sections.fields import Section
     from flexneedle.scenario.tissue.layer import Layer
-    from flexneedle.simulator.control import Control
+    from flexneedle.simulator.control import controls
     from flexneedle.simulator.simulator import Simulator
     from flexneedle.simulator.state import State
     from flexneedle.study.runner import run_study
-    from flexneedle.types import Insertion, Measurement, Plan
+    from flexneedle.types import Control, Insertion, Measurement, Plan, Pose
 
 __version__ = "0.1.0"
 
@@ -54,6 +54,7 @@ __all__ = [
     "Method",
     "Plan",
     "Plant",
+    "Pose",
     "Rig",
     "RunError",
     "Scenario",
@@ -67,6 +68,7 @@ __all__ = [
     "TipTracker",
     "Truth",
     "__version__",
+    "controls",
     "insert",
     "load",
     "load_scenario",
@@ -101,11 +103,11 @@ _HOMES = {
     "scenario.model": ("Scenario",),
     "scenario.sections.fields": ("Section",),
     "scenario.tissue.layer": ("Layer",),
-    "simulator.control": ("Control",),
+    "simulator.control": ("controls",),
     "simulator.simulator": ("Simulator",),
     "simulator.state": ("State",),
     "study.runner": ("run_study",),
-    "types": ("Insertion", "Measurement", "Plan"),
+    "types": ("Control", "Insertion", "Measurement", "Plan", "Pose"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

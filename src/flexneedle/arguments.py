@@ -24,16 +24,17 @@ def whole(name: str, value: Any, least: int, remedy: str = "") -> int:
     return number
 
 
-def pair(name: str, value: Any, parts: str) -> tuple[float, float]:
-    """Return two numbers; `parts` describes them in the message. Raises InputError for anything else."""
+def point(name: str, value: Any, parts: str) -> tuple[float, float, float]:
+    """Return three numbers, the last 0 if only two are given; `parts` describes them. Raises InputError for others."""
     try:
         given = [] if isinstance(value, str | Mapping) else list(value)
         numbers = [] if any(isinstance(part, bool | str) for part in given) else list(map(float, given))
     except (TypeError, ValueError):
         numbers = []
-    if len(numbers) != 2:
-        raise refusal(name, value, f"must be two numbers, {parts}")
-    return numbers[0], numbers[1]
+    if len(numbers) not in (2, 3):
+        raise refusal(name, value, f"must be two or three numbers, {parts}")
+    x, y, z = (*numbers, 0.0)[:3]
+    return x, y, z
 
 
 def instance(name: str, value: Any, kind: type[_Kind], remedy: str) -> _Kind:

@@ -1,10 +1,16 @@
-"""Frozen records shared by all layers: commands, measurements, plans and insertions. Units are mm, N, mJ, rad, s."""
+"""Frozen records shared by all layers: commands, measurements, plans and insertions. Units are mm, N, mJ, rad, s.
 
-from collections.abc import Mapping, Sequence
+Positions are x along the insertion axis and y, z across it; a needle in the plane has z = 0. Poses and commands are
+rows of columns, in arrays, too.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from numbers import Real
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +21,146 @@ if TYPE_CHECKING:
     from flexneedle.scenario.model import Scenario
 
 Floats = NDArray[np.float64]
-Pose = tuple[float, float, float]
-"""x (mm), y (mm), slope angle (rad)."""
-Command = tuple[float, float, float, float, int]
-"""db_x, db_y (mm), db_theta (rad), dg_y (mm), flip (−1, or +1 to roll the bevel by half a turn)."""
-
-
 Point = tuple[float, float, float]
 """x, y, z (mm)."""
+Lateral = tuple[float, float]
+"""y, z of a lateral quantity."""
+UNKNOWN: Lateral = (math.nan, math.nan)
+"""A lateral quantity that is not known."""
+
+Matrix = tuple[tuple[float, ...], ...]
+"""A matrix by rows."""
+
+X, Y, Z, THETA, PSI = range(5)
+"""Columns of a pose."""
+DB_X, DB_Y, DB_Z, DB_THETA, DB_PSI, DG_Y, DG_Z, ROLL, SPIN = range(9)
+"""Columns of a control."""
+
+
+Laterals = NDArray[Any]
+"""Lateral quantities: y in the plane, y + iz in space."""
+
+
+def laterals(rows: Floats, first: int, axes: int) -> Laterals:
+    """`across` in space, the column of y in the plane."""
+    return rows[..., first] if axes == 1 else across(rows, first)
+
+
+def across(rows: Floats, first: int) -> NDArray[np.complex128]:
+    """The lateral quantities y + iz (…) of rows (…, k); `first`: the column of y, as Y, THETA, DB_Y or DG_Y."""
+    lateral: NDArray[np.complex128] = rows[..., first] + 1j * rows[..., first + 1]
+    return lateral
+
+
+def wrapped(angle: Floats) -> Floats:
+    """Angles (rad) from −π, excluded, to π."""
+    within: Floats = np.pi - (np.pi - angle) % (2.0 * np.pi)
+    return within
+
+
+class Pose(NamedTuple):
+    """Position x, y, z (mm), and slopes θ = dy/dx and ψ = dz/dx (rad): of a needle that is bent far, the angle by which
+    it is tilted from x, in the directions y and z.
+    """
+
+    x: float
+    y: float
+    z: float
+    theta: float
+    psi: float
+
+    @property
+    def point(self) -> Point:
+        """x, y, z (mm)."""
+        return self.x, self.y, self.z
+
+    @property
+    def axis(self) -> Point:
+        """Direction of the needle, a unit vector: x tilted by √(θ² + ψ²) in the direction (θ, ψ)."""
+        angle = math.hypot(self.theta, self.psi)
+        share = math.sin(angle) / angle if angle else 1.0
+        return math.cos(angle), share * self.theta, share * self.psi
+
+    @staticmethod
+    def of(row: Iterable[float]) -> "Pose":
+        """The pose of five columns."""
+        return Pose(*map(float, row))
+
+
+class Shape(NamedTuple):
+    """A predicted shape: poses (n, 5) at the nodes of the needle, and standard deviations (n, 2) of their y and z
+    (mm).
+    """
+
+    nodes: Floats
+    sd: Floats
+
+
+class _Columns(NamedTuple):
+    db_x: float = 0.0
+    db_y: float = 0.0
+    db_z: float = 0.0
+    db_theta: float = 0.0
+    db_psi: float = 0.0
+    dg_y: float = 0.0
+    dg_z: float = 0.0
+    roll: float = 0.0
+    spin: float = 0.0
+
+
+COLUMNS: tuple[str, ...] = _Columns._fields
+"""Names of the columns of a control."""
+
+
+class Control(_Columns):
+    """One control step, a row of nine columns: motion of the base by db_x, db_y, db_z (mm) and of its slopes by
+    db_theta, db_psi (rad), of the guide by dg_y, dg_z (mm); `roll` of the needle before the step, and `spin` evenly
+    during it (rad). `flip` is a roll by half a turn. Raises InputError for anything but numbers.
+    """
+
+    __slots__ = ()
+
+    def __new__(
+        cls,
+        db_x: float = 0.0,
+        db_y: float = 0.0,
+        db_z: float = 0.0,
+        db_theta: float = 0.0,
+        db_psi: float = 0.0,
+        dg_y: float = 0.0,
+        dg_z: float = 0.0,
+        roll: float = 0.0,
+        spin: float = 0.0,
+        *,
+        flip: bool = False,
+    ) -> "Control":
+        """Return the row; `flip` adds half a turn to `roll`."""
+        values: tuple[Any, ...] = (db_x, db_y, db_z, db_theta, db_psi, dg_y, dg_z, roll, spin)
+        for name, value in zip(COLUMNS, values, strict=True):
+            if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
+                raise refusal(name, value, "must be a number, in mm or rad")
+        if not isinstance(flip, bool | np.bool_):
+            raise refusal("flip", flip, "must be True or False")
+        turn = roll + math.pi if flip else roll
+        return super().__new__(cls, *map(float, (*values[:ROLL], turn, spin)))
+
+    @classmethod
+    def of(cls, row: Iterable[float]) -> "Control":
+        """Return the control of nine columns. Raises InputError for another number of them."""
+        values = tuple(row)
+        if len(values) != len(COLUMNS):
+            raise refusal("control", values, f"must have {len(COLUMNS)} columns: {', '.join(COLUMNS)}")
+        return cls(*values)
+
+    @property
+    def rolls(self) -> bool:
+        """Whether the needle is rolled, before or during the step."""
+        return self.roll != 0.0 or self.spin != 0.0
+
+
+STILL = Control()
+"""No motion."""
+
 Quaternion = tuple[float, float, float, float]
 """Unit quaternion w, x, y, z from the sensor's to the tracker's frame; the sensor's z axis is the needle's."""
 
@@ -73,9 +211,11 @@ class Frame:
 
 @dataclass(frozen=True)
 class Measurement:
-    """The tip in one frame: time of measurement (s); x, y in the plane and z out of it (mm), None if not measured.
+    """The tip in one frame: time of measurement (s); x, y, z (mm), None if not measured.
 
-    frame: all sensors of the tracker, for the monitor; None if there is only the tip.
+    frame: all sensors of the tracker, for the monitor; None if there is only the tip. direction: slopes dy/dx and dz/dx
+    (rad) of the needle at the tip; points: x, y, z (mm) measured along the needle, from the base on. Covariances as
+    the tracker reports them, of position (3, 3), mm², and direction (2, 2), rad²; None: those of the scenario.
     """
 
     time: float
@@ -83,22 +223,26 @@ class Measurement:
     y: float | None
     z: float | None = None
     frame: Frame | None = None
+    direction: Lateral | None = None
+    points: tuple[Point, ...] = ()
+    covariance: Matrix | None = None
+    direction_covariance: Matrix | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
     """A planned insertion of m steps.
 
-    controls (m, 5): columns db_x, db_y, db_theta, dg_y, flip; tips (m + 1, 3): planned tip poses, the start first;
-    strain_energy (m + 1,): weighted tissue energy (mJ); guide (m + 1,): guide position (mm); shapes (m + 1, n, 3):
-    nodes of the needle; terms: cost by name; history: one dict per iteration of the planner; scenario: that of the
-    plan, None if unknown.
+    target: x, y, z (mm); roll: of the needle before the first step (rad); controls (m, 9): columns of `Control`;
+    tips (m + 1, 5): planned tip poses, the start first; strain_energy (m + 1,): weighted tissue energy (mJ); guide
+    (m + 1, 2): guide position y, z (mm); shapes (m + 1, n, 5): poses at the nodes of the needle; terms: cost by name;
+    history: one dict per iteration of the planner; scenario: that of the plan, None if unknown.
     """
 
     strategy: str
-    target: tuple[float, float]
+    target: Point
     seed: int
-    bevel: int  # at the start, before the first step
+    roll: float
     controls: Floats
     tips: Floats
     strain_energy: Floats
@@ -114,14 +258,14 @@ class Plan:
     scenario: "Scenario | None" = None
 
     @property
-    def tip_mm(self) -> tuple[float, float]:
+    def tip_mm(self) -> Point:
         """Position of the planned tip at the end."""
-        return float(self.tips[-1, 0]), float(self.tips[-1, 1])
+        return Pose.of(self.tips[-1]).point
 
     @property
     def error_mm(self) -> float:
-        """Planar distance from the planned tip to the target (mm)."""
-        return float(np.hypot(self.tips[-1, 0] - self.target[0], self.tips[-1, 1] - self.target[1]))
+        """Distance from the planned tip to the target (mm)."""
+        return math.dist(self.tip_mm, self.target)
 
     @property
     def strain_energy_mj(self) -> float:
@@ -135,14 +279,20 @@ class Plan:
 
     @property
     def entry_angle(self) -> float:
-        """Slope angle (rad) of the planned tip at the skin; NaN if it does not reach the skin."""
-        depth, angle = self.tips[:, 0], self.tips[:, 2]
+        """Slope dy/dx (rad) of the planned tip at the skin; NaN if it does not reach the skin."""
+        return self.entry_angles[0]
+
+    @property
+    def entry_angles(self) -> Lateral:
+        """Slopes dy/dx and dz/dx (rad) of the planned tip at the skin; NaN if it does not reach the skin."""
+        depth = self.tips[:, X]
         inside = np.flatnonzero(depth >= 0.0)
         if len(inside) == 0:
-            return float("nan")
+            return math.nan, math.nan
         after = max(int(inside[0]), 1)
         ends = slice(after - 1, after + 1)
-        return float(np.interp(0.0, depth[ends], angle[ends]))
+        theta, psi = (float(np.interp(0.0, depth[ends], self.tips[ends, slope])) for slope in (THETA, PSI))
+        return theta, psi
 
     @property
     def summary(self) -> str:
@@ -154,8 +304,8 @@ class Plan:
 
     @property
     def flips(self) -> int:
-        """Number of bevel flips (half-turns) during the insertion; setting the side at the start is not counted."""
-        return int(np.count_nonzero(self.controls[:, 4] > 0.0))
+        """Number of rolls of the bevel (bevel flips, in the plane) during the insertion, without that at the start."""
+        return int(np.count_nonzero(self.controls[:, ROLL]))
 
     def __repr__(self) -> str:
         to = f"{self.strategy} to {_mm(self.target)} in {len(self.controls)} steps"
@@ -231,18 +381,18 @@ class Period:
 
     index: int
     time: float  # end of the period (s), simulated time or clock of the rig
-    command: Command
-    applied: Command
+    command: Control
+    applied: Control
     measurement: Measurement  # the newest reading, or the last good one while none arrives
     verdict: Verdict  # of the measurement, or of the field
-    innovation: tuple[float, float]  # measurement minus prediction (mm); 0, 0 without a usable measurement
+    innovation: Point  # measurement minus prediction (mm); 0, 0, 0 without a usable measurement
     estimate: Pose
-    shape: Floats  # (n, 3) nodes of the estimated needle
+    shape: Floats  # (n, 5) poses at the nodes of the estimated needle
     base: Pose
-    guide: float
-    bevel: int
+    guide: Lateral  # position (mm)
+    roll: float  # of the needle (rad)
     strain_energy: float  # of the estimate (mJ)
-    tip_load: float  # lateral force at the tip (N) added by the observer
+    tip_load: Lateral  # force at the tip (N) added by the observer
     path: Pose  # planned pose at the estimated tip's depth
     cost: float  # predicted cost of the chosen command
     spread: float  # final standard deviation of the first guide step (mm)
@@ -253,9 +403,11 @@ class Period:
     durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
     converged: bool = True  # solves of the model in this period, and of the virtual phantom up to it
     true_stretch: float | None = None  # minimum stretch λ of the true tissue so far
-    miss: float = float("nan")  # predicted lateral miss at the target (mm); NaN: not predicted
-    miss_sd: float = float("nan")  # its standard deviation (mm)
+    miss: Lateral = UNKNOWN  # predicted lateral miss y, z at the target (mm); NaN: not predicted
+    miss_sd: float = math.nan  # its standard deviation on an axis (mm)
     warning: str = ""  # warning of a likely miss, or ""
+    predicted: Shape | None = None  # shape at the target; None: not predicted
+    true_shape: Floats | None = None  # points x, y, z (n, 3) at equal distances along the needle (mm)
     readings: tuple[CheckedMeasurement, ...] = ()  # all readings of the period, oldest first
 
     def __repr__(self) -> str:
@@ -279,26 +431,32 @@ class Insertion:
     scenario: "Scenario | None" = None  # of the insertion
 
     @property
-    def target(self) -> tuple[float, float]:
-        """Target (x, y) in mm."""
+    def target(self) -> Point:
+        """Target x, y, z in mm."""
         return self.plan.target
 
     @property
     def true_error_mm(self) -> float:
-        """Planar distance (depth and lateral) from the true tip to the target at the last period; NaN if unknown."""
+        """Distance from the true tip to the target at the last period; NaN if unknown."""
         truth = self.periods[-1].true_tip if self.periods else None
-        return _distance(truth, self.target)
+        return math.nan if truth is None else math.dist(truth.point, self.target)
 
     @property
     def residual_mm(self) -> float:
-        """Planar distance from the last accepted reading to the target, as in the paper; NaN without a reading."""
+        """Distance from the last accepted reading to the target, as in the paper; NaN without a reading.
+
+        A reading without z counts in the plane.
+        """
         good = [period.measurement for period in self.periods if period.verdict.ok]
-        return _distance((good[-1].x, good[-1].y) if good else None, self.target)
+        if not good or good[-1].x is None or good[-1].y is None:
+            return math.nan
+        x, y, z = self.target
+        return math.dist((good[-1].x, good[-1].y, z if good[-1].z is None else good[-1].z), (x, y, z))
 
     @property
     def flips(self) -> int:
-        """Number of applied bevel flips (half-turns)."""
-        return sum(period.applied[4] > 0 for period in self.periods)
+        """Number of applied rolls of the bevel (bevel flips, in the plane)."""
+        return sum(period.applied.rolls for period in self.periods)
 
     @property
     def warning(self) -> str:
@@ -346,10 +504,6 @@ def scenario_of(record: Plan | Insertion) -> "Scenario":
 
 
 def _mm(position: Sequence[float]) -> str:
-    return f"({position[0]:.4g}, {position[1]:.4g}) mm"
-
-
-def _distance(point: Any, target: tuple[float, float]) -> float:
-    if point is None:
-        return float("nan")
-    return float(np.hypot(point[0] - target[0], point[1] - target[1]))
+    """A position, without z in the plane."""
+    x, y, *out = position[:3]
+    return f"({', '.join(f'{value:.4g}' for value in (x, y, *(z for z in out if z != 0.0)))}) mm"

@@ -73,7 +73,7 @@ def test_insert_json_is_one_object_with_all_digits(engine, capsys):
     result = json.loads(out)
     assert status == 0
     assert list(result) == INSERT_KEYS
-    assert result["target_mm"] == [40.0, 5.0]
+    assert result["target_mm"] == [40.0, 5.0, 0.0]
     assert result["reached"] is True
     assert result["true_error_mm"] == pytest.approx(0.07)
     assert (result["flips"], result["planned_flips"], result["steps"], result["seed"]) == (3, 1, 69, 3)
@@ -156,14 +156,40 @@ def test_the_first_compilation_is_announced(engine, capsys, monkeypatch):
     assert "Compiling" not in run(capsys, "plan")[2]
 
 
+def test_a_target_has_two_or_three_numbers(capsys):
+    for given in (["1"], ["1", "2", "3", "4"], ["40", "5", "phantom"]):
+        with pytest.raises(SystemExit) as caught:
+            cli.main(["insert", "--target", *given])
+        assert caught.value.code == 2
+        line = capsys.readouterr().err.splitlines()[-1]
+        assert line.endswith(f"{' '.join(given)}: must be two or three numbers, with SCENARIO before it")
+
+
+def test_a_target_in_space_has_two_lateral_offsets(engine, capsys):
+    engine()
+    status, out, _ = run(capsys, "insert", "phantom3d", "--target", "30", "-4.5", "2")
+    assert status in (0, 1)
+    assert "target (depth, lateral offsets)" in out
+    assert "30, -4.5, 2 mm" in out
+    assert re.search(r"^ bevel rolls +\d", out, re.MULTILINE)
+
+
+def test_a_plan_in_space_has_two_entry_angles(engine, capsys):
+    engine()
+    _, out, _ = run(capsys, "plan", "phantom3d")
+    assert re.search(r"^ entry angles +[+-]\d+\.\d\d°, [+-]\d+\.\d\d° $", out, re.MULTILINE)
+    _, out, _ = run(capsys, "plan", "phantom")
+    assert re.search(r"^ entry angle +[+-]\d+\.\d\d° $", out, re.MULTILINE)
+
+
 def test_the_target_is_depth_then_lateral_offset(engine, capsys):
     engine()
     status, out, _ = run(capsys, "insert", "--json", "--target", "30", "-4.5")
     result = json.loads(out)
     assert status == 0
-    assert result["target_mm"] == [30.0, -4.5]
+    assert result["target_mm"] == [30.0, -4.5, 0.0]
     stored = json.loads((Path(result["run_dir"]) / "run.json").read_text())
-    assert stored["scenario"]["target"] == {"depth_mm": 30.0, "lateral_mm": -4.5}
+    assert stored["scenario"]["target"] == {"depth_mm": 30.0, "lateral_mm": -4.5, "lateral_z_mm": 0.0}
 
 
 def test_a_miss_is_reported_and_fails(engine, capsys):
@@ -216,7 +242,7 @@ def test_a_refusal_before_the_plan_prints_the_same_keys(argv, reason, capsys, in
     result = json.loads(out)
     assert (status, list(result), err) == (2, INSERT_KEYS, f"flexneedle: {reason}\n")
     assert (result["outcome"], result["reason"], result["reached"]) == ("refused", reason, False)
-    assert (result["controller"], result["target_mm"], result["seed"]) == (argv[-1], [40.0, 5.0], 4)
+    assert (result["controller"], result["target_mm"], result["seed"]) == (argv[-1], [40.0, 5.0, 0.0], 4)
     assert (result["run_dir"], result["planned_error_mm"]) == (None, None)
     assert result["timing"] == {"plan_seconds": None, "period_ms": {"p50": None, "p99": None, "max": None}}
     assert names(in_tmp) == ["case.toml"]
@@ -366,7 +392,8 @@ def test_wrong_arguments_exit_with_status_2(argv, capsys):
     ("argv", "target", "reason"),
     [
         (["nowhere.toml"], None, "nowhere.toml"),
-        (["phantom", "--target", "45", "20"], [45.0, 20.0], "target.lateral_mm = 20"),
+        (["phantom", "--target", "45", "20"], [45.0, 20.0, 0.0], "target.lateral_mm = 20"),
+        (["phantom3d", "--target", "45", "2", "-20"], [45.0, 2.0, -20.0], "target.lateral_z_mm = -20"),
     ],
 )
 def test_a_refused_scenario_prints_the_same_keys(capsys, in_tmp, argv, target, reason):

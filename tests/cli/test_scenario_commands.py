@@ -35,7 +35,8 @@ def run_process(*argv, stdout=subprocess.PIPE):
 
 
 def test_list_names_the_presets(capsys):
-    assert run(capsys, "scenario", "list") == (0, "phantom      Two-layer tissue phantom\n", [])
+    listed = "phantom      Two-layer tissue phantom\nphantom3d    Two-layer tissue phantom in space\n"
+    assert run(capsys, "scenario", "list") == (0, listed, [])
 
 
 def test_show_prints_the_scenario_with_its_defaults(capsys, minimal_text, scenario_file):
@@ -146,7 +147,10 @@ def test_an_error_prints_no_traceback():
     done = run_process("scenario", "check", "/nowhere.toml")
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr == "flexneedle: /nowhere.toml: no such file, and no such preset (choices: phantom)\n"
+    assert (
+        done.stderr
+        == "flexneedle: /nowhere.toml: no such file, and no such preset (choices: phantom, phantom3d)\n"
+    )
 
 
 @pytest.mark.parametrize("argv", [["scenario", "schema"], ["--help"]])

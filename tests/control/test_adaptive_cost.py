@@ -1,5 +1,6 @@
 """What a path costs the default controller: weights, miss and reach."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,14 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_of
+from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_of, unrolled
 from flexneedle.control.methods import adaptive_mpc
 from flexneedle.control.path import of_plan
 from flexneedle.planning import terms
 from flexneedle.planning.planner import bevel_reach
 from flexneedle.planning.terms import charges
-from flexneedle.simulator.control import Control
+from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import Control, Y
 from tasks import task_of
 
 
@@ -67,7 +69,7 @@ def test_a_miss_counts_little_below_what_it_is_known_by(quick_plan, along):
     ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
     trajectories = adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
     (term,) = (term for term in adaptive_mpc.cost_terms(task, estimate, memory, ahead) if term.name == "miss")
-    past = float(terms.past(trajectories, quick_plan.target)[0])
+    past = float(terms.past(trajectories, quick_plan.target)[0].real)
     assert abs(past) > 1e-3
     blur = 0.3 * ahead.left / 40.0
     assert blur < 0.25
@@ -83,9 +85,9 @@ def test_near_the_target_what_is_above_its_standard_deviation_is_urgent_and_what
     memory = replace(ADAPTIVE.begin(task), blur=0.3)
     ahead = adaptive_mpc.Ahead.of(task, estimate.state, memory.path)
     trajectories = adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0])
-    off = terms.past(trajectories, quick_plan.target)[0]
+    off = terms.past(trajectories, quick_plan.target)[0].real
     tips = np.repeat(trajectories.tips, 3, axis=0)
-    tips[:, -1, 1] += np.array([0.01, 0.3, 30.0]) - off
+    tips[:, -1, Y] += np.array([0.01, 0.3, 30.0]) - off
     charged = charges(
         adaptive_mpc.cost_terms(task, estimate, memory, ahead)[:2], replace(trajectories, tips=tips)
     )
@@ -110,19 +112,20 @@ def test_what_is_expected_above_zero_is_the_integral(mean, sd):
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-@pytest.mark.parametrize("bevel", [1, -1])
-def test_reach_is_not_given_away_by_a_step_with_the_bevel_on_the_wrong_side(quick_plan, side, bevel):
+@pytest.mark.parametrize("roll", [0.0, math.pi])
+def test_reach_is_not_given_away_by_a_step_with_the_bevel_on_the_wrong_side(quick_plan, side, roll):
     """To a target near the end of what the bevel can reach."""
     simulator = Simulator(BARE, threads=1)
-    state = simulator.replay(simulator.start(bevel), [[31.0, 0.0, 0.0, 0.0, -1.0]])[0]
+    state = simulator.replay(simulator.start(roll), controls(1, db_x=31.0))[0]
     estimate = estimate_of(state, BARE)
     least, greatest = bevel_reach(BARE, 40.0, threads=1)
-    plan = replace(quick_plan, target=(40.0, 0.9 * (greatest if side > 0 else least)), bevel=bevel)
+    plan = replace(quick_plan, target=(40.0, 0.9 * (greatest if side > 0 else least), 0.0), roll=roll)
     task = task_of(simulator, plan)
-    ahead = adaptive_mpc.Ahead.of(task, state, replace(of_plan(plan), rolls=()))
-    kept, rolled = adaptive_mpc.out_of_reach(task, estimate, ahead, ADAPTIVE.begin(task))
+    ahead = adaptive_mpc.Ahead.of(task, state, unrolled(of_plan(plan)))
+    expected = adaptive_mpc.out_of_reach(task, estimate, ahead, ADAPTIVE.begin(task))
+    kept, _, rolled, _ = expected(adaptive_mpc.measured_rollout(estimate, ahead.constant))
     assert min(kept, rolled) >= 0.0
-    assert (kept < rolled) == (side == bevel)
+    assert (kept < rolled) == (side == state.bevel.real)
 
 
 def test_cost_is_a_length_that_no_scale_of_tissue_changes(quick_plan, along):

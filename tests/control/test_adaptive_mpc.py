@@ -9,25 +9,24 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 import flexneedle
-from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_of
+from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_of, rolls_at, unrolled
 from flexneedle.control.interface import travel_left
 from flexneedle.control.methods import DEFAULT, adaptive_mpc
 from flexneedle.control.path import of_plan
 from flexneedle.estimation.estimate import Move
-from flexneedle.estimation.prior import RUN_OUT
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.planning.terms import cost
 from flexneedle.scenario.worlds import world
-from flexneedle.simulator.control import Control
+from flexneedle.simulator.control import controls as controls_of
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Measurement
+from flexneedle.types import DG_Y, ROLL, STILL, THETA, Control, Measurement, X, Y
 from reference.cases import numbers
-from tasks import task_of
+from tasks import stretched, task_of
 
 ACCURATE = PHANTOM.with_values(
     {f"control.adaptive_mpc.{key}": 0.0 for key in ("energy_weight_mm", "line_weight", "slope_weight_mm")}
 )
-STILL = (0.0, 0.0, 0.0, 0.0, -1)
+FORWARD = Control(db_x=1.0)
 ROLLING = BARE.with_values(
     {
         f"control.adaptive_mpc.{key}": 0.0
@@ -40,12 +39,12 @@ def carried_out(plan, scenario, plant=None, steps=100, seed=0):
     """Decisions of a whole insertion into a plant whose tip is measured at the end of each, and both states then."""
     task, plant = task_of(Simulator(scenario, threads=1), plan), plant or Simulator(scenario, threads=1)
     estimate, rng = ADAPTIVE.observer.begin(task), np.random.default_rng(seed)
-    truth, memory, decisions = plant.start(plan.bevel), ADAPTIVE.begin(task), []
+    truth, memory, decisions = plant.start(plan.roll), ADAPTIVE.begin(task), []
     for k in range(steps):
         decision, memory = ADAPTIVE.decide(task, memory, estimate, rng)
         decisions.append(decision)
         command = STILL if decision.rest > 0.0 else decision.command
-        truth = plant.step(truth, Control.from_row(command))
+        truth = plant.step(truth, command)
         x, y = truth.tip[:2].tolist()
         estimate = estimate.move(command, k, k + 1.0).observe([Measurement(k + 1.0, x, y)])
         if ADAPTIVE.arrived(task, memory, estimate):
@@ -69,27 +68,25 @@ def test_without_a_guide_it_rolls_the_bevel_to_a_target_on_either_side(quick_pla
     state = simulator.start()
     for k in range(35):
         state = simulator.step(state, Control(db_x=1.0, flip=rolled and k == 0))
-    flips = (1.0, -1.0)
-    ends = [
-        simulator.replay(state, [[1.0, 0.0, 0.0, 0.0, flip if k == 0 else -1.0] for k in range(30)])[0].tip
-        for flip in flips
-    ]
-    goal, other = sorted(ends, key=lambda tip: -side * tip[1])
-    plan = replace(quick_plan, target=(float(goal[0]), float(goal[1])))
-    decision, memory = decided(plan, estimate_of(state, ROLLING), path=replace(of_plan(plan), rolls=()))
-    rolled = (decision.command[4] > 0.0) + len(memory.path.rolls)
-    assert abs(goal[1] - other[1]) > 1.0
-    assert abs(decision.miss) < 0.25 * abs(goal[1] - other[1])
-    assert rolled > 0 or side == state.bevel
+    way = controls_of(2, 30, db_x=1.0)
+    way[0, 0, ROLL] = np.pi
+    ends = [simulator.replay(state, rows)[0].tip for rows in way]
+    goal, other = sorted(ends, key=lambda tip: -side * tip[Y])
+    plan = replace(quick_plan, target=(float(goal[X]), float(goal[Y]), 0.0))
+    decision, memory = decided(plan, estimate_of(state, ROLLING), path=unrolled(of_plan(plan)))
+    rolled = (decision.command.roll > 0.0) + len(memory.path.rolls)
+    assert abs(goal[Y] - other[Y]) > 1.0
+    assert abs(decision.miss) < 0.25 * abs(goal[Y] - other[Y])
+    assert rolled > 0 or side == state.bevel.real
 
 
 @pytest.mark.parametrize("offset", [-1.0, 1.0])
 def test_off_the_plan_it_finds_a_path_that_ends_nearer_the_target(quick_plan, along, offset):
     """With a base clamp that is off, where the plan's guide would miss."""
-    estimate = estimate_of(along(quick_plan, 20, base_y=offset), ACCURATE)
+    estimate = estimate_of(along(quick_plan, 20, base=(offset,)), ACCURATE)
     ahead = adaptive_mpc.Ahead.of(task_of(estimate.nominal, quick_plan), estimate.state, of_plan(quick_plan))
     kept = (
-        adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0]).tips[0, -1, 1] - 5.0
+        adaptive_mpc.measured_rollout(estimate, ahead.controls(ahead.current[None])[0]).tips[0, -1, Y] - 5.0
     )
     assert abs(kept) > 0.3
     assert abs(decide(quick_plan, estimate).miss) < 0.3 * abs(kept)
@@ -99,7 +96,7 @@ def test_it_rests_four_two_and_one_steps_before_the_target(quick_plan):
     """For as long as a reading takes to come in, and a control step; the command waits."""
     decisions, _, _ = carried_out(quick_plan, QUICK)
     rests = [k for k, decision in enumerate(decisions) if decision.rest > 0.0]
-    left = [sum(decision.command[0] for decision in decisions[k:] if not decision.rest) for k in rests]
+    left = [sum(decision.command.db_x for decision in decisions[k:] if not decision.rest) for k in rests]
     np.testing.assert_allclose(left, [4.0, 2.0, 1.0], atol=1.0)
     assert len(rests) == 3
     assert all(decisions[k].rest >= 0.2 for k in rests)
@@ -108,10 +105,10 @@ def test_it_rests_four_two_and_one_steps_before_the_target(quick_plan):
 def test_it_rests_once_after_a_step_that_the_fit_does_not_explain(quick_plan, along):
     """Four standard deviations off, to either side; in air, and where the needle has just rested, it moves."""
 
-    def rest(state, sd, command=(1.0, 0.0, 0.0, 0.0, -1)):
+    def rest(state, sd, command=FORWARD):
         estimate = estimate_of(state)
         off = sd * np.sqrt(estimate.reading_variance)
-        estimate = replace(estimate, innovation=(0.0, off), moves=(Move(0.0, 1.0, command),))
+        estimate = replace(estimate, innovation=(0.0, off, 0.0), moves=(Move(0.0, 1.0, command),))
         return decide(quick_plan, estimate).rest
 
     inside = along(quick_plan, 40)
@@ -127,7 +124,7 @@ def test_what_is_in_hand_is_never_given_up_for_something_worse(quick_plan, along
     estimate = estimate_of(along(quick_plan, 40), QUICK)
     task = task_of(estimate.nominal, quick_plan)
     for rolls in ((), (20.0,), (15.0, 18.0)):
-        path = replace(of_plan(quick_plan), rolls=rolls)
+        path = replace(of_plan(quick_plan), rolls=rolls_at(*rolls))
         ahead = adaptive_mpc.Ahead.of(task, estimate.state, path)
         kept = ahead.controls(ahead.current[None])[0]
         listed = adaptive_mpc.cost_terms(task, estimate, ADAPTIVE.begin(task), ahead)
@@ -140,23 +137,21 @@ def test_a_roll_stays_in_hand_until_the_needle_has_rolled(quick_plan, along, car
     """A period that is held leaves the bevel where it is: the roll that was due in it is still planned."""
     estimate = estimate_of(along(quick_plan, 40), QUICK)
     task, x = task_of(estimate.nominal, quick_plan), float(estimate.state.tip[0])
-    path = replace(of_plan(quick_plan), rolls=(x,))
-    memory = replace(
-        ADAPTIVE.begin(task), path=path, rolled=replace(path, rolls=()), bevel=estimate.state.bevel
-    )
+    path = replace(of_plan(quick_plan), rolls=rolls_at(x))
+    memory = replace(ADAPTIVE.begin(task), path=path, rolled=unrolled(path), roll=estimate.state.roll)
     if carried_out:
         estimate = replace(estimate, state=estimate.simulator.step(estimate.state, Control(flip=True)))
     rolls = []
     search = adaptive_mpc.search_path
 
     def spied(task, fitted, ahead, *rest):
-        rolls.append(ahead.path.rolls)
+        rolls.append(ahead.path.rolls[:, 0].tolist())
         return search(task, fitted, ahead, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(adaptive_mpc, "search_path", spied)
         ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))
-    assert rolls[0] == (() if carried_out else (x,))
+    assert rolls[0] == ([] if carried_out else [x])
 
 
 def test_the_miss_is_that_of_the_path_that_is_found(quick_plan, along):
@@ -164,11 +159,11 @@ def test_the_miss_is_that_of_the_path_that_is_found(quick_plan, along):
     estimate = estimate_of(along(quick_plan, 45))
     decision, memory = decided(quick_plan, estimate)
     task, state, path = task_of(estimate.nominal, quick_plan), estimate.state, memory.path
-    state = estimate.simulator.step(state, Control.from_row(decision.command))
+    state = estimate.simulator.step(state, decision.command)
     while travel_left(PHANTOM, quick_plan, state) > 1e-9:
         command, path = adaptive_mpc.Ahead.of(task, state, path).first(path)
-        state = estimate.simulator.step(state, Control.from_row(command))
-    assert state.tip[1] - 5.0 == pytest.approx(decision.miss, abs=0.02)
+        state = estimate.simulator.step(state, command)
+    assert state.tip[Y] - 5.0 == pytest.approx(decision.miss, abs=0.02)
     assert decision.miss_sd > 0.0
     assert f"{decision.miss:+.3f} ± {decision.miss_sd:.3f} mm" in decision.why
 
@@ -177,32 +172,31 @@ def test_what_the_axis_is_off_is_off_the_target_too(quick_plan, along):
     """A tip measured 0.2 mm off the model's, and the target with it: the same command."""
     state = along(quick_plan, 45)
     here = decide(quick_plan, estimate_of(state))
-    beside = replace(quick_plan, target=(quick_plan.target[0], quick_plan.target[1] + 0.2))
+    beside = replace(quick_plan, target=(quick_plan.target[0], quick_plan.target[1] + 0.2, 0.0))
     left = estimate_of(state, residual=0.2)
     assert decide(beside, left).command == pytest.approx(here.command, abs=1e-6)
-    assert decide(quick_plan, left).command[3] != pytest.approx(here.command[3], abs=1e-3)
+    assert decide(quick_plan, left).command.dg_y != pytest.approx(here.command.dg_y, abs=1e-3)
 
 
 def test_a_roll_takes_the_run_out_to_the_other_side(quick_plan, along):
     """The tips of a rollout are those that the tracker will measure."""
     estimate = estimate_of(along(quick_plan, 45))
     parameters = estimate.parameters.copy()
-    parameters[RUN_OUT] = 0.5
-    controls = np.zeros((1, 4, 5))
-    controls[..., 0], controls[..., 4] = 1.0, (-1.0, 1.0, -1.0, -1.0)
+    parameters[estimate.slots.run_out] = 0.5
+    controls = controls_of(1, 4, db_x=1.0, roll=[0.0, np.pi, 0.0, 0.0])
     plain = adaptive_mpc.measured_rollout(estimate, controls).tips
     tips = adaptive_mpc.measured_rollout(replace(estimate, parameters=parameters), controls).tips
-    side = estimate.state.bevel * np.array([1.0, -1.0, -1.0, -1.0])
-    np.testing.assert_allclose(tips[0, :, 1] - plain[0, :, 1], 0.5 * side, atol=1e-12)
-    np.testing.assert_array_equal(tips[0, :, [0, 2]], plain[0, :, [0, 2]])
+    side = estimate.state.bevel.real * np.array([1.0, -1.0, -1.0, -1.0])
+    np.testing.assert_allclose(tips[0, :, Y] - plain[0, :, Y], 0.5 * side, atol=1e-12)
+    np.testing.assert_array_equal(np.delete(tips, Y, axis=-1), np.delete(plain, Y, axis=-1))
 
 
 def test_the_fitted_model_is_the_one_that_predicts(quick_plan, along):
     """Tissue thrice as stiff asks for another guide step, from the same state."""
-    estimate = estimate_of(along(quick_plan, 55, base_y=0.3))
+    estimate = estimate_of(along(quick_plan, 55, base=(0.3,)))
     stiff = replace(estimate, simulator=estimate.nominal.adapted(Adaptation(np.zeros(1), np.full(2, 3.0))))
     assert decide(quick_plan, stiff).cost != decide(quick_plan, estimate).cost
-    assert decide(quick_plan, stiff).command[3] != decide(quick_plan, estimate).command[3]
+    assert decide(quick_plan, stiff).command.dg_y != decide(quick_plan, estimate).command.dg_y
 
 
 def test_a_longer_search_is_made_where_no_path_is_found(quick_plan, along, monkeypatch):
@@ -219,7 +213,7 @@ def test_a_longer_search_is_made_where_no_path_is_found(quick_plan, along, monke
     task = task_of(estimate.nominal, quick_plan)
     ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))
     assert efforts == [task.settings.effort, 1]
-    far = replace(quick_plan, target=(40.0, 14.0))
+    far = replace(quick_plan, target=(40.0, 14.0, 0.0))
     decision, _ = ADAPTIVE.decide(task_of(estimate.nominal, far), memory, estimate, np.random.default_rng(0))
     assert efforts[2:] == [1, task.settings.effort]
     assert decision.miss < -2.0
@@ -242,20 +236,20 @@ def test_limits_are_kept_whatever_the_plan(quick_plan, step, reach, advance, str
         }
     )  # fmt: skip
     wide = replace(
-        quick_plan, tips=quick_plan.tips * [1.0, stretch, stretch], target=(40.0, 5.0 * stretch),
-        guide=quick_plan.guide * stretch, controls=quick_plan.controls * [1.0, 1.0, 1.0, stretch, 1.0],
+        quick_plan, tips=stretched(quick_plan.tips, stretch, Y, THETA), target=(40.0, 5.0 * stretch, 0.0),
+        guide=quick_plan.guide * stretch, controls=stretched(quick_plan.controls, stretch, DG_Y),
     )  # fmt: skip
     simulator, rng = Simulator(scenario, threads=1), np.random.default_rng(seed)
     task = task_of(simulator, wide)
     estimate, places, memory = ADAPTIVE.observer.begin(task), [0.0], ADAPTIVE.begin(task)
     for k in range(12):
         decision, memory = ADAPTIVE.decide(task, memory, estimate, rng)
-        simulator.check(estimate.state, Control.from_row(decision.command))
+        simulator.check(estimate.state, decision.command)
         estimate = estimate.move(decision.command, k, k + 1.0)
         x, y = estimate.tip[:2]
         estimate = estimate.observe([Measurement(k + 1.0, float(x), float(y) + rng.normal(0.0, 0.5))])
-        places.append(estimate.state.guide)
-        assert 0.0 < decision.command[0] <= advance + 1e-12
+        places.append(estimate.state.guide[0])
+        assert 0.0 < decision.command.db_x <= advance + 1e-12
     assert np.abs(np.diff(places)).max() <= step + 1e-12
     assert np.abs(places).max() <= reach + 1e-12
 
@@ -268,12 +262,12 @@ def test_the_stroke_is_what_was_commanded_wherever_the_base_began(quick_plan, al
     state = along(quick_plan, 50, short)
     state = state.with_estimate(base_x=float(state.base[0]) + axial)
     assert travel_left(short, quick_plan, state) == pytest.approx(0.4)
-    assert decide(quick_plan, estimate_of(state, short)).command[0] == pytest.approx(0.4)
+    assert decide(quick_plan, estimate_of(state, short)).command.db_x == pytest.approx(0.4)
 
 
 def test_a_target_above_the_first_contact_point_is_decided_on_too(quick_plan):
     """There is no tissue to spare."""
-    shallow = replace(quick_plan, target=(0.05, 0.1))
+    shallow = replace(quick_plan, target=(0.05, 0.1, 0.0))
     decision = decide(shallow, estimate_of(Simulator(PHANTOM, 1).start()))
     assert np.isfinite([*decision.command, decision.cost, decision.miss, decision.miss_sd]).all()
 
@@ -289,15 +283,15 @@ def test_a_whole_insertion_into_another_tissue_ends_at_the_target(quick_plan):
     plant = Simulator(PHANTOM, threads=1).adapted(
         Adaptation(np.zeros(1), np.array([2.0, 1.5]), bevel=0.5, bend=0.4)
     )
-    state = plant.start(quick_plan.bevel)
+    state = plant.start(quick_plan.roll)
     for row in quick_plan.controls:
-        state = plant.step(state, Control.from_row(row))
-    blind = abs(state.tip[1] - 5.0)
+        state = plant.step(state, Control.of(row))
+    blind = abs(state.tip[Y] - 5.0)
     assert blind > 0.5
     misses = []
     for seed in range(4):
         decisions, truth, estimate = carried_out(quick_plan, ACCURATE, plant, seed=seed)
-        misses.append(abs(truth.tip[1] - 5.0))
+        misses.append(abs(truth.tip[Y] - 5.0))
         assert 0.0 <= travel_left(PHANTOM, quick_plan, estimate.state) <= PHANTOM.control.depth_tolerance_mm
         assert truth.tip[0] == pytest.approx(40.0, abs=0.05)
         assert len(decisions) <= 1.1 * len(quick_plan.controls)
@@ -306,14 +300,14 @@ def test_a_whole_insertion_into_another_tissue_ends_at_the_target(quick_plan):
 
 def test_without_a_guide_none_is_moved(quick_plan):
     decisions, truth, _ = carried_out(quick_plan, QUICK.with_values({"setup.guide_to_skin_mm": None}))
-    np.testing.assert_array_equal([decision.command[3] for decision in decisions], 0.0)
+    np.testing.assert_array_equal([decision.command.dg_y for decision in decisions], 0.0)
     assert truth.tip[0] == pytest.approx(40.0, abs=0.02)
     assert {decision.spread for decision in decisions} == {0.0}
 
 
 def test_on_the_exact_model_it_ends_at_the_target(quick_plan):
     decisions, truth, _ = carried_out(quick_plan, PHANTOM)
-    assert abs(truth.tip[1] - 5.0) < 0.1
+    assert abs(truth.tip[Y] - 5.0) < 0.1
     last = [decision for decision in decisions if np.isfinite(decision.miss)][-1]
     assert abs(last.miss) < 0.1
 
@@ -330,10 +324,12 @@ def test_the_predicted_miss_gets_no_less_sure_on_the_way(quick_plan):
 
 
 def test_the_same_random_numbers_lead_to_the_same_decision(quick_plan, along):
-    estimate = estimate_of(along(quick_plan, 45, base_y=0.5))
+    estimate = estimate_of(along(quick_plan, 45, base=(0.5,)))
     one, again, other = (decide(quick_plan, estimate, seed) for seed in (5, 5, 6))
     assert one == again
-    assert other.command[3] != one.command[3]
+    for here, there in zip(one.predicted, again.predicted, strict=True):
+        np.testing.assert_array_equal(here, there)
+    assert other.command.dg_y != one.command.dg_y
     many = replace(estimate, simulator=Simulator(PHANTOM, threads=3))
     assert decide(quick_plan, many, 5) == one
 
@@ -372,7 +368,7 @@ def test_where_no_path_converges_it_rests_and_reports_it(quick_plan, along, monk
 
     monkeypatch.setattr(adaptive_mpc, "measured_rollout", lost)
     decision, after = ADAPTIVE.decide(task, memory, estimate, np.random.default_rng(0))
-    assert decision.command == (0.0, 0.0, 0.0, 0.0, -1)
+    assert decision.command == STILL
     assert decision.why == "no path converges on the fitted model"
     assert np.isnan(decision.miss)
     assert decision.cost == np.inf

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from flexneedle.control.bang_bang import closest_approach, wants_flip
+from flexneedle.control.bang_bang import closest_approach, wanted_roll
 
 POSES = {
     "straight ahead": ((0.0, 0.0, 0.0), (40.0, 0.0)),
@@ -19,6 +19,23 @@ POSES = {
     "within the circle": ((0.0, 0.0, 0.0), (3.0, 30.0)),
     "steep": ((0.0, 0.0, 1.2), (5.0, 25.0)),
 }
+
+
+def at(x, y, theta):
+    """A pose (5,) in the plane."""
+    return np.array([x, y, 0.0, theta, 0.0])
+
+
+def nearest(pose, curvature, target):
+    """`closest_approach` in the plane, for a curvature (1/mm) to either side."""
+    return closest_approach(pose, abs(curvature), math.copysign(1.0, curvature), (*target, 0.0))
+
+
+def wants_flip(pose, bevel, curvature, target, band, noise):
+    """Whether the bevel is to be rolled, and the reason."""
+    roll, why = wanted_roll(pose, bevel, curvature, (*target, 0.0), band, noise)
+    assert roll in (0.0, math.pi)
+    return roll > 0.0, why
 
 
 def followed(pose, curvature, target, step=1e-3):
@@ -34,21 +51,21 @@ def followed(pose, curvature, target, step=1e-3):
 @pytest.mark.parametrize(("pose", "target"), POSES.values(), ids=POSES)
 def test_closest_approach_is_that_of_the_path_in_small_steps(pose, target, curvature):
     expected = followed(pose, curvature, target)
-    assert closest_approach(np.array(pose), curvature, target) == pytest.approx(expected, abs=2e-3)
+    assert nearest(at(*pose), curvature, target) == pytest.approx(expected, abs=2e-3)
 
 
 def test_closest_approach_to_a_circle_by_hand():
     """A radius of 100 round (0, 100): the target at (60, 20) is exactly on it, (60, 30) inside by 100 − √8500."""
-    start = np.zeros(3)
-    assert closest_approach(start, 0.01, (60.0, 20.0)) == pytest.approx(0.0, abs=1e-12)
-    assert closest_approach(start, 0.01, (60.0, 30.0)) == pytest.approx(100.0 - math.sqrt(8500.0))
+    start = np.zeros(5)
+    assert nearest(start, 0.01, (60.0, 20.0)) == pytest.approx(0.0, abs=1e-12)
+    assert nearest(start, 0.01, (60.0, 30.0)) == pytest.approx(100.0 - math.sqrt(8500.0))
 
 
 @pytest.mark.parametrize("curvature", [-0.01, 0.0, 0.01])
 def test_a_target_behind_is_as_near_as_it_is_now(curvature):
-    assert closest_approach(np.array([40.0, 5.0, 0.0]), curvature, (37.0, 1.0)) == pytest.approx(5.0)
-    backwards = np.array([0.0, 0.0, math.pi])
-    assert closest_approach(backwards, curvature, (3.0, 4.0)) == pytest.approx(5.0)
+    assert nearest(at(40.0, 5.0, 0.0), curvature, (37.0, 1.0)) == pytest.approx(5.0)
+    backwards = at(0.0, 0.0, math.pi)
+    assert nearest(backwards, curvature, (3.0, 4.0)) == pytest.approx(5.0)
 
 
 @given(
@@ -57,13 +74,13 @@ def test_a_target_behind_is_as_near_as_it_is_now(curvature):
 )  # fmt: skip
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=200)
 def test_mirrored_pose_target_and_bevel_give_the_same_answer(x, y, theta, lateral, bevel, curvature):
-    here = wants_flip(np.array([x, y, theta]), bevel, curvature, (40.0, lateral), 0.3, 0.01)
-    mirrored = wants_flip(np.array([x, -y, -theta]), -bevel, curvature, (40.0, -lateral), 0.3, 0.01)
+    here = wants_flip(at(x, y, theta), bevel, curvature, (40.0, lateral), 0.3, 0.01)
+    mirrored = wants_flip(at(x, -y, -theta), -bevel, curvature, (40.0, -lateral), 0.3, 0.01)
     assert here == mirrored
 
 
 def flips(bevel, target, *, band=0.0, noise=0.0, curvature=0.001, pose=(0.0, 0.0, 0.0)):
-    return wants_flip(np.array(pose), bevel, curvature, target, band, noise)[0]
+    return wants_flip(at(*pose), bevel, curvature, target, band, noise)[0]
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -109,8 +126,8 @@ def test_without_advantage_or_curvature_or_with_the_target_behind_the_bevel_stay
 
 def test_reason_gives_both_misses():
     """±0.8 mm at 40 mm and a target 0.6 mm to the other side."""
-    flip, why = wants_flip(np.zeros(3), 1, 0.001, (40.0, -0.6), 0.0, 0.0)
+    flip, why = wants_flip(np.zeros(5), 1, 0.001, (40.0, -0.6), 0.0, 0.0)
     assert flip
     assert why == "bevel rolled: predicted miss 1.399 mm if kept, 0.200 mm if rolled"
-    _, why = wants_flip(np.zeros(3), -1, 0.001, (40.0, -0.6), 0.0, 0.0)
+    _, why = wants_flip(np.zeros(5), -1, 0.001, (40.0, -0.6), 0.0, 0.0)
     assert why == "bevel kept: predicted miss 0.200 mm if kept, 1.399 mm if rolled"

@@ -1,5 +1,6 @@
 """Bevel alone: full advance, no lateral motion, the bevel towards the target by its own settings."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +9,8 @@ import pytest
 import flexneedle
 from flexneedle.control import bang_bang
 from flexneedle.control.methods import METHODS
-from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import Control
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -26,19 +27,20 @@ def command(plan, estimate, **settings):
 
 def aimed(plan, state, lateral, ahead=20.0):
     """The plan with a target at these distances ahead of a tip and lateral of its line (mm)."""
-    x, y, theta = state.tip
-    return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(theta) + lateral)))
+    x, y, _, theta, _ = state.tip
+    return replace(plan, target=(float(x) + ahead, float(y + ahead * np.tan(theta) + lateral), 0.0))
 
 
 def test_it_advances_at_full_step_and_moves_nothing_aside(quick_plan, estimated, along):
     for steps in (0, 20, 50):
-        assert command(quick_plan, estimated(along(quick_plan, steps)))[:4] == (1.0, 0.0, 0.0, 0.0)
+        given = command(quick_plan, estimated(along(quick_plan, steps)))
+        assert given == Control(db_x=1.0, roll=given.roll)
 
 
 @pytest.mark.parametrize("left", [0.7, 0.02])
 def test_the_last_advance_ends_at_the_target_depth(quick_plan, estimated, along, left):
     state = along(quick_plan, 50)
-    assert command(aimed(quick_plan, state, 0.0, ahead=left), estimated(state))[0] == pytest.approx(left)
+    assert command(aimed(quick_plan, state, 0.0, ahead=left), estimated(state)).db_x == pytest.approx(left)
 
 
 @pytest.mark.parametrize("rolled", [False, True])
@@ -46,9 +48,9 @@ def test_the_last_advance_ends_at_the_target_depth(quick_plan, estimated, along,
 def test_the_bevel_rolls_to_the_target_in_tissue_and_stays_in_air(quick_plan, estimated, along, side, rolled):
     for steps, in_air in ((50, False), (5, True)):
         state = Simulator(PHANTOM).step(along(quick_plan, steps), Control(flip=rolled))
-        right_way = state.bevel == side
+        right_way = state.bevel.real == side
         given = command(aimed(quick_plan, state, 2.0 * side), estimated(state))
-        assert given[4] == (-1 if right_way or in_air else 1)
+        assert given.roll == (0.0 if right_way or in_air else math.pi)
 
 
 def test_curvature_and_dead_band_are_its_own(quick_plan, estimated, along):
@@ -57,15 +59,21 @@ def test_curvature_and_dead_band_are_its_own(quick_plan, estimated, along):
     half = 0.5 * 10e-3 * 20.0**2
     estimate = estimated(state)
     for share, flips in ((1.3, False), (1.8, True)):
-        away = aimed(quick_plan, state, -(share - 1.0) * half * state.bevel)
-        assert (command(away, estimate, curvature_per_m=10.0, flip_dead_band=0.5)[4] == 1) is flips
-    away = aimed(quick_plan, state, -3.0 * state.bevel)
-    assert command(away, estimate, curvature_per_m=10.0)[4] == 1
-    assert command(away, estimate, curvature_per_m=0.0)[4] == -1  # both paths are the same line
+        away = aimed(quick_plan, state, -(share - 1.0) * half * state.bevel.real)
+        assert (command(away, estimate, curvature_per_m=10.0, flip_dead_band=0.5).roll > 0.0) is flips
+    away = aimed(quick_plan, state, -3.0 * state.bevel.real)
+    assert command(away, estimate, curvature_per_m=10.0).roll == math.pi
+    assert command(away, estimate, curvature_per_m=0.0).roll == 0.0  # both paths are the same line
 
 
 def test_the_rule_hears_of_three_standard_deviations_of_a_reading(quick_plan, estimated, along, monkeypatch):
-    calls, rule = [], bang_bang.wants_flip
-    monkeypatch.setattr(bang_bang, "wants_flip", lambda *args: calls.append(args[2:]) or rule(*args))
+    calls, rule = [], bang_bang.wanted_roll
+
+    def spied(*args, **options):
+        calls.append((*args[2:], options))
+        return rule(*args, **options)
+
+    monkeypatch.setattr(bang_bang, "wanted_roll", spied)
     command(quick_plan, estimated(along(quick_plan, 50)), curvature_per_m=2.0, flip_dead_band=0.25)
-    assert calls == [(pytest.approx(2e-3), quick_plan.target, 0.25, pytest.approx(3 * 0.07 / 3**0.5))]
+    noise = pytest.approx(3 * 0.07 / 3**0.5)
+    assert calls == [(pytest.approx(2e-3), quick_plan.target, 0.25, noise, {"half_turns": True})]

@@ -15,6 +15,7 @@ import flexneedle
 from flexneedle.control.methods import METHODS
 from flexneedle.control.methods import broyden_mpc as bm
 from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import DB_X, DG_Y, Control, X, Y
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -107,20 +108,22 @@ def test_a_guide_without_effect_or_room_stays():
 def moves(plan, jacobian, tip, guide=0.0, steps=4, **settings):
     ahead = np.arange(1.0, steps + 1)
     chosen = SETTINGS.model_copy(update=settings)
-    return bm.guide_moves(chosen, PHANTOM.setup, plan, jacobian, np.array(tip), ahead, guide)
+    found, cost = bm.guide_moves(chosen, PHANTOM, plan, jacobian, np.array(tip), ahead, np.array([guide]))
+    return found[:, 0], cost
 
 
 def straight(plan, lateral):
     """The plan with a path at one lateral position."""
-    tips = plan.tips * [1.0, 0.0, 0.0] + [0.0, lateral, 0.0]
-    return replace(plan, tips=tips, target=(plan.target[0], lateral))
+    tips = np.zeros_like(plan.tips)
+    tips[:, X], tips[:, Y] = plan.tips[:, X], lateral
+    return replace(plan, tips=tips, target=(plan.target[0], lateral, 0.0))
 
 
 def test_free_of_limits_and_weight_the_prediction_meets_the_path_at_every_step(quick_plan):
     jacobian = np.array([[1.0, 0.0], [0.1, 0.8]])
     found, cost = moves(quick_plan, jacobian, (12.0, 1.3), guide_weight=0.0)
     tip = 1.3 + 0.1 * np.arange(1, 5) + 0.8 * found
-    goal = np.interp(12.0 + np.arange(1, 5), quick_plan.tips[:, 0], quick_plan.tips[:, 1])
+    goal = np.interp(12.0 + np.arange(1, 5), quick_plan.tips[:, X], quick_plan.tips[:, Y])
     unlimited = np.abs(found) < 0.5 * np.arange(1, 5)
     assert unlimited.any()
     np.testing.assert_allclose(tip[unlimited], goal[unlimited], atol=1e-7)
@@ -158,14 +161,15 @@ def linear_run(plan, slope, effect, *, delay=1, steps=30, noise=0.0, guide_effec
         insertion, guide = inputs[-1]
         measured = tips[k - delay] + rng.normal(0.0, noise, 2) if k >= delay else None
         state = SimpleNamespace(
-            travel=np.array([insertion, 0.0, 0.0, guide]), guide=guide, tip=np.array([*tips[-1], 0.0]),
-            base=np.array([scenario.start_base_x + insertion, 0.0, 0.0]),
+            travel=np.array([insertion, 0.0, 0.0, 0.0, 0.0, guide, 0.0]), guide=(guide, 0.0),
+            tip=np.array([*tips[-1], 0.0, 0.0, 0.0]),
+            base=np.array([scenario.start_base_x + insertion, 0.0, 0.0, 0.0, 0.0]),
         )  # fmt: skip
-        estimate = SimpleNamespace(state=state, measured=None if measured is None else tuple(measured))
+        estimate = SimpleNamespace(state=state, measured=None if measured is None else (*measured, 0.0))
         decision, memory = BROYDEN.decide(task, memory, estimate, RNG)
-        assert decision.command[1:3] == (0.0, 0.0)
-        assert decision.command[4] == -1
-        inputs.append(inputs[-1] + np.array(decision.command)[[0, 3]])
+        command = decision.command
+        assert command == Control(db_x=command.db_x, dg_y=command.dg_y)
+        inputs.append(inputs[-1] + np.array(command)[[DB_X, DG_Y]])
         tips.append(np.array([-28.5 + inputs[-1][0], slope * inputs[-1][0] + effect * inputs[-1][1]]))
     return np.array(tips), np.array(inputs), memory
 
@@ -230,10 +234,10 @@ def test_inputs_are_those_of_when_the_tip_was_there():
 def test_memory_is_a_value_that_deciding_leaves_alone(quick_plan, along, estimated):
     task = task_of(Simulator(PHANTOM, threads=1), quick_plan, "broyden-mpc")
     state = along(quick_plan, 30)
-    last_update = (state.tip[:2] - [2.0, 0.1], np.array([state.travel[0] - 2.0, state.guide]))
+    last_update = (state.tip[:2] - [2.0, 0.1], np.array([state.travel[0] - 2.0, state.guide[0]]))
     memory = bm.JacobianEstimate(np.array([[1.0, 0.0], [0.1, 0.9]]), (), last_update)
     before = memory.jacobian.copy(), memory.last_update[0].copy(), memory.last_update[1].copy()
-    estimate = estimated(state, measured=tuple(state.tip[:2].tolist()))
+    estimate = estimated(state, measured=tuple(state.tip[:3].tolist()))
     one, after = BROYDEN.decide(task, memory, estimate, RNG)
     again, _ = BROYDEN.decide(task, memory, estimate, RNG)
     assert one == again

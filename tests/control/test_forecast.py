@@ -10,9 +10,9 @@ from scipy.stats import norm
 import flexneedle
 from flexneedle.control.forecast import hopeless, likely_misses, missed, probability_beyond, warning
 from flexneedle.control.interface import Decision
+from flexneedle.types import STILL
 
 CONTROL = flexneedle.load_scenario("phantom").control
-STILL = (0.0, 0.0, 0.0, 0.0, -1)
 LIMIT, SURE = CONTROL.miss_limit_mm, norm.ppf(CONTROL.miss_confidence)
 
 

@@ -68,11 +68,11 @@ def test_the_refusal_comes_before_the_plan(tmp_path):
 
 def test_ce_mpc_leaves_the_guide_where_it_is(steered, along):
     """With a base clamp that is off, which it would move the guide for otherwise."""
-    state = along(steered, 40, base_y=1.0)
+    state = along(steered, 40, base=(1.0,))
     choice = mpc.choose(
-        Simulator(PHANTOM, 1), steered, state, CeMpc(), flip=False, rng=np.random.default_rng(0)
+        Simulator(PHANTOM, 1), steered, state, CeMpc(), roll=0.0, rng=np.random.default_rng(0)
     )
-    assert choice.steps[3] == 0.0
+    assert choice.command.dg_y == 0.0
     assert choice.spread == 0.0
 
 
@@ -80,4 +80,4 @@ def test_ce_mpc_leaves_the_guide_where_it_is(steered, along):
 def test_a_steering_plan_is_carried_out_with_the_guide_still(name, steered):
     done = flexneedle.insert(QUICK, steered, 5000, controller=name, threads=1)
     assert done.outcome == "done"
-    assert {period.applied[3] for period in done.periods} == {0.0}
+    assert {period.applied.dg_y for period in done.periods} == {0.0}

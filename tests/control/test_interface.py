@@ -1,4 +1,4 @@
-"""What a decision must be: five plain numbers, a miss that is predicted or not, a rest that ends."""
+"""What a decision must be: nine plain numbers, a miss that is predicted or not, a rest that ends."""
 
 import math
 
@@ -7,25 +7,37 @@ import pytest
 
 from flexneedle.control.interface import Decision
 from flexneedle.errors import InputError
+from flexneedle.types import STILL, Control, Shape
 
 
 @pytest.mark.parametrize("kind", [list, np.array])
 def test_a_command_of_any_sequence_becomes_plain_numbers(kind):
-    command = Decision(kind([1.0, 0.0, 0.0, 0.5, -1.0]), "").command
-    assert command == (1.0, 0.0, 0.0, 0.5, -1)
-    assert [type(value) for value in command] == [float] * 4 + [int]
+    command = Decision(kind([1, 0, 0, 0, 0, 0.5, 0, math.pi, 0]), "").command
+    assert command == Control(db_x=1.0, dg_y=0.5, flip=True)
+    assert [type(value) for value in command] == [float] * 9
+
+
+def test_decisions_with_a_predicted_shape_can_be_compared():
+    """By their commands and figures; the shape follows from them."""
+
+    def decision(command, sd):
+        shape = Shape(np.zeros((3, 5)), np.full((3, 2), sd))
+        return Decision(command, "", 0.0, 0.0, miss=0.1, miss_sd=0.2, predicted=shape)
+
+    assert decision(STILL, 1.0) == decision(STILL, 1.0)
+    assert decision(STILL, 1.0) != decision(Control(db_x=1.0), 1.0)
 
 
 @pytest.mark.parametrize(
     ("command", "rule"),
     [
-        ((1.0, 0.0), "must have 5 numbers"),
-        (None, "must have 5 numbers"),
-        ((1.0, 0.0, 0.0, "far", -1), "must have 5 numbers"),
-        ((math.nan, 0.0, 0.0, 0.0, -1), "must have finite numbers"),
-        ((1.0, 0.0, 0.0, math.inf, -1), "must have finite numbers"),
-        ((1.0, 0.0, 0.0, 0.0, 0), "flip must be -1 or 1"),
-        ((1.0, 0.0, 0.0, 0.0, math.nan), "flip must be -1 or 1"),
+        ((1.0, 0.0), "must be a Control, or its 9 columns"),
+        ((1.0, 0.0, 0.0, 0.0, -1), "must be a Control, or its 9 columns"),
+        (None, "must be a Control, or its 9 columns"),
+        ((1.0, 0.0, 0.0, "far", 0.0, 0.0, 0.0, 0.0, 0.0), "must be a Control, or its 9 columns"),
+        (Control(db_x=math.nan), "must have finite numbers"),
+        (Control(dg_y=math.inf), "must have finite numbers"),
+        (Control(roll=math.nan), "must have finite numbers"),
     ],
 )
 def test_another_command_is_refused(command, rule):
@@ -44,4 +56,4 @@ def test_another_command_is_refused(command, rule):
 )
 def test_a_prediction_or_a_rest_that_means_nothing_is_refused(value, message):
     with pytest.raises(InputError, match=f"^{message}"):
-        Decision((0.0, 0.0, 0.0, 0.0, -1), "", **value)
+        Decision(STILL, "", **value)

@@ -14,9 +14,10 @@ from flexneedle.control.interface import travel_left
 from flexneedle.control.methods import DEFAULT, METHODS, method
 from flexneedle.errors import InputError
 from flexneedle.rig.phantom.plants import PLANTS
-from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
-from tasks import task_of
+from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, STILL, THETA, X, Y
+from reference.cases import MIRROR
+from tasks import stretched, task_of
 
 # Only the default controller estimates an axial start error.
 PHANTOM = flexneedle.load_scenario("phantom").with_values({"phantom.start_axial_sd_mm": 0.0})
@@ -29,13 +30,13 @@ def drive(name, plan, scenario, estimated, readings, *, steps, plant=None):
     task = task_of(Simulator(scenario, threads=1), plan, name)
     chosen, simulator = METHODS[name], Simulator(plant or scenario, threads=1)
     memory, rng = chosen.begin(task), np.random.default_rng(0)
-    state, last, commands = simulator.start(plan.bevel), None, []
+    state, last, commands = simulator.start(plan.roll), None, []
     for off in readings[:steps]:
-        measured = None if last is None else tuple((last + np.array([0.0, off])).tolist())
-        estimate = estimated(replace(state, scenario=scenario), measured=measured, innovation=(0.0, off))
+        measured = None if last is None else tuple((last + np.array([0.0, off, 0.0])).tolist())
+        estimate = estimated(replace(state, scenario=scenario), measured=measured, innovation=(0.0, off, 0.0))
         decision, memory = chosen.decide(task, memory, estimate, rng)
         commands.append(decision.command)
-        last, state = state.tip[:2], simulator.step(state, Control.from_row(decision.command))
+        last, state = state.tip[:3], simulator.step(state, decision.command)
         if chosen.arrived(task, memory, estimated(state)):
             break
     return np.array(commands), state
@@ -71,19 +72,19 @@ def test_limits_are_kept_whatever_the_target_and_the_readings(
         }
     )  # fmt: skip
     wide = replace(
-        quick_plan, tips=quick_plan.tips * [1.0, stretch, stretch], target=(40.0, 5.0 * stretch),
-        controls=quick_plan.controls * [1.0, 1.0, 1.0, stretch, 1.0] + [0.0, base, 0.1 * base, 0.0, 0.0],
+        quick_plan, tips=stretched(quick_plan.tips, stretch, Y, THETA), target=(40.0, 5.0 * stretch, 0.0),
+        controls=stretched(quick_plan.controls, stretch, DG_Y) + STILL._replace(db_y=base, db_theta=0.1 * base),
         guide=quick_plan.guide * stretch,
     )  # fmt: skip
     commands, state = drive(name, wide, scenario, estimated, readings, steps=12)
     assert np.isfinite(commands).all()
-    assert np.abs(commands[:, 3]).max() <= step + 1e-12
-    assert np.abs(np.cumsum(commands[:, 3])).max() <= reach + 1e-9
-    assert np.abs(commands[:, 1]).max() <= step + 1e-12
-    assert np.abs(commands[:, 2]).max() <= 5e-3 + 1e-12
-    assert np.abs(np.cumsum(commands[:, 1])).max() <= reach + 1e-9
-    assert (commands[:, 0] > 0.0).all()
-    assert commands[:, 0].max() <= advance + 1e-12
+    assert np.abs(commands[:, DG_Y]).max() <= step + 1e-12
+    assert np.abs(np.cumsum(commands[:, DG_Y])).max() <= reach + 1e-9
+    assert np.abs(commands[:, DB_Y]).max() <= step + 1e-12
+    assert np.abs(commands[:, DB_THETA]).max() <= 5e-3 + 1e-12
+    assert np.abs(np.cumsum(commands[:, DB_Y])).max() <= reach + 1e-9
+    assert (commands[:, DB_X] > 0.0).all()
+    assert commands[:, DB_X].max() <= advance + 1e-12
     assert state.converged
 
 
@@ -92,22 +93,23 @@ def test_towards_a_path_far_aside_the_guide_goes_to_the_end_of_its_reach_and_no_
     quick_plan, estimated, name
 ):
     scenario = PHANTOM.with_values({"setup.max_guide_travel_mm": 0.8, "target.lateral_mm": 0.0})
-    away = replace(quick_plan, tips=quick_plan.tips + np.array([0.0, 6.0, 0.0]), target=(40.0, 11.0))
+    aside = np.array([0.0, 6.0, 0.0, 0.0, 0.0])
+    away = replace(quick_plan, tips=quick_plan.tips + aside, target=(40.0, 11.0, 0.0))
     commands, _ = drive(name, away, scenario, estimated, [0.0] * 8, steps=8)
-    assert np.cumsum(commands[:, 3]).max() == pytest.approx(0.8, abs=1e-9)
-    assert np.abs(commands[:, 3]).max() == pytest.approx(0.5)
+    assert np.cumsum(commands[:, DG_Y]).max() == pytest.approx(0.8, abs=1e-9)
+    assert np.abs(commands[:, DG_Y]).max() == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("name", ["open-loop", "ce-mpc", "resolved-rate", "broyden-mpc"])
 def test_planned_motion_of_the_base_is_followed(quick_plan, estimated, name):
     """To where the plan has it at the tip's depth; the other methods steer with guide or bevel alone."""
     moving = quick_plan.controls.copy()
-    moving[:60, 1:3] = 0.02, 1e-4
+    moving[:60, [DB_Y, DB_THETA]] = 0.02, 1e-4
     plan = replace(quick_plan, controls=moving)
     commands, state = drive(name, plan, PHANTOM, estimated, [0.0] * 30, steps=30)
-    depth = [-28.5, *(-28.5 + np.cumsum(commands[:, 0]))]
-    planned = np.interp(depth[-1], plan.tips[:, 0], np.arange(len(plan.tips)))
-    np.testing.assert_allclose(state.travel[1:3], planned * np.array([0.02, 1e-4]), rtol=0.03)
+    depth = [-28.5, *(-28.5 + np.cumsum(commands[:, DB_X]))]
+    planned = np.interp(depth[-1], plan.tips[:, X], np.arange(len(plan.tips)))
+    np.testing.assert_allclose(state.travel[[DB_Y, DB_THETA]], planned * np.array([0.02, 1e-4]), rtol=0.03)
 
 
 @cache
@@ -123,9 +125,9 @@ def test_mirrored_plan_and_readings_give_mirrored_commands(quick_plan, mirrored,
     here, end = drive(name, quick_plan, scenario, estimated, noise(), steps=80, plant=plant)
     away = tuple(-off for off in noise())
     there, other_end = drive(name, mirrored(quick_plan), scenario, estimated, away, steps=80, plant=plant)
-    np.testing.assert_allclose(there, here * [1.0, -1.0, -1.0, -1.0, 1.0], atol=1e-9)
-    np.testing.assert_allclose(other_end.tip, end.tip * [1.0, -1.0, -1.0], atol=1e-9)
-    assert np.abs(here[:, 3]).max() > 0.0 or name == "bevel-only"
+    np.testing.assert_allclose(there, stretched(here, -1.0, DB_Y, DB_THETA, DG_Y), atol=1e-9)
+    np.testing.assert_allclose(other_end.tip, end.tip * MIRROR, atol=1e-9)
+    assert np.abs(here[:, DG_Y]).max() > 0.0 or name == "bevel-only"
 
 
 @pytest.mark.parametrize("name", ["bevel-only", "resolved-rate", "broyden-mpc"])
@@ -140,8 +142,8 @@ def test_with_exact_readings_the_guide_takes_the_tip_to_the_target(quick_plan, e
     plant = PHANTOM.with_values({f"tissue.{k}.shear_modulus_kpa": 6.0 for k in (0, 1)})
     _, blind = drive("open-loop", quick_plan, PHANTOM, estimated, [0.0] * 80, steps=80, plant=plant)
     _, steered = drive(name, quick_plan, PHANTOM, estimated, [0.0] * 80, steps=80, plant=plant)
-    assert abs(blind.tip[1] - 5.0) > 0.2
-    assert abs(steered.tip[1] - 5.0) < 0.25 * abs(blind.tip[1] - 5.0)
+    assert abs(blind.tip[Y] - 5.0) > 0.2
+    assert abs(steered.tip[Y] - 5.0) < 0.25 * abs(blind.tip[Y] - 5.0)
 
 
 # ---- on the exact plant, with its delay, noise, missing readings, play and friction
@@ -160,13 +162,13 @@ def test_a_whole_insertion_into_the_exact_plant_ends_done(quick_plan, name, limi
     done = inserted(name, quick_plan)
     assert (done.outcome, done.controller) == ("done", name)
     assert done.true_error_mm < limit
-    assert done.periods[-1].true_tip[0] == pytest.approx(40.0, abs=0.15 if name != "open-loop" else 0.5)
+    assert done.periods[-1].true_tip.x == pytest.approx(40.0, abs=0.15 if name != "open-loop" else 0.5)
     assert all(period.converged and period.decision for period in done.periods)
     assert len(done.periods) <= 1.1 * len(quick_plan.controls) + 2
     if name in ("open-loop", "broyden-mpc"):
         assert done.flips == 0
     if name == "bevel-only":
-        assert all(period.command[1:4] == (0.0, 0.0, 0.0) for period in done.periods)
+        assert not any(any(period.command[DB_Y:ROLL]) for period in done.periods)
 
 
 @pytest.mark.parametrize("plant", PLANTS)
@@ -181,8 +183,8 @@ def test_every_controller_finishes_on_every_plant_with_its_commands_carried_out(
     left_out = np.subtract(
         [period.command for period in done.periods], [period.applied for period in done.periods]
     )
-    assert np.abs(left_out[:, :4]).max() <= PHANTOM.phantom.motor_resolution_mm + 1e-9
-    assert (left_out[:, 4] == 0.0).all()
+    assert np.abs(left_out[:, :ROLL]).max() <= PHANTOM.phantom.motor_resolution_mm + 1e-9
+    assert (left_out[:, ROLL:] == 0.0).all()
     assert all(period.converged for period in done.periods)
     assert np.isfinite(done.true_error_mm)
 

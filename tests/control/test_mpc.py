@@ -11,9 +11,9 @@ from flexneedle.control.interface import at_depth
 from flexneedle.control.methods import METHODS
 from flexneedle.estimation.task import Task
 from flexneedle.planning.terms import Trajectories, cost
-from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
-from tasks import task_of
+from flexneedle.types import DB_X, DB_Y, DG_Y, DG_Z, ROLL, STILL, Control, X, Y
+from tasks import stretched, task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
 
@@ -23,9 +23,9 @@ def plan(quick_plan):
     return quick_plan
 
 
-def choose(plan, state, scenario=PHANTOM, seed=0, *, flip=False):
+def choose(plan, state, scenario=PHANTOM, seed=0, *, roll=0.0):
     task = task_of(Simulator(scenario, 1), plan, "ce-mpc")
-    return mpc.choose(task.simulator, plan, state, task.settings, flip=flip, rng=np.random.default_rng(seed))
+    return mpc.choose(task.simulator, plan, state, task.settings, roll=roll, rng=np.random.default_rng(seed))
 
 
 def decide(plan, estimate, seed=0):
@@ -38,8 +38,8 @@ def decide(plan, estimate, seed=0):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_command_is_within_the_limits(plan, periods, seed, along):
     choice = choose(plan, along(plan, periods), seed=seed)
-    assert 0.5 <= choice.steps[0] <= 1.0
-    assert abs(choice.steps[3]) <= 0.5
+    assert 0.5 <= choice.command.db_x <= 1.0
+    assert abs(choice.command.dg_y) <= 0.5
     assert np.isfinite(choice.cost)
     assert choice.spread > 0.0
 
@@ -47,29 +47,29 @@ def test_command_is_within_the_limits(plan, periods, seed, along):
 def test_on_the_plan_it_goes_on_with_the_plan(plan, along):
     for periods in (10, 40, 60):
         choice = choose(plan, along(plan, periods))
-        assert choice.steps[3] == pytest.approx(plan.controls[periods, 3], abs=0.06)
-        assert choice.steps[0] == pytest.approx(plan.controls[periods, 0], abs=0.1)
+        assert choice.command.dg_y == pytest.approx(plan.controls[periods, DG_Y], abs=0.06)
+        assert choice.command.db_x == pytest.approx(plan.controls[periods, DB_X], abs=0.1)
 
 
 @pytest.mark.parametrize("offset", [-1.5, 1.5])
 def test_off_the_plan_the_guide_moves_back_to_it(plan, offset, along):
     """A base clamp off to one side moves the tip there; the guide goes the other way, against what was planned."""
-    state = along(plan, 15, base_y=offset)
-    side = np.sign(state.tip[1] - along(plan, 15).tip[1])
-    assert side * (choose(plan, state).steps[3] - plan.controls[15, 3]) < -0.05
+    state = along(plan, 15, base=(offset,))
+    side = np.sign(state.tip[Y] - along(plan, 15).tip[Y])
+    assert side * (choose(plan, state).command.dg_y - plan.controls[15, DG_Y]) < -0.05
 
 
 def test_the_deviation_shrinks_over_the_next_periods(plan, along):
-    simulator, state = Simulator(PHANTOM), along(plan, 10, base_y=1.0)
+    simulator, state = Simulator(PHANTOM), along(plan, 10, base=(1.0,))
     rng = np.random.default_rng(0)
 
     def deviation():
-        return abs(state.tip[1] - np.interp(state.tip[0], plan.tips[:, 0], plan.tips[:, 1]))
+        return abs(state.tip[Y] - np.interp(state.tip[X], plan.tips[:, X], plan.tips[:, Y]))
 
     first = deviation()
     for _ in range(12):
-        choice = mpc.choose(simulator, plan, state, mpc.CeMpc(), flip=False, rng=rng)
-        state = simulator.step(state, Control(db_x=choice.steps[0], dg_y=choice.steps[3]))
+        choice = mpc.choose(simulator, plan, state, mpc.CeMpc(), roll=0.0, rng=rng)
+        state = simulator.step(state, Control(db_x=choice.command.db_x, dg_y=choice.command.dg_y))
     assert first > 0.1
     assert deviation() < 0.2 * first
 
@@ -77,34 +77,34 @@ def test_the_deviation_shrinks_over_the_next_periods(plan, along):
 def test_guide_stays_within_its_reach(plan):
     """A plan with a large lateral offset, and a guide that may hardly move: it goes to its end and no further."""
     scenario = PHANTOM.with_values({"setup.max_guide_travel_mm": 0.3, "target.lateral_mm": 0.3})
-    away = replace(plan, tips=plan.tips + np.array([0.0, 6.0, 0.0]))
+    away = replace(plan, tips=plan.tips + np.array([0.0, 6.0, 0.0, 0.0, 0.0]))
     simulator, state, rng = Simulator(scenario), Simulator(scenario).start(), np.random.default_rng(0)
     for _ in range(4):
-        choice = mpc.choose(simulator, away, state, mpc.CeMpc(), flip=False, rng=rng)
-        state = simulator.step(state, Control(db_x=choice.steps[0], dg_y=choice.steps[3]))
-        assert abs(state.guide) <= 0.3 + 1e-9
-    assert state.guide == pytest.approx(0.3)
+        choice = mpc.choose(simulator, away, state, mpc.CeMpc(), roll=0.0, rng=rng)
+        state = simulator.step(state, Control(db_x=choice.command.db_x, dg_y=choice.command.dg_y))
+        assert abs(state.guide[0]) <= 0.3 + 1e-9
+    assert state.guide == (pytest.approx(0.3), 0.0)
 
 
 @pytest.mark.parametrize("left", [0.7, 0.3, 1e-6])
 def test_last_advance_ends_at_the_target_depth(plan, left, along):
     state = along(plan, len(plan.controls) - 1)
-    near = replace(plan, target=(float(state.tip[0]) + left, 5.0))
+    near = replace(plan, target=(float(state.tip[0]) + left, 5.0, 0.0))
     choice = choose(near, state)
-    assert choice.steps[0] == pytest.approx(left, abs=0.21 if left > 0.5 else 1e-12)
-    assert choice.steps[0] <= left + 1e-12
+    assert choice.command.db_x == pytest.approx(left, abs=0.21 if left > 0.5 else 1e-12)
+    assert choice.command.db_x <= left + 1e-12
 
 
 def test_past_the_target_nothing_moves_any_more(plan, along):
     state = along(plan, len(plan.controls))
-    past = replace(plan, target=(float(state.tip[0]) - 0.5, 5.0))
+    past = replace(plan, target=(float(state.tip[0]) - 0.5, 5.0, 0.0))
     choice = choose(past, state)
-    assert (choice.steps[0], choice.steps[3]) == (0.0, 0.0)
+    assert (choice.command.db_x, choice.command.dg_y) == (0.0, 0.0)
 
 
 def test_without_a_guide_none_is_moved(plan):
     scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
-    assert choose(plan, Simulator(scenario).start(), scenario).steps[3] == 0.0
+    assert choose(plan, Simulator(scenario).start(), scenario).command.dg_y == 0.0
 
 
 def test_spread_is_that_of_the_first_guide_step(plan, along):
@@ -117,10 +117,10 @@ def test_spread_is_that_of_the_first_guide_step(plan, along):
 
 
 def test_same_seed_same_command_other_seed_another(plan, along):
-    state = along(plan, 30, base_y=0.5)
+    state = along(plan, 30, base=(0.5,))
     one, again, other = choose(plan, state, seed=5), choose(plan, state, seed=5), choose(plan, state, seed=6)
-    assert (one.steps, one.cost, one.spread) == (again.steps, again.cost, again.spread)
-    assert one.steps[3] != other.steps[3]
+    assert (one.command, one.cost, one.spread) == (again.command, again.cost, again.spread)
+    assert one.command.dg_y != other.command.dg_y
 
 
 def test_cost_is_that_of_the_chosen_steps(plan, along):
@@ -130,13 +130,13 @@ def test_cost_is_that_of_the_chosen_steps(plan, along):
         "control.ce_mpc.energy_weight_per_mj": 2.0,
     }  # fmt: skip
     scenario = PHANTOM.with_values(weights)
-    state = along(plan, 40, scenario, base_y=1.0)
+    state = along(plan, 40, scenario, base=(1.0,))
     choice = choose(plan, state, scenario)
-    after = Simulator(scenario).step(state, Control(db_x=choice.steps[0], dg_y=choice.steps[3]))
+    after = Simulator(scenario).step(state, Control(db_x=choice.command.db_x, dg_y=choice.command.dg_y))
     at = np.interp(state.tip[0], plan.tips[:, 0], np.arange(len(plan.tips)))
-    goal = [np.interp(at + 1, np.arange(len(plan.tips)), plan.tips[:, k]) for k in range(3)]
-    off = (after.tip - goal) * [1.0, 1.0, 40.0]
-    guide = choice.steps[3] - plan.controls[int(at + 1e-9), 3]
+    goal = [np.interp(at + 1, np.arange(len(plan.tips)), plan.tips[:, k]) for k in range(5)]
+    off = (after.tip - goal) * [1.0, 1.0, 1.0, 40.0, 40.0]
+    guide = choice.command.dg_y - plan.controls[int(at + 1e-9), DG_Y]
     expected = (off**2).sum() + 3.0 * guide**2 + 2.0 * after.strain_energy
     assert choice.cost == pytest.approx(expected, rel=1e-9)
 
@@ -149,39 +149,39 @@ def test_each_step_is_held_against_the_plans_own_guide_step(plan, along):
         "control.ce_mpc.energy_weight_per_mj": 0.0,
     }
     scenario = PHANTOM.with_values(alone)
-    changes = np.flatnonzero(np.diff(plan.controls[:, 3]))
+    changes = np.flatnonzero(np.diff(plan.controls[:, DG_Y]))
     for k in (changes[0], changes[0] + 1):
         choice = choose(plan, along(plan, k, scenario), scenario)
-        assert choice.steps[3] == pytest.approx(plan.controls[k, 3], abs=1e-4)
+        assert choice.command.dg_y == pytest.approx(plan.controls[k, DG_Y], abs=1e-4)
 
 
 def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
     """One step ahead: the command is near the best of a fine grid."""
     scenario = PHANTOM.with_values({"control.ce_mpc.horizon": 1})
-    state = along(plan, 40, scenario, base_y=1.0)
+    state = along(plan, 40, scenario, base=(1.0,))
     simulator, choice = Simulator(scenario), choose(plan, state, scenario)
     reference, nominal = mpc.plan_window(plan, float(state.tip[0]), 1)
     grid = np.stack(np.meshgrid(np.linspace(0.5, 1, 41), np.linspace(-0.5, 0.5, 81)), axis=-1).reshape(-1, 2)
-    controls = mpc.controls_of(scenario, state, grid, np.zeros((1, 2)), 40.0, flip=False)
-    trajectories = Trajectories(controls, *simulator.rollout(state, controls))
-    best = cost(mpc.cost_terms(mpc.CeMpc(horizon=1), reference, nominal[:, 3]), trajectories).min()
+    controls = mpc.controls_of(scenario, state, grid, np.zeros((1, 4)), 40.0, roll=0.0)
+    trajectories = Trajectories(controls, *simulator.rollout(state, controls)[:3])
+    best = cost(mpc.cost_terms(mpc.CeMpc(horizon=1), reference, nominal[:, [DG_Y, DG_Z]]), trajectories).min()
     assert choice.cost <= best + 0.002
 
 
-@pytest.mark.parametrize("flip", [True, False])
-def test_rollouts_roll_the_bevel_only_in_the_first_step_and_if_asked(plan, flip, along):
+@pytest.mark.parametrize("roll", [np.pi, 0.0])
+def test_rollouts_roll_the_bevel_only_in_the_first_step_and_if_asked(plan, roll, along):
     state = along(plan, 40)
-    controls = mpc.controls_of(PHANTOM, state, np.tile([0.9, 0.1], (3, 8)), np.zeros((8, 2)), 30.0, flip=flip)
-    assert (controls[:, 0, 4] == (1.0 if flip else -1.0)).all()
-    assert (controls[:, 1:, 4] == -1.0).all()
+    controls = mpc.controls_of(PHANTOM, state, np.tile([0.9, 0.1], (3, 8)), np.zeros((8, 4)), 30.0, roll=roll)
+    assert (controls[:, 0, ROLL] == roll).all()
+    assert (controls[:, 1:, ROLL] == 0.0).all()
 
 
 def test_in_air_the_bevel_stays(plan, along, estimated):
     """Even where the rule would roll it."""
     state = along(plan, 5)
-    away = replace(plan, target=(40.0, -5.0))
+    away = replace(plan, target=(40.0, -5.0, 0.0))
     decision = decide(away, estimated(state))
-    assert decision.command[4] == -1
+    assert decision.command.roll == 0.0
     assert decision.why == "in air"
 
 
@@ -190,79 +190,82 @@ def test_in_air_the_bevel_stays(plan, along, estimated):
 def test_in_tissue_the_bevel_rolls_to_the_target(plan, side, rolled, along, estimated):
     """The target is to one side of the tip's own line, further than either path bends."""
     state = Simulator(PHANTOM).step(along(plan, 50), Control(flip=rolled))
-    x, y, theta = state.tip
-    away = replace(plan, target=(float(x) + 30.0, float(y + 30.0 * np.tan(theta) + 2.0 * side)))
+    x, y, _, theta, _ = state.tip
+    away = replace(plan, target=(float(x) + 30.0, float(y + 30.0 * np.tan(theta) + 2.0 * side), 0.0))
     decision = decide(away, estimated(state))
-    assert decision.command[4] == (-1 if side == state.bevel else 1)
-    assert decision.why.startswith("bevel kept" if side == state.bevel else "bevel rolled")
+    assert decision.command.roll == (0.0 if side == state.bevel.real else np.pi)
+    assert decision.why.startswith("bevel kept" if side == state.bevel.real else "bevel rolled")
 
 
 def test_the_rollouts_know_of_the_turn(plan, along):
     """A predicted cost of its own: the bevel that the rule chose acts on the steps that are searched."""
     state, scenario = along(plan, 50), PHANTOM.with_values({"control.ce_mpc.energy_weight_per_mj": 0.0})
-    kept, rolled = (choose(plan, state, scenario, flip=flip) for flip in (False, True))
+    kept, rolled = (choose(plan, state, scenario, roll=roll) for roll in (0.0, np.pi))
     assert kept.cost != rolled.cost
 
 
-def test_command_has_the_five_inputs_and_leaves_the_base_alone(plan, along, estimated):
-    decision = decide(plan, estimated(along(plan, 30)))
-    assert len(decision.command) == 5
-    assert decision.command[1:3] == (0.0, 0.0)
-    assert decision.command[4] in (-1, 1)
+def test_command_has_the_inputs_of_the_plane_and_leaves_the_base_alone(plan, along, estimated):
+    command = decide(plan, estimated(along(plan, 30))).command
+    assert command == Control(db_x=command.db_x, dg_y=command.dg_y, roll=command.roll)
+    assert command.roll in (0.0, np.pi)
 
 
 @pytest.mark.parametrize(("short", "there"), [(0.02, False), (0.009, True), (-0.5, True)])
 def test_arrived_at_the_depth_within_the_tolerance_or_past_it(plan, short, there, along, estimated):
     state = along(plan, 60)
-    goal = replace(plan, target=(float(state.tip[0]) + short, 5.0))
+    goal = replace(plan, target=(float(state.tip[0]) + short, 5.0, 0.0))
     assert at_depth(Task(Simulator(PHANTOM), goal), None, estimated(state)) is there
 
 
 @pytest.mark.parametrize(("more", "there"), [(0.02, False), (0.009, True)])
 def test_arrived_where_the_stroke_is_used_up(plan, more, there, along, estimated):
     """The needle stays before the target, and the last advance goes to the end of the stroke at most."""
-    advanced = float(plan.controls[:60, 0].sum())
+    advanced = float(plan.controls[:60, DB_X].sum())
     short = PHANTOM.with_values({"setup.stroke_mm": advanced + more, "target.depth_mm": 10.0})
     state = along(plan, 60, short)
     assert at_depth(Task(Simulator(short), plan), None, estimated(state)) is there
-    assert choose(plan, state, short).steps[0] <= more + 1e-9
+    assert choose(plan, state, short).command.db_x <= more + 1e-9
 
 
 def test_planned_base_steps_are_followed_and_caught_up_with():
     """A base step that was missed is made good, as fast as the limits allow, which hold for its travel too."""
     plan = flexneedle.plan(PHANTOM.with_values({"plan.base_sigma_mm": 0.1, "plan.iterations": 2}), seed=3)
     scenario = PHANTOM.with_values({"setup.max_base_step_mm": 0.2})
-    moved = np.cumsum(plan.controls[:, 1])
+    moved = np.cumsum(plan.controls[:, DB_Y])
     state = Simulator(scenario).start()
     steps = mpc.planned_base(scenario.setup, plan, state, plan.tips[1:9, 0])
     assert abs(moved[:8]).max() > 0.01
     np.testing.assert_allclose(np.cumsum(steps[:, 0]), moved[:8], atol=1e-12)
     away = moved[20] + np.sign(moved[20]) * 0.5
-    ahead = replace(plan, controls=plan.controls * [1.0, away / moved[20], 1.0, 1.0, 1.0])
+    ahead = replace(plan, controls=stretched(plan.controls, away / moved[20], DB_Y))
     caught_up = mpc.planned_base(scenario.setup, ahead, state, np.full(9, plan.tips[21, 0]))
     assert abs(caught_up).max() == pytest.approx(0.2)
     assert caught_up[:, 0].sum() == pytest.approx(away)
-    far = replace(plan, controls=plan.controls * [1.0, 1e4, 1.0, 1.0, 1.0])
+    far = replace(plan, controls=stretched(plan.controls, 1e4, DB_Y))
     to_the_end = mpc.planned_base(scenario.setup, far, state, np.repeat(plan.tips[-1:, 0], 400))
     assert abs(np.cumsum(to_the_end[:, 0])).max() == pytest.approx(15.0)
 
 
 def test_without_planned_base_steps_none_is_made(plan, along):
     steps = mpc.planned_base(PHANTOM.setup, plan, along(plan, 30), plan.tips[31:35, 0])
-    np.testing.assert_array_equal(steps, np.zeros((4, 2)))
+    np.testing.assert_array_equal(steps, np.zeros((4, 4)))
 
 
 def test_controls_carry_the_base_steps_while_the_needle_advances(plan, along):
-    base = np.array([[0.1, 1e-3]] * 8)
+    base = np.array([[0.1, 0.0, 1e-3, 0.0]] * 8)
     z = np.tile(np.repeat([0.9, 0.0], 8), (2, 1))
-    controls = mpc.controls_of(PHANTOM, along(plan, 10), z, base, 2.0, flip=False)
-    np.testing.assert_allclose(controls[:, :3, 1:3], np.broadcast_to(base[:3], (2, 3, 2)))
-    assert (controls[:, 3:, :4] == 0.0).all()
+    controls = mpc.controls_of(PHANTOM, along(plan, 10), z, base, 2.0, roll=0.0)
+    np.testing.assert_allclose(controls[:, :3, DB_Y:DG_Y], np.broadcast_to(base[:3], (2, 3, 4)))
+    assert (controls[:, 3:] == STILL).all()
 
 
 def test_the_bevel_rule_hears_of_three_standard_deviations_of_a_reading(plan, monkeypatch, along, estimated):
-    noises = []
-    rule = bang_bang.wants_flip
-    monkeypatch.setattr(bang_bang, "wants_flip", lambda *args: noises.append(args[-1]) or rule(*args))
+    noises, rule = [], bang_bang.wanted_roll
+
+    def spied(*args, **options):
+        noises.append(args[-1])
+        return rule(*args, **options)
+
+    monkeypatch.setattr(bang_bang, "wanted_roll", spied)
     decide(plan, estimated(along(plan, 40)))
     assert noises == [pytest.approx(3 * PHANTOM.tracker.jitter_mm / 3**0.5)]

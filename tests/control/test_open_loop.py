@@ -7,13 +7,14 @@ import pytest
 
 import flexneedle
 from flexneedle.control.methods import METHODS
-from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, Control
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
 OPEN = METHODS["open-loop"]
 RNG = np.random.default_rng(0)
+MOTORS = [DB_X, DG_Y]
 
 
 def truncated(moved, row, grid=0.01):
@@ -25,26 +26,26 @@ def truncated(moved, row, grid=0.01):
 def replayed(plan, estimated, scenario=PHANTOM, motor=truncated):
     """Commands, and where base x and guide stood after each, through a driver with a motor."""
     task = task_of(Simulator(scenario, threads=1), plan, "open-loop")
-    state, memory = task.simulator.start(plan.bevel), OPEN.begin(task)
+    state, memory = task.simulator.start(plan.roll), OPEN.begin(task)
     commands, places = [], []
     while not OPEN.arrived(task, memory, estimated(state)):
         decision, memory = OPEN.decide(task, memory, estimated(state), RNG)
         row = np.array(decision.command)
-        row[[0, 3]] = motor(state.travel[[0, 3]], row[[0, 3]])
+        row[MOTORS] = motor(state.travel[MOTORS], row[MOTORS])
         commands.append(decision.command)
-        state = task.simulator.step(state, Control.from_row(row.tolist()))
-        places.append(state.travel[[0, 3]])
+        state = task.simulator.step(state, Control.of(row.tolist()))
+        places.append(state.travel[MOTORS])
     return commands, np.array(places)
 
 
 def test_places_follow_the_plan_through_a_motor_that_stops_short(quick_plan, estimated):
     """Never more than one resolution behind; repeating the steps themselves loses some at each."""
-    planned = np.cumsum(quick_plan.controls[:, [0, 3]], axis=0)
+    planned = np.cumsum(quick_plan.controls[:, MOTORS], axis=0)
     _, places = replayed(quick_plan, estimated)
     assert places.shape == planned.shape
     assert np.abs(places - planned).max() < 0.01 + 1e-6
     lost = np.zeros(2)
-    for row in quick_plan.controls[:, [0, 3]]:
+    for row in quick_plan.controls[:, MOTORS]:
         lost = lost + truncated(lost, row)
     assert np.abs(lost - planned[-1]).max() > 0.1
 
@@ -56,24 +57,24 @@ def test_a_perfect_motor_gets_the_planned_steps(quick_plan, estimated):
 
 def test_bevel_rolls_where_planned(quick_plan, estimated):
     rolls = quick_plan.controls.copy()
-    rolls[[12, 40], 4] = 1.0
+    rolls[[12, 40], ROLL] = np.pi
     commands, _ = replayed(replace(quick_plan, controls=rolls), estimated)
-    assert [k for k, command in enumerate(commands) if command[4] > 0] == [12, 40]
+    assert [k for k, command in enumerate(commands) if command.roll > 0.0] == [12, 40]
 
 
 def test_base_steps_are_replayed_too(quick_plan, estimated):
     lateral = quick_plan.controls.copy()
-    lateral[:10, 1:3] = 0.1, 2e-4
+    lateral[:10, [DB_Y, DB_THETA]] = 0.1, 2e-4
     commands, _ = replayed(replace(quick_plan, controls=lateral), estimated)
-    np.testing.assert_allclose(np.sum(commands, axis=0)[1:3], [1.0, 2e-3], atol=1e-12)
+    np.testing.assert_allclose(np.sum(commands, axis=0)[[DB_Y, DB_THETA]], [1.0, 2e-3], atol=1e-12)
 
 
 def test_what_the_tracker_sees_changes_nothing(quick_plan, estimated, along):
     task, state = task_of(Simulator(PHANTOM, threads=1), quick_plan, "open-loop"), along(quick_plan, 20)
     blind = OPEN.decide(task, 20, estimated(state), RNG)[0].command
-    seeing = OPEN.decide(task, 20, estimated(state, measured=(1.0, 9.0), innovation=(0.5, 3.0)), RNG)[
-        0
-    ].command
+    seeing = OPEN.decide(
+        task, 20, estimated(state, measured=(1.0, 9.0, 0.0), innovation=(0.5, 3.0, 0.0)), RNG
+    )[0].command
     assert blind == seeing == pytest.approx(tuple(quick_plan.controls[20]))
 
 
@@ -88,5 +89,5 @@ def test_steps_and_reach_of_a_smaller_setup_are_kept(quick_plan, estimated):
     """A plan of a larger setup: slower and with less lateral travel, without an exception."""
     tight = {"setup.max_guide_step_mm": 0.02, "setup.max_guide_travel_mm": 0.4, "target.lateral_mm": 0.0}
     commands, places = replayed(quick_plan, estimated, PHANTOM.with_values(tight))
-    assert max(abs(command[3]) for command in commands) <= 0.02
+    assert max(abs(command.dg_y) for command in commands) <= 0.02
     assert np.abs(places[:, 1]).max() == pytest.approx(0.4)

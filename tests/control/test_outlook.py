@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from flexneedle.control import outlook as ol
 from flexneedle.control.outlook import Outlook
-from flexneedle.estimation.prior import RUN_OUT
-from identified import NEEDLES, followed
+from flexneedle.types import Control, X, Y
+from identified import NEEDLES, RUN_OUT, followed
 
 TARGET = 40.0
 GRID = np.arange(-30.0, 60.0)
@@ -24,9 +24,11 @@ def linear(precision, curves, now=0.0, variance=1e-3):
         precision=np.asarray(precision),
         reading_variance=variance,
         nominal=SimpleNamespace(scenario=SimpleNamespace(setup=setup)),
-        state=SimpleNamespace(tip=np.array([now, 0.0, 0.0])),
+        state=SimpleNamespace(tip=np.array([now, 0.0, 0.0, 0.0, 0.0])),
+        axes=1,
     )
-    return Outlook(GRID, np.asarray(curves)), estimate
+    curves = np.asarray(curves)
+    return Outlook(GRID, curves, np.zeros((len(curves), 2))), estimate
 
 
 def two_parameters():
@@ -100,22 +102,25 @@ def test_the_nearer_the_target_the_less_will_be_learned():
 
 
 def ahead_of(estimate, steps=12):
-    """Controls (m, 5) with a roll on the way, and the tips (m, 3) as the estimated needle goes, by the tracker."""
-    rows = [(2.0, 0.0, 0.0, 0.05, 1 if k == 5 else -1) for k in range(steps)]
+    """Controls (m, 9) with a roll on the way, the tips (m, 5) as the estimated needle goes, by the tracker, and its
+    shape (n, 5) at the end.
+    """
+    rows = [Control(db_x=2.0, dg_y=0.05, flip=k == 5) for k in range(steps)]
     state, tips = estimate.state, []
     for row in rows:
         state = estimate.simulator.replay(state, [row])[0]
-        tips.append(np.add(state.tip, [0.0, estimate.off_axis(state.bevel), 0.0]))
-    return np.array(rows), np.array(tips)
+        tips.append(state.tip)
+        tips[-1][Y] += estimate.off_axis(state.bevel).real
+    return np.array(rows), np.array(tips), state.nodes
 
 
 def test_what_was_just_perturbed_is_renewed_along_the_path_ahead():
     """The difference of two needles that are both carried on, one of them with another value; the rest is kept."""
     estimate, _ = followed(NEEDLES["all"], 40)
-    controls, tips = ahead_of(estimate)
+    controls, tips, shape = ahead_of(estimate)
     old = Outlook.of(estimate)
-    new = old.renewed(estimate, controls, tips)
-    passed = (new.grid > tips[0, 0]) & (new.grid < tips[-1, 0])
+    new = old.renewed(estimate, controls, tips, shape)
+    passed = (new.grid > tips[0, X]) & (new.grid < tips[-1, X])
     renewed = {one.parameter for one in estimate.perturbed} | {RUN_OUT}
     for one in estimate.perturbed:
         moved, axis = one.state, estimate.state
@@ -123,8 +128,8 @@ def test_what_was_just_perturbed_is_renewed_along_the_path_ahead():
         for row in controls:
             moved = one.simulator.replay(moved, [row])[0]
             axis = estimate.simulator.replay(axis, [row])[0]
-            expected.append((moved.tip[1] - axis.tip[1]) / one.step)
-        by_hand = np.interp(new.grid[passed], tips[:, 0], expected)
+            expected.append((moved.tip[Y] - axis.tip[Y]) / one.step)
+        by_hand = np.interp(new.grid[passed], tips[:, X], expected)
         scale = np.abs(by_hand).max()
         np.testing.assert_allclose(new.curves[one.parameter][passed], by_hand, atol=0.01 * scale + 2e-3)
     for k in set(range(estimate.parameters.size)) - renewed:
@@ -133,8 +138,8 @@ def test_what_was_just_perturbed_is_renewed_along_the_path_ahead():
 
 def test_the_run_out_is_on_the_bevels_side():
     estimate, _ = followed(NEEDLES["run-out"], 30)
-    controls, tips = ahead_of(estimate)
-    curve = Outlook.of(estimate).renewed(estimate, controls, tips).curves[RUN_OUT]
-    side = estimate.state.bevel
-    assert np.interp(tips[3, 0], estimate.grid, curve) == side
-    assert np.interp(tips[9, 0], estimate.grid, curve) == -side
+    controls, tips, shape = ahead_of(estimate)
+    curve = Outlook.of(estimate).renewed(estimate, controls, tips, shape).curves[RUN_OUT]
+    side = estimate.state.bevel.real
+    assert np.interp(tips[3, X], estimate.grid, curve) == side
+    assert np.interp(tips[9, X], estimate.grid, curve) == -side

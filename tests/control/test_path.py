@@ -9,9 +9,11 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 import flexneedle
+from adaptive import rolls_at
 from flexneedle.control.path import KNOTS, LEAST_SLOTS, Ahead, GuidePath, of_plan, proposals
-from flexneedle.simulator.control import Control
+from flexneedle.simulator.control import controls as controls_of
 from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, DG_Z, ROLL, X, Y
 from tasks import task_of
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -27,7 +29,12 @@ def ahead_of(plan, state, path=None, scenario=PHANTOM):
 
 def level(*rolls, guide=0.0):
     """A path with the guide at one place (mm)."""
-    return GuidePath(np.array([-28.5, 40.0]), np.full(2, guide), rolls)
+    return GuidePath(np.array([-28.5, 40.0]), np.array([[guide, 0.0]] * 2), rolls_at(*rolls))
+
+
+def depths(path):
+    """Those of a path's rolls."""
+    return path.rolls[:, 0].tolist()
 
 
 def started(x, guide=0.0, simulator=None):
@@ -35,7 +42,7 @@ def started(x, guide=0.0, simulator=None):
     simulator = simulator or Simulator(PHANTOM, threads=1)
     state = simulator.start()
     for _ in range(3):
-        rows = [[x - state.tip[0], 0.0, 0.0, guide - state.guide, -1.0]]
+        rows = controls_of(1, db_x=x - state.tip[X], dg_y=guide - state.guide[0])
         state = simulator.replay(state, rows)[0]
     return state
 
@@ -46,24 +53,27 @@ def started(x, guide=0.0, simulator=None):
 def test_it_begins_as_the_plans(quick_plan):
     """The guide at every depth, the bevel rolled where the plan rolls it."""
     controls = quick_plan.controls.copy()
-    controls[:, 4] = -1.0
-    controls[[12, 40, 60], 4] = 1.0
+    controls[:, ROLL] = 0.0
+    controls[[12, 40, 60], ROLL] = np.pi
     path = of_plan(replace(quick_plan, controls=controls))
-    np.testing.assert_array_equal(np.interp(quick_plan.tips[:, 0], path.depth, path.guide), quick_plan.guide)
-    assert path.rolls == tuple(quick_plan.tips[[12, 40, 60], 0])
+    for axis in range(2):
+        there = np.interp(quick_plan.tips[:, X], path.depth, path.guide[:, axis])
+        np.testing.assert_array_equal(there, quick_plan.guide[:, axis])
+    assert depths(path) == quick_plan.tips[[12, 40, 60], X].tolist()
+    np.testing.assert_allclose(path.rolls[:, 1], [np.pi, 2.0 * np.pi, 3.0 * np.pi])
 
 
 def test_no_roll_of_the_plan_is_lost(quick_plan):
     """However many there are: all are in the path, in the sample that corrects nothing, and in its controls."""
     controls = quick_plan.controls.copy()
-    controls[:, 4] = -1.0
-    controls[35:70:5, 4] = 1.0
+    controls[:, ROLL] = 0.0
+    controls[35:70:5, ROLL] = np.pi
     plan = replace(quick_plan, controls=controls)
     path = of_plan(plan)
-    assert path.rolls == tuple(quick_plan.tips[35:70:5, 0])
+    assert depths(path) == quick_plan.tips[35:70:5, X].tolist()
     ahead = ahead_of(plan, started(0.0), path)
     controls, depth = ahead.controls(ahead.current[None])
-    assert tuple(depth[0, :-1][controls[0, :, 4] > 0.0]) == path.rolls
+    assert depth[0, :-1][controls[0, :, ROLL] > 0.0].tolist() == depths(path)
     z = proposals(ahead, 24, np.random.default_rng(0))
     np.testing.assert_array_equal(z[0], ahead.current)
 
@@ -74,7 +84,7 @@ def test_depths_ascend_where_a_plan_stands_still(quick_plan):
     tips[5:8, 0] = tips[4, 0]
     path = of_plan(replace(quick_plan, tips=tips))
     assert (np.diff(path.depth) > 0.0).all()
-    assert path.guide.size == guide.size - 3
+    assert len(path.guide) == len(guide) - 3
 
 
 # ---- sample 0
@@ -85,13 +95,13 @@ def test_the_sample_that_corrects_nothing_is_the_path_in_hand(quick_plan, along,
     """The same guide at the ends of the steps, the same rolls."""
     state = along(quick_plan, steps)
     x = float(state.tip[0])
-    path = replace(of_plan(quick_plan), rolls=(x + 0.35 * (40.0 - x), x + 0.7 * (40.0 - x)))
+    path = replace(of_plan(quick_plan), rolls=rolls_at(x + 0.35 * (40.0 - x), x + 0.7 * (40.0 - x)))
     ahead = ahead_of(quick_plan, state, path)
     controls, depth = ahead.controls(ahead.current[None])
-    guide = state.guide + np.cumsum(controls[0, :, 3])
-    np.testing.assert_allclose(guide, np.interp(depth[0, 1:], path.depth, path.guide), atol=2e-3)
+    guide = state.guide[0] + np.cumsum(controls[0, :, DG_Y])
+    np.testing.assert_allclose(guide, np.interp(depth[0, 1:], path.depth, path.guide[:, 0]), atol=2e-3)
     kept = ahead.corrected(ahead.current)
-    assert kept.rolls == pytest.approx(path.rolls)
+    assert depths(kept) == pytest.approx(depths(path))
     again = ahead_of(quick_plan, state, kept)
     np.testing.assert_allclose(again.controls(again.current[None])[0], controls, atol=1e-12)
 
@@ -105,7 +115,7 @@ def test_corrections_of_the_guide_are_linear_between_the_knots(quick_plan):
     controls, depth = ahead.controls(z[None])
     share = (depth[0] - depth[0, 0]) / (40.0 - depth[0, 0])
     expected = np.interp(share, np.append(0.0, KNOTS), np.append(0.0, corrections))
-    np.testing.assert_allclose(np.cumsum(controls[0, :, 3]), expected[1:], atol=1e-12)
+    np.testing.assert_allclose(np.cumsum(controls[0, :, DG_Y]), expected[1:], atol=1e-12)
 
 
 def test_what_is_found_is_the_path_in_hand_of_the_next_period(quick_plan, along):
@@ -115,11 +125,11 @@ def test_what_is_found_is_the_path_in_hand_of_the_next_period(quick_plan, along)
     for z in proposals(ahead, 48, np.random.default_rng(2)):
         after = ahead_of(quick_plan, state, ahead.corrected(z))
         np.testing.assert_allclose(
-            after.controls(after.current[None])[0][:, :, [0, 3]].sum(axis=1),
-            ahead.controls(z[None])[0][:, :, [0, 3]].sum(axis=1), atol=1e-9,
+            after.controls(after.current[None])[0][:, :, [DB_X, DG_Y, DG_Z]].sum(axis=1),
+            ahead.controls(z[None])[0][:, :, [DB_X, DG_Y, DG_Z]].sum(axis=1), atol=1e-9,
         )  # fmt: skip
         flips = [
-            np.flatnonzero(each.controls(one[None])[0][0, :, 4] > 0.0)
+            np.flatnonzero(each.controls(one[None])[0][0, :, ROLL] > 0.0)
             for each, one in ((after, after.current), (ahead, z))
         ]
         np.testing.assert_array_equal(*flips)
@@ -145,16 +155,16 @@ def test_every_sample_within_the_bounds_keeps_every_limit(quick_plan, seed, x, g
     z[::3, : KNOTS.size] = 0.0
     z[::4, -1] = z[::4, -2]  # two rolls at one depth
     controls, depth = ahead.controls(z)
-    advance = controls[:, :, 0]
+    advance = controls[:, :, DB_X]
     assert (advance >= 0.0).all()
     np.testing.assert_allclose(advance.sum(axis=1), 40.0 - state.tip[0], atol=1e-9)
     np.testing.assert_allclose(np.diff(depth, axis=1), advance, atol=1e-12)
-    place = state.guide + np.cumsum(controls[:, :, 3], axis=1)
+    place = state.guide[0] + np.cumsum(controls[:, :, DG_Y], axis=1)
     assert np.abs(place).max() <= REACH + 1e-9
-    assert (np.abs(controls[:, :, 3]) <= STEP * advance / PHANTOM.setup.max_advance_mm + 1e-9).all()
-    assert set(np.unique(controls[:, :, 4])) <= {-1.0, 1.0}
+    assert (np.abs(controls[:, :, DG_Y]) <= STEP * advance / PHANTOM.setup.max_advance_mm + 1e-9).all()
+    assert set(np.unique(controls[:, :, ROLL])) <= {0.0, np.pi}
     inside = z[:, KNOTS.size :] < 0.5 * (ahead.depth[-1] + ahead.depth[-2])  # others are too late for a step
-    np.testing.assert_array_equal((controls[:, :, 4] > 0.0).sum(axis=1) % 2, inside.sum(axis=1) % 2)
+    np.testing.assert_array_equal((controls[:, :, ROLL] > 0.0).sum(axis=1) % 2, inside.sum(axis=1) % 2)
 
 
 @pytest.mark.parametrize("guide", [0.0, 1.5])
@@ -163,10 +173,10 @@ def test_the_end_is_continuous_in_the_depth_of_a_roll(quick_plan, guide):
     simulator = Simulator(PHANTOM, threads=1)
     state = started(12.0, guide)
     ahead = ahead_of(quick_plan, state, level(guide=guide))
-    depths = np.arange(12.6, 39.0, 0.02)
-    z = np.tile(ahead.current, (depths.size, 1))
-    z[:, KNOTS.size] = depths
-    ends = simulator.rollout(state, ahead.controls(z)[0], limits=False).tips[:, -1, 1]
+    places = np.arange(12.6, 39.0, 0.02)
+    z = np.tile(ahead.current, (places.size, 1))
+    z[:, KNOTS.size] = places
+    ends = simulator.rollout(state, ahead.controls(z)[0], limits=False).tips[:, -1, Y]
     assert np.ptp(ends) > 1.0
     assert np.abs(np.diff(ends)).max() < 0.01 * np.ptp(ends)
 
@@ -176,29 +186,29 @@ def test_a_roll_is_made_at_its_own_depth(quick_plan):
     z = ahead.current[None].repeat(3, axis=0)
     z[:, KNOTS.size] = 11.0, 17.3, 30.01
     controls, depth = ahead.controls(z)
-    rolls = [depth[k, :-1][controls[k, :, 4] > 0.0].tolist() for k in range(3)]
+    rolls = [depth[k, :-1][controls[k, :, ROLL] > 0.0].tolist() for k in range(3)]
     assert np.ravel(rolls) == pytest.approx([11.0, 17.3, 30.01])
 
 
 def test_two_rolls_at_one_place_cancel(quick_plan):
     """Those before and after them do not."""
-    for rolls, left in [((20.0, 20.0), ()), ((10.0, 20.0, 20.0, 30.0), (10.0, 30.0)), ((20.0,) * 3, (20.0,))]:
+    for rolls, left in [((20.0, 20.0), []), ((10.0, 20.0, 20.0, 30.0), [10.0, 30.0]), ((20.0,) * 3, [20.0])]:
         ahead = ahead_of(quick_plan, started(9.0), level(*rolls))
-        assert ahead.corrected(ahead.current).rolls == left
+        assert depths(ahead.corrected(ahead.current)) == left
 
 
 @given(rolls=st.lists(st.floats(9.2, 30.0), max_size=4))
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=100)
 def test_rolls_that_are_near_each_other_are_all_made(quick_plan, rolls):
     """Where they are, in order, but for those within a twentieth of a control step of each other."""
-    rolls = tuple(sorted(rolls))
+    rolls = sorted(rolls)
     assume((np.diff(rolls) > 0.051).all())
     ahead = ahead_of(quick_plan, started(9.0), level(*rolls))
     depth = ahead.controls(ahead.current[None])[1]
     assert (np.diff(depth) >= 0.0).all()
     assert depth[0, -1] == ahead.depth[-1]
-    assert ahead.corrected(ahead.current).rolls == pytest.approx(rolls, abs=0.5)
-    assert ahead.corrected(ahead.current).rolls[1:] == rolls[1:]
+    assert depths(ahead.corrected(ahead.current)) == pytest.approx(rolls, abs=0.5)
+    assert depths(ahead.corrected(ahead.current))[1:] == rolls[1:]
 
 
 def test_a_guide_that_may_not_move_is_not_moved(quick_plan):
@@ -207,22 +217,24 @@ def test_a_guide_that_may_not_move_is_not_moved(quick_plan):
         state = started(10.0, simulator=Simulator(scenario, threads=1))
         ahead = ahead_of(plan, state, scenario=scenario)
         controls, _ = ahead.controls(proposals(ahead, 60, np.random.default_rng(0)))
-        np.testing.assert_array_equal(controls[:, :, 3], 0.0)
-        assert ahead.first(ahead.path)[0][3] == 0.0
+        np.testing.assert_array_equal(controls[:, :, [DG_Y, DG_Z]], 0.0)
+        assert ahead.first(ahead.path)[0].dg_y == 0.0
 
 
 def test_base_motion_of_the_plan_is_followed(quick_plan):
     """Where the plan has the base at a depth, in the samples and in the command."""
     moving = quick_plan.controls.copy()
-    moving[:60, 1:3] = 0.02, 1e-4
+    moving[:60, [DB_Y, DB_THETA]] = 0.02, 1e-4
     plan, state = replace(quick_plan, controls=moving), started(float(quick_plan.tips[30, 0]))
     simulator = Simulator(PHANTOM, threads=1)
-    state = simulator.replay(state, [[0.0, 0.6, 30e-4, 0.0, -1.0]])[0]
+    state = simulator.replay(state, controls_of(1, db_y=0.6, db_theta=30e-4))[0]
     ahead = ahead_of(plan, state)
     first, planned = ahead.first(ahead.path)[0], np.diff(quick_plan.tips[30:32, 0])[0]
-    assert np.divide(first[1:3], first[0]) == pytest.approx(np.array([0.02, 1e-4]) / planned, rel=0.02)
+    assert np.divide([first.db_y, first.db_theta], first.db_x) == pytest.approx(
+        np.array([0.02, 1e-4]) / planned, rel=0.02
+    )
     controls, _ = ahead.controls(ahead.current[None])
-    total = controls[0, :, 1:3].sum(axis=0)
+    total = controls[0, :, [DB_Y, DB_THETA]].sum(axis=1)
     np.testing.assert_allclose(total, [30 * 0.02, 30 * 1e-4], rtol=1e-6)
 
 
@@ -261,10 +273,10 @@ def carried_out(plan, path, state, simulator):
         if ahead.left <= 1e-9:
             return rolls, advances, state, path
         command, path = ahead.first(path)
-        if command[4] > 0.0:
+        if command.roll > 0.0:
             rolls.append(float(state.tip[0]))
-        advances.append(command[0])
-        state = simulator.step(state, Control.from_row(command))
+        advances.append(command.db_x)
+        state = simulator.step(state, command)
     raise AssertionError("it never gets there")
 
 
@@ -276,24 +288,24 @@ def test_rolls_are_executed_once_at_their_depth(quick_plan, rolls):
     simulator = Simulator(PHANTOM, threads=1)
     made, _, end, left = carried_out(quick_plan, level(*rolls), started(10.0), simulator)
     assert made == pytest.approx(np.maximum(rolls, 10.0).tolist(), abs=0.1 * PHANTOM.setup.max_advance_mm)
-    assert left.rolls == ()
-    assert end.bevel == (-1) ** len(rolls)
+    assert depths(left) == []
+    assert end.bevel.real == (-1) ** len(rolls)
 
 
 def test_two_rolls_that_are_due_are_none(quick_plan):
     """They would bring the bevel back to its side; both are over."""
     ahead = ahead_of(quick_plan, started(10.0), level(9.0, 10.01, 25.0))
     command, after = ahead.first(ahead.path)
-    assert command[4] == -1
-    assert after.rolls == (25.0,)
+    assert command.roll == 0.0
+    assert depths(after) == [25.0]
 
 
 def test_the_advance_ends_where_the_next_roll_is_due(quick_plan):
     for roll, advance in ((10.6, 0.6), (10.3, 0.3), (11.0, 1.0), (11.4, 1.0), (39.0, 1.0)):
         ahead = ahead_of(quick_plan, started(10.0), level(roll))
         command, after = ahead.first(ahead.path)
-        assert command[0] == pytest.approx(advance, abs=1e-6)
-        assert (command[4], after.rolls) == (-1, (roll,))
+        assert command.db_x == pytest.approx(advance, abs=1e-6)
+        assert (command.roll, depths(after)) == (0.0, [roll])
 
 
 def test_every_step_is_the_longest_but_before_rolls_and_at_the_end(quick_plan):
@@ -308,30 +320,30 @@ def test_every_step_is_the_longest_but_before_rolls_and_at_the_end(quick_plan):
 @pytest.mark.parametrize("left", [0.7, 0.02, 1e-6])
 def test_the_last_advance_ends_at_the_target_depth(quick_plan, left):
     state = started(20.0)
-    near = replace(quick_plan, target=(float(state.tip[0]) + left, 5.0))
+    near = replace(quick_plan, target=(float(state.tip[0]) + left, 5.0, 0.0))
     ahead = ahead_of(near, state, level())
-    assert ahead.first(ahead.path)[0][0] == pytest.approx(left, rel=1e-6)
+    assert ahead.first(ahead.path)[0].db_x == pytest.approx(left, rel=1e-6)
 
 
 def test_at_the_depth_nothing_moves(quick_plan):
     state = started(20.0)
-    past = replace(quick_plan, target=(float(state.tip[0]) - 0.1, 9.0))
+    past = replace(quick_plan, target=(float(state.tip[0]) - 0.1, 9.0, 0.0))
     ahead = ahead_of(past, state, level())
     controls, _ = ahead.controls(proposals(ahead, 24, np.random.default_rng(0)))
-    np.testing.assert_allclose(controls[:, :, :4], 0.0, atol=1e-12)
-    assert ahead.first(ahead.path)[0][:4] == pytest.approx((0.0, 0.0, 0.0, 0.0), abs=1e-12)
+    np.testing.assert_allclose(controls[:, :, :ROLL], 0.0, atol=1e-12)
+    assert ahead.first(ahead.path)[0][:ROLL] == pytest.approx((0.0,) * ROLL, abs=1e-12)
 
 
 def test_the_stroke_ends_the_advance(quick_plan):
     short = PHANTOM.with_values({"setup.stroke_mm": 48.9, "target.depth_mm": 10.0})
     state = started(20.0)
     ahead = ahead_of(quick_plan, state, level(), short)
-    assert ahead.first(ahead.path)[0][0] == pytest.approx(48.9 - float(state.travel[0]), abs=1e-9)
+    assert ahead.first(ahead.path)[0].db_x == pytest.approx(48.9 - float(state.travel[0]), abs=1e-9)
 
 
 @pytest.mark.parametrize("wanted", [4.0, -4.0])
 def test_a_guide_far_from_its_path_comes_back_as_fast_as_it_may(quick_plan, wanted):
     ahead = ahead_of(quick_plan, started(10.0), level(guide=wanted))
-    assert ahead.first(ahead.path)[0][3] == pytest.approx(np.sign(wanted) * STEP)
+    assert ahead.first(ahead.path)[0].dg_y == pytest.approx(np.sign(wanted) * STEP)
     controls, _ = ahead.controls(ahead.current[None])
-    assert np.abs(np.cumsum(controls[0, :, 3])).max() == pytest.approx(min(abs(wanted), REACH))
+    assert np.abs(np.cumsum(controls[0, :, DG_Y])).max() == pytest.approx(min(abs(wanted), REACH))

@@ -7,16 +7,21 @@ import pytest
 
 from flexneedle.estimation import identification as idn
 from flexneedle.estimation.identification import Identification
-from flexneedle.estimation.prior import BASE_TURN, BASE_Y, BEND, BEVEL, CLEARANCE, RUN_OUT, unexplained
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Measurement
+from flexneedle.types import ROLL, Control, Measurement, X, Y
 from identified import (
+    BASE,
+    BEND,
+    BEVEL,
     CELLS,
+    CLEARANCE,
     NEEDLES,
     OWN,
     PHANTOM,
     QUIET,
+    RUN_OUT,
     SHIFT,
+    SLOPE,
     Needle,
     commands,
     followed,
@@ -24,6 +29,7 @@ from identified import (
     predicted,
     readings,
     stepped,
+    unexplained,
 )
 from tasks import begun_with
 
@@ -34,14 +40,14 @@ def finely(estimate):
     """The same with all its derivatives simulated now, on a grid so fine that nothing is lost between its points."""
     grid = np.arange(estimate.grid[0], estimate.grid[-1], 0.05)
     size = estimate.parameters.size
-    return replace(estimate, grid=grid, curves=np.zeros((size, grid.size)))._differentiated(range(size))
+    return replace(estimate, grid=grid, curves=np.zeros((1, size, grid.size)))._differentiated(range(size))
 
 
 def test_derivatives_agree_with_central_differences():
     """Of the readings, by every parameter, at parameters off the prior; closely with small steps."""
     estimate, readings = off_the_prior()
     fine = replace(estimate, prior=replace(estimate.prior, steps=1e-3 * estimate.prior.steps))
-    jacobian, close = idn.jacobian_of(finely(estimate), readings), idn.jacobian_of(finely(fine), readings)
+    jacobian, close = idn.jacobian_of(finely(estimate)), idn.jacobian_of(finely(fine))
     assert jacobian.shape == (readings.y.size, estimate.parameters.size)
     for k in range(CELLS + 12):
         step = np.zeros(estimate.parameters.size)
@@ -57,7 +63,7 @@ def test_derivatives_agree_with_central_differences():
         # of the clearance, across where the needle leaves a wall.
         off = 0.25 if SHIFT <= k < CELLS or k == CLEARANCE else 0.03
         assert np.linalg.norm(jacobian[:, k] - central) <= off * np.linalg.norm(central) + 1e-6
-    deepest = estimate.tips[:, 0].max()
+    deepest = estimate.tips[:, X].max()
     np.testing.assert_array_equal(jacobian[:, CELLS + int(deepest // 2.5) + 1 :], 0.0)
 
 
@@ -65,30 +71,30 @@ def test_a_fresh_curve_is_the_difference_of_two_whole_insertions():
     """Those of the last period, over the depth passed and a few steps ahead."""
     estimate, _ = followed(NEEDLES["all"], 50)
     assert len(estimate.perturbed) > 3
-    forward = [(1.0, 0.0, 0.0, 0.0, -1)] * 4
+    forward = [Control(db_x=1.0)] * 4
     rows = [*commands(50), *forward]
 
     def lateral(parameters):
         return np.array([state.tip for state in stepped(parameters, rows, estimate.axial)])
 
     base = lateral(estimate.parameters)
-    depth = np.maximum.accumulate(base[:, 0])
+    depth = np.maximum.accumulate(base[:, X])
     passed = (estimate.grid > depth[0]) & (estimate.grid < depth[-1])
     for one in estimate.perturbed:
         k, step = one.parameter, estimate.prior.steps[one.parameter]
         parameters = estimate.parameters.copy()
         parameters[k] += step
-        difference = (lateral(parameters)[:, 1] - base[:, 1]) / step
+        difference = (lateral(parameters)[:, Y] - base[:, Y]) / step
         expected = np.interp(estimate.grid[passed], depth, difference)
-        np.testing.assert_allclose(estimate.curves[k][passed], expected, rtol=1e-5, atol=2e-5)
+        np.testing.assert_allclose(estimate.curves[0, k][passed], expected, rtol=1e-5, atol=2e-5)
         assert one.step == step
 
 
 def test_no_derivative_is_older_than_a_round():
     """All are simulated anew within it, those of start, needle and guide more often."""
     rows, states = commands(40), Needle().inserted(PHANTOM, commands(40))
-    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
-    last, leading = {}, (BASE_Y, BASE_TURN, BEND, BEVEL, CLEARANCE)
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1)))
+    last, leading = {}, (BASE, SLOPE, BEND, BEVEL, CLEARANCE)
     for k, row in enumerate(rows):
         batch = readings(Needle(), states[k], states[k + 1], k, 2, 0.0, np.random.default_rng(0))
         estimate = estimate.move(row, k, k + 1.0).observe(batch)
@@ -102,13 +108,13 @@ def test_no_derivative_is_older_than_a_round():
 
 def test_derivatives_from_the_stops_are_those_from_the_start():
     """What is not simulated again does not depend on the parameter."""
-    estimate, readings = off_the_prior(66)
+    estimate, _ = off_the_prior(66)
     assert len(estimate.stops) > 4
     whole = replace(estimate, stops=estimate.stops[:1])
     again = replace(whole, prior=replace(estimate.prior, begins=np.full_like(estimate.prior.begins, -np.inf)))
-    jacobian = idn.jacobian_of(finely(estimate), readings)
-    np.testing.assert_allclose(jacobian, idn.jacobian_of(finely(whole), readings), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(jacobian, idn.jacobian_of(finely(again), readings), rtol=1e-6, atol=1e-6)
+    jacobian = idn.jacobian_of(finely(estimate))
+    np.testing.assert_allclose(jacobian, idn.jacobian_of(finely(whole)), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(jacobian, idn.jacobian_of(finely(again)), rtol=1e-6, atol=1e-6)
     assert np.abs(jacobian[:, CELLS + 12]).max() > 1e-4
 
 
@@ -125,32 +131,32 @@ def test_the_stops_are_states_of_the_way():
 def test_one_step_is_the_maximum_a_posteriori_of_the_linear_problem():
     """Least squares of readings and prior stacked, each over its standard deviation."""
     estimate, readings = off_the_prior(45, "bend")
-    y = estimate.tips[:, 1]
+    y = estimate.tips[:, Y]
     bends = np.abs(np.diff(np.concatenate([y[:1], y, y[-1:]]), n=2))
     chord = 0.25 * np.maximum(bends[readings.index], bends[readings.index + 1])
     assert chord.max() > 0.01
     jitter = QUIET.tracker.jitter_per_axis / np.sqrt(readings.count)
     sd = np.sqrt(jitter**2 + unexplained(QUIET, estimate.settings) ** 2 + chord**2)
     prior = np.linalg.cholesky(estimate.prior.precision).T
-    jacobian = idn.jacobian_of(estimate, readings)
+    jacobian = idn.jacobian_of(estimate)
     matrix = np.concatenate([jacobian / sd[:, None], prior])
     missing = readings.y - predicted(estimate.parameters, commands(45), readings, estimate.axial)
     right = np.concatenate([missing / sd, prior @ (estimate.prior.mean - estimate.parameters)])
     step = np.linalg.lstsq(matrix, right, rcond=None)[0]
     assert (np.abs(step) > 1e-4).sum() > 10
-    found = idn.improved(estimate, readings).parameters
+    found = idn.improved(estimate).parameters
     np.testing.assert_allclose(found, estimate.parameters + step, rtol=1e-6, atol=1e-8)
 
 
 def misfit(estimate, readings, before):
     """What the fit makes least: squares over variances, halved; the variances are those of the estimate `before`."""
-    variance = estimate.variance(readings) + readings.bent(before.tips[:, 1]) ** 2
+    variance = estimate.variances()[0] + readings.bent(before.tips[:, Y]) ** 2
     off = estimate.parameters - estimate.prior.mean
     rows, p = np.array([done.applied for done in estimate.moves]), estimate.parameters
-    y = estimate.tips[:, 1]
+    y = estimate.tips[:, Y]
     y = y[readings.index] + readings.part * (y[readings.index + 1] - y[readings.index])
-    first = estimate.stops[0][1].bevel
-    sides = first * np.cumprod(np.where(rows[:, 4] > 0.0, -1.0, 1.0))[readings.index]
+    first = estimate.stops[0][1].bevel.real
+    sides = first * np.cumprod(np.where(rows[:, ROLL] > 0.0, -1.0, 1.0))[readings.index]
     left = readings.y - y - p[RUN_OUT] * sides
     return 0.5 * (left**2 / variance).sum() + 0.5 * off @ estimate.prior.precision @ off
 
@@ -165,9 +171,9 @@ def test_a_step_never_fits_worse(monkeypatch):
     """
     costs, tried, improved, with_ = [], [], idn.improved, idn.Identified._with
 
-    def spied(estimate, readings):
+    def spied(estimate):
         tried.append(0)
-        fitted = improved(estimate, readings)
+        fitted, readings = improved(estimate), estimate._readings[0]
         if len(estimate.moves) > 1:
             costs.append((misfit(estimate, readings, estimate), misfit(fitted, readings, estimate)))
         return fitted
@@ -180,7 +186,7 @@ def test_a_step_never_fits_worse(monkeypatch):
     monkeypatch.setattr(idn.Identified, "_with", counted)
     for scenario, jump in ((PHANTOM, 1.0), (QUIET, 0.1)):
         estimate, states = (
-            Identification().begin(begun_with(Simulator(scenario.with_values(KNOWN), 1), 1)),
+            Identification().begin(begun_with(Simulator(scenario.with_values(KNOWN), 1))),
             Needle().inserted(scenario, commands(50)),
         )
         for k, row in enumerate(commands(50)):
@@ -199,7 +205,7 @@ def test_a_wrong_step_is_not_taken(monkeypatch, factor):
     estimate, readings = off_the_prior(45)
     jacobian = idn.jacobian_of
     monkeypatch.setattr(idn, "jacobian_of", lambda *args: factor * jacobian(*args))
-    fitted = idn.improved(estimate, readings)
+    fitted = idn.improved(estimate)
     assert misfit(fitted, readings, estimate) <= misfit(estimate, readings, estimate) * (1.0 + 1e-12)
 
 
@@ -217,14 +223,14 @@ def test_a_trial_step_that_ends_in_nan_is_refused(monkeypatch):
         return spoilt(other) if len(tried) <= 2 else other
 
     monkeypatch.setattr(idn.Identified, "_with", failing)
-    fitted = idn.improved(estimate, readings)
+    fitted = idn.improved(estimate)
     assert len(tried) >= 3
     assert np.isfinite(fitted.tips).all()
     assert misfit(fitted, readings, estimate) <= misfit(estimate, readings, estimate)
 
 
 def test_if_no_trial_step_can_be_had_the_parameters_stay(monkeypatch):
-    estimate, readings = off_the_prior(45)
+    estimate, _ = off_the_prior(45)
     with_ = idn.Identified._with
 
     def failing(self, parameters):
@@ -232,13 +238,13 @@ def test_if_no_trial_step_can_be_had_the_parameters_stay(monkeypatch):
         return other if np.array_equal(parameters, estimate.parameters) else spoilt(other)
 
     monkeypatch.setattr(idn.Identified, "_with", failing)
-    fitted = idn.improved(estimate, readings)
+    fitted = idn.improved(estimate)
     np.testing.assert_array_equal(fitted.parameters, estimate.parameters)
     np.testing.assert_array_equal(fitted.tips, estimate.tips)
 
 
 def test_a_trial_step_that_does_not_converge_is_refused(monkeypatch):
-    estimate, readings = off_the_prior(45)
+    estimate, _ = off_the_prior(45)
     with_ = idn.Identified._with
 
     def failing(self, parameters):
@@ -251,7 +257,7 @@ def test_a_trial_step_that_does_not_converge_is_refused(monkeypatch):
         )
 
     monkeypatch.setattr(idn.Identified, "_with", failing)
-    assert idn.improved(estimate, readings).state.converged
+    assert idn.improved(estimate).state.converged
 
 
 def test_a_jacobian_that_is_not_finite_leaves_the_parameters(monkeypatch):
@@ -259,29 +265,29 @@ def test_a_jacobian_that_is_not_finite_leaves_the_parameters(monkeypatch):
     monkeypatch.setattr(
         idn, "jacobian_of", lambda *_: np.full((readings.y.size, estimate.parameters.size), np.nan)
     )
-    np.testing.assert_array_equal(idn.improved(estimate, readings).parameters, estimate.parameters)
+    np.testing.assert_array_equal(idn.improved(estimate).parameters, estimate.parameters)
 
 
 def test_readings_of_a_move_are_averaged_at_their_mean_time():
-    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1)))
     for k in range(2):
-        estimate = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 2.0 * k, 2.0 * k + 2.0)
+        estimate = estimate.move(Control(db_x=1.0), 2.0 * k, 2.0 * k + 2.0)
     readings = [Measurement(2.5, -27.3, 0.1), Measurement(3.5, -26.7, 0.3)]
-    means = estimate.observe(readings)._readings
+    (means,) = estimate.observe(readings)._readings
     assert (means.index.tolist(), means.count.tolist()) == ([1], [2.0])
     assert (means.part[0], means.x[0], means.y[0]) == pytest.approx((0.5, -27.0, 0.2))
     np.testing.assert_allclose(means.between(np.array([0.0, 10.0, 20.0])), [15.0])
 
 
-@pytest.mark.parametrize("first", [1, -1])
-def test_a_reading_is_on_the_side_to_which_the_bevel_rolled_before_its_move(first):
-    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), first))
-    for k, flip in enumerate((-1, 1, -1, 1, -1)):
-        estimate = estimate.move((1.0, 0.0, 0.0, 0.0, flip), float(k), k + 1.0)
+@pytest.mark.parametrize(("roll", "first"), [(0.0, 1), (np.pi, -1)])
+def test_a_reading_is_on_the_side_to_which_the_bevel_rolled_before_its_move(roll, first):
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), roll))
+    for k, flip in enumerate((False, True, False, True, False)):
+        estimate = estimate.move(Control(db_x=1.0, flip=flip), float(k), k + 1.0)
     readings = [Measurement(k + 0.5, -28.0 + k, 0.0) for k in (0, 1, 3, 4)]
-    means = estimate.observe(readings)._readings
+    (means,) = estimate.observe(readings)._readings
     np.testing.assert_array_equal(means.index, [0, 1, 3, 4])
-    np.testing.assert_array_equal(means.sides, np.multiply(first, [1, -1, 1, 1]))
+    np.testing.assert_array_equal(means.bevel, np.multiply(first, [1, -1, 1, 1]))
 
 
 def test_the_low_pass_follows_the_newest_and_forgets():
@@ -299,18 +305,18 @@ def prior_sd_of_the_tip(estimate):
     """Standard deviation (mm) of the tip's lateral position at the start: each parameter moved on its own, by hand."""
     prior = estimate.prior
     slope = np.zeros(prior.mean.size)
-    start = stepped(prior.mean, [])[0].tip[1]
+    start = stepped(prior.mean, [])[0].tip[Y]
     for k in range(prior.mean.size):
         parameters = prior.mean.copy()
         parameters[k] += prior.steps[k]
-        slope[k] = (stepped(parameters, [])[0].tip[1] - start) / prior.steps[k]
-    slope[RUN_OUT] = estimate.state.bevel
+        slope[k] = (stepped(parameters, [])[0].tip[Y] - start) / prior.steps[k]
+    slope[RUN_OUT] = estimate.state.bevel.real
     return float(np.sqrt(slope @ np.linalg.solve(prior.precision, slope)))
 
 
 def test_before_any_reading_the_tip_is_as_uncertain_as_the_prior_says():
     """Across, and along the axis."""
-    estimate = Identification().begin(begun_with(Simulator(QUIET, 1), 1))
+    estimate = Identification().begin(begun_with(Simulator(QUIET, 1)))
     across = prior_sd_of_the_tip(estimate)
     assert across > 0.1
     assert estimate.tip_sd == pytest.approx(np.hypot(across, QUIET.control.start_axial_sd_mm), rel=1e-3)
@@ -321,7 +327,7 @@ def test_readings_leave_nothing_more_uncertain():
     """The covariance is below the prior's in every direction, and far below it at the end."""
     rows, needle = commands(60), NEEDLES["all"]
     states = needle.inserted(PHANTOM, rows)
-    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1)))
     volumes, prior = [], np.linalg.inv(estimate.prior.precision)
     for k, row in enumerate(rows):
         batch = readings(needle, states[k], states[k + 1], k, 4, 0.0, np.random.default_rng(0))
@@ -333,6 +339,6 @@ def test_readings_leave_nothing_more_uncertain():
 
 
 def test_readings_make_the_next_one_less_uncertain():
-    start = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
+    start = Identification().begin(begun_with(Simulator(PHANTOM, 1)))
     few, many = (followed(Needle(), count, scenario=PHANTOM)[0] for count in (2, 20))
     assert start.tip_sd > few.tip_sd > many.tip_sd > 0.0

@@ -6,27 +6,23 @@ import numpy as np
 import pytest
 
 from flexneedle.estimation.identification import Identification
-from flexneedle.estimation.prior import (
-    BASE_TURN,
-    BASE_Y,
+from flexneedle.mechanics.model import Adaptation
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import Control, Measurement, X, Y
+from identified import (
+    BASE,
     BEND,
     BEVEL,
+    CELLS,
     CLEARANCE,
     MODULUS,
-    RUN_OUT,
-    unexplained,
-)
-from flexneedle.mechanics.model import Adaptation
-from flexneedle.simulator.control import Control
-from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Measurement
-from identified import (
-    CELLS,
     NEEDLES,
     OWN,
     PHANTOM,
     QUIET,
+    RUN_OUT,
     SHIFT,
+    SLOPE,
     TIGHT,
     Needle,
     adaptation_of,
@@ -34,8 +30,9 @@ from identified import (
     followed,
     readings,
     stepped,
+    unexplained,
 )
-from reference.cases import numbers
+from reference.cases import MIRROR, numbers
 from tasks import begun_with
 
 
@@ -44,14 +41,14 @@ def test_parameters_stay_within_four_standard_deviations(off):
     """Readings far off laterally, in air and in tissue, and a solve that still converges."""
     rows = commands(50)
     states = Needle().inserted(PHANTOM, rows)
-    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
+    estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1)))
     for k, row in enumerate(rows):
         estimate = estimate.move(row, k, k + 1.0)
         x, y = states[k + 1].tip[:2]
         estimate = estimate.observe([Measurement(k + 1.0, float(x), float(y) + off * (-1) ** (k // 10))])
         found = estimate.parameters
-        assert abs(found[BASE_Y]) <= 4.0 * 0.5 + 1e-12
-        assert abs(found[BASE_TURN]) <= 4.0 * 3e-3 + 1e-12
+        assert abs(found[BASE]) <= 4.0 * 0.5 + 1e-12
+        assert abs(found[SLOPE]) <= 4.0 * 3e-3 + 1e-12
         assert abs(found[BEND]) <= 4.0 * OWN.bend_sd_mm + 1e-12
         assert abs(found[RUN_OUT]) <= 4.0 * OWN.run_out_sd_mm + 1e-12
         assert 0.0 <= found[CLEARANCE] <= OWN.clearance_mm + 4.0 * OWN.clearance_sd_mm + 1e-12
@@ -67,14 +64,14 @@ def test_parameters_stay_within_four_standard_deviations(off):
 def test_mirrored_readings_give_the_mirrored_estimate():
     needle, rows = NEEDLES["all"], commands(45)
     states = needle.inserted(PHANTOM, rows)
-    here, there = (Identification().begin(begun_with(Simulator(PHANTOM, 1), side)) for side in (1, -1))
+    here, there = (Identification().begin(begun_with(Simulator(PHANTOM, 1), roll)) for roll in (0.0, np.pi))
     for k, row in enumerate(rows):
-        away = (*row[:3], -row[3], row[4])
+        away = row._replace(dg_y=-row.dg_y)
         batch = readings(needle, states[k], states[k + 1], k, 2, 0.0, np.random.default_rng(0))
         here = here.move(row, k, k + 1.0).observe(batch)
         there = there.move(away, k, k + 1.0).observe([replace(s, y=-s.y) for s in batch])
-    np.testing.assert_allclose(there.tip, here.tip * [1.0, -1.0, -1.0], atol=1e-6)
-    mirrored = np.where(np.isin(np.arange(here.parameters.size), (BASE_Y, BASE_TURN)), -1.0, 1.0)
+    np.testing.assert_allclose(there.tip, here.tip * MIRROR, atol=1e-6)
+    mirrored = np.where(np.isin(np.arange(here.parameters.size), (BASE, SLOPE)), -1.0, 1.0)
     np.testing.assert_allclose(there.parameters, mirrored * here.parameters, atol=1e-4)
 
 
@@ -82,14 +79,14 @@ def test_a_roll_of_the_bevel_mirrors_bend_and_run_out():
     """In air: an estimated bend of the free needle and a run-out show on the other side."""
     scenario = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
     simulator = Simulator(scenario, 1)
-    estimate = Identification().begin(begun_with(simulator, 1))
+    estimate = Identification().begin(begun_with(simulator))
     parameters = estimate.parameters.copy()
     parameters[[BEND, RUN_OUT]] = 0.6, 0.1
     adapted = simulator.adapted(Adaptation(np.zeros(1), np.ones(2), bend=0.6))
     state = adapted.step(simulator.start(), Control())
     bent = replace(estimate, simulator=adapted, state=state, parameters=parameters)
-    assert bent.tip[1] == pytest.approx(0.7, abs=1e-4)  # the bend shortens the needle a little
-    mirrored = bent.move((0.1, 0.0, 0.0, 0.0, 1), 0.0, 1.0)
+    assert bent.tip[Y] == pytest.approx(0.7, abs=1e-4)  # the bend shortens the needle a little
+    mirrored = bent.move(Control(db_x=0.1, flip=True), 0.0, 1.0)
     np.testing.assert_allclose(mirrored.tip[1:], -bent.tip[1:], atol=1e-9)
     assert bent.off_axis(-1) == pytest.approx(-bent.off_axis(1))
     left = replace(bent, residual=0.03)
@@ -100,12 +97,12 @@ def test_a_bevel_rolls_before_its_move_and_so_does_the_run_out():
     """A needle that is known, run-out included, is still known after readings in the middle of the move of a roll."""
     needle = replace(NEEDLES["run-out"], clearance=0.0)
     estimate, _ = followed(needle, 20, scenario=TIGHT)
-    assert commands(21)[20][4] == 1
+    assert commands(21)[20].rolls
     before, after = needle.inserted(TIGHT, commands(21))[20:22]
     moved = estimate.move(commands(21)[20], 20.0, 21.0)
-    assert moved.tip[1] == pytest.approx(needle.measured(after)[1], abs=2e-3)
+    assert moved.tip[Y] == pytest.approx(needle.measured(after)[1], abs=2e-3)
     corrected = moved.observe(readings(needle, before, after, 20, 4, 0.0, np.random.default_rng(0)))
-    assert corrected.tip[1] == pytest.approx(needle.measured(after)[1], abs=2e-3)
+    assert corrected.tip[Y] == pytest.approx(needle.measured(after)[1], abs=2e-3)
     assert corrected.parameters[RUN_OUT] == pytest.approx(-0.15, abs=0.01)
 
 
@@ -117,9 +114,9 @@ def test_where_the_tip_was_is_on_the_side_of_the_bevel_then():
     for time, flips in ((19.5, 0), (20.0, 0), (20.01, 1), (20.5, 1), (21.0, 1), (23.5, 1)):
         whole, part = int(time), time - int(time)
         axis = (1.0 - part) * estimate.tips[whole] + part * estimate.tips[min(24, whole + 1)]
-        assert estimate.tip_at(time) == pytest.approx((axis[0], axis[1] + out * (-1) ** flips), abs=1e-9)
-    assert estimate.tip_at(24.0) == pytest.approx(tuple(estimate.tip[:2]), abs=1e-12)
-    assert states[-1].bevel == -1
+        assert estimate.tip_at(time) == pytest.approx((axis[X], axis[Y] + out * (-1) ** flips, 0.0), abs=1e-9)
+    assert estimate.tip_at(24.0) == pytest.approx(tuple(estimate.tip[:3]), abs=1e-12)
+    assert states[-1].bevel == -1.0
 
 
 @pytest.mark.usefixtures("all_fresh")
@@ -130,7 +127,7 @@ def test_late_readings_lead_to_the_same_estimate(late):
     in_time, _ = followed(needle, 50)
     behind, states = followed(needle, 50, late=late)
     np.testing.assert_allclose(behind.tip[1:], in_time.tip[1:], atol=unexplained(QUIET, OWN))
-    assert behind.tip[1] == pytest.approx(needle.measured(states[-1])[1], abs=0.01)
+    assert behind.tip[Y] == pytest.approx(needle.measured(states[-1])[1], abs=0.01)
     assert len(behind.moves) == 50
 
 
@@ -149,14 +146,14 @@ def test_the_belief_now_is_the_fitted_insertion_carried_out_again():
 def test_innovation_and_measured_tip_are_those_of_the_newest_reading():
     needle = NEEDLES["run-out"]
     estimate, _ = followed(needle, 45)
-    moved = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 45.0, 46.0)
+    moved = estimate.move(Control(db_x=1.0), 45.0, 46.0)
     x, y = np.add(moved.tip[:2], [0.01, 0.002])
     updated = moved.observe([Measurement(46.0, float(x), float(y))])
-    assert updated.measured == pytest.approx((x, y), abs=1e-9)
+    assert updated.measured == pytest.approx((x, y, 0.0), abs=1e-9)
     assert updated.innovation[0] == pytest.approx(0.01, abs=2e-3)
     assert abs(updated.innovation[1]) < 0.002
-    assert updated.tip_at(46.0) == pytest.approx(tuple(updated.tip[:2]), abs=1e-12)
-    assert updated.without_reading().innovation == (0.0, 0.0)
+    assert updated.tip_at(46.0) == pytest.approx(tuple(updated.tip[:3]), abs=1e-12)
+    assert updated.without_reading().innovation == (0.0, 0.0, 0.0)
 
 
 def test_in_air_nothing_is_left_over():
@@ -166,12 +163,12 @@ def test_in_air_nothing_is_left_over():
 
 def test_without_readings_or_moves_the_estimate_stays():
     estimate, _ = followed(NEEDLES["bend"], 30)
-    moved = estimate.move((1.0, 0.0, 0.0, 0.0, -1), 30.0, 31.0)
+    moved = estimate.move(Control(db_x=1.0), 30.0, 31.0)
     for kept in (moved.observe([]), moved.without_reading()):
         assert kept.state is moved.state
         assert kept.parameters is moved.parameters
-        assert kept.innovation == (0.0, 0.0)
-    start = Identification().begin(begun_with(Simulator(PHANTOM, 1), 1))
+        assert kept.innovation == (0.0, 0.0, 0.0)
+    start = Identification().begin(begun_with(Simulator(PHANTOM, 1)))
     assert start.observe([Measurement(0.0, -28.5, 0.4)]).state == start.state
 
 
@@ -182,7 +179,7 @@ def test_observing_changes_nothing_of_the_old_belief_and_threads_nothing_of_the_
     np.testing.assert_array_equal(one.parameters, many.parameters)
     assert one.state == many.state
     before = one.parameters.copy(), one.tips.copy(), numbers(one.state), one.moves
-    moved = one.move((1.0, 0.0, 0.0, 0.1, -1), 45.0, 46.0)
+    moved = one.move(Control(db_x=1.0, dg_y=0.1), 45.0, 46.0)
     here, again = (moved.observe([Measurement(46.0, 17.5, 1.0)]) for _ in range(2))
     np.testing.assert_array_equal(here.parameters, again.parameters)
     after = one.parameters, one.tips, numbers(one.state)

@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Measurement
+from flexneedle.types import Control, Measurement
 from observed import AHEAD, PHANTOM, begun, in_tissue, readings_between
 from reference.cases import numbers
 
 GUIDE = (0.3, -0.2, 0.1, 0.25, -0.3, 0.2)
-COMMANDS = [(1.0, 0.0, 0.0, step, 1 if k == 2 else -1) for k, step in enumerate(GUIDE)]
+COMMANDS = [Control(db_x=1.0, dg_y=step, flip=k == 2) for k, step in enumerate(GUIDE)]
 
 
 def gathered(estimate, late, *, readings):
@@ -30,7 +29,7 @@ def noisy_readings(state, simulator, count, rng):
     """Readings of each period of a needle under a load that the model lacks, and noise."""
     batches = []
     for k, command in enumerate(COMMANDS):
-        before, state = state, simulator.step(state.with_estimate(tip_load=0.002), Control.from_row(command))
+        before, state = state, simulator.step(state.with_estimate(tip_load=(0.002,)), command)
         batch = readings_between(before, state, k, count)
         batches.append([replace(s, y=s.y + rng.normal(0.0, 0.05)) for s in batch])
     return batches
@@ -70,7 +69,7 @@ def test_the_estimate_before_late_readings_is_what_they_left_moved_on(late):
         behind = behind.observe(readings[k - late])
         expected = in_time.state
         for missed in COMMANDS[k - late + 1 : k + 1]:
-            expected = simulator.step(expected, Control.from_row(missed))
+            expected = simulator.step(expected, missed)
         assert behind.state == expected
         assert len(behind.moves) == late
         np.testing.assert_array_equal(behind.tips[0], in_time.tip)

@@ -8,26 +8,25 @@ import pytest
 
 from flexneedle.control.methods import METHODS
 from flexneedle.estimation.estimate import Move, along, place
-from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Measurement
+from flexneedle.types import THETA, Control, Measurement, X, Y, Z
 from observed import AHEAD, PHANTOM, QUIET, begun, follow, in_tissue, readings_between, start_with
 from tasks import begun_with
 
 
 def test_it_begins_with_a_straight_start_with_the_prior_of_the_scenario():
-    estimate = begun(Simulator(PHANTOM), bevel=-1)
-    np.testing.assert_array_equal(estimate.tip, [-28.5, 0.0, 0.0])
-    assert estimate.state.bevel == -1
+    estimate = begun(Simulator(PHANTOM), roll=np.pi)
+    np.testing.assert_array_equal(estimate.tip, [-28.5, 0.0, 0.0, 0.0, 0.0])
+    assert estimate.state.bevel == -1.0
     np.testing.assert_allclose(estimate.covariance, np.diag([0.5**2, 0.003**2]))
-    assert estimate.innovation == (0.0, 0.0)
+    assert estimate.innovation == (0.0, 0.0, 0.0)
     assert estimate.measured is None
 
 
 def test_a_move_moves_the_needle_as_the_driver_did():
     simulator = Simulator(PHANTOM)
     estimate = begun(simulator)
-    moved = estimate.move((0.7, 0.0, 0.0, 0.2, 1), 0.0, 1.0)
+    moved = estimate.move(Control(db_x=0.7, dg_y=0.2, flip=True), 0.0, 1.0)
     assert moved.state == simulator.step(estimate.state, Control(db_x=0.7, dg_y=0.2, flip=True))
     np.testing.assert_array_equal(moved.tip, moved.state.tip)
 
@@ -36,50 +35,52 @@ def test_a_move_moves_the_needle_as_the_driver_did():
 def test_in_air_the_tip_effect_of_base_offset_and_slope_is_recovered(base_y, base_turn):
     """Guide at rest: the tip shows one combination of the two, and that is what the path needs."""
     simulator, plant = Simulator(QUIET), Simulator(QUIET)
-    truth = start_with(QUIET, base_y=base_y, base_turn=base_turn)
-    assert abs(truth.tip[1]) > 0.01
+    truth = start_with(QUIET, base=(base_y,), slope=(base_turn,))
+    assert abs(truth.tip[Y]) > 0.01
     truth, estimate, _ = follow(truth, begun(simulator), plant, 25)
     np.testing.assert_allclose(estimate.tip[:2], truth.tip[:2], atol=2e-3)
-    np.testing.assert_allclose(estimate.tip[2], truth.tip[2], atol=1e-4)
-    assert estimate.state.tip_load == 0.0
+    np.testing.assert_allclose(estimate.tip[THETA], truth.tip[THETA], atol=1e-4)
+    assert estimate.state.tip_load == (0.0, 0.0)
 
 
 def test_in_air_it_still_predicts_well_as_the_needle_goes_in():
     """What was estimated in air holds 10 mm deep without any further reading."""
     simulator = Simulator(QUIET)
-    truth, estimate, _ = follow(start_with(QUIET, base_y=0.6), begun(simulator), simulator, 28)
-    assert truth.tip[0] < 0.0
+    truth, estimate, _ = follow(start_with(QUIET, base=(0.6,)), begun(simulator), simulator, 28)
+    assert truth.tip[X] < 0.0
     state, naive = estimate.state, Simulator(QUIET).start()
     for _ in range(28):
         naive = simulator.step(naive, Control(db_x=1.0))
     for _ in range(10):
         truth, state, naive = (simulator.step(s, Control(db_x=1.0)) for s in (truth, state, naive))
-    assert abs(state.tip[1] - truth.tip[1]) < 0.1 * abs(naive.tip[1] - truth.tip[1])
+    assert abs(state.tip[Y] - truth.tip[Y]) < 0.1 * abs(naive.tip[Y] - truth.tip[Y])
 
 
 def test_fit_in_air_is_the_least_squares_solution_with_the_prior():
     """Against the normal equations of all periods at once, on a needle whose tip is linear in the base."""
     simulator, noise = Simulator(PHANTOM), PHANTOM.tracker.jitter_per_axis
-    truth, estimate = start_with(PHANTOM, base_y=0.7, base_turn=-0.002), begun(simulator)
+    truth, estimate = start_with(PHANTOM, base=(0.7,), slope=(-0.002,)), begun(simulator)
     information, moment = np.diag([0.5**-2, 0.003**-2]), np.zeros(2)
     straight = simulator.start()
     for k in range(6):
         truth = simulator.step(truth, Control(db_x=1.0))
         straight = simulator.step(straight, Control(db_x=1.0))
-        shifts = [{"base_y": 0.1}, {"base_turn": 1e-3}]
+        shifts = [{"base": (0.1,)}, {"slope": (1e-3,)}]
         h = [
-            (simulator.step(straight.with_estimate(**shift), Control()).tip[1] - straight.tip[1])
+            (simulator.step(straight.with_estimate(**shift), Control()).tip[Y] - straight.tip[Y])
             / (0.1, 1e-3)[i]
             for i, shift in enumerate(shifts)
         ]
-        reading = truth.tip[1] + 0.02 * (-1) ** k
+        reading = truth.tip[Y] + 0.02 * (-1) ** k
         information += np.outer(h, h) / (noise**2 / 2)
         moment += np.array(h) * reading / (noise**2 / 2)
         readings = [
-            Measurement(k + 1.0, float(truth.tip[0]), float(reading))
+            Measurement(k + 1.0, float(truth.tip[X]), float(reading))
         ] * 2  # at the end, so two of variance σ²
         estimate = estimate.move(AHEAD, k, k + 1.0).observe(readings)
-    np.testing.assert_allclose(estimate.state.base[1:], np.linalg.solve(information, moment), rtol=2e-3)
+    np.testing.assert_allclose(
+        estimate.state.base[[Y, THETA]], np.linalg.solve(information, moment), rtol=2e-3
+    )
     np.testing.assert_allclose(estimate.covariance, np.linalg.inv(information), rtol=2e-3)
 
 
@@ -89,9 +90,9 @@ def test_in_tissue_the_prediction_has_no_offset_under_a_constant_disturbance(loa
     simulator = Simulator(QUIET)
     state = in_tissue(simulator)
     _, estimate, innovations = follow(state, begun(simulator, state), simulator, 30, force=load)
-    assert abs(innovations[0, 1]) > 5e-3
-    assert np.abs(innovations[-5:, 1]).max() < 0.05 * abs(innovations[0, 1])
-    assert estimate.state.tip_load == pytest.approx(load, rel=0.25)
+    assert abs(innovations[0, Y]) > 5e-3
+    assert np.abs(innovations[-5:, Y]).max() < 0.05 * abs(innovations[0, Y])
+    assert estimate.state.tip_load == (pytest.approx(load, rel=0.25), 0.0)
 
 
 @pytest.mark.parametrize(("gain", "estimates"), [(0.0, True), (0.3, False)])
@@ -101,8 +102,8 @@ def test_without_estimating_the_load_the_offset_stays(gain, estimates):
     state = in_tissue(simulator)
     begin = begun(simulator, state, estimates_load=estimates)
     _, estimate, innovations = follow(state, begin, simulator, 30, force=0.003)
-    assert estimate.state.tip_load == 0.0
-    assert np.abs(innovations[-5:, 1]).min() > 0.3 * abs(innovations[0, 1])
+    assert estimate.state.tip_load == (0.0, 0.0)
+    assert np.abs(innovations[-5:, Y]).min() > 0.3 * abs(innovations[0, Y])
 
 
 def test_stiffer_tissue_than_estimated_leaves_next_to_no_offset():
@@ -114,26 +115,26 @@ def test_stiffer_tissue_than_estimated_leaves_next_to_no_offset():
         )
         simulator, plant = Simulator(soft.with_values({"control.load_gain": gain})), Simulator(stiff)
         *_, innovations = follow(plant.start(), begun(simulator), plant, 65, guide=0.02)
-        left.append(np.abs(innovations[-10:, 1]).max())
+        left.append(np.abs(innovations[-10:, Y]).max())
     assert left[0] < 0.2 * left[1]
 
 
 def test_load_takes_the_gain_times_the_reaction_and_the_tip_goes_where_it_was_seen():
     simulator = Simulator(PHANTOM)
-    known = replace(begun(simulator, in_tissue(simulator).with_estimate(tip_load=0.001)), axial=0.0)
+    known = replace(begun(simulator, in_tissue(simulator).with_estimate(tip_load=(0.001,))), axial=0.0)
     moved = known.move(AHEAD, 0.0, 1.0)
     predicted = moved.state
     x, y = predicted.tip[:2] + np.array([0.05, 0.3])
     corrected = moved.observe([Measurement(1.0, x, y)])
     held = simulator.assimilate(predicted, (x, y)).state
-    expected = 0.001 + PHANTOM.control.load_gain * held.reactions.tip_force
-    assert held.reactions.tip_force > 1e-4
-    assert corrected.state.tip_load == pytest.approx(expected, rel=1e-12)
+    expected = 0.001 + PHANTOM.control.load_gain * held.reactions.tip_force[0]
+    assert held.reactions.tip_force[0] > 1e-4
+    assert corrected.state.tip_load == (pytest.approx(expected, rel=1e-12), 0.0)
     np.testing.assert_array_equal(corrected.tip, held.tip)
-    assert corrected.tip[1] == pytest.approx(y, abs=1e-9)
-    assert corrected.tip[0] == pytest.approx(predicted.tip[0], abs=0.02)  # axial motion isn't corrected
-    np.testing.assert_allclose(corrected.innovation, [0.05, 0.3], atol=1e-12)
-    np.testing.assert_allclose(corrected.measured, (x, y), atol=1e-12)
+    assert corrected.tip[Y] == pytest.approx(y, abs=1e-9)
+    assert corrected.tip[X] == pytest.approx(predicted.tip[X], abs=0.02)  # axial motion isn't corrected
+    np.testing.assert_allclose(corrected.innovation, [0.05, 0.3, 0.0], atol=1e-12)
+    np.testing.assert_allclose(corrected.measured, (x, y, 0.0), atol=1e-12)
 
 
 @pytest.mark.parametrize("base_x", [2.0, -2.0])
@@ -151,7 +152,7 @@ def test_the_start_along_the_axis_is_found_and_how_surely(base_x):
     control, jitter = PHANTOM.control, PHANTOM.tracker.jitter_per_axis
     precision = control.start_axial_sd_mm**-2.0 + 40.0 / jitter**2
     assert estimate.axial == pytest.approx(1.0 / precision, rel=1e-6)
-    assert estimate.tip[0] == pytest.approx(truth.tip[0], abs=0.01)
+    assert estimate.tip[X] == pytest.approx(truth.tip[X], abs=0.01)
     assert estimate.state.travel[0] == pytest.approx(10.0)
     assert (np.diff(sds) < 0.0).all()
 
@@ -161,11 +162,11 @@ def test_the_next_reading_is_as_uncertain_as_the_path_since_the_last_one_is_long
     simulator = Simulator(PHANTOM)
     estimate = replace(begun(simulator, in_tissue(simulator)), drift=0.01)
     updated = estimate.move(AHEAD, 0.0, 1.0).observe(
-        [Measurement(1.0, float(estimate.tip[0]) + 1.0, float(estimate.tip[1]))]
+        [Measurement(1.0, float(estimate.tip[X]) + 1.0, float(estimate.tip[Y]))]
     )
     later = updated.move(AHEAD, 1.0, 2.0)
     for one, since in [(estimate, 0.0), (later, updated.measured[0])]:
-        depth, start = float(one.tip[0]), replace(one, drift=0.0).tip_sd
+        depth, start = float(one.tip[X]), replace(one, drift=0.0).tip_sd
         assert depth > since + 0.5
         assert one.tip_sd == pytest.approx(np.hypot(start, 0.01 * (depth**2 - since**2)))
     assert later.tip_sd < estimate.tip_sd
@@ -180,48 +181,50 @@ def test_a_contact_that_is_cut_is_on_the_measured_path_wherever_the_tip_is_along
     moved = start.move(AHEAD, 0.0, 1.0)
     x, y = np.add(moved.tip[:2], off).tolist()
     corrected = moved.observe([Measurement(1.0, x, y)])
-    assert corrected.tip[1] == pytest.approx(y, abs=1e-9)
-    assert corrected.tip[0] == pytest.approx(moved.tip[0] + axial * off[0], abs=0.03)
+    assert corrected.tip[Y] == pytest.approx(y, abs=1e-9)
+    assert corrected.tip[X] == pytest.approx(moved.tip[X] + axial * off[0], abs=0.03)
     before, after, contacts = start.tip, corrected.tip, corrected.state.contacts
-    fresh = contacts.x > before[0]
+    fresh = contacts.x > before[X]
     assert fresh.any()
-    line = before[1] + (contacts.x[fresh] - before[0]) / (after[0] - before[0]) * (after[1] - before[1])
-    np.testing.assert_allclose(contacts.rest_y[fresh], line, atol=1e-6)
+    share = (contacts.x[fresh] - before[X]) / (after[X] - before[X])
+    line = before[Y] + share * (after[Y] - before[Y])
+    np.testing.assert_allclose(contacts.rest[fresh, 0], line, atol=1e-6)
 
 
 def test_innovations_of_a_period_are_averaged_at_the_times_of_the_readings():
     """A tip that goes evenly and readings that are off by 0.1, 0.2 and 0.6: the innovation is 0.3."""
     simulator = Simulator(PHANTOM)
     estimate = begun(simulator, in_tissue(simulator))
-    predicted = estimate.move((1.0, 0.0, 0.0, 0.3, -1), 7.0, 9.0)
+    predicted = estimate.move(Control(db_x=1.0, dg_y=0.3), 7.0, 9.0)
     readings = []
     for off, part in ((0.1, 0.25), (0.2, 0.5), (0.6, 1.0)):
         x, y = estimate.tip[:2] + part * (predicted.tip[:2] - estimate.tip[:2])
         readings.append(Measurement(7.0 + 2.0 * part, float(x) - off, float(y) + off))
     corrected = predicted.observe(readings)
-    np.testing.assert_allclose(corrected.innovation, [-0.3, 0.3], atol=1e-12)
-    assert corrected.tip[1] == pytest.approx(corrected.measured[1], abs=1e-9)
-    np.testing.assert_allclose(corrected.measured, np.add(predicted.tip[:2], [-0.3, 0.3]), atol=1e-12)
+    np.testing.assert_allclose(corrected.innovation, [-0.3, 0.3, 0.0], atol=1e-12)
+    assert corrected.tip[Y] == pytest.approx(corrected.measured[1], abs=1e-9)
+    np.testing.assert_allclose(corrected.measured, np.add(predicted.tip[:3], [-0.3, 0.3, 0.0]), atol=1e-12)
 
 
 @pytest.mark.parametrize(("time", "part"), [(7.0, 0.0), (7.5, 0.25), (9.0, 1.0), (6.0, 0.0), (11.0, 1.0)])
 def test_the_tip_moves_evenly_within_a_move_and_rests_outside(time, part):
-    tips = np.array([[10.0, 1.0, 0.3], [12.0, 0.0, 0.2]])
-    x, y = along((Move(7.0, 9.0, AHEAD),), tips, time)
-    assert (x, y) == pytest.approx((10.0 + 2.0 * part, 1.0 - part))
+    tips = np.array([[10.0, 1.0, -2.0, 0.3, 0.1], [12.0, 0.0, 2.0, 0.2, 0.1]])
+    point = along((Move(7.0, 9.0, AHEAD),), tips, time)
+    assert point == pytest.approx((10.0 + 2.0 * part, 1.0 - part, -2.0 + 4.0 * part))
     assert Move(7.0, 9.0, AHEAD).part(time) == pytest.approx(part)
 
 
 def test_the_tip_goes_from_move_to_move():
     moves = Move(0.0, 1.0, AHEAD), Move(1.0, 3.0, AHEAD)
-    tips = np.array([[0.0, 0.0, 0.0], [1.0, 0.2, 0.0], [2.0, 0.0, 0.0]])
-    assert along(moves, tips, 0.5) == pytest.approx((0.5, 0.1))
-    assert along(moves, tips, 2.5) == pytest.approx((1.75, 0.05))
-    assert along((), tips[2:], 99.0) == (2.0, 0.0)
+    tips = np.zeros((3, 5))
+    tips[:, X], tips[:, Y], tips[:, Z] = (0.0, 1.0, 2.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.4)
+    assert along(moves, tips, 0.5) == pytest.approx((0.5, 0.1, 0.0))
+    assert along(moves, tips, 2.5) == pytest.approx((1.75, 0.05, 0.3))
+    assert along((), tips[2:], 99.0) == (2.0, 0.0, 0.4)
     estimate = begun(Simulator(PHANTOM))
-    assert estimate.tip_at(3.0) == (-28.5, 0.0)
+    assert estimate.tip_at(3.0) == (-28.5, 0.0, 0.0)
     two = estimate.move(AHEAD, 0.0, 1.0).move(AHEAD, 1.0, 3.0)
-    assert two.tip_at(2.0) == pytest.approx((-27.0, 0.0))
+    assert two.tip_at(2.0) == pytest.approx((-27.0, 0.0, 0.0))
 
 
 def test_a_move_without_duration_is_done_at_once():
@@ -233,7 +236,7 @@ def test_more_readings_are_trusted_more():
     simulator = Simulator(PHANTOM.with_values({"tracker.jitter_mm": 1.0}))
     predicted = begun(simulator).move(AHEAD, 0.0, 1.0)
     x, y = predicted.tip[:2] + np.array([0.0, 0.5])
-    tips = [predicted.observe([Measurement(1.0, x, y)] * n).tip[1] for n in (1, 4, 16)]
+    tips = [predicted.observe([Measurement(1.0, x, y)] * n).tip[Y] for n in (1, 4, 16)]
     assert all(0.0 < less < more < 0.5 for less, more in pairwise(tips))
 
 
@@ -251,28 +254,28 @@ def test_without_fitting_the_start_the_measured_tip_is_held_in_air_too():
     predicted = begun(simulator, fits_start=False, estimates_load=False).move(AHEAD, 0.0, 1.0)
     x, y = predicted.tip[:2] + np.array([0.0, 0.5])
     corrected = predicted.observe([Measurement(1.0, x, y)])
-    assert corrected.tip[1] == pytest.approx(0.5, abs=1e-9)
+    assert corrected.tip[Y] == pytest.approx(0.5, abs=1e-9)
     np.testing.assert_array_equal(corrected.state.base[1:], 0.0)
-    assert corrected.move(AHEAD, 1.0, 2.0).tip[1] == pytest.approx(0.0, abs=1e-9)  # released
+    assert corrected.move(AHEAD, 1.0, 2.0).tip[Y] == pytest.approx(0.0, abs=1e-9)  # released
 
 
 @pytest.mark.parametrize(("name", "estimates"), [("ce-mpc", False), ("resolved-rate", True)])
 def test_the_papers_controller_releases_the_measured_tip_and_estimates_nothing(name, estimates):
     """In air no base offset, in tissue no load; the others keep both."""
     simulator = Simulator(PHANTOM)
-    begin = METHODS[name].observer.begin(begun_with(simulator, 1, name))
+    begin = METHODS[name].observer.begin(begun_with(simulator, controller=name))
     for steps in (10, 40):
         state = in_tissue(simulator, steps)
         moved = replace(begin, state=state, past=state, tips=state.tip[None]).move(AHEAD, 0.0, 1.0)
         x, y = np.add(moved.tip[:2], [0.0, 0.3])
         updated = moved.observe([Measurement(1.0, float(x), float(y))]).state
-        assert bool(updated.base[1] != 0.0 or updated.tip_load != 0.0) is estimates
+        assert bool(updated.base[Y] != 0.0 or updated.tip_load != (0.0, 0.0)) is estimates
 
 
 def test_unseen_keeps_the_belief_and_has_no_innovation():
     simulator = Simulator(PHANTOM)
     moved = begun(simulator, in_tissue(simulator)).move(AHEAD, 0.0, 1.0)
     updated = moved.observe([Measurement(1.0, *(moved.tip[:2] + 0.1))])
-    assert updated.innovation != (0.0, 0.0)
-    assert updated.without_reading().innovation == (0.0, 0.0)
+    assert updated.innovation != (0.0, 0.0, 0.0)
+    assert updated.without_reading().innovation == (0.0, 0.0, 0.0)
     assert updated.without_reading().state is updated.state

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from flexneedle.errors import ScenarioError
 from flexneedle.estimation import prior as prior_of
 from flexneedle.estimation.identification import Identification
-from flexneedle.estimation.prior import BEVEL, CLEARANCE, Prior, unexplained
+from flexneedle.estimation.prior import Prior
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.scenario.worlds import world
 from flexneedle.simulator.simulator import Simulator
-from identified import CELLS, OWN, PHANTOM
+from identified import BEVEL, CELLS, CLEARANCE, OWN, PHANTOM, unexplained
 from tasks import begun_with
 
 

@@ -1,7 +1,6 @@
 """Figures hold what they must: judged by their artists, not by their pixels."""
 
 from dataclasses import replace
-from itertools import combinations
 
 import matplotlib
 import numpy as np
@@ -10,6 +9,7 @@ from matplotlib.colors import to_hex
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.text import Text
 
+from drawn import axes, lines, names, overlapping, texts
 from flexneedle.figures.curves import held_spans, worst_indicator
 from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.plans import plan_figure
@@ -17,7 +17,7 @@ from flexneedle.figures.style import NEEDLE, save
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.trace.columns import verdict_of
-from flexneedle.types import CheckedMeasurement, Insertion, Measurement, Outcome
+from flexneedle.types import ROLL, THETA, CheckedMeasurement, Insertion, Measurement, Outcome
 from synthetic import GUIDE_X, blind, make_insertion, make_plan
 from synthetic_readings import frame_of, held, with_readings
 
@@ -41,46 +41,6 @@ def saved(insertion, tmp_path_factory):
     save(figure, folder, "insertion")
     save(plan_figure(PHANTOM, [insertion.plan]), folder, "plan")
     return folder, figure
-
-
-def texts(figure):
-    found = (text.get_text().strip() for text in figure.findobj(Text) if text.get_visible())
-    return [text for text in found if text]
-
-
-def lines(ax, label):
-    return [line for line in ax.get_lines() if line.get_label() == label]
-
-
-def axes(figure, *names):
-    """Return the axes with these names."""
-    named = {ax.get_label(): ax for ax in figure.axes}
-    return [named[name] for name in names]
-
-
-def names(legend):
-    return [text.get_text() for text in legend.get_texts()]
-
-
-def invisible_ticks(figure):
-    """Return the labels of ticks beyond the ends of their axes, which are not drawn."""
-    sides = [axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)]
-    ticks = [(tick, sorted(axis.get_view_interval())) for axis in sides for tick in axis.get_major_ticks()]
-    return {tick.label1 for tick, (low, high) in ticks if not low <= tick.get_loc() <= high}
-
-
-def overlapping(figure):
-    """Return pairs of visible texts whose boxes overlap, and texts that leave the figure."""
-    renderer = figure.canvas.get_renderer()
-    figure.draw_without_rendering()
-    unmeasured = invisible_ticks(figure)
-    shown = [
-        t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and t not in unmeasured
-    ]
-    boxes = [(text.get_text(), Text.get_window_extent(text, renderer)) for text in shown]  # without arrows
-    cut = [name for name, box in boxes if not (figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1)]
-    cut += [name for name, box in boxes if not (figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1)]
-    return cut + [(a, b) for (a, one), (b, two) in combinations(boxes, 2) if one.overlaps(two)]
 
 
 def test_the_scene_is_to_scale(figure):
@@ -109,7 +69,7 @@ def test_needle_is_as_thick_as_it_is(figure, insertion):
     np.testing.assert_allclose((upper + lower[::-1]) / 2, shape[:, :2], atol=1e-12)
     across = upper - lower[::-1]
     np.testing.assert_allclose(np.hypot(*across.T), 0.819)
-    np.testing.assert_allclose(across @ [1.0, 0.0], -0.819 * np.sin(shape[:, 2]), atol=1e-12)
+    np.testing.assert_allclose(across @ [1.0, 0.0], -0.819 * np.sin(shape[:, THETA]), atol=1e-12)
     assert len(lines(scene, "earlier shapes")) == 4
 
 
@@ -118,10 +78,10 @@ def test_the_guide_is_drawn_open_where_it_ended(figure, insertion):
     upper, lower = sorted(jaws, key=lambda jaw: -jaw.get_y())
     assert lower.get_x() < GUIDE_X < lower.get_x() + lower.get_width()
     assert (upper.get_y() + lower.get_y() + lower.get_height()) / 2 == pytest.approx(
-        insertion.periods[-1].guide
+        insertion.periods[-1].guide[0]
     )
     (travel,) = lines(figure.axes[0], "guide travel")
-    assert travel.get_ydata()[0] == min(period.guide for period in insertion.periods)
+    assert travel.get_ydata()[0] == min(period.guide[0] for period in insertion.periods)
 
 
 def test_the_guide_travel_is_upright_in_the_figure_and_in_the_legend(figure):
@@ -154,8 +114,8 @@ def test_rolls_of_the_bevel_show_side_and_position(figure, insertion):
     assert planned.get_xdata()[0] == plan.tips[45, 0]
     applied = lines(scene, "bevel flip, applied")
     assert [line.get_marker() for line in applied] == ["v", "^", "v"]
-    assert applied[0].get_xdata()[0] == insertion.periods[40].estimate[0]
-    assert applied[0].get_ydata()[0] < insertion.periods[40].estimate[1]
+    assert applied[0].get_xdata()[0] == insertion.periods[40].estimate.x
+    assert applied[0].get_ydata()[0] < insertion.periods[40].estimate.y
     (start,) = lines(scene, "bevel at the start")
     assert start.get_marker() == "^"
 
@@ -163,11 +123,11 @@ def test_rolls_of_the_bevel_show_side_and_position(figure, insertion):
 def test_panels_show_error_motion_and_energy_over_depth(figure, insertion):
     error, motion, energy = axes(figure, "deviation", "motion", "energy")
     (true,) = lines(error, "true")
-    lateral = [p.true_tip[1] - q[1] for p, q in zip(insertion.periods, insertion.plan.tips[1:], strict=True)]
+    lateral = [p.true_tip.y - q[1] for p, q in zip(insertion.periods, insertion.plan.tips[1:], strict=True)]
     np.testing.assert_allclose(true.get_ydata(), lateral, atol=1e-12)
     assert lines(error, "tracker")
     (applied,) = lines(motion, "applied")
-    np.testing.assert_array_equal(applied.get_ydata(), [period.guide for period in insertion.periods])
+    np.testing.assert_array_equal(applied.get_ydata(), [period.guide[0] for period in insertion.periods])
     (planned,) = lines(energy, "planned")
     np.testing.assert_array_equal(planned.get_ydata(), insertion.plan.strain_energy)
     (stored,) = lines(energy, "true")
@@ -342,8 +302,8 @@ def test_a_panel_without_a_line_gives_the_reason(insertion):
 def without_rolls(insertion, *, planned=True, applied=True):
     """Return the insertion without the planned or the applied rolls of the bevel."""
     controls = insertion.plan.controls.copy()
-    controls[:, 4] = -1.0 if planned else controls[:, 4]
-    still = tuple(replace(p, applied=(*p.applied[:4], -1)) for p in insertion.periods)
+    controls[:, ROLL] = 0.0 if planned else controls[:, ROLL]
+    still = tuple(replace(p, applied=p.applied._replace(roll=0.0)) for p in insertion.periods)
     plan = replace(insertion.plan, controls=controls)
     return replace(insertion, plan=plan, periods=still if applied else insertion.periods)
 
@@ -492,7 +452,7 @@ def test_no_labels_of_plans_overlap():
 
 def test_a_long_reason_of_a_miss_stays_within_the_figure():
     limit = "needle.bevel.offset_mm = 4 (the bevel alone reaches -1.80 to 1.80 mm lateral)"
-    missed = replace(make_plan("steering"), target=(40.0, 12.0), limit=limit)
+    missed = replace(make_plan("steering"), target=(40.0, 12.0, 0.0), limit=limit)
     figure = plan_figure(PHANTOM, [make_plan(), missed])
     assert overlapping(figure) == []
     (title,) = figure.findobj(lambda artist: isinstance(artist, Text) and "MISSES" in artist.get_text())

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from numba.core import config
 
+from flexneedle import types
 from flexneedle.mechanics import compile as compiling
 
 SOURCE = """\
@@ -31,8 +32,9 @@ def cache(tmp_path, monkeypatch):
 @pytest.fixture
 def package(tmp_path, cache, monkeypatch):
     """Write kernels into a folder of their own, and import them. Their cache is empty at first."""
-    # Of two edits in a second, Python would take the bytecode of the first.
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    monkeypatch.setattr(
+        sys, "dont_write_bytecode", True
+    )  # Python would take a second edit in a second for the first
     home = tmp_path / "kernels"
     home.mkdir()
     assert cache.exists()
@@ -64,6 +66,13 @@ def test_an_edit_of_the_package_asks_for_its_kernels_anew(package):
     assert not compiling.compiled(package.home)
     assert edited.twice(4.0) == 12.0
     assert compiling.compiled(package.home)
+
+
+def test_other_columns_ask_for_the_kernels_anew(package, monkeypatch):
+    """They are constants in the kernels, but defined above them."""
+    before = compiling.cache_folder(package.home)
+    monkeypatch.setattr(types, "DB_Y", types.DB_Z)
+    assert compiling.cache_folder(package.home) != before
 
 
 def test_packages_have_folders_of_their_own(package):

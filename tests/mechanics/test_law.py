@@ -207,7 +207,7 @@ def test_the_sharpness_bounds_the_change_of_the_stiffness(law, e):
 def test_a_contact_is_that_of_the_reference(alpha, u):
     """Within and beyond the limit of 0.7, written out there as in equations 1 to 3; odd in u."""
     point = Tissue(*(np.array([value]) for value in (MU, alpha, HEIGHT, WIDTH * HEIGHT)))
-    energy, force, stiffness = (float(values[0]) for values in ogden(point, np.array([u])))
+    energy, force, stiffness, _ = (float(values[0]) for values in ogden(point, np.array([u])))
     size = MU * WIDTH * HEIGHT / alpha**2
     found = contact(alpha, u)
     assert found[0] == pytest.approx(energy, rel=1e-9, abs=1e-14 * size)

@@ -2,6 +2,7 @@
 
 import cmath
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,10 +28,7 @@ def drawn(seed, steps=60):
     rng = np.random.default_rng(seed)
     scenario = draw_scenario(rng)
     rows = draw_controls(scenario, steps, rng)
-    roll = np.where(rows[:, 4] > 0.0, math.pi, 0.0)
-    return scenario, commands(
-        steps, rows[:, 0], base=rows[:, 1], slope=rows[:, 2], guide=rows[:, 3], roll=roll
-    )
+    return scenario, rows
 
 
 def random_in_space(seed, steps=60):
@@ -174,16 +172,7 @@ def test_a_roll_by_half_a_turn_is_the_flip():
     before, _ = carried_out(start(PHANTOM), commands(48, 1.0, guide=0.03))
     boundary = before.needle.boundary
     reversed_ = before.needle._replace(boundary=boundary._replace(bevel=-boundary.bevel))
-    by_hand = type(before)(
-        before.scenario,
-        before.model,
-        reversed_,
-        before.clamp,
-        before.rest,
-        before.compression,
-        before.mesh,
-        0.0,
-    )
+    by_hand = replace(before, needle=reversed_)
     on = commands(20, 1.0)
     _, expected = carried_out(by_hand, on)
     plane = start(PHANTOM, across=float)

@@ -8,19 +8,19 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+from flexneedle import controls as controls_of
 from flexneedle.planning import cross_entropy as ce
 from flexneedle.planning import horizon, terms
 from flexneedle.planning.terms import Term, Trajectories
+from flexneedle.types import DB_X, DG_Y, X, Y
 
 SEARCH = ce.Search(samples=16, elite=4, iterations=3, smoothing=0.2, tolerance=1e-9)
-TARGET = (4.0, 1.5)
+TARGET = (4.0, 1.5, 0.0)
 
 
 def controls(z):
     """Guide steps z (N, 4), 1 mm of advance each."""
-    made = np.zeros((*z.shape, 5))
-    made[:, :, 0], made[:, :, 3], made[:, :, 4] = 1.0, z, -1.0
-    return made
+    return controls_of(*z.shape, db_x=1.0, dg_y=z)
 
 
 VARIABLES = horizon.Variables(
@@ -35,7 +35,8 @@ TERMS = (
 def rigid(rows, failed=lambda tips: np.zeros(tips.shape[:2], dtype=bool)):
     """A tip that goes where the guide goes."""
     moved = np.cumsum(rows, axis=1)
-    tips = np.stack([moved[:, :, 0], moved[:, :, 3], np.zeros(moved.shape[:2])], axis=2)
+    tips = np.zeros((*moved.shape[:2], 5))
+    tips[:, :, X], tips[:, :, Y] = moved[:, :, DB_X], moved[:, :, DG_Y]
     return Trajectories(rows, tips, np.zeros(tips.shape[:2]), ~failed(tips))
 
 
@@ -46,7 +47,7 @@ class Taped:
         self.rows = []
 
     def __call__(self, rows):
-        self.rows.append(rows[:, :, 3].copy())
+        self.rows.append(rows[:, :, DG_Y].copy())
         return rigid(rows)
 
 

@@ -63,7 +63,7 @@ def test_a_plan_serves_all_cases_of_a_world():
 
 
 def test_a_target_that_the_planner_was_given_need_not_be_the_scenarios():
-    given = replace(PLAN, target=(30.0, -2.0))
+    given = replace(PLAN, target=(30.0, -2.0, 0.0))
     check_origin(given, PHANTOM)
     check_origin(given, PHANTOM.with_values({"target.depth_mm": 30.0, "target.lateral_mm": -2.0}))
     with pytest.raises(InputError, match=r"^target\.depth_mm = 20\.0: the plan was made with 40\.0: "):
@@ -81,7 +81,7 @@ def test_the_planner_notes_the_scenario(quick_plan):
 def test_insert_and_run_refuse_before_anything_moves(quick_plan):
     other = PHANTOM.with_values({"tissue.0.shear_modulus_kpa": 3.0})
     seeds = Seeds(*np.random.SeedSequence(0).spawn(3))
-    rig, rng = virtual_rig(other, quick_plan.bevel, seeds, DEFAULT_PLANT), np.random.default_rng(0)
+    rig, rng = virtual_rig(other, quick_plan.roll, seeds, DEFAULT_PLANT), np.random.default_rng(0)
     for carry_out in (
         lambda: flexneedle.insert(other, quick_plan),
         lambda: flexneedle.run(other, quick_plan, rig, rng),

@@ -1,5 +1,6 @@
 """Plans on the phantom: they arrive, they end at the depth, they say what keeps them away."""
 
+import math
 from functools import cache
 
 import numpy as np
@@ -9,8 +10,9 @@ import flexneedle
 from flexneedle.errors import InputError, ScenarioError
 from flexneedle.planning.planner import bevel_reach
 from flexneedle.scenario.worlds import world
-from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, Control
+from reference.cases import MIRROR
 
 PHANTOM = flexneedle.load_scenario("phantom")
 TARGETS = [(depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0)]
@@ -35,9 +37,9 @@ def coarse(changes=None, target=LATERAL, **options):
 def states_of(plan, scenario=PHANTOM):
     """The plan carried out step by step, the start first."""
     simulator = Simulator(scenario)
-    states = [simulator.start(plan.bevel)]
+    states = [simulator.start(plan.roll)]
     for row in plan.controls:
-        states.append(simulator.step(states[-1], Control.from_row(row.tolist())))
+        states.append(simulator.step(states[-1], Control.of(row.tolist())))
     return states
 
 
@@ -57,11 +59,11 @@ def test_each_target_of_the_paper_is_reached_within_the_limits_of_the_scenario(t
     assert plan.flips <= 3
     assert plan.converged
     controls = plan.controls
-    assert (controls[:, 0] > 0.0).all()
-    assert controls[:, 0].max() <= setup.max_advance_mm + 1e-9
-    assert np.abs(controls[:, 3]).max() <= setup.max_guide_step_mm + 1e-9
-    assert (controls[:, 1:3] == 0.0).all()
-    assert controls[0, 4] == -1.0
+    assert (controls[:, DB_X] > 0.0).all()
+    assert controls[:, DB_X].max() <= setup.max_advance_mm + 1e-9
+    assert np.abs(controls[:, DG_Y]).max() <= setup.max_guide_step_mm + 1e-9
+    assert (controls[:, DB_Y:DG_Y] == 0.0).all()
+    assert controls[0, ROLL] == 0.0
 
 
 def test_record_is_what_the_simulator_does_with_its_controls():
@@ -71,7 +73,7 @@ def test_record_is_what_the_simulator_does_with_its_controls():
     np.testing.assert_array_equal(plan.guide, [state.guide for state in states])
     np.testing.assert_array_equal(plan.strain_energy, [state.strain_energy for state in states])
     np.testing.assert_array_equal(plan.shapes[-1], states[-1].nodes)
-    assert (plan.target, plan.strategy, plan.seed) == (LATERAL, "manipulation", 1)
+    assert (plan.target, plan.strategy, plan.seed) == ((*LATERAL, 0.0), "manipulation", 1)
     assert plan.iterations == len(plan.history)
     # The search's sequences end with steps of no length, in which the tip is solved again, to 1e-6 mm.
     assert plan.cost == pytest.approx(sum(plan.terms.values()), abs=1e-4)
@@ -82,7 +84,7 @@ def test_cost_is_that_of_the_plan_to_the_last_step():
     """Recomputed from the record; only the last, shortened step may differ a little."""
     plan, settings = planned(LATERAL), PHANTOM.plan
     inside = plan.tips[1:, 0] > 0.0
-    guide = settings.guide_weight * (plan.controls[inside, 3] ** 2).sum()
+    guide = settings.guide_weight * (plan.controls[inside, DG_Y] ** 2).sum()
     assert plan.terms["guide"] == pytest.approx(guide, rel=0.02)
     assert plan.terms["energy"] == pytest.approx(
         settings.energy_weight_per_mj * plan.strain_energy[-1], rel=0.1
@@ -121,7 +123,7 @@ def test_steering_reaches_the_target_with_the_guide_still():
     plan = planned(NEAR, "steering")
     assert plan.error_mm <= 0.01
     assert plan.converged
-    assert (plan.controls[:, 1:4] == 0.0).all()
+    assert (plan.controls[:, DB_Y:ROLL] == 0.0).all()
     assert (plan.guide == 0.0).all()
     assert plan.cost > planned(NEAR).cost  # which may move the guide as well
     assert abs(plan.entry_angle) < abs(planned(LATERAL).entry_angle)
@@ -182,9 +184,11 @@ def test_mirrored_target_costs_about_the_same():
 
 def test_mirrored_controls_mirror_the_plan():
     plan = planned(LATERAL)
-    mirrored = plan.controls * [1, -1, -1, -1, 1]
-    tips = Simulator(PHANTOM).rollout(Simulator(PHANTOM).start(-plan.bevel), mirrored[None]).tips[0]
-    np.testing.assert_allclose(tips, plan.tips[1:] * [1, -1, -1], atol=1e-9)
+    mirrored = plan.controls.copy()
+    mirrored[:, [DB_Y, DB_THETA, DG_Y]] *= -1.0
+    start = Simulator(PHANTOM).start(plan.roll + math.pi)
+    tips = Simulator(PHANTOM).rollout(start, mirrored[None]).tips[0]
+    np.testing.assert_allclose(tips, plan.tips[1:] * MIRROR, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -227,7 +231,7 @@ def test_stroke_is_named_when_it_binds():
     plan = coarse(
         {"setup.max_guide_travel_mm": 30.0, "plan.iterations": 8, "plan.max_iterations": 8}, (81.5, 28.0)
     )
-    assert plan.controls[:, 0].sum() == pytest.approx(110.0)
+    assert plan.controls[:, DB_X].sum() == pytest.approx(110.0)
     assert plan.tip_mm[0] < 80.0
     assert plan.limit == "setup.stroke_mm = 110"
 
@@ -235,7 +239,7 @@ def test_stroke_is_named_when_it_binds():
 @pytest.mark.parametrize("depth", [81.4, 81.2])
 def test_a_target_near_the_full_stroke_is_planned_within_it(depth):
     plan = coarse({"plan.iterations": 8}, (depth, 14.0))
-    assert plan.controls[:, 0].sum() <= 110.0 + 1e-9
+    assert plan.controls[:, DB_X].sum() <= 110.0 + 1e-9
 
 
 def test_unknown_strategy_names_the_choices():
@@ -259,36 +263,39 @@ def test_targets_that_the_scenario_excludes_are_refused(target, words):
 
 def test_default_target_is_the_scenarios():
     plan = coarse({"target.depth_mm": 30.0, "target.lateral_mm": -2.0}, None)
-    assert plan.target == (30.0, -2.0)
+    assert plan.target == (30.0, -2.0, 0.0)
     assert plan.tip_mm[0] == pytest.approx(30.0, abs=1e-5)
 
 
-@pytest.mark.parametrize(("key", "column"), [("plan.base_sigma_mm", 1), ("plan.base_turn_sigma_mrad", 2)])
-def test_scenario_frees_base_inputs(key, column):
+@pytest.mark.parametrize(
+    ("key", "column", "other"),
+    [("plan.base_sigma_mm", DB_Y, DB_THETA), ("plan.base_turn_sigma_mrad", DB_THETA, DB_Y)],
+)
+def test_scenario_frees_base_inputs(key, column, other):
     setup = PHANTOM.setup
     plan = coarse({key: 0.2})
     assert plan.controls[:, column].any()
-    assert not plan.controls[:, 3 - column].any()
-    limit = (setup.max_base_step_mm, setup.max_base_turn_step)[column - 1]
+    assert not plan.controls[:, other].any()
+    limit = setup.max_base_step_mm if column == DB_Y else setup.max_base_turn_step
     assert np.abs(plan.controls[:, column]).max() <= limit + 1e-12
     still = coarse({key: 0.2}, strategy="steering")
-    assert not still.controls[:, 1:4].any()
+    assert not still.controls[:, DB_Y:ROLL].any()
 
 
 def test_guide_and_advance_stay_as_they_are_without_sigma():
     plan = coarse({"plan.guide_sigma_mm": 0.0, "plan.advance_sigma_mm": 0.0})
-    assert not plan.controls[:, 3].any()
-    assert (plan.controls[:, 0] <= 1.0 + 1e-9).all()
-    assert (plan.controls[:-1, 0] > 0.85).all()
+    assert not plan.controls[:, DG_Y].any()
+    assert (plan.controls[:, DB_X] <= 1.0 + 1e-9).all()
+    assert (plan.controls[:-1, DB_X] > 0.85).all()
 
 
 def test_without_a_guide_the_bevel_steers_and_the_limit_says_so():
     free = {"setup.guide_to_skin_mm": None}
     near = flexneedle.plan(PHANTOM.with_values(free), (40.0, 1.0))
     assert near.error_mm <= 0.05
-    assert not near.controls[:, 3].any()
+    assert not near.controls[:, DG_Y].any()
     far = coarse({**free, "plan.guide_sigma_mm": 5.0}, (40.0, 14.0))
-    assert not far.controls[:, 3].any()
+    assert not far.controls[:, DG_Y].any()
     assert far.limit.startswith("needle.bevel.offset_mm = 4 (the bevel alone reaches")
 
 

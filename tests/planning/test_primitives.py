@@ -1,5 +1,6 @@
 """Primitives to controls, the terms of a plan's cost, and the search on a needle that is made up."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,14 +10,17 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from flexneedle import controls as controls_of
 from flexneedle.planning import insertion
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.insertion import PlanProblem, optimise, schedule
 from flexneedle.planning.terms import Trajectories, charges
+from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, X, Y
 
 PROBLEM = PlanProblem(
-    target=(8.0, 2.0), travel=12.0, air=4.0, primitives=3,
-    step=np.array([1.0, 0.5, 0.005, 0.5]), reach=np.array([20.0, 1.0, np.inf, 2.0]),
+    target=(8.0, 2.0, 0.0), travel=12.0, air=4.0, primitives=3,
+    step=np.array([1.0, 0.5, 0.0, 0.005, 0.0, 0.5, 0.0]),
+    reach=np.array([20.0, 1.0, 1.0, np.inf, np.inf, 2.0, 2.0]),
     sigma=np.array([0.1, 0.0, 0.0, 0.25, 1.0, 0.3]),
     accuracy_weight=20.0, energy_weight=5.0, deflection_weight=0.002, guide_weight=1.0, flip_weight=0.3,
 )  # fmt: skip
@@ -40,19 +44,23 @@ def test_equal_shares_and_full_steps():
     """12 mm in three primitives of four steps; the bevel rolls at the second and again at the third."""
     z = primitives((1, 0, 0, 0.1, 2.0, 0), (1, 0.02, 0, 0, -0.1, 0), (1, 0, 0.001, -0.2, 0.1, 0))
     controls, wanted = schedule(PROBLEM, z)
-    expected = np.zeros((12, 5))
-    expected[:, 0], expected[:, 4] = 1.0, -1.0
-    expected[:4, 3], expected[4:8, 1], expected[8:, 2], expected[8:, 3] = 0.1, 0.02, 0.001, -0.2
-    expected[[4, 8], 4] = 1.0
+    expected = controls_of(12, db_x=1.0)
+    expected[:4, DG_Y], expected[4:8, DB_Y], expected[8:, DB_THETA], expected[8:, DG_Y] = (
+        0.1,
+        0.02,
+        0.001,
+        -0.2,
+    )
+    expected[[4, 8], ROLL] = np.pi
     np.testing.assert_allclose(controls[0], expected, atol=1e-14)
-    np.testing.assert_array_equal(wanted, [[1.0, -1.0, 1.0]])
+    np.testing.assert_array_equal(wanted, [[0.0, np.pi, 0.0]])
 
 
 def test_shares_are_the_exponentials_and_steps_no_longer_than_asked():
     """Shares 2 : 1 : 1 of 12 mm with longest steps of 1, 0.7 and 0.5: 6, 5 and 6 steps."""
     z = primitives((1, 0, 0, 0, 1, np.log(2)), (0.7, 0, 0, 0, 1, 0), (0.5, 0, 0, 0, 1, 0))
     controls, _ = schedule(PROBLEM, z)
-    np.testing.assert_allclose(controls[0, :, 0], [*[1.0] * 6, *[0.6] * 5, *[0.5] * 6])
+    np.testing.assert_allclose(controls[0, :, DB_X], [*[1.0] * 6, *[0.6] * 5, *[0.5] * 6])
 
 
 def test_rounding_makes_no_further_step():
@@ -60,56 +68,56 @@ def test_rounding_makes_no_further_step():
     assert 2.1 / 0.7 > 3.0
     one = replace(PROBLEM, travel=2.1, primitives=1)
     controls, _ = schedule(one, primitives((0.7, 0, 0, 0, 1, 0)))
-    assert controls.shape == (1, 3, 5)
+    assert controls.shape == (1, 3, 9)
 
 
 def test_wanting_minus_from_the_start_turns_in_the_first_step():
     controls, wanted = schedule(PROBLEM, primitives(*[(1, 0, 0, 0, -1, 0)] * 3))
-    assert controls[0, :, 4].tolist() == [1.0, *[-1.0] * 11]
-    assert wanted.tolist() == [[-1.0, -1.0, -1.0]]
+    assert controls[0, :, ROLL].tolist() == [np.pi, *[0.0] * 11]
+    assert wanted.tolist() == [[np.pi] * 3]
 
 
 def test_no_direction_at_all_counts_as_plus():
     controls, wanted = schedule(PROBLEM, primitives(*[(1, 0, 0, 0, 0.0, 0)] * 3))
-    assert (controls[0, :, 4] == -1.0).all()
-    assert (wanted == 1.0).all()
+    assert (controls[0, :, ROLL] == 0.0).all()
+    assert (wanted == 0.0).all()
 
 
 def test_guide_stops_at_its_reach_and_comes_back_from_there():
     """Four steps of 0.5 reach 2.0, the limit; four more stay; four back end at 0."""
     up = (1, 0, 0, 0.5, 1, 0)
     controls, _ = schedule(PROBLEM, primitives(up, up, (1, 0, 0, -0.5, 1, 0)))
-    np.testing.assert_allclose(controls[0, :, 3], [*[0.5] * 4, *[0.0] * 4, *[-0.5] * 4], atol=1e-14)
+    np.testing.assert_allclose(controls[0, :, DG_Y], [*[0.5] * 4, *[0.0] * 4, *[-0.5] * 4], atol=1e-14)
     halfway, _ = schedule(PROBLEM, primitives((1, 0, 0, 0.4, 1, 0), up, up))
-    np.testing.assert_allclose(halfway[0, :, 3], [*[0.4] * 4, *[0.1] * 4, *[0.0] * 4], atol=1e-14)
+    np.testing.assert_allclose(halfway[0, :, DG_Y], [*[0.4] * 4, *[0.1] * 4, *[0.0] * 4], atol=1e-14)
 
 
 def test_short_samples_are_padded_with_steps_that_do_nothing():
     quick, slow = (1, 0, 0, 0.1, -1, 0), (0.5, 0, 0, 0.1, -1, 0)
     controls, _ = schedule(PROBLEM, np.concatenate([primitives(*[quick] * 3), primitives(*[slow] * 3)]))
-    assert controls.shape == (2, 24, 5)
-    np.testing.assert_array_equal(controls[0, 12:], np.tile([0.0, 0.0, 0.0, 0.0, -1.0], (12, 1)))
-    assert (controls[1, :, 0] > 0.0).all()
+    assert controls.shape == (2, 24, 9)
+    assert not controls[0, 12:].any()
+    assert (controls[1, :, DB_X] > 0.0).all()
 
 
 @given(z=sampled())
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=100)
 def test_any_sample_keeps_travel_limits_and_turns(z):
     controls, wanted = schedule(PROBLEM, z)
-    np.testing.assert_allclose(controls[:, :, 0].sum(axis=1), PROBLEM.travel, rtol=1e-12)
-    assert (np.abs(controls[:, :, :4]) <= PROBLEM.step + 1e-12).all()
-    travel = np.abs(np.cumsum(controls[:, :, :4], axis=1))
+    np.testing.assert_allclose(controls[:, :, DB_X].sum(axis=1), PROBLEM.travel, rtol=1e-12)
+    assert (np.abs(controls[:, :, :ROLL]) <= PROBLEM.step + 1e-12).all()
+    travel = np.abs(np.cumsum(controls[:, :, :ROLL], axis=1))
     assert (travel <= PROBLEM.reach + 1e-12).all()
-    rolls = (np.diff(wanted, axis=1, prepend=1.0) != 0.0).sum(axis=1)
-    np.testing.assert_array_equal((controls[:, :, 4] == 1.0).sum(axis=1), rolls)
-    assert set(np.unique(controls[:, :, 4])) <= {-1.0, 1.0}
-    facing = np.cumprod(np.where(controls[:, :, 4] > 0.0, -1.0, 1.0), axis=1)
-    np.testing.assert_array_equal(facing[:, 0], wanted[:, 0])
-    np.testing.assert_array_equal(facing[:, -1], wanted[:, -1])
+    rolls = (np.diff(wanted, axis=1, prepend=0.0) != 0.0).sum(axis=1)
+    np.testing.assert_array_equal((controls[:, :, ROLL] == np.pi).sum(axis=1), rolls)
+    assert set(np.unique(controls[:, :, ROLL])) <= {0.0, np.pi}
+    facing = np.cumprod(np.cos(controls[:, :, ROLL]), axis=1)
+    np.testing.assert_array_equal(facing[:, 0], np.cos(wanted[:, 0]))
+    np.testing.assert_array_equal(facing[:, -1], np.cos(wanted[:, -1]))
     for row, sample in zip(controls, z.reshape(4, 3, 6), strict=True):
-        moving = row[row[:, 0] > 0.0]
-        assert (row[len(moving) :, :4] == 0.0).all()
-        assert (moving[:, 0] <= sample[:, 0].max() + 1e-12).all()
+        moving = row[row[:, DB_X] > 0.0]
+        assert (row[len(moving) :, :ROLL] == 0.0).all()
+        assert (moving[:, DB_X] <= sample[:, 0].max() + 1e-12).all()
         share = np.exp(sample[:, 5]) / np.exp(sample[:, 5]).sum() * PROBLEM.travel
         least = np.ceil(share / sample[:, 0] - 1e-9).sum()
         assert len(moving) == least  # no more steps than needed
@@ -118,9 +126,9 @@ def test_any_sample_keeps_travel_limits_and_turns(z):
 def made_up(n):
     """A rollout of n samples, 12 steps: the tip ends at (7.5, 1.5) with slope 0.2, in tissue for the last 8."""
     x = np.arange(12.0) - 3.0
-    tips = np.zeros((n, 12, 3))
-    tips[:, :, 0] = np.where(x < 1.0, x, x - 0.5)
-    tips[:, -1] = 7.5, 1.5, 0.2
+    tips = np.zeros((n, 12, 5))
+    tips[:, :, X] = np.where(x < 1.0, x, x - 0.5)
+    tips[:, -1] = 7.5, 1.5, 0.0, 0.2, 0.0
     energy = np.tile(np.linspace(0.0, 0.4, 12), (n, 1))
     deflection = np.tile(np.arange(12.0), (n, 1))
     return tips, energy, np.ones((n, 12), dtype=bool), deflection
@@ -175,7 +183,7 @@ def test_padding_of_a_shorter_sample_is_not_charged():
     controls, _ = schedule(PROBLEM, z)
     n, m = controls.shape[:2]
     trajectories = Trajectories(
-        controls, np.ones((n, m, 3)), np.zeros((n, m)), np.ones((n, m), dtype=bool), np.ones((n, m))
+        controls, np.ones((n, m, 5)), np.zeros((n, m)), np.ones((n, m), dtype=bool), np.ones((n, m))
     )
     found = charges(insertion.cost_terms(PROBLEM), trajectories)
     np.testing.assert_allclose(found["deflection"], [0.002 * 12, 0.002 * 24])
@@ -183,41 +191,42 @@ def test_padding_of_a_shorter_sample_is_not_charged():
 
 def rigid(controls, bevel=1.0):
     """A needle that goes where guide (mm) and bevel (0.1 mm a mm in tissue) push it, without tissue energy."""
-    x = np.cumsum(controls[:, :, 0], axis=1) - 4.0
-    facing = bevel * np.cumprod(np.where(controls[:, :, 4] > 0.0, -1.0, 1.0), axis=1)
-    bent = 0.1 * np.cumsum(facing * controls[:, :, 0] * (x > 0.0), axis=1)
-    tips = np.stack([x, np.cumsum(controls[:, :, 3], axis=1) + bent, np.zeros_like(x)], axis=2)
+    x = np.cumsum(controls[:, :, DB_X], axis=1) - 4.0
+    facing = bevel * np.cumprod(np.cos(controls[:, :, ROLL]), axis=1)
+    bent = 0.1 * np.cumsum(facing * controls[:, :, DB_X] * (x > 0.0), axis=1)
+    tips = np.zeros((*x.shape, 5))
+    tips[:, :, X], tips[:, :, Y] = x, np.cumsum(controls[:, :, DG_Y], axis=1) + bent
     zero = np.zeros_like(x)
     return Trajectories(controls, tips, zero, np.ones(x.shape, dtype=bool), zero)
 
 
 def test_search_meets_the_target_of_a_rigid_needle():
     found = optimise(rigid, PROBLEM, SEARCH, np.random.default_rng(0))
-    end = rigid(found.controls[None], found.bevel).tips[0, -1]
+    end = rigid(found.controls[None], math.cos(found.roll)).tips[0, -1]
     np.testing.assert_allclose(end[:2], [8.0, 2.0], atol=0.01)
     assert sum(found.terms.values()) == pytest.approx(found.search_state.best_cost)
 
 
 def bevel_only(sign):
     sigma = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.3])
-    return replace(PROBLEM, target=(8.0, 0.8 * sign), sigma=sigma)
+    return replace(PROBLEM, target=(8.0, 0.8 * sign, 0.0), sigma=sigma)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_bevel_at_the_start_is_told_and_no_turn_is_left_in_the_first_step(sign):
     """Straight away to one side: 8 mm at 0.1 a mm, without a roll while inserting."""
     found = optimise(rigid, bevel_only(sign), SEARCH, np.random.default_rng(0))
-    assert found.bevel == sign
-    assert (found.controls[:, 4] == -1.0).all()
+    assert math.cos(found.roll) == sign
+    assert (found.controls[:, ROLL] == 0.0).all()
     assert found.terms["flips"] == 0.0
     assert found.terms["accuracy"] == pytest.approx(0.0, abs=1e-4)
-    assert (found.controls[:, 1:4] == 0.0).all()
+    assert (found.controls[:, DB_Y:ROLL] == 0.0).all()
 
 
 def test_inputs_that_are_not_free_stay_still():
     found = optimise(rigid, PROBLEM, SEARCH, np.random.default_rng(0))
-    assert (found.controls[:, 1:3] == 0.0).all()
-    assert found.controls[:, 3].any()
+    assert (found.controls[:, DB_Y:DG_Y] == 0.0).all()
+    assert found.controls[:, DG_Y].any()
 
 
 def test_bounds_of_the_search_keep_the_steps():
@@ -231,9 +240,9 @@ def test_bounds_of_the_search_keep_the_steps():
 
     optimise(rollout, wild, replace(SEARCH, iterations=4), np.random.default_rng(0))
     for controls in evaluated:
-        assert (np.abs(controls[:, :, :4]) <= PROBLEM.step + 1e-12).all()
+        assert (np.abs(controls[:, :, :ROLL]) <= PROBLEM.step + 1e-12).all()
         assert controls.shape[1] <= 2 * 12 + 3
-    shares = [controls[:, :, 0].sum(axis=1) for controls in evaluated]
+    shares = [controls[:, :, DB_X].sum(axis=1) for controls in evaluated]
     np.testing.assert_allclose(np.concatenate(shares), 12.0)
 
 
@@ -242,7 +251,7 @@ def test_neighbouring_primitives_want_the_same_bevel_more_often_than_not():
     rolls = []
 
     def rollout(controls):
-        rolls.append((controls[:, 1:, 4] > 0.0).sum(axis=1))
+        rolls.append((controls[:, 1:, ROLL] > 0.0).sum(axis=1))
         return rigid(controls)
 
     many = replace(SEARCH, samples=4000, iterations=1, elite=100)

@@ -1,5 +1,6 @@
 """Rolls of the bevel to controls, and the search of their depths on a needle that is made up."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from flexneedle.planning import steering
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.insertion import PlanProblem
 from flexneedle.planning.terms import Trajectories
+from flexneedle.types import DB_X, DB_Y, ROLL, THETA, X, Y
 
 SEARCH = Search(samples=16, elite=4, iterations=60, smoothing=0.2, tolerance=1e-6)
 BEND = 0.01  # curvature of the tip's path, 1/mm
@@ -21,8 +23,9 @@ BEND = 0.01  # curvature of the tip's path, 1/mm
 def problem(lateral, **changes):
     """8 mm in air and 20 mm in tissue, steps of 3 mm, which do not divide it."""
     made = PlanProblem(
-        target=(20.0, lateral), travel=28.0, air=8.0, primitives=1, step=np.array([3.0, 0.5, 0.005, 0.5]),
-        reach=np.array([50.0, 1.0, np.inf, 2.0]), sigma=np.zeros(6),
+        target=(20.0, lateral, 0.0), travel=28.0, air=8.0, primitives=1,
+        step=np.array([3.0, 0.5, 0.0, 0.005, 0.0, 0.5, 0.0]),
+        reach=np.array([50.0, 1.0, 1.0, np.inf, np.inf, 2.0, 2.0]), sigma=np.zeros(6),
         accuracy_weight=20.0, energy_weight=0.0, deflection_weight=0.0, guide_weight=0.0, flip_weight=0.01,
     )  # fmt: skip
     return replace(made, **changes)
@@ -30,20 +33,21 @@ def problem(lateral, **changes):
 
 def kinematic(controls, start=1.0, charge=lambda y: 0.0 * y):
     """A tip that bends with ±BEND in tissue, integrated exactly over each step; `charge` makes an energy of y."""
-    advance = controls[:, :, 0]
-    facing = start * np.cumprod(-controls[:, :, 4], axis=1)
+    advance = controls[:, :, DB_X]
+    facing = start * np.cumprod(np.cos(controls[:, :, ROLL]), axis=1)
     x = np.cumsum(advance, axis=1) - 8.0
     inside = np.maximum(x, 0.0) - np.maximum(x - advance, 0.0)
     bent = np.cumsum(BEND * facing * inside, axis=1)
     before = bent - BEND * facing * inside
     y = np.cumsum(before * inside + 0.5 * BEND * facing * inside**2, axis=1)
-    tips = np.stack([x, y, np.arctan(bent)], axis=2)
+    tips = np.zeros((*x.shape, 5))
+    tips[:, :, X], tips[:, :, Y], tips[:, :, THETA] = x, y, np.arctan(bent)
     return Trajectories(controls, tips, charge(y), np.ones(x.shape, dtype=bool), 0.0 * y)
 
 
 def end(z, side, p=None):
     """Where the tip ends for rolls at shares z of the depth."""
-    return float(kinematic(steering.rolled(p or problem(0.0), np.array([z]), side)).tips[0, -1, 1])
+    return float(kinematic(steering.rolled(p or problem(0.0), np.array([z]), side)).tips[0, -1, Y])
 
 
 @pytest.mark.parametrize(("z", "side"), [((), 1.0), ((0.3,), -1.0), ((0.25, 0.9), 1.0)])
@@ -57,12 +61,12 @@ def test_rolls_are_where_they_are_asked_for(z, side):
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=100)
 def test_any_sample_keeps_travel_and_steps_and_has_its_rolls(z, side):
     controls = steering.rolled(problem(0.0), z, side)
-    np.testing.assert_allclose(controls[:, :, 0].sum(axis=1), 28.0, rtol=1e-12)
-    assert (controls[:, :, 0] >= 0.0).all()
-    assert (controls[:, :, 0] <= 3.0 + 1e-12).all()
-    assert not controls[:, :, 1:4].any()
-    assert ((controls[:, 1:, 4] > 0.0).sum(axis=1) == 4).all()
-    assert (controls[:, 0, 4] == -side).all()
+    np.testing.assert_allclose(controls[:, :, DB_X].sum(axis=1), 28.0, rtol=1e-12)
+    assert (controls[:, :, DB_X] >= 0.0).all()
+    assert (controls[:, :, DB_X] <= 3.0 + 1e-12).all()
+    assert not controls[:, :, DB_Y:ROLL].any()
+    assert ((controls[:, 1:, ROLL] > 0.0).sum(axis=1) == 4).all()
+    assert (np.cos(controls[:, 0, ROLL]) == side).all()
 
 
 def test_the_order_of_the_rolls_does_not_matter():
@@ -76,7 +80,7 @@ def test_where_a_roll_crosses_a_step_the_end_is_continuous(at):
 
 
 def test_a_roll_leaves_the_other_steps_where_they_are():
-    edges = [np.cumsum(steering.rolled(problem(0.0), np.array([[z]]), 1.0)[0, :, 0]) for z in (0.31, 0.32)]
+    edges = [np.cumsum(steering.rolled(problem(0.0), np.array([[z]]), 1.0)[0, :, DB_X]) for z in (0.31, 0.32)]
     assert len(np.setdiff1d(np.round(edges[0], 9), np.round(edges[1], 9))) == 1
 
 
@@ -84,10 +88,10 @@ def test_a_roll_leaves_the_other_steps_where_they_are():
 @hypothesis_settings(deadline=None, derandomize=True, max_examples=20)
 def test_every_target_within_reach_is_reached(share, seed):
     found = steering.steer(kinematic, problem(share * 2.0), SEARCH, np.random.default_rng(seed))
-    tip = kinematic(found.controls[None], found.bevel).tips[0, -1]
+    tip = kinematic(found.controls[None], math.cos(found.roll)).tips[0, -1]
     assert abs(tip[1] - share * 2.0) < 1e-3
-    assert (found.controls[:, 0] > 0.0).all()
-    assert found.controls[0, 4] == -1.0
+    assert (found.controls[:, DB_X] > 0.0).all()
+    assert found.controls[0, ROLL] == 0.0
 
 
 def test_reach_is_between_the_ends_without_a_roll():
@@ -97,8 +101,8 @@ def test_reach_is_between_the_ends_without_a_roll():
 @pytest.mark.parametrize("side", [1, -1])
 def test_beyond_reach_the_bevel_stays_on_the_targets_side(side):
     found = steering.steer(kinematic, problem(side * 3.0), SEARCH, np.random.default_rng(0))
-    assert found.bevel == side
-    assert (found.controls[:, 4] == -1.0).all()
+    assert math.cos(found.roll) == side
+    assert (found.controls[:, ROLL] == 0.0).all()
     assert found.terms["accuracy"] == pytest.approx(20.0)
 
 
@@ -109,7 +113,7 @@ def test_more_rolls_are_made_where_they_pay():
         return kinematic(controls, start, lambda y: np.cumsum(y**2, axis=1))
 
     rolls = [
-        int((found.controls[:, 4] > 0.0).sum())
+        int((found.controls[:, ROLL] > 0.0).sum())
         for weight in (0.0, 100.0)
         for found in [
             steering.steer(swinging, problem(0.0, energy_weight=weight), SEARCH, np.random.default_rng(0))

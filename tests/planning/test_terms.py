@@ -6,20 +6,22 @@ from functools import partial
 import numpy as np
 import pytest
 
+from flexneedle import controls as controls_of
 from flexneedle.planning import terms
 from flexneedle.planning.terms import Term, Trajectories
+from flexneedle.types import DB_X, DG_Y, ROLL, THETA, X, Y
 
 # Two sequences of three steps. The first one's first step ends in air; the second one's last is padding.
 ADVANCE = np.array([[1.0, 2.0, 2.0], [1.0, 0.5, 0.0]])
 GUIDE = np.array([[0.1, 0.2, -0.4], [0.3, 0.0, 0.0]])
-FLIP = np.array([[1.0, -1.0, 1.0], [-1.0, 1.0, -1.0]])
-X = np.array([[-0.5, 1.5, 3.5], [0.5, 1.0, 1.0]])
-Y = np.array([[0.0, 0.2, 0.5], [1.0, -1.0, -1.0]])
+FLIP = np.array([[True, False, True], [False, True, False]])
+DEPTH = np.array([[-0.5, 1.5, 3.5], [0.5, 1.0, 1.0]])
+LATERAL = np.array([[0.0, 0.2, 0.5], [1.0, -1.0, -1.0]])
 TURN = np.array([[0.0, 0.1, 0.2], [0.0, 0.0, -0.3]])
-CONTROLS = np.stack([ADVANCE, 0 * X, 0 * X, GUIDE, FLIP], axis=2)
+CONTROLS = controls_of(2, 3, db_x=ADVANCE, dg_y=GUIDE, roll=np.pi * FLIP)
 TRAJECTORIES = Trajectories(
     CONTROLS,
-    np.stack([X, Y, TURN], axis=2),
+    np.stack([DEPTH, LATERAL, 0 * DEPTH, TURN, 0 * DEPTH], axis=2),
     np.array([[0.0, 1.0, 4.0], [2.0, 3.0, 3.0]]),
     np.ones((2, 3), dtype=bool),
     np.array([[5.0, 6.0, 7.0], [8.0, 9.0, 10.0]]),
@@ -30,7 +32,7 @@ TRAJECTORIES = Trajectories(
     ("term", "expected"),
     [
         (
-            partial(terms.miss, target=(4.0, -0.5)),
+            partial(terms.miss, target=(4.0, -0.5, 0.0)),
             [0.5 + 0.5 * np.tan(0.2) + 0.5, abs(-1.0 - 3.0 * np.tan(0.3) + 0.5)],
         ),
         (terms.energy_at_end, [4.0, 3.0]),
@@ -41,7 +43,10 @@ TRAJECTORIES = Trajectories(
         (partial(terms.out_of_reach, expected=np.array([0.3, 0.7])), [0.7, 0.3]),
         (terms.deflection, [6.0 + 7.0, 8.0 + 9.0]),
         (terms.guide_motion, [0.04 + 0.16, 0.09]),
-        (partial(terms.guide_departure, nominal=np.array([0.1, 0.0, 0.1])), [0.04 + 0.25, 0.04 + 0.01]),
+        (
+            partial(terms.guide_departure, nominal=np.array([[0.1, 0.0], [0.0, 0.0], [0.1, 0.0]])),
+            [0.04 + 0.25, 0.04 + 0.01],
+        ),
     ],
 )
 def test_term_against_numbers_by_hand(term, expected):
@@ -50,37 +55,43 @@ def test_term_against_numbers_by_hand(term, expected):
 
 def test_distance_from_the_line_is_a_mean_over_the_advance_in_tissue():
     """From (0, 0) with slope −1/4: at 1.5 and 3.5 by 0.575 and 1.375, two mm each; at 0.5 and 1 by 1.125 and 0.75."""
-    found = terms.distance_from_line(TRAJECTORIES, (0.0, 0.0), (4.0, -1.0))
+    found = terms.distance_from_line(TRAJECTORIES, (0.0, 0.0, 0.0), (4.0, -1.0, 0.0))
     np.testing.assert_allclose(found, [(0.575 + 1.375) / 2, (1.125 * 1.0 + 0.75 * 0.5) / 1.5], rtol=1e-14)
 
 
 def test_distance_from_the_line_knows_where_the_line_starts():
-    found = terms.distance_from_line(TRAJECTORIES, (1.5, 0.2), (3.5, 0.5))
+    found = terms.distance_from_line(TRAJECTORIES, (1.5, 0.2, 0.0), (3.5, 0.5, 0.0))
     assert found[0] == pytest.approx(0.0, abs=1e-15)
 
 
 def test_distance_from_a_line_without_length_is_that_from_its_height():
-    found = terms.distance_from_line(TRAJECTORIES, (3.5, 0.2), (3.5, 0.5))
+    found = terms.distance_from_line(TRAJECTORIES, (3.5, 0.2, 0.0), (3.5, 0.5, 0.0))
     assert found[0] == pytest.approx((0.0 + 0.3) / 2)
 
 
 def test_in_air_and_without_an_advance_nothing_is_divided_by_zero():
     still = replace(TRAJECTORIES, controls=np.zeros_like(CONTROLS))
     np.testing.assert_array_equal(terms.guide_slope(still), [0.0, 0.0])
-    np.testing.assert_array_equal(terms.distance_from_line(still, (0.0, 0.0), (4.0, 1.0)), [0.0, 0.0])
+    np.testing.assert_array_equal(
+        terms.distance_from_line(still, (0.0, 0.0, 0.0), (4.0, 1.0, 0.0)), [0.0, 0.0]
+    )
 
 
 def test_deviation_weighs_an_angle_as_a_distance_and_changes_no_tips():
     before = TRAJECTORIES.tips.copy()
+    reference = np.zeros((3, 5))
+    reference[:, [X, Y, THETA]] = 0.25
     off = TRAJECTORIES.tips - 0.25
-    expected = (off[:, :, 0] ** 2 + off[:, :, 1] ** 2 + 9.0 * off[:, :, 2] ** 2).sum(axis=1)
-    np.testing.assert_allclose(terms.deviation(TRAJECTORIES, np.full((3, 3), 0.25), 3.0), expected)
+    expected = (off[:, :, X] ** 2 + off[:, :, Y] ** 2 + 9.0 * off[:, :, THETA] ** 2).sum(axis=1)
+    np.testing.assert_allclose(terms.deviation(TRAJECTORIES, reference, 3.0), expected)
     np.testing.assert_array_equal(TRAJECTORIES.tips, before)
 
 
 def test_a_slope_does_not_depend_on_the_length_of_the_steps():
     """Halving every step leaves the guide's slope, where the paper's sum of squares halves."""
-    halved = replace(TRAJECTORIES, controls=np.repeat(CONTROLS, 2, axis=1) * [0.5, 1, 1, 0.5, 1])
+    controls = np.repeat(CONTROLS, 2, axis=1)
+    controls[:, :, [DB_X, DG_Y]] *= 0.5
+    halved = replace(TRAJECTORIES, controls=controls)
     np.testing.assert_allclose(terms.guide_slope(halved), terms.guide_slope(TRAJECTORIES))
 
 
@@ -95,10 +106,9 @@ def test_cost_is_the_weighted_sum_and_infinite_where_the_model_failed():
 
 
 def test_a_late_roll_costs_more_the_nearer_the_target_and_one_at_it_one():
-    controls, tips = np.zeros((3, 2, 5)), np.zeros((3, 2, 3))
-    controls[:, :, 0], controls[:, :, 4] = 5.0, -1.0
-    controls[0, 0, 4] = controls[1, 1, 4] = 1.0  # the third rolls nothing
-    tips[:, :, 0] = 35.0, 40.0
+    controls, tips = controls_of(3, 2, db_x=5.0), np.zeros((3, 2, 5))
+    controls[0, 0, ROLL] = controls[1, 1, ROLL] = np.pi  # the third rolls nothing
+    tips[:, :, X] = 35.0, 40.0
     late = terms.late_rolls(replace(TRAJECTORIES, controls=controls, tips=tips), depth=40.0, length=5.0)
     np.testing.assert_allclose(late, [np.exp(-2.0), np.exp(-1.0), 0.0])
     at_target = terms.late_rolls(replace(TRAJECTORIES, controls=controls, tips=tips), depth=35.0, length=5.0)
@@ -108,9 +118,9 @@ def test_a_late_roll_costs_more_the_nearer_the_target_and_one_at_it_one():
 @pytest.mark.parametrize("blur", [0.0, 0.01, 0.3, 5.0])
 def test_a_miss_counts_as_far_as_it_is_known(blur):
     """As its square where it is far below what is known, in full, less that, where it is far above; on either side."""
-    tips = np.zeros((4, 1, 3))
-    tips[:, 0, 0], tips[:, 0, 1] = 40.0, (1e-3, -1e-3, 100.0, -100.0)
-    miss = terms.miss(replace(TRAJECTORIES, tips=tips), (40.0, 0.0), blur)
+    tips = np.zeros((4, 1, 5))
+    tips[:, 0, X], tips[:, 0, Y] = 40.0, (1e-3, -1e-3, 100.0, -100.0)
+    miss = terms.miss(replace(TRAJECTORIES, tips=tips), (40.0, 0.0, 0.0), blur)
     near = 1e-3 if blur == 0.0 else 0.5e-6 / blur
     np.testing.assert_allclose(miss[:2], near, rtol=0.01)
     np.testing.assert_allclose(miss[2:], 100.0 - blur, rtol=2e-3)
@@ -119,14 +129,16 @@ def test_a_miss_counts_as_far_as_it_is_known(blur):
 @pytest.mark.parametrize("blur", [0.0, 0.3])
 def test_a_large_miss_is_one_beyond_its_standard_deviation(blur):
     """Nothing of one that is far below it counts, half of one that equals it, all of one that is far above."""
-    tips = np.zeros((4, 1, 3))
-    tips[:, 0, 0], tips[:, 0, 1] = 40.0, (1e-4, 0.1, -0.1, 100.0)
+    tips = np.zeros((4, 1, 5))
+    tips[:, 0, X], tips[:, 0, Y] = 40.0, (1e-4, 0.1, -0.1, 100.0)
     trajectories = replace(TRAJECTORIES, tips=tips)
-    share = terms.large_miss(trajectories, (40.0, 0.0), blur, 0.1) / terms.miss(
-        trajectories, (40.0, 0.0), blur
+    share = terms.large_miss(trajectories, (40.0, 0.0, 0.0), blur, 0.1) / terms.miss(
+        trajectories, (40.0, 0.0, 0.0), blur
     )
     np.testing.assert_allclose(share, [1e-6, 0.5, 0.5, 1.0], rtol=1e-5)
     assert (
-        terms.large_miss(replace(TRAJECTORIES, tips=0.0 * tips + (40.0, 0.0, 0.0)), (40.0, 0.0), blur, 0.0)[0]
+        terms.large_miss(
+            replace(TRAJECTORIES, tips=0.0 * tips + (40.0, 0.0, 0.0, 0.0, 0.0)), (40.0, 0.0, 0.0), blur, 0.0
+        )[0]
         == 0.0
     )

@@ -8,6 +8,7 @@ from flexneedle import Control, Scenario, Simulator
 from flexneedle.simulator.state import State
 
 EI = 200e3 * np.pi * 0.4**4 / 64  # of `long_beam`, N·mm²
+MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0])  # y and θ of poses the other way
 LENGTH_MM = 10.0  # 1/β of `long_beam`
 FOUNDATION = 4 * EI / LENGTH_MM**4  # its k₀ = 3μw/h, N/mm²
 
@@ -46,11 +47,11 @@ def repeat(simulator: Simulator, state: State, control: Control, times: int) -> 
     return states
 
 
-def insert_to(simulator: Simulator, depth: float, *, step: float = 1.0, bevel: int = 1) -> State:
+def insert_to(simulator: Simulator, depth: float, *, step: float = 1.0, roll: float = 0.0) -> State:
     """A straight push until an unbent needle would be at `depth`."""
     way = depth + simulator.scenario.setup.tip_to_skin_mm
     steps = int(np.ceil(way / step - 1e-9))
-    return repeat(simulator, simulator.start(bevel), Control(db_x=way / steps), steps)[-1]
+    return repeat(simulator, simulator.start(roll), Control(db_x=way / steps), steps)[-1]
 
 
 def numbers(state: State) -> np.ndarray:
@@ -78,5 +79,5 @@ def _refilled(like, values):
 
 def assert_same_curve(one: State, other: State, tolerance: float) -> None:
     """Nodes within `tolerance` mm, slopes within as many mm on 10 mm."""
-    gap = np.abs(one.nodes - other.nodes) * [1.0, 1.0, 10.0]
+    gap = np.abs(one.nodes - other.nodes) * [1.0, 1.0, 1.0, 10.0, 10.0]
     assert gap.max() < tolerance

@@ -3,6 +3,7 @@
 import numpy as np
 
 import flexneedle
+from flexneedle import controls
 from flexneedle.scenario.model import Scenario
 
 GAUGES = ("18G", "19G", "20G", "21G", "22G", "23G")
@@ -33,6 +34,26 @@ def draw_scenario(rng: np.random.Generator) -> Scenario:
     return Scenario.from_values(values)
 
 
+def in_space(scenario: Scenario, rng: np.random.Generator) -> Scenario:
+    """The same in space: a guide on one axis or two, any line of entry, long steps from near the skin."""
+    values = scenario.values()
+    gap = float(rng.choice([0.3, 4.0]))
+    values["setup"] |= {
+        "axes": 2,
+        "guide_axes": int(rng.integers(1, 3)),
+        "max_advance_mm": 2.0,
+        "tip_to_skin_mm": gap,
+        "stroke_mm": gap + 50.0,
+    }
+    if rng.random() < 0.5:
+        offsets, slopes = rng.uniform(-2.0, 2.0, 2), rng.uniform(-40.0, 40.0, 2)
+        line = np.concatenate([offsets, slopes]).tolist()
+        names = "lateral_mm", "lateral_z_mm", "slope_mrad", "slope_z_mrad"
+        values["entry"] = dict(zip(names, line, strict=True))
+        values["target"]["lateral_mm"], values["target"]["lateral_z_mm"] = line[:2]
+    return Scenario.from_values(values)
+
+
 def draw_layer(rng: np.random.Generator, *, thickness: bool) -> dict:
     """A layer, from fat to muscle."""
     layer = {
@@ -46,22 +67,36 @@ def draw_layer(rng: np.random.Generator, *, thickness: bool) -> dict:
 
 
 def draw_controls(scenario: Scenario, steps: int, rng: np.random.Generator) -> np.ndarray:
-    """(steps, 5): insertion in steps of 1e-9 to 1 mm with a few retractions, all other inputs, flips."""
+    """(steps, 9): insertion in steps of 1e-9 mm to the longest with a few retractions, and all other inputs.
+
+    In the plane flips, in space rolls and spins by any angle.
+    """
     forward = rng.random(steps) < 0.85
     long = rng.uniform(0.3, 1.0, steps)
     short = 10.0 ** rng.uniform(-9.0, 0.0, steps)
-    length = np.where(rng.random(steps) < 0.8, long, short)
+    length = scenario.setup.max_advance_mm * np.where(rng.random(steps) < 0.8, long, short)
     back = np.flatnonzero(rng.random(steps) < 0.015)  # pulled back by several millimetres, and on again
     for start in back:
         forward[start : start + rng.integers(1, 12)] = False
     advance = _keep_within(np.where(forward, length, -length), 0.0, scenario.setup.stroke_mm)
+    base, turn, guide = _draw_across(scenario, steps, rng)
+    columns = {"db_x": advance, "db_y": base, "db_theta": turn, "dg_y": guide}
+    columns["roll"] = np.where(rng.random(steps) < 0.08, np.pi, 0.0)
+    if scenario.setup.axes == 2:
+        base, turn, guide = _draw_across(scenario, steps, rng)
+        columns |= {"db_z": base, "db_psi": turn}
+        columns["dg_z"] = guide if scenario.setup.moved_guide_axes == 2 else np.zeros(steps)
+        columns["roll"] = np.where(rng.random(steps) < 0.15, rng.uniform(-4.0, 4.0, steps), 0.0)
+        columns["spin"] = np.where(rng.random(steps) < 0.3, rng.uniform(-9.0, 9.0, steps), 0.0)
+    return controls(steps, **columns)
+
+
+def _draw_across(scenario: Scenario, steps: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Steps (steps,) of base, slope and guide on one axis."""
     swing = rng.uniform(0.0, 0.3)
     lateral = rng.uniform(-swing, swing, (3, steps)) + rng.uniform(-0.04, 0.04, (3, 1))
     guide = _keep_within(lateral[0], -10.0, 10.0) if scenario.setup.has_guide else np.zeros(steps)
-    base = _keep_within(lateral[1], -5.0, 5.0)
-    turn = _keep_within(5e-3 * lateral[2], -0.05, 0.05)
-    flip = np.where(rng.random(steps) < 0.08, 1.0, -1.0)
-    return np.stack([advance, base, turn, guide, flip], axis=1)
+    return _keep_within(lateral[1], -5.0, 5.0), _keep_within(5e-3 * lateral[2], -0.05, 0.05), guide
 
 
 def _keep_within(steps: np.ndarray, low: float, high: float) -> np.ndarray:

@@ -37,3 +37,27 @@ def arc_tip(length: float, curvature: float) -> tuple[float, float, float]:
     """Tip of an arc that starts along x at the origin: sin κL/κ, (1 − cos κL)/κ, κL."""
     turn = curvature * length
     return np.sin(turn) / curvature, (1.0 - np.cos(turn)) / curvature, turn
+
+
+def twisted_buckling_moment(length: float, stiffness: float, push: float = 0.0) -> float:
+    """Twisting moment (N·mm) that buckles a straight rod, clamped at both ends, under an axial load (Greenhill 1883).
+
+    Lateral w = y + iz: EI w⁗ − iT w‴ + P w″ = 0, so w = a + bs + c e^(iλ₁s) + d e^(iλ₂s) with EI λ² − Tλ − P = 0.
+    Without an axial load T L/EI = 8.987, the smallest solution of tan(T L/2EI) = T L/2EI.
+    """
+
+    def miss(moment: float) -> float:
+        root = np.sqrt(moment**2 + 4.0 * stiffness * push)
+        waves = np.array([moment + root, moment - root]) / (2.0 * stiffness)
+        end = np.exp(1j * waves * length)
+        shape = np.array(
+            [[1, 0, 1, 1], [0, 1, *(1j * waves)], [1, length, *end], [0, 1, *(1j * waves * end)]]
+        )
+        return float(np.imag(np.linalg.det(shape) * np.exp(-0.5j * length * waves.sum())))
+
+    if push == 0.0:  # two of the four solutions are the same
+        return float(2.0 * stiffness / length * brentq(lambda x: np.tan(x) - x, 4.4, 4.6))
+    moments = np.linspace(0.0, 9.5, 400) * stiffness / length
+    values = [miss(moment) for moment in moments]
+    first = next(k for k in range(1, len(values)) if values[k - 1] * values[k] < 0.0)
+    return float(brentq(miss, moments[first - 1], moments[first]))

@@ -3,19 +3,24 @@
 The needle is a cantilever, and whatever touches it is a force on it. A unit force at distance b from the base
 deflects it at distance a ≤ b by a²(3b − a)/6EI, and so by b²(3a − b)/6EI beyond it. That is exact, and well
 conditioned for forces as close together as you like. Nothing here is shared with flexneedle.mechanics.
+
+Laterally, numbers are y + iz; the plane is the case z = 0. The unknowns of Newton's method are the y of all places,
+then their z: each contact has its true tangent, two by two.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from flexneedle.scenario.model import Scenario
-from flexneedle.simulator.control import Control
+from flexneedle.types import ROLL, Control
 
 TOLERANCE_MM = 1e-11
 _FLOOR = 0.3
-_GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(3)  # exact to degree 5; y'² has degree 4
+_GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(3)  # exact to degree 5; |y'|² has degree 4
+_SPIN_X, _SPIN_W = np.polynomial.legendre.leggauss(64)  # for some turns of the bevel
 
 
 class Tissue(NamedTuple):
@@ -31,10 +36,20 @@ class Tissue(NamedTuple):
         return Tissue(*(values[which] for values in self))
 
 
-def ogden(tissue: Tissue, u):
-    """Energy, force −dW/du and stiffness d²W/du² at the compression u (mm): equations 1 to 3, with the floor."""
+class Response(NamedTuple):
+    """Tissue at a compression: energy (mJ), force on the needle (N), stiffness along and across it (N/mm)."""
+
+    energy: np.ndarray
+    force: np.ndarray
+    along: np.ndarray
+    across: np.ndarray
+
+
+def ogden(tissue: Tissue, u) -> Response:
+    """The response to the compression u (mm), y or y + iz: equations 1 to 3, with the floor."""
     mu, alpha, h, volume = tissue
-    stretch = 1.0 - np.abs(u) / h
+    size = np.abs(u)
+    stretch = 1.0 - size / h
     lam = np.maximum(stretch, _FLOOR)
     beyond = (lam - stretch) * h
     energy = volume * 2 * mu / alpha**2 * (2 * lam ** (-alpha / 2) + lam**alpha - 3)
@@ -47,7 +62,22 @@ def ogden(tissue: Tissue, u):
         * ((alpha - 1) * lam ** (alpha - 2) + (alpha / 2 + 1) * lam ** (-alpha / 2 - 2))
     )
     energy = energy + push * beyond + stiffness * beyond**2 / 2
-    return energy, -np.sign(u) * (push + stiffness * beyond), stiffness
+    push = push + stiffness * beyond
+    across = np.divide(push, size, out=stiffness.copy(), where=size > 0.0)
+    return Response(energy, -push * np.sign(u), stiffness, across)
+
+
+class End(NamedTuple):
+    """An end of the needle: position x and y + iz (mm), slope θ + iψ."""
+
+    x: float
+    y: complex
+    turn: complex
+
+    @property
+    def row(self) -> np.ndarray:
+        """x, y, z, θ, ψ."""
+        return np.array([self.x, self.y.real, self.y.imag, self.turn.real, self.turn.imag])
 
 
 class Loads(NamedTuple):
@@ -58,34 +88,38 @@ class Loads(NamedTuple):
 
 
 class Cut(NamedTuple):
-    """What a step starts from: tip pose, front of the channel, rest positions of contacts and of the tip spring."""
+    """What a step starts from: tip, front of the channel, rest positions of contacts and of the tip spring.
 
-    tip: np.ndarray
+    spin: angle (rad) by which the bevel turns in the step.
+    """
+
+    tip: End
     front: float
     rest: np.ndarray
-    bevel_rest: float
+    bevel_rest: complex
+    spin: float = 0.0
 
 
 @dataclass(frozen=True)
 class Pose:
     """The insertion after a step; `cut` is what the step started from, `after` what the next one starts from."""
 
-    base: np.ndarray
-    guide: float
-    bevel: int
-    load: float
+    base: End
+    guide: complex
+    bevel: complex
+    load: complex
     cut: Cut
     after: Cut
     y: np.ndarray  # of the contacts that the tip has passed
     loads: Loads
-    guide_force: float
-    tip_force: float
+    guide_force: complex
+    tip_force: complex
     energy: float
     strain_energy: float
 
     @property
-    def tip(self) -> np.ndarray:
-        """x, y, θ."""
+    def tip(self) -> End:
+        """Where the next step starts."""
         return self.after.tip
 
 
@@ -93,9 +127,9 @@ class _Trial(NamedTuple):
     """Equilibrium for a given x of the tip."""
 
     y: np.ndarray
-    y_tip: float
+    y_tip: complex
     rest: np.ndarray
-    bevel_rest: float
+    bevel_rest: complex
     loads: Loads
     reactions: np.ndarray
     tissue_energy: np.ndarray
@@ -127,62 +161,67 @@ class Reference:
         self.tissue = law._replace(volume=law.volume * self.length)
         self.weight = np.array([layer.energy_weight for layer in layers])[kind]
 
-    def start(self, bevel: int = 1) -> Pose:
-        """The straight needle in air."""
-        setup, needle = self.scenario.setup, self.scenario.needle
-        base = np.array([-setup.tip_to_skin_mm - needle.length_mm, 0.0, 0.0])
-        tip = np.array([-setup.tip_to_skin_mm, 0.0, 0.0])
-        cut = Cut(tip, 0.0, np.zeros(self.x.size), 0.0)
+    def start(self, roll: float = 0.0) -> Pose:
+        """The straight needle in air, on the line of its entry, rolled (rad)."""
+        setup, entry = self.scenario.setup, self.scenario.entry
+        offset = entry.lateral_mm + 1j * entry.lateral_z_mm
+        slope = 1e-3 * (entry.slope_mrad + 1j * entry.slope_z_mrad)
+        tip_x = -setup.tip_to_skin_mm
+        base, tip = (
+            End(x, offset + slope * x, slope) for x in (tip_x - self.scenario.needle.length_mm, tip_x)
+        )
+        guide = offset - slope * setup.guide_to_skin_mm if setup.has_guide else 0.0
+        cut = Cut(tip, 0.0, np.zeros(self.x.size, complex), 0.0)
         nothing = np.zeros(0)
-        pose = Pose(base, 0.0, bevel, 0.0, cut, cut, nothing, Loads(nothing, nothing), 0.0, 0.0, 0.0, 0.0)
+        bevel = np.exp(1j * roll)
+        pose = Pose(base, guide, bevel, 0.0, cut, cut, nothing, Loads(nothing, nothing), 0.0, 0.0, 0.0, 0.0)
         return self._solve(pose, cut)
 
     def step(self, pose: Pose, control: Control) -> Pose:
         """One control step, in parts that end where the tip is due at multiples of Δ/4 down to 3Δ."""
         part, left = self.scenario.contact.spacing_mm / 4, 1.0
         while left > 0.0:
-            x, share = pose.tip[0], left
+            x, share = pose.tip.x, left
             if control.db_x > 0.0 and x < 12 * part and x + left * control.db_x > 0.0:
                 due = max(0.0, part * (np.floor(x / part + 1e-3) + 1))
                 share = min(left, (due - x) / control.db_x)
-            pose = self._move(
-                pose,
-                Control(
-                    share * control.db_x,
-                    share * control.db_y,
-                    share * control.db_theta,
-                    share * control.dg_y,
-                    control.flip and left == 1.0,
-                ),
-            )
+            row = share * np.array(control)
+            row[ROLL] = control.roll if left == 1.0 else 0.0
+            pose = self._move(pose, Control.of(row))
             left -= share if share < left else left
         return pose
 
     def _move(self, pose: Pose, control: Control) -> Pose:
+        base, entry = pose.base, self.scenario.entry
+        along = 1e-3 * (entry.slope_mrad + 1j * entry.slope_z_mrad)
         moved = replace(
             pose,
-            base=np.add(pose.base, [control.db_x, control.db_y, control.db_theta]),
-            guide=pose.guide + control.dg_y,
-            bevel=-pose.bevel if control.flip else pose.bevel,
+            base=End(
+                base.x + control.db_x,
+                base.y + along * control.db_x + control.db_y + 1j * control.db_z,
+                base.turn + control.db_theta + 1j * control.db_psi,
+            ),
+            guide=pose.guide + control.dg_y + 1j * control.dg_z,
+            bevel=pose.bevel * np.exp(1j * (control.roll + control.spin)),
         )
-        return self._solve(moved, pose.after)
+        return self._solve(moved, pose.after._replace(spin=control.spin))
 
-    def hold(self, pose: Pose, tip_y: float, points=()) -> Pose:
-        """The last step again, with the tip held at tip_y and the needle at further (x, y)."""
-        return self._solve(pose, pose.cut, held=tip_y, points=tuple(points))
+    def hold(self, pose: Pose, tip: Sequence[float], points: Sequence[Sequence[float]] = ()) -> Pose:
+        """The last step again, with the tip held at x, y (, z), of which x is ignored, and the needle at others."""
+        return self._solve(pose, pose.cut, held=complex(*tip[1:]), points=points)
 
     def curve(self, pose: Pose, x):
-        """y, θ and arc length from the base at places x (mm) along the needle."""
+        """Lateral position, slope, and arc length from the base at places x (mm) along the needle."""
         y, turn = self._shape(pose.base, pose.loads, np.asarray(x, dtype=float))
         return (
             y,
             turn,
-            np.array([self._integrals(pose.base, pose.loads, end)[0] for end in x]) + (x - pose.base[0]),
+            np.array([self._integrals(pose.base, pose.loads, end)[0] for end in x]) + (x - pose.base.x),
         )
 
     def _solve(self, pose: Pose, cut: Cut, held=None, points=()) -> Pose:
         """Find x_t = b_x + L − s by the secant rule."""
-        straight = pose.base[0] + self.scenario.needle.length_mm
+        straight = pose.base.x + self.scenario.needle.length_mm
         at = straight - self._integrals(pose.base, pose.loads, np.inf)[0] if pose.loads.x.size else straight
         guess, last = pose, None
         for _ in range(100):
@@ -204,34 +243,38 @@ class Reference:
         influence = self._influence(pose.base, x, x)
         of_fixed = self._influence(pose.base, x, fixed_x)
         among_fixed = self._influence(pose.base, fixed_x, fixed_x)
-        free, free_fixed = (pose.base[1] + pose.base[2] * (a - pose.base[0]) for a in (x, fixed_x))
+        free, free_fixed = (pose.base.y + pose.base.turn * (a - pose.base.x) for a in (x, fixed_x))
         touch = _Touch(self, cut, pose, tip_x, count)
         y = self._shape(pose.base, pose.loads, x)[0]
-        reactions = np.zeros(fixed_x.size)
+        reactions = np.zeros(fixed_x.size, complex)
         for _ in range(200):
-            u, force, slope = touch.forces(y)
+            u, force = touch.forces(y)
             residual = y - free - influence @ force - of_fixed @ reactions
             miss = fixed_y - free_fixed - of_fixed.T @ force - among_fixed @ reactions
+            slope = touch.slope(u)
             matrix = np.block(
-                [[np.eye(count + 1) - influence @ slope, -of_fixed], [of_fixed.T @ slope, among_fixed]]
+                [
+                    [np.eye(2 * count + 2) - _on_both(influence) @ slope, -_on_both(of_fixed)],
+                    [_on_both(of_fixed.T) @ slope, _on_both(among_fixed)],
+                ]
             )
-            change = np.linalg.solve(matrix, np.concatenate([-residual, miss]))
-            share = touch.largest_share(u, y, change[: count + 1])
-            y = y + share * change[: count + 1]
-            reactions = reactions + share * change[count + 1 :]
-            if np.abs(change[: count + 1]).max() < TOLERANCE_MM / 10:
+            change = np.linalg.solve(matrix, np.concatenate([_parts(-residual), _parts(miss)]))
+            dy, more = _joined(change[: 2 * count + 2]), _joined(change[2 * count + 2 :])
+            share = touch.largest_share(u, y, dy)
+            y = y + share * dy
+            reactions = reactions + share * more
+            if np.abs(dy).max() < TOLERANCE_MM / 10:
                 return touch.result(y, x, fixed_x, reactions)
         raise ArithmeticError("no equilibrium found")
 
     def _finish(self, pose: Pose, cut: Cut, trial: _Trial, tip_x: float, beam_energy: float, held) -> Pose:
-        turn = float(self._shape(pose.base, trial.loads, np.array([tip_x]))[1][0])
-        tip = np.array([tip_x, trial.y_tip, turn])
+        tip = End(tip_x, trial.y_tip, complex(self._shape(pose.base, trial.loads, np.array([tip_x]))[1][0]))
         count = trial.y.size
         if tip_x > 0.0:
             rest = np.append(trial.rest, cut.rest[count:])
             after = Cut(tip, max(cut.front, tip_x), rest, trial.bevel_rest)
         else:
-            after = Cut(tip, 0.0, np.zeros(self.x.size), 0.0)
+            after = Cut(tip, 0.0, np.zeros(self.x.size, complex), 0.0)
         guide_x = self.scenario.setup.guide_x
         guided = guide_x is not None and guide_x < tip_x
         return replace(
@@ -240,34 +283,34 @@ class Reference:
             after=after,
             y=trial.y,
             loads=trial.loads,
-            guide_force=float(trial.reactions[0]) if guided else 0.0,
-            tip_force=float(trial.reactions[-1]) if held is not None else 0.0,
+            guide_force=complex(trial.reactions[0]) if guided else 0.0,
+            tip_force=complex(trial.reactions[-1]) if held is not None else 0.0,
             energy=float(beam_energy + trial.tissue_energy.sum() + trial.spring_energy),
             strain_energy=float(self.weight[:count] @ trial.tissue_energy),
         )
 
     def _influence(self, base, x, of):
         """Deflection at x of unit forces at `of`."""
-        a, b = x[:, None] - base[0], of[None, :] - base[0]
+        a, b = x[:, None] - base.x, of[None, :] - base.x
         return np.where(a < b, a**2 * (3 * b - a), b**2 * (3 * a - b)) / (6 * self.stiffness)
 
     def _shape(self, base, loads: Loads, x):
-        """y and θ at x."""
-        s, b = (x - base[0])[:, None], (loads.x - base[0])[None, :]
-        y = base[1] + base[2] * (x - base[0]) + self._influence(base, x, loads.x) @ loads.force
+        """Lateral position and slope at x."""
+        s, b = (x - base.x)[:, None], (loads.x - base.x)[None, :]
+        y = base.y + base.turn * (x - base.x) + self._influence(base, x, loads.x) @ loads.force
         turn = np.where(s < b, s * (2 * b - s), b**2) / (2 * self.stiffness)
-        return y, base[2] + turn @ loads.force
+        return y, base.turn + turn @ loads.force
 
     def _integrals(self, base, loads: Loads, end: float):
-        """½∫y'² dx and ½∫M²/EI dx from the base to `end`, or to the last force."""
-        breaks = np.unique(np.concatenate([[base[0]], loads.x, [] if np.isinf(end) else [end]]))
+        """½∫|y'|² dx and ½∫|M|²/EI dx from the base to `end`, or to the last force."""
+        breaks = np.unique(np.concatenate([[base.x], loads.x, [] if np.isinf(end) else [end]]))
         breaks = breaks[breaks <= end]
         left, half = breaks[:-1, None], np.diff(breaks)[:, None] / 2
         x = (left + half * (1 + _GAUSS_X)).ravel()
         share = (half * _GAUSS_W).ravel()
         turn = self._shape(base, loads, x)[1]
         moment = np.maximum(loads.x[None, :] - x[:, None], 0.0) @ loads.force
-        return share @ turn**2 / 2, share @ moment**2 / (2 * self.stiffness)
+        return share @ np.abs(turn) ** 2 / 2, share @ np.abs(moment) ** 2 / (2 * self.stiffness)
 
 
 class _Touch:
@@ -289,20 +332,31 @@ class _Touch:
         if self.cuts > 0.0:
             decay = np.exp(-self.cuts / bevel.length_mm)
             g = -bevel.length_mm * np.expm1(-self.cuts / bevel.length_mm) / self.cuts
-            b = pose.bevel * bevel.offset_mm
             y_front = y0 + turn0 * (cut.front - x0)
-            q = cut.bevel_rest - y_front - b if cut.front > 0.0 else 0.0
             line = y_front + turn0 * self.cuts
-            self.bevel_rest, self.follow = line + b + q * decay - (1 - g) * line, 1 - g
+            rate = cut.spin / (tip_x - x0)
+            offset, gained = _offsets(bevel.offset_mm * pose.bevel, rate, bevel.length_mm, self.cuts)
+            q = cut.bevel_rest - y_front if cut.front > 0.0 else offset
+            self.bevel_rest, self.follow = line + q * decay + gained - (1 - g) * line, 1 - g
+        self.compressing = np.eye(count + 1)
+        self.compressing[:-1, -1] = -self.along
+        self.compressing[-1, -1] = 1 - self.follow
 
     def forces(self, y):
-        """Compressions (of contacts and tip), forces and their derivatives (k + 1, k + 1)."""
-        u = np.append(y[:-1] - self.rest - self.along * y[-1], y[-1] * (1 - self.follow) - self.bevel_rest)
-        _, force, stiffness = ogden(self.tissue, u[:-1])
-        _, tip_force, tip_stiffness = ogden(self.pieces, u[-1])
-        slope = np.diag(np.append(-self.ramp * stiffness, -tip_stiffness.sum() * (1 - self.follow)))
-        slope[:-1, -1] += self.ramp * stiffness * self.along
-        return u, np.append(self.ramp * force, tip_force.sum() + self.load), slope
+        """Compressions (of contacts and tip) and forces."""
+        u = self.compressing @ y - np.append(self.rest, self.bevel_rest)
+        force, tip_force = ogden(self.tissue, u[:-1]).force, ogden(self.pieces, u[-1]).force
+        return u, np.append(self.ramp * force, tip_force.sum() + self.load)
+
+    def slope(self, u):
+        """Derivatives of the forces by y, and z, of the places: −(c_t I + (c_r − c_t) n nᵀ) of each compression."""
+        contacts, tip = ogden(self.tissue, u[:-1]), ogden(self.pieces, u[-1])
+        along = np.append(self.ramp * contacts.along, tip.along.sum())
+        across = np.append(self.ramp * contacts.across, tip.across.sum())
+        n, more = np.sign(u), along - across
+        yy, yz, zz = across + more * n.real**2, more * n.real * n.imag, across + more * n.imag**2
+        tangents = np.block([[np.diag(yy), np.diag(yz)], [np.diag(yz), np.diag(zz)]])
+        return -tangents @ _on_both(self.compressing)
 
     def largest_share(self, u, y, change) -> float:
         """How much of a change takes at most half of any remaining stretch."""
@@ -313,16 +367,16 @@ class _Touch:
 
     def result(self, y, x, fixed_x, reactions) -> _Trial:
         """Collect what equilibrium at y means."""
-        u, force, _ = self.forces(y)
+        u, force = self.forces(y)
         return _Trial(
             y[:-1],
-            float(y[-1]),
+            complex(y[-1]),
             self.rest + self.along * y[-1],
-            float(self.bevel_rest + self.follow * y[-1]),
+            complex(self.bevel_rest + self.follow * y[-1]),
             Loads(np.append(x, fixed_x), np.append(force, reactions)),
             reactions,
-            self.ramp * ogden(self.tissue, u[:-1])[0],
-            float(ogden(self.pieces, u[-1])[0].sum()),
+            self.ramp * ogden(self.tissue, u[:-1]).energy,
+            float(ogden(self.pieces, u[-1]).energy.sum()),
         )
 
 
@@ -344,10 +398,10 @@ def _interval_edges(scenario: Scenario, ends):
 def _essential(guide_x, guide_y, points, tip_x, held):
     """Places and values that are prescribed: guide first, held tip last."""
     pairs = [(guide_x, guide_y)] if guide_x is not None and guide_x < tip_x else []
-    pairs += [tuple(point) for point in points]
+    pairs += [(point[0], complex(*point[1:])) for point in points]
     pairs += [] if held is None else [(tip_x, held)]
-    x, y = np.array(pairs, dtype=float).reshape(-1, 2).T
-    return x, y
+    x, y = np.array(pairs, dtype=complex).reshape(-1, 2).T
+    return x.real, y
 
 
 def _spring(reference: Reference, start: float, end: float) -> Tissue:
@@ -355,3 +409,31 @@ def _spring(reference: Reference, start: float, end: float) -> Tissue:
     tops = np.append(0.0, reference.ends[:-1])
     length = np.clip(np.minimum(reference.ends, end) - np.maximum(tops, start), 0.0, None)
     return reference.laws._replace(volume=reference.laws.volume * length)
+
+
+def _offsets(end: complex, rate: float, length: float, cuts: float):
+    """The steady offset of the spring where a cut begins, and what the cut adds to it; `end`: the bevel's at its end.
+
+    The bevel turns by `rate` (rad/mm). The spring forgets with the relaxation length, so the cut adds an integral over
+    its way back from the end.
+    """
+    back = cuts / 2 * (1 + _SPIN_X)
+    fading = np.exp(-(1 / length + 1j * rate) * back)
+    steady = end * np.exp(-1j * rate * cuts) / (1 + 1j * rate * length)
+    return steady, end / length * cuts / 2 * (_SPIN_W @ fading)
+
+
+def _parts(values):
+    """The y of lateral numbers, then their z."""
+    return np.concatenate([values.real, values.imag])
+
+
+def _joined(parts):
+    """Lateral numbers from their y, then their z."""
+    y, z = np.split(parts, 2)
+    return y + 1j * z
+
+
+def _on_both(matrix):
+    """A matrix that acts on y and z alike."""
+    return np.kron(np.eye(2), matrix)

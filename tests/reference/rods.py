@@ -1,18 +1,17 @@
 """Rods for the tests of `phantom.rod`: on a bench, the plant of a scenario, and that plant worked out otherwise."""
 
 import math
-import sys
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
-from flexneedle import load_scenario
+from flexneedle import Control, load_scenario
 from flexneedle.mechanics.law import tables
 from flexneedle.rig.phantom import rod as rd
 from flexneedle.rig.phantom.draw import Truth
+from flexneedle.rig.phantom.equilibrium import step
 from flexneedle.rig.phantom.plants import ExactPlant
 from flexneedle.scenario.tissue.ogden import Ogden
+from flexneedle.types import THETA, X, Y
 
 ZEROS = (
     "shear_modulus_variation",
@@ -25,6 +24,7 @@ ZEROS = (
     "run_out_mm",
     "guide_clearance_mm",
     "friction_mn_per_mm",
+    "rotation_friction_mn",
     "motor_resolution_mm",
     "delay_periods",
     "missing_fraction",
@@ -43,13 +43,16 @@ IDEAL = load_scenario("phantom").with_values(PERFECT)
 
 _ON_A_BENCH = {
     "stiffness": 1000.0,
+    "torsion": 770.0,
     "curvature": 0.0,
+    "curvature_across": 0.0,
     "bevel_offset": 0.0,
     "bevel_length": 1.0,
     "guide_x": math.nan,
     "clearance": 0.0,
     "guide_stiffness": 1e3,
     "friction": 0.0,
+    "rotation_friction": 0.0,
     "spacing": 0.5,
     "cell": 1.0,
     "laws": tables(
@@ -63,69 +66,65 @@ _ON_A_BENCH = {
 
 
 class Bench:
-    """A rod of EI = 1000 N·mm² far from any tissue, every scalar of which a test may reach; steps in place."""
+    """A rod of EI = 1000 N·mm² far from any tissue, every part of which a test may reach; steps in place."""
 
-    def __init__(self, length=100.0, segments=64, base=(-1000.0, 0.0, 0.0), bevel=1, **constants):
+    def __init__(self, length=100.0, segments=64, base=(-1000.0, 0.0, 0.0), roll=0.0, tilt=None, **constants):
         self.rod = rd.Rod(**{**_ON_A_BENCH, "segment": length / segments, **constants})
-        self.s = np.zeros(rd.SIZE)
-        self.s[[rd.BASE_X, rd.BASE_Y, rd.BASE_TURN]] = base
-        self.s[rd.BEVEL] = bevel
-        self.theta = np.full(segments, float(base[2]))
-        self.work = np.zeros((rd.WORK_ROWS, segments + 1))
-        self.channel = np.zeros((rd.CHANNEL_ROWS, 400))
-        self.count = 0
+        x, y, turn = base
+        self.s, self.segments = rd.start((x, y, 0.0), tilt or (turn, 0.0), length, segments, roll)
+        self.channel, self.count = np.zeros(400, rd.POINT), 0
 
-    def step(self, db_x=0.0, db_y=0.0, db_theta=0.0, dg_y=0.0, flip=-1.0):
+    def step(self, **columns):
         """Move and settle."""
-        row = np.array([db_x, db_y, db_theta, dg_y, flip])
-        self.count = rd.step(self.rod, self.s, self.theta, self.channel, self.count, self.work, row)
+        row = np.array(Control(**columns))
+        self.count = step(self.rod, self.s, self.segments, self.channel, self.count, row)
         return self
 
-    def loaded(self, x=0.0, y=0.0):
+    def loaded(self, x=0.0, y=0.0, z=0.0):
         """The same under a dead load (N) at the tip."""
-        self.s[rd.LOAD_X], self.s[rd.LOAD_Y] = x, y
+        self.s["load"] = x, y, z
         return self.step()
 
     @property
     def converged(self):
-        return self.s[rd.CONVERGED] > 0.0
+        return self.s["converged"] > 0.0
 
     @property
     def tip(self):
-        """x, y, θ; place as seen from the base."""
-        return self.s[[rd.TIP_X, rd.TIP_Y, rd.TIP_TURN]] - [self.s[rd.BASE_X], self.s[rd.BASE_Y], 0.0]
+        """x, y, θ; position relative to the base."""
+        (x, y, _), t = self.s["tip"] - self.s["base"], self.s["tangent"]
+        return np.array([x, y, math.atan2(t[1], t[0])])
 
     @property
     def nodes(self):
-        """(N + 1, 2) as seen from the base."""
-        return (self.work[[rd.X, rd.Y]] - self.s[[rd.BASE_X, rd.BASE_Y]][:, None]).T
+        """(N + 1, 3) relative to the base."""
+        return self.segments["node"] - self.s["base"]
+
+    @property
+    def turns(self):
+        """Angles (N,) of the segments in the plane."""
+        x, y, _ = self.segments["tangent"][:-1].T
+        return np.arctan2(y, x)
 
 
-def plant(scenario=IDEAL, *, bevel=1, cell=None, **truth):
+def plant(scenario=IDEAL, *, roll=0.0, cell=None, **truth):
     """The exact plant of a scenario; `truth` are fields of `Truth`."""
     cell = 0.5 * scenario.phantom.contact_spacing_mm if cell is None else cell
-    return ExactPlant(Truth(scenario, cell_mm=cell, **truth), bevel)
+    return ExactPlant(Truth(scenario, cell_mm=cell, **truth), roll)
 
 
 def move(plant, db_x=0.0, db_y=0.0, db_theta=0.0, dg_y=0.0, flip=False, times=1):
     """Step a plant, `times` alike; a step that finds no equilibrium is an error of the test."""
     for _ in range(times):
-        plant.step(np.array([db_x, db_y, db_theta, dg_y, 1.0 if flip else -1.0]))
+        plant.step(np.array(Control(db_x, db_y=db_y, db_theta=db_theta, dg_y=dg_y, flip=flip)))
     if not plant.converged:
-        raise ValueError(f"residual {plant._s[rd.RESIDUAL]:.3g} mm")
+        raise ValueError(f"residual {plant.state['residual']:.3g} mm")
     return plant
 
 
-def uncompiled(module: ModuleType) -> ModuleType:
-    """A copy of a kernel module that runs as plain Python: slow, without compilation."""
-    text = Path(module.__file__).read_text(encoding="utf-8")
-    plain = text.replace("from flexneedle.mechanics.compile import", "from reference.plain import")
-    if plain == text:
-        raise ValueError(f"{module.__file__}: imports no decorators")
-    copy = ModuleType(f"uncompiled_{module.__name__.rsplit('.', 1)[-1]}")
-    sys.modules[copy.__name__] = copy  # NamedTuple looks its module up
-    exec(compile(plain, module.__file__, "exec"), vars(copy))
-    return copy
+def planar(pose):
+    """x, y, θ of a pose."""
+    return pose[[X, Y, THETA]]
 
 
 class Shooting:

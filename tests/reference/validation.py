@@ -5,12 +5,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from flexneedle import Control, Simulator
-from flexneedle.rig.phantom import rod as rd
+from flexneedle import Control, Simulator, controls
 from flexneedle.rig.phantom.draw import Truth
-from reference import closed_forms, elastica
+from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, THETA
+from reference import closed_forms, elastica, space_validation
 from reference.cases import EI, FOUNDATION, long_beam
-from reference.rods import IDEAL, PERFECT, Bench, Shooting, move, plant
+from reference.rods import IDEAL, PERFECT, Bench, Shooting, move, planar, plant
 
 LOADS = {1.0: 0.3017, 2.0: 0.4935, 5.0: 0.7138}
 """PL²/EI of a cantilever, and the deflection of its tip over its length as tables have it."""
@@ -28,7 +28,6 @@ MOVES = {  # base y (mm), base turn (rad), guide y (mm)
     GUIDE: (0.0, 0.0, 2.0),
     "all": (-1.0, 0.01, 1.0),
 }
-_FORCES = [rd.BASE_FORCE_X, rd.BASE_FORCE_Y, rd.BASE_MOMENT, rd.GUIDE_FORCE]
 
 
 def order(sizes, errors) -> float:
@@ -69,14 +68,12 @@ def buckling_factor(segments: int) -> float:
 
 
 def commands(scale: float, depth: float, step: float) -> np.ndarray:
-    """Rows (m, 5) to `depth` mm: the guide swings by 2.4 mm times `scale`; the bevel turns over 20 mm deep."""
+    """Rows (m, 9) to `depth` mm: the guide swings by 2.4 mm times `scale`; the bevel turns over 20 mm deep."""
     count = round((depth + IDEAL.setup.tip_to_skin_mm) / step)
     way = step * np.arange(count + 1)
-    rows = np.zeros((count, 5))
-    rows[:, 0] = step
-    rows[:, 3] = np.diff(1.2 * scale * (1.0 - np.cos(2.0 * np.pi * way / 50.0)))
-    rows[:, 4] = np.where(np.abs(way[:-1] - IDEAL.setup.tip_to_skin_mm - 20.0) < 1e-9, 1.0, -1.0)
-    return rows
+    guide = np.diff(1.2 * scale * (1.0 - np.cos(2.0 * np.pi * way / 50.0)))
+    roll = np.where(np.abs(way[:-1] - IDEAL.setup.tip_to_skin_mm - 20.0) < 1e-9, np.pi, 0.0)
+    return controls(count, db_x=step, dg_y=guide, roll=roll)
 
 
 def scaled(scale: float, layers: int, element: float, spacing: float):
@@ -100,7 +97,7 @@ def inserted_tip(
     needle = plant(scaled(scale, layers, element, spacing), **truth)
     for row in commands(scale, depth, step):
         needle.step(row)
-    return move(needle).tip
+    return planar(move(needle).tip)
 
 
 @dataclass(frozen=True)
@@ -121,14 +118,14 @@ def model_gap(scale: float, layers: int, *, element: float, spacing: float, step
     needle.rod = needle.rod._replace(guide_stiffness=_RIGID)
     state, tips = simulator.start(), []
     for row in rows:
-        state = simulator.step(state, Control.from_row(row.tolist()))
+        state = simulator.step(state, Control.of(row.tolist()))
         needle.step(row)
         tips.append((needle.tip, state.tip))
     move(needle)
     exact, model = np.array(tips).swapaxes(0, 1)
     apart = np.hypot(*(exact - model)[:, :2].T)
     energy = needle.strain_energy / state.strain_energy - 1.0
-    return Gap(float(np.abs(exact[:, 2]).max()), float(apart.max()), float(apart[-1]), energy)
+    return Gap(float(np.abs(exact[:, THETA]).max()), float(apart.max()), float(apart[-1]), energy)
 
 
 def path_curvature(resolution: float, bevel_length: float, bevel: float = 0.01) -> float:
@@ -138,9 +135,9 @@ def path_curvature(resolution: float, bevel_length: float, bevel: float = 0.01) 
     needle = plant(scenario.with_values(PERFECT | sizes))
     tips = []
     for _ in range(round(251.0 / resolution)):
-        needle.step(np.array([resolution, 0.0, 0.0, 0.0, -1.0]))
+        needle.step(np.array(Control(db_x=resolution)))
         tips.append(needle.tip)
-    x, y, _ = np.array(tips).T
+    x, y, *_ = np.array(tips).T
     last = x > 190.0
     bend, slope, _ = np.polyfit(x[last] - x[last].mean(), y[last], 2)
     return float(2.0 * bend / (1.0 + slope**2) ** 1.5)
@@ -201,9 +198,9 @@ def shot(scenario, rows) -> np.ndarray:
 
 
 def stepped(scenario, rows, element: float) -> np.ndarray:
-    """Poses of the tip (m, 3) of the plant."""
+    """Poses of the tip (m, 3) of the plant: x, y, θ."""
     needle = plant(scenario.with_values({"phantom.element_mm": element}), cell=0.5, **START)
-    return np.array([move(needle, **row).tip for row in rows])
+    return np.array([planar(move(needle, **row).tip) for row in rows])
 
 
 # --- work and energy
@@ -217,13 +214,19 @@ def bent(withdrawn: float, friction: float = 0.0):
     return move(needle, -withdrawn / 20, times=20)
 
 
+def holding(needle) -> np.ndarray:
+    """Force x, y and moment of the base, force of the guide (N, N·mm), in the plane."""
+    s = needle.state
+    return np.array([*s["base_force"][:2], s["base_moment"][2], s["guide_force"][0]])
+
+
 def work(needle, *, steps: int, db_x=0.0, db_y=0.0, db_theta=0.0, dg_y=0.0) -> tuple[float, float]:
     """(work of base and guide, change of the stored energy) over a move in so many steps, by the trapezoid rule."""
     part = np.array([db_x, db_y, db_theta, dg_y]) / steps
-    energy = needle._s[rd.ENERGY]
-    forces = [needle._s[_FORCES], *(move(needle, *part)._s[_FORCES] for _ in range(steps))]
+    energy = needle.state["energy"]
+    forces = [holding(needle), *(holding(move(needle, *part)) for _ in range(steps))]
     done = sum(0.5 * float((before + after) @ part) for before, after in pairwise(forces))
-    return done, float(needle._s[rd.ENERGY] - energy)
+    return done, float(needle.state["energy"] - energy)
 
 
 def energy_balance(name: str, steps: int) -> tuple[float, float]:
@@ -242,9 +245,9 @@ def friction_balance(steps: int, friction: float = 5.0) -> tuple[float, float, f
 
 
 def slide(before: np.ndarray, after: np.ndarray) -> float:
-    """How far the needle in the tissue moved along itself, summed over its length (mm²), from its nodes (N + 1, 2)."""
+    """How far the needle in the tissue moved along itself, summed over its length (mm²), from its nodes (N + 1, 3)."""
     way = np.diff(0.5 * (before + after), axis=0)
-    length = np.hypot(*way.T)
+    length = np.linalg.norm(way, axis=1)
     along = (0.5 * (after - before)[:-1] + 0.5 * (after - before)[1:]) * way / length[:, None]
     left, right = 0.5 * (before + after)[:-1, 0], 0.5 * (before + after)[1:, 0]
     inside = np.clip(right / (right - left), 0.0, 1.0) * length
@@ -280,26 +283,26 @@ def insertion_balance(step: float, *, spacing=0.5, element=0.5, depth=40.0, fric
     done, lost, last, before = np.zeros(3), 0.0, np.zeros(6), needle.nodes
     for row in commands(1.0, depth, step):
         needle.step(row)
-        nodes, forces = needle.nodes, np.array([*needle._s[_FORCES], *-needle._work[[rd.GX, rd.GY], -1]])
-        shares = 0.5 * (forces + last) * [*row[:4], *(nodes - before)[-1]]
+        nodes, forces = needle.nodes, np.append(holding(needle), -needle.segments["force"][-1, :2])
+        shares = 0.5 * (forces + last) * [*row[[DB_X, DB_Y, DB_THETA, DG_Y]], *(nodes - before)[-1, :2]]
         done += [shares[:3].sum(), shares[3], shares[4:].sum()]
         lost += 1e-3 * friction * slide(before, nodes)
         last, before = forces, nodes
-    s, w, rod = move(needle)._s, needle._work, needle.rod
-    bends = np.full(needle._theta.size, rod.segment)
+    s, w, rod = move(needle).state, needle.segments[:-1], needle.rod
+    bends = np.full(w.size, rod.segment)
     bends[0] *= 0.5
     return Balance(
         *done.tolist(),
-        needle=float((w[rd.MOMENT, :-1] ** 2 * bends).sum() / (2.0 * rod.stiffness)),
+        needle=float((w["moment"][:, 2] ** 2 * bends).sum() / (2.0 * rod.stiffness)),
         tissue=needle.strain_energy,
-        spring=float(s[rd.GUIDE_FORCE] ** 2 / (2.0 * rod.guide_stiffness)),
+        spring=float(s["guide_force"][0] ** 2 / (2.0 * rod.guide_stiffness)),
         friction=lost,
     )
 
 
 def inside_length(needle) -> float:
     """Arc length (mm) of the needle in the tissue."""
-    x, _ = needle.nodes.T
+    x = needle.nodes[:, 0]
     arc = needle.rod.segment * np.arange(x.size)
     return float(arc[-1] - np.interp(0.0, x, arc))
 
@@ -334,6 +337,7 @@ class Found:
     second: np.ndarray  # largest distances from the second solver (x, y, θ) by ELEMENTS
     rubbed: list[float]  # the same with friction at the end, for one and two parts of a step
     refined: dict[str, np.ndarray]  # distances (mm) from the finest, by SIZES
+    space: space_validation.Space
 
 
 def compute() -> Found:
@@ -350,6 +354,7 @@ def compute() -> Found:
         second=second_solver(),
         rubbed=[rubbed(parts) for parts in (1, 2)],
         refined={name: refined(name) for name in SIZES},
+        space=space_validation.compute(),
     )
 
 
@@ -357,7 +362,7 @@ def cantilevers(load: float) -> tuple[np.ndarray, np.ndarray]:
     """Errors of the tip by SEGMENTS, and the nodes of the finest over the length."""
     errors = np.array([cantilever_error(load, n) for n in SEGMENTS.tolist()])
     bench = Bench(length=100.0, segments=int(SEGMENTS[-1])).loaded(y=load * 1000.0 / 100.0**2)
-    return errors, bench.nodes / 100.0
+    return errors, bench.nodes[:, :2] / 100.0
 
 
 def model_gaps(layers: int, element: float) -> list[Gap]:

@@ -12,12 +12,12 @@ EVERYTHING = """
 import flexneedle
 from flexneedle.control.methods import METHODS
 from flexneedle.mechanics import insertion, shape
-from flexneedle.rig.phantom import rod
+from flexneedle.rig.phantom import equilibrium
 from flexneedle.rig.phantom.plants import PLANTS
 from flexneedle.rig.kernels import all_compiled, compile_kernels
 
 def signatures():
-    found = {name: value for part in (insertion, shape, rod) for name, value in vars(part).items()}
+    found = {name: value for part in (insertion, shape, equilibrium) for name, value in vars(part).items()}
     return {name: len(value.signatures) for name, value in found.items() if hasattr(value, "signatures")}
 
 compile_kernels()

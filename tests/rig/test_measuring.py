@@ -13,7 +13,7 @@ from flexneedle.types import VISIBLE, Frame, Measurement, SensorReading
 OK = "ok"
 
 SCENARIO = flexneedle.load_scenario("phantom")
-TIP = (30.0, 1.0)
+TIP = (30.0, 1.0, 0.0)
 RATE = 40.0
 STALE_AFTER = SCENARIO.control.stale_after_s
 
@@ -48,8 +48,8 @@ class Recorded:
 
 def measurement(time, *, measured=True, indicator=0.02):
     references = {f"ref{k}": SensorReading((0.0, 0.0, 0.0), indicator=indicator) for k in (1, 2, 3)}
-    tip = SensorReading((*TIP, time)) if measured else SensorReading(None, status="out of volume")
-    x, y, z = (*TIP, 0.0) if measured else (None, None, None)
+    tip = SensorReading((*TIP[:2], time)) if measured else SensorReading(None, status="out of volume")
+    x, y, z = TIP if measured else (None, None, None)
     return Measurement(time, x, y, z, Frame(time, round(time * RATE), {"tip": tip, **references}))
 
 
@@ -201,7 +201,7 @@ class Refitted(AtRest):
     tip_sd = 1.0
 
     def tip_at(self, _time):
-        return TIP[0] + (1.0 if self.used else 0.0), TIP[1]
+        return TIP[0] + (1.0 if self.used else 0.0), *TIP[1:]
 
     def observe(self, measurements):
         return Refitted(self.used + len(measurements))
@@ -211,7 +211,7 @@ def test_a_correction_of_the_estimate_at_rest_does_not_make_a_noise_free_tracker
     estimate, monitor = Refitted(), Monitor(SCENARIO.monitor)
     for k in range(8):
         observation = observe(
-            SCENARIO, estimate, monitor, k / RATE - 0.2, k / RATE, Recorded(Measurement(k / RATE, *TIP))
+            SCENARIO, estimate, monitor, k / RATE - 0.2, k / RATE, Recorded(Measurement(k / RATE, *TIP[:2]))
         )
         assert str(observation.verdict) == OK
         estimate, monitor = observation.estimate, observation.monitor

@@ -15,21 +15,22 @@ from flexneedle.rig.phantom.draw import Truth
 from flexneedle.rig.phantom.phantom import Phantom
 from flexneedle.rig.phantom.plants import PLANTS
 from flexneedle.rig.virtual import Seeds, virtual_rig
+from flexneedle.types import STILL
 from synthetic import make_plan
 
 PHANTOM = flexneedle.load_scenario("phantom")
 
 LAB = """
-from flexneedle import Decision, Method
+from flexneedle import Control, Decision, Method
 from flexneedle.rig.phantom.phantom import Phantom
 
 def decide(task, memory, estimate, rng):
-    return Decision((1.0, 0.0, 0.0, 0.0, -1), "on"), memory
+    return Decision(Control(db_x=1.0), "on"), memory
 
 def one(truth):
     return None
 
-def nothing(truth, bevel):
+def nothing(truth, roll):
     return {}
 
 def blind(scenario, phantom, rng):
@@ -90,7 +91,7 @@ def test_parts_are_found_by_name_module_and_object():
         (
             "controller",
             "lab_parts:FIEN",
-            "lab_parts has no FIEN; public names: Decision, Method, Phantom, decide,",
+            "lab_parts has no FIEN; public names: Control, Decision, Method, Phantom, decide,",
         ),
         (
             "controller",
@@ -103,8 +104,8 @@ def test_parts_are_found_by_name_module_and_object():
         ("controller", "lab_exits:METHOD", "lab_exits cannot be imported: SystemExit: 3"),
         ("controller", "lab_wrong:METHOD", "name = 'My PID': a controller's name must be like"),
         ("phantom", "jelly", "must be one of exact, model, or module:NAME of your own"),
-        ("phantom", "lab_parts:NUMBER", "is an int, not a function of (truth, bevel)"),
-        ("phantom", "lab_parts:one", "must be a function of (truth, bevel): too many positional arguments"),
+        ("phantom", "lab_parts:NUMBER", "is an int, not a function of (truth, roll)"),
+        ("phantom", "lab_parts:one", "must be a function of (truth, roll): too many positional arguments"),
         ("tracker", "eye", "must be one of scenario, or module:NAME of your own"),
         ("tracker", "lab_parts:one", "must be a function of (scenario, phantom, rng): too many"),
     ],
@@ -124,20 +125,20 @@ def test_two_controllers_with_the_same_name_are_rejected(capsys):
 
 def test_a_factory_that_returns_no_plant_is_rejected():
     with pytest.raises(
-        InputError, match="phantom = <lambda>: dict is not a plant, missing: step, tip, bevel,"
+        InputError, match="phantom = <lambda>: dict is not a plant, missing: step, tip, roll,"
     ):
-        Phantom(Truth(PHANTOM), 1, lambda _truth, _bevel: {})
+        Phantom(Truth(PHANTOM), 0.0, lambda _truth, _roll: {})
 
 
 def test_a_plant_whose_tip_is_not_a_pose_is_rejected():
     class Flat:
-        step = bevel = strain_energy = least_stretch = converged = 0
+        step = roll = strain_energy = least_stretch = converged = 0
 
-        def __init__(self, _truth, _bevel):
+        def __init__(self, _truth, _roll):
             self.tip = (0.0, 0.0)
 
-    with pytest.raises(InputError, match="phantom = Flat: tip must be three numbers"):
-        Phantom(Truth(PHANTOM), 1, Flat)
+    with pytest.raises(InputError, match="phantom = Flat: tip must be five numbers"):
+        Phantom(Truth(PHANTOM), 0.0, Flat)
 
 
 def test_a_factory_that_returns_no_tracker_is_rejected():
@@ -145,10 +146,10 @@ def test_a_factory_that_returns_no_tracker_is_rejected():
     with pytest.raises(
         InputError, match=r"^tracker = <object .*>: must be an object with read, status; see "
     ):
-        virtual_rig(PHANTOM, 1, seeds, "model", tracker=lambda *_: object())
+        virtual_rig(PHANTOM, 0.0, seeds, "model", tracker=lambda *_: object())
 
 
-@pytest.mark.parametrize("answer", [None, (1, 2), (1.0, 0.0, 0.0, 0.0, -1)])
+@pytest.mark.parametrize("answer", [None, (1, 2), STILL])
 def test_a_return_value_that_is_not_a_decision_is_rejected(answer):
     own = replace(METHODS["open-loop"], name="odd", decide=lambda *_: answer)
     with pytest.raises(
@@ -157,8 +158,10 @@ def test_a_return_value_that_is_not_a_decision_is_rejected(answer):
         flexneedle.insert(PHANTOM, make_plan(), controller=own, phantom="model", force=True)
 
 
-def test_a_command_has_five_numbers():
+@pytest.mark.parametrize("command", [(1.0, 0.0), (1.0, 0.0, 0.0, 0.0, -1), (*STILL, 0.0), 1.0, "forward"])
+def test_a_command_has_nine_columns(command):
     with pytest.raises(
-        InputError, match=r"command = \(1.0, 0.0\): must have 5 numbers, db_x, db_y, db_theta, dg_y, "
+        InputError, match=r": must be a Control, or its 9 columns db_x, db_y, db_z, db_theta, "
     ):
-        flexneedle.Decision((1.0, 0.0), "short")
+        flexneedle.Decision(command, "short")
+    assert flexneedle.Decision(list(STILL), "still").command == STILL

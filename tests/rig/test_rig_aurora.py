@@ -12,10 +12,10 @@ from emulated import emulated, read_until, until
 from flexneedle.rig.devices.aurora.tracker import Aurora
 from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.loop import run
-from flexneedle.rig.tracking.plane import InPlane
+from flexneedle.rig.tracking.stage import OnStage
 from flexneedle.rig.virtual import Rig, to_stage
+from flexneedle.types import STILL
 
-STILL = (0.0, 0.0, 0.0, 0.0, -1)
 # The emulated tip does not follow the needle: all checks of its position are disabled.
 ANYWHERE = {
     "control.innovation_limit_mm": 1e4,
@@ -44,7 +44,7 @@ def test_the_needle_moves_while_frames_arrive_and_is_held_without_replies():
     with emulated("--fault", "silence@5:60") as path, Aurora(path, clock) as tracker:
         read_until(tracker, lambda frames: frames and all(r.position for r in frames[-1].readings.values()))
         read_until(tracker, lambda frames: len(frames) >= 40)
-        tip = InPlane(tracker, to_stage(None))
+        tip = OnStage(tracker, to_stage(None))
         rig = Rig(
             clock, Motors(clock), tip
         )  # force: the tip does not follow the motors, so that a miss is predicted

@@ -12,9 +12,10 @@ from flexneedle.rig.tracking.field.poses import reference_poses
 from flexneedle.rig.tracking.field.room import Room
 from flexneedle.rig.tracking.field.sensors import indicator, noiseless
 from flexneedle.rig.tracking.placement import placed_references
-from flexneedle.rig.tracking.plane import InPlane
+from flexneedle.rig.tracking.stage import OnStage
 from flexneedle.rig.virtual import Rig, Seeds, to_stage, virtual_rig, virtual_room
-from flexneedle.types import Frame, SensorReading
+from flexneedle.types import STILL as AT_REST
+from flexneedle.types import Control, Frame, SensorReading
 from rooms import STILL, shipped
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -38,7 +39,7 @@ def inserted(plan):
             scenario = scenario.with_values(plate)
         phantom, tracker, control, room = np.random.SeedSequence(seed).spawn(4)
         rig = virtual_rig(
-            scenario, plan.bevel, Seeds(phantom, tracker, room), "model", plate_distance_at=plate_at
+            scenario, plan.roll, Seeds(phantom, tracker, room), "model", plate_distance_at=plate_at
         )
         return run(scenario, plan, rig, np.random.default_rng(control))
 
@@ -79,8 +80,8 @@ def test_a_passing_plate_holds_the_needle_while_it_is_near(inserted):
     assert 7.3 < field[-1].time < 8.1
     held = [period for period in done.periods if field[0].time < period.time <= field[-1].time]
     assert {period.decision for period in held} == {"held"}
-    assert {period.applied for period in held} == {(0.0, 0.0, 0.0, 0.0, -1)}
-    assert {period.innovation for period in held} == {(0.0, 0.0)}  # no correction in a distorted field
+    assert {period.applied for period in held} == {AT_REST}
+    assert {period.innovation for period in held} == {(0.0, 0.0, 0.0)}  # no correction in a distorted field
     assert done.outcome == "done"
     assert done.held_s == pytest.approx(field[-1].time - field[0].time, abs=0.1)
 
@@ -111,7 +112,7 @@ def interrupted(plan, span, calls, **values):
     )
     phantom, tracker, control, room = np.random.SeedSequence(3).spawn(4)
     seeds = Seeds(phantom, tracker, room)
-    rig = virtual_rig(scenario, plan.bevel, seeds, "model", plate_distance_at=passing)
+    rig = virtual_rig(scenario, plan.roll, seeds, "model", plate_distance_at=passing)
     rig = replace(rig, tracker=Interrupted(rig.tracker, rig.clock, span, calls))
     return run(scenario, plan, rig, np.random.default_rng(control))
 
@@ -146,13 +147,13 @@ def test_nothing_moves_before_the_field_was_checked(inserted):
     for environment, verdict in (("ideal", "ok"), ("noisy", "field distorted")):
         first = inserted(environment).periods[0]
         assert first.time == 0.0
-        assert first.applied == (0.0, 0.0, 0.0, 0.0, -1)
+        assert first.applied == AT_REST
         assert len(first.readings) == 40
         assert str(first.verdict).startswith(verdict)
     held = inserted("noisy")
     verdicts = {str(one.verdict).split(":")[0] for period in held.periods for one in period.readings}
     assert verdicts == {"field distorted", "missing"}  # none is good
-    assert {period.applied for period in held.periods} == {(0.0, 0.0, 0.0, 0.0, -1)}
+    assert {period.applied for period in held.periods} == {AT_REST}
     assert held.periods[-1].true_tip == held.periods[0].true_tip
 
 
@@ -181,7 +182,7 @@ def rig_of(**values):
             **values,
         }
     )
-    return virtual_rig(scenario, 1, Seeds(*map(np.random.SeedSequence, (1, 2, 3))), "model")
+    return virtual_rig(scenario, 0.0, Seeds(*map(np.random.SeedSequence, (1, 2, 3))), "model")
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -194,8 +195,8 @@ def test_the_bias_of_the_scenario_also_applies_in_an_environment(seed):
             "phantom.tracker_bias_mm": 0.3,
         }
     )
-    rig = virtual_rig(scenario, 1, Seeds(*map(np.random.SeedSequence, (seed, 2, 3))), "model")
-    rig.driver.apply((1.0, 0.0, 0.0, 0.2, -1), 0.2)
+    rig = virtual_rig(scenario, 0.0, Seeds(*map(np.random.SeedSequence, (seed, 2, 3))), "model")
+    rig.driver.apply(Control(db_x=1.0, dg_y=0.2), 0.2)
     sample = rig.tracker.read()[-1]
     error = np.array((sample.x, sample.y)) - rig.truth().tip[:2]
     assert np.hypot(*error) == pytest.approx(0.3)
@@ -205,7 +206,7 @@ def test_the_bias_of_the_scenario_also_applies_in_an_environment(seed):
 def test_the_tip_is_measured_by_a_sensor_behind_it(offset):
     rig = rig_of(**{"tracker.tip_offset_mm": offset})
     for _ in range(30):
-        rig.driver.apply((1.0, 0.0, 0.0, 0.2, -1), 0.2)
+        rig.driver.apply(Control(db_x=1.0, dg_y=0.2), 0.2)
     sample = rig.tracker.read()[-1]
     np.testing.assert_allclose((sample.x, sample.y), rig.truth().tip[:2], atol=1e-9)
     sensor = np.array(sample.frame.readings["tip"].position)
@@ -277,7 +278,7 @@ class Bench:
 
 def on_bench(plan, readings_at, status="unplugged", **values):
     bench = Bench(readings_at, status)
-    rig = Rig(bench, bench, InPlane(bench, to_stage(None)))
+    rig = Rig(bench, bench, OnStage(bench, to_stage(None)))
     return run(PHANTOM.with_values(values), plan, rig, np.random.default_rng(0))
 
 
@@ -325,7 +326,7 @@ def test_nothing_moves_before_the_first_frame(plan):
 
     done = on_bench(plan, readings_at, status="connecting")
     assert str(done.periods[0].verdict) == "missing: no reading (connecting)"
-    assert {period.applied for period in done.periods} == {(0.0, 0.0, 0.0, 0.0, -1)}
+    assert {period.applied for period in done.periods} == {AT_REST}
     assert done.reason.startswith("held for 10.0")
     kinds = list(dict.fromkeys(str(period.verdict).split(":")[0] for period in done.periods))
     assert kinds == ["missing", "field not known", "field distorted"]

@@ -6,24 +6,25 @@ import numpy as np
 import pytest
 
 from flexneedle.rig.virtual import Seeds, virtual_rig, virtual_room
+from flexneedle.types import THETA, Control
 from insertions import PHANTOM
 
 
 def rig_of(seed=4, phantom="exact", **values):
     scenario = PHANTOM.with_values({key.replace("__", "."): value for key, value in values.items()})
-    return virtual_rig(scenario, 1, Seeds(*map(np.random.SeedSequence, (seed, 5, 6))), phantom)
+    return virtual_rig(scenario, 0.0, Seeds(*map(np.random.SeedSequence, (seed, 5, 6))), phantom)
 
 
 def test_the_virtual_rig_depends_on_its_seed():
     rig, again, other = rig_of(), rig_of(), rig_of(seed=3)
     for one in (rig, again, other):
-        one.driver.apply((1.0, 0.0, 0.0, 0.0, -1), 0.2)
+        one.driver.apply(Control(db_x=1.0), 0.2)
     assert str(rig.truth()) == str(again.truth()) != str(other.truth())
     at_rest = rig.tracker.read()
     assert at_rest == again.tracker.read()
     assert len(at_rest) == 9  # the first was available at the start
     tip = rig.truth().tip[:2]
-    rig.driver.apply((1.0, 0.0, 0.0, 0.0, -1), 0.2)
+    rig.driver.apply(Control(db_x=1.0), 0.2)
     samples = rig.tracker.read()
     assert len(samples) == 8
     error = np.array([(s.x, s.y) for s in samples])[-1] - tip  # of the previous period
@@ -35,7 +36,7 @@ def test_measurements_are_plain_numbers(environment):
     """So that they print as numbers: before the first motion, in motion and at rest."""
     rig = rig_of(**{"tracker__environment": environment} if environment else {})
     samples = [*rig.tracker.read()]
-    rig.driver.apply((1.0, 0.0, 0.0, 0.0, -1), 0.2)
+    rig.driver.apply(Control(db_x=1.0), 0.2)
     rig.clock.wait(0.2)
     samples += rig.tracker.read()
     measured = [sample for sample in samples if sample.x is not None]
@@ -73,7 +74,7 @@ def test_the_plant_is_the_chosen_one():
     for name in ("exact", "model"):
         rig = rig_of(phantom=name)
         for _ in range(35):
-            rig.driver.apply((1.0, 0.0, 0.0, 0.1, -1), 0.2)
+            rig.driver.apply(Control(db_x=1.0, dg_y=0.1), 0.2)
         tips[name] = rig.truth().tip
     distance = np.hypot(*(tips["exact"] - tips["model"])[:2])
     assert 1e-3 < distance < 2.0  # due to imperfections such as an initial bend of 0.5 mm
@@ -87,7 +88,7 @@ def test_references_are_placed_with_the_start_position_of_a_moving_plate():
     def distance_at(time):
         return 400.0 if time <= 0.0 else 30.0
 
-    frame = virtual_rig(scenario, 1, seeds, plate_distance_at=distance_at).tracker.read()[0].frame
+    frame = virtual_rig(scenario, 0.0, seeds, plate_distance_at=distance_at).tracker.read()[0].frame
     (_, far), (_, near) = (virtual_room(scenario, seeds.room, distance_at(time)) for time in (0.0, 1.0))
     for name, pose in far.items():
         measured = np.array(frame.readings[name].position)
@@ -99,8 +100,8 @@ def test_the_z_axis_of_the_tip_sensor_is_along_the_needle():
     """With a lateral guide motion, so that the needle is inclined."""
     rig = rig_of(tracker__environment="ideal", tracker__tip_offset_mm=8.0)
     for _ in range(30):
-        rig.driver.apply((1.0, 0.0, 0.0, 0.3, -1), 0.2)
-    theta = rig.truth().tip[2]
+        rig.driver.apply(Control(db_x=1.0, dg_y=0.3), 0.2)
+    theta = rig.truth().tip[THETA]
     w, x, y, z = rig.tracker.read()[-1].frame.readings["tip"].orientation
     axis = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z)
     assert abs(theta) > 0.05

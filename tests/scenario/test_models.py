@@ -21,12 +21,22 @@ PHANTOM = load_scenario("phantom")
 
 
 def test_the_preset_is_the_two_layer_phantom():
-    assert PRESETS.names() == ["phantom"]
+    assert PRESETS.names() == ["phantom", "phantom3d"]
     assert PHANTOM.name == "Two-layer tissue phantom"
     assert [layer.shear_modulus_kpa for layer in PHANTOM.tissue] == [1.82, 3.63]
     assert PHANTOM.setup.guide_to_skin_mm == 41.0
-    assert PHANTOM.target.position == (40.0, 5.0)
+    assert PHANTOM.target.position == (40.0, 5.0, 0.0)
     assert PHANTOM.phantom.shear_modulus_factor == (0.6, 1.6)
+
+
+def test_the_phantom_in_space_is_the_same_with_two_axes_and_a_target_off_both():
+    changes = {
+        "name": "Two-layer tissue phantom in space",
+        "setup.axes": 2,
+        "target.lateral_mm": 4.0,
+        "target.lateral_z_mm": 3.0,
+    }
+    assert checked(load_scenario("phantom3d")) == checked(PHANTOM).with_values(changes)
 
 
 def test_a_minimal_file_takes_its_settings_from_the_phantom(minimal_text, scenario_file):
@@ -197,12 +207,20 @@ def test_a_target_within_reach_passes(target):
             "target.lateral_mm = -15.1: must be at most 15 in size, the lateral travel of the guide",
         ),
         ((40, math.inf), "target.lateral_mm = inf: must be at most 15 in size"),
+        ((40, 0, -3.0), "target.lateral_z_mm = -3.0: must be 0 with setup.axes = 1"),
     ],
 )
 def test_a_target_out_of_reach_is_refused(target, message):
     with pytest.raises(ScenarioError) as caught:
         check_target(PHANTOM, *target)
     assert str(caught.value).startswith(message)
+
+
+def test_in_space_a_target_lies_as_far_aside_on_either_axis():
+    scenario = PHANTOM.with_values({"setup.axes": 2, "target.lateral_z_mm": -15.0})
+    assert scenario.target.position == (40.0, 5.0, -15.0)
+    with pytest.raises(ScenarioError, match=r"target\.lateral_z_mm = -15\.1: must be at most 15 in size"):
+        check_target(scenario, 40, 7, -15.1)
 
 
 def test_without_a_guide_a_target_lies_as_far_aside_as_the_base_travels():

@@ -40,6 +40,13 @@ def changed(key, value):
     return values
 
 
+def test_a_target_out_of_reach_from_the_entry_is_told():
+    """With the range around the needle's axis at its depth, the free part included."""
+    entry = {"lateral_mm": 20.0, "slope_mrad": 25.0, "free_radius_mm": 0.5}
+    (line,) = problems({**PHANTOM.values(), "entry": entry})
+    assert line == "target.lateral_mm = 5.0: must be from 5.5 to 36.5, in reach of the guide from the entry"
+
+
 @pytest.mark.parametrize(("key", "value", "rule"), RULES, ids=lambda part: str(part)[:30])
 def test_a_broken_rule_is_told_in_one_line(key, value, rule):
     (line,) = problems(changed(key, value))
@@ -227,7 +234,7 @@ def test_a_byte_order_mark_and_windows_line_ends_are_accepted(minimal_text, scen
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("phantm", "phantm: no such file, and no such preset (choices: phantom)"),
+        ("phantm", "phantm: no such file, and no such preset (choices: phantom, phantom3d)"),
         ("", '"": is a directory'),
         ("/", "/: is a directory, not a scenario file"),
         ("a\0b", "a\\x00b: cannot be read"),

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from flexneedle import load_scenario
 from flexneedle.errors import ScenarioError
-from flexneedle.scenario.worlds import CASES, LARGEST_WORLD, structural, world, world_name
+from flexneedle.scenario.worlds import CASES, LARGEST_WORLD, PLANE, RIGS, structural, world, world_name
 
 PRESET = load_scenario("phantom").values()
 NUMBERS = st.integers(0, LARGEST_WORLD)
@@ -22,7 +22,9 @@ many_worlds = hypothesis_settings(deadline=None, derandomize=True, max_examples=
 def digest(number):
     values = world(number).values()
     for layer in values["tissue"]:
-        assert layer.pop("law") == "ogden"  # a key that is not drawn, and younger than the published numbers
+        assert layer.pop("law") == "ogden"  # keys that are not drawn, and younger than the published numbers
+    space = [values["setup"].pop(key) for key in ("axes", "guide_axes", "rotation")]
+    assert [*space, values["target"].pop("lateral_z_mm")] == [1, 2, "free", 0.0]
     text = json.dumps({name: values[name] for name in (*DRAWN, "contact")}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -101,7 +103,8 @@ def test_a_perfect_world_has_no_mismatch_and_the_same_mesh(number):
         key
         for key in world(number).flat()
         if key.startswith("phantom.")
-        and key not in ("phantom.variation_length_mm", "phantom.tracker_bias_mm")  # 0 in the preset
+        and key
+        not in ("phantom.variation_length_mm", "phantom.tracker_bias_mm", "phantom.rotation_friction_mn")
         and not key.endswith(("spacing_mm", "element_mm", "step_mm"))
         and ".structure." not in key
     }
@@ -156,13 +159,25 @@ def test_names_of_worlds_are_short_and_the_real_one_needs_no_case():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("world:", "world:: must be world:NUMBER or world:NUMBER:CASE, cases: perfect, real, structure"),
+        (
+            "world:",
+            "world:: must be world:NUMBER, with :CASE, :RIG or :CASE:RIG after it, cases: perfect, real, structure, ",
+        ),
         ("world:-1", "world:-1: must be world:NUMBER"),
         ("world:1.5", "world:1.5: must be world:NUMBER"),
         ("world:7:", "world:7:: must be world:NUMBER"),
         ("world:7\n", "world:7\\n: must be world:NUMBER"),
         ("world:1000000001", "world = 1000000001: must be a whole number from 0 to 1000000000"),
         ("world:7:ideal", "world_case = 'ideal': must be one of perfect, real, structure"),
+        ("world:7:two-axes:real", "world:7:two-axes:real: must be world:NUMBER"),
+        (
+            "world:7:no-guide",
+            "world 7 has a guide: its rigs are plane, two-axes, two-axes-half-turns, one-axis",
+        ),
+        (
+            "world:15:perfect:one-axis",
+            "world 15 has no guide: its rigs are plane, no-guide, no-guide-half-turns",
+        ),
     ],
 )
 def test_a_name_of_no_world_is_refused_in_one_line(name, message):
@@ -170,3 +185,66 @@ def test_a_name_of_no_world_is_refused_in_one_line(name, message):
         load_scenario(name)
     (line,) = caught.value.problems
     assert line.startswith(message)
+
+
+def rigs(number):
+    """The rigs in space that a world can have."""
+    if world(number).setup.has_guide:
+        return ("two-axes", "two-axes-half-turns", "one-axis", "one-axis-half-turns")
+    return ("no-guide", "no-guide-half-turns")
+
+
+@given(number=NUMBERS, case=st.sampled_from(CASES[:2]))
+@many_worlds
+def test_a_world_in_space_differs_in_driver_and_direction_of_its_target(number, case):
+    """The offset has the size that it has in the plane, but for its rounding."""
+    flat = world(number, case)
+    for rig in rigs(number):
+        found = world(number, case, rig)
+        changed = {key for key, value in found.flat().items() if flat.flat().get(key) != value}
+        assert changed <= {
+            *("setup.axes", "setup.guide_axes", "setup.rotation"),
+            *("target.lateral_mm", "target.lateral_z_mm"),
+        }
+        assert found.setup.axes == 2
+        assert found.setup.half_turns == rig.endswith("half-turns")
+        assert found.setup.moved_guide_axes == {"two": 2, "one": 1, "no-": 0}[rig[:3]]
+        size = np.hypot(found.target.lateral_mm, found.target.lateral_z_mm)
+        assert size == pytest.approx(abs(flat.target.lateral_mm), abs=1e-3)
+
+
+@given(number=NUMBERS)
+@many_worlds
+def test_where_nothing_steers_along_z_the_target_is_in_the_plane_of_the_bevel(number):
+    for rig in ("one-axis-half-turns", "no-guide-half-turns"):
+        if rig in rigs(number):
+            assert world(number, "real", rig).target == world(number).target
+
+
+def test_every_driver_has_the_same_target_and_directions_are_uniform():
+    angles = []
+    for number in range(400):
+        *free, _ = (world(number, "real", rig) for rig in rigs(number))
+        targets = {found.target.position for found in free}
+        assert len(targets) == 1
+        _, y, z = targets.pop()
+        angles.append(np.arctan2(z, y))
+    counts, _ = np.histogram(angles, 4, (-np.pi, np.pi))
+    np.testing.assert_allclose(counts, 100, atol=35)
+
+
+@given(number=NUMBERS, case=st.sampled_from(CASES[:2]))
+@many_worlds
+def test_a_world_in_space_is_found_by_its_name(number, case):
+    for rig in rigs(number):
+        assert load_scenario(world_name(number, case, rig)) == world(number, case, rig)
+
+
+def test_names_of_worlds_in_space():
+    assert world_name(3, "real", "one-axis") == "world:3:one-axis"
+    assert world_name(3, "perfect", "two-axes-half-turns") == "world:3:perfect:two-axes-half-turns"
+    assert world(3, "real", PLANE) == world(3)
+    assert load_scenario("world:3:plane") == world(3)
+    assert RIGS[0] == PLANE
+    with pytest.raises(ScenarioError, match="world_rig = 'three-axes': must be one of plane, two-axes"):
+        world(3, "real", "three-axes")

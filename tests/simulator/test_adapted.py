@@ -1,14 +1,16 @@
 """Simulators with estimated constants: a bent needle in closed form, other tissue, and insertions carried out again."""
 
+import math
 import pickle
 
 import numpy as np
 import pytest
 
-from flexneedle import Control, Simulator, load_scenario
+from flexneedle import Control, Simulator, controls, load_scenario
 from flexneedle.mechanics.model import Adaptation
+from flexneedle.types import ROLL, THETA
 from reference import closed_forms as exact
-from reference.cases import EI, FOUNDATION, LENGTH_MM, insert_to, long_beam, numbers, repeat
+from reference.cases import EI, FOUNDATION, LENGTH_MM, MIRROR, insert_to, long_beam, numbers, repeat
 from reference.tight import tight
 
 PHANTOM = load_scenario("phantom")
@@ -23,56 +25,56 @@ def adaptation(stiffness=(1.0, 1.0), shift=None, **others):
     return Adaptation(still if shift is None else np.array(shift), np.array(stiffness), **others)
 
 
-def bent(scenario, bend, bevel=1):
+def bent(scenario, bend, roll=0.0):
     """The needle at the start, with its natural bend."""
     simulator = tight(scenario, slide=1e-10).adapted(adaptation(bend=bend))
-    return simulator, simulator.step(simulator.start(bevel), Control())
+    return simulator, simulator.step(simulator.start(roll), Control())
 
 
 # ---- natural bend
 
 
 @pytest.mark.parametrize("bend", [0.5, -1.2])
-@pytest.mark.parametrize("bevel", [1, -1])
-def test_a_free_needle_is_an_arc_that_rolls_with_the_bevel(bend, bevel):
+@pytest.mark.parametrize(("roll", "bevel"), [(0.0, 1), (math.pi, -1)])
+def test_a_free_needle_is_an_arc_that_rolls_with_the_bevel(bend, roll, bevel):
     """y = ½κx², κ = 2w/L², in every node, unstrained; shortened by ½∫y'² = κ²L³/6."""
-    _, state = bent(BARE, bend, bevel)
+    _, state = bent(BARE, bend, roll)
     kappa = bevel * 2.0 * bend / LENGTH**2
     x = state.nodes[:, 0] - state.base[0]
     np.testing.assert_allclose(state.nodes[:, 1], 0.5 * kappa * x**2, atol=1e-11)
-    np.testing.assert_allclose(state.nodes[:, 2], kappa * x, atol=1e-13)
+    np.testing.assert_allclose(state.nodes[:, THETA], kappa * x, atol=1e-13)
     assert state.tip[1] == pytest.approx(bevel * bend, rel=1e-3)
     assert LENGTH - x[-1] == pytest.approx(kappa**2 * LENGTH**3 / 6.0, rel=1e-3)
     assert state.energy == pytest.approx(0.0, abs=1e-15)
-    assert state.reactions.base_force == pytest.approx(0.0, abs=1e-13)
+    assert state.reactions.base_force == pytest.approx((0.0, 0.0), abs=1e-13)
     assert state.converged
 
 
 def test_a_roll_of_the_bevel_mirrors_the_free_needle():
     simulator, state = bent(BARE, 0.7)
     rolled = simulator.step(state, Control(flip=True))
-    np.testing.assert_allclose(rolled.nodes, state.nodes * [1.0, -1.0, -1.0], atol=1e-10)
+    np.testing.assert_allclose(rolled.nodes, state.nodes * MIRROR, atol=1e-10)
 
 
 def test_bend_and_end_load_of_a_cantilever_add_up():
     simulator, state = bent(BARE, 0.3)
     load = 0.005
-    loaded = simulator.step(state.with_estimate(tip_load=load), Control())
+    loaded = simulator.step(state.with_estimate(tip_load=(load, 0.0)), Control())
     x = loaded.nodes[:, 0] - loaded.base[0]
     curve = exact.cantilever(x, load, STIFFNESS, x[-1]) + 0.5 * (2.0 * 0.3 / LENGTH**2) * x**2
     np.testing.assert_allclose(loaded.nodes[:, 1], curve, atol=1e-10)
     assert loaded.energy == pytest.approx(load**2 * x[-1] ** 3 / (6.0 * STIFFNESS), rel=1e-9)
 
 
-@pytest.mark.parametrize("bevel", [1, -1])
-def test_a_guide_straightens_a_bent_needle(bevel):
+@pytest.mark.parametrize(("roll", "bevel"), [(0.0, 1), (math.pi, -1)])
+def test_a_guide_straightens_a_bent_needle(roll, bevel):
     """Clamp and guide `a` apart: force −3EIκ/2a, slope κa/4 there, energy 3EIκ²a/8, and an arc beyond."""
-    _, state = bent(PHANTOM, 0.8, bevel)
+    _, state = bent(PHANTOM, 0.8, roll)
     arm, over = -41.0 - state.base[0], state.tip[0] + 41.0
     kappa = bevel * 2.0 * 0.8 / LENGTH**2
     assert state.tip[1] == pytest.approx(kappa * arm * over / 4.0 + 0.5 * kappa * over**2, rel=1e-9)
-    assert state.tip[2] == pytest.approx(kappa * arm / 4.0 + kappa * over, rel=1e-9)
-    assert state.reactions.guide_force == pytest.approx(-1.5 * STIFFNESS * kappa / arm, rel=1e-9)
+    assert state.tip[THETA] == pytest.approx(kappa * arm / 4.0 + kappa * over, rel=1e-9)
+    assert state.reactions.guide_force[0] == pytest.approx(-1.5 * STIFFNESS * kappa / arm, rel=1e-9)
     assert state.energy == pytest.approx(3.0 * STIFFNESS * kappa**2 * arm / 8.0, rel=1e-9)
 
 
@@ -80,7 +82,7 @@ def test_work_of_the_guide_is_the_energy_of_a_bent_needle():
     """dE/dg is the guide's force: exact for the mean of both ends, as the needle in air is linear."""
     simulator, one = bent(PHANTOM, 0.8)
     other = simulator.step(one, Control(dg_y=0.4))
-    mean = 0.5 * (one.reactions.guide_force + other.reactions.guide_force)
+    mean = 0.5 * (one.reactions.guide_force[0] + other.reactions.guide_force[0])
     assert abs(other.energy - one.energy) > 5e-4
     assert other.energy - one.energy == pytest.approx(0.4 * mean, rel=1e-3)
 
@@ -98,7 +100,7 @@ def test_a_bent_end_in_tissue_is_the_beam_on_springs_with_an_end_moment():
         errors.append(
             [
                 state.tip[1] / (2.0 * EI * kappa * beta**2 / FOUNDATION) - 1.0,
-                state.tip[2] / (kappa / beta) - 1.0,
+                state.tip[THETA] / (kappa / beta) - 1.0,
             ]
         )
     order = np.log2(np.abs(np.divide(errors[:-1], errors[1:])))
@@ -110,13 +112,13 @@ def test_bevel_and_bend_mirror_together():
     """Through the skin and into tissue, with guide motion and a roll."""
     here = Simulator(PHANTOM, threads=1).adapted(adaptation((1.3, 0.8), (1.6,), bevel=1.4, bend=0.6))
     states = {}
-    for side in (1, -1):
-        state = here.start(side)
+    for side, roll in ((1, 0.0), (-1, math.pi)):
+        state = here.start(roll)
         for k in range(45):
             control = Control(db_x=1.0, dg_y=0.05 * side, flip=k == 36)
             state = here.step(state, control)
         states[side] = state
-    np.testing.assert_allclose(states[-1].nodes, states[1].nodes * [1.0, -1.0, -1.0], atol=1e-9)
+    np.testing.assert_allclose(states[-1].nodes, states[1].nodes * MIRROR, atol=1e-9)
     assert states[-1].strain_energy == pytest.approx(states[1].strain_energy, rel=1e-7)
 
 
@@ -137,7 +139,7 @@ def test_factors_on_modulus_and_bevel_are_those_of_another_scenario():
         one, two = adapted.step(one, control), expected.step(two, control)
     np.testing.assert_allclose(one.nodes, two.nodes, atol=1e-9)
     assert one.strain_energy == pytest.approx(two.strain_energy, rel=1e-9)
-    rows = np.tile(Control(db_x=1.0, dg_y=0.1).row(), (2, 5, 1))
+    rows = np.tile(Control(db_x=1.0, dg_y=0.1), (2, 5, 1))
     np.testing.assert_array_equal(
         adapted.rollout(one, rows).tips[0, -1], repeat(adapted, one, Control(db_x=1.0, dg_y=0.1), 5)[-1].tip
     )
@@ -146,7 +148,7 @@ def test_factors_on_modulus_and_bevel_are_those_of_another_scenario():
 def agree(one, two, atol=1e-9):
     """The same insertion, whatever the scenario is called."""
     np.testing.assert_allclose(one.nodes, two.nodes, atol=atol)
-    np.testing.assert_allclose(one.contacts.rest_y, two.contacts.rest_y, atol=atol)
+    np.testing.assert_allclose(one.contacts.rest, two.contacts.rest, atol=atol)
     assert one.strain_energy == pytest.approx(two.strain_energy, rel=1e-7)
 
 
@@ -217,26 +219,24 @@ def test_adapting_leaves_the_simulator_as_it_was():
 
 def rows_of(count):
     rng = np.random.default_rng(8)
-    rows = np.zeros((count, 5))
-    rows[:, 0], rows[:, 3] = rng.uniform(0.3, 1.0, count), rng.uniform(-0.2, 0.25, count)
-    rows[:, 4] = np.where(rng.random(count) < 0.1, 1.0, -1.0)
-    return rows
+    advance, guide = rng.uniform(0.3, 1.0, count), rng.uniform(-0.2, 0.25, count)
+    return controls(count, db_x=advance, dg_y=guide, roll=np.where(rng.random(count) < 0.1, np.pi, 0.0))
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.5])
 def test_a_replay_is_repeated_steps_bit_for_bit(bend):
     """From the start and from the midst."""
     simulator, rows = Simulator(PHANTOM, threads=1), rows_of(80)
-    assert (rows[:, 4] > 0).sum() > 3
+    assert (rows[:, ROLL] > 0).sum() > 3
     estimated = adaptation(
         (1.2, 0.7), (1.3,), cell=2.5, variation=np.linspace(0.5, 1.5, 12), bevel=1.4, bend=bend
     )
     adapted = simulator.adapted(estimated)
-    state = simulator.start().with_estimate(base_y=0.3, base_turn=-1e-3)
+    state = simulator.start().with_estimate(base=(0.3, 0.0), slope=(-1e-3, 0.0))
     for first, last in ((0, 50), (50, 80)):
         after, tips = adapted.replay(state, rows[first:last])
         for k in range(first, last):
-            state = adapted.step(state, Control.from_row(rows[k]))
+            state = adapted.step(state, Control.of(rows[k]))
             np.testing.assert_array_equal(tips[k - first], state.tip)
         assert after == state
         assert after.strain_energy == state.strain_energy
@@ -257,7 +257,7 @@ def test_a_replay_changes_neither_state_nor_controls():
 
 def test_a_replay_takes_steps_longer_than_a_command():
     simulator = Simulator(PHANTOM, threads=1)
-    state, tips = simulator.replay(simulator.start(), [[20.0, 0.0, 0.0, 1.0, -1.0]])
+    state, tips = simulator.replay(simulator.start(), [Control(db_x=20.0, dg_y=1.0)])
     assert state.converged
     np.testing.assert_array_equal(tips[0], state.tip)
     assert tips[0, 0] == pytest.approx(-8.5, abs=0.01)

@@ -6,6 +6,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from flexneedle import Control, Simulator, load_scenario
 from flexneedle.errors import CommandError
+from flexneedle.types import THETA, X, Y
 from reference.cases import assert_same_curve, insert_to, repeat
 
 PHANTOM = load_scenario("phantom")
@@ -33,18 +34,18 @@ def test_measurement_that_agrees_changes_nothing(state):
     held, innovation = SIMULATOR.assimilate(state, state.tip[:2])
     assert_same_curve(held, state, 1e-6)
     assert innovation == pytest.approx(0.0, abs=2e-6)
-    assert held.reactions.tip_force == pytest.approx(0.0, abs=1e-8)
+    assert held.reactions.tip_force == pytest.approx((0.0, 0.0), abs=1e-8)
 
 
 def test_reaction_is_the_load_that_the_model_lacks(state):
     """With the reaction as a tip load, the needle stays where it was held without being held."""
-    x, y, _ = state.tip
+    x, y = state.tip[:2]
     held, slide = SIMULATOR.assimilate(state, (x, y + 0.4))
-    assert held.reactions.tip_force > 1e-3
-    assert state.reactions.tip_force == 0.0
+    assert held.reactions.tip_force[0] > 1e-3
+    assert state.reactions.tip_force == (0.0, 0.0)
     loaded = held.with_estimate(tip_load=held.reactions.tip_force)
     again, innovation = SIMULATOR.assimilate(loaded, (x, y + 0.4))
-    assert again.reactions.tip_force == pytest.approx(0.0, abs=1e-8)
+    assert again.reactions.tip_force == pytest.approx((0.0, 0.0), abs=1e-8)
     assert innovation == pytest.approx(slide, abs=1e-5)
     assert SIMULATOR.step(loaded, Control()).tip[1] == pytest.approx(y + 0.4, abs=2e-3)
     assert SIMULATOR.step(held, Control()).tip[1] < y + 0.3
@@ -53,7 +54,7 @@ def test_reaction_is_the_load_that_the_model_lacks(state):
 def test_channel_follows_the_measurement(state):
     """The cut of the last step is laid anew, older points keep their rest."""
     held = SIMULATOR.assimilate(state, np.add(state.tip[:2], [0.0, 0.3])).state
-    moved = held.contacts.rest_y - state.contacts.rest_y
+    moved = (held.contacts.rest - state.contacts.rest)[:, 0]
     assert moved[-1] > 0.1
     assert not moved[:-1].any()
 
@@ -61,23 +62,23 @@ def test_channel_follows_the_measurement(state):
 @pytest.mark.parametrize("x", [-80.0, -20.0, 3.2, 10.5, 25.0])
 def test_measured_points_lie_on_the_mesh(state, x):
     """Contacts next to a laterally displaced point follow it; one far from it pulls the needle."""
-    curve = CubicHermiteSpline(*state.nodes.T)
+    curve = CubicHermiteSpline(*state.nodes.T[[X, Y, THETA]])
     y = float(curve(x)) + 0.3
     held = SIMULATOR.assimilate(state, state.tip[:2], [(x, y)]).state
     assert held.converged
     contacts = held.contacts
     beside = np.abs(contacts.x - x) < 0.51
-    np.testing.assert_allclose(contacts.y[beside], y, atol=0.05)
+    np.testing.assert_allclose(contacts.position[beside, 0], y, atol=0.05)
     assert np.abs(held.nodes - state.nodes)[:, 1].max() > 0.1
 
 
 @pytest.mark.parametrize("x", [-80.0, -20.0, 3.2, 15.3])
 def test_nodes_pass_through_measured_points(state, x):
     """The needle state is the curve that met the measurement, in unloaded spans too."""
-    curve = CubicHermiteSpline(*state.nodes.T)
+    curve = CubicHermiteSpline(*state.nodes.T[[X, Y, THETA]])
     y = float(curve(x)) + 0.3
     held = SIMULATOR.assimilate(state, state.tip[:2], [(x, y)]).state
-    assert float(CubicHermiteSpline(*held.nodes.T)(x)) == pytest.approx(y, abs=1e-3)
+    assert float(CubicHermiteSpline(*held.nodes.T[[X, Y, THETA]])(x)) == pytest.approx(y, abs=1e-3)
 
 
 def test_order_of_measured_points_does_not_matter(state):
@@ -115,5 +116,5 @@ def test_a_measured_point_has_two_coordinates():
     simulator = Simulator(load_scenario("phantom"))
     state = simulator.start()
     for tip, points in ((state.tip, ()), ((0.0, 0.0, 1.0, 2.0), ()), ((-28.5, 0.0), [(1.0, 2.0, 3.0)])):
-        with pytest.raises(CommandError, match="must be 2, x and y in mm"):
+        with pytest.raises(CommandError, match="must be 2, x, y in mm"):
             simulator.assimilate(state, tip, points)

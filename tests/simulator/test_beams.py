@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from flexneedle import Control, Simulator, load_scenario
+from flexneedle.types import THETA, Y
 from reference import closed_forms as exact
 from reference.cases import EI, FOUNDATION, LENGTH_MM, insert_to, long_beam, repeat
 from reference.tight import tight
@@ -26,24 +27,24 @@ def free_needle(**changes):
 def test_cantilever_with_an_end_load_is_exact_to_rounding(load):
     """In every node, over the length that the shortening leaves."""
     simulator = free_needle()
-    state = simulator.step(simulator.start().with_estimate(tip_load=load), Control())
+    state = simulator.step(simulator.start().with_estimate(tip_load=(load, 0.0)), Control())
     stiffness = simulator.scenario.needle.bending_stiffness
     x, length = state.nodes[:, 0] - state.base[0], state.tip[0] - state.base[0]
     np.testing.assert_allclose(
         state.nodes[:, 1], exact.cantilever(x, load, stiffness, length), rtol=1e-12, atol=1e-15 * length
     )
     assert state.tip[1] == pytest.approx(load * length**3 / (3 * stiffness), rel=1e-13)
-    assert state.tip[2] == pytest.approx(load * length**2 / (2 * stiffness), rel=1e-13)
+    assert state.tip[THETA] == pytest.approx(load * length**2 / (2 * stiffness), rel=1e-13)
     assert state.energy == pytest.approx(load * state.tip[1] / 2, rel=1e-12)
-    assert state.reactions.base_force == pytest.approx(-load, rel=1e-12)
-    assert state.reactions.base_moment == pytest.approx(-load * length, rel=1e-12)
+    assert state.reactions.base_force[0] == pytest.approx(-load, rel=1e-12)
+    assert state.reactions.base_moment[0] == pytest.approx(-load * length, rel=1e-12)
 
 
 def test_arc_length_is_kept_to_second_order():
     """A cantilever shortens by ½∫y'² = P²L⁵/15(EI)² (equation 5)."""
     simulator = free_needle()
     load = 0.01
-    state = simulator.step(simulator.start().with_estimate(tip_load=load), Control())
+    state = simulator.step(simulator.start().with_estimate(tip_load=(load, 0.0)), Control())
     length = state.tip[0] - state.base[0]
     short = load**2 * length**5 / (15 * simulator.scenario.needle.bending_stiffness**2)
     assert short > 0.02
@@ -57,8 +58,8 @@ def test_needle_in_air_follows_base_and_guide():
     state = repeat(simulator, simulator.start(), control, 10)[-1]
     arm, overhang = -41.0 - state.base[0], state.tip[0] + 41.0
     y, turn, force = exact.guided_tip(2.0, -0.02, 4.0, arm, overhang, PHANTOM.needle.bending_stiffness)
-    np.testing.assert_allclose(state.tip[1:], [y, turn], rtol=1e-12)
-    assert state.reactions.guide_force == pytest.approx(force, rel=1e-12)
+    np.testing.assert_allclose(state.tip[[Y, THETA]], [y, turn], rtol=1e-12)
+    assert state.reactions.guide_force[0] == pytest.approx(force, rel=1e-12)
     assert state.contacts.x.size == 0
     assert state.strain_energy == 0.0
 
@@ -71,7 +72,7 @@ def test_without_tissue_effect_the_needle_is_a_free_beam():
     state = repeat(simulator, state, Control(db_y=0.1, db_theta=1e-3, dg_y=-0.3), 10)[-1]
     arm, overhang = -41.0 - state.base[0], state.tip[0] + 41.0
     y, turn, _ = exact.guided_tip(1.0, 0.01, -3.0, arm, overhang, PHANTOM.needle.bending_stiffness)
-    np.testing.assert_allclose(state.tip[1:], [y, turn], atol=1e-4)
+    np.testing.assert_allclose(state.tip[[Y, THETA]], [y, turn], atol=1e-4)
     assert state.contacts.active.sum() >= 29
 
 
@@ -84,8 +85,8 @@ def test_endless_beam_on_springs_converges_at_fourth_order():
         state = simulator.step(simulator.start(), Control(db_x=depth + 1.0))
         contacts = simulator.assimilate(state, (depth, 0.0), [(depth / 2, y0)]).state.contacts
         y = exact.endless_beam(contacts.x - depth / 2, y0, beta)
-        shape.append(np.abs(contacts.y - y).max() / y0)
-        load.append(FOUNDATION * spacing * contacts.y.sum() / (2 * FOUNDATION * y0 / beta) - 1)
+        shape.append(np.abs(contacts.position[:, 0] - y).max() / y0)
+        load.append(FOUNDATION * spacing * contacts.position[:, 0].sum() / (2 * FOUNDATION * y0 / beta) - 1)
     np.testing.assert_allclose(orders(shape), 4.0, atol=0.1)
     np.testing.assert_allclose(orders(load), 4.0, atol=0.25)
     assert shape[-1] < 1.2e-6
@@ -97,10 +98,10 @@ def loaded_free_end(depth, spacing):
     beta, load = 1 / LENGTH_MM, 1e-3 * FOUNDATION * LENGTH_MM / 2
     simulator = Simulator(long_beam(depth, spacing=spacing))
     state = simulator.step(simulator.start(), Control(db_x=depth + 1.0))
-    state = simulator.step(state.with_estimate(tip_load=load), Control())
+    state = simulator.step(state.with_estimate(tip_load=(load, 0.0)), Control())
     y = exact.free_end(0.0, load, FOUNDATION, beta)
     turn = exact.free_end_slope(load, FOUNDATION, beta)
-    return np.array([state.tip[1] / y, state.tip[2] / turn, state.energy / (load * y / 2)]) - 1
+    return np.array([state.tip[1] / y, state.tip[THETA] / turn, state.energy / (load * y / 2)]) - 1
 
 
 def test_loaded_free_end_converges_at_second_order():

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from flexneedle import Control, Simulator, load_scenario
+from flexneedle import Control, Simulator, controls, load_scenario
+from flexneedle.types import ROLL, THETA
 from reference import closed_forms as exact
 from reference.cases import EI, FOUNDATION, insert_to, long_beam, repeat
 
@@ -19,20 +20,19 @@ def straight_push(scenario, depth, step):
 
 
 def push_rows(scenario, depth, step, flip_at=None):
-    """Controls (1, m, 5) of that insertion; the bevel rolls with the step that starts at `flip_at`."""
+    """Controls (1, m, 9) of that insertion; the bevel rolls with the step that starts at `flip_at`."""
     way = depth + scenario.setup.tip_to_skin_mm
     ends = np.append(np.arange(way, 1e-9, -step), 0.0)[::-1]
-    rows = np.zeros((1, ends.size - 1, 5))
-    rows[..., 0], rows[..., 4] = np.diff(ends), -1.0
+    rows = controls(1, ends.size - 1, db_x=np.diff(ends))
     if flip_at is not None:
-        rows[0, np.argmin(np.abs(ends - scenario.setup.tip_to_skin_mm - flip_at)), 4] = 1.0
+        rows[0, np.argmin(np.abs(ends - scenario.setup.tip_to_skin_mm - flip_at)), ROLL] = np.pi
     return rows
 
 
 def path_curvature(resolution, bevel_length, bevel=0.01):
     """κ over the last 6/β of a path that is 25/β deep, on a needle 31/β long."""
     scenario = long_beam(250.0, spacing=resolution, bevel=bevel, bevel_length=bevel_length)
-    x, y, _ = straight_push(scenario, 250.0, resolution).T
+    x, y, *_ = straight_push(scenario, 250.0, resolution).T
     last = x > 190.0
     return 2 * np.polyfit(x[last] - x[last].mean(), y[last], 2)[0]
 
@@ -101,7 +101,7 @@ def test_flip_bends_the_path_to_the_other_side():
     on = repeat(simulator, state, Control(db_x=1.0), 15)[-1]
     first = simulator.step(state, Control(db_x=1.0, flip=True))
     rolled = repeat(simulator, first, Control(db_x=1.0), 14)[-1]
-    assert rolled.tip[2] < state.tip[2] < on.tip[2]
+    assert rolled.tip[THETA] < state.tip[THETA] < on.tip[THETA]
     assert rolled.tip[1] < on.tip[1] - 0.3
 
 

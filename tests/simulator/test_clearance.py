@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
-from flexneedle import Control, load_scenario
+from flexneedle import Control, controls, load_scenario
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.model import Adaptation
+from flexneedle.types import THETA
 from reference.cases import repeat
 from reference.tight import tight
 
@@ -27,7 +28,7 @@ def loose(clearance, **others):
 
 def off_centre(state):
     """Lateral position (mm) of the needle in the guide, from the guide's middle."""
-    return float(state.mesh["y"][state.mesh["x"] == GUIDE_X][0]) - state.guide
+    return float(state.mesh["y"][state.mesh["x"] == GUIDE_X][0]) - state.guide[0]
 
 
 def wall(state):
@@ -38,7 +39,7 @@ def wall(state):
 def loaded(clearance, depth, guide, base_y=0.0, base_turn=0.0):
     """States of an insertion to a depth (mm), the guide moved by 0.1 mm a step as far as `guide` (mm) in tissue."""
     simulator = loose(clearance)
-    start = simulator.start().with_estimate(base_y=base_y, base_turn=base_turn)
+    start = simulator.start().with_estimate(base=(base_y, 0.0), slope=(base_turn, 0.0))
     states = [simulator.step(start, Control())]
     states += repeat(simulator, states[-1], Control(db_x=1.0), int(depth - PHANTOM.setup.start_tip_x))
     steps = int(np.ceil(abs(guide) / 0.1))
@@ -52,8 +53,8 @@ def loaded(clearance, depth, guide, base_y=0.0, base_turn=0.0):
 def test_a_needle_free_within_the_clearance_bears_no_force(guide):
     state = loose(0.05).step(EXACT.start(), Control(dg_y=guide))
     np.testing.assert_allclose(state.nodes[:, 1], 0.0, atol=1e-12)
-    assert state.reactions.guide_force == 0.0
-    assert state.reactions.base_force == pytest.approx(0.0, abs=1e-12)
+    assert state.reactions.guide_force == (0.0, 0.0)
+    assert state.reactions.base_force == pytest.approx((0.0, 0.0), abs=1e-12)
     assert off_centre(state) == pytest.approx(-guide, abs=1e-12)
 
 
@@ -63,7 +64,7 @@ def test_beyond_the_clearance_one_wall_pushes(side):
     state = loose(0.05).step(EXACT.start(), Control(dg_y=0.3 * side))
     exact = EXACT.step(EXACT.start(), Control(dg_y=0.25 * side))
     assert off_centre(state) == pytest.approx(-0.05 * side, abs=1e-12)
-    assert np.sign(state.reactions.guide_force) == side
+    assert np.sign(state.reactions.guide_force[0]) == side
     assert state.reactions.guide_force == pytest.approx(exact.reactions.guide_force, rel=1e-9)
     np.testing.assert_allclose(state.tip, exact.tip, atol=1e-9)
 
@@ -73,7 +74,7 @@ def test_from_wall_to_wall_the_needle_follows_late():
     simulator, state, path = loose(0.05), EXACT.start(), []
     for dg_y in [0.02] * 10 + [-0.02] * 20 + [0.02] * 20:
         state = simulator.step(state, Control(dg_y=dg_y))
-        path.append((state.guide, off_centre(state)))
+        path.append((state.guide[0], off_centre(state)))
     guide, off = np.array(path).T
     at_wall = np.where(np.abs(guide) > 0.05, -0.05 * np.sign(guide), -guide)  # straight unless it is pushed
     np.testing.assert_allclose(off, at_wall, atol=1e-9)
@@ -87,7 +88,7 @@ def test_a_flip_takes_a_bent_needle_from_one_wall_to_the_other():
     assert rolled.converged
     assert off_centre(state) == pytest.approx(0.05)
     assert off_centre(rolled) == pytest.approx(-0.05)
-    assert rolled.reactions.guide_force == pytest.approx(-state.reactions.guide_force, rel=1e-9)
+    assert rolled.reactions.guide_force[0] == pytest.approx(-state.reactions.guide_force[0], rel=1e-9)
 
 
 @settings(deadline=None, derandomize=True, max_examples=40)
@@ -99,12 +100,12 @@ def test_of_all_places_between_the_walls_the_needle_takes_that_of_least_energy(
     clearance, guide, base_y, base_turn
 ):
     """Each place is what a guide without clearance would prescribe."""
-    start = EXACT.start().with_estimate(base_y=base_y, base_turn=base_turn)
+    start = EXACT.start().with_estimate(base=(base_y, 0.0), slope=(base_turn, 0.0))
     found = loose(clearance).step(start, Control(dg_y=guide))
     places = guide + clearance * np.linspace(-1.0, 1.0, 21)
     energies = [EXACT.step(start, Control(dg_y=place)).energy for place in places.clip(-0.5, 0.5)]
     assert found.energy <= min(energies) + 1e-12
-    there = EXACT.replay(start, [[0.0, 0.0, 0.0, guide + off_centre(found), -1.0]])[0]
+    there = EXACT.replay(start, [Control(dg_y=guide + off_centre(found))])[0]
     assert found.energy == pytest.approx(there.energy, rel=1e-9, abs=1e-15)
 
 
@@ -119,7 +120,7 @@ def test_of_all_places_between_the_walls_the_needle_takes_that_of_least_energy(
 def test_force_and_gap_are_complementary(clearance, guide, depth, base_y, base_turn):
     """A wall only pushes, the needle is never beyond one, and where it touches none nothing pushes."""
     for state in loaded(clearance, depth, guide, base_y, base_turn):
-        off, force = off_centre(state), state.reactions.guide_force
+        off, force = off_centre(state), state.reactions.guide_force[0]
         lower, upper = max(0.0, force), max(0.0, -force)  # of the lower wall upwards, and of the upper one
         assert abs(off) <= clearance + TOLERANCE
         assert lower * (clearance + off) == pytest.approx(0.0, abs=TOLERANCE)
@@ -132,7 +133,7 @@ def test_it_bears_on_the_wall_that_follows_it(guide):
     """Tissue holds the needle back where the guide goes."""
     state = loaded(0.1, 20, guide)[-1]
     assert off_centre(state) == pytest.approx(-0.1 * np.sign(guide), abs=1e-12)
-    assert np.sign(state.reactions.guide_force) == np.sign(guide)
+    assert np.sign(state.reactions.guide_force[0]) == np.sign(guide)
 
 
 def test_a_small_clearance_is_nearly_none():
@@ -166,7 +167,7 @@ def test_a_needle_without_a_guide_has_no_clearance():
     bare = tight(PHANTOM.with_values({"setup.guide_to_skin_mm": None}))
     wide = bare.adapted(Adaptation(np.zeros(1), np.ones(2), clearance=0.1))
     none = bare.adapted(Adaptation(np.zeros(1), np.ones(2)))
-    rows = np.tile([1.0, 0.0, 0.0, 0.0, -1.0], (60, 1))
+    rows = controls(60, db_x=1.0)
     np.testing.assert_array_equal(wide.replay(bare.start(), rows)[1], none.replay(bare.start(), rows)[1])
 
 
@@ -175,12 +176,12 @@ def test_a_needle_that_touches_no_wall_bends_as_without_a_guide(base_y):
     """Its lateral position in the guide is on the cubic between the neighbouring nodes of a needle without a guide."""
     bare = tight(PHANTOM.with_values({"setup.guide_to_skin_mm": None}))
     free = loaded(5.0, 25, 0.0, base_y)[-1]
-    other = bare.step(bare.start().with_estimate(base_y=base_y), Control())
+    other = bare.step(bare.start().with_estimate(base=(base_y, 0.0)), Control())
     other = repeat(bare, other, Control(db_x=1.0), int(25 - PHANTOM.setup.start_tip_x))[-1]
     np.testing.assert_allclose(free.tip, other.tip, atol=1e-9)
     x, y, slope = (other.mesh[name] for name in ("x", "y", "slope"))
     shape = CubicHermiteSpline(
-        np.append(other.base[0], x), np.append(other.base[1], y), np.append(other.base[2], slope)
+        np.append(other.base[0], x), np.append(other.base[1], y), np.append(other.base[THETA], slope)
     )
     assert abs(off_centre(free)) > 0.01
     assert off_centre(free) == pytest.approx(float(shape(GUIDE_X)), abs=1e-9)
@@ -189,18 +190,17 @@ def test_a_needle_that_touches_no_wall_bends_as_without_a_guide(base_y):
 def test_rollouts_converge_and_equal_steps():
     """A guide that goes from wall to wall, rolls of the bevel, an uneven advance: bit for bit as one by one."""
     rng = np.random.default_rng(4)
-    controls = np.zeros((48, 60, 5))
-    controls[:, :, 0] = rng.uniform(0.3, 1.0, (48, 60))
-    controls[:, :, 3] = rng.uniform(-0.1, 0.1, (48, 60))
-    controls[:, :, 4] = np.where(rng.random((48, 60)) < 0.05, 1.0, -1.0)
+    advance, guide = rng.uniform(0.3, 1.0, (48, 60)), rng.uniform(-0.1, 0.1, (48, 60))
+    roll = np.where(rng.random((48, 60)) < 0.05, np.pi, 0.0)
+    rows = controls(48, 60, db_x=advance, dg_y=guide, roll=roll)
     simulator = loose(0.08)
-    rolled = simulator.rollout(simulator.start(), controls)
+    rolled = simulator.rollout(simulator.start(), rows)
     assert rolled.converged.all()
     walls = set()
     for sample in (0, 7, 23):
         state = simulator.start()
-        for row, tip in zip(controls[sample], rolled.tips[sample], strict=True):
-            state = simulator.step(state, Control.from_row(row))
+        for row, tip in zip(rows[sample], rolled.tips[sample], strict=True):
+            state = simulator.step(state, Control.of(row))
             walls.add(np.sign(wall(state)))
             np.testing.assert_array_equal(state.tip, tip)
             assert state.iterations <= nd.COUPLED_ITERATIONS

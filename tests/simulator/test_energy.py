@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from flexneedle import Control, Simulator, load_scenario
+from flexneedle.types import THETA
 from reference.cases import insert_to, repeat
 from reference.tight import tight
 
@@ -34,8 +35,7 @@ def withdrawn(by):
 
 def lateral_forces(state):
     """Work-conjugates of base y, base turn, guide y, held tip y."""
-    reactions = state.reactions
-    return np.array([reactions.base_force, reactions.base_moment, reactions.guide_force, reactions.tip_force])
+    return np.array(state.reactions)[:, 0]
 
 
 def axial_force(state):
@@ -45,14 +45,17 @@ def axial_force(state):
     growing = (x > 0.0) & (behind < PHANTOM.contact.spacing_mm / 2)
     length = state.tip[0] - max(0.0, front - PHANTOM.needle.bevel.length_mm)
     spring = state.spring_energy / length if length > 0.0 else 0.0
-    return (energy[growing] / behind[growing]).sum() + spring - state.needle.solution.loads.tip * state.tip[2]
+    return (
+        (energy[growing] / behind[growing]).sum()
+        + spring
+        - state.needle.solution.loads.tip * state.tip[THETA]
+    )
 
 
 def base_axial_force(state):
     """∂(energy)/∂b_x: bent needle drawn into the clamp, a lateral force on a slope."""
-    reactions = state.reactions
-    bent = reactions.base_moment**2 / (2 * PHANTOM.needle.bending_stiffness)
-    return bent - reactions.base_force * state.base[2]
+    force, moment, *_ = lateral_forces(state)
+    return moment**2 / (2 * PHANTOM.needle.bending_stiffness) - force * state.base[THETA]
 
 
 def travel(state, move, advance=0.0, steps=60):
@@ -133,10 +136,11 @@ def test_forces_and_moments_on_the_needle_balance():
     """Clamp, guide, contacts, tip: the forces add up to nothing where the tip spring is out."""
     state = repeat(SIMULATOR, withdrawn(3.55), Control(db_y=0.2, dg_y=-0.3), 5)[-1]
     contacts = state.mesh["force"][state.mesh["x"] > 0.0]
-    reactions, x = state.reactions, state.contacts.x[state.contacts.active]
-    total = reactions.base_force + reactions.guide_force + contacts.sum()
+    base, moment, guide, _ = lateral_forces(state)
+    x = state.contacts.x[state.contacts.active]
+    total = base + guide + contacts.sum()
     base_x = state.base[0]
-    turning = reactions.base_moment + reactions.guide_force * (-41.0 - base_x) + contacts @ (x - base_x)
+    turning = moment + guide * (-41.0 - base_x) + contacts @ (x - base_x)
     assert np.abs(contacts).max() > 1e-4
     assert total == pytest.approx(0.0, abs=1e-6)
     assert turning == pytest.approx(0.0, abs=1e-4)

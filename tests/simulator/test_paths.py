@@ -1,12 +1,15 @@
 """The path as a continuous function of the commands: small steps, retraction, entry and exit, mirror images."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexneedle import Control, Simulator, load_scenario
-from reference.cases import assert_same_curve, insert_to, repeat
+from flexneedle import Control, Simulator, controls, load_scenario
+from flexneedle.types import DG_Y, ROLL, THETA, X, Y
+from reference.cases import MIRROR, assert_same_curve, insert_to, repeat
 
 PHANTOM = load_scenario("phantom")
 SIMULATOR = Simulator(PHANTOM)
@@ -84,7 +87,7 @@ def test_retraction_and_reinsertion_return_to_the_same_shape(pull):
     back = repeat(SIMULATOR, out, Control(db_x=pull / steps), steps)[-1]
     assert np.abs(out.tip - state.tip)[0] > 0.9 * pull
     assert_same_curve(back, state, 1e-3)
-    np.testing.assert_allclose(back.contacts.rest_y, state.contacts.rest_y, atol=1e-3)
+    np.testing.assert_allclose(back.contacts.rest, state.contacts.rest, atol=1e-3)
     assert back.energy == pytest.approx(state.energy, abs=1e-4)
     one, other = (SIMULATOR.step(s, Control(db_x=1.0)) for s in (state, back))
     assert_same_curve(one, other, 2e-3)
@@ -99,8 +102,8 @@ def test_points_ahead_of_a_retracted_tip_rest():
     np.testing.assert_array_equal(contacts.active, contacts.x < out.tip[0])
     ahead = ~contacts.active
     assert ahead.sum() == 10
-    np.testing.assert_array_equal(contacts.rest_y, state.contacts.rest_y)
-    np.testing.assert_array_equal(contacts.y[ahead], contacts.rest_y[ahead])
+    np.testing.assert_array_equal(contacts.rest, state.contacts.rest)
+    np.testing.assert_array_equal(contacts.position[ahead], contacts.rest[ahead])
     assert np.all(contacts.stretch[ahead] == 1.0)
 
 
@@ -113,8 +116,8 @@ def test_new_points_rest_on_the_line_from_tip_to_tip():
     new = after.contacts.x > before.tip[0]
     assert new.sum() == 4
     line = np.interp(after.contacts.x[new], *np.transpose([before.tip[:2], after.tip[:2]]))
-    np.testing.assert_allclose(after.contacts.rest_y[new], line, atol=1e-12)
-    np.testing.assert_array_equal(after.contacts.rest_y[~new], before.contacts.rest_y)
+    np.testing.assert_allclose(after.contacts.rest[new, 0], line, atol=1e-12)
+    np.testing.assert_array_equal(after.contacts.rest[~new], before.contacts.rest)
 
 
 def test_channel_closes_when_the_tip_leaves_the_skin():
@@ -128,7 +131,7 @@ def test_channel_closes_when_the_tip_leaves_the_skin():
     fresh = repeat(SIMULATOR, insert_to(SIMULATOR, -2.0), Control(dg_y=0.5), 6)[-1]
     one, other = (repeat(SIMULATOR, state, Control(db_x=1.0), 8)[-1] for state in (again, fresh))
     assert one.contacts.x.size == other.contacts.x.size == 11
-    np.testing.assert_allclose(one.contacts.rest_y, other.contacts.rest_y, atol=1e-5)
+    np.testing.assert_allclose(one.contacts.rest, other.contacts.rest, atol=1e-5)
     assert_same_curve(one, other, 1e-5)
 
 
@@ -143,8 +146,8 @@ def test_points_grow_in_over_the_second_half_of_their_interval(past):
     contacts = held.contacts
     assert contacts.x[-1] == 10.5
     y = np.interp(contacts.x, held.nodes[:, 0], held.nodes[:, 1])  # check of the mesh against the nodes
-    np.testing.assert_allclose(contacts.y, y, atol=2e-3)
-    layer, u = scenario.tissue[0], np.abs(contacts.y - contacts.rest_y)
+    np.testing.assert_allclose(contacts.position[:, 0], y, atol=2e-3)
+    layer, u = scenario.tissue[0], np.abs(contacts.position - contacts.rest)[:, 0]
     length = np.where(contacts.x < 1.0, 0.25, np.where(contacts.x < 3.0, 0.5, 1.0))
     lam = 1 - u / layer.compression_length_mm
     volume = length * layer.engaged_width_mm * layer.compression_length_mm
@@ -163,7 +166,7 @@ def test_points_grow_in_over_the_second_half_of_their_interval(past):
             st.floats(-0.3, 0.3),
             st.floats(-3e-3, 3e-3),
             st.floats(-0.4, 0.4),
-            st.sampled_from([-1.0, -1.0, -1.0, 1.0]),
+            st.sampled_from([False, False, False, True]),
         ),
         min_size=1,
         max_size=30,
@@ -171,11 +174,12 @@ def test_points_grow_in_over_the_second_half_of_their_interval(past):
 )
 def test_mirrored_commands_and_bevel_mirror_the_insertion_to_the_last_bit(rows):
     """y → −y with the bevel reversed."""
-    one, other = SIMULATOR.start(+1), SIMULATOR.start(-1)
-    for row in [(1.0, 0.0, 0.0, 0.1, -1.0)] * 30 + rows:
-        one = SIMULATOR.step(one, Control.from_row(row))
-        other = SIMULATOR.step(other, Control.from_row(row * np.array([1, -1, -1, -1, 1])))
-    np.testing.assert_array_equal(one.nodes, other.nodes * [1, -1, -1])
+    one, other = SIMULATOR.start(), SIMULATOR.start(math.pi)
+    for db_x, db_y, db_theta, dg_y, flip in [(1.0, 0.0, 0.0, 0.1, False)] * 30 + rows:
+        one = SIMULATOR.step(one, Control(db_x, db_y=db_y, db_theta=db_theta, dg_y=dg_y, flip=flip))
+        mirrored = Control(db_x, db_y=-db_y, db_theta=-db_theta, dg_y=-dg_y, flip=flip)
+        other = SIMULATOR.step(other, mirrored)
+    np.testing.assert_array_equal(one.nodes, other.nodes * MIRROR)
     np.testing.assert_array_equal(one.contacts.stretch, other.contacts.stretch)
     assert (one.energy, one.bevel, one.iterations) == (other.energy, -other.bevel, other.iterations)
     assert one.tip[1] != 0.0
@@ -193,8 +197,8 @@ def test_one_layer_or_two_of_the_same_tissue_are_the_same():
 def test_nodes_stand_at_equal_arc_lengths():
     """n of them, base and tip among them, (1 + ½y'²)dx apart."""
     state = repeat(SIMULATOR, insert_to(SIMULATOR, 30.0), Control(dg_y=-0.3, db_x=0.5), 20)[-1]
-    x, y, turn = state.nodes.T
-    assert state.nodes.shape == (61, 3)
+    x, y, turn = state.nodes.T[[X, Y, THETA]]
+    assert state.nodes.shape == (61, 5)
     np.testing.assert_array_equal(state.nodes[0], state.base)
     np.testing.assert_array_equal(state.nodes[-1], state.tip)
     length = np.diff(x)
@@ -227,9 +231,8 @@ def test_steep_laws_converge(alpha, modulus_kpa):
     layer = {"alpha": alpha, "shear_modulus_kpa": modulus_kpa}
     steep = {f"tissue.{i}.{key}": value for i in (0, 1) for key, value in layer.items()}
     simulator = Simulator(PHANTOM.with_values({"needle.bevel.offset_mm": 13.0, **steep}))
-    controls = np.zeros((1, 70, 5))
-    controls[..., 0], controls[..., 4] = 1.0, -1.0
-    controls[0, 31:, 3], controls[0, 45, 4] = 0.2, 1.0
-    result = simulator.rollout(simulator.start(), controls)
+    rows = controls(1, 70, db_x=1.0)
+    rows[0, 31:, DG_Y], rows[0, 45, ROLL] = 0.2, math.pi
+    result = simulator.rollout(simulator.start(), rows)
     assert result.converged.all()
     assert np.isfinite(result.tips).all()

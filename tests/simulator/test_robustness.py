@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flexneedle.simulator.simulator import Rollout
+from flexneedle.types import DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN
 
 STUDY = Path(__file__).parents[2] / "studies" / "robustness.py"
 
@@ -38,6 +39,44 @@ def test_random_sequences_run_without_failure(study, capsys):
     assert "batch 20/20" in progress
 
 
+@pytest.mark.parametrize("options", [["--space"], ["--adapted"], ["--space", "--adapted"]])
+def test_random_sequences_in_space_and_of_adapted_models_run_without_failure(study, capsys, options):
+    status, summary, _ = run(study, capsys, *options, "--sequences", 100, "--seed", 20)
+    assert (status, summary["sequences"], summary["passed"]) == (0, 100, True)
+    assert summary["worst_residual_mm"] <= 2e-5
+
+
+@pytest.mark.parametrize(
+    "batch",
+    [
+        pytest.param(320, id="iterations that run away"),
+        pytest.param(510, id="a needle that touches its guide almost without force"),
+    ],
+)
+def test_rare_steps_of_an_adapted_model_in_space_converge(study, capsys, batch):
+    status, summary, _ = run(study, capsys, "--space", "--adapted", "--seed", 0, "--batch", batch)
+    assert (status, summary["passed"]) == (0, True)
+
+
+def test_sequences_in_space_leave_the_plane_and_roll_to_any_angle(study):
+    rng = np.random.default_rng(0)
+    guided = next(found for found in iter(lambda: study.draw_scenario(rng), None) if found.setup.has_guide)
+    controls = study.draw_controls_in_space(guided, 50, rng)
+    most = np.abs(controls).max(axis=(0, 1))[[DB_Z, DB_PSI, DG_Z, ROLL, SPIN]]
+    assert (most > [0.1, 1e-3, 0.1, 3.5, 3.0]).all()
+    half = (controls[..., ROLL] % np.pi == 0.0).all(axis=1)
+    assert 10 <= half.sum() <= 40
+
+
+def test_an_adapted_model_has_a_bend_and_a_clearance_in_half_of_the_cases(study):
+    rng, fitted = np.random.default_rng(0), []
+    for _ in range(200):
+        scenario = study.draw_scenario(rng).with_values({"setup.axes": 2})
+        model = study.bent(study.Simulator(scenario, 1), rng)._model
+        fitted.append((model.curvature != 0.0, model.clearance > 0.0))
+    np.testing.assert_allclose(np.mean(fitted, axis=0), 0.5, atol=0.1)
+
+
 def test_drawn_scenarios_cover_what_they_are_to_cover(study):
     """1 to 5 layers, the range of moduli and exponents, with and without a guide, all inputs."""
     draws = [study.draw_scenario(np.random.default_rng((3, batch))) for batch in range(200)]
@@ -50,8 +89,9 @@ def test_drawn_scenarios_cover_what_they_are_to_cover(study):
         assert high / 1.1 < max(values) <= high
     guided = next(scenario for scenario in draws if scenario.setup.has_guide)
     controls = study.draw_controls(guided, 50, np.random.default_rng(0))
-    assert (np.abs(controls).max(axis=(0, 1)) > [0.5, 0.1, 1e-3, 0.1, 0.5]).all()
-    assert (controls[..., 0] < 0.0).any()
+    most = np.abs(controls).max(axis=(0, 1))[[DB_X, DB_Y, DB_THETA, DG_Y, ROLL]]
+    assert (most > [0.5, 0.1, 1e-3, 0.1, 0.5]).all()
+    assert (controls[..., DB_X] < 0.0).any()
 
 
 def test_a_batch_is_reproduced_by_its_number(study, capsys):
@@ -70,7 +110,13 @@ def broken(how):
 
     def rollout(self, state, controls):  # noqa: ARG001  the signature of a simulator
         n, m = controls.shape[:2]
-        result = Rollout(np.zeros((n, m, 3)), np.zeros((n, m)), np.ones((n, m), dtype=bool))
+        result = Rollout(
+            np.zeros((n, m, 5)),
+            np.zeros((n, m)),
+            np.ones((n, m), dtype=bool),
+            np.zeros((0, 0)),
+            np.zeros((0,) * 4),
+        )
         if how == "exceptions":
             raise ZeroDivisionError("a bug")
         if how == "not_finite":
@@ -96,7 +142,7 @@ def test_any_failure_fails_the_study_with_its_reproduction(study, monkeypatch, c
 def test_interrupt_keeps_what_was_counted(study, monkeypatch, capsys):
     """Summary printed, exit status 130."""
 
-    def interrupted(*_):
+    def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(study, "run_batch", interrupted)

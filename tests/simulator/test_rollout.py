@@ -23,12 +23,12 @@ def test_rollout_equals_repeated_steps_to_the_last_bit(controls):
     simulator = Simulator(PHANTOM)
     start = insert_to(simulator, 12.0)
     result = simulator.rollout(start, controls)
-    assert result.tips.shape == (40, 60, 3)
+    assert result.tips.shape == (40, 60, 5)
     assert result.strain_energy.shape == result.converged.shape == (40, 60)
     for j in range(0, 40, 7):
         state = start
         for k, row in enumerate(controls[j]):
-            state = simulator.step(state, Control.from_row(row))
+            state = simulator.step(state, Control.of(row))
             assert state.tip.tobytes() == result.tips[j, k].tobytes()
             assert state.converged == result.converged[j, k]
             assert state.strain_energy == result.strain_energy[j, k]
@@ -54,25 +54,27 @@ def test_mean_square_deflection_is_that_of_the_nodes(controls):
     simulator = Simulator(PHANTOM.with_values({"needle.nodes": 2001}))
     start = insert_to(simulator, 12.0)
     plain = simulator.rollout(start, controls[:2])
-    result, deflection = simulator.rollout_with_deflection(start, controls[:2])
+    result = simulator.rollout(start, controls[:2], deflection=True)
     assert plain.tips.tobytes() == result.tips.tobytes()
+    assert plain.deflection.size == 0
     for j in range(2):
         state = start
         for row in controls[j]:
-            state = simulator.step(state, Control.from_row(row))
-        x, y, _ = state.nodes.T
+            state = simulator.step(state, Control.of(row))
+        x, y, *_ = state.nodes.T
         mean = np.trapezoid(y**2, x) / 150.0
-        assert deflection[j, -1] == pytest.approx(mean, rel=1e-5)
+        assert result.deflection[j, -1] == pytest.approx(mean, rel=1e-5)
 
 
 def test_empty_and_single_batches():
     """No sequence, no step, one step."""
     simulator = Simulator(PHANTOM)
     state = simulator.start()
-    assert simulator.rollout(state, np.zeros((0, 5, 5))).tips.shape == (0, 5, 3)
-    assert simulator.rollout(state, np.zeros((3, 0, 5))).tips.shape == (3, 0, 3)
-    one = simulator.rollout(state, [[[1.0, 0.0, 0.0, 0.1, -1.0]]])
-    np.testing.assert_array_equal(one.tips[0, 0], simulator.step(state, Control(db_x=1.0, dg_y=0.1)).tip)
+    assert simulator.rollout(state, np.zeros((0, 5, 9))).tips.shape == (0, 5, 5)
+    assert simulator.rollout(state, np.zeros((3, 0, 9))).tips.shape == (3, 0, 5)
+    control = Control(db_x=1.0, dg_y=0.1)
+    one = simulator.rollout(state, [[control]])
+    np.testing.assert_array_equal(one.tips[0, 0], simulator.step(state, control).tip)
 
 
 def test_rollout_leaves_its_inputs_alone(controls):
@@ -94,6 +96,6 @@ def test_strain_energy_of_a_rollout_is_weighted_by_layer(controls):
     start = insert_to(simulator, 18.0)
     state = start
     for row in controls[0]:
-        state = simulator.step(state, Control.from_row(row))
+        state = simulator.step(state, Control.of(row))
     assert state.tip[0] > 20.0
     assert state.strain_energy == simulator.rollout(start, controls[:1]).strain_energy[0, -1]

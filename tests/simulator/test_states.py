@@ -1,6 +1,7 @@
 """States as values, and commands that are refused."""
 
 import copy
+import math
 import pickle
 from dataclasses import replace
 
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexneedle import Control, Simulator, load_scenario
+from flexneedle import Control, Simulator, controls, load_scenario
 from flexneedle.errors import CommandError, StateError
 from reference.cases import insert_to, numbers, repeat, with_number
 
@@ -44,7 +45,7 @@ def test_copies_are_equal_and_go_on_the_same(state, duplicate):
 def test_states_compare_by_value(state):
     """A step makes a difference, and so does a correction; other things are not states."""
     assert state != SIMULATOR.step(state, Control(db_x=0.1))
-    assert state != state.with_estimate(tip_load=1e-3)
+    assert state != state.with_estimate(tip_load=(1e-3, 0.0))
     assert SIMULATOR.step(state, ON) == SIMULATOR.step(state, ON)
     assert state != 3
     assert state.with_estimate() == state
@@ -53,8 +54,9 @@ def test_states_compare_by_value(state):
 def test_a_correction_replaces_the_one_before():
     """Position and slope of the base, and the origin of its travel: only the last correction counts."""
     start = SIMULATOR.start()
-    last = {"base_x": -170.0, "base_y": 0.2, "base_turn": 1e-3}
-    twice = start.with_estimate(base_x=-171.0, base_y=-0.5, base_turn=-2e-3).with_estimate(**last)
+    last = {"base_x": -170.0, "base": (0.2, 0.0), "slope": (1e-3, 0.0)}
+    first = {"base_x": -171.0, "base": (-0.5, 0.0), "slope": (-2e-3, 0.0)}
+    twice = start.with_estimate(**first).with_estimate(**last)
     np.testing.assert_allclose(numbers(twice), numbers(start.with_estimate(**last)), rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(twice.travel, 0.0, atol=1e-12)
 
@@ -111,7 +113,7 @@ def test_state_of_other_mechanics_is_refused_with_the_key(state, tmp_path, key, 
     state.save(path)
     uses = (
         lambda: other.step(state, ON),
-        lambda: other.rollout(state, [[ON.row()]]),
+        lambda: other.rollout(state, [[ON]]),
         lambda: other.assimilate(state, state.tip[:2]),
         lambda: other.load(path),
     )
@@ -187,13 +189,14 @@ def test_simulator_pickles(state):
 
 def test_start_is_straight_and_in_air():
     """Tip before the skin, nothing bent, both bevels."""
-    for bevel in (-1, 1):
-        start = SIMULATOR.start(bevel)
-        np.testing.assert_array_equal(start.tip, [-28.5, 0.0, 0.0])
-        np.testing.assert_array_equal(start.base, [-178.5, 0.0, 0.0])
-        assert (start.bevel, start.guide, start.energy, start.contacts.x.size) == (bevel, 0.0, 0.0, 0)
-    with pytest.raises(CommandError, match="bevel = 0"):
-        SIMULATOR.start(0)
+    for roll, bevel in ((math.pi, -1), (0.0, 1)):
+        start = SIMULATOR.start(roll)
+        np.testing.assert_array_equal(start.tip, [-28.5, 0.0, 0.0, 0.0, 0.0])
+        np.testing.assert_array_equal(start.base, [-178.5, 0.0, 0.0, 0.0, 0.0])
+        assert (start.bevel, start.guide, start.energy, start.contacts.x.size) == (bevel, (0.0, 0.0), 0.0, 0)
+        assert start.roll == roll
+    with pytest.raises(CommandError, match=r"roll = 1: must be half turns with setup\.axes = 1"):
+        SIMULATOR.start(1.0)
 
 
 @pytest.mark.parametrize(
@@ -237,7 +240,7 @@ def test_travel_is_limited(name, step, travel):
         CommandError, match=rf"{name} = .*sum of the steps must be at (most|least) -?{travel:g} mm"
     ):
         SIMULATOR.step(end, Control(**{name: step / 100}))
-    rows = np.repeat([[Control(**{name: step}).row()]], times + 1, axis=1)
+    rows = controls(1, times + 1, **{name: step})
     SIMULATOR.rollout(SIMULATOR.start(), rows[:, :-1])
     with pytest.raises(CommandError, match=rf"{name} = "):
         SIMULATOR.rollout(SIMULATOR.start(), rows)
@@ -251,23 +254,25 @@ def test_guide_that_is_not_there_cannot_move():
     assert (caught.value.name, caught.value.limit) == ("dg_y", 0.0)
 
 
-@pytest.mark.parametrize("shape", [(5,), (3, 5), (2, 3, 4), (1, 2, 3, 5)])
+@pytest.mark.parametrize("shape", [(9,), (3, 9), (2, 3, 5), (1, 2, 3, 9)])
 def test_controls_of_another_shape_are_refused(shape):
     """With the shape in the message."""
-    with pytest.raises(CommandError, match=r"shape \(N, m, 5\)"):
+    with pytest.raises(CommandError, match=r"shape \(N, m, 9\)"):
         SIMULATOR.rollout(SIMULATOR.start(), np.zeros(shape))
 
 
-@pytest.mark.parametrize("flip", [0.0, 2.0, -0.5])
-def test_flip_is_minus_or_plus_one(flip):
-    """Nothing between."""
-    with pytest.raises(CommandError, match="flip"):
-        SIMULATOR.rollout(SIMULATOR.start(), [[[0.0, 0.0, 0.0, 0.0, flip]]])
+@pytest.mark.parametrize("roll", [1.0, -2.0, 0.5 * np.pi])
+def test_a_needle_in_the_plane_rolls_by_half_turns(roll):
+    """Nothing between, and no spin."""
+    with pytest.raises(CommandError, match=r"roll = .*must be half turns with setup\.axes = 1"):
+        SIMULATOR.rollout(SIMULATOR.start(), [[Control(roll=roll)]])
+    with pytest.raises(CommandError, match=r"spin = .*must be 0 with setup\.axes = 1"):
+        SIMULATOR.rollout(SIMULATOR.start(), [[Control(spin=roll)]])
 
 
 def test_control_rows_round_trip():
-    """Columns as in a rollout, flip as −1 or +1."""
-    control = Control(0.5, -0.1, 2e-3, 0.3, flip=True)
-    np.testing.assert_array_equal(control.row(), [0.5, -0.1, 2e-3, 0.3, 1.0])
-    assert Control.from_row(control.row()) == control
-    assert Control.from_row(Control().row()) == Control()
+    """Columns as in a rollout, a flip as half a turn."""
+    control = Control(0.5, db_y=-0.1, db_theta=2e-3, dg_y=0.3, flip=True)
+    np.testing.assert_array_equal(control, [0.5, -0.1, 0.0, 2e-3, 0.0, 0.3, 0.0, np.pi, 0.0])
+    assert Control.of(np.array(control)) == control
+    assert Control.of(np.array(Control())) == Control()

@@ -45,9 +45,11 @@ def test_every_shipped_study_is_documented():
             "gauges",
             "tracker",
             "worlds",
+            "space",
+            "worlds-space",
         )
     ]
-    assert len(STUDIES.names()) == 11
+    assert len(STUDIES.names()) == 13
 
 
 def test_every_column_is_documented(quick, uninterrupted):

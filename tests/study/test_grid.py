@@ -1,13 +1,17 @@
 """Study files: the grid, its order and seeds; and one line for each violated rule."""
 
+import importlib.util
 import itertools
+import tomllib
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pytest
 
 from flexneedle.control.methods import METHODS, checked
 from flexneedle.errors import InputError, ScenarioWarning
+from flexneedle.planning.planner import bevel_reach
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.study.grid import load_study
 from flexneedle.study.spec import LARGEST_SEED, STUDIES
@@ -66,7 +70,7 @@ def test_cases_vary_slowest_then_axes_in_their_order_and_repeats_fastest(study):
         (i.point.case, i.point.scenario.target.position, i.point.controller, i.repeat)
         for i in insertions(study(TWO_BY_TWO))
     ]
-    targets, controllers = [(30.0, 0.0), (40.0, 5.0)], list(CONTROLLERS)
+    targets, controllers = [(30.0, 0.0, 0.0), (40.0, 5.0, 0.0)], list(CONTROLLERS)
     assert got == list(itertools.product(["base", "rough"], targets, controllers, [0, 1]))
 
 
@@ -97,6 +101,91 @@ def test_values_apply_to_all_points_and_axes_and_cases_override_them(study):
     points = study(text).points
     assert {(point.plant, point.plan_seed) for point in points} == {("model", 4)}
     assert [point.scenario.phantom.run_out_mm for point in points] == [1.0] * 4 + [0.4] * 4
+
+
+OWN_TARGETS = """
+repeats = 2
+first_seed = 50
+[values]
+setup.axes = 2
+[[axes]]
+key = "controller"
+values = ["CONTROLLERS"]
+[[cases]]
+name = "any"
+targets = [[30, 1, 2], [40, 5]]
+[[cases]]
+name = "one axis"
+values = { setup.guide_axes = 1 }
+reach = true
+targets = [[30, 1, 2], [35, 0, -1]]
+[[cases]]
+name = "as in the scenario"
+""".replace("CONTROLLERS", '", "'.join(CONTROLLERS))
+
+
+def test_a_case_may_have_its_own_targets(study):
+    """They vary after the cases and before the axes; without z they are in the plane; without any, the scenario's."""
+    points = study(OWN_TARGETS).points
+    targets = [(point.case, point.scenario.target.position) for point in points[::2]]
+    assert targets == [
+        ("any", (30.0, 1.0, 2.0)),
+        ("any", (40.0, 5.0, 0.0)),
+        ("one axis", (30.0, 1.0, 2.0)),
+        ("one axis", (35.0, 0.0, -1.0)),
+        ("as in the scenario", PHANTOM.target.position),
+    ]
+    assert [point.controller for point in points] == 5 * list(CONTROLLERS)
+    assert {point.scenario.setup.guide_axes for point in points if point.case == "one axis"} == {1}
+    assert all(set(point.varied) == {"controller"} for point in points)
+
+
+def test_equal_targets_of_two_cases_have_the_same_seeds(study):
+    seeds = {}
+    for insertion in insertions(study(OWN_TARGETS)):
+        seeds.setdefault(insertion.point.scenario.target.position, set()).add(insertion.seed)
+    expected = {(30.0, 1.0, 2.0): {50, 51}, (40.0, 5.0, 0.0): {52, 53}, (35.0, 0.0, -1.0): {54, 55}}
+    assert seeds == expected  # the target of the scenario is that of the first case, too
+
+
+def test_a_case_may_have_its_reach_computed(study):
+    assert [point.with_reach for point in study(OWN_TARGETS).points] == [False] * 4 + [True] * 4 + [False] * 2
+
+
+def test_targets_and_reach_of_cases_are_part_of_the_definition(study):
+    definition = study(OWN_TARGETS).definition
+    assert definition["targets"] == {"any": [[30, 1, 2], [40, 5]], "one axis": [[30, 1, 2], [35, 0, -1]]}
+    assert definition["reach"] == ["one axis"]
+    assert definition["insertions"] == 5 * len(CONTROLLERS) * 2
+
+
+def test_a_target_of_two_numbers_is_in_the_plane(study):
+    """Whatever the scenario's own target."""
+    points = study('scenario = "phantom3d"\n[[axes]]\nkey = "target"\nvalues = [[30, 1, 2], [30, 1]]').points
+    assert [point.scenario.target.position for point in points] == [(30.0, 1.0, 2.0), (30.0, 1.0, 0.0)]
+
+
+def test_the_targets_of_space_are_those_that_were_drawn(capsys):
+    """`studies/space_targets.py` prints them."""
+    path = Path(__file__).parents[2] / "studies" / "space_targets.py"
+    spec = importlib.util.spec_from_file_location("space_targets", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.main([])
+    lists = capsys.readouterr().out.split("targets = ")[1:]
+    drawn = [tomllib.loads(f"targets = {text}")["targets"] for text in lists]
+    found = load_study("space").definition["targets"]
+    assert drawn == list(found.values())
+    two, one, half = (np.array(found[name]) for name in ("two axes", "one axis", "half turns"))
+    most = np.minimum(8.0, 0.2 * two[:, 0])
+    assert len(two) == len(one) == len(half) == 30
+    assert two[:, 0].min() >= 25.0
+    assert two[:, 0].max() <= 80.0
+    assert (np.hypot(two[:, 1], two[:, 2]) <= most + 0.01).all()
+    assert len(set(np.sign(two[:, 1]) + 3 * np.sign(two[:, 2]))) == 4  # in all quadrants
+    reach = [bevel_reach(load_scenario("phantom3d"), depth)[1] for depth in one[:, 0]]
+    assert (np.abs(one[:, 2]) <= 0.5 * np.array(reach) + 0.01).all()
+    assert (half[:, 2] == 0.0).all()
 
 
 def test_all_means_every_controller(study):
@@ -161,6 +250,11 @@ def test_true_is_not_a_duplicate_of_one(study):
     assert "twice" not in refusal(study, axis("plan.samples", "[16, 1, true]"))[0]
 
 
+def in_space(case):
+    """A study in space with one case."""
+    return f'[values]\nsetup.axes = 2\n[[cases]]\nname = "a"\n{case}\n'
+
+
 def axis(key, values):
     return f"[[axes]]\nkey = '{key}'\nvalues = {values}\n"
 
@@ -188,20 +282,38 @@ def axis(key, values):
             "[values]\nseed = 3",
             "values.seed = 3: not allowed here: set seeds with first_seed and repeats, or with an axis",
         ),
-        ("[values]\ntarget = 3", "values.target = 3: must be two numbers, [depth, lateral] in mm"),
+        (
+            "[values]\ntarget = 3",
+            "values.target = 3: must be two or three numbers, [depth, y] or [depth, y, z] in mm",
+        ),
         ("[values]\nphantom.runout_mm = 3", "phantom.runout_mm = 3: unknown key; did you mean run_out_mm?"),
         ("[values]\nsetup.stroke_mm = 'a'", 'setup.stroke_mm = "a": must be a number'),
         (axis("setup.stroke_mm", "[100, 140]"), "setup.stroke_mm = 140.0: the base would reach the guide"),
         (axis("plan.sample", "[16]"), "plan.sample = 16: unknown key; did you mean samples?"),
-        (axis("controler", '["ce-mpc"]'), "plan_seed, world_case, as an axis also seed, world"),
+        (axis("controler", '["ce-mpc"]'), "plan_seed, world_case, world_rig, as an axis also seed, world"),
         (axis("plan.samples", "[]"), "axes[0].values = []: must be a list of at least one value"),
         (axis("plan.samples", "'all'"), 'axes[0].values = "all": must be a list of at least one value'),
         (axis("plan.samples", "[8, 9, 8]"), "axes[0].values = [8, 9, 8]: contains 8 twice"),
         (axis("setup.stroke_mm", "[100, 100.0]"), "axes[0].values = [100, 100.0]: contains 100 twice"),
         (axis("target", "[[30, 0], [30.0, -0.0]]"), "[30.0, -0.0]]: contains [30, 0] twice"),
         (axis("controller", f"['{CONTROLLERS[0]}', 'x']"), f'controller = "x": {CHOICES}'),
-        (axis("target", "[[30, 0], 40]"), "axes[0].values = 40: must be two numbers"),
+        (axis("target", "[[30, 0], 40]"), "axes[0].values = 40: must be two or three numbers"),
         (axis("target", "[[30, 0], [400, 0]]"), "target.depth_mm = 400.0: beyond the stroke"),
+        (in_space("targets = 3"), "cases[0].targets = 3: must be a list of at least one value"),
+        (in_space("targets = []"), "cases[0].targets = []: must be a list of at least one value"),
+        (in_space("targets = [[30]]"), "cases[0].targets = [30]: must be two or three numbers, [depth, y]"),
+        (in_space("targets = [[30, 1], [30, 1]]"), "[[30, 1], [30, 1]]: contains [30, 1] twice"),
+        (
+            in_space("targets = [[30, 1]]\nvalues = { target.depth_mm = 30 }"),
+            "cases[0].values.target.depth_mm: also set by targets",
+        ),
+        (
+            in_space("targets = [[30, 1]]") + axis("target.lateral_z_mm", "[0, 1]"),
+            "cases[0].targets: also set by an axis",
+        ),
+        (in_space("targets = [[30, 1]]") + axis("world", "[3]"), "cases[0].targets: also set by an axis"),
+        (in_space("targets = [[30, 1, 99]]"), "target.lateral_z_mm = 99.0: must be at most 15 in size"),
+        (axis("target", "[[30, 0, 1]]"), "target.lateral_z_mm = 1.0: must be 0 with setup.axes = 1"),
         (axis("seed", "[1, -2]"), f"axes[0].values = [1, -2]: must be whole numbers {SEEDS}"),
         (axis("seed", f"[1, {LARGEST_SEED + 1}]"), f"{LARGEST_SEED + 1}]: must be whole numbers {SEEDS}"),
         (
@@ -262,12 +374,14 @@ def test_the_shipped_studies_load():
         "gauges": 8 * 150,
         "tracker": 5 * 150,
         "worlds": 2202,
+        "space": 3 * 4 * 300,
+        "worlds-space": 2936,
     }
 
 
 def test_the_phantom_study_has_the_papers_targets_and_its_own_seeds():
     all_of_it = insertions(load_study("phantom"))
-    targets = [insertion.point.scenario.target.position for insertion in all_of_it]
+    targets = [insertion.point.scenario.target.position[:2] for insertion in all_of_it]
     assert targets == [target for target in itertools.product(DEPTHS, LATERALS) for _ in range(10)]
     assert [insertion.seed for insertion in all_of_it] == list(range(100000, 100150))
 
@@ -282,7 +396,7 @@ def test_the_published_phantoms_are_those_of_the_phantom_study_without_later_imp
 
 def test_odd_targets_are_off_the_papers_grid():
     all_of_it = insertions(load_study("odd-targets"))
-    targets = {insertion.point.scenario.target.position for insertion in all_of_it}
+    targets = {insertion.point.scenario.target.position[:2] for insertion in all_of_it}
     assert not targets & set(itertools.product(DEPTHS, LATERALS))
     assert {insertion.seed for insertion in all_of_it} == set(range(300000, 300150))
 
@@ -333,7 +447,14 @@ def test_each_imperfection_is_changed_alone():
         changed[key] = (base[key], value)
     own = {f"phantom.{name}" for name in type(PHANTOM.phantom).model_fields}
     sizes = {f"phantom.{name}_mm" for name in ("contact_spacing", "element", "step")}
-    assert own - set(changed) == {*sizes, "phantom.structure"}
+    out_of_plane = (
+        "start_offset_z_sd_mm",
+        "start_angle_z_sd_mrad",
+        "direction_spread_deg",
+        "rotation_friction_mn",
+    )
+    none_in_the_plane = {f"phantom.{name}" for name in out_of_plane}
+    assert own - set(changed) == {*sizes, *none_in_the_plane, "phantom.structure"}
     assert changed.pop("phantom.tracker_bias_mm") == (0.0, 0.3)
     assert changed.pop("phantom.shear_modulus_factor") == ([0.6, 1.6], [0.3, 2.5])
     assert changed.pop("phantom.bevel_factor") == ([0.5, 1.5], [0.0, 2.0])

@@ -1,5 +1,6 @@
 """The reach: smallest miss that any controller could achieve."""
 
+import cmath
 import math
 
 import numpy as np
@@ -10,7 +11,7 @@ import synthetic
 from flexneedle.rig.phantom.draw import draw
 from flexneedle.rig.phantom.plants import ModelPlant
 from flexneedle.scenario.worlds import world
-from flexneedle.study.reach import reach, straight_end
+from flexneedle.study.reach import reach, straight_end, to_disc, to_interval
 from flexneedle.types import Insertion, Outcome
 
 COARSE = {"phantom.step_mm": 1.0, "phantom.element_mm": 1.0, "phantom.contact_spacing_mm": 1.0}
@@ -18,15 +19,15 @@ FREE = world(15, "perfect").with_values(COARSE)
 GUIDED = world(3, "perfect").with_values(COARSE)
 
 
-def end(scenario, bevel, phantom="model"):
+def end(scenario, roll=0.0, phantom="model"):
     truth = draw(scenario, np.random.default_rng(np.random.SeedSequence(0).spawn(4)[0]))
-    return straight_end(truth, bevel, phantom, scenario.target.depth_mm)
+    return straight_end(truth, roll, phantom, scenario.target.depth_mm)
 
 
 @pytest.mark.parametrize("phantom", ["model", "exact"])
 def test_without_a_guide_the_ends_are_mirror_images(phantom):
-    right, left = (end(FREE, bevel, phantom) for bevel in (1, -1))
-    np.testing.assert_allclose(right, (left[0], -left[1]), atol=1e-9)
+    right, left = (end(FREE, roll, phantom) for roll in (0.0, math.pi))
+    np.testing.assert_allclose(right, (left[0], -left[1], 0.0), atol=1e-9)
     assert right[0] == FREE.target.depth_mm
     assert right[1] > 1.0
 
@@ -39,14 +40,14 @@ def test_an_end_point_is_that_of_straight_insertion_to_the_depth():
     while tips[-1][0] < FREE.target.depth_mm:
         state = simulator.step(state, flexneedle.Control(db_x=1.0))
         tips.append(state.tip)
-    x, y, _ = np.array(tips).T
-    assert end(FREE, 1)[1] == pytest.approx(np.interp(FREE.target.depth_mm, x, y), abs=1e-9)
+    x, y, *_ = np.array(tips).T
+    assert end(FREE)[1] == pytest.approx(np.interp(FREE.target.depth_mm, x, y), abs=1e-9)
 
 
 @pytest.mark.parametrize(("beyond", "expected"), [(-0.5, 0.0), (0.0, 0.0), (0.7, 0.7)])
 def test_without_a_guide_the_reach_is_the_distance_to_the_interval_between_the_ends(beyond, expected):
     for side in (-1, 1):
-        lateral = side * (end(FREE, 1)[1] + beyond)
+        lateral = side * (end(FREE)[1] + beyond)
         scenario = FREE.with_values({"target.lateral_mm": lateral})
         assert reach(scenario, 0, "model") == pytest.approx(expected, abs=1e-9)
 
@@ -106,8 +107,77 @@ def test_a_plant_that_does_not_converge_has_no_reach(monkeypatch):
 @pytest.mark.long
 def test_a_guide_that_steering_does_not_move_does_not_improve_the_reach():
     """A target within reach of guide and bevel but not of the bevel alone."""
-    low, high = sorted(end(GUIDED, bevel)[1] for bevel in (-1, 1))
+    low, high = sorted(end(GUIDED, roll)[1] for roll in (math.pi, 0.0))
     scenario = GUIDED.with_values({"target.lateral_mm": high + 1.0})
     assert reach(scenario, 0, "model") < 0.1
     assert reach(scenario, 0, "model", "steering") == pytest.approx(1.0, abs=1e-9)
     assert low < high
+
+
+# ---- in space
+
+FREE_IN_SPACE = world(15, "perfect", "no-guide").with_values(COARSE)
+HALF_TURNS = world(15, "perfect", "no-guide-half-turns").with_values(COARSE)
+
+
+def aimed(scenario, offset):
+    """The scenario with a target at y + iz (mm)."""
+    return scenario.with_values({"target.lateral_mm": offset.real, "target.lateral_z_mm": offset.imag})
+
+
+@pytest.mark.parametrize("direction", [0.0, 1.0, 2.5, -2.0])
+def test_a_needle_that_rolls_to_any_angle_reaches_a_disc(direction):
+    """As far as the constant bevel, in every direction."""
+    radius = end(FREE_IN_SPACE)[1]
+    for beyond in (-0.5, 0.7):
+        target = cmath.rect(radius + beyond, direction)
+        assert reach(aimed(FREE_IN_SPACE, target), 0, "model") == pytest.approx(max(0.0, beyond), abs=1e-3)
+
+
+def test_half_turns_reach_an_interval_and_nothing_beside_it():
+    radius = end(HALF_TURNS)[1]
+    assert reach(aimed(HALF_TURNS, complex(0.5 * radius, 0.8)), 0, "model") == pytest.approx(0.8, abs=1e-6)
+    corner = reach(aimed(HALF_TURNS, complex(-radius - 0.6, 0.8)), 0, "model")
+    assert corner == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_reach_is_about_the_place_where_a_displaced_needle_ends():
+    """A clamp that is displaced along z displaces what half turns reach, and the disc."""
+    values = {"phantom.start_offset_sd_mm": 0.0, "phantom.start_offset_z_sd_mm": 1.0}
+    for scenario in (HALF_TURNS, FREE_IN_SPACE):
+        off = scenario.with_values(values)
+        _, y, z = end(off)
+        assert abs(z) > 0.05
+        within = reach(aimed(off, 0.9 * y + 1j * z), 0, "model")
+        assert within == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("target", "expected"),
+    [(0.0, (0.0, 0.0)), (1j, (0.0, 1.0)), (3.0, (1.0, 0.0)), (-2.5 - 1j, (0.5, -1.0)), (2.0, (0.0, 0.0))],
+)
+def test_the_distance_from_an_interval_has_a_part_along_and_one_across(target, expected):
+    for turn in (1.0, cmath.exp(0.4j), cmath.exp(-1.2j)):
+        ends = [2.0 * turn, -2.0 * turn]
+        for given in (ends, ends[::-1]):
+            np.testing.assert_allclose(to_interval(target * turn, given), expected, atol=1e-12)
+
+
+def test_an_interval_and_a_disc_without_extent_are_points():
+    assert to_interval(3.0 + 4.0j, [0.0, 0.0]) == (3.0, 4.0)
+    assert to_disc(3.0 + 4.0j, [0.0, 0.0, 0.0]) == (5.0,)
+
+
+def test_the_disc_is_around_the_mean_of_the_ends_with_their_mean_distance():
+    ends = [1.0 + 1.0j + radius * turn for radius, turn in ((2.0, 1), (2.0, -1), (4.0, 1j), (4.0, -1j))]
+    assert to_disc(1.0 + 6.0j, ends) == pytest.approx((2.0,))
+    assert to_disc(2.0 + 1.0j, ends) == (0.0,)
+
+
+def test_a_plant_that_does_not_converge_on_one_side_has_no_reach(monkeypatch):
+    def ends(_truth, roll, *_):
+        return (math.nan,) * 3 if roll == 0.0 else (30.0, 1.0, 0.0)
+
+    monkeypatch.setattr("flexneedle.study.reach.straight_end", ends)
+    assert math.isnan(reach(HALF_TURNS, 0, "model"))
+    assert math.isnan(reach(FREE_IN_SPACE, 0, "model"))

@@ -15,7 +15,7 @@ from flexneedle.study.journal import Journal
 from flexneedle.study.plans import Plans, plan_key
 from flexneedle.study.rows import Job, make_plan, run_job
 from flexneedle.trace.results import RESULT_COLUMNS
-from flexneedle.types import Verdict, VerdictKind
+from flexneedle.types import DG_Y, ROLL, Verdict, VerdictKind
 
 
 @pytest.fixture(scope="module")
@@ -41,12 +41,12 @@ def test_a_row_has_the_results_of_the_insertion(point, plan):
     last = insertion.periods[-1]
     applied = np.array([period.applied for period in insertion.periods])
     assert row["index"] == 3
-    assert row["true_error_mm"] == insertion.true_error_mm == math.dist(last.true_tip[:2], plan.target)
+    assert row["true_error_mm"] == insertion.true_error_mm == math.dist(last.true_tip[:3], plan.target)
     assert row["residual_mm"] == insertion.residual_mm
     assert (row["tip_x_mm"], row["tip_y_mm"]) == last.true_tip[:2]
-    assert row["flips"] == np.count_nonzero(applied[:, 4] > 0)
+    assert row["flips"] == np.count_nonzero(applied[:, ROLL])
     assert row["strain_energy_mj"] == last.true_strain_energy
-    assert row["guide_travel_mm"] == pytest.approx(np.abs(applied[:, 3]).sum(), rel=1e-12)
+    assert row["guide_travel_mm"] == pytest.approx(np.abs(applied[:, DG_Y]).sum(), rel=1e-12)
     assert row["peak_stretch"] == min(period.true_stretch for period in insertion.periods) < 1.0
     assert (row["periods"], row["planned_periods"]) == (len(applied), len(plan.controls))
     assert (row["planned_flips"], row["planned_error_mm"]) == (plan.flips, plan.error_mm)
@@ -68,7 +68,7 @@ def test_unconverged_periods_are_counted(point, plan, monkeypatch):
 
 
 def test_a_plan_that_misses_is_refused_in_a_row_without_results(point, plan):
-    tips = plan.tips + np.array([0.0, 1.5, 0.0])
+    tips = plan.tips + np.array([0.0, 1.5, 0.0, 0.0, 0.0])
     point = replace(point, controller="open-loop")
     row = only_row(Job(point, replace(plan, tips=tips, limit="some limit"), "", ((0, 11),)))
     assert row["outcome"] == "refused"

@@ -55,7 +55,7 @@ def test_a_study_writes_one_row_per_insertion_in_grid_order(quick, uninterrupted
         settings = {name: row[name] for name in point.scenario.flat()}
         assert row["index"] == index
         assert settings == point.scenario.flat()
-        assert (row["target_depth_mm"], row["target_lateral_mm"]) == point.scenario.target.position
+        assert (row["target_depth_mm"], row["target_lateral_mm"]) == point.scenario.target.position[:2]
         assert (row["seed"], row["repeat"], row["case"]) == (insertion.seed, insertion.repeat, point.case)
         assert (row["controller"], row["plant"]) == (point.controller, point.plant)
         assert (row["strategy"], row["plan_seed"]) == ("manipulation", 0)
@@ -438,6 +438,21 @@ def test_the_summary_is_over_finished_insertions_and_counts_the_others(quick, un
     )
     assert summary["flips"] == pytest.approx(sum(row["flips"] for row in rest) / (SIZE - 1))
     assert summary["unconverged_periods"] == 3
+
+
+def test_the_summary_has_the_coverage_of_tip_and_middle(quick, uninterrupted, tmp_path):
+    """Over finished insertions with a prediction, at each fraction of the depth."""
+    table = pq.read_table(uninterrupted / "runs.parquet")
+    rows = table.to_pylist()
+    for number, row in enumerate(rows):
+        row["predicted_half_tip_y_sds"] = 2.5 if number % 4 == 0 else -1.5
+        row["predicted_half_middle_y_sds"] = 9.0 if number == 0 else None
+    rows[0]["outcome"] = "held"
+    pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), tmp_path / "runs.parquet")
+    shutil.copy(uninterrupted / "timing.parquet", tmp_path)
+    coverage = summarise(tmp_path, load_study(quick))["coverage"]
+    assert coverage["tip"]["half"] == pytest.approx(12 / 15)
+    assert coverage["middle"]["half"] is None
 
 
 def test_a_plan_counts_once_in_the_time(quick, uninterrupted):

@@ -19,7 +19,7 @@ from flexneedle.study.figures.energy import energy_figure
 from flexneedle.study.figures.samples import Sample
 from flexneedle.study.figures.shares import share_figure
 from flexneedle.study.figures.sweeps import sweep_figure
-from flexneedle.study.figures.targeting import Tips, targeting_figure
+from flexneedle.study.figures.targeting import ACROSS, Tips, targeting_figure
 
 TARGETS = np.array(
     [(depth, lateral) for depth in (25.0, 30.0, 35.0, 40.0, 45.0) for lateral in (-5.0, 0.0, 5.0)]
@@ -258,6 +258,18 @@ def test_the_close_up_shows_where_tips_ended_from_their_targets():
     assert_allclose(dots(close, TIP)[0].get_offsets(), panel.content.tips - panel.content.targets)
     farthest = np.hypot(*(panel.content.tips - panel.content.targets).T).max()
     assert close.get_xlim()[1] == pytest.approx(1.15 * farthest)
+
+
+def test_the_view_along_the_axis_is_relative_to_the_target():
+    off = np.random.default_rng(0).normal(0.0, 0.1, (20, 2))
+    panel = replace(target_panel(), content=Tips(np.zeros_like(off), off, np.ones(20, dtype=bool), ACROSS))
+    for figure in (targeting_figure([panel]), targeting_figure([panel, panel])):
+        shown = texts(figure)
+        assert "y beyond the target (mm)" in shown
+        assert "z beyond the target (mm)" in shown
+        (circles,) = (found for found in figure.axes[0].collections if isinstance(found, PatchCollection))
+        assert len(circles.get_paths()) == 1
+        assert_allclose(dots(figure.axes[0], TIP)[0].get_offsets(), off)
 
 
 def test_targets_that_are_many_are_laid_on_one_another():

@@ -218,3 +218,46 @@ def test_points_with_another_needle_have_another_reach(load):
     other = replace(point, scenario=point.scenario.with_values({"phantom.run_out_mm": 0.1}))
     assert truth_key(other) != truth_key(point)
     assert plan_key(other) == plan_key(point)
+
+
+IN_SPACE = f"""
+name = "few"
+[[axes]]
+key = "world"
+values = [{FREE}, {GUIDED}]
+[[axes]]
+key = "world_rig"
+values = "all"
+[[axes]]
+key = "controller"
+values = ["open-loop", "resolved-rate"]
+"""
+
+
+def test_each_world_has_the_rigs_that_it_can_have(load):
+    """Of those with the guide of the world, and that in the plane."""
+    study = load(IN_SPACE)
+    found = {(point.world, point.world_rig, point.controller) for point in study.points}
+    guided = ("plane", "two-axes", "two-axes-half-turns", "one-axis", "one-axis-half-turns")
+    assert found == {
+        *((GUIDED, rig, name) for rig in guided for name in ("open-loop", "resolved-rate")),
+        *((FREE, rig, "open-loop") for rig in ("plane", "no-guide", "no-guide-half-turns")),
+    }
+    for point in study.points:
+        assert point.scenario == checked(world(point.world, "real", point.world_rig))
+        assert point.varied["world_rig"] == point.world_rig
+
+
+def test_a_rig_needs_an_axis_of_worlds(load):
+    with pytest.raises(InputError, match="world_rig: needs an axis of worlds"):
+        load('name = "a"\n[values]\nworld_rig = "two-axes"\n')
+    with pytest.raises(InputError, match='world_rig = "three": must be one of plane, two-axes'):
+        load(IN_SPACE.replace('"all"', '["three"]'))
+
+
+def test_the_shipped_worlds_in_space_have_every_rig_in_both_cases():
+    study = load_study("worlds-space")
+    guided = sum(world(number).setup.has_guide for number in range(100000, 100200))
+    assert len(study) == 2 * 2 * (4 * guided + 2 * (200 - guided))
+    assert {point.scenario.setup.axes for point in study.points} == {2}
+    assert all(study.insertion(k).seed == study.insertion(k).point.world for k in range(0, len(study), 97))

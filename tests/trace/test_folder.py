@@ -171,7 +171,7 @@ def test_a_plan_is_restored_with_the_scenario_of_its_run(tmp_path):
 def test_a_plan_without_steps_is_restored():
     values = plan_values(make_plan())
     again = plan_from_values({**values, "controls": []})
-    assert again.controls.shape == (0, 5)
+    assert again.controls.shape == (0, 9)
     assert again.flips == 0
 
 

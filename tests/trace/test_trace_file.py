@@ -21,11 +21,25 @@ from flexneedle.trace.messages import joints
 from flexneedle.trace.reader import read_trace
 from flexneedle.trace.topics import TOPICS
 from flexneedle.trace.writer import TraceWriter
-from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading, Verdict, VerdictKind
+from flexneedle.types import (
+    CheckedMeasurement,
+    Control,
+    Frame,
+    Measurement,
+    Pose,
+    SensorReading,
+    Shape,
+    Verdict,
+    VerdictKind,
+)
 from synthetic import blind, make_periods, make_plan
 
 PLAN = make_plan()
-PERIODS = list(make_periods(PLAN))[:12]
+OFF = np.array([0.0, 0.1, -0.2, 0.01, -0.02])
+PERIODS = [
+    replace(period, predicted=Shape(period.shape + OFF, period.shape[:, 1:3] ** 2))
+    for period in list(make_periods(PLAN))[:12]
+]
 ABOUT = {"seed": "0", "flexneedle": "0.1.0"}
 SCENARIO = {"name": "Größe", "target": {"depth_mm": 40.0}}
 
@@ -91,6 +105,44 @@ def test_periods_are_restored_to_the_last_bit_of_every_scalar(trace_file):
 def test_shapes_are_restored(trace_file):
     for again, period in zip(read_trace(trace_file).periods, PERIODS, strict=True):
         np.testing.assert_allclose(again.shape, period.shape, rtol=1e-14, atol=1e-14)
+        for found, known in zip(again.predicted, period.predicted, strict=True):
+            np.testing.assert_allclose(found, known, rtol=1e-14, atol=1e-13)
+
+
+def test_what_was_not_predicted_is_not_that_of_the_period_before(tmp_path):
+    blank = replace(PERIODS[4], predicted=None)
+    first, second = read_trace(write(tmp_path / "trace.mcap", [PERIODS[3], blank])).periods
+    assert first.predicted is not None
+    assert second.predicted is None
+
+
+def test_a_period_in_space_is_restored(tmp_path):
+    """Every column out of the plane, a roll to any angle and a spin; to the last bit."""
+    out = {
+        "command": Control(1.0, 0.1, -0.2, 1e-3, -2e-3, 0.3, -0.4, 0.5, -0.6),
+        "applied": Control(0.9, 0.2, -0.3, 2e-3, -3e-3, 0.4, -0.5, 0.6, -0.7),
+        "innovation": (1 / 3, 0.1, -0.2), "estimate": Pose(30.0, 1.0, -1 / 3, 0.1, -0.2), "guide": (0.3, -1 / 7),
+        "base": Pose(-120.0, 0.2, -0.3, 1e-3, -1 / 3), "path": Pose(30.0, 1.1, -0.4, 0.1, -0.3), "roll": 7.0,
+        "tip_load": (0.01, -0.02), "true_tip": Pose(30.1, 1.2, -0.5, 0.2, -0.3), "miss": (0.5, -1 / 7),
+        "shape": PERIODS[3].shape + OFF, "true_shape": (PERIODS[3].shape + OFF)[:, :3],
+    }  # fmt: skip
+    period = replace(PERIODS[3], **out)
+    (again,) = read_trace(write(tmp_path / "trace.mcap", [period])).periods
+    for name, value in out.items():
+        if name.endswith("shape"):
+            np.testing.assert_allclose(getattr(again, name), value, rtol=1e-13, atol=1e-13)
+        else:
+            assert getattr(again, name) == value, name
+
+
+def test_a_period_does_not_have_the_shapes_of_the_previous_one(tmp_path):
+    shape = PERIODS[3].shape
+    with_shapes = replace(PERIODS[3], predicted=Shape(shape, shape[:, 1:3]), true_shape=shape[:, :3])
+    without = replace(PERIODS[4], predicted=None, true_shape=None)
+    first, second = read_trace(write(tmp_path / "trace.mcap", [with_shapes, without])).periods
+    assert first.predicted is not None
+    assert first.true_shape.shape == (len(shape), 3)
+    assert (second.predicted, second.true_shape) == (None, None)
 
 
 def test_a_period_without_a_tip_is_restored(tmp_path):
@@ -178,13 +230,10 @@ def test_columns_carry_units():
     bare = {
         "index",
         "verdict",
-        "bevel",
         "cost",
         "action",
         "decision",
         "converged",
-        "command_flip",
-        "applied_flip",
     }
     bare |= {"warning"}
     bare |= {"true_stretch"}  # a ratio
@@ -207,11 +256,11 @@ def test_rosbags_reads_types_units_and_frame(trace_file):
     time, estimate = found["/tip/estimate"]
     assert time == round(last.time * 1e9)
     assert estimate.header.frame_id == "skin"
-    assert estimate.pose.position.y == pytest.approx(last.estimate[1] * 1e-3, rel=1e-15)
-    assert 2 * estimate.pose.orientation.z == pytest.approx(last.estimate[2], rel=1e-3)
+    assert estimate.pose.position.y == pytest.approx(last.estimate.y * 1e-3, rel=1e-15)
+    assert 2 * estimate.pose.orientation.z == pytest.approx(last.estimate.theta, rel=1e-3)
     assert found["/tissue/true_strain_energy"][1].data == last.true_strain_energy * 1e-3
     command = found["/command"][1]
-    assert dict(zip(command.name, command.position, strict=True))["base_x"] == last.command[0] * 1e-3
+    assert dict(zip(command.name, command.position, strict=True))["base_x"] == last.command.db_x * 1e-3
     assert len(found["/needle/shape"][1].poses) == len(last.shape)
     measured = found["/tip/measured"][1].header.stamp
     assert measured.sec + measured.nanosec * 1e-9 == pytest.approx(last.measurement.time)
@@ -283,6 +332,10 @@ def test_a_trace_is_never_overwritten(trace_file):
 
 
 def test_joints_are_in_metres_and_radians():
-    message = joints(1.5, (-170.0, 0.25, 2e-3, -1.5, -1))
-    assert message.name == ["base_x", "base_y", "base_theta", "guide_y", "bevel"]
-    np.testing.assert_allclose(message.position, [-0.170, 2.5e-4, 2e-3, -1.5e-3, -1.0], rtol=1e-12)
+    message = joints(1.5, (-170.0, 0.25, -0.5, 2e-3, -1e-3, -1.5, 2.5, np.pi))
+    assert message.name == [
+        "base_x", "base_y", "base_z", "base_theta", "base_psi", "guide_y", "guide_z", "roll",
+    ]  # fmt: skip
+    np.testing.assert_allclose(
+        message.position, [-0.170, 2.5e-4, -5e-4, 2e-3, -1e-3, -1.5e-3, 2.5e-3, np.pi], rtol=1e-12
+    )

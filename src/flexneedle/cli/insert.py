@@ -17,6 +17,7 @@ from flexneedle.console.common import (
     print_table,
     run_name,
     seed,
+    target_row,
     with_examples,
 )
 from flexneedle.errors import FlexneedleError, one_line
@@ -190,7 +191,7 @@ class _InsertProgress:
 
     def period(self, period: Period) -> None:
         self._progress.finish("Planning")
-        depth = period.estimate[0]
+        depth = period.estimate.x
         if period.warning and not self._warned:
             self._warned = True
             self._progress.print_line(f"flexneedle: warning at {depth:.1f} mm: {period.warning}")
@@ -217,18 +218,17 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
     from flexneedle.trace.results import insertion_result, insertion_timing
 
     result, timing = insertion_result(insertion), insertion_timing(insertion)
-    depth, lateral = insertion.target
     rows = [
         ("controller", insertion.controller),
         ("phantom", insertion.phantom),
-        ("target (depth, lateral offset)", f"{depth:g}, {lateral:g} mm"),
+        target_row(scenario, insertion.target),
         ("true tip to target", _number(result["true_error_mm"], "mm")),
         ("  measured", _number(result["residual_mm"], "mm")),
         ("  planned", _number(result["planned_error_mm"], "mm")),
         *_registration(scenario, insertion),
         ("strain energy of the true tissue", _number(result["strain_energy_mj"], "mJ")),
         ("  planned", _number(result["planned_strain_energy_mj"], "mJ")),
-        ("bevel flips", str(insertion.flips)),
+        (scenario.setup.turns, str(insertion.flips)),
         ("  planned", str(insertion.plan.flips)),
         ("control periods", str(result["steps"])),
         *([("held", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
@@ -243,7 +243,7 @@ def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, s
 
     if scenario.tracker.registration is None:
         return []
-    error = expected_error(scenario.tracker.registration, (*insertion.target, 0.0))
+    error = expected_error(scenario.tracker.registration, insertion.target)
     return [("  expected registration error", _number(error, "mm"))]
 
 

@@ -13,12 +13,14 @@ from flexneedle.console.common import (
     print_json,
     print_table,
     run_name,
+    target_row,
     with_examples,
 )
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from flexneedle.scenario.model import Scenario
     from flexneedle.types import Plan
 
 
@@ -61,11 +63,11 @@ def _plan(args: argparse.Namespace) -> int:
             progress.show(f"Planning ({strategy})", info["iteration"], info["iterations"], note)
 
         plans = record_plans(folder, scenario, strategies, args.seed, show)
-    _report(plans, args.json, folder.path)
+    _report(scenario, plans, args.json, folder.path)
     return 0 if all(plan.reached for plan in plans.values()) else 1
 
 
-def _report(plans: dict[str, Plan], as_json: bool, folder: Path) -> None:
+def _report(scenario: Scenario, plans: dict[str, Plan], as_json: bool, folder: Path) -> None:
     from flexneedle.trace.results import plan_result, plan_timing
 
     if as_json:
@@ -73,20 +75,19 @@ def _report(plans: dict[str, Plan], as_json: bool, folder: Path) -> None:
         print_json(results if len(results) > 1 else next(iter(results.values())))
         return
     title = "\n".join(f"Plan ({name}) {plan.summary}" for name, plan in plans.items())
-    columns = [_rows(plan) for plan in plans.values()]
+    columns = [_rows(scenario, plan) for plan in plans.values()]
     names = dict.fromkeys(name for column in columns for name in column)
     rows = [(name, *(column.get(name, "") for column in columns)) for name in names]
     print_table(title, rows, folder, heads=list(plans) if len(plans) > 1 else ())
 
 
-def _rows(plan: Plan) -> dict[str, str]:
-    angle = plan.entry_angle
-    depth, lateral = plan.target
+def _rows(scenario: Scenario, plan: Plan) -> dict[str, str]:
+    angles = ", ".join(f"{degrees(angle):+.2f}°" for angle in plan.entry_angles[: scenario.setup.axes])
     return {
-        "target (depth, lateral offset)": f"{depth:g}, {lateral:g} mm",
+        **dict([target_row(scenario, plan.target)]),
         "planned tip to target": f"{plan.error_mm:.3f} mm",
-        "entry angle": "none" if isnan(angle) else f"{degrees(angle):+.2f}°",
-        "bevel flips": str(plan.flips),
+        f"entry angle{'s' if scenario.setup.axes > 1 else ''}": "none" if isnan(plan.entry_angle) else angles,
+        scenario.setup.turns: str(plan.flips),
         "strain energy of the tissue": f"{plan.strain_energy[-1]:.3f} mJ",
         "cost": f"{plan.cost:.3f}",
         **{f"  {name}": f"{value:.3f}" for name, value in plan.terms.items()},

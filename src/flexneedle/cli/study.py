@@ -196,6 +196,9 @@ def _table(summary: Mapping[str, Any]) -> None:
         "\nFinished insertions: true error (mm); mean flips (planned); mean tissue energy and largest number of "
         "periods, relative to the plan."
     )
+    if summary["coverage"]["tip"]["half"] is not None:
+        shares = "; ".join(f"{part} {_percents(of)}" for part, of in summary["coverage"].items())
+        console.print(f"Within ±1.96 sd of the prediction at ¼, ½ and ¾ of the depth: {shares}.")
     if unconverged:
         console.print(
             f"{unconverged} periods did not converge: see column unconverged_periods of runs.parquet."
@@ -222,6 +225,12 @@ def _cells(part: Mapping[str, Any]) -> Sequence[str]:
         _number(part["energy_ratio"], 2),
         _number(periods["max"], 2),
     )
+
+
+def _percents(shares: Mapping[str, float | None]) -> str:
+    """Shares as text in one unit, "–" where unknown."""
+    texts = ("–" if share is None else f"{100.0 * share:.0f}" for share in shares.values())
+    return f"{', '.join(texts)} %"
 
 
 def _number(value: float | None, digits: int = 3) -> str:

@@ -26,6 +26,27 @@ def examples(*lines: str) -> str:
     return "\n".join(["examples:", *(f"  {line}" for line in lines)])
 
 
+class _Target(argparse.Action):
+    """Two or three numbers, kept as x, y, z; z is 0 unless it is given."""
+
+    def __call__(
+        self,
+        _parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        _option: str | None = None,
+    ) -> None:
+        """Keep the target. Raises ArgumentError for anything but two or three numbers."""
+        try:
+            given = [float(value) for value in values]
+        except ValueError:
+            given = []
+        if len(given) not in (2, 3):
+            rule = "must be two or three numbers, with SCENARIO before it"
+            raise argparse.ArgumentError(self, f"{' '.join(values)}: {rule}")
+        setattr(namespace, self.dest, (*given, 0.0)[:3])
+
+
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments common to `plan` and `insert`."""
     parser.add_argument(
@@ -37,10 +58,10 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--target",
-        nargs=2,
-        type=float,
-        metavar=("X", "Y"),
-        help="depth and lateral offset of the target in mm (default: as in the scenario)",
+        nargs="+",
+        action=_Target,
+        metavar=("X Y", "Z"),
+        help="depth and lateral offset of the target in mm, in space both offsets (default: as in the scenario)",
     )
     parser.add_argument(
         "--seed",
@@ -71,8 +92,14 @@ def chosen_scenario(args: argparse.Namespace, *own: Method) -> Scenario:
     scenario = used(load_scenario(args.scenario), *own, source=args.scenario)
     if args.target is None:
         return scenario
-    depth, lateral = args.target
-    return scenario.with_values({"target.depth_mm": depth, "target.lateral_mm": lateral})
+    keys = ("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm")
+    return scenario.with_values(dict(zip(keys, args.target, strict=True)))
+
+
+def target_row(scenario: Scenario, target: Sequence[float]) -> tuple[str, str]:
+    """Return the row of a table for a target x, y, z (mm), without z in the plane."""
+    shown = ", ".join(f"{value:g}" for value in target[: 1 + scenario.setup.axes])
+    return f"target (depth, lateral offset{'s' if scenario.setup.axes > 1 else ''})", f"{shown} mm"
 
 
 def compile_first() -> None:

@@ -1,6 +1,9 @@
 """Consequences of the miss that a decision predicts at the target: a warning, or a hold."""
 
+import cmath
 import math
+
+from scipy.special import chndtr
 
 from flexneedle.control.interface import Decision
 from flexneedle.scenario.sections.settings import ControlSettings
@@ -10,17 +13,24 @@ _LIKELY = 0.5  # probability of a miss from which a decision counts towards a wa
 _IN_A_ROW = 3  # such decisions make one: a single prediction, right after the skin for example, may be wrong
 
 
-def probability_beyond(limit: float, miss: float, sd: float) -> float:
-    """Probability that a normal miss (mean `miss`, standard deviation `sd`, mm) is larger than `limit` in size.
+def probability_beyond(limit: float, miss: float | complex, sd: float) -> float:
+    """Probability that a normal miss (mean `miss`, standard deviation `sd` on each axis, mm) is larger than `limit`.
 
     0 where nothing is predicted (NaN).
     """
-    if math.isnan(miss) or math.isnan(sd):
+    if cmath.isnan(miss) or math.isnan(sd):
         return 0.0
     if sd == 0.0:
         return float(abs(miss) > limit)
+    if isinstance(miss, complex):  # (size/sd)² is noncentral χ² distributed
+        return 1.0 - float(chndtr((limit / sd) ** 2, 2.0, (abs(miss) / sd) ** 2))
     scale = sd * math.sqrt(2.0)
     return 0.5 * (math.erfc((limit - miss) / scale) + math.erfc((limit + miss) / scale))
+
+
+def size_text(miss: float | complex) -> str:
+    """A miss (mm) as text: with its sign in the plane, its size in space."""
+    return f"{abs(miss):.3f}" if isinstance(miss, complex) else f"{miss:+.3f}"
 
 
 def hopeless(decision: Decision, control: ControlSettings) -> str:
@@ -32,7 +42,7 @@ def hopeless(decision: Decision, control: ControlSettings) -> str:
     if probability < control.miss_confidence:
         return ""
     return (
-        f"no path to the target found: predicted miss {decision.miss:+.2f} ± {decision.miss_sd:.2f} mm is beyond "
+        f"no path to the target found: predicted miss {_predicted(decision)} is beyond "
         f"control.miss_limit_mm = {limit:g} with a probability of {probability:.3f} "
         f"(limit {control.miss_confidence:g}); use --force to insert anyway"
     )
@@ -46,9 +56,15 @@ def likely_misses(decision: Decision, before: int) -> int:
 
 def warning(decision: Decision, in_a_row: int) -> str:
     """A warning once `in_a_row` successive decisions that predict a miss of more than 1 mm are enough; else empty."""
-    if in_a_row < _IN_A_ROW or math.isnan(decision.miss):
+    if in_a_row < _IN_A_ROW or cmath.isnan(decision.miss):
         return ""
-    return f"predicted miss {decision.miss:+.2f} ± {decision.miss_sd:.2f} mm: likely beyond {_RADIUS_MM:g} mm"
+    return f"predicted miss {_predicted(decision)}: likely beyond {_RADIUS_MM:g} mm"
+
+
+def _predicted(decision: Decision) -> str:
+    miss = decision.miss
+    size = f"{abs(miss):.2f}" if isinstance(miss, complex) else f"{miss:+.2f}"
+    return f"{size} ± {decision.miss_sd:.2f} mm"
 
 
 def missed(true: float, estimated: float) -> str:

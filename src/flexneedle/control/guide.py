@@ -2,6 +2,7 @@
 
 from flexneedle.control.interface import Method
 from flexneedle.errors import InputError
+from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
 
 _STILL = "steering"  # the strategy with the bevel as the only input
@@ -15,6 +16,18 @@ def guide_may_move(setup: Setup, strategy: str) -> bool:
 def most_guide_step(setup: Setup, strategy: str) -> float:
     """Largest lateral travel (mm) of the guide in a control step; 0 if it may not move."""
     return setup.max_guide_step_mm if guide_may_move(setup, strategy) else 0.0
+
+
+def guide_reach(scenario: Scenario, axis: int) -> tuple[float, float]:
+    """Range (mm) of the guide's position on an axis, 0 or 1."""
+    home, reach = scenario.guide_home, scenario.setup.max_guide_travel_mm
+    middle = home.imag if axis else home.real
+    return middle - reach, middle + reach
+
+
+def guide_axes(setup: Setup, strategy: str) -> int:
+    """Lateral axes in which the guide may move."""
+    return setup.moved_guide_axes if strategy != _STILL else 0
 
 
 def check_guide(method: Method, setup: Setup, strategy: str) -> None:

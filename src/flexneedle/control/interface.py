@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,9 +16,8 @@ from flexneedle.estimation.task import Task
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.fields import Section
 from flexneedle.scenario.sections.settings import ControlSettings
-from flexneedle.simulator.control import COLUMNS
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, Plan
+from flexneedle.types import COLUMNS, Control, Plan, Shape, X
 
 _CORRECTED_MODEL = StateCorrection()
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
@@ -30,20 +29,21 @@ class Decision:
 
     An infinite cost means that no feasible command was found: the loop holds the needle, with `why` as the reason.
 
-    miss, miss_sd: lateral miss predicted at the target, positive in +y, and its standard deviation with the corrections
-    to come (mm; NaN: not predicted). The loop warns and holds by them. rest: time (s) for which the needle rests,
-    in place of the command, so that late readings arrive.
-    Raises InputError for a command that is not five finite numbers, a negative miss_sd, or a rest that is negative or
-    not finite.
+    miss, miss_sd: lateral miss predicted at the target, y or, in space, y + iz, and its standard deviation on an axis
+    with the corrections to come (mm; NaN: not predicted). The loop warns and holds by them. rest: time (s) for which
+    the needle rests, in place of the command, so that late readings arrive. predicted: shape of the needle at the
+    target, None if it is not predicted; not compared. command: a `Control`, or its nine columns. Raises InputError for
+    another command, or one that is not finite, a negative miss_sd, or a rest that is negative or not finite.
     """
 
-    command: Command
+    command: Control
     why: str
     cost: float = math.nan
     spread: float = math.nan
-    miss: float = math.nan
+    miss: float | complex = math.nan
     miss_sd: float = math.nan
     rest: float = 0.0
+    predicted: Shape | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "command", _plain_command(self.command))
@@ -55,18 +55,17 @@ class Decision:
             raise InputError(f"rest = {self.rest}: must be finite and at least 0 (s)")
 
 
-def _plain_command(command: Any) -> Command:
+def _plain_command(command: Any) -> Control:
     """The command as plain numbers, whatever their types."""
     try:
-        x, y, turn, guide, flip = map(float, command)
-    except (TypeError, ValueError):
-        rule = f"must have {len(COLUMNS)} numbers, {', '.join(COLUMNS)}"
-        raise InputError(f"command = {command}: {rule}") from None
-    if not all(map(math.isfinite, (x, y, turn, guide))):
+        row = Control.of(map(float, command))
+    except (TypeError, ValueError, InputError):
+        raise InputError(
+            f"command = {command}: must be a Control, or its {len(COLUMNS)} columns {', '.join(COLUMNS)}"
+        ) from None
+    if not all(map(math.isfinite, row)):
         raise InputError(f"command = {command}: must have finite numbers, {', '.join(COLUMNS)}")
-    if flip not in (-1.0, 1.0):
-        raise InputError(f"command = {command}: flip must be -1 or 1")
-    return x, y, turn, guide, int(flip)
+    return row
 
 
 def travel_left(scenario: Scenario, plan: Plan, state: State) -> float:
@@ -74,7 +73,7 @@ def travel_left(scenario: Scenario, plan: Plan, state: State) -> float:
     stroke_left = scenario.setup.stroke_mm - float(
         state.travel[0]
     )  # commanded travel, without the start error
-    return max(0.0, min(plan.target[0] - float(state.tip[0]), stroke_left))
+    return max(0.0, min(plan.target[0] - float(state.tip[X]), stroke_left))
 
 
 def at_depth(task: Task, _memory: Any, estimate: Estimate) -> bool:

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from flexneedle.control.bang_bang import BevelRule
-from flexneedle.control.guide import most_guide_step
+from flexneedle.control.guide import guide_reach, most_guide_step
 from flexneedle.control.interface import travel_left
 from flexneedle.planning import terms
 from flexneedle.planning.cross_entropy import Search, elite_count
@@ -15,9 +15,10 @@ from flexneedle.planning.terms import Term, Trajectories
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, count
+from flexneedle.simulator.control import MOVES, controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Floats, Plan
+from flexneedle.types import DB_X, DB_Y, DG_Y, ROLL, STILL, Control, Floats, Plan, X
 
 _LEAST_ADVANCE = 0.5  # of the longest step, so that the cost is not reduced by not advancing
 
@@ -45,9 +46,9 @@ class CeMpc(BevelRule):
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The steps of a period (db_x, db_y, db_theta, dg_y; mm, rad), their cost, and the sd left in dg_y (mm)."""
+    """The command of a period, its cost, and the sd left in dg_y (mm)."""
 
-    steps: tuple[float, float, float, float]
+    command: Control
     cost: float
     spread: float
 
@@ -58,16 +59,19 @@ def choose(
     state: State,
     control: CeMpc,
     *,
-    flip: bool,
+    roll: float,
     rng: np.random.Generator,
 ) -> Choice:
-    """Search the next steps of advance and guide for the least deviation from the planned tip poses."""
+    """Search the next steps of advance and guide for the least deviation from the planned tip poses.
+
+    roll: that of the first step (rad).
+    """
     scenario = simulator.scenario
     steps, travel = control.horizon, travel_left(scenario, plan, state)
-    reference, nominal = plan_window(plan, float(state.tip[0]), steps)
-    base = planned_base(scenario.setup, plan, state, reference[:, 0])
+    reference, nominal = plan_window(plan, float(state.tip[X]), steps)
+    base = planned_base(scenario.setup, plan, state, reference[:, X])
     guide = most_guide_step(scenario.setup, plan.strategy)
-    variables = _variables(scenario, state, base, travel, nominal, guide, flip=flip)
+    variables = _variables(scenario, state, base, travel, nominal, guide, roll)
     search = Search(
         samples=control.samples,
         elite=elite_count(control.samples, scenario.plan.elite_fraction),
@@ -76,36 +80,35 @@ def choose(
         tolerance=scenario.plan.tolerance,
     )
 
-    def rollout(controls: Floats) -> Trajectories:
-        return Trajectories(controls, *simulator.rollout(state, controls))
+    def rollout(rows: Floats) -> Trajectories:
+        return Trajectories(rows, *simulator.rollout(state, rows)[:3])
 
-    found = best(variables, rollout, cost_terms(control, reference, nominal[:, 3]), search, rng)
+    found = best(variables, rollout, cost_terms(control, reference, nominal[:, DG_Y : DG_Y + 2]), search, rng)
     spread = float(np.sqrt(found.search_state.covariance[steps, steps]))
-    db_x, db_y, db_theta, dg_y = found.trajectories.controls[0, 0, :4].tolist()
-    return Choice((db_x, db_y, db_theta, dg_y), found.cost, spread)
+    return Choice(Control.of(found.trajectories.controls[0, 0].tolist()), found.cost, spread)
 
 
 def plan_window(plan: Plan, x: float, steps: int) -> tuple[Floats, Floats]:
-    """Planned tip poses (steps, 3) after each step from the plan's tip at depth x, and its controls (steps, 5)."""
+    """Planned tip poses (steps, 5) after each step from the plan's tip at depth x, and its controls (steps, 9)."""
     last = len(plan.tips) - 1
-    at = float(np.interp(x, plan.tips[:, 0], np.arange(last + 1)))
+    at = float(np.interp(x, plan.tips[:, X], np.arange(last + 1)))
     index = np.minimum(at + np.arange(1, steps + 1), last)
-    poses = np.stack([np.interp(index, np.arange(last + 1), plan.tips[:, k]) for k in range(3)], axis=1)
+    poses = np.stack([np.interp(index, np.arange(last + 1), plan.tips[:, k]) for k in range(5)], axis=1)
     rows = np.minimum(np.floor(at + 1e-9).astype(int) + np.arange(steps), last)
-    controls = np.concatenate([plan.controls, [[0.0, 0.0, 0.0, 0.0, -1.0]]])[rows]
-    return poses, controls
+    return poses, np.concatenate([plan.controls, [STILL]])[rows]
 
 
 def planned_base(setup: Setup, plan: Plan, state: State, depth: Floats) -> Floats:
-    """Steps (n, 2) of base y (mm) and θ (rad) to the planned base poses with the tip at `depth` (n,), mm.
+    """Steps (n, 4) of base y, z (mm), θ, ψ (rad) to the planned base poses with the tip at `depth` (n,), mm.
 
     A base that lags behind the plan moves as fast as its limits allow.
     """
-    limit = np.array([setup.max_base_step_mm, setup.max_base_turn_step])
-    moved = np.concatenate([np.zeros((1, 2)), np.cumsum(plan.controls[:, 1:3], axis=0)])
-    goal = np.stack([np.interp(depth, plan.tips[:, 0], moved[:, k]) for k in (0, 1)], axis=1)
-    goal[:, 0] = np.clip(goal[:, 0], -setup.max_base_travel_mm, setup.max_base_travel_mm)
-    steps, place = np.zeros_like(goal), state.travel[1:3]
+    limit = np.repeat([setup.max_base_step_mm, setup.max_base_turn_step], 2)
+    base = slice(DB_Y, DG_Y)
+    moved = np.concatenate([np.zeros((1, 4)), np.cumsum(plan.controls[:, base], axis=0)])
+    goal = np.stack([np.interp(depth, plan.tips[:, X], column) for column in moved.T], axis=1)
+    goal[:, :2] = np.clip(goal[:, :2], -setup.max_base_travel_mm, setup.max_base_travel_mm)
+    steps, place = np.zeros_like(goal), state.travel[base]
     for step, end in zip(steps, goal, strict=True):
         step[:] = np.clip(end - place, -limit, limit)
         place = place + step
@@ -119,26 +122,30 @@ def _variables(
     travel: float,
     nominal: Floats,
     guide: float,
-    *,
-    flip: bool,
+    roll: float,
 ) -> Variables:
-    """z = (advances, guide steps), each (steps,), about those of the plan (steps, 5); guide: the longest step (mm)."""
+    """z = (advances, guide steps on each axis), each (steps,), about those of the plan (steps, 9).
+
+    guide: the longest step (mm).
+    """
     control, steps, advance = scenario.control, len(nominal), scenario.setup.max_advance_mm
     # A guide step must undo the start error within half the horizon; jitter asks for a little more.
     sigma = min(guide, 2.0 * (control.start_offset_sd_mm + scenario.tracker.jitter_per_axis) / steps)
-    lower = np.repeat([_LEAST_ADVANCE * advance, -guide], steps)
-    upper = np.repeat([advance, guide], steps)
+    axes = scenario.setup.moved_guide_axes or 1
+    lower = np.repeat([_LEAST_ADVANCE * advance, *[-guide] * axes], steps)
+    upper = np.repeat([advance, *[guide] * axes], steps)
+    planned = [nominal[:, DB_X], *nominal.T[DG_Y : DG_Y + axes]]
     return Variables(
         lower=lower,
         upper=upper,
-        mean=np.clip(np.concatenate([nominal[:, 0], nominal[:, 3]]), lower, upper),
-        sigma=np.repeat([scenario.plan.advance_sigma_mm, sigma], steps),
-        controls=lambda z: controls_of(scenario, state, z, base, travel, flip),
+        mean=np.clip(np.concatenate(planned), lower, upper),
+        sigma=np.repeat([scenario.plan.advance_sigma_mm, *[sigma] * axes], steps),
+        controls=lambda z: controls_of(scenario, state, z, base, travel, roll),
     )
 
 
 def cost_terms(control: CeMpc, reference: Floats, nominal: Floats) -> tuple[Term, ...]:
-    """Deviation from poses (steps, 3), departure from guide steps (steps,), tissue energy (paper eq. 13)."""
+    """Deviation from poses (steps, 5), departure from guide steps (steps, 2), tissue energy (paper eq. 13)."""
     poses = partial(terms.deviation, reference=reference, orientation=control.orientation_weight_mm)
     return (
         Term("deviation", 1.0, poses),
@@ -148,18 +155,17 @@ def cost_terms(control: CeMpc, reference: Floats, nominal: Floats) -> tuple[Term
 
 
 def controls_of(
-    scenario: Scenario, state: State, z: Floats, base: Floats, travel: float, flip: bool
+    scenario: Scenario, state: State, z: Floats, base: Floats, travel: float, roll: float
 ) -> Floats:
-    """Controls (N, steps, 5) of z and the base's steps: advance limited to the travel, the guide to its reach."""
-    n, steps = len(z), z.shape[1] // 2
-    reach = scenario.setup.max_guide_travel_mm
+    """Controls (N, steps, 9) of z and the base's steps: advance limited to the travel, the guide to its reach."""
+    n, steps = len(z), len(base)
     moved = np.minimum(np.cumsum(z[:, :steps], axis=1), travel)
-    guide = np.clip(state.guide + np.cumsum(z[:, steps:], axis=1), -reach, reach)
-    controls = np.zeros((n, steps, 5))
-    controls[:, :, 0] = np.diff(moved, axis=1, prepend=0.0)
-    controls[:, :, 3] = np.diff(guide, axis=1, prepend=state.guide)
-    controls[:, :, 1:3] = base
-    controls[:, :, 1:4] *= controls[:, :, :1] > 0.0
-    controls[:, :, 4] = -1.0
-    controls[:, 0, 4] = 1.0 if flip else -1.0
-    return controls
+    rows = controls(n, steps, db_x=np.diff(moved, axis=1, prepend=0.0))
+    for axis, sideways in enumerate(np.split(z[:, steps:], z.shape[1] // steps - 1, axis=1)):
+        place = state.guide[axis]
+        guide = np.clip(place + np.cumsum(sideways, axis=1), *guide_reach(scenario, axis))
+        rows[:, :, DG_Y + axis] = np.diff(guide, axis=1, prepend=place)
+    rows[:, :, DB_Y:DG_Y] = base
+    rows[:, :, DB_Y:MOVES] *= rows[:, :, :1] > 0.0
+    rows[:, 0, ROLL] = roll
+    return rows

@@ -15,9 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexneedle.estimation.identification import Identified
-from flexneedle.estimation.prior import RUN_OUT
-from flexneedle.types import Floats
+from flexneedle.estimation.identification import Identified, directions, facing
+from flexneedle.types import Floats, Laterals, X, Y, laterals
 
 UNCORRECTED = 5.0
 """Control steps before the target in which a correction takes no effect."""
@@ -27,46 +26,75 @@ _DRIFT = 0.0008  # mm per mm of path
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """Derivatives (K, g) of the tip's lateral position ahead with respect to the parameters, over the depth grid (g,).
+    """Derivatives (K, g) of the tip's lateral position ahead with respect to the parameters, over the depth grid
+    (g,), and those of the needle's shape at the target (K, n).
 
     A few of them are simulated again each period, along the current path (`Identified.perturbed`).
     """
 
     grid: Floats
-    curves: Floats
+    curves: Laterals
+    bent: Laterals
 
     @staticmethod
     def of(estimate: Identified) -> "Outlook":
-        """The derivatives before the first path: those of the estimate itself, a few steps ahead."""
-        return Outlook(estimate.grid, estimate.curves)
+        """The derivatives before the first path: those of the estimate itself, a few steps ahead; none of the shape."""
+        nodes = estimate.nominal.scenario.needle.nodes
+        curves = estimate.curves[0]
+        return Outlook(estimate.grid, curves, np.zeros((len(curves), nodes), curves.dtype))
 
-    def renewed(self, estimate: Identified, controls: Floats, tips: Floats) -> "Outlook":
-        """Derivatives renewed for the parameters that the estimate has just perturbed, along controls (m, 5).
+    def renewed(self, estimate: Identified, controls: Floats, tips: Floats, shape: Floats) -> "Outlook":
+        """Derivatives renewed for the parameters that the estimate has just perturbed, along controls (m, 9).
 
-        tips (m, 3): measured tips predicted for these controls.
+        tips (m, 5), shape (n, 5): measured tips, and the shape at the end, predicted for these controls.
         """
-        curves = self.curves.copy()
-        side = estimate.state.bevel * np.cumprod(-np.sign(controls[:, 4]))
-        lateral = tips[:, 1] - estimate.run_out * side - estimate.residual  # of the needle's axis
-        depth = np.maximum.accumulate(tips[:, 0])
+        curves, bent = self.curves.copy(), self.bent.copy()
+        bevel = facing(estimate.state.bevel, controls, estimate.axes)
+        lateral = (
+            laterals(tips, Y, estimate.axes) - estimate.run_out * bevel - estimate.residual
+        )  # of the axis
+        depth = np.maximum.accumulate(tips[:, X])
         for one in estimate.perturbed:
-            moved = one.simulator.rollout(one.state, controls[None], limits=False).tips[0]
-            curves[one.parameter] = np.interp(self.grid, depth, (moved[:, 1] - lateral) / one.step)
-        curves[RUN_OUT] = np.interp(self.grid, depth, side)
-        return replace(self, curves=curves)
+            ended = one.simulator.rollout(one.state, controls[None], limits=False, rough=True, shapes=True)
+            moved = ended.tips[0]
+            bent[one.parameter] = laterals(ended.shapes[0, -1] - shape, Y, estimate.axes) / one.step
+            curves[one.parameter] = np.interp(
+                self.grid, depth, (laterals(moved, Y, estimate.axes) - lateral) / one.step
+            )
+        for k, direction in zip(
+            range(*estimate.slots.run_out.indices(len(curves))), directions(1.0, estimate.axes), strict=True
+        ):
+            curves[k] = np.interp(self.grid, depth, bevel * direction)
+        return replace(self, curves=curves, bent=bent)
 
-    def sd(self, estimate: Identified, target: float, miss: float) -> float:
-        """Standard deviation (mm) of the miss at the depth `target` (mm), if `miss` (mm) is predicted."""
+    def sd(self, estimate: Identified, target: float, miss: complex) -> float:
+        """Standard deviation (mm), on an axis, of the miss at the depth `target` (mm), if `miss` (mm) is predicted."""
         step = estimate.nominal.scenario.setup.max_advance_mm
-        end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
-        to_come = (self.grid > estimate.state.tip[0]) & (self.grid <= target - UNCORRECTED * step)
+        end, axes = np.array([np.interp(target, self.grid, curve) for curve in self.curves]), estimate.axes
+        to_come = (self.grid > estimate.state.tip[X]) & (self.grid <= target - UNCORRECTED * step)
         slopes = self.curves[:, to_come]
-        then = estimate.precision + slopes @ slopes.T / estimate.reading_variance
-        known = end @ np.linalg.solve(then, end) + _UNEXPLAINED**2 * estimate.reading_variance
-        known += (_DRIFT * (target - float(estimate.state.tip[0]))) ** 2
-        return float(np.sqrt(float(known) + min(miss**2, self.sd_now(estimate, target) ** 2)))
+        then = estimate.precision + (slopes @ slopes.conj().T).real / estimate.reading_variance
+        known = (end.conj() @ np.linalg.solve(then, end)).real / axes
+        known += _UNEXPLAINED**2 * estimate.reading_variance
+        known += (_DRIFT * (target - float(estimate.state.tip[X]))) ** 2
+        return float(np.sqrt(float(known) + min(abs(miss) ** 2 / axes, self.sd_now(estimate, target) ** 2)))
+
+    def shape_sd(self, estimate: Identified, target: float, lever: Laterals, miss_sd: float) -> Floats:
+        """Standard deviations (n, 2) of y and z of the nodes at the target (mm).
+
+        Corrections of the path to come undo the miss at the depth `target` (mm) but for `miss_sd` (mm); by this they
+        move the nodes by `lever` (n,), relative to the tip.
+        """
+        end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
+        left = self.bent - np.outer(end, lever)
+        parts = np.stack([left.real, left.imag])
+        variance = np.einsum("akn,kl,aln->na", parts, estimate.covariance, parts)
+        sd: Floats = np.sqrt(variance + np.abs(lever[:, None]) ** 2 * miss_sd**2)
+        return sd
 
     def sd_now(self, estimate: Identified, target: float) -> float:
-        """Standard deviation (mm) of the tip's lateral position at the depth `target` (mm) without corrections."""
+        """Standard deviation (mm), on an axis, of the tip's lateral position at the depth `target` (mm) without
+        corrections.
+        """
         end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
-        return float(np.sqrt(end @ np.linalg.solve(estimate.precision, end)))
+        return float(np.sqrt((end.conj() @ np.linalg.solve(estimate.precision, end)).real / estimate.axes))

@@ -1,8 +1,8 @@
 """The current path: the guide over absolute depth and the depths at which the bevel rolls, and its corrections.
 
-A sample corrects the path: lateral corrections of the guide at a few knots between now and the target, and the depths
-of the rolls, `LEAST_SLOTS` or as many as the path has. Sample 0 corrects nothing, so the path is only replaced by
-a better one on the same model.
+A sample corrects the path: lateral corrections of the guide at a few knots between now and the target, on each axis of
+the guide, and the rolls, `LEAST_SLOTS` or as many as the path has: their depths, and the needle's angles after them
+where it rolls to any angle. Sample 0 corrects nothing, so the path is only replaced by a better one on the same model.
 """
 
 from dataclasses import dataclass, replace
@@ -10,12 +10,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.control.guide import most_guide_step
+from flexneedle.control.guide import guide_axes, guide_reach, most_guide_step
 from flexneedle.control.interface import travel_left
 from flexneedle.control.mpc import planned_base
+from flexneedle.control.rotation import roll_within
 from flexneedle.estimation.task import Task
+from flexneedle.planning.insertion import LEAST_ROLL
+from flexneedle.scenario.sections.apparatus import Setup
+from flexneedle.simulator.control import controls
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, Floats, Plan
+from flexneedle.types import DB_Y, DG_Y, ROLL, Control, Floats, Plan, X
 
 KNOTS = np.array([0.1, 0.3, 0.6, 1.0])
 """Positions of the corrections of the guide, as shares of the path from the tip to the target."""
@@ -29,40 +33,47 @@ _DUE = 0.05  # of a control step: a roll this near is made at once
 _STEEPEST = 0.03  # slope of the largest correction of the guide, mm per mm of the path left
 _SHARE_OF_A_STEP = 0.5  # of the guide's limit in a control step, added to it: largest next to the target
 _FURTHEST = 0.3  # largest move of a roll, of the path left
+_WIDEST = 1.0  # largest change of an angle (rad)
+_LEAN = 0.1  # mm
 _DECADES = 2.0  # over which the scales of the samples spread
+_TURNS = 4.0 * np.pi  # from the present angle, to either side: bounds of an angle
 
 
 @dataclass(frozen=True, eq=False)
 class GuidePath:
-    """The guide's lateral position (r,) over the depth (r,) of the tip, mm, and the depths of the rolls, ascending."""
+    """The guide's position y, z (r, 2) over the depth (r,) of the tip, mm; and the rolls (k, 2): their depths (mm),
+    ascending, and the needle's angle (rad) after each.
+    """
 
     depth: Floats
     guide: Floats
-    rolls: tuple[float, ...]
+    rolls: Floats
 
 
 def of_plan(plan: Plan) -> GuidePath:
     """The plan's path."""
-    rolls = plan.tips[:-1][plan.controls[:, 4] > 0.0][:, 0]
-    keep = np.concatenate([[True], np.diff(plan.tips[:, 0]) > 1e-9])
-    return GuidePath(plan.tips[keep, 0], plan.guide[keep], tuple(rolls.tolist()))
+    rolled = plan.controls[:, ROLL] != 0.0
+    angle = plan.roll + np.cumsum(plan.controls[:, ROLL])
+    keep = np.concatenate([[True], np.diff(plan.tips[:, X]) > 1e-9])
+    rolls = np.stack([plan.tips[:-1, X], angle], axis=1)[rolled]
+    return GuidePath(plan.tips[keep, X], plan.guide[keep], rolls)
 
 
 @dataclass(frozen=True, eq=False)
 class Ahead:
-    """The path from the tip to the target in m steps: depth (m + 1,) of their ends, base (m, 2) of each; mm, rad.
+    """The path from the tip to the target in m steps: depth (m + 1,) of their ends, base (m, 4) of each; mm, rad.
 
-    state: the estimated needle; path: the current one; step, reach: the guide's limits (mm), per control step, in all;
-    advance: longest control step (mm).
+    state: the estimated needle; path: the current one; setup: its limits; step: largest one of the guide (mm), which
+    moves on `axes` axes.
     """
 
     depth: Floats
     base: Floats
     state: State
     path: GuidePath
+    setup: Setup
     step: float
-    reach: float
-    advance: float
+    axes: int
 
     @staticmethod
     def of(task: Task, state: State, path: GuidePath) -> "Ahead":
@@ -73,16 +84,22 @@ class Ahead:
         first = np.linspace(0.0, fine, max(1, int(np.ceil(fine / longest - 1e-9))) + 1)
         rest = left - fine
         steps = int(np.ceil(rest / (_COARSE * longest) - 1e-9))
-        depth = float(state.tip[0]) + np.append(first, fine + rest * np.arange(1, steps + 1) / max(steps, 1))
+        depth = float(state.tip[X]) + np.append(first, fine + rest * np.arange(1, steps + 1) / max(steps, 1))
+        strategy = task.plan.strategy
         return Ahead(
             depth,
             planned_base(setup, task.plan, state, depth[1:]),
             state,
             path,
-            most_guide_step(setup, task.plan.strategy),
-            setup.max_guide_travel_mm,
-            longest,
+            setup,
+            most_guide_step(setup, strategy),
+            guide_axes(setup, strategy) or 1,
         )
+
+    @property
+    def advance(self) -> float:
+        """Longest control step (mm)."""
+        return self.setup.max_advance_mm
 
     @property
     def left(self) -> float:
@@ -95,6 +112,22 @@ class Ahead:
         return max(LEAST_SLOTS, len(self.path.rolls))
 
     @property
+    def knots(self) -> int:
+        """Corrections of the guide in a sample."""
+        return int(self.axes * KNOTS.size)
+
+    @property
+    def depths(self) -> slice:
+        """Depths of the rolls in a sample."""
+        return slice(self.knots, self.knots + self.slots)
+
+    @property
+    def angles(self) -> slice:
+        """Angles after the rolls in a sample; none where the needle rolls by half turns."""
+        last = self.depths.stop
+        return slice(last, last if self.setup.half_turns else last + self.slots)
+
+    @property
     def unused(self) -> float:
         """Depth (mm) of a roll that is not made."""
         return float(self.depth[-1]) + 0.5 * self.left + self.advance
@@ -102,117 +135,156 @@ class Ahead:
     @property
     def bounds(self) -> tuple[Floats, Floats]:
         """Bounds of a sample, (d,) each."""
-        wide = 2.0 * self.reach if self.step > 0.0 else 0.0
-        lower = [np.full(KNOTS.size, -wide), np.full(self.slots, self.depth[0])]
-        upper = [np.full(KNOTS.size, wide), np.full(self.slots, self.unused)]
+        wide = 2.0 * self.setup.max_guide_travel_mm if self.step > 0.0 else 0.0
+        angles = self.angles.stop - self.angles.start
+        lower = [np.full(self.knots, -wide), np.full(self.slots, self.depth[0])]
+        upper = [np.full(self.knots, wide), np.full(self.slots, self.unused)]
+        lower.append(np.full(angles, max(-self.setup.max_rotation, self.state.roll - _TURNS)))
+        upper.append(np.full(angles, min(self.setup.max_rotation, self.state.roll + _TURNS)))
         return np.concatenate(lower), np.concatenate(upper)
 
     @property
     def current(self) -> Floats:
         """The sample (d,) that corrects nothing."""
-        rolls = np.full(self.slots, self.unused)
-        rolls[: len(self.path.rolls)] = np.maximum(self.path.rolls, self.depth[0])
-        return np.concatenate([np.zeros(KNOTS.size), rolls])
+        known = len(self.path.rolls)
+        rolls = np.full((self.slots, 2), (self.unused, self.state.roll))
+        rolls[:known] = self.path.rolls
+        rolls[:known, 0] = np.maximum(rolls[:known, 0], self.depth[0])
+        angles = rolls[:0, 1] if self.setup.half_turns else rolls[:, 1]
+        return np.concatenate([np.zeros(self.knots), rolls[:, 0], angles])
+
+    def leaning(self, z: Floats) -> Floats:
+        """A sample (d,) with the guide a tenth of a millimetre further in +y at the target, where it may move."""
+        other = z.copy()
+        other[: KNOTS.size] += _LEAN * KNOTS if self.step > 0.0 else 0.0
+        return other
 
     @property
     def constant(self) -> Floats:
-        """Samples (4, d) that roll before the first step or not, and after it or not (last index), and never again."""
-        z = np.tile(self.current, (4, 1))
-        z[:, KNOTS.size :] = self.unused
-        z[2:, KNOTS.size] = self.depth[0]
-        z[1::2, KNOTS.size + 1] = self.depth[1]
-        return z
+        """Controls (4, m, 9) that roll by half a turn before the first step or not, and after it or not (last index),
+        and never again.
+        """
+        rows, _ = self._unrolled(self.current[None, : self.knots], np.tile(self.depth, (4, 1)))
+        rows[2:, 0, ROLL] = np.pi
+        if rows.shape[1] > 1:
+            rows[1::2, 1, ROLL] = np.pi
+        return rows
 
     def controls(self, z: Floats) -> tuple[Floats, Floats]:
-        """Controls (N, m, 5) of samples z (N, d), and the tip's depths (N, m + 1) before and after each step."""
-        depth, roll = self._grid(z[:, KNOTS.size :])
-        guide = self._guide(z[:, : KNOTS.size], depth)
-        controls = np.zeros((*depth[:, 1:].shape, 5))
-        controls[:, :, 0] = np.diff(depth, axis=1)
-        controls[:, :, 1:3] = self.base
-        controls[:, :, 3] = np.diff(guide, axis=1)
-        controls[:, :, 4] = np.where(roll, 1.0, -1.0)
-        return controls, depth
+        """Controls (N, m, 9) of samples z (N, d), and the tip's depths (N, m + 1) before and after each step."""
+        depth, roll = self._grid(z[:, self.depths], z[:, self.angles])
+        rows, depth = self._unrolled(z[:, : self.knots], depth)
+        rows[:, :, ROLL] = roll
+        return rows, depth
 
-    def _grid(self, rolls: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Depths (N, m + 1) with a boundary at each roll (N, s), and whether the bevel rolls before each step (N, m).
+    def _unrolled(self, corrections: Floats, depth: Floats) -> tuple[Floats, Floats]:
+        """Controls (N, m, 9) without rolls, of corrections (N, knots) or (1, knots), on depths (N, m + 1)."""
+        rows = controls(len(depth), depth.shape[1] - 1, db_x=np.diff(depth, axis=1))
+        for axis, ones in enumerate(np.split(corrections, self.axes, axis=1)):
+            rows[:, :, DG_Y + axis] = np.diff(self._guide(ones, depth, axis), axis=1)
+        rows[:, :, DB_Y:DG_Y] = self.base
+        return rows, depth
+
+    def _grid(self, rolls: Floats, angles: Floats) -> tuple[Floats, Floats]:
+        """Depths (N, m + 1) with a boundary at each roll (N, s), and the roll (rad) before each step (N, m).
 
         So the cost is continuous in the depth of a roll. Each roll has its own boundary, the nearest or the next one
-        that is free, if there is one before the last step; two rolls at one depth cancel.
+        that is free, if there is one before the last step; of two rolls at one depth the second counts, and two half
+        turns cancel.
         """
-        n, m = len(rolls), self.depth.size - 1
-        depth, rolled = np.tile(self.depth, (n, 1)), np.zeros((n, m + 1), dtype=bool)
+        n, m, half = len(rolls), self.depth.size - 1, self.setup.half_turns
+        order = np.argsort(rolls, axis=1, kind="stable")
+        ascending = np.take_along_axis(rolls, order, axis=1)
+        goals = np.full_like(ascending, np.pi) if half else np.take_along_axis(angles, order, axis=1)
+        depth, turned = np.tile(self.depth, (n, 1)), np.zeros((n, m + 1))
         middle = 0.5 * (self.depth[1:] + self.depth[:-1])
-        rows, last = np.arange(n), np.full(n, -1)
-        for roll in _without_twins(np.sort(rolls, axis=1), _DUE * self.advance).T:
+        rows, last, angle = np.arange(n), np.full(n, -1), np.full(n, 0.0 if half else self.state.roll)
+        for roll, goal in zip(
+            _without_twins(ascending, _DUE * self.advance, both=half).T, goals.T, strict=True
+        ):
             nearest = np.searchsorted(middle, roll)
-            made = (roll < self.depth[-1]) & (nearest < m)
+            made = (roll < self.depth[-1]) & (nearest < m) & (np.abs(goal - angle) >= LEAST_ROLL)
             at = np.minimum(np.maximum(nearest, last + 1), m - 1)
             inner = made & (at > 0)
             depth[rows[inner], at[inner]] = roll[inner]
-            rolled[rows[made], at[made]] ^= True
+            turned[rows[made], at[made]] += (goal - angle)[made]
+            angle = angle if half else np.where(made, goal, angle)
             last = np.where(made, at, last)
-        return depth, rolled[:, :m]
+        roll = turned[:, :m]
+        return depth, np.pi * (np.rint(roll / np.pi) % 2.0) if half else roll
 
-    def _guide(self, corrections: Floats, depth: Floats) -> Floats:
-        """Guide positions (N, m + 1) within the limits, for corrections (N, k) at the knots."""
+    def _guide(self, corrections: Floats, depth: Floats, axis: int) -> Floats:
+        """Guide positions (N, m + 1) on an axis within the limits, for corrections (N, k) at the knots."""
+        least, greatest = guide_reach(self.state.scenario, axis)
         share = (depth - self.depth[0]) / max(self.left, 1e-9)
         knots = np.append(0.0, KNOTS)
         padded = np.concatenate([np.zeros((len(corrections), 1)), corrections], axis=1)
         at = np.clip(np.searchsorted(knots, share, side="right") - 1, 0, KNOTS.size - 1)
         part = (share - knots[at]) / (knots[at + 1] - knots[at])
         rows = np.arange(len(corrections))[:, None]
-        wanted = np.interp(depth, self.path.depth, self.path.guide)
+        wanted = np.interp(depth, self.path.depth, self.path.guide[:, axis])
         wanted += (1.0 - part) * padded[rows, at] + part * padded[rows, at + 1]
-        wanted = np.clip(wanted, -self.reach, self.reach)
+        wanted = np.clip(wanted, least, greatest)
         most = self.step * np.diff(depth, axis=1) / self.advance
         guide = np.empty_like(wanted)
-        guide[:, 0] = self.state.guide
+        guide[:, 0] = self.state.guide[axis]
         for k in range(most.shape[1]):
             guide[:, k + 1] = np.clip(wanted[:, k + 1], guide[:, k] - most[:, k], guide[:, k] + most[:, k])
         return guide
 
     def corrected(self, z: Floats) -> GuidePath:
         """The path with the corrections of a sample (d,)."""
-        controls, depth = self.controls(z[None])
-        guide = self.state.guide + np.append(0.0, np.cumsum(controls[0, :, 3]))
-        return GuidePath(depth[0], guide, tuple(depth[0, :-1][controls[0, :, 4] > 0.0].tolist()))
+        rows, depth = self.controls(z[None])
+        moved = np.cumsum(rows[0, :, DG_Y : DG_Y + 2], axis=0)
+        guide = np.array(self.state.guide) + np.concatenate([np.zeros((1, 2)), moved])
+        angle = self.state.roll + np.cumsum(rows[0, :, ROLL])
+        rolls = np.stack([depth[0, :-1], angle], axis=1)[rows[0, :, ROLL] != 0.0]
+        return GuidePath(depth[0], guide, rolls)
 
-    def first(self, path: GuidePath) -> tuple[Command, GuidePath]:
+    def first(self, path: GuidePath) -> tuple[Control, GuidePath]:
         """The command of this period, and the rest of a path after it.
 
         A roll that is due is made at once; the advance ends at the depth of the next one.
         """
         x = float(self.depth[0])
-        due = x + _DUE * self.advance
-        later = tuple(roll for roll in path.rolls if roll > due)
-        flip = (len(path.rolls) - len(later)) % 2 == 1
-        advance = min(self.advance, self.left, *(roll - x for roll in later[:1]))
-        guide = float(np.interp(x + advance, path.depth, path.guide)) - self.state.guide
-        db_y, db_theta = (
-            (self.base[0] * advance / (self.depth[1] - x)).tolist() if self.left > 0.0 else (0.0, 0.0)
-        )
-        step = max(-self.step, min(self.step, guide))
-        return (advance, db_y, db_theta, step, 1 if flip else -1), replace(path, rolls=later)
+        due = path.rolls[:, 0] <= x + _DUE * self.advance
+        later = path.rolls[~due]
+        advance = min(self.advance, self.left, *(later[:1, 0] - x).tolist())
+        row = controls(1, db_x=advance)[0]
+        for axis in range(self.axes):
+            place = self.state.guide[axis]
+            step = float(np.interp(x + advance, path.depth, path.guide[:, axis])) - place
+            row[DG_Y + axis] = max(-self.step, min(self.step, step))
+        if self.left > 0.0:
+            row[DB_Y:DG_Y] = self.base[0] * advance / (self.depth[1] - x)
+        row[ROLL] = self._due_roll(path.rolls[due, 1])
+        return Control.of(row.tolist()), replace(path, rolls=later)
+
+    def _due_roll(self, angles: Floats) -> float:
+        """The roll (rad) to the last of these angles."""
+        if self.setup.half_turns:
+            return np.pi * (len(angles) % 2)
+        return float(angles[-1]) - self.state.roll if len(angles) else 0.0
 
 
-def _without_twins(rolls: Floats, near: float) -> Floats:
-    """Ascending rolls (N, s); pairs within `near` (mm), which cancel, are infinite."""
+def _without_twins(rolls: Floats, near: float, *, both: bool) -> Floats:
+    """Ascending rolls (N, s); of pairs within `near` (mm) the first is infinite, or both, if they cancel."""
     left = rolls.copy()
     for k in range(left.shape[1] - 1):
         twins = np.isfinite(left[:, k]) & (left[:, k + 1] - left[:, k] <= near)
-        left[twins, k : k + 2] = np.inf
+        left[twins, k : k + 1 + both] = np.inf
     return left
 
 
-def proposals(ahead: Ahead, count: int, rng: np.random.Generator) -> Floats:
+def proposals(ahead: Ahead, count: int, rng: np.random.Generator, aim: complex = 1.0) -> Floats:
     """Samples (count, d) around the current path, which is the first, with scales over two decades.
 
     With a guide a quarter changes it alone, a quarter the rolls alone, a sixth adds a pair of rolls, the rest changes
-    all; without one three quarters change the rolls, a half adds a pair.
+    all; without one three quarters change the rolls, a half adds a pair. Where the needle rolls to any angle, a pair
+    rolls it to either side of the direction `aim`, half of them now.
     """
     z = np.tile(ahead.current, (count, 1))
-    k = KNOTS.size
+    k, depths = ahead.knots, ahead.depths
     kind = np.arange(count) % 12
     scale = 10.0 ** rng.uniform(-_DECADES, 0.0, (count, 2))
     widest = _STEEPEST * ahead.left + _SHARE_OF_A_STEP * ahead.step
@@ -220,12 +292,35 @@ def proposals(ahead: Ahead, count: int, rng: np.random.Generator) -> Floats:
     rolls = _FURTHEST * ahead.left * scale[:, 1:] * rng.standard_normal((count, ahead.slots))
     if ahead.step > 0.0:
         z[:, :k] += np.where(((kind < 3) | (kind >= 8))[:, None], guide, 0.0)
-    used = z[0, k:] < ahead.depth[-1]
-    z[:, k:] += np.where((kind >= 3)[:, None] & used, rolls, 0.0)
+    used = z[0, depths] < ahead.depth[-1]
+    z[:, depths] += np.where((kind >= 3)[:, None] & used, rolls, 0.0)
     pair = np.flatnonzero((kind == 6) | (kind == 7)) if ahead.step > 0.0 else np.flatnonzero(kind % 2 == 0)
     if used.sum() <= ahead.slots - 2:
         middle = rng.uniform(ahead.depth[0], ahead.depth[-1], pair.size)
         half = 0.5 * ahead.left * 10.0 ** rng.uniform(-1.5, 0.0, pair.size)
-        z[pair, -2], z[pair, -1] = middle - half, middle + half
+        z[pair, depths.stop - 2], z[pair, depths.stop - 1] = middle - half, middle + half
+    if not ahead.setup.half_turns:
+        _propose_angles(ahead, z, scale[:, 1:], (kind >= 3)[:, None] & used, pair, aim, rng)
     z[0] = ahead.current
     return np.clip(z, *ahead.bounds)
+
+
+def _propose_angles(
+    ahead: Ahead,
+    z: Floats,
+    scale: Floats,
+    changed: NDArray[np.bool_],
+    pair: NDArray[np.intp],
+    aim: complex,
+    rng: np.random.Generator,
+) -> None:
+    """Change the angles of the rolls `changed` (N, s), and those of samples `pair`, of which every second one rolls
+    now.
+    """
+    z[:, ahead.angles] += np.where(changed, _WIDEST * scale * rng.standard_normal(changed.shape), 0.0)
+    present = ahead.state.roll
+    towards = present + roll_within(ahead.setup, present, float(np.angle(aim * np.exp(-1j * present))))
+    aside = rng.choice([-1.0, 1.0], pair.size) * rng.uniform(0.0, np.pi, pair.size)
+    last = ahead.angles.stop
+    z[pair, last - 2], z[pair, last - 1] = towards + aside, towards - aside
+    z[pair[::2], ahead.depths.stop - 2] = ahead.depth[0]

@@ -1,16 +1,19 @@
 """Interface of all observers: the estimated needle, corrected by delayed readings."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import nan
 from statistics import fmean
 from typing import Protocol
 
 import numpy as np
 
+from flexneedle.estimation.sensor import Sensor
+from flexneedle.estimation.sensors import SENSORS
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, Floats, Measurement
+from flexneedle.types import THETA, Control, Floats, Measurement, Point, Pose, X, Y, Z
 
 
 @dataclass(frozen=True)
@@ -19,17 +22,32 @@ class Move:
 
     begun: float
     ended: float
-    applied: Command
+    applied: Control
     measurements: tuple[Measurement, ...] = ()
 
     @cached_property
-    def mean(self) -> tuple[float, float, float, float] | None:
-        """Means over its readings: share of the move done, x, y (mm); and their number. None without any."""
-        if not self.measurements:
+    def means(self) -> Mapping[str, tuple[float, ...]]:
+        """Means over its readings by sensor: share of the move done, x (mm), y and z of the measured quantity, their
+        number, and the variance of the means where all readings report it, else NaN. Sensors without readings are left
+        out.
+        """
+        means = ((sensor.name, self._mean(sensor)) for sensor in SENSORS.values())
+        return {name: mean for name, mean in means if mean is not None}
+
+    def _mean(self, sensor: Sensor) -> tuple[float, ...] | None:
+        read = [(one, sensor.read(one)) for one in self.measurements]
+        known = [(one, value) for one, value in read if value is not None]
+        if not known:
             return None
-        part = [self.part(one.time) for one in self.measurements]
-        x, y = zip(*map(place, self.measurements), strict=True)
-        return fmean(part), fmean(x), fmean(y), float(len(part))
+        part, x = (
+            fmean(column)
+            for column in zip(*((self.part(one.time), place(one)[0]) for one, _ in known), strict=True)
+        )
+        y, z = (fmean(column) for column in zip(*(value for _, value in known), strict=True))
+        variances = [sensor.variance(one) for one, _ in known]
+        reported = [value for value in variances if value is not None]
+        variance = sum(reported) / len(known) ** 2 if len(reported) == len(known) else nan
+        return part, x, y, z, float(len(known)), variance
 
     def part(self, time: float) -> float:
         """Share of the move that is done at `time`."""
@@ -53,17 +71,17 @@ class Estimate(Protocol):
 
     @property
     def tip(self) -> Floats:
-        """Present pose (3,) of the tip, as a tracker without errors would measure it."""
+        """Present pose (5,) of the tip, as a tracker without errors would measure it."""
         ...
 
     @property
-    def innovation(self) -> tuple[float, float]:
+    def innovation(self) -> Point:
         """The last reading minus its prediction (mm)."""
         ...
 
     @property
-    def measured(self) -> tuple[float, float] | None:
-        """Tip (x, y) measured at the end of the last move with a reading (mm), None before the first."""
+    def measured(self) -> Point | None:
+        """Tip x, y, z measured at the end of the last move with a reading (mm), None before the first."""
         ...
 
     @property
@@ -71,11 +89,15 @@ class Estimate(Protocol):
         """Standard deviation (mm) of the predicted distance of the next reading of the tip."""
         ...
 
-    def tip_at(self, time: float) -> tuple[float, float]:
+    def shape_sd(self, nodes: Floats) -> Floats:
+        """Standard deviations (n, 2), mm, of y and z at predicted nodes (n, 5) of the needle at the target."""
+        ...
+
+    def tip_at(self, time: float) -> Point:
         """Estimated position of the tip (mm) at `time`, with constant velocity in each move."""
         ...
 
-    def move(self, applied: Command, begun: float, ended: float) -> "Estimate":
+    def move(self, applied: Control, begun: float, ended: float) -> "Estimate":
         """The estimate after a motion `applied` by the driver from `begun` to `ended` (s)."""
         ...
 
@@ -90,8 +112,10 @@ class Estimate(Protocol):
 
 def described(estimate: Estimate) -> str:
     """Return one line about an estimate, for its `repr`."""
-    x, y, slope = estimate.tip
-    where = f"tip ({x:.3f}, {y:.3f}) mm ± {estimate.tip_sd:.3f} mm, slope {1e3 * slope:.2f} mrad"
+    axes, tip = estimate.simulator.scenario.setup.axes, estimate.tip
+    position = ", ".join(f"{value:.3f}" for value in tip[: 1 + axes])
+    slope = ", ".join(f"{1e3 * value:.2f}" for value in tip[THETA : THETA + axes])
+    where = f"tip ({position}) mm ± {estimate.tip_sd:.3f} mm, slope {slope} mrad"
     return f"<{type(estimate).__name__} {where}>"
 
 
@@ -107,16 +131,17 @@ def assigned(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> tu
     )
 
 
-def along(moves: tuple[Move, ...], tips: Floats, time: float) -> tuple[float, float]:
-    """Position (mm) at `time` on the path through tips (k + 1, 3), before and after each of k moves."""
+def along(moves: tuple[Move, ...], tips: Floats, time: float) -> Point:
+    """Position (mm) at `time` on the path through tips (k + 1, 5), before and after each of k moves."""
     if not moves:
-        return float(tips[-1, 0]), float(tips[-1, 1])
+        return Pose.of(tips[-1]).point
     times = [moves[0].begun, *(done.ended for done in moves)]
-    return float(np.interp(time, times, tips[:, 0])), float(np.interp(time, times, tips[:, 1]))
+    x, y, z = (float(np.interp(time, times, tips[:, column])) for column in (X, Y, Z))
+    return x, y, z
 
 
-def place(measurement: Measurement) -> tuple[float, float]:
-    """Measured tip (mm) of a good measurement. Raises ValueError for an empty one."""
+def place(measurement: Measurement) -> Point:
+    """Measured tip (mm) of a good measurement, z = 0 if it is not measured. Raises ValueError for an empty one."""
     if measurement.x is None or measurement.y is None:
         raise ValueError("an empty measurement was not removed")
-    return measurement.x, measurement.y
+    return measurement.x, measurement.y, measurement.z or 0.0

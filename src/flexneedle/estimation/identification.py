@@ -16,6 +16,7 @@ steps ahead of it too. A few of the curves are simulated again each period, so t
 periods.
 """
 
+import cmath
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,36 +24,37 @@ from functools import cached_property
 import numpy as np
 
 from flexneedle.estimation.estimate import Move, along, assigned, described
-from flexneedle.estimation.prior import (
-    BASE_TURN,
-    BASE_Y,
-    BEND,
-    BEVEL,
-    CLEARANCE,
-    LEAST_SD,
-    MODULUS,
-    RUN_OUT,
-    Prior,
-    Priors,
-    check_cells,
-    unexplained,
-)
+from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
 from flexneedle.estimation.readings import MoveMeans, shared
+from flexneedle.estimation.sensor import Sensor
+from flexneedle.estimation.sensors import used
 from flexneedle.estimation.task import Task
 from flexneedle.mechanics.model import Adaptation
-from flexneedle.simulator.control import Control
+from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, Floats, Measurement
+from flexneedle.types import (
+    ROLL,
+    SPIN,
+    STILL,
+    THETA,
+    Control,
+    Floats,
+    Laterals,
+    Measurement,
+    Point,
+    X,
+    Y,
+    Z,
+    laterals,
+)
 
 _MOVES_A_SEGMENT = 8  # in tissue; in air there is one segment
 _RECENT = 12  # moves whose residuals are low-passed
 _SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a Gauss–Newton step: the first that does not raise the cost
-_REST = np.array([[0.0, 0.0, 0.0, 0.0, -1.0]])
+_REST = np.array([STILL])
 _ROUND = 8  # periods in which each curve of derivatives is simulated once;
-_LEADING = (BASE_Y, BASE_TURN, BEND, BEVEL, CLEARANCE)  # these are once in
-_LEADING_ROUND = 2  # periods
-_STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
+_LEADING_ROUND = 2  # periods in which those of base, bend, bevel and clearance are
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Identification:
         """The estimate before the first reading: the prior's means. Raises ScenarioError for too short cells."""
         simulator, scenario, settings = task.simulator, task.scenario, task.settings
         check_cells(scenario, settings)
-        state, prior = simulator.start(task.plan.bevel), Prior.of(scenario, settings, task.plan.target[0])
+        state, prior = simulator.start(task.plan.roll), Prior.of(scenario, settings, task.plan.target[0])
         step = scenario.setup.max_advance_mm
         grid = np.arange(
             scenario.setup.start_tip_x - 5 * step, scenario.setup.max_depth + (_ROUND + 6) * step, step
@@ -78,7 +80,10 @@ class Identification:
             state.tip[None],
             ((0, state),),
             grid,
-            np.zeros((prior.mean.size, grid.size)),
+            np.zeros(
+                (len(used(scenario)), prior.mean.size, grid.size),
+                dtype=float if scenario.setup.axes == 1 else complex,
+            ),
             prior.precision,
             axial_variance=scenario.control.start_axial_sd_mm**2,
         )
@@ -98,8 +103,9 @@ class Perturbed:
 @dataclass(frozen=True, eq=False)
 class Identified:
     """The estimate. nominal: the scenario's model, to which the prior refers; simulator: that with the parameters (K,);
-    state: its present state; tips (m + 1, 3): at the ends of the m moves, the start first; stops: its state before some
-    of the moves; grid (g,), curves (K, g): derivatives of the tip's lateral position over its depth (mm);
+    state: its present state; tips (m + 1, 5): at the ends of the m moves, the start first; stops: its state before some
+    of the moves; grid (g,), curves (S, K, g): derivatives of the sensors' quantities over the tip's depth (mm), its
+    lateral position first;
     precision (K, K): inverse covariance of the parameters; axial: start error along the axis (mm); period: its number.
     """
 
@@ -112,52 +118,64 @@ class Identified:
     tips: Floats
     stops: tuple[tuple[int, State], ...]
     grid: Floats
-    curves: Floats
+    curves: Laterals
     precision: Floats
     axial: float = 0.0
     axial_variance: float = 0.0
     period: int = 0
     perturbed: tuple[Perturbed, ...] = ()
     moves: tuple[Move, ...] = ()
-    residual: float = 0.0
-    innovation: tuple[float, float] = (0.0, 0.0)
-    measured: tuple[float, float] | None = None
+    residual: complex = 0.0
+    innovation: Point = (0.0, 0.0, 0.0)
+    measured: Point | None = None
 
     def __repr__(self) -> str:
         return described(self)
 
     @property
     def tip(self) -> Floats:
-        """Tip pose (3,) as measured: that of the model plus the tip's offset from the needle's axis."""
-        tip = self.state.tip
-        tip[1] += self.off_axis(self.state.bevel)
+        """Tip pose (5,) as measured: that of the model plus the tip's offset from the needle's axis."""
+        tip, off = self.state.tip, self.off_axis(self.state.bevel)
+        tip[Y] += off.real
+        tip[Z] += off.imag
         return tip
 
     @property
-    def run_out(self) -> float:
-        """Lateral offset (mm) of the measured tip from the needle's axis, with the bevel on the side +1."""
-        return float(self.parameters[RUN_OUT])
+    def axes(self) -> int:
+        """Lateral axes."""
+        return self.nominal.scenario.setup.axes
 
-    def off_axis(self, bevel: float) -> float:
-        """Lateral offset (mm) of the measured tip from the model's, with the bevel on the side `bevel`."""
+    @cached_property
+    def slots(self) -> Slots:
+        """Places of the parameters."""
+        return Slots.of(self.nominal.scenario)
+
+    @property
+    def run_out(self) -> complex:
+        """Lateral offset (mm) of the measured tip from the needle's axis, relative to the bevel's direction."""
+        return _lateral(self.parameters[self.slots.run_out])
+
+    def off_axis(self, bevel: complex) -> complex:
+        """Lateral offset (mm) of the measured tip from the model's, with the bevel in this direction."""
         return self.run_out * bevel + self.residual
 
-    def tip_at(self, time: float) -> tuple[float, float]:
+    def tip_at(self, time: float) -> Point:
         """Estimated position of the tip (mm) at `time`."""
-        x, y = along(self.moves, self.tips, time)
-        rolls_since = sum(done.applied[4] > 0.0 for done in self.moves if done.begun >= time)
-        return x, y + self.off_axis(self.state.bevel * (-1) ** rolls_since)
+        x, y, z = along(self.moves, self.tips, time)
+        since = sum(done.applied.roll + done.applied.spin for done in self.moves if done.begun >= time)
+        off = self.off_axis(self.state.bevel * cmath.exp(-1j * since))
+        return x, y + off.real, z + (off.imag if self.axes > 1 else 0.0)
 
     def without_reading(self) -> "Identified":
         """The estimate of a period without a good reading: innovation 0."""
-        return replace(self, innovation=(0.0, 0.0))
+        return replace(self, innovation=(0.0, 0.0, 0.0))
 
-    def move(self, applied: Command, begun: float, ended: float) -> "Identified":
+    def move(self, applied: Control, begun: float, ended: float) -> "Identified":
         """Move the estimated needle as the driver did, from `begun` to `ended` (s)."""
-        if applied == _STILL and self.moves and self.moves[-1].applied == _STILL:  # one move, however long
+        if applied == STILL and self.moves and self.moves[-1].applied == STILL:  # one move, however long
             last = replace(self.moves[-1], ended=ended)
             return replace(self, moves=(*self.moves[:-1], last), perturbed=())
-        state = self.simulator.step(self.state, Control.from_row(applied))
+        state = self.simulator.step(self.state, applied)
         tips = np.concatenate([self.tips, state.tip[None]])
         return replace(
             self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)), perturbed=()
@@ -168,46 +186,63 @@ class Identified:
         if not measurements or not self.moves:
             return self.without_reading()
         extended = replace(self, moves=assigned(self.moves, measurements))
-        readings = extended._readings
-        without = readings.ahead(extended.tips[:, 0]) + extended.axial
+        readings = extended._readings[0]
+        without = readings.ahead(extended.tips[:, X]) + extended.axial
         prior_sd = max(self.nominal.scenario.control.start_axial_sd_mm, LEAST_SD)
-        axial, axial_variance = shared(without, extended.variance(readings), prior_sd)
+        axial, axial_variance = shared(without, extended.variances()[0], prior_sd)
         extended = replace(extended, axial=axial, axial_variance=axial_variance)
-        fitted = improved(extended, readings)._differentiated()
-        left, ahead = fitted.left(readings), readings.ahead(fitted.tips[:, 0])
+        fitted = improved(extended)._differentiated()
+        left, ahead = fitted.left[0], readings.ahead(fitted.tips[:, X])
         newest = int(readings.index[-1]) + 1
-        x, y = fitted.tips[newest, :2] + (ahead[-1], left[-1] + fitted.run_out * readings.sides[-1])
-        inside = fitted.tips[-1, 0] > 0.0
+        y = fitted.laterals[0][newest] + left[-1] + fitted.run_out * readings.bevel[-1]
+        inside = fitted.tips[-1, X] > 0.0
         return replace(
             fitted,
             residual=low_passed(self.settings, left) if inside else 0.0,
-            innovation=(float(ahead[-1]), float(left[-1])),
-            measured=(float(x), float(y)),
+            innovation=(float(ahead[-1]), float(left[-1].real), float(left[-1].imag)),
+            measured=(float(fitted.tips[newest, X] + ahead[-1]), float(y.real), float(y.imag)),
         )
 
     @cached_property
     def rows(self) -> Floats:
-        """The commands of the moves (m, 5)."""
-        return np.array([done.applied for done in self.moves], dtype=float).reshape(-1, 5)
+        """The commands of the moves (m, 9)."""
+        return np.array([done.applied for done in self.moves], dtype=float).reshape(-1, len(STILL))
 
     @cached_property
-    def _readings(self) -> MoveMeans:
-        return MoveMeans.of(self.moves, self.state.bevel)
+    def sensors(self) -> tuple[Sensor, ...]:
+        """The sensors in use, the tip's position first."""
+        return used(self.nominal.scenario)
 
-    def variance(self, readings: MoveMeans) -> Floats:
-        """Variances (r,) of the means of readings, mm²: jitter and model error."""
+    @cached_property
+    def _readings(self) -> tuple[MoveMeans, ...]:
+        return tuple(MoveMeans.of(self.moves, one.name, self.state.bevel, self.axes) for one in self.sensors)
+
+    def variances(self) -> list[Floats]:
+        """Variances (r,) of the means of each sensor's readings: jitter and model error."""
         scenario = self.nominal.scenario
-        return readings.variance(scenario.tracker.jitter_per_axis, unexplained(scenario, self.settings))
+        return [
+            readings.variance(sensor.sd(scenario) or 0.0, sensor.unexplained(scenario, self.settings))
+            for sensor, readings in zip(self.sensors, self._readings, strict=True)
+        ]
 
-    def left(self, readings: MoveMeans) -> Floats:
-        """Lateral residuals (r,), mm: readings minus those of the model."""
-        return readings.left(self.tips[:, 1], self.run_out)
+    @property
+    def laterals(self) -> list[Laterals]:
+        """Lateral quantity (m + 1,) of the tips for each sensor; the first is their position (mm)."""
+        return [laterals(self.tips, sensor.column, self.axes) for sensor in self.sensors]
+
+    @property
+    def left(self) -> list[Laterals]:
+        """Lateral residuals (r,) of each sensor: readings minus those of the model."""
+        return [
+            readings.left(tips, _lateral(self.parameters[getattr(self.slots, sensor.offset)]))
+            for sensor, readings, tips in zip(self.sensors, self._readings, self.laterals, strict=True)
+        ]
 
     def _with(self, parameters: Floats) -> "Identified":
         """The estimate with these parameters: the insertion simulated again, in segments."""
         simulator = _adapted(self.nominal, self.settings, parameters)
         state = _started(self, simulator, parameters)
-        inside = int(np.argmax(np.append(self.tips[1:, 0], np.inf) > 0.0))
+        inside = int(np.argmax(np.append(self.tips[1:, X], np.inf) > 0.0))
         ends = [*range(min(inside, len(self.rows)), len(self.rows), _MOVES_A_SEGMENT), len(self.rows)]
         stops, parts, first = [], [state.tip[None]], 0
         for last in ends:
@@ -235,13 +270,21 @@ class Identified:
     def tip_sd(self) -> float:
         """Standard deviation (mm) of the predicted distance of the next reading of the tip."""
         slope = self._slopes(self.state.tip[:1])[0]
-        slope[RUN_OUT] = self.state.bevel
-        return float(np.sqrt(slope @ self.covariance @ slope + self.axial_variance))
+        slope[self.slots.run_out] = directions(self.state.bevel, self.axes)
+        return float(np.sqrt(variance_of(slope, self.covariance) + self.axial_variance))
+
+    def shape_sd(self, nodes: Floats) -> Floats:
+        """Standard deviations (n, 2), mm, of y and z at predicted nodes (n, 5): those of a tip that passes there."""
+        slopes = self._slopes(nodes[:, 0])
+        parts = np.stack([slopes.real, slopes.imag])
+        sd: Floats = np.sqrt(np.einsum("ank,kl,anl->na", parts, self.covariance, parts))
+        return sd
 
     @property
     def bevel_sd(self) -> float:
         """Standard deviation of the factor on the bevel offset, relative to it."""
-        return float(np.sqrt(self.covariance[BEVEL, BEVEL]) / max(self.parameters[BEVEL], LEAST_SD))
+        k = self.slots.bevel
+        return float(np.sqrt(self.covariance[k, k]) / max(self.parameters[k], LEAST_SD))
 
     @property
     def lag(self) -> float:
@@ -252,28 +295,30 @@ class Identified:
     @property
     def roll_sd(self) -> float:
         """Standard deviation (mm) of the tip's lateral motion if the bevel rolls now."""
-        slope = np.zeros(self.parameters.size)
-        slope[BEND] = 2.0 * self._slopes(self.state.tip[:1])[0, BEND]
-        slope[RUN_OUT] = 2.0
-        return float(np.sqrt(slope @ self.covariance @ slope))
+        bend, run_out = self.slots.bend, self.slots.run_out
+        slope = np.zeros(self.parameters.size, dtype=self.curves.dtype)
+        slope[bend] = 2.0 * self._slopes(self.state.tip[:1])[0, bend]
+        slope[run_out] = 2.0 * directions(1.0, self.axes)
+        return float(np.sqrt(variance_of(slope, self.covariance)))
 
-    def _slopes(self, depth: Floats) -> Floats:
-        """Derivatives (n, K) of the tip's lateral position at depths (n,), mm, from the curves; 0 for the run-out."""
+    def _slopes(self, depth: Floats, sensor: int = 0) -> Laterals:
+        """Derivatives (n, K) of a sensor's quantity at depths (n,), mm, from the curves; 0 for its offset."""
         step = self.grid[1] - self.grid[0]
         place = np.clip((depth - self.grid[0]) / step, 0.0, self.grid.size - 1.001)
         left = place.astype(int)
         part = place - left
-        slopes: Floats = ((1.0 - part) * self.curves[:, left] + part * self.curves[:, left + 1]).T
+        curves = self.curves[sensor]
+        slopes: Laterals = ((1.0 - part) * curves[:, left] + part * curves[:, left + 1]).T
         return slopes
 
     def _differentiated(self, which: Sequence[int] | None = None) -> "Identified":
         """Simulate the curves that are due again, with a few steps ahead."""
-        ahead = np.tile([[self.nominal.scenario.setup.max_advance_mm, 0.0, 0.0, 0.0, -1.0]], (_ROUND, 1))
+        ahead = controls(_ROUND, db_x=self.nominal.scenario.setup.max_advance_mm)
         base = np.concatenate([self.tips, self.simulator.replay(self.state, ahead)[1]])
-        depth = np.maximum.accumulate(base[:, 0])
+        depth = np.maximum.accumulate(base[:, X])
         curves, members = self.curves.copy(), []
         for k in self._due() if which is None else which:
-            if k == RUN_OUT:
+            if self.slots.is_offset(k):
                 continue
             parameters = self.parameters.copy()
             parameters[k] += self.prior.steps[k]
@@ -283,7 +328,9 @@ class Identified:
                 continue
             member, tips = _perturbed(self, parameters, k, ahead)
             members.append(member)
-            curves[k] = np.interp(self.grid, depth, (tips[:, 1] - base[:, 1]) / self.prior.steps[k])
+            for curve, sensor in zip(curves[:, k], self.sensors, strict=True):
+                moved = laterals(tips, sensor.column, self.axes) - laterals(base, sensor.column, self.axes)
+                curve[:] = np.interp(self.grid, depth, moved / self.prior.steps[k])
         return replace(self, curves=curves, perturbed=tuple(members), period=self.period + 1)
 
     @property
@@ -292,55 +339,59 @@ class Identified:
         scenario = self.nominal.scenario
         step = scenario.setup.max_advance_mm / scenario.setup.insertion_speed_mm_s
         count = max(1.0, step / scenario.tracker.period)
-        return float(scenario.tracker.jitter_per_axis**2 / count + unexplained(scenario, self.settings) ** 2)
+        unexplained = self.sensors[0].unexplained(scenario, self.settings)
+        return float(scenario.tracker.jitter_per_axis**2 / count + unexplained**2)
 
     def _due(self) -> Iterator[int]:
         """The parameters whose curves are simulated this period."""
-        for place, k in enumerate(_LEADING):
+        leading = (*range(self.slots.run_out.start), self.slots.bevel, self.slots.clearance)
+        for place, k in enumerate(leading):
             if place % _LEADING_ROUND == self.period % _LEADING_ROUND:
                 yield k
-        for k in range(MODULUS, self.parameters.size):
+        for k in range(self.slots.modulus, self.parameters.size):
             if k % _ROUND == self.period % _ROUND:
                 yield k
 
 
 def _adapted(nominal: Simulator, settings: Priors, parameters: Floats) -> Simulator:
     """The model with these parameters."""
-    layers = len(nominal.scenario.tissue)
-    shift = MODULUS + layers
+    layers, slots = len(nominal.scenario.tissue), Slots.of(nominal.scenario)
+    shift = slots.modulus + layers
     variation = shift + layers - 1
     return nominal.adapted(
         Adaptation(
             shift=parameters[shift:variation],
-            stiffness=np.exp(parameters[MODULUS:shift]),
+            stiffness=np.exp(parameters[slots.modulus : shift]),
             cell=settings.cell_mm,
             variation=np.exp(parameters[variation:]),
-            bevel=float(parameters[BEVEL]),
-            bend=float(parameters[BEND]),
-            clearance=float(parameters[CLEARANCE]),
+            bevel=float(parameters[slots.bevel]),
+            bend=_lateral(parameters[slots.bend]),
+            clearance=float(parameters[slots.clearance]),
         )
     )
 
 
 def _started(estimate: Identified, simulator: Simulator, parameters: Floats) -> State:
     """The state of the start, settled with these parameters."""
-    start = estimate.nominal.start(estimate.stops[0][1].bevel)
+    start = estimate.nominal.start(estimate.stops[0][1].roll)
     moved = start.with_estimate(
         base_x=float(start.base[0]) + estimate.axial,
-        base_y=float(parameters[BASE_Y]),
-        base_turn=float(parameters[BASE_TURN]),
+        base=(start.base[Y : Z + 1] + _pair(parameters[estimate.slots.base])).tolist(),
+        slope=(start.base[THETA:] + _pair(parameters[estimate.slots.slope])).tolist(),
     )
     return simulator.replay(moved, _REST)[0]
 
 
-def improved(estimate: Identified, readings: MoveMeans) -> Identified:
+def improved(estimate: Identified) -> Identified:
     """One Gauss–Newton step to the maximum a posteriori within the bounds, shortened until the cost does not rise."""
     prior = estimate.prior
-    jacobian = jacobian_of(estimate, readings)
-    variance = estimate.variance(readings) + readings.bent(estimate.tips[:, 1]) ** 2
-    weighted = jacobian.T / variance
-    gradient = weighted @ estimate.left(readings) - prior.precision @ (estimate.parameters - prior.mean)
-    precision = weighted @ jacobian + prior.precision
+    jacobian = jacobian_of(estimate)
+    both = zip(estimate.variances(), estimate._readings, estimate.laterals, strict=True)
+    variance = np.concatenate([noise + readings.bent(tips) ** 2 for noise, readings, tips in both])
+    weighted = jacobian.conj().T / variance
+    off = estimate.parameters - prior.mean
+    gradient = (weighted @ np.concatenate(estimate.left)).real - prior.precision @ off
+    precision = (weighted @ jacobian).real + prior.precision
     estimate = replace(estimate, precision=precision)
     step = np.linalg.solve(precision, gradient)
     if not np.isfinite(step).all():
@@ -348,7 +399,8 @@ def improved(estimate: Identified, readings: MoveMeans) -> Identified:
     goal = np.clip(estimate.parameters + step, *prior.bounds)
 
     def cost(other: Identified) -> float:
-        return float(0.5 * (other.left(readings) ** 2 / variance).sum()) + prior.cost(other.parameters)
+        squares = np.abs(np.concatenate(other.left)) ** 2
+        return float(0.5 * (squares / variance).sum()) + prior.cost(other.parameters)
 
     most, fitted = cost(estimate), estimate
     for share in _SHARES:
@@ -358,15 +410,19 @@ def improved(estimate: Identified, readings: MoveMeans) -> Identified:
     return fitted
 
 
-def jacobian_of(estimate: Identified, readings: MoveMeans) -> Floats:
-    """Derivative (r, K) of the predicted readings, from the curves."""
-    jacobian = estimate._slopes(readings.between(estimate.tips[:, 0]))
-    jacobian[:, RUN_OUT] = readings.sides
-    return jacobian
+def jacobian_of(estimate: Identified) -> Laterals:
+    """Derivative (r, K) of the predicted readings of all sensors, from the curves."""
+    parts = []
+    for k, (sensor, readings) in enumerate(zip(estimate.sensors, estimate._readings, strict=True)):
+        part = estimate._slopes(readings.between(estimate.tips[:, X]), k)
+        offset = np.multiply.outer(readings.bevel, directions(1.0, estimate.axes))
+        part[:, getattr(estimate.slots, sensor.offset)] = offset
+        parts.append(part)
+    return np.concatenate(parts)
 
 
 def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) -> tuple[Perturbed, Floats]:
-    """The needle with another value of parameter k, and its tips (m + 1 + a, 3), the a steps `ahead` included.
+    """The needle with another value of parameter k, and its tips (m + 1 + a, 5), the a steps `ahead` included.
 
     Moves before the parameter has an effect are not simulated again.
     """
@@ -374,7 +430,7 @@ def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) 
         _adapted(estimate.nominal, estimate.settings, parameters),
         float(estimate.prior.begins[k]),
     )
-    reached = int(np.argmax(np.append(estimate.tips[:, 0], np.inf) > begins))  # by the move before this one
+    reached = int(np.argmax(np.append(estimate.tips[:, X], np.inf) > begins))  # by the move before this one
     first, state = max(
         (stop for stop in estimate.stops if stop[0] < max(1, reached)), key=lambda stop: stop[0]
     )
@@ -387,7 +443,34 @@ def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) 
     return member, np.concatenate([before, tips, later])
 
 
-def low_passed(settings: Priors, left: Floats) -> float:
+def facing(bevel: complex, controls: Floats, axes: int) -> Laterals:
+    """Direction (…, m) of the bevel after each of controls (…, m, 9), from its direction before them."""
+    turned = bevel * np.exp(1j * np.cumsum(controls[..., ROLL] + controls[..., SPIN], axis=-1))
+    faces: Laterals = np.rint(turned.real) if axes == 1 else turned
+    return faces
+
+
+def directions(bevel: complex, axes: int) -> Laterals:
+    """Directions (axes,) of a quantity relative to the bevel's direction."""
+    return np.array([bevel.real]) if axes == 1 else np.array([bevel, 1j * bevel])
+
+
+def variance_of(slope: Laterals, covariance: Floats) -> float:
+    """Variance, summed over the axes, of a lateral quantity with derivatives `slope` (K,) to parameters."""
+    return float((slope.conj() @ covariance @ slope).real)
+
+
+def _lateral(values: Floats) -> complex:
+    """A lateral quantity of its components: a float in the plane."""
+    return float(values[0]) if len(values) == 1 else complex(*values)
+
+
+def _pair(values: Floats) -> tuple[float, float]:
+    y, z = (*values.tolist(), 0.0)[:2]
+    return y, z
+
+
+def low_passed(settings: Priors, left: Laterals) -> complex:
     """Low-pass of the residuals (r,) of the last moves, later ones with more weight."""
     level, gain = 0.0, settings.residual_gain
     for value in left[-_RECENT:].tolist():

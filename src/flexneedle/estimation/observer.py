@@ -16,10 +16,10 @@ import numpy as np
 
 from flexneedle.estimation.estimate import Move, along, assigned, described, place
 from flexneedle.estimation.task import Task
-from flexneedle.simulator.control import Control
+from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Command, Floats, Measurement
+from flexneedle.types import STILL, THETA, Control, Floats, Measurement, Point, Y, Z
 
 _DRIFT = 0.5  # of the path that the bevel bends: standard deviation of a model's error
 
@@ -38,7 +38,7 @@ class StateCorrection:
         """The estimate before the first reading: a straight needle, and the scenario's prior."""
         simulator, control = task.simulator, task.scenario.control
         prior = np.diag([control.start_offset_sd_mm**2, control.start_angle_sd**2])
-        state = simulator.start(task.plan.bevel)
+        state = simulator.start(task.plan.roll)
         axial = control.start_axial_sd_mm**2
         drift = _DRIFT * _bevel_reach(simulator, task.plan.target[0]) / task.plan.target[0] ** 2
         return Corrected(simulator, self, state, state, prior, axial, state.tip[None], drift)
@@ -48,7 +48,7 @@ class StateCorrection:
 class Corrected:
     """An `Estimate`; `state` is the present one.
 
-    past: the state before the first of `moves`, those whose readings may still arrive; tips (k + 1, 3): estimated
+    past: the state before the first of `moves`, those whose readings may still arrive; tips (k + 1, 5): estimated
     tip pose at their ends, the start first; covariance (2, 2) of base y (mm) and θ (rad), and axial, the variance of
     the start along the axis (mm²), before `moves`; drift: standard deviation of the path's curvature (1/mm).
     """
@@ -62,15 +62,15 @@ class Corrected:
     tips: Floats
     drift: float
     moves: tuple[Move, ...] = ()
-    innovation: tuple[float, float] = (0.0, 0.0)
-    measured: tuple[float, float] | None = None
+    innovation: Point = (0.0, 0.0, 0.0)
+    measured: Point | None = None
 
     def __repr__(self) -> str:
         return described(self)
 
     @property
     def tip(self) -> Floats:
-        """Tip pose (3,)."""
+        """Tip pose (5,)."""
         return self.state.tip
 
     @property
@@ -79,25 +79,33 @@ class Corrected:
 
         A path that leaves the model's by drift · x² below the skin leaves it by drift · (x² − s²) after a reading at s.
         """
-        arm = np.array([1.0, self.simulator.scenario.needle.length_mm])
-        depth, measured = (
-            max(0.0, float(self.state.tip[0])),
-            max(0.0, self.measured[0] if self.measured else 0.0),
-        )
-        off_path = self.drift * max(0.0, depth**2 - measured**2)
-        return float(np.sqrt(arm @ self.covariance @ arm + self.axial + off_path**2))
+        arm = np.array([self.simulator.scenario.needle.length_mm])
+        return float(np.sqrt(self._across(self.state.tip[:1], arm)[0] + self.axial))
 
-    def tip_at(self, time: float) -> tuple[float, float]:
+    def _across(self, x: Floats, arms: Floats) -> Floats:
+        """Variance (n,), mm², of lateral positions at x (n,), mm, with these distances (n,) from the base."""
+        arm = np.stack([np.ones_like(arms), arms])
+        measured = max(0.0, self.measured[0] if self.measured else 0.0)
+        off_path = self.drift * np.maximum(0.0, np.maximum(x, 0.0) ** 2 - measured**2)
+        variance: Floats = np.einsum("kn,kl,ln->n", arm, self.covariance, arm) + off_path**2
+        return variance
+
+    def shape_sd(self, nodes: Floats) -> Floats:
+        """Standard deviations (n, 2), mm, of y and z at predicted nodes (n, 5), the same on each axis of the setup."""
+        sd = np.sqrt(self._across(nodes[:, 0], nodes[:, 0] - nodes[0, 0]))[:, None]
+        return sd * ([1.0, 0.0] if self.simulator.scenario.setup.axes == 1 else [1.0, 1.0])
+
+    def tip_at(self, time: float) -> Point:
         """Estimated position of the tip (mm) at `time`."""
         return along(self.moves, self.tips, time)
 
     def without_reading(self) -> "Corrected":
         """The estimate of a period without a good reading: innovation 0."""
-        return replace(self, innovation=(0.0, 0.0))
+        return replace(self, innovation=(0.0, 0.0, 0.0))
 
-    def move(self, applied: Command, begun: float, ended: float) -> "Corrected":
+    def move(self, applied: Control, begun: float, ended: float) -> "Corrected":
         """Move the estimated needle as the driver did, from `begun` to `ended` (s)."""
-        state = self.simulator.step(self.state, Control.from_row(applied))
+        state = self.simulator.step(self.state, applied)
         tips = np.concatenate([self.tips, state.tip[None]])
         return replace(self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)))
 
@@ -124,29 +132,40 @@ class Corrected:
 
 def _followed(at: Corrected, done: Move) -> Corrected:
     """The estimate after a move: predicted, and corrected by the mean innovation of its readings."""
-    before, predicted = at.tip, at.simulator.step(at.state, Control.from_row(done.applied))
+    before, predicted = at.tip, at.simulator.step(at.state, done.applied)
     if not done.measurements:
         return replace(at, state=predicted)
     innovation = np.mean([_innovation(before, predicted.tip, done, one) for one in done.measurements], axis=0)
-    measured = predicted.tip[:2] + innovation
+    measured = predicted.tip[: Z + 1] + innovation
     noise = float(at.simulator.scenario.tracker.jitter_per_axis / np.sqrt(len(done.measurements)))
     at, predicted = _moved_along(at, done, float(innovation[0]), noise)
     at = replace(
         at,
-        innovation=(float(innovation[0]), float(innovation[1])),
-        measured=(float(measured[0]), float(measured[1])),
+        innovation=_point(innovation),
+        measured=_point(measured),
     )
     if predicted.tip[0] > 0.0:
         return replace(at, state=_held(at, predicted, measured))
     if not at.correction.fits_start:
-        return replace(at, state=at.simulator.assimilate(predicted, measured.tolist()).state)
-    return _fit_start(at, predicted, float(measured[1] - predicted.tip[1]), noise)
+        return replace(at, state=_assimilated(at, predicted, measured))
+    return _fit_start(at, predicted, measured[Y:] - predicted.tip[Y : Z + 1], noise)
 
 
 def _innovation(before: Floats, after: Floats, done: Move, measurement: Measurement) -> Floats:
-    """Reading (mm) less prediction at its time, the move taken as even, shape (2,)."""
-    expected: Floats = before[:2] + done.part(measurement.time) * (after[:2] - before[:2])
+    """Reading (mm) less prediction at its time, the move taken as even, shape (3,)."""
+    here, there = before[: Z + 1], after[: Z + 1]
+    expected: Floats = here + done.part(measurement.time) * (there - here)
     return np.asarray(place(measurement)) - expected
+
+
+def _point(values: Floats) -> Point:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _assimilated(at: Corrected, predicted: State, measured: Floats) -> State:
+    axes = at.simulator.scenario.setup.axes
+    return at.simulator.assimilate(predicted, measured[: 1 + axes].tolist()).state
 
 
 def _moved_along(at: Corrected, done: Move, off: float, noise: float) -> tuple[Corrected, State]:
@@ -156,7 +175,7 @@ def _moved_along(at: Corrected, done: Move, off: float, noise: float) -> tuple[C
     """
     gain = at.axial / (at.axial + noise**2 + 1e-12)
     moved = at.state.with_estimate(base_x=float(at.state.base[0]) + gain * off)
-    predicted = at.simulator.step(moved, Control.from_row(done.applied))
+    predicted = at.simulator.step(moved, done.applied)
     return replace(at, axial=(1.0 - gain) * at.axial), predicted
 
 
@@ -165,37 +184,41 @@ def _bevel_reach(simulator: Simulator, depth: float) -> float:
     setup = simulator.scenario.setup
     travel = min(depth + setup.tip_to_skin_mm, setup.stroke_mm)
     steps = int(np.ceil(travel / setup.max_advance_mm - 1e-9))
-    controls = np.zeros((1, steps, 5))
-    controls[:, :, 0], controls[:, :, 4] = travel / steps, -1.0
-    return abs(float(simulator.rollout(simulator.start(), controls).tips[0, -1, 1]))
+    straight = controls(1, steps, db_x=travel / steps)
+    return abs(float(simulator.rollout(simulator.start(), straight).tips[0, -1, Y]))
 
 
-def _fit_start(at: Corrected, predicted: State, innovation: float, noise: float) -> Corrected:
-    """One step of recursive least squares on base y and θ; linear, since only the guide touches the needle."""
+def _fit_start(at: Corrected, predicted: State, innovation: Floats, noise: float) -> Corrected:
+    """One step of recursive least squares on base position and slope, with the same gain on both axes; linear, since
+    only the guide touches the needle. innovation (2,): y, z.
+    """
     simulator = at.simulator
     sensitivity = np.array(
         [_tip_shift(simulator, predicted, 1.0, 0.0), _tip_shift(simulator, predicted, 0.0, 1e-3) / 1e-3]
     )
     spread = at.covariance @ sensitivity
     gain = spread / (sensitivity @ spread + noise**2 + 1e-12)
-    base_y, base_turn = predicted.base[1:] + gain * innovation
-    corrected = simulator.step(
-        predicted.with_estimate(base_y=float(base_y), base_turn=float(base_turn)), Control()
+    axes = simulator.scenario.setup.axes
+    base, slope = (
+        (predicted.base[first : first + axes] + one * innovation[:axes]).tolist()
+        for first, one in zip((Y, THETA), gain.tolist(), strict=True)
     )
+    corrected = simulator.step(predicted.with_estimate(base=base, slope=slope), STILL)
     return replace(at, state=corrected, covariance=at.covariance - np.outer(gain, spread))
 
 
 def _tip_shift(simulator: Simulator, state: State, base_y: float, base_turn: float) -> float:
-    """Lateral shift of the tip (mm) for a shift of the base (mm, rad)."""
-    _, y, turn = state.base
-    moved = state.with_estimate(base_y=float(y) + base_y, base_turn=float(turn) + base_turn)
-    return float(simulator.step(moved, Control()).tip[1] - state.tip[1])
+    """Shift of the tip (mm) along y for a shift of the base along it (mm, rad)."""
+    _, y, z, theta, psi = state.base.tolist()
+    moved = state.with_estimate(base=(y + base_y, z), slope=(theta + base_turn, psi))
+    return float(simulator.step(moved, STILL).tip[Y] - state.tip[Y])
 
 
 def _held(at: Corrected, predicted: State, measured: Floats) -> State:
     """The state with the tip held at its measured position and, if it is estimated, the low-passed load of that."""
-    held = at.simulator.assimilate(predicted, measured.tolist()).state
+    held = _assimilated(at, predicted, measured)
     if not at.correction.estimates_load:
         return held
     gain = at.simulator.scenario.control.load_gain
-    return held.with_estimate(tip_load=held.tip_load + gain * held.reactions.tip_force)
+    load = np.add(held.tip_load, gain * np.array(held.reactions.tip_force))
+    return held.with_estimate(tip_load=load.tolist())

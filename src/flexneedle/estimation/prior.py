@@ -6,6 +6,7 @@ layers, ln of a further factor on the modulus in cells along the depth, correlat
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,10 +16,40 @@ from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive, Section
 from flexneedle.types import Floats
 
-BASE_Y, BASE_TURN, BEND, RUN_OUT, BEVEL, CLEARANCE, MODULUS = range(7)
+
+class Slots(NamedTuple):
+    """Places of the parameters: on each axis base, slope, bend, run-out and the tilt of a measured direction (the
+    latter three relative to the bevel's direction), bevel factor, clearance, and the first of the moduli.
+    """
+
+    base: slice
+    slope: slice
+    bend: slice
+    run_out: slice
+    tilt: slice
+    bevel: int
+    clearance: int
+    modulus: int
+
+    @staticmethod
+    def of(scenario: Scenario) -> "Slots":
+        """The places for the axes of a scenario."""
+        axes, kinds = scenario.setup.axes, 4 if scenario.tracker.direction_jitter is None else 5
+        base, slope, bend, run_out, tilt = (
+            slice(min(k, kinds) * axes, min(k + 1, kinds) * axes) for k in range(5)
+        )
+        bevel = kinds * axes
+        return Slots(base, slope, bend, run_out, tilt, bevel, bevel + 1, bevel + 2)
+
+    def is_offset(self, parameter: int) -> bool:
+        """Whether a parameter is an offset of a measurement, without effect on the needle."""
+        return bool(self.run_out.start <= parameter < self.tilt.stop)
+
+
 LEAST_SD = 1e-6
 """Standard deviation of a parameter that is known (given as 0)."""
-_STEPS = (0.05, 3e-4, 0.05, 0.05, 0.05, 0.02)  # for differences: mm, rad, mm, mm, 1, mm
+_LATERAL_STEPS = (0.05, 3e-4, 0.05, 0.05, 1e-3)  # for differences, on each axis: mm, rad, mm, mm, rad
+_STEPS = (0.05, 0.02)  # of bevel factor and clearance: 1, mm
 _LOG_STEP = 0.05
 _SHIFT_STEP = 0.2  # mm
 _WIDEST = 4.0  # standard deviations by which a parameter may deviate from its prior
@@ -32,6 +63,8 @@ class Priors(Section):
     """Prior of the natural bend of the needle (lateral offset of its tip): standard deviation."""
     run_out_sd_mm: NonNegative = 0.1
     """Prior of the distance of the measured tip from the needle's axis: standard deviation."""
+    tilt_sd_mrad: NonNegative = 10.0
+    """Prior of the angle between the measured direction and the needle at the tip: standard deviation on each axis."""
     clearance_mm: NonNegative = 0.05
     """Prior of the clearance of the needle in the guide, to either side: mean."""
     clearance_sd_mm: NonNegative = 0.02
@@ -52,6 +85,8 @@ class Priors(Section):
     """Model error: standard deviation of the mean of a move's readings, relative to the bevel offset."""
     least_model_sd_mm: Positive = 0.0126
     """Lower bound of the same standard deviation."""
+    model_slope_sd_mrad: Positive = 1.0
+    """Model error: standard deviation of the mean of a move's measured directions."""
     residual_gain: Fraction = 0.4
     """Gain of the low-pass filter on the residuals of the fit, per move."""
 
@@ -71,44 +106,44 @@ class Prior:
     @staticmethod
     def of(scenario: Scenario, settings: Priors, depth: float) -> "Prior":
         """The prior of a scenario."""
-        control = scenario.control
+        control, slots, axes = scenario.control, Slots.of(scenario), scenario.setup.axes
         layers, cells = len(scenario.tissue), _cells(depth, settings)
+        lateral = (
+            control.start_offset_sd_mm,
+            control.start_angle_sd,
+            settings.bend_sd_mm,
+            settings.run_out_sd_mm,
+            1e-3 * settings.tilt_sd_mrad,
+        )[: slots.bevel // axes]
         single = (
-            [control.start_offset_sd_mm, control.start_angle_sd, settings.bend_sd_mm]
-            + [
-                settings.run_out_sd_mm,
-                settings.bevel_sd,
-                settings.clearance_sd_mm if scenario.setup.has_guide else 0.0,
-            ]
+            np.repeat(lateral, axes).tolist()
+            + [settings.bevel_sd, settings.clearance_sd_mm if scenario.setup.has_guide else 0.0]
             + [settings.modulus_log_sd] * layers
             + [settings.boundary_sd_mm] * (layers - 1)
         )
         sd = np.maximum([*single, *[settings.variation_sd] * cells], LEAST_SD)
-        mean = np.where(np.arange(sd.size) == BEVEL, 1.0, 0.0)
-        mean[CLEARANCE] = settings.clearance_mm if scenario.setup.has_guide else 0.0
+        mean = np.where(np.arange(sd.size) == slots.bevel, 1.0, 0.0)
+        mean[slots.clearance] = settings.clearance_mm if scenario.setup.has_guide else 0.0
         precision = np.diag(sd**-2.0)
         precision[-cells:, -cells:] = uncorrelating(cells, settings.cell_mm / settings.variation_length_mm)
         precision[-cells:, -cells:] /= sd[-1] ** 2
         bounds = mean + np.outer((-_WIDEST, _WIDEST), sd)
-        bounds[0, CLEARANCE] = 0.0
-        bounds[:, BEVEL] = 0.0, _largest_bevel(scenario)
+        bounds[0, slots.clearance] = 0.0
+        bounds[:, slots.bevel] = 0.0, _largest_bevel(scenario)
         logs, shifts = [_LOG_STEP] * layers, [_SHIFT_STEP] * (layers - 1)
-        steps = np.array([*_STEPS, *logs, *shifts, *[_LOG_STEP] * cells])
+        steps = np.array(
+            [*np.repeat(_LATERAL_STEPS[: len(lateral)], axes), *_STEPS, *logs, *shifts, *[_LOG_STEP] * cells]
+        )
         tops = np.array(scenario.layer_tops) - _WIDEST * settings.boundary_sd_mm
         tops[0] = 0.0
         starts = settings.cell_mm * np.arange(cells)
-        begins = np.concatenate([[-np.inf] * BEVEL, [0.0, -np.inf], tops, tops[1:], starts])
+        begins = np.concatenate([[-np.inf] * slots.bevel, [0.0, -np.inf], tops, tops[1:], starts])
         return Prior(mean, precision, bounds, steps, begins)
 
     def cost(self, parameters: Floats) -> float:
         """Negative logarithm of the density, up to a constant."""
         off = parameters - self.mean
         return float(0.5 * off @ self.precision @ off)
-
-
-def unexplained(scenario: Scenario, settings: Priors) -> float:
-    """Model error: standard deviation (mm) of the mean of a move's readings that no parameter explains."""
-    return max(settings.least_model_sd_mm, settings.model_sd * scenario.needle.bevel.offset_mm)
 
 
 def uncorrelating(size: int, distance: float) -> Floats:

@@ -7,13 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexneedle.estimation.estimate import Move
-from flexneedle.types import Floats
+from flexneedle.types import Floats, Laterals
 
 
 @dataclass(frozen=True, eq=False)
 class MoveMeans:
-    """Means of the readings of each move that has any: the move, the share of it done, x, y (mm), their number, and
-    the bevel's side, which changes before its move; each (r,).
+    """Means of a sensor's readings of each move that has any: the move, the share of it done, x (mm) and the measured
+    quantity y, their number and variance (NaN: not reported), and the bevel's direction after the move; each (r,).
+    Lateral quantities are complex in space.
 
     Quantities of a model are given at the ends of all m moves, the start first: (m + 1,).
     """
@@ -21,27 +22,31 @@ class MoveMeans:
     index: NDArray[np.intp]
     part: Floats
     x: Floats
-    y: Floats
+    y: Laterals
     count: Floats
-    sides: Floats
+    reported: Floats
+    bevel: Laterals
 
     @staticmethod
-    def of(moves: Sequence[Move], bevel: float) -> "MoveMeans":
-        """The means of moves with at least one reading among them; bevel: its side after the last move."""
-        means = [(k, *done.mean) for k, done in enumerate(moves) if done.mean is not None]
-        index, part, x, y, count = np.array(means, dtype=float).T
-        sides = np.cumprod([-1.0 if done.applied[4] > 0.0 else 1.0 for done in moves])
+    def of(moves: Sequence[Move], sensor: str, bevel: complex, axes: int) -> "MoveMeans":
+        """The means of a sensor's readings; bevel: its direction after the last move."""
+        means = [(k, *done.means[sensor]) for k, done in enumerate(moves) if sensor in done.means]
+        index, part, x, y, z, count, reported = np.array(means, dtype=float).reshape(-1, 7).T
+        rolled = np.cumsum([done.applied.roll + done.applied.spin for done in moves])
         kept = index.astype(int)
-        return MoveMeans(kept, part, x, y, count, (bevel * sides[-1] * sides)[kept])
+        directions = (bevel * np.exp(1j * (rolled - rolled[-1])))[kept]
+        if axes == 1:
+            return MoveMeans(kept, part, x, y, count, reported, np.rint(directions.real))
+        return MoveMeans(kept, part, x, y + 1j * z, count, reported, directions)
 
-    def between(self, ends: Floats) -> Floats:
+    def between(self, ends: Laterals) -> Laterals:
         """A quantity interpolated to the readings (r,)."""
-        between: Floats = (1.0 - self.part) * ends[self.index] + self.part * ends[self.index + 1]
+        between: Laterals = (1.0 - self.part) * ends[self.index] + self.part * ends[self.index + 1]
         return between
 
-    def left(self, y: Floats, run_out: float) -> Floats:
-        """Lateral residuals (r,), mm: readings minus those of a model."""
-        left: Floats = self.y - self.between(y) - run_out * self.sides
+    def left(self, y: Laterals, offset: complex) -> Laterals:
+        """Lateral residuals (r,): readings minus those of a model, with an offset that turns with the bevel."""
+        left: Laterals = self.y - self.between(y) - offset * self.bevel
         return left
 
     def ahead(self, x: Floats) -> Floats:
@@ -50,12 +55,13 @@ class MoveMeans:
         return ahead
 
     def variance(self, jitter: float, unexplained: float) -> Floats:
-        """Variances (r,) of the means, mm²; jitter of a reading and model error of a mean: standard deviations, mm."""
-        variance: Floats = jitter**2 / self.count + unexplained**2
+        """Variances (r,) of the means; jitter of a reading and model error of a mean: standard deviations."""
+        noise = np.where(np.isnan(self.reported), jitter**2 / self.count, self.reported)
+        variance: Floats = noise + unexplained**2
         return variance
 
-    def bent(self, y: Floats) -> Floats:
-        """Possible deviation (r,) of a reading from the chord of its move, mm: the tip's path bends below the skin."""
+    def bent(self, y: Laterals) -> Floats:
+        """Possible deviation (r,) of a reading from the chord of its move: the tip's path bends below the skin."""
         change = np.abs(np.diff(y, n=2, prepend=y[0], append=y[-1]))
         sag: Floats = 0.25 * np.maximum(change[self.index], change[self.index + 1])
         return sag

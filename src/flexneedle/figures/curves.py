@@ -1,5 +1,9 @@
-"""Data of the figures as arrays: paths, rolls of the bevel, errors, guide and energy over depth, the field."""
+"""Data of the figures as arrays: paths, rolls of the bevel, errors, guide and energy over depth, the field.
 
+Points are rows x, y, z; a figure draws two of their columns.
+"""
+
+import math
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -8,85 +12,151 @@ from statistics import median
 
 import numpy as np
 
-from flexneedle.types import Action, Floats, Frame, Insertion, Plan, VerdictKind
+from flexneedle.types import (
+    DB_Y,
+    ROLL,
+    SPIN,
+    Action,
+    Floats,
+    Frame,
+    Insertion,
+    Period,
+    Plan,
+    Pose,
+    VerdictKind,
+    X,
+    Y,
+)
 
 _TIP = "tip"  # the sensor in the needle; all others of a frame are references
 # Verdicts of readings that the monitor excludes from its window.
 _EXCLUDED = (VerdictKind.STALE, VerdictKind.NOT_A_NUMBER)
+_MARKED = math.radians(5.0)  # smaller rolls have no mark
 
 
 @dataclass(frozen=True)
 class Roll:
-    """A roll of the bevel at a tip position (mm), to the side +1 (+y) or −1."""
+    """A roll of the needle to an angle (rad) at a tip position x, y, z (mm)."""
 
-    x: float
-    y: float
-    side: int
+    point: tuple[float, ...]
+    angle: float
+
+    @property
+    def side(self) -> int:
+        """The side of the bevel in the plane, +1 (+y) or −1."""
+        return 1 if math.cos(self.angle) >= 0.0 else -1
+
+    @property
+    def direction(self) -> tuple[float, float, float]:
+        """Unit vector x, y, z of the bevel."""
+        return 0.0, math.cos(self.angle), math.sin(self.angle)
+
+
+def start_roll(plan: Plan) -> Roll:
+    """Return the angle of the needle at the start of a plan."""
+    return Roll(_place(plan.tips[0]), plan.roll)
 
 
 def planned_rolls(plan: Plan) -> list[Roll]:
-    """Return the rolls of a plan, each at the tip position before its step."""
-    steps = np.flatnonzero(plan.controls[:, 4] > 0.0)
-    sides = plan.bevel * (-1) ** np.arange(1, len(steps) + 1)
-    positions = plan.tips[steps, :2].tolist()
-    return [Roll(x, y, int(side)) for (x, y), side in zip(positions, sides, strict=True)]
+    """Return the rolls of a plan that are large enough for a mark, each at the tip position before its step."""
+    angles = planned_angles(plan)[1::2, 1]
+    steps = np.flatnonzero(np.abs(plan.controls[:, ROLL]) > _MARKED)
+    return [Roll(_place(plan.tips[k]), float(angles[k])) for k in steps]
 
 
 def applied_rolls(insertion: Insertion) -> list[Roll]:
-    """Return the rolls as applied, each at the estimated tip position before its period."""
-    before = [insertion.plan.tips[0].tolist(), *(period.estimate for period in insertion.periods)]
+    """Return the rolls as applied, as `planned_rolls`, each at the estimated tip position before its period."""
+    before = [Pose.of(insertion.plan.tips[0]), *(period.estimate for period in insertion.periods)]
     return [
-        Roll(float(tip[0]), float(tip[1]), period.bevel)
+        Roll(tip.point, period.roll - period.applied.spin)
         for tip, period in zip(before, insertion.periods, strict=False)
-        if period.applied[4] > 0
+        if abs(period.applied.roll) > _MARKED
     ]
 
 
+def planned_angles(plan: Plan) -> Floats:
+    """Return depth of the tip (mm) and angle of the needle (rad) (2m + 1, 2): the start, then begin and end of each
+    step.
+    """
+    rolls, spins = plan.controls[:, ROLL], plan.controls[:, SPIN]
+    ends = plan.roll + np.cumsum(rolls + spins)
+    angles = np.column_stack([ends - spins, ends]).ravel()
+    depths = np.column_stack([plan.tips[:-1, X], plan.tips[1:, X]]).ravel()
+    return np.column_stack([[plan.tips[0, X], *depths], [plan.roll, *angles]])
+
+
+def applied_angles(insertion: Insertion) -> Floats:
+    """Return depth of the estimated tip (mm) and angle of the needle (rad) (2k, 2), begin and end of each period."""
+    before = [float(insertion.plan.tips[0, X]), *(period.estimate.x for period in insertion.periods)]
+    pairs = zip(pairwise(before), insertion.periods, strict=True)
+    rows = (((begin, p.roll - p.applied.spin), (end, p.roll)) for (begin, end), p in pairs)
+    return np.array(list(rows)).reshape(-1, 2)
+
+
+def prediction(insertion: Insertion) -> Period | None:
+    """Return the last period up to half the target depth in which the shape at the target was predicted."""
+    half = 0.5 * insertion.target[0]
+    known = [p for p in insertion.periods if p.predicted is not None and p.estimate.x <= half]
+    return known[-1] if known else None
+
+
 def estimated_path(insertion: Insertion) -> Floats:
-    """Return x, y (k, 2) of the estimated tip."""
-    return _points(period.estimate[:2] for period in insertion.periods)
+    """Return x, y, z (k, 3) of the estimated tip."""
+    return _points(period.estimate.point for period in insertion.periods)
 
 
 def true_path(insertion: Insertion) -> Floats:
-    """Return x, y (k, 2) of the true tip, where it is known."""
-    return _points(period.true_tip[:2] for period in insertion.periods if period.true_tip is not None)
+    """Return x, y, z (k, 3) of the true tip, where it is known."""
+    return _points(period.true_tip.point for period in insertion.periods if period.true_tip is not None)
 
 
 def good_measurements(insertion: Insertion) -> Floats:
-    """Return x, y (k, 2) of the readings that were used."""
-    return _points((p.measurement.x, p.measurement.y) for p in insertion.periods if p.verdict.ok)
+    """Return x, y, z (k, 3) of the readings that were used; z is NaN where it was not measured."""
+    return _points(
+        (p.measurement.x, p.measurement.y, p.measurement.z) for p in insertion.periods if p.verdict.ok
+    )
 
 
 def rejected_measurements(insertion: Insertion) -> Floats:
-    """Return x, y (k, 2) of the readings that were rejected."""
+    """Return x, y, z (k, 3) of the readings that were rejected."""
     rejected = (p.measurement for p in insertion.periods if not p.verdict.ok)
-    return _points((one.x, one.y) for one in rejected if one.x is not None)
+    return _points((one.x, one.y, one.z) for one in rejected if one.x is not None)
 
 
-def lateral_error(plan: Plan, points: Floats) -> Floats:
-    """Return the lateral deviation (k,), mm, signed, of points (k, 2) from the planned path at their depth."""
-    order = np.argsort(plan.tips[:, 0], kind="stable")
-    planned = np.interp(points[:, 0], plan.tips[order, 0], plan.tips[order, 1])
-    return np.asarray(points[:, 1] - planned)
+def lateral_error(plan: Plan, points: Floats, axis: int = Y) -> Floats:
+    """Return the deviation (k,), mm, signed, of points (k, 3) along y or z from the planned path at their depth."""
+    order = np.argsort(plan.tips[:, X], kind="stable")
+    planned = np.interp(points[:, 0], plan.tips[order, X], plan.tips[order, axis])
+    return np.asarray(points[:, axis] - planned)
 
 
-def planned_motion(plan: Plan, guided: bool) -> Floats:
-    """Return the lateral position (k,), mm, of the guide at each tip position, or of the base if there is no guide."""
-    return plan.guide if guided else np.cumsum([0.0, *plan.controls[:, 1]])
+def planned_motion(plan: Plan, guided: bool, axis: int = Y) -> Floats:
+    """Return y or z (k,), mm, of the guide at each tip position, or of the base if there is no guide."""
+    lateral = axis - Y
+    if guided:
+        return plan.guide[:, lateral]
+    return np.cumsum([0.0, *plan.controls[:, DB_Y + lateral]])
+
+
+def applied_motion(insertion: Insertion, guided: bool, axis: int = Y) -> Floats:
+    """Return y or z (k,), mm, of the guide after each period, or of the base if there is no guide."""
+    lateral = axis - Y
+    return np.array([p.guide[lateral] if guided else p.base[axis] for p in insertion.periods])
 
 
 def true_energy(insertion: Insertion) -> Floats:
     """Return depth of the true tip (mm) and energy of the true tissue (mJ) (k, 2), where they are known."""
-    return _points(
-        (period.true_tip[0], period.true_strain_energy)
+    known = [
+        (period.true_tip.x, period.true_strain_energy)
         for period in insertion.periods
         if period.true_tip is not None and period.true_strain_energy is not None
-    )
+    ]
+    return np.array(known, dtype=float).reshape(-1, 2)
 
 
 def intermediate_shapes(tips: Floats, shapes: list[Floats], count: int = 4) -> list[Floats]:
     """Return up to `count` shapes at equal distances of the tip from start to end, without the last one."""
-    depth = tips[:, 0]
+    depth = tips[:, X]
     wanted = np.linspace(depth[0], depth[-1], count + 1)[:-1]
     chosen = dict.fromkeys(int(np.argmin(np.abs(depth - x))) for x in wanted)
     return [shapes[k] for k in chosen if k != len(shapes) - 1]
@@ -143,5 +213,9 @@ def _worst(frames: Sequence[Frame]) -> float:
     return max(map(median, by_sensor.values()), default=float("nan"))
 
 
-def _points(pairs: Iterable[tuple[float | None, float | None]]) -> Floats:
-    return np.array(list(pairs), dtype=float).reshape(-1, 2)
+def _points(rows: Iterable[tuple[float | None, ...]]) -> Floats:
+    return np.array(list(rows), dtype=float).reshape(-1, 3)
+
+
+def _place(pose: Floats) -> tuple[float, ...]:
+    return tuple(map(float, pose[:3]))

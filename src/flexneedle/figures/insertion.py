@@ -1,8 +1,10 @@
 """The figure of an insertion: the scene to scale, panels over depth below it, and the end magnified.
 
-With a tracker that measures its field, a panel over time shows the indicators and the times of holds.
+In space the scene is two sections to the same scale, x–y and x–z, with the view along the axis beside them. With a
+tracker that measures its field, a panel over time shows the indicators and the times of holds.
 """
 
+from math import dist
 from textwrap import fill
 from typing import Any
 
@@ -10,75 +12,141 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flexneedle.figures import curves, scene
-from flexneedle.figures.layout import legend_of, mosaic, short
+from flexneedle.figures import curves, scene, space
+from flexneedle.figures.layout import COLUMNS, legend_of, mosaic, short
 from flexneedle.figures.panels import DepthPanel, Line, draw_depths, draw_timeline
-from flexneedle.figures.style import BAD, ESTIMATE, MEASURED, PLAN, QUIET, TARGET, TRUE, signed, styled
+from flexneedle.figures.scene import View
+from flexneedle.figures.style import BAD, ESTIMATE, MEASURED, PLAN, QUIET, TARGET, TRUE, styled, tone
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats, Insertion
+from flexneedle.types import Floats, Insertion, X
 
-_PANELS = ("deviation", "motion", "energy")
 _FAR = 6.0  # mm; further from the target, the close-up shows the tip instead
 _LONG = 0.5  # mm; shorter paths would be hidden below their ends
-_LINE = 92  # characters of the verdict
+_LINES = {1: 92, 2: 60}  # characters of a line of the verdict, by the number of lateral axes
 
 
 def insertion_figure(scenario: Scenario, insertion: Insertion) -> Figure:
     """Return the figure of an insertion with at least one period, finished or not."""
     field = curves.worst_indicator(insertion, scenario.monitor.indicator_window_s)
-    rows = [("scene", "scene"), *((name, "end") for name in _PANELS)]
-    if len(field):
-        rows.append(("field", "."))
+    shown = _panels(scenario, insertion)
     with styled():
-        figure, axes = mosaic(_title(scenario, insertion), 2.8 + 1.15 * len(rows), rows)
-        _scene(axes["scene"], scenario, insertion)
-        motion = _motion(scenario, insertion)
-        draw_depths(
-            [axes[name] for name in _PANELS], scenario, [_deviation(insertion), motion, _energy(insertion)]
-        )
-        _close_up(axes["end"], scenario, insertion)
+        figure, axes = _sheet(scenario, insertion, list(shown), field=len(field) > 0)
+        sections = scene.sections(scenario)
+        scenes = [axes[f"scene{end}"] for end in sections]
+        for ax, view in zip(scenes, sections.values(), strict=True):
+            _scene(ax, scenario, insertion, view)
+        verdict = fill(insertion.summary, _LINES[scenario.setup.axes])
+        scene.name_scenes(scenes, verdict, TARGET if insertion.reached else BAD)
+        if scenario.setup.axes == 2:
+            _along(axes["along"], scenario, insertion)
+        draw_depths([axes[name] for name in shown], scenario, list(shown.values()))
+        for end, view in sections.items():
+            _close_up(axes[f"end{end}"], scenario, insertion, view)
+        axes[f"end{end}"].set_xlabel("\n".join(_facts(scenario, insertion)))
         if len(field):
             _field(axes["field"], scenario, insertion, field)
-        legend_of(figure, [axes["scene"]])
+        legend_of(figure, [*scenes, *(axes[name] for name in axes if name == "along")])
         figure.draw_without_rendering()
-        scene.name_layers(axes["scene"], scenario)
+        for ax in scenes:
+            scene.name_layers(ax, scenario)
     return figure
 
 
-def _title(scenario: Scenario, insertion: Insertion) -> str:
-    depth, lateral = insertion.target
-    target = f"target {signed(depth)} mm deep, {signed(lateral)} mm lateral"
+def _panels(scenario: Scenario, insertion: Insertion) -> dict[str, DepthPanel]:
+    """Panels over depth by name, from above."""
+    roll = {"roll": _roll(insertion)} if scenario.setup.axes == 2 else {}
+    deviation, motion = _deviation(scenario, insertion), _motion(scenario, insertion)
+    return {"deviation": deviation, "motion": motion} | roll | {"energy": _energy(insertion)}
+
+
+def _sheet(
+    scenario: Scenario, insertion: Insertion, panels: list[str], *, field: bool
+) -> tuple[Figure, dict[str, Axes]]:
+    if scenario.setup.axes == 1:
+        scenes = [["scene", "scene"]]
+        below = [[name, "end"] for name in panels]
+        heights, widths, tall = [2.4], COLUMNS, 2.8
+    else:
+        scenes = [[name, name, "along"] for name in ("scene y", "scene z")]
+        ends = ("end y", "end y", "end z", "end z")
+        below = [[name, end, end] for name, end in zip(panels, ends, strict=True)]
+        heights, widths, tall = [1.6, 1.6], space.COLUMNS, 2.8
+    rows = [*scenes, *below, *([["field", *["."] * (len(widths) - 1)]] if field else [])]
+    heights = heights + [1.0] * (len(rows) - len(scenes))
+    return mosaic(title_of(scenario, insertion), tall + 1.15 * len(rows), rows, heights, widths)
+
+
+def title_of(scenario: Scenario, insertion: Insertion) -> str:
+    """Return the title of a figure of an insertion."""
+    target = f"target {scene.place(scenario, insertion.target)}"
     return f"{short(scenario.name, 60)}: {target} (seed {insertion.seed})"
 
 
-def _scene(ax: Axes, scenario: Scenario, insertion: Insertion) -> None:
+def _scene(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> None:
     plan, last = insertion.plan, insertion.periods[-1]
     estimated = curves.estimated_path(insertion)
     known = [plan.tips, estimated, curves.true_path(insertion), np.array([plan.target])]
-    scene.draw_tissue(ax, scenario, known)
+    scene.draw_tissue(ax, scenario, known, view)
     before = curves.intermediate_shapes(estimated, [period.shape for period in insertion.periods])
-    scene.draw_needle(ax, last.shape, before, scenario.needle.outer_diameter, "estimated needle")
-    _paths(ax, insertion)
-    scene.draw_start(ax, plan)
-    scene.draw_rolls(ax, curves.planned_rolls(plan), PLAN, solid=False, label="bevel flip, planned")
-    scene.draw_rolls(ax, curves.applied_rolls(insertion), ESTIMATE, solid=True, label="bevel flip, applied")
-    scene.draw_target(ax, plan.target)
+    scene.draw_needle(ax, last.shape, before, scenario.needle.outer_diameter, "estimated needle", view)
+    _paths(ax, insertion, view)
+    _rolls(ax, scenario, insertion, view, 4.0)
+    scene.draw_target(ax, plan.target, view)
+    if scenario.setup.axes == 2:
+        _prediction(ax, insertion, view)
     if scenario.setup.guide_x is not None:
-        travel = np.array([0.0, *(period.guide for period in insertion.periods)])
-        scene.draw_guide(ax, scenario.setup.guide_x, travel, last.guide)
-    color = TARGET if insertion.reached else BAD
-    ax.set_title(fill(insertion.summary, _LINE), color=color, fontsize=10)
+        travel = _guide_travel(insertion)[:, view[1]]
+        scene.draw_guide(ax, scenario.setup.guide_x, travel, travel[-1])
 
 
-def _paths(ax: Axes, insertion: Insertion, scale: float = 1.0) -> None:
+def _rolls(ax: Axes, scenario: Scenario, insertion: Insertion, view: View, length: float) -> None:
+    """Draw the bevel at the start and after rolls: its side in the plane, its direction in space."""
+    planned, applied = curves.planned_rolls(insertion.plan), curves.applied_rolls(insertion)
+    if scenario.setup.axes == 1:
+        scene.draw_start(ax, insertion.plan)
+        scene.draw_rolls(ax, planned, PLAN, solid=False, label="bevel flip, planned")
+        scene.draw_rolls(ax, applied, ESTIMATE, solid=True, label="bevel flip, applied")
+        return
+    space.draw_start(ax, insertion.plan, view, length)
+    space.draw_bevels(ax, planned, view, length, PLAN, solid=False, label=space.PLANNED)
+    space.draw_bevels(ax, applied, view, length, ESTIMATE, solid=True, label=space.APPLIED)
+
+
+def _prediction(ax: Axes, insertion: Insertion, view: View) -> None:
+    period = curves.prediction(insertion)
+    if period is not None and period.predicted is not None:
+        space.draw_prediction(ax, period.predicted, view, space.prediction_label(period))
+
+
+def _guide_travel(insertion: Insertion) -> Floats:
+    """Columns x (0), y, z of the guide, from the start."""
+    places = [tuple(insertion.plan.guide[0]), *(period.guide for period in insertion.periods)]
+    return np.array([(0.0, *place) for place in places])
+
+
+def _along(ax: Axes, scenario: Scenario, insertion: Insertion) -> None:
+    """Draw the view along the axis: paths of tip and guide, directions of the bevel, target."""
+    travel, path = _guide_travel(insertion), _known_path(insertion)
+    space.set_up_along(ax, scenario, [insertion.plan.tips, path, travel, np.array([insertion.target])])
+    if scenario.setup.has_guide:
+        space.draw_guide_along(ax, travel[:, 1:], insertion.target)
+    space.draw_along(ax, path, insertion.plan.tips)
+    _rolls(ax, scenario, insertion, scene.ALONG, space.arrow_along(ax))
+    scene.draw_target(ax, insertion.target, scene.ALONG)
+
+
+def _paths(ax: Axes, insertion: Insertion, view: View, scale: float = 1.0) -> None:
     """Draw paths and readings of the tip, as far as there are any."""
     estimated, true = curves.estimated_path(insertion), curves.true_path(insertion)
-    _path(
-        ax, insertion.plan.tips, "planned path", color=PLAN, linestyle="--", linewidth=1.1 * scale, zorder=5
+    planned: dict[str, Any] = {"color": PLAN, "linestyle": "--", "linewidth": 1.1 * scale, "zorder": 5}
+    _path(ax, insertion.plan.tips[:, view], "planned path", **planned)
+    _path(ax, true[:, view], "true path", color=TRUE, linewidth=1.3 * scale, zorder=4)
+    dotted: dict[str, Any] = {"color": ESTIMATE, "linestyle": ":", "linewidth": 1.5 * scale, "zorder": 4.5}
+    _path(ax, estimated[:, view], "estimated path", **dotted)
+    used, rejected = (
+        points[:, view]
+        for points in (curves.good_measurements(insertion), curves.rejected_measurements(insertion))
     )
-    _path(ax, true, "true path", color=TRUE, linewidth=1.3 * scale, zorder=4)
-    _path(ax, estimated, "estimated path", color=ESTIMATE, linestyle=":", linewidth=1.5 * scale, zorder=4.5)
-    used, rejected = curves.good_measurements(insertion), curves.rejected_measurements(insertion)
     if len(used):
         ax.plot(*used.T, "o", color=MEASURED, markersize=2.0 * scale, zorder=3, label="tracker")
     if len(rejected):
@@ -86,36 +154,49 @@ def _paths(ax: Axes, insertion: Insertion, scale: float = 1.0) -> None:
 
 
 def _path(ax: Axes, points: Floats, label: str, **how: Any) -> None:
-    """Draw a path (k, ≥ 2) that is long enough to be visible."""
-    if len(points) and np.ptp(points[:, :2], axis=0).max() > _LONG:
-        ax.plot(*points[:, :2].T, label=label, **how)
+    """Draw a path (k, 2) that is long enough to be visible."""
+    if len(points) and np.ptp(points, axis=0).max() > _LONG:
+        ax.plot(*points.T, label=label, **how)
 
 
-def _deviation(insertion: Insertion) -> DepthPanel:
+def _deviation(scenario: Scenario, insertion: Insertion) -> DepthPanel:
     plan = insertion.plan
     measured, truth = curves.good_measurements(insertion), curves.true_path(insertion)
-    lines = [
-        Line("tracker", measured[:, 0], curves.lateral_error(plan, measured), MEASURED, "o"),
-        Line("true", truth[:, 0], curves.lateral_error(plan, truth), TRUE),
-    ]
+    lines: list[Line] = []
+    for end, (_, axis) in scene.sections(scenario).items():
+        off, true = (curves.lateral_error(plan, points, axis) for points in (measured, truth))
+        lines.append(Line(f"tracker{end}", measured[:, X], off, tone(MEASURED, axis), "o"))
+        lines.append(Line(f"true{end}", truth[:, X], true, tone(TRUE, axis)))
     return DepthPanel("Deviation from the plan (mm)", lines, 0.4)
 
 
 def _motion(scenario: Scenario, insertion: Insertion) -> DepthPanel:
     """Lateral position of the guide over depth, or of the base where there is no guide."""
     plan, guided = insertion.plan, scenario.setup.has_guide
-    applied = [period.guide if guided else period.base[1] for period in insertion.periods]
-    lines = [
-        Line("planned", plan.tips[:, 0], curves.planned_motion(plan, guided), PLAN, "--"),
-        Line("applied", curves.estimated_path(insertion)[:, 0], np.array(applied), ESTIMATE),
-    ]
+    depth = curves.estimated_path(insertion)[:, X]
+    lines: list[Line] = []
+    for end, axis in scene.moved_axes(scenario).items():
+        planned = curves.planned_motion(plan, guided, axis)
+        applied = curves.applied_motion(insertion, guided, axis)
+        lines.append(Line(f"planned{end}", plan.tips[:, X], planned, tone(PLAN, axis), "--"))
+        lines.append(Line(f"applied{end}", depth, applied, tone(ESTIMATE, axis)))
     return DepthPanel("Guide, lateral (mm)" if guided else "Base, lateral (mm)", lines, 0.4)
+
+
+def _roll(insertion: Insertion) -> DepthPanel:
+    """Angle of the needle over depth."""
+    planned, applied = curves.planned_angles(insertion.plan), curves.applied_angles(insertion)
+    lines = [
+        Line("planned", planned[:, 0], np.degrees(planned[:, 1]), PLAN, "--"),
+        Line("applied", applied[:, 0], np.degrees(applied[:, 1]), ESTIMATE),
+    ]
+    return DepthPanel("Roll of the needle (°)", lines, 30.0, angles=True)
 
 
 def _energy(insertion: Insertion) -> DepthPanel:
     plan, truth = insertion.plan, curves.true_energy(insertion)
     lines = [
-        Line("planned", plan.tips[:, 0], plan.strain_energy, PLAN, "--"),
+        Line("planned", plan.tips[:, X], plan.strain_energy, PLAN, "--"),
         Line("true", truth[:, 0], truth[:, 1], TRUE),
     ]
     return DepthPanel("Energy stored in the tissue (mJ)", lines, 0.01)
@@ -137,38 +218,43 @@ def _field(ax: Axes, scenario: Scenario, insertion: Insertion, field: Floats) ->
     draw_timeline(ax, "Largest indicator of the references", lines, held, shade)
 
 
-def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion) -> None:
+def _close_up(ax: Axes, scenario: Scenario, insertion: Insertion, view: View) -> None:
     """Magnify the end: around the target, or around the tip where that is far from the target."""
-    tip = _last_tip(insertion)
-    distance = float(np.hypot(*(tip - insertion.target)))
+    tip: Any = tuple(map(float, _known_path(insertion)[-1]))
+    target = insertion.target
+    distance = dist(tip, target)
     near = distance <= _FAR
-    centre, half = (insertion.target, max(1.6, 1.15 * distance)) if near else (tip, 3.0)
-    ax.set_xlim(centre[0] - half, centre[0] + half)
-    ax.set_ylim(centre[1] - half, centre[1] + half)
+    centre, half = (target, max(1.6, 1.15 * distance)) if near else (tip, 3.0)
+    right, up = view
+    ax.set_xlim(centre[right] - half, centre[right] + half)
+    ax.set_ylim(centre[up] - half, centre[up] + half)
     ax.set(aspect="equal", anchor="N")
-    ax.set_title("The end, magnified (mm)" if near else f"The tip, {distance:.1f} mm from the target")
+    seen = "" if scenario.setup.axes == 1 else f" in x–{'xyz'[up]}"
+    whole = f"The end{seen}, magnified (mm)"
+    ax.set_title(whole if near else f"The tip{seen}, {distance:.1f} mm from the target")
     scene.tint_layers(ax, scenario)
-    _paths(ax, insertion, scale=1.6)
-    scene.draw_target(ax, insertion.target)
+    _paths(ax, insertion, view, scale=1.6)
+    scene.draw_target(ax, target, view)
     if near and not insertion.reached:
-        ax.plot(*np.array([tip, insertion.target]).T, color=BAD, linewidth=1.0, zorder=6, label="miss")
-    ax.plot(*tip, "o", color=TRUE, markersize=6, markeredgecolor="white", zorder=9, label="tip")
+        miss = np.array([tip, target])[:, view]
+        ax.plot(*miss.T, color=BAD, linewidth=1.0, zorder=6, label="miss")
+    end: dict[str, Any] = {"color": TRUE, "markersize": 6, "markeredgecolor": "white", "zorder": 9}
+    ax.plot(tip[right], tip[up], "o", label="tip", **end)
     for side in ("top", "right"):
         ax.spines[side].set_visible(True)
     ax.locator_params(nbins=5)
-    ax.set_xlabel("\n".join(_facts(insertion)))
 
 
-def _last_tip(insertion: Insertion) -> Floats:
+def _known_path(insertion: Insertion) -> Floats:
+    """The true path of the tip, or where it is unknown the estimated one."""
     truth = curves.true_path(insertion)
-    end: Floats = (truth if len(truth) else curves.estimated_path(insertion))[-1]
-    return end
+    return truth if len(truth) else curves.estimated_path(insertion)
 
 
-def _facts(insertion: Insertion) -> list[str]:
-    """Errors, bevel flips, controller and phantom, as far as they are known."""
+def _facts(scenario: Scenario, insertion: Insertion) -> list[str]:
+    """Errors, bevel flips or rolls, controller and phantom, as far as they are known."""
     values = (("true error", insertion.true_error_mm), ("tracker residual", insertion.residual_mm))
     errors = [f"{name} {value:.3f} mm" for name, value in values if not np.isnan(value)]
-    flips = f"bevel flips: {insertion.flips} (planned {insertion.plan.flips})"
+    flips = f"{scenario.setup.turns}: {insertion.flips} (planned {insertion.plan.flips})"
     phantom = f"{insertion.phantom} phantom" if insertion.phantom else ""
     return [*errors, flips, ", ".join(filter(None, (insertion.controller, phantom)))]

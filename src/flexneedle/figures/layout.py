@@ -11,7 +11,9 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.legend_handler import HandlerLine2D
+from matplotlib.legend import Legend
+from matplotlib.legend_handler import HandlerBase, HandlerLine2D, HandlerPatch
+from matplotlib.patches import FancyArrowPatch
 from numpy.typing import NDArray
 
 from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, new_figure
@@ -19,8 +21,12 @@ from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, new_figure
 Floats = NDArray[np.float64]
 Content = TypeVar("Content")
 
+COLUMNS: tuple[float, ...] = (1.8, 1.0)
+"""Widths of a mosaic's columns, relative to each other."""
 UPRIGHT = "upright"
 """gid of a line whose mark in the legend is upright."""
+ARROW = "arrow"
+"""gid of arrows, whose mark in the legend is an arrow."""
 MOST_PANELS = 9
 OVERLAID = 3  # controllers in one panel; more get a panel each
 MANY = 1500  # dots; more are small and drawn as an image inside the SVG
@@ -33,7 +39,6 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 _LEGEND = 0.45  # inches
 _TITLE, _ROW, _HANDLE = 88, 140, 7  # characters: of a line of the title, a row of the legend, a mark in it
-_COLUMNS = (1.8, 1.0)  # widths of a mosaic's columns, relative to each other
 
 
 @dataclass(frozen=True)
@@ -109,14 +114,19 @@ def head(ax: Axes, panel: Panel[Any], columns: int) -> None:
     ax.annotate(panel.note, (0, 1), (0, 4), "axes fraction", "offset points", color=QUIET, fontsize=7.5)
 
 
-def mosaic(title: str, height: float, rows: Sequence[tuple[str, str]]) -> tuple[Figure, dict[str, Axes]]:
-    """Return a figure with its title and the axes named in `rows` of two columns; one in both is higher."""
+def mosaic(
+    title: str,
+    height: float,
+    rows: Sequence[Sequence[str]],
+    heights: Sequence[float],
+    widths: Sequence[float] = COLUMNS,
+) -> tuple[Figure, dict[str, Axes]]:
+    """Return a figure with its title and the axes named in `rows`; heights, widths: relative to each other."""
     figure = new_figure(height)
     figure.set_layout_engine("constrained", h_pad=0.08, w_pad=0.08)
     figure.suptitle(fill(title, _TITLE), x=0.01, ha="left", fontsize=11, weight="bold")
-    heights = [2.4 if left == right else 1.0 for left, right in rows]
     return figure, figure.subplot_mosaic(
-        [list(row) for row in rows], height_ratios=heights, width_ratios=_COLUMNS
+        [list(row) for row in rows], height_ratios=heights, width_ratios=widths
     )
 
 
@@ -130,6 +140,24 @@ class _Upright(HandlerLine2D):
         ends = [-ydescent - above, height - ydescent + above]
         line.set(xdata=[middle, middle], ydata=ends, markevery=None)  # a marker at each end
         return [line]
+
+
+class _Arrow(HandlerPatch):
+    """Draws the mark of arrows as one of them."""
+
+    def create_artists(self, *given: Any) -> list[Artist]:
+        _, original, xdescent, ydescent, width, height, _, transform = given
+        middle = 0.5 * height - ydescent
+        ends = ((-xdescent, middle), (width - xdescent, middle))
+        style = "Simple,tail_width=1.6,head_width=7,head_length=8"
+        arrow = FancyArrowPatch(*ends, arrowstyle=style, mutation_scale=1.0, shrinkA=0.0, shrinkB=0.0)
+        face, edge = (np.atleast_2d(of())[0] for of in (original.get_facecolor, original.get_edgecolor))
+        width = float(np.atleast_1d(original.get_linewidth())[0])
+        arrow.set(facecolor=face, edgecolor=edge, linewidth=width, transform=transform)
+        return [arrow]
+
+
+_MARKS: dict[str | None, HandlerBase] = {UPRIGHT: _Upright(), ARROW: _Arrow()}
 
 
 def legend_of(figure: Figure, shown: Iterable[Axes]) -> None:
@@ -147,13 +175,21 @@ def legend(figure: Figure, handles: Sequence[Artist], named: Sequence[Artist] = 
     shown = [*named, *(handle for handle in handles if handle.get_label() in drawn)]
     rows = ceil(sum(len(str(handle.get_label())) + _HANDLE for handle in shown) / _ROW)
     columns = ceil(len(shown) / max(1, rows)) or 1
-    figure.legend(
+    made = _legend(figure, shown, columns)
+    while columns > 1 and made.get_window_extent().width > figure.bbox.width:
+        made.remove()
+        columns = ceil(len(shown) / ceil(len(shown) / (columns - 1)))  # as many in each
+        made = _legend(figure, shown, columns)
+
+
+def _legend(figure: Figure, shown: Sequence[Artist], columns: int) -> Legend:
+    return figure.legend(
         handles=shown,
         loc="outside lower center",
         ncols=columns,
         columnspacing=1.6,
         handlelength=1.8,
-        handler_map={handle: _Upright() for handle in shown if handle.get_gid() == UPRIGHT},
+        handler_map={handle: _MARKS[handle.get_gid()] for handle in shown if handle.get_gid() in _MARKS},
     )
 
 

@@ -6,12 +6,15 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MultipleLocator
 
 from flexneedle.figures.scene import tint_layers
 from flexneedle.figures.style import BAD, QUIET
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats
 
+_ANGLES = (15, 30, 45, 90, 180, 360, 720, 1440)  # distances of ticks at angles (degrees)
+_TICKS = 4
 _VISIBLE = 0.008  # least extent of a visible line, as a share of the panel's width
 
 
@@ -28,11 +31,15 @@ class Line:
 
 @dataclass(frozen=True)
 class DepthPanel:
-    """Lines over the depth of the tip; the y axis spans at least `least`."""
+    """Lines over the depth of the tip; the y axis spans at least `least`.
+
+    angles: the lines are angles in degrees.
+    """
 
     title: str
     lines: Sequence[Line]
     least: float
+    angles: bool = False
 
 
 def draw_depths(axes: Sequence[Axes], scenario: Scenario, shown: Sequence[DepthPanel]) -> None:
@@ -101,3 +108,8 @@ def _set_height(ax: Axes, panel: DepthPanel) -> None:
     pad = max(0.1 * (high - low), (panel.least - (high - low)) / 2)
     bottom = -0.04 * panel.least if low == 0.0 and high > 0.0 else low - pad
     ax.set_ylim(bottom, high + pad)
+    if panel.angles:
+        span = high + pad - bottom
+        ax.yaxis.set_major_locator(
+            MultipleLocator(next((a for a in _ANGLES if a * _TICKS >= span), _ANGLES[-1]))
+        )

@@ -9,29 +9,37 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flexneedle.figures import curves, scene
+from flexneedle.figures import curves, scene, space
 from flexneedle.figures.layout import legend_of, mosaic, short
 from flexneedle.figures.panels import DepthPanel, Line, draw_depths
-from flexneedle.figures.style import BAD, INK, PLAN, STRATEGIES, TARGET, signed, styled
+from flexneedle.figures.scene import View
+from flexneedle.figures.style import BAD, INK, PLAN, STRATEGIES, TARGET, signed, styled, tone
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats, Plan
+from flexneedle.types import Floats, Plan, X, Y
 
-_LINE = 100  # characters of the line above a plan
+_LINES = {1: 100, 2: 66}  # characters of a line above a plan, by the number of lateral axes
 _ENTRY = np.array([-12.0, 12.0])  # mm; ends of the line along the tip at the skin
 
 
 def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
     """Return the figure of one or more plans to the same target."""
-    strategies = [plan.strategy for plan in plans]
-    rows = [*((name, name) for name in strategies), ("motion", "cost"), ("energy", "cost")]
+    panels = _panels(scenario, plans)
     with styled():
-        figure, axes = mosaic(_title(scenario, plans[0]), 3.4 + 2.4 * len(plans), rows)
-        scenes = [axes[name] for name in strategies]
+        figure, axes = _sheet(scenario, plans, list(panels))
         known = [*(plan.tips for plan in plans), np.array([plans[0].target])]
-        for ax, plan, color in zip(scenes, plans, STRATEGIES, strict=False):
-            scene.draw_tissue(ax, scenario, known)
-            _draw_plan(ax, scenario, plan, color)
-        draw_depths([axes["motion"], axes["energy"]], scenario, [_motion(scenario, plans), _energy(plans)])
+        scenes: list[Axes] = []
+        for plan, color in zip(plans, STRATEGIES, strict=False):
+            drawn = [axes[plan.strategy + end] for end in scene.sections(scenario)]
+            for ax, view in zip(drawn, scene.sections(scenario).values(), strict=True):
+                scene.draw_tissue(ax, scenario, known, view)
+                _draw_plan(ax, scenario, plan, color, view)
+            scene.name_scenes(
+                drawn, fill(_result(scenario, plan), _LINES[scenario.setup.axes]), *_title_style(plan)
+            )
+            scenes += drawn
+            if scenario.setup.axes == 2:
+                _draw_along(axes[f"{plan.strategy} along"], scenario, plan)
+        draw_depths([axes[name] for name in panels], scenario, list(panels.values()))
         _draw_cost(axes["cost"], plans)
         legend_of(figure, scenes)
         figure.draw_without_rendering()
@@ -40,48 +48,107 @@ def plan_figure(scenario: Scenario, plans: Sequence[Plan]) -> Figure:
     return figure
 
 
+def _panels(scenario: Scenario, plans: Sequence[Plan]) -> dict[str, DepthPanel]:
+    """Panels over depth by name, from above."""
+    roll = {"roll": _roll(plans)} if scenario.setup.axes == 2 else {}
+    return {"motion": _motion(scenario, plans)} | roll | {"energy": _energy(plans)}
+
+
+def _sheet(scenario: Scenario, plans: Sequence[Plan], panels: list[str]) -> tuple[Figure, dict[str, Axes]]:
+    names, title = [plan.strategy for plan in plans], _title(scenario, plans[0])
+    if scenario.setup.axes == 1:
+        rows = [*((name, name) for name in names), *((panel, "cost") for panel in panels)]
+        return mosaic(title, 3.4 + 2.4 * len(plans), rows, [2.4] * len(plans) + [1.0, 1.0])
+    ends = [(name, end) for name in names for end in scene.sections(scenario)]
+    sections = [(name + end, name + end, f"{name} along") for name, end in ends]
+    below = [(panel, "cost", "cost") for panel in panels]
+    heights = [1.6] * len(ends) + [1.0] * len(panels)
+    return mosaic(title, 4.6 + 3.2 * len(plans), sections + below, heights, space.COLUMNS)
+
+
 def _title(scenario: Scenario, plan: Plan) -> str:
-    depth, lateral = plan.target
-    target = f"{signed(depth)} mm deep, {signed(lateral)} mm lateral"
-    return f"{short(scenario.name, 60)}: plan to {target} (seed {plan.seed})"
+    return f"{short(scenario.name, 60)}: plan to {scene.place(scenario, plan.target)} (seed {plan.seed})"
 
 
-def _draw_plan(ax: Axes, scenario: Scenario, plan: Plan, color: str) -> None:
+def _draw_plan(ax: Axes, scenario: Scenario, plan: Plan, color: str, view: View) -> None:
     before = curves.intermediate_shapes(plan.tips, list(plan.shapes))
-    scene.draw_needle(ax, plan.shapes[-1], before, scenario.needle.outer_diameter, "planned needle")
-    ax.plot(
-        *plan.tips[:, :2].T,
-        "--",
-        color=color,
-        linewidth=1.4,
-        zorder=5,
-        label=f"planned path, {plan.strategy}",
-    )
-    scene.draw_start(ax, plan)
-    scene.draw_rolls(ax, curves.planned_rolls(plan), PLAN, solid=False, label="bevel flip, planned")
-    scene.draw_target(ax, plan.target)
+    scene.draw_needle(ax, plan.shapes[-1], before, scenario.needle.outer_diameter, "planned needle", view)
+    how: dict[str, Any] = {"color": color, "linewidth": 1.4, "zorder": 5}
+    ax.plot(*plan.tips[:, view].T, "--", label=f"planned path, {plan.strategy}", **how)
+    _draw_rolls(ax, scenario, plan, view, 4.0)
+    scene.draw_target(ax, plan.target, view)
     if scenario.setup.guide_x is not None:
-        scene.draw_guide(ax, scenario.setup.guide_x, plan.guide, float(plan.guide[-1]))
-    result = f"{plan.strategy}: {plan.summary} (cost {plan.cost:.2f}){_draw_entry(ax, plan)}"
-    ax.set_title(fill(result, _LINE), color=TARGET if plan.reached else BAD, fontsize=9.5)
+        travel = plan.guide[:, view[1] - Y]
+        scene.draw_guide(ax, scenario.setup.guide_x, travel, float(travel[-1]))
+    _draw_entry(ax, plan, view)
 
 
-def _draw_entry(ax: Axes, plan: Plan) -> str:
-    """Draw the direction of the tip at the skin and return its angle in words, "" if it is not known."""
-    angle = plan.entry_angle
+def _draw_rolls(ax: Axes, scenario: Scenario, plan: Plan, view: View, length: float) -> None:
+    """Draw the bevel at the start and after rolls: its side in the plane, its direction in space."""
+    planned = curves.planned_rolls(plan)
+    if scenario.setup.axes == 1:
+        scene.draw_start(ax, plan)
+        scene.draw_rolls(ax, planned, PLAN, solid=False, label="bevel flip, planned")
+    else:
+        space.draw_start(ax, plan, view, length)
+        space.draw_bevels(ax, planned, view, length, PLAN, solid=False, label=space.PLANNED)
+
+
+def _draw_along(ax: Axes, scenario: Scenario, plan: Plan) -> None:
+    """Draw the view along the axis: paths of tip and guide, directions of the bevel, target."""
+    travel = np.column_stack([np.zeros(len(plan.guide)), plan.guide])
+    space.set_up_along(ax, scenario, [plan.tips, travel, np.array([plan.target])])
+    if scenario.setup.has_guide:
+        space.draw_guide_along(ax, plan.guide, plan.target)
+    space.draw_along(ax, plan.tips)
+    _draw_rolls(ax, scenario, plan, scene.ALONG, space.arrow_along(ax))
+    scene.draw_target(ax, plan.target, scene.ALONG)
+
+
+def _result(scenario: Scenario, plan: Plan) -> str:
+    """The plan in a line: result, cost, and angles of the tip at the skin, if they are known."""
+    angles = [f"{signed(degrees(angle), '+.1f')}°" for angle in plan.entry_angles[: scenario.setup.axes]]
+    entry = "" if isnan(plan.entry_angle) else f", enters at {' and '.join(angles)}"
+    return f"{plan.strategy}: {plan.summary} (cost {plan.cost:.2f}){entry}"
+
+
+def _title_style(plan: Plan) -> tuple[str, float]:
+    return TARGET if plan.reached else BAD, 9.5
+
+
+def _draw_entry(ax: Axes, plan: Plan, view: View) -> None:
+    """Draw the direction of the tip at the skin, if it is known."""
+    lateral = view[1]
+    angle = plan.entry_angles[lateral - Y]
     if isnan(angle):
-        return ""
-    y = float(np.interp(0.0, plan.tips[:, 0], plan.tips[:, 1]))
+        return
+    y = float(np.interp(0.0, plan.tips[:, X], plan.tips[:, lateral]))
     how: dict[str, Any] = {"color": INK, "linewidth": 0.8, "zorder": 6, "label": "direction of entry"}
     ax.plot(_ENTRY * cos(angle), y + _ENTRY * sin(angle), **how)
-    return f", enters at {signed(degrees(angle), '+.1f')}°"
 
 
 def _motion(scenario: Scenario, plans: Sequence[Plan]) -> DepthPanel:
     """Lateral position of the guide over depth, or of the base where there is no guide."""
     guided = scenario.setup.has_guide
     title = "Guide, lateral (mm)" if guided else "Base, lateral (mm)"
-    return DepthPanel(title, _lines(plans, [curves.planned_motion(plan, guided) for plan in plans]), 0.4)
+    lines = [
+        Line(
+            plan.strategy + end, plan.tips[:, X], curves.planned_motion(plan, guided, axis), tone(color, axis)
+        )
+        for plan, color in zip(plans, STRATEGIES, strict=False)
+        for end, axis in scene.moved_axes(scenario).items()
+    ]
+    return DepthPanel(title, lines, 0.4)
+
+
+def _roll(plans: Sequence[Plan]) -> DepthPanel:
+    """Angle of the needle over depth."""
+    angles = [curves.planned_angles(plan) for plan in plans]
+    lines = [
+        Line(plan.strategy, depth, np.degrees(angle), color)
+        for plan, (depth, angle), color in zip(plans, (one.T for one in angles), STRATEGIES, strict=False)
+    ]
+    return DepthPanel("Roll of the needle (°)", lines, 30.0, angles=True)
 
 
 def _energy(plans: Sequence[Plan]) -> DepthPanel:
@@ -91,7 +158,7 @@ def _energy(plans: Sequence[Plan]) -> DepthPanel:
 
 def _lines(plans: Sequence[Plan], values: Sequence[Floats]) -> list[Line]:
     return [
-        Line(plan.strategy, plan.tips[:, 0], value, color)
+        Line(plan.strategy, plan.tips[:, X], value, color)
         for plan, value, color in zip(plans, values, STRATEGIES, strict=False)
     ]
 

@@ -1,4 +1,7 @@
-"""The scene to scale: tissue, guide, needle, target, bevel flips. The legend names the artists by their labels."""
+"""The scene to scale: tissue, guide, needle, target, bevel flips. The legend names the artists by their labels.
+
+A view is the pair of coordinates that are drawn: depth and y, and in space depth and z, or z and y along the axis.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
@@ -7,52 +10,99 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
-from flexneedle.figures.curves import Roll
+from flexneedle.figures.curves import Roll, start_roll
 from flexneedle.figures.layout import UPRIGHT
-from flexneedle.figures.style import GUIDE, NEEDLE, QUIET, TARGET
+from flexneedle.figures.style import GUIDE, NEEDLE, QUIET, TARGET, signed
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import Layer
-from flexneedle.types import Floats, Plan
+from flexneedle.types import THETA, Floats, Plan, Point, X, Y, Z
+
+View = tuple[int, int]
+"""Columns of a point that are drawn to the right and upwards."""
+SIDE: View = (X, Y)
+ABOVE: View = (X, Z)
+ALONG: View = (Z, Y)
+"""Along the axis, in the direction of insertion."""
 
 _TISSUES = ("#fbeee3", "#f3dcc8", "#e9c9ad", "#deb592")  # soft to stiff
-_SKIN, _BORDER, _NAME = "#8c5a36", "#c9a27f", "#6d4526"
+SKIN, BORDER, NAME = "#8c5a36", "#c9a27f", "#6d4526"
 _SHAPE = 0.2  # height of a scene by its width
 _OPENING, _BLOCK, _WIDE = 0.7, 2.2, 1.1  # half opening, length and half width of the guide's jaws (mm)
 _SMALL: Any = {"textcoords": "offset points", "fontsize": 8}
 
 
-def draw_tissue(ax: Axes, scenario: Scenario, paths: Iterable[Floats]) -> None:
-    """Set up axes to scale around start, guide and paths (k, ≥ 2), with air, skin and layers."""
-    _frame(ax, scenario, np.concatenate([path[:, :2] for path in paths]))
+def sections(scenario: Scenario) -> dict[str, View]:
+    """Return the views from the side, by the end of the names of their axes."""
+    return {"": SIDE} if scenario.setup.axes == 1 else {" y": SIDE, " z": ABOVE}
+
+
+def moved_axes(scenario: Scenario) -> dict[str, int]:
+    """Return the lateral axes in which guide or base move, by the end of the names of their lines."""
+    setup, sides = scenario.setup, sections(scenario)
+    count = setup.moved_guide_axes if setup.has_guide else setup.axes
+    return {end: axis for end, (_, axis) in list(sides.items())[:count]}
+
+
+def name_scenes(scenes: Sequence[Axes], title: str, color: str, size: float = 10.0) -> None:
+    """Write the title over the first of scenes one above the other, and depths below the last."""
+    scenes[0].set_title(title, color=color, fontsize=size)
+    for ax in scenes[:-1]:
+        ax.tick_params(labelbottom=False)
+        ax.set_xlabel("")
+
+
+def place(scenario: Scenario, target: Point) -> str:
+    """Return a target as text."""
+    depth, *lateral = (f"{signed(value)} mm" for value in target[: 1 + scenario.setup.axes])
+    return f"{depth} deep, {' and '.join(lateral)} lateral"
+
+
+def draw_tissue(ax: Axes, scenario: Scenario, paths: Iterable[Floats], view: View = SIDE) -> None:
+    """Set up axes to scale around start, guide and paths (k, ≥ 3), with air, skin and layers.
+
+    All views of the same paths have the same scale.
+    """
+    _frame(ax, scenario, np.concatenate([path[:, : 1 + scenario.setup.axes] for path in paths]), view)
     tint_layers(ax, scenario)
-    ax.axvline(0.0, color=_SKIN, linewidth=1.6, zorder=1)
+    ax.axvline(0.0, color=SKIN, linewidth=1.6, zorder=1)
     ax.annotate("air", (0, 0), (4, 4), "axes fraction", color=QUIET, **_SMALL)
     above: dict[str, Any] = {"xycoords": ax.get_xaxis_transform(), "ha": "right", "va": "top"}
-    ax.annotate("skin", (0, 1), (-4, -3), color=_SKIN, **above, **_SMALL)
-    ax.set(xlabel="depth (mm)", ylabel="lateral (mm)")
+    ax.annotate("skin", (0, 1), (-4, -3), color=SKIN, **above, **_SMALL)
+    ax.set(xlabel="depth (mm)", ylabel=lateral_label(scenario, view[1]))
 
 
-def _frame(ax: Axes, scenario: Scenario, points: Floats) -> None:
-    """Set limits around points (k, 2), always of the same shape."""
+def lateral_label(scenario: Scenario, axis: int) -> str:
+    """Return the label of a lateral axis."""
+    return "lateral (mm)" if scenario.setup.axes == 1 else f"lateral {'xyz'[axis]} (mm)"
+
+
+def _frame(ax: Axes, scenario: Scenario, points: Floats, view: View) -> None:
+    """Set limits around points (k, 1 + axes), always of the same shape."""
+    still = np.zeros(scenario.setup.axes)
+    before, after = np.array([0.0, *(still + 4.0)]), np.array([6.0, *(still + 4.0)])
     guide_x = scenario.setup.guide_x
     left = min(scenario.setup.start_tip_x - 8.0, 0.0 if guide_x is None else guide_x - 6.0)
-    low = np.minimum(np.array([left, 0.0]), points.min(axis=0)) - np.array([0.0, 4.0])
-    high = np.maximum(np.zeros(2), points.max(axis=0)) + np.array([6.0, 4.0])
-    width = max(high[0] - low[0], (high[1] - low[1]) / _SHAPE)
-    half, middle = 0.5 * width * np.array([1.0, _SHAPE]), 0.5 * (low + high)
+    low = np.minimum([left, *still], points.min(axis=0)) - before
+    high = np.maximum([0.0, *still], points.max(axis=0)) + after
+    width = max(high[0] - low[0], (high - low)[1:].max() / _SHAPE)
+    half, middle = 0.5 * width * np.array([1.0, _SHAPE]), 0.5 * (low + high)[list(view)]
     (left, bottom), (right, top) = middle - half, middle + half
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", anchor="W")
 
 
 def tint_layers(ax: Axes, scenario: Scenario) -> None:
     """Colour the layers as far as the axes reach, the stiffer the darker."""
-    stiffness = sorted({layer.shear_modulus_kpa for layer in scenario.tissue})
     for layer, top, bottom in _layers(ax, scenario):
-        rank = stiffness.index(layer.shear_modulus_kpa) / max(1, len(stiffness) - 1)
-        shade = _TISSUES[round(rank * (min(len(stiffness), len(_TISSUES)) - 1))]
-        ax.axvspan(top, bottom, facecolor=shade, edgecolor="none", zorder=0)
+        ax.axvspan(top, bottom, facecolor=tissue_color(scenario, layer), edgecolor="none", zorder=0)
         if top > 0.0:
-            ax.axvline(top, color=_BORDER, linewidth=0.8, zorder=0.5)
+            ax.axvline(top, color=BORDER, linewidth=0.8, zorder=0.5)
+
+
+def tissue_color(scenario: Scenario, layer: Layer) -> str:
+    """Return the colour of a layer, the stiffer the darker."""
+    stiffness = sorted({layer.shear_modulus_kpa for layer in scenario.tissue})
+    rank = stiffness.index(layer.shear_modulus_kpa) / max(1, len(stiffness) - 1)
+    return _TISSUES[round(rank * (min(len(stiffness), len(_TISSUES)) - 1))]
 
 
 def _layers(ax: Axes, scenario: Scenario) -> Iterator[tuple[Layer, float, float]]:
@@ -68,7 +118,7 @@ def name_layers(ax: Axes, scenario: Scenario) -> None:
     for layer, top, bottom in _layers(ax, scenario):
         right = ax.transData.transform((bottom, 0.0))[0]
         modulus = f"μ {layer.shear_modulus_kpa:g} kPa"
-        name = ax.annotate("", (top, 0), (4, 4), ax.get_xaxis_transform(), color=_NAME, **_SMALL)
+        name = ax.annotate("", (top, 0), (4, 4), ax.get_xaxis_transform(), color=NAME, **_SMALL)
         for text in (f"{layer.name}, {modulus}", f"{layer.name}\n{modulus}", modulus, ""):
             name.set_text(text)
             if name.get_window_extent().x1 < right or not text:
@@ -91,29 +141,32 @@ def draw_guide(ax: Axes, x: float, travel: Floats, y: float) -> None:
     ax.annotate("guide", (x, y + _OPENING + _BLOCK), color=GUIDE, **above, **_SMALL)
 
 
-def draw_needle(ax: Axes, shape: Floats, before: Sequence[Floats], diameter: float, label: str) -> None:
-    """Draw the needle (n, 3) to scale, and faded the middle lines of its earlier shapes."""
-    across = 0.5 * diameter * np.column_stack([-np.sin(shape[:, 2]), np.cos(shape[:, 2])])
-    outline = np.concatenate([shape[:, :2] + across, (shape[:, :2] - across)[::-1]])
+def draw_needle(
+    ax: Axes, shape: Floats, before: Sequence[Floats], diameter: float, label: str, view: View = SIDE
+) -> None:
+    """Draw the needle (n, 5) to scale, and faded the middle lines of its earlier shapes, from the side."""
+    slope = shape[:, THETA - Y + view[1]]
+    across = 0.5 * diameter * np.column_stack([-np.sin(slope), np.cos(slope)])
+    outline = np.concatenate([shape[:, view] + across, (shape[:, view] - across)[::-1]])
     ax.fill(*outline.T, color=NEEDLE, alpha=0.75, linewidth=0.0, zorder=2.5, label=label)
     faded: dict[str, Any] = {"color": NEEDLE, "alpha": 0.45, "linewidth": 1.6, "zorder": 2}
     for old in before:
-        ax.plot(*old[:, :2].T, marker="o", markevery=[-1], markersize=4, label="earlier shapes", **faded)
+        ax.plot(*old[:, view].T, marker="o", markevery=[-1], markersize=4, label="earlier shapes", **faded)
 
 
-def draw_target(ax: Axes, target: tuple[float, float]) -> None:
+def draw_target(ax: Axes, target: Point, view: View = SIDE) -> None:
     """Draw the target with the circle of 1 mm within which it counts as reached."""
-    circle = Circle(target, 1.0, facecolor="none", edgecolor=TARGET, linewidth=1.4, zorder=6)
+    centre = target[view[0]], target[view[1]]
+    circle = Circle(centre, 1.0, facecolor="none", edgecolor=TARGET, linewidth=1.4, zorder=6)
     circle.set_gid("target")
     ax.add_patch(circle)
     cross: dict[str, Any] = {"marker": "+", "markersize": 6, "markeredgewidth": 1.2, "linestyle": "none"}
-    ax.plot(*target, color=TARGET, zorder=6, label="target, circle of 1 mm radius", **cross)
+    ax.plot(*centre, color=TARGET, zorder=6, label="target, circle of 1 mm radius", **cross)
 
 
 def draw_start(ax: Axes, plan: Plan) -> None:
     """Show beside the start of the tip the side of the bevel at the start."""
-    x, y = plan.tips[0, :2].tolist()
-    draw_rolls(ax, [Roll(x, y, plan.bevel)], QUIET, solid=True, label="bevel at the start")
+    draw_rolls(ax, [start_roll(plan)], QUIET, solid=True, label="bevel at the start")
 
 
 def draw_rolls(ax: Axes, rolls: Sequence[Roll], color: str, *, solid: bool, label: str) -> None:
@@ -128,4 +181,5 @@ def draw_rolls(ax: Axes, rolls: Sequence[Roll], color: str, *, solid: bool, labe
     for roll in rolls:
         shape = "^" if roll.side > 0 else "v"
         fill = color if solid else "none"
-        ax.plot(roll.x, roll.y + 1.5 * roll.side, marker=shape, markerfacecolor=fill, label=label, **how)
+        x, y, _ = roll.point
+        ax.plot(x, y + 1.5 * roll.side, marker=shape, markerfacecolor=fill, label=label, **how)

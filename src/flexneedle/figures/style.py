@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from flexneedle.files import replace_file
+from flexneedle.types import Z
 
 WIDTH = 9.0  # inches; shown 900 pixels wide, a point is 1.4 pixels
 
@@ -22,6 +23,16 @@ INK, QUIET = "#222222", "#6b6b6b"
 PLAN, ESTIMATE, TRUE, MEASURED, TARGET, BAD = "#222222", "#0072B2", "#D55E00", "#A8437F", "#00734f", "#B03A00"
 NEEDLE, GUIDE = "#8a8f98", "#4d535c"
 STRATEGIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+
+# The colour of z in space, beside that of y.
+_SECOND = {
+    PLAN: "#8a8a8a",
+    ESTIMATE: "#56B4E9",
+    TRUE: "#E69F00",
+    MEASURED: "#CC79A7",
+    "#009E73": "#7fcfb4",
+    "#CC79A7": "#e3b8d0",
+}
 
 _SETTINGS: Any = {
     "font.size": 8.5,
@@ -52,6 +63,11 @@ _SETTINGS: Any = {
     "svg.hashsalt": "flexneedle",
     "svg.fonttype": "path",
 }
+
+
+def tone(color: str, axis: int) -> str:
+    """Return the colour of a line along y, or the lighter one along z."""
+    return _SECOND[color] if axis == Z else color
 
 
 def signed(value: float, form: str = "g") -> str:

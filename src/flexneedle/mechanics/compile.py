@@ -1,7 +1,7 @@
 """How kernels are compiled: Numba, double precision, no fast-math, no GIL, kept on disk.
 
 Numba's own cache checks only the file of the outermost function, so an edit of a law in another file would
-silently run the old law. Here the cache folder is named after the sources of all kernels.
+silently run the old law. Here the cache folder is named after the sources of all kernels and the columns of arrays.
 """
 
 import hashlib
@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 import numba as nb
 from numba.core import config as _numba_config
 
+from flexneedle import types
+
 _Function = TypeVar("_Function")  # a compiled function is called like the one that it was
 _njit: Any = nb.njit
 _config: Any = _numba_config  # its settings are not declared
@@ -20,7 +22,7 @@ HERE = Path(__file__).parent
 
 def cache_folder(home: Path) -> str:
     """The folder for the exact sources of `home` and here: under NUMBA_CACHE_DIR, beside the code, or the user's."""
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(repr(_columns()).encode())
     for folder in dict.fromkeys((HERE, home)):  # in this order, wherever they are
         for source in sorted(folder.glob("*.py")):
             digest.update(source.read_bytes())
@@ -29,6 +31,11 @@ def cache_folder(home: Path) -> str:
     writable = os.access(beside if beside.exists() else home, os.W_OK)
     base = Path(_config.CACHE_DIR) if _config.CACHE_DIR else (beside if writable else user)
     return str(base / f"kernels-{digest.hexdigest()[:16]}")
+
+
+def _columns() -> list[tuple[str, int]]:
+    """Columns of poses and controls by name: kernels have them as constants."""
+    return [(name, value) for name, value in vars(types).items() if type(value) is int]
 
 
 def compiled(home: Path = HERE) -> bool:

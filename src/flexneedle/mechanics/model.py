@@ -44,7 +44,8 @@ LAYER = np.dtype(
 class Model(NamedTuple):
     """A needle in layered tissue: bending stiffness (N·mm²), length (mm), bevel offset and length (mm).
 
-    laws: tables of `law`; curvature: of the free needle (1/mm) towards the bevel's direction, with which it turns;
+    laws: tables of `law`; curvature: lateral, of the free needle (1/mm), relative to the bevel's direction, with which
+    it turns;
     part, zone: length (mm) of the parts of a step down to the depth `zone` (mm); clearance: of the needle in the guide,
     to either side (mm); tolerance: estimated distance from equilibrium at which a solve ends (mm); slide: distance (mm)
     of the tip from the place for which it was solved, up to which it is moved there along its own line.
@@ -59,7 +60,7 @@ class Model(NamedTuple):
     laws: Floats
     part: float
     zone: float
-    curvature: float = 0.0
+    curvature: Any = 0.0
     clearance: float = 0.0
     tolerance: float = 1e-7
     slide: float = 2e-5
@@ -125,9 +126,9 @@ class Adaptation(NamedTuple):
 
     shift (k − 1,): of the ends of all layers but the last (mm); stiffness (k,): factor on the modulus of each layer;
     cell: length (mm) of cells along the depth from the skin; variation (c,): further factor on the modulus in each,
-    the last one has no end; bevel: factor on the bevel offset; bend: distance (mm) of the free needle's tip from the
-    straight, towards the bevel's direction, with which it turns; clearance: of the needle in the guide, to either side
-    (mm).
+    the last one has no end; bevel: factor on the bevel offset; bend: lateral distance (mm) of the free needle's tip
+    from the straight, relative to the bevel's direction, with which it turns; clearance: of the needle in the guide,
+    to either side (mm).
     """
 
     shift: Floats
@@ -135,7 +136,7 @@ class Adaptation(NamedTuple):
     cell: float = 1.0
     variation: Floats = np.ones(1)
     bevel: float = 1.0
-    bend: float = 0.0
+    bend: Any = 0.0
     clearance: float = 0.0
 
 

@@ -133,8 +133,8 @@ class Needle(NamedTuple):
     solution: Solution
 
 
-def start(base: Pose, tip: Pose, bevel: Lateral) -> Needle:
-    """The straight needle in air, before a solve."""
+def start(base: Pose, tip: Pose, bevel: Lateral, guide: Lateral) -> Needle:
+    """The straight needle in air, before a solve, with the guide on it."""
     none = 0.0 * bevel
     channel = Channel(0.0, none)
     solution = Solution(
@@ -145,7 +145,7 @@ def start(base: Pose, tip: Pose, bevel: Lateral) -> Needle:
         0.0,
         True,
     )
-    return Needle(Boundary(base, none, bevel, none), Cut(tip, channel, 0.0), channel, solution)
+    return Needle(Boundary(base, guide, bevel, none), Cut(tip, channel, 0.0), channel, solution)
 
 
 class Path(NamedTuple):
@@ -226,7 +226,7 @@ def _sweep_out(
     flexibility = 1.0 / model.bending_stiffness
     x, a1, a2 = boundary.base.x, boundary.base.y, boundary.base.slope
     g1, g2, b11, b12, b22 = 0.0, 0.0, 0.0, 0.0, 0.0
-    bend = times(model.curvature, boundary.bevel)
+    bend = model.curvature * boundary.bevel
     per_length = 1.0 / (tip_x - cut.tip.x) if fresh < count else 0.0
     path_y = times(1.0 - path.coupling, path.y)
     for i in range(count + 1):
@@ -406,7 +406,7 @@ def _sweep_back(
     """
     nodes = model.nodes
     flexibility = 1.0 / model.bending_stiffness
-    bend = times(model.curvature, boundary.bevel)
+    bend = model.curvature * boundary.bevel
     x, y, turn, shear = tip_x, tip.y, tip.slope, tip.force
     moment = times(0.0, shear)
     left, fraction = tip.left, tip.fraction
@@ -551,7 +551,10 @@ def _bearing(model: Model, boundary: Boundary, w: Work, count: int, last: Bearin
     free = y - times(give, force)
     distance = size(free)
     pulls = dot(force, last.wall) > 0.0
-    if distance <= model.clearance or (pulls and dot(free, last.wall) <= 0.0):
+    off = distance <= model.clearance and (
+        pulls or not bears
+    )  # a wall that pushes stays, however little it does
+    if off or (pulls and dot(free, last.wall) <= 0.0):
         return not bears, Bearing(times(0.0, y), give, y, force)
     wall = free / distance
     agrees = bears and model.clearance * size(wall - last.wall) <= model.slide
@@ -620,13 +623,16 @@ def solve(
     """
     y, spring = _guess(model, boundary, cut, last, u)
     unknown = times(math.nan, y)
-    guide = Bearing(last.guide.wall, last.guide.give, unknown, unknown)
-    at = Iterate(spring, last.shortening, guide, last.behind)
+    guide_before = Bearing(last.guide.wall, last.guide.give, unknown, unknown)
+    at = Iterate(spring, last.shortening, guide_before, last.behind)
     path = Path(1.0, y)
     for iteration in range(1, MAX_ITERATIONS + 1):
         if iteration == COUPLED_ITERATIONS + 1:
+            for i in range(model.nodes.size):
+                if not math.isfinite(size(u[i])):  # the coupled iterations ran away
+                    u[i] = times(0.0, boundary.base.y)
             y, spring = _guess(model, boundary, cut, last, u)
-            at = Iterate(spring, last.shortening, at.guide, last.behind)
+            at = Iterate(spring, last.shortening, guide_before, last.behind)
             path = Path(0.0, y)
         radial_weight = 0.5 if path.coupling > 0.0 else float(iteration % 2)
         tip, new, loads, fresh, left = _iterate(

@@ -22,7 +22,7 @@ class Variables:
     """Variables of a search: d coordinates that describe a sequence of controls.
 
     lower, upper, mean, sigma (d,): bounds, initial mean and standard deviation; a coordinate with sigma 0 is fixed.
-    controls: z (N, d) → (N, m, 5). correlation (d, d): of the first samples (default: none).
+    controls: z (N, d) → (N, m, 9). correlation (d, d): of the first samples (default: none).
     """
 
     lower: Floats

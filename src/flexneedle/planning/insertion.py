@@ -1,9 +1,9 @@
 """Insertion plans: a few control primitives, their cost, and the search for the best (paper section III-A).
 
-A primitive covers its share of the travel with equal steps. Its six coordinates are the longest step of base x
-(mm), the step of base y (mm), base θ (rad) and guide (mm), ε, whose sign is the wanted bevel direction, and the
-logarithm of its share, before normalisation. A flip is issued, counted and charged where the wanted direction
-changes.
+A primitive covers its share of the travel with equal steps. Its coordinates are the longest step of base x (mm), on
+each lateral axis the step of the base (mm), of its slope (rad) and of the guide (mm), ε, the vector of the wanted bevel
+direction, and the logarithm of its share, before normalisation. In the plane, and where the needle rolls by half turns,
+the sign of ε_y is the direction. The needle is rolled, and charged by the angle, where the wanted direction changes.
 """
 
 from collections.abc import Callable
@@ -18,13 +18,32 @@ from flexneedle.planning import terms
 from flexneedle.planning.cross_entropy import Search, SearchState
 from flexneedle.planning.horizon import Found, Variables, best
 from flexneedle.planning.terms import RolloutFunction, Term
-from flexneedle.types import Floats
+from flexneedle.types import (
+    COLUMNS,
+    DB_PSI,
+    DB_THETA,
+    DB_X,
+    DB_Y,
+    DB_Z,
+    DG_Y,
+    DG_Z,
+    ROLL,
+    Floats,
+    Laterals,
+    Point,
+    wrapped,
+)
 
-ADVANCE, BASE_Y, BASE_TURN, GUIDE, BEVEL, SHARE = range(6)
-COORDINATES = 6
+ADVANCE, LATERAL = range(2)
+"""Coordinates of a primitive: the longest step, then those of `MOVES`, of ε on each axis, and of the share."""
+MOVES = {1: (DB_Y, DB_THETA, DG_Y), 2: (DB_Y, DB_Z, DB_THETA, DB_PSI, DG_Y, DG_Z)}
+"""Columns of a control that lateral coordinates are, by the number of axes."""
 _LEAST_ADVANCE = 0.5  # of the longest step
 _BEVEL_BOUND = 3.0  # ε has standard deviation 1 at first
+_ENTRY_SIGMA = 0.25  # of the bounds
 _SHARE_BOUND = 1.0  # no primitive is longer than e² times another
+LEAST_ROLL = 0.1
+"""Smallest roll (rad): a smaller one turns the path by less than it costs a driver to make it."""
 _BEVEL_CORRELATION = 0.8  # of ε of neighbouring primitives at first: few flips are likelier than many
 
 
@@ -32,12 +51,15 @@ _BEVEL_CORRELATION = 0.8  # of ε of neighbouring primitives at first: few flips
 class PlanProblem:
     """Target, limits and weights of a plan: mm, rad.
 
-    travel: insertion from the start to the target depth, of which `air` comes before the skin; step (4,) and reach
-    (4,): largest step of base x, y, θ, guide and largest sum of steps; sigma (6,): first standard deviation of each
-    coordinate, 0 if not free.
+    travel: insertion from the start to the target depth, of which `air` comes before the skin; step (7,) and reach
+    (7,): largest step of each column of travel of a control, and largest sum of steps; sigma (c,): first standard
+    deviation of each coordinate of a primitive, 0 if not free; axes: 1 or 2; half_turns: the only rolls; rotation:
+    largest angle of the needle to either side; frame: the direction in which the first of two lateral coordinates
+    points; entry: largest change of the point on the skin (mm) and of the slope (rad); mounts: x of base and guide at
+    the start; axis: y + iz of the needle's axis at the target's depth.
     """
 
-    target: tuple[float, float]
+    target: Point
     travel: float
     air: float
     primitives: int
@@ -48,15 +70,54 @@ class PlanProblem:
     energy_weight: float  # gamma_2, 1/mJ
     deflection_weight: float  # Q, 1/mm²
     guide_weight: float  # R, 1/mm²
-    flip_weight: float  # R of a flip
+    flip_weight: float  # R of a half turn
+    axes: int = 1
+    half_turns: bool = True
+    rotation: float = np.inf
+    frame: complex = 1.0
+    entry: tuple[float, float] = (0.0, 0.0)
+    mounts: tuple[float, float] = (0.0, 0.0)
+    axis: complex = 0.0
+
+    @property
+    def entry_coordinates(self) -> int:
+        """Number of coordinates of the entry; 0 if it is fixed."""
+        return 2 * self.axes if any(self.entry) else 0
+
+    @property
+    def direction(self) -> complex:
+        """Direction in which the bevel alone steers: from the needle's axis to the target, or y where it rolls by half
+        turns.
+        """
+        across = complex(*self.target[1:]) - self.axis
+        return 1.0 if self.half_turns or across == 0.0 else across / abs(across)
+
+    @property
+    def lateral(self) -> float:
+        """Lateral offset (mm) of the target in that direction."""
+        return (complex(*self.target[1:]) * self.direction.conjugate()).real
+
+    @property
+    def bevel(self) -> slice:
+        """Coordinates of ε."""
+        first = LATERAL + len(MOVES[self.axes])
+        return slice(first, first + self.axes)
+
+    @property
+    def coordinates(self) -> int:
+        """Number of coordinates of a primitive."""
+        return LATERAL + len(MOVES[self.axes]) + self.axes + 1
 
 
 @dataclass(frozen=True)
 class Solution:
-    """The best controls (m, 5) and bevel at the start, its cost by term, and the search behind it."""
+    """The best controls (m, 9), entry as changes of y + iz (mm) and slope, roll at the start (rad), its cost by term,
+    and the search behind it.
+    """
 
     controls: Floats
-    bevel: int
+    entry: tuple[complex, complex]
+    roll: float
     cost: float
     terms: dict[str, float]
     search_state: SearchState
@@ -71,32 +132,84 @@ def optimise(
 ) -> Solution:
     """Search the primitives.
 
-    `rollout` starts with bevel +1 in air; a sample that wants −1 flips in its first step, which is not charged.
+    `rollout` starts without roll in air; a sample that wants another direction rolls in its first step, which is not
+    charged.
     """
     found = best(_variables(problem), rollout, cost_terms(problem), search, rng, progress=progress)
-    return solution(found)
+    return solution(problem, found)
 
 
-def solution(found: Found) -> Solution:
-    """The solution: without steps that do not advance, the bevel set before the first."""
+def solution(problem: PlanProblem, found: Found) -> Solution:
+    """The solution: without steps that do not advance, rolled before the first."""
     controls = found.trajectories.controls[0]
-    facing = np.cumprod(-controls[:, 4])
-    moving = controls[:, 0] > 0.0
+    entry = _entry(problem, found.z[None, found.z.size - problem.entry_coordinates :])
+    facing = np.cumsum(controls[:, ROLL])
+    moving = controls[:, DB_X] > 0.0
     controls, facing = controls[moving], facing[moving]
-    controls[:, 4] = np.where(np.diff(facing, prepend=facing[0]) != 0.0, 1.0, -1.0)
-    return Solution(controls, int(facing[0]), found.cost, found.terms, found.search_state)
+    controls[:, ROLL] = np.diff(facing, prepend=facing[0])
+    _add_along(controls[None], -entry[1])
+    place = complex(entry[0][0]), complex(entry[1][0])
+    return Solution(controls, place, float(facing[0]), found.cost, found.terms, found.search_state)
 
 
 def _variables(problem: PlanProblem) -> Variables:
-    n, most = problem.primitives, [*problem.step[1:], _BEVEL_BOUND, _SHARE_BOUND]
+    n, lateral = problem.primitives, problem.step[list(MOVES[problem.axes])]
+    most, entry = [*lateral, *[_BEVEL_BOUND] * problem.axes, _SHARE_BOUND], entry_bounds(problem)
     return Variables(
-        lower=np.tile([_LEAST_ADVANCE * problem.step[0], *np.negative(most)], n),
-        upper=np.tile([problem.step[0], *most], n),
-        mean=np.tile([problem.step[0], 0.0, 0.0, 0.0, 0.0, 0.0], n),
-        sigma=np.tile(problem.sigma, n),
+        lower=np.append(np.tile([_LEAST_ADVANCE * problem.step[0], *np.negative(most)], n), -entry),
+        upper=np.append(np.tile([problem.step[0], *most], n), entry),
+        mean=np.append(np.tile([problem.step[0], *np.zeros(len(most))], n), 0.0 * entry),
+        sigma=np.append(np.tile(problem.sigma, n), _ENTRY_SIGMA * entry * _aside(problem)),
         controls=lambda z: schedule(problem, z)[0],
-        correlation=_correlation(n),
+        correlation=_correlation(problem),
     )
+
+
+def _aside(problem: PlanProblem) -> Floats:
+    """Standard deviations of the coordinates of the entry, relative to those along the frame: as those of ε."""
+    return np.tile(problem.sigma[problem.bevel], 2)[: problem.entry_coordinates]
+
+
+def entry_bounds(problem: PlanProblem) -> Floats:
+    """Bounds to either side of the coordinates of the entry: those of the point, then those of the slope."""
+    return np.repeat(problem.entry, problem.axes)[: problem.entry_coordinates]
+
+
+def _entry(problem: PlanProblem, z: Floats) -> tuple[Laterals, Laterals]:
+    """Changes (N,) of point (mm) and slope (rad) of the entry, for its coordinates (N, 2 axes) or none (N, 0)."""
+    if not z.size:
+        none = np.zeros(len(z), dtype=complex)
+        return none, none
+    parts = z.reshape(len(z), 2, problem.axes)
+    across = problem.frame * (parts[:, :, 0] + (1j * parts[:, :, 1] if problem.axes > 1 else 0.0))
+    size = np.maximum(np.abs(across) / np.maximum(problem.entry, np.finfo(float).tiny), 1.0)
+    point, slope = (across / size).T
+    return point, slope
+
+
+def _add_along(rows: Floats, slope: Laterals) -> None:
+    """Add the lateral part of the advance of controls (N, m, 9) along axes with these slopes (N,)."""
+    rows[:, :, DB_Y] += slope.real[:, None] * rows[:, :, DB_X]
+    rows[:, :, DB_Z] += slope.imag[:, None] * rows[:, :, DB_X]
+
+
+def mounted(problem: PlanProblem, rows: Floats, z: Floats) -> Floats:
+    """Controls (N, m, 9) after one more that moves base and guide to the entry (N, 2 axes), and rolls, in air.
+
+    The advance is along the axis of the entry.
+    """
+    if not z.size:
+        return rows
+    point, slope = _entry(problem, z)
+    base, guide = (point + slope * x for x in problem.mounts)
+    first = np.zeros_like(rows[:, :1])
+    for column, value in ((DB_Y, base), (DB_THETA, slope), (DG_Y, guide)):
+        first[:, 0, column], first[:, 0, column + 1] = value.real, value.imag
+    first[:, 0, ROLL] = rows[:, 0, ROLL]
+    rest = rows.copy()
+    rest[:, 0, ROLL] = 0.0
+    _add_along(rest, slope)
+    return np.concatenate([first, rest], axis=1)
 
 
 def cost_terms(problem: PlanProblem) -> tuple[Term, ...]:
@@ -110,49 +223,75 @@ def cost_terms(problem: PlanProblem) -> tuple[Term, ...]:
     )
 
 
-def _correlation(primitives: int) -> Floats:
+def _correlation(problem: PlanProblem) -> Floats:
     """Correlation of the coordinates at first: only that of ε between primitives."""
-    correlation = np.eye(primitives * COORDINATES)
-    index = np.arange(primitives)
+    correlation = np.eye(problem.primitives * problem.coordinates + problem.entry_coordinates)
+    index = np.arange(problem.primitives)
     apart = np.abs(index[:, None] - index)
-    bevel = index * COORDINATES + BEVEL
-    correlation[np.ix_(bevel, bevel)] = _BEVEL_CORRELATION**apart
+    for k in range(problem.bevel.start, problem.bevel.stop):
+        bevel = index * problem.coordinates + k
+        correlation[np.ix_(bevel, bevel)] = _BEVEL_CORRELATION**apart
     return correlation
 
 
 def schedule(problem: PlanProblem, z: Floats) -> tuple[Floats, Floats]:
-    """Primitives z (N, 6 P) to controls (N, m, 5), padded with zero steps, and bevel directions (N, P).
+    """Primitives and entry z (N, c P + e) to controls (N, m, 9), padded with zero steps, and bevel directions (N, P),
+    rad.
 
     The sum of lateral steps is limited to the reach here, before any rollout.
     """
-    primitives = z.reshape(len(z), problem.primitives, COORDINATES)
-    share = np.exp(primitives[:, :, SHARE])
+    known = problem.primitives * problem.coordinates
+    entry, primitives = z[:, known:], z[:, :known].reshape(len(z), problem.primitives, problem.coordinates)
+    share = np.exp(primitives[:, :, -1])
     share *= problem.travel / share.sum(axis=1, keepdims=True)
     count = np.ceil(share / primitives[:, :, ADVANCE] - 1e-9).astype(int)  # steps of each primitive
     steps = np.concatenate([(share / count)[:, :, None], _within_reach(problem, primitives, count)], axis=2)
-    wanted = np.where(primitives[:, :, BEVEL] >= 0.0, 1.0, -1.0)
+    wanted = _directions(problem, primitives[:, :, problem.bevel])
     ends = np.cumsum(count, axis=1)
     index = np.arange(ends[:, -1].max())
     owner = (index[None, :, None] >= ends[:, None, :]).sum(
         axis=2
     )  # primitive of each step; P when it is over
     rows = np.arange(len(z))[:, None]
-    steps = np.concatenate([steps, np.zeros((len(z), 1, 4))], axis=1)
-    controls = np.full((len(z), index.size, 5), -1.0)
-    controls[:, :, :4] = steps[rows, owner]
+    steps = np.concatenate([steps, np.zeros((len(z), 1, steps.shape[2]))], axis=1)
+    controls = np.zeros((len(z), index.size, len(COLUMNS)))
+    controls[:, :, [DB_X, *MOVES[problem.axes]]] = steps[rows, owner]
     first = np.concatenate([np.zeros((len(z), 1), dtype=int), ends[:, :-1]], axis=1)
-    rolls = wanted != np.concatenate([np.ones((len(z), 1)), wanted[:, :-1]], axis=1)
-    controls[rows, first, 4] = np.where(rolls, 1.0, -1.0)
-    return controls, wanted
+    wanted = _without_small_rolls(wanted)
+    rolls = np.diff(wanted, axis=1, prepend=0.0)
+    controls[rows, first, ROLL] = rolls if np.isfinite(problem.rotation) else wrapped(rolls)
+    return mounted(problem, controls, entry), wanted
+
+
+def _without_small_rolls(wanted: Floats) -> Floats:
+    """Directions (N, P), rad, of which one that hardly differs from the direction before it is the same."""
+    kept = wanted.copy()
+    for p in range(1, wanted.shape[1]):
+        small = np.abs(wrapped(kept[:, p] - kept[:, p - 1])) < LEAST_ROLL
+        kept[small, p] = kept[small, p - 1]
+    return kept
+
+
+def _directions(problem: PlanProblem, bevel: Floats) -> Floats:
+    """Angles (N, P) of wanted directions (N, P, axes)."""
+    if problem.half_turns:
+        return np.where(bevel[:, :, 0] >= 0.0, 0.0, np.pi)
+    angles = wrapped(np.arctan2(bevel[:, :, 1], bevel[:, :, 0]) + np.angle(problem.frame))
+    return np.clip(angles, -problem.rotation, problem.rotation)
 
 
 def _within_reach(problem: PlanProblem, primitives: Floats, count: NDArray[np.int64]) -> Floats:
-    """Lateral steps (N, P, 3) whose running sums stay within reach."""
-    lateral = primitives[:, :, BASE_Y : GUIDE + 1].copy()
-    total = np.zeros((len(primitives), 3))
+    """Lateral steps (N, P, k) whose running sums stay within reach."""
+    columns = list(MOVES[problem.axes])
+    lateral, reach = primitives[:, :, LATERAL : problem.bevel.start].copy(), problem.reach[columns]
+    if problem.frame != 1.0:
+        turned = (lateral[:, :, ::2] + 1j * lateral[:, :, 1::2]) * problem.frame
+        lateral[:, :, ::2], lateral[:, :, 1::2] = turned.real, turned.imag
+        lateral = np.clip(lateral, -problem.step[columns], problem.step[columns])
+    total = np.zeros((len(primitives), len(columns)))
     for p in range(problem.primitives):
         n = count[:, p, None]
-        moved = np.clip(total + n * lateral[:, p], -problem.reach[1:], problem.reach[1:])
+        moved = np.clip(total + n * lateral[:, p], -reach, reach)
         lateral[:, p] = (moved - total) / n
         total = moved
     return lateral

@@ -5,9 +5,17 @@ from flexneedle.scenario.dotted import split_key
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Plan
 
-PLANNER_INPUTS = ("needle", "setup", "tissue", "contact", "target", "plan")
+PLANNER_INPUTS = ("needle", "setup", "tissue", "contact", "entry", "target", "plan")
 """Sections of a scenario that a plan depends on. It may be carried out with any other controller, tracker, monitor or
 phantom."""
+
+
+def placed(scenario: Scenario, plan: Plan) -> Scenario:
+    """The scenario with the entry that a plan has chosen, where it is free."""
+    made = plan.scenario
+    if made is None or not scenario.entry.free:
+        return scenario
+    return scenario.with_values({f"entry.{key}": value for key, value in made.entry.model_dump().items()})
 
 
 def check_origin(plan: Plan, scenario: Scenario) -> None:

@@ -2,45 +2,47 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flexneedle.arguments import pair, whole
+from flexneedle.arguments import point, whole
 from flexneedle.errors import InputError
 from flexneedle.planning.cross_entropy import Search, elite_count
-from flexneedle.planning.insertion import BASE_Y, GUIDE, PlanProblem, Solution, optimise
+from flexneedle.planning.insertion import LATERAL, PlanProblem, Solution, optimise
 from flexneedle.planning.steering import reach, steer
 from flexneedle.planning.terms import Trajectories
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario, check_target
 from flexneedle.scenario.sections.settings import PlanSettings
-from flexneedle.simulator.control import Control, Limits
+from flexneedle.simulator.control import Limits, controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Floats, Plan
+from flexneedle.types import DB_X, DG_Y, Control, Floats, Plan, Point, X, Z
 
-_TARGET = "depth and lateral offset in mm"
+_TARGET = "depth and lateral offsets in mm"
 STRATEGIES = ("manipulation", "steering")
 _DEPTH_TOLERANCE_MM = 1e-6
+_ASIDE = 0.1  # share of a standard deviation across the direction of the target
 _SHARE_SIGMA = 0.1  # of the logarithm of a primitive's share of the travel
-_SHARE_OF_A_SEARCH = 4  # plan.samples over this for each number of rolls and side, which have few coordinates
+# plan.samples over this for each number of rolls and side, with few coordinates and no entry
+_SHARE_OF_A_SEARCH = 4
 _LEAST_SAMPLES = 8
 _AT_LIMIT = 0.999  # share of a limit that counts as reached
 
 
 def plan(
     scenario: str | Path | Scenario,
-    target: tuple[float, float] | None = None,
+    target: Sequence[float] | None = None,
     strategy: str = "manipulation",
     seed: int = 0,
     progress: Callable[[dict[str, Any]], None] | None = None,
     *,
     threads: int | None = None,
 ) -> Plan:
-    """Plan an insertion to `target` (x, y) in mm (default: the scenario's), best found by cross-entropy.
+    """Plan an insertion to `target` (x, y) or (x, y, z) in mm (default: the scenario's), best found by cross-entropy.
 
     scenario: also by its name or path, as for `load_scenario`;
     strategy: "manipulation" moves guide and bevel; "steering" moves only the bevel (paper section III-A, but on the
@@ -51,22 +53,25 @@ def plan(
     scenario, seed = load_scenario(scenario), whole("seed", seed, 0)
     if strategy not in STRATEGIES:
         raise InputError(f"strategy = {strategy!r}: must be one of {', '.join(STRATEGIES)}")
-    goal = scenario.target.position if target is None else pair("target", target, _TARGET)
+    goal = scenario.target.position if target is None else point("target", target, _TARGET)
     check_target(scenario, *goal)
     begun = time.perf_counter()
     simulator = Simulator(scenario, threads)
     problem = _problem(scenario, goal, strategy)
     solution = _search(simulator, problem, np.random.default_rng(seed), progress)
-    controls = _end_at_depth(simulator, solution.controls, solution.bevel, goal[0])
-    states = [simulator.start(solution.bevel)]
-    for row in controls:
-        states.append(simulator.step(states[-1], Control.from_row(row.tolist())))
+    if scenario.entry.free:
+        scenario = _entering(scenario, *solution.entry)
+        simulator = Simulator(scenario, threads)
+    rows = _end_at_depth(simulator, solution.controls, solution.roll, goal[0])
+    states = [simulator.start(solution.roll)]
+    for row in rows:
+        states.append(simulator.step(states[-1], Control.of(row.tolist())))
     return Plan(
         strategy=strategy,
         target=goal,
         seed=seed,
-        bevel=solution.bevel,
-        controls=controls,
+        roll=solution.roll,
+        controls=rows,
         tips=np.array([state.tip for state in states]),
         strain_energy=np.array([state.strain_energy for state in states]),
         guide=np.array([state.guide for state in states]),
@@ -76,7 +81,7 @@ def plan(
         iterations=solution.search_state.iterations,
         converged=solution.search_state.converged,
         history=solution.search_state.history,
-        limit=_binding_limit(simulator, problem, controls, states),
+        limit=_binding_limit(simulator, problem, rows, states),
         seconds=time.perf_counter() - begun,
         scenario=scenario,
     )
@@ -85,7 +90,7 @@ def plan(
 def bevel_reach(scenario: Scenario, depth: float, threads: int | None = None) -> tuple[float, float]:
     """Least and greatest lateral position (mm) at a depth (mm) that the bevel alone can reach."""
     simulator = Simulator(scenario, threads)
-    return reach(_rollout(simulator), _problem(scenario, (depth, 0.0), "steering"))
+    return reach(_rollout(simulator), _problem(scenario, (depth, 0.0, 0.0), "steering"))
 
 
 def _search(
@@ -97,17 +102,19 @@ def _search(
     """The best primitives, or the best rolls where only the bevel is free."""
     plan, rollout = simulator.scenario.plan, _rollout(simulator)
     if _bevel_alone(problem):
-        search = _settings(plan, max(_LEAST_SAMPLES, plan.samples // _SHARE_OF_A_SEARCH))
+        share = 1 if problem.entry_coordinates else _SHARE_OF_A_SEARCH
+        search = _settings(plan, max(_LEAST_SAMPLES, plan.samples // share))
         return steer(rollout, problem, search, rng, progress)
     return optimise(rollout, problem, _settings(plan, plan.samples), rng, progress)
 
 
 def _rollout(simulator: Simulator) -> Callable[[Floats], Trajectories]:
-    start = simulator.start()
+    start, fixed = simulator.start(), not simulator.scenario.entry.free
 
     def rollout(controls: Floats) -> Trajectories:
-        result, deflection = simulator.rollout_with_deflection(start, controls)
-        return Trajectories(controls, *result, deflection)
+        # Base and guide are mounted at a free entry by the first control, which no limit applies to.
+        result = simulator.rollout(start, controls, deflection=True, limits=fixed)
+        return Trajectories(controls, *result[:4])
 
     return rollout
 
@@ -124,26 +131,24 @@ def _settings(plan: PlanSettings, samples: int) -> Search:
 
 
 def _bevel_alone(problem: PlanProblem) -> bool:
-    return not problem.sigma[BASE_Y : GUIDE + 1].any()
+    return not problem.sigma[LATERAL : problem.bevel.start].any()
 
 
-def _problem(scenario: Scenario, goal: tuple[float, float], strategy: str) -> PlanProblem:
+def _problem(scenario: Scenario, goal: Point, strategy: str) -> PlanProblem:
     setup, plan = scenario.setup, scenario.plan
     limits = Limits.of(scenario)
-    sigma = np.array(
-        [
-            plan.advance_sigma_mm,
-            plan.base_sigma_mm,
-            plan.base_turn_sigma,
-            plan.guide_sigma_mm,
-            1.0,
-            _SHARE_SIGMA,
-        ]
-    )
-    if strategy == "steering":
-        sigma[1:4] = 0.0
-    elif not setup.has_guide:
-        sigma[3] = 0.0
+    axes = setup.axes
+    free = strategy != "steering"
+    guide = plan.guide_sigma_mm if free and setup.has_guide else 0.0
+    across = (plan.base_sigma_mm if free else 0.0, plan.base_turn_sigma if free else 0.0, guide)
+    axis = scenario.entry.lateral(goal[0])
+    toward = complex(*goal[1:]) - axis
+    turned = toward != 0.0 and setup.moved_guide_axes == 2 and not setup.half_turns
+    aside = [1.0, _ASIDE if turned else 1.0][:axes]
+    lateral = np.outer(across, aside).ravel()
+    if setup.moved_guide_axes < axes:
+        lateral[-1] = 0.0
+    sigma = np.array([plan.advance_sigma_mm, *lateral, *aside, _SHARE_SIGMA])
     return PlanProblem(
         target=goal,
         travel=setup.tip_to_skin_mm + goal[0],
@@ -157,49 +162,76 @@ def _problem(scenario: Scenario, goal: tuple[float, float], strategy: str) -> Pl
         deflection_weight=plan.deflection_weight,
         guide_weight=plan.guide_weight,
         flip_weight=plan.flip_weight,
+        axes=axes,
+        half_turns=setup.half_turns,
+        rotation=setup.max_rotation,
+        frame=toward / abs(toward) if turned else 1.0,
+        entry=(scenario.entry.free_radius_mm, 1e-3 * scenario.entry.free_slope_mrad),
+        axis=axis,
+        mounts=(scenario.start_base_x, setup.guide_x or 0.0),
     )
 
 
-def _end_at_depth(simulator: Simulator, controls: Floats, bevel: int, depth: float) -> Floats:
+def _entering(scenario: Scenario, point: complex, slope: complex) -> Scenario:
+    """The scenario with the entry fixed, changed by `point` (mm) and `slope` (rad)."""
+    entry = scenario.entry
+    values = {
+        "lateral_mm": entry.lateral_mm + point.real,
+        "lateral_z_mm": entry.lateral_z_mm + point.imag,
+        "slope_mrad": entry.slope_mrad + 1e3 * slope.real,
+        "slope_z_mrad": entry.slope_z_mrad + 1e3 * slope.imag,
+        "free_radius_mm": 0.0,
+        "free_slope_mrad": 0.0,
+    }
+    return scenario.with_values({f"entry.{key}": value for key, value in values.items()})
+
+
+def _end_at_depth(simulator: Simulator, rows: Floats, roll: float, depth: float) -> Floats:
     """Shorten or add last steps until the tip ends at the target depth."""
-    start, setup = simulator.start(bevel), simulator.scenario.setup
+    start, setup = simulator.start(roll), simulator.scenario.setup
     for _ in range(8):
-        short = depth - float(simulator.rollout(start, controls[None]).tips[0, -1, 0])
+        short = depth - float(simulator.rollout(start, rows[None]).tips[0, -1, X])
         if abs(short) < _DEPTH_TOLERANCE_MM:
             break
-        last = float(controls[-1, 0]) + short
-        stroke_left = setup.stroke_mm - float(controls[:, 0].sum())
-        if last <= 0.0 and len(controls) > 1:
-            controls = controls[:-1]
+        last = float(rows[-1, DB_X]) + short
+        stroke_left = setup.stroke_mm - float(rows[:, DB_X].sum())
+        if last <= 0.0 and len(rows) > 1:
+            rows = rows[:-1]
         elif last > setup.max_advance_mm and stroke_left > _DEPTH_TOLERANCE_MM:
             # The rest is no more than the shortening, so it takes a single further step.
-            extra = np.array([[min(short, setup.max_advance_mm, stroke_left), 0.0, 0.0, 0.0, -1.0]])
-            controls = np.concatenate([controls, extra])
+            rows = np.concatenate([rows, controls(1, db_x=min(short, setup.max_advance_mm, stroke_left))])
         else:
-            controls = controls.copy()
-            controls[-1, 0] = min(last, setup.max_advance_mm, float(controls[-1, 0]) + stroke_left)
-    return controls
+            rows = rows.copy()
+            rows[-1, DB_X] = min(last, setup.max_advance_mm, float(rows[-1, DB_X]) + stroke_left)
+    return rows
 
 
-def _binding_limit(simulator: Simulator, problem: PlanProblem, controls: Floats, states: list[State]) -> str:
+def _binding_limit(simulator: Simulator, problem: PlanProblem, rows: Floats, states: list[State]) -> str:
     """Name the key of the limit that keeps the plan from its target; empty if it reaches it.
 
     A target out of the bevel's reach is named even if the plan ends within 1 mm of it.
     """
     scenario, end = simulator.scenario, states[-1].tip
-    setup, near = scenario.setup, math.dist(end[:2], problem.target) <= 1.0
-    guide = max(abs(state.guide) for state in states)
-    if controls[:, 0].sum() > _AT_LIMIT * setup.stroke_mm and end[0] < problem.target[0] - 0.5:
+    setup, near = scenario.setup, math.dist(end[:3], problem.target) <= 1.0
+    guide = np.abs([state.travel[DG_Y:] for state in states]).max()
+    if rows[:, DB_X].sum() > _AT_LIMIT * setup.stroke_mm and end[X] < problem.target[0] - 0.5:
         return f"setup.stroke_mm = {setup.stroke_mm:g}"
     if _bevel_alone(problem):
         least, greatest = reach(_rollout(simulator), problem)
-        if not least <= problem.target[1] <= greatest:
+        if not least <= problem.lateral <= greatest:
             why = f"the bevel alone reaches {least:.2f} to {greatest:.2f} mm lateral"
             return f"needle.bevel.offset_mm = {scenario.needle.bevel.offset_mm:g} ({why})"
     if near:
         return ""
+    if (
+        setup.axes == 2
+        and setup.half_turns
+        and setup.moved_guide_axes < 2
+        and abs(end[Z] - problem.target[2]) > 1.0
+    ):
+        return f"{setup.half_turns_by} (nothing steers along z)"
     if guide > _AT_LIMIT * setup.max_guide_travel_mm:
         return f"setup.max_guide_travel_mm = {setup.max_guide_travel_mm:g}"
-    if np.abs(controls[:, 3]).max() > _AT_LIMIT * setup.max_guide_step_mm:
+    if np.abs(rows[:, DG_Y : DG_Y + 2]).max() > _AT_LIMIT * setup.max_guide_step_mm:
         return f"setup.max_guide_step_mm = {setup.max_guide_step_mm:g}"
     return f"plan.accuracy_weight_per_mm = {scenario.plan.accuracy_weight_per_mm:g} (other costs outweigh the miss)"

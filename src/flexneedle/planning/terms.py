@@ -25,18 +25,18 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.types import Floats
+from flexneedle.types import DB_X, DG_Y, PSI, ROLL, SPIN, THETA, Floats, Point, X, Y, across
 
-PlanarPoint = tuple[float, float]
+Complexes = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectories:
     """N sequences of m steps and where they lead.
 
-    controls (N, m, 5): db_x, db_y, db_theta, dg_y (mm, rad), flip (−1 or +1); tips (N, m, 3): after each step, mm and
-    rad; energy (N, m): strain energy of the tissue, mJ; converged (N, m); deflection (N, m): mean square of the
-    needle's lateral deflection, mm², where a term needs it.
+    controls (N, m, 9): columns of `Control`; tips (N, m, 5): poses after each step, mm and rad; energy (N, m): strain
+    energy of the tissue, mJ; converged (N, m); deflection (N, m): mean square of the needle's lateral deflection, mm²,
+    where a term needs it.
     """
 
     controls: Floats
@@ -48,7 +48,7 @@ class Trajectories:
     @property
     def inside(self) -> NDArray[np.bool_]:
         """(N, m): steps that advance and end with the tip in the tissue."""
-        inside: NDArray[np.bool_] = (self.tips[:, :, 0] > 0.0) & (self.controls[:, :, 0] > 0.0)
+        inside: NDArray[np.bool_] = (self.tips[:, :, X] > 0.0) & (self.controls[:, :, DB_X] > 0.0)
         return inside
 
     def __repr__(self) -> str:
@@ -58,7 +58,7 @@ class Trajectories:
 
 
 RolloutFunction = Callable[[Floats], Trajectories]
-"""Simulates controls (N, m, 5)."""
+"""Simulates controls (N, m, 9)."""
 
 
 @dataclass(frozen=True)
@@ -81,27 +81,28 @@ def cost(terms: Sequence[Term], trajectories: Trajectories) -> Floats:
     return np.where(trajectories.converged.all(axis=1), total, np.inf)
 
 
-def past(trajectories: Trajectories, target: PlanarPoint) -> Floats:
-    """Signed lateral miss (mm, + in +y) at the target's depth, to which the tip's line is extended from the end."""
+def past(trajectories: Trajectories, target: Point) -> Complexes:
+    """Lateral miss y + iz (N,), mm, at the target's depth, to which the tip's line is extended from the end."""
     end = trajectories.tips[:, -1]
-    distance: Floats = end[:, 1] + np.tan(end[:, 2]) * (target[0] - end[:, 0]) - target[1]
-    return distance
+    slope = np.tan(end[:, THETA]) + 1j * np.tan(end[:, PSI])
+    vector: Complexes = across(end, Y) + slope * (target[0] - end[:, X]) - complex(*target[1:])
+    return vector
 
 
-def miss(trajectories: Trajectories, target: PlanarPoint, blur: float = 0.0) -> Floats:
+def miss(trajectories: Trajectories, target: Point, blur: float = 0.0) -> Floats:
     """Lateral distance (mm) from the target at its depth, the size of `past`.
 
     blur (mm): uncertainty of the distance d, of which √(d² + blur²) − blur is charged.
     """
-    blurred: Floats = np.hypot(past(trajectories, target), blur) - blur
+    blurred: Floats = np.hypot(np.abs(past(trajectories, target)), blur) - blur
     return blurred
 
 
-def large_miss(trajectories: Trajectories, target: PlanarPoint, blur: float, sd: float) -> Floats:
+def large_miss(trajectories: Trajectories, target: Point, blur: float, sd: float) -> Floats:
     """The share d² / (d² + sd²) of the `miss` (mm): near 0 for a distance d far below its standard deviation sd (mm),
     near 1 far above it.
     """
-    square = past(trajectories, target) ** 2
+    square = np.abs(past(trajectories, target)) ** 2
     least = np.finfo(float).tiny
     share = square / np.maximum(square + sd**2, least)
     large: Floats = share * miss(trajectories, target, blur)
@@ -121,45 +122,46 @@ def energy_of_steps(trajectories: Trajectories) -> Floats:
 
 def guide_slope(trajectories: Trajectories) -> Floats:
     """Mean square slope of the guide's path over the travel of the base: ∫(dg/db_x)² db_x / ∫db_x."""
-    advance = trajectories.controls[:, :, 0]
+    advance = trajectories.controls[:, :, DB_X]
     squares = np.divide(
-        trajectories.controls[:, :, 3] ** 2, advance, out=np.zeros_like(advance), where=advance > 0.0
+        _guide_squares(trajectories), advance, out=np.zeros_like(advance), where=advance > 0.0
     )
     slope: Floats = squares.sum(axis=1) / np.maximum(advance.sum(axis=1), np.finfo(float).tiny)
     return slope
 
 
 def flips(trajectories: Trajectories, first: int = 0) -> Floats:
-    """Number of flips of the bevel from step `first` on."""
-    count: Floats = (trajectories.controls[:, first:, 4] > 0.0).sum(axis=1).astype(float)
+    """Flips of the bevel from step `first` on, by their angle: each half turn counts as one."""
+    count: Floats = _half_turns(trajectories)[:, first:].sum(axis=1)
     return count
 
 
 def late_rolls(trajectories: Trajectories, depth: float, length: float) -> Floats:
     """Sum over the rolls of the bevel of e^(−d/length), d the distance (mm) of the tip from the depth (mm) then."""
-    before = trajectories.tips[:, :, 0] - trajectories.controls[:, :, 0]
+    before = trajectories.tips[:, :, X] - trajectories.controls[:, :, DB_X]
     near = np.exp(np.minimum(0.0, before - depth) / length)
-    sum_: Floats = (near * (trajectories.controls[:, :, 4] > 0.0)).sum(axis=1)
+    sum_: Floats = (near * _half_turns(trajectories)).sum(axis=1)
     return sum_
 
 
-def distance_from_line(trajectories: Trajectories, start: PlanarPoint, target: PlanarPoint) -> Floats:
+def distance_from_line(trajectories: Trajectories, start: Point, target: Point) -> Floats:
     """Mean lateral distance (mm) of the tip from the line between two points, over the advance in the tissue."""
-    x, y = trajectories.tips[:, :, 0], trajectories.tips[:, :, 1]
-    length = target[0] - start[0]
-    slope = (target[1] - start[1]) / length if length != 0.0 else 0.0
-    away = np.abs(y - start[1] - slope * (x - start[0]))
-    share = np.where(trajectories.inside, trajectories.controls[:, :, 0], 0.0)
+    x, y = trajectories.tips[:, :, X], across(trajectories.tips, Y)
+    length, begin = target[0] - start[0], complex(*start[1:])
+    slope = (complex(*target[1:]) - begin) / length if length != 0.0 else 0.0
+    away = np.abs(y - begin - slope * (x - start[0]))
+    share = np.where(trajectories.inside, trajectories.controls[:, :, DB_X], 0.0)
     mean: Floats = (away * share).sum(axis=1) / np.maximum(share.sum(axis=1), np.finfo(float).tiny)
     return mean
 
 
-def out_of_reach(trajectories: Trajectories, expected: Floats) -> Floats:
+def out_of_reach(trajectories: Trajectories, expected: Floats, angle: float = 0.0) -> Floats:
     """Expected distance (mm) of the target from the bevel's reach after the first step.
 
-    expected (2,): with the bevel as it is, and with the bevel rolled before that step.
+    expected (2,): if the roll before that step turns the bevel by `angle` (rad), and if it turns it the other way.
     """
-    value: Floats = expected[(trajectories.controls[:, 0, 4] > 0.0).astype(int)]
+    away = 0.5 - 0.5 * np.cos(trajectories.controls[:, 0, ROLL] - angle)
+    value: Floats = (1.0 - away) * expected[0] + away * expected[1]
     return value
 
 
@@ -171,22 +173,34 @@ def deflection(trajectories: Trajectories) -> Floats:
 
 def guide_motion(trajectories: Trajectories) -> Floats:
     """Squared guide steps (mm²), summed over the steps in the tissue (paper eq. 10)."""
-    total: Floats = ((trajectories.controls[:, :, 3] ** 2) * trajectories.inside).sum(axis=1)
+    total: Floats = (_guide_squares(trajectories) * trajectories.inside).sum(axis=1)
     return total
 
 
 def deviation(trajectories: Trajectories, reference: Floats, orientation: float) -> Floats:
-    """Squared SE(2) deviation (mm²) from poses (m, 3), summed over the steps (paper eq. 13).
+    """Squared deviation (mm²) from poses (m, 5), summed over the steps (paper eq. 13).
 
-    orientation: weight of the angle, as the distance (mm) that is equivalent to 1 rad.
+    orientation: weight of the slopes, as the distance (mm) that is equivalent to 1 rad.
     """
     off = trajectories.tips - reference
-    off[:, :, 2] *= orientation
+    off[:, :, THETA:] *= orientation
     total: Floats = (off**2).sum(axis=(1, 2))
     return total
 
 
 def guide_departure(trajectories: Trajectories, nominal: Floats) -> Floats:
-    """Squared differences (mm²) of the guide steps from `nominal` (m,), summed over the steps."""
-    total: Floats = ((trajectories.controls[:, :, 3] - nominal) ** 2).sum(axis=1)
+    """Squared differences (mm²) of the guide steps from `nominal` (m, 2), summed over the steps."""
+    off = trajectories.controls[:, :, DG_Y : DG_Y + 2] - nominal
+    total: Floats = (off**2).sum(axis=(1, 2))
     return total
+
+
+def _guide_squares(trajectories: Trajectories) -> Floats:
+    squares: Floats = (trajectories.controls[:, :, DG_Y : DG_Y + 2] ** 2).sum(axis=2)
+    return squares
+
+
+def _half_turns(trajectories: Trajectories) -> Floats:
+    angles = np.abs(trajectories.controls[:, :, ROLL]) + np.abs(trajectories.controls[:, :, SPIN])
+    turns: Floats = angles / np.pi
+    return turns

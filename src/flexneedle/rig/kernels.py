@@ -10,6 +10,7 @@ from flexneedle.rig.phantom.phantom import Phantom
 from flexneedle.rig.phantom.plants import PLANTS
 from flexneedle.scenario.files import load_scenario
 from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import STILL
 
 
 def all_compiled() -> bool:
@@ -22,4 +23,4 @@ def compile_kernels() -> None:
     scenario = load_scenario("phantom")  # kernels are the same for every scenario
     Simulator(scenario, threads=1).compile()
     for kind in PLANTS:
-        Phantom(Truth(scenario), 1, kind).apply((0.0, 0.0, 0.0, 0.0, -1), 0.0)
+        Phantom(Truth(scenario), 0.0, kind).apply(STILL, 0.0)

@@ -1,9 +1,10 @@
 """Closed-loop insertion with a driver and a tracker, by default those of the virtual phantom."""
 
+import cmath
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 
 from flexneedle.arguments import instance, whole
 from flexneedle.control import tables
+from flexneedle.control.ahead import along_plan
 from flexneedle.control.forecast import hopeless, likely_misses, missed, warning
 from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Decision, Method, at_depth
@@ -19,7 +21,7 @@ from flexneedle.control.methods import DEFAULT, used
 from flexneedle.errors import InputError, RunError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
-from flexneedle.planning.origin import check_origin
+from flexneedle.planning.origin import check_origin, placed
 from flexneedle.rig.measuring import Observation, observe, observe_before_start
 from flexneedle.rig.monitor.monitor import Monitor
 from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, controller_of, plant_of, tracker_of
@@ -29,10 +31,21 @@ from flexneedle.rig.virtual import Rig, Seeds, virtual_rig
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Action, Command, Insertion, Outcome, Period, Plan
+from flexneedle.types import (
+    STILL,
+    UNKNOWN,
+    Action,
+    Control,
+    Insertion,
+    Lateral,
+    Outcome,
+    Period,
+    Plan,
+    Pose,
+    X,
+)
 
 _MOST_MOVES = 4  # times the planned steps; then the insertion fails
-_AT_REST: Command = (0.0, 0.0, 0.0, 0.0, -1)
 
 
 def insert(
@@ -69,7 +82,7 @@ def insert(
     plant_name, plant = plant_of(phantom)
     tracker_name, own_tracker = tracker_of(tracker)
     seeds = Seeds(phantom_seed, tracker_seed, room_seed)
-    rig = virtual_rig(scenario, plan.bevel, seeds, plant, tracker=own_tracker)
+    rig = virtual_rig(placed(scenario, plan), plan.roll, seeds, plant, tracker=own_tracker)
     rng = np.random.default_rng(control_seed)
     insertion = run(
         scenario,
@@ -101,6 +114,7 @@ def run(
     scenario, plan, seed = load_scenario(scenario), _planned(plan), whole("seed", seed, 0)
     rig = instance("rig", rig, Rig, "Rig(clock, driver, tracker), parts as in flexneedle.rig.ports")
     rng = instance("rng", rng, np.random.Generator, "such as numpy.random.default_rng(0)")
+    scenario = placed(scenario, plan)
     check_origin(plan, scenario)
     name, chosen = controller_of(controller)
     check_guide(chosen, scenario.setup, plan.strategy)
@@ -120,7 +134,7 @@ def run(
             on_period(period)
     insertion = Insertion(plan, seed, tuple(periods), *ending, name, scenario=scenario)
     if insertion.outcome is Outcome.DONE:
-        line = missed(insertion.true_error_mm, math.dist(periods[-1].estimate[:2], plan.target))
+        line = missed(insertion.true_error_mm, math.dist(periods[-1].estimate.point, plan.target))
         return replace(insertion, reason="; ".join(filter(None, (insertion.reason, line))))
     return insertion
 
@@ -142,7 +156,7 @@ def _periods(
     if (first := _first_step(progress)) is not None:
         clocks, observation = [start, start, start, time.perf_counter()], progress.observation
         yield (
-            _record(next(indices), rig.clock.now(), task.plan, rig, first, _AT_REST, observation, clocks),
+            _record(next(indices), rig.clock.now(), task.plan, rig, first, STILL, observation, clocks),
             None,
         )
     for index in indices:
@@ -166,7 +180,7 @@ def _periods(
 
 def _before_start(scenario: Scenario, memory: Any, estimate: Estimate, rig: Rig) -> Progress:
     """The progress after the measurement before the first motion."""
-    monitor = Monitor(scenario.monitor)
+    monitor = Monitor(scenario.monitor, scenario.setup.axes)
     observation = observe_before_start(scenario, estimate, monitor, rig.clock.now(), rig.tracker)
     return Progress(observation, memory, hold_after(None, observation, rig.clock.now()))
 
@@ -175,7 +189,7 @@ def _first_step(progress: Progress) -> "_Step | None":
     """The step of the measurement before the first motion; None for a good reading of a tip alone: not recorded."""
     if progress.hold is None and progress.observation.measurement.frame is None:
         return None
-    return _Step(Action.MEASURE, Decision(_AT_REST, "measurement before the first motion"))
+    return _Step(Action.MEASURE, Decision(STILL, "measurement before the first motion"))
 
 
 def _next_step(
@@ -184,20 +198,27 @@ def _next_step(
     """The step of the period that begins at `begun` (s), and the progress with the controller's decision."""
     reading = task.scenario.tracker.period
     if progress.hold is not None:
-        return _Step(Action.HOLD, Decision(_AT_REST, "held"), reading), progress
+        return _Step(Action.HOLD, Decision(STILL, "held", predicted=progress.predicted), reading), progress
     if progress.arrived_at is not None:
         delay = begun - progress.observation.measurement.time
-        waiting = Decision(_AT_REST, "waiting for the last reading")
+        waiting = Decision(STILL, "waiting for the last reading", predicted=progress.predicted)
         return _Step(Action.REST, waiting, max(reading, delay)), progress
     decision, memory = _decided(chosen, task, progress.memory, progress.observation.estimate, rng)
     no_path = progress.no_path.after("" if force else hopeless(decision, task.scenario.control))
     moves, in_a_row = progress.moves + (not no_path.reason), likely_misses(decision, progress.in_a_row)
-    decided = replace(progress, memory=memory, no_path=no_path, moves=moves, in_a_row=in_a_row)
+    decided = replace(
+        progress,
+        memory=memory,
+        no_path=no_path,
+        moves=moves,
+        in_a_row=in_a_row,
+        predicted=decision.predicted,
+    )
     return _step(decision, no_path.reason, reading), decided
 
 
 def _observed(
-    before: Observation, scenario: Scenario, rig: Rig, applied: Command, begun: float
+    before: Observation, scenario: Scenario, rig: Rig, applied: Control, begun: float
 ) -> Observation:
     """The observation after a motion `applied` by the driver since `begun` (s)."""
     predicted = before.estimate.move(applied, begun, rig.clock.now())
@@ -224,10 +245,19 @@ def _decided(
     chosen: Method, task: Task, memory: Any, estimate: Estimate, rng: np.random.Generator
 ) -> tuple[Decision, Any]:
     """The controller's decision and its memory. Raises InputError if `decide` returns anything else."""
-    match answer := chosen.decide(task, memory, estimate, rng):
-        case (Decision(), _):
-            return answer
+    match chosen.decide(task, memory, estimate, rng):
+        case (Decision() as decision, after):
+            return _with_shape(decision, task, estimate), after
     raise InputError(f"controller {chosen.name}: decide must return a Decision and the memory after it")
+
+
+def _with_shape(decision: Decision, task: Task, estimate: Estimate) -> Decision:
+    """The decision with a predicted shape: its own, or that at the end of the plan."""
+    return (
+        decision
+        if decision.predicted is not None
+        else replace(decision, predicted=along_plan(task, estimate))
+    )
 
 
 @dataclass(frozen=True)
@@ -241,7 +271,7 @@ class _Step:
 
 def _step(decision: Decision, no_path: str, reading: float) -> _Step:
     """The step for a decision; no_path: reason why no path reaches the target, or ""; reading: tracker period (s)."""
-    at_rest = replace(decision, command=_AT_REST)
+    at_rest = replace(decision, command=STILL)
     if no_path:
         return _Step(Action.HOLD, replace(at_rest, why=f"held: {no_path}"), reading)
     if decision.rest > 0.0:
@@ -249,14 +279,19 @@ def _step(decision: Decision, no_path: str, reading: float) -> _Step:
     return _Step(Action.MOVE, decision)
 
 
-def _carry_out(scenario: Scenario, rig: Rig, command: Command, wait: float) -> Command:
+def _carry_out(scenario: Scenario, rig: Rig, command: Control, wait: float) -> Control:
     """Move, within the time at insertion speed, rounded up to whole tracker periods; or wait for `wait` (s)."""
     if wait > 0.0:
         rig.clock.wait(wait)
         return command
     reading = scenario.tracker.period
-    readings = math.ceil(abs(command[0]) / scenario.setup.insertion_speed_mm_s / reading - 1e-6)
+    readings = math.ceil(abs(command.db_x) / scenario.setup.insertion_speed_mm_s / reading - 1e-6)
     return rig.driver.apply(command, max(1, readings) * reading)
+
+
+def _pair(miss: float | complex) -> Lateral:
+    """y, z of a miss (mm); z is 0 in the plane."""
+    return UNKNOWN if cmath.isnan(miss) else (complex(miss).real, complex(miss).imag)
 
 
 def _ending(task: Task, progress: Progress) -> tuple[Outcome, str] | None:
@@ -269,7 +304,7 @@ def _ending(task: Task, progress: Progress) -> tuple[Outcome, str] | None:
         return Outcome.HELD, f"held for {held:.2f} s (limit {limit:g} s): {observation.verdict}"
     if not progress.measured_at_rest:
         return progress.no_path.ending(task.scenario.control.hold_limit_s)
-    short = task.plan.target[0] - float(estimate.tip[0])
+    short = task.plan.target[0] - float(estimate.tip[X])
     if short > task.scenario.control.depth_tolerance_mm and at_depth(task, None, estimate):
         return Outcome.DONE, f"stroke ends {short:.2f} mm before the target depth"
     return Outcome.DONE, ""
@@ -281,7 +316,7 @@ def _record(
     plan: Plan,
     rig: Rig,
     step: _Step,
-    applied: Command,
+    applied: Control,
     observation: Observation,
     clocks: list[float],
 ) -> Period:
@@ -296,23 +331,25 @@ def _record(
         verdict=observation.verdict,
         readings=observation.readings,
         innovation=estimate.innovation,
-        estimate=_pose(estimate.tip),
+        estimate=Pose.of(estimate.tip),
         shape=state.nodes,
-        base=_pose(state.base),
+        base=Pose.of(state.base),
         guide=state.guide,
-        bevel=state.bevel,
+        roll=state.roll,
         strain_energy=state.strain_energy,
         tip_load=state.tip_load,
-        path=_pose([np.interp(state.tip[0], plan.tips[:, 0], plan.tips[:, k]) for k in range(3)]),
+        path=Pose.of(np.interp(state.tip[X], plan.tips[:, X], column) for column in plan.tips.T),
         cost=step.decision.cost,
         spread=step.decision.spread,
         action=step.action,
         decision=step.decision.why,
-        miss=step.decision.miss,
+        miss=_pair(step.decision.miss),
         miss_sd=step.decision.miss_sd,
-        true_tip=None if truth is None else _pose(truth.tip),
+        predicted=step.decision.predicted,
+        true_tip=None if truth is None else Pose.of(truth.tip),
         true_strain_energy=None if truth is None else truth.strain_energy,
         true_stretch=None if truth is None else truth.least_stretch,
+        true_shape=None if truth is None else truth.shape,
         durations={
             "decide": clocks[1] - clocks[0],
             "apply": clocks[2] - clocks[1],
@@ -321,8 +358,3 @@ def _record(
         },
         converged=state.converged and (truth is None or truth.converged),
     )
-
-
-def _pose(values: Iterable[float]) -> tuple[float, float, float]:
-    x, y, theta = (float(value) for value in values)
-    return x, y, theta

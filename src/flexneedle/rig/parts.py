@@ -51,7 +51,7 @@ def plant_of(given: str | PlantFactory) -> tuple[str, PlantFactory]:
     if _is_listed(given, PLANTS):
         return given, PLANTS[given]
     found = _resolved("phantom", given, PLANTS)
-    _check_call("phantom", given, found, PLANTS, ("truth", "bevel"))
+    _check_call("phantom", given, found, PLANTS, ("truth", "roll"))
     return _name(given), found
 
 

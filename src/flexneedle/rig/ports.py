@@ -2,7 +2,7 @@
 
 from typing import Protocol
 
-from flexneedle.types import Command, Frame, Measurement
+from flexneedle.types import Control, Frame, Measurement
 
 
 class Clock(Protocol):
@@ -20,7 +20,7 @@ class Clock(Protocol):
 class Driver(Protocol):
     """Moves base and guide and rolls the bevel."""
 
-    def apply(self, command: Command, duration: float) -> Command:
+    def apply(self, command: Control, duration: float) -> Control:
         """Execute `command` within `duration` seconds; return the command as applied."""
         ...
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexneedle.rig.measuring import Observation
-from flexneedle.types import Outcome
+from flexneedle.types import Outcome, Shape
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Progress:
     """An insertion between two periods.
 
     arrived_at: time (s) at which the needle arrived at its depth; moves: number of moves; in_a_row: number of
-    consecutive decisions with a likely miss.
+    consecutive decisions with a likely miss; predicted: the last predicted shape.
     """
 
     observation: Observation
@@ -78,6 +78,7 @@ class Progress:
     arrived_at: float | None = None
     moves: int = 0
     in_a_row: int = 0
+    predicted: Shape | None = None
 
     @property
     def decides(self) -> bool:

@@ -16,13 +16,14 @@ from flexneedle.rig.tracking.field.poses import SensorPose, tip_sensor_pose
 from flexneedle.rig.tracking.field.room import Room
 from flexneedle.rig.tracking.field.tracker import FieldTracker
 from flexneedle.rig.tracking.placement import placed_references
-from flexneedle.rig.tracking.plane import InPlane
 from flexneedle.rig.tracking.quaternion import to_matrix
 from flexneedle.rig.tracking.registration import Rigid, fit_rigid, identity
 from flexneedle.rig.tracking.simulated import NoisyTracker
+from flexneedle.rig.tracking.stage import OnStage
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.registration import Registration
+from flexneedle.types import THETA, Point
 
 _CLEAN = 0.75  # of the indicator's limit: a reference below it is not moved
 
@@ -66,7 +67,7 @@ class Seeds:
 
 def virtual_rig(
     scenario: Scenario,
-    bevel: int,
+    roll: float,
     seeds: Seeds,
     phantom: str | PlantFactory = DEFAULT_PLANT,
     *,
@@ -80,7 +81,7 @@ def virtual_rig(
     Raises InputError if the factory returns no tracker.
     """
     truth = draw(scenario, np.random.default_rng(seeds.phantom))
-    tank = Phantom(truth, bevel, phantom)
+    tank = Phantom(truth, roll, phantom)
     if tracker is not None:
         own = tracker(scenario, tank, np.random.default_rng(seeds.tracker))
         return Rig(tank, tank, own, tank.condition)
@@ -134,13 +135,14 @@ def _noisy_tracker(
 ) -> NoisyTracker:
     """The tracker with white noise only."""
 
-    def tip_at(time: float) -> tuple[float, float]:
-        x, y = tank.tip_at(time)
+    def tip_at(time: float) -> Point:
+        tip = tank.tip_at(time)
         if scenario.tracker.registration is None:
-            return x, y
-        x, y, _ = errors.registration.apply(np.array((x, y, 0.0))).tolist()
-        return x, y
+            return tip
+        x, y, z = errors.registration.apply(np.array(tip)).tolist()
+        return x, y, z
 
+    jitter = scenario.tracker.direction_jitter
     return NoisyTracker(
         tip_at,
         tank,
@@ -150,6 +152,9 @@ def _noisy_tracker(
         delay=_delay(scenario),
         missing=scenario.phantom.missing_fraction,
         bias=errors.bias,
+        axes=scenario.setup.axes,
+        direction_at=None if jitter is None else lambda time: tank.pose_at(time)[THETA:],
+        direction_jitter=jitter or 0.0,
     )
 
 
@@ -160,16 +165,19 @@ def _field_tracker(
     errors: _Errors,
     rng: np.random.Generator,
     plate_distance_at: Callable[[float], float] | None,
-) -> InPlane:
+) -> OnStage:
     """The tracker in its environment; around: room and references."""
     (room, references), settings = around, scenario.tracker
     center, offset = settings.workspace_center_mm, settings.tip_offset_mm
     registered = to_stage(settings.registration)
 
     def poses_at(time: float) -> Mapping[str, SensorPose]:
-        x, y, theta = tank.pose_at(time)
-        tip = x + errors.bias[0], y + errors.bias[1], 0.0
-        return {TIP: tip_sensor_pose(tip, (math.cos(theta), math.sin(theta), 0.0), offset), **references}
+        pose = tank.pose_at(time)
+        tip = pose.x + errors.bias[0], pose.y + errors.bias[1], pose.z
+        return {
+            TIP: tip_sensor_pose(tip, pose.axis, offset),
+            **references,
+        }
 
     tracker = FieldTracker(
         room,
@@ -184,7 +192,7 @@ def _field_tracker(
         to_tracker=registered.inverse().after(errors.registration),
         plate_distance_at=plate_distance_at,
     )
-    return InPlane(tracker, registered, offset)
+    return OnStage(tracker, registered, offset)
 
 
 def _delay(scenario: Scenario) -> float:

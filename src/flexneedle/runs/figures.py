@@ -4,6 +4,7 @@ from pathlib import Path
 
 from flexneedle.errors import RunError
 from flexneedle.figures.insertion import insertion_figure
+from flexneedle.figures.perspective import perspective_figure
 from flexneedle.figures.plans import plan_figure
 from flexneedle.figures.style import save
 from flexneedle.runs.reading import insertion_of
@@ -13,6 +14,8 @@ from flexneedle.trace.folder import TRACE_FILE, read_run
 def draw_run(folder: Path) -> list[Path]:
     """Draw `insertion.png` and `.svg`, or `plan.png` and `.svg` if there are no periods; return the paths.
 
+    An insertion in space is drawn in perspective, too: `perspective.png` and `.svg`.
+
     Raises InputError if the folder contains no run, RunError if there is nothing to draw yet.
     """
     run = read_run(folder)
@@ -20,5 +23,8 @@ def draw_run(folder: Path) -> list[Path]:
         raise RunError(f"{folder}: nothing to draw: the run ended before planning finished")
     insertion = insertion_of(run)[0] if run.kind == "insertion" and (folder / TRACE_FILE).exists() else None
     if insertion is not None and insertion.periods:
-        return save(insertion_figure(run.scenario, insertion), folder, "insertion")
+        paths = save(insertion_figure(run.scenario, insertion), folder, "insertion")
+        if run.scenario.setup.axes == 2:
+            paths += save(perspective_figure(run.scenario, insertion), folder, "perspective")
+        return paths
     return save(plan_figure(run.scenario, list(run.plans.values())), folder, "plan")

@@ -13,6 +13,7 @@ from flexneedle.scenario.dotted import flatten, set_value, split_key
 from flexneedle.scenario.problems import describe, key_path, refuse, to_line
 from flexneedle.scenario.renamed import current_key, current_values, given_twice
 from flexneedle.scenario.rules import (
+    entry_problems,
     geometry_problems,
     grid_problems,
     layer_problems,
@@ -20,7 +21,7 @@ from flexneedle.scenario.rules import (
     plan_problems,
     target_problems,
 )
-from flexneedle.scenario.sections.apparatus import Setup, TrackerSettings
+from flexneedle.scenario.sections.apparatus import Entry, Setup, TrackerSettings
 from flexneedle.scenario.sections.environment import ENVIRONMENTS, expanded
 from flexneedle.scenario.sections.fields import Section, Title
 from flexneedle.scenario.sections.monitor import MonitorSettings
@@ -46,6 +47,7 @@ class Scenario(Section):
     tissue: Annotated[tuple[AnyLayer, ...], Field(strict=False, max_length=1_000)]
     """Layers from the skin down."""
     contact: Contact = Contact()
+    entry: Entry = Entry()
     target: Target = Target()
     plan: PlanSettings = PlanSettings()
     control: ControlSettings = ControlSettings()
@@ -66,7 +68,8 @@ class Scenario(Section):
                 geometry_problems(self.needle, self.setup),
                 structure_problems(self.needle, self.setup, self.phantom.structure),
                 layer_problems(self.tissue, self.needle.bevel),
-                target_problems(self.setup, self.target),
+                entry_problems(self.setup, self.entry),
+                target_problems(self.setup, self.entry, self.target),
                 plan_problems(self.plan),
                 monitor_problems(self.monitor, self.tracker),
                 grid_problems(self.setup, self.contact, self.phantom, self.tracker),
@@ -129,9 +132,9 @@ class Scenario(Section):
     def __repr__(self) -> str:
         layers = f"{len(self.tissue)} layer{'s' if len(self.tissue) > 1 else ''}"
         guide = f"guide at {self.setup.guide_to_skin_mm:g} mm" if self.setup.has_guide else "no guide"
-        depth, lateral = self.target.position
+        target = ", ".join(f"{value:g}" for value in self.target.position[: 1 + self.setup.axes])
         needle = f"needle {self.needle.outer_diameter:g} mm"
-        return f"<Scenario {self.name!r}: {needle}, {layers}, {guide}, target ({depth:g}, {lateral:g}) mm>"
+        return f"<Scenario {self.name!r}: {needle}, {layers}, {guide}, target ({target}) mm>"
 
     __str__ = __repr__
 
@@ -139,6 +142,12 @@ class Scenario(Section):
     def start_base_x(self) -> float:
         """x of the base clamp at the start, mm."""
         return self.setup.start_tip_x - self.needle.length_mm
+
+    @property
+    def guide_home(self) -> complex:
+        """y + iz of the guide at the start, mm; 0 without a guide."""
+        guide = self.setup.guide_x
+        return 0.0 if guide is None else self.entry.lateral(guide)
 
     @property
     def layer_tops(self) -> tuple[float, ...]:
@@ -159,9 +168,10 @@ def _expanded(key: str, value: Any) -> Any:
     return expanded(value) if known else value
 
 
-def check_target(scenario: Scenario, depth: float, lateral: float) -> None:
-    """Raise ScenarioError if a target (x, y), mm, is beyond the stroke or the lateral travel."""
-    target = Target.model_construct(depth_mm=float(depth), lateral_mm=float(lateral))
-    problems = [to_line(problem) for problem in target_problems(scenario.setup, target)]
+def check_target(scenario: Scenario, depth: float, lateral: float, lateral_z: float = 0.0) -> None:
+    """Raise ScenarioError if a target (x, y, z), mm, is beyond the stroke or the lateral travel."""
+    place = {"depth_mm": depth, "lateral_mm": lateral, "lateral_z_mm": lateral_z}
+    target = Target().model_copy(update={key: float(value) for key, value in place.items()})
+    problems = [to_line(problem) for problem in target_problems(scenario.setup, scenario.entry, target)]
     if problems:
         raise ScenarioError(*problems)

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from math import isfinite
 
 from flexneedle.scenario.problems import Problem
-from flexneedle.scenario.sections.apparatus import Setup, TrackerSettings
+from flexneedle.scenario.sections.apparatus import Entry, Setup, TrackerSettings
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.scenario.sections.needle import Bevel, Needle
 from flexneedle.scenario.sections.settings import PhantomSettings, PlanSettings, Target
@@ -24,6 +24,9 @@ def geometry_problems(needle: Needle, setup: Setup) -> Iterator[Problem]:
     if guide is not None and tip >= guide:
         rule = f"the tip would start behind the guide: must be below setup.guide_to_skin_mm ({guide:g})"
         yield Problem("setup.tip_to_skin_mm", tip, rule)
+    if setup.max_rotation_deg is not None and setup.half_turns:
+        rule = f"must not be set where the needle rolls by half turns ({setup.half_turns_by})"
+        yield Problem("setup.max_rotation_deg", setup.max_rotation_deg, rule)
     room = needle.length_mm + tip - (guide or 0.0)
     if setup.stroke_mm >= room:
         stop = "skin" if guide is None else "guide"
@@ -51,7 +54,14 @@ def layer_problems(tissue: Sequence[Layer], bevel: Bevel) -> Iterator[Problem]:
         yield Problem("needle.bevel.offset_mm", bevel.offset_mm, rule)
 
 
-def target_problems(setup: Setup, target: Target) -> Iterator[Problem]:
+def entry_problems(setup: Setup, entry: Entry) -> Iterator[Problem]:
+    """A needle in the plane enters in the plane."""
+    for key in ("lateral_z_mm", "slope_z_mrad"):
+        if setup.axes == 1 and (value := getattr(entry, key)) != 0.0:
+            yield Problem(f"entry.{key}", value, "must be 0 with setup.axes = 1")
+
+
+def target_problems(setup: Setup, entry: Entry, target: Target) -> Iterator[Problem]:
     """Return why a target is out of reach: not in the tissue, beyond the stroke or the lateral travel."""
     depth, lateral = target.depth_mm, target.lateral_mm
     if not (isfinite(depth) and depth > 0):
@@ -61,10 +71,22 @@ def target_problems(setup: Setup, target: Target) -> Iterator[Problem]:
             f"beyond the stroke: must be at most {setup.max_depth:g} (setup.stroke_mm - setup.tip_to_skin_mm)"
         )
         yield Problem("target.depth_mm", depth, rule)
-    if not abs(lateral) <= setup.max_lateral:
-        mover = "guide" if setup.has_guide else "base"
-        rule = f"must be at most {setup.max_lateral:g} in size, the lateral travel of the {mover}"
-        yield Problem("target.lateral_mm", lateral, rule)
+    mover = "guide" if setup.has_guide else "base"
+    most = setup.max_lateral + entry.free_radius_mm + 1e-3 * entry.free_slope_mrad * depth
+    middle = entry.lateral(depth)
+    for key, value, axis in (
+        ("target.lateral_mm", lateral, middle.real),
+        ("target.lateral_z_mm", target.lateral_z_mm, middle.imag),
+    ):
+        if not abs(value - axis) <= most:
+            rule = f"must be at most {most:g} in size, the lateral travel of the {mover}"
+            if entry.free or middle != 0.0:
+                rule = (
+                    f"must be from {axis - most:g} to {axis + most:g}, in reach of the {mover} from the entry"
+                )
+            yield Problem(key, value, rule)
+    if setup.axes == 1 and target.lateral_z_mm != 0.0:
+        yield Problem("target.lateral_z_mm", target.lateral_z_mm, "must be 0 with setup.axes = 1")
 
 
 def plan_problems(plan: PlanSettings) -> Iterator[Problem]:

@@ -15,9 +15,16 @@
 Everything else is as in the preset `phantom`. Numbers 0 to 999 are for choosing settings, 100,000 and up for reports.
 A world has three cases, which differ only in `[phantom]`: `perfect` has no mismatch, `real` the preset's, `structure`
 (with a guide only) one kind of structural mismatch in addition, see `structural`.
+
+A world is in the plane, or in space with one of the `RIGS`. In space the lateral offset of its target has a uniform
+direction, of a random stream of its own; with half turns and no guide in two axes, where nothing steers along z, it
+stays in the plane of the bevel.
 """
 
+import cmath
+import math
 import re
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,12 +41,45 @@ LARGEST_WORLD = 10**9
 PERFECT, REAL, STRUCTURE = "perfect", "real", "structure"
 CASES = (PERFECT, REAL, STRUCTURE)
 
+PLANE = "plane"
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The driver of a needle in space. guide_axes: axes in which its guide moves, 0 without a guide."""
+
+    guide_axes: int
+    half_turns: bool
+
+    @property
+    def steers_out(self) -> bool:
+        """Whether anything steers out of the plane of the bevel."""
+        return self.guide_axes == 2 or not self.half_turns
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Values of the scenario by dotted key."""
+        rotation = "half-turns" if self.half_turns else "free"
+        guide = {"setup.guide_axes": self.guide_axes} if self.guide_axes else {}
+        return {"setup.axes": 2, "setup.rotation": rotation, **guide}
+
+
+_IN_SPACE = {
+    "two-axes": Rig(2, half_turns=False),
+    "two-axes-half-turns": Rig(2, half_turns=True),
+    "one-axis": Rig(1, half_turns=False),
+    "one-axis-half-turns": Rig(1, half_turns=True),
+    "no-guide": Rig(0, half_turns=False),
+    "no-guide-half-turns": Rig(0, half_turns=True),
+}
+RIGS = (PLANE, *_IN_SPACE)
+
 _STREAM = 0x776F726C64  # separates worlds from other streams that are seeded by a small number
-_STRUCTURE_STREAM = _STREAM + 1
+_STRUCTURE_STREAM, _DIRECTION_STREAM = _STREAM + 1, _STREAM + 2
 _STEEL_GAUGES = tuple(list(GAUGES)[1:9])  # 18G to 25G
 _THINNEST_LAYER_MM = 4.0
 _BEYOND_TARGET_MM = 5.0
-_NAMED = re.compile(rf"{WORLD}([0-9]{{1,18}})(?::([a-z]+))?")
+_NAMED = re.compile(rf"{WORLD}([0-9]{{1,18}})(?::([a-z]+))??(?::({'|'.join(RIGS)}))?")
 _NO_MISMATCH: dict[str, Any] = {
     "phantom.shear_modulus_factor": [1.0, 1.0],
     "phantom.bevel_factor": [1.0, 1.0],
@@ -49,17 +89,45 @@ _NO_MISMATCH: dict[str, Any] = {
             *("shear_modulus_variation", "layer_shift_sd_mm", "start_offset_sd_mm", "start_angle_sd_mrad"),
             *("start_axial_sd_mm", "youngs_modulus_variation", "initial_bend_mm", "run_out_mm"),
             *("guide_clearance_mm", "friction_mn_per_mm", "motor_resolution_mm", "delay_periods"),
-            *("missing_fraction", "tracker_bias_mm"),
+            *("missing_fraction", "tracker_bias_mm", "rotation_friction_mn"),
         )
     },
 }
 
 
-def world(number: int, case: str = REAL) -> Scenario:
-    """Return the scenario of a world in one of the `CASES`.
+def world(number: int, case: str = REAL, rig: str = PLANE) -> Scenario:
+    """Return the scenario of a world in one of the `CASES`, in the plane or with one of the `RIGS`.
 
-    Raises ScenarioError for a number out of range, an unknown case, and `structure` without a guide.
+    Raises ScenarioError for a number out of range, an unknown case or rig, `structure` without a guide, and a rig with
+    a guide that the world lacks, or without one that it has.
     """
+    scenario = _in_plane(number, case)
+    if rig not in RIGS:
+        raise ScenarioError(f"world_rig = {rig!r}: must be one of {', '.join(RIGS)}")
+    return scenario if rig == PLANE else _in_space(number, scenario, rig)
+
+
+def has_rig(scenario: Scenario, rig: str) -> bool:
+    """Whether a world can have a rig: one with a guide if it has a guide itself, or that in the plane."""
+    return rig not in _IN_SPACE or (_IN_SPACE[rig].guide_axes > 0) == scenario.setup.has_guide
+
+
+def _in_space(number: int, scenario: Scenario, name: str) -> Scenario:
+    rig = _IN_SPACE[name]
+    if not has_rig(scenario, name):
+        rigs = ", ".join(other for other in RIGS if has_rig(scenario, other))
+        raise ScenarioError(
+            f"world {number} has {'a' if scenario.setup.has_guide else 'no'} guide: its rigs are {rigs}"
+        )
+    if not rig.steers_out:
+        return scenario.with_values(rig.values)
+    angle = np.random.default_rng([_DIRECTION_STREAM, number]).uniform(0.0, 2.0 * math.pi)
+    offset = cmath.rect(abs(scenario.target.lateral_mm), angle)
+    target = {"target.lateral_mm": _rounded(offset.real), "target.lateral_z_mm": _rounded(offset.imag)}
+    return scenario.with_values({**rig.values, **target})
+
+
+def _in_plane(number: int, case: str) -> Scenario:
     if not 0 <= number <= LARGEST_WORLD:
         raise ScenarioError(f"world = {number}: must be a whole number from 0 to {LARGEST_WORLD}")
     scenario = _real(number)
@@ -74,18 +142,20 @@ def world(number: int, case: str = REAL) -> Scenario:
     return scenario.with_values(structural(number, scenario))
 
 
-def world_name(number: int, case: str = REAL) -> str:
-    """Return the name by which `load_scenario` finds a world, such as `world:100012:structure`."""
-    return f"{WORLD}{number}" + ("" if case == REAL else f":{case}")
+def world_name(number: int, case: str = REAL, rig: str = PLANE) -> str:
+    """Return the name by which `load_scenario` finds a world, such as `world:100012:structure:two-axes`."""
+    parts = [*([] if case == REAL else [case]), *([] if rig == PLANE else [rig])]
+    return ":".join([f"{WORLD}{number}", *parts])
 
 
 def named_world(name: str) -> Scenario:
     """Return the world of a name. Raises ScenarioError."""
     found = _NAMED.fullmatch(name)
     if found is None:
-        rule = f"must be {WORLD}NUMBER or {WORLD}NUMBER:CASE, cases: {', '.join(CASES)}"
+        rule = f"must be {WORLD}NUMBER, with :CASE, :RIG or :CASE:RIG after it"
+        rule += f", cases: {', '.join(CASES)}, rigs: {', '.join(RIGS)}"
         raise ScenarioError(f"{printable(name)}: {rule}")
-    return world(int(found[1]), found[2] or REAL)
+    return world(int(found[1]), found[2] or REAL, found[3] or PLANE)
 
 
 def structural(number: int, scenario: Scenario) -> dict[str, Any]:

@@ -1,77 +1,76 @@
-"""Control inputs U = (δb_x, δb_y, δb_θ, δg_y, flip) and the limits that a command must keep."""
+"""The limits that control inputs U = (δb, δθ, δψ, δg, roll, spin) must keep, and arrays of them."""
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
-from numbers import Real
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from flexneedle.arguments import refusal
 from flexneedle.errors import CommandError
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats
+from flexneedle.types import COLUMNS, DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, ROLL, SPIN, Floats
 
-COLUMNS = ("db_x", "db_y", "db_theta", "dg_y", "flip")
+MOVES = ROLL
+"""Number of columns of a control that are travel: of the base and of the guide."""
 _SLACK = 1e-9  # rounding of sums of steps, mm or rad
 
 
-@dataclass(frozen=True)
-class Control:
-    """One step of base (mm, mm, rad) and guide (mm); `flip` rolls the bevel by half a turn before the step."""
+def controls(*shape: int, **columns: ArrayLike) -> Floats:
+    """Return an array (*shape, 9) of controls: `columns` by name, the others 0. Raises InputError for other names."""
+    array = np.zeros((*shape, len(COLUMNS)))
+    for name, values in columns.items():
+        if name not in COLUMNS:
+            raise refusal("column", name, f"must be one of {', '.join(COLUMNS)}")
+        array[..., COLUMNS.index(name)] = values
+    return array
 
-    db_x: float = 0.0
-    db_y: float = 0.0
-    db_theta: float = 0.0
-    dg_y: float = 0.0
-    flip: bool = False
 
-    def __post_init__(self) -> None:
-        """Raise InputError for text in place of numbers, and for a flip of −1, which rolls no bevel in a row."""
-        for name in COLUMNS[:-1]:
-            if not isinstance(value := getattr(self, name), Real):
-                raise refusal(name, value, "must be a number, in mm or rad")
-        if not isinstance(self.flip, bool | np.bool_):
-            raise refusal("flip", self.flip, "must be True or False")
-
-    @classmethod
-    def from_row(cls, row: Sequence[float]) -> "Control":
-        """Return the control of five columns, flip as −1 or +1."""
-        db_x, db_y, db_theta, dg_y, flip = row
-        return cls(db_x, db_y, db_theta, dg_y, flip > 0.0)
-
-    def row(self) -> Floats:
-        """The five columns of `Simulator.rollout`, flip as −1 or +1."""
-        return np.array([self.db_x, self.db_y, self.db_theta, self.dg_y, 1.0 if self.flip else -1.0])
+def along_entry(scenario: Scenario, rows: Floats) -> Floats:
+    """Controls (…, m, 9) with the base's advance along the axis on which it is mounted, in place of along x."""
+    slope = scenario.entry.slope
+    if slope == 0.0:
+        return rows
+    driven = rows.copy()
+    driven[..., DB_Y] += slope.real * rows[..., DB_X]
+    driven[..., DB_Z] += slope.imag * rows[..., DB_X]
+    return driven
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Largest step of each column, and the range of the sum of steps from the start, shapes (4,) and (4, 2)."""
+    """Largest step of each column of travel, and the range of the sum of steps from the start, shapes (7,) and (7, 2).
+
+    half_turns: the key and value by which the needle rolls by half turns only, or ""; rotation: largest angle from 0
+    to either side (rad).
+    """
 
     step: Floats
     travel: Floats
+    half_turns: str = "setup.axes = 1"
+    rotation: float = math.inf
 
     @classmethod
     def of(cls, scenario: Scenario) -> "Limits":
         """Return the limits of a scenario in mm and rad; without a guide it cannot move."""
         setup = scenario.setup
-        guide_step = setup.max_guide_step_mm if setup.has_guide else 0.0
-        step = np.array([setup.max_advance_mm, setup.max_base_step_mm, setup.max_base_turn_step, guide_step])
-        lateral, guide = setup.max_base_travel_mm, setup.max_guide_travel_mm
-        travel = np.array([[0.0, setup.stroke_mm], [-lateral, lateral], [-np.inf, np.inf], [-guide, guide]])
-        return cls(step, travel)
+        turn, base = setup.max_base_turn_step, setup.max_base_step_mm
+        out = 0.0 if setup.axes == 1 else 1.0
+        guide = [setup.max_guide_step_mm if axis < setup.moved_guide_axes else 0.0 for axis in range(2)]
+        step = np.array([setup.max_advance_mm, base, out * base, turn, out * turn, *guide])
+        lateral, reach = setup.max_base_travel_mm, setup.max_guide_travel_mm
+        travel = np.array([lateral, lateral, np.inf, np.inf, reach, reach])
+        sums = np.array([[0.0, setup.stroke_mm], *np.stack([-travel, travel], axis=1).tolist()])
+        return cls(step, sums, setup.half_turns_by, setup.max_rotation)
 
-    def check(self, moved: Floats, controls: Floats) -> None:
-        """Raise CommandError for the first value in `controls` (…, m, 5) that breaks a limit.
+    def check(self, moved: Floats, rows: Floats, roll: float = 0.0) -> None:
+        """Raise CommandError for the first value in `rows` (…, m, 9) that breaks a limit.
 
-        `moved` (4,) is the sum of the steps of each input before them.
+        `moved` (7,) is the sum of the steps of each column of travel before them, `roll` the needle's angle (rad).
         """
-        if not np.isfinite(controls).all():
-            self._refuse(controls, ~np.isfinite(controls), "must be a finite number")
-        if (bad := np.abs(controls[..., 4]) != 1.0).any():
-            raise CommandError("flip", float(controls[..., 4][bad][0]), 1.0, "must be −1 or +1")
-        steps = controls[..., :4]
+        if not np.isfinite(rows).all():
+            self._refuse(rows, ~np.isfinite(rows), "must be a finite number")
+        steps = rows[..., :MOVES]
         if (bad := np.abs(steps) > self.step + _SLACK).any():
             self._refuse(steps, bad, "must be at most", self.step)
         travel = moved + np.cumsum(steps, axis=-2)
@@ -79,10 +78,26 @@ class Limits:
             self._refuse(travel, bad, "sum of the steps must be at most", self.travel[:, 1])
         if (bad := travel < self.travel[:, 0] - _SLACK).any():
             self._refuse(travel, bad, "sum of the steps must be at least", self.travel[:, 0])
+        self._check_rotation(rows, roll)
+
+    def _check_rotation(self, rows: Floats, roll: float) -> None:
+        if self.half_turns:
+            halves, spin = rows[..., ROLL] / np.pi, rows[..., SPIN]
+            if (bad := np.abs(halves - np.rint(halves)) > _SLACK).any():
+                rule = f"must be half turns with {self.half_turns}"
+                raise CommandError("roll", float(rows[..., ROLL][bad][0]), np.pi, rule)
+            if (bad := spin != 0.0).any():
+                raise CommandError("spin", float(spin[bad][0]), 0.0, f"must be 0 with {self.half_turns}")
+        elif math.isfinite(self.rotation):
+            steps = rows[..., ROLL:].reshape(*rows.shape[:-2], -1)
+            angle = roll + np.cumsum(steps, axis=-1)
+            if (bad := np.abs(angle) > self.rotation + _SLACK).any():
+                rule = f"angle of the needle must be at most {self.rotation:g} rad to either side"
+                raise CommandError("roll", float(angle[bad][0]), self.rotation, rule)
 
     def _refuse(self, values: Floats, bad: NDArray[np.bool_], rule: str, limit: Floats | None = None) -> None:
         index = tuple(np.argwhere(bad)[0])
         name, bound = COLUMNS[index[-1]], float("nan") if limit is None else float(limit[index[-1]])
-        unit = "rad" if name == "db_theta" else "mm"
+        unit = "rad" if index[-1] in (DB_THETA, DB_PSI, ROLL, SPIN) else "mm"
         text = rule if limit is None else f"{rule} {bound:g} {unit}"
         raise CommandError(name, float(values[index]), bound, text)

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,12 +16,13 @@ from flexneedle.arguments import instance, whole
 from flexneedle.errors import CommandError, StateError
 from flexneedle.mechanics import insertion, law, model
 from flexneedle.mechanics import needle as nd
+from flexneedle.mechanics.lateral import Lateral, turned
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
-from flexneedle.simulator.control import Control, Limits
+from flexneedle.simulator.control import MOVES, Limits, along_entry, controls
 from flexneedle.simulator.state import State, load_state, mechanics_difference, solved
-from flexneedle.types import Floats
+from flexneedle.types import COLUMNS, ROLL, Control, Floats
 
 _STEPS_WORTH_A_THREAD = 200
 _CHUNKS_A_THREAD = 4
@@ -32,11 +33,17 @@ _ALL_CORES = "leave it out for one per core"
 
 
 class Rollout(NamedTuple):
-    """Result of N sequences of m steps: tips (N, m, 3) in mm and rad, strain_energy (N, m) in mJ, converged (N, m)."""
+    """Result of N sequences of m steps: poses of the tip (N, m, 5), strain_energy (N, m) in mJ, converged (N, m).
+
+    On demand deflection (N, m), the mean square of the needle's lateral deflection in mm², and shapes (N, m, n, 5),
+    poses at its nodes; else their size is 0.
+    """
 
     tips: Floats
     strain_energy: Floats
     converged: NDArray[np.bool_]
+    deflection: Floats
+    shapes: Floats
 
     def __repr__(self) -> str:
         sequences, steps = self.strain_energy.shape
@@ -77,39 +84,50 @@ class Simulator:
         """Compile the kernels, or load them from the cache, ahead of the first call of each."""
         _ = self.step(self.start(), Control()).nodes
 
-    def start(self, bevel: int = 1) -> State:
-        """Return the straight needle in air, `setup.tip_to_skin_mm` before the skin, bevel −1 or +1."""
-        if bevel not in (-1, 1):
-            raise CommandError("bevel", bevel, 1.0, "must be −1 or +1")
-        rest = np.zeros(self._model.nodes.size)
+    def start(self, roll: float = 0.0) -> State:
+        """Return the straight needle in air, `setup.tip_to_skin_mm` before the skin, rolled by `roll` (rad)."""
+        self._limits.check(np.zeros(MOVES), controls(1, roll=roll))
+        one: Lateral = 1.0 if self.scenario.setup.axes == 1 else 1.0 + 0.0j
+
+        def across(value: complex) -> Lateral:
+            return complex(value) if self.scenario.setup.axes == 2 else value.real
+
+        bevel, none, entry = turned(roll, one), 0.0 * one, self.scenario.entry
+        rest, slope = np.full(self._model.nodes.size, none), across(entry.slope)
         base, tip = (
-            nd.Pose(x, 0.0, 0.0) for x in (self.scenario.start_base_x, self.scenario.setup.start_tip_x)
+            nd.Pose(x, across(entry.lateral(x)), slope)
+            for x in (self.scenario.start_base_x, self.scenario.setup.start_tip_x)
         )
-        needle = nd.start(base, tip, float(bevel))
+        needle = nd.start(base, tip, bevel, across(self.scenario.guide_home))
         mesh = np.zeros(0)
-        state = State(self.scenario, self._model, needle, nd.Pose(0.0, 0.0, 0.0), rest, rest, mesh, 0.0)
-        return self._settled(state, self._model, math.nan)
+        clamp = nd.Pose(0.0, base.y, slope)
+        state = State(self.scenario, self._model, needle, clamp, rest, rest, mesh, 0.0, float(roll))
+        return self._settled(state, self._model, math.nan * one)
 
     def step(self, state: State, control: Control) -> State:
         """Return the state after one control step; CommandError, with the limit, if it is out of range."""
         instance("state", state, State, "begin with simulator.start()")
         instance("control", control, Control, "make one with flexneedle.Control(db_x=1.0)")
         self.check(state, control)
-        return self._carried_out(state, control.row()[None])[0]
+        return self._carried_out(state, np.array([control]))[0]
 
     def replay(self, state: State, controls: ArrayLike) -> tuple[State, Floats]:
-        """Carry out controls (m, 5), m ≥ 1, as repeated `step` does, but without limits.
+        """Carry out controls (m, 9), m ≥ 1, as repeated `step` does, but without limits.
 
-        Returns the state at the end and the tips (m, 3).
+        Returns the state at the end and the tips (m, 5).
         """
         self._own(state)
         return self._carried_out(state, np.array(controls, dtype=float))
 
-    def _carried_out(self, state: State, controls: Floats) -> tuple[State, Floats]:
-        out, work = insertion.outputs(1, len(controls)), self._work(state)
+    def _carried_out(self, state: State, rows: Floats) -> tuple[State, Floats]:
+        out, work = insertion.outputs(1, len(rows)), self._work(state)
         start = state.needle, state.rest, state.compression
-        needle = insertion.rollout(self._model, *start, *work, _commands(controls[None]), 0, 1, out)
-        return solved(state, self._model, needle, *work), _planar(out.tips[0])
+        driven = along_entry(self.scenario, rows)[None]
+        needle = insertion.rollout(self._model, *start, *work, driven, 0, 1, out)
+        turned = np.cumsum(np.append(state.roll, rows[:, ROLL:].sum(axis=1)))[
+            -1
+        ]  # in order, as repeated steps
+        return solved(replace(state, roll=float(turned)), self._model, needle, *work), out.tips[0]
 
     def adapted(self, adaptation: model.Adaptation) -> "Simulator":
         """Return this simulator with the constants that an observer has estimated, for states of the same scenario."""
@@ -118,39 +136,73 @@ class Simulator:
     def check(self, state: State, control: Control) -> None:
         """Raise CommandError, with value and limit, if `control` may not be applied to `state`."""
         self._own(state)
-        self._limits.check(state.travel, control.row()[None])
+        self._limits.check(state.travel, np.array([control]), state.roll)
 
-    def rollout(self, state: State, controls: ArrayLike, *, limits: bool = True) -> Rollout:
-        """Run each of N sequences from `state`; controls (N, m, 5): db_x, db_y, db_theta, dg_y, flip (−1 or +1).
+    def rollout(
+        self,
+        state: State,
+        controls: ArrayLike,
+        *,
+        limits: bool = True,
+        rough: bool = False,
+        deflection: bool = False,
+        shapes: bool = False,
+    ) -> Rollout:
+        """Run each of N sequences from `state`; controls (N, m, 9): the columns of `Control`.
 
-        Equal to repeated `step`, bit by bit; CommandError if any value is out of range. Without `limits` a step
-        may be longer than a command, and each is solved only to 1e-4 mm: for long predictions with little work.
+        Equal to repeated `step`, bit by bit; CommandError if any value is out of range. Without `limits` a step may be
+        longer than a command; a `rough` rollout solves each only to 1e-4 mm: for long predictions with little work.
         """
-        return Rollout(*self._rollout(state, controls, deflection=False, limits=limits)[:3])
+        self._own(state)
+        rows = np.array(controls, dtype=float)  # a copy: the kernel is compiled for writable arrays
+        if rows.ndim != 3 or rows.shape[2] != len(COLUMNS):
+            rule = f"must have shape (N, m, {len(COLUMNS)}), not {rows.shape}"
+            raise CommandError("controls", float(rows.ndim), 3.0, rule)
+        if limits:
+            self._limits.check(state.travel, rows, state.roll)
+        rows = along_entry(self.scenario, rows)
+        n, m = rows.shape[:2]
+        out = insertion.outputs(
+            n, m, deflection=deflection, nodes=self.scenario.needle.nodes if shapes else 0
+        )
+        start = state.needle, state.rest, state.compression
+        loose = self._model._replace(tolerance=_AHEAD_TOLERANCE_MM, slide=_AHEAD_TOLERANCE_MM)
+        constants = loose if rough else self._model
 
-    def rollout_with_deflection(self, state: State, controls: ArrayLike) -> tuple[Rollout, Floats]:
-        """`rollout`, and the mean square lateral deflection of the needle (N, m) in mm²."""
-        *arrays, deflection = self._rollout(state, controls, deflection=True)
-        return Rollout(*arrays), deflection
+        def run(first: int, last: int) -> None:
+            insertion.rollout(constants, *start, *self._work(state), rows, first, last, out)
+
+        threads = min(self.threads, n * m // _STEPS_WORTH_A_THREAD)
+        if threads <= 1:
+            run(0, n)
+        else:
+            edges = np.unique(np.linspace(0, n, threads * _CHUNKS_A_THREAD + 1).astype(int))
+            list(self._pool.map(run, edges[:-1], edges[1:]))
+        return Rollout(*out)
 
     def assimilate(
         self, state: State, tip: Sequence[float], points: Sequence[Sequence[float]] = ()
     ) -> Assimilation:
-        """Hold the tip at its measured y, and the needle at further measured (x, y), as essential conditions.
+        """Hold the tip at its measured lateral position, and the needle at further points, as essential conditions.
+
+        Positions are x, y and, in space, z.
 
         The last step is solved again, so a contact that it cut is on the measured path. Axial motion is
         rigid: x is not corrected, its innovation is returned. The next step releases the conditions;
         `state.reactions.tip_force` is the force (N) on the tip beyond `state.tip_load`.
         """
         self._own(state)
-        measured = np.array([_point(tip), *map(_point, points)])
+        axes = self.scenario.setup.axes
+        measured = np.array([_point(values, axes) for values in (tip, *points)])
         if not np.isfinite(measured).all():
             raise CommandError(
                 "measured position", float(measured[~np.isfinite(measured)][0]), 0.0, "must be finite"
             )
-        x, y = measured[1:][np.argsort(measured[1:, 0])].T
+        across = measured[:, 1] if axes == 1 else measured[:, 1] + 1j * measured[:, 2]
+        order = 1 + np.argsort(measured[1:, 0])
+        x = measured[order, 0]
         self._check_points(state, x)
-        after = self._assimilated(state, float(measured[0, 1]), x, y)
+        after = self._assimilated(state, across[0].item(), x, across[order])
         return Assimilation(after, float(measured[0, 0] - after.tip[0]))
 
     def energy_scale(self, depth: float) -> float:
@@ -169,7 +221,7 @@ class Simulator:
         """Read a state that `State.save` wrote; StateError with the differing key under another scenario."""
         return load_state(path, self.start())
 
-    def _assimilated(self, state: State, tip_y: float, x: Floats, y: Floats) -> State:
+    def _assimilated(self, state: State, tip_y: Lateral, x: Floats, y: nd.Laterals) -> State:
         place = self._model.nodes["x"].searchsorted(x)
         merged = self._model._replace(nodes=model.insert_essential(self._model.nodes, x))
         more = replace(
@@ -190,35 +242,9 @@ class Simulator:
                 )
                 raise CommandError("measured point x", float(value), high, rule)
 
-    def _settled(self, state: State, merged: model.Model, held: float) -> State:
+    def _settled(self, state: State, merged: model.Model, held: Lateral) -> State:
         work = self._work(state)
         return solved(state, merged, insertion.settle(merged, state.needle, *work, held), *work)
-
-    def _rollout(
-        self, state: State, controls: ArrayLike, *, deflection: bool, limits: bool = True
-    ) -> tuple[Any, ...]:
-        self._own(state)
-        u = np.array(controls, dtype=float)
-        if u.ndim != 3 or u.shape[2] != 5:
-            raise CommandError("controls", float(u.ndim), 3.0, f"must have shape (N, m, 5), not {u.shape}")
-        if limits:
-            self._limits.check(state.travel, u)
-        n, m = u.shape[:2]
-        out, commands = insertion.outputs(n, m, deflection=deflection), _commands(u)
-        start = state.needle, state.rest, state.compression
-        loose = self._model._replace(tolerance=_AHEAD_TOLERANCE_MM, slide=_AHEAD_TOLERANCE_MM)
-        constants = self._model if limits else loose
-
-        def run(first: int, last: int) -> None:
-            insertion.rollout(constants, *start, *self._work(state), commands, first, last, out)
-
-        threads = min(self.threads, n * m // _STEPS_WORTH_A_THREAD)
-        if threads <= 1:
-            run(0, n)
-        else:
-            edges = np.unique(np.linspace(0, n, threads * _CHUNKS_A_THREAD + 1).astype(int))
-            list(self._pool.map(run, edges[:-1], edges[1:]))
-        return _planar(out.tips), out.energy, out.converged, out.deflection
 
     def _own(self, state: State) -> None:
         if state.scenario is self.scenario:
@@ -243,11 +269,12 @@ def _restored(scenario: Scenario, threads: int, constants: model.Model) -> Simul
     return Simulator(scenario, threads, constants=constants)
 
 
-def _point(values: Sequence[float]) -> tuple[float, float]:
-    """Return (x, y) of a measured point; CommandError for any other number of coordinates."""
-    if len(values) != 2:
-        raise CommandError("coordinates of a measured point", len(values), 2, "must be 2, x and y in mm")
-    return float(values[0]), float(values[1])
+def _point(values: Sequence[float], axes: int) -> list[float]:
+    """Return the coordinates of a measured point; CommandError for any other number of them."""
+    if len(values) != 1 + axes:
+        rule = f"must be {1 + axes}, {', '.join('xyz'[: 1 + axes])} in mm"
+        raise CommandError("coordinates of a measured point", len(values), 1 + axes, rule)
+    return [float(value) for value in values]
 
 
 def _cores() -> int:
@@ -280,17 +307,3 @@ def _build_model(scenario: Scenario) -> model.Model:
         part=model.SKIN_PART * spacing,
         zone=model.SKIN_ZONE * spacing,
     )
-
-
-def _commands(controls: Floats) -> Floats:
-    """Commands (…, 9) of the kernels for controls (…, 5)."""
-    rows = np.zeros((*controls.shape[:-1], insertion.COMMAND_SIZE))
-    rows[..., [insertion.DB_X, insertion.DB_Y, insertion.DB_THETA, insertion.DG_Y]] = controls[..., :4]
-    rows[..., insertion.ROLL] = np.where(controls[..., 4] > 0.0, math.pi, 0.0)
-    return rows
-
-
-def _planar(tips: Floats) -> Floats:
-    """x, y, θ (…, 3) of poses in space."""
-    planar: Floats = tips[..., [0, 1, 3]]
-    return planar

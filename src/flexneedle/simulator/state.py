@@ -1,7 +1,8 @@
 """The state (X, C) of an insertion: a frozen value that can be compared, pickled, saved and loaded."""
 
 import json
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from io import BytesIO
@@ -16,13 +17,14 @@ from flexneedle.errors import StateError
 from flexneedle.files import replace_file
 from flexneedle.mechanics import insertion
 from flexneedle.mechanics import needle as nd
+from flexneedle.mechanics.lateral import lateral
 from flexneedle.mechanics.model import CONTACT, ESSENTIAL, Model
 from flexneedle.mechanics.needle import Laterals
 from flexneedle.mechanics.shape import beam_energy, equal_arc_nodes
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Floats
+from flexneedle.types import THETA, Floats, Lateral
 
-_MECHANICS = ("needle.", "setup.", "tissue", "contact.")  # the keys that a state depends on
+_MECHANICS = ("needle.", "setup.", "entry.", "tissue", "contact.")  # the keys that a state depends on
 _Array = TypeVar("_Array", bound=NDArray[Any])
 _Record = TypeVar("_Record", bound=tuple[Any, ...])
 _ACROSS = ("y", "slope", "shear", "moment", "force")
@@ -30,14 +32,15 @@ _ENERGIES = ("energy", "weighted")
 
 
 class Contacts(NamedTuple):
-    """Contact points of the cut channel, each (k,), by depth: x, rest_y, y (mm), stretch λ, whether active.
+    """Contact points of the cut channel by depth: x (k,), rest and present positions y, z (k, 2), mm; stretch λ (k,);
+    whether active (k,).
 
-    A point ahead of a tip that was pulled back is not active: it is undisplaced, y = rest_y and stretch 1.
+    A point ahead of a tip that was pulled back is not active: it is undisplaced, position = rest and stretch 1.
     """
 
     x: Floats
-    rest_y: Floats
-    y: Floats
+    rest: Floats
+    position: Floats
     stretch: Floats
     active: NDArray[np.bool_]
 
@@ -49,10 +52,10 @@ class Contacts(NamedTuple):
 class Reactions(NamedTuple):
     """Reactions on the needle: lateral forces (N) and the clamp's moment (N·mm), 0 where nothing holds it."""
 
-    base_force: float
-    base_moment: float
-    guide_force: float
-    tip_force: float
+    base_force: Lateral
+    base_moment: Lateral
+    guide_force: Lateral
+    tip_force: Lateral
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +64,8 @@ class State:
 
     needle, `rest` (k,) and `compression` (k,) are the input of the next step. clamp: part of the base pose that no
     command moved. `mesh` (j,) is the solution at the nodes behind the tip, measured points included: x; y, slope,
-    shear, moment and force on the needle; stored energy, the same times w_c. spring_energy: of the tip spring.
+    shear, moment and force on the needle; stored energy, the same times w_c. spring_energy: of the tip spring. roll:
+    the needle's angle about its axis, whole turns included; 0 bends the path towards +y, π/2 towards +z.
     """
 
     scenario: Scenario
@@ -72,38 +76,41 @@ class State:
     compression: Laterals
     mesh: NDArray[Any]
     spring_energy: float
+    roll: float
 
     @property
     def tip(self) -> Floats:
-        """Tip pose x, y, θ, shape (3,)."""
-        return np.array(self.needle.solution.tip)
+        """Tip pose x, y, z, θ, ψ, shape (5,)."""
+        return _row(self.needle.solution.tip)
 
     @property
     def base(self) -> Floats:
-        """Pose of the base clamp x, y, θ, shape (3,)."""
-        return np.array(self.needle.boundary.base)
+        """Pose of the base clamp x, y, z, θ, ψ, shape (5,)."""
+        return _row(self.needle.boundary.base)
 
     @property
     def travel(self) -> Floats:
-        """Sum of the commands since the start: base x, y (mm), base θ (rad) and guide (mm), shape (4,)."""
+        """Sum of the commands since the start: base x, y, z (mm), θ, ψ (rad) and guide y, z (mm), shape (7,)."""
         base, clamp = self.needle.boundary.base, self.clamp
         x = base.x - (self.scenario.start_base_x + clamp.x)
-        return np.array([x, base.y - clamp.y, base.slope - clamp.slope, self.guide])
+        guide = self.needle.boundary.guide - self.scenario.guide_home
+        across = base.y - clamp.y - self.scenario.entry.slope * x
+        return np.array([*_row(nd.Pose(x, across, base.slope - clamp.slope)), *_pair(guide)])
 
     @property
-    def guide(self) -> float:
-        """Lateral position of the guide (mm); 0 without a guide."""
-        return float(self.needle.boundary.guide.real)
+    def guide(self) -> Lateral:
+        """Position y, z of the guide (mm); 0 without a guide."""
+        return _pair(self.needle.boundary.guide)
 
     @property
-    def bevel(self) -> int:
-        """Bevel direction bvl, −1 or +1; +1 bends the path towards +y."""
-        return int(self.needle.boundary.bevel.real)
+    def bevel(self) -> complex:
+        """Direction of the bevel, a unit number y + iz; ±1 in the plane."""
+        return complex(self.needle.boundary.bevel)
 
     @property
-    def tip_load(self) -> float:
-        """Additional lateral force at the tip (N), estimated by an observer."""
-        return float(self.needle.boundary.load.real)
+    def tip_load(self) -> Lateral:
+        """Additional force y, z at the tip (N), estimated by an observer."""
+        return _pair(self.needle.boundary.load)
 
     @property
     def converged(self) -> bool:
@@ -122,10 +129,10 @@ class State:
 
     @cached_property
     def nodes(self) -> Floats:
-        """Needle state X: (n, 3) of x, y, θ at n equal arc lengths from base to tip."""
+        """Needle state X: poses (n, 5) at n equal arc lengths from base to tip: x, y, z, θ, ψ."""
         nodes = np.empty((self.scenario.needle.nodes, insertion.POSE_SIZE))
         equal_arc_nodes(*self._curve(), nodes)
-        return _frozen(nodes[:, [0, 1, 3]])
+        return _frozen(nodes)
 
     @cached_property
     def contacts(self) -> Contacts:
@@ -136,8 +143,8 @@ class State:
         compression = np.where(active, self.compression, 0.0)
         columns = (
             nodes["x"],
-            self.rest,
-            self.rest + compression,
+            _pairs(self.rest),
+            _pairs(self.rest + compression),
             1.0 - np.abs(compression) / nodes["height"],
             active,
         )
@@ -164,32 +171,35 @@ class State:
         """Forces of clamp, guide and held tip on the needle."""
         loads = self.needle.solution.loads
         guide = self.mesh["force"][self.mesh["x"] == self.scenario.setup.guide_x]
-        return Reactions(-loads.shear.real, -loads.moment.real, float(guide.sum()), loads.reaction.real)
+        forces = -loads.shear, -loads.moment, complex(guide.sum()), loads.reaction
+        return Reactions(*map(_pair, forces))
 
     def with_estimate(
         self,
         *,
         base_x: float | None = None,
-        base_y: float | None = None,
-        base_turn: float | None = None,
-        tip_load: float | None = None,
+        base: Sequence[float] | None = None,
+        slope: Sequence[float] | None = None,
+        tip_load: Sequence[float] | None = None,
     ) -> "State":
         """Return the state with an observer's corrections (mm, rad, N), which take effect in the next solve.
+
+        base, slope, tip_load: y and, in space, z.
 
         A corrected base position does not count as travel.
         """
         boundary, clamp = self.needle.boundary, self.clamp
         old = boundary.base
-        base = nd.Pose(
-            old.x if base_x is None else base_x,
-            old.y if base_y is None else base_y,
-            old.slope if base_turn is None else base_turn,
-        )
+
+        def across(now: complex, given: Sequence[float] | None) -> complex:
+            return now if given is None else lateral(now, *_both(given))
+
+        pose = nd.Pose(old.x if base_x is None else base_x, across(old.y, base), across(old.slope, slope))
         moved = nd.Pose(
-            clamp.x + (base.x - old.x), clamp.y + (base.y - old.y), clamp.slope + (base.slope - old.slope)
+            clamp.x + (pose.x - old.x), clamp.y + (pose.y - old.y), clamp.slope + (pose.slope - old.slope)
         )
-        load = boundary.load if tip_load is None else tip_load
-        needle = self.needle._replace(boundary=boundary._replace(base=base, load=load))
+        load = across(boundary.load, tip_load)
+        needle = self.needle._replace(boundary=boundary._replace(base=pose, load=load))
         return replace(self, needle=needle, clamp=moved)
 
     def save(self, path: str | Path) -> None:
@@ -205,7 +215,7 @@ class State:
             "rest": self.rest,
             "compression": self.compression,
             "mesh": self.mesh,
-            "spring_energy": np.array(self.spring_energy),
+            "ends": np.array([self.spring_energy, self.roll]),
         }
 
     def _curve(self) -> tuple[Floats, Laterals, Laterals]:
@@ -228,10 +238,15 @@ class State:
         return hash(self._bytes())
 
     def __repr__(self) -> str:
-        x, y, slope = self.tip
+        count = self.scenario.setup.axes
+        position = ", ".join(f"{value:.3f}" for value in self.tip[: 1 + count])
+        slope = ", ".join(f"{1e3 * value:.2f}" for value in self.tip[THETA : THETA + count])
+        guide = ", ".join(f"{value:.3f}" for value in self.guide[:count])
+        where = (
+            f"tip ({position}) mm, slope {slope} mrad, guide {guide} mm, roll {math.degrees(self.roll):.0f}°"
+        )
         ended = "converged" if self.converged else "NOT converged"
-        where = f"tip ({x:.3f}, {y:.3f}) mm, slope {1e3 * slope:.2f} mrad, guide {self.guide:.3f} mm"
-        return f"<State {where}, bevel {self.bevel:+d}, {self.strain_energy:.4g} mJ in the tissue, {ended}>"
+        return f"<State {where}, {self.strain_energy:.4g} mJ in the tissue, {ended}>"
 
 
 def mechanics_difference(one: Scenario, other: Scenario) -> str | None:
@@ -261,9 +276,29 @@ def load_state(path: str | Path, start: State) -> State:
     if {name: (array.dtype, array.ndim) for name, array in arrays.items()} != known:
         raise StateError(f"{path}: saved by another version of flexneedle")
     needle = _filled(start.needle, iter(arrays.pop("needle").tolist()))
-    clamp, energy = nd.Pose(*arrays.pop("clamp").tolist()), float(arrays.pop("spring_energy"))
+    clamp = nd.Pose(*arrays.pop("clamp").tolist())
+    energy, roll = arrays.pop("ends").tolist()
     parts = {name: _frozen(array) for name, array in arrays.items()}
-    return replace(start, needle=needle, clamp=clamp, spring_energy=energy, **parts)
+    return replace(start, needle=needle, clamp=clamp, spring_energy=energy, roll=roll, **parts)
+
+
+def _both(given: Sequence[float]) -> tuple[float, float]:
+    """y and z, 0 if it is not given."""
+    y, z = (*given, 0.0)[:2]
+    return y, z
+
+
+def _pair(value: complex) -> Lateral:
+    return float(value.real), float(value.imag)
+
+
+def _pairs(values: Laterals) -> Floats:
+    return np.stack([values.real, values.imag], axis=-1)
+
+
+def _row(pose: nd.Pose) -> Floats:
+    (y, z), (theta, psi) = _pair(pose.y), _pair(pose.slope)
+    return np.array([pose.x, y, z, theta, psi])
 
 
 def _flat(record: tuple[Any, ...]) -> list[Any]:

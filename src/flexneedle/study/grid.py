@@ -3,7 +3,7 @@
 import itertools
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -26,13 +26,15 @@ from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PLANTS
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.own import is_own
 from flexneedle.scenario.problems import Problem, printable, to_line
-from flexneedle.scenario.worlds import CASES, REAL, STRUCTURE, world
+from flexneedle.scenario.worlds import CASES, PLANE, REAL, RIGS, STRUCTURE, has_rig, world
 from flexneedle.study.spec import (
     ALL,
     LARGEST_SEED,
     SEED,
+    TARGET,
     WORLD,
     WORLD_CASE,
+    WORLD_RIG,
     Axis,
     StudyFile,
     base_of,
@@ -42,6 +44,7 @@ from flexneedle.study.spec import (
     settings_of,
 )
 from flexneedle.trace.plain import plain
+from flexneedle.types import Point
 
 _DEFAULTS = {
     "controller": DEFAULT,
@@ -56,12 +59,12 @@ _CHOICES = {
     "tracker": (SCENARIO_TRACKER,),
     "strategy": STRATEGIES,
     WORLD_CASE: CASES,
+    WORLD_RIG: RIGS,
 }
 _OWN = {"controller": controller_of, "plant": plant_of, "tracker": tracker_of}
 _MAX_INSERTIONS = 1_000_000
-_FURTHER_KEYS = (
-    f"; further keys of a study: {', '.join(_DEFAULTS)}, {WORLD_CASE}, as an axis also {SEED}, {WORLD}"
-)
+_KEYS = ", ".join((*_DEFAULTS, WORLD_CASE, WORLD_RIG))
+_FURTHER_KEYS = f"; further keys of a study: {_KEYS}, as an axis also {SEED}, {WORLD}"
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,8 @@ class GridPoint:
     """A point of the grid: the settings shared by its insertions.
 
     varied: values of the axes except target and world; target_number: index of the target in the study, or number of
-    the world; world: that number, None if the scenario is not a world; world_case: case of the world.
+    the world; world: that number, None if the scenario is not a world; world_case, world_rig: case and rig of the
+    world; with_reach: whether the reach of its insertions is computed.
     """
 
     scenario: Scenario
@@ -83,6 +87,8 @@ class GridPoint:
     varied: Mapping[str, Any]
     world: int | None = None
     world_case: str = ""
+    world_rig: str = ""
+    with_reach: bool = False
 
 
 @dataclass(frozen=True)
@@ -149,7 +155,10 @@ def _expanded(file: StudyFile, base: Scenario) -> Study:
     axes = {axis.key: _axis_values(axis) for axis in file.axes}
     seeds = tuple(axes.pop(SEED, ()))
     repeats = len(seeds) or file.repeats
-    total = math.prod((len(file.cases) or 1, repeats, *map(len, axes.values())))
+    targets = {case.name: case.targets for case in file.cases if case.targets is not None}
+    reaching = [case.name for case in file.cases if case.reach]
+    of_cases = sum(len(targets.get(case.name, [None])) for case in file.cases) or 1
+    total = math.prod((of_cases, repeats, *map(len, axes.values())))
     if total > _MAX_INSERTIONS:
         raise InputError(f"insertions = {total}: must be at most {_MAX_INSERTIONS}")
     fixed = _DEFAULTS | settings_of(file.values)
@@ -158,7 +167,8 @@ def _expanded(file: StudyFile, base: Scenario) -> Study:
     own = own_controllers(names["controller"])
     base = checked(base, *own)
     _check_without(file.without, base)
-    points = tuple(_points(base, dict.fromkeys(file.without), fixed, cases or {"": {}}, axes, own))
+    grid = _Grid(base, dict.fromkeys(file.without), fixed, cases or {"": {}}, targets, reaching, axes, own)
+    points = tuple(_points(grid))
     definition = {
         "name": file.name,
         "title": file.title,
@@ -166,6 +176,8 @@ def _expanded(file: StudyFile, base: Scenario) -> Study:
         "without": list(file.without),
         "values": fixed,
         "cases": cases,
+        "targets": targets,
+        "reach": reaching,
         "axes": axes,
         "repeats": repeats,
         "first_seed": file.first_seed,
@@ -201,44 +213,62 @@ def _check_without(keys: tuple[str, ...], base: Scenario) -> None:
             raise InputError(f"without = {json.dumps(key)}: not a key of the scenario")
 
 
-def _points(
-    base: Scenario,
-    left_out: Mapping[str, None],
-    fixed: Mapping[str, Any],
-    cases: Mapping[str, Mapping[str, Any]],
-    axes: Mapping[str, list[Any]],
-    own: tuple[Method, ...],
-) -> Iterator[GridPoint]:
-    """Yield the points: cases vary slowest, then the axes in order; later settings override earlier ones."""
-    targets: dict[tuple[float, float], int] = {}
+@dataclass(frozen=True)
+class _Grid:
+    """The parts of a grid: targets: those of a case by its name; reaching: cases with a reach."""
+
+    base: Scenario
+    left_out: Mapping[str, None]
+    fixed: Mapping[str, Any]
+    cases: Mapping[str, Mapping[str, Any]]
+    targets: Mapping[str, list[Any]]
+    reaching: Sequence[str]
+    axes: Mapping[str, list[Any]]
+    own: tuple[Method, ...]
+
+    def choices(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Each case and its values: cases vary slowest, then their targets, then the axes in order."""
+        for case in self.cases:
+            own = {TARGET: self.targets[case]} if case in self.targets else {}
+            axes = {**own, **self.axes}
+            for values in itertools.product(*axes.values()):
+                yield case, dict(zip(axes, values, strict=True))
+
+
+def _points(grid: _Grid) -> Iterator[GridPoint]:
+    """Yield the points; later settings override earlier ones."""
+    targets: dict[Point, int] = {}
     worlds = cache(world)  # the same worlds for every controller
-    for case, values in itertools.product(cases, itertools.product(*axes.values())):
-        chosen = dict(zip(axes, values, strict=True))
-        settings = {**fixed, **cases[case], **settings_of(chosen)}
+    for case, chosen in grid.choices():
+        settings = {**grid.fixed, **grid.cases[case], **settings_of(chosen)}
         named = {"case": case, **chosen} if case else chosen
         at = printable(", ".join(f"{key} = {value}" for key, value in named.items()))
         run = {key: settings.pop(key) for key in _DEFAULTS}
-        number, world_case = settings.pop(WORLD, None), settings.pop(WORLD_CASE, REAL)
-        _check_run(run | {WORLD_CASE: world_case})
-        if number is not None and _is_skipped(worlds(number), run["controller"], world_case):
+        number = settings.pop(WORLD, None)
+        kind = {WORLD_CASE: settings.pop(WORLD_CASE, REAL), WORLD_RIG: settings.pop(WORLD_RIG, PLANE)}
+        _check_run(run | kind)
+        if number is not None and _is_skipped(worlds(number), run["controller"], *kind.values()):
             continue
-        start = base if number is None else worlds(number, world_case)
-        scenario = _varied(start, {**left_out, **settings}, own, at)
+        start = grid.base if number is None else worlds(number, *kind.values())
+        scenario = _varied(start, {**grid.left_out, **settings}, grid.own, at)
         _check_guide(run, scenario, at)
         if number is None:
             number, of_world = targets.setdefault(scenario.target.position, len(targets)), {}
         else:
-            of_world = {WORLD: number, WORLD_CASE: world_case}
+            of_world = {WORLD: number, **kind}
         varied = {
             key: value for key, value in chosen.items() if key != WORLD and not key.startswith("target")
         }
-        yield GridPoint(scenario, case, **run, target_number=number, varied=varied, **of_world)
+        with_reach = bool(of_world) or case in grid.reaching
+        yield GridPoint(
+            scenario, case, **run, target_number=number, varied=varied, **of_world, with_reach=with_reach
+        )
 
 
-def _is_skipped(scenario: Scenario, controller: str, world_case: str) -> bool:
-    """Whether a world without a guide lacks this case, or the controller needs a guide."""
-    return not scenario.setup.has_guide and (
-        world_case == STRUCTURE or controller_of(controller)[1].needs_guide
+def _is_skipped(scenario: Scenario, controller: str, world_case: str, world_rig: str) -> bool:
+    """Whether a world has another guide than the rig, or none that this case or the controller needs."""
+    return not has_rig(scenario, world_rig) or (
+        not scenario.setup.has_guide and (world_case == STRUCTURE or controller_of(controller)[1].needs_guide)
     )
 
 

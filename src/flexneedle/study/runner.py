@@ -167,10 +167,10 @@ def _pending(study: Study, done: Container[int]) -> _Pending:
 
 
 def _reach_points(study: Study) -> set[int]:
-    """Return the points, by id, whose insertions also compute the reach: in worlds, the first with each truth."""
+    """Return the points, by id, whose insertions also compute the reach: the first with each truth."""
     first: dict[str, int] = {}
     for point in study.points:
-        if point.world is not None:
+        if point.with_reach:
             first.setdefault(truth_key(point), id(point))
     return set(first.values())
 

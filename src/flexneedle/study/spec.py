@@ -20,10 +20,10 @@ from flexneedle.scenario.sections.fields import Section, Title, count
 from flexneedle.scenario.worlds import LARGEST_WORLD
 
 SEED, ALL = "seed", "all"
-WORLD, WORLD_CASE = "world", "world_case"
-NAMED = ("controller", "plant", "strategy", WORLD_CASE)
-_TARGET = "target"
-_TARGET_KEYS = ("target.depth_mm", "target.lateral_mm")
+WORLD, WORLD_CASE, WORLD_RIG = "world", "world_case", "world_rig"
+NAMED = ("controller", "plant", "strategy", WORLD_CASE, WORLD_RIG)
+TARGET = "target"
+_TARGET_KEYS = ("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm")
 STUDIES = Library("a study file", "study", files(__package__) / "studies")
 _MAX_VALUES = 100_000
 LARGEST_SEED = 2**62
@@ -46,10 +46,11 @@ class Axis(Section):
     """One `[[axes]]`: a key and its values; axes are combined in all ways."""
 
     key: Annotated[str, AfterValidator(current_key)]
-    """A key of the scenario, or target, controller, plant, tracker, strategy, plan_seed, seed, world, world_case."""
+    """A key of the scenario, or target, controller, plant, tracker, strategy, plan_seed, seed, world, world_case,
+    world_rig."""
     values: Any
-    """A list; "all" for every controller, plant, strategy or case of a world; {from, count} for consecutive seeds or
-    worlds."""
+    """A list; "all" for every controller, plant, strategy, case or rig of a world; {from, count} for consecutive seeds
+    or worlds."""
 
     @model_validator(mode="after")
     def _check_values(self) -> "Axis":
@@ -64,10 +65,17 @@ class Case(Section):
     """Name in the column `case`."""
     values: dict[str, Any] = Field(default_factory=dict)
     """Values by dotted key; omitted: the base case."""
+    targets: Any = None
+    """Targets of the case, in place of an axis of targets: each [depth, y] or [depth, y, z] in mm."""
+    reach: bool = False
+    """Whether `reach_mm` is computed in this case, too, as in worlds."""
 
     @model_validator(mode="after")
     def _check_values(self) -> "Case":
         refuse(_settings_problems(self.values))
+        if self.targets is not None:
+            refuse(_value_problems(TARGET, self.targets, "targets"))
+            refuse(_target_twice(self.values))
         return self
 
 
@@ -132,29 +140,30 @@ def of_worlds(file: StudyFile, first: int, count: int) -> StudyFile:
 
 
 def settings_of(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values by dotted key; a target [depth, lateral] becomes the two keys of the scenario."""
+    """Return values by dotted key; a target [depth, y] or [depth, y, z] becomes the three keys of the scenario."""
     flat = {current_key(key): value for key, value in flatten(values).items()}
-    if _TARGET in flat:
-        flat |= dict(zip(_TARGET_KEYS, flat.pop(_TARGET), strict=True))
+    if TARGET in flat:
+        x, y, z = (*flat.pop(TARGET), 0.0)[:3]
+        flat |= dict(zip(_TARGET_KEYS, (x, y, z), strict=True))
     return flat
 
 
 def _keys_of(key: str) -> tuple[str, ...]:
     """Return the scenario keys of an axis."""
-    return _TARGET_KEYS if key == _TARGET else (key,)
+    return _TARGET_KEYS if key == TARGET else (key,)
 
 
-def _value_problems(key: str, values: Any) -> Iterator[Problem]:
+def _value_problems(key: str, values: Any, name: str = "values") -> Iterator[Problem]:
     if key in NAMED and values == ALL:
         return
     if key in _LARGEST and isinstance(values, dict):
         yield from _range_problems(values, _LARGEST[key])
     elif not isinstance(values, list) or not values:
-        yield Problem("values", values, "must be a list of at least one value")
+        yield Problem(name, values, "must be a list of at least one value")
     elif (twice := _twice(values)) is not None:
-        yield Problem("values", values, f"contains {twice!r} twice")
-    elif key == _TARGET:
-        yield from (problem for value in values for problem in _target_problems("values", value))
+        yield Problem(name, values, f"contains {twice!r} twice")
+    elif key == TARGET:
+        yield from (problem for value in values for problem in _target_problems(name, value))
     elif key in _LARGEST and not all(is_seed(value) and value <= _LARGEST[key] for value in values):
         yield Problem("values", values, f"must be whole numbers from 0 to {_LARGEST[key]}")
 
@@ -184,14 +193,21 @@ def _range_problems(values: dict[str, Any], largest: int) -> Iterator[Problem]:
 
 
 def _target_problems(key: str, value: Any) -> Iterator[Problem]:
-    if not isinstance(value, list) or len(value) != 2:
-        yield Problem(key, value, "must be two numbers, [depth, lateral] in mm")
+    if not isinstance(value, list) or len(value) not in (2, 3):
+        yield Problem(key, value, "must be two or three numbers, [depth, y] or [depth, y, z] in mm")
+
+
+def _target_twice(values: Mapping[str, Any]) -> Iterator[Problem]:
+    """Targets of a case that its values set, too."""
+    for key in settings_of(values):
+        if key in _TARGET_KEYS:
+            yield Problem(f"values.{key}", None, "also set by targets")
 
 
 def _settings_problems(values: Mapping[str, Any]) -> Iterator[Problem]:
     flat = flatten(values)
-    if _TARGET in flat:
-        yield from _target_problems(f"values.{_TARGET}", flat[_TARGET])
+    if TARGET in flat:
+        yield from _target_problems(f"values.{TARGET}", flat[TARGET])
     if SEED in flat:
         rule = "not allowed here: set seeds with first_seed and repeats, or with an axis"
         yield Problem(f"values.{SEED}", flat[SEED], rule)
@@ -215,6 +231,8 @@ def _key_problems(study: StudyFile) -> Iterator[Problem]:
         for key in settings_of(case.values):
             if key in axes:
                 yield Problem(f"cases.{number}.values", key, "also set by an axis")
+        if case.targets is not None and axes.keys() & {*_TARGET_KEYS, WORLD}:
+            yield Problem(f"cases.{number}.targets", None, "also set by an axis")
 
 
 def _seed_problems(study: StudyFile) -> Iterator[Problem]:
@@ -229,5 +247,7 @@ def _world_problems(study: StudyFile) -> Iterator[Problem]:
     if WORLD in axes:
         for key in sorted({"scenario", "without"} & study.model_fields_set):
             yield Problem(key, getattr(study, key), "remove it: an axis sets the worlds")
-    elif WORLD_CASE in axes.union(study.values, *(case.values for case in study.cases)):
-        yield Problem(WORLD_CASE, None, "needs an axis of worlds")
+    else:
+        for key in (WORLD_CASE, WORLD_RIG):
+            if key in axes.union(study.values, *(case.values for case in study.cases)):
+                yield Problem(key, None, "needs an axis of worlds")

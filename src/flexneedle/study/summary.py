@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
+from flexneedle.study.coverage import columns_of, covered
 from flexneedle.study.grid import Study
 from flexneedle.study.tables import RUNS_FILE, TIMING_FILE
 from flexneedle.trace.plain import plain
+from flexneedle.trace.results import DEPTH_FRACTIONS, PREDICTED_PARTS
 
 _ENERGY, _PLANNED_ENERGY = "strain_energy_mj", "planned_strain_energy_mj"
 _WITHIN_REACH_MM = 1.0
@@ -22,10 +25,11 @@ def summarise(folder: Path, study: Study) -> dict[str, Any]:
     """Return outcomes, errors (mm), bevel flips, energy (mJ), periods and times (s) of a study folder as plain values.
 
     Statistics are over finished insertions with a known value, as in the report; unconverged periods are counted
-    over all insertions; failures are insertions that did not finish although the reach was at most 1 mm (all that
-    did not finish if the reach is unknown). `first_failure`: outcome and reason of the first insertion that did not
-    finish, or None. Groups are the combinations of cases and axis values, except targets, worlds and seeds; a study
-    without any has no groups.
+    over all insertions; coverage is the share of final tips, and of needles at half of the target's depth, within 1.96
+    standard deviations of the prediction at each fraction of the depth; failures are insertions that did not finish
+    although the reach was at most 1 mm (all that did not finish if the reach is unknown). `first_failure`: outcome and
+    reason of the first insertion that did not finish, or None. Groups are the combinations of cases and axis values,
+    except targets, worlds and seeds; a study without any has no groups.
     """
     columns = ["index", "outcome", "true_error_mm", "residual_mm", "flips", "planned_flips", _ENERGY]
     columns += [
@@ -36,6 +40,7 @@ def summarise(folder: Path, study: Study) -> dict[str, Any]:
         "reach_mm",
         "reason",
         _LIMIT,
+        *(name for part in PREDICTED_PARTS for axes in columns_of(part) for name in axes),
     ]
     rows = pq.read_table(folder / RUNS_FILE, columns=columns).to_pylist()
     result: dict[str, Any] = plain(
@@ -102,7 +107,17 @@ def _statistics(members: Sequence[_Row]) -> dict[str, Any]:
         "energy_ratio": _mean(rows, _ENERGY) / _mean(rows, _PLANNED_ENERGY),
         "period_ratio": _spread([_ratio(row["periods"], row["planned_periods"]) for row in rows]),
         "unconverged_periods": sum(row["unconverged_periods"] or 0 for row in members),
+        "coverage": {
+            part: dict(zip(DEPTH_FRACTIONS, covered(_deviations(rows, part)), strict=True))
+            for part in PREDICTED_PARTS
+        },
     }
+
+
+def _deviations(rows: Sequence[_Row], part: str) -> NDArray[np.float64]:
+    """The deviations (3, 2, n) of tip or middle from the predictions, NaN where unknown."""
+    values = [[[row[name] for row in rows] for name in axes] for axes in columns_of(part)]
+    return np.array(values, dtype=float).reshape(len(values), len(values[0]), len(rows))
 
 
 def _mean(rows: Sequence[_Row], name: str) -> float:

@@ -25,12 +25,14 @@ _CONDITIONS: dict[str, tuple[type, Callable[[StudyInsertion, str], Any]]] = {
     "strategy": (str, lambda insertion, _: insertion.point.strategy),
     "target_depth_mm": (float, lambda insertion, _: insertion.point.scenario.target.depth_mm),
     "target_lateral_mm": (float, lambda insertion, _: insertion.point.scenario.target.lateral_mm),
+    "target_lateral_z_mm": (float, lambda insertion, _: insertion.point.scenario.target.lateral_z_mm),
     "seed": (int, lambda insertion, _: insertion.seed),
     "plan_seed": (int, lambda insertion, _: insertion.point.plan_seed),
     "repeat": (int, lambda insertion, _: insertion.repeat),
     "plan": (str, lambda _, plan: plan),
     "world": (int, lambda insertion, _: insertion.point.world),
     "world_case": (str, lambda insertion, _: insertion.point.world_case),
+    "world_rig": (str, lambda insertion, _: insertion.point.world_rig),
 }
 _TIMING = {"index": int, "plan": str, "plan_s": float, **TIMES}
 
@@ -56,7 +58,7 @@ def _with_reach(
     insertions: Sequence[StudyInsertion], results: Sequence[Mapping[str, Any]]
 ) -> list[Mapping[str, Any]]:
     """Return the results, each with the reach that was computed for the same truth."""
-    digests = {id(i.point): "" if i.point.world is None else truth_key(i.point) for i in insertions}
+    digests = {id(i.point): truth_key(i.point) if i.point.with_reach else "" for i in insertions}
     keys = [(digests[id(insertion.point)], insertion.seed) for insertion in insertions]
     known = {
         key: row["reach_mm"] for key, row in zip(keys, results, strict=True) if row["reach_mm"] is not None

@@ -9,7 +9,19 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from flexneedle.types import Action, CheckedMeasurement, Floats, Measurement, Period, Verdict, VerdictKind
+from flexneedle.trace.planar import row_in_space
+from flexneedle.types import COLUMNS as CONTROL
+from flexneedle.types import (
+    Action,
+    CheckedMeasurement,
+    Control,
+    Floats,
+    Measurement,
+    Period,
+    Pose,
+    Verdict,
+    VerdictKind,
+)
 
 _Scalar = Callable[[str], Any]
 
@@ -25,12 +37,12 @@ def _flag(value: object) -> bool:
 
 
 def _command(name: str) -> tuple[tuple[str, _Scalar], ...]:
-    moves = ("db_x_mm", "db_y_mm", "db_theta_rad", "dg_y_mm")
-    return (*((f"{name}_{move}", float) for move in moves), (f"{name}_flip", int))
+    angles = ("db_theta", "db_psi", "roll", "spin")
+    return tuple((f"{name}_{column}_{'rad' if column in angles else 'mm'}", float) for column in CONTROL)
 
 
 def _pose(name: str) -> tuple[tuple[str, _Scalar], ...]:
-    return tuple((f"{name}_{part}", float) for part in ("x_mm", "y_mm", "theta_rad"))
+    return tuple((f"{name}_{part}", float) for part in ("x_mm", "y_mm", "z_mm", "theta_rad", "psi_rad"))
 
 
 _TEXTS = (str, verdict_of, Action)
@@ -43,19 +55,19 @@ _FIELDS: dict[str, tuple[tuple[str, _Scalar], ...]] = {
     "applied": _command("applied"),
     "measurement": tuple((f"measured_{part}", float) for part in ("time_s", "x_mm", "y_mm", "z_mm")),
     "verdict": (("verdict", verdict_of),),
-    "innovation": (("innovation_x_mm", float), ("innovation_y_mm", float)),
+    "innovation": tuple((f"innovation_{axis}_mm", float) for axis in "xyz"),
     "estimate": _pose("estimate"),
     "base": _pose("base"),
-    "guide": (("guide_y_mm", float),),
-    "bevel": (("bevel", int),),
+    "guide": (("guide_y_mm", float), ("guide_z_mm", float)),
+    "roll": (("roll_rad", float),),
     "strain_energy": (("strain_energy_mj", float),),
-    "tip_load": (("tip_load_n", float),),
+    "tip_load": (("tip_load_y_n", float), ("tip_load_z_n", float)),
     "path": _pose("path"),
     "cost": (("cost", float),),
     "spread": (("spread_mm", float),),
     "action": (("action", Action),),
     "decision": (("decision", str),),
-    "miss": (("miss_mm", float),),
+    "miss": (("miss_y_mm", float), ("miss_z_mm", float)),
     "miss_sd": (("miss_sd_mm", float),),
     "warning": (("warning", str),),
     "true_tip": _pose("true"),
@@ -67,8 +79,11 @@ _FIELDS: dict[str, tuple[tuple[str, _Scalar], ...]] = {
 COLUMNS: tuple[str, ...] = tuple(name for columns in _FIELDS.values() for name, _ in columns)
 """Names of the columns, in order."""
 
-# Columns by their names in traces of earlier versions.
-_RENAMED = {name.replace("measured_", "sample_"): name for name, _ in _FIELDS["measurement"]}
+_KINDS: dict[str, Callable[..., Any]] = {
+    **dict.fromkeys(("command", "applied"), Control),
+    **dict.fromkeys(("estimate", "base", "path", "true_tip"), Pose),
+    "measurement": Measurement,
+}
 
 
 def to_row(period: Period) -> dict[str, str]:
@@ -88,7 +103,7 @@ def from_row(
     readings: tuple[CheckedMeasurement, ...] = (),
 ) -> Period:
     """Return the period of a row and of the values not in it; raises KeyError or ValueError for other rows."""
-    row = {_RENAMED.get(name, name): text for name, text in row.items()}
+    row = row_in_space(row)
     values = {field: _value(field, row) for field in _FIELDS}
     return Period(shape=shape, durations=durations, readings=readings, **values)
 
@@ -110,8 +125,8 @@ def _text(value: Any) -> str:
 
 def _value(field: str, row: Mapping[str, str]) -> Any:
     parts: Any = tuple(kind(row[name]) if row[name] or kind is str else None for name, kind in _FIELDS[field])
-    if field == "measurement":
-        return Measurement(*parts)
     if len(parts) == 1:
         return parts[0]
-    return parts if parts[0] is not None else None
+    if parts[0] is None:
+        return None
+    return _KINDS[field](*parts) if field in _KINDS else parts

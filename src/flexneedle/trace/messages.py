@@ -1,7 +1,7 @@
-"""ROS 2 messages of a run: standard types, SI units (m, rad, s, J, N), planar poses in the frame `skin`.
+"""ROS 2 messages of a run: standard types, SI units (m, rad, s, J, N), poses in the frame `skin`.
 
-The frame `skin` has its origin at the intersection of the insertion axis with the skin, x into the tissue, y lateral,
-z by the right-hand rule. Time is that of the run and starts at 0.
+The frame `skin` has its origin at the intersection of the insertion axis with the skin, x into the tissue, y and z
+across it, right-handed. Time is that of the run and starts at 0.
 """
 
 from collections.abc import Iterable, Mapping
@@ -12,13 +12,13 @@ import numpy as np
 import rosbags.typesys.stores.ros2_humble as ros
 from rosbags.typesys import Stores, get_typestore
 
-from flexneedle.types import Floats, Pose
+from flexneedle.types import Floats, Point, Pose
 
 Time = ros.builtin_interfaces__msg__Time
 DiagnosticArray = ros.diagnostic_msgs__msg__DiagnosticArray
 DiagnosticStatus = ros.diagnostic_msgs__msg__DiagnosticStatus
 KeyValue = ros.diagnostic_msgs__msg__KeyValue
-Point = ros.geometry_msgs__msg__Point
+PointMessage = ros.geometry_msgs__msg__Point
 PoseMessage = ros.geometry_msgs__msg__Pose
 PoseStamped = ros.geometry_msgs__msg__PoseStamped
 Quaternion = ros.geometry_msgs__msg__Quaternion
@@ -27,10 +27,14 @@ Vector3Stamped = ros.geometry_msgs__msg__Vector3Stamped
 Path = ros.nav_msgs__msg__Path
 JointState = ros.sensor_msgs__msg__JointState
 Float64 = ros.std_msgs__msg__Float64
+Float64MultiArray = ros.std_msgs__msg__Float64MultiArray
+MultiArrayDimension = ros.std_msgs__msg__MultiArrayDimension
+MultiArrayLayout = ros.std_msgs__msg__MultiArrayLayout
 Header = ros.std_msgs__msg__Header
 
 FRAME = "skin"
-JOINTS = ["base_x", "base_y", "base_theta", "guide_y", "bevel"]
+JOINTS = ["base_x", "base_y", "base_z", "base_theta", "base_psi", "guide_y", "guide_z", "roll"]
+_METRES = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, 1e-3, 1e-3, 1.0])
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
@@ -43,7 +47,7 @@ class Check:
     values: Mapping[str, str]
 
 
-Message = PoseStamped | Path | JointState | Float64 | Vector3Stamped | DiagnosticArray
+Message = PoseStamped | Path | JointState | Float64 | Float64MultiArray | Vector3Stamped | DiagnosticArray
 
 
 def nanoseconds(time: float) -> int:
@@ -52,25 +56,29 @@ def nanoseconds(time: float) -> int:
 
 
 def pose(time: float, at: Pose) -> PoseStamped:
-    """Return a planar pose (mm, mm, rad) at a time (s)."""
+    """Return a pose at a time (s)."""
     return _pose_stamped(_header(time), at)
 
 
 def path(time: float, poses: Floats) -> Path:
-    """Return poses (n, 3) (mm, mm, rad), all with the same time (s)."""
+    """Return poses (n, 5), all with the same time (s)."""
     header = _header(time)
-    return Path(header, [_pose_stamped(header, (x, y, theta)) for x, y, theta in poses.tolist()])
+    return Path(header, [_pose_stamped(header, Pose.of(row)) for row in poses.tolist()])
 
 
-def points_of(message: Path) -> Floats:
-    """Return the poses (n, 3) (mm, mm, rad) of a path."""
-    return np.array([_planar(stamped.pose) for stamped in message.poses]).reshape(-1, 3)
+def points(time: float, places: Floats) -> Path:
+    """Return points (n, 3) as poses without an angle."""
+    return path(time, np.pad(places, ((0, 0), (0, 2))))
+
+
+def poses_of(message: Path) -> Floats:
+    """Return the poses (n, 5) of a path."""
+    return np.array([_row(stamped.pose) for stamped in message.poses]).reshape(-1, 5)
 
 
 def joints(time: float, values: Iterable[float]) -> JointState:
-    """Return base_x, base_y, base_theta, guide_y, bevel (mm, mm, rad, mm, ±1) as joint positions."""
-    base_x, base_y, base_theta, guide_y, bevel = values
-    position = np.array([base_x * 1e-3, base_y * 1e-3, base_theta, guide_y * 1e-3, bevel])
+    """Return values (mm, rad) of JOINTS as joint positions."""
+    position = np.array([*values]) * _METRES
     return JointState(_header(time), JOINTS, position, np.empty(0), np.empty(0))
 
 
@@ -79,9 +87,21 @@ def number(value: float) -> Float64:
     return Float64(float(value))
 
 
-def vector(time: float, x: float, y: float) -> Vector3Stamped:
-    """Return a planar vector (mm)."""
-    return Vector3Stamped(_header(time), Vector3(float(x) * 1e-3, float(y) * 1e-3, 0.0))
+def table(values: Floats) -> Float64MultiArray:
+    """Return lengths (n, k) in mm as an array of rows."""
+    rows, columns = values.shape
+    sizes = [MultiArrayDimension("node", rows, rows * columns), MultiArrayDimension("axis", columns, columns)]
+    return Float64MultiArray(MultiArrayLayout(sizes, 0), 1e-3 * values.ravel())
+
+
+def values_of(message: Float64MultiArray) -> Floats:
+    """Return the lengths (n, k), mm, of an array of rows."""
+    return 1e3 * message.data.reshape([size.size for size in message.layout.dim])
+
+
+def vector(time: float, at: Point) -> Vector3Stamped:
+    """Return a vector (mm)."""
+    return Vector3Stamped(_header(time), Vector3(*(float(value) * 1e-3 for value in at)))
 
 
 def diagnostics(
@@ -108,10 +128,13 @@ def _header(time: float) -> Header:
 
 
 def _pose_stamped(header: Header, at: Pose) -> PoseStamped:
-    x, y, theta = at
-    quaternion = Quaternion(0.0, 0.0, sin(theta / 2), cos(theta / 2))
-    return PoseStamped(header, PoseMessage(Point(x * 1e-3, y * 1e-3, 0.0), quaternion))
+    """The needle's x axis turned by θ about z, then by −ψ about y."""
+    position = PointMessage(at.x * 1e-3, at.y * 1e-3, at.z * 1e-3)
+    (sz, cz), (sy, cy) = ((sin(angle / 2), cos(angle / 2)) for angle in (at.theta, -at.psi))
+    return PoseStamped(header, PoseMessage(position, Quaternion(-sz * sy, cz * sy, sz * cy, cz * cy)))
 
 
-def _planar(at: PoseMessage) -> Pose:
-    return at.position.x * 1e3, at.position.y * 1e3, 2 * float(np.arctan2(at.orientation.z, at.orientation.w))
+def _row(at: PoseMessage) -> list[float]:
+    turn = at.orientation
+    theta, psi = 2 * float(np.arctan2(turn.z, turn.w)), 2 * float(np.arctan2(-turn.y, turn.w))
+    return [at.position.x * 1e3, at.position.y * 1e3, at.position.z * 1e3, theta, psi]

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from flexneedle.types import Plan
+from flexneedle.trace.planar import plan_in_space
+from flexneedle.types import COLUMNS, Plan
 
 _ARRAYS = ("controls", "tips", "strain_energy", "guide", "shapes")
 _STORED_ELSEWHERE = ("seconds", "scenario")
@@ -39,10 +40,11 @@ def plan_values(plan: Plan) -> dict[str, Any]:
 
 def plan_from_values(values: Mapping[str, Any]) -> Plan:
     """Return the plan of `plan_values`; raises KeyError, TypeError or ValueError for other values."""
+    values = values if "roll" in values else plan_in_space(values)
     given = {**values, **{name: np.array(values[name], dtype=float) for name in _ARRAYS}}
-    given["controls"] = given["controls"].reshape(-1, 5)
-    x, y = values["target"]
-    return Plan(**{**given, "target": (x, y), "history": tuple(values["history"])})
+    given["controls"] = given["controls"].reshape(-1, len(COLUMNS))
+    x, y, z = values["target"]
+    return Plan(**{**given, "target": (x, y, z), "history": tuple(values["history"])})
 
 
 def to_text(values: Mapping[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from struct import error as StructError
 from typing import Any
@@ -14,11 +14,27 @@ from mcap.stream_reader import CRCValidationError, StreamReader
 
 from flexneedle.errors import InputError
 from flexneedle.trace.columns import from_row, verdict_of
-from flexneedle.trace.messages import STORE, DiagnosticArray, DiagnosticStatus, points_of
+from flexneedle.trace.messages import (
+    STORE,
+    DiagnosticArray,
+    DiagnosticStatus,
+    Float64MultiArray,
+    poses_of,
+    values_of,
+)
 from flexneedle.trace.messages import Path as PathMessage
 from flexneedle.trace.readings import from_values
-from flexneedle.trace.topics import READINGS, SHAPE, STATUS, TIMING, TOPICS
-from flexneedle.types import CheckedMeasurement, Floats, Period
+from flexneedle.trace.topics import (
+    PREDICTED,
+    PREDICTED_SD,
+    READINGS,
+    SHAPE,
+    STATUS,
+    TIMING,
+    TOPICS,
+    TRUE_SHAPE,
+)
+from flexneedle.types import CheckedMeasurement, Floats, Period, Shape, Z
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +81,10 @@ class _Collector:
         self.about: dict[str, str] | None = None
         self.scenario: dict[str, Any] = {}
         self._topics: dict[int, str] = {}
-        self._shape: Floats = np.empty((0, 3))
+        self._shape: Floats = np.empty((0, 5))
+        self._nodes: Floats = np.empty((0, 5))
+        self._predicted: Shape | None = None
+        self._true_shape: Floats | None = None
         self._durations: dict[str, float] = {}
         self._readings: tuple[CheckedMeasurement, ...] = ()
 
@@ -81,11 +100,17 @@ class _Collector:
             self.scenario = json.loads(record.data)
 
     def _add_message(self, topic: str, data: bytes) -> None:
-        if topic not in (SHAPE, READINGS, TIMING, STATUS):
+        if topic not in (SHAPE, PREDICTED, PREDICTED_SD, TRUE_SHAPE, READINGS, TIMING, STATUS):
             return
         message = STORE.deserialize_cdr(data, TOPICS[topic])
-        if isinstance(message, PathMessage):
-            self._shape = points_of(message)
+        if isinstance(message, PathMessage) and topic == SHAPE:
+            self._shape, self._predicted, self._true_shape = poses_of(message), None, None
+        elif isinstance(message, PathMessage) and topic == TRUE_SHAPE:
+            self._true_shape = poses_of(message)[:, : Z + 1]
+        elif isinstance(message, PathMessage):
+            self._nodes = poses_of(message)
+        elif isinstance(message, Float64MultiArray):
+            self._predicted = Shape(self._nodes, values_of(message))
         elif isinstance(message, DiagnosticArray) and topic == TIMING:
             self._durations = {name[:-2]: float(value) for name, value in _pairs(message.status[0])}
         elif isinstance(message, DiagnosticArray) and topic == READINGS:
@@ -94,7 +119,8 @@ class _Collector:
             )
         elif isinstance(message, DiagnosticArray):
             row = dict(_pairs(message.status[0]))
-            self.periods.append(from_row(row, self._shape, self._durations, self._readings))
+            period = from_row(row, self._shape, self._durations, self._readings)
+            self.periods.append(replace(period, predicted=self._predicted, true_shape=self._true_shape))
 
 
 def _pairs(status: DiagnosticStatus) -> Iterator[tuple[str, str]]:

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from math import isnan
+from math import hypot, isnan
 from typing import Any
 
 import numpy as np
 
 from flexneedle.trace.plain import plain
-from flexneedle.types import Insertion, Outcome, Period, Plan
+from flexneedle.types import Insertion, Outcome, Period, Plan, X
 
 RESULT_KEYS = (
     *("controller", "phantom", "target_mm", "tip_true_mm", "tip_measured_mm", "true_error_mm", "residual_mm"),
@@ -18,7 +18,9 @@ RESULT_KEYS = (
 )
 """Keys of the result of an insertion, in order."""
 DEPTH_FRACTIONS = {"quarter": 0.25, "half": 0.5, "three_quarters": 0.75}
-"""Fractions of the target depth at which the predicted miss is recorded, by name."""
+"""Fractions of the target depth at which the predictions are recorded, by name."""
+PREDICTED_PARTS = ("tip", "middle")
+LATERAL_AXES = ("y", "z")
 _OF_PERIODS = ("p50", "p99", "max")
 NO_TIMING = {"plan_seconds": None, "period_ms": dict.fromkeys(_OF_PERIODS)}
 """Times of an insertion that was refused before planning."""
@@ -50,22 +52,82 @@ def _true_state(insertion: Insertion, name: str) -> Any:
     return getattr(_last(insertion), name, None)
 
 
-def _predicted(insertion: Insertion, name: str, depth_fraction: float) -> float | None:
-    """`miss` or `miss_sd` (mm) of the first prediction with the estimated tip at this fraction of the target depth."""
+def sds_column(fraction: str, part: str, axis: str) -> str:
+    """Name of the column of a deviation from the prediction: a fraction of the depth, tip or middle, y or z."""
+    return f"predicted_{fraction}_{part}_{axis}_sds"
+
+
+def _prediction(insertion: Insertion, depth_fraction: float) -> Period | None:
+    """The first period with a prediction and the estimated tip at this fraction of the target depth."""
     depth = depth_fraction * insertion.target[0]
-    predictions = (p for p in insertion.periods if p.estimate[0] >= depth and not isnan(p.miss))
-    first = next(predictions, None)
-    return None if first is None else getattr(first, name)
+    predicting = (p for p in insertion.periods if p.predicted is not None or not isnan(p.miss[0]))
+    return next((period for period in predicting if period.estimate.x >= depth), None)
+
+
+def _predicted_miss(insertion: Insertion, axis: int, fraction: float) -> float | None:
+    found = _prediction(insertion, fraction)
+    return None if found is None else found.miss[axis]
+
+
+def _predicted_sd(insertion: Insertion, fraction: float) -> float | None:
+    found = _prediction(insertion, fraction)
+    return None if found is None else found.miss_sd
+
+
+def _tip_sds(insertion: Insertion, axis: int, fraction: float) -> float | None:
+    """Deviation of the final true tip from the predicted one, in its standard deviations.
+
+    It is predicted by the miss, or else by the end of the predicted shape.
+    """
+    found, last = _prediction(insertion, fraction), _at_target(insertion)
+    if found is None or last is None or last.true_tip is None:
+        return None
+    true = last.true_tip[1 + axis]
+    if not isnan(found.miss[0]):
+        return _in_sds(insertion, axis, true - insertion.target[1 + axis] - found.miss[axis], found.miss_sd)
+    if found.predicted is None:
+        return None
+    nodes, sd = found.predicted
+    return _in_sds(insertion, axis, true - float(nodes[-1, 1 + axis]), float(sd[-1, axis]))
+
+
+def _middle_sds(insertion: Insertion, axis: int, fraction: float) -> float | None:
+    """As `_tip_sds`, of the needle at half of the target's depth."""
+    found, last = _prediction(insertion, fraction), _at_target(insertion)
+    if found is None or found.predicted is None or last is None or last.true_shape is None:
+        return None
+    middle, (nodes, sd) = 0.5 * insertion.target[0], found.predicted
+    true = np.interp(middle, last.true_shape[:, X], last.true_shape[:, 1 + axis])
+    predicted, deviation = (
+        np.interp(middle, nodes[:, X], of[:, at]) for of, at in ((nodes, 1 + axis), (sd, axis))
+    )
+    return _in_sds(insertion, axis, float(true - predicted), float(deviation))
+
+
+def _at_target(insertion: Insertion) -> Period | None:
+    """The last period of an insertion that is done."""
+    return _last(insertion) if insertion.outcome is Outcome.DONE else None
+
+
+def _in_sds(insertion: Insertion, axis: int, deviation: float, sd: float) -> float | None:
+    """A deviation in standard deviations; None out of the plane of a needle in the plane."""
+    scenario = insertion.scenario or insertion.plan.scenario
+    axes = 1 if scenario is None else scenario.setup.axes
+    return deviation / sd if axis < axes and sd > 0.0 else None
 
 
 def _prediction_columns() -> dict[str, ResultColumn]:
-    return {
-        f"predicted_{name}{suffix}_mm": ResultColumn(
-            float, of_insertion=partial(_predicted, name=field, depth_fraction=fraction)
-        )
-        for name, fraction in DEPTH_FRACTIONS.items()
-        for suffix, field in (("", "miss"), ("_sd", "miss_sd"))
-    }
+    """Predicted miss and its standard deviation, then the deviations from the prediction."""
+    columns: dict[str, Callable[[Insertion], Any]] = {}
+    for name, fraction in DEPTH_FRACTIONS.items():
+        for k, axis in enumerate(LATERAL_AXES):
+            columns[f"predicted_{name}_{axis}_mm"] = partial(_predicted_miss, axis=k, fraction=fraction)
+        columns[f"predicted_{name}_sd_mm"] = partial(_predicted_sd, fraction=fraction)
+    for name, fraction in DEPTH_FRACTIONS.items():
+        for part, sds in zip(PREDICTED_PARTS, (_tip_sds, _middle_sds), strict=True):
+            for k, axis in enumerate(LATERAL_AXES):
+                columns[sds_column(name, part, axis)] = partial(sds, axis=k, fraction=fraction)
+    return {name: ResultColumn(float, of_insertion=value) for name, value in columns.items()}
 
 
 RESULT_COLUMNS: dict[str, ResultColumn] = {
@@ -73,12 +135,15 @@ RESULT_COLUMNS: dict[str, ResultColumn] = {
     "residual_mm": ResultColumn(float, of_insertion=lambda i: i.residual_mm),
     "tip_x_mm": ResultColumn(float, of_insertion=partial(_true_tip, axis=0)),
     "tip_y_mm": ResultColumn(float, of_insertion=partial(_true_tip, axis=1)),
+    "tip_z_mm": ResultColumn(float, of_insertion=partial(_true_tip, axis=2)),
     "flips": ResultColumn(int, of_insertion=lambda i: i.flips),
     "planned_flips": ResultColumn(int, of_plan=lambda plan: plan.flips),
     "strain_energy_mj": ResultColumn(float, of_insertion=partial(_true_state, name="true_strain_energy")),
     "planned_strain_energy_mj": ResultColumn(float, of_plan=lambda plan: plan.strain_energy_mj),
     "planned_error_mm": ResultColumn(float, of_plan=lambda plan: plan.error_mm),
-    "guide_travel_mm": ResultColumn(float, of_insertion=lambda i: sum(abs(p.applied[3]) for p in i.periods)),
+    "guide_travel_mm": ResultColumn(
+        float, of_insertion=lambda i: sum(hypot(p.applied.dg_y, p.applied.dg_z) for p in i.periods)
+    ),
     "peak_stretch": ResultColumn(float, of_insertion=partial(_true_state, name="true_stretch")),
     "periods": ResultColumn(int, of_insertion=lambda i: len(i.periods)),
     "planned_periods": ResultColumn(int, of_plan=lambda plan: len(plan.controls)),
@@ -95,7 +160,8 @@ RESULT_COLUMNS: dict[str, ResultColumn] = {
 """Columns of the results of an insertion in the table of a study, in order.
 
 predicted_…: lateral miss predicted by the controller with the tip at that fraction of the target depth, and its
-standard deviation.
+standard deviation; predicted_…_sds: deviation from this prediction, in standard deviations, of the final true tip and
+of the final true needle at half of the target's depth.
 """
 
 
@@ -138,7 +204,7 @@ def plan_timing(plan: Plan) -> dict[str, Any]:
 def insertion_result(insertion: Insertion) -> dict[str, Any]:
     """Return the result of an insertion; unknown values are None."""
     row = insertion_row(insertion)
-    tip = row["tip_x_mm"], row["tip_y_mm"]
+    tip = row["tip_x_mm"], row["tip_y_mm"], row["tip_z_mm"]
     values = row | {
         "controller": insertion.controller,
         "phantom": insertion.phantom or None,
@@ -158,7 +224,7 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
 def refused_result(*, target: Sequence[float] | None, reason: str, seed: int, **parts: str) -> dict[str, Any]:
     """Return the result of an insertion that was refused before planning: the keys of `insertion_result`.
 
-    parts: names of controller and phantom; target in mm, None if it is not known.
+    parts: names of controller and phantom; target x, y, z in mm, None if it is not known.
     """
     known: dict[str, Any] = {
         **parts,
@@ -186,6 +252,6 @@ def insertion_timing(insertion: Insertion) -> dict[str, Any]:
     }
 
 
-def _measured_tip(insertion: Insertion) -> tuple[float | None, float | None] | None:
+def _measured_tip(insertion: Insertion) -> tuple[float | None, float | None, float | None] | None:
     good = [period.measurement for period in insertion.periods if period.verdict.ok]
-    return (good[-1].x, good[-1].y) if good else None
+    return (good[-1].x, good[-1].y, good[-1].z) if good else None

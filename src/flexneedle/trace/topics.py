@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import isfinite
+from math import hypot, isfinite
 
 from flexneedle.trace.columns import to_row
 from flexneedle.trace.messages import (
@@ -13,14 +13,18 @@ from flexneedle.trace.messages import (
     nanoseconds,
     number,
     path,
+    points,
     pose,
     statuses,
+    table,
     vector,
 )
 from flexneedle.trace.readings import to_values
-from flexneedle.types import Floats, Period
+from flexneedle.types import ROLL, Control, Floats, Period, Pose
 
 PLAN, SHAPE, STATUS, TIMING = "/plan/path", "/needle/shape", "/control/status", "/timing"
+PREDICTED, PREDICTED_SD = "/needle/predicted_shape", "/needle/predicted_sd"
+TRUE_SHAPE = "/needle/true_shape"
 READINGS = "/tracker/readings"
 
 _POSE, _PATH, _JOINTS = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path", "sensor_msgs/msg/JointState"
@@ -29,13 +33,16 @@ _NUMBER, _STATUS = "std_msgs/msg/Float64", "diagnostic_msgs/msg/DiagnosticArray"
 TOPICS: dict[str, str] = {
     PLAN: _PATH,  # planned poses of the tip, once at the start
     SHAPE: _PATH,  # estimated nodes of the needle
+    PREDICTED: _PATH,  # its nodes at the target, as predicted
+    PREDICTED_SD: "std_msgs/msg/Float64MultiArray",  # standard deviations of their y and z, m
+    TRUE_SHAPE: _PATH,  # points along the needle of the virtual phantom; without angles
     "/tip/measured": _POSE,  # the tracker's reading at its time of measurement; without an angle
     "/tip/estimate": _POSE,
     "/tip/path": _POSE,  # planned pose at the estimated depth
     "/tip/true": _POSE,  # of the virtual phantom; not available to the controller
-    "/command": _JOINTS,  # increments of the period; bevel +1: half-turn, −1: none
+    "/command": _JOINTS,  # increments of the period; roll includes the spin
     "/command/applied": _JOINTS,  # the same as applied by the actuators
-    "/joint_states": _JOINTS,  # positions of base and guide after it; bevel ±1: its direction
+    "/joint_states": _JOINTS,  # positions of base and guide and the roll after it
     "/control/cost": _NUMBER,
     "/control/spread": _NUMBER,  # m
     "/control/tip_load": _NUMBER,  # N
@@ -62,7 +69,7 @@ class TopicMessage:
 
 
 def plan_message(tips: Floats) -> TopicMessage:
-    """Return the message of the planned tip poses (m + 1, 3) at time 0."""
+    """Return the message of the planned tip poses (m + 1, 5) at time 0."""
     return TopicMessage(PLAN, 0, path(0.0, tips))
 
 
@@ -75,9 +82,17 @@ def period_messages(period: Period) -> Iterator[TopicMessage]:
 
 def _tip(period: Period) -> Iterator[tuple[str, Message]]:
     yield SHAPE, path(period.time, period.shape)
+    if period.predicted is not None:
+        yield PREDICTED, path(period.time, period.predicted.nodes)
+        yield PREDICTED_SD, table(period.predicted.sd)
+    if period.true_shape is not None:
+        yield TRUE_SHAPE, points(period.time, period.true_shape)
     x, y = period.measurement.x, period.measurement.y
     if x is not None and y is not None and isfinite(x) and isfinite(y):
-        yield "/tip/measured", pose(period.measurement.time, (x, y, 0.0))
+        yield (
+            "/tip/measured",
+            pose(period.measurement.time, Pose(x, y, period.measurement.z or 0.0, 0.0, 0.0)),
+        )
     yield "/tip/estimate", pose(period.time, period.estimate)
     yield "/tip/path", pose(period.time, period.path)
     if period.true_tip is not None:
@@ -85,13 +100,17 @@ def _tip(period: Period) -> Iterator[tuple[str, Message]]:
 
 
 def _control(period: Period) -> Iterator[tuple[str, Message]]:
-    yield "/command", joints(period.time, period.command)
-    yield "/command/applied", joints(period.time, period.applied)
-    yield "/joint_states", joints(period.time, (*period.base, period.guide, period.bevel))
+    yield "/command", joints(period.time, _increments(period.command))
+    yield "/command/applied", joints(period.time, _increments(period.applied))
+    yield "/joint_states", joints(period.time, (*period.base, *period.guide, period.roll))
     yield "/control/cost", number(period.cost)
     yield "/control/spread", number(period.spread * 1e-3)
-    yield "/control/tip_load", number(period.tip_load)
-    yield "/control/innovation", vector(period.time, *period.innovation)
+    yield "/control/tip_load", number(hypot(*period.tip_load))
+    yield "/control/innovation", vector(period.time, period.innovation)
+
+
+def _increments(command: Control) -> tuple[float, ...]:
+    return *command[:ROLL], command.roll + command.spin
 
 
 def _tissue(period: Period) -> Iterator[tuple[str, Message]]:

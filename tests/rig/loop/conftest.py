@@ -25,14 +25,14 @@ def plan():
 @pytest.fixture(scope="session")
 def real(plan):
     """An insertion with a phantom and undelayed readings, and the record of its tracker."""
-    tank = Tank(plan.bevel)
+    tank = Tank(plan.roll)
     return run(plan, tank.rig()), tank
 
 
 @pytest.fixture(scope="session")
 def late(plan):
     """The same with readings delayed by a control period."""
-    tank = Tank(plan.bevel, delay=0.2)
+    tank = Tank(plan.roll, delay=0.2)
     return run(plan, tank.rig()), tank
 
 

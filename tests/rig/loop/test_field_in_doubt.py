@@ -33,7 +33,7 @@ def test_a_period_with_the_field_in_doubt_moves_without_a_correction(plan, real,
     periods = run(plan, Stage(tape, real[1].applied).rig(), UNNAMED).periods
     verdicts = {str(reading.verdict) for reading in periods[30].readings}
     assert verdicts == {"field in doubt: ref1 0.2000, limit 0.0547 (median over 0.2 s)"}
-    assert (str(periods[30].verdict), periods[30].innovation) == ("ok", (0.0, 0.0))
+    assert (str(periods[30].verdict), periods[30].innovation) == ("ok", (0.0, 0.0, 0.0))
     assert np.abs(periods[31].innovation).max() > 0.0
     assert {str(period.verdict) for period in periods} == {"ok"}
 

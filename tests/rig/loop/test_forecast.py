@@ -16,6 +16,7 @@ from flexneedle.trace.export import write_csv
 from flexneedle.trace.reader import read_trace
 from flexneedle.trace.results import insertion_result
 from flexneedle.trace.writer import TraceWriter
+from flexneedle.types import Control
 from insertions import PHANTOM, STILL, Tank, moving, of_any_scenario, run
 
 SECONDS = PHANTOM.control.hold_limit_s
@@ -27,19 +28,19 @@ def predicting(misses, sd=0.1):
 
     def decide(_task, memory, _estimate, _rng):
         miss = misses[min(memory, len(misses) - 1)]
-        return Decision((1.0, 0.0, 0.0, 0.0, -1), "straight", miss=miss, miss_sd=sd), memory + 1
+        return Decision(Control(db_x=1.0), "straight", miss=miss, miss_sd=sd), memory + 1
 
     return Method("straight-on", "inserts straight", decide=decide, begin=lambda _task: 0)
 
 
 def in_air(plan):
     """The plan with a target in air: fast, without bending."""
-    return replace(plan, target=(-20.0, 0.0))
+    return replace(plan, target=(-20.0, 0.0, 0.0))
 
 
 def inserted(plan, misses, sd=0.1, *, force=True, scenario=PHANTOM):
     """An insertion with such a controller."""
-    tank = Tank(plan.bevel, scenario=scenario)
+    tank = Tank(plan.roll, scenario=scenario)
     return run(plan, tank.rig(), scenario, controller=predicting(misses, sd), force=force), tank
 
 
@@ -92,19 +93,24 @@ def test_a_likely_miss_gives_a_warning_and_no_hold(plan, miss, sd, warned):
     assert done.outcome == "done"
     assert bool(done.warning) is warned
     recorded = [(period.miss, period.miss_sd) for period in moving(done)]
-    assert set(recorded) == {(miss, sd)}
+    assert set(recorded) == {((miss, 0.0), sd)}
+
+
+def test_a_miss_in_space_is_recorded_with_its_direction(plan):
+    done, _ = inserted(in_air(plan), [0.3 - 0.4j])
+    assert {period.miss for period in moving(done)} == {(0.3, -0.4)}
 
 
 def test_a_controller_without_predictions_gets_neither_hold_nor_warning(plan):
     done, _ = inserted(in_air(plan), [np.nan], np.nan)
     assert done.outcome == "done"
     assert done.warning == ""
-    assert all(np.isnan(period.miss) for period in done.periods)
+    assert all(np.isnan(period.miss).all() for period in done.periods)
 
 
 def test_a_miss_that_was_not_predicted_is_reported_in_the_reason_without_a_warning(plan):
     """So that a study can count the misses without a warning."""
-    lateral = replace(in_air(plan), target=(-20.0, 3.0))
+    lateral = replace(in_air(plan), target=(-20.0, 3.0, 0.0))
     done, _ = inserted(lateral, [0.0])
     assert done.outcome == "done"
     assert done.reason.startswith("missed the target by 3.")
@@ -123,12 +129,13 @@ def test_hold_and_warning_are_in_trace_csv_and_json(plan, tmp_path):
     kept = read_trace(tmp_path / "trace.mcap")
     assert kept.note == ""
     assert list(map(to_row, kept.periods)) == list(map(to_row, done.periods))
-    assert [period.miss for period in kept.periods[:3]] == [0.2, 1.5, 3.0]
+    assert [period.miss for period in kept.periods[:3]] == [(0.2, 0.0), (1.5, 0.0), (3.0, 0.0)]
     assert [period.warning for period in kept.periods] == [period.warning for period in done.periods]
     text = io.StringIO(newline="")
     write_csv(text, done.periods)
     rows = list(csv.DictReader(io.StringIO(text.getvalue())))
-    assert [float(row["miss_mm"]) for row in rows[:3]] == [0.2, 1.5, 3.0]
+    assert [float(row["miss_y_mm"]) for row in rows[:3]] == [0.2, 1.5, 3.0]
+    assert [float(row["miss_z_mm"]) for row in rows[:3]] == [0.0] * 3
     assert [float(row["miss_sd_mm"]) for row in rows[:3]] == [0.1] * 3
     assert [bool(row["warning"]) for row in rows] == warned
     assert rows[2]["decision"].startswith(HELD)
@@ -142,12 +149,12 @@ def test_an_unreachable_target_is_held_unless_forced(plan):
     narrow = PHANTOM.with_values(
         {"setup.max_guide_travel_mm": 0.1, "needle.bevel.offset_mm": 0.5, "target.lateral_mm": 0.0}
     )
-    tank = Tank(plan.bevel, scenario=narrow)
+    tank = Tank(plan.roll, scenario=narrow)
     done = run(of_any_scenario(plan), tank.rig(), narrow)
     assert done.outcome == "held"
     assert done.reason.startswith("no path to the target found: predicted miss -")
-    assert done.periods[-1].estimate[0] < 0.0  # it is known before the needle enters
-    forced = run(of_any_scenario(plan), Tank(plan.bevel, scenario=narrow).rig(), narrow, force=True)
+    assert done.periods[-1].estimate.x < 0.0  # it is known before the needle enters
+    forced = run(of_any_scenario(plan), Tank(plan.roll, scenario=narrow).rig(), narrow, force=True)
     assert forced.outcome == "done"
     assert forced.warning
     assert forced.true_error_mm > narrow.control.miss_limit_mm
@@ -176,7 +183,7 @@ def test_the_depth_is_reached_with_an_axial_start_error(plan, controller, gap):
         if key.startswith("phantom.") and "structure" not in key
     }
     scenario = PHANTOM.with_values(nothing)
-    tank = Tank(plan.bevel, scenario=scenario.with_values({"setup.tip_to_skin_mm": 28.5 + gap}))
+    tank = Tank(plan.roll, scenario=scenario.with_values({"setup.tip_to_skin_mm": 28.5 + gap}))
     done = run(plan, tank.rig(), scenario, controller=controller)
     assert done.outcome == "done"
-    assert done.periods[-1].true_tip[0] == pytest.approx(plan.target[0], abs=0.1)
+    assert done.periods[-1].true_tip.x == pytest.approx(plan.target[0], abs=0.1)

@@ -49,15 +49,15 @@ def test_record_is_complete_for_every_period(plan, real):
         np.testing.assert_allclose(
             period.applied, period.command, atol=0.01
         )  # except for the motors' resolution
-        assert period.shape.shape == (61, 3)
+        assert period.shape.shape == (61, 5)
         assert period.decision
         assert math.isfinite(period.cost)
         assert period.spread > 0.0
-        on_plan = np.clip(period.estimate[0], plan.tips[0, 0], plan.tips[-1, 0])
-        assert period.path[0] == pytest.approx(on_plan, abs=0.02)
+        on_plan = np.clip(period.estimate.x, plan.tips[0, 0], plan.tips[-1, 0])
+        assert period.path.x == pytest.approx(on_plan, abs=0.02)
         assert period.true_stretch <= 1.0
         assert period.true_strain_energy >= 0.0
-        assert np.isfinite([*period.estimate, *period.base, *period.true_tip, period.tip_load]).all()
+        assert np.isfinite([*period.estimate, *period.base, *period.true_tip, *period.tip_load]).all()
         assert period.durations.keys() == {"decide", "apply", "observe", "total"}
         parts = period.durations["decide"] + period.durations["observe"]
         assert period.durations["total"] == pytest.approx(parts)
@@ -67,17 +67,16 @@ def test_record_is_complete_for_every_period(plan, real):
 def test_the_record_ends_with_the_true_state(plan, real):
     done, tank = real
     condition = tank.phantom.condition()
-    x, y = condition.tip[:2]
-    assert done.true_error_mm == pytest.approx(math.dist((x, y), plan.target))
+    assert done.true_error_mm == pytest.approx(math.dist(condition.tip[:3], plan.target))
     last = tank.tape[-1][-1]
-    assert done.residual_mm == pytest.approx(math.dist((last.x, last.y), plan.target))
-    assert done.flips == sum(command[4] > 0 for _, command in tank.moves)
+    assert done.residual_mm == pytest.approx(math.dist((last.x, last.y), plan.target[:2]))
+    assert done.flips == sum(command.rolls for _, command in tank.moves)
     assert done.periods[-1].true_strain_energy == condition.strain_energy
     assert done.periods[-1].true_stretch == condition.least_stretch < 1.0
     assert all(np.diff([period.true_stretch for period in done.periods]) <= 0.0)
     assert done.reached
-    assert done.periods[-1].estimate[0] >= plan.target[0] - PHANTOM.control.depth_tolerance_mm
-    assert done.periods[-2].estimate[0] < plan.target[0] - PHANTOM.control.depth_tolerance_mm
+    assert done.periods[-1].estimate.x >= plan.target[0] - PHANTOM.control.depth_tolerance_mm
+    assert done.periods[-2].estimate.x < plan.target[0] - PHANTOM.control.depth_tolerance_mm
 
 
 def test_the_duration_of_a_move_is_rounded_up_to_whole_tracker_periods(real):
@@ -86,7 +85,7 @@ def test_the_duration_of_a_move_is_rounded_up_to_whole_tracker_periods(real):
     for period, duration in zip(done.periods, np.diff(times), strict=True):
         if period.command == STILL:  # a rest, for delayed readings
             continue
-        needed = period.command[0] / PHANTOM.setup.insertion_speed_mm_s
+        needed = period.command.db_x / PHANTOM.setup.insertion_speed_mm_s
         assert needed - 1e-6 <= duration < needed + READING
         assert duration / READING == pytest.approx(round(duration / READING))
 
@@ -121,7 +120,7 @@ def test_another_seed_changes_phantom_tracker_and_search(inserted):
 def test_both_plants_have_the_same_start(inserted):
     """Same draw, same noise; some imperfections exist only in the exact plant."""
     exact, model = inserted(2001), inserted(2001, "model")
-    assert exact.periods[0].true_tip[1] == pytest.approx(model.periods[0].true_tip[1], abs=0.5)
+    assert exact.periods[0].true_tip.y == pytest.approx(model.periods[0].true_tip.y, abs=0.5)
     assert exact.periods[-1].true_tip != model.periods[-1].true_tip
     assert model.true_error_mm < 1.0
 
@@ -136,7 +135,7 @@ def test_unknown_names_of_plant_and_controller_are_rejected_with_the_choices(pla
 def test_phantom_tracker_and_search_have_independent_random_streams(plan, monkeypatch):
     drawn, plants = [], []
 
-    def virtual_rig(_scenario, _bevel, seeds, phantom, **_options):
+    def virtual_rig(_scenario, _roll, seeds, phantom, **_options):
         drawn.extend(np.random.default_rng(seed).random() for seed in dataclasses.astuple(seeds))
         plants.append(phantom)
 
@@ -155,8 +154,8 @@ def test_phantom_tracker_and_search_have_independent_random_streams(plan, monkey
 
 def test_on_period_gets_each_period_as_it_ends(plan):
     periods = []
-    tank = Tank(plan.bevel)
-    part = replace(plan, target=(-20.0, 0.0))
+    tank = Tank(plan.roll)
+    part = replace(plan, target=(-20.0, 0.0, 0.0))
 
     def watch(period):
         periods.append(period)
@@ -190,7 +189,7 @@ def test_replayed_delayed_readings_give_the_same_commands(plan, late):
 
 def test_replayed_readings_with_another_phantom_give_the_same_commands(plan, real):
     done, tank = real
-    other, stage = Tank(plan.bevel, seed=2777), Stage(tank.tape)
+    other, stage = Tank(plan.roll, seed=2777), Stage(tank.tape)
     swapped = run(plan, Rig(other.phantom, other, stage, other.phantom.condition))
     assert list(map(commanded_and_estimated, swapped.periods)) == list(
         map(commanded_and_estimated, done.periods)

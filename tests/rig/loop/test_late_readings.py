@@ -28,7 +28,7 @@ def test_after_the_last_move_it_rests_until_a_reading_at_rest_arrives(plan, late
     assert list(done.periods[-len(rests) :]) == rests
     arrival = done.periods[-len(rests) - 1]
     assert arrival.decision != RESTING
-    assert arrival.estimate[0] >= plan.target[0] - PHANTOM.control.depth_tolerance_mm
+    assert arrival.estimate.x >= plan.target[0] - PHANTOM.control.depth_tolerance_mm
     assert {(period.command, period.applied) for period in rests} == {(STILL, STILL)}
     assert len(tank.moves) == len(moving(done))
     assert {period.true_tip for period in rests} == {arrival.true_tip}

@@ -26,12 +26,12 @@ def frame(time, indicators=(0.02, 0.02, 0.02), tip=(1.0, 2.0, 3.0)):
 
 
 def at_rest(_time):
-    return 30.0, 1.0
+    return 30.0, 1.0, 0.0
 
 
 def driven(speed):
     """The predicted tip (mm) of a needle that is inserted at `speed` (mm/s) from time 0 on."""
-    return lambda time: (30.0 + speed * time, 1.0)
+    return lambda time: (30.0 + speed * time, 1.0, 0.0)
 
 
 def observed(monitor, indicators, begin, count):
@@ -294,14 +294,14 @@ def verdict_on_repeats(estimates):
 
 @pytest.mark.parametrize("shift", [1.0, -1.0])
 def test_a_correction_of_the_estimate_at_rest_does_not_count_as_travel(shift):
-    assert verdict_on_repeats([at_rest] * 4 + [lambda _: (30.0 + shift, 1.0)] * 4) == OK
+    assert verdict_on_repeats([at_rest] * 4 + [lambda _: (30.0 + shift, 1.0, 0.0)] * 4) == OK
 
 
 def test_corrections_do_not_hide_the_motion_of_a_driven_needle():
     """3.9 mm/s: 0.0975 mm between two readings, after each of which the estimate is corrected to the reading."""
 
     def after(k):
-        return lambda time: (30.0 + 3.9 * (time - k / RATE), 1.0)
+        return lambda time: (30.0 + 3.9 * (time - k / RATE), 1.0, 0.0)
 
     assert verdict_on_repeats(after(k) for k in range(4)) == OK
     assert verdict_on_repeats(after(k) for k in range(5)) == (

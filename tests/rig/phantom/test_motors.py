@@ -6,11 +6,14 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from flexneedle.rig.phantom import rod as rd
-from flexneedle.simulator.control import Control
+from flexneedle import Control
+from flexneedle.simulator.control import MOVES
 from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import DB_X, DB_Y, DB_Z, DG_Y, DG_Z, STILL
 from reference.rods import IDEAL
-from tanks import COARSE, STILL, tank
+from tanks import COARSE, tank
+
+LENGTHS = [DB_X, DB_Y, DB_Z, DG_Y, DG_Z]
 
 
 def rough(grid, scenario=IDEAL):
@@ -30,24 +33,26 @@ def rough(grid, scenario=IDEAL):
 def test_motors_are_on_whole_steps_and_rounding_does_not_accumulate(grid, rows):
     """After any commands each sum is within half a step of the requested one; the applied command is returned."""
     phantom = rough(grid)
-    asked, done = np.zeros(4), np.zeros(4)
-    for row in rows:
-        *applied, flip = phantom.apply((*row, -1), 0.2)
-        asked, done = asked + row, done + applied
-        assert flip == -1
-        lengths = done[[0, 1, 3]]
+    asked, done = np.zeros(9), np.zeros(9)
+    for db_x, db_y, db_theta, dg_y in rows:
+        command = Control(db_x, db_y=db_y, db_theta=db_theta, dg_y=dg_y)
+        applied = phantom.apply(command, 0.2)
+        asked, done = asked + command, done + applied
+        assert not applied.rolls
+        lengths = done[LENGTHS]
         np.testing.assert_allclose(lengths / grid, np.rint(lengths / grid), atol=1e-6)
-        assert np.abs(asked - done)[[0, 1, 3]].max() <= 0.5 * grid + 1e-9
-        assert applied[2] == row[2]  # the rotation of the base is not rounded
-    s = phantom._plant._s[[rd.BASE_X, rd.BASE_Y, rd.BASE_TURN, rd.GUIDE_Y]]
-    np.testing.assert_allclose(s - [IDEAL.start_base_x, 0.0, 0.0, 0.0], done, atol=1e-9)
+        assert np.abs(asked - done)[LENGTHS].max() <= 0.5 * grid + 1e-9
+        assert applied.db_theta == db_theta  # the rotation of the base is not rounded
+    s = phantom._plant.state
+    travel = np.array([*s["base"], *s["tilt"], *s["guide"]]) - [IDEAL.start_base_x, *np.zeros(6)]
+    np.testing.assert_allclose(travel, done[:MOVES], atol=1e-9)
 
 
 def test_steps_far_below_the_resolution_accumulate():
     """A thousand guide steps of 3 µm are 3 mm, with the rounded sum at each step."""
     phantom, stood = rough(0.01), 0.0
     for k in range(1000):
-        _, _, _, moved, _ = phantom.apply((0.0, 0.0, 0.0, 0.003, -1), 0.2)
+        moved = phantom.apply(Control(dg_y=0.003), 0.2).dg_y
         stood += moved
         assert round(moved, 9) in (0.0, 0.01)
         assert abs(stood - 0.003 * (k + 1)) <= 0.005 + 1e-9
@@ -56,15 +61,14 @@ def test_steps_far_below_the_resolution_accumulate():
 
 def test_a_motor_with_resolution_0_applies_the_command_exactly():
     phantom = rough(0.0)
-    assert phantom.apply((0.123456, 0.01234, 0.001, -0.098765, 1), 0.2) == (
-        0.123456, 0.01234, 0.001, -0.098765, 1,
-    )  # fmt: skip
+    command = Control(0.123456, db_y=0.01234, db_theta=0.001, dg_y=-0.098765, flip=True)
+    assert phantom.apply(command, 0.2) == command
 
 
 def test_a_motor_without_a_command_does_not_move():
     """Even with a remainder of half a step, here since 0.255 mm is above the largest step."""
     phantom = rough(0.01, IDEAL.with_values({"setup.max_guide_step_mm": 0.255}))
-    assert phantom.apply((0.0, 0.0, 0.0, 0.255, -1), 0.2)[3] == pytest.approx(0.25)
+    assert phantom.apply(Control(dg_y=0.255), 0.2).dg_y == pytest.approx(0.25)
     for _ in range(5):
         assert phantom.apply(STILL, 0.2) == STILL
 
@@ -87,9 +91,9 @@ def test_rounding_does_not_exceed_a_limit_of_the_setup():
     state, asked = model.start(), np.zeros(2)
     for k in range(118):
         guide = 0.256 if k < 4 else 1.237 - asked[1] if k == 4 else 0.0
-        row = (min(0.256, 29.996 - state.travel[0]), 0.0, 0.0, guide, -1)
-        applied = phantom.apply(row, 0.2)
-        asked += (row[0], row[3])
-        state = model.step(state, Control.from_row(applied))
-    assert state.travel[0] == pytest.approx(29.5)  # 0.25 per step, the largest
-    assert state.travel[3] == pytest.approx(1.22, abs=0.011)
+        command = Control(min(0.256, 29.996 - state.travel[DB_X]), dg_y=guide)
+        applied = phantom.apply(command, 0.2)
+        asked += (command.db_x, command.dg_y)
+        state = model.step(state, applied)
+    assert state.travel[DB_X] == pytest.approx(29.5)  # 0.25 per step, the largest
+    assert state.travel[DG_Y] == pytest.approx(1.22, abs=0.011)

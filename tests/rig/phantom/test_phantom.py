@@ -5,15 +5,16 @@ import math
 import numpy as np
 import pytest
 
+from flexneedle import Control
 from flexneedle.errors import CommandError, InputError
 from flexneedle.rig.phantom import rod as rd
 from flexneedle.rig.phantom.draw import Truth, draw
-from flexneedle.rig.phantom.phantom import Phantom
+from flexneedle.rig.phantom.phantom import Phantom, evenly_spaced
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PLANTS, plant
-from flexneedle.simulator.control import Control
 from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import THETA
 from reference.rods import IDEAL, Bench
-from tanks import AHEAD, PHANTOM, STRAIGHT, both_plants, driven, tank, tip
+from tanks import AHEAD, PHANTOM, SKIN, STRAIGHT, both_plants, driven, tank, tip
 
 # ---- commands and time
 
@@ -21,25 +22,28 @@ from tanks import AHEAD, PHANTOM, STRAIGHT, both_plants, driven, tank, tip
 @both_plants
 def test_the_needle_starts_at_the_true_pose_of_the_clamp(kind):
     """As the controller's model with this base, except for the mesh."""
-    phantom = tank(kind=kind, bevel=-1, base_y=0.4, base_turn=-0.002)
+    phantom = tank(kind=kind, roll=math.pi, base_y=0.4, base_turn=-0.002)
     simulator = Simulator(IDEAL)
-    expected = simulator.step(simulator.start(-1).with_estimate(base_y=0.4, base_turn=-0.002), Control())
+    expected = simulator.step(
+        simulator.start(math.pi).with_estimate(base=(0.4, 0.0), slope=(-0.002, 0.0)), Control()
+    )
     np.testing.assert_allclose(tip(phantom), expected.tip, atol=1e-3)
     assert abs(tip(phantom)[1]) > 0.01
-    assert phantom._plant.bevel == -1
+    assert phantom._plant.roll == math.pi
     assert phantom.now() == 0.0
-    assert phantom.condition()[1:] == (0.0, 1.0, True)
+    assert phantom.condition()[1:4] == (0.0, 1.0, True)
 
 
 @both_plants
 def test_a_command_is_executed_in_finer_steps(kind):
     """1 mm in steps of 0.25 mm: four equal parts, and one roll of the bevel."""
     phantom = tank(kind=kind)
-    by_hand = plant(kind, Truth(IDEAL), 1)
+    by_hand = plant(kind, Truth(IDEAL), 0.0)
+    flipped = Control(db_x=1.0, dg_y=0.1, flip=True)
     for _ in range(32):
-        assert phantom.apply((*AHEAD[:4], 1), 0.2) == (*AHEAD[:4], 1)
+        assert phantom.apply(flipped, 0.2) == flipped
         for part in range(4):
-            by_hand.step(np.array([0.25, 0.0, 0.0, 0.025, 1.0 if part == 0 else -1.0]))
+            by_hand.step(np.array(Control(db_x=0.25, dg_y=0.025, flip=part == 0)))
     np.testing.assert_array_equal(tip(phantom), by_hand.tip)
     assert phantom.condition().strain_energy == by_hand.strain_energy > 0.0
 
@@ -51,19 +55,24 @@ def test_parts_are_no_longer_than_the_step_of_the_phantom(advance, parts):
     phantom = driven(tank(), STRAIGHT)
     advances, step = [], phantom._plant.step
     phantom._plant.step = lambda row: advances.append(row[0]) or step(row)
-    driven(phantom, (advance, 0.0, 0.0, 0.0, -1))
+    driven(phantom, Control(db_x=advance))
     np.testing.assert_allclose(advances, [advance / parts] * parts)
 
 
 @both_plants
 def test_all_inputs_of_a_command_are_executed(kind):
-    phantom = driven(tank(kind=kind, base_y=0.1, base_turn=0.001), (0.9, 0.2, 0.002, 0.3, 1))
+    phantom = driven(
+        tank(kind=kind, base_y=0.1, base_turn=0.001),
+        Control(0.9, db_y=0.2, db_theta=0.002, dg_y=0.3, flip=True),
+    )
     inside = phantom._plant
-    base = inside._s[[rd.BASE_X, rd.BASE_Y, rd.BASE_TURN]] if kind == "exact" else inside._state.base
-    guide = inside._s[rd.GUIDE_Y] if kind == "exact" else inside._state.guide
-    np.testing.assert_allclose(base, [IDEAL.start_base_x + 0.9, 0.3, 0.003])
-    assert guide == pytest.approx(0.3)
-    assert inside.bevel == -1
+    if kind == "exact":
+        base, guide = [*inside.state["base"], *inside.state["tilt"]], inside.state["guide"]
+    else:
+        base, guide = inside._state.base, inside._state.guide
+    np.testing.assert_allclose(base, [IDEAL.start_base_x + 0.9, 0.3, 0.0, 0.003, 0.0])
+    assert tuple(guide) == pytest.approx((0.3, 0.0))
+    assert inside.roll == math.pi
 
 
 def test_time_advances_by_commands_and_waits():
@@ -75,10 +84,10 @@ def test_time_advances_by_commands_and_waits():
 def test_the_tip_is_known_at_any_past_time():
     """Within the last command, within earlier ones, and at rest before the start."""
     phantom = tank()
-    tips = [tip(phantom)[:2]]
+    tips = [tip(phantom)[:3]]
     for _ in range(3):
-        driven(phantom, (0.5, 0.0, 0.0, 0.25, -1))
-        tips.append(tip(phantom)[:2])
+        driven(phantom, Control(db_x=0.5, dg_y=0.25))
+        tips.append(tip(phantom)[:3])
     for k in range(4):
         np.testing.assert_allclose(phantom.tip_at(0.2 * k), tips[k], atol=1e-9)
     middle = phantom.tip_at(0.3)  # between the two parts of the second command
@@ -95,11 +104,12 @@ def test_the_tip_does_not_move_during_a_wait():
     before = phantom.condition()
     phantom.wait(0.5)
     for time in (0.2, 0.45, 0.7):
-        np.testing.assert_allclose(phantom.tip_at(time), before.tip[:2], atol=1e-12)
+        np.testing.assert_allclose(phantom.tip_at(time), before.tip[:3], atol=1e-12)
     np.testing.assert_array_equal(tip(phantom), before.tip)
-    assert phantom.condition()[1:] == before[1:]
+    assert phantom.condition()[1:4] == before[1:4]
+    np.testing.assert_array_equal(phantom.condition().shape, before.shape)
     driven(phantom, AHEAD)
-    np.testing.assert_allclose(phantom.tip_at(0.7), before.tip[:2], atol=1e-12)
+    np.testing.assert_allclose(phantom.tip_at(0.7), before.tip[:3], atol=1e-12)
 
 
 @both_plants
@@ -114,14 +124,14 @@ def test_a_clamp_offset_beyond_the_travel_of_the_base_is_valid(kind):
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        ((2.0, 0.0, 0.0, 0.0, -1), r"db_x = 2: must be at most 1 mm"),
-        ((-0.5, 0.0, 0.0, 0.0, -1), r"db_x = -0.5: sum of the steps must be at least 0 mm"),
-        ((0.0, 0.0, 0.0, 0.6, -1), r"dg_y = 0.6: must be at most 0.5 mm"),
-        ((1.0, 0.0, math.nan, 0.0, -1), r"db_theta = nan: must be a finite number"),
+        (Control(db_x=2.0), r"db_x = 2: must be at most 1 mm"),
+        (Control(db_x=-0.5), r"db_x = -0.5: sum of the steps must be at least 0 mm"),
+        (Control(dg_y=0.6), r"dg_y = 0.6: must be at most 0.5 mm"),
+        (Control(db_x=1.0, db_theta=math.nan), r"db_theta = nan: must be a finite number"),
     ],
 )
 def test_a_command_beyond_a_limit_is_rejected_before_anything_moves(kind, command, message):
-    phantom = Phantom(draw(PHANTOM, np.random.default_rng(3)), 1, kind)
+    phantom = Phantom(draw(PHANTOM, np.random.default_rng(3)), 0.0, kind)
     before = tip(phantom)
     with pytest.raises(CommandError, match=message):
         phantom.apply(command, 0.4)
@@ -143,7 +153,7 @@ def test_there_are_two_plants_and_the_exact_one_is_the_default():
 def swung():
     """Both plants without imperfections with the same commands to 45 mm: the guide out and back, a roll at 15 mm."""
     commands = [
-        (1.0, 0.0, 0.0, round(-0.25 * math.cos(math.pi * k / 40), 3), 1 if k == 44 else -1) for k in range(73)
+        Control(db_x=1.0, dg_y=round(-0.25 * math.cos(math.pi * k / 40), 3), flip=k == 44) for k in range(73)
     ]
     phantoms = {kind: tank(kind=kind) for kind in PLANTS}
     return {
@@ -158,7 +168,7 @@ def test_without_imperfections_both_plants_agree(swung):
     apart = np.hypot(*(exact - model)[:, :2].T)
     assert 0.0 < apart.max() < 0.02
     assert np.abs(exact[:, 1]).max() > 2.0
-    assert np.abs(exact[:, 2]).max() > 0.04
+    assert np.abs(exact[:, THETA]).max() > 0.04
     one, other = (swung[kind][-1] for kind in ("exact", "model"))
     assert one.strain_energy == pytest.approx(other.strain_energy, rel=0.01)
     assert one.least_stretch == pytest.approx(other.least_stretch, abs=0.01)
@@ -173,7 +183,7 @@ def test_the_recorded_stretch_is_the_smallest_since_the_start(swung, kind):
     assert stretches[0] == 1.0
     phantom = driven(tank(kind=kind), AHEAD, times=45)
     compressed = phantom.condition().least_stretch
-    driven(phantom, (-1.0, 0.0, 0.0, -0.1, -1), times=44)
+    driven(phantom, Control(db_x=-1.0, dg_y=-0.1), times=44)
     assert phantom._plant.least_stretch > compressed
     assert phantom.condition().least_stretch <= compressed
 
@@ -189,9 +199,9 @@ def test_they_converge_in_every_step(swung, kind):
 def test_one_failed_step_within_a_command_is_reported_permanently():
     phantom = driven(tank(), AHEAD, times=3)
     assert phantom.condition().converged
-    phantom._plant._s[rd.LOAD_X] = -100.0  # many times the buckling load
-    driven(phantom, (0.25, 0.0, 0.0, 0.0, -1))
-    phantom._plant._s[rd.LOAD_X] = 0.0
+    phantom._plant.state["load"][0] = -100.0  # many times the buckling load
+    driven(phantom, Control(db_x=0.25))
+    phantom._plant.state["load"][0] = 0.0
     driven(phantom, AHEAD)
     assert not phantom.condition().converged
 
@@ -215,7 +225,41 @@ def test_the_model_plant_reports_a_failed_step(monkeypatch):
 def test_a_full_channel_is_reported(room, whole):
     """10 mm need twenty points: with fewer the tissue would be incomplete."""
     bench = Bench(length=60.0, segments=30, base=(-60.0, 0.0, 0.0))
-    bench.channel = np.zeros((rd.CHANNEL_ROWS, room))
+    bench.channel = np.zeros(room, rd.POINT)
     for _ in range(10):
         bench.step(db_x=1.0)
     assert bench.converged == whole
+
+
+@both_plants
+def test_the_true_shape_is_the_needle_in_points_at_equal_distances(kind):
+    """As many as the model has nodes, from the base to the end of the axis; those of the plant lie between them."""
+    phantom = driven(tank(kind=kind, base_y=0.4, base_z=-0.3), AHEAD, times=SKIN + 10)
+    shape, nodes = phantom.condition().shape, phantom._plant.nodes
+    assert shape.shape == (IDEAL.needle.nodes, 3)
+    spacing = np.linalg.norm(np.diff(shape, axis=0), axis=1)
+    np.testing.assert_allclose(spacing, spacing.mean(), rtol=1e-3)  # a chord is shorter than its arc
+    np.testing.assert_allclose(shape[0], nodes[0], atol=1e-12)
+    np.testing.assert_allclose(shape[-1], phantom._plant.tip[:3], atol=1e-9)
+    for column in (1, 2):
+        between = np.interp(shape[:, 0], nodes[:, 0], nodes[:, column])
+        np.testing.assert_allclose(shape[:, column], between, atol=1e-3)
+
+
+def test_points_at_equal_distances_are_along_the_chain():
+    corner = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [3.0, 1.0, 0.0]])
+    points = [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [3.0, 1.0, 0.0]]
+    np.testing.assert_allclose(evenly_spaced(corner, 3), points, atol=1e-15)
+
+
+def test_a_plant_without_nodes_has_no_shape():
+    class Without:
+        def __init__(self, truth, roll):
+            self._plant = plant("model", truth, roll)
+
+        def __getattr__(self, name):
+            if name == "nodes":
+                raise AttributeError(name)
+            return getattr(self._plant, name)
+
+    assert tank(kind=Without).condition().shape is None

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from flexneedle.rig.phantom import rod as rd
+from flexneedle.types import THETA
 from reference.rods import IDEAL, Bench, move, plant
 from reference.validation import (
     FINE,
@@ -122,7 +122,8 @@ def test_the_spring_enters_the_skin_fully_compressed():
     ratio = 0.25 / 3.0
     drift = needle.tip[1]
     expected = 4.0 - drift * (1.0 - math.exp(-ratio)) / ratio
-    assert needle._s[rd.OFFSET] == pytest.approx(expected, rel=1e-3)
+    assert needle.state["offset"] @ needle.segments["tangent"][-2] == pytest.approx(0.0, abs=1e-12)
+    assert np.hypot(*needle.state["offset"][:2]) == pytest.approx(expected, rel=1e-3)
     assert 0.0 < drift < 0.1
 
 
@@ -146,15 +147,15 @@ def test_the_channel_is_on_the_path_of_the_tip():
     for row in commands(1.5, 44.5, AHEAD):
         needle.step(row)
         way.append(needle.tip[:2])
-        cut.append(needle._s[rd.CUT])
-    points = needle._channel[[rd.C_X, rd.C_Y], : needle._count]
-    at = 0.5 * (np.arange(needle._count) + 0.5)
+        cut.append(needle.state["cut"])
+    points = needle.channel["place"][: needle.count, :2].T
+    at = 0.5 * (np.arange(needle.count) + 0.5)
     assert at[-1] <= cut[-1] < at[-1] + 0.5
     expected = [np.interp(at, cut, along) for along in np.transpose(way)]
     np.testing.assert_allclose(points[:, 1:], np.array(expected)[:, 1:], atol=1e-9)
     np.testing.assert_allclose(points[:, 0], np.array(expected)[:, 0], atol=0.02)  # from air into the skin
     assert cut[-1] == pytest.approx(way[-1][0], rel=0.01)
-    force, deep = needle._channel[rd.C_STIFFNESS, : needle._count], points[0] > 20.0
+    force, deep = needle.channel["stiffness"][: needle.count], points[0] > 20.0
     assert np.unique(force[~deep]).size == np.unique(force[deep]).size == 1
     assert force[deep][0] / force[~deep][0] == pytest.approx(3.63 / 1.82)
 
@@ -164,12 +165,12 @@ def test_an_inclined_needle_cuts_along_its_axis_from_the_skin_on():
     turn = 0.2
     bench = Bench(length=60.0, segments=30, base=(-60.0, 0.0, turn)).step().step(db_x=3.0)
     depth = 3.0 - 60.0 * (1.0 - math.cos(turn))
-    entry = bench.s[rd.TIP_Y] - depth * math.tan(turn)
+    entry = bench.s["tip"][1] - depth * math.tan(turn)
     along = 0.25 + 0.5 * np.arange(bench.count)
     assert bench.count == 4
-    np.testing.assert_allclose(bench.channel[rd.C_X, :4], along * math.cos(turn), atol=1e-9)
-    np.testing.assert_allclose(bench.channel[rd.C_Y, :4], entry + along * math.sin(turn), atol=1e-9)
-    assert bench.s[rd.CUT] == pytest.approx(depth / math.cos(turn), rel=1e-12)
+    np.testing.assert_allclose(bench.channel["place"][:4, 0], along * math.cos(turn), atol=1e-9)
+    np.testing.assert_allclose(bench.channel["place"][:4, 1], entry + along * math.sin(turn), atol=1e-9)
+    assert bench.s["cut"] == pytest.approx(depth / math.cos(turn), rel=1e-12)
 
 
 def test_a_flip_without_insertion_changes_only_the_bevel():
@@ -177,7 +178,7 @@ def test_a_flip_without_insertion_changes_only_the_bevel():
     needle = move(plant(), AHEAD, times=START + 80)
     tip = needle.tip
     np.testing.assert_allclose(move(needle, flip=True).tip, tip, atol=1e-9)
-    assert needle.bevel == -1
+    assert needle.roll == math.pi
     move(needle, flip=True)
     one, other = (move(plant(), AHEAD, times=START + 80) for _ in range(2))
     np.testing.assert_allclose(move(one, BACK).tip, move(other, BACK, flip=True).tip, atol=1e-9)
@@ -191,7 +192,7 @@ def test_flip_bends_the_path_to_the_other_side():
     move(on, AHEAD, times=60)
     move(turned, AHEAD, flip=True)
     move(turned, AHEAD, times=59)
-    assert turned.tip[2] < 0.0 < on.tip[2]
+    assert turned.tip[THETA] < 0.0 < on.tip[THETA]
     assert turned.tip[1] < on.tip[1] - 0.3
 
 
@@ -199,10 +200,10 @@ def test_a_retracted_needle_follows_its_channel_and_returns_to_the_same_position
     needle = plant()
     for row in commands(1.0, 30.0, AHEAD):
         needle.step(row)
-    before, cut, count = needle.tip, needle._s[rd.CUT], needle._count
+    before, cut, count = needle.tip, needle.state["cut"], needle.count
     for _ in range(40):
         move(needle, BACK)
-    assert (needle._s[rd.CUT], needle._count) == (cut, count)
+    assert (needle.state["cut"], needle.count) == (cut, count)
     move(needle, AHEAD, times=40)
     np.testing.assert_allclose(needle.tip, before, atol=1e-3)
 
@@ -212,7 +213,7 @@ def test_the_bevels_spring_vanishes_as_the_tip_is_retracted():
     needle = move(plant(), AHEAD, times=START + 120)
     parts = []
     for _ in range(16):
-        parts.append(np.hypot(*needle._work[[rd.GX, rd.GY], -1]))
+        parts.append(np.linalg.norm(needle.segments["force"][-1]))
         move(needle, BACK)
     force = np.array(parts)
     assert (np.diff(force[:13]) < 0.0).all()
@@ -225,12 +226,12 @@ def test_out_of_the_skin_the_channel_is_closed():
     needle = move(plant(), AHEAD, times=START + 40)
     move(needle, BACK, times=44)
     assert needle.tip[0] < 0.0
-    assert (needle._count, needle._s[rd.CUT], needle._s[rd.OFFSET]) == (0, 0.0, 0.0)
+    assert (needle.count, needle.state["cut"], *needle.state["offset"]) == (0, 0.0, 0.0, 0.0, 0.0)
     assert needle.strain_energy == 0.0
     move(needle, dg_y=0.3, times=4)
     entry = needle.tip[1]
     move(needle, AHEAD, times=12)
-    assert needle._channel[rd.C_Y, 0] == pytest.approx(entry, abs=0.1)
+    assert needle.channel["place"][0, 1] == pytest.approx(entry, abs=0.1)
     assert entry > 1.0
 
 
@@ -250,10 +251,10 @@ def test_stiffness_varies_with_the_depth_as_in_the_true_phantom():
     variation = tuple(1.0 + 0.5 * (k % 2) for k in range(400))  # 0.25 mm each
     needle = move(plant(IDEAL, variation=variation, cell=0.25), AHEAD, times=START + 60)
     plain = move(plant(IDEAL), AHEAD, times=START + 60)
-    points = needle._count
-    x = needle._channel[rd.C_X, :points]
+    points = needle.count
+    x = needle.channel["place"][:points, 0]
     expected = np.where((x / 0.25).astype(int) % 2 == 1, 1.5, 1.0)
-    ratio = needle._channel[rd.C_STIFFNESS, :points] / plain._channel[rd.C_STIFFNESS, :points]
+    ratio = needle.channel["stiffness"][:points] / plain.channel["stiffness"][:points]
     np.testing.assert_allclose(ratio, expected)
     stiffer = move(plant(IDEAL, variation=(1.5,), cell=0.25), AHEAD, times=START + 4)
     firm = {f"tissue.{k}.shear_modulus_kpa": 1.5 * (1.82, 3.63)[k] for k in (0, 1)}
@@ -271,20 +272,20 @@ def test_strain_energy_is_weighted_by_layer_and_counts_contact_points():
     assert one.strain_energy > 1e-3
     assert three.strain_energy == pytest.approx(3.0 * one.strain_energy, rel=1e-12)
     np.testing.assert_array_equal(three.tip, one.tip)
-    bend = 0.5 * (one._work[rd.MOMENT, :-1] ** 2).sum() * one.rod.segment / one.rod.stiffness
+    bend = 0.5 * (one.segments["moment"][:-1] ** 2).sum() * one.rod.segment / one.rod.stiffness
     bend -= (
-        0.25 * one._work[rd.MOMENT, 0] ** 2 * one.rod.segment / one.rod.stiffness
+        0.25 * one.segments["moment"][0, 2] ** 2 * one.rod.segment / one.rod.stiffness
     )  # the first is half as long
-    guide = 0.5 * one._s[rd.GUIDE_FORCE] ** 2 / one.rod.guide_stiffness
-    assert one._s[rd.ENERGY] == pytest.approx(one.strain_energy + bend + guide, rel=1e-6)
+    guide = 0.5 * one.state["guide_force"][0] ** 2 / one.rod.guide_stiffness
+    assert one.state["energy"] == pytest.approx(one.strain_energy + bend + guide, rel=1e-6)
 
 
 def test_least_stretch_is_that_of_the_most_compressed_point():
     needle = plant()
     for row in commands(1.5, 40.0, AHEAD):
         needle.step(row)
-    x, y = needle.nodes.T
-    points = needle._channel[[rd.C_X, rd.C_Y], : needle._count].T
+    x, y, _ = needle.nodes.T
+    points = needle.channel["place"][: needle.count]
     apart = np.abs(np.interp(points[:, 0], x, y) - points[:, 1])
     assert needle.least_stretch == pytest.approx(1.0 - apart.max() / 20.0, abs=1e-3)
     assert needle.least_stretch < 0.99

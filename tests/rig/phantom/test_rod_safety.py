@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 import flexneedle.rig.phantom
-from flexneedle import load_scenario
+from flexneedle import Control, load_scenario
 from flexneedle.rig.phantom import rod as rd
 from flexneedle.rig.phantom.draw import draw
 from flexneedle.rig.phantom.phantom import Phantom
+from flexneedle.rig.phantom.plants import ExactPlant
+from flexneedle.simulator.control import MOVES
+from flexneedle.types import STILL
 from reference import draws
 from reference.rods import IDEAL, Bench, move, plant
 
@@ -33,16 +36,16 @@ EXTREME = PHANTOM.with_values(
 
 
 def within(phantom, row):
-    """A row (4,) cut to the limits of step and travel."""
+    """A control cut to the limits of step and travel."""
     limits, moved = phantom._limits, phantom._moved
-    row = np.clip(row, -limits.step, limits.step)
-    return np.clip(row, limits.travel[:, 0] - moved, limits.travel[:, 1] - moved)
+    row = np.clip(row[:MOVES], -limits.step, limits.step)
+    return np.clip(row, limits.travel[:, 0] - moved, limits.travel[:, 1] - moved).tolist()
 
 
 def wander(scenario, seed, periods):
     """(steps, failed steps) of random commands in all five inputs on a drawn phantom."""
     rng = np.random.default_rng(seed)
-    phantom = Phantom(draw(scenario, rng), 1)
+    phantom = Phantom(draw(scenario, rng), 0.0)
     inner, steps, lost = phantom._plant, 0, 0
     forward, drift = rng.uniform(0.6, 1.0), rng.normal(0.0, 0.2)
 
@@ -50,8 +53,8 @@ def wander(scenario, seed, periods):
         nonlocal steps, lost
         step(row)
         steps += 1
-        lost += inner._s[rd.CONVERGED] == 0.0
-        assert np.isfinite(inner._s).all()
+        lost += inner.state["converged"] == 0.0
+        assert np.isfinite([*inner.nodes.ravel(), *inner.state["offset"], inner.state["energy"]]).all()
 
     inner.step = counted
     for _ in range(periods):
@@ -61,8 +64,8 @@ def wander(scenario, seed, periods):
             rng.uniform(-2e-3, 2e-3),
             drift + rng.normal(0.0, 0.2),
         )
-        row = within(phantom, np.array([ahead, lateral, rotation, guide]))
-        phantom.apply((*row.tolist(), 1 if rng.random() < 0.1 else -1), 0.2)
+        row = within(phantom, np.array(Control(ahead, db_y=lateral, db_theta=rotation, dg_y=guide)))
+        phantom.apply(Control(*row, flip=bool(rng.random() < 0.1)), 0.2)
     assert phantom.condition().converged == (lost == 0)
     return steps, lost
 
@@ -84,17 +87,32 @@ def test_random_scenarios_converge():
     assert counts[1] == 0
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_needle_slides_round_the_wall_of_its_guide_in_few_iterations(seed):
+    """The preset in space, with a clearance of 0.05 mm: rolls of a bent needle by any angle, the guide in both axes."""
+    rng = np.random.default_rng(seed)
+    needle = ExactPlant(draw(PHANTOM.with_values({"setup.axes": 2}), rng), 0.0)
+    iterations = []
+    for _ in range(250):
+        roll = rng.uniform(-3.0, 3.0) if rng.random() < 0.1 else 0.0
+        across = rng.normal(0.0, 0.03, 2)
+        needle.step(np.array(Control(db_x=0.25, dg_y=across[0], dg_z=across[1], roll=roll)))
+        iterations.append(needle.state["iterations"])
+    assert needle.converged
+    assert np.mean(iterations) < 8.0
+
+
 def test_a_failed_equilibrium_is_reported_permanently():
     """A straight column under three times Euler's load is an unstable equilibrium."""
     bench = Bench(segments=32).loaded(x=-3.0 * math.pi**2 * 1000.0 / (4.0 * 100.0**2))
     assert not bench.converged
     needle = plant()
-    needle._s[rd.LOAD_X] = -100.0
-    needle.step(np.array([0.0, 0.0, 0.0, 0.0, -1.0]))
+    needle.state["load"][0] = -100.0
+    needle.step(np.array(STILL))
     assert not needle.converged
-    needle._s[rd.LOAD_X] = 0.0
-    needle.step(np.array([0.0, 0.0, 0.0, 0.0, -1.0]))
-    assert needle._s[rd.CONVERGED] == 1.0
+    needle.state["load"][0] = 0.0
+    needle.step(np.array(STILL))
+    assert needle.state["converged"] == 1.0
     assert not needle.converged  # permanently
 
 
@@ -104,23 +122,22 @@ def test_a_failed_equilibrium_is_reported_permanently():
 def test_invalid_numbers_are_reported_and_the_solve_ends(where, bad):
     """No endless loop, no crash; the failure is reported."""
     needle = move(plant(), 0.25, times=140)
-    places = {"base": rd.BASE_Y, "guide": rd.GUIDE_Y, "load": rd.LOAD_Y}
     if where == "angle":
-        needle._theta[3] = bad
+        needle.segments["frame"][3, 3] = bad
     elif where == "contact":
-        needle._channel[rd.C_Y, 2] = bad
+        needle.channel["place"][2, 1] = bad
     else:
-        needle._s[places[where]] = bad
+        needle.state[where][0 if where == "guide" else 1] = bad
     for _ in range(3):
-        needle.step(np.array([0.25, 0.0, 0.0, 0.0, -1.0]))
-    assert not needle.converged or np.isfinite(needle._s).all()
+        needle.step(np.array(Control(db_x=0.25)))
+    assert not needle.converged or np.isfinite(needle.nodes).all()
     if math.isnan(bad):
         assert not needle.converged
 
 
 def test_a_full_channel_ends_the_cut_and_not_the_program():
     bench = Bench(length=60.0, segments=30, base=(-60.0, 0.0, 0.0))
-    bench.channel = np.zeros((rd.CHANNEL_ROWS, 5))
+    bench.channel = np.zeros(5, rd.POINT)
     for _ in range(10):
         bench.step(db_x=1.0)
     assert bench.count == 5
@@ -132,10 +149,10 @@ def test_beyond_the_last_cell_the_tissue_is_that_of_the_last_cell():
     needle = plant()
     depth = needle.rod.law.size * needle.rod.cell
     assert depth >= IDEAL.setup.max_depth + 2.0
-    needle._s[rd.BASE_X] += depth + 27.0
+    needle.state["base"][0] += depth + 27.0
     move(needle, 0.25, times=20)
     assert needle.tip[0] > depth
-    assert needle._channel[rd.C_STIFFNESS, needle._count - 1] > 0.0
+    assert needle.channel["stiffness"][needle.count - 1] > 0.0
 
 
 def imports(path):
@@ -153,22 +170,19 @@ def imports(path):
     return plain + named
 
 
-def test_the_rod_shares_no_solver_with_the_controllers_model():
-    """From the package it imports only the two decorators for compilation, and the tables of the tissue's laws."""
-    path = Path(flexneedle.rig.phantom.__file__).with_name("rod.py")
-    ours = {pair for pair in imports(path) if pair[0].startswith("flexneedle")}
-    assert ours == {
-        ("flexneedle.mechanics.compile", "inner"),
-        ("flexneedle.mechanics.compile", "kernel"),
-        ("flexneedle.mechanics.law", "response"),
-        ("flexneedle.mechanics.law", "stored_energy"),
-    }
-    assert {module for module, _ in imports(path)} - {module for module, _ in ours} == {
-        "math",
-        "typing",
-        "numpy",
-        "numpy.typing",
-    }
+KERNELS = ("space.py", "rod.py", "hinges.py", "loads.py", "sweep.py", "equilibrium.py")
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_the_rod_shares_no_solver_with_the_controllers_model(name):
+    """Only the two decorators for compilation, the tables of the tissue's laws, and the columns of a control."""
+    found = imports(Path(flexneedle.rig.phantom.__file__).with_name(name))
+    modules = {module for module, _ in found if module.startswith("flexneedle")}
+    ours = {f"flexneedle.rig.phantom.{Path(kernels).stem}" for kernels in KERNELS}
+    assert modules - ours <= {"flexneedle.mechanics.compile", "flexneedle.mechanics.law", "flexneedle.types"}
+    names = {name for module, name in found if module.startswith("flexneedle.mechanics")}
+    assert names <= {"inner", "kernel", "response", "stored_energy"}
+    assert {module for module, _ in found} - modules <= {"math", "typing", "numpy", "numpy.typing"}
 
 
 def test_the_exact_plant_imports_from_mechanics_only_the_tables_of_the_laws():

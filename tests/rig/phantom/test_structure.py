@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from flexneedle import load_scenario
+from flexneedle import Control, load_scenario
 from flexneedle.errors import ScenarioError
 from flexneedle.rig.phantom.draw import draw
 from flexneedle.rig.phantom.phantom import Phantom
@@ -81,9 +81,9 @@ def test_a_hidden_layer_across_a_boundary_is_stiffer_on_both_sides():
 def test_each_structural_change_moves_the_tip_of_both_plants(kind, structure):
     ends = []
     for scenario in (IDEAL, structured(IDEAL, **structure)):
-        phantom = Phantom(truth_of(scenario.with_values(COARSE)), 1, kind)
+        phantom = Phantom(truth_of(scenario.with_values(COARSE)), 0.0, kind)
         for _ in range(60):
-            phantom.apply((1.0, 0.0, 0.0, 0.05, -1), 0.2)
+            phantom.apply(Control(db_x=1.0, dg_y=0.05), 0.2)
         assert phantom.condition().converged
         ends.append(phantom.condition().tip[1])
     assert abs(ends[0] - ends[1]) > 1e-3

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from reference import space_validation as in_space
 from reference import validation as problems
 from reference.rods import Bench
 
@@ -30,7 +31,7 @@ def made_up():
     falling = {name: 1e-4 * sizes[:-1] ** 2 for name, sizes in problems.SIZES.items()}
     return problems.Found(
         cantilever={load: np.outer(problems.SEGMENTS**-2.0, [1.0, 2.0, 3.0]) for load in problems.LOADS},
-        shapes=dict.fromkeys(problems.LOADS, bench.nodes / 100.0),
+        shapes=dict.fromkeys(problems.LOADS, bench.nodes[:, :2] / 100.0),
         buckling=0.999,
         gaps={layers: dict.fromkeys(problems.MESHES, gaps) for layers in (1, 2)},
         curvature={length: [0.01, 0.002, 5e-4] for length in problems.BEVELS},
@@ -42,6 +43,12 @@ def made_up():
         second=np.outer(problems.ELEMENTS**2, [1e-6, 1e-4, 1e-5]),
         rubbed=[2e-3, 1e-3],
         refined=falling,
+        space=in_space.Space(
+            [1e-3 * np.array([16.0, 4.0, 1.0])],
+            [1e-4, 2.5e-5, 6e-6],
+            dict.fromkeys(in_space.SHARES, 0.99),
+            1e-12,
+        ),
     )
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from flexneedle import load_scenario
 from flexneedle.rig.tracking.simulated import NoisyTracker
 from flexneedle.rig.virtual import Seeds, virtual_rig
+from flexneedle.types import Control
 
 PERIOD = 0.025
 
@@ -28,7 +29,7 @@ class ManualClock:
 
 def moving(time):
     """A tip that moves at 1 mm/s along x and −1 mm/s along y, and is at rest before the start."""
-    return 10.0 + max(time, 0.0), -max(time, 0.0)
+    return 10.0 + max(time, 0.0), -max(time, 0.0), 0.0
 
 
 def fresh(clock, tip_at=moving, period=PERIOD, jitter=0.0, seed=0, **faults):
@@ -109,7 +110,7 @@ def test_a_delayed_reading_has_the_position_and_time_of_measurement(delay):
         clock.wait(PERIOD)
         (sample,) = device.read()
         assert sample.time == pytest.approx(clock.now() - delay)
-        assert (sample.x, sample.y) == pytest.approx(moving(clock.now() - delay))
+        assert (sample.x, sample.y) == pytest.approx(moving(clock.now() - delay)[:2])
 
 
 def test_before_the_first_delayed_reading_of_a_move_readings_are_at_rest():
@@ -157,10 +158,10 @@ def test_the_rigs_delay_is_a_control_period_at_full_step_and_speed():
         scenario = load_scenario("phantom").with_values(
             {"phantom.delay_periods": periods, "phantom.missing_fraction": 0.0, "tracker.jitter_mm": 0.0}
         )
-        rig = virtual_rig(scenario, 1, Seeds(*map(np.random.SeedSequence, (1, 2, 3))))
+        rig = virtual_rig(scenario, 0.0, Seeds(*map(np.random.SeedSequence, (1, 2, 3))))
         tips = [rig.truth().tip[:2]]
         for _ in range(4):
-            rig.driver.apply((1.0, 0.0, 0.0, 0.2, -1), 0.2)
+            rig.driver.apply(Control(db_x=1.0, dg_y=0.2), 0.2)
             tips.append(rig.truth().tip[:2])
             last = rig.tracker.read()[-1]
             index = max(0, len(tips) - 1 - int(periods))
@@ -204,7 +205,7 @@ def test_missing_readings_do_not_change_other_readings():
 
 def test_a_delay_does_not_change_the_noise():
     """For any number of readings before the start."""
-    at_rest = {"tip_at": lambda _: (0.0, 0.0), "jitter": 0.1, "missing": 0.1}
+    at_rest = {"tip_at": lambda _: (0.0, 0.0, 0.0), "jitter": 0.1, "missing": 0.1}
     noise = []
     for delay in (0.0, 0.2, 0.4):
         clock = ManualClock()
@@ -229,7 +230,7 @@ def test_noise_is_white_with_the_jitter_on_each_axis():
     clock = ManualClock()
     jitter = load_scenario("phantom").tracker.jitter_per_axis
     assert jitter == pytest.approx(0.07 / np.sqrt(3))
-    device = tracker(clock, lambda _: (10.0, -3.0), jitter=jitter)
+    device = tracker(clock, lambda _: (10.0, -3.0, 0.0), jitter=jitter)
     clock.wait(PERIOD * 20_000)
     noise = np.array([(sample.x - 10.0, sample.y + 3.0) for sample in device.read()])
     np.testing.assert_allclose(noise.std(axis=0), jitter, rtol=0.02)
@@ -250,3 +251,27 @@ def test_readings_before_the_start_have_the_same_noise():
 def test_same_seed_same_noise():
     assert readings(40, seed=3) == readings(40, seed=3)
     assert readings(40, seed=3) != readings(40, seed=4)
+
+
+def test_in_space_z_is_measured_with_the_same_noise_and_in_the_plane_not_at_all():
+    clock = ManualClock()
+    one = fresh(clock, lambda _: (1.0, 2.0, 3.0), jitter=0.1, axes=2)
+    flat = fresh(clock, lambda _: (1.0, 2.0, 3.0), jitter=0.1)
+    clock.wait(4000 * PERIOD)
+    z = np.array([reading.z for reading in one.read()])
+    assert z.mean() == pytest.approx(3.0, abs=0.006)
+    assert z.std() == pytest.approx(0.1, rel=0.05)
+    assert all(reading.z is None for reading in flat.read())
+
+
+def test_directions_have_their_own_noise_and_change_no_position():
+    clock = ManualClock()
+    plain = fresh(clock, jitter=0.1)
+    with_ = fresh(clock, jitter=0.1, direction_at=lambda _: (0.02, -0.01), direction_jitter=0.003)
+    clock.wait(4000 * PERIOD)
+    one, other = plain.read(), with_.read()
+    assert [(each.x, each.y) for each in one] == [(each.x, each.y) for each in other]
+    assert all(each.direction is None for each in one)
+    directions = np.array([each.direction for each in other])
+    np.testing.assert_allclose(directions.mean(axis=0), [0.02, -0.01], atol=2e-4)
+    np.testing.assert_allclose(directions.std(axis=0), 0.003, rtol=0.05)

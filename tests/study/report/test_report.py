@@ -7,6 +7,7 @@ import re
 import shlex
 import xml.etree.ElementTree as ElementTree
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -427,6 +428,104 @@ def test_the_worst_have_a_command_to_reproduce_them(report_on):
         f"--seed {first['seed']} --plan-seed 0 --controller open-loop --phantom exact --strategy manipulation"
     )
     assert worst[0]["command"] in page.text
+
+
+def in_space(rows, off=1.0):
+    """The rows as those of a study in space: targets at z = 2 mm, tips beyond them along z by `off` of their error."""
+    return [
+        row
+        | {"setup.axes": 2, "target.lateral_z_mm": 2.0, "target_lateral_z_mm": 2.0}
+        | {"tip_z_mm": 2.0 + off * row["true_error_mm"]}
+        for row in rows
+    ]
+
+
+def test_a_study_in_space_shows_its_tips_in_the_view_along_the_axis(sketched_on, rows):
+    report, _ = sketched_on(in_space(rows))
+    assert [drawn.name for drawn in report.figures][:2] == ["targeting", "targeting-across"]
+    assert "view along the axis" in report.figures[1].caption
+
+
+def test_the_view_along_the_axis_has_the_distances_from_the_targets(drawn_on, rows, monkeypatch):
+    shown = []
+    monkeypatch.setattr("flexneedle.study.report.figures.save", save_nothing)
+    monkeypatch.setattr(
+        "flexneedle.study.report.figures.targeting_figure", lambda panels: shown.append(panels)
+    )
+    rows = in_space(rows)
+    drawn_on(rows)
+    _, across = shown
+    tips = np.concatenate([panel.content.tips for panel in across])
+    expected = [(row["tip_y_mm"] - row["target_lateral_mm"], row["true_error_mm"]) for row in rows]
+    np.testing.assert_allclose(sorted(tips.tolist()), sorted(expected), atol=1e-12)
+    assert all((panel.content.targets == 0.0).all() for panel in across)
+
+
+def test_targets_in_space_have_three_numbers_in_page_and_command(report_on, rows):
+    report, page = report_on(in_space(rows))
+    depth, lateral = (
+        rows[report.findings.worst[0]]["target_depth_mm"],
+        rows[report.findings.worst[0]]["target_lateral_mm"],
+    )
+    assert f"--target {depth:g} {lateral:g} 2 --seed" in report.values()["worst"][0]["command"]
+    assert f"{depth:g}, {lateral:g}, 2" in page.text
+
+
+def test_differences_pair_targets_with_the_same_z(report_on, rows):
+    """Rows of the other controller at other z are not compared."""
+    rows = in_space(rows)
+    ours = rows[0]["controller"]
+    apart = [row if row["controller"] == ours else row | {"target_lateral_z_mm": -2.0} for row in rows]
+    assert [found.pairs for found in report_on(rows)[0].findings.against] == [len(rows) // 2]
+    assert [found.pairs for found in report_on(apart)[0].findings.against] == [0]
+
+
+def sds(tip, middle):
+    """Columns of the deviations (y, z) from the predictions, the same at each fraction of the depth."""
+    both = {"tip": tip, "middle": middle}
+    return {
+        f"predicted_{fraction}_{part}_{axis}_sds": value
+        for fraction in ("quarter", "half", "three_quarters")
+        for part, values in both.items()
+        for axis, value in zip("yz", values, strict=True)
+    }
+
+
+def test_coverage_counts_both_axes_of_tip_and_middle(report_on):
+    """Of four insertions one is off in y, two in z of the middle; 1.95 is within, 1.97 is not."""
+    rows = in_space(make_rows(targets=TARGETS[:1], repeats=4))
+    deviations = [
+        ((1.97, 0.1), (0.0, 3.0)),
+        ((-1.95, 0.2), (0.1, -2.0)),
+        ((1.0, 1.0), (1.0, 1.0)),
+        ((0.0,) * 2,) * 2,
+    ]
+    rows = [row | sds(*of) | {"predicted_half_sd_mm": 0.1} for row, of in zip(rows, deviations, strict=True)]
+    report, page = report_on(rows)
+    (found,) = report.findings.predictions
+    assert (found.count, found.tip_covered, found.middle_covered) == (4, (7 / 8,) * 3, (6 / 8,) * 3)
+    assert "87.5 %" in page.text
+    assert "75.0 %" in page.text
+
+
+def test_a_controller_that_predicts_shapes_alone_warns_of_nothing(report_on):
+    rows = [row | sds((0.5, None), (0.5, None)) for row in make_rows(targets=TARGETS[:1], repeats=4)]
+    (found,) = report_on(rows)[0].findings.predictions
+    assert (found.tip_covered, found.unwarned) == ((1.0,) * 3, None)
+    assert np.isnan(found.in_vain)
+
+
+def test_studies_of_before_have_no_coverage_and_no_view_along_the_axis(sketched_on, rows):
+    """Their tables have neither a second axis nor deviations."""
+    young = ("setup.axes", "setup.guide_axes", "setup.rotation", "entry.")
+    rows = [
+        {name: value for name, value in row.items() if "_z_" not in name and not name.startswith(young)}
+        for row in rows
+    ]
+    assert not any(name.endswith("_sds") for name in rows[0])
+    report, _ = sketched_on(rows)
+    assert report.findings.predictions == []
+    assert "targeting-across" not in {drawn.name for drawn in report.figures}
 
 
 def test_other_scenarios_are_written_for_the_commands(report_on):

@@ -55,7 +55,7 @@ def row_of(study, index, bounded):
     insertion = study.insertion(index)
     point = insertion.point
     error = ERRORS[point.controller][point.world] if point.case == "perfect" else 0.05
-    depth, lateral = point.scenario.target.position
+    depth, lateral, _ = point.scenario.target.position
     return dict.fromkeys(RESULT_COLUMNS) | {
         "index": index,
         "true_error_mm": error,
@@ -72,14 +72,15 @@ def row_of(study, index, bounded):
 
 
 def predicted(point, error):
-    """Predictions with a standard deviation of 0.1 mm and an error of the given number of them."""
+    """Deviations of the tip from its predictions, half as large in the middle; y alone, as in the plane."""
     if (point.controller, point.case) != (DEFAULT, "perfect"):
         return {}
     places = zip(("quarter", "half", "three_quarters"), SIGMAS.get(point.world, [None] * 3), strict=True)
     found = {"warning": "predicted miss" if point.world in WARNED else ""}
     for place, off in places:
         if off is not None:
-            found |= {f"predicted_{place}_mm": error + 0.1 * off, f"predicted_{place}_sd_mm": 0.1}
+            found |= {f"predicted_{place}_y_mm": error + 0.1 * off, f"predicted_{place}_sd_mm": 0.1}
+            found |= {f"predicted_{place}_tip_y_sds": off, f"predicted_{place}_middle_y_sds": 0.75 * off}
     return found
 
 
@@ -155,8 +156,9 @@ def test_predictions_are_reported_for_groups_that_have_any(report):
     guided, free = report.findings.predictions
     assert guided.levels == {"controller": DEFAULT, "case": "perfect", "guide": "with a guide"}
     assert (guided.count, free.count) == (3, 1)
-    assert_allclose(guided.covered, (2 / 3, 1 / 3, 2 / 3))
-    assert_allclose(free.covered, (np.nan, np.nan, 1.0))
+    assert_allclose(guided.tip_covered, (2 / 3, 1 / 3, 2 / 3))
+    assert_allclose(guided.middle_covered, (2 / 3, 2 / 3, 1.0))
+    assert_allclose(free.tip_covered, (np.nan, np.nan, 1.0))
 
 
 def test_false_warnings_and_misses_without_warning_are_counted(report):
@@ -167,7 +169,9 @@ def test_false_warnings_and_misses_without_warning_are_counted(report):
 
 
 def test_page_and_summary_have_the_predictions(report):
-    assert "covered at ¼ of the depth" in report.page.read_text(encoding="utf-8")
+    page = report.page.read_text(encoding="utf-8")
+    assert "tip covered at ¼ of the depth" in page
+    assert "middle covered at ¼ of the depth" in page
     assert [group["unwarned"] for group in report.values()["predictions"]] == [1, 0]
 
 
@@ -210,3 +214,44 @@ def test_each_cell_of_the_tables_of_worlds_has_its_heading_as_label(report):
         (found,) = (table for caption, table in tables.items() if caption.startswith(start))
         assert len(found.labels) > 0
         assert all(labels == found.headings for labels in found.labels)
+
+
+def test_worlds_in_space_are_grouped_by_their_rigs_and_named_in_the_commands(tmp_path, monkeypatch):
+    monkeypatch.setattr("flexneedle.study.report.figures.save", save_nothing)
+    (tmp_path / "few.toml").write_text(
+        'name = "few"\n[[axes]]\nkey = "world"\nvalues = [3, 15]\n'
+        '[[axes]]\nkey = "world_rig"\nvalues = ["two-axes", "one-axis", "no-guide"]\n'
+    )
+    study = load_study(tmp_path / "few.toml")
+    rows = {k: done_row(study, k) for k in range(len(study))}
+    write_tables(tmp_path, study, rows, Plans(tmp_path / "plans"))
+    (tmp_path / "study.json").write_text(json.dumps({"study": study.definition}))
+    report = write_report(tmp_path)
+    assert [list(found.levels.values()) for found in report.findings.worlds] == [
+        [DEFAULT, "two-axes"],
+        [DEFAULT, "one-axis"],
+        [DEFAULT, "no-guide"],
+    ]
+    names = {
+        re.match(r"flexneedle insert (\S+) --target", command)[1] for command in report.commands.values()
+    }
+    assert names == {"world:3:two-axes", "world:3:one-axis", "world:15:no-guide"}
+    assert "targeting-across" in {drawn.name for drawn in report.figures}
+
+
+def done_row(study, index):
+    """An insertion that ends 0.1 mm beyond its target along z."""
+    depth, lateral, z = study.insertion(index).point.scenario.target.position
+    tip = {"tip_x_mm": depth, "tip_y_mm": lateral, "tip_z_mm": z + 0.1}
+    return (
+        dict.fromkeys(RESULT_COLUMNS)
+        | tip
+        | {
+            "index": index,
+            "true_error_mm": 0.1,
+            "reach_mm": 0.0,
+            "unconverged_periods": 0,
+            "outcome": "done",
+            "reason": "",
+        }
+    )

@@ -9,7 +9,9 @@ each relative to a scale of the scenario, so that one setting serves every needl
 Each decision comes with the predicted miss and its standard deviation (`control.outlook`).
 """
 
+import cmath
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import cast
@@ -17,13 +19,13 @@ from typing import cast
 import numpy as np
 from pydantic import Field
 
-from flexneedle.control.forecast import probability_beyond
+from flexneedle.control.forecast import probability_beyond, size_text
 from flexneedle.control.guide import guide_may_move
 from flexneedle.control.interface import Decision, Method
 from flexneedle.control.outlook import UNCORRECTED, Outlook
 from flexneedle.control.path import Ahead, GuidePath, of_plan, proposals
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.estimation.identification import Identification, Identified
+from flexneedle.estimation.identification import Identification, Identified, facing
 from flexneedle.estimation.prior import Priors
 from flexneedle.estimation.task import Task
 from flexneedle.planning import terms
@@ -31,14 +33,16 @@ from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.horizon import Found, Variables, best
 from flexneedle.planning.terms import Term, Trajectories
 from flexneedle.scenario.sections.fields import NonNegative, count
-from flexneedle.types import Command, Floats
+from flexneedle.types import STILL, Floats, Pose, Shape, X, Y, Z, laterals
 
 _ELITE_FRACTION = 0.125
 _SMOOTHING = 0.3
 _TOLERANCE = 1e-6
 _RESTS = (4.0, 2.0, 1.0)  # control steps before the target at which the needle rests
-_STILL: Command = (0.0, 0.0, 0.0, 0.0, -1)
 _SURPRISE = 4.0  # residual of the fit, in standard deviations of a reading, from which the needle rests
+_STILL = 1e-6  # rad: of a needle that did not roll
+
+_FURTHEST_LEVER = 3.0  # of the needle for a motion of the tip: beyond it the bevel corrects, too
 _LOST = 0.5  # probability of a miss beyond the limit from which a longer search is made
 
 
@@ -78,7 +82,7 @@ class AdaptiveMpc(Priors):
 class Memory:
     """The memory from period to period: the current path, and the derivatives ahead of the tip.
 
-    path: as decided; rolled: the same after the roll of the command; bevel: side of the bevel before the command.
+    path: as decided; rolled: the same after the roll of the command; roll: the needle's angle (rad) before the command.
     The next estimate shows which of the two is current: a needle that is held or rests does not roll.
     scale: energy (mJ) of the tissue down to the target displaced by 1 mm; rests: number of rests already made;
     blur: standard deviation (mm) of a predicted miss of 0.
@@ -86,7 +90,7 @@ class Memory:
 
     path: GuidePath
     rolled: GuidePath
-    bevel: int
+    roll: float
     scale: float
     outlook: Outlook | None = None
     rests: int = 0
@@ -96,7 +100,7 @@ class Memory:
 def begin(task: Task) -> Memory:
     """The memory at the start: the plan's path."""
     path, scale = of_plan(task.plan), task.simulator.energy_scale(task.plan.target[0])
-    return Memory(path, path, task.plan.bevel, scale)
+    return Memory(path, path, task.plan.roll, scale)
 
 
 def decide(
@@ -105,33 +109,40 @@ def decide(
     """The first step of the best path found."""
     fitted = cast(Identified, estimate)  # METHOD below names its observer
     settings = task.settings
-    current = memory.path if fitted.state.bevel == memory.bevel else memory.rolled
+    current = memory.path if math.isclose(fitted.state.roll, memory.roll, abs_tol=_STILL) else memory.rolled
     ahead = Ahead.of(task, fitted.state, current)
     found = search_path(task, fitted, ahead, memory, 1 if memory.outlook else settings.effort, rng)
     if not math.isfinite(found.cost):
-        return Decision(_STILL, "no path converges on the fitted model", found.cost), memory
-    outlook, miss, sd = _forecast(task, memory, fitted, found)
+        return Decision(STILL, "no path converges on the fitted model", found.cost), memory
+    outlook, miss, sd, predicted = _forecast(task, memory, fitted, ahead, found)
     if probability_beyond(task.scenario.control.miss_limit_mm, miss, sd) > _LOST:
         ahead = Ahead.of(task, fitted.state, ahead.corrected(found.z))
         found = search_path(task, fitted, ahead, memory, settings.effort, rng)
-        outlook, miss, sd = _forecast(task, memory, fitted, found)
+        outlook, miss, sd, predicted = _forecast(task, memory, fitted, ahead, found)
     path = ahead.corrected(found.z)
     command, rolled = ahead.first(path)
     rest, rests = _rest(task, memory, fitted, ahead.left)
-    depths = ", ".join(f"{roll:.1f}" for roll in rolled.rolls)
-    rolls = f"rolls at {depths} mm" if depths else "no roll"
-    why = f"{rolls}; predicted miss {miss:+.3f} ± {sd:.3f} mm"
+    why = f"{_rolls_text(rolled, fitted.axes)}; predicted miss {size_text(miss)} ± {sd:.3f} mm"
     spread = float(np.sqrt(found.search_state.covariance[0, 0]))
     after = Memory(
         path,
         rolled,
-        fitted.state.bevel,
+        fitted.state.roll,
         memory.scale,
         outlook,
         rests,
         outlook.sd(fitted, task.plan.target[0], 0.0),
     )
-    return Decision(command, why, found.cost, spread, miss, sd, rest), after
+    return Decision(command, why, found.cost, spread, miss, sd, rest, predicted), after
+
+
+def _rolls_text(path: GuidePath, axes: int) -> str:
+    """Where the needle rolls, in space with its angles after that."""
+    if not len(path.rolls):
+        return "no roll"
+    if axes == 1:
+        return f"rolls at {', '.join(f'{depth:.1f}' for depth, _ in path.rolls)} mm"
+    return f"rolls at {', '.join(f'{depth:.1f} mm to {math.degrees(angle):.0f}°' for depth, angle in path.rolls)}"
 
 
 def _rest(task: Task, memory: Memory, fitted: Identified, left: float) -> tuple[float, int]:
@@ -151,9 +162,9 @@ def _rest(task: Task, memory: Memory, fitted: Identified, left: float) -> tuple[
 
 def _surprised(fitted: Identified) -> bool:
     """Whether the residual of the fit to the readings of a step in the tissue is improbably large."""
-    stepped = bool(fitted.moves) and fitted.moves[-1].applied[0] > 0.0
-    off = abs(fitted.innovation[1]) / math.sqrt(fitted.reading_variance)
-    return stepped and float(fitted.state.tip[0]) > 0.0 and off > _SURPRISE
+    stepped = bool(fitted.moves) and fitted.moves[-1].applied.db_x > 0.0
+    off = math.hypot(*fitted.innovation[1:]) / math.sqrt(fitted.reading_variance)
+    return stepped and float(fitted.state.tip[X]) > 0.0 and off > _SURPRISE
 
 
 def search_path(
@@ -162,7 +173,7 @@ def search_path(
     """The best correction of the current path, which is itself among the samples."""
     settings = task.settings
     samples = effort * settings.samples
-    first = proposals(ahead, samples, rng)
+    first = proposals(ahead, samples, rng, _aim(task, fitted, ahead))
     lower, upper = ahead.bounds
     variables = Variables(lower, upper, ahead.current, first.std(axis=0), lambda z: ahead.controls(z)[0])
     elite = elite_count(samples, _ELITE_FRACTION)
@@ -171,11 +182,21 @@ def search_path(
     return best(variables, partial(measured_rollout, fitted), charged, search, rng, first=first)
 
 
+def _aim(task: Task, fitted: Identified, ahead: Ahead) -> complex:
+    """Direction in which the current path misses the target by too little, for a needle that rolls to any angle."""
+    if ahead.setup.half_turns:
+        return 1.0
+    along = measured_rollout(fitted, ahead.controls(ahead.current[None])[0])
+    return complex(-terms.past(along, task.plan.target)[0])
+
+
 def measured_rollout(fitted: Identified, controls: Floats) -> Trajectories:
-    """Trajectories of controls (N, m, 5) on the fitted model; tips as a tracker without errors would measure them."""
-    tips, energy, converged = fitted.simulator.rollout(fitted.state, controls, limits=False)
-    side = fitted.state.bevel * np.cumprod(-np.sign(controls[:, :, 4]), axis=1)
-    tips[:, :, 1] += fitted.run_out * side + fitted.residual
+    """Trajectories of controls (N, m, 9) on the fitted model; tips as a tracker without errors would measure them."""
+    predicted = fitted.simulator.rollout(fitted.state, controls, limits=False, rough=True)
+    tips, energy, converged = predicted[:3]
+    off = fitted.run_out * facing(fitted.state.bevel, controls, fitted.axes) + fitted.residual
+    tips[:, :, Y] += off.real
+    tips[:, :, Z] += off.imag
     return Trajectories(controls, tips, energy, converged)
 
 
@@ -192,7 +213,7 @@ def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> 
     urgent = min(1.0, max(ahead.left, uncorrected) / whole)
     miss = partial(terms.miss, target=target, blur=memory.blur * share)
     large = partial(terms.large_miss, target=target, blur=memory.blur * share, sd=memory.blur)
-    start = float(fitted.tip[0]), float(fitted.tip[1])
+    start = Pose.of(fitted.tip).point
     return (
         Term("miss", 1.0, miss),
         Term("large miss", urgent**-settings.urgency - 1.0, large),
@@ -201,26 +222,34 @@ def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> 
         Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
         Term("flips", settings.roll_weight_mm, terms.flips),
         Term("late", settings.late_roll_weight * fitted.roll_sd, late),
-        Term("reach", reach, partial(terms.out_of_reach, expected=out_of_reach(task, fitted, ahead, memory))),
+        Term("reach", reach, out_of_reach(task, fitted, ahead, memory)),
     )
 
 
-def out_of_reach(task: Task, fitted: Identified, ahead: Ahead, memory: Memory) -> Floats:
-    """Expected distance (2,), mm, of the target from the bevel's reach after the first step, with the bevel as it is or
-    rolled before the step. The reach is the interval between the ends with the bevel on either side from the second
-    step on; its bounds are normally distributed.
+def out_of_reach(
+    task: Task, fitted: Identified, ahead: Ahead, memory: Memory
+) -> Callable[[Trajectories], Floats]:
+    """Expected distance (N,), mm, of the target from the bevel's reach after the first step of trajectories.
 
-    With the bevel alone, lost reach cannot be regained; with a guide, the bevel still moves the tip when the guide is
-    far behind it.
+    The reach of a needle that rolls by half turns is the interval between the ends with the bevel on either side from
+    the second step on; that of one that rolls to any angle is the circle about the middle of such an interval. The
+    bounds are normally distributed. With the bevel alone, lost reach cannot be regained; with a guide, the bevel still
+    moves the tip when the guide is far behind it.
     """
-    trajectories = measured_rollout(fitted, ahead.controls(ahead.constant)[0])
+    trajectories = measured_rollout(fitted, ahead.constant)
     if not trajectories.converged.all():
-        return np.zeros(2)
+        return partial(terms.out_of_reach, expected=np.zeros(2))
     past = terms.past(trajectories, task.plan.target).reshape(2, 2)
-    low, high = past.min(axis=1), past.max(axis=1)
     middle = (memory.outlook or Outlook.of(fitted)).sd_now(fitted, task.plan.target[0])
-    sd = np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
-    return above_zero(low, sd) + above_zero(-high, sd)
+    if ahead.setup.half_turns:
+        low, high = past.real.min(axis=1), past.real.max(axis=1)
+        sd = np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
+        return partial(terms.out_of_reach, expected=above_zero(low, sd) + above_zero(-high, sd))
+    # By symmetry the ends along the present direction of the bevel are those along any other.
+    away, radius = -past.mean(), 0.5 * np.abs(np.array([past[0, 0] - past[1, 1], past[1, 0] - past[0, 1]]))
+    sd = np.hypot(middle, radius * fitted.bevel_sd)
+    angle = cmath.phase(complex(away) * fitted.state.bevel.conjugate())
+    return partial(terms.out_of_reach, expected=above_zero(abs(away) - radius, sd), angle=angle)
 
 
 def above_zero(mean: Floats, sd: Floats) -> Floats:
@@ -231,12 +260,27 @@ def above_zero(mean: Floats, sd: Floats) -> Floats:
     return part
 
 
-def _forecast(task: Task, memory: Memory, fitted: Identified, found: Found) -> tuple[Outlook, float, float]:
-    """Derivatives ahead of the tip, the predicted miss (mm, positive in +y) and its standard deviation (mm)."""
-    miss = float(terms.past(found.trajectories, task.plan.target)[0])
+def _forecast(
+    task: Task, memory: Memory, fitted: Identified, ahead: Ahead, found: Found
+) -> tuple[Outlook, complex, float, Shape]:
+    """Derivatives ahead of the tip, the predicted miss (mm; y + iz in space), its standard deviation on an axis (mm),
+    and the predicted shape at the target.
+    """
+    past = complex(terms.past(found.trajectories, task.plan.target)[0])
+    miss = past.real if fitted.axes == 1 else past
+    both = np.concatenate([found.trajectories.controls, ahead.controls(ahead.leaning(found.z)[None])[0]])
+    shapes = fitted.simulator.rollout(fitted.state, both, limits=False, rough=True, shapes=True).shapes
+    nodes, leaning = shapes[:, -1]
     before = memory.outlook or Outlook.of(fitted)
-    outlook = before.renewed(fitted, found.trajectories.controls[0], found.trajectories.tips[0])
-    return outlook, miss, outlook.sd(fitted, task.plan.target[0], miss)
+    outlook = before.renewed(fitted, found.trajectories.controls[0], found.trajectories.tips[0], nodes)
+    sd = outlook.sd(fitted, task.plan.target[0], miss)
+    by_guide, by_bevel = laterals(leaning - nodes, Y, fitted.axes), outlook.bent[fitted.slots.bevel]
+    guide, bevel = (
+        moved / moved[-1] if abs(moved[-1]) > _STILL else 0.0 * moved for moved in (by_guide, by_bevel)
+    )
+    share = min(1.0, _FURTHEST_LEVER / max(float(np.abs(guide).max()), 1.0)) if guide.any() else 0.0
+    lever = share * guide + (1.0 - share) * bevel
+    return outlook, miss, sd, Shape(nodes, outlook.shape_sd(fitted, task.plan.target[0], lever, sd))
 
 
 METHOD = Method(

@@ -7,6 +7,7 @@ from flexneedle.control.interface import Decision, Method, travel_left
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
+from flexneedle.types import Control
 
 
 class BevelOnly(bang_bang.BevelRule):
@@ -17,8 +18,8 @@ def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generat
     """Advance by the largest step, with the bevel towards the target."""
     scenario = task.scenario
     advance = min(scenario.setup.max_advance_mm, travel_left(scenario, task.plan, estimate.state))
-    flip, why = bang_bang.decide(task, estimate, task.settings)
-    return Decision((advance, 0.0, 0.0, 0.0, 1 if flip else -1), why), memory
+    roll, why = bang_bang.decide(task, estimate, task.settings)
+    return Decision(Control(db_x=advance, roll=roll), why), memory
 
 
 METHOD = Method(

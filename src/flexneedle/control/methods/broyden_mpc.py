@@ -17,9 +17,9 @@ from flexneedle.control.mpc import planned_base
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
-from flexneedle.scenario.sections.apparatus import Setup
+from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive, Section, count
-from flexneedle.types import Floats, Plan
+from flexneedle.types import DB_X, DG_Y, Control, Floats, Plan, X
 
 _LEAST_INSERTION_MM = 0.5  # between two updates: in a shorter one the tracker's noise dominates
 _RIDGE = 1e-9  # mm² per squared millimetre of the guide: a unique solution where the guide has no effect
@@ -44,19 +44,23 @@ class BroydenMpc(Section):
 
 @dataclass(frozen=True, eq=False)
 class JacobianEstimate:
-    """Jacobian (2, 2) from (insertion, guide) to the tip (x, y); the last (tip x, insertion, guide) as commanded.
+    """Jacobian (1 + a, 1 + g) from insertion and guide, on g axes, to the tip, on a lateral axes; the last (tip x,
+    insertion, guide) as commanded.
 
-    last_update: tip (x, y) and inputs (insertion, guide), each (2,), of the newest update; None before a reading.
+    last_update: tip (1 + a,) and inputs (1 + g,) of the newest update; None before a reading.
     """
 
     jacobian: Floats
-    history: tuple[tuple[float, float, float], ...] = ()
+    history: tuple[tuple[float, ...], ...] = ()
     last_update: tuple[Floats, Floats] | None = None
 
 
 def begin(task: Task) -> JacobianEstimate:
     """The initial Jacobian: a tip that continues straight and follows the guide laterally."""
-    return JacobianEstimate(np.diag([1.0, task.settings.guide_effect]))
+    setup = task.scenario.setup
+    jacobian = np.eye(1 + setup.axes, 1 + setup.moved_guide_axes)
+    jacobian[1:, 1:] *= task.settings.guide_effect
+    return JacobianEstimate(jacobian)
 
 
 def decide(
@@ -65,33 +69,32 @@ def decide(
     """Update the Jacobian by a new reading, predict the present tip, and take the first of the best guide steps."""
     scenario, state = task.scenario, estimate.state
     settings, setup = task.settings, scenario.setup
-    inputs = np.array([state.travel[0], state.guide])
-    estimated = remember(estimated, float(state.tip[0]), inputs)
+    inputs = np.array([state.travel[DB_X], *state.guide[: setup.moved_guide_axes]])
+    estimated = remember(estimated, float(state.tip[X]), inputs)
     left = travel_left(scenario, task.plan, state)
     advance = min(setup.max_advance_mm, left)
-    db_y, db_theta = planned_base(setup, task.plan, state, state.tip[:1] + advance)[0].tolist()
+    row = Control(advance, *planned_base(setup, task.plan, state, state.tip[:1] + advance)[0].tolist())
     if estimate.measured is None or left <= 0.0:
-        return Decision((advance, db_y, db_theta, 0.0, -1), "no reading yet"), estimated
-    tip = np.array(estimate.measured)
+        return Decision(row, "no reading yet"), estimated
+    tip = np.array(estimate.measured[: 1 + setup.axes])
     then = inputs_at(estimated, float(tip[0]))
     estimated = updated(estimated, tip, then, settings.update_gain)
     tip = tip + estimated.jacobian @ (inputs - then)
     ahead = np.minimum(setup.max_advance_mm * np.arange(1, settings.horizon + 1), left)
-    moves, cost = guide_moves(settings, setup, task.plan, estimated.jacobian, tip, ahead, state.guide)
-    slope, effect = estimated.jacobian[1].tolist()
+    moves, cost = guide_moves(settings, scenario, task.plan, estimated.jacobian, tip, ahead, inputs[1:])
+    slope, effect = estimated.jacobian[1, :2].tolist()
     why = f"bevel kept: never rolled; tip moves {slope:.3f} laterally with insertion, {effect:.3f} with the guide"
-    return Decision((advance, db_y, db_theta, float(moves[0]), -1), why, cost), estimated
+    return Decision(Control(*row[:DG_Y], *moves[0].tolist()), why, cost), estimated
 
 
 def remember(estimated: JacobianEstimate, x: float, inputs: Floats) -> JacobianEstimate:
     """Record the inputs with the tip at depth x (mm), to which later readings are assigned."""
-    insertion, guide = inputs.tolist()
-    history = (*estimated.history, (x, insertion, guide))[-_KEPT:]
+    history = (*estimated.history, (x, *inputs.tolist()))[-_KEPT:]
     return JacobianEstimate(estimated.jacobian, history, estimated.last_update)
 
 
 def inputs_at(estimated: JacobianEstimate, x: float) -> Floats:
-    """Inputs (2,) with the tip at depth x (mm), within the recorded range."""
+    """Inputs (1 + g,) with the tip at depth x (mm), within the recorded range."""
     depth, *inputs = np.array(estimated.history).T
     return np.array([np.interp(x, depth, values) for values in inputs])
 
@@ -114,33 +117,37 @@ def broyden(jacobian: Floats, moved: Floats, measured: Floats, gain: float) -> F
 
 def guide_moves(
     settings: BroydenMpc,
-    setup: Setup,
+    scenario: Scenario,
     plan: Plan,
     jacobian: Floats,
     tip: Floats,
     ahead: Floats,
-    guide: float,
+    guide: Floats,
 ) -> tuple[Floats, float]:
-    """Guide positions (mm, relative to the present one) after n steps that end `ahead` (n,) of the tip, and their cost.
+    """Guide positions (n, g), mm, relative to the present ones (g,), after n steps that end `ahead` (n,) of the tip,
+    and their cost.
 
     Cost: squared distance (mm²) of tip and planned path, and `guide_weight` times the squared guide steps.
     """
-    n = len(ahead)
-    goal = np.interp(tip[0] + ahead, *_path(plan))
-    steps = np.sqrt(settings.guide_weight) * (np.eye(n) - np.eye(n, k=-1))
-    matrix = np.concatenate([jacobian[1, 1] * np.eye(n), steps])
-    right = np.concatenate([goal - tip[1] - jacobian[1, 0] * ahead, np.zeros(n)])
+    n, axes = len(ahead), guide.size
+    goal = np.array([np.interp(tip[0] + ahead, *_path(plan, k)) for k in range(1, tip.size)])
+    effort = np.sqrt(settings.guide_weight) * (np.eye(n) - np.eye(n, k=-1))
+    matrix = np.concatenate([np.kron(jacobian[1:, 1:], np.eye(n)), np.kron(np.eye(axes), effort)])
+    left = goal - tip[1:, None] - np.multiply.outer(jacobian[1:, 0], ahead)
+    right = np.concatenate([left.ravel(), np.zeros(axes * n)])
+    setup, home = scenario.setup, scenario.guide_home
     reach = min(settings.max_guide_travel_mm, setup.max_guide_travel_mm)
-    furthest = setup.max_guide_step_mm * np.arange(1, n + 1)
-    lower, upper = np.maximum(-furthest, -reach - guide), np.minimum(furthest, reach - guide)
+    guide = guide - np.array([home.real, home.imag])[:axes]
+    furthest, place = np.tile(setup.max_guide_step_mm * np.arange(1, n + 1), axes), np.repeat(guide, n)
+    lower, upper = np.maximum(-furthest, -reach - place), np.minimum(furthest, reach - place)
     moves = bounded_least_squares(matrix, right, np.minimum(lower, 0.0), np.maximum(upper, 0.0))
-    return moves, float(np.sum((matrix @ moves - right) ** 2))
+    return moves.reshape(axes, n).T, float(np.sum((matrix @ moves - right) ** 2))
 
 
-def _path(plan: Plan) -> tuple[Floats, Floats]:
-    """Depth and lateral position of the planned path, with the target as its end."""
-    x, y = (np.append(plan.tips[:-1, k], plan.target[k]) for k in (0, 1))
-    return x, y
+def _path(plan: Plan, k: int) -> tuple[Floats, Floats]:
+    """Depth and a lateral position, column k, of the planned path, with the target as its end."""
+    depth, lateral = (np.append(plan.tips[:-1, column], plan.target[column]) for column in (0, k))
+    return depth, lateral
 
 
 def bounded_least_squares(matrix: Floats, right: Floats, lower: Floats, upper: Floats) -> Floats:

@@ -16,9 +16,9 @@ from flexneedle.estimation.task import Task
 
 def decide(task: Task, memory: None, estimate: Estimate, rng: np.random.Generator) -> tuple[Decision, None]:
     """Bevel by the rule, then the best first step of a short horizon along the plan."""
-    flip, why = bang_bang.decide(task, estimate, task.settings)
-    choice = mpc.choose(estimate.simulator, task.plan, estimate.state, task.settings, flip=flip, rng=rng)
-    return Decision((*choice.steps, 1 if flip else -1), why, choice.cost, choice.spread), memory
+    roll, why = bang_bang.decide(task, estimate, task.settings)
+    choice = mpc.choose(estimate.simulator, task.plan, estimate.state, task.settings, roll=roll, rng=rng)
+    return Decision(choice.command, why, choice.cost, choice.spread), memory
 
 
 METHOD = Method(

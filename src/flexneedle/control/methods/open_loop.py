@@ -6,7 +6,8 @@ from flexneedle.control.interface import Decision, Method
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
-from flexneedle.simulator.control import Limits
+from flexneedle.simulator.control import MOVES, Limits
+from flexneedle.types import Control
 
 
 def decide(task: Task, done: int, estimate: Estimate, _rng: np.random.Generator) -> tuple[Decision, int]:
@@ -15,10 +16,11 @@ def decide(task: Task, done: int, estimate: Estimate, _rng: np.random.Generator)
     Positions are replayed, not steps: the rounding of a step by the motors is corrected in the next.
     """
     limits, controls = Limits.of(task.scenario), task.plan.controls
-    goal = np.clip(controls[: done + 1, :4].sum(axis=0), *limits.travel.T)
-    db_x, db_y, db_theta, dg_y = np.clip(goal - estimate.state.travel, -limits.step, limits.step).tolist()
-    command = (db_x, db_y, db_theta, dg_y, 1 if controls[done, 4] > 0.0 else -1)
-    return Decision(command, f"planned step {done + 1}"), done + 1
+    goal = np.clip(controls[: done + 1, :MOVES].sum(axis=0), *limits.travel.T)
+    moves = np.clip(goal - estimate.state.travel, -limits.step, limits.step)
+    return Decision(
+        Control(*moves.tolist(), *controls[done, MOVES:].tolist()), f"planned step {done + 1}"
+    ), done + 1
 
 
 def arrived(task: Task, done: int, _estimate: Estimate) -> bool:

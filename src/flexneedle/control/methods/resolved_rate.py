@@ -14,16 +14,18 @@ import math
 import numpy as np
 
 from flexneedle.control import bang_bang
+from flexneedle.control.guide import guide_reach
 from flexneedle.control.interface import Decision, Method, travel_left
 from flexneedle.control.mpc import planned_base
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
-from flexneedle.scenario.sections.apparatus import Setup
+from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Positive
+from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import Floats, Plan
+from flexneedle.types import DB_Y, DG_Y, ROLL, STILL, Control, Floats, Plan, X, Y, Z
 
 _DISTURBANCE_MM = 0.05  # of the guide: above rounding, small against the 10 mm over which the tissue stiffens
 
@@ -48,59 +50,76 @@ def decide(task: Task, memory: None, estimate: Estimate, _rng: np.random.Generat
     scenario, state = task.scenario, estimate.state
     settings, setup = task.settings, scenario.setup
     left = travel_left(scenario, task.plan, state)
-    flip, why = bang_bang.decide(task, estimate, settings)
+    roll, why = bang_bang.decide(task, estimate, settings)
     if left <= 0.0:
-        return Decision((0.0, 0.0, 0.0, 0.0, -1), "at the target depth"), memory
+        return Decision(STILL, "at the target depth"), memory
     disturbance = min(_DISTURBANCE_MM, 0.5 * setup.max_guide_step_mm, 0.5 * setup.max_guide_travel_mm)
     travel = min(left, max(setup.max_advance_mm, settings.lookahead_mm))
-    controls = nominal(setup, task.plan, state, travel, disturbance, flip=flip)
-    end, jacobian = sensitivity(estimate.simulator, state, controls, disturbance)
-    off = planned_y(task.plan, float(end[0])) - float(end[1]) - estimate.innovation[1]
-    wanted = float(controls[0, 3]) + settings.gain * damped_inverse(jacobian, settings.damping) * off
-    step = max(-setup.max_guide_step_mm, min(setup.max_guide_step_mm, wanted))
-    guide = max(-setup.max_guide_travel_mm, min(setup.max_guide_travel_mm, state.guide + step))
-    db_x, db_y, db_theta = controls[0, :3].tolist()
-    command = (db_x, db_y, db_theta, guide - state.guide, 1 if flip else -1)
-    why = f"{why}; predicted deviation of the tip {-off:.3f} mm, {jacobian:.3f} mm per mm of the guide"
-    return Decision(command, why), memory
+    rows = nominal(scenario, task.plan, state, travel, disturbance, roll)
+    end, jacobian = sensitivity(estimate.simulator, state, rows, disturbance, setup.moved_guide_axes)
+    off = planned_lateral(task.plan, float(end[X])) - end[Y : Z + 1] - estimate.innovation[1:]
+    moved = slice(DG_Y, DG_Y + setup.moved_guide_axes)
+    wanted = rows[0, moved] + settings.gain * damped_solution(jacobian, off, settings.damping)
+    step = np.clip(wanted, -setup.max_guide_step_mm, setup.max_guide_step_mm)
+    place = np.array(state.guide[: len(step)])
+    least, greatest = np.transpose([guide_reach(scenario, axis) for axis in range(len(step))])
+    rows[0, moved] = np.clip(place + step, least, greatest) - place
+    away, follows = ", ".join(f"{-value:.3f}" for value in off[: setup.axes]), float(jacobian[0, 0])
+    why = f"{why}; predicted deviation of the tip {away} mm, {follows:.3f} mm per mm of the guide"
+    return Decision(Control.of(rows[0].tolist()), why), memory
 
 
-def nominal(setup: Setup, plan: Plan, state: State, travel: float, margin: float, *, flip: bool) -> Floats:
-    """Controls (n, 5) that insert by `travel` (mm) as planned, the guide `margin` (mm) inside its limits."""
+def nominal(
+    scenario: Scenario, plan: Plan, state: State, travel: float, margin: float, roll: float
+) -> Floats:
+    """Controls (n, 9) that insert by `travel` (mm) as planned, the guide `margin` (mm) inside its limits.
+
+    roll: that of the first step (rad).
+    """
+    setup = scenario.setup
     count = max(1, math.ceil(travel / setup.max_advance_mm - 1e-9))
     ends = np.minimum(setup.max_advance_mm * np.arange(1, count + 1), travel)
-    depth = float(state.tip[0]) + np.append(0.0, ends)
-    steps = np.diff(np.interp(depth, plan.tips[:, 0], plan.guide))
-    limit, reach = setup.max_guide_step_mm - margin, setup.max_guide_travel_mm - margin
-    guide = np.clip(state.guide + np.cumsum(np.clip(steps, -limit, limit)), -reach, reach)
-    controls = np.zeros((count, 5))
-    controls[:, 0] = np.diff(ends, prepend=0.0)
-    controls[:, 1:3] = planned_base(setup, plan, state, depth[1:])
-    controls[:, 3] = np.diff(guide, prepend=state.guide)
-    controls[:, 4] = -1.0
-    controls[0, 4] = 1.0 if flip else -1.0
-    return controls
+    depth = float(state.tip[X]) + np.append(0.0, ends)
+    limit = setup.max_guide_step_mm - margin
+    rows = controls(count, db_x=np.diff(ends, prepend=0.0))
+    for axis in range(setup.moved_guide_axes):
+        steps, place = np.diff(np.interp(depth, plan.tips[:, X], plan.guide[:, axis])), state.guide[axis]
+        least, greatest = guide_reach(scenario, axis)
+        wanted = place + np.cumsum(np.clip(steps, -limit, limit))
+        guide = np.clip(wanted, least + margin, greatest - margin)
+        rows[:, DG_Y + axis] = np.diff(guide, prepend=place)
+    rows[:, DB_Y:DG_Y] = planned_base(setup, plan, state, depth[1:])
+    rows[0, ROLL] = roll
+    return rows
 
 
 def sensitivity(
-    simulator: Simulator, state: State, controls: Floats, disturbance: float
-) -> tuple[Floats, float]:
-    """Tip pose (3,) after `controls`, and its lateral motion for that of the guide in their first step."""
-    three = np.stack([controls] * 3)
-    three[1:, 0, 3] += disturbance, -disturbance
-    end, more, less = simulator.rollout(state, three).tips[:, -1]
-    return end, float(more[1] - less[1]) / (2.0 * disturbance)
+    simulator: Simulator, state: State, rows: Floats, disturbance: float, axes: int = 1
+) -> tuple[Floats, Floats]:
+    """Tip pose (5,) after controls `rows` (n, 9), and its motion y, z for that of the guide in their first step (2,
+    axes).
+    """
+    tried = np.stack([rows] * (1 + 2 * axes))
+    for axis in range(axes):
+        tried[1 + 2 * axis : 3 + 2 * axis, 0, DG_Y + axis] += disturbance, -disturbance
+    end, *moved = simulator.rollout(state, tried).tips[:, -1]
+    across = np.array(moved)[:, Y : Z + 1]
+    return end, (across[::2] - across[1::2]).T / (2.0 * disturbance)
 
 
-def planned_y(plan: Plan, x: float) -> float:
-    """Lateral position (mm) of the planned path at depth x, with the target as its end."""
-    depth, lateral = plan.tips[:-1, 0], plan.tips[:-1, 1]
-    return float(np.interp(x, np.append(depth, plan.target[0]), np.append(lateral, plan.target[1])))
+def planned_lateral(plan: Plan, x: float) -> Floats:
+    """Lateral position y, z (mm) of the planned path at depth x, with the target as its end."""
+    depth = np.append(plan.tips[:-1, X], plan.target[0])
+    return np.array(
+        [np.interp(x, depth, np.append(plan.tips[:-1, k], plan.target[k])) for k in (Y, Z)], dtype=float
+    )
 
 
-def damped_inverse(jacobian: float, damping: float) -> float:
-    """J/(J² + λ²), which minimises (J u − 1)² + λ² u²; 0 where both are 0."""
-    return jacobian / (jacobian**2 + damping**2) if jacobian or damping else 0.0
+def damped_solution(jacobian: Floats, off: Floats, damping: float) -> Floats:
+    """The least u that minimises ‖J u − off‖² + λ² ‖u‖²."""
+    axes = jacobian.shape[1]
+    matrix, right = np.vstack([jacobian, damping * np.eye(axes)]), np.append(off, np.zeros(axes))
+    return np.asarray(np.linalg.lstsq(matrix, right)[0], dtype=float)
 
 
 METHOD = Method(

@@ -9,9 +9,9 @@ from statistics import median
 from flexneedle.rig.monitor import rules
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import OK, Frame, Measurement, Verdict, VerdictKind
+from flexneedle.types import OK, Frame, Measurement, Point, Verdict, VerdictKind
 
-TipAt = Callable[[float], tuple[float, float]]
+TipAt = Callable[[float], Point]
 """Predicted position of the tip (mm) at a time (s)."""
 
 
@@ -81,11 +81,13 @@ class _Repeats:
 class Monitor:
     """State of the monitor. Frozen: `check` and `check_field` return the next state.
 
-    recent: readings within the window; repeats: the newest readings with the same position; good: the last good
-    reading; field: the last verdict on the field; distorted: whether the field counts as distorted.
+    axes: lateral axes of the needle; recent: readings within the window; repeats: the newest readings with the same
+    position; good: the last good reading; field: the last verdict on the field; distorted: whether the field counts
+    as distorted.
     """
 
     settings: MonitorSettings
+    axes: int = 1
     recent: tuple[Measurement, ...] = ()
     repeats: _Repeats | None = None
     good: Measurement | None = None
@@ -164,14 +166,17 @@ class Monitor:
         return [one.frame for one in self.recent if one.frame is not None]
 
     def _verdicts(
-        self, measurement: Measurement, predicted: tuple[float, float], max_innovation: float
+        self, measurement: Measurement, predicted: Point, max_innovation: float
     ) -> Iterator[Verdict]:
         settings = self.settings
-        yield rules.missing(measurement)
-        if measurement.x is not None and measurement.y is not None:
-            yield rules.innovation((measurement.x, measurement.y), predicted, max_innovation)
+        measured = (measurement.x, measurement.y, measurement.z)[: 1 + self.axes]
+        tip = tuple(value for value in measured if value is not None)
+        yield rules.missing(measurement, self.axes)
+        if len(tip) == len(measured):
+            yield rules.innovation(tip, predicted[: 1 + self.axes], max_innovation)
         if settings.enabled:
-            yield rules.out_of_plane(measurement.z, settings.out_of_plane_limit_mm)
+            if self.axes == 1:
+                yield rules.out_of_plane(measurement.z, settings.out_of_plane_limit_mm)
             yield rules.jump(measurement, self.good, settings.speed_limit_mm_s, settings.jump_margin_mm)
             if self.repeats is not None:
                 yield rules.frozen(self.repeats.count, self.repeats.travel, settings.frozen_travel_mm)

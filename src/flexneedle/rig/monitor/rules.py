@@ -27,9 +27,9 @@ def first_bad(verdicts: Iterable[Verdict]) -> Verdict:
     return next((verdict for verdict in verdicts if not verdict.ok), OK)
 
 
-def missing(measurement: Measurement) -> Verdict:
-    """A reading without a tip; with the tracker's reason if it gives one."""
-    if measurement.x is not None and measurement.y is not None:
+def missing(measurement: Measurement, axes: int = 1) -> Verdict:
+    """A reading without a tip, which has z, too, with two lateral axes; with the tracker's reason if it gives one."""
+    if None not in (measurement.x, measurement.y, measurement.z)[: 1 + axes]:
         return OK
     reading = None if measurement.frame is None else measurement.frame.readings.get(TIP)
     if reading is None:
@@ -64,9 +64,9 @@ def repeated(frame: Frame | None, previous: Frame | None) -> Verdict:
     return Verdict(VerdictKind.STALE, f"frame {frame.number} after frame {previous.number}")
 
 
-def innovation(measured: tuple[float, float], predicted: tuple[float, float], limit: float) -> Verdict:
+def innovation(measured: Position, predicted: Position, limit: float) -> Verdict:
     """The measured tip is more than `limit` (mm) from the predicted one."""
-    distance = math.hypot(measured[0] - predicted[0], measured[1] - predicted[1])
+    distance = math.dist(measured, predicted)
     if distance <= limit:
         return OK
     return Verdict(VerdictKind.INNOVATION, f"{distance:.2f} mm, limit {limit:g} mm")

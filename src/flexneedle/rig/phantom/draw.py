@@ -16,8 +16,9 @@ _THINNEST_MM = 0.1  # least thickness of a layer between displaced boundaries
 class Truth:
     """The true scenario, pose of the clamped base (mm, rad), and imperfections with their sign (mm).
 
-    bend: tip deflection of the free needle, for bevel +1; run_out: offset of the tip from the needle's axis, for
-    bevel +1; bias (x, y) of the tracker; variation: factor on μ in cells of `cell_mm` from the skin down.
+    bend: tip deflection of the free needle, towards the bevel and turned from it by bend_angle (rad); run_out: offset
+    of the tip from the needle's axis, in the same way; both roll with the needle. load: constant force y, z on the tip
+    (N). bias (x, y) of the tracker; variation: factor on μ in cells of `cell_mm` from the skin down.
     """
 
     scenario: Scenario
@@ -28,9 +29,16 @@ class Truth:
     bias: tuple[float, float] = (0.0, 0.0)
     variation: tuple[float, ...] = (1.0,)
     cell_mm: float = 0.25
+    base_z: float = 0.0
+    base_psi: float = 0.0
+    bend_angle: float = 0.0
+    run_out_angle: float = 0.0
+    load: tuple[float, float] = (0.0, 0.0)
 
     def __repr__(self) -> str:
         base = f"base {self.base_y:.3f} mm, {1e3 * self.base_turn:.2f} mrad"
+        if self.base_z or self.base_psi:
+            base += f", out of the plane {self.base_z:.3f} mm, {1e3 * self.base_psi:.2f} mrad"
         off = f"bend {self.bend:.3f} mm, run-out {self.run_out:.3f} mm"
         return f"<Truth {base}, {off}, {self.scenario!r}>"
 
@@ -56,6 +64,7 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
     cell = 0.5 * settings.contact_spacing_mm
     variation = _variation(scenario, cell, rng)
     values |= _start(scenario, rng) | _modulus(scenario, rng)
+    base_z, base_psi, bend_angle, run_out_angle = _out_of_plane(scenario, rng)
     return Truth(
         with_hidden_layer(scenario.with_values(values), scenario),
         base_y,
@@ -65,6 +74,10 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
         (settings.tracker_bias_mm * math.cos(angle), settings.tracker_bias_mm * math.sin(angle)),
         variation,
         cell,
+        base_z,
+        base_psi,
+        bend_angle,
+        run_out_angle,
     )
 
 
@@ -130,3 +143,21 @@ def _modulus(scenario: Scenario, rng: np.random.Generator) -> dict[str, float]:
     """Draw the needle's modulus, uniform around the scenario's."""
     factor = 1.0 + scenario.phantom.youngs_modulus_variation * float(rng.uniform(-1.0, 1.0))
     return {"needle.youngs_modulus_gpa": factor * scenario.needle.youngs_modulus_gpa}
+
+
+def _out_of_plane(scenario: Scenario, rng: np.random.Generator) -> tuple[float, float, float, float]:
+    """Draw base z (mm) and ψ (rad), and the angles (rad) of bend and run-out from the plane of the bevel.
+
+    The sides of bend and run-out are drawn before, so that ± a right angle is any direction.
+    """
+    settings, axes = scenario.phantom, scenario.setup.axes
+
+    def range_of(given: float | None, with_two_axes: float) -> float:
+        return (with_two_axes if axes == 2 else 0.0) if given is None else given
+
+    z, psi = rng.normal(0.0, 1.0, 2).tolist()
+    bend, run_out = rng.uniform(-1.0, 1.0, 2).tolist()
+    spread = math.radians(range_of(settings.direction_spread_deg, 90.0))
+    offset = range_of(settings.start_offset_z_sd_mm, settings.start_offset_sd_mm)
+    angle = 1e-3 * range_of(settings.start_angle_z_sd_mrad, settings.start_angle_sd_mrad)
+    return z * offset, psi * angle, bend * spread, run_out * spread

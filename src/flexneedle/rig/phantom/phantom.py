@@ -7,37 +7,63 @@ import numpy as np
 
 from flexneedle.rig.phantom.draw import Truth
 from flexneedle.rig.phantom.plants import PlantFactory, plant
-from flexneedle.simulator.control import Control, Limits
-from flexneedle.types import Command, Floats
+from flexneedle.simulator.control import MOVES, Limits
+from flexneedle.types import (
+    DB_X,
+    DB_Y,
+    DB_Z,
+    DG_Y,
+    DG_Z,
+    PSI,
+    ROLL,
+    SPIN,
+    THETA,
+    Control,
+    Floats,
+    Point,
+    Pose,
+    X,
+    Y,
+    Z,
+)
 
+_LENGTHS = [DB_X, DB_Y, DB_Z, DG_Y, DG_Z]
 _WHOLE = 1e-8  # of a motor step: tolerance for a position on a whole step
 
 
 class Condition(NamedTuple):
-    """True state: tip pose (mm, rad), tissue strain energy (mJ), smallest stretch λ since the start, convergence."""
+    """True state: tip pose (mm, rad), tissue strain energy (mJ), smallest stretch λ since the start, convergence.
+
+    shape: points x, y, z (n, 3) of the needle's axis at equal distances along it, the base first (mm); None if the
+    plant has no nodes.
+    """
 
     tip: Floats
     strain_energy: float
     least_stretch: float
     converged: bool
+    shape: Floats | None = None
 
 
 class Phantom:
     """The true needle. It moves on command; its clock advances by the duration of each command."""
 
-    def __init__(self, truth: Truth, bevel: int, kind: str | PlantFactory = "exact") -> None:
-        self._plant = plant(kind, truth, bevel)
+    def __init__(self, truth: Truth, roll: float, kind: str | PlantFactory = "exact") -> None:
+        self._plant = plant(kind, truth, roll)
         self._truth = truth
         self._limits = Limits.of(truth.scenario)
-        self._moved = np.zeros(4)
-        self._remainder = np.zeros(4)  # of all commands after rounding to motor steps
+        self._moved, self._rolled = np.zeros(MOVES), roll
+        self._remainder = np.zeros(MOVES)  # of all commands after rounding to motor steps
         self._time = 0.0
         self._least_stretch = 1.0
-        self._path = [(0.0, *self._tip().tolist())]  # time, x, y, slope
+        self._path = [(0.0, *self._tip().tolist())]  # time and pose
 
     def condition(self) -> Condition:
         """The true state, for the record only; not available to controllers."""
-        return Condition(self._tip(), self._plant.strain_energy, self._least_stretch, self._plant.converged)
+        plant = self._plant
+        return Condition(
+            self._tip(), plant.strain_energy, self._least_stretch, plant.converged, self._shape()
+        )
 
     def now(self) -> float:
         """Seconds since the start."""
@@ -48,42 +74,44 @@ class Phantom:
         self._time += seconds
         self._path.append((self._time, *self._tip().tolist()))
 
-    def apply(self, command: Command, duration: float) -> Command:
+    def apply(self, command: Control, duration: float) -> Control:
         """Execute `command` at constant velocity within `duration` s, in steps of at most `phantom.step_mm`.
 
         Motors move to the multiple of their resolution nearest to the sum of all commands, so that rounding errors do
         not accumulate. Returns the command as applied. Raises CommandError if it exceeds a limit of the setup.
         """
-        self._limits.check(self._moved, Control.from_row(command).row()[None])
+        self._limits.check(self._moved, np.array([command]), self._rolled)
         row = self._rounded(command)
-        parts = max(1, math.ceil(abs(row[0]) / self._truth.scenario.phantom.step_mm - 1e-9))
+        parts = max(1, math.ceil(abs(row[DB_X]) / self._truth.scenario.phantom.step_mm - 1e-9))
         for k in range(parts):
-            self._plant.step(np.append(row[:4] / parts, row[4] if k == 0 else -1.0))
+            part = row / parts
+            part[ROLL] = row[ROLL] if k == 0 else 0.0
+            self._plant.step(part)
             self._least_stretch = min(self._least_stretch, self._plant.least_stretch)
             self._path.append((self._time + duration * (k + 1) / parts, *self._tip().tolist()))
-        self._moved += row[:4]
+        self._moved += row[:MOVES]
+        self._rolled += float(row[ROLL] + row[SPIN])
         self._time += duration
-        db_x, db_y, db_theta, dg_y = row[:4].tolist()
-        return db_x, db_y, db_theta, dg_y, command[4]
+        return Control.of(row.tolist())
 
-    def tip_at(self, time: float) -> tuple[float, float]:
-        """Return the true tip (x, y) in mm at a time, for a simulated tracker; at rest before the start."""
-        return self.pose_at(time)[:2]
+    def tip_at(self, time: float) -> Point:
+        """Return the true tip x, y, z in mm at a time, for a simulated tracker; at rest before the start."""
+        return self.pose_at(time).point
 
-    def pose_at(self, time: float) -> tuple[float, float, float]:
-        """Return the true tip and its slope (x, y, θ), mm and rad, at a time; at rest before the start."""
-        for (t0, x0, y0, a0), (t1, x1, y1, a1) in zip(self._path[-2::-1], self._path[:0:-1], strict=True):
+    def pose_at(self, time: float) -> Pose:
+        """Return the true pose of the tip (mm, rad) at a time; at rest before the start."""
+        for (t0, *before), (t1, *after) in zip(self._path[-2::-1], self._path[:0:-1], strict=True):
             if time > t0:
                 part = min(1.0, (time - t0) / (t1 - t0)) if t1 > t0 else 1.0
-                return x0 + part * (x1 - x0), y0 + part * (y1 - y0), a0 + part * (a1 - a0)
-        return self._path[0][1:]
+                return Pose(*(p + part * (q - p) for p, q in zip(before, after, strict=True)))
+        return Pose(*self._path[0][1:])
 
-    def _rounded(self, command: Command) -> Floats:
+    def _rounded(self, command: Control) -> Floats:
         """The command in whole motor steps, within the limits; the rotation of the base is not rounded."""
         row = np.array(command, dtype=float)
         grid = self._truth.scenario.phantom.motor_resolution_mm
         if grid > 0.0:
-            lengths = [0, 1, 3]
+            lengths = _LENGTHS
             position, requested = self._moved[lengths], row[lengths] + self._remainder[lengths]
             step, travel = self._limits.step[lengths], self._limits.travel[lengths]
             lowest = np.ceil(np.maximum(position - step, travel[:, 0]) / grid - _WHOLE)
@@ -93,8 +121,36 @@ class Phantom:
             self._remainder[lengths] = np.clip(requested - row[lengths], -0.5 * grid, 0.5 * grid)
         return row
 
+    def _shape(self) -> Floats | None:
+        """As many points as the model of the scenario has nodes; None if the plant has none."""
+        nodes = getattr(self._plant, "nodes", None)
+        return None if nodes is None else evenly_spaced(nodes, self._truth.scenario.needle.nodes)
+
     def _tip(self) -> Floats:
         """The pose of the tip, which is offset from the needle's axis by the run-out."""
-        x, y, theta = self._plant.tip
-        offset = self._truth.run_out * self._plant.bevel
-        return np.array([x - offset * math.sin(theta), y + offset * math.cos(theta), theta])
+        pose, truth = self._plant.tip, self._truth
+        x, y, z = across(float(pose[THETA]), float(pose[PSI]), self._plant.roll + truth.run_out_angle)
+        off = truth.run_out
+        return np.array([pose[X] + off * x, pose[Y] + off * y, pose[Z] + off * z, *pose[THETA:]])
+
+
+def evenly_spaced(nodes: Floats, count: int) -> Floats:
+    """Points (count, 3) at equal distances along the chain of nodes (n, 3), its ends included."""
+    lengths = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    wanted = np.linspace(0.0, along[-1], count)
+    return np.stack([np.interp(wanted, along, column) for column in nodes.T], axis=1)
+
+
+def across(theta: float, psi: float, roll: float) -> Point:
+    """Direction of the bevel of a needle that is rolled and then tilted (rad); exactly in the plane for half turns."""
+    halves = np.rint(roll / math.pi)
+    sign, left = (-1.0 if halves % 2 else 1.0), roll - halves * math.pi
+    y, z = sign * math.cos(left), sign * math.sin(left)
+    angle = math.hypot(theta, psi)
+    if angle == 0.0:
+        return 0.0, y, z
+    to_y, to_z = theta / angle, psi / angle
+    along = to_y * y + to_z * z  # the part that the tilt turns
+    turned = along * math.cos(angle)
+    return -along * math.sin(angle), turned * to_y + (y - along * to_y), turned * to_z + (z - along * to_z)

@@ -10,16 +10,22 @@ from flexneedle.errors import InputError
 from flexneedle.mechanics.law import tables
 from flexneedle.rig.phantom import rod as rd
 from flexneedle.rig.phantom.draw import Truth
+from flexneedle.rig.phantom.equilibrium import step
+from flexneedle.rig.phantom.space import roll_about_x, tilt_of, turn, vector
 from flexneedle.scenario.tissue.layer import laws_of
-from flexneedle.simulator.control import Control
+from flexneedle.simulator.control import along_entry
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Floats
+from flexneedle.types import STILL, Control, Floats, Z
 
+_POISSON = 0.3  # steel and nitinol; GJ = EI/(1 + ν) for a round needle
 _GUIDE_STIFFNESS = 1e3  # N/mm; the force of a needle on its guide is about 1 N
 
 
 class Plant(Protocol):
-    """A needle that moves on command (db_x, db_y, db_theta, dg_y, flip)."""
+    """A needle that moves on command: the columns of `Control`.
+
+    It may have `nodes`, x, y, z from base to tip (N + 1, 3) in mm; then its shape is recorded.
+    """
 
     def step(self, row: Floats) -> None:
         """Move the needle and cut the tissue."""
@@ -27,12 +33,12 @@ class Plant(Protocol):
 
     @property
     def tip(self) -> Floats:
-        """Pose x, y, θ (mm, rad) of the end of the needle's axis."""
+        """Pose x, y, z, θ, ψ (mm, rad) of the end of the needle's axis."""
         ...
 
     @property
-    def bevel(self) -> int:
-        """Direction of the bevel, −1 or +1."""
+    def roll(self) -> float:
+        """Roll of the bevel (rad); 0 bends the path towards +y, π/2 towards +z."""
         ...
 
     @property
@@ -57,26 +63,34 @@ class ModelPlant:
     Without initial bend, guide clearance, friction, and variation of stiffness along the depth.
     """
 
-    def __init__(self, truth: Truth, bevel: int) -> None:
-        self._simulator = Simulator(truth.scenario, threads=1)
-        start = self._simulator.start(bevel).with_estimate(base_y=truth.base_y, base_turn=truth.base_turn)
-        self._state = self._simulator.step(start, Control())
+    def __init__(self, truth: Truth, roll: float) -> None:
+        leaves_plane = any((truth.base_z, truth.base_psi, truth.load[1]))
+        space = truth.scenario.with_values({"setup.axes": 2}) if leaves_plane else truth.scenario
+        self._simulator = Simulator(space, threads=1)
+        start = self._simulator.start(roll)
+        _, y, z, theta, psi = start.base.tolist()
+        moved = start.with_estimate(
+            base=(y + truth.base_y, z + truth.base_z),
+            slope=(theta + truth.base_turn, psi + truth.base_psi),
+            tip_load=truth.load,
+        )
+        self._state = self._simulator.step(moved, STILL)
         self._converged = self._state.converged
 
     def step(self, row: Floats) -> None:
         """Move the needle and cut the tissue."""
-        self._state = self._simulator.step(self._state, Control.from_row(row.tolist()))
+        self._state = self._simulator.step(self._state, Control.of(row.tolist()))
         self._converged &= self._state.converged
 
     @property
     def tip(self) -> Floats:
-        """Pose x, y, θ (mm, rad) of the end of the needle's axis."""
+        """Pose x, y, z, θ, ψ (mm, rad) of the end of the needle's axis."""
         return self._state.tip
 
     @property
-    def bevel(self) -> int:
-        """Direction of the bevel, −1 or +1."""
-        return self._state.bevel
+    def roll(self) -> float:
+        """Roll of the bevel (rad); 0 bends the path towards +y, π/2 towards +z."""
+        return self._state.roll
 
     @property
     def strain_energy(self) -> float:
@@ -94,56 +108,62 @@ class ModelPlant:
         """Whether all steps converged to an equilibrium."""
         return self._converged
 
+    @property
+    def nodes(self) -> Floats:
+        """Nodes of the needle from base to tip, x, y and z, shape (N + 1, 3)."""
+        return self._state.nodes[:, : Z + 1]
+
 
 class ExactPlant:
     """The geometrically exact rod (`phantom.rod`), with all imperfections of `[phantom]`."""
 
-    def __init__(self, truth: Truth, bevel: int) -> None:
-        scenario = truth.scenario
+    def __init__(self, truth: Truth, roll: float) -> None:
+        self.scenario = scenario = truth.scenario
         segments = max(8, round(scenario.needle.length_mm / scenario.phantom.element_mm))
         self.rod = build_rod(truth, segments)
-        self._theta = np.full(segments, truth.base_turn)
-        self._work = np.zeros((rd.WORK_ROWS, segments + 1))
+        place, home = scenario.entry.lateral(scenario.start_base_x), scenario.guide_home
+        tilt = _tilt(scenario.entry.slope)
+        self.state, self.segments = rd.start(
+            (scenario.start_base_x, place.real + truth.base_y, place.imag + truth.base_z),
+            (tilt.real + truth.base_turn, tilt.imag + truth.base_psi),
+            scenario.needle.length_mm,
+            segments,
+            roll,
+        )
+        self.state["guide"] = home.real, home.imag
+        self.state["load"][1:] = truth.load
         # The path of a needle is longer than its depth, by less than a factor of 2 for insertions along x.
         points = math.ceil(2.0 * max(scenario.setup.max_depth, 1.0) / self.rod.spacing) + 8
-        self._channel = np.zeros((rd.CHANNEL_ROWS, points))
-        self._count = 0
-        self._s = np.zeros(rd.SIZE)
-        self._s[[rd.BASE_X, rd.BASE_Y, rd.BASE_TURN]] = (
-            scenario.start_base_x,
-            truth.base_y,
-            truth.base_turn,
-        )
-        self._s[rd.BEVEL] = bevel
-        self._s[[rd.TIP_X, rd.CONVERGED]] = scenario.setup.start_tip_x, 1.0
+        self.channel = np.zeros(points, rd.POINT)
+        self.count = 0
         self._converged = True
-        self.step(np.array([0.0, 0.0, 0.0, 0.0, -1.0]))
+        self.step(np.array(STILL))
 
     def step(self, row: Floats) -> None:
         """Move the needle and cut the tissue."""
-        self._count = rd.step(self.rod, self._s, self._theta, self._channel, self._count, self._work, row)
-        self._converged &= bool(self._s[rd.CONVERGED] > 0.0)
+        driven = along_entry(self.scenario, row)
+        self.count = step(self.rod, self.state, self.segments, self.channel, self.count, driven)
+        self._converged &= bool(self.state["converged"] > 0.0)
 
     @property
     def tip(self) -> Floats:
-        """Pose x, y, θ (mm, rad) of the end of the needle's axis."""
-        tip: Floats = self._s[[rd.TIP_X, rd.TIP_Y, rd.TIP_TURN]]
-        return tip
+        """Pose x, y, z, θ, ψ (mm, rad) of the end of the needle's axis: its tilt from x by √(θ² + ψ²)."""
+        return np.array([*self.state["tip"], *tilt_of(vector(self.state["tangent"]))])
 
     @property
-    def bevel(self) -> int:
-        """Direction of the bevel, −1 or +1."""
-        return int(self._s[rd.BEVEL])
+    def roll(self) -> float:
+        """Roll of the bevel (rad) before its tilt, from −π to π: that of the base less what the shaft twists."""
+        return roll_about_x(turn(self.state["frame"]))
 
     @property
     def strain_energy(self) -> float:
         """Strain energy of the tissue, weighted by layer (mJ)."""
-        return float(self._s[rd.STRAIN_ENERGY])
+        return float(self.state["strain_energy"])
 
     @property
     def least_stretch(self) -> float:
         """Smallest present stretch λ of the tissue; 1 is unloaded."""
-        return float(self._s[rd.LEAST_STRETCH])
+        return float(self.state["least_stretch"])
 
     @property
     def converged(self) -> bool:
@@ -152,8 +172,15 @@ class ExactPlant:
 
     @property
     def nodes(self) -> Floats:
-        """Nodes of the needle from base to tip, x and y, shape (N + 1, 2)."""
-        return self._work[[rd.X, rd.Y]].T.copy()
+        """Nodes of the needle from base to tip, x, y and z, shape (N + 1, 3)."""
+        nodes: Floats = self.segments["node"].copy()
+        return nodes
+
+
+def _tilt(slope: complex) -> complex:
+    """The angle (rad) of a slope, in its direction."""
+    size = abs(slope)
+    return slope * (math.atan(size) / size) if size > 0.0 else 0.0
 
 
 def build_rod(truth: Truth, segments: int) -> rd.Rod:
@@ -175,14 +202,17 @@ def build_rod(truth: Truth, segments: int) -> rd.Rod:
     guide = scenario.setup.guide_x
     return rd.Rod(
         stiffness=needle.bending_stiffness,
+        torsion=needle.bending_stiffness / (1.0 + _POISSON),
         segment=needle.length_mm / segments,
-        curvature=2.0 * truth.bend / needle.length_mm**2,
+        curvature=2.0 * truth.bend * math.cos(truth.bend_angle) / needle.length_mm**2,
+        curvature_across=2.0 * truth.bend * math.sin(truth.bend_angle) / needle.length_mm**2,
         bevel_offset=needle.bevel.offset_mm,
         bevel_length=needle.bevel.length_mm,
         guide_x=math.nan if guide is None else guide,
         clearance=settings.guide_clearance_mm,
         guide_stiffness=_GUIDE_STIFFNESS,
         friction=settings.friction,
+        rotation_friction=settings.rotation_friction,
         spacing=settings.contact_spacing_mm,
         cell=cell,
         laws=tables(laws),
@@ -193,32 +223,32 @@ def build_rod(truth: Truth, segments: int) -> rd.Rod:
     )
 
 
-PlantFactory = Callable[[Truth, int], Plant]
-"""Makes a plant in its start state, from the true phantom and the direction of the bevel, −1 or +1."""
+PlantFactory = Callable[[Truth, float], Plant]
+"""Makes a plant in its start state, from the true phantom and the roll of the needle (rad)."""
 
 PLANTS: dict[str, PlantFactory] = {"exact": ExactPlant, "model": ModelPlant}
 DEFAULT_PLANT = "exact"
-_PARTS = ("step", "tip", "bevel", "strain_energy", "least_stretch", "converged")
+_PARTS = ("step", "tip", "roll", "strain_energy", "least_stretch", "converged")
 
 
-def plant(kind: str | PlantFactory, truth: Truth, bevel: int) -> Plant:
+def plant(kind: str | PlantFactory, truth: Truth, roll: float) -> Plant:
     """Return the plant of a name or a factory in its start state.
 
     Raises InputError for an unknown name, or if the factory returns no plant.
     """
     if not isinstance(kind, str):
-        return _made(kind, truth, bevel)
+        return _made(kind, truth, roll)
     if kind not in PLANTS:
         raise InputError(f"phantom = {kind!r}: must be one of {', '.join(PLANTS)}")
-    return PLANTS[kind](truth, bevel)
+    return PLANTS[kind](truth, roll)
 
 
-def _made(factory: PlantFactory, truth: Truth, bevel: int) -> Plant:
-    made, name = factory(truth, bevel), getattr(factory, "__name__", type(factory).__name__)
+def _made(factory: PlantFactory, truth: Truth, roll: float) -> Plant:
+    made, name = factory(truth, roll), getattr(factory, "__name__", type(factory).__name__)
     if missing := [part for part in _PARTS if not hasattr(made, part)]:
         raise InputError(
             f"phantom = {name}: {type(made).__name__} is not a plant, missing: {', '.join(missing)}"
         )
-    if np.shape(made.tip) != (3,):
-        raise InputError(f"phantom = {name}: tip must be three numbers x, y (mm), slope (rad)")
+    if np.shape(made.tip) != (5,):
+        raise InputError(f"phantom = {name}: tip must be five numbers x, y, z (mm), θ, ψ (rad)")
     return made

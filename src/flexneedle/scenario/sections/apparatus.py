@@ -1,12 +1,12 @@
 """The setup that holds and moves the needle, and the tracker that measures it."""
 
-from math import sqrt
-from typing import Annotated
+from math import inf, radians, sqrt
+from typing import Annotated, Literal
 
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, Field
 
 from flexneedle.scenario.sections.environment import AnySeed, Environment, Vector, expanded
-from flexneedle.scenario.sections.fields import NonNegative, Positive, Section
+from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, count
 from flexneedle.scenario.sections.registration import Registration
 
 
@@ -19,9 +19,21 @@ def _moves(value: object) -> object:
 GuideTravel = Annotated[Positive, BeforeValidator(_moves)]
 
 
+_STEEPEST_MRAD = 200.0  # small slopes
+
+
 class Setup(Section):
     """Section `setup`: positions at the start, travel and speed of the actuators."""
 
+    axes: int = count(1, least=1, most=2)
+    """Lateral axes: 1, a needle in the plane, or 2, in space."""
+    guide_axes: int = count(2, least=1, most=2)
+    """Lateral axes in which the guide of a needle in space moves: 1, along y only, or 2."""
+    rotation: Literal["half-turns", "free"] = "free"
+    """How the driver rotates the needle in space: between 0 and 180°, or to any angle. In the plane it rolls by half
+    turns."""
+    max_rotation_deg: Positive | None = None
+    """Largest angle of the needle from its angle 0, to either side, with free rotation. Not set: no limit."""
     guide_to_skin_mm: Positive | None = None
     """G, distance from the guide to the skin. Not set: there is no guide."""
     tip_to_skin_mm: Positive
@@ -42,6 +54,33 @@ class Setup(Section):
     """Largest rotation of the base in a control step."""
     insertion_speed_mm_s: Positive = 5.0
     """Insertion speed; a step of 1 mm at 5 mm/s lasts 200 ms."""
+
+    @property
+    def half_turns(self) -> bool:
+        """Whether the needle rolls by half turns only."""
+        return self.axes == 1 or self.rotation == "half-turns"
+
+    @property
+    def half_turns_by(self) -> str:
+        """The key and value by which the needle rolls by half turns only; empty if it rolls to any angle."""
+        if self.axes == 1:
+            return "setup.axes = 1"
+        return 'setup.rotation = "half-turns"' if self.half_turns else ""
+
+    @property
+    def turns(self) -> str:
+        """What rolls of the bevel are called."""
+        return "bevel flips" if self.half_turns else "bevel rolls"
+
+    @property
+    def max_rotation(self) -> float:
+        """Largest angle of the needle from its angle 0, to either side, rad."""
+        return inf if self.max_rotation_deg is None else radians(self.max_rotation_deg)
+
+    @property
+    def moved_guide_axes(self) -> int:
+        """Lateral axes in which the guide moves; 0 without a guide."""
+        return min(self.guide_axes, self.axes) if self.has_guide else 0
 
     @property
     def has_guide(self) -> bool:
@@ -74,6 +113,37 @@ class Setup(Section):
         return 1e-3 * self.max_base_turn_step_mrad
 
 
+class Entry(Section):
+    """Section `entry`: where and how the needle enters the skin. Base and guide are mounted on its axis."""
+
+    lateral_mm: float = 0.0
+    """y of the point where the needle's axis meets the skin."""
+    lateral_z_mm: float = 0.0
+    """z of that point."""
+    slope_mrad: float = Field(default=0.0, ge=-_STEEPEST_MRAD, le=_STEEPEST_MRAD)
+    """Slope dy/dx of the axis."""
+    slope_z_mrad: float = Field(default=0.0, ge=-_STEEPEST_MRAD, le=_STEEPEST_MRAD)
+    """Slope dz/dx of the axis."""
+    free_radius_mm: NonNegative = 0.0
+    """The planner may choose another point on the skin, at most this distance from it. 0: fixed."""
+    free_slope_mrad: float = Field(default=0.0, ge=0.0, le=_STEEPEST_MRAD)
+    """The planner may change the slope by at most this. 0: fixed."""
+
+    @property
+    def free(self) -> bool:
+        """Whether the planner chooses point or slope."""
+        return self.free_radius_mm > 0.0 or self.free_slope_mrad > 0.0
+
+    @property
+    def slope(self) -> complex:
+        """Slope dy/dx + i dz/dx of the axis, rad."""
+        return 1e-3 * complex(self.slope_mrad, self.slope_z_mrad)
+
+    def lateral(self, x: float) -> complex:
+        """y + iz of the axis at x, mm."""
+        return complex(self.lateral_mm, self.lateral_z_mm) + self.slope * x
+
+
 class TrackerSettings(Section):
     """Section `tracker`: the device that measures the tip."""
 
@@ -81,6 +151,8 @@ class TrackerSettings(Section):
     """Readings per second."""
     jitter_mm: NonNegative = 0.07
     """RMS length of the 3D deviation of a reading from the mean. With `environment`, its sensors' values apply."""
+    direction_jitter_mrad: Positive | None = None
+    """Standard deviation of a coordinate of the tip's measured direction. Not set: the direction is not used."""
     tip_offset_mm: NonNegative = 0.0
     """Calibrated distance from the sensor to the needle's tip, along the needle."""
     workspace_center_mm: Vector = (20.0, 0.0, 0.0)
@@ -97,6 +169,11 @@ class TrackerSettings(Section):
     def period(self) -> float:
         """Time between two readings, s."""
         return 1 / self.rate_hz
+
+    @property
+    def direction_jitter(self) -> float | None:
+        """Standard deviation of a coordinate of the tip's measured direction, rad; None if it is not used."""
+        return None if self.direction_jitter_mrad is None else 1e-3 * self.direction_jitter_mrad
 
     @property
     def jitter_per_axis(self) -> float:

@@ -24,11 +24,13 @@ class Target(Section):
     """x of the target: depth below the skin."""
     lateral_mm: float = 5.0
     """y of the target: lateral offset from the insertion axis."""
+    lateral_z_mm: float = 0.0
+    """z of the target: lateral offset on the second axis."""
 
     @property
-    def position(self) -> tuple[float, float]:
-        """(x, y), mm."""
-        return self.depth_mm, self.lateral_mm
+    def position(self) -> tuple[float, float, float]:
+        """x, y, z, mm."""
+        return self.depth_mm, self.lateral_mm, self.lateral_z_mm
 
 
 class PlanSettings(Section):
@@ -144,6 +146,12 @@ class PhantomSettings(Section):
     """Standard deviation of the base clamp's lateral position at the start."""
     start_angle_sd_mrad: NonNegative = 3.0
     """Standard deviation of the base clamp's slope at the start."""
+    start_offset_z_sd_mm: NonNegative | None = None
+    """Standard deviation of the base clamp's position along z at the start. Not set: that along y with
+    `setup.axes = 2`, 0 in the plane."""
+    start_angle_z_sd_mrad: NonNegative | None = None
+    """Standard deviation of the base clamp's slope towards z at the start. Not set: that towards y with
+    `setup.axes = 2`, 0 in the plane."""
     start_axial_sd_mm: NonNegative = 1.0
     """Standard deviation of the position of base and tip along the axis at the start, from errors of length, clamp
     and skin; the error is at most half of the distance to the skin, to the guide, and of that left at full stroke."""
@@ -153,10 +161,16 @@ class PhantomSettings(Section):
     """Lateral offset of the free needle's tip by its natural bend, which rolls with the bevel; its side is drawn."""
     run_out_mm: NonNegative = 0.2
     """Lateral motion of the tip when the bevel rolls; its side is drawn."""
+    direction_spread_deg: Annotated[float, Field(ge=0, le=90)] | None = None
+    """Largest angle of natural bend and run-out from the plane of the bevel, drawn uniformly to either side; 90: any
+    direction. Not set: 90 with `setup.axes = 2`, 0 in the plane."""
     guide_clearance_mm: NonNegative = 0.05
     """Clearance of the needle in the guide, to either side."""
     friction_mn_per_mm: NonNegative = 5.0
     """Axial friction of the tissue on each mm of the inserted needle."""
+    rotation_friction_mn: NonNegative = 0.0
+    """Friction of the tissue against rotation: the largest couple (mN·mm) on each mm of the inserted needle. The tip's
+    roll lags behind that of the base, so that with it a half turn leaves the plane."""
     motor_resolution_mm: NonNegative = 0.01
     """Resolution of the motors: base and guide are at multiples of it; 0: exact."""
     delay_periods: NonNegative = 1.0
@@ -182,3 +196,8 @@ class PhantomSettings(Section):
     def friction(self) -> float:
         """Axial friction, N/mm."""
         return 1e-3 * self.friction_mn_per_mm
+
+    @property
+    def rotation_friction(self) -> float:
+        """Friction against rotation, N·mm/mm."""
+        return 1e-3 * self.rotation_friction_mn

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from flexneedle.figures.layout import FAINT, Floats, Panel, columns_of, head, legend, panels, scattered, sheet
 from flexneedle.figures.style import BAD, QUIET, TARGET, WIDTH, styled
 
+MAP = ("depth (mm)", "lateral (mm)")
+BEYOND = ("depth beyond the target (mm)", "lateral (mm)")
+ACROSS = ("y beyond the target (mm)", "z beyond the target (mm)")
 _MOST_TARGETS = 40  # above this, all targets are drawn at the origin
 _MARGIN, _FAR = 2.0, 6.0  # smallest and largest margin (mm) around the targets
 _CIRCLE, _TIP, _CROSS = (
@@ -24,38 +27,42 @@ _CIRCLE, _TIP, _CROSS = (
     "final true tip",
     "final true tip, not finished",
 )
-_LATERAL = "lateral (mm)"
 
 
 @dataclass(frozen=True, eq=False)
 class Tips:
-    """Targets and true tips (n, 2) of n insertions, mm, NaN where unknown; done (n,): whether they finished."""
+    """Targets and true tips (n, 2) of n insertions, mm, NaN where unknown; done (n,): whether they finished.
+
+    labels: of both axes, MAP or ACROSS.
+    """
 
     targets: Floats
     tips: Floats
     done: NDArray[np.bool_]
+    labels: tuple[str, str] = MAP
 
     @property
     def on_one(self) -> "Tips":
         """The tips relative to their targets, all targets at the origin."""
-        return replace(self, targets=np.zeros_like(self.targets), tips=self.tips - self.targets)
+        labels = BEYOND if self.labels == MAP else self.labels
+        tips = self.tips - self.targets
+        return replace(self, targets=np.zeros_like(self.targets), tips=tips, labels=labels)
 
 
 def targeting_figure(shown: Sequence[Panel[Tips]]) -> Figure:
     """Return the figure: one panel each, on the same scale; a single panel has a magnified view beside it."""
     targets = np.unique(np.concatenate([panel.content.targets for panel in shown]), axis=0)
-    xlabel = "depth (mm)"
     if len(targets) > _MOST_TARGETS:
         shown = [replace(panel, content=panel.content.on_one) for panel in shown]
-        targets, xlabel = np.zeros((1, 2)), "depth beyond the target (mm)"
+        targets = np.zeros((1, 2))
     low, high = _window(targets, [panel.content.tips for panel in shown])
     ratio = float(high[1] - low[1]) / float(high[0] - low[0])
     with styled():
         if len(shown) == 1:
-            figure, axes = _with_close_up(shown[0], ratio, xlabel)
+            figure, axes = _with_close_up(shown[0], ratio)
         else:
             height = ratio * (WIDTH / columns_of(len(shown)) - 0.3) + 0.75
-            figure, axes = panels(shown, height, xlabel, _LATERAL)
+            figure, axes = panels(shown, height, *shown[0].content.labels)
         for ax, panel in zip(axes, shown, strict=True):
             _draw_map(ax, panel, low, high)
         legend(figure, _handles())
@@ -71,13 +78,13 @@ def _window(targets: Floats, tips: Sequence[Floats]) -> tuple[Floats, Floats]:
     return low - below, high + above
 
 
-def _with_close_up(panel: Panel[Tips], ratio: float, xlabel: str) -> tuple[Figure, list[Axes]]:
+def _with_close_up(panel: Panel[Tips], ratio: float) -> tuple[Figure, list[Axes]]:
     """Return a figure with an empty map and, beside it, the tips relative to their targets."""
     height = ratio * (WIDTH - 1.2) / (1.0 + ratio) + 0.8
     figure, (ax, close) = sheet(height, columns=2, widths=(1.0, ratio))
     head(ax, panel, 2)
-    ax.set_xlabel(xlabel)
-    ax.set_ylabel(_LATERAL)
+    ax.set_xlabel(panel.content.labels[0])
+    ax.set_ylabel(panel.content.labels[1])
     _draw_close_up(close, panel.content.on_one, panel.color)
     return figure, [ax]
 
@@ -95,7 +102,7 @@ def _draw_close_up(ax: Axes, tips: Tips, color: str) -> None:
     head(ax, Panel("all targets, magnified", note, QUIET, None), 3)
     _draw_tips(ax, tips, color, np.full(2, -half), np.full(2, half))
     ax.locator_params(nbins=5)
-    ax.set_xlabel("depth beyond the target (mm)")
+    ax.set_xlabel(tips.labels[0])
 
 
 def _draw_map(ax: Axes, panel: Panel[Tips], low: Floats, high: Floats) -> None:

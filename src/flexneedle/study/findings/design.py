@@ -18,7 +18,7 @@ _UNITS = {
     "per_mm": "1/mm", "per_m": "1/m", "per_mj": "1/mJ", "mn_per_mm": "mN/mm", "mm_s": "mm/s",
     "mm": "mm", "mrad": "mrad", "kpa": "kPa", "gpa": "GPa", "hz": "Hz", "mj": "mJ", "s": "s",
 }  # fmt: skip
-_LABELS = {"needle.gauge": "needle gauge", "tracker.environment": "tracker environment"}
+_LABELS = {"world_rig": "rig", "needle.gauge": "needle gauge", "tracker.environment": "tracker environment"}
 _NUMBERED = re.compile(r"([^\d.+-]*)([-+]?(?:\d+\.?\d*|\.\d+))([^\d.]*)")
 
 
@@ -81,7 +81,7 @@ def design_of(rows: Rows, definition: StudyDefinition) -> Design:
         _factor("controller", rows.text("controller"), first=controllers_in_order()),
         cases,
         tuple(axis for axis in axes if axis.varies),
-        _factor("guide", _guides(rows), first=["with a guide"]),
+        _factor("guide", [""] * len(rows) if "world_rig" in keys else _guides(rows), first=["with a guide"]),
     )
 
 

@@ -1,57 +1,60 @@
-"""Quality of the predictions of a controller: the miss with its standard deviation, and the warnings."""
+"""Quality of the predictions of a controller: the final needle with its standard deviation, and the warnings."""
 
 from dataclasses import dataclass
 from math import nan
 
 import numpy as np
 
+from flexneedle.study.coverage import Shares, columns_of, covered
 from flexneedle.study.findings.design import Design
 from flexneedle.study.findings.rows import Flags, Floats, Rows
 from flexneedle.study.findings.summary import HIT_MM, finished, members_of
 from flexneedle.study.findings.worlds import mean_of
-from flexneedle.trace.results import DEPTH_FRACTIONS
+from flexneedle.trace.results import DEPTH_FRACTIONS, PREDICTED_PARTS
 
-# A normal miss is within ± this many standard deviations with a probability of 95 %.
-_WIDTH = 1.959963984540054
 GOOD_MM = 0.5
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """Predictions in the finished insertions with the same level of every factor whose controller predicts the miss.
+    """Predictions in the finished insertions with the same level of every factor.
 
-    count: insertions; covered: share of lateral misses within ±1.96 sd of the prediction at a quarter, half and three
-    quarters of the depth; in_vain: share of false warnings among insertions that end within 0.5 mm; unwarned: number of
-    insertions that end beyond 1 mm without a warning. NaN: unknown.
+    count: insertions; tip_covered, middle_covered: share of the final true tips, and of the needles at half of the
+    target's depth, within ±1.96 sd of the prediction at a quarter, half and three quarters of the depth, where y and
+    z count separately; in_vain: share of false warnings among insertions that end within 0.5 mm; unwarned: number of
+    insertions that end beyond 1 mm without a warning, None if the controller predicts no miss. NaN: unknown.
     """
 
     levels: dict[str, str]
     count: int
-    covered: tuple[float, float, float]
+    tip_covered: Shares
+    middle_covered: Shares
     in_vain: float
-    unwarned: int
+    unwarned: int | None
 
 
 def predictions_of(rows: Rows, design: Design) -> list[Predictions]:
-    """Return the groups whose controller predicts the miss, in the order of the factors."""
-    miss = rows.number("tip_y_mm") - rows.number("target_lateral_mm")
-    inside = np.stack([_inside(rows, name, miss) for name in DEPTH_FRACTIONS])
-    known = finished(rows) & ~np.isnan(inside).all(axis=0) & ~np.isnan(miss)
+    """Return the groups with predictions, in the order of the factors."""
+    tip, middle = (_deviations(rows, part) for part in PREDICTED_PARTS)
+    known = finished(rows) & ~(np.isnan(tip) & np.isnan(middle)).all(axis=(0, 1))
+    sds = np.array([rows.number(f"predicted_{name}_sd_mm") for name in DEPTH_FRACTIONS])
+    warning: Flags = ~np.isnan(sds).all(axis=0)
     error, warned = rows.number("true_error_mm"), np.array([bool(line) for line in rows.text("warning")])
     groups = [(levels, own[known[own]]) for levels, own in members_of(design.factors)]
-    return [_group(levels, inside[:, own], error[own], warned[own]) for levels, own in groups if len(own) > 0]
+    return [
+        Predictions(
+            levels,
+            len(own),
+            covered(tip[..., own]),
+            covered(middle[..., own]),
+            mean_of(warned[own][error[own] < GOOD_MM]) if warning[own].any() else nan,
+            int(np.count_nonzero((error[own] > HIT_MM) & ~warned[own])) if warning[own].any() else None,
+        )
+        for levels, own in groups
+        if len(own) > 0
+    ]
 
 
-def _inside(rows: Rows, fraction: str, miss: Floats) -> Floats:
-    """1 where the miss (n,) is within the interval predicted at a fraction of the depth, 0 if not, NaN if unknown."""
-    mean, sd = rows.number(f"predicted_{fraction}_mm"), rows.number(f"predicted_{fraction}_sd_mm")
-    within = np.abs(miss - mean) <= _WIDTH * sd
-    return np.where(np.isnan(mean) | np.isnan(sd), nan, within)
-
-
-def _group(levels: dict[str, str], inside: Floats, error: Floats, warned: Flags) -> Predictions:
-    quarter, half, three_quarters = (mean_of(part[~np.isnan(part)]) for part in inside)
-    unwarned = int(np.count_nonzero((error > HIT_MM) & ~warned))
-    return Predictions(
-        levels, len(error), (quarter, half, three_quarters), mean_of(warned[error < GOOD_MM]), unwarned
-    )
+def _deviations(rows: Rows, part: str) -> Floats:
+    """The deviations (3, 2, n) of tip or middle from the predictions at the fractions of the depth, in y and z."""
+    return np.array([[rows.number(name) for name in axes] for axes in columns_of(part)])

@@ -8,6 +8,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+TARGET_COLUMNS = ("target_depth_mm", "target_lateral_mm", "target_lateral_z_mm")
+"""x, y, z of the target; tables of earlier versions have no z."""
+
 Floats = NDArray[np.float64]
 Codes = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -43,6 +46,11 @@ class Rows:
     def value(self, name: str, row: int) -> Any:
         """Return one value of a column, as in `values`."""
         return _plain(self.table.column(name)[row].as_py()) if name in self.names else None
+
+    def target(self, row: int) -> tuple[float, ...]:
+        """Return the target of a row in mm, without z in the plane."""
+        *in_plane, z = (self.value(name, row) for name in TARGET_COLUMNS)
+        return (*in_plane, z) if z else tuple(in_plane)
 
     def text(self, name: str) -> list[str]:
         """Return a column as text, "" where unknown."""

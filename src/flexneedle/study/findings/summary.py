@@ -9,7 +9,7 @@ from math import isnan, nan
 import numpy as np
 
 from flexneedle.study.findings.design import Design, Factor
-from flexneedle.study.findings.rows import Codes, Flags, Floats, Rows
+from flexneedle.study.findings.rows import TARGET_COLUMNS, Codes, Flags, Floats, Rows
 from flexneedle.study.findings.statistics import (
     IntervalEstimate,
     beyond_largest,
@@ -245,7 +245,7 @@ def _verdict(difference: IntervalEstimate) -> str | None:
 
 def pair_keys(rows: Rows, factors: Sequence[Factor]) -> Codes:
     """Return an integer key (n,) for each row, equal for rows with the same seed, target, repeat and factors."""
-    names = ("seed", "plan_seed", "target_depth_mm", "target_lateral_mm", "repeat")
+    names = ("seed", "plan_seed", *TARGET_COLUMNS, "repeat")
     columns = np.stack([*map(rows.codes, names), *(factor.codes for factor in factors)], axis=1)
     return np.unique(columns, axis=0, return_inverse=True)[1].ravel()
 

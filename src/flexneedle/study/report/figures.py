@@ -18,10 +18,10 @@ from flexneedle.study.figures.energy import energy_figure
 from flexneedle.study.figures.samples import Sample
 from flexneedle.study.figures.shares import share_figure
 from flexneedle.study.figures.sweeps import sweep_figure
-from flexneedle.study.figures.targeting import Tips, targeting_figure
+from flexneedle.study.figures.targeting import ACROSS, Tips, targeting_figure
 from flexneedle.study.findings.design import Factor, controllers_in_order
 from flexneedle.study.findings.findings import Findings
-from flexneedle.study.findings.rows import Flags
+from flexneedle.study.findings.rows import TARGET_COLUMNS, Flags, Rows
 from flexneedle.study.findings.summary import Difference, depths, finished
 from flexneedle.study.findings.worlds import failures
 
@@ -62,7 +62,6 @@ class _Facts:
     error: Floats
     done: Flags
     known: Flags
-    tips: Floats
     energy: Floats
 
     @property
@@ -128,15 +127,15 @@ def _facts(found: Findings) -> _Facts:
     rows, names = found.study.rows, found.design.controller.names
     order = [*controllers_in_order(), *sorted(set(names) - set(controllers_in_order()))]
     error, done = rows.number("true_error_mm"), finished(rows)
-    tips = np.stack([rows.number("tip_x_mm"), rows.number("tip_y_mm")], axis=1)
     looks = [look(order.index(name)) for name in names]
-    return _Facts(found, looks, error, done, done & ~np.isnan(error), tips, rows.number("strain_energy_mj"))
+    return _Facts(found, looks, error, done, done & ~np.isnan(error), rows.number("strain_energy_mj"))
 
 
 def _table(f: _Facts) -> list[_Entry]:
     """Return all figures in reading order."""
     found, any_known, ours = f.found, bool(f.known.any()), f.found.design.controller.names[0]
-    dots, depth = f"Every finished insertion is a dot{f.pooled(f.panel_factor)}.", depths(f.found.study.rows)
+    rows = found.study.rows
+    dots, depth = f"Every finished insertion is a dot{f.pooled(f.panel_factor)}.", depths(rows)
     return [
         _Entry(
             "shares", "True error in worlds", bool(found.worlds) and any_known,
@@ -145,9 +144,15 @@ def _table(f: _Facts) -> list[_Entry]:
             partial(_shares, f), share_figure,
         ),
         _Entry(
-            "targeting", "Final tip positions", not found.worlds and not np.isnan(f.tips).all(),
+            "targeting", "Final tip positions", not found.worlds and not np.isnan(rows.number("tip_x_mm")).all(),
             "True tips of all insertions, and targets with circles of 1 mm radius, to scale.",
             partial(_tips, f), targeting_figure,
+        ),
+        _Entry(
+            "targeting-across", "Final tip positions along the axis", _in_space(rows),
+            "True tips of all insertions in the view along the axis, y and z relative to the target, with a circle of "
+            "1 mm radius, to scale.",
+            partial(_tips_across, f), targeting_figure,
         ),
         _Entry(
             "errors", "True error by controller", any_known and found.design.controller.varies,
@@ -221,9 +226,26 @@ def _shares(f: _Facts) -> list[Panel[Any]]:
 
 
 def _tips(f: _Facts) -> list[Panel[Any]]:
-    rows = f.found.study.rows
-    targets = np.stack([rows.number("target_depth_mm"), rows.number("target_lateral_mm")], axis=1)
-    return f.panels(lambda own, _: Tips(targets[own], f.tips[own], f.done[own]))
+    targets, tips = _places(f.found.study.rows, slice(2))
+    return f.panels(lambda own, _: Tips(targets[own], tips[own], f.done[own]))
+
+
+def _tips_across(f: _Facts) -> list[Panel[Any]]:
+    targets, tips = _places(f.found.study.rows, slice(1, 3))
+    off = tips - targets
+    return f.panels(lambda own, _: Tips(np.zeros_like(off[own]), off[own], f.done[own], ACROSS))
+
+
+def _places(rows: Rows, columns: slice) -> tuple[Floats, Floats]:
+    """Columns x, y, z of the targets and true tips (n, k), mm."""
+    names = TARGET_COLUMNS[columns], ("tip_x_mm", "tip_y_mm", "tip_z_mm")[columns]
+    targets, tips = (np.stack(list(map(rows.number, of)), axis=1) for of in names)
+    return targets, tips
+
+
+def _in_space(rows: Rows) -> bool:
+    """Whether there are tips of needles with two lateral axes."""
+    return bool(((rows.number("setup.axes") == 2) & ~np.isnan(rows.number("tip_z_mm"))).any())
 
 
 def _by_controller(f: _Facts) -> list[Panel[Any]]:

@@ -13,7 +13,7 @@ from flexneedle.scenario.files import dump_scenario, load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.own import is_own
 from flexneedle.scenario.preset import PRESETS
-from flexneedle.scenario.worlds import world_name
+from flexneedle.scenario.worlds import PLANE, world_name
 from flexneedle.study.findings.rows import Rows
 
 _SECTIONS = frozenset(Scenario.model_fields)
@@ -58,12 +58,14 @@ def _scenario_of(rows: Rows, row: int) -> Scenario | None:
 def _world_of(rows: Rows, row: int) -> str:
     """Return the name of the world of a row, or ""."""
     number = rows.value("world", row)
-    return "" if number is None else world_name(int(number), rows.value("world_case", row))
+    if number is None:
+        return ""
+    return world_name(int(number), rows.value("world_case", row), rows.value("world_rig", row) or PLANE)
 
 
 def _command(rows: Rows, row: int, source: str) -> str:
     words = ["flexneedle", "insert", source, "--target"]
-    words += [_number(rows.value(name, row)) for name in ("target_depth_mm", "target_lateral_mm")]
+    words += map(_number, rows.target(row))
     words += ["--seed", _number(rows.value("seed", row))]
     plan_seed = rows.value("plan_seed", row)
     if plan_seed is not None and plan_seed != rows.value("seed", row):

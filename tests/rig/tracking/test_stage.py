@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from flexneedle.rig.tracking.field.poses import tip_sensor_pose
 from flexneedle.rig.tracking.field.room import Room
 from flexneedle.rig.tracking.field.tracker import FieldTracker
-from flexneedle.rig.tracking.plane import InPlane, tip_in_plane
 from flexneedle.rig.tracking.registration import Rigid, identity
-from flexneedle.types import Frame, SensorReading
+from flexneedle.rig.tracking.stage import OnStage, tip_on_stage
+from flexneedle.types import Frame, Pose, SensorReading
 from rooms import ManualClock, environment
 
 ANGLES = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3)
@@ -38,7 +38,7 @@ def test_the_maps_to_the_tracker_and_back_cancel(angles, shift, tip, angle, offs
         to_tracker=to_tracker,
     )
     clock.wait(0.05)
-    samples = InPlane(tracker, to_tracker.inverse(), offset).read()
+    samples = OnStage(tracker, to_tracker.inverse(), offset).read()
     assert len(samples) == 2
     for sample in samples:
         assert (sample.x, sample.y, sample.z) == pytest.approx(tuple(tip), abs=1e-9)
@@ -49,7 +49,7 @@ def test_the_tip_is_ahead_of_its_sensor():
     """A needle along y: a quarter turn of z about −x."""
     half = np.sqrt(0.5)
     reading = SensorReading((1.0, 2.0, 3.0), (half, -half, 0.0, 0.0))
-    sample = tip_in_plane(frame(tip=reading), identity(), 5.0)
+    sample = tip_on_stage(frame(tip=reading), identity(), 5.0)
     assert (sample.x, sample.y, sample.z) == pytest.approx((1.0, 7.0, 3.0))
 
 
@@ -64,12 +64,28 @@ def test_the_tip_is_ahead_of_its_sensor():
     ],
 )
 def test_a_missing_tip_has_no_coordinates_but_its_frame(readings):
-    sample = tip_in_plane(frame(**readings), identity())
+    sample = tip_on_stage(frame(**readings), identity())
     assert (sample.time, sample.x, sample.y, sample.z) == (1.5, None, None, None)
     assert sample.frame == frame(**readings)
 
 
 def test_without_an_orientation_the_tip_is_measured_only_with_offset_0():
     reading = frame(tip=SensorReading((1.0, 2.0, 3.0)))
-    assert tip_in_plane(reading, identity(), 5.0).x is None
-    assert tip_in_plane(reading, identity()).x == pytest.approx(1.0)
+    assert tip_on_stage(reading, identity(), 5.0).x is None
+    assert tip_on_stage(reading, identity()).x == pytest.approx(1.0)
+
+
+@given(angles=ANGLES, theta=st.floats(-1.0, 1.0), psi=st.floats(-1.0, 1.0))
+@hypothesis_settings(deadline=None, derandomize=True, max_examples=60)
+def test_the_direction_of_the_sensor_is_that_of_the_needle(angles, theta, psi):
+    """As its slopes in the stage's frame, whatever the tracker's."""
+    to_stage = Rigid(Rotation.from_euler("xyz", angles).as_matrix(), np.zeros(3))
+    pose = Pose(1.0, 2.0, 3.0, theta, psi)
+    sensor = tip_sensor_pose((1.0, 2.0, 3.0), pose.axis)
+    there = Rotation.from_matrix(to_stage.rotation).inv() * Rotation.from_quat(
+        sensor.orientation, scalar_first=True
+    )
+    reading = SensorReading((0.0, 0.0, 0.0), tuple(there.as_quat(scalar_first=True).tolist()))
+    sample = tip_on_stage(frame(tip=reading), to_stage)
+    assert sample.direction == pytest.approx((theta, psi), abs=1e-9)
+    assert tip_on_stage(frame(tip=SensorReading((0.0, 0.0, 0.0))), to_stage).direction is None

@@ -1,0 +1,85 @@
+"""Measure the exact plant: python benchmarks/plant.py. A JSON summary, times of one run, no thresholds.
+
+Insertions of drawn phantoms of the preset to 45 mm, in steps of 0.25 mm, with random guide motion: in the plane with
+flips, interleaved with the planar kernel of before (tests/reference/planar_rod.py), and in space with rolls by any
+angle.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+import flexneedle
+from flexneedle.rig.phantom.draw import draw
+from flexneedle.rig.phantom.plants import ExactPlant
+from reference import planar_rod
+
+DEPTH_MM, STEP_MM, PHANTOMS = 45.0, 0.25, 12
+
+
+def phantom(axes: int, seed: int) -> tuple[ExactPlant, np.ndarray]:
+    """A drawn plant at its start, and commands (m, 9)."""
+    rng = np.random.default_rng(seed)
+    scenario = flexneedle.load_scenario("phantom").with_values({"setup.axes": axes})
+    plant = ExactPlant(draw(scenario, rng), 0.0)
+    count = round((scenario.setup.tip_to_skin_mm + DEPTH_MM) / STEP_MM)
+    guide = rng.normal(0.0, 0.03, (axes, count))
+    if axes == 1:
+        roll = np.where(rng.random(count) < 0.03, np.pi, 0.0)
+        return plant, flexneedle.controls(count, db_x=STEP_MM, dg_y=guide[0], roll=roll)
+    roll = np.where(rng.random(count) < 0.1, rng.uniform(-3.0, 3.0, count), 0.0)
+    return plant, flexneedle.controls(count, db_x=STEP_MM, dg_y=guide[0], dg_z=guide[1], roll=roll)
+
+
+def seconds(needle: Any, rows: Iterable[np.ndarray]) -> float:
+    """Wall-clock time of all steps."""
+    begun = time.perf_counter()
+    for row in rows:
+        needle.step(row)
+    return time.perf_counter() - begun
+
+
+def iterations(plant: ExactPlant, rows: np.ndarray) -> float:
+    """Mean number of Newton iterations of a step."""
+    found = []
+    for row in rows:
+        plant.step(row)
+        found.append(float(plant.state["iterations"]))
+    return float(np.mean(found))
+
+
+def summary() -> dict[str, Any]:
+    """Times of the kernels and their ratio, medians over phantoms."""
+    begun = time.perf_counter()
+    plant, _ = phantom(1, 0)
+    first = time.perf_counter() - begun
+    planar_rod.Needle(plant)  # compiled
+    plane, before, space = [], [], []
+    for seed in range(PHANTOMS):
+        plant, rows = phantom(1, seed)
+        old = planar_rod.Needle(plant)
+        plane.append(seconds(plant, rows) / len(rows))
+        before.append(seconds(old, rows) / len(rows))
+        plant, rows = phantom(2, seed)
+        space.append(seconds(plant, rows) / len(rows))
+    return {
+        "first_plant_s": round(first, 2),
+        "plane_us_per_step": round(1e6 * median(plane), 1),
+        "planar_kernel_of_before_us_per_step": round(1e6 * median(before), 1),
+        "plane_over_before": round(median(np.divide(plane, before).tolist()), 2),
+        "space_us_per_step": round(1e6 * median(space), 1),
+        "plane_iterations": round(median(iterations(*phantom(1, seed)) for seed in range(PHANTOMS)), 2),
+        "space_iterations": round(median(iterations(*phantom(2, seed)) for seed in range(PHANTOMS)), 2),
+    }
+
+
+if __name__ == "__main__":
+    print(json.dumps(summary(), indent=2))

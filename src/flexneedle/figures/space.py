@@ -1,0 +1,126 @@
+"""What figures of a needle in space add to the scene: directions of the bevel, the predicted shape, the view along
+the axis.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.patches import Annulus
+
+from flexneedle.figures import scene
+from flexneedle.figures.curves import Roll, start_roll
+from flexneedle.figures.layout import ARROW
+from flexneedle.figures.scene import ALONG, View
+from flexneedle.figures.style import ESTIMATE, GUIDE, PLAN, QUIET, TRUE
+from flexneedle.scenario.model import Scenario
+from flexneedle.types import Floats, Period, Plan, Point, Shape, X, Y, Z
+
+COLUMNS: tuple[float, ...] = (4.2, 0.2, 2.4)
+"""Widths of the columns of a figure: the middle one is the end of a section, not of a panel."""
+PLANNED, APPLIED = "bevel after a roll, planned", "bevel after a roll, applied"
+SDS = 2.0
+"""Half width of the band about a predicted shape, in standard deviations."""
+DEPTHS = LinearSegmentedColormap.from_list("depth", ("#f8c9a4", TRUE, "#5c2600"))
+"""Colours of the true path from the start to the end."""
+
+_RING = 0.9  # mm; radius of the guide along the axis
+_SCALE = (0.1, -0.33, 0.8, 0.035)  # the scale of depths, in shares of the axes
+_ROOM = 1.4  # mm around all that is drawn in the view along the axis
+
+
+def draw_bevels(
+    ax: Axes, rolls: Sequence[Roll], view: View, length: float, color: str, *, solid: bool, label: str
+) -> None:
+    """Draw the bevel's directions after rolls as arrows from the tip, `length` mm long in space; solid or hollow."""
+    if not rolls:
+        return
+    start = np.array([roll.point for roll in rolls])[:, view]
+    arrow = length * np.array([roll.direction for roll in rolls])[:, view]
+    how: dict[str, Any] = {
+        "angles": "xy",
+        "scale_units": "xy",
+        "scale": 1.0,
+        "units": "inches",
+        "width": 0.018,
+    }
+    how |= {"headwidth": 4.5, "headlength": 5.0, "headaxislength": 4.5, "minlength": 0.5}
+    how |= {"facecolor": color if solid else "white", "edgecolor": color, "linewidth": 0.0 if solid else 0.7}
+    arrows = ax.quiver(*start.T, *arrow.T, zorder=7 + solid, label=label, **how)
+    arrows.set_gid(ARROW)
+
+
+def draw_start(ax: Axes, plan: Plan, view: View, length: float) -> None:
+    """Draw the direction of the bevel at the start."""
+    draw_bevels(ax, [start_roll(plan)], view, length, QUIET, solid=True, label="bevel at the start")
+
+
+def prediction_label(period: Period) -> str:
+    """Return the name of the shape that was predicted in a period."""
+    return f"final shape ± {SDS:g} sd, predicted at {period.estimate.x:.0f} mm"
+
+
+def draw_prediction(ax: Axes, predicted: Shape, view: View, label: str) -> None:
+    """Draw the band about a predicted shape, seen from the side."""
+    x, y = predicted.nodes[:, view].T
+    half = SDS * predicted.sd[:, view[1] - Y]
+    ax.fill_between(x, y - half, y + half, color=ESTIMATE, alpha=0.2, linewidth=0.0, zorder=2.2, label=label)
+
+
+def set_up_along(ax: Axes, scenario: Scenario, paths: Sequence[Floats]) -> None:
+    """Set up axes along the axis, to scale around paths (k, ≥ 3) of tip and guide."""
+    points = np.concatenate([path[:, [Z, Y]] for path in paths])
+    low, high = points.min(axis=0), points.max(axis=0)
+    half, middle = 0.58 * float(np.max(high - low)) + _ROOM, 0.5 * (low + high)
+    (left, bottom), (right, top) = middle - half, middle + half
+    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", anchor="N")
+    ax.set(xlabel=scene.lateral_label(scenario, Z), ylabel=scene.lateral_label(scenario, Y))
+    ax.set_title("View along the axis")
+    ax.locator_params(nbins=6)
+    ax.grid(color="#e4e4e4", linewidth=0.6)
+    ax.set_axisbelow(True)
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(True)
+
+
+def arrow_along(ax: Axes) -> float:
+    """Return the length (mm) of arrows along the axis."""
+    return 0.15 * float(np.ptp(ax.get_xlim()))
+
+
+def draw_along(ax: Axes, path: Floats, planned: Floats | None = None) -> None:
+    """Draw along the axis the path of the tip (k, ≥ 3), coloured by depth with its scale, and the planned path."""
+    if planned is not None:
+        ax.plot(*planned[:, ALONG].T, "--", color=PLAN, linewidth=1.0, zorder=5)
+    if len(path) > 1:
+        _draw_depths(ax, path)
+    ax.plot(*path[-1, ALONG], "o", color=TRUE, markersize=5, markeredgecolor="white", zorder=9)
+
+
+def _draw_depths(ax: Axes, path: Floats) -> None:
+    points = path[:, ALONG]
+    how: dict[str, Any] = {"cmap": DEPTHS, "linewidth": 2.2, "zorder": 4, "capstyle": "round"}
+    line = LineCollection(list(np.stack([points[:-1], points[1:]], axis=1)), **how)
+    line.set_array(0.5 * (path[:-1, X] + path[1:, X]))
+    line.set_gid("path by depth")
+    ax.add_collection(line, autolim=False)
+    figure: Any = ax.figure
+    bar = figure.colorbar(line, cax=ax.inset_axes(_SCALE), orientation="horizontal")
+    bar.set_label("depth of the tip (mm)")
+    bar.outline.set_visible(False)
+
+
+def draw_guide_along(ax: Axes, travel: Floats, target: Point) -> None:
+    """Draw the guide's path y, z (k, 2) along the axis, and the guide at its end, named on the side off the target."""
+    y, z = travel.T
+    ax.plot(z, y, color=GUIDE, linewidth=1.0, zorder=3)
+    ring = Annulus((z[-1], y[-1]), _RING, 0.25, facecolor=GUIDE, alpha=0.6, edgecolor="none", zorder=2)
+    ring.set_gid("guide")
+    ax.add_patch(ring)
+    up = 1 if target[Y] < y[-1] else -1
+    beside: dict[str, Any] = {"ha": "center", "va": "bottom" if up > 0 else "top", "fontsize": 8}
+    beside |= {"xytext": (0, 2 * up), "textcoords": "offset points", "color": GUIDE}
+    ax.annotate("guide", (z[-1], y[-1] + up * _RING), **beside)

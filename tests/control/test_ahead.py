@@ -1,0 +1,71 @@
+"""The predicted shape for controllers that predict none: the rest of the plan from the estimated state."""
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.control.ahead import along_plan, rest_of_plan
+from flexneedle.control.methods import METHODS
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import DB_X, DG_Y, DG_Z, ROLL, Control, X
+from tasks import task_of
+
+SCENARIOS = {
+    "plane": flexneedle.load_scenario("phantom"),
+    "space": flexneedle.load_scenario("phantom").with_values({"setup.axes": 2, "target.lateral_z_mm": 3.0}),
+}
+
+
+@pytest.fixture(scope="module", params=SCENARIOS)
+def plan(request):
+    return flexneedle.plan(SCENARIOS[request.param], threads=1)
+
+
+def estimates(plan, controller, steps):
+    """The estimate before any motion, and after steps of the plan without a reading."""
+    task = task_of(Simulator(plan.scenario, 1), plan, controller)
+    estimate = METHODS[controller].observer.begin(task)
+    for k, row in enumerate(plan.controls[:steps]):
+        estimate = estimate.move(Control.of(row), 0.2 * k, 0.2 * (k + 1))
+    return task, estimate
+
+
+@pytest.mark.parametrize("steps", [0, 40, 60])
+def test_the_rest_of_a_plan_ends_where_it_does(plan, steps):
+    """All of guide, base and rolls; the shape at its end is the plan's, to the length of a step at each roll."""
+    task, estimate = estimates(plan, "open-loop", steps)
+    rows = rest_of_plan(task, estimate)
+    left = plan.controls[steps:]
+    assert rows[:, DB_X].max() <= task.scenario.setup.max_advance_mm + 1e-9
+    assert estimate.state.tip[X] + rows[:, DB_X].sum() == pytest.approx(plan.target[0], abs=1e-6)
+    np.testing.assert_allclose(
+        rows[:, [DG_Y, DG_Z]].sum(axis=0), left[:, [DG_Y, DG_Z]].sum(axis=0), atol=0.02
+    )
+    assert rows[:, ROLL].sum() == pytest.approx(left[:, ROLL].sum(), abs=1e-9)
+    nodes, sd = along_plan(task, estimate)
+    np.testing.assert_allclose(nodes[:, 1:3], plan.shapes[-1][:, 1:3], atol=0.15)
+    assert np.isfinite(sd).all()
+    assert (sd[:, 1] == 0.0).all() == (plan.scenario.setup.axes == 1)
+
+
+@pytest.mark.parametrize("controller", METHODS)
+def test_each_period_of_each_controller_has_a_predicted_shape(plan, controller):
+    """At the target, less sure ahead of the tip than where it was measured."""
+    done = flexneedle.insert(
+        plan.scenario, plan, 1, controller=controller, phantom="model", force=True, threads=1
+    )
+    periods = done.periods
+    assert all(period.predicted is not None for period in periods)
+    for period in periods[::10]:
+        assert period.predicted.nodes[-1, X] == pytest.approx(plan.target[0], abs=0.6)
+        assert (period.predicted.sd[:, 0] > 0.0).any()
+    last = periods[-1]
+    assert np.abs(last.predicted.nodes[-1, 1:3] - last.estimate[1:3]).max() < 0.5
+
+
+def test_at_the_target_the_predicted_shape_is_the_present_one(plan):
+    task, estimate = estimates(plan, "open-loop", len(plan.controls))
+    rows = rest_of_plan(task, estimate)
+    assert rows.shape == (1, 9)
+    assert np.abs(rows[0, DG_Y:]).max() < 1e-3
+    np.testing.assert_allclose(along_plan(task, estimate).nodes, estimate.state.nodes, atol=2e-4)

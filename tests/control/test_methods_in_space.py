@@ -1,0 +1,161 @@
+"""Every controller in space, on the rigs it can steer: with guides on two axes and one, and none."""
+
+import math
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.control.forecast import probability_beyond
+from flexneedle.control.methods import METHODS
+from flexneedle.scenario.worlds import world
+from flexneedle.types import DG_Z, ROLL
+
+PERFECT = world(3, "perfect")
+"""A needle with a guide whose plant is the controllers' model, with the tracker's noise."""
+DEPTH, OFF = 30.0, 1.5
+
+
+def scenario_of(direction=0.6, off=OFF, **changes):
+    """To a target in a direction (rad) across the axis."""
+    return PERFECT.with_values(
+        {
+            "setup.axes": 2,
+            "target.depth_mm": DEPTH,
+            "target.lateral_mm": off * math.cos(direction),
+            "target.lateral_z_mm": off * math.sin(direction),
+            "plan.max_iterations": 25,
+        }
+        | {key.replace("__", "."): value for key, value in changes.items()}
+    )
+
+
+def inserted(scenario, controller, seed=0, force=True, plan=None):
+    plan = plan or flexneedle.plan(scenario, threads=1)
+    return flexneedle.insert(
+        scenario, plan, seed, controller=controller, phantom="model", force=force, threads=1
+    )
+
+
+@pytest.fixture(scope="module")
+def plans():
+    rigs = {
+        "two axes": scenario_of(),
+        "one axis": scenario_of(setup__guide_axes=1, off=1.0),
+        "no guide": scenario_of(setup__guide_to_skin_mm=None, off=0.4),
+    }
+    return {rig: flexneedle.plan(scenario, threads=1) for rig, scenario in rigs.items()}
+
+
+@pytest.mark.parametrize(
+    ("rig", "controller", "most"),
+    [
+        ("two axes", "open-loop", 0.05),
+        ("two axes", "adaptive-mpc", 0.1),
+        ("two axes", "ce-mpc", 0.2),
+        ("two axes", "resolved-rate", 0.2),
+        ("two axes", "broyden-mpc", 0.2),
+        ("one axis", "open-loop", 0.05),
+        ("one axis", "adaptive-mpc", 0.15),
+        ("one axis", "ce-mpc", 0.3),
+        ("one axis", "resolved-rate", 0.3),
+        ("no guide", "open-loop", 0.05),
+        ("no guide", "adaptive-mpc", 0.2),
+        ("no guide", "ce-mpc", 0.3),
+        ("no guide", "bevel-only", 0.3),
+    ],
+)
+def test_a_controller_reaches_a_target_off_both_axes(plans, rig, controller, most):
+    plan = plans[rig]
+    done = inserted(plan.scenario, controller, plan=plan)
+    assert done.outcome == "done"
+    assert done.true_error_mm < most
+    if rig == "one axis":
+        assert all(period.command[DG_Z] == 0.0 for period in done.periods)
+
+
+def test_every_controller_is_among_those_above():
+    assert set(METHODS) == {
+        *("adaptive-mpc", "bevel-only", "broyden-mpc", "ce-mpc", "open-loop", "resolved-rate")
+    }
+
+
+@pytest.mark.parametrize("controller", ["resolved-rate", "broyden-mpc", "bevel-only"])
+def test_a_target_on_the_other_axis_is_reached_in_the_same_way(controller):
+    """Without noise, target and plan turned by 90°: all commands and tips are turned, too, but for the start that is
+    fitted in air, with the sensitivity along y for both axes.
+    """
+    one = scenario_of(0.0, tracker__jitter_mm=0.0)
+    other = scenario_of(math.pi / 2, tracker__jitter_mm=0.0)
+    first, second = (
+        inserted(scenario, controller, plan=flexneedle.plan(scenario, threads=1)) for scenario in (one, other)
+    )
+    assert len(first.periods) == len(second.periods)
+    for before, after in zip(first.periods, second.periods, strict=True):
+        assert after.true_tip.z == pytest.approx(before.true_tip.y, abs=2e-3)
+        assert after.true_tip.y == pytest.approx(-before.true_tip.z, abs=2e-3)
+        assert after.command.dg_z == pytest.approx(before.command.dg_y, abs=2e-3)
+        assert after.command.roll == pytest.approx(before.command.roll, abs=2e-3)
+
+
+@pytest.mark.parametrize("limit", [90.0, 180.0])
+def test_a_driver_with_a_limited_rotation_stays_within_it(limit):
+    scenario = scenario_of(2.5, setup__guide_axes=1, off=0.8, setup__max_rotation_deg=limit)
+    plan = flexneedle.plan(scenario, threads=1)
+    angle = plan.roll + np.cumsum(plan.controls[:, ROLL])
+    assert np.abs(angle).max() <= math.radians(limit) + 1e-9
+    done = inserted(scenario, "adaptive-mpc", plan=plan)
+    assert max(abs(period.roll) for period in done.periods) <= math.radians(limit) + 1e-9
+
+
+def test_half_turns_stay_half_turns():
+    """With a guide on two axes the bevel still rolls by 180° alone."""
+    scenario = scenario_of(1.0, setup__rotation="half-turns")
+    plan = flexneedle.plan(scenario, threads=1)
+    for name in ("adaptive-mpc", "ce-mpc", "resolved-rate"):
+        done = inserted(scenario, name, plan=plan)
+        rolls = {period.command.roll for period in done.periods}
+        assert rolls <= {0.0, math.pi}
+        assert done.true_error_mm < 0.3
+
+
+def test_a_needle_that_nothing_steers_along_z_says_so():
+    """One-axis guide and half turns: the plan names the limit, the controller holds."""
+    scenario = scenario_of(math.pi / 2, off=3.0, setup__guide_axes=1, setup__rotation="half-turns")
+    plan = flexneedle.plan(scenario, threads=1)
+    assert plan.limit == 'setup.rotation = "half-turns" (nothing steers along z)'
+    done = inserted(scenario, "adaptive-mpc", plan=plan, force=False)
+    assert done.outcome == "held"
+    assert "no path to the target found" in done.reason
+
+
+@pytest.mark.parametrize(("miss", "sd"), [(0.3, 0.2), (2.0, 0.4), (0.0, 1.0), (0.9, 0.05)])
+def test_the_probability_of_a_miss_in_space_is_that_of_samples(miss, sd):
+    rng = np.random.default_rng(0)
+    samples = np.hypot(miss + sd * rng.standard_normal(400_000), sd * rng.standard_normal(400_000))
+    expected = np.mean(samples > 1.0)
+    assert probability_beyond(1.0, miss * np.exp(0.7j).item(), sd) == pytest.approx(expected, abs=3e-3)
+
+
+def test_a_certain_miss_in_space_is_beyond_the_limit_or_not():
+    assert probability_beyond(1.0, complex(0.8, 0.8), 0.0) == 1.0
+    assert probability_beyond(1.0, complex(0.6, 0.6), 0.0) == 0.0
+    assert probability_beyond(1.0, complex(np.nan, 0.0), 0.1) == 0.0
+
+
+def test_the_predicted_shape_ends_at_the_predicted_miss(plans):
+    """In each period: nodes to the target's depth, its tip's standard deviation that of the miss, none at the base."""
+    done = inserted(plans["two axes"].scenario, "adaptive-mpc", plan=plans["two axes"])
+    predicted = [period for period in done.periods if period.predicted is not None]
+    assert len(predicted) > 20
+    for period in predicted:
+        nodes, sd = period.predicted
+        assert nodes.shape == (61, 5)
+        assert sd.shape == (61, 2)
+        assert nodes[-1, 0] == pytest.approx(DEPTH, abs=0.3)
+        np.testing.assert_allclose(sd[-1], period.miss_sd, rtol=0.5)
+        assert np.isfinite(sd).all()
+    last = predicted[-1].predicted
+    true = done.periods[-1].true_tip
+    assert abs(last.nodes[-1, 1] - true.y) < 4.0 * last.sd[-1, 0]
+    assert abs(last.nodes[-1, 2] - true.z) < 4.0 * last.sd[-1, 1]

@@ -1,0 +1,100 @@
+"""The bevel in space: kinematic paths, the rule that rolls it, and the range of the driver's rotation."""
+
+import cmath
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flexneedle.control.bang_bang import closest_approach, seen, wanted_roll
+from flexneedle.control.rotation import roll_within
+from flexneedle.scenario.files import load_scenario
+
+SLOPES = st.floats(-0.4, 0.4)
+ANGLES = st.floats(-math.pi, math.pi)
+PLACES = st.floats(-6.0, 6.0)
+AHEAD = st.floats(5.0, 60.0)
+SPACE = load_scenario("phantom").with_values({"setup.axes": 2})
+
+
+def tangent(theta, psi):
+    """The needle's axis: tilted from x by √(θ² + ψ²) in the direction (θ, ψ)."""
+    angle = math.hypot(theta, psi)
+    share = math.sin(angle) / angle if angle else 1.0
+    return np.array([math.cos(angle), share * theta, share * psi])
+
+
+def normal(theta, psi, bevel):
+    """The bevel's direction across the axis: turned with it by the smallest rotation."""
+    x, across = tangent(theta, psi), np.array([0.0, bevel.real, bevel.imag])
+    old = np.array([1.0, 0.0, 0.0])
+    return across - (across @ x) / (1.0 + old @ x) * (old + x)
+
+
+@given(theta=SLOPES, psi=SLOPES, roll=ANGLES, x=AHEAD, y=PLACES, z=PLACES, curvature=st.floats(0.0, 0.02))
+def test_the_closest_approach_is_that_of_the_circle_in_space(theta, psi, roll, x, y, z, curvature):
+    """Against the least distance to points of the circle ahead of the tip."""
+    bevel, pose = cmath.exp(1j * roll), np.array([0.0, 0.0, 0.0, theta, psi])
+    axis, side = tangent(theta, psi), normal(theta, psi, bevel)
+    along = np.linspace(0.0, 100.0, 20_001)[:, None]
+    if curvature < 1e-9:
+        path = along * axis
+    else:
+        turned = curvature * along
+        path = (np.sin(turned) * axis + (1.0 - np.cos(turned)) * side) / curvature
+    least = np.linalg.norm(path - np.array([x, y, z]), axis=1).min()
+    assert closest_approach(pose, curvature, bevel, (x, y, z)) == pytest.approx(least, abs=3e-3)
+
+
+@given(theta=SLOPES, psi=SLOPES, turn=ANGLES, x=AHEAD, y=PLACES, z=PLACES)
+def test_what_the_tip_sees_turns_with_everything(theta, psi, turn, x, y, z):
+    by = cmath.exp(1j * turn)
+    slope, place = complex(theta, psi) * by, complex(y, z) * by
+    along, across = seen(np.array([0.0, 0.0, 0.0, theta, psi]), (x, y, z))
+    turned = seen(np.array([0.0, 0.0, 0.0, slope.real, slope.imag]), (x, place.real, place.imag))
+    assert turned[0] == pytest.approx(along, abs=1e-12)
+    assert turned[1] == pytest.approx(across * by, abs=1e-12)
+
+
+@given(roll=ANGLES, y=PLACES, z=PLACES)
+def test_a_needle_that_rolls_freely_aims_at_the_target_or_away_from_it(roll, y, z):
+    """Straight ahead, without dead band: rolled, its path passes no farther from the target than any other."""
+    pose, bevel, target = np.zeros(5), cmath.exp(1j * roll), (30.0, y, z)
+    angle, why = wanted_roll(pose, bevel, 0.004, target, 0.0, 0.0, half_turns=False)
+    chosen = closest_approach(pose, 0.004, bevel * cmath.exp(1j * angle), target)
+    others = [
+        closest_approach(pose, 0.004, cmath.exp(1j * other), target) for other in np.linspace(0.0, 6.3, 64)
+    ]
+    if angle == 0.0:
+        assert "kept" in why
+    else:
+        assert chosen <= min(others) + 1e-9
+        assert "rolled" in why
+
+
+def test_half_turns_are_all_that_the_papers_driver_is_asked_for():
+    """Whatever the direction of the target."""
+    for y, z in ((5.0, 0.0), (-5.0, 1.0), (0.5, 5.0)):
+        angle, _ = wanted_roll(np.zeros(5), 1.0 + 0.0j, 0.004, (30.0, y, z), 0.0, 0.0, half_turns=True)
+        assert angle in (0.0, math.pi)
+    assert wanted_roll(np.zeros(5), 1.0 + 0.0j, 0.004, (30.0, -5.0, 1.0), 0.0, 0.0)[0] == math.pi
+
+
+@given(most=st.floats(10.0, 360.0), angle=st.floats(-1.0, 1.0), roll=ANGLES)
+def test_a_roll_stays_within_the_range_of_the_driver(most, angle, roll):
+    """And has the wanted direction wherever the range has it."""
+    setup = SPACE.with_values({"setup.max_rotation_deg": most}).setup
+    before = angle * setup.max_rotation
+    after = before + roll_within(setup, before, roll)
+    assert abs(after) <= setup.max_rotation + 1e-12
+    wanted = math.remainder(before + roll, 2.0 * math.pi)
+    if abs(wanted) <= setup.max_rotation:
+        assert abs(math.remainder(after - wanted, 2.0 * math.pi)) < 1e-9
+    else:
+        assert abs(after) == pytest.approx(setup.max_rotation)
+
+
+def test_without_a_limit_a_roll_is_not_changed():
+    assert roll_within(SPACE.setup, 10.0, 5.0) == 5.0

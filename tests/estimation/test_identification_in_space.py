@@ -1,0 +1,190 @@
+"""The observer that fits the model, in space: what it finds turns with the needle; directions of the tip help it."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.control.methods.adaptive_mpc import AdaptiveMpc
+from flexneedle.estimation.identification import Identification
+from flexneedle.estimation.observer import StateCorrection
+from flexneedle.estimation.prior import Slots
+from flexneedle.estimation.sensors import SENSORS, used
+from flexneedle.mechanics.model import Adaptation
+from flexneedle.simulator.simulator import Simulator
+from flexneedle.types import THETA, Control, Measurement, Y, Z
+from tasks import begun_with
+
+QUIET = flexneedle.load_scenario("phantom").with_values(
+    {
+        "setup.axes": 2,
+        "tracker.jitter_mm": 1e-3,
+        "control.adaptive_mpc.model_sd": 0.0,
+        "control.adaptive_mpc.least_model_sd_mm": 3e-3,
+        "control.adaptive_mpc.clearance_mm": 0.0,
+        "control.adaptive_mpc.clearance_sd_mm": 0.0,
+    }
+)
+DIRECTED = QUIET.with_values({"tracker.direction_jitter_mrad": 0.1})
+BASE, SLOPE, BEND, RUN_OUT, TILT = 0.4 - 0.3j, 0.002 + 0.003j, 0.3 + 0.2j, 0.05 - 0.08j, 0.006 + 0.004j
+
+
+def moves(count, turn=0.0, roll=None, guided=True):
+    """Advance by 1 mm a move; the guide in some direction, rolls by odd angles."""
+    rows = []
+    for k in range(count):
+        guide = (0.1 * math.sin(0.3 * k) + 0.06j * math.cos(0.2 * k)) * complex(
+            math.cos(turn), math.sin(turn)
+        )
+        guide *= guided
+        rows.append(Control(1.0, dg_y=guide.real, dg_z=guide.imag, roll=(roll or {}).get(k, 0.0)))
+    return rows
+
+
+ROLLS = {20: 1.1, 38: -2.4, 50: 0.8}
+
+
+def followed(count, scenario=QUIET, turn=0.0, truth=True, given=lambda one: one, observer=None):
+    """The estimate after moves of a needle with other constants, all turned about the axis, and its true states."""
+    by = complex(math.cos(turn), math.sin(turn)) if truth else 0.0
+    model = Simulator(scenario, 1)
+    cells = AdaptiveMpc().cell_mm
+    own = Adaptation(
+        np.zeros(1), np.ones(2), cell=cells, variation=np.ones(1), bevel=1.0, bend=BEND if truth else 0.0
+    )
+    needle = model.adapted(own)
+    state = needle.start(turn)
+    base, slope = BASE * by, SLOPE * by
+    state = needle.step(
+        state.with_estimate(base=(base.real, base.imag), slope=(slope.real, slope.imag)), Control()
+    )
+    estimate = (observer or Identification()).begin(begun_with(model, turn))
+    states = [state]
+    for k, row in enumerate(moves(count, turn, ROLLS, scenario.setup.has_guide)):
+        state = needle.step(state, row)
+        states.append(state)
+        off = RUN_OUT * state.bevel if truth else 0.0
+        tilt = TILT * state.bevel if truth else 0.0
+        x, y, z, theta, psi = state.tip.tolist()
+        reading = Measurement(0.2 * (k + 1), x, y + np.real(off), z + np.imag(off))
+        reading = replace(reading, direction=(theta + np.real(tilt), psi + np.imag(tilt)))
+        estimate = estimate.move(row, 0.2 * k, 0.2 * (k + 1)).observe([given(reading)])
+    return estimate, states
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return followed(62)
+
+
+def test_it_finds_clamp_bend_and_run_out_on_both_axes(fitted):
+    """In their own directions, relative to the bevel for what turns with the needle; the tip to 5 µm."""
+    estimate, states = fitted
+    slots = estimate.slots
+    np.testing.assert_allclose(estimate.parameters[slots.run_out], [RUN_OUT.real, RUN_OUT.imag], atol=0.01)
+    np.testing.assert_allclose(estimate.parameters[slots.bend], [BEND.real, BEND.imag], atol=0.06)
+    np.testing.assert_allclose(estimate.parameters[slots.base], [BASE.real, BASE.imag], atol=0.06)
+    off = RUN_OUT * states[-1].bevel
+    wanted = states[-1].tip[Y : Z + 1] + np.array([off.real, off.imag])
+    np.testing.assert_allclose(estimate.tip[Y : Z + 1], wanted, atol=5e-3)
+
+
+def test_the_estimate_turns_with_the_needle(fitted):
+    """All of it turned by 90° about the axis: the same parameters for what turns with the needle, turned ones else."""
+    estimate, _ = fitted
+    turned, _ = followed(62, turn=math.pi / 2)
+    slots = estimate.slots
+    for part in (slots.run_out, slots.bend):
+        np.testing.assert_allclose(turned.parameters[part], estimate.parameters[part], atol=2e-3)
+    for part in (slots.base, slots.slope):
+        y, z = estimate.parameters[part]
+        np.testing.assert_allclose(turned.parameters[part], [-z, y], atol=2e-3)
+    np.testing.assert_allclose(turned.tip[Z], estimate.tip[Y], atol=1e-3)
+
+
+def test_the_other_axis_of_a_needle_in_the_plane_stays_at_rest():
+    """The scenario's own needle: nothing to find, no innovation on either axis."""
+    estimate, states = followed(40, truth=False)
+    np.testing.assert_allclose(estimate.parameters, estimate.prior.mean, atol=2e-4)
+    np.testing.assert_allclose(estimate.tip, states[-1].tip, atol=2e-4)
+
+
+# ---- directions of the tip
+
+
+def test_a_scenario_without_directions_has_no_place_for_their_tilt():
+    """With them, two more parameters before the bevel's factor; a direction that is not in use changes nothing."""
+    without, with_ = Slots.of(QUIET), Slots.of(DIRECTED)
+    assert with_.bevel == without.bevel + 2
+    assert without.tilt.start == without.tilt.stop
+    assert [sensor.name for sensor in used(QUIET)] == ["tip position"]
+    assert [sensor.name for sensor in used(DIRECTED)] == ["tip position", "tip direction"]
+    one, _ = followed(8)
+    other, _ = followed(8, given=lambda reading: replace(reading, direction=(0.3, -0.3)))
+    np.testing.assert_array_equal(one.parameters, other.parameters)
+
+
+def test_it_finds_the_tilt_of_the_sensor_and_the_direction_of_the_tip():
+    estimate, states = followed(62, DIRECTED)
+    np.testing.assert_allclose(estimate.parameters[estimate.slots.tilt], [TILT.real, TILT.imag], atol=5e-4)
+    np.testing.assert_allclose(estimate.state.tip[THETA:], states[-1].tip[THETA:], atol=2e-4)
+    before, _ = followed(62)
+    assert estimate.tip_sd < before.tip_sd
+
+
+def test_a_direction_narrows_the_prediction_in_air():
+    """Of a straight needle without a guide the clamp's slope is seen at once, if the sensor is aligned."""
+    free = {"setup.guide_to_skin_mm": None, "control.adaptive_mpc.bend_sd_mm": 0.0}
+    aligned = {
+        **free,
+        "control.adaptive_mpc.tilt_sd_mrad": 0.0,
+        "control.adaptive_mpc.model_slope_sd_mrad": 1e-3,
+    }
+    with_, _ = followed(3, DIRECTED.with_values(aligned), truth=False)
+    without, _ = followed(3, QUIET.with_values(free), truth=False)
+    k = without.slots.slope.start
+    sds = [math.sqrt(one.covariance[k, k]) for one in (with_, without)]
+    assert sds[0] < 0.5 * sds[1]
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_reported_covariance_replaces_the_scenarios_noise(name):
+    """Readings said to be useless leave the prior as it is; without a covariance they do not."""
+    worthless = {
+        "tip position": {"covariance": tuple(tuple(row) for row in (1e6 * np.eye(3)).tolist())},
+        "tip direction": {"direction_covariance": tuple(tuple(row) for row in (1e6 * np.eye(2)).tolist())},
+    }
+    others = [values for other, values in worthless.items() if other != name]
+    rest = {field: value for values in others for field, value in values.items()}
+    useless, _ = followed(12, DIRECTED, given=lambda one: replace(one, **rest, **worthless[name]))
+    useful, _ = followed(12, DIRECTED, given=lambda one: replace(one, **rest))
+    scale = np.sqrt(np.diag(np.linalg.inv(useless.prior.precision)))
+    off = [np.abs((each.parameters - each.prior.mean) / scale).max() for each in (useless, useful)]
+    assert off[0] < 1e-3
+    assert off[1] > 0.2
+
+
+# ---- the other observer
+
+
+@pytest.mark.parametrize("turn", [0.0, math.pi / 2])
+def test_the_correction_of_the_state_finds_the_clamp_in_air_on_both_axes(turn):
+    """With small tracker noise: base position and slope, and the tip."""
+    estimate, states = followed(25, turn=turn, observer=StateCorrection())
+    assert states[-1].tip[0] < 0.0
+    off = RUN_OUT * states[-1].bevel
+    np.testing.assert_allclose(
+        estimate.tip[Y : Z + 1], states[-1].tip[Y : Z + 1] + np.array([off.real, off.imag]), atol=0.02
+    )
+
+
+def test_the_correction_of_the_state_holds_the_tip_in_tissue_and_loads_it_on_both_axes():
+    """The measured tip is met; the force that it needs has both components."""
+    estimate, states = followed(62, observer=StateCorrection())
+    off = RUN_OUT * states[-1].bevel
+    np.testing.assert_allclose(
+        estimate.tip[Y : Z + 1], states[-1].tip[Y : Z + 1] + np.array([off.real, off.imag]), atol=1e-6
+    )
+    assert min(map(abs, estimate.state.tip_load)) > 1e-5
