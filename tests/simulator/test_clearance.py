@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
-from flexneedle import Control, controls, load_scenario
+from flexneedle import Control, Simulator, controls, load_scenario
 from flexneedle.mechanics import needle as nd
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.types import THETA
@@ -205,3 +205,15 @@ def test_rollouts_converge_and_equal_steps():
             np.testing.assert_array_equal(state.tip, tip)
             assert state.iterations <= nd.COUPLED_ITERATIONS
     assert walls == {-1.0, 0.0, 1.0}
+
+
+@pytest.mark.parametrize("clearance", [0.0, 5e-324, 1e-12, 1e-6, 1e-4])
+@pytest.mark.parametrize("preset", ["phantom", "phantom3d"])
+def test_a_clearance_however_small_is_solved(preset, clearance):
+    """A needle that nothing bends touches its guide without force, on no side in particular."""
+    scenario = load_scenario(preset).with_values({"needle.bevel.offset_mm": 0.0})
+    simulator = Simulator(scenario).adapted(Adaptation(np.zeros(1), np.ones(2), clearance=clearance))
+    states = repeat(simulator, simulator.start(), Control(db_x=1.0), 40)
+    moved = simulator.step(states[-1], Control(dg_y=clearance))
+    assert all(state.converged for state in (*states, moved))
+    assert np.abs(moved.nodes[:, 1:3]).max() <= 2.0 * clearance + 1e-9

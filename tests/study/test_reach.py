@@ -11,7 +11,7 @@ import synthetic
 from flexneedle.rig.phantom.draw import draw
 from flexneedle.rig.phantom.plants import ModelPlant
 from flexneedle.scenario.worlds import world
-from flexneedle.study.reach import reach, straight_end, to_disc, to_interval
+from flexneedle.study.reach import beside, reach, reachable, straight_end, to_hull
 from flexneedle.types import Insertion, Outcome
 
 COARSE = {"phantom.step_mm": 1.0, "phantom.element_mm": 1.0, "phantom.contact_spacing_mm": 1.0}
@@ -153,25 +153,74 @@ def test_the_reach_is_about_the_place_where_a_displaced_needle_ends():
 
 
 @pytest.mark.parametrize(
-    ("target", "expected"),
-    [(0.0, (0.0, 0.0)), (1j, (0.0, 1.0)), (3.0, (1.0, 0.0)), (-2.5 - 1j, (0.5, -1.0)), (2.0, (0.0, 0.0))],
+    ("target", "expected"), [(0.0, 0.0), (1j, 1.0), (3.0, 1.0), (-2.5 - 1j, math.hypot(0.5, 1.0)), (2.0, 0.0)]
 )
-def test_the_distance_from_an_interval_has_a_part_along_and_one_across(target, expected):
+def test_the_distance_from_the_interval_between_two_ends(target, expected):
     for turn in (1.0, cmath.exp(0.4j), cmath.exp(-1.2j)):
         ends = [2.0 * turn, -2.0 * turn]
         for given in (ends, ends[::-1]):
-            np.testing.assert_allclose(to_interval(target * turn, given), expected, atol=1e-12)
+            assert to_hull(target * turn, given) == pytest.approx(expected, abs=1e-12)
 
 
-def test_an_interval_and_a_disc_without_extent_are_points():
-    assert to_interval(3.0 + 4.0j, [0.0, 0.0]) == (3.0, 4.0)
-    assert to_disc(3.0 + 4.0j, [0.0, 0.0, 0.0]) == (5.0,)
+@pytest.mark.parametrize(
+    ("target", "expected"),
+    [
+        (0.9 + 0.9j, 0.0),
+        (0.5j, 0.0),
+        (-1.0 + 0.2j, 1.0),
+        (3.0 + 0.9j, 1.0),
+        (2.0 + 2.0j, 1.0),
+        (3.0 + 2.0j, math.sqrt(2.0)),
+    ],
+)
+def test_the_distance_from_the_hull_of_a_square(target, expected):
+    """With a point inside, and one twice, which change nothing."""
+    ends = [0.0, 2.0, 2.0 + 1.0j, 1.0j, 1.0j, 0.7 + 0.6j]
+    for turn in (1.0, cmath.exp(0.4j), 1j):
+        assert to_hull(target * turn, [end * turn for end in ends]) == pytest.approx(expected, abs=1e-12)
 
 
-def test_the_disc_is_around_the_mean_of_the_ends_with_their_mean_distance():
+def test_an_end_without_extent_is_a_point():
+    assert to_hull(3.0 + 4.0j, [0.0, 0.0]) == 5.0
+    assert reachable([2j, 2j, 2j], all_around=True) == ([2j], 0.0)
+
+
+def test_all_around_the_ends_give_the_disc_about_their_mean_with_their_mean_distance():
     ends = [1.0 + 1.0j + radius * turn for radius, turn in ((2.0, 1), (2.0, -1), (4.0, 1j), (4.0, -1j))]
-    assert to_disc(1.0 + 6.0j, ends) == pytest.approx((2.0,))
-    assert to_disc(2.0 + 1.0j, ends) == (0.0,)
+    (middle,), radius = reachable(ends, all_around=True)
+    assert (middle, radius) == (pytest.approx(1.0 + 1.0j), pytest.approx(3.0))
+    assert reachable(ends, all_around=False) == (ends, 0.0)
+
+
+def test_how_far_a_target_is_beside_what_the_bevel_reaches_along_z():
+    assert [beside(z, [1.0 + 2.0j, -4.0j], 0.5) for z in (-5.0, -4.5, 0.0, 2.5, 4.0)] == [
+        0.5,
+        0.0,
+        0.0,
+        0.0,
+        1.5,
+    ]
+
+
+def test_a_limited_range_reaches_the_hull_of_its_arc():
+    """Within ±60°: the direction of the range's end as far as the bevel, its chord, and nothing behind that."""
+    radius, limited = end(FREE_IN_SPACE)[1], FREE_IN_SPACE.with_values({"setup.max_rotation_deg": 60.0})
+    for target, expected in (
+        (cmath.rect(radius + 0.5, math.pi / 3.0), 0.5),
+        (complex(0.5 * radius, 0.3), 0.0),
+        (complex(0.5 * radius - 0.8, 0.3), 0.8),
+    ):
+        assert reach(aimed(limited, target), 0, "model") == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize("rig", ["one-axis", "one-axis-half-turns"])
+def test_a_guide_on_one_axis_leaves_the_other_to_the_bevel(rig):
+    """A target beyond what the bevel reaches along z; half turns reach nothing there."""
+    scenario = world(3, "perfect", rig).with_values(COARSE)
+    bevel = end(scenario)[1] if rig == "one-axis" else 0.0
+    off = aimed(scenario, complex(0.5, -bevel - 0.9))
+    assert reach(off, 0, "model") == pytest.approx(0.9, abs=0.05)
+    assert reach(aimed(scenario, complex(0.5, -0.9 * bevel)), 0, "model") < 0.02
 
 
 def test_a_plant_that_does_not_converge_on_one_side_has_no_reach(monkeypatch):

@@ -5,16 +5,21 @@ In space a needle that rolls to any angle aims its bevel at the target or away f
 
 import cmath
 import math
+import sys
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from flexneedle.control.rotation import roll_within
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
+from flexneedle.planning.insertion import LEAST_ROLL
 from flexneedle.scenario.sections.fields import Fraction, NonNegative, Section
 from flexneedle.types import Floats, Point, X
 
 _NOISE_SDS = 3.0  # standard deviations of a reading, added to the dead band
+_LEAST_ANGLE = sys.float_info.min  # rad: the direction of a smaller slope is rounding
 
 
 def seen(pose: Floats, target: Point) -> tuple[float, complex]:
@@ -25,7 +30,7 @@ def seen(pose: Floats, target: Point) -> tuple[float, complex]:
     x, y, z, theta, psi = pose.tolist()
     ahead, across = target[0] - x, complex(target[1] - y, target[2] - z)
     angle = math.hypot(theta, psi)
-    if angle == 0.0:
+    if angle < _LEAST_ANGLE:
         return ahead, across
     to = complex(theta, psi) / angle
     there = across * to.conjugate()
@@ -55,29 +60,36 @@ def wanted_roll(
     dead_band: float,
     noise: float,
     *,
-    half_turns: bool = True,
+    within: Callable[[float], float] | None = None,
 ) -> tuple[float, str]:
     """Angle (rad) by which to roll the bevel, and the reason.
 
-    The bevel is rolled, by half a turn or to aim at the target or away from it, if the other path passes nearer and the
-    present one misses by more than half of the paths' separation at the target, ½κs², enlarged by the share
-    `dead_band`, plus `noise` (mm): a band that shrinks towards the target, where the two paths are close together, but
-    not below the resolution of the tracker.
+    The bevel is rolled if the other path passes nearer, by more than a dead band. The band is the share `dead_band` of
+    half of the paths' separation at the target, ½κs², plus `noise` (mm): it shrinks towards the target, where the two
+    paths are close together, but not below the resolution of the tracker. With half turns the present path must miss by
+    the half and the band. With rolls to any angle, which `within` maps to those that the driver can make, the bevel is
+    aimed at the target or away from it, and the miss must become smaller by the band.
     """
-    across = seen(pose, target)[1]
-    aim = -bevel if half_turns or across == 0.0 else across / abs(across)
-    keep = closest_approach(pose, curvature, bevel, target)
-    others = (aim,) if half_turns else (aim, -aim)
-    roll, other = min(((closest_approach(pose, curvature, one, target), one) for one in others), key=_first)
     half = 0.5 * curvature * float(np.sum(np.square(np.subtract(target, pose[:3]))))
-    rolled = roll < keep and keep > (1.0 + dead_band) * half + noise
+    band = dead_band * half + noise
+    keep = closest_approach(pose, curvature, bevel, target)
+    if within is None:
+        angle, roll = math.pi, closest_approach(pose, curvature, -bevel, target)
+        rolled = roll < keep and keep > half + band
+    else:
+        across = seen(pose, target)[1]
+        towards = across if across != 0.0 else bevel
+        angles = [within(cmath.phase(one * bevel.conjugate())) for one in (towards, -towards)]
+        roll, angle = min(
+            (closest_approach(pose, curvature, _turned(bevel, one), target), one) for one in angles
+        )
+        rolled = keep - roll > band and abs(angle) >= LEAST_ROLL
     why = f"predicted miss {keep:.3f} mm if kept, {roll:.3f} mm if rolled"
-    angle = math.pi if half_turns else cmath.phase(other * bevel.conjugate())
     return (angle, f"bevel rolled: {why}") if rolled else (0.0, f"bevel kept: {why}")
 
 
-def _first(pair: tuple[float, complex]) -> float:
-    return pair[0]
+def _turned(bevel: complex, angle: float) -> complex:
+    return bevel * cmath.rect(1.0, angle)
 
 
 class BevelRule(Section):
@@ -86,7 +98,8 @@ class BevelRule(Section):
     curvature_per_m: NonNegative = 0.646
     """κ, curvature of the two paths of the bang-bang rule."""
     flip_dead_band: Fraction = 0.875
-    """Dead band of the rule: a miss below half of the two paths' separation times 1 + this does not roll the bevel."""
+    """Dead band of the rule, as a share of half of the two paths' separation at the target: a miss that is less than
+    this above that half does not flip the bevel; in space, a roll that gains less than this is not made."""
 
     @property
     def curvature(self) -> float:
@@ -99,13 +112,12 @@ def decide(task: Task, estimate: Estimate, rule: BevelRule) -> tuple[float, str]
     if estimate.tip[X] <= 0.0:
         return 0.0, "in air"
     setup, state = task.scenario.setup, estimate.state
-    angle, why = wanted_roll(
+    return wanted_roll(
         estimate.tip,
         state.bevel,
         rule.curvature,
         task.plan.target,
         rule.flip_dead_band,
         _NOISE_SDS * task.scenario.tracker.jitter_per_axis,
-        half_turns=setup.half_turns,
+        within=None if setup.half_turns else partial(roll_within, setup, state.roll),
     )
-    return roll_within(setup, state.roll, angle), why

@@ -163,7 +163,8 @@ def adapted(model: Model, adaptation: Adaptation) -> Model:
         nodes=changed,
         layers=layers,
         curvature=2.0 * adaptation.bend / model.length**2,
-        clearance=adaptation.clearance,
+        # Below the tolerance of the solve the side that the needle bears on would be rounding.
+        clearance=adaptation.clearance if adaptation.clearance > model.slide else 0.0,
     )
 
 

@@ -556,7 +556,7 @@ def _bearing(model: Model, boundary: Boundary, w: Work, count: int, last: Bearin
     )  # a wall that pushes stays, however little it does
     if off or (pulls and dot(free, last.wall) <= 0.0):
         return not bears, Bearing(times(0.0, y), give, y, force)
-    wall = free / distance
+    wall = free / distance if distance > 0.0 else last.wall
     agrees = bears and model.clearance * size(wall - last.wall) <= model.slide
     return agrees, Bearing(wall, give, y, force)
 

@@ -19,11 +19,11 @@ from flexneedle.rig.tracking.placement import placed_references
 from flexneedle.rig.tracking.quaternion import to_matrix
 from flexneedle.rig.tracking.registration import Rigid, fit_rigid, identity
 from flexneedle.rig.tracking.simulated import NoisyTracker
-from flexneedle.rig.tracking.stage import OnStage
+from flexneedle.rig.tracking.stage import OnStage, tilt_of
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.registration import Registration
-from flexneedle.types import THETA, Point
+from flexneedle.types import Lateral, Point
 
 _CLEAN = 0.75  # of the indicator's limit: a reference below it is not moved
 
@@ -124,9 +124,9 @@ def to_stage(registration: Registration | None) -> Rigid:
 
 @dataclass(frozen=True)
 class _Errors:
-    """Constant errors: bias (x, y) in mm, and the registration error as a map."""
+    """Constant errors: bias x, y, z in mm, and the registration error as a map."""
 
-    bias: tuple[float, float]
+    bias: Point
     registration: Rigid
 
 
@@ -142,6 +142,12 @@ def _noisy_tracker(
         x, y, z = errors.registration.apply(np.array(tip)).tolist()
         return x, y, z
 
+    def direction_at(time: float) -> Lateral:
+        pose = tank.pose_at(time)
+        if scenario.tracker.registration is None:
+            return pose.theta, pose.psi
+        return tilt_of(errors.registration.rotation @ np.array(pose.axis))
+
     jitter = scenario.tracker.direction_jitter
     return NoisyTracker(
         tip_at,
@@ -153,7 +159,7 @@ def _noisy_tracker(
         missing=scenario.phantom.missing_fraction,
         bias=errors.bias,
         axes=scenario.setup.axes,
-        direction_at=None if jitter is None else lambda time: tank.pose_at(time)[THETA:],
+        direction_at=None if jitter is None else direction_at,
         direction_jitter=jitter or 0.0,
     )
 
@@ -173,9 +179,9 @@ def _field_tracker(
 
     def poses_at(time: float) -> Mapping[str, SensorPose]:
         pose = tank.pose_at(time)
-        tip = pose.x + errors.bias[0], pose.y + errors.bias[1], pose.z
+        x, y, z = (value + off for value, off in zip(pose.point, errors.bias, strict=True))
         return {
-            TIP: tip_sensor_pose(tip, pose.axis, offset),
+            TIP: tip_sensor_pose((x, y, z), pose.axis, offset),
             **references,
         }
 

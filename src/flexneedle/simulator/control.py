@@ -37,6 +37,15 @@ def along_entry(scenario: Scenario, rows: Floats) -> Floats:
     return driven
 
 
+def half_turned(angle: float, roll: float) -> float:
+    """The roll (rad) of a driver that turns the needle between 0 and half a turn, to and fro: from its `angle`, for a
+    `roll` by any number of half turns.
+    """
+    if round(roll / math.pi) % 2 == 0:
+        return 0.0
+    return -angle if round(angle / math.pi) % 2 else math.pi
+
+
 @dataclass(frozen=True)
 class Limits:
     """Largest step of each column of travel, and the range of the sum of steps from the start, shapes (7,) and (7, 2).

@@ -20,7 +20,7 @@ from flexneedle.mechanics.lateral import Lateral, turned
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
-from flexneedle.simulator.control import MOVES, Limits, along_entry, controls
+from flexneedle.simulator.control import MOVES, Limits, along_entry, controls, half_turned
 from flexneedle.simulator.state import State, load_state, mechanics_difference, solved
 from flexneedle.types import COLUMNS, ROLL, Control, Floats
 
@@ -124,10 +124,17 @@ class Simulator:
         start = state.needle, state.rest, state.compression
         driven = along_entry(self.scenario, rows)[None]
         needle = insertion.rollout(self._model, *start, *work, driven, 0, 1, out)
-        turned = np.cumsum(np.append(state.roll, rows[:, ROLL:].sum(axis=1)))[
-            -1
-        ]  # in order, as repeated steps
-        return solved(replace(state, roll=float(turned)), self._model, needle, *work), out.tips[0]
+        return solved(
+            replace(state, roll=self._turned(state.roll, rows)), self._model, needle, *work
+        ), out.tips[0]
+
+    def _turned(self, angle: float, rows: Floats) -> float:
+        """The needle's angle (rad) after controls (m, 9), summed in order, as repeated steps do."""
+        if not self.scenario.setup.half_turns:
+            return float(np.cumsum(np.append(angle, rows[:, ROLL:].sum(axis=1)))[-1])
+        for roll in rows[:, ROLL].tolist():
+            angle += half_turned(angle, roll)
+        return angle
 
     def adapted(self, adaptation: model.Adaptation) -> "Simulator":
         """Return this simulator with the constants that an observer has estimated, for states of the same scenario."""

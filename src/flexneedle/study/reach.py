@@ -5,13 +5,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flexneedle.control.guide import guide_may_move
+from flexneedle.control.guide import guide_axes
 from flexneedle.planning.planner import plan
 from flexneedle.rig.parts import plant_of
 from flexneedle.rig.phantom.draw import Truth, draw
 from flexneedle.rig.phantom.phantom import Phantom
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.types import Control, Point, X, Y, Z
 
 _SEARCH = {
@@ -24,7 +25,8 @@ _SEARCH = {
     "plan.flip_weight": 0.0,
 }
 """Search for the smallest miss: up to 4000 rollouts, 14 times the longest decision of the default controller."""
-_DIRECTIONS = tuple(2.0 * math.pi * k / 6 for k in range(6))
+_DIRECTIONS = 6
+"""Constant directions of the bevel, all around; on an arc one more, with both of its ends."""
 
 
 def reach(
@@ -35,40 +37,79 @@ def reach(
 ) -> float:
     """Return the smallest miss (mm) of an ideal controller in the insertion of a seed, to about 0.5 mm.
 
-    strategy: strategy of the plans, "manipulation" or "steering". If guide or base may move: the miss of the best plan
-    of a search with up to 4000 rollouts on the model with the phantom's true parameters. Otherwise: with half turns,
-    distance from the target to the interval between the end points of the plant inserted with the bevel on either side;
-    by continuity all points between them can be reached. With rolls to any angle, distance to the disc around the mean
-    of the end points of constant directions, with their mean distance from it as its radius. NaN if the plant does not
-    converge.
+    strategy: strategy of the plans, "manipulation" or "steering". If the guide moves on all lateral axes, or the base
+    may move: the miss of the best plan of a search with up to 4000 rollouts on the model with the phantom's true
+    parameters. If neither moves: distance from the target to the convex hull of the end points of the plant inserted
+    with the bevel in constant directions; by rolls between them all points in it can be reached. If the guide of a
+    needle in space moves along y only: both, the miss of the best plan to a target on the needle's axis in z, and the
+    distance along z from that hull. NaN if the plant does not converge.
     """
     truth = draw(scenario, np.random.default_rng(np.random.SeedSequence(seed).spawn(4)[0]))
+    setup, depth = scenario.setup, scenario.target.depth_mm
     base_moves = scenario.plan.base_sigma_mm > 0.0 or scenario.plan.base_turn_sigma > 0.0
-    if guide_may_move(scenario.setup, strategy) or base_moves:
-        return plan(truth.scenario.with_values(_SEARCH), threads=1).error_mm
-    depth, *lateral = scenario.target.position
-    rolls = (math.pi, 0.0) if scenario.setup.half_turns else _DIRECTIONS
-    ends = [straight_end(truth, roll, plant_of(phantom)[1], depth) for roll in rolls]
+    axes = setup.axes if base_moves else guide_axes(setup, strategy)
+    if axes == setup.axes:
+        return _best_miss(truth)
+    ends = [straight_end(truth, roll, plant_of(phantom)[1], depth) for roll in _rolls(setup)]
     if any(math.isnan(x) for x, *_ in ends):
         return math.nan
-    short, places = max(depth - x for x, *_ in ends), [complex(y, z) for _, y, z in ends]
-    beyond = to_interval if scenario.setup.half_turns else to_disc
-    return math.hypot(short, *beyond(complex(*lateral), places))
+    _, *lateral = scenario.target.position
+    all_around = not setup.half_turns and setup.max_rotation >= math.pi
+    places, radius = reachable([complex(y, z) for _, y, z in ends], all_around=all_around)
+    if axes == 1:
+        return math.hypot(_best_miss(truth, on_axis=True), beside(lateral[1], places, radius))
+    short = max(depth - x for x, *_ in ends)
+    return math.hypot(short, max(0.0, to_hull(complex(*lateral), places) - radius))
 
 
-def to_interval(target: complex, ends: Sequence[complex]) -> tuple[float, float]:
-    """Return how far a target is from the interval between two ends y + iz (mm): along it, and across it."""
-    first, last = sorted(ends, key=lambda end: end.real)
-    along = (last - first) / abs(last - first) if last != first else 1.0
-    low, place, high = ((at * along.conjugate()).real for at in (first, target, last))
-    return max(0.0, low - place, place - high), ((target - first) * along.conjugate()).imag
+def _best_miss(truth: Truth, *, on_axis: bool = False) -> float:
+    """Miss (mm) of the best plan on the true model; on_axis: with the target's z on the needle's axis."""
+    scenario, target = truth.scenario, truth.scenario.target
+    z = scenario.entry.lateral(target.depth_mm).imag if on_axis else target.lateral_z_mm
+    aimed = scenario.with_values(_SEARCH | {"target.lateral_z_mm": z})
+    return plan(aimed, threads=1).error_mm
 
 
-def to_disc(target: complex, ends: Sequence[complex]) -> tuple[float]:
-    """Return the distance (mm) of a target y + iz from the disc around the mean of the ends."""
+def _rolls(setup: Setup) -> list[float]:
+    """Constant angles (rad) of the needle: both of half turns, all around, or along the range of the rotation."""
+    if setup.half_turns:
+        return [math.pi, 0.0]
+    if setup.max_rotation >= math.pi:
+        return [2.0 * math.pi * k / _DIRECTIONS for k in range(_DIRECTIONS)]
+    return [setup.max_rotation * (2.0 * k / _DIRECTIONS - 1.0) for k in range(_DIRECTIONS + 1)]
+
+
+def reachable(ends: Sequence[complex], *, all_around: bool) -> tuple[list[complex], float]:
+    """What the needle reaches, as points y + iz and a distance (mm) from their convex hull.
+
+    The ends themselves, or, where their directions are all around, their mean, and their mean distance from it.
+    """
+    if not all_around:
+        return list(ends), 0.0
     middle = sum(ends) / len(ends)
-    radius = sum(abs(end - middle) for end in ends) / len(ends)
-    return (max(0.0, abs(target - middle) - radius),)
+    return [middle], sum(abs(end - middle) for end in ends) / len(ends)
+
+
+def to_hull(target: complex, ends: Sequence[complex]) -> float:
+    """Return the distance (mm) of a target y + iz from the convex hull of the ends."""
+    sides = [(a, b - a) for a in ends for b in ends if a != b]
+    ways = [
+        side * turn / abs(side) for _, side in sides for turn in (1.0, 1.0j)
+    ]  # both signs, by both orders
+    if sides and all(_along(target, way) <= max(_along(end, way) for end in ends) for way in ways):
+        return 0.0
+    nearest = [a + side * min(1.0, max(0.0, _along(target - a, side) / abs(side) ** 2)) for a, side in sides]
+    return min(abs(target - place) for place in (*nearest, *ends))
+
+
+def _along(place: complex, way: complex) -> float:
+    return (place * way.conjugate()).real
+
+
+def beside(z: float, places: Sequence[complex], radius: float) -> float:
+    """Return how far (mm) a target's z is from the range of z of points with a radius about each."""
+    low, high = min(place.imag for place in places) - radius, max(place.imag for place in places) + radius
+    return max(0.0, low - z, z - high)
 
 
 def straight_end(truth: Truth, roll: float, phantom: str | PlantFactory, depth: float) -> Point:

@@ -196,4 +196,7 @@ def _reported_position(measurement: Measurement) -> rules.Position | None:
     reading = None if measurement.frame is None else measurement.frame.readings.get(TIP)
     if reading is not None:
         return reading.position
-    return None if measurement.x is None or measurement.y is None else (measurement.x, measurement.y)
+    x, y, z = measurement.x, measurement.y, measurement.z
+    if x is None or y is None:
+        return None
+    return (x, y) if z is None else (x, y, z)

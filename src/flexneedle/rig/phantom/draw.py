@@ -8,6 +8,7 @@ import numpy as np
 
 from flexneedle.rig.phantom.structure import guide_to_skin, structure_values, with_hidden_layer
 from flexneedle.scenario.model import Scenario
+from flexneedle.types import Point
 
 _THINNEST_MM = 0.1  # least thickness of a layer between displaced boundaries
 
@@ -18,7 +19,7 @@ class Truth:
 
     bend: tip deflection of the free needle, towards the bevel and turned from it by bend_angle (rad); run_out: offset
     of the tip from the needle's axis, in the same way; both roll with the needle. load: constant force y, z on the tip
-    (N). bias (x, y) of the tracker; variation: factor on μ in cells of `cell_mm` from the skin down.
+    (N). bias x, y, z of the tracker (mm); variation: factor on μ in cells of `cell_mm` from the skin down.
     """
 
     scenario: Scenario
@@ -26,7 +27,7 @@ class Truth:
     base_turn: float = 0.0
     bend: float = 0.0
     run_out: float = 0.0
-    bias: tuple[float, float] = (0.0, 0.0)
+    bias: Point = (0.0, 0.0, 0.0)
     variation: tuple[float, ...] = (1.0,)
     cell_mm: float = 0.25
     base_z: float = 0.0
@@ -71,7 +72,7 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
         base_turn,
         bend_side * settings.initial_bend_mm,
         0.5 * run_out_side * settings.run_out_mm,
-        (settings.tracker_bias_mm * math.cos(angle), settings.tracker_bias_mm * math.sin(angle)),
+        _bias(scenario, angle, rng),
         variation,
         cell,
         base_z,
@@ -79,6 +80,17 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Truth:
         bend_angle,
         run_out_angle,
     )
+
+
+def _bias(scenario: Scenario, angle: float, rng: np.random.Generator) -> Point:
+    """The tracker's constant error (mm), at an angle (rad) from x in the plane.
+
+    In space it is raised from that at random, so that every direction is as likely.
+    """
+    size = scenario.phantom.tracker_bias_mm
+    z = float(rng.uniform(-1.0, 1.0)) if scenario.setup.axes == 2 else 0.0
+    flat = size * math.sqrt(1.0 - z**2)
+    return flat * math.cos(angle), flat * math.sin(angle), size * z
 
 
 def _bevel_factor(scenario: Scenario, rng: np.random.Generator) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 
 from flexneedle.rig.phantom.draw import Truth
 from flexneedle.rig.phantom.plants import PlantFactory, plant
-from flexneedle.simulator.control import MOVES, Limits
+from flexneedle.simulator.control import MOVES, Limits, half_turned
 from flexneedle.types import (
     DB_X,
     DB_Y,
@@ -78,10 +78,13 @@ class Phantom:
         """Execute `command` at constant velocity within `duration` s, in steps of at most `phantom.step_mm`.
 
         Motors move to the multiple of their resolution nearest to the sum of all commands, so that rounding errors do
-        not accumulate. Returns the command as applied. Raises CommandError if it exceeds a limit of the setup.
+        not accumulate. A driver of half turns turns to and fro. Returns the command as applied. Raises CommandError if
+        it exceeds a limit of the setup.
         """
         self._limits.check(self._moved, np.array([command]), self._rolled)
         row = self._rounded(command)
+        if self._limits.half_turns:
+            row[ROLL] = half_turned(self._rolled, row[ROLL])
         parts = max(1, math.ceil(abs(row[DB_X]) / self._truth.scenario.phantom.step_mm - 1e-9))
         for k in range(parts):
             part = row / parts

@@ -12,6 +12,7 @@ from flexneedle.rig.phantom import rod as rd
 from flexneedle.rig.phantom.draw import Truth
 from flexneedle.rig.phantom.equilibrium import step
 from flexneedle.rig.phantom.space import roll_about_x, tilt_of, turn, vector
+from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.control import along_entry
 from flexneedle.simulator.simulator import Simulator
@@ -212,7 +213,7 @@ def build_rod(truth: Truth, segments: int) -> rd.Rod:
         clearance=settings.guide_clearance_mm,
         guide_stiffness=_GUIDE_STIFFNESS,
         friction=settings.friction,
-        rotation_friction=settings.rotation_friction,
+        rotation_friction=_rotation_friction(scenario),
         spacing=settings.contact_spacing_mm,
         cell=cell,
         laws=tables(laws),
@@ -221,6 +222,14 @@ def build_rod(truth: Truth, segments: int) -> rd.Rod:
         foundation=modulus * factor * width / height,
         weight=weight,
     )
+
+
+def _rotation_friction(scenario: Scenario) -> float:
+    """Largest couple (N·mm per mm) against rotation: that given, or the axial friction at the needle's surface."""
+    settings = scenario.phantom
+    if settings.rotation_friction_mn is not None:
+        return 1e-3 * settings.rotation_friction_mn
+    return settings.friction * 0.5 * scenario.needle.outer_diameter if scenario.setup.axes == 2 else 0.0
 
 
 PlantFactory = Callable[[Truth, float], Plant]

@@ -12,9 +12,9 @@ from flexneedle.types import VISIBLE, Measurement, Point
 class NoisyTracker:
     """Reads `tip_at(time)` → x, y, z in mm every `period` s with white noise of `jitter` mm on each axis.
 
-    A reading arrives `delay` s after it was taken and has the time of measurement; `bias` (x, y) in mm is added to all.
-    A share `missing` of them has no tip, except the first, which is available at the start. With one lateral axis z
-    is not measured. `direction_at(time)` → slopes θ, ψ of the tip (rad), if given, is measured with white noise of
+    A reading arrives `delay` s after it was taken and has the time of measurement; `bias` (x, y, z) in mm is added to
+    all. A share `missing` of them has no tip, except the first, which is available at the start. With one lateral axis
+    z is not measured. `direction_at(time)` → slopes θ, ψ of the tip (rad), if given, is measured with white noise of
     `direction_jitter` rad. A `TipTracker`.
     """
 
@@ -28,7 +28,7 @@ class NoisyTracker:
         *,
         delay: float = 0.0,
         missing: float = 0.0,
-        bias: tuple[float, float] = (0.0, 0.0),
+        bias: Point = (0.0, 0.0, 0.0),
         axes: int = 1,
         direction_at: Callable[[float], Sequence[float]] | None = None,
         direction_jitter: float = 0.0,
@@ -66,7 +66,10 @@ class NoisyTracker:
             return Measurement(time, None, None)
         tip = x + self._bias[0] + noise[0], y + self._bias[1] + noise[1]
         return Measurement(
-            time, *tip, z + noise[2] if self._axes > 1 else None, direction=self._direction(time)
+            time,
+            *tip,
+            z + self._bias[2] + noise[2] if self._axes > 1 else None,
+            direction=self._direction(time),
         )
 
     def _direction(self, time: float) -> tuple[float, float] | None:

@@ -168,9 +168,10 @@ class PhantomSettings(Section):
     """Clearance of the needle in the guide, to either side."""
     friction_mn_per_mm: NonNegative = 5.0
     """Axial friction of the tissue on each mm of the inserted needle."""
-    rotation_friction_mn: NonNegative = 0.0
+    rotation_friction_mn: NonNegative | None = None
     """Friction of the tissue against rotation: the largest couple (mN·mm) on each mm of the inserted needle. The tip's
-    roll lags behind that of the base, so that with it a half turn leaves the plane."""
+    roll lags behind that of the base, so that with it a half turn leaves the plane. Not set: with `setup.axes = 2` the
+    axial friction at the needle's outer radius, 0 in the plane."""
     motor_resolution_mm: NonNegative = 0.01
     """Resolution of the motors: base and guide are at multiples of it; 0: exact."""
     delay_periods: NonNegative = 1.0
@@ -178,7 +179,7 @@ class PhantomSettings(Section):
     missing_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.01
     """Share of the tracker's readings without a tip position."""
     tracker_bias_mm: NonNegative = 0.0
-    """Constant error of the tracker in the plane of the insertion; its direction is drawn."""
+    """Constant error of the tracker, in the plane of the insertion with `setup.axes = 1`; its direction is drawn."""
     contact_spacing_mm: Positive = 0.5
     """Spacing of the phantom's contact points along the cut channel."""
     element_mm: Positive = 0.5
@@ -196,8 +197,3 @@ class PhantomSettings(Section):
     def friction(self) -> float:
         """Axial friction, N/mm."""
         return 1e-3 * self.friction_mn_per_mm
-
-    @property
-    def rotation_friction(self) -> float:
-        """Friction against rotation, N·mm/mm."""
-        return 1e-3 * self.rotation_friction_mn
