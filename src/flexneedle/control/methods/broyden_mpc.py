@@ -82,9 +82,15 @@ def decide(
     tip = tip + estimated.jacobian @ (inputs - then)
     ahead = np.minimum(setup.max_advance_mm * np.arange(1, settings.horizon + 1), left)
     moves, cost = guide_moves(settings, scenario, task.plan, estimated.jacobian, tip, ahead, inputs[1:])
-    slope, effect = estimated.jacobian[1, :2].tolist()
-    why = f"bevel kept: never rolled; tip moves {slope:.3f} laterally with insertion, {effect:.3f} with the guide"
+    slopes, effects = estimated.jacobian[1:, 0], np.diag(estimated.jacobian[1:, 1:])
+    moves_by = f"tip moves {_listed(slopes)} laterally with insertion, {_listed(effects)} with the guide"
+    why = f"bevel kept: never rolled; {moves_by}"
     return Decision(Control(*row[:DG_Y], *moves[0].tolist()), why, cost), estimated
+
+
+def _listed(values: Floats) -> str:
+    """A number for each axis."""
+    return " and ".join(f"{value:.3f}" for value in values.tolist())
 
 
 def remember(estimated: JacobianEstimate, x: float, inputs: Floats) -> JacobianEstimate:
