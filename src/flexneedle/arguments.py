@@ -2,6 +2,8 @@
 
 import reprlib
 from collections.abc import Mapping
+from math import inf, isfinite
+from numbers import Real
 from operator import index
 from os import PathLike
 from pathlib import Path
@@ -11,6 +13,7 @@ from flexneedle.errors import InputError
 
 _Kind = TypeVar("_Kind")
 _LONGEST = 60  # characters of a value in a message
+_ROUNDING = 1e-6  # of the largest entry: rounding of a product of matrices in single precision
 
 
 def whole(name: str, value: Any, least: int, remedy: str = "") -> int:
@@ -35,6 +38,45 @@ def point(name: str, value: Any, parts: str) -> tuple[float, float, float]:
         raise refusal(name, value, f"must be two or three numbers, {parts}")
     x, y, z = (*numbers, 0.0)[:3]
     return x, y, z
+
+
+def numbers(value: Any, count: int) -> tuple[float, ...] | None:
+    """Return a row of `count` numbers, finite or not, as floats; None for anything else."""
+    try:
+        row = tuple(value)
+    except TypeError:
+        return None
+    if len(row) != count or any(isinstance(part, bool) or not isinstance(part, Real) for part in row):
+        return None
+    return tuple(map(float, row))
+
+
+def rows_of(value: Any, count: int) -> tuple[tuple[float, ...], ...] | None:
+    """Return any number of rows of `count` numbers, finite or not, as floats; None for anything else."""
+    try:
+        rows = [numbers(row, count) for row in value]
+    except TypeError:
+        return None
+    known = tuple(row for row in rows if row is not None)
+    return known if len(known) == len(rows) else None
+
+
+def covariance(name: str, value: Any, size: int) -> tuple[tuple[float, ...], ...]:
+    """Return a covariance by rows. Raises InputError unless it has `size` rows of `size` numbers, is symmetric up to
+    rounding and has no negative variance; entries that are not finite may be anything.
+    """
+    rows = rows_of(value, size)
+    if rows is None or len(rows) != size:
+        raise refusal(name, value, f"must be {size} rows of {size} numbers")
+    rounding = _ROUNDING * max((abs(part) for row in rows for part in row if isfinite(part)), default=0.0)
+    for i, row in enumerate(rows):
+        if -inf < row[i] < 0.0:
+            raise refusal(f"{name}[{i}][{i}]", row[i], "must be at least 0, a variance")
+        for j in range(i + 1, size):
+            if rounding < abs(row[j] - rows[j][i]) < inf:
+                rule = f"must equal {name}[{j}][{i}], here {rows[j][i]!r}, up to rounding"
+                raise refusal(f"{name}[{i}][{j}]", row[j], rule)
+    return rows
 
 
 def instance(name: str, value: Any, kind: type[_Kind], remedy: str) -> _Kind:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.arguments import refusal
+from flexneedle.arguments import covariance, numbers, refusal, rows_of
 
 if TYPE_CHECKING:
     from flexneedle.scenario.model import Scenario
@@ -215,7 +215,11 @@ class Measurement:
 
     frame: all sensors of the tracker, for the monitor; None if there is only the tip. direction: slopes dy/dx and dz/dx
     (rad) of the needle at the tip; points: x, y, z (mm) measured along the needle, from the base on. Covariances as
-    the tracker reports them, of position (3, 3), mm², and direction (2, 2), rad²; None: those of the scenario.
+    the tracker reports them, of position (3, 3), mm², and direction (2, 2), rad²; None: those of the scenario. Only
+    the observer of `adaptive-mpc` uses direction and covariances; others use the position, with the scenario's noise.
+
+    Arrays and lists become tuples. Raises InputError for other shapes, and for covariances that are not symmetric up to
+    rounding or have negative variances. Values need not be finite: the monitor rejects such a reading.
     """
 
     time: float
@@ -227,6 +231,20 @@ class Measurement:
     points: tuple[Point, ...] = ()
     covariance: Matrix | None = None
     direction_covariance: Matrix | None = None
+
+    def __post_init__(self) -> None:
+        if self.direction is not None:
+            slopes = numbers(self.direction, 2)
+            if slopes is None:
+                raise refusal("direction", self.direction, "must be two numbers, dy/dx and dz/dx in rad")
+            object.__setattr__(self, "direction", slopes)
+        points = rows_of(self.points, 3)
+        if points is None:
+            raise refusal("points", self.points, "must each be three numbers, x, y, z in mm")
+        object.__setattr__(self, "points", points)
+        for name, size in (("covariance", 3), ("direction_covariance", 2)):
+            if (matrix := getattr(self, name)) is not None:
+                object.__setattr__(self, name, covariance(name, matrix, size))
 
 
 @dataclass(frozen=True, eq=False)

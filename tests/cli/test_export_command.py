@@ -1,6 +1,7 @@
 """`flexneedle export`: tables of periods and of readings."""
 
 import csv
+from dataclasses import replace
 
 import pytest
 
@@ -9,6 +10,7 @@ from commands import run
 from flexneedle.cli import main as cli
 from flexneedle.trace.columns import COLUMNS
 from flexneedle.trace.reader import read_trace
+from flexneedle.types import CheckedMeasurement
 from synthetic import make_periods
 from synthetic_readings import with_readings
 
@@ -69,6 +71,27 @@ def test_export_writes_one_line_per_reading_with_all_sensors(capsys, in_tmp):
     assert [rows[0][f"ref2.{part}"] for part in sensor] == [""] * 8 + ["missing"]
 
 
+def test_what_a_tracker_measures_besides_the_tip_has_columns_of_its_own(engine, monkeypatch, capsys):
+    measured = {
+        "direction": (0.125, -0.25),
+        "covariance": ((1.0, 0.5, 0.0), (0.5, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    }
+
+    def make(*options):
+        for period in make_periods(*options):
+            both = (period.measurement, replace(period.measurement, **measured))
+            yield replace(period, readings=tuple(CheckedMeasurement(one, period.verdict) for one in both))
+
+    monkeypatch.setattr(fake_engine, "make_periods", make)
+    engine()
+    run(capsys, "insert", "--out", "here")
+    bare, full, *_ = csv.DictReader(run(capsys, "export", "here", "--readings", "-")[1].splitlines())
+    names = ["direction_theta_rad", "direction_psi_rad", "covariance_mm2"]
+    assert list(full)[-4:] == ["z_mm", *names]
+    assert [full[name] for name in names] == ["0.125", "-0.25", "1.0 0.5 0.0; 0.5 1.0 0.0; 0.0 0.0 1.0"]
+    assert [bare[name] for name in names] == ["", "", ""]
+
+
 def test_a_tracker_without_frames_exports_the_tip_alone(engine, capsys):
     engine()
     run(capsys, "insert", "--out", "here")
@@ -89,6 +112,7 @@ def test_the_help_of_export_names_the_columns_of_readings(capsys):
         cli.main(["export", "--help"])
     message = capsys.readouterr().out
     columns = ("time_s", "period", "frame_number", "verdict", "x_mm", "NAME.qw", "NAME.indicator")
+    columns += ("direction_theta_rad", "points_mm", "covariance_mm2", "direction_covariance_rad2")
     assert [name for name in columns if name not in message] == []
 
 

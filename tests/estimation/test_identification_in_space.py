@@ -166,6 +166,15 @@ def test_a_reported_covariance_replaces_the_scenarios_noise(name):
     assert off[1] > 0.2
 
 
+def test_a_variance_is_of_the_measured_axes_only():
+    """In the plane z is not measured, and its entry says nothing."""
+    covariance = ((9.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 1e6))
+    variance = SENSORS["tip position"].variance
+    assert variance(Measurement(0.1, 1.0, 2.0, covariance=covariance)) == 0.5
+    assert variance(Measurement(0.1, 1.0, 2.0, 3.0, covariance=covariance)) == 0.5 * (0.5 + 1e6)
+    assert variance(Measurement(0.1, 1.0, 2.0)) is None
+
+
 # ---- the other observer
 
 

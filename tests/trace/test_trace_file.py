@@ -200,6 +200,7 @@ def test_a_verdict_is_restored_from_its_text(kind, reason):
 
 
 def test_the_text_of_a_verdict_is_that_of_earlier_traces():
+    assert verdict_of("not a number") == Verdict(VerdictKind.NOT_A_NUMBER)
     assert verdict_of("field distorted: ref1 0.09") == Verdict(VerdictKind.FIELD_DISTORTED, "ref1 0.09")
     assert verdict_of("ok") == Verdict()
 

@@ -17,6 +17,10 @@ _COLUMN_HELP = """
                                   arrival, frame number of the tracker
   verdict                         ok, or the reason for the rejection
   x_mm, y_mm, z_mm                needle tip in the stage frame
+  direction_theta_rad, direction_psi_rad, points_mm, covariance_mm2,
+  direction_covariance_rad2       if measured: slopes of the needle at the tip,
+                                  points along the needle, covariances; numbers
+                                  separated by spaces, rows by semicolons
   NAME.x_mm, NAME.y_mm, NAME.z_mm, NAME.qw, NAME.qx, NAME.qy, NAME.qz,
   NAME.indicator, NAME.status     each sensor (tip, ref1, ...) as reported by
                                   the tracker, in the tracker frame

@@ -28,7 +28,8 @@ _DRIFT = 0.5  # of the path that the bevel bends: standard deviation of a model'
 class StateCorrection:
     """Quantities that this observer estimates: in air the pose of the base clamp, in tissue a tip load.
 
-    Without the load the prediction releases the measured tip, as in the paper.
+    Without the load the prediction releases the measured tip, as in the paper. It uses the position of the tip with the
+    scenario's noise, not the direction, points and covariances that a measurement may have.
     """
 
     fits_start: bool = True

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import IO
 
 from flexneedle.trace.columns import COLUMNS, to_row
-from flexneedle.trace.readings import to_values
+from flexneedle.trace.readings import OPTIONAL, to_values
 from flexneedle.types import Period
 
 _READING = ("time_s", "period", "frame_number", "verdict", "x_mm", "y_mm", "z_mm")
@@ -22,16 +22,20 @@ def write_csv(file: IO[str], periods: Sequence[Period]) -> None:
 def write_readings(file: IO[str], periods: Sequence[Period]) -> None:
     """Write all readings of periods, one line per reading, to a text file opened with newline="".
 
-    The tip of the needle in the stage's frame is followed by each sensor in the tracker's frame, as reported: columns
-    `NAME.x_mm` and so on, for all sensors of all frames. Missing values are empty.
+    The tip of the needle in the stage's frame, with the direction, points and covariances that any reading has, is
+    followed by each sensor in the tracker's frame, as reported: columns `NAME.x_mm` and so on, for all sensors of all
+    frames. Missing values are empty.
     """
-    columns = [*_READING, *(f"{name}.{part}" for name in _sensors(periods) for part in _SENSOR)]
+    rows = [
+        {"period": str(period.index), "verdict": str(checked.verdict)} | to_values(checked)
+        for period in periods
+        for checked in period.readings
+    ]
+    measured = [key for key in OPTIONAL if any(key in row for row in rows)]
+    columns = [*_READING, *measured, *(f"{name}.{part}" for name in _sensors(periods) for part in _SENSOR)]
     writer = csv.DictWriter(file, columns, lineterminator="\n", extrasaction="ignore")
     writer.writeheader()
-    for period in periods:
-        for checked in period.readings:
-            row = {"period": str(period.index), "verdict": str(checked.verdict)}
-            writer.writerow(row | to_values(checked))
+    writer.writerows(rows)
 
 
 def _sensors(periods: Iterable[Period]) -> list[str]:

@@ -1,12 +1,13 @@
 """ROS 2 messages of a run: standard types, SI units (m, rad, s, J, N), poses in the frame `skin`.
 
 The frame `skin` has its origin at the intersection of the insertion axis with the skin, x into the tissue, y and z
-across it, right-handed. Time is that of the run and starts at 0.
+across it, right-handed. The orientation of a pose is the smallest rotation that turns the x axis into the needle's.
+Time is that of the run and starts at 0.
 """
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from math import cos, sin
+from math import cos, hypot, sin
 
 import numpy as np
 import rosbags.typesys.stores.ros2_humble as ros
@@ -128,13 +129,23 @@ def _header(time: float) -> Header:
 
 
 def _pose_stamped(header: Header, at: Pose) -> PoseStamped:
-    """The needle's x axis turned by θ about z, then by −ψ about y."""
+    """The smallest rotation that turns the x axis into the needle's, `Pose.axis`: about an axis normal to x."""
     position = PointMessage(at.x * 1e-3, at.y * 1e-3, at.z * 1e-3)
-    (sz, cz), (sy, cy) = ((sin(angle / 2), cos(angle / 2)) for angle in (at.theta, -at.psi))
-    return PoseStamped(header, PoseMessage(position, Quaternion(-sz * sy, cz * sy, sz * cy, cz * cy)))
+    tilt, toward_y, toward_z = _polar(at.theta, at.psi)
+    y, z = -sin(tilt / 2) * toward_z, sin(tilt / 2) * toward_y
+    # The product has the sign of zero of a turn about z: in the plane the two are the same to the last bit.
+    return PoseStamped(header, PoseMessage(position, Quaternion(0.0 * z, y, z, cos(tilt / 2))))
 
 
 def _row(at: PoseMessage) -> list[float]:
     turn = at.orientation
-    theta, psi = 2 * float(np.arctan2(turn.z, turn.w)), 2 * float(np.arctan2(-turn.y, turn.w))
-    return [at.position.x * 1e3, at.position.y * 1e3, at.position.z * 1e3, theta, psi]
+    sine, toward_y, toward_z = _polar(turn.z, -turn.y)
+    tilt = 2 * float(np.arctan2(sine, turn.w))
+    position = (at.position.x * 1e3, at.position.y * 1e3, at.position.z * 1e3)
+    return [*position, tilt * toward_y, tilt * toward_z]
+
+
+def _polar(y: float, z: float) -> tuple[float, float, float]:
+    """Length and direction of a lateral vector; of a zero vector the direction is zero."""
+    length = hypot(y, z)
+    return (length, y / length, z / length) if length else (length, y, z)

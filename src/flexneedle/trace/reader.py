@@ -68,7 +68,7 @@ def _collect(file: Any, collector: "_Collector") -> str:
     try:
         for record in StreamReader(file, validate_crcs=True).records:
             collector.add(record)
-    except (McapError, CRCValidationError, StructError, KeyError, ValueError) as error:
+    except (McapError, CRCValidationError, StructError, KeyError, ValueError, InputError) as error:
         return f"incomplete: {len(collector.periods)} complete periods read ({type(error).__name__})"
     return ""
 

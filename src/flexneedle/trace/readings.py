@@ -1,10 +1,19 @@
-"""Conversion of a checked reading to exact text by key and back: one status of `/tracker/readings`."""
+"""Conversion of a checked reading to exact text by key and back: one status of `/tracker/readings`.
+
+Points and matrices are one text: numbers separated by spaces, rows by semicolons.
+"""
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
-from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading, Verdict
+from flexneedle.types import CheckedMeasurement, Frame, Matrix, Measurement, SensorReading, Verdict
 
 _POSITION, _ORIENTATION = ("x_mm", "y_mm", "z_mm"), ("qw", "qx", "qy", "qz")
+_DIRECTION = ("direction_theta_rad", "direction_psi_rad")
+_POINTS, _COVARIANCE, _DIRECTION_COVARIANCE = "points_mm", "covariance_mm2", "direction_covariance_rad2"
+
+OPTIONAL: tuple[str, ...] = (*_DIRECTION, _POINTS, _COVARIANCE, _DIRECTION_COVARIANCE)
+"""Keys of what a tracker may measure besides the position of the tip, in order."""
 
 
 def to_values(checked: CheckedMeasurement) -> dict[str, str]:
@@ -12,6 +21,11 @@ def to_values(checked: CheckedMeasurement) -> dict[str, str]:
     measurement, frame = checked.measurement, checked.measurement.frame
     values = {"time_s": repr(float(measurement.time))}
     values |= _numbers(_POSITION, (measurement.x, measurement.y, measurement.z))
+    values |= _numbers(_DIRECTION, measurement.direction or ())
+    matrices = (measurement.points or None, measurement.covariance, measurement.direction_covariance)
+    for key, matrix in zip((_POINTS, _COVARIANCE, _DIRECTION_COVARIANCE), matrices, strict=True):
+        if matrix is not None:
+            values[key] = "; ".join(" ".join(map(repr, row)) for row in matrix)
     if frame is not None:
         values |= {"frame_time_s": repr(float(frame.time)), "frame_number": str(frame.number)}
         for name, reading in frame.readings.items():
@@ -20,9 +34,21 @@ def to_values(checked: CheckedMeasurement) -> dict[str, str]:
 
 
 def from_values(values: Mapping[str, str], verdict: Verdict) -> CheckedMeasurement:
-    """Return the reading of such a status; raises KeyError or ValueError for other values."""
+    """Return the reading of such a status; raises KeyError, ValueError or InputError for other values."""
     x, y, z = (_number(values, key) for key in _POSITION)
-    return CheckedMeasurement(Measurement(float(values["time_s"]), x, y, z, _frame(values)), verdict)
+    theta, psi = (_number(values, key) for key in _DIRECTION)
+    measurement = Measurement(
+        float(values["time_s"]),
+        x,
+        y,
+        z,
+        _frame(values),
+        direction=None if theta is None or psi is None else (theta, psi),
+        points=_matrix(values, _POINTS) or (),
+        covariance=_matrix(values, _COVARIANCE),
+        direction_covariance=_matrix(values, _DIRECTION_COVARIANCE),
+    )
+    return CheckedMeasurement(measurement, verdict)
 
 
 def _frame(values: Mapping[str, str]) -> Frame | None:
@@ -57,3 +83,11 @@ def _numbers(keys: tuple[str, ...], values: tuple[float | None, ...]) -> dict[st
 
 def _number(values: Mapping[str, str], key: str) -> float | None:
     return float(values[key]) if key in values else None
+
+
+def _matrix(values: Mapping[str, str], key: str) -> Any:
+    """The rows of a text, None without one; their number and length are for `Measurement` to check."""
+    if key not in values:
+        return None
+    rows: Matrix = tuple(tuple(map(float, row.split())) for row in values[key].split(";"))
+    return rows

@@ -144,7 +144,7 @@ def test_a_bad_last_reading_holds_although_earlier_ones_were_good(plan, real):
     _, tank = real
     done = run(plan, Stage(loop(spoilt_tape(tank.tape, -1, garbled)), tank.applied).rig())
     assert done.outcome == "held"
-    assert str(done.periods[0].verdict) == "not a number"
+    assert str(done.periods[0].verdict) == "not a number: y nan"
 
 
 def test_a_bad_reading_at_the_target_depth_does_not_count_as_arrival(plan, real):
@@ -153,7 +153,7 @@ def test_a_bad_reading_at_the_target_depth_does_not_count_as_arrival(plan, real)
     *way, last = tank.tape
     again = (replace(last[-1], time=last[-1].time + READING),)
     held = run(plan, Stage([*way, (garbled(last[-1]),), again], tank.applied).rig())
-    assert [str(period.verdict) for period in held.periods[-2:]] == ["not a number", "ok"]
+    assert [str(period.verdict) for period in held.periods[-2:]] == ["not a number: y nan", "ok"]
     assert len(held.periods) == len(done.periods) + 1
     assert held.outcome == "done"
     assert held.periods[-1].command == STILL

@@ -238,7 +238,8 @@ def test_a_tracker_that_reports_only_the_tip_is_accepted():
 @pytest.mark.parametrize(
     ("measurement", "verdict"),
     [
-        (Measurement(1.0, float("nan"), 1.0), "not a number"),
+        (Measurement(1.0, float("nan"), 1.0), "not a number: x nan"),
+        (Measurement(1.0, 30.0, 1.0, direction=(0.1, float("nan"))), "not a number: direction nan"),
         (Measurement(1.0, None, None), "missing: tip not measured"),
         (
             Measurement(1.0, None, None, frame=frame(1.0, tip=None)),

@@ -1,6 +1,7 @@
 """Each rule of the monitor: accepted and rejected readings, on both sides of its limit."""
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
@@ -61,15 +62,40 @@ def test_a_missing_tip_has_the_trackers_reason():
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("which", range(4))
+@pytest.mark.parametrize("which", ["time", "x", "y", "z"])
 def test_a_value_that_is_not_finite_is_not_a_number(bad, which):
-    values = [1.0, 30.0, 1.0, 0.0]
-    values[which] = bad
-    assert rules.not_a_number(Measurement(*values)) == "not a number"
+    measurement = replace(Measurement(1.0, 30.0, 1.0, 0.0), **{which: bad})
+    assert rules.not_a_number(measurement) == f"not a number: {which} {bad}"
     assert (
         rules.not_a_number(Measurement(1.0, 30.0, 1.0))
         == rules.not_a_number(Measurement(1.0, None, None))
         == OK
+    )
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_directions_points_and_covariances_must_be_finite(bad):
+    good = Measurement(
+        1.0,
+        30.0,
+        1.0,
+        direction=(0.1, 0.2),
+        points=((0.0, 0.0, 0.0), (10.0, 0.1, 0.2)),
+        covariance=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        direction_covariance=((1.0, 0.0), (0.0, 1.0)),
+    )
+    assert rules.not_a_number(good) == OK
+    spoilt = {
+        "direction": {"direction": (0.1, bad)},
+        "points": {"points": ((0.0, 0.0, 0.0), (10.0, bad, 0.2))},
+        "covariance": {"covariance": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, bad))},
+        "direction covariance": {"direction_covariance": ((1.0, bad), (0.0, 1.0))},
+    }
+    for name, values in spoilt.items():
+        assert rules.not_a_number(replace(good, **values)) == f"not a number: {name} {bad}"
+    everything = {field: value for values in spoilt.values() for field, value in values.items()}
+    assert rules.not_a_number(replace(good, y=bad, **everything)) == (
+        f"not a number: y {bad}, direction {bad}, points {bad}, covariance {bad}, direction covariance {bad}"
     )
 
 

@@ -11,8 +11,10 @@ def _read(measurement: Measurement) -> Lateral | None:
 
 
 def _variance(measurement: Measurement) -> float | None:
-    covariance = measurement.covariance
-    return None if covariance is None else 0.5 * (covariance[1][1] + covariance[2][2])
+    if measurement.covariance is None:
+        return None
+    _, (_, y, _), (_, _, z) = measurement.covariance
+    return y if measurement.z is None else 0.5 * (y + z)
 
 
 def _sd(scenario: Scenario) -> float:

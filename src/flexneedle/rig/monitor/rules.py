@@ -4,7 +4,8 @@ A rule returns OK, or a verdict with the measured value and its limit. A bad rea
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from statistics import median
 
 from flexneedle.rig.tracking.table import TIP
@@ -42,10 +43,13 @@ def missing(measurement: Measurement, axes: int = 1) -> Verdict:
 
 
 def not_a_number(measurement: Measurement) -> Verdict:
-    """The time or a coordinate is not finite."""
-    values = (measurement.time, measurement.x, measurement.y, measurement.z)
-    finite = all(math.isfinite(value) for value in values if value is not None)
-    return OK if finite else Verdict(VerdictKind.NOT_A_NUMBER)
+    """The time, a coordinate, the direction, a point or a covariance is not finite; the verdict names each of them."""
+    bad = [
+        f"{name} {wrong[0]}"
+        for name, values in _reported(measurement)
+        if (wrong := [value for value in values if value is not None and not math.isfinite(value)])
+    ]
+    return Verdict(VerdictKind.NOT_A_NUMBER, ", ".join(bad)) if bad else OK
 
 
 def stale(time: float, now: float, limit: float) -> Verdict:
@@ -159,6 +163,18 @@ def _largest_median(indicators: Mapping[str, Sequence[float]]) -> tuple[str, flo
     """The sensor with the largest median indicator, and that median; 0 without any indicator."""
     medians = {name: median(values) for name, values in indicators.items() if values}
     return max(medians.items(), key=lambda item: item[1], default=("", 0.0))
+
+
+def _reported(measurement: Measurement) -> Iterator[tuple[str, Iterable[float | None]]]:
+    """The numbers of a reading by name, None if not measured; those of the frame's sensors excluded."""
+    yield "time", (measurement.time,)
+    yield "x", (measurement.x,)
+    yield "y", (measurement.y,)
+    yield "z", (measurement.z,)
+    yield "direction", measurement.direction or ()
+    yield "points", chain.from_iterable(measurement.points)
+    yield "covariance", chain.from_iterable(measurement.covariance or ())
+    yield "direction covariance", chain.from_iterable(measurement.direction_covariance or ())
 
 
 def _common_coordinates(one: Measurement, other: Measurement) -> tuple[Position, Position]:
