@@ -19,6 +19,7 @@ from flexneedle.scenario.sections.fields import Fraction, NonNegative, Section
 from flexneedle.types import Floats, Point, X
 
 _NOISE_SDS = 3.0  # standard deviations of a reading, added to the dead band
+_LEAST_GAIN = 0.25  # of the dead band without noise: a bevel that is nearly aimed is not rolled in every step
 _LEAST_ANGLE = sys.float_info.min  # rad: the direction of a smaller slope is rounding
 
 
@@ -64,11 +65,11 @@ def wanted_roll(
 ) -> tuple[float, str]:
     """Angle (rad) by which to roll the bevel, and the reason.
 
-    The bevel is rolled if the other path passes nearer, by more than a dead band. The band is the share `dead_band` of
-    half of the paths' separation at the target, ½κs², plus `noise` (mm): it shrinks towards the target, where the two
-    paths are close together, but not below the resolution of the tracker. With half turns the present path must miss by
-    the half and the band. With rolls to any angle, which `within` maps to those that the driver can make, the bevel is
-    aimed at the target or away from it, and the miss must become smaller by the band.
+    The bevel is rolled if the other path passes nearer and the target is off the tip's line by more than a dead band:
+    the share `dead_band` of half of the paths' separation at the target, ½κs², plus `noise` (mm). It shrinks towards
+    the target, where the two paths are close together, but not below the resolution of the tracker. With rolls to any
+    angle, which `within` maps to those that the driver can make, the bevel is aimed at the target or away from it, if
+    that lowers the miss by at least a quarter of that share.
     """
     half = 0.5 * curvature * float(np.sum(np.square(np.subtract(target, pose[:3]))))
     band = dead_band * half + noise
@@ -80,10 +81,12 @@ def wanted_roll(
         across = seen(pose, target)[1]
         towards = across if across != 0.0 else bevel
         angles = [within(cmath.phase(one * bevel.conjugate())) for one in (towards, -towards)]
-        roll, angle = min(
-            (closest_approach(pose, curvature, _turned(bevel, one), target), one) for one in angles
+        ends = ((closest_approach(pose, curvature, _turned(bevel, one), target), one) for one in angles)
+        (roll, angle), off = min(ends), closest_approach(pose, 0.0, bevel, target)
+        gain = keep - roll
+        rolled = (
+            off > band and gain > 0.0 and gain >= _LEAST_GAIN * dead_band * half and abs(angle) >= LEAST_ROLL
         )
-        rolled = keep - roll > band and abs(angle) >= LEAST_ROLL
     why = f"predicted miss {keep:.3f} mm if kept, {roll:.3f} mm if rolled"
     return (angle, f"bevel rolled: {why}") if rolled else (0.0, f"bevel kept: {why}")
 
@@ -98,8 +101,8 @@ class BevelRule(Section):
     curvature_per_m: NonNegative = 0.646
     """κ, curvature of the two paths of the bang-bang rule."""
     flip_dead_band: Fraction = 0.875
-    """Dead band of the rule, as a share of half of the two paths' separation at the target: a miss that is less than
-    this above that half does not flip the bevel; in space, a roll that gains less than this is not made."""
+    """Dead band of the rule, as a share of half of the two paths' separation at the target: while the target is less
+    than this off the tip's line the bevel is not rolled."""
 
     @property
     def curvature(self) -> float:

@@ -37,8 +37,8 @@ class CeMpc(BevelRule):
     curvature_per_m: NonNegative = 0.232
     """κ, curvature of the two paths of the bang-bang rule."""
     flip_dead_band: Fraction = 0.875
-    """Dead band of the rule, as a share of half of the two paths' separation at the target: a miss that is less than
-    this above that half does not flip the bevel; in space, a roll that gains less than this is not made."""
+    """Dead band of the rule, as a share of half of the two paths' separation at the target: while the target is less
+    than this off the tip's line the bevel is not rolled."""
     guide_weight: NonNegative = 0.075
     """Weight of the squared difference (mm²) between a guide step and the plan's."""
     energy_weight_per_mj: NonNegative = 2.74

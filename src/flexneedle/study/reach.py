@@ -38,11 +38,11 @@ def reach(
     """Return the smallest miss (mm) of an ideal controller in the insertion of a seed, to about 0.5 mm.
 
     strategy: strategy of the plans, "manipulation" or "steering". If the guide moves on all lateral axes, or the base
-    may move: the miss of the best plan of up to 4480 rollouts on the model with the phantom's true parameters; the search
-    ends with a miss of 0.05 mm. If neither moves: distance from the target to the convex hull of the end points of the plant inserted
-    with the bevel in constant directions; by rolls between them all points in it can be reached. If the guide of a
-    needle in space moves along y only: both, the miss of the best plan to a target on the needle's axis in z, and the
-    distance along z from that hull. NaN if the plant does not converge.
+    may move: the miss of the best plan of up to 4480 rollouts on the model with the phantom's true parameters; the
+    search ends with a miss of 0.05 mm. If neither moves: distance from the target to the convex hull of the end points
+    of the plant inserted with the bevel in constant directions; by rolls between them all points in it can be reached.
+    If the guide of a needle in space moves along y only: both, the miss of the best plan to a target on the needle's
+    axis in z, and the distance along z from that hull. NaN if the plant does not converge.
     """
     truth = draw(scenario, np.random.default_rng(np.random.SeedSequence(seed).spawn(4)[0]))
     setup, depth = scenario.setup, scenario.target.depth_mm

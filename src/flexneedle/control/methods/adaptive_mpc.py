@@ -245,8 +245,8 @@ def out_of_reach(
         low, high = past.real.min(axis=1), past.real.max(axis=1)
         sd = np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
         return partial(terms.out_of_reach, expected=above_zero(low, sd) + above_zero(-high, sd))
-    # By symmetry the ends along the present direction of the bevel are those along any other. The first step displaces the
-    # middle towards the target or away from it: with its direction kept the ends are that much farther, else nearer.
+    # By symmetry the ends along the present direction of the bevel are those along any other. The first step displaces
+    # the middle towards the target or away from it: the ends are that much farther, or nearer.
     away, radius = -past.mean(), 0.5 * np.abs(past[0] - past[1])
     sd = np.hypot(middle, radius * fitted.bevel_sd)
     angle = cmath.phase(complex(away) * fitted.state.bevel.conjugate())

@@ -36,8 +36,8 @@ class ResolvedRate(bang_bang.BevelRule):
     curvature_per_m: NonNegative = 0.0834
     """κ, curvature of the two paths of the bang-bang rule."""
     flip_dead_band: Fraction = 0.625
-    """Dead band of the rule, as a share of half of the two paths' separation at the target: a miss that is less than
-    this above that half does not flip the bevel; in space, a roll that gains less than this is not made."""
+    """Dead band of the rule, as a share of half of the two paths' separation at the target: while the target is less
+    than this off the tip's line the bevel is not rolled."""
     gain: NonNegative = 1.38
     """Share of the tip's predicted deviation that a control step corrects."""
     damping: NonNegative = 0.0533
