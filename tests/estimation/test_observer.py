@@ -286,7 +286,7 @@ def test_unseen_keeps_the_belief_and_has_no_innovation():
     [
         {"entry.lateral_mm": 3.0},
         {"entry.slope_mrad": 50.0},
-        {"setup.axes": 2, "entry.lateral_z_mm": -3.0, "entry.slope_z_mrad": 50.0},
+        {"setup.axes": 2, "entry.lateral_mm": 2.0, "entry.lateral_z_mm": -3.0, "entry.slope_z_mrad": 50.0},
     ],
     ids=str,
 )
