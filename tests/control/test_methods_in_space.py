@@ -123,7 +123,9 @@ def test_a_needle_that_nothing_steers_along_z_says_so():
     """One-axis guide and half turns: the plan names the limit, the controller holds."""
     scenario = scenario_of(math.pi / 2, off=3.0, setup__guide_axes=1, setup__rotation="half-turns")
     plan = flexneedle.plan(scenario, threads=1)
-    assert plan.limit == 'setup.rotation = "half-turns" (nothing steers along z)'
+    assert (
+        plan.limit == 'setup.guide_axes = 1 (nothing else steers along z with setup.rotation = "half-turns")'
+    )
     done = inserted(scenario, "adaptive-mpc", plan=plan, force=False)
     assert done.outcome == "held"
     assert "no path to the target found" in done.reason

@@ -22,6 +22,8 @@ RIGS = {
     "half turns": {"setup.rotation": "half-turns"},
     "half a turn to either side": {"setup.max_rotation_deg": 180.0},
     "a quarter turn to either side": {"setup.max_rotation_deg": 90.0},
+    "a sixth of a turn to either side": {"setup.max_rotation_deg": 60.0},
+    "three quarters of a turn to either side": {"setup.max_rotation_deg": 270.0},
 }
 SAMPLES = st.integers(0, 2**32 - 1)
 

@@ -121,5 +121,18 @@ def test_a_roll_stays_within_the_range_of_the_driver(most, angle, roll):
         assert abs(after) == pytest.approx(setup.max_rotation)
 
 
+@given(
+    most=st.floats(45.0, 270.0), angle=st.floats(-1.0, 1.0), roll=ANGLES, other=st.floats(-1.0, 1.0),
+)  # fmt: skip
+def test_no_angle_in_the_range_is_nearer_in_direction(most, angle, roll, other):
+    setup = SPACE.with_values({"setup.max_rotation_deg": most}).setup
+    before = angle * setup.max_rotation
+    wanted, after = before + roll, before + roll_within(setup, before, roll)
+    ends = (other * setup.max_rotation, -setup.max_rotation, setup.max_rotation)
+    off, *others = (abs(math.remainder(one - wanted, 2.0 * math.pi)) for one in (after, *ends))
+    assert abs(after) <= setup.max_rotation + 1e-12
+    assert off <= min(others) + 1e-9
+
+
 def test_without_a_limit_a_roll_is_not_changed():
     assert roll_within(SPACE.setup, 10.0, 5.0) == 5.0

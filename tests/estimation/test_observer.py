@@ -279,3 +279,18 @@ def test_unseen_keeps_the_belief_and_has_no_innovation():
     assert updated.innovation != (0.0, 0.0, 0.0)
     assert updated.without_reading().innovation == (0.0, 0.0, 0.0)
     assert updated.without_reading().state is updated.state
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"entry.lateral_mm": 3.0},
+        {"entry.slope_mrad": 50.0},
+        {"setup.axes": 2, "entry.lateral_mm": 2.0, "entry.lateral_z_mm": -3.0, "entry.slope_z_mrad": 50.0},
+    ],
+    ids=str,
+)
+def test_the_uncertainty_of_the_path_is_that_of_a_needle_on_the_axis(entry):
+    """The bevel bends the needle from its axis, wherever that is: by as much within a few percent."""
+    drift, on_axis = (begun(Simulator(PHANTOM.with_values(each))).drift for each in (entry, {}))
+    assert drift == pytest.approx(on_axis, rel=0.03)

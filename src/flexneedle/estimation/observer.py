@@ -181,12 +181,13 @@ def _moved_along(at: Corrected, done: Move, off: float, noise: float) -> tuple[C
 
 
 def _bevel_reach(simulator: Simulator, depth: float) -> float:
-    """Lateral distance (mm) of the tip from the straight at `depth` (mm), with the bevel never rolled."""
+    """Lateral distance (mm) of the tip from the entry's axis at `depth` (mm), with the bevel never rolled."""
     setup = simulator.scenario.setup
     travel = min(depth + setup.tip_to_skin_mm, setup.stroke_mm)
     steps = int(np.ceil(travel / setup.max_advance_mm - 1e-9))
     straight = controls(1, steps, db_x=travel / steps)
-    return abs(float(simulator.rollout(simulator.start(), straight).tips[0, -1, Y]))
+    x, y, z, *_ = simulator.rollout(simulator.start(), straight).tips[0, -1].tolist()
+    return abs(complex(y, z) - simulator.scenario.entry.lateral(x))
 
 
 def _fit_start(at: Corrected, predicted: State, innovation: Floats, noise: float) -> Corrected:

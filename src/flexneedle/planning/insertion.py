@@ -42,6 +42,7 @@ _LEAST_ADVANCE = 0.5  # of the longest step
 _BEVEL_BOUND = 3.0  # ε has standard deviation 1 at first
 _ENTRY_SIGMA = 0.25  # of the bounds
 _SHARE_BOUND = 1.0  # no primitive is longer than e² times another
+_ROUNDING = 1e-10  # mm, or of a length
 LEAST_ROLL = 0.1
 """Smallest roll (rad): a smaller one turns the path by less than it costs a driver to make it."""
 _BEVEL_CORRELATION = 0.8  # of ε of neighbouring primitives at first: few flips are likelier than many
@@ -56,7 +57,9 @@ class PlanProblem:
     deviation of each coordinate of a primitive, 0 if not free; axes: 1 or 2; half_turns: the only rolls; rotation:
     largest angle of the needle to either side; frame: the direction in which the first of two lateral coordinates
     points; entry: largest change of the point on the skin (mm) and of the slope (rad); mounts: x of base and guide at
-    the start; axis: y + iz of the needle's axis at the target's depth.
+    the start; axis: y + iz of the needle's axis at the target's depth; slope: that of the axis (rad); steepest: its
+    largest size on each lateral axis; lateral_travel: largest distance (mm) on each of the target from the axis;
+    home: an entry that keeps it; left: vector y + iz (mm) to the target from the nearest axis that is free.
     """
 
     target: Point
@@ -78,6 +81,11 @@ class PlanProblem:
     entry: tuple[float, float] = (0.0, 0.0)
     mounts: tuple[float, float] = (0.0, 0.0)
     axis: complex = 0.0
+    slope: complex = 0.0
+    steepest: float = np.inf
+    lateral_travel: float = np.inf
+    home: tuple[complex, complex] = (0.0, 0.0)
+    left: complex = 0.0
 
     @property
     def entry_coordinates(self) -> int:
@@ -85,17 +93,30 @@ class PlanProblem:
         return 2 * self.axes if any(self.entry) else 0
 
     @property
+    def across(self) -> complex:
+        """Lateral vector y + iz (mm) from the needle's axis to the target."""
+        return complex(*self.target[1:]) - self.axis
+
+    @property
     def direction(self) -> complex:
         """Direction in which the bevel alone steers: from the needle's axis to the target, or y where it rolls by half
         turns.
+
+        Where a limit keeps a free entry from moving straight to the target: from the nearest axis that is free.
         """
-        across = complex(*self.target[1:]) - self.axis
+        aside = abs((self.left * self.across.conjugate()).imag)
+        across = self.left if aside > _ROUNDING * abs(self.across) ** 2 else self.across
         return 1.0 if self.half_turns or across == 0.0 else across / abs(across)
 
     @property
     def lateral(self) -> float:
-        """Lateral offset (mm) of the target in that direction."""
-        return (complex(*self.target[1:]) * self.direction.conjugate()).real
+        """Lateral offset (mm) of the target from the needle's axis in that direction."""
+        return (self.across * self.direction.conjugate()).real
+
+    @property
+    def narrow(self) -> bool:
+        """Whether the driver's range is less than a turn, so that the bevel cannot face every direction."""
+        return not self.half_turns and self.rotation < np.pi
 
     @property
     def bevel(self) -> slice:
@@ -142,7 +163,7 @@ def optimise(
 def solution(problem: PlanProblem, found: Found) -> Solution:
     """The solution: without steps that do not advance, rolled before the first."""
     controls = found.trajectories.controls[0]
-    entry = _entry(problem, found.z[None, found.z.size - problem.entry_coordinates :])
+    entry = entry_of(problem, found.z[None, found.z.size - problem.entry_coordinates :])
     facing = np.cumsum(controls[:, ROLL])
     moving = controls[:, DB_X] > 0.0
     controls, facing = controls[moving], facing[moving]
@@ -175,8 +196,12 @@ def entry_bounds(problem: PlanProblem) -> Floats:
     return np.repeat(problem.entry, problem.axes)[: problem.entry_coordinates]
 
 
-def _entry(problem: PlanProblem, z: Floats) -> tuple[Laterals, Laterals]:
-    """Changes (N,) of point (mm) and slope (rad) of the entry, for its coordinates (N, 2 axes) or none (N, 0)."""
+def entry_of(problem: PlanProblem, z: Floats) -> tuple[Laterals, Laterals]:
+    """Changes (N,) of point (mm) and slope (rad) of the entry, for its coordinates (N, 2 axes) or none (N, 0).
+
+    The slope stays within its limit, and the target within the lateral travel: an entry that is too far from it is
+    moved towards `home` as far as necessary.
+    """
     if not z.size:
         none = np.zeros(len(z), dtype=complex)
         return none, none
@@ -184,7 +209,31 @@ def _entry(problem: PlanProblem, z: Floats) -> tuple[Laterals, Laterals]:
     across = problem.frame * (parts[:, :, 0] + (1j * parts[:, :, 1] if problem.axes > 1 else 0.0))
     size = np.maximum(np.abs(across) / np.maximum(problem.entry, np.finfo(float).tiny), 1.0)
     point, slope = (across / size).T
+    _keep_steepness(problem, slope)
+    _keep_travel(problem, point, slope)
     return point, slope
+
+
+def _keep_steepness(problem: PlanProblem, slope: Laterals) -> None:
+    """Limit the slope on each axis, for changes (N,) of it; in the plane these are real."""
+    parts = ((slope.real, problem.slope.real), (slope.imag, problem.slope.imag))
+    for part, now in parts[: problem.axes]:
+        np.clip(part, -problem.steepest - now, problem.steepest - now, out=part)
+
+
+def _keep_travel(problem: PlanProblem, point: Laterals, slope: Laterals) -> None:
+    """Move entries (N,) from which the target is beyond the lateral travel towards `home`, no further than need be."""
+    depth, home = problem.target[0], problem.home
+    off = problem.across - point - slope * depth
+    least = problem.across - home[0] - home[1] * depth
+    share = np.zeros(len(off))
+    for there, near in ((off.real, least.real), (off.imag, least.imag)):
+        far = np.abs(there) - problem.lateral_travel
+        out = far > _ROUNDING
+        share[out] = np.maximum(share[out], np.minimum(far[out] / np.abs(there - near)[out], 1.0))
+    moved = share > 0.0
+    for changes, to in ((point, home[0]), (slope, home[1])):
+        changes[moved] += share[moved] * ((to.real if problem.axes == 1 else to) - changes[moved])
 
 
 def _add_along(rows: Floats, slope: Laterals) -> None:
@@ -200,7 +249,7 @@ def mounted(problem: PlanProblem, rows: Floats, z: Floats) -> Floats:
     """
     if not z.size:
         return rows
-    point, slope = _entry(problem, z)
+    point, slope = entry_of(problem, z)
     base, guide = (point + slope * x for x in problem.mounts)
     first = np.zeros_like(rows[:, :1])
     for column, value in ((DB_Y, base), (DB_THETA, slope), (DG_Y, guide)):
@@ -257,19 +306,33 @@ def schedule(problem: PlanProblem, z: Floats) -> tuple[Floats, Floats]:
     controls = np.zeros((len(z), index.size, len(COLUMNS)))
     controls[:, :, [DB_X, *MOVES[problem.axes]]] = steps[rows, owner]
     first = np.concatenate([np.zeros((len(z), 1), dtype=int), ends[:, :-1]], axis=1)
-    wanted = _without_small_rolls(wanted)
-    rolls = np.diff(wanted, axis=1, prepend=0.0)
+    wanted = without_small_rolls(wanted)
+    rolls = np.diff(_in_range(wanted, problem.rotation), axis=1, prepend=0.0)
     controls[rows, first, ROLL] = rolls if np.isfinite(problem.rotation) else wrapped(rolls)
     return mounted(problem, controls, entry), wanted
 
 
-def _without_small_rolls(wanted: Floats) -> Floats:
+def without_small_rolls(wanted: Floats) -> Floats:
     """Directions (N, P), rad, of which one that hardly differs from the direction before it is the same."""
     kept = wanted.copy()
     for p in range(1, wanted.shape[1]):
         small = np.abs(wrapped(kept[:, p] - kept[:, p - 1])) < LEAST_ROLL
         kept[small, p] = kept[small, p - 1]
     return kept
+
+
+def _in_range(wanted: Floats, rotation: float) -> Floats:
+    """Angles (N, P), rad, of the directions `wanted` (N, P), −π to π: of those within the range the nearest to the one
+    before, so that no roll is longer than need be.
+    """
+    if not np.pi < rotation < np.inf:
+        return wanted
+    angles = wanted.copy()
+    for p in range(1, wanted.shape[1]):
+        near = angles[:, p - 1] + wrapped(wanted[:, p] - angles[:, p - 1])
+        back = near - 2.0 * np.pi * np.sign(near)
+        angles[:, p] = np.where(np.abs(near) <= rotation, near, back)
+    return angles
 
 
 def _directions(problem: PlanProblem, bevel: Floats) -> Floats:

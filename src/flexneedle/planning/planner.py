@@ -12,25 +12,27 @@ from flexneedle.arguments import point, whole
 from flexneedle.errors import InputError
 from flexneedle.planning.cross_entropy import Search, elite_count
 from flexneedle.planning.insertion import LATERAL, PlanProblem, Solution, optimise
-from flexneedle.planning.steering import reach, steer
+from flexneedle.planning.steering import radius, reach, steer
 from flexneedle.planning.terms import Trajectories
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario, check_target
+from flexneedle.scenario.sections.apparatus import STEEPEST_MRAD
 from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.simulator.control import Limits, controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import DB_X, DG_Y, Control, Floats, Plan, Point, X, Z
+from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, Control, Floats, Plan, Point, X, Z, across
 
 _TARGET = "depth and lateral offsets in mm"
 STRATEGIES = ("manipulation", "steering")
 _DEPTH_TOLERANCE_MM = 1e-6
 _ASIDE = 0.1  # share of a standard deviation across the direction of the target
 _SHARE_SIGMA = 0.1  # of the logarithm of a primitive's share of the travel
-# plan.samples over this for each number of rolls and side, with few coordinates and no entry
+# plan.samples over this for each number of rolls and side, where only depths of rolls are searched
 _SHARE_OF_A_SEARCH = 4
 _LEAST_SAMPLES = 8
 _AT_LIMIT = 0.999  # share of a limit that counts as reached
+_REACHED_MM = 0.05  # the hull of what a bevel with a range of angles reaches is known to about this
 
 
 def plan(
@@ -61,7 +63,7 @@ def plan(
     solution = _search(simulator, problem, np.random.default_rng(seed), progress)
     if scenario.entry.free:
         scenario = _entering(scenario, *solution.entry)
-        simulator = Simulator(scenario, threads)
+        simulator, problem = Simulator(scenario, threads), _problem(scenario, goal, strategy)
     rows = _end_at_depth(simulator, solution.controls, solution.roll, goal[0])
     states = [simulator.start(solution.roll)]
     for row in rows:
@@ -88,9 +90,11 @@ def plan(
 
 
 def bevel_reach(scenario: Scenario, depth: float, threads: int | None = None) -> tuple[float, float]:
-    """Least and greatest lateral position (mm) at a depth (mm) that the bevel alone can reach."""
-    simulator = Simulator(scenario, threads)
-    return reach(_rollout(simulator), _problem(scenario, (depth, 0.0, 0.0), "steering"))
+    """Least and greatest y (mm) at a depth (mm) that the bevel alone can reach, at the z of the needle's axis."""
+    simulator, axis = Simulator(scenario, threads), scenario.entry.lateral(depth)
+    problem = _problem(scenario, (depth, axis.real, axis.imag), "steering")
+    least, greatest = reach(_rollout(simulator), problem)
+    return axis.real + least, axis.real + greatest
 
 
 def _search(
@@ -102,7 +106,7 @@ def _search(
     """The best primitives, or the best rolls where only the bevel is free."""
     plan, rollout = simulator.scenario.plan, _rollout(simulator)
     if _bevel_alone(problem):
-        share = 1 if problem.entry_coordinates else _SHARE_OF_A_SEARCH
+        share = 1 if problem.entry_coordinates or problem.narrow else _SHARE_OF_A_SEARCH
         search = _settings(plan, max(_LEAST_SAMPLES, plan.samples // share))
         return steer(rollout, problem, search, rng, progress)
     return optimise(rollout, problem, _settings(plan, plan.samples), rng, progress)
@@ -140,12 +144,13 @@ def _problem(scenario: Scenario, goal: Point, strategy: str) -> PlanProblem:
     axes = setup.axes
     free = strategy != "steering"
     guide = plan.guide_sigma_mm if free and setup.has_guide else 0.0
-    across = (plan.base_sigma_mm if free else 0.0, plan.base_turn_sigma if free else 0.0, guide)
+    sizes = (plan.base_sigma_mm if free else 0.0, plan.base_turn_sigma if free else 0.0, guide)
     axis = scenario.entry.lateral(goal[0])
     toward = complex(*goal[1:]) - axis
+    point, slope = scenario.entry.nearest(toward, goal[0], 0.0)
     turned = toward != 0.0 and setup.moved_guide_axes == 2 and not setup.half_turns
     aside = [1.0, _ASIDE if turned else 1.0][:axes]
-    lateral = np.outer(across, aside).ravel()
+    lateral = np.outer(sizes, aside).ravel()
     if setup.moved_guide_axes < axes:
         lateral[-1] = 0.0
     sigma = np.array([plan.advance_sigma_mm, *lateral, *aside, _SHARE_SIGMA])
@@ -167,6 +172,11 @@ def _problem(scenario: Scenario, goal: Point, strategy: str) -> PlanProblem:
         rotation=setup.max_rotation,
         frame=toward / abs(toward) if turned else 1.0,
         entry=(scenario.entry.free_radius_mm, 1e-3 * scenario.entry.free_slope_mrad),
+        slope=scenario.entry.slope,
+        steepest=1e-3 * STEEPEST_MRAD,
+        lateral_travel=setup.max_lateral,
+        home=scenario.entry.nearest(toward, goal[0], setup.max_lateral),
+        left=toward - point - slope * goal[0],
         axis=axis,
         mounts=(scenario.start_base_x, setup.guide_x or 0.0),
     )
@@ -175,11 +185,16 @@ def _problem(scenario: Scenario, goal: Point, strategy: str) -> PlanProblem:
 def _entering(scenario: Scenario, point: complex, slope: complex) -> Scenario:
     """The scenario with the entry fixed, changed by `point` (mm) and `slope` (rad)."""
     entry = scenario.entry
+
+    def steep(now: float, change: float) -> float:
+        """A slope (mrad) that the search keeps within its limit, up to rounding."""
+        return max(-STEEPEST_MRAD, min(STEEPEST_MRAD, now + 1e3 * change))
+
     values = {
         "lateral_mm": entry.lateral_mm + point.real,
         "lateral_z_mm": entry.lateral_z_mm + point.imag,
-        "slope_mrad": entry.slope_mrad + 1e3 * slope.real,
-        "slope_z_mrad": entry.slope_z_mrad + 1e3 * slope.imag,
+        "slope_mrad": steep(entry.slope_mrad, slope.real),
+        "slope_z_mrad": steep(entry.slope_z_mrad, slope.imag),
         "free_radius_mm": 0.0,
         "free_slope_mrad": 0.0,
     }
@@ -209,29 +224,73 @@ def _end_at_depth(simulator: Simulator, rows: Floats, roll: float, depth: float)
 def _binding_limit(simulator: Simulator, problem: PlanProblem, rows: Floats, states: list[State]) -> str:
     """Name the key of the limit that keeps the plan from its target; empty if it reaches it.
 
-    A target out of the bevel's reach is named even if the plan ends within 1 mm of it.
+    A target out of the bevel's reach is named even if the plan ends within 1 mm of it. `setup.max_rotation_deg` is
+    named where a driver without that limit would reach the target.
     """
     scenario, end = simulator.scenario, states[-1].tip
     setup, near = scenario.setup, math.dist(end[:3], problem.target) <= 1.0
-    guide = np.abs([state.travel[DG_Y:] for state in states]).max()
     if rows[:, DB_X].sum() > _AT_LIMIT * setup.stroke_mm and end[X] < problem.target[0] - 0.5:
         return f"setup.stroke_mm = {setup.stroke_mm:g}"
-    if _bevel_alone(problem):
-        least, greatest = reach(_rollout(simulator), problem)
-        if not least <= problem.lateral <= greatest:
-            why = f"the bevel alone reaches {least:.2f} to {greatest:.2f} mm lateral"
-            return f"needle.bevel.offset_mm = {scenario.needle.bevel.offset_mm:g} ({why})"
+    missed = not problem.narrow or math.dist(end[:3], problem.target) > _REACHED_MM
+    if _bevel_alone(problem) and missed and (beyond := _beyond_the_bevel(simulator, problem)):
+        return beyond
     if near:
         return ""
     if (
         setup.axes == 2
-        and setup.half_turns
-        and setup.moved_guide_axes < 2
         and abs(end[Z] - problem.target[2]) > 1.0
+        and (key := _not_along_z(simulator, problem))
     ):
-        return f"{setup.half_turns_by} (nothing steers along z)"
-    if guide > _AT_LIMIT * setup.max_guide_travel_mm:
-        return f"setup.max_guide_travel_mm = {setup.max_guide_travel_mm:g}"
-    if np.abs(rows[:, DG_Y : DG_Y + 2]).max() > _AT_LIMIT * setup.max_guide_step_mm:
-        return f"setup.max_guide_step_mm = {setup.max_guide_step_mm:g}"
+        return key
+    travel = np.abs([state.travel for state in states]).max(axis=0)
+    # The search bounds a step in the direction of its frame.
+    steps = {first: np.abs(across(rows, first)).max() for first in (DB_Y, DB_THETA, DG_Y)}
+    for name, largest in (
+        ("max_guide_travel_mm", travel[DG_Y:].max()),
+        ("max_base_travel_mm", travel[DB_Y:DB_THETA].max()),
+        ("max_guide_step_mm", steps[DG_Y]),
+        ("max_base_step_mm", steps[DB_Y]),
+        ("max_base_turn_step_mrad", 1e3 * steps[DB_THETA]),
+    ):
+        if largest > _AT_LIMIT * getattr(setup, name):
+            return f"setup.{name} = {getattr(setup, name):g}"
     return f"plan.accuracy_weight_per_mm = {scenario.plan.accuracy_weight_per_mm:g} (other costs outweigh the miss)"
+
+
+def _beyond_the_bevel(simulator: Simulator, problem: PlanProblem) -> str:
+    """Name the key that keeps the bevel alone from the target; empty if nothing does."""
+    scenario, rollout = simulator.scenario, _rollout(simulator)
+    least, greatest = reach(rollout, problem)
+    if least <= problem.lateral <= greatest:
+        return ""
+    from_axis = f" from the needle's axis, the target is at {problem.lateral:.2f} mm" if problem.axis else ""
+    why = f"the bevel alone reaches {least:.2f} to {greatest:.2f} mm lateral{from_axis}"
+    if problem.narrow:
+        size, most = radius(rollout, problem), scenario.setup.max_rotation_deg
+        if problem.lateral <= size:
+            there = f"{least:.2f} to {greatest:.2f} mm" if least <= greatest else "nothing"
+            line = f"on the line from the needle's axis to the target at {problem.lateral:.2f} mm"
+            return f"setup.max_rotation_deg = {most:g} ({line} the bevel alone reaches {there})"
+        why = f"the bevel alone reaches at most {size:.2f} mm lateral{from_axis}"
+    return f"needle.bevel.offset_mm = {scenario.needle.bevel.offset_mm:g} ({why})"
+
+
+def _not_along_z(simulator: Simulator, problem: PlanProblem) -> str:
+    """Name the key that keeps the needle from the target's z where neither guide nor base moves along z; empty if they
+    do, or if the bevel reaches it.
+    """
+    setup = simulator.scenario.setup
+    if problem.sigma[LATERAL + 1 : problem.bevel.start : 2].any():
+        return ""
+    if problem.half_turns:
+        if _bevel_alone(problem):
+            return f"{setup.half_turns_by} (nothing steers along z)"
+        return f"setup.guide_axes = 1 (nothing else steers along z with {setup.half_turns_by})"
+    size = radius(_rollout(simulator), problem)
+    most = size * math.sin(min(problem.rotation, 0.5 * math.pi))
+    if _bevel_alone(problem) or abs(problem.across.imag) <= most:
+        return ""
+    why = f"along z only the bevel steers, by up to {most:.2f} mm"
+    limited = problem.narrow and abs(problem.across.imag) <= size
+    key = f"max_rotation_deg = {setup.max_rotation_deg:g}" if limited else "guide_axes = 1"
+    return f"setup.{key} ({why})"

@@ -4,6 +4,10 @@ The end of the tip is a continuous function of the depth of a roll. A roll at th
 side, a roll at the target one without a roll; so by the intermediate value theorem one roll reaches every target
 between the ends of the two insertions without any, and no sequence of rolls is needed to find it. More rolls can only
 lower the cost.
+
+With less than half a turn to either side the bevel cannot face each direction and its opposite, so angles are searched
+as well. The ends of insertions with one angle lie on an arc, and what the bevel reaches is its convex hull. One roll
+still reaches all of it: each point of the hull lies on a chord between two angles ±b in the range.
 """
 
 import cmath
@@ -15,7 +19,16 @@ import numpy as np
 
 from flexneedle.planning.cross_entropy import Search
 from flexneedle.planning.horizon import Found, Variables, best
-from flexneedle.planning.insertion import PlanProblem, Solution, cost_terms, entry_bounds, mounted, solution
+from flexneedle.planning.insertion import (
+    PlanProblem,
+    Solution,
+    cost_terms,
+    entry_bounds,
+    entry_of,
+    mounted,
+    solution,
+    without_small_rolls,
+)
 from flexneedle.planning.terms import RolloutFunction, Term, Trajectories, past
 from flexneedle.simulator.control import controls
 from flexneedle.types import DB_THETA, DB_Y, ROLL, Floats, X, across
@@ -23,7 +36,8 @@ from flexneedle.types import DB_THETA, DB_Y, ROLL, Floats, X, across
 MOST_ROLLS = 4
 _INNER = 0.5  # of the reach
 _USUAL_SEARCHES = 5  # one roll and two, from either side, and the last
-_WIDE, _NARROW = 0.3, 0.02  # first standard deviations of a roll's depth, as a share of the target's
+_WIDE, _NARROW = 0.3, 0.02  # first standard deviations, as shares of the target's depth and of the bounds
+_ROUNDING = 1e-9  # of the reach
 
 OnIteration = Callable[[dict[str, Any]], None]
 
@@ -37,69 +51,85 @@ def steer(
 ) -> Solution:
     """Search the depths of 0 to 4 rolls with either side at the start, until one more roll does not lower the cost.
 
-    The best of all is searched once more with the travel that it needs to end at the target's depth: a bent needle
-    ends short of it. `rollout` starts with bevel +1 in air; `search` is that of each number of rolls and side.
+    Where the driver's range is less than a turn, the needle's angles before the first roll and after each one are
+    searched as well. The best of all is searched once more with the travel that it needs to end at the target's depth:
+    a bent needle ends short of it. `rollout` starts with bevel +1 in air; `search` is that of each number of rolls and
+    side.
     """
-    found: list[tuple[float, Found]] = []
+    found: list[tuple[float, int, Found]] = []
     charged = (*cost_terms(problem), *_margin(rollout, problem))
+    size = radius(rollout, problem) if problem.narrow else 0.0
     for rolls in range(MOST_ROLLS + 1):
-        before = min((one.cost for _, one in found), default=np.inf)
+        before = min((one.cost for *_, one in found), default=np.inf)
         for side in (1.0, -1.0):
-            alone = rolls == 0 and problem.entry_coordinates == 0  # all samples are one
+            alone = (
+                rolls == 0 and problem.entry_coordinates == 0 and not problem.narrow
+            )  # all samples are one
             count = search.elite if alone else search.samples
-            first = np.sort(rng.uniform(size=(count, rolls)), axis=1)
-            variables = _variables(problem, side, np.arange(1, rolls + 1) / (rolls + 1), _WIDE)
-            first = np.concatenate([first, _entries(problem, count, rng)], axis=1)
-            shown = _counted(progress, search, [one for _, one in found])
-            found.append(
-                (
-                    side,
-                    best(variables, rollout, charged, search, rng, first=first, progress=shown),
-                )
-            )
-        if rolls > 0 and min(one.cost for _, one in found) == before:
+            depths = np.sort(rng.uniform(size=(count, rolls)), axis=1)
+            entries = _entries(problem, count, rng)
+            angles = _angles(problem, size, side, rolls, entries)
+            even = np.arange(1, rolls + 1) / (rolls + 1)
+            variables = _variables(problem, side, rolls, np.concatenate([even, angles[0], entries[0]]), _WIDE)
+            if problem.narrow:
+                angles = _scattered(problem, angles, rng)
+            first = np.concatenate([depths, angles, entries], axis=1)
+            shown = _counted(progress, search, [one for *_, one in found])
+            one = best(variables, rollout, charged, search, rng, first=first, progress=shown)
+            found.append((side, rolls, one))
+        if rolls > 0 and min(one.cost for *_, one in found) == before:
             break
-    side, one = min(found, key=lambda pair: pair[1].cost)
+    side, rolls, one = min(found, key=lambda each: each[2].cost)
     short = max(0.0, problem.target[0] - float(one.trajectories.tips[0, -1, X]))
     longer = replace(problem, travel=min(problem.travel + short, float(problem.reach[0])))
-    shown = _counted(progress, search, [one for _, one in found])
-    rolls = one.z.size - problem.entry_coordinates
-    variables = _variables(longer, side, np.sort(one.z[:rolls]), _NARROW, one.z[rolls:])
+    shown = _counted(progress, search, [each for *_, each in found])
+    mean = np.append(np.sort(one.z[:rolls]), one.z[rolls:])
+    variables = _variables(longer, side, rolls, mean, _NARROW)
     return solution(longer, best(variables, rollout, charged, search, rng, progress=shown))
 
 
 def _margin(rollout: RolloutFunction, problem: PlanProblem) -> tuple[Term, ...]:
     """With a free entry, the distance (mm) of the target from the inner half of the bevel's reach, as a miss.
 
-    At the end of its reach the bevel could correct no error to one side.
+    At the end of its reach the bevel could correct no error to one side. Where the range is less than a turn, that is
+    the inner half of the largest disc in the reach.
     """
     if not problem.entry_coordinates:
         return ()
-    least, greatest = reach(rollout, problem)
-    half = _INNER * 0.5 * (greatest - least)
+    middle = 0.0
+    if problem.narrow:
+        size, least = radius(rollout, problem), np.cos(problem.rotation)
+        middle, half = 0.5 * size * (1.0 + least), _INNER * 0.5 * size * (1.0 - least)
+    else:
+        least, greatest = _ends(rollout, problem)
+        half = _INNER * 0.5 * (greatest - least)
 
     def beyond(trajectories: Trajectories) -> Floats:
         first, base = trajectories.controls[:, 0], problem.mounts[0]
         slope = across(first, DB_THETA)
         point = across(first, DB_Y) - slope * base
         off = complex(*problem.target[1:]) - problem.axis - point - slope * problem.target[0]
-        return np.maximum(np.abs(off) - half, 0.0)
+        outside: Floats = np.maximum(np.abs(off - middle) - half, 0.0)
+        return outside
 
     return (Term("margin", problem.accuracy_weight, beyond),)
 
 
-def _variables(
-    problem: PlanProblem, side: float, mean: Floats, sigma: float, entry: Floats | float = 0.0
-) -> Variables:
-    """The depths of the rolls, as shares of the target's, and the coordinates of the entry, of mean `entry`."""
-    ones, bounds = np.ones(mean.size), entry_bounds(problem)
-    return Variables(
-        np.append(0.0 * ones, -bounds),
-        np.append(ones, bounds),
-        np.append(mean, entry + 0.0 * bounds),
-        sigma * np.append(ones, bounds),
-        lambda z: mounted(problem, rolled(problem, z[:, : mean.size], side), z[:, mean.size :]),
-    )
+def _variables(problem: PlanProblem, side: float, rolls: int, mean: Floats, sigma: float) -> Variables:
+    """The depths of the rolls, as shares of the target's, the needle's angles (rad) before and after them where the
+    range is less than a turn, and the coordinates of the entry; together `mean`.
+    """
+    bounds, last = entry_bounds(problem), mean.size - problem.entry_coordinates
+    most = np.concatenate([np.ones(rolls), np.full(last - rolls, problem.rotation), bounds])
+    least = -most
+    least[:rolls] = 0.0
+
+    def controls_of(z: Floats) -> Floats:
+        depths, angles, entry = np.split(z, [rolls, last], axis=1)
+        rows = turned(problem, depths, angles) if problem.narrow else rolled(problem, depths, side)
+        return mounted(problem, rows, entry)
+
+    return Variables(least, most, mean, sigma * most, controls_of)
 
 
 def _entries(problem: PlanProblem, count: int, rng: np.random.Generator) -> Floats:
@@ -110,30 +140,97 @@ def _entries(problem: PlanProblem, count: int, rng: np.random.Generator) -> Floa
     return entries
 
 
+def _angles(problem: PlanProblem, size: float, side: float, rolls: int, entries: Floats) -> Floats:
+    """Angles (count, rolls + 1) between which an insertion reaches the target, in turn, for coordinates (count, e) of
+    the entry; none where the range is not less than a turn. size: that of the bevel's reach (mm).
+
+    They are ±b on the chord through the target, or through the place in the reach that is nearest to it.
+    """
+    if not problem.narrow:
+        return np.empty((len(entries), 0))
+    point, slope = entry_of(problem, entries)
+    off = (problem.across - point - slope * problem.target[0]) / max(size, np.finfo(float).tiny)
+    place = (off / np.maximum(np.abs(off), 1.0)).real
+    half = np.arccos(np.maximum(place, np.cos(problem.rotation)))
+    angles: Floats = np.minimum(half, problem.rotation)[:, None] * side * (-1.0) ** np.arange(rolls + 1)
+    return angles
+
+
+def _scattered(problem: PlanProblem, angles: Floats, rng: np.random.Generator) -> Floats:
+    """Angles (count, k) with deviations that grow from none in the first sample to `_WIDE` of the range."""
+    scale = _WIDE * problem.rotation * np.linspace(0.0, 1.0, len(angles))[:, None]
+    return angles + scale * rng.standard_normal(angles.shape)
+
+
 def rolled(problem: PlanProblem, z: Floats, side: float) -> Floats:
     """Controls (N, m, 9) of an insertion that starts with the bevel to `side` of the problem's direction and flips it
     at shares z (N, k) of the target's depth, in any order.
+    """
+    start, rolls = cmath.phase(side * problem.direction), np.full(z.shape, np.pi)
+    if np.isfinite(problem.rotation):  # to and fro between two angles in the range
+        there = cmath.phase(-side * problem.direction)
+        rolls = np.tile((there - start) * (-1.0) ** np.arange(z.shape[1]), (len(z), 1))
+    return _insertion(problem, z, np.full(len(z), start), rolls)
+
+
+def turned(problem: PlanProblem, z: Floats, angles: Floats) -> Floats:
+    """Controls (N, m, 9) of an insertion at the first of angles (N, k + 1), rad, that rolls to the next one at each of
+    the shares z (N, k) of the target's depth, in any order.
+    """
+    kept = without_small_rolls(angles)
+    return _insertion(problem, z, kept[:, 0], np.diff(kept, axis=1))
+
+
+def _insertion(problem: PlanProblem, z: Floats, start: Floats, rolls: Floats) -> Floats:
+    """Controls (N, m, 9) that begin with the angles `start` (N,) and roll by `rolls` (N, k), rad, in this order at
+    shares z (N, k) of the target's depth, in any order.
 
     Its steps are even except where a roll divides one: so no roll changes the other steps, whose length has an effect
     near the skin, and the end of the tip is continuous in z.
     """
-    n = len(z)
+    n, z = len(z), np.sort(z, axis=1)
     even = np.linspace(0.0, problem.travel, int(np.ceil(problem.travel / problem.step[0] - 1e-9)) + 1)
-    rolls = problem.air + z * problem.target[0]
-    starts = np.concatenate([np.tile(even[:-1], (n, 1)), rolls], axis=1)
+    starts = np.concatenate([np.tile(even[:-1], (n, 1)), problem.air + z * problem.target[0]], axis=1)
     order = np.argsort(starts, axis=1, kind="stable")
     edges = np.take_along_axis(starts, order, axis=1)
     rows = controls(n, edges.shape[1], db_x=np.diff(edges, axis=1, append=problem.travel))
-    rows[:, :, ROLL] = np.where(order < even.size - 1, 0.0, np.pi)
-    rows[:, 0, ROLL] = cmath.phase(side * problem.direction)
+    made = np.concatenate([np.zeros((n, even.size - 1)), rolls], axis=1)
+    rows[:, :, ROLL] = np.take_along_axis(made, order, axis=1)
+    rows[:, 0, ROLL] = start
     return rows
 
 
 def reach(rollout: RolloutFunction, problem: PlanProblem) -> tuple[float, float]:
-    """Least and greatest lateral position (mm) at the target's depth that the bevel alone can reach.
+    """Least and greatest distance (mm) of the tip from the needle's axis, at the target's depth and in the problem's
+    direction, that the bevel alone can reach.
 
-    In the problem's direction.
+    Where the range is less than a turn: on the line from the axis to the target, the part in the hull of the arc of
+    ends; the least is infinite and the greatest −infinite if the line passes by the hull.
     """
+    if not problem.narrow:
+        axis = (problem.axis * problem.direction.conjugate()).real
+        least, greatest = _ends(rollout, problem)
+        return least - axis, greatest - axis
+    size, cosine = radius(rollout, problem), problem.direction.real
+    chord = size * (float(np.cos(problem.rotation)) - _ROUNDING)
+    if cosine == 0.0:
+        return (-size, size) if chord <= 0.0 else (np.inf, -np.inf)
+    least = max(-size, chord / cosine) if cosine > 0.0 else -size
+    greatest = size if cosine > 0.0 else min(size, chord / cosine)
+    return (least, greatest) if least <= greatest else (np.inf, -np.inf)
+
+
+def radius(rollout: RolloutFunction, problem: PlanProblem) -> float:
+    """Distance (mm) from the needle's axis at the target's depth where an insertion without rolls ends: tissue has no
+    preferred direction, so it is the same for each angle of the bevel.
+    """
+    ahead = (problem.target[0], problem.axis.real, problem.axis.imag)
+    end = past(rollout(turned(problem, np.empty((1, 0)), np.zeros((1, 1)))), ahead)
+    return float(abs(end[0]))
+
+
+def _ends(rollout: RolloutFunction, problem: PlanProblem) -> tuple[float, float]:
+    """Least and greatest position (mm) in the problem's direction where the two insertions without rolls end."""
     ahead = (problem.target[0], 0.0, 0.0)
     ends = [past(rollout(rolled(problem, np.empty((1, 0)), side)), ahead)[0] for side in (-1.0, 1.0)]
     along = [float((end * problem.direction.conjugate()).real) for end in ends]

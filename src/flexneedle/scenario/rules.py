@@ -13,6 +13,7 @@ from flexneedle.scenario.tissue.layer import Contact, Layer
 _MOST_GRID_POINTS = 20_000
 _MOST_READINGS_A_STEP = 10_000
 _FRAMES_IN_A_WINDOW = 2
+_ROUNDING_MM = 1e-9  # of an entry that a plan has chosen
 
 
 def geometry_problems(needle: Needle, setup: Setup) -> Iterator[Problem]:
@@ -71,20 +72,27 @@ def target_problems(setup: Setup, entry: Entry, target: Target) -> Iterator[Prob
             f"beyond the stroke: must be at most {setup.max_depth:g} (setup.stroke_mm - setup.tip_to_skin_mm)"
         )
         yield Problem("target.depth_mm", depth, rule)
-    mover = "guide" if setup.has_guide else "base"
-    most = setup.max_lateral + entry.free_radius_mm + 1e-3 * entry.free_slope_mrad * depth
-    middle = entry.lateral(depth)
-    for key, value, axis in (
-        ("target.lateral_mm", lateral, middle.real),
-        ("target.lateral_z_mm", target.lateral_z_mm, middle.imag),
+    mover, most = "guide" if setup.has_guide else "base", setup.max_lateral
+    middle, inside = entry.lateral(depth), True
+    for key, value, axis, unit in (
+        ("target.lateral_mm", lateral, middle.real, 1.0),
+        ("target.lateral_z_mm", target.lateral_z_mm, middle.imag, 1.0j),
     ):
-        if not abs(value - axis) <= most:
-            rule = f"must be at most {most:g} in size, the lateral travel of the {mover}"
+        steeper = [abs(entry.steepening(way * unit)) for way in (-1.0, 1.0)]
+        free = [entry.free_radius_mm + slope * depth for slope in steeper]
+        least, greatest = axis - most - free[0], axis + most + free[1]
+        if not least - _ROUNDING_MM <= value <= greatest + _ROUNDING_MM:
+            inside, rule = False, f"must be at most {most:g} in size, the lateral travel of the {mover}"
             if entry.free or middle != 0.0:
-                rule = (
-                    f"must be from {axis - most:g} to {axis + most:g}, in reach of the {mover} from the entry"
-                )
+                rule = f"must be from {least:g} to {greatest:g}, in reach of the {mover} from the entry"
             yield Problem(key, value, rule)
+    if entry.free and inside and depth > 0.0:
+        off = complex(lateral, target.lateral_z_mm) - middle
+        point, slope = entry.nearest(off, depth, most)
+        left = off - point - slope * depth
+        if max(abs(left.real), abs(left.imag)) > most + 1e-6:
+            rule = f"no free entry brings it and target.lateral_z_mm both within {most:g} mm, in reach of the {mover}"
+            yield Problem("target.lateral_mm", lateral, rule)
     if setup.axes == 1 and target.lateral_z_mm != 0.0:
         yield Problem("target.lateral_z_mm", target.lateral_z_mm, "must be 0 with setup.axes = 1")
 

@@ -1,6 +1,6 @@
 """The setup that holds and moves the needle, and the tracker that measures it."""
 
-from math import inf, radians, sqrt
+from math import copysign, inf, radians, sqrt
 from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
@@ -19,7 +19,9 @@ def _moves(value: object) -> object:
 GuideTravel = Annotated[Positive, BeforeValidator(_moves)]
 
 
-_STEEPEST_MRAD = 200.0  # small slopes
+STEEPEST_MRAD = 200.0
+"""Largest slope of the needle's axis on each lateral axis: slopes are small."""
+_ROUNDS = 50  # of alternating projections
 
 
 class Setup(Section):
@@ -120,13 +122,13 @@ class Entry(Section):
     """y of the point where the needle's axis meets the skin."""
     lateral_z_mm: float = 0.0
     """z of that point."""
-    slope_mrad: float = Field(default=0.0, ge=-_STEEPEST_MRAD, le=_STEEPEST_MRAD)
+    slope_mrad: float = Field(default=0.0, ge=-STEEPEST_MRAD, le=STEEPEST_MRAD)
     """Slope dy/dx of the axis."""
-    slope_z_mrad: float = Field(default=0.0, ge=-_STEEPEST_MRAD, le=_STEEPEST_MRAD)
+    slope_z_mrad: float = Field(default=0.0, ge=-STEEPEST_MRAD, le=STEEPEST_MRAD)
     """Slope dz/dx of the axis."""
     free_radius_mm: NonNegative = 0.0
     """The planner may choose another point on the skin, at most this distance from it. 0: fixed."""
-    free_slope_mrad: float = Field(default=0.0, ge=0.0, le=_STEEPEST_MRAD)
+    free_slope_mrad: float = Field(default=0.0, ge=0.0, le=STEEPEST_MRAD)
     """The planner may change the slope by at most this. 0: fixed."""
 
     @property
@@ -142,6 +144,45 @@ class Entry(Section):
     def lateral(self, x: float) -> complex:
         """y + iz of the axis at x, mm."""
         return complex(self.lateral_mm, self.lateral_z_mm) + self.slope * x
+
+    def steepening(self, change: complex) -> complex:
+        """The nearest change (rad) to this one that is free and keeps the slope on each axis within its limit."""
+        most = 1e-3 * self.free_slope_mrad
+        free = _within(change, most)
+        y, z = self._kept(free)
+        if y != free.real:  # leaves more of the disc to z
+            z = copysign(min(abs(change.imag), sqrt(most**2 - y**2)), change.imag)
+        elif z != free.imag:
+            y = copysign(min(abs(change.real), sqrt(most**2 - z**2)), change.real)
+        return complex(*self._kept(complex(y, z)))
+
+    def _kept(self, change: complex) -> tuple[float, float]:
+        """A change of the slope with each coordinate clipped so that the slope's keeps its limit."""
+        steepest, now = 1e-3 * STEEPEST_MRAD, self.slope
+        y = max(-steepest - now.real, min(steepest - now.real, change.real))
+        return y, max(-steepest - now.imag, min(steepest - now.imag, change.imag))
+
+    def nearest(self, off: complex, depth: float, most: float) -> tuple[complex, complex]:
+        """Changes of the point (mm) and the slope (rad), within what is free, after which a target at a depth (mm) is
+        at most `most` (mm) from the axis on each lateral axis, or as near to that as can be.
+
+        off: y + iz from the present axis to the target (mm).
+        """
+        point = slope = 0j
+        for _ in range(_ROUNDS):
+            point = _within(_beyond(off - slope * depth, most), self.free_radius_mm)
+            slope = self.steepening(_beyond(off - point, most) / depth)
+        return point, slope
+
+
+def _within(vector: complex, size: float) -> complex:
+    return vector if abs(vector) <= size else vector * (size / abs(vector))
+
+
+def _beyond(off: complex, most: float) -> complex:
+    """The part of each coordinate beyond ±most."""
+    parts = ((part, max(0.0, abs(part) - most)) for part in (off.real, off.imag))
+    return complex(*(copysign(size, part) for part, size in parts))
 
 
 class TrackerSettings(Section):
