@@ -375,7 +375,7 @@ def test_the_shipped_studies_load():
         "tracker": 5 * 150,
         "worlds": 2202,
         "space": 3 * 4 * 300,
-        "worlds-space": 2936,
+        "worlds-space": 5740,
     }
 
 

@@ -85,8 +85,8 @@ def test_a_stroke_that_ends_before_the_target_is_out_of_reach():
 
 @pytest.mark.long
 def test_with_a_guide_the_reach_is_the_miss_of_a_long_search():
-    """Almost zero with the full travel of the guide, larger with a limited one."""
-    assert reach(GUIDED, 0, "model") < 0.01
+    """At most what ends the search with the full travel of the guide, larger with a limited one."""
+    assert reach(GUIDED, 0, "model") < 0.05
     tight = {"setup.max_guide_travel_mm": 0.2, "needle.bevel.offset_mm": 0.0, "target.lateral_mm": 0.2}
     bound = GUIDED.with_values({**tight, "setup.max_guide_step_mm": 1e-3})
     assert 0.05 < reach(bound, 0, "model") < 0.2
