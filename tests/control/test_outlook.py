@@ -58,7 +58,7 @@ def test_it_is_that_of_a_monte_carlo_of_a_linear_problem(now, variance):
     estimated = readings @ gain.T
     end = curves[:, GRID == TARGET].ravel()
     miss = (truth - estimated) @ end + rng.normal(0.0, floor(estimate), n)
-    assert outlook.sd(estimate, TARGET, 0.0) == pytest.approx(miss.std(), rel=0.03)
+    assert outlook.sd_to_come(estimate, TARGET) == pytest.approx(miss.std(), rel=0.03)
 
 
 def test_past_the_last_correction_nothing_is_learned():
@@ -67,7 +67,7 @@ def test_past_the_last_correction_nothing_is_learned():
     outlook, estimate = linear(precision, curves, now=TARGET - ol.UNCORRECTED)
     end = curves[:, GRID == TARGET].ravel()
     expected = np.sqrt(end @ np.linalg.inv(precision) @ end + floor(estimate) ** 2)
-    assert outlook.sd(estimate, TARGET, 0.0) == pytest.approx(expected)
+    assert outlook.sd_to_come(estimate, TARGET) == pytest.approx(expected)
 
 
 @given(
@@ -80,7 +80,7 @@ def test_it_is_never_below_what_is_unexplained_and_grows_with_a_miss_that_stays(
     _, curves = two_parameters()
     outlook, estimate = linear(np.diag(np.array(sds) ** -2.0), curves, now, variance)
     least, sd = outlook.sd(estimate, TARGET, 0.0), outlook.sd(estimate, TARGET, miss)
-    assert floor(estimate) <= least <= sd
+    assert 0.7 * floor(estimate) <= least == 0.7 * outlook.sd_to_come(estimate, TARGET) <= sd
     end = curves[:, GRID == TARGET].ravel()
     uncertain = np.sqrt(end**2 @ np.array(sds) ** 2)
     grown = np.sqrt(max(sd**2 - least**2, 0.0))
@@ -93,7 +93,7 @@ def test_the_nearer_the_target_the_less_will_be_learned():
     sds = []
     for now in (-20.0, 0.0, 15.0, 30.0, 35.0):
         outlook, estimate = linear(precision, curves, now, variance=0.02)
-        sds.append(np.sqrt(outlook.sd(estimate, TARGET, 0.0) ** 2 - floor(estimate) ** 2))
+        sds.append(np.sqrt(outlook.sd_to_come(estimate, TARGET) ** 2 - floor(estimate) ** 2))
     assert (np.diff(sds) >= 0.0).all()
     assert sds[-1] > 2.0 * sds[0]
 

@@ -4,11 +4,15 @@ The estimate's parameters are normal, with the posterior covariance P. Readings 
 and the path is corrected by them, until the tip is so near the target that a correction takes no effect. With c, the
 derivative of the tip's lateral position at the target with respect to the parameters, the variance of the miss is
 
-    c P' c + σ² + (κ l)² + min(m², c P c)
+    f² (c P' c + σ² + (κ l)²) + min(m², c P c)
 
 σ is the model error of a reading, κ l that of the remaining path of length l. The last term is for a miss m that
 is predicted although the search minimises it: at the limits of the needle, errors that later
 readings reveal cannot be corrected either.
+
+Tissue is rarely as far from the prior as this allows for, and the fit takes the errors of its model for noise of the
+readings. So the normal distribution is too wide about the tip and too narrow along the needle. The factors f, and f_s on
+the deviations of the shape, make intervals for 95 % contain about 95 % of the ends of insertions in training worlds.
 """
 
 from dataclasses import dataclass, replace
@@ -22,6 +26,8 @@ UNCORRECTED = 5.0
 """Control steps before the target in which a correction takes no effect."""
 _UNEXPLAINED = 1.0  # standard deviations of the mean of a control step's readings
 _DRIFT = 0.0008  # mm per mm of path
+_MISS_FACTOR = 0.7  # f
+_SHAPE_FACTOR = 1.4  # f_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +75,11 @@ class Outlook:
 
     def sd(self, estimate: Identified, target: float, miss: complex) -> float:
         """Standard deviation (mm), on an axis, of the miss at the depth `target` (mm), if `miss` (mm) is predicted."""
+        stays = min(abs(miss) ** 2 / estimate.axes, self.sd_now(estimate, target) ** 2)
+        return float(np.sqrt((_MISS_FACTOR * self.sd_to_come(estimate, target)) ** 2 + stays))
+
+    def sd_to_come(self, estimate: Identified, target: float) -> float:
+        """Standard deviation (mm), on an axis, of a miss that is corrected as long as it can be, of the linear model."""
         step = estimate.nominal.scenario.setup.max_advance_mm
         end, axes = np.array([np.interp(target, self.grid, curve) for curve in self.curves]), estimate.axes
         to_come = (self.grid > estimate.state.tip[X]) & (self.grid <= target - UNCORRECTED * step)
@@ -77,7 +88,7 @@ class Outlook:
         known = (end.conj() @ np.linalg.solve(then, end)).real / axes
         known += _UNEXPLAINED**2 * estimate.reading_variance
         known += (_DRIFT * (target - float(estimate.state.tip[X]))) ** 2
-        return float(np.sqrt(float(known) + min(abs(miss) ** 2 / axes, self.sd_now(estimate, target) ** 2)))
+        return float(np.sqrt(known))
 
     def shape_sd(self, estimate: Identified, target: float, lever: Laterals, miss_sd: float) -> Floats:
         """Standard deviations (n, 2) of y and z of the nodes at the target (mm).
@@ -88,7 +99,7 @@ class Outlook:
         end = np.array([np.interp(target, self.grid, curve) for curve in self.curves])
         left = self.bent - np.outer(end, lever)
         parts = np.stack([left.real, left.imag])
-        variance = np.einsum("akn,kl,aln->na", parts, estimate.covariance, parts)
+        variance = _SHAPE_FACTOR**2 * np.einsum("akn,kl,aln->na", parts, estimate.covariance, parts)
         sd: Floats = np.sqrt(variance + np.abs(lever[:, None]) ** 2 * miss_sd**2)
         return sd
 

@@ -85,7 +85,7 @@ class Memory:
     path: as decided; rolled: the same after the roll of the command; roll: the needle's angle (rad) before the command.
     The next estimate shows which of the two is current: a needle that is held or rests does not roll.
     scale: energy (mJ) of the tissue down to the target displaced by 1 mm; rests: number of rests already made;
-    blur: standard deviation (mm) of a predicted miss of 0.
+    blur: standard deviation (mm) of a miss that is corrected as long as it can be.
     """
 
     path: GuidePath
@@ -131,7 +131,7 @@ def decide(
         memory.scale,
         outlook,
         rests,
-        outlook.sd(fitted, task.plan.target[0], 0.0),
+        outlook.sd_to_come(fitted, task.plan.target[0]),
     )
     return Decision(command, why, found.cost, spread, miss, sd, rest, predicted), after
 
