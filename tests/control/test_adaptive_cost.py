@@ -97,9 +97,11 @@ def test_near_the_target_what_is_above_its_standard_deviation_is_urgent_and_what
     np.testing.assert_allclose(share / full, [0.0011, 0.5, 1.0], rtol=0.01)
 
 
-def test_the_blur_is_the_standard_deviation_that_was_predicted_without_a_miss(quick_plan, along):
-    decision, memory = decided(quick_plan, estimate_of(along(quick_plan, 40), QUICK))
-    assert 0.0 < memory.blur <= decision.miss_sd
+def test_the_blur_is_the_standard_deviation_of_the_linear_model_without_a_miss(quick_plan, along):
+    estimate = estimate_of(along(quick_plan, 40), QUICK)
+    decision, memory = decided(quick_plan, estimate)
+    assert memory.blur == memory.outlook.sd_to_come(estimate, quick_plan.target[0])
+    assert 0.0 < 0.7 * memory.blur <= decision.miss_sd
 
 
 @given(st.floats(-3.0, 3.0), st.floats(0.01, 2.0))

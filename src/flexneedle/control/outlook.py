@@ -11,8 +11,8 @@ is predicted although the search minimises it: at the limits of the needle, erro
 readings reveal cannot be corrected either.
 
 Tissue is rarely as far from the prior as this allows for, and the fit takes the errors of its model for noise of the
-readings. So the normal distribution is too wide about the tip and too narrow along the needle. The factors f, and f_s on
-the deviations of the shape, make intervals for 95 % contain about 95 % of the ends of insertions in training worlds.
+readings. So the normal distribution is too wide about the tip and too narrow along the needle. The factors f, and f_s
+on the deviations of the shape, make intervals for 95 % contain about 95 % of the ends of insertions in training worlds.
 """
 
 from dataclasses import dataclass, replace
@@ -79,7 +79,7 @@ class Outlook:
         return float(np.sqrt((_MISS_FACTOR * self.sd_to_come(estimate, target)) ** 2 + stays))
 
     def sd_to_come(self, estimate: Identified, target: float) -> float:
-        """Standard deviation (mm), on an axis, of a miss that is corrected as long as it can be, of the linear model."""
+        """Standard deviation (mm), on an axis, of a miss that is corrected while it can be, by the linear model."""
         step = estimate.nominal.scenario.setup.max_advance_mm
         end, axes = np.array([np.interp(target, self.grid, curve) for curve in self.curves]), estimate.axes
         to_come = (self.grid > estimate.state.tip[X]) & (self.grid <= target - UNCORRECTED * step)
