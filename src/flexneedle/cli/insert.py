@@ -211,6 +211,8 @@ def _report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Pat
         result, timing = insertion_result(insertion), insertion_timing(insertion)
         print_json({**result, "run_dir": str(folder), "timing": timing})
     else:
+        if not insertion.plan.reached:
+            print(f"flexneedle: warning: the plan {insertion.plan.summary}", file=sys.stderr)
         _table(scenario, insertion, folder)
     return 0 if insertion.reached else 1
 
