@@ -43,7 +43,9 @@ from flexneedle.types import Floats, Insertion, Shape, X, Y, Z
 _HEIGHT = 3.9  # inches
 _LINE = 100  # characters of a line of the verdict
 _LEADING = 0.2  # inches between lines of the verdict
-_ROOM = np.array([[0.03, 0.22], [0.99, 0.86]])  # the part of the figure that the box fills below one line of verdict
+_ROOM = np.array(
+    [[0.03, 0.22], [0.99, 0.86]]
+)  # the part of the figure that the box fills below one line of verdict
 _VIEW: Any = {"elev": 20.0, "azim": -72.0}
 _BEHIND, _BEYOND, _AROUND = 6.0, 4.0, 4.0  # mm behind the guide, beyond the target, around all that is drawn
 _ARROW = 5.0  # mm
