@@ -8,8 +8,8 @@ from commands import names, run
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
 PLAN_KEYS = [
-    *("tip_mm", "error_mm", "reached", "cost", "terms", "flips", "strain_energy_mj", "iterations"),
-    *("converged", "seed", "timing"),
+    *("tip_mm", "error_mm", "reached", "entry", "cost", "terms", "flips", "strain_energy_mj"),
+    *("iterations", "converged", "seed", "timing"),
 ]
 
 

@@ -274,6 +274,17 @@ def test_an_invalid_argument_prints_no_object(capsys):
     assert (status, out) == (2, "")
 
 
+def test_what_limits_a_plan_that_misses_is_named(engine, capsys):
+    """The default controller inserts nevertheless."""
+    engine(plan_miss=2.5)
+    status, _, err = run(capsys, "insert", "--out", "missed")
+    assert status == 1
+    assert "flexneedle: warning: the plan MISSES the target: best distance 2.510 mm" in err
+    assert "limited by setup.max_guide_travel_mm = 15" in err
+    engine()
+    assert "warning" not in run(capsys, "insert", "--out", "reached")[2]
+
+
 def test_force_inserts_despite_a_planned_miss(engine, capsys):
     engine(plan_miss=2.5)
     status, out, _ = run(capsys, "insert", "--json", "--force", "--controller", "open-loop")

@@ -95,6 +95,16 @@ def test_titles_are_those_of_the_insertion_and_the_legend_names_what_is_drawn(fi
     ]
 
 
+def held():
+    """With the longest reason that the default controller gives."""
+    reason = (
+        "no path to the target found: predicted miss -12.96 ± 10.59 mm is beyond control.miss_limit_mm = 2 with a "
+        "probability of 0.958 (limit 0.95); use --force to insert anyway"
+    )
+    made = in_space(make_insertion(make_plan(target=(45.0, 3.0)), outcome="held"), -2.0)
+    return replace(made, reason=reason)
+
+
 def without_truth():
     made = in_space(make_insertion(), ANGLE)
     return replace(made, periods=tuple(replace(blind(p), predicted=None) for p in made.periods))
@@ -105,6 +115,7 @@ CASES = {
     "downwards": lambda: (SPACE, in_space(make_insertion(miss=1.4), -2.5)),
     "deep": lambda: (SPACE, in_space(make_insertion(make_plan(target=(80.0, 12.0))), 2.0)),
     "shallow": lambda: (NO_GUIDE, in_space(make_insertion(make_plan(target=(20.0, -12.0))), 1.0)),
+    "held": lambda: (NO_GUIDE, held()),
     "no truth": lambda: (SPACE, without_truth()),
     "after one period": lambda: (SPACE, in_space(make_insertion(periods=1, outcome="interrupted"), ANGLE)),
 }

@@ -172,6 +172,15 @@ def test_a_guide_of_one_axis_has_one_line_and_a_needle_without_a_guide_shows_its
     np.testing.assert_array_equal(base.get_ydata(), [period.base.z for period in insertion.periods])
 
 
+def test_the_planned_base_is_where_the_needle_is_mounted(insertion):
+    """Off the x axis where the needle enters elsewhere, as the applied one is."""
+    entered = replace(insertion.plan, shapes=insertion.plan.shapes + np.array([0.0, -1.5, 2.5, 0.0, 0.0]))
+    figure = insertion_figure(NO_GUIDE, replace(insertion, plan=entered))
+    for axis, name in ((1, "planned y"), (2, "planned z")):
+        (planned,) = lines(*axes(figure, "motion"), name)
+        np.testing.assert_allclose(planned.get_ydata(), entered.shapes[:, 0, axis])
+
+
 def test_the_guide_is_a_ring_where_it_ended(figure, insertion):
     (ax,) = axes(figure, "along")
     (ring,) = (patch for patch in ax.patches if isinstance(patch, Annulus))

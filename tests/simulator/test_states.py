@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexneedle import Control, Simulator, controls, load_scenario
-from flexneedle.errors import CommandError, StateError
+from flexneedle.errors import CommandError, InputError, StateError
 from reference.cases import insert_to, numbers, repeat, with_number
 
 PHANTOM = load_scenario("phantom")
@@ -252,6 +252,58 @@ def test_guide_that_is_not_there_cannot_move():
     with pytest.raises(CommandError) as caught:
         simulator.step(simulator.start(), Control(dg_y=0.1))
     assert (caught.value.name, caught.value.limit) == ("dg_y", 0.0)
+
+
+NO_GUIDE = "must be 0 without a guide (setup.guide_to_skin_mm)"
+
+
+@pytest.mark.parametrize(
+    ("preset", "changes", "control", "message"),
+    [
+        ("phantom", {}, {"dg_z": 0.1}, "dg_z = 0.1: must be 0 with setup.axes = 1"),
+        ("phantom", {}, {"db_z": -0.1}, "db_z = -0.1: must be 0 with setup.axes = 1"),
+        ("phantom", {}, {"db_psi": 0.001}, "db_psi = 0.001: must be 0 with setup.axes = 1"),
+        (
+            "phantom3d",
+            {"setup.guide_axes": 1},
+            {"dg_z": 0.1},
+            "dg_z = 0.1: must be 0 with setup.guide_axes = 1",
+        ),
+        ("phantom3d", {"setup.guide_to_skin_mm": None}, {"dg_z": 0.1}, f"dg_z = 0.1: {NO_GUIDE}"),
+        ("phantom3d", {"setup.guide_to_skin_mm": None}, {"dg_y": 0.1}, f"dg_y = 0.1: {NO_GUIDE}"),
+        (
+            "phantom3d",
+            {"setup.max_rotation_deg": 60.0},
+            {"roll": 1.0, "spin": 0.2},
+            "roll = 1.2: angle of the needle must be at most 1.0472 rad to either side (setup.max_rotation_deg = 60)",
+        ),
+    ],
+)
+def test_what_the_rig_cannot_do_is_refused_with_the_key(preset, changes, control, message):
+    simulator = Simulator(load_scenario(preset).with_values(changes))
+    with pytest.raises(CommandError) as caught:
+        simulator.step(simulator.start(), Control(**control))
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("shape", "columns", "message"),
+    [
+        (((4, 30),), {}, "size = (4, 30): must be a whole number, at least 0; give the sizes one by one"),
+        ((-3,), {}, "size = -3: must be a whole number, at least 0"),
+        (
+            (4, 30),
+            {"dg_z": [0.1, 0.2]},
+            "dg_z = [0.1, 0.2]: must be numbers that broadcast to the shape (4, 30)",
+        ),
+        ((3,), {"roll": "a"}, "roll = 'a': must be numbers that broadcast to the shape (3,)"),
+        ((3,), {"dgz": 0.1}, "column = 'dgz': must be one of db_x, "),
+    ],
+)
+def test_controls_that_cannot_be_made_are_one_clear_line(shape, columns, message):
+    with pytest.raises(InputError) as caught:
+        controls(*shape, **columns)
+    assert str(caught.value).startswith(message)
 
 
 @pytest.mark.parametrize("shape", [(9,), (3, 9), (2, 3, 5), (1, 2, 3, 9)])

@@ -19,7 +19,7 @@ ADVICE: dict[str, Any] = tomllib.loads((HERE / "advice.toml").read_text(encoding
 _UNITS = {
     "_mn_per_mm": "mN/mm", "_mrad_per_mm": "mrad/mm", "_mm_s": "mm/s", "_per_mm": "1/mm", "_per_mj": "1/mJ",
     "_per_m": "1/m", "_kpa": "kPa", "_gpa": "GPa", "_mrad": "mrad", "_hz": "Hz", "_mm": "mm", "_s": "s",
-    "_periods": "periods", "_mn": "mN",
+    "_periods": "periods", "_mn": "mN", "_deg": "°",
 }  # fmt: skip
 _WITHOUT_ENDING = {"plan.deflection_weight": "1/mm²", "plan.guide_weight": "1/mm²"}
 _LARGEST = 1e6

@@ -13,6 +13,7 @@ from flexneedle.console.common import (
     add_run_arguments,
     chosen_scenario,
     compile_first,
+    entry_rows,
     print_json,
     print_table,
     run_name,
@@ -210,6 +211,8 @@ def _report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Pat
         result, timing = insertion_result(insertion), insertion_timing(insertion)
         print_json({**result, "run_dir": str(folder), "timing": timing})
     else:
+        if not insertion.plan.reached:
+            print(f"flexneedle: warning: the plan {insertion.plan.summary}", file=sys.stderr)
         _table(scenario, insertion, folder)
     return 0 if insertion.reached else 1
 
@@ -222,6 +225,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         ("controller", insertion.controller),
         ("phantom", insertion.phantom),
         target_row(scenario, insertion.target),
+        *entry_rows(scenario, insertion.plan),
         ("true tip to target", _number(result["true_error_mm"], "mm")),
         ("  measured", _number(result["residual_mm"], "mm")),
         ("  planned", _number(result["planned_error_mm"], "mm")),

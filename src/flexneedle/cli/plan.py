@@ -10,6 +10,7 @@ from flexneedle.console.common import (
     add_run_arguments,
     chosen_scenario,
     compile_first,
+    entry_rows,
     print_json,
     print_table,
     run_name,
@@ -84,7 +85,7 @@ def _report(scenario: Scenario, plans: dict[str, Plan], as_json: bool, folder: P
 def _rows(scenario: Scenario, plan: Plan) -> dict[str, str]:
     angles = ", ".join(f"{degrees(angle):+.2f}°" for angle in plan.entry_angles[: scenario.setup.axes])
     return {
-        **dict([target_row(scenario, plan.target)]),
+        **dict([target_row(scenario, plan.target), *entry_rows(scenario, plan)]),
         "planned tip to target": f"{plan.error_mm:.3f} mm",
         f"entry angle{'s' if scenario.setup.axes > 1 else ''}": "none" if isnan(plan.entry_angle) else angles,
         scenario.setup.turns: str(plan.flips),

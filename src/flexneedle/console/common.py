@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from flexneedle.control.interface import Method
     from flexneedle.scenario.model import Scenario
+    from flexneedle.types import Plan
 
 
 class HelpFormatter(argparse.HelpFormatter):
@@ -100,6 +101,21 @@ def target_row(scenario: Scenario, target: Sequence[float]) -> tuple[str, str]:
     """Return the row of a table for a target x, y, z (mm), without z in the plane."""
     shown = ", ".join(f"{value:g}" for value in target[: 1 + scenario.setup.axes])
     return f"target (depth, lateral offset{'s' if scenario.setup.axes > 1 else ''})", f"{shown} mm"
+
+
+def entry_rows(scenario: Scenario, plan: Plan) -> list[tuple[str, str]]:
+    """Return the rows of a table for the entry that a plan has chosen; none where the scenario fixes it."""
+    if plan.scenario is None or not scenario.entry.free:
+        return []
+    entry, axes = plan.scenario.entry, scenario.setup.axes
+    point, slope = (
+        (entry.lateral_mm, entry.lateral_z_mm)[:axes],
+        (entry.slope_mrad, entry.slope_z_mrad)[:axes],
+    )
+    return [
+        ("chosen entry, lateral", f"{', '.join(f'{value:.2f}' for value in point)} mm"),
+        ("  slope of the axis", f"{', '.join(f'{value:.1f}' for value in slope)} mrad"),
+    ]
 
 
 def compile_first() -> None:

@@ -13,7 +13,6 @@ from statistics import median
 import numpy as np
 
 from flexneedle.types import (
-    DB_Y,
     ROLL,
     SPIN,
     Action,
@@ -132,10 +131,7 @@ def lateral_error(plan: Plan, points: Floats, axis: int = Y) -> Floats:
 
 def planned_motion(plan: Plan, guided: bool, axis: int = Y) -> Floats:
     """Return y or z (k,), mm, of the guide at each tip position, or of the base if there is no guide."""
-    lateral = axis - Y
-    if guided:
-        return plan.guide[:, lateral]
-    return np.cumsum([0.0, *plan.controls[:, DB_Y + lateral]])
+    return plan.guide[:, axis - Y] if guided else plan.shapes[:, 0, axis]
 
 
 def applied_motion(insertion: Insertion, guided: bool, axis: int = Y) -> Floats:

@@ -5,7 +5,7 @@ Points are rows x, y, z (mm), drawn to the same scale; y points upwards, as in t
 
 from itertools import pairwise
 from math import ceil
-from textwrap import fill
+from textwrap import wrap
 from typing import Any
 
 import matplotlib
@@ -42,7 +42,10 @@ from flexneedle.types import Floats, Insertion, Shape, X, Y, Z
 
 _HEIGHT = 3.9  # inches
 _LINE = 100  # characters of a line of the verdict
-_ROOM = np.array([[0.03, 0.22], [0.99, 0.86]])  # corners of the part of the figure that the box fills
+_LEADING = 0.2  # inches between lines of the verdict
+_ROOM = np.array(
+    [[0.03, 0.22], [0.99, 0.86]]
+)  # the part of the figure that the box fills below one line of verdict
 _VIEW: Any = {"elev": 20.0, "azim": -72.0}
 _BEHIND, _BEYOND, _AROUND = 6.0, 4.0, 4.0  # mm behind the guide, beyond the target, around all that is drawn
 _ARROW = 5.0  # mm
@@ -60,12 +63,14 @@ def perspective_figure(scenario: Scenario, insertion: Insertion) -> Figure:
         figure.suptitle(title_of(scenario, insertion), x=0.01, ha="left", fontsize=11, weight="bold")
         color = TARGET if insertion.reached else BAD
         verdict: dict[str, Any] = {"color": color, "fontsize": 10, "weight": "bold", "va": "top"}
-        figure.text(0.01, 1.0 - 0.36 / _HEIGHT, fill(insertion.summary, _LINE), **verdict)
+        lines = wrap(insertion.summary, _LINE)
+        figure.text(0.01, 1.0 - 0.36 / _HEIGHT, "\n".join(lines), **verdict)
         square = (0.0, 0.0, 1.0, WIDTH / _HEIGHT)  # into which Matplotlib draws space
         ax: Any = figure.add_axes(square, projection="3d", computed_zorder=False, facecolor="none")
         ax.set_label("perspective")
         _set_up(ax, low, high)
-        _fit(figure, ax, np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3))
+        room = _ROOM - [[0.0, 0.0], [0.0, (len(lines) - 1) * _LEADING / _HEIGHT]]
+        _fit(figure, ax, np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3), room)
         _draw_tissue(ax, scenario, low, high)
         _draw_shadows(ax, insertion, low)
         _draw_guide(ax, scenario, insertion)
@@ -106,14 +111,14 @@ def _set_up(ax: Any, low: Floats, high: Floats) -> None:
     ax.set_axis_off()
 
 
-def _fit(figure: Figure, ax: Any, corners: Floats) -> None:
-    """Place the axes so that the corners of the box (8, 3) fill their part of the figure."""
+def _fit(figure: Figure, ax: Any, corners: Floats, room: Floats) -> None:
+    """Place the axes so that the corners of the box (8, 3) fill `room` (2, 2), corners of a part of the figure."""
     x, y, _ = proj3d.proj_transform(*_turned(corners), ax.get_proj())
     ends = figure.transFigure.inverted().transform(ax.transData.transform(np.column_stack([x, y])))
-    scale = float(np.min(np.ptp(_ROOM, axis=0) / np.ptp(ends, axis=0)))
+    scale = float(np.min(np.ptp(room, axis=0) / np.ptp(ends, axis=0)))
     middle = 0.5 * (ends.min(axis=0) + ends.max(axis=0))
     place = ax.get_position(original=True)
-    corner = _ROOM.mean(axis=0) + scale * (place.p0 - middle)
+    corner = room.mean(axis=0) + scale * (place.p0 - middle)
     ax.set_position((*corner, scale * place.width, scale * place.height))
 
 

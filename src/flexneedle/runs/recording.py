@@ -9,6 +9,7 @@ from typing import Any
 from flexneedle.control.guide import check_guide
 from flexneedle.control.methods import DEFAULT
 from flexneedle.errors import FlexneedleError, one_line
+from flexneedle.planning.origin import placed
 from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT
 from flexneedle.runs.figures import draw_run
@@ -86,6 +87,8 @@ def record_insertion(
         check_choices(scenario, choices)
         plan_seed = choices.seed if choices.plan_seed is None else choices.plan_seed
         plan = _plan(folder, scenario, choices.strategy, plan_seed, on_iteration)
+        scenario = placed(scenario, plan)
+        folder.values["scenario"] = scenario.values()
         insertion = _insert(folder, scenario, plan, choices, on_period)
         finish_insertion(folder, insertion)
     return insertion

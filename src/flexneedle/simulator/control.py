@@ -6,23 +6,30 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flexneedle.arguments import refusal
+from flexneedle.arguments import refusal, whole
 from flexneedle.errors import CommandError
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.apparatus import Setup
 from flexneedle.types import COLUMNS, DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, ROLL, SPIN, Floats
 
 MOVES = ROLL
 """Number of columns of a control that are travel: of the base and of the guide."""
+_SIZES = "give the sizes one by one: controls(4, 30, db_x=1.0)"
 _SLACK = 1e-9  # rounding of sums of steps, mm or rad
 
 
 def controls(*shape: int, **columns: ArrayLike) -> Floats:
-    """Return an array (*shape, 9) of controls: `columns` by name, the others 0. Raises InputError for other names."""
-    array = np.zeros((*shape, len(COLUMNS)))
+    """Return an array (*shape, 9) of controls: `columns` by name, the others 0. Raises InputError for other names, for
+    sizes that are not whole numbers from 0, and for values that do not broadcast to the shape.
+    """
+    array = np.zeros((*(whole("size", size, 0, _SIZES) for size in shape), len(COLUMNS)))
     for name, values in columns.items():
         if name not in COLUMNS:
             raise refusal("column", name, f"must be one of {', '.join(COLUMNS)}")
-        array[..., COLUMNS.index(name)] = values
+        try:
+            array[..., COLUMNS.index(name)] = values
+        except (TypeError, ValueError):
+            raise refusal(name, values, f"must be numbers that broadcast to the shape {shape}") from None
     return array
 
 
@@ -46,18 +53,28 @@ def half_turned(angle: float, roll: float) -> float:
     return -angle if round(angle / math.pi) % 2 else math.pi
 
 
+def _fixed_by(setup: Setup) -> tuple[str, ...]:
+    """Why each column of travel may not move, or "" where it may."""
+    plane = "with setup.axes = 1" if setup.axes == 1 else ""
+    mounted = "" if setup.has_guide else "without a guide (setup.guide_to_skin_mm)"
+    one_axis = "with setup.guide_axes = 1" if setup.guide_axes == 1 else ""
+    by_name = {"db_z": plane, "db_psi": plane, "dg_y": mounted, "dg_z": plane or mounted or one_axis}
+    return tuple(by_name.get(name, "") for name in COLUMNS[:MOVES])
+
+
 @dataclass(frozen=True)
 class Limits:
     """Largest step of each column of travel, and the range of the sum of steps from the start, shapes (7,) and (7, 2).
 
     half_turns: the key and value by which the needle rolls by half turns only, or ""; rotation: largest angle from 0
-    to either side (rad).
+    to either side (rad); fixed: for each column of travel why it may not move, or "".
     """
 
     step: Floats
     travel: Floats
     half_turns: str = "setup.axes = 1"
     rotation: float = math.inf
+    fixed: tuple[str, ...] = ("",) * MOVES
 
     @classmethod
     def of(cls, scenario: Scenario) -> "Limits":
@@ -70,7 +87,7 @@ class Limits:
         lateral, reach = setup.max_base_travel_mm, setup.max_guide_travel_mm
         travel = np.array([lateral, lateral, np.inf, np.inf, reach, reach])
         sums = np.array([[0.0, setup.stroke_mm], *np.stack([-travel, travel], axis=1).tolist()])
-        return cls(step, sums, setup.half_turns_by, setup.max_rotation)
+        return cls(step, sums, setup.half_turns_by, setup.max_rotation, _fixed_by(setup))
 
     def check(self, moved: Floats, rows: Floats, roll: float = 0.0) -> None:
         """Raise CommandError for the first value in `rows` (…, m, 9) that breaks a limit.
@@ -80,6 +97,10 @@ class Limits:
         if not np.isfinite(rows).all():
             self._refuse(rows, ~np.isfinite(rows), "must be a finite number")
         steps = rows[..., :MOVES]
+        for column, reason in enumerate(self.fixed):
+            if reason and (moving := np.abs(steps[..., column]) > _SLACK).any():
+                value = float(steps[..., column][moving][0])
+                raise CommandError(COLUMNS[column], value, 0.0, f"must be 0 {reason}")
         if (bad := np.abs(steps) > self.step + _SLACK).any():
             self._refuse(steps, bad, "must be at most", self.step)
         travel = moved + np.cumsum(steps, axis=-2)
@@ -102,6 +123,7 @@ class Limits:
             angle = roll + np.cumsum(steps, axis=-1)
             if (bad := np.abs(angle) > self.rotation + _SLACK).any():
                 rule = f"angle of the needle must be at most {self.rotation:g} rad to either side"
+                rule += f" (setup.max_rotation_deg = {math.degrees(self.rotation):g})"
                 raise CommandError("roll", float(angle[bad][0]), self.rotation, rule)
 
     def _refuse(self, values: Floats, bad: NDArray[np.bool_], rule: str, limit: Floats | None = None) -> None:

@@ -155,10 +155,11 @@ class Simulator:
         deflection: bool = False,
         shapes: bool = False,
     ) -> Rollout:
-        """Run each of N sequences from `state`; controls (N, m, 9): the columns of `Control`.
+        """Run each of N sequences from `state`; controls (N, m, 9): the columns of `Control`, see `controls`.
 
         Equal to repeated `step`, bit by bit; CommandError if any value is out of range. Without `limits` a step may be
         longer than a command; a `rough` rollout solves each only to 1e-4 mm: for long predictions with little work.
+        With `deflection` or `shapes` the result has these, too.
         """
         self._own(state)
         rows = np.array(controls, dtype=float)  # a copy: the kernel is compiled for writable arrays

@@ -1,8 +1,9 @@
 """The folder of a run: created once, with a `run.json` that is always complete.
 
 `run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing and
-plans; that of an insertion also controller, phantom and tracker. All except `timing`, the date and the wall-clock
-times, is the same for the same seed.
+plans; that of an insertion also controller, phantom and tracker. A plan that chose where the needle enters has its own
+section `entry`; the scenario of an insertion is the one with the entry of its plan. All except `timing`, the date and
+the wall-clock times, is the same for the same seed.
 """
 
 import hashlib
@@ -83,9 +84,16 @@ class Folder:
 
     def write(self) -> None:
         """Write `run.json` in one step: readers get the old or the new text, never a part."""
-        plans = {name: plan_values(plan) for name, plan in self.plans.items()}
+        plans = {name: self._chosen_entry(plan) | plan_values(plan) for name, plan in self.plans.items()}
         text = to_text({**self.values, "timing": self.timing, "plans": plans})
         replace_file(self.path / RUN_FILE, text.encode())
+
+    def _chosen_entry(self, plan: Plan) -> dict[str, Any]:
+        """The section `entry` of a plan that has chosen another than that of the run's scenario."""
+        if plan.scenario is None:
+            return {}
+        entry = plan.scenario.values()["entry"]
+        return {} if entry == self.values["scenario"]["entry"] else {"entry": entry}
 
     def end(self, status: str, reason: str = "") -> None:
         """Set the final status, and write."""
@@ -144,16 +152,23 @@ def _checked(path: Path, values: Any) -> RunFile:
     if not isinstance(values, dict) or values.get("format") != _FORMAT:
         raise InputError(f"{path}: not a run of this version of flexneedle: format must be {_FORMAT}")
     try:
-        read = {name: plan_from_values(plan) for name, plan in values["plans"].items()}
+        read = values["plans"].items()
         named = {name: values[name] for name in ("kind", "status", "reason", "seed", "result", "timing")}
         named |= {name: values.get(name, "") for name in ("controller", "phantom", "tracker")}
         scenario = Scenario.from_record(values["scenario"])
-        plans = {name: replace(plan, scenario=scenario) for name, plan in read.items()}
+        plans = {name: _plan(plan, values["scenario"]) for name, plan in read}
         return RunFile(path.parent, scenario=scenario, plans=plans, **named)
     except ScenarioError as error:
         raise InputError(f"{path}: damaged: {error.problems[0]}") from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: damaged: {type(error).__name__} {error}") from None
+
+
+def _plan(values: dict[str, Any], scenario: dict[str, Any]) -> Plan:
+    """The plan of a run, with the run's scenario, at the entry that the plan has chosen."""
+    chosen = {name: values[name] for name in ("entry",) if name in values}
+    plan = plan_from_values({name: value for name, value in values.items() if name not in chosen})
+    return replace(plan, scenario=Scenario.from_record(scenario | chosen))
 
 
 def _make(path: Path) -> Path:

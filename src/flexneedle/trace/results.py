@@ -21,6 +21,7 @@ DEPTH_FRACTIONS = {"quarter": 0.25, "half": 0.5, "three_quarters": 0.75}
 """Fractions of the target depth at which the predictions are recorded, by name."""
 PREDICTED_PARTS = ("tip", "middle")
 LATERAL_AXES = ("y", "z")
+_ENTRY_KEYS = ("lateral_mm", "lateral_z_mm", "slope_mrad", "slope_z_mrad")
 _OF_PERIODS = ("p50", "p99", "max")
 NO_TIMING = {"plan_seconds": None, "period_ms": dict.fromkeys(_OF_PERIODS)}
 """Times of an insertion that was refused before planning."""
@@ -178,12 +179,15 @@ def insertion_row(insertion: Insertion) -> dict[str, Any]:
 
 
 def plan_result(plan: Plan) -> dict[str, Any]:
-    """Return the result of a plan; tip in mm."""
+    """Return the result of a plan; tip in mm; entry: where the needle enters, by keys of the scenario."""
+    made = plan.scenario
+    entry = None if made is None else {key: getattr(made.entry, key) for key in _ENTRY_KEYS}
     result: dict[str, Any] = plain(
         {
             "tip_mm": plan.tip_mm,
             "error_mm": plan.error_mm,
             "reached": bool(plan.reached),
+            "entry": entry,
             "cost": plan.cost,
             "terms": plan.terms,
             "flips": plan.flips,

@@ -10,12 +10,15 @@ from pydantic import SerializeAsAny, ValidationError, ValidatorFunctionWrapHandl
 
 from flexneedle.errors import InputError
 from flexneedle.scenario.own import resolved
-from flexneedle.scenario.problems import Problem, problems_of, refuse
+from flexneedle.scenario.problems import Problem, printable, problems_of, refuse
 from flexneedle.scenario.tissue.layer import Layer
 from flexneedle.scenario.tissue.linear import Linear
 from flexneedle.scenario.tissue.ogden import Ogden
 
 DEFAULT = "ogden"
+_FUNCTIONS = ("energy", "force", "stiffness")
+_POINTS = 4097  # at which a law of the user's own is checked
+_AGREEMENT = 0.01  # relative difference of a function and the integral of the next
 
 
 def _found() -> Iterator[tuple[str, type[Layer]]]:
@@ -44,10 +47,13 @@ def _layer(value: Any, _validate: ValidatorFunctionWrapHandler) -> Layer:
         raise ValueError("must be a table")
     law = _law(value.get("law", DEFAULT))
     try:
-        return law.model_validate(dict(value))
+        layer = law.model_validate(dict(value))
     except ValidationError as error:
         refuse(problems_of(error, law))
         raise
+    if law not in LAWS.values() and (rule := _broken_rule(layer)):
+        refuse([Problem("law", value["law"], rule)])
+    return layer
 
 
 def _law(name: object) -> type[Layer]:
@@ -60,8 +66,48 @@ def _law(name: object) -> type[Layer]:
         refuse([Problem("law", name, str(error))])
     if not _is_law(law):
         refuse([Problem("law", name, "must be a subclass of flexneedle.Layer")])
+    if lacking := [part for part in ("limit", *_FUNCTIONS) if not _has(law, part)]:
+        refuse([Problem("law", name, f"must define {', '.join(lacking)}")])
     found: type[Layer] = law
     return found
+
+
+def _has(law: type[Layer], part: str) -> bool:
+    return hasattr(law, part) and part not in law.__abstractmethods__
+
+
+def _broken_rule(layer: Layer) -> str:
+    """The first rule of laws that a law of the user's own breaks, or ""."""
+    import numpy as np  # only here: a scenario of the package's laws is read without it
+
+    if not 0.0 < layer.limit < 1.0:
+        return f"limit = {layer.limit!r}: must be above 0 and below 1"
+    e = np.linspace(0.0, layer.limit, _POINTS)
+    found = []
+    for name in _FUNCTIONS:
+        try:
+            with np.errstate(all="ignore"):
+                values = np.asarray(getattr(layer, name)(e), dtype=float)
+        except Exception as error:  # noqa: BLE001 - whatever the function of a user raises
+            return f"{name} raises {type(error).__name__}: {printable(str(error))}"
+        if values.shape != e.shape:
+            return f"{name} must return an array of the shape of e, {e.shape}, not {values.shape}"
+        if not np.isfinite(values).all():
+            return f"{name} must be finite up to limit = {layer.limit:g}"
+        found.append(values)
+    energy, force, stiffness = found
+    starts = [float(values[0]) for values in found]
+    if not np.allclose(starts, [0.0, 0.0, 1.0], atol=1e-6):
+        return f"energy, force and stiffness at e = 0 must be 0, 0 and 1, not {', '.join(f'{s:g}' for s in starts)}"
+    if stiffness.min() <= 0.0:
+        return f"stiffness must be above 0 up to limit = {layer.limit:g}"
+    for name, whole, slope in (("force", energy, force), ("stiffness", force, stiffness)):
+        sums = np.append(0.0, np.cumsum(0.5 * np.diff(e) * (slope[1:] + slope[:-1])))
+        off = np.abs(sums - whole) > _AGREEMENT * np.abs(whole) + 1e-6
+        if off.any():
+            of, at = {"force": "energy", "stiffness": "force"}[name], float(e[off][0])
+            return f"{name} must be the derivative of {of}, but is not at e = {at:.3g}"
+    return ""
 
 
 AnyLayer = Annotated[SerializeAsAny[Ogden | Linear], WrapValidator(_layer)]
