@@ -167,7 +167,7 @@ def test_names_of_worlds_are_short_and_the_real_one_needs_no_case():
         ("world:7:", "world:7:: must be world:NUMBER"),
         ("world:7\n", "world:7\\n: must be world:NUMBER"),
         ("world:1000000001", "world = 1000000001: must be a whole number from 0 to 1000000000"),
-        ("world:7:ideal", "world_case = 'ideal': must be one of perfect, real, structure"),
+        ("world:7:ideal", "world:7:ideal: must be world:NUMBER, with :CASE, :RIG or :CASE:RIG after it"),
         ("world:7:two-axes:real", "world:7:two-axes:real: must be world:NUMBER"),
         (
             "world:7:no-guide",

@@ -3,6 +3,7 @@
 import copy
 import math
 import pickle
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -309,7 +310,9 @@ def test_controls_that_cannot_be_made_are_one_clear_line(shape, columns, message
 @pytest.mark.parametrize("shape", [(9,), (3, 9), (2, 3, 5), (1, 2, 3, 9)])
 def test_controls_of_another_shape_are_refused(shape):
     """With the shape in the message."""
-    with pytest.raises(CommandError, match=r"shape \(N, m, 9\)"):
+    with pytest.raises(
+        InputError, match=f"shape of controls = {re.escape(str(shape))}: must be \\(N, m, 9\\)"
+    ):
         SIMULATOR.rollout(SIMULATOR.start(), np.zeros(shape))
 
 

@@ -107,7 +107,10 @@ def _draw_along(ax: Axes, scenario: Scenario, plan: Plan) -> None:
 
 def _result(scenario: Scenario, plan: Plan) -> str:
     """The plan in a line: result, cost, and angles of the tip at the skin, if they are known."""
-    angles = [f"{signed(degrees(angle), '+.1f')}°" for angle in plan.entry_angles[: scenario.setup.axes]]
+    angles = [
+        f"{signed(round(degrees(angle), 1) + 0.0, '+.1f')}°"
+        for angle in plan.entry_angles[: scenario.setup.axes]
+    ]
     entry = "" if isnan(plan.entry_angle) else f", enters at {' and '.join(angles)}"
     return f"{plan.strategy}: {plan.summary} (cost {plan.cost:.2f}){entry}"
 

@@ -264,7 +264,8 @@ def _beyond_the_bevel(simulator: Simulator, problem: PlanProblem) -> str:
     if least <= problem.lateral <= greatest:
         return ""
     from_axis = f" from the needle's axis, the target is at {problem.lateral:.2f} mm" if problem.axis else ""
-    why = f"the bevel alone reaches {least:.2f} to {greatest:.2f} mm lateral{from_axis}"
+    anywhere = " in any direction" if problem.axes == 2 and not problem.half_turns else ""
+    why = f"the bevel alone reaches {least:.2f} to {greatest:.2f} mm lateral{anywhere}{from_axis}"
     if problem.narrow:
         size, most = radius(rollout, problem), scenario.setup.max_rotation_deg
         if problem.lateral <= size:

@@ -151,7 +151,7 @@ def world_name(number: int, case: str = REAL, rig: str = PLANE) -> str:
 def named_world(name: str) -> Scenario:
     """Return the world of a name. Raises ScenarioError."""
     found = _NAMED.fullmatch(name)
-    if found is None:
+    if found is None or (found[2] or REAL) not in CASES:
         rule = f"must be {WORLD}NUMBER, with :CASE, :RIG or :CASE:RIG after it"
         rule += f", cases: {', '.join(CASES)}, rigs: {', '.join(RIGS)}"
         raise ScenarioError(f"{printable(name)}: {rule}")

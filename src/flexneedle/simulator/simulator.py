@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flexneedle.arguments import instance, whole
+from flexneedle.arguments import instance, refusal, whole
 from flexneedle.errors import CommandError, StateError
 from flexneedle.mechanics import insertion, law, model
 from flexneedle.mechanics import needle as nd
@@ -157,15 +157,15 @@ class Simulator:
     ) -> Rollout:
         """Run each of N sequences from `state`; controls (N, m, 9): the columns of `Control`, see `controls`.
 
-        Equal to repeated `step`, bit by bit; CommandError if any value is out of range. Without `limits` a step may be
+        Equal to repeated `step`, bit by bit; InputError for another shape, CommandError for a value out of range. Without `limits` a step may be
         longer than a command; a `rough` rollout solves each only to 1e-4 mm: for long predictions with little work.
         With `deflection` or `shapes` the result has these, too.
         """
         self._own(state)
         rows = np.array(controls, dtype=float)  # a copy: the kernel is compiled for writable arrays
         if rows.ndim != 3 or rows.shape[2] != len(COLUMNS):
-            rule = f"must have shape (N, m, {len(COLUMNS)}), not {rows.shape}"
-            raise CommandError("controls", float(rows.ndim), 3.0, rule)
+            rule = f"must be (N, m, {len(COLUMNS)}), sequences of controls with the columns of Control"
+            raise refusal("shape of controls", rows.shape, rule)
         if limits:
             self._limits.check(state.travel, rows, state.roll)
         rows = along_entry(self.scenario, rows)
