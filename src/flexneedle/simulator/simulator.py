@@ -157,8 +157,9 @@ class Simulator:
     ) -> Rollout:
         """Run each of N sequences from `state`; controls (N, m, 9): the columns of `Control`, see `controls`.
 
-        Equal to repeated `step`, bit by bit; InputError for another shape, CommandError for a value out of range. Without `limits` a step may be
-        longer than a command; a `rough` rollout solves each only to 1e-4 mm: for long predictions with little work.
+        Equal to repeated `step`, bit by bit; InputError for another shape, CommandError for a value out of range.
+        Without `limits` a step may be longer than a command; a `rough` rollout solves each only to 1e-4 mm: for long
+        predictions with little work.
         With `deflection` or `shapes` the result has these, too.
         """
         self._own(state)
