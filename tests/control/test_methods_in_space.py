@@ -146,7 +146,7 @@ def test_a_certain_miss_in_space_is_beyond_the_limit_or_not():
 
 
 def test_the_predicted_shape_ends_at_the_predicted_miss(plans):
-    """In each period: nodes to the target's depth, its tip's standard deviation that of the miss, none at the base."""
+    """In each period: nodes to the target's depth; the end of the axis is as uncertain as the miss and the run-out."""
     done = inserted(plans["two axes"].scenario, "adaptive-mpc", plan=plans["two axes"])
     predicted = [period for period in done.periods if period.predicted is not None]
     assert len(predicted) > 20
@@ -155,7 +155,8 @@ def test_the_predicted_shape_ends_at_the_predicted_miss(plans):
         assert nodes.shape == (61, 5)
         assert sd.shape == (61, 2)
         assert nodes[-1, 0] == pytest.approx(DEPTH, abs=0.3)
-        np.testing.assert_allclose(sd[-1], period.miss_sd, rtol=0.5)
+        assert (sd[-1] > 0.99 * period.miss_sd).all()
+        assert (sd[-1] < np.hypot(period.miss_sd, 0.15)).all()
         assert np.isfinite(sd).all()
     last = predicted[-1].predicted
     true = done.periods[-1].true_tip
