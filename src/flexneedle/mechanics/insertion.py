@@ -147,9 +147,9 @@ def _advanced(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work
 def _contact_energy(model: Model, i: int, u: Lateral, tip_x: float) -> float:
     """Energy (mJ) that contact point i stores, without its weight."""
     node = model.nodes[i]
-    ramp = min(1.0, (tip_x - node.x) / node.reach)
-    stored = stored_energy(model.laws[node.law], size(u) / node.height)
-    return float(ramp * node.stiffness * node.height * node.height * stored)
+    stored = node.stiffness * node.height * node.height * stored_energy(model.laws[node.law], size(u) / node.height)
+    behind = tip_x - node.x
+    return float(stored if behind >= node.reach else stored * behind / node.reach)
 
 
 @inner

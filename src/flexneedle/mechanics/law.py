@@ -117,5 +117,5 @@ def stored_energy(table: Floats, e: float) -> float:
     t, c = place - cell, table[cell]
     total = 0.0
     for k in range(DEGREE, -1, -1):
-        total = total * t + c[k] * (cell / (k + 1.0) + t / (k + 2.0))
+        total = total * t + c[k] * (cell * (1.0 / (k + 1.0)) + t * (1.0 / (k + 2.0)))
     return float(c[_ENERGY] + t * total / (end[_PER_UNIT] * end[_PER_UNIT]))
