@@ -122,7 +122,9 @@ def in_space(simulator: Simulator, controls: np.ndarray) -> Callable[[], inserti
     base, tip = (nd.Pose(x, 0j, 0j) for x in (SCENARIO.start_base_x, setup.start_tip_x))
     rest = np.zeros(model.nodes.size, complex)
     work = rest.copy(), rest.copy(), nd.work_array(rest)
-    needle = insertion.settle(model, nd.start(base, tip, 1.0 + 0j, complex(SCENARIO.guide_home)), *work, complex(np.nan))
+    needle = insertion.settle(
+        model, nd.start(base, tip, 1.0 + 0j, complex(SCENARIO.guide_home)), *work, complex(np.nan)
+    )
     start = needle, rest, rest.copy()
     count, steps = controls.shape[:2]
 

@@ -1,9 +1,11 @@
-"""Computing time of a control period of the default controller over random worlds.
+"""Computing time of a control period of the default controller over random worlds, in the plane and in space.
 
     python benchmarks/periods.py [--worlds FIRST COUNT] [--threads N]
 
-One insertion per world with the shipped mismatch; for each period with a decision, the time (ms) to decide and to
-observe, without the plant. A control step of 1 mm at 5 mm/s lasts 200 ms. Planning is not included.
+One insertion per world and rig with the shipped mismatch; for each period with a decision, the time (ms) to decide and
+to observe, without the plant. A control step of 1 mm at 5 mm/s lasts 200 ms. Planning is not included. In space the
+needle turns to any angle, with a guide in both axes where the world has a guide; each world runs in the plane and in
+space one after the other, and the last line compares the two.
 """
 
 import argparse
@@ -12,24 +14,25 @@ import numpy as np
 
 import flexneedle
 from flexneedle.rig.kernels import compile_kernels
-from flexneedle.scenario.worlds import world
+from flexneedle.scenario.worlds import PLANE, has_rig, world
 
 FIRST, COUNT = 100_000, 40
+IN_SPACE = ("two-axes", "no-guide")
 
 
-def periods_of(number: int, threads: int | None) -> np.ndarray:
+def periods_of(number: int, rig: str, threads: int | None) -> np.ndarray:
     """Times (n, 2) to decide and to observe (ms) in the periods of a world's insertion with a decision."""
-    scenario = world(number)
+    scenario = world(number, rig=rig)
     plan = flexneedle.plan(scenario, seed=number, threads=threads)
     insertion = flexneedle.insert(scenario, plan, seed=number, force=True, threads=threads)
     decided = [period.durations for period in insertion.periods if np.isfinite(period.miss[0])]
     return 1e3 * np.array([[spent["decide"], spent["observe"]] for spent in decided]).reshape(-1, 2)
 
 
-def line(label: str, values: np.ndarray) -> str:
+def line(label: str, values: np.ndarray, unit: str = " ms") -> str:
     """Median, 99 % quantile and maximum as text."""
     median, late, most = np.percentile(values, (50, 99, 100))
-    return f"{label:20s} median {median:6.1f} ms   99 % {late:6.1f} ms   max {most:6.1f} ms"
+    return f"{label:20s} median {median:6.2f}{unit}   99 % {late:6.2f}{unit}   max {most:6.2f}{unit}".rstrip()
 
 
 def main() -> None:
@@ -44,11 +47,21 @@ def main() -> None:
     args = parser.parse_args()
     compile_kernels()
     first, count = args.worlds
-    times = np.concatenate([periods_of(number, args.threads) for number in range(first, first + count)])
-    print(f"{len(times)} periods, {count} worlds from {first}")
-    print(line("decide", times[:, 0]))
-    print(line("observe", times[:, 1]))
-    print(line("decide and observe", times.sum(axis=1)))
+    plane, space = [], []
+    for number in range(first, first + count):
+        plane.append(periods_of(number, PLANE, args.threads))
+        rig = next(rig for rig in IN_SPACE if has_rig(world(number), rig))
+        space.append(periods_of(number, rig, args.threads))
+    for name, found in (("plane", plane), ("space", space)):
+        times = np.concatenate(found)
+        print(f"{name}: {len(times)} periods, {count} worlds from {first}")
+        print(line("decide", times[:, 0]))
+        print(line("observe", times[:, 1]))
+        print(line("decide and observe", times.sum(axis=1)))
+    ratios = [
+        there.sum(axis=1).mean() / here.sum(axis=1).mean() for here, there in zip(plane, space, strict=True)
+    ]
+    print(line("space / plane", np.array(ratios), unit=""))
 
 
 if __name__ == "__main__":

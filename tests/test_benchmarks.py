@@ -1,0 +1,14 @@
+"""benchmarks/bench.py compares the same step in the plane, in space and with a banded solve of its matrix."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+import bench
+
+
+def test_plane_space_and_the_banded_matrix_agree():
+    found = bench.measure_step(repeats=1)
+    assert found["space_differs_from_plane_mm"] < 1e-5
+    assert found["dpbsv_differs_from_the_state_mm"] < 1e-7
+    assert found["step_us"] > 0.0 and found["dpbsv_us"] > 0.0
