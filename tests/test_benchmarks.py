@@ -11,4 +11,3 @@ def test_plane_space_and_the_banded_matrix_agree():
     found = bench.measure_step(repeats=1)
     assert found["space_differs_from_plane_mm"] < 1e-5
     assert found["dpbsv_differs_from_the_state_mm"] < 1e-7
-    assert found["step_us"] > 0.0 and found["dpbsv_us"] > 0.0

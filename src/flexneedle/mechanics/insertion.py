@@ -147,9 +147,10 @@ def _advanced(model: Model, needle: Needle, rest: Laterals, u: Laterals, w: Work
 def _contact_energy(model: Model, i: int, u: Lateral, tip_x: float) -> float:
     """Energy (mJ) that contact point i stores, without its weight."""
     node = model.nodes[i]
-    stored = node.stiffness * node.height * node.height * stored_energy(model.laws[node.law], size(u) / node.height)
+    stored = stored_energy(model.laws[node.law], size(u) / node.height)
+    energy = node.stiffness * node.height * node.height * stored
     behind = tip_x - node.x
-    return float(stored if behind >= node.reach else stored * behind / node.reach)
+    return float(energy if behind >= node.reach else energy * behind / node.reach)
 
 
 @inner
