@@ -27,10 +27,14 @@ NOWHERE = np.zeros((0, 2))
 @pytest.fixture(scope="module")
 def state():
     """A needle at a depth, with the bevel rolled once on the way."""
-    state = SIMULATOR.start(ROLL_AT_START)
+    return inserted(SIMULATOR)
+
+
+def inserted(simulator):
+    state = simulator.start(ROLL_AT_START)
     while state.tip[0] < DEPTH:
         roll = 1.1 if 5.0 <= state.tip[0] < 6.0 else 0.0
-        state = SIMULATOR.step(state, Control(db_x=1.0, roll=roll))
+        state = simulator.step(state, Control(db_x=1.0, roll=roll))
     return state
 
 
@@ -43,10 +47,10 @@ def ends(state, *, first=0.0, then=0.0):
     return complex(y, z)
 
 
-def prepared(state, target):
+def prepared(state, target, scenario=SPACE):
     """Task, estimate, memory and path ahead of a needle whose guide stays, and which rolls no more."""
-    plan = replace(make_plan("manipulation", (END, target.real, target.imag), 0), scenario=SPACE)
-    estimate = estimate_of(state, SPACE)
+    plan = replace(make_plan("manipulation", (END, target.real, target.imag), 0), scenario=scenario)
+    estimate = estimate_of(state, scenario)
     estimate = replace(estimate, precision=1e8 * estimate.precision)  # as good as certain
     task = task_of(estimate.nominal, plan)
     still = GuidePath(np.array([-50.0, 60.0]), np.tile(state.guide, (2, 1)), NOWHERE)
@@ -85,6 +89,24 @@ def test_the_reach_after_a_step_is_the_disc_of_what_the_bevel_does_then(state, d
         assert expected == pytest.approx(max(0.0, away), abs=0.03)
     towards, back = term.keywords["expected"]
     assert towards < back or beyond < 0.0
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_guide_on_one_axis_leaves_the_bevel_to_reach_across_it(state, side):
+    """Along it the guide corrects: the target may be anywhere. Across it, the weight is that of no guide at all."""
+    one_axis = SPACE.with_values({"setup.guide_axes": 1})
+    there = inserted(Simulator(one_axis, threads=1))
+    middle = np.mean([ends(state, then=turn) for turn in np.arange(4) * 0.5 * math.pi])
+    far = middle + side * 3.0j
+    task, estimate, memory, ahead = prepared(state, far)
+    both = adaptive_mpc.out_of_reach(task, estimate, ahead, memory).keywords
+    task, estimate, memory, ahead = prepared(there, far + 5.0, one_axis)
+    across = adaptive_mpc.out_of_reach(task, estimate, ahead, memory).keywords
+    assert across["expected"] == pytest.approx(both["expected"], abs=0.02)
+    assert across["expected"][0] > 1.0
+    assert there.bevel * cmath.exp(1j * across["angle"]) == pytest.approx(side * 1j, abs=1e-9)
+    weight = {term.name: term.weight for term in adaptive_mpc.cost_terms(task, estimate, memory, ahead)}
+    assert weight["reach"] == task.settings.unguided_reach_weight
 
 
 @pytest.fixture

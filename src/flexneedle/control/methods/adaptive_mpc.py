@@ -73,7 +73,7 @@ class AdaptiveMpc(Priors):
     reach_weight: NonNegative = 1.0
     """Weight of the expected distance of the target from the bevel's reach, with the guide fixed."""
     unguided_reach_weight: NonNegative = 30.0
-    """`reach_weight` where the guide may not move."""
+    """`reach_weight` where the guide may not move, or not on the axis across which the bevel steers alone."""
     late_roll_weight: NonNegative = 1.0
     """Weight of the standard deviation of the tip's motion in a roll just before the target."""
 
@@ -205,7 +205,8 @@ def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> 
     guided = guide_may_move(task.scenario.setup, task.plan.strategy)
     energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
     line = settings.line_weight if guided else settings.unguided_line_weight
-    reach = settings.reach_weight if guided else settings.unguided_reach_weight
+    alone = _bevel_alone_across(task, ahead)
+    reach = settings.reach_weight if guided and not alone else settings.unguided_reach_weight
     uncorrected = UNCORRECTED * task.scenario.setup.max_advance_mm
     late = partial(terms.late_rolls, depth=target[0], length=uncorrected)
     whole = max(target[0], uncorrected)
@@ -234,7 +235,8 @@ def out_of_reach(
     The reach of a needle that rolls by half turns is the interval between the ends with the bevel on either side from
     the second step on; that of one that rolls to any angle is the circle about the middle of such an interval. The
     bounds are normally distributed. With the bevel alone, lost reach cannot be regained; with a guide, the bevel still
-    moves the tip when the guide is far behind it.
+    moves the tip when the guide is far behind it. Along the axis of a guide that moves on one the guide corrects, so
+    that only the distance across it counts.
     """
     trajectories = measured_rollout(fitted, ahead.constant)
     if not trajectories.converged.all():
@@ -248,9 +250,18 @@ def out_of_reach(
     # By symmetry the ends along the present direction of the bevel are those along any other. The first step displaces
     # the middle towards the target or away from it: the ends are that much farther, or nearer.
     away, radius = -past.mean(), 0.5 * np.abs(past[0] - past[1])
+    if _bevel_alone_across(task, ahead):
+        away = 1j * away.imag
     sd = np.hypot(middle, radius * fitted.bevel_sd)
     angle = cmath.phase(complex(away) * fitted.state.bevel.conjugate())
     return partial(terms.out_of_reach, expected=above_zero(abs(away) - radius, sd), angle=angle)
+
+
+def _bevel_alone_across(task: Task, ahead: Ahead) -> bool:
+    """Whether the guide moves along y only, and a bevel that turns to any angle steers along z."""
+    setup = ahead.setup
+    guided = guide_may_move(setup, task.plan.strategy)
+    return guided and setup.moved_guide_axes < setup.axes and not setup.half_turns
 
 
 def above_zero(mean: Floats, sd: Floats) -> Floats:
