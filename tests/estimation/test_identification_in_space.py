@@ -8,6 +8,7 @@ import pytest
 
 import flexneedle
 from flexneedle.control.methods.adaptive_mpc import AdaptiveMpc
+from flexneedle.estimation.estimate import Move
 from flexneedle.estimation.identification import Identification
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.prior import Slots
@@ -173,6 +174,33 @@ def test_a_variance_is_of_the_measured_axes_only():
     assert variance(Measurement(0.1, 1.0, 2.0, covariance=covariance)) == 0.5
     assert variance(Measurement(0.1, 1.0, 2.0, 3.0, covariance=covariance)) == 0.5 * (0.5 + 1e6)
     assert variance(Measurement(0.1, 1.0, 2.0)) is None
+
+
+def test_a_variance_of_a_direction_is_the_mean_of_both_axes():
+    variance = SENSORS["tip direction"].variance
+    one = Measurement(0.1, 1.0, 2.0, 3.0, direction=(0.0, 0.0), direction_covariance=((1.0, 0.0), (0.0, 3.0)))
+    assert variance(one) == 2.0
+    assert variance(replace(one, direction_covariance=None)) is None
+
+
+def test_reported_variances_become_those_of_the_mean():
+    """Of four readings a quarter; unknown if one of them does not report its own."""
+    covariance = ((8.0, 0.0, 0.0), (0.0, 4.0, 0.0), (0.0, 0.0, 12.0))
+    readings = tuple(Measurement(0.1 * k, 1.0, 2.0, 3.0, covariance=covariance) for k in range(4))
+    move = Move(0.0, 0.4, Control(1.0), readings)
+    assert move.means["tip position"][-2:] == (2.0, 2.0)
+    mixed = replace(move, measurements=(*readings[:3], replace(readings[3], covariance=None)))
+    assert all(map(math.isnan, mixed.means["tip position"][-2:]))
+
+
+@pytest.mark.parametrize(("ahead", "across", "trusted"), [(1e6, 1e-4, False), (1e-4, 1e6, True)])
+def test_the_start_along_the_axis_follows_the_variance_along_the_axis(ahead, across, trusted):
+    """Readings that are a millimetre ahead move it only where x is said to be known."""
+    covariance = ((ahead, 0.0, 0.0), (0.0, across, 0.0), (0.0, 0.0, across))
+    estimate, _ = followed(
+        3, truth=False, given=lambda one: replace(one, x=one.x + 1.0, covariance=covariance)
+    )
+    assert estimate.axial == pytest.approx(1.0 if trusted else 0.0, abs=1e-2)
 
 
 # ---- the other observer

@@ -28,8 +28,8 @@ class Move:
     @cached_property
     def means(self) -> Mapping[str, tuple[float, ...]]:
         """Means over its readings by sensor: share of the move done, x (mm), y and z of the measured quantity, their
-        number, and the variance of the means where all readings report it, else NaN. Sensors without readings are left
-        out.
+        number, and the variances of the means of y or z and of x where all readings report them, else NaN. Sensors
+        without readings are left out.
         """
         means = ((sensor.name, self._mean(sensor)) for sensor in SENSORS.values())
         return {name: mean for name, mean in means if mean is not None}
@@ -44,10 +44,9 @@ class Move:
             for column in zip(*((self.part(one.time), place(one)[0]) for one, _ in known), strict=True)
         )
         y, z = (fmean(column) for column in zip(*(value for _, value in known), strict=True))
-        variances = [sensor.variance(one) for one, _ in known]
-        reported = [value for value in variances if value is not None]
-        variance = sum(reported) / len(known) ** 2 if len(reported) == len(known) else nan
-        return part, x, y, z, float(len(known)), variance
+        across = _variance_of_mean([sensor.variance(one) for one, _ in known])
+        ahead = _variance_of_mean([one.covariance[0][0] if one.covariance else None for one, _ in known])
+        return part, x, y, z, float(len(known)), across, ahead
 
     def part(self, time: float) -> float:
         """Share of the move that is done at `time`."""
@@ -138,6 +137,12 @@ def along(moves: tuple[Move, ...], tips: Floats, time: float) -> Point:
     times = [moves[0].begun, *(done.ended for done in moves)]
     x, y, z = (float(np.interp(time, times, tips[:, column])) for column in (X, Y, Z))
     return x, y, z
+
+
+def _variance_of_mean(variances: Sequence[float | None]) -> float:
+    """Variance of the mean of readings with these variances; NaN unless all are known."""
+    known = [value for value in variances if value is not None]
+    return sum(known) / len(known) ** 2 if len(known) == len(variances) else nan
 
 
 def place(measurement: Measurement) -> Point:

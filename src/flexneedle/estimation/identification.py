@@ -189,7 +189,7 @@ class Identified:
         readings = extended._readings[0]
         without = readings.ahead(extended.tips[:, X]) + extended.axial
         prior_sd = max(self.nominal.scenario.control.start_axial_sd_mm, LEAST_SD)
-        axial, axial_variance = shared(without, extended.variances()[0], prior_sd)
+        axial, axial_variance = shared(without, extended.axial_variances(), prior_sd)
         extended = replace(extended, axial=axial, axial_variance=axial_variance)
         fitted = improved(extended)._differentiated()
         left, ahead = fitted.left[0], readings.ahead(fitted.tips[:, X])
@@ -224,6 +224,12 @@ class Identified:
             readings.variance(sensor.sd(scenario) or 0.0, sensor.unexplained(scenario, self.settings))
             for sensor, readings in zip(self.sensors, self._readings, strict=True)
         ]
+
+    def axial_variances(self) -> Floats:
+        """Variances (r,) of the means of the tip's x: jitter and model error."""
+        scenario, position = self.nominal.scenario, self.sensors[0]
+        unexplained = position.unexplained(scenario, self.settings)
+        return self._readings[0].axial_variance(position.sd(scenario) or 0.0, unexplained)
 
     @property
     def laterals(self) -> list[Laterals]:

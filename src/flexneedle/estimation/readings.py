@@ -13,8 +13,8 @@ from flexneedle.types import Floats, Laterals
 @dataclass(frozen=True, eq=False)
 class MoveMeans:
     """Means of a sensor's readings of each move that has any: the move, the share of it done, x (mm) and the measured
-    quantity y, their number and variance (NaN: not reported), and the bevel's direction after the move; each (r,).
-    Lateral quantities are complex in space.
+    quantity y, their number, variances of y on an axis and of x (NaN: not reported), and the bevel's direction after
+    the move; each (r,). Lateral quantities are complex in space.
 
     Quantities of a model are given at the ends of all m moves, the start first: (m + 1,).
     """
@@ -25,19 +25,20 @@ class MoveMeans:
     y: Laterals
     count: Floats
     reported: Floats
+    reported_x: Floats
     bevel: Laterals
 
     @staticmethod
     def of(moves: Sequence[Move], sensor: str, bevel: complex, axes: int) -> "MoveMeans":
         """The means of a sensor's readings; bevel: its direction after the last move."""
         means = [(k, *done.means[sensor]) for k, done in enumerate(moves) if sensor in done.means]
-        index, part, x, y, z, count, reported = np.array(means, dtype=float).reshape(-1, 7).T
+        index, part, x, y, z, count, reported, ahead = np.array(means, dtype=float).reshape(-1, 8).T
         rolled = np.cumsum([done.applied.roll + done.applied.spin for done in moves])
         kept = index.astype(int)
         directions = (bevel * np.exp(1j * (rolled - rolled[-1])))[kept]
         if axes == 1:
-            return MoveMeans(kept, part, x, y, count, reported, np.rint(directions.real))
-        return MoveMeans(kept, part, x, y + 1j * z, count, reported, directions)
+            return MoveMeans(kept, part, x, y, count, reported, ahead, np.rint(directions.real))
+        return MoveMeans(kept, part, x, y + 1j * z, count, reported, ahead, directions)
 
     def between(self, ends: Laterals) -> Laterals:
         """A quantity interpolated to the readings (r,)."""
@@ -55,8 +56,17 @@ class MoveMeans:
         return ahead
 
     def variance(self, jitter: float, unexplained: float) -> Floats:
-        """Variances (r,) of the means; jitter of a reading and model error of a mean: standard deviations."""
-        noise = np.where(np.isnan(self.reported), jitter**2 / self.count, self.reported)
+        """Variances (r,) of the means of y on an axis; jitter of a reading and model error of a mean: standard
+        deviations.
+        """
+        return self._variance(self.reported, jitter, unexplained)
+
+    def axial_variance(self, jitter: float, unexplained: float) -> Floats:
+        """As `variance`, of the means of x."""
+        return self._variance(self.reported_x, jitter, unexplained)
+
+    def _variance(self, reported: Floats, jitter: float, unexplained: float) -> Floats:
+        noise = np.where(np.isnan(reported), jitter**2 / self.count, reported)
         variance: Floats = noise + unexplained**2
         return variance
 

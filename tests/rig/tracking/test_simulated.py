@@ -258,9 +258,10 @@ def test_in_space_z_is_measured_with_the_same_noise_and_in_the_plane_not_at_all(
     one = fresh(clock, lambda _: (1.0, 2.0, 3.0), jitter=0.1, axes=2)
     flat = fresh(clock, lambda _: (1.0, 2.0, 3.0), jitter=0.1)
     clock.wait(4000 * PERIOD)
-    z = np.array([reading.z for reading in one.read()])
+    y, z = np.array([(reading.y, reading.z) for reading in one.read()]).T
     assert z.mean() == pytest.approx(3.0, abs=0.006)
     assert z.std() == pytest.approx(0.1, rel=0.05)
+    assert abs(np.corrcoef(y, z)[0, 1]) < 0.08  # 5 standard deviations
     assert all(reading.z is None for reading in flat.read())
 
 
