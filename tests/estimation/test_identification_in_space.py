@@ -206,6 +206,18 @@ def test_the_start_along_the_axis_follows_the_variance_along_the_axis(ahead, acr
 # ---- the other observer
 
 
+def test_a_second_axis_makes_the_distance_of_the_next_reading_larger():
+    """The variance of the distance is that along the axis and that on each lateral axis."""
+    plane = flexneedle.load_scenario("phantom")
+    one, two = (
+        StateCorrection().begin(begun_with(Simulator(plane.with_values({"setup.axes": axes}), 1)))
+        for axes in (1, 2)
+    )
+    across = one.tip_sd**2 - one.axial
+    assert across > 0.1
+    assert two.tip_sd**2 == pytest.approx(two.axial + 2.0 * across)
+
+
 @pytest.mark.parametrize("turn", [0.0, math.pi / 2])
 def test_the_correction_of_the_state_finds_the_clamp_in_air_on_both_axes(turn):
     """With small tracker noise: base position and slope, and the tip."""

@@ -81,10 +81,11 @@ class Corrected:
         A path that leaves the model's by drift · x² below the skin leaves it by drift · (x² − s²) after a reading at s.
         """
         arm = np.array([self.simulator.scenario.needle.length_mm])
-        return float(np.sqrt(self._across(self.state.tip[:1], arm)[0] + self.axial))
+        axes = self.simulator.scenario.setup.axes
+        return float(np.sqrt(axes * self._across(self.state.tip[:1], arm)[0] + self.axial))
 
     def _across(self, x: Floats, arms: Floats) -> Floats:
-        """Variance (n,), mm², of lateral positions at x (n,), mm, with these distances (n,) from the base."""
+        """Variance (n,), mm², of positions on a lateral axis at x (n,), mm, with these distances (n,) from the base."""
         arm = np.stack([np.ones_like(arms), arms])
         measured = max(0.0, self.measured[0] if self.measured else 0.0)
         off_path = self.drift * np.maximum(0.0, np.maximum(x, 0.0) ** 2 - measured**2)
