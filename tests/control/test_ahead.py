@@ -1,5 +1,7 @@
 """The predicted shape for controllers that predict none: the rest of the plan from the estimated state."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ import flexneedle
 from flexneedle.control.ahead import along_plan, rest_of_plan
 from flexneedle.control.methods import METHODS
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import DB_X, DG_Y, DG_Z, ROLL, Control, X
+from flexneedle.types import DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, Control, X
 from tasks import task_of
 
 SCENARIOS = {
@@ -46,6 +48,17 @@ def test_the_rest_of_a_plan_ends_where_it_does(plan, steps):
     np.testing.assert_allclose(nodes[:, 1:3], plan.shapes[-1][:, 1:3], atol=0.15)
     assert np.isfinite(sd).all()
     assert (sd[:, 1] == 0.0).all() == (plan.scenario.setup.axes == 1)
+
+
+def test_the_base_goes_to_its_planned_pose(plan):
+    """In the rest of a plan that moves it along and turns it about every axis that it has."""
+    columns = [DB_Y, DB_THETA] if plan.scenario.setup.axes == 1 else [DB_Y, DB_Z, DB_THETA, DB_PSI]
+    rows = plan.controls.copy()
+    rows[:, columns] = 1e-3 * np.arange(1, 1 + len(columns))
+    task, estimate = estimates(replace(plan, controls=rows), "open-loop", 20)
+    moved = rest_of_plan(task, estimate)[:, columns].sum(axis=0)
+    np.testing.assert_allclose(moved, rows[20:, columns].sum(axis=0), atol=1e-2)
+    assert moved.min() > 0.03
 
 
 @pytest.mark.parametrize("controller", METHODS)

@@ -168,6 +168,18 @@ def test_no_random_search_of_many_samples_beats_it_by_much(plan, along):
     assert choice.cost <= best + 0.002
 
 
+def test_the_guide_stays_within_its_travel_from_the_entry_on_each_axis():
+    """Of a needle that enters off both axes, by different distances."""
+    entry = {"entry.lateral_mm": -2.0, "entry.lateral_z_mm": 5.0, "target.lateral_z_mm": 5.0}
+    scenario = PHANTOM.with_values({"setup.axes": 2, "setup.max_guide_travel_mm": 8.0} | entry)
+    state = Simulator(scenario, 1).start()
+    for sign in (-1.0, 1.0):
+        z = np.repeat([[0.9, sign, sign]], 30, axis=1)
+        rows = mpc.controls_of(scenario, state, z, np.zeros((30, 4)), 40.0, roll=0.0)
+        end = np.array(state.guide) + rows[0, :, DG_Y : DG_Z + 1].sum(axis=0)
+        np.testing.assert_allclose(end, [-2.0 + 8.0 * sign, 5.0 + 8.0 * sign])
+
+
 @pytest.mark.parametrize("roll", [np.pi, 0.0])
 def test_rollouts_roll_the_bevel_only_in_the_first_step_and_if_asked(plan, roll, along):
     state = along(plan, 40)

@@ -9,7 +9,7 @@ import pytest
 from flexneedle import controls as controls_of
 from flexneedle.planning import terms
 from flexneedle.planning.terms import Term, Trajectories
-from flexneedle.types import DB_X, DG_Y, ROLL, THETA, X, Y
+from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, SPIN, THETA, X, Y
 
 # Two sequences of three steps. The first one's first step ends in air; the second one's last is padding.
 ADVANCE = np.array([[1.0, 2.0, 2.0], [1.0, 0.5, 0.0]])
@@ -51,6 +51,56 @@ TRAJECTORIES = Trajectories(
 )
 def test_term_against_numbers_by_hand(term, expected):
     np.testing.assert_allclose(term(TRAJECTORIES), expected, rtol=1e-14)
+
+
+def turned(trajectories, angle):
+    """All lateral quantities turned about the axis, small slopes as vectors."""
+    controls, tips = trajectories.controls.copy(), trajectories.tips.copy()
+    for rows, columns in ((controls, (DB_Y, DB_THETA, DG_Y)), (tips, (Y, THETA))):
+        for k in columns:
+            lateral = (rows[..., k] + 1j * rows[..., k + 1]) * np.exp(1j * angle)
+            rows[..., k], rows[..., k + 1] = lateral.real, lateral.imag
+    return replace(trajectories, controls=controls, tips=tips)
+
+
+@pytest.mark.parametrize("angle", [0.7, np.pi / 2, -2.0])
+def test_no_term_prefers_a_direction_across_the_axis(angle):
+    """Of a needle in the plane that is turned about the axis, with the target."""
+    flat = replace(TRAJECTORIES, tips=TRAJECTORIES.tips * [1.0, 1.0, 1.0, 1e-6, 1e-6])
+
+    def of(given, by):
+        def place(x, lateral):
+            return x, lateral * np.cos(by), lateral * np.sin(by)
+
+        poses = turned(replace(flat, tips=0.5 * flat.tips), by).tips[0]
+        nominal = turned(replace(flat, controls=0.5 * flat.controls), by).controls[0, :, DG_Y : DG_Y + 2]
+        return {
+            "miss": terms.miss(given, place(4.0, -0.5)),
+            "large": terms.large_miss(given, place(4.0, -0.5), 0.1, 0.3),
+            "line": terms.distance_from_line(given, (0.0, 0.0, 0.0), place(4.0, -1.0)),
+            "slope": terms.guide_slope(given),
+            "motion": terms.guide_motion(given),
+            "deviation": terms.deviation(given, poses, 3.0),
+            "departure": terms.guide_departure(given, nominal),
+        }
+
+    here, there = of(flat, 0.0), of(turned(flat, angle), angle)
+    for name, value in here.items():
+        np.testing.assert_allclose(there[name], value, rtol=1e-6, err_msg=name)
+
+
+def test_rolls_are_charged_by_their_angle_to_either_side_and_spins_as_well():
+    """A half turn is one."""
+    rows = controls_of(4, 1, db_x=5.0)
+    rows[:, 0, ROLL], rows[:, 0, SPIN] = (
+        [np.pi, -0.5 * np.pi, 0.25 * np.pi, 0.0],
+        [0.0, 0.0, 0.5 * np.pi, -np.pi],
+    )
+    tips = np.zeros((4, 1, 5))
+    tips[:, :, X] = 40.0
+    given = replace(TRAJECTORIES, controls=rows, tips=tips)
+    np.testing.assert_allclose(terms.flips(given), [1.0, 0.5, 0.75, 1.0])
+    np.testing.assert_allclose(terms.late_rolls(given, 35.0, 5.0), [1.0, 0.5, 0.75, 1.0])
 
 
 def test_distance_from_the_line_is_a_mean_over_the_advance_in_tissue():
