@@ -61,6 +61,18 @@ def test_it_is_that_of_a_monte_carlo_of_a_linear_problem(now, variance):
     assert outlook.sd_to_come(estimate, TARGET) == pytest.approx(miss.std(), rel=0.03)
 
 
+@pytest.mark.parametrize("now", [-20.0, 25.0])
+@pytest.mark.parametrize("miss", [0.0, 0.1, 3.0])
+def test_in_space_it_is_that_on_an_axis(now, miss):
+    """The same problem on both axes, each with its own parameters: the deviation of either."""
+    precision, curves = two_parameters()
+    flat, plane = linear(precision, curves, now)
+    deep, space = linear(np.kron(np.eye(2), precision), np.concatenate([curves, 1j * curves]), now)
+    space.axes = 2
+    assert deep.sd_to_come(space, TARGET) == pytest.approx(flat.sd_to_come(plane, TARGET))
+    assert deep.sd(space, TARGET, miss * (1 - 1j)) == pytest.approx(flat.sd(plane, TARGET, miss))
+
+
 def test_past_the_last_correction_nothing_is_learned():
     """What is known now is all that will be."""
     precision, curves = two_parameters()

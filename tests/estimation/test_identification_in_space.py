@@ -9,7 +9,7 @@ import pytest
 import flexneedle
 from flexneedle.control.methods.adaptive_mpc import AdaptiveMpc
 from flexneedle.estimation.estimate import Move
-from flexneedle.estimation.identification import Identification
+from flexneedle.estimation.identification import Identification, facing
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.prior import Slots
 from flexneedle.estimation.sensors import SENSORS, used
@@ -110,6 +110,13 @@ def test_the_other_axis_of_a_needle_in_the_plane_stays_at_rest():
     estimate, states = followed(40, truth=False)
     np.testing.assert_allclose(estimate.parameters, estimate.prior.mean, atol=2e-4)
     np.testing.assert_allclose(estimate.tip, states[-1].tip, atol=2e-4)
+
+
+def test_the_bevel_turns_with_rolls_and_spins():
+    """After each control, from its direction before them."""
+    rows = flexneedle.controls(2, roll=[0.0, 1.0], spin=[0.25, 0.5])
+    expected = np.exp(1j * (0.4 + np.array([0.25, 1.75])))
+    np.testing.assert_allclose(facing(np.exp(0.4j), rows, 2), expected, rtol=1e-12)
 
 
 # ---- directions of the tip
