@@ -103,6 +103,9 @@ def test_the_estimate_turns_with_the_needle(fitted):
         y, z = estimate.parameters[part]
         np.testing.assert_allclose(turned.parameters[part], [-z, y], atol=2e-3)
     np.testing.assert_allclose(turned.tip[Z], estimate.tip[Y], atol=1e-3)
+    here, there = (one.shape_sd(one.state.nodes) for one in (estimate, turned))
+    np.testing.assert_allclose(there[:, ::-1], here, rtol=0.03, atol=1e-4)
+    assert np.abs(here[:, 0] / here[:, 1] - 1.0).max() > 0.1
 
 
 def test_the_other_axis_of_a_needle_in_the_plane_stays_at_rest():
