@@ -1,6 +1,7 @@
 """Every controller in space, on the rigs it can steer: with guides on two axes and one, and none."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -72,6 +73,29 @@ def test_a_controller_reaches_a_target_off_both_axes(plans, rig, controller, mos
     assert done.true_error_mm < most
     if rig == "one axis":
         assert all(period.command[DG_Z] == 0.0 for period in done.periods)
+
+
+@pytest.mark.parametrize("controller", ["ce-mpc", "resolved-rate", "broyden-mpc"])
+def test_the_guide_moves_about_its_home_on_each_axis(plans, controller):
+    """Mounted off both axes by more than the guide's travel, with the plan moved there: the same commands."""
+    y, z = -4.0, 7.0
+    near = {"setup__max_guide_travel_mm": 3.0, "tracker__jitter_mm": 0.0}
+    entry = {"entry__lateral_mm": y, "entry__lateral_z_mm": z}
+    here = replace(plans["two axes"], scenario=scenario_of(**near))
+    x, *off = here.target
+    target = (x, off[0] + y, off[1] + z)
+    goal = {"target__lateral_mm": target[1], "target__lateral_z_mm": target[2]}
+    moved = {name: getattr(here, name) + np.array([0.0, y, z, 0.0, 0.0]) for name in ("tips", "shapes")}
+    there = replace(
+        here,
+        scenario=scenario_of(**near, **entry, **goal),
+        target=target,
+        guide=here.guide + np.array([y, z]),
+        **moved,
+    )
+    one, other = (inserted(plan.scenario, controller, plan=plan) for plan in (here, there))
+    commands = [np.array([period.command for period in done.periods]) for done in (one, other)]
+    np.testing.assert_allclose(commands[1], commands[0], atol=1e-6)
 
 
 def test_every_controller_is_among_those_above():
