@@ -122,6 +122,18 @@ def test_the_bevel_turns_with_rolls_and_spins():
     np.testing.assert_allclose(facing(np.exp(0.4j), rows, 2), expected, rtol=1e-12)
 
 
+def test_before_a_roll_the_measured_tip_is_on_the_other_side_of_the_axis(fitted):
+    """At a time before the last roll of a quarter turn: off the axis as the bevel was then."""
+    estimate, _ = fitted
+    estimate = replace(estimate, residual=0.0)
+    end = estimate.moves[-1].ended
+    rolled = estimate.move(Control(roll=math.pi / 2), end, end + 0.2)
+    _, y, z = rolled.tip_at(end)
+    off = estimate.run_out * estimate.state.bevel
+    expected = estimate.state.tip[Y : Z + 1] + np.array([off.real, off.imag])
+    np.testing.assert_allclose([y, z], expected, atol=1e-9)
+
+
 # ---- directions of the tip
 
 
