@@ -130,7 +130,7 @@ def in_space(simulator: Simulator, controls: np.ndarray) -> Callable[[], inserti
 
     def call() -> insertion.Outputs:
         out = insertion.outputs(count, steps)
-        insertion.rollout(model, *start, *work, controls, 0, count, out)
+        insertion.rollout(model, *start, *work, controls, np.zeros((count, 2), complex), 0, count, out)
         return out
 
     return call

@@ -69,7 +69,9 @@ def carried_out(state: State, commands: np.ndarray) -> tuple[State, np.ndarray]:
     work = state.rest.copy(), state.compression.copy(), nd.work_array(state.rest)
     start, rows = (state.needle, state.rest, state.compression), np.ascontiguousarray(commands)[None]
     out = insertion.outputs(1, len(commands))
-    needle = insertion.rollout(state.model, *start, *work, rows, 0, 1, out)
+    needle = insertion.rollout(
+        state.model, *start, *work, rows, np.zeros((1, 2), state.rest.dtype), 0, 1, out
+    )
     return solved(state, state.model, needle, *work), out.tips[0]
 
 

@@ -66,6 +66,34 @@ def test_mean_square_deflection_is_that_of_the_nodes(controls):
         assert result.deflection[j, -1] == pytest.approx(mean, rel=1e-5)
 
 
+@pytest.mark.parametrize("preset", ["phantom", "phantom3d"])
+def test_the_deflection_is_that_from_the_axis_of_the_entry(preset, controls):
+    """Moved and tilted with the entry, and from a line of one's own; a straight needle has none from its axis."""
+    simulator = Simulator(preset)
+    values = {"entry.lateral_mm": -4.0, "entry.slope_mrad": 30.0}
+    if preset == "phantom3d":
+        values |= {"entry.lateral_z_mm": 7.0, "entry.slope_z_mrad": -20.0}
+    moved = Simulator(load_scenario(preset).with_values(values | {"setup.stroke_mm": 69.0}))
+    still = moved.rollout(moved.start(), np.zeros((1, 1, 9)), deflection=True)
+    assert still.deflection[0, 0] < 1e-12
+    own = moved.rollout(moved.start(), np.zeros((2, 1, 9)), deflection=True, axes=[[0.0, 0.0], [1.0, 0.0]])
+    x = np.linspace(moved.start().base[0], moved.start().tip[0], 2001)
+    y = np.array([moved.scenario.entry.lateral(each) for each in x])
+    y = y.real if preset == "phantom" else y
+    for found, line in zip(own.deflection[:, 0], (y, y - 1.0), strict=True):
+        assert found == pytest.approx(np.trapezoid(np.abs(line) ** 2, x) / 150.0, rel=1e-6)
+    if preset == "phantom":
+        return
+    # Without tissue forces that depend on the place, an entry that is only moved has the same deflections.
+    shifted = Simulator(
+        load_scenario(preset).with_values({"entry.lateral_mm": -4.0, "entry.lateral_z_mm": 7.0})
+    )
+    here, there = (
+        each.rollout(each.start(), controls[:3, :30], deflection=True) for each in (simulator, shifted)
+    )
+    np.testing.assert_allclose(there.deflection, here.deflection, rtol=1e-6, atol=1e-9)
+
+
 def test_empty_and_single_batches():
     """No sequence, no step, one step."""
     simulator = Simulator(PHANTOM)

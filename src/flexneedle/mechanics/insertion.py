@@ -38,7 +38,7 @@ class Outputs(NamedTuple):
     """Arrays that a rollout of N sequences of m steps fills; what is not wanted has size 0.
 
     tips: poses (N, m, 5); energy: strain energy of the tissue (N, m), mJ; converged (N, m); deflection: mean square of
-    the needle's (N, m), mm²; shapes: poses at n nodes (N, m, n, 5).
+    the needle's (N, m) from an axis, mm²; shapes: poses at n nodes (N, m, n, 5).
     """
 
     tips: Floats
@@ -173,14 +173,20 @@ def energies(model: Model, needle: Needle, u: Laterals, stored: Floats) -> float
 
 
 @inner
-def _mean_square_deflection(model: Model, needle: Needle, w: Work) -> float:
-    """∫y² dx over the length of the needle (mm²), exact for cubics (the consistent mass matrix of a beam)."""
-    (x, y, turn), base = needle.solution.tip, needle.boundary.base
+def _mean_square_deflection(model: Model, needle: Needle, w: Work, axis: Laterals) -> float:
+    """∫y² dx over the length of the needle (mm²), exact for cubics (the consistent mass matrix of a beam).
+
+    axis: y at x = 0 and slope of the line from which y counts.
+    """
+    tip, base = needle.solution.tip, needle.boundary.base
+    at, slope = axis[0], axis[1]
+    x, y, turn = tip.x, tip.y - at - times(tip.x, slope), tip.slope - slope
     total = 0.0
     for i in range(needle.solution.last.behind - 1, -2, -1):
         x0, y0, turn0 = base.x, base.y, base.slope
         if i >= 0:
             x0, y0, turn0 = model.nodes[i].x, w[i].y, w[i].slope
+        y0, turn0 = y0 - at - times(x0, slope), turn0 - slope
         length = x - x0
         squares = (156.0 * (square(y0) + square(y)) + 108.0 * dot(y0, y)) / 420.0
         mixed = (44.0 * (dot(y0, turn0) - dot(y, turn)) + 26.0 * (dot(turn0, y) - dot(y0, turn))) / 420.0
@@ -213,12 +219,14 @@ def rollout(
     u: Laterals,
     w: Work,
     commands: Floats,
+    axes: Laterals,
     first: int,
     last: int,
     out: Outputs,
 ) -> Needle:
     """Run samples first to last − 1 of `commands` (N, m, 9) from one state (paper eq. 1).
 
+    axes (N, 2): y at x = 0 (mm) and slope of the line from which the deflection of a sample counts.
     Fills `out`. Returns the needle after the last sample, of which `rest`, `u` and `w` are left, arrays as in
     `needle.solve`.
     """
@@ -238,7 +246,7 @@ def rollout(
             out.energy[j, k] = _strain_energy(model, needle, u)
             out.converged[j, k] = needle.solution.converged
             if out.deflection.size > 0:
-                out.deflection[j, k] = _mean_square_deflection(model, needle, w)
+                out.deflection[j, k] = _mean_square_deflection(model, needle, w, axes[j])
             if out.shapes.size > 0:
                 _shape(model, needle, w, x, y, slope, out.shapes[j, k])
     return needle

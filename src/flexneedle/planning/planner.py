@@ -21,7 +21,22 @@ from flexneedle.scenario.sections.settings import PlanSettings
 from flexneedle.simulator.control import Limits, controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, Control, Floats, Plan, Point, X, Z, across
+from flexneedle.types import (
+    DB_PSI,
+    DB_THETA,
+    DB_X,
+    DB_Y,
+    DB_Z,
+    DG_Y,
+    Control,
+    Floats,
+    Laterals,
+    Plan,
+    Point,
+    X,
+    Z,
+    across,
+)
 
 _TARGET = "depth and lateral offsets in mm"
 STRATEGIES = ("manipulation", "steering")
@@ -113,14 +128,22 @@ def _search(
 
 
 def _rollout(simulator: Simulator) -> Callable[[Floats], Trajectories]:
-    start, fixed = simulator.start(), not simulator.scenario.entry.free
+    start, free = simulator.start(), simulator.scenario.entry.free
 
     def rollout(controls: Floats) -> Trajectories:
         # Base and guide are mounted at a free entry by the first control, which no limit applies to.
-        result = simulator.rollout(start, controls, deflection=True, limits=fixed)
+        axes = _mounted_axes(simulator.scenario, controls[:, 0]) if free else None
+        result = simulator.rollout(start, controls, deflection=True, limits=not free, axes=axes)
         return Trajectories(controls, *result[:4])
 
     return rollout
+
+
+def _mounted_axes(scenario: Scenario, first: Floats) -> Laterals:
+    """Axes (N, 2) of needles that the controls (N, 9) mount: y + iz (mm) at x = 0, and slope (rad)."""
+    slope = scenario.entry.slope + first[:, DB_THETA] + 1j * first[:, DB_PSI]
+    base = scenario.entry.lateral(scenario.start_base_x) + first[:, DB_Y] + 1j * first[:, DB_Z]
+    return np.stack([base - slope * scenario.start_base_x, slope], axis=1)
 
 
 def _settings(plan: PlanSettings, samples: int) -> Search:

@@ -35,7 +35,7 @@ _ALL_CORES = "leave it out for one per core"
 class Rollout(NamedTuple):
     """Result of N sequences of m steps: poses of the tip (N, m, 5), strain_energy (N, m) in mJ, converged (N, m).
 
-    On demand deflection (N, m), the mean square of the needle's lateral deflection in mm², and shapes (N, m, n, 5),
+    On demand deflection (N, m), the mean square of the needle's distance from its axis in mm², and shapes (N, m, n, 5),
     poses at its nodes; else their size is 0.
     """
 
@@ -123,10 +123,17 @@ class Simulator:
         out, work = insertion.outputs(1, len(rows)), self._work(state)
         start = state.needle, state.rest, state.compression
         driven = along_entry(self.scenario, rows)[None]
-        needle = insertion.rollout(self._model, *start, *work, driven, 0, 1, out)
+        needle = insertion.rollout(self._model, *start, *work, driven, self._axes(1), 0, 1, out)
         return solved(
             replace(state, roll=self._turned(state.roll, rows)), self._model, needle, *work
         ), out.tips[0]
+
+    def _axes(self, count: int, axes: ArrayLike | None = None) -> nd.Laterals:
+        """Lines (count, 2) from which a deflection counts, of the type of the state's laterals."""
+        entry = self.scenario.entry
+        given = np.array([entry.lateral(0.0), entry.slope]) if axes is None else np.asarray(axes)
+        lines = np.broadcast_to(given, (count, 2))
+        return np.array(lines.real if self.scenario.setup.axes == 1 else lines + 0j)
 
     def _turned(self, angle: float, rows: Floats) -> float:
         """The needle's angle (rad) after controls (m, 9), summed in order, as repeated steps do."""
@@ -154,13 +161,15 @@ class Simulator:
         rough: bool = False,
         deflection: bool = False,
         shapes: bool = False,
+        axes: ArrayLike | None = None,
     ) -> Rollout:
         """Run each of N sequences from `state`; controls (N, m, 9): the columns of `Control`, see `controls`.
 
         Equal to repeated `step`, bit by bit; InputError for another shape, CommandError for a value out of range.
         Without `limits` a step may be longer than a command; a `rough` rollout solves each only to 1e-4 mm: for long
         predictions with little work.
-        With `deflection` or `shapes` the result has these, too.
+        With `deflection` or `shapes` the result has these, too; the deflection of each sequence is that from its line
+        in `axes` (N, 2): y + iz (mm) at x = 0 and slope (rad), by default the axis of the entry.
         """
         self._own(state)
         rows = np.array(controls, dtype=float)  # a copy: the kernel is compiled for writable arrays
@@ -171,6 +180,7 @@ class Simulator:
             self._limits.check(state.travel, rows, state.roll)
         rows = along_entry(self.scenario, rows)
         n, m = rows.shape[:2]
+        lines = self._axes(n, axes)
         out = insertion.outputs(
             n, m, deflection=deflection, nodes=self.scenario.needle.nodes if shapes else 0
         )
@@ -179,7 +189,7 @@ class Simulator:
         constants = loose if rough else self._model
 
         def run(first: int, last: int) -> None:
-            insertion.rollout(constants, *start, *self._work(state), rows, first, last, out)
+            insertion.rollout(constants, *start, *self._work(state), rows, lines, first, last, out)
 
         threads = min(self.threads, n * m // _STEPS_WORTH_A_THREAD)
         if threads <= 1:
