@@ -15,6 +15,7 @@ from flexneedle.rig.phantom.plants import PLANTS
 from flexneedle.rig.virtual import Seeds, virtual_rig
 from flexneedle.simulator.control import half_turned
 from flexneedle.types import Measurement, VerdictKind
+from rooms import STILL
 
 SPACE = load_scenario("phantom").with_values({"setup.axes": 2, "phantom.motor_resolution_mm": 0.0})
 ENTERED = SPACE.with_values(
@@ -103,8 +104,9 @@ def read(values, seed=4):
     return rig.tracker.read()[-1], rig.truth().tip
 
 
-def test_a_bias_of_the_tracker_is_in_all_coordinates():
-    reading, tip = read({"phantom.tracker_bias_mm": 0.5})
+@pytest.mark.parametrize("room", [{}, {"tracker.environment": STILL}])
+def test_a_bias_of_the_tracker_is_in_all_coordinates(room):
+    reading, tip = read({"phantom.tracker_bias_mm": 0.5, **room})
     off = np.array([reading.x, reading.y, reading.z]) - tip[:3]
     assert np.linalg.norm(off) == pytest.approx(0.5)
     assert np.abs(off).min() > 0.01

@@ -230,6 +230,17 @@ def test_command_that_is_no_number_is_refused(name, value):
         SIMULATOR.step(SIMULATOR.start(), Control(**{name: value}))
 
 
+@pytest.mark.parametrize("preset", ["phantom", "phantom3d"])
+def test_travel_is_the_sum_of_the_commands_also_along_a_tilted_entry(preset):
+    """The base advances along the axis; what it moves sideways by that does not count as lateral travel."""
+    tilt = {"entry.slope_mrad": 40.0} | ({"entry.slope_z_mrad": -30.0} if preset == "phantom3d" else {})
+    simulator = Simulator(load_scenario(preset).with_values(tilt))
+    state = simulator.start()
+    for _ in range(20):
+        state = simulator.step(state, Control(db_x=1.0, db_y=0.01, dg_y=0.02))
+    np.testing.assert_allclose(state.travel, [20.0, 0.2, 0.0, 0.0, 0.0, 0.4, 0.0], atol=1e-10)
+
+
 @pytest.mark.parametrize(
     ("name", "step", "travel"), [("db_x", 1.0, 110.0), ("dg_y", 0.5, 15.0), ("db_y", -0.5, 15.0)]
 )
