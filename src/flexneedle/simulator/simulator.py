@@ -133,7 +133,8 @@ class Simulator:
         entry = self.scenario.entry
         given = np.array([entry.lateral(0.0), entry.slope]) if axes is None else np.asarray(axes)
         lines = np.broadcast_to(given, (count, 2))
-        return np.array(lines.real if self.scenario.setup.axes == 1 else lines + 0j)
+        # Row by row in memory: another order would compile a second kernel.
+        return np.array(lines.real if self.scenario.setup.axes == 1 else lines + 0j, order="C")
 
     def _turned(self, angle: float, rows: Floats) -> float:
         """The needle's angle (rad) after controls (m, 9), summed in order, as repeated steps do."""
