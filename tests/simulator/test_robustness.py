@@ -51,6 +51,8 @@ def test_random_sequences_in_space_and_of_adapted_models_run_without_failure(stu
     [
         pytest.param(320, id="iterations that run away"),
         pytest.param(510, id="a needle that touches its guide almost without force"),
+        pytest.param(648, id="a needle that two walls take turns to push"),
+        pytest.param(3168, id="a needle that goes round from wall to wall"),
     ],
 )
 def test_rare_steps_of_an_adapted_model_in_space_converge(study, capsys, batch):

@@ -42,6 +42,7 @@ Laterals = NDArray[Any]
 Work = NDArray[Any]
 
 COUPLED_ITERATIONS = 15
+BEARING_LOOKS = 15
 MAX_ITERATIONS = 100
 
 
@@ -573,19 +574,29 @@ def _iterate(
     w: Work,
     held: Lateral,
     radial_weight: float,
-) -> tuple[Pose, Iterate, Loads, int, float]:
-    """One iteration, in place; returns tip, where the next begins, loads, first node being cut, what is left (mm)."""
+) -> tuple[Pose, Iterate, Loads, int, float, bool]:
+    """One iteration, in place; returns tip, where the next begins, loads, first node being cut, what is left (mm), and
+    whether the needle bears on its guide as it began.
+
+    Without coupling it first finds where in the guide its own quadratic energy is least: a line search towards that
+    point descends, so that the needle cannot go from wall to wall in a cycle.
+    """
     nodes = model.nodes
     tip_x = boundary.base.x + model.length - at.shortening
     count = _behind(model, tip_x, at.behind)
     fresh = count
     while fresh > 0 and nodes[fresh - 1].x > cut.channel.front:
         fresh -= 1
-    ahead = _sweep_out(
-        model, boundary, cut, at.guide.wall, path, rest, u, w, tip_x, count, fresh, radial_weight
-    )
-    tip = _tip(model, boundary, cut, at.spring, path, tip_x, held, ahead)
-    shear, moment, shortening, left, fraction = _sweep_back(model, boundary, u, w, tip_x, tip, count)
+    guide = at.guide
+    for _ in range(1 if path.coupling > 0.0 else BEARING_LOOKS):
+        ahead = _sweep_out(
+            model, boundary, cut, guide.wall, path, rest, u, w, tip_x, count, fresh, radial_weight
+        )
+        tip = _tip(model, boundary, cut, at.spring, path, tip_x, held, ahead)
+        shear, moment, shortening, left, fraction = _sweep_back(model, boundary, u, w, tip_x, tip, count)
+        agrees, guide = _bearing(model, boundary, w, count, guide)
+        if agrees:
+            break
     if path.coupling == 0.0 and left > model.tolerance:
         front, spring = cut.channel.front, at.spring
         fraction = min(fraction, _line_search(model, front, spring, u, w, count, tip_x, tip.spring))
@@ -595,10 +606,11 @@ def _iterate(
     spring = tip.spring if fraction == 1.0 else at.spring + times(fraction, tip.spring - at.spring)
     return (
         Pose(tip_x, tip.y, tip.slope),
-        Iterate(spring, shortening, at.guide, count),
+        Iterate(spring, shortening, guide, count),
         Loads(tip.force, tip.reaction, shear, moment),
         fresh,
         left if fraction == 1.0 else math.inf,
+        agrees,
     )
 
 
@@ -635,19 +647,21 @@ def solve(
             at = Iterate(spring, last.shortening, guide_before, last.behind)
             path = Path(0.0, y)
         radial_weight = 0.5 if path.coupling > 0.0 else float(iteration % 2)
-        tip, new, loads, fresh, left = _iterate(
+        tip, new, loads, fresh, left, agrees = _iterate(
             model, boundary, cut, at, path, rest, u, w, held, radial_weight
         )
         slide = at.shortening - new.shortening if path.coupling > 0.0 else 0.0
         found = left <= model.tolerance and abs(slide) <= model.slide
-        agrees, guide = _bearing(model, boundary, w, new.behind, new.guide)
+        guide, shortening = new.guide, new.shortening
         if found and agrees:
-            at = Iterate(new.spring, new.shortening, guide, new.behind)
+            at = new
             break
-        # On the circle the needle moves on from a solution: before it, the displacement per force is not known.
-        if not found and size(guide.wall) > 0.0 and size(new.guide.wall) > 0.0:
-            guide = new.guide
-        at = Iterate(new.spring, new.shortening if path.coupling > 0.0 else at.shortening, guide, new.behind)
+        if path.coupling == 0.0:
+            shortening = at.shortening
+        elif not found and size(guide.wall) > 0.0 and size(at.guide.wall) > 0.0:
+            # On the circle the needle moves on from a solution: before it, the displacement per force is not known.
+            guide = at.guide
+        at = Iterate(new.spring, shortening, guide, new.behind)
     on = times(slide, tip.slope) if math.isnan(held.real) else times(0.0, tip.slope)
     tip = Pose(tip.x + slide, tip.y + on, tip.slope)
     finite = math.isfinite(size(tip.y)) and math.isfinite(tip.x)
