@@ -536,8 +536,10 @@ def _guess(model: Model, boundary: Boundary, cut: Cut, last: Iterate, u: Lateral
 
 
 @inner
-def _bearing(model: Model, boundary: Boundary, w: Work, count: int, last: Bearing) -> tuple[bool, Bearing]:
-    """Whether the needle bears on its guide as was assumed, and what to assume next.
+def _bearing(
+    model: Model, boundary: Boundary, w: Work, count: int, last: Bearing, settled: float
+) -> tuple[bool, Bearing]:
+    """Whether the needle bears on its guide as was assumed, to `settled` (mm), and what to assume next.
 
     A wall only pushes, and between the walls nothing does: one inequality of a convex problem, so that few changes do.
     In space the wall is a circle, which pushes towards its middle: the needle bears on the point nearest to where it
@@ -547,7 +549,7 @@ def _bearing(model: Model, boundary: Boundary, w: Work, count: int, last: Bearin
         return True, last
     y, force, bears = w[0].y - boundary.guide, w[0].force, size(last.wall) > 0.0
     give, moved = last.give, size(y - last.y)
-    if moved > model.slide:  # not at the first look in a solve, where the last y is NaN
+    if moved > settled:  # not at a first look, where the last y is NaN
         give = min(moved / size(force - last.force), w[0].b11)
     free = y - times(give, force)
     distance = size(free)
@@ -558,7 +560,7 @@ def _bearing(model: Model, boundary: Boundary, w: Work, count: int, last: Bearin
     if off or (pulls and dot(free, last.wall) <= 0.0):
         return not bears, Bearing(times(0.0, y), give, y, force)
     wall = free / distance if distance > 0.0 else last.wall
-    agrees = bears and model.clearance * size(wall - last.wall) <= model.slide
+    agrees = bears and model.clearance * size(wall - last.wall) <= settled
     return agrees, Bearing(wall, give, y, force)
 
 
@@ -587,14 +589,18 @@ def _iterate(
     fresh = count
     while fresh > 0 and nodes[fresh - 1].x > cut.channel.front:
         fresh -= 1
-    guide = at.guide
-    for _ in range(1 if path.coupling > 0.0 else BEARING_LOOKS):
+    looks, settled, guide = 1, model.slide, at.guide
+    if path.coupling == 0.0:
+        unknown = times(math.nan, boundary.guide)
+        looks, settled = BEARING_LOOKS, 0.1 * model.tolerance
+        guide = Bearing(guide.wall, guide.give, unknown, unknown)
+    for _ in range(looks):
         ahead = _sweep_out(
             model, boundary, cut, guide.wall, path, rest, u, w, tip_x, count, fresh, radial_weight
         )
         tip = _tip(model, boundary, cut, at.spring, path, tip_x, held, ahead)
         shear, moment, shortening, left, fraction = _sweep_back(model, boundary, u, w, tip_x, tip, count)
-        agrees, guide = _bearing(model, boundary, w, count, guide)
+        agrees, guide = _bearing(model, boundary, w, count, guide, settled)
         if agrees:
             break
     if path.coupling == 0.0 and left > model.tolerance:
