@@ -72,7 +72,7 @@ class AdaptiveMpc(Priors):
     """Cost of a roll of the bevel."""
     reach_weight: NonNegative = 1.0
     """Weight of the expected distance of the target from the bevel's reach, with the guide fixed."""
-    unguided_reach_weight: NonNegative = 30.0
+    unguided_reach_weight: NonNegative = 100.0
     """`reach_weight` where the guide may not move, or not on the axis across which the bevel steers alone."""
     late_roll_weight: NonNegative = 1.0
     """Weight of the standard deviation of the tip's motion in a roll just before the target."""
