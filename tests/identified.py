@@ -11,7 +11,7 @@ from flexneedle.estimation.prior import Slots
 from flexneedle.estimation.sensors import POSITION, SENSORS
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Control, Measurement
+from flexneedle.types import Control, Measurement, Motion
 from tasks import begun_with
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -111,7 +111,7 @@ def followed(needle, count, *, scenario=QUIET, noise=0.0, late=0, threads=1, per
     estimate = Identification().begin(begun_with(Simulator(scenario, threads)))
     batches = [readings(needle, states[k], states[k + 1], k, per_move, noise, rng) for k in range(len(rows))]
     for k, row in enumerate(rows):
-        estimate = estimate.move(row, k, k + 1.0)
+        estimate = estimate.move(Motion(row, k, k + 1.0))
         if k >= late:
             estimate = estimate.observe(batches[k - late])
     for batch in batches[count - late :] if late else ():
@@ -131,7 +131,7 @@ def ahead(estimate, needle, states, scenario=QUIET, steps=8):
         row = Control(db_x=1.0, dg_y=0.1)
         truth = own.step(truth, row)
         naive = nominal.step(naive, row)
-        estimate = estimate.move(row, 100.0 + k, 101.0 + k)
+        estimate = estimate.move(Motion(row, 100.0 + k, 101.0 + k))
     goal = needle.measured(truth)[1]
     return abs(estimate.tip[1] - goal), abs(naive.tip[1] - goal)
 

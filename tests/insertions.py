@@ -13,7 +13,7 @@ from flexneedle.rig.phantom.draw import draw
 from flexneedle.rig.phantom.phantom import Phantom
 from flexneedle.rig.tracking.simulated import NoisyTracker
 from flexneedle.rig.virtual import Rig
-from flexneedle.types import STILL, VISIBLE, Measurement
+from flexneedle.types import STILL, VISIBLE, Measurement, Motion
 
 PHANTOM = flexneedle.load_scenario("phantom")
 READING = PHANTOM.tracker.period
@@ -42,8 +42,12 @@ class Tank:
 
     def apply(self, command, duration):
         self.moves.append((self.phantom.now(), command))
-        self.applied.append(self.phantom.apply(command, duration))
-        return self.applied[-1]
+        motion = self.phantom.apply(command, duration)
+        self.applied.append(motion.control)
+        return motion
+
+    def stop(self):
+        self.phantom.stop()
 
     def rig(self):
         return Rig(self.phantom, self, self, self.phantom.condition)
@@ -65,8 +69,11 @@ class Stage:
         self.time += seconds
 
     def apply(self, command, duration):
-        self.time += duration
-        return next(self.applied, command)
+        begun, self.time = self.time, self.time + duration
+        return Motion(next(self.applied, command), begun, self.time)
+
+    def stop(self):
+        """Nothing moves between commands."""
 
     def read(self):
         return next(self.tape)

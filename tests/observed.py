@@ -7,7 +7,7 @@ import numpy as np
 import flexneedle
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Control, Measurement
+from flexneedle.types import Control, Measurement, Motion
 from tasks import begun_with
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -52,6 +52,6 @@ def follow(truth, estimate, plant, steps, *, noise=0.0, force=0.0, guide=0.0):
     for k in range(steps):
         before, truth = truth, plant.step(truth.with_estimate(tip_load=(force,)), command)
         readings = [replace(s, y=s.y + rng.normal(0.0, noise)) for s in readings_between(before, truth, k)]
-        estimate = estimate.move(command, k, k + 1.0).observe(readings)
+        estimate = estimate.move(Motion(command, k, k + 1.0)).observe(readings)
         innovations.append(estimate.innovation)
     return truth, estimate, np.array(innovations)

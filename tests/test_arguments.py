@@ -22,7 +22,7 @@ MAKE = "make one with flexneedle.plan(scenario)"
 OWN = "module:NAME of your own"
 MISSING = "name: missing\nneedle = 3: must be a table\nsetup: missing\ntissue: missing"
 VALUES = flexneedle.load_scenario("phantom").values()
-BENCH = SimpleNamespace(now=float, wait=float, apply=tuple, read=tuple, status="")
+BENCH = SimpleNamespace(now=float, wait=float, apply=tuple, stop=tuple, read=tuple, status="")
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ BENCH = SimpleNamespace(now=float, wait=float, apply=tuple, read=tuple, status="
         ),
         (
             lambda: flexneedle.Rig(BENCH, 2, 3),
-            "driver = 2: must be an object with apply; see flexneedle.rig.ports.Driver",
+            "driver = 2: must be an object with apply, stop; see flexneedle.rig.ports.Driver",
         ),
         (
             lambda: flexneedle.Rig(BENCH, BENCH, SimpleNamespace(read=1)),

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from flexneedle.simulator.simulator import Simulator
     from flexneedle.simulator.state import State
     from flexneedle.study.runner import run_study
-    from flexneedle.types import Control, Insertion, Measurement, Plan, Pose
+    from flexneedle.types import Control, Insertion, Measurement, Motion, Plan, Pose
 
 __version__ = "0.1.0"
 
@@ -52,6 +52,7 @@ __all__ = [
     "Layer",
     "Measurement",
     "Method",
+    "Motion",
     "Plan",
     "Plant",
     "Pose",
@@ -107,7 +108,7 @@ _HOMES = {
     "simulator.simulator": ("Simulator",),
     "simulator.state": ("State",),
     "study.runner": ("run_study",),
-    "types": ("Control", "Insertion", "Measurement", "Plan", "Pose"),
+    "types": ("Control", "Insertion", "Measurement", "Motion", "Plan", "Pose"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

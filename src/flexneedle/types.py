@@ -161,6 +161,15 @@ class Control(_Columns):
 STILL = Control()
 """No motion."""
 
+
+class Motion(NamedTuple):
+    """A control as a driver carried it out, from `begun` to `ended` (s, on the clock of the run)."""
+
+    control: Control
+    begun: float
+    ended: float
+
+
 Quaternion = tuple[float, float, float, float]
 """Unit quaternion w, x, y, z from the sensor's to the tracker's frame; the sensor's z axis is the needle's."""
 
@@ -489,22 +498,27 @@ class Insertion:
         return sum((end - begin for period, (begin, end) in spans if period.action is Action.HOLD), 0.0)
 
     @property
+    def error_mm(self) -> float:
+        """`true_error_mm`; where the truth is unknown, as on a rig, `residual_mm`."""
+        return self.residual_mm if math.isnan(self.true_error_mm) else self.true_error_mm
+
+    @property
     def reached(self) -> bool:
-        """Whether the outcome is done and the true tip ended within 1 mm of the target."""
-        return self.outcome is Outcome.DONE and self.true_error_mm <= 1.0
+        """Whether the outcome is done and the tip ended within 1 mm of the target, by `error_mm`."""
+        return self.outcome is Outcome.DONE and self.error_mm <= 1.0
 
     @property
     def summary(self) -> str:
         """Outcome of the insertion in one line."""
-        error = self.true_error_mm
         if self.outcome is not Outcome.DONE:
             after = f"{self.outcome} after {len(self.periods)} periods"
             return f"{after}: {self.reason}" if self.reason else after
-        if np.isnan(error):
-            return "done: true tip unknown"
+        if math.isnan(self.error_mm):
+            return "done: neither the true tip nor a reading of it is known"
+        by = " by the tracker" if math.isnan(self.true_error_mm) else ""
         if self.reached:
-            return f"reached: the tip ended {error:.3f} mm from the target"
-        return f"MISSED: the tip ended {error:.3f} mm from the target, more than 1 mm"
+            return f"reached: the tip ended {self.error_mm:.3f} mm from the target{by}"
+        return f"MISSED: the tip ended {self.error_mm:.3f} mm from the target{by}, more than 1 mm"
 
     def __repr__(self) -> str:
         to = f"to {_mm(self.target)}, {len(self.periods)} periods, seed {self.seed}"

@@ -19,7 +19,7 @@ from flexneedle.planning.terms import cost
 from flexneedle.scenario.worlds import world
 from flexneedle.simulator.control import controls as controls_of
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import DG_Y, ROLL, STILL, THETA, Control, Measurement, X, Y
+from flexneedle.types import DG_Y, ROLL, STILL, THETA, Control, Measurement, Motion, X, Y
 from reference.cases import numbers
 from tasks import stretched, task_of
 
@@ -46,7 +46,7 @@ def carried_out(plan, scenario, plant=None, steps=100, seed=0):
         command = STILL if decision.rest > 0.0 else decision.command
         truth = plant.step(truth, command)
         x, y = truth.tip[:2].tolist()
-        estimate = estimate.move(command, k, k + 1.0).observe([Measurement(k + 1.0, x, y)])
+        estimate = estimate.move(Motion(command, k, k + 1.0)).observe([Measurement(k + 1.0, x, y)])
         if ADAPTIVE.arrived(task, memory, estimate):
             break
     return decisions, truth, estimate
@@ -245,7 +245,7 @@ def test_limits_are_kept_whatever_the_plan(quick_plan, step, reach, advance, str
     for k in range(12):
         decision, memory = ADAPTIVE.decide(task, memory, estimate, rng)
         simulator.check(estimate.state, decision.command)
-        estimate = estimate.move(decision.command, k, k + 1.0)
+        estimate = estimate.move(Motion(decision.command, k, k + 1.0))
         x, y = estimate.tip[:2]
         estimate = estimate.observe([Measurement(k + 1.0, float(x), float(y) + rng.normal(0.0, 0.5))])
         places.append(estimate.state.guide[0])

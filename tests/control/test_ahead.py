@@ -9,7 +9,7 @@ import flexneedle
 from flexneedle.control.ahead import along_plan, rest_of_plan
 from flexneedle.control.methods import METHODS
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, Control, X
+from flexneedle.types import DB_PSI, DB_THETA, DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, Control, Motion, X
 from tasks import task_of
 
 SCENARIOS = {
@@ -28,7 +28,7 @@ def estimates(plan, controller, steps):
     task = task_of(Simulator(plan.scenario, 1), plan, controller)
     estimate = METHODS[controller].observer.begin(task)
     for k, row in enumerate(plan.controls[:steps]):
-        estimate = estimate.move(Control.of(row), 0.2 * k, 0.2 * (k + 1))
+        estimate = estimate.move(Motion(Control.of(row), 0.2 * k, 0.2 * (k + 1)))
     return task, estimate
 
 

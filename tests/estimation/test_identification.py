@@ -7,7 +7,7 @@ import pytest
 
 from flexneedle.estimation.identification import Identification
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import STILL, Control, Measurement, X, Y
+from flexneedle.types import STILL, Control, Measurement, Motion, X, Y
 from identified import (
     BASE,
     BEND,
@@ -82,7 +82,7 @@ def test_at_rest_the_tip_is_found_too_with_derivatives_that_are_renewed_alternat
     estimate, states = followed(needle, 70)
     x, y = needle.measured(states[-1]).tolist()
     for k in range(8):
-        estimate = estimate.move(STILL, 70.0 + k, 71.0 + k).observe([Measurement(71.0 + k, x, y)])
+        estimate = estimate.move(Motion(STILL, 70.0 + k, 71.0 + k)).observe([Measurement(71.0 + k, x, y)])
     assert estimate.tip[Y] == pytest.approx(y, abs=5e-3)
 
 
@@ -195,7 +195,9 @@ def test_more_noise_means_less_is_believed():
     for jitter in (1e-3, 0.05, 0.5):
         scenario = TIGHT.with_values({"tracker.jitter_mm": jitter})
         estimate = (
-            Identification().begin(begun_with(Simulator(scenario, 1))).move(Control(db_x=1.0), 0.0, 1.0)
+            Identification()
+            .begin(begun_with(Simulator(scenario, 1)))
+            .move(Motion(Control(db_x=1.0), 0.0, 1.0))
         )
         moved.append(estimate.observe([Measurement(1.0, -27.5, 0.1)]).tip[Y])
     assert 0.1 > moved[0] > moved[1] > moved[2] > 0.0
@@ -246,7 +248,7 @@ def test_the_error_along_the_axis_is_as_uncertain_as_it_is_off():
         states = needle.inserted(scenario, rows)
         estimate = Identification().begin(begun_with(Simulator(scenario, 1)))
         for k, row in enumerate(rows):
-            estimate = estimate.move(row, k, k + 1.0)
+            estimate = estimate.move(Motion(row, k, k + 1.0))
             estimate = estimate.observe(readings(needle, states[k], states[k + 1], k, 2, noise, rng))
         off.append((estimate.axial - needle.base_x) / np.sqrt(estimate.axial_variance))
     assert np.sqrt(estimate.axial_variance) == pytest.approx(noise / np.sqrt(12.0), rel=0.01)
@@ -266,7 +268,7 @@ def test_idle_periods_are_one_move_and_cost_no_simulation(monkeypatch):
     """However many: its readings are those of all of them, and the needle is not simulated again to move it."""
     needle = NEEDLES["bend"]
     estimate, states = followed(needle, 30)
-    resting = estimate.move(STILL, 30.0, 31.0)
+    resting = estimate.move(Motion(STILL, 30.0, 31.0))
     assert len(resting.moves) == 31
     np.testing.assert_allclose(resting.tip, estimate.tip, atol=1e-6)
     resting = resting.observe([Measurement(31.0, *needle.measured(states[-1]).tolist())])
@@ -279,11 +281,11 @@ def test_idle_periods_are_one_move_and_cost_no_simulation(monkeypatch):
             no_simulation.setattr(Simulator, name, none)
         longer = resting
         for k in range(20):
-            longer = longer.move(STILL, 31.0 + k, 32.0 + k)
+            longer = longer.move(Motion(STILL, 31.0 + k, 32.0 + k))
     assert longer.state is resting.state
     assert (len(longer.moves), longer.tips.shape) == (31, resting.tips.shape)
     assert (longer.moves[-1].begun, longer.moves[-1].ended) == (30.0, 51.0)
     updated = longer.observe([Measurement(50.0, *needle.measured(states[-1]).tolist())])
     assert len(updated.moves[-1].measurements) == 2
     assert updated.tip_at(40.5) == pytest.approx(tuple(updated.tip[:3]), abs=1e-6)
-    assert len(updated.move(Control(db_x=1.0), 51.0, 52.0).moves) == 32
+    assert len(updated.move(Motion(Control(db_x=1.0), 51.0, 52.0)).moves) == 32

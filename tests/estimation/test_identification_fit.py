@@ -8,7 +8,7 @@ import pytest
 from flexneedle.estimation import identification as idn
 from flexneedle.estimation.identification import Identification
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import ROLL, Control, Measurement, X, Y
+from flexneedle.types import ROLL, Control, Measurement, Motion, X, Y
 from identified import (
     BASE,
     BEND,
@@ -97,7 +97,7 @@ def test_no_derivative_is_older_than_a_round():
     last, leading = {}, (BASE, SLOPE, BEND, BEVEL, CLEARANCE)
     for k, row in enumerate(rows):
         batch = readings(Needle(), states[k], states[k + 1], k, 2, 0.0, np.random.default_rng(0))
-        estimate = estimate.move(row, k, k + 1.0).observe(batch)
+        estimate = estimate.move(Motion(row, k, k + 1.0)).observe(batch)
         last |= {one.parameter: k for one in estimate.perturbed}
     everyone = set(range(estimate.parameters.size)) - {RUN_OUT}
     assert set(last) == everyone
@@ -192,7 +192,7 @@ def test_a_step_never_fits_worse(monkeypatch):
         for k, row in enumerate(commands(50)):
             x, y = states[k + 1].tip[:2].tolist()
             off = jump * (-1) ** (k // 5)
-            estimate = estimate.move(row, k, k + 1.0).observe([Measurement(k + 1.0, x, y + off)])
+            estimate = estimate.move(Motion(row, k, k + 1.0)).observe([Measurement(k + 1.0, x, y + off)])
     before, after = np.array(costs).T
     assert (after <= before * (1.0 + 1e-8)).all()
     assert len(set(tried)) >= 3
@@ -271,7 +271,7 @@ def test_a_jacobian_that_is_not_finite_leaves_the_parameters(monkeypatch):
 def test_readings_of_a_move_are_averaged_at_their_mean_time():
     estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1)))
     for k in range(2):
-        estimate = estimate.move(Control(db_x=1.0), 2.0 * k, 2.0 * k + 2.0)
+        estimate = estimate.move(Motion(Control(db_x=1.0), 2.0 * k, 2.0 * k + 2.0))
     readings = [Measurement(2.5, -27.3, 0.1), Measurement(3.5, -26.7, 0.3)]
     (means,) = estimate.observe(readings)._readings
     assert (means.index.tolist(), means.count.tolist()) == ([1], [2.0])
@@ -283,7 +283,7 @@ def test_readings_of_a_move_are_averaged_at_their_mean_time():
 def test_a_reading_is_on_the_side_to_which_the_bevel_rolled_before_its_move(roll, first):
     estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1), roll))
     for k, flip in enumerate((False, True, False, True, False)):
-        estimate = estimate.move(Control(db_x=1.0, flip=flip), float(k), k + 1.0)
+        estimate = estimate.move(Motion(Control(db_x=1.0, flip=flip), float(k), k + 1.0))
     readings = [Measurement(k + 0.5, -28.0 + k, 0.0) for k in (0, 1, 3, 4)]
     (means,) = estimate.observe(readings)._readings
     np.testing.assert_array_equal(means.index, [0, 1, 3, 4])
@@ -331,7 +331,7 @@ def test_readings_leave_nothing_more_uncertain():
     volumes, prior = [], np.linalg.inv(estimate.prior.precision)
     for k, row in enumerate(rows):
         batch = readings(needle, states[k], states[k + 1], k, 4, 0.0, np.random.default_rng(0))
-        estimate = estimate.move(row, k, k + 1.0).observe(batch)
+        estimate = estimate.move(Motion(row, k, k + 1.0)).observe(batch)
         volumes.append(np.linalg.slogdet(estimate.covariance)[1])
         assert np.linalg.eigvalsh(prior - estimate.covariance).min() > -1e-9
     assert volumes[0] < np.linalg.slogdet(prior)[1]

@@ -15,7 +15,7 @@ from flexneedle.estimation.prior import Slots
 from flexneedle.estimation.sensors import SENSORS, used
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import THETA, Control, Measurement, Y, Z
+from flexneedle.types import THETA, Control, Measurement, Motion, Y, Z
 from tasks import begun_with
 
 QUIET = flexneedle.load_scenario("phantom").with_values(
@@ -71,7 +71,7 @@ def followed(count, scenario=QUIET, turn=0.0, truth=True, given=lambda one: one,
         x, y, z, theta, psi = state.tip.tolist()
         reading = Measurement(0.2 * (k + 1), x, y + np.real(off), z + np.imag(off))
         reading = replace(reading, direction=(theta + np.real(tilt), psi + np.imag(tilt)))
-        estimate = estimate.move(row, 0.2 * k, 0.2 * (k + 1)).observe([given(reading)])
+        estimate = estimate.move(Motion(row, 0.2 * k, 0.2 * (k + 1))).observe([given(reading)])
     return estimate, states
 
 
@@ -127,7 +127,7 @@ def test_before_a_roll_the_measured_tip_is_on_the_other_side_of_the_axis(fitted)
     estimate, _ = fitted
     estimate = replace(estimate, residual=0.0)
     end = estimate.moves[-1].ended
-    rolled = estimate.move(Control(roll=math.pi / 2), end, end + 0.2)
+    rolled = estimate.move(Motion(Control(roll=math.pi / 2), end, end + 0.2))
     _, y, z = rolled.tip_at(end)
     off = estimate.run_out * estimate.state.bevel
     expected = estimate.state.tip[Y : Z + 1] + np.array([off.real, off.imag])

@@ -8,7 +8,7 @@ import pytest
 from flexneedle.estimation.identification import Identification
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Control, Measurement, X, Y
+from flexneedle.types import Control, Measurement, Motion, X, Y
 from identified import (
     BASE,
     BEND,
@@ -43,7 +43,7 @@ def test_parameters_stay_within_four_standard_deviations(off):
     states = Needle().inserted(PHANTOM, rows)
     estimate = Identification().begin(begun_with(Simulator(PHANTOM, 1)))
     for k, row in enumerate(rows):
-        estimate = estimate.move(row, k, k + 1.0)
+        estimate = estimate.move(Motion(row, k, k + 1.0))
         x, y = states[k + 1].tip[:2]
         estimate = estimate.observe([Measurement(k + 1.0, float(x), float(y) + off * (-1) ** (k // 10))])
         found = estimate.parameters
@@ -68,8 +68,8 @@ def test_mirrored_readings_give_the_mirrored_estimate():
     for k, row in enumerate(rows):
         away = row._replace(dg_y=-row.dg_y)
         batch = readings(needle, states[k], states[k + 1], k, 2, 0.0, np.random.default_rng(0))
-        here = here.move(row, k, k + 1.0).observe(batch)
-        there = there.move(away, k, k + 1.0).observe([replace(s, y=-s.y) for s in batch])
+        here = here.move(Motion(row, k, k + 1.0)).observe(batch)
+        there = there.move(Motion(away, k, k + 1.0)).observe([replace(s, y=-s.y) for s in batch])
     np.testing.assert_allclose(there.tip, here.tip * MIRROR, atol=1e-6)
     mirrored = np.where(np.isin(np.arange(here.parameters.size), (BASE, SLOPE)), -1.0, 1.0)
     np.testing.assert_allclose(there.parameters, mirrored * here.parameters, atol=1e-4)
@@ -86,7 +86,7 @@ def test_a_roll_of_the_bevel_mirrors_bend_and_run_out():
     state = adapted.step(simulator.start(), Control())
     bent = replace(estimate, simulator=adapted, state=state, parameters=parameters)
     assert bent.tip[Y] == pytest.approx(0.7, abs=1e-4)  # the bend shortens the needle a little
-    mirrored = bent.move(Control(db_x=0.1, flip=True), 0.0, 1.0)
+    mirrored = bent.move(Motion(Control(db_x=0.1, flip=True), 0.0, 1.0))
     np.testing.assert_allclose(mirrored.tip[1:], -bent.tip[1:], atol=1e-9)
     assert bent.off_axis(-1) == pytest.approx(-bent.off_axis(1))
     left = replace(bent, residual=0.03)
@@ -99,7 +99,7 @@ def test_a_bevel_rolls_before_its_move_and_so_does_the_run_out():
     estimate, _ = followed(needle, 20, scenario=TIGHT)
     assert commands(21)[20].rolls
     before, after = needle.inserted(TIGHT, commands(21))[20:22]
-    moved = estimate.move(commands(21)[20], 20.0, 21.0)
+    moved = estimate.move(Motion(commands(21)[20], 20.0, 21.0))
     assert moved.tip[Y] == pytest.approx(needle.measured(after)[1], abs=2e-3)
     corrected = moved.observe(readings(needle, before, after, 20, 4, 0.0, np.random.default_rng(0)))
     assert corrected.tip[Y] == pytest.approx(needle.measured(after)[1], abs=2e-3)
@@ -146,7 +146,7 @@ def test_the_belief_now_is_the_fitted_insertion_carried_out_again():
 def test_innovation_and_measured_tip_are_those_of_the_newest_reading():
     needle = NEEDLES["run-out"]
     estimate, _ = followed(needle, 45)
-    moved = estimate.move(Control(db_x=1.0), 45.0, 46.0)
+    moved = estimate.move(Motion(Control(db_x=1.0), 45.0, 46.0))
     x, y = np.add(moved.tip[:2], [0.01, 0.002])
     updated = moved.observe([Measurement(46.0, float(x), float(y))])
     assert updated.measured == pytest.approx((x, y, 0.0), abs=1e-9)
@@ -163,7 +163,7 @@ def test_in_air_nothing_is_left_over():
 
 def test_without_readings_or_moves_the_estimate_stays():
     estimate, _ = followed(NEEDLES["bend"], 30)
-    moved = estimate.move(Control(db_x=1.0), 30.0, 31.0)
+    moved = estimate.move(Motion(Control(db_x=1.0), 30.0, 31.0))
     for kept in (moved.observe([]), moved.without_reading()):
         assert kept.state is moved.state
         assert kept.parameters is moved.parameters
@@ -179,7 +179,7 @@ def test_observing_changes_nothing_of_the_old_belief_and_threads_nothing_of_the_
     np.testing.assert_array_equal(one.parameters, many.parameters)
     assert one.state == many.state
     before = one.parameters.copy(), one.tips.copy(), numbers(one.state), one.moves
-    moved = one.move(Control(db_x=1.0, dg_y=0.1), 45.0, 46.0)
+    moved = one.move(Motion(Control(db_x=1.0, dg_y=0.1), 45.0, 46.0))
     here, again = (moved.observe([Measurement(46.0, 17.5, 1.0)]) for _ in range(2))
     np.testing.assert_array_equal(here.parameters, again.parameters)
     after = one.parameters, one.tips, numbers(one.state)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import Control, Measurement
+from flexneedle.types import Control, Measurement, Motion
 from observed import AHEAD, PHANTOM, begun, in_tissue, readings_between
 from reference.cases import numbers
 
@@ -17,7 +17,7 @@ COMMANDS = [Control(db_x=1.0, dg_y=step, flip=k == 2) for k, step in enumerate(G
 def gathered(estimate, late, *, readings):
     """The estimate after all moves, readings a number of periods late; then the last ones at rest."""
     for k, command in enumerate(COMMANDS):
-        estimate = estimate.move(command, k, k + 1.0)
+        estimate = estimate.move(Motion(command, k, k + 1.0))
         if k >= late:
             estimate = estimate.observe(readings[k - late])
     for batch in readings[len(readings) - late :] if late else ():
@@ -62,10 +62,12 @@ def test_the_estimate_before_late_readings_is_what_they_left_moved_on(late):
     readings = noisy_readings(state, simulator, 4, np.random.default_rng(4))
     in_time, behind = begun(simulator, state), begun(simulator, state)
     for k, command in enumerate(COMMANDS):
-        behind = behind.move(command, k, k + 1.0)
+        behind = behind.move(Motion(command, k, k + 1.0))
         if k < late:
             continue
-        in_time = in_time.move(COMMANDS[k - late], k - late, k - late + 1.0).observe(readings[k - late])
+        in_time = in_time.move(Motion(COMMANDS[k - late], k - late, k - late + 1.0)).observe(
+            readings[k - late]
+        )
         behind = behind.observe(readings[k - late])
         expected = in_time.state
         for missed in COMMANDS[k - late + 1 : k + 1]:
@@ -83,7 +85,7 @@ def test_readings_out_of_order_and_split_over_calls_count_the_same(depth):
     readings = noisy_readings(state, simulator, 4, np.random.default_rng(5))
     estimate = begun(simulator, state)
     for k in range(3):
-        estimate = estimate.move(COMMANDS[k], k, k + 1.0)
+        estimate = estimate.move(Motion(COMMANDS[k], k, k + 1.0))
     together = [sample for batch in readings[:3] for sample in batch]
     whole = estimate.observe(together)
     shuffled = [together[k] for k in (5, 0, 11, 3, 8, 1, 2, 10, 4, 9, 6, 7)]
@@ -98,8 +100,9 @@ def test_readings_out_of_order_and_split_over_calls_count_the_same(depth):
 
 def test_a_reading_belongs_to_the_move_in_which_it_was_taken():
     """One at the end of a move to that move; one from before the start to the first, one from after to the last."""
-    simulator = Simulator(PHANTOM)
-    estimate = begun(simulator).move(AHEAD, 0.0, 1.0).move(AHEAD, 1.0, 2.0).move(AHEAD, 2.0, 3.0)
+    estimate = begun(Simulator(PHANTOM))
+    for k in range(3):
+        estimate = estimate.move(Motion(AHEAD, float(k), k + 1.0))
     at = {time: Measurement(time, -27.0, 0.01) for time in (-0.5, 0.4, 1.0)}
     updated = estimate.observe([at[-0.5], at[0.4]])
     assert [done.measurements for done in updated.moves] == [(at[-0.5], at[0.4]), (), ()]
@@ -111,7 +114,7 @@ def test_a_reading_belongs_to_the_move_in_which_it_was_taken():
 def test_without_readings_nothing_is_corrected_and_moves_stay_open():
     simulator = Simulator(PHANTOM)
     estimate = begun(simulator, in_tissue(simulator))
-    moved = estimate.move(AHEAD, 0.0, 1.0).move(AHEAD, 1.0, 2.0)
+    moved = estimate.move(Motion(AHEAD, 0.0, 1.0)).move(Motion(AHEAD, 1.0, 2.0))
     updated = moved.observe([])
     assert updated.state == moved.state
     assert updated.past is estimate.past
@@ -122,7 +125,7 @@ def test_without_readings_nothing_is_corrected_and_moves_stay_open():
 
 def test_observing_leaves_the_old_belief_as_it_was():
     simulator = Simulator(PHANTOM)
-    moved = begun(simulator, in_tissue(simulator, 20)).move(AHEAD, 0.0, 1.0)
+    moved = begun(simulator, in_tissue(simulator, 20)).move(Motion(AHEAD, 0.0, 1.0))
     before = moved.tips.copy(), moved.covariance.copy(), numbers(moved.state), moved.moves
     one, other = (moved.observe([Measurement(1.0, -7.5, 0.2)]) for _ in range(2))
     assert_same_belief(one, other)

@@ -9,7 +9,7 @@ import pytest
 from flexneedle.control.methods import METHODS
 from flexneedle.estimation.estimate import Move, along, place
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import THETA, Control, Measurement, X, Y, Z
+from flexneedle.types import THETA, Control, Measurement, Motion, X, Y, Z
 from observed import AHEAD, PHANTOM, QUIET, begun, follow, in_tissue, readings_between, start_with
 from tasks import begun_with
 
@@ -26,7 +26,7 @@ def test_it_begins_with_a_straight_start_with_the_prior_of_the_scenario():
 def test_a_move_moves_the_needle_as_the_driver_did():
     simulator = Simulator(PHANTOM)
     estimate = begun(simulator)
-    moved = estimate.move(Control(db_x=0.7, dg_y=0.2, flip=True), 0.0, 1.0)
+    moved = estimate.move(Motion(Control(db_x=0.7, dg_y=0.2, flip=True), 0.0, 1.0))
     assert moved.state == simulator.step(estimate.state, Control(db_x=0.7, dg_y=0.2, flip=True))
     np.testing.assert_array_equal(moved.tip, moved.state.tip)
 
@@ -77,7 +77,7 @@ def test_fit_in_air_is_the_least_squares_solution_with_the_prior():
         readings = [
             Measurement(k + 1.0, float(truth.tip[X]), float(reading))
         ] * 2  # at the end, so two of variance σ²
-        estimate = estimate.move(AHEAD, k, k + 1.0).observe(readings)
+        estimate = estimate.move(Motion(AHEAD, k, k + 1.0)).observe(readings)
     np.testing.assert_allclose(
         estimate.state.base[[Y, THETA]], np.linalg.solve(information, moment), rtol=2e-3
     )
@@ -122,7 +122,7 @@ def test_stiffer_tissue_than_estimated_leaves_next_to_no_offset():
 def test_load_takes_the_gain_times_the_reaction_and_the_tip_goes_where_it_was_seen():
     simulator = Simulator(PHANTOM)
     known = replace(begun(simulator, in_tissue(simulator).with_estimate(tip_load=(0.001,))), axial=0.0)
-    moved = known.move(AHEAD, 0.0, 1.0)
+    moved = known.move(Motion(AHEAD, 0.0, 1.0))
     predicted = moved.state
     x, y = predicted.tip[:2] + np.array([0.05, 0.3])
     corrected = moved.observe([Measurement(1.0, x, y)])
@@ -147,7 +147,7 @@ def test_the_start_along_the_axis_is_found_and_how_surely(base_x):
     sds = [estimate.tip_sd]
     for k in range(10):
         before, truth = truth, simulator.step(truth, Control(db_x=1.0))
-        estimate = estimate.move(AHEAD, k, k + 1.0).observe(readings_between(before, truth, k))
+        estimate = estimate.move(Motion(AHEAD, k, k + 1.0)).observe(readings_between(before, truth, k))
         sds.append(estimate.tip_sd)
     control, jitter = PHANTOM.control, PHANTOM.tracker.jitter_per_axis
     precision = control.start_axial_sd_mm**-2.0 + 40.0 / jitter**2
@@ -161,10 +161,10 @@ def test_the_next_reading_is_as_uncertain_as_the_path_since_the_last_one_is_long
     """From the skin by drift x², from a reading at s by drift (x² − s²), each beside what the start leaves."""
     simulator = Simulator(PHANTOM)
     estimate = replace(begun(simulator, in_tissue(simulator)), drift=0.01)
-    updated = estimate.move(AHEAD, 0.0, 1.0).observe(
+    updated = estimate.move(Motion(AHEAD, 0.0, 1.0)).observe(
         [Measurement(1.0, float(estimate.tip[X]) + 1.0, float(estimate.tip[Y]))]
     )
-    later = updated.move(AHEAD, 1.0, 2.0)
+    later = updated.move(Motion(AHEAD, 1.0, 2.0))
     for one, since in [(estimate, 0.0), (later, updated.measured[0])]:
         depth, start = float(one.tip[X]), replace(one, drift=0.0).tip_sd
         assert depth > since + 0.5
@@ -178,7 +178,7 @@ def test_a_contact_that_is_cut_is_on_the_measured_path_wherever_the_tip_is_along
     """The tip is where it was measured, and what the move cut rests on the line to it."""
     simulator = Simulator(PHANTOM)
     start = replace(begun(simulator, in_tissue(simulator)), axial=axial)
-    moved = start.move(AHEAD, 0.0, 1.0)
+    moved = start.move(Motion(AHEAD, 0.0, 1.0))
     x, y = np.add(moved.tip[:2], off).tolist()
     corrected = moved.observe([Measurement(1.0, x, y)])
     assert corrected.tip[Y] == pytest.approx(y, abs=1e-9)
@@ -195,7 +195,7 @@ def test_innovations_of_a_period_are_averaged_at_the_times_of_the_readings():
     """A tip that goes evenly and readings that are off by 0.1, 0.2 and 0.6: the innovation is 0.3."""
     simulator = Simulator(PHANTOM)
     estimate = begun(simulator, in_tissue(simulator))
-    predicted = estimate.move(Control(db_x=1.0, dg_y=0.3), 7.0, 9.0)
+    predicted = estimate.move(Motion(Control(db_x=1.0, dg_y=0.3), 7.0, 9.0))
     readings = []
     for off, part in ((0.1, 0.25), (0.2, 0.5), (0.6, 1.0)):
         x, y = estimate.tip[:2] + part * (predicted.tip[:2] - estimate.tip[:2])
@@ -223,7 +223,7 @@ def test_the_tip_goes_from_move_to_move():
     assert along((), tips[2:], 99.0) == (2.0, 0.0, 0.4)
     estimate = begun(Simulator(PHANTOM))
     assert estimate.tip_at(3.0) == (-28.5, 0.0, 0.0)
-    two = estimate.move(AHEAD, 0.0, 1.0).move(AHEAD, 1.0, 3.0)
+    two = estimate.move(Motion(AHEAD, 0.0, 1.0)).move(Motion(AHEAD, 1.0, 3.0))
     assert two.tip_at(2.0) == pytest.approx((-27.0, 0.0, 0.0))
 
 
@@ -234,14 +234,14 @@ def test_a_move_without_duration_is_done_at_once():
 def test_more_readings_are_trusted_more():
     """In air a period's correction grows with the number of its readings, as their mean is less noisy."""
     simulator = Simulator(PHANTOM.with_values({"tracker.jitter_mm": 1.0}))
-    predicted = begun(simulator).move(AHEAD, 0.0, 1.0)
+    predicted = begun(simulator).move(Motion(AHEAD, 0.0, 1.0))
     x, y = predicted.tip[:2] + np.array([0.0, 0.5])
     tips = [predicted.observe([Measurement(1.0, x, y)] * n).tip[Y] for n in (1, 4, 16)]
     assert all(0.0 < less < more < 0.5 for less, more in pairwise(tips))
 
 
 def test_an_empty_reading_is_refused():
-    moved = begun(Simulator(PHANTOM)).move(AHEAD, 0.0, 1.0)
+    moved = begun(Simulator(PHANTOM)).move(Motion(AHEAD, 0.0, 1.0))
     with pytest.raises(ValueError, match="not removed"):
         moved.observe([Measurement(1.0, None, None)])
     with pytest.raises(ValueError, match="not removed"):
@@ -251,12 +251,12 @@ def test_an_empty_reading_is_refused():
 def test_without_fitting_the_start_the_measured_tip_is_held_in_air_too():
     """As in the paper; the base is estimated where it was commanded."""
     simulator = Simulator(PHANTOM)
-    predicted = begun(simulator, fits_start=False, estimates_load=False).move(AHEAD, 0.0, 1.0)
+    predicted = begun(simulator, fits_start=False, estimates_load=False).move(Motion(AHEAD, 0.0, 1.0))
     x, y = predicted.tip[:2] + np.array([0.0, 0.5])
     corrected = predicted.observe([Measurement(1.0, x, y)])
     assert corrected.tip[Y] == pytest.approx(0.5, abs=1e-9)
     np.testing.assert_array_equal(corrected.state.base[1:], 0.0)
-    assert corrected.move(AHEAD, 1.0, 2.0).tip[Y] == pytest.approx(0.0, abs=1e-9)  # released
+    assert corrected.move(Motion(AHEAD, 1.0, 2.0)).tip[Y] == pytest.approx(0.0, abs=1e-9)  # released
 
 
 @pytest.mark.parametrize(("name", "estimates"), [("ce-mpc", False), ("resolved-rate", True)])
@@ -266,7 +266,7 @@ def test_the_papers_controller_releases_the_measured_tip_and_estimates_nothing(n
     begin = METHODS[name].observer.begin(begun_with(simulator, controller=name))
     for steps in (10, 40):
         state = in_tissue(simulator, steps)
-        moved = replace(begin, state=state, past=state, tips=state.tip[None]).move(AHEAD, 0.0, 1.0)
+        moved = replace(begin, state=state, past=state, tips=state.tip[None]).move(Motion(AHEAD, 0.0, 1.0))
         x, y = np.add(moved.tip[:2], [0.0, 0.3])
         updated = moved.observe([Measurement(1.0, float(x), float(y))]).state
         assert bool(updated.base[Y] != 0.0 or updated.tip_load != (0.0, 0.0)) is estimates
@@ -274,7 +274,7 @@ def test_the_papers_controller_releases_the_measured_tip_and_estimates_nothing(n
 
 def test_unseen_keeps_the_belief_and_has_no_innovation():
     simulator = Simulator(PHANTOM)
-    moved = begun(simulator, in_tissue(simulator)).move(AHEAD, 0.0, 1.0)
+    moved = begun(simulator, in_tissue(simulator)).move(Motion(AHEAD, 0.0, 1.0))
     updated = moved.observe([Measurement(1.0, *(moved.tip[:2] + 0.1))])
     assert updated.innovation != (0.0, 0.0, 0.0)
     assert updated.without_reading().innovation == (0.0, 0.0, 0.0)

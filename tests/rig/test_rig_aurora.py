@@ -14,7 +14,7 @@ from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.loop import run
 from flexneedle.rig.tracking.stage import OnStage
 from flexneedle.rig.virtual import Rig, to_stage
-from flexneedle.types import STILL
+from flexneedle.types import STILL, Motion
 
 # The emulated tip does not follow the needle: all checks of its position are disabled.
 ANYWHERE = {
@@ -32,8 +32,12 @@ class Motors:
         self.clock = clock
 
     def apply(self, command, duration):
+        begun = self.clock.now()
         self.clock.wait(duration)
-        return command
+        return Motion(command, begun, self.clock.now())
+
+    def stop(self):
+        """Nothing moves between commands."""
 
 
 @pytest.mark.long

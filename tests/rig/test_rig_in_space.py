@@ -164,7 +164,7 @@ def test_with_half_turns_the_shaft_is_never_wound_up(kind):
     phantom, simulator = Phantom(Truth(scenario), 0.0, kind), Simulator(scenario)
     state, applied = simulator.start(), []
     for _ in range(3):
-        applied.append(phantom.apply(Control(db_x=1.0, flip=True), 0.2))
+        applied.append(phantom.apply(Control(db_x=1.0, flip=True), 0.2).control)
         state = simulator.step(state, applied[-1])
     assert [each.roll for each in applied] == [math.pi, -math.pi, math.pi]
     assert state.roll == math.pi

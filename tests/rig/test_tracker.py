@@ -15,7 +15,7 @@ from flexneedle.rig.tracking.placement import placed_references
 from flexneedle.rig.tracking.stage import OnStage
 from flexneedle.rig.virtual import Rig, Seeds, to_stage, virtual_rig, virtual_room
 from flexneedle.types import STILL as AT_REST
-from flexneedle.types import Control, Frame, SensorReading
+from flexneedle.types import Control, Frame, Motion, SensorReading
 from rooms import STILL, shipped
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -267,7 +267,10 @@ class Bench:
 
     def apply(self, command, duration):
         self.time += duration
-        return command
+        return Motion(command, self.time - duration, self.time)
+
+    def stop(self):
+        """Nothing moves between commands."""
 
     def read(self):
         numbers = range(self.number, round(self.time * 40) + 1)

@@ -50,7 +50,7 @@ def test_the_summary_of_an_insertion_is_one_line():
         == "held after 3 periods: no sample"
     )
     unknown_tip = Insertion(PLAN, 0, tuple(map(blind, make_insertion().periods)), Outcome("done"), "")
-    assert unknown_tip.summary == "done: true tip unknown"
+    assert unknown_tip.summary == "done: neither the true tip nor a reading of it is known"
 
 
 def test_missing_values_are_null():

@@ -13,7 +13,7 @@ from flexneedle.estimation.sensor import Sensor
 from flexneedle.estimation.sensors import SENSORS
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import THETA, Control, Floats, Measurement, Point, Pose, X, Y, Z
+from flexneedle.types import THETA, Control, Floats, Measurement, Motion, Point, Pose, X, Y, Z
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,11 @@ class Move:
         if self.ended <= self.begun:
             return 1.0
         return min(1.0, max(0.0, (time - self.begun) / (self.ended - self.begun)))
+
+    @staticmethod
+    def of(motion: Motion) -> "Move":
+        """A motion before its readings."""
+        return Move(motion.begun, motion.ended, motion.control)
 
 
 class Estimate(Protocol):
@@ -96,8 +101,8 @@ class Estimate(Protocol):
         """Estimated position of the tip (mm) at `time`, with constant velocity in each move."""
         ...
 
-    def move(self, applied: Control, begun: float, ended: float) -> "Estimate":
-        """The estimate after a motion `applied` by the driver from `begun` to `ended` (s)."""
+    def move(self, motion: Motion) -> "Estimate":
+        """The estimate after a motion, as the driver carried it out: without limits, which are those of commands."""
         ...
 
     def observe(self, measurements: Sequence[Measurement]) -> "Estimate":
@@ -118,6 +123,11 @@ def described(estimate: Estimate) -> str:
     return f"<{type(estimate).__name__} {where}>"
 
 
+def after(simulator: Simulator, state: State, applied: Control) -> State:
+    """The state after a motion as the driver carried it out, which may exceed a limit of commands a little."""
+    return simulator.replay(state, np.array([applied]))[0]
+
+
 def assigned(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> tuple[Move, ...]:
     """Assign each measurement to the move in which it was taken, earlier ones to the first, later ones to the last."""
     ends = np.array([done.ended for done in moves[:-1]])
@@ -131,11 +141,12 @@ def assigned(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> tu
 
 
 def along(moves: tuple[Move, ...], tips: Floats, time: float) -> Point:
-    """Position (mm) at `time` on the path through tips (k + 1, 5), before and after each of k moves."""
+    """Position (mm) at `time` on the path through tips (k + 1, 5), at the ends of k moves, at rest between them."""
     if not moves:
         return Pose.of(tips[-1]).point
-    times = [moves[0].begun, *(done.ended for done in moves)]
-    x, y, z = (float(np.interp(time, times, tips[:, column])) for column in (X, Y, Z))
+    times = [limit for done in moves for limit in (done.begun, done.ended)]
+    at = [end for k in range(len(moves)) for end in (k, k + 1)]
+    x, y, z = (float(np.interp(time, times, tips[at, column])) for column in (X, Y, Z))
     return x, y, z
 
 

@@ -23,7 +23,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Move, along, assigned, described
+from flexneedle.estimation.estimate import Move, after, along, assigned, described
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
 from flexneedle.estimation.readings import MoveMeans, shared
 from flexneedle.estimation.sensor import Sensor
@@ -38,10 +38,10 @@ from flexneedle.types import (
     SPIN,
     STILL,
     THETA,
-    Control,
     Floats,
     Laterals,
     Measurement,
+    Motion,
     Point,
     X,
     Y,
@@ -170,16 +170,16 @@ class Identified:
         """The estimate of a period without a good reading: innovation 0."""
         return replace(self, innovation=(0.0, 0.0, 0.0))
 
-    def move(self, applied: Control, begun: float, ended: float) -> "Identified":
-        """Move the estimated needle as the driver did, from `begun` to `ended` (s)."""
-        if applied == STILL and self.moves and self.moves[-1].applied == STILL:  # one move, however long
-            last = replace(self.moves[-1], ended=ended)
+    def move(self, motion: Motion) -> "Identified":
+        """Move the estimated needle as the driver did."""
+        if (
+            motion.control == STILL and self.moves and self.moves[-1].applied == STILL
+        ):  # one move, however long
+            last = replace(self.moves[-1], ended=motion.ended)
             return replace(self, moves=(*self.moves[:-1], last), perturbed=())
-        state = self.simulator.step(self.state, applied)
+        state = after(self.simulator, self.state, motion.control)
         tips = np.concatenate([self.tips, state.tip[None]])
-        return replace(
-            self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)), perturbed=()
-        )
+        return replace(self, state=state, tips=tips, moves=(*self.moves, Move.of(motion)), perturbed=())
 
     def observe(self, measurements: Sequence[Measurement]) -> "Identified":
         """Fit the parameters to all readings by one Gauss–Newton step, and simulate the insertion with them."""

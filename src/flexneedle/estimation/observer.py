@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Move, along, assigned, described, place
+from flexneedle.estimation.estimate import Move, after, along, assigned, described, place
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import STILL, THETA, Control, Floats, Measurement, Point, Y, Z
+from flexneedle.types import STILL, THETA, Floats, Measurement, Motion, Point, Y, Z
 
 _DRIFT = 0.5  # of the path that the bevel bends: standard deviation of a model's error
 
@@ -105,11 +105,11 @@ class Corrected:
         """The estimate of a period without a good reading: innovation 0."""
         return replace(self, innovation=(0.0, 0.0, 0.0))
 
-    def move(self, applied: Control, begun: float, ended: float) -> "Corrected":
-        """Move the estimated needle as the driver did, from `begun` to `ended` (s)."""
-        state = self.simulator.step(self.state, applied)
+    def move(self, motion: Motion) -> "Corrected":
+        """Move the estimated needle as the driver did."""
+        state = after(self.simulator, self.state, motion.control)
         tips = np.concatenate([self.tips, state.tip[None]])
-        return replace(self, state=state, tips=tips, moves=(*self.moves, Move(begun, ended, applied)))
+        return replace(self, state=state, tips=tips, moves=(*self.moves, Move.of(motion)))
 
     def observe(self, measurements: Sequence[Measurement]) -> "Corrected":
         """Correct by good measurements (newest last); a move is closed once a reading of its end has arrived."""
@@ -134,7 +134,7 @@ class Corrected:
 
 def _followed(at: Corrected, done: Move) -> Corrected:
     """The estimate after a move: predicted, and corrected by the mean innovation of its readings."""
-    before, predicted = at.tip, at.simulator.step(at.state, done.applied)
+    before, predicted = at.tip, after(at.simulator, at.state, done.applied)
     if not done.measurements:
         return replace(at, state=predicted)
     innovation = np.mean([_innovation(before, predicted.tip, done, one) for one in done.measurements], axis=0)
@@ -177,7 +177,7 @@ def _moved_along(at: Corrected, done: Move, off: float, noise: float) -> tuple[C
     """
     gain = at.axial / (at.axial + noise**2 + 1e-12)
     moved = at.state.with_estimate(base_x=float(at.state.base[0]) + gain * off)
-    predicted = at.simulator.step(moved, done.applied)
+    predicted = after(at.simulator, moved, done.applied)
     return replace(at, axial=(1.0 - gain) * at.axial), predicted
 
 

@@ -38,6 +38,7 @@ from flexneedle.types import (
     Control,
     Insertion,
     Lateral,
+    Motion,
     Outcome,
     Period,
     Plan,
@@ -127,11 +128,14 @@ def run(
     task = tables.task(chosen, Simulator(scenario, threads), plan)
     periods: list[Period] = []
     ending = (Outcome.FAILED, f"target depth not reached within {_MOST_MOVES} times the planned steps")
-    for period, ended in _periods(task, chosen, rig, rng, force=force):
-        periods.append(period)
-        ending = ended or ending
-        if on_period is not None:
-            on_period(period)
+    try:
+        for period, ended in _periods(task, chosen, rig, rng, force=force):
+            periods.append(period)
+            ending = ended or ending
+            if on_period is not None:
+                on_period(period)
+    finally:  # also after an error or an interrupt no motor goes on
+        rig.driver.stop()
     insertion = Insertion(plan, seed, tuple(periods), *ending, name, scenario=scenario)
     if insertion.outcome is Outcome.DONE:
         line = missed(insertion.true_error_mm, math.dist(periods[-1].estimate.point, plan.target))
@@ -165,14 +169,14 @@ def _periods(
         clocks, begun = [time.perf_counter()], rig.clock.now()
         step, decided = _next_step(progress, task, chosen, rng, begun, force=force)
         clocks.append(time.perf_counter())
-        applied = _carry_out(task.scenario, rig, step.decision.command, step.wait)
+        motion = _carry_out(task.scenario, rig, step.decision.command, step.wait)
         clocks.append(time.perf_counter())
-        observation = _observed(progress.observation, task.scenario, rig, applied, begun)
+        observation = _observed(progress.observation, task.scenario, rig, motion, begun)
         clocks.append(time.perf_counter())
         now = rig.clock.now()
         progress = _progress_after(decided, observation, task, chosen, begun, now)
         ending = _ending(task, progress)
-        period = _record(index, now, task.plan, rig, step, applied, observation, clocks)
+        period = _record(index, now, task.plan, rig, step, motion.control, observation, clocks)
         yield replace(period, warning=warning(step.decision, progress.in_a_row)), ending
         if ending is not None:
             return
@@ -217,11 +221,9 @@ def _next_step(
     return _step(decision, no_path.reason, reading), decided
 
 
-def _observed(
-    before: Observation, scenario: Scenario, rig: Rig, applied: Control, begun: float
-) -> Observation:
-    """The observation after a motion `applied` by the driver since `begun` (s)."""
-    predicted = before.estimate.move(applied, begun, rig.clock.now())
+def _observed(before: Observation, scenario: Scenario, rig: Rig, motion: Motion, begun: float) -> Observation:
+    """The observation after the motion of a period that began at `begun` (s)."""
+    predicted = before.estimate.move(motion)
     return observe(scenario, predicted, before.monitor, begun, rig.clock.now(), rig.tracker)
 
 
@@ -279,11 +281,12 @@ def _step(decision: Decision, no_path: str, reading: float) -> _Step:
     return _Step(Action.MOVE, decision)
 
 
-def _carry_out(scenario: Scenario, rig: Rig, command: Control, wait: float) -> Control:
+def _carry_out(scenario: Scenario, rig: Rig, command: Control, wait: float) -> Motion:
     """Move, within the time at insertion speed, rounded up to whole tracker periods; or wait for `wait` (s)."""
     if wait > 0.0:
+        begun = rig.clock.now()
         rig.clock.wait(wait)
-        return command
+        return Motion(command, begun, rig.clock.now())
     reading = scenario.tracker.period
     readings = math.ceil(abs(command.db_x) / scenario.setup.insertion_speed_mm_s / reading - 1e-6)
     return rig.driver.apply(command, max(1, readings) * reading)

@@ -2,7 +2,7 @@
 
 from typing import Protocol
 
-from flexneedle.types import Control, Frame, Measurement
+from flexneedle.types import Control, Frame, Measurement, Motion
 
 
 class Clock(Protocol):
@@ -20,8 +20,12 @@ class Clock(Protocol):
 class Driver(Protocol):
     """Moves base and guide and rolls the bevel."""
 
-    def apply(self, command: Control, duration: float) -> Control:
-        """Execute `command` within `duration` seconds; return the command as applied."""
+    def apply(self, command: Control, duration: float) -> Motion:
+        """Execute `command` within `duration` seconds; return what was done, and when it began and ended."""
+        ...
+
+    def stop(self) -> None:
+        """Stop all axes at once, also a motion that is under way; without one, do nothing."""
         ...
 
 

@@ -42,7 +42,7 @@ class Rig:
 
     def __post_init__(self) -> None:
         _check_port("clock", self.clock, Clock, ("now", "wait"))
-        _check_port("driver", self.driver, Driver, ("apply",))
+        _check_port("driver", self.driver, Driver, ("apply", "stop"))
         _check_port("tracker", self.tracker, TipTracker, ("read", "status"))
         if not (self.truth is None or callable(self.truth)):
             raise refusal("truth", self.truth, "must be a function of () that returns a Condition, or None")

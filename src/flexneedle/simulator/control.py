@@ -92,7 +92,8 @@ class Limits:
     def check(self, moved: Floats, rows: Floats, roll: float = 0.0) -> None:
         """Raise CommandError for the first value in `rows` (…, m, 9) that breaks a limit.
 
-        `moved` (7,) is the sum of the steps of each column of travel before them, `roll` the needle's angle (rad).
+        `moved` (7,) is the sum of the steps of each column of travel before them, `roll` the needle's angle (rad). A
+        driver may have ended a little beyond a limit: there it may rest, and return.
         """
         if not np.isfinite(rows).all():
             self._refuse(rows, ~np.isfinite(rows), "must be a finite number")
@@ -104,9 +105,10 @@ class Limits:
         if (bad := np.abs(steps) > self.step + _SLACK).any():
             self._refuse(steps, bad, "must be at most", self.step)
         travel = moved + np.cumsum(steps, axis=-2)
-        if (bad := travel > self.travel[:, 1] + _SLACK).any():
+        before = travel - steps
+        if (bad := travel > np.maximum(self.travel[:, 1], before) + _SLACK).any():
             self._refuse(travel, bad, "sum of the steps must be at most", self.travel[:, 1])
-        if (bad := travel < self.travel[:, 0] - _SLACK).any():
+        if (bad := travel < np.minimum(self.travel[:, 0], before) - _SLACK).any():
             self._refuse(travel, bad, "sum of the steps must be at least", self.travel[:, 0])
         self._check_rotation(rows, roll)
 
@@ -121,7 +123,7 @@ class Limits:
         elif math.isfinite(self.rotation):
             steps = rows[..., ROLL:].reshape(*rows.shape[:-2], -1)
             angle = roll + np.cumsum(steps, axis=-1)
-            if (bad := np.abs(angle) > self.rotation + _SLACK).any():
+            if (bad := np.abs(angle) > np.maximum(self.rotation, np.abs(angle - steps)) + _SLACK).any():
                 rule = f"angle of the needle must be at most {self.rotation:g} rad to either side"
                 rule += f" (setup.max_rotation_deg = {math.degrees(self.rotation):g})"
                 raise CommandError("roll", float(angle[bad][0]), self.rotation, rule)

@@ -60,8 +60,7 @@ class Stuck(Stage):
         super().__init__([])
 
     def apply(self, command, duration):
-        super().apply(command, duration)
-        return STILL
+        return super().apply(command, duration)._replace(control=STILL)
 
     def read(self):
         return (Measurement(self.time, -28.5, 0.0),)
@@ -148,8 +147,17 @@ def test_the_command_as_applied_is_recorded_and_used_by_the_estimate(plan):
 
 
 def test_without_a_truth_the_true_error_is_not_known(real, replayed):
+    """Whether it reached the target, the tracker says."""
     assert math.isnan(replayed.true_error_mm)
-    assert not replayed.reached
+    assert replayed.error_mm == replayed.residual_mm <= 1.0
+    assert replayed.reached
+    assert (
+        replayed.summary
+        == f"reached: the tip ended {replayed.residual_mm:.3f} mm from the target by the tracker"
+    )
+    missed = replace(replayed, plan=replace(replayed.plan, target=(40.0, 7.0, 0.0)))
+    assert not missed.reached
+    assert missed.summary.endswith("mm from the target by the tracker, more than 1 mm")
     assert {period.true_tip for period in replayed.periods} == {None}
     assert {period.true_strain_energy for period in replayed.periods} == {None}
     assert {period.true_stretch for period in replayed.periods} == {None}

@@ -36,7 +36,7 @@ def test_motors_are_on_whole_steps_and_rounding_does_not_accumulate(grid, rows):
     asked, done = np.zeros(9), np.zeros(9)
     for db_x, db_y, db_theta, dg_y in rows:
         command = Control(db_x, db_y=db_y, db_theta=db_theta, dg_y=dg_y)
-        applied = phantom.apply(command, 0.2)
+        applied = phantom.apply(command, 0.2).control
         asked, done = asked + command, done + applied
         assert not applied.rolls
         lengths = done[LENGTHS]
@@ -52,7 +52,7 @@ def test_steps_far_below_the_resolution_accumulate():
     """A thousand guide steps of 3 µm are 3 mm, with the rounded sum at each step."""
     phantom, stood = rough(0.01), 0.0
     for k in range(1000):
-        moved = phantom.apply(Control(dg_y=0.003), 0.2).dg_y
+        moved = phantom.apply(Control(dg_y=0.003), 0.2).control.dg_y
         stood += moved
         assert round(moved, 9) in (0.0, 0.01)
         assert abs(stood - 0.003 * (k + 1)) <= 0.005 + 1e-9
@@ -62,15 +62,15 @@ def test_steps_far_below_the_resolution_accumulate():
 def test_a_motor_with_resolution_0_applies_the_command_exactly():
     phantom = rough(0.0)
     command = Control(0.123456, db_y=0.01234, db_theta=0.001, dg_y=-0.098765, flip=True)
-    assert phantom.apply(command, 0.2) == command
+    assert phantom.apply(command, 0.2).control == command
 
 
 def test_a_motor_without_a_command_does_not_move():
     """Even with a remainder of half a step, here since 0.255 mm is above the largest step."""
     phantom = rough(0.01, IDEAL.with_values({"setup.max_guide_step_mm": 0.255}))
-    assert phantom.apply(Control(dg_y=0.255), 0.2).dg_y == pytest.approx(0.25)
+    assert phantom.apply(Control(dg_y=0.255), 0.2).control.dg_y == pytest.approx(0.25)
     for _ in range(5):
-        assert phantom.apply(STILL, 0.2) == STILL
+        assert phantom.apply(STILL, 0.2).control == STILL
 
 
 def test_rounding_does_not_exceed_a_limit_of_the_setup():
@@ -92,7 +92,7 @@ def test_rounding_does_not_exceed_a_limit_of_the_setup():
     for k in range(118):
         guide = 0.256 if k < 4 else 1.237 - asked[1] if k == 4 else 0.0
         command = Control(min(0.256, 29.996 - state.travel[DB_X]), dg_y=guide)
-        applied = phantom.apply(command, 0.2)
+        applied = phantom.apply(command, 0.2).control
         asked += (command.db_x, command.dg_y)
         state = model.step(state, applied)
     assert state.travel[DB_X] == pytest.approx(29.5)  # 0.25 per step, the largest

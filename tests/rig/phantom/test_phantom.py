@@ -42,7 +42,7 @@ def test_a_command_is_executed_in_finer_steps(kind):
     flipped = Control(db_x=1.0, dg_y=0.1, flip=True)
     for number in range(32):
         roll = (-1) ** number * math.pi
-        assert phantom.apply(flipped, 0.2) == flipped._replace(roll=roll)
+        assert phantom.apply(flipped, 0.2).control == flipped._replace(roll=roll)
         for part in range(4):
             by_hand.step(np.array(Control(db_x=0.25, dg_y=0.025, roll=roll * (part == 0))))
     np.testing.assert_array_equal(tip(phantom), by_hand.tip)

@@ -20,6 +20,7 @@ from flexneedle.types import (
     THETA,
     Control,
     Floats,
+    Motion,
     Point,
     Pose,
     X,
@@ -74,12 +75,12 @@ class Phantom:
         self._time += seconds
         self._path.append((self._time, *self._tip().tolist()))
 
-    def apply(self, command: Control, duration: float) -> Control:
+    def apply(self, command: Control, duration: float) -> Motion:
         """Execute `command` at constant velocity within `duration` s, in steps of at most `phantom.step_mm`.
 
         Motors move to the multiple of their resolution nearest to the sum of all commands, so that rounding errors do
-        not accumulate. A driver of half turns turns to and fro. Returns the command as applied. Raises CommandError if
-        it exceeds a limit of the setup.
+        not accumulate. A driver of half turns turns to and fro. Raises CommandError if the command exceeds a limit of
+        the setup.
         """
         self._limits.check(self._moved, np.array([command]), self._rolled)
         row = self._rounded(command)
@@ -94,8 +95,11 @@ class Phantom:
             self._path.append((self._time + duration * (k + 1) / parts, *self._tip().tolist()))
         self._moved += row[:MOVES]
         self._rolled += float(row[ROLL] + row[SPIN])
-        self._time += duration
-        return Control.of(row.tolist())
+        begun, self._time = self._time, self._time + duration
+        return Motion(Control.of(row.tolist()), begun, self._time)
+
+    def stop(self) -> None:
+        """Do nothing: between commands the needle is at rest."""
 
     def tip_at(self, time: float) -> Point:
         """Return the true tip x, y, z in mm at a time, for a simulated tracker; at rest before the start."""
