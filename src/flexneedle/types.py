@@ -499,8 +499,12 @@ class Insertion:
 
     @property
     def error_mm(self) -> float:
-        """`true_error_mm`; where the truth is unknown, as on a rig, `residual_mm`."""
-        return self.residual_mm if math.isnan(self.true_error_mm) else self.true_error_mm
+        """`true_error_mm`; where the truth is not recorded, as on a rig, `residual_mm`."""
+        return self.true_error_mm if self._has_truth else self.residual_mm
+
+    @property
+    def _has_truth(self) -> bool:
+        return bool(self.periods) and self.periods[-1].true_tip is not None
 
     @property
     def reached(self) -> bool:
@@ -515,7 +519,7 @@ class Insertion:
             return f"{after}: {self.reason}" if self.reason else after
         if math.isnan(self.error_mm):
             return "done: neither the true tip nor a reading of it is known"
-        by = " by the tracker" if math.isnan(self.true_error_mm) else ""
+        by = "" if self._has_truth else " by the tracker"
         if self.reached:
             return f"reached: the tip ended {self.error_mm:.3f} mm from the target{by}"
         return f"MISSED: the tip ended {self.error_mm:.3f} mm from the target{by}, more than 1 mm"

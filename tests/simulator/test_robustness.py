@@ -47,16 +47,17 @@ def test_random_sequences_in_space_and_of_adapted_models_run_without_failure(stu
 
 
 @pytest.mark.parametrize(
-    "batch",
+    ("seed", "batch"),
     [
-        pytest.param(320, id="iterations that run away"),
-        pytest.param(510, id="a needle that touches its guide almost without force"),
-        pytest.param(648, id="a needle that two walls take turns to push"),
-        pytest.param(3168, id="a needle that goes round from wall to wall"),
+        pytest.param(0, 320, id="iterations that run away"),
+        pytest.param(0, 510, id="a needle that touches its guide almost without force"),
+        pytest.param(0, 648, id="a needle that two walls take turns to push"),
+        pytest.param(0, 3168, id="a needle that goes round from wall to wall"),
+        pytest.param(1, 2670, id="two stiffnesses that move the wall to and fro"),
     ],
 )
-def test_rare_steps_of_an_adapted_model_in_space_converge(study, capsys, batch):
-    status, summary, _ = run(study, capsys, "--space", "--adapted", "--seed", 0, "--batch", batch)
+def test_rare_steps_of_an_adapted_model_in_space_converge(study, capsys, seed, batch):
+    status, summary, _ = run(study, capsys, "--space", "--adapted", "--seed", seed, "--batch", batch)
     assert (status, summary["passed"]) == (0, True)
 
 
@@ -110,7 +111,7 @@ def test_a_batch_is_reproduced_by_its_number(study, capsys):
 def broken(how):
     """A rollout with one bad step."""
 
-    def rollout(self, state, controls):  # noqa: ARG001  the signature of a simulator
+    def rollout(_simulator, _state, controls):
         n, m = controls.shape[:2]
         result = Rollout(
             np.zeros((n, m, 5)),

@@ -172,9 +172,8 @@ class Identified:
 
     def move(self, motion: Motion) -> "Identified":
         """Move the estimated needle as the driver did."""
-        if (
-            motion.control == STILL and self.moves and self.moves[-1].applied == STILL
-        ):  # one move, however long
+        rested = self.moves and self.moves[-1].applied == STILL
+        if motion.control == STILL and rested:  # one move, however long
             last = replace(self.moves[-1], ended=motion.ended)
             return replace(self, moves=(*self.moves[:-1], last), perturbed=())
         state = after(self.simulator, self.state, motion.control)

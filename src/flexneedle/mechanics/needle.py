@@ -42,7 +42,7 @@ Laterals = NDArray[Any]
 Work = NDArray[Any]
 
 COUPLED_ITERATIONS = 15
-BEARING_LOOKS = 15
+BEARING_LOOKS = 15  # at the needle in its guide, in an iteration without coupling
 MAX_ITERATIONS = 100
 
 

@@ -111,7 +111,10 @@ def run(
     threads: int | None = None,
     on_period: Callable[[Period], None] | None = None,
 ) -> Insertion:
-    """As `insert`, on any rig. rng: randomness of the controller; seed: only recorded."""
+    """As `insert`, on any rig. rng: randomness of the controller; seed: only recorded.
+
+    The driver is stopped at the end, after an error and after an interrupt.
+    """
     scenario, plan, seed = load_scenario(scenario), _planned(plan), whole("seed", seed, 0)
     rig = instance("rig", rig, Rig, "Rig(clock, driver, tracker), parts as in flexneedle.rig.ports")
     rng = instance("rng", rng, np.random.Generator, "such as numpy.random.default_rng(0)")
@@ -289,7 +292,8 @@ def _carry_out(scenario: Scenario, rig: Rig, command: Control, wait: float) -> M
         return Motion(command, begun, rig.clock.now())
     reading = scenario.tracker.period
     readings = math.ceil(abs(command.db_x) / scenario.setup.insertion_speed_mm_s / reading - 1e-6)
-    return rig.driver.apply(command, max(1, readings) * reading)
+    motion = rig.driver.apply(command, max(1, readings) * reading)
+    return instance("result of driver.apply", motion, Motion, "Motion(control, begun, ended)")
 
 
 def _pair(miss: float | complex) -> Lateral:

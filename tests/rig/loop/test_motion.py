@@ -15,7 +15,7 @@ from insertions import PHANTOM, Stage, Tank, run
 THINKING_S = 0.1
 
 
-def straight(name="straight", before=lambda: None):
+def straight(before):
     """A controller that advances to the target depth; `before` each decision something may happen."""
 
     def decide(task, _memory, estimate, _rng):
@@ -23,7 +23,7 @@ def straight(name="straight", before=lambda: None):
         left = travel_left(task.scenario, task.plan, estimate.state)
         return Decision(Control(db_x=min(task.scenario.setup.max_advance_mm, left)), "ahead"), None
 
-    return Method(name, "advances without a roll", decide=decide)
+    return Method("straight", "advances without a roll", decide=decide)
 
 
 class Overshooting(Tank):
@@ -46,7 +46,7 @@ def test_a_driver_that_reports_more_than_a_step_does_not_end_the_insertion(plan,
 def test_the_time_of_a_decision_is_no_motion(plan, thinking):
     """On a clock that goes on while the controller decides the readings are compared with a needle at rest."""
     tank = Tank(plan.roll)
-    slow = straight(before=lambda: thinking and tank.phantom.wait(thinking))
+    slow = straight(lambda: thinking and tank.phantom.wait(thinking))
     done = run(plan, tank.rig(), controller=slow, force=True)
     off = [period.estimate.x - period.true_tip.x for period in done.periods][20:]
     assert len(off) >= 30
