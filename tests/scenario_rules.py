@@ -88,6 +88,7 @@ NOT_NEGATIVE = [
     "control.adaptive_mpc.late_roll_weight",
     "control.adaptive_mpc.reach_weight",
     "control.adaptive_mpc.unguided_reach_weight",
+    "control.adaptive_mpc.unguided_reach_margin",
     "control.adaptive_mpc.clearance_mm",
     "control.adaptive_mpc.clearance_sd_mm",
     "control.adaptive_mpc.model_sd",

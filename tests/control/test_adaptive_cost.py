@@ -124,10 +124,30 @@ def test_reach_is_not_given_away_by_a_step_with_the_bevel_on_the_wrong_side(quic
     plan = replace(quick_plan, target=(40.0, 0.9 * (greatest if side > 0 else least), 0.0), roll=roll)
     task = task_of(simulator, plan)
     ahead = adaptive_mpc.Ahead.of(task, state, unrolled(of_plan(plan)))
-    expected = adaptive_mpc.out_of_reach(task, estimate, ahead, ADAPTIVE.begin(task))
+    expected = adaptive_mpc.out_of_reach(task, estimate, ahead, ADAPTIVE.begin(task), 1.0)
     kept, _, rolled, _ = expected(adaptive_mpc.measured_rollout(estimate, ahead.constant))
     assert min(kept, rolled) >= 0.0
     assert (kept < rolled) == (side == state.bevel.real)
+
+
+@pytest.mark.parametrize("scenario", [PHANTOM, BARE], ids=["a guide", "no guide"])
+def test_the_bevel_keeps_its_reach_with_a_margin_where_it_steers_alone(quick_plan, scenario):
+    """The deviations that the reach is charged with: those of the estimate, or a multiple of them without a guide."""
+    simulator = Simulator(scenario, threads=1)
+    state = simulator.replay(simulator.start(), controls(1, db_x=31.0))[0]
+    estimate, task = estimate_of(state, scenario), task_of(simulator, quick_plan)
+    memory = ADAPTIVE.begin(task)
+    ahead = adaptive_mpc.Ahead.of(task, state, memory.path)
+    charged = {term.name: term.value for term in adaptive_mpc.cost_terms(task, estimate, memory, ahead)}
+    sure, wide, wider = (
+        adaptive_mpc.out_of_reach(task, estimate, ahead, memory, margin).keywords["expected"]
+        for margin in (0.0, 1.0, task.settings.unguided_reach_margin)
+    )
+    assert (sure <= wide).all()
+    assert (wide < wider).all()
+    assert charged["reach"].keywords["expected"] == pytest.approx(
+        wider if scenario is BARE else wide, rel=1e-12
+    )
 
 
 def test_cost_is_a_length_that_no_scale_of_tissue_changes(quick_plan, along):

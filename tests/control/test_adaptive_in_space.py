@@ -79,7 +79,7 @@ def test_the_reach_after_a_step_is_the_disc_of_what_the_bevel_does_then(state, d
     radius = np.mean([np.abs(np.array(around) - np.mean(around)).mean() for around in rolled.values()])
     target = middle + (radius + beyond) * cmath.exp(1j * direction)
     task, estimate, memory, ahead = prepared(state, target)
-    term = adaptive_mpc.out_of_reach(task, estimate, ahead, memory)
+    term = adaptive_mpc.out_of_reach(task, estimate, ahead, memory, 1.0)
     angle = term.keywords["angle"]
     aimed = state.bevel * cmath.exp(1j * angle)
     assert aimed == pytest.approx((target - middle) / abs(target - middle), abs=1e-2)
@@ -99,9 +99,9 @@ def test_a_guide_on_one_axis_leaves_the_bevel_to_reach_across_it(state, side):
     middle = np.mean([ends(state, then=turn) for turn in np.arange(4) * 0.5 * math.pi])
     far = middle + side * 3.0j
     task, estimate, memory, ahead = prepared(state, far)
-    both = adaptive_mpc.out_of_reach(task, estimate, ahead, memory).keywords
+    both = adaptive_mpc.out_of_reach(task, estimate, ahead, memory, 1.0).keywords
     task, estimate, memory, ahead = prepared(there, far + 5.0, one_axis)
-    across = adaptive_mpc.out_of_reach(task, estimate, ahead, memory).keywords
+    across = adaptive_mpc.out_of_reach(task, estimate, ahead, memory, 1.0).keywords
     assert across["expected"] == pytest.approx(both["expected"], abs=0.02)
     assert across["expected"][0] > 1.0
     assert there.bevel * cmath.exp(1j * across["angle"]) == pytest.approx(side * 1j, abs=1e-9)

@@ -40,6 +40,7 @@ _SMOOTHING = 0.3
 _TOLERANCE = 1e-6
 _RESTS = (4.0, 2.0, 1.0)  # control steps before the target at which the needle rests
 _SURPRISE = 4.0  # residual of the fit, in standard deviations of a reading, from which the needle rests
+_CERTAIN = 1e-9  # mm: standard deviation of a distance that is known
 _STILL = 1e-6  # rad: of a needle that did not roll
 
 _FURTHEST_LEVER = 3.0  # of the needle for a motion of the tip: beyond it the bevel corrects, too
@@ -74,6 +75,8 @@ class AdaptiveMpc(Priors):
     """Weight of the expected distance of the target from the bevel's reach, with the guide fixed."""
     unguided_reach_weight: NonNegative = 100.0
     """`reach_weight` where the guide may not move, or not on the axis across which the bevel steers alone."""
+    unguided_reach_margin: NonNegative = 3.0
+    """Factor there on the standard deviation of that distance: reach is kept until as much is to spare."""
     late_roll_weight: NonNegative = 1.0
     """Weight of the standard deviation of the tip's motion in a roll just before the target."""
 
@@ -206,7 +209,9 @@ def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> 
     energy = settings.energy_weight_mm if guided else settings.unguided_energy_weight_mm
     line = settings.line_weight if guided else settings.unguided_line_weight
     alone = _bevel_alone_across(task, ahead)
-    reach = settings.reach_weight if guided and not alone else settings.unguided_reach_weight
+    spare = guided and not alone
+    reach = settings.reach_weight if spare else settings.unguided_reach_weight
+    margin = 1.0 if spare else settings.unguided_reach_margin
     uncorrected = UNCORRECTED * task.scenario.setup.max_advance_mm
     late = partial(terms.late_rolls, depth=target[0], length=uncorrected)
     whole = max(target[0], uncorrected)
@@ -223,20 +228,21 @@ def cost_terms(task: Task, fitted: Identified, memory: Memory, ahead: Ahead) -> 
         Term("slope", settings.slope_weight_mm * share, terms.guide_slope),
         Term("flips", settings.roll_weight_mm, terms.flips),
         Term("late", settings.late_roll_weight * fitted.roll_sd, late),
-        Term("reach", reach, out_of_reach(task, fitted, ahead, memory)),
+        Term("reach", reach, out_of_reach(task, fitted, ahead, memory, margin)),
     )
 
 
 def out_of_reach(
-    task: Task, fitted: Identified, ahead: Ahead, memory: Memory
+    task: Task, fitted: Identified, ahead: Ahead, memory: Memory, margin: float
 ) -> Callable[[Trajectories], Floats]:
     """Expected distance (N,), mm, of the target from the bevel's reach after the first step of trajectories.
 
     The reach of a needle that rolls by half turns is the interval between the ends with the bevel on either side from
     the second step on; that of one that rolls to any angle is the circle about the middle of such an interval. The
-    bounds are normally distributed. With the bevel alone, lost reach cannot be regained; with a guide, the bevel still
-    moves the tip when the guide is far behind it. Along the axis of a guide that moves on one the guide corrects, so
-    that only the distance across it counts.
+    bounds are normally distributed, `margin` times as widely as the estimate is, since reach that no later step will
+    need may be given away. With the bevel alone, lost reach cannot be regained; with a guide, the bevel still moves the
+    tip when the guide is far behind it. Along the axis of a guide that moves on one the guide corrects, so that only
+    the distance across it counts.
     """
     trajectories = measured_rollout(fitted, ahead.constant)
     if not trajectories.converged.all():
@@ -245,14 +251,14 @@ def out_of_reach(
     middle = (memory.outlook or Outlook.of(fitted)).sd_now(fitted, task.plan.target[0])
     if ahead.setup.half_turns:
         low, high = past.real.min(axis=1), past.real.max(axis=1)
-        sd = np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
+        sd = margin * np.hypot(middle, 0.5 * (high - low) * fitted.bevel_sd)
         return partial(terms.out_of_reach, expected=above_zero(low, sd) + above_zero(-high, sd))
     # By symmetry the ends along the present direction of the bevel are those along any other. The first step displaces
     # the middle towards the target or away from it: the ends are that much farther, or nearer.
     away, radius = -past.mean(), 0.5 * np.abs(past[0] - past[1])
     if _bevel_alone_across(task, ahead):
         away = 1j * away.imag
-    sd = np.hypot(middle, radius * fitted.bevel_sd)
+    sd = margin * np.hypot(middle, radius * fitted.bevel_sd)
     angle = cmath.phase(complex(away) * fitted.state.bevel.conjugate())
     return partial(terms.out_of_reach, expected=above_zero(abs(away) - radius, sd), angle=angle)
 
@@ -266,7 +272,7 @@ def _bevel_alone_across(task: Task, ahead: Ahead) -> bool:
 
 def above_zero(mean: Floats, sd: Floats) -> Floats:
     """Mean of the part above zero of normal values: ∫₀^∞ x N(mean, sd²) dx."""
-    z = mean / np.maximum(sd, np.finfo(float).tiny)
+    z = mean / np.maximum(sd, _CERTAIN)
     below = np.array([0.5 * math.erfc(-value / math.sqrt(2.0)) for value in z])
     part: Floats = mean * below + sd * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
     return part
