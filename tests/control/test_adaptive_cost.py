@@ -102,6 +102,8 @@ def test_the_blur_is_the_standard_deviation_of_the_linear_model_without_a_miss(q
     decision, memory = decided(quick_plan, estimate)
     assert memory.blur == memory.outlook.sd_to_come(estimate, quick_plan.target[0])
     assert 0.0 < 0.7 * memory.blur <= decision.miss_sd
+    alone, memory = decided(replace(quick_plan, strategy="steering"), estimate)
+    assert alone.miss_sd >= memory.blur
 
 
 @given(st.floats(-3.0, 3.0), st.floats(0.01, 2.0))

@@ -70,7 +70,8 @@ def test_in_space_it_is_that_on_an_axis(now, miss):
     deep, space = linear(np.kron(np.eye(2), precision), np.concatenate([curves, 1j * curves]), now)
     space.axes = 2
     assert deep.sd_to_come(space, TARGET) == pytest.approx(flat.sd_to_come(plane, TARGET))
-    assert deep.sd(space, TARGET, miss * (1 - 1j)) == pytest.approx(flat.sd(plane, TARGET, miss))
+    on_an_axis = flat.sd(plane, TARGET, miss, guided=True)
+    assert deep.sd(space, TARGET, miss * (1 - 1j), guided=True) == pytest.approx(on_an_axis)
 
 
 def test_past_the_last_correction_nothing_is_learned():
@@ -84,20 +85,23 @@ def test_past_the_last_correction_nothing_is_learned():
 
 @given(
     miss=st.floats(-30.0, 30.0), now=st.floats(-25.0, 39.0), variance=st.floats(1e-6, 1.0),
-    sds=st.tuples(st.floats(1e-3, 3.0), st.floats(1e-3, 3.0)),
+    sds=st.tuples(st.floats(1e-3, 3.0), st.floats(1e-3, 3.0)), guided=st.booleans(),
 )  # fmt: skip
 @hypothesis_settings(deadline=None, derandomize=True)
-def test_it_is_never_below_what_is_unexplained_and_grows_with_a_miss_that_stays(miss, now, variance, sds):
-    """By the miss at first, and by what is uncertain now at most."""
+def test_it_is_never_below_what_is_unexplained_and_grows_with_a_miss_that_stays(
+    miss, now, variance, sds, guided
+):
+    """By the miss at first, and by what is uncertain now at most. A guide that corrects makes it smaller."""
     _, curves = two_parameters()
     outlook, estimate = linear(np.diag(np.array(sds) ** -2.0), curves, now, variance)
-    least, sd = outlook.sd(estimate, TARGET, 0.0), outlook.sd(estimate, TARGET, miss)
-    assert 0.7 * floor(estimate) <= least == 0.7 * outlook.sd_to_come(estimate, TARGET) <= sd
+    least, sd = (outlook.sd(estimate, TARGET, one, guided=guided) for one in (0.0, miss))
+    factor = 0.7 if guided else 1.0
+    assert factor * floor(estimate) <= least == factor * outlook.sd_to_come(estimate, TARGET) <= sd
     end = curves[:, GRID == TARGET].ravel()
     uncertain = np.sqrt(end**2 @ np.array(sds) ** 2)
     grown = np.sqrt(max(sd**2 - least**2, 0.0))
     assert grown == pytest.approx(min(abs(miss), uncertain), rel=1e-6, abs=1e-6)
-    assert outlook.sd(estimate, TARGET, -miss) == sd
+    assert outlook.sd(estimate, TARGET, -miss, guided=guided) == sd
 
 
 def test_the_nearer_the_target_the_less_will_be_learned():

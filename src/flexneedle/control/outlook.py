@@ -11,8 +11,9 @@ is predicted although the search minimises it: at the limits of the needle, erro
 readings reveal cannot be corrected either.
 
 Tissue is rarely as far from the prior as this allows for, and the fit takes the errors of its model for noise of the
-readings. So the normal distribution is too wide about the tip and too narrow along the needle. The factors f, and f_s
-on the deviations of the shape, make intervals for 95 % contain about 95 % of the ends of insertions in training worlds.
+readings. So the normal distribution is too wide about a tip that the guide corrects, and too narrow along the needle.
+The factors f, and f_s on the deviations of the shape, make intervals for 95 % contain about 95 % of the ends of
+insertions in training worlds. With the bevel alone, f is 1.
 """
 
 from dataclasses import dataclass, replace
@@ -73,10 +74,14 @@ class Outlook:
             curves[k] = np.interp(self.grid, depth, bevel * direction)
         return replace(self, curves=curves, bent=bent)
 
-    def sd(self, estimate: Identified, target: float, miss: complex) -> float:
-        """Standard deviation (mm), on an axis, of the miss at the depth `target` (mm), if `miss` (mm) is predicted."""
+    def sd(self, estimate: Identified, target: float, miss: complex, *, guided: bool) -> float:
+        """Standard deviation (mm), on an axis, of the miss at the depth `target` (mm), if `miss` (mm) is predicted.
+
+        guided: whether the guide may move.
+        """
+        factor = _MISS_FACTOR if guided else 1.0
         stays = min(abs(miss) ** 2 / estimate.axes, self.sd_now(estimate, target) ** 2)
-        return float(np.sqrt((_MISS_FACTOR * self.sd_to_come(estimate, target)) ** 2 + stays))
+        return float(np.sqrt((factor * self.sd_to_come(estimate, target)) ** 2 + stays))
 
     def sd_to_come(self, estimate: Identified, target: float) -> float:
         """Standard deviation (mm), on an axis, of a miss that is corrected while it can be, by the linear model."""

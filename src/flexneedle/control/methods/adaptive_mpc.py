@@ -291,7 +291,8 @@ def _forecast(
     nodes, leaning = shapes[:, -1]
     before = memory.outlook or Outlook.of(fitted)
     outlook = before.renewed(fitted, found.trajectories.controls[0], found.trajectories.tips[0], nodes)
-    sd = outlook.sd(fitted, task.plan.target[0], miss)
+    guided = guide_may_move(task.scenario.setup, task.plan.strategy)
+    sd = outlook.sd(fitted, task.plan.target[0], miss, guided=guided)
     by_guide, by_bevel = laterals(leaning - nodes, Y, fitted.axes), outlook.bent[fitted.slots.bevel]
     guide, bevel = (
         moved / moved[-1] if abs(moved[-1]) > _STILL else 0.0 * moved for moved in (by_guide, by_bevel)
