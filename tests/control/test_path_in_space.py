@@ -57,7 +57,7 @@ def angles_of(ahead, rows):
 
 @pytest.mark.parametrize("rig", RIGS)
 @given(seed=SAMPLES)
-@settings(max_examples=8)
+@settings(max_examples=8, deadline=None)
 def test_every_sample_is_within_the_limits_of_the_rig(rig, seed):
     """Guide, on its axes alone, and rotation; the depths grow to the target."""
     ahead, scenario = ahead_of(rig)
@@ -124,7 +124,7 @@ def test_two_half_turns_that_are_due_cancel():
 
 
 @given(seed=SAMPLES)
-@settings(max_examples=15)
+@settings(max_examples=15, deadline=None)
 def test_the_needle_has_the_angle_of_the_last_roll_behind_it(seed):
     """Random rolls at depths that differ: at every place beyond a step's length of a roll."""
     ahead, _ = ahead_of("two axes")
@@ -139,6 +139,22 @@ def test_the_needle_has_the_angle_of_the_last_roll_behind_it(seed):
     middle, angle = 0.5 * (depth[0, 1:] + depth[0, :-1]), angles_of(ahead, rows)[0]
     behind = np.searchsorted(depths, middle)
     np.testing.assert_allclose(angle, np.append(ahead.state.roll, angles)[behind], atol=1e-9)
+
+
+@given(seed=SAMPLES)
+@settings(max_examples=20, deadline=None)
+def test_no_roll_goes_the_long_way_round(seed):
+    """Whatever angles a sample has, if the driver turns without limit; also of several rolls that are due at once."""
+    ahead, _ = ahead_of("two axes", roll=2.0)
+    rng = np.random.default_rng(seed)
+    samples = proposals(ahead, 24, rng)
+    samples[:, ahead.angles] += rng.uniform(-12.0, 12.0, samples[:, ahead.angles].shape)
+    rows, _ = ahead.controls(samples)
+    assert (np.abs(rows[..., ROLL]) <= math.pi + 1e-9).all()
+    x = float(ahead.depth[0])
+    now = GuidePath(ahead.path.depth, ahead.path.guide, np.array([[x, 5.0], [x, 7.9]]))
+    command, _ = ahead.first(now)
+    assert command.roll == pytest.approx(math.remainder(7.9 - 2.0, 2.0 * math.pi))
 
 
 def test_of_two_rolls_at_one_depth_the_second_counts():

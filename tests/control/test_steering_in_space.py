@@ -134,5 +134,14 @@ def test_no_angle_in_the_range_is_nearer_in_direction(most, angle, roll, other):
     assert off <= min(others) + 1e-9
 
 
-def test_without_a_limit_a_roll_is_not_changed():
-    assert roll_within(SPACE.setup, 10.0, 5.0) == 5.0
+@given(most=st.floats(200.0, 720.0) | st.none(), angle=st.floats(-1.0, 1.0), roll=st.floats(-20.0, 20.0))
+def test_a_roll_goes_the_short_way_round_where_it_can(most, angle, roll):
+    """The long way only where the short one ends beyond the range."""
+    setup = SPACE.with_values({} if most is None else {"setup.max_rotation_deg": most}).setup
+    before = angle * min(setup.max_rotation, 10.0)
+    turn = roll_within(setup, before, roll)
+    assert abs(math.remainder(turn - roll, 2.0 * math.pi)) < 1e-8
+    short = math.remainder(roll, 2.0 * math.pi)
+    if abs(turn) > math.pi + 1e-9:
+        assert abs(before + short) > setup.max_rotation
+    assert abs(turn) < 2.0 * math.pi + 1e-9

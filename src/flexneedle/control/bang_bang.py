@@ -80,7 +80,7 @@ def wanted_roll(
     else:
         across = seen(pose, target)[1]
         towards = across if across != 0.0 else bevel
-        angles = [within(cmath.phase(one * bevel.conjugate())) for one in (towards, -towards)]
+        angles = [within(float(np.angle(one * bevel.conjugate()))) for one in (towards, -towards)]
         ends = ((closest_approach(pose, curvature, _turned(bevel, one), target), one) for one in angles)
         (roll, angle), off = min(ends), closest_approach(pose, 0.0, bevel, target)
         gain = keep - roll

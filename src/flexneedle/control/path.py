@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flexneedle.control.guide import guide_axes, guide_reach, most_guide_step
 from flexneedle.control.interface import travel_left
 from flexneedle.control.mpc import planned_base
-from flexneedle.control.rotation import roll_within
+from flexneedle.control.rotation import roll_within, shortest
 from flexneedle.estimation.task import Task
 from flexneedle.planning.insertion import LEAST_ROLL
 from flexneedle.scenario.sections.apparatus import Setup
@@ -203,12 +203,13 @@ class Ahead:
             _without_twins(ascending, _DUE * self.advance, both=half).T, goals.T, strict=True
         ):
             nearest = np.searchsorted(middle, roll)
-            made = (roll < self.depth[-1]) & (nearest < m) & (np.abs(goal - angle) >= LEAST_ROLL)
+            turn = goal - angle if half else shortest(self.setup, angle, goal - angle)
+            made = (roll < self.depth[-1]) & (nearest < m) & (np.abs(turn) >= LEAST_ROLL)
             at = np.minimum(np.maximum(nearest, last + 1), m - 1)
             inner = made & (at > 0)
             depth[rows[inner], at[inner]] = roll[inner]
-            turned[rows[made], at[made]] += (goal - angle)[made]
-            angle = angle if half else np.where(made, goal, angle)
+            turned[rows[made], at[made]] += turn[made]
+            angle = angle if half else np.where(made, angle + turn, angle)
             last = np.where(made, at, last)
         roll = turned[:, :m]
         return depth, np.pi * (np.rint(roll / np.pi) % 2.0) if half else roll
@@ -261,10 +262,11 @@ class Ahead:
         return Control.of(row.tolist()), replace(path, rolls=later)
 
     def _due_roll(self, angles: Floats) -> float:
-        """The roll (rad) to the last of these angles."""
+        """The roll (rad) to the last of these angles, the short way."""
         if self.setup.half_turns:
             return np.pi * (len(angles) % 2)
-        return float(angles[-1]) - self.state.roll if len(angles) else 0.0
+        present = self.state.roll
+        return roll_within(self.setup, present, float(angles[-1]) - present) if len(angles) else 0.0
 
 
 def _without_twins(rolls: Floats, near: float, *, both: bool) -> Floats:

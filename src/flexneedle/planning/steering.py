@@ -10,7 +10,6 @@ as well. The ends of insertions with one angle lie on an arc, and what the bevel
 still reaches all of it: each point of the hull lies on a chord between two angles ±b in the range.
 """
 
-import cmath
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -166,9 +165,9 @@ def rolled(problem: PlanProblem, z: Floats, side: float) -> Floats:
     """Controls (N, m, 9) of an insertion that starts with the bevel to `side` of the problem's direction and flips it
     at shares z (N, k) of the target's depth, in any order.
     """
-    start, rolls = cmath.phase(side * problem.direction), np.full(z.shape, np.pi)
+    start, rolls = float(np.angle(side * problem.direction)), np.full(z.shape, np.pi)
     if np.isfinite(problem.rotation):  # to and fro between two angles in the range
-        there = cmath.phase(-side * problem.direction)
+        there = float(np.angle(-side * problem.direction))
         rolls = np.tile((there - start) * (-1.0) ** np.arange(z.shape[1]), (len(z), 1))
     return _insertion(problem, z, np.full(len(z), start), rolls)
 

@@ -9,7 +9,6 @@ each relative to a scale of the scenario, so that one setting serves every needl
 Each decision comes with the predicted miss and its standard deviation (`control.outlook`).
 """
 
-import cmath
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -259,7 +258,7 @@ def out_of_reach(
     if _bevel_alone_across(task, ahead):
         away = 1j * away.imag
     sd = margin * np.hypot(middle, radius * fitted.bevel_sd)
-    angle = cmath.phase(complex(away) * fitted.state.bevel.conjugate())
+    angle = float(np.angle(complex(away) * fitted.state.bevel.conjugate()))
     return partial(terms.out_of_reach, expected=above_zero(abs(away) - radius, sd), angle=angle)
 
 
