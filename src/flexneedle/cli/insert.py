@@ -235,7 +235,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         (scenario.setup.turns, str(insertion.flips)),
         ("  planned", str(insertion.plan.flips)),
         ("control periods", str(result["steps"])),
-        *([("held", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
+        *([("waited", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
         ("planning time", _number(timing["plan_seconds"], "s")),
         ("median period time", _number(timing["period_ms"]["p50"], "ms")),
     ]
