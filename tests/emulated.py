@@ -16,10 +16,10 @@ DEADLINE_S = 20.0
 
 
 @contextmanager
-def emulator(*arguments, end=signal.SIGINT):
-    """Run `flexneedle emulate aurora` with these arguments; give the path of the device and a function that writes a
-    line to it and returns what it answers."""
-    command = [sys.executable, "-m", "flexneedle", "emulate", "aurora", *arguments]
+def emulator(*arguments, end=signal.SIGINT, device="aurora"):
+    """Run `flexneedle emulate` with a device and these arguments; give the path or address of the device and a function
+    that writes a line to the emulator and returns what it says to that."""
+    command = [sys.executable, "-m", "flexneedle", "emulate", device, *arguments]
     process = subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True)
 
     def tell(line):

@@ -1,4 +1,4 @@
-"""`flexneedle emulate`: an emulated device on a pseudo-terminal, for tests without hardware."""
+"""`flexneedle emulate`: an emulated tracker or motion controller, for tests without hardware."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ from flexneedle.console.common import HelpFormatter, examples, seed
 _EXAMPLES = examples(
     "flexneedle emulate aurora --link /tmp/aurora",
     "flexneedle emulate aurora --still --sensors 2 --seed 3",
+    "flexneedle emulate galil --port 2323 --fault stall=A@5",
 )
+
+
+_LAST_PORT = 65535
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -59,19 +63,47 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--seed", type=seed, default=0, metavar="N", help="seed of jitter and corrupted bytes (default: 0)"
     )
     aurora.set_defaults(handler=_emulate_aurora)
+    galil = devices.add_parser(
+        "galil",
+        help="a Galil DMC-4143 on a TCP port",
+        description="Print the address of the emulated controller and serve it until interrupted (Ctrl-C). "
+        "Its four motors move in real time.",
+        epilog=_EXAMPLES,
+        formatter_class=HelpFormatter,
+    )
+    galil.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1, only this machine)"
+    )
+    galil.add_argument(
+        "--port", type=_port, default=0, metavar="N", help="port to listen on (default: one that is free)"
+    )
+    galil.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="KIND[=DETAIL]@SECONDS[:DURATION]",
+        help="inject a fault at SECONDS after the first motion; repeatable; see docs/rig/galil.md",
+    )
+    galil.set_defaults(handler=_emulate_galil)
+
+
+def _port(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and int(text) <= _LAST_PORT):
+        raise argparse.ArgumentTypeError(f"{text}: must be a port from 0 (one that is free) to {_LAST_PORT}")
+    return int(text)
 
 
 def _emulate_aurora(args: argparse.Namespace) -> int:
     from time import monotonic
 
     from flexneedle.rig.devices.priority import set_realtime_priority
-    from flexneedle.rig.emulator.aurora import FIRMWARE, fresh
+    from flexneedle.rig.emulator.aurora import FAULTS, FIRMWARE, fresh
     from flexneedle.rig.emulator.faults import parse_fault
     from flexneedle.rig.emulator.motion import CENTRE
     from flexneedle.rig.emulator.orders import Orders
     from flexneedle.rig.emulator.server import EmulatorSession, Serial, serve
 
-    faults = [parse_fault(spec) for spec in args.fault]
+    faults = [parse_fault(spec, FAULTS) for spec in args.fault]
     device = fresh(args.sensors, args.firmware or FIRMWARE, has_bx=not args.no_bx)
     with Serial(args.link) as serial:
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the link is removed then too
@@ -82,6 +114,25 @@ def _emulate_aurora(args: argparse.Namespace) -> int:
                 device, faults, args.seed, monotonic(), rest=CENTRE if args.still else None
             )
             serve(session, serial, Orders(None if sys.stdin is None else sys.stdin.fileno()), _print_line)
+        except KeyboardInterrupt:
+            return 0
+
+
+def _emulate_galil(args: argparse.Namespace) -> int:
+    from time import monotonic
+
+    from flexneedle.rig.devices.priority import set_realtime_priority
+    from flexneedle.rig.emulator.faults import parse_fault
+    from flexneedle.rig.emulator.galil.controller import Device
+    from flexneedle.rig.emulator.galil.server import FAULTS, GalilSession, Tcp, serve
+
+    faults = [parse_fault(spec, FAULTS) for spec in args.fault]
+    with Tcp(args.host, args.port) as tcp:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        set_realtime_priority()  # a real device does not wait for other processes on this machine
+        try:
+            print("{}:{}".format(*tcp.address), flush=True)
+            serve(GalilSession(Device(), faults, monotonic()), tcp, _print_line)
         except KeyboardInterrupt:
             return 0
 

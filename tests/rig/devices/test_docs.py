@@ -14,7 +14,8 @@ import pytest
 
 from flexneedle.cli.main import build_parser
 from flexneedle.rig.devices.aurora.readings import reading
-from flexneedle.rig.emulator.faults import KINDS, parse_fault
+from flexneedle.rig.emulator.aurora import FAULTS
+from flexneedle.rig.emulator.faults import parse_fault
 
 PAGE = (Path(__file__).parents[3] / "docs" / "tracking" / "aurora.md").read_text()
 COMMANDS = [
@@ -29,14 +30,14 @@ COMMANDS = [
 def test_its_commands_are_valid(command):
     args = build_parser().parse_args(shlex.split(command))
     assert callable(args.handler)
-    assert all(parse_fault(fault).kind in KINDS for fault in getattr(args, "fault", []))
+    assert all(parse_fault(fault, FAULTS).kind in FAULTS for fault in getattr(args, "fault", []))
 
 
 def test_its_table_has_every_fault():
     listed = re.findall(
         r"`([a-z-]+)`", "".join(line.split("|")[1] for line in PAGE.splitlines() if "|" in line)
     )
-    assert set(KINDS) <= set(listed)
+    assert set(FAULTS) <= set(listed)
 
 
 def test_its_table_has_every_status():

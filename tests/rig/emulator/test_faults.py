@@ -4,16 +4,16 @@ import pytest
 
 from flexneedle.errors import InputError
 from flexneedle.rig.emulator import codec
-from flexneedle.rig.emulator.aurora import fresh
+from flexneedle.rig.emulator.aurora import FAULTS, fresh
 from flexneedle.rig.emulator.faults import Fault, active, parse_fault
 from flexneedle.rig.emulator.server import EmulatorSession
 
 
 def test_a_fault_has_a_kind_a_detail_a_start_and_a_duration():
-    assert parse_fault("missing=ref1@5:2") == Fault("missing", 5.0, 7.0, "ref1")
-    assert parse_fault("silence@0.5") == Fault("silence", 0.5)
-    assert parse_fault("error@1:1").detail == "0D"
-    assert parse_fault("broken@1:1").detail == "tip"
+    assert parse_fault("missing=ref1@5:2", FAULTS) == Fault("missing", 5.0, 7.0, "ref1")
+    assert parse_fault("silence@0.5", FAULTS) == Fault("silence", 0.5)
+    assert parse_fault("error@1:1", FAULTS).detail == "0D"
+    assert parse_fault("broken@1:1", FAULTS).detail == "tip"
 
 
 @pytest.mark.parametrize(
@@ -21,7 +21,7 @@ def test_a_fault_has_a_kind_a_detail_a_start_and_a_duration():
     [
         ("missing", "must be KIND"),
         ("mising@1", "kinds: missing, out-of-volume"),
-        ("missing=ref9@1", "sensors: tip, ref1"),
+        ("missing=ref9@1", "no such sensor; choices: tip, ref1"),
         ("error=XY@1", "two hexadecimal digits, such as 0D"),
         ("system=1@1", "two hexadecimal digits, such as 20"),
         ("delay=x@1", "x is not a number of seconds"),
@@ -33,7 +33,7 @@ def test_a_fault_has_a_kind_a_detail_a_start_and_a_duration():
 )
 def test_an_invalid_fault_is_rejected_in_one_line(spec, message):
     with pytest.raises(InputError, match=message) as refusal:
-        parse_fault(spec)
+        parse_fault(spec, FAULTS)
     assert "\n" not in str(refusal.value)
 
 
@@ -48,7 +48,7 @@ def command(text):
 
 def tracking(*specs, seed=0):
     """Return a session that began tracking at 10 s."""
-    session = EmulatorSession(fresh(1), [parse_fault(spec) for spec in specs], seed, 0.0)
+    session = EmulatorSession(fresh(1), [parse_fault(spec, FAULTS) for spec in specs], seed, 0.0)
     for text in ("INIT:", "PINIT:0A", "PENA:0AD", "TSTART:"):
         due, reply = session.reply(command(text), 10.0)
         assert (due, reply) == (10.0, codec.text("OKAY")), "faults only begin with tracking"

@@ -10,10 +10,37 @@ from dataclasses import dataclass, field, replace
 
 from flexneedle.rig.emulator import codec
 from flexneedle.rig.emulator.codec import Request
+from flexneedle.rig.emulator.faults import BYTE, SECONDS, FaultKind
 from flexneedle.rig.emulator.motion import SENSORS, EmulatedPose
 
 FIRMWARE = "AURORA Rev 008"
 """Freeze tag of the firmware, by which clients choose BX or TX."""
+
+
+def _of_a_sensor(text: str) -> FaultKind:
+    return FaultKind(text, SENSORS[0], "sensor", SENSORS)
+
+
+FAULTS = {
+    "missing": _of_a_sensor("a sensor is not measured (tip, or missing=SENSOR)"),
+    "out-of-volume": _of_a_sensor("a sensor is outside the volume (tip, or out-of-volume=SENSOR)"),
+    "partly-out": _of_a_sensor("a sensor is partly outside the volume (tip, or partly-out=SENSOR)"),
+    "broken": _of_a_sensor("a coil of a sensor is broken (tip, or broken=SENSOR)"),
+    "disabled": _of_a_sensor("a sensor is disabled (tip, or disabled=SENSOR)"),
+    "error": FaultKind("every command returns an error (0D, or error=CODE in hexadecimal)", "0D", BYTE),
+    "system": FaultKind(
+        "the field generator is disconnected (20, or system=BITS of the system status in hexadecimal)",
+        "20",
+        BYTE,
+    ),
+    "garbled": FaultKind("a byte of each reply is wrong"),
+    "cut": FaultKind("the second half of each reply is lost"),
+    "silence": FaultKind("no reply"),
+    "delay": FaultKind("replies are delayed (0.2, or delay=SECONDS)", "0.2", SECONDS),
+    "frozen": FaultKind("the frame number does not increase"),
+    "unplug": FaultKind("the cable is pulled, and plugged in again after the duration"),
+}
+"""The kinds of fault of the tracker; their times are since tracking first began."""
 
 _FIRST_HANDLE = 0x0A
 _OCCUPIED, _INITIALIZED, _ENABLED = 0x01, 0x10, 0x20

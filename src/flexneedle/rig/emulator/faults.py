@@ -1,38 +1,34 @@
-"""Faults of the emulated tracker and their times: `KIND[=DETAIL]@SECONDS[:DURATION]`."""
+"""Faults of an emulated device and their times: `KIND[=DETAIL]@SECONDS[:DURATION]`. Each device has its own kinds."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import inf
 
 from flexneedle.errors import InputError
-from flexneedle.rig.emulator.motion import SENSORS
 
-KINDS = {
-    "missing": "a sensor is not measured (tip, or missing=SENSOR)",
-    "out-of-volume": "a sensor is outside the volume (tip, or out-of-volume=SENSOR)",
-    "partly-out": "a sensor is partly outside the volume (tip, or partly-out=SENSOR)",
-    "broken": "a coil of a sensor is broken (tip, or broken=SENSOR)",
-    "disabled": "a sensor is disabled (tip, or disabled=SENSOR)",
-    "error": "every command returns an error (0D, or error=CODE in hexadecimal)",
-    "system": "the field generator is disconnected (20, or system=BITS of the system status in hexadecimal)",
-    "garbled": "a byte of each reply is wrong",
-    "cut": "the second half of each reply is lost",
-    "silence": "no reply",
-    "delay": "replies are delayed (0.2, or delay=SECONDS)",
-    "frozen": "the frame number does not increase",
-    "unplug": "the cable is pulled, and plugged in again after the duration",
-}
-"""Description of each kind of fault and its detail."""
-
-_OF_A_SENSOR = ("missing", "out-of-volume", "partly-out", "broken", "disabled")
-_DEFAULTS = dict.fromkeys(_OF_A_SENSOR, SENSORS[0]) | {"error": "0D", "system": "20", "delay": "0.2"}
 _FORM = re.compile(r"(?P<kind>[a-z-]+)(=(?P<detail>[^@]+))?@(?P<start>[0-9.]+)(:(?P<duration>[0-9.]+))?")
+
+SECONDS, BYTE = "seconds", "byte"
+"""Forms of a detail: a number of seconds above 0; two hexadecimal digits."""
+
+
+@dataclass(frozen=True)
+class FaultKind:
+    """A kind of fault: its description, the detail if none is given, and what the detail may be.
+
+    form: SECONDS, BYTE, or what the detail names ("sensor", one of `choices`); "": it takes none.
+    """
+
+    text: str
+    default: str = ""
+    form: str = ""
+    choices: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault from `start` to `end` (s since tracking first began); detail: a sensor, a code, seconds, or ""."""
+    """A fault from `start` to `end` (s since the device began to work); detail: as its kind has it, or ""."""
 
     kind: str
     start: float
@@ -40,33 +36,31 @@ class Fault:
     detail: str = ""
 
 
-def parse_fault(spec: str) -> Fault:
-    """Return the fault of an option value. Raises InputError."""
+def parse_fault(spec: str, kinds: Mapping[str, FaultKind]) -> Fault:
+    """Return the fault of an option value, of one of these kinds by name. Raises InputError."""
     form = _FORM.fullmatch(spec)
     if form is None:
-        raise InputError(
-            f"--fault {spec}: must be KIND[=DETAIL]@SECONDS[:DURATION], such as missing=ref1@5:2"
-        )
-    kind = form["kind"]
-    if kind not in KINDS:
-        raise InputError(f"--fault {spec}: unknown kind; kinds: {', '.join(KINDS)}")
-    detail = form["detail"] or _DEFAULTS.get(kind, "")
-    _check_detail(spec, kind, detail)
+        example = next(f"{name}={kind.choices[-1]}@5:2" for name, kind in kinds.items() if kind.choices)
+        raise InputError(f"--fault {spec}: must be KIND[=DETAIL]@SECONDS[:DURATION], such as {example}")
+    name = form["kind"]
+    if name not in kinds:
+        raise InputError(f"--fault {spec}: unknown kind; kinds: {', '.join(kinds)}")
+    detail = form["detail"] or kinds[name].default
+    _check_detail(spec, name, kinds[name], detail)
     start = _seconds(spec, form["start"])
     end = inf if form["duration"] is None else start + _seconds(spec, form["duration"])
-    return Fault(kind, start, end, detail)
+    return Fault(name, start, end, detail)
 
 
-def _check_detail(spec: str, kind: str, detail: str) -> None:
-    if kind in _OF_A_SENSOR and detail not in SENSORS:
-        raise InputError(f"--fault {spec}: no such sensor; sensors: {', '.join(SENSORS)}")
-    if kind in ("error", "system") and not re.fullmatch(r"[0-9A-F]{2}", detail):
-        raise InputError(f"--fault {spec}: must be two hexadecimal digits, such as {_DEFAULTS[kind]}")
-    if kind == "delay":
-        if not _seconds(spec, detail) > 0.0:
-            raise InputError(f"--fault {spec}: the delay must be above 0 s, such as delay=0.2")
-    elif detail and kind not in _DEFAULTS:
-        raise InputError(f"--fault {spec}: {kind} takes no detail")
+def _check_detail(spec: str, name: str, kind: FaultKind, detail: str) -> None:
+    if kind.choices and detail not in kind.choices:
+        raise InputError(f"--fault {spec}: no such {kind.form}; choices: {', '.join(kind.choices)}")
+    if kind.form == BYTE and not re.fullmatch(r"[0-9A-F]{2}", detail):
+        raise InputError(f"--fault {spec}: must be two hexadecimal digits, such as {kind.default}")
+    if kind.form == SECONDS and not _seconds(spec, detail) > 0.0:
+        raise InputError(f"--fault {spec}: the {name} must be above 0 s, such as {name}={kind.default}")
+    if detail and not kind.form:
+        raise InputError(f"--fault {spec}: {name} takes no detail")
 
 
 def _seconds(spec: str, text: str) -> float:
@@ -77,5 +71,5 @@ def _seconds(spec: str, text: str) -> float:
 
 
 def active(faults: Iterable[Fault], time: float) -> tuple[Fault, ...]:
-    """Return the faults that are active at a time (s since tracking first began)."""
+    """Return the faults that are active at a time (s since the device began to work)."""
     return tuple(fault for fault in faults if fault.start <= time < fault.end)

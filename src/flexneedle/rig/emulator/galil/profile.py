@@ -1,0 +1,87 @@
+"""The motion profile of one axis: speed in trapezoids, sampled like the controller's. Counts and seconds.
+
+The controller renews the commanded position once a sample, 1 ms. Within a sample the acceleration is constant, so that
+the position is exact for the speeds at its ends.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+SAMPLE_S = 0.001
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Commanded position and speed of an axis, and where it is going.
+
+    goal: position at which the motion ends, None for one without end (jog); cruise: signed speed of that; speed,
+    acceleration, deceleration: positive, counts/s and counts/s²; stopping: it slows down to rest wherever that is.
+    """
+
+    position: float = 0.0
+    velocity: float = 0.0
+    goal: float | None = 0.0
+    cruise: float = 0.0
+    speed: float = 25_000.0
+    acceleration: float = 256_000.0
+    deceleration: float = 256_000.0
+    stopping: bool = False
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the motion has ended."""
+        arrived = self.stopping or (self.goal is not None and self.position == self.goal)
+        return self.velocity == 0.0 and (arrived or (self.goal is None and self.cruise == 0.0))
+
+
+def stopped(profile: Profile) -> Profile:
+    """The profile slowing down to rest at once."""
+    return replace(profile, stopping=True)
+
+
+def halted(profile: Profile) -> Profile:
+    """The profile at rest where it is, without slowing down."""
+    return replace(profile, velocity=0.0, goal=profile.position, stopping=False)
+
+
+def advanced(profile: Profile) -> Profile:
+    """The profile after one sample."""
+    if profile.at_rest:
+        return replace(profile, goal=profile.position, cruise=0.0, stopping=False)
+    wanted = _wanted(profile)
+    velocity = _towards(profile, wanted)
+    position = profile.position + 0.5 * (profile.velocity + velocity) * SAMPLE_S
+    goal = None if profile.stopping else profile.goal
+    slow = abs(velocity) <= profile.deceleration * SAMPLE_S
+    if goal is not None and slow and _is_at(goal, profile.position, position):
+        position, velocity = goal, 0.0
+    return replace(profile, position=position, velocity=velocity)
+
+
+def _wanted(profile: Profile) -> float:
+    """Signed speed at the end of the sample from which the axis can still stop at its goal."""
+    if profile.stopping:
+        return 0.0
+    if profile.goal is None:
+        return profile.cruise
+    left = profile.goal - profile.position
+    # It moves on for the mean of both speeds in this sample, and then slows down: v²/2d + (v₀ + v) h/2 = |left|.
+    step = profile.deceleration * SAMPLE_S
+    ahead = abs(left) - 0.5 * math.copysign(1.0, left) * profile.velocity * SAMPLE_S
+    stops = 0.5 * (math.sqrt(step * step + 8.0 * profile.deceleration * max(0.0, ahead)) - step)
+    return math.copysign(min(profile.speed, stops), left)
+
+
+def _towards(profile: Profile, wanted: float) -> float:
+    """Signed speed at the end of the sample, within acceleration and deceleration."""
+    now = profile.velocity
+    slower = now * wanted < 0.0 or abs(wanted) < abs(now)
+    most = (profile.deceleration if slower else profile.acceleration) * SAMPLE_S
+    if now * wanted < 0.0:  # to rest first
+        wanted = 0.0
+    return now + max(-most, min(most, wanted - now))
+
+
+def _is_at(goal: float, before: float, after: float) -> bool:
+    """Whether a sample ends as good as at the goal, or beyond it."""
+    return (goal - before) * (goal - after) <= 0.0 or abs(goal - after) < 0.5

@@ -1,0 +1,226 @@
+"""The emulated controller on TCP, with its time and faults. Runs until interrupted.
+
+Its motors run in real time, also while this process is not scheduled: before each command, and every few milliseconds,
+the samples are made up to the present.
+"""
+
+import select
+import socket
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from time import monotonic
+from typing import NoReturn, Self
+
+from flexneedle.errors import InputError
+from flexneedle.rig.emulator.faults import SECONDS, Fault, FaultKind, active
+from flexneedle.rig.emulator.galil import axis as one
+from flexneedle.rig.emulator.galil.axis import Axis
+from flexneedle.rig.emulator.galil.controller import AXES, SAMPLES_HZ, Device, advanced, reply
+
+_TICK_S = 0.005
+_LONGEST_LINE = 4096
+_MOST_CLIENTS = 8
+
+
+def _of_an_axis(text: str) -> FaultKind:
+    return FaultKind(text, AXES[0], "axis", tuple(AXES))
+
+
+FAULTS = {
+    "stall": _of_an_axis("a motor does not move (A, or stall=AXIS)"),
+    "lag": _of_an_axis("a motor follows late, by 0.15 s (A, or lag=AXIS)"),
+    "overshoot": _of_an_axis("a motor goes a fifth too far (A, or overshoot=AXIS)"),
+    "reversed": _of_an_axis("a motor turns the wrong way (A, or reversed=AXIS)"),
+    "limit": _of_an_axis("both limit switches of an axis are active (A, or limit=AXIS)"),
+    "off": _of_an_axis("a motor is switched off (A, or off=AXIS)"),
+    "reset": _of_an_axis("the position of an axis becomes 0 (A, or reset=AXIS)"),
+    "refuse": FaultKind("every command is answered by ?"),
+    "silence": FaultKind("commands are carried out, but not answered"),
+    "half-open": FaultKind("nothing is received and nothing answered; the connection stays"),
+    "delay": FaultKind("replies are delayed (0.2, or delay=SECONDS)", "0.2", SECONDS),
+    "unplug": FaultKind("connections are closed, and refused for the duration"),
+}
+"""The kinds of fault of the controller; their times are since the first motion."""
+
+_OF_MOTORS = one.FAULTS
+
+
+@dataclass
+class GalilSession:
+    """The controller and its faults over time. Times are monotonic, in seconds; power_on is the first.
+
+    moved_since: when an axis first moved, from which faults count; done: faults of one instant that have happened.
+    """
+
+    device: Device
+    faults: Sequence[Fault]
+    power_on: float
+    moved_since: float | None = None
+    _samples: int = 0
+    _done: set[Fault] = field(default_factory=set)
+
+    def faults_at(self, now: float) -> dict[str, Fault]:
+        """Return the active faults by kind; none before the first motion."""
+        if self.moved_since is None:
+            return {}
+        return {fault.kind: fault for fault in active(self.faults, now - self.moved_since)}
+
+    def advance(self, now: float) -> None:
+        """Let the axes move until `now`, with their faults."""
+        faults = self.faults_at(now)
+        axes = tuple(self._with_faults(axis, AXES[k], faults) for k, axis in enumerate(self.device.axes))
+        due = int((now - self.power_on) * SAMPLES_HZ) - self._samples
+        self.device = advanced(replace(self.device, axes=axes), max(0, due))
+        self._samples += max(0, due)
+        if self.moved_since is None and any(axis.running for axis in self.device.axes):
+            self.moved_since = now
+
+    def _with_faults(self, axis: Axis, name: str, faults: dict[str, Fault]) -> Axis:
+        of_this = {kind: fault for kind, fault in faults.items() if fault.detail == name}
+        for kind, change in _ONCE.items():
+            if kind in of_this and of_this[kind] not in self._done:
+                self._done.add(of_this[kind])
+                axis = change(axis)
+        return replace(axis, fault=next((kind for kind in _OF_MOTORS if kind in of_this), one.FOLLOWS))
+
+    def reply(self, line: str, now: float) -> tuple[float, bytes]:
+        """Return time and data of the reply to a line (b"": no reply)."""
+        self.advance(now)
+        faults = self.faults_at(now)
+        if "refuse" in faults:
+            return now, b"?"
+        self.device, answer = reply(self.device, line)
+        delay = float(faults["delay"].detail) if "delay" in faults else 0.0
+        return now + delay, b"" if "silence" in faults else answer.encode("ascii", "replace")
+
+
+_ONCE: dict[str, Callable[[Axis], Axis]] = {
+    "off": lambda axis: one.off(axis, one.ABORTED),
+    "reset": lambda axis: one.defined(axis, 0.0),
+}
+"""Faults of one instant."""
+
+
+@dataclass
+class _Client:
+    """A connection: what it has sent of a line, and replies that are due."""
+
+    socket: socket.socket
+    received: bytes = b""
+    due: list[tuple[float, bytes]] = field(default_factory=list)
+
+
+class Tcp:
+    """The listening socket and its connections. Use it as a context manager.
+
+    Raises InputError if the address cannot be used.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._address = host, port
+        self._listening: socket.socket | None = None
+        self.clients: list[_Client] = []
+
+    def __enter__(self) -> Self:
+        self.plug()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.unplug()
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Host and port on which it listens."""
+        return self._address
+
+    @property
+    def plugged(self) -> bool:
+        """Whether it listens."""
+        return self._listening is not None
+
+    def plug(self) -> None:
+        """Listen. Raises InputError."""
+        host, port = self._address
+        try:
+            self._listening = socket.create_server((host, port), reuse_port=False)
+        except OSError as error:
+            raise InputError(f"{host}:{port}: cannot be listened on: {error.strerror}") from None
+        self._listening.setblocking(False)
+        self._address = host, self._listening.getsockname()[1]
+
+    def unplug(self) -> None:
+        """Close all connections, and listen no more."""
+        for client in self.clients:
+            client.socket.close()
+        self.clients = []
+        if self._listening is not None:
+            self._listening.close()
+        self._listening = None
+
+    def lines(self, idle: float, *, deaf: bool) -> list[tuple[_Client, str]]:
+        """Wait for at most `idle` seconds; return the lines received, by connection. deaf: nothing is received."""
+        sources = [] if self._listening is None else [self._listening]
+        sources += [] if deaf else [client.socket for client in self.clients]
+        ready, _, _ = select.select(sources, [], [], idle)
+        if self._listening in ready and self._listening is not None:
+            with suppress(BlockingIOError):
+                self._accept(self._listening.accept()[0])
+        return [
+            (client, line)
+            for client in list(self.clients)
+            if client.socket in ready
+            for line in self._read(client)
+        ]
+
+    def _accept(self, connection: socket.socket) -> None:
+        if len(self.clients) == _MOST_CLIENTS:
+            connection.close()
+            return
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.clients.append(_Client(connection))
+
+    def _read(self, client: _Client) -> list[str]:
+        try:
+            data = client.socket.recv(_LONGEST_LINE)
+        except BlockingIOError:
+            return []
+        except OSError:
+            data = b""
+        if not data:
+            self._drop(client)
+            return []
+        *lines, client.received = (client.received + data)[-_LONGEST_LINE:].split(b"\r")
+        return [line.strip(b"\n").decode("ascii", "replace") for line in lines]
+
+    def _drop(self, client: _Client) -> None:
+        client.socket.close()
+        self.clients.remove(client)
+
+    def send_due(self, now: float) -> None:
+        """Send the replies that are due; what a connection does not take at once is lost."""
+        for client in list(self.clients):
+            while client.due and client.due[0][0] <= now:
+                try:
+                    client.socket.send(client.due.pop(0)[1])
+                except BlockingIOError:
+                    continue
+                except OSError:
+                    self._drop(client)
+                    break
+
+
+def serve(session: GalilSession, tcp: Tcp, say: Callable[[str], None]) -> NoReturn:
+    """Answer commands until interrupted. say: called with a line when connections are closed or possible again."""
+    while True:
+        now = monotonic()
+        faults = session.faults_at(now)
+        if ("unplug" in faults) == tcp.plugged:
+            (tcp.unplug if tcp.plugged else tcp.plug)()
+            say("listens again" if tcp.plugged else "unplugged")
+        for client, line in tcp.lines(_TICK_S, deaf="half-open" in faults):
+            client.due.append(session.reply(line, monotonic()))
+        now = monotonic()
+        session.advance(now)
+        tcp.send_due(now)
