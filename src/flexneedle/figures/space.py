@@ -15,7 +15,7 @@ from flexneedle.figures import scene
 from flexneedle.figures.curves import Roll, start_roll
 from flexneedle.figures.layout import ARROW
 from flexneedle.figures.scene import ALONG, View
-from flexneedle.figures.style import ESTIMATE, GUIDE, PLAN, QUIET, TRUE
+from flexneedle.figures.style import ESTIMATE, GUIDE, PLAN, QUIET, TRUE, signed
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Floats, Period, Plan, Point, Shape, X, Y, Z
 
@@ -60,7 +60,7 @@ def draw_start(ax: Axes, plan: Plan, view: View, length: float) -> None:
 
 def prediction_label(period: Period) -> str:
     """Return the name of the shape that was predicted in a period."""
-    return f"final shape ± {SDS:g} sd, predicted at {period.estimate.x:.0f} mm"
+    return f"final shape ± {SDS:g} sd, predicted at {signed(period.estimate.x, '.0f')} mm"
 
 
 def draw_prediction(ax: Axes, predicted: Shape, view: View, label: str) -> None:
@@ -123,4 +123,4 @@ def draw_guide_along(ax: Axes, travel: Floats, target: Point) -> None:
     up = 1 if target[Y] < y[-1] else -1
     beside: dict[str, Any] = {"ha": "center", "va": "bottom" if up > 0 else "top", "fontsize": 8}
     beside |= {"xytext": (0, 2 * up), "textcoords": "offset points", "color": GUIDE}
-    ax.annotate("guide", (z[-1], y[-1] + up * _RING), **beside)
+    ax.annotate("guide and its path", (z[-1], y[-1] + up * _RING), **beside)
