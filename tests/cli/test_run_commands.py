@@ -162,7 +162,8 @@ def test_a_target_has_two_or_three_numbers(capsys):
             cli.main(["insert", "--target", *given])
         assert caught.value.code == 2
         line = capsys.readouterr().err.splitlines()[-1]
-        assert line.endswith(f"{' '.join(given)}: must be two or three numbers, with SCENARIO before it")
+        rule = "must be two or three numbers (depth, y and, in space, z); SCENARIO stands before --target"
+        assert line.endswith(f"{' '.join(given)}: {rule}")
 
 
 def test_a_target_in_space_has_two_lateral_offsets(engine, capsys):

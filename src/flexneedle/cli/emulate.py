@@ -11,7 +11,14 @@ from flexneedle.console.common import HelpFormatter, examples, seed
 
 _EXAMPLES = examples(
     "flexneedle emulate aurora --link /tmp/aurora",
+    "flexneedle emulate galil --port 2323",
+)
+_AURORA_EXAMPLES = examples(
+    "flexneedle emulate aurora --link /tmp/aurora",
     "flexneedle emulate aurora --still --sensors 2 --seed 3",
+)
+_GALIL_EXAMPLES = examples(
+    "flexneedle emulate galil --port 2323",
     "flexneedle emulate galil --port 2323 --fault stall=A@5",
 )
 
@@ -33,7 +40,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="an NDI Aurora on a pseudo-terminal",
         description="Print the path of the emulated device and serve it until interrupted (Ctrl-C). "
         "The tip moves along an arc; a line X Y Z on stdin (mm, tracker frame) stops it at that position.",
-        epilog=_EXAMPLES,
+        epilog=_AURORA_EXAMPLES,
         formatter_class=HelpFormatter,
     )
     aurora.add_argument(
@@ -68,7 +75,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="a Galil DMC-4143 on a TCP port",
         description="Print the address of the emulated controller and serve it until interrupted (Ctrl-C). "
         "Its four motors move in real time.",
-        epilog=_EXAMPLES,
+        epilog=_GALIL_EXAMPLES,
         formatter_class=HelpFormatter,
     )
     galil.add_argument(
