@@ -162,7 +162,7 @@ def test_a_target_has_two_or_three_numbers(capsys):
             cli.main(["insert", "--target", *given])
         assert caught.value.code == 2
         line = capsys.readouterr().err.splitlines()[-1]
-        rule = "must be two or three numbers (depth, y and, in space, z); SCENARIO stands before --target"
+        rule = "must be two or three numbers (depth, y and, in space, z); put SCENARIO before --target"
         assert line.endswith(f"{' '.join(given)}: {rule}")
 
 

@@ -35,6 +35,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         formatter_class=HelpFormatter,
     )
     devices = parser.add_subparsers(title="devices", metavar="DEVICE", required=True)
+    _add_aurora(devices)
+    _add_galil(devices)
+
+
+def _add_aurora(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     aurora = devices.add_parser(
         "aurora",
         help="an NDI Aurora on a pseudo-terminal",
@@ -70,6 +75,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--seed", type=seed, default=0, metavar="N", help="seed of jitter and corrupted bytes (default: 0)"
     )
     aurora.set_defaults(handler=_emulate_aurora)
+
+
+def _add_galil(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     galil = devices.add_parser(
         "galil",
         help="a Galil DMC-4143 on a TCP port",

@@ -43,7 +43,7 @@ class _Target(argparse.Action):
         except ValueError:
             given = []
         if len(given) not in (2, 3):
-            rule = "must be two or three numbers (depth, y and, in space, z); SCENARIO stands before --target"
+            rule = "must be two or three numbers (depth, y and, in space, z); put SCENARIO before --target"
             raise argparse.ArgumentError(self, f"{' '.join(values)}: {rule}")
         setattr(namespace, self.dest, (*given, 0.0)[:3])
 

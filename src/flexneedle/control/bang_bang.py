@@ -45,12 +45,12 @@ def closest_approach(pose: Floats, curvature: float, bevel: complex, target: Poi
     bevel: its direction. The path of paper eq. 14 with steps u → 0: a line for curvature 0, else a circle.
     """
     along, across = seen(pose, target)
-    lateral, aside = (across * bevel.conjugate()).real, (across * bevel.conjugate()).imag
+    lateral, across_bevel = (across * bevel.conjugate()).real, (across * bevel.conjugate()).imag
     if along <= 0.0:
         return math.dist(target, pose[:3].tolist())
     # |‖t − c‖ − R| with the center c at the lateral distance R = 1/κ, rearranged so that κ → 0 stays exact.
     bend = curvature * (along**2 + lateral**2) - 2.0 * lateral
-    return math.hypot(bend / (1.0 + math.sqrt(max(0.0, 1.0 + curvature * bend))), aside)
+    return math.hypot(bend / (1.0 + math.sqrt(max(0.0, 1.0 + curvature * bend))), across_bevel)
 
 
 def wanted_roll(

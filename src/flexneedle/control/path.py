@@ -322,7 +322,7 @@ def _propose_angles(
     z[:, ahead.angles] += np.where(changed, _WIDEST * scale * rng.standard_normal(changed.shape), 0.0)
     present = ahead.state.roll
     towards = present + roll_within(ahead.setup, present, float(np.angle(aim * np.exp(-1j * present))))
-    aside = rng.choice([-1.0, 1.0], pair.size) * rng.uniform(0.0, np.pi, pair.size)
+    angle = rng.choice([-1.0, 1.0], pair.size) * rng.uniform(0.0, np.pi, pair.size)
     last = ahead.angles.stop
-    z[pair, last - 2], z[pair, last - 1] = towards + aside, towards - aside
+    z[pair, last - 2], z[pair, last - 1] = towards + angle, towards - angle
     z[pair[::2], ahead.depths.stop - 2] = ahead.depth[0]

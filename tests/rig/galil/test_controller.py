@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from flexneedle.rig.emulator.galil.controller import Device, advanced, reply
 
 
-def told(device, *lines):
+def after(device, *lines):
     """The state after lines, each of which must be accepted, and the last reply."""
     answer = ""
     for line in lines:
@@ -20,7 +20,7 @@ def told(device, *lines):
 
 def value(device, question):
     """The number that a question gets."""
-    return float(told(device, question)[1].rstrip(":"))
+    return float(after(device, question)[1].rstrip(":"))
 
 
 def why(device, line):
@@ -31,7 +31,7 @@ def why(device, line):
 
 
 def switched_on(*lines):
-    return told(Device(), "SH", *lines)[0]
+    return after(Device(), "SH", *lines)[0]
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_a_line_is_answered_command_by_command(line, answer):
     ],
 )
 def test_a_command_that_is_not_valid_is_refused_with_its_reason(lines, refused, reason):
-    device, _ = told(Device(), *lines)
+    device, _ = after(Device(), *lines)
     device = advanced(device, 5)
     assert why(device, refused) == f" {reason}\r\n:"
 
@@ -84,15 +84,15 @@ def test_of_several_values_none_is_set_if_one_is_refused():
 
 
 def test_a_relative_and_an_absolute_move_end_where_they_should():
-    device = advanced(told(switched_on(), "PR 500,,-200", "BGAC")[0], 200)
-    assert told(device, "TP")[1] == " 500, 0, -200, 0\r\n:"
+    device = advanced(after(switched_on(), "PR 500,,-200", "BGAC")[0], 200)
+    assert after(device, "TP")[1] == " 500, 0, -200, 0\r\n:"
     assert value(device, "SCA") == 1
-    device = advanced(told(device, "PAA=100", "BGA")[0], 200)
+    device = advanced(after(device, "PAA=100", "BGA")[0], 200)
     assert value(device, "TPA") == 100
 
 
-def test_motion_is_told_while_it_lasts():
-    device = advanced(told(switched_on(), "SPA=1000", "PRA=1000", "BGA")[0], 500)
+def test_motion_is_reported_while_it_lasts():
+    device = advanced(after(switched_on(), "SPA=1000", "PRA=1000", "BGA")[0], 500)
     assert value(device, "MG _BGA") == 1
     assert value(device, "TVA") == 1000
     assert value(device, "SCA") == 0
@@ -103,23 +103,23 @@ def test_motion_is_told_while_it_lasts():
 
 
 def test_a_stop_slows_down_and_an_abort_does_not():
-    device = advanced(told(switched_on(), "SP 1000,1000", "DC 10240,10240", "JG 1000,1000", "BGAB")[0], 300)
+    device = advanced(after(switched_on(), "SP 1000,1000", "DC 10240,10240", "JG 1000,1000", "BGAB")[0], 300)
     at = value(device, "TPA")
-    slowed = advanced(told(device, "ST")[0], 300)
+    slowed = advanced(after(device, "ST")[0], 300)
     assert value(slowed, "TPA") - at == pytest.approx(1000**2 / (2 * 10240), abs=2)
     assert value(slowed, "SCA") == 4
-    aborted = advanced(told(device, "AB")[0], 300)
+    aborted = advanced(after(device, "AB")[0], 300)
     assert value(aborted, "TPA") == at
     assert value(aborted, "SCA") == 7
 
 
 def test_position_tracking_follows_new_positions_without_begin():
-    device = told(switched_on("SPA=2000"), "PTA=1")[0]
+    device = after(switched_on("SPA=2000"), "PTA=1")[0]
     for goal in range(10, 210, 10):
-        device = advanced(told(device, f"PAA={goal}")[0], 25)
+        device = advanced(after(device, f"PAA={goal}")[0], 25)
     assert value(advanced(device, 100), "TPA") == 200
-    device = advanced(told(device, "PAA=9999")[0], 50)
-    rested = advanced(told(device, "STA")[0], 300)
+    device = advanced(after(device, "PAA=9999")[0], 50)
+    rested = advanced(after(device, "STA")[0], 300)
     assert value(rested, "TPA") < 400
     assert value(rested, "PTA=?") == 0
 
@@ -129,15 +129,15 @@ def test_position_tracking_follows_new_positions_without_begin():
 def test_a_limit_stops_the_axis_but_lets_it_go_back(kind, to, code):
     device = switched_on("SPA=2000", "DCA=102400")
     if kind == "software":
-        device = told(device, "FLA=300", "BLA=-300")[0]
+        device = after(device, "FLA=300", "BLA=-300")[0]
     else:
         first = replace(device.axes[0], switches=(-300.0, 300.0))
         device = replace(device, axes=(first, *device.axes[1:]))
-    device = advanced(told(device, f"PAA={to}", "BGA")[0], 2000)
+    device = advanced(after(device, f"PAA={to}", "BGA")[0], 2000)
     assert abs(value(device, "TPA")) == pytest.approx(300 + 2000**2 / (2 * 102400), abs=3)
     assert value(device, "SCA") == code
     assert why(device, "BGA").startswith(" 22 ") or why(device, f"PAA={to};BGA").startswith(" 22 ")
-    back = advanced(told(device, "PAA=0", "BGA")[0], 2000)
+    back = advanced(after(device, "PAA=0", "BGA")[0], 2000)
     assert value(back, "TPA") == 0
 
 
@@ -145,14 +145,14 @@ def test_a_limit_stops_the_axis_but_lets_it_go_back(kind, to, code):
 def test_a_motor_that_does_not_follow_is_switched_off_beyond_its_position_error(fault):
     device = switched_on("SPA=2000", "ERA=40", "OEA=1")
     device = replace(device, axes=(replace(device.axes[0], fault=fault), *device.axes[1:]))
-    device = advanced(told(device, "PRA=2000", "BGA")[0], 2000)
+    device = advanced(after(device, "PRA=2000", "BGA")[0], 2000)
     assert value(device, "MG _MOA") == 1
     assert value(device, "SCA") == 8
     assert abs(value(device, "TPA")) < 600
 
 
 def test_a_motor_that_is_off_does_not_move_and_its_position_follows_the_encoder():
-    device = told(switched_on(), "DPA=77", "MOA")[0]
+    device = after(switched_on(), "DPA=77", "MOA")[0]
     assert why(device, "BGA").startswith(" 20 ")
     assert value(device, "RPA") == value(device, "TPA") == 77
 

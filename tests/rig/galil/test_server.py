@@ -55,23 +55,31 @@ def test_an_unplugged_controller_loses_its_connections_and_can_be_reached_again(
     with connected("--fault", "unplug@0:0.3") as ask:
         ask("SHA;PRA=2000000;BGA")
 
-        def lost():
-            try:
-                ask("TPA")
-            except OSError:
-                return True
-            return False
-
+        lost, reachable = _holds_for(OSError, lambda: ask("TPA")), _works(ask.address)
         until(lost)
+        until(reachable)
+        with socket.create_connection(ask.address, timeout=DEADLINE_S) as line:
+            line.sendall(b"EO 0\r")
+            assert line.recv(16) == b":"
 
-        def again():
-            try:
-                socket.create_connection(ask.address, timeout=DEADLINE_S).close()
-            except OSError:
-                return False
+
+def _holds_for(error, action):
+    """Whether an action fails with an error."""
+
+    def fails():
+        try:
+            action()
+        except error:
             return True
+        return False
 
-        until(again)
+    return fails
+
+
+def _works(address):
+    """Whether a connection to an address is possible."""
+    refused = _holds_for(OSError, lambda: socket.create_connection(address, timeout=DEADLINE_S).close())
+    return lambda: not refused()
 
 
 def test_a_port_in_use_is_said_in_one_line():

@@ -7,14 +7,14 @@ from flexneedle.rig.emulator.galil.profile import SAMPLE_S, Profile, advanced, h
 
 FOLLOWS = "follows"
 FAULTS = ("stall", "lag", "overshoot", "reversed", "limit")
-"""What a motor may do in place of what it is told: it does not move; follows late; goes too far; turns the wrong way;
-stands at a limit switch."""
+"""What a motor may do in place of its command: it does not move; follows late; goes too far; turns the wrong way; is at
+a limit switch."""
 
 _LAG_S = 0.15
 _OVERSHOOT = 0.2
 
 RUNNING, ARRIVED, FORWARD_LIMIT, REVERSE_LIMIT, STOPPED, ABORTED, ERROR_OFF = 0, 1, 2, 3, 4, 7, 8
-"""Stop codes, as SC tells them."""
+"""Stop codes, as SC reports them."""
 
 _FAR = 2_147_483_647.0
 

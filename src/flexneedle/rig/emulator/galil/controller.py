@@ -1,10 +1,10 @@
 """The emulated Galil DMC-4143: its reply to a line in a state. Pure functions, without I/O or time.
 
 It has the commands that drive axes A to D: motor on and off, speeds, relative and absolute moves, position tracking,
-jog, stop, abort, limits, and what tells positions, errors and reasons. A command is two capital letters, axes and
-values as `PRA=100`, `PR 100,,50` or `BGAC`; several stand on a line with `;` between them. Each is answered by its data
-and `:`, or by `?`, after which `TC1` tells why. Facts are those of the maker's published command reference; it was not
-compared with a controller.
+jog, stop, abort, limits, and queries of positions, errors and reasons. A command is two capital letters, axes and
+values as `PRA=100`, `PR 100,,50` or `BGAC`; a line may have several with `;` between them. Each is answered by its data
+and `:`, or by `?`, after which `TC1` reports why. Facts are those of the maker's published command reference; it
+was not compared with a controller.
 """
 
 import math
@@ -90,9 +90,9 @@ def _executed(device: Device, command: str) -> tuple[Device, str]:
         return _WHOLE[name](device, rest)
     if name in _ACTIONS:
         return _acted(device, name, rest), ""
-    if name in _TOLD:
+    if name in _REPORTED:
         which = _listed(rest)
-        return device, _line(", ".join(_number(_TOLD[name](device.axes[k])) for k in which))
+        return device, _line(", ".join(_number(_REPORTED[name](device.axes[k])) for k in which))
     if name in _SETTINGS:
         return _set(device, name, rest)
     raise _RefusalError(1)
@@ -138,11 +138,11 @@ def _set(device: Device, name: str, rest: str) -> tuple[Device, str]:
         fields = {k: text.strip() for k, text in enumerate(rest.split(",")) if text.strip()}
     if not fields or max(fields) >= len(AXES):
         raise _RefusalError(50 if not fields else 4)
-    told, change = _SETTINGS[name]
+    reported, change = _SETTINGS[name]
     if any(text == "?" for text in fields.values()):
         if not all(text == "?" for text in fields.values()):
             raise _RefusalError(51)
-        return device, _line(", ".join(_number(told(device.axes[k])) for k in sorted(fields)))
+        return device, _line(", ".join(_number(reported(device.axes[k])) for k in sorted(fields)))
     # All values are checked before one is set.
     return _with(device, {k: change(device.axes[k], _value(text)) for k, text in fields.items()}), ""
 
@@ -276,7 +276,7 @@ _ACTIONS: dict[str, Callable[[Axis], Axis]] = {
 }
 
 
-# What tells
+# Queries
 
 
 def _switches(axis: Axis) -> float:
@@ -293,7 +293,7 @@ def _switches(axis: Axis) -> float:
     return float(sum(1 << bit for bit, holds in bits if holds))
 
 
-_TOLD: dict[str, Callable[[Axis], float]] = {
+_REPORTED: dict[str, Callable[[Axis], float]] = {
     "TP": lambda axis: round(axis.encoder),
     "RP": lambda axis: round(axis.profile.position),
     "TE": lambda axis: round(axis.profile.position) - round(axis.encoder),
@@ -301,7 +301,7 @@ _TOLD: dict[str, Callable[[Axis], float]] = {
     "TS": _switches,
     "SC": lambda axis: axis.stop,
 }
-_OPERANDS: dict[str, Callable[[Axis], float]] = _TOLD | {
+_OPERANDS: dict[str, Callable[[Axis], float]] = _REPORTED | {
     "BG": lambda axis: float(axis.running),
     "MO": lambda axis: float(not axis.servo),
     "LF": lambda axis: float(not axis.at_switches[1]),
@@ -309,7 +309,7 @@ _OPERANDS: dict[str, Callable[[Axis], float]] = _TOLD | {
 }
 
 
-def _tell_code(device: Device, rest: str) -> tuple[Device, str]:
+def _report_code(device: Device, rest: str) -> tuple[Device, str]:
     if rest not in ("", "0", "1"):
         raise _RefusalError(4)
     text = f"{device.error} {_ERRORS[device.error]}".strip() if rest == "1" else str(device.error)
@@ -339,7 +339,7 @@ def _echo(device: Device, rest: str) -> tuple[Device, str]:
 
 
 _WHOLE: dict[str, Callable[[Device, str], tuple[Device, str]]] = {
-    "TC": _tell_code,
+    "TC": _report_code,
     "MG": _message,
     "AB": _abort,
     "EO": _echo,
