@@ -109,6 +109,18 @@ def test_a_guide_on_one_axis_leaves_the_bevel_to_reach_across_it(state, side):
     assert weight["reach"] == task.settings.unguided_reach_weight
 
 
+def test_the_disc_is_charged_with_a_margin_of_its_uncertainty(state):
+    """Three times as uncertain, more of the target is expected beyond it."""
+    middle = np.mean([ends(state, then=turn) for turn in np.arange(4) * 0.5 * math.pi])
+    task, estimate, memory, ahead = prepared(state, middle + 2.0)
+    estimate = replace(estimate, precision=1e-8 * estimate.precision)
+    one, three = (
+        adaptive_mpc.out_of_reach(task, estimate, ahead, memory, margin).keywords["expected"]
+        for margin in (1.0, 3.0)
+    )
+    assert (three > one).all()
+
+
 @pytest.fixture
 def outlook(state):
     """Derivatives of the path and of the shape ahead, drawn at random, and an estimate with some covariance."""
