@@ -25,6 +25,10 @@ class ScenarioError(FileError):
     """A scenario cannot be read or violates a rule."""
 
 
+class RigError(FileError):
+    """A rig file cannot be read or violates a rule."""
+
+
 class CommandError(InputError, ValueError):
     """A command to the simulator or a device is out of range.
 
@@ -46,6 +50,10 @@ class StateError(InputError):
 
 class RunError(FlexneedleError):
     """An insertion or a study failed (exit status 1)."""
+
+
+class DriverError(RunError):
+    """A motor controller cannot be reached, refuses a command, or does not do what it was commanded."""
 
 
 class ScenarioWarning(UserWarning):

@@ -1,5 +1,7 @@
-"""Ports of the closed loop: a clock, a driver that moves the needle, a tracker of its tip."""
+"""Ports of the closed loop: a clock, a driver that moves the needle, a tracker of its tip; and the motors of a rig."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 from flexneedle.types import Control, Frame, Measurement, Motion
@@ -52,4 +54,62 @@ class TipTracker(Protocol):
     @property
     def status(self) -> str:
         """VISIBLE while readings arrive, else the reason in a few words."""
+        ...
+
+
+@dataclass(frozen=True)
+class MotorState:
+    """One motor as its controller reports it. Positions in counts.
+
+    position: measured by the encoder; commanded: where the controller's own profile is now; moving: whether the profile
+    is under way; on: whether the motor is powered; reverse_limit, forward_limit: whether the limit switch is active;
+    stopped: why the controller itself ended the motion or switched the motor off, "" while it did neither.
+    """
+
+    position: float
+    commanded: float
+    moving: bool = False
+    on: bool = True
+    reverse_limit: bool = False
+    forward_limit: bool = False
+    stopped: str = ""
+
+
+class Motors(Protocol):
+    """The motors of a rig by channel. It knows counts and channels, neither needles nor plans.
+
+    No call takes longer than the reply timeout of the device. Each raises DriverError if the device cannot be reached
+    or refuses the command; the message has the device's reason.
+    """
+
+    def read(self) -> Mapping[str, MotorState]:
+        """State of every channel, as of now."""
+        ...
+
+    def set_speed(self, channel: str, speed: float, acceleration: float) -> None:
+        """Limit speed (counts/s) and acceleration (counts/s²) of the motions to come, and of those under way."""
+        ...
+
+    def follow(self, positions: Mapping[str, float]) -> None:
+        """Move channels to absolute positions (counts), from wherever they are; each call replaces the one before."""
+        ...
+
+    def stop(self) -> None:
+        """Stop all channels at once; motors stay powered."""
+        ...
+
+    def define(self, channel: str, position: float) -> None:
+        """Call the present position of a channel at rest `position` (counts), as at the end of homing."""
+        ...
+
+    def power(self, channel: str, on: bool) -> None:
+        """Switch a motor at rest on or off. Switched on, it is held where it is."""
+        ...
+
+    def reconnect(self) -> None:
+        """Drop the connection and open a new one. It moves nothing, and changes nothing in the device."""
+        ...
+
+    def close(self) -> None:
+        """Close the connection; motors are left as they are."""
         ...
