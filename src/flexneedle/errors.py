@@ -56,6 +56,14 @@ class DriverError(RunError):
     """A motor controller cannot be reached, refuses a command, or does not do what it was commanded."""
 
 
+class StoppedError(RunError):
+    """A rig was stopped: from the keyboard, by a signal or service, or since its controller did not answer."""
+
+
+class RefusedError(InputError):
+    """A rig refuses a command, and nothing moves: its state does not allow it, or it breaks a limit."""
+
+
 class ScenarioWarning(UserWarning):
     """A scenario has a deprecated or unused key that should be changed. The message is one line."""
 

@@ -1,0 +1,75 @@
+"""Checks of motors at each tick: pure functions that return a problem in one line, or ""."""
+
+from flexneedle.rig.ports import MotorState
+from flexneedle.rig.supervisor.drives import Drive
+
+_HASTE = 1.5  # times its speed an axis may seem to move between two ticks, whose times are not exact
+_STILL = 2.0  # times the tolerance of its goal a motor at rest may move
+
+
+def motor_problem(drive: Drive, state: MotorState, before: MotorState) -> str:
+    """A motor that is off, was stopped by its controller since the reading before, or does not follow."""
+    error = drive.error(state)
+    if not state.on:
+        return f"{drive.name}: the motor is off{_because(state.stopped)}"
+    if state.stopped and state.stopped != before.stopped:
+        return f"{drive.name}: the motor was stopped by its controller: {state.stopped}"
+    if abs(error) > drive.axis.max_error:
+        limit = drive.shown(drive.axis.max_error)
+        return f"{drive.name}: the motor does not follow: {drive.shown(abs(error))} off, limit {limit}"
+    return ""
+
+
+def position_problem(
+    drive: Drive, state: MotorState, before: MotorState, seconds: float, *, unlimited: bool = False
+) -> str:
+    """A position that jumped since the reading before, `seconds` ago, or is beyond a soft limit.
+
+    unlimited: the position counts from nowhere, as during homing, so that limits mean nothing.
+    """
+    moved = abs((state.position - before.position) / drive.axis.scale)
+    most = _HASTE * drive.axis.speed * seconds + drive.axis.max_error
+    if moved > most:
+        return f"{drive.name}: the position jumped by {drive.shown(moved)} in {seconds:.3f} s"
+    position, (low, high) = drive.position(state.position), drive.axis.limits
+    if not (unlimited or low - drive.axis.max_error <= position <= high + drive.axis.max_error):
+        limits = f"{drive.shown(low)} to {drive.shown(high)}"
+        return f"{drive.name}: at {drive.shown(position)}, beyond its range {limits}"
+    return ""
+
+
+def reversal_problem(drive: Drive, state: MotorState, before: MotorState, way: float) -> str:
+    """A motor that went back on its way (counts, signed) since the reading before: its position was reset.
+
+    A jump within what its speed allows is found by its direction alone.
+    """
+    back = -(state.position - before.position) * (1.0 if way > 0.0 else -1.0) / abs(drive.axis.scale)
+    if back > _STILL * drive.axis.tolerance:
+        return f"{drive.name}: the position went back by {drive.shown(back)} during a motion"
+    return ""
+
+
+def at_home(drive: Drive, state: MotorState) -> bool:
+    """Whether an axis has found its home, a limit switch, and rests there."""
+    at = state.reverse_limit if drive.axis.home == "reverse-limit" else state.forward_limit
+    # A limit of the motor's direction is that of the axis only if both count alike.
+    if drive.axis.direction < 0:
+        at = state.forward_limit if drive.axis.home == "reverse-limit" else state.reverse_limit
+    return at and not state.moving
+
+
+def rest_problem(drive: Drive, state: MotorState, goal: float) -> str:
+    """A motor that is not where it was left; goal: that position (counts)."""
+    off = abs((state.position - goal) / drive.axis.scale)
+    if off > _STILL * drive.axis.tolerance:
+        return f"{drive.name}: moved by {drive.shown(off)} without a command"
+    return ""
+
+
+def arrived(drive: Drive, state: MotorState, goal: float) -> bool:
+    """Whether a motor is at rest within the tolerance of its goal (counts)."""
+    return not state.moving and abs((state.position - goal) / drive.axis.scale) <= drive.axis.tolerance
+
+
+def _because(reason: str) -> str:
+    return f" ({reason})" if reason else ""

@@ -1,0 +1,257 @@
+"""The client of the supervisor, which it starts: motions with their ends, and what each tick found."""
+
+import socket
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable, Mapping
+from math import inf
+from multiprocessing.connection import Connection
+from threading import Condition, Thread
+from time import monotonic
+from typing import Any, Self
+
+from flexneedle.errors import DriverError, RefusedError, StoppedError
+from flexneedle.rig.devices.clock import WallClock
+from flexneedle.rig.supervisor import messages as say
+from flexneedle.rig.supervisor.machine import State
+from flexneedle.types import Measurement
+
+_HEARTBEAT_S = 0.1
+_SILENT_S = 1.0  # without a report: the supervisor hangs
+_OPEN_S = 60.0  # to find a tracker
+_END_S = 5.0
+_MOST_KEPT = 4000  # measurements: 100 s without a reader
+
+
+class Supervisor:
+    """A supervisor in a process of its own. Use it as a context manager.
+
+    on_report: called with what each tick found, in a thread.
+    Raises DriverError or StoppedError if the rig has a fault or is stopped, InputError if it refuses a request.
+    """
+
+    def __init__(self, task: say.Task, on_report: Callable[[say.Report], None] | None = None) -> None:
+        self.clock = WallClock(start=task.started)
+        self._task, self._on_report = task, on_report
+        self._changed = Condition()
+        self._latest: say.Report | None = None
+        self._latest_at = monotonic()
+        self._ended: str | None = None
+        self._answers: dict[int, say.Done | say.Refused] = {}
+        self._measurements: deque[Measurement] = deque(maxlen=_MOST_KEPT)
+        self._number = 0
+        ours, theirs = socket.socketpair()
+        command = [sys.executable, "-m", f"{__package__}.process", str(theirs.fileno())]
+        self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL)
+        theirs.close()
+        self._connection = Connection(ours.detach())
+        self._thread = Thread(target=self._receive, name="supervisor", daemon=True)
+        self._thread.start()
+        try:
+            self._send(task)
+            self._wait(lambda: self._latest is not None, _OPEN_S, "the rig does not open")
+        except BaseException:  # also on Ctrl-C: the devices must be released
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the motors, and end the supervisor."""
+        if self._ended is None:
+            self._send(say.Close(), lost=True)
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._connection.close()
+
+    @property
+    def pid(self) -> int:
+        """Number of the supervisor's process."""
+        return self._process.pid
+
+    @property
+    def report(self) -> say.Report:
+        """What the last tick found."""
+        with self._changed:
+            if self._latest is None:
+                raise DriverError(f"the supervisor has not reported: {self._ended or 'it opens'}")
+            return self._latest
+
+    def read(self) -> tuple[Measurement, ...]:
+        """The measurements since the last call, oldest first."""
+        with self._changed:
+            found = tuple(self._measurements)
+            self._measurements.clear()
+        return found
+
+    @property
+    def status(self) -> str:
+        """Status of the tracker."""
+        return self.report.tracker
+
+    # Requests
+
+    def arm(self, deepest: float = inf) -> None:
+        """Switch the motors on; deepest: largest advance (mm) from here."""
+        self._ask(say.Arm(deepest), State.ARMED)
+
+    def reset(self) -> None:
+        """Leave the states stopped and fault."""
+        self._ask(say.Reset(), State.IDLE)
+
+    def stop(self, who: str = "the controller") -> None:
+        """Stop all motors, and return when they rest."""
+        if self._ended is not None:
+            return
+        self._send(say.Stop(who))
+        self._wait(lambda: self._at_rest(), _END_S, "the motors do not come to rest", stopped=True)
+
+    def step(
+        self,
+        roll: float,
+        travel: Mapping[str, float],
+        duration: float,
+        expected: say.Expectation | None = None,
+    ) -> say.Done:
+        """Carry out a step of an insertion: roll (rad), then travel (mm or rad by axis) within `duration` s."""
+        return self._carry_out(lambda number: say.Step(number, roll, travel, duration, expected))
+
+    def move_to(self, axis: str, position: float, speed: float | None = None) -> say.Done:
+        """Move one axis alone to a position (mm or rad), at its largest speed or slower (mm/s or rad/s)."""
+        return self._go(axis, position, speed, retract=False)
+
+    def jog(self, axis: str, distance: float, speed: float | None = None) -> say.Done:
+        """Move one axis alone by a distance (mm or rad)."""
+        return self._go(axis, self.report.axes[axis].position + distance, speed, retract=False)
+
+    def retract(self, position: float, speed: float | None = None) -> say.Done:
+        """Withdraw the base to a position of the insertion axis (mm)."""
+        return self._go("insertion", position, speed, retract=True)
+
+    def home(self, axis: str) -> say.Done:
+        """Find the home of an axis."""
+        return self._carry_out(lambda number: say.Home(number, axis))
+
+    def wait(self, seconds: float) -> None:
+        """Wait while nothing moves."""
+        until = monotonic() + seconds
+        self._wait(lambda: monotonic() >= until, seconds + 1.0, "the clock stands still", every=seconds)
+
+    def _go(self, axis: str, position: float, speed: float | None, *, retract: bool) -> say.Done:
+        found = dict(self._task.rig.axes.items())
+        if axis not in found:
+            raise RefusedError(f"the rig has no axis {axis}; axes: {', '.join(found)}")
+        fastest = found[axis].speed if speed is None else speed
+        return self._carry_out(lambda number: say.Go(number, axis, position, fastest, retract))
+
+    def _carry_out(self, made: Callable[[int], say.Request]) -> say.Done:
+        self._number += 1
+        number = self._number
+        self._send(made(number))
+        self._wait(lambda: number in self._answers, inf, "")
+        answer = self._answers.pop(number)
+        if isinstance(answer, say.Refused):
+            raise RefusedError(answer.why)
+        self._check(answer.state, answer.why)
+        return answer
+
+    def _ask(self, request: say.Request, wanted: State) -> None:
+        self._answers.pop(0, None)
+        self._send(request)
+        self._wait(
+            lambda: 0 in self._answers or self.report.state is wanted, _END_S, f"not {wanted}", stopped=True
+        )
+        refused = self._answers.pop(0, None)
+        if isinstance(refused, say.Refused):
+            raise RefusedError(refused.why)
+
+    # Waiting
+
+    def _send(self, message: Any, *, lost: bool = False) -> None:
+        try:
+            self._connection.send(message)
+        except OSError:
+            if not lost:
+                raise DriverError(f"the supervisor has ended{self._because()}") from None
+
+    def _because(self) -> str:
+        return f": {self._ended}" if self._ended else ""
+
+    def _wait(
+        self,
+        condition: Callable[[], bool],
+        limit: float,
+        problem: str,
+        *,
+        stopped: bool = False,
+        every: float = _HEARTBEAT_S,
+    ) -> None:
+        """Wait for a condition, with heartbeats. stopped: whether it can come about in a rig that is stopped.
+
+        Raises DriverError: the limit (s) is reached, or the supervisor has ended or hangs.
+        """
+        until = monotonic() + limit
+        with self._changed:
+            while not condition():
+                if self._ended is not None:
+                    raise DriverError(f"the supervisor has ended{self._because()}")
+                now = monotonic()
+                if self._latest is not None and now - self._latest_at > _SILENT_S:
+                    raise DriverError(f"the supervisor has not reported for {now - self._latest_at:.1f} s")
+                if now > until:
+                    raise DriverError(f"{problem}: waited for {limit:g} s")
+                if self._latest is not None and not stopped:
+                    self._check(self._latest.state, self._latest.why)
+                self._changed.wait(min(_HEARTBEAT_S, every, max(0.0, until - now)))
+                if self._latest is not None:
+                    self._send(say.Heartbeat())
+
+    @staticmethod
+    def _check(state: State, why: str) -> None:
+        if state is State.FAULT:
+            raise DriverError(why)
+        if state is State.STOPPED:
+            raise StoppedError(f"stopped: {why}")
+
+    def _at_rest(self) -> bool:
+        report = self.report
+        return report.state in (State.STOPPED, State.FAULT) and not any(
+            axis.motor.moving for axis in report.axes.values()
+        )
+
+    # The thread
+
+    def _receive(self) -> None:
+        why = "it was killed"
+        try:
+            while True:
+                message = self._connection.recv()
+                if isinstance(message, say.Ended):
+                    why = message.why
+                    break
+                self._take(message)
+        except (EOFError, OSError):
+            pass
+        with self._changed:
+            self._ended = why
+            self._changed.notify_all()
+
+    def _take(self, message: say.Report | say.Done | say.Refused) -> None:
+        with self._changed:
+            match message:
+                case say.Report():
+                    self._latest, self._latest_at = message, monotonic()
+                    self._measurements.extend(message.measurements)
+                case _:
+                    self._answers[message.number] = message
+            self._changed.notify_all()
+        if self._on_report is not None and isinstance(message, say.Report):
+            self._on_report(message)

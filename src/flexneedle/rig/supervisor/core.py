@@ -1,0 +1,424 @@
+"""The supervisor without its process: requests, ticks, and what they make of motors and tracker.
+
+Each tick reads motors and tracker, checks both, and either sends the next targets or stops. Motors get targets at most
+`loop.queue_ms` ahead, so that they stop by themselves where ticks end. Nothing here waits.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from flexneedle.errors import DriverError
+from flexneedle.rig.monitor.monitor import Monitor
+from flexneedle.rig.ports import Clock, Motors, Tracker
+from flexneedle.rig.supervisor import messages as say
+from flexneedle.rig.supervisor.checks import (
+    at_home,
+    motor_problem,
+    position_problem,
+    rest_problem,
+    reversal_problem,
+)
+from flexneedle.rig.supervisor.drives import Drive
+from flexneedle.rig.supervisor.machine import Event, State, accepted, after
+from flexneedle.rig.supervisor.motion import Leg, Motion, beyond, leg_of, positions
+from flexneedle.rig.supervisor.watch import Watch
+from flexneedle.rig.tracking.stage import tip_on_stage
+from flexneedle.types import Measurement
+
+HEARTBEAT_S = 0.5
+"""Longest time (s) without a message of the client during a motion."""
+
+_AGAIN_S = 0.25  # after which motors that still move are stopped again, and a lost controller is called again
+_HOMING_SHARE = 0.1  # of the largest speed
+_HOMING_REACH = 1.1  # of the range
+_UNCHECKED = frozenset({State.IDLE, State.STOPPED, State.FAULT})
+"""States in which motors may be off, and have been stopped: nothing more can be done about what they do."""
+
+
+class Supervisor:
+    """State of a rig, and what its motors are to do. send: called with each message to the client but reports."""
+
+    def __init__(
+        self, task: say.Task, motors: Motors, tracker: Tracker, clock: Clock, send: Callable[[Any], None]
+    ) -> None:
+        self._task, self._motors, self._tracker, self._clock, self._send = task, motors, tracker, clock, send
+        self._drives = {name: Drive(name, axis) for name, axis in task.rig.axes.items()}
+        self._queue = 1e-3 * task.rig.loop.queue_ms
+        self.state, self.why = State.IDLE, ""
+        self._heard = now = clock.now()
+        self._watch = Watch(Monitor(task.monitor, task.lateral_axes), task.stale_after, now)
+        self._read(now)
+        self._goals = self._at()
+        self._motion: Motion | None = None
+        self._deepest = 0.0
+        self._stop_at: float | None = None  # when motors are stopped (again); None: they need not be
+        self._lost = False
+        self._measurements: tuple[Measurement, ...] = ()
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether all motors are known to rest."""
+        return not self._lost and not any(state.moving for state in self._states.values())
+
+    # Requests
+
+    def request(self, request: say.Request) -> None:
+        """Act on a message of the client."""
+        self._heard = self._clock.now()
+        match request:
+            case say.Stop(who):
+                self.stop(who)
+            case say.Reset():
+                self._reset()
+            case say.Arm(deepest):
+                self._arm(deepest)
+            case say.Step():
+                self._step(request)
+            case say.Go():
+                self._go(request)
+            case say.Home():
+                self._home(request)
+
+    def stop(self, who: str) -> None:
+        """Stop all motors."""
+        if self.state not in (State.STOPPED, State.FAULT):
+            self._enter(Event.STOP, who)
+            self._halt(who)
+
+    def _enter(self, event: Event, why: str = "") -> None:
+        """Change the state by an event that it accepts."""
+        new = after(self.state, event)
+        if new is not None:
+            self.state, self.why = new, why
+
+    def _allowed(self, event: Event, number: int = 0) -> bool:
+        """Whether the state accepts an event and nothing moves; else the request is refused with the reason."""
+        because = f": {self.why}" if self.why else ""
+        if after(self.state, event) is None:
+            choices = ", ".join(accepted(self.state))
+            self._refuse(number, f"{event}: refused while {self.state}{because}; accepted: {choices}")
+            return False
+        if self._motion is not None or self._stop_at is not None:
+            self._refuse(number, f"{event}: refused: motors have not come to rest yet{because}")
+            return False
+        return True
+
+    def _refuse(self, number: int, why: str) -> None:
+        self._send(say.Refused(number, why))
+
+    def _reset(self) -> None:
+        if self._allowed(Event.RESET):
+            self._enter(Event.RESET)
+
+    def _arm(self, deepest: float) -> None:
+        if not self._allowed(Event.ARM):
+            return
+        try:
+            for drive in self._drives.values():
+                self._motors.power(drive.axis.channel, True)
+            self._read(self._clock.now())
+        except DriverError as error:
+            self._fault(str(error))
+            return
+        at = self._positions()
+        if problem := beyond(self._drives, list(at.items())):
+            self._refuse(0, f"arm: refused: {problem}")
+            return
+        self._goals, self._deepest = self._at(), at["insertion"] + deepest
+        self._enter(Event.ARM)
+
+    def _step(self, step: say.Step) -> None:
+        if self.state is State.HOLDING and self._stop_at is not None:
+            self._nothing_done(step.number)
+            return
+        if not self._allowed(Event.STEP, step.number):
+            return
+        turns = {"rotation": step.roll + step.travel.get("rotation", 0.0)} if step.roll else {}
+        if problem := self._unreachable({**step.travel, **turns}):
+            self._refuse(step.number, problem)
+            return
+        now = self._clock.now()
+        if step.expected is not None:
+            self._watch = self._watch.expecting(step.expected, now, now)
+        if not self._watch.verdict.ok:  # still, or again: nothing moves
+            self._nothing_done(step.number)
+            return
+        self._enter(Event.STEP)
+        roll: list[tuple[Mapping[str, float], float]] = [({"rotation": step.roll}, 0.0)] if step.roll else []
+        legs = [*roll, (step.travel, step.duration)]
+        self._begin(Motion(step.number, legs, self._positions(), step.expected))
+
+    def _nothing_done(self, number: int) -> None:
+        now, why = self._clock.now(), self.why or str(self._watch.verdict)
+        self._send(say.Done(number, dict.fromkeys(self._drives, 0.0), now, now, self.state, why))
+
+    def _unreachable(self, travel: Mapping[str, float]) -> str:
+        """A problem with a travel by axis: an axis that is not there, an end outside a range, or too deep; or ""."""
+        moved = {name: way for name, way in travel.items() if way}
+        if missing := [name for name in moved if name not in self._drives]:
+            return f"the rig has no axis {', '.join(missing)}; axes: {', '.join(self._drives)}"
+        ends = {name: self._goal(name) + way for name, way in moved.items()}
+        problem = beyond(self._drives, list(ends.items()))
+        if not problem and moved.get("insertion", 0.0) > 0.0 and ends["insertion"] > self._deepest + 1e-9:
+            deepest = f"{self._deepest:.3f} mm, as far as this insertion may go"
+            return f"insertion = {ends['insertion']:.3f} mm: must be at most {deepest}"
+        return problem
+
+    def _go(self, go: say.Go) -> None:
+        event = Event.RETRACT if go.retract else Event.JOG
+        if not self._allowed(event, go.number):
+            return
+        if problem := self._misguided(go):
+            self._refuse(go.number, problem)
+            return
+        travel = go.position - self._goal(go.axis)
+        self._enter(event)
+        self._begin(Motion(go.number, [({go.axis: travel}, abs(travel) / go.speed)], self._positions()))
+
+    def _misguided(self, go: say.Go) -> str:
+        """A problem with a motion of one axis, or ""."""
+        if go.axis not in self._drives:
+            return f"the rig has no axis {go.axis}; axes: {', '.join(self._drives)}"
+        drive = self._drives[go.axis]
+        if problem := beyond(self._drives, [(go.axis, go.position)]):
+            return problem
+        if go.retract and not (go.axis == "insertion" and go.position <= self._goal(go.axis)):
+            at = drive.shown(self._goal(go.axis))
+            return f"retract to {drive.shown(go.position)}: must withdraw the base, which is at {at}"
+        if not 0.0 < go.speed <= drive.axis.speed * (1.0 + 1e-9):
+            return f"speed of {go.axis} = {go.speed:g}/s: must be above 0, at most {drive.axis.speed:g}/s"
+        return ""
+
+    def _home(self, home: say.Home) -> None:
+        if not self._allowed(Event.HOME, home.number):
+            return
+        drive = self._drives.get(home.axis)
+        if drive is None:
+            self._refuse(home.number, f"the rig has no axis {home.axis}; axes: {', '.join(self._drives)}")
+            return
+        if drive.axis.home == "absolute":
+            self._refuse(home.number, f"{home.axis}: has an absolute encoder, and no home to search")
+            return
+        self._enter(Event.HOME)
+        low, high = drive.axis.limits
+        way = {"here": 0.0, "reverse-limit": low - high, "forward-limit": high - low}[drive.axis.home]
+        travel = _HOMING_REACH * way
+        duration = abs(travel) / (_HOMING_SHARE * drive.axis.speed)
+        legs: list[tuple[Mapping[str, float], float]] = [({home.axis: travel}, duration)]
+        self._begin(Motion(home.number, legs, self._positions(), home=drive))
+
+    def _begin(self, motion: Motion) -> None:
+        """Begin a motion at once, not at the next tick."""
+        self._motion = motion
+        self._next_leg(self._clock.now())
+
+    # Ticks
+
+    def tick(self) -> None:
+        """Read motors and tracker, check, and send targets or stop."""
+        now = self._clock.now()
+        self._measure(now)
+        self._check_motors(now)
+        self._check_client(now)
+        if self._stop_at is not None:
+            self._stop_motors(now)
+        elif self._motion is not None and self._motion.leg is not None:
+            self._go_on(self._motion, self._motion.leg, now)
+
+    def report(self, late: float, work: float, missed: int) -> say.Report:
+        """What the last tick found, with the measurements since the last report."""
+        measurements, self._measurements = self._measurements, ()
+        at = self._positions()
+        axes = {
+            name: say.AxisState(at[name], self._states[drive.axis.channel])
+            for name, drive in self._drives.items()
+        }
+        times = late, work, missed
+        return say.Report(
+            self._read_at, self.state, self.why, axes, measurements, self._tracker.status, *times
+        )
+
+    def _measure(self, now: float) -> None:
+        task = self._task
+        try:
+            frames = self._tracker.read()
+        except DriverError as error:
+            self._fault(str(error))
+            return
+        found = tuple(tip_on_stage(frame, task.to_stage, task.tip_offset) for frame in frames)
+        self._measurements += found
+        self._watch = self._watch.after(found, now, self._tracker.status)
+        if not self._watch.verdict.ok and self.state is State.INSERTING:
+            self._hold(str(self._watch.verdict))
+
+    def _hold(self, why: str) -> None:
+        """Stop the insertion. A roll under way is completed: a bevel at any angle could not be steered."""
+        self._enter(Event.HOLD, why)
+        if self._motion is not None and self._motion.rolls:
+            self._motion.why, self._motion.legs = why, []
+        else:
+            self._halt(why)
+
+    def _check_motors(self, now: float) -> None:
+        if self._lost:
+            return
+        before, seconds = self._states, now - self._read_at
+        try:
+            self._read(now)
+        except DriverError as error:
+            self._lost = True
+            self._fault(str(error))
+            return
+        if self.state in _UNCHECKED:
+            return
+        for drive in self._drives.values():
+            channel = drive.axis.channel
+            state, last = self._states[channel], before[channel]
+            homing = self._motion is not None and self._motion.home is not None
+            problem = "" if homing and at_home(drive, state) else motor_problem(drive, state, last)
+            problem = problem or position_problem(drive, state, last, seconds, unlimited=homing)
+            leg = None if self._motion is None or self._stop_at is not None else self._motion.leg
+            if not problem and leg is not None and channel in leg.drives:
+                problem = reversal_problem(drive, state, last, leg.way(channel))
+            elif not problem and self._stop_at is None:
+                problem = rest_problem(drive, state, self._goals[channel])
+            if problem:
+                self._fault(problem)
+                return
+
+    def _read(self, now: float) -> None:
+        self._states = dict(self._motors.read())
+        self._read_at = 0.5 * (now + self._clock.now())
+
+    def _check_client(self, now: float) -> None:
+        silent, limit = now - self._heard, self._task.rig.loop.decision_limit_s
+        if self._motion is not None and silent > HEARTBEAT_S:
+            self.stop(f"no heartbeat of the controller for {silent:.2f} s")
+        elif self.state in (State.INSERTING, State.HOLDING) and silent > limit:
+            self.stop(f"no command of the controller for {silent:.2f} s, limit {limit:g} s")
+
+    def _fault(self, why: str) -> None:
+        if self.state is not State.FAULT:
+            self._enter(Event.FAULT, why)
+            self._halt(why)
+
+    def _halt(self, why: str) -> None:
+        """Stop the motors now, and end the motion under way once they rest."""
+        if self._motion is not None:
+            self._motion.why = self._motion.why or why
+        self._stop_at = self._clock.now()
+        self._stop_motors(self._stop_at)
+
+    def _stop_motors(self, now: float) -> None:
+        """Stop motors, again while they move or cannot be reached; once they rest, end the motion under way."""
+        if self._stop_at is None:
+            return
+        if now < self._stop_at:
+            if self.at_rest:
+                self._stop_at = None
+                self._goals = self._at()
+                self._finish(now)
+            return
+        self._stop_at = now + _AGAIN_S
+        try:
+            if self._lost:
+                self._motors.reconnect()
+            self._motors.stop()
+            self._lost = False
+        except DriverError as error:
+            self._lost = True
+            self._fault(str(error))
+            self._finish(now)
+
+    # Motions
+
+    def _next_leg(self, now: float) -> None:
+        """Begin the next leg that moves anything, or end the motion."""
+        motion = self._motion
+        if motion is None:
+            return
+        motion.leg = None
+        while motion.legs and motion.leg is None:
+            travel, duration = motion.legs.pop(0)
+            motion.leg = leg_of(self._drives, self._goals, travel, duration, now)
+        if motion.leg is None:
+            self._finish(now)
+            return
+        leg = motion.leg
+        self._drives |= {drive.name: drive for drive in leg.drives.values()}
+        if motion.expected is not None and not motion.legs:
+            self._watch = self._watch.expecting(motion.expected, now, now + leg.trajectory.duration)
+        try:
+            for channel, speed in leg.trajectory.speeds.items():
+                self._motors.set_speed(channel, speed, leg.trajectory.accelerations[channel])
+            self._motors.follow(leg.targets(now, self._queue))
+        except DriverError as error:
+            self._fault(str(error))
+
+    def _go_on(self, motion: Motion, leg: Leg, now: float) -> None:
+        """Send the next targets, or go on to the next leg."""
+        leg.note(self._states, self._read_at)
+        if motion.home is not None and at_home(motion.home, self._states[motion.home.axis.channel]):
+            motion.legs = []
+            self._end_leg(motion, leg, now)
+        elif leg.has_arrived(self._states, now):
+            if motion.home is not None:
+                motion.why = f"{motion.home.name}: no limit switch within its range"
+            self._end_leg(motion, leg, now)
+        elif leg.overdue(now):
+            self._fault(f"the motors have not arrived: {leg.missing(self._states)} from the goal")
+        else:
+            try:
+                self._motors.follow(leg.targets(now, self._queue))
+            except DriverError as error:
+                self._not_followed(motion, str(error))
+
+    def _not_followed(self, motion: Motion, why: str) -> None:
+        """A target was refused: a fault, but not at the limit switch that is the home, which the next tick reads."""
+        if motion.home is not None:
+            self._check_motors(self._clock.now())
+            if at_home(motion.home, self._states[motion.home.axis.channel]):
+                return
+        self._fault(why)
+
+    def _end_leg(self, motion: Motion, leg: Leg, now: float) -> None:
+        motion.spans.append(leg.span())
+        self._goals |= leg.trajectory.goal
+        motion.leg = None
+        self._next_leg(now)
+
+    def _finish(self, now: float) -> None:
+        """End the motion under way, and report what was done."""
+        motion, self._motion = self._motion, None
+        if motion is None:
+            return
+        if motion.leg is not None:
+            motion.spans.append(motion.leg.span())
+        at = self._positions()
+        travelled = {name: at[name] - motion.origin[name] for name in at}
+        if motion.home is not None and not motion.why:
+            self._set_home(motion.home)
+        if self.state in (State.HOMING, State.JOGGING, State.RETRACTING):
+            self._enter(Event.ARRIVED)
+        begun, ended = motion.times(now)
+        self._send(say.Done(motion.number, travelled, begun, ended, self.state, motion.why))
+
+    def _set_home(self, drive: Drive) -> None:
+        try:
+            self._motors.define(drive.axis.channel, self._drives[drive.name].counts(drive.axis.at_home))
+            self._read(self._clock.now())
+            self._goals = self._at()
+        except DriverError as error:
+            self._fault(str(error))
+
+    def _at(self) -> dict[str, float]:
+        """Measured positions of the motors (counts) by channel."""
+        return {channel: state.position for channel, state in self._states.items()}
+
+    def _goal(self, name: str) -> float:
+        """Where an axis was last sent, or where it was when it last was stopped (mm or rad)."""
+        drive = self._drives[name]
+        return drive.position(self._goals[drive.axis.channel])
+
+    def _positions(self) -> dict[str, float]:
+        return positions(self._drives, self._states)

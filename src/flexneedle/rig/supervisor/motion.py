@@ -1,0 +1,133 @@
+"""A motion under way: its legs one after the other, where its motors shall be, and what they really did."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from flexneedle.rig.ports import MotorState
+from flexneedle.rig.supervisor.checks import arrived
+from flexneedle.rig.supervisor.drives import Drive
+from flexneedle.rig.supervisor.measured import span
+from flexneedle.rig.supervisor.messages import Expectation
+from flexneedle.rig.supervisor.trajectory import Trajectory, between
+
+SETTLE_S = 0.5
+"""Longest time (s) from the end of a trajectory until its motors have arrived."""
+
+
+@dataclass
+class Leg:
+    """Motors that move together. drives: by channel, as they are in this direction; begun: s on the run's clock."""
+
+    drives: Mapping[str, Drive]
+    trajectory: Trajectory
+    begun: float
+    samples: list[tuple[float, float]] = field(default_factory=list)
+
+    def targets(self, now: float, ahead: float) -> dict[str, float]:
+        """Where the motors shall go now (counts by channel): where they shall be `ahead` s later."""
+        return self.trajectory.at(now - self.begun + ahead)
+
+    def note(self, states: Mapping[str, MotorState], now: float) -> None:
+        """Keep how much of the way is done, by the motor with the longest."""
+        channel = max(self.drives, key=self._seconds)
+        if way := self.way(channel):
+            self.samples.append((now, (states[channel].position - self.trajectory.start[channel]) / way))
+
+    def way(self, channel: str) -> float:
+        """A motor's way (counts, signed)."""
+        return self.trajectory.goal[channel] - self.trajectory.start[channel]
+
+    def _seconds(self, channel: str) -> float:
+        """Duration (s) of a motor's way at its largest speed."""
+        axis = self.drives[channel].axis
+        return abs(self.way(channel) / axis.scale) / axis.speed
+
+    def has_arrived(self, states: Mapping[str, MotorState], now: float) -> bool:
+        """Whether the last target was sent, and every motor is at rest there."""
+        if now < self.begun + self.trajectory.duration:
+            return False
+        return all(
+            arrived(drive, states[name], self.trajectory.goal[name]) for name, drive in self.drives.items()
+        )
+
+    def overdue(self, now: float) -> bool:
+        """Whether the motors should have arrived long ago."""
+        return now > self.begun + self.trajectory.duration + SETTLE_S
+
+    def missing(self, states: Mapping[str, MotorState]) -> str:
+        """How far each motor is from its goal, for messages."""
+        goal = self.trajectory.goal
+        return ", ".join(
+            f"{drive.name} {drive.shown(abs((goal[name] - states[name].position) / drive.axis.scale))}"
+            for name, drive in self.drives.items()
+        )
+
+    def span(self) -> tuple[float, float]:
+        """When it began and ended, as measured (s)."""
+        ramp = 0.5 * self.trajectory.ramp
+        return span(self.samples, self.begun + ramp, self.begun + self.trajectory.duration - ramp)
+
+
+@dataclass
+class Motion:
+    """A motion of one request: legs still to come as (travel by axis, duration), the present leg, and what was done.
+
+    origin: positions of all axes at its begin; expected: of the tip; spans: begin and end of each leg that is done;
+    home: the axis whose home is searched, or None; why: why it ends before its goal, or "".
+    """
+
+    number: int
+    legs: list[tuple[Mapping[str, float], float]]
+    origin: Mapping[str, float]
+    expected: Expectation | None = None
+    home: Drive | None = None
+    leg: Leg | None = None
+    spans: list[tuple[float, float]] = field(default_factory=list)
+    why: str = ""
+
+    @property
+    def rolls(self) -> bool:
+        """Whether the needle is rolled alone, before the travel."""
+        return bool(self.legs) and self.leg is not None
+
+    def times(self, now: float) -> tuple[float, float]:
+        """Begin and end of its last leg with a motion; `now` twice without one."""
+        return self.spans[-1] if self.spans else (now, now)
+
+
+def leg_of(
+    drives: Mapping[str, Drive],
+    goals: Mapping[str, float],
+    travel: Mapping[str, float],
+    duration: float,
+    now: float,
+) -> Leg | None:
+    """The leg of a travel (mm or rad by axis) from the present goals (counts by channel); None where nothing moves.
+
+    drives: by axis, as they are before. Positions are absolute, so that rounding does not add up.
+    """
+    moved = {name: drives[name].towards(way) for name, way in travel.items() if way != 0.0}
+    if not moved:
+        return None
+    by_channel = {drive.axis.channel: drive for drive in moved.values()}
+    start = {channel: goals[channel] for channel in by_channel}
+    goal = {
+        drive.axis.channel: drive.counts(drives[name].position(goals[drive.axis.channel]) + travel[name])
+        for name, drive in moved.items()
+    }
+    return Leg(by_channel, between(by_channel, start, goal, duration), now)
+
+
+def positions(drives: Mapping[str, Drive], states: Mapping[str, MotorState]) -> dict[str, float]:
+    """Measured positions (mm or rad) by axis."""
+    return {name: drive.position(states[drive.axis.channel].position) for name, drive in drives.items()}
+
+
+def beyond(drives: Mapping[str, Drive], ends: Sequence[tuple[str, float]]) -> str:
+    """A problem with the first of these positions by axis that is outside the axis's range, or ""."""
+    for name, position in ends:
+        low, high = drives[name].axis.limits
+        if not low - 1e-9 <= position <= high + 1e-9:
+            shown = drives[name].shown
+            return f"{name} = {shown(position)}: must be within {shown(low)} and {shown(high)}"
+    return ""

@@ -1,0 +1,150 @@
+"""The process of the supervisor: `python -m flexneedle.rig.supervisor.process DESCRIPTOR`.
+
+Its socket comes from the client, which starts it. It ticks on the monotonic clock: a tick that comes too late for the
+next one is counted, and left out. It is a process because a planner that keeps Python busy would delay ticks, and so
+that either one may be killed: without the client it stops the motors and ends, and without it motors stop at the end
+of what is queued.
+"""
+
+import gc
+import signal
+import socket
+import sys
+from multiprocessing.connection import Connection, wait
+from queue import SimpleQueue
+from threading import Thread
+from time import monotonic
+from typing import Any
+
+from flexneedle.errors import FlexneedleError, one_line
+from flexneedle.rig.devices.clock import WallClock
+from flexneedle.rig.devices.priority import set_realtime_priority
+from flexneedle.rig.devices.registry import open_motors, open_tracker
+from flexneedle.rig.supervisor import messages as say
+from flexneedle.rig.supervisor.core import Supervisor
+from flexneedle.rig.supervisor.dry import DryMotors
+
+_MOST_WAITING = 400  # reports that a client has not taken: 10 s
+_REST_S = 2.0  # longest wait for motors to rest before the end
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Outbox:
+    """Messages to the client, sent by a thread: a client that does not read delays nothing, and loses reports."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection, self._waiting = connection, SimpleQueue[Any]()
+        self._thread = Thread(target=self._send, name="outbox", daemon=True)
+        self._thread.start()
+
+    def put(self, message: Any) -> None:
+        """Send a message, later."""
+        if not isinstance(message, say.Report) or self._waiting.qsize() < _MOST_WAITING:
+            self._waiting.put(message)
+
+    def close(self) -> None:
+        """Send what waits, within a second."""
+        self._waiting.put(None)
+        self._thread.join(1.0)
+
+    def _send(self) -> None:
+        while (message := self._waiting.get()) is not None:
+            try:
+                self._connection.send(message)
+            except OSError:  # the client is gone, which the ticks notice
+                return
+
+
+def main(descriptor: int) -> None:
+    """Serve the client until it closes or ends."""
+    connection = Connection(descriptor)
+    task = connection.recv()
+    outbox = Outbox(connection)
+    why = "the supervisor failed"
+    try:
+        why = _serve(connection, task, outbox)
+    except FlexneedleError as error:
+        why = one_line(error)
+    finally:
+        outbox.put(say.Ended(why))
+        outbox.close()
+
+
+def _serve(connection: Connection, task: say.Task, outbox: Outbox) -> str:
+    """Open the devices, tick until the end, and return its reason."""
+    signals = _signals()
+    clock = WallClock(start=task.started)
+    motors = open_motors(task.rig)
+    if task.dry:
+        motors = DryMotors(motors, clock)
+    try:
+        with open_tracker(task.rig, clock) as tracker:
+            core = Supervisor(task, motors, tracker, clock, outbox.put)
+            set_realtime_priority()
+            gc.collect()
+            gc.freeze()
+            gc.disable()  # nothing here makes cycles; a collection would delay a tick
+            try:
+                return _tick(connection, core, outbox, signals, 1.0 / task.rig.loop.rate_hz)
+            finally:
+                motors.stop()
+    finally:
+        motors.close()
+
+
+def _signals() -> socket.socket:
+    """A socket that receives a byte with each signal that shall stop the motors."""
+    receiving, sending = socket.socketpair()
+    receiving.setblocking(False)
+    sending.setblocking(False)
+    signal.set_wakeup_fd(sending.fileno(), warn_on_full_buffer=False)
+    for number in _SIGNALS:
+        signal.signal(number, lambda *_, kept=sending: None)
+    return receiving
+
+
+def _tick(
+    connection: Connection, core: Supervisor, outbox: Outbox, signals: socket.socket, period: float
+) -> str:
+    """Tick until the client ends; return why."""
+    due, missed, ending, why = monotonic(), 0, None, ""
+    while ending is None or (monotonic() < ending and not core.at_rest):
+        sources: list[Any] = [signals] if ending is not None else [signals, connection]
+        ready = wait(sources, max(0.0, due - monotonic()))
+        if signals in ready:
+            core.stop(_named(signals.recv(64)))
+        if connection in ready:
+            try:
+                closed = _requested(connection, core)
+            except (EOFError, OSError):
+                closed, why = True, "the controller has ended"
+            if closed:
+                core.stop(why or "closed")
+                ending = monotonic() + _REST_S
+        late = monotonic() - due
+        if late >= 0.0:
+            begun, skipped = monotonic(), int(late / period)
+            missed += skipped
+            due += period * (1 + skipped)
+            core.tick()
+            outbox.put(core.report(late, monotonic() - begun, missed))
+    return why
+
+
+def _requested(connection: Connection, core: Supervisor) -> bool:
+    """Act on what the client has sent; True at the request to end."""
+    while connection.poll():
+        request = connection.recv()
+        if isinstance(request, say.Close):
+            return True
+        core.request(request)
+    return False
+
+
+def _named(received: bytes) -> str:
+    names = ", ".join(signal.Signals(number).name for number in received)
+    return f"signal {names}"
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))

@@ -1,0 +1,90 @@
+"""A motion of several motors over time: all start and end together, with one trapezoid of speed. Pure functions.
+
+With accelerating time h of a motion that takes T, a motor that travels d has the largest speed d/(T − h) and the
+acceleration d/((T − h) h). T and h are the smallest that keep the limits of every axis.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from flexneedle.rig.supervisor.drives import Drive
+from flexneedle.scenario.rig import Axis
+
+_SHORTEST_S = 1e-3
+_ROUNDING = 1e-9
+_ROUNDS = 50
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A motion: motor positions at start and goal by channel (counts), its duration and accelerating time (s)."""
+
+    start: Mapping[str, float]
+    goal: Mapping[str, float]
+    duration: float
+    ramp: float
+
+    def share(self, time: float) -> float:
+        """Share of the way that is done `time` (s) after the start."""
+        if time <= 0.0:
+            return 0.0
+        if time >= self.duration:
+            return 1.0
+        near = min(time, self.duration - time)
+        cruise = self.duration - self.ramp
+        part = near**2 / (2.0 * self.ramp * cruise) if near < self.ramp else (near - 0.5 * self.ramp) / cruise
+        return part if near == time else 1.0 - part
+
+    def at(self, time: float) -> dict[str, float]:
+        """Positions (counts) by channel `time` (s) after the start."""
+        share = self.share(time)
+        if share == 1.0:  # exactly, without rounding
+            return dict(self.goal)
+        return {name: begin + share * (self.goal[name] - begin) for name, begin in self.start.items()}
+
+    @property
+    def speeds(self) -> dict[str, float]:
+        """Largest speed (counts/s) by channel."""
+        cruise = self.duration - self.ramp
+        return {name: abs(self.goal[name] - begin) / cruise for name, begin in self.start.items()}
+
+    @property
+    def accelerations(self) -> dict[str, float]:
+        """Acceleration (counts/s²) by channel."""
+        return {name: speed / self.ramp for name, speed in self.speeds.items()}
+
+
+def between(
+    drives: Mapping[str, Drive], start: Mapping[str, float], goal: Mapping[str, float], duration: float
+) -> Trajectory:
+    """The motion from start to goal (counts by channel) within `duration` s, or longer where an axis cannot keep that.
+
+    drives: by channel, those that move.
+    """
+    travels = [
+        (abs((goal[channel] - start[channel]) / drive.axis.scale), drive.axis)
+        for channel, drive in drives.items()
+    ]
+    total = max(duration, _SHORTEST_S, *(_fastest(travel, axis) for travel, axis in travels))
+    ramp = 0.5 * total
+    for _ in range(_ROUNDS):
+        ramp = max(_SHORTEST_S / 4, *(_ramp(travel, axis.acceleration, total) for travel, axis in travels))
+        needed = max(travel / axis.speed for travel, axis in travels) + ramp
+        if needed <= total * (1.0 + _ROUNDING):
+            break
+        total = needed
+    return Trajectory(dict(start), dict(goal), total, ramp)
+
+
+def _fastest(travel: float, axis: Axis) -> float:
+    """Shortest duration (s) of one axis alone."""
+    if travel > axis.speed**2 / axis.acceleration:
+        return travel / axis.speed + axis.speed / axis.acceleration
+    return 2.0 * math.sqrt(travel / axis.acceleration)
+
+
+def _ramp(travel: float, acceleration: float, duration: float) -> float:
+    """Smallest h with travel/((T − h) h) ≤ acceleration."""
+    left = duration**2 - 4.0 * travel / acceleration
+    return 0.5 * (duration - math.sqrt(max(0.0, left)))

@@ -1,0 +1,58 @@
+"""Finding the home of an axis: at a switch, on either side, in either direction of the motor; or where it is."""
+
+import math
+
+import pytest
+
+from flexneedle.rig.supervisor import messages as say
+from flexneedle.rig.supervisor.machine import State
+from stages import Bench, rig_file
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("home", ["reverse-limit", "forward-limit"])
+def test_an_axis_finds_its_switch_and_calls_it_its_home(home, direction):
+    bench = Bench(rig_file(guide_y={"home": home, "home_mm": 2.5, "direction": direction})).armed()
+    motor = bench.stage.motors["C"]
+    motor.low, motor.high = -3000.0, 2000.0  # counts, 500 a mm
+    bench.core.request(say.Home(1, "guide_y"))
+    assert bench.core.state is State.HOMING
+    done = bench.until(1, most=20_000)
+    assert (done.why, done.state) == ("", State.ARMED)
+    assert motor.position == direction * 500.0 * 2.5
+    towards_low = (home == "reverse-limit") == (direction > 0)
+    assert (motor.low if towards_low else motor.high) == motor.position
+    assert bench.position("guide_y") == 2.5
+    bench.core.request(say.Go(2, "guide_y", 1.0 if home == "forward-limit" else 4.0, 5.0))
+    assert bench.until(2).why == ""
+
+
+def test_an_axis_is_at_home_where_it_is():
+    bench = Bench(rig_file(rotation={"home_deg": 90.0})).armed()
+    bench.core.request(say.Home(1, "rotation"))
+    assert bench.until(1).why == ""
+    assert bench.position("rotation") == pytest.approx(math.pi / 2)
+
+
+def test_without_a_switch_the_axis_has_no_home():
+    bench = Bench(rig_file(guide_y={"home": "reverse-limit"})).armed()
+    bench.core.request(say.Home(1, "guide_y"))
+    done = bench.until(1, most=20_000)
+    assert done.why == "guide_y: no limit switch within its range"
+    assert not [call for call in bench.stage.calls if call[0] == "define"]
+
+
+def test_an_absolute_encoder_is_not_homed():
+    bench = Bench(rig_file(guide_y={"home": "absolute"})).armed()
+    bench.core.request(say.Home(1, "guide_y"))
+    assert bench.sent == [say.Refused(1, "guide_y: has an absolute encoder, and no home to search")]
+
+
+def test_a_stall_while_homing_is_a_fault():
+    bench = Bench(rig_file(guide_y={"home": "reverse-limit"})).armed()
+    bench.core.request(say.Home(1, "guide_y"))
+    bench.tick(5)
+    bench.stage.motors["C"].fault = "stall"
+    done = bench.until(1)
+    assert done.state is State.FAULT
+    assert "does not follow" in done.why

@@ -1,0 +1,163 @@
+"""Steps of an insertion in the supervisor: what is done, when, and how much is queued in the motors."""
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flexneedle.rig.supervisor import messages as say
+from flexneedle.rig.supervisor.machine import State
+from stages import TICK_S, Bench, rig_file
+
+
+def step(number=1, roll=0.0, duration=0.2, expected=None, **travel):
+    return say.Step(number, roll, travel or {"insertion": 1.0}, duration, expected)
+
+
+@pytest.fixture
+def bench():
+    return Bench().armed()
+
+
+def test_a_step_moves_all_axes_together_and_reports_what_was_done(bench):
+    bench.core.request(step(insertion=1.0, guide_y=-0.3))
+    done = bench.until(1)
+    assert done.why == ""
+    assert done.state is State.INSERTING
+    assert done.travelled["insertion"] == pytest.approx(1.0, abs=1e-3)
+    assert done.travelled["guide_y"] == pytest.approx(-0.3, abs=2e-3)
+    assert done.travelled["rotation"] == 0.0
+    assert bench.stage.motors["A"].position == pytest.approx(1000.0)
+    assert bench.stage.motors["C"].position == pytest.approx(150.0)  # its direction is −1
+
+
+def test_its_begin_and_end_are_those_of_the_motion_and_not_of_ticks(bench):
+    bench.core.request(step(insertion=1.0))
+    done = bench.until(1)
+    ramp = (1.0 / 0.17) / 200.0  # about the speed over the acceleration
+    assert done.begun == pytest.approx(0.5 * ramp, abs=0.01)
+    assert done.ended == pytest.approx(0.2 - 0.5 * ramp, abs=0.01)
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    st.lists(
+        st.tuples(st.floats(-1.0, 1.0), st.floats(-0.5, 0.5), st.floats(0.0, 0.02)), min_size=1, max_size=8
+    )
+)
+def test_positions_do_not_drift_and_motors_never_have_more_than_the_queue(steps):
+    """Targets are ahead of the motors by at most the queue at the step's speed, in any step."""
+    bench = Bench(rig_file(guide_y={"backlash_mm": 0.05})).armed()
+    insertion = guide = 0.0
+    for number, (advance, across, late) in enumerate(steps, 1):
+        bench.clock.wait(late)
+        bench.core.request(step(number, insertion=advance, guide_y=across))
+        while not any(getattr(one, "number", None) == number for one in bench.sent):
+            bench.tick()
+            for motor in bench.stage.motors.values():
+                ahead = abs(motor.target - motor.commanded)
+                assert ahead <= motor.speed * 0.100 + 1.0
+        insertion, guide = insertion + advance, guide + across
+        assert bench.position("insertion") == pytest.approx(insertion, abs=1e-3)
+        assert bench.position("guide_y") == pytest.approx(
+            guide, abs=0.03
+        )  # half the lost motion, before it is known
+
+
+def test_without_ticks_motors_stop_within_the_queue(bench):
+    bench.core.request(step(insertion=1.0))
+    bench.tick(3)
+    at = bench.position("insertion")
+    bench.clock.wait(5.0)
+    bench.stage.read()
+    assert 0.1 < bench.stage.motors["A"].position / 1000.0 - at <= 0.075 * 1.0 / 0.17 + 1e-3
+    assert not bench.stage.motors["A"].moving
+
+
+def test_a_roll_is_confirmed_by_its_position_before_the_needle_advances(bench):
+    bench.core.request(step(roll=math.pi))
+    advanced_at = None
+    while not bench.sent:
+        bench.tick()
+        if bench.stage.motors["A"].position > 0.0 and advanced_at is None:
+            advanced_at = bench.stage.motors["B"].position
+    assert advanced_at == pytest.approx(18_000.0, abs=100.0)
+    done = bench.sent[-1]
+    assert done.travelled["rotation"] == pytest.approx(math.pi, abs=1e-3)
+    assert done.ended - done.begun < 0.2  # of the advance alone
+
+
+def test_a_roll_that_does_not_arrive_is_a_fault_and_the_needle_does_not_advance(bench):
+    bench.core.request(step(roll=math.pi))
+    bench.tick(3)
+    bench.stage.motors["B"].fault = "stall"
+    done = bench.until(1)
+    assert done.state is State.FAULT
+    assert "rotation: the motor does not follow" in done.why
+    assert bench.position("insertion") == 0.0
+
+
+def test_a_step_that_moves_nothing_ends_at_once(bench):
+    bench.core.request(step(insertion=0.0))
+    assert bench.sent[-1].travelled == {"insertion": 0.0, "rotation": 0.0, "guide_y": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("travel", "why"),
+    [
+        ({"insertion": 50.001}, "insertion = 50.001 mm: must be at most 50.000 mm, as far as this insertion"),
+        ({"insertion": -5.2}, "insertion = -5.200 mm: must be within -5.000 mm and 110.000 mm"),
+        ({"guide_y": 15.1}, "guide_y = 15.100 mm: must be within -15.000 mm and 15.000 mm"),
+        ({"guide_z": 0.1}, "the rig has no axis guide_z; axes: insertion, rotation, guide_y"),
+        ({"rotation": 4.0}, "rotation = 229.18°: must be within -10.00° and 190.00°"),
+    ],
+)
+def test_a_step_beyond_a_limit_is_refused_and_nothing_moves(bench, travel, why):
+    bench.core.request(step(**travel))
+    assert bench.sent == [say.Refused(1, bench.sent[0].why)]
+    assert bench.sent[0].why.startswith(why)
+    bench.tick(10)
+    assert not [call for call in bench.stage.calls if call[0] == "follow"]
+
+
+def test_lost_motion_is_made_up_for_on_reversal():
+    bench = Bench(rig_file(guide_y={"backlash_mm": 0.2})).armed()
+    for number, across in enumerate((0.5, -0.5, 0.5), 1):
+        bench.core.request(step(number, guide_y=across))
+        bench.until(number)
+    # With the flank at +, then − and + again: half of 0.2 mm from the unknown side, then all of it twice.
+    goals = [call[1]["C"] for call in bench.stage.calls if call[0] == "follow"]
+    assert goals[-1] == pytest.approx(-500.0 * (0.5 + 0.1))
+    assert max(goals) == pytest.approx(-500.0 * (0.0 - 0.1), abs=1.0)
+
+
+def test_a_second_step_is_refused_while_one_is_under_way(bench):
+    bench.core.request(step(1))
+    bench.core.request(step(2))
+    assert bench.sent == [say.Refused(2, "step: refused: motors have not come to rest yet")]
+
+
+def test_before_arming_a_step_is_refused():
+    bench = Bench()
+    bench.core.request(step())
+    assert bench.sent == [say.Refused(1, "step: refused while idle; accepted: arm, stop, fault")]
+
+
+def test_arming_beyond_a_range_is_refused():
+    bench = Bench()
+    bench.stage.motors["A"].position = -6000.0
+    bench.armed()
+    assert bench.core.state is State.IDLE
+    assert bench.sent[0].why.startswith("arm: refused: insertion = -6.000 mm: must be within")
+
+
+def test_ticks_go_on_while_the_controller_thinks(bench):
+    bench.core.request(step())
+    bench.until(1)
+    before = len(bench.reports)
+    bench.tick(10, beat=False)
+    assert len(bench.reports) == before + 10
+    assert all(report.measurements for report in bench.reports[before:])
+    assert bench.core.state is State.INSERTING
+    assert bench.reports[-1].time - bench.reports[-2].time == pytest.approx(TICK_S)

@@ -1,0 +1,237 @@
+"""Motors and a tracker in memory, on a clock that a test sets: what a supervisor moves and reads."""
+
+import math
+from dataclasses import dataclass, field
+
+from flexneedle.errors import DriverError
+from flexneedle.rig.ports import MotorState
+from flexneedle.rig.supervisor import messages as say
+from flexneedle.rig.supervisor.core import Supervisor
+from flexneedle.rig.tracking.registration import identity
+from flexneedle.scenario.rig import RigFile
+from flexneedle.scenario.sections.monitor import MonitorSettings
+from flexneedle.types import Frame, SensorReading
+
+TICK_S = 0.025
+
+RIG = {
+    "name": "in memory",
+    "driver": {"kind": "memory"},
+    "tracker": {"kind": "memory"},
+    "axes": {
+        "insertion": {
+            "channel": "A",
+            "counts_per_mm": 1000.0,
+            "range_mm": [-5.0, 110.0],
+            "speed_mm_s": 10.0,
+            "acceleration_mm_s2": 200.0,
+        },
+        "rotation": {
+            "channel": "B",
+            "counts_per_deg": 100.0,
+            "range_deg": [-10.0, 190.0],
+            "speed_deg_s": 360.0,
+            "acceleration_deg_s2": 7200.0,
+        },
+        "guide_y": {
+            "channel": "C",
+            "direction": -1,
+            "counts_per_mm": 500.0,
+            "range_mm": [-15.0, 15.0],
+            "speed_mm_s": 10.0,
+            "acceleration_mm_s2": 200.0,
+        },
+    },
+}
+
+
+def rig_file(**changes):
+    """The rig in memory with keys of its axes changed: rig_file(guide_y={"backlash_mm": 0.1})."""
+    axes = {name: axis | changes.get(name, {}) for name, axis in RIG["axes"].items()}
+    return RigFile.model_validate(RIG | {"axes": axes})
+
+
+class Hand:
+    """A clock that only the test moves."""
+
+    def __init__(self):
+        self.time = 0.0
+
+    def now(self):
+        return self.time
+
+    def wait(self, seconds):
+        self.time += seconds
+
+
+@dataclass
+class Motor:
+    """A motor with a trapezoid of its own, in steps of 1 ms. fault: what it does in place of its command."""
+
+    position: float = 0.0
+    commanded: float = 0.0
+    velocity: float = 0.0
+    target: float = 0.0
+    speed: float = 1e5
+    acceleration: float = 1e7
+    on: bool = True
+    stopped: str = ""
+    fault: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+
+    def step(self, seconds):
+        left = self.target - self.commanded
+        stops = math.sqrt(max(0.0, 2.0 * self.acceleration * abs(left)))
+        wanted = math.copysign(min(self.speed, stops, abs(left) / seconds), left)
+        most = self.acceleration * seconds
+        self.velocity += max(-most, min(most, wanted - self.velocity))
+        moved = self.velocity * seconds
+        if abs(left) < 0.5:
+            self.velocity, moved = 0.0, left
+        self.commanded += moved
+        self.position += {"stall": 0.0, "reversed": -moved, "overshoot": 1.2 * moved}.get(self.fault, moved)
+        if not self.low <= self.position <= self.high and moved:
+            self.position = min(self.high, max(self.low, self.position))
+            self.halt("limit switch")
+
+    def halt(self, why=""):
+        self.target = self.commanded = self.position
+        self.velocity, self.stopped = 0.0, why or self.stopped
+
+    @property
+    def moving(self):
+        return self.velocity != 0.0 or self.commanded != self.target
+
+
+class Stage:
+    """The port `Motors` in memory."""
+
+    def __init__(self, clock, channels="ABC"):
+        self.clock, self.at = clock, clock.now()
+        self.motors = {channel: Motor() for channel in channels}
+        self.calls, self.lost, self.refuses = [], False, False
+
+    def _up_to_now(self):
+        while self.at < self.clock.now() - 1e-9:
+            self.at += 1e-3
+            for motor in self.motors.values():
+                if motor.on:
+                    motor.step(1e-3)
+
+    def _called(self, *call):
+        self._up_to_now()
+        self.calls.append(call)
+        if self.lost:
+            raise DriverError("no reply within 100 ms")
+        if self.refuses and call[0] == "follow":
+            raise DriverError("PAA=5: ? 22 Begin not possible due to limit switch")
+
+    def read(self):
+        self._called("read")
+        return {
+            channel: MotorState(
+                motor.position,
+                motor.commanded,
+                motor.moving,
+                motor.on,
+                motor.position <= motor.low,
+                motor.position >= motor.high,
+                motor.stopped,
+            )
+            for channel, motor in self.motors.items()
+        }
+
+    def set_speed(self, channel, speed, acceleration):
+        self._called("set_speed", channel, speed, acceleration)
+        self.motors[channel].speed, self.motors[channel].acceleration = speed, acceleration
+
+    def follow(self, positions):
+        self._called("follow", dict(positions))
+        for channel, position in positions.items():
+            self.motors[channel].target = position
+            self.motors[channel].stopped = ""
+
+    def stop(self):
+        self._called("stop")
+        for motor in self.motors.values():
+            motor.target = motor.commanded
+            motor.velocity = 0.0
+
+    def define(self, channel, position):
+        self._called("define", channel, position)
+        motor = self.motors[channel]
+        shift = position - motor.position
+        motor.position = motor.commanded = motor.target = position
+        motor.low, motor.high = motor.low + shift, motor.high + shift
+
+    def power(self, channel, on):
+        self._called("power", channel, on)
+        self.motors[channel].on = on
+
+    def reconnect(self):
+        self._called("reconnect")
+
+    def close(self):
+        pass
+
+
+@dataclass
+class Camera:
+    """A tracker in memory: a frame at every tick with the tip where `tip` puts it; None: no frame."""
+
+    clock: Hand
+    tip: object = field(default=lambda _: (0.0, 0.0, 0.0))
+    status: str = "ok"
+    number: int = 0
+
+    def read(self):
+        place = self.tip(self.clock.now())
+        if place is None:
+            return ()
+        self.number += 1
+        position = None if place == "missing" else place
+        status = "missing" if position is None else "ok"
+        return (Frame(self.clock.now(), self.number, {"tip": SensorReading(position, None, None, status)}),)
+
+
+class Bench:
+    """A supervisor with devices in memory, and the messages that it has sent."""
+
+    def __init__(self, rig=None, **loop):
+        self.clock = Hand()
+        self.stage, self.camera = Stage(self.clock), Camera(self.clock)
+        rig = rig or rig_file()
+        if loop:
+            rig = rig.model_copy(update={"loop": rig.loop.model_copy(update=loop)})
+        monitor = MonitorSettings(references=0)
+        task = say.Task(rig, 0.0, 2, monitor, identity(), 0.0, 0.3)
+        self.sent, self.reports = [], []
+        self.core = Supervisor(task, self.stage, self.camera, self.clock, self.sent.append)
+
+    def tick(self, count=1, beat=True):
+        """Let `count` ticks pass."""
+        for _ in range(count):
+            self.clock.wait(TICK_S)
+            if beat:
+                self.core.request(say.Heartbeat())
+            self.core.tick()
+            self.reports.append(self.core.report(0.0, 0.0, 0))
+
+    def until(self, number, most=4000):
+        """Tick until the motion of this number has ended; return its message."""
+        for _ in range(most):
+            found = [one for one in self.sent if getattr(one, "number", None) == number]
+            if found:
+                return found[-1]
+            self.tick()
+        raise AssertionError(f"motion {number} has not ended")
+
+    def armed(self, deepest=50.0):
+        """The same, armed."""
+        self.core.request(say.Arm(deepest))
+        return self
+
+    def position(self, name):
+        """Measured position of an axis (mm or rad)."""
+        return self.core.report(0.0, 0.0, 0).axes[name].position
