@@ -5,7 +5,6 @@
 """
 
 import hashlib
-import inspect
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -21,7 +20,7 @@ from flexneedle.rig.phantom.phantom import Phantom
 from flexneedle.rig.phantom.plants import PLANTS, PlantFactory
 from flexneedle.rig.ports import TipTracker
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.own import OWN, is_own, resolved
+from flexneedle.scenario.own import OWN, a_kind_of, is_own, not_callable_with, resolved
 from flexneedle.scenario.problems import printable
 
 TrackerFactory = Callable[[Scenario, Phantom, np.random.Generator], TipTracker]
@@ -101,21 +100,16 @@ def _check_call(
     kind: str, given: object, found: object, names: Iterable[str], arguments: tuple[str, ...]
 ) -> None:
     """Raise InputError unless `found` can be called with these arguments."""
-    wanted = f"a function of ({', '.join(arguments)})"
     if not callable(found):
-        raise _unsuitable(kind, given, found, names, wanted)
-    try:
-        inspect.signature(found).bind(*arguments)
-    except TypeError as error:
-        raise InputError(f"{kind} = {_shown(given)}: must be {wanted}: {error}") from None
-    except ValueError:  # a built-in without a signature
-        return
+        raise _unsuitable(kind, given, found, names, f"a function of ({', '.join(arguments)})")
+    if rule := not_callable_with(found, arguments):
+        raise InputError(f"{kind} = {_shown(given)}: {rule}")
 
 
 def _unsuitable(kind: str, given: object, found: object, names: Iterable[str], wanted: str) -> InputError:
     """The error for a part of the wrong type: an object, or the one that `module:NAME` has been resolved to."""
     choices = f"must be one of {', '.join(names)}, {OWN}, or {wanted}"
-    rule = f"is {_a(found)}, not {wanted}" if isinstance(given, str) else choices
+    rule = f"is {a_kind_of(found)}, not {wanted}" if isinstance(given, str) else choices
     return InputError(f"{kind} = {_shown(given)}: {rule}")
 
 
@@ -132,10 +126,3 @@ def _shown(given: object) -> str:
     if isinstance(given, str):
         return printable(repr(given))
     return printable(getattr(given, "__name__", shown(given)))
-
-
-def _a(found: object) -> str:
-    if isinstance(found, type):
-        return f"the class {found.__name__}"
-    name = type(found).__name__
-    return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"

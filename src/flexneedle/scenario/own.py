@@ -3,6 +3,7 @@
 The current directory is searched, as with `python -m`.
 """
 
+import inspect
 import sys
 from collections.abc import Iterable
 from importlib import import_module
@@ -30,17 +31,51 @@ def resolved(given: str, names: Iterable[str]) -> Any:
         raise InputError(f"must be one of {', '.join(names)}, or {OWN}")
     if not all(part.isidentifier() for part in (*module.split("."), name)):
         raise InputError("must be module:NAME, such as mymodule:MINE")
-    found = _module(module)
-    if not hasattr(found, name):
-        public = ", ".join(key for key in vars(found) if not key.startswith("_")) or "none"
-        raise InputError(f"{module} has no {name}; public names: {public}")
-    return getattr(found, name)
-
-
-def _module(name: str) -> Any:
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.insert(0, here)
+    return attribute(module, name)
+
+
+def attribute(module: str, name: str) -> Any:
+    """Return an attribute of a module that is importable; `name` may have dots.
+
+    Raises InputError with the rule that is broken: no such module, one that cannot be imported, no such attribute.
+    """
+    found = _module(module)
+    for part in name.split("."):
+        if not hasattr(found, part):
+            public = (
+                ", ".join(key for key in getattr(found, "__dict__", ()) if not key.startswith("_")) or "none"
+            )
+            raise InputError(f"{module} has no {name}; public names: {public}")
+        found = getattr(found, part)
+    return found
+
+
+def not_callable_with(found: object, arguments: tuple[str, ...]) -> str:
+    """Return why an object cannot be called with these positional arguments, or "" if it can."""
+    wanted = f"a function of ({', '.join(arguments)})"
+    if not callable(found):
+        return f"is {a_kind_of(found)}, not {wanted}"
+    try:
+        inspect.signature(found).bind(*arguments)
+    except TypeError as error:
+        return f"must be {wanted}: {error}"
+    except ValueError:  # a built-in without a signature
+        return ""
+    return ""
+
+
+def a_kind_of(found: object) -> str:
+    """What an object is, for a message: "an int", "the class Rig"."""
+    if isinstance(found, type):
+        return f"the class {found.__name__}"
+    name = type(found).__name__
+    return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
+
+
+def _module(name: str) -> Any:
     try:
         return import_module(name)
     except InputError:
@@ -48,7 +83,7 @@ def _module(name: str) -> Any:
     except ModuleNotFoundError as error:
         missing = str(error.name)
         if name == missing or name.startswith(f"{missing}."):
-            rule = f"no module {missing} in {here} or installed"
+            rule = f"no module {missing} in {Path.cwd()} or installed"
         else:
             rule = f"{name} cannot be imported: it needs the module {missing}"
         raise InputError(printable(rule)) from None

@@ -4,17 +4,18 @@ Lengths are in mm, angles in degrees; counts are those of the motor's encoder. A
 own beside `kind`, which it checks itself.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from math import radians
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from flexneedle.errors import RigError
 from flexneedle.scenario.library import Library
-from flexneedle.scenario.problems import Problem, refuse
-from flexneedle.scenario.sections.fields import NonNegative, Positive, Section, Title
+from flexneedle.scenario.problems import Problem, describe, refuse
+from flexneedle.scenario.sections.fields import LARGEST, NonNegative, Positive, Section, Title, one_line
 from flexneedle.scenario.sections.registration import Registration
 
 RIGS = Library("a rig file", error=RigError)
@@ -22,8 +23,22 @@ RIGS = Library("a rig file", error=RigError)
 LINEAR_AXES = ("insertion", "guide_y", "guide_z", "base_y", "base_z")
 """Axes with a length: advance of the base, lateral offsets of guide and base."""
 
-Channel = Annotated[str, Field(min_length=1, max_length=40)]
-Range = Annotated[tuple[float, float], Field(strict=False)]
+Settings = TypeVar("Settings", bound=Section)
+
+_FASTEST_HZ = 1000.0
+_ROUNDING = 1e-9
+_SWITCH = "the {} switch is at the {} end of range_{}, or beyond"
+
+
+def _whole(value: object) -> object:
+    if isinstance(value, bool):  # equal to 1, but not what was meant by a direction
+        raise ValueError("must be one of -1, 1")
+    return value
+
+
+Channel = Annotated[str, Field(max_length=40), AfterValidator(one_line)]
+Coordinate = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Range = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
 Home = Literal["here", "reverse-limit", "forward-limit", "absolute"]
 
 
@@ -32,7 +47,7 @@ class Part(Section):
 
     model_config = ConfigDict(extra="allow")
 
-    kind: Annotated[str, Field(min_length=1, max_length=200)]
+    kind: Annotated[str, Field(max_length=200), AfterValidator(one_line)]
     """Name of one that is installed, or `module:NAME` for your own."""
 
     @property
@@ -41,59 +56,83 @@ class Part(Section):
         return dict(self.model_extra or {})
 
 
-class Axis(Section):
-    """An axis and its motor. `scale`, `limits` and the other properties are in counts, mm or rad, and s."""
+class Axis(Section, ABC):
+    """An axis and its motor. `scale`, `limits` and the other properties are in counts, mm or rad, and s.
+
+    unit: of the file, "mm" or "deg"; size: of that unit in mm or rad.
+    """
+
+    unit: ClassVar[str]
+    size: ClassVar[float]
 
     channel: Channel
     """The motor's name at its controller, such as "A"."""
-    direction: Literal[-1, 1] = 1
+    direction: Annotated[Literal[-1, 1], BeforeValidator(_whole)] = 1
     """1 if counts increase with the axis's positive direction, else −1."""
     home: Home = "here"
-    """How `rig home` finds the zero: where the axis is, at a limit switch, or never (an absolute encoder)."""
+    """How `rig home` finds the zero: where the axis is, at a limit switch of the controller, or never (an absolute
+    encoder)."""
 
     @property
+    @abstractmethod
     def scale(self) -> float:
         """Signed counts per mm or rad."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def limits(self) -> tuple[float, float]:
         """Lowest and highest position, mm or rad."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def speed(self) -> float:
         """Largest speed, mm/s or rad/s."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def acceleration(self) -> float:
         """Acceleration, mm/s² or rad/s²."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def at_home(self) -> float:
-        """Position of the zero, mm or rad."""
-        raise NotImplementedError
+        """Position of the axis at its home, mm or rad."""
 
     @property
+    @abstractmethod
     def backlash(self) -> float:
         """Lost motion on reversal, mm or rad."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def max_error(self) -> float:
         """Largest difference of commanded and measured position, mm or rad."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def tolerance(self) -> float:
         """Largest distance from the goal of a motion that has ended, mm or rad."""
-        raise NotImplementedError
+
+    @property
+    def to_home(self) -> int:
+        """Direction in which the axis moves to the limit switch of its home, 1 or −1; 0 without one."""
+        return self.direction * {"forward-limit": 1, "reverse-limit": -1}.get(self.home, 0)
+
+    def shown(self, value: float) -> str:
+        """A position, distance or speed (mm or rad, and s) as a number in the unit of the file, such as "12.5"."""
+        return f"{round(value / self.size, 6):.7g}"
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refuse(_problems_of(self))
+        return self
 
 
 class LinearAxis(Axis):
     """Section `axes.insertion`, and those of guide and base: an axis with a length."""
+
+    unit = "mm"
+    size = 1.0
 
     counts_per_mm: Positive
     """Counts of the encoder per mm."""
@@ -103,7 +142,7 @@ class LinearAxis(Axis):
     """Largest speed."""
     acceleration_mm_s2: Positive
     """Acceleration and deceleration."""
-    home_mm: float = 0.0
+    home_mm: Coordinate = 0.0
     """Position of the axis at its home."""
     backlash_mm: NonNegative = 0.0
     """Lost motion when the motor reverses, made up for."""
@@ -112,18 +151,52 @@ class LinearAxis(Axis):
     tolerance_mm: Positive = 0.02
     """A motion has arrived within this distance from its goal."""
 
-    scale = property(lambda self: self.direction * self.counts_per_mm)
-    limits = property(lambda self: self.range_mm)
-    speed = property(lambda self: self.speed_mm_s)
-    acceleration = property(lambda self: self.acceleration_mm_s2)
-    at_home = property(lambda self: self.home_mm)
-    backlash = property(lambda self: self.backlash_mm)
-    max_error = property(lambda self: self.max_error_mm)
-    tolerance = property(lambda self: self.tolerance_mm)
+    @property
+    def scale(self) -> float:
+        """Signed counts per mm."""
+        return self.direction * self.counts_per_mm
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest position, mm."""
+        return self.range_mm
+
+    @property
+    def speed(self) -> float:
+        """Largest speed, mm/s."""
+        return self.speed_mm_s
+
+    @property
+    def acceleration(self) -> float:
+        """Acceleration, mm/s²."""
+        return self.acceleration_mm_s2
+
+    @property
+    def at_home(self) -> float:
+        """Position of the axis at its home, mm."""
+        return self.home_mm
+
+    @property
+    def backlash(self) -> float:
+        """Lost motion on reversal, mm."""
+        return self.backlash_mm
+
+    @property
+    def max_error(self) -> float:
+        """Largest difference of commanded and measured position, mm."""
+        return self.max_error_mm
+
+    @property
+    def tolerance(self) -> float:
+        """Largest distance from the goal of a motion that has ended, mm."""
+        return self.tolerance_mm
 
 
 class RotaryAxis(Axis):
     """Section `axes.rotation`: the roll of the needle about its axis."""
+
+    unit = "deg"
+    size = radians(1.0)
 
     counts_per_deg: Positive
     """Counts of the encoder per degree."""
@@ -133,7 +206,7 @@ class RotaryAxis(Axis):
     """Largest speed."""
     acceleration_deg_s2: Positive
     """Acceleration and deceleration."""
-    home_deg: float = 0.0
+    home_deg: Coordinate = 0.0
     """Angle of the axis at its home."""
     backlash_deg: NonNegative = 0.0
     """Lost motion when the motor reverses, made up for."""
@@ -142,18 +215,82 @@ class RotaryAxis(Axis):
     tolerance_deg: Positive = 1.0
     """A roll has arrived within this angle from its goal."""
 
-    scale = property(lambda self: self.direction * self.counts_per_deg / radians(1.0))
-    limits = property(lambda self: (radians(self.range_deg[0]), radians(self.range_deg[1])))
-    speed = property(lambda self: radians(self.speed_deg_s))
-    acceleration = property(lambda self: radians(self.acceleration_deg_s2))
-    at_home = property(lambda self: radians(self.home_deg))
-    backlash = property(lambda self: radians(self.backlash_deg))
-    max_error = property(lambda self: radians(self.max_error_deg))
-    tolerance = property(lambda self: radians(self.tolerance_deg))
+    @property
+    def scale(self) -> float:
+        """Signed counts per rad."""
+        return self.direction * self.counts_per_deg / self.size
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest angle, rad."""
+        low, high = self.range_deg
+        return radians(low), radians(high)
+
+    @property
+    def speed(self) -> float:
+        """Largest speed, rad/s."""
+        return radians(self.speed_deg_s)
+
+    @property
+    def acceleration(self) -> float:
+        """Acceleration, rad/s²."""
+        return radians(self.acceleration_deg_s2)
+
+    @property
+    def at_home(self) -> float:
+        """Angle of the axis at its home, rad."""
+        return radians(self.home_deg)
+
+    @property
+    def backlash(self) -> float:
+        """Lost motion on reversal, rad."""
+        return radians(self.backlash_deg)
+
+    @property
+    def max_error(self) -> float:
+        """Largest difference of commanded and measured angle, rad."""
+        return radians(self.max_error_deg)
+
+    @property
+    def tolerance(self) -> float:
+        """Largest angle from the goal of a roll that has ended, rad."""
+        return radians(self.tolerance_deg)
+
+
+def _problems_of(axis: Axis) -> Iterator[Problem]:
+    """The rules between the keys of an axis. Keys end in the axis's unit."""
+    unit, shown, (low, high) = axis.unit, axis.shown, axis.limits
+    limits = [float(shown(low)), float(shown(high))]
+    if low >= high:
+        yield Problem(f"range_{unit}", limits, "must be [lowest, highest]")
+        return
+    if (rule := _misplaced(axis, low, high)) and axis.home != "absolute":
+        yield Problem(f"home_{unit}", float(shown(axis.at_home)), rule)
+    if axis.backlash >= high - low:
+        rule = f"must be below {shown(high - low)}, the width of range_{unit}"
+        yield Problem(f"backlash_{unit}", float(shown(axis.backlash)), rule)
+    if axis.tolerance >= axis.max_error:
+        rule = f"must be below max_error_{unit} ({shown(axis.max_error)})"
+        yield Problem(f"tolerance_{unit}", float(shown(axis.tolerance)), rule)
+    if axis.tolerance * abs(axis.scale) < 1.0 - _ROUNDING:
+        rule = f"must be at least one count, {shown(1.0 / abs(axis.scale))}"
+        yield Problem(f"tolerance_{unit}", float(shown(axis.tolerance)), rule)
+
+
+def _misplaced(axis: Axis, low: float, high: float) -> str:
+    """The rule that the home of an axis breaks, or "". A limit switch is not between the soft limits."""
+    home, end = axis.at_home, axis.to_home
+    if end == 0 and not low - _ROUNDING <= home <= high + _ROUNDING:
+        return f"must be within range_{axis.unit}, {axis.shown(low)} to {axis.shown(high)}"
+    if end < 0 and home > low + _ROUNDING:
+        return f"must be at most {axis.shown(low)}: {_SWITCH.format(axis.home, 'low', axis.unit)}"
+    if end > 0 and home < high - _ROUNDING:
+        return f"must be at least {axis.shown(high)}: {_SWITCH.format(axis.home, 'high', axis.unit)}"
+    return ""
 
 
 class Axes(Section):
-    """Section `axes`: the axes that the rig has."""
+    """Section `axes`: the axes that the rig has. All but `insertion` may be left out."""
 
     insertion: LinearAxis
     rotation: RotaryAxis | None = None
@@ -170,25 +307,21 @@ class Axes(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        refuse(_axis_problems(self))
+        refuse(_shared_channels(self))
         return self
 
 
-def _axis_problems(axes: Axes) -> Iterator[Problem]:
+def _shared_channels(axes: Axes) -> Iterator[Problem]:
     channels: dict[str, str] = {}
     for name, axis in axes.items():
         if (other := channels.setdefault(axis.channel, name)) != name:
             yield Problem(f"{name}.channel", axis.channel, f"is that of {other}, too: each axis has its own")
-        key = "range_deg" if isinstance(axis, RotaryAxis) else "range_mm"
-        low, high = getattr(axis, key)
-        if low >= high:
-            yield Problem(f"{name}.{key}", [low, high], "must be [lowest, highest]")
 
 
 class LoopSettings(Section):
     """Section `loop`: times of the supervisor and of the decisions."""
 
-    rate_hz: Positive = 40.0
+    rate_hz: Annotated[float, Field(gt=0, le=_FASTEST_HZ)] = 40.0
     """Rate at which tracker and motors are read and checked, and targets sent."""
     queue_ms: Annotated[float, Field(gt=0, le=100)] = 75.0
     """Motion that is queued in the motors: what they still do after the computer has stopped."""
@@ -196,6 +329,25 @@ class LoopSettings(Section):
     """Time for a decision. While it takes longer the needle rests, and the period counts as late."""
     decision_limit_s: Positive = 2.0
     """Time without a command after which the insertion is stopped: the controller does not answer."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refuse(self._problems())
+        return self
+
+    def _problems(self) -> Iterator[Problem]:
+        tick = 1e3 / self.rate_hz
+        if self.queue_ms < tick:
+            rule = f"must be at least {tick:g}, the time of a tick at rate_hz ({self.rate_hz:g})"
+            yield Problem("queue_ms", self.queue_ms, f"{rule}: motors would stop between two ticks")
+        if 1e3 * self.decision_limit_s <= self.decision_ms:
+            rule = f"must be above decision_ms ({self.decision_ms:g} ms)"
+            yield Problem("decision_limit_s", self.decision_limit_s, rule)
+
+    @property
+    def queue(self) -> float:
+        """Motion that is queued in the motors, s."""
+        return 1e-3 * self.queue_ms
 
 
 class RigFile(Section):
@@ -211,6 +363,17 @@ class RigFile(Section):
     loop: LoopSettings = LoopSettings()
     ros: Part | None = None
     """What is published to ROS 2. Not set: nothing."""
+
+
+def settings_of(model: type[Settings], settings: Mapping[str, Any]) -> Settings:
+    """Return the settings of a driver or tracker, checked.
+
+    Raises RigError with one line `key = value: rule` for each problem.
+    """
+    try:
+        return model.model_validate(settings)
+    except ValidationError as error:
+        raise RigError(*describe(error, model)) from None
 
 
 def load_rig(path: str | Path) -> RigFile:

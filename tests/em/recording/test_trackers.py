@@ -1,16 +1,12 @@
 """Trackers named on the command line."""
 
-from pathlib import Path
-from types import SimpleNamespace
-
 import pytest
 
 from flexneedle.em.recording import trackers
-from flexneedle.em.recording.trackers import clock_for, frames_of_run, open_tracker
+from flexneedle.em.recording.trackers import clock_for, open_tracker
 from flexneedle.errors import InputError
 from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.devices.replay import Replay
-from flexneedle.types import CheckedMeasurement, Frame, Measurement, SensorReading
 
 RECORDING = "time_s,frame_number,sensor,x_mm,y_mm,z_mm\n0.0,1,tip,1,2,3\n1.0,2,tip,1,2,3\n"
 
@@ -69,7 +65,7 @@ def test_an_invalid_speed_is_refused(speed):
     ],
 )
 def test_an_aurora_has_a_port_and_names(monkeypatch, spec, port, names):
-    monkeypatch.setattr(trackers, "Aurora", lambda *given: given)
+    monkeypatch.setattr("flexneedle.rig.devices.trackers.Aurora", lambda *given: given)
     clock = WallClock()
     assert open_tracker(spec, clock) == (port, clock, names)
 
@@ -90,29 +86,6 @@ def test_an_invalid_tracker_is_refused_with_the_valid_forms(spec, message):
         open_tracker(spec, WallClock())
 
 
-def read_run(monkeypatch, *samples):
-    """Return the frames of a run with these readings in two periods."""
-    checked = [CheckedMeasurement(sample, "ok") for sample in samples]
-    periods = [SimpleNamespace(readings=checked[:1]), SimpleNamespace(readings=checked[1:])]
-    monkeypatch.setattr(trackers, "read_trace", lambda _: SimpleNamespace(periods=periods))
-    return frames_of_run(Path("run"))
-
-
-def test_a_run_returns_each_frame_of_its_tracker_once(monkeypatch):
-    frames = [Frame(n / 40, 7 + n, {"tip": SensorReading((1.0, 2.0, 3.0))}) for n in range(2)]
-    first, second = (Measurement(frame.time, 5.0, 6.0, 7.0, frame) for frame in frames)
-    assert read_run(monkeypatch, first, second, second) == tuple(frames)
-
-
-def test_a_run_with_a_tracker_of_the_tip_alone_gives_frames_of_the_tip(monkeypatch):
-    measured, lost = read_run(monkeypatch, Measurement(0.1, 5.0, 6.0), Measurement(0.2, None, None))
-    assert measured == Frame(0.1, 0, {"tip": SensorReading((5.0, 6.0, 0.0))})
-    assert lost == Frame(0.2, 1, {"tip": SensorReading(None, status="missing")})
-
-
-def test_a_run_without_readings_is_refused(monkeypatch, tmp_path):
-    with pytest.raises(InputError, match="has no tracker readings"):
-        read_run(monkeypatch)
-    monkeypatch.undo()
+def test_a_run_without_a_trace_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"trace\.mcap: cannot be read"):
         open_tracker(f"replay:{tmp_path}", WallClock())

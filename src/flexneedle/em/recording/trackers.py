@@ -1,20 +1,14 @@
 """Trackers named on the command line."""
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from math import isfinite
 from pathlib import Path
 
-from flexneedle.errors import InputError
-from flexneedle.rig.devices.aurora.readings import NAMES
-from flexneedle.rig.devices.aurora.tracker import Aurora
+from flexneedle.errors import InputError, RigError, one_line
+from flexneedle.rig.devices import trackers
 from flexneedle.rig.devices.clock import WallClock
-from flexneedle.rig.devices.recording import read_frames
-from flexneedle.rig.devices.replay import Replay
 from flexneedle.rig.ports import Clock, Tracker
-from flexneedle.rig.tracking.table import TIP
-from flexneedle.trace.folder import TRACE_FILE
-from flexneedle.trace.reader import read_trace
-from flexneedle.types import Frame, Measurement, SensorReading
 
 FORMS = "aurora:PORT[=NAME,NAME,…] or replay:FILE[@SPEED] (a recording or a run folder)"
 """Syntax of a tracker on the command line."""
@@ -30,7 +24,7 @@ def open_tracker(spec: str, clock: Clock) -> AbstractContextManager[Tracker]:
     kind, _, rest = spec.partition(":")
     if not rest or kind not in ("aurora", "replay"):
         raise InputError(f"tracker {spec}: must be {FORMS}")
-    return _aurora(rest, clock) if kind == "aurora" else _replay(rest, clock)
+    return _opened(spec, _aurora if kind == "aurora" else _replay, rest, clock)
 
 
 def clock_for(spec: str) -> WallClock:
@@ -42,19 +36,23 @@ def clock_for(spec: str) -> WallClock:
     return WallClock(_file_and_speed(rest)[1] if kind == "replay" else 1.0)
 
 
-def _aurora(rest: str, clock: Clock) -> Aurora:
-    port, _, names = rest.partition("=")
-    chosen = tuple(names.split(",")) if names else NAMES
-    if not all(name.isidentifier() for name in chosen) or len({*chosen}) < len(chosen):
-        raise InputError(
-            f"tracker aurora:{rest}: sensor names must be different identifiers, such as tip,ref1"
-        )
-    return Aurora(port, clock, chosen)
+def _opened(
+    spec: str, make: Callable[[str, Clock], AbstractContextManager[Tracker]], rest: str, clock: Clock
+) -> AbstractContextManager[Tracker]:
+    try:
+        return make(rest, clock)
+    except RigError as error:
+        raise InputError(f"tracker {spec}: {one_line(error)}") from error
 
 
-def _replay(rest: str, clock: Clock) -> Replay:
-    path = Path(_file_and_speed(rest)[0])
-    return Replay(frames_of_run(path) if path.is_dir() else read_frames(path), clock)
+def _aurora(rest: str, clock: Clock) -> AbstractContextManager[Tracker]:
+    port, equals, names = rest.partition("=")
+    sensors = {"sensors": names.split(",")} if equals and names else {}
+    return trackers.aurora({"port": port, **sensors}, clock)
+
+
+def _replay(rest: str, clock: Clock) -> AbstractContextManager[Tracker]:
+    return trackers.replay({"file": _file_and_speed(rest)[0]}, clock)
 
 
 def _file_and_speed(rest: str) -> tuple[str, float]:
@@ -74,29 +72,3 @@ def _file_and_speed(rest: str) -> tuple[str, float]:
     if not (isfinite(speed) and speed > 0.0):
         raise InputError(f"tracker replay:{rest}: the speed must be finite and above 0")
     return file, speed
-
-
-def frames_of_run(folder: Path) -> tuple[Frame, ...]:
-    """Return the tracker's frames of a recorded insertion, each once, in the tracker's frame of reference.
-
-    Measurements without frames (a tracker of the tip alone) become frames with the sensor tip, in the stage's frame and
-    with z = 0 if unknown. Raises InputError if the run has no readings.
-    """
-    periods = read_trace(folder / TRACE_FILE).periods
-    measurements = [judged.measurement for period in periods for judged in period.readings]
-    frames = {frame.number: frame for frame in (_frame(n, one) for n, one in enumerate(measurements))}
-    if not frames:
-        raise InputError(f"{folder}: the run has no tracker readings")
-    return tuple(frames.values())
-
-
-def _frame(number: int, measurement: Measurement) -> Frame:
-    if measurement.frame is not None:
-        return measurement.frame
-    known = measurement.x is not None and measurement.y is not None
-    position = (measurement.x or 0.0, measurement.y or 0.0, measurement.z or 0.0)
-    return Frame(
-        measurement.time,
-        number,
-        {TIP: SensorReading(position) if known else SensorReading(None, status="missing")},
-    )

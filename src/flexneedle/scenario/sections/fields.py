@@ -30,7 +30,8 @@ def _not_tiny(value: float) -> float:
     return value
 
 
-def _one_line(text: str) -> str:
+def one_line(text: str) -> str:
+    """Return a text unchanged. Raises ValueError, for pydantic, unless it is one line of printable text."""
     if not text.isprintable() or not text.strip():
         raise ValueError("must be one line of printable text")
     return text
@@ -45,7 +46,7 @@ def _low_first(limits: tuple[float, float]) -> tuple[float, float]:
 Positive = Annotated[float, Field(gt=0, le=LARGEST), AfterValidator(_not_tiny)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Title = Annotated[str, Field(max_length=200), AfterValidator(_one_line)]
+Title = Annotated[str, Field(max_length=200), AfterValidator(one_line)]
 # strict=False lets the list of a TOML file become a tuple; the numbers in it stay strict.
 PositiveRange = Annotated[tuple[Positive, Positive], Field(strict=False), AfterValidator(_low_first)]
 NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], Field(strict=False), AfterValidator(_low_first)]

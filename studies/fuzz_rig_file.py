@@ -1,0 +1,272 @@
+"""Random rig files: each gives a rig whose numbers are usable, or lines that name a problem, and nothing else.
+
+    python studies/fuzz_rig_file.py [--inputs N] [--seconds S] [--seed N]
+
+Each input is a valid rig file with a few random changes: values, lines, tables, bytes, its end. It is read from the
+disk as `flexneedle rig check` does. Ends after N inputs (default: a million) or S seconds (default: 600), whichever is
+first. A JSON summary on stdout; exit status 1 after any failure, 130 after an interrupt. An input depends only on seed
+and number, which reproduce a failure (`--first N --inputs 1`).
+"""
+
+import argparse
+import json
+import math
+import random
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+from flexneedle.errors import RigError
+from flexneedle.scenario.rig import RigFile, load_rig
+
+VALID = b"""\
+name = "Bench"
+
+[driver]
+kind = "galil"
+address = "192.168.1.2"
+
+[axes.insertion]
+channel = "A"
+direction = 1
+home = "reverse-limit"
+counts_per_mm = 1000
+range_mm = [0, 120]
+speed_mm_s = 10.0
+acceleration_mm_s2 = 100
+home_mm = -1.5
+backlash_mm = 0.01
+max_error_mm = 0.2
+tolerance_mm = 0.02
+
+[axes.rotation]
+channel = "B"
+direction = -1
+counts_per_deg = 100
+range_deg = [-10, 190]
+speed_deg_s = 360
+acceleration_deg_s2 = 1800
+tolerance_deg = 1
+
+[axes.guide_y]
+channel = "C"
+home = "absolute"
+counts_per_mm = 500
+range_mm = [-15, 15]
+speed_mm_s = 5
+acceleration_mm_s2 = 50
+
+[tracker]
+kind = "aurora"
+port = "/dev/ttyUSB0"
+sensors = ["tip", "ref1"]
+
+[registration]
+rotation = [1.0, 0.0, 0.0, 0.0]
+translation_mm = [0, 0, 0]
+fiducials_mm = [[0, 0, 0], [10, 0, 0], [0, 10, 0]]
+
+[loop]
+rate_hz = 40
+queue_ms = 75
+decision_ms = 200
+decision_limit_s = 2.0
+
+[ros]
+kind = "default"
+"""
+ODD = (
+    b"0", b"-1", b"1e400", b"-1e308", b"5e-324", b"inf", b"-inf", b"nan", b"1_0", b"0x7fffffffffffffffffff", b"true",
+    b'""', b'"A"', b'"a\\nb"', b"[]", b"{}", b"[[]]", b"[nan, 1]", b"[1, 0]", b"[0, 1e6]", b"{kind = 1}", b"1979-05-27",
+    b"'''x'''", b'"absolute"', b'"forward-limit"', b'"here"', b"1e-6", b"1e6", b"999999.9999999", b"9" * 4000, b"0.1",
+    b"\xff", b"1.5",
+)  # fmt: skip
+TABLES = (
+    b"[axes]",
+    b"[axes.base_z]",
+    b"[[axes.insertion]]",
+    b"[ros.topics]",
+    b"[loop]",
+    b"[registration]",
+    b"[x]",
+)
+SLOWEST_S = 1.0
+
+
+def fuzzed(seed: int, number: int) -> bytes:
+    """Return an input."""
+    draw = random.Random(f"{seed}/{number}")
+    data = VALID
+    for _ in range(draw.randint(1, 3)):
+        data = draw.choice(CHANGES)(data, draw)
+    return data
+
+
+def _value(data: bytes, draw: random.Random) -> bytes:
+    lines, at = _lines(data, draw)
+    key, equals, _ = lines[at].partition(b"=")
+    lines[at] = key + b"= " + draw.choice(ODD) if equals else lines[at]
+    return b"\n".join(lines)
+
+
+def _number(data: bytes, draw: random.Random) -> bytes:
+    lines, at = _lines(data, draw)
+    key, equals, _ = lines[at].partition(b"=")
+    drawn = draw.choice((-1, 1)) * 10 ** draw.uniform(-8, 8)
+    lines[at] = key + b"= " + repr(drawn).encode() if equals else lines[at]
+    return b"\n".join(lines)
+
+
+def _key(data: bytes, draw: random.Random) -> bytes:
+    lines, at = _lines(data, draw)
+    key, equals, value = lines[at].partition(b"=")
+    other = draw.choice((b"x ", b"kind ", b'"" ', b'"a.b" ', b"a.b ", key.strip() + b"s "))
+    lines[at] = other + equals + value if equals else lines[at]
+    return b"\n".join(lines)
+
+
+def _without(data: bytes, draw: random.Random) -> bytes:
+    lines, at = _lines(data, draw)
+    del lines[at : at + draw.randint(1, 3)]
+    return b"\n".join(lines)
+
+
+def _twice(data: bytes, draw: random.Random) -> bytes:
+    lines, at = _lines(data, draw)
+    lines.insert(draw.randint(0, len(lines)), lines[at])
+    return b"\n".join(lines)
+
+
+def _table(data: bytes, draw: random.Random) -> bytes:
+    lines, at = _lines(data, draw)
+    lines.insert(at, draw.choice(TABLES))
+    return b"\n".join(lines)
+
+
+def _bytes(data: bytes, draw: random.Random) -> bytes:
+    at, length = draw.randint(0, len(data)), draw.randint(0, 8)
+    return data[:at] + draw.randbytes(draw.randint(0, 6)) + data[at + length :]
+
+
+def _end(data: bytes, draw: random.Random) -> bytes:
+    return data[: draw.randint(0, len(data))]
+
+
+def _nested(data: bytes, draw: random.Random) -> bytes:
+    lines, at = _lines(data, draw)
+    depth = draw.choice((3, 50, 3000))
+    lines.insert(at, b"deep = " + b"[" * depth + b"]" * depth)
+    return b"\n".join(lines)
+
+
+CHANGES = (
+    _value,
+    _value,
+    _value,
+    _number,
+    _number,
+    _key,
+    _without,
+    _twice,
+    _table,
+    _bytes,
+    _bytes,
+    _end,
+    _nested,
+)
+
+
+def _lines(data: bytes, draw: random.Random) -> tuple[list[bytes], int]:
+    lines = data.split(b"\n")
+    return lines, draw.randrange(len(lines))
+
+
+def unusable(rig: RigFile) -> str:
+    """Return what is wrong with an accepted rig, or "": what a supervisor computes with must be finite and ordered."""
+    for name, axis in rig.axes.items():
+        low, high = axis.limits
+        numbers = (
+            axis.scale,
+            low,
+            high,
+            axis.speed,
+            axis.acceleration,
+            axis.at_home,
+            axis.max_error,
+            axis.tolerance,
+        )
+        if not all(map(math.isfinite, numbers)):
+            return f"{name}: a number is not finite"
+        if not (low < high and 0.0 < axis.tolerance < axis.max_error and axis.backlash < high - low):
+            return f"{name}: limits or tolerances are not ordered"
+        if abs(axis.scale) * axis.tolerance < 0.999 or max(abs(low), abs(high)) * abs(axis.scale) > 2**53:
+            return f"{name}: a count is lost"
+    if not 1.0 / rig.loop.rate_hz <= rig.loop.queue * 1.000001 <= 0.1001:
+        return "the queue does not last for a tick"
+    return ""
+
+
+def outcome(path: Path) -> str:
+    """Read a file: "rig", "refused", or what is wrong."""
+    try:
+        rig = load_rig(path)
+    except RigError as error:
+        lines = error.problems
+        good = lines and all(line.startswith(f"{path}: ") and line.isprintable() for line in lines)
+        return "refused" if good else f"bad lines: {lines!r}"
+    except Exception as error:  # noqa: BLE001 - what the study searches
+        return f"{type(error).__name__}: {error}"
+    return unusable(rig) or "rig"
+
+
+def run(seed: int, first: int, inputs: int, seconds: float) -> dict[str, object]:
+    """Return the counts of a run."""
+    counts: Counter[str] = Counter()
+    failures: list[str] = []
+    slowest, number, begun = 0.0, first, time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "rig.toml"
+        for number in range(first, first + inputs):
+            path.write_bytes(fuzzed(seed, number))
+            before = time.monotonic()
+            found = outcome(path)
+            took = time.monotonic() - before
+            slowest = max(slowest, took)
+            if found not in ("rig", "refused") or took > SLOWEST_S:
+                failures.append(f"input {number}: {found}, {took:.2f} s")
+                found = "failed"
+            counts[found] += 1
+            if before - begun > seconds:
+                break
+    elapsed = time.monotonic() - begun
+    return {
+        "inputs": counts.total(),
+        **counts,
+        "seconds": elapsed,
+        "slowest_s": slowest,
+        "failures": failures[:20],
+    }
+
+
+def main() -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--inputs", type=int, default=1_000_000, metavar="N")
+    parser.add_argument("--seconds", type=float, default=600.0, metavar="S")
+    parser.add_argument("--seed", type=int, default=0, metavar="N")
+    parser.add_argument("--first", type=int, default=0, metavar="N")
+    args = parser.parse_args()
+    try:
+        summary = run(args.seed, args.first, args.inputs, args.seconds)
+    except KeyboardInterrupt:
+        return 130
+    print(json.dumps({"seed": args.seed, **summary}, indent=2))
+    return 1 if summary["failures"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

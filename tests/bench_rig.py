@@ -1,0 +1,145 @@
+"""A rig file, and motors and a tracker that record what they are asked, for tests of what is around them."""
+
+import copy
+import tomllib
+from dataclasses import replace
+
+from flexneedle.errors import DriverError
+from flexneedle.rig.ports import MotorState
+from flexneedle.scenario.rig import RigFile
+from flexneedle.types import VISIBLE, Frame, SensorReading
+
+TEXT = """\
+name = "Bench"
+
+[driver]
+kind = "bench"
+
+[axes.insertion]
+channel = "A"
+counts_per_mm = 1000
+range_mm = [0, 120]
+speed_mm_s = 10
+acceleration_mm_s2 = 100
+home = "reverse-limit"
+
+[axes.rotation]
+channel = "B"
+counts_per_deg = 100
+range_deg = [-10, 190]
+speed_deg_s = 360
+acceleration_deg_s2 = 1800
+
+[axes.guide_y]
+channel = "C"
+direction = -1
+counts_per_mm = 500
+range_mm = [-15, 15]
+speed_mm_s = 5
+acceleration_mm_s2 = 50
+home = "absolute"
+
+[tracker]
+kind = "bench"
+"""
+VALUES = tomllib.loads(TEXT)
+
+
+def values(changes=None):
+    """The values of the rig file, with some by dotted key; None takes one out."""
+    changed = copy.deepcopy(VALUES)
+    for key, value in (changes or {}).items():
+        *way, last = key.split(".")
+        table = changed
+        for part in way:
+            table = table.setdefault(part, {})
+        if value is None:
+            del table[last]
+        else:
+            table[last] = value
+    return changed
+
+
+def rig(**changes):
+    """The rig, with values changed; `axes__insertion__home="here"` is a dotted key."""
+    return RigFile.model_validate(values({key.replace("__", "."): value for key, value in changes.items()}))
+
+
+class Motors:
+    """The port `Motors`: states by channel, and the calls that it got. `fails`: raised by each call."""
+
+    def __init__(self, channels=("A", "B", "C"), fails=""):
+        self.states = {channel: MotorState(0.0, 0.0) for channel in channels}
+        self.calls, self.fails, self.closed = [], fails, False
+
+    def set(self, channel, **values):
+        self.states[channel] = replace(self.states[channel], **values)
+
+    def read(self):
+        if self.fails:
+            raise DriverError(self.fails)
+        return dict(self.states)
+
+    def _called(self, *call):
+        self.calls.append(call)
+
+    def set_speed(self, channel, speed, acceleration):
+        self._called("set_speed", channel, speed, acceleration)
+
+    def follow(self, positions):
+        self._called("follow", dict(positions))
+
+    def stop(self):
+        self._called("stop")
+
+    def define(self, channel, position):
+        self._called("define", channel, position)
+
+    def power(self, channel, on):
+        self._called("power", channel, on)
+
+    def reconnect(self):
+        self._called("reconnect")
+
+    def close(self):
+        self.closed = True
+
+
+class Tracker:
+    """The port `Tracker` on a clock: frames at `rate` (Hz) with these sensors, from its start."""
+
+    def __init__(self, clock, rate=40.0, sensors=("tip",), status=VISIBLE):
+        self.clock, self.rate, self.sensors, self.status = clock, rate, sensors, status
+        self.start, self.number, self.closed = clock.now(), 0, False
+
+    def read(self):
+        due = int((self.clock.now() - self.start) * self.rate + 1e-9)
+        taken, self.number = range(self.number, due), due
+        readings = {name: SensorReading((1.0, 2.0, 3.0)) for name in self.sensors}
+        return tuple(Frame(self.start + n / self.rate, n, readings) for n in taken)
+
+    def close(self):
+        self.closed = True
+
+
+class Clock:
+    """The port `Clock`, of a time that passes only while it is waited for."""
+
+    def __init__(self):
+        self.time = 0.0
+
+    def now(self):
+        return self.time
+
+    def wait(self, seconds):
+        self.time += seconds
+
+
+def drivers(_settings, channels):
+    """A factory of motors."""
+    return Motors(channels)
+
+
+def trackers(settings, clock):
+    """A factory of trackers."""
+    return Tracker(clock, **settings)

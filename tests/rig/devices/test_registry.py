@@ -1,0 +1,216 @@
+"""Drivers and trackers of a rig file are found by name or as `module:NAME`, made, and checked."""
+
+import sys
+import tomllib
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from bench_rig import Clock, Motors, Tracker, rig
+from flexneedle.errors import InputError, RigError, RunError
+from flexneedle.rig.devices.registry import DRIVERS, TRACKERS, open_motors, open_tracker
+from flexneedle.scenario.own import resolved
+
+PROJECT = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
+
+
+class Halves:
+    """A tracker without status."""
+
+    closed = False
+
+    def read(self):
+        return ()
+
+    def close(self):
+        type(self).closed = True
+
+
+def keeps_what_it_gets(settings, channels):
+    motors = Motors(channels)
+    motors.settings = settings
+    return motors
+
+
+def refuses(settings, _about):
+    raise RigError(f"port = {settings['port']}: must be text", "speed = 0: must be above 0")
+
+
+def refuses_in_one_line(_settings, _about):
+    raise InputError("/dev/tty9: no such port")
+
+
+def does_not_reply(_settings, _clock):
+    raise RunError("/dev/tty9: no tracker: no reply")
+
+
+@contextmanager
+def managed(_settings, clock):
+    tracker = Tracker(clock)
+    yield tracker
+    tracker.close()
+
+
+def halves(_settings, _clock):
+    return Halves()
+
+
+def lists(_settings, _about):
+    return []
+
+
+def takes_one(_settings):
+    return None
+
+
+@contextmanager
+def managed_lists(_settings, _clock):
+    yield []
+    Halves.closed = True
+
+
+@pytest.fixture(autouse=True)
+def _importable(monkeypatch):
+    """This module is importable as `parts`."""
+    monkeypatch.setitem(sys.modules, "parts", sys.modules[__name__])
+    Halves.closed = False
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """Return a function that installs a package with entry points of a group, without its code."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def install(name, group, **points):
+        folder = tmp_path / f"{name.replace('-', '_')}-1.0.dist-info"
+        folder.mkdir()
+        (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        lines = "".join(f"{point} = {value}\n" for point, value in points.items())
+        (folder / "entry_points.txt").write_text(f"[{group}]\n{lines}")
+        monkeypatch.syspath_prepend(tmp_path)  # the finder of packages reads the folder again
+
+    return install
+
+
+def message(call, *arguments):
+    with pytest.raises(RigError) as caught:
+        call(*arguments)
+    lines = caught.value.problems
+    assert all(line.isprintable() for line in lines)
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("group", [DRIVERS, TRACKERS])
+def test_what_the_package_registers_exists(group):
+    points = PROJECT["entry-points"].get(group, {})
+    assert all(callable(resolved(value, ())) for value in points.values())
+    assert group != TRACKERS or {"aurora", "replay"} <= set(points)
+
+
+def test_a_driver_is_called_with_its_settings_and_the_channels_of_the_axes():
+    motors = open_motors(rig(driver={"kind": "parts:keeps_what_it_gets", "port": 7, "deep": {"a": [1]}}))
+    assert motors.settings == {"port": 7, "deep": {"a": [1]}}
+    assert tuple(motors.states) == ("A", "B", "C")
+
+
+def test_an_installed_package_has_drivers_and_trackers_by_name(package):
+    package("acme-stage", DRIVERS, acme="bench_rig:drivers")
+    package("acme-camera", TRACKERS, acme="bench_rig:trackers")
+    found = rig(driver={"kind": "acme"}, tracker={"kind": "acme", "rate": 20.0})
+    clock = Clock()
+    assert isinstance(open_motors(found), Motors)
+    tracker = open_tracker(found, clock)
+    assert (tracker.rate, tracker.clock) == (20.0, clock)
+
+
+def test_a_tracker_with_close_is_returned_as_it_is():
+    tracker = open_tracker(rig(tracker={"kind": "bench_rig:trackers"}), Clock())
+    assert isinstance(tracker, Tracker)
+    tracker.close()
+    assert tracker.closed
+
+
+def test_a_tracker_may_be_a_context_manager():
+    clock = Clock()
+    tracker = open_tracker(rig(tracker={"kind": "parts:managed"}), clock)
+    clock.wait(0.1)
+    assert (len(tracker.read()), tracker.status) == (4, "ok")
+    assert not tracker.tracker.closed
+    tracker.close()
+    assert tracker.tracker.closed
+
+
+def test_an_unknown_name_is_refused_with_the_names_that_are_installed(package):
+    package("acme-stage", DRIVERS, acme="bench_rig:drivers")
+    line = message(open_motors, rig(driver={"kind": "acmee"}))
+    assert line.startswith('driver.kind = "acmee": must be one of ')
+    assert "acme" in line.split("one of ")[1].split(" or ")[0].replace(",", "").split()
+    assert line.endswith("or module:NAME of your own")
+
+
+def test_two_packages_with_the_same_name_are_refused(package):
+    """Which of them would move the needle?"""
+    package("acme-stage", DRIVERS, stage="bench_rig:drivers")
+    package("other-stage", DRIVERS, stage="other:drivers")
+    line = message(open_motors, rig(driver={"kind": "stage"}))
+    assert line.startswith('driver.kind = "stage": several packages have one of this name: ')
+    assert "acme-stage (bench_rig:drivers)" in line
+    assert "other-stage (other:drivers)" in line
+
+
+def test_a_package_that_is_broken_is_named(package):
+    package("acme-stage", DRIVERS, gone="acme_gone:drivers", less="bench_rig:Nothing")
+    gone = message(open_motors, rig(driver={"kind": "gone"}))
+    assert gone.startswith('driver.kind = "gone": no module acme_gone in ')
+    assert gone.endswith("(entry point of acme-stage)")
+    less = message(open_motors, rig(driver={"kind": "less"}))
+    assert less.startswith('driver.kind = "less": bench_rig has no Nothing; public names: ')
+
+
+@pytest.mark.parametrize(
+    ("kind", "line"),
+    [
+        ("nothing_such:NAME", "no module nothing_such in "),
+        ("parts:Nothing", "parts has no Nothing; public names: "),
+        ("not a name:x", "must be module:NAME, such as mymodule:MINE"),
+        ("parts:PROJECT", "is a dict, not a function of (settings, "),
+        ("parts:takes_one", "must be a function of (settings, "),
+        ("parts:lists", "made a list "),
+    ],
+)
+def test_an_unsuitable_part_of_your_own_is_refused(kind, line):
+    found = rig(driver={"kind": kind}, tracker={"kind": kind})
+    assert message(open_motors, found).startswith(f'driver.kind = "{kind}": {line}')
+    assert message(open_tracker, found, Clock()).startswith(f'tracker.kind = "{kind}": {line}')
+
+
+def test_a_device_has_all_parts_of_its_port():
+    missing = "without read, set_speed, follow, stop, define, power, reconnect, close"
+    assert message(open_motors, rig(driver={"kind": "parts:lists"})).endswith(f"made a list {missing}")
+    line = message(open_tracker, rig(tracker={"kind": "parts:lists"}), Clock())
+    assert line.endswith("made a list that cannot be closed: it needs close(), or to be a context manager")
+
+
+def test_a_device_that_is_refused_is_closed():
+    line = message(open_tracker, rig(tracker={"kind": "parts:halves"}), Clock())
+    assert line == 'tracker.kind = "parts:halves": made a Halves without status'
+    assert Halves.closed
+    Halves.closed = False
+    line = message(open_tracker, rig(tracker={"kind": "parts:managed_lists"}), Clock())
+    assert line == 'tracker.kind = "parts:managed_lists": made a list without read, status'
+    assert Halves.closed
+
+
+def test_settings_that_a_device_refuses_are_reported_with_its_kind():
+    found = rig(driver={"kind": "parts:refuses", "port": 3}, tracker={"kind": "parts:refuses_in_one_line"})
+    assert message(open_motors, found) == (
+        "driver parts:refuses: port = 3: must be text\ndriver parts:refuses: speed = 0: must be above 0"
+    )
+    line = message(open_tracker, found, Clock())
+    assert line == "tracker parts:refuses_in_one_line: /dev/tty9: no such port"
+
+
+def test_a_device_that_does_not_reply_is_no_error_of_the_file():
+    with pytest.raises(RunError, match="no reply"):
+        open_tracker(rig(tracker={"kind": "parts:does_not_reply"}), Clock())
