@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 
 from flexneedle.errors import DriverError
+from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.ports import MotorState
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.core import Supervisor
@@ -235,3 +236,32 @@ class Bench:
     def position(self, name):
         """Measured position of an axis (mm or rad)."""
         return self.core.report(0.0, 0.0, 0).axes[name].position
+
+
+def real_motors(settings, channels):
+    """A driver of a rig file, `stages:real_motors`: the motors in memory, in real time. position: of all (counts)."""
+    stage = Stage(WallClock(), channels)
+    for motor in stage.motors.values():
+        motor.position = motor.commanded = motor.target = float(settings.get("position", 0.0))
+    return stage
+
+
+class Still:
+    """A tracker of a rig file, `stages:Still`: 40 frames a second of a tip at rest, with a little noise."""
+
+    status = "ok"
+
+    def __init__(self, _settings, clock):
+        self.clock, self.number = clock, 0
+
+    def read(self):
+        due = int(self.clock.now() * 40.0)
+        fresh = range(self.number + 1, due + 1)
+        self.number = max(self.number, due)
+        return tuple(
+            Frame(number / 40.0, number, {"tip": SensorReading((0.0, 0.0, 1e-4 * math.sin(number)))})
+            for number in fresh
+        )
+
+    def close(self):
+        pass

@@ -11,19 +11,21 @@ from stages import Bench, rig_file
 
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("home", ["reverse-limit", "forward-limit"])
-def test_an_axis_finds_its_switch_and_calls_it_its_home(home, direction):
-    bench = Bench(rig_file(guide_y={"home": home, "home_mm": 2.5, "direction": direction})).armed()
+def test_an_axis_finds_its_switch_calls_it_its_home_and_moves_into_its_range(home, direction):
+    to_home = direction * (1 if home == "forward-limit" else -1)
+    keys = {"home": home, "home_mm": 15.5 * to_home, "direction": direction}
+    bench = Bench(rig_file(guide_y=keys)).armed()
     motor = bench.stage.motors["C"]
-    motor.low, motor.high = -3000.0, 2000.0  # counts, 500 a mm
+    motor.low, motor.high = -9000.0, 7000.0  # counts, 500 a mm
     bench.core.request(say.Home(1, "guide_y"))
     assert bench.core.state is State.HOMING
     done = bench.until(1, most=20_000)
     assert (done.why, done.state) == ("", State.ARMED)
-    assert motor.position == direction * 500.0 * 2.5
-    towards_low = (home == "reverse-limit") == (direction > 0)
-    assert (motor.low if towards_low else motor.high) == motor.position
-    assert bench.position("guide_y") == 2.5
-    bench.core.request(say.Go(2, "guide_y", 1.0 if home == "forward-limit" else 4.0, 5.0))
+    assert ("define", "C", direction * 500.0 * 15.5 * to_home) in bench.stage.calls
+    switch = motor.low if home == "reverse-limit" else motor.high
+    assert switch == direction * 500.0 * 15.5 * to_home
+    assert bench.position("guide_y") == pytest.approx(15.0 * to_home, abs=2e-3)
+    bench.core.request(say.Go(2, "guide_y", 0.0, 5.0))
     assert bench.until(2).why == ""
 
 
@@ -35,7 +37,7 @@ def test_an_axis_is_at_home_where_it_is():
 
 
 def test_without_a_switch_the_axis_has_no_home():
-    bench = Bench(rig_file(guide_y={"home": "reverse-limit"})).armed()
+    bench = Bench(rig_file(guide_y={"home": "reverse-limit", "home_mm": 15.0})).armed()
     bench.core.request(say.Home(1, "guide_y"))
     done = bench.until(1, most=20_000)
     assert done.why == "guide_y: no limit switch within its range"
@@ -49,7 +51,7 @@ def test_an_absolute_encoder_is_not_homed():
 
 
 def test_a_stall_while_homing_is_a_fault():
-    bench = Bench(rig_file(guide_y={"home": "reverse-limit"})).armed()
+    bench = Bench(rig_file(guide_y={"home": "reverse-limit", "home_mm": 15.0})).armed()
     bench.core.request(say.Home(1, "guide_y"))
     bench.tick(5)
     bench.stage.motors["C"].fault = "stall"

@@ -85,7 +85,8 @@ def test_a_roll_is_confirmed_by_its_position_before_the_needle_advances(bench):
     assert advanced_at == pytest.approx(18_000.0, abs=100.0)
     done = bench.sent[-1]
     assert done.travelled["rotation"] == pytest.approx(math.pi, abs=1e-3)
-    assert done.ended - done.begun < 0.2  # of the advance alone
+    assert done.ended - done.turned < 0.2  # the advance alone
+    assert done.turned - done.begun > 0.4  # half a turn at 360°/s
 
 
 def test_a_roll_that_does_not_arrive_is_a_fault_and_the_needle_does_not_advance(bench):

@@ -1,4 +1,4 @@
-"""What stops the motors: faults of motors, the tracker, the client and the operator; and that nothing starts by itself."""
+"""What stops the motors: motors, tracker, client and operator; and that nothing starts by itself."""
 
 import math
 

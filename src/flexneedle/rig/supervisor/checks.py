@@ -50,11 +50,8 @@ def reversal_problem(drive: Drive, state: MotorState, before: MotorState, way: f
 
 
 def at_home(drive: Drive, state: MotorState) -> bool:
-    """Whether an axis has found its home, a limit switch, and rests there."""
+    """Whether an axis is at the limit switch of its home, and rests there."""
     at = state.reverse_limit if drive.axis.home == "reverse-limit" else state.forward_limit
-    # A limit of the motor's direction is that of the axis only if both count alike.
-    if drive.axis.direction < 0:
-        at = state.forward_limit if drive.axis.home == "reverse-limit" else state.reverse_limit
     return at and not state.moving
 
 

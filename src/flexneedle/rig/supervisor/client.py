@@ -15,6 +15,7 @@ from flexneedle.errors import DriverError, RefusedError, StoppedError
 from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.machine import State
+from flexneedle.scenario.rig import Axis
 from flexneedle.types import Measurement
 
 _HEARTBEAT_S = 0.1
@@ -130,6 +131,7 @@ class Supervisor:
 
     def jog(self, axis: str, distance: float, speed: float | None = None) -> say.Done:
         """Move one axis alone by a distance (mm or rad)."""
+        self._known(axis)
         return self._go(axis, self.report.axes[axis].position + distance, speed, retract=False)
 
     def retract(self, position: float, speed: float | None = None) -> say.Done:
@@ -146,11 +148,14 @@ class Supervisor:
         self._wait(lambda: monotonic() >= until, seconds + 1.0, "the clock stands still", every=seconds)
 
     def _go(self, axis: str, position: float, speed: float | None, *, retract: bool) -> say.Done:
+        fastest = self._known(axis).speed if speed is None else speed
+        return self._carry_out(lambda number: say.Go(number, axis, position, fastest, retract))
+
+    def _known(self, axis: str) -> Axis:
         found = dict(self._task.rig.axes.items())
         if axis not in found:
             raise RefusedError(f"the rig has no axis {axis}; axes: {', '.join(found)}")
-        fastest = found[axis].speed if speed is None else speed
-        return self._carry_out(lambda number: say.Go(number, axis, position, fastest, retract))
+        return found[axis]
 
     def _carry_out(self, made: Callable[[int], say.Request]) -> say.Done:
         self._number += 1

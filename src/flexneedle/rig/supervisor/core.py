@@ -200,12 +200,15 @@ class Supervisor:
             self._refuse(home.number, f"{home.axis}: has an absolute encoder, and no home to search")
             return
         self._enter(Event.HOME)
-        low, high = drive.axis.limits
-        way = {"here": 0.0, "reverse-limit": low - high, "forward-limit": high - low}[drive.axis.home]
-        travel = _HOMING_REACH * way
-        duration = abs(travel) / (_HOMING_SHARE * drive.axis.speed)
-        legs: list[tuple[Mapping[str, float], float]] = [({home.axis: travel}, duration)]
-        self._begin(Motion(home.number, legs, self._positions(), home=drive))
+        if drive.axis.home == "here":
+            motion = Motion(home.number, [], self._positions(), unlimited=True)
+            self._set_home(motion, drive)
+        else:
+            low, high = drive.axis.limits
+            travel = drive.axis.to_home * _HOMING_REACH * (high - low)
+            leg = {home.axis: travel}, abs(travel) / (_HOMING_SHARE * drive.axis.speed)
+            motion = Motion(home.number, [leg], self._positions(), home=drive, unlimited=True)
+        self._begin(motion)
 
     def _begin(self, motion: Motion) -> None:
         """Begin a motion at once, not at the next tick."""
@@ -274,9 +277,11 @@ class Supervisor:
         for drive in self._drives.values():
             channel = drive.axis.channel
             state, last = self._states[channel], before[channel]
-            homing = self._motion is not None and self._motion.home is not None
-            problem = "" if homing and at_home(drive, state) else motor_problem(drive, state, last)
-            problem = problem or position_problem(drive, state, last, seconds, unlimited=homing)
+            home = None if self._motion is None else self._motion.home
+            at = home is not None and home.name == drive.name and at_home(drive, state)
+            problem = "" if at else motor_problem(drive, state, last)
+            unlimited = self._motion is not None and self._motion.unlimited
+            problem = problem or position_problem(drive, state, last, seconds, unlimited=unlimited)
             leg = None if self._motion is None or self._stop_at is not None else self._motion.leg
             if not problem and leg is not None and channel in leg.drives:
                 problem = reversal_problem(drive, state, last, leg.way(channel))
@@ -359,8 +364,9 @@ class Supervisor:
         """Send the next targets, or go on to the next leg."""
         leg.note(self._states, self._read_at)
         if motion.home is not None and at_home(motion.home, self._states[motion.home.axis.channel]):
-            motion.legs = []
-            self._end_leg(motion, leg, now)
+            self._set_home(motion, motion.home)
+            motion.home, motion.leg = None, None
+            self._next_leg(now)
         elif leg.has_arrived(self._states, now):
             if motion.home is not None:
                 motion.why = f"{motion.home.name}: no limit switch within its range"
@@ -396,20 +402,24 @@ class Supervisor:
             motion.spans.append(motion.leg.span())
         at = self._positions()
         travelled = {name: at[name] - motion.origin[name] for name in at}
-        if motion.home is not None and not motion.why:
-            self._set_home(motion.home)
         if self.state in (State.HOMING, State.JOGGING, State.RETRACTING):
             self._enter(Event.ARRIVED)
-        begun, ended = motion.times(now)
-        self._send(say.Done(motion.number, travelled, begun, ended, self.state, motion.why))
+        begun, ended, turned = motion.times(now)
+        self._send(say.Done(motion.number, travelled, begun, ended, self.state, motion.why, turned))
 
-    def _set_home(self, drive: Drive) -> None:
+    def _set_home(self, motion: Motion, drive: Drive) -> None:
+        """Call the present position of an axis its home; from beyond its range it then moves into that."""
+        drive, home = self._drives[drive.name], drive.axis.at_home
         try:
-            self._motors.define(drive.axis.channel, self._drives[drive.name].counts(drive.axis.at_home))
+            self._motors.define(drive.axis.channel, drive.counts(home))
             self._read(self._clock.now())
-            self._goals = self._at()
         except DriverError as error:
             self._fault(str(error))
+            return
+        self._goals = self._at()
+        low, high = drive.axis.limits
+        into = min(max(home, low), high) - home
+        motion.legs = [({drive.name: into}, abs(into) / (_HOMING_SHARE * drive.axis.speed))]
 
     def _at(self) -> dict[str, float]:
         """Measured positions of the motors (counts) by channel."""

@@ -126,6 +126,7 @@ class AxisState:
 class Done:
     """A motion has ended: what was really done by axis, from `begun` to `ended` (s).
 
+    turned: when the travel began after a roll, None without one;
     why: why it was ended before its goal, or ""; state: of the rig after it.
     """
 
@@ -135,6 +136,7 @@ class Done:
     ended: float
     state: State
     why: str = ""
+    turned: float | None = None
 
 
 @dataclass(frozen=True)

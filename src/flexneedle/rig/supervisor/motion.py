@@ -73,7 +73,8 @@ class Motion:
     """A motion of one request: legs still to come as (travel by axis, duration), the present leg, and what was done.
 
     origin: positions of all axes at its begin; expected: of the tip; spans: begin and end of each leg that is done;
-    home: the axis whose home is searched, or None; why: why it ends before its goal, or "".
+    home: the axis whose home is searched, or None; unlimited: positions count from nowhere yet, or the axis comes from
+    its home beyond its range; why: why it ends before its goal, or "".
     """
 
     number: int
@@ -81,6 +82,7 @@ class Motion:
     origin: Mapping[str, float]
     expected: Expectation | None = None
     home: Drive | None = None
+    unlimited: bool = False
     leg: Leg | None = None
     spans: list[tuple[float, float]] = field(default_factory=list)
     why: str = ""
@@ -90,9 +92,15 @@ class Motion:
         """Whether the needle is rolled alone, before the travel."""
         return bool(self.legs) and self.leg is not None
 
-    def times(self, now: float) -> tuple[float, float]:
-        """Begin and end of its last leg with a motion; `now` twice without one."""
-        return self.spans[-1] if self.spans else (now, now)
+    def times(self, now: float) -> tuple[float, float, float | None]:
+        """When it began and ended, and when the travel began after a roll (None: no roll) (s).
+
+        `now` where nothing has moved.
+        """
+        if not self.spans:
+            return now, now, None
+        begun, ended = self.spans[0][0], self.spans[-1][1]
+        return begun, ended, self.spans[-1][0] if len(self.spans) > 1 else None
 
 
 def leg_of(

@@ -10,6 +10,7 @@ import gc
 import signal
 import socket
 import sys
+from contextlib import closing
 from multiprocessing.connection import Connection, wait
 from queue import SimpleQueue
 from threading import Thread
@@ -74,22 +75,17 @@ def _serve(connection: Connection, task: say.Task, outbox: Outbox) -> str:
     """Open the devices, tick until the end, and return its reason."""
     signals = _signals()
     clock = WallClock(start=task.started)
-    motors = open_motors(task.rig)
-    if task.dry:
-        motors = DryMotors(motors, clock)
-    try:
-        with open_tracker(task.rig, clock) as tracker:
-            core = Supervisor(task, motors, tracker, clock, outbox.put)
-            set_realtime_priority()
-            gc.collect()
-            gc.freeze()
-            gc.disable()  # nothing here makes cycles; a collection would delay a tick
-            try:
-                return _tick(connection, core, outbox, signals, 1.0 / task.rig.loop.rate_hz)
-            finally:
-                motors.stop()
-    finally:
-        motors.close()
+    with closing(open_motors(task.rig)) as connected, closing(open_tracker(task.rig, clock)) as tracker:
+        motors = DryMotors(connected, clock) if task.dry else connected
+        core = Supervisor(task, motors, tracker, clock, outbox.put)
+        set_realtime_priority()
+        gc.collect()
+        gc.freeze()
+        gc.disable()  # nothing here makes cycles; a collection would delay a tick
+        try:
+            return _tick(connection, core, outbox, signals, 1.0 / task.rig.loop.rate_hz)
+        finally:
+            motors.stop()
 
 
 def _signals() -> socket.socket:
@@ -97,9 +93,9 @@ def _signals() -> socket.socket:
     receiving, sending = socket.socketpair()
     receiving.setblocking(False)
     sending.setblocking(False)
-    signal.set_wakeup_fd(sending.fileno(), warn_on_full_buffer=False)
+    signal.set_wakeup_fd(sending.detach(), warn_on_full_buffer=False)
     for number in _SIGNALS:
-        signal.signal(number, lambda *_, kept=sending: None)
+        signal.signal(number, lambda *_: None)
     return receiving
 
 

@@ -1,0 +1,139 @@
+"""The supervisor in a process of its own: its ticks, and what happens when it or its client is killed."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from time import monotonic
+
+import pytest
+
+from emulated import until
+from flexneedle.errors import DriverError, RefusedError, RigError, StoppedError
+from flexneedle.rig.supervisor import messages as say
+from flexneedle.rig.supervisor.client import Supervisor
+from flexneedle.rig.supervisor.machine import State
+from flexneedle.rig.tracking.registration import identity
+from flexneedle.scenario.rig import Part
+from flexneedle.scenario.sections.monitor import MonitorSettings
+from stages import rig_file
+
+TESTS = Path(__file__).parents[2]
+
+
+def task(driver="stages:real_motors", tracker="stages:Still", **settings):
+    rig = rig_file().model_copy(
+        update={"driver": Part(kind=driver, **settings), "tracker": Part(kind=tracker)}
+    )
+    return say.Task(rig, monotonic(), 2, MonitorSettings(references=0), identity(), 0.0, 0.3)
+
+
+@pytest.fixture(autouse=True)
+def in_the_folder_of_the_stage(monkeypatch):
+    monkeypatch.chdir(TESTS)
+
+
+@pytest.fixture
+def supervisor():
+    with Supervisor(task()) as made:
+        yield made
+
+
+def test_a_step_is_carried_out_and_ticks_go_on(supervisor):
+    supervisor.arm()
+    done = supervisor.step(0.0, {"insertion": 1.0, "guide_y": 0.2}, 0.2)
+    assert done.travelled["insertion"] == pytest.approx(1.0, abs=0.02)
+    assert 0.1 < done.ended - done.begun < 0.25
+    assert abs(supervisor.clock.now() - done.ended) < 0.5
+    before = supervisor.report.time
+    supervisor.wait(0.2)
+    assert supervisor.report.time > before + 0.1
+    assert supervisor.report.axes["insertion"].position == pytest.approx(1.0, abs=0.02)
+    assert len(supervisor.read()) > 5
+    assert supervisor.read() == () or len(supervisor.read()) < 3
+
+
+def test_operators_move_axes(supervisor):
+    with pytest.raises(RefusedError, match="jog: refused while idle"):
+        supervisor.jog("guide_y", 1.0)
+    supervisor.arm()
+    supervisor.jog("guide_y", 1.0)
+    supervisor.move_to("insertion", 2.0)
+    supervisor.retract(-1.0)
+    supervisor.home("rotation")
+    found = {name: round(axis.position, 1) for name, axis in supervisor.report.axes.items()}
+    assert found == {"guide_y": 1.0, "insertion": -1.0, "rotation": 0.0}
+    with pytest.raises(RefusedError, match="no axis nose; axes: insertion"):
+        supervisor.jog("nose", 1.0)
+
+
+def test_a_stopped_rig_is_reset_before_it_is_armed_again(supervisor):
+    supervisor.arm()
+    supervisor.stop("the test")
+    with pytest.raises(StoppedError, match="stopped: the test"):
+        supervisor.step(0.0, {"insertion": 1.0}, 0.2)
+    supervisor.reset()
+    supervisor.arm()
+    assert supervisor.report.state is State.ARMED
+
+
+def test_a_signal_stops_the_motors(supervisor):
+    supervisor.arm()
+    os.kill(supervisor.pid, signal.SIGTERM)
+    with pytest.raises(StoppedError, match="stopped: signal SIGTERM"):
+        supervisor.wait(5.0)
+
+
+def test_a_supervisor_that_is_killed_is_an_error(supervisor):
+    supervisor.arm()
+    os.kill(supervisor.pid, signal.SIGKILL)
+    with pytest.raises(DriverError, match="the supervisor has ended: it was killed"):
+        supervisor.wait(5.0)
+
+
+def test_a_supervisor_that_hangs_is_an_error(supervisor):
+    supervisor.arm()
+    os.kill(supervisor.pid, signal.SIGSTOP)
+    try:
+        with pytest.raises(DriverError, match="the supervisor has not reported for"):
+            supervisor.wait(5.0)
+    finally:
+        os.kill(supervisor.pid, signal.SIGCONT)
+
+
+CLIENT = """
+import sys
+sys.path.insert(0, {tests!r})
+from rig.supervisor.test_process import task
+from flexneedle.rig.supervisor.client import Supervisor
+
+with Supervisor(task()) as made:
+    made.arm()
+    print(made.pid, flush=True)
+    made.move_to("insertion", 100.0, 1.0)
+"""
+
+
+def test_without_its_client_the_supervisor_stops_and_ends(tmp_path):
+    script = tmp_path / "client.py"
+    script.write_text(textwrap.dedent(CLIENT.format(tests=str(TESTS))))
+    client = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
+    pid = int(client.stdout.readline())
+    client.kill()
+    client.wait()
+    client.stdout.close()
+    until(lambda: not Path(f"/proc/{pid}").exists() or "Z" in Path(f"/proc/{pid}/stat").read_text())
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ({"driver": "nonesuch"}, r'driver.kind = "nonesuch": must be one of'),
+        ({"tracker": "stages:nonesuch"}, r'tracker.kind = "stages:nonesuch": stages has no nonesuch'),
+    ],
+)
+def test_a_rig_that_cannot_be_opened_is_refused_with_its_reason(given, why):
+    with pytest.raises((DriverError, RigError), match=why):
+        Supervisor(task(**given))
