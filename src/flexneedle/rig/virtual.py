@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexneedle.arguments import refusal
+from flexneedle.estimation.estimate import Estimate
 from flexneedle.rig.parts import TrackerFactory
 from flexneedle.rig.phantom.draw import draw
 from flexneedle.rig.phantom.phantom import Condition, Phantom
@@ -23,7 +24,7 @@ from flexneedle.rig.tracking.stage import OnStage, tilt_of
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.registration import Registration
-from flexneedle.types import Lateral, Point
+from flexneedle.types import Control, Lateral, Point
 
 _CLEAN = 0.75  # of the indicator's limit: a reference below it is not moved
 
@@ -32,6 +33,8 @@ _CLEAN = 0.75  # of the indicator's limit: a reference below it is not moved
 class Rig:
     """Ports of the closed loop; `truth` is only recorded, None on hardware.
 
+    expect: called with the estimate and the command before each motion, so that readings during it can be checked; None
+    where they are not.
     Raises InputError if one has not the functions of its port.
     """
 
@@ -39,6 +42,7 @@ class Rig:
     driver: Driver
     tracker: TipTracker
     truth: Callable[[], Condition] | None = None
+    expect: Callable[[Estimate, Control], None] | None = None
 
     def __post_init__(self) -> None:
         _check_port("clock", self.clock, Clock, ("now", "wait"))

@@ -15,7 +15,7 @@ from flexneedle.errors import DriverError, RefusedError, StoppedError
 from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.machine import State
-from flexneedle.scenario.rig import Axis
+from flexneedle.scenario.rig import Axis, RigFile
 from flexneedle.types import Measurement
 
 _HEARTBEAT_S = 0.1
@@ -33,7 +33,7 @@ class Supervisor:
     """
 
     def __init__(self, task: say.Task, on_report: Callable[[say.Report], None] | None = None) -> None:
-        self.clock = WallClock(start=task.started)
+        self._clock = WallClock(start=task.started)
         self._task, self._on_report = task, on_report
         self._changed = Condition()
         self._latest: say.Report | None = None
@@ -72,6 +72,15 @@ class Supervisor:
             self._process.kill()
             self._process.wait()
         self._connection.close()
+
+    @property
+    def rig(self) -> RigFile:
+        """The rig."""
+        return self._task.rig
+
+    def now(self) -> float:
+        """Seconds since the start of the run."""
+        return self._clock.now()
 
     @property
     def pid(self) -> int:

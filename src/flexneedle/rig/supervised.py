@@ -1,0 +1,194 @@
+"""A rig of a rig file with the ports of the closed loop: its driver, tracker and clock are those of a supervisor."""
+
+import math
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from time import monotonic
+
+import numpy as np
+
+from flexneedle.errors import DriverError
+from flexneedle.estimation.estimate import Estimate
+from flexneedle.rig.supervisor.client import Supervisor
+from flexneedle.rig.supervisor.messages import Done, Expectation, Report, Task
+from flexneedle.rig.virtual import Rig, to_stage
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.rig import RigFile
+from flexneedle.simulator.control import MOVES, Limits, half_turned
+from flexneedle.types import (
+    DB_X,
+    DB_Y,
+    DB_Z,
+    DG_Y,
+    DG_Z,
+    ROLL,
+    SPIN,
+    STILL,
+    Control,
+    Motion,
+    Plan,
+    Pose,
+)
+
+_SDS = 3.0  # standard deviations of the prediction that a reading may be off beyond the limit
+_MOST_TICKS = 200_000  # an hour and more
+_GUIDE = {"guide_y": DG_Y, "guide_z": DG_Z}
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns of a control as travel of the rig's axes. slope: dy/dx + i dz/dx of the axis on which the base moves."""
+
+    slope: complex
+
+    @property
+    def _stretch(self) -> float:
+        """Length of the insertion axis for each mm along x."""
+        return math.sqrt(1.0 + abs(self.slope) ** 2)
+
+    def travel(self, row: Control) -> dict[str, float]:
+        """Travel (mm or rad) by axis, of the axes that move."""
+        base_y, base_z = row.db_y - self.slope.real * row.db_x, row.db_z - self.slope.imag * row.db_x
+        travel = {
+            "insertion": self._stretch * row.db_x,
+            "base_y": base_y,
+            "base_z": base_z,
+            "rotation": row.spin,
+            **{name: row[column] for name, column in _GUIDE.items()},
+        }
+        return {name: way for name, way in travel.items() if abs(way) > 1e-12}
+
+    def control(self, travelled: Mapping[str, float], roll: float) -> Control:
+        """The control that travelled axes have carried out, with its roll (rad) before the spin."""
+        row = np.zeros(len(STILL))
+        row[DB_X] = travelled.get("insertion", 0.0) / self._stretch
+        row[DB_Y] = travelled.get("base_y", 0.0) + self.slope.real * row[DB_X]
+        row[DB_Z] = travelled.get("base_z", 0.0) + self.slope.imag * row[DB_X]
+        for name, column in _GUIDE.items():
+            row[column] = travelled.get(name, 0.0)
+        row[ROLL], row[SPIN] = roll, travelled.get("rotation", 0.0) - roll
+        return Control.of(row.tolist())
+
+
+@dataclass
+class Ticks:
+    """Times of the supervisor's ticks (s): how much later than scheduled each began, and how long it took."""
+
+    late: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_TICKS))
+    work: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_TICKS))
+    missed: int = 0
+
+    def add(self, report: Report) -> None:
+        """Add a tick."""
+        self.late.append(report.late)
+        self.work.append(report.work)
+        self.missed = report.missed
+
+    def summary(self) -> dict[str, float]:
+        """Number of ticks, ticks left out, and late and work in ms: median, 99 % and largest."""
+        found: dict[str, float] = {"count": len(self.late), "missed": self.missed}
+        for name, values in (("late", self.late), ("work", self.work)):
+            for q, label in ((50, "p50"), (99, "p99"), (100, "max")):
+                found[f"{name}_{label}_ms"] = 1e3 * float(np.percentile(values, q)) if values else math.nan
+        return found
+
+
+class SupervisedDriver:
+    """The port `Driver` of a supervisor that is armed."""
+
+    def __init__(self, supervisor: Supervisor, scenario: Scenario, roll: float) -> None:
+        self._supervisor, self._scenario = supervisor, scenario
+        self._columns = Columns(scenario.entry.slope)
+        self._limits = Limits.of(scenario)
+        self._moved, self._rolled = np.zeros(MOVES), roll
+        self._expected: Expectation | None = None
+
+    def expect(self, estimate: Estimate, command: Control) -> None:
+        """Take the estimated tip before a command, and where about it will be after it, for the check of readings."""
+        tip = Pose.of(estimate.tip)
+        axis = np.array(tip.axis) / tip.axis[0]
+        begin, end = tip.point, np.array(tip.point) + command.db_x * axis
+        limit = self._scenario.control.innovation_limit_mm + _SDS * estimate.tip_sd
+        x, y, z = map(float, end)
+        self._expected = Expectation(begin, (x, y, z), limit)
+
+    def apply(self, command: Control, duration: float) -> Motion:
+        """Roll, confirm that by its position, then travel within `duration` s.
+
+        A motion that the monitor ended is returned as far as it went. Raises CommandError if the command breaks a limit
+        of the scenario, RefusedError if it breaks one of the rig, DriverError after a fault, StoppedError after a stop.
+        """
+        self._limits.check(self._moved, np.array([command]), self._rolled)
+        roll = half_turned(self._rolled, command.roll) if self._limits.half_turns else command.roll
+        done = self._supervisor.step(roll, self._columns.travel(command), duration, self._expected)
+        row = self._columns.control(done.travelled, self._done_roll(done, command, roll))
+        self._moved += np.array(row[:MOVES])
+        self._rolled += row.roll + row.spin
+        return Motion(row, done.begun, done.ended, done.turned)
+
+    def _done_roll(self, done: Done, command: Control, roll: float) -> float:
+        """The part of the rotation that is the roll.
+
+        Half a turn was confirmed by its position, and counts as half a turn. Without a spin all rotation is the roll.
+        """
+        turned = done.travelled.get("rotation", 0.0)
+        if roll == 0.0:
+            return 0.0
+        if not self._limits.half_turns:
+            return turned if command.spin == 0.0 else roll
+        tolerance = self._tolerance
+        if abs(turned) > tolerance and abs(turned - roll) > tolerance:
+            raise DriverError(
+                f"the roll was interrupted at {math.degrees(turned):.1f}°: the bevel is not known"
+            )
+        return roll if abs(turned) > tolerance else 0.0
+
+    @property
+    def _tolerance(self) -> float:
+        return 2.0 * dict(self._supervisor.rig.axes.items())["rotation"].tolerance
+
+    def stop(self) -> None:
+        """Stop all axes, and return when they rest."""
+        self._supervisor.stop()
+
+
+@contextmanager
+def supervised(
+    rig: RigFile, scenario: Scenario, plan: Plan, *, dry: bool = False
+) -> Iterator[tuple[Rig, Ticks]]:
+    """Open a rig, arm it, roll the needle as the plan begins, and give its ports and the times of its ticks.
+
+    Positions of the axes at this moment are those at the start of the plan. dry: motors are read and never moved.
+    Raises RigError if the rig does not fit the scenario, DriverError or RunError if a device fails.
+    """
+    settings = scenario.tracker
+    if rig.registration is not None:
+        scenario = scenario.with_values({"tracker.registration": rig.registration.model_dump(mode="json")})
+    task = Task(
+        rig,
+        monotonic(),
+        scenario.setup.axes,
+        scenario.monitor,
+        to_stage(scenario.tracker.registration),
+        settings.tip_offset_mm,
+        scenario.control.stale_after_s,
+        dry,
+    )
+    ticks = Ticks()
+    with Supervisor(task, ticks.add) as supervisor:
+        supervisor.arm(_deepest(scenario))
+        if rig.axes.rotation is not None:
+            supervisor.move_to("rotation", plan.roll)
+        if scenario.monitor.enabled and scenario.monitor.references:
+            supervisor.wait(scenario.monitor.indicator_window_s)  # the field must be known before the start
+        driver = SupervisedDriver(supervisor, scenario, plan.roll)
+        yield Rig(supervisor, driver, supervisor, expect=driver.expect), ticks
+
+
+def _deepest(scenario: Scenario) -> float:
+    """Advance (mm) of the base at which a straight needle is as far past its target as it may be."""
+    past = 2.0
+    way = scenario.target.depth_mm + past - scenario.setup.start_tip_x
+    return way * math.sqrt(1.0 + abs(scenario.entry.slope) ** 2)
