@@ -163,11 +163,20 @@ STILL = Control()
 
 
 class Motion(NamedTuple):
-    """A control as a driver carried it out, from `begun` to `ended` (s, on the clock of the run)."""
+    """A control as a driver carried it out, from `begun` to `ended` (s, on the clock of the run).
+
+    The needle rolls first: `turned` is when the roll had ended and the travel began. None: there was no roll.
+    """
 
     control: Control
     begun: float
     ended: float
+    turned: float | None = None
+
+    @property
+    def travel_begun(self) -> float:
+        """When the travel began (s)."""
+        return self.begun if self.turned is None else self.turned
 
 
 Quaternion = tuple[float, float, float, float]

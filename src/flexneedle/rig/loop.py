@@ -24,6 +24,7 @@ from flexneedle.estimation.task import Task
 from flexneedle.planning.origin import check_origin, placed
 from flexneedle.rig.measuring import Observation, observe, observe_before_start
 from flexneedle.rig.monitor.monitor import Monitor
+from flexneedle.rig.pace import travel_time
 from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
 from flexneedle.rig.progress import Progress, hold_after
@@ -285,15 +286,15 @@ def _step(decision: Decision, no_path: str, reading: float) -> _Step:
 
 
 def _carry_out(scenario: Scenario, rig: Rig, command: Control, wait: float) -> Motion:
-    """Move, within the time at insertion speed, rounded up to whole tracker periods; or wait for `wait` (s)."""
+    """Move, the travel in the time of its slowest axis, rounded up to whole tracker periods; or wait for `wait` (s)."""
     if wait > 0.0:
         begun = rig.clock.now()
         rig.clock.wait(wait)
         return Motion(command, begun, rig.clock.now())
     reading = scenario.tracker.period
-    readings = math.ceil(abs(command.db_x) / scenario.setup.insertion_speed_mm_s / reading - 1e-6)
+    readings = math.ceil(travel_time(scenario.setup, command) / reading - 1e-6)
     motion = rig.driver.apply(command, max(1, readings) * reading)
-    return instance("result of driver.apply", motion, Motion, "Motion(control, begun, ended)")
+    return instance("result of driver.apply", motion, Motion, "Motion(control, begun, ended, turned)")
 
 
 def _pair(miss: float | complex) -> Lateral:

@@ -1,14 +1,18 @@
 """A virtual phantom with the ports of a rig: a `Driver` and a `Clock`, and the true state for the record."""
 
+import cmath
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from flexneedle.rig.pace import roll_time
 from flexneedle.rig.phantom.draw import Truth
 from flexneedle.rig.phantom.plants import PlantFactory, plant
 from flexneedle.simulator.control import MOVES, Limits, half_turned
 from flexneedle.types import (
+    COLUMNS,
     DB_X,
     DB_Y,
     DB_Z,
@@ -29,6 +33,7 @@ from flexneedle.types import (
 )
 
 _LENGTHS = [DB_X, DB_Y, DB_Z, DG_Y, DG_Z]
+_ARC = 8  # parts of the tip's path in a roll
 _WHOLE = 1e-8  # of a motor step: tolerance for a position on a whole step
 
 
@@ -76,9 +81,9 @@ class Phantom:
         self._path.append((self._time, *self._tip().tolist()))
 
     def apply(self, command: Control, duration: float) -> Motion:
-        """Execute `command` at constant velocity within `duration` s, in steps of at most `phantom.step_mm`.
+        """Roll, then travel at constant velocity within `duration` s, in steps of at most `phantom.step_mm`.
 
-        Motors move to the multiple of their resolution nearest to the sum of all commands, so that rounding errors do
+        The roll takes its own time before that. Motors move to the multiple of their resolution nearest to the sum of all commands, so that rounding errors do
         not accumulate. A driver of half turns turns to and fro. Raises CommandError if the command exceeds a limit of
         the setup.
         """
@@ -86,17 +91,16 @@ class Phantom:
         row = self._rounded(command)
         if self._limits.half_turns:
             row[ROLL] = half_turned(self._rolled, row[ROLL])
+        begun, turned = self._time, self._roll(float(row[ROLL]))
         parts = max(1, math.ceil(abs(row[DB_X]) / self._truth.scenario.phantom.step_mm - 1e-9))
         for k in range(parts):
             part = row / parts
-            part[ROLL] = row[ROLL] if k == 0 else 0.0
-            self._plant.step(part)
-            self._least_stretch = min(self._least_stretch, self._plant.least_stretch)
-            self._path.append((self._time + duration * (k + 1) / parts, *self._tip().tolist()))
+            part[ROLL] = 0.0
+            self._step(part, turned + duration * (k + 1) / parts)
         self._moved += row[:MOVES]
         self._rolled += float(row[ROLL] + row[SPIN])
-        begun, self._time = self._time, self._time + duration
-        return Motion(Control.of(row.tolist()), begun, self._time)
+        self._time = turned + duration
+        return Motion(Control.of(row.tolist()), begun, self._time, turned if row[ROLL] else None)
 
     def stop(self) -> None:
         """Do nothing: between commands the needle is at rest."""
@@ -112,6 +116,28 @@ class Phantom:
                 part = min(1.0, (time - t0) / (t1 - t0)) if t1 > t0 else 1.0
                 return Pose(*(p + part * (q - p) for p, q in zip(before, after, strict=True)))
         return Pose(*self._path[0][1:])
+
+    def _roll(self, roll: float) -> float:
+        """Roll with the base at rest; return the time (s) of the end. Between its ends the tip moves on an arc."""
+        if roll == 0.0:
+            return self._time
+        setup, begun = self._truth.scenario.setup, self._time
+        ended = begun + roll_time(setup, roll)
+        row = np.zeros(len(COLUMNS))
+        row[ROLL] = roll
+        self._step(row, ended)
+        after, before = self._path.pop()[1:], self._path[-1][1:]
+        for k in range(1, _ARC + 1):
+            part = k / _ARC
+            share = of_arc(roll, part) if setup.axes == 2 else of_arc(roll, part).real
+            self._path.append((begun + part * (ended - begun), *_between(before, after, part, share)))
+        return ended
+
+    def _step(self, row: Floats, time: float) -> None:
+        """Step the plant, which ends at `time` (s)."""
+        self._plant.step(row)
+        self._least_stretch = min(self._least_stretch, self._plant.least_stretch)
+        self._path.append((time, *self._tip().tolist()))
 
     def _rounded(self, command: Control) -> Floats:
         """The command in whole motor steps, within the limits; the rotation of the base is not rounded."""
@@ -139,6 +165,22 @@ class Phantom:
         x, y, z = across(float(pose[THETA]), float(pose[PSI]), self._plant.roll + truth.run_out_angle)
         off = truth.run_out
         return np.array([pose[X] + off * x, pose[Y] + off * y, pose[Z] + off * z, *pose[THETA:]])
+
+
+def _between(before: Sequence[float], after: Sequence[float], part: float, share: complex) -> list[float]:
+    """The pose with a part of the way along x done, and a share of that across it."""
+    x = before[X] + part * (after[X] - before[X])
+    lateral = (
+        complex(*before[k : k + 2]) + share * (complex(*after[k : k + 2]) - complex(*before[k : k + 2]))
+        for k in (Y, THETA)
+    )
+    return [x, *(value for one in lateral for value in (one.real, one.imag))]
+
+
+def of_arc(roll: float, part: float) -> complex:
+    """Share of the chord, as a lateral quantity, that a point on an arc by `roll` (rad) has done at a part of it."""
+    whole = cmath.exp(1j * roll) - 1.0
+    return (cmath.exp(1j * roll * part) - 1.0) / whole if abs(whole) > _WHOLE else complex(part)
 
 
 def evenly_spaced(nodes: Floats, count: int) -> Floats:

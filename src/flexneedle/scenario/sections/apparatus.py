@@ -56,6 +56,15 @@ class Setup(Section):
     """Largest rotation of the base in a control step."""
     insertion_speed_mm_s: Positive = 5.0
     """Insertion speed; a step of 1 mm at 5 mm/s lasts 200 ms."""
+    guide_speed_mm_s: Positive | None = None
+    """Lateral speed of the guide on an axis. Not set: its largest step takes as long as the largest advance."""
+    base_speed_mm_s: Positive | None = None
+    """Lateral speed of the base on an axis. Not set: its largest step takes as long as the largest advance."""
+    base_turn_speed_mrad_s: Positive | None = None
+    """Speed of the base's rotation about an axis. Not set: its largest step takes as long as the largest advance."""
+    rotation_speed_deg_s: Positive = 360.0
+    """Speed at which the needle rolls and spins; a half turn at 360°/s lasts 0.5 s. The needle does not advance while it
+    rolls."""
 
     @property
     def half_turns(self) -> bool:
@@ -113,6 +122,31 @@ class Setup(Section):
     def max_base_turn_step(self) -> float:
         """Largest rotation of the base in a control step, rad."""
         return 1e-3 * self.max_base_turn_step_mrad
+
+    @property
+    def step_time(self) -> float:
+        """Time of the largest advance, s."""
+        return self.max_advance_mm / self.insertion_speed_mm_s
+
+    @property
+    def guide_speed(self) -> float:
+        """Lateral speed of the guide on an axis, mm/s."""
+        return self.guide_speed_mm_s or self.max_guide_step_mm / self.step_time
+
+    @property
+    def base_speed(self) -> float:
+        """Lateral speed of the base on an axis, mm/s."""
+        return self.base_speed_mm_s or self.max_base_step_mm / self.step_time
+
+    @property
+    def base_turn_speed(self) -> float:
+        """Speed of the base's rotation about an axis, rad/s."""
+        return 1e-3 * (self.base_turn_speed_mrad_s or self.max_base_turn_step_mrad / self.step_time)
+
+    @property
+    def rotation_speed(self) -> float:
+        """Speed at which the needle rolls and spins, rad/s."""
+        return radians(self.rotation_speed_deg_s)
 
 
 class Entry(Section):
