@@ -1,0 +1,194 @@
+"""Whether a rig can do what a scenario needs, before anything is connected. Pure functions.
+
+An insertion starts where base and guide are when it begins, so that their soft limits must be as far apart as the
+travel that the scenario allows; the angle of the rotation is that of the needle, 0 or 180° at the start.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from flexneedle.control.guide import guide_axes
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.problems import Problem, to_line
+from flexneedle.scenario.rig import Axis, RigFile
+
+_ROUNDING = 1e-9
+_STILL = "steering"  # the strategy that moves neither guide nor base laterally
+
+
+@dataclass(frozen=True)
+class Need:
+    """What a scenario needs of a linear axis.
+
+    key: of the scenario's largest travel, to one side (back = 0) or to both; travel, back, ahead: from the start (mm);
+    step_key, step: largest travel in a control step (mm); why: the axis is needed.
+    """
+
+    axis: str
+    key: str
+    travel: float
+    step_key: str
+    step: float
+    why: str
+    both: bool = True
+
+    @property
+    def back(self) -> float:
+        """Travel to the negative side, mm."""
+        return self.travel if self.both else 0.0
+
+    @property
+    def width(self) -> float:
+        """Smallest distance between the soft limits, mm."""
+        return self.travel + self.back
+
+
+def needs(scenario: Scenario, strategy: str) -> tuple[Need, ...]:
+    """Return what a scenario needs of each linear axis, with the strategy of its plan."""
+    return (_insertion(scenario), *_guide(scenario, strategy), *_base(scenario, strategy))
+
+
+def fit_problems(rig: RigFile, scenario: Scenario, strategy: str = "manipulation") -> list[str]:
+    """Return one line for each thing that the scenario needs and the rig cannot; empty if the rig can all."""
+    found = [
+        *(problem for need in needs(scenario, strategy) for problem in _linear(rig, scenario, need)),
+        *_turning_base(scenario, strategy),
+        *_rotation(rig, scenario),
+        *_rate(rig, scenario),
+    ]
+    return [to_line(problem) for problem in found]
+
+
+def room_problems(
+    rig: RigFile, scenario: Scenario, positions: Mapping[str, float], strategy: str = "manipulation"
+) -> list[tuple[str, str]]:
+    """Return axis and line for each axis from whose position (mm) the scenario's travel would pass a soft limit."""
+    axes = dict(rig.axes.items())
+    return [
+        (need.axis, line)
+        for need in needs(scenario, strategy)
+        if need.axis in positions and need.axis in axes
+        for line in _room(axes[need.axis], need, positions[need.axis])
+    ]
+
+
+def queued(rig: RigFile) -> list[tuple[str, str]]:
+    """Return for each axis its name and what it still moves after the computer has stopped, at its largest speed."""
+    time = rig.loop.queue
+    return [(name, _queued(axis, time)) for name, axis in rig.axes.items()]
+
+
+def _queued(axis: Axis, time: float) -> str:
+    speed, distance = axis.shown(axis.speed), axis.shown(axis.speed * time)
+    return f"{distance} {axis.unit} ({speed} {axis.unit}/s × {1e3 * time:g} ms)"
+
+
+def _insertion(scenario: Scenario) -> Need:
+    setup = scenario.setup
+    return Need(
+        "insertion",
+        "setup.stroke_mm",
+        setup.stroke_mm,
+        "setup.max_advance_mm",
+        setup.max_advance_mm,
+        "the base advances",
+        both=False,
+    )
+
+
+def _guide(scenario: Scenario, strategy: str) -> Iterator[Need]:
+    setup, moved = scenario.setup, guide_axes(scenario.setup, strategy)
+    why = f"the guide moves on {moved} axes" if moved > 1 else "the guide moves"
+    for name in ("guide_y", "guide_z")[:moved]:
+        keys = "setup.max_guide_travel_mm", "setup.max_guide_step_mm"
+        yield Need(name, keys[0], setup.max_guide_travel_mm, keys[1], setup.max_guide_step_mm, why)
+
+
+def _base(scenario: Scenario, strategy: str) -> Iterator[Need]:
+    setup, sigma = scenario.setup, scenario.plan.base_sigma_mm
+    if sigma == 0.0 or strategy == _STILL:
+        return
+    why = f"the base moves laterally with plan.base_sigma_mm = {sigma:g}"
+    for name in ("base_y", "base_z")[: setup.axes]:
+        keys = "setup.max_base_travel_mm", "setup.max_base_step_mm"
+        yield Need(name, keys[0], setup.max_base_travel_mm, keys[1], setup.max_base_step_mm, why)
+
+
+def _linear(rig: RigFile, scenario: Scenario, need: Need) -> Iterator[Problem]:
+    axis = dict(rig.axes.items()).get(need.axis)
+    if axis is None:
+        yield Problem(f"axes.{need.axis}", None, f"missing: {need.why}")
+        return
+    yield from _too_far(axis, need)
+    yield from _too_fast(axis, scenario, need)
+
+
+def _too_far(axis: Axis, need: Need) -> Iterator[Problem]:
+    low, high = axis.limits
+    width = high - low
+    if need.width > width + _ROUNDING:
+        most, part = (width / 2, "half the width") if need.both else (width, "the width")
+        rule = f"must be at most {most:g}, {part} of axes.{need.axis}.range_mm ({low:g} to {high:g})"
+        yield Problem(need.key, need.travel, rule)
+
+
+def _too_fast(axis: Axis, scenario: Scenario, need: Need) -> Iterator[Problem]:
+    speed = scenario.setup.insertion_speed_mm_s
+    if need.axis == "insertion":
+        if speed > axis.speed + _ROUNDING:
+            rule = f"must be at most {axis.speed:g}, axes.insertion.speed_mm_s"
+            yield Problem("setup.insertion_speed_mm_s", speed, rule)
+        return
+    time = scenario.setup.max_advance_mm / speed
+    if need.step > axis.speed * time + _ROUNDING:
+        advance = "setup.max_advance_mm at setup.insertion_speed_mm_s"
+        rule = f"must be at most {axis.speed * time:g}: axes.{need.axis}.speed_mm_s is {axis.speed:g}, and a step lasts"
+        yield Problem(need.step_key, need.step, f"{rule} {time:g} s ({advance})")
+
+
+def _room(axis: Axis, need: Need, position: float) -> Iterator[str]:
+    low, high = axis.limits
+    for end, travel, room in (("low", need.back, position - low), ("high", need.travel, high - position)):
+        left = max(room, 0.0)
+        if travel > left + _ROUNDING:
+            limit = f"{left:.6g} mm to the {end} end of range_mm ({low if end == 'low' else high:g})"
+            yield f"at {position:.6g} mm, {limit}: {need.key} = {need.travel:g} needs more"
+
+
+def _turning_base(scenario: Scenario, strategy: str) -> Iterator[Problem]:
+    turn = scenario.plan.base_turn_sigma_mrad
+    if turn > 0.0 and strategy != _STILL:
+        yield Problem("plan.base_turn_sigma_mrad", turn, "must be 0: no axis of a rig rotates the base")
+
+
+def _rotation(rig: RigFile, scenario: Scenario) -> Iterator[Problem]:
+    setup, axis = scenario.setup, rig.axes.rotation
+    if axis is None:
+        yield Problem("axes.rotation", None, f"missing: the needle is rolled ({setup.turns})")
+        return
+    low, high = axis.range_deg
+    shown = f"axes.rotation.range_deg is {low:g} to {high:g}"
+    if setup.half_turns:
+        if low > 0.0 or high < 180.0:
+            rule = f"must include 0 to 180: the needle rolls by half turns ({setup.half_turns_by})"
+            yield Problem("axes.rotation.range_deg", [low, high], rule)
+        return
+    most, free = min(-low, high), setup.max_rotation_deg
+    if most <= 0.0:
+        yield Problem(
+            "axes.rotation.range_deg", [low, high], "must include 0, the needle's angle at the start"
+        )
+    elif free is None:
+        yield Problem("setup.max_rotation_deg", None, f"not set: must be at most {most:g}, {shown}")
+    elif free > most + _ROUNDING:
+        yield Problem("setup.max_rotation_deg", free, f"must be at most {most:g}, {shown}")
+
+
+def _rate(rig: RigFile, scenario: Scenario) -> Iterator[Problem]:
+    tracker, loop = scenario.tracker.rate_hz, rig.loop.rate_hz
+    if loop < tracker and not math.isclose(loop, tracker):
+        rule = (
+            f"must be at least {tracker:g}, tracker.rate_hz of the scenario: readings would wait for a tick"
+        )
+        yield Problem("loop.rate_hz", loop, rule)

@@ -1,0 +1,179 @@
+"""A rig that cannot do what a scenario needs is reported before anything is connected."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bench_rig import VALUES, rig
+from flexneedle.rig.fit import fit_problems, queued, room_problems
+from flexneedle.scenario.files import load_scenario
+
+PLANE, SPACE = load_scenario("phantom"), load_scenario("phantom3d")
+GUIDE_Z = {**VALUES["axes"]["guide_y"], "channel": "D"}
+
+
+def in_space(**changes):
+    """A rig for needles in space that roll to any angle."""
+    return rig(axes__guide_z=GUIDE_Z, axes__rotation__range_deg=[-200, 200], **changes)
+
+
+def scenario(base=PLANE, **changes):
+    return base.with_values({key.replace("__", "."): value for key, value in changes.items()})
+
+
+def test_the_rig_of_the_paper_does_what_the_paper_needs():
+    assert fit_problems(rig(), PLANE) == []
+
+
+def test_a_rig_in_space_does_what_a_driver_of_any_angle_needs():
+    assert fit_problems(in_space(), scenario(SPACE, setup__max_rotation_deg=200.0)) == []
+    assert fit_problems(in_space(), scenario(SPACE, setup__rotation="half-turns")) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"axes__guide_y": None}, "axes.guide_y: missing: the guide moves"),
+        ({"axes__rotation": None}, "axes.rotation: missing: the needle is rolled (bevel flips)"),
+        (
+            {"axes__insertion__range_mm": [0, 109]},
+            "setup.stroke_mm = 110.0: must be at most 109, the width of axes.insertion.range_mm (0 to 109)",
+        ),
+        (
+            {"axes__insertion__speed_mm_s": 4},
+            "setup.insertion_speed_mm_s = 5.0: must be at most 4, axes.insertion.speed_mm_s",
+        ),
+        (
+            {"axes__guide_y__range_mm": [-10, 19]},
+            "setup.max_guide_travel_mm = 15.0: must be at most 14.5, half the width of axes.guide_y.range_mm "
+            "(-10 to 19)",
+        ),
+        (
+            {"axes__guide_y__speed_mm_s": 2},
+            "setup.max_guide_step_mm = 0.5: must be at most 0.4: axes.guide_y.speed_mm_s is 2, and a step lasts 0.2 s "
+            "(setup.max_advance_mm at setup.insertion_speed_mm_s)",
+        ),
+        (
+            {"axes__rotation__range_deg": [-170, 179.9]},
+            "axes.rotation.range_deg = [-170.0, 179.9]: must include 0 to 180: the needle rolls by half turns "
+            "(setup.axes = 1)",
+        ),
+        (
+            {"axes__rotation__range_deg": [1, 181], "axes__rotation__home_deg": 1},
+            "axes.rotation.range_deg = [1.0, 181.0]: must include 0 to 180: the needle rolls by half turns "
+            "(setup.axes = 1)",
+        ),
+        (
+            {"loop__rate_hz": 20},
+            "loop.rate_hz = 20.0: must be at least 40, tracker.rate_hz of the scenario: readings would wait for a tick",
+        ),
+    ],
+    ids=str,
+)
+def test_what_the_rig_lacks_is_a_line(changes, line):
+    assert fit_problems(rig(**changes), PLANE) == [line]
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"setup__axes": 2}, "axes.guide_z: missing: the guide moves on 2 axes"),
+        (
+            {"plan__base_sigma_mm": 0.1},
+            "axes.base_y: missing: the base moves laterally with plan.base_sigma_mm = 0.1",
+        ),
+        (
+            {"plan__base_turn_sigma_mrad": 1.0},
+            "plan.base_turn_sigma_mrad = 1.0: must be 0: no axis of a rig rotates the base",
+        ),
+    ],
+    ids=str,
+)
+def test_what_the_scenario_moves_needs_an_axis(changes, line):
+    assert line in fit_problems(rig(axes__rotation__range_deg=[-200, 200]), scenario(**changes))
+
+
+def test_base_axes_are_checked_like_those_of_the_guide():
+    base = {**VALUES["axes"]["guide_y"], "channel": "E", "range_mm": [-5, 5], "speed_mm_s": 1}
+    lines = fit_problems(rig(axes__base_y=base), scenario(plan__base_sigma_mm=0.1))
+    assert [line.split(" = ")[0] for line in lines] == ["setup.max_base_travel_mm", "setup.max_base_step_mm"]
+    assert fit_problems(rig(axes__base_y={**base, "range_mm": [-15, 15], "speed_mm_s": 5}), PLANE) == []
+
+
+@pytest.mark.parametrize(
+    ("limit", "line"),
+    [
+        (
+            None,
+            "setup.max_rotation_deg: not set: must be at most 200, axes.rotation.range_deg is -200 to 200",
+        ),
+        (
+            201.0,
+            "setup.max_rotation_deg = 201.0: must be at most 200, axes.rotation.range_deg is -200 to 200",
+        ),
+    ],
+)
+def test_rolls_to_any_angle_stay_within_the_range_of_the_motor(limit, line):
+    assert fit_problems(in_space(), scenario(SPACE, setup__max_rotation_deg=limit)) == [line]
+
+
+def test_a_rotation_that_never_is_0_cannot_start():
+    found = rig(axes__guide_z=GUIDE_Z, axes__rotation__range_deg=[10, 200], axes__rotation__home_deg=10)
+    assert fit_problems(found, scenario(SPACE, setup__max_rotation_deg=90.0)) == [
+        "axes.rotation.range_deg = [10.0, 200.0]: must include 0, the needle's angle at the start"
+    ]
+
+
+def test_a_plan_that_steers_by_the_bevel_needs_neither_guide_nor_base():
+    moving = scenario(plan__base_sigma_mm=0.1, plan__base_turn_sigma_mrad=1.0)
+    assert fit_problems(rig(axes__guide_y=None), moving, "steering") == []
+
+
+def test_a_needle_without_a_guide_needs_none():
+    assert fit_problems(rig(axes__guide_y=None), scenario(setup__guide_to_skin_mm=None)) == []
+
+
+@pytest.mark.parametrize(
+    ("positions", "lines"),
+    [
+        ({"insertion": 0.0, "guide_y": 0.0, "rotation": 3.0}, []),
+        ({"insertion": 10.0}, []),
+        (
+            {"insertion": 10.01},
+            ["at 10.01 mm, 109.99 mm to the high end of range_mm (120): setup.stroke_mm = 110 needs more"],
+        ),
+        ({"insertion": -3.0}, []),
+        (
+            {"guide_y": -1.0},
+            ["at -1 mm, 14 mm to the low end of range_mm (-15): setup.max_guide_travel_mm = 15 needs more"],
+        ),
+        (
+            {"guide_y": 17.0},
+            ["at 17 mm, 0 mm to the high end of range_mm (15): setup.max_guide_travel_mm = 15 needs more"],
+        ),
+    ],
+    ids=str,
+)
+def test_an_axis_too_near_to_its_end_is_a_line(positions, lines):
+    assert [line for _, line in room_problems(rig(), PLANE, positions)] == lines
+
+
+def test_what_is_queued_is_the_largest_speed_times_the_queue():
+    assert dict(queued(rig(loop__queue_ms=50))) == {
+        "insertion": "0.5 mm (10 mm/s × 50 ms)",
+        "rotation": "18 deg (360 deg/s × 50 ms)",
+        "guide_y": "0.25 mm (5 mm/s × 50 ms)",
+    }
+
+
+@settings(deadline=None)
+@given(st.floats(1.0, 500.0), st.floats(29.0, 500.0))
+def test_the_stroke_fits_if_and_only_if_the_range_is_as_wide(width, stroke):
+    found = fit_problems(
+        rig(axes__insertion__range_mm=[0.0, width]), PLANE.model_copy(update=_stroke(stroke))
+    )
+    assert bool(found) == (stroke > width + 1e-9)
+
+
+def _stroke(stroke):
+    return {"setup": PLANE.setup.model_copy(update={"stroke_mm": stroke})}
