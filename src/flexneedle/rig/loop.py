@@ -173,6 +173,8 @@ def _periods(
         clocks, begun = [time.perf_counter()], rig.clock.now()
         step, decided = _next_step(progress, task, chosen, rng, begun, force=force)
         clocks.append(time.perf_counter())
+        if rig.expect is not None:
+            rig.expect(progress.observation.estimate, step.decision.command)
         motion = _carry_out(task.scenario, rig, step.decision.command, step.wait)
         clocks.append(time.perf_counter())
         observation = _observed(progress.observation, task.scenario, rig, motion, begun)
