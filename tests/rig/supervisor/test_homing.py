@@ -47,7 +47,7 @@ def test_without_a_switch_the_axis_has_no_home():
 def test_an_absolute_encoder_is_not_homed():
     bench = Bench(rig_file(guide_y={"home": "absolute"})).armed()
     bench.core.request(say.Home(1, "guide_y"))
-    assert bench.sent == [say.Refused(1, "guide_y: has an absolute encoder, and no home to search")]
+    assert bench.sent[0].why == "guide_y: has an absolute encoder, and no home to search"
 
 
 def test_a_stall_while_homing_is_a_fault():

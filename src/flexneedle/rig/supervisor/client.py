@@ -173,6 +173,7 @@ class Supervisor:
         self._wait(lambda: number in self._answers, inf, "")
         answer = self._answers.pop(number)
         if isinstance(answer, say.Refused):
+            self._check(answer.state, answer.cause)
             raise RefusedError(answer.why)
         self._check(answer.state, answer.why)
         return answer

@@ -104,7 +104,7 @@ class Supervisor:
         return True
 
     def _refuse(self, number: int, why: str) -> None:
-        self._send(say.Refused(number, why))
+        self._send(say.Refused(number, why, self.state, self.why))
 
     def _reset(self) -> None:
         if self._allowed(Event.RESET):

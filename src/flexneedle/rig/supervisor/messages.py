@@ -141,10 +141,15 @@ class Done:
 
 @dataclass(frozen=True)
 class Refused:
-    """A request that the state does not allow, or that breaks a limit; nothing moved. number: of the motion, or 0."""
+    """A request that the state does not allow, or that breaks a limit; nothing moved.
+
+    number: of the motion, or 0; state, cause: of the rig, and the reason of a stop or fault.
+    """
 
     number: int
     why: str
+    state: State
+    cause: str = ""
 
 
 @dataclass(frozen=True)
