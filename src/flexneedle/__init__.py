@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from flexneedle.estimation.task import Task
     from flexneedle.figures.record import plot
     from flexneedle.planning.planner import plan
-    from flexneedle.rig.loop import insert, run
+    from flexneedle.rig.insert import insert
+    from flexneedle.rig.loop import run
     from flexneedle.rig.phantom.draw import Truth
     from flexneedle.rig.phantom.plants import Plant
     from flexneedle.rig.ports import TipTracker
@@ -92,7 +93,8 @@ _HOMES = {
     "estimation.task": ("Task",),
     "figures.record": ("plot",),
     "planning.planner": ("plan",),
-    "rig.loop": ("insert", "run"),
+    "rig.insert": ("insert",),
+    "rig.loop": ("run",),
     "rig.phantom.draw": ("Truth",),
     "rig.phantom.plants": ("Plant",),
     "rig.ports": ("TipTracker",),

@@ -465,6 +465,8 @@ class Insertion:
     phantom: str = ""  # formulation of the virtual phantom, "" on a rig
     tracker: str = ""  # name, "" on a rig
     scenario: "Scenario | None" = None  # of the insertion
+    rig: str = ""  # name of the rig, "" on a virtual one
+    ticks: Mapping[str, float] = field(default_factory=dict, compare=False)  # of the rig: number, times (ms)
 
     @property
     def target(self) -> Point:

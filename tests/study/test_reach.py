@@ -62,7 +62,8 @@ def test_the_reach_is_computed_for_the_phantom_of_the_insertion(monkeypatch):
     monkeypatch.setattr("flexneedle.study.reach.draw", recorded)
     monkeypatch.setattr("flexneedle.rig.virtual.draw", recorded)
     monkeypatch.setattr(
-        "flexneedle.rig.loop.run", lambda _scenario, plan, *_, **__: Insertion(plan, 5, (), Outcome.DONE, "")
+        "flexneedle.rig.insert.run",
+        lambda _scenario, plan, *_, **__: Insertion(plan, 5, (), Outcome.DONE, ""),
     )
     scenario = world(15).with_values(COARSE)
     reach(scenario, 5)

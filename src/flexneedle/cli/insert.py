@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +22,13 @@ from flexneedle.console.common import (
     target_row,
     with_examples,
 )
-from flexneedle.errors import FlexneedleError, one_line
+from flexneedle.errors import FlexneedleError, InputError, one_line
 
 if TYPE_CHECKING:
     from flexneedle.console.progress import Progress
     from flexneedle.runs.recording import Choices
     from flexneedle.scenario.model import Scenario
+    from flexneedle.scenario.rig import RigFile
     from flexneedle.trace.folder import Folder
     from flexneedle.types import Insertion, Period
 
@@ -35,9 +37,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the command to the parser of `flexneedle`."""
     parser = subparsers.add_parser(
         "insert",
-        help="plan an insertion and execute it in closed loop on the virtual phantom",
+        help="plan an insertion and execute it in closed loop on the virtual phantom or on a rig",
         **with_examples(
             "flexneedle insert phantom --target 35 -5 --seed 3",
+            "flexneedle insert phantom --rig rig.toml --dry-run",
             "flexneedle insert world:100012 --controller ce-mpc --phantom model --json",
         ),
     )
@@ -76,6 +79,20 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="FILE",
         help="registration of the tracker to the stage, written by em register",
     )
+    parser.add_argument(
+        "--rig",
+        type=Path,
+        metavar="FILE",
+        help="rig file, on whose motors and tracker the plan is executed, from where the motors are (default: the "
+        "virtual phantom)",
+    )
+    parser.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="with --rig: read motors and tracker, go through all motions, and send none; the needle is the virtual "
+        "phantom's",
+    )
+    parser.add_argument("--yes", action="store_true", help="with --rig: insert without a confirmation")
     parser.add_argument("--list", action="store_true", help="list the controllers and exit")
     parser.add_argument(
         "--force",
@@ -97,6 +114,7 @@ def _insert(args: argparse.Namespace) -> int:
         scenario = _scenario(args, choices)
     with _refusal_printed(args, choices, scenario):
         check_choices(scenario, choices)
+        _confirm(args, scenario, choices)
         compile_first()
         folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
     with _refusal_printed(args, choices, scenario, folder):
@@ -164,7 +182,41 @@ def _choices(args: argparse.Namespace) -> Choices:
 
     chosen = {"controller": args.controller, "phantom": args.phantom, "tracker": args.tracker}
     named = {name: value for name, value in chosen.items() if value is not None}
-    return Choices(args.seed, args.strategy, args.plan_seed, force=args.force, **named)
+    rig = _rig(args, named)
+    made = Choices(args.seed, args.strategy, args.plan_seed, force=args.force, **named)
+    return replace(made, rig=rig, dry_run=args.dry_run)
+
+
+def _rig(args: argparse.Namespace, named: Mapping[str, str]) -> RigFile | None:
+    """The rig of --rig. Raises InputError for options that contradict each other."""
+    if args.rig is None:
+        if args.dry_run:
+            raise InputError("--dry-run: needs --rig FILE; without a rig every insertion is virtual")
+        return None
+    if virtual := [f"--{name}" for name in ("phantom", "tracker") if name in named]:
+        raise InputError(
+            f"{' and '.join(virtual)}: not with --rig, which has a needle and a tracker of its own"
+        )
+    from flexneedle.scenario.rig import load_rig
+
+    return load_rig(args.rig)
+
+
+def _confirm(args: argparse.Namespace, scenario: Scenario, choices: Choices) -> None:
+    """Ask before motors move. Raises InputError without a terminal, KeyboardInterrupt for any answer but yes."""
+    if choices.rig is None or choices.dry_run or args.yes:
+        return
+    depth, *lateral = scenario.target.position[: 1 + scenario.setup.axes]
+    to = f"{depth:g} mm deep, {', '.join(f'{value:g}' for value in lateral)} mm to the side"
+    if not sys.stdin.isatty():
+        raise InputError("--rig: motors will move: confirm on a terminal, or with --yes")
+    print(
+        f"{choices.rig.name}: the needle will be inserted from where it is, to a target {to}.",
+        file=sys.stderr,
+    )
+    print("Continue? [y/N] ", end="", file=sys.stderr, flush=True)
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise KeyboardInterrupt
 
 
 def _list() -> int:
@@ -223,7 +275,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
     result, timing = insertion_result(insertion), insertion_timing(insertion)
     rows = [
         ("controller", insertion.controller),
-        ("phantom", insertion.phantom),
+        ("rig", insertion.rig) if insertion.rig else ("phantom", insertion.phantom),
         target_row(scenario, insertion.target),
         *entry_rows(scenario, insertion.plan),
         ("true tip to target", _number(result["true_error_mm"], "mm")),
@@ -238,8 +290,20 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         *([("waited", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
         ("planning time", _number(timing["plan_seconds"], "s")),
         ("median period time", _number(timing["period_ms"]["p50"], "ms")),
+        *_ticks(insertion),
     ]
     print_table(insertion.summary[:1].upper() + insertion.summary[1:], rows, folder)
+
+
+def _ticks(insertion: Insertion) -> list[tuple[str, str]]:
+    """Rows of a rig: the times of its ticks."""
+    if not insertion.ticks:
+        return []
+    found = insertion.ticks
+    times = (
+        f"{found['late_p99_ms'] + found['work_p99_ms']:.2f} ms (99 %), longest {found['work_max_ms']:.2f} ms"
+    )
+    return [("ticks", f"{found['count']:.0f}, {times}, {found['missed']:.0f} missed")]
 
 
 def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, str]]:

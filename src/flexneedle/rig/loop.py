@@ -25,10 +25,9 @@ from flexneedle.planning.origin import check_origin, placed
 from flexneedle.rig.measuring import Observation, observe, observe_before_start
 from flexneedle.rig.monitor.monitor import Monitor
 from flexneedle.rig.pace import travel_time
-from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, controller_of, plant_of, tracker_of
-from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
+from flexneedle.rig.parts import controller_of
 from flexneedle.rig.progress import Progress, hold_after
-from flexneedle.rig.virtual import Rig, Seeds, virtual_rig
+from flexneedle.rig.virtual import Rig
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.simulator.simulator import Simulator
@@ -50,56 +49,6 @@ from flexneedle.types import (
 _MOST_MOVES = 4  # times the planned steps; then the insertion fails
 
 
-def insert(
-    scenario: str | Path | Scenario,
-    plan: Plan,
-    seed: int = 0,
-    *,
-    controller: str | Method = DEFAULT,
-    phantom: str | PlantFactory = DEFAULT_PLANT,
-    tracker: str | TrackerFactory = SCENARIO_TRACKER,
-    force: bool = False,
-    threads: int | None = None,
-    on_period: Callable[[Period], None] | None = None,
-) -> Insertion:
-    """Execute `plan` in closed loop in the virtual phantom drawn with `seed`; return the complete record.
-
-    scenario: a scenario, or its name or path as for `load_scenario`. It must be the plan's own, or differ from it only
-    in controller, tracker, monitor and phantom.
-    controller: one of `control.methods.METHODS`; phantom: "exact" or "model", the formulation of the plant; tracker:
-    "scenario", the one that the scenario describes. Each may also be an object of your own or its name `module:NAME`
-    (docs/extend.md).
-    threads: for rollouts (default: all cores), without effect on the result. on_period: called with each control
-    period when it ends.
-
-    The record is the same for the same seed, except for wall-clock durations.
-
-    Raises InputError for an unknown name, an unsuitable object, a plan of another scenario, or a controller that needs
-    the guide where it may not move; ScenarioError for a setting that the controllers reject; RunError if the plan
-    misses its target by more than 1 mm, unless `force` is set or the controller predicts the miss itself, as the
-    default one does.
-    """
-    scenario, plan, seed = load_scenario(scenario), _planned(plan), whole("seed", seed, 0)
-    phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
-    plant_name, plant = plant_of(phantom)
-    tracker_name, own_tracker = tracker_of(tracker)
-    seeds = Seeds(phantom_seed, tracker_seed, room_seed)
-    rig = virtual_rig(placed(scenario, plan), plan.roll, seeds, plant, tracker=own_tracker)
-    rng = np.random.default_rng(control_seed)
-    insertion = run(
-        scenario,
-        plan,
-        rig,
-        rng,
-        seed,
-        controller=controller,
-        force=force,
-        threads=threads,
-        on_period=on_period,
-    )
-    return replace(insertion, phantom=plant_name, tracker=tracker_name)
-
-
 def run(
     scenario: str | Path | Scenario,
     plan: Plan,
@@ -112,11 +61,14 @@ def run(
     threads: int | None = None,
     on_period: Callable[[Period], None] | None = None,
 ) -> Insertion:
-    """As `insert`, on any rig. rng: randomness of the controller; seed: only recorded.
+    """Execute `plan` in closed loop on any rig; return the complete record.
+
+    scenario, controller, force, threads, on_period: as for `insert`. rng: randomness of the controller; seed: only
+    recorded.
 
     The driver is stopped at the end, after an error and after an interrupt.
     """
-    scenario, plan, seed = load_scenario(scenario), _planned(plan), whole("seed", seed, 0)
+    scenario, plan, seed = load_scenario(scenario), planned(plan), whole("seed", seed, 0)
     rig = instance("rig", rig, Rig, "Rig(clock, driver, tracker), parts as in flexneedle.rig.ports")
     rng = instance("rng", rng, np.random.Generator, "such as numpy.random.default_rng(0)")
     scenario = placed(scenario, plan)
@@ -147,7 +99,7 @@ def run(
     return insertion
 
 
-def _planned(plan: object) -> Plan:
+def planned(plan: object) -> Plan:
     return instance("plan", plan, Plan, "make one with flexneedle.plan(scenario)")
 
 

@@ -9,8 +9,9 @@ from time import monotonic
 
 import numpy as np
 
-from flexneedle.errors import DriverError
+from flexneedle.errors import DriverError, RigError
 from flexneedle.estimation.estimate import Estimate
+from flexneedle.rig.fit import fit_problems
 from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.rig.supervisor.messages import Done, Expectation, Report, Task
 from flexneedle.rig.virtual import Rig, to_stage
@@ -152,6 +153,12 @@ class SupervisedDriver:
     def stop(self) -> None:
         """Stop all axes, and return when they rest."""
         self._supervisor.stop()
+
+
+def check_fit(rig: RigFile, scenario: Scenario, strategy: str) -> None:
+    """Raise RigError, one line for each problem, if the rig cannot do what the scenario needs with such a plan."""
+    if problems := fit_problems(rig, scenario, strategy):
+        raise RigError(*problems)
 
 
 @contextmanager

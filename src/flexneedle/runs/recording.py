@@ -12,9 +12,11 @@ from flexneedle.errors import FlexneedleError, one_line
 from flexneedle.planning.origin import placed
 from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT
+from flexneedle.rig.supervised import check_fit
 from flexneedle.runs.figures import draw_run
 from flexneedle.runs.saving import finish_insertion, finish_plans, keep_plan, note_result, open_trace
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.rig import RigFile
 from flexneedle.trace.folder import Folder
 from flexneedle.types import Insertion, Outcome, Period, Plan
 
@@ -27,7 +29,7 @@ OnPeriod = Callable[[Period], None]
 @dataclass(frozen=True)
 class Choices:
     """Options of planning and insertion. plan_seed: seed of the planner, None for `seed`; force: insert even if the
-    plan misses the target.
+    plan misses the target; rig: a rig file, or None for the virtual phantom; dry_run: its motors do not move.
 
     controller, phantom, tracker: a name, or module:NAME. Raises InputError with the valid choices for an unknown name.
     """
@@ -39,14 +41,18 @@ class Choices:
     phantom: str = DEFAULT_PLANT
     tracker: str = SCENARIO_TRACKER
     force: bool = False
+    rig: RigFile | None = None
+    dry_run: bool = False
 
     def __post_init__(self) -> None:
         controller_of(self.controller), plant_of(self.phantom), tracker_of(self.tracker)
 
     @property
     def parts(self) -> dict[str, str]:
-        """Names of controller, phantom and tracker."""
-        return {"controller": self.controller, "phantom": self.phantom, "tracker": self.tracker}
+        """Names of controller, phantom, tracker and rig; on a rig phantom and tracker have none."""
+        if self.rig is not None:
+            return {"controller": self.controller, "phantom": "", "tracker": "", "rig": self.rig.name}
+        return {"controller": self.controller, "phantom": self.phantom, "tracker": self.tracker, "rig": ""}
 
 
 def record_plans(
@@ -64,8 +70,10 @@ def record_plans(
 
 
 def check_choices(scenario: Scenario, choices: Choices) -> None:
-    """Raise InputError for a controller that needs the guide if the guide may not move."""
+    """Raise InputError for a controller that needs a guide which may not move, RigError for a rig that does not fit."""
     check_guide(controller_of(choices.controller)[1], scenario.setup, choices.strategy)
+    if choices.rig is not None:
+        check_fit(choices.rig, scenario, choices.strategy)
 
 
 def record_insertion(
@@ -105,13 +113,14 @@ def _plan(folder: Folder, scenario: Scenario, strategy: str, seed: int, on_itera
 def _insert(
     folder: Folder, scenario: Scenario, plan: Plan, choices: Choices, on_period: OnPeriod
 ) -> Insertion:
-    from flexneedle.rig.loop import insert
+    from flexneedle.rig.insert import insert
 
     periods: list[Period] = []
 
     def ended(outcome: Outcome, reason: str) -> Insertion:
-        parts = choices.controller, choices.phantom, choices.tracker
-        return Insertion(plan, choices.seed, tuple(periods), outcome, reason, *parts, scenario)
+        controller, phantom, tracker, rig = choices.parts.values()
+        parts = controller, phantom, tracker, scenario, rig
+        return Insertion(plan, choices.seed, tuple(periods), outcome, reason, *parts)
 
     with open_trace(folder, scenario, plan, choices.seed, choices.parts) as trace:
 
@@ -120,7 +129,14 @@ def _insert(
             periods.append(period)
             on_period(period)
 
-        options: dict[str, Any] = {**choices.parts, "force": choices.force}
+        options: dict[str, Any] = {
+            "controller": choices.controller,
+            "phantom": choices.phantom,
+            "tracker": choices.tracker,
+            "force": choices.force,
+            "rig": choices.rig,
+            "dry_run": choices.dry_run,
+        }
         try:
             return insert(scenario, plan, choices.seed, on_period=keep, **options)
         except KeyboardInterrupt:

@@ -26,7 +26,7 @@ def save(record: Plan | Insertion, folder: str | Path) -> Path:
         finish_plans(claimed)
     else:
         claimed = Folder.claim(out, "", "insertion", scenario, record.seed)
-        parts = {name: getattr(record, name) for name in ("controller", "phantom", "tracker")}
+        parts = {name: getattr(record, name) for name in ("controller", "phantom", "tracker", "rig")}
         claimed.values |= parts
         keep_plan(claimed, record.plan)
         with open_trace(claimed, scenario, record.plan, record.seed, parts) as trace:
@@ -53,7 +53,7 @@ def finish_plans(folder: Folder) -> None:
 def open_trace(
     folder: Folder, scenario: Scenario, plan: Plan, seed: int, parts: Mapping[str, str]
 ) -> TraceWriter:
-    """Return the writer of `trace.mcap`; parts: names of controller, phantom and tracker."""
+    """Return the writer of `trace.mcap`; parts: names of controller, phantom, tracker and rig."""
     about = {"seed": str(seed), "scenario": scenario.name, "strategy": plan.strategy, **parts, **versions()}
     return TraceWriter(folder.path / TRACE_FILE, plan, about=about, scenario=scenario.values())
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from flexneedle.errors import RunError, ScenarioWarning
 from flexneedle.planning.planner import plan
+from flexneedle.rig.insert import insert
 from flexneedle.rig.kernels import compile_kernels
-from flexneedle.rig.loop import insert
 from flexneedle.study.grid import GridPoint
 from flexneedle.study.reach import reach
 from flexneedle.trace.folder import versions

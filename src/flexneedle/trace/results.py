@@ -12,7 +12,16 @@ from flexneedle.trace.plain import plain
 from flexneedle.types import Insertion, Outcome, Period, Plan, X
 
 RESULT_KEYS = (
-    *("controller", "phantom", "target_mm", "tip_true_mm", "tip_measured_mm", "true_error_mm", "residual_mm"),
+    *(
+        "controller",
+        "phantom",
+        "rig",
+        "target_mm",
+        "tip_true_mm",
+        "tip_measured_mm",
+        "true_error_mm",
+        "residual_mm",
+    ),
     *("planned_error_mm", "reached", "outcome", "reason", "warning", "flips", "planned_flips"),
     *("strain_energy_mj", "planned_strain_energy_mj", "steps", "held_s", "converged", "seed"),
 )
@@ -212,6 +221,7 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
     values = row | {
         "controller": insertion.controller,
         "phantom": insertion.phantom or None,
+        "rig": insertion.rig or None,
         "target_mm": insertion.target,
         "tip_true_mm": None if tip[0] is None else tip,
         "tip_measured_mm": _measured_tip(insertion),
@@ -253,6 +263,7 @@ def insertion_timing(insertion: Insertion) -> dict[str, Any]:
     return {
         **plan_timing(insertion.plan),
         "period_ms": dict(zip(_OF_PERIODS, milliseconds, strict=True)),
+        **({"ticks": dict(insertion.ticks)} if insertion.ticks else {}),
     }
 
 

@@ -15,7 +15,9 @@ from flexneedle.errors import DriverError, RefusedError, StoppedError
 from flexneedle.rig.devices.clock import WallClock
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.machine import State
+from flexneedle.rig.tracking.registration import identity
 from flexneedle.scenario.rig import Axis, RigFile
+from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import Measurement
 
 _HEARTBEAT_S = 0.1
@@ -55,6 +57,12 @@ class Supervisor:
         except BaseException:  # also on Ctrl-C: the devices must be released
             self.close()
             raise
+
+    @classmethod
+    def of_operator(cls, rig: RigFile) -> Self:
+        """The supervisor of a rig without its tracker, for motions of single axes."""
+        monitor = MonitorSettings(enabled=False)
+        return cls(say.Task(rig, monotonic(), 2, monitor, identity(), 0.0, inf, tracked=False))
 
     def __enter__(self) -> Self:
         return self

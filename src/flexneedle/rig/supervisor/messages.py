@@ -20,7 +20,7 @@ class Task:
 
     started: zero of the run's clock on the monotonic clock (s); lateral_axes: of the needle; to_stage: map from the
     tracker's frame to that of the insertion; tip_offset: from the sensor to the tip (mm); stale_after: age (s) above
-    which a reading is stale; dry: motors are read, and never moved.
+    which a reading is stale; dry: motors are read, and never moved; tracked: whether the tracker is opened.
     """
 
     rig: RigFile
@@ -31,6 +31,7 @@ class Task:
     tip_offset: float
     stale_after: float
     dry: bool = False
+    tracked: bool = True
 
 
 @dataclass(frozen=True)

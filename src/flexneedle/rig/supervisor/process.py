@@ -24,6 +24,7 @@ from flexneedle.rig.devices.registry import open_motors, open_tracker
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.core import Supervisor
 from flexneedle.rig.supervisor.dry import DryMotors
+from flexneedle.types import Frame
 
 _MOST_WAITING = 400  # reports that a client has not taken: 10 s
 _REST_S = 2.0  # longest wait for motors to rest before the end
@@ -56,6 +57,19 @@ class Outbox:
                 return
 
 
+class Untracked:
+    """No tracker, for motions of the operator."""
+
+    status = "not opened"
+
+    def read(self) -> tuple[Frame, ...]:
+        """No frames."""
+        return ()
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
 def main(descriptor: int) -> None:
     """Serve the client until it closes or ends."""
     connection = Connection(descriptor)
@@ -75,7 +89,8 @@ def _serve(connection: Connection, task: say.Task, outbox: Outbox) -> str:
     """Open the devices, tick until the end, and return its reason."""
     signals = _signals()
     clock = WallClock(start=task.started)
-    with closing(open_motors(task.rig)) as connected, closing(open_tracker(task.rig, clock)) as tracker:
+    tracked = open_tracker(task.rig, clock) if task.tracked else Untracked()
+    with closing(tracked) as tracker, closing(open_motors(task.rig)) as connected:
         motors = DryMotors(connected, clock) if task.dry else connected
         core = Supervisor(task, motors, tracker, clock, outbox.put)
         set_realtime_priority()

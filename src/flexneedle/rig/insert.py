@@ -1,0 +1,91 @@
+"""Insertions on the virtual phantom, or on the rig of a rig file."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from flexneedle.arguments import whole
+from flexneedle.control.interface import Method
+from flexneedle.control.methods import DEFAULT
+from flexneedle.errors import InputError
+from flexneedle.planning.origin import placed
+from flexneedle.rig.dry_run import in_memory
+from flexneedle.rig.loop import planned, run
+from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, plant_of, tracker_of
+from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
+from flexneedle.rig.supervised import check_fit, supervised
+from flexneedle.rig.virtual import Rig, Seeds, virtual_rig
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.rig import RigFile, load_rig
+from flexneedle.types import Insertion, Period, Plan
+
+
+def insert(
+    scenario: str | Path | Scenario,
+    plan: Plan,
+    seed: int = 0,
+    *,
+    controller: str | Method = DEFAULT,
+    phantom: str | PlantFactory = DEFAULT_PLANT,
+    tracker: str | TrackerFactory = SCENARIO_TRACKER,
+    force: bool = False,
+    threads: int | None = None,
+    on_period: Callable[[Period], None] | None = None,
+    rig: str | Path | RigFile | None = None,
+    dry_run: bool = False,
+) -> Insertion:
+    """Execute `plan` in closed loop in the virtual phantom drawn with `seed`; return the complete record.
+
+    rig: a rig file, on whose motors and tracker the plan is executed in place of the virtual phantom, from where the
+    motors are. dry_run: its motors and tracker are read; motors never move, and the needle is the virtual phantom's.
+
+    scenario: a scenario, or its name or path as for `load_scenario`. It must be the plan's own, or differ from it only
+    in controller, tracker, monitor and phantom.
+    controller: one of `control.methods.METHODS`; phantom: "exact" or "model", the formulation of the plant; tracker:
+    "scenario", the one that the scenario describes. Each may also be an object of your own or its name `module:NAME`
+    (docs/extend.md).
+    threads: for rollouts (default: all cores), without effect on the result. on_period: called with each control
+    period when it ends.
+
+    The record is the same for the same seed, except for wall-clock durations.
+
+    Raises InputError for an unknown name, an unsuitable object, a plan of another scenario, or a controller that needs
+    the guide where it may not move; RigError for a rig that breaks a rule or does not fit the scenario; DriverError if
+    one of its devices cannot be opened; ScenarioError for a setting that the controllers reject; RunError if the plan
+    misses its target by more than 1 mm, unless `force` is set or the controller predicts the miss itself, as the
+    default one does.
+    """
+    scenario, plan, seed = load_scenario(scenario), planned(plan), whole("seed", seed, 0)
+    phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
+    plant_name, plant = plant_of(phantom)
+    tracker_name, own_tracker = tracker_of(tracker)
+    seeds = Seeds(phantom_seed, tracker_seed, room_seed)
+    scenario = placed(scenario, plan)
+    virtual = virtual_rig(scenario, plan.roll, seeds, plant, tracker=own_tracker)
+    rng = np.random.default_rng(control_seed)
+
+    def executed(ports: Rig) -> Insertion:
+        return run(
+            scenario,
+            plan,
+            ports,
+            rng,
+            seed,
+            controller=controller,
+            force=force,
+            threads=threads,
+            on_period=on_period,
+        )
+
+    if rig is None:
+        return replace(executed(virtual), phantom=plant_name, tracker=tracker_name)
+    if (plant_name, tracker_name) != (DEFAULT_PLANT, SCENARIO_TRACKER):
+        raise InputError("phantom and tracker are those of the rig: give neither with a rig")
+    file = rig if isinstance(rig, RigFile) else load_rig(rig)
+    check_fit(file, scenario, plan.strategy)
+    with supervised(file, scenario, plan, dry=dry_run) as (ports, ticks):
+        insertion = executed(in_memory(ports, virtual) if dry_run else ports)
+    return replace(insertion, rig=file.name, ticks=ticks.summary())
