@@ -32,13 +32,17 @@ _CLEAN = 0.75  # of the indicator's limit: a reference below it is not moved
 class Rig:
     """Ports of the closed loop; `truth` is only recorded, None on hardware.
 
-    Raises InputError if one has not the functions of its port.
+    deadline: time (s) of a decision after which it counts as late; the tracker is then read again before it is used.
+    None: no decision is late.
+
+    Raises InputError if one has not the functions of its port, and for a deadline that is not above 0.
     """
 
     clock: Clock
     driver: Driver
     tracker: TipTracker
     truth: Callable[[], Condition] | None = None
+    deadline: float | None = None
 
     def __post_init__(self) -> None:
         _check_port("clock", self.clock, Clock, ("now", "wait"))
@@ -46,6 +50,8 @@ class Rig:
         _check_port("tracker", self.tracker, TipTracker, ("read", "status"))
         if not (self.truth is None or callable(self.truth)):
             raise refusal("truth", self.truth, "must be a function of () that returns a Condition, or None")
+        if not (self.deadline is None or 0.0 < self.deadline < math.inf):
+            raise refusal("deadline", self.deadline, "must be a time above 0 (s), or None")
 
 
 def _check_port(name: str, given: object, port: type, parts: Collection[str]) -> None:
