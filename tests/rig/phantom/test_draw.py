@@ -325,7 +325,12 @@ def digest(truth):
     """Of all drawn values."""
     values = truth.scenario.values()
     values = {name: values[name] for name in ("needle", "setup", "tissue", "contact", "target")}
-    for key in ("axes", "guide_axes", "rotation", "rotation_speed_deg_s"):  # not drawn, and younger than the published phantoms
+    for key in (
+        "axes",
+        "guide_axes",
+        "rotation",
+        "rotation_speed_deg_s",
+    ):  # not drawn, and younger than the published phantoms
         del values["setup"][key]
     assert values["target"].pop("lateral_z_mm") == 0.0
     for layer in values["tissue"]:
