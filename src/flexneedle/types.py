@@ -433,7 +433,9 @@ class Period:
     cost: float  # predicted cost of the chosen command
     spread: float  # final standard deviation of the first guide step (mm)
     action: Action
-    decision: str  # reason why the bevel was rolled or kept, or the needle held
+    decision: (
+        str  # reason why the bevel was rolled or kept, or the needle held; "late: …" with the time it took
+    )
     true_tip: Pose | None
     true_strain_energy: float | None
     durations: dict[str, float] = field(compare=False)  # wall clock (s): observe, decide, total
@@ -445,6 +447,7 @@ class Period:
     predicted: Shape | None = None  # shape at the target; None: not predicted
     true_shape: Floats | None = None  # points x, y, z (n, 3) at equal distances along the needle (mm)
     readings: tuple[CheckedMeasurement, ...] = ()  # all readings of the period, oldest first
+    late: bool = False  # whether the decision came after the deadline, so that the needle rested
 
     def __repr__(self) -> str:
         at = f"{self.time:.2f} s: {self.action}, estimated tip {_mm(self.estimate)}"
@@ -500,6 +503,11 @@ class Insertion:
     def warning(self) -> str:
         """The first warning of the insertion, or ""."""
         return next((period.warning for period in self.periods if period.warning), "")
+
+    @property
+    def late(self) -> int:
+        """Number of decisions that came after the deadline."""
+        return sum(period.late for period in self.periods)
 
     @property
     def held_s(self) -> float:

@@ -23,11 +23,11 @@ from functools import cached_property
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Move, after, along, assigned, described
+from flexneedle.estimation.estimate import Move, after, along, assigned, described, outside_rolls
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
 from flexneedle.estimation.readings import MoveMeans, shared
 from flexneedle.estimation.sensor import Sensor
-from flexneedle.estimation.sensors import used
+from flexneedle.estimation.sensors import used as used_sensors
 from flexneedle.estimation.task import Task
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.control import controls
@@ -81,7 +81,7 @@ class Identification:
             ((0, state),),
             grid,
             np.zeros(
-                (len(used(scenario)), prior.mean.size, grid.size),
+                (len(used_sensors(scenario)), prior.mean.size, grid.size),
                 dtype=float if scenario.setup.axes == 1 else complex,
             ),
             prior.precision,
@@ -162,7 +162,7 @@ class Identified:
     def tip_at(self, time: float) -> Point:
         """Estimated position of the tip (mm) at `time`."""
         x, y, z = along(self.moves, self.tips, time)
-        since = sum(done.applied.roll + done.applied.spin for done in self.moves if done.begun >= time)
+        since = sum(done.applied.roll + done.applied.spin for done in self.moves if done.travel_begun >= time)
         off = self.off_axis(self.state.bevel * cmath.exp(-1j * since))
         return x, y + off.real, z + (off.imag if self.axes > 1 else 0.0)
 
@@ -182,9 +182,10 @@ class Identified:
 
     def observe(self, measurements: Sequence[Measurement]) -> "Identified":
         """Fit the parameters to all readings by one Gauss–Newton step, and simulate the insertion with them."""
-        if not measurements or not self.moves:
+        used = outside_rolls(self.moves, measurements)
+        if not used or not self.moves:
             return self.without_reading()
-        extended = replace(self, moves=assigned(self.moves, measurements))
+        extended = replace(self, moves=assigned(self.moves, used))
         readings = extended._readings[0]
         without = readings.ahead(extended.tips[:, X]) + extended.axial
         prior_sd = max(self.nominal.scenario.control.start_axial_sd_mm, LEAST_SD)
@@ -210,7 +211,7 @@ class Identified:
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
         """The sensors in use, the tip's position first."""
-        return used(self.nominal.scenario)
+        return used_sensors(self.nominal.scenario)
 
     @cached_property
     def _readings(self) -> tuple[MoveMeans, ...]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Move, after, along, assigned, described, place
+from flexneedle.estimation.estimate import Move, after, along, assigned, described, outside_rolls, place
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
@@ -107,14 +107,23 @@ class Corrected:
 
     def move(self, motion: Motion) -> "Corrected":
         """Move the estimated needle as the driver did."""
+        if motion.control == STILL and self._rests_unread:  # one move, however long
+            last = replace(self.moves[-1], ended=motion.ended)
+            return replace(self, moves=(*self.moves[:-1], last))
         state = after(self.simulator, self.state, motion.control)
         tips = np.concatenate([self.tips, state.tip[None]])
         return replace(self, state=state, tips=tips, moves=(*self.moves, Move.of(motion)))
 
+    @property
+    def _rests_unread(self) -> bool:
+        """Whether the last move was none, and no reading of it has arrived."""
+        return bool(self.moves) and self.moves[-1].applied == STILL and not self.moves[-1].measurements
+
     def observe(self, measurements: Sequence[Measurement]) -> "Corrected":
         """Correct by good measurements (newest last); a move is closed once a reading of its end has arrived."""
-        moves = assigned(self.moves, measurements)
-        newest = max((one.time for one in measurements), default=-np.inf)
+        used = outside_rolls(self.moves, measurements)
+        moves = assigned(self.moves, used)
+        newest = max((one.time for one in used), default=-np.inf)
         at = replace(self, state=self.past, moves=moves)
         past, closed, tips = at, 0, [at.tip]
         for k, done in enumerate(moves):

@@ -3,8 +3,14 @@
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from flexneedle.control.interface import Decision
+from flexneedle.estimation.estimate import Estimate
 from flexneedle.rig.measuring import Observation
-from flexneedle.types import Outcome, Shape
+from flexneedle.types import Floats, Outcome, Shape, Z
+
+_CHANGED_SDS = 3.0  # standard deviations of an estimate beyond which a decision on it is made anew
 
 
 @dataclass(frozen=True)
@@ -22,22 +28,23 @@ class Hold:
 
 
 @dataclass(frozen=True)
-class NoPath:
-    """Reason why no path reaches the target, empty if one does, and the time (s) held for it.
+class Refused:
+    """Why decisions are not carried out, empty if they are, and the time (s) held for it.
 
-    The time does not run while the needle is held on account of the tracker; a decision with a path resets it.
+    Either no path reaches the target, or the command would exceed a limit. The time does not run while the needle
+    is held on account of the tracker; a decision that is carried out resets it.
     """
 
     reason: str = ""
     duration: float = 0.0
 
-    def after(self, reason: str) -> "NoPath":
+    def after(self, reason: str) -> "Refused":
         """After a decision."""
-        return NoPath(reason, self.duration) if reason else NoPath()
+        return Refused(reason, self.duration) if reason else Refused()
 
-    def extended(self, seconds: float) -> "NoPath":
+    def extended(self, seconds: float) -> "Refused":
         """After a period of this length."""
-        return NoPath(self.reason, self.duration + seconds) if self.reason else self
+        return Refused(self.reason, self.duration + seconds) if self.reason else self
 
     def ending(self, limit: float) -> tuple[Outcome, str] | None:
         """Outcome and reason once the hold has lasted for `limit` (s)."""
@@ -63,22 +70,46 @@ def hold_after(hold: Hold | None, observation: Observation, now: float) -> Hold 
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Late:
+    """A decision that came after its deadline, the memory after it, and the estimate of the tip on which it was made:
+    pose (5,) and standard deviation (mm).
+    """
+
+    decision: Decision
+    memory: Any
+    tip: Floats
+    sd: float
+
+    @staticmethod
+    def of(decision: Decision, memory: Any, estimate: Estimate) -> "Late":
+        """A decision on an estimate."""
+        return Late(decision, memory, estimate.tip, estimate.tip_sd)
+
+    def holds_for(self, estimate: Estimate) -> bool:
+        """Whether the readings since then have moved the estimated tip by no more than it was uncertain."""
+        moved = np.linalg.norm(estimate.tip[: Z + 1] - self.tip[: Z + 1])
+        return bool(moved <= _CHANGED_SDS * self.sd)
+
+
 @dataclass(frozen=True)
 class Progress:
     """An insertion between two periods.
 
     arrived_at: time (s) at which the needle arrived at its depth; moves: number of moves; in_a_row: number of
-    consecutive decisions with a likely miss; predicted: the last predicted shape.
+    consecutive decisions with a likely miss; predicted: the last predicted shape; late: a decision of the last period
+    that came late.
     """
 
     observation: Observation
     memory: Any  # of the controller
     hold: Hold | None
-    no_path: NoPath = NoPath()
+    refused: Refused = Refused()
     arrived_at: float | None = None
     moves: int = 0
     in_a_row: int = 0
     predicted: Shape | None = None
+    late: Late | None = None
 
     @property
     def decides(self) -> bool:

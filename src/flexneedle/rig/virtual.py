@@ -34,8 +34,10 @@ class Rig:
     """Ports of the closed loop; `truth` is only recorded, None on hardware.
 
     expect: called with the estimate and the command before each motion, so that readings during it can be checked; None
-    where they are not.
-    Raises InputError if one has not the functions of its port.
+    where they are not. deadline: time (s) of a decision after which it counts as late; the tracker is then read again
+    before it is used. None: no decision is late.
+
+    Raises InputError if one has not the functions of its port, and for a deadline that is not above 0.
     """
 
     clock: Clock
@@ -43,6 +45,7 @@ class Rig:
     tracker: TipTracker
     truth: Callable[[], Condition] | None = None
     expect: Callable[[Estimate, Control], None] | None = None
+    deadline: float | None = None
 
     def __post_init__(self) -> None:
         _check_port("clock", self.clock, Clock, ("now", "wait"))
@@ -50,6 +53,8 @@ class Rig:
         _check_port("tracker", self.tracker, TipTracker, ("read", "status"))
         if not (self.truth is None or callable(self.truth)):
             raise refusal("truth", self.truth, "must be a function of () that returns a Condition, or None")
+        if not (self.deadline is None or 0.0 < self.deadline < math.inf):
+            raise refusal("deadline", self.deadline, "must be a time above 0 (s), or None")
 
 
 def _check_port(name: str, given: object, port: type, parts: Collection[str]) -> None:

@@ -24,6 +24,7 @@ from flexneedle.scenario.rules import (
 from flexneedle.scenario.sections.apparatus import Entry, Setup, TrackerSettings
 from flexneedle.scenario.sections.environment import ENVIRONMENTS, expanded
 from flexneedle.scenario.sections.fields import Section, Title
+from flexneedle.scenario.sections.guard import GuardSettings
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.scenario.sections.needle import Needle
 from flexneedle.scenario.sections.settings import ControlSettings, PhantomSettings, PlanSettings, Target
@@ -53,6 +54,7 @@ class Scenario(Section):
     control: ControlSettings = ControlSettings()
     tracker: TrackerSettings = TrackerSettings()
     monitor: MonitorSettings = MonitorSettings()
+    guard: GuardSettings = GuardSettings()
     phantom: PhantomSettings = PhantomSettings()
 
     def __init__(self, /, **values: Any) -> None:

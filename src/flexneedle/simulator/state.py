@@ -33,7 +33,7 @@ _ENERGIES = ("energy", "weighted")
 
 class Contacts(NamedTuple):
     """Contact points of the cut channel by depth: x (k,), rest and present positions y, z (k, 2), mm; stretch λ (k,);
-    whether active (k,).
+    whether active (k,); index of the tissue's law (k,), as in `laws_of`.
 
     A point ahead of a tip that was pulled back is not active: it is undisplaced, position = rest and stretch 1.
     """
@@ -43,6 +43,7 @@ class Contacts(NamedTuple):
     position: Floats
     stretch: Floats
     active: NDArray[np.bool_]
+    law: NDArray[np.int64]
 
     def __repr__(self) -> str:
         least = f", least stretch {self.stretch.min():.4f}" if len(self.x) else ""
@@ -147,6 +148,7 @@ class State:
             _pairs(self.rest + compression),
             1.0 - np.abs(compression) / nodes["height"],
             active,
+            nodes["law"],
         )
         return Contacts(*(_frozen(column[formed]) for column in columns))
 

@@ -66,6 +66,7 @@ _FIELDS: dict[str, tuple[tuple[str, _Scalar], ...]] = {
     "cost": (("cost", float),),
     "spread": (("spread_mm", float),),
     "action": (("action", Action),),
+    "late": (("late", _flag),),
     "decision": (("decision", str),),
     "miss": (("miss_y_mm", float), ("miss_z_mm", float)),
     "miss_sd": (("miss_sd_mm", float),),

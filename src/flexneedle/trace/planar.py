@@ -30,6 +30,7 @@ def row_in_space(row: Mapping[str, str]) -> dict[str, str]:
         name.replace("sample_", "measured_") if name.startswith("sample_") else name: text
         for name, text in row.items()
     }
+    current.setdefault("late", str(False))  # before deadlines were recorded
     zero, absent = repr(0.0), ("path", "true", "estimate", "base")
     if "miss_mm" in current:
         miss = current.pop("miss_mm")

@@ -83,9 +83,9 @@ class Phantom:
     def apply(self, command: Control, duration: float) -> Motion:
         """Roll, then travel at constant velocity within `duration` s, in steps of at most `phantom.step_mm`.
 
-        The roll takes its own time before that. Motors move to the multiple of their resolution nearest to the sum of all commands, so that rounding errors do
-        not accumulate. A driver of half turns turns to and fro. Raises CommandError if the command exceeds a limit of
-        the setup.
+        The roll takes its own time before that. Motors move to the multiple of their resolution nearest to the sum of
+        all commands, so that rounding errors do not accumulate. A driver of half turns turns to and fro. Raises
+        CommandError if the command exceeds a limit of the setup.
         """
         self._limits.check(self._moved, np.array([command]), self._rolled)
         row = self._rounded(command)

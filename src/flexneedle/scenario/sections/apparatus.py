@@ -63,8 +63,7 @@ class Setup(Section):
     base_turn_speed_mrad_s: Positive | None = None
     """Speed of the base's rotation about an axis. Not set: its largest step takes as long as the largest advance."""
     rotation_speed_deg_s: Positive = 360.0
-    """Speed at which the needle rolls and spins; a half turn at 360°/s lasts 0.5 s. The needle does not advance while it
-    rolls."""
+    """Speed at which the needle rolls and spins; a half turn at 360°/s lasts 0.5 s. It does not advance in a roll."""
 
     @property
     def half_turns(self) -> bool:

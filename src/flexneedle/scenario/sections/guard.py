@@ -1,0 +1,20 @@
+"""Limits of what a command may do to needle and tissue."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from flexneedle.scenario.sections.fields import Positive, Section
+
+
+class GuardSettings(Section):
+    """Section `guard`: limits of the predicted state after a command. One that would exceed them is not carried out."""
+
+    least_stretch: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """Least stretch λ of the tissue along the needle. Not set: in each layer that at 19/20 of the compression at which
+    its law ends, 0.335 for `ogden`."""
+    guide_force_n: Positive | None = None
+    """Largest force between guide and needle. Not set: that which over the distance from guide to skin bends the needle
+    until its surface is strained by 0.5 %."""
+    past_target_mm: Positive = 2.0
+    """Largest distance of the tip past the target, along the insertion axis."""
