@@ -120,7 +120,7 @@ class Axis(Section, ABC):
 
     def shown(self, value: float) -> str:
         """A position, distance or speed (mm or rad, and s) as a number in the unit of the file, such as "12.5"."""
-        return f"{round(value / self.size, 6):.7g}"
+        return f"{round(value / self.size, 6) + 0.0:.7g}"  # not -0
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -1,0 +1,340 @@
+"""`flexneedle rig`: check a rig, and move its axes one by one."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from flexneedle.console.common import described, print_json, with_examples
+from flexneedle.errors import DriverError, InputError
+
+if TYPE_CHECKING:
+    from flexneedle.rig.check import Finding, Wanted
+    from flexneedle.rig.moves import Homing, Move
+    from flexneedle.scenario.rig import RigFile
+
+_SECONDS = 2.0
+_ARMS = "The motors of all axes are switched on first. Ctrl-C stops."
+_NEGATIVE = re.compile(r"^-[\d.]")
+
+
+class Operator(Protocol):
+    """The supervisor of a rig, for an operator's motions; each call returns when the motion has ended.
+
+    Each raises DriverError, with the reason, if it is refused or ends before its goal.
+    """
+
+    def arm(self) -> None:
+        """Switch the motors on."""
+        ...
+
+    def jog(self, axis: str, distance: float, speed: float) -> None:
+        """Move an axis by a distance (mm or rad), at most at a speed (mm/s or rad/s)."""
+        ...
+
+    def home(self, axis: str) -> None:
+        """Find the home of an axis."""
+        ...
+
+    def move_to(self, axis: str, position: float) -> None:
+        """Move an axis to a position (mm or rad)."""
+        ...
+
+    def stop(self) -> None:
+        """Stop all axes."""
+        ...
+
+
+def supervised(rig: RigFile) -> AbstractContextManager[Operator]:
+    """Return the supervisor of a rig; leaving the context stops all axes and ends it."""
+    from importlib import import_module
+
+    made: AbstractContextManager[Operator] = import_module("flexneedle.rig.supervisor.client").Supervisor(rig)
+    return made
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser of `flexneedle`."""
+    parser = subparsers.add_parser(
+        "rig",
+        help="check the motors and the tracker of a rig, and move its axes",
+        **with_examples(
+            "flexneedle rig check rig.toml --scenario phantom",
+            "flexneedle rig jog rig.toml insertion -5mm",
+        ),
+    )
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for add in (_add_check, _add_jog, _add_home, _add_retract):
+        add(commands)
+
+
+def _add_check(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "check",
+        help="compare a rig with its file; moves nothing",
+        **described(
+            "Connect to each device and compare it with the rig file: motors, positions, limit switches, frames and "
+            "sensors of the tracker. Moves, powers and changes nothing. One line for each thing that was checked; "
+            "exit status 1 if there is a problem.",
+            "flexneedle rig check rig.toml",
+            "flexneedle rig check rig.toml --scenario phantom --json",
+        ),
+    )
+    _add_rig(parser)
+    parser.add_argument(
+        "--scenario",
+        metavar="S",
+        help="also check that the rig can do what this scenario needs (name or path)",
+    )
+    parser.add_argument(
+        "--strategy",
+        choices=("manipulation", "steering"),
+        default="manipulation",
+        help="strategy of the scenario's plan; steering moves neither guide nor base sideways (default: manipulation)",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=_positive,
+        default=_SECONDS,
+        metavar="S",
+        help=f"time for which frames of the tracker are counted (default: {_SECONDS:g})",
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of lines")
+    parser.set_defaults(handler=_check)
+
+
+def _add_jog(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "jog",
+        help="move one axis by a distance",
+        **described(
+            "Move one axis by a distance from where it is, within its soft limits. Prints what would move and asks "
+            "for confirmation; Ctrl-C stops.",
+            "flexneedle rig jog rig.toml insertion -5mm",
+            "flexneedle rig jog rig.toml rotation 180deg --speed 90",
+        ),
+    )
+    _add_rig(parser)
+    parser.add_argument(
+        "axis", metavar="AXIS", help="axis of the rig file, such as insertion, rotation or guide_y"
+    )
+    parser.add_argument(
+        "distance", metavar="DISTANCE", help="distance with its sign, such as 5, -2.5mm or 90deg"
+    )
+    parser.add_argument(
+        "--speed",
+        type=_positive,
+        metavar="V",
+        help="largest speed, mm/s or deg/s (default: a fifth of the axis's)",
+    )
+    _add_yes(parser)
+    # The pattern by which argparse tells -5mm from an option; there is no public way to set it.
+    parser._negative_number_matcher = _NEGATIVE
+    parser.set_defaults(handler=_jog)
+
+
+def _add_home(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "home",
+        help="find the zero of axes",
+        **described(
+            "Find the zero of axes by the key home of the rig file, one after the other, the insertion first. "
+            "Only without a needle in tissue. Prints what would move and asks for confirmation; Ctrl-C stops.",
+            "flexneedle rig home rig.toml",
+            "flexneedle rig home rig.toml insertion --yes",
+        ),
+    )
+    _add_rig(parser)
+    parser.add_argument(
+        "axes", nargs="*", metavar="AXIS", help="axes (default: all but those with an absolute encoder)"
+    )
+    _add_yes(parser)
+    parser.set_defaults(handler=_home)
+
+
+def _add_retract(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "retract",
+        help="withdraw the needle",
+        **described(
+            "Move the insertion axis backwards; rotation and guide stay where they are. Prints what would move and "
+            "asks for confirmation; Ctrl-C stops.",
+            "flexneedle rig retract rig.toml",
+            "flexneedle rig retract rig.toml --to 10 --yes",
+        ),
+    )
+    _add_rig(parser)
+    parser.add_argument(
+        "--to",
+        type=_number,
+        metavar="MM",
+        help="position at which the retraction ends (default: the lowest of the axis's range_mm)",
+    )
+    _add_yes(parser)
+    parser.set_defaults(handler=_retract)
+
+
+def _add_rig(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("rig", type=Path, metavar="RIG", help="rig file (docs/rig/file.md)")
+
+
+def _add_yes(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--yes", action="store_true", help="move without asking; needed without a terminal")
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text}: must be a finite number")
+    return value
+
+
+def _positive(text: str) -> float:
+    value = _number(text)
+    if value <= 0.0:
+        raise argparse.ArgumentTypeError(f"{text}: must be above 0")
+    return value
+
+
+# Check
+
+
+def _check(args: argparse.Namespace) -> int:
+    from flexneedle.rig.check import check_rig
+    from flexneedle.rig.devices.clock import WallClock
+    from flexneedle.scenario.rig import load_rig
+
+    rig = load_rig(args.rig)
+    findings = check_rig(rig, WallClock(), args.seconds, _wanted(args))
+    problems = sum(1 for finding in findings if finding.problem)
+    if args.json:
+        print_json(_values(rig, findings))
+    else:
+        _print_findings(findings)
+        print(f"\n{args.rig}: {_counted(problems)}")
+    return 1 if problems else 0
+
+
+def _wanted(args: argparse.Namespace) -> Wanted | None:
+    from flexneedle.rig.check import Wanted
+    from flexneedle.scenario.files import load_scenario
+
+    return None if args.scenario is None else Wanted(load_scenario(args.scenario), args.strategy)
+
+
+def _values(rig: RigFile, findings: Sequence[Finding]) -> dict[str, Any]:
+    lines = [
+        {"part": one.part, "item": one.item, "found": one.found, "problem": one.problem or None}
+        for one in findings
+    ]
+    return {"rig": rig.name, "ok": not any(one.problem for one in findings), "findings": lines}
+
+
+def _print_findings(findings: Sequence[Finding]) -> None:
+    parts, items = (
+        max(map(len, column)) for column in zip(*((one.part, one.item) for one in findings), strict=True)
+    )
+    for one in findings:
+        verdict = f"PROBLEM  {one.part:{parts}}  {one.item:{items}}" if one.problem else ""
+        line = verdict or f"ok       {one.part:{parts}}  {one.item:{items}}"
+        print(f"{line}  {'; '.join(filter(None, (one.found, one.problem)))}")
+
+
+def _counted(problems: int) -> str:
+    return f"{problems} problem{'s' if problems > 1 else ''}" if problems else "ok"
+
+
+# Motions
+
+
+def _jog(args: argparse.Namespace) -> int:
+    from flexneedle.rig.moves import axis_of, jog
+    from flexneedle.scenario.rig import load_rig
+
+    rig = load_rig(args.rig)
+    axis_of(rig, args.axis)
+    move = jog(rig, args.axis, args.distance, _positions(rig)[args.axis], args.speed)
+    return _carried_out(
+        rig, [move], args.yes, lambda operator: operator.jog(move.name, move.distance, move.speed)
+    )
+
+
+def _home(args: argparse.Namespace) -> int:
+    from flexneedle.rig.moves import homings
+    from flexneedle.scenario.rig import load_rig
+
+    rig = load_rig(args.rig)
+    chosen = homings(rig, args.axes)
+    if not chosen:
+        print("flexneedle: no axis needs homing: all have absolute encoders", file=sys.stderr)
+        return 0
+
+    def home(operator: Operator) -> None:
+        for homing in chosen:
+            operator.home(homing.name)
+
+    return _carried_out(rig, chosen, args.yes, home)
+
+
+def _retract(args: argparse.Namespace) -> int:
+    from flexneedle.rig.moves import retraction
+    from flexneedle.scenario.rig import load_rig
+
+    rig = load_rig(args.rig)
+    move = retraction(rig, _positions(rig)["insertion"], args.to)
+    return _carried_out(rig, [move], args.yes, lambda operator: operator.move_to(move.name, move.goal))
+
+
+def _positions(rig: RigFile) -> dict[str, float]:
+    """Where the axes are, mm or rad. Raises DriverError if the driver has no such channel, or cannot be read."""
+    from flexneedle.rig.devices.registry import open_motors
+
+    with closing(open_motors(rig)) as motors:
+        states = motors.read()
+    missing = [axis.channel for _, axis in rig.axes.items() if axis.channel not in states]
+    if missing:
+        raise DriverError(
+            f"the driver has no channel {', '.join(missing)}; it has {', '.join(states) or 'none'}"
+        )
+    return {name: states[axis.channel].position / axis.scale for name, axis in rig.axes.items()}
+
+
+def _carried_out(
+    rig: RigFile, moves: Sequence[Move | Homing], yes: bool, command: Callable[[Operator], None]
+) -> int:
+    """Print the motions and, if they are confirmed, command them; return the exit status."""
+    print("\n".join([*map(str, moves), _ARMS]), file=sys.stderr)
+    if not (yes or _confirmed()):
+        print("flexneedle: not confirmed: nothing was moved", file=sys.stderr)
+        return 1
+    with supervised(rig) as operator, _stopped_on_error(operator):
+        operator.arm()
+        command(operator)
+    print("done", file=sys.stderr)
+    return 0
+
+
+def _confirmed() -> bool:
+    if not sys.stdin.isatty():
+        raise InputError("no terminal to confirm the motion on: use --yes to move without asking")
+    print("Move? [y/N] ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+@contextmanager
+def _stopped_on_error(operator: Operator) -> Iterator[None]:
+    """Stop all axes after an error and after Ctrl-C; a second Ctrl-C waits until they are stopped."""
+    from flexneedle.files import uninterrupted
+
+    try:
+        yield
+    except BaseException:
+        with uninterrupted():
+            operator.stop()
+        raise

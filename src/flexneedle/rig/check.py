@@ -1,0 +1,253 @@
+"""Comparing a rig with its file: it reads each device, and moves, powers and changes nothing."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from math import isfinite
+from statistics import median
+from typing import Protocol, TypeVar
+
+from flexneedle.errors import FlexneedleError, one_line
+from flexneedle.rig.devices.registry import OpenTracker, open_motors, open_tracker
+from flexneedle.rig.fit import fit_problems, queued, room_problems
+from flexneedle.rig.ports import Clock, Motors, MotorState
+from flexneedle.rig.tracking.table import TIP
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.rig import Axis, RigFile
+from flexneedle.types import VISIBLE, Frame, is_reference
+
+_PAUSE_S = 0.01
+_READINGS = 5  # of the motors, for the time of a reply
+_LEAST_MEASURED = 0.9  # share of the frames in which a sensor has a position
+_RATE_TOLERANCE = 0.1
+
+
+class _Closable(Protocol):
+    def close(self) -> None: ...
+
+
+Device = TypeVar("Device", bound=_Closable)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the check: the part of the rig, what was checked, what was found, and the problem, "" if there is
+    none."""
+
+    part: str
+    item: str
+    found: str
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A scenario, and the strategy of its plan, that the rig is checked for."""
+
+    scenario: Scenario
+    strategy: str = "manipulation"
+
+
+def check_rig(rig: RigFile, clock: Clock, seconds: float, wanted: Wanted | None = None) -> list[Finding]:
+    """Return what was found at each device. seconds: for which frames of the tracker are counted; clock: real time.
+
+    A device that cannot be reached is a finding, too.
+    """
+    found = [*_of_file(rig), *(_of_scenario(rig, wanted) if wanted is not None else ())]
+    found += _with_device(
+        "driver", rig.driver.kind, lambda: open_motors(rig), lambda m: motors(rig, m, clock, wanted)
+    )
+    found += _with_device(
+        "tracker",
+        rig.tracker.kind,
+        lambda: open_tracker(rig, clock),
+        lambda t: tracker(t, clock, seconds, wanted),
+    )
+    return found
+
+
+def _with_device(
+    part: str, kind: str, connect: Callable[[], Device], read: Callable[[Device], list[Finding]]
+) -> list[Finding]:
+    """The findings of one device; where it fails, its error in place of what was not found."""
+    connected: list[Finding] = []
+    try:
+        with closing(connect()) as device:
+            connected = [Finding(part, "connection", f"{kind}{_identity(device)}")]
+            return connected + read(device)
+    except (FlexneedleError, OSError) as error:
+        problem = one_line(error) if isinstance(error, FlexneedleError) else str(error)
+        return [*connected, Finding(part, "reading" if connected else "connection", kind, problem)]
+
+
+def _identity(device: object) -> str:
+    identity = getattr(device, "identity", "")
+    return f", {identity}" if identity else ""
+
+
+def _of_file(rig: RigFile) -> Iterator[Finding]:
+    for name, distance in queued(rig):
+        yield Finding(name, "queued motion", distance)
+
+
+def _of_scenario(rig: RigFile, wanted: Wanted) -> list[Finding]:
+    problems = fit_problems(rig, wanted.scenario, wanted.strategy)
+    name = wanted.scenario.name
+    return [Finding("scenario", "fit", name, line) for line in problems] or [Finding("scenario", "fit", name)]
+
+
+# Motors
+
+
+def motors(rig: RigFile, device: Motors, clock: Clock, wanted: Wanted | None = None) -> list[Finding]:
+    """Return what a few readings of the motors show. Raises DriverError if they cannot be read."""
+    states, seconds = _read(device, clock)
+    found = [_reply(rig, seconds)]
+    positions: dict[str, float] = {}
+    for name, axis in rig.axes.items():
+        state = states.get(axis.channel)
+        if state is None:
+            rule = f"the driver has no channel {axis.channel}; it has {', '.join(states) or 'none'}"
+            found.append(Finding(name, "motor", axis.channel, rule))
+            continue
+        found += _of_axis(name, axis, state)
+        positions[name] = state.position / axis.scale
+    return found + _rooms(rig, positions, wanted)
+
+
+def _read(device: Motors, clock: Clock) -> tuple[Mapping[str, MotorState], float]:
+    """The last of a few readings, and the median time (s) of one."""
+    states: Mapping[str, MotorState] = {}
+    times = []
+    for _ in range(_READINGS):
+        begun = clock.now()
+        states = device.read()
+        times.append(clock.now() - begun)
+    return states, median(times)
+
+
+def _reply(rig: RigFile, seconds: float) -> Finding:
+    tick = 1.0 / rig.loop.rate_hz
+    late = f"longer than a tick of the loop, {1e3 * tick:.4g} ms" if seconds > tick else ""
+    return Finding("driver", "reply", f"{1e3 * seconds:.1f} ms", late)
+
+
+def _of_axis(name: str, axis: Axis, state: MotorState) -> Iterator[Finding]:
+    yield Finding(name, "motor", f"{axis.channel}, {'on' if state.on else 'off'}", _at_rest(state))
+    yield Finding(name, "position", _position(axis, state.position), _beyond(axis, state.position))
+    yield Finding(name, "limit switches", _switches(state) or "none active", _switch_problem(axis, state))
+    if state.on:
+        yield _following(name, axis, state)
+
+
+def _at_rest(state: MotorState) -> str:
+    moving = "moves, though this command does not move it" if state.moving else ""
+    return "; ".join(filter(None, (moving, state.stopped)))
+
+
+def _position(axis: Axis, counts: float) -> str:
+    return f"{axis.shown(counts / axis.scale)} {axis.unit} ({counts:.10g} counts)"
+
+
+def _beyond(axis: Axis, counts: float) -> str:
+    position, (low, high) = counts / axis.scale, axis.limits
+    if not isfinite(position):
+        return "is not a number"
+    if low - axis.tolerance <= position <= high + axis.tolerance:
+        return ""
+    return f"beyond the soft limits, {axis.shown(low)} to {axis.shown(high)} {axis.unit}"
+
+
+def _switches(state: MotorState) -> str:
+    active = ("reverse", state.reverse_limit), ("forward", state.forward_limit)
+    return " and ".join(name for name, is_active in active if is_active)
+
+
+def _switch_problem(axis: Axis, state: MotorState) -> str:
+    """An axis may rest at the switch of its home."""
+    if state.reverse_limit and state.forward_limit:
+        return "both are active: check their wiring and polarity"
+    name = _switches(state)
+    return f"the {name} switch is active" if name and axis.home != f"{name}-limit" else ""
+
+
+def _following(name: str, axis: Axis, state: MotorState) -> Finding:
+    error = abs((state.commanded - state.position) / axis.scale)
+    most = axis.max_error
+    rule = "" if error <= most else f"must be at most max_error_{axis.unit} ({axis.shown(most)})"
+    return Finding(name, "commanded - measured", f"{axis.shown(error)} {axis.unit}", rule)
+
+
+def _rooms(rig: RigFile, positions: Mapping[str, float], wanted: Wanted | None) -> list[Finding]:
+    """Whether the insertion of a scenario could start from where the axes are."""
+    if wanted is None:
+        return []
+    return [
+        Finding(name, "room", "from here", line)
+        for name, line in room_problems(rig, wanted.scenario, positions, wanted.strategy)
+    ]
+
+
+# Tracker
+
+
+def tracker(device: OpenTracker, clock: Clock, seconds: float, wanted: Wanted | None = None) -> list[Finding]:
+    """Return what the frames of `seconds` show. Raises RunError if the tracker fails."""
+    frames = _frames(device, clock, seconds)
+    if not frames:
+        reason = "no frame" if device.status == VISIBLE else f"no frame: {device.status}"
+        return [Finding("tracker", "frames", f"none in {seconds:g} s", reason)]
+    status = device.status
+    return [
+        _rate(frames, wanted),
+        Finding("tracker", "status", status, "" if status == VISIBLE else "must be ok while frames arrive"),
+        *_sensors(frames),
+        *_needed_sensors(frames, wanted),
+    ]
+
+
+def _frames(device: OpenTracker, clock: Clock, seconds: float) -> list[Frame]:
+    begun, frames = clock.now(), list[Frame]()
+    while clock.now() - begun < seconds:
+        frames += device.read()
+        clock.wait(_PAUSE_S)
+    return frames
+
+
+def _rate(frames: Sequence[Frame], wanted: Wanted | None) -> Finding:
+    span, missed = frames[-1].time - frames[0].time, frames[-1].number - frames[0].number + 1 - len(frames)
+    rate = (len(frames) - 1) / span if span > 0.0 else 0.0
+    shown = f"{rate:.1f} Hz, {len(frames)} frames, {missed} missed"
+    if rate == 0.0:
+        return Finding("tracker", "frames", shown, "too few for a rate")
+    expected = None if wanted is None else wanted.scenario.tracker.rate_hz
+    if expected is not None and abs(rate / expected - 1.0) > _RATE_TOLERANCE:
+        return Finding("tracker", "frames", shown, f"tracker.rate_hz of the scenario is {expected:g}")
+    return Finding("tracker", "frames", shown)
+
+
+def _sensors(frames: Sequence[Frame]) -> Iterator[Finding]:
+    names = dict.fromkeys(name for frame in frames for name in frame.readings)
+    for name in names:
+        readings = [frame.readings[name] for frame in frames if name in frame.readings]
+        measured = [reading for reading in readings if reading.position is not None]
+        share, at = len(measured) / len(frames), ""
+        if measured and (position := measured[-1].position) is not None:
+            at = " at {:.2f}, {:.2f}, {:.2f} mm".format(*position)
+        last = next((r.status for r in reversed(readings) if r.status != VISIBLE), "not in every frame")
+        problem = "" if share >= _LEAST_MEASURED else f"measured in too few frames: {last}"
+        yield Finding("tracker", f"sensor {name}", f"measured in {share:.0%}{at}", problem)
+
+
+def _needed_sensors(frames: Sequence[Frame], wanted: Wanted | None) -> Iterator[Finding]:
+    names = {name for frame in frames for name in frame.readings}
+    if TIP not in names:
+        yield Finding(
+            "tracker", f"sensor {TIP}", "not found", f"the needle's sensor must have the name {TIP}"
+        )
+    if wanted is None or not wanted.scenario.monitor.enabled:
+        return
+    references, needed = sum(map(is_reference, names)), wanted.scenario.monitor.references
+    if references < needed:
+        rule = f"monitor.references of the scenario is {needed}: a sensor whose name begins with ref is one"
+        yield Finding("tracker", "reference sensors", str(references), rule)

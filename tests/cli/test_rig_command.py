@@ -1,0 +1,295 @@
+"""`flexneedle rig`: one line a check; nothing moves without confirmation, and Ctrl-C stops."""
+
+import json
+import math
+from types import SimpleNamespace
+
+import pytest
+import tomli_w
+
+import bench_rig
+from bench_rig import Motors, values
+from commands import run
+from flexneedle.cli import rig as command
+from flexneedle.errors import DriverError
+
+KINDS = {"driver.kind": "bench_rig:drivers", "tracker.kind": "bench_rig:trackers"}
+
+
+class Supervisor:
+    """The supervisor: records calls, and raises `failure` in place of a motion."""
+
+    def __init__(self):
+        self.calls, self.failure = [], None
+
+    def __call__(self, rig):
+        self.calls.append(("rig", rig.name))
+        return self
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_exception):
+        self.calls.append(("closed",))
+
+    def _move(self, *call):
+        self.calls.append(call)
+        if self.failure is not None:
+            raise self.failure
+
+    def arm(self):
+        self.calls.append(("arm",))
+
+    def jog(self, axis, distance, speed):
+        self._move("jog", axis, round(distance, 9), round(speed, 9))
+
+    def home(self, axis):
+        self._move("home", axis)
+
+    def move_to(self, axis, position):
+        self._move("move_to", axis, position)
+
+    def stop(self):
+        self.calls.append(("stop",))
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Return a function that writes a rig file with values changed and returns its path."""
+
+    def write(changes=None):
+        path = tmp_path / "rig.toml"
+        path.write_text(tomli_w.dumps(values({**KINDS, **(changes or {})})))
+        return str(path)
+
+    return write
+
+
+@pytest.fixture
+def device(monkeypatch):
+    """The motors, with the insertion at 30 mm."""
+    motors = Motors()
+    motors.set("A", position=30_000.0, commanded=30_000.0)
+    monkeypatch.setattr(bench_rig, "drivers", lambda _settings, _channels: motors)
+    return motors
+
+
+@pytest.fixture
+def supervisor(monkeypatch):
+    fake = Supervisor()
+    monkeypatch.setattr(command, "supervised", fake)
+    return fake
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """Return a function after which stdin is a terminal at which this is typed; an exception is raised instead."""
+
+    def types(answer):
+        def readline():
+            if isinstance(answer, str):
+                return answer
+            raise answer
+
+        monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True, readline=readline))
+
+    return types
+
+
+# Check
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """The clock of the tests: the check does not wait."""
+    monkeypatch.setattr("flexneedle.rig.devices.clock.WallClock", bench_rig.Clock)
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_good_rig_has_a_line_for_each_check(capsys, file):
+    status, out, _ = run(capsys, "rig", "check", file())
+    *lines, blank, last = out.splitlines()
+    assert (status, blank) == (0, "")
+    assert last.endswith("rig.toml: ok")
+    assert all(line.startswith("ok  ") for line in lines)
+    assert "ok       insertion  position              0 mm (0 counts)" in lines
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_problem_is_a_line_and_the_exit_status_1(capsys, file, device):
+    device.set("A", forward_limit=True)
+    status, out, _ = run(capsys, "rig", "check", file())
+    (line,) = [line for line in out.splitlines() if line.startswith("PROBLEM")]
+    assert " ".join(line.split()) == (
+        "PROBLEM insertion limit switches forward; the forward switch is active"
+    )
+    assert status == 1
+    assert out.splitlines()[-1].endswith("rig.toml: 1 problem")
+    assert device.calls == []
+
+
+@pytest.mark.usefixtures("quick")
+def test_json_has_every_finding(capsys, file, device):
+    device.set("A", position=math.nan)
+    status, out, _ = run(capsys, "rig", "check", file(), "--json", "--scenario", "phantom")
+    result = json.loads(out)
+    assert (status, result["ok"], result["rig"]) == (1, False, "Bench")
+    by_item = {(one["part"], one["item"]): one["problem"] for one in result["findings"]}
+    assert by_item[("insertion", "position")] == "is not a number"
+    assert by_item[("guide_y", "position")] is None
+    assert by_item[("scenario", "fit")] is None
+    assert by_item[("tracker", "reference sensors")].startswith("monitor.references of the scenario is 3")
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_plan_that_steers_needs_no_guide(capsys, file):
+    small = file({"axes.guide_y": None})
+    _, out, _ = run(capsys, "rig", "check", small, "--scenario", "phantom")
+    assert "axes.guide_y: missing: the guide moves" in out
+    _, out, _ = run(capsys, "rig", "check", small, "--scenario", "phantom", "--strategy", "steering")
+    assert "missing" not in out
+
+
+@pytest.mark.parametrize("name", [("check",), ("jog", "insertion", "1"), ("home",), ("retract",)])
+def test_a_file_that_is_none_is_bad_input(capsys, tmp_path, name):
+    path = tmp_path / "rig.toml"
+    path.write_text("name = 3")
+    status, out, err = run(capsys, "rig", name[0], str(path), *name[1:])
+    assert (status, out) == (2, "")
+    assert f"{path}: name = 3: must be text in quotes" in err
+
+
+# Motions
+
+
+MOTIONS = [
+    (
+        ("jog", "insertion", "-5mm"),
+        ("jog", "insertion", -5.0, 2.0),
+        "insertion: from 30 to 25 mm, at most at 2 mm/s",
+    ),
+    (
+        ("jog", "insertion", "5", "--speed", "1"),
+        ("jog", "insertion", 5.0, 1.0),
+        "insertion: from 30 to 35 mm",
+    ),
+    (
+        ("jog", "rotation", "-9deg"),
+        ("jog", "rotation", round(-math.pi / 20, 9), round(math.radians(72), 9)),
+        "rotation: from 0 to -9 deg, at most at 72 deg/s",
+    ),
+    (("retract",), ("move_to", "insertion", 0.0), "insertion: from 30 to 0 mm, at most at 10 mm/s"),
+    (("retract", "--to", "12.5"), ("move_to", "insertion", 12.5), "insertion: from 30 to 12.5 mm"),
+    (
+        ("home", "insertion"),
+        ("home", "insertion"),
+        "insertion: in its negative direction to the reverse limit switch",
+    ),
+]
+
+
+@pytest.mark.usefixtures("device")
+@pytest.mark.parametrize(("words", "call", "line"), MOTIONS)
+def test_a_confirmed_motion_is_carried_out(capsys, file, supervisor, terminal, words, call, line):
+    terminal("y\n")
+    status, _, err = run(capsys, "rig", words[0], file(), *words[1:])
+    assert line in err
+    assert supervisor.calls == [("rig", "Bench"), ("arm",), call, ("closed",)]
+    assert status == 0
+    assert err.endswith("done\n")
+
+
+@pytest.mark.usefixtures("device")
+@pytest.mark.parametrize("answer", ["\n", "n\n", "no\n", "", "yess\n"])
+@pytest.mark.parametrize(("words", "call", "line"), MOTIONS[::3])
+def test_a_motion_that_is_not_confirmed_does_not_happen(
+    capsys, file, supervisor, terminal, words, call, line, answer
+):
+    terminal(answer)
+    status, _, err = run(capsys, "rig", words[0], file(), *words[1:])
+    assert line in err, f"asked before {call}"
+    assert supervisor.calls == []
+    assert status == 1
+    assert "not confirmed: nothing was moved" in err
+
+
+@pytest.mark.usefixtures("device")
+@pytest.mark.parametrize(("words", "call", "line"), MOTIONS[::3])
+def test_without_a_terminal_yes_is_needed(capsys, file, supervisor, monkeypatch, words, call, line):
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: False))
+    status, _, err = run(capsys, "rig", words[0], file(), *words[1:])
+    assert (status, supervisor.calls) == (2, [])
+    assert "no terminal to confirm the motion on: use --yes to move without asking" in err
+    status, _, err = run(capsys, "rig", words[0], file(), *words[1:], "--yes")
+    assert (status, supervisor.calls[2]) == (0, call)
+    assert line in err
+
+
+@pytest.mark.usefixtures("device")
+@pytest.mark.parametrize(("words", "call", "line"), MOTIONS[::3])
+def test_ctrl_c_stops_what_moves(capsys, file, supervisor, words, call, line):
+    supervisor.failure = KeyboardInterrupt()
+    status, _, err = run(capsys, "rig", words[0], file(), *words[1:], "--yes")
+    assert supervisor.calls == [("rig", "Bench"), ("arm",), call, ("stop",), ("closed",)]
+    assert status == 130
+    assert line in err
+    assert "done" not in err
+
+
+@pytest.mark.usefixtures("device")
+def test_ctrl_c_at_the_question_moves_nothing(capsys, file, supervisor, terminal):
+    terminal(KeyboardInterrupt())
+    status, _, _ = run(capsys, "rig", "retract", file())
+    assert (status, supervisor.calls) == (130, [])
+
+
+@pytest.mark.usefixtures("device")
+def test_a_fault_is_reported_with_its_reason_and_stops(capsys, file, supervisor):
+    supervisor.failure = DriverError("insertion: stalled at 28.1 mm")
+    status, _, err = run(capsys, "rig", "retract", file(), "--yes")
+    assert (status, supervisor.calls[-2:]) == (1, [("stop",), ("closed",)])
+    assert "flexneedle: insertion: stalled at 28.1 mm" in err
+    assert "done" not in err
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (
+            ("jog", "insertion", "91"),
+            "insertion to 121 mm: beyond the soft limits, 0 to 120 mm; it is at 30 mm",
+        ),
+        (("jog", "insertion", "5deg"), "distance '5deg': the unit of insertion is mm"),
+        (("jog", "guide_z", "1"), "axis 'guide_z': must be one of insertion, rotation, guide_y"),
+        (("jog", "insertion", "1", "--speed", "11"), "speed 11: must be above 0 and at most 10"),
+        (("retract", "--to", "31"), "must be below 30 mm, where the insertion axis is"),
+        (("retract", "--to", "-1"), "insertion to -1 mm: beyond the soft limits"),
+        (("home", "guide_y"), 'axis guide_y: has home = "absolute"'),
+    ],
+)
+def test_what_must_not_be_is_refused_before_anything_moves(capsys, file, device, supervisor, words, line):
+    status, _, err = run(capsys, "rig", words[0], file(), *words[1:], "--yes")
+    assert status == 2
+    assert line in err
+    assert (supervisor.calls, device.calls) == ([], [])
+
+
+def test_several_axes_are_homed_one_after_the_other(capsys, file, device, supervisor):
+    status, _, err = run(capsys, "rig", "home", file(), "--yes")
+    assert (status, supervisor.calls[2:4]) == (0, [("home", "insertion"), ("home", "rotation")])
+    assert "rotation: stays where it is, and its position is called 0 deg" in err
+    assert device.calls == []
+
+
+def test_axes_with_absolute_encoders_need_no_homing(capsys, file, supervisor):
+    only = file({"axes.rotation": None, "axes.guide_y": None, "axes.insertion.home": "absolute"})
+    status, _, err = run(capsys, "rig", "home", only, "--yes")
+    assert (status, supervisor.calls) == (0, [])
+    assert "no axis needs homing" in err
+
+
+def test_a_driver_without_the_channel_is_an_error(capsys, file, monkeypatch, supervisor):
+    monkeypatch.setattr(bench_rig, "drivers", lambda _settings, _channels: Motors(("A",)))
+    status, _, err = run(capsys, "rig", "jog", file(), "insertion", "1", "--yes")
+    assert (status, supervisor.calls) == (1, [])
+    assert "the driver has no channel B, C; it has A" in err
