@@ -99,6 +99,7 @@ def _add_galil(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         metavar="KIND[=DETAIL]@SECONDS[:DURATION]",
         help="inject a fault at SECONDS after the first motion; repeatable; see docs/rig/galil.md",
     )
+    galil.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of changed bytes (default: 0)")
     galil.set_defaults(handler=_emulate_galil)
 
 
@@ -147,7 +148,7 @@ def _emulate_galil(args: argparse.Namespace) -> int:
         set_realtime_priority()  # a real device does not wait for other processes on this machine
         try:
             print("{}:{}".format(*tcp.address), flush=True)
-            serve(GalilSession(Device(), faults, monotonic()), tcp, _print_line)
+            serve(GalilSession(Device(), faults, monotonic(), args.seed), tcp, _print_line)
         except KeyboardInterrupt:
             return 0
 

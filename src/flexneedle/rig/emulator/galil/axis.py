@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 
-from flexneedle.rig.emulator.galil.profile import SAMPLE_S, Profile, advanced, halted, stopped
+from flexneedle.rig.emulator.galil.profile import DECELERATION, SAMPLE_S, Profile, advanced, halted, stopped
 
 FOLLOWS = "follows"
 FAULTS = ("stall", "lag", "overshoot", "reversed", "limit")
@@ -17,15 +17,19 @@ RUNNING, ARRIVED, FORWARD_LIMIT, REVERSE_LIMIT, STOPPED, ABORTED, ERROR_OFF = 0,
 """Stop codes, as SC reports them."""
 
 _FAR = 2_147_483_647.0
+_OFF_ON_ERROR, _OFF_ON_SWITCH = 1, 2
+_ROUNDING = 1e-6  # counts; steps of the encoder are summed up
 
 
 @dataclass(frozen=True)
 class Axis:
     """An axis. encoder: measured position; forward, reverse: software limits; switches: positions of the limit
-    switches; error_limit: position error (ER); off_on_error: whether the motor is switched off beyond it (OE).
+    switches; deceleration, limit_deceleration: to its goal or after a stop (DC), and at a limit (SD); error_limit:
+    position error (ER), none if negative; off_on_error: OE, 1 to switch the motor off beyond it and on an abort, 2 at
+    a limit switch, 3 both.
 
-    relative, absolute: of the next motion, PR or PA; tracking: whether it follows PA at once (PT); stop: why it
-    rests; fault: what the motor does.
+    relative, absolute: of the next motion, PR or PA; tracking: whether it follows PA at once (PT); rested: commanded
+    position at which the last motion ended; stop: why it rests; fault: what the motor does.
     """
 
     profile: Profile = field(default_factory=Profile)
@@ -36,11 +40,14 @@ class Axis:
     jog: float | None = None
     relative: float | None = None
     absolute: float = 0.0
+    rested: float = 0.0
     forward: float = _FAR
-    reverse: float = -_FAR
+    reverse: float = -_FAR - 1.0
+    deceleration: float = DECELERATION
+    limit_deceleration: float = DECELERATION
     switches: tuple[float, float] = (-math.inf, math.inf)
     error_limit: float = 16_384.0
-    off_on_error: bool = False
+    off_on_error: int = 0
     stop: int = ARRIVED
     fault: str = FOLLOWS
 
@@ -61,40 +68,56 @@ class Axis:
         return self.absolute if self.relative is None else self.profile.position + self.relative
 
     def blocked(self, direction: float) -> int | None:
-        """The stop code of a limit in this direction, if one is there."""
+        """The stop code of a limit in this direction, if one is there. A software limit begins a count beyond."""
         reverse, forward = self.at_switches
-        if direction > 0.0 and (forward or self.profile.position >= self.forward):
+        if direction > 0.0 and (forward or self.profile.position >= self.forward + 1.0):
             return FORWARD_LIMIT
-        if direction < 0.0 and (reverse or self.profile.position <= self.reverse):
+        if direction < 0.0 and (reverse or self.profile.position <= self.reverse - 1.0):
             return REVERSE_LIMIT
         return None
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing changes in a sample: the motor is off, or commanded and measured position rest as one."""
+        rests = self.profile.at_rest and abs(self.error) < _ROUNDING
+        return not self.servo or (rests and self.running == self.tracking)
 
 
 def begun(axis: Axis) -> Axis:
     """The axis on its way to what is set."""
-    if axis.jog is not None:
-        profile = replace(axis.profile, goal=None, cruise=axis.jog, stopping=False)
-    else:
-        profile = replace(axis.profile, goal=axis.goal, stopping=False)
+    goal, cruise = (axis.goal, 0.0) if axis.jog is None else (None, axis.jog)
+    profile = replace(axis.profile, goal=goal, cruise=cruise, stopping=False, deceleration=axis.deceleration)
     return replace(axis, profile=profile, running=True, stop=RUNNING, relative=None, absolute=axis.goal)
 
 
 def tracked(axis: Axis, position: float) -> Axis:
     """The axis following a new position at once."""
-    profile = replace(axis.profile, goal=position, stopping=False)
+    profile = replace(axis.profile, goal=position, stopping=False, deceleration=axis.deceleration)
     return replace(axis, profile=profile, absolute=position, running=True, stop=RUNNING)
 
 
 def slowed(axis: Axis, why: int) -> Axis:
-    """The axis slowing down to rest."""
-    return replace(axis, profile=stopped(axis.profile), tracking=False, jog=None, stop=why)
+    """The axis slowing down to rest, with SD at a limit, else with DC."""
+    at_limit = why in (FORWARD_LIMIT, REVERSE_LIMIT)
+    rate = axis.limit_deceleration if at_limit else axis.deceleration
+    profile = replace(stopped(axis.profile), deceleration=rate)
+    return replace(axis, profile=profile, tracking=False, jog=None, stop=why)
 
 
 def off(axis: Axis, why: int | None = None) -> Axis:
-    """The axis with its motor off: the commanded position follows the encoder."""
+    """The axis with its motor off: the commanded position follows the encoder. why: stop code if it was in motion."""
+    stop = why if why is not None and axis.running else axis.stop
     profile = halted(replace(axis.profile, position=axis.encoder))
-    stop = axis.stop if why is None else why
-    return replace(axis, profile=profile, servo=False, running=False, tracking=False, jog=None, stop=stop)
+    return replace(
+        axis,
+        profile=profile,
+        servo=False,
+        running=False,
+        tracking=False,
+        jog=None,
+        rested=axis.encoder,
+        stop=stop,
+    )
 
 
 def on(axis: Axis) -> Axis:
@@ -106,8 +129,14 @@ def on(axis: Axis) -> Axis:
 
 
 def aborted(axis: Axis) -> Axis:
-    """The axis at rest at once."""
-    return replace(axis, profile=halted(axis.profile), running=False, tracking=False, jog=None, stop=ABORTED)
+    """The axis at rest at once; its motor off if it is to be switched off on errors."""
+    if axis.off_on_error:
+        return off(axis, ABORTED)
+    stop = ABORTED if axis.running else axis.stop
+    profile = halted(axis.profile)
+    return replace(
+        axis, profile=profile, running=False, tracking=False, jog=None, rested=profile.position, stop=stop
+    )
 
 
 def defined(axis: Axis, position: float) -> Axis:
@@ -115,27 +144,35 @@ def defined(axis: Axis, position: float) -> Axis:
     shift = position - axis.encoder
     profile = halted(replace(axis.profile, position=axis.profile.position + shift))
     low, high = axis.switches
+    switches = (low + shift, high + shift)
     return replace(
-        axis, profile=profile, encoder=position, absolute=position, switches=(low + shift, high + shift)
+        axis, profile=profile, encoder=position, absolute=position, rested=profile.position, switches=switches
     )
 
 
 def sampled(axis: Axis) -> Axis:
     """The axis after one sample of the controller."""
-    if not axis.servo:
+    if axis.idle:
         return axis
     before = axis.profile
     limit = axis.blocked(_direction(axis)) if axis.running and not before.stopping else None
     if limit is not None:
+        if axis.off_on_error & _OFF_ON_SWITCH and any(axis.at_switches):
+            return off(axis, limit)
         axis = slowed(axis, limit)
     profile = advanced(axis.profile) if axis.running else axis.profile
     axis = replace(axis, profile=profile, encoder=_followed(axis, before, profile))
-    if axis.running and profile.at_rest:
-        arrived = ARRIVED if axis.stop == RUNNING else axis.stop
-        axis = replace(axis, running=axis.tracking, stop=RUNNING if axis.tracking else arrived)
-    if axis.off_on_error and abs(axis.error) > axis.error_limit:
+    if axis.off_on_error & _OFF_ON_ERROR and abs(axis.error) > axis.error_limit >= 0.0:
         return off(axis, ERROR_OFF)
-    return axis
+    return _ended(axis) if axis.running and profile.at_rest else axis
+
+
+def _ended(axis: Axis) -> Axis:
+    """The axis at the end of its motion. In position tracking it waits for the next goal."""
+    if axis.tracking:
+        return replace(axis, rested=axis.profile.position, stop=RUNNING)
+    stop = ARRIVED if axis.stop == RUNNING else axis.stop
+    return replace(axis, running=False, rested=axis.profile.position, stop=stop)
 
 
 def _direction(axis: Axis) -> float:

@@ -3,8 +3,8 @@
 It has the commands that drive axes A to D: motor on and off, speeds, relative and absolute moves, position tracking,
 jog, stop, abort, limits, and queries of positions, errors and reasons. A command is two capital letters, axes and
 values as `PRA=100`, `PR 100,,50` or `BGAC`; a line may have several with `;` between them. Each is answered by its data
-and `:`, or by `?`, after which `TC1` reports why. Facts are those of the maker's published command reference; it
-was not compared with a controller.
+and `:`, or by `?`, after which `TC1` reports why. Facts are those of Galil's Command Reference for the DMC-4103, the
+series of the DMC-4143; it was not compared with a controller.
 """
 
 import math
@@ -14,32 +14,37 @@ from dataclasses import dataclass, replace
 
 from flexneedle.rig.emulator.galil import axis as one
 from flexneedle.rig.emulator.galil.axis import Axis
-from flexneedle.rig.emulator.galil.profile import SAMPLE_S
+from flexneedle.rig.emulator.galil.profile import SAMPLE_S, stopped
 
 AXES = "ABCD"
 REVISION = "DMC4143 Rev 1.3d"
 SAMPLES_HZ = round(1.0 / SAMPLE_S)
 
-_ERRORS = {
-    0: "",
+ERRORS = {
     1: "Unrecognized command",
     4: "Operand error",
     6: "Number out of range",
     7: "Command not valid while running",
+    13: "JG only valid when running in jog mode",
     20: "Begin not valid with motor off",
     21: "Begin not valid while running",
-    22: "Begin not possible due to limit switch",
+    22: "Begin not possible due to Limit Switch",
     50: "Not enough fields",
     51: "Question mark not valid",
 }
+"""Error codes that it may report, with their texts."""
+
 _MOST = 2_147_483_647.0
-_MOST_SPEED = 22_000_000.0
-_MOST_ACCELERATION = 1_073_740_800.0
+_MOST_SPEED = 15_000_000.0  # of servo motors
+_LEAST_ACCELERATION, _MOST_ACCELERATION = 1024.0, 1_073_740_800.0  # at 1000 samples a second (TM 1000)
+_SPEED_STEP, _ACCELERATION_STEP = 2.0, 1024.0  # set values are rounded down to their multiples
 _LONGEST_LINE = 80
 
 _FORM = re.compile(r"(?P<name>[A-Z]{2})\s*(?P<rest>.*)")
 _ASSIGNED = re.compile(r"(?P<axis>[A-D])\s*=\s*(?P<value>[^,]*)")
 _OPERAND = re.compile(r"_(?P<name>[A-Z]{2})(?P<axis>[A-D])")
+_GENERAL = {"_TM": 1000.0, "_CN0": -1.0, "_PF": 10.0, "_BV": float(len(AXES))}
+"""Operands without an axis: sample time (µs), polarity of limit switches, format of positions, number of axes."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +65,15 @@ class _RefusalError(Exception):
 
 def advanced(device: Device, samples: int = 1) -> Device:
     """The controller after a number of its samples, 1 ms each."""
+    return replace(device, axes=tuple(_after(axis, samples) for axis in device.axes))
+
+
+def _after(axis: Axis, samples: int) -> Axis:
     for _ in range(samples):
-        device = replace(device, axes=tuple(one.sampled(axis) for axis in device.axes))
-    return device
+        if axis.idle:
+            break
+        axis = one.sampled(axis)
+    return axis
 
 
 def reply(device: Device, line: str) -> tuple[Device, str]:
@@ -159,28 +170,43 @@ def _at_rest(axis: Axis) -> None:
 
 
 def _speed(axis: Axis, value: float) -> Axis:
-    return replace(axis, profile=replace(axis.profile, speed=_within(value, 0.0, _MOST_SPEED)))
+    speed = _rounded_down(_within(abs(value), 0.0, _MOST_SPEED), _SPEED_STEP)
+    return replace(axis, profile=replace(axis.profile, speed=speed))
+
+
+def _rounded_down(value: float, step: float) -> float:
+    return math.floor(value / step) * step
+
+
+def _rate(value: float) -> float:
+    return _rounded_down(_within(value, _LEAST_ACCELERATION, _MOST_ACCELERATION), _ACCELERATION_STEP)
 
 
 def _acceleration(axis: Axis, value: float) -> Axis:
-    return replace(
-        axis, profile=replace(axis.profile, acceleration=_within(value, 1024.0, _MOST_ACCELERATION))
-    )
+    return replace(axis, profile=replace(axis.profile, acceleration=_rate(value)))
 
 
 def _deceleration(axis: Axis, value: float) -> Axis:
-    return replace(
-        axis, profile=replace(axis.profile, deceleration=_within(value, 1024.0, _MOST_ACCELERATION))
-    )
+    """DC, which may change in a jog and after a stop, but not on the way to a position."""
+    stopping = axis.profile.stopping
+    if axis.running and axis.jog is None and not stopping and not axis.profile.at_rest:
+        raise _RefusalError(7)
+    rate = _rate(value)
+    profile = replace(axis.profile, deceleration=rate) if axis.jog is not None or stopping else axis.profile
+    return replace(axis, deceleration=rate, profile=profile)
 
 
 def _relative(axis: Axis, value: float) -> Axis:
     _at_rest(axis)
-    return replace(axis, relative=_within(value, -_MOST, _MOST), jog=None)
+    return replace(axis, relative=_counts(value), jog=None)
+
+
+def _counts(value: float) -> float:
+    return float(int(_within(value, -_MOST - 1.0, _MOST)))
 
 
 def _absolute(axis: Axis, value: float) -> Axis:
-    value = _within(value, -_MOST, _MOST)
+    value = _counts(value)
     if axis.tracking:
         if axis.blocked(value - axis.profile.position) is not None:
             raise _RefusalError(22)
@@ -190,53 +216,62 @@ def _absolute(axis: Axis, value: float) -> Axis:
 
 
 def _jogged(axis: Axis, value: float) -> Axis:
-    value = _within(value, -_MOST_SPEED, _MOST_SPEED)
+    value = math.copysign(_rounded_down(_within(abs(value), 0.0, _MOST_SPEED), _SPEED_STEP), value)
     if axis.running and axis.jog is not None:
         return replace(axis, jog=value, profile=replace(axis.profile, cruise=value))
-    _at_rest(axis)
+    if axis.running:
+        raise _RefusalError(13)
     return replace(axis, jog=value, relative=None)
 
 
 def _position(axis: Axis, value: float) -> Axis:
     _at_rest(axis)
-    return one.defined(axis, _within(value, -_MOST, _MOST))
+    return one.defined(axis, _counts(value))
 
 
 def _track(axis: Axis, value: float) -> Axis:
     if value not in (0.0, 1.0):
         raise _RefusalError(6)
-    if value == 1.0:
-        _at_rest(axis)
-        if not axis.servo:
-            raise _RefusalError(20)
-        return replace(axis, tracking=True, jog=None, relative=None, absolute=axis.profile.position)
-    return one.slowed(axis, one.STOPPED) if axis.running else replace(axis, tracking=False)
+    if value == 0.0:
+        return one.slowed(axis, one.STOPPED) if axis.running else replace(axis, tracking=False)
+    if not axis.servo:
+        raise _RefusalError(20)
+    if axis.tracking or axis.profile.stopping:
+        return replace(axis, tracking=True)
+    if axis.jog is not None and axis.running:
+        return replace(axis, tracking=True, jog=None, profile=stopped(axis.profile))
+    goal = axis.profile.goal if axis.running else axis.profile.position
+    return replace(axis, tracking=True, jog=None, relative=None, absolute=goal or 0.0)
+
+
+def _whole(value: float, least: float, most: float) -> float:
+    if value != int(value):
+        raise _RefusalError(6)
+    return _within(value, least, most)
 
 
 _SETTINGS: dict[str, tuple[Callable[[Axis], float], Callable[[Axis, float], Axis]]] = {
     "SP": (lambda axis: axis.profile.speed, _speed),
     "AC": (lambda axis: axis.profile.acceleration, _acceleration),
-    "DC": (lambda axis: axis.profile.deceleration, _deceleration),
-    "PR": (lambda axis: axis.relative or 0.0, _relative),
-    "PA": (lambda axis: axis.absolute, _absolute),
+    "DC": (lambda axis: axis.deceleration, _deceleration),
+    "SD": (
+        lambda axis: axis.limit_deceleration,
+        lambda axis, value: replace(axis, limit_deceleration=_rate(value)),
+    ),
+    "PR": (lambda axis: axis.goal - axis.profile.position, _relative),
+    "PA": (lambda axis: axis.rested, _absolute),
     "JG": (lambda axis: axis.jog or 0.0, _jogged),
     "DP": (lambda axis: axis.encoder, _position),
     "PT": (lambda axis: float(axis.tracking), _track),
-    "FL": (
-        lambda axis: axis.forward,
-        lambda axis, value: replace(axis, forward=_within(value, -_MOST, _MOST)),
-    ),
-    "BL": (
-        lambda axis: axis.reverse,
-        lambda axis, value: replace(axis, reverse=_within(value, -_MOST - 1.0, _MOST)),
-    ),
+    "FL": (lambda axis: axis.forward, lambda axis, value: replace(axis, forward=_counts(value))),
+    "BL": (lambda axis: axis.reverse, lambda axis, value: replace(axis, reverse=_counts(value))),
     "ER": (
         lambda axis: axis.error_limit,
-        lambda axis, value: replace(axis, error_limit=_within(value, -1.0, _MOST)),
+        lambda axis, value: replace(axis, error_limit=_whole(value, -1.0, _MOST)),
     ),
     "OE": (
         lambda axis: float(axis.off_on_error),
-        lambda axis, value: replace(axis, off_on_error=_within(value, 0.0, 3.0) > 0.0),
+        lambda axis, value: replace(axis, off_on_error=int(_whole(value, 0.0, 3.0))),
     ),
 }
 
@@ -268,8 +303,13 @@ def _stop(axis: Axis) -> Axis:
     return one.slowed(axis, one.STOPPED) if axis.running else replace(axis, tracking=False)
 
 
+def _motor_on(axis: Axis) -> Axis:
+    _at_rest(axis)
+    return one.on(axis)
+
+
 _ACTIONS: dict[str, Callable[[Axis], Axis]] = {
-    "SH": one.on,
+    "SH": _motor_on,
     "MO": _motor_off,
     "BG": _begin,
     "ST": _stop,
@@ -301,34 +341,42 @@ _REPORTED: dict[str, Callable[[Axis], float]] = {
     "TS": _switches,
     "SC": lambda axis: axis.stop,
 }
-_OPERANDS: dict[str, Callable[[Axis], float]] = _REPORTED | {
+_OPERANDS: dict[str, Callable[[Axis], float]] = {
+    **_REPORTED,
+    **{name: reported for name, (reported, _) in _SETTINGS.items()},
     "BG": lambda axis: float(axis.running),
     "MO": lambda axis: float(not axis.servo),
     "LF": lambda axis: float(not axis.at_switches[1]),
     "LR": lambda axis: float(not axis.at_switches[0]),
+    "MT": lambda _: 1.0,
+    "LD": lambda _: 0.0,
 }
 
 
 def _report_code(device: Device, rest: str) -> tuple[Device, str]:
-    if rest not in ("", "0", "1"):
+    if rest not in ("", "0", "1", "?"):
         raise _RefusalError(4)
-    text = f"{device.error} {_ERRORS[device.error]}".strip() if rest == "1" else str(device.error)
+    text = f"{device.error} {ERRORS.get(device.error, '')}".strip() if rest == "1" else str(device.error)
     return replace(device, error=0), _line(text)
 
 
 def _message(device: Device, rest: str) -> tuple[Device, str]:
-    values = []
-    for text in rest.split(","):
-        operand = _OPERAND.fullmatch(text.strip())
-        if operand is None or operand["name"] not in _OPERANDS:
-            raise _RefusalError(1)
-        values.append(_OPERANDS[operand["name"]](device.axes[AXES.index(operand["axis"])]))
+    values = (_operand(device, text.strip()) for text in rest.split(","))
     return device, _line(" ".join(f"{value:.4f}" for value in values))
 
 
+def _operand(device: Device, text: str) -> float:
+    if text in _GENERAL:
+        return _GENERAL[text]
+    operand = _OPERAND.fullmatch(text)
+    if operand is None or operand["name"] not in _OPERANDS:
+        raise _RefusalError(1)
+    return _OPERANDS[operand["name"]](device.axes[AXES.index(operand["axis"])])
+
+
 def _abort(device: Device, rest: str) -> tuple[Device, str]:
-    if rest:
-        raise _RefusalError(4)
+    if rest not in ("", "0", "1"):  # 1: not the programs, of which it has none
+        raise _RefusalError(6)
     return replace(device, axes=tuple(one.aborted(axis) for axis in device.axes)), ""
 
 

@@ -8,6 +8,8 @@ import math
 from dataclasses import dataclass, replace
 
 SAMPLE_S = 0.001
+DECELERATION = 256_000.0
+"""Deceleration (counts/s²) of a controller that has not been set up."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class Profile:
     cruise: float = 0.0
     speed: float = 25_000.0
     acceleration: float = 256_000.0
-    deceleration: float = 256_000.0
+    deceleration: float = DECELERATION
     stopping: bool = False
 
     @property

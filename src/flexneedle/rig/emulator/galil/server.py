@@ -12,11 +12,13 @@ from dataclasses import dataclass, field, replace
 from time import monotonic
 from typing import NoReturn, Self
 
+import numpy as np
+
 from flexneedle.errors import InputError
 from flexneedle.rig.emulator.faults import SECONDS, Fault, FaultKind, active
 from flexneedle.rig.emulator.galil import axis as one
 from flexneedle.rig.emulator.galil.axis import Axis
-from flexneedle.rig.emulator.galil.controller import AXES, SAMPLES_HZ, Device, advanced, reply
+from flexneedle.rig.emulator.galil.controller import AXES, ERRORS, SAMPLES_HZ, Device, advanced, reply
 
 _TICK_S = 0.005
 _LONGEST_LINE = 4096
@@ -35,8 +37,16 @@ FAULTS = {
     "limit": _of_an_axis("both limit switches of an axis are active (A, or limit=AXIS)"),
     "off": _of_an_axis("a motor is switched off (A, or off=AXIS)"),
     "reset": _of_an_axis("the position of an axis becomes 0 (A, or reset=AXIS)"),
-    "refuse": FaultKind("every command is answered by ?"),
+    "refuse": FaultKind(
+        "every command but TC is answered by ? (7, or refuse=CODE)",
+        "7",
+        "error code",
+        tuple(map(str, ERRORS)),
+    ),
     "silence": FaultKind("commands are carried out, but not answered"),
+    "garbled": FaultKind("a byte of each reply is changed"),
+    "cut": FaultKind("half of each reply is sent"),
+    "chatter": FaultKind("a message that was not asked for precedes each reply"),
     "half-open": FaultKind("nothing is received and nothing answered; the connection stays"),
     "delay": FaultKind("replies are delayed (0.2, or delay=SECONDS)", "0.2", SECONDS),
     "unplug": FaultKind("connections are closed, and refused for the duration"),
@@ -44,21 +54,27 @@ FAULTS = {
 """The kinds of fault of the controller; their times are since the first motion."""
 
 _OF_MOTORS = one.FAULTS
+_CHATTER = b" 17.0000\r\n"
 
 
 @dataclass
 class GalilSession:
     """The controller and its faults over time. Times are monotonic, in seconds; power_on is the first.
 
-    moved_since: when an axis first moved, from which faults count; done: faults of one instant that have happened.
+    seed: of garbled replies; moved_since: when an axis first moved, from which faults count; done: faults of one
+    instant that have happened.
     """
 
     device: Device
     faults: Sequence[Fault]
     power_on: float
+    seed: int = 0
     moved_since: float | None = None
     _samples: int = 0
     _done: set[Fault] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self._random = np.random.default_rng((self.seed, 1))
 
     def faults_at(self, now: float) -> dict[str, Fault]:
         """Return the active faults by kind; none before the first motion."""
@@ -89,10 +105,35 @@ class GalilSession:
         self.advance(now)
         faults = self.faults_at(now)
         if "refuse" in faults:
-            return now, b"?"
-        self.device, answer = reply(self.device, line)
+            self.device, answer = _refused(self.device, line, int(faults["refuse"].detail))
+        else:
+            self.device, answer = reply(self.device, line)
         delay = float(faults["delay"].detail) if "delay" in faults else 0.0
-        return now + delay, b"" if "silence" in faults else answer.encode("ascii", "replace")
+        return now + delay, self._damaged(answer.encode("ascii", "replace"), faults)
+
+    def _damaged(self, complete: bytes, faults: dict[str, Fault]) -> bytes:
+        if "silence" in faults:
+            return b""
+        if "chatter" in faults:
+            complete = _CHATTER + complete
+        if "cut" in faults:
+            return complete[: len(complete) // 2]
+        if "garbled" in faults:
+            at, flipped = self._random.integers(len(complete)), self._random.integers(1, 256)
+            complete = complete[:at] + bytes([complete[at] ^ int(flipped)]) + complete[at + 1 :]
+        return complete
+
+
+def _refused(device: Device, line: str, code: int) -> tuple[Device, str]:
+    """A line of which every command but TC is refused for this reason."""
+    answers = []
+    for command in line.split(";"):
+        if command.strip().startswith("TC"):
+            device, answer = reply(device, command)
+        else:
+            device, answer = replace(device, error=code), "?"
+        answers.append(answer)
+    return device, "".join(answers)
 
 
 _ONCE: dict[str, Callable[[Axis], Axis]] = {

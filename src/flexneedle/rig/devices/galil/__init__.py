@@ -1,0 +1,1 @@
+"""Motors on a Galil DMC-4143, over TCP."""

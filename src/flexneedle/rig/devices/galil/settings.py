@@ -1,0 +1,71 @@
+"""Settings of the driver `galil` in a rig file, beside `kind`."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, ValidationError
+
+from flexneedle.errors import RigError
+from flexneedle.scenario.problems import Problem, describe, to_line
+from flexneedle.scenario.sections.fields import Section
+
+AXES = "ABCDEFGH"
+"""Axes of the largest controller of the series; a DMC-4143 has the first four."""
+
+_TELNET = 23
+_LAST_PORT = 65535
+_ADDRESS = re.compile(r"(?P<host>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.%a-z]+\])(:(?P<port>[0-9]{1,5}))?")
+
+
+def _address(text: str) -> str:
+    form = _ADDRESS.fullmatch(text)
+    if form is None or not 1 <= int(form["port"] or _TELNET) <= _LAST_PORT:
+        raise ValueError(f"must be HOST or HOST:PORT, such as 192.168.1.10:{_TELNET}")
+    return text
+
+
+class GalilSettings(Section):
+    """Table `driver` of a rig file with `kind = "galil"`."""
+
+    address: Annotated[str, AfterValidator(_address)]
+    """Host name or IP address of the controller, and port if it is not 23."""
+    mode: Literal["tracking", "moves"] = "tracking"
+    """Position tracking (PT), or a move of its own for each target (PA, BG)."""
+    reply_timeout_ms: Annotated[float, Field(ge=1, le=1000)] = 100.0
+    """Time for a call, with all its replies, after which the connection counts as lost."""
+
+    @property
+    def host(self) -> str:
+        """Host of the address."""
+        form = _ADDRESS.fullmatch(self.address)
+        return form["host"].strip("[]") if form else ""
+
+    @property
+    def port(self) -> int:
+        """Port of the address."""
+        form = _ADDRESS.fullmatch(self.address)
+        return int(form["port"] or _TELNET) if form else _TELNET
+
+
+def checked(settings: Mapping[str, Any], channels: Sequence[str]) -> GalilSettings:
+    """Return the settings of a driver with these channels. Raises RigError with one line for each problem."""
+    problems = [to_line(problem) for problem in _channel_problems(channels)]
+    try:
+        found = GalilSettings.model_validate(dict(settings))
+    except ValidationError as error:
+        found = None
+        problems = [f"driver.{line}" for line in describe(error, GalilSettings)] + problems
+    if found is None or problems:
+        raise RigError(*problems)
+    return found
+
+
+def _channel_problems(channels: Sequence[str]) -> Iterator[Problem]:
+    for channel in channels:
+        if len(channel) != 1 or channel not in AXES:
+            yield Problem("channel", channel, f"must be an axis of the controller, one of {', '.join(AXES)}")
+        elif channels.count(channel) > 1:
+            yield Problem("channel", channel, "each axis once")
+    if not channels:
+        yield Problem("channel", None, "at least one")
