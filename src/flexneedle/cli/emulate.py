@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import json
 import signal
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from flexneedle.console.common import HelpFormatter, examples, seed
+
+if TYPE_CHECKING:
+    from flexneedle.rig.emulator.coupled.job import Job
+    from flexneedle.rig.emulator.orders import Orders
 
 _EXAMPLES = examples(
     "flexneedle emulate aurora --link /tmp/aurora",
     "flexneedle emulate galil --port 2323",
+    "flexneedle emulate rig emulated phantom",
 )
 _AURORA_EXAMPLES = examples(
     "flexneedle emulate aurora --link /tmp/aurora",
@@ -22,6 +30,11 @@ _GALIL_EXAMPLES = examples(
     "flexneedle emulate galil --port 2323 --fault stall=A@5",
 )
 
+
+_RIG_EXAMPLES = examples(
+    "flexneedle emulate rig emulated phantom --seed 3 --truth truth.csv",
+    "flexneedle emulate rig my-rig.toml phantom3d --fault galil:stall=A@5 --fault aurora:missing@8:0.5",
+)
 
 _LAST_PORT = 65535
 
@@ -37,6 +50,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     devices = parser.add_subparsers(title="devices", metavar="DEVICE", required=True)
     _add_aurora(devices)
     _add_galil(devices)
+    _add_rig(devices)
 
 
 def _add_aurora(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -103,6 +117,43 @@ def _add_galil(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     galil.set_defaults(handler=_emulate_galil)
 
 
+def _add_rig(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    rig = devices.add_parser(
+        "rig",
+        help="a whole rig: motors that move a virtual needle, and a tracker that measures its tip",
+        description="Emulate the controller and the tracker of a rig file, with the virtual phantom of a scenario "
+        "between them, in three processes, until interrupted (Ctrl-C). Print one line when all are ready, and one for "
+        "each event. A line fault DEVICE:KIND[=DETAIL][:DURATION] on stdin injects a fault, clear ends all.",
+        epilog=_RIG_EXAMPLES,
+        formatter_class=HelpFormatter,
+    )
+    rig.add_argument("rig", metavar="RIG", help="rig file: its path, or emulated for the one of the package")
+    rig.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path of a scenario")
+    rig.add_argument(
+        "--seed",
+        type=seed,
+        default=0,
+        metavar="N",
+        help="seed of phantom and noise: the phantom is that of flexneedle insert --seed N (default: 0)",
+    )
+    rig.add_argument(
+        "--plan",
+        type=Path,
+        metavar="DIR",
+        help="folder with the plan, where the scenario leaves the entry to it",
+    )
+    rig.add_argument("--truth", type=Path, metavar="FILE", help="write the true states to a new CSV file")
+    rig.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="DEVICE:KIND[=DETAIL]@SECONDS[:DURATION]",
+        help="inject a fault of aurora or galil at SECONDS after the start of tracking, or after the first motion; "
+        "repeatable; see docs/rig/emulate.md",
+    )
+    rig.set_defaults(handler=_emulate_rig)
+
+
 def _port(text: str) -> int:
     if not (text.isascii() and text.isdigit() and int(text) <= _LAST_PORT):
         raise argparse.ArgumentTypeError(f"{text}: must be a port from 0 (one that is free) to {_LAST_PORT}")
@@ -115,9 +166,8 @@ def _emulate_aurora(args: argparse.Namespace) -> int:
     from flexneedle.rig.devices.priority import set_realtime_priority
     from flexneedle.rig.emulator.aurora import FAULTS, FIRMWARE, fresh
     from flexneedle.rig.emulator.faults import parse_fault
-    from flexneedle.rig.emulator.motion import CENTRE
-    from flexneedle.rig.emulator.orders import Orders
-    from flexneedle.rig.emulator.server import EmulatorSession, Serial, serve
+    from flexneedle.rig.emulator.motion import CENTRE, CIRCLE, Rest
+    from flexneedle.rig.emulator.server import EmulatorSession, Serial, execute, serve
 
     faults = [parse_fault(spec, FAULTS) for spec in args.fault]
     device = fresh(args.sensors, args.firmware or FIRMWARE, has_bx=not args.no_bx)
@@ -126,10 +176,9 @@ def _emulate_aurora(args: argparse.Namespace) -> int:
         set_realtime_priority()  # a real device does not wait for other processes on this machine
         try:
             print(serial.link, flush=True)
-            session = EmulatorSession(
-                device, faults, args.seed, monotonic(), rest=CENTRE if args.still else None
-            )
-            serve(session, serial, Orders(None if sys.stdin is None else sys.stdin.fileno()), _print_line)
+            tip = Rest(CENTRE) if args.still else CIRCLE
+            session = EmulatorSession(device, faults, args.seed, monotonic(), tip=tip)
+            serve(session, serial, _orders(), lambda line: _print_line(execute(session, line)), _print_line)
         except KeyboardInterrupt:
             return 0
 
@@ -140,7 +189,7 @@ def _emulate_galil(args: argparse.Namespace) -> int:
     from flexneedle.rig.devices.priority import set_realtime_priority
     from flexneedle.rig.emulator.faults import parse_fault
     from flexneedle.rig.emulator.galil.controller import Device
-    from flexneedle.rig.emulator.galil.server import FAULTS, GalilSession, Tcp, serve
+    from flexneedle.rig.emulator.galil.server import FAULTS, GalilSession, Tcp, execute, serve
 
     faults = [parse_fault(spec, FAULTS) for spec in args.fault]
     with Tcp(args.host, args.port) as tcp:
@@ -148,9 +197,49 @@ def _emulate_galil(args: argparse.Namespace) -> int:
         set_realtime_priority()  # a real device does not wait for other processes on this machine
         try:
             print("{}:{}".format(*tcp.address), flush=True)
-            serve(GalilSession(Device(), faults, monotonic(), args.seed), tcp, _print_line)
+            session = GalilSession(Device(), faults, monotonic(), args.seed)
+            serve(session, tcp, _orders(), lambda line: _print_line(execute(session, line)), _print_line)
         except KeyboardInterrupt:
             return 0
+
+
+def _emulate_rig(args: argparse.Namespace) -> int:
+    from flexneedle.rig.emulator.coupled.rig import EmulatedRig, split_fault
+
+    faults = tuple(split_fault(given) for given in args.fault)
+    job = _job(args, faults)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with EmulatedRig(job, _print_message) as rig:
+            rig.serve(_orders())
+    except KeyboardInterrupt:
+        return 0
+
+
+def _job(args: argparse.Namespace, faults: tuple[tuple[str, str], ...]) -> Job:
+    from flexneedle.rig.emulator.coupled.job import checked_job
+    from flexneedle.runs.reading import load
+    from flexneedle.scenario.files import load_scenario
+    from flexneedle.scenario.rig import load_rig
+
+    record = None if args.plan is None else load(args.plan)
+    return checked_job(
+        load_rig(args.rig), load_scenario(args.scenario), record, args.seed, args.truth, faults
+    )
+
+
+def _print_message(message: Mapping[str, Any]) -> None:
+    """Print a message of an emulated rig: a line of JSON, or on stderr a note for a person."""
+    if "note" in message:
+        _print_line(f"flexneedle: {message['note']}")
+    else:
+        print(json.dumps(message), flush=True)
+
+
+def _orders() -> Orders:
+    from flexneedle.rig.emulator.orders import Orders
+
+    return Orders(None if sys.stdin is None else sys.stdin.fileno())
 
 
 def _print_line(line: str) -> None:

@@ -73,6 +73,12 @@ class Seeds:
     tracker: np.random.SeedSequence
     room: np.random.SeedSequence
 
+    @classmethod
+    def of(cls, seed: int) -> "Seeds":
+        """Return the seeds of the virtual rig of `insert` with a seed, whose third part is the controller's."""
+        phantom, tracker, _, room = np.random.SeedSequence(seed).spawn(4)
+        return cls(phantom, tracker, room)
+
 
 def virtual_rig(
     scenario: Scenario,
@@ -94,7 +100,7 @@ def virtual_rig(
     if tracker is not None:
         own = tracker(scenario, tank, np.random.default_rng(seeds.tracker))
         return Rig(tank, tank, own, tank.condition)
-    errors = _Errors(truth.bias, _registration_error(scenario.tracker.registration, seeds.room))
+    errors = _Errors(truth.bias, registration_error(scenario.tracker.registration, seeds.room))
     rng, around = (
         np.random.default_rng(seeds.tracker),
         virtual_room(scenario, seeds.room, None if plate_distance_at is None else plate_distance_at(0.0)),
@@ -216,7 +222,7 @@ def _delay(scenario: Scenario) -> float:
     return scenario.phantom.delay_periods * step
 
 
-def _registration_error(registration: Registration | None, seed: np.random.SeedSequence) -> Rigid:
+def registration_error(registration: Registration | None, seed: np.random.SeedSequence) -> Rigid:
     """Error of a registration, drawn from its fiducials and their localisation error."""
     if registration is None or registration.localisation_mm == 0.0:
         return identity()

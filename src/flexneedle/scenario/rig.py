@@ -6,6 +6,7 @@ own beside `kind`, which it checks itself.
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from importlib.resources import files
 from math import radians
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
@@ -18,7 +19,8 @@ from flexneedle.scenario.problems import Problem, describe, refuse
 from flexneedle.scenario.sections.fields import LARGEST, NonNegative, Positive, Section, Title, one_line
 from flexneedle.scenario.sections.registration import Registration
 
-RIGS = Library("a rig file", error=RigError)
+RIGS = Library("a rig file", "rig", files(__package__) / "rigs", RigError)
+"""The rigs that come with the package."""
 
 LINEAR_AXES = ("insertion", "guide_y", "guide_z", "base_y", "base_z")
 """Axes with a length: advance of the base, lateral offsets of guide and base."""
@@ -377,5 +379,8 @@ def settings_of(model: type[Settings], settings: Mapping[str, Any]) -> Settings:
 
 
 def load_rig(path: str | Path) -> RigFile:
-    """Return the rig of a TOML file. Raises RigError with one line for each problem: file, key, value, rule."""
+    """Return the rig of a shipped name or of a TOML file.
+
+    Raises RigError with one line for each problem: file, key, value, rule.
+    """
     return RIGS.load(path, RigFile)

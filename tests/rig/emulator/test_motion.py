@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flexneedle.rig.emulator.motion import RATE_HZ, SENSORS, pose
+from flexneedle.rig.emulator.motion import RATE_HZ, SENSORS, Rest, pose
 
 
 def path(sensor, count=800):
@@ -29,10 +29,10 @@ def test_the_tip_moves_on_a_circle_at_the_speed_of_a_needle():
 
 def test_a_resting_tip_is_at_its_position_with_the_same_jitter():
     rest = (10.0, 20.0, -300.0)
-    positions = np.array([pose("tip", n, 0, rest).position for n in range(800)])
+    positions = np.array([pose("tip", n, 0, Rest(rest)).position for n in range(800)])
     np.testing.assert_allclose(positions.mean(axis=0), rest, atol=0.01)
     np.testing.assert_allclose(np.sqrt(((positions - rest) ** 2).sum(axis=1).mean()), 0.07, rtol=0.1)
-    assert pose("ref1", 5, 0, rest) == pose("ref1", 5, 0)
+    assert pose("ref1", 5, 0, Rest(rest)) == pose("ref1", 5, 0)
 
 
 def test_the_tips_z_axis_is_along_its_motion():

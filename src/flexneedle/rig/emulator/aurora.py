@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 from flexneedle.rig.emulator import codec
 from flexneedle.rig.emulator.codec import Request
-from flexneedle.rig.emulator.faults import BYTE, SECONDS, FaultKind
+from flexneedle.rig.emulator.faults import BYTE, MM, RATIO, SECONDS, FaultKind
 from flexneedle.rig.emulator.motion import SENSORS, EmulatedPose
 
 FIRMWARE = "AURORA Rev 008"
@@ -38,6 +38,12 @@ FAULTS = {
     "silence": FaultKind("no reply"),
     "delay": FaultKind("replies are delayed (0.2, or delay=SECONDS)", "0.2", SECONDS),
     "frozen": FaultKind("the frame number does not increase"),
+    "stuck": _of_a_sensor(
+        "a sensor's values repeat, while the frame number increases (tip, or stuck=SENSOR)"
+    ),
+    "nan": _of_a_sensor("the values of a sensor are not numbers (tip, or nan=SENSOR)"),
+    "jump": FaultKind("the tip is reported 5 mm beside its position (along y, or jump=MM)", "5", MM),
+    "indicator": FaultKind("all indicators are high (0.2, or indicator=VALUE)", "0.2", RATIO),
     "unplug": FaultKind("the cable is pulled, and plugged in again after the duration"),
 }
 """The kinds of fault of the tracker; their times are since tracking first began."""
@@ -367,5 +373,8 @@ def _reading(port: Port, options: int, frame: EmulatedFrame) -> tuple[int, int, 
         return _MISSING, bits, None
     return _VALID, bits, frame.poses[port.sensor or ""]
 
+
+OF_STATUS = ("missing", "out-of-volume", "partly-out", "broken", "disabled")
+"""Faults of a sensor that its status reports."""
 
 _FAULT_BITS = {"out-of-volume": _OUT_OF_VOLUME, "partly-out": _PARTLY_OUT, "broken": _BROKEN}

@@ -6,6 +6,7 @@ A command is ASCII, `NAME:argumentsCRC\\r`, or `NAME arguments\\r` without a che
 
 import struct
 from dataclasses import dataclass
+from math import isfinite
 
 from flexneedle.rig.emulator.motion import EmulatedPose
 
@@ -68,10 +69,17 @@ def binary(body: bytes) -> bytes:
 
 
 def transform_text(pose: EmulatedPose) -> str:
-    """Return a pose in the format of `TX`: quaternion and indicator to 1e-4, position to 0.01 mm."""
-    orientation = "".join(f"{round(part * 10_000):+06d}" for part in pose.orientation)
-    position = "".join(f"{round(part * 100):+07d}" for part in pose.position)
-    return f"{orientation}{position}{round(pose.indicator * 10_000):+06d}"
+    """Return a pose in the format of `TX`: quaternion and indicator to 1e-4, position to 0.01 mm.
+
+    A value that is not a number, for which the format has no digits, is `nan`.
+    """
+    orientation = "".join(_digits(part, 10_000, 6) for part in pose.orientation)
+    position = "".join(_digits(part, 100, 7) for part in pose.position)
+    return f"{orientation}{position}{_digits(pose.indicator, 10_000, 6)}"
+
+
+def _digits(value: float, parts: int, width: int) -> str:
+    return f"{round(value * parts):+0{width}d}" if isfinite(value) else f"{'nan':>{width}}"
 
 
 def transform_binary(pose: EmulatedPose) -> bytes:

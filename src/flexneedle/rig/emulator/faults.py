@@ -1,23 +1,29 @@
-"""Faults of an emulated device and their times: `KIND[=DETAIL]@SECONDS[:DURATION]`. Each device has its own kinds."""
+"""Faults of an emulated device and their times: `KIND[=DETAIL]@SECONDS[:DURATION]`. Each device has its own kinds.
+
+A fault may also be ordered while the device works: `fault KIND[=DETAIL][:DURATION]`, from now on; `clear` ends all.
+"""
 
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from math import inf
 
 from flexneedle.errors import InputError
 
 _FORM = re.compile(r"(?P<kind>[a-z-]+)(=(?P<detail>[^@]+))?@(?P<start>[0-9.]+)(:(?P<duration>[0-9.]+))?")
+_ORDER = re.compile(r"fault\s+(?P<kind>[a-z-]+)(=(?P<detail>[^@:]+))?(:(?P<duration>[0-9.]+))?")
+_CLEAR = "clear"
 
-SECONDS, BYTE = "seconds", "byte"
-"""Forms of a detail: a number of seconds above 0; two hexadecimal digits."""
+SECONDS, BYTE, MM, RATIO = "seconds", "byte", "mm", "ratio"
+"""Forms of a detail: a number above 0, in s, in mm or without a unit; two hexadecimal digits (BYTE)."""
+_UNITS = {SECONDS: " s", MM: " mm", RATIO: ""}
 
 
 @dataclass(frozen=True)
 class FaultKind:
     """A kind of fault: its description, the detail if none is given, and what the detail may be.
 
-    form: SECONDS, BYTE, or what the detail names ("sensor", one of `choices`); "": it takes none.
+    form: SECONDS, BYTE, MM, RATIO, or what the detail names ("sensor", one of `choices`); "": it takes none.
     """
 
     text: str
@@ -28,7 +34,10 @@ class FaultKind:
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault from `start` to `end` (s since the device began to work); detail: as its kind has it, or ""."""
+    """A fault from `start` to `end` (s); detail: as its kind has it, or "".
+
+    Times of a scheduled fault count from when the device began to work; those of an active one are the device's.
+    """
 
     kind: str
     start: float
@@ -38,38 +47,105 @@ class Fault:
 
 def parse_fault(spec: str, kinds: Mapping[str, FaultKind]) -> Fault:
     """Return the fault of an option value, of one of these kinds by name. Raises InputError."""
-    form = _FORM.fullmatch(spec)
+    form, given = _FORM.fullmatch(spec), f"--fault {spec}"
     if form is None:
-        example = next(f"{name}={kind.choices[-1]}@5:2" for name, kind in kinds.items() if kind.choices)
-        raise InputError(f"--fault {spec}: must be KIND[=DETAIL]@SECONDS[:DURATION], such as {example}")
+        raise InputError(f"{given}: must be KIND[=DETAIL]@SECONDS[:DURATION], such as {_example(kinds)}@5:2")
+    kind, detail = _kind(given, form, kinds)
+    start = _number(given, form["start"], SECONDS)
+    return Fault(kind, start, _end(given, start, form["duration"]), detail)
+
+
+def is_order(line: str) -> bool:
+    """Whether a line orders a fault, or the end of all."""
+    return line.split()[:1] in (["fault"], [_CLEAR])
+
+
+def parse_order(line: str, kinds: Mapping[str, FaultKind], now: float) -> Fault | None:
+    """Return the fault that a line orders, from `now` (s) on; None for the end of all. Raises InputError."""
+    if line.strip() == _CLEAR:
+        return None
+    form, given = _ORDER.fullmatch(line.strip()), line.strip()
+    if form is None:
+        example = _example(kinds)
+        raise InputError(
+            f"{given}: must be fault KIND[=DETAIL][:DURATION], such as fault {example}:2, or clear"
+        )
+    kind, detail = _kind(given, form, kinds)
+    return Fault(kind, now, _end(given, now, form["duration"]), detail)
+
+
+def _example(kinds: Mapping[str, FaultKind]) -> str:
+    return next(f"{name}={kind.choices[-1]}" for name, kind in kinds.items() if kind.choices)
+
+
+def _kind(given: str, form: re.Match[str], kinds: Mapping[str, FaultKind]) -> tuple[str, str]:
+    """Kind and detail of a fault. Raises InputError."""
     name = form["kind"]
     if name not in kinds:
-        raise InputError(f"--fault {spec}: unknown kind; kinds: {', '.join(kinds)}")
+        raise InputError(f"{given}: unknown kind; kinds: {', '.join(kinds)}")
     detail = form["detail"] or kinds[name].default
-    _check_detail(spec, name, kinds[name], detail)
-    start = _seconds(spec, form["start"])
-    end = inf if form["duration"] is None else start + _seconds(spec, form["duration"])
-    return Fault(name, start, end, detail)
+    _check_detail(given, name, kinds[name], detail)
+    return name, detail
 
 
-def _check_detail(spec: str, name: str, kind: FaultKind, detail: str) -> None:
+def _check_detail(given: str, name: str, kind: FaultKind, detail: str) -> None:
     if kind.choices and detail not in kind.choices:
-        raise InputError(f"--fault {spec}: no such {kind.form}; choices: {', '.join(kind.choices)}")
+        raise InputError(f"{given}: no such {kind.form}; choices: {', '.join(kind.choices)}")
     if kind.form == BYTE and not re.fullmatch(r"[0-9A-F]{2}", detail):
-        raise InputError(f"--fault {spec}: must be two hexadecimal digits, such as {kind.default}")
-    if kind.form == SECONDS and not _seconds(spec, detail) > 0.0:
-        raise InputError(f"--fault {spec}: the {name} must be above 0 s, such as {name}={kind.default}")
+        raise InputError(f"{given}: must be two hexadecimal digits, such as {kind.default}")
+    if kind.form in _UNITS and not 0.0 < _number(given, detail, kind.form) < inf:
+        unit = _UNITS[kind.form]
+        raise InputError(f"{given}: the {name} must be above 0{unit}, such as {name}={kind.default}")
     if detail and not kind.form:
-        raise InputError(f"--fault {spec}: {name} takes no detail")
+        raise InputError(f"{given}: {name} takes no detail")
 
 
-def _seconds(spec: str, text: str) -> float:
+def _end(given: str, start: float, duration: str | None) -> float:
+    return inf if duration is None else start + _number(given, duration, SECONDS)
+
+
+def _number(given: str, text: str, form: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise InputError(f"--fault {spec}: {text} is not a number of seconds") from None
+        of = f" of {'seconds' if form == SECONDS else form}" if form in (SECONDS, MM) else ""
+        raise InputError(f"{given}: {text} is not a number{of}") from None
 
 
 def active(faults: Iterable[Fault], time: float) -> tuple[Fault, ...]:
-    """Return the faults that are active at a time (s since the device began to work)."""
+    """Return the faults that are active at a time (s, of the same origin as theirs)."""
     return tuple(fault for fault in faults if fault.start <= time < fault.end)
+
+
+@dataclass
+class Schedule:
+    """The faults of a device: `scheduled` ones count from when it began to work (`since`, None: not yet), `ordered`
+    ones have its own times (s).
+    """
+
+    kinds: Mapping[str, FaultKind]
+    scheduled: Sequence[Fault] = ()
+    ordered: tuple[Fault, ...] = ()
+
+    def at(self, now: float, since: float | None) -> tuple[Fault, ...]:
+        """Return the active faults, with the device's times."""
+        begun = () if since is None else tuple(_later(fault, since) for fault in self.scheduled)
+        return active((*begun, *self.ordered), now)
+
+    def obey(self, line: str, now: float) -> str:
+        """Inject the fault of a line from `now` (s) on, or end all; return what was done. Raises InputError."""
+        fault = parse_order(line, self.kinds, now)
+        if fault is None:
+            self.scheduled = self.ordered = ()
+            return "no fault"
+        kept = [one for one in self.ordered if one.end > now and not _same(one, fault)]
+        self.ordered = (*kept, fault)
+        return f"{fault.kind}{fault.detail and '='}{fault.detail}"
+
+
+def _same(one: Fault, other: Fault) -> bool:
+    return (one.kind, one.detail) == (other.kind, other.detail)
+
+
+def _later(fault: Fault, since: float) -> Fault:
+    return replace(fault, start=since + fault.start, end=since + fault.end)

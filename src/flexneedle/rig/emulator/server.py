@@ -7,7 +7,8 @@ import tempfile
 import tty
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import nan
 from pathlib import Path
 from time import monotonic
 from typing import NoReturn, Self
@@ -17,10 +18,20 @@ import numpy as np
 from flexneedle.errors import InputError
 from flexneedle.rig.emulator import aurora, codec
 from flexneedle.rig.emulator.aurora import AuroraState, EmulatedFrame
-from flexneedle.rig.emulator.faults import Fault, active
-from flexneedle.rig.emulator.motion import RATE_HZ, SENSORS, pose
+from flexneedle.rig.emulator.faults import Fault, Schedule, is_order
+from flexneedle.rig.emulator.motion import (
+    CIRCLE,
+    ORDINARY,
+    RATE_HZ,
+    SENSORS,
+    EmulatedPose,
+    Noise,
+    Rest,
+    TipSource,
+    is_missing,
+    pose,
+)
 from flexneedle.rig.emulator.orders import Orders, parse_position
-from flexneedle.types import Point
 
 _TICK_S = 0.005  # longest sleep of the loop
 _LONGEST_STEP_S = 2 * _TICK_S
@@ -32,7 +43,8 @@ _LONGEST_LINE = 4096
 class EmulatorSession:
     """The device and its faults over time. Times are in seconds on the device's clock, `power_on` the first.
 
-    rest: resting position of the tip (mm, the tracker's frame), None while it moves on its circle.
+    faults: scheduled, from when tracking first begins; tip: where it is; noise: errors of the tip's sensor.
+    on_tracking: called when tracking first begins.
     """
 
     device: AuroraState
@@ -40,16 +52,21 @@ class EmulatorSession:
     seed: int
     power_on: float
     tracked_since: float | None = None
-    rest: Point | None = None
+    tip: TipSource = CIRCLE
+    noise: Noise = ORDINARY
+    on_tracking: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
         self._random = np.random.default_rng((self.seed, 1))
+        self._repeated: dict[Fault, EmulatedPose] = {}
+        self.schedule = Schedule(aurora.FAULTS, self.faults)
 
     def faults_at(self, now: float) -> dict[str, Fault]:
-        """Return the active faults by kind; none before tracking first begins."""
-        if self.tracked_since is None:
-            return {}
-        return {fault.kind: fault for fault in active(self.faults, now - self.tracked_since)}
+        """Return the active faults by kind; of the scheduled ones none before tracking first begins."""
+        return {fault.kind: fault for fault in self._present(now)}
+
+    def _present(self, now: float) -> tuple[Fault, ...]:
+        return self.schedule.at(now, self.tracked_since)
 
     def reply(self, line: bytes, now: float) -> tuple[float, bytes]:
         """Return time and data of the reply to a command (b"": no reply)."""
@@ -61,19 +78,29 @@ class EmulatorSession:
         self.device, complete = aurora.reply(self.device, line, self._frame(now, faults))
         if self.device.mode == "tracking" and self.tracked_since is None:
             self.tracked_since = now
+            self.on_tracking()
         delay = float(faults["delay"].detail) if "delay" in faults else 0.0
         return now + delay, self._damaged(complete, faults)
 
     def _frame(self, now: float, faults: dict[str, Fault]) -> EmulatedFrame:
-        if "frozen" in faults and self.tracked_since is not None:
-            now = self.tracked_since + faults["frozen"].start
-        number = int((now - self.power_on) * RATE_HZ) & 0xFFFF_FFFF
-        present = () if self.tracked_since is None else active(self.faults, now - self.tracked_since)
-        by_sensor = {fault.detail: fault.kind for fault in present if fault.detail in SENSORS}
-        poses = {name: pose(name, number, self.seed, self.rest) for name in SENSORS}
-        return EmulatedFrame(
-            number, poses, by_sensor, int(faults["system"].detail, 16) if "system" in faults else 0
-        )
+        taken = faults["frozen"].start if "frozen" in faults else now
+        number = self.tip.newest(int((taken - self.power_on) * RATE_HZ))
+        present = self._present(now)
+        by_sensor = {fault.detail: fault.kind for fault in present if fault.kind in aurora.OF_STATUS}
+        if is_missing(number, self.seed, self.noise):
+            by_sensor.setdefault(SENSORS[0], "missing")
+        poses = {name: self._pose(name, number, present) for name in SENSORS}
+        system = int(faults["system"].detail, 16) if "system" in faults else 0
+        return EmulatedFrame(number & 0xFFFF_FFFF, poses, by_sensor, system)
+
+    def _pose(self, name: str, number: int, present: Sequence[Fault]) -> EmulatedPose:
+        """Pose of a sensor in a frame, with the faults that change its values."""
+        made = pose(name, number, self.seed, self.tip, self.noise)
+        for fault in present:
+            if fault.kind == "stuck" and fault.detail == name:
+                made = self._repeated.setdefault(fault, made)
+            made = changed(name, made, fault)
+        return made
 
     def _damaged(self, complete: bytes, faults: dict[str, Fault]) -> bytes:
         if "cut" in faults:
@@ -82,6 +109,18 @@ class EmulatorSession:
             return complete
         at, flipped = self._random.integers(len(complete)), self._random.integers(1, 256)
         return complete[:at] + bytes([complete[at] ^ int(flipped)]) + complete[at + 1 :]
+
+
+def changed(name: str, made: EmulatedPose, fault: Fault) -> EmulatedPose:
+    """The pose of a sensor with the values of a fault that reports wrong ones."""
+    if fault.kind == "nan" and fault.detail == name:
+        return EmulatedPose((nan, nan, nan), (nan, nan, nan, nan), nan)
+    if fault.kind == "jump" and name == SENSORS[0]:
+        x, y, z = made.position
+        return replace(made, position=(x, y + float(fault.detail), z))
+    if fault.kind == "indicator":
+        return replace(made, indicator=float(fault.detail))
+    return made
 
 
 def _is_left_over(link: Path) -> bool:
@@ -168,9 +207,16 @@ def device_time(before: float, served: float, now: float) -> float:
     return max(now - _MOST_BEHIND_S, min(now, stepped))
 
 
-def serve(session: EmulatorSession, serial: Serial, orders: Orders, say: Callable[[str], None]) -> NoReturn:
-    """Reply to commands until interrupted. say: called with a line when the cable is unplugged or plugged in, and when
-    the tip is moved to a resting position."""
+def serve(
+    session: EmulatorSession,
+    serial: Serial,
+    orders: Orders,
+    obey: Callable[[str], None],
+    say: Callable[[str], None],
+) -> NoReturn:
+    """Reply to commands until interrupted. obey: called with each line of the orders; say: called with a line when the
+    cable is unplugged or plugged in.
+    """
     received, due = b"", list[tuple[float, bytes]]()
     now = served = monotonic()
     while True:
@@ -183,7 +229,7 @@ def serve(session: EmulatorSession, serial: Serial, orders: Orders, say: Callabl
         ready, _, _ = select.select([*serial.sources, *orders.sources], [], [], idle)
         now, served = device_time(now, served, real := monotonic()), real
         for order in orders.read(ready):
-            say(execute(session, order))
+            obey(order)
         received += serial.read()
         *lines, received = received[-_LONGEST_LINE:].split(b"\r")
         due += [session.reply(line, now) for line in lines]
@@ -192,9 +238,11 @@ def serve(session: EmulatorSession, serial: Serial, orders: Orders, say: Callabl
 
 
 def execute(session: EmulatorSession, order: str) -> str:
-    """Rest the tip at the position in a line; return a message with the position or the error."""
+    """Rest the tip at the position in a line, or inject the fault in it; return a message on that, or the error."""
     try:
-        session.rest = parse_position(order)
+        if is_order(order):
+            return f"{session.schedule.obey(order, monotonic())} from now on"
+        session.tip = Rest(parse_position(order))
     except InputError as error:
         return str(error)
-    return "the tip rests at {:g} {:g} {:g} mm".format(*session.rest)
+    return "the tip rests at {:g} {:g} {:g} mm".format(*session.tip.position)

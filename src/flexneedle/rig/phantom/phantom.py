@@ -9,7 +9,7 @@ import numpy as np
 
 from flexneedle.rig.pace import roll_time
 from flexneedle.rig.phantom.draw import Truth
-from flexneedle.rig.phantom.plants import PlantFactory, plant
+from flexneedle.rig.phantom.plants import Plant, PlantFactory, plant
 from flexneedle.simulator.control import MOVES, Limits, half_turned
 from flexneedle.types import (
     COLUMNS,
@@ -160,11 +160,14 @@ class Phantom:
         return None if nodes is None else evenly_spaced(nodes, self._truth.scenario.needle.nodes)
 
     def _tip(self) -> Floats:
-        """The pose of the tip, which is offset from the needle's axis by the run-out."""
-        pose, truth = self._plant.tip, self._truth
-        x, y, z = across(float(pose[THETA]), float(pose[PSI]), self._plant.roll + truth.run_out_angle)
-        off = truth.run_out
-        return np.array([pose[X] + off * x, pose[Y] + off * y, pose[Z] + off * z, *pose[THETA:]])
+        return tip_of(self._plant, self._truth)
+
+
+def tip_of(needle: Plant, truth: Truth) -> Floats:
+    """The pose x, y, z, θ, ψ (mm, rad) of the tip, which is offset from the needle's axis by the run-out."""
+    pose, off = needle.tip, truth.run_out
+    x, y, z = across(float(pose[THETA]), float(pose[PSI]), needle.roll + truth.run_out_angle)
+    return np.array([pose[X] + off * x, pose[Y] + off * y, pose[Z] + off * z, *pose[THETA:]])
 
 
 def _between(before: Sequence[float], after: Sequence[float], part: float, share: complex) -> list[float]:

@@ -15,12 +15,14 @@ from typing import NoReturn, Self
 import numpy as np
 
 from flexneedle.errors import InputError
-from flexneedle.rig.emulator.faults import SECONDS, Fault, FaultKind, active
+from flexneedle.rig.emulator.faults import SECONDS, Fault, FaultKind, Schedule, is_order
 from flexneedle.rig.emulator.galil import axis as one
 from flexneedle.rig.emulator.galil.axis import Axis
 from flexneedle.rig.emulator.galil.controller import AXES, ERRORS, SAMPLES_HZ, Device, advanced, reply
+from flexneedle.rig.emulator.orders import Orders
 
-_TICK_S = 0.005
+_TICK_S = 0.004
+_SAMPLES = 5  # of the controller at once: 5 ms
 _LONGEST_LINE = 4096
 _MOST_CLIENTS = 8
 
@@ -57,12 +59,17 @@ _OF_MOTORS = one.FAULTS
 _CHATTER = b" 17.0000\r\n"
 
 
+Observer = Callable[[float, Sequence[float], bool], None]
+"""Called with a time (s, monotonic), the travel of each motor since power-on (counts, whatever its position is called),
+and whether one moves, or has been commanded to, from then on."""
+
+
 @dataclass
 class GalilSession:
     """The controller and its faults over time. Times are monotonic, in seconds; power_on is the first.
 
-    seed: of garbled replies; moved_since: when an axis first moved, from which faults count; done: faults of one
-    instant that have happened.
+    seed: of garbled replies; moved_since: when an axis first moved, from which scheduled faults count; done: faults of
+    one instant that have happened. observe: called after every few samples, and after every command.
     """
 
     device: Device
@@ -70,30 +77,53 @@ class GalilSession:
     power_on: float
     seed: int = 0
     moved_since: float | None = None
+    observe: Observer | None = None
     _samples: int = 0
     _done: set[Fault] = field(default_factory=set)
+    _travel: tuple[float, ...] = (0.0,) * len(AXES)
+
+    def __post_init__(self) -> None:
+        self.schedule = Schedule(FAULTS, self.faults)
 
     def __post_init__(self) -> None:
         self._random = np.random.default_rng((self.seed, 1))
 
     def faults_at(self, now: float) -> dict[str, Fault]:
-        """Return the active faults by kind; none before the first motion."""
-        if self.moved_since is None:
-            return {}
-        return {fault.kind: fault for fault in active(self.faults, now - self.moved_since)}
+        """Return the active faults by kind; of the scheduled ones none before the first motion."""
+        return {fault.kind: fault for fault in self._present(now)}
+
+    def _present(self, now: float) -> tuple[Fault, ...]:
+        return self.schedule.at(now, self.moved_since)
 
     def advance(self, now: float) -> None:
-        """Let the axes move until `now`, with their faults."""
-        faults = self.faults_at(now)
-        axes = tuple(self._with_faults(axis, AXES[k], faults) for k, axis in enumerate(self.device.axes))
+        """Let the axes move until `now`, with their faults, a few samples at a time."""
         due = int((now - self.power_on) * SAMPLES_HZ) - self._samples
-        self.device = advanced(replace(self.device, axes=axes), max(0, due))
-        self._samples += max(0, due)
+        while due > _SAMPLES:
+            self._advance(self.power_on + (self._samples + _SAMPLES) / SAMPLES_HZ, _SAMPLES)
+            due -= _SAMPLES
+        self._advance(now, max(0, due))
+
+    def _advance(self, now: float, samples: int) -> None:
+        present = self._present(now)
+        before = tuple(self._with_faults(axis, AXES[k], present) for k, axis in enumerate(self.device.axes))
+        self.device = advanced(replace(self.device, axes=before), samples)
+        self._samples += samples
         if self.moved_since is None and any(axis.running for axis in self.device.axes):
             self.moved_since = now
+        self._report(
+            [after.encoder - axis.encoder for axis, after in zip(before, self.device.axes, strict=True)]
+        )
 
-    def _with_faults(self, axis: Axis, name: str, faults: dict[str, Fault]) -> Axis:
-        of_this = {kind: fault for kind, fault in faults.items() if fault.detail == name}
+    def _report(self, moved: Sequence[float]) -> None:
+        """Report the travel after a motion (counts) to the observer."""
+        self._travel = tuple(travel + step for travel, step in zip(self._travel, moved, strict=True))
+        if self.observe is not None:
+            moving = any(axis.running and not axis.profile.at_rest for axis in self.device.axes)
+            time = self.power_on + self._samples / SAMPLES_HZ
+            self.observe(time, self._travel, moving or any(moved))
+
+    def _with_faults(self, axis: Axis, name: str, present: Sequence[Fault]) -> Axis:
+        of_this = {fault.kind: fault for fault in present if fault.detail == name}
         for kind, change in _ONCE.items():
             if kind in of_this and of_this[kind] not in self._done:
                 self._done.add(of_this[kind])
@@ -108,6 +138,7 @@ class GalilSession:
             self.device, answer = _refused(self.device, line, int(faults["refuse"].detail))
         else:
             self.device, answer = reply(self.device, line)
+        self._report([0.0] * len(AXES))
         delay = float(faults["delay"].detail) if "delay" in faults else 0.0
         return now + delay, self._damaged(answer.encode("ascii", "replace"), faults)
 
@@ -252,8 +283,12 @@ class Tcp:
                     break
 
 
-def serve(session: GalilSession, tcp: Tcp, say: Callable[[str], None]) -> NoReturn:
-    """Answer commands until interrupted. say: called with a line when connections are closed or possible again."""
+def serve(
+    session: GalilSession, tcp: Tcp, orders: Orders, obey: Callable[[str], None], say: Callable[[str], None]
+) -> NoReturn:
+    """Answer commands until interrupted. obey: called with each line of the orders; say: called with a line when
+    connections are closed or possible again.
+    """
     while True:
         now = monotonic()
         faults = session.faults_at(now)
@@ -262,6 +297,18 @@ def serve(session: GalilSession, tcp: Tcp, say: Callable[[str], None]) -> NoRetu
             say("listens again" if tcp.plugged else "unplugged")
         for client, line in tcp.lines(_TICK_S, deaf="half-open" in faults):
             client.due.append(session.reply(line, monotonic()))
+        for order in orders.read(select.select(orders.sources, [], [], 0.0)[0]):
+            obey(order)
         now = monotonic()
         session.advance(now)
         tcp.send_due(now)
+
+
+def execute(session: GalilSession, order: str) -> str:
+    """Inject the fault in a line; return a message on that, or the error."""
+    try:
+        if not is_order(order):
+            raise InputError(f"{order.strip()!r}: must be fault KIND[=DETAIL][:DURATION], or clear")
+        return f"{session.schedule.obey(order, monotonic())} from now on"
+    except InputError as error:
+        return str(error)

@@ -1,0 +1,151 @@
+"""The record of what an emulated rig truly does: a CSV that is written as it goes, and its reader."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import degrees
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from flexneedle.errors import InputError
+from flexneedle.types import Floats
+
+_TIP = ("x_mm", "y_mm", "z_mm", "theta_rad", "psi_rad")
+_REST = ("strain_energy_mj", "least_stretch", "converged", "lag_ms")
+_ROTATION = "rotation"
+
+
+def columns(axes: Sequence[str]) -> tuple[str, ...]:
+    """Columns of a record of these axes."""
+    counts = (f"{name}_counts" for name in axes)
+    positions = (f"{name}_{_unit(name)}" for name in axes)
+    return ("time_s", *counts, *positions, *_TIP, *_REST)
+
+
+def _unit(axis: str) -> str:
+    return "deg" if axis == _ROTATION else "mm"
+
+
+class Row(NamedTuple):
+    """What is true at a time (s, monotonic clock).
+
+    In the order of the axes the travel of the motors (counts) and the positions of the axes (mm, rad); pose of the tip
+    (5,); strain energy (mJ), least stretch and convergence so far; lag (s).
+    """
+
+    time: float
+    counts: Sequence[float]
+    positions: Sequence[float]
+    tip: Floats
+    strain_energy: float
+    least_stretch: float
+    converged: bool
+    lag: float
+
+
+class TruthWriter:
+    """Writes a record of these axes to a new file, each row at once. Use it as a context manager.
+
+    Raises InputError if the file exists or cannot be created.
+    """
+
+    def __init__(self, path: Path, axes: Sequence[str]) -> None:
+        self._axes = tuple(axes)
+        try:
+            self._file = path.open("x", encoding="utf-8", newline="")
+        except FileExistsError:
+            raise InputError(f"{path}: already exists: choose another file, or remove it") from None
+        except OSError as error:
+            raise InputError(f"{path}: cannot be created: {error.strerror}") from None
+        self._write(columns(axes))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def write(self, row: Row) -> None:
+        """Write a row."""
+        shown = [
+            degrees(place) if name == _ROTATION else place
+            for name, place in zip(self._axes, row.positions, strict=True)
+        ]
+        counts = (round(count, 3) for count in row.counts)
+        numbers = (*counts, *shown, *row.tip.tolist(), row.strain_energy, row.least_stretch)
+        last = int(row.converged), f"{1e3 * row.lag:.3f}"
+        self._write((f"{row.time:.6f}", *(f"{value:.9g}" for value in numbers), *last))
+
+    def _write(self, cells: Sequence[object]) -> None:
+        self._file.write(",".join(map(str, cells)) + "\n")
+        self._file.flush()
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """A record: times (n,) in s on the monotonic clock; by name of the axis the travel of its motor since power-on
+    (counts) and its position (mm, rad), each (n,); poses x, y, z, θ, ψ of the tip (n, 5); strain energy of the tissue
+    (mJ), least stretch so far, whether all steps converged, and lag of the phantom (s), each (n,).
+    """
+
+    time: Floats
+    counts: Mapping[str, Floats]
+    positions: Mapping[str, Floats]
+    tips: Floats
+    strain_energy: Floats
+    least_stretch: Floats
+    converged: Floats
+    lag: Floats
+
+    def tip_at(self, times: Floats | float) -> Floats:
+        """Poses (…, 5) of the tip at times (s), linear between rows. Raises InputError for times outside of them."""
+        wanted = np.asarray(times, dtype=float)
+        if wanted.size and not (self.time[0] <= wanted.min() and wanted.max() <= self.time[-1]):
+            raise InputError(f"times must be from {self.time[0]:.3f} to {self.time[-1]:.3f} s")
+        return np.stack([np.interp(wanted, self.time, column) for column in self.tips.T], axis=-1)
+
+
+def read_truth(path: Path) -> Truth:
+    """Return the record in a file of `emulate rig --truth`, also while it is written: its last row may be incomplete.
+
+    Raises InputError: file, rule.
+    """
+    names, rows = _rows(path)
+    table = dict(zip(names, np.array(rows, dtype=float).reshape(-1, len(names)).T, strict=True))
+    axes = [name.removesuffix("_counts") for name in names if name.endswith("_counts")]
+    if names != columns(axes) or not rows:
+        raise InputError(f"{path}: must have the columns of emulate rig --truth, and a row")
+    positions = {name: table[f"{name}_{_unit(name)}"] for name in axes}
+    return Truth(
+        table["time_s"],
+        {name: table[f"{name}_counts"] for name in axes},
+        {name: np.radians(place) if name == _ROTATION else place for name, place in positions.items()},
+        np.stack([table[name] for name in _TIP], axis=-1),
+        table["strain_energy_mj"],
+        table["least_stretch"],
+        table["converged"],
+        1e-3 * table["lag_ms"],
+    )
+
+
+def _rows(path: Path) -> tuple[tuple[str, ...], list[list[float]]]:
+    """Names of the columns, and the complete rows."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: cannot be read: {reason}") from None
+    head, *lines = text[: text.rfind("\n") + 1].splitlines() or [""]
+    names = tuple(head.split(","))
+    try:
+        rows = [[float(cell) for cell in row] for row in csv.reader(lines)]
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    if any(len(row) != len(names) for row in rows):
+        raise InputError(f"{path}: all rows must have {len(names)} cells")
+    return names, rows
