@@ -84,8 +84,6 @@ class GalilSession:
 
     def __post_init__(self) -> None:
         self.schedule = Schedule(FAULTS, self.faults)
-
-    def __post_init__(self) -> None:
         self._random = np.random.default_rng((self.seed, 1))
 
     def faults_at(self, now: float) -> dict[str, Fault]:
