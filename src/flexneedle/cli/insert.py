@@ -81,7 +81,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--rig",
-        type=Path,
         metavar="FILE",
         help="rig file, on whose motors and tracker the plan is executed, from where the motors are (default: the "
         "virtual phantom)",

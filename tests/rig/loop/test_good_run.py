@@ -15,7 +15,7 @@ import pytest
 import flexneedle
 import flexneedle.control
 from flexneedle.errors import InputError
-from flexneedle.rig import loop as insertion
+from flexneedle.rig import insert as insertion
 from flexneedle.rig.phantom.plants import PLANTS
 from flexneedle.rig.virtual import Rig
 from flexneedle.types import Insertion, Outcome

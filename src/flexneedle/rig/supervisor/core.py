@@ -30,6 +30,7 @@ HEARTBEAT_S = 0.5
 
 _AGAIN_S = 0.25  # after which motors that still move are stopped again, and a lost controller is called again
 _HOMING_SHARE = 0.1  # of the largest speed
+_SLOWEST_SHARE = 0.01
 _HOMING_REACH = 1.1  # of the range
 _UNCHECKED = frozenset({State.IDLE, State.STOPPED, State.FAULT})
 """States in which motors may be off, and have been stopped: nothing more can be done about what they do."""
@@ -355,7 +356,10 @@ class Supervisor:
             self._watch = self._watch.expecting(motion.expected, now, now + leg.trajectory.duration)
         try:
             for channel, speed in leg.trajectory.speeds.items():
-                self._motors.set_speed(channel, speed, leg.trajectory.accelerations[channel])
+                axis = leg.drives[channel].axis
+                # Controllers round small speeds, to 0 as well; a motor that is faster waits for its next target.
+                slowest = _SLOWEST_SHARE * axis.speed * abs(axis.scale)
+                self._motors.set_speed(channel, max(speed, slowest), axis.acceleration * abs(axis.scale))
             self._motors.follow(leg.targets(now, self._queue))
         except DriverError as error:
             self._fault(str(error))

@@ -49,11 +49,6 @@ class Trajectory:
         cruise = self.duration - self.ramp
         return {name: abs(self.goal[name] - begin) / cruise for name, begin in self.start.items()}
 
-    @property
-    def accelerations(self) -> dict[str, float]:
-        """Acceleration (counts/s²) by channel."""
-        return {name: speed / self.ramp for name, speed in self.speeds.items()}
-
 
 def between(
     drives: Mapping[str, Drive], start: Mapping[str, float], goal: Mapping[str, float], duration: float
