@@ -191,11 +191,11 @@ def supervised(
         if scenario.monitor.enabled and scenario.monitor.references:
             supervisor.wait(scenario.monitor.indicator_window_s)  # the field must be known before the start
         driver = SupervisedDriver(supervisor, scenario, plan.roll)
-        yield Rig(supervisor, driver, supervisor, expect=driver.expect), ticks
+        deadline = 1e-3 * rig.loop.decision_ms
+        yield Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline), ticks
 
 
 def _deepest(scenario: Scenario) -> float:
     """Advance (mm) of the base at which a straight needle is as far past its target as it may be."""
-    past = 2.0
-    way = scenario.target.depth_mm + past - scenario.setup.start_tip_x
+    way = scenario.target.depth_mm + scenario.guard.past_target_mm - scenario.setup.start_tip_x
     return way * math.sqrt(1.0 + abs(scenario.entry.slope) ** 2)

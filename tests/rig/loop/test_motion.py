@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flexneedle.control.interface import Decision, Method, travel_left
-from flexneedle.errors import CommandError
+from flexneedle.errors import CommandError, StoppedError
 from flexneedle.estimation.estimate import Move, along
 from flexneedle.simulator.control import Limits, controls
 from flexneedle.types import STILL, Control, Motion, Outcome
@@ -111,3 +111,10 @@ def test_beyond_its_range_the_needle_may_only_roll_back():
     limits.check(np.zeros(7), controls(1), 1.0004)
     with pytest.raises(CommandError, match="angle of the needle"):
         limits.check(np.zeros(7), controls(1, roll=0.1), 1.0004)
+
+
+def test_an_insertion_that_is_stopped_at_the_rig_is_interrupted(plan):
+    stage = Stopped(StoppedError("stopped: the emergency button"))
+    done = run(plan, stage.rig(), force=True)
+    assert (done.outcome, done.reason) == (Outcome.INTERRUPTED, "stopped: the emergency button")
+    assert stage.stops == 1
