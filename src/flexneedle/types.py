@@ -469,7 +469,7 @@ class Insertion:
     tracker: str = ""  # name, "" on a rig
     scenario: "Scenario | None" = None  # of the insertion
     rig: str = ""  # name of the rig, "" on a virtual one
-    ticks: Mapping[str, float] = field(default_factory=dict, compare=False)  # of the rig: number, times (ms)
+    ticks: Mapping[str, Any] = field(default_factory=dict, compare=False)  # of the rig: number, times, states
 
     @property
     def target(self) -> Point:

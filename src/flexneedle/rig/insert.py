@@ -15,7 +15,7 @@ from flexneedle.rig.dry_run import in_memory
 from flexneedle.rig.loop import planned, run
 from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
-from flexneedle.rig.supervised import check_fit, supervised
+from flexneedle.rig.supervised import Ticks, check_fit, supervised
 from flexneedle.rig.virtual import Rig, Seeds, virtual_rig
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
@@ -36,11 +36,13 @@ def insert(
     on_period: Callable[[Period], None] | None = None,
     rig: str | Path | RigFile | None = None,
     dry_run: bool = False,
+    ticks: Ticks | None = None,
 ) -> Insertion:
     """Execute `plan` in closed loop in the virtual phantom drawn with `seed`; return the complete record.
 
     rig: a rig file, on whose motors and tracker the plan is executed in place of the virtual phantom, from where the
     motors are. dry_run: its motors and tracker are read; motors never move, and the needle is the virtual phantom's.
+    ticks: to which the times of the rig's ticks are added as they are made (default: only to the record).
 
     scenario: a scenario, or its name or path as for `load_scenario`. It must be the plan's own, or differ from it only
     in controller, tracker, monitor and phantom.
@@ -86,6 +88,6 @@ def insert(
         raise InputError("phantom and tracker are those of the rig: give neither with a rig")
     file = rig if isinstance(rig, RigFile) else load_rig(rig)
     check_fit(file, scenario, plan.strategy)
-    with supervised(file, scenario, plan, dry=dry_run) as (ports, ticks):
+    with supervised(file, scenario, plan, dry=dry_run, ticks=ticks) as (ports, made):
         insertion = executed(in_memory(ports, virtual) if dry_run else ports)
-    return replace(insertion, rig=file.name, ticks=ticks.summary())
+    return replace(insertion, rig=file.name, ticks=made.summary())

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import monotonic
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,7 @@ from flexneedle.types import (
 
 _SDS = 3.0  # standard deviations of the prediction that a reading may be off beyond the limit
 _MOST_TICKS = 200_000  # an hour and more
+_MOST_KEPT = 10_000
 _GUIDE = {"guide_y": DG_Y, "guide_z": DG_Z}
 
 
@@ -75,24 +77,36 @@ class Columns:
 
 @dataclass
 class Ticks:
-    """Times of the supervisor's ticks (s): how much later than scheduled each began, and how long it took."""
+    """Times of the supervisor's ticks (s): how much later than scheduled each began, and how long it took; times of
+    those before which others were left out; changes of the rig's state. Times are on the monotonic clock.
+    """
 
+    started: float = 0.0
     late: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_TICKS))
     work: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_TICKS))
     missed: int = 0
+    stalls: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_MOST_KEPT))
+    states: deque[tuple[float, str, str]] = field(default_factory=lambda: deque(maxlen=_MOST_KEPT))
 
     def add(self, report: Report) -> None:
         """Add a tick."""
+        time = self.started + report.time
         self.late.append(report.late)
         self.work.append(report.work)
+        if report.missed > self.missed:
+            self.stalls.append((time, report.late))
         self.missed = report.missed
+        if not self.states or self.states[-1][1:] != (report.state, report.why):
+            self.states.append((time, report.state, report.why))
 
-    def summary(self) -> dict[str, float]:
-        """Number of ticks, ticks left out, and late and work in ms: median, 99 % and largest."""
-        found: dict[str, float] = {"count": len(self.late), "missed": self.missed}
+    def summary(self) -> dict[str, Any]:
+        """Number of ticks, ticks left out, late and work in ms: median, 99 % and largest; stalls and states."""
+        found: dict[str, Any] = {"count": len(self.late), "missed": self.missed}
         for name, values in (("late", self.late), ("work", self.work)):
             for q, label in ((50, "p50"), (99, "p99"), (100, "max")):
-                found[f"{name}_{label}_ms"] = 1e3 * float(np.percentile(values, q)) if values else math.nan
+                found[f"{name}_{label}_ms"] = 1e3 * float(np.percentile(values, q)) if values else None
+        found["stalls"] = [{"time_s": time, "late_s": late} for time, late in self.stalls]
+        found["states"] = [{"time_s": time, "state": state, "why": why} for time, state, why in self.states]
         return found
 
 
@@ -167,6 +181,8 @@ def supervised(
 ) -> Iterator[tuple[Rig, Ticks]]:
     """Open a rig, arm it, roll the needle as the plan begins, and give its ports and the times of its ticks.
 
+    ticks: to which those are added (default: new ones).
+
     Positions of the axes at this moment are those at the start of the plan. dry: motors are read and never moved.
     Raises RigError if the rig does not fit the scenario, DriverError or RunError if a device fails.
     """
@@ -183,7 +199,8 @@ def supervised(
         scenario.control.stale_after_s,
         dry,
     )
-    ticks = Ticks()
+    ticks = Ticks() if ticks is None else ticks
+    ticks.started = task.started
     with Supervisor(task, ticks.add) as supervisor:
         supervisor.arm(_deepest(scenario))
         if rig.axes.rotation is not None:
