@@ -177,7 +177,7 @@ def check_fit(rig: RigFile, scenario: Scenario, strategy: str) -> None:
 
 @contextmanager
 def supervised(
-    rig: RigFile, scenario: Scenario, plan: Plan, *, dry: bool = False
+    rig: RigFile, scenario: Scenario, plan: Plan, *, dry: bool = False, ticks: Ticks | None = None
 ) -> Iterator[tuple[Rig, Ticks]]:
     """Open a rig, arm it, roll the needle as the plan begins, and give its ports and the times of its ticks.
 
