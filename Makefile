@@ -101,6 +101,7 @@ slow: setup  ## the long tests: a thousand insertions each in the plane and in s
 
 docs: setup  ## build the documentation site into site/; warnings are errors
 	$(BIN)/python tools/docs/scenario_reference.py
+	$(BIN)/python tools/docs/rig_reference.py
 	$(BIN)/python tools/docs/command_reference.py
 	PYTHONPATH=tools/docs $(BIN)/zensical build --strict --clean
 

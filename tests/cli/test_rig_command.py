@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -10,6 +11,7 @@ import tomli_w
 import bench_rig
 from bench_rig import Motors, values
 from commands import run
+from emulated import emulated
 from flexneedle.cli import rig as command
 from flexneedle.errors import DriverError
 
@@ -96,6 +98,13 @@ def terminal(monkeypatch):
     return types
 
 
+def test_the_supervisor_is_that_of_the_rig(monkeypatch):
+    fake = Supervisor()
+    monkeypatch.setitem(sys.modules, "flexneedle.rig.supervisor.client", SimpleNamespace(Supervisor=fake))
+    assert command.supervised(bench_rig.rig()) is fake
+    assert fake.calls == [("rig", "Bench")]
+
+
 # Check
 
 
@@ -157,6 +166,26 @@ def test_a_file_that_is_none_is_bad_input(capsys, tmp_path, name):
     status, out, err = run(capsys, "rig", name[0], str(path), *name[1:])
     assert (status, out) == (2, "")
     assert f"{path}: name = 3: must be text in quotes" in err
+
+
+def test_an_emulated_aurora_is_checked_over_its_line(capsys, file, tmp_path):
+    """A real process on a pseudo-terminal, read as a rig reads it; its registered name is another test's."""
+    with emulated("--link", str(tmp_path / "aurora"), "--still") as path:
+        tracker = {"kind": "flexneedle.rig.devices.trackers:aurora", "port": path}
+        words = ("--seconds", "1", "--json", "--scenario", "phantom")
+        status, out, _ = run(capsys, "rig", "check", file({"tracker": tracker}), *words)
+    findings = {one["item"]: one for one in json.loads(out)["findings"] if one["part"] == "tracker"}
+    assert [one for one in findings.values() if one["problem"]] == []
+    assert status == 0
+    assert {"sensor tip", "sensor ref1", "sensor ref2", "sensor ref3", "frames", "status"} <= set(findings)
+
+
+def test_a_port_that_does_not_exist_is_a_problem_of_the_tracker(capsys, file):
+    tracker = {"kind": "flexneedle.rig.devices.trackers:aurora", "port": "/dev/no-such-port"}
+    status, out, _ = run(capsys, "rig", "check", file({"tracker": tracker}))
+    (line,) = [line for line in out.splitlines() if line.startswith("PROBLEM")]
+    assert status == 1
+    assert "/dev/no-such-port: no such port; serial ports found: " in line
 
 
 # Motions
@@ -278,6 +307,7 @@ def test_several_axes_are_homed_one_after_the_other(capsys, file, device, superv
     status, _, err = run(capsys, "rig", "home", file(), "--yes")
     assert (status, supervisor.calls[2:4]) == (0, [("home", "insertion"), ("home", "rotation")])
     assert "rotation: stays where it is, and its position is called 0 deg" in err
+    assert "Only without a needle in tissue." in err
     assert device.calls == []
 
 

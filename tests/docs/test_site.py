@@ -14,9 +14,12 @@ import pytest
 import command_reference
 import flexneedle
 import math_fence
+import rig_reference
 import scenario_reference
+from flexneedle.rig.fit import fit_problems
 from flexneedle.scenario.files import load_scenario
-from markdown_examples import ROOT
+from flexneedle.scenario.rig import load_rig
+from markdown_examples import ROOT, blocks
 
 DOCS = ROOT / "docs"
 SITE = tomllib.loads((ROOT / "zensical.toml").read_text(encoding="utf-8"))["project"]
@@ -30,6 +33,27 @@ def entries(nav: object) -> Iterator[str]:
 
 def test_the_scenario_reference_is_that_of_the_schema():
     assert scenario_reference.PAGE.read_text(encoding="utf-8") == scenario_reference.page(), "make docs"
+
+
+def test_the_rig_reference_is_that_of_the_models():
+    assert rig_reference.PAGE.read_text(encoding="utf-8") == rig_reference.page(), "make docs"
+
+
+def test_every_section_and_every_key_of_a_rig_has_advice():
+    tables = list(rig_reference.all_tables())
+    assert set(rig_reference.ADVICE["keys"]) == {key.name for table in tables for key in table.keys}
+    assert all(
+        text.endswith(".") and "\n" not in text and len(text) < 200
+        for text in rig_reference.ADVICE["keys"].values()
+    )
+    assert set(rig_reference.ADVICE["sections"]) == {table.name for table in tables if table.name}
+
+
+def test_the_rig_of_the_reference_can_do_what_the_paper_needs(tmp_path):
+    (example,) = [block for block in blocks(rig_reference.PAGE.read_text(encoding="utf-8")) if block.title]
+    path = tmp_path / example.title
+    path.write_text(example.code, encoding="utf-8")
+    assert fit_problems(load_rig(path), load_scenario("phantom")) == []
 
 
 def test_the_command_reference_is_the_help():
@@ -57,6 +81,10 @@ def test_every_section_and_every_key_has_advice():
         ("control.ce_mpc.curvature_per_m", "1/m"),
         ("monitor.abort_after_s", "s"),
         ("tissue.alpha", "–"),
+        ("axes.insertion.counts_per_mm", "counts/mm"),
+        ("axes.insertion.acceleration_mm_s2", "mm/s²"),
+        ("axes.rotation.speed_deg_s", "°/s"),
+        ("loop.queue_ms", "ms"),
     ],
 )
 def test_the_unit_of_a_key_is_its_ending(key, unit):

@@ -97,6 +97,17 @@ def test_what_a_motor_may_be_is_none(state):
     assert problems(motors(rig(), motors_with("A", **state), Clock())) == {}
 
 
+def test_the_limits_of_a_motor_that_turns_the_other_way_are_those_of_its_axis():
+    found = rig(axes__guide_y__range_mm=[-5, 15])
+    inside, outside = (
+        {"position": counts, "commanded": counts} for counts in (-7000.0, 7000.0)
+    )  # 14 and -14 mm
+    assert problems(motors(found, motors_with("C", **inside), Clock())) == {}
+    assert problems(motors(found, motors_with("C", **outside), Clock())) == {
+        ("guide_y", "position"): "beyond the soft limits, -5 to 15 mm"
+    }
+
+
 def test_a_motor_that_is_off_is_found_off():
     findings = motors(rig(), motors_with("B", on=False), Clock())
     assert [of(findings, name, "motor").found for name in ("insertion", "rotation")] == ["A, on", "B, off"]

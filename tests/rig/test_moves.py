@@ -62,9 +62,12 @@ def test_another_jog_is_refused(name, distance, position, line):
     assert str(caught.value).startswith(line)
 
 
-@pytest.mark.parametrize(("speed", "taken"), [(10.0, 10.0), (0.5, 0.5)])
-def test_a_jog_is_as_fast_as_asked(speed, taken):
-    assert jog(RIG, "insertion", "5", 0.0, speed).speed == taken
+@pytest.mark.parametrize(
+    ("name", "speed", "taken"),
+    [("insertion", 10.0, 10.0), ("insertion", 0.5, 0.5), ("rotation", 90.0, math.pi / 2)],
+)
+def test_a_jog_is_as_fast_as_asked(name, speed, taken):
+    assert jog(RIG, name, "5", 0.0, speed).speed == pytest.approx(taken)
 
 
 @pytest.mark.parametrize("speed", [10.01, 0.0, -1.0, math.nan])

@@ -17,8 +17,9 @@ ADVICE: dict[str, Any] = tomllib.loads((HERE / "advice.toml").read_text(encoding
 
 # The longest ending that fits counts, so the order matters.
 _UNITS = {
-    "_mn_per_mm": "mN/mm", "_mrad_per_mm": "mrad/mm", "_mm_s": "mm/s", "_per_mm": "1/mm", "_per_mj": "1/mJ",
-    "_per_m": "1/m", "_kpa": "kPa", "_gpa": "GPa", "_mrad": "mrad", "_hz": "Hz", "_mm": "mm", "_s": "s",
+    "_mn_per_mm": "mN/mm", "_mrad_per_mm": "mrad/mm", "counts_per_mm": "counts/mm", "counts_per_deg": "counts/°",
+    "_mm_s2": "mm/s²", "_deg_s2": "°/s²", "_mm_s": "mm/s", "_deg_s": "°/s", "_per_mm": "1/mm", "_per_mj": "1/mJ",
+    "_per_m": "1/m", "_kpa": "kPa", "_gpa": "GPa", "_mrad": "mrad", "_hz": "Hz", "_mm": "mm", "_ms": "ms", "_s": "s",
     "_periods": "periods", "_mn": "mN", "_deg": "°",
 }  # fmt: skip
 _WITHOUT_ENDING = {"plan.deflection_weight": "1/mm²", "plan.guide_weight": "1/mm²"}
@@ -49,7 +50,7 @@ def schema() -> dict[str, Any]:
 
 def tables(root: dict[str, Any]) -> Iterator[Table]:
     """Yield the sections, each before those inside of it."""
-    yield from _tables("", "", root, root["$defs"])
+    yield from _tables("", "", root, root.get("$defs", {}))
 
 
 def unit(name: str) -> str:
@@ -60,8 +61,14 @@ def unit(name: str) -> str:
 
 def page() -> str:
     """Return the page, Markdown."""
-    sections = "\n".join(_section(table) for table in tables(schema()))
+    sections = "\n".join(section(table, heading(table), ADVICE) for table in tables(schema()))
     return f"{ADVICE['introduction']}\n{sections}".rstrip() + "\n"
+
+
+def heading(table: Table) -> str:
+    """Return the heading of a section."""
+    name = f"[[{table.name}]]" if table.name == "tissue" else f"[{table.name}]"
+    return f"## `{name}`" if table.name else "## Top level"
 
 
 def _tables(name: str, key: str, node: dict[str, Any], known: dict[str, Any]) -> Iterator[Table]:
@@ -86,15 +93,14 @@ def _table_of(value: dict[str, Any], known: dict[str, Any]) -> dict[str, Any] | 
     return known[names[0]] if names else None
 
 
-def _section(table: Table) -> str:
-    heading = f"[[{table.name}]]" if table.name == "tissue" else f"[{table.name}]"
-    advice = ADVICE["sections"].get(table.name, "")
-    lines = [f"## `{heading}`\n" if table.name else "## Top level\n"]
-    lines += [f"{' '.join(text.split())}\n" for text in (_about(table), table.key, advice) if text]
+def section(table: Table, title: str, advice: dict[str, Any]) -> str:
+    """Return a section with a row for each key; advice: texts of sections and keys by name."""
+    texts = (_about(table), table.key, advice["sections"].get(table.name, ""))
+    lines = [f"{title}\n", *(f"{' '.join(text.split())}\n" for text in texts if text)]
     if table.keys:
         lines.append('<div class="scenario" markdown>\n')
         lines += ["| key | unit | default | allowed | meaning and choice |", "|---|---|---|---|---|"]
-        lines += [_row(key) for key in table.keys]
+        lines += [_row(key, advice) for key in table.keys]
         lines.append("\n</div>\n")
     return "\n".join(lines)
 
@@ -110,9 +116,9 @@ def _about(table: Table) -> str:
     return rest[:1].upper() + rest[1:]
 
 
-def _row(key: Key) -> str:
+def _row(key: Key, advice: dict[str, Any]) -> str:
     meaning = " ".join(key.schema.get("description", "").split())
-    text = f"{meaning} *Choose:* {ADVICE['keys'][key.name]}"
+    text = f"{meaning} *Choose:* {advice['keys'][key.name]}"
     short = key.name.rsplit(".", 1)[-1]
     cells = (f"`{short}`", unit(key.name), _default(key), allowed(key.schema), text)
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
@@ -136,6 +142,8 @@ def _toml(value: Any) -> str:
 def allowed(node: dict[str, Any]) -> str:
     """Return which values a schema allows, in a few words."""
     node = next((one for one in node.get("anyOf", [node]) if one.get("type") != "null"), node)
+    if "enum" in node:
+        return ", ".join(f"`{name}`" for name in node["enum"])
     match node.get("type"):
         case "array" if "prefixItems" in node:
             return f"{len(node['prefixItems'])} numbers, {allowed(node['prefixItems'][0])}"
@@ -144,7 +152,7 @@ def allowed(node: dict[str, Any]) -> str:
         case "boolean":
             return "`true`, `false`"
         case "string":
-            return ", ".join(f"`{name}`" for name in node["enum"]) if "enum" in node else "text in one line"
+            return "text in one line"
         case "integer":
             return f"whole, {_bounds(node)}"
         case _:

@@ -279,7 +279,7 @@ def _home(args: argparse.Namespace) -> int:
         for homing in chosen:
             operator.home(homing.name)
 
-    return _carried_out(rig, chosen, args.yes, home)
+    return _carried_out(rig, chosen, args.yes, home, "Only without a needle in tissue.")
 
 
 def _retract(args: argparse.Namespace) -> int:
@@ -306,10 +306,10 @@ def _positions(rig: RigFile) -> dict[str, float]:
 
 
 def _carried_out(
-    rig: RigFile, moves: Sequence[Move | Homing], yes: bool, command: Callable[[Operator], None]
+    rig: RigFile, moves: Sequence[Move | Homing], yes: bool, command: Callable[[Operator], None], *notes: str
 ) -> int:
     """Print the motions and, if they are confirmed, command them; return the exit status."""
-    print("\n".join([*map(str, moves), _ARMS]), file=sys.stderr)
+    print("\n".join([*map(str, moves), *notes, _ARMS]), file=sys.stderr)
     if not (yes or _confirmed()):
         print("flexneedle: not confirmed: nothing was moved", file=sys.stderr)
         return 1

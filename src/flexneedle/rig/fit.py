@@ -8,7 +8,6 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from flexneedle.control.guide import guide_axes
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.rig import Axis, RigFile
@@ -98,7 +97,8 @@ def _insertion(scenario: Scenario) -> Need:
 
 
 def _guide(scenario: Scenario, strategy: str) -> Iterator[Need]:
-    setup, moved = scenario.setup, guide_axes(scenario.setup, strategy)
+    setup = scenario.setup
+    moved = 0 if strategy == _STILL else setup.moved_guide_axes
     why = f"the guide moves on {moved} axes" if moved > 1 else "the guide moves"
     for name in ("guide_y", "guide_z")[:moved]:
         keys = "setup.max_guide_travel_mm", "setup.max_guide_step_mm"

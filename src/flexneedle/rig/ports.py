@@ -79,7 +79,8 @@ class Motors(Protocol):
     """The motors of a rig by channel. It knows counts and channels, neither needles nor plans.
 
     No call takes longer than the reply timeout of the device. Each raises DriverError if the device cannot be reached
-    or refuses the command; the message has the device's reason.
+    or refuses the command; the message has the device's reason. A driver may have `identity`, one line that names the
+    controller and its firmware, for `rig check`.
     """
 
     def read(self) -> Mapping[str, MotorState]:

@@ -45,7 +45,7 @@ Home = Literal["here", "reverse-limit", "forward-limit", "absolute"]
 
 
 class Part(Section):
-    """A driver or tracker: its kind, and settings of its own, unchecked here."""
+    """A kind, and settings of its own, which are checked where it is made."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -131,7 +131,7 @@ class Axis(Section, ABC):
 
 
 class LinearAxis(Axis):
-    """Section `axes.insertion`, and those of guide and base: an axis with a length."""
+    """Section `axes.insertion`: an axis with a length, as those of guide and base."""
 
     unit = "mm"
     size = 1.0
