@@ -82,10 +82,16 @@ class EmulatedRig:
 
 
 @contextmanager
-def emulated_rig(folder: Path, scenario: str, seed: int, *, changes: Mapping[str, str] = {}) -> Iterator[EmulatedRig]:
+def emulated_rig(
+    folder: Path, scenario: str, seed: int, *, changes: Mapping[str, str] = {}
+) -> Iterator[EmulatedRig]:
     """Serve an emulated rig with its files in a folder. changes: texts of the rig file by what they replace."""
     text = (files("flexneedle.scenario") / "rigs" / "emulated.toml").read_text()
-    for before, after in {"/tmp/aurora": str(folder / "aurora"), "127.0.0.1:2323": "127.0.0.1:0", **changes}.items():
+    for before, after in {
+        "/tmp/aurora": str(folder / "aurora"),
+        "127.0.0.1:2323": "127.0.0.1:0",
+        **changes,
+    }.items():
         text = text.replace(before, after)
     rig, truth = folder / "rig.toml", folder / "truth.csv"
     rig.write_text(text)
@@ -105,7 +111,12 @@ def emulated_rig(folder: Path, scenario: str, seed: int, *, changes: Mapping[str
 
 
 def insertion(
-    rig: Path, scenario: str, out: Path, *options: str, environment: Mapping[str, str] = {}, cwd: Path | None = None
+    rig: Path,
+    scenario: str,
+    out: Path,
+    *options: str,
+    environment: Mapping[str, str] = {},
+    cwd: Path | None = None,
 ) -> subprocess.Popen[bytes]:
     """Start an insertion on a rig, in a session of its own."""
     command = [sys.executable, "-m", "flexneedle", "insert", scenario, "--rig", str(rig), "--yes"]

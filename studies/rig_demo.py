@@ -3,9 +3,9 @@
 python studies/rig_demo.py [--insertions 20] [--out runs/rig-demo]
 
 Each insertion has an emulated Galil, an emulated Aurora and a phantom of its own seed in three processes; the
-controller gets nothing but the two protocols. Every tenth is in space. Beside it the same insertion runs on the virtual
-rig, in simulated time. A witness, a process that only sleeps, records the machine's own stalls: a tick that was left out
-counts as missed unless the witness was late at the same time.
+controller gets nothing but the two protocols. Every tenth is in space. Beside it the same insertion runs on the
+virtual rig, in simulated time. A witness, a process that only sleeps, records the machine's own stalls: a tick that was
+left out counts as missed unless the witness was late at the same time.
 """
 
 import argparse
@@ -79,7 +79,9 @@ def _unexplained(stalls: list[dict[str, float]], seen: Witness) -> int:
 
 def main() -> None:
     """Run the insertions and print a line for each, and a summary."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--insertions", type=int, default=1)
     parser.add_argument("--space", action="store_true", help="all in space")
     parser.add_argument("--out", type=Path, default=Path("runs/rig-demo"))
@@ -112,8 +114,8 @@ def _summarise(results: list[Result]) -> None:
         f"simulated {np.mean(simulated):.3f} mm ({max(simulated):.3f} mm); axial innovation "
         f"{np.mean([one.innovation for one in results]):+.4f} mm; {sum(one.ticks for one in results)} ticks, "
         f"99 % {percentile([one.tick_99 for one in results], 1.0):.2f} ms in the worst insertion, "
-        f"{sum(one.missed for one in results)} left out, {sum(one.unexplained for one in results)} not by a stall of the "
-        f"machine; {sum(one.late_periods for one in results)} decisions late"
+        f"{sum(one.missed for one in results)} left out, {sum(one.unexplained for one in results)} not by a stall of "
+        f"the machine; {sum(one.late_periods for one in results)} decisions late"
     )
 
 

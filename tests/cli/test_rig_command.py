@@ -2,7 +2,7 @@
 
 import json
 import math
-import sys
+from contextlib import closing
 from types import SimpleNamespace
 
 import pytest
@@ -11,9 +11,10 @@ import tomli_w
 import bench_rig
 from bench_rig import Motors, values
 from commands import run
-from emulated import emulated
+from emulated import emulated, emulator
 from flexneedle.cli import rig as command
 from flexneedle.errors import DriverError
+from flexneedle.rig.devices.galil.motors import factory
 
 KINDS = {"driver.kind": "bench_rig:drivers", "tracker.kind": "bench_rig:trackers"}
 
@@ -48,8 +49,8 @@ class Supervisor:
     def home(self, axis):
         self._move("home", axis)
 
-    def move_to(self, axis, position):
-        self._move("move_to", axis, position)
+    def retract(self, position):
+        self._move("retract", position)
 
     def stop(self):
         self.calls.append(("stop",))
@@ -98,11 +99,20 @@ def terminal(monkeypatch):
     return types
 
 
-def test_the_supervisor_is_that_of_the_rig(monkeypatch):
-    fake = Supervisor()
-    monkeypatch.setitem(sys.modules, "flexneedle.rig.supervisor.client", SimpleNamespace(Supervisor=fake))
-    assert command.supervised(bench_rig.rig()) is fake
-    assert fake.calls == [("rig", "Bench")]
+def test_axes_of_an_emulated_controller_are_jogged_and_retracted_by_the_supervisor(capsys, tmp_path):
+    with emulator(device="galil") as (address, _):
+        path = tmp_path / "rig.toml"
+        driver = {"driver": {"kind": "galil", "address": address}}
+        path.write_text(tomli_w.dumps(values() | driver))
+        for words in (("jog", str(path), "guide_y", "-1.5mm"), ("jog", str(path), "insertion", "3mm")):
+            assert run(capsys, "rig", *words, "--yes")[0] == 0
+        assert run(capsys, "rig", "retract", str(path), "--to", "1", "--yes")[0] == 0
+        axes = dict(bench_rig.rig().axes.items())
+        with closing(factory({"address": address}, [axis.channel for axis in axes.values()])) as motors:
+            found = motors.read()
+    at = {name: found[axis.channel].position / axis.scale for name, axis in axes.items()}
+    assert at["guide_y"] == pytest.approx(-1.5, abs=0.01)
+    assert at["insertion"] == pytest.approx(1.0, abs=0.01)
 
 
 # Check
@@ -207,8 +217,8 @@ MOTIONS = [
         ("jog", "rotation", round(-math.pi / 20, 9), round(math.radians(72), 9)),
         "rotation: from 0 to -9 deg, at most at 72 deg/s",
     ),
-    (("retract",), ("move_to", "insertion", 0.0), "insertion: from 30 to 0 mm, at most at 10 mm/s"),
-    (("retract", "--to", "12.5"), ("move_to", "insertion", 12.5), "insertion: from 30 to 12.5 mm"),
+    (("retract",), ("retract", 0.0), "insertion: from 30 to 0 mm, at most at 10 mm/s"),
+    (("retract", "--to", "12.5"), ("retract", 12.5), "insertion: from 30 to 12.5 mm"),
     (
         ("home", "insertion"),
         ("home", "insertion"),

@@ -27,23 +27,23 @@ _NEGATIVE = re.compile(r"^-[\d.]")
 class Operator(Protocol):
     """The supervisor of a rig, for an operator's motions; each call returns when the motion has ended.
 
-    Each raises DriverError, with the reason, if it is refused or ends before its goal.
+    Each raises RefusedError or DriverError, with the reason, if it is refused or ends before its goal.
     """
 
     def arm(self) -> None:
         """Switch the motors on."""
         ...
 
-    def jog(self, axis: str, distance: float, speed: float) -> None:
+    def jog(self, axis: str, distance: float, speed: float) -> object:
         """Move an axis by a distance (mm or rad), at most at a speed (mm/s or rad/s)."""
         ...
 
-    def home(self, axis: str) -> None:
+    def home(self, axis: str) -> object:
         """Find the home of an axis."""
         ...
 
-    def move_to(self, axis: str, position: float) -> None:
-        """Move an axis to a position (mm or rad)."""
+    def retract(self, position: float) -> object:
+        """Withdraw the base to a position of the insertion axis (mm)."""
         ...
 
     def stop(self) -> None:
@@ -53,10 +53,9 @@ class Operator(Protocol):
 
 def supervised(rig: RigFile) -> AbstractContextManager[Operator]:
     """Return the supervisor of a rig; leaving the context stops all axes and ends it."""
-    from importlib import import_module
+    from flexneedle.rig.supervisor.client import Supervisor
 
-    made: AbstractContextManager[Operator] = import_module("flexneedle.rig.supervisor.client").Supervisor(rig)
-    return made
+    return Supervisor.of_operator(rig)
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -288,7 +287,7 @@ def _retract(args: argparse.Namespace) -> int:
 
     rig = load_rig(args.rig)
     move = retraction(rig, _positions(rig)["insertion"], args.to)
-    return _carried_out(rig, [move], args.yes, lambda operator: operator.move_to(move.name, move.goal))
+    return _carried_out(rig, [move], args.yes, lambda operator: operator.retract(move.goal))
 
 
 def _positions(rig: RigFile) -> dict[str, float]:
@@ -306,7 +305,11 @@ def _positions(rig: RigFile) -> dict[str, float]:
 
 
 def _carried_out(
-    rig: RigFile, moves: Sequence[Move | Homing], yes: bool, command: Callable[[Operator], None], *notes: str
+    rig: RigFile,
+    moves: Sequence[Move | Homing],
+    yes: bool,
+    command: Callable[[Operator], object],
+    *notes: str,
 ) -> int:
     """Print the motions and, if they are confirmed, command them; return the exit status."""
     print("\n".join([*map(str, moves), *notes, _ARMS]), file=sys.stderr)

@@ -23,7 +23,7 @@ def motor_problem(drive: Drive, state: MotorState, before: MotorState) -> str:
 def position_problem(
     drive: Drive, state: MotorState, before: MotorState, seconds: float, *, unlimited: bool = False
 ) -> str:
-    """A position that jumped since the reading before, `seconds` ago, or is beyond a soft limit.
+    """A position that jumped since the reading before, `seconds` ago, or goes further beyond a soft limit.
 
     unlimited: the position counts from nowhere, as during homing, so that limits mean nothing.
     """
@@ -31,11 +31,17 @@ def position_problem(
     most = _HASTE * drive.axis.speed * seconds + drive.axis.max_error
     if moved > most:
         return f"{drive.name}: the position jumped by {drive.shown(moved)} in {seconds:.3f} s"
-    position, (low, high) = drive.position(state.position), drive.axis.limits
-    if not (unlimited or low - drive.axis.max_error <= position <= high + drive.axis.max_error):
-        limits = f"{drive.shown(low)} to {drive.shown(high)}"
-        return f"{drive.name}: at {drive.shown(position)}, beyond its range {limits}"
+    outside = _outside(drive, state)
+    if not unlimited and outside > drive.axis.max_error and outside > _outside(drive, before):
+        low, high = map(drive.shown, drive.axis.limits)
+        return f"{drive.name}: at {drive.shown(drive.position(state.position))}, beyond its range {low} to {high}"
     return ""
+
+
+def _outside(drive: Drive, state: MotorState) -> float:
+    """How far a position is beyond the range (mm or rad)."""
+    position, (low, high) = drive.position(state.position), drive.axis.limits
+    return max(low - position, position - high, 0.0)
 
 
 def reversal_problem(drive: Drive, state: MotorState, before: MotorState, way: float) -> str:

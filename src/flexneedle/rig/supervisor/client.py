@@ -79,6 +79,7 @@ class Supervisor:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._thread.join()  # it ends with the supervisor's end of the line
         self._connection.close()
 
     @property

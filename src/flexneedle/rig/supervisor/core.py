@@ -122,7 +122,7 @@ class Supervisor:
             self._fault(str(error))
             return
         at = self._positions()
-        if problem := beyond(self._drives, list(at.items())):
+        if self._task.tracked and (problem := beyond(self._drives, list(at.items()))):
             self._refuse(0, f"arm: refused: {problem}")
             return
         self._goals, self._deepest = self._at(), at["insertion"] + deepest
