@@ -36,7 +36,7 @@ def drive(needle, before, after, ticks=TICKS):
 
 
 def insertions(name, seed, **values):
-    """A virtual rig and a driven needle with the same motions: to 33 mm, with a guide, and half turns in air and tissue.
+    """A virtual rig and a driven needle with the same motions: to 33 mm, with a guide, half turns in air and tissue.
 
     Yields the true state of the one, and the other.
     """
@@ -130,4 +130,6 @@ def test_a_sensor_is_behind_the_tip_in_the_trackers_frame():
     np.testing.assert_allclose((found.x, found.y, found.z), (31.1, 1.8, -0.7), atol=1e-9)
     np.testing.assert_allclose(found.direction, (0.06, -0.03), atol=1e-9)
     assert math.dist((x, y, z), registered.inverse().apply(np.array([31.1, 1.8, -0.7]))) == pytest.approx(9.0)
-    assert np.array(axis) @ (registered.inverse().rotation @ np.array(Pose.of(tip).axis)) == pytest.approx(1.0)
+    assert np.array(axis) @ (registered.inverse().rotation @ np.array(Pose.of(tip).axis)) == pytest.approx(
+        1.0
+    )

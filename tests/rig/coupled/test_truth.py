@@ -41,7 +41,7 @@ def test_the_tip_between_two_rows_is_between_theirs(path):
         writer.write(row(10.5, 1.0))
     found = read_truth(path)
     np.testing.assert_allclose(found.tip_at(np.array([10.0, 10.25])), [TIP, TIP + 0.5])
-    with pytest.raises(InputError, match="from 10.000 to 10.500 s"):
+    with pytest.raises(InputError, match=r"from 10\.000 to 10\.500 s"):
         found.tip_at(10.6)
 
 

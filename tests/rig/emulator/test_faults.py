@@ -162,7 +162,11 @@ def test_an_order_is_a_fault_from_now_on():
     assert parse_order("fault missing=ref1:2", FAULTS, 7.0) == Fault("missing", 7.0, 9.0, "ref1")
     assert parse_order(" fault  jump ", FAULTS, 7.0) == Fault("jump", 7.0, math.inf, "5")
     assert parse_order("clear", FAULTS, 7.0) is None
-    assert [is_order(line) for line in ("fault x", "clear", "1 2 3", "faults", "")] == [True, True, *[False] * 3]
+    assert [is_order(line) for line in ("fault x", "clear", "1 2 3", "faults", "")] == [
+        True,
+        True,
+        *[False] * 3,
+    ]
 
 
 @pytest.mark.parametrize(

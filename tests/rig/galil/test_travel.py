@@ -1,5 +1,7 @@
 """What an observer of the emulated controller is told: how far its motors have really turned."""
 
+from itertools import pairwise
+
 import pytest
 
 from flexneedle.rig.emulator.faults import parse_fault
@@ -24,7 +26,7 @@ def test_the_travel_is_that_of_the_encoder_every_few_milliseconds():
     moving = [(time, travel[0]) for time, travel, moves in told if moves]
     times = [time for time, _ in moving]
     assert times[0] == pytest.approx(0.1)
-    assert max(after - before for before, after in zip(times, times[1:], strict=False)) < 0.0051
+    assert max(after - before for before, after in pairwise(times)) < 0.0051
     assert moving[-1][1] == pytest.approx(session.device.axes[0].encoder)
     assert moving[-1][1] > 500.0
 
