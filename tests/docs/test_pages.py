@@ -14,6 +14,7 @@ from markdown_examples import PAGES, ROOT, SHELL, blocks, printed, same
 # Pages that take more than about 5 s.
 LONG = {
     "controllers.md",
+    "emulate.md",
     "extend.md",
     "index.md",
     "needle-and-tissue.md",

@@ -33,7 +33,7 @@ _GALIL_EXAMPLES = examples(
 
 _RIG_EXAMPLES = examples(
     "flexneedle emulate rig emulated phantom --seed 3 --truth truth.csv",
-    "flexneedle emulate rig my-rig.toml phantom3d --fault galil:stall=A@5 --fault aurora:missing@8:0.5",
+    "flexneedle emulate rig my-rig.toml phantom3d --fault galil:stall=A@5 --fault aurora:jump@8:0.5",
 )
 
 _LAST_PORT = 65535

@@ -1,12 +1,17 @@
 """Parsing of faults, and their effects in a session over time."""
 
+import math
+import struct
+
 import pytest
 
 from flexneedle.errors import InputError
+from flexneedle.rig.devices.aurora.readings import reading
 from flexneedle.rig.emulator import codec
 from flexneedle.rig.emulator.aurora import FAULTS, fresh
-from flexneedle.rig.emulator.faults import Fault, active, parse_fault
-from flexneedle.rig.emulator.server import EmulatorSession
+from flexneedle.rig.emulator.faults import Fault, Schedule, active, is_order, parse_fault, parse_order
+from flexneedle.rig.emulator.motion import pose
+from flexneedle.rig.emulator.server import EmulatorSession, execute
 
 
 def test_a_fault_has_a_kind_a_detail_a_start_and_a_duration():
@@ -29,6 +34,9 @@ def test_a_fault_has_a_kind_a_detail_a_start_and_a_duration():
         ("delay=nan@1", "the delay must be above 0 s"),
         ("silence=3@1", "silence takes no detail"),
         ("silence@1.2.3", "1.2.3 is not a number of seconds"),
+        ("jump=x@1", "x is not a number of mm"),
+        ("jump=0@1", "the jump must be above 0 mm, such as jump=5"),
+        ("indicator=inf@1", "the indicator must be above 0, such as indicator=0.2"),
     ],
 )
 def test_an_invalid_fault_is_rejected_in_one_line(spec, message):
@@ -104,3 +112,99 @@ def test_faults_continue_after_another_set_up():
     session.reply(command("INIT:"), 10.5)
     session.reply(command("TSTART:"), 10.6)
     assert session.reply(command("INIT:"), 11.5)[1] == b""
+
+
+def values(session, now):
+    """The numbers of the tip's reading in a binary reply: quaternion, position, indicator."""
+    body = session.reply(command("BX:0801"), now)[1]
+    assert body[6:9] == bytes((1, 0x0A, 1)), "one sensor, valid"
+    return struct.unpack("<8f", body[9:41])
+
+
+def test_a_jump_is_beside_the_position():
+    good, bad = values(tracking(), 11.5), values(tracking("jump=7.5@1:1"), 11.5)
+    assert bad[5] - good[5] == pytest.approx(7.5, abs=1e-4)
+    assert (bad[4], bad[6], bad[7]) == (good[4], good[6], good[7])
+    assert values(tracking("jump@1:1"), 12.5) == values(tracking(), 12.5)
+
+
+def test_a_stuck_sensor_repeats_its_values_while_frames_continue():
+    session = tracking("stuck@1:1")
+    first, later = values(session, 11.0), values(session, 11.9)
+    assert first == later == values(tracking(), 11.0)
+    assert number(read(session, 11.0)[1]) < number(read(session, 11.9)[1])
+    assert values(session, 12.1) == values(tracking(), 12.1)
+
+
+def test_a_high_indicator_leaves_the_pose_as_it_is():
+    good, bad = values(tracking(), 11.0), values(tracking("indicator=0.3@1"), 11.0)
+    assert bad[:7] == good[:7]
+    assert bad[7] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("kind", ["BX", "TX"])
+def test_values_that_are_not_numbers_are_reported_and_rejected_by_the_adapter(kind):
+    if kind == "BX":
+        found = values(tracking("nan@1"), 11.0)
+        assert all(map(math.isnan, found))
+    else:
+        text = read(tracking("nan@1"), 11.0)[1].decode()
+        assert text.startswith("010A" + 4 * "   nan" + 3 * "    nan" + "   nan")
+        found = (0.0,) * 8  # as ndicapi reads what are no digits
+    assert reading(0, 0x31, found).status == "bad transform"
+
+
+def test_a_fault_of_another_sensor_does_not_change_the_tip():
+    assert values(tracking("nan=ref1@0", "stuck=ref2@0"), 11.5) == values(tracking(), 11.5)
+
+
+def test_an_order_is_a_fault_from_now_on():
+    assert parse_order("fault missing=ref1:2", FAULTS, 7.0) == Fault("missing", 7.0, 9.0, "ref1")
+    assert parse_order(" fault  jump ", FAULTS, 7.0) == Fault("jump", 7.0, math.inf, "5")
+    assert parse_order("clear", FAULTS, 7.0) is None
+    assert [is_order(line) for line in ("fault x", "clear", "1 2 3", "faults", "")] == [
+        True,
+        True,
+        *[False] * 3,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("fault", "must be fault KIND"),
+        ("fault missing@5", "must be fault KIND"),
+        ("fault mising", "kinds: missing, out-of-volume"),
+        ("fault missing=ref9", "no such sensor"),
+        ("clear all", "must be fault KIND"),
+    ],
+)
+def test_an_invalid_order_is_rejected_in_one_line(line, message):
+    with pytest.raises(InputError, match=message) as refusal:
+        parse_order(line, FAULTS, 0.0)
+    assert "\n" not in str(refusal.value)
+
+
+def test_orders_are_of_the_devices_time_and_scheduled_faults_of_its_work():
+    schedule = Schedule(FAULTS, (Fault("silence", 1.0, 2.0),))
+    schedule.obey("fault cut:0.5", 100.0)
+    assert schedule.at(100.2, None) == (Fault("cut", 100.0, 100.5),)
+    assert schedule.at(101.5, 100.0) == (Fault("silence", 101.0, 102.0),)
+    schedule.obey("fault cut", 102.0)
+    schedule.obey("fault cut:1", 103.0)
+    assert schedule.at(103.5, None) == (Fault("cut", 103.0, 104.0),), "it takes the place of the same one"
+    assert schedule.obey("clear", 103.0) == "no fault"
+    assert schedule.at(103.5, 102.0) == ()
+
+
+def test_a_line_to_the_emulator_is_a_fault_or_a_position():
+    session = tracking()
+    assert execute(session, "fault jump=3:9") == "jump=3 from now on"
+    assert execute(session, "fault jmp").startswith("fault jmp: unknown kind; kinds: missing")
+    assert execute(session, "1 2 -3") == "the tip rests at 1 2 -3 mm"
+    assert execute(session, "clear") == "no fault from now on"
+
+
+def test_a_frozen_frame_is_the_same_frame():
+    session = tracking("frozen@1")
+    assert values(session, 15.0)[4:7] == pytest.approx(pose("tip", 440, 0).position, abs=1e-4)

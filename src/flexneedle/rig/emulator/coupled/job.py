@@ -81,8 +81,8 @@ def checked_job(
         raise InputError("tracker.environment: the emulated tracker has white noise only; leave it out")
     plan = record.plan if isinstance(record, Insertion) else record
     if isinstance(plan, Plan):
-        check_origin(plan, scenario)
         scenario = placed(scenario, plan)
+        check_origin(plan, scenario)
     elif plan is not None:
         raise InputError(
             "--plan: the folder has several plans; make one with flexneedle plan --strategy NAME"

@@ -93,6 +93,11 @@ class GalilSession:
     def _present(self, now: float) -> tuple[Fault, ...]:
         return self.schedule.at(now, self.moved_since)
 
+    @property
+    def _time(self) -> float:
+        """Time of the last sample."""
+        return self.power_on + self._samples / SAMPLES_HZ
+
     def advance(self, now: float) -> None:
         """Let the axes move until `now`, with their faults, a few samples at a time."""
         due = int((now - self.power_on) * SAMPLES_HZ) - self._samples
@@ -102,12 +107,12 @@ class GalilSession:
         self._advance(now, max(0, due))
 
     def _advance(self, now: float, samples: int) -> None:
+        if self.moved_since is None and any(axis.running for axis in self.device.axes):
+            self.moved_since = self._time
         present = self._present(now)
         before = tuple(self._with_faults(axis, AXES[k], present) for k, axis in enumerate(self.device.axes))
         self.device = advanced(replace(self.device, axes=before), samples)
         self._samples += samples
-        if self.moved_since is None and any(axis.running for axis in self.device.axes):
-            self.moved_since = now
         self._report(
             [after.encoder - axis.encoder for axis, after in zip(before, self.device.axes, strict=True)]
         )
@@ -117,8 +122,7 @@ class GalilSession:
         self._travel = tuple(travel + step for travel, step in zip(self._travel, moved, strict=True))
         if self.observe is not None:
             moving = any(axis.running and not axis.profile.at_rest for axis in self.device.axes)
-            time = self.power_on + self._samples / SAMPLES_HZ
-            self.observe(time, self._travel, moving or any(moved))
+            self.observe(self._time, self._travel, moving or any(moved))
 
     def _with_faults(self, axis: Axis, name: str, present: Sequence[Fault]) -> Axis:
         of_this = {fault.kind: fault for fault in present if fault.detail == name}

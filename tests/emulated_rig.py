@@ -1,0 +1,126 @@
+"""A whole emulated rig in processes of its own, and a raw client of its controller."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import contextmanager
+from importlib.resources import files
+
+import psutil
+
+from emulated import DEADLINE_S, until
+
+START_S = 60.0  # the first run compiles the kernels
+
+
+def rig_file(folder, **replaced):
+    """Write the emulated rig of the package with a free port and a link in the folder; return its path. replaced: texts
+    by the text that takes their place."""
+    text = (files("flexneedle.scenario") / "rigs" / "emulated.toml").read_text()
+    for before, after in {
+        "127.0.0.1:2323": "127.0.0.1:0",
+        "/tmp/aurora": str(folder / "aurora"),
+        **replaced,
+    }.items():
+        assert before in text
+        text = text.replace(before, after)
+    path = folder / "rig.toml"
+    path.write_text(text)
+    return path
+
+
+class EmulatedRig:
+    """The processes and what they have reported so far; `ask` sends a line to the controller and returns its reply."""
+
+    def __init__(self, process):
+        self.process, self.messages, self._received, self._line = process, [], b"", None
+        os.set_blocking(process.stdout.fileno(), False)
+        until(lambda: self.message("ready") or process.poll() is not None, START_S)
+        self.ready = self.message("ready")
+
+    def message(self, key, **values):
+        """The first message with a key and these values, None if there is none yet."""
+        self._read()
+        return next((m for m in self.messages if key in m and values.items() <= m.items()), None)
+
+    def order(self, line):
+        """Write an order; return the first message about it."""
+        before = len(self.messages)
+        self.process.stdin.write(f"{line}\n".encode())
+        self.process.stdin.flush()
+
+        def answered():
+            self._read()
+            return [m for m in self.messages[before:] if "done" in m or "refused" in m]
+
+        until(answered)
+        return answered()[0]
+
+    def ask(self, commands):
+        """Send a line to the controller; return its reply."""
+        if self._line is None:
+            host, port = self.ready["ready"]["galil"].rsplit(":", 1)
+            self._line = socket.create_connection((host, int(port)), timeout=DEADLINE_S)
+        self._line.sendall(f"{commands}\r".encode())
+        answer = b""
+        while answer.count(b":") + answer.count(b"?") <= commands.count(";"):
+            got = self._line.recv(4096)
+            if not got:
+                raise ConnectionResetError
+            answer += got
+        return answer.decode()
+
+    def at_rest(self, letters):
+        """Wait until these motors rest."""
+        query = "MG " + ",".join(f"_BG{letter}" for letter in letters)
+        until(lambda: not any(map(float, self.ask(query).strip(" \r\n:").split())))
+
+    @property
+    def children(self):
+        """The processes that it has started."""
+        return [psutil.Process(pid) for pid in self.ready["pids"].values()]
+
+    def end(self, how=signal.SIGINT):
+        """End it; return exit status and errors."""
+        if self._line is not None:
+            self._line.close()
+        if self.process.poll() is None:
+            self.process.send_signal(how)
+        self.process.wait(DEADLINE_S)
+        self._read()
+        errors = self.process.stderr.read().decode()
+        for stream in (self.process.stdin, self.process.stdout, self.process.stderr):
+            stream.close()
+        return self.process.returncode, errors
+
+    def _read(self):
+        if self.process.stdout.closed:
+            return
+        try:
+            while data := os.read(self.process.stdout.fileno(), 65_536):
+                self._received += data
+        except BlockingIOError:
+            pass
+        *lines, self._received = self._received.split(b"\n")
+        self.messages += [json.loads(line) for line in lines]
+
+
+def started(*arguments):
+    """Start `flexneedle emulate rig` with these arguments; return it when it is ready."""
+    command = [sys.executable, "-m", "flexneedle", "emulate", "rig", *map(str, arguments)]
+    pipe = subprocess.PIPE
+    return EmulatedRig(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe))
+
+
+@contextmanager
+def emulated_rig(*arguments):
+    """Run `flexneedle emulate rig` with these arguments, to its good end."""
+    rig = started(*arguments)
+    try:
+        yield rig
+    finally:
+        code, errors = rig.end()
+    assert code == 0, errors
