@@ -102,7 +102,10 @@ class GalilMotors:
         return DriverError(f"{self._link.name}: {problem}")
 
     def reconnect(self) -> None:
-        """Drop the connection and open a new one. It moves nothing, and changes nothing in the controller."""
+        """Drop the connection and open a new one. It moves nothing, and changes nothing in the controller.
+
+        Axes that an earlier connection has left in position tracking may count as moving, also at rest, until `stop`.
+        """
         self._connect(self._deadline())
 
     def close(self) -> None:
