@@ -104,11 +104,8 @@ def test_when_targets_end_the_motor_stops_after_the_motion_that_was_sent_ahead()
         for _ in range(5):
             at = motors.read()["A"].commanded
             motors.follow({"A": at + SPEED * AHEAD_S})
-        begin = monotonic()
         end = settled(motors)["A"].position
-        took = monotonic() - begin
     assert 0 < end - at <= SPEED * AHEAD_S + 1
-    assert took < AHEAD_S + SPEED / ACCELERATION + 1.0
 
 
 def test_speed_changes_under_way_while_targets_are_streamed():

@@ -2,6 +2,7 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
+from time import monotonic
 
 import pytest
 from hypothesis import given, settings
@@ -163,6 +164,19 @@ def test_a_repeated_stop_lets_the_axes_slow_down():
         motors.stop()
         motors.stop()
         assert device.lines[-2:] == ["STAB", "STAB"]
+
+
+def test_a_stop_of_a_new_motion_is_the_first():
+    with driven() as (motors, device):
+        for channel in "AB":
+            motors.set_speed(channel, 2000, 1_024_000)
+        motors.stop()
+        late = monotonic() + 0.1
+        until(lambda: monotonic() > late)
+        motors.follow({"A": 99999.0})
+        device.lines.clear()
+        motors.stop()
+        assert device.lines == ["STAB"]
 
 
 def test_a_stop_that_has_no_effect_is_followed_by_an_abort():
