@@ -33,6 +33,7 @@ from flexneedle.rig.emulator.galil.controller import Device, advanced, reply
 
 FARTHEST = 2.0**31
 TIMEOUT_MS, SLACK_S = 10.0, 1.0  # slack: the machine may be busy with other processes
+RECOVERY_S = 20.0
 LETTERS = "AB"
 
 
@@ -339,13 +340,15 @@ def connected(motors: GalilMotors) -> bool:
 
 def recover(motors: GalilMotors) -> None:
     """Connect again to a controller that answers. Raises Failure if that does not succeed."""
-    for _ in range(50):
+    deadline, reason = monotonic() + RECOVERY_S, ""
+    while monotonic() < deadline:
         try:
             motors.reconnect()
-        except DriverError:
+        except DriverError as error:
+            reason = str(error)
             continue
         return
-    raise Failure("no connection to a controller that answers")
+    raise Failure(f"no connection to a controller that answers: {reason}")
 
 
 ACTIONS: dict[str, Callable[[GalilMotors, Random], object]] = {

@@ -96,5 +96,5 @@ def reads_truly(motors, device):
         found = [state.position for state in motors.read().values()]
     except DriverError:
         return False
-    assert found == pytest.approx([axis.encoder for axis in device.device.axes[:2]], abs=500)
+    assert found == pytest.approx([axis.encoder for axis in device.device.axes[:2]], abs=1)
     return True
