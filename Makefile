@@ -37,12 +37,13 @@ test: setup  ## run the tests but the long ones, on all cores
 test-all: setup  ## run all tests but the slow ones: statistics over many draws, studies in several processes
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" $(PYTEST_ARGS)
 
-bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker
+bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker, round trips to emulated motors
 	$(BIN)/python benchmarks/bench.py
 	$(BIN)/python benchmarks/plant.py
 	$(BIN)/python benchmarks/periods.py
 	$(BIN)/python benchmarks/em.py
 	$(BIN)/python benchmarks/aurora.py
+	$(BIN)/python benchmarks/galil.py
 
 robustness: setup  ## 100,000 random insertions of the model in the plane and in space, as it ships and adapted, and 2,000 of the exact plant (long)
 	$(BIN)/python studies/robustness.py

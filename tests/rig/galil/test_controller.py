@@ -172,6 +172,7 @@ def test_a_limit_switch_switches_the_motor_off_where_it_shall(off_on_error):
 def test_a_software_limit_begins_a_count_beyond():
     device = advanced(after(switched_on("FLA=30", "BLA=-30"), "PAA=30", "BGA")[0], 100)
     assert (value(device, "TPA"), value(device, "SCA")) == (30, 1)
+    assert value(advanced(after(device, "PAA=90", "BGA")[0], 100), "TPA") < 35
     assert why(advanced(after(device, "DPA=31")[0], 1), "PAA=40;BGA").startswith(" 22 ")
 
 

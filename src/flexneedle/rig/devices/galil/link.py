@@ -27,8 +27,8 @@ class Link:
     call, may take seconds).
     """
 
-    def __init__(self, host: str, port: int, farewell: str = "") -> None:
-        self._farewell = farewell.encode("ascii") + _END if farewell else b""
+    def __init__(self, host: str, port: int) -> None:
+        self.farewell = ""
         self.name = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         try:
             found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
@@ -100,10 +100,10 @@ class Link:
 
     def failed(self, problem: str) -> DriverError:
         """Send the farewell and close a connection whose replies are in doubt; return the error to raise."""
-        if self._socket is not None and self._farewell:
+        if self._socket is not None and self.farewell:
             with suppress(OSError):
                 self._socket.setblocking(False)
-                self._socket.send(self._farewell)
+                self._socket.send(self.farewell.encode("ascii") + _END)
                 self._socket.shutdown(socket.SHUT_WR)
                 self._socket.recv(
                     _MOST_UNREAD

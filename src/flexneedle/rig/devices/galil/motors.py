@@ -55,7 +55,7 @@ class GalilMotors:
         self._timeout = settings.reply_timeout_ms / 1e3
         self._tracks = settings.mode == "tracking"
         self._letters = "".join(sorted(channels))
-        self._link = Link(settings.host, settings.port, farewell=f"ST{self._letters}")
+        self._link = Link(settings.host, settings.port)
         self._dialogue = Dialogue(self._link)
         self._channels = dict.fromkeys(self._letters, Channel())
         self._rates: dict[str, int] = {}
@@ -74,16 +74,21 @@ class GalilMotors:
     def _connect(self, deadline: float) -> None:
         self._channels = dict.fromkeys(self._letters, Channel())
         self._rates, self._stopping = {}, None
+        self._link.farewell = ""  # it may be any device
         self._link.open(deadline)
+        try:
+            self._greet(deadline)
+        except DriverError as error:
+            self._link.close(str(error))
+            raise
+        self._link.farewell = f"ST{self._letters}"
+
+    def _greet(self, deadline: float) -> None:
+        """Find out what is there. Raises DriverError if it is not a controller that can be read as it is."""
         self._link.ask(["EO 0"], deadline)  # refused where there is no echo to switch off, as on Ethernet
         self.identity = self._dialogue.text(_REVISION, deadline)
         if "DMC" not in self.identity:
             raise self._unfit(f"not a Galil motion controller: {self.identity}")
-        self._check(deadline)
-        self._reports(deadline)
-
-    def _check(self, deadline: float) -> None:
-        """Raise DriverError if positions could not be read as they are."""
         queries = ["MG _PF", f"MG {facts.operands('MT', self._letters)}"]
         (form,), kinds = self._dialogue.numbers(queries, [1, len(self._letters)], deadline)
         if form != facts.POSITION_FORMAT:
@@ -91,13 +96,16 @@ class GalilMotors:
         for letter, kind in zip(self._letters, kinds, strict=True):
             if abs(kind) not in facts.SERVOS:
                 raise self._unfit(f"{letter} is no servo motor (MT {kind:g}): its position is not measured")
+        self._reports(deadline)
 
     def _unfit(self, problem: str) -> DriverError:
-        self._link.close(problem)
         return DriverError(f"{self._link.name}: {problem}")
 
     def reconnect(self) -> None:
-        """Drop the connection and open a new one. It moves nothing, and changes nothing in the controller."""
+        """Drop the connection and open a new one. It moves nothing, and changes nothing in the controller.
+
+        Axes that an earlier connection has left in position tracking may count as moving, also at rest, until `stop`.
+        """
         self._connect(self._deadline())
 
     def close(self) -> None:

@@ -14,7 +14,7 @@ LONGEST_LINE = 80
 _ACCEPTED, _REFUSED = b":", b"?"
 _TERMINATOR = re.compile(rb"[:?]")
 _DATA = re.compile(rb"[\x20-\x7e\r\n]*")
-_NUMBER = re.compile(r"-?\d{1,10}(?:\.\d{1,4})?")
+_NUMBER = re.compile(r"-?[0-9]{1,10}(?:\.[0-9]{1,4})?")
 _SEPARATOR = re.compile(r", *| +")
 
 

@@ -236,8 +236,8 @@ def _track(axis: Axis, value: float) -> Axis:
         return one.slowed(axis, one.STOPPED) if axis.running else replace(axis, tracking=False)
     if not axis.servo:
         raise _RefusalError(20)
-    if axis.tracking or axis.profile.stopping:
-        return replace(axis, tracking=True)
+    if axis.tracking:
+        return axis
     if axis.jog is not None and axis.running:
         return replace(axis, tracking=True, jog=None, profile=stopped(axis.profile))
     goal = axis.profile.goal if axis.running else axis.profile.position

@@ -1,0 +1,145 @@
+"""Time from command to reply of the motors on an emulated Galil: python benchmarks/galil.py [--calls N] [--json].
+
+Loopback, the emulated controller in a process of its own, four axes. `read()` and `follow()` are alternated at the rate
+at which they come (without a pause), while two axes move; between them an echo of as many bytes as a reading has, by a
+plain TCP server in a third process: what the machine needs for a round trip alone. Median, 99 % and largest time of
+each, and the ratio to the echo. To judge the machine: processor time taken by the host (Linux in a virtual machine).
+Exit status 1 if 99 % of read() or follow() took longer than 2 ms.
+"""
+
+import argparse
+import json
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from time import perf_counter
+
+import numpy as np
+import psutil
+
+from flexneedle.rig.devices.galil.motors import GalilMotors, factory
+
+CHANNELS = "ABCD"
+BAR_MS = 2.0
+_ECHO = """
+import socket
+with socket.create_server(("127.0.0.1", 0)) as server:
+    print(server.getsockname()[1], flush=True)
+    connection, _ = server.accept()
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    while data := connection.recv(4096):
+        connection.sendall(data)
+"""
+_REPLY = b" 12345, -12345, 0, 0\r\n:" * 4
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--calls", type=int, default=5000)
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    found = measure(args.calls)
+    if args.json:
+        print(json.dumps(found))
+    else:
+        for name, value in found.items():
+            print(f"{name}: {value}")
+    return 1 if max(found["read(), ms"]["99 %"], found["follow(), ms"]["99 %"]) > BAR_MS else 0
+
+
+def measure(calls: int) -> dict[str, object]:
+    """Return the times of so many calls of each kind."""
+    stolen = getattr(psutil.cpu_times(), "steal", 0.0)
+    with emulated() as address, echo() as line, connected(address) as motors:
+        prepare(motors)
+        motion = targets()
+        kinds: dict[str, Callable[[], object]] = {
+            "echo": lambda: exchanged(line),
+            "read()": motors.read,
+            "follow()": lambda: motors.follow(next(motion)),
+        }
+        times: dict[str, list[float]] = {name: [] for name in kinds}
+        for _ in range(calls):
+            for name, call in kinds.items():
+                begun = perf_counter()
+                call()
+                times[name].append(1e3 * (perf_counter() - begun))
+        motors.stop()
+    found: dict[str, object] = {f"{name}, ms": summary(values) for name, values in times.items()}
+    for name in ("read()", "follow()"):
+        ratio = np.median(times[name]) / np.median(times["echo"])
+        found[f"{name}, times the echo (medians)"] = round(float(ratio), 2)
+    found["processor time taken by the host, s"] = round(
+        getattr(psutil.cpu_times(), "steal", 0.0) - stolen, 1
+    )
+    return found
+
+
+def connected(address: str) -> GalilMotors:
+    """Return the motors of a controller."""
+    return factory({"address": address, "reply_timeout_ms": 1000.0}, list(CHANNELS))
+
+
+def prepare(motors: GalilMotors) -> None:
+    """Switch the motors on."""
+    for channel in CHANNELS:
+        motors.power(channel, True)
+        motors.set_speed(channel, 20_000.0, 1_024_000.0)
+
+
+def targets() -> Iterator[dict[str, float]]:
+    """Targets of two axes, ahead of where they are."""
+    position = 0.0
+    while True:
+        position += 10.0
+        yield {"A": position, "B": -position}
+
+
+def summary(values: list[float]) -> dict[str, float]:
+    """Return median, 99 % and largest of times."""
+    median, most = map(float, np.percentile(values, [50, 99]))
+    return {"median": round(median, 3), "99 %": round(most, 3), "largest": round(max(values), 3)}
+
+
+def exchanged(line: socket.socket) -> None:
+    """Send as many bytes as a reading has, and receive them."""
+    line.sendall(_REPLY)
+    received = 0
+    while received < len(_REPLY):
+        received += len(line.recv(4096))
+
+
+@contextmanager
+def emulated() -> Iterator[str]:
+    """Run the emulated controller; yield its address."""
+    command = [sys.executable, "-m", "flexneedle", "emulate", "galil"]
+    with running(command) as process:
+        yield process.stdout.readline().strip() if process.stdout else ""
+
+
+@contextmanager
+def echo() -> Iterator[socket.socket]:
+    """Run the echo server; yield a connection to it."""
+    with running([sys.executable, "-c", _ECHO]) as process:
+        port = int(process.stdout.readline()) if process.stdout else 0
+        with socket.create_connection(("127.0.0.1", port)) as line:
+            line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            yield line
+
+
+@contextmanager
+def running(command: list[str]) -> Iterator["subprocess.Popen[str]"]:
+    """Run a process, and end it."""
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
