@@ -114,7 +114,8 @@ def run(
     """As `insert`, on any rig. rng: randomness of the controller; seed: only recorded.
 
     The driver is stopped at the end, after an error and after an interrupt. A DriverError of driver or tracker is no
-    exception here: the insertion has its reason, the outcome "failed", and the periods before it.
+    exception here: the insertion has its reason, the outcome "failed", and the periods before it. It is raised only if
+    the driver cannot be stopped after another error or an interrupt.
     """
     scenario, plan, seed = load_scenario(scenario), _planned(plan), whole("seed", seed, 0)
     rig = instance("rig", rig, Rig, "Rig(clock, driver, tracker), parts as in flexneedle.rig.ports")
@@ -141,8 +142,10 @@ def run(
                 on_period(period)
     except DriverError as error:
         ending = Outcome.FAILED, one_line(error)
-    except BaseException:  # also after an interrupt or another error no motor goes on
-        rig.driver.stop()
+    except BaseException as error:  # also after an interrupt or another error no motor goes on
+        _, still_on = _stopped(rig.driver, (Outcome.INTERRUPTED, ""))
+        if still_on:
+            raise DriverError(f"{str(error) or 'interrupted'}; {still_on}") from error
         raise
     ending = _stopped(rig.driver, ending)
     insertion = Insertion(plan, seed, tuple(periods), *ending, name, scenario=scenario)
