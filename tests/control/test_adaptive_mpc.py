@@ -13,7 +13,7 @@ from adaptive import ADAPTIVE, BARE, PHANTOM, QUICK, decide, decided, estimate_o
 from flexneedle.control.interface import travel_left
 from flexneedle.control.methods import DEFAULT, adaptive_mpc
 from flexneedle.control.path import of_plan
-from flexneedle.estimation.estimate import Move
+from flexneedle.estimation.moves import Move
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.planning.terms import cost
 from flexneedle.scenario.worlds import world

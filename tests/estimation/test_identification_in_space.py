@@ -8,8 +8,8 @@ import pytest
 
 import flexneedle
 from flexneedle.control.methods.adaptive_mpc import AdaptiveMpc
-from flexneedle.estimation.estimate import Move
 from flexneedle.estimation.identification import Identification, facing
+from flexneedle.estimation.moves import Move
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.prior import Slots
 from flexneedle.estimation.sensors import SENSORS, used

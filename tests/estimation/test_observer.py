@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flexneedle.control.methods import METHODS
-from flexneedle.estimation.estimate import Move, along, place
+from flexneedle.estimation.moves import Move, along, place
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import THETA, Control, Measurement, Motion, X, Y, Z
 from observed import AHEAD, PHANTOM, QUIET, begun, follow, in_tissue, readings_between, start_with

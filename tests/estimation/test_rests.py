@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexneedle.estimation.estimate import Move
 from flexneedle.estimation.identification import Identification
+from flexneedle.estimation.moves import Move
 from flexneedle.estimation.readings import MoveMeans
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import STILL, Measurement, Motion

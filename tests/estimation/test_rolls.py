@@ -1,12 +1,19 @@
-"""A needle rolls before it travels: readings of the roll are of neither end, and correct nothing."""
+"""A needle rolls before it travels. Its tip then goes round the needle's axis.
 
+The observer that fits a run-out uses the readings of a roll, by the mean direction of the bevel; the other one, for
+which the tip is on the axis, leaves them out.
+"""
+
+import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from flexneedle.estimation.estimate import Move, along, assigned, outside_rolls
 from flexneedle.estimation.identification import Identification
+from flexneedle.estimation.moves import Move, along, assigned, outside_rolls
+from flexneedle.estimation.readings import MoveMeans
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.types import Control, Measurement, Motion
 from identified import QUIET, Needle
@@ -50,20 +57,52 @@ def test_readings_of_a_roll_are_left_out():
     assert outside_rolls((), at(0.9)) == at(0.9)
 
 
-def observers():
-    scenario = Simulator(PHANTOM)
-    return begun(scenario, in_tissue(scenario, 40)), Identification().begin(begun_with(Simulator(QUIET, 1)))
-
-
-@pytest.mark.parametrize("estimate", observers(), ids=["corrected", "identified"])
-def test_readings_of_a_roll_alone_correct_nothing(estimate):
-    moved = estimate.move(ROLLED)
+def test_without_a_run_out_readings_of_a_roll_correct_nothing():
+    simulator = Simulator(PHANTOM)
+    moved = begun(simulator, in_tissue(simulator, 40)).move(ROLLED)
     x, y = moved.tip[:2]
-    off = [Measurement(time, x, y + 1.0) for time in (1.1, 1.3, 1.5)]
-    left = moved.observe(off)
+    left = moved.observe([Measurement(time, x, y + 1.0) for time in (1.1, 1.3, 1.5)])
     assert left.state == moved.state
     assert left.innovation == (0.0, 0.0, 0.0)
     assert left.observe([Measurement(2.0, x, y + 1.0)]).tip[1] > y + 0.01
+
+
+def test_a_roll_that_takes_time_is_a_move_of_its_own():
+    roll, travel = Move.parts_of(ROLLED)
+    assert (roll.begun, roll.ended, roll.applied) == (1.0, 1.6, Control(flip=True))
+    assert (travel.begun, travel.ended, travel.applied) == (1.6, 2.0, AHEAD)
+    assert roll.is_roll
+    assert not travel.is_roll
+    at_once = Motion(TURN, 1.0, 2.0)
+    assert Move.parts_of(at_once) == (Move.of(at_once),)
+
+
+@pytest.mark.parametrize(
+    ("motion", "times", "left"),
+    [
+        (ROLLED, (0.9, 1.0, 1.3, 1.6, 1.7), (math.pi, math.pi, 0.5 * math.pi, 0.0, 0.0)),
+        (Motion(TURN, 1.0, 2.0), (0.9, 1.0, 1.1, 2.0), (math.pi, math.pi, 0.0, 0.0)),
+        (Motion(Control(db_x=1.0, spin=1.0), 1.0, 2.0), (0.9, 1.5, 2.0), (1.0, 0.5, 0.0)),
+    ],
+    ids=["before the travel", "at once", "spin"],
+)
+def test_what_is_left_to_turn_falls_evenly_in_a_roll_and_in_a_spin(motion, times, left):
+    moves = Move.parts_of(motion)
+    assert [sum(move.left_to_turn(time) for move in moves) for time in times] == pytest.approx(left)
+
+
+@pytest.mark.parametrize(
+    ("parts", "facing"),
+    [((0.0, 0.5, 1.0), -1j / 3.0), ((0.0, 0.25), -0.5 - 0.25 * math.sqrt(2.0) * (1.0 + 1.0j))],
+)
+def test_readings_of_a_half_turn_have_the_mean_direction_of_the_bevel(parts, facing):
+    """Relative to that after it: −1 before it, −i in the middle; of that the plane has the real part."""
+    roll, _ = Move.parts_of(ROLLED)
+    move = roll.with_readings(tuple(at(*(1.0 + 0.6 * part for part in parts))))
+    plane, space = (MoveMeans.of([move], "tip position", -1.0, axes) for axes in (1, 2))
+    assert plane.bevel[0] == pytest.approx(-facing.real)
+    assert space.bevel[0] == pytest.approx(-facing)
+    assert plane.turns.all()
 
 
 def rolling(needle, before, after, begun):
@@ -79,13 +118,48 @@ def rolling(needle, before, after, begun):
     return readings, (begun, turned + 0.2, turned if turns else None)
 
 
-def test_with_rolls_that_take_time_the_run_out_is_found():
-    """More readings are of the first half of a roll: as readings of its end they would bend the estimate."""
-    needle, now = Needle(run_out=-0.15), 0.0
-    rows = [Control(db_x=1.0, flip=k in (34, 40, 46, 52)) for k in range(56)]
+def rolled(needle, rolls, count, used=lambda _turning: True):
+    """The estimate after moves with rolls that take time; used: whether its readings are, by whether it rolls."""
+    rows, now = [Control(db_x=1.0, flip=k in rolls) for k in range(count)], 0.0
     states = needle.inserted(QUIET, rows)
     estimate = Identification().begin(begun_with(Simulator(QUIET, 1)))
     for row, (before, after) in zip(rows, pairwise(states), strict=True):
         readings, times = rolling(needle, before, after, now)
-        estimate, now = estimate.move(Motion(row, *times)).observe(readings), times[1]
+        kept = [one for one in readings if used(times[2] is not None and one.time < times[2])]
+        estimate, now = estimate.move(Motion(row, *times)).observe(kept), times[1]
+    return estimate, states[-1]
+
+
+@pytest.mark.parametrize("used", [lambda _: True, lambda turning: not turning], ids=["used", "left out"])
+def test_with_rolls_that_take_time_the_run_out_is_found(used):
+    """Most readings are of the first half of each roll: as readings of its end they would bend the estimate."""
+    needle = Needle(run_out=-0.15)
+    estimate, truth = rolled(needle, (34, 40, 46, 52), 56, used)
     assert abs(estimate.run_out - needle.run_out) <= 0.01
+    np.testing.assert_allclose(estimate.tip[:2], needle.measured(truth), atol=0.01)
+    assert len(estimate.moves) == 60
+
+
+def test_in_a_roll_the_predicted_tip_goes_round_the_axis():
+    needle = Needle(run_out=-0.15)
+    estimate, _ = rolled(needle, (34,), 36)
+    end, estimate = estimate.moves[-1].ended, replace(estimate, residual=0.0)
+    moved = estimate.move(Motion(TURN, end, end + 0.6, end + 0.4))
+    (before, after), side = moved.tips[-3:-1, 1], estimate.off_axis(estimate.state.bevel).real
+    for part in (0.0, 0.25, 0.5, 1.0):
+        axis = before + part * (after - before)
+        expected = axis + side * math.cos(math.pi * part)
+        assert moved.tip_at(end + 0.4 * part)[1] == pytest.approx(expected, abs=1e-9)
+    assert abs(side) >= 0.1
+
+
+def test_the_measured_tip_after_a_roll_is_on_the_side_of_the_bevel():
+    """Also if the newest reading is of the middle of the roll."""
+    needle = Needle(run_out=-0.15)
+    estimate, _ = rolled(needle, (34,), 36)
+    end = estimate.moves[-1].ended
+    moved = estimate.move(Motion(TURN, end, end + 0.6, end + 0.4))
+    x, y, _ = moved.tip_at(end + 0.2)
+    observed = moved.observe([Measurement(end + 0.2, x, y)])
+    side = observed.run_out * moved.state.bevel.real
+    assert observed.measured[1] == pytest.approx(observed.tips[-2][1] + side, abs=0.01)

@@ -23,8 +23,8 @@ def digest(number):
     values = world(number).values()
     for layer in values["tissue"]:
         assert layer.pop("law") == "ogden"  # keys that are not drawn, and younger than the published numbers
-    space = [values["setup"].pop(key) for key in ("axes", "guide_axes", "rotation")]
-    assert [*space, values["target"].pop("lateral_z_mm")] == [1, 2, "free", 0.0]
+    younger = [values["setup"].pop(key) for key in ("axes", "guide_axes", "rotation", "rotation_speed_deg_s")]
+    assert [*younger, values["target"].pop("lateral_z_mm")] == [1, 2, "free", 360.0, 0.0]
     text = json.dumps({name: values[name] for name in (*DRAWN, "contact")}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -23,11 +23,12 @@ from functools import cached_property
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Move, after, along, assigned, described, outside_rolls
+from flexneedle.estimation.estimate import described
+from flexneedle.estimation.moves import Move, along, assigned
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
 from flexneedle.estimation.readings import MoveMeans, shared
 from flexneedle.estimation.sensor import Sensor
-from flexneedle.estimation.sensors import used as used_sensors
+from flexneedle.estimation.sensors import used
 from flexneedle.estimation.task import Task
 from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.control import controls
@@ -53,6 +54,9 @@ _MOVES_A_SEGMENT = 8  # in tissue; in air there is one segment
 _RECENT = 12  # moves whose residuals are low-passed
 _SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a Gauss–Newton step: the first that does not raise the cost
 _REST = np.array([STILL])
+_UNEVEN = (
+    0.2  # of an offset that turns with the bevel: error of its mean in a roll, whose motor starts and stops
+)
 _ROUND = 8  # periods in which each curve of derivatives is simulated once;
 _LEADING_ROUND = 2  # periods in which those of base, bend, bevel and clearance are
 
@@ -81,7 +85,7 @@ class Identification:
             ((0, state),),
             grid,
             np.zeros(
-                (len(used_sensors(scenario)), prior.mean.size, grid.size),
+                (len(used(scenario)), prior.mean.size, grid.size),
                 dtype=float if scenario.setup.axes == 1 else complex,
             ),
             prior.precision,
@@ -162,8 +166,8 @@ class Identified:
     def tip_at(self, time: float) -> Point:
         """Estimated position of the tip (mm) at `time`."""
         x, y, z = along(self.moves, self.tips, time)
-        since = sum(done.applied.roll + done.applied.spin for done in self.moves if done.travel_begun >= time)
-        off = self.off_axis(self.state.bevel * cmath.exp(-1j * since))
+        left = sum(done.left_to_turn(time) for done in self.moves if time < done.ended)
+        off = self.off_axis(self.state.bevel * cmath.exp(-1j * left))
         return x, y + off.real, z + (off.imag if self.axes > 1 else 0.0)
 
     def without_reading(self) -> "Identified":
@@ -176,16 +180,16 @@ class Identified:
         if motion.control == STILL and rested:  # one move, however long
             last = replace(self.moves[-1], ended=motion.ended)
             return replace(self, moves=(*self.moves[:-1], last), perturbed=())
-        state = after(self.simulator, self.state, motion.control)
-        tips = np.concatenate([self.tips, state.tip[None]])
-        return replace(self, state=state, tips=tips, moves=(*self.moves, Move.of(motion)), perturbed=())
+        new = Move.parts_of(motion)
+        state, tips = self.simulator.replay(self.state, np.array([done.applied for done in new]))
+        tips = np.concatenate([self.tips, tips])
+        return replace(self, state=state, tips=tips, moves=(*self.moves, *new), perturbed=())
 
     def observe(self, measurements: Sequence[Measurement]) -> "Identified":
         """Fit the parameters to all readings by one Gauss–Newton step, and simulate the insertion with them."""
-        used = outside_rolls(self.moves, measurements)
-        if not used or not self.moves:
+        if not measurements or not self.moves:
             return self.without_reading()
-        extended = replace(self, moves=assigned(self.moves, used))
+        extended = replace(self, moves=assigned(self.moves, measurements))
         readings = extended._readings[0]
         without = readings.ahead(extended.tips[:, X]) + extended.axial
         prior_sd = max(self.nominal.scenario.control.start_axial_sd_mm, LEAST_SD)
@@ -194,13 +198,15 @@ class Identified:
         fitted = improved(extended)._differentiated()
         left, ahead = fitted.left[0], readings.ahead(fitted.tips[:, X])
         newest = int(readings.index[-1]) + 1
-        y = fitted.laterals[0][newest] + left[-1] + fitted.run_out * readings.bevel[-1]
+        since = sum(done.applied.roll + done.applied.spin for done in fitted.moves[newest:])
+        bevel = fitted.state.bevel * cmath.exp(-1j * since)
+        y = complex(fitted.laterals[0][newest] + left[-1] + fitted.run_out * bevel)
         inside = fitted.tips[-1, X] > 0.0
         return replace(
             fitted,
             residual=low_passed(self.settings, left) if inside else 0.0,
             innovation=(float(ahead[-1]), float(left[-1].real), float(left[-1].imag)),
-            measured=(float(fitted.tips[newest, X] + ahead[-1]), float(y.real), float(y.imag)),
+            measured=(float(fitted.tips[newest, X] + ahead[-1]), y.real, y.imag if self.axes > 1 else 0.0),
         )
 
     @cached_property
@@ -211,17 +217,18 @@ class Identified:
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
         """The sensors in use, the tip's position first."""
-        return used_sensors(self.nominal.scenario)
+        return used(self.nominal.scenario)
 
     @cached_property
     def _readings(self) -> tuple[MoveMeans, ...]:
         return tuple(MoveMeans.of(self.moves, one.name, self.state.bevel, self.axes) for one in self.sensors)
 
     def variances(self) -> list[Floats]:
-        """Variances (r,) of the means of each sensor's readings: jitter and model error."""
-        scenario = self.nominal.scenario
+        """Variances (r,) of the means of each sensor's readings: jitter, model error, error of the angle in a roll."""
+        scenario, sd = self.nominal.scenario, 1.0 / np.sqrt(np.diag(self.prior.precision))
         return [
             readings.variance(sensor.sd(scenario) or 0.0, sensor.unexplained(scenario, self.settings))
+            + np.where(readings.turns, (_UNEVEN * sd[getattr(self.slots, sensor.offset).start]) ** 2, 0.0)
             for sensor, readings in zip(self.sensors, self._readings, strict=True)
         ]
 

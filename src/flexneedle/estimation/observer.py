@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexneedle.estimation.estimate import Move, after, along, assigned, described, outside_rolls, place
+from flexneedle.estimation.estimate import after, described
+from flexneedle.estimation.moves import Move, along, assigned, outside_rolls, place
 from flexneedle.estimation.task import Task
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator

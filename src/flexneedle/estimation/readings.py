@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flexneedle.estimation.estimate import Move
+from flexneedle.estimation.moves import Move
 from flexneedle.types import Floats, Laterals
 
 
 @dataclass(frozen=True, eq=False)
 class MoveMeans:
     """Means of a sensor's readings of each move that has any: the move, the share of it done, x (mm) and the measured
-    quantity y, their number, variances of y on an axis and of x (NaN: not reported), and the bevel's direction after
-    the move; each (r,). Lateral quantities are complex in space.
+    quantity y, their number, variances of y on an axis and of x (NaN: not reported), and the mean of the bevel's
+    direction; each (r,). turns: whether the move is a roll. Lateral quantities are complex in space.
 
     Quantities of a model are given at the ends of all m moves, the start first: (m + 1,).
     """
@@ -27,18 +27,24 @@ class MoveMeans:
     reported: Floats
     reported_x: Floats
     bevel: Laterals
+    turns: NDArray[np.bool_]
 
     @staticmethod
     def of(moves: Sequence[Move], sensor: str, bevel: complex, axes: int) -> "MoveMeans":
         """The means of a sensor's readings; bevel: its direction after the last move."""
-        means = [(k, *done.means[sensor]) for k, done in enumerate(moves) if sensor in done.means]
-        index, part, x, y, z, count, reported, ahead = np.array(means, dtype=float).reshape(-1, 8).T
-        rolled = np.cumsum([done.applied.roll + done.applied.spin for done in moves])
-        kept = index.astype(int)
-        directions = (bevel * np.exp(1j * (rolled - rolled[-1])))[kept]
+        found = {k: done.means[sensor] for k, done in enumerate(moves) if sensor in done.means}
+        kept = np.array([*found], dtype=int)
+        part, x, y, z, facing_y, facing_z, count, reported, ahead = (
+            np.array([*found.values()]).reshape(-1, 9).T
+        )
+        turned = np.cumsum([done.applied.roll + done.applied.spin for done in moves])
+        after = bevel * np.exp(1j * (turned - turned[-1]))[kept]
+        turns = np.array([moves[k].is_roll for k in kept], dtype=bool)
         if axes == 1:
-            return MoveMeans(kept, part, x, y, count, reported, ahead, np.rint(directions.real))
-        return MoveMeans(kept, part, x, y + 1j * z, count, reported, ahead, directions)
+            facing = np.rint(after.real) * facing_y
+            return MoveMeans(kept, part, x, y, count, reported, ahead, facing, turns)
+        facing = after * (facing_y + 1j * facing_z)
+        return MoveMeans(kept, part, x, y + 1j * z, count, reported, ahead, facing, turns)
 
     def between(self, ends: Laterals) -> Laterals:
         """A quantity interpolated to the readings (r,)."""

@@ -67,7 +67,8 @@ def run(
 
     The driver is stopped at the end, after an error and after an interrupt. A DriverError of driver or tracker is no
     exception here: the insertion has its reason, the outcome "failed", and the periods before it. So has one that was
-    stopped at the rig, with the outcome "interrupted".
+    stopped at the rig, with the outcome "interrupted". A DriverError is raised only if the driver cannot be stopped
+    after another error or an interrupt.
     """
     scenario, plan, seed = load_scenario(scenario), planned(plan), whole("seed", seed, 0)
     rig = instance("rig", rig, Rig, "Rig(clock, driver, tracker), parts as in flexneedle.rig.ports")
@@ -96,8 +97,10 @@ def run(
         ending = Outcome.FAILED, one_line(error)
     except StoppedError as error:
         ending = Outcome.INTERRUPTED, one_line(error)
-    except BaseException:  # also after an interrupt or another error no motor goes on
-        rig.driver.stop()
+    except BaseException as error:  # also after an interrupt or another error no motor goes on
+        _, still_on = _stopped(rig.driver, (Outcome.INTERRUPTED, ""))
+        if still_on:
+            raise DriverError(f"{str(error) or 'interrupted'}; {still_on}") from error
         raise
     ending = _stopped(rig.driver, ending)
     insertion = Insertion(plan, seed, tuple(periods), *ending, name, scenario=scenario)
@@ -147,7 +150,7 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
         observation = _observed(progress.observation, task.scenario, rig, motion, begun)
         clocks.append(time.perf_counter())
         now = rig.clock.now()
-        progress = _progress_after(decided, observation, task, steering.method, begun, now)
+        progress = _progress_after(decided, step, observation, steering, begun, now)
         ending = _ending(task, progress)
         period = record(index, now, task.plan, rig, step, motion.control, observation, clocks)
         yield replace(period, warning=warning(step.decision, progress.in_a_row)), ending
@@ -176,11 +179,15 @@ def _observed(before: Observation, scenario: Scenario, rig: Rig, motion: Motion,
 
 
 def _progress_after(
-    decided: Progress, observation: Observation, task: Task, chosen: Method, begun: float, now: float
+    decided: Progress, step: Step, observation: Observation, steering: Steering, begun: float, now: float
 ) -> Progress:
     """The progress after a period from `begun` to `now` (s)."""
-    arrived_at, arrived = decided.arrived_at, chosen.arrived
-    if arrived_at is None and observation.verdict.ok and arrived(task, decided.memory, observation.estimate):
+    arrived_at, arrived = decided.arrived_at, steering.method.arrived
+    if (
+        arrived_at is None
+        and observation.verdict.ok
+        and arrived(steering.task, decided.memory, observation.estimate)
+    ):
         arrived_at = now
     return replace(
         decided,
@@ -188,6 +195,7 @@ def _progress_after(
         hold=hold_after(decided.hold, observation, now),
         refused=decided.refused.extended(now - begun) if decided.decides else decided.refused,
         arrived_at=arrived_at,
+        held_in_all=decided.held_in_all + (now - begun if step.action is Action.HOLD else 0.0),
     )
 
 
@@ -209,15 +217,24 @@ def _carry_out(scenario: Scenario, rig: Rig, step: Step, begun: float) -> Motion
 
 def _ending(task: Task, progress: Progress) -> _Ending | None:
     """Outcome and reason if the insertion ends with this period."""
-    observation, held = progress.observation, progress.held
-    estimate, limit = observation.estimate, observation.hold_limit(task.scenario)
+    estimate = progress.observation.estimate
     if not estimate.state.converged:
         return Outcome.FAILED, f"the model did not converge: residual {estimate.state.residual:.3g} mm"
-    if held is not None and held > limit - 1e-9:
-        return Outcome.HELD, f"held for {held:.2f} s (limit {limit:g} s): {observation.verdict}"
     if not progress.measured_at_rest:
-        return progress.refused.ending(task.scenario.control.hold_limit_s)
+        return _held_too_long(task.scenario, progress)
     short = task.plan.target[0] - float(estimate.tip[X])
     if short > task.scenario.control.depth_tolerance_mm and at_depth(task, None, estimate):
         return Outcome.DONE, f"stroke ends {short:.2f} mm before the target depth"
     return Outcome.DONE, ""
+
+
+def _held_too_long(scenario: Scenario, progress: Progress) -> _Ending | None:
+    """Outcome and reason if the needle has been held for as long as it may be, at once or in all."""
+    observation, held, refused = progress.observation, progress.held, progress.refused
+    limit, total = observation.hold_limit(scenario), scenario.control.hold_total_s
+    if held is not None and held > limit - 1e-9:
+        return Outcome.HELD, f"held for {held:.2f} s (limit {limit:g} s): {observation.verdict}"
+    if progress.held_in_all > total - 1e-9 and (held is not None or refused.reason):
+        why = refused.reason if held is None else observation.verdict
+        return Outcome.HELD, f"held for {progress.held_in_all:.2f} s in all (limit {total:g} s): {why}"
+    return refused.ending(scenario.control.hold_limit_s)

@@ -98,7 +98,7 @@ class Progress:
 
     arrived_at: time (s) at which the needle arrived at its depth; moves: number of moves; in_a_row: number of
     consecutive decisions with a likely miss; predicted: the last predicted shape; late: a decision of the last period
-    that came late.
+    that came late; held_in_all: time (s) of all holds.
     """
 
     observation: Observation
@@ -110,6 +110,7 @@ class Progress:
     in_a_row: int = 0
     predicted: Shape | None = None
     late: Late | None = None
+    held_in_all: float = 0.0
 
     @property
     def decides(self) -> bool:

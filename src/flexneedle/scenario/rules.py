@@ -12,6 +12,7 @@ from flexneedle.scenario.tissue.layer import Contact, Layer
 
 _MOST_GRID_POINTS = 20_000
 _MOST_READINGS_A_STEP = 10_000
+_HALF_TURN_DEG = 180.0
 _FRAMES_IN_A_WINDOW = 2
 _ROUNDING_MM = 1e-9  # of an entry that a plan has chosen
 
@@ -119,10 +120,21 @@ def grid_problems(
     for key, value in grids.items():
         if value < smallest:
             yield Problem(key, value, f"must be at least {smallest:g}, setup.stroke_mm / {_MOST_GRID_POINTS}")
-    fastest = _MOST_READINGS_A_STEP * setup.insertion_speed_mm_s / setup.max_advance_mm
+    fastest = _MOST_READINGS_A_STEP / setup.step_time
     if tracker.rate_hz > fastest:
         rule = f"must be at most {fastest:g}, {_MOST_READINGS_A_STEP} readings in a control step"
         yield Problem("tracker.rate_hz", tracker.rate_hz, rule)
+        return
+    for key, travel in (
+        ("guide_speed_mm_s", setup.max_guide_step_mm),
+        ("base_speed_mm_s", setup.max_base_step_mm),
+        ("base_turn_speed_mrad_s", setup.max_base_turn_step_mrad),
+        ("rotation_speed_deg_s", _HALF_TURN_DEG),
+    ):
+        speed, slowest = getattr(setup, key), travel * tracker.rate_hz / _MOST_READINGS_A_STEP
+        if speed is not None and speed < slowest:
+            rule = f"must be at least {slowest:g}, {_MOST_READINGS_A_STEP} readings in a motion by {travel:g}"
+            yield Problem(f"setup.{key}", speed, rule)
 
 
 def monitor_problems(monitor: MonitorSettings, tracker: TrackerSettings) -> Iterator[Problem]:

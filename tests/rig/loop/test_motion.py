@@ -7,7 +7,7 @@ import pytest
 
 from flexneedle.control.interface import Decision, Method, travel_left
 from flexneedle.errors import CommandError, StoppedError
-from flexneedle.estimation.estimate import Move, along
+from flexneedle.estimation.moves import Move, along
 from flexneedle.simulator.control import Limits, controls
 from flexneedle.types import STILL, Control, Motion, Outcome
 from insertions import PHANTOM, Stage, Tank, run

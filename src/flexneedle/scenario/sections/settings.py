@@ -101,6 +101,8 @@ class ControlSettings(Section):
     """Probability of a miss beyond `miss_limit_mm` from which the needle is held."""
     hold_limit_s: Positive = 1.0
     """Time without a usable reading, or without a path to the target, after which the insertion ends."""
+    hold_total_s: Positive = 300.0
+    """Time for which the needle may be held in one insertion, all holds together; then it ends."""
     stale_after_s: Positive = 0.3
     """Age above which a reading is rejected as stale."""
 

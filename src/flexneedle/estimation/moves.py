@@ -1,0 +1,180 @@
+"""The moves of an insertion, and the readings that were taken during each."""
+
+import cmath
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import nan
+from statistics import fmean
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexneedle.estimation.sensor import Sensor
+from flexneedle.estimation.sensors import SENSORS
+from flexneedle.types import STILL, Control, Floats, Measurement, Motion, Point, Pose, X, Y, Z
+
+_KEPT = 100  # readings of a move at rest that are kept one by one
+_ROUNDING_S = 1e-9
+
+
+class Means(NamedTuple):
+    """Means over the readings of a move: share of the move done, x (mm), y and z of the measured quantity, and those of
+    the bevel's direction, relative to that after the move; the number of readings, and the variances of the means of y
+    or z and of x where all readings report them, else NaN.
+    """
+
+    part: float
+    x: float
+    y: float
+    z: float
+    facing_y: float
+    facing_z: float
+    number: float
+    across: float
+    ahead: float
+
+    def joined(self, other: "Means") -> "Means":
+        """The means over the readings of both."""
+        number = self.number + other.number
+        mine, theirs = self.number / number, other.number / number
+        last = Means._fields.index("number")
+        means = [mine * a + theirs * b for a, b in zip(self[:last], other[:last], strict=True)]
+        variances = [
+            mine**2 * a + theirs**2 * b for a, b in zip(self[last + 1 :], other[last + 1 :], strict=True)
+        ]
+        return Means._make([*means, number, *variances])
+
+
+@dataclass(frozen=True)
+class Move:
+    """A motion from `begun` to `ended` (s) as applied by the driver, and the good readings taken during it.
+
+    turned: end of the roll before the travel (s); None: it took no time, or there was none. earlier: means over
+    readings of a needle at rest that are no longer kept one by one.
+    """
+
+    begun: float
+    ended: float
+    applied: Control
+    measurements: tuple[Measurement, ...] = ()
+    turned: float | None = None
+    earlier: Mapping[str, Means] = field(default_factory=dict)
+
+    @cached_property
+    def means(self) -> Mapping[str, Means]:
+        """Means over its readings by sensor; sensors without readings are left out."""
+        means = ((sensor.name, self._mean(sensor)) for sensor in SENSORS.values())
+        newer = {name: mean for name, mean in means if mean is not None}
+        both = {name: self.earlier[name].joined(newer[name]) for name in self.earlier.keys() & newer.keys()}
+        return {**self.earlier, **newer, **both}
+
+    def _mean(self, sensor: Sensor) -> Means | None:
+        read = [(one, sensor.read(one)) for one in self.measurements]
+        known = [(one, value) for one, value in read if value is not None]
+        if not known:
+            return None
+        times = [one.time for one, _ in known]
+        facing = sum(cmath.exp(-1j * self.left_to_turn(time)) for time in times) / len(times)
+        across = _variance_of_mean([sensor.variance(one) for one, _ in known])
+        ahead = _variance_of_mean([one.covariance[0][0] if one.covariance else None for one, _ in known])
+        part, x = fmean(map(self.part, times)), fmean(place(one)[0] for one, _ in known)
+        y, z = (fmean(column) for column in zip(*(value for _, value in known), strict=True))
+        return Means(part, x, y, z, facing.real, facing.imag, float(len(known)), across, ahead)
+
+    @property
+    def is_roll(self) -> bool:
+        """Whether it is a roll alone, which turns evenly."""
+        return self.applied.roll != 0.0 and self.applied._replace(roll=0.0) == STILL
+
+    def left_to_turn(self, time: float) -> float:
+        """Angle (rad) by which the needle has yet to turn at `time`; a roll before a travel is done at its start."""
+        if self.is_roll:
+            return self.applied.roll * (1.0 - self.part(time))
+        before = self.applied.roll if time <= self.travel_begun else 0.0
+        return before + self.applied.spin * (1.0 - self.part(time))
+
+    def part(self, time: float) -> float:
+        """Share of the travel that is done at `time`."""
+        if self.ended <= self.travel_begun:
+            return 1.0
+        return min(1.0, max(0.0, (time - self.travel_begun) / (self.ended - self.travel_begun)))
+
+    @property
+    def travel_begun(self) -> float:
+        """Start of the travel (s), after the roll."""
+        return self.begun if self.turned is None else self.turned
+
+    def with_readings(self, new: tuple[Measurement, ...]) -> "Move":
+        """The move with further readings, of which a needle at rest keeps the newest, and the mean of the others."""
+        every = self.measurements + new
+        count = len(every) - _KEPT if self.applied == STILL else 0
+        if count <= 0:
+            return replace(self, measurements=every)
+        older = replace(self, measurements=every[:count])
+        return replace(self, measurements=every[count:], earlier=older.means)
+
+    @staticmethod
+    def of(motion: Motion) -> "Move":
+        """A motion before its readings."""
+        return Move(motion.begun, motion.ended, motion.control, turned=motion.turned)
+
+    @staticmethod
+    def parts_of(motion: Motion) -> "tuple[Move, ...]":
+        """The roll and the travel of a motion, if the roll took time, as moves of their own."""
+        if motion.turned is None:
+            return (Move.of(motion),)
+        roll, travel = Control(roll=motion.control.roll), motion.control._replace(roll=0.0)
+        return Move(motion.begun, motion.turned, roll), Move(motion.turned, motion.ended, travel)
+
+
+def assigned(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> tuple[Move, ...]:
+    """Assign each measurement to the last move that had begun, earlier ones to the first: between moves it rests."""
+    owner = _owners(moves, measurements)
+    return tuple(
+        done.with_readings(new)
+        if (new := tuple(one for one, k in zip(measurements, owner, strict=True) if k == j))
+        else done
+        for j, done in enumerate(moves)
+    )
+
+
+def outside_rolls(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> list[Measurement]:
+    """The measurements without those of a roll, whose tip is between two sides of the needle's axis."""
+    if not moves:
+        return list(measurements)
+    owned = zip(measurements, _owners(moves, measurements), strict=True)
+    return [
+        one for one, k in owned if moves[k].turned is None or one.time > moves[k].travel_begun - _ROUNDING_S
+    ]
+
+
+def _owners(moves: tuple[Move, ...], measurements: Sequence[Measurement]) -> NDArray[np.intp]:
+    """The number of the last move that had begun before each measurement, 0 for earlier ones."""
+    starts = np.array([done.begun for done in moves[1:]])
+    owners: NDArray[np.intp] = np.searchsorted(starts, [one.time - _ROUNDING_S for one in measurements])
+    return owners
+
+
+def along(moves: tuple[Move, ...], tips: Floats, time: float) -> Point:
+    """Position (mm) at `time` on the path through tips (k + 1, 5), at the ends of k moves, at rest between them."""
+    if not moves:
+        return Pose.of(tips[-1]).point
+    times = [limit for done in moves for limit in (done.travel_begun, done.ended)]
+    at = [end for k in range(len(moves)) for end in (k, k + 1)]
+    x, y, z = (float(np.interp(time, times, tips[at, column])) for column in (X, Y, Z))
+    return x, y, z
+
+
+def _variance_of_mean(variances: Sequence[float | None]) -> float:
+    """Variance of the mean of readings with these variances; NaN unless all are known."""
+    known = [value for value in variances if value is not None]
+    return sum(known) / len(known) ** 2 if len(known) == len(variances) else nan
+
+
+def place(measurement: Measurement) -> Point:
+    """Measured tip (mm) of a good measurement, z = 0 if it is not measured. Raises ValueError for an empty one."""
+    if measurement.x is None or measurement.y is None:
+        raise ValueError("an empty measurement was not removed")
+    return measurement.x, measurement.y, measurement.z or 0.0

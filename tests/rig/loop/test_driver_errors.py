@@ -1,0 +1,83 @@
+"""An error of a device ends the insertion with a record: outcome failed, the reason, all periods before it."""
+
+import pytest
+
+from flexneedle.errors import DriverError, RunError
+from flexneedle.types import Outcome
+from insertions import Tank, facts, first_periods, run
+
+LOST = DriverError("galil 10.0.0.5:23: no reply within 0.1 s")
+LAST = 6
+
+
+class Failing(Tank):
+    """A rig whose driver, tracker or stop raises an error from some call on; it counts its stops."""
+
+    def __init__(self, roll, **errors):
+        super().__init__(roll)
+        self.errors, self.calls, self.stops = errors, {"apply": 0, "read": 0}, 0
+
+    def fail(self, name):
+        self.calls[name] += 1
+        if name in self.errors and self.calls[name] > LAST:
+            raise self.errors[name]
+
+    def apply(self, command, duration):
+        self.fail("apply")
+        return super().apply(command, duration)
+
+    def read(self):
+        self.fail("read")
+        return super().read()
+
+    def stop(self):
+        self.stops += 1
+        if "stop" in self.errors:
+            raise self.errors["stop"]
+
+
+@pytest.mark.parametrize(("part", "kept"), [("apply", LAST), ("read", LAST - 1)])
+def test_the_insertion_fails_with_its_reason_and_all_periods_before_it(plan, part, kept):
+    rig = Failing(plan.roll, **{part: LOST})
+    done = run(plan, rig.rig())
+    assert (done.outcome, done.reason, rig.stops) == (Outcome.FAILED, str(LOST), 1)
+    assert len(done.periods) == kept
+    expected = first_periods(kept, plan, Tank(plan.roll).rig())
+    assert [facts(period) for period in done.periods] == [facts(period) for period in expected]
+    assert done.summary == f"failed after {kept} periods: {LOST}"
+    assert not done.reached
+
+
+def test_before_the_first_motion_the_record_is_empty(plan):
+    rig = Failing(plan.roll, read=LOST)
+    rig.calls["read"] = LAST
+    done = run(plan, rig.rig())
+    assert (done.outcome, done.reason, done.periods, rig.stops) == (Outcome.FAILED, str(LOST), (), 1)
+
+
+def test_a_driver_that_cannot_be_stopped_either_is_in_the_reason(plan):
+    dead = DriverError("galil 10.0.0.5:23: not connected")
+    done = run(plan, Failing(plan.roll, apply=LOST, stop=dead).rig())
+    assert done.outcome is Outcome.FAILED
+    assert done.reason == f"{LOST}; the driver was not stopped: {dead}"
+
+
+def test_at_the_target_a_driver_that_cannot_be_stopped_is_a_failure(plan):
+    dead = DriverError("galil 10.0.0.5:23: not connected")
+    done = run(plan, Failing(plan.roll, stop=dead).rig())
+    assert (done.outcome, done.reason) == (Outcome.FAILED, f"the driver was not stopped: {dead}")
+    assert done.true_error_mm <= 1.0
+
+
+@pytest.mark.parametrize(("error", "text"), [(KeyboardInterrupt(), "interrupted"), (OSError("torn"), "torn")])
+def test_a_driver_that_cannot_be_stopped_after_an_interrupt_is_an_error_of_its_own(plan, error, text):
+    with pytest.raises(DriverError, match=f"{text}; the driver was not stopped: galil.*no reply"):
+        run(plan, Failing(plan.roll, apply=error, stop=LOST).rig())
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("no such device"), RunError("refused")])
+def test_other_errors_are_raised_after_the_stop(plan, error):
+    rig = Failing(plan.roll, apply=error)
+    with pytest.raises(type(error)):
+        run(plan, rig.rig())
+    assert rig.stops == 1
