@@ -129,7 +129,7 @@ class RosMotors:
         self._stopped = True
         deadline = time.monotonic() + _CONNECT_S
         try:
-            while self._reading is None and time.monotonic() < deadline:
+            while time.monotonic() < deadline and self._reading is None:
                 time.sleep(0.01)
                 self._poll()
             self._fresh()
