@@ -2,8 +2,8 @@
 
 python studies/rig_faults.py [--timings 20] [--out runs/rig-faults] [--only stall,unplugged] [--workers 2]
 
-Each trial has an emulated rig of its own (controller, tracker and phantom in three processes) and an insertion on it. At
-a random time of the insertion a fault is injected. The record of the rig's states gives the time to detection, the
+Each trial has an emulated rig of its own (controller, tracker and phantom in three processes) and an insertion on it.
+At a random time of the insertion a fault is injected. The record of the rig's states gives the time to detection, the
 true positions how far the base moved after it, and whether the needle rests at the end. Trials are appended to
 OUT/trials.jsonl as they end, and not repeated: the study can be interrupted. It prints the table of docs/safety.md.
 """
@@ -201,8 +201,8 @@ def _faults() -> list[Fault]:
     ]
 
 
-def run_trial(fault: Fault, timing: int) -> dict[str, Any]:
-    """Run one trial; return its result as plain values."""
+def run_trial(fault: Fault, timing: int, keep: Path | None = None) -> dict[str, Any]:
+    """Run one trial; return its result as plain values. keep: folder for the records of the insertions."""
     seed = crc32(f"{fault.group} {fault.name} {timing}".encode())
     rng = np.random.default_rng(seed)
     with ExitStack() as stack:
@@ -219,6 +219,10 @@ def run_trial(fault: Fault, timing: int) -> dict[str, Any]:
         _await_end(fault, process, injected)
         status, _, errors = ended(process, 5.0)
         sleep(1.0)
+        if keep is not None and out.exists():
+            shutil.copytree(
+                out, keep / f"{fault.group}-{fault.name}-{timing}".replace(" ", "-"), dirs_exist_ok=True
+            )
         return _judged(fault, timing, rig.read_truth(), injected, out, status, errors)
 
 
@@ -354,6 +358,7 @@ def main() -> None:
     parser.add_argument("--timings", type=int, default=20)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--only", default="", help="parts of names of faults, with commas")
+    parser.add_argument("--keep", action="store_true", help="keep the records of the insertions in OUT")
     parser.add_argument("--out", type=Path, default=Path("runs/rig-faults"))
     args = parser.parse_args()
     chosen = [part.strip() for part in args.only.split(",") if part.strip()]
@@ -365,6 +370,7 @@ def main() -> None:
     path = args.out / "trials.jsonl"
     trials = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     done = {(one["group"], one["fault"], one["timing"]) for one in trials}
+    keep = args.out if args.keep else None
     missing = [
         (fault, timing)
         for timing in range(args.timings)
@@ -372,7 +378,9 @@ def main() -> None:
         if (fault.group, fault.name, timing) not in done
     ]
     with ThreadPoolExecutor(args.workers) as pool:
-        for (fault, _), trial in zip(missing, pool.map(lambda one: run_trial(*one), missing), strict=True):
+        for (fault, _), trial in zip(
+            missing, pool.map(lambda one: run_trial(*one, keep), missing), strict=True
+        ):
             trials.append(trial)
             with path.open("a") as file:
                 file.write(json.dumps(trial) + "\n")

@@ -101,7 +101,7 @@ def test_it_is_made_anew_after_readings_that_turned_bad(plan):
     assert done.outcome is Outcome.DONE
 
 
-@pytest.mark.parametrize(("off", "anew"), [(1.8, True), (0.0, False)])
+@pytest.mark.parametrize(("off", "anew"), [(1.3, True), (0.0, False)])
 def test_it_is_made_anew_where_the_readings_have_moved_the_estimate(plan, off, anew):
     """By more than the estimate was uncertain."""
 

@@ -78,11 +78,28 @@ class _Repeats:
 
 
 @dataclass(frozen=True)
+class _Jump:
+    """A jump that has not been taken back: the largest distance (mm) from the last good reading that was allowed at its
+    time (s).
+
+    The needle is held after a jump, and then no time makes a distance plausible: with a limit that grew with it, a
+    sensor that has slipped would soon be believed. Only the travel that is still predicted adds to it.
+    """
+
+    time: float
+    limit: float
+
+    def limit_at(self, time: float, tip_at: TipAt) -> float:
+        """The largest distance (mm) of a later reading from the last good one."""
+        return self.limit + math.dist(tip_at(self.time), tip_at(time))
+
+
+@dataclass(frozen=True)
 class Monitor:
     """State of the monitor. Frozen: `check` and `check_field` return the next state.
 
     axes: lateral axes of the needle; recent: readings within the window; repeats: the newest readings with the same
-    position; good: the last good reading; field: the last verdict on the field; distorted: whether the field counts
+    position; good: the last good reading; jumped: the jump since then, if any; field: the last verdict on the field; distorted: whether the field counts
     as distorted.
     """
 
@@ -91,6 +108,7 @@ class Monitor:
     recent: tuple[Measurement, ...] = ()
     repeats: _Repeats | None = None
     good: Measurement | None = None
+    jumped: _Jump | None = None
     field: Verdict = OK
     distorted: bool = False
 
@@ -115,8 +133,24 @@ class Monitor:
         since = measurement.time - self.settings.indicator_window_s + 1e-9
         kept = tuple(one for one in self.recent if one.time > since)
         monitor = replace(self, recent=(*kept, measurement), repeats=self._repeats_with(measurement, tip_at))
-        verdict = rules.first_bad(monitor._verdicts(measurement, tip_at(measurement.time), max_innovation))
-        return (replace(monitor, good=measurement) if verdict.ok else monitor), verdict
+        monitor, jump = monitor._after_jump(measurement, tip_at)
+        verdict = rules.first_bad(
+            monitor._verdicts(measurement, tip_at(measurement.time), max_innovation, jump)
+        )
+        return (replace(monitor, good=measurement, jumped=None) if verdict.ok else monitor), verdict
+
+    def _after_jump(self, measurement: Measurement, tip_at: TipAt) -> "tuple[Monitor, Verdict]":
+        """The state after the check of a reading for a jump, and its verdict."""
+        if self.good is None:
+            return self, OK
+        settings, time = self.settings, measurement.time
+        limit = settings.speed_limit_mm_s * abs(time - self.good.time) + settings.jump_margin_mm
+        if self.jumped is not None:
+            limit = min(limit, self.jumped.limit_at(time, tip_at))
+        verdict = rules.jump(measurement, self.good, limit)
+        if verdict.ok or self.jumped is not None or not settings.enabled:
+            return self, verdict
+        return replace(self, jumped=_Jump(time, limit)), verdict
 
     def check_field(self) -> "tuple[Monitor, Verdict]":
         """Return the state after a check of the field by the reference sensors, and the verdict.
@@ -166,7 +200,7 @@ class Monitor:
         return [one.frame for one in self.recent if one.frame is not None]
 
     def _verdicts(
-        self, measurement: Measurement, predicted: Point, max_innovation: float
+        self, measurement: Measurement, predicted: Point, max_innovation: float, jump: Verdict
     ) -> Iterator[Verdict]:
         settings = self.settings
         measured = (measurement.x, measurement.y, measurement.z)[: 1 + self.axes]
@@ -177,7 +211,7 @@ class Monitor:
         if settings.enabled:
             if self.axes == 1:
                 yield rules.out_of_plane(measurement.z, settings.out_of_plane_limit_mm)
-            yield rules.jump(measurement, self.good, settings.speed_limit_mm_s, settings.jump_margin_mm)
+            yield jump
             if self.repeats is not None:
                 yield rules.frozen(self.repeats.count, self.repeats.travel, settings.frozen_travel_mm)
 

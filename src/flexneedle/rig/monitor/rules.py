@@ -83,12 +83,9 @@ def out_of_plane(z: float | None, limit: float) -> Verdict:
     return Verdict(VerdictKind.OUT_OF_PLANE, f"{z:.2f} mm, limit {limit:g} mm")
 
 
-def jump(measurement: Measurement, previous: Measurement | None, speed: float, margin: float) -> Verdict:
-    """The tip moved faster than `speed` (mm/s) since the previous good reading; `margin` (mm) allows for noise."""
-    if previous is None:
-        return OK
+def jump(measurement: Measurement, previous: Measurement, limit: float) -> Verdict:
+    """The tip is more than `limit` (mm) from the previous good reading."""
     travel = math.dist(*_common_coordinates(measurement, previous))
-    limit = speed * abs(measurement.time - previous.time) + margin
     if travel <= limit:
         return OK
     return Verdict(VerdictKind.JUMP, f"{travel:.2f} mm, limit {limit:.2f} mm")

@@ -46,7 +46,7 @@ class Supervisor:
         self._drives = {name: Drive(name, axis) for name, axis in task.rig.axes.items()}
         self._queue = 1e-3 * task.rig.loop.queue_ms
         self.state, self.why = State.IDLE, ""
-        self._heard = now = clock.now()
+        self._heard = self._ticked_at = now = clock.now()
         self._watch = Watch(Monitor(task.monitor, task.lateral_axes), task.stale_after, now)
         self._read(now)
         self._goals = self._at()
@@ -220,7 +220,7 @@ class Supervisor:
 
     def tick(self) -> None:
         """Read motors and tracker, check, and send targets or stop."""
-        now = self._clock.now()
+        self._ticked_at = now = self._clock.now()
         self._measure(now)
         self._check_motors(now)
         self._check_client(now)
@@ -239,7 +239,7 @@ class Supervisor:
         }
         times = late, work, missed
         return say.Report(
-            self._read_at, self.state, self.why, axes, measurements, self._tracker.status, *times
+            self._ticked_at, self.state, self.why, axes, measurements, self._tracker.status, *times
         )
 
     def _measure(self, now: float) -> None:
