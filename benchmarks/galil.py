@@ -4,7 +4,8 @@ Loopback, the emulated controller in a process of its own, four axes. `read()` a
 at which they come (without a pause), while two axes move; between them an echo of as many bytes as a reading has, by a
 plain TCP server in a third process: what the machine needs for a round trip alone. Median, 99 % and largest time of
 each, and the ratio to the echo. To judge the machine: processor time taken by the host (Linux in a virtual machine).
-Exit status 1 if 99 % of read() or follow() took longer than 2 ms.
+Exit status 1 if the 99 % of read() or follow() are above 2 ms; 2 if those of the echo are above 1 ms: the machine is
+busy, and the times are not those of the driver.
 """
 
 import argparse
@@ -22,7 +23,7 @@ import psutil
 from flexneedle.rig.devices.galil.motors import GalilMotors, factory
 
 CHANNELS = "ABCD"
-BAR_MS = 2.0
+BAR_MS, BUSY_MS = 2.0, 1.0
 _ECHO = """
 import socket
 with socket.create_server(("127.0.0.1", 0)) as server:
@@ -47,10 +48,12 @@ def main() -> int:
     else:
         for name, value in found.items():
             print(f"{name}: {value}")
-    return 1 if max(found["read(), ms"]["99 %"], found["follow(), ms"]["99 %"]) > BAR_MS else 0
+    if found["echo, 99 %, ms"] > BUSY_MS:
+        return 2
+    return 1 if max(found["read(), 99 %, ms"], found["follow(), 99 %, ms"]) > BAR_MS else 0
 
 
-def measure(calls: int) -> dict[str, object]:
+def measure(calls: int) -> dict[str, float]:
     """Return the times of so many calls of each kind."""
     stolen = getattr(psutil.cpu_times(), "steal", 0.0)
     with emulated() as address, echo() as line, connected(address) as motors:
@@ -68,7 +71,7 @@ def measure(calls: int) -> dict[str, object]:
                 call()
                 times[name].append(1e3 * (perf_counter() - begun))
         motors.stop()
-    found: dict[str, object] = {f"{name}, ms": summary(values) for name, values in times.items()}
+    found = {text: value for name, values in times.items() for text, value in summary(name, values)}
     for name in ("read()", "follow()"):
         ratio = np.median(times[name]) / np.median(times["echo"])
         found[f"{name}, times the echo (medians)"] = round(float(ratio), 2)
@@ -98,10 +101,10 @@ def targets() -> Iterator[dict[str, float]]:
         yield {"A": position, "B": -position}
 
 
-def summary(values: list[float]) -> dict[str, float]:
-    """Return median, 99 % and largest of times."""
-    median, most = map(float, np.percentile(values, [50, 99]))
-    return {"median": round(median, 3), "99 %": round(most, 3), "largest": round(max(values), 3)}
+def summary(name: str, values: list[float]) -> Iterator[tuple[str, float]]:
+    """Yield median, 99 % and largest of times, with what they are."""
+    for text, percent in (("median", 50), ("99 %", 99), ("largest", 100)):
+        yield f"{name}, {text}, ms", round(float(np.percentile(values, percent)), 3)
 
 
 def exchanged(line: socket.socket) -> None:

@@ -53,6 +53,17 @@ def test_a_host_that_is_not_known_is_refused_in_one_line():
         Link("no-such-host.invalid", 23)
 
 
+def test_a_host_with_several_addresses_is_reached_at_that_of_ipv4(monkeypatch):
+    found = socket.getaddrinfo("::1", 0, type=socket.SOCK_STREAM)
+    with peer() as device:
+        found += socket.getaddrinfo("127.0.0.1", device.port, type=socket.SOCK_STREAM)
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+        link = Link("both.lab", device.port)
+        link.open(monotonic() + PATIENT_S)
+        assert ask(link, "TPA")[0].accepted
+        link.close()
+
+
 def test_a_port_where_nothing_listens_is_refused_in_one_line():
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]

@@ -35,7 +35,9 @@ class Link:
         except (OSError, UnicodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise DriverError(f"{self.name}: unknown host: {reason}") from None
-        self._family, self._address = found[0][0], found[0][4]
+        # IPv4 first, which is all that the controllers have.
+        best = min(found, key=lambda each: each[0] != socket.AF_INET)
+        self._family, self._address = best[0], best[4]
         self._socket: socket.socket | None = None
         self._closed = "not connected yet"
 
