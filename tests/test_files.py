@@ -6,6 +6,7 @@ import signal
 import pytest
 
 import flexneedle
+from flexneedle.errors import RecordError
 from flexneedle.figures.style import new_figure, save
 from flexneedle.files import replace_file, uninterrupted
 
@@ -34,7 +35,7 @@ def test_a_file_is_the_old_one_until_the_new_one_is_complete(tmp_path, monkeypat
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        with pytest.raises(OSError, match="No space left"):
+        with pytest.raises(RecordError, match="cannot be written: No space left"):
             write(tmp_path)
     assert {path.read_bytes() for path in written} == {b"old"}
     write(tmp_path)

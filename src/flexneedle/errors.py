@@ -1,5 +1,7 @@
 """The errors of the package. A message is one line: the value, the rule, the valid choices."""
 
+from pathlib import Path
+
 
 class FlexneedleError(Exception):
     """Base class of all errors that flexneedle raises."""
@@ -50,6 +52,15 @@ class StateError(InputError):
 
 class RunError(FlexneedleError):
     """An insertion or a study failed (exit status 1)."""
+
+
+class RecordError(RunError):
+    """A file cannot be written, as on a full disk."""
+
+    @classmethod
+    def of(cls, path: Path, error: OSError) -> "RecordError":
+        """The error for a file, with the reason of the operating system."""
+        return cls(f"{path.name} cannot be written: {error.strerror or error}")
 
 
 class DriverError(RunError):

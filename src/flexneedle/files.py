@@ -11,7 +11,7 @@ from pathlib import Path
 from threading import current_thread, main_thread
 from types import FrameType
 
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, RecordError
 
 RUNS = Path("runs")
 _LONGEST_NAME = 60
@@ -35,14 +35,21 @@ def uninterrupted() -> Iterator[None]:
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Replace a file in one step: readers get the old or the new one, never a part."""
+    """Replace a file in one step: readers get the old or the new one, never a part.
+
+    Raises RecordError, and leaves the old one, if it cannot be written.
+    """
     draft = path.with_name(path.name + ".tmp")
     with uninterrupted():
-        with draft.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(path)
+        try:
+            with draft.open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            draft.replace(path)
+        except OSError as error:
+            draft.unlink(missing_ok=True)  # a part of it would take the last room of a full disk
+            raise RecordError.of(path, error) from error
 
 
 def new_folder(*parts: str, now: datetime | None = None) -> Path:

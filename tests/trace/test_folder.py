@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import flexneedle
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, RecordError
 from flexneedle.scenario.files import load_scenario
 from flexneedle.trace import folder as folder_module
 from flexneedle.trace.folder import Folder, read_run, versions
@@ -110,7 +110,7 @@ def test_run_json_is_complete_at_any_time(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(RecordError, match=r"run\.json cannot be written: No space"):
         folder.end("done")
     assert (tmp_path / "run.json").read_bytes() == before
 

@@ -160,7 +160,8 @@ def test_every_column_of_a_row_is_restored_to_the_last_bit(loaded, rows_then):
         assert set(now) == set(COLUMNS)
         angles = {"roll_rad", "command_roll_rad", "applied_roll_rad"}
         unknown = {"miss_z_mm"} if then["miss_mm"] == "nan" else set()
-        assert {now[name] for name in set(now) - set(kept) - angles - unknown} == {"0.0"}
+        assert {now[name] for name in set(now) - set(kept) - angles - unknown - {"late"}} == {"0.0"}
+        assert now["late"] == "False"
         assert {now[name] for name in unknown} <= {"nan"}
         assert np.cos(period.roll) == int(then["bevel"])
         for name in ("command", "applied"):

@@ -236,7 +236,7 @@ def test_columns_carry_units():
         "decision",
         "converged",
     }
-    bare |= {"warning"}
+    bare |= {"warning", "late"}
     bare |= {"true_stretch"}  # a ratio
     units = {"mm", "rad", "s", "mj", "n"}
     assert {name for name in COLUMNS if name.rsplit("_", 1)[-1] not in units} == bare

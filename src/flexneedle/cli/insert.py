@@ -17,6 +17,7 @@ from flexneedle.console.common import (
     entry_rows,
     print_json,
     print_table,
+    problems_printed,
     run_name,
     seed,
     target_row,
@@ -116,9 +117,11 @@ def _insert(args: argparse.Namespace) -> int:
         _confirm(args, scenario, choices)
         compile_first()
         folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
-    with _refusal_printed(args, choices, scenario, folder):
-        insertion = _execute(folder, scenario, choices)
-    return _report(scenario, insertion, args.json, folder.path)
+    with problems_printed(folder):
+        with _refusal_printed(args, choices, scenario, folder):
+            insertion = _execute(folder, scenario, choices)
+        status = _report(scenario, insertion, args.json, folder.path)
+    return status or int(bool(folder.problems))
 
 
 def _scenario(args: argparse.Namespace, choices: Choices) -> Scenario:

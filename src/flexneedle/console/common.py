@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from flexneedle.control.interface import Method
     from flexneedle.scenario.model import Scenario
+    from flexneedle.trace.folder import Folder
     from flexneedle.types import Plan
 
 
@@ -156,6 +159,16 @@ def print_table(title: str, rows: Iterable[Sequence[str]], folder: Path, heads: 
         table.add_row(*map(Text, row))
     console.print(Text(title, style="bold"), table, sep="\n\n")
     console.print(Text(f"\nRecord and figures: {folder}"))
+
+
+@contextmanager
+def problems_printed(folder: Folder) -> Iterator[None]:
+    """At the end, print a line on stderr for each file of the record that could not be written."""
+    try:
+        yield
+    finally:
+        for line in dict.fromkeys(folder.problems):
+            print(f"flexneedle: {line}", file=sys.stderr)
 
 
 def described(text: str, *lines: str) -> dict[str, Any]:

@@ -8,16 +8,16 @@ from typing import Any
 
 from flexneedle.control.guide import check_guide
 from flexneedle.control.methods import DEFAULT
-from flexneedle.errors import FlexneedleError, one_line
+from flexneedle.errors import FlexneedleError, RecordError, one_line
 from flexneedle.planning.origin import placed
 from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT
 from flexneedle.rig.supervised import Ticks, check_fit
-from flexneedle.runs.figures import draw_run
-from flexneedle.runs.saving import finish_insertion, finish_plans, keep_plan, note_result, open_trace
+from flexneedle.runs.saving import finish, finish_insertion, finish_plans, keep_plan, note_result, open_trace
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.rig import RigFile
 from flexneedle.trace.folder import Folder
+from flexneedle.trace.writer import TraceWriter
 from flexneedle.types import Insertion, Outcome, Period, Plan
 
 OnIteration = Callable[[str, dict[str, Any]], None]
@@ -88,7 +88,8 @@ def record_insertion(
 
     An insertion that is interrupted (Ctrl-C) is returned with its periods and the outcome "interrupted". An
     error, or an interruption of planning, is recorded in `run.json` and re-raised; if there was a plan, the record
-    includes the result, with the outcome "refused", or "failed" once the needle has moved.
+    includes the result, with the outcome "refused", or "failed" once the needle has moved. An insertion whose trace
+    cannot be written is held; what else cannot be written is in `folder.problems`.
     """
     folder.values |= choices.parts
     with _status_recorded(folder):
@@ -123,11 +124,11 @@ def _insert(
         parts = controller, phantom, tracker, scenario, rig, {} if choices.rig is None else ticks.summary()
         return Insertion(plan, choices.seed, tuple(periods), outcome, reason, *parts)
 
-    with open_trace(folder, scenario, plan, choices.seed, choices.parts) as trace:
+    with _closed_at_the_end(folder, open_trace(folder, scenario, plan, choices.seed, choices.parts)) as trace:
 
         def keep(period: Period) -> None:
-            trace.add(period)
             periods.append(period)
+            trace.add(period)
             on_period(period)
 
         options: dict[str, Any] = {
@@ -143,10 +144,24 @@ def _insert(
             return insert(scenario, plan, choices.seed, on_period=keep, **options)
         except KeyboardInterrupt:
             return ended(Outcome.INTERRUPTED, "stopped by the user")
+        except RecordError as error:  # what happens is no longer recorded: the needle goes no further
+            return ended(Outcome.HELD, one_line(error))
         except FlexneedleError as error:
             outcome = Outcome.FAILED if periods else Outcome.REFUSED
             note_result(folder, ended(outcome, one_line(error)))
             raise
+
+
+@contextmanager
+def _closed_at_the_end(folder: Folder, trace: TraceWriter) -> Iterator[TraceWriter]:
+    """A trace whose index may fail to be written, without which it is readable: then `folder.problems` has it."""
+    try:
+        yield trace
+    finally:
+        try:
+            trace.close()
+        except RecordError as problem:
+            folder.problems.append(str(problem))
 
 
 @contextmanager
@@ -157,7 +172,6 @@ def _status_recorded(folder: Folder) -> Iterator[None]:
     except BaseException as error:
         if folder.values["status"] == "running":
             interrupted = isinstance(error, KeyboardInterrupt)
-            folder.end("interrupted" if interrupted else "failed", str(error) or type(error).__name__)
-            if folder.plans:
-                draw_run(folder.path)
+            status = "interrupted" if interrupted else "failed"
+            finish(folder, status, str(error) or type(error).__name__)
         raise

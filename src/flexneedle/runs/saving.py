@@ -1,10 +1,12 @@
 """Write plans and insertions to the folder of a run, step by step or at once."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from flexneedle.arguments import path
 from flexneedle.control.methods import used
+from flexneedle.errors import RecordError
 from flexneedle.runs.figures import draw_run
 from flexneedle.scenario.model import Scenario
 from flexneedle.trace.folder import TRACE_FILE, Folder, versions
@@ -17,7 +19,8 @@ def save(record: Plan | Insertion, folder: str | Path) -> Path:
     """Write a plan or an insertion to a folder, as the commands do, and return the folder.
 
     The folder is created; `load`, `flexneedle view` and `flexneedle export` read it. Raises InputError for a folder
-    that already contains a run or cannot be created, and for a record without its scenario.
+    that already contains a run or cannot be created, and for a record without its scenario; RecordError if a file
+    cannot be written.
     """
     scenario, out = scenario_of(record), path("folder", folder)
     if isinstance(record, Plan):
@@ -33,6 +36,8 @@ def save(record: Plan | Insertion, folder: str | Path) -> Path:
             for period in record.periods:
                 trace.add(period)
         finish_insertion(claimed, record)
+    if claimed.problems:
+        raise RecordError("; ".join(claimed.problems))
     return claimed.path
 
 
@@ -65,7 +70,18 @@ def note_result(folder: Folder, insertion: Insertion) -> None:
 
 
 def finish_insertion(folder: Folder, insertion: Insertion) -> None:
-    """Write the outcome of an insertion to `run.json`, and draw it."""
+    """Write the outcome of an insertion to `run.json`, and draw it; `folder.problems` has what cannot be written."""
     note_result(folder, insertion)
-    folder.end(insertion.outcome, insertion.reason)
-    draw_run(folder.path)
+    finish(folder, insertion.outcome, insertion.reason)
+
+
+def finish(folder: Folder, status: str, reason: str) -> None:
+    """Write the final status, and draw plans and insertion; `folder.problems` has what cannot be written."""
+    steps: list[Callable[[], object]] = [partial(folder.end, status, reason)]
+    if folder.plans:
+        steps.append(partial(draw_run, folder.path))
+    for step in steps:
+        try:
+            step()
+        except RecordError as problem:
+            folder.problems.append(str(problem))

@@ -54,12 +54,16 @@ class RunFile:
 
 @dataclass(eq=False)
 class Folder:
-    """A folder of a run and the values of its `run.json`, written by `write`."""
+    """A folder of a run and the values of its `run.json`, written by `write`.
+
+    problems: a line for each file of the record that could not be written at the end of the run.
+    """
 
     path: Path
     values: dict[str, Any]
     timing: dict[str, Any]
     plans: dict[str, Plan] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
 
     @classmethod
     def claim(cls, out: Path | None, name: str, kind: str, scenario: Scenario, seed: int) -> "Folder":
@@ -84,7 +88,7 @@ class Folder:
         return folder
 
     def write(self) -> None:
-        """Write `run.json` in one step: readers get the old or the new text, never a part."""
+        """Write `run.json` in one step: readers get the old or the new text, never a part. Raises RecordError."""
         plans = {name: self._chosen_entry(plan) | plan_values(plan) for name, plan in self.plans.items()}
         text = to_text({**self.values, "timing": self.timing, "plans": plans})
         replace_file(self.path / RUN_FILE, text.encode())

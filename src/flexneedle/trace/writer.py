@@ -1,17 +1,21 @@
 """`trace.mcap`: a run as standard ROS 2 messages, complete up to the last period even if the process is killed.
 
-Each period is one chunk (uncompressed), written at once when the period ends, so that the file ends with a complete
-record.
+Each period is one chunk (uncompressed), given to the operating system at once when the period ends, so that the file
+ends with a complete record. The disk itself gets it when the system writes its cache, and at the end: no period waits
+for a disk. A power failure may cost the periods of the last half minute.
 """
 
 import json
-from collections.abc import Iterable, Mapping
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 from mcap.writer import CompressionType, Writer
 
+from flexneedle.errors import RecordError
 from flexneedle.files import uninterrupted
 from flexneedle.trace.messages import STORE
 from flexneedle.trace.topics import LATCHED, TOPICS, TopicMessage, period_messages, plan_message
@@ -36,32 +40,37 @@ class TraceWriter:
     """Writes a run to a new file. Use it as a context manager, or call `close`.
 
     about: metadata `flexneedle` of the file, such as seed and versions; scenario: nested values, attached as
-    `scenario.json`. Raises FileExistsError if the file exists.
+    `scenario.json`. Raises FileExistsError if the file exists. It and all functions raise RecordError if the file
+    cannot be written; what was written before stays, and the writer is closed.
     """
 
     def __init__(
         self, path: Path, plan: Plan, *, about: Mapping[str, str], scenario: Mapping[str, Any]
     ) -> None:
-        self._file = path.open("xb", buffering=_CHUNK_SIZE)
+        self._path, self._count = path, 0
+        self._file = _opened(path)
         self._writer = Writer(self._file, chunk_size=_CHUNK_SIZE, compression=CompressionType.NONE)
-        self._writer.start(profile="ros2", library="flexneedle")
-        self._writer.add_metadata("flexneedle", dict(about))
-        text = json.dumps(scenario, indent=1, ensure_ascii=False, allow_nan=False)
-        self._writer.add_attachment(0, 0, "scenario.json", "application/json", text.encode())
-        self._channels = self._register()
-        self._count = 0
-        self._write([plan_message(plan.tips)])
+        try:
+            with self._writing():
+                self._begin(about, scenario)
+                self._write([plan_message(plan.tips)])
+        except RecordError:
+            path.unlink()  # without its beginning it is no trace
+            raise
 
     def add(self, period: Period) -> None:
         """Write a period to the file."""
-        self._write(list(period_messages(period)))
+        with self._writing():
+            self._write(list(period_messages(period)))
 
     def close(self) -> None:
         """Write the index and close the file; without an index the file is readable as well."""
         if self._file.closed:
             return
-        with uninterrupted():
+        with self._writing():
             self._writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates no result
+            self._file.flush()
+            os.fsync(self._file.fileno())
             self._file.close()
 
     def __enter__(self) -> Self:
@@ -72,14 +81,31 @@ class TraceWriter:
     ) -> None:
         self.close()
 
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Delay Ctrl-C until a record is written. If it cannot be, close the file as it is."""
+        try:
+            with uninterrupted():
+                yield
+        except OSError as error:
+            with suppress(OSError):  # the same again, of what is still in the buffer
+                self._file.close()
+            raise RecordError.of(self._path, error) from error
+
+    def _begin(self, about: Mapping[str, str], scenario: Mapping[str, Any]) -> None:
+        self._writer.start(profile="ros2", library="flexneedle")
+        self._writer.add_metadata("flexneedle", dict(about))
+        text = json.dumps(scenario, indent=1, ensure_ascii=False, allow_nan=False)
+        self._writer.add_attachment(0, 0, "scenario.json", "application/json", text.encode())
+        self._channels = self._register()
+
     def _write(self, messages: Iterable[TopicMessage]) -> None:
         """Write messages as one chunk and flush it."""
-        with uninterrupted():
-            for one in messages:
-                data = bytes(STORE.serialize_cdr(one.message, TOPICS[one.topic]))
-                self._writer.add_message(self._channels[one.topic], one.time, data, one.time, self._count)
-            self._writer.flush()  # type: ignore[no-untyped-call]  # mcap annotates no result
-            self._count += 1
+        for one in messages:
+            data = bytes(STORE.serialize_cdr(one.message, TOPICS[one.topic]))
+            self._writer.add_message(self._channels[one.topic], one.time, data, one.time, self._count)
+        self._writer.flush()  # type: ignore[no-untyped-call]  # mcap annotates no result
+        self._count += 1
 
     def _register(self) -> dict[str, int]:
         """Register types and topics; return the channel of each topic."""
@@ -93,3 +119,12 @@ class TraceWriter:
     def _channel(self, topic: str, schema: int) -> int:
         qos = {"offered_qos_profiles": _LATCHED_QOS} if topic in LATCHED else {}
         return int(self._writer.register_channel(topic, "cdr", schema, qos))
+
+
+def _opened(path: Path) -> BinaryIO:
+    try:
+        return path.open("xb", buffering=_CHUNK_SIZE)
+    except FileExistsError:
+        raise
+    except OSError as error:
+        raise RecordError.of(path, error) from error
