@@ -154,16 +154,13 @@ class EmulatedRig:
 
     def _messages(self, part: _Part) -> Iterator[Mapping[str, Any]]:
         """The reports of a process. Raises the error that it has reported, or RunError if it has ended."""
-        for message in part.read():
-            if "failed" in message:
-                kind = InputError if message["input"] else RunError
-                raise kind(message["failed"])
-            yield message
+        yield from _without_failure(part)
         if part.ended:
             first = self._first_to_fail(part)
-            raise RunError(
-                f"the process of the {first.name} has ended with exit code {first.process.returncode}"
-            )
+            while not first.ended:
+                yield from _without_failure(first)
+            code = first.process.returncode
+            raise RunError(f"the process of the {first.name} has ended with exit code {code}")
 
     def _first_to_fail(self, ended: _Part) -> _Part:
         """The process that has failed: this one, or the one with which it has ended in good order."""
@@ -195,6 +192,15 @@ class EmulatedRig:
                     self._say({"device": part.name, **message})
         if part.process.stdout is not None:
             part.process.stdout.close()
+
+
+def _without_failure(part: _Part) -> Iterator[Mapping[str, Any]]:
+    """The reports of a process that have arrived; waits for one. Raises the error that it has reported."""
+    for message in part.read():
+        if "failed" in message:
+            kind = InputError if message["input"] else RunError
+            raise kind(message["failed"])
+        yield message
 
 
 def _split_order(line: str) -> tuple[str, str]:
