@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 _EXAMPLES = examples(
     "flexneedle emulate aurora --link /tmp/aurora",
-    "flexneedle emulate galil --port 2323",
     "flexneedle emulate rig emulated phantom",
 )
 _AURORA_EXAMPLES = examples(

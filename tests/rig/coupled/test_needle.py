@@ -97,7 +97,9 @@ def test_the_tip_turns_with_the_motor_and_returns_to_the_plane():
 def test_a_turn_is_followed_in_small_parts():
     needle = DrivenNeedle(truth_of("phantom3d", 0), place(0.0))
     assert needle.follow(place(0.0, rotation=math.pi), exactly=False) == math.ceil(math.pi / 0.1)
+    before = needle.tip
     assert needle.follow(place(1.0, rotation=math.pi), exactly=False) == 4  # phantom.step_mm = 0.25
+    assert needle.tip[0] - before[0] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_motions_below_the_resolution_are_followed_at_rest_only():

@@ -1,7 +1,9 @@
 """The whole emulated rig in processes: motors move the needle, the tracker measures it, faults and endings."""
 
+import json
 import math
 import signal
+import subprocess
 from time import monotonic
 
 import numpy as np
@@ -10,10 +12,14 @@ import pytest
 
 from emulated import DEADLINE_S, read_until, until
 from emulated_rig import emulated_rig, rig_file, started
+from flexneedle.errors import RunError
 from flexneedle.rig.devices.aurora.tracker import Aurora
+from flexneedle.rig.emulator.coupled.job import Job
+from flexneedle.rig.emulator.coupled.rig import EmulatedRig, _Part
 from flexneedle.rig.emulator.coupled.truth import read_truth
 from flexneedle.rig.emulator.motion import RATE_HZ
 from flexneedle.rig.virtual import to_stage
+from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.rig import load_rig
 
 SETTINGS = (
@@ -186,6 +192,23 @@ def test_where_a_process_is_lost_all_end(tmp_path):
     assert code == 1
     assert errors.strip() == "flexneedle: the process of the phantom has ended with exit code -9"
     until(gone(children))
+
+
+def test_the_reason_of_a_process_that_fails_is_reported(monkeypatch):
+    """Whichever of them is noticed first: the others end in good order."""
+
+    def part(name, command):
+        process = subprocess.Popen(["sh", "-c", command], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        return _Part(name, process)
+
+    rig = EmulatedRig(Job(load_rig("emulated"), load_scenario("phantom")), print)
+    failure = json.dumps({"failed": "the disk is full", "input": False})
+    parts = {"phantom": part("phantom", "true"), "galil": part("galil", f"echo '{failure}'; exit 1")}
+    monkeypatch.setattr(rig, "_parts", parts)
+    with pytest.raises(RunError, match="the disk is full"):
+        list(rig._messages(parts["phantom"]))
+    rig._end()
+    assert [one.process.returncode for one in parts.values()] == [0, 1]
 
 
 def test_a_device_that_cannot_begin_is_said_in_one_line(tmp_path):

@@ -1,11 +1,12 @@
 """The file of the true states: written as it goes, read back."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, RunError
 from flexneedle.rig.emulator.coupled.truth import Row, TruthWriter, read_truth
 
 AXES = ("insertion", "rotation")
@@ -78,3 +79,12 @@ def test_another_file_is_refused_in_one_line(path, text, message):
     assert "\n" not in str(refusal.value)
     with pytest.raises(InputError, match="cannot be read"):
         read_truth(path.parent)
+
+
+def test_a_full_disk_is_an_error_in_one_line(path, monkeypatch):
+    with TruthWriter(path, AXES) as writer:
+        monkeypatch.setattr(writer, "_file", full := Path("/dev/full").open("wb", buffering=0))  # noqa: SIM115
+        with pytest.raises(RunError, match=r"truth\.csv: cannot be written: No space left on device"):
+            writer.write(row(10.0))
+        monkeypatch.undo()
+    full.close()

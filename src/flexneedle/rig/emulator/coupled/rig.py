@@ -25,6 +25,7 @@ DEVICES: Mapping[str, Mapping[str, FaultKind]] = {"aurora": aurora.FAULTS, "gali
 _PHANTOM, _GALIL, _AURORA = "phantom", "galil", "aurora"
 _MODULES = {_PHANTOM: "phantom", _GALIL: "motors", _AURORA: "tracker"}
 _END_S = 3.0  # for a process to end by itself
+_FOLLOW_S = 0.5  # a process that has lost another may end before it
 
 
 def split_fault(given: str) -> tuple[str, str]:
@@ -153,14 +154,23 @@ class EmulatedRig:
 
     def _messages(self, part: _Part) -> Iterator[Mapping[str, Any]]:
         """The reports of a process. Raises the error that it has reported, or RunError if it has ended."""
-        for message in part.read():
-            if "failed" in message:
-                kind = InputError if message["input"] else RunError
-                raise kind(message["failed"])
-            yield message
+        yield from _without_failure(part)
         if part.ended:
-            code = part.process.wait()
-            raise RunError(f"the process of the {part.name} has ended with exit code {code}")
+            first = self._first_to_fail(part)
+            while not first.ended:
+                yield from _without_failure(first)
+            code = first.process.returncode
+            raise RunError(f"the process of the {first.name} has ended with exit code {code}")
+
+    def _first_to_fail(self, ended: _Part) -> _Part:
+        """The process that has failed: this one, or the one with which it has ended in good order."""
+        if ended.process.wait() != 0:
+            return ended
+        for part in self._parts.values():
+            with suppress(subprocess.TimeoutExpired):
+                if part.process.wait(_FOLLOW_S) != 0:
+                    return part
+        return ended
 
     def _end(self) -> None:
         """End all processes by closing their inputs, and report what they report then."""
@@ -182,6 +192,15 @@ class EmulatedRig:
                     self._say({"device": part.name, **message})
         if part.process.stdout is not None:
             part.process.stdout.close()
+
+
+def _without_failure(part: _Part) -> Iterator[Mapping[str, Any]]:
+    """The reports of a process that have arrived; waits for one. Raises the error that it has reported."""
+    for message in part.read():
+        if "failed" in message:
+            kind = InputError if message["input"] else RunError
+            raise kind(message["failed"])
+        yield message
 
 
 def _split_order(line: str) -> tuple[str, str]:

@@ -10,7 +10,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, RunError
 from flexneedle.types import Floats
 
 _TIP = ("x_mm", "y_mm", "z_mm", "theta_rad", "psi_rad")
@@ -49,13 +49,13 @@ class Row(NamedTuple):
 class TruthWriter:
     """Writes a record of these axes to a new file, each row at once. Use it as a context manager.
 
-    Raises InputError if the file exists or cannot be created.
+    Raises InputError if the file exists or cannot be created, RunError if a row cannot be written.
     """
 
     def __init__(self, path: Path, axes: Sequence[str]) -> None:
-        self._axes = tuple(axes)
+        self._axes, self._path = tuple(axes), path
         try:
-            self._file = path.open("x", encoding="utf-8", newline="")
+            self._file = path.open("xb", buffering=0)
         except FileExistsError:
             raise InputError(f"{path}: already exists: choose another file, or remove it") from None
         except OSError as error:
@@ -82,8 +82,13 @@ class TruthWriter:
         self._write((f"{row.time:.6f}", *(f"{value:.9g}" for value in numbers), *last))
 
     def _write(self, cells: Sequence[object]) -> None:
-        self._file.write(",".join(map(str, cells)) + "\n")
-        self._file.flush()
+        line = (",".join(map(str, cells)) + "\n").encode()
+        try:
+            written = self._file.write(line)
+        except OSError as error:
+            raise RunError(f"{self._path}: cannot be written: {error.strerror}") from None
+        if written != len(line):
+            raise RunError(f"{self._path}: cannot be written: the disk is full")
 
 
 @dataclass(frozen=True, eq=False)
