@@ -1,0 +1,32 @@
+"""Writes the table of states in docs/safety.md from the one that the supervisor runs from.
+
+python tools/docs/rig_states.py
+"""
+
+from pathlib import Path
+
+from flexneedle.rig.supervisor.machine import MOVING, Event, State, after
+
+PAGE = Path(__file__).parents[2] / "docs" / "safety.md"
+BEGIN, END = "<!-- states -->\n", "<!-- end of states -->\n"
+
+
+def table() -> str:
+    """Return the table, Markdown: the state after each event, empty where it is refused."""
+    heads = " | ".join(str(event) for event in Event)
+    lines = [f"| state | {heads} |", "|---" * (1 + len(Event)) + "|"]
+    for state in State:
+        cells = " | ".join(str(after(state, event) or "") for event in Event)
+        lines.append(f"| {f'**{state}**' if state in MOVING else state} | {cells} |")
+    return "\n".join(lines) + "\n"
+
+
+def page(text: str) -> str:
+    """Return the page with the present table in place of the one in `text`."""
+    before, _, rest = text.partition(BEGIN)
+    _, _, after_it = rest.partition(END)
+    return f"{before}{BEGIN}\n{table()}\n{END}{after_it}"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
