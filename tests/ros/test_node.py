@@ -20,7 +20,17 @@ from flexneedle.ros.dds import Reader, Writer
 from flexneedle.ros.idl import type_hash
 from flexneedle.ros.messages import Composer
 from flexneedle.ros.profile import load_profile
-from flexneedle.ros.records import Arm, Lost, Refused, RigState, ShapeReading, Stop, Target, TipReading
+from flexneedle.ros.records import (
+    Arm,
+    JointTargets,
+    Lost,
+    Refused,
+    RigState,
+    ShapeReading,
+    Stop,
+    Target,
+    TipReading,
+)
 from flexneedle.types import VISIBLE, Measurement, Shape
 from ros_peers import Bool, Peer, await_requests, cdr, shape, target, tip
 from synthetic import make_periods, make_plan
@@ -158,6 +168,33 @@ def test_two_trackers_on_one_topic_are_refused(measuring):
     until(both)
 
 
+def test_a_flood_of_measurements_does_not_hold_up_a_stop():
+    with NodeClient(NEUTRAL.only(subscribe=("tip", "stop"))) as node:
+        peer = Peer(NEUTRAL, subscribe=("tip", "stop"))
+        peer.await_node(node)
+        begun = time.time()
+        for number in range(3000):  # good and bad ones, as fast as they can be sent
+            peer.send("tip", tip(begun + number, frame="skin" if number % 2 else "map"))
+        sent = time.monotonic()
+        peer.send("stop", Bool(True))
+        requests = []
+        until(lambda: requests.extend(node.poll()) or any(isinstance(one, Stop) for one in requests))
+    stop = next(one for one in requests if isinstance(one, Stop))
+    assert stop.time - sent < 1.0
+    assert sum(isinstance(one, Refused) for one in requests) < 60  # one in 0.1 s
+
+
+def test_targets_of_joints_that_are_late_are_not_sent():
+    profile = NEUTRAL.only(publish=("joint_targets",))
+    with NodeClient(profile) as node:
+        peer = Peer(profile, publish=("joint_targets",))
+        peer.await_node(node)
+        node.publish(JointTargets(time.monotonic() - 0.2, {"a": 1.0}))
+        node.publish(JointTargets(time.monotonic() + 10.0, {"a": 2.0}))
+        until(lambda: peer.received("joint_targets"))
+    assert [message.position.tolist() for message in peer.taken["joint_targets"]] == [[2.0]]
+
+
 def test_what_the_node_publishes_is_not_read_back():
     """Cyclone could deliver a participant's own samples; a profile cannot have a topic both ways, either."""
     topic = NEUTRAL.subscribe.target.topic
@@ -175,7 +212,7 @@ def test_what_the_node_publishes_is_not_read_back():
 def test_a_node_that_is_killed_is_lost_once():
     with open_node(NEUTRAL) as node:
         assert node.status == VISIBLE
-        os.kill(node._process.pid, signal.SIGKILL)
+        os.kill(node.pid, signal.SIGKILL)
         (lost,) = await_requests(node, Lost)
         assert lost.reason == "the ROS node has ended"
         assert node.status == lost.reason
@@ -185,21 +222,21 @@ def test_a_node_that_is_killed_is_lost_once():
 
 def test_a_node_that_hangs_is_lost():
     with open_node(NEUTRAL) as node:
-        os.kill(node._process.pid, signal.SIGSTOP)
+        os.kill(node.pid, signal.SIGSTOP)
         (lost,) = await_requests(node, Lost)
         assert "does not answer for 1." in lost.reason
-        os.kill(node._process.pid, signal.SIGCONT)
+        os.kill(node.pid, signal.SIGCONT)
 
 
 def test_publishing_does_not_wait_for_a_node_that_hangs():
     with open_node(NEUTRAL) as node:
-        os.kill(node._process.pid, signal.SIGSTOP)
+        os.kill(node.pid, signal.SIGSTOP)
         longest = 0.0
         for _ in range(1000):  # 10 MB
             before = time.perf_counter()
             node.publish(PERIODS[0])
             longest = max(longest, time.perf_counter() - before)
-        os.kill(node._process.pid, signal.SIGCONT)
+        os.kill(node.pid, signal.SIGCONT)
         assert node.dropped > 0
     assert longest < 0.5
 

@@ -86,6 +86,11 @@ class NodeClient:
         return self._lost or self._silent() or VISIBLE
 
     @property
+    def pid(self) -> int:
+        """Identifier of the node's process."""
+        return self._process.pid
+
+    @property
     def dropped(self) -> int:
         """Records that were not published, because the node did not keep up."""
         return self._pipe.dropped
