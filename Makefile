@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all slow bench robustness validation accuracy controllers studies tracker steering worlds space worlds-space tuning docs lint clean
+.PHONY: help setup demo test test-all slow bench fuzz-ros robustness validation accuracy controllers studies tracker steering worlds space worlds-space tuning docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -37,13 +37,17 @@ test: setup  ## run the tests but the long ones, on all cores
 test-all: setup  ## run all tests but the slow ones: statistics over many draws, studies in several processes
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" $(PYTEST_ARGS)
 
-bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker, round trips to emulated motors
+bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker, round trips to emulated motors, ROS topics
 	$(BIN)/python benchmarks/bench.py
 	$(BIN)/python benchmarks/plant.py
 	$(BIN)/python benchmarks/periods.py
 	$(BIN)/python benchmarks/em.py
 	$(BIN)/python benchmarks/aurora.py
 	$(BIN)/python benchmarks/galil.py
+	$(BIN)/python benchmarks/ros.py
+
+fuzz-ros: setup  ## a million random and damaged messages to all that reads ROS topics, and to a running node
+	$(BIN)/python studies/fuzz_ros.py --live
 
 robustness: setup  ## 100,000 random insertions of the model in the plane and in space, as it ships and adapted, and 2,000 of the exact plant (long)
 	$(BIN)/python studies/robustness.py

@@ -1,6 +1,8 @@
 """A ROS node of a test: publishers and subscribers of a profile's topics in the process of the test."""
 
+import time
 from collections import defaultdict
+from threading import Event, Thread
 
 import numpy as np
 import rosbags.typesys.stores.ros2_humble as ros
@@ -55,6 +57,10 @@ def cdr(message, kind=None):
     return bytes(STORE.serialize_cdr(message, kind or message.__msgtype__))
 
 
+PEERS = []
+"""All peers of a test, whose topics end with it (`tests/ros/conftest.py`): a test that fails keeps its variables."""
+
+
 class Peer:
     """Subscribes to what a profile publishes, publishes what it subscribes to."""
 
@@ -71,6 +77,11 @@ class Peer:
             for key in subscribe
         }
         self.taken = defaultdict(list)
+        PEERS.append(self)
+
+    def close(self):
+        """End its topics."""
+        self.readers, self.writers, self.domain = {}, {}, None
 
     def await_node(self, node):
         """Wait until the node and this peer have found each other on all topics."""
@@ -105,3 +116,40 @@ def await_requests(node, kind, count=1):
 
     until(enough)
     return found
+
+
+class Joints(Thread):
+    """The other side of a rig of topics: joints that go at once to where they are told, reported at 200 Hz.
+
+    targets: all that were received. silent: while it is set nothing is reported.
+    """
+
+    def __init__(self, profile, **positions):
+        super().__init__(daemon=True)
+        topics = profile.publish.joint_targets.topic, profile.subscribe.joint_states.topic
+        self.domain = participant()
+        self.reader = Reader(self.domain, topics[0], "sensor_msgs/msg/JointState")
+        self.writer = Writer(self.domain, topics[1], "sensor_msgs/msg/JointState")
+        self.positions, self.targets = dict(positions), []
+        self.silent, self.ended, self.free = Event(), Event(), Event()
+
+    def run(self):
+        while not self.ended.wait(0.005):
+            for data, _ in self.reader.take():
+                message = STORE.deserialize_cdr(data, "sensor_msgs/msg/JointState")
+                self.targets.append(
+                    (time.monotonic(), dict(zip(message.name, message.position.tolist(), strict=True)))
+                )
+                if not self.free.is_set():
+                    self.positions |= self.targets[-1][1]
+            if not self.silent.is_set():
+                self.writer.write(joints(time.time(), self.positions))
+
+    def __enter__(self):
+        self.start()
+        return self
+
+    def __exit__(self, *_):
+        self.ended.set()
+        self.join()
+        self.reader = self.writer = self.domain = None

@@ -4,6 +4,8 @@ import os
 
 import pytest
 
+from ros_peers import PEERS
+
 LOOPBACK = """\
 <CycloneDDS><Domain>
   <General>
@@ -22,3 +24,10 @@ def loopback():
         patch.setenv("CYCLONEDDS_URI", LOOPBACK)
         patch.setenv("ROS_DOMAIN_ID", str(40 + os.getpid() % 150))
         yield
+
+
+@pytest.fixture(autouse=True)
+def no_peers_left():
+    yield
+    while PEERS:
+        PEERS.pop().close()

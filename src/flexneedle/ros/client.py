@@ -46,6 +46,7 @@ class NodeClient:
         theirs.close()
         self._pipe, self._lost = Pipe(ours), ""
         self._beat_at: float | None = None
+        self._early: list[Request] = []
         self.subscribers: Mapping[str, int] = {}
         self._pipe.send(Setup(profile, epoch))
         try:
@@ -68,7 +69,7 @@ class NodeClient:
     def poll(self) -> list[Request]:
         """What was received since the last call, oldest first. A `Lost` is the last record of all."""
         self._pipe.flush()
-        requests: list[Request] = []
+        requests, self._early = self._early, []
         for record in self._pipe.receive():
             if isinstance(record, Beat):
                 self._beat_at, self.subscribers = record.time, record.subscribers
@@ -83,6 +84,11 @@ class NodeClient:
     def status(self) -> str:
         """VISIBLE while the node shows signs of life, else the reason in a few words."""
         return self._lost or self._silent() or VISIBLE
+
+    @property
+    def pid(self) -> int:
+        """Identifier of the node's process."""
+        return self._process.pid
 
     @property
     def dropped(self) -> int:
@@ -117,6 +123,6 @@ class NodeClient:
             if monotonic() > deadline:
                 raise RunError(f"the ROS node has not started within {_START_S:g} s")
             select([self._pipe.socket], [], [], 0.1)
-            for request in self.poll():
-                if isinstance(request, Lost):
-                    raise RunError(request.reason)
+            self._early = self.poll()  # a stop may come first
+            if self._lost:
+                raise RunError(self._lost)

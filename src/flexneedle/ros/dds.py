@@ -59,19 +59,28 @@ class Writer:
     """Publishes messages of one type. It never waits: without a reader that keeps up, old samples are replaced.
 
     Reliable, so that reliable and best-effort subscribers both match, with a short history: a slow subscriber misses
-    samples. latched: the last message is also delivered to later subscribers.
+    samples. latched: the last message is also delivered to later subscribers. quality: policies in place of these.
     """
 
-    def __init__(self, domain: DomainParticipant, topic: str, kind: str, *, latched: bool = False) -> None:
+    def __init__(
+        self,
+        domain: DomainParticipant,
+        topic: str,
+        kind: str,
+        quality: Qos | None = None,
+        *,
+        latched: bool = False,
+    ) -> None:
         self._kind = kind
-        durability = Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile
-        quality = Qos(
+        usual = Qos(
             Policy.Reliability.Reliable(max_blocking_time=0),
             Policy.History.KeepLast(1 if latched else _DEPTH),
-            durability,
+            Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
             *_common(kind),
         )
-        self._writer: Any = DataWriter(domain, _topic(domain, topic, kind), qos=quality)
+        self._writer: Any = DataWriter(
+            domain, _topic(domain, topic, kind), qos=Qos(*(quality or ()), base=usual)
+        )
         self.missed = 0
 
     def write(self, message: Any) -> None:

@@ -20,6 +20,7 @@ from flexneedle.types import Floats, Point, Quaternion
 FARTHEST_MM = 1e4
 """Positions beyond 10 m are refused."""
 _UNIT_LENGTH = 1e-2  # a quaternion of another length is none: a message that was never filled has length 0
+_OVERFLOW = 1e100
 _PER_METRE = {"m": 1.0, "mm": 1e3}
 _TO_Z = np.array([0.5, 0.5, 0.5, 0.5])  # z to x, x to y, y to z: a tracker's sensor has the needle along z
 
@@ -90,10 +91,13 @@ class FrameMap:
 
     def to_point(self, point: PointMessage) -> Point:
         """Position (mm) in the frame of the insertion. Raises InputError for one that is not finite or too far."""
-        given = np.array(_xyz(point)) / self.per_metre
-        if not np.isfinite(given).all():
+        given = [value / self.per_metre for value in _xyz(point)]
+        if not all(map(isfinite, given)):
             raise InputError(f"position {_shown(_xyz(point))}: not a number")
-        x, y, z = (1e3 * (given - self.origin) @ self.rotation).tolist()
+        near = max(map(abs, given)) < _OVERFLOW
+        x, y, z = (
+            (1e3 * (np.array(given) - self.origin) @ self.rotation).tolist() if near else (FARTHEST_MM,) * 3
+        )
         if hypot(x, y, z) > FARTHEST_MM:
             raise InputError(f"position {_shown(_xyz(point))}: farther than 10 m")
         return x, y, z

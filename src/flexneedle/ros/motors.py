@@ -16,8 +16,10 @@ from flexneedle.ros.client import NodeClient
 from flexneedle.ros.profile import Profile
 from flexneedle.ros.records import JointReading, JointTargets, Lost, Refused
 from flexneedle.ros.settings import DriverSettings, checked, profile_with
+from flexneedle.scenario.problems import printable
 
 _CONNECT_S = 5.0
+_LONGEST = 200  # characters of a list of joints
 
 
 @dataclass(frozen=True)
@@ -127,15 +129,19 @@ class RosMotors:
         self._refused = ""
         self._points: dict[str, SetPoint] = {}
         self._stopped = True
-        deadline = time.monotonic() + _CONNECT_S
         try:
-            while time.monotonic() < deadline and self._reading is None:
-                time.sleep(0.01)
-                self._poll()
+            self._await_states(time.monotonic() + _CONNECT_S)
             self._fresh()
         except BaseException:  # also on Ctrl-C: the process must end
             self._node.close()
             raise
+
+    def _await_states(self, deadline: float) -> None:
+        while time.monotonic() < deadline:
+            self._poll()
+            if self._reading is not None:
+                return
+            time.sleep(0.01)
 
     def _poll(self) -> None:
         for request in self._node.poll():
@@ -158,9 +164,8 @@ class RosMotors:
             raise DriverError(f"{name}: the last joint states are {age:.2f} s old{self._refused}")
         missing = [channel for channel in self._channels if channel not in reading.positions]
         if missing:
-            raise DriverError(
-                f"{name}: no joint {', '.join(missing)}; joints: {', '.join(reading.positions)}"
-            )
+            found = printable(", ".join(reading.positions))[:_LONGEST]
+            raise DriverError(f"{name}: no joint {', '.join(missing)}; joints: {found}")
         return reading
 
     def _measured_lately(self, now: float) -> Mapping[str, float]:

@@ -20,7 +20,7 @@ from flexneedle.ros.messages import Composer
 from flexneedle.ros.parsing import Subscription
 from flexneedle.ros.pipe import Pipe
 from flexneedle.ros.profile import LATCHED, PUBLISHED
-from flexneedle.ros.records import Arm, Beat, JointTargets, Lost, Request, Setup, Stop
+from flexneedle.ros.records import Arm, Beat, JointTargets, Lost, Refused, Request, Setup, Stop
 
 BEAT_S = 0.1
 STALE_S = 0.1
@@ -46,6 +46,7 @@ class Node:
         wanted = (Subscription(setup.profile, key) for key in keys if getattr(subscribe, key) is not None)
         self._inputs = [(one, self._readers_of(one)) for one in wanted]
         self._seen: dict[str, tuple[int, int]] = {}
+        self._refused: dict[str, float] = {}
         self._listener = Thread(target=self._listen, name="listener", daemon=True)
 
     def run(self) -> None:
@@ -92,13 +93,16 @@ class Node:
         for data, source in reader.take():
             if self._seen.get(subscription.key) != source:  # a stop has several readers
                 record = subscription.read(data, monotonic(), publishers)
-                if record is not None:
-                    self._pipe.send(record, keep=_is_kept(record))
+                if record is not None and not self._repeats(record):
+                    self._pipe.send(record, keep=isinstance(record, Stop | Arm))
             self._seen[subscription.key] = source
 
-
-def _is_kept(record: Request) -> bool:
-    return isinstance(record, Stop | Arm)
+    def _repeats(self, record: Request) -> bool:
+        """Whether it is a refusal soon after one of the same topic: a flood of messages is no flood of records."""
+        if not isinstance(record, Refused) or record.time - self._refused.get(record.topic, -1.0) < BEAT_S:
+            return isinstance(record, Refused)
+        self._refused[record.topic] = record.time
+        return False
 
 
 def main() -> int:

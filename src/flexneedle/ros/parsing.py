@@ -14,6 +14,7 @@ from flexneedle.scenario.problems import printable
 from flexneedle.trace.messages import STORE, Header
 from flexneedle.types import VISIBLE, Point
 
+_BOOL, _HEADER = "std_msgs/msg/Bool", 4  # bytes before the value
 _OF_ONE = ("tip", "shape", "joint_states")
 LARGEST_BYTES = 1_000_000
 """Longer messages are refused unread."""
@@ -65,9 +66,12 @@ class Subscription:
         if len(data) > LARGEST_BYTES:
             raise InputError(f"{len(data)} bytes: longer than {LARGEST_BYTES}")
         try:
-            return STORE.deserialize_cdr(data, self.kind)
+            message = STORE.deserialize_cdr(data, self.kind)
         except SerdeError as error:
             raise InputError(f"not a {self.kind}: {printable(str(error))}") from None
+        if self.kind == _BOOL and data[_HEADER] > 1:  # anything but 0 would be true
+            raise InputError(f"not a {self.kind}: {data[_HEADER]} is neither true nor false")
+        return message
 
 
 def _stop(subscription: Subscription, message: Any, arrival: float) -> Request | None:

@@ -43,11 +43,14 @@ class Pipe:
             self._pump()
 
     def receive(self) -> list[Any]:
-        """The records that have arrived, oldest first."""
+        """The records that have arrived, oldest first; what is beyond 1 MB waits for the next call."""
         try:
-            while data := self.socket.recv(_CHUNK):
+            while len(self._received) < _BUFFER:
+                data = self.socket.recv(_CHUNK)
                 self._received += data
-            self.ended = True
+                if not data:
+                    self.ended = True
+                    break
         except BlockingIOError:
             pass
         except OSError:  # the other end was killed

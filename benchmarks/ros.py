@@ -1,0 +1,172 @@
+"""Cost of the ROS node to a rig: python benchmarks/ros.py [--periods N] [--stops N] [--profile NAME] [--json].
+
+Periods are published at 40 Hz, faster than an insertion does, to four subscribers of all topics in processes of their
+own, one of which reads nothing for seconds. Printed are the time that the rig's process spends in `publish` and `poll`,
+processor time of the node for a period, and the time from a stop that a ROS node publishes to its arrival in the rig,
+which polls every 25 ms and, to see the node alone, without pause. DDS is kept on the loopback interface.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import psutil
+import rosbags.typesys.stores.ros2_humble as ros
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from flexneedle.ros.client import NodeClient, open_node
+from flexneedle.ros.profile import LATCHED, PUBLISHED, Profile, load_profile
+from flexneedle.ros.records import Stop
+from flexneedle.types import Period, Plan, Shape
+from synthetic import make_periods, make_plan
+
+LOOPBACK = (
+    '<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>'
+    "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
+    '<Peers><Peer Address="localhost"/></Peers></Discovery></Domain></CycloneDDS>'
+)
+SUBSCRIBERS, PERIOD_S = 4, 0.025
+SLOW = "slow"
+
+
+def main() -> int:
+    """Run the measurements and print them."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--periods", type=int, default=400)
+    parser.add_argument("--stops", type=int, default=200)
+    parser.add_argument("--profile", default="neutral")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--subscriber", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    os.environ.setdefault("CYCLONEDDS_URI", LOOPBACK)
+    os.environ.setdefault("ROS_DOMAIN_ID", str(40 + os.getpid() % 150))
+    profile = load_profile(args.profile)
+    if args.subscriber:
+        return subscribe(profile, slow=args.subscriber == SLOW)
+    found = measure(profile, args)
+    if args.json:
+        print(json.dumps(found))
+    else:
+        for title, values in found.items():
+            print(title, *(f"  {name}: {value}" for name, value in values.items()), sep="\n")
+    return 0
+
+
+def measure(profile: Profile, args: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """All measurements, in order, with one node."""
+    plan = make_plan()
+    periods = [replace(one, predicted=Shape(one.shape, one.shape[:, 1:3] ** 2)) for one in make_periods(plan)]
+    command = [sys.executable, __file__, "--profile", args.profile, "--subscriber"]
+    with open_node(profile) as node:
+        kinds = [SLOW, *["fast"] * (SUBSCRIBERS - 1)]
+        others = [subprocess.Popen([*command, kind], stdin=subprocess.PIPE) for kind in kinds]
+        try:
+            _await(lambda: node.poll() is not None and _found(node, SUBSCRIBERS))
+            return {
+                f"{args.periods} periods at {1 / PERIOD_S:.0f} Hz to {SUBSCRIBERS} subscribers": _periods(
+                    node, plan, periods, args.periods
+                ),
+                f"{args.stops} stops, polled every 25 ms": _stops(node, profile, args.stops, PERIOD_S),
+                f"{args.stops} stops, polled without pause": _stops(node, profile, args.stops, 0.0),
+            }
+        finally:
+            for other in others:
+                other.stdin.close()
+            for other in others:
+                other.wait()
+
+
+def _periods(node: NodeClient, plan: Plan, periods: list[Period], count: int) -> dict[str, float]:
+    process = psutil.Process(node.pid)
+    node.publish(plan)
+    spent, before = [], sum(process.cpu_times()[:2])
+    due = time.perf_counter()
+    for number in range(count):
+        begun = time.perf_counter()
+        node.publish(replace(periods[number % len(periods)], time=PERIOD_S * number))
+        node.poll()
+        spent.append(time.perf_counter() - begun)
+        due += PERIOD_S
+        time.sleep(max(0.0, due - time.perf_counter()))
+    cost = (sum(process.cpu_times()[:2]) - before) / count
+    return {
+        "publish and poll in the rig, median, ms": _ms(np.median(spent)),
+        "publish and poll in the rig, 99 %, ms": _ms(np.percentile(spent, 99)),
+        "publish and poll in the rig, largest, ms": _ms(max(spent)),
+        "processor time of the node for a period, ms": _ms(cost),
+        "records dropped": node.dropped,
+    }
+
+
+def _stops(node: NodeClient, profile: Profile, count: int, pause: float) -> dict[str, float]:
+    from flexneedle.ros.dds import Writer, participant
+
+    writer = Writer(participant(), profile.subscribe.stop.topic, "std_msgs/msg/Bool")
+    _await(lambda: writer.readers >= 2)
+    rng, taken, arrived = np.random.default_rng(0), [], []
+    for _ in range(count):
+        time.sleep(0.005 + float(rng.uniform(0.0, PERIOD_S)))
+        node.poll()
+        begun = time.monotonic()
+        writer.write(ros.std_msgs__msg__Bool(True))
+        stops: list[Stop] = []
+        due = time.monotonic() + (float(rng.uniform(0.0, pause)) if pause else 0.0)  # ticks fall anywhere
+        while not stops:
+            time.sleep(max(0.0, due - time.monotonic()))
+            stops = [one for one in node.poll() if isinstance(one, Stop)]
+            due += pause
+        taken.append(time.monotonic() - begun)
+        arrived.append(stops[0].time - begun)
+    return {
+        "to the node, median, ms": _ms(np.median(arrived)),
+        "to the node, 99 %, ms": _ms(np.percentile(arrived, 99)),
+        "to the rig, median, ms": _ms(np.median(taken)),
+        "to the rig, 99 %, ms": _ms(np.percentile(taken, 99)),
+        "to the rig, largest, ms": _ms(max(taken)),
+    }
+
+
+def subscribe(profile: Profile, *, slow: bool) -> int:
+    """Read all topics until the standard input ends; a slow one pauses for seconds."""
+    from select import select
+
+    from flexneedle.ros.dds import Reader, participant
+
+    domain = participant()
+    readers = [
+        Reader(domain, topic.topic, kind, latched=key in LATCHED)
+        for key, kind in PUBLISHED.items()
+        if (topic := getattr(profile.publish, key)) is not None and key != "joint_targets"
+    ]
+    while not select([sys.stdin], [], [], 3.0 if slow else 0.005)[0]:
+        for reader in readers:
+            list(reader.take())
+    return 0
+
+
+def _found(node: NodeClient, count: int) -> bool:
+    return bool(node.subscribers) and min(node.subscribers.values()) >= count
+
+
+def _await(condition, seconds: float = 30.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            raise SystemExit("the nodes have not found each other")
+        time.sleep(0.01)
+
+
+def _ms(seconds: float) -> float:
+    return round(1e3 * float(seconds), 3)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

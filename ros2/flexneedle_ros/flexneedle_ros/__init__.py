@@ -1,0 +1,1 @@
+"""Services and views of a flexneedle rig for ROS 2."""

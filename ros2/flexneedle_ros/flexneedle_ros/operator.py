@@ -1,0 +1,126 @@
+"""Node `flexneedle_operator`: services `~/stop` and `~/arm` (std_srvs/srv/Trigger) of a flexneedle rig.
+
+The rig itself has topics, which are the same for every DDS vendor. A service call publishes on its topic and answers
+once the rig reports a state that shows that it has been carried out, or that it has not within `answer_s`.
+"""
+
+import sys
+import threading
+import time
+
+STOPPED = ("stopped", "fault", "idle")
+ARMED = ("armed",)
+REPEAT_S = 0.05
+
+DEFAULTS = {
+    "stop_topic": "/flexneedle/stop",
+    "arm_topic": "/flexneedle/arm",
+    "state_topic": "/flexneedle/state",
+    "answer_s": 1.0,
+}
+
+
+class States:
+    """The last reported state of the rig, for threads that wait for one."""
+
+    def __init__(self):
+        self._changed = threading.Condition()
+        self._state = ""
+
+    def report(self, state):
+        """Note a state that the rig reports."""
+        with self._changed:
+            self._state = state
+            self._changed.notify_all()
+
+    @property
+    def last(self):
+        """The last state, "" before the first."""
+        return self._state
+
+    def wait(self, wanted, seconds):
+        """Whether the state is among `wanted` within some seconds."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._state in wanted, seconds)
+
+
+def ask(publish, states, wanted, seconds, *, repeat):
+    """Publish, again and again if `repeat`, until the state is among `wanted`; return whether it is in time."""
+    deadline = time.monotonic() + seconds
+    publish()
+    while not states.wait(wanted, min(REPEAT_S, max(0.0, deadline - time.monotonic()))):
+        if time.monotonic() >= deadline:
+            return False
+        if repeat:
+            publish()
+    return True
+
+
+def answer(done, states, seconds):
+    """The text of an answer."""
+    state = f"the rig reports {states.last!r}" if states.last else "the rig has not reported a state"
+    return state if done else f"not done within {seconds:g} s: {state}"
+
+
+def main(args=None):
+    """Run the node until Ctrl-C. Returns 2 without ROS 2."""
+    try:
+        import rclpy
+        from rclpy.callback_groups import ReentrantCallbackGroup
+        from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        from std_msgs.msg import Bool, String
+        from std_srvs.srv import Trigger
+    except ModuleNotFoundError as error:
+        print(
+            f"flexneedle_ros needs ROS 2 (no module {error.name}): source /opt/ros/DISTRIBUTION/setup.bash first",
+            file=sys.stderr,
+        )
+        return 2
+
+    rclpy.init(args=args)
+    node = rclpy.create_node("flexneedle_operator")
+    given = {name: node.declare_parameter(name, default).value for name, default in DEFAULTS.items()}
+    states, group = States(), ReentrantCallbackGroup()
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(
+        String,
+        given["state_topic"],
+        lambda message: states.report(message.data),
+        latched,
+        callback_group=group,
+    )
+
+    def serve(name, topic, wanted, *, repeat):
+        publisher = node.create_publisher(Bool, topic, 1)
+
+        def call(_request, response):
+            if node.count_publishers(given["state_topic"]) == 0:
+                if repeat:  # a rig that cannot be heard is stopped all the same
+                    publisher.publish(Bool(data=True))
+                response.success, response.message = False, f"no rig publishes {given['state_topic']}"
+                return response
+            done = ask(
+                lambda: publisher.publish(Bool(data=True)), states, wanted, given["answer_s"], repeat=repeat
+            )
+            response.success, response.message = done, answer(done, states, given["answer_s"])
+            return response
+
+        node.create_service(Trigger, f"~/{name}", call, callback_group=group)
+
+    serve("stop", given["stop_topic"], STOPPED, repeat=True)
+    serve("arm", given["arm_topic"], ARMED, repeat=False)
+    executor = MultiThreadedExecutor()
+    executor.add_node(node)
+    try:
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,333 @@
+"""Random and damaged messages to all that reads ROS topics: no crash, no hang, no motion (`make fuzz-ros`).
+
+    python studies/fuzz_ros.py [--seconds S] [--inputs N] [--seed SEED] [--live]
+
+Inputs are random bytes, messages with changed, missing or repeated bytes, and valid messages with odd numbers (not a
+number, infinite, huge, tiny), texts, counts and stamps, on every topic of a profile. Each must give a record or a
+refusal with its reason, within a second; positions must be finite and near, and only a valid `true` may arm. Driver
+and tracker `ros` get the records: the driver must not send a target. With `--live` the bytes go over DDS to a running
+node, which must still forward a stop at the end. Exit status 1 after any failure; it names seed and input.
+"""
+
+import argparse
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+import rosbags.typesys.stores.ros2_humble as ros
+
+from flexneedle.errors import DriverError
+from flexneedle.rig.devices.clock import WallClock
+from flexneedle.ros.client import NodeClient
+from flexneedle.ros.frames import FARTHEST_MM
+from flexneedle.ros.motors import RosMotors
+from flexneedle.ros.parsing import Subscription
+from flexneedle.ros.profile import SUBSCRIBED, load_profile
+from flexneedle.ros.records import Arm, JointReading, Refused, Request, ShapeReading, Stop, Target, TipReading
+from flexneedle.ros.tracker import RosTracker
+from flexneedle.trace.messages import STORE
+from flexneedle.types import VISIBLE
+
+SLOWEST_S = 1.0
+PROFILES = ("neutral", "smartneedle", "smartneedle-fbg")
+ODD = (0.0, -0.0, 1.0, -1.0, 1e-320, 1e-3, 0.04, 35.0, 9.9, 1e4, -1e9, 1e300, math.inf, -math.inf, math.nan)
+TEXTS = ("", "skin", "/skin", "needle", "stage", "map", "é\u2028\x1b", "x" * 5000)
+STAMPS = (0, 1, -1, 2**31 - 1, -(2**31))
+
+Bytes = Callable[[np.random.Generator, str], bytes]
+
+
+@dataclass
+class Tally:
+    """Counts of a run."""
+
+    inputs: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+    slowest_s: float = 0.0
+    failures: list[str] = field(default_factory=list)
+
+
+# Inputs
+
+
+def random_bytes(rng: np.random.Generator, _key: str) -> bytes:
+    """Any bytes, half of them with a header of CDR."""
+    header = bytes([0, rng.integers(2), 0, 0]) if rng.random() < 0.5 else b""
+    return header + rng.bytes(int(rng.integers(200)))
+
+
+def damaged(rng: np.random.Generator, key: str) -> bytes:
+    """A valid message with changed, missing or repeated bytes."""
+    data = bytearray(valid(rng, key))
+    for _ in range(int(rng.integers(1, 6))):
+        place = int(rng.integers(len(data))) if data else 0
+        match int(rng.integers(5)):
+            case 0 if data:
+                data[place] = int(rng.integers(256))
+            case 1:
+                data[place : place + int(rng.integers(1, 20))] = b""
+            case 2:
+                data[place:place] = data[place : place + int(rng.integers(1, 40))]
+            case 3:
+                data[place : place + 4] = (0xFFFFFFFF - int(rng.integers(3))).to_bytes(4, "little")
+            case _:
+                data += rng.bytes(int(rng.integers(10)))
+    return bytes(data)
+
+
+def valid(rng: np.random.Generator, key: str) -> bytes:
+    """A message that can be read, with odd contents."""
+    message = MESSAGES[key](rng)
+    return bytes(STORE.serialize_cdr(message, SUBSCRIBED[key], little_endian=bool(rng.random() < 0.9)))
+
+
+def _number(rng: np.random.Generator) -> float:
+    return float(rng.choice(ODD)) if rng.random() < 0.3 else float(rng.normal(scale=0.05))
+
+
+def _header(rng: np.random.Generator) -> ros.std_msgs__msg__Header:
+    second = int(rng.choice(STAMPS)) if rng.random() < 0.2 else int(rng.integers(1_000_000))
+    text = str(rng.choice(TEXTS)) if rng.random() < 0.2 else str(rng.choice(("skin", "stage", "needle")))
+    return ros.std_msgs__msg__Header(
+        ros.builtin_interfaces__msg__Time(second, int(rng.integers(2**32))), text
+    )
+
+
+def _point(rng: np.random.Generator) -> ros.geometry_msgs__msg__Point:
+    return ros.geometry_msgs__msg__Point(_number(rng), _number(rng), _number(rng))
+
+
+def _pose(rng: np.random.Generator) -> ros.geometry_msgs__msg__Pose:
+    turn = rng.normal(size=4)
+    turn = turn / np.linalg.norm(turn) if rng.random() < 0.7 else [_number(rng) for _ in range(4)]
+    return ros.geometry_msgs__msg__Pose(_point(rng), ros.geometry_msgs__msg__Quaternion(*map(float, turn)))
+
+
+def _shape(rng: np.random.Generator) -> ros.geometry_msgs__msg__PoseArray:
+    count = int(rng.choice((0, 1, 2, 30, 300), p=(0.2, 0.2, 0.3, 0.2, 0.1)))
+    return ros.geometry_msgs__msg__PoseArray(_header(rng), [_pose(rng) for _ in range(count)])
+
+
+def _joints(rng: np.random.Generator) -> ros.sensor_msgs__msg__JointState:
+    counts = rng.integers(0, 5, size=4) if rng.random() < 0.3 else [int(rng.integers(1, 5))] * 4
+    names = [str(name) for name in rng.choice(("a", "b", "c", "d", *TEXTS), size=counts[0])]
+    if rng.random() < 0.5:
+        names, counts = ["a", "b"], [2, 2, *counts[2:]]
+        counts[2] = int(rng.choice((0, 2)))
+    position, velocity, effort = (np.array([_number(rng) for _ in range(count)]) for count in counts[1:])
+    return ros.sensor_msgs__msg__JointState(_header(rng), names, position, velocity, effort)
+
+
+def _flag(rng: np.random.Generator) -> ros.std_msgs__msg__Bool:
+    return ros.std_msgs__msg__Bool(bool(rng.integers(2)))
+
+
+MESSAGES = {
+    "tip": lambda rng: ros.geometry_msgs__msg__PoseStamped(_header(rng), _pose(rng)),
+    "shape": _shape,
+    "target": lambda rng: ros.geometry_msgs__msg__PointStamped(_header(rng), _point(rng)),
+    "stop": _flag,
+    "arm": _flag,
+    "joint_states": _joints,
+}
+KINDS: dict[str, Bytes] = {"random": random_bytes, "damaged": damaged, "valid": valid}
+
+
+# What must hold
+
+
+def problem(key: str, data: bytes, record: Request | None) -> str:
+    """Why a record must not be made of these bytes, or ""."""
+    match record:
+        case None:
+            return "" if key == "stop" else "no record"
+        case Arm():
+            fine = key == "arm" and len(data) >= 5 and data[4] == 1
+            return "" if fine else "armed"
+        case Stop(reason=reason):
+            fine = key in ("stop", "arm")
+            return "" if fine and reason == " ".join(reason.split()) else f"stop from {key}"
+        case Refused(reason=reason):
+            return "" if reason and reason.isprintable() and len(reason) < 300 else f"reason {reason!r}"
+        case Target(point=point):
+            return _far([point])
+        case ShapeReading(points=points, tip=tip):
+            return _far(points) or problem("tip", data, tip)
+        case TipReading(position=position, orientation=turn, status=status):
+            if (position is None) is (status == VISIBLE):
+                return f"position {position}, status {status}"
+            unit = turn is None or abs(math.hypot(*turn) - 1.0) < 1e-6
+            return _far([position] if position else []) or ("" if unit else f"orientation {turn}")
+        case JointReading(positions=positions, velocities=velocities):
+            values = [*positions.values(), *velocities.values()]
+            return "" if all(map(math.isfinite, values)) else f"joints {values}"
+    return f"a record of type {type(record).__name__}"
+
+
+def _far(points: object) -> str:
+    far = [point for point in points if not math.hypot(*point) <= FARTHEST_MM * (1 + 1e-9)]  # type: ignore[attr-defined]
+    return f"position {far[0]}" if far else ""
+
+
+class SilentNode:
+    """In place of a node: hands out records, and keeps what is to be published."""
+
+    status = VISIBLE
+
+    def __init__(self) -> None:
+        self.records: list[Request] = []
+        self.published: list[object] = []
+
+    def poll(self) -> list[Request]:
+        """The records."""
+        found, self.records = self.records, []
+        return found
+
+    def publish(self, record: object) -> None:
+        """Keep a record."""
+        self.published.append(record)
+
+
+class Consumers:
+    """Driver and tracker on one silent node each."""
+
+    def __init__(self) -> None:
+        self.nodes = SilentNode(), SilentNode()
+        self.tracker = RosTracker(self.nodes[0], WallClock(), 0.25)  # type: ignore[arg-type]
+        self.motors = RosMotors.__new__(RosMotors)
+        vars(self.motors).update(
+            _profile=load_profile("neutral"), _channels=("a", "b"), _stale=1e9, _speeds={"a": 1.0, "b": 1.0},
+            _offsets={"a": 0.0, "b": 0.0}, _node=self.nodes[1], _reading=None, _refused="", _points={}, _stopped=True,
+        )  # fmt: skip
+
+    def take(self, record: Request) -> str:
+        """Why they must not do what they do with a record, or ""."""
+        for node in self.nodes:
+            node.records.append(record)
+        for frame in self.tracker.read():
+            if not math.isfinite(frame.time):
+                return f"a frame at {frame.time} s"
+        _ = self.tracker.status
+        try:
+            states = self.motors.read()
+        except DriverError as error:
+            return "" if len(str(error).splitlines()) == 1 else f"message {str(error)!r}"
+        finally:
+            self.motors.stop()
+        sent = self.nodes[1].published
+        finite = all(map(math.isfinite, (state.position for state in states.values())))
+        return f"sent {sent[0]}" if sent else "" if finite else f"states {states}"
+
+
+def run(seconds: float, inputs: int, seed: int) -> Tally:
+    """Try inputs until one of both limits is reached."""
+    tally, rng, consumers = Tally(), np.random.default_rng(seed), Consumers()
+    everything = list(_subscriptions())
+    deadline = time.monotonic() + seconds
+    while tally.inputs < inputs and time.monotonic() < deadline:
+        if tally.inputs % 50 == 0:  # stamps must grow: a new subscription takes any stamp first
+            everything = list(_subscriptions())
+        subscription = everything[int(rng.integers(len(everything)))]
+        kind = str(rng.choice(list(KINDS)))
+        data = KINDS[kind](rng, subscription.key)
+        _try(tally, consumers, subscription, kind, data, seed)
+    return tally
+
+
+def _subscriptions() -> Iterator[Subscription]:
+    for name in PROFILES:
+        profile = load_profile(name)
+        for key in SUBSCRIBED:
+            if getattr(profile.subscribe, key) is not None:
+                yield Subscription(profile, key)
+
+
+def _try(
+    tally: Tally, consumers: Consumers, subscription: Subscription, kind: str, data: bytes, seed: int
+) -> None:
+    begun = time.perf_counter()
+    found = ""
+    try:
+        record = subscription.read(data, time.monotonic())
+        found = problem(subscription.key, data, record)
+        if record is not None and not found:
+            found = consumers.take(record)
+        tally.outcomes[f"{kind}: {type(record).__name__}"] += 1
+    except Exception as error:  # noqa: BLE001  whatever it is, it must not happen
+        found = f"{type(error).__name__}: {error}"
+    took = time.perf_counter() - begun
+    tally.slowest_s = max(tally.slowest_s, took)
+    if took > SLOWEST_S:
+        found = found or f"took {took:.1f} s"
+    if found:
+        where = f"seed {seed}, input {tally.inputs}, {subscription.topic}"
+        tally.failures.append(f"{where}: {found}; bytes {data[:100].hex()}")
+    tally.inputs += 1
+
+
+def run_live(seconds: float, inputs: int, seed: int) -> str:
+    """The same bytes over DDS to a node; why it did not survive them, or ""."""
+    from cyclonedds.core import DDSException
+
+    from flexneedle.ros.dds import Cdr, Writer, participant
+
+    profile, rng = load_profile("neutral"), np.random.default_rng(seed)
+    domain = participant()
+    with NodeClient(profile) as node:
+        topics = {key: getattr(profile.subscribe, key).topic for key in SUBSCRIBED}
+        writers = {key: Writer(domain, topic, SUBSCRIBED[key]) for key, topic in topics.items()}
+        if not _within(20.0, lambda: all(writer.readers for writer in writers.values())):
+            return "the node was not found"
+        deadline, count = time.monotonic() + seconds, 0
+        while count < inputs and time.monotonic() < deadline:
+            key = str(rng.choice([key for key in SUBSCRIBED if key not in ("stop", "arm")]))
+            data = KINDS[str(rng.choice(list(KINDS)))](rng, key)
+            with suppress(DDSException):  # less than a header, or no room
+                writers[key]._writer.write(Cdr(data))  # bytes that no message would give
+            count += 1
+            if any(isinstance(one, Arm) for one in node.poll()):
+                return f"armed by input {count}"
+        stopped = _within(20.0, lambda: _stops(writers["stop"], node))
+        return "" if stopped else f"no stop after {count} inputs: {node.status}"
+
+
+def _stops(writer: object, node: NodeClient) -> bool:
+    writer.write(ros.std_msgs__msg__Bool(True))  # type: ignore[attr-defined]
+    return any(isinstance(one, Stop) for one in node.poll())
+
+
+def _within(seconds: float, condition: Callable[[], bool]) -> bool:
+    deadline = time.monotonic() + seconds
+    while not (holds := condition()) and time.monotonic() < deadline:
+        time.sleep(0.005)
+    return holds
+
+
+def main() -> int:
+    """Run and print the counts."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--inputs", type=int, default=1_000_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--live", action="store_true")
+    args = parser.parse_args()
+    tally = run(args.seconds, args.inputs, args.seed)
+    print(f"{tally.inputs} inputs, {len(tally.failures)} failures, slowest {1e3 * tally.slowest_s:.1f} ms")
+    for name, count in sorted(tally.outcomes.items()):
+        print(f"  {name}: {count}")
+    print(*tally.failures[:20], sep="\n", end="\n" if tally.failures else "")
+    lost = run_live(min(args.seconds, 60.0), args.inputs, args.seed) if args.live else ""
+    if args.live:
+        print(f"live node: {lost or 'forwards a stop'}")
+    return 1 if tally.failures or lost else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

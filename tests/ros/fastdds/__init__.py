@@ -1,0 +1,1 @@
+"""A ROS node with eProsima's DDS in place of Cyclone."""

@@ -1,0 +1,47 @@
+"""studies/fuzz_ros.py, for a moment: random and damaged messages neither crash nor move anything."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from flexneedle.ros.records import Arm, JointReading, Refused, Stop, Target, TipReading
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
+import fuzz_ros
+
+
+def test_what_is_received_may_be_anything():
+    tally = fuzz_ros.run(seconds=20.0, inputs=3000, seed=7)
+    assert tally.failures == []
+    assert tally.inputs == 3000
+    assert {name.partition(": ")[2] for name in tally.outcomes} >= {
+        "Arm",
+        "JointReading",
+        "Refused",
+        "Stop",
+        "Target",
+        "TipReading",
+    }
+
+
+def test_a_node_survives_any_bytes_and_still_forwards_a_stop():
+    assert fuzz_ros.run_live(seconds=20.0, inputs=500, seed=7) == ""
+
+
+@pytest.mark.parametrize(
+    ("key", "record", "found"),
+    [
+        ("tip", Arm(0.0, "/t"), "armed"),
+        ("tip", Stop(0.0, "/t"), "stop from tip"),
+        ("tip", None, "no record"),
+        ("target", Target(0.0, (float("nan"), 0.0, 0.0)), "position"),
+        ("target", Target(0.0, (2e4, 0.0, 0.0)), "position"),
+        ("tip", TipReading(0.0, 1, None, None), "position None"),
+        ("tip", TipReading(0.0, 1, (0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0)), "orientation"),
+        ("tip", Refused(0.0, "/t", "two\nlines"), "reason"),
+        ("joint_states", JointReading(0.0, {"a": float("inf")}, {}), "joints"),
+    ],
+)
+def test_it_finds_what_must_not_be(key, record, found):
+    assert fuzz_ros.problem(key, b"\x00\x01\x00\x00\x01", record).startswith(found)
