@@ -99,8 +99,8 @@ class Monitor:
     """State of the monitor. Frozen: `check` and `check_field` return the next state.
 
     axes: lateral axes of the needle; recent: readings within the window; repeats: the newest readings with the same
-    position; good: the last good reading; jumped: the jump since then, if any; field: the last verdict on the field; distorted: whether the field counts
-    as distorted.
+    position; good: the last good reading; jumped: the jump since then, if any; field: the last verdict on the field;
+    distorted: whether the field counts as distorted.
     """
 
     settings: MonitorSettings
