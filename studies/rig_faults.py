@@ -118,13 +118,12 @@ def signalled(number: signal.Signals, group: bool) -> Inject:
 def full_disk(trial: Trial) -> float:
     """The file system of the record becomes full."""
     now = monotonic()
-    with (trial.folder / "disk" / "filler").open("wb") as file:
-        try:
+    try:
+        with (trial.folder / "disk" / "filler").open("wb", buffering=0) as file:
             while True:
                 file.write(b"0" * 4096)
-                file.flush()
-        except OSError:
-            return now
+    except OSError:
+        return now
 
 
 def stepped_clock(trial: Trial) -> float:
@@ -188,12 +187,12 @@ def _faults() -> list[Fault]:
         motors("guide stalls", order("galil:stall=C"), "fault", None, ("failed", "done")),
         computer("decision of 0.5 s", late_decision, "rest until it is there", None, ("done",), (0.5, 0)),
         computer("decision of 5 s", late_decision, "stop", 2.3, interrupted, (5.0, 0)),
-        computer("controller killed", killed("controller"), "stop", 0.1, ("running",)),
+        computer("controller killed", killed("controller"), "stop", None, ("running",)),
         computer("supervisor killed", killed("supervisor"), "motors stop by themselves", None, failed),
         computer(
             "both killed", killed("supervisor", "controller"), "motors stop by themselves", None, ("running",)
         ),
-        computer("controller stopped (SIGSTOP)", signalled(signal.SIGSTOP, False), "stop", 2.3, ("running",)),
+        computer("controller stopped (SIGSTOP)", signalled(signal.SIGSTOP, False), "stop", 2.3, interrupted),
         computer("disk full", full_disk, "hold, end held", None, ("held", "running")),
         computer("clock set back by 1 h", stepped_clock, "continue", None, ("done",), None, "faketime"),
         computer("Ctrl-C", signalled(signal.SIGINT, True), "stop", 0.1, interrupted),
@@ -260,8 +259,7 @@ def _await_end(fault: Fault, process: subprocess.Popen[bytes], injected: float) 
     """Wait until the insertion ends; one that is stopped by a signal is ended once it must have been detected."""
     if fault.name.startswith("controller stopped"):
         sleep(max(0.0, injected + 4.0 - monotonic()))
-        os.killpg(process.pid, signal.SIGKILL)
-        return
+        os.kill(process.pid, signal.SIGCONT)
     deadline = monotonic() + 60.0
     while process.poll() is None and monotonic() < deadline:
         sleep(0.05)
