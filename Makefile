@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all slow bench fuzz-ros robustness validation accuracy controllers studies tracker steering worlds space worlds-space tuning docs lint clean
+.PHONY: help setup demo test test-all slow bench rig-demo rig-faults fuzz-ros robustness validation accuracy controllers studies tracker steering worlds space worlds-space tuning docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -45,6 +45,12 @@ bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten
 	$(BIN)/python benchmarks/aurora.py
 	$(BIN)/python benchmarks/galil.py
 	$(BIN)/python benchmarks/ros.py
+
+rig-demo: setup  ## insertions on an emulated rig over both protocols in real time (N=1)
+	$(BIN)/python studies/rig_demo.py --insertions $(or $(N),1) --out $(or $(DIR),runs/rig-demo)
+
+rig-faults: setup  ## faults injected into running insertions on an emulated rig, 20 times each, and the table of docs/safety.md (hours)
+	$(BIN)/python studies/rig_faults.py --out $(or $(DIR),runs/rig-faults)
 
 fuzz-ros: setup  ## a million random and damaged messages to all that reads ROS topics, and to a running node
 	$(BIN)/python studies/fuzz_ros.py --live

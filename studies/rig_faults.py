@@ -193,10 +193,10 @@ def _faults() -> list[Fault]:
             "both killed", killed("supervisor", "controller"), "motors stop by themselves", None, ("running",)
         ),
         computer("controller stopped (SIGSTOP)", signalled(signal.SIGSTOP, False), "stop", 2.3, interrupted),
-        computer("disk full", full_disk, "hold, end held", None, ("held", "running")),
+        computer("disk full", full_disk, "end held", 0.4, held),
         computer("clock set back by 1 h", stepped_clock, "continue", None, ("done",), None, "faketime"),
         computer("Ctrl-C", signalled(signal.SIGINT, True), "stop", 0.1, interrupted),
-        computer("SIGTERM to all", signalled(signal.SIGTERM, True), "stop", 0.1, ("interrupted", "running")),
+        computer("SIGTERM", signalled(signal.SIGTERM, True), "stop", 0.1, ("interrupted", "running")),
     ]
 
 
@@ -216,13 +216,13 @@ def run_trial(fault: Fault, timing: int, keep: Path | None = None) -> dict[str, 
         sleep(float(rng.uniform(_EARLIEST_S, _LATEST_S)) - (monotonic() - begun))
         injected = fault.inject(Trial(rig, process, folder, rng))
         _await_end(fault, process, injected)
-        status, _, errors = ended(process, 5.0)
+        status, printed, errors = ended(process, 5.0)
         sleep(1.0)
         if keep is not None and out.exists():
             shutil.copytree(
                 out, keep / f"{fault.group}-{fault.name}-{timing}".replace(" ", "-"), dirs_exist_ok=True
             )
-        return _judged(fault, timing, rig.read_truth(), injected, out, status, errors)
+        return _judged(fault, timing, rig.read_truth(), injected, _recorded(out, printed), status, errors)
 
 
 def _record_folder(fault: Fault, folder: Path, stack: ExitStack) -> Path:
@@ -265,10 +265,25 @@ def _await_end(fault: Fault, process: subprocess.Popen[bytes], injected: float) 
         sleep(0.05)
 
 
+def _recorded(out: Path, printed: str) -> Mapping[str, Any]:
+    """What the insertion has recorded in its folder, or printed where that could not be written."""
+    file = out / "run.json"
+    run: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    if run.get("status") == "running" and printed.startswith("{"):
+        result = json.loads(printed)
+        run |= {"status": result["outcome"], "reason": result["reason"], "timing": result["timing"]}
+    return run
+
+
 def _judged(
-    fault: Fault, timing: int, truth: Truth, injected: float, out: Path, status: int, errors: str
+    fault: Fault,
+    timing: int,
+    truth: Truth,
+    injected: float,
+    run: Mapping[str, Any],
+    status: int,
+    errors: str,
 ) -> dict[str, Any]:
-    run = json.loads((out / "run.json").read_text()) if (out / "run.json").exists() else {}
     ticks = (run.get("timing") or {}).get("ticks") or {}
     detected = next(
         (
