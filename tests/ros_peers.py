@@ -92,6 +92,7 @@ class Peer:
                 all(node.subscribers.get(key) for key in self.readers)
                 and all(reader.writers for reader in self.readers.values())
                 and all(writer.readers for writer in self.writers.values())
+                and all(node.publishers.get(key) for key in self.writers)
             )
 
         until(found)
