@@ -120,7 +120,7 @@ def await_requests(node, kind, count=1):
 
 
 class Joints(Thread):
-    """The other side of a rig of topics: joints that go at once to where they are told, reported at 200 Hz.
+    """The other side of a rig of topics: joints that go at once to their targets, reported at 200 Hz.
 
     targets: all that were received. silent: while it is set nothing is reported.
     """

@@ -84,7 +84,8 @@ def test_every_message_of_the_node_comes_back_as_it_was_sent(program, profile):
                 for record in records:
                     node.publish(record)
             for key, reader in readers.items():
-                found.update({key: data[: len(expected[key])] for data, _ in reader.take()})
+                for data, _ in reader.take():
+                    found[key] = data[: len(expected[key])]
             return found == expected
 
         until(come_back)
