@@ -92,6 +92,7 @@ class Peer:
                 all(node.subscribers.get(key) for key in self.readers)
                 and all(reader.writers for reader in self.readers.values())
                 and all(writer.readers for writer in self.writers.values())
+                and all(node.publishers.get(key) for key in self.writers)
             )
 
         until(found)
@@ -119,7 +120,7 @@ def await_requests(node, kind, count=1):
 
 
 class Joints(Thread):
-    """The other side of a rig of topics: joints that go at once to where they are told, reported at 200 Hz.
+    """The other side of a rig of topics: joints that go at once to their targets, reported at 200 Hz.
 
     targets: all that were received. silent: while it is set nothing is reported.
     """

@@ -158,7 +158,7 @@ def test_a_roll_turns_about_the_needles_own_axis():
 
 def test_a_measured_tip_has_its_covariance():
     matrix = ((1e-2, 2e-3, 0.0), (2e-3, 4e-2, 0.0), (0.0, 0.0, 9e-2))
-    slopes = ((1e-4, 0.0), (0.0, 4e-4))
+    slopes = ((1e-4, 5e-5), (5e-5, 4e-4))
     measured = Measurement(
         1.5, 1.0, 2.0, 3.0, direction=(0.1, 0.2), covariance=matrix, direction_covariance=slopes
     )
@@ -166,9 +166,8 @@ def test_a_measured_tip_has_its_covariance():
     sent = composed(period)["measured_tip"]
     found = sent.pose.covariance.reshape(6, 6)
     np.testing.assert_allclose(found[:3, :3], 1e-6 * np.array(matrix))
-    np.testing.assert_allclose(
-        found[3:, 3:], np.diag([UNKNOWN_TURN, 4e-4, 1e-4])
-    )  # ψ turns about −y, θ about z
+    turns = [[UNKNOWN_TURN, 0.0, 0.0], [0.0, 4e-4, -5e-5], [0.0, -5e-5, 1e-4]]  # ψ turns about −y, θ about z
+    np.testing.assert_allclose(found[3:, 3:], turns)
     assert sent.pose.pose == pose(1.5, Pose(1.0, 2.0, 3.0, 0.1, 0.2)).pose
     assert sent.header.stamp.sec == 1
 

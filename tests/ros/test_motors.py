@@ -103,9 +103,11 @@ def test_a_stop_holds_where_the_joint_was_measured(motors, joints):
     motors.set_speed("insertion", 0.005, 1.0)
     motors.follow({"insertion": 0.050})
     follow_until(motors, lambda s: s["insertion"].position > 0.0102)
+    before = joints.positions["insertion"]
     motors.stop()
     state = motors.read()["insertion"]
     assert not state.moving
+    assert state.commanded == pytest.approx(before, abs=1e-3)
     until(lambda: joints.targets[-1][1]["insertion"] == state.commanded)
     assert state.commanded == pytest.approx(joints.positions["insertion"], abs=1e-3)
     joints.free.set()  # a joint that sags is not followed by a second stop

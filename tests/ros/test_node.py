@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -19,9 +20,11 @@ from flexneedle.ros.client import NodeClient, open_node
 from flexneedle.ros.dds import Reader, Writer
 from flexneedle.ros.idl import type_hash
 from flexneedle.ros.messages import Composer
+from flexneedle.ros.pipe import Pipe
 from flexneedle.ros.profile import load_profile
 from flexneedle.ros.records import (
     Arm,
+    Beat,
     JointTargets,
     Lost,
     Refused,
@@ -118,6 +121,21 @@ def test_a_stop_that_was_latched_before_the_start_is_received():
     writer.write(Bool(True))
     with open_node(NEUTRAL) as node:
         await_requests(node, Stop)
+
+
+def test_a_stop_that_comes_before_the_first_sign_of_life_is_received(monkeypatch):
+    class Process:
+        def __init__(self, _command, pass_fds, **_):
+            self.end = Pipe(socket.socket(fileno=os.dup(pass_fds[0])))
+            self.end.send(Stop(1.0, "/stop"))
+            self.end.send(Beat(time.monotonic(), {}, {}))
+
+        def wait(self, _seconds):
+            self.end.close()
+
+    monkeypatch.setattr("flexneedle.ros.client.subprocess.Popen", Process)
+    with open_node(NEUTRAL) as node:
+        assert Stop(1.0, "/stop") in node.poll()
 
 
 def test_an_arm_that_was_latched_before_the_start_is_not_received():

@@ -26,7 +26,7 @@ def row(key, topic, frames):
 def test_tables_are_those_of_the_profiles(name):
     profile = load_profile(name)
     expected = [row(key, topic, profile.frames) for key, topic in profile.topics()]
-    table = re.search(rf"<!-- table: {name} -->\n(.*?)\n\n", PAGE, re.DOTALL).group(1)
+    table = re.search(rf"<!-- table: {name} -->\n\n(.*?)\n\n", PAGE, re.DOTALL).group(1)
     assert table.splitlines()[2:] == expected
 
 

@@ -117,7 +117,7 @@ def test_tips_of_smartneedle_reach_the_stage_of_the_insertion():
     profile = load_profile("smartneedle")
     with make_tracker({"profile": "smartneedle"}, WallClock()) as tracker:
         peer, measured = Peer(profile, subscribe=("tip",)), []
-        until(lambda: peer.writers["tip"].readers)
+        peer.await_node(tracker._node)
         stage = OnStage(tracker, identity())
         for depth in (10.0, 20.0, 30.0):
             along_y = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)  # its z, along the needle, is y of its stage
@@ -132,7 +132,7 @@ def test_a_shape_of_the_fibre_optic_needle():
     profile = load_profile("smartneedle-fbg")
     with make_tracker({"profile": "smartneedle-fbg", "source": "shape"}, WallClock()) as tracker:
         peer, frames = Peer(profile, subscribe=("shape",)), []
-        until(lambda: peer.writers["shape"].readers)
+        peer.await_node(tracker._node)
         peer.send("shape", shape(time.time(), [(0.0, 0.0, z) for z in (0.0, 5.0, 10.0)], frame="needle"))
         until(lambda: frames.extend(tracker.read()) or frames)
     assert frames[0].readings["tip"].position == pytest.approx((10.0, 0.0, 0.0))

@@ -96,7 +96,7 @@ def main(args=None):
 
         def call(_request, response):
             if node.count_publishers(given["state_topic"]) == 0:
-                if repeat:  # a rig that cannot be heard is stopped all the same
+                if repeat:  # a rig that reports no state is stopped all the same
                     publisher.publish(Bool(data=True))
                 response.success, response.message = False, f"no rig publishes {given['state_topic']}"
                 return response

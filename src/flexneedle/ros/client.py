@@ -31,7 +31,10 @@ def open_node(profile: Profile, *, epoch: float = 0.0) -> "NodeClient":
 
 
 class NodeClient:
-    """A node that publishes and reads all that its profile lists. Use it as a context manager, or call `close`."""
+    """A node that publishes and reads all that its profile lists. Use it as a context manager, or call `close`.
+
+    subscribers, publishers: how many nodes have each topic, by key of `publish` and `subscribe`, as of the last `poll`.
+    """
 
     def __init__(self, profile: Profile, *, epoch: float = 0.0) -> None:
         if find_spec("cyclonedds") is None:
@@ -48,6 +51,7 @@ class NodeClient:
         self._beat_at: float | None = None
         self._early: list[Request] = []
         self.subscribers: Mapping[str, int] = {}
+        self.publishers: Mapping[str, int] = {}
         self._pipe.send(Setup(profile, epoch))
         try:
             self._await_ready()
@@ -72,7 +76,8 @@ class NodeClient:
         requests, self._early = self._early, []
         for record in self._pipe.receive():
             if isinstance(record, Beat):
-                self._beat_at, self.subscribers = record.time, record.subscribers
+                self._beat_at = record.time
+                self.subscribers, self.publishers = record.subscribers, record.publishers
             else:
                 requests.append(record)
         if not self._lost and (reason := self._silent()):

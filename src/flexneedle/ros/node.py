@@ -83,10 +83,12 @@ class Node:
                     self._forward(subscription, reader)
             if (now := monotonic()) - last >= BEAT_S:
                 last = now
-                self._pipe.send(
-                    Beat(now, {key: one.readers for key, one in self._writers.items()}), keep=False
-                )
+                self._pipe.send(self._beat(now), keep=False)
             waiting.wait(round(1e9 * BEAT_S))
+
+    def _beat(self, now: float) -> Beat:
+        publishers = {one.key: readers[0].writers for one, readers in self._inputs}
+        return Beat(now, {key: one.readers for key, one in self._writers.items()}, publishers)
 
     def _forward(self, subscription: Subscription, reader: Reader) -> None:
         publishers = reader.writers

@@ -125,10 +125,14 @@ class Setup:
 
 @dataclass(frozen=True)
 class Beat:
-    """A sign of life; the first one is sent when the node is ready. subscribers: by key of `publish`."""
+    """A sign of life; the first one is sent when the node is ready.
+
+    subscribers: their number by key of `publish`; publishers: theirs by key of `subscribe`.
+    """
 
     time: float
     subscribers: Mapping[str, int]
+    publishers: Mapping[str, int]
 
 
 Published = RigState | Target | JointTargets

@@ -24,7 +24,7 @@ class Stamps:
         """Time (s) of `arrival`'s clock at which a message with `stamp` (s) was measured.
 
         Raises InputError if the message is not newer than the one before, or has no stamp, so that old data could not
-        be told from new.
+        be recognised.
         """
         if stamp == 0.0:
             raise InputError("no time stamp: old data could not be recognised")
