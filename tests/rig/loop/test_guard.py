@@ -81,21 +81,21 @@ def test_a_command_within_the_limits_is_not_refused(plan):
 
 
 @pytest.mark.parametrize(
-    ("limit", "reason"),
+    ("limit", "reason", "back"),
     [
-        ({"guide_force_n": 0.05}, r"guard: guide force 0\.\d+ N > 0\.05 N"),
-        ({"least_stretch": 0.99}, r"guard: tissue stretch 0\.\d{3} < 0\.990"),
-        ({"past_target_mm": 0.1}, r"guard: tip \d\.\d\d mm past the target > 0\.1 mm"),
+        ({"guide_force_n": 0.05}, r"guard: guide force 0\.\d+ N > 0\.05 N", Control(dg_y=-0.5)),
+        ({"least_stretch": 0.99}, r"guard: tissue stretch 0\.\d{3} < 0\.990", Control(dg_y=-0.5)),
+        ({"past_target_mm": 0.1}, r"guard: tip \d\.\d\d mm past the target > 0\.1 mm", Control(db_x=-1.0)),
     ],
 )
-def test_beyond_a_limit_a_command_may_lead_back_but_not_on(plan, limit, reason):
+def test_beyond_a_limit_a_command_may_lead_back_but_not_on(plan, limit, reason, back):
     """What counts is the state after the command, against the one before it."""
     simulator = Simulator(PHANTOM, 1)
     state = driven(simulator, in_tissue(simulator, 49), ASIDE, 8)
     guard = guard_of(replace(plan, target=(20.0, 0.0, 0.0)), **limit)
     estimate, worse = estimate_at(state), Control(db_x=1.0, dg_y=0.5)
     assert re.fullmatch(reason, guard.refusal(estimate, worse))
-    assert guard.refusal(estimate, Control(db_x=-1.0, dg_y=-0.5)) == ""
+    assert guard.refusal(estimate, back) == ""
     assert guard.refusal(estimate, STILL) == ""
 
 
@@ -176,7 +176,9 @@ def test_a_hold_ends_with_a_command_that_the_guard_admits(plan):
             refused,
         )
 
-    method = Method("doubting", "goes on, then back", decide=decide, arrived=lambda *_: False)
+    method = Method(
+        "doubting", "goes on, then back", decide=decide, arrived=lambda _, memory, __: memory[1] == 4
+    )
     done = run(replace(plan, target=(5.0, 0.0, 0.0)), Tank(plan.roll).rig(), controller=method, force=True)
     back = next(period.index for period in done.periods if period.decision == "back")
     actions = [period.action for period in done.periods[back - 5 : back + 1]]
