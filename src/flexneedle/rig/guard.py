@@ -19,6 +19,8 @@ from flexneedle.types import Control, Floats, Plan, X
 _SHARE_OF_LAW = 0.95  # of the compression at which a law ends
 _ELASTIC_STRAIN = 0.005  # of hard-drawn 304 steel: 965 MPa (ASTM A666, full hard) over 193 GPa
 
+_ROUNDING = 1e-6  # of a solve: a needle at rest beyond a limit may rest
+
 
 @dataclass(frozen=True)
 class Excess:
@@ -58,7 +60,7 @@ class Guard:
         if not then.converged:
             return f"guard: the model does not converge: residual {then.residual:.3g} mm"
         both = zip(self._excesses(now), self._excesses(then), strict=True)
-        worse = (new for old, new in both if new.beyond > max(old.beyond, 0.0))
+        worse = (new for old, new in both if new.beyond > max(old.beyond, 0.0) + _ROUNDING)
         return next((f"guard: {excess.text}" for excess in worse), "")
 
     def _excesses(self, state: State) -> Iterator[Excess]:
