@@ -9,7 +9,7 @@ import pytest
 
 from flexneedle.control.interface import Decision, Method
 from flexneedle.control.methods import DEFAULT
-from flexneedle.rig.guard import Guard, elastic_guide_force
+from flexneedle.rig.guard import Guard, bending_strain
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.tissue.layer import laws_of
 from flexneedle.simulator.simulator import Simulator
@@ -18,7 +18,6 @@ from flexneedle.types import STILL, Action, Control, Outcome
 from insertions import PHANTOM, Tank, run
 from observed import begun, in_tissue
 
-UNGUIDED = PHANTOM.with_values({"setup.guide_to_skin_mm": None})
 FAR = {"setup.max_guide_travel_mm": 60.0, "setup.max_guide_step_mm": 2.0}
 ASIDE = Control(dg_y=0.5)
 
@@ -51,18 +50,30 @@ def test_by_default_tissue_may_be_compressed_to_a_share_of_what_its_law_allows(p
     assert guard_of(plan, least_stretch=0.6).compression == pytest.approx([0.4])
 
 
-def test_the_force_of_the_guide_is_that_which_strains_the_needle_to_its_elastic_limit():
-    """In bending over the distance to the skin: 0.5 % at the surface of the rod."""
-    needle, distance = PHANTOM.needle, PHANTOM.setup.guide_to_skin_mm
-    strain = elastic_guide_force(PHANTOM) * distance / needle.bending_stiffness * needle.outer_diameter / 2.0
-    assert strain == pytest.approx(0.005)
-    assert elastic_guide_force(PHANTOM) == pytest.approx(1.3154, abs=1e-4)
-    assert elastic_guide_force(UNGUIDED) == math.inf
+def test_the_strain_of_a_cantilever_is_that_of_the_beam():
+    """In air the guide bends the needle over its distance a from the clamp: M = F a, strain M d/2EI."""
+    simulator, needle = Simulator(PHANTOM, 1), PHANTOM.needle
+    bent = driven(simulator, simulator.start(), ASIDE, 10)
+    arm = -PHANTOM.setup.guide_to_skin_mm - float(bent.base[0])
+    moment = 3.0 * needle.bending_stiffness * 5.0 / arm**2
+    assert bent.reactions.guide_force[0] * arm == pytest.approx(moment, rel=1e-3)
+    expected = moment * needle.outer_diameter / (2.0 * needle.bending_stiffness)
+    assert bending_strain(bent) == pytest.approx(expected, rel=1e-3)
+    assert bending_strain(simulator.start()) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_limits_that_are_given_take_the_place_of_the_derived_ones(plan):
-    guard = guard_of(plan, guide_force_n=0.2, past_target_mm=0.5)
-    assert (guard.force, guard.past, guard.depth) == (0.2, 0.5, plan.target[0])
+def test_in_tissue_it_is_that_of_the_curvature_of_its_shape():
+    simulator = Simulator(PHANTOM, 1)
+    bent = driven(simulator, in_tissue(simulator, 49), ASIDE, 8)
+    curvature = np.abs(np.gradient(bent.nodes[:, 3], bent.nodes[:, 0]))
+    expected = curvature.max() * PHANTOM.needle.outer_diameter / 2.0
+    assert bending_strain(bent) == pytest.approx(expected, rel=0.1)
+
+
+def test_limits_are_those_of_the_scenario(plan):
+    guard = guard_of(plan, guide_force_n=0.2, past_target_mm=0.5, needle_strain_percent=0.1)
+    assert (guard.force, guard.past, guard.depth, guard.strain) == (0.2, 0.5, plan.target[0], 0.001)
+    assert (guard_of(plan).force, guard_of(plan).strain) == (math.inf, 0.005)
 
 
 # ---- commands
@@ -84,6 +95,7 @@ def test_a_command_within_the_limits_is_not_refused(plan):
     ("limit", "reason", "back"),
     [
         ({"guide_force_n": 0.05}, r"guard: guide force 0\.\d+ N > 0\.05 N", Control(dg_y=-0.5)),
+        ({"needle_strain_percent": 0.01}, r"guard: needle strain 0\.\d{3} % > 0\.01 %", Control(dg_y=-0.5)),
         ({"least_stretch": 0.99}, r"guard: tissue stretch 0\.\d{3} < 0\.990", Control(dg_y=-0.5)),
         ({"past_target_mm": 0.1}, r"guard: tip \d\.\d\d mm past the target > 0\.1 mm", Control(db_x=-1.0)),
     ],
@@ -144,7 +156,7 @@ def test_a_wild_guide_is_stopped_and_the_insertion_held_with_the_reason(plan, fo
     aside = replace(plan, scenario=None, target=(30.0, 0.0, 0.0))
     done = run(aside, tank.rig(), scenario, controller=wild(15.0, Control(dg_y=2.0)), force=force)
     assert done.outcome is Outcome.HELD
-    assert done.reason.startswith(("guard: guide force", "guard: tissue stretch"))
+    assert done.reason.startswith(("guard: needle strain", "guard: tissue stretch"))
     held = [period for period in done.periods if period.decision.startswith("held: guard: ")]
     assert {(period.action, period.command, period.applied) for period in held} == {
         (Action.HOLD, STILL, STILL)
