@@ -26,6 +26,7 @@ POSITIVE = [
     "setup.base_turn_speed_mrad_s",
     "setup.rotation_speed_deg_s",
     "guard.guide_force_n",
+    "guard.needle_strain_percent",
     "guard.past_target_mm",
     "tissue[0].thickness_mm",
     "tissue[1].shear_modulus_kpa",

@@ -17,7 +17,7 @@ from flexneedle.simulator.state import State
 from flexneedle.types import Control, Floats, Plan, X
 
 _SHARE_OF_LAW = 0.95  # of the compression at which a law ends
-_ELASTIC_STRAIN = 0.005  # of hard-drawn 304 steel: 965 MPa (ASTM A666, full hard) over 193 GPa
+_ROUNDING = 1e-6  # of a solve: a needle at rest beyond a limit may rest
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,12 @@ class Excess:
 
 @dataclass(frozen=True, eq=False)
 class Guard:
-    """Largest compression e of the tissue by law (l,), force of the guide (N), and distance (mm) of the tip past the
-    target, at `depth` (mm).
+    """Largest compression e of the tissue by law (l,), strain of the needle by bending, force of the guide (N), and
+    distance (mm) of the tip past the target, at `depth` (mm).
     """
 
     compression: Floats
+    strain: float
     force: float
     past: float
     depth: float
@@ -45,8 +46,9 @@ class Guard:
         settings, laws = scenario.guard, laws_of(scenario.tissue)[0]
         least = settings.least_stretch
         compression = [_SHARE_OF_LAW * law.limit if least is None else 1.0 - least for law in laws]
-        force = settings.guide_force_n or elastic_guide_force(scenario)
-        return Guard(np.array(compression), force, settings.past_target_mm, plan.target[0])
+        force = math.inf if settings.guide_force_n is None else settings.guide_force_n
+        strain, past = 1e-2 * settings.needle_strain_percent, settings.past_target_mm
+        return Guard(np.array(compression), strain, force, past, plan.target[0])
 
     def refusal(self, estimate: Estimate, command: Control) -> str:
         """Why a command must not be carried out, or "".
@@ -58,11 +60,13 @@ class Guard:
         if not then.converged:
             return f"guard: the model does not converge: residual {then.residual:.3g} mm"
         both = zip(self._excesses(now), self._excesses(then), strict=True)
-        worse = (new for old, new in both if new.beyond > max(old.beyond, 0.0))
+        worse = (new for old, new in both if new.beyond > max(old.beyond, 0.0) + _ROUNDING)
         return next((f"guard: {excess.text}" for excess in worse), "")
 
     def _excesses(self, state: State) -> Iterator[Excess]:
         yield self._compressed(state)
+        strain = bending_strain(state)
+        yield Excess(strain - self.strain, f"needle strain {1e2 * strain:.3f} % > {1e2 * self.strain:g} %")
         force = math.hypot(*state.reactions.guide_force)
         yield Excess(force - self.force, f"guide force {force:.3g} N > {self.force:.3g} N")
         past = float(state.tip[X]) - self.depth
@@ -79,12 +83,8 @@ class Guard:
         return Excess(float(least[worst] - stretch[worst]), text)
 
 
-def elastic_guide_force(scenario: Scenario) -> float:
-    """Force (N) of the guide that, over the distance G to the skin, bends the needle to its elastic limit: the moment
-    2 ε EI/d strains its surface by ε. Infinite without a guide.
-    """
-    needle, distance = scenario.needle, scenario.setup.guide_to_skin_mm
-    if distance is None:
-        return math.inf
-    moment = 2.0 * _ELASTIC_STRAIN * needle.bending_stiffness / needle.outer_diameter
-    return moment / distance
+def bending_strain(state: State) -> float:
+    """Largest strain M d/2EI of the needle's surface by bending; moments are largest where a force acts."""
+    needle = state.scenario.needle
+    moments = np.append(np.abs(state.mesh["moment"]), math.hypot(*state.reactions.base_moment))
+    return float(moments.max() * needle.outer_diameter / (2.0 * needle.bending_stiffness))
