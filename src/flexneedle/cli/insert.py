@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -109,6 +110,9 @@ def _insert(args: argparse.Namespace) -> int:
 
     if args.list:
         return _list()
+    if args.rig is not None:  # so that the record is completed as after Ctrl-C
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        signal.signal(signal.SIGHUP, signal.default_int_handler)
     choices = _choices(args)
     with _refusal_printed(args, choices):
         scenario = _scenario(args, choices)
