@@ -12,7 +12,7 @@ from flexneedle.errors import FlexneedleError, RecordError, one_line
 from flexneedle.planning.origin import placed
 from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT
-from flexneedle.rig.supervised import Ticks, check_fit
+from flexneedle.rig.supervised import Watchers, check_fit
 from flexneedle.runs.saving import finish, finish_insertion, finish_plans, keep_plan, note_result, open_trace
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.rig import RigFile
@@ -117,11 +117,11 @@ def _insert(
     from flexneedle.rig.insert import insert
 
     periods: list[Period] = []
-    ticks = Ticks()
+    watchers = Watchers()
 
     def ended(outcome: Outcome, reason: str) -> Insertion:
         controller, phantom, tracker, rig = choices.parts.values()
-        parts = controller, phantom, tracker, scenario, rig, {} if choices.rig is None else ticks.summary()
+        parts = controller, phantom, tracker, scenario, rig, {} if choices.rig is None else watchers.ticks.summary()
         return Insertion(plan, choices.seed, tuple(periods), outcome, reason, *parts)
 
     with _closed_at_the_end(folder, open_trace(folder, scenario, plan, choices.seed, choices.parts)) as trace:
@@ -138,7 +138,7 @@ def _insert(
             "force": choices.force,
             "rig": choices.rig,
             "dry_run": choices.dry_run,
-            "ticks": ticks,
+            "watchers": watchers,
         }
         try:
             return insert(scenario, plan, choices.seed, on_period=keep, **options)
