@@ -9,7 +9,7 @@ import numpy as np
 from flexneedle.arguments import whole
 from flexneedle.control.interface import Method
 from flexneedle.control.methods import DEFAULT
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, RigError
 from flexneedle.planning.origin import placed
 from flexneedle.rig.dry_run import in_memory
 from flexneedle.rig.loop import planned, run
@@ -55,10 +55,10 @@ def insert(
     The record is the same for the same seed, except for wall-clock durations.
 
     Raises InputError for an unknown name, an unsuitable object, a plan of another scenario, or a controller that needs
-    the guide where it may not move; RigError for a rig that breaks a rule or does not fit the scenario; DriverError if
-    one of its devices cannot be opened, StoppedError if it is stopped before the first motion; ScenarioError for a setting that the controllers reject; RunError if the plan
-    misses its target by more than 1 mm, unless `force` is set or the controller predicts the miss itself, as the
-    default one does.
+    the guide where it may not move; RigError for a rig that breaks a rule, does not fit the scenario, or has a section
+    `ros` that nothing follows; DriverError if one of its devices cannot be opened, StoppedError if it is stopped before
+    the first motion; ScenarioError for a setting that the controllers reject; RunError if the plan misses its target by
+    more than 1 mm, unless `force` is set or the controller predicts the miss itself, as the default one does.
     """
     scenario, plan, seed = load_scenario(scenario), planned(plan), whole("seed", seed, 0)
     phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
@@ -89,6 +89,9 @@ def insert(
     file = rig if isinstance(rig, RigFile) else load_rig(rig)
     check_fit(file, scenario, plan.strategy)
     watchers = Watchers() if watchers is None else watchers
+    if file.ros is not None and watchers.follower is None:
+        rule = "give watchers=Watchers(follower=Bridge(rig.ros)), see flexneedle.ros.bridge"
+        raise RigError(f"ros: nothing listens to the stop of this section: {rule}")
     with supervised(file, scenario, plan, watchers, dry=dry_run) as ports:
         insertion = executed(in_memory(ports, virtual) if dry_run else ports)
     return replace(insertion, rig=file.name, ticks=watchers.ticks.summary())

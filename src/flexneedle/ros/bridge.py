@@ -29,7 +29,7 @@ _BAD = frozenset({State.HOLDING, State.STOPPED, State.FAULT})
 
 
 def profile_of(settings: RosSettings) -> Profile:
-    """Return the profile of a section `ros`. Raises RigError if it lists no topic for an arm or target that it needs."""
+    """Return the profile of a section `ros`. Raises RigError if it lacks the topic of an arm or target that it needs."""
     profile = load_profile(settings.profile)
     for key in ("arm", "target"):
         if getattr(settings, key) and getattr(profile.subscribe, key) is None:
@@ -44,7 +44,7 @@ class Bridge:
     A thread polls the node; a stop goes at once to the supervisor, in whatever the insertion is busy. It is the
     `Follower` of an insertion on a rig. Without a rig a stop ends the insertion at its next period, by `check`.
 
-    settings: the section `ros` of a rig file. show: prints a line for the user, called only within calls of this object.
+    settings: the section `ros` of a rig file. show: prints a line for the user, and is called in no thread of this object.
     record: for `run.json`, with each stop, arm, target, refused message and loss of the node as it happened.
     Raises RigError for the profile, InputError or RunError if the node does not start.
     """
@@ -53,7 +53,9 @@ class Bridge:
         profile = profile_of(settings)
         self.settings, self.show = settings, show
         self.record: dict[str, Any] = {"profile": settings.profile, "events": []}
-        self._topics = {key.partition(".")[2]: topic.topic for key, topic in profile.topics() if key[0] == "s"}
+        self._topics = {
+            key.partition(".")[2]: topic.topic for key, topic in profile.topics() if key[0] == "s"
+        }
         self._lock, self._ended, self._armed = Lock(), Event(), Event()
         self._unprinted = SimpleQueue[str]()
         self._supervisor: Supervisor | None = None
@@ -209,9 +211,11 @@ class Bridge:
 
     def _stop(self, who: str) -> None:
         with self._lock:
-            self._stopped, supervisor = self._stopped or who, self._supervisor
+            first, supervisor = not self._stopped, self._supervisor
+            self._stopped = self._stopped or who
         if supervisor is not None:
             supervisor.request_stop(who)
         else:
-            self._set("stopped", who)
-        self._note(f"stop: {who}")
+            self._set("stopped", self._stopped)
+        if first:  # a stop is repeated until the rig reports it
+            self._note(f"stop: {who}")
