@@ -75,7 +75,9 @@ decision_ms = 200
 decision_limit_s = 2.0
 
 [ros]
-kind = "default"
+profile = "neutral"
+arm = true
+target = false
 """
 ODD = (
     b"0", b"-1", b"1e400", b"-1e308", b"5e-324", b"inf", b"-inf", b"nan", b"1_0", b"0x7fffffffffffffffffff", b"true",

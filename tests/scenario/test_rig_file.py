@@ -195,7 +195,7 @@ FULL = {
     **values(),
     "registration": {"fiducials_mm": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]},
     "loop": {"rate_hz": 40.0, "queue_ms": 75.0, "decision_ms": 200.0, "decision_limit_s": 2.0},
-    "ros": {"kind": "default"},
+    "ros": {"profile": "neutral", "arm": True, "target": False},
 }
 PATHS = sorted(paths(FULL), key=str)
 

@@ -6,8 +6,9 @@ import argparse
 import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,14 +24,16 @@ from flexneedle.console.common import (
     seed,
     target_row,
     with_examples,
+    with_target,
 )
-from flexneedle.errors import FlexneedleError, InputError, one_line
+from flexneedle.errors import FlexneedleError, InputError, StoppedError, one_line
 
 if TYPE_CHECKING:
     from flexneedle.console.progress import Progress
+    from flexneedle.ros.bridge import Bridge
     from flexneedle.runs.recording import Choices
     from flexneedle.scenario.model import Scenario
-    from flexneedle.scenario.rig import RigFile
+    from flexneedle.scenario.rig import RigFile, RosSettings
     from flexneedle.trace.folder import Folder
     from flexneedle.types import Insertion, Period
 
@@ -43,6 +46,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         **with_examples(
             "flexneedle insert phantom --target 35 -5 --seed 3",
             "flexneedle insert phantom --rig rig.toml --dry-run",
+            "flexneedle insert phantom --ros neutral",
             "flexneedle insert world:100012 --controller ce-mpc --phantom model --json",
         ),
     )
@@ -93,6 +97,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="with --rig: read motors and tracker, go through all motions, and send none; the needle is the virtual "
         "phantom's",
     )
+    parser.add_argument(
+        "--ros",
+        metavar="PROFILE",
+        help="publish an insertion without --rig to ROS 2, and let its topic stop it: name or path of a profile of "
+        "topics (with --rig: section [ros] of the rig file)",
+    )
     parser.add_argument("--yes", action="store_true", help="with --rig: insert without a confirmation")
     parser.add_argument("--list", action="store_true", help="list the controllers and exit")
     parser.add_argument(
@@ -114,18 +124,45 @@ def _insert(args: argparse.Namespace) -> int:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         signal.signal(signal.SIGHUP, signal.default_int_handler)
     choices = _choices(args)
-    with _refusal_printed(args, choices):
-        scenario = _scenario(args, choices)
-    with _refusal_printed(args, choices, scenario):
-        check_choices(scenario, choices)
-        _confirm(args, scenario, choices)
-        compile_first()
-        folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
-    with problems_printed(folder):
-        with _refusal_printed(args, choices, scenario, folder):
-            insertion = _execute(folder, scenario, choices)
-        status = _report(scenario, insertion, args.json, folder.path)
+    with ExitStack() as stack:
+        with _refusal_printed(args, choices):
+            scenario = _scenario(args, choices)
+        with _refusal_printed(args, choices, scenario):
+            check_choices(scenario, choices)
+            bridge = _bridge(args, choices, stack)
+            if bridge is not None and bridge.settings.target:
+                scenario = with_target(scenario, bridge.await_target())
+            _confirm(args, scenario, choices)
+            compile_first()
+            folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
+        with problems_printed(folder):
+            with _refusal_printed(args, choices, scenario, folder):
+                insertion = _execute(folder, scenario, choices, bridge)
+            status = _report(scenario, insertion, args.json, folder.path)
     return status or int(bool(folder.problems))
+
+
+def _bridge(args: argparse.Namespace, choices: Choices, stack: ExitStack) -> Bridge | None:
+    """The connection to ROS of --ros or of the rig file; None without one. Raises InputError for a second target."""
+    settings = _ros(args, choices)
+    if settings is None:
+        return None
+    if settings.target and args.target is not None:
+        raise InputError("--target: not with target = true in [ros] of the rig file, which takes it from ROS")
+    from flexneedle.ros.bridge import Bridge
+
+    return stack.enter_context(Bridge(settings, partial(print, file=sys.stderr, flush=True)))
+
+
+def _ros(args: argparse.Namespace, choices: Choices) -> RosSettings | None:
+    """The settings of --ros or of the rig file. Raises InputError for both."""
+    from flexneedle.scenario.rig import RosSettings
+
+    if choices.rig is None:
+        return None if args.ros is None else RosSettings(profile=args.ros)
+    if args.ros is not None:
+        raise InputError("--ros: not with --rig, whose file has a section [ros] for it")
+    return choices.rig.ros
 
 
 def _scenario(args: argparse.Namespace, choices: Choices) -> Scenario:
@@ -136,15 +173,17 @@ def _scenario(args: argparse.Namespace, choices: Choices) -> Scenario:
     return scenario if args.registration is None else load_registration(args.registration, scenario)
 
 
-def _execute(folder: Folder, scenario: Scenario, choices: Choices) -> Insertion:
+def _execute(folder: Folder, scenario: Scenario, choices: Choices, bridge: Bridge | None) -> Insertion:
     from flexneedle.console.progress import Progress
     from flexneedle.runs.recording import record_insertion
     from flexneedle.types import Outcome
 
     with Progress() as progress:
         show = _InsertProgress(progress, scenario)
+        if bridge is not None:
+            bridge.show = progress.print_line
         insertion = record_insertion(
-            folder, scenario, choices, on_iteration=show.iteration, on_period=show.period
+            folder, scenario, choices, on_iteration=show.iteration, on_period=show.period, bridge=bridge
         )
         if insertion.outcome is Outcome.DONE:
             progress.finish("Inserting")
@@ -161,6 +200,8 @@ def _refusal_printed(
     """With --json, print the object of an insertion that is refused or fails; the error is re-raised."""
     try:
         yield
+    except StoppedError:  # like Ctrl-C: no result
+        raise
     except FlexneedleError as error:
         if args.json:
             target = args.target if scenario is None else scenario.target.position
@@ -209,15 +250,19 @@ def _rig(args: argparse.Namespace, named: Mapping[str, str]) -> RigFile | None:
 
 
 def _confirm(args: argparse.Namespace, scenario: Scenario, choices: Choices) -> None:
-    """Ask before motors move. Raises InputError without a terminal, KeyboardInterrupt for any answer but yes."""
-    if choices.rig is None or choices.dry_run or args.yes:
+    """Ask before motors move, but where ROS arms the rig.
+
+    Raises InputError without a terminal, KeyboardInterrupt for any answer but yes.
+    """
+    rig = choices.rig
+    if rig is None or choices.dry_run or args.yes or (rig.ros is not None and rig.ros.arm):
         return
     depth, *lateral = scenario.target.position[: 1 + scenario.setup.axes]
     to = f"{depth:g} mm deep, {', '.join(f'{value:g}' for value in lateral)} mm to the side"
     if not sys.stdin.isatty():
         raise InputError("--rig: motors will move: confirm on a terminal, or with --yes")
     print(
-        f"{choices.rig.name}: the needle will be inserted from where it is, to a target {to}.",
+        f"{rig.name}: the needle will be inserted from where it is, to a target {to}.",
         file=sys.stderr,
     )
     print("Continue? [y/N] ", end="", file=sys.stderr, flush=True)
@@ -259,11 +304,13 @@ class _InsertProgress:
 
 
 def _report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:
+    from flexneedle.runs.recording import BY_USER
     from flexneedle.trace.results import insertion_result, insertion_timing
     from flexneedle.types import Outcome
 
     if insertion.outcome is Outcome.INTERRUPTED:
-        print(f"flexneedle: interrupted; record: {folder}", file=sys.stderr)
+        why = "" if insertion.reason == BY_USER else f": {insertion.reason}"
+        print(f"flexneedle: interrupted{why}; record: {folder}", file=sys.stderr)
         return 130
     if as_json:
         result, timing = insertion_result(insertion), insertion_timing(insertion)

@@ -16,7 +16,7 @@ from typing import Any
 from flexneedle import __version__
 from flexneedle.cli import emulate, export, insert, plan, report, rig, scenario, study, view
 from flexneedle.console.common import described
-from flexneedle.errors import FlexneedleError, InputError, ScenarioWarning
+from flexneedle.errors import FlexneedleError, InputError, ScenarioWarning, StoppedError
 
 _EM = import_module("flexneedle.em.commands.group")  # by name: no other layer imports em
 _COMMANDS = (plan, insert, study, report, view, export, scenario, _EM, rig, emulate)
@@ -93,7 +93,7 @@ def _guarded(command: Callable[[], int]) -> int:
         return command()
     except FlexneedleError as error:
         _print_error(str(error))
-        return 2 if isinstance(error, InputError) else 1
+        return 2 if isinstance(error, InputError) else 130 if isinstance(error, StoppedError) else 1
     except KeyboardInterrupt:
         _print_error("interrupted")
         return 130

@@ -94,10 +94,13 @@ def chosen_scenario(args: argparse.Namespace, *own: Method) -> Scenario:
     from flexneedle.scenario.files import load_scenario
 
     scenario = used(load_scenario(args.scenario), *own, source=args.scenario)
-    if args.target is None:
-        return scenario
+    return scenario if args.target is None else with_target(scenario, args.target)
+
+
+def with_target(scenario: Scenario, target: Sequence[float]) -> Scenario:
+    """Return the scenario with a target x, y, z (mm). Raises ScenarioError for one out of reach."""
     keys = ("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm")
-    return scenario.with_values(dict(zip(keys, args.target, strict=True)))
+    return scenario.with_values(dict(zip(keys, target, strict=True)))
 
 
 def target_row(scenario: Scenario, target: Sequence[float]) -> tuple[str, str]:

@@ -9,13 +9,13 @@ import numpy as np
 from flexneedle.arguments import whole
 from flexneedle.control.interface import Method
 from flexneedle.control.methods import DEFAULT
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, RigError
 from flexneedle.planning.origin import placed
 from flexneedle.rig.dry_run import in_memory
 from flexneedle.rig.loop import planned, run
 from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
-from flexneedle.rig.supervised import Ticks, check_fit, supervised
+from flexneedle.rig.supervised import Watchers, check_fit, supervised
 from flexneedle.rig.virtual import Rig, Seeds, virtual_rig
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
@@ -36,13 +36,13 @@ def insert(
     on_period: Callable[[Period], None] | None = None,
     rig: str | Path | RigFile | None = None,
     dry_run: bool = False,
-    ticks: Ticks | None = None,
+    watchers: Watchers | None = None,
 ) -> Insertion:
     """Execute `plan` in closed loop in the virtual phantom drawn with `seed`; return the complete record.
 
     rig: a rig file, on whose motors and tracker the plan is executed in place of the virtual phantom, from where the
     motors are. dry_run: its motors and tracker are read; motors never move, and the needle is the virtual phantom's.
-    ticks: to which the times of the rig's ticks are added as they are made (default: only to the record).
+    watchers: are given the rig before it is armed, and each of its ticks (default: only the record is).
 
     scenario: a scenario, or its name or path as for `load_scenario`. It must be the plan's own, or differ from it only
     in controller, tracker, monitor and phantom.
@@ -55,10 +55,10 @@ def insert(
     The record is the same for the same seed, except for wall-clock durations.
 
     Raises InputError for an unknown name, an unsuitable object, a plan of another scenario, or a controller that needs
-    the guide where it may not move; RigError for a rig that breaks a rule or does not fit the scenario; DriverError if
-    one of its devices cannot be opened; ScenarioError for a setting that the controllers reject; RunError if the plan
-    misses its target by more than 1 mm, unless `force` is set or the controller predicts the miss itself, as the
-    default one does.
+    the guide where it may not move; RigError for a rig that breaks a rule, does not fit the scenario, or has a section
+    `ros` that nothing follows; DriverError if one of its devices cannot be opened, StoppedError if it is stopped before
+    the first motion; ScenarioError for a setting that the controllers reject; RunError if the plan misses its target by
+    more than 1 mm, unless `force` is set or the controller predicts the miss itself, as the default one does.
     """
     scenario, plan, seed = load_scenario(scenario), planned(plan), whole("seed", seed, 0)
     phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
@@ -88,6 +88,10 @@ def insert(
         raise InputError("phantom and tracker are those of the rig: give neither with a rig")
     file = rig if isinstance(rig, RigFile) else load_rig(rig)
     check_fit(file, scenario, plan.strategy)
-    with supervised(file, scenario, plan, dry=dry_run, ticks=ticks) as (ports, made):
+    watchers = Watchers() if watchers is None else watchers
+    if file.ros is not None and watchers.follower is None:
+        rule = "give watchers=Watchers(follower=Bridge(rig.ros)), see flexneedle.ros.bridge"
+        raise RigError(f"ros: nothing listens to the stop of this section: {rule}")
+    with supervised(file, scenario, plan, watchers, dry=dry_run) as ports:
         insertion = executed(in_memory(ports, virtual) if dry_run else ports)
-    return replace(insertion, rig=file.name, ticks=made.summary())
+    return replace(insertion, rig=file.name, ticks=watchers.ticks.summary())

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import monotonic
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -89,7 +89,7 @@ class Ticks:
     states: deque[tuple[float, str, str]] = field(default_factory=lambda: deque(maxlen=_MOST_KEPT))
 
     def add(self, report: Report) -> None:
-        """Add a tick."""
+        """Add the tick of a report."""
         time = self.started + report.time
         self.late.append(report.late)
         self.work.append(report.work)
@@ -108,6 +108,37 @@ class Ticks:
         found["stalls"] = [{"time_s": time, "late_s": late} for time, late in self.stalls]
         found["states"] = [{"time_s": time, "state": state, "why": why} for time, state, why in self.states]
         return found
+
+
+class Follower(Protocol):
+    """What follows the insertion on a rig, such as a connection to other programs."""
+
+    def opened(self, supervisor: Supervisor) -> None:
+        """Take the supervisor of a rig that is connected and not armed; the rig is armed when this returns."""
+        ...
+
+    def report(self, report: Report) -> None:
+        """Take what a tick found; called in a thread, and shall return at once."""
+        ...
+
+
+@dataclass(frozen=True)
+class Watchers:
+    """What is given each tick of a rig: the record of ticks, and what follows the insertion, None for nothing."""
+
+    ticks: Ticks = field(default_factory=Ticks)
+    follower: Follower | None = None
+
+    def opened(self, supervisor: Supervisor) -> None:
+        """Hand out the supervisor before the rig is armed."""
+        if self.follower is not None:
+            self.follower.opened(supervisor)
+
+    def report(self, report: Report) -> None:
+        """Hand out what a tick found."""
+        self.ticks.add(report)
+        if self.follower is not None:
+            self.follower.report(report)
 
 
 class SupervisedDriver:
@@ -177,14 +208,13 @@ def check_fit(rig: RigFile, scenario: Scenario, strategy: str) -> None:
 
 @contextmanager
 def supervised(
-    rig: RigFile, scenario: Scenario, plan: Plan, *, dry: bool = False, ticks: Ticks | None = None
-) -> Iterator[tuple[Rig, Ticks]]:
-    """Open a rig, arm it, roll the needle as the plan begins, and give its ports and the times of its ticks.
-
-    ticks: to which those are added (default: new ones).
+    rig: RigFile, scenario: Scenario, plan: Plan, watchers: Watchers, *, dry: bool = False
+) -> Iterator[Rig]:
+    """Open a rig, arm it, roll the needle as the plan begins, and give its ports. watchers: are given its ticks.
 
     Positions of the axes at this moment are those at the start of the plan. dry: motors are read and never moved.
-    Raises RigError if the rig does not fit the scenario, DriverError or RunError if a device fails.
+    Raises RigError if the rig does not fit the scenario, DriverError or RunError if a device fails, StoppedError if it
+    is stopped.
     """
     settings = scenario.tracker
     if rig.registration is not None:
@@ -199,9 +229,9 @@ def supervised(
         scenario.control.stale_after_s,
         dry,
     )
-    ticks = Ticks() if ticks is None else ticks
-    ticks.started = task.started
-    with Supervisor(task, ticks.add) as supervisor:
+    watchers.ticks.started = task.started
+    with Supervisor(task, watchers.report) as supervisor:
+        watchers.opened(supervisor)
         supervisor.arm(_deepest(scenario))
         if rig.axes.rotation is not None:
             supervisor.move_to("rotation", plan.roll)
@@ -209,7 +239,7 @@ def supervised(
             supervisor.wait(scenario.monitor.indicator_window_s)  # the field must be known before the start
         driver = SupervisedDriver(supervisor, scenario, plan.roll)
         deadline = 1e-3 * rig.loop.decision_ms
-        yield Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline), ticks
+        yield Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline)
 
 
 def _deepest(scenario: Scenario) -> float:

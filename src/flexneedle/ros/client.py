@@ -85,6 +85,10 @@ class NodeClient:
         self._lost = next((one.reason for one in requests if isinstance(one, Lost)), self._lost)
         return requests
 
+    def wait(self, seconds: float) -> None:
+        """Wait until something is received, at most for `seconds`."""
+        select([self._pipe.socket], [], [], seconds)
+
     @property
     def status(self) -> str:
         """VISIBLE while the node shows signs of life, else the reason in a few words."""

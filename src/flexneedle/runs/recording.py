@@ -4,15 +4,15 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flexneedle.control.guide import check_guide
 from flexneedle.control.methods import DEFAULT
-from flexneedle.errors import FlexneedleError, RecordError, one_line
+from flexneedle.errors import FlexneedleError, RecordError, StoppedError, one_line
 from flexneedle.planning.origin import placed
 from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT
-from flexneedle.rig.supervised import Ticks, check_fit
+from flexneedle.rig.supervised import Watchers, check_fit
 from flexneedle.runs.saving import finish, finish_insertion, finish_plans, keep_plan, note_result, open_trace
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.rig import RigFile
@@ -20,6 +20,11 @@ from flexneedle.trace.folder import Folder
 from flexneedle.trace.writer import TraceWriter
 from flexneedle.types import Insertion, Outcome, Period, Plan
 
+if TYPE_CHECKING:
+    from flexneedle.ros.bridge import Bridge
+
+BY_USER = "stopped by the user"
+"""Reason of an insertion that was interrupted by Ctrl-C."""
 OnIteration = Callable[[str, dict[str, Any]], None]
 """Called after each iteration of the planner with the strategy and the report of the iteration."""
 OnPeriod = Callable[[Period], None]
@@ -83,24 +88,49 @@ def record_insertion(
     *,
     on_iteration: OnIteration,
     on_period: OnPeriod,
+    bridge: "Bridge | None" = None,
 ) -> Insertion:
     """Plan, insert, and write `run.json`, `trace.mcap` and `insertion.png`, `.svg` to the folder.
 
-    An insertion that is interrupted (Ctrl-C) is returned with its periods and the outcome "interrupted". An
+    bridge: an open connection to ROS, which publishes all and may stop it.
+
+    An insertion that is interrupted (Ctrl-C, or a stop) is returned with its periods and the outcome "interrupted". An
     error, or an interruption of planning, is recorded in `run.json` and re-raised; if there was a plan, the record
     includes the result, with the outcome "refused", or "failed" once the needle has moved. An insertion whose trace
     cannot be written is held; what else cannot be written is in `folder.problems`.
     """
     folder.values |= choices.parts
+    if bridge is not None:
+        folder.timing["ros"] = bridge.record
+        on_iteration, on_period = _followed(bridge, on_iteration, on_period)
     with _status_recorded(folder):
         check_choices(scenario, choices)
         plan_seed = choices.seed if choices.plan_seed is None else choices.plan_seed
         plan = _plan(folder, scenario, choices.strategy, plan_seed, on_iteration)
         scenario = placed(scenario, plan)
         folder.values["scenario"] = scenario.values()
-        insertion = _insert(folder, scenario, plan, choices, on_period)
+        if bridge is not None:
+            bridge.publish(plan)
+        insertion = _insert(folder, scenario, plan, choices, on_period, Watchers(follower=bridge))
         finish_insertion(folder, insertion)
     return insertion
+
+
+def _followed(
+    bridge: "Bridge", on_iteration: OnIteration, on_period: OnPeriod
+) -> tuple[OnIteration, OnPeriod]:
+    """The two functions with publication, and the end after a stop, which they raise as StoppedError."""
+
+    def iteration(strategy: str, info: dict[str, Any]) -> None:
+        bridge.check()
+        on_iteration(strategy, info)
+
+    def period(one: Period) -> None:
+        bridge.publish(one)
+        on_period(one)
+        bridge.check()
+
+    return iteration, period
 
 
 def _plan(folder: Folder, scenario: Scenario, strategy: str, seed: int, on_iteration: OnIteration) -> Plan:
@@ -112,16 +142,27 @@ def _plan(folder: Folder, scenario: Scenario, strategy: str, seed: int, on_itera
 
 
 def _insert(
-    folder: Folder, scenario: Scenario, plan: Plan, choices: Choices, on_period: OnPeriod
+    folder: Folder,
+    scenario: Scenario,
+    plan: Plan,
+    choices: Choices,
+    on_period: OnPeriod,
+    watchers: Watchers,
 ) -> Insertion:
     from flexneedle.rig.insert import insert
 
     periods: list[Period] = []
-    ticks = Ticks()
 
     def ended(outcome: Outcome, reason: str) -> Insertion:
         controller, phantom, tracker, rig = choices.parts.values()
-        parts = controller, phantom, tracker, scenario, rig, {} if choices.rig is None else ticks.summary()
+        parts = (
+            controller,
+            phantom,
+            tracker,
+            scenario,
+            rig,
+            {} if choices.rig is None else watchers.ticks.summary(),
+        )
         return Insertion(plan, choices.seed, tuple(periods), outcome, reason, *parts)
 
     with _closed_at_the_end(folder, open_trace(folder, scenario, plan, choices.seed, choices.parts)) as trace:
@@ -138,12 +179,14 @@ def _insert(
             "force": choices.force,
             "rig": choices.rig,
             "dry_run": choices.dry_run,
-            "ticks": ticks,
+            "watchers": watchers,
         }
         try:
             return insert(scenario, plan, choices.seed, on_period=keep, **options)
         except KeyboardInterrupt:
-            return ended(Outcome.INTERRUPTED, "stopped by the user")
+            return ended(Outcome.INTERRUPTED, BY_USER)
+        except StoppedError as error:  # before the first motion; later `insert` returns it
+            return ended(Outcome.INTERRUPTED, one_line(error))
         except RecordError as error:  # what happens is no longer recorded: the needle goes no further
             return ended(Outcome.HELD, one_line(error))
         except FlexneedleError as error:
@@ -171,7 +214,7 @@ def _status_recorded(folder: Folder) -> Iterator[None]:
         yield
     except BaseException as error:
         if folder.values["status"] == "running":
-            interrupted = isinstance(error, KeyboardInterrupt)
+            interrupted = isinstance(error, KeyboardInterrupt | StoppedError)
             status = "interrupted" if interrupted else "failed"
             finish(folder, status, str(error) or type(error).__name__)
         raise

@@ -352,6 +352,17 @@ class LoopSettings(Section):
         return 1e-3 * self.queue_ms
 
 
+class RosSettings(Section):
+    """Section `ros`: the topics by which an insertion is followed and stopped."""
+
+    profile: Annotated[str, Field(max_length=1000), AfterValidator(one_line)] = "neutral"
+    """Name or file of the profile of topics."""
+    arm: bool = False
+    """Whether the rig is armed only after an arm on its topic, and stopped if the ROS node is lost."""
+    target: bool = False
+    """Whether the target is taken from its topic, before planning."""
+
+
 class RigFile(Section):
     """A rig, as its file describes it."""
 
@@ -363,8 +374,8 @@ class RigFile(Section):
     registration: Registration | None = None
     """Map from the tracker's frame to that of the insertion; takes the place of the scenario's."""
     loop: LoopSettings = LoopSettings()
-    ros: Part | None = None
-    """What is published to ROS 2. Not set: nothing."""
+    ros: RosSettings | None = None
+    """Connection to ROS 2. Not set: none."""
 
 
 def settings_of(model: type[Settings], settings: Mapping[str, Any]) -> Settings:

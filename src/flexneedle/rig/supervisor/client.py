@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from math import inf
 from multiprocessing.connection import Connection
-from threading import Condition, Thread
+from threading import Condition, Lock, Thread
 from time import monotonic
 from typing import Any, Self
 
@@ -37,7 +37,7 @@ class Supervisor:
     def __init__(self, task: say.Task, on_report: Callable[[say.Report], None] | None = None) -> None:
         self._clock = WallClock(start=task.started)
         self._task, self._on_report = task, on_report
-        self._changed = Condition()
+        self._changed, self._sending = Condition(), Lock()  # a stop may be requested in any thread
         self._latest: say.Report | None = None
         self._latest_at = monotonic()
         self._ended: str | None = None
@@ -80,7 +80,8 @@ class Supervisor:
             self._process.kill()
             self._process.wait()
         self._thread.join()  # it ends with the supervisor's end of the line
-        self._connection.close()
+        with self._sending:
+            self._connection.close()
 
     @property
     def rig(self) -> RigFile:
@@ -119,7 +120,7 @@ class Supervisor:
     # Requests
 
     def arm(self, deepest: float = inf) -> None:
-        """Switch the motors on; deepest: largest advance (mm) from here."""
+        """Switch the motors on; deepest: largest advance (mm) from here. Raises StoppedError after a stop."""
         self._ask(say.Arm(deepest), State.ARMED)
 
     def reset(self) -> None:
@@ -132,6 +133,13 @@ class Supervisor:
             return
         self._send(say.Stop(who))
         self._wait(lambda: self._at_rest(), _END_S, "the motors do not come to rest", stopped=True)
+
+    def request_stop(self, who: str) -> None:
+        """Request that all motors stop, without waiting for it. It may be called in any thread, and at any time.
+
+        Where the supervisor has ended nothing is done: it has stopped the motors.
+        """
+        self._send(say.Stop(who), lost=True)
 
     def step(
         self,
@@ -195,13 +203,16 @@ class Supervisor:
         )
         refused = self._answers.pop(0, None)
         if isinstance(refused, say.Refused):
+            if wanted is State.ARMED:
+                self._check(refused.state, refused.cause)
             raise RefusedError(refused.why)
 
     # Waiting
 
     def _send(self, message: Any, *, lost: bool = False) -> None:
         try:
-            self._connection.send(message)
+            with self._sending:
+                self._connection.send(message)
         except OSError:
             if not lost:
                 raise DriverError(f"the supervisor has ended{self._because()}") from None

@@ -1,0 +1,221 @@
+"""An insertion and its ROS node: what it publishes, and the stops, arms and targets that it takes from there."""
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from queue import Empty, SimpleQueue
+from threading import Event, Lock, Thread
+from time import monotonic
+from typing import Any, Self
+
+from flexneedle.errors import RigError, RunError, StoppedError
+from flexneedle.rig.supervisor.client import Supervisor
+from flexneedle.rig.supervisor.machine import State
+from flexneedle.rig.supervisor.messages import Report
+from flexneedle.ros.client import open_node
+from flexneedle.ros.profile import Profile, load_profile
+from flexneedle.ros.records import Arm, Lost, Refused, Request, RigState, Stop, Target
+from flexneedle.scenario.problems import Problem, to_line
+from flexneedle.scenario.rig import RosSettings
+from flexneedle.types import Period, Plan, Point
+
+POLL_S = 0.01
+"""Longest time between two looks for a stop."""
+_STATE_S = 1.0  # the state is published at least this often
+_CHECK_S = 0.05  # while an arm or a target is awaited
+_MOST_EVENTS = 1000  # in the record
+_BAD = frozenset({State.HOLDING, State.STOPPED, State.FAULT})
+
+
+def profile_of(settings: RosSettings) -> Profile:
+    """Return the profile of a section `ros`. Raises RigError if it lacks the topic of an arm or target that it needs."""
+    profile = load_profile(settings.profile)
+    for key in ("arm", "target"):
+        if getattr(settings, key) and getattr(profile.subscribe, key) is None:
+            rule = f"must list subscribe.{key}, since ros.{key} = true"
+            raise RigError(to_line(Problem("ros.profile", settings.profile, rule)))
+    return profile
+
+
+class Bridge:
+    """The connection of one insertion to ROS, from before its planning to after its end. Use it as a context manager.
+
+    A thread polls the node; a stop goes at once to the supervisor, in whatever the insertion is busy. It is the
+    `Follower` of an insertion on a rig. Without a rig a stop ends the insertion at its next period, by `check`.
+
+    settings: the section `ros` of a rig file. show: prints a line for the user, and is called in no thread of this object.
+    record: for `run.json`, with each stop, arm, target, refused message and loss of the node as it happened.
+    Raises RigError for the profile, InputError or RunError if the node does not start.
+    """
+
+    def __init__(self, settings: RosSettings, show: Callable[[str], None] = lambda _line: None) -> None:
+        profile = profile_of(settings)
+        self.settings, self.show = settings, show
+        self.record: dict[str, Any] = {"profile": settings.profile, "events": []}
+        self._topics = {
+            key.partition(".")[2]: topic.topic for key, topic in profile.topics() if key[0] == "s"
+        }
+        self._lock, self._ended, self._armed = Lock(), Event(), Event()
+        self._unprinted = SimpleQueue[str]()
+        self._supervisor: Supervisor | None = None
+        self._stopped = self._lost = self._awaited = ""
+        self._target: Point | None = None
+        self._shift: float | None = None  # of the run's time 0 from this object's
+        self._state, self._published_at = ("idle", ""), -_STATE_S
+        self._opened, epoch = monotonic(), time.time()
+        self._node = open_node(profile, epoch=epoch)
+        self._thread = Thread(target=self._listen, name="ROS", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the node, after the last state."""
+        self._ended.set()
+        self._thread.join()
+        if self._supervisor is None:
+            self._announce("stopped" if self._stopped else "idle", self._stopped)
+        self._node.close()
+
+    # The insertion
+
+    def publish(self, record: Plan | Period) -> None:
+        """Publish a plan, with tissue and target, or a period. Returns at once."""
+        if isinstance(record, Plan):
+            self._node.publish(record)
+            return
+        if self._shift is None:  # no rig: the time of the first period is now
+            self._shift = self._now() - record.time
+        if self._supervisor is None and not self._stopped:
+            self._set("inserting")
+        measured = replace(record.measurement, time=record.measurement.time + self._shift)
+        self._node.publish(replace(record, time=record.time + self._shift, measurement=measured))
+
+    def check(self) -> None:
+        """Print what has happened since the last call. Raises StoppedError after a stop."""
+        with suppress(Empty):
+            while True:
+                self.show(f"flexneedle: {self._unprinted.get_nowait()}")
+        if self._stopped:
+            raise StoppedError(f"stopped: {self._stopped}")
+
+    def await_target(self) -> Point:
+        """Wait for a target x, y, z (mm) on its topic. Raises StoppedError after a stop, RunError without the node."""
+        self._wait_for("target", f"a target on {self._topics['target']}")
+        while self._target is None:
+            self._ended.wait(_CHECK_S)
+            self.check()
+            if self._lost:
+                raise RunError(f"no target: {self._lost}")
+        self._awaited = ""
+        self._set("idle")
+        return self._target
+
+    # The rig, as its `Follower`
+
+    def opened(self, supervisor: Supervisor) -> None:
+        """Forward stops to a supervisor from here on; with `settings.arm`, wait until the rig may be armed.
+
+        An arm that came before does not count. Raises StoppedError after a stop.
+        """
+        self._shift = self._now() - supervisor.now()
+        with self._lock:
+            self._supervisor, stopped = supervisor, self._stopped
+        if stopped:
+            supervisor.request_stop(stopped)
+        if not self.settings.arm:
+            return
+        self._wait_for("arm", f"an arm on {self._topics['arm']}; nothing moves before")
+        while not self._armed.is_set():
+            supervisor.wait(_CHECK_S)
+            self.check()
+        self._awaited = ""
+
+    def report(self, report: Report) -> None:
+        """Publish the state of the rig when it changes, and once a second."""
+        waiting = f"waits for {self._awaited}" if self._awaited and report.state is State.IDLE else ""
+        values = {"tracker": report.tracker, "ticks missed": str(report.missed)}
+        changed = self._state != (state := (str(report.state), report.why or waiting))
+        if changed or self._now() - self._published_at >= _STATE_S:
+            self._announce(*state, good=report.state not in _BAD, values=values)
+
+    # States
+
+    def _set(self, state: str, reason: str = "") -> None:
+        """Publish a state without a rig, if it is another."""
+        if self._state != (state, reason):
+            self._announce(state, reason)
+
+    def _announce(
+        self, state: str, reason: str, *, good: bool | None = None, values: dict[str, str] | None = None
+    ) -> None:
+        self._state, self._published_at = (state, reason), self._now()
+        is_good = state != "stopped" if good is None else good
+        self._node.publish(RigState(self._published_at, state, reason, is_good, values or {}))
+
+    def _wait_for(self, key: str, what: str) -> None:
+        self._note(f"waits for {what}")
+        self._awaited = key
+        self._set("idle", f"waits for {key}")
+        self.check()
+
+    def _note(self, event: str) -> None:
+        if len(self.record["events"]) < _MOST_EVENTS:
+            self.record["events"].append({"time_s": self._now(), "event": event})
+            self._unprinted.put(event)
+
+    def _now(self) -> float:
+        """Time (s) of the node's records: since this object was made."""
+        return monotonic() - self._opened
+
+    # The thread
+
+    def _listen(self) -> None:
+        while not self._ended.is_set():
+            if self._lost:  # a node that hung may still bring a stop
+                self._ended.wait(POLL_S)
+            else:
+                self._node.wait(POLL_S)
+            for request in self._node.poll():
+                self._take(request)
+            if self._supervisor is None and self._now() - self._published_at >= _STATE_S:
+                self._announce(*self._state)
+
+    def _take(self, request: Request) -> None:
+        match request:
+            case Stop(_, topic, reason):
+                self._stop(f"ROS topic {topic}" + (f" ({reason})" if reason else ""))
+            case Lost(_, reason):
+                self._lost = reason
+                if self.settings.arm:  # without the node nobody there can stop the rig
+                    self._stop(reason)
+                else:
+                    self._note(f"{reason}: nothing is published, and no stop is received from there")
+            case Arm(_, topic):
+                self._note(f"arm on {topic}" + ("" if self._awaited == "arm" else ": ignored, not awaited"))
+                if self._awaited == "arm":
+                    self._armed.set()
+            case Target(_, point):
+                shown = ", ".join(f"{value:g}" for value in point)
+                wanted = self._awaited == "target"
+                self._note(f"target {shown} mm" + ("" if wanted else ": ignored, not awaited"))
+                if wanted:
+                    self._target = point
+            case Refused(_, topic, reason, count):
+                self._note(f"message {count} refused on {topic}: {reason}")
+
+    def _stop(self, who: str) -> None:
+        with self._lock:
+            first, supervisor = not self._stopped, self._supervisor
+            self._stopped = self._stopped or who
+        if supervisor is not None:
+            supervisor.request_stop(who)
+        else:
+            self._set("stopped", self._stopped)
+        if first:  # a stop is repeated until the rig reports it
+            self._note(f"stop: {who}")
