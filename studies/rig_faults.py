@@ -395,6 +395,34 @@ def _row(fault: Fault, trials: list[dict[str, Any]]) -> str:
     return f"| {fault.group} | {fault.name} | {fault.reaction} | {ended_as} | {limit} | {motion} | {share} |"
 
 
+def draw(faults: list[Fault], trials: list[dict[str, Any]], path: Path) -> None:
+    """Draw the time to detection of each trial with its limit, and the motion after it."""
+    import matplotlib.pyplot as plt
+
+    shown = [one for one in faults if any(trial["fault"] == one.name for trial in trials)]
+    figure, axes = plt.subplots(
+        1, 2, figsize=(10.0, 0.24 * len(shown) + 1.2), sharey=True, layout="constrained"
+    )
+    for row, fault in enumerate(shown):
+        mine = [one for one in trials if (one["group"], one["fault"]) == (fault.group, fault.name)]
+        for axis, key in zip(axes, ("detection_s", "motion_mm"), strict=True):
+            values = [one[key] for one in mine if one[key] is not None]
+            axis.plot(
+                np.maximum(values, 1e-3), [row] * len(values), "o", color="#0072b2", alpha=0.4, markersize=4
+            )
+        if fault.within is not None:
+            axes[0].plot([fault.within], [row], "|", color="#d55e00", markersize=11, markeredgewidth=2)
+    axes[1].axvline(_MOTION_MM, color="#d55e00", linewidth=2)
+    axes[0].set(xscale="log", xlabel="time to detection (s); its limit", yticks=range(len(shown)))
+    axes[0].set_yticklabels([f"{one.group}: {one.name}" for one in shown])
+    axes[1].set(xlabel="motion of the base after detection (mm); limit 0.5", xlim=(-0.02, 0.6))
+    for axis in axes:
+        axis.grid(axis="both", color="0.9")
+        axis.set_axisbelow(True)
+    axes[0].set_ylim(len(shown) - 0.5, -0.5)
+    figure.savefig(path, dpi=150)
+
+
 def main() -> None:
     """Run the trials that are missing, and print the table."""
     parser = argparse.ArgumentParser(
@@ -432,6 +460,7 @@ def main() -> None:
                 f"{mark} {fault.group}: {fault.name}: {shown} {trial['why'] or trial['reason']}", flush=True
             )
     print(table(faults, trials))
+    draw(faults, trials, args.out / "faults.png")
     bad = [one for fault in faults for one in trials if one["fault"] == fault.name and not good(fault, one)]
     sys.exit(bool(bad))
 

@@ -78,6 +78,7 @@ class Motor:
     on: bool = True
     stopped: str = ""
     fault: str = ""
+    lag: float = 0.0  # time constant of the servo (s)
     low: float = -math.inf
     high: float = math.inf
 
@@ -91,8 +92,13 @@ class Motor:
         if abs(left) < 0.5:
             self.velocity, moved = 0.0, left
         self.commanded += moved
+        if self.lag:
+            moved = (self.commanded - self.position) * -math.expm1(-seconds / self.lag)
+        if self.fault == "runaway":  # the controller's own profile goes on, and so does the motor
+            self.target = self.commanded + 1e6
         self.position += {"stall": 0.0, "reversed": -moved, "overshoot": 1.2 * moved}.get(self.fault, moved)
-        if not self.low <= self.position <= self.high and moved:
+        outwards = (self.position < self.low and moved < 0) or (self.position > self.high and moved > 0)
+        if outwards:
             self.position = min(self.high, max(self.low, self.position))
             self.halt("limit switch")
 
@@ -111,7 +117,7 @@ class Stage:
     def __init__(self, clock, channels="ABC"):
         self.clock, self.at = clock, clock.now()
         self.motors = {channel: Motor() for channel in channels}
-        self.calls, self.lost, self.refuses = [], False, False
+        self.calls, self.lost, self.refuses, self.deaf = [], False, False, False
 
     def _up_to_now(self):
         while self.at < self.clock.now() - 1e-9:
@@ -150,12 +156,22 @@ class Stage:
     def follow(self, positions):
         self._called("follow", dict(positions))
         for channel, position in positions.items():
+            motor = self.motors[channel]
+            outwards = (motor.position <= motor.low and position < motor.position) or (
+                motor.position >= motor.high and position > motor.position
+            )
+            if outwards:
+                raise DriverError("PA refused: 22 Begin not possible due to limit switch")
+        for channel, position in positions.items():
             self.motors[channel].target = position
             self.motors[channel].stopped = ""
 
     def stop(self):
         self._called("stop")
+        if self.deaf:
+            return
         for motor in self.motors.values():
+            motor.fault = "" if motor.fault == "runaway" else motor.fault
             motor.target = motor.commanded
             motor.velocity = 0.0
 
@@ -199,14 +215,14 @@ class Camera:
 class Bench:
     """A supervisor with devices in memory, and the messages that it has sent."""
 
-    def __init__(self, rig=None, **loop):
+    def __init__(self, rig=None, monitor=None, tracked=True, **loop):
         self.clock = Hand()
         self.stage, self.camera = Stage(self.clock), Camera(self.clock)
         rig = rig or rig_file()
         if loop:
             rig = rig.model_copy(update={"loop": rig.loop.model_copy(update=loop)})
-        monitor = MonitorSettings(references=0)
-        task = say.Task(rig, 0.0, 2, monitor, identity(), 0.0, 0.3)
+        monitor = monitor or MonitorSettings(references=0)
+        task = say.Task(rig, 0.0, 2, monitor, identity(), 0.0, 0.3, tracked=tracked)
         self.sent, self.reports = [], []
         self.core = Supervisor(task, self.stage, self.camera, self.clock, self.sent.append)
 

@@ -275,7 +275,9 @@ def _home(args: argparse.Namespace) -> int:
         return 0
 
     def home(operator: Operator) -> None:
-        for homing in chosen:
+        for number, homing in enumerate(chosen):
+            if number > 0:
+                operator.arm()
             operator.home(homing.name)
 
     return _carried_out(rig, chosen, args.yes, home, "Only without a needle in tissue.")

@@ -20,11 +20,12 @@ def test_an_axis_finds_its_switch_calls_it_its_home_and_moves_into_its_range(hom
     bench.core.request(say.Home(1, "guide_y"))
     assert bench.core.state is State.HOMING
     done = bench.until(1, most=20_000)
-    assert (done.why, done.state) == ("", State.ARMED)
+    assert (done.why, done.state) == ("", State.IDLE)
     assert ("define", "C", direction * 500.0 * 15.5 * to_home) in bench.stage.calls
     switch = motor.low if home == "reverse-limit" else motor.high
     assert switch == direction * 500.0 * 15.5 * to_home
-    assert bench.position("guide_y") == pytest.approx(15.0 * to_home, abs=2e-3)
+    assert bench.position("guide_y") == pytest.approx((15.0 - 0.6) * to_home, abs=2e-3)
+    bench.armed()
     bench.core.request(say.Go(2, "guide_y", 0.0, 5.0))
     assert bench.until(2).why == ""
 

@@ -1,15 +1,22 @@
 """Checks of motors at each tick: pure functions that return a problem in one line, or ""."""
 
+import math
+
 from flexneedle.rig.ports import MotorState
 from flexneedle.rig.supervisor.drives import Drive
 
 _HASTE = 1.5  # times its speed an axis may seem to move between two ticks, whose times are not exact
+_CREEP = 0.1  # of the tolerance a servo that still follows moves at least between two readings
 _STILL = 2.0  # times the tolerance of its goal a motor at rest may move
 
 
 def motor_problem(drive: Drive, state: MotorState, before: MotorState) -> str:
     """A motor that is off, was stopped by its controller since the reading before, or does not follow."""
     error = drive.error(state)
+    if not math.isfinite(error):
+        return (
+            f"{drive.name}: the controller reports position {state.position:g}, commanded {state.commanded:g}"
+        )
     if not state.on:
         return f"{drive.name}: the motor is off{_because(state.stopped)}"
     if state.stopped and state.stopped != before.stopped:
@@ -31,8 +38,8 @@ def position_problem(
     most = _HASTE * drive.axis.speed * seconds + drive.axis.max_error
     if moved > most:
         return f"{drive.name}: the position jumped by {drive.shown(moved)} in {seconds:.3f} s"
-    outside = _outside(drive, state)
-    if not unlimited and outside > drive.axis.max_error and outside > _outside(drive, before):
+    outside, further = _outside(drive, state), _outside(drive, before) + drive.axis.tolerance
+    if not unlimited and outside > drive.axis.max_error and outside > further:
         low, high = map(drive.shown, drive.axis.limits)
         return f"{drive.name}: at {drive.shown(drive.position(state.position))}, beyond its range {low} to {high}"
     return ""
@@ -53,6 +60,26 @@ def reversal_problem(drive: Drive, state: MotorState, before: MotorState, way: f
     if back > _STILL * drive.axis.tolerance:
         return f"{drive.name}: the position went back by {drive.shown(back)} during a motion"
     return ""
+
+
+def target_problem(drive: Drive, state: MotorState, start: float, sent: float) -> str:
+    """A motor that is beyond the target that was last sent, or behind where it began (counts).
+
+    The controller's own profile may be wrong, too, and its position error small.
+    """
+    low, high = min(start, sent), max(start, sent)
+    off = max(low - state.position, state.position - high) / abs(drive.axis.scale)
+    if off > drive.axis.max_error:
+        return (
+            f"{drive.name}: {drive.shown(off)} beyond its target, limit {drive.shown(drive.axis.max_error)}"
+        )
+    return ""
+
+
+def rests(drive: Drive, state: MotorState, before: MotorState) -> bool:
+    """Whether a motor rests, its servo included, which may follow for a while when the controller's profile has ended."""
+    moved = abs(state.position - before.position) / abs(drive.axis.scale)
+    return not state.moving and moved <= max(_CREEP * drive.axis.tolerance, 1.0 / abs(drive.axis.scale))
 
 
 def at_home(drive: Drive, state: MotorState) -> bool:

@@ -22,6 +22,7 @@ from flexneedle.types import Measurement
 
 _HEARTBEAT_S = 0.1
 _SILENT_S = 1.0  # without a report: the supervisor hangs
+_PATIENCE_S = 0.3  # for reports that have not been taken, after a time without Python's lock
 _OPEN_S = 60.0  # to find a tracker
 _END_S = 5.0
 _MOST_KEPT = 4000  # measurements: 100 s without a reader
@@ -165,8 +166,8 @@ class Supervisor:
         return self._go("insertion", position, speed, retract=True)
 
     def home(self, axis: str) -> say.Done:
-        """Find the home of an axis."""
-        return self._carry_out(lambda number: say.Home(number, axis))
+        """Find the home of an axis. The rig has to be armed again after it."""
+        return self._arrived(lambda number: say.Home(number, axis))
 
     def wait(self, seconds: float) -> None:
         """Wait while nothing moves."""
@@ -175,7 +176,14 @@ class Supervisor:
 
     def _go(self, axis: str, position: float, speed: float | None, *, retract: bool) -> say.Done:
         fastest = self._known(axis).speed if speed is None else speed
-        return self._carry_out(lambda number: say.Go(number, axis, position, fastest, retract))
+        return self._arrived(lambda number: say.Go(number, axis, position, fastest, retract))
+
+    def _arrived(self, made: Callable[[int], say.Request]) -> say.Done:
+        """Carry out a motion. Raises DriverError if it ended before its goal."""
+        done = self._carry_out(made)
+        if done.why:
+            raise DriverError(done.why)
+        return done
 
     def _known(self, axis: str) -> Axis:
         found = dict(self._task.rig.axes.items())
@@ -239,7 +247,11 @@ class Supervisor:
                 if self._ended is not None:
                     raise DriverError(f"the supervisor has ended{self._because()}")
                 now = monotonic()
-                if self._latest is not None and now - self._latest_at > _SILENT_S:
+                if (
+                    self._latest is not None
+                    and now - self._latest_at > _SILENT_S
+                    and not self._late_reports()
+                ):
                     raise DriverError(f"the supervisor has not reported for {now - self._latest_at:.1f} s")
                 if now > until:
                     raise DriverError(f"{problem}: waited for {limit:g} s")
@@ -248,6 +260,12 @@ class Supervisor:
                 self._changed.wait(min(_HEARTBEAT_S, every, max(0.0, until - now)))
                 if self._latest is not None:
                     self._send(say.Heartbeat())
+
+    def _late_reports(self) -> bool:
+        """Whether reports are there that this process has had no time to take."""
+        before = self._latest_at
+        self._changed.wait(_PATIENCE_S)
+        return self._latest_at > before
 
     @staticmethod
     def _check(state: State, why: str) -> None:
@@ -258,9 +276,8 @@ class Supervisor:
 
     def _at_rest(self) -> bool:
         report = self.report
-        return report.state in (State.STOPPED, State.FAULT) and not any(
-            axis.motor.moving for axis in report.axes.values()
-        )
+        moving = any(axis.motor.moving for axis in report.axes.values())
+        return report.state in (State.STOPPED, State.FAULT) and report.reached and not moving
 
     # The thread
 

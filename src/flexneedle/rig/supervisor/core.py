@@ -5,22 +5,26 @@ Each tick reads motors and tracker, checks both, and either sends the next targe
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from flexneedle.errors import DriverError
 from flexneedle.rig.monitor.monitor import Monitor
-from flexneedle.rig.ports import Clock, Motors, Tracker
+from flexneedle.rig.ports import Clock, Motors, MotorState, Tracker
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.checks import (
     at_home,
     motor_problem,
     position_problem,
     rest_problem,
+    rests,
     reversal_problem,
+    target_problem,
 )
 from flexneedle.rig.supervisor.drives import Drive
 from flexneedle.rig.supervisor.machine import Event, State, accepted, after
 from flexneedle.rig.supervisor.motion import Leg, Motion, beyond, leg_of, positions
+from flexneedle.rig.supervisor.trajectory import shortest
 from flexneedle.rig.supervisor.watch import Watch
 from flexneedle.rig.tracking.stage import tip_on_stage
 from flexneedle.types import Measurement
@@ -29,6 +33,9 @@ HEARTBEAT_S = 0.5
 """Longest time (s) without a message of the client during a motion."""
 
 _AGAIN_S = 0.25  # after which motors that still move are stopped again, and a lost controller is called again
+_RESTING_S = 0.5  # longest time from the first stop, besides that of slowing down, until motors must rest
+_STALL_S = 0.5  # without a tick, after which a motion under way is not taken up again
+_BACK_OFF_SHARE = 0.02  # of the range an axis moves away from its limit switch
 _HOMING_SHARE = 0.1  # of the largest speed
 _SLOWEST_SHARE = 0.01
 _HOMING_REACH = 1.1  # of the range
@@ -48,18 +55,21 @@ class Supervisor:
         self.state, self.why = State.IDLE, ""
         self._heard = self._ticked_at = now = clock.now()
         self._watch = Watch(Monitor(task.monitor, task.lateral_axes), task.stale_after, now)
-        self._read(now)
-        self._goals = self._at()
+        self._lost = False
+        self._reported: Mapping[str, float] = {}
+        self._states: Mapping[str, MotorState] = {}
+        self._read()
+        self._take_positions()
         self._motion: Motion | None = None
         self._deepest = 0.0
         self._stop_at: float | None = None  # when motors are stopped (again); None: they need not be
-        self._lost = False
+        self._stopped_at = now  # when they were first
         self._measurements: tuple[Measurement, ...] = ()
 
     @property
     def at_rest(self) -> bool:
         """Whether all motors are known to rest."""
-        return not self._lost and not any(state.moving for state in self._states.values())
+        return not self._lost and self._resting
 
     # Requests
 
@@ -81,10 +91,10 @@ class Supervisor:
                 self._home(request)
 
     def stop(self, who: str) -> None:
-        """Stop all motors."""
+        """Stop all motors, in any state: what rests may have been moved by somebody else."""
         if self.state not in (State.STOPPED, State.FAULT):
             self._enter(Event.STOP, who)
-            self._halt(who)
+        self._halt(who)
 
     def _enter(self, event: Event, why: str = "") -> None:
         """Change the state by an event that it accepts."""
@@ -117,15 +127,16 @@ class Supervisor:
         try:
             for drive in self._drives.values():
                 self._motors.power(drive.axis.channel, True)
-            self._read(self._clock.now())
+            self._read()
         except DriverError as error:
-            self._fault(str(error))
+            self._unreachable(str(error))
             return
         at = self._positions()
         if self._task.tracked and (problem := beyond(self._drives, list(at.items()))):
             self._refuse(0, f"arm: refused: {problem}")
             return
-        self._goals, self._deepest = self._at(), at["insertion"] + deepest
+        self._take_positions()
+        self._deepest = at["insertion"] + deepest
         self._enter(Event.ARM)
 
     def _step(self, step: say.Step) -> None:
@@ -134,26 +145,28 @@ class Supervisor:
             return
         if not self._allowed(Event.STEP, step.number):
             return
-        turns = {"rotation": step.roll + step.travel.get("rotation", 0.0)} if step.roll else {}
-        if problem := self._unreachable({**step.travel, **turns}):
+        spin = step.travel.get("rotation", 0.0)
+        problem = self._too_far({**step.travel, "rotation": step.roll + spin})
+        if problem := problem or self._too_far({"rotation": step.roll}):
             self._refuse(step.number, problem)
             return
         now = self._clock.now()
-        if step.expected is not None:
-            self._watch = self._watch.expecting(step.expected, now, now)
+        if step.expected is not None:  # until the travel begins the tip is where it is
+            there = replace(step.expected, end=step.expected.begin)
+            self._watch = self._watch.expecting(there, now, now).after((), now, self._tracker.status)
         if not self._watch.verdict.ok:  # still, or again: nothing moves
             self._nothing_done(step.number)
             return
         self._enter(Event.STEP)
         roll: list[tuple[Mapping[str, float], float]] = [({"rotation": step.roll}, 0.0)] if step.roll else []
         legs = [*roll, (step.travel, step.duration)]
-        self._begin(Motion(step.number, legs, self._positions(), step.expected))
+        self._begin(Motion(step.number, legs, step.expected, roll=bool(step.roll)))
 
     def _nothing_done(self, number: int) -> None:
-        now, why = self._clock.now(), self.why or str(self._watch.verdict)
+        now, why = self._clock.now(), str(self._watch.verdict) if not self._watch.verdict.ok else self.why
         self._send(say.Done(number, dict.fromkeys(self._drives, 0.0), now, now, self.state, why))
 
-    def _unreachable(self, travel: Mapping[str, float]) -> str:
+    def _too_far(self, travel: Mapping[str, float]) -> str:
         """A problem with a travel by axis: an axis that is not there, an end outside a range, or too deep; or ""."""
         moved = {name: way for name, way in travel.items() if way}
         if missing := [name for name in moved if name not in self._drives]:
@@ -173,15 +186,18 @@ class Supervisor:
             self._refuse(go.number, problem)
             return
         travel = go.position - self._goal(go.axis)
+        duration = shortest(abs(travel), go.speed, self._drives[go.axis].axis.acceleration)
         self._enter(event)
-        self._begin(Motion(go.number, [({go.axis: travel}, abs(travel) / go.speed)], self._positions()))
+        self._begin(Motion(go.number, [({go.axis: travel}, duration)]))
 
     def _misguided(self, go: say.Go) -> str:
         """A problem with a motion of one axis, or ""."""
         if go.axis not in self._drives:
             return f"the rig has no axis {go.axis}; axes: {', '.join(self._drives)}"
         drive = self._drives[go.axis]
-        if problem := beyond(self._drives, [(go.axis, go.position)]):
+        if (problem := self._too_far({go.axis: go.position - self._goal(go.axis)})) and not self._leads_back(
+            go
+        ):
             return problem
         if go.retract and not (go.axis == "insertion" and go.position <= self._goal(go.axis)):
             at = drive.shown(self._goal(go.axis))
@@ -189,6 +205,11 @@ class Supervisor:
         if not 0.0 < go.speed <= drive.axis.speed * (1.0 + 1e-9):
             return f"speed of {go.axis} = {go.speed:g}/s: must be above 0, at most {drive.axis.speed:g}/s"
         return ""
+
+    def _leads_back(self, go: say.Go) -> bool:
+        """Whether a motion of one axis ends nearer to its range than it begins, from beyond it."""
+        (low, high), now = self._drives[go.axis].axis.limits, self._goal(go.axis)
+        return now < go.position <= high if now < low else low <= go.position < now if now > high else False
 
     def _home(self, home: say.Home) -> None:
         if not self._allowed(Event.HOME, home.number):
@@ -201,26 +222,32 @@ class Supervisor:
             self._refuse(home.number, f"{home.axis}: has an absolute encoder, and no home to search")
             return
         self._enter(Event.HOME)
-        if drive.axis.home == "here":
-            motion = Motion(home.number, [], self._positions(), unlimited=True)
-            self._set_home(motion, drive)
-        else:
+        self._motion = motion = Motion(home.number, [], unlimited=True)
+        if drive.axis.to_home and not at_home(drive, self._states[drive.axis.channel]):
             low, high = drive.axis.limits
             travel = drive.axis.to_home * _HOMING_REACH * (high - low)
-            leg = {home.axis: travel}, abs(travel) / (_HOMING_SHARE * drive.axis.speed)
-            motion = Motion(home.number, [leg], self._positions(), home=drive, unlimited=True)
-        self._begin(motion)
+            motion.legs, motion.home = [self._slowly(drive, travel)], drive
+        else:  # where it is, or at the switch already
+            self._set_home(motion, drive)
+        self._next_leg(self._clock.now())
+
+    def _slowly(self, drive: Drive, travel: float) -> tuple[Mapping[str, float], float]:
+        """The leg of a travel (mm or rad) at the speed of homing."""
+        axis = drive.axis
+        return {drive.name: travel}, shortest(abs(travel), _HOMING_SHARE * axis.speed, axis.acceleration)
 
     def _begin(self, motion: Motion) -> None:
         """Begin a motion at once, not at the next tick."""
-        self._motion = motion
+        self._motion, self._ticked_at = motion, self._clock.now()
         self._next_leg(self._clock.now())
 
     # Ticks
 
     def tick(self) -> None:
         """Read motors and tracker, check, and send targets or stop."""
-        self._ticked_at = now = self._clock.now()
+        before, now = self._ticked_at, self._clock.now()
+        self._ticked_at = now
+        self._after_stall(now - before)
         self._measure(now)
         self._check_motors(now)
         self._check_client(now)
@@ -238,9 +265,18 @@ class Supervisor:
             for name, drive in self._drives.items()
         }
         times = late, work, missed
-        return say.Report(
-            self._ticked_at, self.state, self.why, axes, measurements, self._tracker.status, *times
-        )
+        head = self._ticked_at, self.state, self.why, axes, measurements, self._tracker.status
+        return say.Report(*head, not self._lost, *times)
+
+    def _after_stall(self, seconds: float) -> None:
+        """Ticks were late: the motors have stopped, or soon will, and a motion goes on from there, not from where it
+        would be by now."""
+        leg = None if self._motion is None else self._motion.leg
+        if leg is None or seconds <= self._queue:
+            return
+        if seconds > _STALL_S:
+            self.stop(f"no tick for {seconds:.2f} s, limit {_STALL_S:g} s")
+        leg.begun += seconds
 
     def _measure(self, now: float) -> None:
         task = self._task
@@ -266,15 +302,16 @@ class Supervisor:
     def _check_motors(self, now: float) -> None:
         if self._lost:
             return
-        before, seconds = self._states, now - self._read_at
+        before, read_at = self._states, self._read_at
         try:
-            self._read(now)
+            self._read()
         except DriverError as error:
-            self._lost = True
-            self._fault(str(error))
+            self._unreachable(str(error))
             return
         if self.state in _UNCHECKED:
+            self._check_rest(now)
             return
+        seconds = self._read_at - read_at
         for drive in self._drives.values():
             channel = drive.axis.channel
             state, last = self._states[channel], before[channel]
@@ -286,15 +323,38 @@ class Supervisor:
             leg = None if self._motion is None or self._stop_at is not None else self._motion.leg
             if not problem and leg is not None and channel in leg.drives:
                 problem = reversal_problem(drive, state, last, leg.way(channel))
+                problem = problem or target_problem(
+                    drive, state, leg.trajectory.start[channel], leg.sent[channel]
+                )
             elif not problem and self._stop_at is None:
                 problem = rest_problem(drive, state, self._goals[channel])
             if problem:
                 self._fault(problem)
                 return
 
-    def _read(self, now: float) -> None:
-        self._states = dict(self._motors.read())
-        self._read_at = 0.5 * (now + self._clock.now())
+    def _check_rest(self, now: float) -> None:
+        """After a stop or a fault motors rest; one that is moved by somebody else is stopped again."""
+        moving = any(state.moving for state in self._states.values())
+        if moving and self._stop_at is None and self.state is not State.IDLE:
+            self._halt(self.why)
+
+    def _read(self) -> None:
+        begun, before = self._clock.now(), self._states
+        self._states = states = dict(self._motors.read())
+        self._read_at = 0.5 * (begun + self._clock.now())
+        self._resting = all(
+            rests(
+                drive, states[drive.axis.channel], before.get(drive.axis.channel, states[drive.axis.channel])
+            )
+            for drive in self._drives.values()
+        )
+
+    def _unreachable(self, why: str) -> None:
+        """The motors cannot be read or commanded: a fault, and they are stopped as soon as they can be."""
+        self._lost = True
+        self._fault(why)
+        if self._stop_at is None:
+            self._stop_at = self._stopped_at = self._clock.now()
 
     def _check_client(self, now: float) -> None:
         silent, limit = now - self._heard, self._task.rig.loop.decision_limit_s
@@ -312,7 +372,8 @@ class Supervisor:
         """Stop the motors now, and end the motion under way once they rest."""
         if self._motion is not None:
             self._motion.why = self._motion.why or why
-        self._stop_at = self._clock.now()
+        self._stop_at = self._stopped_at = self._clock.now()
+        self._watch = self._watch.at_rest(self._stop_at)
         self._stop_motors(self._stop_at)
 
     def _stop_motors(self, now: float) -> None:
@@ -322,10 +383,13 @@ class Supervisor:
         if now < self._stop_at:
             if self.at_rest:
                 self._stop_at = None
-                self._goals = self._at()
                 self._finish(now)
+                self._goals = self._at()
             return
         self._stop_at = now + _AGAIN_S
+        if now - self._stopped_at > _RESTING_S + self._slowing:
+            self._fault("the motors do not stop")
+            self._finish(now)
         try:
             if self._lost:
                 self._motors.reconnect()
@@ -335,6 +399,11 @@ class Supervisor:
             self._lost = True
             self._fault(str(error))
             self._finish(now)
+
+    @property
+    def _slowing(self) -> float:
+        """Longest time (s) in which an axis slows down from its largest speed."""
+        return max(drive.axis.speed / drive.axis.acceleration for drive in self._drives.values())
 
     # Motions
 
@@ -362,7 +431,7 @@ class Supervisor:
                 self._motors.set_speed(channel, max(speed, slowest), axis.acceleration * abs(axis.scale))
             self._motors.follow(leg.targets(now, self._queue))
         except DriverError as error:
-            self._fault(str(error))
+            self._not_followed(motion, str(error))
 
     def _go_on(self, motion: Motion, leg: Leg, now: float) -> None:
         """Send the next targets, or go on to the next leg."""
@@ -392,7 +461,7 @@ class Supervisor:
         self._fault(why)
 
     def _end_leg(self, motion: Motion, leg: Leg, now: float) -> None:
-        motion.spans.append(leg.span())
+        motion.spans.append(leg.span(now, done=True))
         self._goals |= leg.trajectory.goal
         motion.leg = None
         self._next_leg(now)
@@ -403,31 +472,49 @@ class Supervisor:
         if motion is None:
             return
         if motion.leg is not None:
-            motion.spans.append(motion.leg.span())
+            motion.spans.append(motion.leg.span(now, done=False))
+        # From where the motion before was reported to have ended, so that what motors settle since then counts, too.
         at = self._positions()
-        travelled = {name: at[name] - motion.origin[name] for name in at}
+        travelled = {name: at[name] - self._reported[name] for name in at}
+        self._reported = at
+        if motion.released is not None and not motion.why:
+            motion.why = self._still_at_switch(motion.released)
         if self.state in (State.HOMING, State.JOGGING, State.RETRACTING):
             self._enter(Event.ARRIVED)
         begun, ended, turned = motion.times(now)
         self._send(say.Done(motion.number, travelled, begun, ended, self.state, motion.why, turned))
+
+    def _still_at_switch(self, drive: Drive) -> str:
+        """A problem with a limit switch that is active away from it, or ""."""
+        if at_home(drive, self._states[drive.axis.channel]):
+            return f"{drive.name}: the {drive.axis.home} switch is still active away from it"
+        return ""
 
     def _set_home(self, motion: Motion, drive: Drive) -> None:
         """Call the present position of an axis its home; from beyond its range it then moves into that."""
         drive, home = self._drives[drive.name], drive.axis.at_home
         try:
             self._motors.define(drive.axis.channel, drive.counts(home))
-            self._read(self._clock.now())
+            self._read()
         except DriverError as error:
-            self._fault(str(error))
+            self._unreachable(str(error))
             return
-        self._goals = self._at()
-        low, high = drive.axis.limits
-        into = min(max(home, low), high) - home
-        motion.legs = [({drive.name: into}, abs(into) / (_HOMING_SHARE * drive.axis.speed))]
+        self._take_positions()
+        if drive.axis.to_home:
+            low, high = drive.axis.limits
+            into = min(max(home, low), high) - home - drive.axis.to_home * _BACK_OFF_SHARE * (high - low)
+            motion.legs, motion.released = [self._slowly(drive, into)], drive
+
+    def _take_positions(self) -> None:
+        """Take where the motors are as where they were sent, and as reported."""
+        self._goals, self._reported = self._at(), self._positions()
 
     def _at(self) -> dict[str, float]:
-        """Measured positions of the motors (counts) by channel."""
-        return {channel: state.position for channel, state in self._states.items()}
+        """Where the motors rest (counts) by channel: a servo that lags still moves to where its controller has it."""
+        return {
+            channel: state.commanded if state.on else state.position
+            for channel, state in self._states.items()
+        }
 
     def _goal(self, name: str) -> float:
         """Where an axis was last sent, or where it was when it last was stopped (mm or rad)."""

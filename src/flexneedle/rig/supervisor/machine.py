@@ -38,7 +38,8 @@ TABLE: dict[tuple[State, Event], State] = {
     (State.ARMED, Event.JOG): State.JOGGING,
     (State.ARMED, Event.RETRACT): State.RETRACTING,
     (State.ARMED, Event.STEP): State.INSERTING,
-    (State.HOMING, Event.ARRIVED): State.ARMED,
+    (State.ARMED, Event.ARM): State.ARMED,
+    (State.HOMING, Event.ARRIVED): State.IDLE,  # positions are others now, and with them what armed has taken
     (State.JOGGING, Event.ARRIVED): State.ARMED,
     (State.RETRACTING, Event.ARRIVED): State.ARMED,
     (State.INSERTING, Event.STEP): State.INSERTING,

@@ -6,8 +6,12 @@ from statistics import fmean
 _LOW, _HIGH, _FEWEST, _LEAST_SPREAD = 0.05, 0.95, 3, 0.2
 
 
-def span(samples: Sequence[tuple[float, float]], begun: float, ended: float) -> tuple[float, float]:
+def span(
+    samples: Sequence[tuple[float, float]], begun: float, ended: float, last: float = 1.0
+) -> tuple[float, float]:
     """Begin and end (s) of the motion at constant speed that fits best to samples (time in s, share of the way).
+
+    last: share at which it ended.
 
     A motor accelerates and slows down, so that a tip at constant speed from the command on would be ahead of it and
     then behind. begun, ended: the times returned where too few samples are on the way.
@@ -19,4 +23,4 @@ def span(samples: Sequence[tuple[float, float]], begun: float, ended: float) -> 
     varied = sum((one - share) ** 2 for _, one in way)
     slope = sum((at - time) * (one - share) for at, one in way) / varied  # s for the whole way
     first = time - slope * share
-    return first, first + slope
+    return first, first + slope * last

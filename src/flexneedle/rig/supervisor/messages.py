@@ -158,7 +158,8 @@ class Report:
     """What one tick found.
 
     time: of the tick (s); state, why: of the rig, and the reason of a stop, hold or fault; axes: by name;
-    measurements: since the last report, oldest first; tracker: its status; late, work: how much later than scheduled
+    measurements: since the last report, oldest first; tracker: its status; reached: whether the motors could be read;
+    late, work: how much later than scheduled
     the tick began, and how long it took (s); missed: ticks left out since the start.
     """
 
@@ -168,6 +169,7 @@ class Report:
     axes: Mapping[str, AxisState] = field(default_factory=dict)
     measurements: tuple[Measurement, ...] = ()
     tracker: str = ""
+    reached: bool = True
     late: float = 0.0
     work: float = 0.0
     missed: int = 0

@@ -22,10 +22,12 @@ class Leg:
     trajectory: Trajectory
     begun: float
     samples: list[tuple[float, float]] = field(default_factory=list)
+    sent: Mapping[str, float] = field(default_factory=dict)
 
-    def targets(self, now: float, ahead: float) -> dict[str, float]:
-        """Where the motors shall go now (counts by channel): where they shall be `ahead` s later."""
-        return self.trajectory.at(now - self.begun + ahead)
+    def targets(self, now: float, ahead: float) -> Mapping[str, float]:
+        """Where the motors shall go now (counts by channel): where they shall be `ahead` s later. Kept as `sent`."""
+        self.sent = self.trajectory.at(now - self.begun + ahead)
+        return self.sent
 
     def note(self, states: Mapping[str, MotorState], now: float) -> None:
         """Keep how much of the way is done, by the motor with the longest."""
@@ -62,26 +64,30 @@ class Leg:
             for name, drive in self.drives.items()
         )
 
-    def span(self) -> tuple[float, float]:
-        """When it began and ended, as measured (s)."""
-        ramp = 0.5 * self.trajectory.ramp
-        return span(self.samples, self.begun + ramp, self.begun + self.trajectory.duration - ramp)
+    def span(self, now: float, done: bool) -> tuple[float, float]:
+        """When it began and ended, as measured (s). done: whether it reached its goal; else it ended by now."""
+        ramp, duration = 0.5 * self.trajectory.ramp, self.trajectory.duration
+        last = 1.0 if done or not self.samples else self.samples[-1][1]
+        begun, ended = span(self.samples, self.begun + ramp, self.begun + duration - ramp, last)
+        return min(begun, now), min(ended, now)
 
 
 @dataclass
 class Motion:
     """A motion of one request: legs still to come as (travel by axis, duration), the present leg, and what was done.
 
-    origin: positions of all axes at its begin; expected: of the tip; spans: begin and end of each leg that is done;
-    home: the axis whose home is searched, or None; unlimited: positions count from nowhere yet, or the axis comes from
-    its home beyond its range; why: why it ends before its goal, or "".
+    expected: of the tip; roll: whether the first leg is a roll alone; spans: begin and end of each leg that is done;
+    home: the axis whose home is searched, or None; released: the axis that leaves the switch of its home, or None;
+    unlimited: positions count from nowhere yet, or the axis comes from its home beyond its range; why: why it ends
+    before its goal, or "".
     """
 
     number: int
     legs: list[tuple[Mapping[str, float], float]]
-    origin: Mapping[str, float]
     expected: Expectation | None = None
+    roll: bool = False
     home: Drive | None = None
+    released: Drive | None = None
     unlimited: bool = False
     leg: Leg | None = None
     spans: list[tuple[float, float]] = field(default_factory=list)
@@ -89,8 +95,8 @@ class Motion:
 
     @property
     def rolls(self) -> bool:
-        """Whether the needle is rolled alone, before the travel."""
-        return bool(self.legs) and self.leg is not None
+        """Whether the needle is rolled alone now, before the travel."""
+        return self.roll and not self.spans
 
     def times(self, now: float) -> tuple[float, float, float | None]:
         """When it began and ended, and when the travel began after a roll (None: no roll) (s).
@@ -100,7 +106,9 @@ class Motion:
         if not self.spans:
             return now, now, None
         begun, ended = self.spans[0][0], self.spans[-1][1]
-        return begun, ended, self.spans[-1][0] if len(self.spans) > 1 else None
+        if not self.roll:
+            return begun, ended, None
+        return begun, ended, self.spans[1][0] if len(self.spans) > 1 else ended
 
 
 def leg_of(
@@ -132,10 +140,13 @@ def positions(drives: Mapping[str, Drive], states: Mapping[str, MotorState]) -> 
 
 
 def beyond(drives: Mapping[str, Drive], ends: Sequence[tuple[str, float]]) -> str:
-    """A problem with the first of these positions by axis that is outside the axis's range, or ""."""
+    """A problem with the first of these positions by axis that is outside the axis's range, or "".
+
+    By less than the tolerance of a goal it is not: a motor may rest there.
+    """
     for name, position in ends:
-        low, high = drives[name].axis.limits
-        if not low - 1e-9 <= position <= high + 1e-9:
+        (low, high), tolerance = drives[name].axis.limits, drives[name].axis.tolerance
+        if not low - tolerance <= position <= high + tolerance:
             shown = drives[name].shown
             return f"{name} = {shown(position)}: must be within {shown(low)} and {shown(high)}"
     return ""

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from flexneedle.rig.supervisor.drives import Drive
-from flexneedle.scenario.rig import Axis
 
 _SHORTEST_S = 1e-3
 _ROUNDING = 1e-9
@@ -61,7 +60,8 @@ def between(
         (abs((goal[channel] - start[channel]) / drive.axis.scale), drive.axis)
         for channel, drive in drives.items()
     ]
-    total = max(duration, _SHORTEST_S, *(_fastest(travel, axis) for travel, axis in travels))
+    fastest = (shortest(travel, axis.speed, axis.acceleration) for travel, axis in travels)
+    total = max(duration, _SHORTEST_S, *fastest)
     ramp = 0.5 * total
     for _ in range(_ROUNDS):
         ramp = max(_SHORTEST_S / 4, *(_ramp(travel, axis.acceleration, total) for travel, axis in travels))
@@ -72,11 +72,11 @@ def between(
     return Trajectory(dict(start), dict(goal), total, ramp)
 
 
-def _fastest(travel: float, axis: Axis) -> float:
-    """Shortest duration (s) of one axis alone."""
-    if travel > axis.speed**2 / axis.acceleration:
-        return travel / axis.speed + axis.speed / axis.acceleration
-    return 2.0 * math.sqrt(travel / axis.acceleration)
+def shortest(travel: float, speed: float, acceleration: float) -> float:
+    """Shortest duration (s) of a travel with this largest speed and acceleration."""
+    if travel > speed**2 / acceleration:
+        return travel / speed + speed / acceleration
+    return 2.0 * math.sqrt(travel / acceleration)
 
 
 def _ramp(travel: float, acceleration: float, duration: float) -> float:

@@ -14,8 +14,7 @@ from flexneedle.types import OK, VISIBLE, Measurement, Point, Verdict, VerdictKi
 class Watch:
     """The monitor, what is expected from `begun` to `ended` (s) and at rest before and after, and the last verdict.
 
-    Frozen: `after` returns the next one. since: when the tracker was first watched, from which no reading counts as
-    missing.
+    Frozen: `after` returns the next one. since: when the newest readings came, at first when it began to watch.
     """
 
     monitor: Monitor
@@ -37,6 +36,13 @@ class Watch:
         again = rules.innovation(tuple(place[:axes]), expected.begin[:axes], expected.most_off)
         return replace(watch, verdict=again)
 
+    def at_rest(self, now: float) -> "Watch":
+        """With the needle stopped where it is expected now."""
+        if self.expected is None:
+            return self
+        here = self._tip_at(now)
+        return replace(self, expected=replace(self.expected, begin=here, end=here))
+
     def after(self, measurements: Sequence[Measurement], now: float, status: str) -> "Watch":
         """After the readings of a tick, oldest first. status: of the tracker."""
         if self.expected is None:
@@ -49,7 +55,7 @@ class Watch:
         if measurements:
             monitor, field = monitor.check_field()
             verdict = field if not field.ok else verdict
-            return replace(self, monitor=monitor, verdict=verdict, newest=measurements[-1])
+            return replace(self, monitor=monitor, verdict=verdict, newest=measurements[-1], since=now)
         return replace(self, verdict=self._without(now, status))
 
     def _before(self, measurements: Sequence[Measurement], now: float) -> "Watch":
@@ -64,13 +70,11 @@ class Watch:
         return self
 
     def _without(self, now: float, status: str) -> Verdict:
-        """The verdict of a tick without a new reading: the one before, until the last good reading is stale."""
-        good = self.monitor.good
-        last = self.since if good is None else max(good.time, self.since)
-        if not self.verdict.ok or now - last <= self.stale_after:
+        """The verdict of a tick without a new reading: the one before, until the last one came too long ago."""
+        if not self.verdict.ok or now - self.since <= self.stale_after:
             return self.verdict
         reason = "" if status == VISIBLE else f" ({status})"
-        return Verdict(VerdictKind.MISSING, f"no reading for {now - last:.2f} s{reason}")
+        return Verdict(VerdictKind.MISSING, f"no reading for {now - self.since:.2f} s{reason}")
 
     def _tip_at(self, time: float) -> Point:
         if self.expected is None:
