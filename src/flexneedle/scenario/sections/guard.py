@@ -13,7 +13,7 @@ class GuardSettings(Section):
     least_stretch: Annotated[float, Field(gt=0, lt=1)] | None = None
     """Least stretch λ of the tissue along the needle. Not set: in each layer that at 19/20 of the compression at which
     its law ends, 0.335 for `ogden`."""
-    needle_strain_percent: Annotated[float, Field(gt=0, le=100)] = 0.5
+    needle_strain_percent: Annotated[float, Field(gt=0, le=100)] = 0.7
     """Largest strain of the needle's surface by bending, to which the guide's force contributes most."""
     guide_force_n: Positive | None = None
     """Largest force between guide and needle. Not set: that which strains the needle to `needle_strain_percent`."""
