@@ -73,8 +73,8 @@ def test_a_roll_that_takes_time_is_a_move_of_its_own():
     assert (travel.begun, travel.ended, travel.applied) == (1.6, 2.0, AHEAD)
     assert roll.is_roll
     assert not travel.is_roll
-    at_once = Motion(TURN, 1.0, 2.0)
-    assert Move.parts_of(at_once) == (Move.of(at_once),)
+    for whole in (Motion(TURN, 1.0, 2.0), Motion(AHEAD, 1.0, 2.0, turned=1.0)):
+        assert Move.parts_of(whole) == (Move.of(whole),) == (Move(1.0, 2.0, whole.control),)
 
 
 @pytest.mark.parametrize(

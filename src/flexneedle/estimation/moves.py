@@ -118,12 +118,13 @@ class Move:
     @staticmethod
     def of(motion: Motion) -> "Move":
         """A motion before its readings."""
-        return Move(motion.begun, motion.ended, motion.control, turned=motion.turned)
+        turned = motion.turned if motion.control.roll != 0.0 else None
+        return Move(motion.begun, motion.ended, motion.control, turned=turned)
 
     @staticmethod
     def parts_of(motion: Motion) -> "tuple[Move, ...]":
         """The roll and the travel of a motion, if the roll took time, as moves of their own."""
-        if motion.turned is None:
+        if motion.turned is None or motion.control.roll == 0.0:
             return (Move.of(motion),)
         roll, travel = Control(roll=motion.control.roll), motion.control._replace(roll=0.0)
         return Move(motion.begun, motion.turned, roll), Move(motion.turned, motion.ended, travel)

@@ -29,8 +29,8 @@ class Driver(Protocol):
         time of its own: the travel begins only once the roll has arrived. Base, guide and spin then move together, each
         evenly over the `duration`, which is that of the slowest axis, never 0. Returns when all axes are at rest.
 
-        The `Motion` has the control as it was carried out, and times on the clock of the run: `begun`, before which, and
-        `ended`, after which nothing moved; `turned` (None without a roll), when the roll had arrived and the travel
+        The `Motion` has the control as it was carried out, and times on the clock of the run: `begun`, before which,
+        and `ended`, after which nothing moved; `turned` (None without a roll), when the roll had arrived and the travel
         began. So readings are compared with a needle that rests until `begun`, rolls until `turned`, and travels until
         `ended`. Raises DriverError if the command is not carried out, CommandError if it exceeds a limit.
         """

@@ -13,9 +13,9 @@ class GuardSettings(Section):
     least_stretch: Annotated[float, Field(gt=0, lt=1)] | None = None
     """Least stretch λ of the tissue along the needle. Not set: in each layer that at 19/20 of the compression at which
     its law ends, 0.335 for `ogden`."""
-    needle_strain_percent: Annotated[float, Field(gt=0, le=100)] = 0.5
-    """Largest strain of the needle's surface by bending, to which the guide's force contributes most."""
+    needle_strain_percent: Annotated[float, Field(gt=0, le=100)] = 1.0
+    """Largest strain of the needle's surface by bending."""
     guide_force_n: Positive | None = None
-    """Largest force between guide and needle. Not set: that which strains the needle to `needle_strain_percent`."""
+    """Largest force between guide and needle. Not set: limited by `needle_strain_percent` alone."""
     past_target_mm: Positive = 2.0
     """Largest distance of the tip past the target, along the insertion axis."""
