@@ -138,6 +138,11 @@ class Started:
         out, errors = self.process.communicate(timeout=seconds)
         return self.process.returncode, out, errors.splitlines()
 
+    def end_followed_by(self, peer):
+        """The same, while a peer takes what is published."""
+        until(lambda: list(map(peer.received, peer.readers)) and self.process.poll() is not None, 60.0)
+        return self.end()
+
     @property
     def stored(self):
         """The values of `run.json`."""

@@ -131,7 +131,7 @@ def test_a_dry_run_takes_its_target_from_ros_and_has_the_trace_of_a_simulated_ru
         until(lambda: "waits for target" in str(peer.received("diagnostics")), 60.0)
         peer.send("target", target(time.time(), (0.005, 0.001, 0.0), frame="map"))  # refused
         peer.send("target", target(time.time() + 1.0, (0.005, 0.001, 0.0)))
-        status, _, errors = insertion.end()
+        status, _, errors = insertion.end_followed_by(peer)
         shapes = peer.received("shape")
     assert status in (0, 1), errors
     aim = insertion.stored["scenario"]["target"]
@@ -153,7 +153,7 @@ def test_a_dry_run_takes_its_target_from_ros_and_has_the_trace_of_a_simulated_ru
 
     with started(other, NEUTRAL, "--ros", "neutral") as simulated:
         peer = simulated.peer(("state", *STREAMED, "plan"))
-        simulated.end()
+        simulated.end_followed_by(peer)
     assert {one.data for one in peer.received("state")} >= {"inserting", "idle"}
     assert len(peer.received("shape")) > 3
     assert len(peer.received("plan")) == 1
@@ -177,7 +177,7 @@ def test_a_target_out_of_reach_is_refused_as_on_the_command_line(tmp_path):
         peer.send("target", target(time.time(), (0.5, 0.0, 0.0)))
         status, _, errors = insertion.end()
     assert status == 2
-    assert errors[-1].startswith("flexneedle: target.depth_mm = 500: must be at most")
+    assert errors[-1].startswith("flexneedle: target.depth_mm = 500.0: beyond the stroke")
     assert not insertion.out.exists()
 
 
