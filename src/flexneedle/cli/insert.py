@@ -155,11 +155,11 @@ def _bridge(args: argparse.Namespace, choices: Choices, stack: ExitStack) -> Bri
 
 
 def _ros(args: argparse.Namespace, choices: Choices) -> RosSettings | None:
-    """The settings of --ros or of the rig file. Raises InputError for both."""
-    from flexneedle.scenario.rig import RosSettings
+    """The settings of --ros or of the rig file. Raises InputError for both, RigError for a name that is none."""
+    from flexneedle.scenario.rig import RosSettings, settings_of
 
     if choices.rig is None:
-        return None if args.ros is None else RosSettings(profile=args.ros)
+        return None if args.ros is None else settings_of(RosSettings, {"profile": args.ros})
     if args.ros is not None:
         raise InputError("--ros: not with --rig, whose file has a section [ros] for it")
     return choices.rig.ros

@@ -1,0 +1,161 @@
+"""Insertions on a rig in memory, in real time and in a process of their own, for ROS nodes that follow and stop them."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic
+
+import psutil
+import tomli_w
+
+import flexneedle
+from emulated import DEADLINE_S, until
+from flexneedle.rig.devices.clock import WallClock
+from flexneedle.scenario.files import dump_scenario
+from flexneedle.types import Frame, SensorReading
+from ros_peers import Peer
+from stages import RIG, Stage
+
+TESTS = Path(__file__).parent
+START_MM = flexneedle.load_scenario("phantom").setup.start_tip_x
+QUICK = {
+    "target.depth_mm": 6.0, "target.lateral_mm": 0.0, "plan.samples": 16, "plan.iterations": 2,
+    "monitor.references": 0, "plan.max_iterations": 2, "needle.nodes": 15, "phantom.element_mm": 5.0, "phantom.contact_spacing_mm": 2.0,
+}  # fmt: skip
+
+
+class Noting(Stage):
+    """Motors in memory that write a line for each call that switches, moves or stops them: what, when, where."""
+
+    made = None
+
+    def __init__(self, file, channels):
+        self._file = open(file, "a")  # noqa: SIM115  closed with the motors
+        super().__init__(WallClock(), channels)
+        Noting.made = self
+
+    def _called(self, *call):
+        super()._called(*call)
+        if call[0] in ("power", "follow", "stop"):
+            self._write(call[0])
+
+    def _write(self, what):
+        at = {channel: motor.position for channel, motor in self.motors.items()}
+        self._file.write(f"{json.dumps([what, monotonic(), at])}\n")
+        self._file.flush()
+
+    def close(self):
+        self._up_to_now()
+        self._write("close")
+        self._file.close()
+
+
+def motors(settings, channels):
+    """The driver `ros_rig:motors`. notes: the file of the lines."""
+    return Noting(settings["notes"], channels)
+
+
+class Tip:
+    """The tracker `ros_rig:Tip`: the tip of a needle that no tissue bends."""
+
+    status = "ok"
+
+    def __init__(self, _settings, clock):
+        self.clock, self.number = clock, 0
+
+    def read(self):
+        due = int(self.clock.now() * 40.0)
+        if Noting.made is None or due <= self.number:
+            return ()
+        self.number = due
+        x = START_MM + Noting.made.motors["A"].position / 1000.0
+        noise = 1e-3 * (due % 7)
+        return (Frame(self.clock.now(), due, {"tip": SensorReading((x, noise, 0.0))}),)
+
+    def close(self):
+        pass
+
+
+class Started:
+    """An insertion in a process of its own. Peers are made by `peer`."""
+
+    def __init__(self, folder, profile, *options, ros):
+        self.folder, self.profile, self.notes = folder, profile, folder / "notes"
+        scenario, self.out = folder / "quick.toml", folder / "out"
+        scenario.write_text(dump_scenario(flexneedle.load_scenario("phantom").with_values(QUICK)))
+        command = [sys.executable, "-m", "flexneedle", "insert", str(scenario), "--force"]
+        if ros is not None:
+            rig = folder / "rig.toml"
+            parts = {"driver": {"kind": "ros_rig:motors", "notes": str(self.notes)}, "ros": ros}
+            rig.write_text(tomli_w.dumps(RIG | parts | {"tracker": {"kind": "ros_rig:Tip"}}))
+            command += ["--rig", str(rig)]
+        self.process = subprocess.Popen(
+            [*command, "--out", str(self.out), *options],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=TESTS,
+            start_new_session=True,
+        )
+
+    def peer(self, publish=("state",), subscribe=("stop",)):
+        """A ROS node that the insertion's node has found on these topics."""
+        peer = Peer(self.profile, publish=publish, subscribe=subscribe)
+
+        def found():
+            return all(one.writers for one in peer.readers.values()) and all(
+                one.readers for one in peer.writers.values()
+            )
+
+        until(lambda: found() or self.over, 60.0)
+        return peer
+
+    @property
+    def over(self):
+        assert self.process.poll() is None, self.process.communicate()[1]
+        return False
+
+    def until_state(self, peer, state):
+        """Wait until the rig reports a state."""
+        until(lambda: state in [one.data for one in peer.received("state")], 60.0)
+
+    def calls(self, *wanted):
+        """The calls of the motors with these names: (what, when, where)."""
+        lines = self.notes.read_text().splitlines() if self.notes.exists() else []
+        return [call for call in map(json.loads, lines) if call[0] in wanted]
+
+    def node(self):
+        """The process of the insertion's node."""
+        children = psutil.Process(self.process.pid).children()
+        return next(child for child in children if "flexneedle.ros.node" in child.cmdline())
+
+    def end(self, seconds=60.0):
+        """Wait for its end; return exit status, stdout and the lines of stderr."""
+        out, errors = self.process.communicate(timeout=seconds)
+        return self.process.returncode, out, errors.splitlines()
+
+    def end_followed_by(self, peer):
+        """The same, while a peer takes what is published."""
+        until(lambda: list(map(peer.received, peer.readers)) and self.process.poll() is not None, 60.0)
+        return self.end()
+
+    @property
+    def stored(self):
+        """The values of `run.json`."""
+        return json.loads((self.out / "run.json").read_text())
+
+
+@contextmanager
+def started(folder, profile, *options, ros=None):
+    """Start an insertion: on the rig in memory with a section `ros`, None: a virtual one."""
+    made = Started(folder, profile, *options, ros=ros)
+    try:
+        yield made
+    finally:
+        if made.process.poll() is None:
+            os.killpg(made.process.pid, signal.SIGKILL)
+            made.process.communicate(timeout=DEADLINE_S)
