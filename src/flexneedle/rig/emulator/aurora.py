@@ -254,7 +254,7 @@ def _search(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
 def _request(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     handle = max(aurora.ports, default=_FIRST_HANDLE - 1) + 1
     if handle > _LAST_HANDLE:
-        raise _Refusal("10")
+        raise _Refusal("2D")
     port = Port(0, None)
     return replace(aurora, ports={**aurora.ports, handle: port}), codec.text(f"{handle:02X}")
 
