@@ -29,6 +29,7 @@ from flexneedle.types import VISIBLE, Frame
 READ_S, CLOSE_S, OPEN_S, RECOVERY_S = 0.5, 8.0, 60.0, 60.0  # longest times of a call; the machine may be busy
 RESET_AFTER_S = 0.4  # without commands: as the reply to a serial break, which a pseudo-terminal does not have
 REPORTED_S = 0.5
+ROW = 42  # bytes of a measured sensor in a reply to BX
 BYTES = b" -0123456789,.:\"[]{}\r\nERORabcdef\x00\x7f\x80\xa5\xc4\xff"
 Point = tuple[float, ...]
 Damage = Callable[[bytes], bytes]
@@ -118,14 +119,14 @@ def _rounded(position: Point) -> Point:
 
 
 def _recomputed(random: Random, true: bytes) -> bytes:
-    """A reply to BX whose checksum is right, with other values: of a tracker that is out of order."""
-    if decoded(true) is None:
+    """A reply to BX whose checksum is right, with other values in its rows: of a tracker that is out of order."""
+    if not decoded(true):
         return mutated(random, true)
     body = bytearray(true[6:-2])
     for _ in range(random.randint(1, 4)):
-        at = random.randrange(len(body))
+        at = 1 + ROW * random.randrange(len(body) // ROW) + random.randint(2, ROW - 4)
         new = random.choice((b"\xff" * 4, b"\0" * 4, b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", random.randbytes(4)))
-        body[at : at + 4] = new[: len(body) - at]
+        body[at : at + 4] = new
     return codec.binary(bytes(body))
 
 
