@@ -48,11 +48,12 @@ FAULTS = {
 }
 """The kinds of fault of the tracker; their times are since tracking first began."""
 
-_FIRST_HANDLE = 0x0A
+_FIRST_HANDLE, _LAST_HANDLE = 0x0A, 0xFF
 _OCCUPIED, _INITIALIZED, _ENABLED = 0x01, 0x10, 0x20
 _OUT_OF_VOLUME, _PARTLY_OUT, _BROKEN = 0x40, 0x80, 0x100
 _VALID, _MISSING, _DISABLED = 1, 2, 4
 _TRANSFORMS, _ALSO_OUT_OF_VOLUME = 0x0001, 0x0800
+_DIGITS = frozenset("0123456789abcdefABCDEF")
 _OFF, _SETUP, _TRACKING = "off", "setup", "tracking"
 
 
@@ -149,10 +150,9 @@ def _options(arguments: str) -> int:
 def _hexadecimal(digits: str, length: int) -> int:
     if len(digits) < length:
         raise _Refusal("03")
-    try:
-        return int(digits[:length], 16)
-    except ValueError:
-        raise _Refusal("23") from None
+    if not set(digits[:length]) <= _DIGITS:
+        raise _Refusal("23")
+    return int(digits[:length], 16)
 
 
 # Commands in any mode
@@ -172,6 +172,12 @@ def _reset(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
 
 def _okay(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     return aurora, codec.text("OKAY")
+
+
+def _echo(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
+    if not arguments.isascii():
+        raise _Refusal("23")
+    return aurora, codec.text(arguments)
 
 
 def _beep(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
@@ -247,6 +253,8 @@ def _search(aurora: AuroraState, arguments: str) -> tuple[AuroraState, bytes]:
 
 def _request(aurora: AuroraState, _arguments: str) -> tuple[AuroraState, bytes]:
     handle = max(aurora.ports, default=_FIRST_HANDLE - 1) + 1
+    if handle > _LAST_HANDLE:
+        raise _Refusal("2D")
     port = Port(0, None)
     return replace(aurora, ports={**aurora.ports, handle: port}), codec.text(f"{handle:02X}")
 
@@ -310,7 +318,7 @@ _Handler = Callable[[AuroraState, str], tuple[AuroraState, bytes]]
 _ANYWHERE: dict[str, _Handler] = {
     "INIT": _init,
     "RESET": _reset,
-    "ECHO": lambda aurora, arguments: (aurora, codec.text(arguments)),
+    "ECHO": _echo,
     "BEEP": _beep,
     "COMM": _comm,
     "VER": _version,

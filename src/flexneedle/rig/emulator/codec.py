@@ -6,13 +6,14 @@ A command is ASCII, `NAME:argumentsCRC\\r`, or `NAME arguments\\r` without a che
 
 import struct
 from dataclasses import dataclass
-from math import isfinite
+from math import copysign, inf, isfinite, isnan
 
 from flexneedle.rig.emulator.motion import EmulatedPose
 
 _BINARY_START = 0xA5C4
 _POLYNOMIAL = 0xA001  # x^16 + x^15 + x^2 + 1, lowest bit first
 _CRC_DIGITS = 4
+_LARGEST = 3.4e38  # single precision
 
 
 def _divided(byte: int) -> int:
@@ -71,7 +72,7 @@ def binary(body: bytes) -> bytes:
 def transform_text(pose: EmulatedPose) -> str:
     """Return a pose in the format of `TX`: quaternion and indicator to 1e-4, position to 0.01 mm.
 
-    A value that is not a number, for which the format has no digits, is `nan`.
+    A value that is not a number, or for which the format has too few digits, is `nan`.
     """
     orientation = "".join(_digits(part, 10_000, 6) for part in pose.orientation)
     position = "".join(_digits(part, 100, 7) for part in pose.position)
@@ -79,9 +80,13 @@ def transform_text(pose: EmulatedPose) -> str:
 
 
 def _digits(value: float, parts: int, width: int) -> str:
-    return f"{round(value * parts):+0{width}d}" if isfinite(value) else f"{'nan':>{width}}"
+    fits = isfinite(value) and abs(round(value * parts)) < 10 ** (width - 1)
+    return f"{round(value * parts):+0{width}d}" if fits else f"{'nan':>{width}}"
 
 
 def transform_binary(pose: EmulatedPose) -> bytes:
-    """Return a pose in the format of `BX`: eight single-precision numbers."""
-    return struct.pack("<8f", *pose.orientation, *pose.position, pose.indicator)
+    """Return a pose in the format of `BX`: eight single-precision numbers; a value too large for one is infinite."""
+    values = (*pose.orientation, *pose.position, pose.indicator)
+    return struct.pack(
+        "<8f", *(value if isnan(value) or abs(value) < _LARGEST else copysign(inf, value) for value in values)
+    )

@@ -9,6 +9,8 @@ from flexneedle.rig.monitor.monitor import Monitor
 from flexneedle.rig.supervisor.messages import Expectation
 from flexneedle.types import OK, VISIBLE, Measurement, Point, Verdict, VerdictKind
 
+_NEVER = (VerdictKind.NOT_A_NUMBER, VerdictKind.STALE)  # whatever is expected
+
 
 @dataclass(frozen=True)
 class Watch:
@@ -59,14 +61,18 @@ class Watch:
         return replace(self, verdict=self._without(now, status))
 
     def _before(self, measurements: Sequence[Measurement], now: float) -> "Watch":
-        """Before the first step nothing is expected: the readings only fill the monitor's windows."""
-        monitor = self.monitor
+        """Before the first step nothing is expected: the readings fill the monitor's windows.
+
+        Only a newest reading that is not a number, repeated or stale is rejected, so that a step does not begin on it.
+        """
+        monitor, verdict = self.monitor, OK
         for one in measurements:
             at = tuple(value or 0.0 for value in (one.x, one.y, one.z))
-            monitor, _ = monitor.check(one, lambda _, at=at: at, now, self.stale_after, math.inf)  # type: ignore[misc]
+            monitor, verdict = monitor.check(one, lambda _, at=at: at, now, self.stale_after, math.inf)  # type: ignore[misc]
         if measurements:
             monitor, _ = monitor.check_field()
-            return replace(self, monitor=monitor, newest=measurements[-1], since=now)
+            verdict = verdict if verdict.kind in _NEVER else OK
+            return replace(self, monitor=monitor, verdict=verdict, newest=measurements[-1], since=now)
         return self
 
     def _without(self, now: float, status: str) -> Verdict:

@@ -12,7 +12,7 @@ import pytest
 
 from emulated import assert_true_and_new, emulated, read_until, until
 from flexneedle.errors import InputError, RunError
-from flexneedle.rig.devices.aurora import library, link, tracker
+from flexneedle.rig.devices.aurora import incoming, library, link, tracker
 from flexneedle.rig.devices.aurora.tracker import Aurora
 from flexneedle.rig.devices.clock import WallClock
 from flexneedle.types import VISIBLE
@@ -48,7 +48,7 @@ def process_of(word):
 def assert_times_of_measurement(frames):
     """Times are on a line of 1/40 s per frame, which only moves back within 400 frames."""
     numbers, times = np.array([(frame.number, frame.time) for frame in frames[:400]]).T
-    assert (np.diff(times) <= np.diff(numbers) / tracker.RATE_HZ + 1e-9).all()
+    assert (np.diff(times) <= np.diff(numbers) / incoming.RATE_HZ + 1e-9).all()
 
 
 def test_at_40_hz_no_frame_is_lost_and_each_is_correct():
@@ -244,7 +244,7 @@ def test_a_link_that_crashes_or_hangs_is_replaced(kill, text, monkeypatch):
 
 
 def test_without_a_read_the_oldest_frames_are_dropped_and_counted(monkeypatch):
-    monkeypatch.setattr(tracker, "_QUEUE", 5)
+    monkeypatch.setattr(incoming, "_QUEUE", 5)
     with emulated("--sensors", "1") as path, Aurora(path, WallClock()) as aurora:
         until(lambda: aurora.counts.dropped >= 5)
         frames = aurora.read()

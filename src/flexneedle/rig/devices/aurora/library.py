@@ -28,6 +28,7 @@ _ERROR = re.compile(rb"ERROR([0-9A-F]{2})")
 _HANDLES = re.compile(rb"([0-9A-F]{2})((?:[0-9A-F]{5})*)")
 _LOCATION = re.compile(rb".{10}([0-9]{2})([0-9A-F]{2})")
 _REVISION = re.compile(rb"(?:[A-Z]\.[0-9]{3}\.[0-9]{3}|ERROR[0-9A-F]{2})[0-9A-F]{4}\r")
+_UNDESCRIBED = (0x43, 0xF6)  # ndiErrorString reads beyond its tables (3.7.6), which may crash
 _QUIET_S, _RETRY_S = 0.02, 0.2
 _FUNCTIONS = {
     "ndiOpenSerial": (_POINTER, _CHARS),
@@ -118,6 +119,8 @@ class Device:
 
     def explain(self, code: int) -> str:
         """Return the description of an error code."""
+        if code in _UNDESCRIBED:
+            return "unrecognized error code"
         return str(self._c.ndiErrorString(code).decode("ascii", "replace"))
 
     def port_handles(self) -> list[int]:

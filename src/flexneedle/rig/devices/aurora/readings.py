@@ -10,7 +10,7 @@ from flexneedle.types import VISIBLE, SensorReading
 NAMES = ("tip", "ref1", "ref2", "ref3")
 """Sensors at the ports 1 to 4 (default)."""
 
-_MEASURED, _MISSING = 0, 2
+_MEASURED = 0  # other kinds: disabled, missing, and a port that is not occupied
 _STALE = SensorReading(None, status="stale")
 _BITS = {
     0x0040: "out of volume",
@@ -24,6 +24,7 @@ _BITS = {
 }
 _OCCUPIED = 0x01
 _FARTHEST_MM = 10_000.0
+_POSE = 8
 _UNIT_WITHIN = 1e-2  # TX rounds to 1e-4
 
 
@@ -71,12 +72,13 @@ def _fault(kind: int, status: int) -> str:
     if not status & _OCCUPIED:
         return "unplugged"
     fault = next((words for bit, words in _BITS.items() if status & bit), None)
-    return fault or ("missing" if kind == _MISSING else VISIBLE)
+    return fault or (VISIBLE if kind == _MEASURED else "missing")
 
 
 def _is_valid(pose: Sequence[float]) -> bool:
     return (
-        all(map(isfinite, pose))
+        len(pose) == _POSE
+        and all(map(isfinite, pose))
         and abs(hypot(*pose[:4]) - 1) < _UNIT_WITHIN
         and max(map(abs, pose[4:7])) < _FARTHEST_MM
     )

@@ -24,7 +24,8 @@ class Timeline:
         self._starts.append(requested - number * self._period)
         time = min(self._starts) + number * self._period
         if self._last is not None:  # still increase if the estimate of t₀ became smaller
-            time = min(requested, max(time, self._last + self._period / 2))
+            time = max(time, self._last + self._period / 2)
+        time = min(requested, time)  # also where a large number is rounded
         self._last = time
         return time
 

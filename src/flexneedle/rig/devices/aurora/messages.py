@@ -1,0 +1,38 @@
+"""Messages of the link, one line of JSON each: checked before anything is done with them."""
+
+from typing import Annotated, Literal
+
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+
+_Number = Annotated[int, Field(ge=0, lt=2**32)]
+_Handle = Annotated[str, Field(pattern="^[0-9]{1,3}$")]
+_Location = tuple[Annotated[str, Field(pattern="^[0-9]{2}$")], Annotated[str, Field(pattern="^[0-9A-F]{2}$")]]
+_Pose = tuple[float, float, float, float, float, float, float, float]
+_Time = Annotated[float, Field(allow_inf_nan=False)]
+_Sensor = tuple[_Number, _Number, _Number, _Pose]
+
+Ready = tuple[Literal["ready"], Annotated[dict[_Handle, _Location], Field(min_length=1)]]
+Sample = tuple[Literal["frame"], _Number, _Time, dict[_Handle, _Sensor]]
+Problem = tuple[Literal["error"], Literal["garbled", "no reply", "error", "system", "unplugged"], str]
+End = tuple[Literal["end"], str]
+Message = Ready | Sample | Problem | End
+"""As the link describes them. Numbers of a pose need not be finite: such a sensor has no position."""
+
+LONGEST_LINE = 65536
+"""Bytes of the longest message: 100 sensors."""
+
+_MESSAGE: TypeAdapter[Message] = TypeAdapter(Message, config=ConfigDict(strict=True))
+
+
+def parse(line: bytes) -> Message:
+    """Return the message in a line without its end. Raises ValueError if it is none."""
+    try:
+        return _MESSAGE.validate_json(line)
+    except ValidationError:
+        raise ValueError(f"not a message: {line[:60]!r}") from None
+
+
+def in_words(reason: str) -> str:
+    """The reason in one printable line of at most 200 characters."""
+    words = " ".join(reason.split())
+    return "".join(letter if letter.isprintable() else "?" for letter in words)[:200]
