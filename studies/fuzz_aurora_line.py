@@ -1,9 +1,10 @@
 """A pseudo-terminal that answers the real link process, with ndicapi's C library, by damaged replies.
 
-Episodes follow each other for `fuzz_aurora.py --live`: replies are damaged in one way, the cable is pulled, or the tracker
-is switched off and on; then the line is good until frames arrive again. Meanwhile `read` and `status` must return at once;
-each frame must be one that was sent intact, by its checksum, and not dated after that; while nothing intact is sent for a
-while the status must give a reason. `close` must return, and a new `Aurora` on a bad line must refuse.
+Episodes follow each other for `fuzz_aurora.py --live`: replies are damaged in one way, the cable is pulled, or the
+tracker is switched off and on; then the line is good until frames arrive again. Meanwhile `read` and `status` must
+return at once; each frame must be one that was sent intact, by its checksum, and not dated after that; while nothing
+intact is sent for a while the status must give a reason. `close` must return, and a new `Aurora` on a bad line must
+refuse.
 """
 
 import re
@@ -30,7 +31,7 @@ READ_S, CLOSE_S, OPEN_S, RECOVERY_S = 0.5, 8.0, 60.0, 60.0  # longest times of a
 RESET_AFTER_S = 0.4  # without commands: as the reply to a serial break, which a pseudo-terminal does not have
 REPORTED_S = 0.5
 ROW = 42  # bytes of a measured sensor in a reply to BX
-BYTES = b" -0123456789,.:\"[]{}\r\nERORabcdef\x00\x7f\x80\xa5\xc4\xff"
+BYTES = b' -0123456789,.:"[]{}\r\nERORabcdef\x00\x7f\x80\xa5\xc4\xff'
 Point = tuple[float, ...]
 Damage = Callable[[bytes], bytes]
 
@@ -125,7 +126,9 @@ def _recomputed(random: Random, true: bytes) -> bytes:
     body = bytearray(true[6:-2])
     for _ in range(random.randint(1, 4)):
         at = 1 + ROW * random.randrange(len(body) // ROW) + random.randint(2, ROW - 4)
-        new = random.choice((b"\xff" * 4, b"\0" * 4, b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", random.randbytes(4)))
+        new = random.choice(
+            (b"\xff" * 4, b"\0" * 4, b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", random.randbytes(4))
+        )
         body[at : at + 4] = new
     return codec.binary(bytes(body))
 
@@ -150,7 +153,9 @@ DAMAGES: dict[str, Callable[[Random, bytes], bytes]] = {
     "mutated": mutated,
     "cut": lambda random, true: true[: random.randint(0, len(true))],
     "huge": _huge,
-    "flood": lambda random, true: random.choice((true, b"\xff", b"A", b"\r", b"\xc4\xa5")) * random.randint(2, 4000),
+    "flood": lambda random, true: (
+        random.choice((true, b"\xff", b"A", b"\r", b"\xc4\xa5")) * random.randint(2, 4000)
+    ),
     "silence": lambda _random, _true: b"",
     "twice": lambda _random, true: true * 2,
     "before": lambda random, true: random.randbytes(random.randint(1, 20)) + true,
@@ -280,7 +285,9 @@ def run(deadline: float, random: Random) -> tuple[int, str]:
         replies, damaged = line.replies, line.damaged
     times = ", ".join(f"{what} {1e3 * seconds:.0f} ms" for what, seconds in sorted(tally.longest.items()))
     counts = f"{tally.frames} frames, {tally.reconnections} reconnections, {dict(tally.errors)}"
-    note = f" of which {damaged} damaged, in {tally.episodes} episodes: {counts}; {tally.refused} times refused"
+    note = (
+        f" of which {damaged} damaged, in {tally.episodes} episodes: {counts}; {tally.refused} times refused"
+    )
     return replies, f"{note}; longest {times}"
 
 

@@ -54,7 +54,7 @@ def insert(
 def install(setattr_, **options):
     """Put both in the place of the real ones by `setattr_`; options change their defaults."""
     from flexneedle.planning import planner
-    from flexneedle.rig import loop as insertion
+    from flexneedle.rig import insert as insertion
 
     plan_options = {"miss": options.pop("plan_miss", 0.0)}
     setattr_(planner, "plan", partial(plan, **plan_options))

@@ -309,7 +309,7 @@ class Supervisor:
             self._unreachable(str(error))
             return
         if self.state in _UNCHECKED:
-            self._check_rest(now)
+            self._check_rest()
             return
         seconds = self._read_at - read_at
         for drive in self._drives.values():
@@ -332,7 +332,7 @@ class Supervisor:
                 self._fault(problem)
                 return
 
-    def _check_rest(self, now: float) -> None:
+    def _check_rest(self) -> None:
         """After a stop or a fault motors rest; one that is moved by somebody else is stopped again."""
         moving = any(state.moving for state in self._states.values())
         if moving and self._stop_at is None and self.state is not State.IDLE:
