@@ -203,7 +203,7 @@ def unusable(rig: RigFile) -> str:
             return f"{name}: a number is not finite"
         if not (low < high and 0.0 < axis.tolerance < axis.max_error and axis.backlash < high - low):
             return f"{name}: limits or tolerances are not ordered"
-        if abs(axis.scale) * axis.tolerance < 0.999 or max(abs(low), abs(high)) * abs(axis.scale) > 2**53:
+        if max(abs(low), abs(high)) * abs(axis.scale) > 2**53:
             return f"{name}: a count is lost"
     if not 1.0 / rig.loop.rate_hz <= rig.loop.queue * 1.000001 <= 0.1001:
         return "the queue does not last for a tick"

@@ -315,7 +315,7 @@ def test_what_must_not_be_is_refused_before_anything_moves(capsys, file, device,
 
 def test_several_axes_are_homed_one_after_the_other(capsys, file, device, supervisor):
     status, _, err = run(capsys, "rig", "home", file(), "--yes")
-    assert (status, supervisor.calls[2:4]) == (0, [("home", "insertion"), ("home", "rotation")])
+    assert (status, supervisor.calls[2:5]) == (0, [("home", "insertion"), ("arm",), ("home", "rotation")])
     assert "rotation: stays where it is, and its position is called 0 deg" in err
     assert "Only without a needle in tissue." in err
     assert device.calls == []

@@ -109,14 +109,12 @@ RULES = [
     ("insertion.backlash_mm", -0.1, "must be at least 0"),
     ("insertion.backlash_mm", 120, "must be below 120, the width of range_mm"),
     ("insertion.tolerance_mm", 0.2, "must be below max_error_mm (0.2)"),
-    ("insertion.tolerance_mm", 0.0009, "must be at least one count, 0.001"),
     ("insertion.home_mm", 1.0, "must be at most 0: the reverse-limit switch is at the low end of range_mm"),
     ("rotation.home_deg", 191, "must be within range_deg, -10 to 190"),
     ("rotation.home_deg", -10.5, "must be within range_deg, -10 to 190"),
     ("rotation.range_deg", [180, -180], "must be [lowest, highest]"),
     ("rotation.backlash_deg", 200, "must be below 200, the width of range_deg"),
     ("rotation.tolerance_deg", 5.0, "must be below max_error_deg (5)"),
-    ("rotation.tolerance_deg", 0.009, "must be at least one count, 0.01"),
     ("guide_y.channel", "A", "is that of insertion, too: each axis has its own"),
 ]
 

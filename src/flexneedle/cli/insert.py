@@ -44,10 +44,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "insert",
         help="plan an insertion and execute it in closed loop on the virtual phantom or on a rig",
         **with_examples(
-            "flexneedle insert phantom --target 35 -5 --seed 3",
+            "flexneedle insert phantom --target 35 -5 --seed 3 --controller ce-mpc --json",
             "flexneedle insert phantom --rig rig.toml --dry-run",
-            "flexneedle insert phantom --ros neutral",
-            "flexneedle insert world:100012 --controller ce-mpc --phantom model --json",
         ),
     )
     add_run_arguments(parser)

@@ -81,7 +81,8 @@ def jog(rig: RigFile, name: str, distance: str, position: float, speed: float | 
     move = _checked(
         Move(name, axis, position, position + distance_of(distance, name, axis), _speed(name, axis, speed))
     )
-    if abs(move.distance) < 1.0 / abs(axis.scale):
+    # A driver whose counts are no steps of an encoder, such as m, has a finer resolution.
+    if abs(move.distance) < min(1.0 / abs(axis.scale), axis.tolerance):
         raise InputError(f"distance {text_of(distance)}: must be at least one count of {name}")
     return move
 

@@ -155,14 +155,8 @@ def _insert(
 
     def ended(outcome: Outcome, reason: str) -> Insertion:
         controller, phantom, tracker, rig = choices.parts.values()
-        parts = (
-            controller,
-            phantom,
-            tracker,
-            scenario,
-            rig,
-            {} if choices.rig is None else watchers.ticks.summary(),
-        )
+        ticks = {} if choices.rig is None else watchers.ticks.summary()
+        parts = controller, phantom, tracker, scenario, rig, ticks
         return Insertion(plan, choices.seed, tuple(periods), outcome, reason, *parts)
 
     with _closed_at_the_end(folder, open_trace(folder, scenario, plan, choices.seed, choices.parts)) as trace:
@@ -177,10 +171,9 @@ def _insert(
             "phantom": choices.phantom,
             "tracker": choices.tracker,
             "force": choices.force,
-            "rig": choices.rig,
-            "dry_run": choices.dry_run,
-            "watchers": watchers,
         }
+        if choices.rig is not None:
+            options |= {"rig": choices.rig, "dry_run": choices.dry_run, "watchers": watchers}
         try:
             return insert(scenario, plan, choices.seed, on_period=keep, **options)
         except KeyboardInterrupt:

@@ -274,9 +274,6 @@ def _problems_of(axis: Axis) -> Iterator[Problem]:
     if axis.tolerance >= axis.max_error:
         rule = f"must be below max_error_{unit} ({shown(axis.max_error)})"
         yield Problem(f"tolerance_{unit}", float(shown(axis.tolerance)), rule)
-    if axis.tolerance * abs(axis.scale) < 1.0 - _ROUNDING:
-        rule = f"must be at least one count, {shown(1.0 / abs(axis.scale))}"
-        yield Problem(f"tolerance_{unit}", float(shown(axis.tolerance)), rule)
 
 
 def _misplaced(axis: Axis, low: float, high: float) -> str:

@@ -107,7 +107,6 @@ def test_an_axis_starts_at_its_home_and_a_switch_is_where_it_is_homed():
     ("changes", "message"),
     [
         ({"channel": "E"}, r"axes.insertion.channel = 'E': must be one of A, B, C, D"),
-        ({"home_mm": -1.0}, r"axes.insertion.home_mm: the range must contain"),
     ],
 )
 def test_an_axis_that_cannot_be_emulated_is_refused_in_one_line(changes, message):

@@ -78,8 +78,9 @@ def target_problem(drive: Drive, state: MotorState, start: float, sent: float) -
 
 def rests(drive: Drive, state: MotorState, before: MotorState) -> bool:
     """Whether a motor rests, its servo included, which may follow on when the controller's profile has ended."""
-    moved = abs(state.position - before.position) / abs(drive.axis.scale)
-    return not state.moving and moved <= max(_CREEP * drive.axis.tolerance, 1.0 / abs(drive.axis.scale))
+    tolerance, count = drive.axis.tolerance, 1.0 / abs(drive.axis.scale)
+    moved = abs(state.position - before.position) * count
+    return not state.moving and moved <= max(_CREEP * tolerance, min(count, tolerance))
 
 
 def at_home(drive: Drive, state: MotorState) -> bool:
