@@ -35,7 +35,7 @@ class Noting(Stage):
     made = None
 
     def __init__(self, file, channels):
-        self._file = open(file, "a")  # noqa: SIM115  closed with the motors
+        self._file = Path(file).open("a")  # noqa: SIM115  closed with the motors
         super().__init__(WallClock(), channels)
         Noting.made = self
 

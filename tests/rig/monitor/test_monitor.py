@@ -296,8 +296,16 @@ def test_the_travel_that_is_predicted_after_a_jump_adds_to_its_limit():
     monitor, _ = Monitor(SETTINGS).check(Measurement(0.0, 30.0, 1.0), driven(5.0), 0.0, 0.3, 9.0)
     monitor, verdict = monitor.check(Measurement(0.1, 35.0, 1.0), driven(5.0), 0.1, 0.3, 9.0)
     assert str(verdict) == "jump: 5.00 mm, limit 3.00 mm"
-    assert one_of(monitor, Measurement(0.4, 34.4, 1.0)) == OK
-    assert one_of(monitor, Measurement(0.4, 34.6, 1.0)) == "jump: 4.60 mm, limit 4.50 mm"
+    assert one_of(monitor, Measurement(0.4, 25.6, 1.0)) == OK
+    assert one_of(monitor, Measurement(0.4, 25.4, 1.0)) == "jump: 4.60 mm, limit 4.50 mm"
+
+
+def test_after_a_jump_a_reading_at_its_prediction_shows_that_the_one_before_was_wrong():
+    """As when a plate of metal, which has distorted the last good readings, has gone."""
+    monitor, _ = Monitor(SETTINGS).check(Measurement(0.0, 30.0, 2.9), at_rest, 0.0, 0.3, 9.0)
+    monitor, verdict = monitor.check(Measurement(0.025, 30.0, 5.0), at_rest, 0.025, 0.3, 9.0)
+    assert str(verdict) == "jump: 2.10 mm, limit 1.50 mm"
+    assert str(monitor.check(Measurement(0.4, 30.0, 1.2), at_rest, 0.4, 0.3, 9.0)[1]) == OK
 
 
 def one_of(monitor, measurement):

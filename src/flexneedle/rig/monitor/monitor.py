@@ -83,7 +83,8 @@ class _Jump:
     time (s).
 
     The needle is held after a jump, and then no time makes a distance plausible: with a limit that grew with it, a
-    sensor that has slipped would soon be believed. Only the travel that is still predicted adds to it.
+    sensor that has slipped would soon be believed. Only the travel that is still predicted adds to it. A reading that
+    is as near to its prediction, which no reading has corrected since, shows that the last good one was wrong.
     """
 
     time: float
@@ -148,6 +149,9 @@ class Monitor:
         if self.jumped is not None:
             limit = min(limit, self.jumped.limit_at(time, tip_at))
         verdict = rules.jump(measurement, self.good, limit)
+        if self.jumped is not None and not verdict.ok:
+            predicted = Measurement(time, *tip_at(time))
+            verdict = verdict if not rules.jump(measurement, predicted, self.jumped.limit).ok else OK
         if verdict.ok or self.jumped is not None or not settings.enabled:
             return self, verdict
         return replace(self, jumped=_Jump(time, limit)), verdict
