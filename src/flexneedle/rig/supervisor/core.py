@@ -249,7 +249,7 @@ class Supervisor:
         self._ticked_at = now
         self._after_stall(now - before)
         self._measure(now)
-        self._check_motors(now)
+        self._check_motors()
         self._check_client(now)
         if self._stop_at is not None:
             self._stop_motors(now)
@@ -299,7 +299,7 @@ class Supervisor:
         else:
             self._halt(why)
 
-    def _check_motors(self, now: float) -> None:
+    def _check_motors(self) -> None:
         if self._lost:
             return
         before, read_at = self._states, self._read_at
@@ -455,7 +455,7 @@ class Supervisor:
     def _not_followed(self, motion: Motion, why: str) -> None:
         """A target was refused: a fault, but not at the limit switch that is the home, which the next tick reads."""
         if motion.home is not None:
-            self._check_motors(self._clock.now())
+            self._check_motors()
             if at_home(motion.home, self._states[motion.home.axis.channel]):
                 return
         self._fault(why)
