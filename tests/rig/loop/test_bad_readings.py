@@ -120,15 +120,15 @@ def test_the_hold_limit_applies_to_each_hold(plan):
 
 def test_all_holds_together_have_a_limit(plan):
     """Each is within its own; the insertion ends in the hold in which their sum exceeds it."""
-    scenario = PHANTOM.with_values({"control.hold_total_s": 1.0})
+    scenario = PHANTOM.with_values({"control.hold_total_s": 0.5})
 
     def spoil(batch):
         return tuple(one for one in batch if one.time % 2.0 <= 1.6 or one.time < 2.0)
 
     done = run(plan, Tank(plan.roll, spoil=spoil).rig(), scenario)
     assert done.outcome == "held"
-    assert done.reason.startswith(f"held for {done.held_s:.2f} s in all (limit 1 s): missing")
-    assert 1.0 <= done.held_s <= 1.0 + READING + 1e-6
+    assert done.reason.startswith(f"held for {done.held_s:.2f} s in all (limit 0.5 s): missing")
+    assert 0.5 - 1e-6 <= done.held_s <= 0.5 + READING + 1e-6
     held = [period.action == "hold" for period in done.periods]
     assert sum(one and not before for before, one in pairwise(held)) >= 3
     assert run(plan, Tank(plan.roll, spoil=spoil).rig()).outcome == "done"
