@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -115,6 +116,22 @@ def test_the_hold_limit_applies_to_each_hold(plan):
     first, second = between(3.0, 3.8, lost), between(5.0, 5.8, lost)
     done = run(plan, Tank(plan.roll, spoil=lambda batch: second(first(batch))).rig())
     assert done.outcome == "done"
+
+
+def test_all_holds_together_have_a_limit(plan):
+    """Each is within its own; the insertion ends in the hold in which their sum exceeds it."""
+    scenario = PHANTOM.with_values({"control.hold_total_s": 0.5})
+
+    def spoil(batch):
+        return tuple(one for one in batch if one.time % 2.0 <= 1.6 or one.time < 2.0)
+
+    done = run(plan, Tank(plan.roll, spoil=spoil).rig(), scenario)
+    assert done.outcome == "held"
+    assert done.reason.startswith(f"held for {done.held_s:.2f} s in all (limit 0.5 s): missing")
+    assert 0.5 - 1e-6 <= done.held_s <= 0.5 + READING + 1e-6
+    held = [period.action == "hold" for period in done.periods]
+    assert sum(one and not before for before, one in pairwise(held)) >= 3
+    assert run(plan, Tank(plan.roll, spoil=spoil).rig()).outcome == "done"
 
 
 @pytest.mark.long
