@@ -409,6 +409,17 @@ def test_the_reason_why_a_port_was_not_opened():
     assert library.open_problem("/") == "the port cannot be opened: Is a directory"
 
 
+@pytest.mark.parametrize("code", [0x0D, 0x43, 0x7F, 0xF6, 0x103])
+def test_any_error_code_has_a_description(code):
+    """Codes that a reply ERRORxx may have, and for which ndicapi reads beyond its tables."""
+    device, host = os.openpty()
+    found = library.Device(os.ttyname(host))
+    assert found.explain(code)
+    found.close()
+    os.close(device)
+    os.close(host)
+
+
 @pytest.mark.slow
 def test_a_port_without_a_tracker_is_rejected():
     """Slow: it waits for the tracker's reset after a serial break."""
