@@ -10,7 +10,7 @@ link      lines in place of the link's messages: a message, or ValueError, which
 emulator  commands to the emulated Aurora: an intact reply to each, a valid state, tracking only after TSTART
 watch     frames to the supervisor's check: a verdict, not OK if the newest reading is not a number, repeated or stale
 
-With `--live` then for S seconds a pseudo-terminal that answers the real link and ndicapi's C library by damaged replies:
+With `--live`, then for S seconds, a pseudo-terminal answers the real link and ndicapi's C library by damaged replies:
 see `fuzz_aurora_line.py`. Prints the inputs; at the first failure the input, and exit status 1.
 """
 
@@ -99,7 +99,9 @@ def random_sensor(random: Random) -> tuple[int, int, int, tuple[float, ...]]:
     """Kind, port status, frame and pose, half of them nearly those of a measured sensor."""
     pose = list(POSE)
     for _ in range(random.choice((0, 1, 2, 8))):
-        drawn = random.choice(ODD) if random.random() < 0.5 else random.gauss(0, 1) * 10 ** random.uniform(-5, 5)
+        drawn = (
+            random.choice(ODD) if random.random() < 0.5 else random.gauss(0, 1) * 10 ** random.uniform(-5, 5)
+        )
         pose[random.randrange(8)] = drawn
     if random.random() < 0.05:
         pose = (pose * 2)[: random.randint(0, 16)]
@@ -202,7 +204,11 @@ def random_message(random: Random, feeding: Feeding) -> list[Any]:
                 ["ready", {}],
                 ["ready", {"10": ["01", "00"], "11": ["01", "00"]}],
                 ["ready", {"10": ["\u00b2", "00"]}],
-                ["error", random.choice(("garbled", "no reply", "x", [], {})), random.choice(("", "a\nb\x1b" * 999))],
+                [
+                    "error",
+                    random.choice(("garbled", "no reply", "x", [], {})),
+                    random.choice(("", "a\nb\x1b" * 999)),
+                ],
                 ["end", random.choice(("no reply", "", VISIBLE, "x" * 9999, None))],
                 [],
                 ["frame"],
@@ -212,8 +218,12 @@ def random_message(random: Random, feeding: Feeding) -> list[Any]:
         feeding.device_number = random.choice((5, 5, 2**31))
         return ready
     feeding.device_number += random.choice((1, 1, 1, 1, 5, 0, -3, 2**31))
-    requested = feeding.time + random.choice((0.0, 0.0, 0.0, -0.001, -0.3, 0.01, -1e4, math.nan, math.inf, 1e300))
-    handles = random.choice((("10", "11"), ("10", "11"), ("10", "11"), ("10",), ("10", "11", "12"), ("x", "11")))
+    requested = feeding.time + random.choice(
+        (0.0, 0.0, 0.0, -0.001, -0.3, 0.01, -1e4, math.nan, math.inf, 1e300)
+    )
+    handles = random.choice(
+        (("10", "11"), ("10", "11"), ("10", "11"), ("10",), ("10", "11", "12"), ("x", "11"))
+    )
     found = {handle: list(random_sensor(random)) for handle in handles}
     for sensor in found.values():
         sensor[2] = feeding.device_number
@@ -270,7 +280,10 @@ def check_incoming(feeding: Feeding, line: bytes) -> None:
         raise Failure(f"{line[:500]!r}: {feeding.errors} links failed, {counts}")
     frames = incoming.read()
     for frame in frames:
-        new = frame.number > feeding.number and feeding.newest - ROUNDED_S <= frame.time <= feeding.time - 1000.0
+        new = (
+            frame.number > feeding.number
+            and feeding.newest - ROUNDED_S <= frame.time <= feeding.time - 1000.0
+        )
         if not new:
             raise Failure(f"{line[:500]!r}: {frame} after {feeding.number}, {feeding.newest} s")
         feeding.number, feeding.newest = frame.number, frame.time
@@ -310,7 +323,9 @@ def random_frame(random: Random) -> aurora.EmulatedFrame:
     made = EmulatedPose(tuple(values[4:7]), tuple(values[:4]), values[7])  # type: ignore[arg-type]
     faults = {name: random.choice(aurora.OF_STATUS) for name in SENSORS if random.random() < 0.1}
     number = random.choice((0, 1, random.randrange(2**32)))
-    return aurora.EmulatedFrame(number, dict.fromkeys(SENSORS, made), faults, random.choice((0, 0, 0x20, 0xFF)))
+    return aurora.EmulatedFrame(
+        number, dict.fromkeys(SENSORS, made), faults, random.choice((0, 0, 0x20, 0xFF))
+    )
 
 
 def checked_command(
@@ -373,7 +388,9 @@ def ticked(watching: Watching, random: Random) -> None:
         begin, end = ((random.uniform(0, 9), 0.0, 0.0) for _ in range(2))
         most_off = random.choice((MOST_OFF_MM, 1e4, math.inf))
         expected = Expectation(begin, end, most_off)
-        watching.watch = watching.watch.expecting(expected, watching.now, watching.now + random.choice((0.0, 1.0)))
+        watching.watch = watching.watch.expecting(
+            expected, watching.now, watching.now + random.choice((0.0, 1.0))
+        )
     frames = [random_tip_frame(random, watching) for _ in range(random.choice((0, 1, 1, 1, 1, 2, 5)))]
     try:
         with np.errstate(all="ignore"):  # not a number in, not a number out
@@ -409,7 +426,9 @@ def fault_of(one: Measurement, watching: Watching) -> str:
 
 def random_tip_frame(random: Random, watching: Watching) -> Frame:
     """A frame, most of them the next one."""
-    watching.sent += random.choice((1, 1, 1, 1, 1, 0, -1, 1000, -1000, 2**40) if random.random() < 0.3 else (1,))
+    watching.sent += random.choice(
+        (1, 1, 1, 1, 1, 0, -1, 1000, -1000, 2**40) if random.random() < 0.3 else (1,)
+    )
     late = random.choice((0.0, 0.1, 0.3, -0.01, -0.3, -5.0, math.nan, math.inf, -math.inf, 1e300))
     time = watching.now - (late if random.random() < 0.2 else random.uniform(0.0, 0.03))
     names = random.choice((("tip", "ref1", "ref2", "ref3"), ("tip",), ("ref1",), (), ("tip", "ref1")))

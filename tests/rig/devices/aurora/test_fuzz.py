@@ -52,7 +52,11 @@ def test_a_sensor_has_a_position_only_if_it_is_finite_and_in_range(kind, bits, f
 
 
 @settings(deadline=None, derandomize=True, max_examples=300)
-@given(st.lists(st.binary(max_size=60) | JSON.map(lambda value: fuzz_aurora.json.dumps(value).encode()), max_size=5))
+@given(
+    st.lists(
+        st.binary(max_size=60) | JSON.map(lambda value: fuzz_aurora.json.dumps(value).encode()), max_size=5
+    )
+)
 def test_any_line_is_a_message_or_refused_and_counted(lines):
     feeding = fuzz_aurora.Feeding()
     for number, line in enumerate(lines):
