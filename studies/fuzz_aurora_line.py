@@ -1,10 +1,10 @@
 """A pseudo-terminal that answers the real link process, with ndicapi's C library, by damaged replies.
 
-Episodes follow each other for `fuzz_aurora.py --live`: replies are damaged in one way, the cable is pulled, or the
-tracker is switched off and on; then the line is good until frames arrive again. Meanwhile `read` and `status` must
-return at once; each frame must be one that was sent intact, by its checksum, and not dated after that; while nothing
-intact is sent for a while the status must give a reason. `close` must return, and a new `Aurora` on a bad line must
-refuse.
+Episodes follow each other for `fuzz_aurora.py --live`: replies are damaged in one way or delayed, the cable is pulled,
+or the tracker is switched off and on; then the line is good until frames arrive again. Meanwhile `read` and `status`
+must return at once; each frame must be one that was sent intact, by its checksum, and not dated after its reply was
+made; while nothing intact arrives the status must give a reason. `close` must return, and a new `Aurora` on a bad line
+must refuse.
 """
 
 import re
@@ -86,7 +86,7 @@ def decoded_text(reply: bytes) -> list[Point] | None:
 
 @dataclass
 class Sent:
-    """The intact readings that were sent: numbers of replies by rounded position, and the time of each reply."""
+    """The intact readings that were sent: numbers of replies by rounded position, and and when each reply was made."""
 
     by_position: dict[Point, set[int]] = field(default_factory=dict)
     times: list[float] = field(default_factory=list)
@@ -109,7 +109,7 @@ class Sent:
         if not together:
             return f"{frame}: positions {visible} were not sent in one intact reply"
         latest = max(self.times[reply] for reply in together)
-        return "" if frame.time <= latest else f"{frame}: dated {frame.time - latest:.3f} s after it was sent"
+        return "" if frame.time <= latest else f"{frame}: dated {frame.time - latest:.3f} s after it was made"
 
 
 def _rounded(position: Point) -> Point:
@@ -157,6 +157,7 @@ DAMAGES: dict[str, Callable[[Random, bytes], bytes]] = {
         random.choice((true, b"\xff", b"A", b"\r", b"\xc4\xa5")) * random.randint(2, 4000)
     ),
     "silence": lambda _random, _true: b"",
+    "none": lambda _random, true: true,
     "twice": lambda _random, true: true * 2,
     "before": lambda random, true: random.randbytes(random.randint(1, 20)) + true,
     "recomputed": _recomputed,
@@ -164,6 +165,7 @@ DAMAGES: dict[str, Callable[[Random, bytes], bytes]] = {
     "error": _error,
     "no end": lambda _random, true: true.replace(b"\r", b"") + b"0" * 3000,
 }
+DELAYS_S = (0.02, 0.1, 0.25, 0.31, 0.6, 1.2)
 RARE = 0.3  # share of the replies that are damaged in a mild episode
 
 
@@ -176,6 +178,7 @@ class Line:
     def __init__(self, folder: Path) -> None:
         self.serial, self.sent, self.lock = Serial(folder / "aurora"), Sent(), Lock()
         self.damage: Damage | None = None
+        self.delay, self.due = 0.0, list[tuple[float, bytes, bool]]()
         self.plugged, self.end = True, Event()
         self.replies = self.damaged = 0
         self.intact_at = self.started = monotonic()
@@ -196,6 +199,8 @@ class Line:
                 *lines, received = (received + data)[-4096:].split(b"\r")
                 for line in lines:
                     self._answer(line)
+                while self.due and self.due[0][0] <= monotonic():
+                    self._send(*self.due.pop(0)[1:])
                 if data:
                     heard = monotonic()
                 elif monotonic() - heard > RESET_AFTER_S and self.damage is None:
@@ -213,11 +218,16 @@ class Line:
         complete = true if damage is None else damage(true)
         self.replies += 1
         self.damaged += complete != true
+        now, intact = monotonic(), False
         with self.lock:  # before it is written: a frame may not arrive earlier
             for part in (complete, true if true in complete else b""):
-                if self.sent.add(part, monotonic()):
-                    self.intact_at = monotonic()
-                    break
+                intact = intact or self.sent.add(part, now)
+        latest = self.due[-1][0] if self.due else 0.0  # replies do not overtake each other
+        self.due.append((max(latest, now + self.delay), complete, intact))
+
+    def _send(self, complete: bytes, intact: bool) -> None:
+        if intact:
+            self.intact_at = monotonic()
         for at in range(0, len(complete), 4096):
             self.serial.write(complete[at : at + 4096])
 
@@ -350,9 +360,11 @@ def _episode(line: Line, found: Aurora, tally: Tally, random: Random) -> None:
         line.plugged = False
     elif kind < 0.2:
         line.power(random.random() < 0.7)
+    elif kind < 0.4:
+        line.delay = random.choice(DELAYS_S)
     try:
         _watch(line, found, tally, monotonic() + random.choice((0.1, 0.3, 1.0, 1.0, 2.5)))
-        line.damage, line.plugged = None, True
+        line.damage, line.plugged, line.delay = None, True, 0.0
         good, before = monotonic(), tally.frames
         while tally.frames < before + 3:
             _watch(line, found, tally, monotonic() + 0.02)

@@ -60,3 +60,12 @@ def test_a_pose_in_binary_is_eight_singles():
     pose = EmulatedPose((1.5, -20.25, -200.0), (0.5, -0.5, 0.5, -0.5), 0.0239)
     values = struct.unpack("<8f", codec.transform_binary(pose))
     np.testing.assert_allclose(values, (0.5, -0.5, 0.5, -0.5, 1.5, -20.25, -200.0, 0.0239), rtol=1e-6)
+
+
+def test_a_value_too_large_for_the_format_is_not_a_number_or_infinite():
+    far = EmulatedPose((1e39, -1e39, 100_000.0), (1.0, 0.0, 0.0, 0.0), 100.0)
+    assert codec.transform_text(far)[24:] == "    nan    nan    nan   nan"
+    near = EmulatedPose((9999.99, -9999.99, 0.0), (1.0, 0.0, 0.0, 0.0), 9.9999)
+    assert codec.transform_text(near)[24:] == "+999999-999999+000000+99999"
+    values = struct.unpack("<8f", codec.transform_binary(far))
+    assert values[4:7] == (np.inf, -np.inf, 100_000.0)

@@ -142,3 +142,22 @@ def test_the_system_status_is_at_the_end_of_a_reading(read):
     device, _ = send(set_up(1), "TSTART:")
     _, reply = send(device, f"{read}:0801", frame=EmulatedFrame(7, FRAME.poses, system=0x21))
     assert reply.endswith("0021") if read == "TX" else reply[-4:-2] == b"\x21\0"
+
+
+def test_an_echo_is_ascii():
+    assert send(fresh(), "ECHO:Aurora 1")[1] == "Aurora 1"
+    assert send(fresh(), "ECHO:\u00e9")[1] == "ERROR23"
+
+
+def test_there_are_no_more_handles_than_two_digits_have():
+    device = set_up(1)
+    for handle in range(0x0B, 0x100):
+        device, reply = send(device, "PHRQ:*********1****")
+        assert reply == f"{handle:02X}"
+    assert send(device, "PHRQ:*********1****")[1] == "ERROR2D"
+    assert max(device.ports) == 0xFF
+
+
+@pytest.mark.parametrize("arguments", ["-1", "1_", " 1", "+A"])
+def test_hexadecimal_digits_are_nothing_else(arguments):
+    assert send(set_up(), f"PINIT:{arguments}")[1] == "ERROR23"

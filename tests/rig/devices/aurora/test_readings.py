@@ -6,7 +6,7 @@ from flexneedle.rig.devices.aurora.readings import NAMES, reading, readings, sen
 from flexneedle.types import VISIBLE, SensorReading
 
 POSE = (0.5, -0.5, 0.5, -0.5, 10.0, -20.0, -200.0, 0.024)
-MEASURED, DISABLED, MISSING = 0, 1, 2
+MEASURED, DISABLED, MISSING, UNOCCUPIED = 0, 1, 2, 4
 
 
 def test_a_measured_sensor_has_position_orientation_and_indicator():
@@ -38,6 +38,7 @@ def test_a_rounded_quaternion_is_made_unit():
         (DISABLED, 0x11, "disabled"),
         (DISABLED, 0x00, "disabled"),
         (MEASURED, 0x30, "unplugged"),
+        (UNOCCUPIED, 0x31, "missing"),
     ],
 )
 def test_a_sensor_with_a_fault_has_its_status_and_no_position(kind, bits, status):
@@ -52,6 +53,9 @@ def test_a_sensor_with_a_fault_has_its_status_and_no_position(kind, bits, status
         (*POSE[:4], -3.697314e28, *POSE[5:]),
         (0.9, 0.0, 0.0, 0.0, *POSE[4:]),
         (0.0,) * 8,
+        (*POSE[:7], float("nan")),
+        POSE[:7],
+        (*POSE, 0.0),
     ],
 )
 def test_an_invalid_pose_gives_no_position(pose):

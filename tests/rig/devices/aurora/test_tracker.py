@@ -5,6 +5,7 @@ No test depends on durations, only on results.
 
 import os
 import signal
+import sys
 
 import numpy as np
 import psutil
@@ -243,6 +244,39 @@ def test_a_link_that_crashes_or_hangs_is_replaced(kill, text, monkeypatch):
     assert any(text in status for status in statuses)
 
 
+BAD_LINK = """
+import os, signal, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+os.write(1, b'["ready", {"10": ["01", "00"]}]\\n' + BYTES)
+while True: time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize(
+    ("sent", "text"),
+    [
+        (b"no JSON\n", "not a message: b'no JSON'"),
+        (b"[]\n", "not a message: b'[]'"),
+        (b'["frame", 1, "now", {}]\n', "not a message"),
+        (b'["frame", 1, 0.0, {"10": 5}]\n', "not a message"),
+        (b'["frame", 1, 0.0, {"99": [0, 49, 1, [1, 0, 0, 0, 1, 2, 3, 0]]}]\n', "requested"),
+        (b"x" * 70000, "without the end of a line"),
+    ],
+)
+def test_a_link_that_sends_no_message_is_ended_and_counted_and_replaced(sent, text, monkeypatch):
+    """Also if it would neither end nor obey; frames of the next link arrive."""
+    commands = [[sys.executable, "-c", BAD_LINK.replace("BYTES", repr(sent))]]
+    command = tracker._command
+    monkeypatch.setattr(tracker, "_STOP_S", 0.1)
+    monkeypatch.setattr(tracker, "_command", lambda *given: commands.pop() if commands else command(*given))
+    with emulated() as path, Aurora(path, WallClock()) as aurora:
+        frames, statuses = read_until(aurora, at_least(3))
+        counts = aurora.counts
+    assert_true_and_new(frames)
+    assert counts.errors == {"crash": 1}
+    assert any(status.startswith("the link failed: ") and text in status for status in statuses)
+
+
 def test_without_a_read_the_oldest_frames_are_dropped_and_counted(monkeypatch):
     monkeypatch.setattr(incoming, "_QUEUE", 5)
     with emulated("--sensors", "1") as path, Aurora(path, WallClock()) as aurora:
@@ -373,6 +407,17 @@ def test_the_reason_why_a_port_was_not_opened():
     os.close(host)
     assert "does not exist" in library.open_problem("/dev/ttyNothing")
     assert library.open_problem("/") == "the port cannot be opened: Is a directory"
+
+
+@pytest.mark.parametrize("code", [0x0D, 0x43, 0x7F, 0xF6, 0x103])
+def test_any_error_code_has_a_description(code):
+    """Codes that a reply ERRORxx may have, and for which ndicapi reads beyond its tables."""
+    device, host = os.openpty()
+    found = library.Device(os.ttyname(host))
+    assert found.explain(code)
+    found.close()
+    os.close(device)
+    os.close(host)
 
 
 @pytest.mark.slow

@@ -105,7 +105,7 @@ class Aurora:
     def _connect_once(self, may_break: bool) -> bool:
         """Run one link to its end; return whether it was ready at any time."""
         before = self._incoming.connections
-        command = [sys.executable, "-m", f"{__package__}.link", self._path, *(["break"] if may_break else [])]
+        command = _command(self._path, may_break)
         # In a separate session, so that Ctrl-C reaches only the run, which then stops the link.
         with tempfile.TemporaryFile() as errors:
             link = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, start_new_session=True)
@@ -128,13 +128,19 @@ class Aurora:
                 if not data:
                     self._incoming.finish()
                     return
-                if self._incoming.feed(data):
+                if self._feed(data):
                     received_at, limit = monotonic(), _SILENT_S
-                if self._incoming.connections:
-                    self._first.set()
             if monotonic() - received_at > limit:
                 self._incoming.explain("no reply: the link does not respond")
                 return
+
+    def _feed(self, data: bytes) -> bool:
+        """Take data of a link; return whether a message was complete. Raises ValueError."""
+        try:
+            return self._incoming.feed(data)
+        finally:
+            if self._incoming.connections:
+                self._first.set()
 
     def _record_end(self, code: int, errors: IO[bytes]) -> None:
         """Record the reason why a link ended if it sent none: a crash, or it was killed."""
@@ -148,6 +154,11 @@ class Aurora:
             else f"the link ended with exit code {code}"
         )
         self._incoming.crashed(lines[-1] if lines else problem)
+
+
+def _command(path: str, may_break: bool) -> list[str]:
+    """The command line of a link."""
+    return [sys.executable, "-m", f"{__package__}.link", path, *(["break"] if may_break else [])]
 
 
 def _check_port(path: str) -> None:
