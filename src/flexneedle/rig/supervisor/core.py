@@ -12,18 +12,12 @@ from flexneedle.errors import DriverError
 from flexneedle.rig.monitor.monitor import Monitor
 from flexneedle.rig.ports import Clock, Motors, MotorState, Tracker
 from flexneedle.rig.supervisor import messages as say
-from flexneedle.rig.supervisor.checks import (
-    at_home,
-    motor_problem,
-    position_problem,
-    rest_problem,
-    rests,
-    reversal_problem,
-    target_problem,
-)
+from flexneedle.rig.supervisor.checks import at_home, rests
 from flexneedle.rig.supervisor.drives import Drive
+from flexneedle.rig.supervisor.inspection import Inspection
 from flexneedle.rig.supervisor.machine import Event, State, accepted, after
 from flexneedle.rig.supervisor.motion import Leg, Motion, beyond, leg_of, positions
+from flexneedle.rig.supervisor.room import Room
 from flexneedle.rig.supervisor.trajectory import shortest
 from flexneedle.rig.supervisor.watch import Watch
 from flexneedle.rig.tracking.stage import tip_on_stage
@@ -114,6 +108,12 @@ class Supervisor:
             return False
         return True
 
+    @property
+    def _room(self) -> Room:
+        """Where the axes may go from here."""
+        at = {name: self._goal(name) for name in self._drives}
+        return Room(self._drives, at, self._deepest)
+
     def _refuse(self, number: int, why: str) -> None:
         self._send(say.Refused(number, why, self.state, self.why))
 
@@ -145,9 +145,7 @@ class Supervisor:
             return
         if not self._allowed(Event.STEP, step.number):
             return
-        spin = step.travel.get("rotation", 0.0)
-        problem = self._too_far({**step.travel, "rotation": step.roll + spin})
-        if problem := problem or self._too_far({"rotation": step.roll}):
+        if problem := self._room.step_problem(step):
             self._refuse(step.number, problem)
             return
         now = self._clock.now()
@@ -166,23 +164,11 @@ class Supervisor:
         now, why = self._clock.now(), str(self._watch.verdict) if not self._watch.verdict.ok else self.why
         self._send(say.Done(number, dict.fromkeys(self._drives, 0.0), now, now, self.state, why))
 
-    def _too_far(self, travel: Mapping[str, float]) -> str:
-        """A problem with a travel by axis: an axis that is not there, an end outside a range, or too deep; or ""."""
-        moved = {name: way for name, way in travel.items() if way}
-        if missing := [name for name in moved if name not in self._drives]:
-            return f"the rig has no axis {', '.join(missing)}; axes: {', '.join(self._drives)}"
-        ends = {name: self._goal(name) + way for name, way in moved.items()}
-        problem = beyond(self._drives, list(ends.items()))
-        if not problem and moved.get("insertion", 0.0) > 0.0 and ends["insertion"] > self._deepest + 1e-9:
-            deepest = f"{self._deepest:.3f} mm, as far as this insertion may go"
-            return f"insertion = {ends['insertion']:.3f} mm: must be at most {deepest}"
-        return problem
-
     def _go(self, go: say.Go) -> None:
         event = Event.RETRACT if go.retract else Event.JOG
         if not self._allowed(event, go.number):
             return
-        if problem := self._misguided(go):
+        if problem := self._room.go_problem(go):
             self._refuse(go.number, problem)
             return
         travel = go.position - self._goal(go.axis)
@@ -190,37 +176,13 @@ class Supervisor:
         self._enter(event)
         self._begin(Motion(go.number, [({go.axis: travel}, duration)]))
 
-    def _misguided(self, go: say.Go) -> str:
-        """A problem with a motion of one axis, or ""."""
-        if go.axis not in self._drives:
-            return f"the rig has no axis {go.axis}; axes: {', '.join(self._drives)}"
-        drive = self._drives[go.axis]
-        if (problem := self._too_far({go.axis: go.position - self._goal(go.axis)})) and not self._leads_back(
-            go
-        ):
-            return problem
-        if go.retract and not (go.axis == "insertion" and go.position <= self._goal(go.axis)):
-            at = drive.shown(self._goal(go.axis))
-            return f"retract to {drive.shown(go.position)}: must withdraw the base, which is at {at}"
-        if not 0.0 < go.speed <= drive.axis.speed * (1.0 + 1e-9):
-            return f"speed of {go.axis} = {go.speed:g}/s: must be above 0, at most {drive.axis.speed:g}/s"
-        return ""
-
-    def _leads_back(self, go: say.Go) -> bool:
-        """Whether a motion of one axis ends nearer to its range than it begins, from beyond it."""
-        (low, high), now = self._drives[go.axis].axis.limits, self._goal(go.axis)
-        return now < go.position <= high if now < low else low <= go.position < now if now > high else False
-
     def _home(self, home: say.Home) -> None:
         if not self._allowed(Event.HOME, home.number):
             return
-        drive = self._drives.get(home.axis)
-        if drive is None:
-            self._refuse(home.number, f"the rig has no axis {home.axis}; axes: {', '.join(self._drives)}")
+        if problem := self._room.home_problem(home):
+            self._refuse(home.number, problem)
             return
-        if drive.axis.home == "absolute":
-            self._refuse(home.number, f"{home.axis}: has an absolute encoder, and no home to search")
-            return
+        drive = self._drives[home.axis]
         self._enter(Event.HOME)
         self._motion = motion = Motion(home.number, [], unlimited=True)
         if drive.axis.to_home and not at_home(drive, self._states[drive.axis.channel]):
@@ -311,26 +273,10 @@ class Supervisor:
         if self.state in _UNCHECKED:
             self._check_rest()
             return
-        seconds = self._read_at - read_at
-        for drive in self._drives.values():
-            channel = drive.axis.channel
-            state, last = self._states[channel], before[channel]
-            home = None if self._motion is None else self._motion.home
-            at = home is not None and home.name == drive.name and at_home(drive, state)
-            problem = "" if at else motor_problem(drive, state, last)
-            unlimited = self._motion is not None and self._motion.unlimited
-            problem = problem or position_problem(drive, state, last, seconds, unlimited=unlimited)
-            leg = None if self._motion is None or self._stop_at is not None else self._motion.leg
-            if not problem and leg is not None and channel in leg.drives:
-                problem = reversal_problem(drive, state, last, leg.way(channel))
-                problem = problem or target_problem(
-                    drive, state, leg.trajectory.start[channel], leg.sent[channel]
-                )
-            elif not problem and self._stop_at is None:
-                problem = rest_problem(drive, state, self._goals[channel])
-            if problem:
-                self._fault(problem)
-                return
+        seconds, stopping = self._read_at - read_at, self._stop_at is not None
+        inspection = Inspection(self._motion, self._goals, stopping, self._states, before, seconds)
+        if problem := inspection.first_problem(self._drives):
+            self._fault(problem)
 
     def _check_rest(self) -> None:
         """After a stop or a fault motors rest; one that is moved by somebody else is stopped again."""
