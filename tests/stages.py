@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from flexneedle.errors import DriverError
 from flexneedle.rig.devices.clock import WallClock
@@ -281,3 +282,22 @@ class Still:
 
     def close(self):
         pass
+
+
+class Noting(Stage):
+    """Motors in memory that note each call that commands them in a file."""
+
+    def __init__(self, file, channels):
+        self.file = Path(file)
+        super().__init__(WallClock(), channels)
+
+    def _called(self, *call):
+        if call[0] != "read":
+            with self.file.open("a") as file:
+                file.write(f"{call[0]}\n")
+        super()._called(*call)
+
+
+def noting_motors(settings, channels):
+    """A driver of a rig file, `stages:noting_motors`; file: path of its notes."""
+    return Noting(settings["file"], channels)

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 
@@ -103,6 +104,65 @@ def test_a_supervisor_that_hangs_is_an_error(supervisor):
         os.kill(supervisor.pid, signal.SIGCONT)
 
 
+def test_a_motion_longer_than_the_heartbeat_is_kept_alive_by_its_client(supervisor):
+    supervisor.arm()
+    supervisor.move_to("insertion", 9.0)
+    assert supervisor.report.axes["insertion"].position == pytest.approx(9.0, abs=0.02)
+
+
+def test_motors_of_a_dry_run_get_no_command(tmp_path):
+    made = replace(task("stages:noting_motors", file=str(tmp_path / "calls")), dry=True)
+    with Supervisor(made) as supervisor:
+        supervisor.arm()
+        done = supervisor.step(0.0, {"insertion": 1.0}, 0.2)
+        assert done.travelled["insertion"] == pytest.approx(1.0, abs=0.02)
+        supervisor.stop()
+    assert not (tmp_path / "calls").exists()
+
+
+@pytest.mark.parametrize("how", ["close", "kill"])
+def test_motors_are_stopped_at_the_end_whatever_it_is(tmp_path, how):
+    file = tmp_path / "calls"
+    script = tmp_path / "client.py"
+    script.write_text(textwrap.dedent(ENDING.format(tests=str(TESTS), file=str(file), how=how)))
+    client = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
+    pid = int(client.stdout.readline())
+    if how == "kill":
+        client.kill()
+    client.wait()
+    client.stdout.close()
+    until(lambda: ended(pid))
+    calls = file.read_text().split()
+    assert "follow" in calls
+    assert calls[-1] == "stop"
+
+
+def ended(pid):
+    """Whether a process has ended."""
+    try:
+        return "Z" in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2]
+    except OSError:
+        return True
+
+
+ENDING = """
+import sys
+from threading import Thread
+sys.path.insert(0, {tests!r})
+from rig.supervisor.test_process import task
+from flexneedle.errors import FlexneedleError
+from flexneedle.rig.supervisor.client import Supervisor
+
+made = Supervisor(task("stages:noting_motors", file={file!r}))
+made.arm()
+made.step(0.0, {{"insertion": 1.0}}, 0.2)
+print(made.pid, flush=True)
+if {how!r} == "close":
+    made.close()
+else:
+    made.move_to("insertion", 100.0, 1.0)
+"""
+
 CLIENT = """
 import sys
 sys.path.insert(0, {tests!r})
@@ -124,7 +184,7 @@ def test_without_its_client_the_supervisor_stops_and_ends(tmp_path):
     client.kill()
     client.wait()
     client.stdout.close()
-    until(lambda: not Path(f"/proc/{pid}").exists() or "Z" in Path(f"/proc/{pid}/stat").read_text())
+    until(lambda: ended(pid))
 
 
 @pytest.mark.parametrize(
