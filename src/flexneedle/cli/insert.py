@@ -339,6 +339,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         ("  planned", str(insertion.plan.flips)),
         ("control periods", str(result["steps"])),
         *([("waited", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
+        *([("late decisions", str(insertion.late))] if insertion.late else []),
         ("planning time", _number(timing["plan_seconds"], "s")),
         ("median period time", _number(timing["period_ms"]["p50"], "ms")),
         *_ticks(insertion),
