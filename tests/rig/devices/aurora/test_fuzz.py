@@ -16,7 +16,7 @@ from flexneedle.rig.emulator import aurora, codec
 from flexneedle.rig.supervisor.watch import Watch
 from flexneedle.types import OK, Frame, SensorReading
 
-sys.path.insert(0, str(Path(__file__).parents[4] / "studies"))
+sys.path.append(str(Path(__file__).parents[4] / "studies"))  # behind the tests: both have an `emulated`
 import fuzz_aurora
 import fuzz_aurora_line
 
