@@ -36,6 +36,7 @@ def insert(
     miss=0.06,
     stop=None,
     outcome="done",
+    **_of_a_rig,
 ):
     """Insert as `flexneedle.insert` does; stop: after so many periods, call that."""
     del tracker  # nothing is measured
@@ -54,7 +55,7 @@ def insert(
 def install(setattr_, **options):
     """Put both in the place of the real ones by `setattr_`; options change their defaults."""
     from flexneedle.planning import planner
-    from flexneedle.rig import loop as insertion
+    from flexneedle.rig import insert as insertion
 
     plan_options = {"miss": options.pop("plan_miss", 0.0)}
     setattr_(planner, "plan", partial(plan, **plan_options))

@@ -45,8 +45,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         **with_examples(
             "flexneedle insert phantom --target 35 -5 --seed 3",
             "flexneedle insert phantom --rig rig.toml --dry-run",
-            "flexneedle insert phantom --ros neutral",
-            "flexneedle insert world:100012 --controller ce-mpc --phantom model --json",
         ),
     )
     add_run_arguments(parser)
