@@ -36,6 +36,7 @@ def insert(
     miss=0.06,
     stop=None,
     outcome="done",
+    **_of_a_rig,
 ):
     """Insert as `flexneedle.insert` does; stop: after so many periods, call that."""
     del tracker  # nothing is measured

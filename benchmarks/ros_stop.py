@@ -1,0 +1,172 @@
+"""Time from a stop on a ROS topic to the stop of the motors: python benchmarks/ros_stop.py [--stops N] [--json].
+
+A ROS node in a process of its own publishes a stop while an axis of a rig in memory moves. Between them are the node of
+the insertion, the controller's process, which forwards the stop, and the supervisor. Measured is the time from the
+publication to the call that stops the motors, while the controller waits, and while it plans on all cores, and how far
+the axis then moved. DDS is kept on the loopback interface.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Event, Thread
+
+import numpy as np
+
+HERE = Path(__file__).resolve()
+TESTS = HERE.parents[1] / "tests"
+sys.path.insert(0, str(TESTS))
+import flexneedle
+from flexneedle.errors import StoppedError
+from flexneedle.rig.supervisor.client import Supervisor
+from flexneedle.rig.supervisor.messages import Task
+from flexneedle.rig.tracking.registration import identity
+from flexneedle.ros.bridge import Bridge
+from flexneedle.ros.dds import Writer, participant
+from flexneedle.ros.profile import load_profile
+from flexneedle.scenario.rig import RigFile, RosSettings
+from flexneedle.scenario.sections.monitor import MonitorSettings
+from ros import LOOPBACK
+from stages import RIG
+
+SPEED_MM_S, FAR_MM = 5.0, 100.0
+TOPIC = load_profile("neutral").subscribe.stop.topic
+
+
+def main() -> int:
+    """Run the measurements and print them."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--stops", type=int, default=200)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--publisher", action="store_true", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    os.environ.setdefault("CYCLONEDDS_URI", LOOPBACK)
+    os.environ.setdefault("ROS_DOMAIN_ID", str(40 + os.getpid() % 150))
+    if args.publisher:
+        return publish()
+    os.chdir(TESTS)  # where the supervisor finds the motors
+    found = measure(args.stops)
+    if args.json:
+        print(json.dumps(found))
+    else:
+        for title, values in found.items():
+            print(title, *(f"  {name}: {value}" for name, value in values.items()), sep="\n")
+    return 0
+
+
+def measure(count: int) -> dict[str, dict[str, float]]:
+    """All measurements, with one rig and one node."""
+    with tempfile.TemporaryDirectory() as folder:
+        notes = Path(folder) / "notes"
+        parts = {
+            "driver": {"kind": "ros_rig:motors", "notes": str(notes)},
+            "tracker": {"kind": "stages:Still"},
+        }
+        rig = RigFile.model_validate(RIG | parts)
+        task = Task(rig, time.monotonic(), 2, MonitorSettings(references=0), identity(), 0.0, 0.3)
+        command = [sys.executable, HERE, "--publisher"]
+        with Bridge(RosSettings()) as bridge, Supervisor(task, bridge.report) as supervisor:
+            bridge.opened(supervisor)
+            other = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+            if not other.stdout.readline():
+                raise SystemExit("the nodes have not found each other")
+            waiting = _stops(supervisor, other, notes, count)
+            with _planning():
+                busy = _stops(supervisor, other, notes, count)
+            other.communicate()
+    return {
+        f"{count} stops while the controller waits": waiting,
+        f"{count} stops while it plans": busy,
+    }
+
+
+def _stops(
+    supervisor: Supervisor, other: subprocess.Popen[str], notes: Path, count: int
+) -> dict[str, float]:
+    taken, moved = [], []
+    for _ in range(count):
+        _rest_at_zero(supervisor)
+        before = len(notes.read_text().splitlines())
+        other.stdin.write("stop\n")
+        other.stdin.flush()
+        try:
+            supervisor.move_to("insertion", FAR_MM, SPEED_MM_S)
+        except StoppedError:
+            pass
+        else:
+            raise SystemExit("not stopped")
+        sent = float(other.stdout.readline())
+        lines = [json.loads(line) for line in notes.read_text().splitlines()[before:]]
+        _, at, where = next(line for line in lines if line[0] == "stop")
+        supervisor.stop()
+        rest = supervisor.report.axes["insertion"].position
+        taken.append(at - sent)
+        moved.append(rest - 1e-3 * where["A"])
+    return {
+        "to the stop of the motors, median, ms": _ms(np.median(taken)),
+        "to the stop of the motors, 99 %, ms": _ms(np.percentile(taken, 99)),
+        "to the stop of the motors, largest, ms": _ms(max(taken)),
+        "motion after it, largest, mm": round(max(moved), 4),
+    }
+
+
+def _rest_at_zero(supervisor: Supervisor) -> None:
+    if supervisor.report.state == "stopped":
+        supervisor.stop()
+        supervisor.reset()
+    supervisor.arm()
+    supervisor.move_to("insertion", 0.0)
+
+
+@contextmanager
+def _planning() -> Iterator[None]:
+    """Plan again and again in a thread, as a controller does."""
+    ended, scenario = Event(), flexneedle.load_scenario("phantom")
+
+    def plan() -> None:
+        while not ended.is_set():
+            flexneedle.plan(scenario, progress=lambda _: None)
+
+    thread = Thread(target=plan)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def publish() -> int:
+    """Publish a stop a random time after each line of the standard input, and print when (s, monotonic)."""
+    import rosbags.typesys.stores.ros2_humble as messages
+
+    writer, rng = Writer(participant(), TOPIC, "std_msgs/msg/Bool"), np.random.default_rng(0)
+    deadline = time.monotonic() + 30.0
+    while writer.readers < 2:  # the node has a third one, for stops that are latched
+        if time.monotonic() > deadline:
+            return 1
+        time.sleep(0.01)
+    print("ready", flush=True)
+    for _ in sys.stdin:
+        time.sleep(0.2 + float(rng.uniform(0.0, 0.1)))
+        begun = time.monotonic()
+        writer.write(messages.std_msgs__msg__Bool(True))
+        print(begun, flush=True)
+    return 0
+
+
+def _ms(seconds: float) -> float:
+    return round(1e3 * float(seconds), 3)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
