@@ -73,7 +73,7 @@ def test_in_tissue_it_is_that_of_the_curvature_of_its_shape():
 def test_limits_are_those_of_the_scenario(plan):
     guard = guard_of(plan, guide_force_n=0.2, past_target_mm=0.5, needle_strain_percent=0.1)
     assert (guard.force, guard.past, guard.depth, guard.strain) == (0.2, 0.5, plan.target[0], 0.001)
-    assert (guard_of(plan).force, guard_of(plan).strain) == (math.inf, 0.005)
+    assert (guard_of(plan).force, guard_of(plan).strain) == (math.inf, 0.01)
 
 
 # ---- commands
