@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all slow bench rig-demo rig-faults fuzz-ros robustness validation accuracy controllers studies tracker steering worlds space worlds-space tuning docs lint clean
+.PHONY: help setup demo test test-all slow bench rig-demo rig-faults fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering worlds space worlds-space tuning docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -51,6 +51,11 @@ rig-demo: setup  ## insertions on an emulated rig over both protocols in real ti
 
 rig-faults: setup  ## faults injected into running insertions on an emulated rig, 20 times each, and the table of docs/safety.md (hours)
 	$(BIN)/python studies/rig_faults.py --out $(or $(DIR),runs/rig-faults)
+
+fuzz: setup  ## a million random and damaged inputs each to what reads the Galil, the Aurora and rig files
+	$(BIN)/python studies/fuzz_galil.py
+	$(BIN)/python studies/fuzz_aurora.py --live
+	$(BIN)/python studies/fuzz_rig_file.py
 
 fuzz-ros: setup  ## a million random and damaged messages to all that reads ROS topics, and to a running node
 	$(BIN)/python studies/fuzz_ros.py --live
