@@ -237,5 +237,3 @@ def test_options_that_contradict_each_other_are_refused(tmp_path, capsys):
     assert status == 2
     assert "nonesuch" in error
     assert len(error.splitlines()) == 1
-
-
