@@ -89,42 +89,29 @@ def measure(count: int) -> dict[str, dict[str, float]]:
     }
 
 
-def _stops(
-    supervisor: Supervisor, other: subprocess.Popen[str], notes: Path, count: int
-) -> dict[str, float]:
-    taken, moved = [], []
+def _stops(supervisor: Supervisor, other: subprocess.Popen[str], notes: Path, count: int) -> dict[str, float]:
+    taken = []
     for _ in range(count):
-        _rest_at_zero(supervisor)
+        supervisor.arm()
+        supervisor.move_to("insertion", 0.0)
         before = len(notes.read_text().splitlines())
         other.stdin.write("stop\n")
         other.stdin.flush()
         try:
             supervisor.move_to("insertion", FAR_MM, SPEED_MM_S)
         except StoppedError:
-            pass
+            supervisor.stop()  # until the motors rest
+            supervisor.reset()
         else:
             raise SystemExit("not stopped")
         sent = float(other.stdout.readline())
         lines = [json.loads(line) for line in notes.read_text().splitlines()[before:]]
-        _, at, where = next(line for line in lines if line[0] == "stop")
-        supervisor.stop()
-        rest = supervisor.report.axes["insertion"].position
-        taken.append(at - sent)
-        moved.append(rest - 1e-3 * where["A"])
+        taken.append(next(at for what, at, _ in lines if what == "stop") - sent)
     return {
         "to the stop of the motors, median, ms": _ms(np.median(taken)),
         "to the stop of the motors, 99 %, ms": _ms(np.percentile(taken, 99)),
         "to the stop of the motors, largest, ms": _ms(max(taken)),
-        "motion after it, largest, mm": round(max(moved), 4),
     }
-
-
-def _rest_at_zero(supervisor: Supervisor) -> None:
-    if supervisor.report.state == "stopped":
-        supervisor.stop()
-        supervisor.reset()
-    supervisor.arm()
-    supervisor.move_to("insertion", 0.0)
 
 
 @contextmanager

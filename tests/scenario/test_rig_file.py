@@ -140,6 +140,9 @@ def test_a_broken_rule_of_an_axis_is_reported_in_one_line(file, key, value, rule
         ("axes.insertion", None, "missing"),
         ("axes.guide_x", {}, "unknown key; did you mean guide_"),
         ("registration", {"fiducials_mm": [[0, 0, 0]]}, "must have at least 3 entries"),
+        ("ros.profile", "", "must be one line of printable text"),
+        ("ros.arm", 1, "must be true or false"),
+        ("ros.kind", "default", "unknown key"),
         ("name", "two\nlines", "must be one line of printable text"),
     ],
 )

@@ -7,6 +7,7 @@ import sys
 import textwrap
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 from time import monotonic
 
 import pytest
@@ -85,6 +86,33 @@ def test_a_signal_stops_the_motors(supervisor):
     os.kill(supervisor.pid, signal.SIGTERM)
     with pytest.raises(StoppedError, match="stopped: signal SIGTERM"):
         supervisor.wait(5.0)
+
+
+def test_a_stop_from_another_thread_ends_a_motion(supervisor):
+    supervisor.arm()
+    threads = [Thread(target=supervisor.request_stop, args=("ROS topic /stop",)) for _ in range(8)]
+    started = supervisor.report.time
+
+    def stop_soon():
+        until(lambda: supervisor.report.axes["insertion"].position > 0.5)
+        for thread in threads:
+            thread.start()
+
+    other = Thread(target=stop_soon)
+    other.start()
+    with pytest.raises(StoppedError, match="stopped: ROS topic /stop"):
+        supervisor.move_to("insertion", 100.0)
+    for thread in (other, *threads):
+        thread.join()
+    assert supervisor.report.time - started < 5.0
+    with pytest.raises(StoppedError, match="stopped: ROS topic /stop"):
+        supervisor.arm()
+
+
+def test_a_stop_after_the_end_does_nothing():
+    with Supervisor(task()) as made:
+        made.arm()
+    made.request_stop("too late")
 
 
 def test_a_supervisor_that_is_killed_is_an_error(supervisor):
