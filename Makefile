@@ -45,6 +45,7 @@ bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten
 	$(BIN)/python benchmarks/aurora.py
 	$(BIN)/python benchmarks/galil.py
 	$(BIN)/python benchmarks/ros.py
+	$(BIN)/python benchmarks/ros_stop.py
 
 fuzz-ros: setup  ## a million random and damaged messages to all that reads ROS topics, and to a running node
 	$(BIN)/python studies/fuzz_ros.py --live

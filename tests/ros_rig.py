@@ -1,4 +1,4 @@
-"""Insertions on a rig in memory, in real time and in a process of their own, for ROS nodes that follow and stop them."""
+"""Insertions on a rig in memory, in real time, in a process of their own, which ROS nodes follow and stop."""
 
 import json
 import os
@@ -23,9 +23,16 @@ from stages import RIG, Stage
 TESTS = Path(__file__).parent
 START_MM = flexneedle.load_scenario("phantom").setup.start_tip_x
 QUICK = {
-    "target.depth_mm": 6.0, "target.lateral_mm": 0.0, "plan.samples": 16, "plan.iterations": 2,
-    "monitor.references": 0, "plan.max_iterations": 2, "needle.nodes": 15, "phantom.element_mm": 5.0, "phantom.contact_spacing_mm": 2.0,
-}  # fmt: skip
+    "target.depth_mm": 6.0,
+    "target.lateral_mm": 0.0,
+    "monitor.references": 0,
+    "plan.samples": 16,
+    "plan.iterations": 2,
+    "plan.max_iterations": 2,
+    "needle.nodes": 15,
+    "phantom.element_mm": 5.0,
+    "phantom.contact_spacing_mm": 2.0,
+}
 
 
 class Noting(Stage):
@@ -34,7 +41,7 @@ class Noting(Stage):
     made = None
 
     def __init__(self, file, channels):
-        self._file = open(file, "a")  # noqa: SIM115  closed with the motors
+        self._file = Path(file).open("a")  # noqa: SIM115  closed with the motors
         super().__init__(WallClock(), channels)
         Noting.made = self
 

@@ -164,7 +164,7 @@ def topics(folder):
     """Topics of a trace with their types."""
     from mcap.reader import make_reader
 
-    with open(folder / "trace.mcap", "rb") as file:
+    with (folder / "trace.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
     return {(one.topic, summary.schemas[one.schema_id].name) for one in summary.channels.values()}
 
