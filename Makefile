@@ -45,6 +45,7 @@ bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten
 	$(BIN)/python benchmarks/aurora.py
 	$(BIN)/python benchmarks/galil.py
 	$(BIN)/python benchmarks/ros.py
+	$(BIN)/python benchmarks/ros_stop.py
 
 rig-demo: setup  ## insertions on an emulated rig over both protocols in real time (N=1)
 	$(BIN)/python studies/rig_demo.py --insertions $(or $(N),1) --out $(or $(DIR),runs/rig-demo)

@@ -20,9 +20,7 @@ from threading import Event, Thread
 
 import numpy as np
 
-HERE = Path(__file__).resolve()
-TESTS = HERE.parents[1] / "tests"
-sys.path.insert(0, str(TESTS))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import flexneedle
 from flexneedle.errors import StoppedError
 from flexneedle.rig.supervisor.client import Supervisor
@@ -36,6 +34,8 @@ from flexneedle.scenario.sections.monitor import MonitorSettings
 from ros import LOOPBACK
 from stages import RIG
 
+HERE = Path(__file__).resolve()
+TESTS = HERE.parents[1] / "tests"
 SPEED_MM_S, FAR_MM = 5.0, 100.0
 TOPIC = load_profile("neutral").subscribe.stop.topic
 

@@ -1,4 +1,4 @@
-"""Insertions on a rig in memory, in real time and processes of their own, for ROS nodes that follow and stop them."""
+"""Insertions on a rig in memory, in real time, in a process of their own, which ROS nodes follow and stop."""
 
 import json
 import os
@@ -23,10 +23,16 @@ from stages import RIG, Stage
 TESTS = Path(__file__).parent
 START_MM = flexneedle.load_scenario("phantom").setup.start_tip_x
 QUICK = {
-    "target.depth_mm": 6.0, "target.lateral_mm": 0.0, "plan.samples": 16, "plan.iterations": 2,
-    "monitor.references": 0, "plan.max_iterations": 2, "needle.nodes": 15, "phantom.element_mm": 5.0,
+    "target.depth_mm": 6.0,
+    "target.lateral_mm": 0.0,
+    "monitor.references": 0,
+    "plan.samples": 16,
+    "plan.iterations": 2,
+    "plan.max_iterations": 2,
+    "needle.nodes": 15,
+    "phantom.element_mm": 5.0,
     "phantom.contact_spacing_mm": 2.0,
-}  # fmt: skip
+}
 
 
 class Noting(Stage):

@@ -40,6 +40,8 @@ def test_a_stop_on_its_topic_stops_the_motors_at_once(tmp_path):
     why = "stopped: ROS topic /flexneedle/stop"
     assert errors[-1] == f"flexneedle: interrupted: {why}; record: {insertion.out}"
     assert (insertion.stored["status"], insertion.stored["reason"]) == ("interrupted", why)
+    stopped = insertion.stored["timing"]["ticks"]["states"][-1]  # by the supervisor, not at the next period
+    assert (stopped["state"], stopped["why"]) == ("stopped", "ROS topic /flexneedle/stop")
     _, at, where = insertion.calls("stop")[0]
     assert 0.0 < at - sent < 0.3
     assert [one for one in insertion.calls("follow") if one[1] > at] == []

@@ -44,7 +44,7 @@ class Bridge:
     A thread polls the node; a stop goes at once to the supervisor, in whatever the insertion is busy. It is the
     `Follower` of an insertion on a rig. Without a rig a stop ends the insertion at its next period, by `check`.
 
-    settings: the section `ros` of a rig file. show: prints a line for the user, never from a thread of this object.
+    settings: the section `ros` of a rig file. show: prints a line for the user; no thread of this calls it.
     record: for `run.json`, with each stop, arm, target, refused message and loss of the node as it happened.
     Raises RigError for the profile, InputError or RunError if the node does not start.
     """
