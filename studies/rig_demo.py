@@ -19,9 +19,10 @@ import numpy as np
 
 import flexneedle
 from emulated import Witness, emulated_rig, ended, insertion, percentile, witness
+from flexneedle.scenario.files import dump_scenario
 
 _SPACE_EVERY, _FIRST_SEED = 10, 400_000
-_REST_S = 0.5
+_ROTATION_DEG = 1080.0  # of the emulated rig
 
 
 @dataclass(frozen=True)
@@ -45,16 +46,18 @@ class Result:
 
 def measured(scenario: str, seed: int, out: Path) -> Result:
     """Carry out one insertion on the emulated rig, and the same on the virtual one."""
-    with tempfile.TemporaryDirectory() as folder, emulated_rig(Path(folder), scenario, seed) as rig:
-        with witness() as seen:
-            status, _, errors = ended(insertion(rig.rig, scenario, out, "--seed", str(seed)), 180.0)
-        truth = rig.read_truth()
+    with tempfile.TemporaryDirectory() as folder:
+        file = _scenario_file(scenario, Path(folder))
+        with emulated_rig(Path(folder), str(file), seed) as rig:
+            with witness() as seen:
+                status, _, errors = ended(insertion(rig.rig, str(file), out, "--seed", str(seed)), 180.0)
+            truth = rig.read_truth()
     if status not in (0, 1):
         raise SystemExit(f"{scenario}, seed {seed}: exit status {status}\n{errors}")
     done = flexneedle.load(out)
     plan = done.plan
     ticks = json.loads((out / "run.json").read_text())["timing"]["ticks"]
-    simulated = flexneedle.insert(scenario, plan, seed)
+    simulated = flexneedle.insert(plan.scenario, plan, seed)
     moved = [period.innovation[0] for period in done.periods if period.verdict.ok and period.readings]
     return Result(
         scenario,
@@ -71,6 +74,16 @@ def measured(scenario: str, seed: int, out: Path) -> Result:
         ticks["missed"],
         _unexplained(ticks["stalls"], seen),
     )
+
+
+def _scenario_file(scenario: str, folder: Path) -> Path:
+    """The preset in a file; in space with the range in which the rig can roll the needle."""
+    made = flexneedle.load_scenario(scenario)
+    if not made.setup.half_turns:
+        made = made.with_values({"setup.max_rotation_deg": _ROTATION_DEG})
+    path = folder / f"{scenario}.toml"
+    path.write_text(dump_scenario(made))
+    return path
 
 
 def _unexplained(stalls: list[dict[str, float]], seen: Witness) -> int:
