@@ -63,15 +63,15 @@ class Columns:
         }
         return {name: way for name, way in travel.items() if abs(way) > 1e-12}
 
-    def control(self, travelled: Mapping[str, float], roll: float) -> Control:
-        """The control that travelled axes have carried out, with its roll (rad) before the spin."""
+    def control(self, travelled: Mapping[str, float], roll: float, spin: float) -> Control:
+        """The control that travelled axes have carried out, with the roll and the spin (rad) of their rotation."""
         row = np.zeros(len(STILL))
         row[DB_X] = travelled.get("insertion", 0.0) / self._stretch
         row[DB_Y] = travelled.get("base_y", 0.0) + self.slope.real * row[DB_X]
         row[DB_Z] = travelled.get("base_z", 0.0) + self.slope.imag * row[DB_X]
         for name, column in _GUIDE.items():
             row[column] = travelled.get(name, 0.0)
-        row[ROLL], row[SPIN] = roll, travelled.get("rotation", 0.0) - roll
+        row[ROLL], row[SPIN] = roll, spin
         return Control.of(row.tolist())
 
 
@@ -169,27 +169,26 @@ class SupervisedDriver:
         self._limits.check(self._moved, np.array([command]), self._rolled)
         roll = half_turned(self._rolled, command.roll) if self._limits.half_turns else command.roll
         done = self._supervisor.step(roll, self._columns.travel(command), duration, self._expected)
-        row = self._columns.control(done.travelled, self._done_roll(done, command, roll))
+        row = self._columns.control(done.travelled, *self._rotation(done, command, roll))
         self._moved += np.array(row[:MOVES])
         self._rolled += row.roll + row.spin
         return Motion(row, done.begun, done.ended, done.turned)
 
-    def _done_roll(self, done: Done, command: Control, roll: float) -> float:
-        """The part of the rotation that is the roll.
+    def _rotation(self, done: Done, command: Control, roll: float) -> tuple[float, float]:
+        """Roll and spin of what was turned.
 
-        Half a turn was confirmed by its position, and counts as half a turn. Without a spin all rotation is the roll.
+        A half turn was confirmed by its position and counts as one, so that half turns to and fro do not drift. Else
+        all rotation is the roll, or the spin after it where one was commanded.
         """
         turned = done.travelled.get("rotation", 0.0)
-        if roll == 0.0:
-            return 0.0
         if not self._limits.half_turns:
-            return turned if command.spin == 0.0 else roll
-        tolerance = self._tolerance
-        if abs(turned) > tolerance and abs(turned - roll) > tolerance:
-            raise DriverError(
-                f"the roll was interrupted at {math.degrees(turned):.1f}°: the bevel is not known"
-            )
-        return roll if abs(turned) > tolerance else 0.0
+            return (roll, turned - roll) if command.spin != 0.0 or roll == 0.0 else (turned, 0.0)
+        if roll == 0.0:
+            return 0.0, 0.0
+        if min(abs(turned), abs(turned - roll)) > self._tolerance:
+            at = f"{math.degrees(turned):.1f}° of {math.degrees(roll):.0f}°"
+            raise DriverError(f"the roll was interrupted at {at}: the bevel is not known")
+        return (roll if abs(turned) > self._tolerance else 0.0), 0.0
 
     @property
     def _tolerance(self) -> float:
@@ -232,7 +231,7 @@ def supervised(
     watchers.ticks.started = task.started
     with Supervisor(task, watchers.report) as supervisor:
         watchers.opened(supervisor)
-        supervisor.arm(_deepest(scenario))
+        supervisor.arm(_deepest(scenario, plan))
         if rig.axes.rotation is not None:
             supervisor.move_to("rotation", plan.roll)
         if scenario.monitor.enabled and scenario.monitor.references:
@@ -242,7 +241,7 @@ def supervised(
         yield Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline)
 
 
-def _deepest(scenario: Scenario) -> float:
-    """Advance (mm) of the base at which a straight needle is as far past its target as it may be."""
-    way = scenario.target.depth_mm + scenario.guard.past_target_mm - scenario.setup.start_tip_x
+def _deepest(scenario: Scenario, plan: Plan) -> float:
+    """Advance (mm) of the base at which a straight needle is as far past the plan's target as it may be."""
+    way = plan.target[0] + scenario.guard.past_target_mm - scenario.setup.start_tip_x
     return way * math.sqrt(1.0 + abs(scenario.entry.slope) ** 2)
