@@ -133,7 +133,7 @@ def _add_jog(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="largest speed, mm/s or deg/s (default: a fifth of the axis's)",
     )
     _add_yes(parser)
-    # The pattern by which argparse tells -5mm from an option; there is no public way to set it.
+    # The pattern by which argparse distinguishes -5mm from an option; there is no public way to set it.
     parser._negative_number_matcher = _NEGATIVE
     parser.set_defaults(handler=_jog)
 

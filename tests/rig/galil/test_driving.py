@@ -238,7 +238,7 @@ def test_a_line_that_fails_is_noticed_and_can_be_renewed(fault, problem):
 
 @pytest.mark.parametrize("fault", ["silence@0.05:0.3", "delay=0.5@0.05:0.3"])
 def test_motors_whose_state_is_unknown_are_stopped(fault):
-    """Although they were told to go far."""
+    """Although their targets are far."""
     with rig(fault, timeout_ms=100) as motors:
         motors.follow({"A": 1e6})
         lost(motors)

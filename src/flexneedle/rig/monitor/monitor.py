@@ -83,7 +83,7 @@ class _Jump:
     time (s).
 
     The needle is held after a jump, and then no time makes a distance plausible: with a limit that grew with it, a
-    sensor that has slipped would soon be believed. Only the travel that is still predicted adds to it. A reading that
+    sensor that has slipped would soon be accepted. Only the travel that is still predicted adds to it. A reading that
     is as near to its prediction, which no reading has corrected since, shows that the last good one was wrong.
     """
 

@@ -123,7 +123,7 @@ class Link:
 
 
 def _require_silence(connection: socket.socket) -> None:
-    """Raise GarbledError if there is data before anything was asked: its sender believes in another order of things."""
+    """Raise GarbledError if there is data before anything was asked: replies and commands would no longer match."""
     connection.setblocking(False)
     with suppress(BlockingIOError):
         data = connection.recv(_LARGEST_REPLY)
