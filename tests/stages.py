@@ -1,7 +1,7 @@
 """Motors and a tracker in memory, on a clock that a test sets: what a supervisor moves and reads."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from flexneedle.errors import DriverError
@@ -282,6 +282,14 @@ class Still:
 
     def close(self):
         pass
+
+
+class Blind(Still):
+    """A tracker of a rig file, `stages:Blind`: frames without the tip."""
+
+    def read(self):
+        unseen = {"tip": SensorReading(None, status="missing")}
+        return tuple(replace(frame, readings=unseen) for frame in super().read())
 
 
 class Noting(Stage):

@@ -113,7 +113,8 @@ def test_a_reading_is_expected_on_the_line_of_the_needle():
 
 def test_the_base_may_advance_as_far_as_the_plans_target_and_no_other():
     plan = make_plan("manipulation", (25.0, 1.0, 0.0), 0)
-    assert _deepest(PHANTOM, plan) == pytest.approx(25.0 + 2.0 + PHANTOM.setup.tip_to_skin_mm)
+    assert _deepest(PHANTOM, plan, None) == pytest.approx(25.0 + 2.0 + PHANTOM.setup.tip_to_skin_mm)
+    assert _deepest(PHANTOM, plan, -31.0) == pytest.approx(25.0 + 2.0 + 31.0)
 
 
 @pytest.mark.long
@@ -122,12 +123,14 @@ def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
     scenario = PHANTOM.with_values({"target.depth_mm": 12.0, "target.lateral_mm": 1.0})
     plan = flexneedle.plan(scenario, seed=0)
     path, truth = rig_file(tmp_path), tmp_path / "truth.csv"
-    with emulated_rig(path, "phantom", "--seed", "3", "--truth", truth) as rig:
+    seed = 862  # its tip starts 2.5 mm behind the scenario's, more than it may go past the target
+    with emulated_rig(path, "phantom", "--seed", str(seed), "--truth", truth) as rig:
         address = rig.ready["ready"]["galil"]
         path.write_text(path.read_text().replace("127.0.0.1:0", address))
-        done = flexneedle.insert(scenario, plan, 3, rig=path, dry_run=dry)
+        done = flexneedle.insert(scenario, plan, seed, rig=path, dry_run=dry)
         assert rig.ask("TPA") == (" 0\r\n:" if dry else rig.ask("TPA"))
     found = read_truth(truth)
+    assert found.tips[0, 0] < PHANTOM.setup.start_tip_x - PHANTOM.guard.past_target_mm
     assert done.outcome == "done"
     assert done.reached
     assert done.ticks["count"] > 100

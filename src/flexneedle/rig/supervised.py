@@ -231,7 +231,9 @@ def supervised(
     watchers.ticks.started = task.started
     with Supervisor(task, watchers.report) as supervisor:
         watchers.opened(supervisor)
-        supervisor.arm(_deepest(scenario, plan))
+        # In a dry run nothing moves, and the tip is not that of the tracker.
+        tip = None if dry else supervisor.tip_x(scenario.control.stale_after_s)
+        supervisor.arm(math.inf if dry else _deepest(scenario, plan, tip))
         if rig.axes.rotation is not None:
             supervisor.move_to("rotation", plan.roll)
         if scenario.monitor.enabled and scenario.monitor.references:
@@ -241,7 +243,11 @@ def supervised(
         yield Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline)
 
 
-def _deepest(scenario: Scenario, plan: Plan) -> float:
-    """Advance (mm) of the base at which a straight needle is as far past the plan's target as it may be."""
-    way = plan.target[0] + scenario.guard.past_target_mm - scenario.setup.start_tip_x
+def _deepest(scenario: Scenario, plan: Plan, tip: float | None) -> float:
+    """Advance (mm) of the base at which a straight needle is as far past the plan's target as it may be.
+
+    tip: its measured depth at the start (mm); None: not measured, the scenario's.
+    """
+    start = scenario.setup.start_tip_x if tip is None else tip
+    way = plan.target[0] + scenario.guard.past_target_mm - start
     return way * math.sqrt(1.0 + abs(scenario.entry.slope) ** 2)

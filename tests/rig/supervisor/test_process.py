@@ -57,6 +57,17 @@ def test_a_step_is_carried_out_and_ticks_go_on(supervisor):
     assert supervisor.read() == () or len(supervisor.read()) < 3
 
 
+def test_the_depth_of_the_tip_is_the_median_of_measurements_that_can_still_be_read(supervisor):
+    found = supervisor.tip_x(2.0)
+    assert len(supervisor.read()) >= 9
+    assert found == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_tip_that_is_not_measured_has_no_depth():
+    with Supervisor(task(tracker="stages:Blind")) as supervisor:
+        assert supervisor.tip_x(0.2) is None
+
+
 def test_operators_move_axes(supervisor):
     with pytest.raises(RefusedError, match="jog: refused while idle"):
         supervisor.jog("guide_y", 1.0)

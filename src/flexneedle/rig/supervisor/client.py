@@ -5,9 +5,10 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable, Mapping
-from math import inf
+from math import inf, isfinite
 from multiprocessing.connection import Connection
 from threading import Condition, Lock, Thread
+from statistics import median
 from time import monotonic
 from typing import Any, Self
 
@@ -26,6 +27,7 @@ _PATIENCE_S = 0.3  # for reports that have not been taken, after a time without 
 _OPEN_S = 60.0  # to find a tracker
 _END_S = 5.0
 _MOST_KEPT = 4000  # measurements: 100 s without a reader
+_ENOUGH = 9  # measurements for a median
 
 
 class Supervisor:
@@ -112,6 +114,20 @@ class Supervisor:
             found = tuple(self._measurements)
             self._measurements.clear()
         return found
+
+    def tip_x(self, within: float) -> float | None:
+        """Depth (mm) of the tip at rest, the median of at least 9 measurements or all within a time (s); None: none.
+
+        `read` returns them, too.
+        """
+        until, found = monotonic() + within, list[float]()
+
+        def enough() -> bool:
+            found[:] = [one.x for one in self._measurements if one.x is not None and isfinite(one.x)]
+            return len(found) >= _ENOUGH or monotonic() >= until
+
+        self._wait(enough, within + 1.0, "the clock stands still")
+        return median(found) if found else None
 
     @property
     def status(self) -> str:
