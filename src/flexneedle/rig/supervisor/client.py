@@ -7,8 +7,8 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from math import inf, isfinite
 from multiprocessing.connection import Connection
-from threading import Condition, Lock, Thread
 from statistics import median
+from threading import Condition, Lock, Thread
 from time import monotonic
 from typing import Any, Self
 
