@@ -15,6 +15,8 @@ from select import select
 from time import monotonic, sleep
 from typing import Any
 
+import numpy as np
+
 from flexneedle.rig.devices.priority import set_realtime_priority
 from flexneedle.rig.emulator.coupled.truth import Truth, read_truth
 
@@ -179,6 +181,19 @@ def watch() -> None:
         if now - before > _STALL_S:
             print(f"{now:.6f} {now - before:.6f}", flush=True)
         before = now
+
+
+def moved_after(truth: Truth, since: float) -> float:
+    """How far the base has moved (mm) after a time (s, monotonic)."""
+    base = truth.positions["insertion"]
+    after = base[truth.time >= since]
+    return float(np.abs(after - np.interp(since, truth.time, base)).max()) if len(after) else 0.0
+
+
+def rests(truth: Truth, seconds: float = 0.5, most: float = 0.005) -> bool:
+    """Whether no axis has moved by `most` (mm, rad) in the last `seconds`."""
+    last = truth.time >= truth.time[-1] - seconds
+    return all(np.ptp(place[last]) < most for place in truth.positions.values())
 
 
 def percentile(values: Sequence[float], share: float) -> float:

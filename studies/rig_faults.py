@@ -28,11 +28,10 @@ from zlib import crc32
 
 import numpy as np
 
-from emulated import EmulatedRig, emulated_rig, ended, insertion
+from emulated import EmulatedRig, emulated_rig, ended, insertion, moved_after, rests
 from flexneedle.rig.emulator.coupled.truth import Truth
 
 _MOTION_MM = 0.5  # the most that the base may move after detection
-_REST_S, _REST_MM = 0.5, 0.005
 _EARLIEST_S, _LATEST_S = 1.0, 13.0  # after the first motion, while the needle is driven
 _STATES = ("holding", "stopped", "fault")
 _CLOCK = r"""
@@ -338,7 +337,7 @@ def _judged(
         "why": None if detected is None else detected["why"],
         "detection_s": None if detected is None else detected["time_s"] - injected,
         "motion_mm": _motion(fault, truth, injected, detected),
-        "rests": _rests(truth),
+        "rests": rests(truth),
         "errors": errors[-300:] if status not in (0, 1, 130) else "",
     }
 
@@ -351,15 +350,7 @@ def _motion(fault: Fault, truth: Truth, injected: float, detected: Mapping[str, 
         return None
     if detected is None and "by themselves" not in fault.reaction and "killed" not in fault.name:
         return None
-    place = np.interp(since, truth.time, truth.positions["insertion"])
-    after = truth.positions["insertion"][truth.time >= since]
-    return float(np.abs(after - place).max()) if len(after) else 0.0
-
-
-def _rests(truth: Truth) -> bool:
-    """Whether nothing moves at the end."""
-    last = truth.time >= truth.time[-1] - _REST_S
-    return all(np.ptp(place[last]) < _REST_MM for place in truth.positions.values())
+    return moved_after(truth, since)
 
 
 def good(fault: Fault, trial: Mapping[str, Any]) -> bool:
