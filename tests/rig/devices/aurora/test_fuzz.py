@@ -14,7 +14,7 @@ from flexneedle.rig.devices.aurora.incoming import Incoming
 from flexneedle.rig.devices.aurora.messages import parse
 from flexneedle.rig.emulator import aurora, codec
 from flexneedle.rig.supervisor.watch import Watch
-from flexneedle.types import OK, Frame, SensorReading
+from flexneedle.types import OK, VISIBLE, Frame, SensorReading
 
 sys.path.append(str(Path(__file__).parents[4] / "studies"))  # behind the tests: both have an `emulated`
 import fuzz_aurora
@@ -49,7 +49,9 @@ def test_a_line_that_damages_replies_gives_no_frame_that_was_not_sent():
     pose=st.lists(FINITE, max_size=10) | st.tuples(*[FINITE] * 8),
 )
 def test_a_sensor_has_a_position_only_if_it_is_finite_and_in_range(kind, bits, frame, pose):
-    fuzz_aurora.checked_reading((kind, bits, frame, tuple(pose)), 2)
+    found = fuzz_aurora.checked_reading((kind, bits, frame, tuple(pose)), 2)
+    assert (found.position is None) == (found.status != VISIBLE)
+    assert all(abs(part) < fuzz_aurora.FARTHEST_MM for part in found.position or ())
 
 
 @settings(deadline=None, derandomize=True, max_examples=300)
@@ -58,10 +60,12 @@ def test_a_sensor_has_a_position_only_if_it_is_finite_and_in_range(kind, bits, f
         st.binary(max_size=60) | JSON.map(lambda value: fuzz_aurora.json.dumps(value).encode()), max_size=5
     )
 )
-def test_any_line_is_a_message_or_refused_and_counted(lines):
+def test_any_line_that_is_no_message_is_refused_and_counted(lines):
     feeding = fuzz_aurora.Feeding()
     for number, line in enumerate(lines):
         fuzz_aurora.fed(feeding, line.replace(b"\n", b"") + b"\n", Random(number))
+    assert feeding.incoming.counts.errors.get("crash", 0) == len(lines)
+    assert feeding.incoming.read() == ()
 
 
 @settings(deadline=None, derandomize=True, max_examples=200)
@@ -71,7 +75,10 @@ def test_any_bytes_to_the_emulated_tracker_are_answered(lines):
     for number, line in enumerate(lines):
         checked = codec.parse(line).name.encode() + b":"
         for sent in (line, checked + b"%04X" % codec.crc16(checked)):
-            device = fuzz_aurora.checked_command(device, sent, fuzz_aurora.random_frame(Random(number)))
+            frame = fuzz_aurora.random_frame(Random(number))
+            _, answer = aurora.reply(device, sent, frame)
+            assert answer.endswith(b"\r") or fuzz_aurora.decoded(answer) is not None
+            device = fuzz_aurora.checked_command(device, sent, frame)
 
 
 # What it must notice
