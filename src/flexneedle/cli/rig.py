@@ -79,8 +79,8 @@ def _add_check(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="compare a rig with its file; moves nothing",
         **described(
             "Connect to each device and compare it with the rig file: motors, positions, limit switches, frames and "
-            "sensors of the tracker. Moves, powers and changes nothing. One line for each thing that was checked; "
-            "exit status 1 if there is a problem.",
+            "sensors of the tracker, publishers of ROS topics. Moves, powers, publishes and changes nothing. One line "
+            "for each thing that was checked; exit status 1 if there is a problem.",
             "flexneedle rig check rig.toml",
             "flexneedle rig check rig.toml --scenario phantom --json",
         ),
@@ -102,7 +102,7 @@ def _add_check(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         type=_positive,
         default=_SECONDS,
         metavar="S",
-        help=f"time for which frames of the tracker are counted (default: {_SECONDS:g})",
+        help=f"time for which frames of the tracker and messages are counted (default: {_SECONDS:g})",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of lines")
     parser.set_defaults(handler=_check)
@@ -207,10 +207,14 @@ def _positive(text: str) -> float:
 def _check(args: argparse.Namespace) -> int:
     from flexneedle.rig.check import check_rig
     from flexneedle.rig.devices.clock import WallClock
+    from flexneedle.ros.check import check_ros
     from flexneedle.scenario.rig import load_rig
 
-    rig = load_rig(args.rig)
-    findings = check_rig(rig, WallClock(), args.seconds, _wanted(args))
+    rig, clock = load_rig(args.rig), WallClock()
+    findings = [
+        *check_rig(rig, clock, args.seconds, _wanted(args)),
+        *check_ros(rig, clock, args.seconds),
+    ]
     problems = sum(1 for finding in findings if finding.problem)
     if args.json:
         print_json(_values(rig, findings))

@@ -20,6 +20,12 @@ from flexneedle.types import VISIBLE, Period, Plan
 _START_S, _SILENT_S, _STOP_S = 30.0, 1.0, 2.0
 
 
+def check_installed() -> None:
+    """Raises InputError if cyclonedds is not installed."""
+    if find_spec("cyclonedds") is None:
+        raise InputError("ROS 2 needs cyclonedds, which is not installed: pip install 'flexneedle[ros]'")
+
+
 def open_node(profile: Profile, *, epoch: float = 0.0) -> "NodeClient":
     """Start the node of an insertion: it publishes what the profile lists, and reads stop, arm and target.
 
@@ -37,8 +43,7 @@ class NodeClient:
     """
 
     def __init__(self, profile: Profile, *, epoch: float = 0.0) -> None:
-        if find_spec("cyclonedds") is None:
-            raise InputError("ROS 2 needs cyclonedds, which is not installed: pip install 'flexneedle[ros]'")
+        check_installed()
         ours, theirs = socket.socketpair()
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  closed with the node
         command = [sys.executable, "-m", "flexneedle.ros.node", "--fd", str(theirs.fileno())]
