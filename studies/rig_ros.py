@@ -191,7 +191,8 @@ def _judged(truth: Truth, sent: float, run: Row) -> Row:
     how far the base moved (mm) after the order and after the report.
     """
     states = run["timing"]["ticks"]["states"]
-    reported = next((one["time_s"] for one in states if one["state"] == "stopped"), float("nan"))
+    later = (one["time_s"] for one in states if one["state"] == "stopped" and one["time_s"] >= sent)
+    reported = next(later, float("nan"))
     turned = np.any([np.diff(counts) != 0.0 for counts in truth.counts.values()], axis=0)
     before, at = np.interp([sent - 0.02, sent], truth.time, truth.positions["insertion"])
     return {
@@ -232,16 +233,19 @@ def costs(pairs: int, first: int, out: Path) -> None:
 
 def stops(count: int, out: Path) -> bool:
     """Run insertions that are stopped, and print their table and a summary; return whether all ended as they must."""
-    print("stop           no   mm/s  reported      rest    moved  after the report  ended")
+    print("stop           no   mm/s  reported      rest    moved  after the report  reason")
     rows: dict[str, list[Row]] = {how: [] for how in STOPS}
     for timing, how in product(range(count), STOPS):
         folder = out / f"{how}-{timing}".replace(" ", "-")
         row = resumed(out / RESULTS, {"stop": how, "timing": timing}, partial(stop, how, timing, folder))
         rows[how].append(row)
-        print(_line(how, str(timing), row), "as required" if good(row) else f"BAD: {row}", flush=True)
+        mark = "" if good(row) else "not as required: "
+        print(f"{_line(how, str(timing), row)} {mark}{row['reason']}", flush=True)
     for how, found in rows.items():
-        for name, of in (("median", np.median), ("most", np.max)):
-            print(_line(how, name, {key: float(of([row[key] for row in found])) for key in NUMBERS}))
+        fit = [row for row in found if good(row)]
+        for name, of in (("median", np.median), ("most", np.max)) if fit else ():
+            numbers = {key: float(of([row[key] for row in fit])) for key in NUMBERS}
+            print(f"{_line(how, name, numbers)} of {len(fit)} as required, {len(found) - len(fit)} not")
     return all(map(good, chain(*rows.values())))
 
 
