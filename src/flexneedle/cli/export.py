@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from flexneedle.console.common import HelpFormatter, examples
+from flexneedle.console.commands import Commands, add_command
 from flexneedle.errors import InputError
 
 _PERIODS, _READINGS, _STDOUT = "periods.csv", "readings.csv", "-"
@@ -27,16 +27,18 @@ _COLUMN_HELP = """
 Unknown values are empty. A tracker without frames has no sensor columns.
 
 """
-_EXAMPLES = examples("flexneedle export runs/mine --csv", "flexneedle export runs/mine --readings - | head")
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        commands,
         "export",
-        help="export the control periods or the tracker readings of a run",
-        epilog=_COLUMN_HELP + _EXAMPLES,
-        formatter_class=HelpFormatter,
+        "export the control periods or the tracker readings of a run",
+        _export,
+        "flexneedle export runs/mine --csv",
+        "flexneedle export runs/mine --readings - | head",
+        notes=_COLUMN_HELP,
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run")
     what = parser.add_mutually_exclusive_group(required=True)
@@ -51,7 +53,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             metavar="FILE",
             help=f"export {rows} as CSV, units in the header; {_STDOUT}: stdout (default: RUN/{default})",
         )
-    parser.set_defaults(handler=_export)
 
 
 def _export(args: argparse.Namespace) -> int:

@@ -12,6 +12,7 @@ from time import monotonic
 from typing import Self
 
 from flexneedle.errors import InputError, RunError
+from flexneedle.rig.processes import end_process, last_line
 from flexneedle.ros.pipe import Pipe
 from flexneedle.ros.profile import OF_THE_LOOP, Profile
 from flexneedle.ros.records import Beat, Lost, Published, Request, RigState, Setup, Target
@@ -112,24 +113,16 @@ class NodeClient:
     def close(self) -> None:
         """End the node."""
         self._pipe.close()
-        try:
-            self._process.wait(_STOP_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        end_process(self._process, _STOP_S)
         self._errors.close()
 
     def _silent(self) -> str:
         """Why nothing is received any more, or ""."""
         if self._pipe.ended:
-            return f"the ROS node has ended{self._last_words()}"
+            words = last_line(self._errors)
+            return f"the ROS node has ended: {words}" if words else "the ROS node has ended"
         silent = 0.0 if self._beat_at is None else monotonic() - self._beat_at
         return f"the ROS node does not answer for {silent:.1f} s" if silent > _SILENT_S else ""
-
-    def _last_words(self) -> str:
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        return f": {lines[-1]}" if lines else ""
 
     def _await_ready(self) -> None:
         deadline = monotonic() + _START_S

@@ -14,6 +14,7 @@ from typing import Any, Self
 
 from flexneedle.errors import DriverError, RefusedError, StoppedError
 from flexneedle.rig.devices.clock import WallClock
+from flexneedle.rig.processes import end_process
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.machine import State
 from flexneedle.rig.tracking.registration import identity
@@ -77,11 +78,7 @@ class Supervisor:
         """Stop the motors, and end the supervisor."""
         if self._ended is None:
             self._send(say.Close(), lost=True)
-        try:
-            self._process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        end_process(self._process, _END_S)
         self._thread.join()  # it ends with the supervisor's end of the line
         with self._sending:
             self._connection.close()
