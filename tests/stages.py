@@ -256,10 +256,14 @@ class Bench:
 
 
 def real_motors(settings, channels):
-    """A driver of a rig file, `stages:real_motors`: the motors in memory, in real time. position: of all (counts)."""
+    """A driver of a rig file, `stages:real_motors`: the motors in memory, in real time.
+
+    position: of all (counts); off: how far they are from where their controller has them (counts).
+    """
     stage = Stage(WallClock(), channels)
     for motor in stage.motors.values():
         motor.position = motor.commanded = motor.target = float(settings.get("position", 0.0))
+        motor.position += float(settings.get("off", 0.0))
     return stage
 
 

@@ -12,12 +12,11 @@ import flexneedle
 from emulated_rig import emulated_rig, rig_file
 from flexneedle.errors import CommandError, DriverError
 from flexneedle.rig.emulator.coupled.truth import read_truth
-from flexneedle.rig.supervised import Columns, SupervisedDriver, _deepest
+from flexneedle.rig.supervised import Columns, SupervisedDriver
 from flexneedle.rig.supervisor.machine import State
 from flexneedle.rig.supervisor.messages import Done
 from flexneedle.scenario.rig import load_rig
 from flexneedle.types import Control
-from synthetic import make_plan
 
 PHANTOM = flexneedle.load_scenario("phantom")
 SPACE = flexneedle.load_scenario("phantom3d")
@@ -109,12 +108,6 @@ def test_a_reading_is_expected_on_the_line_of_the_needle():
     assert expected.begin == (10.0, 2.0, 0.0)
     assert expected.end == pytest.approx((11.0, 2.0 + math.tan(0.1), 0.0))
     assert expected.most_off == pytest.approx(2.0 + 3 * 0.2)
-
-
-def test_the_base_may_advance_as_far_as_the_plans_target_and_no_other():
-    plan = make_plan("manipulation", (25.0, 1.0, 0.0), 0)
-    assert _deepest(PHANTOM, plan, None) == pytest.approx(25.0 + 2.0 + PHANTOM.setup.tip_to_skin_mm)
-    assert _deepest(PHANTOM, plan, -31.0) == pytest.approx(25.0 + 2.0 + 31.0)
 
 
 @pytest.mark.long

@@ -13,6 +13,7 @@ import numpy as np
 from flexneedle.errors import DriverError, RigError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.rig.fit import fit_problems
+from flexneedle.rig.start import checked_start, deepest
 from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.rig.supervisor.messages import Done, Expectation, Report, Task
 from flexneedle.rig.virtual import Rig, to_stage
@@ -231,9 +232,8 @@ def supervised(
     watchers.ticks.started = task.started
     with Supervisor(task, watchers.report) as supervisor:
         watchers.opened(supervisor)
-        # In a dry run nothing moves, and the tip is not that of the tracker.
-        tip = None if dry else supervisor.tip_x(scenario.control.stale_after_s)
-        supervisor.arm(math.inf if dry else _deepest(scenario, plan, tip))
+        tip = checked_start(scenario, supervisor.tip(scenario.control.hold_limit_s))
+        supervisor.arm(deepest(scenario, plan, None if dry else tip[0]))
         if rig.axes.rotation is not None:
             supervisor.move_to("rotation", plan.roll)
         if scenario.monitor.enabled and scenario.monitor.references:
@@ -241,13 +241,3 @@ def supervised(
         driver = SupervisedDriver(supervisor, scenario, plan.roll)
         deadline = 1e-3 * rig.loop.decision_ms
         yield Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline)
-
-
-def _deepest(scenario: Scenario, plan: Plan, tip: float | None) -> float:
-    """Advance (mm) of the base at which a straight needle is as far past the plan's target as it may be.
-
-    tip: its measured depth at the start (mm); None: not measured, the scenario's.
-    """
-    start = scenario.setup.start_tip_x if tip is None else tip
-    way = plan.target[0] + scenario.guard.past_target_mm - start
-    return way * math.sqrt(1.0 + abs(scenario.entry.slope) ** 2)

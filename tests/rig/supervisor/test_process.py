@@ -57,15 +57,15 @@ def test_a_step_is_carried_out_and_ticks_go_on(supervisor):
     assert supervisor.read() == () or len(supervisor.read()) < 3
 
 
-def test_the_depth_of_the_tip_is_the_median_of_measurements_that_can_still_be_read(supervisor):
-    found = supervisor.tip_x(2.0)
+def test_the_tip_is_the_median_of_measurements_that_can_still_be_read(supervisor):
+    found = supervisor.tip(2.0)
     assert len(supervisor.read()) >= 9
-    assert found == pytest.approx(0.0, abs=1e-3)
+    assert found == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
 
 
-def test_a_tip_that_is_not_measured_has_no_depth():
+def test_a_tip_that_is_not_measured_is_none():
     with Supervisor(task(tracker="stages:Blind")) as supervisor:
-        assert supervisor.tip_x(0.2) is None
+        assert supervisor.tip(0.2) is None
 
 
 def test_operators_move_axes(supervisor):
@@ -90,6 +90,14 @@ def test_a_stopped_rig_is_reset_before_it_is_armed_again(supervisor):
     supervisor.reset()
     supervisor.arm()
     assert supervisor.report.state is State.ARMED
+
+
+def test_arming_that_ends_in_a_fault_has_its_reason():
+    with (
+        Supervisor(task(off=-300.0)) as supervisor,
+        pytest.raises(DriverError, match=r"insertion: the motor does not follow: 0\.300 mm off"),
+    ):
+        supervisor.arm()
 
 
 def test_a_signal_stops_the_motors(supervisor):

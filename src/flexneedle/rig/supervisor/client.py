@@ -20,7 +20,7 @@ from flexneedle.rig.supervisor.machine import State
 from flexneedle.rig.tracking.registration import identity
 from flexneedle.scenario.rig import Axis, RigFile
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import Measurement
+from flexneedle.types import Measurement, Point
 
 _HEARTBEAT_S = 0.1
 _SILENT_S = 1.0  # without a report: the supervisor hangs
@@ -112,19 +112,22 @@ class Supervisor:
             self._measurements.clear()
         return found
 
-    def tip_x(self, within: float) -> float | None:
-        """Depth (mm) of the tip at rest, the median of at least 9 measurements or all within a time (s); None: none.
+    def tip(self, within: float) -> Point | None:
+        """Position (mm) of the tip at rest, the median of at least 9 measurements or all within a time (s); None: none.
 
         `read` returns them, too.
         """
-        until, found = monotonic() + within, list[float]()
+        until, found = monotonic() + within, list[Point]()
 
         def enough() -> bool:
-            found[:] = [one.x for one in self._measurements if one.x is not None and isfinite(one.x)]
+            found[:] = filter(None, map(_position, self._measurements))
             return len(found) >= _ENOUGH or monotonic() >= until
 
         self._wait(enough, within + 1.0, "the clock stands still")
-        return median(found) if found else None
+        if not found:
+            return None
+        x, y, z = (median(values) for values in zip(*found, strict=True))
+        return x, y, z
 
     @property
     def status(self) -> str:
@@ -219,14 +222,20 @@ class Supervisor:
     def _ask(self, request: say.Request, wanted: State) -> None:
         self._answers.pop(0, None)
         self._send(request)
-        self._wait(
-            lambda: 0 in self._answers or self.report.state is wanted, _END_S, f"not {wanted}", stopped=True
-        )
+        armed = wanted is State.ARMED
+
+        def answered() -> bool:
+            state = self.report.state
+            return 0 in self._answers or state is wanted or (armed and state is State.FAULT)
+
+        self._wait(answered, _END_S, f"not {wanted}", stopped=True)
         refused = self._answers.pop(0, None)
         if isinstance(refused, say.Refused):
-            if wanted is State.ARMED:
+            if armed:
                 self._check(refused.state, refused.cause)
             raise RefusedError(refused.why)
+        if armed:
+            self._check(self.report.state, self.report.why)
 
     # Waiting
 
@@ -320,3 +329,9 @@ class Supervisor:
             self._changed.notify_all()
         if self._on_report is not None and isinstance(message, say.Report):
             self._on_report(message)
+
+
+def _position(measurement: Measurement) -> Point | None:
+    """Position (mm) of a measurement, z = 0 in the plane; None if it is not measured."""
+    x, y, z = measurement.x, measurement.y, 0.0 if measurement.z is None else measurement.z
+    return None if x is None or y is None or not all(map(isfinite, (x, y, z))) else (x, y, z)
