@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from flexneedle.console.common import with_examples
@@ -25,6 +26,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _view(args: argparse.Namespace) -> int:
     from flexneedle.runs.figures import draw_run
 
-    for path in draw_run(args.run):
+    for path in draw_run(args.run, lambda line: print(f"flexneedle: {line}", file=sys.stderr)):
         print(path)
     return 0
