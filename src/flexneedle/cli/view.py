@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from flexneedle.console.commands import Commands, add_command
@@ -24,6 +25,6 @@ def add_parser(commands: Commands) -> None:
 def _view(args: argparse.Namespace) -> int:
     from flexneedle.runs.figures import draw_run
 
-    for path in draw_run(args.run):
+    for path in draw_run(args.run, lambda line: print(f"flexneedle: {line}", file=sys.stderr)):
         print(path)
     return 0
