@@ -159,11 +159,11 @@ def print_table(title: str, rows: Iterable[Sequence[str]], folder: Path, heads: 
 
 @contextmanager
 def problems_printed(folder: Folder) -> Iterator[None]:
-    """At the end, print a line on stderr for each file of the record that could not be written."""
+    """At the end, print a line on stderr for each file that could not be written, and figure not drawn."""
     try:
         yield
     finally:
-        for line in dict.fromkeys(folder.problems):
+        for line in dict.fromkeys([*folder.problems, *folder.undrawn]):
             print(f"flexneedle: {line}", file=sys.stderr)
 
 

@@ -36,8 +36,8 @@ def save(record: Plan | Insertion, folder: str | Path) -> Path:
             for period in record.periods:
                 trace.add(period)
         finish_insertion(claimed, record)
-    if claimed.problems:
-        raise RecordError("; ".join(claimed.problems))
+    if problems := [*claimed.problems, *claimed.undrawn]:
+        raise RecordError("; ".join(problems))
     return claimed.path
 
 
@@ -52,7 +52,7 @@ def finish_plans(folder: Folder) -> None:
     """Record that all plans are complete, and draw them."""
     folder.values["result"] = {name: plan_result(plan) for name, plan in folder.plans.items()}
     folder.end("done")
-    draw_run(folder.path)
+    _draw(folder)
 
 
 def open_trace(
@@ -79,9 +79,19 @@ def finish(folder: Folder, status: str, reason: str) -> None:
     """Write the final status, and draw plans and insertion; `folder.problems` has what cannot be written."""
     steps: list[Callable[[], object]] = [partial(folder.end, status, reason)]
     if folder.plans:
-        steps.append(partial(draw_run, folder.path))
+        steps.append(partial(_draw, folder))
     for step in steps:
         try:
             step()
         except RecordError as problem:
             folder.problems.append(str(problem))
+
+
+def _draw(folder: Folder) -> None:
+    """Draw the figures; `folder.undrawn` has why one cannot be. Raises RecordError if one cannot be written."""
+    try:
+        draw_run(folder.path)
+    except RecordError:
+        raise
+    except Exception as error:  # noqa: BLE001 - whatever drawing raises, the record and the result stay
+        folder.undrawn.append(f"figures cannot be drawn: {type(error).__name__}: {error}")

@@ -56,7 +56,8 @@ class RunFile:
 class Folder:
     """A folder of a run and the values of its `run.json`, written by `write`.
 
-    problems: a line for each file of the record that could not be written at the end of the run.
+    problems: a line for each file of the record that could not be written at the end of the run; undrawn: a line for
+    each figure that could not be drawn, which is no part of the record.
     """
 
     path: Path
@@ -64,6 +65,7 @@ class Folder:
     timing: dict[str, Any]
     plans: dict[str, Plan] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
+    undrawn: list[str] = field(default_factory=list)
 
     @classmethod
     def claim(cls, out: Path | None, name: str, kind: str, scenario: Scenario, seed: int) -> "Folder":
