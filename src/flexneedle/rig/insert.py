@@ -88,7 +88,7 @@ def insert(
     watchers = _checked(watchers or Watchers(), file)
     with supervised(file, scenario, plan, watchers, dry=dry_run) as ports:
         insertion = executed(in_memory(ports, virtual) if dry_run else ports)
-    return replace(insertion, rig=file.name, ticks=watchers.ticks.summary())
+    return replace(insertion, rig=file.name, ticks=watchers.ticks.summary(), dry_run=dry_run)
 
 
 def _checked(watchers: Watchers, rig: RigFile) -> Watchers:

@@ -45,7 +45,7 @@ def insertion_of(run: RunFile) -> tuple[Insertion, str]:
     outcome, reason = (Outcome.INTERRUPTED, _UNFINISHED) if killed else (Outcome(run.status), run.reason)
     plan = next(iter(run.plans.values()))
     ending = (outcome, reason, run.controller, run.phantom, run.tracker, run.scenario, run.rig)
-    return Insertion(plan, run.seed, trace.periods, *ending), trace.note
+    return Insertion(plan, run.seed, trace.periods, *ending, dry_run=run.dry_run), trace.note
 
 
 def _planned(run: RunFile) -> RunFile:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from flexneedle.arguments import path
 from flexneedle.control.methods import used
@@ -13,6 +14,9 @@ from flexneedle.trace.folder import TRACE_FILE, Folder, versions
 from flexneedle.trace.results import insertion_result, insertion_timing, plan_result, plan_timing
 from flexneedle.trace.writer import TraceWriter
 from flexneedle.types import Insertion, Plan, scenario_of
+
+PARTS = ("controller", "phantom", "tracker", "rig", "dry_run")
+"""What an insertion was made with, in `run.json` and `trace.mcap`: names, and whether the rig did not move."""
 
 
 def save(record: Plan | Insertion, folder: str | Path) -> Path:
@@ -29,7 +33,7 @@ def save(record: Plan | Insertion, folder: str | Path) -> Path:
         finish_plans(claimed)
     else:
         claimed = Folder.claim(out, "", "insertion", scenario, record.seed)
-        parts = {name: getattr(record, name) for name in ("controller", "phantom", "tracker", "rig")}
+        parts = {name: getattr(record, name) for name in PARTS}
         claimed.values |= parts
         keep_plan(claimed, record.plan)
         with open_trace(claimed, scenario, record.plan, record.seed, parts) as trace:
@@ -56,10 +60,11 @@ def finish_plans(folder: Folder) -> None:
 
 
 def open_trace(
-    folder: Folder, scenario: Scenario, plan: Plan, seed: int, parts: Mapping[str, str]
+    folder: Folder, scenario: Scenario, plan: Plan, seed: int, parts: Mapping[str, Any]
 ) -> TraceWriter:
-    """Return the writer of `trace.mcap`; parts: names of controller, phantom, tracker and rig."""
-    about = {"seed": str(seed), "scenario": scenario.name, "strategy": plan.strategy, **parts, **versions()}
+    """Return the writer of `trace.mcap`; parts: names of controller, phantom, tracker and rig, and dry_run."""
+    named = {name: str(part) for name, part in parts.items()}
+    about = {"seed": str(seed), "scenario": scenario.name, "strategy": plan.strategy, **named, **versions()}
     return TraceWriter(folder.path / TRACE_FILE, plan, about=about, scenario=scenario.values())
 
 
