@@ -98,8 +98,8 @@ def _add_rig(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rig",
         metavar="FILE",
-        help="rig file, on whose motors and tracker the plan is executed, from where the motors are (default: the "
-        "virtual phantom)",
+        help="rig file (its path, or emulated for the one of the package), on whose motors and tracker the plan is "
+        "executed, from where the motors are (default: the virtual phantom)",
     )
     parser.add_argument(
         "--dry-run",

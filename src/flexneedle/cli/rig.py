@@ -170,7 +170,11 @@ def _add_retract(commands: Commands) -> None:
 
 
 def _add_rig(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("rig", type=Path, metavar="RIG", help="rig file (docs/rig/file.md)")
+    parser.add_argument(
+        "rig",
+        metavar="RIG",
+        help="rig file: its path, or emulated for the one of the package (docs/rig/file.md)",
+    )
 
 
 def _add_yes(parser: argparse.ArgumentParser) -> None:
