@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flexneedle.console.values import seed
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, RunError
 
 if TYPE_CHECKING:
     from flexneedle.control.interface import Method
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from flexneedle.trace.folder import Folder
     from flexneedle.types import Plan
 
+ARMS = "The motors of all axes are switched on first. Ctrl-C stops."
+"""Printed before any motion of a rig."""
 STRATEGIES = ("manipulation", "steering")
 """Strategies of planning, the default first."""
 
@@ -167,9 +169,21 @@ def problems_printed(folder: Folder) -> Iterator[None]:
             print(f"flexneedle: {line}", file=sys.stderr)
 
 
-def confirmed(question: str, without: str) -> bool:
-    """Ask on stderr; return whether the answer on stdin is yes. Raises InputError `without` a terminal."""
+def require_terminal() -> None:
+    """Raise InputError if there is no terminal on which motions could be confirmed."""
     if not sys.stdin.isatty():
-        raise InputError(without)
+        raise InputError("no terminal to confirm the motion on: use --yes to move without asking")
+
+
+def confirm_motions(lines: Iterable[str], question: str) -> None:
+    """Print what would move, and ask on stderr; "": do not ask.
+
+    Raises RunError for any answer but yes, InputError without a terminal.
+    """
+    print("\n".join(lines), file=sys.stderr)
+    if not question:
+        return
+    require_terminal()
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
-    return sys.stdin.readline().strip().lower() in ("y", "yes")
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise RunError("not confirmed: nothing was moved")

@@ -43,7 +43,8 @@ def insert(
 
     rig: a rig file, on whose motors and tracker the plan is executed in place of the virtual phantom, from where the
     motors are. dry_run: its motors and tracker are read; motors never move, and the needle is the virtual phantom's.
-    watchers: are given the rig before it is armed, and each of its ticks (default: only the record is).
+    watchers: are given the rig before it is armed, which they may refuse, and each of its ticks (default: only the
+    record is).
 
     scenario: a scenario, or its name or path as for `load_scenario`. It must be the plan's own, or differ from it only
     in controller, tracker, monitor and phantom.

@@ -1,6 +1,6 @@
 """Plan and insert with a record on disk: the work of the commands `plan` and `insert`."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -96,10 +96,12 @@ def record_insertion(
     on_iteration: OnIteration,
     on_period: OnPeriod,
     bridge: "Bridge | None" = None,
+    confirm: Callable[[Mapping[str, float]], None] | None = None,
 ) -> Insertion:
     """Plan, insert, and write `run.json`, `trace.mcap` and `insertion.png`, `.svg` to the folder.
 
-    bridge: an open connection to ROS, which publishes all and may stop it.
+    bridge: an open connection to ROS, which publishes all and may stop it. confirm: called with the positions of a
+    rig's axes after planning, before anything moves; what it raises ends the insertion.
 
     An insertion that is interrupted (Ctrl-C, or a stop) is returned with its periods and the outcome "interrupted". An
     error, or an interruption of planning, is recorded in `run.json` and re-raised; if there was a plan, the record
@@ -118,7 +120,9 @@ def record_insertion(
         folder.values["scenario"] = scenario.values()
         if bridge is not None:
             bridge.publish(plan)
-        insertion = _insert(folder, scenario, plan, choices, on_period, Watchers(follower=bridge))
+        insertion = _insert(
+            folder, scenario, plan, choices, on_period, Watchers(follower=bridge, confirm=confirm)
+        )
         finish_insertion(folder, insertion)
     return insertion
 

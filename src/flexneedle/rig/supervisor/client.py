@@ -103,6 +103,13 @@ class Supervisor:
                 raise DriverError(f"the supervisor has not reported: {self._ended or 'it opens'}")
             return self._latest
 
+    @property
+    def positions(self) -> dict[str, float]:
+        """Where the axes are, mm or rad. Raises DriverError after a fault, StoppedError after a stop."""
+        found = self.report
+        self._check(found.state, found.why)
+        return {name: axis.position for name, axis in found.axes.items()}
+
     def read(self) -> tuple[Measurement, ...]:
         """The measurements since the last call, oldest first."""
         with self._changed:
