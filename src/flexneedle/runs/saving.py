@@ -10,6 +10,7 @@ from flexneedle.control.methods import used
 from flexneedle.errors import RecordError
 from flexneedle.runs.figures import draw_run
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.problems import unexpected
 from flexneedle.trace.folder import TRACE_FILE, Folder, versions
 from flexneedle.trace.results import insertion_result, insertion_timing, plan_result, plan_timing
 from flexneedle.trace.writer import TraceWriter
@@ -99,4 +100,4 @@ def _draw(folder: Folder) -> None:
     except RecordError:
         raise
     except Exception as error:  # noqa: BLE001 - whatever drawing raises, the record and the result stay
-        folder.undrawn.append(f"figures cannot be drawn: {type(error).__name__}: {error}")
+        folder.undrawn.append(f"figures cannot be drawn: {unexpected(error)}")

@@ -140,6 +140,13 @@ def test_a_supervisor_that_is_killed_is_an_error(supervisor):
         supervisor.wait(5.0)
 
 
+def test_a_device_that_does_not_open_is_the_reason():
+    with pytest.raises(
+        DriverError, match=r"^driver stages:real_motors: ValueError: could not convert .*stages"
+    ):
+        Supervisor(task(position="nowhere"))
+
+
 def test_a_supervisor_that_hangs_is_an_error(supervisor):
     supervisor.arm()
     os.kill(supervisor.pid, signal.SIGSTOP)

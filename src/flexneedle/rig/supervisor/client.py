@@ -43,6 +43,7 @@ class Supervisor:
         self._latest: say.Report | None = None
         self._latest_at = monotonic()
         self._ended: str | None = None
+        self._unopened = ""
         self._answers: dict[int, say.Done | say.Refused] = {}
         self._measurements: deque[Measurement] = deque(maxlen=_MOST_KEPT)
         self._number = 0
@@ -227,10 +228,13 @@ class Supervisor:
                 self._connection.send(message)
         except OSError:
             if not lost:
-                raise DriverError(f"the supervisor has ended{self._because()}") from None
+                raise self._end() from None
 
-    def _because(self) -> str:
-        return f": {self._ended}" if self._ended else ""
+    def _end(self) -> DriverError:
+        """The error after the supervisor's end: its reason alone, such as that of a device, if the rig did not open."""
+        if self._unopened:
+            return DriverError(self._unopened)
+        return DriverError(f"the supervisor has ended{f': {self._ended}' if self._ended else ''}")
 
     def _wait(
         self,
@@ -249,7 +253,7 @@ class Supervisor:
         with self._changed:
             while not condition():
                 if self._ended is not None:
-                    raise DriverError(f"the supervisor has ended{self._because()}")
+                    raise self._end()
                 now = monotonic()
                 if (
                     self._latest is not None
@@ -292,6 +296,7 @@ class Supervisor:
                 message = self._connection.recv()
                 if isinstance(message, say.Ended):
                     why = message.why
+                    self._unopened = why if self._latest is None else ""
                     break
                 self._take(message)
         except (EOFError, OSError):
