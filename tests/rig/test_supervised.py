@@ -127,6 +127,7 @@ def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
     assert done.outcome == "done"
     assert done.reached
     assert done.ticks["count"] > 100
+    assert done.dry_run is dry
     if dry:
         assert np.ptp(found.positions["insertion"]) == 0.0
         assert done.true_error_mm < 0.3

@@ -40,7 +40,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
     result, timing = insertion_result(insertion), insertion_timing(insertion)
     rows = [
         ("controller", insertion.controller),
-        ("rig", insertion.rig) if insertion.rig else ("phantom", insertion.phantom),
+        _needle(insertion),
         target_row(scenario, insertion.target),
         *entry_rows(scenario, insertion.plan),
         ("true tip to target", _number(result["true_error_mm"], "mm")),
@@ -59,6 +59,14 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         *_ticks(insertion),
     ]
     print_table(insertion.summary[:1].upper() + insertion.summary[1:], rows, folder)
+
+
+def _needle(insertion: Insertion) -> tuple[str, str]:
+    """Row of what had the needle."""
+    if not insertion.rig:
+        return "phantom", insertion.phantom
+    virtual = " (did not move: the needle is the virtual phantom's)" if insertion.dry_run else ""
+    return "rig", f"{insertion.rig}{virtual}"
 
 
 def _ticks(insertion: Insertion) -> list[tuple[str, str]]:

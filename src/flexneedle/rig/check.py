@@ -75,9 +75,8 @@ def with_device(
         with closing(connect()) as device:
             connected = [Finding(part, "connection", f"{kind}{_identity(device)}")]
             return connected + read(device)
-    except (FlexneedleError, OSError) as error:
-        problem = one_line(error) if isinstance(error, FlexneedleError) else str(error)
-        return [*connected, Finding(part, "reading" if connected else "connection", kind, problem)]
+    except FlexneedleError as error:
+        return [*connected, Finding(part, "reading" if connected else "connection", kind, one_line(error))]
 
 
 def _identity(device: object) -> str:
