@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from flexneedle.console.commands import Commands, add_command, add_group
 from flexneedle.console.common import ARMS, add_strategy, confirm_motions, print_json
 from flexneedle.console.values import finite, positive
-from flexneedle.errors import DriverError
+from flexneedle.errors import DriverError, RigError, one_line
 
 if TYPE_CHECKING:
     from flexneedle.rig.check import Finding, Wanted
@@ -187,7 +187,7 @@ def _check(args: argparse.Namespace) -> int:
     from flexneedle.scenario.rig import load_rig
 
     rig = load_rig(args.rig)
-    findings = check_rig(rig, WallClock(), args.seconds, _wanted(args))
+    findings = [*_of_ros(rig), *check_rig(rig, WallClock(), args.seconds, _wanted(args))]
     problems = sum(1 for finding in findings if finding.problem)
     if args.json:
         print_json(_values(rig, findings))
@@ -202,6 +202,20 @@ def _wanted(args: argparse.Namespace) -> Wanted | None:
     from flexneedle.scenario.files import load_scenario
 
     return None if args.scenario is None else Wanted(load_scenario(args.scenario), args.strategy)
+
+
+def _of_ros(rig: RigFile) -> list[Finding]:
+    """Whether the section `ros` has a profile with the topics that it needs; nothing is connected."""
+    from flexneedle.rig.check import Finding
+    from flexneedle.ros.bridge import profile_of
+
+    if rig.ros is None:
+        return []
+    try:
+        profile_of(rig.ros)
+    except RigError as error:
+        return [Finding("ros", "profile", rig.ros.profile, one_line(error))]
+    return [Finding("ros", "profile", rig.ros.profile)]
 
 
 def _values(rig: RigFile, findings: Sequence[Finding]) -> dict[str, Any]:
@@ -265,7 +279,12 @@ def _retract(args: argparse.Namespace) -> int:
     from flexneedle.scenario.rig import load_rig
 
     rig = load_rig(args.rig)
-    move = retraction(rig, _positions(rig)["insertion"], args.to)
+    position = _positions(rig)["insertion"]
+    move = retraction(rig, position, args.to)
+    if move is None:
+        at = rig.axes.insertion.shown(position)
+        print(f"flexneedle: insertion is at {at} mm: nothing to retract", file=sys.stderr)
+        return 0
     return _carried_out(rig, [move], args.yes, lambda operator: operator.retract(move.goal))
 
 
