@@ -70,8 +70,7 @@ def _needle(insertion: Insertion) -> tuple[str, str]:
     """Row of what had the needle."""
     if not insertion.rig:
         return "phantom", insertion.phantom
-    virtual = " (did not move: the needle is the virtual phantom's)" if insertion.dry_run else ""
-    return "rig", f"{insertion.rig}{virtual}"
+    return "rig", f"{insertion.rig}{', not moved; virtual needle' if insertion.dry_run else ''}"
 
 
 def _ticks(insertion: Insertion) -> list[tuple[str, str]]:
