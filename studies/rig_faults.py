@@ -217,7 +217,8 @@ def _faults() -> list[Fault]:
     motors = partial(Fault, "motors")
     computer = partial(Fault, "computer")
     return [
-        tracker("missing for 0.1 s", order("aurora:missing:0.1"), "continue", None, ("done",)),
+        # As long as monitor.lost_after_s: it may or may not be a hold.
+        tracker("missing for 0.1 s", order("aurora:missing:0.1"), "continue, or hold briefly", None, ("done",)),
         tracker("missing for 0.5 s", order("aurora:missing:0.5"), "hold, then continue", 0.25, ("done",)),
         tracker("missing for 2 s", order("aurora:missing:2"), "hold, end held", 0.25, held),
         tracker("frozen: no new frames", order("aurora:frozen"), "hold, end held", 0.45, held),
