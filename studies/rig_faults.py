@@ -127,7 +127,7 @@ class Fault:
     @property
     def unnoticed(self) -> bool:
         """Whether the insertion must go on without a hold or stop."""
-        return self.within is None and self.outcomes == ("done",)
+        return self.reaction in ("continue", "rest until it is there")
 
     def detection_s(self, trial: Mapping[str, Any]) -> float | None:
         """Time to detection in a trial; None without one, and where an older trial has not recorded it."""
@@ -218,7 +218,9 @@ def _faults() -> list[Fault]:
     computer = partial(Fault, "computer")
     return [
         # As long as monitor.lost_after_s: it may or may not be a hold.
-        tracker("missing for 0.1 s", order("aurora:missing:0.1"), "continue, or hold briefly", None, ("done",)),
+        tracker(
+            "missing for 0.1 s", order("aurora:missing:0.1"), "continue, or hold briefly", None, ("done",)
+        ),
         tracker("missing for 0.5 s", order("aurora:missing:0.5"), "hold, then continue", 0.25, ("done",)),
         tracker("missing for 2 s", order("aurora:missing:2"), "hold, end held", 0.25, held),
         tracker("frozen: no new frames", order("aurora:frozen"), "hold, end held", 0.45, held),
