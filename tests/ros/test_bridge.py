@@ -42,7 +42,8 @@ def test_a_stop_on_its_topic_stops_the_motors_at_once(tmp_path):
         status, out, errors = insertion.end()
     assert (status, out) == (130, "")
     why = "stopped: ROS topic /flexneedle/stop"
-    assert errors[-1] == f"flexneedle: interrupted: {why}; record: {insertion.out}"
+    assert errors[-2] == f"flexneedle: interrupted: {why}; record: {insertion.out}"
+    assert errors[-1].startswith("flexneedle: the needle is still in: withdraw it by flexneedle rig retract ")
     assert (insertion.stored["status"], insertion.stored["reason"]) == ("interrupted", why)
     stopped = insertion.stored["timing"]["ticks"]["states"][-1]  # by the supervisor, not at the next period
     assert (stopped["state"], stopped["why"]) == ("stopped", "ROS topic /flexneedle/stop")
@@ -101,7 +102,7 @@ def test_a_rig_is_armed_on_its_topic_and_stopped_when_it_is_disarmed(tmp_path):
         peer.send("arm", Bool(False))
         status, _, errors = insertion.end()
     assert status == 130
-    assert "stopped: ROS topic /flexneedle/arm (disarmed)" in errors[-1]
+    assert "stopped: ROS topic /flexneedle/arm (disarmed)" in errors[-2]
     assert any("waits for an arm on /flexneedle/arm; nothing moves before" in line for line in errors)
     assert insertion.calls("power")[0][1] < insertion.calls("follow")[0][1]
 
