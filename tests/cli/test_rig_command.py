@@ -161,6 +161,14 @@ def test_json_has_every_finding(capsys, file, device):
 
 
 @pytest.mark.usefixtures("quick")
+def test_an_unknown_profile_of_topics_is_a_problem(capsys, file):
+    status, out, _ = run(capsys, "rig", "check", file({"ros.profile": "nope"}), "--json")
+    (found,) = [one for one in json.loads(out)["findings"] if one["part"] == "ros"]
+    assert (found["found"], status) == ("nope", 1)
+    assert "no such profile (choices: " in found["problem"]
+
+
+@pytest.mark.usefixtures("quick")
 def test_a_plan_that_steers_needs_no_guide(capsys, file):
     small = file({"axes.guide_y": None})
     _, out, _ = run(capsys, "rig", "check", small, "--scenario", "phantom")
@@ -176,6 +184,19 @@ def test_a_file_that_is_none_is_bad_input(capsys, tmp_path, name):
     status, out, err = run(capsys, "rig", name[0], str(path), *name[1:])
     assert (status, out) == (2, "")
     assert f"{path}: name = 3: must be text in quotes" in err
+
+
+@pytest.mark.parametrize("words", [("jog", "nose", "1"), ("home", "nose")])
+def test_the_rig_of_the_package_is_given_by_its_name(capsys, words):
+    status, _, err = run(capsys, "rig", words[0], "emulated", *words[1:])
+    assert status == 2
+    assert "axis 'nose': must be one of insertion, rotation, guide_y" in err
+
+
+def test_a_name_that_is_no_rig_has_the_choices(capsys):
+    status, _, err = run(capsys, "rig", "check", "nonesuch")
+    assert status == 2
+    assert "no such rig (choices: emulated)" in err
 
 
 def test_an_emulated_aurora_is_checked_over_its_line(capsys, file, tmp_path):
@@ -311,6 +332,13 @@ def test_what_must_not_be_is_refused_before_anything_moves(capsys, file, device,
     assert status == 2
     assert line in err
     assert (supervisor.calls, device.calls) == ([], [])
+
+
+def test_a_base_that_is_at_its_lowest_position_is_not_retracted(capsys, file, device, supervisor):
+    device.set("A", position=0.0, commanded=0.0)
+    status, _, err = run(capsys, "rig", "retract", file(), "--yes")
+    assert (status, supervisor.calls, device.calls) == (0, [], [])
+    assert err == "flexneedle: insertion is at 0 mm: nothing to retract\n"
 
 
 def test_several_axes_are_homed_one_after_the_other(capsys, file, device, supervisor):

@@ -173,6 +173,19 @@ def test_an_index_that_cannot_be_written_is_named_and_the_result_stays(tmp_path,
     assert len(read_trace(tmp_path / "run/trace.mcap").periods) >= 30
 
 
+def test_a_figure_that_cannot_be_drawn_is_named_and_the_result_stays(tmp_path, capsys, monkeypatch):
+    def broken(*_):
+        raise ValueError("Axis limits cannot be NaN or Inf")
+
+    monkeypatch.setattr(saving, "draw_run", broken)
+    arguments = command(tmp_path, tmp_path / "run", "--json")
+    status, out, err = run(capsys, *arguments)
+    result = json.loads(out)
+    assert (status, result["outcome"]) == (int(not result["reached"]), "done")
+    assert "flexneedle: figures cannot be drawn: ValueError: Axis limits cannot be NaN or Inf\n" in err
+    assert json.loads((tmp_path / "run/run.json").read_text())["status"] == "done"
+
+
 def write(path, periods=PERIODS):
     with TraceWriter(path, PLAN, about={"seed": "0"}, scenario={}) as writer:
         for period in periods:

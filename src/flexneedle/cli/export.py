@@ -24,7 +24,8 @@ _COLUMN_HELP = """
   NAME.x_mm, NAME.y_mm, NAME.z_mm, NAME.qw, NAME.qx, NAME.qy, NAME.qz,
   NAME.indicator, NAME.status     each sensor (tip, ref1, ...) as reported by
                                   the tracker, in the tracker frame
-Unknown values are empty. A tracker without frames has no sensor columns.
+Unknown values are empty. A tracker without frames has no sensor columns. All
+rows of a dry run (insert --dry-run) have a last column dry_run.
 
 """
 
@@ -67,12 +68,12 @@ def _export(args: argparse.Namespace) -> int:
     if note:
         print(f"flexneedle: {note}", file=sys.stderr)
     if name == _STDOUT:
-        write(sys.stdout, insertion.periods)
+        write(sys.stdout, insertion)
         return 0
     path = Path(name) if name else args.run / default
     try:
         with path.open("w", encoding="utf-8", newline="") as file:
-            write(file, insertion.periods)
+            write(file, insertion)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     print(path)

@@ -12,16 +12,18 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexneedle.cli.inserted import report
+from flexneedle.cli.inserted import print_still_in, report
 from flexneedle.console.commands import Commands, add_command
 from flexneedle.console.common import (
+    ARMS,
     add_run_arguments,
     add_strategy,
     chosen_scenario,
     compile_first,
-    confirmed,
+    confirm_motions,
     print_json,
     problems_printed,
+    require_terminal,
     run_name,
     with_target,
 )
@@ -98,8 +100,8 @@ def _add_rig(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rig",
         metavar="FILE",
-        help="rig file, on whose motors and tracker the plan is executed, from where the motors are (default: the "
-        "virtual phantom)",
+        help="rig file (its path, or emulated for the one of the package), on whose motors and tracker the plan is "
+        "executed, from where the motors are (default: the virtual phantom)",
     )
     parser.add_argument(
         "--dry-run",
@@ -119,6 +121,7 @@ def _add_rig(parser: argparse.ArgumentParser) -> None:
 def _insert(args: argparse.Namespace) -> int:
     from flexneedle.runs.recording import check_choices
     from flexneedle.trace.folder import Folder
+    from flexneedle.types import Outcome
 
     if args.list:
         return _list()
@@ -134,13 +137,16 @@ def _insert(args: argparse.Namespace) -> int:
             bridge = _bridge(args, choices, stack)
             if bridge is not None and bridge.settings.target:
                 scenario = with_target(scenario, bridge.await_target())
-            _confirm(args, scenario, choices)
+            if _asks(args, choices):
+                require_terminal()  # before the time of planning is spent
             compile_first()
             folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
         with problems_printed(folder):
             with _refusal_printed(args, choices, scenario, folder):
-                insertion = _execute(folder, scenario, choices, bridge)
+                insertion = _execute(args, folder, scenario, choices, bridge)
             status = report(scenario, insertion, args.json, folder.path)
+            if choices.moves and insertion.periods and insertion.outcome is not Outcome.DONE:
+                print_still_in(args.rig)
     return status or int(bool(folder.problems))
 
 
@@ -175,7 +181,9 @@ def _scenario(args: argparse.Namespace, choices: Choices) -> Scenario:
     return scenario if args.registration is None else load_registration(args.registration, scenario)
 
 
-def _execute(folder: Folder, scenario: Scenario, choices: Choices, bridge: Bridge | None) -> Insertion:
+def _execute(
+    args: argparse.Namespace, folder: Folder, scenario: Scenario, choices: Choices, bridge: Bridge | None
+) -> Insertion:
     from flexneedle.console.progress import Progress
     from flexneedle.runs.recording import record_insertion
     from flexneedle.types import Outcome
@@ -184,8 +192,18 @@ def _execute(folder: Folder, scenario: Scenario, choices: Choices, bridge: Bridg
         show = _InsertProgress(progress, scenario)
         if bridge is not None:
             bridge.show = progress.print_line
+        confirm = None
+        if choices.rig is not None and choices.moves:
+            question = "Insert?" if _asks(args, choices) else ""
+            confirm = partial(_confirm, progress, scenario, choices.rig, question)
         insertion = record_insertion(
-            folder, scenario, choices, on_iteration=show.iteration, on_period=show.period, bridge=bridge
+            folder,
+            scenario,
+            choices,
+            on_iteration=show.iteration,
+            on_period=show.period,
+            bridge=bridge,
+            confirm=confirm,
         )
         if insertion.outcome is Outcome.DONE:
             progress.finish("Inserting")
@@ -208,6 +226,9 @@ def _refusal_printed(
         if args.json:
             target = args.target if scenario is None else scenario.target.position
             print_json(_refusal(folder, target, choices, one_line(error)))
+        result = folder and folder.values["result"]
+        if choices.moves and result and result["outcome"] == "failed":
+            print_still_in(args.rig)
         raise
 
 
@@ -222,7 +243,7 @@ def _refusal(
         timing = {key: folder.timing[key] for key in NO_TIMING}
         return {**folder.values["result"], "run_dir": run_dir, "timing": timing}
     names = {"controller": choices.controller, "phantom": choices.phantom}
-    result = refused_result(target=target, reason=reason, seed=choices.seed, **names)
+    result = refused_result(target=target, reason=reason, seed=choices.seed, dry_run=choices.dry_run, **names)
     return {**result, "run_dir": run_dir, "timing": NO_TIMING}
 
 
@@ -251,19 +272,26 @@ def _rig(args: argparse.Namespace, named: Mapping[str, str]) -> RigFile | None:
     return load_rig(args.rig)
 
 
-def _confirm(args: argparse.Namespace, scenario: Scenario, choices: Choices) -> None:
-    """Ask before motors move, but where ROS arms the rig.
+def _asks(args: argparse.Namespace, choices: Choices) -> bool:
+    """Whether motions are confirmed on the terminal: those of motors, unless --yes is given or ROS arms the rig."""
+    ros = None if choices.rig is None else choices.rig.ros
+    return choices.moves and not (args.yes or (ros is not None and ros.arm))
 
-    Raises InputError without a terminal, KeyboardInterrupt for any answer but yes.
+
+def _confirm(
+    progress: Progress, scenario: Scenario, rig: RigFile, question: str, positions: Mapping[str, float]
+) -> None:
+    """Print where the axes are (mm or rad), and ask before motors move; "": do not ask.
+
+    Raises RunError for any answer but yes.
     """
-    rig = choices.rig
-    if rig is None or choices.dry_run or args.yes or (rig.ros is not None and rig.ros.arm):
-        return
+    from flexneedle.rig.moves import resting
+
     depth, *lateral = scenario.target.position[: 1 + scenario.setup.axes]
     to = f"{depth:g} mm deep, {', '.join(f'{value:g}' for value in lateral)} mm to the side"
-    question = f"{rig.name}: the needle will be inserted from where it is, to a target {to}.\nContinue?"
-    if not confirmed(question, "--rig: motors will move: confirm on a terminal, or with --yes"):
-        raise KeyboardInterrupt
+    first = f"{rig.name}: the needle will be inserted from where it is, to a target {to}."
+    with progress.paused():
+        confirm_motions([first, *resting(rig, positions), ARMS], question)
 
 
 def _list() -> int:

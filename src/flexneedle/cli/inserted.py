@@ -14,6 +14,11 @@ if TYPE_CHECKING:
     from flexneedle.types import Insertion
 
 
+def print_still_in(rig: str) -> None:
+    """Print how a needle that was left in is withdrawn. rig: as the user gave it."""
+    print(f"flexneedle: the needle is still in: withdraw it by flexneedle rig retract {rig}", file=sys.stderr)
+
+
 def report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:
     """Print how an insertion ended, and where its record is; return the exit status."""
     from flexneedle.runs.recording import BY_USER
@@ -40,7 +45,7 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
     result, timing = insertion_result(insertion), insertion_timing(insertion)
     rows = [
         ("controller", insertion.controller),
-        ("rig", insertion.rig) if insertion.rig else ("phantom", insertion.phantom),
+        _needle(insertion),
         target_row(scenario, insertion.target),
         *entry_rows(scenario, insertion.plan),
         ("true tip to target", _number(result["true_error_mm"], "mm")),
@@ -59,6 +64,13 @@ def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
         *_ticks(insertion),
     ]
     print_table(insertion.summary[:1].upper() + insertion.summary[1:], rows, folder)
+
+
+def _needle(insertion: Insertion) -> tuple[str, str]:
+    """Row of what had the needle."""
+    if not insertion.rig:
+        return "phantom", insertion.phantom
+    return "rig", f"{insertion.rig}{', not moved; virtual needle' if insertion.dry_run else ''}"
 
 
 def _ticks(insertion: Insertion) -> list[tuple[str, str]]:

@@ -16,6 +16,7 @@ from flexneedle.console.common import (
     entry_rows,
     print_json,
     print_table,
+    problems_printed,
     run_name,
     target_row,
 )
@@ -50,7 +51,7 @@ def _plan(args: argparse.Namespace) -> int:
     compile_first()
     strategies = STRATEGIES if args.strategy == "both" else (args.strategy,)
     folder = Folder.claim(args.out, run_name(args), "plan", scenario, args.seed)
-    with Progress() as progress:
+    with problems_printed(folder), Progress() as progress:
 
         def show(strategy: str, info: dict[str, Any]) -> None:
             note = f"best cost {info['best']:.4g}"

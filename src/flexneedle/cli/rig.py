@@ -7,11 +7,10 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from flexneedle.console.commands import Commands, add_command, add_group
-from flexneedle.console.common import add_strategy, confirmed, print_json
+from flexneedle.console.common import ARMS, add_strategy, confirm_motions, print_json
 from flexneedle.console.values import finite, positive
 from flexneedle.errors import DriverError
 
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
     from flexneedle.scenario.rig import RigFile
 
 _SECONDS = 2.0
-_ARMS = "The motors of all axes are switched on first. Ctrl-C stops."
-_NO_TERMINAL = "no terminal to confirm the motion on: use --yes to move without asking"
 _NEGATIVE = re.compile(r"^-[\d.]")
 
 
@@ -170,7 +167,11 @@ def _add_retract(commands: Commands) -> None:
 
 
 def _add_rig(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("rig", type=Path, metavar="RIG", help="rig file (docs/rig/file.md)")
+    parser.add_argument(
+        "rig",
+        metavar="RIG",
+        help="rig file: its path, or emulated for the one of the package (docs/rig/file.md)",
+    )
 
 
 def _add_yes(parser: argparse.ArgumentParser) -> None:
@@ -268,7 +269,12 @@ def _retract(args: argparse.Namespace) -> int:
     from flexneedle.scenario.rig import load_rig
 
     rig = load_rig(args.rig)
-    move = retraction(rig, _positions(rig)["insertion"], args.to)
+    position = _positions(rig)["insertion"]
+    move = retraction(rig, position, args.to)
+    if move is None:
+        at = rig.axes.insertion.shown(position)
+        print(f"flexneedle: insertion is at {at} mm: nothing to retract", file=sys.stderr)
+        return 0
     return _carried_out(rig, [move], args.yes, lambda operator: operator.retract(move.goal))
 
 
@@ -293,11 +299,8 @@ def _carried_out(
     command: Callable[[Operator], object],
     *notes: str,
 ) -> int:
-    """Print the motions and, if they are confirmed, command them; return the exit status."""
-    print("\n".join([*map(str, moves), *notes, _ARMS]), file=sys.stderr)
-    if not (yes or confirmed("Move?", _NO_TERMINAL)):
-        print("flexneedle: not confirmed: nothing was moved", file=sys.stderr)
-        return 1
+    """Print the motions, command them once they are confirmed, and return the exit status."""
+    confirm_motions([*map(str, moves), *notes, ARMS], "" if yes else "Move?")
     with supervised(rig) as operator, _stopped_on_error(operator):
         operator.arm()
         command(operator)

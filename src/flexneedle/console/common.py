@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flexneedle.console.values import seed
-from flexneedle.errors import InputError
+from flexneedle.errors import InputError, RunError
 
 if TYPE_CHECKING:
     from flexneedle.control.interface import Method
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from flexneedle.trace.folder import Folder
     from flexneedle.types import Plan
 
+ARMS = "The motors of all axes are switched on first. Ctrl-C stops."
+"""Printed before any motion of a rig."""
 STRATEGIES = ("manipulation", "steering")
 """Strategies of planning, the default first."""
 
@@ -159,17 +161,29 @@ def print_table(title: str, rows: Iterable[Sequence[str]], folder: Path, heads: 
 
 @contextmanager
 def problems_printed(folder: Folder) -> Iterator[None]:
-    """At the end, print a line on stderr for each file of the record that could not be written."""
+    """At the end, print a line on stderr for each file that could not be written, and figure not drawn."""
     try:
         yield
     finally:
-        for line in dict.fromkeys(folder.problems):
+        for line in dict.fromkeys([*folder.problems, *folder.undrawn]):
             print(f"flexneedle: {line}", file=sys.stderr)
 
 
-def confirmed(question: str, without: str) -> bool:
-    """Ask on stderr; return whether the answer on stdin is yes. Raises InputError `without` a terminal."""
+def require_terminal() -> None:
+    """Raise InputError if there is no terminal on which motions could be confirmed."""
     if not sys.stdin.isatty():
-        raise InputError(without)
+        raise InputError("no terminal to confirm the motion on: use --yes to move without asking")
+
+
+def confirm_motions(lines: Iterable[str], question: str) -> None:
+    """Print what would move, and ask on stderr; "": do not ask.
+
+    Raises RunError for any answer but yes, InputError without a terminal.
+    """
+    print("\n".join(lines), file=sys.stderr)
+    if not question:
+        return
+    require_terminal()
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
-    return sys.stdin.readline().strip().lower() in ("y", "yes")
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise RunError("not confirmed: nothing was moved")

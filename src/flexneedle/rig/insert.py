@@ -43,7 +43,8 @@ def insert(
 
     rig: a rig file, on whose motors and tracker the plan is executed in place of the virtual phantom, from where the
     motors are. dry_run: its motors and tracker are read; motors never move, and the needle is the virtual phantom's.
-    watchers: are given the rig before it is armed, and each of its ticks (default: only the record is).
+    watchers: are given the rig before it is armed, which they may refuse, and each of its ticks (default: only the
+    record is).
 
     scenario: a scenario, or its name or path as for `load_scenario`. It must be the plan's own, or differ from it only
     in controller, tracker, monitor and phantom.
@@ -88,7 +89,7 @@ def insert(
     watchers = _checked(watchers or Watchers(), file)
     with supervised(file, scenario, plan, watchers, dry=dry_run) as ports:
         insertion = executed(in_memory(ports, virtual) if dry_run else ports)
-    return replace(insertion, rig=file.name, ticks=watchers.ticks.summary())
+    return replace(insertion, rig=file.name, ticks=watchers.ticks.summary(), dry_run=dry_run)
 
 
 def _checked(watchers: Watchers, rig: RigFile) -> Watchers:

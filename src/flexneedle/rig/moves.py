@@ -1,7 +1,7 @@
 """Motions that an operator commands, outside of an insertion: what would move, from where to where. Pure functions."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import isfinite
 
@@ -53,6 +53,14 @@ class Homing:
         return f"{self.name}: {switch}, {most}; the position there is called {at}"
 
 
+def resting(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
+    """Return one line for each axis: where it is (mm or rad, by name), and how fast it moves at most."""
+    return [
+        f"{name}: at {axis.shown(positions[name])} {axis.unit}, moves at most at {axis.shown(axis.speed)} {axis.unit}/s"
+        for name, axis in rig.axes.items()
+    ]
+
+
 def axis_of(rig: RigFile, name: str) -> Axis:
     """Return an axis by its name. Raises InputError, with the axes of the rig, for another name."""
     axes = dict(rig.axes.items())
@@ -87,12 +95,14 @@ def jog(rig: RigFile, name: str, distance: str, position: float, speed: float | 
     return move
 
 
-def retraction(rig: RigFile, position: float, to_mm: float | None = None) -> Move:
-    """Return the motion of the base back to `to_mm`, to the lowest position without it.
+def retraction(rig: RigFile, position: float, to_mm: float | None = None) -> Move | None:
+    """Return the motion of the base back to `to_mm`; without it to the lowest position, None if it is there.
 
     Raises InputError if that is not backwards or beyond the soft limits.
     """
     axis = rig.axes.insertion
+    if to_mm is None and position - axis.limits[0] < 1.0 / abs(axis.scale):
+        return None
     goal = axis.limits[0] if to_mm is None else to_mm
     move = _checked(Move("insertion", axis, position, goal, axis.speed))
     if move.distance > -1.0 / abs(axis.scale):

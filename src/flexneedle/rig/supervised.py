@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import monotonic
@@ -125,15 +125,22 @@ class Follower(Protocol):
 
 @dataclass(frozen=True)
 class Watchers:
-    """What is given each tick of a rig: the record of ticks, and what follows the insertion, None for nothing."""
+    """What is given each tick of a rig: the record of ticks, and what follows the insertion, None for nothing.
+
+    confirm: called with the positions of the axes (mm or rad) before the rig is armed; what it raises ends the
+    insertion before anything has moved.
+    """
 
     ticks: Ticks = field(default_factory=Ticks)
     follower: Follower | None = None
+    confirm: Callable[[Mapping[str, float]], None] | None = None
 
     def opened(self, supervisor: Supervisor) -> None:
-        """Hand out the supervisor before the rig is armed."""
+        """Hand out the supervisor before the rig is armed, and have the motions confirmed."""
         if self.follower is not None:
             self.follower.opened(supervisor)
+        if self.confirm is not None:
+            self.confirm(supervisor.positions)
 
     def report(self, report: Report) -> None:
         """Hand out what a tick found."""

@@ -13,7 +13,8 @@ from time import monotonic
 import pytest
 
 from emulated import until
-from flexneedle.errors import DriverError, RefusedError, RigError, StoppedError
+from flexneedle.errors import DriverError, RefusedError, RigError, RunError, StoppedError
+from flexneedle.rig.supervised import Watchers
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.rig.supervisor.machine import State
@@ -82,6 +83,23 @@ def test_operators_move_axes(supervisor):
         supervisor.jog("nose", 1.0)
 
 
+def test_a_rig_that_is_not_confirmed_is_not_armed(supervisor):
+    shown = []
+
+    def refuse(positions):
+        shown.append(positions)
+        raise RunError("not confirmed")
+
+    with pytest.raises(RunError, match="not confirmed"):
+        Watchers(confirm=refuse).opened(supervisor)
+    assert shown == [{"insertion": 0.0, "rotation": 0.0, "guide_y": 0.0}]
+    assert supervisor.report.state is State.IDLE
+    supervisor.stop("the test")
+    with pytest.raises(StoppedError, match="stopped: the test"):
+        Watchers(confirm=shown.append).opened(supervisor)
+    assert len(shown) == 1
+
+
 def test_a_stopped_rig_is_reset_before_it_is_armed_again(supervisor):
     supervisor.arm()
     supervisor.stop("the test")
@@ -139,6 +157,13 @@ def test_a_supervisor_that_is_killed_is_an_error(supervisor):
     os.kill(supervisor.pid, signal.SIGKILL)
     with pytest.raises(DriverError, match="the supervisor has ended: it was killed"):
         supervisor.wait(5.0)
+
+
+def test_a_device_that_does_not_open_is_the_reason():
+    with pytest.raises(
+        DriverError, match=r"^driver stages:real_motors: ValueError: could not convert .*stages"
+    ):
+        Supervisor(task(position="nowhere"))
 
 
 def test_a_supervisor_that_hangs_is_an_error(supervisor):

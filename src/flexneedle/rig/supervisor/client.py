@@ -45,6 +45,7 @@ class Supervisor:
         self._latest: say.Report | None = None
         self._latest_at = monotonic()
         self._ended: str | None = None
+        self._unopened = ""
         self._answers: dict[int, say.Done | say.Refused] = {}
         self._measurements: deque[Measurement] = deque(maxlen=_MOST_KEPT)
         self._number = 0
@@ -104,6 +105,13 @@ class Supervisor:
             if self._latest is None:
                 raise DriverError(f"the supervisor has not reported: {self._ended or 'it opens'}")
             return self._latest
+
+    @property
+    def positions(self) -> dict[str, float]:
+        """Where the axes are, mm or rad. Raises DriverError after a fault, StoppedError after a stop."""
+        found = self.report
+        self._check(found.state, found.why)
+        return {name: axis.position for name, axis in found.axes.items()}
 
     def read(self) -> tuple[Measurement, ...]:
         """The measurements since the last call, oldest first."""
@@ -245,10 +253,13 @@ class Supervisor:
                 self._connection.send(message)
         except OSError:
             if not lost:
-                raise DriverError(f"the supervisor has ended{self._because()}") from None
+                raise self._end() from None
 
-    def _because(self) -> str:
-        return f": {self._ended}" if self._ended else ""
+    def _end(self) -> DriverError:
+        """The error after the supervisor's end: its reason alone, such as that of a device, if the rig did not open."""
+        if self._unopened:
+            return DriverError(self._unopened)
+        return DriverError(f"the supervisor has ended{f': {self._ended}' if self._ended else ''}")
 
     def _wait(
         self,
@@ -267,7 +278,7 @@ class Supervisor:
         with self._changed:
             while not condition():
                 if self._ended is not None:
-                    raise DriverError(f"the supervisor has ended{self._because()}")
+                    raise self._end()
                 now = monotonic()
                 if (
                     self._latest is not None
@@ -310,6 +321,7 @@ class Supervisor:
                 message = self._connection.recv()
                 if isinstance(message, say.Ended):
                     why = message.why
+                    self._unopened = why if self._latest is None else ""
                     break
                 self._take(message)
         except (EOFError, OSError):
