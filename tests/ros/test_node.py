@@ -11,6 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cyclonedds.core import Policy, Qos
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
 
 import flexneedle
 from emulated import until
@@ -39,6 +41,7 @@ from ros_peers import Bool, Peer, await_requests, cdr, shape, target, tip
 from synthetic import make_periods, make_plan
 
 NEUTRAL = load_profile("neutral")
+TOPIC = NEUTRAL.subscribe.stop.topic, "std_msgs/msg/Bool"
 PLAN = replace(make_plan(), scenario=flexneedle.load_scenario("phantom"))
 MEASURED = Measurement(1.5, 1.0, 2.0, 3.0, covariance=((1e-2, 0, 0), (0, 1e-2, 0), (0, 0, 1e-2)))
 PERIODS = [
@@ -113,6 +116,19 @@ def test_a_stop_is_taken_from_a_publisher_that_does_not_repeat_what_is_lost(node
         return any(isinstance(request, Stop) for request in node.poll())
 
     until(stopped)
+
+
+@pytest.mark.parametrize(
+    ("kind", "asked", "count"),
+    [
+        (DataWriter, "_get_matched_subscriptions", lambda domain: Writer(domain, *TOPIC).readers),
+        (DataReader, "_get_matched_publications", lambda domain: Reader(domain, *TOPIC).writers),
+    ],
+)
+def test_one_that_comes_while_they_are_counted_is_counted(monkeypatch, kind, asked, count):
+    found = iter((1, 2, 2, 2))  # Cyclone DDS asks for the number, then for as many
+    monkeypatch.setattr(kind, asked, lambda *_: next(found))
+    assert count(Peer(NEUTRAL).domain) == 2
 
 
 def test_a_stop_that_was_latched_before_the_start_is_received():

@@ -4,7 +4,7 @@ The domain is ROS_DOMAIN_ID (default: 0); network interfaces and discovery are t
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Self
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication
@@ -97,7 +97,7 @@ class Writer:
     @property
     def readers(self) -> int:
         """Number of subscribers."""
-        return len(self._writer.get_matched_subscriptions())
+        return _count(self._writer.get_matched_subscriptions)
 
 
 class Reader:
@@ -132,7 +132,7 @@ class Reader:
     @property
     def writers(self) -> int:
         """Number of publishers."""
-        return len(self._reader.get_matched_publications())
+        return _count(self._reader.get_matched_publications)
 
 
 def waitset(domain: DomainParticipant, readers: list[Reader]) -> WaitSet:
@@ -167,6 +167,15 @@ class Directory:
     def _read(self, which: int) -> Any:
         reader, alive = self._known[which]
         return reader.read(N=_MOST_KNOWN, condition=alive)
+
+
+def _count(matched: Callable[[], list[int]]) -> int:
+    """Number of what is matched. Cyclone DDS asks twice, and raises IndexError if there are more the second time."""
+    while True:
+        try:
+            return len(matched())
+        except IndexError:
+            continue
 
 
 def _common(kind: str) -> tuple[Any, ...]:
