@@ -111,9 +111,14 @@ def test_a_reading_is_expected_on_the_line_of_the_needle():
     assert expected.most_off == pytest.approx(2.0 + 3 * 0.2)
 
 
-def test_the_base_may_advance_as_far_as_the_plans_target_and_no_other():
+@pytest.mark.parametrize(
+    ("measured", "start"), [(None, -28.5), (-30.7, -30.7), (-27.9, -27.9), (-35.0, -31.5), (40.0, -25.5)]
+)
+def test_the_base_may_advance_as_far_as_the_plans_target_from_where_the_tip_was_measured(measured, start):
+    """Within three standard deviations of where the tip starts, so that a wrong reading does not move the limit."""
     plan = make_plan("manipulation", (25.0, 1.0, 0.0), 0)
-    assert _deepest(PHANTOM, plan) == pytest.approx(25.0 + 2.0 + PHANTOM.setup.tip_to_skin_mm)
+    assert PHANTOM.setup.start_tip_x == -28.5
+    assert _deepest(PHANTOM, plan, measured) == pytest.approx(25.0 + 2.0 - start)
 
 
 @pytest.mark.long

@@ -57,6 +57,16 @@ def test_a_step_is_carried_out_and_ticks_go_on(supervisor):
     assert supervisor.read() == () or len(supervisor.read()) < 3
 
 
+def test_the_tip_is_measured_before_the_start_and_its_readings_stay(supervisor):
+    assert supervisor.measured_x(2.0) == 0.0
+    assert supervisor.read()
+
+
+def test_without_a_tracker_no_tip_is_measured():
+    with Supervisor.of_operator(rig_file().model_copy(update={"driver": task().rig.driver})) as untracked:
+        assert untracked.measured_x(0.0) is None
+
+
 def test_operators_move_axes(supervisor):
     with pytest.raises(RefusedError, match="jog: refused while idle"):
         supervisor.jog("guide_y", 1.0)

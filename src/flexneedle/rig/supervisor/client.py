@@ -5,8 +5,9 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable, Mapping
-from math import inf
+from math import inf, isfinite
 from multiprocessing.connection import Connection
+from statistics import median
 from threading import Condition, Lock, Thread
 from time import monotonic
 from typing import Any, Self
@@ -112,6 +113,21 @@ class Supervisor:
             found = tuple(self._measurements)
             self._measurements.clear()
         return found
+
+    def measured_x(self, seconds: float) -> float | None:
+        """Median x (mm) of the tip's measurements since the last `read`, which stay; None where none comes for
+        `seconds`.
+        """
+        until = monotonic() + seconds
+        self._wait(
+            lambda: bool(self._measured()) or monotonic() >= until, seconds + 1.0, "the clock stands still"
+        )
+        with self._changed:
+            found = self._measured()
+        return median(found) if found else None
+
+    def _measured(self) -> list[float]:
+        return [one.x for one in self._measurements if one.x is not None and isfinite(one.x)]
 
     @property
     def status(self) -> str:

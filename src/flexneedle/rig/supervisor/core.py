@@ -222,8 +222,10 @@ class Supervisor:
         """What the last tick found, with the measurements since the last report."""
         measurements, self._measurements = self._measurements, ()
         at = self._positions()
+        leg = None if self._motion is None or self._stop_at is not None else self._motion.leg
+        queued = {} if leg is None else leg.queued(self._states)
         axes = {
-            name: say.AxisState(at[name], self._states[drive.axis.channel])
+            name: say.AxisState(at[name], self._states[drive.axis.channel], queued.get(name, 0.0))
             for name, drive in self._drives.items()
         }
         times = late, work, missed

@@ -29,6 +29,14 @@ class Leg:
         self.sent = self.trajectory.at(now - self.begun + ahead)
         return self.sent
 
+    def queued(self, states: Mapping[str, MotorState]) -> dict[str, float]:
+        """How far each axis is from the target that was last sent (mm or rad): what it does without another one."""
+        return {
+            drive.name: abs((self.sent[name] - states[name].position) / drive.axis.scale)
+            for name, drive in self.drives.items()
+            if name in self.sent
+        }
+
     def note(self, states: Mapping[str, MotorState], now: float) -> None:
         """Keep how much of the way is done, by the motor with the longest."""
         channel = max(self.drives, key=self._seconds)
