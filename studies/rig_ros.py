@@ -9,7 +9,6 @@ counts as missed unless the witness was late at the same time. DDS is kept on th
 """
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -18,8 +17,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from rig_trials import inserted, shipped_rig, witness
+
 import flexneedle
-from emulated import emulated_rig, ended, insertion, witness
 
 BENCHMARK = Path(__file__).resolve().parents[1] / "benchmarks" / "ros.py"
 LOOPBACK = (
@@ -47,19 +47,13 @@ def subscribers(count: int) -> Iterator[None]:
 
 def measured(seed: int, count: int, out: Path) -> str:
     """Carry out an insertion with so many subscribers; return its line of the table."""
-    section = {"[tracker]": "[ros]\n\n[tracker]"}
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        emulated_rig(Path(folder), "phantom", seed, changes=section) as rig,
-        subscribers(count),
-        witness() as seen,
-    ):
-        status, _, errors = ended(insertion(rig.rig, "phantom", out, "--seed", str(seed)), 180.0)
-    if status not in (0, 1):
-        raise SystemExit(f"seed {seed}: exit status {status}\n{errors}")
-    done, timing = flexneedle.load(out), json.loads((out / "run.json").read_text())["timing"]
-    ticks, events = timing["ticks"], timing["ros"]["events"]
-    unexplained = sum(not seen.explains(one["time_s"], one["late_s"]) for one in ticks["stalls"])
+    text = shipped_rig().replace("[tracker]", "[ros]\n\n[tracker]")
+    with tempfile.TemporaryDirectory() as folder, subscribers(count), witness() as seen:
+        found = inserted(Path(folder), "phantom", seed, out, text=text)
+        unexplained = found.unexplained(seen)
+    if found.status not in (0, 1):
+        raise SystemExit(f"seed {seed}: exit status {found.status}\n{found.errors}")
+    done, ticks, events = flexneedle.load(out), found.ticks, found.run["timing"]["ros"]["events"]
     return (
         f"{count:11} {seed:7} {done.outcome!s:8} {len(done.periods):8} {done.late:5} {ticks['count']:6} "
         f"{ticks['late_p99_ms'] + ticks['work_p99_ms']:5.2f} ms {ticks['late_max_ms']:6.1f} ms {ticks['missed']:7} "
