@@ -31,7 +31,7 @@ _RESTING_S = 0.5  # longest time from the first stop, besides that of slowing do
 _STALL_S = 0.5  # without a tick, after which a motion under way is not taken up again
 _BACK_OFF_SHARE = 0.02  # of the range an axis moves away from its limit switch
 _HOMING_SHARE = 0.1  # of the largest speed
-_SLOWEST_SHARE = 0.01
+_SLOWEST_SHARE, _SLOWEST = 0.01, 10.0  # of the largest speed, and counts/s
 _HOMING_REACH = 1.1  # of the range
 _UNCHECKED = frozenset({State.IDLE, State.STOPPED, State.FAULT})
 """States in which motors may be off, and have been stopped: nothing more can be done about what they do."""
@@ -45,7 +45,7 @@ class Supervisor:
     ) -> None:
         self._task, self._motors, self._tracker, self._clock, self._send = task, motors, tracker, clock, send
         self._drives = {name: Drive(name, axis) for name, axis in task.rig.axes.items()}
-        self._queue = 1e-3 * task.rig.loop.queue_ms
+        self._loop = task.rig.loop
         self.state, self.why = State.IDLE, ""
         self._heard = self._ticked_at = now = clock.now()
         self._watch = Watch(Monitor(task.monitor, task.lateral_axes), task.stale_after, now)
@@ -209,7 +209,7 @@ class Supervisor:
         """Read motors and tracker, check, and send targets or stop."""
         before, now = self._ticked_at, self._clock.now()
         self._ticked_at = now
-        self._after_stall(now - before)
+        self._check_ticks(now - before)
         self._measure(now)
         self._check_motors()
         self._check_client(now)
@@ -232,15 +232,10 @@ class Supervisor:
         head = self._ticked_at, self.state, self.why, axes, measurements, self._tracker.status
         return say.Report(*head, not self._lost, *times)
 
-    def _after_stall(self, seconds: float) -> None:
-        """Ticks were late: the motors have stopped, or soon will, and a motion goes on from there, not from where it
-        would be by now."""
-        leg = None if self._motion is None else self._motion.leg
-        if leg is None or seconds <= self._queue:
-            return
-        if seconds > _STALL_S:
+    def _check_ticks(self, seconds: float) -> None:
+        """Ticks were late: the motors have stopped, and after long nothing goes on by itself."""
+        if self._motion is not None and self._motion.leg is not None and seconds > _STALL_S:
             self.stop(f"no tick for {seconds:.2f} s, limit {_STALL_S:g} s")
-        leg.begun += seconds
 
     def _measure(self, now: float) -> None:
         task = self._task
@@ -305,7 +300,7 @@ class Supervisor:
             self._stop_at = self._stopped_at = self._clock.now()
 
     def _check_client(self, now: float) -> None:
-        silent, limit = now - self._heard, self._task.rig.loop.decision_limit_s
+        silent, limit = now - self._heard, self._loop.decision_limit_s
         if self._motion is not None and silent > HEARTBEAT_S:
             self.stop(f"no heartbeat of the controller for {silent:.2f} s")
         elif self.state in (State.INSERTING, State.HOLDING) and silent > limit:
@@ -374,10 +369,11 @@ class Supervisor:
         try:
             for channel, speed in leg.trajectory.speeds.items():
                 axis = leg.drives[channel].axis
+                fastest = axis.speed * abs(axis.scale)
                 # Controllers round small speeds, to 0 as well; a motor that is faster waits for its next target.
-                slowest = _SLOWEST_SHARE * axis.speed * abs(axis.scale)
+                slowest = min(fastest, max(_SLOWEST_SHARE * fastest, _SLOWEST))
                 self._motors.set_speed(channel, max(speed, slowest), axis.acceleration * abs(axis.scale))
-            self._motors.follow(leg.targets(now, self._queue))
+            self._follow(leg, now)
         except DriverError as error:
             self._not_followed(motion, str(error))
 
@@ -392,13 +388,19 @@ class Supervisor:
             if motion.home is not None:
                 motion.why = f"{motion.home.name}: no limit switch within its range"
             self._end_leg(motion, leg, now)
-        elif leg.overdue(now):
+        elif leg.overdue(self._states, now):
             self._fault(f"the motors have not arrived: {leg.missing(self._states)} from the goal")
         else:
             try:
-                self._motors.follow(leg.targets(now, self._queue))
+                self._follow(leg, now)
             except DriverError as error:
                 self._not_followed(motion, str(error))
+
+    def _follow(self, leg: Leg, now: float) -> None:
+        """Send the next targets. While the trajectory waits for its motors, so does what is expected of the tip."""
+        before = leg.waited
+        self._motors.follow(leg.targets(now, self._loop, self._states))
+        self._watch = self._watch.waiting(now, leg.waited - before)
 
     def _not_followed(self, motion: Motion, why: str) -> None:
         """A target was refused: a fault, but not at the limit switch that is the home, which the next tick reads."""
