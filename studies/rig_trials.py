@@ -8,7 +8,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -17,6 +17,7 @@ from time import monotonic, sleep
 from typing import Any, TypeVar
 
 import numpy as np
+import psutil
 
 from flexneedle.rig.devices.priority import set_realtime_priority
 from flexneedle.rig.emulator.coupled.truth import Truth, read_truth
@@ -219,13 +220,15 @@ def resumed(
     """Yield the row of each task, and whether it is new: those in a file first, then others as they end.
 
     A row has the values of its task's key, by which it is found again, and is appended to the file (JSON, a line each)
-    once it is complete. An interrupt leaves out tasks that have not ended.
+    once it is complete. After an interrupt (Ctrl-C, SIGTERM) tasks that have not ended leave no row, and the processes
+    that they have started are ended.
     """
     lines = file.read_text().splitlines() if file.exists() else []
     kept = [row for row in map(json.loads, lines) if any(key(task).items() <= row.items() for task in tasks)]
     yield from ((row, False) for row in kept)
     missing = [task for task in tasks if not any(key(task).items() <= row.items() for row in kept)]
     file.parent.mkdir(parents=True, exist_ok=True)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     pool = ThreadPoolExecutor(workers)
     try:
         for done in as_completed([pool.submit(run, task) for task in missing]):
@@ -233,8 +236,14 @@ def resumed(
             with file.open("a") as opened:
                 opened.write(json.dumps(row) + "\n")
             yield row, True
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in psutil.Process().children(recursive=True):
+            with suppress(psutil.NoSuchProcess):
+                process.terminate()
+        raise
     finally:
-        pool.shutdown(cancel_futures=True)
+        pool.shutdown()
 
 
 @dataclass(frozen=True)
