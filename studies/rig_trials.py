@@ -23,7 +23,7 @@ from flexneedle.rig.devices.priority import set_realtime_priority
 from flexneedle.rig.emulator.coupled.truth import Truth, read_truth
 from flexneedle.types import Insertion
 
-START_S, END_S = 120.0, 60.0
+START_S, END_S = 300.0, 60.0
 _STALL_S = 0.005
 _BAD_INPUT = 2  # exit status
 
@@ -220,8 +220,8 @@ def resumed(
     """Yield the row of each task, and whether it is new: those in a file first, then others as they end.
 
     A row has the values of its task's key, by which it is found again, and is appended to the file (JSON, a line each)
-    once it is complete. After an interrupt (Ctrl-C, SIGTERM) tasks that have not ended leave no row, and the processes
-    that they have started are ended.
+    once it is complete. A task that raises RuntimeError is printed, and leaves no row. After an interrupt (Ctrl-C,
+    SIGTERM) tasks that have not ended leave none, and the processes that they have started are ended.
     """
     lines = file.read_text().splitlines() if file.exists() else []
     kept = [row for row in map(json.loads, lines) if any(key(task).items() <= row.items() for task in tasks)]
@@ -232,7 +232,11 @@ def resumed(
     pool = ThreadPoolExecutor(workers)
     try:
         for done in as_completed([pool.submit(run, task) for task in missing]):
-            row = done.result()
+            try:
+                row = done.result()
+            except RuntimeError as error:
+                print(error, file=sys.stderr, flush=True)
+                continue
             with file.open("a") as opened:
                 opened.write(json.dumps(row) + "\n")
             yield row, True
