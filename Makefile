@@ -55,11 +55,11 @@ rig-faults: setup  ## faults injected into running insertions on an emulated rig
 
 fuzz: setup  ## a million random and damaged inputs each to what reads the Galil, the Aurora and rig files
 	$(BIN)/python studies/fuzz_galil.py
-	$(BIN)/python studies/fuzz_aurora.py --live
+	$(BIN)/python studies/fuzz_aurora.py
 	$(BIN)/python studies/fuzz_rig_file.py
 
 fuzz-ros: setup  ## a million random and damaged messages to all that reads ROS topics, and to a running node
-	$(BIN)/python studies/fuzz_ros.py --live
+	$(BIN)/python studies/fuzz_ros.py
 
 robustness: setup  ## 100,000 random insertions of the model in the plane and in space, as it ships and adapted, and 2,000 of the exact plant (long)
 	$(BIN)/python studies/robustness.py

@@ -67,7 +67,8 @@ def measure(profile: Profile, args: argparse.Namespace) -> dict[str, dict[str, f
     command = [sys.executable, __file__, "--profile", args.profile, "--subscriber"]
     with open_node(profile) as node:
         kinds = [SLOW, *["fast"] * (SUBSCRIBERS - 1)]
-        others = [subprocess.Popen([*command, kind], stdin=subprocess.PIPE) for kind in kinds]
+        pipe, nothing = subprocess.PIPE, subprocess.DEVNULL
+        others = [subprocess.Popen([*command, kind], stdin=pipe, stdout=nothing) for kind in kinds]
         try:
             _await(lambda: node.poll() is not None and _found(node, SUBSCRIBERS))
             return {
@@ -135,7 +136,7 @@ def _stops(node: NodeClient, profile: Profile, count: int, pause: float) -> dict
 
 
 def subscribe(profile: Profile, *, slow: bool) -> int:
-    """Read all topics until the standard input ends; a slow one pauses for seconds."""
+    """Read all topics until the standard input ends, and print how many messages; a slow one pauses for seconds."""
     from select import select
 
     from flexneedle.ros.dds import Reader, participant
@@ -146,9 +147,10 @@ def subscribe(profile: Profile, *, slow: bool) -> int:
         for key, kind in PUBLISHED.items()
         if (topic := getattr(profile.publish, key)) is not None and key != "joint_targets"
     ]
+    count = 0
     while not select([sys.stdin], [], [], 3.0 if slow else 0.005)[0]:
-        for reader in readers:
-            list(reader.take())
+        count += sum(len(list(reader.take())) for reader in readers)
+    print(count)
     return 0
 
 

@@ -37,7 +37,7 @@ from stages import RIG
 HERE = Path(__file__).resolve()
 TESTS = HERE.parents[1] / "tests"
 SPEED_MM_S, FAR_MM = 5.0, 100.0
-TOPIC = load_profile("neutral").subscribe.stop.topic
+SUBSCRIBED = load_profile("neutral").subscribe
 
 
 def main() -> int:
@@ -79,9 +79,10 @@ def measure(count: int) -> dict[str, dict[str, float]]:
             other = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
             if not other.stdout.readline():
                 raise SystemExit("the nodes have not found each other")
-            waiting = _stops(supervisor, other, notes, count)
+            rng = np.random.default_rng(0)
+            waiting = _stops(supervisor, other, notes, count, rng)
             with _planning():
-                busy = _stops(supervisor, other, notes, count)
+                busy = _stops(supervisor, other, notes, count, rng)
             other.communicate()
     return {
         f"{count} stops while the controller waits": waiting,
@@ -89,13 +90,19 @@ def measure(count: int) -> dict[str, dict[str, float]]:
     }
 
 
-def _stops(supervisor: Supervisor, other: subprocess.Popen[str], notes: Path, count: int) -> dict[str, float]:
+def _stops(
+    supervisor: Supervisor,
+    other: subprocess.Popen[str],
+    notes: Path,
+    count: int,
+    rng: np.random.Generator,
+) -> dict[str, float]:
     taken = []
     for _ in range(count):
         supervisor.arm()
         supervisor.move_to("insertion", 0.0)
         before = len(notes.read_text().splitlines())
-        other.stdin.write("stop\n")
+        other.stdin.write(f"stop true {rng.uniform(0.2, 0.3)}\n")
         other.stdin.flush()
         try:
             supervisor.move_to("insertion", FAR_MM, SPEED_MM_S)
@@ -133,20 +140,29 @@ def _planning() -> Iterator[None]:
 
 
 def publish() -> int:
-    """Publish a stop a random time after each line of the standard input, and print when (s, monotonic)."""
+    """Publish as each line KEY VALUE SECONDS of the standard input says, such as `stop true 0.2`; print when.
+
+    KEY: stop or arm; VALUE: true or false; SECONDS: to wait before. Times are in s on the monotonic clock.
+    """
     import rosbags.typesys.stores.ros2_humble as messages
 
-    writer, rng = Writer(participant(), TOPIC, "std_msgs/msg/Bool"), np.random.default_rng(0)
+    domain = participant()
+    writers = {
+        key: Writer(domain, getattr(SUBSCRIBED, key).topic, "std_msgs/msg/Bool") for key in ("stop", "arm")
+    }
     deadline = time.monotonic() + 30.0
-    while writer.readers < 2:  # the node has a third one, for stops that are latched
+    # The node has a third reader of stops, for latched ones.
+    while writers["stop"].readers < 2 or writers["arm"].readers < 1:
         if time.monotonic() > deadline:
             return 1
         time.sleep(0.01)
     print("ready", flush=True)
-    for _ in sys.stdin:
-        time.sleep(0.2 + float(rng.uniform(0.0, 0.1)))
+    for line in sys.stdin:
+        key, value, seconds = line.split()
+        message = messages.std_msgs__msg__Bool(value == "true")
+        time.sleep(float(seconds))
         begun = time.monotonic()
-        writer.write(messages.std_msgs__msg__Bool(True))
+        writers[key].write(message)
         print(begun, flush=True)
     return 0
 

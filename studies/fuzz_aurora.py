@@ -1,32 +1,31 @@
 """Random and damaged data to all that reads an Aurora: no crash, no hang, no old or damaged frame.
 
-    python studies/fuzz_aurora.py [--inputs N] [--seconds S] [--seed N] [--part readings|link|emulator|watch] [--live]
+    python studies/fuzz_aurora.py [--inputs N] [--seconds S] [--seed N] [--part readings|link|emulator|watch|live]
 
-Four parts, each until N inputs (default: a million) or S seconds (default: 600):
+Five parts, each until N inputs (default: a million) or S seconds (default: 600):
 
 readings  values of a sensor from the link: a reading, whose position, if it has one, is finite and in range
 link      lines in place of the link's messages: a message, or ValueError, which ends the link and is counted; bounded
           memory; frames are new, and not of the future
 emulator  commands to the emulated Aurora: an intact reply to each, a valid state, tracking only after TSTART
 watch     frames to the supervisor's check: a verdict, not OK if the newest reading is not a number, repeated or stale
+live      episodes of a pseudo-terminal that answers the real link, with ndicapi's C library, by damaged replies: see
+          `fuzz_aurora_line.py`
 
-With `--live`, then for S seconds, a pseudo-terminal answers the real link and ndicapi's C library by damaged replies:
-see `fuzz_aurora_line.py`. Prints the inputs; at the first failure the input, and exit status 1.
+Prints the inputs; at the first failure its seed and input, and exit status 1.
 """
 
-import argparse
 import json
 import math
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from random import Random
-from time import monotonic
 from typing import Any
 
-import fuzz_aurora_line
 import numpy as np
-from fuzz_aurora_line import Failure, decoded, mutated
+from fuzz_aurora_line import BYTES, decoded, episodes
+from fuzzing import Failure, Part, main, mutated
 
 from flexneedle.rig.devices.aurora.incoming import Incoming
 from flexneedle.rig.devices.aurora.messages import LONGEST_LINE
@@ -48,40 +47,6 @@ POSE = (0.5, -0.5, 0.5, -0.5, 10.0, -20.0, -200.0, 0.024)
 BITS = (*(0x31,) * 10, 0x30, 0x71, 0xB1, 0x131, 0x231, 0x1031, 0xFFFF, 0, 1)
 MOST_FRAMES, MOST_ERRORS = 4000, 6
 ROUNDED_S = 1e-5  # of times of frame numbers above 2³², at which a new connection may begin
-
-
-def main() -> int:
-    """Run the parts and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--inputs", type=int, default=1_000_000)
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--part", choices=PARTS)
-    parser.add_argument("--live", action="store_true")
-    args = parser.parse_args()
-    chosen = [args.part] if args.part else PARTS
-    for name in [*chosen, *(["live"] if args.live else [])]:
-        begun = monotonic()
-        try:
-            done, note = run(name, args.inputs, args.seconds, args.seed)
-        except Failure as failure:
-            print(f"{name}: {failure}")
-            return 1
-        print(f"{name}: {done} inputs in {monotonic() - begun:.0f} s{note}", flush=True)
-    return 0
-
-
-def run(part: str, inputs: int, seconds: float, seed: int) -> tuple[int, str]:
-    """Return the number of inputs tried, and a note. Raises Failure."""
-    deadline = monotonic() + seconds
-    if part == "live":
-        return fuzz_aurora_line.run(deadline, Random(f"{part} {seed}"))
-    for done, note in enumerate(PARTS[part](Random(f"{part} {seed}")), 1):
-        if done == inputs or monotonic() >= deadline:
-            return done, note
-    raise AssertionError("a part has no end")
 
 
 # Values of a sensor
@@ -181,7 +146,7 @@ def random_line(random: Random, feeding: Feeding) -> bytes:
     if kind < 0.062:
         return random.choice((b"[", b'{"a":', b"9", b" ", b"\x00")) * random.choice((1000, 70000, 200000))
     line = json.dumps(random_message(random, feeding)).encode() + b"\n"
-    return mutated(random, line) if random.random() < 0.15 else line
+    return mutated(random, line, BYTES) if random.random() < 0.15 else line
 
 
 def random_json(random: Random, depth: int) -> Any:
@@ -314,7 +279,7 @@ def random_command(random: Random) -> bytes:
         return random.randbytes(random.randint(0, 20))
     text = f"{random.choice(NAMES_OF_COMMANDS)}:{random.choice(ARGUMENTS)}".encode()
     line = text + b"%04X" % codec.crc16(text) if random.random() < 0.9 else text.replace(b":", b" ", 1)
-    return mutated(random, line) if random.random() < 0.1 else line
+    return mutated(random, line, BYTES) if random.random() < 0.1 else line
 
 
 def random_frame(random: Random) -> aurora.EmulatedFrame:
@@ -445,12 +410,13 @@ def random_reading(random: Random) -> SensorReading:
     return SensorReading(place, turn, random.choice((None, 0.02, 0.2, drawn[7])), status)
 
 
-PARTS: dict[str, Callable[[Random], Iterator[str]]] = {
+PARTS: dict[str, Part] = {
     "readings": readings_inputs,
     "link": link_inputs,
     "emulator": emulator_inputs,
     "watch": watch_inputs,
+    "live": episodes,
 }
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(__doc__, PARTS))

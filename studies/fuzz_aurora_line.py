@@ -1,10 +1,10 @@
 """A pseudo-terminal that answers the real link process, with ndicapi's C library, by damaged replies.
 
-Episodes follow each other for `fuzz_aurora.py --live`: replies are damaged in one way or delayed, the cable is pulled,
-or the tracker is switched off and on; then the line is good until frames arrive again. Meanwhile `read` and `status`
-must return at once; each frame must be one that was sent intact, by its checksum, and not dated after its reply was
-made; while nothing intact arrives the status must give a reason. `close` must return, and a new `Aurora` on a bad line
-must refuse.
+Episodes follow each other for `fuzz_aurora.py --part live`: replies are damaged in one way or delayed, the cable is
+pulled, or the tracker is switched off and on; then the line is good until frames arrive again. Meanwhile `read` and
+`status` must return at once; each frame must be one that was sent intact, by its checksum, and not dated after its
+reply was made; while nothing intact arrives the status must give a reason. `close` must return, and a new `Aurora` on
+a bad line must refuse.
 """
 
 import re
@@ -18,6 +18,8 @@ from pathlib import Path
 from random import Random
 from threading import Event, Lock, Thread
 from time import monotonic
+
+from fuzzing import Failure, mutated
 
 from flexneedle.errors import InputError, RunError
 from flexneedle.rig.devices.aurora import tracker
@@ -34,27 +36,6 @@ ROW = 42  # bytes of a measured sensor in a reply to BX
 BYTES = b' -0123456789,.:"[]{}\r\nERORabcdef\x00\x7f\x80\xa5\xc4\xff'
 Point = tuple[float, ...]
 Damage = Callable[[bytes], bytes]
-
-
-class Failure(Exception):
-    """A rule that does not hold, with the input."""
-
-
-def mutated(random: Random, data: bytes) -> bytes:
-    """Return data with some bytes changed, added, removed or repeated."""
-    found = bytearray(data)
-    for _ in range(random.randint(1, 3)):
-        at = random.randint(0, len(found))
-        match random.randrange(4):
-            case 0:
-                found[at : at + 1] = bytes([random.choice(BYTES)])
-            case 1:
-                found[at : at + 1] = random.randbytes(1)
-            case 2:
-                del found[at : at + random.randint(1, 8)]
-            case _:
-                found[at:at] = found[: random.randint(0, len(found))]
-    return bytes(found)
 
 
 # What was sent
@@ -122,7 +103,7 @@ def _rounded(position: Point) -> Point:
 def _recomputed(random: Random, true: bytes) -> bytes:
     """A reply to BX whose checksum is right, with other values in its rows: of a tracker that is out of order."""
     if not decoded(true):
-        return mutated(random, true)
+        return mutated(random, true, BYTES)
     body = bytearray(true[6:-2])
     for _ in range(random.randint(1, 4)):
         at = 1 + ROW * random.randrange(len(body) // ROW) + random.randint(2, ROW - 4)
@@ -150,7 +131,7 @@ def _error(random: Random, _true: bytes) -> bytes:
 
 DAMAGES: dict[str, Callable[[Random, bytes], bytes]] = {
     "garbage": lambda random, _: random.randbytes(random.randint(0, 300)),
-    "mutated": mutated,
+    "mutated": lambda random, true: mutated(random, true, BYTES),
     "cut": lambda random, true: true[: random.randint(0, len(true))],
     "huge": _huge,
     "flood": lambda random, true: (
@@ -266,7 +247,6 @@ class Tally:
     """Counts of a run; the longest times (s)."""
 
     frames: int = 0
-    episodes: int = 0
     refused: int = 0
     reconnections: int = 0
     errors: Counter[str] = field(default_factory=Counter)
@@ -280,29 +260,25 @@ class Tally:
         if seconds > limit:
             raise Failure(f"{what} took {seconds:.1f} s, limit {limit:g} s")
 
+    def __str__(self) -> str:
+        times = ", ".join(f"{what} {1e3 * seconds:.0f} ms" for what, seconds in sorted(self.longest.items()))
+        counts = f"{self.frames} frames, {self.reconnections} reconnections, {dict(self.errors)}"
+        return f"{counts}, {self.refused} times refused; longest {times}"
 
-def run(deadline: float, random: Random) -> tuple[int, str]:
-    """Return the number of replies until a deadline, and a note. Raises Failure."""
+
+def episodes(random: Random) -> Iterator[str]:
+    """Yield a note on all so far after each episode. Raises Failure."""
     # More connections in the time; the waits are nothing that is tried here.
     tracker._FIRST_WAIT_S, tracker._LONGEST_WAIT_S = 0.05, 0.5
     tally = Tally()
     with served() as line:
-        while monotonic() < deadline:
-            try:
-                _session(line, tally, random, deadline)
-            except Failure as failure:
-                raise Failure(f"episode {tally.episodes}: {failure}") from failure
-        replies, damaged = line.replies, line.damaged
-    times = ", ".join(f"{what} {1e3 * seconds:.0f} ms" for what, seconds in sorted(tally.longest.items()))
-    counts = f"{tally.frames} frames, {tally.reconnections} reconnections, {dict(tally.errors)}"
-    note = (
-        f" of which {damaged} damaged, in {tally.episodes} episodes: {counts}; {tally.refused} times refused"
-    )
-    return replies, f"{note}; longest {times}"
+        while True:
+            for _ in _session(line, tally, random):
+                yield f": {line.replies} replies, {line.damaged} of them damaged, {tally}"
 
 
-def _session(line: Line, tally: Tally, random: Random, deadline: float) -> None:
-    """Open an adapter, sometimes on a bad line, and close it after some episodes, during one."""
+def _session(line: Line, tally: Tally, random: Random) -> Iterator[None]:
+    """Open an adapter, sometimes on a bad line, and close it after some episodes, during one; yield after each."""
     if random.random() < 0.2:
         _refused(line, tally, random)
     begun = monotonic()
@@ -318,8 +294,8 @@ def _session(line: Line, tally: Tally, random: Random, deadline: float) -> None:
     tally.number = -1
     try:
         for _ in range(random.randint(1, 12)):
-            if monotonic() < deadline:
-                _episode(line, found, tally, random)
+            _episode(line, found, tally, random)
+            yield
         line.damage = _damage(random)[1]
         _watch(line, found, tally, monotonic() + random.uniform(0.0, 0.3))
     finally:
@@ -353,7 +329,6 @@ def _damage(random: Random) -> tuple[str, Damage]:
 
 
 def _episode(line: Line, found: Aurora, tally: Tally, random: Random) -> None:
-    tally.episodes += 1
     name, line.damage = _damage(random)
     kind = random.random()
     if kind < 0.1:

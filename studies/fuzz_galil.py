@@ -10,10 +10,9 @@ controller  lines to the emulated controller: each command is answered, the stat
 driver      calls of `GalilMotors` on a controller that answers by damaged, partial, huge, late, no or true replies: a
             state that is what was sent, or DriverError; never later than the reply timeout
 
-Prints the inputs and the largest times; at the first failure the input, and exit status 1.
+Prints the inputs and the largest times; at the first failure its seed and input, and exit status 1.
 """
 
-import argparse
 import re
 import socket
 import sys
@@ -23,6 +22,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from random import Random
 from time import monotonic
+
+from fuzzing import Failure, Part, main, mutated
 
 from flexneedle.errors import DriverError
 from flexneedle.rig.devices.galil.motors import GalilMotors, factory
@@ -35,41 +36,6 @@ FARTHEST = 2.0**31
 TIMEOUT_MS, SLACK_S = 10.0, 1.0  # slack: the machine may be busy with other processes
 RECOVERY_S = 20.0
 LETTERS = "AB"
-
-
-class Failure(Exception):
-    """A rule that does not hold, with the input."""
-
-
-def main() -> int:
-    """Run the parts and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--inputs", type=int, default=1_000_000)
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--part", choices=PARTS)
-    args = parser.parse_args()
-    for name in [args.part] if args.part else PARTS:
-        begun = monotonic()
-        try:
-            done, note = run(name, args.inputs, args.seconds, args.seed)
-        except Failure as failure:
-            print(f"{name}: {failure}")
-            return 1
-        print(f"{name}: {done} inputs in {monotonic() - begun:.0f} s{note}", flush=True)
-    return 0
-
-
-def run(part: str, inputs: int, seconds: float, seed: int) -> tuple[int, str]:
-    """Return the number of inputs tried, and a note. Raises Failure."""
-    deadline = monotonic() + seconds
-    random = Random(f"{part} {seed}")
-    for done, note in enumerate(PARTS[part](random), 1):
-        if done == inputs or monotonic() >= deadline:
-            return done, note
-    raise AssertionError("a part has no end")
 
 
 # The parser
@@ -88,7 +54,7 @@ BYTES = b" -0123456789,.:?\r\n;$eEnaif\x00\x7f\x80\xba\xbf\xff"
 def parser_inputs(random: Random) -> Iterator[str]:
     """Parse one input after another."""
     while True:
-        received = mutated(random, random.choice(REPLIES))
+        received = mutated(random, random.choice(REPLIES), BYTES)
         count = random.randint(1, 5)
         with suppress(GarbledError):
             found = parse(received, count)
@@ -103,27 +69,6 @@ def parser_inputs(random: Random) -> Iterator[str]:
         with suppress(GarbledError):
             text(received.decode("latin-1"))
         yield ""
-
-
-def mutated(random: Random, data: bytes) -> bytes:
-    """Return data with some bytes changed, added, removed or repeated; sometimes only such bytes."""
-    if random.random() < 0.1:
-        return bytes(random.choice(BYTES) for _ in range(random.randint(0, 40)))
-    found = bytearray(data)
-    for _ in range(random.randint(0, 3)):
-        at = random.randint(0, len(found))
-        kind = random.random()
-        if kind < 0.4:
-            found[at : at + 1] = bytes(
-                [random.choice(BYTES) if random.random() < 0.7 else random.randrange(256)]
-            )
-        elif kind < 0.6:
-            del found[at : at + random.randint(1, 5)]
-        elif kind < 0.8:
-            found[at:at] = found[: random.randint(0, len(found))]
-        else:
-            found[at:at] = bytes([random.choice(BYTES)])
-    return bytes(found)
 
 
 # The emulated controller
@@ -296,7 +241,7 @@ def damages(random: Random) -> Callable[[bytes], bytes | None] | None:
         return lambda true: b" 17.0000\r\n" + true
     if kind < 0.6:
         return lambda true: true + true
-    return lambda true: mutated(random, true) or None
+    return lambda true: mutated(random, true, BYTES) or None
 
 
 def called(motors: GalilMotors, server: Server, name: str, random: Random) -> float:
@@ -362,11 +307,11 @@ ACTIONS: dict[str, Callable[[GalilMotors, Random], object]] = {
     "reconnect": lambda motors, _: motors.reconnect(),
 }
 CALLS = ("read", "read", "follow", *ACTIONS)
-PARTS: dict[str, Callable[[Random], Iterator[str]]] = {
+PARTS: dict[str, Part] = {
     "parser": parser_inputs,
     "controller": controller_inputs,
     "driver": driver_inputs,
 }
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(__doc__, PARTS))

@@ -4,19 +4,19 @@
 
 Each input is a valid rig file with a few random changes: values, lines, tables, bytes, its end. It is read from the
 disk as `flexneedle rig check` does. Ends after N inputs (default: a million) or S seconds (default: 600), whichever is
-first. A JSON summary on stdout; exit status 1 after any failure, 130 after an interrupt. An input depends only on seed
-and number, which reproduce a failure (`--first N --inputs 1`).
+first. Prints the inputs; at the first failure its seed and input, and exit status 1.
 """
 
-import argparse
-import json
 import math
-import random
 import sys
 import tempfile
-import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from random import Random
+from time import monotonic
+
+from fuzzing import Failure, main
 
 from flexneedle.errors import RigError
 from flexneedle.scenario.rig import RigFile, load_rig
@@ -97,23 +97,22 @@ TABLES = (
 SLOWEST_S = 1.0
 
 
-def fuzzed(seed: int, number: int) -> bytes:
+def fuzzed(draw: Random) -> bytes:
     """Return an input."""
-    draw = random.Random(f"{seed}/{number}")
     data = VALID
     for _ in range(draw.randint(1, 3)):
         data = draw.choice(CHANGES)(data, draw)
     return data
 
 
-def _value(data: bytes, draw: random.Random) -> bytes:
+def _value(data: bytes, draw: Random) -> bytes:
     lines, at = _lines(data, draw)
     key, equals, _ = lines[at].partition(b"=")
     lines[at] = key + b"= " + draw.choice(ODD) if equals else lines[at]
     return b"\n".join(lines)
 
 
-def _number(data: bytes, draw: random.Random) -> bytes:
+def _number(data: bytes, draw: Random) -> bytes:
     lines, at = _lines(data, draw)
     key, equals, _ = lines[at].partition(b"=")
     drawn = draw.choice((-1, 1)) * 10 ** draw.uniform(-8, 8)
@@ -121,7 +120,7 @@ def _number(data: bytes, draw: random.Random) -> bytes:
     return b"\n".join(lines)
 
 
-def _key(data: bytes, draw: random.Random) -> bytes:
+def _key(data: bytes, draw: Random) -> bytes:
     lines, at = _lines(data, draw)
     key, equals, value = lines[at].partition(b"=")
     other = draw.choice((b"x ", b"kind ", b'"" ', b'"a.b" ', b"a.b ", key.strip() + b"s "))
@@ -129,34 +128,34 @@ def _key(data: bytes, draw: random.Random) -> bytes:
     return b"\n".join(lines)
 
 
-def _without(data: bytes, draw: random.Random) -> bytes:
+def _without(data: bytes, draw: Random) -> bytes:
     lines, at = _lines(data, draw)
     del lines[at : at + draw.randint(1, 3)]
     return b"\n".join(lines)
 
 
-def _twice(data: bytes, draw: random.Random) -> bytes:
+def _twice(data: bytes, draw: Random) -> bytes:
     lines, at = _lines(data, draw)
     lines.insert(draw.randint(0, len(lines)), lines[at])
     return b"\n".join(lines)
 
 
-def _table(data: bytes, draw: random.Random) -> bytes:
+def _table(data: bytes, draw: Random) -> bytes:
     lines, at = _lines(data, draw)
     lines.insert(at, draw.choice(TABLES))
     return b"\n".join(lines)
 
 
-def _bytes(data: bytes, draw: random.Random) -> bytes:
+def _bytes(data: bytes, draw: Random) -> bytes:
     at, length = draw.randint(0, len(data)), draw.randint(0, 8)
     return data[:at] + draw.randbytes(draw.randint(0, 6)) + data[at + length :]
 
 
-def _end(data: bytes, draw: random.Random) -> bytes:
+def _end(data: bytes, draw: Random) -> bytes:
     return data[: draw.randint(0, len(data))]
 
 
-def _nested(data: bytes, draw: random.Random) -> bytes:
+def _nested(data: bytes, draw: Random) -> bytes:
     lines, at = _lines(data, draw)
     depth = draw.choice((3, 50, 3000))
     lines.insert(at, b"deep = " + b"[" * depth + b"]" * depth)
@@ -180,7 +179,7 @@ CHANGES = (
 )
 
 
-def _lines(data: bytes, draw: random.Random) -> tuple[list[bytes], int]:
+def _lines(data: bytes, draw: Random) -> tuple[list[bytes], int]:
     lines = data.split(b"\n")
     return lines, draw.randrange(len(lines))
 
@@ -223,52 +222,21 @@ def outcome(path: Path) -> str:
     return unusable(rig) or "rig"
 
 
-def run(seed: int, first: int, inputs: int, seconds: float) -> dict[str, object]:
-    """Return the counts of a run."""
-    counts: Counter[str] = Counter()
-    failures: list[str] = []
-    slowest, number, begun = 0.0, first, time.monotonic()
+def files(random: Random) -> Iterator[str]:
+    """Read one file after another."""
+    counts, slowest = Counter[str](), 0.0
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rig.toml"
-        for number in range(first, first + inputs):
-            path.write_bytes(fuzzed(seed, number))
-            before = time.monotonic()
-            found = outcome(path)
-            took = time.monotonic() - before
-            slowest = max(slowest, took)
+        while True:
+            data = fuzzed(random)
+            path.write_bytes(data)
+            begun = monotonic()
+            found, took = outcome(path), monotonic() - begun
             if found not in ("rig", "refused") or took > SLOWEST_S:
-                failures.append(f"input {number}: {found}, {took:.2f} s")
-                found = "failed"
-            counts[found] += 1
-            if before - begun > seconds:
-                break
-    elapsed = time.monotonic() - begun
-    return {
-        "inputs": counts.total(),
-        **counts,
-        "seconds": elapsed,
-        "slowest_s": slowest,
-        "failures": failures[:20],
-    }
-
-
-def main() -> int:
-    """Run the study."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--inputs", type=int, default=1_000_000, metavar="N")
-    parser.add_argument("--seconds", type=float, default=600.0, metavar="S")
-    parser.add_argument("--seed", type=int, default=0, metavar="N")
-    parser.add_argument("--first", type=int, default=0, metavar="N")
-    args = parser.parse_args()
-    try:
-        summary = run(args.seed, args.first, args.inputs, args.seconds)
-    except KeyboardInterrupt:
-        return 130
-    print(json.dumps({"seed": args.seed, **summary}, indent=2))
-    return 1 if summary["failures"] else 0
+                raise Failure(f"{data!r}: {found}, {took:.2f} s")
+            counts[found], slowest = counts[found] + 1, max(slowest, took)
+            yield f": {counts['rig']} rigs, {counts['refused']} refused, slowest {1e3 * slowest:.0f} ms"
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(__doc__, {"files": files}))

@@ -1,25 +1,27 @@
 """Random and damaged messages to all that reads ROS topics: no crash, no hang, no motion (`make fuzz-ros`).
 
-    python studies/fuzz_ros.py [--seconds S] [--inputs N] [--seed SEED] [--live]
+    python studies/fuzz_ros.py [--inputs N] [--seconds S] [--seed N] [--part messages|live]
 
 Inputs are random bytes, messages with changed, missing or repeated bytes, and valid messages with odd numbers (not a
 number, infinite, huge, tiny), texts, counts and stamps, on every topic of a profile. Each must give a record or a
 refusal with its reason, within a second; positions must be finite and near, and only a valid `true` may arm. Driver
-and tracker `ros` get the records: the driver must not send a target. With `--live` the bytes go over DDS to a running
-node, which must still forward a stop at the end. Exit status 1 after any failure; it names seed and input.
+and tracker `ros` get the records: the driver must not send a target. The part `live` sends the bytes over DDS to a
+running node, which must not arm, and still forward stops. Each part ends after N inputs (default: a million) or S
+seconds (default: 600). Prints the inputs; at the first failure its seed and input, and exit status 1.
 """
 
-import argparse
+import itertools
 import math
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from random import Random
 
 import numpy as np
 import rosbags.typesys.stores.ros2_humble as ros
+from fuzzing import Failure, main
 
 from flexneedle.errors import DriverError
 from flexneedle.rig.devices.clock import WallClock
@@ -40,16 +42,6 @@ TEXTS = ("", "skin", "/skin", "needle", "stage", "map", "é\u2028\x1b", "x" * 50
 STAMPS = (0, 1, -1, 2**31 - 1, -(2**31))
 
 Bytes = Callable[[np.random.Generator, str], bytes]
-
-
-@dataclass
-class Tally:
-    """Counts of a run."""
-
-    inputs: int = 0
-    outcomes: Counter[str] = field(default_factory=Counter)
-    slowest_s: float = 0.0
-    failures: list[str] = field(default_factory=list)
 
 
 # Inputs
@@ -224,19 +216,23 @@ class Consumers:
         return f"sent {sent[0]}" if sent else "" if finite else f"states {states}"
 
 
-def run(seconds: float, inputs: int, seed: int) -> Tally:
-    """Try inputs until one of both limits is reached."""
-    tally, rng, consumers = Tally(), np.random.default_rng(seed), Consumers()
-    everything = list(_subscriptions())
-    deadline = time.monotonic() + seconds
-    while tally.inputs < inputs and time.monotonic() < deadline:
-        if tally.inputs % 50 == 0:  # stamps must grow: a new subscription takes any stamp first
-            everything = list(_subscriptions())
-        subscription = everything[int(rng.integers(len(everything)))]
-        kind = str(rng.choice(list(KINDS)))
-        data = KINDS[kind](rng, subscription.key)
-        _try(tally, consumers, subscription, kind, data, seed)
-    return tally
+def messages(random: Random) -> Iterator[str]:
+    """Read one message after another, and hand its record to driver and tracker."""
+    rng, consumers = np.random.default_rng(random.getrandbits(64)), Consumers()
+    outcomes, slowest = Counter[str](), 0.0
+    while True:
+        everything = list(_subscriptions())  # stamps must grow: a new subscription takes any stamp first
+        for _ in range(50):
+            subscription, kind = everything[rng.integers(len(everything))], str(rng.choice(list(KINDS)))
+            data = KINDS[kind](rng, subscription.key)
+            begun = time.perf_counter()
+            record = _taken(consumers, subscription, data)
+            took = time.perf_counter() - begun
+            if took > SLOWEST_S:
+                raise Failure(f"{subscription.topic}: {data.hex()} took {took:.1f} s")
+            outcomes[f"{kind} {record}"] += 1
+            slowest = max(slowest, took)
+            yield f": {dict(outcomes)}, slowest {1e3 * slowest:.1f} ms"
 
 
 def _subscriptions() -> Iterator[Subscription]:
@@ -247,58 +243,55 @@ def _subscriptions() -> Iterator[Subscription]:
                 yield Subscription(profile, key)
 
 
-def _try(
-    tally: Tally, consumers: Consumers, subscription: Subscription, kind: str, data: bytes, seed: int
-) -> None:
-    begun = time.perf_counter()
-    found = ""
+def _taken(consumers: Consumers, subscription: Subscription, data: bytes) -> str:
+    """Return the type of the record of a message. Raises Failure."""
     try:
         record = subscription.read(data, time.monotonic())
         found = problem(subscription.key, data, record)
         if record is not None and not found:
             found = consumers.take(record)
-        tally.outcomes[f"{kind}: {type(record).__name__}"] += 1
-    except Exception as error:  # noqa: BLE001  whatever it is, it must not happen
-        found = f"{type(error).__name__}: {error}"
-    took = time.perf_counter() - begun
-    tally.slowest_s = max(tally.slowest_s, took)
-    if took > SLOWEST_S:
-        found = found or f"took {took:.1f} s"
+    except Exception as error:
+        raise Failure(f"{subscription.topic}: {data.hex()}: {error!r}") from error
     if found:
-        where = f"seed {seed}, input {tally.inputs}, {subscription.topic}"
-        tally.failures.append(f"{where}: {found}; bytes {data[:100].hex()}")
-    tally.inputs += 1
+        raise Failure(f"{subscription.topic}: {data.hex()}: {found}")
+    return type(record).__name__
 
 
-def run_live(seconds: float, inputs: int, seed: int) -> str:
-    """The same bytes over DDS to a node; why it did not survive them, or ""."""
+def live(random: Random) -> Iterator[str]:
+    """Send bytes over DDS to a node, which must not arm, and still forward a stop after each hundred."""
     from cyclonedds.core import DDSException
 
     from flexneedle.ros.dds import Cdr, Writer, participant
 
-    profile, rng = load_profile("neutral"), np.random.default_rng(seed)
+    profile, rng = load_profile("neutral"), np.random.default_rng(random.getrandbits(64))
     domain = participant()
     with NodeClient(profile) as node:
         topics = {key: getattr(profile.subscribe, key).topic for key in SUBSCRIBED}
         writers = {key: Writer(domain, topic, SUBSCRIBED[key]) for key, topic in topics.items()}
         if not _within(20.0, lambda: all(writer.readers for writer in writers.values())):
-            return "the node was not found"
-        deadline, count = time.monotonic() + seconds, 0
-        while count < inputs and time.monotonic() < deadline:
+            raise Failure("the node was not found")
+        for count in itertools.count(1):
             key = str(rng.choice([key for key in SUBSCRIBED if key not in ("stop", "arm")]))
             data = KINDS[str(rng.choice(list(KINDS)))](rng, key)
             with suppress(DDSException):  # less than a header, or no room
                 writers[key]._writer.write(Cdr(data))  # bytes that no message would give
-            count += 1
-            if any(isinstance(one, Arm) for one in node.poll()):
-                return f"armed by input {count}"
-        stopped = _within(20.0, lambda: _stops(writers["stop"], node))
-        return "" if stopped else f"no stop after {count} inputs: {node.status}"
+            _requests(node)
+            if count % 100 == 0 and not _within(20.0, lambda: _stops(writers["stop"], node)):
+                raise Failure(f"no stop is forwarded: {node.status}")
+            yield ""
+
+
+def _requests(node: NodeClient) -> list[Request]:
+    """Return what was received. Raises Failure for an arm, which was not sent."""
+    requests = node.poll()
+    if any(isinstance(one, Arm) for one in requests):
+        raise Failure("armed")
+    return requests
 
 
 def _stops(writer: object, node: NodeClient) -> bool:
     writer.write(ros.std_msgs__msg__Bool(True))  # type: ignore[attr-defined]
-    return any(isinstance(one, Stop) for one in node.poll())
+    return any(isinstance(one, Stop) for one in _requests(node))
 
 
 def _within(seconds: float, condition: Callable[[], bool]) -> bool:
@@ -308,26 +301,5 @@ def _within(seconds: float, condition: Callable[[], bool]) -> bool:
     return holds
 
 
-def main() -> int:
-    """Run and print the counts."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--inputs", type=int, default=1_000_000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--live", action="store_true")
-    args = parser.parse_args()
-    tally = run(args.seconds, args.inputs, args.seed)
-    print(f"{tally.inputs} inputs, {len(tally.failures)} failures, slowest {1e3 * tally.slowest_s:.1f} ms")
-    for name, count in sorted(tally.outcomes.items()):
-        print(f"  {name}: {count}")
-    print(*tally.failures[:20], sep="\n", end="\n" if tally.failures else "")
-    lost = run_live(min(args.seconds, 60.0), args.inputs, args.seed) if args.live else ""
-    if args.live:
-        print(f"live node: {lost or 'forwards a stop'}")
-    return 1 if tally.failures or lost else 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(__doc__, {"messages": messages, "live": live}))

@@ -104,8 +104,8 @@ def _preset(rng: np.random.Generator, guides: int, *, in_space: bool, any_angle:
         return flexneedle.load_scenario("phantom").with_values(values)
     rotation = "free" if any_angle else "half-turns"
     values |= {"setup.guide_axes": guides, "setup.rotation": rotation}
-    if guides < 2 and not any_angle:  # nothing steers along z
-        values["target.lateral_z_mm"] = 0.0
+    if guides < 2:  # along z the bevel steers, or nothing
+        values["target.lateral_z_mm"] = round(float(rng.uniform(-1.0, 1.0)), 2) if any_angle else 0.0
     return flexneedle.load_scenario("phantom3d").with_values(values)
 
 

@@ -27,14 +27,15 @@ from typing import Any
 from zlib import crc32
 
 import numpy as np
-from rig_trials import EmulatedRig, emulated_rig, ended, insertion
+from rig_trials import EmulatedRig, emulated_rig, ended, insertion, moved_after, rests
 
 from flexneedle.rig.emulator.coupled.truth import Truth
 
 _MOTION_MM = 0.5  # the most that the base may move after detection
-_REST_S, _REST_MM = 0.5, 0.005
 _EARLIEST_S, _LATEST_S = 1.0, 13.0  # after the first motion, while the needle is driven
 _STATES = ("holding", "stopped", "fault")
+_END = "the controller"  # who stops the motors at the end of an insertion
+_PAUSE_S = 0.02  # of the base between two motions; within one it is somewhere else after 4 ms
 _CLOCK = r"""
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -110,7 +111,8 @@ Inject = Callable[[Trial], float]
 @dataclass(frozen=True)
 class Fault:
     """A fault of the table. reaction: the required one; within: time to detection (s), None where none is required;
-    outcomes: that the insertion may have. options: of the insertion.
+    outcomes: that the insertion may have. controller: how long which of its decisions takes, where that is the fault;
+    since_motion: whether the time to detection counts from the beginning of the motion in which the fault shows.
     """
 
     group: str
@@ -120,6 +122,24 @@ class Fault:
     within: float | None
     outcomes: tuple[str, ...]
     controller: tuple[float, int] | None = None
+    since_motion: bool = False
+
+    @property
+    def unnoticed(self) -> bool:
+        """Whether the insertion must go on without a hold or stop."""
+        return self.within is None and self.outcomes == ("done",)
+
+    def detection_s(self, trial: Mapping[str, Any]) -> float | None:
+        """Time to detection in a trial; None without one, and where an older trial has not recorded it."""
+        found: float | None = trial.get("from_motion_s" if self.since_motion else "detection_s")
+        return found
+
+    def timely(self, trial: Mapping[str, Any]) -> bool:
+        """Whether it was detected in time. What shows only in a motion may not come about before the end."""
+        seconds = self.detection_s(trial)
+        if self.since_motion and seconds is None:
+            return trial["outcome"] == "done" or "from_motion_s" not in trial
+        return self.within is None or (seconds is not None and seconds <= self.within)
 
 
 def order(text: str) -> Inject:
@@ -220,7 +240,7 @@ def _faults() -> list[Fault]:
         motors("wrong direction", order("galil:reversed=A"), "fault", 0.4, failed),
         motors("position reset", order("galil:reset=A"), "fault", 0.1, failed),
         motors("motor off", order("galil:off=A"), "fault", 0.1, failed),
-        motors("guide stalls", order("galil:stall=C"), "fault", None, ("failed", "done")),
+        motors("guide stalls", order("galil:stall=C"), "fault", 0.9, ("failed", "done"), since_motion=True),
         computer("decision of 0.5 s", late_decision, "rest until it is there", None, ("done",), (0.5, 0)),
         computer("decision of 5 s", late_decision, "stop", 2.3, interrupted, (5.0, 0)),
         computer("controller killed", killed("controller"), "stop", None, ("running",)),
@@ -321,12 +341,10 @@ def _judged(
         (
             one
             for one in ticks.get("states", ())
-            if one["state"] in _STATES and one["time_s"] >= injected - 1e-3
+            if one["state"] in _STATES and one["why"] != _END and one["time_s"] >= injected - 1e-3
         ),
         None,
     )
-    if fault.outcomes == ("done",) and fault.within is None:
-        detected = None
     return {
         "group": fault.group,
         "fault": fault.name,
@@ -337,8 +355,9 @@ def _judged(
         "state": None if detected is None else detected["state"],
         "why": None if detected is None else detected["why"],
         "detection_s": None if detected is None else detected["time_s"] - injected,
+        "from_motion_s": None if detected is None else _from_motion(truth, detected["time_s"]),
         "motion_mm": _motion(fault, truth, injected, detected),
-        "rests": _rests(truth),
+        "rests": rests(truth),
         "errors": errors[-300:] if status not in (0, 1, 130) else "",
     }
 
@@ -351,24 +370,23 @@ def _motion(fault: Fault, truth: Truth, injected: float, detected: Mapping[str, 
         return None
     if detected is None and "by themselves" not in fault.reaction and "killed" not in fault.name:
         return None
-    place = np.interp(since, truth.time, truth.positions["insertion"])
-    after = truth.positions["insertion"][truth.time >= since]
-    return float(np.abs(after - place).max()) if len(after) else 0.0
+    return moved_after(truth, since)
 
 
-def _rests(truth: Truth) -> bool:
-    """Whether nothing moves at the end."""
-    last = truth.time >= truth.time[-1] - _REST_S
-    return all(np.ptp(place[last]) < _REST_MM for place in truth.positions.values())
+def _from_motion(truth: Truth, time: float) -> float | None:
+    """Time since the base last began to move, and with it the guide, or should have; None if it has not."""
+    moved = truth.time[:-1][np.diff(truth.positions["insertion"]) != 0.0]
+    moved = moved[moved <= time]
+    begins = moved[np.diff(moved, prepend=-np.inf) > _PAUSE_S]
+    return float(time - begins[-1]) if len(begins) else None
 
 
 def good(fault: Fault, trial: Mapping[str, Any]) -> bool:
     """Whether a trial ended as required."""
-    timely = fault.within is None or (
-        trial["detection_s"] is not None and trial["detection_s"] <= fault.within
-    )
     still = trial["motion_mm"] is None or trial["motion_mm"] <= _MOTION_MM
-    return bool(trial["rests"] and still and timely and trial["outcome"] in fault.outcomes)
+    unnoticed = trial["state"] is None or not fault.unnoticed
+    ended_well = trial["rests"] and trial["outcome"] in fault.outcomes
+    return bool(ended_well and still and unnoticed and fault.timely(trial))
 
 
 def table(faults: list[Fault], trials: list[dict[str, Any]]) -> str:
@@ -386,9 +404,10 @@ def table(faults: list[Fault], trials: list[dict[str, Any]]) -> str:
 
 def _row(fault: Fault, trials: list[dict[str, Any]]) -> str:
     outcomes = sorted({one["outcome"] for one in trials})
-    times = [one["detection_s"] for one in trials if one["detection_s"] is not None]
+    times = [time for time in map(fault.detection_s, trials) if time is not None]
     motions = [one["motion_mm"] for one in trials if one["motion_mm"] is not None]
-    limit = "–" if fault.within is None else f"{max(times, default=float('nan')):.3f} ({fault.within:g})"
+    longest = f"{max(times):.3f}" if times else "–"
+    limit = "–" if fault.within is None else f"{longest} ({fault.within:g})"
     motion = f"{max(motions):.3f}" if motions else "–"
     share = f"{sum(good(fault, one) for one in trials)} of {len(trials)}"
     ended_as = ", ".join("no record" if one == "running" else one for one in outcomes)
@@ -405,15 +424,18 @@ def draw(faults: list[Fault], trials: list[dict[str, Any]], path: Path) -> None:
     )
     for row, fault in enumerate(shown):
         mine = [one for one in trials if (one["group"], one["fault"]) == (fault.group, fault.name)]
-        for axis, key in zip(axes, ("detection_s", "motion_mm"), strict=True):
-            values = [one[key] for one in mine if one[key] is not None]
+        seconds, motions = map(fault.detection_s, mine), (one["motion_mm"] for one in mine)
+        for axis, found in zip(axes, (seconds, motions), strict=True):
+            values = [value for value in found if value is not None]
             axis.plot(
                 np.maximum(values, 1e-3), [row] * len(values), "o", color="#0072b2", alpha=0.4, markersize=4
             )
         if fault.within is not None:
             axes[0].plot([fault.within], [row], "|", color="#d55e00", markersize=11, markeredgewidth=2)
     axes[1].axvline(_MOTION_MM, color="#d55e00", linewidth=2)
-    axes[0].set(xscale="log", xlabel="time to detection (s); its limit", yticks=range(len(shown)))
+    axes[0].set(
+        xscale="log", xlim=(8e-4, 4.0), xlabel="time to detection (s); its limit", yticks=range(len(shown))
+    )
     axes[0].set_yticklabels([f"{one.group}: {one.name}" for one in shown])
     axes[1].set(xlabel="motion of the base after detection (mm); limit 0.5", xlim=(-0.02, 0.6))
     for axis in axes:

@@ -250,11 +250,15 @@ def resumed(
         pool.shutdown()
 
 
-@dataclass(frozen=True)
+@dataclass
 class Witness:
-    """The file of the times (s, monotonic) at which a process that only sleeps woke up late, and how late."""
+    """The file of the times (s, monotonic) at which a process that only sleeps woke up late, and how late.
+
+    text: of the file, once the process has ended.
+    """
 
     file: Path
+    text: str | None = None
 
     def explains(self, time: float, late: float) -> bool:
         """Whether it was late, too, by at least half as much, when a tick began late at this time."""
@@ -262,7 +266,7 @@ class Witness:
         return any(begun <= at <= time + 0.05 and gap >= 0.5 * late for at, gap in self._stalls())
 
     def _stalls(self) -> Iterator[tuple[float, float]]:
-        text = self.file.read_text()
+        text = self.file.read_text() if self.text is None else self.text
         for line in text[: text.rfind("\n") + 1].splitlines():
             at, gap = map(float, line.split())
             yield at, gap
@@ -280,6 +284,7 @@ def witness() -> Iterator[Witness]:
         finally:
             process.terminate()
             process.wait()
+            found.text = found.file.read_text()
 
 
 def watch() -> None:
@@ -292,6 +297,19 @@ def watch() -> None:
         if now - before > _STALL_S:
             print(f"{now:.6f} {now - before:.6f}", flush=True)
         before = now
+
+
+def moved_after(truth: Truth, since: float) -> float:
+    """How far the base has moved (mm) after a time (s, monotonic)."""
+    base = truth.positions["insertion"]
+    after = base[truth.time >= since]
+    return float(np.abs(after - np.interp(since, truth.time, base)).max()) if len(after) else 0.0
+
+
+def rests(truth: Truth, seconds: float = 0.5, most: float = 0.005) -> bool:
+    """Whether no axis has moved by `most` (mm, rad) in the last `seconds`."""
+    last = truth.time >= truth.time[-1] - seconds
+    return all(np.ptp(place[last]) < most for place in truth.positions.values())
 
 
 def percentile(values: Sequence[float], share: float) -> float:

@@ -1,4 +1,4 @@
-"""Insertions on a rig in memory, in real time, in a process of their own, which ROS nodes follow and stop."""
+"""Insertions in real time, in a process of their own, which ROS nodes follow and stop; most on a rig in memory."""
 
 import json
 import os
@@ -87,16 +87,22 @@ class Tip:
         pass
 
 
+def quick_scenario(folder):
+    """Write a scenario that is planned and inserted quickly; return its path."""
+    path = folder / "quick.toml"
+    path.write_text(dump_scenario(flexneedle.load_scenario("phantom").with_values(QUICK)))
+    return path
+
+
 class Started:
     """An insertion in a process of its own. Peers are made by `peer`."""
 
     def __init__(self, folder, profile, *options, ros):
         self.folder, self.profile, self.notes = folder, profile, folder / "notes"
-        scenario, self.out = folder / "quick.toml", folder / "out"
-        scenario.write_text(dump_scenario(flexneedle.load_scenario("phantom").with_values(QUICK)))
-        command = [sys.executable, "-m", "flexneedle", "insert", str(scenario), "--force"]
+        self.out = folder / "out"
+        command = [sys.executable, "-m", "flexneedle", "insert", str(quick_scenario(folder)), "--force"]
         if ros is not None:
-            rig = folder / "rig.toml"
+            rig = folder / "memory.toml"
             parts = {"driver": {"kind": "ros_rig:motors", "notes": str(self.notes)}, "ros": ros}
             rig.write_text(tomli_w.dumps(RIG | parts | {"tracker": {"kind": "ros_rig:Tip"}}))
             command += ["--rig", str(rig)]
@@ -158,7 +164,7 @@ class Started:
 
 @contextmanager
 def started(folder, profile, *options, ros=None):
-    """Start an insertion: on the rig in memory with a section `ros`, None: a virtual one."""
+    """Start an insertion: on the rig in memory with a section `ros`; None: a virtual one, or that of the options."""
     made = Started(folder, profile, *options, ros=ros)
     try:
         yield made

@@ -278,10 +278,14 @@ class Moves(Stage):
 
 
 def real_motors(settings, channels):
-    """A driver of a rig file, `stages:real_motors`: the motors in memory, in real time. position: of all (counts)."""
+    """A driver of a rig file, `stages:real_motors`: the motors in memory, in real time.
+
+    position: of all (counts); off: how far they are from where their controller has them (counts).
+    """
     stage = Stage(WallClock(), channels)
     for motor in stage.motors.values():
         motor.position = motor.commanded = motor.target = float(settings.get("position", 0.0))
+        motor.position += float(settings.get("off", 0.0))
     return stage
 
 
@@ -304,6 +308,14 @@ class Still:
 
     def close(self):
         pass
+
+
+class Blind(Still):
+    """A tracker of a rig file, `stages:Blind`: frames without the tip."""
+
+    def read(self):
+        unseen = {"tip": SensorReading(None, status="missing")}
+        return tuple(replace(frame, readings=unseen) for frame in super().read())
 
 
 class Noting(Stage):

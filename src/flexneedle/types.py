@@ -470,6 +470,7 @@ class Insertion:
     scenario: "Scenario | None" = None  # of the insertion
     rig: str = ""  # name of the rig, "" on a virtual one
     ticks: Mapping[str, Any] = field(default_factory=dict, compare=False)  # of the rig: number, times, states
+    dry_run: bool = False  # the rig did not move: the needle was the virtual phantom's
 
     @property
     def target(self) -> Point:
@@ -532,7 +533,11 @@ class Insertion:
 
     @property
     def summary(self) -> str:
-        """Outcome of the insertion in one line."""
+        """Outcome of the insertion in one line, which begins with "dry run" for one."""
+        return f"dry run: {self._ending}" if self.dry_run else self._ending
+
+    @property
+    def _ending(self) -> str:
         if self.outcome is not Outcome.DONE:
             after = f"{self.outcome} after {len(self.periods)} periods"
             return f"{after}: {self.reason}" if self.reason else after

@@ -178,6 +178,19 @@ def test_a_file_that_is_none_is_bad_input(capsys, tmp_path, name):
     assert f"{path}: name = 3: must be text in quotes" in err
 
 
+@pytest.mark.parametrize("words", [("jog", "nose", "1"), ("home", "nose")])
+def test_the_rig_of_the_package_is_given_by_its_name(capsys, words):
+    status, _, err = run(capsys, "rig", words[0], "emulated", *words[1:])
+    assert status == 2
+    assert "axis 'nose': must be one of insertion, rotation, guide_y" in err
+
+
+def test_a_name_that_is_no_rig_has_the_choices(capsys):
+    status, _, err = run(capsys, "rig", "check", "nonesuch")
+    assert status == 2
+    assert "no such rig (choices: emulated)" in err
+
+
 def test_an_emulated_aurora_is_checked_over_its_line(capsys, file, tmp_path):
     """A real process on a pseudo-terminal, read as a rig reads it; its registered name is another test's."""
     with emulated("--link", str(tmp_path / "aurora"), "--still") as path:

@@ -282,6 +282,17 @@ def test_a_line_that_went_nowhere_ends_in_a_dot_and_is_named(insertion):
     assert names(energy.get_legend()) == ["planned", "true"]
 
 
+def test_a_reading_without_a_position_does_not_set_the_depths(insertion):
+    first = insertion.periods[0]
+    unknown = replace(first, measurement=replace(first.measurement, x=None, y=None))
+    figure = insertion_figure(PHANTOM, replace(insertion, periods=(unknown, *insertion.periods[1:])))
+    ends = [
+        ax.get_xlim()
+        for ax in (axes(figure, "deviation")[0], axes(insertion_figure(PHANTOM, insertion), "deviation")[0])
+    ]
+    assert ends[0] == ends[1]
+
+
 def test_a_panel_without_a_line_gives_the_reason(insertion):
     (error,) = axes(insertion_figure(PHANTOM, held_from_the_start(insertion)), "deviation")
     # Readings were there, but the periods' own verdicts are against them.

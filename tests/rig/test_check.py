@@ -223,6 +223,15 @@ def test_a_device_that_fails_later_is_a_problem_and_closed(monkeypatch):
     assert device.closed
 
 
+def test_an_error_in_a_driver_of_your_own_is_a_problem(monkeypatch):
+    def broken(_settings, _channels):
+        raise ValueError("bad byte")
+
+    monkeypatch.setattr(bench_rig, "drivers", broken)
+    (line,) = problems(check_rig(rig(**KINDS), Clock(), 1.0)).values()
+    assert line.startswith("driver bench_rig:drivers: ValueError: bad byte (test_check.py, line ")
+
+
 def test_a_part_that_is_not_installed_is_a_problem():
     findings = check_rig(rig(tracker__kind="bench_rig:trackers"), Clock(), 1.0)
     (line,) = problems(findings).values()

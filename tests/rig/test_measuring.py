@@ -82,6 +82,14 @@ def test_before_the_start_the_tip_may_be_missing_for_a_tenth_of_a_second(lost, v
     assert not observation.field
 
 
+def test_before_the_start_the_last_good_reading_is_recorded_while_the_tip_may_be_missing():
+    measurements = second()
+    blind = [*measurements[:-2], *(measurement(one.time, measured=False) for one in measurements[-2:])]
+    observation = before(1.0, *blind)
+    assert str(observation.verdict) == OK
+    assert observation.measurement == measurements[-3]
+
+
 def test_before_the_start_a_missing_tip_does_not_hide_a_distorted_field():
     measurements = second(indicator=0.2)
     measurements[-1] = measurement(1.0, measured=False, indicator=0.2)

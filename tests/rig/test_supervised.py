@@ -12,12 +12,11 @@ import flexneedle
 from emulated_rig import emulated_rig, rig_file
 from flexneedle.errors import CommandError, DriverError
 from flexneedle.rig.emulator.coupled.truth import read_truth
-from flexneedle.rig.supervised import Columns, SupervisedDriver, _deepest
+from flexneedle.rig.supervised import Columns, SupervisedDriver
 from flexneedle.rig.supervisor.machine import State
 from flexneedle.rig.supervisor.messages import Done
 from flexneedle.scenario.rig import load_rig
 from flexneedle.types import Control
-from synthetic import make_plan
 
 PHANTOM = flexneedle.load_scenario("phantom")
 SPACE = flexneedle.load_scenario("phantom3d")
@@ -111,31 +110,24 @@ def test_a_reading_is_expected_on_the_line_of_the_needle():
     assert expected.most_off == pytest.approx(2.0 + 3 * 0.2)
 
 
-@pytest.mark.parametrize(
-    ("measured", "start"), [(None, -28.5), (-30.7, -30.7), (-27.9, -27.9), (-35.0, -31.5), (40.0, -25.5)]
-)
-def test_the_base_may_advance_as_far_as_the_plans_target_from_where_the_tip_was_measured(measured, start):
-    """Within three standard deviations of where the tip starts, so that a wrong reading does not move the limit."""
-    plan = make_plan("manipulation", (25.0, 1.0, 0.0), 0)
-    assert PHANTOM.setup.start_tip_x == -28.5
-    assert _deepest(PHANTOM, plan, measured) == pytest.approx(25.0 + 2.0 - start)
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("dry", [False, True])
 def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
     scenario = PHANTOM.with_values({"target.depth_mm": 12.0, "target.lateral_mm": 1.0})
     plan = flexneedle.plan(scenario, seed=0)
     path, truth = rig_file(tmp_path), tmp_path / "truth.csv"
-    with emulated_rig(path, "phantom", "--seed", "3", "--truth", truth) as rig:
+    seed = 862  # its tip starts 2.5 mm behind the scenario's, more than it may go past the target
+    with emulated_rig(path, "phantom", "--seed", str(seed), "--truth", truth) as rig:
         address = rig.ready["ready"]["galil"]
         path.write_text(path.read_text().replace("127.0.0.1:0", address))
-        done = flexneedle.insert(scenario, plan, 3, rig=path, dry_run=dry)
+        done = flexneedle.insert(scenario, plan, seed, rig=path, dry_run=dry)
         assert rig.ask("TPA") == (" 0\r\n:" if dry else rig.ask("TPA"))
     found = read_truth(truth)
+    assert found.tips[0, 0] < PHANTOM.setup.start_tip_x - PHANTOM.guard.past_target_mm
     assert done.outcome == "done"
     assert done.reached
     assert done.ticks["count"] > 100
+    assert done.dry_run is dry
     if dry:
         assert np.ptp(found.positions["insertion"]) == 0.0
         assert done.true_error_mm < 0.3

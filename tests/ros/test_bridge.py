@@ -9,13 +9,15 @@ import pytest
 
 import flexneedle
 from emulated import until
+from emulated_rig import emulated_rig, rig_file
 from flexneedle.errors import RigError
+from flexneedle.rig.emulator.coupled.truth import read_truth
 from flexneedle.ros.bridge import profile_of
 from flexneedle.ros.profile import load_profile
 from flexneedle.scenario.rig import RigFile, RosSettings
 from flexneedle.trace.reader import read_trace
 from ros_peers import Bool, target
-from ros_rig import QUICK, started
+from ros_rig import QUICK, quick_scenario, started
 from stages import RIG
 
 NEUTRAL = load_profile("neutral")
@@ -48,6 +50,32 @@ def test_a_stop_on_its_topic_stops_the_motors_at_once(tmp_path):
     ((_, _, rest),) = insertion.calls("close")
     assert 1000.0 < where["A"] <= rest["A"] < where["A"] + 500.0  # 0.5 mm
     assert events(insertion) == ["stop: ROS topic /flexneedle/stop"]
+
+
+@pytest.mark.long
+def test_the_needle_of_the_emulated_rig_rests_after_a_stop(tmp_path):
+    path, record = rig_file(tmp_path), tmp_path / "truth.csv"
+    with emulated_rig(path, quick_scenario(tmp_path), "--seed", 3, "--truth", record) as rig:
+        served = path.read_text().replace("127.0.0.1:0", rig.ready["ready"]["galil"])
+        path.write_text(f"{served}\n[ros]\n")
+        with started(tmp_path, NEUTRAL, "--yes", "--rig", str(path)) as insertion:
+            peer = insertion.peer(("tip",))
+            until(lambda: len(peer.received("tip")) > 8, 60.0)
+            sent = time.monotonic()
+            peer.send("stop", Bool(True))
+            status, _, errors = insertion.end()
+        ended = time.monotonic()
+        until(lambda: read_truth(record).time[-1] > ended + 1.0)
+    assert (status, insertion.stored["reason"]) == (130, "stopped: ROS topic /flexneedle/stop"), errors
+    stopped = insertion.stored["timing"]["ticks"]["states"][-1]
+    assert stopped["state"] == "stopped"
+    assert 0.0 < stopped["time_s"] - sent < 0.3
+    truth = read_truth(record)
+    base = truth.positions["insertion"]
+    reached = np.interp([sent, stopped["time_s"]], truth.time, base)
+    assert reached[0] > 2.0
+    assert np.all(base[-1] - reached < (2.0, 0.5))  # 0.3 s at 5 mm/s, and 0.5 mm
+    assert all(np.ptp(turns[truth.time > ended]) == 0.0 for turns in truth.counts.values())
 
 
 @pytest.mark.long

@@ -3,11 +3,13 @@
 import builtins
 import json
 from dataclasses import fields, replace
+from io import StringIO
 
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 import flexneedle
 from flexneedle.cli import main as cli
@@ -17,6 +19,7 @@ from flexneedle.figures.plans import plan_figure
 from flexneedle.runs.figures import draw_run
 from flexneedle.trace.columns import COLUMNS
 from flexneedle.trace.folder import TRACE_FILE
+from flexneedle.trace.results import insertion_result
 from synthetic import blind, make_insertion, make_plan
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -104,6 +107,26 @@ def test_a_dataframe_has_the_rows_and_columns_of_the_exported_table(tmp_path, ca
     assert np.isnan(frame["true_x_mm"].iloc[-1])
     assert frame["true_x_mm"].dtype == frame["measured_z_mm"].dtype == float
     assert frame["converged"].dtype == bool
+
+
+def test_each_record_of_a_dry_run_is_marked_as_one(tmp_path, capsys):
+    dry, folder = replace(INSERTION, phantom="", rig="Bench", dry_run=True), tmp_path / "run"
+    assert dry.summary == f"dry run: {INSERTION.summary}"
+    flexneedle.save(dry, folder)
+    stored = json.loads((folder / "run.json").read_text())
+    assert (stored["dry_run"], stored["result"]["dry_run"]) == (True, True)
+    loaded = flexneedle.load(folder)
+    assert loaded.dry_run
+    assert dry.summary in {text.get_text() for text in flexneedle.plot(loaded).findobj(Text)}
+    assert cli.main(["export", str(folder), "--csv", "-"]) == 0
+    table = pd.read_csv(StringIO(capsys.readouterr().out))
+    assert table["dry_run"].all()
+    pd.testing.assert_series_equal(flexneedle.to_dataframe(loaded)["dry_run"], table["dry_run"])
+
+
+def test_an_insertion_that_moved_a_needle_has_no_mark_of_a_dry_run():
+    assert "dry_run" not in flexneedle.to_dataframe(INSERTION)
+    assert insertion_result(INSERTION)["dry_run"] is False
 
 
 def test_a_dataframe_without_periods_has_the_columns():

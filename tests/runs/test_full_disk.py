@@ -5,6 +5,7 @@ import resource
 import signal
 import subprocess
 from contextlib import contextmanager
+from dataclasses import replace
 
 import pytest
 
@@ -16,15 +17,17 @@ from flexneedle.rig import kernels
 from flexneedle.rig.phantom.phantom import Phantom
 from flexneedle.runs import saving
 from flexneedle.scenario.files import dump_scenario
+from flexneedle.trace.folder import Folder
 from flexneedle.trace.reader import read_trace
 from flexneedle.trace.writer import TraceWriter
-from flexneedle.types import Outcome
+from flexneedle.types import Outcome, Plan
 from synthetic import make_periods, make_plan
 
 QUICK = {
     "target.depth_mm": 3.0, "target.lateral_mm": 0.0, "plan.samples": 16, "plan.iterations": 2,
     "plan.max_iterations": 2, "needle.nodes": 15, "phantom.element_mm": 5.0, "phantom.contact_spacing_mm": 2.0,
 }  # fmt: skip
+NO_END = ": no end is recorded: the run was killed, its disk was full, or it is still running"
 FULL, TOO_LARGE = "No space left on device", "File too large"
 PLAN = make_plan()
 PERIODS = list(make_periods(PLAN))[:12]
@@ -94,6 +97,40 @@ def test_the_insertion_is_held_and_says_why(tmp_path, capsys, small_disk, motors
     assert len(left.periods) == motors.count("apply") - 1  # all but the one that did not fit
     assert json.loads((small_disk / "run/run.json").read_text())["status"] == "running"
     assert not list((small_disk / "run").glob("*.tmp"))
+    with pytest.warns(RuntimeWarning, match=f"{NO_END}; .*trace.mcap: incomplete"):
+        loaded = flexneedle.load(small_disk / "run")
+    assert (loaded.outcome, len(loaded.periods)) == (Outcome.INTERRUPTED, len(left.periods))
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_a_run_whose_end_cannot_be_written_is_shown_as_one_without_an_end(tmp_path, capsys, monkeypatch):
+    def full(_folder, _status, _reason=""):
+        raise RecordError("run.json cannot be written")
+
+    folder, reason = tmp_path / "run", NO_END.removeprefix(": ")
+    with monkeypatch.context() as patch:
+        patch.setattr(Folder, "end", full)
+        status, out, err = run(capsys, *command(tmp_path, folder))
+    assert (status, out.partition(":")[0]) in ((0, "Reached"), (1, "MISSED"))
+    assert "flexneedle: run.json cannot be written" in err
+    status, out, err = run(capsys, "view", str(folder))
+    assert (status, err) == (0, f"flexneedle: {folder}{NO_END}\n")
+    assert out.splitlines() == [str(folder / "insertion.png"), str(folder / "insertion.svg")]
+    assert run(capsys, "export", str(folder), "--csv")[2] == f"flexneedle: {folder}{NO_END}\n"
+    with pytest.warns(RuntimeWarning, match=reason):
+        loaded = flexneedle.load(folder)
+    made = read_trace(folder / "trace.mcap").periods
+    assert (loaded.outcome, loaded.reason, len(loaded.periods)) == (Outcome.INTERRUPTED, reason, len(made))
+    assert loaded.summary == f"interrupted after {len(made)} periods: {reason}"
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_plans_without_a_recorded_end_are_loaded_with_a_warning(tmp_path):
+    plan = replace(PLAN, scenario=flexneedle.load_scenario("phantom"))
+    path = flexneedle.save(plan, tmp_path / "plan") / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"status": "running"}))
+    with pytest.warns(RuntimeWarning, match=f"^{path.parent}{NO_END}$"):
+        assert isinstance(flexneedle.load(path.parent), Plan)
 
 
 @pytest.mark.usefixtures("empty_figures")
@@ -134,6 +171,19 @@ def test_an_index_that_cannot_be_written_is_named_and_the_result_stays(tmp_path,
     assert out.startswith(("Reached", "MISSED"))
     assert f"flexneedle: trace.mcap cannot be written: {FULL}" in err
     assert len(read_trace(tmp_path / "run/trace.mcap").periods) >= 30
+
+
+def test_a_figure_that_cannot_be_drawn_is_named_and_the_result_stays(tmp_path, capsys, monkeypatch):
+    def broken(*_):
+        raise ValueError("Axis limits cannot be NaN or Inf")
+
+    monkeypatch.setattr(saving, "draw_run", broken)
+    arguments = command(tmp_path, tmp_path / "run", "--json")
+    status, out, err = run(capsys, *arguments)
+    result = json.loads(out)
+    assert (status, result["outcome"]) == (int(not result["reached"]), "done")
+    assert "flexneedle: figures cannot be drawn: ValueError: Axis limits cannot be NaN or Inf\n" in err
+    assert json.loads((tmp_path / "run/run.json").read_text())["status"] == "done"
 
 
 def write(path, periods=PERIODS):

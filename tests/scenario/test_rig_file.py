@@ -2,6 +2,7 @@
 
 import copy
 import math
+import re
 import sys
 import tomllib
 from pathlib import Path
@@ -19,6 +20,7 @@ from flexneedle.scenario.rig import RigFile, load_rig
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
 import fuzz_rig_file
+import fuzzing
 
 
 @pytest.fixture
@@ -274,9 +276,9 @@ def test_any_edit_of_the_text_gives_a_rig_or_lines(tmp_path_factory, start, leng
 @pytest.mark.parametrize("seed", [0, 1])
 def test_random_files_give_a_rig_or_lines(seed):
     """The study of a million inputs in small: both are frequent, nothing else occurs."""
-    summary = fuzz_rig_file.run(seed, 0, 300, 60.0)
-    assert summary["failures"] == []
-    assert min(summary["rig"], summary["refused"]) > 15
+    done, note = fuzzing.run(fuzz_rig_file.files, 300, 60.0, seed)
+    assert done == 300
+    assert min(int(count) for count in re.findall(r"(\d+) (?:rigs|refused)", note)) > 15
 
 
 def test_an_unusable_rig_is_noticed():

@@ -10,56 +10,39 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexneedle.console.common import HelpFormatter, examples, seed
+from flexneedle.console.commands import Commands, add_command, add_group
+from flexneedle.console.common import add_seed
 
 if TYPE_CHECKING:
     from flexneedle.rig.emulator.coupled.job import Job
     from flexneedle.rig.emulator.orders import Orders
 
-_EXAMPLES = examples(
-    "flexneedle emulate aurora --link /tmp/aurora",
-    "flexneedle emulate rig emulated phantom",
-)
-_AURORA_EXAMPLES = examples(
-    "flexneedle emulate aurora --link /tmp/aurora",
-    "flexneedle emulate aurora --still --sensors 2 --seed 3",
-)
-_GALIL_EXAMPLES = examples(
-    "flexneedle emulate galil --port 2323",
-    "flexneedle emulate galil --port 2323 --fault stall=A@5",
-)
-
-
-_RIG_EXAMPLES = examples(
-    "flexneedle emulate rig emulated phantom --seed 3 --truth truth.csv",
-    "flexneedle emulate rig my-rig.toml phantom3d --fault galil:stall=A@5 --fault aurora:jump@8:0.5",
-)
-
 _LAST_PORT = 65535
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser(
+    add_group(
+        commands,
         "emulate",
-        help="emulate a device, for tests without hardware",
-        epilog=_EXAMPLES,
-        formatter_class=HelpFormatter,
+        "emulate a device, for tests without hardware",
+        (_add_aurora, _add_galil, _add_rig),
+        "flexneedle emulate aurora --link /tmp/aurora",
+        "flexneedle emulate rig emulated phantom",
+        title="devices",
     )
-    devices = parser.add_subparsers(title="devices", metavar="DEVICE", required=True)
-    _add_aurora(devices)
-    _add_galil(devices)
-    _add_rig(devices)
 
 
-def _add_aurora(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    aurora = devices.add_parser(
+def _add_aurora(commands: Commands) -> None:
+    aurora = add_command(
+        commands,
         "aurora",
-        help="an NDI Aurora on a pseudo-terminal",
-        description="Print the path of the emulated device and serve it until interrupted (Ctrl-C). "
+        "an NDI Aurora on a pseudo-terminal",
+        _emulate_aurora,
+        "flexneedle emulate aurora --link /tmp/aurora",
+        "flexneedle emulate aurora --still --sensors 2 --seed 3",
+        about="Print the path of the emulated device and serve it until interrupted (Ctrl-C). "
         "The tip moves along an arc; a line X Y Z on stdin (mm, tracker frame) stops it at that position.",
-        epilog=_AURORA_EXAMPLES,
-        formatter_class=HelpFormatter,
     )
     aurora.add_argument(
         "--link",
@@ -67,13 +50,7 @@ def _add_aurora(devices: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         metavar="PATH",
         help="path of the device (default: one in a new folder under /tmp)",
     )
-    aurora.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="KIND[=DETAIL]@SECONDS[:DURATION]",
-        help="inject a fault at SECONDS after the start of tracking; repeatable; see docs/tracking/aurora.md",
-    )
+    _add_fault(aurora, "a fault at SECONDS after the start of tracking", "docs/tracking/aurora.md")
     aurora.add_argument("--still", action="store_true", help="start with the tip at rest")
     aurora.add_argument(
         "--sensors", type=int, choices=range(1, 5), default=4, help="number of connected sensors (default: 4)"
@@ -84,20 +61,19 @@ def _add_aurora(devices: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     aurora.add_argument(
         "--no-bx", action="store_true", help="do not support binary readings (BX), as old firmware"
     )
-    aurora.add_argument(
-        "--seed", type=seed, default=0, metavar="N", help="seed of jitter and corrupted bytes (default: 0)"
-    )
-    aurora.set_defaults(handler=_emulate_aurora)
+    add_seed(aurora, "seed of jitter and corrupted bytes")
 
 
-def _add_galil(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    galil = devices.add_parser(
+def _add_galil(commands: Commands) -> None:
+    galil = add_command(
+        commands,
         "galil",
-        help="a Galil DMC-4143 on a TCP port",
-        description="Print the address of the emulated controller and serve it until interrupted (Ctrl-C). "
+        "a Galil DMC-4143 on a TCP port",
+        _emulate_galil,
+        "flexneedle emulate galil --port 2323",
+        "flexneedle emulate galil --port 2323 --fault stall=A@5",
+        about="Print the address of the emulated controller and serve it until interrupted (Ctrl-C). "
         "Its four motors move in real time.",
-        epilog=_GALIL_EXAMPLES,
-        formatter_class=HelpFormatter,
     )
     galil.add_argument(
         "--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1, only this machine)"
@@ -105,36 +81,25 @@ def _add_galil(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     galil.add_argument(
         "--port", type=_port, default=0, metavar="N", help="port to listen on (default: one that is free)"
     )
-    galil.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="KIND[=DETAIL]@SECONDS[:DURATION]",
-        help="inject a fault at SECONDS after the first motion; repeatable; see docs/rig/galil.md",
-    )
-    galil.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of changed bytes (default: 0)")
-    galil.set_defaults(handler=_emulate_galil)
+    _add_fault(galil, "a fault at SECONDS after the first motion", "docs/rig/galil.md")
+    add_seed(galil, "seed of changed bytes")
 
 
-def _add_rig(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    rig = devices.add_parser(
+def _add_rig(commands: Commands) -> None:
+    rig = add_command(
+        commands,
         "rig",
-        help="a whole rig: motors that move a virtual needle, and a tracker that measures its tip",
-        description="Emulate the controller and the tracker of a rig file, with the virtual phantom of a scenario "
+        "a whole rig: motors that move a virtual needle, and a tracker that measures its tip",
+        _emulate_rig,
+        "flexneedle emulate rig emulated phantom --seed 3 --truth truth.csv",
+        "flexneedle emulate rig my-rig.toml phantom3d --fault galil:stall=A@5 --fault aurora:jump@8:0.5",
+        about="Emulate the controller and the tracker of a rig file, with the virtual phantom of a scenario "
         "between them, in three processes, until interrupted (Ctrl-C). Print one line when all are ready, and one for "
         "each event. A line fault DEVICE:KIND[=DETAIL][:DURATION] on stdin injects a fault, clear ends all.",
-        epilog=_RIG_EXAMPLES,
-        formatter_class=HelpFormatter,
     )
     rig.add_argument("rig", metavar="RIG", help="rig file: its path, or emulated for the one of the package")
     rig.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path of a scenario")
-    rig.add_argument(
-        "--seed",
-        type=seed,
-        default=0,
-        metavar="N",
-        help="seed of phantom and noise: the phantom is that of flexneedle insert --seed N (default: 0)",
-    )
+    add_seed(rig, "seed of phantom and noise: the phantom is that of flexneedle insert --seed N")
     rig.add_argument(
         "--plan",
         type=Path,
@@ -142,15 +107,22 @@ def _add_rig(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         help="folder with the plan, where the scenario leaves the entry to it",
     )
     rig.add_argument("--truth", type=Path, metavar="FILE", help="write the true states to a new CSV file")
-    rig.add_argument(
+    _add_fault(
+        rig,
+        "a fault of aurora or galil at SECONDS after the start of tracking, or after the first motion",
+        "docs/rig/emulate.md",
+        device="DEVICE:",
+    )
+
+
+def _add_fault(parser: argparse.ArgumentParser, fault: str, page: str, *, device: str = "") -> None:
+    parser.add_argument(
         "--fault",
         action="append",
         default=[],
-        metavar="DEVICE:KIND[=DETAIL]@SECONDS[:DURATION]",
-        help="inject a fault of aurora or galil at SECONDS after the start of tracking, or after the first motion; "
-        "repeatable; see docs/rig/emulate.md",
+        metavar=f"{device}KIND[=DETAIL]@SECONDS[:DURATION]",
+        help=f"inject {fault}; repeatable; see {page}",
     )
-    rig.set_defaults(handler=_emulate_rig)
 
 
 def _port(text: str) -> int:

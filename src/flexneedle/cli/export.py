@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from flexneedle.console.common import HelpFormatter, examples
+from flexneedle.console.commands import Commands, add_command
 from flexneedle.errors import InputError
 
 _PERIODS, _READINGS, _STDOUT = "periods.csv", "readings.csv", "-"
@@ -24,19 +24,22 @@ _COLUMN_HELP = """
   NAME.x_mm, NAME.y_mm, NAME.z_mm, NAME.qw, NAME.qx, NAME.qy, NAME.qz,
   NAME.indicator, NAME.status     each sensor (tip, ref1, ...) as reported by
                                   the tracker, in the tracker frame
-Unknown values are empty. A tracker without frames has no sensor columns.
+Unknown values are empty. A tracker without frames has no sensor columns. All
+rows of a dry run (insert --dry-run) have a last column dry_run.
 
 """
-_EXAMPLES = examples("flexneedle export runs/mine --csv", "flexneedle export runs/mine --readings - | head")
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        commands,
         "export",
-        help="export the control periods or the tracker readings of a run",
-        epilog=_COLUMN_HELP + _EXAMPLES,
-        formatter_class=HelpFormatter,
+        "export the control periods or the tracker readings of a run",
+        _export,
+        "flexneedle export runs/mine --csv",
+        "flexneedle export runs/mine --readings - | head",
+        notes=_COLUMN_HELP,
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run")
     what = parser.add_mutually_exclusive_group(required=True)
@@ -51,7 +54,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             metavar="FILE",
             help=f"export {rows} as CSV, units in the header; {_STDOUT}: stdout (default: RUN/{default})",
         )
-    parser.set_defaults(handler=_export)
 
 
 def _export(args: argparse.Namespace) -> int:
@@ -66,12 +68,12 @@ def _export(args: argparse.Namespace) -> int:
     if note:
         print(f"flexneedle: {note}", file=sys.stderr)
     if name == _STDOUT:
-        write(sys.stdout, insertion.periods)
+        write(sys.stdout, insertion)
         return 0
     path = Path(name) if name else args.run / default
     try:
         with path.open("w", encoding="utf-8", newline="") as file:
-            write(file, insertion.periods)
+            write(file, insertion)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     print(path)

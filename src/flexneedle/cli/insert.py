@@ -12,20 +12,22 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flexneedle.cli.inserted import report
+from flexneedle.console.commands import Commands, add_command
 from flexneedle.console.common import (
+    ARMS,
     add_run_arguments,
+    add_strategy,
     chosen_scenario,
     compile_first,
-    entry_rows,
+    confirm_motions,
     print_json,
-    print_table,
     problems_printed,
+    require_terminal,
     run_name,
-    seed,
-    target_row,
-    with_examples,
     with_target,
 )
+from flexneedle.console.values import seed
 from flexneedle.errors import FlexneedleError, InputError, StoppedError, one_line
 
 if TYPE_CHECKING:
@@ -38,29 +40,37 @@ if TYPE_CHECKING:
     from flexneedle.types import Insertion, Period
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        commands,
         "insert",
-        help="plan an insertion and execute it in closed loop on the virtual phantom or on a rig",
-        **with_examples(
-            "flexneedle insert phantom --target 35 -5 --seed 3 --controller ce-mpc --json",
-            "flexneedle insert phantom --rig rig.toml --dry-run",
-        ),
+        "plan an insertion and execute it in closed loop on the virtual phantom or on a rig",
+        _insert,
+        "flexneedle insert phantom --target 35 -5 --seed 3 --controller ce-mpc --json",
+        "flexneedle insert phantom --rig rig.toml --dry-run",
     )
     add_run_arguments(parser)
-    parser.add_argument(
-        "--strategy",
-        choices=("manipulation", "steering"),
-        default="manipulation",
-        help="planning strategy: manipulation moves guide and bevel, steering only the bevel (default: manipulation)",
-    )
+    add_strategy(parser, "planning strategy: manipulation moves guide and bevel, steering only the bevel")
     parser.add_argument(
         "--plan-seed",
         type=seed,
         metavar="N",
         help="seed of the planner (default: --seed)",
     )
+    _add_parts(parser)
+    _add_rig(parser)
+    parser.add_argument("--list", action="store_true", help="list the controllers and exit")
+    parser.add_argument(
+        "--force",
+        action="store_true",
+        help="insert even if the plan misses the target by more than 1 mm, and do not hold if the predicted miss "
+        "exceeds control.miss_limit_mm",
+    )
+
+
+def _add_parts(parser: argparse.ArgumentParser) -> None:
+    """Controller, plant and tracker."""
     parser.add_argument(
         "--controller",
         metavar="NAME",
@@ -83,11 +93,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="FILE",
         help="registration of the tracker to the stage, written by em register",
     )
+
+
+def _add_rig(parser: argparse.ArgumentParser) -> None:
+    """The rig, and the connection to ROS."""
     parser.add_argument(
         "--rig",
         metavar="FILE",
-        help="rig file, on whose motors and tracker the plan is executed, from where the motors are (default: the "
-        "virtual phantom)",
+        help="rig file (its path, or emulated for the one of the package), on whose motors and tracker the plan is "
+        "executed, from where the motors are (default: the virtual phantom)",
     )
     parser.add_argument(
         "--dry-run",
@@ -102,14 +116,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "topics (with --rig: section [ros] of the rig file)",
     )
     parser.add_argument("--yes", action="store_true", help="with --rig: insert without a confirmation")
-    parser.add_argument("--list", action="store_true", help="list the controllers and exit")
-    parser.add_argument(
-        "--force",
-        action="store_true",
-        help="insert even if the plan misses the target by more than 1 mm, and do not hold if the predicted miss "
-        "exceeds control.miss_limit_mm",
-    )
-    parser.set_defaults(handler=_insert)
 
 
 def _insert(args: argparse.Namespace) -> int:
@@ -130,13 +136,14 @@ def _insert(args: argparse.Namespace) -> int:
             bridge = _bridge(args, choices, stack)
             if bridge is not None and bridge.settings.target:
                 scenario = with_target(scenario, bridge.await_target())
-            _confirm(args, scenario, choices)
+            if _asks(args, choices):
+                require_terminal()  # before the time of planning is spent
             compile_first()
             folder = Folder.claim(args.out, run_name(args), "insertion", scenario, args.seed)
         with problems_printed(folder):
             with _refusal_printed(args, choices, scenario, folder):
-                insertion = _execute(folder, scenario, choices, bridge)
-            status = _report(scenario, insertion, args.json, folder.path)
+                insertion = _execute(args, folder, scenario, choices, bridge)
+            status = report(scenario, insertion, args.json, folder.path)
     return status or int(bool(folder.problems))
 
 
@@ -171,7 +178,9 @@ def _scenario(args: argparse.Namespace, choices: Choices) -> Scenario:
     return scenario if args.registration is None else load_registration(args.registration, scenario)
 
 
-def _execute(folder: Folder, scenario: Scenario, choices: Choices, bridge: Bridge | None) -> Insertion:
+def _execute(
+    args: argparse.Namespace, folder: Folder, scenario: Scenario, choices: Choices, bridge: Bridge | None
+) -> Insertion:
     from flexneedle.console.progress import Progress
     from flexneedle.runs.recording import record_insertion
     from flexneedle.types import Outcome
@@ -180,8 +189,18 @@ def _execute(folder: Folder, scenario: Scenario, choices: Choices, bridge: Bridg
         show = _InsertProgress(progress, scenario)
         if bridge is not None:
             bridge.show = progress.print_line
+        confirm = None
+        if choices.rig is not None and not choices.dry_run:
+            question = "Insert?" if _asks(args, choices) else ""
+            confirm = partial(_confirm, progress, scenario, choices.rig, question)
         insertion = record_insertion(
-            folder, scenario, choices, on_iteration=show.iteration, on_period=show.period, bridge=bridge
+            folder,
+            scenario,
+            choices,
+            on_iteration=show.iteration,
+            on_period=show.period,
+            bridge=bridge,
+            confirm=confirm,
         )
         if insertion.outcome is Outcome.DONE:
             progress.finish("Inserting")
@@ -218,7 +237,7 @@ def _refusal(
         timing = {key: folder.timing[key] for key in NO_TIMING}
         return {**folder.values["result"], "run_dir": run_dir, "timing": timing}
     names = {"controller": choices.controller, "phantom": choices.phantom}
-    result = refused_result(target=target, reason=reason, seed=choices.seed, **names)
+    result = refused_result(target=target, reason=reason, seed=choices.seed, dry_run=choices.dry_run, **names)
     return {**result, "run_dir": run_dir, "timing": NO_TIMING}
 
 
@@ -247,25 +266,26 @@ def _rig(args: argparse.Namespace, named: Mapping[str, str]) -> RigFile | None:
     return load_rig(args.rig)
 
 
-def _confirm(args: argparse.Namespace, scenario: Scenario, choices: Choices) -> None:
-    """Ask before motors move, but where ROS arms the rig.
-
-    Raises InputError without a terminal, KeyboardInterrupt for any answer but yes.
-    """
+def _asks(args: argparse.Namespace, choices: Choices) -> bool:
+    """Whether motions are confirmed on the terminal: those of motors, unless --yes is given or ROS arms the rig."""
     rig = choices.rig
-    if rig is None or choices.dry_run or args.yes or (rig.ros is not None and rig.ros.arm):
-        return
+    return rig is not None and not (choices.dry_run or args.yes or (rig.ros is not None and rig.ros.arm))
+
+
+def _confirm(
+    progress: Progress, scenario: Scenario, rig: RigFile, question: str, positions: Mapping[str, float]
+) -> None:
+    """Print where the axes are (mm or rad), and ask before motors move; "": do not ask.
+
+    Raises RunError for any answer but yes.
+    """
+    from flexneedle.rig.moves import resting
+
     depth, *lateral = scenario.target.position[: 1 + scenario.setup.axes]
     to = f"{depth:g} mm deep, {', '.join(f'{value:g}' for value in lateral)} mm to the side"
-    if not sys.stdin.isatty():
-        raise InputError("--rig: motors will move: confirm on a terminal, or with --yes")
-    print(
-        f"{rig.name}: the needle will be inserted from where it is, to a target {to}.",
-        file=sys.stderr,
-    )
-    print("Continue? [y/N] ", end="", file=sys.stderr, flush=True)
-    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-        raise KeyboardInterrupt
+    first = f"{rig.name}: the needle will be inserted from where it is, to a target {to}."
+    with progress.paused():
+        confirm_motions([first, *resting(rig, positions), ARMS], question)
 
 
 def _list() -> int:
@@ -299,73 +319,3 @@ class _InsertProgress:
             self._progress.print_line(f"flexneedle: warning at {depth:.1f} mm: {period.warning}")
         done = min(max(depth - self._start, 0.0), self._travel)
         self._progress.show("Inserting", done, self._travel, f"tip at {depth:.1f} mm")
-
-
-def _report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:
-    from flexneedle.runs.recording import BY_USER
-    from flexneedle.trace.results import insertion_result, insertion_timing
-    from flexneedle.types import Outcome
-
-    if insertion.outcome is Outcome.INTERRUPTED:
-        why = "" if insertion.reason == BY_USER else f": {insertion.reason}"
-        print(f"flexneedle: interrupted{why}; record: {folder}", file=sys.stderr)
-        return 130
-    if as_json:
-        result, timing = insertion_result(insertion), insertion_timing(insertion)
-        print_json({**result, "run_dir": str(folder), "timing": timing})
-    else:
-        if not insertion.plan.reached:
-            print(f"flexneedle: warning: the plan {insertion.plan.summary}", file=sys.stderr)
-        _table(scenario, insertion, folder)
-    return 0 if insertion.reached else 1
-
-
-def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
-    from flexneedle.trace.results import insertion_result, insertion_timing
-
-    result, timing = insertion_result(insertion), insertion_timing(insertion)
-    rows = [
-        ("controller", insertion.controller),
-        ("rig", insertion.rig) if insertion.rig else ("phantom", insertion.phantom),
-        target_row(scenario, insertion.target),
-        *entry_rows(scenario, insertion.plan),
-        ("true tip to target", _number(result["true_error_mm"], "mm")),
-        ("  measured", _number(result["residual_mm"], "mm")),
-        ("  planned", _number(result["planned_error_mm"], "mm")),
-        *_registration(scenario, insertion),
-        ("strain energy of the true tissue", _number(result["strain_energy_mj"], "mJ")),
-        ("  planned", _number(result["planned_strain_energy_mj"], "mJ")),
-        (scenario.setup.turns, str(insertion.flips)),
-        ("  planned", str(insertion.plan.flips)),
-        ("control periods", str(result["steps"])),
-        *([("waited", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
-        *([("late decisions", str(insertion.late))] if insertion.late else []),
-        ("planning time", _number(timing["plan_seconds"], "s")),
-        ("median period time", _number(timing["period_ms"]["p50"], "ms")),
-        *_ticks(insertion),
-    ]
-    print_table(insertion.summary[:1].upper() + insertion.summary[1:], rows, folder)
-
-
-def _ticks(insertion: Insertion) -> list[tuple[str, str]]:
-    """Rows of a rig: the times of its ticks."""
-    if not insertion.ticks:
-        return []
-    found = insertion.ticks
-    times = (
-        f"{found['late_p99_ms'] + found['work_p99_ms']:.2f} ms (99 %), longest {found['work_max_ms']:.2f} ms"
-    )
-    return [("ticks", f"{found['count']:.0f}, {times}, {found['missed']:.0f} missed")]
-
-
-def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, str]]:
-    from flexneedle.rig.tracking.registration import expected_error
-
-    if scenario.tracker.registration is None:
-        return []
-    error = expected_error(scenario.tracker.registration, insertion.target)
-    return [("  expected registration error", _number(error, "mm"))]
-
-
-def _number(value: float | None, unit: str) -> str:
-    return "unknown" if value is None else f"{value:.3f} {unit}"

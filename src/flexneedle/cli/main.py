@@ -15,7 +15,7 @@ from typing import Any
 
 from flexneedle import __version__
 from flexneedle.cli import emulate, export, insert, plan, report, rig, scenario, study, view
-from flexneedle.console.common import described
+from flexneedle.console.commands import help_texts
 from flexneedle.errors import FlexneedleError, InputError, ScenarioWarning, StoppedError
 
 _EM = import_module("flexneedle.em.commands.group")  # by name: no other layer imports em
@@ -36,10 +36,10 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser; each command sets `handler`, which maps the arguments to the exit status."""
     parser: argparse.ArgumentParser = _Parser(
         prog="flexneedle",
-        **described(
-            "Simulate, plan and steer flexible bevel-tip needles in soft tissue. For research only.",
+        **help_texts(
             "flexneedle insert phantom --target 35 -5 --seed 3",
             "flexneedle scenario show phantom > mine.toml",
+            about="Simulate, plan and steer flexible bevel-tip needles in soft tissue. For research only.",
         ),
     )
     parser.add_argument("--version", action="version", version=f"flexneedle {__version__}")

@@ -6,16 +6,19 @@ import argparse
 from math import degrees, isnan
 from typing import TYPE_CHECKING, Any
 
+from flexneedle.console.commands import Commands, add_command
 from flexneedle.console.common import (
+    STRATEGIES,
     add_run_arguments,
+    add_strategy,
     chosen_scenario,
     compile_first,
     entry_rows,
     print_json,
     print_table,
+    problems_printed,
     run_name,
     target_row,
-    with_examples,
 )
 
 if TYPE_CHECKING:
@@ -25,27 +28,18 @@ if TYPE_CHECKING:
     from flexneedle.types import Plan
 
 
-_STRATEGIES = ("manipulation", "steering")
-
-
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        commands,
         "plan",
-        help="plan an insertion and draw the plan",
-        **with_examples(
-            "flexneedle plan phantom --target 40 1.5 --strategy both",
-            "flexneedle plan mine.toml --seed 3 --json",
-        ),
+        "plan an insertion and draw the plan",
+        _plan,
+        "flexneedle plan phantom --target 40 1.5 --strategy both",
+        "flexneedle plan mine.toml --seed 3 --json",
     )
     add_run_arguments(parser)
-    parser.add_argument(
-        "--strategy",
-        choices=(*_STRATEGIES, "both"),
-        default="manipulation",
-        help="manipulation moves guide and bevel, steering only the bevel (default: manipulation)",
-    )
-    parser.set_defaults(handler=_plan)
+    add_strategy(parser, "manipulation moves guide and bevel, steering only the bevel", "both")
 
 
 def _plan(args: argparse.Namespace) -> int:
@@ -55,9 +49,9 @@ def _plan(args: argparse.Namespace) -> int:
 
     scenario = chosen_scenario(args)
     compile_first()
-    strategies = _STRATEGIES if args.strategy == "both" else (args.strategy,)
+    strategies = STRATEGIES if args.strategy == "both" else (args.strategy,)
     folder = Folder.claim(args.out, run_name(args), "plan", scenario, args.seed)
-    with Progress() as progress:
+    with problems_printed(folder), Progress() as progress:
 
         def show(strategy: str, info: dict[str, Any]) -> None:
             note = f"best cost {info['best']:.4g}"

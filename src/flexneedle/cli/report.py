@@ -5,15 +5,20 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from flexneedle.console.common import HelpFormatter, examples, print_json
+from flexneedle.console.commands import Commands, add_command
+from flexneedle.console.common import print_json
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        commands,
         "report",
-        help="write the report of a study: an HTML page and its figures",
-        description="Write the report of a study: an HTML page and its figures. The study may be complete or "
+        "write the report of a study: an HTML page and its figures",
+        _report,
+        "flexneedle report runs/accuracy",
+        "flexneedle report runs/mine --out mine --json",
+        about="Write the report of a study: an HTML page and its figures. The study may be complete or "
         "interrupted (Ctrl-C). A study that is running or was killed (kill -9) may have no tables yet: after kill -9, "
         "run `flexneedle study` with --resume first.",
     )
@@ -28,11 +33,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="folder of the tuning records to show (default: those of the package)",
     )
     parser.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
-    parser.epilog = examples(
-        "flexneedle report runs/accuracy", "flexneedle report runs/mine --out mine --json"
-    )
-    parser.formatter_class = HelpFormatter
-    parser.set_defaults(handler=_report)
 
 
 def _report(args: argparse.Namespace) -> int:

@@ -7,12 +7,12 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
-from math import isfinite
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from flexneedle.console.common import described, print_json, with_examples
-from flexneedle.errors import DriverError, InputError
+from flexneedle.console.commands import Commands, add_command, add_group
+from flexneedle.console.common import ARMS, add_strategy, confirm_motions, print_json
+from flexneedle.console.values import finite, positive
+from flexneedle.errors import DriverError
 
 if TYPE_CHECKING:
     from flexneedle.rig.check import Finding, Wanted
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from flexneedle.scenario.rig import RigFile
 
 _SECONDS = 2.0
-_ARMS = "The motors of all axes are switched on first. Ctrl-C stops."
 _NEGATIVE = re.compile(r"^-[\d.]")
 
 
@@ -58,32 +57,29 @@ def supervised(rig: RigFile) -> AbstractContextManager[Operator]:
     return Supervisor.of_operator(rig)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser(
+    add_group(
+        commands,
         "rig",
-        help="check the motors and the tracker of a rig, and move its axes",
-        **with_examples(
-            "flexneedle rig check rig.toml --scenario phantom",
-            "flexneedle rig jog rig.toml insertion -5mm",
-        ),
+        "check the motors and the tracker of a rig, and move its axes",
+        (_add_check, _add_jog, _add_home, _add_retract),
+        "flexneedle rig check rig.toml --scenario phantom",
+        "flexneedle rig jog rig.toml insertion -5mm",
     )
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (_add_check, _add_jog, _add_home, _add_retract):
-        add(commands)
 
 
-def _add_check(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = commands.add_parser(
+def _add_check(commands: Commands) -> None:
+    parser = add_command(
+        commands,
         "check",
-        help="compare a rig with its file; moves nothing",
-        **described(
-            "Connect to each device and compare it with the rig file: motors, positions, limit switches, frames and "
-            "sensors of the tracker. Moves, powers and changes nothing. One line for each thing that was checked; "
-            "exit status 1 if there is a problem.",
-            "flexneedle rig check rig.toml",
-            "flexneedle rig check rig.toml --scenario phantom --json",
-        ),
+        "compare a rig with its file; moves nothing",
+        _check,
+        "flexneedle rig check rig.toml",
+        "flexneedle rig check rig.toml --scenario phantom --json",
+        about="Connect to each device and compare it with the rig file: motors, positions, limit switches, frames and "
+        "sensors of the tracker, publishers of ROS topics. Moves, powers, publishes and changes nothing. One line "
+        "for each thing that was checked; exit status 1 if there is a problem.",
     )
     _add_rig(parser)
     parser.add_argument(
@@ -91,33 +87,27 @@ def _add_check(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         metavar="S",
         help="also check that the rig can do what this scenario needs (name or path)",
     )
-    parser.add_argument(
-        "--strategy",
-        choices=("manipulation", "steering"),
-        default="manipulation",
-        help="strategy of the scenario's plan; steering moves neither guide nor base sideways (default: manipulation)",
-    )
+    add_strategy(parser, "strategy of the scenario's plan; steering moves neither guide nor base sideways")
     parser.add_argument(
         "--seconds",
-        type=_positive,
+        type=positive,
         default=_SECONDS,
         metavar="S",
-        help=f"time for which frames of the tracker are counted (default: {_SECONDS:g})",
+        help=f"time for which frames of the tracker and messages are counted (default: {_SECONDS:g})",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of lines")
-    parser.set_defaults(handler=_check)
 
 
-def _add_jog(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = commands.add_parser(
+def _add_jog(commands: Commands) -> None:
+    parser = add_command(
+        commands,
         "jog",
-        help="move one axis by a distance",
-        **described(
-            "Move one axis by a distance from where it is, within its soft limits. Prints what would move and asks "
-            "for confirmation; Ctrl-C stops.",
-            "flexneedle rig jog rig.toml insertion -5mm",
-            "flexneedle rig jog rig.toml rotation 180deg --speed 90",
-        ),
+        "move one axis by a distance",
+        _jog,
+        "flexneedle rig jog rig.toml insertion -5mm",
+        "flexneedle rig jog rig.toml rotation 180deg --speed 90",
+        about="Move one axis by a distance from where it is, within its soft limits. Prints what would move and asks "
+        "for confirmation; Ctrl-C stops.",
     )
     _add_rig(parser)
     parser.add_argument(
@@ -128,77 +118,64 @@ def _add_jog(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument(
         "--speed",
-        type=_positive,
+        type=positive,
         metavar="V",
         help="largest speed, mm/s or deg/s (default: a fifth of the axis's)",
     )
     _add_yes(parser)
     # The pattern by which argparse distinguishes -5mm from an option; there is no public way to set it.
     parser._negative_number_matcher = _NEGATIVE
-    parser.set_defaults(handler=_jog)
 
 
-def _add_home(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = commands.add_parser(
+def _add_home(commands: Commands) -> None:
+    parser = add_command(
+        commands,
         "home",
-        help="find the zero of axes",
-        **described(
-            "Find the zero of axes by the key home of the rig file, one after the other, the insertion first. "
-            "Only without a needle in tissue. Prints what would move and asks for confirmation; Ctrl-C stops.",
-            "flexneedle rig home rig.toml",
-            "flexneedle rig home rig.toml insertion --yes",
-        ),
+        "find the zero of axes",
+        _home,
+        "flexneedle rig home rig.toml",
+        "flexneedle rig home rig.toml insertion --yes",
+        about="Find the zero of axes by the key home of the rig file, one after the other, the insertion first. "
+        "Only without a needle in tissue. Prints what would move and asks for confirmation; Ctrl-C stops.",
     )
     _add_rig(parser)
     parser.add_argument(
         "axes", nargs="*", metavar="AXIS", help="axes (default: all but those with an absolute encoder)"
     )
     _add_yes(parser)
-    parser.set_defaults(handler=_home)
 
 
-def _add_retract(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = commands.add_parser(
+def _add_retract(commands: Commands) -> None:
+    parser = add_command(
+        commands,
         "retract",
-        help="withdraw the needle",
-        **described(
-            "Move the insertion axis backwards; rotation and guide stay where they are. Prints what would move and "
-            "asks for confirmation; Ctrl-C stops.",
-            "flexneedle rig retract rig.toml",
-            "flexneedle rig retract rig.toml --to 10 --yes",
-        ),
+        "withdraw the needle",
+        _retract,
+        "flexneedle rig retract rig.toml",
+        "flexneedle rig retract rig.toml --to 10 --yes",
+        about="Move the insertion axis backwards; rotation and guide stay where they are. Prints what would move and "
+        "asks for confirmation; Ctrl-C stops.",
     )
     _add_rig(parser)
     parser.add_argument(
         "--to",
-        type=_number,
+        type=finite,
         metavar="MM",
         help="position at which the retraction ends (default: the lowest of the axis's range_mm)",
     )
     _add_yes(parser)
-    parser.set_defaults(handler=_retract)
 
 
 def _add_rig(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("rig", type=Path, metavar="RIG", help="rig file (docs/rig/file.md)")
+    parser.add_argument(
+        "rig",
+        metavar="RIG",
+        help="rig file: its path, or emulated for the one of the package (docs/rig/file.md)",
+    )
 
 
 def _add_yes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--yes", action="store_true", help="move without asking; needed without a terminal")
-
-
-def _number(text: str) -> float:
-    value = float(text)
-    if not isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text}: must be a finite number")
-    return value
-
-
-def _positive(text: str) -> float:
-    value = _number(text)
-    if value <= 0.0:
-        raise argparse.ArgumentTypeError(f"{text}: must be above 0")
-    return value
 
 
 # Check
@@ -207,10 +184,14 @@ def _positive(text: str) -> float:
 def _check(args: argparse.Namespace) -> int:
     from flexneedle.rig.check import check_rig
     from flexneedle.rig.devices.clock import WallClock
+    from flexneedle.ros.check import check_ros
     from flexneedle.scenario.rig import load_rig
 
-    rig = load_rig(args.rig)
-    findings = check_rig(rig, WallClock(), args.seconds, _wanted(args))
+    rig, clock = load_rig(args.rig), WallClock()
+    findings = [
+        *check_rig(rig, clock, args.seconds, _wanted(args)),
+        *check_ros(rig, clock, args.seconds),
+    ]
     problems = sum(1 for finding in findings if finding.problem)
     if args.json:
         print_json(_values(rig, findings))
@@ -313,23 +294,13 @@ def _carried_out(
     command: Callable[[Operator], object],
     *notes: str,
 ) -> int:
-    """Print the motions and, if they are confirmed, command them; return the exit status."""
-    print("\n".join([*map(str, moves), *notes, _ARMS]), file=sys.stderr)
-    if not (yes or _confirmed()):
-        print("flexneedle: not confirmed: nothing was moved", file=sys.stderr)
-        return 1
+    """Print the motions, command them once they are confirmed, and return the exit status."""
+    confirm_motions([*map(str, moves), *notes, ARMS], "" if yes else "Move?")
     with supervised(rig) as operator, _stopped_on_error(operator):
         operator.arm()
         command(operator)
     print("done", file=sys.stderr)
     return 0
-
-
-def _confirmed() -> bool:
-    if not sys.stdin.isatty():
-        raise InputError("no terminal to confirm the motion on: use --yes to move without asking")
-    print("Move? [y/N] ", end="", file=sys.stderr, flush=True)
-    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 @contextmanager

@@ -6,81 +6,73 @@ import argparse
 import warnings
 from typing import TYPE_CHECKING
 
-from flexneedle.console.common import with_examples
+from flexneedle.console.commands import Commands, add_command, add_group
 
 if TYPE_CHECKING:
     from flexneedle.scenario.model import Scenario
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser(
+    add_group(
+        commands,
         "scenario",
-        help="list, show and check scenarios",
-        **with_examples(
-            "flexneedle scenario show phantom > mine.toml",
-            "flexneedle scenario check mine.toml",
-        ),
+        "list, show and check scenarios",
+        (_add_list, _add_show, _add_check, _add_schema),
+        "flexneedle scenario show phantom > mine.toml",
+        "flexneedle scenario check mine.toml",
     )
-    actions = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-
-    for add in (_add_list, _add_show, _add_check, _add_schema):
-        add(actions)
 
 
-def _add_list(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = actions.add_parser(
+def _add_list(commands: Commands) -> None:
+    add_command(
+        commands,
         "list",
-        help="list the presets",
-        **with_examples(
-            "flexneedle scenario list",
-            "flexneedle scenario list | grep -i tissue",
-        ),
+        "list the presets",
+        _list,
+        "flexneedle scenario list",
+        "flexneedle scenario list | grep -i tissue",
     )
-    parser.set_defaults(handler=_list)
 
 
-def _add_show(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = actions.add_parser(
+def _add_show(commands: Commands) -> None:
+    parser = add_command(
+        commands,
         "show",
-        help="print a scenario with all its defaults, as TOML",
-        **with_examples(
-            "flexneedle scenario show phantom > mine.toml",
-            "flexneedle scenario show world:100012:perfect",
-        ),
+        "print a scenario with all its defaults, as TOML",
+        _show,
+        "flexneedle scenario show phantom > mine.toml",
+        "flexneedle scenario show world:100012:perfect",
     )
     parser.add_argument("scenario", metavar="SCENARIO", help="preset name, world:NUMBER or path")
     _add_controller(parser)
-    parser.set_defaults(handler=_show)
 
 
-def _add_check(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = actions.add_parser(
+def _add_check(commands: Commands) -> None:
+    parser = add_command(
+        commands,
         "check",
-        help="check a scenario: one line for each problem, exit status 2",
-        description="Check a scenario. One line on stderr for each problem, exit status 2. A warning, exit status 0, "
+        "check a scenario: one line for each problem, exit status 2",
+        _check,
+        "flexneedle scenario check mine.toml --strict",
+        "flexneedle scenario check mine.toml --controller follow_path:METHOD",
+        about="Check a scenario. One line on stderr for each problem, exit status 2. A warning, exit status 0, "
         "for each value that is not used, has been renamed, or is an order of magnitude outside the usual range.",
-        **with_examples(
-            "flexneedle scenario check mine.toml --strict",
-            "flexneedle scenario check mine.toml --controller follow_path:METHOD",
-        ),
     )
     parser.add_argument("scenario", metavar="SCENARIO", help="path, preset name or world:NUMBER")
     _add_controller(parser)
     parser.add_argument("--strict", action="store_true", help="exit status 2 for warnings too")
-    parser.set_defaults(handler=_check)
 
 
-def _add_schema(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = actions.add_parser(
+def _add_schema(commands: Commands) -> None:
+    add_command(
+        commands,
         "schema",
-        help="print the JSON schema of scenario files",
-        **with_examples(
-            "flexneedle scenario schema > scenario.schema.json",
-            "flexneedle scenario schema | python -m json.tool | less",
-        ),
+        "print the JSON schema of scenario files",
+        _schema,
+        "flexneedle scenario schema > scenario.schema.json",
+        "flexneedle scenario schema | python -m json.tool | less",
     )
-    parser.set_defaults(handler=_schema)
 
 
 def _add_controller(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexneedle.console.common import compile_first, print_json, with_examples
+from flexneedle.console.commands import Commands, add_command
+from flexneedle.console.common import compile_first, print_json
 
 if TYPE_CHECKING:
     from flexneedle.console.progress import Progress
@@ -22,15 +23,15 @@ _TABLE_WIDTH = 120  # at least, so that rows are not wrapped in a file
 _STAGES = ("Planning", "Inserting")
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle`."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        commands,
         "study",
-        help="run many insertions and write their results to tables",
-        **with_examples(
-            "flexneedle study phantom --out runs/accuracy",
-            "flexneedle study mine.toml --workers 4 --out runs/mine --resume",
-        ),
+        "run many insertions and write their results to tables",
+        _study,
+        "flexneedle study phantom --out runs/accuracy",
+        "flexneedle study mine.toml --workers 4 --out runs/mine --resume",
     )
     parser.add_argument("study", metavar="STUDY", help="name of a shipped study, or path to a TOML file")
     parser.add_argument(
@@ -51,7 +52,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--out", type=Path, metavar="DIR", help="folder of the study (default: runs/<date>-study-<name>)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
-    parser.set_defaults(handler=_study)
 
 
 def _workers(text: str) -> int:

@@ -9,25 +9,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flexneedle.console.values import seed
+from flexneedle.errors import InputError, RunError
+
 if TYPE_CHECKING:
     from flexneedle.control.interface import Method
     from flexneedle.scenario.model import Scenario
     from flexneedle.trace.folder import Folder
     from flexneedle.types import Plan
 
-
-class HelpFormatter(argparse.HelpFormatter):
-    """Wraps single-line texts and keeps the line breaks of others, such as `examples`."""
-
-    def _fill_text(self, text: str, width: int, indent: str) -> str:
-        if "\n" not in text:
-            return super()._fill_text(text, width, indent)
-        return "".join(indent + line for line in text.strip("\n").splitlines(keepends=True))
-
-
-def examples(*lines: str) -> str:
-    """Return the end of a command's help: example command lines."""
-    return "\n".join(["examples:", *(f"  {line}" for line in lines)])
+ARMS = "The motors of all axes are switched on first. Ctrl-C stops."
+"""Printed before any motion of a rig."""
+STRATEGIES = ("manipulation", "steering")
+"""Strategies of planning, the default first."""
 
 
 class _Target(argparse.Action):
@@ -67,25 +61,26 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("X Y", "Z"),
         help="depth and lateral offset of the target in mm, in space both offsets (default: as in the scenario)",
     )
-    parser.add_argument(
-        "--seed",
-        type=seed,
-        default=0,
-        metavar="N",
-        help="random seed; the same seed gives the same result (default: 0)",
-    )
+    add_seed(parser, "random seed; the same seed gives the same result")
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the run (default: runs/<date>-<scenario>-<seed>)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
 
 
-def seed(text: str) -> int:
-    """Return the seed of an argument. Raises ArgumentTypeError for a negative one."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{value}: must be at least 0")
-    return value
+def add_seed(parser: argparse.ArgumentParser, meaning: str) -> None:
+    """Add the seed (default: 0). meaning: for the help."""
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help=f"{meaning} (default: 0)")
+
+
+def add_strategy(parser: argparse.ArgumentParser, meaning: str, *more: str) -> None:
+    """Add the planning strategy. meaning: of the strategies, for the help; more: choices besides the two."""
+    parser.add_argument(
+        "--strategy",
+        choices=(*STRATEGIES, *more),
+        default=STRATEGIES[0],
+        help=f"{meaning} (default: {STRATEGIES[0]})",
+    )
 
 
 def chosen_scenario(args: argparse.Namespace, *own: Method) -> Scenario:
@@ -166,19 +161,29 @@ def print_table(title: str, rows: Iterable[Sequence[str]], folder: Path, heads: 
 
 @contextmanager
 def problems_printed(folder: Folder) -> Iterator[None]:
-    """At the end, print a line on stderr for each file of the record that could not be written."""
+    """At the end, print a line on stderr for each file that could not be written, and figure not drawn."""
     try:
         yield
     finally:
-        for line in dict.fromkeys(folder.problems):
+        for line in dict.fromkeys([*folder.problems, *folder.undrawn]):
             print(f"flexneedle: {line}", file=sys.stderr)
 
 
-def described(text: str, *lines: str) -> dict[str, Any]:
-    """Return the argparse options for a description and the examples at the end of the help."""
-    return {"description": text, **with_examples(*lines)}
+def require_terminal() -> None:
+    """Raise InputError if there is no terminal on which motions could be confirmed."""
+    if not sys.stdin.isatty():
+        raise InputError("no terminal to confirm the motion on: use --yes to move without asking")
 
 
-def with_examples(*lines: str) -> dict[str, Any]:
-    """Return the argparse options for the examples at the end of the help."""
-    return {"epilog": examples(*lines), "formatter_class": HelpFormatter}
+def confirm_motions(lines: Iterable[str], question: str) -> None:
+    """Print what would move, and ask on stderr; "": do not ask.
+
+    Raises RunError for any answer but yes, InputError without a terminal.
+    """
+    print("\n".join(lines), file=sys.stderr)
+    if not question:
+        return
+    require_terminal()
+    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise RunError("not confirmed: nothing was moved")

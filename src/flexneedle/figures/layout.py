@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
+from matplotlib.axis import XAxis, YAxis
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.legend_handler import HandlerBase, HandlerLine2D, HandlerPatch
@@ -201,18 +201,14 @@ def limit_line(ax: Axes, vertical: bool) -> None:
         draw(1.0, **LIMIT, zorder=1)
 
 
-def decades(axis: Axis, values: Iterable[Floats], most: int) -> None:
+def decades(axis: XAxis | YAxis, values: Iterable[Floats], most: int) -> None:
     """Make an axis logarithmic over all positive values, with up to `most` ticks at plain numbers."""
     known = np.concatenate([np.asarray(array, dtype=float).ravel() for array in values] or [np.empty(0)])
     known = known[np.isfinite(known) & (known > 0.0)]
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.1, 1.0)
     low, high = low / 1.25, high * 1.25
     ticks = _ticks(low, high, most)
-    bounds: Any = {"x": axis.axes.set_xlim, "y": axis.axes.set_ylim}
-    scales: Any = {"x": axis.axes.set_xscale, "y": axis.axes.set_yscale}
-    name = axis.axis_name  # type: ignore[attr-defined]  # of XAxis and YAxis, not of their base
-    scales[name]("log")
-    bounds[name](low, high)
+    axis.axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}lim": (low, high)})
     axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
     axis.set_ticks([], minor=True)
 

@@ -43,8 +43,12 @@ class DepthPanel:
 
 
 def draw_depths(axes: Sequence[Axes], scenario: Scenario, shown: Sequence[DepthPanel]) -> None:
-    """Draw panels one below the other, over the depth that their lines span; the lowest has the axis."""
+    """Draw panels one below the other, over the depth that their lines span; the lowest has the axis.
+
+    A depth that is not known (NaN) is not drawn; one at least must be known.
+    """
     depth = np.concatenate([line.x for panel in shown for line in panel.lines])
+    depth = depth[np.isfinite(depth)]
     room = 0.01 * float(np.ptp(depth))
     for ax, panel in zip(axes, shown, strict=True):
         ax.set_xlim(depth.min() - room, depth.max() + room)

@@ -54,10 +54,10 @@ def check_rig(rig: RigFile, clock: Clock, seconds: float, wanted: Wanted | None 
     A device that cannot be reached is a finding, too.
     """
     found = [*_of_file(rig), *(_of_scenario(rig, wanted) if wanted is not None else ())]
-    found += _with_device(
+    found += with_device(
         "driver", rig.driver.kind, lambda: open_motors(rig), lambda m: motors(rig, m, clock, wanted)
     )
-    found += _with_device(
+    found += with_device(
         "tracker",
         rig.tracker.kind,
         lambda: open_tracker(rig, clock),
@@ -66,18 +66,17 @@ def check_rig(rig: RigFile, clock: Clock, seconds: float, wanted: Wanted | None 
     return found
 
 
-def _with_device(
+def with_device(
     part: str, kind: str, connect: Callable[[], Device], read: Callable[[Device], list[Finding]]
 ) -> list[Finding]:
-    """The findings of one device; where it fails, its error in place of what was not found."""
+    """Return the findings of one device; where it fails, its error in place of what was not found."""
     connected: list[Finding] = []
     try:
         with closing(connect()) as device:
             connected = [Finding(part, "connection", f"{kind}{_identity(device)}")]
             return connected + read(device)
-    except (FlexneedleError, OSError) as error:
-        problem = one_line(error) if isinstance(error, FlexneedleError) else str(error)
-        return [*connected, Finding(part, "reading" if connected else "connection", kind, problem)]
+    except FlexneedleError as error:
+        return [*connected, Finding(part, "reading" if connected else "connection", kind, one_line(error))]
 
 
 def _identity(device: object) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from flexneedle.rig.loop import planned, run
 from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
 from flexneedle.rig.supervised import Watchers, check_fit, supervised
-from flexneedle.rig.virtual import Rig, Seeds, virtual_rig
+from flexneedle.rig.virtual import Seeds, virtual_rig
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.rig import RigFile, load_rig
@@ -42,7 +43,8 @@ def insert(
 
     rig: a rig file, on whose motors and tracker the plan is executed in place of the virtual phantom, from where the
     motors are. dry_run: its motors and tracker are read; motors never move, and the needle is the virtual phantom's.
-    watchers: are given the rig before it is armed, and each of its ticks (default: only the record is).
+    watchers: are given the rig before it is armed, which they may refuse, and each of its ticks (default: only the
+    record is).
 
     scenario: a scenario, or its name or path as for `load_scenario`. It must be the plan's own, or differ from it only
     in controller, tracker, monitor and phantom.
@@ -67,31 +69,32 @@ def insert(
     seeds = Seeds(phantom_seed, tracker_seed, room_seed)
     scenario = placed(scenario, plan)
     virtual = virtual_rig(scenario, plan.roll, seeds, plant, tracker=own_tracker)
-    rng = np.random.default_rng(control_seed)
-
-    def executed(ports: Rig) -> Insertion:
-        return run(
-            scenario,
-            plan,
-            ports,
-            rng,
-            seed,
-            controller=controller,
-            force=force,
-            threads=threads,
-            on_period=on_period,
-        )
-
+    executed = partial(
+        run,
+        scenario,
+        plan,
+        rng=np.random.default_rng(control_seed),
+        seed=seed,
+        controller=controller,
+        force=force,
+        threads=threads,
+        on_period=on_period,
+    )
     if rig is None:
         return replace(executed(virtual), phantom=plant_name, tracker=tracker_name)
     if (plant_name, tracker_name) != (DEFAULT_PLANT, SCENARIO_TRACKER):
         raise InputError("phantom and tracker are those of the rig: give neither with a rig")
     file = rig if isinstance(rig, RigFile) else load_rig(rig)
     check_fit(file, scenario, plan.strategy)
-    watchers = Watchers() if watchers is None else watchers
-    if file.ros is not None and watchers.follower is None:
-        rule = "give watchers=Watchers(follower=Bridge(rig.ros)), see flexneedle.ros.bridge"
-        raise RigError(f"ros: nothing listens to the stop of this section: {rule}")
+    watchers = _checked(watchers or Watchers(), file)
     with supervised(file, scenario, plan, watchers, dry=dry_run) as ports:
         insertion = executed(in_memory(ports, virtual) if dry_run else ports)
-    return replace(insertion, rig=file.name, ticks=watchers.ticks.summary())
+    return replace(insertion, rig=file.name, ticks=watchers.ticks.summary(), dry_run=dry_run)
+
+
+def _checked(watchers: Watchers, rig: RigFile) -> Watchers:
+    """The watchers of a rig. Raises RigError if none of them follows the stop of its section `ros`."""
+    if rig.ros is not None and watchers.follower is None:
+        rule = "give watchers=Watchers(follower=Bridge(rig.ros)), see flexneedle.ros.bridge"
+        raise RigError(f"ros: nothing listens to the stop of this section: {rule}")
+    return watchers

@@ -51,14 +51,12 @@ def observe_before_start(
     monitor, readings = _checked(scenario, estimate, monitor, measurements, max_ages, now)
     monitor, field = monitor.check_field()
     newest = readings[-1]
-    verdict = newest.verdict if field.ok else field
-    if (
-        verdict == newest.verdict
-        and monitor.last_good_before_dropout(newest.measurement, newest.verdict) is not None
-    ):
-        verdict = OK
-    checked = readings if field.ok else _rejected(readings, field)
-    return Observation(estimate, monitor, checked, newest.measurement, verdict, not field.ok)
+    if not field.ok:
+        rejected = _rejected(readings, field)
+        return Observation(estimate, monitor, rejected, newest.measurement, field, field=True)
+    if (last_good := monitor.last_good_before_dropout(newest.measurement, newest.verdict)) is not None:
+        return Observation(estimate, monitor, readings, last_good)
+    return Observation(estimate, monitor, readings, newest.measurement, newest.verdict)
 
 
 def observe(

@@ -1,7 +1,7 @@
 """Motions that an operator commands, outside of an insertion: what would move, from where to where. Pure functions."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import isfinite
 
@@ -51,6 +51,14 @@ class Homing:
         switch = f"in its {way} direction to the {axis.home.replace('-', ' ')} switch"
         most = f"at most at {axis.shown(axis.speed)} {axis.unit}/s"
         return f"{self.name}: {switch}, {most}; the position there is called {at}"
+
+
+def resting(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
+    """Return one line for each axis: where it is (mm or rad, by name), and how fast it moves at most."""
+    return [
+        f"{name}: at {axis.shown(positions[name])} {axis.unit}, moves at most at {axis.shown(axis.speed)} {axis.unit}/s"
+        for name, axis in rig.axes.items()
+    ]
 
 
 def axis_of(rig: RigFile, name: str) -> Axis:

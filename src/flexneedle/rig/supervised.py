@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import monotonic
@@ -13,6 +13,7 @@ import numpy as np
 from flexneedle.errors import DriverError, RigError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.rig.fit import fit_problems
+from flexneedle.rig.start import checked_start, deepest
 from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.rig.supervisor.messages import Done, Expectation, Report, Task
 from flexneedle.rig.virtual import Rig, to_stage
@@ -34,8 +35,7 @@ from flexneedle.types import (
     Pose,
 )
 
-_SDS = 3.0  # standard deviations that a reading may be off from what is expected
-_READING_S = 0.5  # in which a tracker that measures the tip has done so
+_SDS = 3.0  # standard deviations of the prediction that a reading may be off beyond the limit
 _MOST_TICKS = 200_000  # an hour and more
 _MOST_KEPT = 10_000
 _GUIDE = {"guide_y": DG_Y, "guide_z": DG_Z}
@@ -138,15 +138,22 @@ class Follower(Protocol):
 
 @dataclass(frozen=True)
 class Watchers:
-    """What is given each tick of a rig: the record of ticks, and what follows the insertion, None for nothing."""
+    """What is given each tick of a rig: the record of ticks, and what follows the insertion, None for nothing.
+
+    confirm: called with the positions of the axes (mm or rad) before the rig is armed; what it raises ends the
+    insertion before anything has moved.
+    """
 
     ticks: Ticks = field(default_factory=Ticks)
     follower: Follower | None = None
+    confirm: Callable[[Mapping[str, float]], None] | None = None
 
     def opened(self, supervisor: Supervisor) -> None:
-        """Hand out the supervisor before the rig is armed."""
+        """Hand out the supervisor before the rig is armed, and have the motions confirmed."""
         if self.follower is not None:
             self.follower.opened(supervisor)
+        if self.confirm is not None:
+            self.confirm(supervisor.positions)
 
     def report(self, report: Report) -> None:
         """Hand out what a tick found."""
@@ -245,7 +252,8 @@ def supervised(
     watchers.ticks.started = task.started
     with Supervisor(task, watchers.report) as supervisor:
         watchers.opened(supervisor)
-        supervisor.arm(_deepest(scenario, plan, supervisor.measured_x(_READING_S)))
+        tip = checked_start(scenario, supervisor.tip(scenario.control.hold_limit_s))
+        supervisor.arm(deepest(scenario, plan, None if dry else tip[0]))
         if rig.axes.rotation is not None:
             supervisor.move_to("rotation", plan.roll)
         if scenario.monitor.enabled and scenario.monitor.references:
@@ -253,14 +261,3 @@ def supervised(
         driver = SupervisedDriver(supervisor, scenario, plan.roll)
         deadline = 1e-3 * rig.loop.decision_ms
         yield Rig(supervisor, driver, supervisor, expect=driver.expect, deadline=deadline)
-
-
-def _deepest(scenario: Scenario, plan: Plan, measured: float | None) -> float:
-    """Advance (mm) of the base at which a straight needle is as far past the plan's target as it may be.
-
-    measured: x (mm) of the tip at the start, taken within three standard deviations of the scenario's; None: that one.
-    """
-    nominal, most = scenario.setup.start_tip_x, _SDS * scenario.control.start_axial_sd_mm
-    start = nominal if measured is None else min(max(measured, nominal - most), nominal + most)
-    way = plan.target[0] + scenario.guard.past_target_mm - start
-    return way * math.sqrt(1.0 + abs(scenario.entry.slope) ** 2)

@@ -12,12 +12,19 @@ from time import monotonic
 from typing import Self
 
 from flexneedle.errors import InputError, RunError
+from flexneedle.rig.processes import end_process, last_line
 from flexneedle.ros.pipe import Pipe
 from flexneedle.ros.profile import OF_THE_LOOP, Profile
 from flexneedle.ros.records import Beat, Lost, Published, Request, RigState, Setup, Target
 from flexneedle.types import VISIBLE, Period, Plan
 
 _START_S, _SILENT_S, _STOP_S = 30.0, 1.0, 2.0
+
+
+def check_installed() -> None:
+    """Raises InputError if cyclonedds is not installed."""
+    if find_spec("cyclonedds") is None:
+        raise InputError("ROS 2 needs cyclonedds, which is not installed: pip install 'flexneedle[ros]'")
 
 
 def open_node(profile: Profile, *, epoch: float = 0.0) -> "NodeClient":
@@ -37,8 +44,7 @@ class NodeClient:
     """
 
     def __init__(self, profile: Profile, *, epoch: float = 0.0) -> None:
-        if find_spec("cyclonedds") is None:
-            raise InputError("ROS 2 needs cyclonedds, which is not installed: pip install 'flexneedle[ros]'")
+        check_installed()
         ours, theirs = socket.socketpair()
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  closed with the node
         command = [sys.executable, "-m", "flexneedle.ros.node", "--fd", str(theirs.fileno())]
@@ -107,24 +113,16 @@ class NodeClient:
     def close(self) -> None:
         """End the node."""
         self._pipe.close()
-        try:
-            self._process.wait(_STOP_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        end_process(self._process, _STOP_S)
         self._errors.close()
 
     def _silent(self) -> str:
         """Why nothing is received any more, or ""."""
         if self._pipe.ended:
-            return f"the ROS node has ended{self._last_words()}"
+            words = last_line(self._errors)
+            return f"the ROS node has ended: {words}" if words else "the ROS node has ended"
         silent = 0.0 if self._beat_at is None else monotonic() - self._beat_at
         return f"the ROS node does not answer for {silent:.1f} s" if silent > _SILENT_S else ""
-
-    def _last_words(self) -> str:
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        return f": {lines[-1]}" if lines else ""
 
     def _await_ready(self) -> None:
         deadline = monotonic() + _START_S

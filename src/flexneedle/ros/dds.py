@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator
 from typing import Any, Self
 
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication
 from cyclonedds.core import DDSException, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.core import InstanceState as Instances
 from cyclonedds.domain import DomainParticipant
@@ -20,6 +21,7 @@ from flexneedle.trace.messages import STORE
 
 _HIGHEST_DOMAIN = 232  # beyond it the ports of RTPS would not exist
 _DEPTH, _TAKEN = 5, 32
+_MOST_KNOWN = 10_000  # participants and publishers of a domain
 _ANY = SampleState.Any | ViewState.Any | Instances.Any
 
 
@@ -139,6 +141,32 @@ def waitset(domain: DomainParticipant, readers: list[Reader]) -> WaitSet:
     for reader in readers:
         found.attach(reader.condition)
     return found
+
+
+class Directory:
+    """The participants of a domain and their publishers, as far as they have been discovered."""
+
+    def __init__(self, domain: DomainParticipant) -> None:
+        readers: list[Any] = [
+            BuiltinDataReader(domain, topic)
+            for topic in (BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication)
+        ]
+        alive = SampleState.Any | ViewState.Any | Instances.Alive
+        self._known = [(reader, ReadCondition(reader, alive)) for reader in readers]
+
+    @property
+    def participants(self) -> int:
+        """Number of participants, this one included."""
+        return len(self._read(0))
+
+    @property
+    def publishers(self) -> list[tuple[str, str]]:
+        """DDS names of the topic and the type of each publisher."""
+        return [(one.topic_name, one.type_name) for one in self._read(1)]
+
+    def _read(self, which: int) -> Any:
+        reader, alive = self._known[which]
+        return reader.read(N=_MOST_KNOWN, condition=alive)
 
 
 def _common(kind: str) -> tuple[Any, ...]:

@@ -37,6 +37,12 @@ def dds_name(name: str) -> str:
     return f"{package}::{folder}::dds_::{kind}_"
 
 
+def ros_name(name: str) -> str:
+    """Return the name of the ROS type of a DDS type; that of the DDS type if it is of none."""
+    package, *folder, kind = name.split("::")
+    return f"{package}/{folder[0]}/{kind[:-1]}" if folder[1:] == ["dds_"] else name
+
+
 def dds_topic(topic: str) -> str:
     """Return the DDS topic of a ROS topic such as `/tip`."""
     return f"rt{topic}"

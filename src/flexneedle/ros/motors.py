@@ -66,7 +66,7 @@ class RosMotors:
             self._advance()
         return {channel: self._state(channel, reading) for channel in self._channels}
 
-    def set_speed(self, channel: str, speed: float, acceleration: float) -> None:  # noqa: ARG002
+    def set_speed(self, channel: str, speed: float, _acceleration: float) -> None:
         """Limit the speed of the motions to come, and of those under way. The acceleration is that of the joint."""
         self._check({channel: speed})
         if not speed > 0.0:

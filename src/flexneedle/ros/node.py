@@ -14,6 +14,8 @@ import sys
 from threading import Event, Thread
 from time import monotonic
 
+from cyclonedds.domain import DomainParticipant
+
 from flexneedle.errors import FlexneedleError, one_line
 from flexneedle.ros.dds import Reader, Writer, participant, waitset
 from flexneedle.ros.messages import Composer
@@ -27,6 +29,18 @@ STALE_S = 0.1
 """Targets of joints that are older are not published: a command is carried out in time or not at all."""
 
 _SWITCH_S = 5e-4  # a stop waits no longer than this for a thread that makes messages
+
+
+def readers_of(domain: DomainParticipant, subscription: Subscription) -> list[Reader]:
+    """Return the readers of a subscription, the first of which has all its publishers.
+
+    A stop is taken from every publisher, whatever its quality of service, and also if it was sent before.
+    """
+    topic, kind = subscription.topic, subscription.kind
+    if subscription.key == "stop":
+        qualities = ({"reliable": False}, {"reliable": True}, {"reliable": True, "latched": True})
+        return [Reader(domain, topic, kind, **quality) for quality in qualities]
+    return [Reader(domain, topic, kind, reliable=subscription.key in ("target", "arm"))]
 
 
 class Node:
@@ -44,7 +58,7 @@ class Node:
         # Stops come first, also among messages that have arrived together.
         keys = sorted(type(subscribe).model_fields, key="stop".__ne__)
         wanted = (Subscription(setup.profile, key) for key in keys if getattr(subscribe, key) is not None)
-        self._inputs = [(one, self._readers_of(one)) for one in wanted]
+        self._inputs = [(one, readers_of(self._domain, one)) for one in wanted]
         self._seen: dict[str, tuple[int, int]] = {}
         self._refused: dict[str, float] = {}
         self._listener = Thread(target=self._listen, name="listener", daemon=True)
@@ -64,14 +78,6 @@ class Node:
             return
         for outgoing in self._composer.messages(record):
             self._writers[outgoing.key].write(outgoing.message)
-
-    def _readers_of(self, subscription: Subscription) -> list[Reader]:
-        """A stop is taken from every publisher, whatever its quality of service, and also if it was sent before."""
-        topic, kind = subscription.topic, subscription.kind
-        if subscription.key == "stop":
-            qualities = ({"reliable": False}, {"reliable": True}, {"reliable": True, "latched": True})
-            return [Reader(self._domain, topic, kind, **quality) for quality in qualities]
-        return [Reader(self._domain, topic, kind, reliable=subscription.key in ("target", "arm"))]
 
     def _listen(self) -> None:
         every = [reader for _, readers in self._inputs for reader in readers]

@@ -1,5 +1,6 @@
 """The figures of a run, always drawn from its folder, so that `view` reproduces them."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from flexneedle.errors import RunError
@@ -7,21 +8,25 @@ from flexneedle.figures.insertion import insertion_figure
 from flexneedle.figures.perspective import perspective_figure
 from flexneedle.figures.plans import plan_figure
 from flexneedle.figures.style import save
-from flexneedle.runs.reading import insertion_of
+from flexneedle.runs.reading import insertion_of, unfinished
 from flexneedle.trace.folder import TRACE_FILE, read_run
 
 
-def draw_run(folder: Path) -> list[Path]:
+def draw_run(folder: Path, note: Callable[[str], object] = lambda _line: None) -> list[Path]:
     """Draw `insertion.png` and `.svg`, or `plan.png` and `.svg` if there are no periods; return the paths.
 
     An insertion in space is drawn in perspective, too: `perspective.png` and `.svg`.
+    note: called with a line if the record lacks its end, or that of its trace.
 
     Raises InputError if the folder contains no run, RunError if there is nothing to draw yet.
     """
     run = read_run(folder)
     if not run.plans:
         raise RunError(f"{folder}: nothing to draw: the run ended before planning finished")
-    insertion = insertion_of(run)[0] if run.kind == "insertion" and (folder / TRACE_FILE).exists() else None
+    is_traced = run.kind == "insertion" and (folder / TRACE_FILE).exists()
+    insertion, lacking = insertion_of(run) if is_traced else (None, unfinished(run))
+    if lacking:
+        note(lacking)
     if insertion is not None and insertion.periods:
         paths = save(insertion_figure(run.scenario, insertion), folder, "insertion")
         if run.scenario.setup.axes == 2:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from flexneedle.arguments import instance
 from flexneedle.errors import InputError
 from flexneedle.trace.columns import COLUMNS, to_values
+from flexneedle.trace.export import marks
 from flexneedle.types import Insertion
 
 if TYPE_CHECKING:
@@ -22,4 +23,6 @@ def to_dataframe(insertion: Insertion) -> "DataFrame":
         from pandas import DataFrame
     except ModuleNotFoundError:
         raise InputError("to_dataframe needs pandas, which is not installed: pip install pandas") from None
-    return DataFrame([to_values(period) for period in checked.periods], columns=list(COLUMNS))
+    marked = marks(checked)
+    rows = [to_values(period) | marked for period in checked.periods]
+    return DataFrame(rows, columns=[*COLUMNS, *marked])

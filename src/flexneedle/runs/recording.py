@@ -1,6 +1,6 @@
 """Plan and insert with a record on disk: the work of the commands `plan` and `insert`."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -13,7 +13,15 @@ from flexneedle.planning.origin import placed
 from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT
 from flexneedle.rig.supervised import Watchers, check_fit
-from flexneedle.runs.saving import finish, finish_insertion, finish_plans, keep_plan, note_result, open_trace
+from flexneedle.runs.saving import (
+    PARTS,
+    finish,
+    finish_insertion,
+    finish_plans,
+    keep_plan,
+    note_result,
+    open_trace,
+)
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.rig import RigFile
 from flexneedle.trace.folder import Folder
@@ -53,11 +61,10 @@ class Choices:
         controller_of(self.controller), plant_of(self.phantom), tracker_of(self.tracker)
 
     @property
-    def parts(self) -> dict[str, str]:
-        """Names of controller, phantom, tracker and rig; on a rig phantom and tracker have none."""
-        if self.rig is not None:
-            return {"controller": self.controller, "phantom": "", "tracker": "", "rig": self.rig.name}
-        return {"controller": self.controller, "phantom": self.phantom, "tracker": self.tracker, "rig": ""}
+    def parts(self) -> dict[str, Any]:
+        """Names of controller, phantom, tracker and rig, and `dry_run`; on a rig phantom and tracker have no name."""
+        own = (self.phantom, self.tracker, "") if self.rig is None else ("", "", self.rig.name)
+        return dict(zip(PARTS, (self.controller, *own, self.dry_run), strict=True))
 
 
 def record_plans(
@@ -89,10 +96,12 @@ def record_insertion(
     on_iteration: OnIteration,
     on_period: OnPeriod,
     bridge: "Bridge | None" = None,
+    confirm: Callable[[Mapping[str, float]], None] | None = None,
 ) -> Insertion:
     """Plan, insert, and write `run.json`, `trace.mcap` and `insertion.png`, `.svg` to the folder.
 
-    bridge: an open connection to ROS, which publishes all and may stop it.
+    bridge: an open connection to ROS, which publishes all and may stop it. confirm: called with the positions of a
+    rig's axes after planning, before anything moves; what it raises ends the insertion.
 
     An insertion that is interrupted (Ctrl-C, or a stop) is returned with its periods and the outcome "interrupted". An
     error, or an interruption of planning, is recorded in `run.json` and re-raised; if there was a plan, the record
@@ -111,7 +120,9 @@ def record_insertion(
         folder.values["scenario"] = scenario.values()
         if bridge is not None:
             bridge.publish(plan)
-        insertion = _insert(folder, scenario, plan, choices, on_period, Watchers(follower=bridge))
+        insertion = _insert(
+            folder, scenario, plan, choices, on_period, Watchers(follower=bridge, confirm=confirm)
+        )
         finish_insertion(folder, insertion)
     return insertion
 
@@ -154,10 +165,9 @@ def _insert(
     periods: list[Period] = []
 
     def ended(outcome: Outcome, reason: str) -> Insertion:
-        controller, phantom, tracker, rig = choices.parts.values()
         ticks = {} if choices.rig is None else watchers.ticks.summary()
-        parts = controller, phantom, tracker, scenario, rig, ticks
-        return Insertion(plan, choices.seed, tuple(periods), outcome, reason, *parts)
+        record: dict[str, Any] = {**choices.parts, "scenario": scenario, "ticks": ticks}
+        return Insertion(plan, choices.seed, tuple(periods), outcome, reason, **record)
 
     with _closed_at_the_end(folder, open_trace(folder, scenario, plan, choices.seed, choices.parts)) as trace:
 

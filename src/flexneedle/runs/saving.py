@@ -3,16 +3,21 @@
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from flexneedle.arguments import path
 from flexneedle.control.methods import used
 from flexneedle.errors import RecordError
 from flexneedle.runs.figures import draw_run
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.problems import unexpected
 from flexneedle.trace.folder import TRACE_FILE, Folder, versions
 from flexneedle.trace.results import insertion_result, insertion_timing, plan_result, plan_timing
 from flexneedle.trace.writer import TraceWriter
 from flexneedle.types import Insertion, Plan, scenario_of
+
+PARTS = ("controller", "phantom", "tracker", "rig", "dry_run")
+"""What an insertion was made with, in `run.json` and `trace.mcap`: names, and whether the rig did not move."""
 
 
 def save(record: Plan | Insertion, folder: str | Path) -> Path:
@@ -29,15 +34,15 @@ def save(record: Plan | Insertion, folder: str | Path) -> Path:
         finish_plans(claimed)
     else:
         claimed = Folder.claim(out, "", "insertion", scenario, record.seed)
-        parts = {name: getattr(record, name) for name in ("controller", "phantom", "tracker", "rig")}
+        parts = {name: getattr(record, name) for name in PARTS}
         claimed.values |= parts
         keep_plan(claimed, record.plan)
         with open_trace(claimed, scenario, record.plan, record.seed, parts) as trace:
             for period in record.periods:
                 trace.add(period)
         finish_insertion(claimed, record)
-    if claimed.problems:
-        raise RecordError("; ".join(claimed.problems))
+    if problems := [*claimed.problems, *claimed.undrawn]:
+        raise RecordError("; ".join(problems))
     return claimed.path
 
 
@@ -52,14 +57,15 @@ def finish_plans(folder: Folder) -> None:
     """Record that all plans are complete, and draw them."""
     folder.values["result"] = {name: plan_result(plan) for name, plan in folder.plans.items()}
     folder.end("done")
-    draw_run(folder.path)
+    _draw(folder)
 
 
 def open_trace(
-    folder: Folder, scenario: Scenario, plan: Plan, seed: int, parts: Mapping[str, str]
+    folder: Folder, scenario: Scenario, plan: Plan, seed: int, parts: Mapping[str, Any]
 ) -> TraceWriter:
-    """Return the writer of `trace.mcap`; parts: names of controller, phantom, tracker and rig."""
-    about = {"seed": str(seed), "scenario": scenario.name, "strategy": plan.strategy, **parts, **versions()}
+    """Return the writer of `trace.mcap`; parts: names of controller, phantom, tracker and rig, and dry_run."""
+    named = {name: str(part) for name, part in parts.items()}
+    about = {"seed": str(seed), "scenario": scenario.name, "strategy": plan.strategy, **named, **versions()}
     return TraceWriter(folder.path / TRACE_FILE, plan, about=about, scenario=scenario.values())
 
 
@@ -79,9 +85,19 @@ def finish(folder: Folder, status: str, reason: str) -> None:
     """Write the final status, and draw plans and insertion; `folder.problems` has what cannot be written."""
     steps: list[Callable[[], object]] = [partial(folder.end, status, reason)]
     if folder.plans:
-        steps.append(partial(draw_run, folder.path))
+        steps.append(partial(_draw, folder))
     for step in steps:
         try:
             step()
         except RecordError as problem:
             folder.problems.append(str(problem))
+
+
+def _draw(folder: Folder) -> None:
+    """Draw the figures; `folder.undrawn` has why one cannot be. Raises RecordError if one cannot be written."""
+    try:
+        draw_run(folder.path)
+    except RecordError:
+        raise
+    except Exception as error:  # noqa: BLE001 - whatever drawing raises, the record and the result stay
+        folder.undrawn.append(f"figures cannot be drawn: {unexpected(error)}")

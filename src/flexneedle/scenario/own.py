@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.errors import InputError
-from flexneedle.scenario.problems import printable
+from flexneedle.scenario.problems import printable, unexpected
 
 OWN = "module:NAME of your own"
 
@@ -88,5 +88,4 @@ def _module(name: str) -> Any:
             rule = f"{name} cannot be imported: it needs the module {missing}"
         raise InputError(printable(rule)) from None
     except (Exception, SystemExit) as error:
-        problem = printable(f"{type(error).__name__}: {' '.join(str(error).split())}")
-        raise InputError(f"{name} cannot be imported: {problem}") from error
+        raise InputError(f"{name} cannot be imported: {unexpected(error)}") from error

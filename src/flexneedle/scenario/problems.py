@@ -53,6 +53,11 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+def unexpected(error: BaseException) -> str:
+    """Return the type and the message of an error of any code in one line."""
+    return printable(": ".join(filter(None, (type(error).__name__, " ".join(str(error).split())))))
+
+
 def key_path(loc: Sequence[str | int]) -> str:
     """Return a path as it is written in messages: `tissue[1].alpha`."""
     path = ""

@@ -1,38 +1,46 @@
 """A run as CSV: a header with units, one line per period or reading, numbers with all digits."""
 
 import csv
-from collections.abc import Iterable, Sequence
-from typing import IO
+from collections.abc import Iterable
+from typing import IO, Any
 
 from flexneedle.trace.columns import COLUMNS, to_row
 from flexneedle.trace.readings import OPTIONAL, to_values
-from flexneedle.types import Period
+from flexneedle.types import Insertion, Period
 
 _READING = ("time_s", "period", "frame_number", "verdict", "x_mm", "y_mm", "z_mm")
 _SENSOR = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "indicator", "status")
 
 
-def write_csv(file: IO[str], periods: Sequence[Period]) -> None:
+def marks(insertion: Insertion) -> dict[str, Any]:
+    """Return the columns that mark every row of a dry run; none for an insertion that moved a needle."""
+    return {"dry_run": True} if insertion.dry_run else {}
+
+
+def write_csv(file: IO[str], insertion: Insertion) -> None:
     """Write periods to a text file opened with newline="". Wall-clock durations are only in the trace."""
-    writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+    marked = marks(insertion)
+    writer = csv.DictWriter(file, [*COLUMNS, *marked], lineterminator="\n")
     writer.writeheader()
-    writer.writerows(map(to_row, periods))
+    writer.writerows(to_row(period) | marked for period in insertion.periods)
 
 
-def write_readings(file: IO[str], periods: Sequence[Period]) -> None:
-    """Write all readings of periods, one line per reading, to a text file opened with newline="".
+def write_readings(file: IO[str], insertion: Insertion) -> None:
+    """Write all readings of an insertion, one line per reading, to a text file opened with newline="".
 
     The tip of the needle in the stage's frame, with the direction, points and covariances that any reading has, is
     followed by each sensor in the tracker's frame, as reported: columns `NAME.x_mm` and so on, for all sensors of all
     frames. Missing values are empty.
     """
+    periods, marked = insertion.periods, marks(insertion)
     rows = [
-        {"period": str(period.index), "verdict": str(checked.verdict)} | to_values(checked)
+        {"period": str(period.index), "verdict": str(checked.verdict)} | to_values(checked) | marked
         for period in periods
         for checked in period.readings
     ]
     measured = [key for key in OPTIONAL if any(key in row for row in rows)]
-    columns = [*_READING, *measured, *(f"{name}.{part}" for name in _sensors(periods) for part in _SENSOR)]
+    sensors = (f"{name}.{part}" for name in _sensors(periods) for part in _SENSOR)
+    columns = [*_READING, *measured, *sensors, *marked]
     writer = csv.DictWriter(file, columns, lineterminator="\n", extrasaction="ignore")
     writer.writeheader()
     writer.writerows(rows)

@@ -1,9 +1,9 @@
 """The folder of a run: created once, with a `run.json` that is always complete.
 
 `run.json` has format, kind ("plan" or "insertion"), status, reason, seed, versions, scenario, result, timing and
-plans; that of an insertion also controller, phantom, tracker and rig. A plan that chose where the needle enters has its
-own section `entry`; the scenario of an insertion is the one with the entry of its plan. All except `timing`, the date
-and the wall-clock times, is the same for the same seed.
+plans; that of an insertion also controller, phantom, tracker, rig and dry_run. A plan that chose where the needle
+enters has its own section `entry`; the scenario of an insertion is the one with the entry of its plan. All except
+`timing`, the date and the wall-clock times, is the same for the same seed.
 """
 
 import hashlib
@@ -34,7 +34,7 @@ _FORMAT = 1
 class RunFile:
     """Contents of `run.json`. status: "running" (or killed), "done", "held", "failed" or "interrupted".
 
-    controller, phantom, tracker, rig: of an insertion, "" if not recorded.
+    controller, phantom, tracker, rig: of an insertion, "" if not recorded; dry_run: whether the rig did not move.
     """
 
     folder: Path
@@ -50,13 +50,15 @@ class RunFile:
     phantom: str
     tracker: str
     rig: str = ""
+    dry_run: bool = False
 
 
 @dataclass(eq=False)
 class Folder:
     """A folder of a run and the values of its `run.json`, written by `write`.
 
-    problems: a line for each file of the record that could not be written at the end of the run.
+    problems: a line for each file of the record that could not be written at the end of the run; undrawn: a line for
+    each figure that could not be drawn, which is no part of the record.
     """
 
     path: Path
@@ -64,6 +66,7 @@ class Folder:
     timing: dict[str, Any]
     plans: dict[str, Plan] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
+    undrawn: list[str] = field(default_factory=list)
 
     @classmethod
     def claim(cls, out: Path | None, name: str, kind: str, scenario: Scenario, seed: int) -> "Folder":
@@ -160,6 +163,7 @@ def _checked(path: Path, values: Any) -> RunFile:
         read = values["plans"].items()
         named = {name: values[name] for name in ("kind", "status", "reason", "seed", "result", "timing")}
         named |= {name: values.get(name, "") for name in ("controller", "phantom", "tracker", "rig")}
+        named["dry_run"] = values.get("dry_run", False) is True
         scenario = Scenario.from_record(values["scenario"])
         plans = {name: _plan(plan, values["scenario"]) for name, plan in read}
         return RunFile(path.parent, scenario=scenario, plans=plans, **named)

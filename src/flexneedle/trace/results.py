@@ -16,6 +16,7 @@ RESULT_KEYS = (
         "controller",
         "phantom",
         "rig",
+        "dry_run",
         "target_mm",
         "tip_true_mm",
         "tip_measured_mm",
@@ -222,6 +223,7 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
         "controller": insertion.controller,
         "phantom": insertion.phantom or None,
         "rig": insertion.rig or None,
+        "dry_run": insertion.dry_run,
         "target_mm": insertion.target,
         "tip_true_mm": None if tip[0] is None else tip,
         "tip_measured_mm": _measured_tip(insertion),
@@ -235,13 +237,16 @@ def insertion_result(insertion: Insertion) -> dict[str, Any]:
     return result
 
 
-def refused_result(*, target: Sequence[float] | None, reason: str, seed: int, **parts: str) -> dict[str, Any]:
+def refused_result(
+    *, target: Sequence[float] | None, reason: str, seed: int, dry_run: bool = False, **parts: str
+) -> dict[str, Any]:
     """Return the result of an insertion that was refused before planning: the keys of `insertion_result`.
 
     parts: names of controller and phantom; target x, y, z in mm, None if it is not known.
     """
     known: dict[str, Any] = {
         **parts,
+        "dry_run": dry_run,
         "target_mm": None if target is None else list(target),
         "reached": False,
         "outcome": str(Outcome.REFUSED),

@@ -68,7 +68,7 @@ class TraceWriter:
         if self._file.closed:
             return
         with self._writing():
-            self._writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates no result
+            self._writer.finish()
             self._file.flush()
             os.fsync(self._file.fileno())
             self._file.close()
@@ -104,7 +104,7 @@ class TraceWriter:
         for one in messages:
             data = bytes(STORE.serialize_cdr(one.message, TOPICS[one.topic]))
             self._writer.add_message(self._channels[one.topic], one.time, data, one.time, self._count)
-        self._writer.flush()  # type: ignore[no-untyped-call]  # mcap annotates no result
+        self._writer.flush()
         self._count += 1
 
     def _register(self) -> dict[str, int]:

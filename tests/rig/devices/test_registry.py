@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bench_rig import Clock, Motors, Tracker, rig
-from flexneedle.errors import InputError, RigError, RunError
+from flexneedle.errors import DriverError, InputError, RigError, RunError
 from flexneedle.rig.devices.registry import DRIVERS, TRACKERS, open_motors, open_tracker
 from flexneedle.scenario.own import resolved
 
@@ -119,14 +119,13 @@ def test_an_installed_package_has_drivers_and_trackers_by_name(package):
     package("acme-camera", TRACKERS, acme="bench_rig:trackers")
     found = rig(driver={"kind": "acme"}, tracker={"kind": "acme", "rate": 20.0})
     clock = Clock()
-    assert isinstance(open_motors(found), Motors)
+    assert tuple(open_motors(found).read()) == ("A", "B", "C")
     tracker = open_tracker(found, clock)
     assert (tracker.rate, tracker.clock) == (20.0, clock)
 
 
-def test_a_tracker_with_close_is_returned_as_it_is():
+def test_a_tracker_with_close_is_closed_by_it():
     tracker = open_tracker(rig(tracker={"kind": "bench_rig:trackers"}), Clock())
-    assert isinstance(tracker, Tracker)
     tracker.close()
     assert tracker.closed
 
@@ -139,6 +138,43 @@ def test_a_tracker_may_be_a_context_manager():
     assert not tracker.tracker.closed
     tracker.close()
     assert tracker.tracker.closed
+
+
+class Faulty(Motors):
+    """Motors of a user, whose code has an error in one of its parts."""
+
+    @property
+    def identity(self):
+        raise OSError("no such port")
+
+    def read(self):
+        return {"A": int("bad\nbyte")}
+
+
+def faulty(_settings, channels):
+    return Faulty(channels)
+
+
+def does_not_open(settings, _about):
+    return settings["nothing"]
+
+
+def test_any_error_in_a_device_of_your_own_names_it_the_call_and_the_line():
+    motors = open_motors(rig(driver={"kind": "parts:faulty"}))
+    with pytest.raises(
+        DriverError, match=r"^driver parts:faulty: read: ValueError: invalid literal .* line \d+\)$"
+    ):
+        motors.read()
+    with pytest.raises(DriverError, match=r"^driver parts:faulty: identity: OSError: no such port \("):
+        _ = motors.identity
+    motors.stop()
+    assert not hasattr(motors, "describe")
+    with pytest.raises(
+        DriverError, match=r"^driver parts:does_not_open: KeyError: 'nothing' \(test_registry\.py, "
+    ):
+        open_motors(rig(driver={"kind": "parts:does_not_open"}))
+    with pytest.raises(DriverError, match=r"^tracker parts:does_not_open: KeyError: 'nothing' "):
+        open_tracker(rig(tracker={"kind": "parts:does_not_open"}), Clock())
 
 
 def test_an_unknown_name_is_refused_with_the_names_that_are_installed(package):

@@ -163,13 +163,23 @@ def test_a_position_that_is_reset_is_visible():
             return len(positions) > 1 and positions[-1] < positions[-2]
 
         until(fell)
+    *before, last = positions
+    assert before == sorted(before)
+    assert 0.0 <= last < before[-1]
 
 
 @pytest.mark.parametrize("fault", ["stall", "lag", "overshoot", "reversed"])
 def test_a_motor_that_does_not_follow_is_reported_beside_what_was_commanded(fault):
     with rig(f"{fault}=A@0") as motors:
         motors.follow({"A": 5000.0})
-        until(lambda: abs(motors.read()["A"].commanded - motors.read()["A"].position) > 0.02 * COUNTS_PER_MM)
+        states = []
+
+        def differs():
+            states.append(motors.read()["A"])
+            return abs(states[-1].commanded - states[-1].position) > 0.02 * COUNTS_PER_MM
+
+        until(differs)
+    assert all((state.on, state.stopped) == (True, "") for state in states)
 
 
 def test_a_refused_command_has_the_controllers_reason():

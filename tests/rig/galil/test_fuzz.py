@@ -37,7 +37,11 @@ LINE = st.lists(COMMAND, min_size=1, max_size=3).map(";".join)
 def test_an_axis_moves_only_if_its_motor_is_on_and_it_was_begun(lines):
     device, _ = reply(Device(), "SHAB")
     for line, samples in lines:
-        device = fuzz_galil.checked_line(device, line, samples)
+        before, device = device, fuzz_galil.checked_line(device, line, samples)
+        pairs = zip(before.axes, device.axes, strict=True)
+        begun = [now for was, now in pairs if now.running and not was.running]
+        assert all(axis.servo for axis in begun)
+        assert not begun or "BG" in line or "PA" in line
 
 
 def test_the_fuzz_notices_a_motion_that_nothing_began():

@@ -53,7 +53,9 @@ def test_a_controller_without_an_echo_to_switch_off_is_accepted():
     """The maker: EO is accepted over the serial port only."""
     with peer() as device:
         device.damage = lambda line, true: b"?" if line == "EO 0" else true
-        factory({"address": f"127.0.0.1:{device.port}"}, ["A"]).close()
+        with factory({"address": f"127.0.0.1:{device.port}"}, ["A"]) as motors:
+            assert set(motors.read()) == {"A"}
+            assert "EO 0" in device.lines
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,7 @@ def test_hold_and_warning_are_in_trace_csv_and_json(plan, tmp_path):
     assert [period.miss for period in kept.periods[:3]] == [(0.2, 0.0), (1.5, 0.0), (3.0, 0.0)]
     assert [period.warning for period in kept.periods] == [period.warning for period in done.periods]
     text = io.StringIO(newline="")
-    write_csv(text, done.periods)
+    write_csv(text, done)
     rows = list(csv.DictReader(io.StringIO(text.getvalue())))
     assert [float(row["miss_y_mm"]) for row in rows[:3]] == [0.2, 1.5, 3.0]
     assert [float(row["miss_z_mm"]) for row in rows[:3]] == [0.0] * 3

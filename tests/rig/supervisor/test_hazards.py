@@ -65,6 +65,26 @@ def test_a_motor_that_runs_past_its_target_with_its_controller_is_a_fault(bench)
     assert bench.position("insertion") < 1.3
 
 
+@pytest.mark.parametrize(
+    ("travel", "steps", "seconds", "why"),
+    [
+        (1.0, 1, 0.1, "insertion: the motor does not follow"),  # more than max_error_mm of the step is left
+        (0.15, 1, 0.3 + 2 * TICK_S, "the motors have not arrived: insertion 0.150 mm from the goal"),
+        (0.015, 2, 0.3 + 2 * TICK_S, "the motors have not arrived: insertion 0.030 mm from the goal"),
+    ],
+)
+def test_a_stall_is_found_by_what_is_left_of_the_step(bench, travel, steps, seconds, why):
+    bench.stage.motors["A"].fault = "stall"
+    for number in range(1, steps + 1):
+        assert bench.core.state is not State.FAULT
+        begun = bench.clock.time
+        bench.core.request(step(number, insertion=travel))
+        bench.until(number)
+    assert bench.core.state is State.FAULT
+    assert bench.core.why.startswith(why)
+    assert seconds - 3 * TICK_S <= bench.clock.time - begun <= seconds
+
+
 def test_a_line_that_fails_at_rest_after_a_fault_is_opened_again_before_anything_else(bench):
     bench.stage.motors["C"].on = False
     bench.tick(20)

@@ -60,4 +60,4 @@ def test_a_stall_while_homing_is_a_fault():
     done = bench.until(1)
     assert done.state is State.FAULT
     assert done.why.startswith("the motors have not arrived: guide_y 32.8")
-    assert bench.clock.now() - begun < 0.6
+    assert bench.clock.now() - begun < 0.4

@@ -13,7 +13,8 @@ from time import monotonic
 import pytest
 
 from emulated import until
-from flexneedle.errors import DriverError, RefusedError, RigError, StoppedError
+from flexneedle.errors import DriverError, RefusedError, RigError, RunError, StoppedError
+from flexneedle.rig.supervised import Watchers
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.rig.supervisor.machine import State
@@ -57,14 +58,15 @@ def test_a_step_is_carried_out_and_ticks_go_on(supervisor):
     assert supervisor.read() == () or len(supervisor.read()) < 3
 
 
-def test_the_tip_is_measured_before_the_start_and_its_readings_stay(supervisor):
-    assert supervisor.measured_x(2.0) == 0.0
-    assert supervisor.read()
+def test_the_tip_is_the_median_of_measurements_that_can_still_be_read(supervisor):
+    found = supervisor.tip(2.0)
+    assert len(supervisor.read()) >= 9
+    assert found == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
 
 
-def test_without_a_tracker_no_tip_is_measured():
-    with Supervisor.of_operator(rig_file().model_copy(update={"driver": task().rig.driver})) as untracked:
-        assert untracked.measured_x(0.0) is None
+def test_a_tip_that_is_not_measured_is_none():
+    with Supervisor(task(tracker="stages:Blind")) as supervisor:
+        assert supervisor.tip(0.2) is None
 
 
 def test_operators_move_axes(supervisor):
@@ -81,6 +83,23 @@ def test_operators_move_axes(supervisor):
         supervisor.jog("nose", 1.0)
 
 
+def test_a_rig_that_is_not_confirmed_is_not_armed(supervisor):
+    shown = []
+
+    def refuse(positions):
+        shown.append(positions)
+        raise RunError("not confirmed")
+
+    with pytest.raises(RunError, match="not confirmed"):
+        Watchers(confirm=refuse).opened(supervisor)
+    assert shown == [{"insertion": 0.0, "rotation": 0.0, "guide_y": 0.0}]
+    assert supervisor.report.state is State.IDLE
+    supervisor.stop("the test")
+    with pytest.raises(StoppedError, match="stopped: the test"):
+        Watchers(confirm=shown.append).opened(supervisor)
+    assert len(shown) == 1
+
+
 def test_a_stopped_rig_is_reset_before_it_is_armed_again(supervisor):
     supervisor.arm()
     supervisor.stop("the test")
@@ -89,6 +108,14 @@ def test_a_stopped_rig_is_reset_before_it_is_armed_again(supervisor):
     supervisor.reset()
     supervisor.arm()
     assert supervisor.report.state is State.ARMED
+
+
+def test_arming_that_ends_in_a_fault_has_its_reason():
+    with (
+        Supervisor(task(off=-300.0)) as supervisor,
+        pytest.raises(DriverError, match=r"insertion: the motor does not follow: 0\.300 mm off"),
+    ):
+        supervisor.arm()
 
 
 def test_a_signal_stops_the_motors(supervisor):
@@ -130,6 +157,13 @@ def test_a_supervisor_that_is_killed_is_an_error(supervisor):
     os.kill(supervisor.pid, signal.SIGKILL)
     with pytest.raises(DriverError, match="the supervisor has ended: it was killed"):
         supervisor.wait(5.0)
+
+
+def test_a_device_that_does_not_open_is_the_reason():
+    with pytest.raises(
+        DriverError, match=r"^driver stages:real_motors: ValueError: could not convert .*stages"
+    ):
+        Supervisor(task(position="nowhere"))
 
 
 def test_a_supervisor_that_hangs_is_an_error(supervisor):

@@ -86,7 +86,7 @@ def test_slow_motors_arrive_later_and_no_target_is_further_from_one_than_the_que
     bench.core.request(
         step(1, roll=math.pi if roll else 0.0, duration=1.0 / speed, insertion=1.0, guide_y=-0.2)
     )
-    done, limits = bench.until(1), bench.core._loop
+    done, limits = bench.until(1), rig.loop.model_copy(update={"queue_ms": queue_ms})
     assert done.why == ""
     assert done.travelled["insertion"] == pytest.approx(1.0, abs=0.02)
     for report in bench.reports:

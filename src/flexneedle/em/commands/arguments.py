@@ -23,22 +23,6 @@ def within(
     return number
 
 
-def positive(text: str) -> float:
-    """Return a finite number above 0."""
-    value = float(text)
-    if not (isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text}: must be a finite number above 0")
-    return value
-
-
-def finite(text: str) -> float:
-    """Return a finite number."""
-    value = float(text)
-    if not isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text}: must be a finite number")
-    return value
-
-
 def name(text: str) -> str:
     """Return a name without leading and trailing blanks."""
     if not text.strip():

@@ -6,8 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flexneedle.console.common import described, print_json
-from flexneedle.em.commands.arguments import add_columns, add_labels, positive
+from flexneedle.console.commands import Commands, add_command
+from flexneedle.console.common import print_json
+from flexneedle.console.values import positive
+from flexneedle.em.commands.arguments import add_columns, add_labels
 from flexneedle.em.commands.tables import number, print_notes, print_rows, span
 
 if TYPE_CHECKING:
@@ -16,17 +18,17 @@ if TYPE_CHECKING:
 _THRESHOLD = 0.0547  # paper, section IV-B
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle em`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "check",
-        help="compare the indicator with the rig's power off and on",
-        **described(
-            "Compare the distortion indicator of two environments in one table: power of the rig off and on. "
-            "The exit status is 1 if the mean indicator of any sensor exceeds the threshold with power on.",
-            "flexneedle em check power.csv",
-            "flexneedle em check power.csv --off quiet --on driven --threshold 0.04",
-        ),
+        "compare the indicator with the rig's power off and on",
+        _check,
+        "flexneedle em check power.csv",
+        "flexneedle em check power.csv --off quiet --on driven --threshold 0.04",
+        about="Compare the distortion indicator of two environments in one table: power of the rig off and on. "
+        "The exit status is 1 if the mean indicator of any sensor exceeds the threshold with power on.",
     )
     parser.add_argument(
         "data", metavar="DATA", type=Path, help="table with both environments (CSV or Parquet)"
@@ -48,7 +50,6 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     add_columns(parser)
     add_labels(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
-    parser.set_defaults(handler=_check)
 
 
 def _check(args: argparse.Namespace) -> int:

@@ -5,21 +5,23 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from flexneedle.console.common import described, print_json
-from flexneedle.em.commands.arguments import add_columns, add_labels, positive
+from flexneedle.console.commands import Commands, add_command
+from flexneedle.console.common import print_json
+from flexneedle.console.values import positive
+from flexneedle.em.commands.arguments import add_columns, add_labels
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle em`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "evaluate",
-        help="compute a tracker's errors and distortion indicator from measurements",
-        **described(
-            "Compute a tracker's errors, jitter and distortion indicator from repeated measurements on a grid, one "
-            "row per sample (docs/tracking/evaluate.md).",
-            "flexneedle em evaluate measurements.csv",
-            'flexneedle em evaluate table.parquet --register --columns "X [mm]=x_mm" --json',
-        ),
+        "compute a tracker's errors and distortion indicator from measurements",
+        _evaluate,
+        "flexneedle em evaluate measurements.csv",
+        'flexneedle em evaluate table.parquet --register --columns "X [mm]=x_mm" --json',
+        about="Compute a tracker's errors, jitter and distortion indicator from repeated measurements on a grid, one "
+        "row per sample (docs/tracking/evaluate.md).",
     )
     parser.add_argument("data", metavar="DATA", type=Path, help="table of measurements (CSV or Parquet)")
     parser.add_argument(
@@ -52,7 +54,6 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--out", type=Path, metavar="DIR", help="output folder (default: runs/<date>-em-<name>)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
-    parser.set_defaults(handler=_evaluate)
 
 
 def _evaluate(args: argparse.Namespace) -> int:

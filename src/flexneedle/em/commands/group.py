@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
-from typing import Any
-
-from flexneedle.console.common import with_examples
+from flexneedle.console.commands import Commands, add_group
 from flexneedle.em.commands import check, evaluate, record, register, simulate, watch
 
-_COMMANDS: tuple[Any, ...] = (evaluate, check, simulate, register, record, watch)
 
-
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command and its subcommands to the parser of `flexneedle`."""
-    parser = subparsers.add_parser(
+    add_group(
+        commands,
         "em",
-        help="evaluate, simulate or record an electromagnetic tracker",
-        **with_examples("flexneedle em simulate", "flexneedle em evaluate measurements.csv"),
+        "evaluate, simulate or record an electromagnetic tracker",
+        [command.add_parser for command in (evaluate, check, simulate, register, record, watch)],
+        "flexneedle em simulate",
+        "flexneedle em evaluate measurements.csv",
     )
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in _COMMANDS:
-        command.add_parser(commands)

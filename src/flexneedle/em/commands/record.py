@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flexneedle.console.common import described
+from flexneedle.console.commands import Commands, add_command
 from flexneedle.em.commands.arguments import within
 
 if TYPE_CHECKING:
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     from flexneedle.em.recording.record import Operator
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle em`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "record",
-        help="record a tracker at the points of a grid; writes a table for evaluate",
-        **described(
-            "Prompt for the stage to be moved to each point of the grid and record the tracker there. After an "
-            "interruption, run the command again with the same --out to resume at the next point.",
-            "flexneedle em record --tracker aurora:/dev/ttyUSB0 --grid cube --out ideal.csv",
-            "flexneedle em record --tracker aurora:/dev/ttyUSB0 --grid mine.toml --out noisy.csv --dwell 5",
-        ),
+        "record a tracker at the points of a grid; writes a table for evaluate",
+        _record,
+        "flexneedle em record --tracker aurora:/dev/ttyUSB0 --grid cube --out ideal.csv",
+        "flexneedle em record --tracker aurora:/dev/ttyUSB0 --grid mine.toml --out noisy.csv --dwell 5",
+        about="Prompt for the stage to be moved to each point of the grid and record the tracker there. After an "
+        "interruption, run the command again with the same --out to resume at the next point.",
     )
     parser.add_argument(
         "--tracker", required=True, metavar="SPEC", help="tracker, such as aurora:/dev/ttyUSB0"
@@ -52,7 +52,6 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         action="store_true",
         help="record points even if sensor and stage moved by different distances (by more than 5 mm and 20 %%)",
     )
-    parser.set_defaults(handler=_record)
 
 
 def _record(args: argparse.Namespace) -> int:

@@ -6,24 +6,26 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flexneedle.console.common import described, print_json, print_table
-from flexneedle.em.commands.arguments import add_columns, finite
+from flexneedle.console.commands import Commands, add_command
+from flexneedle.console.common import print_json, print_table
+from flexneedle.console.values import finite
+from flexneedle.em.commands.arguments import add_columns
 
 if TYPE_CHECKING:
     from flexneedle.em.register import RegistrationResult
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle em`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "register",
-        help="register the tracker's frame to the stage's from pairs of points",
-        **described(
-            "Fit the rigid transform from the tracker's frame to the stage's to pairs of points, with its expected "
-            "errors. Writes a table for a scenario and a figure (docs/tracking/register.md).",
-            "flexneedle em register pairs.csv --target 40 5 0",
-            "flexneedle em register table.csv --sensor ref1 --environment ideal --out rig.toml",
-        ),
+        "register the tracker's frame to the stage's from pairs of points",
+        _register,
+        "flexneedle em register pairs.csv --target 40 5 0",
+        "flexneedle em register table.csv --sensor ref1 --environment ideal --out rig.toml",
+        about="Fit the rigid transform from the tracker's frame to the stage's to pairs of points, with its expected "
+        "errors. Writes a table for a scenario and a figure (docs/tracking/register.md).",
     )
     parser.add_argument(
         "data",
@@ -55,7 +57,6 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="new file; its figure is written to the same folder (default: registration.toml)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
-    parser.set_defaults(handler=_register)
 
 
 def _register(args: argparse.Namespace) -> int:

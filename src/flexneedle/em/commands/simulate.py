@@ -5,21 +5,23 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from flexneedle.console.common import described, seed
+from flexneedle.console.commands import Commands, add_command
+from flexneedle.console.common import add_seed
+from flexneedle.console.values import seed
 from flexneedle.em.commands.arguments import within
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle em`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "simulate",
-        help="record a simulated tracker at the points of a grid; writes a table for evaluate",
-        **described(
-            "Record the tip sensor and a reference sensor of a simulated tracker on a grid over the workspace: "
-            "the paper's experiment. Writes a table for `flexneedle em evaluate`.",
-            "flexneedle em simulate",
-            "flexneedle em simulate --environment mine.toml --samples 20 --seed 1 --out mine.parquet",
-        ),
+        "record a simulated tracker at the points of a grid; writes a table for evaluate",
+        _simulate,
+        "flexneedle em simulate",
+        "flexneedle em simulate --environment mine.toml --samples 20 --seed 1 --out mine.parquet",
+        about="Record the tip sensor and a reference sensor of a simulated tracker on a grid over the workspace: "
+        "the paper's experiment. Writes a table for `flexneedle em evaluate`.",
     )
     parser.add_argument(
         "--environment",
@@ -28,13 +30,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         metavar="ENVIRONMENT",
         help="names of shipped environments or paths of TOML files (default: ideal noisy)",
     )
-    parser.add_argument(
-        "--seed",
-        type=seed,
-        default=0,
-        metavar="N",
-        help="seed of the noise: same seed, same file (default: 0)",
-    )
+    add_seed(parser, "seed of the noise: same seed, same file")
     parser.add_argument(
         "--field-seed",
         type=seed,
@@ -61,7 +57,6 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         metavar="FILE",
         help="new file, CSV or Parquet by its suffix (default: measurements.csv)",
     )
-    parser.set_defaults(handler=_simulate)
 
 
 def _simulate(args: argparse.Namespace) -> int:

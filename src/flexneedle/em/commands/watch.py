@@ -10,8 +10,8 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexneedle.console.common import described
-from flexneedle.em.commands.arguments import positive
+from flexneedle.console.commands import Commands, add_command
+from flexneedle.console.values import positive
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
 _LINE_EVERY_S = 1.0
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the parser of `flexneedle em`."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        commands,
         "watch",
-        help="show live readings and verdicts of a tracker",
-        **described(
-            "Show a live table at a terminal; otherwise print one line per second and at each change of the "
-            "verdict. Ends with Ctrl-C or at the end of a replay.",
-            "flexneedle em watch --tracker aurora:/dev/ttyUSB0 --record frames.csv",
-            "flexneedle em watch --tracker replay:frames.csv@4 --json",
-        ),
+        "show live readings and verdicts of a tracker",
+        _watch,
+        "flexneedle em watch --tracker aurora:/dev/ttyUSB0 --record frames.csv",
+        "flexneedle em watch --tracker replay:frames.csv@4 --json",
+        about="Show a live table at a terminal; otherwise print one line per second and at each change of the "
+        "verdict. Ends with Ctrl-C or at the end of a replay.",
     )
     parser.add_argument(
         "--tracker",
@@ -55,7 +55,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="number of reference sensors needed to judge the field (default: those of the tracker, at most 3)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object per frame and line")
-    parser.set_defaults(handler=_watch)
 
 
 def _watch(args: argparse.Namespace) -> int:

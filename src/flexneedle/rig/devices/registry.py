@@ -14,6 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol
 
 from flexneedle.errors import InputError, RigError
+from flexneedle.rig.devices.guarded import Guarded, errors_named
 from flexneedle.rig.ports import Clock, Motors, Tracker
 from flexneedle.scenario.own import a_kind_of, attribute, not_callable_with, resolved
 from flexneedle.scenario.problems import printable
@@ -41,30 +42,42 @@ def open_motors(rig: RigFile) -> Motors:
     """Return the motors of a rig, connected, at rest.
 
     Raises RigError for an unknown driver, one that cannot be imported or lacks a part of the port, and for settings
-    that it refuses; DriverError if the controller cannot be reached.
+    that it refuses; DriverError if the controller cannot be reached, and for any other error of the driver, then and
+    in each of its calls.
     """
     channels = tuple(axis.channel for _, axis in rig.axes.items())
     factory = _factory("driver", DRIVERS, rig.driver, ("settings", "channels"))
-    motors: Motors = _made("driver", rig.driver, lambda: factory(rig.driver.settings, channels))
-    _check_parts("driver", rig.driver, motors, parts_of(Motors))
+    name = _name("driver", rig.driver)
+    with errors_named(name):
+        made = _made("driver", rig.driver, lambda: factory(rig.driver.settings, channels))
+        _check_parts("driver", rig.driver, made, parts_of(Motors))
+    motors: Motors = Guarded(name, made)
     return motors
 
 
 def open_tracker(rig: RigFile, clock: Clock) -> OpenTracker:
     """Return the tracker of a rig, started; `close` stops it. clock: of the run; frames have its times.
 
-    Raises RigError as `open_motors`, RunError if the tracker does not respond.
+    Raises RigError as `open_motors`, RunError if the tracker does not respond, DriverError for any other error of it.
     """
     factory = _factory("tracker", TRACKERS, rig.tracker, ("settings", "clock"))
-    made = _made("tracker", rig.tracker, lambda: factory(rig.tracker.settings, clock))
+    name = _name("tracker", rig.tracker)
+    with errors_named(name):
+        made = _made("tracker", rig.tracker, lambda: factory(rig.tracker.settings, clock))
+        tracker: OpenTracker = Guarded(name, _closable(rig.tracker, made))
+    return tracker
+
+
+def _closable(part: Part, made: Any) -> OpenTracker:
+    """The tracker, or the one that a context manager gives. Raises RigError if it is none, or cannot be closed."""
     if hasattr(made, "close"):
-        _check_parts("tracker", rig.tracker, made, parts_of(Tracker))
+        _check_parts("tracker", part, made, parts_of(Tracker))
         tracker: OpenTracker = made
         return tracker
     if not isinstance(made, AbstractContextManager):
         rule = f"made {a_kind_of(made)} that cannot be closed: it needs close(), or to be a context manager"
-        raise _error("tracker", rig.tracker, rule)
-    return _entered(rig.tracker, made)
+        raise _error("tracker", part, rule)
+    return _entered(part, made)
 
 
 def installed(group: str) -> tuple[str, ...]:
@@ -144,7 +157,11 @@ def _made(section: str, part: Part, make: Callable[[], Any]) -> Any:
     try:
         return make()
     except InputError as error:
-        raise RigError(*(f"{section} {part.kind}: {line}" for line in str(error).splitlines())) from error
+        raise RigError(*(f"{_name(section, part)}: {line}" for line in str(error).splitlines())) from error
+
+
+def _name(section: str, part: Part) -> str:
+    return printable(f"{section} {part.kind}")
 
 
 def _check_parts(section: str, part: Part, made: object, wanted: Sequence[str]) -> None:

@@ -89,6 +89,15 @@ def at_home(drive: Drive, state: MotorState) -> bool:
     return at and not state.moving
 
 
+def switch_problem(drive: Drive, state: MotorState) -> str:
+    """An axis that has left the limit switch of its home, which is still active."""
+    return (
+        f"{drive.name}: the {drive.axis.home} switch is still active away from it"
+        if at_home(drive, state)
+        else ""
+    )
+
+
 def rest_problem(drive: Drive, state: MotorState, goal: float) -> str:
     """A motor that is not where it was left; goal: that position (counts)."""
     off = abs((state.position - goal) / drive.axis.scale)

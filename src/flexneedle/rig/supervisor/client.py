@@ -14,12 +14,13 @@ from typing import Any, Self
 
 from flexneedle.errors import DriverError, RefusedError, StoppedError
 from flexneedle.rig.devices.clock import WallClock
+from flexneedle.rig.processes import end_process
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.machine import State
 from flexneedle.rig.tracking.registration import identity
 from flexneedle.scenario.rig import Axis, RigFile
 from flexneedle.scenario.sections.monitor import MonitorSettings
-from flexneedle.types import Measurement
+from flexneedle.types import Measurement, Point
 
 _HEARTBEAT_S = 0.1
 _SILENT_S = 1.0  # without a report: the supervisor hangs
@@ -27,6 +28,7 @@ _PATIENCE_S = 0.3  # for reports that have not been taken, after a time without 
 _OPEN_S = 60.0  # to find a tracker
 _END_S = 5.0
 _MOST_KEPT = 4000  # measurements: 100 s without a reader
+_ENOUGH = 9  # measurements for a median
 
 
 class Supervisor:
@@ -43,6 +45,7 @@ class Supervisor:
         self._latest: say.Report | None = None
         self._latest_at = monotonic()
         self._ended: str | None = None
+        self._unopened = ""
         self._answers: dict[int, say.Done | say.Refused] = {}
         self._measurements: deque[Measurement] = deque(maxlen=_MOST_KEPT)
         self._number = 0
@@ -76,11 +79,7 @@ class Supervisor:
         """Stop the motors, and end the supervisor."""
         if self._ended is None:
             self._send(say.Close(), lost=True)
-        try:
-            self._process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        end_process(self._process, _END_S)
         self._thread.join()  # it ends with the supervisor's end of the line
         with self._sending:
             self._connection.close()
@@ -107,6 +106,13 @@ class Supervisor:
                 raise DriverError(f"the supervisor has not reported: {self._ended or 'it opens'}")
             return self._latest
 
+    @property
+    def positions(self) -> dict[str, float]:
+        """Where the axes are, mm or rad. Raises DriverError after a fault, StoppedError after a stop."""
+        found = self.report
+        self._check(found.state, found.why)
+        return {name: axis.position for name, axis in found.axes.items()}
+
     def read(self) -> tuple[Measurement, ...]:
         """The measurements since the last call, oldest first."""
         with self._changed:
@@ -114,20 +120,22 @@ class Supervisor:
             self._measurements.clear()
         return found
 
-    def measured_x(self, seconds: float) -> float | None:
-        """Median x (mm) of the tip's measurements since the last `read`, which stay; None where none comes for
-        `seconds`.
-        """
-        until = monotonic() + seconds
-        self._wait(
-            lambda: bool(self._measured()) or monotonic() >= until, seconds + 1.0, "the clock stands still"
-        )
-        with self._changed:
-            found = self._measured()
-        return median(found) if found else None
+    def tip(self, within: float) -> Point | None:
+        """Position (mm) of the tip at rest, the median of at least 9 measurements or all within a time (s); None: none.
 
-    def _measured(self) -> list[float]:
-        return [one.x for one in self._measurements if one.x is not None and isfinite(one.x)]
+        `read` returns them, too.
+        """
+        until, found = monotonic() + within, list[Point]()
+
+        def enough() -> bool:
+            found[:] = filter(None, map(_position, self._measurements))
+            return len(found) >= _ENOUGH or monotonic() >= until
+
+        self._wait(enough, within + 1.0, "the clock stands still")
+        if not found:
+            return None
+        x, y, z = (median(values) for values in zip(*found, strict=True))
+        return x, y, z
 
     @property
     def status(self) -> str:
@@ -222,14 +230,20 @@ class Supervisor:
     def _ask(self, request: say.Request, wanted: State) -> None:
         self._answers.pop(0, None)
         self._send(request)
-        self._wait(
-            lambda: 0 in self._answers or self.report.state is wanted, _END_S, f"not {wanted}", stopped=True
-        )
+        armed = wanted is State.ARMED
+
+        def answered() -> bool:
+            state = self.report.state
+            return 0 in self._answers or state is wanted or (armed and state is State.FAULT)
+
+        self._wait(answered, _END_S, f"not {wanted}", stopped=True)
         refused = self._answers.pop(0, None)
         if isinstance(refused, say.Refused):
-            if wanted is State.ARMED:
+            if armed:
                 self._check(refused.state, refused.cause)
             raise RefusedError(refused.why)
+        if armed:
+            self._check(self.report.state, self.report.why)
 
     # Waiting
 
@@ -239,10 +253,13 @@ class Supervisor:
                 self._connection.send(message)
         except OSError:
             if not lost:
-                raise DriverError(f"the supervisor has ended{self._because()}") from None
+                raise self._end() from None
 
-    def _because(self) -> str:
-        return f": {self._ended}" if self._ended else ""
+    def _end(self) -> DriverError:
+        """The error after the supervisor's end: its reason alone, such as that of a device, if the rig did not open."""
+        if self._unopened:
+            return DriverError(self._unopened)
+        return DriverError(f"the supervisor has ended{f': {self._ended}' if self._ended else ''}")
 
     def _wait(
         self,
@@ -261,7 +278,7 @@ class Supervisor:
         with self._changed:
             while not condition():
                 if self._ended is not None:
-                    raise DriverError(f"the supervisor has ended{self._because()}")
+                    raise self._end()
                 now = monotonic()
                 if (
                     self._latest is not None
@@ -304,6 +321,7 @@ class Supervisor:
                 message = self._connection.recv()
                 if isinstance(message, say.Ended):
                     why = message.why
+                    self._unopened = why if self._latest is None else ""
                     break
                 self._take(message)
         except (EOFError, OSError):
@@ -323,3 +341,9 @@ class Supervisor:
             self._changed.notify_all()
         if self._on_report is not None and isinstance(message, say.Report):
             self._on_report(message)
+
+
+def _position(measurement: Measurement) -> Point | None:
+    """Position (mm) of a measurement, z = 0 in the plane; None if it is not measured."""
+    x, y, z = measurement.x, measurement.y, 0.0 if measurement.z is None else measurement.z
+    return None if x is None or y is None or not all(map(isfinite, (x, y, z))) else (x, y, z)

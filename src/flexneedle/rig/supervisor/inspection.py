@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from flexneedle.rig.ports import MotorState
+from flexneedle.rig.supervisor.axes import Reading
 from flexneedle.rig.supervisor.checks import (
     at_home,
     motor_problem,
@@ -15,21 +15,18 @@ from flexneedle.rig.supervisor.checks import (
 from flexneedle.rig.supervisor.drives import Drive
 from flexneedle.rig.supervisor.motion import Motion
 
-States = Mapping[str, MotorState]
-
 
 @dataclass(frozen=True)
 class Inspection:
     """The motion under way, or None; where motors were last sent (counts by channel); whether they are being stopped;
-    the states of this reading and of the one before, `seconds` ago.
+    this reading of their states and the one before.
     """
 
     motion: Motion | None
     goals: Mapping[str, float]
     stopping: bool
-    states: States
-    before: States
-    seconds: float
+    newest: Reading
+    before: Reading
 
     def first_problem(self, drives: Mapping[str, Drive]) -> str:
         """The problem of the first drive (by axis) that has one, or ""."""
@@ -37,10 +34,11 @@ class Inspection:
 
     def _problem(self, drive: Drive) -> str:
         channel, motion = drive.axis.channel, self.motion
-        state, last = self.states[channel], self.before[channel]
+        state, last = self.newest.states[channel], self.before.states[channel]
+        seconds = self.newest.time - self.before.time
         unlimited = motion is not None and motion.unlimited
         problem = "" if self._is_at_home(drive) else motor_problem(drive, state, last)
-        problem = problem or position_problem(drive, state, last, self.seconds, unlimited=unlimited)
+        problem = problem or position_problem(drive, state, last, seconds, unlimited=unlimited)
         if problem or self.stopping:
             return problem
         leg = None if motion is None else motion.leg
@@ -52,6 +50,5 @@ class Inspection:
     def _is_at_home(self, drive: Drive) -> bool:
         """Whether the axis has reached the limit switch that is its home, where its controller stops it."""
         home = None if self.motion is None else self.motion.home
-        return (
-            home is not None and home.name == drive.name and at_home(drive, self.states[drive.axis.channel])
-        )
+        state = self.newest.states[drive.axis.channel]
+        return home is not None and home.name == drive.name and at_home(drive, state)

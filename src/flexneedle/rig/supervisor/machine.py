@@ -66,3 +66,11 @@ def after(state: State, event: Event) -> State | None:
 def accepted(state: State) -> tuple[Event, ...]:
     """The events that a state accepts, for messages."""
     return tuple(event for event in Event if (state, event) in TABLE)
+
+
+def refusal(state: State, event: Event, why: str, *, moving: bool) -> str:
+    """Why an event is refused in this state, or "". why: the reason of the state; moving: whether motors still move."""
+    because = f": {why}" if why else ""
+    if after(state, event) is None:
+        return f"{event}: refused while {state}{because}; accepted: {', '.join(accepted(state))}"
+    return f"{event}: refused: motors have not come to rest yet{because}" if moving else ""

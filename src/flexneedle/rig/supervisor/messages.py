@@ -160,8 +160,8 @@ class Report:
 
     time: of the tick (s); state, why: of the rig, and the reason of a stop, hold or fault; axes: by name;
     measurements: since the last report, oldest first; tracker: its status; reached: whether the motors could be read;
-    late, work: how much later than scheduled
-    the tick began, and how long it took (s); missed: ticks left out since the start.
+    late, work: how much later than scheduled the tick began, and how long it took (s); missed: ticks left out since the
+    start.
     """
 
     time: float

@@ -13,7 +13,8 @@ from flexneedle.rig.supervisor.trajectory import Trajectory, between
 from flexneedle.scenario.rig import LoopSettings
 
 SETTLE_S = 0.5
-"""Longest time (s) from the end of a trajectory until its motors have arrived, and that they rest on the way."""
+"""Longest time (s) from the end of a trajectory until its motors have arrived."""
+_STUCK_S = 0.3  # longest time that motors rest away from their targets
 _MOST_WAITED = 10.0  # times its duration: slower motors do not do what they are commanded
 
 
@@ -103,7 +104,7 @@ class Leg:
         """Whether the motors should have arrived long ago, or rest away from their targets."""
         duration = self.trajectory.duration
         latest = self.begun + min(self.waited, _MOST_WAITED * duration) + duration
-        stuck = now > max(self.begun, self.marked[1]) + SETTLE_S and any(
+        stuck = now > max(self.begun, self.marked[1]) + _STUCK_S and any(
             abs((self.sent[name] - states[name].position) / drive.axis.scale) > drive.axis.tolerance
             for name, drive in self.drives.items()
         )

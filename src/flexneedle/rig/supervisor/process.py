@@ -24,6 +24,7 @@ from flexneedle.rig.devices.registry import open_motors, open_tracker
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.core import Supervisor
 from flexneedle.rig.supervisor.dry import DryMotors
+from flexneedle.scenario.problems import unexpected
 from flexneedle.types import Frame
 
 _MOST_WAITING = 400  # reports that a client has not taken: 10 s
@@ -80,6 +81,9 @@ def main(descriptor: int) -> None:
         why = _serve(connection, task, outbox)
     except FlexneedleError as error:
         why = one_line(error)
+    except Exception as error:
+        why = f"the supervisor failed: {unexpected(error)}"
+        raise
     finally:
         outbox.put(say.Ended(why))
         outbox.close()

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from flexneedle.rig.monitor import rules
-from flexneedle.rig.monitor.monitor import Monitor
+from flexneedle.rig.monitor.monitor import Monitor, TipAt
 from flexneedle.rig.supervisor.messages import Expectation
 from flexneedle.types import OK, VISIBLE, Measurement, Point, Verdict, VerdictKind
 
@@ -71,8 +71,8 @@ class Watch:
         """
         monitor, verdict = self.monitor, OK
         for one in measurements:
-            at = tuple(value or 0.0 for value in (one.x, one.y, one.z))
-            monitor, verdict = monitor.check(one, lambda _, at=at: at, now, self.stale_after, math.inf)  # type: ignore[misc]
+            here = _always((one.x or 0.0, one.y or 0.0, one.z or 0.0))
+            monitor, verdict = monitor.check(one, here, now, self.stale_after, math.inf)
         if measurements:
             monitor, _ = monitor.check_field()
             verdict = verdict if verdict.kind in _NEVER else OK
@@ -97,3 +97,8 @@ class Watch:
             for begin, end in zip(self.expected.begin, self.expected.end, strict=True)
         )
         return x, y, z
+
+
+def _always(place: Point) -> TipAt:
+    """A tip that is expected at one place at any time."""
+    return lambda _: place

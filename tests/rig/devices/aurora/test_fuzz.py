@@ -1,10 +1,10 @@
 """Short versions of studies/fuzz_aurora.py, and that it notices what must not be."""
 
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
 from random import Random
-from time import monotonic
 
 import pytest
 from hypothesis import given, settings
@@ -14,11 +14,12 @@ from flexneedle.rig.devices.aurora.incoming import Incoming
 from flexneedle.rig.devices.aurora.messages import parse
 from flexneedle.rig.emulator import aurora, codec
 from flexneedle.rig.supervisor.watch import Watch
-from flexneedle.types import OK, Frame, SensorReading
+from flexneedle.types import OK, VISIBLE, Frame, SensorReading
 
 sys.path.append(str(Path(__file__).parents[4] / "studies"))  # behind the tests: both have an `emulated`
 import fuzz_aurora
 import fuzz_aurora_line
+import fuzzing
 
 SECONDS = 60.0
 FINITE = st.floats(allow_nan=True, allow_infinity=True)
@@ -29,15 +30,15 @@ JSON = st.recursive(
 )
 
 
-@pytest.mark.parametrize("part", fuzz_aurora.PARTS)
+@pytest.mark.parametrize("part", [name for name in fuzz_aurora.PARTS if name != "live"])
 def test_a_few_thousand_inputs_of_each_part_give_what_they_must(part):
-    assert fuzz_aurora.run(part, 4000, SECONDS, seed=7)[0] == 4000
+    assert fuzzing.run(fuzz_aurora.PARTS[part], 4000, SECONDS, seed=7)[0] == 4000
 
 
 @pytest.mark.long
 def test_a_line_that_damages_replies_gives_no_frame_that_was_not_sent():
-    replies, note = fuzz_aurora_line.run(monotonic() + 6.0, Random(3))
-    assert replies > 100, note
+    _, note = fuzzing.run(fuzz_aurora.PARTS["live"], 1000, 6.0, seed=3)
+    assert int(re.search(r"(\d+) replies", note)[1]) > 100, note
 
 
 @settings(deadline=None, derandomize=True, max_examples=300)
@@ -48,7 +49,9 @@ def test_a_line_that_damages_replies_gives_no_frame_that_was_not_sent():
     pose=st.lists(FINITE, max_size=10) | st.tuples(*[FINITE] * 8),
 )
 def test_a_sensor_has_a_position_only_if_it_is_finite_and_in_range(kind, bits, frame, pose):
-    fuzz_aurora.checked_reading((kind, bits, frame, tuple(pose)), 2)
+    found = fuzz_aurora.checked_reading((kind, bits, frame, tuple(pose)), 2)
+    assert (found.position is None) == (found.status != VISIBLE)
+    assert all(abs(part) < fuzz_aurora.FARTHEST_MM for part in found.position or ())
 
 
 @settings(deadline=None, derandomize=True, max_examples=300)
@@ -57,10 +60,12 @@ def test_a_sensor_has_a_position_only_if_it_is_finite_and_in_range(kind, bits, f
         st.binary(max_size=60) | JSON.map(lambda value: fuzz_aurora.json.dumps(value).encode()), max_size=5
     )
 )
-def test_any_line_is_a_message_or_refused_and_counted(lines):
+def test_any_line_that_is_no_message_is_refused_and_counted(lines):
     feeding = fuzz_aurora.Feeding()
     for number, line in enumerate(lines):
         fuzz_aurora.fed(feeding, line.replace(b"\n", b"") + b"\n", Random(number))
+    assert feeding.incoming.counts.errors.get("crash", 0) == len(lines)
+    assert feeding.incoming.read() == ()
 
 
 @settings(deadline=None, derandomize=True, max_examples=200)
@@ -70,7 +75,10 @@ def test_any_bytes_to_the_emulated_tracker_are_answered(lines):
     for number, line in enumerate(lines):
         checked = codec.parse(line).name.encode() + b":"
         for sent in (line, checked + b"%04X" % codec.crc16(checked)):
-            device = fuzz_aurora.checked_command(device, sent, fuzz_aurora.random_frame(Random(number)))
+            frame = fuzz_aurora.random_frame(Random(number))
+            _, answer = aurora.reply(device, sent, frame)
+            assert answer.endswith(b"\r") or fuzz_aurora.decoded(answer) is not None
+            device = fuzz_aurora.checked_command(device, sent, frame)
 
 
 # What it must notice
@@ -104,7 +112,7 @@ def test_the_fuzz_notices_tracking_that_nothing_began():
 def test_the_fuzz_notices_a_verdict_that_does_not_reject(monkeypatch):
     monkeypatch.setattr(Watch, "after", lambda watch, *_: replace(watch, verdict=OK))
     with pytest.raises(fuzz_aurora.Failure):
-        fuzz_aurora.run("watch", 1000, SECONDS, seed=0)
+        fuzzing.run(fuzz_aurora.watch_inputs, 1000, SECONDS, seed=0)
 
 
 def test_the_line_notices_a_frame_that_was_not_sent_intact():

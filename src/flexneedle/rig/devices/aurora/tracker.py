@@ -17,6 +17,7 @@ from flexneedle.rig.devices.aurora.incoming import Counts, Incoming
 from flexneedle.rig.devices.aurora.library import library_path
 from flexneedle.rig.devices.aurora.readings import NAMES
 from flexneedle.rig.ports import Clock
+from flexneedle.rig.processes import end_process, last_line
 from flexneedle.types import Frame
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.25, 5.0  # before a reconnection
@@ -24,7 +25,6 @@ _CONNECT_S, _SILENT_S = 45.0, 3.0  # a link without messages for longer is kille
 _STOP_S = 2.0
 _PORTS = ("ttyUSB*", "ttyACM*", "cu.usb*")
 _BREAK_EVERY = 3
-_LONGEST_ERROR = 4096  # bytes of what a link that crashed printed
 
 
 class Aurora:
@@ -113,7 +113,8 @@ class Aurora:
                 try:
                     self._listen(link)
                 finally:  # also if it sent what is no message, and would continue
-                    _stop(link)
+                    link.terminate()
+                    end_process(link, _STOP_S)
             self._record_end(link.returncode, errors)
         return self._incoming.connections > before
 
@@ -146,14 +147,12 @@ class Aurora:
         """Record the reason why a link ended if it sent none: a crash, or it was killed."""
         if self._stop.is_set() or code == 0:
             return
-        errors.seek(max(0, errors.seek(0, os.SEEK_END) - _LONGEST_ERROR))
-        lines = errors.read().decode(errors="replace").strip().splitlines()
         problem = (
             "no reply: the link does not respond"
             if code == -signal.SIGKILL
             else f"the link ended with exit code {code}"
         )
-        self._incoming.crashed(lines[-1] if lines else problem)
+        self._incoming.crashed(last_line(errors) or problem)
 
 
 def _command(path: str, may_break: bool) -> list[str]:
@@ -178,13 +177,3 @@ def _descriptor(link: subprocess.Popen[bytes]) -> int:
     if link.stdout is None:
         raise RunError("the link has no output")
     return link.stdout.fileno()
-
-
-def _stop(link: subprocess.Popen[bytes]) -> None:
-    """Ask a link to stop the tracker and end; kill it after a timeout."""
-    link.terminate()
-    try:
-        link.wait(_STOP_S)
-    except subprocess.TimeoutExpired:
-        link.kill()
-        link.wait()

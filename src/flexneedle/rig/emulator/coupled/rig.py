@@ -18,6 +18,7 @@ from flexneedle.rig.emulator.coupled.job import Job
 from flexneedle.rig.emulator.faults import FaultKind, parse_fault, parse_order
 from flexneedle.rig.emulator.galil import server as galil
 from flexneedle.rig.emulator.orders import Orders
+from flexneedle.rig.processes import end_process
 
 DEVICES: Mapping[str, Mapping[str, FaultKind]] = {"aurora": aurora.FAULTS, "galil": galil.FAULTS}
 """Kinds of fault by device."""
@@ -178,11 +179,7 @@ class EmulatedRig:
             if part.process.stdin is not None:
                 part.process.stdin.close()
         for part in self._parts.values():
-            try:
-                part.process.wait(_END_S)
-            except subprocess.TimeoutExpired:
-                part.process.kill()
-                part.process.wait()
+            end_process(part.process, _END_S)
             self._last_words(part)
 
     def _last_words(self, part: _Part) -> None:

@@ -1,0 +1,93 @@
+"""What `flexneedle insert` prints at the end of an insertion."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+from flexneedle.console.common import entry_rows, print_json, print_table, target_row
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from flexneedle.scenario.model import Scenario
+    from flexneedle.types import Insertion
+
+
+def report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:
+    """Print how an insertion ended, and where its record is; return the exit status."""
+    from flexneedle.runs.recording import BY_USER
+    from flexneedle.trace.results import insertion_result, insertion_timing
+    from flexneedle.types import Outcome
+
+    if insertion.outcome is Outcome.INTERRUPTED:
+        why = "" if insertion.reason == BY_USER else f": {insertion.reason}"
+        print(f"flexneedle: interrupted{why}; record: {folder}", file=sys.stderr)
+        return 130
+    if as_json:
+        result, timing = insertion_result(insertion), insertion_timing(insertion)
+        print_json({**result, "run_dir": str(folder), "timing": timing})
+    else:
+        if not insertion.plan.reached:
+            print(f"flexneedle: warning: the plan {insertion.plan.summary}", file=sys.stderr)
+        _table(scenario, insertion, folder)
+    return 0 if insertion.reached else 1
+
+
+def _table(scenario: Scenario, insertion: Insertion, folder: Path) -> None:
+    from flexneedle.trace.results import insertion_result, insertion_timing
+
+    result, timing = insertion_result(insertion), insertion_timing(insertion)
+    rows = [
+        ("controller", insertion.controller),
+        _needle(insertion),
+        target_row(scenario, insertion.target),
+        *entry_rows(scenario, insertion.plan),
+        ("true tip to target", _number(result["true_error_mm"], "mm")),
+        ("  measured", _number(result["residual_mm"], "mm")),
+        ("  planned", _number(result["planned_error_mm"], "mm")),
+        *_registration(scenario, insertion),
+        ("strain energy of the true tissue", _number(result["strain_energy_mj"], "mJ")),
+        ("  planned", _number(result["planned_strain_energy_mj"], "mJ")),
+        (scenario.setup.turns, str(insertion.flips)),
+        ("  planned", str(insertion.plan.flips)),
+        ("control periods", str(result["steps"])),
+        *([("waited", _number(insertion.held_s, "s"))] if insertion.held_s > 0.0 else []),
+        *([("late decisions", str(insertion.late))] if insertion.late else []),
+        ("planning time", _number(timing["plan_seconds"], "s")),
+        ("median period time", _number(timing["period_ms"]["p50"], "ms")),
+        *_ticks(insertion),
+    ]
+    print_table(insertion.summary[:1].upper() + insertion.summary[1:], rows, folder)
+
+
+def _needle(insertion: Insertion) -> tuple[str, str]:
+    """Row of what had the needle."""
+    if not insertion.rig:
+        return "phantom", insertion.phantom
+    virtual = " (did not move: the needle is the virtual phantom's)" if insertion.dry_run else ""
+    return "rig", f"{insertion.rig}{virtual}"
+
+
+def _ticks(insertion: Insertion) -> list[tuple[str, str]]:
+    """Rows of a rig: the times of its ticks."""
+    if not insertion.ticks:
+        return []
+    found = insertion.ticks
+    times = (
+        f"{found['late_p99_ms'] + found['work_p99_ms']:.2f} ms (99 %), longest {found['work_max_ms']:.2f} ms"
+    )
+    return [("ticks", f"{found['count']:.0f}, {times}, {found['missed']:.0f} missed")]
+
+
+def _registration(scenario: Scenario, insertion: Insertion) -> list[tuple[str, str]]:
+    from flexneedle.rig.tracking.registration import expected_error
+
+    if scenario.tracker.registration is None:
+        return []
+    error = expected_error(scenario.tracker.registration, insertion.target)
+    return [("  expected registration error", _number(error, "mm"))]
+
+
+def _number(value: float | None, unit: str) -> str:
+    return "unknown" if value is None else f"{value:.3f} {unit}"

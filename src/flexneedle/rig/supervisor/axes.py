@@ -1,0 +1,173 @@
+"""The axes of a rig over their motors: what was read of them last, and where they were last sent."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from flexneedle.errors import DriverError
+from flexneedle.rig.ports import Clock, Motors, MotorState
+from flexneedle.rig.supervisor.checks import at_home, rests
+from flexneedle.rig.supervisor.drives import Drive
+from flexneedle.rig.supervisor.messages import AxisState
+from flexneedle.rig.supervisor.motion import Leg, leg_of, positions
+from flexneedle.scenario.rig import RigFile
+
+_SLOWEST_SHARE, _SLOWEST = 0.01, 10.0  # of the largest speed, and counts/s
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The states of the motors by channel, and when they were read (s)."""
+
+    states: Mapping[str, MotorState]
+    time: float
+
+
+class RigAxes:
+    """Drives by axis, their motors, the last reading and the one before it, and where motors were last sent (counts by
+    channel).
+
+    lost: whether the motors could not be reached, so that they are not known to
+    rest, until they are stopped. Calls of motors raise DriverError.
+    """
+
+    def __init__(self, rig: RigFile, motors: Motors, clock: Clock) -> None:
+        self.drives = {name: Drive(name, axis) for name, axis in rig.axes.items()}
+        self._motors, self._clock = motors, clock
+        self._loop = rig.loop
+        self.lost = False
+        self.newest = self.before = self._read()
+        self.take_positions()
+
+    @property
+    def states(self) -> Mapping[str, MotorState]:
+        """The states of the last reading."""
+        return self.newest.states
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether all motors are known to rest."""
+        return not self.lost and all(
+            rests(drive, self.state(drive), self.before.states[drive.axis.channel])
+            for drive in self.drives.values()
+        )
+
+    @property
+    def positions(self) -> dict[str, float]:
+        """Measured positions (mm or rad) by axis."""
+        return positions(self.drives, self.states)
+
+    @property
+    def slowing(self) -> float:
+        """Longest time (s) in which an axis slows down from its largest speed."""
+        return max(drive.axis.speed / drive.axis.acceleration for drive in self.drives.values())
+
+    def shown(self, leg: Leg | None) -> dict[str, AxisState]:
+        """Position, motor, and motion in the queue by axis, for reports. leg: under way."""
+        at, queued = self.positions, {} if leg is None else leg.queued(self.states)
+        return {
+            name: AxisState(at[name], self.state(drive), queued.get(name, 0.0))
+            for name, drive in self.drives.items()
+        }
+
+    def state(self, drive: Drive) -> MotorState:
+        """The state of an axis's motor."""
+        return self.newest.states[drive.axis.channel]
+
+    def at_home(self, drive: Drive) -> bool:
+        """Whether an axis is at the limit switch of its home, and rests there."""
+        return at_home(drive, self.state(drive))
+
+    def goal(self, name: str) -> float:
+        """Where an axis was last sent, or where it was when it last was stopped (mm or rad)."""
+        drive = self.drives[name]
+        return drive.position(self.goals[drive.axis.channel])
+
+    # Where the axes are taken to be
+
+    def settle(self) -> None:
+        """Take where motors rest as where they were sent: a servo that lags still moves to where its controller has
+        it."""
+        self.goals = {
+            channel: state.commanded if state.on else state.position for channel, state in self.states.items()
+        }
+
+    def take_positions(self) -> None:
+        """Take where the motors are as where they were sent, and as reported."""
+        self.settle()
+        self._reported = self.positions
+
+    def take_travel(self) -> dict[str, float]:
+        """The travel (mm or rad) by axis from where the motion before was reported to have ended, so that what motors
+        settle since then counts, too."""
+        at, before = self.positions, self._reported
+        self._reported = at
+        return {name: at[name] - before[name] for name in at}
+
+    # Calls of the motors
+
+    def read(self) -> None:
+        """Read the states of all motors."""
+        with self._reached():
+            self.before, self.newest = self.newest, self._read()
+
+    def power_on(self) -> None:
+        """Switch all motors on."""
+        with self._reached():
+            for drive in self.drives.values():
+                self._motors.power(drive.axis.channel, True)
+
+    def call_home(self, name: str) -> None:
+        """Call the present position of an axis its home."""
+        drive = self.drives[name]
+        with self._reached():
+            self._motors.define(drive.axis.channel, drive.counts(drive.axis.at_home))
+        self.read()
+        self.take_positions()
+
+    def stop(self) -> None:
+        """Stop all motors; those that were lost are connected again before."""
+        with self._reached():
+            if self.lost:
+                self._motors.reconnect()
+            self._motors.stop()
+            self.lost = False
+
+    def leg(self, travel: Mapping[str, float], duration: float, now: float) -> Leg | None:
+        """The leg of a travel (mm or rad by axis) from where the axes were last sent; None where nothing moves."""
+        leg = leg_of(self.drives, self.goals, travel, duration, now)
+        if leg is not None:
+            self.drives |= {drive.name: drive for drive in leg.drives.values()}
+        return leg
+
+    def begin(self, leg: Leg, now: float) -> None:
+        """Set the speeds of a leg, and send its first targets."""
+        for channel, speed in leg.trajectory.speeds.items():
+            axis = leg.drives[channel].axis
+            fastest = axis.speed * abs(axis.scale)
+            # Controllers round small speeds, to 0 as well; a motor that is faster waits for its next target.
+            slowest = min(fastest, max(_SLOWEST_SHARE * fastest, _SLOWEST))
+            self._motors.set_speed(channel, max(speed, slowest), axis.acceleration * abs(axis.scale))
+        self.follow(leg, now)
+
+    def follow(self, leg: Leg, now: float) -> None:
+        """Send the targets of a leg, with no more motion than the queue."""
+        self._motors.follow(leg.targets(now, self._loop, self.states))
+
+    def keep_goal(self, leg: Leg) -> None:
+        """Take the goal of a leg as where its motors were sent."""
+        self.goals |= leg.trajectory.goal
+
+    def _read(self) -> Reading:
+        begun = self._clock.now()
+        states = dict(self._motors.read())
+        return Reading(states, 0.5 * (begun + self._clock.now()))
+
+    @contextmanager
+    def _reached(self) -> Iterator[None]:
+        """A call without which nothing is known of the motors."""
+        try:
+            yield
+        except DriverError:
+            self.lost = True
+            raise

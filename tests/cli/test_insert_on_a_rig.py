@@ -1,0 +1,87 @@
+"""`flexneedle insert --rig`: it plans, opens the rig, shows where the axes are, and asks before anything moves."""
+
+import json
+from types import SimpleNamespace
+
+import pytest
+import tomli_w
+
+import fake_engine
+from bench_rig import values
+from commands import run
+from flexneedle.rig import insert as insertion
+
+pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
+
+KINDS = {"driver.kind": "bench_rig:drivers", "tracker.kind": "bench_rig:trackers"}
+POSITIONS = {"insertion": 30.0, "rotation": 0.0, "guide_y": -1.5}
+INSERT = ("insert", "phantom", "--rig", "rig.toml", "--out", "run")
+
+
+@pytest.fixture
+def events(monkeypatch, in_tmp, engine):
+    """What happens, in order: the plan, the rig that is opened, the needle that is inserted."""
+    found = []
+    engine()
+    (in_tmp / "rig.toml").write_text(tomli_w.dumps(values(KINDS)))
+
+    def inserted(*given, watchers, **options):
+        found.append("opened")
+        watchers.opened(SimpleNamespace(positions=POSITIONS))
+        found.append("inserted")
+        return fake_engine.insert(*given, **options)
+
+    monkeypatch.setattr(insertion, "insert", inserted)
+    return found
+
+
+def types(monkeypatch, answer, found):
+    def readline():
+        found.append("asked")
+        return answer
+
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True, readline=readline))
+
+
+def test_the_axes_of_the_open_rig_are_shown_before_the_question(capsys, monkeypatch, events):
+    types(monkeypatch, "y\n", events)
+    status, out, err = run(capsys, *INSERT)
+    assert events == ["opened", "asked", "inserted"]
+    assert err.index("Planning") < err.index("insertion: at 30 mm, moves at most at 10 mm/s")
+    assert "guide_y: at -1.5 mm, moves at most at 5 mm/s" in err
+    assert err.index("guide_y: at") < err.index("Insert? [y/N]")
+    assert status == 0
+    assert out.startswith("Reached")
+
+
+@pytest.mark.parametrize("answer", ["n\n", "\n", ""])
+def test_an_insertion_that_is_not_confirmed_moves_nothing(capsys, monkeypatch, events, in_tmp, answer):
+    types(monkeypatch, answer, events)
+    status, _, err = run(capsys, *INSERT)
+    assert events == ["opened", "asked"]
+    assert status == 1
+    assert err.endswith("flexneedle: not confirmed: nothing was moved\n")
+    stored = json.loads((in_tmp / "run/run.json").read_text())
+    assert stored["result"]["outcome"] == "refused"
+
+
+def test_without_a_terminal_it_is_refused_before_planning(capsys, monkeypatch, events, in_tmp):
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: False))
+    status, _, err = run(capsys, *INSERT)
+    assert (status, events) == (2, [])
+    assert "no terminal to confirm the motion on: use --yes to move without asking" in err
+    assert not (in_tmp / "run").exists()
+
+
+def test_with_yes_the_axes_are_shown_and_nothing_is_asked(capsys, events):
+    status, _, err = run(capsys, *INSERT, "--yes")
+    assert (status, events) == (0, ["opened", "inserted"])
+    assert "rotation: at 0 deg, moves at most at 360 deg/s" in err
+    assert "[y/N]" not in err
+
+
+def test_a_dry_run_moves_nothing_and_asks_nothing(capsys, monkeypatch, events):
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: False))
+    status, _, err = run(capsys, *INSERT, "--dry-run")
+    assert (status, events) == (0, ["opened", "inserted"])
+    assert "[y/N]" not in err
