@@ -303,7 +303,7 @@ ACTIONS: dict[str, Callable[[GalilMotors, Random], object]] = {
     "stop": lambda motors, _: motors.stop(),
     "define": lambda motors, random: motors.define("A", random.uniform(-1e4, 1e4)),
     "power": lambda motors, random: motors.power("B", random.random() < 0.5),
-    "describe": lambda motors, _: motors.describe(),
+    "setup": lambda motors, _: motors.setup(),
     "reconnect": lambda motors, _: motors.reconnect(),
 }
 CALLS = ("read", "read", "follow", *ACTIONS)

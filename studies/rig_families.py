@@ -34,7 +34,7 @@ from rig_trials import Inserted, Witness, inserted, resumed, witness
 import flexneedle
 from flexneedle.scenario.files import dump_scenario
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.rig import RIGS
+from flexneedle.scenario.rig import RIGS, LoopSettings
 from flexneedle.scenario.worlds import has_rig, world
 
 FIRST_WORLD, FIRST_SEED = 13_000_000, 730_000
@@ -336,12 +336,12 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
             [row["queued"]["insertion_mm"] for row in moved],
         ]
         axes[1].plot(*queue, "o", color=colour, alpha=0.5, markersize=4, label=mode)
-    axes[0].plot([1e-3, 2.0], [1e-3, 2.0], color="0.6", linewidth=1.0, zorder=0)
+    axes[0].plot([1e-3, 2.0], [1e-3, 2.0], color="0.4")
     axes[0].set(xlabel="error in simulated time (mm)", ylabel="true error on the emulated rig (mm)")
-    axes[1].axhline(0.5, color="0.6", linewidth=1.0, zorder=0)
-    axes[1].set(
-        xlabel="speed of the insertion (mm/s)", ylabel="largest motion in the queue (mm)", ylim=(0.0, None)
-    )
+    axes[0].set_title("grey: equal")
+    axes[1].axhline(LoopSettings().queue_mm, color="0.4")
+    axes[1].set(xlabel="speed of the insertion (mm/s)", ylabel="largest motion in the queue (mm)")
+    axes[1].set(ylim=(0.0, None), title="grey: loop.queue_mm")
     for axis in axes:
         axis.grid(color="0.92")
         axis.set_axisbelow(True)

@@ -15,7 +15,7 @@ OLD = {
 }  # fmt: skip
 NEW = OLD | {"timing": 1, "from_motion_s": 0.75}
 QUIET = OLD | {
-    "group": "tracker", "fault": "missing for 0.1 s", "outcome": "done", "state": None, "detection_s": None,
+    "group": "computer", "fault": "clock set back by 1 h", "outcome": "done", "state": None, "detection_s": None,
     "motion_mm": None,
 }  # fmt: skip
 
@@ -53,6 +53,12 @@ def test_an_insertion_that_must_continue_is_neither_held_nor_stopped(tmp_path):
     held = QUIET | {"state": "holding", "why": "missing: tip not measured (missing)", "detection_s": 0.1}
     assert row(tmp_path, QUIET) == (["–", "–", "1 of 1"], 0)
     assert row(tmp_path, QUIET, held) == (["–", "–", "1 of 2"], 1)
+
+
+def test_a_gap_as_long_as_the_monitors_limit_may_be_a_hold(tmp_path):
+    gap = QUIET | {"group": "tracker", "fault": "missing for 0.1 s"}
+    held = gap | {"state": "holding", "why": "missing: tip not measured (missing)", "detection_s": 0.1}
+    assert row(tmp_path, gap, held) == (["–", "–", "2 of 2"], 0)
 
 
 def judged(name, states, time, base):

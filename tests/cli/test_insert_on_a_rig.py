@@ -9,6 +9,7 @@ import tomli_w
 import fake_engine
 from bench_rig import values
 from commands import run
+from flexneedle.errors import RunError
 from flexneedle.rig import insert as insertion
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
@@ -19,7 +20,7 @@ INSERT = ("insert", "phantom", "--rig", "rig.toml", "--out", "run")
 
 
 @pytest.fixture
-def events(monkeypatch, in_tmp, engine):
+def events(monkeypatch, in_tmp, engine, ends):
     """What happens, in order: the plan, the rig that is opened, the needle that is inserted."""
     found = []
     engine()
@@ -29,10 +30,16 @@ def events(monkeypatch, in_tmp, engine):
         found.append("opened")
         watchers.opened(SimpleNamespace(positions=POSITIONS))
         found.append("inserted")
-        return fake_engine.insert(*given, **options)
+        return fake_engine.insert(*given, **(options | ends))
 
     monkeypatch.setattr(insertion, "insert", inserted)
     return found
+
+
+@pytest.fixture
+def ends():
+    """Options of the fake loop."""
+    return {}
 
 
 def types(monkeypatch, answer, found):
@@ -78,6 +85,33 @@ def test_with_yes_the_axes_are_shown_and_nothing_is_asked(capsys, events):
     assert (status, events) == (0, ["opened", "inserted"])
     assert "rotation: at 0 deg, moves at most at 360 deg/s" in err
     assert "[y/N]" not in err
+
+
+@pytest.mark.parametrize("outcome", ["held", "failed", "interrupted"])
+def test_where_the_needle_is_left_in_the_command_that_withdraws_it_is_named(capsys, events, ends, outcome):
+    ends["outcome"] = outcome
+    _, _, err = run(capsys, *INSERT, "--yes")
+    line = "flexneedle: the needle is still in: withdraw it by flexneedle rig retract rig.toml"
+    assert events[-1] == "inserted"
+    assert err.splitlines()[-1] == line
+    _, _, err = run(capsys, *INSERT[:-1], "dry", "--dry-run")
+    assert line not in err
+
+
+def test_a_needle_at_its_target_has_no_such_line(capsys, events):
+    _, _, err = run(capsys, *INSERT, "--yes")
+    assert events[-1] == "inserted"
+    assert "still in" not in err
+
+
+def test_an_error_after_the_first_motion_leaves_the_needle_in(capsys, events, ends):
+    def broken():
+        raise RunError("the model has ended")
+
+    ends["stop"] = 3, broken
+    status, _, err = run(capsys, *INSERT, "--yes")
+    assert (status, events[-1]) == (1, "inserted")
+    assert "flexneedle: the needle is still in: withdraw it by" in err
 
 
 def test_a_dry_run_moves_nothing_and_asks_nothing(capsys, monkeypatch, events):

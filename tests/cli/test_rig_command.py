@@ -161,6 +161,14 @@ def test_json_has_every_finding(capsys, file, device):
 
 
 @pytest.mark.usefixtures("quick")
+def test_an_unknown_profile_of_topics_is_a_problem(capsys, file):
+    status, out, _ = run(capsys, "rig", "check", file({"ros.profile": "nope"}), "--json")
+    (found,) = [one for one in json.loads(out)["findings"] if one["part"] == "ros"]
+    assert (found["found"], status) == ("nope", 1)
+    assert "no such profile (choices: " in found["problem"]
+
+
+@pytest.mark.usefixtures("quick")
 def test_a_plan_that_steers_needs_no_guide(capsys, file):
     small = file({"axes.guide_y": None})
     _, out, _ = run(capsys, "rig", "check", small, "--scenario", "phantom")
@@ -324,6 +332,13 @@ def test_what_must_not_be_is_refused_before_anything_moves(capsys, file, device,
     assert status == 2
     assert line in err
     assert (supervisor.calls, device.calls) == ([], [])
+
+
+def test_a_base_that_is_at_its_lowest_position_is_not_retracted(capsys, file, device, supervisor):
+    device.set("A", position=0.0, commanded=0.0)
+    status, _, err = run(capsys, "rig", "retract", file(), "--yes")
+    assert (status, supervisor.calls, device.calls) == (0, [], [])
+    assert err == "flexneedle: insertion is at 0 mm: nothing to retract\n"
 
 
 def test_several_axes_are_homed_one_after_the_other(capsys, file, device, supervisor):

@@ -11,6 +11,9 @@ from flexneedle.console.values import finite, positive, seed
     ("kind", "text", "rule"),
     [
         (seed, "-1", "-1: must be at least 0"),
+        (seed, "x", "x: must be a whole number of at least 0"),
+        (finite, "x", "x: must be a finite number"),
+        (positive, "fast", "fast: must be a finite number above 0"),
         (finite, "inf", "inf: must be a finite number"),
         (finite, "nan", "nan: must be a finite number"),
         (positive, "0", "0: must be a finite number above 0"),

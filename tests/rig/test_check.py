@@ -1,13 +1,18 @@
 """`rig check` compares each device with the file, and moves, powers and changes nothing."""
 
+from contextlib import closing
+
 import pytest
 
 import bench_rig
 from bench_rig import Clock, Motors, Tracker, rig
 from flexneedle.errors import RunError
 from flexneedle.rig.check import Finding, Wanted, check_rig, motors, tracker
+from flexneedle.rig.devices.galil.motors import factory
+from flexneedle.rig.emulator.galil.controller import reply
 from flexneedle.scenario.files import load_scenario
 from flexneedle.types import Frame, SensorReading
+from galil_peer import peer
 
 PLANE = Wanted(load_scenario("phantom").with_values({"monitor.references": 0}))
 KINDS = {"driver__kind": "bench_rig:drivers", "tracker__kind": "bench_rig:trackers"}
@@ -244,6 +249,47 @@ def test_an_identity_is_shown(monkeypatch):
     monkeypatch.setattr(bench_rig, "drivers", lambda _settings, _channels: device)
     findings = check_rig(rig(**KINDS), Clock(), 1.0)
     assert of(findings, "driver", "connection").found == "bench_rig:drivers, DMC4143 Rev 1.3h"
+
+
+def set_up(commands):
+    """The findings on an emulated Galil that was set up by these commands."""
+    with peer() as device:
+        device.device, _ = reply(device.device, commands)
+        given = {"address": f"127.0.0.1:{device.port}", "reply_timeout_ms": 1000}
+        with closing(factory(given, ("A", "B", "C"))) as connected:
+            return motors(rig(), connected, Clock())
+
+
+@pytest.mark.parametrize(
+    ("commands", "axis", "item", "problem"),
+    [
+        (
+            "LDA=1",
+            "insertion",
+            "switches in use",
+            "forward disabled in the controller: it does not stop the motor",
+        ),
+        ("LDB=3", "rotation", "switches in use", "reverse and forward disabled in the controller"),
+        ("FLA=119000", "insertion", "controller's limits", "narrower than range_mm, 0 to 120 mm"),
+        ("FLC=5000", "guide_y", "controller's limits", "narrower than range_mm, -15 to 15 mm"),
+        ("ERA=100;OEA=1", "insertion", "motor off on error", "below max_error_mm (0.2): it comes before"),
+    ],
+)
+def test_what_is_set_up_in_the_controller_is_compared_with_the_file(commands, axis, item, problem):
+    ((where, line),) = problems(set_up(commands)).items()
+    assert where == (axis, item)
+    assert line.startswith(problem)
+
+
+def test_a_controller_that_leaves_the_axes_their_range_has_no_problem():
+    findings = set_up("FLA=121000;BLA=-1000;ERA=400;OEA=1")
+    assert problems(findings) == {}
+    shown = {
+        item: of(findings, "insertion", item).found for item in ("controller's limits", "motor off on error")
+    }
+    assert shown == {"controller's limits": "-1 to 121 mm", "motor off on error": "beyond 0.4 mm"}
+    assert of(findings, "guide_y", "controller's limits").found == "none"
+    assert of(findings, "guide_y", "motor off on error").found == "no"
 
 
 def test_a_scenario_that_does_not_fit_is_a_line_for_each_problem(monkeypatch):

@@ -131,6 +131,7 @@ def test_what_would_move_is_a_line():
         "the position there is called 121.5 mm",
     ]
     assert str(jog(RIG, "rotation", "90", 0.0)) == "rotation: from 0 to 90 deg, at most at 72 deg/s"
+    assert retraction(RIG, 0.0) is retraction(RIG, -0.5) is None, "it is there"
     assert str(retraction(RIG, 30.0)) == "insertion: from 30 to 0 mm, at most at 10 mm/s"
 
 

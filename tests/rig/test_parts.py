@@ -91,7 +91,7 @@ def test_parts_are_found_by_name_module_and_object():
         (
             "controller",
             "lab_parts:FIEN",
-            "lab_parts has no FIEN; public names: Control, Decision, Method, Phantom, decide,",
+            "lab_parts has no FIEN; public names: decide, one, nothing, ",
         ),
         (
             "controller",

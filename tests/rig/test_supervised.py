@@ -16,7 +16,9 @@ from flexneedle.rig.supervised import Columns, SupervisedDriver
 from flexneedle.rig.supervisor.machine import State
 from flexneedle.rig.supervisor.messages import Done
 from flexneedle.scenario.rig import load_rig
+from flexneedle.trace.topics import READINGS
 from flexneedle.types import Control
+from traces import contents
 
 PHANTOM = flexneedle.load_scenario("phantom")
 SPACE = flexneedle.load_scenario("phantom3d")
@@ -110,6 +112,20 @@ def test_a_reading_is_expected_on_the_line_of_the_needle():
     assert expected.most_off == pytest.approx(2.0 + 3 * 0.2)
 
 
+OF_A_PHANTOM = ("/needle/true_shape", "/tip/true", "/tissue/true_strain_energy")
+
+
+def assert_trace_of_a_simulated_run(done, folder, without):
+    """It has the same topics, types and names of values, without the truth, which only a phantom knows."""
+    simulated = flexneedle.insert(done.scenario, done.plan, done.seed)
+    recorded = contents(flexneedle.save(done, folder / "recorded"))
+    expected = contents(flexneedle.save(simulated, folder / "simulated"))
+    assert set(expected) - set(recorded) == set(without)
+    assert recorded[READINGS][1] >= expected[READINGS][1]  # a tracker may report more sensors
+    expected[READINGS] = recorded[READINGS]
+    assert recorded == {topic: found for topic, found in expected.items() if topic not in without}
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("dry", [False, True])
 def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
@@ -128,6 +144,7 @@ def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
     assert done.reached
     assert done.ticks["count"] > 100
     assert done.dry_run is dry
+    assert_trace_of_a_simulated_run(done, tmp_path, without=() if dry else OF_A_PHANTOM)
     if dry:
         assert np.ptp(found.positions["insertion"]) == 0.0
         assert done.true_error_mm < 0.3

@@ -1,4 +1,4 @@
-"""Writes docs/rig/file.md from the models of rig files and shipped trackers, and the advice in rig_advice.toml.
+"""Writes docs/rig/file.md from the models of rig files and shipped devices, and the advice in rig_advice.toml.
 
 python tools/docs/rig_reference.py
 """
@@ -9,13 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from flexneedle.rig.devices.trackers import AuroraSettings, ReplaySettings
+from flexneedle.ros.settings import DriverSettings, TrackerSettings
 from flexneedle.scenario.rig import LINEAR_AXES, RigFile
 from scenario_reference import Key, Table, heading, section, tables
 
 HERE = Path(__file__).parent
 PAGE = HERE.parents[1] / "docs" / "rig" / "file.md"
 ADVICE: dict[str, Any] = tomllib.loads((HERE / "rig_advice.toml").read_text(encoding="utf-8"))
-TRACKERS = {"aurora": AuroraSettings, "replay": ReplaySettings}
+SHIPPED: dict[str, dict[str, Any]] = {
+    "driver": {"ros": DriverSettings},
+    "tracker": {"aurora": AuroraSettings, "replay": ReplaySettings, "ros": TrackerSettings},
+}
+"""Settings of the kinds that come with the package, by section; those of `galil` are on its page."""
 _REPEATED = tuple(f"axes.{name}" for name in LINEAR_AXES[1:])  # the keys of the first
 
 
@@ -26,25 +31,24 @@ def page() -> str:
 
 
 def all_tables() -> Iterator[Table]:
-    """Yield the sections of a rig file, that of the tracker followed by the settings of the shipped ones."""
+    """Yield the sections of a rig file, those of driver and tracker followed by the settings of the shipped ones."""
     for table in tables(RigFile.model_json_schema()):
         if table.name in _REPEATED:
             continue
         yield table
-        if table.name == "tracker":
-            yield from map(_shipped, TRACKERS)
+        for kind, model in SHIPPED.get(table.name, {}).items():
+            yield _shipped(f"{table.name}.{kind}", model)
 
 
-def _shipped(kind: str) -> Table:
-    (table,) = tables(TRACKERS[kind].model_json_schema())
-    name = f"tracker.{kind}"
+def _shipped(name: str, model: Any) -> Table:
+    (table,) = tables(model.model_json_schema())
     keys = tuple(Key(f"{name}.{key.name}", key.schema, key.required) for key in table.keys)
     return Table(name, table.about, "", keys)
 
 
 def _title(table: Table) -> str:
-    kind = table.name.removeprefix("tracker.")
-    return f'## `[tracker]` with `kind = "{kind}"`' if kind in TRACKERS else heading(table)
+    part, _, kind = table.name.partition(".")
+    return f'## `[{part}]` with `kind = "{kind}"`' if kind in SHIPPED.get(part, {}) else heading(table)
 
 
 if __name__ == "__main__":

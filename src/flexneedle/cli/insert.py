@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexneedle.cli.inserted import report
+from flexneedle.cli.inserted import print_still_in, report
 from flexneedle.console.commands import Commands, add_command
 from flexneedle.console.common import (
     ARMS,
@@ -121,6 +121,7 @@ def _add_rig(parser: argparse.ArgumentParser) -> None:
 def _insert(args: argparse.Namespace) -> int:
     from flexneedle.runs.recording import check_choices
     from flexneedle.trace.folder import Folder
+    from flexneedle.types import Outcome
 
     if args.list:
         return _list()
@@ -144,6 +145,8 @@ def _insert(args: argparse.Namespace) -> int:
             with _refusal_printed(args, choices, scenario, folder):
                 insertion = _execute(args, folder, scenario, choices, bridge)
             status = report(scenario, insertion, args.json, folder.path)
+            if choices.moves and insertion.periods and insertion.outcome is not Outcome.DONE:
+                print_still_in(args.rig)
     return status or int(bool(folder.problems))
 
 
@@ -190,7 +193,7 @@ def _execute(
         if bridge is not None:
             bridge.show = progress.print_line
         confirm = None
-        if choices.rig is not None and not choices.dry_run:
+        if choices.rig is not None and choices.moves:
             question = "Insert?" if _asks(args, choices) else ""
             confirm = partial(_confirm, progress, scenario, choices.rig, question)
         insertion = record_insertion(
@@ -223,6 +226,9 @@ def _refusal_printed(
         if args.json:
             target = args.target if scenario is None else scenario.target.position
             print_json(_refusal(folder, target, choices, one_line(error)))
+        result = folder and folder.values["result"]
+        if choices.moves and result and result["outcome"] == "failed":
+            print_still_in(args.rig)
         raise
 
 
@@ -268,8 +274,8 @@ def _rig(args: argparse.Namespace, named: Mapping[str, str]) -> RigFile | None:
 
 def _asks(args: argparse.Namespace, choices: Choices) -> bool:
     """Whether motions are confirmed on the terminal: those of motors, unless --yes is given or ROS arms the rig."""
-    rig = choices.rig
-    return rig is not None and not (choices.dry_run or args.yes or (rig.ros is not None and rig.ros.arm))
+    ros = None if choices.rig is None else choices.rig.ros
+    return choices.moves and not (args.yes or (ros is not None and ros.arm))
 
 
 def _confirm(

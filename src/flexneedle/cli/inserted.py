@@ -14,6 +14,11 @@ if TYPE_CHECKING:
     from flexneedle.types import Insertion
 
 
+def print_still_in(rig: str) -> None:
+    """Print how a needle that was left in is withdrawn. rig: as the user gave it."""
+    print(f"flexneedle: the needle is still in: withdraw it by flexneedle rig retract {rig}", file=sys.stderr)
+
+
 def report(scenario: Scenario, insertion: Insertion, as_json: bool, folder: Path) -> int:
     """Print how an insertion ended, and where its record is; return the exit status."""
     from flexneedle.runs.recording import BY_USER
@@ -65,8 +70,7 @@ def _needle(insertion: Insertion) -> tuple[str, str]:
     """Row of what had the needle."""
     if not insertion.rig:
         return "phantom", insertion.phantom
-    virtual = " (did not move: the needle is the virtual phantom's)" if insertion.dry_run else ""
-    return "rig", f"{insertion.rig}{virtual}"
+    return "rig", f"{insertion.rig}{', not moved; virtual needle' if insertion.dry_run else ''}"
 
 
 def _ticks(insertion: Insertion) -> list[tuple[str, str]]:

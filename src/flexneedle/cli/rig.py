@@ -269,7 +269,12 @@ def _retract(args: argparse.Namespace) -> int:
     from flexneedle.scenario.rig import load_rig
 
     rig = load_rig(args.rig)
-    move = retraction(rig, _positions(rig)["insertion"], args.to)
+    position = _positions(rig)["insertion"]
+    move = retraction(rig, position, args.to)
+    if move is None:
+        at = rig.axes.insertion.shown(position)
+        print(f"flexneedle: insertion is at {at} mm: nothing to retract", file=sys.stderr)
+        return 0
     return _carried_out(rig, [move], args.yes, lambda operator: operator.retract(move.goal))
 
 

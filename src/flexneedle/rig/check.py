@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar
 from flexneedle.errors import FlexneedleError, one_line
 from flexneedle.rig.devices.registry import OpenTracker, open_motors, open_tracker
 from flexneedle.rig.fit import fit_problems, queued, room_problems
-from flexneedle.rig.ports import Clock, Motors, MotorState
+from flexneedle.rig.ports import Clock, Motors, MotorSetup, MotorState
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.rig import Axis, RigFile
@@ -102,6 +102,7 @@ def motors(rig: RigFile, device: Motors, clock: Clock, wanted: Wanted | None = N
     """Return what a few readings of the motors show. Raises DriverError if they cannot be read."""
     states, seconds = _read(device, clock)
     found = [_reply(rig, seconds)]
+    setups = _setups(device)
     positions: dict[str, float] = {}
     for name, axis in rig.axes.items():
         state = states.get(axis.channel)
@@ -110,6 +111,8 @@ def motors(rig: RigFile, device: Motors, clock: Clock, wanted: Wanted | None = N
             found.append(Finding(name, "motor", axis.channel, rule))
             continue
         found += _of_axis(name, axis, state)
+        if axis.channel in setups:
+            found += _of_setup(name, axis, setups[axis.channel])
         positions[name] = state.position / axis.scale
     return found + _rooms(rig, positions, wanted)
 
@@ -125,6 +128,12 @@ def _read(device: Motors, clock: Clock) -> tuple[Mapping[str, MotorState], float
     return states, median(times)
 
 
+def _setups(device: Motors) -> Mapping[str, MotorSetup]:
+    """How the controller is set up, by channel; empty where its driver does not report that."""
+    found: Mapping[str, MotorSetup] = device.setup() if hasattr(device, "setup") else {}
+    return found
+
+
 def _reply(rig: RigFile, seconds: float) -> Finding:
     tick = 1.0 / rig.loop.rate_hz
     late = f"longer than a tick of the loop, {1e3 * tick:.4g} ms" if seconds > tick else ""
@@ -137,6 +146,37 @@ def _of_axis(name: str, axis: Axis, state: MotorState) -> Iterator[Finding]:
     yield Finding(name, "limit switches", _switches(state) or "none active", _switch_problem(axis, state))
     if state.on:
         yield _following(name, axis, state)
+
+
+def _of_setup(name: str, axis: Axis, setup: MotorSetup) -> Iterator[Finding]:
+    """What the controller itself does at limits and errors, beside what the rig file has."""
+    off = f"{setup.disabled} disabled in the controller: it does not stop the motor" if setup.disabled else ""
+    yield Finding(name, "switches in use", "all" if not off else "not all", off)
+    low, high = sorted((setup.lowest / axis.scale, setup.highest / axis.scale))
+    narrow = low > axis.limits[0] + axis.tolerance or high < axis.limits[1] - axis.tolerance
+    limits = f"{axis.shown(axis.limits[0])} to {axis.shown(axis.limits[1])} {axis.unit}"
+    rule = f"narrower than range_{axis.unit}, {limits}: motions would end there" if narrow else ""
+    yield Finding(name, "controller's limits", _limits(axis, low, high), rule)
+    yield _error_limit(name, axis, setup)
+
+
+def _limits(axis: Axis, low: float, high: float) -> str:
+    if not (isfinite(low) or isfinite(high)):
+        return "none"
+    ends = (axis.shown(end) if isfinite(end) else "none" for end in (low, high))
+    return f"{' to '.join(ends)} {axis.unit}"
+
+
+def _error_limit(name: str, axis: Axis, setup: MotorSetup) -> Finding:
+    """The controller's own reaction to an error; it shall not come before that of the supervisor."""
+    error = setup.most_error / abs(axis.scale)
+    if not (setup.off_on_error and isfinite(error)):
+        return Finding(name, "motor off on error", "no")
+    most = axis.shown(axis.max_error)
+    rule = (
+        f"below max_error_{axis.unit} ({most}): it comes before the fault" if error < axis.max_error else ""
+    )
+    return Finding(name, "motor off on error", f"beyond {axis.shown(error)} {axis.unit}", rule)
 
 
 def _at_rest(state: MotorState) -> str:

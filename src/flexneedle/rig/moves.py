@@ -95,12 +95,14 @@ def jog(rig: RigFile, name: str, distance: str, position: float, speed: float | 
     return move
 
 
-def retraction(rig: RigFile, position: float, to_mm: float | None = None) -> Move:
-    """Return the motion of the base back to `to_mm`, to the lowest position without it.
+def retraction(rig: RigFile, position: float, to_mm: float | None = None) -> Move | None:
+    """Return the motion of the base back to `to_mm`; without it to the lowest position, None if it is there.
 
     Raises InputError if that is not backwards or beyond the soft limits.
     """
     axis = rig.axes.insertion
+    if to_mm is None and position - axis.limits[0] < 1.0 / abs(axis.scale):
+        return None
     goal = axis.limits[0] if to_mm is None else to_mm
     move = _checked(Move("insertion", axis, position, goal, axis.speed))
     if move.distance > -1.0 / abs(axis.scale):

@@ -85,12 +85,28 @@ class MotorState:
     stopped: str = ""
 
 
+@dataclass(frozen=True)
+class MotorSetup:
+    """How a controller is set up for one motor. Positions in counts.
+
+    lowest, highest: soft limits of the controller itself, infinite where it has none; most_error: difference of
+    commanded and measured position that it takes for an error; off_on_error: whether it then switches the motor off;
+    disabled: limit switches that it ignores, such as "forward", "" for none.
+    """
+
+    lowest: float
+    highest: float
+    most_error: float
+    off_on_error: bool
+    disabled: str = ""
+
+
 class Motors(Protocol):
     """The motors of a rig by channel. It knows counts and channels, neither needles nor plans.
 
     No call takes longer than the reply timeout of the device. Each raises DriverError if the device cannot be reached
-    or refuses the command; the message has the device's reason. A driver may have `identity`, one line that names the
-    controller and its firmware, for `rig check`.
+    or refuses the command; the message has the device's reason. For `rig check` a driver may have `identity`, one line
+    that names the controller and its firmware, and `setup()`, which returns a `MotorSetup` by channel.
     """
 
     def read(self) -> Mapping[str, MotorState]:

@@ -61,6 +61,11 @@ class Choices:
         controller_of(self.controller), plant_of(self.phantom), tracker_of(self.tracker)
 
     @property
+    def moves(self) -> bool:
+        """Whether motors move."""
+        return self.rig is not None and not self.dry_run
+
+    @property
     def parts(self) -> dict[str, Any]:
         """Names of controller, phantom, tracker and rig, and `dry_run`; on a rig phantom and tracker have no name."""
         own = (self.phantom, self.tracker, "") if self.rig is None else ("", "", self.rig.name)

@@ -45,12 +45,24 @@ def attribute(module: str, name: str) -> Any:
     found = _module(module)
     for part in name.split("."):
         if not hasattr(found, part):
-            public = (
-                ", ".join(key for key in getattr(found, "__dict__", ()) if not key.startswith("_")) or "none"
-            )
+            public = ", ".join(_public(found)) or "none"
             raise InputError(f"{module} has no {name}; public names: {public}")
         found = getattr(found, part)
     return found
+
+
+def _public(found: object) -> list[str]:
+    """The public names that a module or a class defines, without what a module imports."""
+    names = [name for name in getattr(found, "__dict__", ()) if not name.startswith("_")]
+    return [name for name in names if not _is_imported(found, getattr(found, name, None))]
+
+
+def _is_imported(module: object, value: object) -> bool:
+    """Whether a value of a module is another module, or a function or class of one."""
+    if not inspect.ismodule(module):
+        return False
+    named = inspect.isclass(value) or inspect.isroutine(value)
+    return inspect.ismodule(value) or (named and value.__module__ != module.__name__)
 
 
 def not_callable_with(found: object, arguments: tuple[str, ...]) -> str:

@@ -395,7 +395,7 @@ class RigFile(Section):
     axes: Axes
     tracker: Part
     registration: Registration | None = None
-    """Map from the tracker's frame to that of the insertion; takes the place of the scenario's."""
+    """In place of the scenario's, where it is set."""
     loop: LoopSettings = LoopSettings()
     ros: RosSettings | None = None
     """Connection to ROS 2. Not set: none."""

@@ -3,6 +3,7 @@
 import json
 import math
 import signal
+import socket
 import subprocess
 from time import monotonic
 
@@ -12,7 +13,7 @@ import pytest
 
 from emulated import DEADLINE_S, read_until, until
 from emulated_rig import emulated_rig, rig_file, started
-from flexneedle.errors import RunError
+from flexneedle.errors import InputError, RunError
 from flexneedle.rig.devices.aurora.tracker import Aurora
 from flexneedle.rig.emulator.coupled.job import Job
 from flexneedle.rig.emulator.coupled.rig import EmulatedRig, _Part
@@ -210,6 +211,19 @@ def test_the_reason_of_a_process_that_fails_is_reported(monkeypatch):
         list(rig._messages(parts["phantom"]))
     rig._end()
     assert [one.process.returncode for one in parts.values()] == [0, 1]
+
+
+def test_an_address_that_is_taken_is_found_out_before_anything_is_started(tmp_path):
+    path = rig_file(tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = f"127.0.0.1:{other.getsockname()[1]}"
+        path.write_text(path.read_text().replace("127.0.0.1:0", taken))
+        rig = EmulatedRig(Job(load_rig(path), load_scenario("phantom")), print)
+        with pytest.raises(InputError) as refused, rig:
+            pass
+    remedy = "cannot be listened on: Address already in use: end what uses it, or choose another port"
+    assert str(refused.value) == f"{taken}: {remedy}"
+    assert rig._parts == {}
 
 
 def test_a_device_that_cannot_begin_is_said_in_one_line(tmp_path):

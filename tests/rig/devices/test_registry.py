@@ -201,7 +201,9 @@ def test_a_package_that_is_broken_is_named(package):
     assert gone.startswith('driver.kind = "gone": no module acme_gone in ')
     assert gone.endswith("(entry point of acme-stage)")
     less = message(open_motors, rig(driver={"kind": "less"}))
-    assert less.startswith('driver.kind = "less": bench_rig has no Nothing; public names: ')
+    names = less.removeprefix('driver.kind = "less": bench_rig has no Nothing; public names: ').split(", ")
+    assert {"Motors", "Tracker", "drivers", "values"} <= set(names)
+    assert not {"copy", "tomllib", "replace", "MotorState"} & set(names), "imported there"
 
 
 @pytest.mark.parametrize(

@@ -68,10 +68,17 @@ def test_a_port_where_nothing_listens_is_refused_in_one_line():
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
     link = Link("127.0.0.1", port)
-    with pytest.raises(DriverError, match=f"^127.0.0.1:{port}: no connection: Connection refused$"):
+    with pytest.raises(
+        DriverError, match=f"^127.0.0.1:{port}: no connection: Connection refused; check the power"
+    ):
         link.open(monotonic() + PATIENT_S)
-    with pytest.raises(DriverError, match="not connected: no connection: Connection refused; reconnect"):
+    with pytest.raises(
+        DriverError, match="not connected: no connection: Connection refused; check the power"
+    ):
         ask(link, "TPA")
+
+
+REMEDY = "check the power, the cable and the address of the controller, and start again"
 
 
 def silent(_line, _true):
@@ -94,7 +101,7 @@ def silent(_line, _true):
 )
 def test_a_connection_whose_replies_are_in_doubt_is_used_no_more(damage, problem):
     with linked(damage) as (link, device):
-        with pytest.raises(DriverError, match=f"^127.0.0.1:{device.port}: {problem}.*TPA.*; reconnect$"):
+        with pytest.raises(DriverError, match=f"^127.0.0.1:{device.port}: {problem}.*TPA.*; {REMEDY}$"):
             ask(link, "TPA", seconds=TIMEOUT_S)
         device.damage = None
         asked = len(device.lines)
@@ -142,7 +149,7 @@ def test_a_connection_that_was_closed_meanwhile_is_noticed():
         link.open(monotonic() + PATIENT_S)
         listening.accept()[0].close()
         until(lambda: link._socket.recv(1, socket.MSG_PEEK) == b"")
-        with pytest.raises(DriverError, match="the controller closed the connection; reconnect"):
+        with pytest.raises(DriverError, match="the controller closed the connection; check the power"):
             ask(link, "TPA")
 
 

@@ -1,5 +1,6 @@
 """The motors of a Galil: what the driver sends, what it refuses, what it reports, on an emulated controller."""
 
+import math
 from contextlib import contextmanager
 from dataclasses import replace
 from time import monotonic
@@ -12,6 +13,7 @@ from emulated import until
 from flexneedle.errors import DriverError
 from flexneedle.rig.devices.galil.motors import factory
 from flexneedle.rig.emulator.galil.controller import Device, reply
+from flexneedle.rig.ports import MotorSetup
 from galil_peer import CLOSE, peer
 
 HELLO = ["EO 0", "\x12\x16", "MG _PF;MG _MTA,_MTB", "TPAB;RPAB;TSAB;SCAB"]
@@ -346,13 +348,13 @@ def test_a_refusal_without_a_reason_is_still_one(answer, reason):
 def test_after_a_reply_that_is_none_nothing_goes_over_the_connection_until_it_is_renewed(damage):
     with driven(timeout_ms=100) as (motors, device):
         device.damage = damage
-        with pytest.raises(DriverError, match=r"; reconnect$"):
+        with pytest.raises(DriverError, match=r"; check the power, .* start again$"):
             motors.read()
         device.damage = None
         until(lambda: device.lines[-1] == "STAB" or damage(None, b"") is CLOSE)
         asked = len(device.lines)
         for call in (motors.read, motors.stop, lambda: motors.follow({"A": 1.0})):
-            with pytest.raises(DriverError, match=r"not connected.*; reconnect$"):
+            with pytest.raises(DriverError, match=r"not connected.*; check the power, .* start again$"):
                 call()
         assert len(device.lines) == asked
         motors.reconnect()
@@ -400,19 +402,12 @@ def test_after_a_limit_the_axis_moves_only_when_told_again():
     assert (state.position, state.stopped, state.forward_limit) == (-50, "", False)
 
 
-def test_a_description_has_what_the_controller_was_set_up_with():
-    with driven(channels=("B",)) as (motors, device):
-        motors.set_speed("B", 5000, 102400)
-        device.device, _ = reply(device.device, "FLB=1000;OEB=1;ERB=200")
-        found = dict(motors.describe())
-    assert found["controller"] == "DMC4143 Rev 1.3d"
-    assert found["sample time (TM)"] == "1000 µs"
-    assert found["B forward software limit (FL)"] == "1000 counts"
-    assert found["B reverse software limit (BL)"] == "none"
-    assert found["B speed (SP)"] == "5000 counts/s"
-    assert found["B motor off on error (OE)"] == "yes"
-    assert found["B position error limit (ER)"] == "200 counts"
-    assert found["B limit switches (LD)"] == "in use"
+def test_the_setup_has_limits_errors_and_disabled_switches_of_the_controller():
+    with driven(channels=("A", "B")) as (motors, device):
+        device.device, _ = reply(device.device, "FLB=1000;OEB=1;ERB=200;LDB=1")
+        found = motors.setup()
+    assert found["A"] == MotorSetup(-math.inf, math.inf, 16384.0, off_on_error=False)
+    assert found["B"] == MotorSetup(-math.inf, 1000.0, 200.0, off_on_error=True, disabled="forward")
 
 
 @settings(deadline=None, derandomize=True, max_examples=200)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from flexneedle.errors import DriverError
 from flexneedle.rig.devices.galil.link import Link
-from flexneedle.rig.devices.galil.replies import GarbledError, numbers, text
+from flexneedle.rig.devices.galil.replies import GarbledError, numbers, printable, text
 
 _REASON = "TC1"
 
@@ -20,7 +20,7 @@ class Dialogue:
     def do(self, commands: Sequence[str], deadline: float) -> None:
         """Have commands carried out."""
         if any(self._data(commands, deadline)):
-            raise self._link.failed(f"data in the reply to {'; '.join(commands)}")
+            raise self._link.failed(f"data in the reply to {printable(commands)}")
 
     def numbers(
         self, queries: Sequence[str], counts: Sequence[int], deadline: float
@@ -30,7 +30,7 @@ class Dialogue:
         try:
             return [numbers(data, count) for data, count in zip(found, counts, strict=True)]
         except GarbledError as error:
-            raise self._link.failed(f"{error} (to {'; '.join(queries)})") from None
+            raise self._link.failed(f"{error} (to {printable(queries)})") from None
 
     def text(self, query: str, deadline: float) -> str:
         """Return the line of text that answers a query."""
@@ -45,7 +45,7 @@ class Dialogue:
         refused = [command for command, reply in zip(commands, replies, strict=True) if not reply.accepted]
         if refused:
             raise DriverError(
-                f"{self._link.name}: {'; '.join(refused)} refused: {self._why(refused, deadline)}"
+                f"{self._link.name}: {printable(refused)} refused: {self._why(refused, deadline)}"
             )
         return tuple(reply.data for reply in replies)
 

@@ -1,9 +1,12 @@
-"""What a controller was set up with: the queries, and their answers in words.
+"""What a controller was set up with: the queries, and their answers.
 
 Source: Galil, Command Reference, DMC-4103.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from math import inf
+
+from flexneedle.rig.ports import MotorSetup
 
 SERVOS = (1.0, 1.5, 4.0)
 """Types of motor (MT, either sign) whose position is that of an encoder; the others are steppers."""
@@ -11,28 +14,9 @@ POSITION_FORMAT = 10.0
 """Format of positions (PF): ten digits, no decimals. A shorter one would cut them off."""
 
 _UNLIMITED = 2_147_483_647.0
-_GENERAL = ("TM", "CN0")
-_OF_AN_AXIS = ("FL", "BL", "LD", "SP", "AC", "DC", "SD", "ER", "OE")
-_NAMES = {
-    "TM": ("sample time", "µs"),
-    "CN0": ("limit switches are active", ""),
-    "FL": ("forward software limit", "counts"),
-    "BL": ("reverse software limit", "counts"),
-    "LD": ("limit switches", ""),
-    "SP": ("speed", "counts/s"),
-    "AC": ("acceleration", "counts/s²"),
-    "DC": ("deceleration", "counts/s²"),
-    "SD": ("deceleration at a limit", "counts/s²"),
-    "ER": ("position error limit", "counts"),
-    "OE": ("motor off on error", ""),
-}
-_WORDS = {
-    "CN0": {-1.0: "low", 1.0: "high"},
-    "LD": {0.0: "in use", 1.0: "forward disabled", 2.0: "reverse disabled", 3.0: "disabled"},
-    "OE": {0.0: "no", 1.0: "yes", 2.0: "at a limit switch", 3.0: "yes, and at a limit switch"},
-    "FL": {_UNLIMITED: "none"},
-    "BL": {-_UNLIMITED - 1.0: "none"},
-}
+_SETUP = ("BL", "FL", "ER", "OE", "LD")
+_DISABLED = {0: "", 1: "forward", 2: "reverse"}
+_SWITCHES_OFF = (1, 3)  # values of OE
 
 
 def operands(name: str, letters: str) -> str:
@@ -40,19 +24,18 @@ def operands(name: str, letters: str) -> str:
     return ",".join(f"_{name}{letter}" for letter in letters)
 
 
-def queries(letters: str) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield what to ask by MG: axis ("" for the controller) and operands."""
-    yield "", tuple(f"_{name}" for name in _GENERAL)
-    for letter in letters:
-        yield letter, tuple(f"_{name}{letter}" for name in _OF_AN_AXIS)
+def query(letter: str) -> tuple[str, int]:
+    """Return what to ask for the setup of an axis, and the number of its answers."""
+    return f"MG {','.join(f'_{name}{letter}' for name in _SETUP)}", len(_SETUP)
 
 
-def described(letter: str, asked: Sequence[str], values: Sequence[float]) -> list[tuple[str, str]]:
-    """Return name and value of each answer in words: ("A speed (SP)", "5000 counts/s")."""
-    found = []
-    for operand, value in zip(asked, values, strict=True):
-        command = operand[1:].removesuffix(letter)
-        name, unit = _NAMES[command]
-        shown = _WORDS.get(command, {}).get(value, f"{value:.12g} {unit}".strip())
-        found.append((f"{letter} {name} ({command})".strip(), shown))
-    return found
+def setup(values: Sequence[float]) -> MotorSetup:
+    """Return the setup of an axis from the answers to its query. A negative ER disables the check of the error."""
+    reverse, forward, error, on_error, disabled = values
+    return MotorSetup(
+        lowest=-inf if reverse <= -_UNLIMITED else reverse,
+        highest=inf if forward >= _UNLIMITED else forward,
+        most_error=error if error >= 0.0 else inf,
+        off_on_error=int(on_error) in _SWITCHES_OFF,
+        disabled=_DISABLED.get(int(disabled), "reverse and forward"),
+    )

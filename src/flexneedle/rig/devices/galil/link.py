@@ -11,11 +11,12 @@ from contextlib import suppress
 from time import monotonic
 
 from flexneedle.errors import DriverError
-from flexneedle.rig.devices.galil.replies import GarbledError, Reply, lines, parse
+from flexneedle.rig.devices.galil.replies import GarbledError, Reply, lines, parse, printable
 
 _LARGEST_REPLY = 4096  # bytes; a reply to the longest line has a few hundred
 _MOST_UNREAD = 1 << 20
 _END = b"\r"
+_REMEDY = "check the power, the cable and the address of the controller, and start again"
 
 
 class Link:
@@ -57,7 +58,7 @@ class Link:
         except OSError as error:
             connection.close()
             self._closed = f"no connection: {_reason(error)}"
-            raise DriverError(f"{self.name}: {self._closed}") from None
+            raise DriverError(f"{self.name}: {self._closed}; {_REMEDY}") from None
         self._socket = connection
 
     def ask(self, commands: Sequence[str], deadline: float) -> tuple[Reply, ...]:
@@ -70,8 +71,8 @@ class Link:
 
     def _exchange(self, line: tuple[str, ...], deadline: float) -> tuple[Reply, ...]:
         if self._socket is None:
-            raise DriverError(f"{self.name}: not connected: {self._closed}; reconnect")
-        shown = _printable(";".join(line))
+            raise DriverError(f"{self.name}: not connected: {self._closed}; {_REMEDY}")
+        shown = printable(line)
         if monotonic() >= deadline:  # before anything is sent: later replies are not in doubt
             raise DriverError(f"{self.name}: no time left for {shown}")
         try:
@@ -80,7 +81,7 @@ class Link:
             self._socket.sendall(";".join(line).encode("ascii") + _END)
         except OSError as error:  # perhaps in the middle of a line: nothing may follow
             self.close(_reason(error))
-            raise DriverError(f"{self.name}: {shown} not sent: {_reason(error)}; reconnect") from None
+            raise DriverError(f"{self.name}: {shown} not sent: {_reason(error)}; {_REMEDY}") from None
         except GarbledError as error:
             raise self.failed(f"{error} (before {shown})") from None
         try:
@@ -111,7 +112,7 @@ class Link:
                     _MOST_UNREAD
                 )  # unread data would make closing a reset, and the farewell be lost
         self.close(problem)
-        return DriverError(f"{self.name}: {problem}; reconnect")
+        return DriverError(f"{self.name}: {problem}; {_REMEDY}")
 
     def close(self, why: str = "closed") -> None:
         """Close the connection."""
@@ -145,7 +146,3 @@ def _reason(error: OSError | GarbledError) -> str:
     if isinstance(error, ConnectionError) and error.strerror is None:
         return "the controller closed the connection"
     return error.strerror or str(error) if isinstance(error, OSError) else str(error)
-
-
-def _printable(line: str) -> str:
-    return line.replace("\x12\x16", "^R^V")

@@ -16,7 +16,7 @@ from flexneedle.rig.devices.galil.link import Link
 from flexneedle.rig.devices.galil.replies import LONGEST_LINE, GarbledError
 from flexneedle.rig.devices.galil.settings import AXES, GalilSettings, checked
 from flexneedle.rig.devices.galil.states import ABORTED, STOPPED, Channel, Report, report, seen
-from flexneedle.rig.ports import MotorState
+from flexneedle.rig.ports import MotorSetup, MotorState
 
 CONNECT_S = 2.0
 """Time for the first connection. A new one has to be there within the reply timeout."""
@@ -259,16 +259,14 @@ class GalilMotors:
                 pass
         self._channels[letter] = self._channels[letter].rests(STOPPED)
 
-    def describe(self) -> tuple[tuple[str, str], ...]:
-        """Names and values of what a user should compare with the rig file: model, limits, speeds, reactions to errors.
-
-        It changes nothing. Raises DriverError.
-        """
-        found = [("controller", self.identity)]
-        for letter, asked in facts.queries(self._letters):
-            (values,) = self._dialogue.numbers([f"MG {','.join(asked)}"], [len(asked)], self._deadline())
-            found += facts.described(letter, asked, values)
-        return tuple(found)
+    def setup(self) -> Mapping[str, MotorSetup]:
+        """How the controller is set up for each channel: limits, position errors. It changes nothing."""
+        found = {}
+        for letter in self._letters:
+            query, count = facts.query(letter)
+            (values,) = self._dialogue.numbers([query], [count], self._deadline())
+            found[letter] = facts.setup(values)
+        return found
 
 
 def _assigned(name: str, values: Mapping[str, int]) -> str:

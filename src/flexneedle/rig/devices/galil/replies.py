@@ -6,6 +6,7 @@ what has the right form is taken as it is. Source: Galil, Command Reference, DMC
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 LONGEST_LINE = 80
@@ -95,6 +96,11 @@ def numbers(data: str, count: int) -> tuple[float, ...]:
     if body == data or len(texts) != count or not all(_NUMBER.fullmatch(text) for text in texts):
         raise GarbledError(f"must be {count} numbers in a line: {_shown(data.encode())}")
     return tuple(map(float, texts))
+
+
+def printable(commands: Sequence[str]) -> str:
+    """Return commands as one prints them: the control characters of the query for the firmware as ^R^V."""
+    return "; ".join(commands).replace("\x12\x16", "^R^V")
 
 
 def text(data: str) -> str:

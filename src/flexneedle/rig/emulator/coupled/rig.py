@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from time import monotonic
 from types import TracebackType
 from typing import Any, NoReturn, Self
@@ -15,10 +16,14 @@ from typing import Any, NoReturn, Self
 from flexneedle.errors import InputError, RunError
 from flexneedle.rig.emulator import aurora
 from flexneedle.rig.emulator.coupled.job import Job
+from flexneedle.rig.emulator.coupled.motors import address_of
+from flexneedle.rig.emulator.coupled.tracker import port_of
 from flexneedle.rig.emulator.faults import FaultKind, parse_fault, parse_order
 from flexneedle.rig.emulator.galil import server as galil
 from flexneedle.rig.emulator.orders import Orders
+from flexneedle.rig.emulator.server import Serial
 from flexneedle.rig.processes import end_process
+from flexneedle.scenario.rig import RigFile
 
 DEVICES: Mapping[str, Mapping[str, FaultKind]] = {"aurora": aurora.FAULTS, "galil": galil.FAULTS}
 """Kinds of fault by device."""
@@ -39,6 +44,14 @@ def split_fault(given: str) -> tuple[str, str]:
         )
     parse_fault(text, DEVICES[device])
     return device, text
+
+
+def check_free(rig: RigFile) -> None:
+    """Raise InputError if the address of the controller or the path of the tracker cannot be used, RigError for one
+    that is none: found out here, before the phantom is made, which takes long.
+    """
+    with galil.Tcp(*address_of(rig)), Serial(Path(port_of(rig))):
+        pass
 
 
 @dataclass
@@ -85,6 +98,7 @@ class EmulatedRig:
         self._parts: dict[str, _Part] = {}
 
     def __enter__(self) -> Self:
+        check_free(self._job.rig)
         from_motors, to_phantom = os.pipe()
         from_phantom, to_tracker = os.pipe()
         ends = {_PHANTOM: (from_motors, to_tracker), _GALIL: (to_phantom,), _AURORA: (from_phantom,)}

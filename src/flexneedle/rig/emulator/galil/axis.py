@@ -24,9 +24,9 @@ _ROUNDING = 1e-6  # counts; steps of the encoder are summed up
 @dataclass(frozen=True)
 class Axis:
     """An axis. encoder: measured position; forward, reverse: software limits; switches: positions of the limit
-    switches; deceleration, limit_deceleration: to its goal or after a stop (DC), and at a limit (SD); error_limit:
-    position error (ER), none if negative; off_on_error: OE, 1 to switch the motor off beyond it and on an abort, 2 at
-    a limit switch, 3 both.
+    switches; disabled: those that stop nothing (LD), 1 forward, 2 reverse, 3 both; deceleration, limit_deceleration: to
+    its goal or after a stop (DC), and at a limit (SD); error_limit: position error (ER), none if negative;
+    off_on_error: OE, 1 to switch the motor off beyond it and on an abort, 2 at a limit switch, 3 both.
 
     relative, absolute: of the next motion, PR or PA; tracking: whether it follows PA at once (PT); rested: commanded
     position at which the last motion ended; stop: why it rests; fault: what the motor does.
@@ -46,6 +46,7 @@ class Axis:
     deceleration: float = DECELERATION
     limit_deceleration: float = DECELERATION
     switches: tuple[float, float] = (-math.inf, math.inf)
+    disabled: int = 0
     error_limit: float = 16_384.0
     off_on_error: int = 0
     stop: int = ARRIVED
@@ -69,7 +70,8 @@ class Axis:
 
     def blocked(self, direction: float) -> int | None:
         """The stop code of a limit in this direction, if one is there. A software limit begins a count beyond."""
-        reverse, forward = self.at_switches
+        active, off = self.at_switches, self.disabled
+        reverse, forward = active[0] and not off & 2, active[1] and not off & 1
         if direction > 0.0 and (forward or self.profile.position >= self.forward + 1.0):
             return FORWARD_LIMIT
         if direction < 0.0 and (reverse or self.profile.position <= self.reverse - 1.0):

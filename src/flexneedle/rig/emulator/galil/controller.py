@@ -265,6 +265,10 @@ _SETTINGS: dict[str, tuple[Callable[[Axis], float], Callable[[Axis, float], Axis
     "PT": (lambda axis: float(axis.tracking), _track),
     "FL": (lambda axis: axis.forward, lambda axis, value: replace(axis, forward=_counts(value))),
     "BL": (lambda axis: axis.reverse, lambda axis, value: replace(axis, reverse=_counts(value))),
+    "LD": (
+        lambda axis: float(axis.disabled),
+        lambda axis, value: replace(axis, disabled=int(_whole(value, 0.0, 3.0))),
+    ),
     "ER": (
         lambda axis: axis.error_limit,
         lambda axis, value: replace(axis, error_limit=_whole(value, -1.0, _MOST)),
@@ -349,7 +353,6 @@ _OPERANDS: dict[str, Callable[[Axis], float]] = {
     "LF": lambda axis: float(not axis.at_switches[1]),
     "LR": lambda axis: float(not axis.at_switches[0]),
     "MT": lambda _: 1.0,
-    "LD": lambda _: 0.0,
 }
 
 

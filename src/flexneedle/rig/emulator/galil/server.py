@@ -4,6 +4,7 @@ Its motors run in real time, also while this process is not scheduled: before ea
 the samples are made up to the present.
 """
 
+import os
 import select
 import socket
 from collections.abc import Callable, Sequence
@@ -219,7 +220,9 @@ class Tcp:
         try:
             self._listening = socket.create_server((host, port), reuse_port=False)
         except OSError as error:
-            raise InputError(f"{host}:{port}: cannot be listened on: {error.strerror}") from None
+            reason = os.strerror(error.errno) if error.errno else error
+            rule = f"cannot be listened on: {reason}: end what uses it, or choose another port"
+            raise InputError(f"{host}:{port}: {rule}") from None
         self._listening.setblocking(False)
         self._address = host, self._listening.getsockname()[1]
 
