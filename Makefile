@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all slow bench rig-demo rig-faults fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering worlds space worlds-space tuning docs lint clean
+.PHONY: help setup demo test test-all slow bench rig-demo rig-faults rig-wall-clock rig-families fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering worlds space worlds-space tuning docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -52,6 +52,12 @@ rig-demo: setup  ## insertions on an emulated rig over both protocols in real ti
 
 rig-faults: setup  ## faults injected into running insertions on an emulated rig, 20 times each, and the table of docs/safety.md (hours)
 	$(BIN)/python studies/rig_faults.py --out $(or $(DIR),runs/rig-faults)
+
+rig-wall-clock: setup  ## 150 pairs of insertions on an emulated rig, each decision 0, 50 and 150 ms longer (hours)
+	$(BIN)/python studies/rig_wall_clock.py --out $(or $(DIR),runs/rig-wall-clock)
+
+rig-families: setup  ## insertions on 100 random rigs, emulated and in simulated time (hours)
+	$(BIN)/python studies/rig_families.py --out $(or $(DIR),runs/rig-families)
 
 fuzz: setup  ## a million random and damaged inputs each to what reads the Galil, the Aurora and rig files
 	$(BIN)/python studies/fuzz_galil.py

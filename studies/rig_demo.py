@@ -9,16 +9,16 @@ left out counts as missed unless the witness was late at the same time.
 """
 
 import argparse
-import json
+import math
 import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from rig_trials import axial_innovation, inserted, percentile, witness
 
 import flexneedle
-from emulated import Witness, emulated_rig, ended, insertion, percentile, witness
 from flexneedle.scenario.files import dump_scenario
 
 _SPACE_EVERY, _FIRST_SEED = 10, 400_000
@@ -46,33 +46,29 @@ class Result:
 
 def measured(scenario: str, seed: int, out: Path) -> Result:
     """Carry out one insertion on the emulated rig, and the same on the virtual one."""
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, witness() as seen:
         file = _scenario_file(scenario, Path(folder))
-        with emulated_rig(Path(folder), str(file), seed) as rig:
-            with witness() as seen:
-                status, _, errors = ended(insertion(rig.rig, str(file), out, "--seed", str(seed)), 180.0)
-            truth = rig.read_truth()
-    if status not in (0, 1):
-        raise SystemExit(f"{scenario}, seed {seed}: exit status {status}\n{errors}")
+        found = inserted(Path(folder), file, seed, out)
+        unexplained = found.unexplained(seen)
+    if found.status not in (0, 1):
+        raise SystemExit(f"{scenario}, seed {seed}: exit status {found.status}\n{found.errors}")
     done = flexneedle.load(out)
-    plan = done.plan
-    ticks = json.loads((out / "run.json").read_text())["timing"]["ticks"]
+    plan, ticks = done.plan, found.ticks
     simulated = flexneedle.insert(plan.scenario, plan, seed)
-    moved = [period.innovation[0] for period in done.periods if period.verdict.ok and period.readings]
     return Result(
         scenario,
         seed,
         str(done.outcome),
-        float(np.linalg.norm(truth.tips[-1, :3] - np.array(done.target))),
+        math.dist(found.tip, done.target),
         simulated.true_error_mm,
-        float(np.mean(moved)),
+        axial_innovation(done),
         len(done.periods),
-        sum("late" in period.decision for period in done.periods),
+        done.late,
         ticks["count"],
         ticks["late_p99_ms"] + ticks["work_p99_ms"],
         ticks["late_max_ms"],
         ticks["missed"],
-        _unexplained(ticks["stalls"], seen),
+        unexplained,
     )
 
 
@@ -84,10 +80,6 @@ def _scenario_file(scenario: str, folder: Path) -> Path:
     path = folder / f"{scenario}.toml"
     path.write_text(dump_scenario(made))
     return path
-
-
-def _unexplained(stalls: list[dict[str, float]], seen: Witness) -> int:
-    return sum(not seen.explains(stall["time_s"], stall["late_s"]) for stall in stalls)
 
 
 def main() -> None:

@@ -27,8 +27,8 @@ from typing import Any
 from zlib import crc32
 
 import numpy as np
+from rig_trials import EmulatedRig, emulated_rig, ended, insertion, moved_after, rests
 
-from emulated import EmulatedRig, emulated_rig, ended, insertion, moved_after, rests
 from flexneedle.rig.emulator.coupled.truth import Truth
 
 _MOTION_MM = 0.5  # the most that the base may move after detection

@@ -37,9 +37,9 @@ from zlib import crc32
 
 import numpy as np
 import psutil
+from rig_trials import EmulatedRig, emulated_rig, ended, insertion, moved_after, rests, shipped_rig, witness
 
 import flexneedle
-from emulated import EmulatedRig, emulated_rig, ended, insertion, moved_after, rests, witness
 from flexneedle.rig.emulator.coupled.truth import Truth
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -78,8 +78,8 @@ def rig_with(section: str, seed: int, out: Path) -> Iterator[EmulatedRig]:
     """An emulated rig with a section in its file. out: folder of the record; one that was interrupted is removed."""
     shutil.rmtree(out, ignore_errors=True)
     with tempfile.TemporaryDirectory() as folder:
-        changes = {"[tracker]": f"{section}\n\n[tracker]"}
-        with emulated_rig(Path(folder), "phantom", seed, changes=changes) as rig:
+        text = shipped_rig().replace("[tracker]", f"{section}\n\n[tracker]")
+        with emulated_rig(Path(folder), "phantom", seed, text=text) as rig:
             yield rig
 
 

@@ -216,9 +216,9 @@ class Camera:
 class Bench:
     """A supervisor with devices in memory, and the messages that it has sent."""
 
-    def __init__(self, rig=None, monitor=None, tracked=True, **loop):
+    def __init__(self, rig=None, monitor=None, tracked=True, motors=Stage, **loop):
         self.clock = Hand()
-        self.stage, self.camera = Stage(self.clock), Camera(self.clock)
+        self.stage, self.camera = motors(self.clock), Camera(self.clock)
         rig = rig or rig_file()
         if loop:
             rig = rig.model_copy(update={"loop": rig.loop.model_copy(update=loop)})
@@ -253,6 +253,28 @@ class Bench:
     def position(self, name):
         """Measured position of an axis (mm or rad)."""
         return self.core.report(0.0, 0.0, 0).axes[name].position
+
+
+class Moves(Stage):
+    """Motors that end each motion before they take the newest of the targets that came meanwhile, as with `moves`."""
+
+    def __init__(self, clock, channels="ABC"):
+        super().__init__(clock, channels)
+        self.waiting = {}
+
+    def read(self):
+        states = super().read()
+        return {name: replace(one, moving=one.moving or name in self.waiting) for name, one in states.items()}
+
+    def follow(self, positions):
+        self._up_to_now()
+        self.waiting |= positions
+        at_rest = [name for name in self.waiting if not self.motors[name].moving]
+        super().follow({name: self.waiting.pop(name) for name in at_rest})
+
+    def stop(self):
+        self.waiting = {}
+        super().stop()
 
 
 def real_motors(settings, channels):

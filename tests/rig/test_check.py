@@ -46,7 +46,7 @@ def test_a_rig_as_its_file_describes_it_has_no_problem(monkeypatch):
     assert made["motors"].calls == [], "nothing was moved, powered or defined"
     assert (made["motors"].closed, made["tracker"].closed) == (True, True)
     assert of(findings, "driver", "connection").found == "bench_rig:drivers"
-    assert of(findings, "insertion", "queued motion").found == "0.75 mm (10 mm/s × 75 ms)"
+    assert of(findings, "insertion", "queued motion").found == "0.5 mm (loop.queue_mm)"
     assert of(findings, "scenario", "fit").found == "Two-layer tissue phantom"
 
 

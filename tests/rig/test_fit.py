@@ -158,12 +158,15 @@ def test_an_axis_too_near_to_its_end_is_a_line(positions, lines):
     assert [line for _, line in room_problems(rig(), PLANE, positions)] == lines
 
 
-def test_what_is_queued_is_the_largest_speed_times_the_queue():
-    assert dict(queued(rig(loop__queue_ms=50))) == {
-        "insertion": "0.5 mm (10 mm/s × 50 ms)",
+def test_what_is_queued_is_the_largest_speed_times_the_queue_within_its_distance():
+    changes = {"axes__insertion__speed_mm_s": 12.0, "axes__guide_y__tolerance_mm": 0.13}
+    found = dict(queued(rig(loop__queue_ms=50, **changes)))
+    assert found == {
+        "insertion": "0.5 mm (loop.queue_mm)",
         "rotation": "18 deg (360 deg/s × 50 ms)",
-        "guide_y": "0.25 mm (5 mm/s × 50 ms)",
+        "guide_y": "0.26 mm (twice tolerance_mm)",
     }
+    assert dict(queued(rig(loop__queue_ms=50)))["guide_y"] == "0.25 mm (5 mm/s × 50 ms)"
 
 
 @settings(deadline=None)

@@ -68,6 +68,35 @@ def test_an_axis_is_in_counts_mm_rad_and_s():
     assert (guide.at_home, guide.backlash, guide.max_error, guide.tolerance) == (-3.0, 0.05, 0.2, 0.02)
 
 
+@pytest.mark.parametrize(
+    ("counts", "speed", "tolerance", "error"),
+    [
+        (2000.0, 10.0, 0.02, 0.2),  # no more than ever
+        (2000.0, 3.0, 0.02, 0.12),  # of 40 ms
+        (20_000.0, 1.0, 0.02, 0.08),  # four tolerances
+        (50.0, 1.0, 0.06, 0.24),  # three counts, twelve counts
+    ],
+)
+def test_without_them_errors_are_derived_from_speed_and_counts(counts, speed, tolerance, error):
+    axis = rig(axes__guide_y__counts_per_mm=counts, axes__guide_y__speed_mm_s=speed).axes.guide_y
+    assert (axis.tolerance, axis.max_error) == pytest.approx((tolerance, error))
+
+
+@pytest.mark.parametrize(
+    ("rate", "milliseconds"), [(10.0, 100.0), (20.0, 100.0), (40.0, 75.0), (1000.0, 75.0)]
+)
+def test_without_it_the_queue_is_three_ticks_between_75_and_100_ms(rate, milliseconds):
+    assert rig(loop__rate_hz=rate).loop.queue == pytest.approx(1e-3 * milliseconds)
+
+
+def test_a_queue_is_limited_by_its_distance_and_two_tolerances():
+    loop, axes = rig(loop__queue_ms=50.0, loop__queue_mm=0.3).loop, rig().axes
+    assert loop.queue_of(axes.insertion, 4.0) == pytest.approx(0.2)
+    assert loop.queue_of(axes.insertion, 10.0) == 0.3
+    assert loop.queue_of(axes.insertion, 0.1) == pytest.approx(0.04)
+    assert loop.queue_of(axes.rotation, math.pi) == pytest.approx(math.pi / 20)
+
+
 def test_a_position_is_shown_in_the_unit_of_the_file():
     axes = rig().axes
     assert axes.insertion.shown(12.5) == "12.5"
@@ -136,6 +165,8 @@ def test_a_broken_rule_of_an_axis_is_reported_in_one_line(file, key, value, rule
         ("loop.queue_ms", 101, "must be at most 100"),
         ("loop.queue_ms", 24, "must be at least 25, the time of a tick at rate_hz (40): motors would stop"),
         ("loop.rate_hz", 1001, "must be at most 1000"),
+        ("loop.rate_hz", 9.9, "must be at least 10: motors would stop between two ticks"),
+        ("loop.queue_mm", 0, "must be above 0"),
         ("loop.decision_limit_s", 0.2, "must be above decision_ms (200 ms)"),
         ("tracker.kind", "", "must be one line of printable text"),
         ("driver.kind", None, "missing"),

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import Problem, to_line
-from flexneedle.scenario.rig import Axis, RigFile
+from flexneedle.scenario.rig import Axis, LoopSettings, RigFile
 
 _ROUNDING = 1e-9
 _STILL = "steering"  # the strategy that moves neither guide nor base laterally
@@ -74,13 +74,16 @@ def room_problems(
 
 def queued(rig: RigFile) -> list[tuple[str, str]]:
     """Return for each axis its name and what it still moves after the computer has stopped, at its largest speed."""
-    time = rig.loop.queue
-    return [(name, _queued(axis, time)) for name, axis in rig.axes.items()]
+    return [(name, _queued(axis, rig.loop)) for name, axis in rig.axes.items()]
 
 
-def _queued(axis: Axis, time: float) -> str:
-    speed, distance = axis.shown(axis.speed), axis.shown(axis.speed * time)
-    return f"{distance} {axis.unit} ({speed} {axis.unit}/s × {1e3 * time:g} ms)"
+def _queued(axis: Axis, loop: LoopSettings) -> str:
+    """Such as `0.375 mm (5 mm/s × 75 ms)`, or `0.5 mm (loop.queue_mm)`."""
+    distance, by_time, unit = loop.queue_of(axis, axis.speed), axis.speed * loop.queue, axis.unit
+    why = f"{axis.shown(axis.speed)} {unit}/s × {1e3 * loop.queue:g} ms"
+    if distance != by_time:
+        why = "loop.queue_mm" if distance < by_time else f"twice tolerance_{unit}"
+    return f"{axis.shown(distance)} {unit} ({why})"
 
 
 def _insertion(scenario: Scenario) -> Need:

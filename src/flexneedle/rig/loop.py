@@ -16,7 +16,7 @@ from flexneedle.control.forecast import missed, warning
 from flexneedle.control.guide import check_guide
 from flexneedle.control.interface import Decision, Method, at_depth
 from flexneedle.control.methods import DEFAULT, used
-from flexneedle.errors import DriverError, RunError, StoppedError, one_line
+from flexneedle.errors import DriverError, RefusedError, RunError, StoppedError, one_line
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.task import Task
 from flexneedle.planning.origin import check_origin, placed
@@ -67,8 +67,8 @@ def run(
 
     The driver is stopped at the end, after an error and after an interrupt. A DriverError of driver or tracker is no
     exception here: the insertion has its reason, the outcome "failed", and the periods before it. So has one that was
-    stopped at the rig, with the outcome "interrupted". A DriverError is raised only if the driver cannot be stopped
-    after another error or an interrupt.
+    stopped at the rig, with the outcome "interrupted", and one with a command that the rig refuses, with the outcome
+    "held". A DriverError is raised only if the driver cannot be stopped after another error or an interrupt.
     """
     scenario, plan, seed = load_scenario(scenario), planned(plan), whole("seed", seed, 0)
     rig = instance("rig", rig, Rig, "Rig(clock, driver, tracker), parts as in flexneedle.rig.ports")
@@ -95,6 +95,8 @@ def run(
                 on_period(period)
     except DriverError as error:
         ending = Outcome.FAILED, one_line(error)
+    except RefusedError as error:
+        ending = Outcome.HELD, one_line(error)
     except StoppedError as error:
         ending = Outcome.INTERRUPTED, one_line(error)
     except BaseException as error:  # also after an interrupt or another error no motor goes on

@@ -80,6 +80,8 @@ class Columns:
 class Ticks:
     """Times of the supervisor's ticks (s): how much later than scheduled each began, and how long it took; times of
     those before which others were left out; changes of the rig's state. Times are on the monotonic clock.
+
+    queued: the largest motion in the queue of each axis (mm or rad).
     """
 
     started: float = 0.0
@@ -88,6 +90,7 @@ class Ticks:
     missed: int = 0
     stalls: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_MOST_KEPT))
     states: deque[tuple[float, str, str]] = field(default_factory=lambda: deque(maxlen=_MOST_KEPT))
+    queued: dict[str, float] = field(default_factory=dict)
 
     def add(self, report: Report) -> None:
         """Add the tick of a report."""
@@ -97,18 +100,28 @@ class Ticks:
         if report.missed > self.missed:
             self.stalls.append((time, report.late))
         self.missed = report.missed
+        for name, axis in report.axes.items():
+            self.queued[name] = max(self.queued.get(name, 0.0), axis.queued)
         if not self.states or self.states[-1][1:] != (report.state, report.why):
             self.states.append((time, report.state, report.why))
 
     def summary(self) -> dict[str, Any]:
-        """Number of ticks, ticks left out, late and work in ms: median, 99 % and largest; stalls and states."""
+        """Number of ticks, ticks left out, late and work in ms: median, 99 % and largest; stalls and states; largest
+        motion in the queue by axis, in mm or degrees.
+        """
         found: dict[str, Any] = {"count": len(self.late), "missed": self.missed}
         for name, values in (("late", self.late), ("work", self.work)):
             for q, label in ((50, "p50"), (99, "p99"), (100, "max")):
                 found[f"{name}_{label}_ms"] = 1e3 * float(np.percentile(values, q)) if values else None
         found["stalls"] = [{"time_s": time, "late_s": late} for time, late in self.stalls]
         found["states"] = [{"time_s": time, "state": state, "why": why} for time, state, why in self.states]
+        found["queued"] = dict(_with_unit(name, way) for name, way in self.queued.items())
         return found
+
+
+def _with_unit(axis: str, way: float) -> tuple[str, float]:
+    """Key and value of a way (mm or rad) of an axis in a record: in mm or degrees."""
+    return (f"{axis}_deg", math.degrees(way)) if axis == "rotation" else (f"{axis}_mm", way)
 
 
 class Follower(Protocol):

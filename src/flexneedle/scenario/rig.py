@@ -28,6 +28,11 @@ LINEAR_AXES = ("insertion", "guide_y", "guide_z", "base_y", "base_z")
 Settings = TypeVar("Settings", bound=Section)
 
 _FASTEST_HZ = 1000.0
+_QUEUE_MS, _QUEUE_TICKS, _LONGEST_QUEUE_MS = 75.0, 3.0, 100.0
+_LEAST_QUEUE = 2.0  # tolerances
+_TOLERATED_COUNTS = 3.0
+_LAG_S = 0.04  # of an axis at its largest speed: several times that of a healthy servo
+_TOLERANCES = 4.0  # that the largest error has at least
 _ROUNDING = 1e-9
 _SWITCH = "the {} switch is at the {} end of range_{}, or beyond"
 
@@ -61,11 +66,13 @@ class Part(Section):
 class Axis(Section, ABC):
     """An axis and its motor. `scale`, `limits` and the other properties are in counts, mm or rad, and s.
 
-    unit: of the file, "mm" or "deg"; size: of that unit in mm or rad.
+    unit: of the file, "mm" or "deg"; size: of that unit in mm or rad; usual_errors: if the file has none, the largest
+    error at most and the tolerance at least, in that unit.
     """
 
     unit: ClassVar[str]
     size: ClassVar[float]
+    usual_errors: ClassVar[tuple[float, float]]
 
     channel: Channel
     """The motor's name at its controller, such as "A"."""
@@ -107,13 +114,25 @@ class Axis(Section, ABC):
 
     @property
     @abstractmethod
-    def max_error(self) -> float:
-        """Largest difference of commanded and measured position, mm or rad."""
+    def _errors(self) -> tuple[float | None, float | None]:
+        """The largest error and the tolerance of the file, in its unit; None: not set."""
 
     @property
-    @abstractmethod
     def tolerance(self) -> float:
         """Largest distance from the goal of a motion that has ended, mm or rad."""
+        return self._tolerance_of_counts if self._errors[1] is None else self.size * self._errors[1]
+
+    @property
+    def max_error(self) -> float:
+        """Largest difference of commanded and measured position, mm or rad."""
+        if self._errors[0] is not None:
+            return self.size * self._errors[0]
+        usual = min(self.size * self.usual_errors[0], _LAG_S * self.speed)
+        return max(usual, _TOLERANCES * self._tolerance_of_counts)
+
+    @property
+    def _tolerance_of_counts(self) -> float:
+        return max(self.size * self.usual_errors[1], _TOLERATED_COUNTS / abs(self.scale))
 
     @property
     def to_home(self) -> int:
@@ -135,6 +154,7 @@ class LinearAxis(Axis):
 
     unit = "mm"
     size = 1.0
+    usual_errors = (0.2, 0.02)
 
     counts_per_mm: Positive
     """Counts of the encoder per mm."""
@@ -148,10 +168,11 @@ class LinearAxis(Axis):
     """Position of the axis at its home."""
     backlash_mm: NonNegative = 0.0
     """Lost motion when the motor reverses, made up for."""
-    max_error_mm: Positive = 0.2
-    """Largest difference of commanded and measured position; beyond it the rig stops with a fault."""
-    tolerance_mm: Positive = 0.02
-    """A motion has arrived within this distance from its goal."""
+    max_error_mm: Positive | None = None
+    """Largest difference of commanded and measured position; beyond it the rig stops with a fault. Not set: the way of
+    40 ms at `speed_mm_s`, at most 0.2 mm, at least 12 counts and 0.08 mm."""
+    tolerance_mm: Positive | None = None
+    """A motion has arrived within this distance from its goal. Not set: 3 counts, at least 0.02 mm."""
 
     @property
     def scale(self) -> float:
@@ -184,14 +205,8 @@ class LinearAxis(Axis):
         return self.backlash_mm
 
     @property
-    def max_error(self) -> float:
-        """Largest difference of commanded and measured position, mm."""
-        return self.max_error_mm
-
-    @property
-    def tolerance(self) -> float:
-        """Largest distance from the goal of a motion that has ended, mm."""
-        return self.tolerance_mm
+    def _errors(self) -> tuple[float | None, float | None]:
+        return self.max_error_mm, self.tolerance_mm
 
 
 class RotaryAxis(Axis):
@@ -199,6 +214,7 @@ class RotaryAxis(Axis):
 
     unit = "deg"
     size = radians(1.0)
+    usual_errors = (5.0, 1.0)
 
     counts_per_deg: Positive
     """Counts of the encoder per degree."""
@@ -212,10 +228,11 @@ class RotaryAxis(Axis):
     """Angle of the axis at its home."""
     backlash_deg: NonNegative = 0.0
     """Lost motion when the motor reverses, made up for."""
-    max_error_deg: Positive = 5.0
-    """Largest difference of commanded and measured angle; beyond it the rig stops with a fault."""
-    tolerance_deg: Positive = 1.0
-    """A roll has arrived within this angle from its goal."""
+    max_error_deg: Positive | None = None
+    """Largest difference of commanded and measured angle; beyond it the rig stops with a fault. Not set: the angle of
+    40 ms at `speed_deg_s`, at most 5°, at least 12 counts and 4°."""
+    tolerance_deg: Positive | None = None
+    """A roll has arrived within this angle from its goal. Not set: 3 counts, at least 1°."""
 
     @property
     def scale(self) -> float:
@@ -249,14 +266,8 @@ class RotaryAxis(Axis):
         return radians(self.backlash_deg)
 
     @property
-    def max_error(self) -> float:
-        """Largest difference of commanded and measured angle, rad."""
-        return radians(self.max_error_deg)
-
-    @property
-    def tolerance(self) -> float:
-        """Largest angle from the goal of a roll that has ended, rad."""
-        return radians(self.tolerance_deg)
+    def _errors(self) -> tuple[float | None, float | None]:
+        return self.max_error_deg, self.tolerance_deg
 
 
 def _problems_of(axis: Axis) -> Iterator[Problem]:
@@ -322,8 +333,11 @@ class LoopSettings(Section):
 
     rate_hz: Annotated[float, Field(gt=0, le=_FASTEST_HZ)] = 40.0
     """Rate at which tracker and motors are read and checked, and targets sent."""
-    queue_ms: Annotated[float, Field(gt=0, le=100)] = 75.0
-    """Motion that is queued in the motors: what they still do after the computer has stopped."""
+    queue_ms: Annotated[float, Field(gt=0, le=_LONGEST_QUEUE_MS)] | None = None
+    """Time of the motion that is queued in the motors: what they still do after the computer has stopped. Not set:
+    three ticks, at least 75 and at most 100."""
+    queue_mm: Positive = 0.5
+    """Largest distance of that motion, for axes with a length. A faster axis is slowed down."""
     decision_ms: Positive = 200.0
     """Time for a decision. While it takes longer the needle rests, and the period counts as late."""
     decision_limit_s: Positive = 2.0
@@ -336,7 +350,10 @@ class LoopSettings(Section):
 
     def _problems(self) -> Iterator[Problem]:
         tick = 1e3 / self.rate_hz
-        if self.queue_ms < tick:
+        if tick > _LONGEST_QUEUE_MS:
+            rule = f"must be at least {1e3 / _LONGEST_QUEUE_MS:g}: motors would stop between two ticks"
+            yield Problem("rate_hz", self.rate_hz, rule)
+        elif self.queue_ms is not None and self.queue_ms < tick:
             rule = f"must be at least {tick:g}, the time of a tick at rate_hz ({self.rate_hz:g})"
             yield Problem("queue_ms", self.queue_ms, f"{rule}: motors would stop between two ticks")
         if 1e3 * self.decision_limit_s <= self.decision_ms:
@@ -345,8 +362,17 @@ class LoopSettings(Section):
 
     @property
     def queue(self) -> float:
-        """Motion that is queued in the motors, s."""
-        return 1e-3 * self.queue_ms
+        """Time of the motion that is queued in the motors, s."""
+        ticks = max(_QUEUE_MS, 1e3 * _QUEUE_TICKS / self.rate_hz)
+        return 1e-3 * (min(ticks, _LONGEST_QUEUE_MS) if self.queue_ms is None else self.queue_ms)
+
+    def queue_of(self, axis: Axis, speed: float) -> float:
+        """Largest distance (mm or rad) of an axis from its target, in a motion with this speed (mm/s or rad/s).
+
+        It is at least two tolerances: a motor may rest within one, and shall move on.
+        """
+        way = max(speed * self.queue, _LEAST_QUEUE * axis.tolerance)
+        return min(way, self.queue_mm) if axis.unit == "mm" else way
 
 
 class RosSettings(Section):

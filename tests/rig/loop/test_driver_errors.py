@@ -2,7 +2,7 @@
 
 import pytest
 
-from flexneedle.errors import DriverError, RunError
+from flexneedle.errors import DriverError, RefusedError, RunError
 from flexneedle.types import Outcome
 from insertions import Tank, facts, first_periods, run
 
@@ -46,6 +46,16 @@ def test_the_insertion_fails_with_its_reason_and_all_periods_before_it(plan, par
     assert [facts(period) for period in done.periods] == [facts(period) for period in expected]
     assert done.summary == f"failed after {kept} periods: {LOST}"
     assert not done.reached
+
+
+def test_a_command_that_the_rig_refuses_ends_the_insertion_as_held(plan):
+    refusal = RefusedError(
+        "insertion = 56.000 mm: must be at most 55.500 mm, as far as this insertion may go"
+    )
+    rig = Failing(plan.roll, apply=refusal)
+    done = run(plan, rig.rig())
+    assert (done.outcome, done.reason, len(done.periods)) == (Outcome.HELD, str(refusal), LAST)
+    assert rig.stops == 1
 
 
 def test_before_the_first_motion_the_record_is_empty(plan):

@@ -69,8 +69,8 @@ def test_a_motor_that_runs_past_its_target_with_its_controller_is_a_fault(bench)
     ("travel", "steps", "seconds", "why"),
     [
         (1.0, 1, 0.1, "insertion: the motor does not follow"),  # more than max_error_mm of the step is left
-        (0.15, 1, 0.2 + 0.5 + 2 * TICK_S, "the motors have not arrived: insertion 0.150 mm from the goal"),
-        (0.015, 2, 0.2 + 0.5 + 2 * TICK_S, "the motors have not arrived: insertion 0.030 mm from the goal"),
+        (0.15, 1, 0.3 + 2 * TICK_S, "the motors have not arrived: insertion 0.150 mm from the goal"),
+        (0.015, 2, 0.3 + 2 * TICK_S, "the motors have not arrived: insertion 0.030 mm from the goal"),
     ],
 )
 def test_a_stall_is_found_by_what_is_left_of_the_step(bench, travel, steps, seconds, why):

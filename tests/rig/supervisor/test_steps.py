@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.machine import State
-from stages import TICK_S, Bench, rig_file
+from stages import TICK_S, Bench, Moves, Stage, rig_file
 
 
 def step(number=1, roll=0.0, duration=0.2, expected=None, **travel):
@@ -63,6 +63,45 @@ def test_positions_do_not_drift_and_motors_never_have_more_than_the_queue(steps)
         assert bench.position("guide_y") == pytest.approx(
             guide, abs=0.03
         )  # half the lost motion, before it is known
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    motors=st.sampled_from([Stage, Moves]),
+    speed=st.floats(1.0, 10.0),
+    seconds_to_speed=st.floats(0.02, 0.25),
+    servo_s=st.floats(0.0, 0.01),
+    queue_ms=st.floats(40.0, 100.0),
+    roll=st.booleans(),
+)
+def test_slow_motors_arrive_later_and_no_target_is_further_from_one_than_the_queue(
+    motors, speed, seconds_to_speed, servo_s, queue_ms, roll
+):
+    linear = {"speed_mm_s": speed, "acceleration_mm_s2": speed / seconds_to_speed}
+    rotation = {"acceleration_deg_s2": 360.0 / seconds_to_speed, "max_error_deg": 10.0}
+    rig = rig_file(insertion=linear, guide_y={"backlash_mm": 0.1}, rotation=rotation)
+    bench = Bench(rig, motors=motors, queue_ms=queue_ms).armed()
+    for motor in bench.stage.motors.values():
+        motor.lag = servo_s
+    bench.core.request(
+        step(1, roll=math.pi if roll else 0.0, duration=1.0 / speed, insertion=1.0, guide_y=-0.2)
+    )
+    done, limits = bench.until(1), rig.loop.model_copy(update={"queue_ms": queue_ms})
+    assert done.why == ""
+    assert done.travelled["insertion"] == pytest.approx(1.0, abs=0.02)
+    for report in bench.reports:
+        for name, axis in rig.axes.items():
+            most = limits.queue_of(axis, axis.speed)
+            assert report.axes[name].queued <= most * 1.02
+            assert most <= (0.5 if axis.unit == "mm" else axis.speed * 0.1)
+
+
+def test_motors_of_few_counts_are_not_slower_than_controllers_can_be(bench):
+    bench = Bench(rig_file(guide_y={"counts_per_mm": 100.0, "speed_mm_s": 1.0})).armed()
+    bench.core.request(step(guide_y=0.0001))
+    bench.until(1)
+    speeds = {call[1]: call[2] for call in bench.stage.calls if call[0] == "set_speed"}
+    assert speeds["C"] == 10.0
 
 
 def test_without_ticks_motors_stop_within_the_queue(bench):

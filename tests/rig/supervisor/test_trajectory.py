@@ -59,8 +59,8 @@ def test_the_fastest_motion_is_the_one_of_its_slowest_axis():
 
 def test_the_goal_is_exact():
     made = travelling({"A": 0.1, "C": 0.3}, 0.2)
-    assert made.at(made.duration) == dict(made.goal)
-    assert made.at(-1.0) == {"A": 7.0, "C": 7.0}
+    assert made.at(made.share(made.duration)) == dict(made.goal)
+    assert made.at(made.share(-1.0)) == {"A": 7.0, "C": 7.0}
 
 
 @settings(deadline=None)

@@ -1,6 +1,7 @@
 """The tick's check before the first step: nothing is expected, but a step does not begin on a reading that is none."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -44,3 +45,13 @@ def test_a_first_step_does_not_begin_on_a_reading_that_is_none_old_or_repeated(n
 
 def test_a_good_reading_ends_the_rejection():
     assert watched(measured(1), measured(1), measured(2)).ok
+
+
+def test_while_a_motion_waits_for_its_motors_so_does_what_is_expected_of_the_tip():
+    watch = Watch(Monitor(MonitorSettings(references=0)), 0.25, 0.0).expecting(AT_TIP, NOW, NOW + 1.0)
+    assert watch.waiting(NOW + 0.5, 1.0).ended == NOW + 2.0
+    assert watch.waiting(NOW + 1.5, 1.0).ended == NOW + 1.0
+    halfway = replace(
+        watch.waiting(NOW + 0.5, 1.0), expected=Expectation((0.0, 0.0, 0.0), (9.0, 0.0, 0.0), 0.1)
+    )
+    assert halfway.after([measured(4, NOW + 1.0, 4.5)], NOW + 1.0, VISIBLE).verdict.ok

@@ -12,7 +12,7 @@ from flexneedle.rig.supervisor.messages import AxisState
 from flexneedle.rig.supervisor.motion import Leg, leg_of, positions
 from flexneedle.scenario.rig import RigFile
 
-_SLOWEST_SHARE = 0.01
+_SLOWEST_SHARE, _SLOWEST = 0.01, 10.0  # of the largest speed, and counts/s
 
 
 @dataclass(frozen=True)
@@ -27,14 +27,14 @@ class RigAxes:
     """Drives by axis, their motors, the last reading and the one before it, and where motors were last sent (counts by
     channel).
 
-    ahead: how far ahead (s) targets are; lost: whether the motors could not be reached, so that they are not known to
+    lost: whether the motors could not be reached, so that they are not known to
     rest, until they are stopped. Calls of motors raise DriverError.
     """
 
     def __init__(self, rig: RigFile, motors: Motors, clock: Clock) -> None:
         self.drives = {name: Drive(name, axis) for name, axis in rig.axes.items()}
         self._motors, self._clock = motors, clock
-        self.ahead = 1e-3 * rig.loop.queue_ms
+        self._loop = rig.loop
         self.lost = False
         self.newest = self.before = self._read()
         self.take_positions()
@@ -62,11 +62,13 @@ class RigAxes:
         """Longest time (s) in which an axis slows down from its largest speed."""
         return max(drive.axis.speed / drive.axis.acceleration for drive in self.drives.values())
 
-    @property
-    def shown(self) -> dict[str, AxisState]:
-        """Position and motor by axis, for reports."""
-        at = self.positions
-        return {name: AxisState(at[name], self.state(drive)) for name, drive in self.drives.items()}
+    def shown(self, leg: Leg | None) -> dict[str, AxisState]:
+        """Position, motor, and motion in the queue by axis, for reports. leg: under way."""
+        at, queued = self.positions, {} if leg is None else leg.queued(self.states)
+        return {
+            name: AxisState(at[name], self.state(drive), queued.get(name, 0.0))
+            for name, drive in self.drives.items()
+        }
 
     def state(self, drive: Drive) -> MotorState:
         """The state of an axis's motor."""
@@ -142,14 +144,15 @@ class RigAxes:
         """Set the speeds of a leg, and send its first targets."""
         for channel, speed in leg.trajectory.speeds.items():
             axis = leg.drives[channel].axis
+            fastest = axis.speed * abs(axis.scale)
             # Controllers round small speeds, to 0 as well; a motor that is faster waits for its next target.
-            slowest = _SLOWEST_SHARE * axis.speed * abs(axis.scale)
+            slowest = min(fastest, max(_SLOWEST_SHARE * fastest, _SLOWEST))
             self._motors.set_speed(channel, max(speed, slowest), axis.acceleration * abs(axis.scale))
         self.follow(leg, now)
 
     def follow(self, leg: Leg, now: float) -> None:
-        """Send the targets of a leg, at most `loop.queue_ms` ahead."""
-        self._motors.follow(leg.targets(now, self.ahead))
+        """Send the targets of a leg, with no more motion than the queue."""
+        self._motors.follow(leg.targets(now, self._loop, self.states))
 
     def keep_goal(self, leg: Leg) -> None:
         """Take the goal of a leg as where its motors were sent."""

@@ -1,7 +1,7 @@
 """The supervisor without its process: requests, ticks, and what they make of motors and tracker.
 
 Each tick reads motors and tracker, checks both, and either sends the next targets or stops. Motors get targets at most
-`loop.queue_ms` ahead, so that they stop by themselves where ticks end. Nothing here waits.
+the queue of `loop` ahead, so that they stop by themselves where ticks end. Nothing here waits.
 """
 
 from collections.abc import Callable
@@ -162,7 +162,7 @@ class Supervisor:
         """Read motors and tracker, check, and send targets or stop."""
         before, now = self._ticked_at, self._clock.now()
         self._ticked_at = now
-        self._after_stall(now - before)
+        self._check_ticks(now - before)
         self._measure(now)
         self._check_motors()
         self._check_client(now)
@@ -174,18 +174,14 @@ class Supervisor:
     def report(self, late: float, work: float, missed: int) -> say.Report:
         """What the last tick found, with the measurements since the last report."""
         axes, tip = self._axes, self._tip
-        found = axes.shown, tip.take(), tip.status, not axes.lost
+        leg = None if self._motion is None or self._stopping is not None else self._motion.leg
+        found = axes.shown(leg), tip.take(), tip.status, not axes.lost
         return say.Report(self._ticked_at, self.state, self.why, *found, late, work, missed)
 
-    def _after_stall(self, seconds: float) -> None:
-        """Ticks were late: the motors have stopped, or soon will, and a motion goes on from there, not from where it
-        would be by now."""
-        leg = None if self._motion is None else self._motion.leg
-        if leg is None or seconds <= self._axes.ahead:
-            return
-        if seconds > _STALL_S:
+    def _check_ticks(self, seconds: float) -> None:
+        """Ticks were late: the motors have stopped, and after long nothing goes on by itself."""
+        if self._motion is not None and self._motion.leg is not None and seconds > _STALL_S:
             self.stop(f"no tick for {seconds:.2f} s, limit {_STALL_S:g} s")
-        leg.begun += seconds
 
     def _measure(self, now: float) -> None:
         try:
@@ -307,13 +303,15 @@ class Supervisor:
             motion.spans.append(leg.span(now, done=True))
             axes.keep_goal(leg)
             self._next_leg(now)
-        elif leg.overdue(now):
+        elif leg.overdue(axes.states, now):
             self._fault(f"the motors have not arrived: {leg.missing(axes.states)} from the goal")
         else:
+            waited = leg.waited
             try:
                 axes.follow(leg, now)
             except DriverError as error:
                 self._not_followed(motion, str(error))
+            self._tip.wait(now, leg.waited - waited)  # while the trajectory waits for its motors
 
     def _not_followed(self, motion: Motion, why: str) -> None:
         """A target was refused: a fault, but not at the limit switch that is the home, which the next tick reads."""

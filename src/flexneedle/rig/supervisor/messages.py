@@ -117,10 +117,11 @@ Request = Heartbeat | Arm | Step | Go | Home | Stop | Reset | Close
 
 @dataclass(frozen=True)
 class AxisState:
-    """An axis: its measured position and its motor."""
+    """An axis: its measured position, its motor, and how far from there its last target is (mm or rad)."""
 
     position: float
     motor: MotorState
+    queued: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """A motion under way: its legs one after the other, where its motors shall be, and what they really did."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -9,28 +10,75 @@ from flexneedle.rig.supervisor.drives import Drive
 from flexneedle.rig.supervisor.measured import span
 from flexneedle.rig.supervisor.messages import Expectation
 from flexneedle.rig.supervisor.trajectory import Trajectory, between
+from flexneedle.scenario.rig import LoopSettings
 
 SETTLE_S = 0.5
 """Longest time (s) from the end of a trajectory until its motors have arrived."""
+_STUCK_S = 0.3  # longest time that motors rest away from their targets
+_MOST_WAITED = 10.0  # times its duration: slower motors do not do what they are commanded
 
 
 @dataclass
 class Leg:
-    """Motors that move together. drives: by channel, as they are in this direction; begun: s on the run's clock."""
+    """Motors that move together. drives: by channel, as they are in this direction; begun: s on the run's clock.
+
+    waited: how long (s) the trajectory has waited for its motors; sent: the last targets (counts by channel); share: of
+    the way, there; marked: tolerances that the motors had gone in all at the time (s) when they last had gone on.
+    """
 
     drives: Mapping[str, Drive]
     trajectory: Trajectory
     begun: float
     samples: list[tuple[float, float]] = field(default_factory=list)
+    waited: float = 0.0
     sent: Mapping[str, float] = field(default_factory=dict)
+    share: float = 0.0
+    marked: tuple[float, float] = (0.0, -math.inf)
 
-    def targets(self, now: float, ahead: float) -> Mapping[str, float]:
-        """Where the motors shall go now (counts by channel): where they shall be `ahead` s later. Kept as `sent`."""
-        self.sent = self.trajectory.at(now - self.begun + ahead)
+    def targets(
+        self, now: float, loop: LoopSettings, states: Mapping[str, MotorState]
+    ) -> Mapping[str, float]:
+        """Where the motors shall go now (counts by channel). Kept as `sent`.
+
+        They shall be there a queue later, but no target is further from its motor than the motor goes in that time at
+        the speed of the motion: for motors that are behind the trajectory waits.
+        """
+        wanted = self.trajectory.share(now - self.begun - self.waited + loop.queue)
+        most = self._most(loop, states)
+        self.waited += max(0.0, wanted - most) * self.trajectory.cruise
+        self.share = max(self.share, min(wanted, most))
+        self.sent = self.trajectory.at(self.share)
         return self.sent
 
+    def _most(self, loop: LoopSettings, states: Mapping[str, MotorState]) -> float:
+        """Largest share of the way at which no target is too far from its motor."""
+        speeds, shares = self.trajectory.speeds, [1.0]
+        for name, drive in self.drives.items():
+            if way := abs(self.way(name) / drive.axis.scale):
+                free = loop.queue_of(drive.axis, speeds[name] / abs(drive.axis.scale))
+                shares.append((self._gone(name, states) + free) / way)
+        return min(shares)
+
+    def _gone(self, channel: str, states: Mapping[str, MotorState]) -> float:
+        """How far a motor has gone on its way (mm or rad)."""
+        gone = (states[channel].position - self.trajectory.start[channel]) / abs(
+            self.drives[channel].axis.scale
+        )
+        return gone if self.way(channel) > 0.0 else -gone
+
+    def queued(self, states: Mapping[str, MotorState]) -> dict[str, float]:
+        """How far each axis is from the target that was last sent (mm or rad): what it does without another one."""
+        return {
+            drive.name: abs((self.sent[name] - states[name].position) / drive.axis.scale)
+            for name, drive in self.drives.items()
+            if name in self.sent
+        }
+
     def note(self, states: Mapping[str, MotorState], now: float) -> None:
-        """Keep how much of the way is done, by the motor with the longest."""
+        """Keep how much of the way is done, by the motor with the longest, and when the motors have gone on."""
+        gone = sum(self._gone(name, states) / drive.axis.tolerance for name, drive in self.drives.items())
+        if gone > self.marked[0] + 1.0:
+            self.marked = gone, now
         channel = max(self.drives, key=self._seconds)
         if way := self.way(channel):
             self.samples.append((now, (states[channel].position - self.trajectory.start[channel]) / way))
@@ -46,15 +94,21 @@ class Leg:
 
     def has_arrived(self, states: Mapping[str, MotorState], now: float) -> bool:
         """Whether the last target was sent, and every motor is at rest there."""
-        if now < self.begun + self.trajectory.duration:
+        if now < self.begun + self.waited + self.trajectory.duration or self.share < 1.0:
             return False
         return all(
             arrived(drive, states[name], self.trajectory.goal[name]) for name, drive in self.drives.items()
         )
 
-    def overdue(self, now: float) -> bool:
-        """Whether the motors should have arrived long ago."""
-        return now > self.begun + self.trajectory.duration + SETTLE_S
+    def overdue(self, states: Mapping[str, MotorState], now: float) -> bool:
+        """Whether the motors should have arrived long ago, or rest away from their targets."""
+        duration = self.trajectory.duration
+        latest = self.begun + min(self.waited, _MOST_WAITED * duration) + duration
+        stuck = now > max(self.begun, self.marked[1]) + _STUCK_S and any(
+            abs((self.sent[name] - states[name].position) / drive.axis.scale) > drive.axis.tolerance
+            for name, drive in self.drives.items()
+        )
+        return now > latest + SETTLE_S or stuck
 
     def missing(self, states: Mapping[str, MotorState]) -> str:
         """How far each motor is from its goal, for messages."""
@@ -68,7 +122,8 @@ class Leg:
         """When it began and ended, as measured (s). done: whether it reached its goal; else it ended by now."""
         ramp, duration = 0.5 * self.trajectory.ramp, self.trajectory.duration
         last = 1.0 if done or not self.samples else self.samples[-1][1]
-        begun, ended = span(self.samples, self.begun + ramp, self.begun + duration - ramp, last)
+        ending = self.begun + self.waited + duration - ramp
+        begun, ended = span(self.samples, self.begun + ramp, ending, last)
         return min(begun, now), min(ended, now)
 
 

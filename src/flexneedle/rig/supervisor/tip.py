@@ -49,6 +49,10 @@ class TrackedTip:
         there = replace(expected, end=expected.begin)
         self._watch = self._watch.expecting(there, now, now).after((), now, self.status)
 
+    def wait(self, now: float, seconds: float) -> None:
+        """Expect the end of the travel under way later by `seconds`."""
+        self._watch = self._watch.waiting(now, seconds)
+
     def stop(self, now: float) -> None:
         """Expect the tip to rest from now on."""
         self._watch = self._watch.at_rest(now)

@@ -31,22 +31,25 @@ class Trajectory:
         if time >= self.duration:
             return 1.0
         near = min(time, self.duration - time)
-        cruise = self.duration - self.ramp
+        cruise = self.cruise
         part = near**2 / (2.0 * self.ramp * cruise) if near < self.ramp else (near - 0.5 * self.ramp) / cruise
         return part if near == time else 1.0 - part
 
-    def at(self, time: float) -> dict[str, float]:
-        """Positions (counts) by channel `time` (s) after the start."""
-        share = self.share(time)
+    def at(self, share: float) -> dict[str, float]:
+        """Positions (counts) by channel with this share of the way done."""
         if share == 1.0:  # exactly, without rounding
             return dict(self.goal)
         return {name: begin + share * (self.goal[name] - begin) for name, begin in self.start.items()}
 
     @property
+    def cruise(self) -> float:
+        """Time (s) of the whole way at its largest speed."""
+        return self.duration - self.ramp
+
+    @property
     def speeds(self) -> dict[str, float]:
         """Largest speed (counts/s) by channel."""
-        cruise = self.duration - self.ramp
-        return {name: abs(self.goal[name] - begin) / cruise for name, begin in self.start.items()}
+        return {name: abs(self.goal[name] - begin) / self.cruise for name, begin in self.start.items()}
 
 
 def between(

@@ -38,6 +38,10 @@ class Watch:
         again = rules.innovation(tuple(place[:axes]), expected.begin[:axes], expected.most_off)
         return replace(watch, verdict=again)
 
+    def waiting(self, now: float, seconds: float) -> "Watch":
+        """With the end of what is expected now later by `seconds`."""
+        return replace(self, ended=self.ended + seconds) if now < self.ended and seconds > 0.0 else self
+
     def at_rest(self, now: float) -> "Watch":
         """With the needle stopped where it is expected now."""
         if self.expected is None:

@@ -6,22 +6,26 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from select import select
 from time import monotonic, sleep
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+import psutil
 
 from flexneedle.rig.devices.priority import set_realtime_priority
 from flexneedle.rig.emulator.coupled.truth import Truth, read_truth
+from flexneedle.types import Insertion
 
-START_S, END_S = 120.0, 60.0
+START_S, END_S = 300.0, 60.0
 _STALL_S = 0.005
+_BAD_INPUT = 2  # exit status
 
 
 class Lines:
@@ -83,17 +87,19 @@ class EmulatedRig:
         return read_truth(self.truth)
 
 
+def shipped_rig() -> str:
+    """The rig file of the package for an emulated rig."""
+    return (files("flexneedle.scenario") / "rigs" / "emulated.toml").read_text()
+
+
 @contextmanager
-def emulated_rig(
-    folder: Path, scenario: str, seed: int, *, changes: Mapping[str, str] = {}
-) -> Iterator[EmulatedRig]:
-    """Serve an emulated rig with its files in a folder. changes: texts of the rig file by what they replace."""
-    text = (files("flexneedle.scenario") / "rigs" / "emulated.toml").read_text()
-    for before, after in {
-        "/tmp/aurora": str(folder / "aurora"),
-        "127.0.0.1:2323": "127.0.0.1:0",
-        **changes,
-    }.items():
+def emulated_rig(folder: Path, scenario: str, seed: int, *, text: str | None = None) -> Iterator[EmulatedRig]:
+    """Serve an emulated rig with its files in a folder.
+
+    text: its rig file, with the address and the port of the shipped one (default: that one).
+    """
+    text = shipped_rig() if text is None else text
+    for before, after in {"/tmp/aurora": str(folder / "aurora"), "127.0.0.1:2323": "127.0.0.1:0"}.items():
         text = text.replace(before, after)
     rig, truth = folder / "rig.toml", folder / "truth.csv"
     rig.write_text(text)
@@ -142,33 +148,143 @@ def ended(process: subprocess.Popen[bytes], seconds: float = END_S) -> tuple[int
     return process.returncode, out.decode(), errors.decode()
 
 
+@dataclass(frozen=True)
+class Inserted:
+    """An insertion on an emulated rig that has ended.
+
+    status: exit status; errors: what it has printed on stderr; run: its run.json, empty without one; tip: the true
+    position of the tip at the end (mm); out: its folder.
+    """
+
+    status: int
+    errors: str
+    run: Mapping[str, Any]
+    tip: tuple[float, float, float]
+    out: Path
+
+    @property
+    def outcome(self) -> str:
+        """Outcome, or "refused" where it was refused before it began."""
+        return "refused" if self.status == _BAD_INPUT else str(self.run.get("status", "no record"))
+
+    @property
+    def reason(self) -> str:
+        """Why it ended as it did, in one line."""
+        printed = self.errors.strip().splitlines() if self.status not in (0, 1) else ()
+        return str(self.run.get("reason") or "") or next(reversed(printed), "")
+
+    @property
+    def ticks(self) -> Mapping[str, Any]:
+        """Times of the supervisor's ticks, empty without any."""
+        return (self.run.get("timing") or {}).get("ticks") or {}
+
+    def unexplained(self, seen: "Witness") -> int:
+        """Stalls of the ticks at which the witness was not late, too."""
+        return sum(not seen.explains(one["time_s"], one["late_s"]) for one in self.ticks.get("stalls", ()))
+
+
+def inserted(
+    folder: Path,
+    scenario: Path | str,
+    seed: int,
+    out: Path,
+    *options: str,
+    text: str | None = None,
+    seconds: float = 180.0,
+) -> Inserted:
+    """Insert into a scenario on an emulated rig of its own, with its files in a folder, within `seconds`.
+
+    text: of the rig file, as for `emulated_rig`; options: of the insertion, which runs in the folder.
+    """
+    with emulated_rig(folder, str(scenario), seed, text=text) as rig:
+        process = insertion(rig.rig, str(scenario), out.resolve(), "--seed", str(seed), *options, cwd=folder)
+        status, _, errors = ended(process, seconds)
+        x, y, z = map(float, rig.read_truth().tips[-1, :3])
+    run = json.loads(file.read_text()) if (file := out / "run.json").exists() else {}
+    return Inserted(status, errors, run, (x, y, z), out)
+
+
+def axial_innovation(record: Insertion) -> float:
+    """Mean axial innovation (mm) of the periods with good readings."""
+    found = [one.innovation[0] for one in record.periods if one.verdict.ok and one.readings]
+    return float(np.mean(found)) if found else float("nan")
+
+
+Task = TypeVar("Task")
+Row = dict[str, Any]
+
+
+def resumed(
+    file: Path, tasks: Sequence[Task], run: Callable[[Task], Row], workers: int, key: Callable[[Task], Row]
+) -> Iterator[tuple[Row, bool]]:
+    """Yield the row of each task, and whether it is new: those in a file first, then others as they end.
+
+    A row has the values of its task's key, by which it is found again, and is appended to the file (JSON, a line each)
+    once it is complete. A task that raises RuntimeError is printed, and leaves no row. After an interrupt (Ctrl-C,
+    SIGTERM) tasks that have not ended leave none, and the processes that they have started are ended.
+    """
+    lines = file.read_text().splitlines() if file.exists() else []
+    kept = [row for row in map(json.loads, lines) if any(key(task).items() <= row.items() for task in tasks)]
+    yield from ((row, False) for row in kept)
+    missing = [task for task in tasks if not any(key(task).items() <= row.items() for row in kept)]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    pool = ThreadPoolExecutor(workers)
+    try:
+        for done in as_completed([pool.submit(run, task) for task in missing]):
+            try:
+                row = done.result()
+            except RuntimeError as error:
+                print(error, file=sys.stderr, flush=True)
+                continue
+            with file.open("a") as opened:
+                opened.write(json.dumps(row) + "\n")
+            yield row, True
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in psutil.Process().children(recursive=True):
+            with suppress(psutil.NoSuchProcess):
+                process.terminate()
+        raise
+    finally:
+        pool.shutdown()
+
+
 @dataclass
 class Witness:
-    """Times (s, monotonic) at which a process that only sleeps woke up late, and how late."""
+    """The file of the times (s, monotonic) at which a process that only sleeps woke up late, and how late.
 
-    stalls: list[tuple[float, float]] = field(default_factory=list)
+    text: of the file, once the process has ended.
+    """
+
+    file: Path
+    text: str | None = None
 
     def explains(self, time: float, late: float) -> bool:
         """Whether it was late, too, by at least half as much, when a tick began late at this time."""
         begun = time - late - 0.005
-        return any(begun <= at <= time + 0.05 and gap >= 0.5 * late for at, gap in self.stalls)
+        return any(begun <= at <= time + 0.05 and gap >= 0.5 * late for at, gap in self._stalls())
+
+    def _stalls(self) -> Iterator[tuple[float, float]]:
+        text = self.file.read_text() if self.text is None else self.text
+        for line in text[: text.rfind("\n") + 1].splitlines():
+            at, gap = map(float, line.split())
+            yield at, gap
 
 
 @contextmanager
 def witness() -> Iterator[Witness]:
     """Watch the machine: a process with the priority of the supervisor sleeps 1 ms again and again."""
-    found = Witness()
-    with tempfile.TemporaryFile() as file:
-        process = subprocess.Popen([sys.executable, __file__], stdout=file)
+    with tempfile.TemporaryDirectory() as folder:
+        found = Witness(Path(folder) / "stalls")
+        with found.file.open("wb") as file:
+            process = subprocess.Popen([sys.executable, __file__], stdout=file)
         try:
             yield found
         finally:
             process.terminate()
             process.wait()
-            file.seek(0)
-            for line in file.read().decode().splitlines():
-                at, gap = map(float, line.split())
-                found.stalls.append((at, gap))
+            found.text = found.file.read_text()
 
 
 def watch() -> None:
