@@ -8,7 +8,8 @@ import pytest
 
 import flexneedle
 from flexneedle.control.methods.adaptive_mpc import AdaptiveMpc
-from flexneedle.estimation.identification import Identification, facing
+from flexneedle.estimation.identification import Identification
+from flexneedle.estimation.lateral import facing
 from flexneedle.estimation.moves import Move
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.prior import Slots

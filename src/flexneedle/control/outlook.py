@@ -20,7 +20,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexneedle.estimation.identification import Identified, directions, facing
+from flexneedle.estimation.identification import Identified
+from flexneedle.estimation.lateral import directions, facing
 from flexneedle.types import Floats, Laterals, X, Y, laterals
 
 UNCORRECTED = 5.0

@@ -23,37 +23,23 @@ from functools import cached_property
 
 import numpy as np
 
+from flexneedle.estimation.adapted import adapted, started
 from flexneedle.estimation.estimate import described
+from flexneedle.estimation.lateral import directions, of_components, variance_of
 from flexneedle.estimation.moves import Move, along, assigned
 from flexneedle.estimation.prior import LEAST_SD, Prior, Priors, Slots, check_cells
 from flexneedle.estimation.readings import MoveMeans, shared
 from flexneedle.estimation.sensor import Sensor
 from flexneedle.estimation.sensors import used
 from flexneedle.estimation.task import Task
-from flexneedle.mechanics.model import Adaptation
 from flexneedle.simulator.control import controls
 from flexneedle.simulator.simulator import Simulator
 from flexneedle.simulator.state import State
-from flexneedle.types import (
-    ROLL,
-    SPIN,
-    STILL,
-    THETA,
-    Floats,
-    Laterals,
-    Measurement,
-    Motion,
-    Point,
-    X,
-    Y,
-    Z,
-    laterals,
-)
+from flexneedle.types import STILL, Floats, Laterals, Measurement, Motion, Point, X, Y, Z, laterals
 
 _MOVES_A_SEGMENT = 8  # in tissue; in air there is one segment
 _RECENT = 12  # moves whose residuals are low-passed
 _SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)  # of a Gauss–Newton step: the first that does not raise the cost
-_REST = np.array([STILL])
 _UNEVEN = (
     0.2  # of an offset that turns with the bevel: error of its mean in a roll, whose motor starts and stops
 )
@@ -157,7 +143,7 @@ class Identified:
     @property
     def run_out(self) -> complex:
         """Lateral offset (mm) of the measured tip from the needle's axis, relative to the bevel's direction."""
-        return _lateral(self.parameters[self.slots.run_out])
+        return of_components(self.parameters[self.slots.run_out])
 
     def off_axis(self, bevel: complex) -> complex:
         """Lateral offset (mm) of the measured tip from the model's, with the bevel in this direction."""
@@ -247,14 +233,14 @@ class Identified:
     def left(self) -> list[Laterals]:
         """Lateral residuals (r,) of each sensor: readings minus those of the model."""
         return [
-            readings.left(tips, _lateral(self.parameters[getattr(self.slots, sensor.offset)]))
+            readings.left(tips, of_components(self.parameters[getattr(self.slots, sensor.offset)]))
             for sensor, readings, tips in zip(self.sensors, self._readings, self.laterals, strict=True)
         ]
 
     def _with(self, parameters: Floats) -> "Identified":
         """The estimate with these parameters: the insertion simulated again, in segments."""
-        simulator = _adapted(self.nominal, self.settings, parameters)
-        state = _started(self, simulator, parameters)
+        simulator = adapted(self.nominal, self.settings, parameters)
+        state = self._started(simulator, parameters)
         inside = int(np.argmax(np.append(self.tips[1:, X], np.inf) > 0.0))
         ends = [*range(min(inside, len(self.rows)), len(self.rows), _MOVES_A_SEGMENT), len(self.rows)]
         stops, parts, first = [], [state.tip[None]], 0
@@ -272,6 +258,10 @@ class Identified:
             tips=np.concatenate(parts),
             stops=tuple(stops),
         )
+
+    def _started(self, simulator: Simulator, parameters: Floats) -> State:
+        """The state of the start with these parameters."""
+        return started(self.nominal, simulator, parameters, self.stops[0][1].roll, self.axial)
 
     @cached_property
     def covariance(self) -> Floats:
@@ -336,7 +326,7 @@ class Identified:
             parameters = self.parameters.copy()
             parameters[k] += self.prior.steps[k]
             if depth[-1] < self.prior.begins[k]:
-                simulator = _adapted(self.nominal, self.settings, parameters)
+                simulator = adapted(self.nominal, self.settings, parameters)
                 members.append(Perturbed(k, float(self.prior.steps[k]), simulator, self.state))
                 continue
             member, tips = _perturbed(self, parameters, k, ahead)
@@ -364,35 +354,6 @@ class Identified:
         for k in range(self.slots.modulus, self.parameters.size):
             if k % _ROUND == self.period % _ROUND:
                 yield k
-
-
-def _adapted(nominal: Simulator, settings: Priors, parameters: Floats) -> Simulator:
-    """The model with these parameters."""
-    layers, slots = len(nominal.scenario.tissue), Slots.of(nominal.scenario)
-    shift = slots.modulus + layers
-    variation = shift + layers - 1
-    return nominal.adapted(
-        Adaptation(
-            shift=parameters[shift:variation],
-            stiffness=np.exp(parameters[slots.modulus : shift]),
-            cell=settings.cell_mm,
-            variation=np.exp(parameters[variation:]),
-            bevel=float(parameters[slots.bevel]),
-            bend=_lateral(parameters[slots.bend]),
-            clearance=float(parameters[slots.clearance]),
-        )
-    )
-
-
-def _started(estimate: Identified, simulator: Simulator, parameters: Floats) -> State:
-    """The state of the start, settled with these parameters."""
-    start = estimate.nominal.start(estimate.stops[0][1].roll)
-    moved = start.with_estimate(
-        base_x=float(start.base[0]) + estimate.axial,
-        base=(start.base[Y : Z + 1] + _pair(parameters[estimate.slots.base])).tolist(),
-        slope=(start.base[THETA:] + _pair(parameters[estimate.slots.slope])).tolist(),
-    )
-    return simulator.replay(moved, _REST)[0]
 
 
 def improved(estimate: Identified) -> Identified:
@@ -440,7 +401,7 @@ def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) 
     Moves before the parameter has an effect are not simulated again.
     """
     simulator, begins = (
-        _adapted(estimate.nominal, estimate.settings, parameters),
+        adapted(estimate.nominal, estimate.settings, parameters),
         float(estimate.prior.begins[k]),
     )
     reached = int(np.argmax(np.append(estimate.tips[:, X], np.inf) > begins))  # by the move before this one
@@ -448,39 +409,12 @@ def _perturbed(estimate: Identified, parameters: Floats, k: int, ahead: Floats) 
         (stop for stop in estimate.stops if stop[0] < max(1, reached)), key=lambda stop: stop[0]
     )
     if first == 0:
-        state = _started(estimate, simulator, parameters)
+        state = estimate._started(simulator, parameters)
     before = np.concatenate([estimate.tips[:first], state.tip[None]])
     now, tips = simulator.replay(state, estimate.rows[first:])
     later = simulator.replay(now, ahead)[1]
     member = Perturbed(k, float(estimate.prior.steps[k]), simulator, now)
     return member, np.concatenate([before, tips, later])
-
-
-def facing(bevel: complex, controls: Floats, axes: int) -> Laterals:
-    """Direction (…, m) of the bevel after each of controls (…, m, 9), from its direction before them."""
-    turned = bevel * np.exp(1j * np.cumsum(controls[..., ROLL] + controls[..., SPIN], axis=-1))
-    faces: Laterals = np.rint(turned.real) if axes == 1 else turned
-    return faces
-
-
-def directions(bevel: complex, axes: int) -> Laterals:
-    """Directions (axes,) of a quantity relative to the bevel's direction."""
-    return np.array([bevel.real]) if axes == 1 else np.array([bevel, 1j * bevel])
-
-
-def variance_of(slope: Laterals, covariance: Floats) -> float:
-    """Variance, summed over the axes, of a lateral quantity with derivatives `slope` (K,) to parameters."""
-    return float((slope.conj() @ covariance @ slope).real)
-
-
-def _lateral(values: Floats) -> complex:
-    """A lateral quantity of its components: a float in the plane."""
-    return float(values[0]) if len(values) == 1 else complex(*values)
-
-
-def _pair(values: Floats) -> tuple[float, float]:
-    y, z = (*values.tolist(), 0.0)[:2]
-    return y, z
 
 
 def low_passed(settings: Priors, left: Laterals) -> complex:

@@ -24,7 +24,8 @@ from flexneedle.control.interface import Decision, Method
 from flexneedle.control.outlook import UNCORRECTED, Outlook
 from flexneedle.control.path import Ahead, GuidePath, of_plan, proposals
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.estimation.identification import Identification, Identified, facing
+from flexneedle.estimation.identification import Identification, Identified
+from flexneedle.estimation.lateral import facing
 from flexneedle.estimation.prior import Priors
 from flexneedle.estimation.task import Task
 from flexneedle.planning import terms
