@@ -285,7 +285,7 @@ def random_command(random: Random) -> bytes:
 def random_frame(random: Random) -> aurora.EmulatedFrame:
     """A frame with odd values and faults."""
     values = [random.choice(ODD) if random.random() < 0.1 else value for value in POSE]
-    made = EmulatedPose(tuple(values[4:7]), tuple(values[:4]), values[7])  # type: ignore[arg-type]
+    made = EmulatedPose(tuple(values[4:7]), tuple(values[:4]), values[7])
     faults = {name: random.choice(aurora.OF_STATUS) for name in SENSORS if random.random() < 0.1}
     number = random.choice((0, 1, random.randrange(2**32)))
     return aurora.EmulatedFrame(

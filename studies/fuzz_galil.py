@@ -17,7 +17,7 @@ import re
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from random import Random
@@ -31,6 +31,7 @@ from flexneedle.rig.devices.galil.replies import GarbledError, numbers, parse, t
 from flexneedle.rig.devices.galil.states import report
 from flexneedle.rig.emulator.galil.axis import Axis
 from flexneedle.rig.emulator.galil.controller import Device, advanced, reply
+from flexneedle.rig.ports import MotorState
 
 FARTHEST = 2.0**31
 TIMEOUT_MS, SLACK_S = 10.0, 1.0  # slack: the machine may be busy with other processes
@@ -265,11 +266,11 @@ def called(motors: GalilMotors, server: Server, name: str, random: Random) -> fl
     return took
 
 
-def compare(states: object, sent: bytes) -> None:
+def compare(states: Mapping[str, MotorState], sent: bytes) -> None:
     """Raise Failure if states are not those that were sent."""
     first, second = re.findall(rb"-?[0-9.]+", sent)[:2], re.findall(rb"-?[0-9.]+", sent)[2:4]
     true = [float(value) for value in first + second]
-    read = [state.position for state in states.values()] + [state.commanded for state in states.values()]  # type: ignore[attr-defined]
+    read = [state.position for state in states.values()] + [state.commanded for state in states.values()]
     if true != read:
         raise Failure(f"{sent!r} read as {states}")
 

@@ -15,9 +15,10 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from random import Random
+from typing import Any
 
 import numpy as np
 import rosbags.typesys.stores.ros2_humble as ros
@@ -161,8 +162,8 @@ def problem(key: str, data: bytes, record: Request | None) -> str:
     return f"a record of type {type(record).__name__}"
 
 
-def _far(points: object) -> str:
-    far = [point for point in points if not math.hypot(*point) <= FARTHEST_MM * (1 + 1e-9)]  # type: ignore[attr-defined]
+def _far(points: Iterable[Sequence[float]]) -> str:
+    far = [point for point in points if not math.hypot(*point) <= FARTHEST_MM * (1 + 1e-9)]
     return f"position {far[0]}" if far else ""
 
 
@@ -190,7 +191,7 @@ class Consumers:
 
     def __init__(self) -> None:
         self.nodes = SilentNode(), SilentNode()
-        self.tracker = RosTracker(self.nodes[0], WallClock(), 0.25)  # type: ignore[arg-type]
+        self.tracker = RosTracker(self.nodes[0], WallClock(), 0.25)
         self.motors = RosMotors.__new__(RosMotors)
         vars(self.motors).update(
             _profile=load_profile("neutral"), _channels=("a", "b"), _stale=1e9, _speeds={"a": 1.0, "b": 1.0},
@@ -289,8 +290,8 @@ def _requests(node: NodeClient) -> list[Request]:
     return requests
 
 
-def _stops(writer: object, node: NodeClient) -> bool:
-    writer.write(ros.std_msgs__msg__Bool(True))  # type: ignore[attr-defined]
+def _stops(writer: Any, node: NodeClient) -> bool:
+    writer.write(ros.std_msgs__msg__Bool(True))
     return any(isinstance(one, Stop) for one in _requests(node))
 
 

@@ -41,7 +41,7 @@ def test_along_a_tilted_entry_only_the_insertion_axis_moves():
 
 
 class Axes:
-    """A supervisor that turns and travels as told, but for what it adds to the rotation."""
+    """A supervisor that turns and travels as commanded, but for what it adds to the rotation."""
 
     rig = load_rig("emulated")
 

@@ -111,11 +111,15 @@ def test_a_stop_is_taken_from_a_publisher_that_does_not_repeat_what_is_lost(node
     once = Qos(Policy.Reliability.BestEffort)
     writer = Writer(peer.domain, NEUTRAL.subscribe.stop.topic, "std_msgs/msg/Bool", once)
 
+    found = []
+
     def stopped():
         writer.write(Bool(True))
-        return any(isinstance(request, Stop) for request in node.poll())
+        found.extend(request for request in node.poll() if isinstance(request, Stop))
+        return found
 
     until(stopped)
+    assert found[0].topic == NEUTRAL.subscribe.stop.topic
 
 
 @pytest.mark.parametrize(
@@ -136,7 +140,8 @@ def test_a_stop_that_was_latched_before_the_start_is_received():
     writer = Writer(peer.domain, NEUTRAL.subscribe.stop.topic, "std_msgs/msg/Bool", latched=True)
     writer.write(Bool(True))
     with open_node(NEUTRAL) as node:
-        await_requests(node, Stop)
+        (stop, *_) = await_requests(node, Stop)
+    assert stop.topic == NEUTRAL.subscribe.stop.topic
 
 
 def test_a_stop_that_comes_before_the_first_sign_of_life_is_received(monkeypatch):
@@ -195,11 +200,15 @@ def test_two_trackers_on_one_topic_are_refused(measuring):
     one.await_node(measuring)
     other.await_node(measuring)
 
+    refused = []
+
     def both():
         one.send("tip", tip(time.time()))
-        return any(isinstance(r, Refused) and "2 publishers" in r.reason for r in measuring.poll())
+        refused.extend(r for r in measuring.poll() if isinstance(r, Refused) and "2 publishers" in r.reason)
+        return refused
 
     until(both)
+    assert refused[0].topic == "/flexneedle/tracker/tip"
 
 
 def test_a_flood_of_measurements_does_not_hold_up_a_stop():

@@ -64,7 +64,7 @@ def small_disk(tmp_path):
 
 @pytest.fixture
 def motors(monkeypatch):
-    """What the driver was told, in order."""
+    """Calls of the driver, in order."""
     calls, apply = [], Phantom.apply
 
     def applied(phantom, *given):

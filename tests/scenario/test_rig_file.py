@@ -153,8 +153,8 @@ RULES = [
 @pytest.mark.parametrize(("key", "value", "rule"), RULES, ids=lambda part: str(part)[:30])
 def test_a_broken_rule_of_an_axis_is_reported_in_one_line(file, key, value, rule):
     (line,) = problems(file({f"axes.{key}": value}))
-    told, message = line.split(": ", maxsplit=1)
-    assert told.split(" = ")[0].removesuffix("[1]") == f"axes.{key}"
+    shown, message = line.split(": ", maxsplit=1)
+    assert shown.split(" = ")[0].removesuffix("[1]") == f"axes.{key}"
     assert message.startswith(rule)
 
 
@@ -181,8 +181,8 @@ def test_a_broken_rule_of_an_axis_is_reported_in_one_line(file, key, value, rule
 )
 def test_a_broken_rule_is_reported_in_one_line(file, key, value, rule):
     (line,) = problems(file({key: value}))
-    told, message = line.split(": ", maxsplit=1)
-    assert told.split(" = ")[0].startswith(key)
+    named, message = line.split(": ", maxsplit=1)
+    assert named.split(" = ")[0].startswith(key)
     assert message.startswith(rule)
 
 

@@ -150,6 +150,7 @@ def test_a_stop_after_the_end_does_nothing():
     with Supervisor(task()) as made:
         made.arm()
     made.request_stop("too late")
+    assert made.report.state is State.ARMED
 
 
 def test_a_supervisor_that_is_killed_is_an_error(supervisor):
@@ -257,6 +258,7 @@ def test_without_its_client_the_supervisor_stops_and_ends(tmp_path):
     client.wait()
     client.stdout.close()
     until(lambda: ended(pid))
+    assert client.returncode == -signal.SIGKILL
 
 
 @pytest.mark.parametrize(
