@@ -16,7 +16,9 @@ from ros_topics_rig import rig_of_page
 def topics_rig():
     command = [sys.executable, "-m", "ros_topics_rig", str(START_MM)]
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=Path(__file__).parents[1]) as process:
+    with subprocess.Popen(
+        command, stdin=pipe, stdout=pipe, text=True, cwd=Path(__file__).parents[1]
+    ) as process:
         assert process.stdout.readline() == "ready\n"
         yield
         process.stdin.close()
