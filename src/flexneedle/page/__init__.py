@@ -1,0 +1,1 @@
+"""The page of `flexneedle serve`: plan, watch and replay in a browser."""

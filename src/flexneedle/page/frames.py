@@ -1,0 +1,83 @@
+"""Binary frames of shapes, as `static/frames.js` reads them.
+
+A header of 16 bytes, little-endian: kind (u8), columns (u8), source (u8), 0 (u8), number (u32) of the first period or of
+the iteration, paths (u32), points (u32) of each path; then paths × points × columns values, float32, point by point.
+Where a frame has several paths of an insertion, each is one period.
+"""
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_HEADER = struct.Struct("<BBBBIII")
+_MOST_VALUES = 4_000_000
+
+
+class Kind(IntEnum):
+    """What a frame shows. Columns are x, y, z (mm) and what is given here."""
+
+    NEEDLE = 1
+    """Nodes of the estimated, planned or simulated needle, base first."""
+    TRUE = 2
+    """Points of the true needle."""
+    PREDICTED = 3
+    """Needle at the target as predicted; column 4: standard deviation (mm) across it."""
+    SAMPLES = 4
+    """Sampled paths of the tip; column 4 of their last point: cost."""
+    PATH = 5
+    """Path of the tip: planned."""
+    CHANNEL = 6
+    """Cut channel; column 4: stretch of the tissue beside it, 1 at rest."""
+    REACH = 7
+    """Section of the targets that can be hit: paths are closed outlines, one for each depth, outermost last."""
+    SWEEP = 8
+    """All needles of a plan, a path for each step."""
+
+
+class Source(IntEnum):
+    """What a frame belongs to."""
+
+    SCENE = 0
+    LIVE = 1
+    FIRST = 2
+    SECOND = 3
+    MANIPULATION = 4
+    STEERING = 5
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeFrame:
+    """A frame: kind, source, number of the first period or of the iteration, values (paths, points, columns)."""
+
+    kind: Kind
+    source: Source
+    number: int
+    values: NDArray[np.float32]
+
+
+def packed(frame: ShapeFrame) -> bytes:
+    """The bytes of a frame."""
+    paths, points, columns = frame.values.shape
+    header = _HEADER.pack(frame.kind, columns, frame.source, 0, frame.number, paths, points)
+    return header + np.ascontiguousarray(frame.values, dtype="<f4").tobytes()
+
+
+def unpacked(data: bytes) -> ShapeFrame:
+    """The frame of bytes. Raises ValueError for bytes that are none."""
+    if len(data) < _HEADER.size:
+        raise ValueError(f"a frame of {len(data)} bytes: must have at least {_HEADER.size}")
+    kind, columns, source, zero, number, paths, points = _HEADER.unpack_from(data)
+    values = paths * points * columns
+    if zero or values > _MOST_VALUES or len(data) != _HEADER.size + 4 * values:
+        raise ValueError(f"a frame of {len(data)} bytes does not have {paths} x {points} x {columns} values")
+    shaped: Any = np.frombuffer(data, dtype="<f4", offset=_HEADER.size).reshape(paths, points, columns)
+    return ShapeFrame(Kind(kind), Source(source), number, shaped)
+
+
+def frame_of(kind: Kind, source: Source, number: int, *paths: Any) -> ShapeFrame:
+    """The frame of paths (points, columns) of equal shape."""
+    return ShapeFrame(kind, source, number, np.stack([np.asarray(path, dtype=np.float32) for path in paths]))

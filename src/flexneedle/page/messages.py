@@ -1,0 +1,450 @@
+"""Messages between the page and its server: JSON objects with a `type`. This file is their reference.
+
+Requests are what a browser sends, news what the server sends. A request may have a `request` number, which the answer
+repeats. Keys of a scenario are dotted, such as "tissue.0.thickness_mm", with the units of the scenario file. Lengths
+are in mm, times in s, angles in degrees where the name says so.
+"""
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+
+Key = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[a-z0-9_.]+$")]
+Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]*$")]
+Seed = Annotated[int, Field(ge=0, le=2**53)]
+Value = float | int | bool | str | list[Any] | dict[str, Any] | None
+Strategy = Literal["manipulation", "steering"]
+Vector = tuple[float, float, float]
+
+
+class Message(BaseModel):
+    """A message: frozen; unknown keys, NaN and numbers in quotes are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False)
+
+
+class Request(Message):
+    """What a browser asks for. steering: whether only the client that steers may ask for it."""
+
+    steering: ClassVar[bool] = True
+
+    request: Annotated[int, Field(ge=0, le=2**53)] | None = None
+
+
+class Steer(Request):
+    """Take the steering, or release it. It is refused while another client steers."""
+
+    steering = False
+
+    type: Literal["steer"]
+    take: bool
+
+
+class Edit(Request):
+    """Change values of the scenario by key. All are refused if one is; a newer edit replaces the work of older ones."""
+
+    type: Literal["edit"]
+    values: Annotated[dict[Key, Value], Field(min_length=1, max_length=200)]
+
+
+class Preset(Request):
+    """Begin with a scenario of the package: a preset or a random world such as "world:7"."""
+
+    type: Literal["preset"]
+    name: Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[a-z0-9][a-z0-9:-]*$")]
+
+
+class Load(Request):
+    """Begin with the text of a scenario file (TOML)."""
+
+    type: Literal["load"]
+    name: Name
+    text: Annotated[str, Field(max_length=200_000)]
+
+
+class Options(Request):
+    """Change what is not in the scenario; what is None stays."""
+
+    type: Literal["options"]
+    seed: Seed | None = None
+    strategy: Strategy | None = None
+    controller: Annotated[str, Field(max_length=60, pattern=r"^[a-z][a-z0-9-]*$")] | None = None
+
+
+class Start(Request):
+    """Start work on the present scenario. compare: plans of both strategies side by side."""
+
+    type: Literal["start"]
+    work: Literal["plan", "compare", "reach"]
+
+
+class Cancel(Request):
+    """Cancel a job."""
+
+    type: Literal["cancel"]
+    job: Annotated[int, Field(ge=0)]
+
+
+class Insert(Request):
+    """Start an insertion with the present plan, which is made first if there is none. rig: the connected one, armed."""
+
+    type: Literal["insert"]
+    rig: bool = False
+    paused: bool = False
+
+
+class Arm(Request):
+    """Arm the connected rig for one insertion, or disarm it. Its user has confirmed that the way is free."""
+
+    type: Literal["arm"]
+    armed: bool
+
+
+class Pace(Request):
+    """Pace of a virtual insertion: 1 is real time, 0 paused."""
+
+    type: Literal["pace"]
+    pace: Annotated[float, Field(ge=0.0, le=50.0)]
+
+
+class Advance(Request):
+    """Carry out one control period of a paused insertion."""
+
+    type: Literal["advance"]
+
+
+class Stop(Request):
+    """Stop the insertion. Anybody may."""
+
+    steering = False
+
+    type: Literal["stop"]
+
+
+class Disturb(Request):
+    """Disturb a virtual insertion.
+
+    push: a force on the tip of `size` N in the direction `angle_deg` about the axis, from now on (0: none); stiffen:
+    the layer with index `layer` is `size` times as stiff; drop: the tracker does not measure the tip for `size` s;
+    plate: a metal plate comes to `size` mm from the center of the tracker's workspace (0: is taken away).
+    """
+
+    type: Literal["disturb"]
+    what: Literal["push", "stiffen", "drop", "plate"]
+    size: Annotated[float, Field(ge=0.0, le=1e4)]
+    angle_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
+    layer: Annotated[int, Field(ge=0, le=20)] = 0
+
+
+class Open(Request):
+    """Show a recorded run of the folder of runs, as the first or the second of two; name None closes it."""
+
+    type: Literal["open"]
+    name: Annotated[str, Field(min_length=1, max_length=200)] | None
+    second: bool = False
+
+
+class Save(Request):
+    """Save the insertion that has ended last under a name in the folder of runs."""
+
+    type: Literal["save"]
+    name: Name
+
+
+class RowsFrom(Request):
+    """Ask for the rows of the insertion from an index on, which this client has missed."""
+
+    steering = False
+
+    type: Literal["rows_from"]
+    index: Annotated[int, Field(ge=0)]
+
+
+AnyRequest = Annotated[
+    Steer
+    | Edit
+    | Preset
+    | Load
+    | Options
+    | Start
+    | Cancel
+    | Insert
+    | Arm
+    | Pace
+    | Advance
+    | Stop
+    | Disturb
+    | Open
+    | Save
+    | RowsFrom,
+    Field(discriminator="type"),
+]
+REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(AnyRequest)
+
+
+class News(Message):
+    """What the server sends. A newer message of the same `key` replaces an older one that was not sent yet."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="null")
+
+    @property
+    def key(self) -> str:
+        """What it is the state of."""
+        return str(self.type)  # type: ignore[attr-defined]
+
+
+class Welcome(News):
+    """First message: id of this client, and what can be chosen. rig: name of the connected rig or None."""
+
+    type: Literal["welcome"] = "welcome"
+    client: int
+    version: str
+    presets: list[str]
+    controllers: list[dict[str, str]]
+    strategies: list[str]
+    rig: str | None = None
+
+
+class People(News):
+    """Who is here. steering: id of the client that steers, None if nobody does."""
+
+    type: Literal["people"] = "people"
+    clients: int
+    steering: int | None
+
+
+class Session(News):
+    """The scenario by key, and the options. revision counts changes; a scene, plan or estimate repeats its revision.
+
+    changed: keys that differ from the preset or file it began with. doubts: values that are valid and implausible.
+    """
+
+    type: Literal["session"] = "session"
+    revision: int
+    name: str
+    values: dict[str, Any]
+    changed: list[str]
+    doubts: list[str]
+    seed: int
+    strategy: str
+    controller: str
+
+
+class Scene(News):
+    """Where everything is before the insertion. The needle at the start is the frame NEEDLE number 0.
+
+    layers: name, top and bottom x (mm; bottom None: no end), shear modulus (kPa); guide: x, y, z and half-width of its
+    hole, None without one; base: x, y, z; axis: point at x = 0 (y, z) and slope of the needle's axis; bevel: direction
+    angle (deg) about x and offset (mm); travel: largest lateral travel of guide and base, largest depth.
+    """
+
+    type: Literal["scene"] = "scene"
+    revision: int
+    axes: int
+    layers: list[dict[str, Any]]
+    guide: Vector | None
+    base: Vector
+    needle_length_mm: float
+    needle_radius_mm: float
+    axis: dict[str, tuple[float, float]]
+    target: Vector
+    bevel: dict[str, float]
+    travel: dict[str, float | None]
+
+
+class Job(News):
+    """State of a job. share: of the work done, None if unknown; text: one line for people."""
+
+    type: Literal["job"] = "job"
+    job: int
+    kind: Literal["scene", "estimate", "plan", "compare", "reach", "insertion", "recording", "save"]
+    state: Literal["waiting", "running", "done", "failed", "cancelled"]
+    share: float | None = None
+    text: str = ""
+
+    @property
+    def key(self) -> str:
+        """Jobs by kind: a newer one replaces the older."""
+        return f"job {self.kind}"
+
+
+class Estimate(News):
+    """First estimate of a plan, a few iterations of a small search: where it ends, error (mm)."""
+
+    type: Literal["estimate"] = "estimate"
+    revision: int
+    error_mm: float
+    reached: bool
+    tip: Vector
+    seconds: float
+
+
+class Iteration(News):
+    """An iteration of the search of a plan; its paths are the frame SAMPLES of the same number.
+
+    quantiles of the cost of the samples: least, elite, median, greatest; best cost so far.
+    """
+
+    type: Literal["iteration"] = "iteration"
+    revision: int
+    strategy: str
+    iteration: int
+    iterations: int
+    best: float
+    quantiles: list[float]
+
+    @property
+    def key(self) -> str:
+        """The newest iteration of a strategy."""
+        return f"iteration {self.strategy}"
+
+
+class Plan(News):
+    """A plan that is found. history: best cost of each iteration; terms: weighted terms of the cost by name.
+
+    Its needles are a frame SWEEP, the tip's path a frame PATH.
+    """
+
+    type: Literal["plan"] = "plan"
+    revision: int
+    strategy: str
+    seed: int
+    reached: bool
+    summary: str
+    limit: str
+    error_mm: float
+    energy_mj: float
+    flips: int
+    cost: float
+    terms: dict[str, float]
+    history: list[float]
+    tip: Vector
+    guide: list[tuple[float, float]]
+    seconds: float
+
+    @property
+    def key(self) -> str:
+        """One plan of each strategy."""
+        return f"plan {self.strategy}"
+
+
+class Reach(News):
+    """Targets that can be hit, in the plane of y or, in space, of the target: outlines are the frame REACH."""
+
+    type: Literal["reach"] = "reach"
+    revision: int
+    depths: list[float]
+    low: list[float]
+    high: list[float]
+    angle_deg: float
+
+
+class Row(Message):
+    """A control period of an insertion, for plots and player. Unknown values are None."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="null")
+
+    index: int
+    time: float
+    action: str
+    decision: str
+    verdict: str
+    measured: tuple[float | None, float | None, float | None] | None
+    estimate: Vector
+    true: Vector | None
+    path: Vector
+    error_mm: float | None
+    guide: tuple[float, float]
+    base: Vector
+    roll_deg: float
+    indicator: float | None
+    energy_mj: float
+    true_energy_mj: float | None
+    stretch: float | None
+    miss_mm: tuple[float | None, float | None]
+    miss_sd_mm: float | None
+    cost: float | None
+    decide_ms: float
+    late: bool
+    warning: str = ""
+
+
+class Rows(News):
+    """Rows of an insertion from `first` on, in order. of: "live", "first" or "second" recording."""
+
+    type: Literal["rows"] = "rows"
+    of: Literal["live", "first", "second"]
+    first: int
+    rows: list[Row]
+
+    @property
+    def key(self) -> str:
+        """Rows of one insertion."""
+        return f"rows {self.of}"
+
+
+class Insertion(News):
+    """State of an insertion, or how it has ended. of: as for `Rows`; source: scenario and seed of a recording.
+
+    state: waiting, planning, running, paused, done, held, failed, interrupted, refused; unmeasured: on a real rig.
+    """
+
+    type: Literal["insertion"] = "insertion"
+    of: Literal["live", "first", "second"]
+    name: str
+    state: str
+    summary: str
+    controller: str
+    seed: int
+    target: Vector
+    periods: int
+    pace: float
+    error_mm: float | None = None
+    rig: str = ""
+    scene: Scene | None = None
+
+    @property
+    def key(self) -> str:
+        """One state of each."""
+        return f"insertion {self.of}"
+
+
+class Disturbances(News):
+    """What disturbs the virtual insertion now."""
+
+    type: Literal["disturbances"] = "disturbances"
+    active: list[str]
+
+
+class RigState(News):
+    """State of the connected rig."""
+
+    type: Literal["rig"] = "rig"
+    name: str
+    armed: bool
+    state: str
+    why: str
+
+
+class Runs(News):
+    """Recorded runs of the folder, newest first: name, kind, summary, when it was made (s since 1970)."""
+
+    type: Literal["runs"] = "runs"
+    runs: list[dict[str, Any]]
+
+
+class Refused(News):
+    """A request that is not carried out. problems: by key of the scenario, for the fields of the form."""
+
+    type: Literal["refused"] = "refused"
+    request: int | None = None
+    what: str
+    reason: str
+    problems: dict[str, str] = {}
+
+
+class Done(News):
+    """A request that is carried out."""
+
+    type: Literal["done"] = "done"
+    request: int
