@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all slow bench rig-demo rig-faults rig-wall-clock rig-families fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering worlds space worlds-space tuning docs lint clean
+.PHONY: help setup demo test test-all test-page slow bench rig-demo rig-faults rig-wall-clock rig-families fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering worlds space worlds-space tuning docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -34,8 +34,11 @@ demo: setup  ## plan and steer one insertion on the phantom
 test: setup  ## run the tests but the long ones, on all cores
 	$(BIN)/python -m pytest -n auto --dist worksteal $(PYTEST_ARGS)
 
-test-all: setup  ## run all tests but the slow ones: statistics over many draws, studies in several processes
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" $(PYTEST_ARGS)
+test-all: setup  ## run all tests but the slow ones and the page's: statistics over many draws, studies in several processes
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not page" $(PYTEST_ARGS)
+
+test-page: setup  ## test the page in a browser; needs chromium on the path (SCREENSHOTS=folder keeps pictures)
+	$(BIN)/python -m pytest -m page tests/page $(PYTEST_ARGS)
 
 bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten million rows of tracker data, 60 s of an emulated tracker, round trips to emulated motors, ROS topics
 	$(BIN)/python benchmarks/bench.py

@@ -233,9 +233,9 @@ class Session(News):
 class Scene(News):
     """Where everything is before the insertion. The needle at the start is the frame NEEDLE number 0.
 
-    layers: name, top and bottom x (mm; bottom None: no end), shear modulus (kPa); guide: x, y, z and half-width of its
-    hole, None without one; base: x, y, z; axis: point at x = 0 (y, z) and slope of the needle's axis; bevel: direction
-    angle (deg) about x and offset (mm); travel: largest lateral travel of guide and base, largest depth.
+    layers: name, top_mm and bottom_mm (None: no end), shear_modulus_kpa; guide: x, y, z, None without one; base: x, y,
+    z; axis: point (y, z at x = 0) and slope (y, z) of the needle's axis; bevel: angle_deg about x from y to z, and
+    offset_mm; travel: lateral_mm of guide and base, depth_mm, both the largest.
     """
 
     type: Literal["scene"] = "scene"

@@ -1,0 +1,25 @@
+// Elements of the page, made without markup in strings.
+
+// An element: name with classes ("div.stage"), properties and attributes, children (elements or text).
+// A function is a listener of the event by that name ({click: …}); a value of undefined or false is left out.
+export function make(name, properties = {}, ...children) {
+  const [tag, ...classes] = name.split(".");
+  const element = document.createElement(tag);
+  element.classList.add(...classes);
+  for (const [key, value] of Object.entries(properties)) {
+    if (value === undefined || value === false) continue;
+    if (typeof value === "function") element.addEventListener(key, value);
+    else if (key in element && typeof value !== "string") element[key] = value;
+    else element.setAttribute(key, value === true ? "" : value);
+  }
+  element.append(...children);
+  return element;
+}
+
+export const button = (text, click, properties = {}) => make("button", { type: "button", click, ...properties }, text);
+
+// A number for people: digits after the point, with a true minus sign; "–" if it is unknown.
+export function shown(value, digits = 2) {
+  if (value === null || value === undefined || Number.isNaN(value)) return "–";
+  return value.toFixed(digits).replace(/^-(?=[0.]*$)/, "").replace("-", "−");
+}

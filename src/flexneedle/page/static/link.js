@@ -1,0 +1,148 @@
+// The web socket: connects and connects again by itself, matches answers to requests, hands news to the store.
+
+import { unpacked } from "./frames.js";
+
+const WAITS = [250, 500, 1000, 2000, 4000]; // ms before the next attempts
+const EDIT_EVERY = 50; // ms
+const MOST_REFUSALS = 20;
+const FREE = ["steer", "stop", "rows_from"]; // what a client that does not steer may ask for
+
+export class Link {
+  #store;
+  #address;
+  #socket = null;
+  #attempts = 0;
+  #timer = 0;
+  #number = 0;
+  #waiting = new Map(); // by number of the request: {resolve, message}
+  #edits = {};
+  #editTimer = 0;
+  #lastEdit = -Infinity;
+  #filling = new Map(); // by insertion: first row that was asked for
+
+  // store.js; address of the web socket (default: /live of this page).
+  constructor(store, address = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live`) {
+    this.#store = store;
+    this.#address = address;
+  }
+
+  // Connect, now and whenever the connection is lost. Store key "connection": connecting, open, lost.
+  connect() {
+    clearTimeout(this.#timer);
+    this.#store.set("connection", this.#attempts ? "lost" : "connecting");
+    const socket = new WebSocket(this.#address);
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = ({ data }) => this.#receive(data);
+    socket.onclose = () => this.#lost(socket);
+    this.#socket = socket;
+  }
+
+  // Send a request. Resolves to {done: true} or {done: false, reason, problems}; never rejects. What needs steering
+  // takes it first where nobody steers. A refusal is shown to the user unless `quiet`.
+  async ask(message, { quiet = false } = {}) {
+    if (this.#mustSteer(message)) {
+      const steering = await this.#send({ type: "steer", take: true });
+      if (!steering.done) return this.#judged(steering, quiet);
+    }
+    return this.#judged(await this.#send(message), quiet);
+  }
+
+  // Change values of the scenario by key. Edits are merged and sent at most 20 times a second; until the last is
+  // answered, store key "draft" has them, so that all panels show them at once.
+  edit(values) {
+    this.#store.set("draft", { ...this.#store.get("draft"), ...values });
+    Object.assign(this.#edits, values);
+    this.#editTimer ||= setTimeout(() => this.#sendEdits(), this.#lastEdit + EDIT_EVERY - performance.now());
+  }
+
+  async #sendEdits() {
+    this.#editTimer = 0;
+    this.#lastEdit = performance.now();
+    const values = this.#edits;
+    this.#edits = {};
+    const answer = await this.ask({ type: "edit", values });
+    this.#settle(values);
+    return answer;
+  }
+
+  // Values of the draft that no later edit has changed are now the scenario's, or refused.
+  #settle(values) {
+    const draft = { ...this.#store.get("draft") };
+    for (const [key, value] of Object.entries(values)) {
+      if (Object.is(draft[key], value) && !(key in this.#edits)) delete draft[key];
+    }
+    this.#store.set("draft", Object.keys(draft).length ? draft : undefined);
+  }
+
+  #mustSteer(message) {
+    const people = this.#store.get("people");
+    return !FREE.includes(message.type) && people?.steering === null;
+  }
+
+  #send(message) {
+    if (this.#socket?.readyState !== WebSocket.OPEN) {
+      return Promise.resolve({ done: false, reason: "There is no connection to the server.", problems: {} });
+    }
+    const request = ++this.#number;
+    this.#socket.send(JSON.stringify({ ...message, request }));
+    return new Promise((resolve) => this.#waiting.set(request, resolve));
+  }
+
+  #judged(answer, quiet) {
+    if (!answer.done && !quiet) this.#refuse(answer);
+    return answer;
+  }
+
+  #refuse({ reason, problems }) {
+    const refusals = this.#store.get("refusals") ?? [];
+    const newest = { reason, problems: problems ?? {}, number: (refusals.at(-1)?.number ?? 0) + 1 };
+    this.#store.set("refusals", [...refusals, newest].slice(-MOST_REFUSALS));
+  }
+
+  #receive(data) {
+    if (data instanceof ArrayBuffer) {
+      this.#store.receiveFrame(unpacked(data));
+      return;
+    }
+    const message = JSON.parse(data);
+    if (message.type === "done") this.#answer(message.request, { done: true });
+    else if (message.type === "refused") this.#refused(message);
+    else this.#news(message);
+  }
+
+  #refused({ request, reason, problems }) {
+    if (this.#waiting.has(request)) this.#answer(request, { done: false, reason, problems: problems ?? {} });
+    else this.#refuse({ reason, problems });
+  }
+
+  #news(message) {
+    if (message.type === "welcome") {
+      this.#attempts = 0;
+      this.#filling.clear();
+      this.#store.set("connection", "open");
+    }
+    const missing = this.#store.receive(message);
+    if (message.type !== "rows") return;
+    if (missing === null) this.#filling.delete(message.of);
+    else if (this.#filling.get(message.of) !== missing) {
+      this.#filling.set(message.of, missing);
+      this.#send({ type: "rows_from", index: missing });
+    }
+  }
+
+  #answer(request, answer) {
+    this.#waiting.get(request)?.(answer);
+    this.#waiting.delete(request);
+  }
+
+  #lost(socket) {
+    if (socket !== this.#socket) return;
+    for (const request of [...this.#waiting.keys()]) {
+      this.#answer(request, { done: false, reason: "The connection to the server was lost.", problems: {} });
+    }
+    const wait = WAITS[Math.min(this.#attempts, WAITS.length - 1)];
+    this.#attempts += 1;
+    this.#store.set("connection", "lost");
+    this.#timer = setTimeout(() => this.connect(), wait);
+  }
+}

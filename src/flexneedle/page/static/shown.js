@@ -1,0 +1,76 @@
+// What the views show: the scene before an insertion, the running insertion, or a recorded one, at a period.
+//   "view of": "scene", "live" or "first", as chosen by the user; undefined: what is newest
+//   "view period": the period that is shown; undefined: the newest
+
+const ACTIVE = ["planning", "running", "paused"];
+const TARGET_KEYS = ["target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"];
+
+// Keys to subscribe to for all that this module gives.
+export const SHOWN = [
+  "view of", "view period", "view theme", "scene", "session", "draft", "insertion ", "rows ", "shape ", "plan ",
+  "iteration ", "reach",
+];
+
+// "scene", "live" or "first".
+export function shownOf(store) {
+  const [live, first] = [store.get("insertion live"), store.get("insertion first")];
+  const chosen = store.get("view of");
+  if (chosen === "scene" || (chosen === "live" && live) || (chosen === "first" && first)) return chosen;
+  if (live && ACTIVE.includes(live.state)) return "live";
+  if (first) return "first";
+  const current = store.get("session")?.revision;
+  return live && (!live.scene || live.scene.revision === current) ? "live" : "scene";
+}
+
+// Index of the period that is shown, or null before the first.
+export function shownPeriod(store, of = shownOf(store)) {
+  const count = store.get(`rows ${of}`)?.length ?? 0;
+  if (!count) return null;
+  return Math.min(store.get("view period") ?? Infinity, count - 1);
+}
+
+// Row of that period, or null.
+export function shownRow(store, of = shownOf(store)) {
+  return store.get(`rows ${of}`)?.[shownPeriod(store, of)] ?? null;
+}
+
+// Shape (paths, points, columns, values) of a kind, such as "needle", of what is shown; or null.
+export function shownShape(store, kind, of = shownOf(store)) {
+  if (of === "scene") return store.get(`shape ${kind} scene`) ?? null;
+  return store.track(kind, of, shownPeriod(store, of) ?? Infinity);
+}
+
+// The second recorded run, {row, shape(kind)}, at the period that is shown, or null.
+export function shownSecond(store) {
+  if (!store.get("insertion second")) return null;
+  const period = shownPeriod(store, "second") ?? Infinity;
+  return { row: shownRow(store, "second"), shape: (kind) => store.track(kind, "second", period) };
+}
+
+// Scene of what is shown, or null before the first has come.
+export function shownScene(store) {
+  const of = shownOf(store);
+  return (of === "scene" ? null : store.get(`insertion ${of}`)?.scene) ?? store.get("scene") ?? null;
+}
+
+// Position of the target (x, y, z), with an edit that is not answered yet; or null.
+export function shownTarget(store) {
+  const of = shownOf(store);
+  if (of !== "scene") return store.get(`insertion ${of}`).target;
+  const scene = store.get("scene");
+  if (!scene) return null;
+  const draft = store.get("draft") ?? {};
+  return TARGET_KEYS.map((key, axis) => draft[key] ?? scene.target[axis]);
+}
+
+// The edit that moves the target to a point (x, y, z), to 0.01 mm; in the plane without z.
+export function targetEdit(store, point) {
+  const axes = store.get("scene").axes;
+  const keys = TARGET_KEYS.slice(0, 1 + axes);
+  return Object.fromEntries(keys.map((key, axis) => [key, Math.round(point[axis] * 100) / 100]));
+}
+
+// Whether a plan, estimate or reach is of an earlier state of the scenario than the present.
+export function isStale(store, result) {
+  return Boolean(result) && result.revision !== store.get("session")?.revision;
+}

@@ -1,0 +1,117 @@
+// The bar at the bottom: connection, who is here and who steers, work with progress and cancel, refusals in words.
+
+import { button, make } from "./dom.js";
+
+const CONNECTIONS = {
+  connecting: "Connecting…",
+  open: "Connected",
+  lost: "Connection lost; trying again…",
+};
+const JOBS = {
+  scene: "Scene", estimate: "First estimate", plan: "Plan", compare: "Both strategies", reach: "Reach",
+  insertion: "Insertion", recording: "Recorded run", save: "Saving",
+};
+const STEPS_IN = ["waiting", "planning", "running", "paused"];
+const SHOWN_FOR = 12_000; // ms
+const SHORT = 1_000; // ms: work that ends sooner is not shown
+
+export function mount(element, store, link) {
+  const connection = make("span.connection", { role: "status" });
+  const steering = make("span.steering", { "aria-live": "polite" });
+  const jobs = make("span.jobs");
+  const stop = button("Stop the insertion", () => link.ask({ type: "stop" }), { class: "danger", hidden: true });
+  const refusals = make("div.refusals", { role: "alert" });
+  element.append(refusals, make("div.status-line", {}, connection, stop, steering, jobs));
+
+  store.subscribe(["connection"], () => showConnection(connection, store.get("connection")));
+  store.subscribe(["people", "welcome", "connection"], () => showSteering(steering, store, link));
+  store.subscribe(["insertion live"], () => {
+    stop.hidden = !STEPS_IN.includes(store.get("insertion live")?.state);
+  });
+  store.subscribe(["session"], () => showTitle(store.get("session")));
+  followJobs(jobs, store, link);
+  followRefusals(refusals, store);
+}
+
+function showConnection(element, state) {
+  element.dataset.state = state;
+  element.replaceChildren(make("span.lamp", { "aria-hidden": "true" }), CONNECTIONS[state]);
+}
+
+function showTitle(session) {
+  const title = session ? `${session.name} · seed ${session.seed}` : "";
+  document.getElementById("title").textContent = title;
+  document.title = session ? `${session.name} – flexneedle` : "flexneedle";
+}
+
+function showSteering(element, store, link) {
+  const [people, welcome] = [store.get("people"), store.get("welcome")];
+  element.replaceChildren();
+  if (!people || !welcome || store.get("connection") !== "open") return;
+  const mine = people.steering === welcome.client;
+  const who = people.steering === null ? "nobody steers" : mine ? "you steer" : `person ${people.steering} steers`;
+  const text = `${people.clients} ${people.clients === 1 ? "person" : "people"} here, ${who}`;
+  const change = button(mine ? "Release" : "Take the steering", () => link.ask({ type: "steer", take: !mine }));
+  element.append(make("span", {}, text));
+  if (mine || people.steering === null) element.append(change);
+}
+
+// Work that takes longer than a second has a bar; what has failed stays until the next of its kind begins.
+function followJobs(element, store, link) {
+  const entries = new Map(); // by kind
+  store.subscribe(["job "], (_, changed) => {
+    for (const key of changed) if (key.startsWith("job ")) change(key.slice(4), store.get(key));
+  });
+  function change(kind, job) {
+    const earlier = entries.get(kind);
+    const runs = job?.state === "running" || job?.state === "waiting";
+    if (earlier && (!job || earlier.job !== job.job || !(runs || job.state === "failed"))) remove(kind);
+    if (!job || !(runs || job.state === "failed")) return;
+    const entry = entries.get(kind) ?? begin(kind, job);
+    update(entry, job);
+    if (job.state === "failed") element.append(entry.element);
+  }
+  function begin(kind, { job }) {
+    const bar = make("progress", { max: "1", "aria-label": `Progress: ${JOBS[kind]}` });
+    const text = make("span");
+    const cancel = button("Cancel", () => link.ask({ type: "cancel", job }), { "aria-label": `Cancel: ${JOBS[kind]}` });
+    const entry = { job, kind, bar, text, cancel, element: make("span.job", {}, text, bar, cancel) };
+    entry.timer = setTimeout(() => element.append(entry.element), SHORT);
+    entries.set(kind, entry);
+    return entry;
+  }
+  function update({ kind, text, bar, cancel }, job) {
+    const failed = job.state === "failed";
+    text.textContent = job.text ? `${JOBS[kind]}: ${job.text}` : `${JOBS[kind]}${failed ? " failed" : "…"}`;
+    text.classList.toggle("bad", failed);
+    bar.hidden = cancel.hidden = failed;
+    if (job.share === null) bar.removeAttribute("value");
+    else bar.value = job.share;
+  }
+  function remove(kind) {
+    const { timer, element: shown } = entries.get(kind);
+    clearTimeout(timer);
+    shown.remove();
+    entries.delete(kind);
+  }
+}
+
+// The newest refusals, each for some seconds or until it is closed.
+function followRefusals(element, store) {
+  let newest = 0;
+  store.subscribe(["refusals"], () => {
+    for (const refusal of store.get("refusals") ?? []) {
+      if (refusal.number <= newest) continue;
+      newest = refusal.number;
+      show(refusal);
+    }
+  });
+  function show({ reason, problems }) {
+    const lines = Object.values(problems).filter((line) => !reason.includes(line));
+    const close = button("Close", () => shown.remove());
+    const shown = make("div.refusal", {}, make("div", {}, ...[reason, ...lines].map((line) => make("p", {}, line))), close);
+    element.append(shown);
+    while (element.children.length > 3) element.firstChild.remove();
+    setTimeout(() => shown.remove(), SHOWN_FOR);
+  }
+}

@@ -1,0 +1,173 @@
+// State of the page by key. A message of the server is the state of its key (as `News.key` in page/messages.py):
+//   "session", "scene", "people", "job plan", "iteration steering", "plan manipulation", "insertion live", …
+//   "rows live" | "rows first" | "rows second": all rows so far, by index (a gap is undefined)
+//   "shape KIND SOURCE", such as "shape needle live": the newest frame; `track` has those of all periods
+// What only this browser knows has keys that begin with "view ", and "connection", "refusals", "draft".
+//
+// Who subscribes is called once before the next paint, however many of its keys have changed by then.
+
+import { Kind, Source, pathOf } from "./frames.js";
+
+const KINDS = Object.keys(Kind).map((name) => name.toLowerCase());
+const SOURCES = Object.keys(Source).map((name) => name.toLowerCase());
+const BY = { job: "kind", iteration: "strategy", plan: "strategy", rows: "of", insertion: "of" };
+const BEFORE_ROWS = ["waiting", "planning"];
+const INSERTIONS = ["live", "first", "second"];
+const OWN = /^(view |connection$|refusals$|draft$)/;
+const PLANS = /^((iteration|plan) .*|reach|estimate|shape \w+ (manipulation|steering)|shape (path|samples|reach|sweep) scene)$/;
+
+// Key of a message of the server.
+export function keyOf(message) {
+  const by = BY[message.type];
+  return by ? `${message.type} ${message[by]}` : message.type;
+}
+
+export class Store {
+  #values = new Map();
+  #tracks = new Map(); // "needle live" → array of paths by period
+  #listeners = new Set();
+  #changed = new Set();
+  #frame = 0;
+
+  get(key) {
+    return this.#values.get(key);
+  }
+
+  // Set a key; undefined removes it. An equal value changes nothing.
+  set(key, value) {
+    if (Object.is(this.#values.get(key), value)) return;
+    if (value === undefined) this.#values.delete(key);
+    else this.#values.set(key, value);
+    this.#mark(key);
+  }
+
+  // Call `listener(store, changed)` when one of the keys has changed; a key that ends in a blank stands for all that
+  // begin with it ("job "). Called a first time before the next paint. Returns a function that ends it.
+  subscribe(keys, listener) {
+    const entry = { keys, listener, first: true };
+    this.#listeners.add(entry);
+    this.#schedule();
+    return () => this.#listeners.delete(entry);
+  }
+
+  // Keep `key` the result of `compute(store)`, computed when one of the keys has changed. Values are compared as JSON.
+  derived(key, keys, compute) {
+    let before;
+    return this.subscribe(keys, () => {
+      const value = compute(this);
+      const text = JSON.stringify(value);
+      if (text === before) return;
+      before = text;
+      this.set(key, value);
+    });
+  }
+
+  // Take a message of the server. Returns the index of the first row that is missing, or null.
+  receive(message) {
+    if (message.type === "rows") return this.#receiveRows(message);
+    const key = keyOf(message);
+    const earlier = this.get(key);
+    if (message.type === "insertion" && this.#isAnother(message, earlier)) this.#forget(message.of);
+    if (message.type === "welcome") this.#forgetAll();
+    if (message.type === "session" && message.name !== earlier?.name) this.#forgetPlans();
+    this.set(key, message);
+    return null;
+  }
+
+  // Take a frame (`unpacked` of frames.js).
+  receiveFrame(frame) {
+    const kind = KINDS[Object.values(Kind).indexOf(frame.kind)];
+    const source = SOURCES[Object.values(Source).indexOf(frame.source)];
+    if (INSERTIONS.includes(source)) this.#keep(kind, source, frame);
+    this.set(`shape ${kind} ${source}`, frame);
+  }
+
+  // The shape of an insertion at a period, or the newest before it: {period, paths, points, columns, values} or null.
+  track(kind, source, period = Infinity) {
+    const track = this.#tracks.get(`${kind} ${source}`);
+    if (!track) return null;
+    for (let at = Math.min(period, track.length - 1); at >= 0; at--) if (track[at]) return track[at];
+    return null;
+  }
+
+  #keep(kind, source, frame) {
+    const name = `${kind} ${source}`;
+    const track = this.#tracks.get(name) ?? [];
+    this.#tracks.set(name, track);
+    const { points, columns, number } = frame;
+    if (kind === "samples" || kind === "reach" || kind === "sweep") {
+      track[number] = { period: number, paths: frame.paths, points, columns, values: frame.values };
+      return;
+    }
+    for (let at = 0; at < frame.paths; at++) {
+      track[number + at] = { period: number + at, paths: 1, points, columns, values: pathOf(frame, at) };
+    }
+  }
+
+  #receiveRows({ of, first, rows }) {
+    const key = `rows ${of}`;
+    const known = this.get(key) ?? [];
+    if (first > known.length) return known.length;
+    if (rows.length) this.set(key, [...known.slice(0, first), ...rows, ...known.slice(first + rows.length)]);
+    return null;
+  }
+
+  #isAnother(message, earlier) {
+    if (!earlier) return false;
+    const begins = BEFORE_ROWS.includes(message.state) && !BEFORE_ROWS.includes(earlier.state);
+    return begins || message.periods < earlier.periods || message.name !== earlier.name;
+  }
+
+  #forget(of) {
+    this.set(`rows ${of}`, undefined);
+    for (const kind of KINDS) {
+      this.#tracks.delete(`${kind} ${of}`);
+      this.set(`shape ${kind} ${of}`, undefined);
+    }
+  }
+
+  // A connection begins: the server sends all that there is.
+  #forgetAll() {
+    this.#tracks.clear();
+    for (const key of [...this.#values.keys()]) if (!OWN.test(key)) this.set(key, undefined);
+  }
+
+  // A plan of another revision of the same scenario is shown as such; of another scenario it is not shown.
+  #forgetPlans() {
+    for (const key of [...this.#values.keys()]) if (PLANS.test(key)) this.set(key, undefined);
+  }
+
+  #mark(key) {
+    this.#changed.add(key);
+    this.#schedule();
+  }
+
+  #schedule() {
+    this.#frame ||= requestAnimationFrame(() => {
+      this.#frame = 0;
+      this.#notify();
+    });
+  }
+
+  // Twice, so that what is derived is shown in the same paint.
+  #notify() {
+    for (let round = 0; round < 2; round++) {
+      const changed = this.#changed;
+      this.#changed = new Set();
+      for (const entry of this.#listeners) {
+        if (!entry.first && !concerns(entry.keys, changed)) continue;
+        entry.first = false;
+        entry.listener(this, changed);
+      }
+    }
+    if (this.#changed.size) this.#schedule();
+  }
+}
+
+function concerns(keys, changed) {
+  for (const key of keys) {
+    if (changed.has(key)) return true;
+    if (key.endsWith(" ")) for (const name of changed) if (name.startsWith(key)) return true;
+  }
+  return false;
+}

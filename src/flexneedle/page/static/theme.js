@@ -1,0 +1,31 @@
+// Light or dark: as the system prefers, or as chosen by the switch, which this browser remembers.
+
+const CHOICE = "flexneedle theme";
+const system = matchMedia("(prefers-color-scheme: dark)");
+
+// Keep store key "view theme" ("light", "dark") and the attribute data-theme of the document; `button` switches.
+export function followTheme(store, button) {
+  const apply = () => {
+    const theme = localStorage.getItem(CHOICE) ?? (system.matches ? "dark" : "light");
+    document.documentElement.dataset.theme = theme;
+    button.textContent = theme === "dark" ? "Light" : "Dark";
+    button.setAttribute("aria-label", `Switch to ${theme === "dark" ? "light" : "dark"} colours`);
+    store.set("view theme", theme);
+  };
+  button.addEventListener("click", () => {
+    localStorage.setItem(CHOICE, store.get("view theme") === "dark" ? "light" : "dark");
+    apply();
+  });
+  system.addEventListener("change", apply);
+  apply();
+}
+
+// Colour of style.css by name, such as "--needle", as "rgb(…)", for canvases and WebGL. Ask again when "view theme"
+// changes.
+export function color(name) {
+  const probe = document.getElementById("theme");
+  probe.style.outlineColor = `var(${name})`;
+  const found = getComputedStyle(probe).outlineColor;
+  probe.style.outlineColor = "";
+  return found;
+}

@@ -1,0 +1,172 @@
+"""A small server of the page's files, without flexneedle behind it: sends what it is given, records requests."""
+
+import asyncio
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.responses import FileResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocketDisconnect
+
+import flexneedle.page
+from flexneedle.page.messages import Done, News, Refused
+from recorded_page import TARGET, opening, people, scene, scene_frames, session
+
+STATIC = Path(flexneedle.page.__file__).parent / "static"
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+    "font-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_KEYS = ("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm")
+
+
+class Guarded:
+    """An application with the page's content security policy on every answer."""
+
+    def __init__(self, app):
+        self.app = app
+
+    async def __call__(self, scope, receive, send):
+        async def guarded(message):
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message["headers"], (b"content-security-policy", POLICY.encode())]
+            await send(message)
+
+        await self.app(scope, receive, guarded)
+
+
+class FakePage:
+    """The server in a thread of its own, on a free port.
+
+    news: what a client gets when it comes; requests: all that clients asked; answers: by type of a request, a
+    `Refused`, or a function of the request that returns news and frames for that client before `Done`; schema: what
+    /schema.json returns.
+    """
+
+    def __init__(self, schema=b"{}"):
+        self.news, self.requests, self.answers, self.schema = opening(), [], {}, schema
+        self._sockets, self._revision, self._target = [], 1, list(TARGET)
+        routes = [
+            Route("/", lambda _: FileResponse(STATIC / "index.html")),
+            Route("/schema.json", lambda _: Response(self.schema, media_type="application/json")),
+            WebSocketRoute("/live", self._live),
+            Mount("/static", StaticFiles(directory=STATIC)),
+        ]
+        config = uvicorn.Config(
+            Guarded(Starlette(routes=routes)),
+            port=0,
+            log_level="critical",
+            ws="websockets-sansio",
+            lifespan="off",
+        )
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._started = threading.Event()
+
+    def __enter__(self):
+        self._thread.start()
+        assert self._started.wait(20.0)
+        port = self._server.servers[0].sockets[0].getsockname()[1]
+        self.url = f"http://127.0.0.1:{port}/"
+        return self
+
+    def __exit__(self, *_):
+        self._server.should_exit = True
+        self.drop()
+        self._thread.join(20.0)
+
+    def send(self, *news):
+        """Send news and frames to all clients."""
+        asyncio.run_coroutine_threadsafe(self._send_all(news), self._loop).result(20.0)
+
+    def drop(self):
+        """Close all connections."""
+        asyncio.run_coroutine_threadsafe(self._drop(), self._loop).result(20.0)
+
+    def asked(self, kind):
+        """Requests of a type, without their numbers."""
+        return [
+            {k: v for k, v in each.items() if k != "request"}
+            for each in self.requests
+            if each["type"] == kind
+        ]
+
+    def _run(self):
+        self._loop = asyncio.new_event_loop()
+        try:
+            self._loop.run_until_complete(self._serve())
+        finally:
+            self._loop.close()
+
+    async def _serve(self):
+        serving = asyncio.ensure_future(self._server.serve())
+        while not self._server.started:
+            await asyncio.sleep(0.01)
+        self._started.set()
+        await serving
+
+    async def _live(self, socket):
+        await socket.accept()
+        self._sockets.append(socket)
+        await self._send_to(socket, self.news)
+        with suppress(WebSocketDisconnect):
+            while True:
+                request = await socket.receive_json()
+                self.requests.append(request)
+                await self._answer(socket, request)
+        self._sockets.remove(socket)
+
+    async def _answer(self, socket, request):
+        given = self.answers.get(request["type"])
+        if isinstance(given, Refused):
+            await self._send_to(socket, [given.model_copy(update={"request": request["request"]})])
+            return
+        await self._send_all(self._consequences(request))
+        await self._send_to(socket, [*(given(request) if given else ()), Done(request=request["request"])])
+
+    def _consequences(self, request):
+        if request["type"] == "steer":
+            return [people(steering=1 if request["take"] else None)]
+        if request["type"] == "edit" and set(request["values"]) <= set(_KEYS):
+            self._revision += 1
+            for axis, key in enumerate(_KEYS):
+                self._target[axis] = request["values"].get(key, self._target[axis])
+            target = tuple(self._target)
+            return [session(self._revision, target), scene(self._revision, target), *scene_frames(target)]
+        return []
+
+    async def _send_all(self, news):
+        for socket in list(self._sockets):
+            await self._send_to(socket, news)
+
+    @staticmethod
+    async def _send_to(socket, news):
+        for each in news:
+            if isinstance(each, News):
+                await socket.send_text(each.model_dump_json())
+            else:
+                await socket.send_bytes(each)
+
+    async def _drop(self):
+        for socket in list(self._sockets):
+            with suppress(RuntimeError):
+                await socket.close(1012)
+
+
+def until(page, condition):
+    """Wait until a condition in JavaScript holds; the policy of the page forbids Playwright's `wait_for_function`."""
+    page.evaluate(
+        f"""() => new Promise((resolve, reject) => {{
+          const deadline = performance.now() + 20000;
+          const check = () => {{
+            if ({condition}) resolve();
+            else if (performance.now() > deadline) reject(new Error({condition!r}));
+            else setTimeout(check, 20);
+          }};
+          check();
+        }})"""
+    )

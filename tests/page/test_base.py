@@ -1,0 +1,125 @@
+"""The page connects, shows its state, and recovers it after a lost connection."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from flexneedle.page.messages import Job, Refused
+from fake_page import until
+from recorded_page import people, planned, rows, session
+
+pytestmark = pytest.mark.page
+
+STATUS = "[data-panel=status]"
+SIZES = {"wide": (1280, 800), "narrow": (390, 844)}
+
+
+def test_state_is_shown_without_a_click(visit):
+    page = visit()
+    page.wait_for_selector("text=Connected")
+    assert "Two-layer tissue phantom in space · seed 0" in page.inner_text("#title")
+    assert "1 person here, nobody steers" in page.inner_text(STATUS)
+
+
+def test_steering_is_taken_and_released_visibly(visit, server):
+    page = visit()
+    page.click("text=Take the steering")
+    page.wait_for_selector("text=you steer")
+    page.click("text=Release")
+    page.wait_for_selector("text=nobody steers")
+    assert server.asked("steer") == [{"type": "steer", "take": True}, {"type": "steer", "take": False}]
+
+
+def test_what_needs_steering_takes_it_where_nobody_steers(visit, server):
+    page = visit()
+    page.wait_for_selector("text=nobody steers")
+    page.evaluate("window.flexneedle.link.edit({'target.depth_mm': 35})")
+    page.wait_for_selector("text=you steer")
+    until(page, "flexneedle.store.get('scene').target[0] === 35 && !flexneedle.store.get('draft')")
+    assert server.asked("edit") == [{"type": "edit", "values": {"target.depth_mm": 35}}]
+
+
+def test_edits_are_merged_and_sent_at_most_twenty_times_a_second(visit, server):
+    page = visit()
+    page.wait_for_selector("text=nobody steers")
+    seconds = page.evaluate(
+        """async () => {
+          const start = performance.now();
+          for (let depth = 0; depth < 100; depth++) {
+            flexneedle.link.edit({ "target.depth_mm": 30 + depth / 10 });
+            await new Promise((resolve) => setTimeout(resolve, 5));
+          }
+          return (performance.now() - start) / 1000;
+        }"""
+    )
+    until(page, "!flexneedle.store.get('draft')")
+    edits = server.asked("edit")
+    assert 2 <= len(edits) <= 20 * seconds + 2
+    assert edits[-1]["values"] == {"target.depth_mm": 39.9}
+
+
+def test_a_refusal_is_shown_in_words(visit, server):
+    server.answers["steer"] = Refused(what="steer", reason="Person 2 steers: ask for the steering.")
+    page = visit()
+    page.click("text=Take the steering")
+    assert "Person 2 steers" in page.inner_text("[role=alert]")
+    page.click("[role=alert] >> text=Close")
+    page.wait_for_selector("text=Person 2 steers", state="detached")
+
+
+def test_work_longer_than_a_second_has_a_bar_and_is_cancelled(visit, server):
+    page = visit()
+    server.send(Job(job=7, kind="plan", state="running", share=0.25, text="iteration 5 of 20"))
+    page.wait_for_selector("text=Plan: iteration 5 of 20")
+    assert page.eval_on_selector(f"{STATUS} progress", "bar => bar.value") == 0.25
+    page.click("[aria-label='Cancel: Plan']")
+    server.send(Job(job=7, kind="plan", state="cancelled"))
+    page.wait_for_selector("text=Plan: iteration", state="detached")
+    assert server.asked("cancel") == [{"type": "cancel", "job": 7}]
+
+
+def test_a_lost_connection_recovers_the_state(visit, server):
+    page = visit()
+    page.wait_for_selector("text=nobody steers")
+    server.news = [*planned()[:1], people(clients=3), session(revision=9, seed=4)]
+    server.drop()
+    page.wait_for_selector("text=3 people here")
+    assert "seed 4" in page.inner_text("#title")
+    assert page.evaluate("[flexneedle.store.get('scene'), flexneedle.store.get('plan steering')]") == [
+        None,
+        None,
+    ]
+
+
+def test_rows_that_are_missing_are_asked_for(visit, server):
+    server.answers["rows_from"] = lambda request: [rows(request["index"], 10)]
+    page = visit()
+    page.wait_for_selector("text=nobody steers")
+    server.send(rows(0, 3))
+    server.send(rows(8, 2))
+    until(page, "flexneedle.store.get('rows live').length === 13")
+    assert server.asked("rows_from") == [{"type": "rows_from", "index": 3}]
+
+
+def test_colours_follow_the_system_and_the_switch(visit):
+    page = visit(scheme="dark")
+    ground = "getComputedStyle(document.body).backgroundColor"
+    dark = page.evaluate(ground)
+    page.click("#theme")
+    assert page.evaluate(ground) != dark
+    page.reload()
+    page.wait_for_selector("#theme >> text=Dark")
+    assert page.evaluate(ground) != dark
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", SIZES)
+def test_the_page_fits_its_width(visit, server, size, scheme):
+    server.news = planned()
+    width, height = SIZES[size]
+    page = visit(width, height, scheme)
+    page.wait_for_selector("text=nobody steers")
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    if folder := os.environ.get("SCREENSHOTS"):
+        page.screenshot(path=Path(folder) / f"base-{size}-{scheme}.png")

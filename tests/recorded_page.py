@@ -1,0 +1,253 @@
+"""News and frames of an insertion in space as a server sends them, drawn from closed curves: no mechanics, no draws.
+
+The needle begins at x = -90 mm, its guide is at -41 mm, its tip at the start at -28.5 mm; the skin is x = 0.
+"""
+
+import numpy as np
+
+from flexneedle.page.frames import Kind, Source, frame_of, packed
+from flexneedle.page.messages import (
+    Disturbances,
+    Insertion,
+    Iteration,
+    Job,
+    People,
+    Plan,
+    Row,
+    Rows,
+    Runs,
+    Scene,
+    Session,
+    Welcome,
+)
+
+TARGET = (40.0, 5.0, 3.0)
+PERIODS = 70
+ITERATIONS = 8
+START, LENGTH, NODES = -28.5, 90.0, 46
+
+WELCOME = Welcome(
+    client=1,
+    version="1.0.0",
+    presets=["phantom", "phantom3d"],
+    controllers=[
+        {"name": "adaptive-mpc", "summary": "Estimates stiffness and bevel, and searches."},
+        {"name": "ce-mpc", "summary": "The paper's."},
+    ],
+    strategies=["manipulation", "steering"],
+)
+
+
+def people(clients=1, steering=None):
+    return People(clients=clients, steering=steering)
+
+
+def session(revision=1, target=TARGET, **changes):
+    values = {
+        "name": "Two-layer tissue phantom in space",
+        "needle.outer_diameter_mm": 0.819,
+        "setup.axes": 2,
+        "tissue.0.name": "superficial",
+        "tissue.0.thickness_mm": 20.0,
+        "tissue.0.shear_modulus_kpa": 1.82,
+        "tissue.1.name": "deep",
+        "tissue.1.shear_modulus_kpa": 3.63,
+        **dict(zip(("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"), target, strict=True)),
+    }
+    given = {
+        "name": values["name"],
+        "seed": 0,
+        "strategy": "manipulation",
+        "controller": "adaptive-mpc",
+        **changes,
+    }
+    return Session(revision=revision, values=values, changed=[], doubts=[], **given)
+
+
+def scene(revision=1, target=TARGET, axes=2):
+    return Scene(
+        revision=revision,
+        axes=axes,
+        layers=[
+            {"name": "superficial", "top_mm": 0.0, "bottom_mm": 20.0, "shear_modulus_kpa": 1.82},
+            {"name": "deep", "top_mm": 20.0, "bottom_mm": None, "shear_modulus_kpa": 3.63},
+        ],
+        guide=(-41.0, 0.0, 0.0),
+        base=(START - LENGTH, 0.0, 0.0),
+        needle_length_mm=LENGTH,
+        needle_radius_mm=0.41,
+        axis={"point": (0.0, 0.0), "slope": (0.0, 0.0)},
+        target=target,
+        bevel={"angle_deg": 90.0, "offset_mm": 0.1},
+        travel={"lateral_mm": 20.0, "depth_mm": 60.0},
+    )
+
+
+def curve(x, target=TARGET, sway=0.0):
+    """Points (n, 3) of a path from the axis to the target: cubic in depth, with a sway (mm) on the way."""
+    along = np.clip((np.asarray(x) - START) / (target[0] - START), 0.0, None)
+    shape = 3.0 * along**2 - 2.0 * along**3
+    wave = sway * np.sin(np.pi * along)
+    return np.column_stack([x, target[1] * shape + wave, target[2] * shape - 0.5 * wave])
+
+
+def needle(tip_x, target=TARGET, sway=0.0):
+    return curve(np.linspace(tip_x - LENGTH, tip_x, NODES), target, sway)
+
+
+def _tip_x(period):
+    return START + (TARGET[0] - START) * (period + 1) / PERIODS
+
+
+def shape(kind, source, number, *paths):
+    return packed(frame_of(kind, source, number, *paths))
+
+
+def scene_frames(target=TARGET):
+    return [shape(Kind.NEEDLE, Source.SCENE, 0, needle(START, target))]
+
+
+def plan_frames(source=Source.MANIPULATION, sway=0.4):
+    tips = curve(np.linspace(START, TARGET[0], PERIODS), sway=sway)
+    sweep = [needle(x, sway=sway) for x in np.linspace(START, TARGET[0], 12)]
+    return [shape(Kind.PATH, source, 0, tips), shape(Kind.SWEEP, source, 0, *sweep)]
+
+
+def iteration(number, strategy="manipulation"):
+    best = 2.0 / (1 + number) ** 2
+    return Iteration(
+        revision=1,
+        strategy=strategy,
+        iteration=number,
+        iterations=ITERATIONS,
+        best=best,
+        quantiles=[best, 1.3 * best, 2.0 * best, 6.0 * best],
+    )
+
+
+def samples(number, count=32, source=Source.MANIPULATION, x=(START, TARGET[0])):
+    """Frame of sampled paths, narrower with each iteration."""
+    spread = 6.0 / (1 + number)
+    ends = [
+        (
+            TARGET[0],
+            TARGET[1] + spread * np.cos(2.4 * k) * k / count,
+            TARGET[2] + spread * np.sin(2.4 * k) * k / count,
+        )
+        for k in range(count)
+    ]
+    paths = [
+        np.column_stack([curve(np.linspace(*x, 24), end), np.full(24, k / count)])
+        for k, end in enumerate(ends)
+    ]
+    return shape(Kind.SAMPLES, source, number, *paths)
+
+
+def reach_frame():
+    angle = np.linspace(0.0, 2.0 * np.pi, 49)
+    outlines = [
+        np.column_stack([np.full(49, x), 0.3 * x * np.cos(angle), 0.25 * x * np.sin(angle)])
+        for x in (15.0, 25.0, 35.0, 45.0)
+    ]
+    return shape(Kind.REACH, Source.SCENE, 0, *outlines)
+
+
+def plan(strategy="manipulation", **changes):
+    given = {
+        "revision": 1, "seed": 0, "reached": True, "summary": "ends 0.001 mm off", "limit": "", "error_mm": 0.001,
+        "energy_mj": 0.0021, "flips": 0, "cost": 0.19, "terms": {"accuracy": 0.02, "energy": 0.12, "flips": 0.05},
+        "history": [2.0 / (1 + k) ** 2 for k in range(ITERATIONS)], "tip": TARGET,
+        "guide": [(0.02 * k, 0.01 * k) for k in range(PERIODS)], "seconds": 0.3, **changes,
+    }  # fmt: skip
+    return Plan(strategy=strategy, **given)
+
+
+def row(index):
+    x, y, z = needle(_tip_x(index), sway=0.3)[-1]
+    true = needle(_tip_x(index), sway=0.6)[-1]
+    return Row(
+        index=index, time=0.2 * index, action="advance", decision="advance as planned", verdict="ok",
+        measured=(x + 0.05 * np.sin(index), y + 0.1 * np.cos(7 * index), z + 0.1 * np.sin(5 * index)),
+        estimate=(x, y, z), true=tuple(true), path=tuple(curve([x])[0]), error_mm=float(np.hypot(*(true[1:] - (y, z)))),
+        guide=(0.02 * index, 0.01 * index), base=(x - LENGTH, 0.0, 0.0), roll_deg=3.0 * index, indicator=0.1,
+        energy_mj=2e-5 * index, true_energy_mj=2.1e-5 * index, stretch=1.0 + 0.004 * index,
+        miss_mm=(0.3 * (1 - index / PERIODS), -0.1), miss_sd_mm=0.5 * (1 - index / PERIODS) + 0.05, cost=0.2,
+        decide_ms=12.0, late=False,
+    )  # fmt: skip
+
+
+def rows(first=0, count=PERIODS, of="live"):
+    return Rows(of=of, first=first, rows=[row(k) for k in range(first, first + count)])
+
+
+def insertion(state="running", of="live", periods=PERIODS, **changes):
+    given = {
+        "name": "phantom3d", "summary": "", "controller": "adaptive-mpc", "seed": 0, "target": TARGET, "pace": 1.0,
+        "error_mm": None, "scene": scene(), **changes,
+    }  # fmt: skip
+    return Insertion(of=of, state=state, periods=periods, **given)
+
+
+def period_frames(period, source=Source.LIVE):
+    """Shapes at a control period."""
+    tip = _tip_x(period)
+    estimate, true = needle(tip, sway=0.3), needle(tip, sway=0.6)
+    remaining = np.linspace(0.0, 1.0, NODES) * (1 - period / PERIODS)
+    predicted = np.column_stack([needle(TARGET[0], sway=0.1), 0.2 + 1.2 * remaining])
+    cut = np.linspace(0.0, max(tip, 0.1), 24)
+    stretch = 1.0 + 0.35 * np.sin(np.pi * cut / (TARGET[0] + 5.0))
+    frames = [
+        shape(Kind.NEEDLE, source, period, estimate),
+        shape(Kind.TRUE, source, period, true),
+        shape(Kind.PREDICTED, source, period, predicted),
+    ]
+    if tip > 0.0:
+        frames.append(shape(Kind.CHANNEL, source, period, np.column_stack([curve(cut, sway=0.3), stretch])))
+    return frames
+
+
+def opening(**changes):
+    """What the server sends to a client that comes: a scene, nothing planned."""
+    return [
+        WELCOME,
+        people(),
+        session(**changes),
+        scene(),
+        *scene_frames(),
+        Disturbances(active=[]),
+        Runs(runs=[{"name": "first", "kind": "insertion", "summary": "reached", "made": 1.7e9}]),
+    ]
+
+
+def planned():
+    """As after a plan with both strategies and a reach."""
+    return [
+        *opening(),
+        iteration(ITERATIONS - 1),
+        samples(2),
+        plan(),
+        *plan_frames(),
+        plan(
+            "steering", reached=False, error_mm=2.1, cost=4.2, flips=2, terms={"accuracy": 4.0, "flips": 0.2}
+        ),
+        *plan_frames(Source.STEERING, sway=-1.5),
+        reach_frame(),
+    ]
+
+
+def inserting(period=50):
+    """As in the middle of an insertion."""
+    return [
+        *planned(),
+        insertion(periods=period + 1),
+        rows(0, period + 1),
+        *(frame for each in range(period + 1) for frame in period_frames(each)),
+        samples(3, source=Source.LIVE, x=(_tip_x(period), TARGET[0])),
+        Job(
+            job=3,
+            kind="insertion",
+            state="running",
+            share=(period + 1) / PERIODS,
+            text=f"period {period + 1}",
+        ),
+    ]
