@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from flexneedle.page.messages import Job, Refused
 from fake_page import until
+from flexneedle.page.messages import Job, Refused
 from recorded_page import people, planned, rows, session
 
 pytestmark = pytest.mark.page

@@ -29,11 +29,10 @@ PACKAGES = {  # version, and integrity as the registry publishes it
 
 THREE = """
 export {
-  AmbientLight, BufferAttribute, BufferGeometry, CanvasTexture, Color, ConeGeometry, CylinderGeometry,
-  DirectionalLight, DoubleSide, DynamicDrawUsage, Group, Line, LineBasicMaterial, LineDashedMaterial, LineSegments,
-  MathUtils, Mesh, MeshBasicMaterial, MeshLambertMaterial, OrthographicCamera, PerspectiveCamera, PlaneGeometry,
-  Quaternion, Raycaster, Scene, SphereGeometry, Sprite, SpriteMaterial, TorusGeometry, Vector2, Vector3,
-  WebGLRenderer,
+  AmbientLight, BackSide, BoxGeometry, BufferAttribute, BufferGeometry, CanvasTexture, Color,
+  ConeGeometry, CylinderGeometry, DirectionalLight, DoubleSide, DynamicDrawUsage, EdgesGeometry, Group,
+  LineBasicMaterial, LineSegments, Mesh, MeshBasicMaterial, MeshLambertMaterial, PerspectiveCamera,
+  PlaneGeometry, SRGBColorSpace, Scene, SphereGeometry, Sprite, SpriteMaterial, Vector3, WebGLRenderer,
 } from "three";
 export { OrbitControls } from "three/addons/controls/OrbitControls.js";
 export { TransformControls } from "three/addons/controls/TransformControls.js";

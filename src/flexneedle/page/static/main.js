@@ -5,7 +5,7 @@ import { Link } from "./link.js";
 import { Store } from "./store.js";
 import { followTheme } from "./theme.js";
 
-const PANELS = ["status"];
+const PANELS = ["status", "space"];
 
 const store = new Store();
 const link = new Link(store);

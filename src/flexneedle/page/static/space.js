@@ -1,0 +1,68 @@
+// The scene in space, to scale: tissue, guide, needle, target, predicted and true needle, paths.
+// Pointer: drag turns, wheel or pinch zooms, right button shifts, arrows of the target move it. Keys: see KEYS.
+
+import { button, make, shown } from "./dom.js";
+import { SHOWN, shownRow, shownTarget } from "./shown.js";
+
+const KEYS = "Arrow keys turn, with Shift they shift the view; + and − zoom; 0 resets; 1, 2 and 3 look at x–y, x–z and along the axis.";
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
+const VIEWS = [["Reset", "reset", "0"], ["x–y", "side", "1"], ["x–z", "top", "2"], ["Axis", "axis", "3"]];
+
+let view = null;
+
+export async function mount(element, store, link) {
+  const notice = make("p.quiet", { role: "note", hidden: true });
+  const graphics = graphicsOf(document.createElement("canvas"));
+  if (graphics === null || SOFTWARE.test(graphics)) {
+    notice.hidden = false;
+    notice.textContent = graphics === null
+      ? "This browser has no WebGL, so there is no view in space. The section and the view along the axis show the same."
+      : "WebGL runs in software here, so this view is slow. The section and the view along the axis are fast.";
+  }
+  element.append(notice);
+  if (graphics === null) return;
+
+  const canvas = make("canvas", { tabindex: "0", role: "img", "aria-label": `The scene in space. ${KEYS}`, "aria-describedby": "space-text" });
+  const legend = make("ul.legend", { "aria-label": "Legend" });
+  const text = make("p.spoken", { id: "space-text" });
+  const tools = make("div.tools", { role: "toolbar", "aria-label": "View in space" });
+  element.append(make("div.stage", {}, canvas), tools, legend, text);
+
+  const { SpaceView } = await import("./space/view.js");
+  view = new SpaceView(canvas, legend, store, link);
+  for (const [label, name, key] of VIEWS) {
+    tools.append(button(label, () => view.camera.look(name), { "aria-keyshortcuts": key, title: `Key ${key}` }));
+  }
+  tools.append(
+    button("+", () => view.camera.zoom(0.8), { "aria-label": "Zoom in" }),
+    button("−", () => view.camera.zoom(1.25), { "aria-label": "Zoom out" }),
+  );
+  store.subscribe(SHOWN, () => {
+    text.textContent = inWords(store);
+  });
+}
+
+// Canvas with the scene drawn into it just now, for pictures; null without WebGL. Read it before returning to the
+// browser, which clears it.
+export function drawnCanvas() {
+  return view?.drawn() ?? null;
+}
+
+// Name of the graphics device, or null without WebGL.
+function graphicsOf(canvas) {
+  const gl = canvas.getContext("webgl2");
+  if (!gl) return null;
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return String(name);
+}
+
+function inWords(store) {
+  const point = (values) => values.map((value) => shown(value, 1)).join(", ");
+  const [target, row] = [shownTarget(store), shownRow(store)];
+  const parts = [];
+  if (target) parts.push(`Target at ${point(target)} mm.`);
+  if (row) parts.push(`Tip at ${point(row.estimate)} mm, error ${shown(row.error_mm)} mm.`);
+  return parts.join(" ");
+}

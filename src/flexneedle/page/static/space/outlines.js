@@ -1,0 +1,37 @@
+// The reach: a shaded strip in its plane from the news, and the outlines at each depth from the frame.
+
+import { BufferAttribute, BufferGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial } from "../vendor/three.js";
+import { Lines } from "./lines.js";
+
+export class Outlines {
+  #lines = new Lines();
+
+  constructor() {
+    const material = new MeshBasicMaterial({ transparent: true, opacity: 0.18, depthWrite: false, side: DoubleSide });
+    this.strip = new Mesh(new BufferGeometry(), material);
+    this.strip.frustumCulled = false;
+    this.strip.renderOrder = 1;
+    this.group = new Group();
+    this.group.add(this.strip, this.#lines.object);
+  }
+
+  // reach: depths, low, high (mm) and angle_deg of their plane about the axis, or null; shape: outlines, or null.
+  update(reach, shape, color) {
+    this.group.visible = Boolean(reach);
+    if (!reach) return;
+    this.strip.material.color = color;
+    this.strip.geometry.dispose();
+    this.strip.geometry = stripOf(reach);
+    this.#lines.update(shape, color, () => 0.7);
+  }
+}
+
+function stripOf({ depths, low, high, angle_deg: angle }) {
+  const [c, s] = [Math.cos((angle * Math.PI) / 180), Math.sin((angle * Math.PI) / 180)];
+  const corners = depths.flatMap((x, at) => [x, c * low[at], s * low[at], x, c * high[at], s * high[at]]);
+  const faces = depths.slice(1).flatMap((_, at) => [2 * at, 2 * at + 1, 2 * at + 2, 2 * at + 1, 2 * at + 3, 2 * at + 2]);
+  const geometry = new BufferGeometry();
+  geometry.setAttribute("position", new BufferAttribute(new Float32Array(corners), 3));
+  geometry.setIndex(faces);
+  return geometry;
+}

@@ -1,0 +1,101 @@
+// What stays while a needle moves: layers of tissue, skin, mm grid with labels. y points upwards, z to the viewer.
+
+import {
+  BackSide, BoxGeometry, BufferAttribute, BufferGeometry, Color, DoubleSide, EdgesGeometry, Group, LineBasicMaterial,
+  LineSegments, Mesh, MeshBasicMaterial, PlaneGeometry,
+} from "../vendor/three.js";
+import { shown } from "../dom.js";
+import { color } from "../theme.js";
+
+const [BEHIND, BEYOND, AROUND, STEP] = [8, 8, 4, 5]; // mm
+const [SOFT, STIFF] = [1, 30]; // kPa, between which the tissue's colour changes
+
+// The box that is drawn, {left, right, half}: from behind the guide to beyond the target, as wide as it is high.
+export function boxOf(scene, target) {
+  const tip = scene.base[0] + scene.needle_length_mm;
+  const left = Math.min(scene.guide ? scene.guide[0] : tip, tip, 0) - BEHIND;
+  const deepest = scene.layers.at(-1)?.top_mm ?? 0;
+  const across = Math.max(...[target, scene.guide ?? target].flatMap(([, y, z]) => [Math.abs(y), Math.abs(z)]));
+  return {
+    left: STEP * Math.floor(left / STEP),
+    right: STEP * Math.ceil((Math.max(target[0], deepest) + BEYOND) / STEP),
+    half: Math.max(2 * STEP, STEP * Math.ceil((across + AROUND) / STEP)),
+  };
+}
+
+export class Room {
+  constructor(labels) {
+    this.group = new Group();
+    this.labels = labels;
+  }
+
+  // Draw the layers of a scene in a box.
+  update(scene, box) {
+    this.group.traverse((each) => {
+      each.geometry?.dispose();
+      each.material?.dispose();
+    });
+    this.group.clear();
+    this.labels.clear();
+    this.#addGrid(box);
+    for (const layer of scene.layers) this.#addLayer(layer, box);
+    if (scene.guide) this.#label("guide", [scene.guide[0], scene.guide[1] + 2.5, scene.guide[2]], "--guide", [0.5, 0]);
+  }
+
+  #addLayer({ name, top_mm: top, bottom_mm: bottom, shear_modulus_kpa: modulus }, { right, half }) {
+    const end = Math.min(bottom ?? right, right);
+    if (end <= top) return;
+    const stiffness = Math.log(Math.min(Math.max(modulus, SOFT), STIFF) / SOFT) / Math.log(STIFF / SOFT);
+    const tissue = { color: color("--tissue"), transparent: true, depthWrite: false };
+    const walls = new MeshBasicMaterial({ ...tissue, opacity: 0.1 + 0.3 * stiffness, side: BackSide });
+    const solid = new BoxGeometry(end - top, 2 * half, 2 * half);
+    const layer = new Mesh(solid, walls);
+    layer.position.x = (top + end) / 2;
+    layer.renderOrder = -2;
+    this.group.add(layer);
+    this.#addBoundary(top, half, top === 0 ? "--skin" : "--tissue");
+    if (top === 0) this.#label("skin", [0, half, half], "--skin", [0.5, 0]);
+    this.#label(name, [(top + end) / 2, half, -half], "--skin", [0.5, 0]);
+  }
+
+  #addBoundary(x, half, tone) {
+    const paint = { color: color(tone), transparent: true, depthWrite: false };
+    const plane = new Mesh(new PlaneGeometry(2 * half, 2 * half), new MeshBasicMaterial({ ...paint, opacity: 0.16, side: DoubleSide }));
+    const edges = new LineSegments(new EdgesGeometry(plane.geometry), new LineBasicMaterial({ ...paint, opacity: 0.6 }));
+    for (const each of [plane, edges]) {
+      each.position.x = x;
+      each.rotation.y = Math.PI / 2;
+      each.renderOrder = -1;
+      this.group.add(each);
+    }
+  }
+
+  // Lines each 5 mm on floor and back wall, depths along the front, y and z at the left.
+  #addGrid({ left, right, half }) {
+    const points = [];
+    for (let x = left; x <= right; x += STEP) points.push(x, -half, half, x, -half, -half, x, -half, -half, x, half, -half);
+    for (let w = -half; w <= half; w += STEP) points.push(left, -half, w, right, -half, w, left, w, -half, right, w, -half);
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", new BufferAttribute(new Float32Array(points), 3));
+    const grid = new LineSegments(geometry, new LineBasicMaterial({ color: color("--grid"), transparent: true, opacity: 0.7 }));
+    grid.renderOrder = -3;
+    this.group.add(grid);
+
+    const every = right - left > 150 ? 50 : right - left > 60 ? 20 : 10;
+    const out = half + 0.15 * half;
+    for (let x = every * Math.ceil(left / every); x <= right; x += every) this.#label(shown(x, 0), [x, -half, out], "--quiet");
+    const middle = every * (Math.round((left + right) / 2 / every) + 0.5);
+    this.#label("depth x (mm)", [middle, -half, out], "--quiet");
+    for (const w of [-half, 0, half]) this.#label(shown(w, 0), [left, w, -half], "--quiet", [1.1, 0.5]);
+    this.#label("y (mm)", [left, half, -half], "--quiet", [0.5, -0.3]);
+    for (const w of [0, half]) this.#label(shown(w, 0), [left, -half, w], "--quiet", [1.1, 0.5]);
+    this.#label("z (mm)", [left, -half, half], "--quiet", [1.1, 1.2]);
+  }
+
+  #label(text, point, tone, anchor) {
+    this.labels.add(text, point, color(tone), anchor);
+  }
+}
+
+// Colour of style.css for three.js.
+export const paint = (name) => new Color(color(name));

@@ -1,0 +1,255 @@
+// What moves: needle, predicted and true needle, cut channel, paths, samples, reach, guide and bevel.
+
+import {
+  ConeGeometry, CylinderGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial, MeshLambertMaterial, Vector3,
+} from "../vendor/three.js";
+import { isStale, shownRow, shownSecond, shownShape } from "../shown.js";
+import { Lines } from "./lines.js";
+import { Outlines } from "./outlines.js";
+import { paint } from "./room.js";
+import { Tube } from "./tube.js";
+
+const SDS = 2; // standard deviations that the tube of the predicted needle shows
+const PATH = 0.14; // mm, radius of a path
+const CHANNEL = 1.7; // radius of the channel by the needle's
+const [BEVEL, GUIDE] = [6, 6]; // mm, lengths
+const STRATEGIES = ["manipulation", "steering"];
+// Stretch of the tissue from low to high, distinguishable by lightness alone.
+const STRETCH = [[0.99, 0.88, 0.68], [0.90, 0.62, 0.0], [0.84, 0.37, 0.0], [0.45, 0.11, 0.0]];
+
+export class Shapes {
+  #tubes = {};
+  #lines = { samples: new Lines(), ghosts: new Lines() };
+  #outlines = new Outlines();
+  #seen = new Map(); // by part: what it was drawn from
+
+  constructor() {
+    this.group = new Group();
+    const solid = { needle: "--needle", second: "--second" };
+    for (const [name, tone] of Object.entries(solid)) this.#addTube(name, new MeshLambertMaterial(), tone, 0);
+    for (const name of ["path", "other", "estimated", "truth", "secondPath", "true", "foreseen"]) {
+      this.#addTube(name, new MeshBasicMaterial({ transparent: true }), `--${name}`, 3);
+    }
+    this.#addTube("channel", translucent({ vertexColors: true, opacity: 0.55 }), null, 4);
+    this.#addTube("predicted", translucent({ opacity: 0.24 }), "--predicted", 5);
+    this.#addGuide();
+    this.#addBevel();
+    this.#lines.samples.object.renderOrder = 2;
+    this.group.add(this.#lines.samples.object, this.#lines.ghosts.object, this.#outlines.group);
+  }
+
+  // Draw what the store has. Returns entries of the legend: {text, tone, form} and for the channel {text, ramp}.
+  update(store, scene, of) {
+    const row = shownRow(store);
+    const shape = (kind) => shownShape(store, kind, of);
+    const theme = store.get("view theme");
+    if (this.#differs("theme", [theme])) this.#seen.clear();
+    const entries = [
+      this.#needle(scene, shape("needle")),
+      this.#true(scene, shape("true")),
+      this.#predicted(scene, this.#foreseen(store, shape, of)),
+      this.#channel(scene, shape("channel")),
+      ...this.#plans(store, of),
+      this.#samples(store, of),
+      ...this.#tips(store, of, row),
+      this.#second(store, scene),
+      this.#reach(store, of),
+    ];
+    this.#place(scene, row, shape("needle"));
+    return entries.filter(Boolean);
+  }
+
+  #addTube(name, material, tone, order) {
+    const tube = new Tube(material);
+    tube.mesh.renderOrder = order;
+    this.#tubes[name] = tube;
+    this.#tubes[name].tone = tone;
+    this.group.add(tube.mesh);
+  }
+
+  #addGuide() {
+    const material = translucent({ opacity: 0.55, side: DoubleSide });
+    this.guide = new Mesh(new CylinderGeometry(1.6, 1.6, GUIDE, 24, 1, true), material);
+    this.guide.rotation.z = Math.PI / 2;
+    this.guide.renderOrder = 6;
+    this.group.add(this.guide);
+  }
+
+  #addBevel() {
+    const material = new MeshBasicMaterial();
+    const shaft = new Mesh(new CylinderGeometry(0.12, 0.12, BEVEL - 1.5, 8), material);
+    const head = new Mesh(new ConeGeometry(0.5, 1.5, 12), material);
+    shaft.position.y = (BEVEL - 1.5) / 2;
+    head.position.y = BEVEL - 0.75;
+    this.bevel = new Group();
+    this.bevel.add(shaft, head);
+    this.group.add(this.bevel);
+  }
+
+  // Whether a part is drawn from something else than before.
+  #differs(part, inputs) {
+    const before = this.#seen.get(part);
+    this.#seen.set(part, inputs);
+    return !before || inputs.length !== before.length || inputs.some((input, at) => !Object.is(input, before[at]));
+  }
+
+  // Update a tube where its path differs; `tone` names its colour.
+  #draw(name, path, radius, { tone = this.#tubes[name].tone, opacity, color } = {}) {
+    const tube = this.#tubes[name];
+    if (!this.#differs(name, [path, tone, opacity, typeof radius === "number" ? radius : 0])) return;
+    tube.update(path, radius, color);
+    if (tone) tube.mesh.material.color = paint(tone);
+    if (opacity !== undefined) tube.mesh.material.opacity = opacity;
+  }
+
+  #needle(scene, path) {
+    this.#draw("needle", first(path), scene.needle_radius_mm);
+    return path && { text: "needle", tone: "--needle", form: "thick" };
+  }
+
+  #true(scene, path) {
+    this.#draw("true", first(path), 0.4 * scene.needle_radius_mm, { opacity: 0.9 });
+    this.#tubes.true.mesh.material.depthTest = false;
+    return path && { text: "true needle", tone: "--true" };
+  }
+
+  // The needle at the target: predicted during an insertion; before one, the last of the plan.
+  #foreseen(store, shape, of) {
+    if (of !== "scene") return first(shape("predicted"));
+    const strategy = store.get("session")?.strategy;
+    const sweep = store.get(`shape sweep ${strategy}`) ?? store.get("shape sweep scene");
+    return sweep && !isStale(store, store.get(`plan ${strategy}`)) ? last(sweep) : null;
+  }
+
+  #predicted(scene, path) {
+    const spread = path && path.columns > 3 ? path : null;
+    const radius = scene.needle_radius_mm;
+    this.#draw("foreseen", path, 0.5 * radius, { tone: "--estimate", opacity: 0.6 });
+    this.#draw("predicted", spread, (point) => radius + SDS * path.values[point * path.columns + 3]);
+    return path && { text: spread ? `predicted needle ± ${SDS} sd` : "needle at the target, planned", tone: "--predicted", form: "area" };
+  }
+
+  #channel(scene, path) {
+    const cut = first(path);
+    const stretch = cut ? Array.from({ length: cut.points }, (_, at) => cut.values[at * cut.columns + 3]) : [];
+    const most = Math.max(1.05, ...stretch);
+    const color = (point, into, at) => into.set(rampAt((stretch[point] - 1) / (most - 1)), at);
+    this.#draw("channel", cut, CHANNEL * scene.needle_radius_mm, { color });
+    return cut && { text: `stretch of the tissue, 1 to ${most.toFixed(2)}`, ramp: STRETCH };
+  }
+
+  // Planned paths of the tip: of the chosen strategy, and of the other beside it.
+  #plans(store, of) {
+    const chosen = store.get("session")?.strategy ?? STRATEGIES[0];
+    const other = STRATEGIES.find((name) => name !== chosen);
+    const replanned = of === "scene" ? null : first(shownShape(store, "path", of));
+    const path = replanned ?? first(store.get(`shape path ${chosen}`) ?? store.get("shape path scene"));
+    const second = of === "scene" ? first(store.get(`shape path ${other}`)) : null;
+    const faint = (name) => (of === "scene" && isStale(store, store.get(`plan ${name}`)) ? 0.35 : 1);
+    this.#draw("path", path, PATH, { tone: second ? `--${chosen}` : "--plan", opacity: faint(chosen) });
+    this.#draw("other", second, PATH, { tone: `--${other}`, opacity: faint(other) });
+    return [
+      path && { text: second ? `path by ${chosen}` : "planned path", tone: second ? `--${chosen}` : "--plan" },
+      second && { text: `path by ${other}`, tone: `--${other}` },
+    ];
+  }
+
+  // Sampled paths: the cheaper, the stronger.
+  #samples(store, of) {
+    const strategy = store.get("session")?.strategy;
+    const own = of === "scene" ? store.get(`shape samples ${strategy}`) ?? store.get("shape samples scene") : null;
+    const shape = of === "scene" ? own : shownShape(store, "samples", of);
+    if (this.#differs("samples", [shape])) {
+      const rank = shape ? ranksOf(shape) : [];
+      this.#lines.samples.update(shape, paint("--estimate"), (path) => 0.55 - 0.45 * rank[path]);
+    }
+    return shape && { text: `${shape.paths} sampled paths`, tone: "--estimate", form: "thin" };
+  }
+
+  // Where the tip was: estimated and true.
+  #tips(store, of, row) {
+    const rows = row && of !== "scene" ? store.get(`rows ${of}`).slice(0, row.index + 1) : [];
+    const count = rows.length;
+    if (this.#differs("tips", [of, count, rows[0]])) {
+      this.#draw("estimated", pathOfRows(rows, "estimate"), PATH, { tone: "--estimate" });
+      this.#draw("truth", pathOfRows(rows, "true"), PATH, { tone: "--true" });
+    }
+    return count > 1 ? [{ text: "estimated path of the tip", tone: "--estimate" }] : [];
+  }
+
+  #second(store, scene) {
+    const second = shownSecond(store);
+    this.#draw("second", first(second?.shape("needle")), scene.needle_radius_mm);
+    const rows = second?.row ? store.get("rows second").slice(0, second.row.index + 1) : [];
+    if (this.#differs("second tips", [rows.length, rows[0]])) {
+      this.#draw("secondPath", pathOfRows(rows, "estimate"), PATH, { tone: "--second" });
+    }
+    return second && { text: "second run", tone: "--second" };
+  }
+
+  #reach(store, of) {
+    const reach = of === "scene" ? store.get("reach") : null;
+    const current = reach && !isStale(store, reach) ? reach : null;
+    const outlines = current && store.get("shape reach scene");
+    if (this.#differs("reach", [current, outlines])) this.#outlines.update(current, outlines ?? null, paint("--reach"));
+    return current && { text: "reach", tone: "--reach", form: "area" };
+  }
+
+  #place(scene, row, needle) {
+    this.guide.visible = Boolean(scene.guide);
+    if (scene.guide) this.guide.position.set(scene.guide[0], ...(row?.guide ?? scene.guide.slice(1)));
+    this.guide.material.color = paint("--guide");
+    const tip = needle && tipOf(first(needle));
+    this.bevel.visible = Boolean(tip);
+    if (!tip) return;
+    const angle = ((scene.bevel.angle_deg + (row?.roll_deg ?? 0)) * Math.PI) / 180;
+    this.bevel.position.set(...tip);
+    this.bevel.quaternion.setFromUnitVectors(new Vector3(0, 1, 0), new Vector3(0, Math.cos(angle), Math.sin(angle)));
+    this.bevel.children[0].material.color = paint("--guide");
+  }
+}
+
+const translucent = (how) => new MeshBasicMaterial({ transparent: true, depthWrite: false, ...how });
+
+const first = (shape) => slice(shape, 0);
+const last = (shape) => slice(shape, shape.paths - 1);
+
+// One path of a shape; the same object for the same shape, so that it is drawn once.
+const slices = new WeakMap();
+function slice(shape, index) {
+  if (!shape || shape.paths === 0) return null;
+  const known = slices.get(shape) ?? new Map();
+  slices.set(shape, known);
+  if (!known.has(index)) {
+    const size = shape.points * shape.columns;
+    known.set(index, { ...shape, paths: 1, values: shape.values.subarray(index * size, (index + 1) * size) });
+  }
+  return known.get(index);
+}
+
+const tipOf = ({ values, points, columns }) => Array.from(values.subarray((points - 1) * columns, (points - 1) * columns + 3));
+
+function pathOfRows(rows, key) {
+  const known = rows.filter((row) => row?.[key]);
+  if (known.length < 2) return null;
+  return { points: known.length, paths: 1, columns: 3, values: Float32Array.from(known.flatMap((row) => row[key])) };
+}
+
+// Rank of each path by its cost, column 4 of its last point, from 0 (least) to 1; 0 where there is none.
+function ranksOf({ values, paths, points, columns }) {
+  const ranks = new Float32Array(paths);
+  if (columns < 4 || paths < 2) return ranks;
+  const cost = (path) => values[((path + 1) * points - 1) * columns + 3];
+  const order = Array.from({ length: paths }, (_, path) => path).sort((a, b) => cost(a) - cost(b));
+  order.forEach((path, place) => {
+    ranks[path] = place / (paths - 1);
+  });
+  return ranks;
+}
+
+// Colour of the stretch scale at a share from 0 to 1.
+function rampAt(share) {
+  const place = Math.min(Math.max(share, 0), 1) * (STRETCH.length - 1);
+  const low = Math.min(Math.floor(place), STRETCH.length - 2);
+  return STRETCH[low].map((value, at) => value + (place - low) * (STRETCH[low + 1][at] - value));
+}

@@ -1,0 +1,123 @@
+// The view in space: draws the store's state, only when something has changed and it is on the screen.
+
+import { AmbientLight, DirectionalLight, Scene, WebGLRenderer } from "../vendor/three.js";
+import { make } from "../dom.js";
+import { SHOWN, shownOf, shownScene, shownTarget } from "../shown.js";
+import { Camera } from "./camera.js";
+import { Labels } from "./labels.js";
+import { Room, boxOf } from "./room.js";
+import { Shapes } from "./shapes.js";
+import { Target } from "./target.js";
+
+const SHARPEST = 2; // device pixels to a pixel of the page
+
+export class SpaceView {
+  #store;
+  #canvas;
+  #legend;
+  #frame = 0;
+  #onScreen = true;
+  #room = "";
+  #entries = "";
+
+  // canvas: of a stage; legend: a list.
+  constructor(canvas, legend, store, link) {
+    [this.#canvas, this.#legend, this.#store] = [canvas, legend, store];
+    this.renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true });
+    this.camera = new Camera(canvas, () => this.#schedule());
+    this.labels = new Labels();
+    this.room = new Room(this.labels);
+    this.shapes = new Shapes();
+    this.target = new Target(this.camera, canvas, store, link, () => this.#schedule());
+    this.scene = new Scene();
+    this.scene.add(this.room.group, this.labels.group, this.shapes.group, this.target.group, ...lights(this.camera.camera));
+    new ResizeObserver(([{ contentRect }]) => this.#resize(contentRect)).observe(canvas.parentElement);
+    new IntersectionObserver(([{ isIntersecting }]) => this.#appear(isIntersecting)).observe(canvas);
+    store.subscribe([...SHOWN, "people", "welcome"], () => this.#update());
+  }
+
+  // The canvas with the scene drawn just now.
+  drawn() {
+    this.renderer.render(this.scene, this.camera.camera);
+    return this.#canvas;
+  }
+
+  #update() {
+    const scene = shownScene(this.#store);
+    if (!scene) return;
+    this.#updateRoom(scene);
+    this.#showLegend([
+      ...this.shapes.update(this.#store, scene, shownOf(this.#store)),
+      { text: "target, 1 mm", tone: "--target", form: "disc" },
+    ]);
+    this.target.update();
+    if (this.#onScreen) this.#render();
+  }
+
+  #updateRoom(scene) {
+    const box = boxOf(scene, shownTarget(this.#store));
+    const room = JSON.stringify([box, scene.layers, scene.guide, this.#store.get("view theme")]);
+    if (room === this.#room) return;
+    const another = JSON.stringify(box) !== JSON.stringify(JSON.parse(this.#room || "[null]")[0]);
+    this.#room = room;
+    this.room.update(scene, box);
+    this.#fitLabels();
+    if (another) this.camera.follow(box);
+  }
+
+  #showLegend(entries) {
+    const text = JSON.stringify(entries);
+    if (text === this.#entries) return;
+    this.#entries = text;
+    this.#legend.replaceChildren(...entries.map(entryOf));
+  }
+
+  #resize({ width, height }) {
+    if (!width || !height) return;
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, SHARPEST));
+    this.renderer.setSize(width, height, false);
+    this.height = height;
+    this.#fitLabels();
+    this.camera.resize(width, height);
+    this.#schedule();
+  }
+
+  #fitLabels() {
+    this.labels.fit(this.height ?? 300, this.camera.camera.fov);
+  }
+
+  #appear(onScreen) {
+    this.#onScreen = onScreen;
+    if (onScreen) this.#schedule();
+  }
+
+  #schedule() {
+    if (!this.#onScreen) return;
+    this.#frame ||= requestAnimationFrame(() => this.#render());
+  }
+
+  #render() {
+    cancelAnimationFrame(this.#frame);
+    this.#frame = 0;
+    this.renderer.render(this.scene, this.camera.camera);
+  }
+}
+
+// Light from everywhere, and from above the viewer's left shoulder.
+function lights(camera) {
+  const sun = new DirectionalLight("#ffffff", 2.2);
+  sun.position.set(-0.5, 1, 0.6);
+  camera.add(sun, sun.target);
+  return [new AmbientLight("#ffffff", 1.4), camera];
+}
+
+function entryOf({ text, tone, form, ramp }) {
+  const swatch = make(`span.swatch${form === "area" || ramp ? ".area" : form === "disc" ? ".disc" : ""}`, { "aria-hidden": "true" });
+  if (tone) swatch.style.color = `var(${tone})`;
+  if (ramp) {
+    const stops = ramp.map((rgb) => `rgb(${rgb.map((value) => Math.round(255 * value)).join(" ")})`);
+    swatch.style.background = `linear-gradient(to right, ${stops.join(", ")})`;
+    swatch.style.opacity = "1";
+  }
+  return make("li", {}, swatch, text);
+}
