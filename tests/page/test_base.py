@@ -63,7 +63,7 @@ def test_a_refusal_is_shown_in_words(visit, server):
     server.answers["steer"] = Refused(what="steer", reason="Person 2 steers: ask for the steering.")
     page = visit()
     page.click("text=Take the steering")
-    assert "Person 2 steers" in page.inner_text("[role=alert]")
+    page.wait_for_selector("[role=alert] >> text=Person 2 steers")
     page.click("[role=alert] >> text=Close")
     page.wait_for_selector("text=Person 2 steers", state="detached")
 

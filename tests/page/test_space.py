@@ -3,20 +3,25 @@
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fake_page import until
 from flexneedle.page.messages import Reach
 from recorded_page import (
+    PERIODS,
+    TARGET,
     inserting,
     insertion,
+    iteration,
+    needle,
     opening,
     people,
     period_frames,
     planned,
-    reach_frame,
     rows,
     samples,
+    scene,
 )
 
 pytestmark = pytest.mark.page
@@ -24,32 +29,233 @@ pytestmark = pytest.mark.page
 SPACE = "[data-panel=space]"
 CANVAS = f"{SPACE} canvas"
 SIZES = {"wide": (1280, 800), "narrow": (390, 844)}
-STATES = {
-    "opening": opening,
-    "planned": lambda: [
-        *planned(),
-        Reach(revision=1, depths=[5.0, 45.0], low=[-1.0, -12.0], high=[1.0, 12.0], angle_deg=31.0),
-    ],
-    "inserting": inserting,
-}
+REACH = Reach(revision=1, depths=[5.0, 45.0], low=[-1.0, -12.0], high=[1.0, 12.0], angle_deg=31.0)
+STATES = {"opening": opening, "planned": lambda: [*planned(), REACH], "inserting": inserting}
 NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null;"
+
+VIEW = "const { spaceView } = await import('/static/space.js'); const view = spaceView();"
+
+
+def on_view(page, code):
+    """What a body of JavaScript returns, in which `view` is the view in space."""
+    return page.evaluate(f"async () => {{ {VIEW} {code} }}")
 
 
 def legend(page):
     return page.locator(f"{SPACE} .legend li").all_inner_texts()
 
 
-def shot(page, name):
-    if folder := os.environ.get("SCREENSHOTS"):
-        page.screenshot(path=Path(folder) / f"{name}.png")
+@pytest.fixture
+def space(visit, server):
+    """A function that opens the page with some news and returns it once the scene is drawn."""
+
+    def opened(news=None, **how):
+        server.news = news or server.news
+        return visit(ready=f"{SPACE} .legend li", **how)
+
+    return opened
+
+
+def settled(page):
+    """Wait until two paints have followed."""
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("state", STATES)
-def test_screenshots(visit, server, state, size, scheme):
-    server.news = STATES[state]()
-    page = visit(*SIZES[size], scheme, ready=f"{SPACE} .legend li")
-    page.wait_for_timeout(500)
-    assert page.evaluate("document.documentElement.scrollWidth") <= SIZES[size][0]
-    shot(page, f"space-{state}-{size}-{scheme}")
+def test_the_scene_is_drawn_at_each_size(space, state, size, scheme):
+    width, height = SIZES[size]
+    page = space(STATES[state](), width=width, height=height, scheme=scheme)
+    settled(page)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    colors = on_view(page, COLORS)
+    assert colors > 50
+    if folder := os.environ.get("SCREENSHOTS"):
+        page.screenshot(path=Path(folder) / f"space-{state}-{size}-{scheme}.png")
+
+
+COLORS = """
+const copy = document.createElement("canvas");
+const drawn = view.drawn();
+[copy.width, copy.height] = [drawn.width, drawn.height];
+const pen = copy.getContext("2d");
+pen.drawImage(drawn, 0, 0);
+return new Set(new Uint32Array(pen.getImageData(0, 0, copy.width, copy.height).data.buffer)).size;
+"""
+
+
+def test_the_legend_names_what_is_drawn(space):
+    assert legend(space()) == ["needle", "target, 1 mm"]
+    found = legend(space([*planned(), REACH]))
+    assert found[1:] == [
+        "needle at the target, planned", "path by manipulation", "path by steering", "32 sampled paths", "reach",
+        "target, 1 mm",
+    ]  # fmt: skip
+    found = legend(space(inserting()))
+    assert found[:4] == [
+        "needle",
+        "true needle",
+        "predicted needle ± 2 sd",
+        "stretch of the tissue, 1 to 1.35",
+    ]
+
+
+def test_lengths_are_to_scale(space):
+    page = space()
+    page.click("text=x–y")
+    pixels = on_view(
+        page,
+        """
+        const corner = (x, y) => {
+          const point = view.target.ball.position.clone().set(x, y, 0).project(view.camera.camera);
+          const { clientWidth, clientHeight } = view.renderer.domElement;
+          return [point.x * clientWidth / 2, point.y * clientHeight / 2];
+        };
+        const [a, b, c] = [corner(0, 0), corner(10, 0), corner(0, 10)];
+        return [b[0] - a[0], c[1] - a[1]];
+        """,
+    )
+    assert pixels[0] > 20.0
+    assert pixels[0] == pytest.approx(pixels[1], rel=1e-3)
+
+
+def test_the_needle_is_a_tube_of_its_radius_along_its_points(space):
+    page = space()
+    position = on_view(page, "return [...view.shapes.group.children[0].geometry.attributes.position.array]")
+    ring = np.reshape(position, (-1, 10, 3))[1]  # ring 0 closes the end
+    start = needle(-28.5)[0]
+    np.testing.assert_allclose(ring.mean(axis=0), start, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(ring - start, axis=1), 0.41, atol=1e-4)
+
+
+def test_scrubbing_shows_the_shapes_of_a_period(space):
+    page = space(inserting(50))
+    page.evaluate("flexneedle.store.set('view period', 20)")
+    settled(page)
+    tip = on_view(page, "return view.shapes.bevel.position.toArray()")
+    np.testing.assert_allclose(tip, needle(-28.5 + 68.5 * 21 / PERIODS, sway=0.3)[-1], atol=1e-3)
+
+
+def test_sampled_paths_narrow_with_each_iteration(space, server):
+    page = space()
+    spreads = []
+    for number in range(4):
+        server.send(iteration(number), samples(number))
+        until(page, f"flexneedle.store.get('shape samples manipulation')?.number === {number}")
+        settled(page)
+        ends = on_view(
+            page,
+            """
+            const lines = view.shapes.group.children.find((each) => each.isLineSegments && each.visible);
+            const { count } = lines.geometry.drawRange;
+            return [...lines.geometry.attributes.position.array.slice(0, 3 * count)];
+            """,
+        )
+        spreads.append(np.ptp(np.reshape(ends, (32, 23, 2, 3))[:, -1, 1, 1]))
+    assert np.all(np.diff(spreads) < 0.0)
+
+
+def test_it_draws_only_when_something_has_changed(space, server):
+    page = space(inserting(10))
+    settled(page)
+    page.wait_for_timeout(200)
+    count = "return view.renderer.info.render.frame"
+    before = on_view(page, count)
+    page.wait_for_timeout(400)
+    assert on_view(page, count) == before
+    server.send(rows(11, 1), *period_frames(11))
+    until(page, "flexneedle.store.get('rows live').length === 12")
+    settled(page)
+    assert before < on_view(page, count) <= before + 4
+
+
+def test_keys_turn_zoom_and_reset(space):
+    page = space()
+    place = "return view.camera.camera.position.toArray()"
+    start = on_view(page, place)
+    page.focus(CANVAS)
+    places = [start]
+    for key in ["ArrowLeft", "ArrowUp", "+", "Shift+ArrowRight", "1", "2", "3"]:
+        page.keyboard.press(key)
+        places.append(on_view(page, place))
+    assert len({tuple(np.round(each, 3)) for each in places}) == len(places)
+    page.keyboard.press("0")
+    np.testing.assert_allclose(on_view(page, place), start, atol=1e-6)
+
+
+def test_the_pointer_turns_the_view_and_the_scene_stays(space, server):
+    page = space()
+    before = on_view(page, "return view.camera.camera.position.toArray()")
+    box = page.locator(CANVAS).bounding_box()
+    page.mouse.move(box["x"] + 60, box["y"] + 40)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 160, box["y"] + 60, steps=4)
+    page.mouse.up()
+    assert (
+        np.linalg.norm(np.subtract(on_view(page, "return view.camera.camera.position.toArray()"), before))
+        > 5.0
+    )
+    assert not server.asked("edit")
+
+
+def drag_target(page, pixels):
+    """Drag the middle of the target's arrows to the right, in steps of one pixel."""
+    page.click("text=x–y")
+    settled(page)
+    x, y = on_view(
+        page,
+        """
+        const point = view.target.ball.position.clone().project(view.camera.camera);
+        const box = view.renderer.domElement.getBoundingClientRect();
+        return [box.x + (point.x + 1) / 2 * box.width, box.y + (1 - point.y) / 2 * box.height];
+        """,
+    )
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + pixels, y, steps=pixels)
+    page.mouse.up()
+
+
+def test_dragging_the_target_edits_the_scenario(space, server):
+    page = space()
+    until(page, "flexneedle.store.get('people')")
+    start = page.evaluate("performance.now()")
+    drag_target(page, 40)
+    until(page, "!flexneedle.store.get('draft')")
+    edits = [each["values"] for each in server.asked("edit")]
+    assert len(edits) <= 20 * (page.evaluate("performance.now()") - start) / 1000 + 2
+    assert set(edits[-1]) == {"target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"}
+    assert edits[-1]["target.depth_mm"] > TARGET[0] + 2.0
+    assert edits[-1]["target.lateral_z_mm"] == pytest.approx(TARGET[2], abs=0.05)
+    assert page.evaluate("flexneedle.store.get('scene').target[0]") == edits[-1]["target.depth_mm"]
+    assert on_view(page, "return view.target.ball.position.x") == edits[-1]["target.depth_mm"]
+
+
+def test_in_the_plane_the_target_has_no_third_coordinate(space, server):
+    page = space([*opening(), scene(axes=1)])
+    until(page, "flexneedle.store.get('scene').axes === 1")
+    drag_target(page, 20)
+    until(page, "!flexneedle.store.get('draft')")
+    assert set(server.asked("edit")[0]["values"]) == {"target.depth_mm", "target.lateral_mm"}
+
+
+@pytest.mark.parametrize("news", [[people(2, steering=2)], [insertion("running", periods=0)]])
+def test_the_target_stays_where_another_steers_or_an_insertion_runs(space, server, news):
+    page = space([*opening(), *news])
+    settled(page)
+    drag_target(page, 20)
+    page.wait_for_timeout(100)
+    assert not server.asked("edit")
+    assert on_view(page, "return view.target.ball.position.toArray()") == list(TARGET)
+
+
+def test_software_rendering_is_noticed(space):
+    assert "software" in space().inner_text(f"{SPACE} [role=note]")
+
+
+def test_without_webgl_a_notice_takes_the_place_of_the_view(visit):
+    page = visit(before=NO_WEBGL, ready=f"{SPACE} [role=note]")
+    assert "no WebGL" in page.inner_text(f"{SPACE} [role=note]")
+    assert not page.locator(CANVAS).count()
+    page.wait_for_selector("text=nobody steers")

@@ -10,7 +10,7 @@ import flexneedle.page
 
 STATIC = Path(flexneedle.page.__file__).parent / "static"
 VENDOR = STATIC / "vendor"
-IMPORT = re.compile(r"""(?:\bfrom|\bimport)\s*\(?\s*["'`]([\w@./][^"'`]*)["'`]""")
+IMPORT = re.compile(r"""(?:\bfrom\s*["']|\bimport\s*\(?\s*["'`])([\w@./][^"'`]*)""")
 
 
 def test_each_vendored_file_has_its_hash():

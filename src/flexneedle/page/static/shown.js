@@ -8,7 +8,7 @@ const TARGET_KEYS = ["target.depth_mm", "target.lateral_mm", "target.lateral_z_m
 // Keys to subscribe to for all that this module gives.
 export const SHOWN = [
   "view of", "view period", "view theme", "scene", "session", "draft", "insertion ", "rows ", "shape ", "plan ",
-  "iteration ", "reach",
+  "iteration ", "reach", "estimate",
 ];
 
 // "scene", "live" or "first".
@@ -37,7 +37,8 @@ export function shownRow(store, of = shownOf(store)) {
 // Shape (paths, points, columns, values) of a kind, such as "needle", of what is shown; or null.
 export function shownShape(store, kind, of = shownOf(store)) {
   if (of === "scene") return store.get(`shape ${kind} scene`) ?? null;
-  return store.track(kind, of, shownPeriod(store, of) ?? Infinity);
+  const start = kind === "needle" ? store.get("shape needle scene") ?? null : null;
+  return store.track(kind, of, shownPeriod(store, of) ?? Infinity) ?? start;
 }
 
 // The second recorded run, {row, shape(kind)}, at the period that is shown, or null.

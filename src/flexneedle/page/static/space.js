@@ -22,7 +22,7 @@ export async function mount(element, store, link) {
   element.append(notice);
   if (graphics === null) return;
 
-  const canvas = make("canvas", { tabindex: "0", role: "img", "aria-label": `The scene in space. ${KEYS}`, "aria-describedby": "space-text" });
+  const canvas = make("canvas", { tabindex: "0", role: "application", "aria-label": `The scene in space. ${KEYS}`, "aria-describedby": "space-text" });
   const legend = make("ul.legend", { "aria-label": "Legend" });
   const text = make("p.spoken", { id: "space-text" });
   const tools = make("div.tools", { role: "toolbar", "aria-label": "View in space" });
@@ -42,10 +42,10 @@ export async function mount(element, store, link) {
   });
 }
 
-// Canvas with the scene drawn into it just now, for pictures; null without WebGL. Read it before returning to the
-// browser, which clears it.
-export function drawnCanvas() {
-  return view?.drawn() ?? null;
+// The view in space of this page (space/view.js), or null before it is loaded and without WebGL. For pictures:
+// `spaceView()?.drawn()`.
+export function spaceView() {
+  return view;
 }
 
 // Name of the graphics device, or null without WebGL.

@@ -107,9 +107,11 @@ function followRefusals(element, store) {
     }
   });
   function show({ reason, problems }) {
+    const keys = Object.keys(problems).join();
+    if (keys && element.lastChild?.dataset.keys === keys) element.lastChild.remove(); // such as while dragging
     const lines = Object.values(problems).filter((line) => !reason.includes(line));
     const close = button("Close", () => shown.remove());
-    const shown = make("div.refusal", {}, make("div", {}, ...[reason, ...lines].map((line) => make("p", {}, line))), close);
+    const shown = make("div.refusal", { "data-keys": keys }, make("div", {}, ...[reason, ...lines].map((line) => make("p", {}, line))), close);
     element.append(shown);
     while (element.children.length > 3) element.firstChild.remove();
     setTimeout(() => shown.remove(), SHOWN_FOR);

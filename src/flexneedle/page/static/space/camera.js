@@ -4,7 +4,7 @@ import { OrbitControls, PerspectiveCamera, Vector3 } from "../vendor/three.js";
 
 const TURN = Math.PI / 36;
 const SHIFT = 0.05; // of the distance
-const ROOM = 1.04;
+const LABELS = [36, 24]; // pixels at each side, above and below
 const DIRECTIONS = { side: [0, 0, 1], top: [0, 1, 0.0001], axis: [-1, 0, 0.0001] };
 const [WIDE, NARROW] = [[-0.28, 0.42, 1], [-0.9, 0.55, 1]];
 const KEYS = { "+": ["zoom", 0.8], "=": ["zoom", 0.8], "-": ["zoom", 1.25], 0: ["look", "reset"], Home: ["look", "reset"],
@@ -14,6 +14,7 @@ const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowD
 export class Camera {
   #changed;
   #box = null;
+  #free = [1, 1]; // share of width and height without labels
   #moved = false;
 
   // canvas: whose pointer and keys it follows; changed: called after each movement.
@@ -30,6 +31,7 @@ export class Camera {
 
   // The view has another size.
   resize(width, height) {
+    this.#free = [Math.max(0.3, 1 - (2 * LABELS[0]) / width), Math.max(0.3, 1 - (2 * LABELS[1]) / height)];
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
     this.#refit();
@@ -67,9 +69,9 @@ export class Camera {
     camera.matrix.compose(camera.position, camera.quaternion, camera.scale);
     camera.matrix.extractBasis(...axes);
     const up = Math.tan((camera.fov * Math.PI) / 360);
-    const distances = cornersOf((right - left) / 2, 1.25 * half).map((corner) => {
+    const distances = cornersOf((right - left) / 2, half).map((corner) => {
       const [x, y, z] = axes.map((axis) => axis.dot(corner));
-      return z + ROOM * Math.max(Math.abs(x) / (up * camera.aspect), Math.abs(y) / up);
+      return z + Math.max(Math.abs(x) / (up * camera.aspect * this.#free[0]), Math.abs(y) / (up * this.#free[1]));
     });
     camera.position.copy(middle).addScaledVector(axes[2], Math.max(...distances));
     this.controls.target.copy(middle);

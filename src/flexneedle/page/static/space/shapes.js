@@ -12,6 +12,7 @@ import { Tube } from "./tube.js";
 const SDS = 2; // standard deviations that the tube of the predicted needle shows
 const PATH = 0.14; // mm, radius of a path
 const CHANNEL = 1.7; // radius of the channel by the needle's
+const STALE = 0.35; // opacity of a path that was planned for an earlier state of the scenario
 const [BEVEL, GUIDE] = [6, 6]; // mm, lengths
 const STRATEGIES = ["manipulation", "steering"];
 // Stretch of the tissue from low to high, distinguishable by lightness alone.
@@ -117,8 +118,8 @@ export class Shapes {
   #foreseen(store, shape, of) {
     if (of !== "scene") return first(shape("predicted"));
     const strategy = store.get("session")?.strategy;
-    const sweep = store.get(`shape sweep ${strategy}`) ?? store.get("shape sweep scene");
-    return sweep && !isStale(store, store.get(`plan ${strategy}`)) ? last(sweep) : null;
+    const sweep = fresh(store, `plan ${strategy}`, `shape sweep ${strategy}`) ?? fresh(store, "estimate", "shape sweep scene");
+    return sweep ? last(sweep) : null;
   }
 
   #predicted(scene, path) {
@@ -142,12 +143,14 @@ export class Shapes {
   #plans(store, of) {
     const chosen = store.get("session")?.strategy ?? STRATEGIES[0];
     const other = STRATEGIES.find((name) => name !== chosen);
-    const replanned = of === "scene" ? null : first(shownShape(store, "path", of));
-    const path = replanned ?? first(store.get(`shape path ${chosen}`) ?? store.get("shape path scene"));
+    const replanned = of === "scene" ? null : shownShape(store, "path", of);
+    const estimated = () => fresh(store, `plan ${chosen}`, `shape path ${chosen}`) ?? fresh(store, "estimate", "shape path scene");
+    const path = first(replanned ?? estimated() ?? store.get(`shape path ${chosen}`));
     const second = of === "scene" ? first(store.get(`shape path ${other}`)) : null;
-    const faint = (name) => (of === "scene" && isStale(store, store.get(`plan ${name}`)) ? 0.35 : 1);
-    this.#draw("path", path, PATH, { tone: second ? `--${chosen}` : "--plan", opacity: faint(chosen) });
-    this.#draw("other", second, PATH, { tone: `--${other}`, opacity: faint(other) });
+    const stale = of === "scene" && !estimated() ? STALE : 1;
+    const otherStale = isStale(store, store.get(`plan ${other}`)) ? STALE : 1;
+    this.#draw("path", path, PATH, { tone: second ? `--${chosen}` : "--plan", opacity: stale });
+    this.#draw("other", second, PATH, { tone: `--${other}`, opacity: otherStale });
     return [
       path && { text: second ? `path by ${chosen}` : "planned path", tone: second ? `--${chosen}` : "--plan" },
       second && { text: `path by ${other}`, tone: `--${other}` },
@@ -157,8 +160,9 @@ export class Shapes {
   // Sampled paths: the cheaper, the stronger.
   #samples(store, of) {
     const strategy = store.get("session")?.strategy;
-    const own = of === "scene" ? store.get(`shape samples ${strategy}`) ?? store.get("shape samples scene") : null;
-    const shape = of === "scene" ? own : shownShape(store, "samples", of);
+    const shape = of === "scene"
+      ? fresh(store, `iteration ${strategy}`, `shape samples ${strategy}`) ?? null
+      : shownShape(store, "samples", of);
     if (this.#differs("samples", [shape])) {
       const rank = shape ? ranksOf(shape) : [];
       this.#lines.samples.update(shape, paint("--estimate"), (path) => 0.55 - 0.45 * rank[path]);
@@ -210,6 +214,9 @@ export class Shapes {
 }
 
 const translucent = (how) => new MeshBasicMaterial({ transparent: true, depthWrite: false, ...how });
+
+// What `key` holds, if the news that it belongs to is of the present state of the scenario.
+const fresh = (store, news, key) => (isStale(store, store.get(news)) ? undefined : store.get(key));
 
 const first = (shape) => slice(shape, 0);
 const last = (shape) => slice(shape, shape.paths - 1);

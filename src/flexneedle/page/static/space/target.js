@@ -11,7 +11,7 @@ const COLORS = ["#0072b2", "#e69f00", "#cc79a7", "#f0e442"]; // of the arrows al
 export class Target {
   #store;
   #gizmo;
-  #dragged = false;
+  dragged = false;
 
   // camera: of camera.js; changed: called when it has to be drawn again.
   constructor(camera, canvas, store, link, changed) {
@@ -24,7 +24,7 @@ export class Target {
     this.#gizmo.attach(this.ball);
     this.#gizmo.addEventListener("change", changed);
     this.#gizmo.addEventListener("dragging-changed", ({ value }) => {
-      this.#dragged = value;
+      this.dragged = value;
       camera.controls.enabled = !value;
     });
     this.#gizmo.addEventListener("objectChange", () => link.edit(targetEdit(store, this.ball.position.toArray())));
@@ -35,7 +35,7 @@ export class Target {
   update() {
     const target = shownTarget(this.#store);
     this.group.visible = Boolean(target);
-    if (target && !this.#dragged) this.ball.position.set(...target);
+    if (target && !this.dragged) this.ball.position.set(...target);
     this.ball.material.color = paint("--target");
     this.#gizmo.enabled = this.#gizmo.getHelper().visible = this.#mayMove();
     this.#gizmo.showZ = this.#store.get("scene")?.axes === 2;

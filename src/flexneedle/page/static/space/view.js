@@ -36,7 +36,7 @@ export class SpaceView {
     store.subscribe([...SHOWN, "people", "welcome"], () => this.#update());
   }
 
-  // The canvas with the scene drawn just now.
+  // The canvas with the scene drawn into it just now. Read it before returning to the browser, which clears it.
   drawn() {
     this.renderer.render(this.scene, this.camera.camera);
     return this.#canvas;
@@ -62,7 +62,7 @@ export class SpaceView {
     this.#room = room;
     this.room.update(scene, box);
     this.#fitLabels();
-    if (another) this.camera.follow(box);
+    if (another && !this.target.dragged) this.camera.follow(box);
   }
 
   #showLegend(entries) {
@@ -112,7 +112,7 @@ function lights(camera) {
 }
 
 function entryOf({ text, tone, form, ramp }) {
-  const swatch = make(`span.swatch${form === "area" || ramp ? ".area" : form === "disc" ? ".disc" : ""}`, { "aria-hidden": "true" });
+  const swatch = make(`span.swatch.${ramp ? "area" : form ?? "line"}`, { "aria-hidden": "true" });
   if (tone) swatch.style.color = `var(${tone})`;
   if (ramp) {
     const stops = ramp.map((rgb) => `rgb(${rgb.map((value) => Math.round(255 * value)).join(" ")})`);
