@@ -216,6 +216,8 @@ class People(News):
 class Session(News):
     """The scenario by key, and the options. revision counts changes; a scene, plan or estimate repeats its revision.
 
+    A session with another name comes before its scene and frames: the browser then forgets plans and paths.
+
     changed: keys that differ from the preset or file it began with. doubts: values that are valid and implausible.
     """
 
@@ -387,6 +389,7 @@ class Insertion(News):
     """State of an insertion, or how it has ended. of: as for `Rows`; source: scenario and seed of a recording.
 
     state: waiting, planning, running, paused, done, held, failed, interrupted, refused; unmeasured: on a real rig.
+    A new insertion or recording is announced before its rows and frames: the browser then forgets those of the last.
     """
 
     type: Literal["insertion"] = "insertion"

@@ -1,6 +1,7 @@
 // Light or dark: as the system prefers, or as chosen by the switch, which this browser remembers.
 
 const CHOICE = "flexneedle theme";
+const colors = new Map(); // by name, in the present theme
 const system = matchMedia("(prefers-color-scheme: dark)");
 
 // Keep store key "view theme" ("light", "dark") and the attribute data-theme of the document; `button` switches.
@@ -8,6 +9,7 @@ export function followTheme(store, button) {
   const apply = () => {
     const theme = localStorage.getItem(CHOICE) ?? (system.matches ? "dark" : "light");
     document.documentElement.dataset.theme = theme;
+    colors.clear();
     button.textContent = theme === "dark" ? "Light" : "Dark";
     button.setAttribute("aria-label", `Switch to ${theme === "dark" ? "light" : "dark"} colours`);
     store.set("view theme", theme);
@@ -23,6 +25,11 @@ export function followTheme(store, button) {
 // Colour of style.css by name, such as "--needle", as "rgb(…)", for canvases and WebGL. Ask again when "view theme"
 // changes.
 export function color(name) {
+  if (!colors.has(name)) colors.set(name, computed(name));
+  return colors.get(name);
+}
+
+function computed(name) {
   const probe = document.getElementById("theme");
   probe.style.outlineColor = `var(${name})`;
   const found = getComputedStyle(probe).outlineColor;

@@ -77,11 +77,12 @@ export class Shapes {
   }
 
   #addBevel() {
-    const material = new MeshBasicMaterial();
+    const material = new MeshBasicMaterial({ depthTest: false, transparent: true });
     const shaft = new Mesh(new CylinderGeometry(0.12, 0.12, BEVEL - 1.5, 8), material);
     const head = new Mesh(new ConeGeometry(0.5, 1.5, 12), material);
     shaft.position.y = (BEVEL - 1.5) / 2;
     head.position.y = BEVEL - 0.75;
+    shaft.renderOrder = head.renderOrder = 8;
     this.bevel = new Group();
     this.bevel.add(shaft, head);
     this.group.add(this.bevel);
@@ -209,7 +210,7 @@ export class Shapes {
     const angle = ((scene.bevel.angle_deg + (row?.roll_deg ?? 0)) * Math.PI) / 180;
     this.bevel.position.set(...tip);
     this.bevel.quaternion.setFromUnitVectors(new Vector3(0, 1, 0), new Vector3(0, Math.cos(angle), Math.sin(angle)));
-    this.bevel.children[0].material.color = paint("--guide");
+    this.bevel.children[0].material.color = paint("--ink");
   }
 }
 
