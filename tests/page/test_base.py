@@ -79,6 +79,19 @@ def test_work_longer_than_a_second_has_a_bar_and_is_cancelled(visit, server):
     assert server.asked("cancel") == [{"type": "cancel", "job": 7}]
 
 
+def test_work_that_runs_or_has_failed_before_is_shown(visit, server):
+    server.news = [
+        *server.news,
+        Job(job=3, kind="plan", state="running", text="iteration 2 of 20"),
+        Job(job=4, kind="reach", state="failed", text="the worker has ended"),
+    ]
+    page = visit()
+    page.wait_for_selector("text=Plan: iteration 2 of 20")
+    page.wait_for_selector("text=Reach: the worker has ended")
+    server.send(Job(job=5, kind="reach", state="running"), Job(job=5, kind="reach", state="done"))
+    page.wait_for_selector("text=the worker has ended", state="detached")
+
+
 def test_a_lost_connection_recovers_the_state(visit, server):
     page = visit()
     page.wait_for_selector("text=nobody steers")

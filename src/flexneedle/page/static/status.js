@@ -59,8 +59,9 @@ function showSteering(element, store, link) {
 // Work that takes longer than a second has a bar; what has failed stays until the next of its kind begins.
 function followJobs(element, store, link) {
   const entries = new Map(); // by kind
-  store.subscribe(["job "], (_, changed) => {
-    for (const key of changed) if (key.startsWith("job ")) change(key.slice(4), store.get(key));
+  store.subscribe(["job "], () => {
+    const kinds = new Set([...entries.keys(), ...store.keys("job ").map((key) => key.slice(4))]);
+    for (const kind of kinds) change(kind, store.get(`job ${kind}`));
   });
   function change(kind, job) {
     const earlier = entries.get(kind);

@@ -33,6 +33,11 @@ export class Store {
     return this.#values.get(key);
   }
 
+  // Keys that begin with a text.
+  keys(beginning) {
+    return [...this.#values.keys()].filter((key) => key.startsWith(beginning));
+  }
+
   // Set a key; undefined removes it. An equal value changes nothing.
   set(key, value) {
     if (Object.is(this.#values.get(key), value)) return;
@@ -41,8 +46,8 @@ export class Store {
     this.#mark(key);
   }
 
-  // Call `listener(store, changed)` when one of the keys has changed; a key that ends in a blank stands for all that
-  // begin with it ("job "). Called a first time before the next paint. Returns a function that ends it.
+  // Call `listener` when one of the keys has changed; a key that ends in a blank stands for all that begin with it
+  // ("job "). Called a first time before the next paint. Returns a function that ends it.
   subscribe(keys, listener) {
     const entry = { keys, listener, first: true };
     this.#listeners.add(entry);
@@ -157,7 +162,7 @@ export class Store {
       for (const entry of this.#listeners) {
         if (!entry.first && !concerns(entry.keys, changed)) continue;
         entry.first = false;
-        entry.listener(this, changed);
+        entry.listener();
       }
     }
     if (this.#changed.size) this.#schedule();

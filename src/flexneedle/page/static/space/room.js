@@ -83,7 +83,8 @@ export class Room {
 
     const every = right - left > 150 ? 50 : right - left > 60 ? 20 : 10;
     const out = half + 0.15 * half;
-    for (let x = every * Math.ceil(left / every); x <= right; x += every) this.#label(shown(x, 0), [x, -half, out], "--quiet");
+    const begin = every * Math.ceil((left + STEP) / every);
+    for (let x = begin; x <= right; x += every) this.#label(shown(x, 0), [x, -half, out], "--quiet");
     this.#label("x (mm)", [right, -half, out], "--quiet", [0.5, 1.4]);
     for (const w of [-half, 0, half]) this.#label(shown(w, 0), [left, w, -half], "--quiet", [1.1, 0.5]);
     this.#label("y (mm)", [left, half, -half], "--quiet", [0.5, -0.3]);
