@@ -83,9 +83,9 @@ class FakePage:
         """Send news and frames to all clients."""
         asyncio.run_coroutine_threadsafe(self._send_all(news), self._loop).result(20.0)
 
-    def drop(self):
+    def drop(self, reason=""):
         """Close all connections."""
-        asyncio.run_coroutine_threadsafe(self._drop(), self._loop).result(20.0)
+        asyncio.run_coroutine_threadsafe(self._drop(reason), self._loop).result(20.0)
 
     def asked(self, kind):
         """Requests of a type, without their numbers."""
@@ -151,10 +151,10 @@ class FakePage:
             else:
                 await socket.send_bytes(each)
 
-    async def _drop(self):
+    async def _drop(self, reason):
         for socket in list(self._sockets):
             with suppress(RuntimeError):
-                await socket.close(1012)
+                await socket.close(1012, reason)
 
 
 def until(page, condition):

@@ -55,7 +55,7 @@ def session(revision=1, target=TARGET, **changes):
         **dict(zip(("target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"), target, strict=True)),
     }
     given = {
-        "name": values["name"],
+        "name": "phantom3d",
         "seed": 0,
         "strategy": "manipulation",
         "controller": "adaptive-mpc",

@@ -412,6 +412,18 @@ class Insertion(News):
         return f"insertion {self.of}"
 
 
+class Closed(News):
+    """A recording is no longer shown; it replaces the `Insertion` of that recording."""
+
+    type: Literal["closed"] = "closed"
+    of: Literal["first", "second"]
+
+    @property
+    def key(self) -> str:
+        """That of the recording's state."""
+        return f"insertion {self.of}"
+
+
 class Disturbances(News):
     """What disturbs the virtual insertion now."""
 

@@ -5,6 +5,7 @@ import { unpacked } from "./frames.js";
 const WAITS = [250, 500, 1000, 2000, 4000]; // ms before the next attempts
 const EDIT_EVERY = 50; // ms
 const MOST_REFUSALS = 20;
+const ANSWER_WITHIN = 10_000; // ms
 const FREE = ["steer", "stop", "rows_from"]; // what a client that does not steer may ask for
 
 export class Link {
@@ -14,7 +15,7 @@ export class Link {
   #attempts = 0;
   #timer = 0;
   #number = 0;
-  #waiting = new Map(); // by number of the request: {resolve, message}
+  #waiting = new Map(); // by number of the request: {resolve, timer}
   #edits = {};
   #editTimer = 0;
   #lastEdit = -Infinity;
@@ -26,14 +27,15 @@ export class Link {
     this.#address = address;
   }
 
-  // Connect, now and whenever the connection is lost. Store key "connection": connecting, open, lost.
+  // Connect, now and whenever the connection is lost. Store key "connection": connecting, open, lost; "connection
+  // reason": the server's words when it was lost, which may be empty.
   connect() {
     clearTimeout(this.#timer);
     this.#store.set("connection", this.#attempts ? "lost" : "connecting");
     const socket = new WebSocket(this.#address);
     socket.binaryType = "arraybuffer";
     socket.onmessage = ({ data }) => this.#receive(data);
-    socket.onclose = () => this.#lost(socket);
+    socket.onclose = ({ reason }) => this.#lost(socket, reason);
     this.#socket = socket;
   }
 
@@ -85,7 +87,9 @@ export class Link {
     }
     const request = ++this.#number;
     this.#socket.send(JSON.stringify({ ...message, request }));
-    return new Promise((resolve) => this.#waiting.set(request, resolve));
+    const late = () => this.#answer(request, { done: false, reason: "The server has not answered.", problems: {} });
+    const timer = setTimeout(late, ANSWER_WITHIN);
+    return new Promise((resolve) => this.#waiting.set(request, { resolve, timer }));
   }
 
   #judged(answer, quiet) {
@@ -131,11 +135,13 @@ export class Link {
   }
 
   #answer(request, answer) {
-    this.#waiting.get(request)?.(answer);
+    const { resolve, timer } = this.#waiting.get(request) ?? {};
+    clearTimeout(timer);
     this.#waiting.delete(request);
+    resolve?.(answer);
   }
 
-  #lost(socket) {
+  #lost(socket, reason) {
     if (socket !== this.#socket) return;
     for (const request of [...this.#waiting.keys()]) {
       this.#answer(request, { done: false, reason: "The connection to the server was lost.", problems: {} });
@@ -143,6 +149,7 @@ export class Link {
     const wait = WAITS[Math.min(this.#attempts, WAITS.length - 1)];
     this.#attempts += 1;
     this.#store.set("connection", "lost");
+    this.#store.set("connection reason", reason);
     this.#timer = setTimeout(() => this.connect(), wait);
   }
 }

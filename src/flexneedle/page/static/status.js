@@ -5,7 +5,7 @@ import { button, make } from "./dom.js";
 const CONNECTIONS = {
   connecting: "Connecting…",
   open: "Connected",
-  lost: "Connection lost; trying again…",
+  lost: "No connection; trying again…",
 };
 const JOBS = {
   scene: "Scene", estimate: "First estimate", plan: "Plan", compare: "Both strategies", reach: "Reach",
@@ -23,7 +23,7 @@ export function mount(element, store, link) {
   const refusals = make("div.refusals", { role: "alert" });
   element.append(refusals, make("div.status-line", {}, connection, stop, steering, jobs));
 
-  store.subscribe(["connection"], () => showConnection(connection, store.get("connection")));
+  store.subscribe(["connection", "connection reason"], () => showConnection(connection, store));
   store.subscribe(["people", "welcome", "connection"], () => showSteering(steering, store, link));
   store.subscribe(["insertion live"], () => {
     stop.hidden = !STEPS_IN.includes(store.get("insertion live")?.state);
@@ -33,15 +33,17 @@ export function mount(element, store, link) {
   followRefusals(refusals, store);
 }
 
-function showConnection(element, state) {
+function showConnection(element, store) {
+  const [state, reason] = [store.get("connection"), store.get("connection reason")];
+  const why = state === "lost" && reason ? ` (${reason})` : "";
   element.dataset.state = state;
-  element.replaceChildren(make("span.lamp", { "aria-hidden": "true" }), CONNECTIONS[state]);
+  element.replaceChildren(make("span.lamp", { "aria-hidden": "true" }), `${CONNECTIONS[state]}${why}`);
 }
 
 function showTitle(session) {
-  const title = session ? `${session.name} · seed ${session.seed}` : "";
+  const title = session ? `${session.values.name} · seed ${session.seed}` : "";
   document.getElementById("title").textContent = title;
-  document.title = session ? `${session.name} – flexneedle` : "flexneedle";
+  document.title = session ? `${session.values.name} – flexneedle` : "flexneedle";
 }
 
 function showSteering(element, store, link) {

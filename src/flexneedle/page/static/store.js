@@ -13,7 +13,7 @@ const SOURCES = Object.keys(Source).map((name) => name.toLowerCase());
 const BY = { job: "kind", iteration: "strategy", plan: "strategy", rows: "of", insertion: "of" };
 const BEFORE_ROWS = ["waiting", "planning"];
 const INSERTIONS = ["live", "first", "second"];
-const OWN = /^(view |connection$|refusals$|draft$)/;
+const OWN = /^(view |connection|refusals$|draft$)/;
 const PLANS = /^((iteration|plan) .*|reach|estimate|shape \w+ (manipulation|steering)|shape (path|samples|reach|sweep) scene)$/;
 
 // Key of a message of the server.
@@ -70,6 +70,7 @@ export class Store {
   // Take a message of the server. Returns the index of the first row that is missing, or null.
   receive(message) {
     if (message.type === "rows") return this.#receiveRows(message);
+    if (message.type === "closed") return this.#close(message);
     const key = keyOf(message);
     const earlier = this.get(key);
     if (message.type === "insertion" && this.#isAnother(message, earlier)) this.#forget(message.of);
@@ -111,9 +112,9 @@ export class Store {
 
   #receiveRows({ of, first, rows }) {
     const key = `rows ${of}`;
-    const known = this.get(key) ?? [];
+    const known = first === 0 ? [] : this.get(key) ?? []; // at 0 an insertion begins
     if (first > known.length) return known.length;
-    if (rows.length) this.set(key, [...known.slice(0, first), ...rows, ...known.slice(first + rows.length)]);
+    this.set(key, [...known.slice(0, first), ...rows, ...known.slice(first + rows.length)]);
     return null;
   }
 
@@ -121,6 +122,12 @@ export class Store {
     if (!earlier) return false;
     const begins = BEFORE_ROWS.includes(message.state) && !BEFORE_ROWS.includes(earlier.state);
     return begins || message.periods < earlier.periods || message.name !== earlier.name;
+  }
+
+  #close({ of }) {
+    this.#forget(of);
+    this.set(`insertion ${of}`, undefined);
+    return null;
   }
 
   #forget(of) {

@@ -228,6 +228,7 @@ def test_dragging_the_target_edits_the_scenario(space, server):
     assert set(edits[-1]) == {"target.depth_mm", "target.lateral_mm", "target.lateral_z_mm"}
     assert edits[-1]["target.depth_mm"] > TARGET[0] + 2.0
     assert edits[-1]["target.lateral_z_mm"] == pytest.approx(TARGET[2], abs=0.05)
+    settled(page)
     assert page.evaluate("flexneedle.store.get('scene').target[0]") == edits[-1]["target.depth_mm"]
     assert on_view(page, "return view.target.ball.position.x") == edits[-1]["target.depth_mm"]
 

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from fake_page import until
-from flexneedle.page.messages import Job, Refused
-from recorded_page import people, planned, rows, session
+from flexneedle.page.frames import Source
+from flexneedle.page.messages import Closed, Job, Refused
+from recorded_page import insertion, people, period_frames, planned, rows, session
 
 pytestmark = pytest.mark.page
 
@@ -103,6 +104,31 @@ def test_a_lost_connection_recovers_the_state(visit, server):
         None,
         None,
     ]
+
+
+def test_the_reason_of_a_lost_connection_is_shown(visit, server):
+    page = visit()
+    page.wait_for_selector("text=nobody steers")
+    page.evaluate("window.WebSocket = class extends EventTarget { close() {} }")  # no other attempt succeeds
+    server.drop("64 pages are connected, which is the limit")
+    page.wait_for_selector("text=No connection; trying again… (64 pages are connected, which is the limit)")
+
+
+def test_another_insertion_and_a_closed_recording_are_forgotten(visit, server):
+    page = visit()
+    page.wait_for_selector("text=nobody steers")
+    for of, source in (("live", Source.LIVE), ("first", Source.FIRST)):
+        server.send(insertion("done", of=of), rows(0, 3, of), *period_frames(2, source))
+    until(page, "flexneedle.store.track('needle', 'first') && flexneedle.store.track('needle', 'live')")
+    server.send(insertion("planning", periods=0), Closed(of="first"))
+    until(
+        page,
+        "!flexneedle.store.get('insertion first') && flexneedle.store.get('insertion live').periods === 0",
+    )
+    left = "['live', 'first'].map((of) => [flexneedle.store.get(`rows ${of}`), flexneedle.store.track('needle', of)])"
+    assert page.evaluate(left) == [[None, None], [None, None]]
+    server.send(rows(0, 5), rows(0, 2))
+    until(page, "flexneedle.store.get('rows live')?.length === 2")
 
 
 def test_rows_that_are_missing_are_asked_for(visit, server):
