@@ -26,6 +26,7 @@ export class Target {
     this.#gizmo.addEventListener("dragging-changed", ({ value }) => {
       this.dragged = value;
       camera.controls.enabled = !value;
+      if (!value) this.update();
     });
     this.#gizmo.addEventListener("objectChange", () => link.edit(targetEdit(store, this.ball.position.toArray())));
     this.group = new Group();
