@@ -32,7 +32,7 @@ def server():
 
 @pytest.fixture
 def visit(browser, server):
-    """A function that opens the page (width, height, scheme) and returns it; its errors fail the test at its end."""
+    """A function that opens the page and returns it. Errors on the page, in `errors`, fail the test at its end."""
     contexts, errors = [], []
 
     def opened(width=1280, height=800, scheme="light", before=None, ready="[data-panel=status] .connection"):
@@ -48,6 +48,7 @@ def visit(browser, server):
         page.wait_for_selector(ready)
         return page
 
+    opened.errors = errors
     yield opened
     for context in contexts:
         context.close()

@@ -141,6 +141,18 @@ def test_rows_that_are_missing_are_asked_for(visit, server):
     assert server.asked("rows_from") == [{"type": "rows_from", "index": 3}]
 
 
+def test_an_error_in_one_panel_leaves_the_others(visit, server):
+    page = visit()
+    page.evaluate("flexneedle.store.subscribe(['session'], () => { throw new Error('one panel'); })")
+    page.evaluate(
+        "flexneedle.store.subscribe(['session'], () => { window.after = flexneedle.store.get('session'); })"
+    )
+    server.send(session(2, seed=8))
+    until(page, "window.after?.seed === 8")
+    assert set(visit.errors) == {"one panel"}
+    visit.errors.clear()
+
+
 def test_colours_follow_the_system_and_the_switch(visit):
     page = visit(scheme="dark")
     ground = "getComputedStyle(document.body).backgroundColor"

@@ -88,7 +88,7 @@ function followJobs(element, store, link) {
     text.textContent = job.text ? `${JOBS[kind]}: ${job.text}` : `${JOBS[kind]}${failed ? " failed" : "…"}`;
     text.classList.toggle("bad", failed);
     bar.hidden = cancel.hidden = failed;
-    if (job.share === null) bar.removeAttribute("value");
+    if ((job.share ?? null) === null) bar.removeAttribute("value");
     else bar.value = job.share;
   }
   function remove(kind) {

@@ -169,7 +169,11 @@ export class Store {
       for (const entry of this.#listeners) {
         if (!entry.first && !concerns(entry.keys, changed)) continue;
         entry.first = false;
-        entry.listener();
+        try {
+          entry.listener();
+        } catch (error) {
+          reportError(error); // and the other panels go on
+        }
       }
     }
     if (this.#changed.size) this.#schedule();
