@@ -143,9 +143,11 @@ def test_rows_that_are_missing_are_asked_for(visit, server):
 
 def test_an_error_in_one_panel_leaves_the_others(visit, server):
     page = visit()
-    page.evaluate("flexneedle.store.subscribe(['session'], () => { throw new Error('one panel'); })")
     page.evaluate(
-        "flexneedle.store.subscribe(['session'], () => { window.after = flexneedle.store.get('session'); })"
+        """() => {
+          flexneedle.store.subscribe(["session"], () => { throw new Error("one panel"); });
+          flexneedle.store.subscribe(["session"], () => { window.after = flexneedle.store.get("session"); });
+        }"""
     )
     server.send(session(2, seed=8))
     until(page, "window.after?.seed === 8")

@@ -170,6 +170,26 @@ def test_it_draws_only_when_something_has_changed(space, server):
     assert before < on_view(page, count) <= before + 4
 
 
+def test_a_shape_is_drawn_once(space, server):
+    page = space()
+    version = "return view.shapes.group.children[0].geometry.attributes.position.version"
+    settled(page)
+    before = on_view(page, version)
+    server.send(people(clients=2))
+    page.wait_for_selector("text=2 people")
+    settled(page)
+    assert on_view(page, version) == before
+
+
+def test_the_switch_repaints_the_scene(space):
+    page = space()
+    color = "return view.shapes.group.children[0].material.color.getHex()"
+    before = on_view(page, color)
+    page.click("#theme")
+    settled(page)
+    assert on_view(page, color) != before
+
+
 def test_keys_turn_zoom_and_reset(space):
     page = space()
     place = "return view.camera.camera.position.toArray()"

@@ -22,6 +22,7 @@ export class Shapes {
   #tubes = {};
   #lines = { samples: new Lines(), ghosts: new Lines() };
   #outlines = new Outlines();
+  #theme = "";
   #seen = new Map(); // by part: what it was drawn from
 
   constructor() {
@@ -44,7 +45,8 @@ export class Shapes {
     const row = shownRow(store);
     const shape = (kind) => shownShape(store, kind, of);
     const theme = store.get("view theme");
-    if (this.#differs("theme", [theme])) this.#seen.clear();
+    if (theme !== this.#theme) this.#seen.clear();
+    this.#theme = theme;
     const entries = [
       this.#needle(scene, shape("needle")),
       this.#true(scene, shape("true")),
