@@ -41,8 +41,8 @@ class Operator(Protocol):
         """Find the home of an axis."""
         ...
 
-    def retract(self, position: float) -> object:
-        """Withdraw the base to a position of the insertion axis (mm)."""
+    def retract(self, position: float, speed: float) -> object:
+        """Withdraw the base to a position of the insertion axis (mm), at most at a speed (mm/s)."""
         ...
 
     def stop(self) -> None:
@@ -116,12 +116,7 @@ def _add_jog(commands: Commands) -> None:
     parser.add_argument(
         "distance", metavar="DISTANCE", help="distance with its sign, such as 5, -2.5mm or 90deg"
     )
-    parser.add_argument(
-        "--speed",
-        type=positive,
-        metavar="V",
-        help="largest speed, mm/s or deg/s (default: a fifth of the axis's)",
-    )
+    _add_speed(parser, "mm/s or deg/s")
     _add_yes(parser)
     # The pattern by which argparse distinguishes -5mm from an option; there is no public way to set it.
     parser._negative_number_matcher = _NEGATIVE
@@ -152,18 +147,29 @@ def _add_retract(commands: Commands) -> None:
         "withdraw the needle",
         _retract,
         "flexneedle rig retract rig.toml",
-        "flexneedle rig retract rig.toml --to 10 --yes",
-        about="Move the insertion axis backwards; rotation and guide stay where they are. Prints what would move and "
-        "asks for confirmation; Ctrl-C stops.",
+        "flexneedle rig retract rig.toml --to 10 --speed 1 --yes",
+        about="Move the insertion axis backwards, within its soft limits and short of the limit switch of its home; "
+        "rotation and guide stay where they are. Prints what would move and asks for confirmation; Ctrl-C stops.",
     )
     _add_rig(parser)
     parser.add_argument(
         "--to",
         type=finite,
         metavar="MM",
-        help="position at which the retraction ends (default: the lowest of the axis's range_mm)",
+        help="position at which the retraction ends (default: where rig home leaves the axis, or without a limit "
+        "switch behind it the lowest of range_mm)",
     )
+    _add_speed(parser, "mm/s")
     _add_yes(parser)
+
+
+def _add_speed(parser: argparse.ArgumentParser, unit: str) -> None:
+    parser.add_argument(
+        "--speed",
+        type=positive,
+        metavar="V",
+        help=f"largest speed, {unit} (default: a fifth of the axis's)",
+    )
 
 
 def _add_rig(parser: argparse.ArgumentParser) -> None:
@@ -265,17 +271,20 @@ def _home(args: argparse.Namespace) -> int:
 
 
 def _retract(args: argparse.Namespace) -> int:
-    from flexneedle.rig.moves import retraction
+    from flexneedle.rig.moves import retraction, withdrawn
     from flexneedle.scenario.rig import load_rig
 
     rig = load_rig(args.rig)
     position = _positions(rig)["insertion"]
-    move = retraction(rig, position, args.to)
+    move = retraction(rig, position, args.to, args.speed)
     if move is None:
-        at = rig.axes.insertion.shown(position)
-        print(f"flexneedle: insertion is at {at} mm: nothing to retract", file=sys.stderr)
+        at, end = map(rig.axes.insertion.shown, (position, withdrawn(rig)))
+        print(
+            f"flexneedle: insertion is at {at} mm, a retraction ends at {end} mm: nothing to retract",
+            file=sys.stderr,
+        )
         return 0
-    return _carried_out(rig, [move], args.yes, lambda operator: operator.retract(move.goal))
+    return _carried_out(rig, [move], args.yes, lambda operator: operator.retract(move.goal, move.speed))
 
 
 def _positions(rig: RigFile) -> dict[str, float]:
