@@ -265,9 +265,8 @@ def supervised(
     )
     watchers.ticks.started = task.started
     with Supervisor(task, watchers.report) as supervisor:
-        start_advance(
-            supervisor, scenario, plan, dry=dry
-        )  # what cannot begin is refused before anybody is asked
+        # What cannot begin is refused before anybody is asked.
+        start_advance(supervisor, scenario, plan, dry=dry)
         watchers.opened(supervisor)
         supervisor.arm(start_advance(supervisor, scenario, plan, dry=dry))
         if rig.axes.rotation is not None:
