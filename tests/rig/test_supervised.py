@@ -1,16 +1,19 @@
 """The driver of the loop on a supervisor: columns and axes, rolls, limits; and whole insertions on the emulated rig."""
 
+import json
 import math
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import flexneedle
 from emulated_rig import emulated_rig, rig_file
-from flexneedle.errors import CommandError, DriverError
+from flexneedle.errors import CommandError, DriverError, RigError
 from flexneedle.rig.emulator.coupled.truth import read_truth
 from flexneedle.rig.supervised import Columns, SupervisedDriver
 from flexneedle.rig.supervisor.machine import State
@@ -18,6 +21,8 @@ from flexneedle.rig.supervisor.messages import Done
 from flexneedle.scenario.rig import load_rig
 from flexneedle.trace.topics import READINGS
 from flexneedle.types import Control
+from stages import RIG
+from synthetic import make_plan
 from traces import contents
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -152,3 +157,15 @@ def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
     assert math.dist(found.tips[-1, :3], done.target) < 0.3
     assert done.periods[-1].true_tip is None
     assert np.mean([period.innovation[0] for period in done.periods]) == pytest.approx(0.0, abs=0.03)
+
+
+def test_nothing_is_switched_on_where_the_tip_is_not_at_the_start(tmp_path, monkeypatch):
+    monkeypatch.chdir(Path(__file__).parents[1])  # where ros_rig is
+    path, notes = tmp_path / "rig.toml", tmp_path / "notes"
+    devices = {"driver": {"kind": "ros_rig:motors", "notes": str(notes)}, "tracker": {"kind": "ros_rig:Tip"}}
+    path.write_text(tomli_w.dumps(RIG | devices))
+    scenario = PHANTOM.with_values({"setup.tip_to_skin_mm": PHANTOM.setup.tip_to_skin_mm + 9.0})
+    plan = make_plan("manipulation", (25.0, 1.0, 0.0), 4)
+    with pytest.raises(RigError, match=r"tip = -28\.\d.* must be within"):
+        flexneedle.insert(scenario, plan, 0, rig=path)
+    assert {json.loads(line)[0] for line in notes.read_text().splitlines()} <= {"stop", "close"}
