@@ -178,6 +178,7 @@ def _add_off(commands: Commands) -> None:
         "switch the motors off",
         _off,
         "flexneedle rig off rig.toml",
+        "flexneedle rig off rig.toml --yes",
         about="Stop all axes and switch their motors off, as before something is freed by hand. A vertical axis may "
         "fall. Asks for confirmation; the next motion switches the motors on again.",
     )
