@@ -43,6 +43,9 @@ class Supervisor:
     def arm(self):
         self.calls.append(("arm",))
 
+    def off(self):
+        self._move("off")
+
     def jog(self, axis, distance, speed):
         self._move("jog", axis, round(distance, 9), round(speed, 9))
 
@@ -309,6 +312,21 @@ def test_ctrl_c_at_the_question_moves_nothing(capsys, file, supervisor, terminal
     terminal(KeyboardInterrupt())
     status, _, _ = run(capsys, "rig", "retract", file())
     assert (status, supervisor.calls) == (130, [])
+
+
+@pytest.mark.usefixtures("device")
+@pytest.mark.parametrize(
+    ("answer", "calls"), [("y\n", [("rig", "Bench"), ("off",), ("closed",)]), ("\n", [])]
+)
+def test_motors_are_switched_off_after_a_warning_and_never_on_before(
+    capsys, file, supervisor, terminal, answer, calls
+):
+    terminal(answer)
+    status, _, err = run(capsys, "rig", "off", file())
+    assert "insertion: at 30 mm, its motor will be switched off" in err
+    assert err.index("A vertical axis falls unless something holds it") < err.index("Switch off? [y/N]")
+    assert supervisor.calls == calls
+    assert status == (0 if calls else 1)
 
 
 @pytest.mark.usefixtures("device")

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from flexneedle.scenario.rig import RigFile
 
 _SECONDS = 2.0
+_FALLS = "A vertical axis falls unless something holds it: support it first."
 _NEGATIVE = re.compile(r"^-[\d.]")
 
 
@@ -29,8 +30,8 @@ class Operator(Protocol):
     Each raises RefusedError or DriverError, with the reason, if it is refused or ends before its goal.
     """
 
-    def arm(self) -> None:
-        """Switch the motors on."""
+    def arm(self) -> str:
+        """Switch the motors on; return what else that has changed, or ""."""
         ...
 
     def jog(self, axis: str, distance: float, speed: float) -> object:
@@ -43,6 +44,10 @@ class Operator(Protocol):
 
     def retract(self, position: float, speed: float) -> object:
         """Withdraw the base to a position of the insertion axis (mm), at most at a speed (mm/s)."""
+        ...
+
+    def off(self) -> None:
+        """Switch the motors off."""
         ...
 
     def stop(self) -> None:
@@ -63,7 +68,7 @@ def add_parser(commands: Commands) -> None:
         commands,
         "rig",
         "check the motors and the tracker of a rig, and move its axes",
-        (_add_check, _add_jog, _add_home, _add_retract),
+        (_add_check, _add_jog, _add_home, _add_retract, _add_off),
         "flexneedle rig check rig.toml --scenario phantom",
         "flexneedle rig jog rig.toml insertion -5mm",
     )
@@ -172,6 +177,23 @@ def _add_speed(parser: argparse.ArgumentParser, unit: str) -> None:
     )
 
 
+def _add_off(commands: Commands) -> None:
+    parser = add_command(
+        commands,
+        "off",
+        "switch the motors off",
+        _off,
+        "flexneedle rig off rig.toml",
+        "flexneedle rig off rig.toml --yes",
+        about="Stop all axes and switch their motors off, as before something is freed by hand. A vertical axis may "
+        "fall. Asks for confirmation; the next motion switches the motors on again.",
+    )
+    _add_rig(parser)
+    parser.add_argument(
+        "--yes", action="store_true", help="switch off without asking; needed without a terminal"
+    )
+
+
 def _add_rig(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "rig",
@@ -264,7 +286,7 @@ def _home(args: argparse.Namespace) -> int:
     def home(operator: Operator) -> None:
         for number, homing in enumerate(chosen):
             if number > 0:
-                operator.arm()
+                _arm(operator)
             operator.home(homing.name)
 
     return _carried_out(rig, chosen, args.yes, home, "Only without a needle in tissue.")
@@ -285,6 +307,18 @@ def _retract(args: argparse.Namespace) -> int:
         )
         return 0
     return _carried_out(rig, [move], args.yes, lambda operator: operator.retract(move.goal, move.speed))
+
+
+def _off(args: argparse.Namespace) -> int:
+    from flexneedle.rig.moves import switched_off
+    from flexneedle.scenario.rig import load_rig
+
+    rig = load_rig(args.rig)
+    confirm_motions([*switched_off(rig, _positions(rig)), _FALLS], "" if args.yes else "Switch off?")
+    with supervised(rig) as operator, _stopped_on_error(operator):
+        operator.off()
+    print("done", file=sys.stderr)
+    return 0
 
 
 def _positions(rig: RigFile) -> dict[str, float]:
@@ -311,10 +345,16 @@ def _carried_out(
     """Print the motions, command them once they are confirmed, and return the exit status."""
     confirm_motions([*map(str, moves), *notes, ARMS], "" if yes else "Move?")
     with supervised(rig) as operator, _stopped_on_error(operator):
-        operator.arm()
+        _arm(operator)
         command(operator)
     print("done", file=sys.stderr)
     return 0
+
+
+def _arm(operator: Operator) -> None:
+    """Switch the motors on, and print what else that has changed."""
+    if changed := operator.arm():
+        print(f"flexneedle: {changed}", file=sys.stderr)
 
 
 @contextmanager

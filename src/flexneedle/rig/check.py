@@ -228,7 +228,8 @@ def _switch_problem(axis: Axis, state: MotorState) -> str:
 def _following(name: str, axis: Axis, state: MotorState) -> Finding:
     error = abs((state.commanded - state.position) / axis.scale)
     most = axis.max_error
-    rule = "" if error <= most else f"must be at most max_error_{axis.unit} ({axis.shown(most)})"
+    limit = f"must be at most max_error_{axis.unit} ({axis.shown(most)})"
+    rule = "" if error <= most else f"{limit}: free the axis; the next motion begins where it then is"
     return Finding(name, "commanded - measured", f"{axis.shown(error)} {axis.unit}", rule)
 
 

@@ -84,6 +84,14 @@ def resting(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
     ]
 
 
+def switched_off(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
+    """Return one line for each axis whose motor is switched off: where it is (mm or rad, by name)."""
+    return [
+        f"{name}: at {axis.shown(positions[name])} {axis.unit}, its motor will be switched off"
+        for name, axis in rig.axes.items()
+    ]
+
+
 def axis_of(rig: RigFile, name: str) -> Axis:
     """Return an axis by its name. Raises InputError, with the axes of the rig, for another name."""
     axes = dict(rig.axes.items())

@@ -93,7 +93,7 @@ def test_a_line_that_fails_at_rest_after_a_fault_is_opened_again_before_anything
     bench.tick(4)
     bench.core.request(say.Reset())
     assert isinstance(bench.sent[-1], say.Refused)
-    assert not bench.reports[-1].reached
+    assert not bench.reports[-1].at_rest
     bench.stage.lost = False
     bench.tick(20)
     assert ("reconnect",) in bench.stage.calls

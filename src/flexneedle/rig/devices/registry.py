@@ -7,6 +7,7 @@ invalid ones, and returns the device open and at rest. A package registers it un
     stage = "mylab.stage:open_stage"
 """
 
+import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -14,7 +15,8 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol
 
-from flexneedle.errors import InputError, RigError
+from flexneedle.errors import FlexneedleError, InputError, RigError
+from flexneedle.rig.devices.answers import MOTORS, TRACKER
 from flexneedle.rig.devices.guarded import Guarded, errors_named
 from flexneedle.rig.ports import Clock, MotorPaces, Motors, Tracker
 from flexneedle.scenario.own import a_kind_of, attribute, not_callable_with, resolved
@@ -54,13 +56,25 @@ def open_motors(rig: RigFile) -> Motors:
     with errors_named(name):
         made = _made("driver", rig.driver, lambda: factory(rig.driver.settings, channels))
         _check_parts("driver", rig.driver, made, parts_of(Motors))
-    motors: Motors = Guarded(name, made)
-    with errors_named(name):
-        problems = [to_line(one) for one in _pace_problems(rig, getattr(motors, "paces", None))]
-    if problems:
+    motors: Motors = Guarded(name, type(made).__name__, made, MOTORS)
+    try:
+        with errors_named(name):
+            _check_paces(rig, getattr(motors, "paces", None))
+    except FlexneedleError:
         motors.close()
-        raise RigError(*problems)
+        raise
     return motors
+
+
+def address_of(part: Part, motors: Motors) -> str:
+    """Return what names the motors on this machine: the `address` of a driver that has one, else kind and settings."""
+    given: str = getattr(motors, "address", "")
+    return given or f"{part.kind} {json.dumps(part.settings, sort_keys=True, default=str)}"
+
+
+def _check_paces(rig: RigFile, paces: MotorPaces | None) -> None:
+    if problems := [to_line(one) for one in _pace_problems(rig, paces)]:
+        raise RigError(*problems)
 
 
 def _pace_problems(rig: RigFile, paces: MotorPaces | None) -> Iterator[Problem]:
@@ -96,7 +110,9 @@ def open_tracker(rig: RigFile, clock: Clock) -> OpenTracker:
     name = _name("tracker", rig.tracker)
     with errors_named(name):
         made = _made("tracker", rig.tracker, lambda: factory(rig.tracker.settings, clock))
-        tracker: OpenTracker = Guarded(name, _closable(rig.tracker, made))
+        opened = _closable(rig.tracker, made)
+    owner = type(opened.tracker if isinstance(opened, _Entered) else opened).__name__
+    tracker: OpenTracker = Guarded(name, owner, opened, TRACKER)
     return tracker
 
 

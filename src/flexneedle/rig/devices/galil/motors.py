@@ -65,6 +65,8 @@ class GalilMotors:
         self._stopping: float | None = None
         self.identity = ""
         """Model and revision of the firmware."""
+        self.address = self._link.address
+        """IP address and port."""
         self._connect(monotonic() + CONNECT_S)
 
     def __enter__(self) -> Self:
