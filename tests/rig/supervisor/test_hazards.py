@@ -101,6 +101,14 @@ def test_a_line_that_fails_at_rest_after_a_fault_is_opened_again_before_anything
     assert bench.core.state is State.IDLE
 
 
+def test_a_driver_that_leaves_a_motor_out_is_a_fault(bench):
+    read = bench.stage.read
+    bench.stage.read = lambda: {channel: state for channel, state in read().items() if channel != "C"}
+    bench.tick(2)
+    assert bench.core.state is State.FAULT
+    assert "no state of channel C" in bench.core.why
+
+
 @pytest.mark.parametrize("how", ["stop", "fault"])
 def test_a_motor_that_moves_after_a_stop_is_stopped_again(bench, how):
     bench.core.request(say.Stop("the test"))

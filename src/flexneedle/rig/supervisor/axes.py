@@ -193,6 +193,10 @@ class RigAxes:
     def _read(self) -> Reading:
         begun = self._clock.now()
         states = dict(self._motors.read())
+        if missing := [
+            drive.axis.channel for drive in self.drives.values() if drive.axis.channel not in states
+        ]:
+            raise DriverError(f"the driver reports no state of channel {', '.join(missing)}")
         return Reading(states, 0.5 * (begun + self._clock.now()))
 
     @contextmanager
