@@ -1,4 +1,4 @@
-"""What the server and a worker write to each other's pipes: each message is a length (u32, little-endian) and its bytes.
+"""What the server and a worker write to each other's pipes: a length (u32, little-endian) and as many bytes.
 
 A message is a text (a JSON object, so that it opens with a brace) or a frame (`page/frames.py`, which opens with its
 kind, a small number).

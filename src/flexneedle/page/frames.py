@@ -1,7 +1,7 @@
 """Binary frames of shapes, as `static/frames.js` reads them.
 
-A header of 16 bytes, little-endian: kind (u8), columns (u8), source (u8), 0 (u8), number (u32) of the first period or of
-the iteration, paths (u32), points (u32) of each path; then paths × points × columns values, float32, point by point.
+A header of 16 bytes, little-endian: kind (u8), columns (u8), source (u8), 0 (u8), number (u32) of the first period or
+of the iteration, paths (u32), points (u32) of each path; then paths × points × columns values, float32, point by point.
 Where a frame has several paths of an insertion, each is one period.
 """
 

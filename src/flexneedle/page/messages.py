@@ -18,13 +18,15 @@ Vector = tuple[float, float, float]
 
 
 class Message(BaseModel):
-    """A message: frozen; unknown keys, NaN and numbers in quotes are refused."""
+    """A message: frozen; unknown keys and NaN are refused."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Request(Message):
-    """What a browser asks for. steering: whether only the client that steers may ask for it."""
+    """What a browser asks for; numbers in quotes are refused. steering: only the client that steers may ask for it."""
+
+    model_config = ConfigDict(strict=True)
 
     steering: ClassVar[bool] = True
 
@@ -406,6 +408,18 @@ class Insertion(News):
     @property
     def key(self) -> str:
         """One state of each."""
+        return f"insertion {self.of}"
+
+
+class Closed(News):
+    """A recording is no longer shown; it replaces the `Insertion` of that recording."""
+
+    type: Literal["closed"] = "closed"
+    of: Literal["first", "second"]
+
+    @property
+    def key(self) -> str:
+        """That of the recording's state."""
         return f"insertion {self.of}"
 
 

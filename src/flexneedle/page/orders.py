@@ -1,10 +1,12 @@
 """What the server asks of its workers: JSON objects in their pipes (`page/channel.py`).
 
-A worker does one `Work` at a time, and gets the next when it has sent a `Job` that is done, failed or cancelled. `Signal`s
-arrive meanwhile. A worker whose stdin ends stops what it does, and ends.
+A worker does one `Work` at a time, and gets the next when it has sent a `Job` that is done, failed or cancelled.
+`Signal`s arrive meanwhile. A worker whose stdin ends stops what it does, and ends.
 """
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from flexneedle.page.messages import Disturb, Message, Strategy
 
@@ -25,7 +27,7 @@ class Work(Message):
     kind: Kind
     revision: int = 0
     name: str = ""
-    scenario: dict[str, Any] = {}
+    scenario: Annotated[dict[str, Any], Field(default_factory=dict)]
     seed: int = 0
     strategy: Strategy = "manipulation"
     controller: str = ""

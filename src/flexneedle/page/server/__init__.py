@@ -1,1 +1,1 @@
-"""The server of the page: clients, their session, jobs of the workers, recorded runs. It has no physics and no numba."""
+"""The server of the page: clients, session, jobs of the workers, recorded runs; no physics and no numba."""

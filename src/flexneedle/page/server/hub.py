@@ -41,6 +41,7 @@ class Outbox:
     def __init__(self, hub: "Hub") -> None:
         self._hub = hub
         self._answers = deque[str]()
+        self._notice: str | None = None
         self._keys = dict.fromkeys(hub.keys)
         self._has = dict[str, tuple[int, int]]()
         self._ready = asyncio.Event()
@@ -54,6 +55,11 @@ class Outbox:
     def answer(self, news: News) -> None:
         """Add an answer to this client alone, which no other replaces."""
         self._answers.append(news.model_dump_json())
+        self._ready.set()
+
+    def notice(self, news: News) -> None:
+        """Add an answer that replaces the last notice, if that is not sent yet."""
+        self._notice = news.model_dump_json()
         self._ready.set()
 
     def touch(self, key: str) -> None:
@@ -78,6 +84,9 @@ class Outbox:
     def _taken(self) -> Message | None:
         if self._answers:
             return self._answers.popleft()
+        if self._notice is not None:
+            notice, self._notice = self._notice, None
+            return notice
         while self._keys:
             key = next(iter(self._keys))
             del self._keys[key]
@@ -135,9 +144,11 @@ class Hub:
         self._put(news.key, news.model_dump_json())
 
     def hand_on(self, message: Message, values: dict[str, Any] | None) -> None:
-        """Send a message of a worker to all clients as it is; values: of a text. Raises RunError for rows with a gap."""
-        if values is None or isinstance(message, bytes):
-            self._put(frame_key(bytes(message)), message)
+        """Send a message of a worker to all clients as it is; values: of a text. Raises RunError if rows are missing."""
+        if isinstance(message, bytes):
+            self._put(frame_key(message), message)
+        elif values is None:
+            raise RunError("a text without values")
         elif values["type"] == _ROWS:
             key = key_of(values)
             self.rows(key).put(values["first"], values["rows"])
