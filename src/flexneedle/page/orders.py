@@ -4,7 +4,7 @@ A worker does one `Work` at a time, and gets the next when it has sent a `Job` t
 `Signal`s arrive meanwhile. A worker whose stdin ends stops what it does, and ends.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -27,7 +27,7 @@ class Work(Message):
     kind: Kind
     revision: int = 0
     name: str = ""
-    scenario: Annotated[dict[str, Any], Field(default_factory=dict)]
+    scenario: dict[str, Any] = Field(default_factory=dict)
     seed: int = 0
     strategy: Strategy = "manipulation"
     controller: str = ""

@@ -16,7 +16,7 @@ from flexneedle.page.messages import News
 
 _PART = {"job": "kind", "iteration": "strategy", "plan": "strategy", "rows": "of", "insertion": "of"}
 """Type of a message and the part of it that its key has, as `News.key`."""
-_ROWS = "rows"
+_ROWS, _JOB = "rows", "job"
 _ROWS_AT_ONCE = 250
 
 
@@ -63,7 +63,9 @@ class Outbox:
         self._ready.set()
 
     def touch(self, key: str) -> None:
-        """Note that a key has news."""
+        """Note that a key has news. The state of a job comes after what the job has sent before."""
+        if key.startswith(_JOB):
+            self._keys.pop(key, None)
         self._keys[key] = None
         self._ready.set()
 
@@ -144,7 +146,7 @@ class Hub:
         self._put(news.key, news.model_dump_json())
 
     def hand_on(self, message: Message, values: dict[str, Any] | None) -> None:
-        """Send a message of a worker to all clients as it is; values: of a text. Raises RunError if rows are missing."""
+        """Send a worker's message to all clients as it is; values: of a text. Raises RunError if rows are missing."""
         if isinstance(message, bytes):
             self._put(frame_key(message), message)
         elif values is None:

@@ -1,4 +1,4 @@
-"""The insertion that runs, virtual or on the connected rig: what may be done to it, and what happens without clients."""
+"""The insertion that runs, virtual or on the connected rig: what may be done to it, what happens without clients."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
