@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from flexneedle.page.server.refusal import Refusal
+from flexneedle.page.server.worker import kill_process
 from flexneedle.trace.folder import RUN_FILE
 
 _NAME = re.compile(r"[\w][\w .+-]*")
@@ -136,8 +137,7 @@ async def _command(arguments: Sequence[str]) -> bytes:
     except TimeoutError:
         raise Refusal(f"not ready after {_EXPORT_S:g} s") from None
     finally:
-        if process.returncode is None:
-            process.kill()
+        kill_process(process)
     if process.returncode:
         raise Refusal(errors.decode(errors="replace").strip().removeprefix("flexneedle: "))
     return out

@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import os
+import signal
 import sys
 from asyncio.subprocess import PIPE, Process
 from collections.abc import Callable, Sequence
@@ -51,8 +53,7 @@ class Worker:
     def kill(self) -> None:
         """End the process at once; it is started again."""
         if self._process is not None:
-            with suppress(ProcessLookupError):
-                self._process.kill()
+            kill_process(self._process)
 
     async def end(self) -> None:
         """End the process for good: its stdin ends, on which it stops what it does; after 3 s it is killed."""
@@ -68,8 +69,7 @@ class Worker:
             async with asyncio.timeout(_END_S):
                 await _drained(process)
         except TimeoutError:
-            with suppress(ProcessLookupError):
-                process.kill()
+            kill_process(process)
             await _drained(process)
 
     async def _keep(self) -> None:
@@ -92,8 +92,10 @@ class Worker:
         self._on_start()
         await self._listen(process)
         self._process = None
-        with suppress(ProcessLookupError):
-            process.kill()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_END_S):
+                return await process.wait()
+        kill_process(process)
         return await process.wait()
 
     async def _listen(self, process: Process) -> None:
@@ -104,6 +106,13 @@ class Worker:
                 self._on_message(message, json.loads(message) if isinstance(message, str) else None)
         except Exception as error:  # noqa: BLE001 - whatever a worker writes, the server stays
             print(f"flexneedle: the worker of {self._name} is ended: {unexpected(error)}", file=sys.stderr)
+
+
+def kill_process(process: Process) -> None:
+    """End a process at once. Process.kill would first collect its status, of which asyncio's watcher then complains."""
+    if process.returncode is None:
+        with suppress(ProcessLookupError):
+            os.kill(process.pid, signal.SIGKILL)
 
 
 async def _drained(process: Process) -> None:
