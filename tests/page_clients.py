@@ -19,7 +19,7 @@ from flexneedle.page.server.serve import PageServer
 from flexneedle.page.server.session import Session
 from flexneedle.scenario.files import load_scenario
 
-STUB = (sys.executable, str(Path(__file__).parent / "page" / "stub_worker.py"))
+STUB = (sys.executable, str(Path(__file__).with_name("page_worker.py")))
 PATIENCE_S = 20.0
 """Time after which a test gives up; what it waits for takes milliseconds."""
 QUICK = Limits(alone_s=0.1, lost_s=0.1, cancel_s=0.1, stop_s=0.3, runs_s=0.05)

@@ -23,9 +23,8 @@ def test_an_edit_changes_values_by_key(session):
 
 
 def test_none_returns_a_value_to_its_default(session):
-    assert (
-        session.edited({"plan.seed_x": None} if False else {"target.lateral_mm": None}).scenario is not None
-    )
+    edited = session.edited({"target.lateral_mm": 3.0})
+    assert edited.edited({"target.lateral_mm": None}).scenario.target.lateral_mm == 0.0
 
 
 def test_all_problems_of_an_edit_are_given_by_key(session):
@@ -100,6 +99,12 @@ def test_no_other_name_is_a_preset(session, name, tmp_path, monkeypatch):
 def test_a_file_is_loaded_with_its_warnings(session, minimal_text):
     loaded = session.with_file("mine", minimal_text)
     assert (loaded.name, loaded.scenario.name, loaded.news().changed) == ("mine", "Minimal", [])
+
+
+def test_a_renamed_key_of_a_file_is_a_doubt(session, minimal_text):
+    text = minimal_text + "[control.adaptive_mpc]\nmodel_sd_mm = 0.1\n"
+    (doubt,) = session.with_file("mine", text).edited({"target.depth_mm": 35.0}).news().doubts
+    assert "least_model_sd_mm" in doubt
 
 
 def test_a_file_that_was_written_is_the_same_scenario(session):

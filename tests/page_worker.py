@@ -14,8 +14,8 @@ from flexneedle.page.channel import packed, read
 
 CRASHES, HANGS, WORKS_ON = 13, 14, 15
 ROWS = 600
-FRAME = struct.pack("<BBBBIII", 1, 3, 1, 0, 0, 1, 20_000) + bytes(4 * 3 * 20_000)
-"""A needle of the live insertion, 240 kB."""
+FRAME = struct.pack("<BBBBIII", 1, 3, 1, 0, 0, 1, 2_000) + bytes(4 * 3 * 2_000)
+"""A needle of the live insertion, 24 kB."""
 
 
 def say(type_, **values):
