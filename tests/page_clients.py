@@ -22,7 +22,7 @@ from flexneedle.scenario.files import load_scenario
 STUB = (sys.executable, str(Path(__file__).with_name("page_worker.py")))
 PATIENCE_S = 20.0
 """Time after which a test gives up; what it waits for takes milliseconds."""
-QUICK = Limits(alone_s=0.1, lost_s=0.1, cancel_s=0.1, stop_s=0.3, runs_s=0.05)
+QUICK = Limits(alone_s=0.1, lost_s=0.1, cancel_s=0.1, stop_s=10.0, runs_s=0.05)
 """Waits that tests can wait for."""
 
 
@@ -53,7 +53,8 @@ class Client:
 
     def __init__(self, server, **options) -> None:
         port = port_of(server)
-        options = {"origin": f"http://127.0.0.1:{port}", "proxy": None, "max_size": None} | options
+        fixed = {"proxy": None, "max_size": None, "ping_interval": None, "close_timeout": 0.1}
+        options = {"origin": f"http://127.0.0.1:{port}"} | fixed | options
         self._connecting = connect(f"ws://127.0.0.1:{port}/live", **options)
         self.socket = self._connecting.__enter__()
         self.newest, self.rows = {}, {}

@@ -56,6 +56,18 @@ def rows(of, first, count):
     say("rows", of=of, first=first, rows=[{"index": index} for index in range(first, first + count)])
 
 
+class Signals:
+    """The signals of one job."""
+
+    def __init__(self, signals, number):
+        self._signals, self._number = signals, number
+
+    def get(self):
+        while (signal := self._signals.get())["job"] != self._number:
+            pass
+        return signal
+
+
 def plan(order, signals):
     if order["seed"] == CRASHES:
         os._exit(3)
@@ -123,12 +135,11 @@ def main():
         os._exit(0)
 
     Thread(target=listen, daemon=True).start()
+    say("ready")
     while True:
         order = {"seed": 0, "revision": 0, "strategy": "manipulation"} | works.get()
-        while not signals.empty():
-            signals.get()
         job(order, "running")
-        job(order, do(order, signals))
+        job(order, do(order, Signals(signals, order["job"])))
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ def test_an_edit_changes_values_by_key(session):
 
 def test_none_returns_a_value_to_its_default(session):
     edited = session.edited({"target.lateral_mm": 3.0})
-    assert edited.edited({"target.lateral_mm": None}).scenario.target.lateral_mm == 0.0
+    assert edited.edited({"target.lateral_mm": None}).scenario.target.lateral_mm == 5.0
 
 
 def test_all_problems_of_an_edit_are_given_by_key(session):

@@ -1,7 +1,8 @@
 """What the server asks of its workers: JSON objects in their pipes (`page/channel.py`).
 
-A worker does one `Work` at a time, and gets the next when it has sent a `Job` that is done, failed or cancelled.
-`Signal`s arrive meanwhile. A worker whose stdin ends stops what it does, and ends.
+A worker first reports that it is `Ready`, when it has imported and compiled what it needs. It does one `Work` at a
+time, and gets the next when it has sent a `Job` that is done, failed or cancelled. `Signal`s arrive meanwhile, the
+first perhaps before the worker has begun with their job. A worker whose stdin ends stops what it does, and ends.
 """
 
 from typing import Any, Literal
@@ -12,6 +13,12 @@ from flexneedle.page.messages import Disturb, Message, Strategy
 
 Do = Literal["scene", "estimate", "plan", "reach", "insert", "read", "save"]
 Kind = Literal["scene", "estimate", "plan", "compare", "reach", "insertion", "recording", "save"]
+
+
+class Ready(Message):
+    """A worker can begin; before that it gets no work."""
+
+    type: Literal["ready"] = "ready"
 
 
 class Work(Message):

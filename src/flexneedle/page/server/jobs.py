@@ -128,7 +128,7 @@ class Jobs:
             self.expect_end(self._limits.cancel_s)
 
     def _next(self) -> None:
-        if self._running is None and self._waiting and self.worker.running:
+        if self._running is None and self._waiting and self.worker.ready:
             self._running = min(self._waiting, key=lambda job: job.urgency)
             self._waiting.remove(self._running)
             self._publish(self._running, "running")
@@ -149,14 +149,16 @@ class Jobs:
         self._over(running, values["state"], values.get("text", ""))
 
     def _ended(self, status: int) -> None:
-        """The process has ended: so has its job."""
-        running = self._running
-        if running is None:
-            return
-        if running.cancelled:
-            self._over(running, "cancelled", "")
+        """The process has ended: so has its job, or all if it was never ready."""
+        text = f"the worker has ended (exit status {status}) and is started again"
+        if self._running is None:  # it was never ready
+            failed, self._waiting = self._waiting, []
+            for job in failed:
+                self._finish(job, "failed", text)
+        elif self._running.cancelled:
+            self._over(self._running, "cancelled", "")
         else:
-            self._over(running, "failed", f"the worker has ended (exit status {status}) and is started again")
+            self._over(self._running, "failed", text)
 
     def _over(self, job: Job, state: str, text: str) -> None:
         self._running = None
@@ -172,7 +174,7 @@ class Jobs:
         self._next()
 
     def _finish(self, job: Job, state: str, text: str) -> None:
-        if not any(other.slot == job.slot for other in self._waiting):  # whose state is newer
+        if not any(other.work.kind == job.work.kind for other in self._waiting):  # whose state is newer
             self._publish(job, state, text)
         self._on_end(job.work, state, text)
 

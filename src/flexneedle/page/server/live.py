@@ -90,8 +90,10 @@ def _answer(desk: Desk, client: int, outbox: Outbox, text: str | None) -> None:
     """Carry out a request, and answer it."""
     what, number = "message", None
     try:
-        request = _parsed(text, desk.limits)
+        request = _parsed(text, desk.limits.file_bytes)
         what, number = request.type, request.request
+        if not isinstance(request, Load):
+            _require_length(text, desk.limits.message_bytes)
         desk.carry_out(client, outbox, request)
     except Refusal as refusal:
         problems = refusal.problems
@@ -106,20 +108,21 @@ def _answer(desk: Desk, client: int, outbox: Outbox, text: str | None) -> None:
             outbox.answer(Done(request=number))
 
 
-def _parsed(text: str | None, limits: Limits) -> AnyRequest:
-    """The request of a text. Raises Refusal for one that is none or too long."""
+def _parsed(text: str | None, longest: int) -> AnyRequest:
+    """The request of a text of at most `longest` bytes. Raises Refusal for anything else."""
+    _require_length(text, longest)
+    try:
+        return REQUESTS.validate_json(text or "")
+    except ValueError as error:
+        raise Refusal(_reason(error)) from None
+
+
+def _require_length(text: str | None, longest: int) -> None:
     if text is None:
         raise Refusal("a message of bytes: must be text, a JSON object")
-    length = len(text.encode(errors="replace"))
-    if length > limits.file_bytes:
-        raise Refusal(f"a message of {length} bytes: must have at most {limits.file_bytes}")
-    try:
-        request = REQUESTS.validate_json(text)
-    except (ValidationError, ValueError) as error:
-        raise Refusal(_reason(error)) from None
-    if length > limits.message_bytes and not isinstance(request, Load):
-        raise Refusal(f"a {request.type} of {length} bytes: must have at most {limits.message_bytes}")
-    return request
+    length = len(text.encode())
+    if length > longest:
+        raise Refusal(f"a message of {length} bytes: must have at most {longest}")
 
 
 def _reason(error: ValueError) -> str:

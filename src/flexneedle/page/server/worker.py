@@ -11,11 +11,12 @@ from contextlib import suppress
 from typing import Any
 
 from flexneedle.page.channel import Message, packed, received
-from flexneedle.page.orders import Signal, Work
+from flexneedle.page.orders import Ready, Signal, Work
 from flexneedle.scenario.problems import unexpected
 
 OnMessage = Callable[[Message, dict[str, Any] | None], None]
 """Called with each message; a text also as values."""
+_READY = Ready().model_dump()
 _SHORT_S, _LONGEST_PAUSE_S, _END_S = 2.0, 30.0, 3.0
 
 
@@ -27,19 +28,16 @@ class Worker:
         name: str,
         command: Sequence[str],
         on_message: OnMessage,
-        on_start: Callable[[], None],
+        on_ready: Callable[[], None],
         on_end: Callable[[int], None],
     ) -> None:
-        """on_start, on_end: called when the process runs, and with its exit status when it has ended."""
+        """on_ready, on_end: called when the process is ready, and with its exit status when it has ended."""
         self._name, self._command = name, command
-        self._on_message, self._on_start, self._on_end = on_message, on_start, on_end
+        self._on_message, self._on_ready, self._on_end = on_message, on_ready, on_end
+        self.ready = False
+        """Whether the process can be given work."""
         self._process: Process | None = None
         self._keeping: asyncio.Task[None] | None = None
-
-    @property
-    def running(self) -> bool:
-        """Whether there is a process that can be written to."""
-        return self._process is not None
 
     def start(self) -> None:
         """Start the process, and keep it running."""
@@ -89,23 +87,30 @@ class Worker:
             *self._command, stdin=PIPE, stdout=PIPE, start_new_session=True
         )
         self._process = process
-        self._on_start()
         await self._listen(process)
-        self._process = None
+        self._process, self.ready = None, False
         with suppress(TimeoutError):
             async with asyncio.timeout(_END_S):
                 return await process.wait()
         kill_process(process)
         return await process.wait()
 
+    def _hear(self, message: Message, values: dict[str, Any] | None) -> None:
+        if values == _READY:
+            self.ready = True
+            self._on_ready()
+        else:
+            self._on_message(message, values)
+
     async def _listen(self, process: Process) -> None:
         if process.stdout is None:
             raise RuntimeError("a process without stdout")
         try:
             while (message := await received(process.stdout)) is not None:
-                self._on_message(message, json.loads(message) if isinstance(message, str) else None)
+                self._hear(message, json.loads(message) if isinstance(message, str) else None)
         except Exception as error:  # noqa: BLE001 - whatever a worker writes, the server stays
             print(f"flexneedle: the worker of {self._name} is ended: {unexpected(error)}", file=sys.stderr)
+            kill_process(process)
 
 
 def kill_process(process: Process) -> None:
