@@ -139,7 +139,8 @@ def test_the_end_of_a_job_comes_after_its_results():
     hub.publish(Job(job=1, kind="plan", state="waiting"))
     worker_says(hub, type="plan", strategy="steering")
     hub.publish(Job(job=1, kind="plan", state="done"))
-    assert [message["type"] for message in drained(outbox)] == ["plan", "job"]
+    for each in (outbox, hub.join()):
+        assert [message["type"] for message in drained(each)] == ["plan", "job"]
 
 
 def test_answers_are_not_replaced_and_notices_are():

@@ -42,7 +42,7 @@ class Outbox:
         self._hub = hub
         self._answers = deque[str]()
         self._notice: str | None = None
-        self._keys = dict.fromkeys(hub.keys)
+        self._keys = dict.fromkeys(sorted(hub.keys, key=_is_job))
         self._has = dict[str, tuple[int, int]]()
         self._ready = asyncio.Event()
         self._ready.set()
@@ -64,7 +64,7 @@ class Outbox:
 
     def touch(self, key: str) -> None:
         """Note that a key has news. The state of a job comes after what the job has sent before."""
-        if key.startswith(_JOB):
+        if _is_job(key):
             self._keys.pop(key, None)
         self._keys[key] = None
         self._ready.set()
@@ -177,6 +177,10 @@ class Hub:
     def _touch(self, key: str) -> None:
         for outbox in self._outboxes:
             outbox.touch(key)
+
+
+def _is_job(key: str) -> bool:
+    return key.startswith(_JOB)
 
 
 def key_of(values: dict[str, Any]) -> str:
