@@ -13,6 +13,13 @@ from flexneedle.page.messages import Job, People, Refused
 from flexneedle.page.server.hub import Hub, frame_key, key_of
 
 
+def joined(hub):
+    """A client that has got its first message."""
+    outbox = hub.join(People(clients=0, steering=None))
+    assert '"people"' in outbox._taken()
+    return outbox
+
+
 def drained(outbox):
     """All that a client has to get."""
 
@@ -39,7 +46,7 @@ def indices(found):
 
 def test_a_client_gets_the_newest_of_each_key():
     hub = Hub()
-    outbox = hub.join()
+    outbox = joined(hub)
     for clients in range(1000):
         hub.publish(People(clients=clients, steering=None))
         hub.publish(Job(job=clients, kind="plan", state="running"))
@@ -54,14 +61,14 @@ def test_a_new_client_gets_all_keys_once():
     worker_says(hub, type="plan", strategy="manipulation")
     worker_says(hub, type="plan", strategy="steering", cost=2)
     rows(hub, 0, 3)
-    found = drained(hub.join())
+    found = drained(joined(hub))
     assert [message.get("strategy") for message in found] == ["steering", "manipulation", None]
     assert indices(found) == [0, 1, 2]
 
 
 def test_frames_are_kept_by_source_and_kind():
     hub, outbox = Hub(), None
-    outbox = hub.join()
+    outbox = joined(hub)
     frames = [
         packed(frame_of(kind, source, number, [[1.0, 2.0, 3.0]]))
         for number in range(3)
@@ -73,12 +80,12 @@ def test_frames_are_kept_by_source_and_kind():
     assert drained(outbox) == frames[-4:]
     assert frame_key(frames[0]) == "frame 1 1"
     hub.forget_frames(Source.LIVE)
-    assert drained(hub.join()) == [frames[-3], frames[-1]]
+    assert drained(joined(hub)) == [frames[-3], frames[-1]]
 
 
 def test_rows_are_sent_once_and_in_order():
     hub = Hub()
-    outbox = hub.join()
+    outbox = joined(hub)
     rows(hub, 0, 2)
     assert indices(drained(outbox)) == [0, 1]
     rows(hub, 2, 1)
@@ -91,14 +98,14 @@ def test_many_rows_leave_others_their_turn():
     hub = Hub()
     rows(hub, 0, 1000)
     hub.publish(People(clients=1, steering=None))
-    outbox = hub.join()
+    outbox = joined(hub)
     types = [message["type"] for message in drained(outbox)]
     assert types.index("people") < len(types) - 1 - types[::-1].index("rows")
 
 
 def test_rows_that_were_missed_are_sent_again():
     hub = Hub()
-    outbox = hub.join()
+    outbox = joined(hub)
     rows(hub, 0, 10)
     drained(outbox)
     outbox.rows_from("rows live", 7)
@@ -109,7 +116,7 @@ def test_rows_that_were_missed_are_sent_again():
 
 def test_rows_of_a_new_insertion_begin_at_0():
     hub = Hub()
-    outbox = hub.join()
+    outbox = joined(hub)
     rows(hub, 0, 10)
     drained(outbox)
     rows(hub, 0, 2)
@@ -130,31 +137,55 @@ def test_what_is_forgotten_is_not_sent():
     rows(hub, 0, 2, of="first")
     worker_says(hub, type="insertion", of="first")
     hub.forget(["rows first", "insertion first"])
-    assert drained(hub.join()) == []
+    assert drained(joined(hub)) == []
 
 
 def test_the_end_of_a_job_comes_after_its_results():
     hub = Hub()
-    outbox = hub.join()
+    outbox = joined(hub)
     hub.publish(Job(job=1, kind="plan", state="waiting"))
     worker_says(hub, type="plan", strategy="steering")
     hub.publish(Job(job=1, kind="plan", state="done"))
-    for each in (outbox, hub.join()):
+    for each in (outbox, joined(hub)):
         assert [message["type"] for message in drained(each)] == ["plan", "job"]
 
 
+def test_what_is_forgotten_and_comes_again_comes_later():
+    hub = Hub()
+    outbox = joined(hub)
+    worker_says(hub, type="reach", revision=1)
+    rows(hub, 0, 5)
+    hub.forget(["rows live", "reach"])
+    worker_says(hub, type="insertion", of="live")
+    worker_says(hub, type="reach", revision=2)
+    rows(hub, 0, 2)
+    found = drained(outbox)
+    assert [message["type"] for message in found] == ["insertion", "reach", "rows"]
+    assert indices(found) == [0, 1]
+
+
+def test_an_answer_comes_after_the_news():
+    hub = Hub()
+    outbox = joined(hub)
+    worker_says(hub, type="session", revision=2)
+    outbox.answer(Refused(request=1, what="edit", reason="no"))
+    worker_says(hub, type="session", revision=3)
+    worker_says(hub, type="scene", revision=3)
+    assert [message["type"] for message in drained(outbox)] == ["session", "refused", "scene"]
+
+
 def test_answers_are_not_replaced_and_notices_are():
-    outbox = Hub().join()
+    outbox = joined(Hub())
     for number in range(3):
         outbox.answer(Refused(request=number, what="edit", reason="no"))
         outbox.notice(Refused(request=number, what="message", reason="no"))
-    assert [message["request"] for message in drained(outbox)] == [0, 1, 2, 2]
+    assert [message["request"] for message in drained(outbox)] == [0, 2, 1, 2]
 
 
 def test_next_waits_for_news():
     async def wait():
         hub = Hub()
-        outbox = hub.join()
+        outbox = joined(hub)
         waiting = asyncio.create_task(outbox.next())
         await asyncio.sleep(0)
         assert not waiting.done()

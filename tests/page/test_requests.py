@@ -99,6 +99,16 @@ def test_a_preset_and_a_file_begin_anew(client):
     assert client.newest["session"]["values"]["name"] == load_scenario("phantom").name
 
 
+def test_another_scenario_forgets_what_was_computed(server, client):
+    client.job("plan", "done")
+    client.do("preset", name="phantom3d")
+    client.wait(lambda: client.newest["estimate"]["revision"] == 2)
+    with Client(server) as other:
+        other.job("estimate", "done")
+        assert "plan manipulation" not in other.newest
+        assert other.newest["scene"]["revision"] == 2
+
+
 def test_what_is_no_preset_or_file_is_refused(client):
     assert client.refused("preset", name="nonsense").startswith("preset = nonsense: must be one of phantom, ")
     assert client.refused("load", name="x", text="[").startswith("x: not TOML: ")

@@ -24,6 +24,7 @@ from flexneedle.page.server.session import Session
 from flexneedle.scenario.preset import PRESETS
 
 _SEARCHES: tuple[Kind, ...] = ("plan", "compare", "reach")
+_RESULTS = ("scene", "estimate", "iteration", "plan", "reach")
 _WORK: tuple[Kind, ...] = ("scene", "estimate", *_SEARCHES, "recording")
 _RECORDINGS: dict[bool, tuple[Literal["first", "second"], Source]] = {
     False: ("first", Source.FIRST),
@@ -93,17 +94,8 @@ class Desk:
         """A new client: its number, and what it has to get. Raises Refusal if there are too many."""
         if len(self.people.clients) >= self.limits.clients:
             raise Refusal(f"{self.limits.clients} pages are connected, which is the limit: close one")
-        client, outbox = self.people.join(), self.hub.join()
-        outbox.answer(
-            m.Welcome(
-                client=client,
-                version=__version__,
-                presets=PRESETS.names(),
-                controllers=CONTROLLERS,
-                strategies=STRATEGIES,
-                rig=None if self._rig is None else self._rig.name,
-            )
-        )
+        client = self.people.join()
+        outbox = self.hub.join(self._welcome(client))
         self._stop_timer("alone")
         self._look.set()
         if self._idle:  # what was cancelled is done again
@@ -112,6 +104,16 @@ class Desk:
             self._order("estimate", "estimate")
         self.hub.publish(self.people.news())
         return client, outbox
+
+    def _welcome(self, client: int) -> m.Welcome:
+        return m.Welcome(
+            client=client,
+            version=__version__,
+            presets=PRESETS.names(),
+            controllers=CONTROLLERS,
+            strategies=STRATEGIES,
+            rig=None if self._rig is None else self._rig.name,
+        )
 
     def leave(self, client: int, outbox: Outbox) -> None:
         """A client is gone."""
@@ -182,6 +184,9 @@ class Desk:
 
     def _begin(self, session: Session) -> None:
         """Go on with a changed session: what is computed for the old one is cancelled."""
+        if session.origin is not self.session.origin:  # nothing of another scenario may come after this
+            self.hub.forget_all_of(*_RESULTS)
+            self.hub.forget_frames(Source.SCENE, Source.MANIPULATION, Source.STEERING)
         self.session = session
         self.hub.publish(session.news())
         self.live.disarm("the scenario or an option was changed")

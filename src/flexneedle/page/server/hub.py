@@ -6,7 +6,6 @@ insertion are a list; each client gets those after the last that it has.
 
 import asyncio
 import json
-from collections import deque
 from collections.abc import Iterable
 from typing import Any
 
@@ -16,7 +15,7 @@ from flexneedle.page.messages import News
 
 _PART = {"job": "kind", "iteration": "strategy", "plan": "strategy", "rows": "of", "insertion": "of"}
 """Type of a message and the part of it that its key has, as `News.key`."""
-_ROWS, _JOB = "rows", "job"
+_ROWS, _JOB, _FIRST = "rows", "job", "first"
 _ROWS_AT_ONCE = 250
 
 
@@ -36,31 +35,31 @@ class Rows:
 
 
 class Outbox:
-    """What a client has to get: answers, and keys."""
+    """What a client has to get: keys with news, and answers to it alone, in the order in which they came up."""
 
-    def __init__(self, hub: "Hub") -> None:
+    def __init__(self, hub: "Hub", first: News) -> None:
+        """first: the message that comes before all others."""
         self._hub = hub
-        self._answers = deque[str]()
-        self._notice: str | None = None
-        self._keys = dict.fromkeys(sorted(hub.keys, key=_is_job))
+        self._own = {_FIRST: first.model_dump_json()}
+        self._keys = dict.fromkeys((_FIRST, *sorted(hub.keys, key=_is_job)))
         self._has = dict[str, tuple[int, int]]()
+        self._answered = 0
         self._ready = asyncio.Event()
         self._ready.set()
 
     @property
     def waiting(self) -> int:
         """Number of answers that are not sent."""
-        return len(self._answers)
+        return len(self._own)
 
     def answer(self, news: News) -> None:
-        """Add an answer to this client alone, which no other replaces."""
-        self._answers.append(news.model_dump_json())
-        self._ready.set()
+        """Add an answer, which no other replaces. It comes after the news to which the request has led."""
+        self._answered += 1
+        self._add(f"answer {self._answered}", news)
 
     def notice(self, news: News) -> None:
         """Add an answer that replaces the last notice, if that is not sent yet."""
-        self._notice = news.model_dump_json()
-        self._ready.set()
+        self._add("notice", news)
 
     def touch(self, key: str) -> None:
         """Note that a key has news. The state of a job comes after what the job has sent before."""
@@ -68,6 +67,10 @@ class Outbox:
             self._keys.pop(key, None)
         self._keys[key] = None
         self._ready.set()
+
+    def drop(self, key: str) -> None:
+        """Note that a key has no news any more; what comes later of it comes after what is now to be sent."""
+        self._keys.pop(key, None)
 
     def rows_from(self, key: str, index: int) -> None:
         """Send rows of a key again, from an index on."""
@@ -83,19 +86,23 @@ class Outbox:
                 return message
             self._ready.clear()
 
+    def _add(self, key: str, news: News) -> None:
+        self._own[key] = news.model_dump_json()
+        self.touch(key)
+
     def _taken(self) -> Message | None:
-        if self._answers:
-            return self._answers.popleft()
-        if self._notice is not None:
-            notice, self._notice = self._notice, None
-            return notice
         while self._keys:
             key = next(iter(self._keys))
             del self._keys[key]
-            message = self._missing(key) if key.startswith(_ROWS) else self._hub.newest(key)
+            message = self._message(key)
             if message is not None:
                 return message
         return None
+
+    def _message(self, key: str) -> Message | None:
+        if key in self._own:
+            return self._own.pop(key)
+        return self._missing(key) if key.startswith(_ROWS) else self._hub.newest(key)
 
     def _missing(self, key: str) -> str | None:
         """Rows after those that this client has, some at once, so that other news get their turn."""
@@ -131,9 +138,9 @@ class Hub:
         """The rows of a key."""
         return self._rows.setdefault(key, Rows())
 
-    def join(self) -> Outbox:
-        """The outbox of a new client, which gets all news."""
-        outbox = Outbox(self)
+    def join(self, first: News) -> Outbox:
+        """The outbox of a new client, which gets a message of its own, and then all news."""
+        outbox = Outbox(self, first)
         self._outboxes.add(outbox)
         return outbox
 
@@ -159,16 +166,22 @@ class Hub:
             self._put(key_of(values), message)
 
     def forget(self, keys: Iterable[str]) -> None:
-        """Forget the news of keys, so that new clients do not get them."""
+        """Forget the news of keys: clients that have not got them do not get them."""
         for key in keys:
             self._newest.pop(key, None)
             if key in self._rows:
                 self._rows[key].put(0, ())
+            for outbox in self._outboxes:
+                outbox.drop(key)
 
-    def forget_frames(self, source: int) -> None:
-        """Forget the frames of a source."""
-        opening = _frames_of(source)
-        self.forget([key for key in self._newest if key.startswith(opening)])
+    def forget_all_of(self, *types: str) -> None:
+        """Forget the news of a type of message."""
+        self.forget([key for key in self._newest if key.split()[0] in types])
+
+    def forget_frames(self, *sources: int) -> None:
+        """Forget the frames of sources."""
+        openings = tuple(map(_frames_of, sources))
+        self.forget([key for key in self._newest if key.startswith(openings)])
 
     def _put(self, key: str, message: Message) -> None:
         self._newest[key] = message
