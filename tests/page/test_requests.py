@@ -1,13 +1,14 @@
 """Each request over a real socket: what it does, and why it is refused."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from flexneedle.page import messages as m
 from flexneedle.page.server.insertion import ConnectedRig
 from flexneedle.scenario.files import dump_scenario, load_scenario
-from page_clients import Client, get, served
+from page_clients import QUICK, Client, get, served
 from page_worker import ROWS
 
 
@@ -315,6 +316,17 @@ def test_a_rig_is_held_when_the_steering_client_is_lost(rig_server):
         assert rig_is(watcher, "inserting")
         watcher.do("steer", take=False)
         assert rig_is(watcher, "held")
+
+
+def test_a_rig_is_not_held_when_the_steering_is_taken_again(tmp_path):
+    with served(tmp_path, rig=RIG, limits=replace(QUICK, lost_s=60.0)) as server, Client(server) as client:
+        client.steer().do("arm", armed=True)
+        running(client, rig=True)
+        client.do("steer", take=False)
+        assert "lost" in server.desk._timers
+        client.steer()
+        assert "lost" not in server.desk._timers
+        assert rig_is(client, "inserting")
 
 
 def test_a_rig_is_disarmed_when_the_steering_client_is_lost(rig_server):
