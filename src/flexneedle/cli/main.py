@@ -14,12 +14,12 @@ from importlib import import_module
 from typing import Any
 
 from flexneedle import __version__
-from flexneedle.cli import emulate, export, insert, plan, report, rig, scenario, study, view
+from flexneedle.cli import emulate, export, insert, plan, report, rig, scenario, serve, study, view
 from flexneedle.console.commands import help_texts
 from flexneedle.errors import FlexneedleError, InputError, ScenarioWarning, StoppedError
 
 _EM = import_module("flexneedle.em.commands.group")  # by name: no other layer imports em
-_COMMANDS = (plan, insert, study, report, view, export, scenario, _EM, rig, emulate)
+_COMMANDS = (plan, insert, serve, study, report, view, export, scenario, _EM, rig, emulate)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -18,13 +18,15 @@ Vector = tuple[float, float, float]
 
 
 class Message(BaseModel):
-    """A message: frozen; unknown keys, NaN and numbers in quotes are refused."""
+    """A message: frozen; unknown keys and NaN are refused."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Request(Message):
-    """What a browser asks for. steering: whether only the client that steers may ask for it."""
+    """What a browser asks for; numbers in quotes are refused. steering: only the client that steers may ask for it."""
+
+    model_config = ConfigDict(strict=True)
 
     steering: ClassVar[bool] = True
 

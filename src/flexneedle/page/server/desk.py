@@ -1,0 +1,287 @@
+"""What becomes of each request, and of clients that come and go."""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from typing import Any, Literal, assert_never
+
+from flexneedle import __version__
+from flexneedle.page import messages as m
+from flexneedle.page.frames import Source
+from flexneedle.page.orders import Do, Kind, Work
+from flexneedle.page.server.catalog import CONTROLLERS, STRATEGIES
+from flexneedle.page.server.folder import RunsFolder
+from flexneedle.page.server.hub import Hub, Outbox
+from flexneedle.page.server.insertion import ConnectedRig, Live
+from flexneedle.page.server.jobs import Jobs
+from flexneedle.page.server.limits import Limits
+from flexneedle.page.server.people import People
+from flexneedle.page.server.refusal import Refusal
+from flexneedle.page.server.session import Session
+from flexneedle.scenario.preset import PRESETS
+
+_SEARCHES: tuple[Kind, ...] = ("plan", "compare", "reach")
+_RESULTS = ("scene", "estimate", "iteration", "plan", "reach")
+_WORK: tuple[Kind, ...] = ("scene", "estimate", *_SEARCHES, "recording")
+_RECORDINGS: dict[bool, tuple[Literal["first", "second"], Source]] = {
+    False: ("first", Source.FIRST),
+    True: ("second", Source.SECOND),
+}
+"""Names and sources of the first and of the second."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What the server is started with. workers: commands of the worker of plans, and of that of insertions."""
+
+    session: Session
+    runs: Path
+    limits: Limits
+    workers: tuple[Sequence[str], Sequence[str]]
+    rig: ConnectedRig | None = None
+
+
+class Desk:
+    """The state of the server, in the thread of its event loop."""
+
+    def __init__(self, setup: Setup) -> None:
+        self.limits, self.hub, self.people = setup.limits, Hub(), People()
+        self.session, self.runs = setup.session, RunsFolder(setup.runs)
+        self._rig = setup.rig
+        numbers, of_plans, of_insertions = count(1), *setup.workers
+        self._plans = Jobs(
+            "plans", of_plans, self.hub, setup.limits, numbers, self._job_ended, lambda _values: None
+        )
+        self.live = Live(self.hub, lambda: self._insertions, setup.limits, setup.rig)
+        self._insertions = Jobs(
+            "insertions", of_insertions, self.hub, setup.limits, numbers, self._job_ended, self.live.note
+        )
+        self._timers = dict[str, asyncio.TimerHandle]()
+        self._watching: asyncio.Task[None] | None = None
+        self._look = asyncio.Event()
+        self._idle = False
+
+    # Start and end
+
+    def start(self) -> None:
+        """Start the workers, and the plan of the first scenario."""
+        for jobs in (self._plans, self._insertions):
+            jobs.worker.start()
+        self.hub.publish(self.people.news())
+        self._begin(self.session)
+        self._order("plan", "plan")
+        self._watching = asyncio.create_task(self._watch_runs())
+
+    def halt(self) -> None:
+        """Stop the insertion, if one runs."""
+        with suppress(Refusal):
+            self.live.stop()
+
+    async def end(self) -> None:
+        """End the workers."""
+        for timer in self._timers.values():
+            timer.cancel()
+        if self._watching is not None:
+            self._watching.cancel()
+        await asyncio.gather(self._plans.worker.end(), self._insertions.worker.end())
+
+    # Clients
+
+    def join(self) -> tuple[int, Outbox]:
+        """A new client: its number, and what it has to get. Raises Refusal if there are too many."""
+        if len(self.people.clients) >= self.limits.clients:
+            raise Refusal(f"{self.limits.clients} pages are connected, which is the limit: close one")
+        client = self.people.join()
+        outbox = self.hub.join(self._welcome(client))
+        self._stop_timer("alone")
+        self._look.set()
+        if self._idle:  # what was cancelled is done again
+            self._idle = False
+            self._order("scene", "scene")
+            self._order("estimate", "estimate")
+        self.hub.publish(self.people.news())
+        return client, outbox
+
+    def _welcome(self, client: int) -> m.Welcome:
+        return m.Welcome(
+            client=client,
+            version=__version__,
+            presets=PRESETS.names(),
+            controllers=CONTROLLERS,
+            strategies=STRATEGIES,
+            rig=None if self._rig is None else self._rig.name,
+        )
+
+    def leave(self, client: int, outbox: Outbox) -> None:
+        """A client is gone."""
+        self.hub.leave(outbox)
+        steered = self.people.steering == client
+        self.people.leave(client)
+        self.hub.publish(self.people.news())
+        if steered:
+            self._nobody_steers("the client that steered is gone")
+        if not self.people.clients:
+            self._start_timer("alone", self.limits.alone_s, self._alone)
+
+    # Requests
+
+    def carry_out(self, client: int, outbox: Outbox, request: m.AnyRequest) -> None:
+        """Carry a request out. Raises Refusal."""
+        if request.steering:
+            self.people.require(client)
+        match request:
+            case m.Steer():
+                self._steer(client, request.take)
+            case m.Edit():
+                self._begin(self.session.edited(request.values))
+            case m.Preset():
+                self._begin(self.session.with_preset(request.name))
+            case m.Load():
+                self._begin(self.session.with_file(request.name, request.text))
+            case m.Options():
+                self._begin(self._with_options(request))
+            case m.Start():
+                self._order("reach" if request.work == "reach" else "plan", request.work)
+            case m.Cancel():
+                self._cancel(request.job)
+            case m.RowsFrom():
+                outbox.rows_from("rows live", request.index)
+            case m.Open():
+                self._open(request)
+            case m.Save():
+                self._save(request.name)
+            case _:
+                self._steer_insertion(request)
+
+    def _steer_insertion(self, request: m.Insert | m.Arm | m.Pace | m.Advance | m.Stop | m.Disturb) -> None:
+        match request:
+            case m.Insert():
+                self._insert(request)
+            case m.Arm():
+                self.live.arm(request.armed)
+            case m.Pace():
+                self.live.set_pace(request.pace)
+            case m.Advance():
+                self.live.advance()
+            case m.Stop():
+                self.live.stop()
+            case m.Disturb():
+                self.live.disturb(request)
+            case _:
+                assert_never(request)
+
+    def _steer(self, client: int, take: bool) -> None:
+        before = self.people.steering
+        self.people.steer(client, take)
+        self.hub.publish(self.people.news())
+        if take:
+            self._stop_timer("lost")
+        elif before == client:
+            self._nobody_steers("the steering was released")
+
+    def _begin(self, session: Session) -> None:
+        """Go on with a changed session: what is computed for the old one is cancelled."""
+        if session.origin is not self.session.origin:  # nothing of another scenario may come after this
+            self.hub.forget_all_of(*_RESULTS)
+            self.hub.forget_frames(Source.SCENE, Source.MANIPULATION, Source.STEERING)
+        self.session = session
+        self.hub.publish(session.news())
+        self.live.disarm("the scenario or an option was changed")
+        self._plans.cancel(*_SEARCHES)
+        self._order("scene", "scene")
+        self._order("estimate", "estimate")
+
+    def _with_options(self, options: m.Options) -> Session:
+        known = [controller["name"] for controller in CONTROLLERS]
+        if options.controller is not None and options.controller not in known:
+            raise Refusal(f"controller = {options.controller}: must be one of {', '.join(known)}")
+        return self.session.with_options(options)
+
+    def _order(self, do: Do, kind: Kind) -> None:
+        self._plans.add(self._work(do, kind))
+
+    def _work(self, do: Do, kind: Kind) -> Work:
+        session = self.session
+        return Work(
+            job=0,
+            do=do,
+            kind=kind,
+            revision=session.revision,
+            name=session.name,
+            scenario=session.scenario.values(),
+            seed=session.seed,
+            strategy=session.strategy,
+            controller=session.controller,
+        )
+
+    def _cancel(self, number: int) -> None:
+        for jobs in (self._plans, self._insertions):
+            if number in jobs.numbers:
+                if jobs is self._insertions and self.live.moves_rig:
+                    raise Refusal("an insertion runs on the rig: stop it instead")
+                jobs.cancel_job(number)
+                return
+        raise Refusal(f"job = {number}: does not run or wait")
+
+    def _insert(self, request: m.Insert) -> None:
+        work = self._work("insert", "insertion").model_copy(update={"paused": request.paused})
+        self.live.start(work, on_rig=request.rig)
+
+    def _open(self, request: m.Open) -> None:
+        of, source = _RECORDINGS[request.second]
+        work = Work(job=0, do="read", kind="recording", name=request.name or "", of=of)
+        if request.name is not None:
+            work = work.model_copy(update={"folder": str(self.runs.run(request.name))})
+        self.hub.forget((f"rows {of}", f"insertion {of}"))
+        self.hub.forget_frames(source)
+        if request.name is None:
+            self.hub.publish(m.Closed(of=of))
+        else:
+            self._plans.add(work)
+
+    def _save(self, name: str) -> None:
+        self.live.require_ended()
+        folder = self.runs.new(name)
+        self._insertions.add(Work(job=0, do="save", kind="save", name=name, folder=str(folder)))
+
+    # What happens by itself
+
+    def _job_ended(self, work: Work, state: str, text: str) -> None:
+        if work.kind == "insertion":
+            self.live.ended(state, text)
+        if work.kind == "save":
+            self._look.set()
+
+    def _nobody_steers(self, why: str) -> None:
+        self.live.disarm(why)
+        self._start_timer("lost", self.limits.lost_s, self.live.lost)
+
+    def _alone(self) -> None:
+        self._idle = True
+        self._plans.cancel(*_WORK)
+        self.live.alone()
+
+    def _start_timer(self, name: str, seconds: float, then: Callable[[], None]) -> None:
+        self._stop_timer(name)
+        self._timers[name] = asyncio.get_running_loop().call_later(seconds, then)
+
+    def _stop_timer(self, name: str) -> None:
+        if name in self._timers:
+            self._timers.pop(name).cancel()
+
+    async def _watch_runs(self) -> None:
+        """Publish the folder of runs whenever it has changed; it is read in a thread, since a disk may be slow."""
+        before: list[dict[str, Any]] | None = None
+        while True:
+            if self.people.clients or before is None:
+                listed = await asyncio.to_thread(self.runs.listed)
+                if listed != before:
+                    before = listed
+                    self.hub.publish(m.Runs(runs=listed))
+            self._look.clear()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(self.limits.runs_s):
+                    await self._look.wait()

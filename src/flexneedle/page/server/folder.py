@@ -1,0 +1,143 @@
+"""The folder of runs: what is in it, and its files for download. A client names a run, never a path."""
+
+import asyncio
+import io
+import json
+import os
+import re
+import sys
+import zipfile
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from flexneedle.page.server.refusal import Refusal
+from flexneedle.page.server.worker import kill_process
+from flexneedle.trace.folder import RUN_FILE
+
+_NAME = re.compile(r"[\w][\w .+-]*")
+_MOST_RUNS = 1_000
+_EXPORT_S = 60.0
+FIGURES = ("insertion.png", "plan.png")
+"""Figures of a run, of which it has one."""
+
+
+class RunsFolder:
+    """The runs in a folder, which need not exist yet."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path.resolve()
+        self._read = dict[str, tuple[tuple[int, int], dict[str, Any]]]()
+
+    def listed(self) -> list[dict[str, Any]]:
+        """Name, kind, summary and time (s since 1970) of each run, the newest first."""
+        found = [(name, stat) for name in self._names() if (stat := self._stat(name)) is not None]
+        found.sort(key=lambda item: item[1].st_mtime, reverse=True)
+        return sorted(
+            (self._entry(name, stat) for name, stat in found[:_MOST_RUNS]),
+            key=lambda entry: float(entry["made"]),
+            reverse=True,
+        )
+
+    def run(self, name: str) -> Path:
+        """The folder of a run. Raises Refusal for a name that is not one of this folder."""
+        if name not in self._names() or self._stat(name) is None:
+            raise Refusal(f"{name!r}: no run of this name in the folder of runs")
+        return self._path / name
+
+    def new(self, name: str) -> Path:
+        """The folder of a run that is to be saved. Raises Refusal if there is something of this name."""
+        if not _NAME.fullmatch(name):
+            raise Refusal(f"{name!r}: must be letters, digits, spaces and any of . _ + -")
+        folder = self._path / name
+        if folder.exists() or folder.is_symlink():
+            raise Refusal(f"{name}: there is already something of this name: choose another")
+        return folder
+
+    def _names(self) -> list[str]:
+        """Names of the folders here; links, which may lead elsewhere, are none."""
+        try:
+            with os.scandir(self._path) as entries:
+                names = [entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
+        except OSError:
+            return []
+        return [name for name in names if _NAME.fullmatch(name)]
+
+    def _stat(self, name: str) -> os.stat_result | None:
+        try:
+            return (self._path / name / RUN_FILE).stat()
+        except OSError:
+            return None
+
+    def _entry(self, name: str, stat: os.stat_result) -> dict[str, Any]:
+        version = (stat.st_mtime_ns, stat.st_size)
+        known = self._read.get(name)
+        if known is None or known[0] != version:
+            known = (version, _entry_of(self._path / name / RUN_FILE, name, stat.st_mtime))
+            self._read[name] = known
+        return known[1]
+
+
+def _entry_of(path: Path, name: str, changed: float) -> dict[str, Any]:
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        kind, made = str(values["kind"]), datetime.fromisoformat(values["timing"]["started"]).timestamp()
+        summary = _summary(values)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        kind, made, summary = "damaged", changed, f"{RUN_FILE} cannot be read"
+    return {"name": name, "kind": kind, "summary": summary, "made": made}
+
+
+def _summary(values: dict[str, Any]) -> str:
+    """One line: title of the scenario, target, how the run ended."""
+    target = values["scenario"]["target"]
+    place = [target.get(key) for key in ("depth_mm", "lateral_mm", "lateral_z_mm")]
+    shown = ", ".join(f"{value:g}" for value in place if value is not None)
+    result, ended = values["result"] or {}, str(values["status"])
+    for key, what in (("true_error_mm", "off"), ("residual_mm", "off by the tracker")):
+        if isinstance(result.get(key), int | float):
+            ended += f", {result[key]:.3f} mm {what}"
+            break
+    return f"{values['scenario']['name']}, target {shown} mm: {ended}"
+
+
+def zipped(folder: Path) -> bytes:
+    """The files of a run as a ZIP archive, in a folder of its name."""
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted(folder.iterdir()):
+            if path.is_file() and not path.is_symlink():
+                archive.write(path, f"{folder.name}/{path.name}")
+    return data.getvalue()
+
+
+async def trace_csv(folder: Path) -> bytes:
+    """The control periods of a run, as `flexneedle export --csv` writes them. Raises Refusal."""
+    return await _command(("export", str(folder), "--csv", "-"))
+
+
+async def replay_html(folder: Path) -> bytes:
+    """The run as one file that replays it, as `flexneedle view --html` writes it. Raises Refusal."""
+    with TemporaryDirectory() as temporary:
+        path = Path(temporary) / "replay.html"
+        await _command(("view", str(folder), "--html", str(path)))
+        return await asyncio.to_thread(path.read_bytes)
+
+
+async def _command(arguments: Sequence[str]) -> bytes:
+    """What a command prints; a process of its own keeps what it imports and computes out of the server."""
+    pipe = asyncio.subprocess.PIPE
+    command = (*("nice", "-n", "10"), *(sys.executable, "-m", "flexneedle"), *arguments)
+    process = await asyncio.create_subprocess_exec(*command, stdout=pipe, stderr=pipe, start_new_session=True)
+    try:
+        async with asyncio.timeout(_EXPORT_S):
+            out, errors = await process.communicate()
+    except TimeoutError:
+        raise Refusal(f"not ready after {_EXPORT_S:g} s") from None
+    finally:
+        kill_process(process)
+    if process.returncode:
+        raise Refusal(errors.decode(errors="replace").strip().removeprefix("flexneedle: "))
+    return out

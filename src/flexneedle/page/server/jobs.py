@@ -1,0 +1,183 @@
+"""Jobs of one worker: those that wait, the one that runs, and what replaces what."""
+
+import asyncio
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from flexneedle.page.channel import Message
+from flexneedle.page.messages import Job as JobNews
+from flexneedle.page.orders import Kind, Signal, Work
+from flexneedle.page.server.hub import Hub
+from flexneedle.page.server.limits import Limits
+from flexneedle.page.server.worker import Worker
+
+_URGENCY: dict[Kind, int] = {"scene": 0, "estimate": 1, "recording": 2, "plan": 3, "compare": 3, "reach": 9}
+_OTHER = 5
+_FINISHED: frozenset[Kind] = frozenset(("scene", "estimate"))
+"""Short ones, which are not cancelled by a newer one: so a target that is dragged has estimates all along."""
+_BACKGROUND: frozenset[Kind] = frozenset(("reach",))
+"""Those that are set back for any other."""
+_ENDS = ("done", "failed", "cancelled")
+
+
+@dataclass(eq=False)
+class Job:
+    """A job. cancelled: whether the worker was asked to cancel it; again: whether it is then to be done again."""
+
+    work: Work
+    cancelled: bool = False
+    again: bool = False
+
+    @property
+    def slot(self) -> tuple[str, str]:
+        """Jobs of the same slot replace each other."""
+        return "plan" if self.work.kind == "compare" else self.work.kind, self.work.of
+
+    @property
+    def urgency(self) -> tuple[int, int]:
+        """By which the next is chosen, the lowest."""
+        return _URGENCY.get(self.work.kind, _OTHER), self.work.job
+
+
+OnEnd = Callable[[Work, str, str], None]
+"""Called with a job, the state in which it has ended, and a line about it."""
+
+
+class Jobs:
+    """The jobs of a worker, which gets one at a time."""
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        hub: Hub,
+        limits: Limits,
+        numbers: Iterator[int],
+        on_end: OnEnd,
+        on_news: Callable[[dict[str, Any]], None],
+    ) -> None:
+        """numbers: of jobs, shared with other workers; on_news: called with each text of the worker but jobs."""
+        self._hub, self._limits, self._numbers = hub, limits, numbers
+        self._on_end, self._on_news = on_end, on_news
+        self._waiting: list[Job] = []
+        self._running: Job | None = None
+        self._deadline: asyncio.TimerHandle | None = None
+        self.worker = Worker(name, command, self._message, self._next, self._ended)
+
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the jobs that run or wait."""
+        return [job.work.job for job in self._all()]
+
+    def runs(self, kind: Kind) -> bool:
+        """Whether a job of a kind runs or waits."""
+        return any(job.work.kind == kind for job in self._all())
+
+    def add(self, work: Work) -> int:
+        """Add a job, with a number that it gets here, and return that. It replaces an older one of its kind."""
+        job = Job(work.model_copy(update={"job": next(self._numbers)}))
+        self._waiting = [other for other in self._waiting if other.slot != job.slot]
+        self._waiting.append(job)
+        self._publish(job, "waiting")
+        running = self._running
+        if running is not None and running.slot == job.slot:
+            if running.work.kind not in _FINISHED:
+                running.again = False
+                self._cancel_running()
+        elif running is not None and running.work.kind in _BACKGROUND and not running.cancelled:
+            running.again = True
+            self._cancel_running()
+        self._next()
+        return job.work.job
+
+    def cancel(self, *kinds: Kind) -> None:
+        """Cancel the jobs of kinds."""
+        for job in [job for job in self._all() if job.work.kind in kinds]:
+            self.cancel_job(job.work.job)
+
+    def cancel_job(self, number: int) -> None:
+        """Cancel a job by number."""
+        for job in [job for job in self._waiting if job.work.job == number]:
+            self._waiting.remove(job)
+            self._finish(job, "cancelled", "")
+        if self._running is not None and self._running.work.job == number:
+            self._running.again = False
+            self._cancel_running()
+
+    def signal(self, kind: Kind, **change: Any) -> bool:
+        """Change the job of a kind, as a `Signal`, if it runs; returns whether it does."""
+        running = self._running
+        if running is None or running.work.kind != kind:
+            return False
+        self.worker.send(Signal(job=running.work.job, **change))
+        return True
+
+    def expect_end(self, seconds: float) -> None:
+        """End the worker if the job that runs has not ended after a time."""
+        if self._deadline is None:
+            self._deadline = asyncio.get_running_loop().call_later(seconds, self.worker.kill)
+
+    def _all(self) -> list[Job]:
+        return [*self._waiting, *(() if self._running is None else (self._running,))]
+
+    def _cancel_running(self) -> None:
+        if self._running is not None and not self._running.cancelled:
+            self._running.cancelled = True
+            self.signal(self._running.work.kind, cancel=True)
+            self.expect_end(self._limits.cancel_s)
+
+    def _next(self) -> None:
+        if self._running is None and self._waiting and self.worker.ready:
+            self._running = min(self._waiting, key=lambda job: job.urgency)
+            self._waiting.remove(self._running)
+            self._publish(self._running, "running")
+            self.worker.send(self._running.work)
+
+    def _message(self, message: Message, values: dict[str, Any] | None) -> None:
+        if values is None or values["type"] != "job":
+            self._hub.hand_on(message, values)
+            if values is not None:
+                self._on_news(values)
+            return
+        running = self._running
+        if running is None or values["job"] != running.work.job:
+            return
+        if values["state"] not in _ENDS:
+            self._hub.hand_on(message, values)
+            return
+        self._over(running, values["state"], values.get("text", ""))
+
+    def _ended(self, status: int) -> None:
+        """The process has ended: so has its job, or all if it was never ready."""
+        text = f"the worker has ended (exit status {status}) and is started again"
+        if self._running is None:  # it was never ready
+            failed, self._waiting = self._waiting, []
+            for job in failed:
+                self._finish(job, "failed", text)
+        elif self._running.cancelled:
+            self._over(self._running, "cancelled", "")
+        else:
+            self._over(self._running, "failed", text)
+
+    def _over(self, job: Job, state: str, text: str) -> None:
+        self._running = None
+        if self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
+        if job.again and state == "cancelled":
+            again = Job(job.work)
+            self._waiting.append(again)
+            self._publish(again, "waiting")
+        else:
+            self._finish(job, state, text)
+        self._next()
+
+    def _finish(self, job: Job, state: str, text: str) -> None:
+        if not any(other.work.kind == job.work.kind for other in self._waiting):  # whose state is newer
+            self._publish(job, state, text)
+        self._on_end(job.work, state, text)
+
+    def _publish(self, job: Job, state: str, text: str = "") -> None:
+        values = {"job": job.work.job, "kind": job.work.kind, "state": state, "text": text}
+        self._hub.publish(JobNews.model_validate(values))

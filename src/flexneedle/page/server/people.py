@@ -1,0 +1,42 @@
+"""Who is connected, and who of them steers."""
+
+from flexneedle.page.messages import People as PeopleNews
+from flexneedle.page.server.refusal import Refusal
+
+
+class People:
+    """Clients by number; at most one of them steers."""
+
+    def __init__(self) -> None:
+        self.clients = set[int]()
+        self.steering: int | None = None
+        self._last = 0
+
+    def join(self) -> int:
+        """The number of a new client."""
+        self._last += 1
+        self.clients.add(self._last)
+        return self._last
+
+    def leave(self, client: int) -> None:
+        """A client is gone, and its steering with it."""
+        self.clients.discard(client)
+        if self.steering == client:
+            self.steering = None
+
+    def steer(self, client: int, take: bool) -> None:
+        """Take or release the steering. Raises Refusal if another client steers."""
+        if self.steering not in (None, client):
+            raise Refusal(f"client {self.steering} steers: it must release the steering first")
+        self.steering = client if take else None
+
+    def require(self, client: int) -> None:
+        """Raise Refusal unless a client steers."""
+        if self.steering is None:
+            raise Refusal("nobody steers: take the steering first")
+        if self.steering != client:
+            raise Refusal(f"client {self.steering} steers: ask for the steering first")
+
+    def news(self) -> PeopleNews:
+        """Who is here."""
+        return PeopleNews(clients=len(self.clients), steering=self.steering)

@@ -1,0 +1,106 @@
+"""The session that all clients share: scenario, seed, strategy, controller."""
+
+import re
+import tomllib
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from flexneedle.errors import ScenarioError, ScenarioWarning
+from flexneedle.page.messages import Options, Strategy
+from flexneedle.page.messages import Session as SessionNews
+from flexneedle.page.server.refusal import Refusal
+from flexneedle.scenario.dotted import split_key
+from flexneedle.scenario.files import load_scenario
+from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.plausible import doubts
+from flexneedle.scenario.preset import PRESETS, WORLD
+from flexneedle.scenario.problems import printable
+
+_LINE = re.compile(r"(?P<key>[^\s=:]+)(?: = .*?)?: (?P<rule>.*)")
+
+
+@dataclass(frozen=True)
+class Session:
+    """A scenario with options. origin: that it began with; notes: warnings of its file; revision: number of changes."""
+
+    name: str
+    origin: Scenario
+    scenario: Scenario
+    controller: str
+    seed: int = 0
+    strategy: Strategy = "manipulation"
+    revision: int = 1
+    notes: tuple[str, ...] = field(default=())
+
+    @classmethod
+    def of(cls, name: str, scenario: Scenario, controller: str) -> "Session":
+        """A new session of a scenario."""
+        return cls(name, scenario, scenario, controller)
+
+    def edited(self, values: Mapping[str, Any]) -> "Session":
+        """The session with values of the scenario changed by key. Raises Refusal with the problems by key."""
+        with _refused():
+            return replace(self, scenario=self.scenario.with_values(values), revision=self.revision + 1)
+
+    def with_preset(self, name: str) -> "Session":
+        """The session with a scenario of the package. Raises Refusal."""
+        if name not in PRESETS.names() and not name.startswith(WORLD):
+            choices = ", ".join(PRESETS.names())
+            raise Refusal(f"preset = {name}: must be one of {choices}, or {WORLD}NUMBER")
+        with _refused():
+            return self._begun(name, load_scenario(name), ())
+
+    def with_file(self, name: str, text: str) -> "Session":
+        """The session with the scenario of a file's text (TOML). Raises Refusal with the problems by key."""
+        try:
+            values = tomllib.loads(text)
+        except RecursionError:
+            raise Refusal(f"{name}: not TOML: nested too deeply") from None
+        except ValueError as error:
+            raise Refusal(f"{name}: not TOML: {printable(str(error))}") from None
+        with warnings.catch_warnings(record=True) as caught, _refused():
+            warnings.simplefilter("always", ScenarioWarning)
+            scenario = Scenario.from_values(values)
+        return self._begun(name, scenario, tuple(str(warning.message) for warning in caught))
+
+    def with_options(self, options: Options) -> "Session":
+        """The session with the options that are set."""
+        chosen = options.model_dump(include={"seed", "strategy", "controller"}, exclude_none=True)
+        return replace(self, revision=self.revision + 1, **chosen)
+
+    def news(self) -> SessionNews:
+        """The session as clients get it."""
+        values, before = self.scenario.flat(), self.origin.flat()
+        return SessionNews(
+            revision=self.revision,
+            name=self.name,
+            values=values,
+            changed=[key for key in before | values if before.get(key) != values.get(key)],
+            doubts=[*self.notes, *doubts(self.scenario)],
+            seed=self.seed,
+            strategy=self.strategy,
+            controller=self.controller,
+        )
+
+    def _begun(self, name: str, scenario: Scenario, notes: tuple[str, ...]) -> "Session":
+        return replace(
+            self, name=name, origin=scenario, scenario=scenario, notes=notes, revision=self.revision + 1
+        )
+
+
+@contextmanager
+def _refused() -> Iterator[None]:
+    try:
+        yield
+    except ScenarioError as error:
+        problems = dict(_by_key(line) for line in reversed(error.problems))
+        raise Refusal("; ".join(error.problems), problems) from None
+
+
+def _by_key(line: str) -> tuple[str, str]:
+    """Dotted key and rule of a problem's line; the key of a line that has none is ""."""
+    found = _LINE.fullmatch(line)
+    return (".".join(map(str, split_key(found["key"]))), found["rule"]) if found else ("", line)

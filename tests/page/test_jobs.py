@@ -1,0 +1,150 @@
+"""Jobs over a real worker's process: what replaces what, and what happens when the worker does not do as it should."""
+
+import sys
+from dataclasses import replace
+
+import pytest
+
+from page_clients import QUICK, STUB, Client, served
+from page_worker import CRASHES, HANGS, WORKS_ON
+
+
+@pytest.fixture
+def planned(client):
+    """A client whose server has nothing to do any more."""
+    client.job("plan", "done")
+    return client
+
+
+def start(client, seed, work="plan"):
+    """Start work with a seed, which the worker carries out or not."""
+    client.do("options", seed=seed)
+    client.do("start", work=work)
+    return client.wait(lambda: running_number(client, work))
+
+
+def running_number(client, kind):
+    job = client.newest.get(f"job {kind}", {"state": ""})
+    return job["job"] if job["state"] == "running" else None
+
+
+def test_a_newer_plan_replaces_the_one_that_runs(planned):
+    older = start(planned, WORKS_ON)
+    planned.do("start", work="plan")
+    planned.wait(lambda: (running_number(planned, "plan") or 0) > older)
+
+
+def test_a_comparison_replaces_a_plan(planned):
+    start(planned, WORKS_ON)
+    planned.do("start", work="compare")
+    planned.job("plan", "cancelled")
+    planned.job("compare", "running")
+
+
+def test_an_edit_cancels_what_is_searched_for_the_old_scenario(planned):
+    start(planned, WORKS_ON)
+    planned.do("edit", values={"target.depth_mm": 35.0})
+    planned.job("plan", "cancelled")
+    planned.wait(lambda: planned.newest["estimate"]["revision"] == 3)
+
+
+def test_a_plan_sets_the_reach_back_which_is_then_done(planned):
+    planned.do("start", work="reach")
+    reach = planned.job("reach", "running")["job"]
+    planned.do("start", work="plan")
+    planned.job("plan", "done")
+    assert planned.job("reach", "running")["job"] == reach
+
+
+def test_a_worker_that_does_not_cancel_is_ended_and_the_next_order_carried_out(planned):
+    number = start(planned, HANGS)
+    planned.do("cancel", job=number)
+    planned.job("plan", "cancelled")
+    start_again(planned)
+
+
+def test_a_worker_that_has_ended_is_started_again(planned):
+    planned.do("options", seed=CRASHES)
+    planned.do("start", work="plan")
+    text = planned.job("plan", "failed")["text"]
+    assert text == "the worker has ended (exit status 3) and is started again"
+    start_again(planned)
+
+
+def start_again(client):
+    client.do("options", seed=0)
+    client.do("start", work="plan")
+    client.job("plan", "done")
+
+
+def test_an_insertion_whose_worker_ends_has_failed(tmp_path):
+    """Without an end of the insertion from its worker, the server reports it; plans are not affected."""
+    with served(tmp_path) as server, Client(server) as client:
+        client.steer().do("insert", paused=True)
+        client.wait(lambda: client.newest.get("insertion live", {}).get("state") == "paused")
+        server.desk._insertions.worker.kill()
+        client.wait(lambda: client.newest["insertion live"]["state"] == "failed")
+        assert "has ended" in client.newest["insertion live"]["summary"]
+        client.job("insertion", "failed")
+        client.do("start", work="plan")
+        client.do("insert", paused=True)
+        client.wait(lambda: client.newest["insertion live"]["state"] == "paused")
+
+
+def broken(script):
+    return (sys.executable, "-c", script)
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        "import sys; sys.exit(7)",
+        "import sys; sys.stdout.buffer.write(b'\\0\\0\\0\\0'); sys.stdout.flush(); input()",
+        "print('this is no message', flush=True); input()",
+        "import sys; sys.stdout.buffer.write(b'\\2\\0\\0\\0{}'); sys.stdout.flush(); input()",
+        "import sys; sys.stdout.buffer.write(b'\\2\\0\\0\\0{x'); sys.stdout.flush(); input()",
+        "import sys; sys.stdout.buffer.write(b'\\1\\0\\0\\0\\1'); sys.stdout.flush(); input()",
+    ],
+)
+def test_a_broken_worker_fails_its_jobs_and_the_server_stays(tmp_path, script):
+    with served(tmp_path, workers=(broken(script), STUB)) as server, Client(server) as client:
+        client.wait(lambda: client.newest.get("job scene", {}).get("state") == "failed")
+        client.steer().do("edit", values={"target.depth_mm": 35.0})
+
+
+def test_work_is_cancelled_when_nobody_is_connected_and_done_again(server):
+    with Client(server) as client:
+        client.job("plan", "done")
+        client.steer().do("start", work="reach")
+        client.job("reach", "running")
+        client.do("insert", paused=True)
+        client.wait(lambda: "insertion live" in client.newest)
+        client.do("edit", values={"target.depth_mm": 35.0})
+        client.do("start", work="reach")
+        client.job("reach", "running")
+    wait_until_alone(server)
+    with Client(server) as client:
+        client.job("reach", "cancelled")
+        client.job("insertion", "cancelled")
+        assert client.newest["insertion live"]["state"] == "interrupted"
+        client.job("scene", "done")
+
+
+def wait_until_alone(server):
+    """Wait for the timer that cancels; the server's thread has no other event to wait for."""
+    from threading import Event
+    from time import monotonic
+
+    end = monotonic() + 10.0
+    while (server.desk._plans.numbers or server.desk._insertions.numbers) and monotonic() < end:
+        Event().wait(0.01)
+
+
+def test_a_page_that_is_loaded_again_keeps_the_work(tmp_path):
+    with served(tmp_path, limits=replace(QUICK, alone_s=60.0)) as server:
+        with Client(server) as client:
+            client.job("plan", "done")
+            client.steer().do("start", work="reach")
+            job = client.job("reach", "running")["job"]
+        with Client(server) as client:
+            assert client.job("reach", "running")["job"] == job

@@ -1,0 +1,337 @@
+"""Each request over a real socket: what it does, and why it is refused."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from flexneedle.page import messages as m
+from flexneedle.page.server.insertion import ConnectedRig
+from flexneedle.scenario.files import dump_scenario, load_scenario
+from page_clients import QUICK, Client, get, served
+from page_worker import ROWS
+
+
+def test_a_client_is_welcomed_with_what_can_be_chosen(server):
+    with Client(server) as client:
+        welcome = client.newest["welcome"]
+        assert welcome["presets"] == ["phantom", "phantom3d"]
+        assert welcome["controllers"][0]["name"] == "adaptive-mpc"
+        assert welcome["strategies"] == ["manipulation", "steering"]
+        assert welcome["rig"] is None
+        assert client.newest["people"] == {"type": "people", "clients": 1, "steering": None}
+
+
+def test_the_first_plan_is_made_before_anybody_asks(server):
+    with Client(server) as client:
+        client.job("plan", "done")
+        assert client.newest["plan manipulation"]["revision"] == 1
+        assert client.newest["scene"]["revision"] == 1
+        assert client.newest["estimate"]["revision"] == 1
+
+
+def test_steering_is_taken_and_released(server):
+    with Client(server) as client:
+        client.do("steer", take=True)
+        client.wait(lambda: client.newest["people"]["steering"] == client.number)
+        client.do("steer", take=False)
+        client.wait(lambda: client.newest["people"]["steering"] is None)
+
+
+STEERED = {
+    "edit": {"values": {"target.depth_mm": 35.0}},
+    "preset": {"name": "phantom3d"},
+    "load": {"name": "mine", "text": ""},
+    "options": {"seed": 3},
+    "start": {"work": "plan"},
+    "cancel": {"job": 1},
+    "insert": {},
+    "arm": {"armed": True},
+    "pace": {"pace": 1.0},
+    "advance": {},
+    "disturb": {"what": "drop", "size": 1.0},
+    "open": {"name": None},
+    "save": {"name": "mine"},
+}
+
+
+@pytest.mark.parametrize("request_", STEERED)
+def test_only_the_client_that_steers_may_ask_for_it(shared_server, request_):
+    with Client(shared_server) as one, Client(shared_server) as other:
+        assert one.refused(request_, **STEERED[request_]) == "nobody steers: take the steering first"
+        other.steer()
+        reason = f"client {other.number} steers: ask for the steering first"
+        assert one.refused(request_, **STEERED[request_]) == reason
+        other.do("steer", take=False)
+
+
+def test_all_requests_but_three_need_the_steering():
+    free = {request for request in m.Request.__subclasses__() if not request.steering}
+    assert free == {m.Steer, m.Stop, m.RowsFrom}
+    assert len(STEERED) + len(free) == len(m.Request.__subclasses__())
+
+
+def test_an_edit_is_seen_by_all_and_computed(server, client):
+    with Client(server) as other:
+        client.do("edit", values={"target.depth_mm": 35.0})
+        for each in (client, other):
+            each.wait(lambda each=each: each.newest.get("scene", {}).get("revision") == 2)
+            each.wait(lambda each=each: each.newest.get("estimate", {}).get("revision") == 2)
+            assert each.newest["scene"]["target"] == 35.0
+            assert each.newest["session"]["values"]["target.depth_mm"] == 35.0
+            assert each.newest["session"]["changed"] == ["target.depth_mm"]
+        assert "depth_mm = 35.0" in get(server, "/scenario.toml")[1]
+
+
+def test_a_wrong_edit_is_refused_with_its_problems_and_changes_nothing(client):
+    answer = client.ask("edit", values={"target.depth_mm": 35.0, "tissue.0.alpha": "x"})
+    assert answer["problems"] == {"tissue.0.alpha": "must be a number"}
+    assert answer["reason"] == 'tissue[0].alpha = "x": must be a number'
+    client.do("options", seed=3)
+    client.wait(lambda: client.newest["session"]["revision"] == 2)
+    assert client.newest["session"]["changed"] == []
+
+
+def test_a_preset_and_a_file_begin_anew(client):
+    client.do("preset", name="phantom3d")
+    client.wait(lambda: client.newest["session"]["name"] == "phantom3d")
+    client.do("load", name="mine.toml", text=dump_scenario(load_scenario("phantom")))
+    client.wait(lambda: client.newest["session"]["name"] == "mine.toml")
+    assert client.newest["session"]["values"]["name"] == load_scenario("phantom").name
+
+
+def test_another_scenario_forgets_what_was_computed(server, client):
+    client.job("plan", "done")
+    client.do("preset", name="phantom3d")
+    client.wait(lambda: client.newest["estimate"]["revision"] == 2)
+    with Client(server) as other:
+        other.job("estimate", "done")
+        assert "plan manipulation" not in other.newest
+        assert other.newest["scene"]["revision"] == 2
+
+
+def test_what_is_no_preset_or_file_is_refused(client):
+    assert client.refused("preset", name="nonsense").startswith("preset = nonsense: must be one of phantom, ")
+    assert client.refused("load", name="x", text="[").startswith("x: not TOML: ")
+    assert client.ask("load", name="x", text="needle = 1")["problems"]["needle"] == "must be a table"
+
+
+def test_options_are_kept_and_checked(client):
+    client.do("options", seed=3, strategy="steering", controller="ce-mpc")
+    client.wait(lambda: client.newest["session"]["controller"] == "ce-mpc")
+    client.do("start", work="plan")
+    client.wait(lambda: client.newest.get("plan steering", {}).get("seed") == 3)
+    reason = client.refused("options", controller="nonsense")
+    assert reason.startswith("controller = nonsense: must be one of adaptive-mpc, ")
+
+
+def test_work_is_started_and_cancelled(client):
+    client.do("start", work="reach")
+    job = client.job("reach", "running")["job"]
+    client.do("cancel", job=job)
+    client.job("reach", "cancelled")
+    assert client.refused("cancel", job=job) == f"job = {job}: does not run or wait"
+
+
+def summary(client):
+    """What the worker of insertions has got last."""
+    return json.loads(client.newest["insertion live"]["summary"])
+
+
+def running(client, **options):
+    client.do("insert", **options)
+    state = "paused" if options.get("paused") else "running"
+    client.wait(lambda: client.newest.get("insertion live", {}).get("state") == state)
+
+
+def test_an_insertion_gets_the_session(client):
+    client.do("edit", values={"target.depth_mm": 35.0})
+    client.do("options", seed=3, strategy="steering", controller="ce-mpc")
+    running(client, paused=True)
+    order = summary(client)
+    assert order["scenario"]["target"]["depth_mm"] == 35.0
+    assert [order[key] for key in ("do", "seed", "strategy", "controller", "paused", "revision", "name")] == [
+        *("insert", 3, "steering", "ce-mpc", True),
+        *(3, "phantom"),
+    ]
+    assert "rig" not in order
+
+
+def test_an_insertion_is_paced_and_disturbed(client):
+    running(client, paused=True)
+    client.do("advance")
+    client.wait(lambda: len(client.rows.get("live", ())) == 1)
+    client.do("disturb", what="push", size=0.5, angle_deg=90.0)
+    client.wait(lambda: "disturb" in summary(client))
+    assert summary(client)["disturb"] == {"type": "disturb", "what": "push", "size": 0.5, "angle_deg": 90.0}
+    client.do("pace", pace=4.0)
+    client.wait(lambda: summary(client).get("pace") == 4.0)
+    assert client.refused("advance") == "the insertion is not paused: pause it first"
+    client.do("pace", pace=0.0)
+    client.do("advance")
+    client.wait(lambda: len(client.rows["live"]) == 2)
+
+
+def test_without_an_insertion_nothing_can_be_done_to_it(client):
+    reason = "no insertion runs: start one first"
+    assert client.refused("pace", pace=1.0) == reason
+    assert client.refused("advance") == reason
+    assert client.refused("stop") == reason
+    assert client.refused("disturb", what="drop", size=1.0) == reason
+    assert client.refused("save", name="mine") == "there is no insertion to save: start one first"
+
+
+def test_a_layer_that_is_not_there_is_not_stiffened(client):
+    running(client, paused=True)
+    reason = client.refused("disturb", what="stiffen", size=2.0, layer=2)
+    assert reason == "layer = 2: must be below 2, the number of layers"
+    client.do("disturb", what="stiffen", size=2.0, layer=1)
+
+
+def test_anybody_may_stop(server, client):
+    running(client)
+    with Client(server) as other:
+        other.do("stop")
+        other.wait(lambda: other.newest.get("insertion live", {}).get("state") == "interrupted")
+    client.job("insertion", "done")
+    assert client.refused("stop") == "no insertion runs: start one first"
+
+
+def test_a_newer_virtual_insertion_replaces_the_older(client):
+    running(client, paused=True)
+    first = client.newest["job insertion"]["job"]
+    client.do("insert", paused=True)
+    client.wait(lambda: client.newest["job insertion"]["job"] > first)
+    client.job("insertion", "running")
+
+
+def test_rows_are_filled_up_on_request(client):
+    running(client)
+    client.wait(lambda: len(client.rows.get("live", ())) == ROWS)
+    client.rows["live"][100:] = []
+    client.do("rows_from", index=100)
+    client.wait(lambda: len(client.rows["live"]) == ROWS)
+    assert [row["index"] for row in client.rows["live"]] == list(range(ROWS))
+
+
+def test_without_a_rig_none_is_armed(client):
+    reason = "no rig is connected: start flexneedle serve with --rig FILE"
+    assert client.refused("arm", armed=True) == reason
+    assert client.refused("insert", rig=True) == reason
+
+
+RIG = ConnectedRig("Bench", "bench.toml")
+
+
+@pytest.fixture
+def rig_server(tmp_path):
+    with served(tmp_path, rig=RIG) as server:
+        yield server
+
+
+@pytest.fixture
+def rig_client(rig_server):
+    with Client(rig_server) as client:
+        yield client.steer()
+
+
+def rig_is(client, state, why=None):
+    client.wait(lambda: client.newest["rig"]["state"] == state)
+    assert why is None or client.newest["rig"]["why"] == why
+    return True
+
+
+def test_a_rig_is_armed_for_one_insertion(rig_client):
+    client = rig_client
+    assert client.newest["welcome"]["rig"] == "Bench"
+    assert client.refused("insert", rig=True) == "Bench is not armed: arm it first"
+    client.do("arm", armed=True)
+    client.wait(lambda: client.newest["rig"]["armed"])
+    running(client, rig=True)
+    assert summary(client)["rig"] == "bench.toml"
+    assert not client.newest["rig"]["armed"]
+    assert rig_is(client, "inserting")
+    assert client.refused("insert", rig=True) == "an insertion runs on the rig: stop it first"
+    assert client.refused("insert") == "an insertion runs on the rig: stop it first"
+    assert client.refused("arm", armed=True).startswith("an insertion runs on the rig")
+    client.do("stop")
+    assert rig_is(client, "idle")
+    assert client.refused("insert", rig=True) == "Bench is not armed: arm it first"
+
+
+def test_an_armed_rig_is_still_not_used_for_a_virtual_insertion(rig_client):
+    rig_client.do("arm", armed=True)
+    running(rig_client)
+    assert "rig" not in summary(rig_client)
+    assert not rig_client.newest["rig"]["armed"]
+
+
+@pytest.mark.parametrize(
+    ("request_", "values", "why"),
+    [
+        ("edit", {"values": {"target.depth_mm": 35.0}}, "the scenario or an option was changed"),
+        ("options", {"seed": 3}, "the scenario or an option was changed"),
+        ("steer", {"take": False}, "the steering was released"),
+        ("arm", {"armed": False}, ""),
+    ],
+)
+def test_a_rig_is_disarmed(rig_client, request_, values, why):
+    rig_client.do("arm", armed=True)
+    rig_client.wait(lambda: rig_client.newest["rig"]["armed"])
+    rig_client.do(request_, **values)
+    rig_client.wait(lambda: not rig_client.newest["rig"]["armed"])
+    assert rig_client.newest["rig"]["why"] == why
+
+
+def test_a_rig_is_held_and_goes_on_but_has_no_other_pace(rig_client):
+    rig_client.do("arm", armed=True)
+    running(rig_client, rig=True)
+    assert rig_client.refused("pace", pace=2.0) == "pace = 2: must be 0 (hold) or 1 on a rig"
+    rig_client.do("pace", pace=0.0)
+    assert rig_is(rig_client, "held")
+    rig_client.wait(lambda: summary(rig_client).get("pace") == 0.0)
+    rig_client.do("pace", pace=1.0)
+    assert rig_is(rig_client, "inserting")
+
+
+def test_a_rig_is_not_disturbed(rig_client):
+    rig_client.do("arm", armed=True)
+    running(rig_client, rig=True)
+    reason = "an insertion runs on the rig: disturbances are for virtual insertions"
+    assert rig_client.refused("disturb", what="push", size=1.0) == reason
+    job = rig_client.newest["job insertion"]["job"]
+    assert rig_client.refused("cancel", job=job) == "an insertion runs on the rig: stop it instead"
+    assert rig_client.refused("advance").startswith("an insertion runs on the rig")
+
+
+def test_a_rig_is_held_when_the_steering_client_is_lost(rig_server):
+    with Client(rig_server) as watcher:
+        with Client(rig_server) as client:
+            client.steer().do("arm", armed=True)
+            running(client, rig=True)
+        assert rig_is(watcher, "held", why="nobody steers")
+        watcher.wait(lambda: summary(watcher).get("pace") == 0.0)
+        watcher.wait(lambda: watcher.newest["people"]["steering"] is None)
+        watcher.steer().do("pace", pace=1.0)
+        assert rig_is(watcher, "inserting")
+        watcher.do("steer", take=False)
+        assert rig_is(watcher, "held")
+
+
+def test_a_rig_is_not_held_when_the_steering_is_taken_again(tmp_path):
+    with served(tmp_path, rig=RIG, limits=replace(QUICK, lost_s=60.0)) as server, Client(server) as client:
+        client.steer().do("arm", armed=True)
+        running(client, rig=True)
+        client.do("steer", take=False)
+        assert "lost" in server.desk._timers
+        client.steer()
+        assert "lost" not in server.desk._timers
+        assert rig_is(client, "inserting")
+
+
+def test_a_rig_is_disarmed_when_the_steering_client_is_lost(rig_server):
+    with Client(rig_server) as watcher:
+        with Client(rig_server) as client:
+            client.steer().do("arm", armed=True)
+        watcher.wait(lambda: watcher.newest["rig"]["why"] == "the client that steered is gone")
+        assert not watcher.newest["rig"]["armed"]

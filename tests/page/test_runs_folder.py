@@ -1,0 +1,230 @@
+"""Recorded runs: what is listed, opened, saved and downloaded, and that nothing else is."""
+
+import io
+import json
+import zipfile
+from contextlib import contextmanager
+from http.client import HTTPConnection
+
+import pytest
+
+from flexneedle.page.server import app
+from flexneedle.page.server.folder import RunsFolder, zipped
+from flexneedle.page.server.refusal import Refusal
+from page_clients import Client, get, port_of
+from page_worker import ROWS
+
+RUN = {
+    "kind": "insertion",
+    "status": "done",
+    "result": {"true_error_mm": 0.0161},
+    "scenario": {"name": "Phantom", "target": {"depth_mm": 40.0, "lateral_mm": 5.0}},
+    "timing": {"started": "2026-01-01T12:00:00Z"},
+}
+
+
+def write_run(folder, started="2026-01-01T12:00:00Z", **values):
+    folder.mkdir(parents=True)
+    text = json.dumps(RUN | {"timing": {"started": started}} | values)
+    (folder / "run.json").write_text(text)
+    return folder
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """A folder of runs, beside which is something that nobody may read."""
+    write_run(tmp_path / "runs" / "older", "2026-01-01T12:00:00Z")
+    write_run(tmp_path / "runs" / "newer", "2026-01-02T12:00:00Z", result=None, status="failed")
+    write_run(tmp_path / "secret")
+    (tmp_path / "runs" / "link").symlink_to(tmp_path / "secret")
+    (tmp_path / "runs" / "no run").mkdir()
+    (tmp_path / "runs" / "file").write_text("")
+    return tmp_path / "runs"
+
+
+def test_runs_are_listed_newest_first(runs):
+    assert RunsFolder(runs).listed() == [
+        {
+            "name": "newer",
+            "kind": "insertion",
+            "summary": "Phantom, target 40, 5 mm: failed",
+            "made": 1767355200.0,
+        },
+        {
+            "name": "older",
+            "kind": "insertion",
+            "summary": "Phantom, target 40, 5 mm: done, 0.016 mm off",
+            "made": 1767268800.0,
+        },
+    ]
+
+
+def test_a_run_that_has_changed_is_read_again(runs):
+    folder = RunsFolder(runs)
+    folder.listed()
+    text = json.dumps(RUN | {"status": "held"})
+    (runs / "older" / "run.json").write_text(text)
+    assert "held" in folder.listed()[1]["summary"]
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"kind": 3}', "\udcff"])
+def test_a_damaged_run_is_listed_as_that(runs, text):
+    (runs / "older" / "run.json").write_bytes(text.encode("utf-8", "surrogateescape"))
+    (entry,) = (entry for entry in RunsFolder(runs).listed() if entry["name"] == "older")
+    assert (entry["kind"], entry["summary"]) == ("damaged", "run.json cannot be read")
+
+
+def test_without_a_folder_there_are_no_runs(tmp_path):
+    assert RunsFolder(tmp_path / "none").listed() == []
+
+
+NO_RUNS = [
+    *("nonsense", "..", ".", "", "link", "no run", "file", "../secret", "older/../../secret"),
+    *("/etc", "older/", "older\0", "OLDER", "~", "older/run.json", "..%2fsecret", "\\..\\secret", "a" * 200),
+]
+
+
+@pytest.mark.parametrize("name", NO_RUNS)
+def test_no_other_name_is_a_run(runs, name):
+    with pytest.raises(Refusal, match="no run of this name"):
+        RunsFolder(runs).run(name)
+
+
+@pytest.mark.parametrize("name", ["..", "../x", "a/b", ".hidden", "", "a\0", "-rf", "a\nb"])
+def test_no_other_name_is_one_to_save_under(runs, name):
+    with pytest.raises(Refusal, match="must be letters"):
+        RunsFolder(runs).new(name)
+
+
+@pytest.mark.parametrize("name", ["older", "link", "file"])
+def test_nothing_is_overwritten(runs, name):
+    with pytest.raises(Refusal, match="already something of this name"):
+        RunsFolder(runs).new(name)
+
+
+def test_an_archive_has_the_files_of_the_run_alone(runs):
+    (runs / "older" / "trace.mcap").write_bytes(b"trace")
+    (runs / "older" / "elsewhere").symlink_to(runs.parent / "secret" / "run.json")
+    with zipfile.ZipFile(io.BytesIO(zipped(runs / "older"))) as archive:
+        assert archive.namelist() == ["older/run.json", "older/trace.mcap"]
+        assert archive.read("older/trace.mcap") == b"trace"
+
+
+# Over sockets: tmp_path / "runs" is the server's folder
+
+
+def test_clients_get_the_runs_and_new_ones(runs, client):
+    client.wait(lambda: [run["name"] for run in client.newest["runs"]["runs"]] == ["newer", "older"])
+    write_run(runs / "newest", "2026-01-03T12:00:00Z")
+    client.wait(lambda: client.newest["runs"]["runs"][0]["name"] == "newest")
+
+
+def test_a_run_is_opened_and_closed(runs, server, client):
+    client.do("open", name="older")
+    client.wait(lambda: len(client.rows.get("first", ())) == ROWS and "frame 2 1" in client.newest)
+    assert client.newest["insertion first"]["summary"] == str(runs / "older")
+    client.do("open", name="newer", second=True)
+    client.wait(lambda: len(client.rows.get("second", ())) == ROWS and "frame 3 1" in client.newest)
+    client.do("open", name=None)
+    assert client.wait(lambda: client.newest.get("closed")) == {"type": "closed", "of": "first"}
+    with Client(server) as other:
+        other.wait(lambda: "insertion second" in other.newest and len(other.rows.get("second", ())) == ROWS)
+        assert "frame 2 1" not in other.newest
+        assert "first" not in other.rows
+
+
+@pytest.mark.usefixtures("runs")
+@pytest.mark.parametrize("name", [name for name in NO_RUNS if name])
+def test_what_is_no_run_is_not_opened(client, name):
+    assert client.refused("open", name=name) == f"{name!r}: no run of this name in the folder of runs"
+
+
+def test_the_last_insertion_is_saved(runs, client):
+    client.do("insert")
+    client.wait(lambda: "insertion live" in client.newest)
+    assert client.refused("save", name="mine") == "the insertion runs: it can be saved when it has ended"
+    client.do("stop")
+    client.job("insertion", "done")
+    client.do("save", name="mine")
+    client.job("save", "done")
+    assert (runs / "mine" / "run.json").exists()
+    client.wait(lambda: any(run["name"] == "mine" for run in client.newest["runs"]["runs"]))
+    assert client.refused("save", name="mine").startswith("mine: there is already something of this name")
+
+
+def test_files_of_a_run_are_downloaded(runs, server):
+    (runs / "older" / "insertion.png").write_bytes(b"\x89PNG")
+    status, _text, headers = get(server, "/runs/older/figure.png")
+    assert (status, headers["content-type"]) == (200, "image/png")
+    status, _text, headers = get(server, "/runs/older/run.zip")
+    assert (status, headers["content-disposition"]) == (200, 'attachment; filename="older-run.zip"')
+    assert get(server, "/runs/newer/figure.png")[:2] == (
+        404,
+        "the run has no figure: flexneedle view draws it\n",
+    )
+
+
+@pytest.mark.usefixtures("runs")
+def test_a_file_that_is_none_of_the_four_is_refused(server):
+    choices = "'run.json': must be one of figure.png, trace.csv, run.zip, replay.html\n"
+    assert get(server, "/runs/older/run.json")[:2] == (404, choices)
+
+
+@pytest.mark.usefixtures("runs")
+def test_what_a_command_refuses_is_the_reason(server):
+    """The run here has no trace: `flexneedle export` says so."""
+    status, text, _headers = get(server, "/runs/older/trace.csv")
+    assert status == 404
+    assert "older" in text
+    assert "Traceback" not in text
+
+
+def test_two_downloads_are_made_at_once_and_no_more(runs, server):
+    downloads = app.Downloads(server.desk)
+    downloads._busy = 2
+    with pytest.raises(Refusal, match="two downloads are being made"):
+        downloads._one_at_a_time(None, runs).send(None)
+
+
+PATHS = [
+    "/runs/../secret/run.zip",
+    "/runs/..%2fsecret/run.zip",
+    "/runs/%2e%2e/run.zip",
+    "/runs/%2e%2e%2fsecret/run.zip",
+    "/runs/link/run.zip",
+    "/runs/older%2f..%2f..%2fsecret/run.zip",
+    "/runs//etc/run.zip",
+    "/runs/older/..%2frun.json",
+    "/runs/older/%2e%2e/%2e%2e/secret/run.json",
+    "/static/../server/desk.py",
+    "/static/..%2fserver%2fdesk.py",
+    "/static/%2e%2e/messages.py",
+    "/static//etc/passwd",
+    "/static/..\\messages.py",
+    "/static/",
+    "//etc/passwd",
+    "/../../etc/passwd",
+]
+
+
+@pytest.mark.usefixtures("runs")
+@pytest.mark.parametrize("path", PATHS)
+def test_no_path_leads_out(server, path):
+    status, text, _headers = get(server, path)
+    assert status == 404
+    assert len(text) < 200
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "TRACE"])
+@pytest.mark.parametrize("path", ["/", "/runs/older/run.zip", "/static/index.html"])
+def test_nothing_is_written_over_http(shared_server, method, path):
+    with requested(shared_server, method, path) as response:
+        assert response.status == 405
+
+
+@contextmanager
+def requested(server, method, path):
+    connection = HTTPConnection("127.0.0.1", port_of(server), timeout=10.0)
+    connection.request(method, path)
+    yield connection.getresponse()
+    connection.close()

@@ -1,0 +1,142 @@
+"""A served page, and clients of its web socket."""
+
+import json
+import sys
+from collections.abc import Callable
+from contextlib import contextmanager
+from http.client import HTTPConnection
+from pathlib import Path
+from threading import Event, Thread
+from time import monotonic
+
+from websockets.sync.client import connect
+
+from flexneedle.page.server.catalog import CONTROLLERS
+from flexneedle.page.server.desk import Setup
+from flexneedle.page.server.hub import frame_key, key_of
+from flexneedle.page.server.limits import Limits
+from flexneedle.page.server.serve import PageServer
+from flexneedle.page.server.session import Session
+from flexneedle.scenario.files import load_scenario
+
+STUB = (sys.executable, str(Path(__file__).with_name("page_worker.py")))
+PATIENCE_S = 20.0
+"""Time after which a test gives up; what it waits for takes milliseconds."""
+QUICK = Limits(alone_s=0.1, lost_s=0.1, cancel_s=0.1, stop_s=10.0, runs_s=0.05)
+"""Waits that tests can wait for."""
+
+
+@contextmanager
+def served(runs: Path, *, limits=QUICK, rig=None, host="127.0.0.1", workers=(STUB, STUB)):
+    """A server in a thread, on a free port."""
+    session = Session.of("phantom", load_scenario("phantom"), CONTROLLERS[0]["name"])
+    server = PageServer(Setup(session, runs, limits, workers, rig), host, 0)
+    listens = Event()
+    server.on_start = listens.set
+    thread = Thread(target=server.serve_until_interrupted)
+    thread.start()
+    try:
+        assert listens.wait(PATIENCE_S)
+        yield server
+    finally:
+        server.should_exit = True
+        thread.join(PATIENCE_S)
+        assert not thread.is_alive()
+
+
+def port_of(server) -> int:
+    return int(server.address.partition("?")[0].rstrip("/").rpartition(":")[2])
+
+
+class Client:
+    """A client: `newest` has the last message of each key, `rows` those that it got, in order."""
+
+    def __init__(self, server, **options) -> None:
+        port = port_of(server)
+        fixed = {"proxy": None, "max_size": None, "ping_interval": None, "close_timeout": 0.1}
+        options = {"origin": f"http://127.0.0.1:{port}"} | fixed | options
+        self._connecting = connect(f"ws://127.0.0.1:{port}/live", **options)
+        self.socket = self._connecting.__enter__()
+        self.newest, self.rows = {}, {}
+        self._asked = 0
+
+    def __enter__(self):
+        self.wait(lambda: "people" in self.newest and "session" in self.newest)
+        return self
+
+    def __exit__(self, *_error) -> None:
+        self._connecting.__exit__(None, None, None)
+
+    @property
+    def number(self) -> int:
+        return self.newest["welcome"]["client"]
+
+    def send(self, type_: str, **values) -> None:
+        self.socket.send(json.dumps({"type": type_, **values}))
+
+    def ask(self, type_: str, **values) -> dict:
+        """Send a request, and return the answer."""
+        self._asked += 1
+        self.send(type_, request=self._asked, **values)
+        return self.wait(lambda: self.answer_to(self._asked))
+
+    def refused(self, type_: str, **values) -> str:
+        """Send a request that is refused, and return the reason."""
+        answer = self.ask(type_, **values)
+        assert answer["type"] == "refused", answer
+        assert answer["what"] == type_
+        return answer["reason"]
+
+    def do(self, type_: str, **values) -> None:
+        """Send a request that is carried out."""
+        answer = self.ask(type_, **values)
+        assert answer["type"] == "done", answer
+
+    def steer(self):
+        self.do("steer", take=True)
+        return self
+
+    def answer_to(self, number: int) -> dict | None:
+        answers = (self.newest.get("done"), self.newest.get("refused"))
+        return next((answer for answer in answers if answer and answer["request"] == number), None)
+
+    def wait(self, wanted: Callable[[], object]):
+        """Read until something is wanted, and return it."""
+        end = monotonic() + PATIENCE_S
+        while not (found := wanted()):
+            self.read(timeout=max(end - monotonic(), 0.0))
+        return found
+
+    def read(self, timeout: float = PATIENCE_S) -> None:
+        """Read one message."""
+        message = self.socket.recv(timeout=timeout)
+        if isinstance(message, bytes):
+            self.newest[frame_key(message)] = message
+            return
+        values = json.loads(message)
+        self.newest[key_of(values)] = values
+        if values["type"] == "rows":
+            rows = self.rows.setdefault(values["of"], [])
+            assert values["first"] <= len(rows), "rows are missing"
+            rows[values["first"] :] = values["rows"]
+
+    def job(self, kind: str, state: str) -> dict:
+        """Wait for the state of a job."""
+        return (
+            self.wait(lambda: self.newest.get(f"job {kind}", {}).get("state") == state)
+            and self.newest[f"job {kind}"]
+        )
+
+
+def get(server, path: str, **headers) -> tuple[int, str, dict[str, str]]:
+    """Status, text and headers (lower case) of a page; headers: of the request, `_` for `-`."""
+    connection = HTTPConnection("127.0.0.1", port_of(server), timeout=PATIENCE_S)
+    connection.putrequest("GET", path, skip_host="Host" in headers)
+    for name, value in headers.items():
+        connection.putheader(name.replace("_", "-"), value)
+    connection.endheaders()
+    response = connection.getresponse()
+    body = response.read().decode(errors="replace")
+    found = {name.lower(): value for name, value in response.getheaders()}
+    connection.close()
+    return response.status, body, found
