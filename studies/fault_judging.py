@@ -32,8 +32,8 @@ class State:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of a trial: the fault, the faulty axis, when it was injected (s, monotonic), true states, `run.json`,
-    messages, and how many processes were left after it.
+    """What is known of a trial: the fault, the faulty axis, when it was injected (s, monotonic), the true states,
+    `run.json`, messages, and how many processes were left after it.
     """
 
     fault: Fault

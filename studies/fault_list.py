@@ -108,9 +108,7 @@ FAULTS: Sequence[Fault] = (
     _computer("controller killed", Kill("controller"), STOPPED_UNRECORDED, rolls=_SOME),
     _computer("supervisor killed", Kill("supervisor"), BY_THEMSELVES, rolls=_SOME),
     _computer("both killed", Kill("supervisor", "controller"), BY_THEMSELVES_UNRECORDED, rolls=_SOME),
-    _computer(
-        "controller stopped (SIGSTOP)", Signal(SIGSTOP), STOPPED, 2.3, "no (command|heartbeat)", _SOME
-    ),
+    _computer("controller stopped (SIGSTOP)", Signal(SIGSTOP), STOPPED, 2.3, "no (command|heartbeat)", _SOME),
     # Found by the controller when it writes a period, which lasts longer while other programs use the processor.
     _computer("disk full", Disk(), ENDED_HELD, 1.0),
     _computer("clock set back by 1 h", Clock(-3600), CONTINUED),

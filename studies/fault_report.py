@@ -23,7 +23,11 @@ def table(faults: Sequence[Fault], rows: Sequence[Row]) -> str:
     during = [row["during"] for row in rows]
     shares = ", ".join(
         f"{during.count(name)} {text}"
-        for name, text in (("advance", "an advance"), ("roll", "a roll"), ("rest", "a rest between two steps"))
+        for name, text in (
+            ("advance", "an advance"),
+            ("roll", "a roll"),
+            ("rest", "a rest between two steps"),
+        )
     )
     return "\n".join([*lines, "", f"{len(rows)} faults, during: {shares}."])
 
@@ -57,7 +61,12 @@ def draw(faults: Sequence[Fault], rows: Sequence[Row], path: Path) -> None:
 
     shown = [(fault, mine) for fault in faults if (mine := rows_of(fault, rows))]
     figure, axes = plt.subplots(
-        1, 3, figsize=(11.0, 0.24 * len(shown) + 1.2), sharey=True, layout="constrained", width_ratios=[3, 3, 2]
+        1,
+        3,
+        figsize=(11.0, 0.24 * len(shown) + 1.2),
+        sharey=True,
+        layout="constrained",
+        width_ratios=[3, 3, 2],
     )
     for at, (fault, mine) in enumerate(shown):
         seconds = [detection_s(fault, row) for row in mine]

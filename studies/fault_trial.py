@@ -27,7 +27,10 @@ from flexneedle.scenario.files import dump_scenario
 
 _EARLIEST_S = 1.0  # after the first motion: the needle may be rolled before the insertion
 _LATEST = 0.8  # of the shortest duration of the insertion
-_FIRST_STEP, _LAST_STEP = 3, 0.7  # in which a decision is late or rolls; steps, and of the path (a step is 1 mm)
+_FIRST_STEP, _LAST_STEP = (
+    3,
+    0.7,
+)  # in which a decision is late or rolls; steps, and of the path (a step is 1 mm)
 _ROLL_SHARES = (0.1, 0.8)  # of the time of the roll at its speed, since the decision
 _STOPPED_S = 3.0  # for which a controller is stopped by SIGSTOP
 _LONGEST_S, _END_S, _REST_S = 60.0, 5.0, 0.6
@@ -93,7 +96,9 @@ class Trial:
 
     def rng(self) -> np.random.Generator:
         """Randomness of its time."""
-        return np.random.default_rng([self.case.seed, crc32(f"{self.fault.group} {self.fault.name}".encode())])
+        return np.random.default_rng(
+            [self.case.seed, crc32(f"{self.fault.group} {self.fault.name}".encode())]
+        )
 
 
 def run_trial(trial: Trial, keep: Path | None = None) -> dict[str, Any]:
@@ -135,9 +140,7 @@ def run_trial(trial: Trial, keep: Path | None = None) -> dict[str, Any]:
     return row | {"seconds": monotonic() - begun}
 
 
-def _controller(
-    trial: Trial, roll: float, folder: Path, rng: np.random.Generator
-) -> tuple[str, ...]:
+def _controller(trial: Trial, roll: float, folder: Path, rng: np.random.Generator) -> tuple[str, ...]:
     """Options of the insertion for a controller of its own, where one decision is late or rolls."""
     if not (roll or trial.fault.decision_s):
         return ()
