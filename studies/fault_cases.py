@@ -2,7 +2,7 @@
 
 Every second one is in space, with drivers of each kind alternately; of both, every second is a preset with a random
 target, the others random worlds (needle, bevel, 1 to 4 layers, target). All have a guide and fit the shipped rig file.
-They are short, so that a trial is: at most 50 mm from the tip's start to the target. In every third case a fault that
+They are short, so that a trial is: at most 40 mm from the tip's start to the target. In every third case a fault that
 may fall in a roll does so, and what would be wrong with the motor of the base is wrong with that of the roll.
 """
 
@@ -20,7 +20,7 @@ from flexneedle.scenario.rig import load_rig
 from flexneedle.scenario.worlds import world
 
 FIRST_WORLD, FIRST_SEED = 15_000_000, 750_000
-MOST_PATH_MM = 50.0
+MOST_PATH_MM = 40.0
 _WORLDS_OF_A_CASE = 1000  # the first of these numbers that fits
 _STREAM = 0x6661756C74
 _PLANE = "plane"
@@ -85,7 +85,7 @@ def _limited(scenario: Scenario) -> Scenario:
 
 
 def _preset(rng: np.random.Generator, driver: str) -> Scenario:
-    depth, lateral, out, gap = rng.uniform((25.0, -5.0, -3.0, 2.0), (40.0, 5.0, 3.0, 10.0)).round(2).tolist()
+    depth, lateral, out, gap = rng.uniform((25.0, -5.0, -3.0, 2.0), (35.0, 5.0, 3.0, 5.0)).round(2).tolist()
     values = {"target.depth_mm": depth, "target.lateral_mm": lateral, "setup.tip_to_skin_mm": gap}
     if driver == _PLANE:
         return flexneedle.load_scenario("phantom").with_values(values)

@@ -25,7 +25,7 @@ from rig_trials import EmulatedRig, emulated_rig, ended, insertion
 
 from flexneedle.scenario.files import dump_scenario
 
-_EARLIEST_S = 1.0  # after the first motion: the needle may be rolled before the insertion
+_EARLIEST_S = 0.2  # after the first advance
 _LATEST = 0.8  # of the shortest duration of the insertion
 _FIRST_STEP, _LAST_STEP = (
     3,
@@ -159,7 +159,7 @@ def _await_moment(
     rng: np.random.Generator,
 ) -> float:
     """Wait until the fault is due; return that time (s, monotonic): of a late decision its beginning."""
-    begun = rig.first_motion(process)
+    begun = _first_advance(rig, process)
     if trial.fault.decision_s:
         return _marked(folder / "marker", process)
     if roll:
@@ -171,6 +171,18 @@ def _await_moment(
         _check_running(process)
         sleep(min(0.05, max(0.0, due - monotonic())))
     return due
+
+
+def _first_advance(rig: EmulatedRig, process: subprocess.Popen[bytes]) -> float:
+    """Wait until the base moves; before that the needle may be rolled, and the field measured."""
+    rig.first_motion(process)
+    while True:
+        truth = rig.read_truth()
+        moving = truth.time[truth.positions["insertion"] != truth.positions["insertion"][0]]
+        if len(moving):
+            return float(moving[0])
+        _check_running(process)
+        sleep(0.1)
 
 
 def _marked(marker: Path, process: subprocess.Popen[bytes]) -> float:
