@@ -14,6 +14,7 @@ from flexneedle.ros.dds import participant
 from flexneedle.ros.profile import LATCHED, PUBLISHED, SUBSCRIBED, load_profile
 from flexneedle.ros.settings import DriverSettings, TrackerSettings, checked
 from flexneedle.scenario.rig import RigFile
+from ros_topics_rig import rig_of_page
 
 PAGE = (Path(__file__).parents[2] / "docs" / "rig" / "ros.md").read_text(encoding="utf-8")
 
@@ -96,8 +97,7 @@ def test_qualities_of_service_are_those_of_a_node(section, kind):
 
 
 def test_the_rig_file_is_one():
-    (text,) = [code for code in re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL) if "[driver]" in code]
-    rig = RigFile.model_validate(tomllib.loads(text))
+    rig = RigFile.model_validate(tomllib.loads(rig_of_page()))
     assert (rig.driver.kind, rig.tracker.kind) == ("ros", "ros")
     checked(rig.driver.settings, DriverSettings)
     checked(rig.tracker.settings, TrackerSettings)

@@ -92,6 +92,10 @@ WITHOUT_A_GUIDE = "must be above 0; to go without a guide leave out setup.guide_
             {"tissue.1.thickness_mm": 20.0},
             "tissue[1].thickness_mm = 20: has no effect: the last layer has no end; leave it out, or add the layer",
         ),
+        (
+            {"setup.insertion_speed_mm_s": 3.0},
+            "phantom.delay_periods = 1: readings arrive 0.333 s old, above control.stale_after_s (0.3), and hold",
+        ),
     ],
 )
 def test_an_implausible_value_is_one_line(values, line):

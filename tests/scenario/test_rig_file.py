@@ -75,6 +75,7 @@ def test_an_axis_is_in_counts_mm_rad_and_s():
         (2000.0, 3.0, 0.02, 0.12),  # of 40 ms
         (20_000.0, 1.0, 0.02, 0.08),  # four tolerances
         (50.0, 1.0, 0.06, 0.24),  # three counts, twelve counts
+        (0.001, 1.0, 0.1, 0.4),  # a joint in m has no counts
     ],
 )
 def test_without_them_errors_are_derived_from_speed_and_counts(counts, speed, tolerance, error):

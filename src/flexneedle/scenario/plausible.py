@@ -87,8 +87,10 @@ _FAR = 10**0.5  # ratio to the nearest usual value from which a value is reporte
 
 
 def doubts(scenario: Scenario) -> list[str]:
-    """Return a line for each value that is half an order of magnitude and more outside the usual range, or unused."""
-    return [*_unusual(scenario), *_unused(scenario)]
+    """Return a line for each value that is half an order of magnitude and more outside the usual range, or unused, or
+    holds the needle from the start.
+    """
+    return [*_unusual(scenario), *_unused(scenario), *_stale(scenario)]
 
 
 def _unusual(scenario: Scenario) -> Iterator[str]:
@@ -111,6 +113,15 @@ def _unused(scenario: Scenario) -> Iterator[str]:
     if thickness is not None:
         rule = "has no effect: the last layer has no end; leave it out, or add the layer below"
         yield f"tissue[{last}].thickness_mm = {thickness:g}: {rule}"
+
+
+def _stale(scenario: Scenario) -> Iterator[str]:
+    periods, limit = scenario.phantom.delay_periods, scenario.control.stale_after_s
+    age = periods * scenario.setup.step_time
+    if age > limit:
+        rule = f"readings arrive {_short(age)} s old, above control.stale_after_s ({limit:g}), and hold the needle"
+        remedy = "lower it, or raise control.stale_after_s"
+        yield f"phantom.delay_periods = {periods:g}: {rule}: {remedy} (setup.insertion_speed_mm_s is low)"
 
 
 def _general(key: str) -> str:

@@ -66,13 +66,14 @@ class Part(Section):
 class Axis(Section, ABC):
     """An axis and its motor. `scale`, `limits` and the other properties are in counts, mm or rad, and s.
 
-    unit: of the file, "mm" or "deg"; size: of that unit in mm or rad; usual_errors: if the file has none, the largest
-    error at most and the tolerance at least, in that unit.
+    unit: of the file, "mm" or "deg"; size: of that unit in mm or rad; usual_error and usual_tolerances: if the file has
+    none, the largest error at most, and the tolerance at least and at most, in that unit.
     """
 
     unit: ClassVar[str]
     size: ClassVar[float]
-    usual_errors: ClassVar[tuple[float, float]]
+    usual_error: ClassVar[float]
+    usual_tolerances: ClassVar[tuple[float, float]]
 
     channel: Channel
     """The motor's name at its controller, such as "A"."""
@@ -120,19 +121,21 @@ class Axis(Section, ABC):
     @property
     def tolerance(self) -> float:
         """Largest distance from the goal of a motion that has ended, mm or rad."""
-        return self._tolerance_of_counts if self._errors[1] is None else self.size * self._errors[1]
+        return self._usual_tolerance if self._errors[1] is None else self.size * self._errors[1]
 
     @property
     def max_error(self) -> float:
         """Largest difference of commanded and measured position, mm or rad."""
         if self._errors[0] is not None:
             return self.size * self._errors[0]
-        usual = min(self.size * self.usual_errors[0], _LAG_S * self.speed)
-        return max(usual, _TOLERANCES * self._tolerance_of_counts)
+        usual = min(self.size * self.usual_error, _LAG_S * self.speed)
+        return max(usual, _TOLERANCES * self._usual_tolerance)
 
     @property
-    def _tolerance_of_counts(self) -> float:
-        return max(self.size * self.usual_errors[1], _TOLERATED_COUNTS / abs(self.scale))
+    def _usual_tolerance(self) -> float:
+        # At most: a "count" of a joint in m or rad is no step of an encoder.
+        least, most = self.usual_tolerances
+        return min(max(self.size * least, _TOLERATED_COUNTS / abs(self.scale)), self.size * most)
 
     @property
     def to_home(self) -> int:
@@ -154,7 +157,8 @@ class LinearAxis(Axis):
 
     unit = "mm"
     size = 1.0
-    usual_errors = (0.2, 0.02)
+    usual_error = 0.2
+    usual_tolerances = (0.02, 0.1)
 
     counts_per_mm: Positive
     """Counts of the encoder per mm."""
@@ -167,12 +171,13 @@ class LinearAxis(Axis):
     home_mm: Coordinate = 0.0
     """Position of the axis at its home."""
     backlash_mm: NonNegative = 0.0
-    """Lost motion when the motor reverses, made up for."""
+    """Lost motion when the motor reverses. Each command makes up for it from the end of its first motion on; until then
+    the position is uncertain by half of it."""
     max_error_mm: Positive | None = None
     """Largest difference of commanded and measured position; beyond it the rig stops with a fault. Not set: the way of
-    40 ms at `speed_mm_s`, at most 0.2 mm, at least 12 counts and 0.08 mm."""
+    40 ms at `speed_mm_s`, at most 0.2 mm, at least four times the usual tolerance."""
     tolerance_mm: Positive | None = None
-    """A motion has arrived within this distance from its goal. Not set: 3 counts, at least 0.02 mm."""
+    """A motion has arrived within this distance from its goal. Not set: 3 counts, 0.02 to 0.1 mm."""
 
     @property
     def scale(self) -> float:
@@ -214,7 +219,8 @@ class RotaryAxis(Axis):
 
     unit = "deg"
     size = radians(1.0)
-    usual_errors = (5.0, 1.0)
+    usual_error = 5.0
+    usual_tolerances = (1.0, 2.0)
 
     counts_per_deg: Positive
     """Counts of the encoder per degree."""
@@ -227,12 +233,13 @@ class RotaryAxis(Axis):
     home_deg: Coordinate = 0.0
     """Angle of the axis at its home."""
     backlash_deg: NonNegative = 0.0
-    """Lost motion when the motor reverses, made up for."""
+    """Lost motion when the motor reverses. Each command makes up for it from the end of its first motion on; until then
+    the angle is uncertain by half of it."""
     max_error_deg: Positive | None = None
     """Largest difference of commanded and measured angle; beyond it the rig stops with a fault. Not set: the angle of
-    40 ms at `speed_deg_s`, at most 5°, at least 12 counts and 4°."""
+    40 ms at `speed_deg_s`, at most 5°, at least four times the usual tolerance."""
     tolerance_deg: Positive | None = None
-    """A roll has arrived within this angle from its goal. Not set: 3 counts, at least 1°."""
+    """A roll has arrived within this angle from its goal. Not set: 3 counts, 1° to 2°."""
 
     @property
     def scale(self) -> float:
