@@ -63,8 +63,9 @@ def plan(
 
     scenario: also by its name or path, as for `load_scenario`;
     strategy: "manipulation" moves guide and bevel; "steering" moves only the bevel (paper section III-A, but on the
-    needle itself, not on a softer one). `progress` gets a dict after each iteration. `threads` is for rollouts
-    (default: all cores) and changes no result. Same seed, same plan.
+    needle itself, not on a softer one). `progress` gets a dict after each iteration, with the samples of the
+    search as `planning.horizon.Samples`. `threads` is for rollouts (default: all cores) and changes no result. Same
+    seed, same plan.
     Raises ScenarioError for a target that the scenario excludes, InputError for another argument that cannot be used.
     """
     scenario, seed = load_scenario(scenario), whole("seed", seed, 0)

@@ -5,8 +5,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from flexneedle.arguments import whole
 from flexneedle.control.interface import Method
 from flexneedle.control.methods import DEFAULT
@@ -63,17 +61,15 @@ def insert(
     more than 1 mm, unless `force` is set or the controller predicts the miss itself, as the default one does.
     """
     scenario, plan, seed = load_scenario(scenario), planned(plan), whole("seed", seed, 0)
-    phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
     plant_name, plant = plant_of(phantom)
     tracker_name, own_tracker = tracker_of(tracker)
-    seeds = Seeds(phantom_seed, tracker_seed, room_seed)
     scenario = placed(scenario, plan)
-    virtual = virtual_rig(scenario, plan.roll, seeds, plant, tracker=own_tracker)
+    virtual = virtual_rig(scenario, plan.roll, Seeds.of(seed), plant, tracker=own_tracker)
     executed = partial(
         run,
         scenario,
         plan,
-        rng=np.random.default_rng(control_seed),
+        rng=Seeds.controller(seed),
         seed=seed,
         controller=controller,
         force=force,
