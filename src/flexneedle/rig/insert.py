@@ -14,6 +14,7 @@ from flexneedle.rig.dry_run import in_memory
 from flexneedle.rig.loop import planned, run
 from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
+from flexneedle.rig.step import OnDecision
 from flexneedle.rig.supervised import Watchers, check_fit, supervised
 from flexneedle.rig.virtual import Seeds, virtual_rig
 from flexneedle.scenario.files import load_scenario
@@ -33,6 +34,7 @@ def insert(
     force: bool = False,
     threads: int | None = None,
     on_period: Callable[[Period], None] | None = None,
+    on_decision: OnDecision | None = None,
     rig: str | Path | RigFile | None = None,
     dry_run: bool = False,
     watchers: Watchers | None = None,
@@ -50,7 +52,8 @@ def insert(
     "scenario", the one that the scenario describes. Each may also be an object of your own or its name `module:NAME`
     (docs/extend.md).
     threads: for rollouts (default: all cores), without effect on the result. on_period: called with each control
-    period when it ends.
+    period when it ends; on_decision: with each decision of the controller, before anything moves, and the estimate that
+    it was made on.
 
     The record is the same for the same seed, except for wall-clock durations.
 
@@ -75,6 +78,7 @@ def insert(
         force=force,
         threads=threads,
         on_period=on_period,
+        on_decision=on_decision,
     )
     if rig is None:
         return replace(executed(virtual), phantom=plant_name, tracker=tracker_name)

@@ -4,10 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
-from flexneedle.control.interface import Decision, Method
-from flexneedle.control.methods import METHODS
+from flexneedle.control.interface import Decision
 from flexneedle.errors import FlexneedleError, InputError, one_line
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.page import messages as m
@@ -121,19 +118,6 @@ class Live:
         share = (period.estimate.x - self.plan.tips[0, 0]) / depth
         self.task.tell("running", min(max(share, 0.0), 1.0), f"tip at {period.estimate.x:.1f} mm")
 
-    def controller(self) -> Method:
-        """The controller of the order, whose searches and cut channels are reported."""
-        method = METHODS[self.task.controller]
-
-        def decide(
-            task: Any, memory: Any, estimate: Estimate, rng: np.random.Generator
-        ) -> tuple[Decision, Any]:
-            decision, after = method.decide(task, memory, estimate, rng)
-            self._show_decision(decision, estimate)
-            return decision, after
-
-        return replace(method, decide=decide)
-
     def _planning(self, info: dict[str, Any]) -> None:
         self.task.signals.check()
         if self.task.signals.stopped:
@@ -141,7 +125,8 @@ class Live:
         done, usual = info["iteration"], info["iterations"]
         self.task.tell("running", done / usual, f"plan: iteration {done} of {usual}")
 
-    def _show_decision(self, decision: Decision, estimate: Estimate) -> None:
+    def decided(self, decision: Decision, estimate: Estimate) -> None:
+        """Report the samples of a decision, and the cut channel of its estimate."""
         if decision.samples is not None:
             self.task.show(samples_of(decision.samples, Source.LIVE, self.periods))
         channel = channel_of(estimate.state.contacts, self.periods)
@@ -182,8 +167,9 @@ def _virtual(live: Live, plan: Plan) -> Insertion:
         rig,
         Seeds.controller(seed),
         seed,
-        controller=live.controller(),
+        controller=task.controller,
         on_period=on_period,
+        on_decision=live.decided,
     )
     return replace(insertion, phantom=DEFAULT_PLANT, tracker=SCENARIO_TRACKER)
 
@@ -227,8 +213,9 @@ def _on_rig(live: Live, plan: Plan) -> Insertion:
         task.scenario,
         plan,
         task.work.seed,
-        controller=live.controller(),
+        controller=task.controller,
         rig=load_rig(task.work.rig),
         watchers=Watchers(follower=follower),
         on_period=on_period,
+        on_decision=live.decided,
     )
