@@ -108,7 +108,9 @@ class Live:
         if disturb.what == "stiffen" and disturb.layer >= self._layers:
             raise Refusal(f"layer = {disturb.layer}: must be below {self._layers}, the number of layers")
         if disturb.what == "plate" and not self._in_a_field:
-            raise Refusal("the tracker of this scenario has no field that metal distorts: set tracker.environment")
+            raise Refusal(
+                "the tracker of this scenario has no field that metal distorts: set tracker.environment"
+            )
         self._signal(disturb=disturb.model_copy(update={"request": None}))
 
     def lost(self) -> None:

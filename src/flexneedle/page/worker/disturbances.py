@@ -12,9 +12,22 @@ from flexneedle.rig.phantom.plants import ExactPlant
 from flexneedle.rig.ports import TipTracker
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.scenario.model import Scenario
+from flexneedle.scenario.sections.environment import ENVIRONMENTS
 from flexneedle.types import Frame, Measurement, SensorReading
 
 _MISSING = "missing"
+_METAL = "noisy"
+"""The environment whose metal plate is brought where the scenario's has none."""
+_FAR_MM = 1e4
+"""Distance of a metal plate that is taken away: it distorts nothing, to the last bit."""
+
+
+def with_plate(scenario: Scenario) -> Scenario:
+    """The scenario with a metal plate in the tracker's environment, if it has an environment without one."""
+    environment = scenario.tracker.environment
+    if environment is None or environment.plate is not None:
+        return scenario
+    return scenario.with_values({"tracker.environment.plate": ENVIRONMENTS.shipped(_METAL)["plate"]})
 
 
 class DisturbedPlant(ExactPlant):
@@ -79,7 +92,8 @@ class Disturber:
         self._scenario, self._now, self._say = scenario, now, say
         self._plant: DisturbedPlant | None = None
         self._tracker: DisturbedTracker | None = None
-        self._plate: float | None = None
+        environment = scenario.tracker.environment
+        self._plate = None if environment is None or environment.plate is not None else _FAR_MM
         self._active: dict[str, str] = {}
         self._dropped_until = -math.inf
 
@@ -89,7 +103,7 @@ class Disturber:
         return self._plant
 
     def plate_distance_at(self, _time: float) -> float | None:
-        """Distance (mm) of the metal plate; None: that of the scenario."""
+        """Distance (mm) of the metal plate of `with_plate`; None: that of the scenario."""
         return self._plate
 
     def watch(self, tracker: TipTracker) -> TipTracker:
@@ -134,7 +148,7 @@ class Disturber:
                 self._dropped_until = self._now() + disturb.size
                 self._tracker.drop(self._now(), self._dropped_until)
             case "plate":
-                self._plate = disturb.size or None
+                self._plate = disturb.size or _FAR_MM
 
     def _name(self, layer: int) -> str:
         return self._scenario.tissue[layer].name or str(layer + 1)

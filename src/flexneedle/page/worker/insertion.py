@@ -9,7 +9,7 @@ from flexneedle.errors import FlexneedleError, InputError, one_line
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.page import messages as m
 from flexneedle.page.frames import Source
-from flexneedle.page.worker.disturbances import Disturber
+from flexneedle.page.worker.disturbances import Disturber, with_plate
 from flexneedle.page.worker.pace import Pacer
 from flexneedle.page.worker.plans import samples_of, shapes_of
 from flexneedle.page.worker.rows import channel_of, frames_of, row_of
@@ -141,7 +141,11 @@ def _virtual(live: Live, plan: Plan) -> Insertion:
     clock: list[Callable[[], float]] = []
     disturber = Disturber(scenario, lambda: clock[0](), task.say)
     rig = virtual_rig(
-        scenario, plan.roll, Seeds.of(seed), disturber.plant, plate_distance_at=disturber.plate_distance_at
+        with_plate(scenario),
+        plan.roll,
+        Seeds.of(seed),
+        disturber.plant,
+        plate_distance_at=disturber.plate_distance_at,
     )
     clock.append(rig.clock.now)
     rig = replace(rig, tracker=disturber.watch(rig.tracker))

@@ -1,7 +1,7 @@
 """The reach: targets that can be hit, at several depths and in several directions; coarse first.
 
 In each direction the best plan to a target as far as the scenario allows is sought by the miss alone: where it ends is
-the reach there. Small searches find it from below, to some tenths of a millimetre.
+the reach there. Small searches find it from below, to some tenths of a millimetre in the last pass.
 """
 
 import cmath
@@ -17,15 +17,17 @@ from flexneedle.planning.planner import plan
 from flexneedle.scenario.model import Scenario
 from flexneedle.types import Point
 
-_SEARCH = (32, 6)
+Size = tuple[int, int]
+"""Samples and iterations of a search."""
+_PASSES: tuple[tuple[int, Size], ...] = ((4, (24, 5)), (8, (24, 5)), (8, (48, 12)))
+"""Number of depths of each pass, evenly down to the deepest, and the size of its searches. A pass does again what was
+searched with less, and keeps the farther end."""
 _ONLY_THE_MISS: dict[str, Any] = {
     "energy_weight_per_mj": 0.0,
     "deflection_weight": 0.0,
     "guide_weight": 0.0,
     "flip_weight": 0.0,
 }
-_DEPTHS = (2, 4, 8)
-"""Number of depths of each pass, evenly down to the deepest; each pass has those of the one before."""
 _DIRECTIONS = 8
 _DEEPEST = 0.95
 """Of the depth that a straight needle reaches; a bent one ends short of it."""
@@ -37,16 +39,24 @@ Outline = list[complex]
 def reach(task: Task) -> None:
     """Report the reach, after each pass over the depths."""
     scenario, known = task.scenario, dict[float, Outline]()
-    angle = _angle(scenario)
+    angle, searched, done = _angle(scenario), dict[float, Size](), 0
     directions = [cmath.rect(1.0, angle + turn) for turn in _turns(scenario)]
     whole = max(scenario.setup.max_depth, 0.0) * _DEEPEST
-    for depths in _DEPTHS:
-        for depth in (whole * (k + 1) / depths for k in range(depths)):
-            if depth not in known:
-                known[depth] = [_end(task, depth, direction) for direction in directions]
-                share = len(known) / _DEPTHS[-1]
-                task.tell("running", share, f"reach at {len(known)} of {_DEPTHS[-1]} depths")
+    passes = [(whole * (k + 1) / count, size) for count, size in _PASSES for k in range(count)]
+    for count, size in _PASSES:
+        for depth, _ in passes[done : done + count]:
+            if searched.get(depth) != size:
+                ends = [_end(task, size, depth, direction) for direction in directions]
+                known[depth] = _farther(scenario, depth, ends, known.get(depth, ends))
+                searched[depth] = size
+            done += 1
+            task.tell("running", done / len(passes), f"reach at {depth:.0f} mm")
         _show(task, known, angle)
+
+
+def _farther(scenario: Scenario, depth: float, one: Outline, other: Outline) -> Outline:
+    axis = scenario.entry.lateral(depth)
+    return [max(ends, key=lambda end: abs(end - axis)) for ends in zip(one, other, strict=True)]
 
 
 def _angle(scenario: Scenario) -> float:
@@ -62,14 +72,14 @@ def _turns(scenario: Scenario) -> list[float]:
     return [2.0 * math.pi * k / count for k in range(count)]
 
 
-def _end(task: Task, depth: float, direction: complex) -> complex:
+def _end(task: Task, size: Size, depth: float, direction: complex) -> complex:
     """The end y + iz (mm) of the best plan to the farthest target in a direction."""
     scenario = task.scenario
     axis, most = scenario.entry.lateral(depth), scenario.setup.max_lateral
     far = axis + direction * most / max(abs(direction.real), abs(direction.imag)) * (1.0 - 1e-9)
     target: Point = (depth, far.real, far.imag if scenario.setup.axes == 2 else 0.0)
     found = plan(
-        smaller(scenario, *_SEARCH, **_ONLY_THE_MISS),
+        smaller(scenario, *size, **_ONLY_THE_MISS),
         target,
         task.work.strategy,
         task.work.seed,
