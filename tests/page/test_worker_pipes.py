@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 from threading import Event
 
 import pytest
@@ -35,8 +36,26 @@ class Pipe:
             yield json.loads(message) if isinstance(message, str) else unpacked(message)
 
 
+ROW = {
+    "index": 0,
+    "time": 0.0,
+    "action": "move",
+    "decision": "",
+    "verdict": "ok",
+    "measured": None,
+    **dict.fromkeys(("estimate", "path", "base"), (0.0, 0.0, 0.0)),
+    **dict.fromkeys(("true", "error_mm", "indicator", "true_energy_mj", "stretch", "miss_sd_mm", "cost")),
+    "guide": (0.0, 0.0),
+    "roll_deg": 0.0,
+    "energy_mj": 0.0,
+    "miss_mm": (None, math.nan),
+    "decide_ms": 0.0,
+    "late": False,
+}
+
+
 def rows(first, count):
-    return Rows.model_construct(of="live", first=first, rows=list(range(first, first + count)))
+    return Rows(of="live", first=first, rows=[ROW | {"index": first + k} for k in range(count)])
 
 
 def job(state):
@@ -75,7 +94,8 @@ def test_no_row_is_lost_and_a_new_insertion_begins_again(outbox, pipe):
     for first in range(5):
         outbox.put(rows(first, 1))
     (news,) = sent(outbox, pipe)
-    assert (news["first"], news["rows"]) == (0, [0, 1, 2, 3, 4])
+    assert (news["first"], [row["index"] for row in news["rows"]]) == (0, [0, 1, 2, 3, 4])
+    assert news["rows"][0]["miss_mm"] == [None, None]
     outbox.put(rows(5, 2))
     outbox.put(rows(0, 1))
     outbox.flush()
@@ -88,6 +108,16 @@ def test_the_end_of_a_job_is_sent_after_its_results(outbox, pipe):
     outbox.put(People(clients=1, steering=None))
     outbox.put(job("done"))
     assert [one["type"] for one in sent(outbox, pipe)] == ["people", "job"]
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_nobody_waits_for_a_server_that_is_gone():
+    def write(_data):
+        raise BrokenPipeError
+
+    outbox = Outbox(write)
+    outbox.put(Runs(runs=[]))
+    outbox.flush()
 
 
 def orders(*messages):

@@ -98,6 +98,12 @@ def test_at_most_64_paths_of_48_points_are_shown_the_best_and_the_worst_among_th
     assert not shown[:, :-1, 3].any()
 
 
+@pytest.fixture(autouse=True)
+def few(monkeypatch):
+    """Few and short searches of the reach."""
+    monkeypatch.setattr("flexneedle.page.worker.reach._PASSES", ((1, (12, 2)), (2, (16, 4))))
+
+
 def reached(scenario, **values):
     reported = done(reach, task("reach", scenario=scenario, **values))
     return reported, reported.of("reach")[-1]

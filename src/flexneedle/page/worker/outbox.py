@@ -17,7 +17,7 @@ class Outbox:
         self._write = write
         self._places: dict[str, News | frames.ShapeFrame] = {}
         self._changed = Condition()
-        self._writing = False
+        self._writing = self._broken = False
         Thread(target=self._run, name="outbox", daemon=True).start()
 
     def put(self, news: News) -> None:
@@ -25,7 +25,7 @@ class Outbox:
         with self._changed:
             before = self._places.get(news.key)
             if isinstance(news, Rows) and isinstance(before, Rows) and news.first > 0:
-                news = Rows(of=news.of, first=before.first, rows=[*before.rows, *news.rows])
+                news = before.model_copy(update={"rows": [*before.rows, *news.rows]})
             if isinstance(news, Job):  # its end is sent after its results
                 self._places.pop(news.key, None)
             self._places[news.key] = news
@@ -38,11 +38,19 @@ class Outbox:
             self._changed.notify_all()
 
     def flush(self) -> None:
-        """Wait until everything is written."""
+        """Wait until everything is written, or nothing more can be."""
         with self._changed:
-            self._changed.wait_for(lambda: not self._places and not self._writing)
+            self._changed.wait_for(lambda: self._broken or not (self._places or self._writing))
 
     def _run(self) -> None:
+        try:
+            self._write_all()
+        finally:  # the server is gone: the end of stdin ends the worker
+            with self._changed:
+                self._broken = True
+                self._changed.notify_all()
+
+    def _write_all(self) -> None:
         while True:
             with self._changed:
                 self._writing = False

@@ -7,6 +7,7 @@ from flexneedle.errors import StoppedError
 from flexneedle.page.worker.signals import Signals
 
 _BY = "stopped on the page"
+_AT_ONCE_S = 1e-6
 
 
 Wait = Callable[[float | None], None]
@@ -57,7 +58,7 @@ class Pacer:
                     return
                 self._wait(None)
                 self._since = self._now()
-            elif left > 0.0:
+            elif left > _AT_ONCE_S:
                 self._note(paused=False)
                 self._wait(left / pace)
             else:
