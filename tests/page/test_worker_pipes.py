@@ -110,7 +110,6 @@ def test_the_end_of_a_job_is_sent_after_its_results(outbox, pipe):
     assert [one["type"] for one in sent(outbox, pipe)] == ["people", "job"]
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_nobody_waits_for_a_server_that_is_gone():
     def write(_data):
         raise BrokenPipeError

@@ -1,6 +1,7 @@
 """What a worker reports, written by a thread: who reports never waits for the server."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from threading import Condition, Thread
 
 from flexneedle.page import channel, frames
@@ -44,8 +45,9 @@ class Outbox:
 
     def _run(self) -> None:
         try:
-            self._write_all()
-        finally:  # the server is gone: the end of stdin ends the worker
+            with suppress(OSError):  # the server is gone: the end of stdin ends the worker
+                self._write_all()
+        finally:
             with self._changed:
                 self._broken = True
                 self._changed.notify_all()

@@ -31,7 +31,7 @@ class Pacer:
     ) -> None:
         self._signals, self._wait, self._each_time = signals, wait, each_time
         self._on_pause, self._now = on_pause, now
-        self._since = now()
+        self._since, self._rate = now(), signals.pace
         self._paused: bool | None = None
 
     def start(self) -> None:
@@ -50,8 +50,9 @@ class Pacer:
         while True:
             self._each_time()
             self._check()
-            pace, now = self._signals.pace, self._now()
-            left, self._since = left - (now - self._since) * pace, now
+            now = self._now()
+            left -= (now - self._since) * self._rate  # at the pace until now
+            self._since, self._rate = now, (pace := self._signals.pace)
             if pace == 0.0:
                 self._note(paused=True)
                 if self._signals.advance():
