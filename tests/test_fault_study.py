@@ -11,6 +11,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from time import monotonic
 
 import numpy as np
 import pytest
@@ -237,7 +238,7 @@ def test_rows_that_are_there_are_not_run_again_and_those_of_another_insertion_ar
 
 
 INTERRUPTED = """
-import signal, subprocess, sys
+import os, signal, subprocess, sys
 from pathlib import Path
 sys.path.insert(0, {studies!r})
 from rig_trials import resumed
@@ -247,7 +248,7 @@ def run(task):
         process = subprocess.Popen(["sleep", "600"])
         if task == 1:
             process.send_signal(signal.SIGSTOP)
-        print(process.pid, flush=True)
+        os.write(1, f"{{process.pid}}\\n".encode())  # at once: two tasks write
         process.wait()
     raise RuntimeError("ended")
 
@@ -261,11 +262,18 @@ def test_no_process_is_left_after_an_interrupt(tmp_path, number):
     study_of = subprocess.Popen(
         [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
-    first = [int(study_of.stdout.readline()) for _ in range(2)]
-    study_of.send_signal(number)
-    out, _ = study_of.communicate(timeout=30)
-    pids = [*first, *map(int, out.split())]
+    begun = monotonic()
+    try:
+        pids = [int(study_of.stdout.readline()) for _ in range(2)]
+        study_of.send_signal(number)
+        pids.append(int(study_of.stdout.readline()))
+        study_of.send_signal(number)  # another one is ignored
+        pids += map(int, study_of.stdout.read().split())
+    finally:
+        study_of.kill()
+        study_of.communicate()
     assert len(pids) == 4
+    assert monotonic() - begun < 300.0  # they have not ended by themselves
     for pid in pids:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
