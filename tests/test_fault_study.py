@@ -43,7 +43,7 @@ def evidence(name, *states, outcome="done", moves=(), left=0, axis="insertion"):
     recorded = [{"time_s": at, "state": state, "why": why} for at, state, why in states]
     run = {"status": outcome, "timing": {"ticks": {"states": recorded}}}
     truth = Truth(time, {}, positions, *[np.zeros(len(time))] * 5)
-    return Evidence(BY_NAME[name], axis, INJECTED, truth, run, "", left)
+    return Evidence(BY_NAME[name], axis, INJECTED - 0.02, INJECTED, truth, run, "", left)
 
 
 def row(name, *states, **more):
@@ -64,6 +64,11 @@ INTERRUPT = (10.02, "stopped", "signal SIGINT")
     ("name", "states", "outcome"),
     [
         ("motor off", [OFF], "failed"),
+        (
+            "limit switch",
+            [(10.1, "fault", "PA 1 refused: 22 Begin not possible due to Limit Switch")],
+            "failed",
+        ),
         ("missing for 2 s", [HOLD, END], "held"),
         ("missing for 0.5 s", [HOLD, GO_ON, END], "done"),
         ("missing for 0.1 s", [END], "done"),
@@ -112,6 +117,12 @@ def test_another_state_reason_or_outcome_is_not(name, states, outcome, problem):
 
 def test_a_state_before_the_fault_is_no_reaction():
     assert wrong("motor off", (9.9, *OFF[1:]), outcome="failed")[0] == "states: none"
+
+
+def test_a_reaction_may_come_before_the_fault_is_reported_and_not_before_it_is_ordered():
+    early = (9.99, *OFF[1:])
+    assert row("motor off", early, outcome="failed")["detection_s"] == 0.0
+    assert wrong("motor off", early, outcome="failed") == []
 
 
 def test_a_roll_that_stalls_is_a_fault_of_the_rotation():
