@@ -22,7 +22,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import flexneedle
-from flexneedle.errors import RefusedError, StoppedError
+from flexneedle.errors import StoppedError
 from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.rig.supervisor.messages import Task
 from flexneedle.rig.tracking.registration import identity
@@ -37,7 +37,6 @@ from stages import RIG
 HERE = Path(__file__).resolve()
 TESTS = HERE.parents[1] / "tests"
 SPEED_MM_S, FAR_MM = 5.0, 100.0
-_REST_S = 5.0  # longest time in which motors come to rest
 SUBSCRIBED = load_profile("neutral").subscribe
 
 
@@ -108,7 +107,8 @@ def _stops(
         try:
             supervisor.move_to("insertion", FAR_MM, SPEED_MM_S)
         except StoppedError:
-            _reset(supervisor)
+            supervisor.stop()
+            supervisor.reset()
         else:
             raise SystemExit("not stopped")
         sent = float(other.stdout.readline())
@@ -119,17 +119,6 @@ def _stops(
         "to the stop of the motors, 99 %, ms": _ms(np.percentile(taken, 99)),
         "to the stop of the motors, largest, ms": _ms(max(taken)),
     }
-
-
-def _reset(supervisor: Supervisor) -> None:
-    """Leave the state stopped, which is refused until the motors rest."""
-    deadline = time.monotonic() + _REST_S
-    while True:
-        try:
-            return supervisor.reset()
-        except RefusedError:
-            if time.monotonic() > deadline:
-                raise
 
 
 @contextmanager

@@ -5,17 +5,20 @@ python studies/rig_demo.py [--insertions 20] [--out runs/rig-demo]
 Each insertion has an emulated Galil, an emulated Aurora and a phantom of its own seed in three processes; the
 controller gets nothing but the two protocols. Every tenth is in space. Beside it the same insertion runs on the
 virtual rig, in simulated time. A witness, a process that only sleeps, records the machine's own stalls: a tick that was
-left out counts as missed unless the witness was late at the same time.
+left out counts as missed unless the witness was late at the same time. Exit status 1 if a bound is exceeded, which is
+printed, or an insertion is not done.
 """
 
 import argparse
 import math
 import sys
 import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from decision_time import MOST_GROWTH_MM
 from rig_trials import axial_innovation, inserted, percentile, witness
 
 import flexneedle
@@ -23,6 +26,7 @@ from flexneedle.scenario.files import dump_scenario
 
 _SPACE_EVERY, _FIRST_SEED = 10, 400_000
 _ROTATION_DEG = 1080.0  # of the emulated rig
+_MOST_TICK_MS = 5.0  # in 99 % of the ticks of an insertion
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,24 @@ def main() -> None:
             flush=True,
         )
     _summarise(results)
-    sys.exit(any(one.outcome != "done" for one in results))
+    exceeded = [*_exceeded(results)]
+    print("\n".join(exceeded) or "no bound is exceeded")
+    sys.exit(bool(exceeded))
+
+
+def _exceeded(results: Sequence[Result]) -> Iterator[str]:
+    """A line for each bound that is exceeded."""
+    undone = sum(one.outcome != "done" for one in results)
+    growth = float(np.mean([one.true_error - one.simulated_error for one in results]))
+    slowest, missed = max(one.tick_99 for one in results), sum(one.unexplained for one in results)
+    for name, value, most in (
+        ("insertions that are not done", undone, 0.0),
+        ("mean true error above the simulated one, mm", growth, MOST_GROWTH_MM),
+        ("99 % of the ticks of the worst insertion, ms", slowest, _MOST_TICK_MS),
+        ("ticks left out, not by a stall", missed, 0.0),
+    ):
+        if not value <= most:
+            yield f"EXCEEDED: {name}: {value:.4g}, must be at most {most:g}"
 
 
 def _summarise(results: list[Result]) -> None:

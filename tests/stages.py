@@ -1,6 +1,7 @@
 """Motors and a tracker in memory, on a clock that a test sets: what a supervisor moves and reads."""
 
 import math
+import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -113,7 +114,9 @@ class Motor:
 
 
 class Stage:
-    """The port `Motors` in memory."""
+    """The port `Motors` in memory, which is this process's own."""
+
+    address = f"memory of {os.getpid()}"
 
     def __init__(self, clock, channels="ABC"):
         self.clock, self.at = clock, clock.now()
@@ -185,7 +188,10 @@ class Stage:
 
     def power(self, channel, on):
         self._called("power", channel, on)
-        self.motors[channel].on = on
+        motor = self.motors[channel]
+        if on and not motor.on:  # it is held where it is
+            motor.commanded = motor.target = motor.position
+        motor.on = on
 
     def reconnect(self):
         self._called("reconnect")
@@ -277,12 +283,19 @@ class Moves(Stage):
         super().stop()
 
 
+class Crooked(Stage):
+    """Motors in memory that are not held where they are when they are switched on."""
+
+    def power(self, channel, on):
+        self._called("power", channel, on)
+
+
 def real_motors(settings, channels):
     """A driver of a rig file, `stages:real_motors`: the motors in memory, in real time.
 
-    position: of all (counts); off: how far they are from where their controller has them (counts).
+    position: of all (counts); off: how far they are from where their controller has them (counts), which stays so.
     """
-    stage = Stage(WallClock(), channels)
+    stage = (Crooked if "off" in settings else Stage)(WallClock(), channels)
     for motor in stage.motors.values():
         motor.position = motor.commanded = motor.target = float(settings.get("position", 0.0))
         motor.position += float(settings.get("off", 0.0))
@@ -333,5 +346,7 @@ class Noting(Stage):
 
 
 def noting_motors(settings, channels):
-    """A driver of a rig file, `stages:noting_motors`; file: path of its notes."""
-    return Noting(settings["file"], channels)
+    """A driver of a rig file, `stages:noting_motors`; file: path of its notes; address: of its motors."""
+    made = Noting(settings["file"], channels)
+    made.address = settings.get("address", Stage.address)
+    return made

@@ -43,14 +43,17 @@ class Supervisor:
     def arm(self):
         self.calls.append(("arm",))
 
+    def off(self):
+        self._move("off")
+
     def jog(self, axis, distance, speed):
         self._move("jog", axis, round(distance, 9), round(speed, 9))
 
     def home(self, axis):
         self._move("home", axis)
 
-    def retract(self, position):
-        self._move("retract", position)
+    def retract(self, position, speed):
+        self._move("retract", round(position, 9), round(speed, 9))
 
     def stop(self):
         self.calls.append(("stop",))
@@ -226,7 +229,7 @@ MOTIONS = [
     (
         ("jog", "insertion", "-5mm"),
         ("jog", "insertion", -5.0, 2.0),
-        "insertion: from 30 to 25 mm, at most at 2 mm/s",
+        "insertion: from 30 to 25 mm (-5 mm), at most at 2 mm/s",
     ),
     (
         ("jog", "insertion", "5", "--speed", "1"),
@@ -236,10 +239,18 @@ MOTIONS = [
     (
         ("jog", "rotation", "-9deg"),
         ("jog", "rotation", round(-math.pi / 20, 9), round(math.radians(72), 9)),
-        "rotation: from 0 to -9 deg, at most at 72 deg/s",
+        "rotation: from 0 to -9 deg (-9 deg), at most at 72 deg/s",
     ),
-    (("retract",), ("retract", 0.0), "insertion: from 30 to 0 mm, at most at 10 mm/s"),
-    (("retract", "--to", "12.5"), ("retract", 12.5), "insertion: from 30 to 12.5 mm"),
+    (
+        ("retract",),
+        ("retract", 2.4, 2.0),
+        "insertion: from 30 to 2.4 mm (-27.6 mm), at most at 2 mm/s",
+    ),
+    (
+        ("retract", "--to", "12.5", "--speed", "0.5"),
+        ("retract", 12.5, 0.5),
+        "insertion: from 30 to 12.5 mm (-17.5 mm), at most at 0.5 mm/s",
+    ),
     (
         ("home", "insertion"),
         ("home", "insertion"),
@@ -304,6 +315,21 @@ def test_ctrl_c_at_the_question_moves_nothing(capsys, file, supervisor, terminal
 
 
 @pytest.mark.usefixtures("device")
+@pytest.mark.parametrize(
+    ("answer", "calls"), [("y\n", [("rig", "Bench"), ("off",), ("closed",)]), ("\n", [])]
+)
+def test_motors_are_switched_off_after_a_warning_and_never_on_before(
+    capsys, file, supervisor, terminal, answer, calls
+):
+    terminal(answer)
+    status, _, err = run(capsys, "rig", "off", file())
+    assert "insertion: at 30 mm, its motor will be switched off" in err
+    assert err.index("A vertical axis falls unless something holds it") < err.index("Switch off? [y/N]")
+    assert supervisor.calls == calls
+    assert status == (0 if calls else 1)
+
+
+@pytest.mark.usefixtures("device")
 def test_a_fault_is_reported_with_its_reason_and_stops(capsys, file, supervisor):
     supervisor.failure = DriverError("insertion: stalled at 28.1 mm")
     status, _, err = run(capsys, "rig", "retract", file(), "--yes")
@@ -324,6 +350,11 @@ def test_a_fault_is_reported_with_its_reason_and_stops(capsys, file, supervisor)
         (("jog", "insertion", "1", "--speed", "11"), "speed 11: must be above 0 and at most 10"),
         (("retract", "--to", "31"), "must be below 30 mm, where the insertion axis is"),
         (("retract", "--to", "-1"), "insertion to -1 mm: beyond the soft limits"),
+        (
+            ("retract", "--to", "0.1"),
+            "to 0.1 mm: must be at least 0.2 mm: the reverse limit switch is at 0 mm",
+        ),
+        (("retract", "--speed", "11"), "speed 11: must be above 0 and at most 10, speed_mm_s of insertion"),
         (("home", "guide_y"), 'axis guide_y: has home = "absolute"'),
     ],
 )
@@ -335,10 +366,10 @@ def test_what_must_not_be_is_refused_before_anything_moves(capsys, file, device,
 
 
 def test_a_base_that_is_at_its_lowest_position_is_not_retracted(capsys, file, device, supervisor):
-    device.set("A", position=0.0, commanded=0.0)
+    device.set("A", position=2_000.0, commanded=2_000.0)
     status, _, err = run(capsys, "rig", "retract", file(), "--yes")
     assert (status, supervisor.calls, device.calls) == (0, [], [])
-    assert err == "flexneedle: insertion is at 0 mm: nothing to retract\n"
+    assert err == "flexneedle: insertion is at 2 mm, a retraction ends at 2.4 mm: nothing to retract\n"
 
 
 def test_several_axes_are_homed_one_after_the_other(capsys, file, device, supervisor):

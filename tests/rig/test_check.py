@@ -15,6 +15,7 @@ from flexneedle.types import Frame, SensorReading
 from galil_peer import peer
 
 PLANE = Wanted(load_scenario("phantom").with_values({"monitor.references": 0}))
+FAR_OFF = "must be at most max_error_mm (0.2): free the axis; the next motion begins where it then is"
 KINDS = {"driver__kind": "bench_rig:drivers", "tracker__kind": "bench_rig:trackers"}
 
 
@@ -77,8 +78,8 @@ def test_positions_are_in_the_unit_of_the_axis_and_in_counts():
             "limit switches",
             "both are active: check their wiring and polarity",
         ),
-        ({"commanded": 201.0}, "commanded - measured", "must be at most max_error_mm (0.2)"),
-        ({"commanded": float("nan")}, "commanded - measured", "must be at most max_error_mm (0.2)"),
+        ({"commanded": 201.0}, "commanded - measured", FAR_OFF),
+        ({"commanded": float("nan")}, "commanded - measured", FAR_OFF),
     ],
     ids=str,
 )
@@ -135,9 +136,31 @@ def test_a_slow_controller_is_a_problem():
 
 
 def test_an_insertion_that_cannot_start_from_here_is_a_problem():
-    found = problems(motors(rig(), motors_with("A", position=30_000.0, commanded=30_000.0), Clock(), PLANE))
-    (line,) = found.values()
-    assert line == "at 30 mm, 90 mm to the high end of range_mm (120): setup.stroke_mm = 110 needs more"
+    for position, count in ((30_000.0, 0), (50_000.0, 1)):  # 40 mm deep need less than the stroke of 110 mm
+        device = motors_with("A", position=position, commanded=position)
+        found = problems(motors(rig(), device, Clock(), PLANE))
+        assert len(found) == count
+    assert found[("insertion", "room")] == (
+        "at 50 mm, 70 mm to the high end of range_mm (120): the advance to guard.past_target_mm = 2 past the target "
+        "is 73.5 mm"
+    )
+
+
+def test_a_position_that_is_uncertain_by_backlash_is_said_so():
+    findings = motors(rig(axes__guide_y__backlash_mm=0.08), Motors(), Clock())
+    assert of(findings, "guide_y", "position").found == (
+        "0 mm (0 counts), uncertain by 0.04 mm (half of backlash_mm)"
+    )
+
+
+def test_a_rig_that_is_slower_than_its_scenario_is_said_so():
+    slow = rig(**KINDS, axes__insertion__acceleration_mm_s2=5.0)
+    findings = check_rig(slow, Clock(), 1.0, PLANE)
+    assert of(findings, "insertion", "speed").found == (
+        "2.11 of 10 mm/s: acceleration_mm_s2 = 5 brakes from no more within the queue"
+    )
+    assert of(findings, "guide_y", "speed").found == "5 mm/s"
+    assert of(findings, "insertion", "largest step").found == "1 mm in 1.1 s, planned for 0.2 s"
 
 
 @pytest.mark.parametrize("rate", [40.0, 20.0])

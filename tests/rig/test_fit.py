@@ -1,11 +1,13 @@
 """A rig that cannot do what a scenario needs is reported before anything is connected."""
 
+import math
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench_rig import VALUES, rig
-from flexneedle.rig.fit import fit_problems, queued, room_problems
+from flexneedle.rig.fit import fit_problems, queued, room_problems, start_problems
 from flexneedle.scenario.files import load_scenario
 
 PLANE, SPACE = load_scenario("phantom"), load_scenario("phantom3d")
@@ -36,8 +38,9 @@ def test_a_rig_in_space_does_what_a_driver_of_any_angle_needs():
         ({"axes__guide_y": None}, "axes.guide_y: missing: the guide moves"),
         ({"axes__rotation": None}, "axes.rotation: missing: the needle is rolled (bevel flips)"),
         (
-            {"axes__insertion__range_mm": [0, 109]},
-            "setup.stroke_mm = 110.0: must be at most 109, the width of axes.insertion.range_mm (0 to 109)",
+            {"axes__insertion__range_mm": [0, 73]},
+            "axes.insertion.range_mm = [0.0, 73.0]: must be at least 73.5 wide: the advance to guard.past_target_mm "
+            "= 2 past the target is 73.5 mm",
         ),
         (
             {"axes__insertion__speed_mm_s": 4},
@@ -45,8 +48,8 @@ def test_a_rig_in_space_does_what_a_driver_of_any_angle_needs():
         ),
         (
             {"axes__guide_y__range_mm": [-10, 19]},
-            "setup.max_guide_travel_mm = 15.0: must be at most 14.5, half the width of axes.guide_y.range_mm "
-            "(-10 to 19)",
+            "axes.guide_y.range_mm = [-10.0, 19.0]: must be at least 30 wide: setup.max_guide_travel_mm is 15, "
+            "to either side",
         ),
         (
             {"axes__guide_y__speed_mm_s": 2},
@@ -96,7 +99,7 @@ def test_what_the_scenario_moves_needs_an_axis(changes, line):
 def test_base_axes_are_checked_like_those_of_the_guide():
     base = {**VALUES["axes"]["guide_y"], "channel": "E", "range_mm": [-5, 5], "speed_mm_s": 1}
     lines = fit_problems(rig(axes__base_y=base), scenario(plan__base_sigma_mm=0.1))
-    assert [line.split(" = ")[0] for line in lines] == ["setup.max_base_travel_mm", "setup.max_base_step_mm"]
+    assert [line.split(" = ")[0] for line in lines] == ["axes.base_y.range_mm", "setup.max_base_step_mm"]
     assert fit_problems(rig(axes__base_y={**base, "range_mm": [-15, 15], "speed_mm_s": 5}), PLANE) == []
 
 
@@ -137,19 +140,27 @@ def test_a_needle_without_a_guide_needs_none():
     ("positions", "lines"),
     [
         ({"insertion": 0.0, "guide_y": 0.0, "rotation": 3.0}, []),
-        ({"insertion": 10.0}, []),
+        ({"insertion": 46.5}, []),  # 40 mm deep, 2 beyond, 28.5 before the skin, 3 sd of the start
         (
-            {"insertion": 10.01},
-            ["at 10.01 mm, 109.99 mm to the high end of range_mm (120): setup.stroke_mm = 110 needs more"],
+            {"insertion": 46.53},
+            [
+                "at 46.53 mm, 73.47 mm to the high end of range_mm (120): the advance to guard.past_target_mm = 2 "
+                "past the target is 73.5 mm"
+            ],
         ),
         ({"insertion": -3.0}, []),
         (
             {"guide_y": -1.0},
-            ["at -1 mm, 14 mm to the low end of range_mm (-15): setup.max_guide_travel_mm = 15 needs more"],
+            [
+                "at -1 mm, 14 mm to the low end of range_mm (-15): setup.max_guide_travel_mm is 15, to either side"
+            ],
         ),
+        ({"guide_y": 0.019}, []),  # within the tolerance of a motion that has ended
         (
             {"guide_y": 17.0},
-            ["at 17 mm, 0 mm to the high end of range_mm (15): setup.max_guide_travel_mm = 15 needs more"],
+            [
+                "at 17 mm, 0 mm to the high end of range_mm (15): setup.max_guide_travel_mm is 15, to either side"
+            ],
         ),
     ],
     ids=str,
@@ -169,14 +180,55 @@ def test_what_is_queued_is_the_largest_speed_times_the_queue_within_its_distance
     assert dict(queued(rig(loop__queue_ms=50)))["guide_y"] == "0.25 mm (5 mm/s × 50 ms)"
 
 
+HERE = {"insertion": 0.0, "rotation": 0.0, "guide_y": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("positions", "advance", "lines"),
+    [
+        ({}, 120.0, []),
+        (
+            {"insertion": 50.0},
+            70.5,
+            [
+                "insertion: at 50 mm, 70 mm to the high end of range_mm (120): the advance to guard.past_target_mm "
+                "= 2 past the target is 70.5 mm"
+            ],
+        ),
+        (
+            {"insertion": -1.0, "rotation": math.radians(195)},
+            70.5,
+            [
+                "insertion: at -1 mm: beyond the soft limits, 0 to 120 mm: jog it back",
+                "rotation: at 195 deg: beyond the soft limits, -10 to 190 deg: jog it back",
+            ],
+        ),
+        (
+            {"guide_y": 2.5},
+            70.5,
+            [
+                "guide_y: at 2.5 mm, 12.5 mm to the high end of range_mm (15): setup.max_guide_travel_mm is 15, "
+                "to either side"
+            ],
+        ),
+    ],
+    ids=str,
+)
+def test_an_axis_from_which_an_insertion_cannot_begin_is_a_line(positions, advance, lines):
+    assert start_problems(rig(), PLANE, HERE | positions, "manipulation", advance) == lines
+
+
+def test_a_plan_that_steers_by_the_bevel_begins_from_any_position_of_the_guide():
+    assert start_problems(rig(), PLANE, HERE | {"guide_y": 2.5}, "steering", 70.5) == []
+
+
 @settings(deadline=None)
-@given(st.floats(1.0, 500.0), st.floats(29.0, 500.0))
-def test_the_stroke_fits_if_and_only_if_the_range_is_as_wide(width, stroke):
-    found = fit_problems(
-        rig(axes__insertion__range_mm=[0.0, width]), PLANE.model_copy(update=_stroke(stroke))
-    )
-    assert bool(found) == (stroke > width + 1e-9)
+@given(st.floats(2.0, 500.0), st.floats(1.0, 60.0))
+def test_the_target_fits_if_and_only_if_the_range_is_as_wide_as_the_advance_to_it(width, depth):
+    found = fit_problems(rig(axes__insertion__range_mm=[0.0, width]), scenario(target__depth_mm=depth))
+    assert bool(found) == (depth + 2.0 + 28.5 + 3.0 > width + 1e-9)
 
 
-def _stroke(stroke):
-    return {"setup": PLANE.setup.model_copy(update={"stroke_mm": stroke})}
+def test_no_more_than_the_stroke_is_needed():
+    deep = scenario(target__depth_mm=80.0)  # 2 mm beyond it are beyond the stroke
+    assert fit_problems(rig(axes__insertion__range_mm=[0.0, 110.0]), deep) == []

@@ -5,22 +5,25 @@ import math
 import pytest
 
 from flexneedle.errors import RigError
-from flexneedle.rig.start import checked_start, deepest
+from flexneedle.rig.start import checked_start, deepest, needed
 from flexneedle.scenario.files import load_scenario
-from synthetic import make_plan
 
 PHANTOM = load_scenario("phantom")
 TILTED = PHANTOM.with_values({"entry.lateral_mm": 3.0, "entry.slope_mrad": 50.0})
 
 
 def test_the_base_may_advance_from_the_measured_tip_to_the_plans_target_and_no_other():
-    plan = make_plan("manipulation", (25.0, 1.0, 0.0), 0)
-    assert deepest(PHANTOM, plan, -31.0) == pytest.approx(25.0 + 2.0 + 31.0)
+    assert deepest(PHANTOM, 25.0, -31.0) == pytest.approx(25.0 + 2.0 + 31.0)
 
 
 def test_a_virtual_needle_may_begin_three_standard_deviations_behind():
-    plan = make_plan("manipulation", (25.0, 1.0, 0.0), 0)
-    assert deepest(PHANTOM, plan, None) == pytest.approx(25.0 + 2.0 + 28.5 + 3.0)
+    assert deepest(PHANTOM, 25.0, None) == pytest.approx(25.0 + 2.0 + 28.5 + 3.0)
+
+
+def test_room_is_needed_for_that_advance_and_no_more_than_the_stroke():
+    steep = math.sqrt(1.0 + 0.05**2)
+    assert needed(TILTED, 25.0, -31.0) == pytest.approx(steep * (25.0 + 2.0 + 31.0))
+    assert needed(TILTED, 80.0, -31.0) == pytest.approx(steep * 110.0)
 
 
 @pytest.mark.parametrize("off", [0.0, 5.0])
@@ -44,4 +47,4 @@ def test_nothing_begins_without_a_measured_tip():
 def test_a_start_that_is_known_less_well_may_be_further_off():
     loose = PHANTOM.with_values({"control.start_axial_sd_mm": 5.0})
     assert checked_start(loose, (-40.0, 0.0, 0.0))[0] == -40.0
-    assert math.isfinite(deepest(loose, make_plan("manipulation", (25.0, 1.0, 0.0), 0), -40.0))
+    assert math.isfinite(deepest(loose, 25.0, -40.0))

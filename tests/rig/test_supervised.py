@@ -15,7 +15,7 @@ import flexneedle
 from emulated_rig import emulated_rig, rig_file
 from flexneedle.errors import CommandError, DriverError, RigError
 from flexneedle.rig.emulator.coupled.truth import read_truth
-from flexneedle.rig.supervised import Columns, SupervisedDriver
+from flexneedle.rig.supervised import Columns, SupervisedDriver, Watchers, supervised
 from flexneedle.rig.supervisor.machine import State
 from flexneedle.rig.supervisor.messages import Done
 from flexneedle.scenario.rig import load_rig
@@ -115,6 +115,117 @@ def test_a_reading_is_expected_on_the_line_of_the_needle():
     assert expected.begin == (10.0, 2.0, 0.0)
     assert expected.end == pytest.approx((11.0, 2.0 + math.tan(0.1), 0.0))
     assert expected.most_off == pytest.approx(2.0 + 3 * 0.2)
+
+
+class Resting:
+    """A supervisor of a rig that rests: axes where they are, a tip, and what it was asked in order."""
+
+    status = "ok"
+
+    def __init__(self, tips=((-28.5, 0.0, 0.0),), **positions):
+        self.rig = load_rig("emulated")
+        self.positions = {name: 0.0 for name, _ in self.rig.axes.items()} | positions
+        self.tips, self.calls = list(tips), []
+
+    def __call__(self, *_task):
+        return self
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_exception):
+        self.calls.append("closed")
+
+    def read(self):
+        self.calls.append("read")
+
+    def tip(self, _within):
+        return self.tips.pop(0) if len(self.tips) > 1 else self.tips[0]
+
+    def arm(self, deepest):
+        self.calls.append(("armed", round(deepest, 6)))
+
+    def move_to(self, axis, _position):
+        self.calls.append(axis)
+
+    def wait(self, _seconds):
+        pass
+
+    def now(self):
+        return 0.0
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """Return a function that opens a rig at rest for a plan 40 mm deep; return what was done, asked included."""
+
+    def open_rig(rest, dry=False):
+        monkeypatch.setattr("flexneedle.rig.supervised.Supervisor", rest)
+        watchers = Watchers(confirm=lambda _positions: rest.calls.append("asked"))
+        plan = make_plan("manipulation", (40.0, 5.0, 0.0), 0)
+        with supervised(rest.rig, PHANTOM, plan, watchers, dry=dry):
+            pass
+        return rest.calls
+
+    return open_rig
+
+
+def test_the_tip_is_measured_anew_after_the_confirmation(opened):
+    rest = Resting(tips=[(-28.5, 0.0, 0.0), (-27.0, 0.0, 0.0)])
+    assert opened(rest) == ["read", "asked", "read", ("armed", 69.0), "rotation", "closed"]
+
+
+@pytest.mark.parametrize(
+    ("rest", "line"),
+    [
+        (
+            Resting(insertion=39.6),  # 110 mm less 40 mm + 2 mm + 28.5 mm are 39.5 mm
+            "insertion: at 39.6 mm, 70.4 mm to the high end of range_mm (110): the advance to guard.past_target_mm "
+            "= 2 past the target is 70.5 mm",
+        ),
+        (
+            Resting(insertion=39.0, tips=[(-29.3, 0.0, 0.0)]),  # the tip is further behind
+            "insertion: at 39 mm, 71 mm to the high end of range_mm (110): the advance to guard.past_target_mm "
+            "= 2 past the target is 71.3 mm",
+        ),
+        (
+            Resting(guide_y=-0.5),
+            "guide_y: at -0.5 mm, 14.5 mm to the low end of range_mm (-15): setup.max_guide_travel_mm is 15, to "
+            "either side",
+        ),
+        (
+            Resting(rotation=math.radians(1090)),
+            "rotation: at 1090 deg: beyond the soft limits, -1080 to 1080 deg: jog it back",
+        ),
+        (
+            Resting(tips=[(-20.0, 0.0, 0.0)]),
+            "tip = -20.0, 0.0, 0.0 mm: must be within 5.6 mm of the scenario's start, -28.5, 0.0, 0.0 mm "
+            "(setup.tip_to_skin_mm): retract the needle, jog the guide, or check the registration",
+        ),
+    ],
+)
+def test_an_insertion_that_has_no_room_is_refused_before_anybody_is_asked(opened, rest, line):
+    with pytest.raises(RigError) as caught:
+        opened(rest)
+    assert str(caught.value) == line
+    assert rest.calls == ["read", "closed"]
+
+
+def test_an_insertion_that_just_has_room_begins(opened):
+    assert ("armed", 70.5) in opened(Resting(insertion=39.5))
+
+
+def test_room_that_is_lost_during_the_question_is_refused(opened):
+    rest = Resting(insertion=39.5, tips=[(-28.5, 0.0, 0.0), (-29.0, 0.0, 0.0)])
+    with pytest.raises(RigError, match=r"the target is 71 mm"):
+        opened(rest)
+    assert rest.calls == ["read", "asked", "read", "closed"]
+
+
+def test_a_dry_run_has_room_for_a_needle_that_begins_three_standard_deviations_behind(opened):
+    assert ("armed", 73.5) in opened(Resting(insertion=36.5), dry=True)
+    with pytest.raises(RigError, match=r"the target is 73\.5 mm"):
+        opened(Resting(insertion=36.6), dry=True)
 
 
 OF_A_PHANTOM = ("/needle/true_shape", "/tip/true", "/tissue/true_strain_energy")

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from flexneedle.scenario.rig import RigFile
 
 _SECONDS = 2.0
+_FALLS = "A vertical axis falls unless something holds it: support it first."
 _NEGATIVE = re.compile(r"^-[\d.]")
 
 
@@ -29,8 +30,8 @@ class Operator(Protocol):
     Each raises RefusedError or DriverError, with the reason, if it is refused or ends before its goal.
     """
 
-    def arm(self) -> None:
-        """Switch the motors on."""
+    def arm(self) -> str:
+        """Switch the motors on; return what else that has changed, or ""."""
         ...
 
     def jog(self, axis: str, distance: float, speed: float) -> object:
@@ -41,8 +42,12 @@ class Operator(Protocol):
         """Find the home of an axis."""
         ...
 
-    def retract(self, position: float) -> object:
-        """Withdraw the base to a position of the insertion axis (mm)."""
+    def retract(self, position: float, speed: float) -> object:
+        """Withdraw the base to a position of the insertion axis (mm), at most at a speed (mm/s)."""
+        ...
+
+    def off(self) -> None:
+        """Switch the motors off."""
         ...
 
     def stop(self) -> None:
@@ -63,7 +68,7 @@ def add_parser(commands: Commands) -> None:
         commands,
         "rig",
         "check the motors and the tracker of a rig, and move its axes",
-        (_add_check, _add_jog, _add_home, _add_retract),
+        (_add_check, _add_jog, _add_home, _add_retract, _add_off),
         "flexneedle rig check rig.toml --scenario phantom",
         "flexneedle rig jog rig.toml insertion -5mm",
     )
@@ -116,12 +121,7 @@ def _add_jog(commands: Commands) -> None:
     parser.add_argument(
         "distance", metavar="DISTANCE", help="distance with its sign, such as 5, -2.5mm or 90deg"
     )
-    parser.add_argument(
-        "--speed",
-        type=positive,
-        metavar="V",
-        help="largest speed, mm/s or deg/s (default: a fifth of the axis's)",
-    )
+    _add_speed(parser, "mm/s or deg/s")
     _add_yes(parser)
     # The pattern by which argparse distinguishes -5mm from an option; there is no public way to set it.
     parser._negative_number_matcher = _NEGATIVE
@@ -152,18 +152,46 @@ def _add_retract(commands: Commands) -> None:
         "withdraw the needle",
         _retract,
         "flexneedle rig retract rig.toml",
-        "flexneedle rig retract rig.toml --to 10 --yes",
-        about="Move the insertion axis backwards; rotation and guide stay where they are. Prints what would move and "
-        "asks for confirmation; Ctrl-C stops.",
+        "flexneedle rig retract rig.toml --to 10 --speed 1 --yes",
+        about="Move the insertion axis backwards, within its soft limits and short of the limit switch of its home; "
+        "rotation and guide stay where they are. Prints what would move and asks for confirmation; Ctrl-C stops.",
     )
     _add_rig(parser)
     parser.add_argument(
         "--to",
         type=finite,
         metavar="MM",
-        help="position at which the retraction ends (default: the lowest of the axis's range_mm)",
+        help="position at which the retraction ends (default: where rig home leaves the axis, or without a limit "
+        "switch behind it the lowest of range_mm)",
     )
+    _add_speed(parser, "mm/s")
     _add_yes(parser)
+
+
+def _add_speed(parser: argparse.ArgumentParser, unit: str) -> None:
+    parser.add_argument(
+        "--speed",
+        type=positive,
+        metavar="V",
+        help=f"largest speed, {unit} (default: a fifth of the axis's)",
+    )
+
+
+def _add_off(commands: Commands) -> None:
+    parser = add_command(
+        commands,
+        "off",
+        "switch the motors off",
+        _off,
+        "flexneedle rig off rig.toml",
+        "flexneedle rig off rig.toml --yes",
+        about="Stop all axes and switch their motors off, as before something is freed by hand. A vertical axis may "
+        "fall. Asks for confirmation; the next motion switches the motors on again.",
+    )
+    _add_rig(parser)
+    parser.add_argument(
+        "--yes", action="store_true", help="switch off without asking; needed without a terminal"
+    )
 
 
 def _add_rig(parser: argparse.ArgumentParser) -> None:
@@ -258,24 +286,39 @@ def _home(args: argparse.Namespace) -> int:
     def home(operator: Operator) -> None:
         for number, homing in enumerate(chosen):
             if number > 0:
-                operator.arm()
+                _arm(operator)
             operator.home(homing.name)
 
     return _carried_out(rig, chosen, args.yes, home, "Only without a needle in tissue.")
 
 
 def _retract(args: argparse.Namespace) -> int:
-    from flexneedle.rig.moves import retraction
+    from flexneedle.rig.moves import retraction, withdrawn
     from flexneedle.scenario.rig import load_rig
 
     rig = load_rig(args.rig)
     position = _positions(rig)["insertion"]
-    move = retraction(rig, position, args.to)
+    move = retraction(rig, position, args.to, args.speed)
     if move is None:
-        at = rig.axes.insertion.shown(position)
-        print(f"flexneedle: insertion is at {at} mm: nothing to retract", file=sys.stderr)
+        at, end = map(rig.axes.insertion.shown, (position, withdrawn(rig)))
+        print(
+            f"flexneedle: insertion is at {at} mm, a retraction ends at {end} mm: nothing to retract",
+            file=sys.stderr,
+        )
         return 0
-    return _carried_out(rig, [move], args.yes, lambda operator: operator.retract(move.goal))
+    return _carried_out(rig, [move], args.yes, lambda operator: operator.retract(move.goal, move.speed))
+
+
+def _off(args: argparse.Namespace) -> int:
+    from flexneedle.rig.moves import switched_off
+    from flexneedle.scenario.rig import load_rig
+
+    rig = load_rig(args.rig)
+    confirm_motions([*switched_off(rig, _positions(rig)), _FALLS], "" if args.yes else "Switch off?")
+    with supervised(rig) as operator, _stopped_on_error(operator):
+        operator.off()
+    print("done", file=sys.stderr)
+    return 0
 
 
 def _positions(rig: RigFile) -> dict[str, float]:
@@ -302,10 +345,16 @@ def _carried_out(
     """Print the motions, command them once they are confirmed, and return the exit status."""
     confirm_motions([*map(str, moves), *notes, ARMS], "" if yes else "Move?")
     with supervised(rig) as operator, _stopped_on_error(operator):
-        operator.arm()
+        _arm(operator)
         command(operator)
     print("done", file=sys.stderr)
     return 0
+
+
+def _arm(operator: Operator) -> None:
+    """Switch the motors on, and print what else that has changed."""
+    if changed := operator.arm():
+        print(f"flexneedle: {changed}", file=sys.stderr)
 
 
 @contextmanager

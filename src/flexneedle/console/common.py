@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from flexneedle.trace.folder import Folder
     from flexneedle.types import Plan
 
-ARMS = "The motors of all axes are switched on first. Ctrl-C stops."
+ARMS = (
+    "The motors of all axes are switched on first. One that rests away from its commanded position is switched off "
+    "and on again, and held where it is: support a vertical axis. Ctrl-C stops."
+)
 """Printed before any motion of a rig."""
 STRATEGIES = ("manipulation", "steering")
 """Strategies of planning, the default first."""

@@ -10,7 +10,9 @@ from typing import Protocol, TypeVar
 from flexneedle.errors import FlexneedleError, one_line
 from flexneedle.rig.devices.registry import OpenTracker, open_motors, open_tracker
 from flexneedle.rig.fit import fit_problems, queued, room_problems
+from flexneedle.rig.moves import uncertain
 from flexneedle.rig.ports import Clock, Motors, MotorSetup, MotorState
+from flexneedle.rig.speeds import kept, step_time
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.rig import Axis, RigFile
@@ -87,12 +89,24 @@ def _identity(device: object) -> str:
 def _of_file(rig: RigFile) -> Iterator[Finding]:
     for name, distance in queued(rig):
         yield Finding(name, "queued motion", distance)
+    for name, speed in kept(rig):
+        yield Finding(name, "speed", speed)
 
 
 def _of_scenario(rig: RigFile, wanted: Wanted) -> list[Finding]:
     problems = fit_problems(rig, wanted.scenario, wanted.strategy)
     name = wanted.scenario.name
-    return [Finding("scenario", "fit", name, line) for line in problems] or [Finding("scenario", "fit", name)]
+    found = [Finding("scenario", "fit", name, line) for line in problems] or [
+        Finding("scenario", "fit", name)
+    ]
+    return [*found, _step(rig, wanted.scenario)]
+
+
+def _step(rig: RigFile, scenario: Scenario) -> Finding:
+    """How long the largest step takes: with a slow acceleration an insertion is slower than its scenario."""
+    way, planned = scenario.setup.max_advance_mm, scenario.setup.step_time
+    time = step_time(rig.axes.insertion, rig.loop, way, planned)
+    return Finding("insertion", "largest step", f"{way:g} mm in {time:.2g} s, planned for {planned:.2g} s")
 
 
 # Motors
@@ -185,7 +199,8 @@ def _at_rest(state: MotorState) -> str:
 
 
 def _position(axis: Axis, counts: float) -> str:
-    return f"{axis.shown(counts / axis.scale)} {axis.unit} ({counts:.10g} counts)"
+    slack = f", {uncertain(axis)}" if axis.backlash else ""
+    return f"{axis.shown(counts / axis.scale)} {axis.unit} ({counts:.10g} counts){slack}"
 
 
 def _beyond(axis: Axis, counts: float) -> str:
@@ -213,7 +228,8 @@ def _switch_problem(axis: Axis, state: MotorState) -> str:
 def _following(name: str, axis: Axis, state: MotorState) -> Finding:
     error = abs((state.commanded - state.position) / axis.scale)
     most = axis.max_error
-    rule = "" if error <= most else f"must be at most max_error_{axis.unit} ({axis.shown(most)})"
+    limit = f"must be at most max_error_{axis.unit} ({axis.shown(most)})"
+    rule = "" if error <= most else f"{limit}: free the axis; the next motion begins where it then is"
     return Finding(name, "commanded - measured", f"{axis.shown(error)} {axis.unit}", rule)
 
 

@@ -1,13 +1,15 @@
 """Whether a rig can do what a scenario needs, before anything is connected. Pure functions.
 
-An insertion starts where base and guide are when it begins, so that their soft limits must be as far apart as the
-travel that the scenario allows; the angle of the rotation is that of the needle, 0 or 180° at the start.
+An insertion starts where base and guide are when it begins. The base needs room for its advance from the tip to as far
+past the target as the needle may be, the guide for the travel that the scenario allows to either side; the angle of the
+rotation is that of the needle, 0 or 180° at the start.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
+from flexneedle.rig.start import needed
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import Problem, to_line
 from flexneedle.scenario.rig import Axis, LoopSettings, RigFile
@@ -20,13 +22,13 @@ _STILL = "steering"  # the strategy that moves neither guide nor base laterally
 class Need:
     """What a scenario needs of a linear axis.
 
-    key: of the scenario's largest travel, to one side (back = 0) or to both; travel, back, ahead: from the start (mm);
-    step_key, step: largest travel in a control step (mm); why: the axis is needed.
+    travel: largest, to the positive side, or to both (mm); reason: of it, for messages; step_key, step: largest travel
+    in a control step (mm); why: the axis is needed.
     """
 
     axis: str
-    key: str
     travel: float
+    reason: str
     step_key: str
     step: float
     why: str
@@ -43,15 +45,20 @@ class Need:
         return self.travel + self.back
 
 
-def needs(scenario: Scenario, strategy: str) -> tuple[Need, ...]:
-    """Return what a scenario needs of each linear axis, with the strategy of its plan."""
-    return (_insertion(scenario), *_guide(scenario, strategy), *_base(scenario, strategy))
+def needs(scenario: Scenario, strategy: str, advance: float) -> tuple[Need, ...]:
+    """Return what a scenario needs of each linear axis, with the strategy of its plan and this advance (mm)."""
+    return (_insertion(scenario, advance), *_guide(scenario, strategy), *_base(scenario, strategy))
+
+
+def _planned(scenario: Scenario, strategy: str) -> tuple[Need, ...]:
+    """What a scenario needs before its tip is measured."""
+    return needs(scenario, strategy, needed(scenario, scenario.target.depth_mm))
 
 
 def fit_problems(rig: RigFile, scenario: Scenario, strategy: str = "manipulation") -> list[str]:
     """Return one line for each thing that the scenario needs and the rig cannot; empty if the rig can all."""
     found = [
-        *(problem for need in needs(scenario, strategy) for problem in _linear(rig, scenario, need)),
+        *(problem for need in _planned(scenario, strategy) for problem in _linear(rig, scenario, need)),
         *_turning_base(scenario, strategy),
         *_rotation(rig, scenario),
         *_rate(rig, scenario),
@@ -63,13 +70,35 @@ def room_problems(
     rig: RigFile, scenario: Scenario, positions: Mapping[str, float], strategy: str = "manipulation"
 ) -> list[tuple[str, str]]:
     """Return axis and line for each axis from whose position (mm) the scenario's travel would pass a soft limit."""
+    return _rooms(rig, _planned(scenario, strategy), positions)
+
+
+def start_problems(
+    rig: RigFile, scenario: Scenario, positions: Mapping[str, float], strategy: str, advance: float
+) -> list[str]:
+    """Return one line for each axis that is beyond its soft limits (positions: mm or rad), or has no room from there
+    for an insertion with this advance of the base (mm)."""
+    outside = [(name, _outside(axis, positions[name])) for name, axis in rig.axes.items()]
+    found = [*outside, *_rooms(rig, needs(scenario, strategy, advance), positions)]
+    return [f"{name}: {line}" for name, line in found if line]
+
+
+def _rooms(rig: RigFile, needed: Iterable[Need], positions: Mapping[str, float]) -> list[tuple[str, str]]:
     axes = dict(rig.axes.items())
     return [
         (need.axis, line)
-        for need in needs(scenario, strategy)
+        for need in needed
         if need.axis in positions and need.axis in axes
         for line in _room(axes[need.axis], need, positions[need.axis])
     ]
+
+
+def _outside(axis: Axis, position: float) -> str:
+    low, high = axis.limits
+    if low - axis.tolerance <= position <= high + axis.tolerance:
+        return ""
+    limits = f"{axis.shown(low)} to {axis.shown(high)} {axis.unit}"
+    return f"at {axis.shown(position)} {axis.unit}: beyond the soft limits, {limits}: jog it back"
 
 
 def queued(rig: RigFile) -> list[tuple[str, str]]:
@@ -86,12 +115,12 @@ def _queued(axis: Axis, loop: LoopSettings) -> str:
     return f"{axis.shown(distance)} {unit} ({why})"
 
 
-def _insertion(scenario: Scenario) -> Need:
-    setup = scenario.setup
+def _insertion(scenario: Scenario, advance: float) -> Need:
+    setup, past = scenario.setup, scenario.guard.past_target_mm
     return Need(
         "insertion",
-        "setup.stroke_mm",
-        setup.stroke_mm,
+        advance,
+        f"the advance to guard.past_target_mm = {past:g} past the target is {advance:.6g} mm",
         "setup.max_advance_mm",
         setup.max_advance_mm,
         "the base advances",
@@ -104,8 +133,9 @@ def _guide(scenario: Scenario, strategy: str) -> Iterator[Need]:
     moved = 0 if strategy == _STILL else setup.moved_guide_axes
     why = f"the guide moves on {moved} axes" if moved > 1 else "the guide moves"
     for name in ("guide_y", "guide_z")[:moved]:
-        keys = "setup.max_guide_travel_mm", "setup.max_guide_step_mm"
-        yield Need(name, keys[0], setup.max_guide_travel_mm, keys[1], setup.max_guide_step_mm, why)
+        reason = f"setup.max_guide_travel_mm is {setup.max_guide_travel_mm:g}, to either side"
+        step = "setup.max_guide_step_mm", setup.max_guide_step_mm
+        yield Need(name, setup.max_guide_travel_mm, reason, *step, why)
 
 
 def _base(scenario: Scenario, strategy: str) -> Iterator[Need]:
@@ -114,8 +144,9 @@ def _base(scenario: Scenario, strategy: str) -> Iterator[Need]:
         return
     why = f"the base moves laterally with plan.base_sigma_mm = {sigma:g}"
     for name in ("base_y", "base_z")[: setup.axes]:
-        keys = "setup.max_base_travel_mm", "setup.max_base_step_mm"
-        yield Need(name, keys[0], setup.max_base_travel_mm, keys[1], setup.max_base_step_mm, why)
+        reason = f"setup.max_base_travel_mm is {setup.max_base_travel_mm:g}, to either side"
+        step = "setup.max_base_step_mm", setup.max_base_step_mm
+        yield Need(name, setup.max_base_travel_mm, reason, *step, why)
 
 
 def _linear(rig: RigFile, scenario: Scenario, need: Need) -> Iterator[Problem]:
@@ -129,11 +160,9 @@ def _linear(rig: RigFile, scenario: Scenario, need: Need) -> Iterator[Problem]:
 
 def _too_far(axis: Axis, need: Need) -> Iterator[Problem]:
     low, high = axis.limits
-    width = high - low
-    if need.width > width + _ROUNDING:
-        most, part = (width / 2, "half the width") if need.both else (width, "the width")
-        rule = f"must be at most {most:g}, {part} of axes.{need.axis}.range_mm ({low:g} to {high:g})"
-        yield Problem(need.key, need.travel, rule)
+    if need.width > high - low + _ROUNDING:
+        rule = f"must be at least {need.width:.6g} wide: {need.reason}"
+        yield Problem(f"axes.{need.axis}.range_mm", [low, high], rule)
 
 
 def _too_fast(axis: Axis, scenario: Scenario, need: Need) -> Iterator[Problem]:
@@ -154,9 +183,9 @@ def _room(axis: Axis, need: Need, position: float) -> Iterator[str]:
     low, high = axis.limits
     for end, travel, room in (("low", need.back, position - low), ("high", need.travel, high - position)):
         left = max(room, 0.0)
-        if travel > left + _ROUNDING:
+        if travel > left + axis.tolerance:
             limit = f"{left:.6g} mm to the {end} end of range_mm ({low if end == 'low' else high:g})"
-            yield f"at {position:.6g} mm, {limit}: {need.key} = {need.travel:g} needs more"
+            yield f"at {position:.6g} mm, {limit}: {need.reason}"
 
 
 def _turning_base(scenario: Scenario, strategy: str) -> Iterator[Problem]:

@@ -7,10 +7,10 @@ from math import isfinite
 
 from flexneedle.arguments import shown as text_of
 from flexneedle.errors import InputError
+from flexneedle.rig.supervisor.requested import homed_at, homing_reach, homing_speed
 from flexneedle.scenario.rig import Axis, RigFile
 
-JOG_SHARE = 0.2
-"""Speed of a jog as a share of the axis's largest (default)."""
+_SHARE = 0.2  # speed of a jog or a retraction as a share of the axis's largest, unless one is given
 
 _ROUNDING = 1e-9
 _DISTANCE = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z°]*)")
@@ -33,7 +33,9 @@ class Move:
 
     def __str__(self) -> str:
         at, unit = self.axis.shown, self.axis.unit
-        return f"{self.name}: from {at(self.start)} to {at(self.goal)} {unit}, at most at {at(self.speed)} {unit}/s"
+        way = f"from {at(self.start)} to {at(self.goal)} {unit} ({at(self.distance)} {unit})"
+        slack = f"; the start is {uncertain(self.axis)}" if self.axis.backlash else ""
+        return f"{self.name}: {way}, at most at {at(self.speed)} {unit}/s{slack}"
 
 
 @dataclass(frozen=True)
@@ -44,19 +46,48 @@ class Homing:
     axis: Axis
 
     def __str__(self) -> str:
-        axis, at = self.axis, f"{self.axis.shown(self.axis.at_home)} {self.axis.unit}"
+        axis = self.axis
+        home = _with_unit(axis, axis.at_home)
         if axis.to_home == 0:
-            return f"{self.name}: stays where it is, and its position is called {at}"
-        way = "positive" if axis.to_home > 0 else "negative"
-        switch = f"in its {way} direction to the {axis.home.replace('-', ' ')} switch"
-        most = f"at most at {axis.shown(axis.speed)} {axis.unit}/s"
-        return f"{self.name}: {switch}, {most}; the position there is called {at}"
+            return f"{self.name}: stays where it is, and its position is called {home}"
+        reach, back = homing_reach(axis), homed_at(axis) - axis.at_home
+        speed = f"at {_with_unit(axis, homing_speed(axis))}/s"
+        search = f"in its {_direction(reach)} direction to the {_switch(axis)}"
+        there = f"by at most {_with_unit(axis, abs(reach))} {speed}; the position there is called {home}"
+        off = f"in its {_direction(back)} direction by {_with_unit(axis, abs(back))} {speed}"
+        return f"{self.name}: {search}, {there}; then {off}, off the switch to {_with_unit(axis, homed_at(axis))}"
+
+
+def _direction(travel: float) -> str:
+    return "positive" if travel > 0.0 else "negative"
+
+
+def _switch(axis: Axis) -> str:
+    return f"{axis.home.replace('-', ' ')} switch"
+
+
+def _with_unit(axis: Axis, value: float) -> str:
+    return f"{axis.shown(value)} {axis.unit}"
+
+
+def uncertain(axis: Axis) -> str:
+    """Return by how much the position of an axis with backlash is uncertain before its first motion, in words."""
+    return f"uncertain by {_with_unit(axis, 0.5 * axis.backlash)} (half of backlash_{axis.unit})"
 
 
 def resting(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
     """Return one line for each axis: where it is (mm or rad, by name), and how fast it moves at most."""
     return [
-        f"{name}: at {axis.shown(positions[name])} {axis.unit}, moves at most at {axis.shown(axis.speed)} {axis.unit}/s"
+        f"{name}: at {_with_unit(axis, positions[name])}, moves at most at {_with_unit(axis, axis.speed)}/s"
+        + (f"; the start is {uncertain(axis)}" if axis.backlash else "")
+        for name, axis in rig.axes.items()
+    ]
+
+
+def switched_off(rig: RigFile, positions: Mapping[str, float]) -> list[str]:
+    """Return one line for each axis whose motor is switched off: where it is (mm or rad, by name)."""
+    return [
+        f"{name}: at {axis.shown(positions[name])} {axis.unit}, its motor will be switched off"
         for name, axis in rig.axes.items()
     ]
 
@@ -95,22 +126,42 @@ def jog(rig: RigFile, name: str, distance: str, position: float, speed: float | 
     return move
 
 
-def retraction(rig: RigFile, position: float, to_mm: float | None = None) -> Move | None:
-    """Return the motion of the base back to `to_mm`; without it to the lowest position, None if it is there.
+def withdrawn(rig: RigFile) -> float:
+    """Return where a retraction ends (mm): where homing leaves the base off a switch behind it, else its lowest
+    position."""
+    axis = rig.axes.insertion
+    return homed_at(axis) if axis.to_home < 0 else axis.limits[0]
 
-    Raises InputError if that is not backwards or beyond the soft limits.
+
+def retraction(
+    rig: RigFile, position: float, to_mm: float | None = None, speed: float | None = None
+) -> Move | None:
+    """Return the motion of the base back to `to_mm`; without it to where it is withdrawn, None if it is there.
+
+    speed: mm/s. Raises InputError if that is not backwards, beyond the soft limits or at the limit switch of the home,
+    or for a speed above the axis's.
     """
     axis = rig.axes.insertion
-    if to_mm is None and position - axis.limits[0] < 1.0 / abs(axis.scale):
+    if to_mm is None and position - withdrawn(rig) < 1.0 / abs(axis.scale):
         return None
-    goal = axis.limits[0] if to_mm is None else to_mm
-    move = _checked(Move("insertion", axis, position, goal, axis.speed))
+    goal = withdrawn(rig) if to_mm is None else to_mm
+    move = _checked(Move("insertion", axis, position, goal, _speed("insertion", axis, speed)))
+    _check_switch(axis, goal)
     if move.distance > -1.0 / abs(axis.scale):
         at = axis.shown(position)
         raise InputError(
             f"to {axis.shown(goal)} mm: must be below {at} mm, where the insertion axis is: it only retracts"
         )
     return move
+
+
+def _check_switch(axis: Axis, goal: float) -> None:
+    """Raise InputError for a goal (mm) at which an axis may be at the limit switch behind it, its home."""
+    least = axis.at_home + axis.max_error
+    if axis.to_home < 0 and goal < least - _ROUNDING:
+        at = axis.shown
+        why = f"the {_switch(axis)} is at {at(axis.at_home)} mm, and max_error_mm is {at(axis.max_error)}"
+        raise InputError(f"to {at(goal)} mm: must be at least {at(least)} mm: {why}")
 
 
 def homings(rig: RigFile, names: Iterable[str]) -> list[Homing]:
@@ -128,7 +179,7 @@ def homings(rig: RigFile, names: Iterable[str]) -> list[Homing]:
 
 def _speed(name: str, axis: Axis, given: float | None) -> float:
     if given is None:
-        return JOG_SHARE * axis.speed
+        return _SHARE * axis.speed
     speed = given * axis.size
     if not 0.0 < speed <= axis.speed * (1.0 + _ROUNDING):
         rule = f"must be above 0 and at most {axis.shown(axis.speed)}, speed_{axis.unit}_s of {name}"

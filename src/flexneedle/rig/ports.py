@@ -101,12 +101,23 @@ class MotorSetup:
     disabled: str = ""
 
 
+@dataclass(frozen=True)
+class MotorPaces:
+    """The smallest and largest speed (counts/s) and acceleration (counts/s²) that a controller takes."""
+
+    speeds: tuple[float, float]
+    accelerations: tuple[float, float]
+
+
 class Motors(Protocol):
     """The motors of a rig by channel. It knows counts and channels, neither needles nor plans.
 
     No call takes longer than the reply timeout of the device. Each raises DriverError if the device cannot be reached
     or refuses the command; the message has the device's reason. For `rig check` a driver may have `identity`, one line
-    that names the controller and its firmware, and `setup()`, which returns a `MotorSetup` by channel.
+    that names the controller and its firmware, and `setup()`, which returns a `MotorSetup` by channel. It should have
+    `address`, one line that names the device on this machine, by which one program at a time moves it; without it the
+    driver's kind and settings in the rig file do. It may have `paces`, a `MotorPaces`: a rig file with another speed or
+    acceleration is refused when the motors are opened.
     """
 
     def read(self) -> Mapping[str, MotorState]:
@@ -130,7 +141,7 @@ class Motors(Protocol):
         ...
 
     def power(self, channel: str, on: bool) -> None:
-        """Switch a motor at rest on or off. Switched on, it is held where it is."""
+        """Switch a motor at rest on or off. Switched on from off, it is held where it is, its commanded position."""
         ...
 
     def reconnect(self) -> None:

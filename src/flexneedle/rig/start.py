@@ -4,7 +4,7 @@ import math
 
 from flexneedle.errors import RigError
 from flexneedle.scenario.model import Scenario
-from flexneedle.types import Plan, Point
+from flexneedle.types import Point
 
 _SDS = 3.0  # standard deviations of the start that a tip may be off
 
@@ -33,12 +33,21 @@ def _place(point: Point) -> str:
     return ", ".join(f"{one:.1f}" for one in point) + " mm"
 
 
-def deepest(scenario: Scenario, plan: Plan, tip: float | None) -> float:
-    """Advance (mm) of the base at which a straight needle is as far past the plan's target as it may be.
+def deepest(scenario: Scenario, target: float, tip: float | None) -> float:
+    """Advance (mm) of the base at which a straight needle is as far past a target at this depth (mm) as it may be.
 
-    tip: its measured depth at the start (mm); None: that of a virtual needle, which begins within three standard
-    deviations of the scenario's.
+    tip: its measured depth at the start (mm); None: that of a needle which begins within three standard deviations of
+    the scenario's.
     """
     start = scenario.setup.start_tip_x - _SDS * scenario.control.start_axial_sd_mm if tip is None else tip
-    way = plan.target[0] + scenario.guard.past_target_mm - start
-    return way * math.sqrt(1.0 + abs(scenario.entry.slope) ** 2)
+    return (target + scenario.guard.past_target_mm - start) * _stretch(scenario)
+
+
+def needed(scenario: Scenario, target: float, tip: float | None = None) -> float:
+    """Advance (mm) of the base for which an insertion needs room: as `deepest`, within the scenario's stroke."""
+    return min(deepest(scenario, target, tip), scenario.setup.stroke_mm * _stretch(scenario))
+
+
+def _stretch(scenario: Scenario) -> float:
+    """Length of the insertion axis for each mm along x."""
+    return math.sqrt(1.0 + abs(scenario.entry.slope) ** 2)

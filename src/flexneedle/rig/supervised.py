@@ -12,8 +12,8 @@ import numpy as np
 
 from flexneedle.errors import DriverError, RigError
 from flexneedle.estimation.estimate import Estimate
-from flexneedle.rig.fit import fit_problems
-from flexneedle.rig.start import checked_start, deepest
+from flexneedle.rig.fit import fit_problems, start_problems
+from flexneedle.rig.start import checked_start, deepest, needed
 from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.rig.supervisor.messages import Done, Expectation, Report, Task
 from flexneedle.rig.virtual import Rig, to_stage
@@ -220,6 +220,20 @@ class SupervisedDriver:
         self._supervisor.stop()
 
 
+def start_advance(supervisor: Supervisor, scenario: Scenario, plan: Plan, *, dry: bool = False) -> float:
+    """How far the base may advance (mm) for a plan, from where it is and the tip is measured now.
+
+    dry: the needle is a virtual one. Raises RigError for a tip or an axis from which the insertion cannot begin.
+    """
+    supervisor.read()  # measurements before may be of a needle that somebody has moved since
+    measured = checked_start(scenario, supervisor.tip(scenario.control.hold_limit_s))
+    depth, tip = plan.target[0], None if dry else measured[0]
+    need = needed(scenario, depth, tip)
+    if problems := start_problems(supervisor.rig, scenario, supervisor.positions, plan.strategy, need):
+        raise RigError(*problems)
+    return deepest(scenario, depth, tip)
+
+
 def check_fit(rig: RigFile, scenario: Scenario, strategy: str) -> None:
     """Raise RigError, one line for each problem, if the rig cannot do what the scenario needs with such a plan."""
     if problems := fit_problems(rig, scenario, strategy):
@@ -233,8 +247,8 @@ def supervised(
     """Open a rig, arm it, roll the needle as the plan begins, and give its ports. watchers: are given its ticks.
 
     Positions of the axes at this moment are those at the start of the plan. dry: motors are read and never moved.
-    Raises RigError if the rig does not fit the scenario, DriverError or RunError if a device fails, StoppedError if it
-    is stopped.
+    Raises RigError if the rig does not fit the scenario or has no room for the insertion from where its axes are,
+    DriverError or RunError if a device fails, StoppedError if it is stopped.
     """
     settings = scenario.tracker
     if rig.registration is not None:
@@ -251,9 +265,10 @@ def supervised(
     )
     watchers.ticks.started = task.started
     with Supervisor(task, watchers.report) as supervisor:
+        # What cannot begin is refused before anybody is asked.
+        start_advance(supervisor, scenario, plan, dry=dry)
         watchers.opened(supervisor)
-        tip = checked_start(scenario, supervisor.tip(scenario.control.hold_limit_s))
-        supervisor.arm(deepest(scenario, plan, None if dry else tip[0]))
+        supervisor.arm(start_advance(supervisor, scenario, plan, dry=dry))
         if rig.axes.rotation is not None:
             supervisor.move_to("rotation", plan.roll)
         if scenario.monitor.enabled and scenario.monitor.references:

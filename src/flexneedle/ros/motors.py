@@ -4,6 +4,7 @@ Targets are sent as a stream of set points that move at the limited speed, so th
 the stream does. Acceleration is left to the controller of the joints.
 """
 
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -58,6 +59,12 @@ class RosMotors:
 
     def __exit__(self, *_exception: object) -> None:
         self.close()
+
+    @property
+    def address(self) -> str:
+        """Domain and topic of the targets."""
+        topic = self._profile.publish.joint_targets
+        return f"ROS domain {os.environ.get('ROS_DOMAIN_ID') or 0}, {topic.topic if topic else ''}"
 
     def read(self) -> Mapping[str, MotorState]:
         """State of every channel; it also sends the set points of a motion that is under way."""

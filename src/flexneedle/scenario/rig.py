@@ -171,7 +171,8 @@ class LinearAxis(Axis):
     home_mm: Coordinate = 0.0
     """Position of the axis at its home."""
     backlash_mm: NonNegative = 0.0
-    """Lost motion when the motor reverses, made up for."""
+    """Lost motion when the motor reverses. Each command makes up for it from the end of its first motion on; until then
+    the position is uncertain by half of it."""
     max_error_mm: Positive | None = None
     """Largest difference of commanded and measured position; beyond it the rig stops with a fault. Not set: the way of
     40 ms at `speed_mm_s`, at most 0.2 mm, at least four times the usual tolerance."""
@@ -232,7 +233,8 @@ class RotaryAxis(Axis):
     home_deg: Coordinate = 0.0
     """Angle of the axis at its home."""
     backlash_deg: NonNegative = 0.0
-    """Lost motion when the motor reverses, made up for."""
+    """Lost motion when the motor reverses. Each command makes up for it from the end of its first motion on; until then
+    the angle is uncertain by half of it."""
     max_error_deg: Positive | None = None
     """Largest difference of commanded and measured angle; beyond it the rig stops with a fault. Not set: the angle of
     40 ms at `speed_deg_s`, at most 5°, at least four times the usual tolerance."""

@@ -10,7 +10,9 @@ import pytest
 from bench_rig import Clock, Motors, Tracker, rig
 from flexneedle.errors import DriverError, InputError, RigError, RunError
 from flexneedle.rig.devices.registry import DRIVERS, TRACKERS, open_motors, open_tracker
+from flexneedle.rig.ports import MotorPaces
 from flexneedle.scenario.own import resolved
+from galil_peer import peer
 
 PROJECT = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
 
@@ -54,6 +56,12 @@ def managed(_settings, clock):
 
 def halves(_settings, _clock):
     return Halves()
+
+
+def paced(_settings, channels):
+    paced.made = motors = Motors(channels)
+    motors.paces = MotorPaces((500.0, 10_000.0), (1024.0, 200_000.0))
+    return motors
 
 
 def lists(_settings, _about):
@@ -247,6 +255,59 @@ def test_settings_that_a_device_refuses_are_reported_with_its_kind():
     )
     line = message(open_tracker, found, Clock())
     assert line == "tracker parts:refuses_in_one_line: /dev/tty9: no such port"
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        (
+            {"axes__insertion__counts_per_mm": 300.0},  # 30,000 counts/s², and 3000 counts/s
+            None,
+        ),
+        (
+            {"axes__insertion__acceleration_mm_s2": 1.02},
+            "axes.insertion.acceleration_mm_s2 = 1.02: must be at least 1.024: the controller takes 1024 counts/s² "
+            "and more",
+        ),
+        (
+            {"axes__guide_y__counts_per_mm": 3.0, "axes__guide_y__acceleration_mm_s2": 341.0},
+            "axes.guide_y.speed_mm_s = 5.0: must be at least 166.666667: the controller takes 500 counts/s and more\n"
+            "axes.guide_y.acceleration_mm_s2 = 341.0: must be at least 341.333334: the controller takes 1024 "
+            "counts/s² and more",
+        ),
+        (
+            {"axes__insertion__speed_mm_s": 10.5},
+            "axes.insertion.speed_mm_s = 10.5: must be at most 10: the controller takes 10000 counts/s and less",
+        ),
+        (
+            {"axes__rotation__acceleration_deg_s2": 2400.0, "axes__rotation__speed_deg_s": 50.0},
+            "axes.rotation.acceleration_deg_s2 = 2400.0: must be at most 2000: the controller takes 200000 "
+            "counts/s² and less",
+        ),
+    ],
+    ids=str,
+)
+def test_speeds_and_accelerations_that_the_controller_does_not_take_are_refused(changes, line):
+    slower = {"axes__rotation__speed_deg_s": 90.0, "axes__guide_y__counts_per_mm": 500.0}
+    found = rig(driver={"kind": "parts:paced"}, **(slower | changes))
+    if line is None:
+        open_motors(found)
+        return
+    assert message(open_motors, found) == line
+    assert paced.made.closed
+    assert paced.made.calls == []
+
+
+def test_an_acceleration_below_the_least_of_a_galil_is_refused_when_it_is_opened():
+    with peer() as device:
+        galil = {"kind": "galil", "address": f"127.0.0.1:{device.port}", "reply_timeout_ms": 1000}
+        open_motors(rig(driver=galil, axes__insertion__acceleration_mm_s2=1.024)).close()
+        line = message(open_motors, rig(driver=galil, axes__insertion__acceleration_mm_s2=1.023))
+        assert not [one for one in device.lines if one.startswith(("AC", "DC", "SP", "SH"))]
+    assert line == (
+        "axes.insertion.acceleration_mm_s2 = 1.023: must be at least 1.024: the controller takes 1024 counts/s² "
+        "and more"
+    )
 
 
 def test_a_device_that_does_not_reply_is_no_error_of_the_file():

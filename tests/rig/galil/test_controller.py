@@ -242,6 +242,32 @@ def test_a_motor_that_is_off_does_not_move_and_its_position_follows_the_encoder(
     assert value(device, "RPA") == value(device, "TPA") == 77
 
 
+def blocked_and_freed(*lines):
+    """A motor that did not move, stopped with a position error of 500 counts, after lines and when it is free again."""
+    device = switched_on("SPA=2000")
+    device = replace(device, axes=(replace(device.axes[0], fault="stall"), *device.axes[1:]))
+    device = advanced(after(device, "PRA=500", "BGA")[0], 2000)
+    assert (value(device, "TPA"), value(device, "TEA")) == (0, 500)
+    device = after(device, *lines)[0]
+    return replace(device, axes=(replace(device.axes[0], fault="follows"), *device.axes[1:]))
+
+
+def test_a_motor_that_comes_free_jumps_to_its_commanded_position():
+    device = blocked_and_freed()
+    assert 0 < value(advanced(device, 5), "TPA") < 500
+    assert value(advanced(device, 300), "TPA") == 500
+
+
+@pytest.mark.parametrize("line", ["MOA;SHA", "MOA"])
+def test_a_motor_that_was_switched_off_and_on_is_held_where_it_is(line):
+    device = advanced(blocked_and_freed(line), 300)
+    assert (value(device, "TPA"), value(device, "RPA"), value(device, "TEA")) == (0, 0, 0)
+
+
+def test_switching_on_a_motor_that_is_on_leaves_its_position_error():
+    assert value(advanced(blocked_and_freed("SHA"), 300), "TPA") == 500
+
+
 @settings(deadline=None, derandomize=True, max_examples=300)
 @given(st.lists(st.text(alphabet="ABCDEGHIJKLMOPRSTVX=?,;-_ .0123456789\x12\x16é", max_size=30), max_size=8))
 def test_no_line_does_harm(lines):

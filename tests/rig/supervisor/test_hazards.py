@@ -93,12 +93,20 @@ def test_a_line_that_fails_at_rest_after_a_fault_is_opened_again_before_anything
     bench.tick(4)
     bench.core.request(say.Reset())
     assert isinstance(bench.sent[-1], say.Refused)
-    assert not bench.reports[-1].reached
+    assert not bench.reports[-1].at_rest
     bench.stage.lost = False
     bench.tick(20)
     assert ("reconnect",) in bench.stage.calls
     bench.core.request(say.Reset())
     assert bench.core.state is State.IDLE
+
+
+def test_a_driver_that_leaves_a_motor_out_is_a_fault(bench):
+    read = bench.stage.read
+    bench.stage.read = lambda: {channel: state for channel, state in read().items() if channel != "C"}
+    bench.tick(2)
+    assert bench.core.state is State.FAULT
+    assert "no state of channel C" in bench.core.why
 
 
 @pytest.mark.parametrize("how", ["stop", "fault"])

@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from flexneedle.rig.moves import homings
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.machine import State
 from stages import Bench, rig_file
@@ -28,6 +29,23 @@ def test_an_axis_finds_its_switch_calls_it_its_home_and_moves_into_its_range(hom
     bench.armed()
     bench.core.request(say.Go(2, "guide_y", 0.0, 5.0))
     assert bench.until(2).why == ""
+
+
+def test_a_search_moves_as_it_is_announced():
+    rig = rig_file(guide_y={"home": "forward-limit", "home_mm": -15.5})
+    (announced,) = homings(rig, ["guide_y"])
+    assert str(announced) == (
+        "guide_y: in its negative direction to the forward limit switch, by at most 33 mm at 1 mm/s; the position "
+        "there is called -15.5 mm; then in its positive direction by 1.1 mm at 1 mm/s, off the switch to -14.4 mm"
+    )
+    bench = Bench(rig).armed()
+    bench.stage.motors["C"].high = 7000.0  # counts, 500 a mm
+    bench.core.request(say.Home(1, "guide_y"))
+    assert bench.until(1, most=20_000).why == ""
+    assert [call[2] for call in bench.stage.calls if call[0] == "set_speed"] == pytest.approx([500.0, 500.0])
+    at = [report.axes["guide_y"].position for report in bench.reports]
+    assert min(at) == pytest.approx(-15.5, abs=0.1)
+    assert at[-1] == pytest.approx(-14.4, abs=2e-3)
 
 
 def test_an_axis_is_at_home_where_it_is():

@@ -1,6 +1,7 @@
 """The supervisor in a process of its own: its ticks, and what happens when it or its client is killed."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -158,6 +159,26 @@ def test_a_supervisor_that_is_killed_is_an_error(supervisor):
     os.kill(supervisor.pid, signal.SIGKILL)
     with pytest.raises(DriverError, match="the supervisor has ended: it was killed"):
         supervisor.wait(5.0)
+
+
+def test_motors_are_moved_by_one_program_at_a_time(tmp_path):
+    """The second one is refused before it sends anything; the end of the first, however it ends, releases them."""
+    file = tmp_path / "calls"
+    of_motors = {"driver": "stages:noting_motors", "file": str(file), "address": str(tmp_path)}
+    first = Supervisor(task(**of_motors))
+    with first:
+        holder = re.escape(f"{tmp_path}: in use by pid {os.getpid()} (")
+        with pytest.raises(DriverError, match=f"^{holder}.*: end it first$"):
+            Supervisor(task(**of_motors))
+        assert not file.exists()
+        with Supervisor(replace(task(**of_motors), dry=True)) as dry:
+            assert dry.report.state is State.IDLE
+        with Supervisor(task(**(of_motors | {"address": "another"}))):
+            pass
+        os.kill(first.pid, signal.SIGKILL)
+        until(lambda: ended(first.pid))
+        with Supervisor(task(**of_motors)) as second:
+            second.arm()
 
 
 def test_a_device_that_does_not_open_is_the_reason():

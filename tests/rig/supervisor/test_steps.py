@@ -172,6 +172,22 @@ def test_lost_motion_is_made_up_for_on_reversal():
     assert max(goals) == pytest.approx(-500.0 * (0.0 - 0.1), abs=1.0)
 
 
+@pytest.mark.parametrize("side", [1, -1])
+def test_before_the_first_motion_a_position_is_uncertain_by_half_the_backlash_and_after_it_is_not(side):
+    """Each command begins anew: where the axis rests after a motion to either side, and what it then is taken to be."""
+    bench = Bench(rig_file(guide_y={"backlash_mm": 0.2}))
+    axis = 3.0
+    motor = bench.stage.motors["C"]
+    motor.position = motor.commanded = motor.target = -500.0 * (axis + 0.1 * side)  # pushed from that side
+    bench.tick(2)
+    found = bench.armed().position("guide_y")
+    assert abs(found - axis) == pytest.approx(0.1)
+    bench.core.request(say.Go(1, "guide_y", 5.0, 2.0))
+    assert bench.until(1).why == ""
+    assert motor.position / -500.0 - 0.1 == pytest.approx(5.0, abs=2e-3), "the axis, pushed by its motor"
+    assert bench.position("guide_y") == pytest.approx(5.0, abs=2e-3)
+
+
 def test_a_second_step_is_refused_while_one_is_under_way(bench):
     bench.core.request(step(1))
     bench.core.request(step(2))

@@ -139,7 +139,7 @@ def test_after_a_stop_nothing_moves_until_the_rig_is_reset_and_armed(bench, stat
     bench.core.request(step(2))
     bench.core.request(say.Arm(10.0))
     assert [type(one) for one in bench.sent[-2:]] == [say.Refused, say.Refused]
-    assert bench.sent[-1].why == "arm: refused while stopped: the keyboard; accepted: stop, fault, reset"
+    assert bench.sent[-1].why == "arm: refused while stopped: the keyboard; accepted: stop, fault, reset, off"
     bench.core.request(say.Reset())
     assert bench.core.state is State.IDLE
     bench.core.request(say.Arm(10.0))

@@ -1,4 +1,4 @@
-"""Devices whose errors, whatever they are, name them: a driver or tracker of a user may raise anything."""
+"""Devices whose errors, whatever they are, name them: a driver or tracker of a user may raise and return anything."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,7 +8,9 @@ from traceback import extract_tb
 from typing import Any
 
 from flexneedle.errors import DriverError, FlexneedleError
-from flexneedle.scenario.problems import unexpected
+from flexneedle.rig.devices.answers import Answers, Rule, text
+from flexneedle.scenario.own import a_kind_of
+from flexneedle.scenario.problems import printable, unexpected
 
 _NONE = object()
 
@@ -27,10 +29,13 @@ def errors_named(name: str) -> Iterator[None]:
 
 
 class Guarded:
-    """A device, of which all calls and attributes raise errors of this package only. name: of the device."""
+    """A device, of which all calls and attributes raise errors of this package only, and return what they should.
 
-    def __init__(self, name: str, device: Any) -> None:
-        self._name, self._device = name, device
+    name: of the device; owner: its class; answers: what it has to return. Raises DriverError for anything else.
+    """
+
+    def __init__(self, name: str, owner: str, device: Any, answers: Answers) -> None:
+        self._name, self._owner, self._device, self._answers = name, owner, device, answers
 
     def __getattr__(self, part: str) -> Any:
         """A part of the device, guarded. Raises AttributeError for one that it has not."""
@@ -38,8 +43,26 @@ class Guarded:
             value = getattr(self._device, part, _NONE)
         if value is _NONE:
             raise AttributeError(part)
-        return partial(self._call, part, value) if callable(value) else value
+        if part in self._answers.texts:
+            return self._checked(part, text, value)
+        if callable(value):
+            return partial(self._call, part, value)
+        if part in self._answers.methods:
+            raise self._wrong(part, f"must be a method, not {a_kind_of(value)}")
+        return value
 
     def _call(self, part: str, call: Any, *given: Any, **named: Any) -> Any:
         with errors_named(f"{self._name}: {part}"):
-            return call(*given, **named)
+            value = call(*given, **named)
+        rule = self._answers.methods.get(part)
+        return value if rule is None else self._checked(f"{part}()", rule, value)
+
+    def _checked(self, part: str, rule: Rule, value: Any) -> Any:
+        with errors_named(f"{self._name}: {part}"):
+            problem = rule(value)
+        if problem:
+            raise self._wrong(part, problem)
+        return value
+
+    def _wrong(self, part: str, problem: str) -> DriverError:
+        return DriverError(printable(f"{self._name}: {self._owner}.{part}: {problem}"))

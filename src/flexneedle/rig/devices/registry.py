@@ -7,22 +7,27 @@ invalid ones, and returns the device open and at rest. A package registers it un
     stage = "mylab.stage:open_stage"
 """
 
+import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol
 
-from flexneedle.errors import InputError, RigError
+from flexneedle.errors import FlexneedleError, InputError, RigError
+from flexneedle.rig.devices.answers import MOTORS, TRACKER
 from flexneedle.rig.devices.guarded import Guarded, errors_named
-from flexneedle.rig.ports import Clock, Motors, Tracker
+from flexneedle.rig.ports import Clock, MotorPaces, Motors, Tracker
 from flexneedle.scenario.own import a_kind_of, attribute, not_callable_with, resolved
-from flexneedle.scenario.problems import printable
-from flexneedle.scenario.rig import Part, RigFile
+from flexneedle.scenario.problems import Problem, printable, to_line
+from flexneedle.scenario.rig import Axis, Part, RigFile
 from flexneedle.types import Frame
 
 DRIVERS, TRACKERS = "flexneedle.drivers", "flexneedle.trackers"
 """Groups of entry points."""
+
+_SHOWN = 1e6  # digits of a limit in a message
 
 MotorsFactory = Callable[[Mapping[str, Any], Sequence[str]], Motors]
 """Makes the motors of a driver from its settings and the channels of the rig's axes."""
@@ -41,9 +46,9 @@ class OpenTracker(Tracker, Protocol):
 def open_motors(rig: RigFile) -> Motors:
     """Return the motors of a rig, connected, at rest.
 
-    Raises RigError for an unknown driver, one that cannot be imported or lacks a part of the port, and for settings
-    that it refuses; DriverError if the controller cannot be reached, and for any other error of the driver, then and
-    in each of its calls.
+    Raises RigError for an unknown driver, one that cannot be imported or lacks a part of the port, for settings that it
+    refuses, and for speeds and accelerations that its controller does not take; DriverError if the controller cannot be
+    reached, and for any other error of the driver, then and in each of its calls.
     """
     channels = tuple(axis.channel for _, axis in rig.axes.items())
     factory = _factory("driver", DRIVERS, rig.driver, ("settings", "channels"))
@@ -51,8 +56,49 @@ def open_motors(rig: RigFile) -> Motors:
     with errors_named(name):
         made = _made("driver", rig.driver, lambda: factory(rig.driver.settings, channels))
         _check_parts("driver", rig.driver, made, parts_of(Motors))
-    motors: Motors = Guarded(name, made)
+    motors: Motors = Guarded(name, type(made).__name__, made, MOTORS)
+    try:
+        with errors_named(name):
+            _check_paces(rig, getattr(motors, "paces", None))
+    except FlexneedleError:
+        motors.close()
+        raise
     return motors
+
+
+def address_of(part: Part, motors: Motors) -> str:
+    """Return what names the motors on this machine: the `address` of a driver that has one, else kind and settings."""
+    given: str = getattr(motors, "address", "")
+    return given or f"{part.kind} {json.dumps(part.settings, sort_keys=True, default=str)}"
+
+
+def _check_paces(rig: RigFile, paces: MotorPaces | None) -> None:
+    if problems := [to_line(one) for one in _pace_problems(rig, paces)]:
+        raise RigError(*problems)
+
+
+def _pace_problems(rig: RigFile, paces: MotorPaces | None) -> Iterator[Problem]:
+    """Speeds and accelerations that the controller would refuse at the first motion."""
+    if paces is None:
+        return
+    for name, axis in rig.axes.items():
+        for key, per, limits in (("speed", "s", paces.speeds), ("acceleration", "s2", paces.accelerations)):
+            value = getattr(axis, key)
+            if rule := _pace_rule(axis, value, limits, per.replace("2", "²")):
+                yield Problem(f"axes.{name}.{key}_{axis.unit}_{per}", float(axis.shown(value)), rule)
+
+
+def _pace_rule(axis: Axis, value: float, limits: tuple[float, float], per: str) -> str:
+    """The rule that a speed or an acceleration (mm or rad, and s) breaks, or "". limits: in counts."""
+    (least, most), counts = limits, abs(axis.scale)
+    file = _SHOWN / (counts * axis.size)
+    if value * counts < least:
+        limit = math.ceil(least * file) / _SHOWN  # so that the value in the message is taken
+        return f"must be at least {limit:.12g}: the controller takes {least:.12g} counts/{per} and more"
+    if value * counts > most:
+        limit = math.floor(most * file) / _SHOWN
+        return f"must be at most {limit:.12g}: the controller takes {most:.12g} counts/{per} and less"
+    return ""
 
 
 def open_tracker(rig: RigFile, clock: Clock) -> OpenTracker:
@@ -64,7 +110,9 @@ def open_tracker(rig: RigFile, clock: Clock) -> OpenTracker:
     name = _name("tracker", rig.tracker)
     with errors_named(name):
         made = _made("tracker", rig.tracker, lambda: factory(rig.tracker.settings, clock))
-        tracker: OpenTracker = Guarded(name, _closable(rig.tracker, made))
+        opened = _closable(rig.tracker, made)
+    owner = type(opened.tracker if isinstance(opened, _Entered) else opened).__name__
+    tracker: OpenTracker = Guarded(name, owner, opened, TRACKER)
     return tracker
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from flexneedle.errors import DriverError
 from flexneedle.rig.ports import Clock, Motors, MotorState
-from flexneedle.rig.supervisor.checks import at_home, rests
+from flexneedle.rig.supervisor.checks import at_home, misplaced, rests
 from flexneedle.rig.supervisor.drives import Drive
 from flexneedle.rig.supervisor.messages import AxisState
 from flexneedle.rig.supervisor.motion import Leg, leg_of, positions
@@ -111,11 +111,43 @@ class RigAxes:
         with self._reached():
             self.before, self.newest = self.newest, self._read()
 
-    def power_on(self) -> None:
-        """Switch all motors on."""
+    def power_on(self) -> str:
+        """Switch all motors on, and read them; return what else was changed, or "".
+
+        A motor that is on, and rests away from where its controller has it, is switched off before: switched on again,
+        it is held where it is.
+        """
+        changed = []
         with self._reached():
             for drive in self.drives.values():
+                if self._is_misplaced(drive):
+                    self._motors.power(drive.axis.channel, False)
+                    off = drive.shown(abs(drive.error(self.state(drive))))
+                    changed.append(
+                        f"{drive.name}: was {off} from its commanded position, now held where it is"
+                    )
                 self._motors.power(drive.axis.channel, True)
+        self.read()
+        return "; ".join(changed)
+
+    def _is_misplaced(self, drive: Drive) -> bool:
+        """Whether a motor is on, and rests too far from where its controller has it."""
+        state, before = self.state(drive), self.before.states[drive.axis.channel]
+        return state.on and rests(drive, state, before) and misplaced(drive, state)
+
+    def power_off(self) -> None:
+        """Switch all motors off, the others also where one cannot be; raise DriverError with all problems."""
+        problems = {}
+        for name, drive in self.drives.items():
+            try:
+                self._motors.power(drive.axis.channel, False)
+            except DriverError as error:
+                problems[name] = f"{name}: {error}"
+        self.read()
+        on = (name for name, drive in self.drives.items() if self.state(drive).on)
+        problems = {name: f"{name}: the motor is still on" for name in on} | problems
+        if problems:
+            raise DriverError("; ".join(problems.values()))
 
     def call_home(self, name: str) -> None:
         """Call the present position of an axis its home."""
@@ -161,6 +193,10 @@ class RigAxes:
     def _read(self) -> Reading:
         begun = self._clock.now()
         states = dict(self._motors.read())
+        if missing := [
+            drive.axis.channel for drive in self.drives.values() if drive.axis.channel not in states
+        ]:
+            raise DriverError(f"the driver reports no state of channel {', '.join(missing)}")
         return Reading(states, 0.5 * (begun + self._clock.now()))
 
     @contextmanager

@@ -106,6 +106,11 @@ def rest_problem(drive: Drive, state: MotorState, goal: float) -> str:
     return ""
 
 
+def misplaced(drive: Drive, state: MotorState) -> bool:
+    """Whether a motor at rest is further from where its controller has it than the checks at rest allow."""
+    return abs(drive.error(state)) > min(drive.axis.max_error, _STILL * drive.axis.tolerance)
+
+
 def arrived(drive: Drive, state: MotorState, goal: float) -> bool:
     """Whether a motor is at rest within the tolerance of its goal (counts)."""
     return not state.moving and abs((state.position - goal) / drive.axis.scale) <= drive.axis.tolerance

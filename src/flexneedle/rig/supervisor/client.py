@@ -49,6 +49,7 @@ class Supervisor:
         self._answers: dict[int, say.Done | say.Refused] = {}
         self._measurements: deque[Measurement] = deque(maxlen=_MOST_KEPT)
         self._number = 0
+        self._sent = -1  # requests; the task, which is sent first, is none
         ours, theirs = socket.socketpair()
         command = [sys.executable, "-m", f"{__package__}.process", str(theirs.fileno())]
         self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL)
@@ -144,20 +145,40 @@ class Supervisor:
 
     # Requests
 
-    def arm(self, deepest: float = inf) -> None:
-        """Switch the motors on; deepest: largest advance (mm) from here. Raises StoppedError after a stop."""
-        self._ask(say.Arm(deepest), State.ARMED)
+    def arm(self, deepest: float = inf) -> str:
+        """Switch the motors on; deepest: largest advance (mm) from here. Raises StoppedError after a stop.
+
+        A motor at rest that is more than its largest error from its commanded position is held where it is: it is
+        switched off and on again. Returns a note of that, or "".
+        """
+        refused = None
+        try:
+            self._ask(say.Arm(deepest))
+        except RefusedError as error:
+            refused = error
+        report = self.report
+        self._check(report.state, report.why)
+        if refused is not None:
+            raise refused
+        return report.why
 
     def reset(self) -> None:
-        """Leave the states stopped and fault."""
-        self._ask(say.Reset(), State.IDLE)
+        """Leave the states stopped and fault. It is refused while motors move: `stop` returns when they rest."""
+        self._ask(say.Reset())
 
     def stop(self, who: str = "the controller") -> None:
-        """Stop all motors, and return when they rest."""
+        """Stop all motors, and return when they rest, so that a reset is accepted."""
         if self._ended is not None:
             return
-        self._send(say.Stop(who))
-        self._wait(lambda: self._at_rest(), _END_S, "the motors do not come to rest", stopped=True)
+        sent = self._send(say.Stop(who))
+        self._wait(lambda: self._stopped(sent), _END_S, "the motors do not come to rest", stopped=True)
+
+    def off(self) -> None:
+        """Stop all motors, and switch them off. Raises DriverError, with the reason, if one is still on."""
+        self.stop("rig off")
+        self._ask(say.Off())
+        if any(axis.motor.on for axis in self.report.axes.values()):
+            raise DriverError(self.report.why)
 
     def request_stop(self, who: str) -> None:
         """Request that all motors stop, without waiting for it. It may be called in any thread, and at any time.
@@ -227,33 +248,26 @@ class Supervisor:
         self._check(answer.state, answer.why)
         return answer
 
-    def _ask(self, request: say.Request, wanted: State) -> None:
+    def _ask(self, request: say.Request) -> None:
+        """Have a request acted on, and return with the report of it. Raises RefusedError if it is refused."""
         self._answers.pop(0, None)
-        self._send(request)
-        armed = wanted is State.ARMED
-
-        def answered() -> bool:
-            state = self.report.state
-            return 0 in self._answers or state is wanted or (armed and state is State.FAULT)
-
-        self._wait(answered, _END_S, f"not {wanted}", stopped=True)
-        refused = self._answers.pop(0, None)
-        if isinstance(refused, say.Refused):
-            if armed:
-                self._check(refused.state, refused.cause)
+        sent = self._send(request)
+        self._wait(lambda: self.report.requests >= sent, _END_S, "no answer to a request", stopped=True)
+        if isinstance(refused := self._answers.pop(0, None), say.Refused):
             raise RefusedError(refused.why)
-        if armed:
-            self._check(self.report.state, self.report.why)
 
     # Waiting
 
-    def _send(self, message: Any, *, lost: bool = False) -> None:
+    def _send(self, message: Any, *, lost: bool = False) -> int:
+        """Send a message; return how many requests were sent with it."""
         try:
             with self._sending:
                 self._connection.send(message)
+                self._sent += 1
         except OSError:
             if not lost:
                 raise self._end() from None
+        return self._sent
 
     def _end(self) -> DriverError:
         """The error after the supervisor's end: its reason alone, such as that of a device, if the rig did not open."""
@@ -307,10 +321,10 @@ class Supervisor:
         if state is State.STOPPED:
             raise StoppedError(f"stopped: {why}")
 
-    def _at_rest(self) -> bool:
+    def _stopped(self, sent: int) -> bool:
+        """Whether the rig has acted on these requests, and its motors rest."""
         report = self.report
-        moving = any(axis.motor.moving for axis in report.axes.values())
-        return report.state in (State.STOPPED, State.FAULT) and report.reached and not moving
+        return report.requests >= sent and report.at_rest and report.state in (State.STOPPED, State.FAULT)
 
     # The thread
 

@@ -41,7 +41,7 @@ class Supervisor:
         self._axes, self._tip = RigAxes(task.rig, motors, clock), TrackedTip(task, tracker, now)
         self._motion: Motion | None = None
         self._stopping: Stopping | None = None  # until the motors rest
-        self._deepest = 0.0
+        self._deepest, self._requests = 0.0, 0
 
     @property
     def at_rest(self) -> bool:
@@ -53,12 +53,15 @@ class Supervisor:
     def request(self, request: say.Request) -> None:
         """Act on a message of the client."""
         self._heard = self._clock.now()
+        self._requests += 1
         match request:
             case say.Stop(who):
                 self.stop(who)
             case say.Reset():
                 if self._allowed(Event.RESET):
                     self._enter(Event.RESET)
+            case say.Off():
+                self._off()
             case say.Arm(deepest):
                 self._arm(deepest)
             case say.Step():
@@ -82,8 +85,12 @@ class Supervisor:
 
     def _allowed(self, event: Event, number: int = 0) -> bool:
         """Whether the state accepts an event and nothing moves; else the request is refused with the reason."""
-        moving = self._motion is not None or self._stopping is not None
-        return self._possible(refusal(self.state, event, self.why, moving=moving), number)
+        return self._possible(refusal(self.state, event, self.why, moving=self._busy), number)
+
+    @property
+    def _busy(self) -> bool:
+        """Whether a motion or a stop is under way."""
+        return self._motion is not None or self._stopping is not None
 
     def _possible(self, problem: str, number: int = 0) -> bool:
         """Whether a request has no problem; else it is refused."""
@@ -101,8 +108,7 @@ class Supervisor:
         if not self._allowed(Event.ARM):
             return
         try:
-            self._axes.power_on()
-            self._axes.read()
+            changed = self._axes.power_on()
         except DriverError as error:
             self._unreachable(str(error))
             return
@@ -112,7 +118,16 @@ class Supervisor:
             return
         self._axes.take_positions()
         self._deepest = at["insertion"] + deepest
-        self._enter(Event.ARM)
+        self._enter(Event.ARM, changed)
+
+    def _off(self) -> None:
+        if not self._allowed(Event.OFF):
+            return
+        try:
+            self._axes.power_off()
+        except DriverError as error:
+            self._enter(Event.FAULT, str(error))
+            self._unreachable(str(error))
 
     def _step(self, step: say.Step) -> None:
         if self.state is State.HOLDING and self._stopping is not None:
@@ -175,8 +190,8 @@ class Supervisor:
         """What the last tick found, with the measurements since the last report."""
         axes, tip = self._axes, self._tip
         leg = None if self._motion is None or self._stopping is not None else self._motion.leg
-        found = axes.shown(leg), tip.take(), tip.status, not axes.lost
-        return say.Report(self._ticked_at, self.state, self.why, *found, late, work, missed)
+        found = axes.shown(leg), tip.take(), tip.status, not self._busy
+        return say.Report(self._ticked_at, self.state, self.why, *found, late, work, missed, self._requests)
 
     def _check_ticks(self, seconds: float) -> None:
         """Ticks were late: the motors have stopped, and after long nothing goes on by itself."""

@@ -30,6 +30,7 @@ class Event(StrEnum):
     STOP = "stop"  # keyboard, signal, ROS, or no heartbeat
     FAULT = "fault"  # a device failed, or did not do what it was commanded
     RESET = "reset"
+    OFF = "off"  # motors are switched off
 
 
 TABLE: dict[tuple[State, Event], State] = {
@@ -48,6 +49,8 @@ TABLE: dict[tuple[State, Event], State] = {
     (State.HOLDING, Event.STEP): State.INSERTING,
     (State.STOPPED, Event.RESET): State.IDLE,
     (State.FAULT, Event.RESET): State.IDLE,
+    (State.STOPPED, Event.OFF): State.STOPPED,
+    (State.FAULT, Event.OFF): State.FAULT,
     **{(state, Event.STOP): State.STOPPED for state in State if state is not State.FAULT},
     **{(state, Event.FAULT): State.FAULT for state in State},
     (State.FAULT, Event.STOP): State.FAULT,

@@ -6,6 +6,7 @@ Positions of axes are in mm or rad, times in s on the run's clock.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from flexneedle.rig.devices.lock import this_program
 from flexneedle.rig.ports import MotorState
 from flexneedle.rig.supervisor.machine import State
 from flexneedle.rig.tracking.registration import Rigid
@@ -20,7 +21,8 @@ class Task:
 
     started: zero of the run's clock on the monotonic clock (s); lateral_axes: of the needle; to_stage: map from the
     tracker's frame to that of the insertion; tip_offset: from the sensor to the tip (mm); stale_after: age (s) above
-    which a reading is stale; dry: motors are read, and never moved; tracked: whether the tracker is opened.
+    which a reading is stale; dry: motors are read, and never moved; tracked: whether the tracker is opened;
+    client: the program that the motors are held for, for the message to another one.
     """
 
     rig: RigFile
@@ -32,6 +34,7 @@ class Task:
     stale_after: float
     dry: bool = False
     tracked: bool = True
+    client: str = field(default_factory=this_program)
 
 
 @dataclass(frozen=True)
@@ -105,11 +108,16 @@ class Reset:
 
 
 @dataclass(frozen=True)
+class Off:
+    """Switch all motors off, after a stop."""
+
+
+@dataclass(frozen=True)
 class Close:
     """Stop, and end the supervisor."""
 
 
-Request = Heartbeat | Arm | Step | Go | Home | Stop | Reset | Close
+Request = Heartbeat | Arm | Step | Go | Home | Stop | Reset | Off | Close
 
 
 # From the supervisor
@@ -158,10 +166,11 @@ class Refused:
 class Report:
     """What one tick found.
 
-    time: of the tick (s); state, why: of the rig, and the reason of a stop, hold or fault; axes: by name;
-    measurements: since the last report, oldest first; tracker: its status; reached: whether the motors could be read;
-    late, work: how much later than scheduled the tick began, and how long it took (s); missed: ticks left out since the
-    start.
+    time: of the tick (s); state, why: of the rig, and the reason of a stop, hold or fault, or what arming has changed;
+    axes: by name; measurements: since the last report, oldest first; tracker: its status; at_rest: whether no motion
+    and no stop is under way; late, work: how much later than scheduled the tick began, and how long it took (s);
+    missed: ticks left out since the start; requests: how many the rig had acted on, so that a client can wait for what
+    its request has changed.
     """
 
     time: float
@@ -170,10 +179,11 @@ class Report:
     axes: Mapping[str, AxisState] = field(default_factory=dict)
     measurements: tuple[Measurement, ...] = ()
     tracker: str = ""
-    reached: bool = True
+    at_rest: bool = True
     late: float = 0.0
     work: float = 0.0
     missed: int = 0
+    requests: int = 0
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import gc
 import signal
 import socket
 import sys
-from contextlib import closing
+from contextlib import ExitStack, closing
 from multiprocessing.connection import Connection, wait
 from queue import SimpleQueue
 from threading import Thread
@@ -19,8 +19,9 @@ from typing import Any
 
 from flexneedle.errors import FlexneedleError, one_line
 from flexneedle.rig.devices.clock import WallClock
+from flexneedle.rig.devices.lock import held
 from flexneedle.rig.devices.priority import set_realtime_priority
-from flexneedle.rig.devices.registry import open_motors, open_tracker
+from flexneedle.rig.devices.registry import address_of, open_motors, open_tracker
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.core import Supervisor
 from flexneedle.rig.supervisor.dry import DryMotors
@@ -94,7 +95,9 @@ def _serve(connection: Connection, task: say.Task, outbox: Outbox) -> str:
     signals = _signals()
     clock = WallClock(start=task.started)
     tracked = open_tracker(task.rig, clock) if task.tracked else Untracked()
-    with closing(tracked) as tracker, closing(open_motors(task.rig)) as connected:
+    with closing(tracked) as tracker, closing(open_motors(task.rig)) as connected, ExitStack() as stack:
+        if not task.dry:  # before anything is sent that moves or stops a motor
+            stack.enter_context(held(address_of(task.rig.driver, connected), task.client))
         motors = DryMotors(connected, clock) if task.dry else connected
         core = Supervisor(task, motors, tracker, clock, outbox.put)
         set_realtime_priority()

@@ -6,6 +6,7 @@ from flexneedle.rig.supervisor.drives import Drive
 from flexneedle.rig.supervisor.messages import Go, Step
 from flexneedle.rig.supervisor.motion import Motion
 from flexneedle.rig.supervisor.trajectory import shortest
+from flexneedle.scenario.rig import Axis
 
 _BACK_OFF_SHARE = 0.02  # of the range an axis moves away from its limit switch
 _HOMING_SHARE = 0.1  # of the largest speed
@@ -30,20 +31,33 @@ def homing(number: int, drive: Drive, *, at_switch: bool) -> Motion:
     """The search of a home, with `home` the axis; without legs where there is none: it is here, or at the switch."""
     motion = Motion(number, [], unlimited=True)
     if drive.axis.to_home and not at_switch:
-        low, high = drive.axis.limits
-        motion.legs = [_slowly(drive, drive.axis.to_home * _HOMING_REACH * (high - low))]
+        motion.legs = [_slowly(drive, homing_reach(drive.axis))]
         motion.home = drive
     return motion
 
 
 def back_off(drive: Drive) -> tuple[Mapping[str, float], float]:
     """The leg of an axis from the limit switch of its home into its range, as (travel by axis, duration)."""
-    home, (low, high) = drive.axis.at_home, drive.axis.limits
-    inwards = min(max(home, low), high) - home
-    return _slowly(drive, inwards - drive.axis.to_home * _BACK_OFF_SHARE * (high - low))
+    return _slowly(drive, homed_at(drive.axis) - drive.axis.at_home)
+
+
+def homing_speed(axis: Axis) -> float:
+    """Speed (mm/s or rad/s) at which an axis searches its limit switch, and leaves it."""
+    return _HOMING_SHARE * axis.speed
+
+
+def homing_reach(axis: Axis) -> float:
+    """Largest travel (mm or rad, signed) of an axis to the limit switch of its home."""
+    low, high = axis.limits
+    return axis.to_home * _HOMING_REACH * (high - low)
+
+
+def homed_at(axis: Axis) -> float:
+    """Position (mm or rad) at which an axis rests after homing: inside its range, off the limit switch of its home."""
+    low, high = axis.limits
+    return min(max(axis.at_home, low), high) - axis.to_home * _BACK_OFF_SHARE * (high - low)
 
 
 def _slowly(drive: Drive, travel: float) -> tuple[Mapping[str, float], float]:
     """The leg of a travel (mm or rad) at the speed of homing."""
-    axis = drive.axis
-    return {drive.name: travel}, shortest(abs(travel), _HOMING_SHARE * axis.speed, axis.acceleration)
+    return {drive.name: travel}, shortest(abs(travel), homing_speed(drive.axis), drive.axis.acceleration)

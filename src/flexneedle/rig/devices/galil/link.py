@@ -43,6 +43,11 @@ class Link:
         self._closed = "not connected yet"
 
     @property
+    def address(self) -> str:
+        """IP address and port, by whichever name the host was given."""
+        return ":".join(map(str, self._address[:2]))
+
+    @property
     def is_open(self) -> bool:
         """Whether a line can be sent."""
         return self._socket is not None

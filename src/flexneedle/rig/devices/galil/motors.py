@@ -16,16 +16,15 @@ from flexneedle.rig.devices.galil.link import Link
 from flexneedle.rig.devices.galil.replies import LONGEST_LINE, GarbledError
 from flexneedle.rig.devices.galil.settings import AXES, GalilSettings, checked
 from flexneedle.rig.devices.galil.states import ABORTED, STOPPED, Channel, Report, report, seen
-from flexneedle.rig.ports import MotorSetup, MotorState
+from flexneedle.rig.ports import MotorPaces, MotorSetup, MotorState
 
 CONNECT_S = 2.0
 """Time for the first connection. A new one has to be there within the reply timeout."""
 
 _REVISION = "\x12\x16"  # Ctrl-R Ctrl-V
 _FARTHEST = 2_147_483_647
-_FASTEST = 15_000_000.0
-_LEAST_RATE, _LARGEST_RATE = 1024.0, 1_073_740_800.0
 _SPEED_STEP, _RATE_STEP = 2, 1024  # the controller rounds down to multiples, at its default sample time
+_PACES = MotorPaces((_SPEED_STEP, 15_000_000.0), (_RATE_STEP, 1_073_740_800.0))
 _SLOWING_S, _MARGIN_S = (
     0.5,
     0.05,
@@ -51,6 +50,9 @@ class GalilMotors:
     whose position is not measured, or a format of positions (PF) other than the default.
     """
 
+    paces = _PACES
+    """Speeds and accelerations that the controller takes, at its default sample time."""
+
     def __init__(self, settings: GalilSettings, channels: Sequence[str]) -> None:
         self._timeout = settings.reply_timeout_ms / 1e3
         self._tracks = settings.mode == "tracking"
@@ -63,6 +65,8 @@ class GalilMotors:
         self._stopping: float | None = None
         self.identity = ""
         """Model and revision of the firmware."""
+        self.address = self._link.address
+        """IP address and port."""
         self._connect(monotonic() + CONNECT_S)
 
     def __enter__(self) -> Self:
@@ -224,8 +228,8 @@ class GalilMotors:
         The deceleration is the acceleration; a controller refuses to change it during a motion to a position.
         """
         self._known(channel)
-        pace = _whole(f"{channel} speed", speed, _SPEED_STEP, _FASTEST, "counts/s")
-        rate = _whole(f"{channel} acceleration", acceleration, _LEAST_RATE, _LARGEST_RATE, "counts/s²")
+        pace = _whole(f"{channel} speed", speed, *_PACES.speeds, "counts/s")
+        rate = _whole(f"{channel} acceleration", acceleration, *_PACES.accelerations, "counts/s²")
         pace, rate = pace // _SPEED_STEP * _SPEED_STEP, rate // _RATE_STEP * _RATE_STEP
         commands = [f"SP{channel}={pace}"]
         if self._rates.pop(channel, None) != rate:

@@ -11,6 +11,7 @@ FAULTS = ("stall", "lag", "overshoot", "reversed", "limit")
 a limit switch."""
 
 _LAG_S = 0.15
+_SERVO_S = 0.02  # in which the servo of a motor that is free again makes up for its position error
 _OVERSHOOT = 0.2
 
 RUNNING, ARRIVED, FORWARD_LIMIT, REVERSE_LIMIT, STOPPED, ABORTED, ERROR_OFF = 0, 1, 2, 3, 4, 7, 8
@@ -194,4 +195,4 @@ def _followed(axis: Axis, before: Profile, after: Profile) -> float:
         return axis.encoder + (1.0 + _OVERSHOOT) * moved
     if axis.fault == "reversed":
         return axis.encoder - moved
-    return axis.encoder + moved
+    return axis.encoder + moved + (before.position - axis.encoder) * SAMPLE_S / _SERVO_S

@@ -1,0 +1,71 @@
+"""One program at a time moves a set of motors: a lock on their address, which ends with the process that holds it."""
+
+import fcntl
+import hashlib
+import os
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from flexneedle.errors import DriverError
+from flexneedle.scenario.problems import printable
+
+FOLDER = Path("/tmp")  # in which all users of a machine may make files; TMPDIR may be another one for each
+_LONGEST = 2000
+
+
+def this_program() -> str:
+    """Number and command of this process, for the one that holds motors for it."""
+    return printable(f"pid {os.getpid()} ({shlex.join(sys.argv)})")[:_LONGEST]
+
+
+@contextmanager
+def held(address: str, holder: str) -> Iterator[None]:
+    """Hold the motors at an address, which no other program may do meanwhile. holder: shown to that one.
+
+    The kernel releases them when this process ends, however it ends; the file stays, and means nothing by itself.
+    Raises DriverError, with the holder, if another program has them.
+    """
+    path = lock_file(address)
+    try:
+        descriptor = _opened(path)
+    except OSError as error:
+        raise DriverError(f"{path}: the lock of {address} cannot be opened: {error.strerror}") from None
+    try:
+        _lock(descriptor, address)
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, holder.encode(), 0)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def lock_file(address: str) -> Path:
+    """The file whose lock is that of an address."""
+    return FOLDER / f"flexneedle-{hashlib.sha256(address.encode()).hexdigest()[:16]}.lock"
+
+
+def _lock(descriptor: int, address: str) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        holder = os.pread(descriptor, _LONGEST, 0).decode(errors="replace") or "another program"
+        raise DriverError(f"{address}: in use by {printable(holder)}: end it first") from None
+
+
+def _opened(path: Path) -> int:
+    """A descriptor of the file, which is made for all users."""
+    flags = os.O_RDWR | os.O_NOFOLLOW
+    while True:
+        try:  # without O_CREAT, with which Linux refuses a file of another user (fs.protected_regular)
+            return os.open(path, flags)
+        except FileNotFoundError:
+            pass
+        try:
+            descriptor = os.open(path, flags | os.O_CREAT | os.O_EXCL)
+        except FileExistsError:
+            continue
+        os.fchmod(descriptor, 0o666)  # whatever the umask is
+        return descriptor

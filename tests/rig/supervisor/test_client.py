@@ -1,0 +1,80 @@
+"""The client waits for what its requests have changed, and takes no earlier report for it."""
+
+import os
+from multiprocessing.connection import Connection
+from threading import Thread
+
+import pytest
+
+from flexneedle.errors import RefusedError
+from flexneedle.rig.supervisor import client
+from flexneedle.rig.supervisor import messages as say
+from flexneedle.rig.supervisor.client import Supervisor
+from flexneedle.rig.supervisor.machine import State
+from stages import rig_file
+
+
+class Scripted:
+    """The supervisor's process in a thread. The rig was stopped long ago; another stop is acted on, and motors
+    rest, heartbeats of a waiting client later.
+    """
+
+    pid = 0
+
+    def __init__(self, _command, pass_fds, **_options):
+        self._line = Connection(os.dup(pass_fds[0]))
+        self._requests, self._next = 0, []
+        self._thread = Thread(target=self._serve)
+        self._thread.start()
+
+    def wait(self, _seconds):
+        self._thread.join()
+
+    def _report(self, requests, *, rests):
+        self._line.send(say.Report(0.0, State.STOPPED, "the test", requests=requests, at_rest=rests))
+
+    def _take(self):
+        request = self._line.recv()
+        self._requests += 1
+        return request
+
+    def _serve(self):
+        self._line.recv()
+        self._report(0, rests=True)
+        with self._line:
+            while not isinstance(request := self._take(), say.Close):
+                self._answer(request)
+            self._line.send(say.Ended())
+
+    def _answer(self, request):
+        match request:
+            case say.Stop():
+                self._report(self._requests - 1, rests=True)  # an earlier one, that was under way
+                self._next = [(self._requests, rests) for rests in (False, False, True)]
+            case say.Heartbeat() if self._next:
+                requests, rests = self._next.pop(0)
+                self._report(requests, rests=rests)
+            case say.Reset() if self._next:
+                self._line.send(say.Refused(0, "motors have not come to rest yet", State.STOPPED))
+                self._report(self._requests, rests=False)
+            case say.Reset():
+                self._line.send(say.Report(0.0, State.IDLE, requests=self._requests))
+
+
+@pytest.fixture
+def supervisor(monkeypatch):
+    monkeypatch.setattr(client.subprocess, "Popen", Scripted)
+    with Supervisor.of_operator(rig_file()) as made:
+        yield made
+
+
+def test_after_a_stop_a_reset_is_accepted(supervisor):
+    supervisor.stop()
+    supervisor.reset()
+    assert supervisor.report.state is State.IDLE
+
+
+def test_a_request_that_is_refused_has_the_reason(supervisor):
+    supervisor.request_stop("another thread")
+    with pytest.raises(RefusedError, match="motors have not come to rest yet"):
+        supervisor.reset()
