@@ -50,7 +50,7 @@ bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten
 rig-demo: setup  ## insertions on an emulated rig over both protocols in real time (N=1)
 	$(BIN)/python studies/rig_demo.py --insertions $(or $(N),1) --out $(or $(DIR),runs/rig-demo)
 
-rig-faults: setup  ## faults injected into running insertions on an emulated rig, 20 times each, and the table of docs/safety.md (hours)
+rig-faults: setup  ## faults injected into running insertions on an emulated rig, 20 times each, and the table of docs/safety.md (an hour and more)
 	$(BIN)/python studies/rig_faults.py --out $(or $(DIR),runs/rig-faults)
 
 rig-wall-clock: setup  ## 150 pairs of insertions on an emulated rig, each decision 0, 50 and 150 ms longer (hours)

@@ -37,7 +37,7 @@ from zlib import crc32
 
 import numpy as np
 import psutil
-from rig_trials import EmulatedRig, emulated_rig, ended, insertion, moved_after, rests, shipped_rig, witness
+from rig_trials import EmulatedRig, emulated_rig, ended, insertion, moved_between, rests, shipped_rig, witness
 
 import flexneedle
 from flexneedle.rig.emulator.coupled.truth import Truth
@@ -157,7 +157,7 @@ def stop(how: str, timing: int, out: Path) -> Row:
         _await_line(process, b"waits for an arm")
         with Operator() as operator:
             operator.publish("arm true")
-            sleep(max(0.0, rig.first_motion() + after - monotonic()))
+            sleep(max(0.0, rig.first_motion(process) + after - monotonic()))
             order = STOPS[how]
             sent = _killed(process.pid) if order is None else operator.publish(order)
             status, _, errors = ended(process)
@@ -199,8 +199,8 @@ def _judged(truth: Truth, sent: float, run: Row) -> Row:
         "speed_mm_s": float(at - before) / 0.02,
         "reported_ms": 1e3 * (reported - sent),
         "rest_ms": 1e3 * max(0.0, float(truth.time[1:][turned][-1]) - sent),
-        "moved_mm": moved_after(truth, sent),
-        "moved_after_mm": moved_after(truth, reported),
+        "moved_mm": moved_between(truth, sent),
+        "moved_after_mm": moved_between(truth, reported),
         "rests": rests(truth),
     }
 

@@ -1,13 +1,14 @@
 """Processes for studies of rigs: an emulated rig, an insertion on it, and a witness of the machine's own stalls."""
 
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.resources import files
@@ -45,6 +46,10 @@ class Lines:
             if monotonic() > deadline or not self._read(deadline):
                 raise RuntimeError(f"no {key}: {self.messages} {self._received!r}")
 
+    def wait(self, seconds: float) -> None:
+        """Wait for lines, at most for a time."""
+        self._read(monotonic() + seconds)
+
     def _read(self, deadline: float) -> bool:
         stream = self._process.stdout.fileno()
         if not select([stream], [], [], max(0.0, deadline - monotonic()))[0]:
@@ -71,16 +76,15 @@ class EmulatedRig:
         self.process.stdin.flush()
         return float(self.lines.until("done", 10.0, before)["time_s"])
 
-    def first_motion(self) -> float:
-        """Wait for the first motion; return its time (s, monotonic)."""
+    def first_motion(self, process: subprocess.Popen[bytes]) -> float:
+        """Wait for the first motion of an insertion; return its time (s, monotonic). Raises RuntimeError if it ends."""
         deadline = monotonic() + START_S
-        while monotonic() < deadline:
-            found = self.lines.until("event", START_S)
-            known = [one for one in self.lines.messages if one.get("event") == "first motion"]
-            if known:
-                return float(known[0]["time_s"])
-            self.lines.until("event", START_S, self.lines.messages.index(found) + 1)
-        raise RuntimeError("no motion")
+        while monotonic() < deadline and process.poll() is None:
+            moved = next((one for one in self.lines.messages if one.get("event") == "first motion"), None)
+            if moved is not None:
+                return float(moved["time_s"])
+            self.lines.wait(0.1)
+        raise RuntimeError(f"no motion: {ended(process, 0.0)}")
 
     def read_truth(self) -> Truth:
         """The true states so far."""
@@ -229,25 +233,35 @@ def resumed(
     missing = [task for task in tasks if not any(key(task).items() <= row.items() for row in kept)]
     file.parent.mkdir(parents=True, exist_ok=True)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    pool = ThreadPoolExecutor(workers)
-    try:
-        for done in as_completed([pool.submit(run, task) for task in missing]):
-            try:
-                row = done.result()
-            except RuntimeError as error:
-                print(error, file=sys.stderr, flush=True)
-                continue
-            with file.open("a") as opened:
-                opened.write(json.dumps(row) + "\n")
-            yield row, True
-    except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in psutil.Process().children(recursive=True):
+    with ThreadPoolExecutor(workers) as pool:
+        running = [pool.submit(run, task) for task in missing]
+        try:
+            for done in as_completed(running):
+                try:
+                    row = done.result()
+                except RuntimeError as error:
+                    print(error, file=sys.stderr, flush=True)
+                    continue
+                with file.open("a") as opened:
+                    opened.write(json.dumps(row) + "\n")
+                yield row, True
+        except BaseException:
+            _end(running)
+            raise
+
+
+def _end(running: Sequence[Future[Row]]) -> None:
+    """Cancel tasks, and end all processes below this one until no task runs: one may start another in between."""
+    for task in running:
+        task.cancel()
+    ended = set[psutil.Process]()
+    while not all(task.done() for task in running):
+        for process in set(psutil.Process().children(recursive=True)) - ended:
+            ended.add(process)
             with suppress(psutil.NoSuchProcess):
                 process.terminate()
-        raise
-    finally:
-        pool.shutdown()
+                process.resume()  # one that is stopped does not end
+        wait(running, 0.1)
 
 
 @dataclass
@@ -299,11 +313,11 @@ def watch() -> None:
         before = now
 
 
-def moved_after(truth: Truth, since: float) -> float:
-    """How far the base has moved (mm) after a time (s, monotonic)."""
-    base = truth.positions["insertion"]
-    after = base[truth.time >= since]
-    return float(np.abs(after - np.interp(since, truth.time, base)).max()) if len(after) else 0.0
+def moved_between(truth: Truth, since: float, until: float = math.inf, axis: str = "insertion") -> float:
+    """How far an axis has moved (mm, rad) from where it was at a time (s, monotonic) until another."""
+    places = truth.positions[axis]
+    after = places[(truth.time >= since) & (truth.time <= until)]
+    return float(np.abs(after - np.interp(since, truth.time, places)).max()) if len(after) else 0.0
 
 
 def rests(truth: Truth, seconds: float = 0.5, most: float = 0.005) -> bool:

@@ -1,105 +1,279 @@
-"""studies/rig_faults.py: what a trial counts as, and its table, of earlier trials, too. No insertion is run."""
+"""studies/rig_faults.py: what a trial counts as, by the states that its supervisor has recorded; cases, table, picture.
+
+No insertion is run.
+"""
 
 import json
+import os
+import re
+import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-STUDIES = Path(__file__).parents[1] / "studies"
-OLD = {
-    "group": "motors", "fault": "guide stalls", "timing": 0, "status": 1, "outcome": "failed", "reason": "", "why": "",
-    "state": "fault", "detection_s": 3.5, "motion_mm": 0.0, "rests": True, "errors": "",
-}  # fmt: skip
-NEW = OLD | {"timing": 1, "from_motion_s": 0.75}
-QUIET = OLD | {
-    "group": "computer", "fault": "clock set back by 1 h", "outcome": "done", "state": None, "detection_s": None,
-    "motion_mm": None,
-}  # fmt: skip
+from flexneedle.rig.emulator.coupled.truth import Truth
+from flexneedle.rig.fit import fit_problems
+from flexneedle.scenario.rig import load_rig
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
+import rig_faults as study
+from fault_cases import FIRST_WORLD, MOST_PATH_MM, case
+from fault_judging import Evidence, good, problems
+from fault_list import FAULTS
+from fault_report import draw, table
+from fault_trial import Trial
+from rig_trials import Lines
+
+BY_NAME = {fault.name: fault for fault in FAULTS}
+INJECTED = 10.0
+END = (20.0, "stopped", "the controller")
+MISSING = "missing: no reading for 0.2 s"
 
 
-def row(folder, *trials):
-    """The last cells of the row of these trials (detection, motion, as required), and the exit status of the study."""
-    (folder / "trials.jsonl").write_text("".join(f"{json.dumps(one)}\n" for one in trials))
-    name = trials[0]["fault"]
-    command = [sys.executable, STUDIES / "rig_faults.py", "--timings", "0", "--only", name, "--out", folder]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.stderr == ""
-    (line,) = [line for line in done.stdout.splitlines() if f"| {name} |" in line]
-    return [cell.strip() for cell in line.split("|")[-4:-1]], done.returncode
+def evidence(name, *states, outcome="done", moves=(), left=0, axis="insertion"):
+    """Of a fault at 10 s: states that the supervisor has entered, motions of the base (begin and end in s, mm)."""
+    time = np.arange(8.0, 23.0, 0.004)
+    base = sum((np.clip((time - a) / (b - a), 0.0, 1.0) * mm for a, b, mm in moves), np.zeros(len(time)))
+    positions = {"insertion": base, "rotation": np.zeros(len(time))}
+    recorded = [{"time_s": at, "state": state, "why": why} for at, state, why in states]
+    run = {"status": outcome, "timing": {"ticks": {"states": recorded}}}
+    truth = Truth(time, {}, positions, *[np.zeros(len(time))] * 5)
+    return Evidence(BY_NAME[name], axis, INJECTED, truth, run, "", left)
+
+
+def row(name, *states, **more):
+    found = evidence(name, (9.0, "inserting", ""), *states, **more)
+    return found.row() | {"group": found.fault.group, "fault": name, "axis": found.axis, "timing": 0}
+
+
+def wrong(name, *states, **more):
+    return problems(BY_NAME[name], row(name, *states, **more))
+
+
+OFF = (10.02, "fault", "insertion: the motor is off")
+HOLD, GO_ON = (10.1, "holding", MISSING), (10.7, "inserting", "")
+INTERRUPT = (10.02, "stopped", "signal SIGINT")
 
 
 @pytest.mark.parametrize(
-    ("trials", "shown", "status"),
+    ("name", "states", "outcome"),
     [
-        ([OLD], ["– (0.9)", "0.000", "1 of 1"], 0),  # it has not recorded the time
-        ([OLD, NEW], ["0.750 (0.9)", "0.000", "2 of 2"], 0),
-        ([NEW, NEW | {"from_motion_s": 0.95}], ["0.950 (0.9)", "0.000", "1 of 2"], 1),
-        ([NEW, NEW | {"from_motion_s": None, "state": None}], ["0.750 (0.9)", "0.000", "1 of 2"], 1),
+        ("motor off", [OFF], "failed"),
+        ("missing for 2 s", [HOLD, END], "held"),
+        ("missing for 0.5 s", [HOLD, GO_ON, END], "done"),
+        ("missing for 0.1 s", [END], "done"),
+        ("missing for 0.1 s", [HOLD, GO_ON, END], "done"),
+        ("decision of 0.5 s", [END], "done"),
+        ("clock set forward by 1 h", [END], "done"),
+        ("Ctrl-C", [INTERRUPT], "interrupted"),
+        ("disk full", [(10.4, "stopped", "the controller")], "held"),
+        ("guide stalls", [END], "done"),
+        ("controller killed", [], "running"),
+        ("supervisor killed", [], "failed"),
     ],
 )
-def test_a_stall_of_the_guide_has_the_time_since_its_motion_began(tmp_path, trials, shown, status):
-    assert row(tmp_path, *trials) == (shown, status)
+def test_the_required_reaction_is_good(name, states, outcome):
+    assert wrong(name, *states, outcome=outcome) == []
 
 
-def test_a_guide_that_does_not_move_again_need_not_be_detected(tmp_path):
-    resting = NEW | {"outcome": "done", "state": None, "from_motion_s": None}
-    assert row(tmp_path, resting) == (["– (0.9)", "0.000", "1 of 1"], 0)
+@pytest.mark.parametrize(
+    ("name", "states", "outcome", "problem"),
+    [
+        ("motor off", [END], "failed", "states: end"),
+        ("motor off", [], "failed", "states: none"),
+        ("motor off", [(10.02, "stopped", "insertion: the motor is off")], "failed", "states: stopped"),
+        ("motor off", [OFF], "interrupted", "outcome: interrupted"),
+        ("motor off", [(10.02, "fault", "guide_y: the motor is off")], "failed", "reason: guide_y"),
+        ("motor off", [OFF, (11.0, "idle", ""), (11.1, "armed", "")], "failed", "states: fault idle armed"),
+        ("missing for 2 s", [(10.1, "fault", MISSING)], "held", "states: fault"),
+        ("missing for 2 s", [END], "held", "states: end"),
+        ("missing for 2 s", [HOLD, GO_ON, END], "held", "states: holding inserting end"),
+        ("missing for 2 s", [(10.1, "holding", "jumped by 5 mm"), END], "held", "reason: jumped"),
+        ("missing for 0.5 s", [END], "done", "states: end"),
+        ("missing for 0.5 s", [HOLD, END], "done", "states: holding end"),
+        ("clock set forward by 1 h", [HOLD, GO_ON, END], "done", "states: holding inserting end"),
+        ("decision of 0.5 s", [HOLD, GO_ON, END], "done", "states: holding inserting end"),
+        ("Ctrl-C", [END], "interrupted", "states: end"),
+        ("Ctrl-C", [(10.02, "stopped", "no heartbeat")], "interrupted", "reason: no heartbeat"),
+        ("guide stalls", [(11.0, "fault", "guide_y: stalls")], "done", "outcome: done"),
+        ("supervisor killed", [OFF], "failed", "states: fault"),
+        ("motor off", [(10.25, *OFF[1:])], "failed", "detection: 0.25"),
+    ],
+)
+def test_another_state_reason_or_outcome_is_not(name, states, outcome, problem):
+    found = wrong(name, *states, outcome=outcome)
+    assert any(one.startswith(problem) for one in found), found
 
 
-def test_an_insertion_that_must_continue_is_neither_held_nor_stopped(tmp_path):
-    held = QUIET | {"state": "holding", "why": "missing: tip not measured (missing)", "detection_s": 0.1}
-    assert row(tmp_path, QUIET) == (["–", "–", "1 of 1"], 0)
-    assert row(tmp_path, QUIET, held) == (["–", "–", "1 of 2"], 1)
+def test_a_state_before_the_fault_is_no_reaction():
+    assert wrong("motor off", (9.9, *OFF[1:]), outcome="failed")[0] == "states: none"
 
 
-def test_a_gap_as_long_as_the_monitors_limit_may_be_a_hold(tmp_path):
-    gap = QUIET | {"group": "tracker", "fault": "missing for 0.1 s"}
-    held = gap | {"state": "holding", "why": "missing: tip not measured (missing)", "detection_s": 0.1}
-    assert row(tmp_path, gap, held) == (["–", "–", "2 of 2"], 0)
+def test_a_roll_that_stalls_is_a_fault_of_the_rotation():
+    stalled = (10.1, "fault", "rotation: the motor does not follow")
+    assert wrong("roll stalls", stalled, outcome="failed", axis="rotation") == []
+    assert wrong("roll stalls", OFF, outcome="failed", axis="rotation") == [f"reason: {OFF[2]}"]
 
 
-def judged(name, states, time, base):
-    """The result of a trial of a fault at 10 s, by its states and the base over time (s, mm)."""
-    script = (
-        "import json, sys; import numpy as np; import rig_faults as study\n"
-        "from flexneedle.rig.emulator.coupled.truth import Truth\n"
-        "name, states, time, base = json.load(sys.stdin)\n"
-        "none = np.zeros(len(time))\n"
-        "truth = Truth(np.array(time), {}, {'insertion': np.array(base)}, *[none] * 5)\n"
-        "(fault,) = [one for one in study._faults() if one.name == name]\n"
-        "run = {'status': 'done', 'timing': {'ticks': {'states': states}}}\n"
-        "print(json.dumps(study._judged(fault, 0, truth, 10.0, run, 0, '')))\n"
+def test_motion_after_detection_and_processes_that_are_left_are_not_good():
+    assert wrong("motor off", OFF, outcome="failed", moves=[(10.0, 10.4, 0.45)]) == []
+    moved = wrong("motor off", OFF, outcome="failed", moves=[(10.1, 10.4, 0.6)])
+    assert [one[:9] for one in moved] == ["motion: 0"]
+    still_moving = wrong("motor off", OFF, outcome="failed", moves=[(10.1, 25.0, 0.45)])
+    assert still_moving == ["no rest"]
+    assert wrong("controller killed", outcome="running", left=1) == ["processes left: 1"]
+
+
+def test_a_hold_ends_where_the_insertion_goes_on():
+    after = [(10.8, 11.8, 5.0)]
+    assert wrong("missing for 0.5 s", HOLD, GO_ON, END, moves=after) == []
+    assert wrong("missing for 0.5 s", HOLD, GO_ON, END, moves=[(10.2, 10.6, 2.0)]) != []
+
+
+def test_the_needle_rests_during_a_late_decision():
+    assert wrong("decision of 0.5 s", END, moves=[(10.6, 11.0, 1.0)]) == []
+    assert wrong("decision of 0.5 s", END, moves=[(10.1, 10.4, 1.0)]) != []
+
+
+def test_the_time_of_a_guide_that_stalls_counts_from_the_last_motion_of_the_base():
+    steps = [(9.0 + 0.3 * k, 9.2 + 0.3 * k, 1.0) for k in range(11)]  # the last one at 12 s
+    found = row(
+        "guide stalls",
+        (12.75, "fault", "guide_y has not arrived"),
+        outcome="failed",
+        moves=steps,
+        axis="guide_y",
     )
-    given = json.dumps((name, states, list(time), list(base)))
-    done = subprocess.run(
-        [sys.executable, "-c", script], input=given, cwd=STUDIES, capture_output=True, text=True, check=True
-    )
-    return json.loads(done.stdout)
-
-
-def state(time, name, why=""):
-    return {"time_s": time, "state": name, "why": why}
-
-
-END = state(20.0, "stopped", "the controller")
-
-
-def test_the_time_counts_from_the_last_motion_of_the_base():
-    """Steps of 0.2 s and 1 mm, each 0.3 s after the last, and none after the one at 12 s."""
-    time = np.arange(9.0, 21.0, 0.004)
-    steps = np.clip((time[:, None] - np.arange(9.0, 12.01, 0.3)) / 0.2, 0.0, 1.0).sum(axis=1)
-    found = judged("guide stalls", [state(12.75, "fault", "the motors have not arrived"), END], time, steps)
-    assert found["state"] == "fault"
     assert found["detection_s"] == pytest.approx(2.75)
     assert found["from_motion_s"] == pytest.approx(0.75, abs=0.005)
+    assert good(BY_NAME["guide stalls"], found)
+    assert not good(BY_NAME["guide stalls"], found | {"from_motion_s": 0.95})
 
 
-def test_the_end_of_an_insertion_is_no_detection_and_a_hold_is_one():
-    still = ([9.0, 21.0], [0.0, 0.0])
-    assert judged("missing for 0.1 s", [state(9.0, "inserting"), END], *still)["state"] is None
-    hold = state(10.1, "holding", "missing: tip not measured (missing)")
-    found = judged("missing for 0.1 s", [hold, state(10.2, "inserting"), END], *still)
-    assert (found["state"], found["from_motion_s"]) == ("holding", None)
+def test_what_the_needle_did_as_the_fault_was_injected():
+    assert row("motor off", OFF)["during"] == "rest"
+    assert row("motor off", OFF, moves=[(9.9, 10.1, 1.0)])["during"] == "advance"
+
+
+def test_every_reaction_names_states_that_a_supervisor_can_record():
+    for fault in FAULTS:
+        for pattern in fault.reaction.outcomes:
+            assert set(re.findall("[a-z]+", pattern)) <= {"holding", "inserting", "stopped", "fault", "end"}
+    assert len({(fault.group, fault.name) for fault in FAULTS}) == len(FAULTS)
+
+
+def test_cases_are_a_family_that_fits_the_rig():
+    cases, rig = [case(number) for number in range(20)], load_rig("emulated")
+    setups = [one.scenario.setup for one in cases]
+    assert [fit_problems(rig, one.scenario) for one in cases] == [[]] * 20
+    assert all(one.path_mm <= MOST_PATH_MM and one.scenario.setup.has_guide for one in cases)
+    assert sum(setup.axes == 2 for setup in setups) == 10
+    kinds = {(setup.guide_axes, setup.half_turns) for setup in setups if setup.axes == 2}
+    assert kinds == {(1, True), (1, False), (2, True), (2, False)}
+    worlds = [int(name.split()[1]) for one in cases if (name := one.scenario.name).startswith("World")]
+    assert len(set(worlds)) == 10
+    assert min(worlds) >= FIRST_WORLD
+    in_rolls = [one for one in cases if one.rolls]
+    assert len(in_rolls) == 6
+    assert {one.scenario.setup.axes for one in in_rolls} == {1, 2}
+    assert {one.scenario.setup.half_turns for one in in_rolls} == {True, False}
+
+
+def test_a_case_depends_on_its_number_alone():
+    case.cache_clear()
+    first = case(5)
+    case.cache_clear()
+    assert case(5).scenario.values() == first.scenario.values()
+    assert case(5).seed != case(6).seed
+
+
+def test_rolls_are_of_the_drivers_angles():
+    rng = np.random.default_rng(0)
+    assert case(2).roll(rng) == pytest.approx(np.pi)
+    angles = [case(5).roll(rng) for _ in range(100)]
+    assert np.pi / 3 <= min(map(abs, angles)) < max(map(abs, angles)) <= np.pi
+    assert min(angles) < 0.0 < max(angles)
+
+
+def test_in_rolls_the_rotation_is_faulty_and_some_faults_never_fall_in_one():
+    assert Trial(BY_NAME["motor off"], case(2)).axis == "rotation"
+    assert Trial(BY_NAME["motor off"], case(3)).axis == "insertion"
+    assert Trial(BY_NAME["stall"], case(2)).axis == "insertion"
+    assert Trial(BY_NAME["roll stalls"], case(3)).axis == "rotation"
+    assert Trial(BY_NAME["guide stalls"], case(2)).axis == "guide_y"
+
+
+def test_table_and_picture(tmp_path):
+    bad = row("motor off", END, outcome="failed")
+    rows = [row("motor off", OFF, outcome="failed"), bad, row("controller killed", outcome="running")]
+    lines = table(FAULTS, rows).splitlines()
+    assert lines[2] == "| motors | motor off | fault | failed | 0.020 (0.1) | 0.000 | 0.0 | 1 of 2 |"
+    assert lines[3] == "| computer | controller killed | stop | no record | – | 0.000 | 0.0 | 1 of 1 |"
+    assert lines[-1] == "3 faults, during: 0 an advance, 0 a roll, 3 a rest between two steps."
+    draw(FAULTS, rows, tmp_path / "drawn.png")
+    assert (tmp_path / "drawn.png").stat().st_size > 10_000
+
+
+def test_rows_that_are_there_are_not_run_again_and_those_of_another_insertion_are(
+    tmp_path, capsys, monkeypatch
+):
+    def run_trial(trial, **_):
+        return row(trial.fault.name, OFF, outcome="failed") | trial.key | {"seconds": 1.0}
+
+    monkeypatch.setattr(study, "run_trial", run_trial)
+    monkeypatch.setattr(study, "draw", lambda *_: None)
+    options = ["--only", "motor off", "--timings", "2", "--out", str(tmp_path)]
+    assert study.main(options) == 0
+    assert capsys.readouterr().err.count("ok motors") == 2
+    file = tmp_path / "rows.jsonl"
+    kept = [json.loads(line) for line in file.read_text().splitlines()]
+    file.write_text("".join(f"{json.dumps(one)}\n" for one in (kept[0], kept[1] | {"seed": 0})))
+    assert study.main(options) == 0
+    assert capsys.readouterr().err.count("ok motors") == 1
+
+
+INTERRUPTED = """
+import signal, subprocess, sys
+from pathlib import Path
+sys.path.insert(0, {studies!r})
+from rig_trials import resumed
+
+def run(task):
+    for _ in range(2):  # what a task starts after the interrupt ends, too
+        process = subprocess.Popen(["sleep", "600"])
+        if task == 1:
+            process.send_signal(signal.SIGSTOP)
+        print(process.pid, flush=True)
+        process.wait()
+    raise RuntimeError("ended")
+
+list(resumed(Path({file!r}), [1, 2, 3], run, 2, lambda task: {{"task": task}}))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_no_process_is_left_after_an_interrupt(tmp_path, number):
+    text = INTERRUPTED.format(studies=str(Path(study.__file__).parent), file=str(tmp_path / "rows.jsonl"))
+    study_of = subprocess.Popen(
+        [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    first = [int(study_of.stdout.readline()) for _ in range(2)]
+    study_of.send_signal(number)
+    out, _ = study_of.communicate(timeout=30)
+    pids = [*first, *map(int, out.split())]
+    assert len(pids) == 4
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+    assert not (tmp_path / "rows.jsonl").exists()
+
+
+def test_a_rig_waits_for_lines_only_so_long():
+    with subprocess.Popen(["sleep", "600"], stdout=subprocess.PIPE) as process, ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(Lines(process).wait, 0.01)
+        assert waiting.result(timeout=10.0) is None
+        process.kill()

@@ -1,0 +1,149 @@
+"""Whether a trial was as required: what the supervisor has recorded, the outcome, the times, and the true motions."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import degrees, inf
+from typing import Any
+
+import numpy as np
+from fault_list import ENDED_HELD, RESTED, Fault
+from rig_trials import moved_between, rests
+
+from flexneedle.rig.emulator.coupled.truth import Truth
+
+MOTION_MM = 0.5
+"""The most that the base may move after detection."""
+END = "end"
+"""The state of a rig whose controller has stopped it, at the end of an insertion."""
+_BY_CONTROLLER = "the controller"  # who stops the motors then
+_PAUSE_S = 0.02  # of an axis between two motions; within one it is somewhere else after 4 ms
+_ROUNDING_S = 1e-3
+
+
+@dataclass(frozen=True)
+class State:
+    """A state that the supervisor has entered: when (s, monotonic), which, and why."""
+
+    time: float
+    name: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of a trial: the fault, the faulty axis, when it was injected (s, monotonic), the true states,
+    `run.json`, messages, and how many processes were left after it.
+    """
+
+    fault: Fault
+    axis: str
+    injected: float
+    truth: Truth
+    run: Mapping[str, Any]
+    errors: str
+    left: int = 0
+
+    def row(self) -> dict[str, Any]:
+        """All that the table, the picture and the judgement need, as plain values."""
+        states = entered(self.run, self.injected)
+        detection = next((one for one in states if one.name in self.fault.reaction.detected), None)
+        resumed = next((one.time for one in states if one.name == "inserting"), inf)
+        span = self._span(detection, resumed)
+        return {
+            "outcome": self.run.get("status", "none"),
+            "reason": self.run.get("reason", ""),
+            "states": " ".join(one.name for one in states),
+            "why": detection.why if detection else "",
+            "detection_s": detection.time - self.injected if detection else None,
+            "from_motion_s": self._from_motion(detection.time) if detection else None,
+            "motion_mm": None if span is None else self._moved("insertion", *span),
+            "rolled_deg": None if span is None else degrees(self._moved("rotation", *span)),
+            "during": self._during(),
+            "rests": rests(self.truth),
+            "left": self.left,
+            "errors": self.errors[-300:],
+        }
+
+    def _span(self, detection: State | None, resumed: float) -> tuple[float, float] | None:
+        """From when to when only the rest of a motion may move: from detection until the insertion is taken up again;
+        from the fault on if a process is killed and nothing is recorded; during a late decision. None: at no time.
+        """
+        if self.fault.reaction is RESTED:
+            return self.injected, self.injected + self.fault.decision_s
+        if detection is not None:
+            return detection.time, resumed
+        return (self.injected, inf) if "" in self.fault.reaction.outcomes else None
+
+    def _moved(self, axis: str, since: float, until: float) -> float:
+        return moved_between(self.truth, since, until, axis)
+
+    def _from_motion(self, time: float) -> float | None:
+        """Time since the base last began to move, and with it the guide, or should have; None if it has not."""
+        moved = self.truth.time[:-1][np.diff(self.truth.positions["insertion"]) != 0.0]
+        moved = moved[moved <= time]
+        begins = moved[np.diff(moved, prepend=-np.inf) > _PAUSE_S]
+        return float(time - begins[-1]) if len(begins) else None
+
+    def _during(self) -> str:
+        """What the needle did as the fault was injected."""
+        for axis, name in (("rotation", "roll"), ("insertion", "advance")):
+            if self._moved(axis, self.injected - _PAUSE_S, self.injected) > 1e-4:
+                return name
+        return "rest"
+
+
+def entered(run: Mapping[str, Any], since: float) -> Sequence[State]:
+    """The states that a supervisor has entered since a time, by its record; changes of the reason alone are none."""
+    ticks = (run.get("timing") or {}).get("ticks") or {}
+    return [one for one in _changes(ticks.get("states", ())) if one.time >= since - _ROUNDING_S]
+
+
+def _changes(states: Sequence[Mapping[str, Any]]) -> Iterator[State]:
+    before = ""
+    for one in states:
+        name = END if (one["state"], one["why"]) == ("stopped", _BY_CONTROLLER) else one["state"]
+        if name != before:
+            yield State(one["time_s"], name, one["why"])
+        before = name
+
+
+def good(fault: Fault, row: Mapping[str, Any]) -> bool:
+    """Whether a trial was as required."""
+    return not problems(fault, row)
+
+
+def problems(fault: Fault, row: Mapping[str, Any]) -> list[str]:
+    """What was not as required."""
+    reaction = fault.reaction
+    required = [
+        outcome for pattern, outcome in reaction.outcomes.items() if re.fullmatch(pattern, row["states"])
+    ]
+    checks = {
+        f"states: {row['states'] or 'none'}": required,
+        f"outcome: {row['outcome']}": not required or row["outcome"] in required,
+        f"reason: {row['why']}": row["detection_s"] is None or _is_because(fault, row),
+        f"detection: {detection_s(fault, row)}": _is_timely(fault, row),
+        f"motion: {row['motion_mm']} mm": row["motion_mm"] is None or row["motion_mm"] <= MOTION_MM,
+        "no rest": row["rests"],
+        f"processes left: {row['left']}": row["left"] == 0,
+    }
+    return [problem for problem, fine in checks.items() if not fine]
+
+
+def detection_s(fault: Fault, row: Mapping[str, Any]) -> float | None:
+    """Time to detection in a trial; None without one."""
+    found: float | None = row["from_motion_s" if fault.from_motion else "detection_s"]
+    return found
+
+
+def _is_because(fault: Fault, row: Mapping[str, Any]) -> bool:
+    return fault.reaction is ENDED_HELD or bool(re.search(fault.because.format(axis=row["axis"]), row["why"]))
+
+
+def _is_timely(fault: Fault, row: Mapping[str, Any]) -> bool:
+    """Whether it was detected in time. What shows only in a motion need not be, if there is none before the end."""
+    seconds = detection_s(fault, row)
+    if seconds is None:
+        return fault.within is None or (fault.from_motion and row["detection_s"] is None)
+    return fault.within is None or seconds <= fault.within

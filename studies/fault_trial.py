@@ -1,0 +1,238 @@
+"""One trial: an emulated rig of its own, an insertion on it, a fault at a random time, and what was recorded."""
+
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from math import degrees
+from pathlib import Path
+from signal import SIGCONT, SIGKILL, SIGSTOP
+from time import monotonic, sleep
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+import psutil
+from fault_cases import Case
+from fault_injections import Running, Signal
+from fault_judging import Evidence
+from fault_list import Fault
+from rig_trials import EmulatedRig, emulated_rig, ended, insertion
+
+from flexneedle.scenario.files import dump_scenario
+
+_EARLIEST_S = 0.2  # after the first advance
+_LATEST = 0.8  # of the shortest duration of the insertion
+_FIRST_STEP, _LAST_STEP = (
+    3,
+    0.7,
+)  # in which a decision is late or rolls; steps, and of the path (a step is 1 mm)
+_ROLL_SHARES = (0.1, 0.8)  # of the time of the roll at its speed, since the decision
+_STOPPED_S = 3.0  # for which a controller is stopped by SIGSTOP
+_LONGEST_S, _END_S, _REST_S = 60.0, 5.0, 0.6
+_CONTROLLER = '''"""The default controller, one of whose decisions takes long or rolls the needle."""
+
+import time
+from dataclasses import replace
+
+from flexneedle.control.methods import DEFAULT, METHODS
+
+_count = iter(range(10**6))
+
+
+def _decide(task, memory, estimate, rng):
+    late = next(_count) == {step}
+    if late and {seconds}:
+        print(time.monotonic(), file=open("marker", "w"))
+        time.sleep({seconds})
+    decision, memory = METHODS[DEFAULT].decide(task, memory, estimate, rng)
+    if late and {roll}:
+        print(time.monotonic(), file=open("marker", "w"))
+        decision = replace(decision, command=decision.command._replace(roll={roll}))
+    return decision, memory
+
+
+OWN = replace(METHODS[DEFAULT], name="own", decide=_decide)
+'''
+_UNFINISHED = '"status": "running"'
+_HEAD = 200  # characters of run.json, among which the status is
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A fault in a case, with its randomness: when it is injected."""
+
+    fault: Fault
+    case: Case
+
+    @property
+    def rolls(self) -> bool:
+        """Whether the fault falls in a roll."""
+        return self.fault.falls_in_roll(self.case.rolls)
+
+    @property
+    def axis(self) -> str:
+        """The axis that is faulty, if one is."""
+        return "rotation" if self.rolls else self.fault.axis
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """By which its row is found again: rows with the same values are of the same fault in the same insertion."""
+        scenario = self.case.scenario
+        return {
+            "group": self.fault.group,
+            "fault": self.fault.name,
+            "timing": self.case.number,
+            "scenario": scenario.name,
+            "target_mm": list(scenario.target.position),
+            "seed": self.case.seed,
+            "axis": self.axis,
+            "rolls": self.rolls,
+        }
+
+    def rng(self) -> np.random.Generator:
+        """Randomness of its time."""
+        return np.random.default_rng(
+            [self.case.seed, crc32(f"{self.fault.group} {self.fault.name}".encode())]
+        )
+
+
+def run_trial(trial: Trial, keep: Path | None = None) -> dict[str, Any]:
+    """Run one trial; return its row. keep: folder for the record of the insertion.
+
+    Raises RuntimeError if the insertion ends before the fault is injected, or a process of the rig does.
+    """
+    fault, case, rng = trial.fault, trial.case, trial.rng()
+    begun = monotonic()
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="faults-")))
+        setting = fault.injection.prepare(folder, stack)
+        (folder / "scenario.toml").write_text(dump_scenario(case.scenario))
+        roll = case.roll(rng) if trial.rolls else 0.0
+        options = _controller(trial, roll, folder, rng)
+        scenario = str(folder / "scenario.toml")
+        rig = stack.enter_context(emulated_rig(folder, scenario, case.seed))
+        options = ("--seed", str(case.seed), *options)
+        process = insertion(
+            rig.rig, scenario, setting.record, *options, environment=setting.environment, cwd=folder
+        )
+        stack.callback(_kill, process)
+        injected_at = _await_moment(trial, roll, process, rig, folder, rng)
+        controller = psutil.Process(process.pid)
+        others = tuple(controller.children(recursive=True))
+        injected = fault.injection.inject(Running(rig, folder, trial.axis, controller, others))
+        injected = injected_at if fault.decision_s else injected
+        _await_end(fault, process, injected, setting.record / "run.json")
+        _, printed, errors = ended(process, _END_S)
+        sleep(_REST_S)
+        if keep is not None and setting.record.exists():
+            name = f"{fault.group}-{fault.name}-{case.number}".replace(" ", "-")
+            shutil.copytree(setting.record, keep / name, dirs_exist_ok=True)
+        run = _recorded(setting.record, printed)
+        evidence = Evidence(
+            fault, trial.axis, injected, rig.read_truth(), run, errors, left=_ended_by_force(others)
+        )
+        row = trial.key | {"roll_deg": round(degrees(roll), 1)} | evidence.row()
+    return row | {"seconds": monotonic() - begun}
+
+
+def _controller(trial: Trial, roll: float, folder: Path, rng: np.random.Generator) -> tuple[str, ...]:
+    """Options of the insertion for a controller of its own, where one decision is late or rolls."""
+    if not (roll or trial.fault.decision_s):
+        return ()
+    step = int(rng.integers(_FIRST_STEP, int(_LAST_STEP * trial.case.path_mm)))
+    values = {"step": step, "seconds": trial.fault.decision_s, "roll": roll}
+    (folder / "own.py").write_text(_CONTROLLER.format(**values))
+    return ("--controller", "own:OWN")
+
+
+def _await_moment(
+    trial: Trial,
+    roll: float,
+    process: subprocess.Popen[bytes],
+    rig: EmulatedRig,
+    folder: Path,
+    rng: np.random.Generator,
+) -> float:
+    """Wait until the fault is due; return that time (s, monotonic): of a late decision its beginning."""
+    begun = _first_advance(rig, process)
+    if trial.fault.decision_s:
+        return _marked(folder / "marker", process)
+    if roll:
+        shares = rng.uniform(*_ROLL_SHARES)
+        due = _marked(folder / "marker", process) + shares * trial.case.roll_s(roll)
+    else:
+        due = begun + float(rng.uniform(_EARLIEST_S, _LATEST * trial.case.shortest_s))
+    while monotonic() < due:
+        _check_running(process)
+        sleep(min(0.05, max(0.0, due - monotonic())))
+    return due
+
+
+def _first_advance(rig: EmulatedRig, process: subprocess.Popen[bytes]) -> float:
+    """Wait until the base moves; before that the needle may be rolled, and the field measured."""
+    rig.first_motion(process)
+    while True:
+        truth = rig.read_truth()
+        moving = truth.time[truth.positions["insertion"] != truth.positions["insertion"][0]]
+        if len(moving):
+            return float(moving[0])
+        _check_running(process)
+        sleep(0.1)
+
+
+def _marked(marker: Path, process: subprocess.Popen[bytes]) -> float:
+    """Wait for the time that the controller writes."""
+    while not (marker.exists() and marker.read_text().endswith("\n")):
+        _check_running(process)
+        sleep(0.005)
+    return float(marker.read_text())
+
+
+def _check_running(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is not None:
+        raise RuntimeError(f"the insertion ended before its fault: {ended(process)}")
+
+
+def _await_end(fault: Fault, process: subprocess.Popen[bytes], injected: float, record: Path) -> None:
+    """Wait until the insertion ends; one that is stopped by a signal goes on once that must have been detected.
+
+    One whose record is complete is ended: its pictures would take more of the processor than the insertion.
+    """
+    if fault.injection == Signal(SIGSTOP):
+        sleep(max(0.0, injected + _STOPPED_S - monotonic()))
+        os.kill(process.pid, SIGCONT)
+    deadline = monotonic() + _LONGEST_S
+    while process.poll() is None and monotonic() < deadline:
+        sleep(0.05)
+        if record.exists() and _UNFINISHED not in record.read_text()[:_HEAD]:
+            process.kill()
+            return
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        os.killpg(process.pid, SIGKILL)
+        process.wait()
+
+
+def _ended_by_force(processes: tuple[psutil.Process, ...]) -> int:
+    """The number of processes that have not ended with the insertion; they are killed."""
+    left = [one for one in processes if one.is_running() and one.status() != psutil.STATUS_ZOMBIE]
+    for one in left:
+        one.kill()
+    return len(left)
+
+
+def _recorded(record: Path, printed: str) -> Mapping[str, Any]:
+    """What the insertion has recorded in its folder, or printed where that could not be written."""
+    file = record / "run.json"
+    run: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    if run.get("status") == "running" and printed.startswith("{"):
+        result = json.loads(printed)
+        run |= {"status": result["outcome"], "reason": result["reason"], "timing": result["timing"]}
+    return run
