@@ -1,6 +1,8 @@
 """A browser for the tests of the page, Debian's Chromium; a fake server and a page for each test."""
 
+import os
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -25,9 +27,21 @@ def browser():
 @pytest.fixture
 def server():
     from fake_page import FakePage
+    from flexneedle.page.server.catalog import SCHEMA
 
-    with FakePage() as server:
+    with FakePage(SCHEMA) as server:
         yield server
+
+
+@pytest.fixture
+def pictures():
+    """A function that keeps a picture of a page or of a part of it where SCREENSHOTS names a folder."""
+
+    def kept(shown, name):
+        if folder := os.environ.get("SCREENSHOTS"):
+            shown.screenshot(path=Path(folder) / f"{name}.png")
+
+    return kept
 
 
 @pytest.fixture
