@@ -5,7 +5,7 @@ import { Link } from "./link.js";
 import { Store } from "./store.js";
 import { followTheme } from "./theme.js";
 
-const PANELS = ["status", "form", "files", "insertion", "player", "plots", "space"];
+const PANELS = ["status", "form", "files", "insertion", "player", "section", "axial", "plans", "plots", "tour", "space"];
 
 const store = new Store();
 const link = new Link(store);

@@ -114,7 +114,10 @@ function titleOf(name, values) {
   return words ? words[0].toUpperCase() + words.slice(1) : "General";
 }
 
-const firstSentence = (text) => (text ?? "").replace(/^Section `[^`]*`[.:]? ?/, "").replaceAll("`", "").split("\n")[0];
+function firstSentence(text) {
+  const words = (text ?? "").replace(/^Section `[^`]*`[.:]? ?/, "").replaceAll("`", "").split("\n")[0];
+  return words && words[0].toUpperCase() + words.slice(1);
+}
 
 const resolved = (schema, property) => (property.$ref ? schema.$defs[property.$ref.split("/").at(-1)] : property);
 const isNullable = ({ anyOf }) => Boolean(anyOf?.some(({ type }) => type === "null"));

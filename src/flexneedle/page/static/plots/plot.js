@@ -67,11 +67,11 @@ export class PlotView {
     const options = {
       width: this.#place.clientWidth || 300,
       height: HEIGHT,
-      padding: [6, 8, 0, 0],
+      padding: [6, 16, 0, 0],
       scales: { x: { time: false } },
       legend: { show: false },
       cursor: { drag: { setScale: false, x: false, y: false }, y: false, points: { show: false } },
-      axes: [{ ...axis, size: 24, values: (_, values) => values.map((value) => `${value} s`) }, { ...axis, size: 46 }],
+      axes: [{ ...axis, size: 24, values: (_, values) => values.map((value) => `${value} s`) }, { ...axis, size: 50, values: (_, values) => values.map((value) => String(Number(value.toPrecision(6)))) }],
       series: [{}, ...lines.map((line) => seriesOf(line))],
       hooks: { draw: [(chart) => this.#drawTime(chart)] },
     };
@@ -92,6 +92,7 @@ export class PlotView {
     ctx.save();
     ctx.strokeStyle = color("--ink");
     ctx.lineWidth = devicePixelRatio;
+    ctx.setLineDash([]);
     ctx.beginPath();
     ctx.moveTo(x, bbox.top);
     ctx.lineTo(x, bbox.top + bbox.height);
