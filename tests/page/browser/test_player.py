@@ -31,6 +31,7 @@ def see_plots(page):
     """Scroll to the plots, which are drawn only on the screen."""
     page.locator(PLOTS).scroll_into_view_if_needed()
     page.wait_for_selector(f"{PLOTS} canvas >> nth=5")
+    page.locator(f"{PLOTS} figure").last.scroll_into_view_if_needed()  # others have grown above them
 
 
 def test_scrubbing_shows_a_period(player):
