@@ -49,7 +49,14 @@ def visit(browser, server):
     """A function that opens the page and returns it. Errors on the page, in `errors`, fail the test at its end."""
     contexts, errors = [], []
 
-    def opened(width=1280, height=800, scheme="light", before=None, tour=False, ready="[data-panel=status] .connection"):
+    def opened(
+        width=1280,
+        height=800,
+        scheme="light",
+        before=None,
+        tour=False,
+        ready="[data-panel=status] .connection",
+    ):
         context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
         contexts.append(context)
         page = context.new_page()

@@ -1,5 +1,6 @@
 """Presets, scenario files, links, recorded runs."""
 
+import numpy as np
 import pytest
 
 from fake_page import until
@@ -110,3 +111,56 @@ def test_a_picture_of_the_scene_is_saved(files):
         page.click("text=Picture")
     assert download.value.suggested_filename == "flexneedle.png"
 
+
+DECODED = """
+async (bytes) => {
+  const decoder = new ImageDecoder({ data: Uint8Array.from(bytes).buffer, type: "image/gif" });
+  await decoder.tracks.ready;
+  const frames = [];
+  for (let at = 0; at < decoder.tracks.selectedTrack.frameCount; at++) {
+    const { image } = await decoder.decode({ frameIndex: at });
+    const canvas = new OffscreenCanvas(image.displayWidth, image.displayHeight);
+    canvas.getContext("2d").drawImage(image, 0, 0);
+    frames.push([...canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data]);
+  }
+  return frames;
+}
+"""
+
+
+@pytest.mark.parametrize("size", [(1, 1), (37, 20), (120, 90)])
+def test_a_gif_has_the_pixels_of_its_frames(files, size):
+    """Also where the codes of a frame need 12 bits and begin anew, and end at any of their lengths."""
+    page = files()
+    rng = np.random.default_rng(3)
+    frames = rng.integers(0, 256, (2, size[1], size[0], 4), dtype=np.uint8)
+    frames[..., 3] = 255
+    frames[1] = np.repeat(frames[1, :, :1], size[0], axis=1)  # long runs
+    made = page.evaluate(
+        """async ([width, height, frames]) => {
+          const { gifOf } = await import("/static/files/gif.js");
+          return [...gifOf(width, height, frames, 0.1)];
+        }""",
+        [*size, [frame.ravel().tolist() for frame in frames]],
+    )
+    shown = np.array(page.evaluate(DECODED, made)).reshape(frames.shape)
+    assert np.max(np.abs(shown - frames.astype(int))) <= 26
+
+
+def test_a_gif_of_an_insertion_is_saved(files, server, tmp_path):
+    page = files()
+    page.click("text=GIF")
+    page.wait_for_selector("text=A GIF needs an insertion")
+    server.send(insertion("done", of="first"), rows(0, 12, "first"), *frames_of(12))
+    until(page, "flexneedle.store.get('rows first')?.length === 12")
+    with page.expect_download() as download:
+        page.click("text=GIF")
+    download.value.save_as(tmp_path / "made.gif")
+    frames = page.evaluate(DECODED, list((tmp_path / "made.gif").read_bytes()))
+    assert len(frames) == 12
+    assert frames[0] != frames[-1]
+    assert page.evaluate("flexneedle.store.get('view period')") is None
+
+
+def frames_of(count):
+    return [frame for period in range(count) for frame in period_frames(period, Source.FIRST)]

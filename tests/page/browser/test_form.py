@@ -15,7 +15,9 @@ FORM = "[data-panel=form]"
 def session(revision=1, changed=(), doubts=(), seed=0, preset="phantom3d", **values):
     flat = load_scenario(preset).flat() | values
     given = {"seed": seed, "strategy": "manipulation", "controller": "adaptive-mpc"}
-    return Session(revision=revision, name=preset, values=flat, changed=list(changed), doubts=list(doubts), **given)
+    return Session(
+        revision=revision, name=preset, values=flat, changed=list(changed), doubts=list(doubts), **given
+    )
 
 
 def field(page, key):
@@ -79,7 +81,9 @@ def test_a_problem_is_beside_its_field_and_the_value_stays(form, server):
     assert page.get_attribute("#field-target-depth_mm", "aria-invalid") == "true"
     server.send(session(2))
     problem.wait_for(state="hidden")
-    until(page, "document.querySelector('#field-target-depth_mm').value === '40' || document.activeElement.id")
+    until(
+        page, "document.querySelector('#field-target-depth_mm').value === '40' || document.activeElement.id"
+    )
 
 
 def test_what_is_no_number_is_not_sent(form, server):
@@ -96,7 +100,9 @@ def test_a_search_opens_the_sections_of_what_it_finds(form):
     page = form()
     page.fill(f"{FORM} input[type=search]", "flip weight")
     page.wait_for_selector("#field-plan-flip_weight")
-    shown = page.locator(f"{FORM} .field[data-key]:visible").evaluate_all("all => all.map((one) => one.dataset.key)")
+    shown = page.locator(f"{FORM} .field[data-key]:visible").evaluate_all(
+        "all => all.map((one) => one.dataset.key)"
+    )
     assert shown == ["plan.flip_weight"]
     assert "1 setting" in page.inner_text(FORM)
 
@@ -116,7 +122,9 @@ def test_a_layer_is_added_and_removed(form, server):
 
 
 def test_options_and_doubts(form, server):
-    page = form([WELCOME, people(), session(changed=["target.depth_mm"], doubts=["plan.samples = 3: few"]), scene()])
+    page = form(
+        [WELCOME, people(), session(changed=["target.depth_mm"], doubts=["plan.samples = 3: few"]), scene()]
+    )
     assert "plan.samples = 3" in page.inner_text(f"{FORM} .doubts")
     page.wait_for_selector(".changed[data-key='target.depth_mm']")
     page.select_option("#option-strategy", "steering")

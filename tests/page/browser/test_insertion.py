@@ -77,7 +77,9 @@ def test_disturbances_are_sent_and_listed(panel, server):
 
 def test_a_rig_is_armed_after_a_check_and_not_disturbed(panel, server):
     welcome = WELCOME.model_copy(update={"rig": "emulated"})
-    page = panel([welcome, people(), *opening()[2:], RigState(name="emulated", armed=False, state="idle", why="")])
+    page = panel(
+        [welcome, people(), *opening()[2:], RigState(name="emulated", armed=False, state="idle", why="")]
+    )
     arm = page.locator(f"{PANEL} .rig button", has_text="Arm")
     assert arm.is_disabled()
     assert page.locator(".rig button", has_text="Insert on the rig").is_disabled()
@@ -89,7 +91,10 @@ def test_a_rig_is_armed_after_a_check_and_not_disturbed(panel, server):
     page.wait_for_timeout(100)
     assert server.asked("arm") == [{"type": "arm", "armed": True}]
     assert server.asked("insert") == [{"type": "insert", "rig": True}]
-    server.send(insertion("running", rig="emulated"), RigState(name="emulated", armed=False, state="inserting", why=""))
+    server.send(
+        insertion("running", rig="emulated"),
+        RigState(name="emulated", armed=False, state="inserting", why=""),
+    )
     page.wait_for_selector(f"{PANEL} button:visible >> text=Hold")
     assert not page.is_visible(".disturb")
     assert not page.is_visible("[aria-label=Pace]")

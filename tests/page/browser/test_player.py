@@ -112,7 +112,9 @@ def test_two_runs_are_plotted_beside_each_other(player, server, pictures):
     see_plots(page)
     assert not page.locator(f"{PLOTS} >> text=roll, second").count()
     shifted = [row(k).model_copy(update={"roll_deg": 90.0, "time": 0.2 * k + 0.05}) for k in range(30)]
-    server.send(insertion("done", of="second", periods=30), rows(0, 1, "second").model_copy(update={"rows": shifted}))
+    server.send(
+        insertion("done", of="second", periods=30), rows(0, 1, "second").model_copy(update={"rows": shifted})
+    )
     page.wait_for_selector(f"{PLOTS} >> text=roll, second")
     pictures(page, "plots-compared")
 

@@ -2,6 +2,7 @@
 
 import { button, make } from "./dom.js";
 import { followLink, linkOf } from "./files/link.js";
+import { saveGif, savePng } from "./files/pictures.js";
 import { showRuns } from "./files/runs.js";
 import { maySteer } from "./shown.js";
 
@@ -16,20 +17,22 @@ export function mount(element, store, link) {
   const file = make("input.spoken", { type: "file", accept: ".toml", "aria-label": "Scenario file", tabindex: "-1" });
   const load = button("Load a file…", () => file.click());
   const save = make("a", { href: "/scenario.toml", download: "scenario.toml" }, "Save the scenario");
-  const copied = make("span.quiet", { role: "status" });
-  const copy = button("Copy a link", () => copyLink(store, copied), { title: "A link to this scenario with seed, strategy and controller" });
+  const status = make("span.quiet", { role: "status" });
+  const copy = button("Copy a link", () => copyLink(store, status), { title: "A link to this scenario with seed, strategy and controller" });
+  const picture = button("Picture", savePng, { title: "The scene in space as PNG" });
+  const gif = button("GIF", () => makeGif(gif, store, status), { title: "The insertion that is shown as an animated picture" });
   const steered = make("fieldset.bare", {}, make("div.tools", {}, preset, begin), make("div.tools", {}, world, draw), make("div.tools", {}, load, file));
   const runs = make("div.runs");
-  element.append(steered, make("div.tools", {}, save, copy, copied, button("Picture", savePicture, { title: "The scene in space as PNG" })), runs);
+  element.append(steered, make("div.tools", {}, save, copy, picture, gif, status), runs);
 
-  file.addEventListener("change", () => loadFile(file, link, copied));
-  acceptDrops(element, link, copied);
+  file.addEventListener("change", () => loadFile(file, link, status));
+  acceptDrops(element, link, status);
   store.subscribe(["welcome", "session"], () => choosePreset(preset, store));
   store.subscribe(["people", "welcome"], () => {
     steered.disabled = !maySteer(store);
   });
   showRuns(runs, store, link);
-  followLink(store, link, copied);
+  followLink(store, link, status);
 }
 
 function choosePreset(select, store) {
@@ -87,18 +90,15 @@ async function copyLink(store, status) {
   }
 }
 
-async function savePicture() {
-  const { spaceView } = await import("./space.js");
-  const canvas = spaceView()?.drawn();
-  if (!canvas) return;
-  const picture = make("canvas", { width: canvas.width, height: canvas.height });
-  const pen = picture.getContext("2d");
-  pen.fillStyle = getComputedStyle(canvas.parentElement).backgroundColor;
-  pen.fillRect(0, 0, picture.width, picture.height);
-  pen.drawImage(canvas, 0, 0);
-  picture.toBlob((blob) => {
-    const address = URL.createObjectURL(blob);
-    make("a", { href: address, download: "flexneedle.png" }).click();
-    setTimeout(() => URL.revokeObjectURL(address), 10_000);
-  });
+// A GIF of the insertion that is shown, with its progress.
+async function makeGif(gif, store, status) {
+  gif.disabled = true;
+  try {
+    const made = await saveGif(store, (share) => {
+      status.textContent = `GIF: ${Math.round(100 * share)} %`;
+    });
+    status.textContent = made ? "" : "A GIF needs an insertion or a recorded run";
+  } finally {
+    gif.disabled = false;
+  }
 }

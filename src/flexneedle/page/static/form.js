@@ -45,7 +45,7 @@ class Form {
   #schema;
   #store;
   #link;
-  #made = ""; // name and keys that the form was made of
+  #made = ""; // name, keys and layers that the form was made of
   #sections = [];
   #problems = {}; // by key
   #refusal = 0; // number of the newest that was read
@@ -83,12 +83,13 @@ class Form {
 
   // The form is made again for another scenario, and when it has other layers or tables.
   #remake({ name, values }) {
-    const found = sectionsOf(this.#schema, values);
-    const made = JSON.stringify([name, found.map((section) => [section.title, section.fields.map(({ key }) => key)])]);
+    const words = Object.keys(values).filter((key) => /^tissue\.\d+\.(law|name)$/.test(key)).map((key) => values[key]);
+    const made = JSON.stringify([name, Object.keys(values), words]);
     if (made === this.#made) return false;
     const open = this.#sections.filter(({ element }) => element.open).map((section) => section.name);
     this.#made = made;
-    this.#sections = found.sort((a, b) => place(a.name) - place(b.name)).map((section) => this.#sectionOf(section, open));
+    const found = sectionsOf(this.#schema, values).sort((a, b) => place(a.name) - place(b.name));
+    this.#sections = found.map((section) => this.#sectionOf(section, open));
     this.#element.replaceChildren(...this.#sections.map((section) => section.element));
     return true;
   }

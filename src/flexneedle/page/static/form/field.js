@@ -9,7 +9,8 @@ export class FieldView {
   #field;
   #slider = null;
   #problem = make("p.problem.bad", { hidden: true });
-  #shown;
+  #shown; // value of the scenario
+  #before = ""; // text when the field got the focus
 
   // field: of fields.js; value: at first, which the slider's range depends on; edit: called with a new value.
   constructor(field, value, edit) {
@@ -71,6 +72,10 @@ export class FieldView {
     const given = { type: "text", inputmode: numeric ? "decimal" : undefined, placeholder: written(usual) || "not set" };
     const input = make("input", { ...described, ...given, autocomplete: "off", size: numeric ? "8" : String(WORDS), change });
     input.addEventListener("keydown", (event) => this.#key(event));
+    input.addEventListener("focus", () => {
+      this.#before = input.value;
+    });
+    input.addEventListener("blur", () => this.#leave());
     return input;
   }
 
@@ -91,9 +96,14 @@ export class FieldView {
     if (problem === undefined) this.edit(value);
   }
 
-  // Enter takes the value, Escape leaves the scenario's.
+  // What has come while the field had the focus is shown, unless its user wrote something.
+  #leave() {
+    const refused = this.input.getAttribute("aria-invalid") === "true";
+    if (!refused && this.input.value === this.#before) this.input.value = written(this.#shown);
+  }
+
+  // Escape restores the scenario's value; Enter is a change.
   #key({ key }) {
-    if (key === "Enter") this.#take();
     if (key !== "Escape") return;
     this.input.value = written(this.#shown);
     this.#show(undefined);

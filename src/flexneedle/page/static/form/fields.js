@@ -5,6 +5,7 @@ const UNITS = Object.entries({
   _mrad_s: "mrad/s", _mn_per_mm: "mN/mm", _deg_s: "°/s", _mm_s: "mm/s", _per_mm: "/mm", _per_mj: "/mJ", _per_m: "1/m",
   _kpa: "kPa", _gpa: "GPa", _mrad: "mrad", _percent: "%", _deg: "°", _hz: "Hz", _mm: "mm", _mn: "mN", _n: "N", _s: "s",
 });
+const TECHNICAL = 1e5; // a bound from here on only keeps out nonsense
 const FAR = 20; // a bound this many times the usual value is none for a slider
 const STEPS = 200; // of a slider
 
@@ -60,9 +61,17 @@ function fieldOf(key, property) {
     max: bounds[1],
     open: found("exclusiveMinimum") !== undefined,
     choices,
-    description: (property.description ?? "").replaceAll("`", "").replaceAll("\n", " "),
+    description: `${(property.description ?? "").replaceAll("`", "").replaceAll("\n", " ")}${inWords(bounds)}`,
     usual: property.default ?? null,
   };
+}
+
+// Bounds that are not merely technical, for people.
+function inWords([min, max]) {
+  const given = max < TECHNICAL;
+  if (min === undefined && !given) return "";
+  if (!given) return min === 0 ? "" : ` At least ${min}.`;
+  return min === undefined ? ` At most ${max}.` : ` From ${min} to ${max}.`;
 }
 
 // Range of a slider about a value: {min, max, step}, within the bounds, or null for what has none.

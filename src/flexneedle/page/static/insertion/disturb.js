@@ -16,7 +16,7 @@ export function disturbForm(store, link) {
 
   const form = make(
     "fieldset.disturb", { hidden: true }, make("legend", {}, "Disturb it"),
-    line("Push the tip", force, "N at", angle, "°", button("Push", () => disturb("push", force, angleOf(angle))), button("Release", () => none("push"), { "aria-label": "Release the tip" })),
+    line("Push the tip", force, "N at", angle, "°", button("Push", () => disturb("push", force, angleOf(angle))), button("Let go", () => none("push"), { "aria-label": "Let go of the tip" })),
     line("Stiffen", layer, "×", factor, button("Stiffen", () => disturb("stiffen", factor, { layer: Number(layer.value) }))),
     line("Drop the tracker for", seconds, "s", button("Drop", () => disturb("drop", seconds))),
     line("Metal plate at", distance, "mm", button("Bring", () => disturb("plate", distance)), button("Take away", () => none("plate"))),

@@ -62,8 +62,12 @@ export class CostPlot {
   #linesOf(strategy) {
     const list = this.#iterations[strategy] ?? [];
     const quantile = (at) => Array.from(list, (each) => each?.quantiles[at] ?? null);
-    const line = (name, values, thin) => ({ name: `${strategy}, ${name}`, tone: `--${strategy}`, values: values.map(positive), thin });
-    return [line("best", this.#best(strategy)), line("elite", quantile(ELITE), true), line("median", quantile(MEDIAN), true)];
+    const line = (name, values, form, dash) => ({ name: `${strategy}, ${name}`, tone: `--${strategy}`, values: values.map(positive), form, dash });
+    return [
+      line("best", this.#best(strategy), "line"),
+      line("elite", quantile(ELITE), "dashed", [6, 3]),
+      line("median", quantile(MEDIAN), "dotted", [2, 4]),
+    ];
   }
 
   #make(lines, data) {
@@ -74,13 +78,13 @@ export class CostPlot {
       cursor: { show: false },
       scales: { x: { time: false }, y: { distr: 3 } },
       axes: [{ ...axis, size: 24, incrs: [1, 2, 5, 10, 20, 50] }, { ...axis, size: 50 }],
-      series: [{}, ...lines.map(({ name, tone, thin }) => ({
-        label: name, stroke: color(tone), width: thin ? 1 : 2, dash: thin ? [3, 3] : undefined, points: { show: false }, spanGaps: true,
+      series: [{}, ...lines.map(({ name, tone, dash }) => ({
+        label: name, stroke: color(tone), width: dash ? 1.25 : 2, dash, points: { show: false }, spanGaps: true,
       }))],
     };
     this.#chart = new uPlot(options, data, this.#place);
-    this.#legend.replaceChildren(...lines.map(({ name, tone, thin }) => {
-      const swatch = make(`span.swatch.${thin ? "dashed" : "line"}`, { "aria-hidden": "true" });
+    this.#legend.replaceChildren(...lines.map(({ name, tone, form }) => {
+      const swatch = make(`span.swatch.${form}`, { "aria-hidden": "true" });
       swatch.style.color = `var(${tone})`;
       return make("span", {}, swatch, name);
     }));
