@@ -65,8 +65,9 @@ def plan(
     scenario: also by its name or path, as for `load_scenario`;
     strategy: "manipulation" moves guide and bevel; "steering" moves only the bevel (paper section III-A, but on the
     needle itself, not on a softer one). A plan that misses its target although guide or base are free is searched again
-    with wider samples, and the better of the two is returned. `progress` gets a dict after each iteration. `threads` is
-    for rollouts (default: all cores) and changes no result. Same seed, same plan.
+    with wider samples, and the better of the two is returned. `progress` gets a dict after each iteration, with the
+    samples of the search as `planning.horizon.Samples`. `threads` is for rollouts (default: all cores) and changes no
+    result. Same seed, same plan.
     Raises ScenarioError for a target that the scenario excludes, InputError for another argument that cannot be used.
     """
     scenario, seed = load_scenario(scenario), whole("seed", seed, 0)
