@@ -43,16 +43,17 @@ class FakePage:
     """The server in a thread of its own, on a free port.
 
     news: what a client gets when it comes; requests: all that clients asked; answers: by type of a request, a
-    `Refused`, or a function of the request that returns news and frames for that client before `Done`; schema: what
-    /schema.json returns.
+    `Refused`, or a function of the request that returns news and frames for that client before `Done`; files: what
+    is served by path.
     """
 
     def __init__(self, schema=b"{}"):
-        self.news, self.requests, self.answers, self.schema = opening(), [], {}, schema
+        self.news, self.requests, self.answers = opening(), [], {}
+        self.files = {"/schema.json": schema, "/scenario.toml": ""}
         self._sockets, self._revision, self._target = [], 1, list(TARGET)
         routes = [
             Route("/", lambda _: FileResponse(STATIC / "index.html")),
-            Route("/schema.json", lambda _: Response(self.schema, media_type="application/json")),
+            *(Route(path, self._file) for path in self.files),
             WebSocketRoute("/live", self._live),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
@@ -94,6 +95,9 @@ class FakePage:
             for each in self.requests
             if each["type"] == kind
         ]
+
+    def _file(self, request):
+        return Response(self.files[request.url.path])
 
     def _run(self):
         self._loop = asyncio.new_event_loop()

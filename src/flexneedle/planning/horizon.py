@@ -16,6 +16,8 @@ from flexneedle.planning import cross_entropy as ce
 from flexneedle.planning.terms import RolloutFunction, Term, Trajectories, charges, cost
 from flexneedle.types import Floats
 
+OnIteration = Callable[[dict[str, Any]], None]
+
 
 @dataclass(frozen=True, eq=False)
 class Variables:
@@ -62,7 +64,7 @@ def best(
     rng: np.random.Generator,
     *,
     first: Floats | None = None,
-    progress: Callable[[dict[str, Any]], None] | None = None,
+    progress: OnIteration | None = None,
 ) -> Found:
     """Search for the sample of least cost; infinite if none converged, z being the mean then.
 
@@ -90,3 +92,18 @@ def best(
     trajectories = rollout(variables.controls(search_state.best[None]))
     charged = {name: float(value[0]) for name, value in charges(terms, trajectories).items()}
     return Found(search_state.best, search_state.best_cost, charged, trajectories, search_state, latest[0])
+
+
+def counted(progress: OnIteration | None, before: int, usual: int, least: float) -> OnIteration | None:
+    """`progress` of a search after `before` iterations of others, which found a cost of `least`.
+
+    usual: number of iterations of all searches together.
+    """
+    if progress is None:
+        return None
+
+    def show(info: dict[str, Any]) -> None:
+        now = before + info["iteration"]
+        progress({**info, "iteration": now, "iterations": max(now, usual), "best": min(info["best"], least)})
+
+    return show

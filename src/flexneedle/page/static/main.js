@@ -5,7 +5,7 @@ import { Link } from "./link.js";
 import { Store } from "./store.js";
 import { followTheme } from "./theme.js";
 
-const PANELS = ["status", "space"];
+const PANELS = ["status", "form", "files", "insertion", "player", "section", "axial", "plans", "plots", "tour", "space"];
 
 const store = new Store();
 const link = new Link(store);
@@ -19,7 +19,7 @@ async function load(name) {
   if (section) section.hidden = false;
   try {
     const panel = await import(`./${name}.js`);
-    panel.mount(element, store, link);
+    await panel.mount(element, store, link);
   } catch (error) {
     element.textContent = `This part of the page could not be loaded: ${error.message}`;
     throw error;

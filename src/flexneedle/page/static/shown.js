@@ -71,6 +71,15 @@ export function targetEdit(store, point) {
   return Object.fromEntries(keys.map((key, axis) => [key, Math.round(point[axis] * 100) / 100]));
 }
 
+// Whether this client steers or can take the steering.
+export function maySteer(store) {
+  const [people, welcome] = [store.get("people"), store.get("welcome")];
+  return Boolean(people) && (people.steering === null || people.steering === welcome?.client);
+}
+
+// Whether what is shown can be moved by hand: the scene before an insertion.
+export const mayMove = (store) => maySteer(store) && shownOf(store) === "scene";
+
 // Whether a plan, estimate or reach is of an earlier state of the scenario than the present.
 export function isStale(store, result) {
   return Boolean(result) && result.revision !== store.get("session")?.revision;

@@ -7,21 +7,8 @@ import {
 import { shown } from "../dom.js";
 import { color } from "../theme.js";
 
-const [BEHIND, BEYOND, AROUND, STEP] = [8, 8, 4, 5]; // mm
+const STEP = 5; // mm
 const [SOFT, STIFF] = [1, 30]; // kPa, between which the tissue's colour changes
-
-// The box that is drawn, {left, right, half}: from behind the guide to beyond the target, as wide as it is high.
-export function boxOf(scene, target) {
-  const tip = scene.base[0] + scene.needle_length_mm;
-  const left = Math.min(scene.guide ? scene.guide[0] : tip, tip, 0) - BEHIND;
-  const deepest = scene.layers.at(-1)?.top_mm ?? 0;
-  const across = Math.max(...[target, scene.guide ?? target].flatMap(([, y, z]) => [Math.abs(y), Math.abs(z)]));
-  return {
-    left: STEP * Math.floor(left / STEP),
-    right: STEP * Math.ceil((Math.max(target[0], deepest) + BEYOND) / STEP),
-    half: Math.max(2 * STEP, STEP * Math.ceil((across + AROUND) / STEP)),
-  };
-}
 
 export class Room {
   constructor(labels) {

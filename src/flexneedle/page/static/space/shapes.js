@@ -3,6 +3,7 @@
 import {
   ConeGeometry, CylinderGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial, MeshLambertMaterial, Vector3,
 } from "../vendor/three.js";
+import { first, fresh, last, pathOfRows, ranksOf, tipOf } from "../paths.js";
 import { isStale, shownRow, shownSecond, shownShape } from "../shown.js";
 import { Lines } from "./lines.js";
 import { Outlines } from "./outlines.js";
@@ -217,45 +218,6 @@ export class Shapes {
 }
 
 const translucent = (how) => new MeshBasicMaterial({ transparent: true, depthWrite: false, ...how });
-
-// What `key` holds, if the news that it belongs to is of the present state of the scenario.
-const fresh = (store, news, key) => (isStale(store, store.get(news)) ? undefined : store.get(key));
-
-const first = (shape) => slice(shape, 0);
-const last = (shape) => slice(shape, shape.paths - 1);
-
-// One path of a shape; the same object for the same shape, so that it is drawn once.
-const slices = new WeakMap();
-function slice(shape, index) {
-  if (!shape || shape.paths === 0) return null;
-  const known = slices.get(shape) ?? new Map();
-  slices.set(shape, known);
-  if (!known.has(index)) {
-    const size = shape.points * shape.columns;
-    known.set(index, { ...shape, paths: 1, values: shape.values.subarray(index * size, (index + 1) * size) });
-  }
-  return known.get(index);
-}
-
-const tipOf = ({ values, points, columns }) => Array.from(values.subarray((points - 1) * columns, (points - 1) * columns + 3));
-
-function pathOfRows(rows, key) {
-  const known = rows.filter((row) => row?.[key]);
-  if (known.length < 2) return null;
-  return { points: known.length, paths: 1, columns: 3, values: Float32Array.from(known.flatMap((row) => row[key])) };
-}
-
-// Rank of each path by its cost, column 4 of its last point, from 0 (least) to 1; 0 where there is none.
-function ranksOf({ values, paths, points, columns }) {
-  const ranks = new Float32Array(paths);
-  if (columns < 4 || paths < 2) return ranks;
-  const cost = (path) => values[((path + 1) * points - 1) * columns + 3];
-  const order = Array.from({ length: paths }, (_, path) => path).sort((a, b) => cost(a) - cost(b));
-  order.forEach((path, place) => {
-    ranks[path] = place / (paths - 1);
-  });
-  return ranks;
-}
 
 // Colour of the stretch scale at a share from 0 to 1.
 function rampAt(share) {

@@ -1,7 +1,7 @@
 // The target: its sphere of 1 mm, and arrows that move it while nobody else steers.
 
 import { Group, Mesh, MeshLambertMaterial, SphereGeometry, TransformControls } from "../vendor/three.js";
-import { shownOf, shownTarget, targetEdit } from "../shown.js";
+import { mayMove, shownTarget, targetEdit } from "../shown.js";
 import { paint } from "./room.js";
 
 const RADIUS = 1; // mm
@@ -38,13 +38,7 @@ export class Target {
     this.group.visible = Boolean(target);
     if (target && !this.dragged) this.ball.position.set(...target);
     this.ball.material.color = paint("--target");
-    this.#gizmo.enabled = this.#gizmo.getHelper().visible = this.#mayMove();
+    this.#gizmo.enabled = this.#gizmo.getHelper().visible = mayMove(this.#store);
     this.#gizmo.showZ = this.#store.get("scene")?.axes === 2;
-  }
-
-  #mayMove() {
-    const [people, welcome] = [this.#store.get("people"), this.#store.get("welcome")];
-    const free = people && (people.steering === null || people.steering === welcome?.client);
-    return Boolean(free) && shownOf(this.#store) === "scene";
   }
 }

@@ -1,11 +1,12 @@
 // The view in space: draws the store's state, only when something has changed and it is on the screen.
 
 import { AmbientLight, DirectionalLight, Scene, WebGLRenderer } from "../vendor/three.js";
+import { boxOf } from "../box.js";
 import { make } from "../dom.js";
 import { SHOWN, shownOf, shownScene, shownTarget } from "../shown.js";
 import { Camera } from "./camera.js";
 import { Labels } from "./labels.js";
-import { Room, boxOf } from "./room.js";
+import { Room } from "./room.js";
 import { Shapes } from "./shapes.js";
 import { Target } from "./target.js";
 

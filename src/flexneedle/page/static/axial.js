@@ -1,0 +1,43 @@
+// The view along the axis, as the needle moves: z to the right, y upwards; the target is moved here.
+
+import { make, shown } from "./dom.js";
+import { drawAxial } from "./flat/axial.js";
+import { KEYS, Handles } from "./flat/handles.js";
+import { legendOf } from "./flat/legend.js";
+import { partsOf } from "./flat/parts.js";
+import { mappingOf } from "./flat/plane.js";
+import { Stage } from "./flat/stage.js";
+import { SHOWN, mayMove, shownScene, shownTarget, targetEdit } from "./shown.js";
+
+const [LEAST, AROUND] = [4, 3]; // mm
+
+export function mount(element, store, link) {
+  const canvas = make("canvas", { role: "img", "aria-label": "View along the axis" });
+  const place = make("div.stage", {}, canvas);
+  const legend = make("ul.legend", { "aria-label": "Legend of the view along the axis" });
+  element.append(place, legend);
+  const handles = new Handles(place);
+  let half = LEAST; // mm, stays while the target is dragged
+
+  const stage = new Stage(canvas, (pen, { width, height }) => {
+    const [scene, target] = [shownScene(store), shownTarget(store)];
+    if (!scene || !target) return;
+    if (!handles.dragged) half = Math.max(LEAST, Math.ceil(Math.max(Math.abs(target[1]), Math.abs(target[2])) + AROUND));
+    const map = mappingOf({ left: -half, right: half, half }, width, height, 1);
+    const parts = partsOf(store, scene);
+    const reached = drawAxial(pen, { width, height, map, scene, target, parts, store });
+    legendOf(legend, parts.filter(({ thick }) => !thick), reached);
+    handles.update(mayMove(store) ? [handleOf(map, scene, target)] : []);
+  });
+  store.subscribe([...SHOWN, "people", "welcome"], () => stage.schedule());
+
+  function handleOf(map, { axes }, target) {
+    const move = (y, z) => link.edit(targetEdit(store, [target[0], y, axes === 2 ? z : target[2]]));
+    return {
+      id: "target", form: "point", at: [map.toX(target[2]), map.toY(target[1])],
+      name: `Target: y ${shown(target[1])} mm, z ${shown(target[2])} mm. ${KEYS}`,
+      drag: (px, py) => move(map.fromY(py), map.fromX(px)),
+      nudge: (right, up) => move(target[1] + up, target[2] + right),
+    };
+  }
+}

@@ -1,0 +1,104 @@
+// Scenarios and runs: presets, files, a link to the present state, recorded runs with downloads, pictures.
+
+import { button, make } from "./dom.js";
+import { followLink, linkOf } from "./files/link.js";
+import { saveGif, savePng } from "./files/pictures.js";
+import { showRuns } from "./files/runs.js";
+import { maySteer } from "./shown.js";
+
+const LARGEST = 200_000; // characters of a scenario file
+const MOST_WORLDS = 1e9;
+
+export function mount(element, store, link) {
+  const preset = make("select", { id: "files-preset", "aria-label": "Preset" });
+  const begin = button("Begin", () => link.ask({ type: "preset", name: preset.value }), { "aria-label": "Begin with the preset" });
+  const world = make("input", { type: "number", min: "0", step: "1", value: "100012", "aria-label": "Number of a random world" });
+  const draw = button("Random world", () => beginWorld(world, link));
+  const file = make("input.spoken", { type: "file", accept: ".toml", "aria-label": "Scenario file", tabindex: "-1" });
+  const load = button("Load a file…", () => file.click());
+  const save = make("a", { href: "/scenario.toml", download: "scenario.toml" }, "Save the scenario");
+  const status = make("span.quiet", { role: "status" });
+  const copy = button("Copy a link", () => copyLink(store, status), { title: "A link to this scenario with seed, strategy and controller" });
+  const picture = button("Picture", savePng, { title: "The scene in space as PNG" });
+  const gif = button("GIF", () => makeGif(gif, store, status), { title: "The insertion that is shown as an animated picture" });
+  const steered = make("fieldset.bare", {}, make("div.tools", {}, preset, begin), make("div.tools", {}, world, draw), make("div.tools", {}, load, file));
+  const runs = make("div.runs");
+  element.append(steered, make("div.tools", {}, save, copy, picture, gif, status), runs);
+
+  file.addEventListener("change", () => loadFile(file, link, status));
+  acceptDrops(element, link, status);
+  store.subscribe(["welcome", "session"], () => choosePreset(preset, store));
+  store.subscribe(["people", "welcome"], () => {
+    steered.disabled = !maySteer(store);
+  });
+  showRuns(runs, store, link);
+  followLink(store, link, status);
+}
+
+function choosePreset(select, store) {
+  const names = store.get("welcome")?.presets ?? [];
+  if (select.options.length !== names.length) select.replaceChildren(...names.map((name) => make("option", {}, name)));
+  const { name } = store.get("session") ?? {};
+  if (names.includes(name)) select.value = name;
+}
+
+function beginWorld(input, link) {
+  const number = Number(input.value);
+  if (!Number.isInteger(number) || number < 0 || number > MOST_WORLDS) input.setAttribute("aria-invalid", "true");
+  else {
+    input.removeAttribute("aria-invalid");
+    link.ask({ type: "preset", name: `world:${number}` });
+  }
+}
+
+async function loadFile(input, link, status) {
+  const [file] = input.files;
+  input.value = ""; // so that the same file can be loaded again
+  if (file) await send(file, link, status);
+}
+
+async function send(file, link, status) {
+  const text = await file.text();
+  if (text.length > LARGEST) {
+    status.textContent = `${file.name}: has ${text.length} characters, must have at most ${LARGEST}`;
+    return;
+  }
+  status.textContent = "";
+  await link.ask({ type: "load", name: safe(file.name), text });
+}
+
+// A name that the server takes.
+const safe = (name) => name.replace(/[^A-Za-z0-9 ._-]/g, "_").replace(/^[^A-Za-z0-9]+/, "").slice(0, 80) || "scenario";
+
+function acceptDrops(element, link, status) {
+  element.addEventListener("dragover", (event) => event.preventDefault());
+  element.addEventListener("drop", (event) => {
+    event.preventDefault();
+    const [file] = event.dataTransfer.files;
+    if (file) send(file, link, status);
+  });
+}
+
+async function copyLink(store, status) {
+  const address = await linkOf(store);
+  history.replaceState(null, "", address);
+  try {
+    await navigator.clipboard.writeText(address);
+    status.textContent = "Copied";
+  } catch {
+    status.textContent = "The link is in the address bar";
+  }
+}
+
+// A GIF of the insertion that is shown, with its progress.
+async function makeGif(gif, store, status) {
+  gif.disabled = true;
+  try {
+    const made = await saveGif(store, (share) => {
+      status.textContent = `GIF: ${Math.round(100 * share)} %`;
+    });
+    status.textContent = made ? "" : "A GIF needs an insertion or a recorded run";
+  } finally {
+    gif.disabled = false;
+  }
+}

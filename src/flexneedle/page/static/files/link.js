@@ -1,0 +1,50 @@
+// A link that reproduces the scenario with its options: all is in the part after #, which no server gets.
+
+const MARK = "#state=";
+
+// Address of this page with the present state.
+export async function linkOf(store) {
+  const { name, seed, strategy, controller } = store.get("session");
+  const text = await (await fetch("/scenario.toml", { cache: "no-store" })).text();
+  const packed = await squeezed(JSON.stringify({ name, text, seed, strategy, controller }));
+  return `${location.origin}${location.pathname}${MARK}${packed}`;
+}
+
+// Load the state of the address once connected, and of each link that is followed later.
+export function followLink(store, link, status) {
+  const take = async () => {
+    if (!location.hash.startsWith(MARK)) return;
+    const packed = location.hash.slice(MARK.length);
+    history.replaceState(null, "", location.pathname + location.search); // a reload keeps what was changed since
+    try {
+      await begin(link, JSON.parse(await unsqueezed(packed)));
+    } catch {
+      status.textContent = "The link is damaged: nothing was loaded";
+    }
+  };
+  const end = store.subscribe(["people"], () => {
+    if (!store.get("people")) return;
+    end();
+    take();
+  });
+  addEventListener("hashchange", take);
+}
+
+async function begin(link, { name, text, seed, strategy, controller }) {
+  const loaded = await link.ask({ type: "load", name: name.replace(/[^A-Za-z0-9 ._-]/g, "-"), text });
+  if (loaded.done) await link.ask({ type: "options", seed, strategy, controller });
+}
+
+async function squeezed(text) {
+  const bytes = new Uint8Array(await through(new Blob([text]), new CompressionStream("deflate-raw")).arrayBuffer());
+  const letters = Array.from(bytes, (byte) => String.fromCharCode(byte)).join("");
+  return btoa(letters).replaceAll("+", "-").replaceAll("/", "_").replace(/=+$/, "");
+}
+
+async function unsqueezed(packed) {
+  const letters = atob(packed.replaceAll("-", "+").replaceAll("_", "/"));
+  const bytes = Uint8Array.from(letters, (letter) => letter.charCodeAt(0));
+  return through(new Blob([bytes]), new DecompressionStream("deflate-raw")).text();
+}
+
+const through = (blob, stream) => new Response(blob.stream().pipeThrough(stream));

@@ -1,0 +1,66 @@
+// Recorded runs: open one, a second to compare, download; save the insertion that has ended last.
+
+import { button, make } from "../dom.js";
+
+const DOWNLOADS = [["Figure", "figure.png"], ["CSV", "trace.csv"], ["Run folder", "run.zip"], ["Replay as HTML", "replay.html"]];
+const NAME = /^[A-Za-z0-9][A-Za-z0-9 ._-]{0,79}$/;
+const ENDED = ["done", "held", "failed", "interrupted"];
+const REPLAYED = ["insertion"]; // kinds of runs that can be shown
+const MOST = 100; // runs in the list
+
+export function showRuns(element, store, link) {
+  const search = make("input", { type: "search", placeholder: "Search the runs", "aria-label": "Search the runs" });
+  const list = make("ul", { "aria-label": "Recorded runs" });
+  const opened = make("div.opened");
+  const save = saveForm(store, link);
+  element.append(save, opened, make("details", { open: true }, make("summary", {}, "Recorded runs"), search, list));
+  const show = () => showList(list, search.value.trim().toLowerCase(), store, link);
+  search.addEventListener("input", show);
+  store.subscribe(["runs"], show);
+  store.subscribe(["insertion first", "insertion second", "runs"], () => showOpened(opened, store, link));
+}
+
+function showList(list, text, store, link) {
+  const found = (store.get("runs")?.runs ?? []).filter(({ name, summary, kind }) => `${name} ${kind} ${summary}`.toLowerCase().includes(text));
+  list.replaceChildren(...found.slice(0, MOST).map((run) => entryOf(run, link)));
+  if (!found.length) list.append(make("li.quiet", {}, text ? "No run has this in its name or summary" : "No recorded runs yet"));
+  if (found.length > MOST) list.append(make("li.quiet", {}, `${found.length - MOST} more: search for them`));
+}
+
+function entryOf({ name, kind, summary, made }, link) {
+  const open = (second) => link.ask({ type: "open", name, second });
+  const when = new Date(1000 * made).toLocaleString([], { dateStyle: "short", timeStyle: "short" });
+  const tools = REPLAYED.includes(kind)
+    ? [button("Open", () => open(false), { "aria-label": `Open ${name}` }), button("Compare", () => open(true), { "aria-label": `Compare with ${name}` })]
+    : [];
+  const downloads = DOWNLOADS.map(([text, file]) => make("a", { href: addressOf(name, file), download: `${name}-${file}`, "aria-label": `${text} of ${name}` }, text));
+  const more = make("details", {}, make("summary", {}, "Download"), make("div.tools", {}, ...downloads));
+  return make("li.run", {}, make("strong", {}, name), make("span.quiet", {}, `${kind}, ${when}: ${summary}`), make("div.tools", {}, ...tools, more));
+}
+
+const addressOf = (name, file) => `/runs/${encodeURIComponent(name)}/${file}`;
+
+function showOpened(element, store, link) {
+  const lines = [["first", false, "Shown"], ["second", true, "Compared with"]].flatMap(([of, second, what]) => {
+    const insertion = store.get(`insertion ${of}`);
+    if (!insertion) return [];
+    const close = button("Close", () => link.ask({ type: "open", name: null, second }), { "aria-label": `Close ${insertion.name}` });
+    return [make("p.tools", {}, make("span", {}, `${what}: ${insertion.name} (${insertion.controller}, seed ${insertion.seed})`), close)];
+  });
+  element.replaceChildren(...lines);
+}
+
+function saveForm(store, link) {
+  const name = make("input", { type: "text", maxlength: "80", placeholder: "Name of the run", "aria-label": "Name of the run to save" });
+  const form = make("form.tools", { hidden: true }, name, make("button", { type: "submit" }, "Save the insertion"));
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const valid = NAME.test(name.value.trim());
+    name.setAttribute("aria-invalid", valid ? "false" : "true");
+    if (valid && (await link.ask({ type: "save", name: name.value.trim() })).done) name.value = "";
+  });
+  store.subscribe(["insertion live"], () => {
+    form.hidden = !ENDED.includes(store.get("insertion live")?.state);
+  });
+  return form;
+}

@@ -1,0 +1,67 @@
+// Draws the view along the axis: reach at the target's depth, paths, tips, guide, bevel, target.
+
+import { tipOf } from "../paths.js";
+import { isStale, shownOf, shownRow } from "../shown.js";
+import { area, disc, grid, pointsOf, polyline } from "./pen.js";
+
+const READINGS = 40; // measured positions that are shown
+const BEVEL = 26; // px, length of the arrow
+
+// Returns whether the reach was drawn.
+export function drawAxial(pen, { width, height, map, scene, target, parts, store }) {
+  const place = (_x, y, z) => [map.toX(z), map.toY(y)];
+  const [of, row] = [shownOf(store), shownRow(store)];
+  grid(pen, map, width, height, ["z (mm)", "y (mm)"]);
+  const reached = reach(pen, place, store, target[0]);
+  disc(pen, place(...target), Math.max(map.sx, 3), { tone: "--target", alpha: 0.5 });
+  for (const part of parts) draw(pen, part, place, map);
+  if (row) readings(pen, place, store.get(`rows ${of}`).slice(Math.max(0, row.index - READINGS), row.index + 1));
+  if (scene.guide) guide(pen, place(0, ...(row?.guide ?? scene.guide.slice(1))));
+  const needle = parts.find(({ text }) => text === "needle");
+  if (needle) bevel(pen, place(...tipOf(needle.path)), scene, row);
+  return reached;
+}
+
+// Needles are shown by their tips, sampled and predicted paths by their ends.
+function draw(pen, { path, tone, width = 1, alpha = 1, dash, thick, sampled, predicted, spread }, place, map) {
+  const end = place(...tipOf(path));
+  if (sampled) disc(pen, end, 2, { tone, alpha: Math.min(1, 1.6 * alpha) });
+  else if (predicted) {
+    const sd = spread ? path.values[(path.points - 1) * path.columns + 3] : 0;
+    if (spread) disc(pen, end, Math.max(spread * sd * map.sx, 2), { tone, alpha: 0.3 });
+    disc(pen, end, 3, { tone, open: true });
+  } else if (thick) disc(pen, end, Math.max((thick / 2) * map.sx, 3), { tone });
+  else polyline(pen, pointsOf(path, place), { tone, width, alpha, dash });
+}
+
+function reach(pen, place, store, depth) {
+  const [news, outlines] = [store.get("reach"), store.get("shape reach scene")];
+  if (shownOf(store) !== "scene" || !news || isStale(store, news) || !outlines?.paths) return false;
+  const { paths, points, columns, values } = outlines;
+  const far = (path) => Math.abs(values[path * points * columns] - depth);
+  const nearest = Array.from({ length: paths }, (_, path) => path).reduce((best, path) => (far(path) < far(best) ? path : best), 0);
+  const outline = { points, columns, values: values.subarray(nearest * points * columns, (nearest + 1) * points * columns) };
+  const corners = pointsOf(outline, place);
+  area(pen, corners, "--reach", 0.2);
+  polyline(pen, [...corners, corners[0]], { tone: "--reach" });
+  return true;
+}
+
+function readings(pen, place, rows) {
+  for (const each of rows) {
+    if (each?.measured?.every((part) => part !== null)) disc(pen, place(...each.measured), 1.5, { tone: "--measured", alpha: 0.7 });
+  }
+}
+
+function guide(pen, [x, y]) {
+  polyline(pen, [[x - 6, y - 6], [x + 6, y - 6], [x + 6, y + 6], [x - 6, y + 6], [x - 6, y - 6]], { tone: "--guide", width: 2 });
+}
+
+function bevel(pen, [x, y], scene, row) {
+  const angle = ((scene.bevel.angle_deg + (row?.roll_deg ?? 0)) * Math.PI) / 180; // from y to z
+  const toward = [Math.sin(angle), -Math.cos(angle)];
+  const [tx, ty] = [x + BEVEL * toward[0], y + BEVEL * toward[1]];
+  polyline(pen, [[x, y], [tx, ty]], { tone: "--ink", width: 1.75 });
+  const side = (sign) => [tx - 6 * toward[0] + sign * 3 * toward[1], ty - 6 * toward[1] - sign * 3 * toward[0]];
+  area(pen, [[tx, ty], side(1), side(-1)], "--ink", 1);
+}

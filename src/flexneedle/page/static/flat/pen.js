@@ -1,0 +1,77 @@
+// Drawing with the pen of a canvas: paths of shapes, grid, texts.
+
+import { color } from "../theme.js";
+
+const FONT = "11px system-ui, 'DejaVu Sans', sans-serif";
+const CLOSEST = 44; // px between two labels
+const STEPS = [0.5, 1, 2, 5, 10, 20, 50, 100];
+
+// Points [px, py] of a path; place: function of x, y, z.
+export function pointsOf({ points, columns, values }, place) {
+  return Array.from({ length: points }, (_, at) => place(...values.subarray(at * columns, at * columns + 3)));
+}
+
+export function polyline(pen, points, { tone, width = 1, alpha = 1, dash = false }) {
+  pen.save();
+  pen.strokeStyle = color(tone);
+  [pen.globalAlpha, pen.lineWidth, pen.lineJoin] = [alpha, width, "round"];
+  pen.setLineDash(dash ? [5, 3] : []);
+  pen.beginPath();
+  for (const [x, y] of points) pen.lineTo(x, y);
+  pen.stroke();
+  pen.restore();
+}
+
+export function area(pen, points, tone, alpha) {
+  pen.save();
+  pen.fillStyle = color(tone);
+  pen.globalAlpha = alpha;
+  pen.beginPath();
+  for (const [x, y] of points) pen.lineTo(x, y);
+  pen.fill();
+  pen.restore();
+}
+
+export function disc(pen, [x, y], radius, { tone, alpha = 1, open = false, width = 1.5 }) {
+  pen.save();
+  pen.globalAlpha = alpha;
+  pen.fillStyle = pen.strokeStyle = color(tone);
+  pen.lineWidth = width;
+  pen.beginPath();
+  pen.arc(x, y, radius, 0, 2 * Math.PI);
+  if (open) pen.stroke();
+  else pen.fill();
+  pen.restore();
+}
+
+export function words(pen, text, [x, y], { tone = "--quiet", align = "center", base = "alphabetic" } = {}) {
+  pen.font = FONT;
+  pen.fillStyle = color(tone);
+  [pen.textAlign, pen.textBaseline] = [align, base];
+  pen.fillText(text, x, y);
+}
+
+// Grid lines with labels in mm along both axes; a mapping of plane.js; names of both axes.
+export function grid(pen, map, width, height, [across, up]) {
+  const bottom = height - 18;
+  const [left, right] = [map.fromX(30), map.fromX(width)];
+  const [low, high] = [map.fromY(bottom), map.fromY(0)];
+  for (const x of ticks(left, right, map.sx)) {
+    polyline(pen, [[map.toX(x), 0], [map.toX(x), bottom]], { tone: "--grid" });
+    words(pen, minus(x), [map.toX(x), height - 5]);
+  }
+  for (const u of ticks(low, high, map.sy)) {
+    polyline(pen, [[30, map.toY(u)], [width, map.toY(u)]], { tone: "--grid" });
+    if (map.toY(u) > 16) words(pen, minus(u), [26, map.toY(u)], { align: "right", base: "middle" });
+  }
+  words(pen, across, [width - 4, bottom - 4], { align: "right" });
+  words(pen, up, [34, 11], { align: "left" });
+}
+
+function ticks(low, high, scale) {
+  const step = STEPS.find((each) => each * scale >= CLOSEST) ?? STEPS.at(-1);
+  const from = Math.ceil(low / step);
+  return Array.from({ length: Math.max(0, Math.floor(high / step) - from + 1) }, (_, at) => (from + at) * step);
+}
+
+const minus = (number) => String(number).replace("-", "−");

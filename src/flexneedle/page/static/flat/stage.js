@@ -1,0 +1,47 @@
+// A drawing in two dimensions that fills its place, is sharp, and is drawn only when it has changed and is on the screen.
+
+const SHARPEST = 2; // device pixels to a pixel of the page
+
+export class Stage {
+  #draw;
+  #frame = 0;
+  #onScreen = true;
+  width = 0;
+  height = 0;
+
+  // canvas: in an element with the class "stage"; draw: called with the pen (in pixels of the page) and this.
+  constructor(canvas, draw) {
+    [this.canvas, this.#draw] = [canvas, draw];
+    this.pen = canvas.getContext("2d");
+    new ResizeObserver(([{ contentRect }]) => this.#resize(contentRect)).observe(canvas.parentElement);
+    new IntersectionObserver(([{ isIntersecting }]) => {
+      this.#onScreen = isIntersecting;
+      if (isIntersecting) this.schedule();
+    }).observe(canvas);
+  }
+
+  // Draw before the next paint.
+  schedule() {
+    if (!this.#onScreen) return;
+    this.#frame ||= requestAnimationFrame(() => {
+      this.#frame = 0;
+      this.draw();
+    });
+  }
+
+  // Draw now.
+  draw() {
+    if (!this.width || !this.height) return;
+    this.pen.setTransform(this.sharpness, 0, 0, this.sharpness, 0, 0);
+    this.pen.clearRect(0, 0, this.width, this.height);
+    this.#draw(this.pen, this);
+  }
+
+  #resize({ width, height }) {
+    [this.width, this.height] = [width, height];
+    this.sharpness = Math.min(devicePixelRatio, SHARPEST);
+    this.canvas.width = Math.round(width * this.sharpness);
+    this.canvas.height = Math.round(height * this.sharpness);
+    this.draw();
+  }
+}

@@ -1,0 +1,171 @@
+// The scenario by fields: options, then the sections of the schema, opened one by one or found by a search.
+
+import { button, make } from "./dom.js";
+import { FieldView } from "./form/field.js";
+import { sectionsOf } from "./form/fields.js";
+import { followOptions } from "./form/options.js";
+import { maySteer } from "./shown.js";
+
+const ORDER = ["target", "needle", "needle.bevel", "tissue", "setup", "entry", "plan", "control", "tracker", "phantom"];
+const OPEN = ["target", "needle.bevel"];
+
+export async function mount(element, store, link) {
+  const options = make("div.options");
+  const doubts = make("ul.doubts.bad", { "aria-label": "Implausible values", hidden: true });
+  const search = make("input", { type: "search", placeholder: "Search: modulus, weight, seed …", "aria-label": "Search the settings" });
+  const none = make("p.quiet", { role: "status" });
+  const sections = make("div.sections");
+  const fields = make("fieldset.bare", {}, options, doubts, make("div.tools", {}, search), none, sections);
+  element.append(fields);
+  followOptions(options, store, link);
+
+  const answer = await fetch("/schema.json");
+  if (!answer.ok) throw new Error(`the schema of scenarios: ${answer.status} ${answer.statusText}`);
+  const form = new Form(sections, await answer.json(), store, link);
+  const find = () => {
+    none.textContent = form.find(search.value.trim().toLowerCase());
+  };
+  search.addEventListener("input", find);
+  store.subscribe(["session", "draft", "refusals"], () => {
+    if (form.update()) find();
+    showDoubts(doubts, store.get("session")?.doubts ?? []);
+  });
+  store.subscribe(["people", "welcome"], () => {
+    fields.disabled = !maySteer(store);
+  });
+}
+
+function showDoubts(element, doubts) {
+  element.hidden = !doubts.length;
+  element.replaceChildren(...doubts.map((doubt) => make("li", {}, doubt)));
+}
+
+class Form {
+  #element;
+  #schema;
+  #store;
+  #link;
+  #made = ""; // name, keys and layers that the form was made of
+  #sections = [];
+  #problems = {}; // by key
+  #refusal = 0; // number of the newest that was read
+  #revision;
+
+  constructor(element, schema, store, link) {
+    [this.#element, this.#schema, this.#store, this.#link] = [element, schema, store, link];
+  }
+
+  // Show the session with the draft. Returns whether the fields are others than before.
+  update() {
+    const session = this.#store.get("session");
+    if (!session) return false;
+    const remade = this.#remake(session);
+    this.#readProblems(session);
+    for (const section of this.#sections) this.#fill(section);
+    return remade;
+  }
+
+  // Show the fields with all words of a text, and their sections; with none all. Returns the number in words.
+  find(text) {
+    const words = text.split(/\s+/).filter(Boolean);
+    let count = 0;
+    for (const section of this.#sections) {
+      if (words.length) this.#make(section);
+      for (const { element, words: its } of section.views) {
+        element.hidden = !words.every((word) => `${section.title.toLowerCase()} ${its}`.includes(word));
+        count += !element.hidden;
+      }
+      section.element.hidden = words.length > 0 && section.views.every((view) => view.element.hidden);
+      if (words.length) section.element.open = !section.element.hidden;
+    }
+    return words.length ? `${count} ${count === 1 ? "setting" : "settings"}` : "";
+  }
+
+  // The form is made again for another scenario, and when it has other layers or tables.
+  #remake({ name, values }) {
+    const words = Object.keys(values).filter((key) => /^tissue\.\d+\.(law|name)$/.test(key)).map((key) => values[key]);
+    const made = JSON.stringify([name, Object.keys(values), words]);
+    if (made === this.#made) return false;
+    const open = this.#sections.filter(({ element }) => element.open).map((section) => section.name);
+    this.#made = made;
+    const found = sectionsOf(this.#schema, values).sort((a, b) => place(a.name) - place(b.name));
+    this.#sections = found.map((section) => this.#sectionOf(section, open));
+    this.#element.replaceChildren(...this.#sections.map((section) => section.element));
+    return true;
+  }
+
+  #sectionOf(section, open) {
+    const summary = make("summary", {}, section.title);
+    const element = make("details", { "data-section": section.name }, summary);
+    const made = { ...section, element, views: [] };
+    element.addEventListener("toggle", () => {
+      this.#make(made);
+      this.#fill(made);
+    });
+    element.open = open.length ? open.includes(section.name) : OPEN.includes(section.name);
+    if (element.open) this.#make(made);
+    return made;
+  }
+
+  // The fields of a section are made when it is opened first.
+  #make(section) {
+    if (section.views.length) return;
+    const { values } = this.#store.get("session");
+    section.views = section.fields.map((field) => {
+      const edit = (value) => this.#link.edit({ [field.key]: value });
+      return Object.assign(new FieldView(field, values[field.key], edit), { key: field.key });
+    });
+    if (section.description) section.element.append(make("p.quiet", {}, section.description));
+    section.element.append(...section.views.map((view) => view.element));
+    if (section.name.startsWith("tissue.")) section.element.append(this.#layerTools(section.name));
+    this.#fill(section);
+  }
+
+  #fill(section) {
+    const [{ values, changed }, draft] = [this.#store.get("session"), this.#store.get("draft") ?? {}];
+    for (const view of section.views) {
+      const value = view.key in draft ? draft[view.key] : values[view.key] ?? null;
+      view.update(value, changed.includes(view.key), this.#problems[view.key]);
+    }
+    const faulty = section.fields.some(({ key }) => this.#problems[key]);
+    section.element.classList.toggle("faulty", faulty);
+  }
+
+  // Problems of the newest refusal, until an edit is taken; the section of the first is opened.
+  #readProblems({ revision }) {
+    if (revision !== this.#revision) this.#problems = {};
+    this.#revision = revision;
+    const newest = (this.#store.get("refusals") ?? []).at(-1);
+    if (!newest || newest.number === this.#refusal) return;
+    this.#refusal = newest.number;
+    this.#problems = newest.problems;
+    const keys = Object.keys(newest.problems);
+    const first = this.#sections.find(({ fields }) => fields.some(({ key }) => keys.includes(key)));
+    if (first) first.element.open = true;
+  }
+
+  #layerTools(name) {
+    const layer = Number(name.split(".")[1]);
+    const change = (make) => this.#link.edit({ tissue: make(layersOf(this.#store.get("session").values)) });
+    const add = () => change((layers) => layers.toSpliced(layer, 0, { ...layers[layer], thickness_mm: layers[layer].thickness_mm ?? 10 }));
+    const remove = button("Remove", () => change((layers) => layers.toSpliced(layer, 1)), { "aria-label": `Remove layer ${layer + 1}` });
+    const { values } = this.#store.get("session");
+    remove.disabled = !("tissue.1.shear_modulus_kpa" in values);
+    return make("div.tools", {}, button("Add a layer above", add, { "aria-label": `Add a layer above layer ${layer + 1}` }), remove);
+  }
+}
+
+// Tables of the layers, from values by key.
+function layersOf(values) {
+  const layers = [];
+  for (const [key, value] of Object.entries(values)) {
+    const [, layer, part] = /^tissue\.(\d+)\.(.+)$/.exec(key) ?? [];
+    if (layer) (layers[layer] ??= {})[part] = value;
+  }
+  return layers;
+}
+
+function place(name) {
+  const at = ORDER.indexOf(name.startsWith("tissue") ? "tissue" : name);
+  return at < 0 ? ORDER.length : at;
+}

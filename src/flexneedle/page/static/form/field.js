@@ -1,0 +1,111 @@
+// One field of the form: label, value with its unit, slider, words, and the problem that the server has with it.
+
+import { make } from "../dom.js";
+import { rangeOf, read, written } from "./fields.js";
+
+const WORDS = 24; // a field of text is at most this wide
+
+export class FieldView {
+  #field;
+  #slider = null;
+  #problem = make("p.problem.bad", { hidden: true });
+  #shown; // value of the scenario
+  #before = ""; // text when the field got the focus
+
+  // field: of fields.js; value: at first, which the slider's range depends on; edit: called with a new value.
+  constructor(field, value, edit) {
+    this.#field = field;
+    this.edit = edit;
+    const id = `field-${field.key.replaceAll(".", "-")}`;
+    this.#problem.id = `${id}-problem`;
+    const help = make("p.help.quiet", { id: `${id}-help` }, field.description);
+    this.input = this.#inputOf(id);
+    const unit = field.unit && make("span.unit.quiet", { "aria-hidden": "true" }, field.unit);
+    const name = make("label", { for: id, title: field.key }, field.label);
+    if (field.unit) name.append(make("span.spoken", {}, ` in ${field.unit}`));
+    const range = rangeOf(field, value);
+    if (range) this.#slider = this.#sliderOf(range);
+    this.element = make("div.field", { "data-key": field.key }, name, make("span.value", {}, this.input, unit));
+    this.element.append(...[this.#slider, this.#problem, help].filter(Boolean));
+  }
+
+  // Text that a search compares with.
+  get words() {
+    const { key, label, unit, description } = this.#field;
+    return `${key} ${label} ${unit} ${description}`.toLowerCase();
+  }
+
+  // Show a value; what the user is writing, or what is refused, stays.
+  update(value, changed, problem) {
+    this.element.classList.toggle("changed", changed);
+    this.#show(problem);
+    if (problem && !this.#same(value)) return;
+    this.#shown = value;
+    if (this.#field.kind === "switch") this.input.checked = Boolean(value);
+    else if (document.activeElement !== this.input) this.input.value = written(value);
+    if (this.#slider && document.activeElement !== this.#slider) this.#slider.value = value ?? this.#field.usual ?? 0;
+  }
+
+  #same(value) {
+    return JSON.stringify(value) === JSON.stringify(this.#shown) && this.input.value === written(value);
+  }
+
+  #show(problem) {
+    this.#problem.hidden = !problem;
+    this.#problem.textContent = problem ?? "";
+    this.input.setAttribute("aria-invalid", problem ? "true" : "false");
+  }
+
+  #inputOf(id) {
+    const { kind, choices, nullable, usual } = this.#field;
+    const described = { id, "aria-describedby": `${id}-problem ${id}-help` };
+    if (kind === "switch") {
+      return make("input", { ...described, type: "checkbox", change: ({ target }) => this.edit(target.checked) });
+    }
+    const change = () => this.#take();
+    if (kind === "choice") {
+      const names = nullable ? ["", ...choices] : choices;
+      const options = names.map((name) => make("option", { value: name }, name || "not set"));
+      return make("select", { ...described, change }, ...options);
+    }
+    const numeric = kind === "number" || kind === "integer";
+    const given = { type: "text", inputmode: numeric ? "decimal" : undefined, placeholder: written(usual) || "not set" };
+    const input = make("input", { ...described, ...given, autocomplete: "off", size: numeric ? "8" : String(WORDS), change });
+    input.addEventListener("keydown", (event) => this.#key(event));
+    input.addEventListener("focus", () => {
+      this.#before = input.value;
+    });
+    input.addEventListener("blur", () => this.#leave());
+    return input;
+  }
+
+  #sliderOf({ min, max, step }) {
+    const { label, unit } = this.#field;
+    const slider = make("input", { type: "range", min: `${min}`, max: `${max}`, step: `${step}`, "aria-label": `${label} ${unit}, slider` });
+    slider.addEventListener("input", () => {
+      const value = Number(slider.value);
+      this.input.value = written(value);
+      this.edit(value);
+    });
+    return slider;
+  }
+
+  #take() {
+    const { value, problem } = read(this.#field, this.input.value);
+    this.#show(problem);
+    if (problem === undefined) this.edit(value);
+  }
+
+  // What has come while the field had the focus is shown, unless its user wrote something.
+  #leave() {
+    const refused = this.input.getAttribute("aria-invalid") === "true";
+    if (!refused && this.input.value === this.#before) this.input.value = written(this.#shown);
+  }
+
+  // Escape restores the scenario's value; Enter is a change.
+  #key({ key }) {
+    if (key !== "Escape") return;
+    this.input.value = written(this.#shown);
+    this.#show(undefined);
+  }
+}

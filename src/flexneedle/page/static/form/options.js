@@ -1,0 +1,43 @@
+// What is not in the scenario: seed, strategy, controller.
+
+import { button, make } from "../dom.js";
+
+const MOST = 2 ** 53;
+
+// Fields of the options in `element`, which follow the session.
+export function followOptions(element, store, link) {
+  const ask = async (options) => {
+    const answer = await link.ask({ type: "options", ...options });
+    if (!answer.done) show();
+  };
+  const seed = make("input", {
+    id: "option-seed", type: "number", min: "0", step: "1", inputmode: "numeric", change: () => takeSeed(Number(seed.value)),
+  });
+  const takeSeed = (value) => (Number.isInteger(value) && value >= 0 && value <= MOST ? ask({ seed: value }) : show());
+  const next = button("Next", () => takeSeed(store.get("session").seed + 1), { "aria-label": "Next seed" });
+  const strategy = make("select", { id: "option-strategy", change: () => ask({ strategy: strategy.value }) });
+  const controller = make("select", { id: "option-controller", change: () => ask({ controller: controller.value }) });
+  const help = make("p.help.quiet", { id: "option-help" });
+  controller.setAttribute("aria-describedby", "option-help");
+  element.append(
+    row("Seed", seed, next), row("Strategy", strategy), row("Controller", controller), help,
+  );
+
+  function show() {
+    const [session, welcome] = [store.get("session"), store.get("welcome")];
+    if (!session || !welcome) return;
+    if (document.activeElement !== seed) seed.value = session.seed;
+    choose(strategy, welcome.strategies, session.strategy);
+    choose(controller, welcome.controllers.map(({ name }) => name), session.controller);
+    help.textContent = welcome.controllers.find(({ name }) => name === session.controller)?.summary ?? "";
+  }
+  store.subscribe(["session", "welcome"], show);
+}
+
+const row = (name, input, ...more) =>
+  make("div.field", {}, make("label", { for: input.id }, name), make("span.value", {}, input, ...more));
+
+function choose(select, names, chosen) {
+  if (select.options.length !== names.length) select.replaceChildren(...names.map((name) => make("option", {}, name)));
+  select.value = chosen;
+}

@@ -1,0 +1,63 @@
+// Run an insertion: start, stop, pause, single periods, pace; arm a connected rig; disturb; decisions in words.
+
+import { button, make, shown } from "./dom.js";
+import { followDecisions } from "./insertion/decisions.js";
+import { disturbForm } from "./insertion/disturb.js";
+import { rigForm } from "./insertion/rig.js";
+import { maySteer } from "./shown.js";
+
+const PACES = [0.25, 0.5, 1, 2, 5, 10, 20];
+const RUNS = ["waiting", "planning", "running", "paused"];
+const STATES = {
+  waiting: "Waiting for the computation", planning: "Planning", running: "Running", paused: "Paused", done: "Ended",
+  held: "Held", failed: "Failed", interrupted: "Stopped", refused: "Refused",
+};
+
+export function mount(element, store, link) {
+  const state = make("p", { role: "status" });
+  const start = button("Insert", () => link.ask({ type: "insert" }), { class: "primary", title: "On the virtual rig, in real time" });
+  const slowly = button("Start paused", () => link.ask({ type: "insert", paused: true }));
+  const stop = button("Stop", () => link.ask({ type: "stop" }), { class: "danger" });
+  const pause = button("Pause", () => link.ask({ type: "pace", pace: pause.dataset.next === "go" ? Number(pace.value) : 0 }));
+  const step = button("One period", () => link.ask({ type: "advance" }), { title: "Carry out one control period" });
+  const pace = make("select", { "aria-label": "Pace", change: () => link.ask({ type: "pace", pace: Number(pace.value) }) });
+  pace.append(...PACES.map((each) => make("option", { value: String(each) }, `${each}×`)));
+  pace.value = "1";
+  const [rig, disturb] = [rigForm(store, link), disturbForm(store, link)];
+  const decisions = make("div.decisions");
+  element.append(
+    state,
+    make("div.tools", { role: "toolbar", "aria-label": "Insertion" }, start, slowly, stop, pause, step, pace),
+    rig, disturb, decisions,
+  );
+  followDecisions(decisions, store);
+
+  store.subscribe(["insertion live", "people", "welcome"], () => {
+    const live = store.get("insertion live");
+    const runs = RUNS.includes(live?.state);
+    const [steers, real, paused] = [maySteer(store), Boolean(live?.rig), live?.pace === 0];
+    state.textContent = inWords(live);
+    for (const each of [start, slowly]) Object.assign(each, { hidden: runs, disabled: !steers });
+    for (const each of [stop, pause]) each.hidden = !runs;
+    step.hidden = pace.hidden = !runs || real;
+    pause.disabled = pace.disabled = !steers;
+    step.disabled = !steers || !paused;
+    pause.dataset.next = paused ? "go" : "pause";
+    pause.textContent = paused ? "Continue" : real ? "Hold" : "Pause";
+    if (real) pace.value = "1";
+    else if (live?.pace && document.activeElement !== pace) pace.value = String(nearest(live.pace));
+    disturb.hidden = !runs || real;
+    disturb.disabled = !steers;
+  });
+}
+
+function inWords(live) {
+  if (!live) return "No insertion yet: the plan is made first, if there is none.";
+  const where = live.rig ? ` on ${live.rig}` : "";
+  const parts = [`${STATES[live.state] ?? live.state}${where}: ${live.controller}, seed ${live.seed}, ${live.periods} periods.`];
+  if (live.summary) parts.push(live.summary);
+  else if ((live.error_mm ?? null) !== null) parts.push(`The tip ended ${shown(live.error_mm, 3)} mm from the target.`);
+  return parts.join(" ");
+}
+
+const nearest = (pace) => PACES.reduce((best, each) => (Math.abs(each - pace) < Math.abs(best - pace) ? each : best));

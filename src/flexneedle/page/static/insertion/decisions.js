@@ -1,0 +1,65 @@
+// What the controller decided, in words: the decision of the shown period, and all changes of it.
+
+import { button, make, shown } from "../dom.js";
+import { SHOWN, shownOf, shownPeriod, shownRow } from "../shown.js";
+
+const MOST = 100; // entries: the newest
+
+export function followDecisions(element, store) {
+  const now = make("p.now");
+  const list = make("ol", { "aria-label": "Decisions" });
+  element.append(now, list);
+  let made = { of: null, first: null, count: 0, text: "", buttons: [] };
+
+  store.subscribe(SHOWN, () => {
+    const of = shownOf(store);
+    const rows = store.get(`rows ${of}`) ?? [];
+    const row = shownRow(store, of);
+    now.hidden = list.hidden = !row;
+    now.textContent = row ? inWords(row) : "";
+    if (made.of !== of || made.first !== rows[0] || rows.length < made.count) restart(of, rows[0]);
+    for (let at = made.count; at < rows.length && rows[at]; at++) add(rows[at]);
+    mark(shownPeriod(store, of));
+  });
+
+  function restart(of, first) {
+    made = { of, first, count: 0, text: "", buttons: [] };
+    list.replaceChildren();
+  }
+
+  // An entry where the words differ from those of the period before.
+  function add(row) {
+    made.count = row.index + 1;
+    const text = textOf(row);
+    if (text === made.text) return;
+    made.text = text;
+    const go = button(`${shown(row.time, 1)} s`, () => store.set("view period", row.index), { "aria-label": `Show period ${row.index + 1}` });
+    const entry = make("li", {}, go, make("span", { class: row.warning || row.late ? "bad" : "" }, text));
+    list.prepend(entry);
+    made.buttons.push({ index: row.index, entry });
+    if (made.buttons.length > MOST) made.buttons.shift().entry.remove();
+  }
+
+  // The entry that holds at the shown period.
+  function mark(period) {
+    const current = made.buttons.findLast(({ index }) => period !== null && index <= period);
+    for (const { entry } of made.buttons) {
+      if (entry === current?.entry) entry.setAttribute("aria-current", "step");
+      else if (entry.hasAttribute("aria-current")) entry.removeAttribute("aria-current");
+    }
+  }
+}
+
+function textOf({ decision, verdict, warning, late }) {
+  const parts = [decision];
+  if (verdict && verdict !== "ok") parts.push(`measurement ${verdict}`);
+  if (late) parts.push("decided late");
+  if (warning) parts.push(warning);
+  return parts.join("; ");
+}
+
+function inWords(row) {
+  const miss = row.miss_mm.filter((each) => each !== null);
+  const predicted = miss.length ? `, predicted miss ${shown(Math.hypot(...miss))} mm ± ${shown(row.miss_sd_mm)}` : "";
+  return `Period ${row.index + 1}, ${shown(row.time, 1)} s: ${textOf(row)} (error ${shown(row.error_mm)} mm${predicted}).`;
+}

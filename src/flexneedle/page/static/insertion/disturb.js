@@ -1,0 +1,41 @@
+// Disturb a virtual insertion: push the tip, stiffen a layer, drop the tracker, bring a metal plate.
+
+import { button, make } from "../dom.js";
+
+// A form whose requests act at once; what is active is listed.
+export function disturbForm(store, link) {
+  const active = make("p.quiet", { role: "status" });
+  const number = (label, value, more = {}) => make("input", { type: "number", min: "0", step: "any", value: String(value), "aria-label": label, ...more });
+  const [force, angle] = [number("Force on the tip in N", 0.1), number("Direction of the force in degrees", 90, { min: "-360", max: "360" })];
+  const [layer, factor] = [make("select", { "aria-label": "Layer" }), number("Factor on its stiffness", 2)];
+  const [seconds, distance] = [number("Seconds without the tracker", 1), number("Distance of the plate in mm", 100)];
+  const disturb = (what, size, more = {}) => {
+    if (Number.isFinite(size.valueAsNumber)) link.ask({ type: "disturb", what, size: size.valueAsNumber, ...more });
+  };
+  const none = (what) => link.ask({ type: "disturb", what, size: 0 });
+
+  const form = make(
+    "fieldset.disturb", { hidden: true }, make("legend", {}, "Disturb it"),
+    line("Push the tip", force, "N at", angle, "°", button("Push", () => disturb("push", force, angleOf(angle))), button("Let go", () => none("push"), { "aria-label": "Let go of the tip" })),
+    line("Stiffen", layer, "×", factor, button("Stiffen", () => disturb("stiffen", factor, { layer: Number(layer.value) }))),
+    line("Drop the tracker for", seconds, "s", button("Drop", () => disturb("drop", seconds))),
+    line("Metal plate at", distance, "mm", button("Bring", () => disturb("plate", distance)), button("Take away", () => none("plate"))),
+    active,
+  );
+  store.subscribe(["disturbances"], () => {
+    const list = store.get("disturbances")?.active ?? [];
+    active.textContent = list.length ? `Active: ${list.join("; ")}` : "";
+  });
+  store.subscribe(["insertion live", "scene"], () => chooseLayers(layer, store));
+  return form;
+}
+
+const line = (...parts) => make("div.tools", {}, ...parts);
+const angleOf = (input) => (Number.isFinite(input.valueAsNumber) ? { angle_deg: input.valueAsNumber } : {});
+
+function chooseLayers(select, store) {
+  const layers = (store.get("insertion live")?.scene ?? store.get("scene"))?.layers ?? [];
+  const names = layers.map(({ name }, index) => `${index + 1}: ${name}`);
+  if (names.join() === [...select.options].map(({ text }) => text).join()) return;
+  select.replaceChildren(...names.map((name, index) => make("option", { value: String(index) }, name)));
+}

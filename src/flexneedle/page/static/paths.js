@@ -1,0 +1,45 @@
+// Paths out of the shapes and rows of the store, for all views.
+
+import { isStale } from "./shown.js";
+
+// What `key` holds, if the news that it belongs to is of the present state of the scenario.
+export const fresh = (store, news, key) => (isStale(store, store.get(news)) ? undefined : store.get(key));
+
+// First and last path of a shape, or null.
+export const first = (shape) => slice(shape, 0);
+export const last = (shape) => slice(shape, (shape?.paths ?? 1) - 1);
+
+// One path of a shape; the same object for the same shape, so that it is drawn once.
+const slices = new WeakMap();
+function slice(shape, index) {
+  if (!shape || shape.paths === 0) return null;
+  const known = slices.get(shape) ?? new Map();
+  slices.set(shape, known);
+  if (!known.has(index)) {
+    const size = shape.points * shape.columns;
+    known.set(index, { ...shape, paths: 1, values: shape.values.subarray(index * size, (index + 1) * size) });
+  }
+  return known.get(index);
+}
+
+// Last point (x, y, z) of a path.
+export const tipOf = ({ values, points, columns }) => Array.from(values.subarray((points - 1) * columns, (points - 1) * columns + 3));
+
+// Path of a position of rows, such as "estimate", or null.
+export function pathOfRows(rows, key) {
+  const known = rows.filter((row) => row?.[key]);
+  if (known.length < 2) return null;
+  return { points: known.length, paths: 1, columns: 3, values: Float32Array.from(known.flatMap((row) => row[key])) };
+}
+
+// Rank of each path by its cost, column 4 of its last point, from 0 (least) to 1; 0 where there is none.
+export function ranksOf({ values, paths, points, columns }) {
+  const ranks = new Float32Array(paths);
+  if (columns < 4 || paths < 2) return ranks;
+  const cost = (path) => values[((path + 1) * points - 1) * columns + 3];
+  const order = Array.from({ length: paths }, (_, path) => path).sort((a, b) => cost(a) - cost(b));
+  order.forEach((path, place) => {
+    ranks[path] = place / (paths - 1);
+  });
+  return ranks;
+}

@@ -1,0 +1,62 @@
+// Plans: search, both strategies side by side with their costs, as in the paper's figure, reach; cost over iterations.
+
+import { button, make, shown } from "./dom.js";
+import { CostPlot } from "./plans/cost.js";
+import { SweepView } from "./plans/sweep.js";
+import { termsTable } from "./plans/terms.js";
+import { isStale, maySteer } from "./shown.js";
+
+const STRATEGIES = ["manipulation", "steering"];
+const WORK = [["Plan", "plan"], ["Both strategies", "compare"], ["Reach", "reach"]];
+const ACTIVE = ["waiting", "running"];
+
+export function mount(element, store, link) {
+  const starts = WORK.map(([text, work]) => button(text, () => link.ask({ type: "start", work }), { "data-work": work }));
+  starts[0].classList.add("primary");
+  const cancel = button("Cancel", () => activeJobs(store).forEach(({ job }) => link.ask({ type: "cancel", job })), { hidden: true });
+  const progress = make("progress", { max: "1", "aria-label": "Progress of the plan", hidden: true });
+  const words = make("ul.words", { role: "status" });
+  const cost = make("div.cost");
+  const figures = make("div.sweeps");
+  const table = make("div");
+  element.append(make("div.tools", { role: "toolbar", "aria-label": "Plan" }, ...starts, cancel, progress), words, cost, figures, table);
+
+  const plot = new CostPlot(cost, store, STRATEGIES);
+  const sweeps = STRATEGIES.map((strategy) => new SweepView(figures, store, strategy));
+  store.subscribe(["people", "welcome"], () => {
+    for (const each of starts) each.disabled = !maySteer(store);
+  });
+  store.subscribe(["job ", "people", "welcome"], () => {
+    const [job] = activeJobs(store);
+    cancel.hidden = progress.hidden = !job;
+    cancel.disabled = !maySteer(store);
+    if ((job?.share ?? null) === null) progress.removeAttribute("value");
+    else progress.value = job.share;
+  });
+  store.subscribe(["session", "scene", "estimate", "plan ", "iteration ", "shape ", "view theme"], () => {
+    words.replaceChildren(...lines(store).map(([text, stale]) => make("li", { class: stale ? "quiet" : "" }, text)));
+    plot.update();
+    for (const sweep of sweeps) sweep.update();
+    table.replaceChildren(...termsTable(STRATEGIES.map((strategy) => store.get(`plan ${strategy}`)).filter(Boolean)));
+  });
+}
+
+const activeJobs = (store) => ["plan", "compare", "reach"].map((kind) => store.get(`job ${kind}`)).filter((job) => job && ACTIVE.includes(job.state));
+
+// [text, stale] for each result.
+function lines(store) {
+  const found = [];
+  const estimate = store.get("estimate");
+  const plans = STRATEGIES.map((strategy) => store.get(`plan ${strategy}`)).filter(Boolean);
+  if (estimate && !isStale(store, estimate) && plans.every((plan) => isStale(store, plan))) {
+    found.push([`First estimate: ends ${shown(estimate.error_mm, 2)} mm off${estimate.reached ? "" : ", out of reach"}.`, false]);
+  }
+  for (const plan of plans) {
+    const stale = isStale(store, plan);
+    const limit = plan.limit ? `; limit: ${plan.limit}` : "";
+    found.push([`${titled(plan.strategy)}: ${plan.summary}${limit}${stale ? " (for an earlier state of the scenario)" : ""}.`, stale]);
+  }
+  return found;
+}
+
+const titled = (word) => word[0].toUpperCase() + word.slice(1);

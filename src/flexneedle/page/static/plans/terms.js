@@ -1,0 +1,29 @@
+// Table of plans: where each ends, and the weighted terms of its cost.
+
+import { make, shown } from "../dom.js";
+
+const ROWS = [
+  ["Ends off the target (mm)", ({ error_mm: error }) => shown(error, 3)],
+  ["Tissue energy (mJ)", ({ energy_mj: energy }) => shown(energy, 4)],
+  ["Flips", ({ flips }) => String(flips)],
+  ["Found in (s)", ({ seconds }) => shown(seconds, 2)],
+];
+
+// A table in a list, or none without plans.
+export function termsTable(plans) {
+  if (!plans.length) return [];
+  const row = (name, cell) => make("tr", {}, make("th", { scope: "row" }, name), ...plans.map((plan) => make("td.number", {}, cell(plan))));
+  const names = [...new Set(plans.flatMap(({ terms }) => Object.keys(terms)))];
+  const most = Math.max(...plans.flatMap(({ terms }) => Object.values(terms)), 1e-12);
+  const terms = names.map((name) => row(`Cost: ${name}`, ({ terms }) => barOf(terms[name], most)));
+  const head = make("tr", {}, make("td"), ...plans.map(({ strategy }) => make("th.number", { scope: "col" }, strategy)));
+  const caption = make("caption.spoken", {}, "Plans and the terms of their cost");
+  return [make("table", {}, caption, make("thead", {}, head), make("tbody", {}, ...terms, row("Cost", ({ cost }) => shown(cost, 3)), ...ROWS.map((each) => row(...each))))];
+}
+
+// A number with a bar of its size.
+function barOf(value, most) {
+  if (value === undefined) return "–";
+  const bar = make("meter", { min: "0", max: String(most), value: String(value), "aria-hidden": "true" });
+  return make("span.bar", {}, bar, shown(value, 3));
+}

@@ -1,0 +1,136 @@
+// Time: which insertion and which period all views show; scrub, play, slower, faster.
+// Keys within the panel: space plays, , and . step, Home and End, < and > change the speed.
+
+import { button, make, shown } from "./dom.js";
+import { SHOWN, shownOf, shownPeriod } from "./shown.js";
+
+const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10, 20];
+const NAMES = { scene: "Plan", live: "Insertion", first: "Recorded run" };
+
+export function mount(element, store) {
+  const player = new Player(store);
+  const choices = Object.entries(NAMES).map(([of, text]) => button(text, () => player.choose(of), { "data-of": of }));
+  const play = button("Play", () => player.toggle(), { "aria-keyshortcuts": "Space", class: "primary" });
+  const back = button("‹", () => player.step(-1), { "aria-label": "One period back", "aria-keyshortcuts": "," });
+  const on = button("›", () => player.step(1), { "aria-label": "One period on", "aria-keyshortcuts": "." });
+  const slower = button("Slower", () => player.change(-1), { "aria-keyshortcuts": "<" });
+  const faster = button("Faster", () => player.change(1), { "aria-keyshortcuts": ">" });
+  const newest = button("Newest", () => player.follow());
+  const [speed, place] = [make("span.number"), make("span.number.quiet")];
+  const scrub = make("input", { type: "range", min: "0", step: "1", "aria-label": "Period", input: () => player.show(Number(scrub.value)) });
+  const tools = make("div.tools", { role: "toolbar", "aria-label": "Player" }, play, back, on, slower, speed, faster, newest, place);
+  const nothing = make("p.quiet", {}, "No insertion and no recorded run yet.");
+  element.append(make("div.tools", { role: "group", "aria-label": "What is shown" }, ...choices), scrub, tools, nothing);
+  element.addEventListener("keydown", (event) => player.key(event));
+
+  store.subscribe([...SHOWN, "view playing", "view speed"], () => {
+    const of = shownOf(store);
+    const rows = store.get(`rows ${of}`) ?? [];
+    const period = shownPeriod(store, of);
+    for (const each of choices) {
+      each.setAttribute("aria-pressed", String(each.dataset.of === of));
+      each.hidden = each.dataset.of !== "scene" && !store.get(`insertion ${each.dataset.of}`);
+    }
+    const some = period !== null;
+    scrub.hidden = tools.hidden = !some;
+    nothing.hidden = some || Boolean(store.get("insertion live") ?? store.get("insertion first"));
+    if (!some) return;
+    scrub.max = String(rows.length - 1);
+    scrub.value = String(period);
+    const time = `${shown(rows[period]?.time, 1)} s`;
+    scrub.setAttribute("aria-valuetext", `period ${period + 1} of ${rows.length}, ${time}`);
+    place.textContent = `${time} · period ${period + 1} of ${rows.length}`;
+    play.textContent = store.get("view playing") ? "Pause" : "Play";
+    speed.textContent = `${player.speed}×`;
+    newest.hidden = store.get("view period") === undefined;
+  });
+}
+
+class Player {
+  #store;
+  #frame = 0;
+  #time = 0; // s of the insertion
+  #before = 0; // ms of the last paint
+
+  constructor(store) {
+    this.#store = store;
+  }
+
+  get speed() {
+    return SPEEDS[this.#store.get("view speed") ?? SPEEDS.indexOf(1)];
+  }
+
+  get #rows() {
+    return this.#store.get(`rows ${shownOf(this.#store)}`) ?? [];
+  }
+
+  choose(of) {
+    this.#pause();
+    this.#store.set("view of", of);
+    this.#store.set("view period", undefined);
+  }
+
+  // Show a period, which ends playing.
+  show(period) {
+    this.#pause();
+    this.#store.set("view period", Math.min(Math.max(period, 0), this.#rows.length - 1));
+  }
+
+  // Show the newest period as it comes.
+  follow() {
+    this.#pause();
+    this.#store.set("view period", undefined);
+  }
+
+  step(by) {
+    this.show((shownPeriod(this.#store) ?? 0) + by);
+  }
+
+  // Change the speed by one place.
+  change(by) {
+    const at = SPEEDS.indexOf(this.speed) + by;
+    this.#store.set("view speed", Math.min(Math.max(at, 0), SPEEDS.length - 1));
+  }
+
+  toggle() {
+    if (this.#store.get("view playing")) this.#pause();
+    else this.#play();
+  }
+
+  key(event) {
+    const { key, target } = event;
+    const acts = { " ": () => this.toggle(), ",": () => this.step(-1), ".": () => this.step(1), "<": () => this.change(-1), ">": () => this.change(1) };
+    if (event.ctrlKey || event.metaKey || event.altKey || !acts[key] || (key === " " && target.tagName === "BUTTON")) return;
+    event.preventDefault();
+    acts[key]();
+  }
+
+  // From the shown period, or from the start at the end.
+  #play() {
+    const rows = this.#rows;
+    if (!rows.length) return;
+    const at = shownPeriod(this.#store);
+    const start = at >= rows.length - 1 ? 0 : at;
+    this.#store.set("view period", start);
+    this.#store.set("view playing", true);
+    this.#time = rows[start]?.time ?? 0;
+    this.#before = performance.now();
+    this.#frame = requestAnimationFrame((now) => this.#tick(now));
+  }
+
+  #pause() {
+    cancelAnimationFrame(this.#frame);
+    this.#store.set("view playing", undefined);
+  }
+
+  #tick(now) {
+    this.#time += (this.speed * Math.max(now - this.#before, 0)) / 1000;
+    this.#before = now;
+    const rows = this.#rows;
+    let period = this.#store.get("view period") ?? 0;
+    while (period < rows.length - 1 && (rows[period + 1]?.time ?? 0) <= this.#time) period += 1;
+    this.#store.set("view period", period);
+    if (period >= rows.length - 1) this.#pause();
+    else this.#frame = requestAnimationFrame((next) => this.#tick(next));
+  }
+}

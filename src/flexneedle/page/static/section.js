@@ -1,0 +1,104 @@
+// The scene in section: x–y, x–z, or the plane through axis and target. Target, guide and boundaries are moved here.
+
+import { boxOf } from "./box.js";
+import { button, make, shown } from "./dom.js";
+import { KEYS, Handles } from "./flat/handles.js";
+import { boundaryEdit, guideEdit, guideOf, layersOf } from "./flat/layers.js";
+import { legendOf } from "./flat/legend.js";
+import { partsOf } from "./flat/parts.js";
+import { lateral, lifted, mappingOf, planeOf } from "./flat/plane.js";
+import { drawSection } from "./flat/section.js";
+import { Stage } from "./flat/stage.js";
+import { SHOWN, mayMove, shownScene, shownTarget, targetEdit } from "./shown.js";
+
+const PLANES = [["x–y", "x–y"], ["x–z", "x–z"], ["Axis and target", "target"]];
+const STRETCHES = [1, 2, 5];
+
+export function mount(element, store, link) {
+  const canvas = make("canvas", { role: "img", "aria-label": "Section of the scene" });
+  const stage = make("div.stage", {}, canvas);
+  const legend = make("ul.legend", { "aria-label": "Legend of the section" });
+  const view = new SectionView(canvas, stage, legend, store, link);
+  const planes = PLANES.map(([text, name]) => button(text, () => view.choose(name), { "data-plane": name }));
+  const stretch = make("select", { "aria-label": "Stretch of the lateral axis", change: () => view.stretchBy(Number(stretch.value)) });
+  stretch.append(...STRETCHES.map((each) => make("option", { value: String(each) }, each === 1 ? "to scale" : `lateral ×${each}`)));
+  element.append(stage, make("div.tools", { role: "toolbar", "aria-label": "Section" }, ...planes, stretch), legend);
+  view.changed = () => {
+    for (const each of planes) each.setAttribute("aria-pressed", String(each.dataset.plane === view.plane));
+  };
+  view.changed();
+}
+
+class SectionView {
+  #stage;
+  #handles;
+  #legend;
+  #store;
+  #link;
+  #stretch = 1;
+  #box = null;
+  #frozen = null; // plane while something is dragged
+  plane = "target";
+  changed = () => {};
+
+  constructor(canvas, stage, legend, store, link) {
+    [this.#legend, this.#store, this.#link] = [legend, store, link];
+    this.#handles = new Handles(stage);
+    this.#stage = new Stage(canvas, (pen, { width, height }) => this.#draw(pen, width, height));
+    store.subscribe([...SHOWN, "people", "welcome"], () => this.#stage.schedule());
+  }
+
+  choose(plane) {
+    this.plane = plane;
+    this.changed();
+    this.#stage.schedule();
+  }
+
+  stretchBy(factor) {
+    this.#stretch = factor;
+    this.#stage.schedule();
+  }
+
+  #draw(pen, width, height) {
+    const [scene, target] = [shownScene(this.#store), shownTarget(this.#store)];
+    if (!scene || !target) return;
+    if (!this.#handles.dragged) {
+      this.#box = boxOf(scene, target);
+      this.#frozen = planeOf(this.plane, scene, target);
+    }
+    const plane = this.#frozen;
+    const map = mappingOf(this.#box, width, height, this.#stretch);
+    const [layers, guide] = [layersOf(this.#store, scene), guideOf(this.#store, scene)];
+    const parts = partsOf(this.#store, scene);
+    const reached = drawSection(pen, { width, height, map, plane, name: this.plane, layers, guide, scene, target, parts, store: this.#store });
+    legendOf(this.#legend, parts, reached);
+    this.#handles.update(mayMove(this.#store) ? this.#handlesOf({ map, plane, layers, guide, scene, target, height }) : []);
+  }
+
+  #handlesOf({ map, plane, layers, guide, target, height }) {
+    const edit = (values) => this.#link.edit(values);
+    const u = lateral(plane, ...target);
+    const move = (x, to) => edit(targetEdit(this.#store, lifted(plane, x, to, target)));
+    const handles = [{
+      id: "target", form: "point", at: [map.toX(target[0]), map.toY(u)],
+      name: `Target: depth ${shown(target[0])} mm, lateral ${target.slice(1).map((each) => shown(each)).join(" and ")} mm. ${KEYS}`,
+      drag: (px, py) => move(map.fromX(px), map.fromY(py)),
+      nudge: (right, up) => move(target[0] + right, u + up),
+    }];
+    if (guide !== null) {
+      handles.push({
+        id: "guide", form: "bar", at: [map.toX(guide), height - 30], name: `Guide: ${shown(-guide)} mm before the skin. ${KEYS}`,
+        drag: (px) => edit(guideEdit(map.fromX(px))), nudge: (right) => edit(guideEdit(guide + right)),
+      });
+    }
+    layers.slice(0, -1).forEach(({ name, bottom }, index) => {
+      const move = (x) => edit(boundaryEdit(layers, index, x));
+      handles.push({
+        id: `boundary-${index}`, form: "bar", at: [map.toX(bottom), height - 30],
+        name: `Boundary between ${name} and ${layers[index + 1].name}: depth ${shown(bottom)} mm. ${KEYS}`,
+        drag: (px) => move(map.fromX(px)), nudge: (right) => move(bottom + right),
+      });
+    });
+    return handles;
+  }
+}

@@ -1,0 +1,166 @@
+"""Presets, scenario files, links, recorded runs."""
+
+import numpy as np
+import pytest
+
+from fake_page import until
+from flexneedle.page.frames import Source
+from recorded_page import insertion, period_frames, rows
+
+pytestmark = pytest.mark.page
+
+FILES = "[data-panel=files]"
+TEXT = 'name = "mine"\n[target]\ndepth_mm = 33.0\n'
+
+
+@pytest.fixture
+def files(visit, server):
+    server.files["/scenario.toml"] = TEXT
+
+    def opened(**how):
+        page = visit(ready=f"{FILES} li", **how)
+        page.wait_for_selector("text=nobody steers")
+        return page
+
+    return opened
+
+
+def test_a_preset_and_a_random_world_are_begun(files, server):
+    page = files()
+    page.select_option("#files-preset", "phantom")
+    page.click("[aria-label='Begin with the preset']")
+    page.fill("[aria-label='Number of a random world']", "7")
+    page.click("text=Random world")
+    page.wait_for_timeout(100)
+    assert [each["name"] for each in server.asked("preset")] == ["phantom", "world:7"]
+
+
+def test_a_file_is_loaded(files, server):
+    page = files()
+    payload = {"name": "my ü.toml", "mimeType": "application/toml", "buffer": TEXT.encode()}
+    page.set_input_files(f"{FILES} input[type=file]", payload)
+    page.wait_for_selector("text=you steer")
+    page.wait_for_timeout(100)
+    assert server.asked("load") == [{"type": "load", "name": "my _.toml", "text": TEXT}]
+
+
+def test_a_file_that_is_too_large_is_not_sent(files, server):
+    page = files()
+    payload = {"name": "large.toml", "mimeType": "application/toml", "buffer": b"x" * 200_001}
+    page.set_input_files(f"{FILES} input[type=file]", payload)
+    page.wait_for_selector("text=must have at most 200000")
+    assert not server.asked("load")
+
+
+def test_a_link_reproduces_scenario_and_options(files, server):
+    page = files()
+    page.click("text=Copy a link")
+    until(page, "location.hash.startsWith('#state=')")
+    address = page.url
+    page.goto("about:blank")
+    page.goto(address)
+    page.wait_for_selector("text=you steer")
+    until(page, "!location.hash")
+    page.wait_for_timeout(200)
+    assert server.asked("load") == [{"type": "load", "name": "phantom3d", "text": TEXT}]
+    assert server.asked("options") == [
+        {"type": "options", "seed": 0, "strategy": "manipulation", "controller": "adaptive-mpc"}
+    ]
+
+
+def test_a_damaged_link_is_reported(files, server):
+    page = files()
+    page.evaluate("() => { location.hash = '#state=x'; }")
+    page.wait_for_selector("text=The link is damaged")
+    assert not server.asked("load")
+
+
+def test_a_run_is_opened_compared_closed_and_downloaded(files, server):
+    page = files()
+    page.click("[aria-label='Open first']")
+    page.click("[aria-label='Compare with first']")
+    page.click("summary:has-text('Download')")
+    links = page.locator(".run a").evaluate_all("all => all.map((one) => one.getAttribute('href'))")
+    assert links == [f"/runs/first/{file}" for file in ("figure.png", "trace.csv", "run.zip", "replay.html")]
+    server.send(insertion("done", of="first"), rows(0, 3, "first"), *period_frames(2, Source.FIRST))
+    page.click("[aria-label='Close phantom3d']")
+    page.wait_for_timeout(100)
+    assert server.asked("open") == [
+        {"type": "open", "name": "first", "second": False},
+        {"type": "open", "name": "first", "second": True},
+        {"type": "open", "name": None, "second": False},
+    ]
+
+
+def test_an_insertion_that_has_ended_is_saved(files, server):
+    page = files()
+    assert not page.is_visible("[aria-label='Name of the run to save']")
+    server.send(insertion("done"))
+    page.fill("[aria-label='Name of the run to save']", "../x")
+    page.click("text=Save the insertion")
+    page.fill("[aria-label='Name of the run to save']", "my run")
+    page.click("text=Save the insertion")
+    page.wait_for_timeout(100)
+    assert server.asked("save") == [{"type": "save", "name": "my run"}]
+
+
+def test_a_picture_of_the_scene_is_saved(files):
+    page = files()
+    page.wait_for_selector("[data-panel=space] .legend li")
+    with page.expect_download() as download:
+        page.click("text=Picture")
+    assert download.value.suggested_filename == "flexneedle.png"
+
+
+DECODED = """
+async (bytes) => {
+  const decoder = new ImageDecoder({ data: Uint8Array.from(bytes).buffer, type: "image/gif" });
+  await decoder.tracks.ready;
+  const frames = [];
+  for (let at = 0; at < decoder.tracks.selectedTrack.frameCount; at++) {
+    const { image } = await decoder.decode({ frameIndex: at });
+    const canvas = new OffscreenCanvas(image.displayWidth, image.displayHeight);
+    canvas.getContext("2d").drawImage(image, 0, 0);
+    frames.push([...canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data]);
+  }
+  return frames;
+}
+"""
+
+
+@pytest.mark.parametrize("size", [(1, 1), (37, 20), (120, 90)])
+def test_a_gif_has_the_pixels_of_its_frames(files, size):
+    """Also where the codes of a frame need 12 bits and begin anew, and end at any of their lengths."""
+    page = files()
+    rng = np.random.default_rng(3)
+    frames = rng.integers(0, 256, (2, size[1], size[0], 4), dtype=np.uint8)
+    frames[..., 3] = 255
+    frames[1] = np.repeat(frames[1, :, :1], size[0], axis=1)  # long runs
+    made = page.evaluate(
+        """async ([width, height, frames]) => {
+          const { gifOf } = await import("/static/files/gif.js");
+          return [...gifOf(width, height, frames, 0.1)];
+        }""",
+        [*size, [frame.ravel().tolist() for frame in frames]],
+    )
+    shown = np.array(page.evaluate(DECODED, made)).reshape(frames.shape)
+    assert np.max(np.abs(shown - frames.astype(int))) <= 26
+
+
+def test_a_gif_of_an_insertion_is_saved(files, server, tmp_path):
+    page = files()
+    page.click("text=GIF")
+    page.wait_for_selector("text=A GIF needs an insertion")
+    server.send(insertion("done", of="first"), rows(0, 12, "first"), *frames_of(12))
+    until(page, "flexneedle.store.get('rows first')?.length === 12")
+    with page.expect_download() as download:
+        page.click("text=GIF")
+    download.value.save_as(tmp_path / "made.gif")
+    frames = page.evaluate(DECODED, list((tmp_path / "made.gif").read_bytes()))
+    assert len(frames) == 12
+    assert frames[0] != frames[-1]
+    assert page.evaluate("flexneedle.store.get('view period')") is None
+
+
+def frames_of(count):
+    return [frame for period in range(count) for frame in period_frames(period, Source.FIRST)]

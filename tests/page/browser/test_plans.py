@@ -1,0 +1,98 @@
+"""Plans: started, watched and cancelled; both strategies side by side with the terms of their cost."""
+
+import pytest
+
+from fake_page import until
+from flexneedle.page.messages import Estimate, Job
+from recorded_page import TARGET, iteration, opening, people, plan, plan_frames, planned, samples, session
+
+pytestmark = pytest.mark.page
+
+PLANS = "[data-panel=plans]"
+INKED = """canvas => {
+  const pen = canvas.getContext("2d");
+  return new Set(new Uint32Array(pen.getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size;
+}"""
+
+
+@pytest.fixture
+def plans(visit, server):
+    def opened(news=None, **how):
+        server.news = news or server.news
+        page = visit(ready=f"{PLANS} button:visible", **how)
+        page.wait_for_selector("text=steers")
+        return page
+
+    return opened
+
+
+def table(page):
+    """Cells by the name of their row."""
+    rows = page.locator(f"{PLANS} tbody tr").all()
+    return {row.locator("th").inner_text(): row.locator("td").all_inner_texts() for row in rows}
+
+
+def test_work_is_started_and_cancelled(plans, server):
+    page = plans()
+    for work in ("plan", "compare", "reach"):
+        page.click(f"{PLANS} [data-work={work}]")
+    page.wait_for_timeout(100)
+    assert [each["work"] for each in server.asked("start")] == ["plan", "compare", "reach"]
+    server.send(Job(job=4, kind="compare", state="running", share=0.25))
+    page.click(f"{PLANS} button:has-text('Cancel')")
+    assert page.eval_on_selector(f"{PLANS} progress", "bar => bar.value") == 0.25
+    server.send(Job(job=4, kind="compare", state="cancelled"))
+    page.wait_for_selector(f"{PLANS} progress", state="hidden")
+    assert server.asked("cancel") == [{"type": "cancel", "job": 4}]
+
+
+def test_cost_falls_with_each_iteration(plans, server):
+    page = plans()
+    for number in range(4):
+        server.send(iteration(number), samples(number))
+        until(page, f"flexneedle.store.get('iteration manipulation')?.iteration === {number}")
+    page.wait_for_selector(f"{PLANS} .cost canvas")
+    assert page.locator(f"{PLANS} .cost .legend > *").all_inner_texts() == [
+        "manipulation, best",
+        "manipulation, elite",
+        "manipulation, median",
+    ]
+
+
+def test_strategies_are_side_by_side_with_their_terms(plans):
+    page = plans(planned())
+    page.wait_for_selector(f"{PLANS} table")
+    cells = table(page)
+    assert cells["Cost: accuracy"] == ["0.020", "4.000"]
+    assert cells["Cost: energy"] == ["0.120", "–"]
+    assert cells["Cost"] == ["0.190", "4.200"]
+    assert cells["Flips"] == ["0", "2"]
+    page.locator(f"{PLANS} .sweeps").scroll_into_view_if_needed()
+    page.wait_for_timeout(200)
+    assert page.locator(f"{PLANS} .sweeps canvas:visible").count() == 2
+    for canvas in page.locator(f"{PLANS} .sweeps canvas").all():
+        assert canvas.evaluate(INKED) > 30
+
+
+def test_a_plan_of_an_earlier_state_is_marked_and_the_estimate_is_shown(plans, server):
+    page = plans([*opening(), plan(), *plan_frames()])
+    page.wait_for_selector(f"{PLANS} >> text=Manipulation: ends 0.001 mm off.")
+    server.send(session(2), Estimate(revision=2, error_mm=0.31, reached=False, tip=TARGET, seconds=0.1))
+    page.wait_for_selector(f"{PLANS} >> text=First estimate: ends 0.31 mm off, out of reach.")
+    page.wait_for_selector(f"{PLANS} >> text=for an earlier state of the scenario")
+    page.wait_for_selector(f"{PLANS} .sweeps .stale")
+
+
+def test_nothing_is_started_while_another_steers(plans):
+    page = plans([*opening(), people(2, steering=2)])
+    until(page, f"document.querySelector('{PLANS} [data-work=plan]').disabled")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(1280, 1000), (390, 844)])
+def test_it_is_drawn_at_each_size(plans, pictures, size, scheme):
+    page = plans(planned(), width=size[0], height=size[1], scheme=scheme)
+    page.evaluate("document.querySelector('.panel.plans').scrollIntoView()")
+    page.wait_for_timeout(300)
+    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    pictures(page, f"plans-{size[0]}-{scheme}")

@@ -1,0 +1,141 @@
+"""Section and view along the axis: to scale, in step with the period; target, guide and boundaries are moved."""
+
+import numpy as np
+import pytest
+
+from fake_page import until
+from flexneedle.page.messages import Reach
+from recorded_page import TARGET, inserting, insertion, opening, people, planned, scene
+
+pytestmark = pytest.mark.page
+
+SECTION, AXIAL = "[data-panel=section]", "[data-panel=axial]"
+REACH = Reach(revision=1, depths=[5.0, 45.0], low=[-1.0, -12.0], high=[1.0, 12.0], angle_deg=31.0)
+COLORS = """canvas => {
+  const pen = canvas.getContext("2d");
+  return new Set(new Uint32Array(pen.getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size;
+}"""
+
+
+@pytest.fixture
+def views(visit, server):
+    def opened(news=None, **how):
+        server.news = news or server.news
+        page = visit(ready=f"{SECTION} .legend li", **how)
+        page.locator(SECTION).scroll_into_view_if_needed()
+        page.wait_for_selector(f"{AXIAL} .legend li")
+        return page
+
+    return opened
+
+
+def handle(page, name, panel=SECTION):
+    return page.locator(f"{panel} [data-handle={name}]")
+
+
+def drag(page, element, right, up=0):
+    box = element.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + right, y - up, steps=8)
+    page.mouse.up()
+
+
+def edited(page, server):
+    until(page, "!flexneedle.store.get('draft')")
+    return server.asked("edit")[-1]["values"]
+
+
+def test_the_legend_names_what_is_drawn(views):
+    page = views([*planned(), REACH])
+    names = page.locator(f"{SECTION} .legend li").all_inner_texts()
+    assert set(names) == {
+        "reach", "32 sampled paths", "path by manipulation", "path by steering", "needle at the target, planned",
+        "needle", "target, 1 mm",
+    }  # fmt: skip
+
+
+def test_arrow_keys_move_the_target_in_its_plane(views, server):
+    page = views()
+    handle(page, "target").focus()
+    page.keyboard.press("ArrowRight")
+    assert edited(page, server)["target.depth_mm"] == TARGET[0] + 0.5
+    page.keyboard.press("Shift+ArrowUp")
+    values = edited(page, server)
+    size = np.hypot(*TARGET[1:])
+    np.testing.assert_allclose(
+        [values["target.lateral_mm"], values["target.lateral_z_mm"]],
+        np.multiply(TARGET[1:], (size + 0.1) / size),
+        atol=0.006,
+    )
+    page.wait_for_selector(f"{SECTION} [data-handle=target][aria-label*='depth 40.50 mm']")
+
+
+def test_the_pointer_moves_the_target(views, server):
+    page = views()
+    page.click(f"{SECTION} >> text=x–y")
+    drag(page, handle(page, "target"), 20, 10)
+    values = edited(page, server)
+    right, up = values["target.depth_mm"] - TARGET[0], values["target.lateral_mm"] - TARGET[1]
+    assert right == pytest.approx(2 * up, abs=0.03)
+    assert right > 1.0
+    assert values["target.lateral_z_mm"] == TARGET[2]
+
+
+def test_the_guide_is_moved_along_the_axis_and_stays_before_the_skin(views, server):
+    page = views()
+    handle(page, "guide").focus()
+    page.keyboard.press("ArrowLeft")
+    assert edited(page, server) == {"setup.guide_to_skin_mm": 41.5}
+    drag(page, handle(page, "guide"), 400)
+    assert edited(page, server) == {"setup.guide_to_skin_mm": 1}
+
+
+def test_a_boundary_is_moved_and_those_below_it_stay(views, server):
+    three = scene().model_copy(
+        update={
+            "layers": [
+                {"name": "skin", "top_mm": 0.0, "bottom_mm": 2.0, "shear_modulus_kpa": 5.0},
+                {"name": "fat", "top_mm": 2.0, "bottom_mm": 20.0, "shear_modulus_kpa": 1.0},
+                {"name": "muscle", "top_mm": 20.0, "bottom_mm": None, "shear_modulus_kpa": 4.0},
+            ]
+        }
+    )
+    page = views([*opening(), three])
+    handle(page, "boundary-0").focus()
+    page.keyboard.press("ArrowRight")
+    assert edited(page, server) == {"tissue.0.thickness_mm": 2.5, "tissue.1.thickness_mm": 17.5}
+    handle(page, "boundary-1").focus()
+    page.keyboard.press("ArrowRight")
+    assert edited(page, server) == {"tissue.1.thickness_mm": 18.5}
+
+
+def test_the_target_is_moved_along_the_axis_view(views, server):
+    page = views()
+    handle(page, "target", AXIAL).focus()
+    page.keyboard.press("ArrowUp")
+    values = edited(page, server)
+    assert values == {"target.depth_mm": 40, "target.lateral_mm": 5.5, "target.lateral_z_mm": 3}
+    page.keyboard.press("ArrowRight")
+    assert edited(page, server)["target.lateral_z_mm"] == 3.5
+
+
+@pytest.mark.parametrize("news", [[people(2, steering=2)], [insertion("running", periods=0)]])
+def test_nothing_is_moved_where_another_steers_or_an_insertion_runs(views, news):
+    page = views([*opening(), *news])
+    until(page, "!document.querySelector('.handle')")
+
+
+@pytest.mark.parametrize("state", ["planned", "inserting"])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
+def test_it_is_drawn_at_each_size(views, pictures, size, scheme, state):
+    news = inserting() if state == "inserting" else [*planned(), REACH]
+    page = views(news, width=size[0], height=size[1], scheme=scheme)
+    page.evaluate("document.querySelector('.panel.section').scrollIntoView()")
+    page.wait_for_timeout(200)
+    for panel in (SECTION, AXIAL):
+        assert page.eval_on_selector(f"{panel} canvas", COLORS) > 30
+    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    pictures(page, f"section-{state}-{size[0]}-{scheme}")
