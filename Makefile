@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all test-page slow bench rig-demo rig-faults rig-wall-clock rig-families fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering worlds space worlds-space tuning docs lint clean
+.PHONY: help setup demo test test-all test-page slow bench rig-demo rig-faults rig-wall-clock rig-families fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets worlds space worlds-space tuning docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -104,6 +104,9 @@ tracker: setup  ## compare the simulated tracker with the paper's tables; its es
 
 steering: setup  ## steering plans on 100 random worlds, replayed on the exact plant
 	$(BIN)/python studies/steering.py
+
+far-targets: setup  ## plans to targets up to the edge of the reach, near the skin and deep, of 40 random worlds
+	$(BIN)/python studies/far_targets.py
 
 worlds: setup  ## 200 random worlds in three cases with four controllers, and the report (DIR=runs/worlds; hours)
 	$(BIN)/flexneedle study worlds --resume --out $(or $(DIR),runs/worlds)

@@ -18,7 +18,6 @@ END = "end"
 """The state of a rig whose controller has stopped it, at the end of an insertion."""
 _BY_CONTROLLER = "the controller"  # who stops the motors then
 _PAUSE_S = 0.02  # of an axis between two motions; within one it is somewhere else after 4 ms
-_ROUNDING_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -32,12 +31,15 @@ class State:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of a trial: the fault, the faulty axis, when it was injected (s, monotonic), the true states,
-    `run.json`, messages, and how many processes were left after it.
+    """What is known of a trial: the fault, the faulty axis, when the fault was ordered and when it is reported to have
+    taken effect (s, monotonic), true states, `run.json`, messages, and how many processes were left.
+
+    A supervisor may detect a fault before that is reported, but not before it was ordered.
     """
 
     fault: Fault
     axis: str
+    ordered: float
     injected: float
     truth: Truth
     run: Mapping[str, Any]
@@ -46,7 +48,7 @@ class Evidence:
 
     def row(self) -> dict[str, Any]:
         """All that the table, the picture and the judgement need, as plain values."""
-        states = entered(self.run, self.injected)
+        states = entered(self.run, self.ordered)
         detection = next((one for one in states if one.name in self.fault.reaction.detected), None)
         resumed = next((one.time for one in states if one.name == "inserting"), inf)
         span = self._span(detection, resumed)
@@ -55,7 +57,7 @@ class Evidence:
             "reason": self.run.get("reason", ""),
             "states": " ".join(one.name for one in states),
             "why": detection.why if detection else "",
-            "detection_s": detection.time - self.injected if detection else None,
+            "detection_s": max(0.0, detection.time - self.injected) if detection else None,
             "from_motion_s": self._from_motion(detection.time) if detection else None,
             "motion_mm": None if span is None else self._moved("insertion", *span),
             "rolled_deg": None if span is None else degrees(self._moved("rotation", *span)),
@@ -96,7 +98,7 @@ class Evidence:
 def entered(run: Mapping[str, Any], since: float) -> Sequence[State]:
     """The states that a supervisor has entered since a time, by its record; changes of the reason alone are none."""
     ticks = (run.get("timing") or {}).get("ticks") or {}
-    return [one for one in _changes(ticks.get("states", ())) if one.time >= since - _ROUNDING_S]
+    return [one for one in _changes(ticks.get("states", ())) if one.time >= since]
 
 
 def _changes(states: Sequence[Mapping[str, Any]]) -> Iterator[State]:

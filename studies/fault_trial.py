@@ -121,11 +121,12 @@ def run_trial(trial: Trial, keep: Path | None = None) -> dict[str, Any]:
             rig.rig, scenario, setting.record, *options, environment=setting.environment, cwd=folder
         )
         stack.callback(_kill, process)
-        injected_at = _await_moment(trial, roll, process, rig, folder, rng)
+        due = _await_moment(trial, roll, process, rig, folder, rng)
         controller = psutil.Process(process.pid)
         others = tuple(controller.children(recursive=True))
-        injected = fault.injection.inject(Running(rig, folder, trial.axis, controller, others))
-        injected = injected_at if fault.decision_s else injected
+        ordered = due if fault.decision_s else monotonic()
+        effective = fault.injection.inject(Running(rig, folder, trial.axis, controller, others))
+        injected = due if fault.decision_s else effective
         _await_end(fault, process, injected, setting.record / "run.json")
         _, printed, errors = ended(process, _END_S)
         sleep(_REST_S)
@@ -133,9 +134,8 @@ def run_trial(trial: Trial, keep: Path | None = None) -> dict[str, Any]:
             name = f"{fault.group}-{fault.name}-{case.number}".replace(" ", "-")
             shutil.copytree(setting.record, keep / name, dirs_exist_ok=True)
         run = _recorded(setting.record, printed)
-        evidence = Evidence(
-            fault, trial.axis, injected, rig.read_truth(), run, errors, left=_ended_by_force(others)
-        )
+        times, left = (ordered, injected), _ended_by_force(others)
+        evidence = Evidence(fault, trial.axis, *times, rig.read_truth(), run, errors, left)
         row = trial.key | {"roll_deg": round(degrees(roll), 1)} | evidence.row()
     return row | {"seconds": monotonic() - begun}
 

@@ -8,12 +8,13 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from select import select
+from threading import Thread
 from time import monotonic, sleep
 from typing import Any, TypeVar
 
@@ -234,9 +235,8 @@ def resumed(
     file.parent.mkdir(parents=True, exist_ok=True)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with ThreadPoolExecutor(workers) as pool:
-        running = [pool.submit(run, task) for task in missing]
         try:
-            for done in as_completed(running):
+            for done in as_completed([pool.submit(run, task) for task in missing]):
                 try:
                     row = done.result()
                 except RuntimeError as error:
@@ -246,22 +246,31 @@ def resumed(
                     opened.write(json.dumps(row) + "\n")
                 yield row, True
         except BaseException:
-            _end(running)
+            _end(pool)
             raise
 
 
-def _end(running: Sequence[Future[Row]]) -> None:
-    """Cancel tasks, and end all processes below this one until no task runs: one may start another in between."""
-    for task in running:
-        task.cancel()
+def _end(pool: ThreadPoolExecutor) -> None:
+    """Cancel tasks, and end all processes below this one until no task runs: one may start another in between.
+
+    Another interrupt would leave some of them, and is ignored.
+    """
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {
+        number: signal.signal(number, lambda *_: None) for number in numbers
+    }  # SIG_IGN would be inherited
+    closing = Thread(target=pool.shutdown, kwargs={"cancel_futures": True})
+    closing.start()
     ended = set[psutil.Process]()
-    while not all(task.done() for task in running):
+    while closing.is_alive():
         for process in set(psutil.Process().children(recursive=True)) - ended:
             ended.add(process)
             with suppress(psutil.NoSuchProcess):
                 process.terminate()
                 process.resume()  # one that is stopped does not end
-        wait(running, 0.1)
+        closing.join(0.1)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @dataclass

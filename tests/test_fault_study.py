@@ -11,6 +11,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from time import monotonic
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def evidence(name, *states, outcome="done", moves=(), left=0, axis="insertion"):
     recorded = [{"time_s": at, "state": state, "why": why} for at, state, why in states]
     run = {"status": outcome, "timing": {"ticks": {"states": recorded}}}
     truth = Truth(time, {}, positions, *[np.zeros(len(time))] * 5)
-    return Evidence(BY_NAME[name], axis, INJECTED, truth, run, "", left)
+    return Evidence(BY_NAME[name], axis, INJECTED - 0.02, INJECTED, truth, run, "", left)
 
 
 def row(name, *states, **more):
@@ -63,6 +64,11 @@ INTERRUPT = (10.02, "stopped", "signal SIGINT")
     ("name", "states", "outcome"),
     [
         ("motor off", [OFF], "failed"),
+        (
+            "limit switch",
+            [(10.1, "fault", "PA 1 refused: 22 Begin not possible due to Limit Switch")],
+            "failed",
+        ),
         ("missing for 2 s", [HOLD, END], "held"),
         ("missing for 0.5 s", [HOLD, GO_ON, END], "done"),
         ("missing for 0.1 s", [END], "done"),
@@ -111,6 +117,12 @@ def test_another_state_reason_or_outcome_is_not(name, states, outcome, problem):
 
 def test_a_state_before_the_fault_is_no_reaction():
     assert wrong("motor off", (9.9, *OFF[1:]), outcome="failed")[0] == "states: none"
+
+
+def test_a_reaction_may_come_before_the_fault_is_reported_and_not_before_it_is_ordered():
+    early = (9.99, *OFF[1:])
+    assert row("motor off", early, outcome="failed")["detection_s"] == 0.0
+    assert wrong("motor off", early, outcome="failed") == []
 
 
 def test_a_roll_that_stalls_is_a_fault_of_the_rotation():
@@ -237,7 +249,7 @@ def test_rows_that_are_there_are_not_run_again_and_those_of_another_insertion_ar
 
 
 INTERRUPTED = """
-import signal, subprocess, sys
+import os, signal, subprocess, sys
 from pathlib import Path
 sys.path.insert(0, {studies!r})
 from rig_trials import resumed
@@ -247,7 +259,7 @@ def run(task):
         process = subprocess.Popen(["sleep", "600"])
         if task == 1:
             process.send_signal(signal.SIGSTOP)
-        print(process.pid, flush=True)
+        os.write(1, f"{{process.pid}}\\n".encode())  # at once: two tasks write
         process.wait()
     raise RuntimeError("ended")
 
@@ -261,11 +273,18 @@ def test_no_process_is_left_after_an_interrupt(tmp_path, number):
     study_of = subprocess.Popen(
         [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
-    first = [int(study_of.stdout.readline()) for _ in range(2)]
-    study_of.send_signal(number)
-    out, _ = study_of.communicate(timeout=30)
-    pids = [*first, *map(int, out.split())]
+    begun = monotonic()
+    try:
+        pids = [int(study_of.stdout.readline()) for _ in range(2)]
+        study_of.send_signal(number)
+        pids.append(int(study_of.stdout.readline()))
+        study_of.send_signal(number)  # another one is ignored
+        pids += map(int, study_of.stdout.read().split())
+    finally:
+        study_of.kill()
+        study_of.communicate()
     assert len(pids) == 4
+    assert monotonic() - begun < 300.0  # they have not ended by themselves
     for pid in pids:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)

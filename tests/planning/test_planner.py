@@ -8,10 +8,11 @@ import pytest
 
 import flexneedle
 from flexneedle.errors import InputError, ScenarioError
+from flexneedle.planning import planner
 from flexneedle.planning.planner import bevel_reach
 from flexneedle.scenario.worlds import world
 from flexneedle.simulator.simulator import Simulator
-from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, Control
+from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, Control, Plan
 from reference.cases import MIRROR
 
 PHANTOM = flexneedle.load_scenario("phantom")
@@ -305,3 +306,66 @@ def test_progress_comes_after_each_iteration():
     assert [call["iteration"] for call in calls] == list(range(1, plan.iterations + 1))
     assert [call["best"] for call in calls] == [entry["best"] for entry in plan.history]
     assert calls[0]["iterations"] == 4
+
+
+NEAR_THE_SKIN = {
+    "in the plane": (world(4), (11.5, -10.0)),
+    "in space": (world(4, rig="two-axes"), (11.5, -6.0, 8.0)),
+}
+
+
+@pytest.mark.parametrize(("scenario", "target"), NEAR_THE_SKIN.values(), ids=NEAR_THE_SKIN)
+def test_a_target_near_the_skin_that_one_search_misses_is_reached(scenario, target, monkeypatch):
+    """With one history of both searches, in which the best cost never rises."""
+    calls = []
+    plan = flexneedle.plan(scenario, target, progress=calls.append)
+    assert plan.error_mm <= 0.5
+    assert plan.limit == ""
+    assert plan.cost == plan.history[-1]["best"]
+    assert [call["iteration"] for call in calls] == list(range(1, plan.iterations + 1))
+    assert [call["best"] for call in calls] == [entry["best"] for entry in plan.history]
+    assert sorted(entry["best"] for entry in plan.history)[::-1] == [entry["best"] for entry in plan.history]
+    assert all(call["iteration"] <= call["iterations"] for call in calls)
+
+    monkeypatch.setattr(Plan, "reached", True)
+    once = flexneedle.plan(scenario, target)
+    assert once.error_mm > 1.0
+    assert once.history == plan.history[: once.iterations]
+
+
+def test_a_plan_that_reaches_its_target_is_not_searched_again(monkeypatch):
+    monkeypatch.setattr(planner, "widened", None)
+    assert coarse(target=(40.0, 1.0)).reached
+
+
+def test_a_second_search_that_is_worse_changes_nothing_but_the_history(monkeypatch):
+    """Out of reach; the second search has one iteration with half of the samples."""
+    short = {"plan.samples": 16, "plan.iterations": 1, "plan.max_iterations": 1}
+    far, search = {"setup.max_guide_step_mm": 0.01}, planner._search
+
+    def worse(simulator, problem, rng, progress):
+        fewer = short if len(made) == 1 else {}
+        made.append(search(Simulator(simulator.scenario.with_values(fewer)), problem, rng, progress))
+        return made[-1]
+
+    made = []
+    monkeypatch.setattr(planner, "_search", worse)
+    plan = coarse(far, (40.0, 15.0))
+    first, second = made
+    assert not plan.reached
+    assert plan.limit
+    assert first.cost < second.cost
+    assert plan.cost == first.cost == plan.history[-1]["best"]
+    assert plan.iterations == first.search_state.iterations + second.search_state.iterations
+
+
+def test_a_second_search_can_be_cancelled():
+    class Stop(Exception):
+        pass
+
+    def stop_in_the_second(call):
+        if call["iteration"] == 5:
+            raise Stop
+
+    with pytest.raises(Stop):
+        coarse({"setup.max_guide_step_mm": 0.01}, (40.0, 15.0), progress=stop_in_the_second)

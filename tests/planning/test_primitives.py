@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from flexneedle import controls as controls_of
 from flexneedle.planning import insertion
 from flexneedle.planning.cross_entropy import Search
-from flexneedle.planning.insertion import PlanProblem, optimise, schedule
+from flexneedle.planning.insertion import PlanProblem, optimise, schedule, widened
 from flexneedle.planning.terms import Trajectories, charges
 from flexneedle.types import DB_THETA, DB_X, DB_Y, DG_Y, ROLL, X, Y
 
@@ -268,3 +268,19 @@ def test_progress_and_same_seed_same_bytes():
     assert [call["iteration"] for call in calls] == [1, 2, 3, 4, 5]
     assert one.controls.tobytes() == again.controls.tobytes()
     assert one.search_state.history == again.search_state.history
+
+
+def test_wider_samples_span_the_largest_steps_of_what_is_free():
+    """The base is fixed; longest step, ε and share stay as they are; a deviation beyond the largest step does, too."""
+    np.testing.assert_array_equal(widened(PROBLEM).sigma, [0.1, 0.0, 0.0, 0.5, 1.0, 0.3])
+    wide = replace(PROBLEM, sigma=np.array([0.1, 0.9, 0.001, 0.25, 1.0, 0.3]))
+    np.testing.assert_array_equal(widened(wide).sigma, [0.1, 0.9, 0.005, 0.5, 1.0, 0.3])
+
+
+def test_wider_samples_in_space_keep_the_ratio_across_the_frame():
+    """Guide in two axes with a tenth across, in one axis with none; step 0.5 mm on each."""
+    step = np.array([1.0, 0.5, 0.5, 0.005, 0.005, 0.5, 0.5])
+    for across, expected in ((0.006, 0.05), (0.0, 0.0)):
+        sigma = np.array([0.03, 0, 0, 0, 0, 0.06, across, 1.0, 0.1, 0.1])
+        made = widened(replace(PROBLEM, axes=2, step=step, sigma=sigma)).sigma
+        np.testing.assert_allclose(made, [0.03, 0, 0, 0, 0, 0.5, expected, 1.0, 0.1, 0.1])

@@ -13,6 +13,7 @@ from flexneedle.errors import InputError
 from flexneedle.estimation.estimate import Estimate
 from flexneedle.estimation.observer import StateCorrection
 from flexneedle.estimation.task import Task
+from flexneedle.planning.horizon import Samples
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.fields import Section
 from flexneedle.scenario.sections.settings import ControlSettings
@@ -32,8 +33,9 @@ class Decision:
     miss, miss_sd: lateral miss predicted at the target, y or, in space, y + iz, and its standard deviation on an axis
     with the corrections to come (mm; NaN: not predicted). The loop warns and holds by them. rest: time (s) for which
     the needle rests, in place of the command, so that late readings arrive. predicted: shape of the needle at the
-    target, None if it is not predicted; not compared. command: a `Control`, or its nine columns. Raises InputError for
-    another command, or one that is not finite, a negative miss_sd, or a rest that is negative or not finite.
+    target, None if it is not predicted; samples: of the search behind it, None without one; neither is compared.
+    command: a `Control`, or its nine columns. Raises InputError for another command, or one that is not finite, a
+    negative miss_sd, or a rest that is negative or not finite.
     """
 
     command: Control
@@ -44,6 +46,7 @@ class Decision:
     miss_sd: float = math.nan
     rest: float = 0.0
     predicted: Shape | None = field(default=None, compare=False)
+    samples: Samples | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "command", _plain_command(self.command))

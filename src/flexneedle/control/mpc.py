@@ -10,7 +10,7 @@ from flexneedle.control.guide import guide_reach, most_guide_step
 from flexneedle.control.interface import travel_left
 from flexneedle.planning import terms
 from flexneedle.planning.cross_entropy import Search, elite_count
-from flexneedle.planning.horizon import Variables, best
+from flexneedle.planning.horizon import Samples, Variables, best
 from flexneedle.planning.terms import Term, Trajectories
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.sections.apparatus import Setup
@@ -47,11 +47,12 @@ class CeMpc(BevelRule):
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The command of a period, its cost, and the sd left in dg_y (mm)."""
+    """The command of a period, its cost, the sd left in dg_y (mm), and the samples of the last iteration."""
 
     command: Control
     cost: float
     spread: float
+    samples: Samples
 
 
 def choose(
@@ -86,7 +87,7 @@ def choose(
 
     found = best(variables, rollout, cost_terms(control, reference, nominal[:, DG_Y : DG_Y + 2]), search, rng)
     spread = float(np.sqrt(found.search_state.covariance[steps, steps]))
-    return Choice(Control.of(found.trajectories.controls[0, 0].tolist()), found.cost, spread)
+    return Choice(Control.of(found.trajectories.controls[0, 0].tolist()), found.cost, spread, found.samples)
 
 
 def plan_window(plan: Plan, x: float, steps: int) -> tuple[Floats, Floats]:

@@ -185,9 +185,12 @@ REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(AnyRequest)
 
 
 class News(Message):
-    """What the server sends. A newer message of the same `key` replaces an older one that was not sent yet."""
+    """What the server sends. A newer message of the same `key` replaces an older one that was not sent yet.
 
-    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="null")
+    Numbers that are NaN or infinite are sent as null.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=True, ser_json_inf_nan="null")
 
     @property
     def key(self) -> str:
@@ -344,9 +347,12 @@ class Reach(News):
 
 
 class Row(Message):
-    """A control period of an insertion, for plots and player. Unknown values are None."""
+    """A control period of an insertion, for plots and player. Unknown values are None, in Python also NaN.
 
-    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="null")
+    error_mm: lateral distance of the true tip, on a rig of the estimated one, from the planned path at its depth.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=True, ser_json_inf_nan="null")
 
     index: int
     time: float

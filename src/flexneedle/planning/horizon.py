@@ -8,13 +8,15 @@ controls, `rollout` simulates these, and the terms are evaluated on the trajecto
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from flexneedle.planning import cross_entropy as ce
 from flexneedle.planning.terms import RolloutFunction, Term, Trajectories, charges, cost
 from flexneedle.types import Floats
+
+OnIteration = Callable[[dict[str, Any]], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,15 +35,25 @@ class Variables:
     correlation: Floats | None = None
 
 
+class Samples(NamedTuple):
+    """The samples of an iteration: poses of the tip after each step (N, m, 5), mm and rad, and costs (N,)."""
+
+    tips: Floats
+    costs: Floats
+
+
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The best sample z (d,), its cost, the cost's weighted terms by name, its rollout (N = 1), and the search."""
+    """The best sample z (d,), its cost, the cost's weighted terms by name, its rollout (N = 1), the search, and the
+    samples of its last iteration.
+    """
 
     z: Floats
     cost: float
     terms: dict[str, float]
     trajectories: Trajectories
     search_state: ce.SearchState
+    samples: Samples
 
 
 def best(
@@ -52,22 +64,46 @@ def best(
     rng: np.random.Generator,
     *,
     first: Floats | None = None,
-    progress: Callable[[dict[str, Any]], None] | None = None,
+    progress: OnIteration | None = None,
 ) -> Found:
     """Search for the sample of least cost; infinite if none converged, z being the mean then.
 
     first (n, d): samples of the first iteration in place of the Gaussian's, at least as many as the elite. The best
-    sample is kept: the result is never worse than an incumbent among them.
+    sample is kept: the result is never worse than an incumbent among them. progress: called after each iteration with a
+    dict: the entry of its history, `iteration`, `iterations`, and its `Samples` as `samples`.
     """
     settings = ce.Settings(**vars(search), lower=variables.lower, upper=variables.upper)
     search_state = ce.start(variables.mean, variables.sigma, variables.correlation)
 
+    latest: list[Samples] = []
+
     def evaluate(z: Floats) -> Floats:
-        return cost(terms, rollout(variables.controls(z)))
+        drawn = rollout(variables.controls(z))
+        latest[:] = [Samples(drawn.tips, cost(terms, drawn))]
+        return latest[0].costs
+
+    def show(info: dict[str, Any]) -> None:
+        if progress is not None:
+            progress({**info, "samples": latest[0]})
 
     opening = ce.sample(search_state, settings, rng) if first is None else first
     opening = np.clip(opening, settings.lower, settings.upper)
-    search_state = ce.minimize(evaluate, search_state, settings, rng, progress, opening)
+    search_state = ce.minimize(evaluate, search_state, settings, rng, show, opening)
     trajectories = rollout(variables.controls(search_state.best[None]))
     charged = {name: float(value[0]) for name, value in charges(terms, trajectories).items()}
-    return Found(search_state.best, search_state.best_cost, charged, trajectories, search_state)
+    return Found(search_state.best, search_state.best_cost, charged, trajectories, search_state, latest[0])
+
+
+def counted(progress: OnIteration | None, before: int, usual: int, least: float) -> OnIteration | None:
+    """`progress` of a search after `before` iterations of others, which found a cost of `least`.
+
+    usual: number of iterations of all searches together.
+    """
+    if progress is None:
+        return None
+
+    def show(info: dict[str, Any]) -> None:
+        now = before + info["iteration"]
+        progress({**info, "iteration": now, "iterations": max(now, usual), "best": min(info["best"], least)})
+
+    return show

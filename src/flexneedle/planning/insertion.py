@@ -7,7 +7,7 @@ the sign of ε_y is the direction. The needle is rolled, and charged by the angl
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -158,6 +158,18 @@ def optimise(
     """
     found = best(_variables(problem), rollout, cost_terms(problem), search, rng, progress=progress)
     return solution(problem, found)
+
+
+def widened(problem: PlanProblem) -> PlanProblem:
+    """The problem with wider first samples: the standard deviation of each lateral step along the frame is at least the
+    largest step, and that across it is in the same ratio to it. What is not free stays so.
+    """
+    lateral, sigma = slice(LATERAL, problem.bevel.start), problem.sigma.copy()
+    along = sigma[lateral][:: problem.axes]
+    most = problem.step[list(MOVES[problem.axes])][:: problem.axes]
+    ratio = np.divide(most, along, out=np.ones_like(along), where=along > 0.0)
+    sigma[lateral] *= np.repeat(np.maximum(ratio, 1.0), problem.axes)
+    return replace(problem, sigma=sigma)
 
 
 def solution(problem: PlanProblem, found: Found) -> Solution:

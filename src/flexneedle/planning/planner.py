@@ -3,15 +3,16 @@
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from flexneedle.arguments import point, whole
 from flexneedle.errors import InputError
 from flexneedle.planning.cross_entropy import Search, elite_count
-from flexneedle.planning.insertion import LATERAL, PlanProblem, Solution, optimise
+from flexneedle.planning.horizon import OnIteration, counted
+from flexneedle.planning.insertion import LATERAL, PlanProblem, Solution, optimise, widened
 from flexneedle.planning.steering import radius, reach, steer
 from flexneedle.planning.terms import Trajectories
 from flexneedle.scenario.files import load_scenario
@@ -55,7 +56,7 @@ def plan(
     target: Sequence[float] | None = None,
     strategy: str = "manipulation",
     seed: int = 0,
-    progress: Callable[[dict[str, Any]], None] | None = None,
+    progress: OnIteration | None = None,
     *,
     threads: int | None = None,
 ) -> Plan:
@@ -63,8 +64,10 @@ def plan(
 
     scenario: also by its name or path, as for `load_scenario`;
     strategy: "manipulation" moves guide and bevel; "steering" moves only the bevel (paper section III-A, but on the
-    needle itself, not on a softer one). `progress` gets a dict after each iteration. `threads` is for rollouts
-    (default: all cores) and changes no result. Same seed, same plan.
+    needle itself, not on a softer one). A plan that misses its target although guide or base are free is searched again
+    with wider samples, and the better of the two is returned. `progress` gets a dict after each iteration, with the
+    samples of the search as `planning.horizon.Samples`. `threads` is for rollouts (default: all cores) and changes no
+    result. Same seed, same plan.
     Raises ScenarioError for a target that the scenario excludes, InputError for another argument that cannot be used.
     """
     scenario, seed = load_scenario(scenario), whole("seed", seed, 0)
@@ -72,13 +75,35 @@ def plan(
         raise InputError(f"strategy = {strategy!r}: must be one of {', '.join(STRATEGIES)}")
     goal = scenario.target.position if target is None else point("target", target, _TARGET)
     check_target(scenario, *goal)
-    begun = time.perf_counter()
+    begun, rng = time.perf_counter(), np.random.default_rng(seed)
     simulator = Simulator(scenario, threads)
     problem = _problem(scenario, goal, strategy)
-    solution = _search(simulator, problem, np.random.default_rng(seed), progress)
+    found = _carried_out(simulator, problem, strategy, seed, _search(simulator, problem, rng, progress))
+    if not found.reached and not _bevel_alone(problem):
+        # A search that begins with small lateral steps can lose its spread before it gets to a far target.
+        usual = found.iterations + scenario.plan.iterations
+        after = counted(progress, found.iterations, usual, found.cost)
+        again = _search(simulator, widened(problem), rng, after)
+        found = _better(found, _carried_out(simulator, problem, strategy, seed, again))
+    return replace(found, seconds=time.perf_counter() - begun)
+
+
+def _better(first: Plan, second: Plan) -> Plan:
+    """The plan of less cost, the first of two of the same, with the history of both searches."""
+    later = tuple({**entry, "best": min(entry["best"], first.cost)} for entry in second.history)
+    history = (*first.history, *later)
+    best = second if second.cost < first.cost else first
+    return replace(best, history=history, iterations=len(history))
+
+
+def _carried_out(
+    simulator: Simulator, problem: PlanProblem, strategy: str, seed: int, solution: Solution
+) -> Plan:
+    """The plan that ends at the target's depth, with its entry in the scenario if that was free."""
+    scenario, goal = simulator.scenario, problem.target
     if scenario.entry.free:
         scenario = _entering(scenario, *solution.entry)
-        simulator, problem = Simulator(scenario, threads), _problem(scenario, goal, strategy)
+        simulator, problem = Simulator(scenario, simulator.threads), _problem(scenario, goal, strategy)
     rows = _end_at_depth(simulator, solution.controls, solution.roll, goal[0])
     states = [simulator.start(solution.roll)]
     for row in rows:
@@ -99,7 +124,6 @@ def plan(
         converged=solution.search_state.converged,
         history=solution.search_state.history,
         limit=_binding_limit(simulator, problem, rows, states),
-        seconds=time.perf_counter() - begun,
         scenario=scenario,
     )
 
@@ -116,7 +140,7 @@ def _search(
     simulator: Simulator,
     problem: PlanProblem,
     rng: np.random.Generator,
-    progress: Callable[[dict[str, Any]], None] | None,
+    progress: OnIteration | None,
 ) -> Solution:
     """The best primitives, or the best rolls where only the bevel is free."""
     plan, rollout = simulator.scenario.plan, _rollout(simulator)

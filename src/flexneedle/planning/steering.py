@@ -10,14 +10,12 @@ as well. The ends of insertions with one angle lie on an arc, and what the bevel
 still reaches all of it: each point of the hull lies on a chord between two angles ±b in the range.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from flexneedle.planning.cross_entropy import Search
-from flexneedle.planning.horizon import Found, Variables, best
+from flexneedle.planning.horizon import Found, OnIteration, Variables, best, counted
 from flexneedle.planning.insertion import (
     PlanProblem,
     Solution,
@@ -37,8 +35,6 @@ _INNER = 0.5  # of the reach
 _USUAL_SEARCHES = 5  # one roll and two, from either side, and the last
 _WIDE, _NARROW = 0.3, 0.02  # first standard deviations, as shares of the target's depth and of the bounds
 _ROUNDING = 1e-9  # of the reach
-
-OnIteration = Callable[[dict[str, Any]], None]
 
 
 def steer(
@@ -238,16 +234,6 @@ def _ends(rollout: RolloutFunction, problem: PlanProblem) -> tuple[float, float]
 
 def _counted(progress: OnIteration | None, search: Search, found: list[Found]) -> OnIteration | None:
     """`progress` with iterations and best cost counted through all searches."""
-    if progress is None:
-        return None
-    before, usual = (
-        sum(one.search_state.iterations for one in found),
-        _USUAL_SEARCHES * (search.usual or search.iterations),
-    )
-    least = min((one.cost for one in found), default=np.inf)
-
-    def show(info: dict[str, Any]) -> None:
-        now = before + info["iteration"]
-        progress({**info, "iteration": now, "iterations": max(now, usual), "best": min(info["best"], least)})
-
-    return show
+    before = sum(one.search_state.iterations for one in found)
+    usual = _USUAL_SEARCHES * (search.usual or search.iterations)
+    return counted(progress, before, usual, min((one.cost for one in found), default=np.inf))

@@ -5,8 +5,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from flexneedle.arguments import whole
 from flexneedle.control.interface import Method
 from flexneedle.control.methods import DEFAULT
@@ -16,6 +14,7 @@ from flexneedle.rig.dry_run import in_memory
 from flexneedle.rig.loop import planned, run
 from flexneedle.rig.parts import SCENARIO_TRACKER, TrackerFactory, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT, PlantFactory
+from flexneedle.rig.step import OnDecision
 from flexneedle.rig.supervised import Watchers, check_fit, supervised
 from flexneedle.rig.virtual import Seeds, virtual_rig
 from flexneedle.scenario.files import load_scenario
@@ -35,6 +34,7 @@ def insert(
     force: bool = False,
     threads: int | None = None,
     on_period: Callable[[Period], None] | None = None,
+    on_decision: OnDecision | None = None,
     rig: str | Path | RigFile | None = None,
     dry_run: bool = False,
     watchers: Watchers | None = None,
@@ -52,7 +52,8 @@ def insert(
     "scenario", the one that the scenario describes. Each may also be an object of your own or its name `module:NAME`
     (docs/extend.md).
     threads: for rollouts (default: all cores), without effect on the result. on_period: called with each control
-    period when it ends.
+    period when it ends; on_decision: with each decision of the controller, before anything moves, and the estimate that
+    it was made on.
 
     The record is the same for the same seed, except for wall-clock durations.
 
@@ -63,22 +64,21 @@ def insert(
     more than 1 mm, unless `force` is set or the controller predicts the miss itself, as the default one does.
     """
     scenario, plan, seed = load_scenario(scenario), planned(plan), whole("seed", seed, 0)
-    phantom_seed, tracker_seed, control_seed, room_seed = np.random.SeedSequence(seed).spawn(4)
     plant_name, plant = plant_of(phantom)
     tracker_name, own_tracker = tracker_of(tracker)
-    seeds = Seeds(phantom_seed, tracker_seed, room_seed)
     scenario = placed(scenario, plan)
-    virtual = virtual_rig(scenario, plan.roll, seeds, plant, tracker=own_tracker)
+    virtual = virtual_rig(scenario, plan.roll, Seeds.of(seed), plant, tracker=own_tracker)
     executed = partial(
         run,
         scenario,
         plan,
-        rng=np.random.default_rng(control_seed),
+        rng=Seeds.controller(seed),
         seed=seed,
         controller=controller,
         force=force,
         threads=threads,
         on_period=on_period,
+        on_decision=on_decision,
     )
     if rig is None:
         return replace(executed(virtual), phantom=plant_name, tracker=tracker_name)

@@ -28,7 +28,7 @@ from flexneedle.rig.parts import controller_of
 from flexneedle.rig.ports import Driver
 from flexneedle.rig.progress import Progress, hold_after
 from flexneedle.rig.record import record
-from flexneedle.rig.step import Steering, Step
+from flexneedle.rig.step import OnDecision, Steering, Step
 from flexneedle.rig.virtual import Rig
 from flexneedle.scenario.files import load_scenario
 from flexneedle.scenario.model import Scenario
@@ -59,11 +59,12 @@ def run(
     force: bool = False,
     threads: int | None = None,
     on_period: Callable[[Period], None] | None = None,
+    on_decision: OnDecision | None = None,
 ) -> Insertion:
     """Execute `plan` in closed loop on any rig; return the complete record.
 
-    scenario, controller, force, threads, on_period: as for `insert`. rng: randomness of the controller; seed: only
-    recorded.
+    scenario, controller, force, threads, on_period, on_decision: as for `insert`. rng: randomness of the controller;
+    seed: only recorded.
 
     The driver is stopped at the end, after an error and after an interrupt. A DriverError of driver or tracker is no
     exception here: the insertion has its reason, the outcome "failed", and the periods before it. So has one that was
@@ -84,7 +85,7 @@ def run(
         )
     scenario = used(scenario, chosen)
     task = tables.task(chosen, Simulator(scenario, threads), plan)
-    steering = Steering(task, chosen, Guard.of(scenario, plan), rng, force)
+    steering = Steering(task, chosen, Guard.of(scenario, plan), rng, force, on_decision)
     periods: list[Period] = []
     ending = (Outcome.FAILED, f"target depth not reached within {_MOST_MOVES} times the planned steps")
     try:

@@ -1,5 +1,6 @@
 """What the needle does in a control period: it moves as decided, rests, or is held."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,6 +16,9 @@ from flexneedle.rig.guard import Guard
 from flexneedle.rig.progress import Late, Progress
 from flexneedle.rig.virtual import Rig
 from flexneedle.types import STILL, Action
+
+OnDecision = Callable[[Decision, Estimate], None]
+"""Called with a decision, and the estimate that it was made on."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,8 @@ class Step:
 @dataclass(frozen=True, eq=False)
 class Steering:
     """What the steps of an insertion follow from. force: whether it continues although a miss is predicted; the guard's
-    limits hold in any case.
+    limits hold in any case. on_decision: called with each decision of the controller, before anything moves, and the
+    estimate that it was made on.
     """
 
     task: Task
@@ -41,6 +46,7 @@ class Steering:
     guard: Guard
     rng: np.random.Generator
     force: bool = False
+    on_decision: OnDecision | None = None
 
     def next_step(self, progress: Progress, rig: Rig, begun: float) -> tuple[Step, Progress]:
         """The step of the period that begins at `begun` (s), and the progress with the controller's decision."""
@@ -64,6 +70,8 @@ class Steering:
         if late is not None and late.holds_for(estimate):
             return self._carried_out(replace(progress, late=None), late.decision, late.memory)
         decision, memory = _decision(self.method, self.task, progress.memory, estimate, self.rng)
+        if self.on_decision is not None:
+            self.on_decision(decision, estimate)
         counted, taken = replace(progress, late=None, moves=progress.moves + 1), rig.clock.now() - begun
         if rig.deadline is None or taken <= rig.deadline:
             return self._carried_out(counted, decision, memory)

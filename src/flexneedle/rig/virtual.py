@@ -76,8 +76,18 @@ class Seeds:
     @classmethod
     def of(cls, seed: int) -> "Seeds":
         """Return the seeds of the virtual rig of `insert` with a seed, whose third part is the controller's."""
-        phantom, tracker, _, room = np.random.SeedSequence(seed).spawn(4)
+        phantom, tracker, _, room = _spawned(seed)
         return cls(phantom, tracker, room)
+
+    @staticmethod
+    def controller(seed: int) -> np.random.Generator:
+        """Return the randomness of the controller in `insert` with a seed."""
+        return np.random.default_rng(_spawned(seed)[2])
+
+
+def _spawned(seed: int) -> list[np.random.SeedSequence]:
+    """Seeds of phantom, tracker, controller and room."""
+    return np.random.SeedSequence(seed).spawn(4)
 
 
 def virtual_rig(
@@ -87,12 +97,12 @@ def virtual_rig(
     phantom: str | PlantFactory = DEFAULT_PLANT,
     *,
     tracker: TrackerFactory | None = None,
-    plate_distance_at: Callable[[float], float] | None = None,
+    plate_distance_at: Callable[[float], float | None] | None = None,
 ) -> Rig:
     """Return a virtual phantom with the ports of a rig.
 
     tracker: factory of the tracker (default: the tracker described by the scenario). plate_distance_at(time): distance
-    (mm) of a moving metal plate from the center of the tracker's workspace (default: the environment's).
+    (mm) of a moving metal plate from the center of the tracker's workspace (default, and None: the environment's).
     Raises InputError if the factory returns no tracker.
     """
     truth = draw(scenario, np.random.default_rng(seeds.phantom))
@@ -185,7 +195,7 @@ def _field_tracker(
     tank: Phantom,
     errors: _Errors,
     rng: np.random.Generator,
-    plate_distance_at: Callable[[float], float] | None,
+    plate_distance_at: Callable[[float], float | None] | None,
 ) -> OnStage:
     """The tracker in its environment; around: room and references."""
     (room, references), settings = around, scenario.tracker

@@ -64,6 +64,7 @@ class Scripted:
 @pytest.fixture
 def supervisor(monkeypatch):
     monkeypatch.setattr(client.subprocess, "Popen", Scripted)
+    monkeypatch.setattr(client, "_SILENT_S", 60.0)  # it reports only when it is asked
     with Supervisor.of_operator(rig_file()) as made:
         yield made
 

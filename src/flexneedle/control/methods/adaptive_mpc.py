@@ -136,7 +136,7 @@ def decide(
         rests,
         outlook.sd_to_come(fitted, task.plan.target[0]),
     )
-    return Decision(command, why, found.cost, spread, miss, sd, rest, predicted), after
+    return Decision(command, why, found.cost, spread, miss, sd, rest, predicted, found.samples), after
 
 
 def _rolls_text(path: GuidePath, axes: int) -> str:

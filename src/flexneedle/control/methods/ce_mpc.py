@@ -18,7 +18,7 @@ def decide(task: Task, memory: None, estimate: Estimate, rng: np.random.Generato
     """Bevel by the rule, then the best first step of a short horizon along the plan."""
     roll, why = bang_bang.decide(task, estimate, task.settings)
     choice = mpc.choose(estimate.simulator, task.plan, estimate.state, task.settings, roll=roll, rng=rng)
-    return Decision(choice.command, why, choice.cost, choice.spread), memory
+    return Decision(choice.command, why, choice.cost, choice.spread, samples=choice.samples), memory
 
 
 METHOD = Method(

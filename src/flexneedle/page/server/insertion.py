@@ -32,7 +32,7 @@ class Live:
         self._armed = False
         self._on_rig = False
         self._pace = 1.0
-        self._layers = 0
+        self._layers, self._in_a_field = 0, False
         self._news: dict[str, Any] | None = None
         self._tell("idle", "")
 
@@ -70,6 +70,7 @@ class Live:
                 raise Refusal(f"{name} is not armed: arm it first")
         self._armed, self._on_rig, self._pace = False, on_rig, 0.0 if work.paused else 1.0
         self._layers, self._news = len(work.scenario["tissue"]), None
+        self._in_a_field = work.scenario.get("tracker", {}).get("environment") is not None
         source = self._rig.source if on_rig and self._rig is not None else ""
         self._hub.forget((_ROWS, "disturbances"))
         self._hub.forget_frames(Source.LIVE)
@@ -102,10 +103,14 @@ class Live:
         self._signal(advance=True)
 
     def disturb(self, disturb: Disturb) -> None:
-        """Disturb the insertion. Raises Refusal unless it is virtual, and for a layer that it has not."""
+        """Disturb the insertion. Raises Refusal unless it is virtual, and for a layer or a field that it has not."""
         self._require_virtual("disturbances are")
         if disturb.what == "stiffen" and disturb.layer >= self._layers:
             raise Refusal(f"layer = {disturb.layer}: must be below {self._layers}, the number of layers")
+        if disturb.what == "plate" and not self._in_a_field:
+            raise Refusal(
+                "the tracker of this scenario has no field that metal distorts: set tracker.environment"
+            )
         self._signal(disturb=disturb.model_copy(update={"request": None}))
 
     def lost(self) -> None:

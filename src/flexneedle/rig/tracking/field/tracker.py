@@ -25,8 +25,8 @@ class FieldTracker:
     was taken and has the time of measurement; the first one was taken `delay` + `ahead` s before the start. Each sensor
     is missing in a share `missing` of the frames, independently of the others.
     to_tracker: map from the stage's frame to the tracker's. plate_distance_at(time): distance (mm) of the plate from
-    the center (default: the environment's). The roll of the tip sensor, which has one coil, is not measured: its
-    orientation is the shortest rotation of the z axis to its axis.
+    the center (default, and None: the environment's). The roll of the tip sensor, which has one coil, is not measured:
+    its orientation is the shortest rotation of the z axis to its axis.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class FieldTracker:
         ahead: float = 0.0,
         missing: float = 0.0,
         to_tracker: Rigid | None = None,
-        plate_distance_at: Callable[[float], float] | None = None,
+        plate_distance_at: Callable[[float], float | None] | None = None,
     ) -> None:
         self._room, self._poses_at, self._clock = room, poses_at, clock
         self._period, self._delay, self._missing = period, delay, missing

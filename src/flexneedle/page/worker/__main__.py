@@ -1,0 +1,76 @@
+"""A worker: `python -m flexneedle.page.worker plans` or `insertion`, started by the server of the page."""
+
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import BinaryIO
+
+from flexneedle.errors import FlexneedleError, ScenarioWarning, one_line
+from flexneedle.page import channel
+from flexneedle.page.orders import Do, Ready
+from flexneedle.page.worker.inbox import Inbox
+from flexneedle.page.worker.insertion import Insertions
+from flexneedle.page.worker.outbox import Outbox
+from flexneedle.page.worker.plans import estimate, plan
+from flexneedle.page.worker.reach import reach
+from flexneedle.page.worker.recording import read
+from flexneedle.page.worker.scene import scene
+from flexneedle.page.worker.signals import Cancelled
+from flexneedle.page.worker.task import Task
+from flexneedle.page.worker.warm import warm_up
+from flexneedle.scenario.problems import unexpected
+
+Actions = Mapping[Do, Callable[[Task], None]]
+
+
+def main() -> int:
+    """Do the orders on stdin until it ends; report on stdout."""
+    out = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what anything prints is no message
+    warnings.simplefilter("ignore", ScenarioWarning)  # the page has them from the server
+    inbox, outbox = Inbox(os.fdopen(os.dup(0), "rb")), Outbox(partial(_write, out))
+    warm_up()
+    _write(out, channel.packed(Ready().model_dump_json()))
+    insertions = Insertions()
+    actions: Actions = {
+        "scene": scene,
+        "estimate": estimate,
+        "plan": plan,
+        "reach": reach,
+        "read": read,
+        "insert": insertions.insert,
+        "save": insertions.save,
+    }
+    while (order := inbox.next()) is not None:
+        carry_out(Task(*order, outbox), actions)
+        outbox.flush()
+        inbox.done(order[0])
+    return 0
+
+
+def _write(out: BinaryIO, data: bytes) -> None:
+    out.write(data)
+    out.flush()
+
+
+def carry_out(task: Task, actions: Actions) -> None:
+    """Do an order, and report how it has ended."""
+    try:
+        task.signals.check()
+        actions[task.work.do](task)
+    except Cancelled:
+        task.tell("cancelled")
+    except FlexneedleError as error:
+        task.tell("failed", text=one_line(error))
+    except Exception as error:  # noqa: BLE001 - whatever one job raises, the worker does the next
+        traceback.print_exc()
+        task.tell("failed", text=unexpected(error))
+    else:
+        task.tell("done", 1.0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

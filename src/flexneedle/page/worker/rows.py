@@ -1,0 +1,97 @@
+"""Rows and frames of control periods, running or recorded."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from flexneedle.page.frames import Kind, ShapeFrame, Source, frame_of
+from flexneedle.page.messages import Row
+from flexneedle.simulator.state import Contacts
+from flexneedle.types import Floats, Period, Plan, Shape, X
+
+_TIP = "tip"
+
+
+def row_of(period: Period, plan: Plan) -> Row:
+    """The row of a period."""
+    tip = period.true_tip or period.estimate
+    measured = period.measurement
+    return Row(
+        index=period.index,
+        time=period.time,
+        action=str(period.action),
+        decision=period.decision,
+        verdict=str(period.verdict),
+        measured=None if measured.x is None else (measured.x, measured.y, measured.z),
+        estimate=period.estimate.point,
+        true=None if period.true_tip is None else period.true_tip.point,
+        path=period.path.point,
+        error_mm=_from_path(plan, tip.point),
+        guide=period.guide,
+        base=period.base.point,
+        roll_deg=math.degrees(period.roll),
+        indicator=_indicator(period),
+        energy_mj=period.strain_energy,
+        true_energy_mj=period.true_strain_energy,
+        stretch=period.true_stretch,
+        miss_mm=period.miss,
+        miss_sd_mm=period.miss_sd,
+        cost=period.cost,
+        decide_ms=1e3 * period.durations.get("decide", 0.0),
+        late=period.late,
+        warning=period.warning,
+    )
+
+
+def _from_path(plan: Plan, point: Sequence[float]) -> float:
+    """Lateral distance (mm) of a point from the planned path of the tip, at its depth."""
+    y, z = (float(np.interp(point[0], plan.tips[:, X], plan.tips[:, column])) for column in (1, 2))
+    return math.hypot(point[1] - y, point[2] - z)
+
+
+def _indicator(period: Period) -> float | None:
+    frame = period.measurement.frame
+    reading = None if frame is None else frame.readings.get(_TIP)
+    return None if reading is None else reading.indicator
+
+
+def frames_of(periods: Sequence[Period], source: Source) -> list[ShapeFrame]:
+    """The frames of successive periods: needle, and the true and the predicted one where they are known."""
+    first = periods[0].index
+    shapes: dict[Kind, list[Any]] = {
+        Kind.NEEDLE: [period.shape[:, :3] for period in periods],
+        Kind.TRUE: [period.true_shape for period in periods],
+        Kind.PREDICTED: [
+            None if period.predicted is None else _with_sd(period.predicted) for period in periods
+        ],
+    }
+    found = []
+    for kind, paths in shapes.items():
+        for begin, end in _runs(paths):
+            found.append(frame_of(kind, source, first + begin, *paths[begin:end]))
+    return found
+
+
+def _runs(paths: Sequence[Any]) -> list[tuple[int, int]]:
+    """Longest ranges of paths that are known."""
+    known = [False, *(path is not None for path in paths), False]
+    edges = [k for k in range(len(paths) + 1) if known[k] != known[k + 1]]
+    return list(zip(edges[::2], edges[1::2], strict=True))
+
+
+def _with_sd(shape: Shape) -> Floats:
+    """Points of a predicted needle, and the larger standard deviation across it."""
+    return np.column_stack([shape.nodes[:, :3], shape.sd.max(axis=1)])
+
+
+def channel_of(contacts: Contacts, number: int) -> ShapeFrame | None:
+    """The frame of the cut channel: where it was cut, and the stretch of the tissue on the side that is released.
+
+    None before the skin.
+    """
+    if len(contacts.x) == 0:
+        return None
+    values = np.column_stack([contacts.x, contacts.position, 2.0 - contacts.stretch])
+    return frame_of(Kind.CHANNEL, Source.LIVE, number, values)

@@ -1,0 +1,47 @@
+"""The scene: where everything is before the insertion."""
+
+from itertools import pairwise
+
+from flexneedle.page.frames import Kind, Source, frame_of
+from flexneedle.page.messages import Scene
+from flexneedle.page.worker.task import Task
+from flexneedle.scenario.model import Scenario
+from flexneedle.simulator.simulator import Simulator
+
+
+def scene(task: Task) -> None:
+    """Report the scene of a scenario, and its needle at the start."""
+    task.say(scene_of(task.scenario, task.work.revision))
+    nodes = Simulator(task.scenario, threads=1).start().nodes[:, :3]
+    task.show(frame_of(Kind.NEEDLE, Source.SCENE, 0, nodes))
+
+
+def scene_of(scenario: Scenario, revision: int) -> Scene:
+    """The scene of a scenario."""
+    setup, entry, needle = scenario.setup, scenario.entry, scenario.needle
+    base, guide, slope = entry.lateral(scenario.start_base_x), scenario.guide_home, entry.slope
+    tops = [*scenario.layer_tops, None]
+    return Scene(
+        revision=revision,
+        axes=setup.axes,
+        layers=[
+            {
+                "name": layer.name,
+                "top_mm": top,
+                "bottom_mm": bottom,
+                "shear_modulus_kpa": layer.shear_modulus_kpa,
+            }
+            for layer, (top, bottom) in zip(scenario.tissue, pairwise(tops), strict=True)
+        ],
+        guide=None if setup.guide_x is None else (setup.guide_x, guide.real, guide.imag),
+        base=(scenario.start_base_x, base.real, base.imag),
+        needle_length_mm=needle.length_mm,
+        needle_radius_mm=0.5 * needle.outer_diameter,
+        axis={
+            "point": (entry.lateral_mm, entry.lateral_z_mm),
+            "slope": (slope.real, slope.imag),
+        },
+        target=scenario.target.position,
+        bevel={"angle_deg": 0.0, "offset_mm": needle.bevel.offset_mm},
+        travel={"lateral_mm": setup.max_lateral, "depth_mm": setup.max_depth},
+    )

@@ -1,0 +1,12 @@
+"""What a worker does before it is ready, so that its first job is as fast as the next."""
+
+from flexneedle.page.worker.plans import smaller
+from flexneedle.planning.planner import plan
+from flexneedle.rig.kernels import compile_kernels
+from flexneedle.scenario.files import load_scenario
+
+
+def warm_up() -> None:
+    """Compile all kernels, or load them from the cache, and make a small plan."""
+    compile_kernels()
+    plan(smaller(load_scenario("phantom"), 16, 1))

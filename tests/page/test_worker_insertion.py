@@ -1,0 +1,196 @@
+"""Insertions of the page's worker: the same as those of `flexneedle.insert`, at any pace."""
+
+import math
+
+import pytest
+
+import flexneedle
+from flexneedle.errors import InputError
+from flexneedle.page.frames import Kind, Source
+from flexneedle.page.messages import Disturb
+from flexneedle.page.orders import Signal
+from flexneedle.page.worker.insertion import Insertions
+from flexneedle.page.worker.recording import read
+from flexneedle.page.worker.rows import row_of
+from flexneedle.page.worker.signals import Cancelled
+from page_tasks import NO_WAIT, Reported, done, short, task
+
+TIMED = {"decide_ms"}
+
+
+def plain(rows):
+    """Rows without what the wall clock decides; NaN is None."""
+    return [row.model_dump(exclude=TIMED, mode="json") for row in rows]
+
+
+@pytest.fixture(scope="module")
+def by_command():
+    """The insertion of `flexneedle.insert`."""
+    plan = flexneedle.plan(short(), seed=3)
+    return flexneedle.insert(short(), plan, 3)
+
+
+@pytest.fixture(scope="module")
+def inserted():
+    """The worker of a finished insertion, and what it has reported."""
+    worker, one = Insertions(), task("insert", "insertion", seed=3)
+    worker.insert(one)
+    return worker, one.outbox
+
+
+def advancing(signals, count):
+    for _ in range(count):
+        signals.take(Signal(job=1, advance=True))
+
+
+def test_rows_are_those_of_the_command(inserted, by_command):
+    rows = inserted[1].rows
+    assert plain(rows) == plain(row_of(period, by_command.plan) for period in by_command.periods)
+    assert len(rows) == len(by_command.periods) > 12
+
+
+def test_rows_are_the_same_period_by_period(by_command):
+    one = task("insert", "insertion", seed=3, pace=0.0)
+    advancing(one.signals, len(by_command.periods) + 1)
+    Insertions().insert(one)
+    assert plain(one.outbox.rows) == plain(row_of(period, by_command.plan) for period in by_command.periods)
+    assert "paused" in [news.state for news in one.outbox.of("insertion")]
+
+
+def test_states_are_reported_in_order(inserted, by_command):
+    news = inserted[1].of("insertion")
+    assert [one.state for one in news] == ["planning", "running", "done"]
+    assert news[-1].summary == by_command.summary
+    assert news[-1].error_mm == by_command.error_mm
+    assert news[-1].periods == len(by_command.periods)
+    assert news[-1].target == short().target.position
+
+
+def test_each_period_has_its_frames(inserted, by_command):
+    reported, count = inserted[1], len(by_command.periods)
+    for kind in (Kind.NEEDLE, Kind.TRUE, Kind.PREDICTED):
+        assert [frame.number for frame in reported.shapes(kind, Source.LIVE)] == list(range(count))
+    decided = {frame.number for frame in reported.shapes(Kind.SAMPLES, Source.LIVE)}
+    assert decided == {row.index for row in reported.rows if not math.isnan(row.cost)}
+    channel = reported.shapes(Kind.CHANNEL, Source.LIVE)[-1].values[0]
+    assert channel[0, 0] < 1.0 < channel[-1, 0]
+    assert (channel[:, 3] >= 1.0).all()
+    assert channel[:, 3].max() > 1.0
+
+
+@pytest.mark.parametrize("controller", ["ce-mpc", "open-loop"])
+def test_another_controller(controller):
+    one = task("insert", "insertion", seed=1, controller=controller)
+    Insertions().insert(one)
+    assert one.outbox.of("insertion")[-1].controller == controller
+    assert bool(one.outbox.shapes(Kind.SAMPLES, Source.LIVE)) == (controller == "ce-mpc")
+
+
+def stopping(at, **signal):
+    """A task with a signal after the row of this index."""
+
+    def then(news):
+        if news.type == "rows" and news.first == at:
+            one.signals.take(Signal(job=1, **signal))
+
+    one = task("insert", "insertion", reported=Reported(then))
+    return one
+
+
+def test_a_stop_ends_it_as_interrupted():
+    one = stopping(4, stop=True)
+    Insertions().insert(one)
+    last = one.outbox.of("insertion")[-1]
+    assert (last.state, last.periods) == ("interrupted", 5)
+    assert "stopped on the page" in last.summary
+
+
+def test_a_cancelled_one_has_no_result():
+    one, worker = stopping(4, cancel=True), Insertions()
+    with pytest.raises(Cancelled):
+        worker.insert(one)
+    assert len(one.outbox.rows) == 5
+    with pytest.raises(InputError, match="no insertion to save"):
+        worker.save(task("save", folder="nowhere"))
+
+
+def test_one_that_is_refused_is_reported():
+    scenario = short(**{"target.lateral_mm": 12.0})
+    reported = done(Insertions().insert, task("insert", "insertion", scenario, controller="ce-mpc"))
+    assert reported.of("insertion")[-1].state == "refused"
+    assert "misses the target" in reported.of("insertion")[-1].summary
+
+
+def test_a_saved_insertion_is_read_as_it_was(inserted, tmp_path):
+    worker, reported = inserted
+    folder = tmp_path / "saved"
+    worker.save(task("save", folder=str(folder)))
+    again = task("read", "recording", folder=str(folder), of="second")
+    read(again)
+    rows = again.outbox.rows
+    assert [news.of for news in again.outbox.of("rows")] == ["second"]
+    assert len(rows) == len(reported.rows)
+    for row, live in zip(rows, reported.rows, strict=True):
+        assert row.true == pytest.approx(live.true, abs=1e-6)
+        assert row.error_mm == pytest.approx(live.error_mm, abs=1e-6)
+        assert (row.action, row.verdict, row.decision) == (live.action, live.verdict, live.decision)
+    (needles,) = again.outbox.shapes(Kind.NEEDLE, Source.SECOND)
+    assert needles.values.shape[0] == len(rows)
+    assert needles.values[-1] == pytest.approx(reported.shapes(Kind.NEEDLE)[-1].values[0], abs=1e-4)
+
+
+def test_a_folder_without_an_insertion_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"run\.json is missing"):
+        read(task("read", "recording", folder=str(tmp_path)))
+
+
+def disturbed(*disturbs, scenario=None, seed=3):
+    """What an insertion reports that is disturbed from its start."""
+    one = task("insert", "insertion", scenario, seed=seed, pace=NO_WAIT)
+    for disturb in disturbs:
+        one.signals.take(Signal(job=1, disturb=Disturb(type="disturb", **disturb)))
+    Insertions().insert(one)
+    return one.outbox
+
+
+def test_a_push_moves_the_true_tip_in_its_direction(by_command):
+    aside = disturbed({"what": "push", "size": 0.05, "angle_deg": 0.0}).rows[1].true[1]
+    back = disturbed({"what": "push", "size": 0.05, "angle_deg": 180.0}).rows[1].true[1]
+    free = by_command.periods[1].true_tip.y
+    assert aside > free + 0.02
+    assert back < free - 0.02
+
+
+def test_no_push_is_no_disturbance(by_command):
+    reported = disturbed({"what": "push", "size": 0.0}, {"what": "stiffen", "size": 1.0})
+    assert plain(reported.rows) == plain(row_of(period, by_command.plan) for period in by_command.periods)
+    assert reported.of("disturbances")[-1].active == []
+
+
+def test_a_stiffer_layer_stores_more_energy_for_the_same_needle(by_command):
+    rows = disturbed({"what": "stiffen", "size": 3.0, "layer": 0}).rows
+    assert rows[-1].true_energy_mj > 1.3 * by_command.periods[-1].true_strain_energy
+    deep = disturbed({"what": "stiffen", "size": 3.0, "layer": 1}).rows  # which the needle does not reach
+    assert deep[-1].true_energy_mj == by_command.periods[-1].true_strain_energy
+
+
+def test_a_lost_tip_holds_the_needle_and_comes_back():
+    reported = disturbed({"what": "drop", "size": 0.5})
+    verdicts = [row.verdict for row in reported.rows]
+    assert any(verdict.startswith("missing") for verdict in verdicts)
+    assert verdicts[-1] == "ok"
+    assert [news.active for news in reported.of("disturbances")] == [["tip not measured for 0.5 s"], []]
+
+
+@pytest.mark.parametrize("environment", ["ideal", "noisy"])
+def test_a_plate_distorts_the_readings_until_it_is_taken_away(environment):
+    scenario = short(**{"tracker.environment": environment, "monitor.enabled": False})
+    plan = flexneedle.plan(scenario, seed=3)
+    by_command = flexneedle.insert(scenario, plan, 3)
+    assert plain(disturbed(scenario=scenario).rows) == plain(row_of(one, plan) for one in by_command.periods)
+    near = disturbed({"what": "plate", "size": 60.0}, scenario=scenario).rows
+    assert abs(near[3].measured[1] - by_command.periods[3].measurement.y) > 0.1
+    away = disturbed({"what": "plate", "size": 60.0}, {"what": "plate", "size": 0.0}, scenario=scenario)
+    same = [row.measured for row in away.rows] == [row.measured for row in disturbed(scenario=scenario).rows]
+    assert same == (environment == "ideal")
+    assert away.of("disturbances")[-1].active == []

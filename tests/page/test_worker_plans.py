@@ -1,0 +1,156 @@
+"""Scene, estimate, plans and reach of the page's worker."""
+
+import math
+
+import numpy as np
+import pytest
+
+import flexneedle
+from flexneedle.page.frames import Kind, Source, packed, unpacked
+from flexneedle.page.orders import Signal
+from flexneedle.page.worker.__main__ import carry_out
+from flexneedle.page.worker.plans import estimate, plan, samples_of
+from flexneedle.page.worker.reach import reach
+from flexneedle.page.worker.scene import scene
+from flexneedle.page.worker.signals import Cancelled
+from flexneedle.planning.horizon import Samples
+from page_tasks import Reported, done, short, task
+
+
+def test_a_scene_is_that_of_the_scenario():
+    made = short("phantom3d", **{"entry.lateral_mm": 1.0, "entry.slope_z_mrad": 20.0})
+    reported = done(scene, task("scene", scenario=made))
+    (news,) = reported.of("scene")
+    assert (news.revision, news.axes, news.target) == (7, 2, made.target.position)
+    assert [layer["top_mm"] for layer in news.layers] == [0.0, 20.0]
+    assert [layer["bottom_mm"] for layer in news.layers] == [20.0, None]
+    assert news.guide == pytest.approx((-41.0, 1.0, -0.82))
+    assert news.axis == {"point": (1.0, 0.0), "slope": (0.0, 0.02)}
+    (needle,) = reported.shapes(Kind.NEEDLE, Source.SCENE)
+    assert needle.values[0, 0] == pytest.approx(news.base, abs=1e-4)
+    assert needle.values[0, -1, 0] == pytest.approx(-2.0, abs=0.05)
+
+
+def test_an_estimate_ends_near_the_target():
+    reported = done(estimate, task("estimate"))
+    (news,) = reported.of("estimate")
+    assert math.dist(news.tip, short().target.position) == pytest.approx(news.error_mm)
+    (path,) = reported.shapes(Kind.PATH, Source.SCENE)
+    assert path.values[0, -1] == pytest.approx(news.tip, abs=1e-4)
+    assert reported.shapes(Kind.SWEEP, Source.SCENE)[0].values.shape[0] == path.values.shape[1]
+
+
+def test_an_estimate_of_few_elites():
+    """Fewer samples than the scenario's leave fewer than two of them with its share of elites."""
+    done_ = done(
+        estimate, task("estimate", scenario=short(**{"plan.samples": 200, "plan.elite_fraction": 0.02}))
+    )
+    assert done_.of("estimate")
+
+
+@pytest.mark.parametrize("strategy", ["manipulation", "steering"])
+def test_a_plan_is_that_of_the_command_with_each_iteration(strategy):
+    reported = done(plan, task("plan", strategy=strategy, seed=2))
+    made = flexneedle.plan(short(), strategy=strategy, seed=2)
+    (news,) = reported.of("plan")
+    assert (news.tip, news.cost, news.terms, news.seed) == (made.tip_mm, made.cost, made.terms, 2)
+    assert news.history == [entry["best"] for entry in made.history]
+    iterations = reported.of("iteration")
+    assert [one.iteration for one in iterations] == list(range(1, len(iterations) + 1))
+    source = Source[strategy.upper()]
+    samples = reported.shapes(Kind.SAMPLES, source)
+    assert [frame.number for frame in samples] == [one.iteration for one in iterations]
+    for one, frame in zip(iterations, samples, strict=True):
+        costs = frame.values[:, -1, 3]
+        assert (np.diff(costs) >= 0.0).all()
+        assert costs[0] == pytest.approx(one.quantiles[0], rel=1e-5)
+    assert reported.shapes(Kind.PATH, source)[0].values[0] == pytest.approx(made.tips[:, :3], abs=1e-4)
+
+
+def test_a_comparison_plans_both():
+    reported = done(plan, task("plan", "compare"))
+    assert [news.strategy for news in reported.of("plan")] == ["manipulation", "steering"]
+    shares = [news.share for news in reported.of("job")]
+    assert shares == sorted(shares)
+    assert shares[-1] <= 1.0
+
+
+def test_a_plan_is_cancelled_between_two_iterations():
+    def then(news):
+        if news.type == "iteration":
+            one.signals.take(Signal(job=1, cancel=True))
+
+    one = task("plan", reported=Reported(then))
+    carry_out(one, {"plan": plan})
+    assert len(one.outbox.of("iteration")) == 1
+    assert one.outbox.of("plan") == []
+    assert one.outbox.of("job")[-1].state == "cancelled"
+
+
+def test_at_most_64_paths_of_48_points_are_shown_the_best_and_the_worst_among_them():
+    rng = np.random.default_rng(0)
+    tips, costs = rng.normal(size=(200, 100, 5)), rng.uniform(size=200)
+    frame = samples_of(Samples(tips, costs), Source.LIVE, 3)
+    assert frame.values.shape == (64, 48, 4)
+    shown = unpacked(packed(frame)).values
+    assert shown[0, :, :3][[0, -1]] == pytest.approx(tips[costs.argmin()][[0, -1], :3], abs=1e-5)
+    assert shown[-1, -1, 3] == pytest.approx(costs.max())
+    assert not shown[:, :-1, 3].any()
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch):
+    """Few and short searches of the reach."""
+    monkeypatch.setattr("flexneedle.page.worker.reach._PASSES", ((1, (12, 2)), (2, (16, 4))))
+
+
+def reached(scenario, **values):
+    reported = done(reach, task("reach", scenario=scenario, **values))
+    return reported, reported.of("reach")[-1]
+
+
+def test_the_reach_grows_with_the_depth_and_is_within_the_travel():
+    scenario = short(**{"setup.stroke_mm": 40.0})
+    reported, last = reached(scenario)
+    first = reported.of("reach")[0]
+    assert len(first.depths) < len(last.depths)
+    assert set(first.depths) <= set(last.depths)
+    assert max(last.depths) < scenario.setup.max_depth
+    assert last.high[0] < last.high[-1] <= scenario.setup.max_lateral + 0.1
+    assert all(low < -0.5 * high for low, high in zip(last.low, last.high, strict=True))
+    deepest = dict(zip(first.depths, first.high, strict=True))
+    assert all(high >= deepest.get(depth, high) for depth, high in zip(last.depths, last.high, strict=True))
+
+
+def test_the_bevel_alone_reaches_less():
+    scenario = short(**{"setup.stroke_mm": 40.0})
+    assert reached(scenario, strategy="steering")[1].high[-1] < reached(scenario)[1].high[-1]
+
+
+def test_outlines_in_space_are_closed_and_in_the_plane_of_the_target():
+    values = {"setup.stroke_mm": 12.0, "target.depth_mm": 8.0, "target.lateral_z_mm": 0.5}
+    reported, last = reached(short("phantom3d", **values))
+    assert last.angle_deg == pytest.approx(45.0)
+    outlines = reported.shapes(Kind.REACH, Source.SCENE)[-1].values
+    assert pytest.approx(np.tile(last.depths, (9, 1))) == outlines[:, :, 0].T
+    assert (outlines[:, 0] == outlines[:, -1]).all()
+    assert outlines[:, 0, 1:].sum(axis=1) / math.sqrt(2.0) == pytest.approx(last.high, abs=1e-4)
+
+
+def test_a_reach_is_cancelled():
+    one = task("reach")
+    one.signals.take(Signal(job=1, cancel=True))
+    with pytest.raises(Cancelled):
+        reach(one)
+
+
+def test_what_goes_wrong_is_the_end_of_the_job(capsys):
+    one = task("plan")
+    bad = one.work.model_copy(update={"scenario": one.work.scenario | {"needle": {}}})
+    failed = type(one)(bad, one.signals, Reported())
+    carry_out(failed, {"plan": plan})
+    (job,) = failed.outbox.of("job")
+    assert (job.state, job.text.startswith("small: needle")) == ("failed", True)
+    carry_out(one, {"plan": lambda _task: 1 / 0})
+    assert one.outbox.of("job")[-1].text.startswith("ZeroDivisionError")
+    assert "Traceback" in capsys.readouterr().err

@@ -1,0 +1,53 @@
+"""studies/far_targets.py: the edge, both plans of a target, and what the table counts."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from flexneedle.scenario.worlds import world
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
+import far_targets
+
+
+def test_a_target_that_one_search_misses_is_planned_with_each_width():
+    row = far_targets.plan_target(world(4), (11.5, -10.0))
+    assert row["before_mm"] > far_targets.MISSED_MM
+    assert row["after_mm"] <= far_targets.HIT_MM
+    assert far_targets.wide_hits(row)
+    assert list(row["widths"]) == [str(width) for width in far_targets.WIDTHS]
+    assert row["after_s"] > row["before_s"] > 0.0
+
+
+def test_the_edge_is_where_the_needle_ends_at_most_at_the_largest_lateral_offset():
+    assert far_targets.edge(world(1), 6.8, -1.0) == pytest.approx(7.65, abs=0.1)
+    assert far_targets.edge(world(4), 11.5, -1.0) == world(4).setup.max_lateral
+
+
+def test_a_world_without_a_guide_has_no_targets():
+    assert not world(15).setup.has_guide
+    assert far_targets.plan_world(15) == []
+
+
+def made(before, after, wide=None):
+    row = {"before_mm": before, "after_mm": after, "before_s": 1.0, "after_s": 2.0}
+    if wide is None:
+        return row
+    preset, *wider = map(str, far_targets.WIDTHS)
+    return row | {"widths": {preset: {"error_mm": 0.0}} | {width: {"error_mm": wide} for width in wider}}
+
+
+def test_targets_are_counted_by_what_a_wide_search_hits():
+    """Hit at once; missed and now hit; missed still; out of reach, though the width of the preset hits by chance."""
+    rows = [made(0.9, 0.9), made(1.1, 0.2, 0.4), made(3.0, 1.1, 0.4), made(3.0, 2.0, 0.6)]
+    cells = [cell.strip() for cell in far_targets.line("all", rows).split("|")[1:-1]]
+    assert cells[:5] == ["all", "4", "2 (50.0%)", "1 (25.0%)", "1"]
+
+
+@pytest.mark.parametrize("worlds", [("-1", "5"), ("0", "0"), ("99990", "20")])
+def test_worlds_for_tuning_and_for_reports_are_not_mixed(worlds, capsys):
+    with pytest.raises(SystemExit) as left:
+        far_targets.main(["--worlds", *worlds])
+    assert left.value.code == 2
+    assert "worlds = " in capsys.readouterr().err
