@@ -64,7 +64,7 @@ def visit(browser, server):
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
         if not tour:
-            page.add_init_script("localStorage.setItem('flexneedle tour', 'seen')")
+            page.add_init_script("if (origin !== 'null') localStorage.setItem('flexneedle tour', 'seen')")
         if before:
             page.add_init_script(before)
         page.goto(server.url)

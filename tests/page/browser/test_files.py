@@ -121,6 +121,7 @@ async (bytes) => {
     const { image } = await decoder.decode({ frameIndex: at });
     const canvas = new OffscreenCanvas(image.displayWidth, image.displayHeight);
     canvas.getContext("2d").drawImage(image, 0, 0);
+    image.close();
     frames.push([...canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data]);
   }
   return frames;

@@ -79,11 +79,24 @@ def test_a_problem_is_beside_its_field_and_the_value_stays(form, server):
     assert problem.inner_text() == rule
     assert page.input_value("#field-target-depth_mm") == "-3"
     assert page.get_attribute("#field-target-depth_mm", "aria-invalid") == "true"
+    page.press("#field-target-depth_mm", "Escape")
+    assert page.input_value("#field-target-depth_mm") == "40"
+    server.send(people(clients=2), session(seed=3))
+    page.wait_for_selector("text=seed 3")
+    assert not problem.is_visible()
+
+
+def test_a_problem_is_left_with_another_state(form, server):
+    server.answers["edit"] = Refused(what="edit", reason="no", problems={"target.lateral_mm": "must be less"})
+    page = form()
+    page.fill("#field-target-depth_mm", "-3")
+    page.press("#field-target-depth_mm", "Enter")
+    problem = field(page, "target.lateral_mm").locator(".problem")
+    problem.wait_for()
+    page.locator("#field-target-depth_mm").blur()
     server.send(session(2))
     problem.wait_for(state="hidden")
-    until(
-        page, "document.querySelector('#field-target-depth_mm').value === '40' || document.activeElement.id"
-    )
+    until(page, "document.querySelector('#field-target-depth_mm').value === '40'")
 
 
 def test_what_is_no_number_is_not_sent(form, server):

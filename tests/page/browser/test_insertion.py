@@ -23,7 +23,7 @@ def panel(visit, server):
 
 
 def click(page, text):
-    page.locator(f"{PANEL} button:visible", has_text=text).first.click()
+    page.locator(PANEL).get_by_role("button", name=text, exact=True).click()
 
 
 def test_it_is_started_paced_and_stopped(panel, server):
@@ -109,13 +109,13 @@ def test_decisions_are_listed_where_they_change_and_show_their_period(panel, ser
     page.wait_for_selector("text=hold; measurement held: no reading; decided late")
     page.click(".decisions li:last-child button")
     until(page, "flexneedle.store.get('view period') === 0")
-    assert "Period 1, 0.0 s: advance as planned" in page.inner_text(".decisions .now")
+    page.wait_for_selector(".decisions .now >> text=Period 1, 0.0 s: advance as planned")
     page.wait_for_selector(".decisions li:last-child[aria-current=step]")
 
 
 def test_anybody_can_stop_and_only_who_steers_can_do_more(panel, server):
     page = panel([*opening(), people(2, steering=2), insertion("running")])
-    assert page.locator(f"{PANEL} button:visible", has_text="Pause").is_disabled()
+    assert page.locator(PANEL).get_by_role("button", name="Pause", exact=True).is_disabled()
     click(page, "Stop")
     page.wait_for_timeout(100)
     assert server.asked("stop") == [{"type": "stop"}]

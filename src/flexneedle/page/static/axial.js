@@ -26,7 +26,7 @@ export function mount(element, store, link) {
     const map = mappingOf({ left: -half, right: half, half }, width, height, 1);
     const parts = partsOf(store, scene);
     const reached = drawAxial(pen, { width, height, map, scene, target, parts, store });
-    legendOf(legend, parts.filter(({ thick }) => !thick), reached);
+    legendOf(legend, parts, reached);
     handles.update(mayMove(store) ? [handleOf(map, scene, target)] : []);
   });
   store.subscribe([...SHOWN, "people", "welcome"], () => stage.schedule());

@@ -124,8 +124,9 @@ class Form {
   #fill(section) {
     const [{ values, changed }, draft] = [this.#store.get("session"), this.#store.get("draft") ?? {}];
     for (const view of section.views) {
-      const value = view.key in draft ? draft[view.key] : values[view.key] ?? null;
-      view.update(value, changed.includes(view.key), this.#problems[view.key]);
+      const pending = view.key in draft;
+      const value = pending ? draft[view.key] : values[view.key] ?? null;
+      view.update(value, { changed: changed.includes(view.key), problem: this.#problems[view.key], pending });
     }
     const faulty = section.fields.some(({ key }) => this.#problems[key]);
     section.element.classList.toggle("faulty", faulty);

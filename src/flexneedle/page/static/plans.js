@@ -53,8 +53,7 @@ function lines(store) {
   }
   for (const plan of plans) {
     const stale = isStale(store, plan);
-    const limit = plan.limit ? `; limit: ${plan.limit}` : "";
-    found.push([`${titled(plan.strategy)}: ${plan.summary}${limit}${stale ? " (for an earlier state of the scenario)" : ""}.`, stale]);
+    found.push([`${titled(plan.strategy)}: ${plan.summary}${stale ? " (for an earlier state of the scenario)" : ""}.`, stale]);
   }
   return found;
 }

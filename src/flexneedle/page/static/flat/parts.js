@@ -18,7 +18,7 @@ export function partsOf(store, scene) {
     foreseen(store, of, shape),
     ...secondRun(store, radius),
     { path: first(shape("needle")), tone: "--needle", thick: 2 * radius, least: 2.5, text: "needle" },
-    { path: first(shape("true")), tone: "--true", width: 1.25, text: "true needle" },
+    { path: first(shape("true")), tone: "--true", thick: 0.6 * radius, least: 1.25, text: "true needle" },
   ];
   return parts.filter(({ path }) => path);
 }

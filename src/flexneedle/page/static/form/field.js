@@ -9,7 +9,9 @@ export class FieldView {
   #field;
   #slider = null;
   #problem = make("p.problem.bad", { hidden: true });
-  #shown; // value of the scenario
+  #shown; // value of the scenario, or of the draft
+  #taken = false; // whether the text is the user's, and not answered yet or refused
+  #dismissed; // problem that was left with Escape
   #before = ""; // text when the field got the focus
 
   // field: of fields.js; value: at first, which the slider's range depends on; edit: called with a new value.
@@ -35,19 +37,19 @@ export class FieldView {
     return `${key} ${label} ${unit} ${description}`.toLowerCase();
   }
 
-  // Show a value; what the user is writing, or what is refused, stays.
-  update(value, changed, problem) {
+  // Show a value. state: {changed: from that of the file, problem: of the server, pending: not answered yet}. What is
+  // being written, or is refused, stays.
+  update(value, { changed, problem, pending }) {
     this.element.classList.toggle("changed", changed);
-    this.#show(problem);
-    if (problem && !this.#same(value)) return;
+    if (problem !== this.#dismissed) this.#dismissed = undefined;
+    const open = this.#dismissed ? undefined : problem;
+    this.#show(open);
     this.#shown = value;
+    if (!problem && !pending) this.#taken = false;
+    if (open && this.#taken) return;
     if (this.#field.kind === "switch") this.input.checked = Boolean(value);
     else if (document.activeElement !== this.input) this.input.value = written(value);
     if (this.#slider && document.activeElement !== this.#slider) this.#slider.value = value ?? this.#field.usual ?? 0;
-  }
-
-  #same(value) {
-    return JSON.stringify(value) === JSON.stringify(this.#shown) && this.input.value === written(value);
   }
 
   #show(problem) {
@@ -85,6 +87,7 @@ export class FieldView {
     slider.addEventListener("input", () => {
       const value = Number(slider.value);
       this.input.value = written(value);
+      this.#taken = true;
       this.edit(value);
     });
     return slider;
@@ -92,6 +95,7 @@ export class FieldView {
 
   #take() {
     const { value, problem } = read(this.#field, this.input.value);
+    this.#taken = true;
     this.#show(problem);
     if (problem === undefined) this.edit(value);
   }
@@ -105,6 +109,8 @@ export class FieldView {
   // Escape restores the scenario's value; Enter is a change.
   #key({ key }) {
     if (key !== "Escape") return;
+    this.#taken = false;
+    this.#dismissed = this.#problem.textContent || undefined;
     this.input.value = written(this.#shown);
     this.#show(undefined);
   }
