@@ -92,7 +92,6 @@ def test_wrong_arguments_are_refused_in_one_line(capsys):
     assert message.startswith("flexneedle: cannot listen on 192.0.2.1, port 0: ")
     assert message.endswith("; choose others with --host and --port\n")
     assert failed(capsys, "nonsense").startswith("flexneedle: nonsense: no such file, and no such preset")
-    assert failed(capsys, "--rig", "nonsense.toml").startswith("flexneedle: nonsense.toml: no such file")
 
 
 @pytest.mark.parametrize("port", ["-1", "65536", "x", "1.5", "²"])
@@ -111,15 +110,14 @@ def test_without_its_packages_it_names_them(capsys, monkeypatch):
     )
 
 
-def test_a_rig_has_shorter_waits_and_its_name(monkeypatch):
+def test_a_world_is_shown_without_a_rig(monkeypatch):
     setups = []
     monkeypatch.setattr(
         "flexneedle.page.server.serve.PageServer", lambda setup, *_where: setups.append(setup) or Ended()
     )
-    assert main(["serve", "world:7", "--rig", "emulated", "--no-open"]) == 0
+    assert main(["serve", "world:7", "--no-open"]) == 0
     (setup,) = setups
-    assert (setup.rig.name, setup.rig.source) == ("Emulated rig", "emulated")
-    assert setup.limits.pong_s == 2.0
+    assert setup.rig is None
     assert setup.session.name == "world:7"
 
 

@@ -16,7 +16,6 @@ from flexneedle.files import RUNS
 
 if TYPE_CHECKING:
     from flexneedle.page.server.desk import Setup
-    from flexneedle.page.server.insertion import ConnectedRig
 
 _HOST, _PORT, _LAST_PORT = "127.0.0.1", 8472, 65535
 _WORKER = (sys.executable, "-m", "flexneedle.page.worker")
@@ -43,12 +42,6 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument(
         "--runs", type=Path, default=RUNS, metavar="DIR", help=f"folder of recorded runs (default: {RUNS})"
-    )
-    parser.add_argument(
-        "--rig",
-        metavar="FILE",
-        help="rig file (its path, or emulated for the one of the package) of a rig on which the page can insert once "
-        "it is armed there (default: virtual insertions only)",
     )
     parser.add_argument(
         "--host",
@@ -98,21 +91,13 @@ def _serve(args: argparse.Namespace) -> int:
 def _setup(args: argparse.Namespace) -> Setup:
     from flexneedle.page.server.catalog import CONTROLLERS
     from flexneedle.page.server.desk import Setup
-    from flexneedle.page.server.limits import RIG, Limits
+    from flexneedle.page.server.limits import Limits
     from flexneedle.page.server.session import Session
     from flexneedle.scenario.files import load_scenario
 
     session = Session.of(args.scenario, load_scenario(args.scenario), CONTROLLERS[0]["name"])
-    rig = None if args.rig is None else _rig(args.rig)
-    limits = Limits() if rig is None else RIG
-    return Setup(session, args.runs, limits, ((*_WORKER, "plans"), (*_WORKER, "insertion")), rig)
-
-
-def _rig(source: str) -> ConnectedRig:
-    from flexneedle.page.server.insertion import ConnectedRig
-    from flexneedle.scenario.rig import load_rig
-
-    return ConnectedRig(load_rig(source).name, source)
+    # None: no rig. Insertions on a rig from the page have not been tried, so the command does not offer them.
+    return Setup(session, args.runs, Limits(), ((*_WORKER, "plans"), (*_WORKER, "insertion")), None)
 
 
 def _announce(address: str, opens: bool) -> None:
