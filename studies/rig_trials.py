@@ -8,13 +8,13 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from select import select
-from threading import Thread
+from threading import Event, Thread
 from time import monotonic, sleep
 from typing import Any, TypeVar
 
@@ -27,6 +27,7 @@ from flexneedle.types import Insertion
 
 START_S, END_S = 300.0, 60.0
 _STALL_S = 0.005
+_POLL_S = 0.2
 _BAD_INPUT = 2  # exit status
 
 
@@ -233,32 +234,42 @@ def resumed(
     yield from ((row, False) for row in kept)
     missing = [task for task in tasks if not any(key(task).items() <= row.items() for row in kept)]
     file.parent.mkdir(parents=True, exist_ok=True)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            for done in as_completed([pool.submit(run, task) for task in missing]):
-                try:
-                    row = done.result()
-                except RuntimeError as error:
-                    print(error, file=sys.stderr, flush=True)
-                    continue
-                with file.open("a") as opened:
-                    opened.write(json.dumps(row) + "\n")
-                yield row, True
-        except BaseException:
-            _end(pool)
-            raise
+    # A flag, since an exception that a signal raises can be lost where Python ignores exceptions, as in a weak
+    # reference's callback.
+    interrupted = Event()
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda *_: interrupted.set()) for number in numbers}
+    try:
+        with ThreadPoolExecutor(workers) as pool:
+            try:
+                for row in _rows([pool.submit(run, task) for task in missing], interrupted):
+                    with file.open("a") as opened:
+                        opened.write(json.dumps(row) + "\n")
+                    yield row, True
+            except BaseException:
+                _end(pool)
+                raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _rows(running: Sequence[Future[Row]], interrupted: Event) -> Iterator[Row]:
+    """The rows of tasks as they end, without those that fail. Raises KeyboardInterrupt once `interrupted` is set."""
+    left = set(running)
+    while left:
+        ended, left = wait(left, _POLL_S, FIRST_COMPLETED)
+        if interrupted.is_set():
+            raise KeyboardInterrupt
+        for one in ended:
+            try:
+                yield one.result()
+            except RuntimeError as error:
+                print(error, file=sys.stderr, flush=True)
 
 
 def _end(pool: ThreadPoolExecutor) -> None:
-    """Cancel tasks, and end all processes below this one until no task runs: one may start another in between.
-
-    Another interrupt would leave some of them, and is ignored.
-    """
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {
-        number: signal.signal(number, lambda *_: None) for number in numbers
-    }  # SIG_IGN would be inherited
+    """Cancel tasks, and end all processes below this one until no task runs: one may start another in between."""
     closing = Thread(target=pool.shutdown, kwargs={"cancel_futures": True})
     closing.start()
     ended = set[psutil.Process]()
@@ -269,8 +280,6 @@ def _end(pool: ThreadPoolExecutor) -> None:
                 process.terminate()
                 process.resume()  # one that is stopped does not end
         closing.join(0.1)
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 @dataclass

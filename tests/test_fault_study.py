@@ -267,7 +267,6 @@ list(resumed(Path({file!r}), [1, 2, 3], run, 2, lambda task: {{"task": task}}))
 """
 
 
-@pytest.mark.slow  # it hung once, in a whole run of the tests
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_no_process_is_left_after_an_interrupt(tmp_path, number):
     text = INTERRUPTED.format(studies=str(Path(study.__file__).parent), file=str(tmp_path / "rows.jsonl"))
