@@ -261,7 +261,7 @@ def _rows(running: Sequence[Future[Row]], interrupted: Event) -> Iterator[Row]:
         ended, left = wait(left, _POLL_S, FIRST_COMPLETED)
         if interrupted.is_set():
             raise KeyboardInterrupt
-        for one in ended:
+        for one in sorted(ended, key=lambda one: one.exception() is not None):  # no row is lost by another's exception
             try:
                 yield one.result()
             except RuntimeError as error:
