@@ -18,7 +18,8 @@ from flexneedle.rig.processes import end_process
 from flexneedle.rig.supervisor import messages as say
 from flexneedle.rig.supervisor.machine import State
 from flexneedle.rig.tracking.registration import identity
-from flexneedle.scenario.rig import Axis, RigFile
+from flexneedle.scenario.rig import RigFile
+from flexneedle.scenario.sections.axes import Axis
 from flexneedle.scenario.sections.monitor import MonitorSettings
 from flexneedle.types import Measurement, Point
 

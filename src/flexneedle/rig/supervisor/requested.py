@@ -6,7 +6,7 @@ from flexneedle.rig.supervisor.drives import Drive
 from flexneedle.rig.supervisor.messages import Go, Step
 from flexneedle.rig.supervisor.motion import Motion
 from flexneedle.rig.supervisor.trajectory import shortest
-from flexneedle.scenario.rig import Axis
+from flexneedle.scenario.sections.axes import Axis
 
 _BACK_OFF_SHARE = 0.02  # of the range an axis moves away from its limit switch
 _HOMING_SHARE = 0.1  # of the largest speed
