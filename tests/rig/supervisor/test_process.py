@@ -87,8 +87,8 @@ def test_operators_move_axes(supervisor):
 def test_a_rig_that_is_not_confirmed_is_not_armed(supervisor):
     shown = []
 
-    def refuse(positions):
-        shown.append(positions)
+    def refuse(asked):
+        shown.append(asked.positions)
         raise RunError("not confirmed")
 
     with pytest.raises(RunError, match="not confirmed"):
@@ -97,7 +97,7 @@ def test_a_rig_that_is_not_confirmed_is_not_armed(supervisor):
     assert supervisor.report.state is State.IDLE
     supervisor.stop("the test")
     with pytest.raises(StoppedError, match="stopped: the test"):
-        Watchers(confirm=shown.append).opened(supervisor)
+        Watchers(confirm=refuse).opened(supervisor)
     assert len(shown) == 1
 
 

@@ -188,15 +188,26 @@ class Supervisor:
         """
         self._send(say.Stop(who), lost=True)
 
+    def signal(self, number: int) -> None:
+        """Send the supervisor's process a signal; it stops the motors at SIGINT, SIGTERM and SIGHUP.
+
+        It may be called in a handler of signals.
+        """
+        self._process.send_signal(number)
+
     def step(
         self,
         roll: float,
         travel: Mapping[str, float],
         duration: float,
         expected: say.Expectation | None = None,
+        roll_duration: float = 0.0,
     ) -> say.Done:
-        """Carry out a step of an insertion: roll (rad), then travel (mm or rad by axis) within `duration` s."""
-        return self._carry_out(lambda number: say.Step(number, roll, travel, duration, expected))
+        """Carry out a step of an insertion: roll (rad) in `roll_duration` s, then travel (mm or rad by axis) in
+        `duration` s, or as soon after that as the axes can."""
+        return self._carry_out(
+            lambda number: say.Step(number, roll, travel, duration, expected, roll_duration)
+        )
 
     def move_to(self, axis: str, position: float, speed: float | None = None) -> say.Done:
         """Move one axis alone to a position (mm or rad), at its largest speed or slower (mm/s or rad/s)."""
