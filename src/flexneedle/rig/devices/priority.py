@@ -1,4 +1,4 @@
-"""Real-time priority of a process."""
+"""Real-time priority of a process, and of its threads."""
 
 import os
 from contextlib import suppress
@@ -12,3 +12,9 @@ def set_realtime_priority() -> None:
     if hasattr(os, "sched_setscheduler"):
         with suppress(PermissionError):
             os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+
+
+def set_normal_priority() -> None:
+    """Give this thread, and the processes that it starts, no more than the normal priority."""
+    if hasattr(os, "sched_setscheduler"):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
