@@ -259,6 +259,16 @@ def test_a_jog_is_no_faster_than_asked(bench):
     assert speeds == pytest.approx([2.0 * 500.0])
 
 
+def test_a_speed_that_is_refused_has_the_unit_of_the_file(bench):
+    for axis, speed in (("rotation", 4.0 * math.pi), ("guide_y", 12.5)):
+        bench.core.request(say.Go(1, axis, 1.0, speed))
+        expected = {
+            "rotation": "speed of rotation = 720 deg/s: must be above 0, at most 360 deg/s",
+            "guide_y": "speed of guide_y = 12.5 mm/s: must be above 0, at most 10 mm/s",
+        }
+        assert bench.sent[-1].why == expected[axis]
+
+
 @pytest.mark.parametrize("tracked", [True, False])
 def test_an_axis_beyond_its_range_is_armed_for_the_operator_alone_and_may_only_be_jogged_back(tracked):
     bench = Bench(tracked=tracked)

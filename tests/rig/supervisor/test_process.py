@@ -188,6 +188,15 @@ def test_a_device_that_does_not_open_is_the_reason():
         Supervisor(task(position="nowhere"))
 
 
+def test_what_a_driver_prints_is_kept_from_standard_output(capfd):
+    """There `insert --json` prints its result."""
+    with Supervisor(task(driver="stages:printing_motors")):
+        pass
+    found = capfd.readouterr()
+    assert found.out == ""
+    assert "opens the stage\nposition of the stage:\n" in found.err
+
+
 def test_a_supervisor_that_hangs_is_an_error(supervisor):
     supervisor.arm()
     os.kill(supervisor.pid, signal.SIGSTOP)

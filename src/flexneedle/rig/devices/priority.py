@@ -1,4 +1,4 @@
-"""Real-time priority of a process."""
+"""Real-time priority of a process, and of its threads."""
 
 import os
 from contextlib import suppress
@@ -19,3 +19,9 @@ def set_realtime_priority() -> None:
     for thread in _THREADS.iterdir():
         with suppress(PermissionError, ProcessLookupError):
             os.sched_setscheduler(int(thread.name), os.SCHED_RR, os.sched_param(1))
+
+
+def set_normal_priority() -> None:
+    """Give this thread, and the processes that it starts, no more than the normal priority."""
+    if hasattr(os, "sched_setscheduler"):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
