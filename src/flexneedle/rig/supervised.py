@@ -107,11 +107,12 @@ class Ticks:
             self.states.append((time, report.state, report.why))
 
     def summary(self) -> dict[str, Any]:
-        """Number of ticks, ticks left out, late and work in ms: median, 99 % and largest; stalls and states; largest
+        """Number of ticks, ticks left out; late, work and their sum, ended, in ms: median, 99 % and largest; stalls and states; largest
         motion in the queue by axis, in mm or degrees.
         """
         found: dict[str, Any] = {"count": len(self.late), "missed": self.missed}
-        for name, values in (("late", self.late), ("work", self.work)):
+        ended = [late + work for late, work in zip(self.late, self.work, strict=True)]
+        for name, values in (("late", self.late), ("work", self.work), ("ended", ended)):
             for q, label in ((50, "p50"), (99, "p99"), (100, "max")):
                 found[f"{name}_{label}_ms"] = 1e3 * float(np.percentile(values, q)) if values else None
         found["stalls"] = [{"time_s": time, "late_s": late} for time, late in self.stalls]
