@@ -107,8 +107,8 @@ class Ticks:
             self.states.append((time, report.state, report.why))
 
     def summary(self) -> dict[str, Any]:
-        """Number of ticks, ticks left out; late, work and their sum, ended, in ms: median, 99 % and largest; stalls and states; largest
-        motion in the queue by axis, in mm or degrees.
+        """Number of ticks, ticks left out; late, work and their sum, ended, in ms: median, 99 % and largest; stalls and
+        states; largest motion in the queue by axis, in mm or degrees.
         """
         found: dict[str, Any] = {"count": len(self.late), "missed": self.missed}
         ended = [late + work for late, work in zip(self.late, self.work, strict=True)]
