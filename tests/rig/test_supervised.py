@@ -262,8 +262,11 @@ def test_an_insertion_on_the_emulated_rig_ends_at_its_target(tmp_path, dry):
         address = rig.ready["ready"]["galil"]
         path.write_text(path.read_text().replace("127.0.0.1:0", address))
         done = flexneedle.insert(scenario, plan, seed, rig=path, dry_run=dry)
-        assert rig.ask("TPA") == (" 0\r\n:" if dry else rig.ask("TPA"))
+        counts = float(rig.ask("TPA").strip(" \r\n:"))
     found = read_truth(truth)
+    advanced = sum(period.applied.db_x for period in done.periods)
+    scale = load_rig(path).axes.insertion.scale
+    assert counts == pytest.approx(0.0 if dry else scale * advanced, abs=0.02 * scale)
     assert found.tips[0, 0] < PHANTOM.setup.start_tip_x - PHANTOM.guard.past_target_mm
     assert done.outcome == "done"
     assert done.reached

@@ -240,14 +240,16 @@ def test_times_of_readings_are_those_of_the_motors_and_not_of_a_slow_tracker():
         return read()
 
     slow.camera.read = slowly
-    spans = []
+    times = []
     for one in (slow, fast):
+        asked = one.clock.time
         one.core.request(step())
         done = one.until(1)
-        spans.append(done.ended - done.begun)
-        begun = done.begun - (one.stage.calls and 0.0)
-    assert spans[0] == pytest.approx(spans[1], abs=0.012)
-    assert begun > 0.0
+        times.append((done.begun - asked, done.ended - done.begun))
+    (begun, lasted), (of_fast, duration) = times
+    assert begun == pytest.approx(of_fast, abs=0.012)
+    assert 0.0 <= of_fast < 2 * TICK_S
+    assert lasted == pytest.approx(duration, abs=0.012)
 
 
 # Motions of the operator

@@ -266,30 +266,6 @@ else:
     made.move_to("insertion", 100.0, 1.0)
 """
 
-CLIENT = """
-import sys
-sys.path.insert(0, {tests!r})
-from rig.supervisor.test_process import task
-from flexneedle.rig.supervisor.client import Supervisor
-
-with Supervisor(task()) as made:
-    made.arm()
-    print(made.pid, flush=True)
-    made.move_to("insertion", 100.0, 1.0)
-"""
-
-
-def test_without_its_client_the_supervisor_stops_and_ends(tmp_path):
-    script = tmp_path / "client.py"
-    script.write_text(textwrap.dedent(CLIENT.format(tests=str(TESTS))))
-    client = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
-    pid = int(client.stdout.readline())
-    client.kill()
-    client.wait()
-    client.stdout.close()
-    until(lambda: ended(pid))
-    assert client.returncode == -signal.SIGKILL
-
 
 @pytest.mark.parametrize(
     ("given", "why"),
