@@ -19,7 +19,8 @@ from typing import Literal
 from playwright.sync_api import Browser, Page, sync_playwright
 
 _ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-_WAIT_MS = 120_000
+_WAIT_MS, _POLL_MS = 120_000, 100
+_PAINTED_MS = 3000  # in space, by software
 _ENDED = "['done', 'held', 'failed'].includes(flexneedle.store.get('insertion live')?.state)"
 _COMPARED = "flexneedle.store.get('job compare')?.state === 'done'"
 
@@ -47,9 +48,18 @@ def _visited(
     page.set_default_timeout(_WAIT_MS)
     page.add_init_script("localStorage.setItem('flexneedle tour', 'seen')")
     page.goto(address)
-    page.wait_for_function("window.flexneedle?.store.get('scene')")
+    _await(page, "window.flexneedle?.store.get('scene')")
     yield page
     context.close()
+
+
+def _await(page: Page, condition: str) -> None:
+    """Wait until an expression is true on the page, whose policy forbids to evaluate one in it again and again."""
+    for _ in range(_WAIT_MS // _POLL_MS):
+        if page.evaluate(condition):
+            return
+        page.wait_for_timeout(_POLL_MS)
+    raise TimeoutError(condition)
 
 
 def _press(page: Page, panel: str, name: str) -> None:
@@ -60,16 +70,19 @@ def _inserted(page: Page, pace: str = "20") -> None:
     """Insert to the end."""
     _press(page, "insertion", "Insert")
     page.locator("[aria-label=Pace]").select_option(pace)
-    page.wait_for_function(_ENDED)
+    _await(page, _ENDED)
 
 
 def _shown(page: Page, share: float) -> None:
-    """Show the period at a share of the insertion, and let it be painted."""
+    """Show the period at a share of the insertion, from the top of the page, and let it be painted."""
     page.evaluate(
-        "share => flexneedle.store.set('view period', Math.round(share * flexneedle.store.get('rows live').length))",
+        """share => {
+            flexneedle.store.set('view period', Math.round(share * flexneedle.store.get('rows live').length));
+            for (const part of [document.getElementById('main'), document.scrollingElement]) part.scrollTop = 0;
+        }""",
         share,
     )
-    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    page.wait_for_timeout(_PAINTED_MS)
 
 
 def _draw_insertion(browser: Browser, folder: Path) -> None:
@@ -80,7 +93,7 @@ def _draw_insertion(browser: Browser, folder: Path) -> None:
             _shown(page, 0.75)
             page.screenshot(path=folder / "page.png")
         with _visited(browser, address, 390, 844, "dark") as page:
-            page.wait_for_function(_ENDED)
+            _await(page, _ENDED)
             _shown(page, 0.75)
             page.screenshot(path=folder / "page-phone.png")
 
@@ -90,7 +103,7 @@ def _draw_plans(browser: Browser, folder: Path) -> None:
     with _served("phantom") as address, _visited(browser, address, 1440, 1200, "light") as page:
         page.evaluate("flexneedle.link.edit({'target.depth_mm': 40, 'target.lateral_mm': 1.5})")
         _press(page, "plans", "Both strategies")
-        page.wait_for_function(_COMPARED)
+        _await(page, _COMPARED)
         page.locator("section.plans").screenshot(path=folder / "page-plans.png")
 
 
@@ -98,12 +111,14 @@ def _draw_disturbance(browser: Browser, folder: Path) -> None:
     """A tip that is pushed half way: what the controller does, in plots and words."""
     with _served("phantom") as address, _visited(browser, address, 1440, 1200, "light") as page:
         _press(page, "insertion", "Start paused")
-        page.wait_for_function("flexneedle.store.get('insertion live')?.state === 'paused'")
-        page.locator("[aria-label=Pace]").select_option("5")
-        page.wait_for_function("flexneedle.store.get('rows live')?.length > 45")
+        _await(page, "flexneedle.store.get('insertion live')?.state === 'paused'")
+        page.locator("[aria-label=Pace]").select_option("2")
+        _await(page, "flexneedle.store.get('rows live')?.length > 40")
+        _press(page, "insertion", "Pause")
         page.get_by_label("Force on the tip in N").fill("0.1")
         _press(page, "insertion", "Push")
-        page.wait_for_function(_ENDED)
+        page.locator("[aria-label=Pace]").select_option("20")
+        _await(page, _ENDED)
         page.locator("section.plots").screenshot(path=folder / "page-disturbed.png")
 
 

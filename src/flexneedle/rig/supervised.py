@@ -80,7 +80,8 @@ class Columns:
 @dataclass
 class Ticks:
     """Times of the supervisor's ticks (s): how much later than scheduled each began, and how long it took; times of
-    those before which others were left out; changes of the rig's state. Times are on the monotonic clock.
+    those before which others were left out; changes of the rig's state, at the end of the tick that found them. Times
+    are on the monotonic clock.
 
     queued: the largest motion in the queue of each axis (mm or rad).
     """
@@ -104,7 +105,7 @@ class Ticks:
         for name, axis in report.axes.items():
             self.queued[name] = max(self.queued.get(name, 0.0), axis.queued)
         if not self.states or self.states[-1][1:] != (report.state, report.why):
-            self.states.append((time, report.state, report.why))
+            self.states.append((time + report.work, report.state, report.why))
 
     def summary(self) -> dict[str, Any]:
         """Number of ticks, ticks left out; late, work and their sum, ended, in ms: median, 99 % and largest; stalls and
