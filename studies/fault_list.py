@@ -33,7 +33,6 @@ RESTED = Reaction("rest until it is there", {"end": "done"})
 FAULT = Reaction("fault", {"fault": "failed"})
 FAULT_ONCE_IT_MOVES = Reaction("fault", {"fault": "failed", "end": "done"})
 STOPPED = Reaction("stop", {"stopped": "interrupted"})
-STOPPED_BY_CONTROLLER = Reaction("stop", {"end": "interrupted"}, detected=("end",))
 STOPPED_UNRECORDED = Reaction("stop", {"": "running"}, detected=())
 BY_THEMSELVES = Reaction("motors stop by themselves", {"": "failed"}, detected=())
 BY_THEMSELVES_UNRECORDED = Reaction("motors stop by themselves", {"": "running"}, detected=())
@@ -148,8 +147,6 @@ FAULTS: Sequence[Fault] = (
     _computer("clock set forward by 1 h", Clock(3600), CONTINUED),
     _computer("Ctrl-C", Signal(SIGINT, group=True), STOPPED, 0.1, "signal SIGINT", _SOME),
     _computer("SIGTERM", Signal(SIGTERM, group=True), STOPPED, 0.1, "signal SIGTERM", _SOME),
-    # Not the supervisor, as from `kill` or a service manager: the controller stops it, once it has left its decision.
-    _computer(
-        "SIGTERM to the controller alone", Signal(SIGTERM), STOPPED_BY_CONTROLLER, 0.3, "by the user", _SOME
-    ),
+    # As from `kill` or a service manager: the controller hands it on, whatever it does then.
+    _computer("SIGTERM to the controller alone", Signal(SIGTERM), STOPPED, 0.1, "signal SIGTERM", _SOME),
 )
