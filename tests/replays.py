@@ -42,7 +42,7 @@ class File(HTMLParser):
         self.elements.append([tag, dict(attrs), ""])
         self.inside = True
 
-    def handle_endtag(self, tag):
+    def handle_endtag(self, _tag):
         self.inside = False
 
     def handle_data(self, data):
@@ -52,9 +52,7 @@ class File(HTMLParser):
     def all(self, tag, **attributes):
         """Text of each element of a name with these attributes."""
         return [
-            text
-            for name, given, text in self.elements
-            if name == tag and attributes.items() <= given.items()
+            text for name, given, text in self.elements if name == tag and attributes.items() <= given.items()
         ]
 
     @property

@@ -1,10 +1,13 @@
 """`flexneedle view --html`: the file, where it is written, and what is refused."""
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from commands import names, run
+from flexneedle.runs.reading import load_insertion
 from replays import File
 
 pytestmark = pytest.mark.usefixtures("in_tmp", "drawing")
@@ -21,10 +24,8 @@ def recorded(in_tmp, drawing, engine, capsys):  # noqa: ARG001 - in this order
 
 def change(name, **values):
     """Change what is recorded of a run."""
-    with open(f"{name}/run.json", encoding="utf-8") as file:
-        stored = json.load(file)
-    with open(f"{name}/run.json", "w", encoding="utf-8") as file:
-        json.dump(stored | values, file)
+    path = Path(name) / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
 
 
 @pytest.mark.usefixtures("recorded")
@@ -44,11 +45,9 @@ def test_two_runs_are_compared(capsys):
     status, out, err = run(capsys, "view", "one", "--html", "-", "--compare", "two")
     assert (status, err) == (0, "")
     file = File.of(out)
-    shown = {each["of"]: each for each in file.record if isinstance(each, dict) and each["type"] == "insertion"}
-    assert {of: (each["name"], each["seed"]) for of, each in shown.items()} == {
-        "first": ("one", 0),
-        "second": ("two", 1),
-    }
+    news = [each for each in file.record if isinstance(each, dict) and each["type"] == "insertion"]
+    shown = [(each["of"], each["name"], each["seed"]) for each in news]
+    assert shown == [("first", "one", 0), ("second", "two", 1)]
     assert file.all("title") == ["one and two – flexneedle"]
 
 
@@ -90,7 +89,8 @@ def test_what_has_no_finished_insertion_is_refused(capsys, in_tmp):
     change("two", status="running")
     (in_tmp / "none").mkdir()
     before = names(in_tmp / "two")
-    assert refused(capsys, "none", "--html") == (2, "flexneedle: none: contains no run: run.json is missing\n")
+    missing = "flexneedle: none: contains no run: run.json is missing\n"
+    assert refused(capsys, "none", "--html") == (2, missing)
     assert refused(capsys, "plan", "--html") == (2, "flexneedle: plan: contains a plan, not an insertion\n")
     unfinished = (
         "flexneedle: two: no end is recorded: the run was killed, its disk was full, or it is still running; "
@@ -112,10 +112,6 @@ def test_an_insertion_without_a_period_is_refused(capsys, monkeypatch):
 
 
 def without_periods(folder):
-    from dataclasses import replace
-
-    from flexneedle.runs.reading import load_insertion
-
     insertion, lacking = load_insertion(folder)
     return replace(insertion, periods=()), lacking
 

@@ -34,7 +34,10 @@ def add_parser(commands: Commands) -> None:
         f"{_STDOUT}: stdout (default: RUN/{_REPLAY})",
     )
     parser.add_argument(
-        "--compare", metavar="RUN", type=Path, help="with --html: folder of a second insertion, shown beside the first"
+        "--compare",
+        metavar="RUN",
+        type=Path,
+        help="with --html: folder of a second insertion, shown beside the first",
     )
 
 
