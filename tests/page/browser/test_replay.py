@@ -141,7 +141,7 @@ def test_two_runs_are_beside_each_other(replay, pictures):
     for panel in ("space", "section", "axial"):
         page.locator(f"[data-panel={panel}]").scroll_into_view_if_needed()
         page.wait_for_selector(f"[data-panel={panel}] .legend >> text=second run")
-    assert "Compared with other Ended: ce-mpc, seed 7" in page.inner_text(WORDS)
+    assert "Compared with other. Ended: ce-mpc, seed 7" in page.inner_text(WORDS)
     page.locator(PLOTS).scroll_into_view_if_needed()
     page.wait_for_selector(f"{PLOTS} >> text=roll, second")
     pictures(page, "replay-compared")

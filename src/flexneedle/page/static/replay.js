@@ -43,7 +43,7 @@ async function load(mount, element) {
 function mountWords(element) {
   for (const [of, what] of Object.entries(RUNS)) {
     const run = store.get(`insertion ${of}`);
-    if (run) element.append(make("p", {}, make("strong", {}, `${what}${run.name}`), ` ${inWords(run)}`));
+    if (run) element.append(make("p", {}, make("strong", {}, `${what}${run.name}.`), ` ${inWords(run)}`));
   }
   const decisions = make("div.decisions");
   element.append(decisions);
