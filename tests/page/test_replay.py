@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import flexneedle.page
-from flexneedle.page.frames import ShapeFrame, packed
+from flexneedle.page.frames import Kind, ShapeFrame, Source, packed, unpacked
 from flexneedle.page.replay.bundle import bundled
 from flexneedle.page.replay.document import as_data, document
 from replays import File, insertion, record
@@ -43,6 +43,17 @@ def test_the_record_is_what_a_worker_reports(file):
     kinds = [each["type"] for each in file.record if isinstance(each, dict)]
     assert kinds == ["insertion", "rows"]
     assert len(file.record[-1]["rows"]) == 69
+
+
+def test_the_shapes_are_those_of_the_insertion(file):
+    made = insertion()
+    path, needles, true = (unpacked(each) for each in file.record if isinstance(each, bytes))
+    assert [frame.kind for frame in (path, needles, true)] == [Kind.PATH, Kind.NEEDLE, Kind.TRUE]
+    assert {frame.source for frame in (path, needles, true)} == {Source.FIRST}
+    assert path.values[0] == pytest.approx(made.plan.tips[:, :3], abs=1e-4)
+    for at in (0, 68):
+        assert needles.values[at] == pytest.approx(made.periods[at].shape[:, :3], abs=1e-4)
+        assert true.values[at] == pytest.approx(made.periods[at].true_shape, abs=1e-4)
 
 
 def test_a_text_of_the_record_ends_no_element():
