@@ -20,9 +20,7 @@ def add_parser(commands: Commands) -> None:
         "redraw the figures of a run, finished or not, or replay it in a browser",
         _view,
         "flexneedle view runs/20260101T120000Z-phantom-0",
-        "flexneedle view runs/mine",
         "flexneedle view runs/mine --html",
-        "flexneedle view runs/mine --html both.html --compare runs/other",
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="folder of the run")
     parser.add_argument(
