@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from base64 import b64encode
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from flexneedle.page.frames import Kind, ShapeFrame, Source, packed, unpacked
 from flexneedle.page.replay.bundle import bundled
 from flexneedle.page.replay.document import as_data, document
 from replays import File, insertion, record
+from synthetic import blind
 
 STATIC = Path(flexneedle.page.__file__).parent / "static"
 IMPORT = re.compile(r"""\b(?:from\s*|import\s*\(?\s*)["']([./][^"']+)["']""")
@@ -54,6 +56,16 @@ def test_the_shapes_are_those_of_the_insertion(file):
     for at in (0, 68):
         assert needles.values[at] == pytest.approx(made.periods[at].shape[:, :3], abs=1e-4)
         assert true.values[at] == pytest.approx(made.periods[at].true_shape, abs=1e-4)
+
+
+def test_what_was_not_recorded_is_not_in_it():
+    made = insertion()
+    made = replace(made, periods=tuple(blind(period) for period in made.periods))
+    *_, rows = File.of(document("mine", record(made))).record
+    assert {
+        (row["measured"], row["true"], row["true_energy_mj"], row["miss_sd_mm"]) for row in rows["rows"]
+    } == {(None, None, None, None)}
+    assert [one.kind for one in record(made) if isinstance(one, ShapeFrame)] == [Kind.PATH, Kind.NEEDLE]
 
 
 def test_a_text_of_the_record_ends_no_element():
