@@ -261,7 +261,8 @@ def _rows(running: Sequence[Future[Row]], interrupted: Event) -> Iterator[Row]:
         ended, left = wait(left, _POLL_S, FIRST_COMPLETED)
         if interrupted.is_set():
             raise KeyboardInterrupt
-        for one in sorted(ended, key=lambda one: one.exception() is not None):  # no row is lost by another's exception
+        # Those that raise come last: another's exception loses no row.
+        for one in sorted(ended, key=lambda one: one.exception() is not None):
             try:
                 yield one.result()
             except RuntimeError as error:

@@ -10,7 +10,8 @@ from typing import Any
 
 from flexneedle.rig.devices.trackers import AuroraSettings, ReplaySettings
 from flexneedle.ros.settings import DriverSettings, TrackerSettings
-from flexneedle.scenario.rig import LINEAR_AXES, RigFile
+from flexneedle.scenario.rig import RigFile
+from flexneedle.scenario.sections.axes import LINEAR_AXES
 from scenario_reference import Key, Table, heading, section, tables
 
 HERE = Path(__file__).parent

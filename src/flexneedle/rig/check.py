@@ -15,7 +15,8 @@ from flexneedle.rig.ports import Clock, Motors, MotorSetup, MotorState
 from flexneedle.rig.speeds import kept, step_time
 from flexneedle.rig.tracking.table import TIP
 from flexneedle.scenario.model import Scenario
-from flexneedle.scenario.rig import Axis, RigFile
+from flexneedle.scenario.rig import RigFile
+from flexneedle.scenario.sections.axes import Axis
 from flexneedle.types import VISIBLE, Frame, is_reference
 
 _PAUSE_S = 0.01

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from flexneedle.rig.start import needed
 from flexneedle.scenario.model import Scenario
 from flexneedle.scenario.problems import Problem, to_line
-from flexneedle.scenario.rig import Axis, LoopSettings, RigFile
+from flexneedle.scenario.rig import LoopSettings, RigFile
+from flexneedle.scenario.sections.axes import Axis
 
 _ROUNDING = 1e-9
 _STILL = "steering"  # the strategy that moves neither guide nor base laterally

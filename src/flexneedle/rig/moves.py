@@ -8,7 +8,8 @@ from math import isfinite
 from flexneedle.arguments import shown as text_of
 from flexneedle.errors import InputError
 from flexneedle.rig.supervisor.requested import homed_at, homing_reach, homing_speed
-from flexneedle.scenario.rig import Axis, RigFile
+from flexneedle.scenario.rig import RigFile
+from flexneedle.scenario.sections.axes import Axis
 
 _SHARE = 0.2  # speed of a jog or a retraction as a share of the axis's largest, unless one is given
 

@@ -4,7 +4,8 @@ import math
 
 from flexneedle.rig.supervisor.drives import Drive
 from flexneedle.rig.supervisor.trajectory import between, shortest
-from flexneedle.scenario.rig import Axis, LoopSettings, RigFile
+from flexneedle.scenario.rig import LoopSettings, RigFile
+from flexneedle.scenario.sections.axes import Axis
 
 _ROUNDING = 1e-9
 

@@ -19,7 +19,8 @@ from flexneedle.rig.emulator.coupled.axes import (
     starts,
 )
 from flexneedle.scenario.files import load_scenario
-from flexneedle.scenario.rig import Axes, load_rig
+from flexneedle.scenario.rig import load_rig
+from flexneedle.scenario.sections.axes import Axes
 from flexneedle.types import DB_X, DB_Y, DB_Z, DG_Y, DG_Z, ROLL, SPIN
 
 PHANTOM = load_scenario("phantom")

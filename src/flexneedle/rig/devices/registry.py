@@ -21,7 +21,8 @@ from flexneedle.rig.devices.guarded import Guarded, errors_named
 from flexneedle.rig.ports import Clock, MotorPaces, Motors, Tracker
 from flexneedle.scenario.own import a_kind_of, attribute, not_callable_with, resolved
 from flexneedle.scenario.problems import Problem, printable, to_line
-from flexneedle.scenario.rig import Axis, Part, RigFile
+from flexneedle.scenario.rig import Part, RigFile
+from flexneedle.scenario.sections.axes import Axis
 from flexneedle.types import Frame
 
 DRIVERS, TRACKERS = "flexneedle.drivers", "flexneedle.trackers"

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, replace
 
 from flexneedle.rig.ports import MotorState
-from flexneedle.scenario.rig import Axis
+from flexneedle.scenario.sections.axes import Axis
 
 
 @dataclass(frozen=True)

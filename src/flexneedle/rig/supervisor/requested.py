@@ -6,7 +6,7 @@ from flexneedle.rig.supervisor.drives import Drive
 from flexneedle.rig.supervisor.messages import Go, Step
 from flexneedle.rig.supervisor.motion import Motion
 from flexneedle.rig.supervisor.trajectory import shortest
-from flexneedle.scenario.rig import Axis
+from flexneedle.scenario.sections.axes import Axis
 
 _BACK_OFF_SHARE = 0.02  # of the range an axis moves away from its limit switch
 _HOMING_SHARE = 0.1  # of the largest speed
@@ -17,7 +17,7 @@ def stepping(step: Step) -> Motion:
     """A step of an insertion: its roll, then its travel."""
     legs = [(step.travel, step.duration)]
     if step.roll:
-        legs.insert(0, ({"rotation": step.roll}, 0.0))
+        legs.insert(0, ({"rotation": step.roll}, step.roll_duration))
     return Motion(step.number, legs, step.expected, roll=bool(step.roll))
 
 
