@@ -97,9 +97,10 @@ FAULTS: Sequence[Fault] = (
     ),
     _tracker("missing for 2 s", Device("aurora:missing:2"), HELD, 0.25, "^missing: tip", _SOME),
     _tracker("frozen: no new frames", Device("aurora:frozen"), HELD, 0.45, _NO_READING),
-    # The tip that is reported stays behind the needle, too.
+    # The tip that is reported stays behind the needle, too. It shows only while the needle travels, after a roll at the
+    # earliest.
     _tracker(
-        "frozen: values repeat", Device("aurora:stuck"), HELD, 0.6, "^(frozen|innovation|out of plane):"
+        "frozen: values repeat", Device("aurora:stuck"), HELD, 1.2, "^(frozen|innovation|out of plane):"
     ),
     _tracker("not a number", Device("aurora:nan"), HELD, 0.25, "^missing: tip"),
     _tracker("jump of 5 mm", Device("aurora:jump=5"), HELD, 0.15, "^(jump|innovation|out of plane):"),

@@ -165,13 +165,15 @@ STILL = Control()
 class Motion(NamedTuple):
     """A control as a driver carried it out, from `begun` to `ended` (s, on the clock of the run).
 
-    The needle rolls first: `turned` is when the roll had ended and the travel began. None: there was no roll.
+    The needle rolls first: `turned` is when the roll had ended and the travel began. None: there was no roll. held: why
+    the rig ended it before its goal, or did not begin it; "" if it was carried out.
     """
 
     control: Control
     begun: float
     ended: float
     turned: float | None = None
+    held: str = ""
 
     @property
     def travel_begun(self) -> float:

@@ -25,7 +25,8 @@ class Imagined:
         """Let the supervisor go through a motion, and the virtual needle make it."""
         motion = self._supervised.driver.apply(command, duration)
         self._rest_until(motion.begun)
-        self._phantom.apply(command, max(motion.ended - motion.travel_begun, 1e-3))
+        done = motion.control if motion.held else command
+        self._phantom.apply(done, max(motion.ended - motion.travel_begun, 1e-3))
         return motion
 
     def stop(self) -> None:

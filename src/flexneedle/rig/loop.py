@@ -153,6 +153,8 @@ def _periods(steering: Steering, rig: Rig) -> Iterator[tuple[Period, _Ending | N
         observation = _observed(progress.observation, task.scenario, rig, motion, begun)
         clocks.append(time.perf_counter())
         now = rig.clock.now()
+        if motion.held:
+            decided, step = decided.withheld(motion.held, progress), step.withheld(motion.held)
         progress = _progress_after(decided, step, observation, steering, begun, now)
         ending = _ending(task, progress)
         period = record(index, now, task.plan, rig, step, motion.control, observation, clocks)
@@ -218,7 +220,12 @@ def _carry_out(scenario: Scenario, rig: Rig, step: Step, begun: float) -> Motion
         motion = rig.driver.apply(command, max(1, readings) * reading)
     except CommandError as error:  # of a controller: refused, with a record of all before
         raise RefusedError(one_line(error)) from error
-    return instance("result of driver.apply", motion, Motion, "Motion(control, begun, ended, turned)")
+    motion = instance("result of driver.apply", motion, Motion, "Motion(control, begun, ended, turned)")
+    if (
+        motion.held
+    ):  # a decision that the rig does not carry out takes no time: the next one shall have a reading
+        rig.clock.wait(reading)
+    return motion
 
 
 def _ending(task: Task, progress: Progress) -> _Ending | None:

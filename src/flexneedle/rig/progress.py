@@ -1,6 +1,6 @@
 """What the closed loop keeps from one control period to the next: holds of the needle, and progress to the target."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,8 +31,9 @@ class Hold:
 class Refused:
     """Why decisions are not carried out, empty if they are, and the time (s) held for it.
 
-    Either no path reaches the target, or the command would exceed a limit. The time does not run while the needle
-    is held on account of the tracker; a decision that is carried out resets it.
+    No path reaches the target, the command would exceed a limit, or the rig, whose checks may differ from those of the
+    loop, ends motions before their goal. The time does not run while the needle is held on account of the tracker; a
+    decision that is carried out resets it.
     """
 
     reason: str = ""
@@ -111,6 +112,10 @@ class Progress:
     predicted: Shape | None = None
     late: Late | None = None
     held_in_all: float = 0.0
+
+    def withheld(self, reason: str, before: "Progress") -> "Progress":
+        """With a decision, on the progress before, that the rig has not carried out to its end."""
+        return replace(self, refused=before.refused.after(reason), moves=before.moves)
 
     @property
     def decides(self) -> bool:

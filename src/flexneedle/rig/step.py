@@ -33,6 +33,10 @@ class Step:
     wait: float | None = None
     late: bool = False
 
+    def withheld(self, reason: str) -> "Step":
+        """As the rig has not carried it out to its end."""
+        return replace(self, decision=replace(self.decision, why=f"held by the rig: {reason}"))
+
 
 @dataclass(frozen=True, eq=False)
 class Steering:

@@ -197,7 +197,7 @@ class SupervisedDriver:
         row = self._columns.control(done.travelled, *self._rotation(done, command, roll))
         self._moved += np.array(row[:MOVES])
         self._rolled += row.roll + row.spin
-        return Motion(row, done.begun, done.ended, done.turned)
+        return Motion(row, done.begun, done.ended, done.turned, done.why)
 
     def _rotation(self, done: Done, command: Control, roll: float) -> tuple[float, float]:
         """Roll and spin of what was turned.
