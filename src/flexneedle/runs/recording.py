@@ -1,6 +1,6 @@
 """Plan and insert with a record on disk: the work of the commands `plan` and `insert`."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -13,6 +13,7 @@ from flexneedle.planning.origin import placed
 from flexneedle.rig.parts import SCENARIO_TRACKER, controller_of, plant_of, tracker_of
 from flexneedle.rig.phantom.plants import DEFAULT_PLANT
 from flexneedle.rig.supervised import Watchers, check_fit
+from flexneedle.rig.supervisor.client import Supervisor
 from flexneedle.runs.saving import (
     PARTS,
     finish,
@@ -101,12 +102,12 @@ def record_insertion(
     on_iteration: OnIteration,
     on_period: OnPeriod,
     bridge: "Bridge | None" = None,
-    confirm: Callable[[Mapping[str, float]], None] | None = None,
+    confirm: Callable[[Supervisor], None] | None = None,
 ) -> Insertion:
     """Plan, insert, and write `run.json`, `trace.mcap` and `insertion.png`, `.svg` to the folder.
 
-    bridge: an open connection to ROS, which publishes all and may stop it. confirm: called with the positions of a
-    rig's axes after planning, before anything moves; what it raises ends the insertion.
+    bridge: an open connection to ROS, which publishes all and may stop it. confirm: called with the supervisor of a rig
+    after planning, before anything moves; what it raises ends the insertion.
 
     An insertion that is interrupted (Ctrl-C, or a stop) is returned with its periods and the outcome "interrupted". An
     error, or an interruption of planning, is recorded in `run.json` and re-raised; if there was a plan, the record
