@@ -32,8 +32,8 @@ PRESETS = ("phantom", "phantom3d")
 FIRST_WORLD, WORLDS_END = 100_000, 200_000  # numbers for reports (flexneedle/scenario/worlds.py)
 WARM_S = 60.0
 """Time after which memory is compared with that at the end."""
-LEAST_GROWTH_MB = {"server": 5.0, "browser": 1.0}
-"""Growth that is none: less than the rows and shapes of two insertions, of which ten minutes have forty."""
+GROWTH_MB = {"server": 5.0, "browser": 1.0}
+"""Growth that counts as none: ten minutes have forty insertions, whose rows have 0.1 MB each."""
 
 
 @dataclass(frozen=True)
@@ -201,8 +201,7 @@ def grown(
 ) -> Iterator[Figure]:
     """Growth of memory while pages watch insertions in real time, one after the other."""
     pages = [new_page(browser, server.address) for _ in range(viewers)]
-    memory, warm, begun = [], 0, time.monotonic()
-    before, shares = server.busy()[0], []
+    memory, warm, shares, begun = [], 0, [], time.monotonic()
     while time.monotonic() - begun < seconds:
         loaded(pages[0], PRESETS[0])
         pages[0].evaluate("seed => flexneedle.link.ask({type: 'options', seed})", int(rng.integers(2**31)))
@@ -222,6 +221,7 @@ def heaps(pages: Sequence[Page]) -> tuple[float, float]:
     """Memory (MB) of the largest page after collecting garbage: objects of its scripts, and their arrays."""
     found = []
     for page in pages:
+        page.evaluate("probe.reset()")  # whose notes are no memory of the page
         session = page.context.new_cdp_session(page)
         session.send("HeapProfiler.collectGarbage")
         usage = session.send("Runtime.getHeapUsage")
@@ -235,7 +235,7 @@ def growth(memory: Any, warm: int, viewers: int) -> Iterator[Figure]:
     """Growth from the first insertions after `warm` to the last, for rows of memory (MB)."""
     few = max(1, min(3, (len(memory) - warm) // 2))
     first, last = (np.median(part, axis=0) for part in (memory[warm : warm + few], memory[-few:]))
-    bars = (LEAST_GROWTH_MB["server"], None, LEAST_GROWTH_MB["browser"], None)
+    bars = (GROWTH_MB["server"], None, GROWTH_MB["browser"], None)
     names = ("server", "its workers", "objects of a page", "arrays of a page")
     for name, then, now, bar in zip(names, first, last, bars, strict=True):
         detail = f"{then:.1f} to {now:.1f} MB, {viewers} pages, {len(memory)} insertions"

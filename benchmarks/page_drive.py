@@ -9,7 +9,7 @@ from playwright.sync_api import Browser, Page
 
 PROBE = Path(__file__).with_name("page_probe.js")
 VIEWPORT = {"width": 1280, "height": 1000}
-PATIENCE_MS = 60_000
+PATIENCE_MS = 300_000
 STEP_S, MOVES = 0.016, 30
 """Of a drag: half a second."""
 PLANES = {1: ("x–y", "target"), 2: ("x–y", "x–z", "target")}
@@ -31,7 +31,7 @@ def new_page(browser: Browser, address: str) -> Page:
 
 
 def until(page: Page, condition: str) -> None:
-    """Wait until a condition in JavaScript holds; it is looked at after each paint."""
+    """Wait until a condition in JavaScript holds; it is looked at every 50 ms."""
     page.evaluate(
         f"""() => new Promise((resolve, reject) => {{
           const deadline = performance.now() + {PATIENCE_MS};

@@ -30,8 +30,18 @@
     });
   }
 
-  // Script before a paint: that of messages since the paint before, and that of its animation frame.
+  // Script before a paint: that of messages and timers since the paint before, and that of its animation frame.
   let [before, between, inFrame, drew] = [0, 0, 0, false];
+  function timed(call) {
+    const begun = performance.now();
+    try {
+      call();
+    } finally {
+      between += performance.now() - begun;
+    }
+  }
+  const later = window.setTimeout.bind(window);
+  window.setTimeout = (callback, delay) => later(() => timed(callback), delay);
   window.requestAnimationFrame = (callback) =>
     frame((now) => {
       const begun = performance.now();
@@ -73,7 +83,7 @@
   const asked = new Map(); // by number: time of the click
   window.addEventListener("click", ({ timeStamp }) => {
     clicked = timeStamp;
-    setTimeout(() => { clicked = null; });
+    later(() => { clicked = null; });
     afterPaint(() => probe.clicks.push(performance.now() - timeStamp));
   }, true);
   window.addEventListener("pointermove", ({ timeStamp, buttons }) => {
@@ -106,9 +116,7 @@
   window.WebSocket = class extends Socket {
     set onmessage(listener) {
       super.onmessage = (event) => {
-        const begun = performance.now();
-        listener(event);
-        between += performance.now() - begun;
+        timed(() => listener(event));
         if (typeof event.data === "string" && HEARD.test(event.data)) heard(JSON.parse(event.data));
       };
     }
