@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all test-page slow bench rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets worlds space worlds-space tuning docs lint clean
+.PHONY: help setup demo test test-all test-page slow bench bench-page rig-demo rig-faults rig-wall-clock rig-families rig-ros fuzz fuzz-ros robustness validation accuracy controllers studies tracker steering far-targets worlds space worlds-space tuning docs lint clean
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 BIN := .venv/bin
@@ -49,6 +49,9 @@ bench: setup  ## measure speed: mechanics, the exact plant, control periods, ten
 	$(BIN)/python benchmarks/galil.py
 	$(BIN)/python benchmarks/ros.py
 	$(BIN)/python benchmarks/ros_stop.py
+
+bench-page: setup  ## measure the page in a browser against its bars; needs chromium on the path (half an hour; ARGS=--quick)
+	$(BIN)/python benchmarks/page.py $(ARGS)
 
 rig-demo: setup  ## insertions on an emulated rig over both protocols in real time (N=1)
 	$(BIN)/python studies/rig_demo.py --insertions $(or $(N),1) --out $(or $(DIR),runs/rig-demo)

@@ -9,7 +9,7 @@ from flexneedle.page import messages as m
 from flexneedle.page.server.insertion import ConnectedRig
 from flexneedle.scenario.files import dump_scenario, load_scenario
 from page_clients import QUICK, Client, get, served
-from page_worker import ROWS
+from page_worker import ROWS, WORKS_ON
 
 
 def test_a_client_is_welcomed_with_what_can_be_chosen(server):
@@ -28,6 +28,38 @@ def test_the_first_plan_is_made_before_anybody_asks(server):
         assert client.newest["plan manipulation"]["revision"] == 1
         assert client.newest["scene"]["revision"] == 1
         assert client.newest["estimate"]["revision"] == 1
+
+
+def test_a_changed_scenario_is_planned_when_it_rests(tmp_path):
+    with served(tmp_path, limits=replace(QUICK, rest_s=0.05)) as server, Client(server) as client:
+        client.steer()
+        for depth in (35.0, 36.0, 37.0):
+            client.do("edit", values={"target.depth_mm": depth})
+        client.do("options", seed=3)
+        client.wait(lambda: client.newest.get("plan manipulation", {}).get("seed") == 3)
+        assert client.newest["plan manipulation"]["revision"] == client.newest["session"]["revision"] == 5
+
+
+def test_while_it_changes_it_is_estimated_and_not_planned(client):
+    client.job("plan", "done")
+    first = client.newest["job plan"]["job"]
+    for depth in (35.0, 36.0):
+        client.do("edit", values={"target.depth_mm": depth})
+        revision = client.newest["session"]["revision"]
+        client.wait(lambda revision=revision: client.newest["estimate"]["revision"] == revision)
+    assert client.newest["job plan"]["job"] == first
+
+
+def test_a_plan_that_was_asked_for_is_not_replaced_by_that_at_rest(tmp_path):
+    with served(tmp_path / "runs", limits=replace(QUICK, rest_s=0.02)) as server, Client(server) as client:
+        client.steer().job("plan", "done")
+        client.do("options", seed=WORKS_ON)
+        client.do("start", work="compare")
+        for name in ("one", "two"):  # each is listed after 0.05 s
+            (tmp_path / "runs" / name).mkdir(parents=True)
+            (tmp_path / "runs" / name / "run.json").write_text("{}")
+            client.wait(lambda name=name: name in {run["name"] for run in client.newest["runs"]["runs"]})
+        assert client.newest["job compare"]["state"] == "running"
 
 
 def test_steering_is_taken_and_released(server):

@@ -1,16 +1,11 @@
 """A browser for the tests of the page, Debian's Chromium; a fake server and a page for each test."""
 
 import os
-import shutil
 from pathlib import Path
 
 import pytest
 
-CHROMIUM = shutil.which("chromium")
-ARGUMENTS = [
-    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--disable-accelerated-2d-canvas", "--disable-gpu-rasterization",
-]  # fmt: skip
+from chromium import ARGUMENTS, CHROMIUM
 
 
 @pytest.fixture(scope="session")

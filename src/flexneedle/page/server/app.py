@@ -54,7 +54,9 @@ def application(desk: Desk, gate: Gate, static: Path = STATIC) -> ASGIApp:
         Mount("/static", StaticFiles(directory=static)),
     ]
     handlers = {HTTPException: _refused}
-    return Guard(Starlette(routes=routes, lifespan=lifespan, exception_handlers=handlers), gate)
+    app = Starlette(routes=routes, lifespan=lifespan, exception_handlers=handlers)
+    app.router.redirect_slashes = False  # a path is an address of the page, or refused
+    return Guard(app, gate)
 
 
 class Downloads:

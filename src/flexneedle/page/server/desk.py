@@ -183,7 +183,11 @@ class Desk:
             self._nobody_steers("the steering was released")
 
     def _begin(self, session: Session) -> None:
-        """Go on with a changed session: what is computed for the old one is cancelled."""
+        """Go on with a changed session: what is computed for the old one is cancelled.
+
+        Its plan is made when no other change has followed: so each place of a dragged target has an estimate, and the
+        place where it rests a plan.
+        """
         if session.origin is not self.session.origin:  # nothing of another scenario may come after this
             self.hub.forget_all_of(*_RESULTS)
             self.hub.forget_frames(Source.SCENE, Source.MANIPULATION, Source.STEERING)
@@ -193,6 +197,7 @@ class Desk:
         self._plans.cancel(*_SEARCHES)
         self._order("scene", "scene")
         self._order("estimate", "estimate")
+        self._start_timer("plan", self.limits.rest_s, self._at_rest)
 
     def _with_options(self, options: m.Options) -> Session:
         known = [controller["name"] for controller in CONTROLLERS]
@@ -201,6 +206,8 @@ class Desk:
         return self.session.with_options(options)
 
     def _order(self, do: Do, kind: Kind) -> None:
+        if do == "plan":
+            self._stop_timer("plan")
         self._plans.add(self._work(do, kind))
 
     def _work(self, do: Do, kind: Kind) -> Work:
@@ -248,6 +255,10 @@ class Desk:
         self._insertions.add(Work(job=0, do="save", kind="save", name=name, folder=str(folder)))
 
     # What happens by itself
+
+    def _at_rest(self) -> None:
+        if not self.live.moves_rig:  # whose loop would share the processor
+            self._order("plan", "plan")
 
     def _job_ended(self, work: Work, state: str, text: str) -> None:
         if work.kind == "insertion":

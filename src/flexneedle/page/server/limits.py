@@ -24,6 +24,8 @@ class Limits:
     pong_s: float = 10.0
     send_s: float = 10.0
     """A client that does not take a message for this time is disconnected."""
+    rest_s: float = 0.1
+    """The scenario is planned when it has not changed for this time."""
     alone_s: float = 5.0
     """Without clients for this time, work is cancelled."""
     lost_s: float = 2.0

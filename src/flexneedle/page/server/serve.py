@@ -1,5 +1,6 @@
 """Listen, and serve the page until Ctrl-C."""
 
+import logging
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -81,7 +82,13 @@ def bind(host: str, port: int, limits: Limits) -> socket.socket:
     return listening
 
 
+def _is_an_error(record: logging.LogRecord) -> bool:
+    """Whether something is wrong, of what uvicorn reports: it also does where a web socket is refused."""
+    return not record.getMessage().startswith("ASGI callable returned without completing handshake")
+
+
 def _config(application: Any, limits: Limits) -> uvicorn.Config:
+    logging.getLogger("uvicorn.error").addFilter(_is_an_error)
     return uvicorn.Config(
         application,
         loop="asyncio",

@@ -1,0 +1,95 @@
+"""Figures of the page, from what benchmarks/page_probe.js has noted, and the table of them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+Log = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure with its bar (None: none), which is the most that it may be, or the least."""
+
+    name: str
+    unit: str
+    value: float
+    bar: float | None
+    detail: str = ""
+    least: bool = False
+
+    @property
+    def kept(self) -> bool:
+        """Whether the bar is kept; a figure that is NaN keeps none."""
+        if self.bar is None:
+            return True
+        return self.value >= self.bar if self.least else self.value <= self.bar
+
+
+def spread(
+    name: str, unit: str, values: Sequence[float] | Mapping[str, Sequence[float]], bar: float | None
+) -> Figure:
+    """The figure that 95 % of the values do not exceed; with the 95 % of each group, if there are groups."""
+    groups = values if isinstance(values, Mapping) else {}
+    all_values = [value for group in groups.values() for value in group] if groups else list(values)
+    of_groups = "".join(f"; {key} {_most(group):.0f}" for key, group in groups.items())
+    detail = f"95 % of {len(all_values)}; median {np.median(all_values or [np.nan]):.3g}, largest "
+    return Figure(
+        name, unit, _most(all_values), bar, f"{detail}{max(all_values, default=np.nan):.3g}{of_groups}"
+    )
+
+
+def clicked(name: str, logs: Sequence[Log], key: str, bar: float) -> Figure:
+    """The time (ms) of clicks in all logs."""
+    return spread(name, "ms", [ms for log in logs for ms in log[key]], bar)
+
+
+def rate(frames: Sequence[Sequence[float]], bar: float) -> Figure:
+    """Animation frames a second, of their times (ms) in several insertions: the least of them."""
+    rates = [1e3 * (len(times) - 1) / (times[-1] - times[0]) for times in frames]
+    longest = max(float(np.diff(times).max()) for times in frames)
+    detail = (
+        f"least of {len(rates)} insertions; median {np.median(rates):.1f}, longest pause {longest:.0f} ms"
+    )
+    return Figure("animation frames", "1/s", min(rates), bar, detail, least=True)
+
+
+def estimate_delays(log: Log) -> list[float]:
+    """Time (ms) from each move of the target until an estimate of that place, or of a later one, was painted."""
+    delays = []
+    for moved in log["moves"]:
+        revision = next((edit["revision"] for edit in log["edits"] if edit["time"] >= moved), None)
+        if revision is not None and revision > 0:
+            delays.append(_painted(log["estimates"], revision) - moved)
+    return delays
+
+
+def plan_delay(log: Log) -> float:
+    """Time (ms) from the release of the target until the plan to its last place was painted."""
+    revision = max(edit["revision"] for edit in log["edits"])
+    return _painted(log["plans"], revision) - float(log["releases"][-1])
+
+
+def _painted(shown: Sequence[Log], revision: int) -> float:
+    """When (ms) a revision was first painted; infinite if it never was."""
+    return min((one["time"] for one in shown if one["revision"] >= revision), default=float("inf"))
+
+
+def _most(values: Sequence[float]) -> float:
+    """What 95 % do not exceed: the smallest of the values for which that holds."""
+    return float(np.quantile(values, 0.95, method="higher")) if len(values) else float("nan")
+
+
+def table(figures: Sequence[Figure]) -> str:
+    """A line for each figure."""
+    width = max(len(figure.name) for figure in figures)
+    lines = []
+    for figure in figures:
+        sign = "≥" if figure.least else "≤"
+        bar = "" if figure.bar is None else f"{sign} {figure.bar:g}"
+        verdict = "" if figure.bar is None else "kept" if figure.kept else "EXCEEDED"
+        value = f"{figure.value:.3g} {figure.unit}"
+        lines.append(f"{figure.name:{width}}  {bar:>7}  {value:>16}  {verdict:8}  {figure.detail}")
+    return "\n".join(lines)

@@ -1,0 +1,65 @@
+"""benchmarks/page_figures.py: figures from what a page has noted."""
+
+import math
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+from page_figures import Figure, estimate_delays, plan_delay, rate, spread, table
+
+LOG = {
+    "moves": [0.0, 40.0, 60.0, 300.0],
+    "releases": [310.0],
+    "edits": [
+        {"time": 10.0, "request": 1, "revision": 5},
+        {"time": 62.0, "request": 2, "revision": 6},
+        {"time": 305.0, "request": 3, "revision": -1},
+    ],
+    "estimates": [{"revision": 5, "time": 100.0}, {"revision": 7, "time": 180.0}],
+    "plans": [{"revision": 4, "time": 20.0}, {"revision": 6, "time": 900.0}],
+}
+
+
+def test_an_estimate_is_that_of_the_edit_with_the_move_or_of_a_later_one():
+    assert estimate_delays(LOG) == [100.0, 140.0, 120.0]  # the last was refused
+
+
+def test_an_estimate_that_has_not_come_is_late_without_end():
+    assert estimate_delays(LOG | {"estimates": []}) == [math.inf] * 3
+
+
+def test_a_plan_is_that_of_the_last_edit():
+    assert plan_delay(LOG) == 900.0 - 310.0
+    assert plan_delay(LOG | {"plans": LOG["plans"][:1]}) == math.inf
+
+
+def test_a_spread_is_what_95_percent_do_not_exceed():
+    values = list(range(1, 101))
+    assert spread("", "ms", values, 96.0).kept
+    assert not spread("", "ms", values, 95.0).kept
+    assert spread("", "ms", {"a": values[:50], "b": values[50:]}, None).value == 96.0
+    assert not spread("", "ms", [], 1.0).kept
+
+
+def test_a_rate_is_the_least_of_all():
+    figure = rate([[0.0, 10.0, 20.0], [0.0, 10.0, 40.0]], 55.0)
+    assert figure.value == pytest.approx(50.0)
+    assert not figure.kept
+    assert figure.detail.endswith("longest pause 30 ms")
+
+
+def test_the_table_has_bar_figure_and_verdict():
+    lines = table(
+        [
+            Figure("a", "ms", 4.2, 5.0),
+            Figure("b", "1/s", 50.0, 55.0, least=True),
+            Figure("c", "MB", 1.0, None),
+        ]
+    )
+    assert [line.split() for line in lines.split("\n")] == [
+        ["a", "≤", "5", "4.2", "ms", "kept"],
+        ["b", "≥", "55", "50", "1/s", "EXCEEDED"],
+        ["c", "1", "MB"],
+    ]
