@@ -185,6 +185,7 @@ def _execute(
     args: argparse.Namespace, folder: Folder, scenario: Scenario, choices: Choices, bridge: Bridge | None
 ) -> Insertion:
     from flexneedle.console.progress import Progress
+    from flexneedle.rig.supervised import Watchers
     from flexneedle.runs.recording import record_insertion
     from flexneedle.types import Outcome
 
@@ -203,7 +204,7 @@ def _execute(
             on_iteration=show.iteration,
             on_period=show.period,
             bridge=bridge,
-            confirm=confirm,
+            watchers=Watchers(confirm=confirm),
         )
         if insertion.outcome is Outcome.DONE:
             progress.finish("Inserting")
@@ -285,13 +286,10 @@ def _confirm(
 
     Raises RunError for any answer but yes.
     """
-    from flexneedle.rig.moves import resting
+    from flexneedle.rig.start import announced
 
-    depth, *lateral = scenario.target.position[: 1 + scenario.setup.axes]
-    to = f"{depth:g} mm deep, {', '.join(f'{value:g}' for value in lateral)} mm to the side"
-    first = f"{rig.name}: the needle will be inserted from where it is, to a target {to}."
     with progress.paused():
-        confirm_motions([first, *resting(rig, positions), ARMS], question)
+        confirm_motions([*announced(rig, scenario, positions), ARMS], question)
 
 
 def _list() -> int:

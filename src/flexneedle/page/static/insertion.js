@@ -4,13 +4,12 @@ import { button, make, shown } from "./dom.js";
 import { followDecisions } from "./insertion/decisions.js";
 import { disturbForm } from "./insertion/disturb.js";
 import { rigForm } from "./insertion/rig.js";
-import { maySteer } from "./shown.js";
+import { maySteer, runs as isRunning } from "./shown.js";
 
 const PACES = [0.25, 0.5, 1, 2, 5, 10, 20];
-const RUNS = ["waiting", "planning", "running", "paused"];
 const STATES = {
-  waiting: "Waiting for the computation", planning: "Planning", running: "Running", paused: "Paused", done: "Ended",
-  held: "Held", failed: "Failed", interrupted: "Stopped", refused: "Refused",
+  waiting: "Waiting for the computation", planning: "Planning", ready: "Ready", running: "Running", paused: "Paused",
+  holding: "Holding", done: "Ended", held: "Held", failed: "Failed", interrupted: "Stopped", refused: "Refused",
 };
 
 export function mount(element, store, link) {
@@ -34,18 +33,17 @@ export function mount(element, store, link) {
 
   store.subscribe(["insertion live", "people", "welcome"], () => {
     const live = store.get("insertion live");
-    const runs = RUNS.includes(live?.state);
+    const runs = isRunning(live);
     const [steers, real, paused] = [maySteer(store), Boolean(live?.rig), live?.pace === 0];
     state.textContent = inWords(live);
     for (const each of [start, slowly]) Object.assign(each, { hidden: runs, disabled: !steers });
-    for (const each of [stop, pause]) each.hidden = !runs;
-    step.hidden = pace.hidden = !runs || real;
+    stop.hidden = !runs;
+    for (const each of [pause, step, pace]) each.hidden = !runs || real;
     pause.disabled = pace.disabled = !steers;
     step.disabled = !steers || !paused;
     pause.dataset.next = paused ? "go" : "pause";
-    pause.textContent = paused ? "Continue" : real ? "Hold" : "Pause";
-    if (real) pace.value = "1";
-    else if (live?.pace && document.activeElement !== pace) pace.value = String(nearest(live.pace));
+    pause.textContent = paused ? "Continue" : "Pause";
+    if (live?.pace && document.activeElement !== pace) pace.value = String(nearest(live.pace));
     disturb.hidden = !runs || real;
     disturb.disabled = !steers;
   });
@@ -57,6 +55,7 @@ function inWords(live) {
   const parts = [`${STATES[live.state] ?? live.state}${where}: ${live.controller}, seed ${live.seed}, ${live.periods} periods.`];
   if (live.summary) parts.push(live.summary);
   else if ((live.error_mm ?? null) !== null) parts.push(`The tip ended ${shown(live.error_mm, 3)} mm from the target.`);
+  if (live.folder && !isRunning(live)) parts.push(`Recorded as ${live.folder}.`);
   return parts.join(" ");
 }
 
