@@ -1,6 +1,7 @@
 """Each request over a real socket: what it does, and why it is refused."""
 
 import json
+
 import pytest
 
 from flexneedle.page import messages as m

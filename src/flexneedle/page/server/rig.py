@@ -120,7 +120,7 @@ class Rig:
         if self.active and self._state in _MOVING:
             self._set_armed(None)
             self._signal(hold=why)
-            self._refresh()
+            self._refresh(why)
         else:
             self.changed(why)
 
@@ -174,7 +174,7 @@ class Rig:
         return self.job is not None and self._jobs().signal(self.job, **change)
 
     def _refresh(self, why: str = "") -> None:
-        """Publish the state of the rig. why: if the supervisor has none."""
+        """Publish the state of the rig. why: what has changed it here; what the worker reports next takes its place."""
         report = self._report
         if not self.active:
             return
